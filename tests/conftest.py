@@ -75,7 +75,7 @@ def compiled_once(compiled_code: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Compiled kernels are found again."""
     from vdgs.kernels.cuda import compile_cache
 
-    monkeypatch.setenv(compile_cache.VARIABLE, str(compiled_code))
+    monkeypatch.setenv(compile_cache.CUDA_CACHE_ENV_VAR, str(compiled_code))
 
 
 @pytest.fixture(scope="session")

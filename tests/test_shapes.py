@@ -12,15 +12,15 @@ import torch
 from jaxtyping import TypeCheckError
 
 from support.package_files import checked_files, files_with_shapes, module_name
-from vdgs.captures.camera_height import reach
+from vdgs.captures.camera_height import view_distance
 from vdgs.config.method import CompensationConfig
 from vdgs.evaluation.metrics import squared_error
 from vdgs.kernels import cpu, rotations, torch_ref
-from vdgs.kernels.spherical_harmonics import basis
-from vdgs.model.initialization.gap_filling import gap_points
-from vdgs.partition.principal_axes import principal_plane
-from vdgs.training.compensation import low_visibility
-from vdgs.visibility.visibility_counts import visibility_of
+from vdgs.kernels.spherical_harmonics import eval_sh_bases
+from vdgs.model.initialization.gap_filling import find_gap_points
+from vdgs.partition.principal_axes import fit_principal_plane
+from vdgs.training.compensation import low_visibility_mask
+from vdgs.visibility.visibility_counts import count_visibility
 
 
 def imports_jaxtyping(file: Path) -> bool:
@@ -56,14 +56,14 @@ WRONG = {
     "kernels.native, two that disagree": lambda: cpu.group_max(torch.zeros(5, 2), torch.zeros(4).long(), 1),
     "kernels.reference": lambda: torch_ref.morton_order(torch.zeros(5, 2)),
     "kernels": lambda: rotations.rotation_matrices(torch.zeros(5, 3)),
-    "model, torch": lambda: visibility_of(torch.zeros(5, 2), []),
-    "model, numpy": lambda: gap_points(FLAT, [], 1.0),
-    "training": lambda: low_visibility(torch.zeros(5, 1), CompensationConfig()),
-    "partition": lambda: principal_plane(np.zeros((5, 3))),
-    "captures": lambda: reach(FLAT, np.zeros((5, 3)), np.zeros(3)),
+    "model, torch": lambda: count_visibility(torch.zeros(5, 2), []),
+    "model, numpy": lambda: find_gap_points(FLAT, [], 1.0),
+    "training": lambda: low_visibility_mask(torch.zeros(5, 1), CompensationConfig()),
+    "partition": lambda: fit_principal_plane(np.zeros((5, 3))),
+    "captures": lambda: view_distance(FLAT, np.zeros((5, 3)), np.zeros(3)),
     "evaluation, two that disagree": lambda: squared_error(*(np.zeros((n, 4, 3), np.uint8) for n in (4, 5))),
     "evaluation, another type": lambda: squared_error(*(np.zeros((4, 4, 3), np.float32) for _ in range(2))),
-    "spherical harmonics": lambda: basis(torch.zeros(5, 2), 1),
+    "spherical harmonics": lambda: eval_sh_bases(torch.zeros(5, 2), 1),
 }
 
 

@@ -22,31 +22,31 @@ from pathlib import Path
 import psutil
 from rich.console import Console
 
-from experiments.bench.definitions import Scene
-from experiments.bench.figure import draw_groups
-from experiments.bench.grids import grids_of
-from experiments.bench.known import left_to_train, on_the_same_pixels, read_known
+from experiments.bench.definitions import BenchScene
+from experiments.bench.figure import plot_visibility_groups
+from experiments.bench.grids import make_result_tables
+from experiments.bench.known import drop_cached_runs, match_pixel_groups, read_cached_results
 from experiments.bench.measure import FRUSTA_FILE, GROUPS_FILE, measure_groups
-from experiments.bench.notes import notes_of
-from experiments.bench.plan import Choices, Plan, PlannedRun, make_plan
+from experiments.bench.notes import make_notes
+from experiments.bench.plan import BenchPlan, PlannedRun, PlanOptions, make_plan
 from experiments.bench.renders import check_renders
-from experiments.bench.results import Result, as_json, gather
-from experiments.bench.seen import Seen, seen_by_frusta, seen_by_model, seen_truly
-from experiments.bench.verdict import verdict
-from experiments.bench.worker import RECORD, Job
-from experiments.bench.writing import latex, markdown, tidy_csv
+from experiments.bench.results import BenchResult, collect_results, results_to_json
+from experiments.bench.seen import PixelVisibility, visibility_from_frusta, visibility_from_model, visibility_from_truth
+from experiments.bench.verdict import check_claims
+from experiments.bench.worker import RECORD_FILE, BenchJob
+from experiments.bench.writing import to_latex, to_markdown, to_tidy_csv
 from vdgs.captures.loading import load_capture
-from vdgs.captures.output_guard import refuse_among_files, refuse_in_a_capture
+from vdgs.captures.output_guard import check_not_among_files, check_not_in_capture
 from vdgs.config.capture_options import CaptureOptions
-from vdgs.config.serialization import differences, to_dict
-from vdgs.distributed.executor import Lines, Outcome, Task
+from vdgs.config.serialization import diff_settings, to_dict
+from vdgs.distributed.executor import LogListener, Task, TaskResult
 from vdgs.distributed.local_executor import LocalExecutor
-from vdgs.distributed.progress_table import STYLES
+from vdgs.distributed.progress_table import STATE_STYLES
 from vdgs.errors import Stopped, VdgsError
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.stage_keys import counted
+from vdgs.runs.stage_keys import hashable_settings
 from vdgs.synth import SynthOptions, generate
-from vdgs.system.atomic_files import jsonable, read_json, write_json, write_text
+from vdgs.system.atomic_files import read_json, to_jsonable, write_json, write_text
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class BenchSettings:
 
     table: str
     output: Path
-    choices: Choices
+    choices: PlanOptions
     data: Path | None = None
     jobs: int = 1
     bins: int = 4
@@ -65,7 +65,7 @@ class BenchSettings:
     known: tuple[Path, ...] = ()
 
 
-def run_bench(settings: BenchSettings, console: Console) -> list[Result]:
+def run_bench(settings: BenchSettings, console: Console) -> list[BenchResult]:
     """Everything; what is finished for the same settings is kept, and the same command continues.
 
     Raises VdgsError for settings that do not work, Stopped after Ctrl-C or SIGTERM (what is measured so far is
@@ -73,9 +73,12 @@ def run_bench(settings: BenchSettings, console: Console) -> list[Result]:
     """
     if settings.jobs < 1 or settings.bins < 1:
         raise VdgsError("--jobs and --bins must be at least 1")
-    _refuse_among_inputs(settings.output, plan := make_plan(settings.table, settings.choices))
-    known, keys = read_known(settings.known), {run.name: _key(run, plan, settings) for run in plan.coarse + plan.runs}
-    left = left_to_train(plan, keys, known)
+    _check_output_outside_inputs(settings.output, plan := make_plan(settings.table, settings.choices))
+    known, keys = (
+        read_cached_results(settings.known),
+        {run.name: _key(run, plan, settings) for run in plan.coarse + plan.runs},
+    )
+    left = drop_cached_runs(plan, keys, known)
     if settings.known:
         taken = len(plan.runs) - len(left.runs)
         console.print(f"{taken} of {len(plan.runs)} runs are known and not trained here", highlight=False)
@@ -84,7 +87,7 @@ def run_bench(settings: BenchSettings, console: Console) -> list[Result]:
         captures, lost = _captures(left, settings, console)
         ended = lost | _train(left, captures, keys, settings, console)
         ended |= _measure(left, captures, ended, settings, console)
-        results = on_the_same_pixels(gather(plan, settings.output, ended, keys, known), known)
+        results = match_pixel_groups(collect_results(plan, settings.output, ended, keys, known), known)
         _write(plan, results, settings, console)
     console.print(f"{(time.monotonic() - began) / 60:.1f} min", highlight=False)
     if any(each.state == "stopped" for each in ended.values()):
@@ -98,30 +101,32 @@ def run_bench(settings: BenchSettings, console: Console) -> list[Result]:
     return results
 
 
-def _refuse_among_inputs(output: Path, plan: Plan) -> None:
+def _check_output_outside_inputs(output: Path, plan: BenchPlan) -> None:
     """Raise VdgsError before anything is written where the output lies among photographs or masks of a scene."""
-    refuse_in_a_capture(output)
+    check_not_in_capture(output)
     for scene in plan.scenes:
         if scene.folder is not None:
             names = [scene.options.get("images"), scene.options.get("masks")]
-            refuse_among_files(output, scene.folder, [scene.folder / name / "any" for name in names if name])
+            check_not_among_files(output, scene.folder, [scene.folder / name / "any" for name in names if name])
 
 
-def _captures(plan: Plan, settings: BenchSettings, console: Console) -> tuple[dict[str, Path], dict[str, Outcome]]:
+def _captures(
+    plan: BenchPlan, settings: BenchSettings, console: Console
+) -> tuple[dict[str, Path], dict[str, TaskResult]]:
     """The folder of every scene, generated where there is none yet; the runs of those that cannot be had, failed."""
-    found, lost = {}, dict[str, Outcome]()
+    found, lost = {}, dict[str, TaskResult]()
     for scene in plan.scenes:
         try:
             found[scene.name] = _capture(scene, settings, console)
         except VdgsError as error:
             names = [run.name for run in plan.coarse + plan.runs if run.scene == scene.name]
-            lost |= {name: Outcome(name=name, state="failed", why=str(error)) for name in names}
+            lost |= {name: TaskResult(name=name, state="failed", why=str(error)) for name in names}
     if lost and not found:
         raise VdgsError(next(iter(lost.values())).why)
     return found, lost
 
 
-def _capture(scene: Scene, settings: BenchSettings, console: Console) -> Path:
+def _capture(scene: BenchScene, settings: BenchSettings, console: Console) -> Path:
     if scene.folder is not None:
         return scene.folder
     if scene.capture is not None:
@@ -144,19 +149,19 @@ def _capture(scene: Scene, settings: BenchSettings, console: Console) -> Path:
 
 
 def _train(
-    plan: Plan, captures: Mapping[str, Path], keys: Mapping[str, str], settings: BenchSettings, console: Console
-) -> dict[str, Outcome]:
+    plan: BenchPlan, captures: Mapping[str, Path], keys: Mapping[str, str], settings: BenchSettings, console: Console
+) -> dict[str, TaskResult]:
     """Every run whose scene is there, trained or found finished."""
-    done, tasks = dict[str, Outcome](), list[Task]()
+    done, tasks = dict[str, TaskResult](), list[Task]()
     wanted = [run for run in plan.coarse + plan.runs if run.scene in captures]
     cores = psutil.cpu_count() or 1
     threads = max(1, cores // settings.jobs)
     for run in wanted:
-        _refuse_other_settings(settings, run)
+        _check_same_settings(settings, run)
     for run in wanted:
         job = _job(run, plan, captures[run.scene], keys[run.name], settings, threads)
         if _is_done(settings.output, run, job.key):
-            done[run.name] = Outcome(name=run.name, state="done")
+            done[run.name] = TaskResult(name=run.name, state="done")
             continue
         _check_renders(run, plan, captures[run.scene], settings)
         stem = settings.output / "jobs" / run.name.replace("/", "__")
@@ -167,7 +172,7 @@ def _train(
         tasks.append(Task(name=run.name, command=command, output=output, environment=_environment(), after=after))
     if done:
         console.print(f"{len(done)} of {len(wanted)} runs are finished already", highlight=False)
-    outcomes = LocalExecutor(settings.jobs).run(tasks, _Teller(len(tasks), console))
+    outcomes = LocalExecutor(settings.jobs).run(tasks, _ProgressReporter(len(tasks), console))
     return done | {outcome.name: outcome for outcome in outcomes}
 
 
@@ -177,7 +182,7 @@ def _environment() -> dict[str, str]:
     return {"OMP_WAIT_POLICY": "PASSIVE", "PYTHONPATH": os.pathsep.join(path for path in paths if path)}
 
 
-class _Teller(Lines):
+class _ProgressReporter(LogListener):
     """One line when a run starts and one when it ended."""
 
     def __init__(self, total: int, console: Console):
@@ -185,15 +190,16 @@ class _Teller(Lines):
         self._left, self._total, self._console = total, total, console
 
     def started(self, task: Task, attempt: int) -> None:
-        self.say(f"started  {task.name}", "dim")
+        self.print_line(f"started  {task.name}", "dim")
 
-    def ended(self, task: Task, outcome: Outcome) -> None:
+    def ended(self, task: Task, outcome: TaskResult) -> None:
         self._left -= 1
         if outcome.state == "stopped" and not outcome.attempts:
             return
         count = f"({self._total - self._left} of {self._total})"
-        self.say(
-            f"{outcome.state:8} {task.name}  {outcome.seconds:.0f} s  {count} {outcome.why}", STYLES[outcome.state]
+        self.print_line(
+            f"{outcome.state:8} {task.name}  {outcome.seconds:.0f} s  {count} {outcome.why}",
+            STATE_STYLES[outcome.state],
         )
 
     def _print(self, text: str, style: str) -> None:
@@ -201,14 +207,14 @@ class _Teller(Lines):
         self._console.file.flush()  # also into a file that someone follows
 
 
-def _check_renders(run: PlannedRun, plan: Plan, capture: Path, settings: BenchSettings) -> None:
+def _check_renders(run: PlannedRun, plan: BenchPlan, capture: Path, settings: BenchSettings) -> None:
     """Raise VdgsError, before anything is trained, for renders by another program that cannot be measured."""
     if run.renders is not None:
         scene = next(scene for scene in plan.scenes if scene.name == run.scene)
         check_renders(run.renders, load_capture(capture, _options(scene, settings)).test_views)
 
 
-def _refuse_other_settings(settings: BenchSettings, run: PlannedRun) -> None:
+def _check_same_settings(settings: BenchSettings, run: PlannedRun) -> None:
     """Raise VdgsError, before anything is trained, if the run's folder was filled with other settings."""
     folder = RunFolder(settings.output / run.folder)
     if settings.redo or not folder.config_file.exists():
@@ -216,8 +222,8 @@ def _refuse_other_settings(settings: BenchSettings, run: PlannedRun) -> None:
     wanted, held = to_dict(run.config), folder.settings().to_dict()
     if "blocks" not in run.stages:  # no other section matters to it
         wanted = {"training": wanted["training"]}
-    before, after = ({name: counted(name, each[name]) for name in wanted} for each in (held, wanted))
-    changed = differences(before, after)
+    before, after = ({name: hashable_settings(name, each[name]) for name in wanted} for each in (held, wanted))
+    changed = diff_settings(before, after)
     if changed:
         raise VdgsError(
             f"{folder.path}: was trained with other settings:\n  "
@@ -226,17 +232,17 @@ def _refuse_other_settings(settings: BenchSettings, run: PlannedRun) -> None:
         )
 
 
-def _key(run: PlannedRun, plan: Plan, settings: BenchSettings) -> str:
+def _key(run: PlannedRun, plan: BenchPlan, settings: BenchSettings) -> str:
     """Of a run of this bench: its settings, what it is trained on and how it is measured."""
     scene = next(scene for scene in plan.scenes if scene.name == run.scene)
-    options = counted("capture", to_dict(_options(scene, settings)))
+    options = hashable_settings("capture", to_dict(_options(scene, settings)))
     of = {"options": options, "scene": dict(scene.synth or scene.contents) or scene.capture}
     return run.key(of, {"bins": settings.bins, "lpips": str(settings.lpips_weights)})
 
 
-def _job(run: PlannedRun, plan: Plan, capture: Path, key: str, settings: BenchSettings, threads: int) -> Job:
+def _job(run: PlannedRun, plan: BenchPlan, capture: Path, key: str, settings: BenchSettings, threads: int) -> BenchJob:
     scene = next(scene for scene in plan.scenes if scene.name == run.scene)
-    return Job(
+    return BenchJob(
         capture.resolve(), to_dict(_options(scene, settings)), to_dict(run.config), run.stages,
         (settings.output / run.folder).resolve(),
         None if run.coarse_from is None else (settings.output / run.coarse_from).resolve(), key,
@@ -246,38 +252,44 @@ def _job(run: PlannedRun, plan: Plan, capture: Path, key: str, settings: BenchSe
     )  # fmt: skip
 
 
-def _options(scene: Scene, settings: BenchSettings) -> CaptureOptions:
+def _options(scene: BenchScene, settings: BenchSettings) -> CaptureOptions:
     return CaptureOptions(**scene.options, validation=settings.choices.validation)
 
 
 def _is_done(output: Path, run: PlannedRun, key: str) -> bool:
     """Finished for this key. Any doubt (a damaged record) means no."""
     try:
-        record = read_json(output / run.folder / RECORD)
+        record = read_json(output / run.folder / RECORD_FILE)
     except (VdgsError, FileNotFoundError):
         return False
     return isinstance(record, dict) and record.get("state") == "done" and record.get("key") == key
 
 
 def _measure(
-    plan: Plan, captures: Mapping[str, Path], ended: Mapping[str, Outcome], settings: BenchSettings, console: Console
-) -> dict[str, Outcome]:
+    plan: BenchPlan,
+    captures: Mapping[str, Path],
+    ended: Mapping[str, TaskResult],
+    settings: BenchSettings,
+    console: Console,
+) -> dict[str, TaskResult]:
     """Groups by visibility of every finished run, scene by scene; runs that cannot be measured, as failed."""
-    failed = dict[str, Outcome]()
+    failed = dict[str, TaskResult]()
     for scene in [scene for scene in plan.scenes if scene.name in captures]:
         done = [run for run in plan.runs if run.scene == scene.name and ended[run.name].state == "done"]
         if not done:
             continue
         try:
-            seen = _seen(plan, scene, captures[scene.name], ended, settings)
+            seen = _pixel_visibility(plan, scene, captures[scene.name], ended, settings)
             if seen is None:
                 for run in done:  # what an earlier table may have left there is of another V
                     for file in (GROUPS_FILE, FRUSTA_FILE):
                         (settings.output / run.folder / file).unlink(missing_ok=True)
                 continue
-            by_frusta = seen_by_frusta(captures[scene.name], _options(scene, settings)) if seen.by == "truth" else None
+            by_frusta = (
+                visibility_from_frusta(captures[scene.name], _options(scene, settings)) if seen.by == "truth" else None
+            )
             folders = [settings.output / run.folder for run in done]
-            keys = {folder: read_json(folder / RECORD)["key"] for folder in folders}
+            keys = {folder: read_json(folder / RECORD_FILE)["key"] for folder in folders}
             with console.status(f"{scene.name}: measuring by visibility") as status:
                 for each in (seen, by_frusta) if by_frusta is not None else (seen,):
                     measure_groups(
@@ -288,41 +300,45 @@ def _measure(
                 for folder in folders:
                     (folder / FRUSTA_FILE).unlink(missing_ok=True)
         except VdgsError as error:
-            failed |= {run.name: Outcome(name=run.name, state="failed", why=str(error)) for run in done}
+            failed |= {run.name: TaskResult(name=run.name, state="failed", why=str(error)) for run in done}
     return failed
 
 
-def _seen(
-    plan: Plan, scene: Scene, capture: Path, ended: Mapping[str, Outcome], settings: BenchSettings
-) -> Seen | None:
+def _pixel_visibility(
+    plan: BenchPlan, scene: BenchScene, capture: Path, ended: Mapping[str, TaskResult], settings: BenchSettings
+) -> PixelVisibility | None:
     """By truth where the capture has it, else by a reference model; None without either."""
-    truly = seen_truly(capture, _options(scene, settings))
+    truly = visibility_from_truth(capture, _options(scene, settings))
     if truly is not None:
         return truly
     reference = plan.reference(scene.name)
     if reference is None or ended[reference.name].state != "done":
         return None
-    return seen_by_model(settings.output / reference.folder)
+    return visibility_from_model(settings.output / reference.folder)
 
 
-def _write(plan: Plan, results: list[Result], settings: BenchSettings, console: Console) -> None:
-    output, grids, lines = settings.output / plan.table.name, grids_of(plan, results), verdict(plan, results)
+def _write(plan: BenchPlan, results: list[BenchResult], settings: BenchSettings, console: Console) -> None:
+    output, grids, lines = (
+        settings.output / plan.table.name,
+        make_result_tables(plan, results),
+        check_claims(plan, results),
+    )
     output.mkdir(exist_ok=True)
     write_json(
         output / "results.json",
-        jsonable({
+        to_jsonable({
             "table": plan.table.name, "title": plan.table.title, "seeds": plan.seeds,
             "budgets": {name: vars(budget) | {"total": budget.total} for name, budget in plan.budgets.items()},
-            "choices": to_dict(settings.choices), "results": as_json(results),
+            "choices": to_dict(settings.choices), "results": results_to_json(results),
             "verdict": [vars(line) for line in lines],
         }),
     )  # fmt: skip
     text = "\n".join(map(str, lines)) or "This table asks no question."
-    drawn = draw_groups(output / "groups.png", plan, results)
-    paragraphs = notes_of(plan, results, lines, drawn)
-    write_text(output / "table.md", markdown(grids, plan.table.title, paragraphs))
-    write_text(output / "table.tex", latex(grids))
-    write_text(output / "table.csv", tidy_csv(grids))
+    drawn = plot_visibility_groups(output / "groups.png", plan, results)
+    paragraphs = make_notes(plan, results, lines, drawn)
+    write_text(output / "table.md", to_markdown(grids, plan.table.title, paragraphs))
+    write_text(output / "table.tex", to_latex(grids))
+    write_text(output / "table.csv", to_tidy_csv(grids))
     write_text(output / "verdict.txt", text + "\n")
     console.print(text, highlight=False, markup=False)
     console.print(f"tables: {output / 'table.md'} and beside it", highlight=False)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal
 
-from experiments.bench.definitions import Budget, Change
+from experiments.bench.definitions import Budget, ConfigOverride
 from vdgs.config.method import CompensationConfig, MergeConfig, MethodConfig, PartitionStrategy
 
 #: So many cameras has each block of the factorial: every camera joins its best block, and each block is topped up to
@@ -17,22 +17,22 @@ from vdgs.config.method import CompensationConfig, MergeConfig, MethodConfig, Pa
 FACTORIAL_CAMERAS = 256
 
 
-def full(config: MethodConfig, _budget: Budget) -> MethodConfig:
+def full_method(config: MethodConfig, _budget: Budget) -> MethodConfig:
     return config
 
 
-def coarse_alone(config: MethodConfig, budget: Budget) -> MethodConfig:
+def coarse_only(config: MethodConfig, budget: Budget) -> MethodConfig:
     """All iterations in the coarse stage."""
     return replace(config, training=replace(config.training, iterations=budget.total))
 
 
-def coarse_alone_averaged(config: MethodConfig, budget: Budget) -> MethodConfig:
+def coarse_only_averaged(config: MethodConfig, budget: Budget) -> MethodConfig:
     """All iterations in the coarse stage, which ends with a mean of models as blocks do."""
-    alone = coarse_alone(config, budget)
+    alone = coarse_only(config, budget)
     return replace(alone, training=replace(alone.training, average=config.block.average))
 
 
-def coarse_as_long(config: MethodConfig, budget: Budget) -> MethodConfig:
+def coarse_same_iterations(config: MethodConfig, budget: Budget) -> MethodConfig:
     """The coarse stage as long as one process takes when every block has its own: coarse + one block's iterations."""
     return replace(config, training=replace(config.training, iterations=budget.coarse + budget.per_block))
 
@@ -47,23 +47,23 @@ def without_blocking(config: MethodConfig, budget: Budget) -> MethodConfig:
     )
 
 
-def without_blocking_as_long(config: MethodConfig, budget: Budget) -> MethodConfig:
+def without_blocking_same_time(config: MethodConfig, budget: Budget) -> MethodConfig:
     """One block of the whole scene, trained as long as one of several: as much time, if those are trained at once."""
     one = without_blocking(config, budget)
     return replace(one, block=replace(one.block, iterations=budget.per_block))
 
 
-def without_anchor_generation(config: MethodConfig, _budget: Budget) -> MethodConfig:
+def without_compensation(config: MethodConfig, _budget: Budget) -> MethodConfig:
     """Blocks grow anchors as the coarse stage does."""
-    return compensated(config, enabled=False)
+    return enable_compensation(config, enabled=False)
 
 
-def growing_plainly(change: Change) -> Change:
+def disable_compensation(change: ConfigOverride) -> ConfigOverride:
     """A method without compensated growth."""
-    return lambda config, budget: without_anchor_generation(change(config, budget), budget)
+    return lambda config, budget: without_compensation(change(config, budget), budget)
 
 
-def as_printed(config: MethodConfig, _budget: Budget) -> MethodConfig:
+def as_in_paper(config: MethodConfig, _budget: Budget) -> MethodConfig:
     """What the paper says of blocks, in place of the preset's own choices: frozen decoder, every photograph used alike
     and at its full size, the coarse stage's rates again, the last model and no mean, cameras above a share of 0.45, its
     compensation. Where it is silent, as the preset `paper`."""
@@ -81,54 +81,54 @@ def as_printed(config: MethodConfig, _budget: Budget) -> MethodConfig:
     )
 
 
-def with_printed_compensation(config: MethodConfig, **values: float) -> MethodConfig:
+def with_paper_compensation(config: MethodConfig, **values: float) -> MethodConfig:
     """The paper's compensation, with other values where they are given."""
     printed = replace(CompensationConfig(), **values)  # type: ignore[arg-type]
     return replace(config, block=replace(config.block, compensation=printed))
 
 
-def in_whole_photographs(change: Change) -> Change:
+def with_full_images(change: ConfigOverride) -> ConfigOverride:
     """A method whose blocks draw whole photographs, so that each makes exactly as many iterations."""
     return lambda config, budget: change(replace(config, block=replace(config.block, crop="off")), budget)
 
 
-def with_compensation_of_sums(config: MethodConfig, _budget: Budget) -> MethodConfig:
+def with_summed_compensation(config: MethodConfig, _budget: Budget) -> MethodConfig:
     """The paper's compensation, added to the sums of gradients and not to their means."""
-    printed = with_printed_compensation(config)
-    return compensated(printed, added_to="sum")
+    printed = with_paper_compensation(config)
+    return enable_compensation(printed, added_to="sum")
 
 
-def densely(change: Change) -> Change:
+def with_dense_adam(change: ConfigOverride) -> ConfigOverride:
     """A method whose Adam moves all anchors in every step, as Scaffold-GS and 3DGS do."""
 
     def dense(config: MethodConfig, budget: Budget) -> MethodConfig:
         changed = change(config, budget)
-        return replace(changed, training=replace(changed.training, adam="dense"))
+        return replace(changed, training=replace(changed.training, optimizer="dense"))
 
     return dense
 
 
-def best_seen(change: Change) -> Change:
+def with_max_visibility_merge(change: ConfigOverride) -> ConfigOverride:
     """Blocks merged by which of them sees a place most (the paper: "based on visibility coverage")."""
     return lambda config, budget: replace(change(config, budget), merge=MergeConfig(rule="best_seen"))
 
 
-def with_longer_blocks(factor: int) -> Change:
+def with_longer_blocks(factor: int) -> ConfigOverride:
     """Blocks that train so many times as long."""
     return lambda config, budget: replace(config, block=replace(config.block, iterations=factor * budget.per_block))
 
 
-def with_block(**values: object) -> Change:
+def with_block(**values: object) -> ConfigOverride:
     """The full method with other settings of block training."""
     return lambda config, _: replace(config, block=replace(config.block, **values))  # type: ignore[arg-type]
 
 
-def with_assignment(**values: object) -> Change:
+def with_assignment(**values: object) -> ConfigOverride:
     """The full method with other settings of the assignment of cameras."""
     return lambda config, _: replace(config, assignment=replace(config.assignment, **values))  # type: ignore[arg-type]
 
 
-def in_blocks(count: int) -> Change:
+def with_block_count(count: int) -> ConfigOverride:
     """The same total of block iterations shared by `count` blocks."""
 
     def change(config: MethodConfig, budget: Budget) -> MethodConfig:
@@ -143,14 +143,14 @@ def in_blocks(count: int) -> Change:
     return change
 
 
-def times_as_many_blocks(factor: float) -> Change:
+def with_more_blocks(factor: float) -> ConfigOverride:
     """`factor` times as many blocks, each of which trains as long as one of the full method."""
     return lambda config, budget: replace(
         config, partition=replace(config.partition, blocks=max(1, round(factor * budget.blocks)))
     )
 
 
-def coarse_compensated(compensation: CompensationConfig) -> Change:
+def coarse_with_compensation(compensation: CompensationConfig) -> ConfigOverride:
     """The coarse stage alone, grown with compensation (the paper's Table III counts one block so)."""
 
     def change(config: MethodConfig, _budget: Budget) -> MethodConfig:
@@ -159,22 +159,22 @@ def coarse_compensated(compensation: CompensationConfig) -> Change:
     return change
 
 
-def factorial(lambda_vis: float, added_to: Literal["mean", "sum"] | None, t_low: float) -> Change:
+def factorial_cell(lambda_vis: float, added_to: Literal["mean", "sum"] | None, t_low: float) -> ConfigOverride:
     """One cell of the factorial: all blocks have equally many cameras, and all of compensation but `added_to` and T_low
     is the paper's."""
 
     def change(config: MethodConfig, budget: Budget) -> MethodConfig:
-        printed = with_printed_compensation(with_lambda_vis(lambda_vis)(config, budget), t_low=t_low)
+        printed = with_paper_compensation(with_lambda_vis(lambda_vis)(config, budget), t_low=t_low)
         equal = replace(printed.assignment, threshold=1.0, min_cameras=FACTORIAL_CAMERAS)
         changed = replace(printed, assignment=equal)
         if added_to is None:
-            return compensated(changed, enabled=False)
-        return compensated(changed, added_to=added_to)
+            return enable_compensation(changed, enabled=False)
+        return enable_compensation(changed, added_to=added_to)
 
     return change
 
 
-def eager(change: Change, factor: float) -> Change:
+def with_lower_threshold(change: ConfigOverride, factor: float) -> ConfigOverride:
     """A method whose blocks grow at `factor` times the threshold: where it is below 1, more anchors than plain growth,
     and so a measure of whether compensation is more than that."""
 
@@ -186,7 +186,7 @@ def eager(change: Change, factor: float) -> Change:
     return grown
 
 
-def eager_coarse(factor: float) -> Change:
+def coarse_with_lower_threshold(factor: float) -> ConfigOverride:
     """The coarse stage alone, plainly grown at `factor` times the threshold."""
 
     def change(config: MethodConfig, _budget: Budget) -> MethodConfig:
@@ -196,50 +196,50 @@ def eager_coarse(factor: float) -> Change:
     return change
 
 
-def with_lambda_vis(value: float) -> Change:
+def with_lambda_vis(value: float) -> ConfigOverride:
     return lambda config, _: replace(config, partition=replace(config.partition, lambda_vis=value))
 
 
-def with_t_low(value: float) -> Change:
+def with_t_low(value: float) -> ConfigOverride:
     """A fixed T_low, as in the paper: never the quantile that the preset `laptop` takes instead."""
-    return lambda config, _: with_printed_compensation(config, t_low=value)
+    return lambda config, _: with_paper_compensation(config, t_low=value)
 
 
-def with_beta_g(value: float) -> Change:
-    return lambda config, _: with_printed_compensation(config, beta_g=value)
+def with_beta_g(value: float) -> ConfigOverride:
+    return lambda config, _: with_paper_compensation(config, beta_g=value)
 
 
-def with_gamma(value: float) -> Change:
-    return lambda config, _: with_printed_compensation(config, gamma=value)
+def with_gamma(value: float) -> ConfigOverride:
+    return lambda config, _: with_paper_compensation(config, gamma=value)
 
 
-def with_literal_gate(config: MethodConfig, _budget: Budget) -> MethodConfig:
+def with_paper_gate(config: MethodConfig, _budget: Budget) -> MethodConfig:
     """Offsets of low visibility are judged after as many draws as the others."""
-    return compensated(config, gate="literal")
+    return enable_compensation(config, gate="literal")
 
 
-def partitioned_by(strategy: PartitionStrategy) -> Change:
+def with_partition_strategy(strategy: PartitionStrategy) -> ConfigOverride:
     """Another partition; growth is plain, since compensation is what VDGS adds."""
 
     def change(config: MethodConfig, budget: Budget) -> MethodConfig:
-        plain = without_anchor_generation(config, budget)
+        plain = without_compensation(config, budget)
         return replace(plain, partition=replace(plain.partition, strategy=strategy))
 
     return change
 
 
-def explicit_gaussians(background: Literal["mean", "black"]) -> Change:
+def explicit_gaussians(background: Literal["mean", "black"]) -> ConfigOverride:
     """3DGS, told by what it has in common with our coarse stage: iterations, seed, background and the limit of anchors
     (`explicit.gaussians_config` makes its settings of these)."""
 
     def change(config: MethodConfig, budget: Budget) -> MethodConfig:
-        alone = coarse_alone(config, budget)
+        alone = coarse_only(config, budget)
         loss = replace(alone.training.loss, background=background)
         return replace(alone, training=replace(alone.training, loss=loss))
 
     return change
 
 
-def compensated(config: MethodConfig, **values: float | bool | str) -> MethodConfig:
+def enable_compensation(config: MethodConfig, **values: float | bool | str) -> MethodConfig:
     changed: CompensationConfig = replace(config.block.compensation, **values)  # type: ignore[arg-type]
     return replace(config, block=replace(config.block, compensation=changed))

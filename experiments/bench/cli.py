@@ -1,4 +1,4 @@
-"""The verb that trains and measures methods side by side: `bench`."""
+"""The verb that trains and measures methods side by side: `bench_command`."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from vdgs.cli.common import open_console, parse
+from vdgs.cli.common import make_console, parse_arguments
 from vdgs.config.capture_options import CaptureOptions
-from vdgs.config.commands import BINS
-from vdgs.config.ranges import MANY, Range
+from vdgs.config.commands import BIN_COUNT_RANGE
+from vdgs.config.ranges import MAX_COUNT, Range
 
 TableName = Literal[
     "table1", "table2", "table3", "table3-each", "table4", "factorial", "coarse-compensation", "more-anchors",
@@ -50,9 +50,9 @@ class BenchArguments:
     """Folder that holds the scenes with names which are not generated: residence-pixsfm, copr, ..."""
     scale_iterations: Annotated[float, Range(0, 1000, above=True)] = 1.0
     """Factor on the iterations of every scene."""
-    iterations_total: Annotated[int | None, Range(1, MANY)] = None
+    iterations_total: Annotated[int | None, Range(1, MAX_COUNT)] = None
     """Iterations that every method may spend on a scene, shared out as the scene's own; overrides the factor."""
-    max_anchors: Annotated[int, Range(0, MANY)] = 0
+    max_anchors: Annotated[int, Range(0, MAX_COUNT)] = 0
     """No growth beyond this many anchors, of the scene or of all blocks together; 0 for no limit."""
     jobs: Annotated[int, Range(1, 1024)] = 1
     """Runs at once; cores are shared among them."""
@@ -60,7 +60,7 @@ class BenchArguments:
     """Allow other settings than those of the runs that are there to discard what they trained."""
     lpips_weights: Path | None = None
     """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
-    bins: Annotated[int, BINS] = 4
+    bins: Annotated[int, BIN_COUNT_RANGE] = 4
     """Number of groups by visibility."""
     quiet: bool = False
     """Print nothing but notes, warnings and errors."""
@@ -68,12 +68,12 @@ class BenchArguments:
     """How folders among --scenes are read; scenes with names have their own. --validation holds for all."""
 
 
-def bench(arguments: list[str]) -> None:
-    asked = parse(BenchArguments, arguments, "vdgs bench")
+def bench_command(arguments: list[str]) -> None:
+    asked = parse_arguments(BenchArguments, arguments, "vdgs bench")
     from experiments.bench.bench import BenchSettings, run_bench
-    from experiments.bench.plan import Choices
+    from experiments.bench.plan import PlanOptions
 
-    choices = Choices(
+    choices = PlanOptions(
         asked.seeds, asked.scenes, asked.methods, asked.scale_iterations, asked.iterations_total, asked.max_anchors,
         asked.options.validation, asked.renders, replace(asked.options, validation=False),
     )  # fmt: skip
@@ -89,5 +89,5 @@ def bench(arguments: list[str]) -> None:
             asked.redo,
             asked.known,
         ),
-        open_console(asked.quiet),
+        make_console(asked.quiet),
     )

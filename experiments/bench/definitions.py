@@ -11,10 +11,10 @@ from vdgs.config.method import MethodConfig
 from vdgs.config.presets import PRESETS, PresetName
 
 #: Stages of the run of a method, by the names that `worker.STAGES` knows.
-COARSE_ONLY = ("coarse", "evaluate")
-WITH_BLOCKS = ("coarse", "partition", "blocks", "merge", "evaluate")
-EXPLICIT = ("gaussians",)
-RENDERS = ("renders",)
+COARSE_STAGES = ("coarse", "evaluate")
+BLOCK_STAGES = ("coarse", "partition", "blocks", "merge", "evaluate")
+GS3D_STAGES = ("gaussians",)
+RENDER_STAGES = ("renders",)
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,11 @@ class Budget:
         return Budget(self.coarse, blocks, max(1, round(self.blocks * self.per_block / blocks)))
 
 
-Change = Callable[[MethodConfig, Budget], MethodConfig]
+ConfigOverride = Callable[[MethodConfig, Budget], MethodConfig]
 
 
 @dataclass(frozen=True)
-class Method:
+class BenchMethod:
     """A way to turn a capture into a model."""
 
     #: Unique; the name of its folder.
@@ -50,13 +50,13 @@ class Method:
     #: What people read.
     title: str
     #: The method's settings from those of the full method with the scene's preset and the budget.
-    change: Change
+    change: ConfigOverride
     #: Its stages in order (`worker.STAGES`).
-    stages: tuple[str, ...] = WITH_BLOCKS
+    stages: tuple[str, ...] = BLOCK_STAGES
     #: Where it was published.
-    cites: str = ""
+    citation: str = ""
     #: What of the published method is not here.
-    leaves_out: tuple[str, ...] = ()
+    omissions: tuple[str, ...] = ()
     #: What is set otherwise than published, or than for the other methods.
     differs: str = ""
     #: What it gets less than the others, where it does not spend the whole budget.
@@ -71,7 +71,7 @@ class Method:
 
 
 @dataclass(frozen=True)
-class Scene:
+class BenchScene:
     """A place to reconstruct: generated (`synth`), a folder under --data (`capture`) or any folder (`folder`)."""
 
     name: str
@@ -88,7 +88,7 @@ class Scene:
     #: CaptureOptions by name.
     options: Mapping[str, Any] = field(default_factory=dict)
     #: How the settings of the preset are adapted to the scene.
-    adapt: Callable[[MethodConfig], MethodConfig] = lambda config: config
+    override: Callable[[MethodConfig], MethodConfig] = lambda config: config
     #: Whether some parts are seen far less than others; the verdict asks other questions of even scenes.
     uneven: bool = True
     #: What people should know: where the data comes from, how its folder is laid out.
@@ -98,13 +98,11 @@ class Scene:
         """The full method on this scene with so many iterations: the scene's preset, with compensated growth, which the
         paper's method has and the preset `laptop` leaves out. `scale` is that of the budget to the scene's own: growth
         begins that much earlier or later, as in `block.scale_iterations`."""
-        config = self.adapt(PRESETS[self.preset])
+        config = self.override(PRESETS[self.preset])
         growth = config.training.growth
-        early = replace(
-            growth, statistics_from=round(scale * growth.statistics_from), start=round(scale * growth.start)
-        )
+        early = replace(growth, stats_start=round(scale * growth.stats_start), start=round(scale * growth.start))
         inner = config.block.growth
-        earlier = replace(inner, statistics_from=round(scale * inner.statistics_from), start=round(scale * inner.start))
+        earlier = replace(inner, stats_start=round(scale * inner.stats_start), start=round(scale * inner.start))
         return replace(
             config,
             training=replace(config.training, iterations=budget.coarse, seed=seed, growth=early),
@@ -119,7 +117,7 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class Group:
+class MethodGroup:
     """Methods that stand together in a table under a heading."""
 
     title: str
@@ -127,7 +125,7 @@ class Group:
 
 
 @dataclass(frozen=True)
-class Table:
+class BenchTable:
     """Methods × scenes × seeds, by name."""
 
     name: str
@@ -135,6 +133,6 @@ class Table:
     methods: tuple[str, ...]
     scenes: tuple[str, ...]
     seeds: tuple[int, ...] = (0, 1, 2)
-    groups: tuple[Group, ...] = ()
+    groups: tuple[MethodGroup, ...] = ()
     #: The method that the verdict is about.
     ours: str = "full"

@@ -10,26 +10,26 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from experiments.bench.grids import bounds_of
+from experiments.bench.grids import group_bounds
 from experiments.bench.measure import group_names
-from experiments.bench.plan import Plan
-from experiments.bench.results import Result
-from experiments.bench.statistics import Summary, summarise
-from vdgs.plots.style import ACCENT, DPI, FAINT, INK, plain, titles
+from experiments.bench.plan import BenchPlan
+from experiments.bench.results import BenchResult
+from experiments.bench.statistics import Summary, summarize
+from vdgs.plots.style import ACCENT, DPI, INK, MUTED, draw_titles, style_axes
 
 #: Colours and markers of the other methods, told apart without colour too.
-COLOURS = ("#1f6f8b", "#8ab17d", "#e0a030", "#7b5ea7", "#22262b", "#2a9d8f", "#b5838d", "#6c757d")
+METHOD_COLORS = ("#1f6f8b", "#8ab17d", "#e0a030", "#7b5ea7", "#22262b", "#2a9d8f", "#b5838d", "#6c757d")
 MARKERS = ("s", "^", "v", "D", "P", "X", "<", ">")
 #: ... and where there are more methods than colours, those of each further round by their lines and hollow markers.
 LINES = ("-", "--", ":")
 #: In the title of a panel.
-WHICH_V = {"truth": "true V", "model": "V by a coarse model"}
+VISIBILITY_LABELS = {"truth": "true V", "model": "V by a coarse model"}
 PANEL_WIDTH, PANEL_HEIGHT = 4.4, 3.6
 #: Inches in the legend: a line with its marker and the space beside it, and a letter of 9 points on average.
 HANDLE_WIDTH, LETTER_WIDTH = 0.65, 0.075
 
 
-def draw_groups(file: Path, plan: Plan, results: Sequence[Result]) -> bool:
+def plot_visibility_groups(file: Path, plan: BenchPlan, results: Sequence[BenchResult]) -> bool:
     """Write a PNG; False, and no file, where no group was measured."""
     scenes = [scene for scene in plan.scenes if any(r.groups for r in results if r.scene == scene.name)]
     if not scenes:
@@ -46,10 +46,10 @@ def draw_groups(file: Path, plan: Plan, results: Sequence[Result]) -> bool:
         axes = figure.add_axes((left / width, (0.7 + legend) / height, panel / width, PANEL_HEIGHT / height))
         _panel(axes, plan, [each for each in results if each.scene == scene.name], scene.title, index == 0)
     handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="lower left", bbox_to_anchor=(0.75 / width, 0.1 / height), ncols=columns,
+    figure.colorbar(handles, labels, loc="lower left", bbox_to_anchor=(0.75 / width, 0.1 / height), ncols=columns,
                   frameon=False, fontsize=9)  # fmt: skip
     bars = "bars: standard deviation over seeds" if len(plan.seeds) > 1 else "one seed"
-    titles(figure, plan.table.title, "PSNR by how many training cameras see the place (raw, dB)",
+    draw_titles(figure, plan.table.title, "PSNR by how many training cameras see the place (raw, dB)",
            f"the same pixels for every method; {bars}")  # fmt: skip
     canvas.print_png(file)  # type: ignore[arg-type]
     return True
@@ -60,14 +60,14 @@ def _columns(labels: Sequence[str], width: float) -> int:
     return min(3, max(1, int(width / (HANDLE_WIDTH + LETTER_WIDTH * max(map(len, labels))))))
 
 
-def _panel(axes: Axes, plan: Plan, results: Sequence[Result], title: str, first: bool) -> None:
+def _panel(axes: Axes, plan: BenchPlan, results: Sequence[BenchResult], title: str, first: bool) -> None:
     groups = max((result.groups for result in results), key=len)
     places = np.arange(len(groups), dtype=float)
     others = 0
     for index, method in enumerate(plan.methods):
         ours = method.name == plan.table.ours
-        round_, place_in_round = (0, 0) if ours else divmod(others, len(COLOURS))
-        colour, marker = (ACCENT, "o") if ours else (COLOURS[place_in_round], MARKERS[place_in_round])
+        round_, place_in_round = (0, 0) if ours else divmod(others, len(METHOD_COLORS))
+        colour, marker = (ACCENT, "o") if ours else (METHOD_COLORS[place_in_round], MARKERS[place_in_round])
         others += not ours
         summaries = [_of(results, method.name, group) for group in range(len(groups))]
         known = [(place, each) for place, each in zip(places, summaries, strict=True) if each is not None]
@@ -80,19 +80,19 @@ def _panel(axes: Axes, plan: Plan, results: Sequence[Result], title: str, first:
             label=method.title, zorder=3 if ours else 2,
         )  # fmt: skip
     names = [
-        f"{name}\nV {bounds_of(group)}"
+        f"{name}\nV {group_bounds(group)}"
         for name, group in zip(group_names(len(groups)), groups, strict=True)
     ]  # fmt: skip
     axes.set_xticks(places, [name.replace(" seen ", "\nseen ") for name in names])
     seen_by = next(result.seen_by for result in results if result.groups)
-    axes.set_title(f"{title}, {WHICH_V[seen_by]}", fontsize=10.5, color=INK, loc="left")
-    axes.grid(axis="y", color=FAINT, alpha=0.18, linewidth=0.7)
+    axes.set_title(f"{title}, {VISIBILITY_LABELS[seen_by]}", fontsize=10.5, color=INK, loc="left")
+    axes.grid(axis="y", color=MUTED, alpha=0.18, linewidth=0.7)
     if first:
         axes.set_ylabel("PSNR, dB")
     axes.margins(x=0.08, y=0.12)
-    plain(axes)
+    style_axes(axes)
     axes.tick_params(axis="x", labelsize=8)
 
 
-def _of(results: Sequence[Result], method: str, group: int) -> Summary | None:
-    return summarise(each.figures.get(f"psnr@{group}") for each in results if each.method == method)
+def _of(results: Sequence[BenchResult], method: str, group: int) -> Summary | None:
+    return summarize(each.figures.get(f"psnr@{group}") for each in results if each.method == method)

@@ -8,38 +8,38 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from experiments.bench.definitions import Budget, Scene
+from experiments.bench.definitions import BenchScene, Budget
 from experiments.bench.scenes import LAPTOP_BUDGET, SCENES
 from vdgs.captures.capture import Capture
-from vdgs.captures.capture_metadata import fingerprint
+from vdgs.captures.capture_metadata import capture_fingerprint
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
-from vdgs.config.method import MethodConfig, with_iterations
+from vdgs.config.method import MethodConfig, resolve_iterations
 from vdgs.config.presets import PRESETS
 from vdgs.errors import VdgsError
 
 #: A block is topped up to this share of the training photographs, within these limits (choice): of a few dozen, a
 #: hundred would be all.
-TOPPED_UP, LEAST_CAMERAS, MOST_CAMERAS = 1 / 8, 16, 100
+MIN_CAMERA_SHARE, MIN_CAMERAS, MAX_CAMERAS = 1 / 8, 16, 100
 
 
-def scenes_of(texts: Sequence[str], options: CaptureOptions, validation: bool) -> tuple[Scene, ...]:
+def resolve_scenes(texts: Sequence[str], options: CaptureOptions, validation: bool) -> tuple[BenchScene, ...]:
     """The scenes that names and folders stand for; `options` say how the folders are read.
 
     A known name is that scene, whatever lies in the working directory; what holds a slash, or is a folder there, is a
     capture. Raises VdgsError for anything else, for a scene named twice and for options that no folder is read with;
     CaptureError for a folder that is no capture that can be used.
     """
-    scenes: dict[str | Path, Scene] = {}
+    scenes: dict[str | Path, BenchScene] = {}
     for text in texts:
         folder = _folder(text)
         key = text if folder is None else folder.resolve()
         if key in scenes:
             raise VdgsError(f"--scenes: {text} is there twice")
         taken = {*SCENES, *(scene.name for scene in scenes.values())}
-        scenes[key] = SCENES[text] if folder is None else _scene_of(folder, options, validation, taken)
+        scenes[key] = SCENES[text] if folder is None else _scene_from_folder(folder, options, validation, taken)
     if not any(scene.folder for scene in scenes.values()):
-        changed = [f"--{name.replace('_', '-')}" for name in _changed(options)]
+        changed = [f"--{name.replace('_', '-')}" for name in _non_default_options(options)]
         if changed:
             raise VdgsError(
                 f"{', '.join(changed)}: say how a capture is read that is given as a folder (--scenes ./my-place); "
@@ -51,7 +51,7 @@ def scenes_of(texts: Sequence[str], options: CaptureOptions, validation: bool) -
 def budget_for(training_views: int) -> Budget:
     """As many coarse iterations as the preset `laptop` takes for so many photographs, and as many for all blocks
     together: that of the small real captures, in proportion."""
-    coarse = with_iterations(PRESETS["laptop"].training, training_views).iterations
+    coarse = resolve_iterations(PRESETS["laptop"].training, training_views).iterations
     return LAPTOP_BUDGET.scaled(coarse / LAPTOP_BUDGET.coarse)
 
 
@@ -67,14 +67,14 @@ def _folder(text: str) -> Path | None:
     )
 
 
-def _scene_of(folder: Path, options: CaptureOptions, validation: bool, taken: Collection[str]) -> Scene:
+def _scene_from_folder(folder: Path, options: CaptureOptions, validation: bool, taken: Collection[str]) -> BenchScene:
     capture = load_capture(folder, options)
     if validation:
         load_capture(folder, replace(options, validation=True))  # what cannot be held out is said now
     name, training = _name(folder, taken), len(capture.train_views)
-    return Scene(
-        name, name, budget_for(training), options=_changed(options), adapt=_for_photographs(training),
-        folder=folder.resolve(), contents=fingerprint(capture), note=_note(capture),
+    return BenchScene(
+        name, name, budget_for(training), options=_non_default_options(options), override=_for_photographs(training),
+        folder=folder.resolve(), contents=capture_fingerprint(capture), note=_note(capture),
     )  # fmt: skip
 
 
@@ -85,7 +85,7 @@ def _name(folder: Path, taken: Collection[str]) -> str:
     return next(each for each in (name, *numbered) if each not in taken)
 
 
-def _changed(options: CaptureOptions) -> dict[str, Any]:
+def _non_default_options(options: CaptureOptions) -> dict[str, Any]:
     """What is not as it is by default; files by their full paths, since processes read them."""
     values = {each.name: getattr(options, each.name) for each in fields(options) if each.name != "validation"}
     plain = CaptureOptions()
@@ -97,7 +97,7 @@ def _changed(options: CaptureOptions) -> dict[str, Any]:
 
 
 def _for_photographs(training: int) -> Callable[[MethodConfig], MethodConfig]:
-    cameras = min(max(round(TOPPED_UP * training), LEAST_CAMERAS), MOST_CAMERAS)
+    cameras = min(max(round(MIN_CAMERA_SHARE * training), MIN_CAMERAS), MAX_CAMERAS)
     return lambda config: replace(config, assignment=replace(config.assignment, min_cameras=cameras))
 
 

@@ -6,17 +6,17 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from experiments.bench.definitions import Group
+from experiments.bench.definitions import MethodGroup
 from experiments.bench.measure import group_names
-from experiments.bench.plan import Plan
-from experiments.bench.quoted import COLUMNS, QUOTED
-from experiments.bench.results import Result
-from experiments.bench.statistics import Mark, Summary, marks, summarise
-from vdgs.evaluation.by_visibility import bounds_of as named_bounds
+from experiments.bench.plan import BenchPlan
+from experiments.bench.quoted import METRIC_COLUMNS, PAPER_NUMBERS
+from experiments.bench.results import BenchResult
+from experiments.bench.statistics import Mark, Summary, rank_marks, summarize
+from vdgs.evaluation.by_visibility import format_bounds as named_bounds
 
 
 @dataclass(frozen=True)
-class Column:
+class TableColumn:
     """A figure: `key` of `Result.figures`, shown times `factor`; `better`: +1 higher, -1 lower, 0 neither."""
 
     title: str
@@ -28,7 +28,7 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Cell:
+class TableCell:
     """A number, or none."""
 
     summary: Summary | None
@@ -37,71 +37,75 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Row:
+class TableRow:
     """A method's numbers; a row without cells is a heading."""
 
     label: str
-    cells: tuple[Cell, ...] = ()
+    cells: tuple[TableCell, ...] = ()
 
 
 @dataclass(frozen=True)
-class Grid:
+class ResultTable:
     """A table with a name for files and machines and a title for people."""
 
     name: str
     title: str
     columns: tuple[str, ...]
-    rows: tuple[Row, ...]
+    rows: tuple[TableRow, ...]
     notes: tuple[str, ...] = ()
 
 
-QUALITY = (Column("PSNR ↑", "psnr"), Column("SSIM ↑", "ssim", 3), Column("LPIPS ↓", "lpips_vgg", 3, -1))
-CORRECTED = (
-    Column("PSNR ↑", "psnr_cc"), Column("SSIM ↑", "ssim_cc", 3), Column("LPIPS ↓", "lpips_vgg_cc", 3, -1),
-)  # fmt: skip
-NEUTRAL = Column("PSNR ↑", "psnr_neutral"), Column("SSIM ↑", "ssim_neutral", 3)
-COSTS = (
-    Column("iterations", "iterations", 0, 0),
-    Column("photographs drawn", "photographs", 0, 0),
-    Column("anchors", "anchors", 0, 0),
-    Column("Gaussians", "gaussians", 0, 0),
-    Column("blocks", "blocks", 0, 0),
-    Column("cameras a block", "cameras_per_block", 0, 0),
-    Column("training s", "seconds", 0, 0),
-    Column("longest block s", "longest_block_seconds", 0, 0),
-    Column("peak memory GB", "peak_memory_bytes", 2, 0, 1e-9),
-    Column("model MB", "model_bytes", 1, 0, 1e-6),
-    Column("frames/s", "fps", 0, 0),
+QUALITY_COLUMNS = (
+    TableColumn("PSNR ↑", "psnr"),
+    TableColumn("SSIM ↑", "ssim", 3),
+    TableColumn("LPIPS ↓", "lpips_vgg", 3, -1),
 )
-SOLIDITY = (
-    Column("opaque % ↑", "solid_share", factor=100.0),
-    Column("PSNR, own background ↑", "psnr_seen_own"),
-    Column("PSNR, black ↑", "psnr_seen_black"),
-    Column("PSNR, white ↑", "psnr_seen_white"),
-    Column("error of expected depth % ↓", "depth_error_median_expected", 2, -1, 100.0),
-    Column("error of median depth % ↓", "depth_error_median_median", 2, -1, 100.0),
-    Column("expected depth within 1 %, % ↑", "depth_within_1_percent_expected", 1, 1, 100.0),
-    Column("median depth within 1 %, % ↑", "depth_within_1_percent_median", 1, 1, 100.0),
-    Column("large splats ↓", "splats_larger_than_picture", 0, -1),
+CORRECTED_COLUMNS = (
+    TableColumn("PSNR ↑", "psnr_cc"), TableColumn("SSIM ↑", "ssim_cc", 3), TableColumn("LPIPS ↓", "lpips_vgg_cc", 3, -1),
+)  # fmt: skip
+REFERENCE_EXPOSURE_COLUMNS = TableColumn("PSNR ↑", "psnr_neutral"), TableColumn("SSIM ↑", "ssim_neutral", 3)
+COST_COLUMNS = (
+    TableColumn("iterations", "iterations", 0, 0),
+    TableColumn("photographs drawn", "photographs", 0, 0),
+    TableColumn("anchors", "anchors", 0, 0),
+    TableColumn("Gaussians", "gaussians", 0, 0),
+    TableColumn("blocks", "blocks", 0, 0),
+    TableColumn("cameras a block", "cameras_per_block", 0, 0),
+    TableColumn("training s", "seconds", 0, 0),
+    TableColumn("longest block s", "longest_block_seconds", 0, 0),
+    TableColumn("peak memory GB", "peak_memory_bytes", 2, 0, 1e-9),
+    TableColumn("model MB", "model_bytes", 1, 0, 1e-6),
+    TableColumn("frames/s", "fps", 0, 0),
+)
+COVERAGE_COLUMNS = (
+    TableColumn("opaque % ↑", "solid_share", factor=100.0),
+    TableColumn("PSNR, own background ↑", "psnr_seen_own"),
+    TableColumn("PSNR, black ↑", "psnr_seen_black"),
+    TableColumn("PSNR, white ↑", "psnr_seen_white"),
+    TableColumn("error of expected depth % ↓", "depth_error_median_expected", 2, -1, 100.0),
+    TableColumn("error of median depth % ↓", "depth_error_median_median", 2, -1, 100.0),
+    TableColumn("expected depth within 1 %, % ↑", "depth_within_1_percent_expected", 1, 1, 100.0),
+    TableColumn("median depth within 1 %, % ↑", "depth_within_1_percent_median", 1, 1, 100.0),
+    TableColumn("large splats ↓", "splats_larger_than_picture", 0, -1),
 )
 #: What makes rows comparable that are exposed and rows that are not.
-NEUTRAL_COLOURS = (
+REFERENCE_EXPOSURE_NOTE = (
     "All methods in the colours of one exposure for the whole place. Raw figures of methods that fit exposures are of "
     "views drawn as their neighbours in the flight are exposed; those of the others are the same here as there."
 )
 #: Over which pixels, and what the columns hold.
-SOLID = (
+COVERAGE_NOTE = (
     "Over the pixels whose place at least 3 training cameras hold in their frustum, as the coarse model of each run "
     "draws it. Opaque: alpha of at least 0.95. Error of depth: the median over these pixels, in percent of the camera "
     "height; what is not drawn counts as infinitely far off. Large: longer than the picture, summed over the views."
 )
 #: An anchor is no Gaussian: what the two columns of sizes hold.
-SIZES = (
+SIZE_NOTE = (
     "Gaussians: of 3DGS its own; of methods with anchors at most as many as these decode to, those without opacity "
     "included, which are not drawn. 3DGS has no anchors."
 )
 #: What V is.
-SEEN_BY = {
+VISIBILITY_SOURCE_NOTES = {
     "truth": "Training cameras that truly see the surface at a pixel, with occlusion (sky, and what none sees, belongs "
     "to no group)",
     "frusta": "Training cameras whose frustum holds the true surface at a pixel, hidden or not, as the paper counts V",
@@ -109,16 +113,21 @@ SEEN_BY = {
 }
 
 
-def grids_of(plan: Plan, results: Sequence[Result]) -> list[Grid]:
+def make_result_tables(plan: BenchPlan, results: Sequence[BenchResult]) -> list[ResultTable]:
     """Quality raw, corrected and, where views are drawn exposed, neutral over all scenes; by visibility, solidity and
     cost for each scene; the paper's own numbers."""
     across = "mean ± standard deviation over seeds" if len(plan.seeds) > 1 else "one seed"
     views = "Validation views" if plan.validation else "Test views"
     unseen = _unseen(plan, results)
     grids = [
-        _measured(plan, results, "raw", f"{views}, raw ({across})", _for_scenes(plan, QUALITY), unseen),
+        _measured(plan, results, "raw", f"{views}, raw ({across})", _for_scenes(plan, QUALITY_COLUMNS), unseen),
         _measured(
-            plan, results, "corrected", f"{views}, colour-corrected ({across})", _for_scenes(plan, CORRECTED), unseen
+            plan,
+            results,
+            "corrected",
+            f"{views}, colour-corrected ({across})",
+            _for_scenes(plan, CORRECTED_COLUMNS),
+            unseen,
         ),
         *_neutral(plan, results, f"{views}, neutral colours ({across})"),
     ]
@@ -132,23 +141,29 @@ def grids_of(plan: Plan, results: Sequence[Result]) -> list[Grid]:
         if columns:
             title = f"{scene.title}: PSNR by visibility as the paper counts it"
             grids.append(_measured(plan, mine, f"frusta-{scene.name}", title, columns, notes))
-        columns = [_for_scene(c, scene.name) for c in SOLIDITY if any(r.figures.get(c.key) is not None for r in mine)]
+        columns = [
+            _for_scene(c, scene.name) for c in COVERAGE_COLUMNS if any(r.figures.get(c.key) is not None for r in mine)
+        ]
         if columns:
             title = f"{scene.title}: solidity"
-            grids.append(_measured(plan, mine, f"solidity-{scene.name}", title, columns, (SOLID,)))
-        columns = [_for_scene(c, scene.name) for c in COSTS]
+            grids.append(_measured(plan, mine, f"solidity-{scene.name}", title, columns, (COVERAGE_NOTE,)))
+        columns = [_for_scene(c, scene.name) for c in COST_COLUMNS]
         title = f"{scene.title}: what each method got"
-        grids.append(_measured(plan, mine, f"costs-{scene.name}", title, columns, (SIZES,)))
-    quoted = _quoted(plan)
+        grids.append(_measured(plan, mine, f"costs-{scene.name}", title, columns, (SIZE_NOTE,)))
+    quoted = _paper_table(plan)
     return grids + ([quoted] if quoted else [])
 
 
-def _neutral(plan: Plan, results: Sequence[Result], title: str) -> list[Grid]:
+def _neutral(plan: BenchPlan, results: Sequence[BenchResult], title: str) -> list[ResultTable]:
     """Quality in neutral colours, of all methods; nothing where no method is measured in others."""
     if all(result.figures.get("psnr_neutral") is None for result in results):
         return []
     alike = [replace(result, figures=_in_neutral_colours(result.figures)) for result in results]
-    return [_measured(plan, alike, "neutral", title, _for_scenes(plan, NEUTRAL), (NEUTRAL_COLOURS,))]
+    return [
+        _measured(
+            plan, alike, "neutral", title, _for_scenes(plan, REFERENCE_EXPOSURE_COLUMNS), (REFERENCE_EXPOSURE_NOTE,)
+        )
+    ]
 
 
 def _in_neutral_colours(figures: Mapping[str, float | None]) -> Mapping[str, float | None]:
@@ -158,14 +173,14 @@ def _in_neutral_colours(figures: Mapping[str, float | None]) -> Mapping[str, flo
     return {**figures, "psnr_neutral": figures.get("psnr"), "ssim_neutral": figures.get("ssim")}
 
 
-def _for_scene(column: Column, scene: str) -> Column:
+def _for_scene(column: TableColumn, scene: str) -> TableColumn:
     return replace(column, scene=scene)
 
 
-def _for_scenes(plan: Plan, columns: Sequence[Column]) -> list[Column]:
+def _for_scenes(plan: BenchPlan, columns: Sequence[TableColumn]) -> list[TableColumn]:
     several = len(plan.scenes) > 1
     return [
-        Column(
+        TableColumn(
             f"{scene.title}: {c.title}" if several else c.title, c.key, c.digits, c.better, c.factor, scene.name
         )
         for scene in plan.scenes
@@ -173,7 +188,7 @@ def _for_scenes(plan: Plan, columns: Sequence[Column]) -> list[Column]:
     ]  # fmt: skip
 
 
-def _unseen(plan: Plan, results: Sequence[Result]) -> tuple[str, ...]:
+def _unseen(plan: BenchPlan, results: Sequence[BenchResult]) -> tuple[str, ...]:
     """What the figures over all pixels hold that no training camera sees, scene by scene."""
     shares = {}
     for scene in plan.scenes:
@@ -187,102 +202,108 @@ def _unseen(plan: Plan, results: Sequence[Result]) -> tuple[str, ...]:
     return (f"Over all pixels, of which no training camera sees: {said}. There every method only guesses.",)
 
 
-def _frusta_columns(results: Sequence[Result], scene: str) -> tuple[list[Column], tuple[str, ...]]:
+def _frusta_columns(results: Sequence[BenchResult], scene: str) -> tuple[list[TableColumn], tuple[str, ...]]:
     """PSNR of each group by V as frusta count it, least seen first; how the groups are bounded."""
     groups = next((result.frusta for result in results if result.frusta), ())
     if not groups:
         return [], ()
     names = group_names(len(groups))
-    columns = [Column(f"{name} ↑", f"psnr@frusta{index}", scene=scene) for index, name in enumerate(names)]
-    bounds = "; ".join(f"{name}: V {bounds_of(group)}" for name, group in zip(names, groups, strict=True))
-    return columns, (f"V: {SEEN_BY['frusta']}. Pooled over all these views: {bounds}.",)
+    columns = [TableColumn(f"{name} ↑", f"psnr@frusta{index}", scene=scene) for index, name in enumerate(names)]
+    bounds = "; ".join(f"{name}: V {group_bounds(group)}" for name, group in zip(names, groups, strict=True))
+    return columns, (f"V: {VISIBILITY_SOURCE_NOTES['frusta']}. Pooled over all these views: {bounds}.",)
 
 
-def _group_columns(results: Sequence[Result], scene: str) -> tuple[list[Column], tuple[str, ...]]:
+def _group_columns(results: Sequence[BenchResult], scene: str) -> tuple[list[TableColumn], tuple[str, ...]]:
     """PSNR of each group, least seen first, raw and corrected for the ends; how the groups are bounded."""
     of = next((result for result in results if result.groups), None)
     groups = of.groups if of else ()
     names = group_names(len(groups)) if groups else []
-    columns = [Column(f"{name} ↑", f"psnr@{index}", scene=scene) for index, name in enumerate(names)]
+    columns = [TableColumn(f"{name} ↑", f"psnr@{index}", scene=scene) for index, name in enumerate(names)]
     columns += [
-        Column(f"{names[index]}, corrected ↑", f"psnr_cc@{index}", scene=scene)
+        TableColumn(f"{names[index]}, corrected ↑", f"psnr_cc@{index}", scene=scene)
         for index in sorted({0, len(names) - 1})
         if names
     ]
     if of is None:
         return columns, ()
-    return columns, (f"V: {SEEN_BY[of.seen_by]}. Pooled over all these views: {all_bounds_of(of)}.",)
+    return columns, (f"V: {VISIBILITY_SOURCE_NOTES[of.seen_by]}. Pooled over all these views: {all_group_bounds(of)}.",)
 
 
-def all_bounds_of(result: Result) -> str:
+def all_group_bounds(result: BenchResult) -> str:
     """The V of every group of a result, least seen first."""
     names = group_names(len(result.groups))
-    return "; ".join(f"{name}: V {bounds_of(group)}" for name, group in zip(names, result.groups, strict=True))
+    return "; ".join(f"{name}: V {group_bounds(group)}" for name, group in zip(names, result.groups, strict=True))
 
 
-def bounds_of(group: Mapping[str, Any]) -> str:
+def group_bounds(group: Mapping[str, Any]) -> str:
     """Least and greatest V of a group."""
     return named_bounds(group["lower"], group["upper"])
 
 
 def _measured(
-    plan: Plan, results: Sequence[Result], name: str, title: str, columns: Sequence[Column],
+    plan: BenchPlan, results: Sequence[BenchResult], name: str, title: str, columns: Sequence[TableColumn],
     notes: tuple[str, ...] = (),
-) -> Grid:  # fmt: skip
+) -> ResultTable:  # fmt: skip
     """Rows in the order of the table's groups, marks within a group."""
     titles = {method.name: method.title for method in plan.methods}
-    rows: list[Row] = []
+    rows: list[TableRow] = []
     shown = set()
     # Methods that were asked for by name come in that order, unless the table has groups of its own.
-    headings = plan.table.groups or (Group("", tuple(titles)),)
+    headings = plan.table.groups or (MethodGroup("", tuple(titles)),)
     for group in headings:
         members = [method for method in group.methods if method in titles]
         shown |= set(members)
         rows += _rows_of_group(group.title, members, titles, results, columns)
     extra = [method for method in titles if method not in shown]
     rows += _rows_of_group("" if not rows else "others", extra, titles, results, columns) if extra else []
-    return Grid(name, title, tuple(column.title for column in columns), tuple(rows), notes)
+    return ResultTable(name, title, tuple(column.title for column in columns), tuple(rows), notes)
 
 
 def _rows_of_group(
-    title: str, methods: Sequence[str], titles: dict[str, str], results: Sequence[Result], columns: Sequence[Column]
-) -> list[Row]:
+    title: str,
+    methods: Sequence[str],
+    titles: dict[str, str],
+    results: Sequence[BenchResult],
+    columns: Sequence[TableColumn],
+) -> list[TableRow]:
     table = [[_summary(results, method, column) for column in columns] for method in methods]
     marked = [
-        marks([None if row[i] is None else row[i].mean for row in table], column.digits, column.better > 0)  # type: ignore[union-attr]
+        rank_marks([None if row[i] is None else row[i].mean for row in table], column.digits, column.better > 0)  # type: ignore[union-attr]
         if column.better
         else [""] * len(methods)
         for i, column in enumerate(columns)
     ]
-    rows = [Row(title)] if title and methods else []
+    rows = [TableRow(title)] if title and methods else []
     for place, method in enumerate(methods):
         cells = tuple(
-            Cell(table[place][i], column.digits, marked[i][place])  # type: ignore[arg-type]
+            TableCell(table[place][i], column.digits, marked[i][place])  # type: ignore[arg-type]
             for i, column in enumerate(columns)
         )  # fmt: skip
-        rows.append(Row(titles[method], cells))
+        rows.append(TableRow(titles[method], cells))
     return rows
 
 
-def _summary(results: Sequence[Result], method: str, column: Column) -> Summary | None:
-    chosen: Callable[[Result], bool] = lambda each: each.method == method and each.scene == column.scene  # noqa: E731
+def _summary(results: Sequence[BenchResult], method: str, column: TableColumn) -> Summary | None:
+    chosen: Callable[[BenchResult], bool] = lambda each: each.method == method and each.scene == column.scene  # noqa: E731
     values = [each.figures.get(column.key) for each in results if chosen(each)]
-    return summarise(None if value is None else column.factor * value for value in values)
+    return summarize(None if value is None else column.factor * value for value in values)
 
 
-def _quoted(plan: Plan) -> Grid | None:
+def _paper_table(plan: BenchPlan) -> ResultTable | None:
     """The paper's numbers for its scenes; all of them, whichever scenes were run, so that they are never mixed up."""
-    rows = QUOTED.get(plan.table.name)
+    rows = PAPER_NUMBERS.get(plan.table.name)
     if not rows:
         return None
     scenes = list(dict.fromkeys(scene for row in rows.values() for scene in row))
-    columns = tuple(f"{scene}: {name}" for scene in scenes for name in COLUMNS)
+    columns = tuple(f"{scene}: {name}" for scene in scenes for name in METRIC_COLUMNS)
     made = []
     for label, row in rows.items():
         cells = [
-            Cell(Summary(row[scene][i], None, 1), 4 if digits == 4 and i else (2 if i == 0 else 3))
-            if scene in row else Cell(None, 2)
+            TableCell(Summary(row[scene][i], None, 1), 4 if digits == 4 and i else (2 if i == 0 else 3))
+            if scene in row else TableCell(None, 2)
             for scene in scenes for i, digits in enumerate([2, 4, 4] if plan.table.name == "table4" else [2, 3, 3])
         ]  # fmt: skip
-        made.append(Row(label, tuple(cells)))
-    return Grid("quoted", "Quoted from the paper (its data, its hardware; not measured here)", columns, tuple(made))
+        made.append(TableRow(label, tuple(cells)))
+    return ResultTable(
+        "quoted", "Quoted from the paper (its data, its hardware; not measured here)", columns, tuple(made)
+    )

@@ -12,18 +12,18 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from experiments.bench.plan import Plan
-from experiments.bench.results import Result
+from experiments.bench.plan import BenchPlan
+from experiments.bench.results import BenchResult
 from vdgs.errors import VdgsError
 from vdgs.system.atomic_files import read_json
 
 
-def read_known(files: Iterable[Path]) -> dict[str, Result]:
+def read_cached_results(files: Iterable[Path]) -> dict[str, BenchResult]:
     """Key -> result of every finished run that the files tell of; of several with one key the first.
 
     Raises VdgsError for a file that cannot be read or is no results.json of a bench.
     """
-    found: dict[str, Result] = {}
+    found: dict[str, BenchResult] = {}
     for file in files:
         content = read_json(file)
         try:
@@ -39,42 +39,42 @@ def read_known(files: Iterable[Path]) -> dict[str, Result]:
     return found
 
 
-def _result(plain: Mapping[str, Any]) -> Result:
-    result = Result(**{each.name: plain[each.name] for each in fields(Result)})
+def _result(plain: Mapping[str, Any]) -> BenchResult:
+    result = BenchResult(**{each.name: plain[each.name] for each in fields(BenchResult)})
     if not result.key or not isinstance(result.figures["psnr"], float):
         raise ValueError("a run without key or figures")
     return replace(result, groups=tuple(result.groups), frusta=tuple(result.frusta))
 
 
-def left_to_train(plan: Plan, keys: Mapping[str, str], known: Mapping[str, Result]) -> Plan:
+def drop_cached_runs(plan: BenchPlan, keys: Mapping[str, str], cached: Mapping[str, BenchResult]) -> BenchPlan:
     """The plan without the runs that are known and without coarse stages that nothing else needs.
 
     `keys`: name of a run -> its key.
     """
-    runs = tuple(run for run in plan.runs if keys[run.name] not in known)
+    runs = tuple(run for run in plan.runs if keys[run.name] not in cached)
     wanted = {run.coarse_from for run in runs}
     coarse = tuple(run for run in plan.coarse if run.folder in wanted)
     scenes = tuple(scene for scene in plan.scenes if any(run.scene == scene.name for run in runs))
     return replace(plan, runs=runs, coarse=coarse, scenes=scenes)
 
 
-def on_the_same_pixels(results: Sequence[Result], known: Mapping[str, Result]) -> list[Result]:
+def match_pixel_groups(results: Sequence[BenchResult], cached: Mapping[str, BenchResult]) -> list[BenchResult]:
     """The results, known ones without their groups by visibility where these hold other pixels than those of the runs
     that were trained here (of captures without truth, a model of each bench says what its groups are)."""
-    reference: dict[str, Result] = {}
-    for each in sorted(results, key=lambda result: result.key in known):  # those trained here first
+    reference: dict[str, BenchResult] = {}
+    for each in sorted(results, key=lambda result: result.key in cached):  # those trained here first
         if each.groups:
             reference.setdefault(each.scene, each)
     return [each if _grouped_alike(each, reference.get(each.scene)) else _ungrouped(each) for each in results]
 
 
-def _grouped_alike(result: Result, reference: Result | None) -> bool:
+def _grouped_alike(result: BenchResult, reference: BenchResult | None) -> bool:
     if reference is None or not result.groups:
         return True
     return (result.seen_by, list(result.groups)) == (reference.seen_by, list(reference.groups))
 
 
-def _ungrouped(result: Result) -> Result:
+def _ungrouped(result: BenchResult) -> BenchResult:
     figures = {name: value for name, value in result.figures.items() if "@" not in name}
     why = "Its groups by visibility are of other pixels than those of the runs here: it has none in this table."
     return replace(result, figures=figures, groups=(), frusta=(), why=why)

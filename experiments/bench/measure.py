@@ -15,16 +15,16 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from experiments.bench.seen import Seen
-from experiments.bench.worker import RECORD
+from experiments.bench.seen import PixelVisibility
+from experiments.bench.worker import RECORD_FILE
 from vdgs.captures.image_cache import ImageCache
 from vdgs.errors import VdgsError
 from vdgs.evaluation import metrics
 from vdgs.evaluation.by_visibility import VisibilityHistogram
-from vdgs.evaluation.color_correction import correct_colours
-from vdgs.evaluation.evaluate_run import EVALUATION_IMAGES_BYTES
-from vdgs.evaluation.image_io import file_stems
-from vdgs.system.atomic_files import jsonable, read_json, write_json
+from vdgs.evaluation.color_correction import correct_colors
+from vdgs.evaluation.evaluate_run import IMAGE_CACHE_BYTES
+from vdgs.evaluation.image_io import unique_file_stems
+from vdgs.system.atomic_files import read_json, to_jsonable, write_json
 
 #: In a run folder: its figures by visibility, and the V and the key of the run that they hold for.
 GROUPS_FILE = "by_visibility.json"
@@ -33,47 +33,55 @@ FRUSTA_FILE = "by_frusta.json"
 NAMES = ("squared_error", "ssim", "squared_error_cc", "ssim_cc")
 
 
-def evaluated(run: Path) -> Path:
+def final_evaluation_folder(run: Path) -> Path:
     """Where the figures of a run's final model are: the merged one, or the coarse one of a run without blocks."""
     merged = run / "evaluation"
     return merged if (merged / "metrics.json").exists() else run / "coarse" / "evaluation"
 
 
-def measure_groups(seen: Seen, runs: Mapping[Path, str], bins: int, tell: Callable[[str], None]) -> None:
+def measure_groups(
+    visibility: PixelVisibility, runs: Mapping[Path, str], bins: int, on_progress: Callable[[str], None]
+) -> None:
     """Write GROUPS_FILE (of V by frusta FRUSTA_FILE) into every run of a scene that has none for this V and its key.
 
     `runs`: folder -> key. The test views are read once for all. Raises VdgsError where a picture is missing.
     """
-    file = FRUSTA_FILE if seen.by == "frusta" else GROUPS_FILE
-    of = {"seen_by": seen.by, "seen": seen.identity, "bins": bins, "whole_cameras": True, "tells_unseen": True}
+    file = FRUSTA_FILE if visibility.by == "frusta" else GROUPS_FILE
+    of = {
+        "seen_by": visibility.by,
+        "seen": visibility.identity,
+        "bins": bins,
+        "whole_cameras": True,
+        "tells_unseen": True,
+    }
     wanted = {folder: of | {"run": key} for folder, key in runs.items()}
     left = [folder for folder, record in wanted.items() if not _is_measured(folder / file, record)]
     if not left:
         return
-    views = seen.capture.test_views
-    stems = file_stems([view.name for view in views])
+    views = visibility.capture.test_views
+    stems = unique_file_stems([view.name for view in views])
     histograms = {folder: VisibilityHistogram(NAMES) for folder in left}
     unseen, pixels = 0, 0
-    with ImageCache(views, EVALUATION_IMAGES_BYTES) as images:
+    with ImageCache(views, IMAGE_CACHE_BYTES) as images:
         for index, view in enumerate(views):
-            tell(f"test view {index + 1} of {len(views)}")
-            photograph, views_of_pixels = images.get(index), seen.visibility_map(view.camera)
+            on_progress(f"test view {index + 1} of {len(views)}")
+            photograph, views_of_pixels = images.get(index), visibility.visibility_map(view.camera)
             mask = None if photograph.mask is None else photograph.mask.numpy() > 0
             kept = np.ones(views_of_pixels.shape, bool) if mask is None else mask
-            unseen, pixels = unseen + int((seen.unseen(view.camera) & kept).sum()), pixels + int(kept.sum())
+            unseen, pixels = unseen + int((visibility.unseen(view.camera) & kept).sum()), pixels + int(kept.sum())
             for folder in left:
-                picture = _read_picture(evaluated(folder) / "renders" / f"{stems[index]}.png", folder)
+                picture = _read_picture(final_evaluation_folder(folder) / "renders" / f"{stems[index]}.png", folder)
                 histograms[folder].add(views_of_pixels, pixel_values(picture, photograph.image.numpy(), mask), mask)
     for folder in left:
         found = {"groups": histograms[folder].bins(bins), "unseen_share": unseen / max(pixels, 1)}
-        write_json(folder / file, jsonable(wanted[folder] | found))
+        write_json(folder / file, to_jsonable(wanted[folder] | found))
 
 
 def pixel_values(
     picture: UInt8[np.ndarray, "h w 3"], photograph: UInt8[np.ndarray, "h w 3"], mask: np.ndarray | None
 ) -> dict[str, np.ndarray]:
     """Squared error and SSIM at every pixel [h, w], raw and after the colour correction."""
-    corrected = metrics.to_8bit(correct_colours(picture, photograph, mask).image)
+    corrected = metrics.to_8bit(correct_colors(picture, photograph, mask).image)
     return {
         "squared_error": metrics.squared_error(picture, photograph),
         "ssim": metrics.ssim_map(picture, photograph, mask),
@@ -103,7 +111,7 @@ def _read_picture(path: Path, run: Path) -> UInt8[np.ndarray, "h w 3"]:
     picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if picture is None:
         raise VdgsError(
-            f"{path}: the rendered test view is missing or damaged. Delete {run / RECORD} and give the same command: "
+            f"{path}: the rendered test view is missing or damaged. Delete {run / RECORD_FILE} and give the same command: "
             "the run is then only measured again."
         )
     return np.ascontiguousarray(picture[..., ::-1])

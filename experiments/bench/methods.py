@@ -9,41 +9,41 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal
 
-from experiments.baselines.gs3d.schedule import LEAST_INTERVAL, PUBLISHED_ITERATIONS
+from experiments.baselines.gs3d.schedule import MIN_INTERVAL, PUBLISHED_ITERATIONS
 from experiments.bench.changes import (
     FACTORIAL_CAMERAS,
-    as_printed,
-    best_seen,
-    coarse_alone,
-    coarse_alone_averaged,
-    coarse_as_long,
-    coarse_compensated,
-    densely,
-    eager,
-    eager_coarse,
+    as_in_paper,
+    coarse_only,
+    coarse_only_averaged,
+    coarse_same_iterations,
+    coarse_with_compensation,
+    coarse_with_lower_threshold,
+    disable_compensation,
     explicit_gaussians,
-    factorial,
-    full,
-    growing_plainly,
-    in_blocks,
-    in_whole_photographs,
-    partitioned_by,
-    times_as_many_blocks,
+    factorial_cell,
+    full_method,
     with_assignment,
     with_beta_g,
     with_block,
-    with_compensation_of_sums,
+    with_block_count,
+    with_dense_adam,
+    with_full_images,
     with_gamma,
     with_lambda_vis,
-    with_literal_gate,
     with_longer_blocks,
-    with_printed_compensation,
+    with_lower_threshold,
+    with_max_visibility_merge,
+    with_more_blocks,
+    with_paper_compensation,
+    with_paper_gate,
+    with_partition_strategy,
+    with_summed_compensation,
     with_t_low,
-    without_anchor_generation,
     without_blocking,
-    without_blocking_as_long,
+    without_blocking_same_time,
+    without_compensation,
 )
-from experiments.bench.definitions import COARSE_ONLY, EXPLICIT, Change, Method
+from experiments.bench.definitions import COARSE_STAGES, GS3D_STAGES, BenchMethod, ConfigOverride
 from vdgs.config.method import CompensationConfig
 
 LAMBDA_VIS = (0.0, 0.5, 1.0, 1.3)
@@ -58,10 +58,10 @@ FACTORIAL_ADDED: tuple[Literal["mean", "sum"] | None, ...] = (None, "mean", "sum
 
 
 def _sweep(
-    prefix: str, symbol: str, values: tuple[float, ...], change: Callable[[float], Change], differs: str
-) -> list[Method]:
+    prefix: str, symbol: str, values: tuple[float, ...], change: Callable[[float], ConfigOverride], differs: str
+) -> list[BenchMethod]:
     return [
-        Method(f"{prefix}-{value:g}", f"{symbol} = {value:g}", in_whole_photographs(change(value)), differs=differs)
+        BenchMethod(f"{prefix}-{value:g}", f"{symbol} = {value:g}", with_full_images(change(value)), differs=differs)
         for value in values
     ]
 
@@ -83,106 +83,114 @@ _3DGS_LEAVES_OUT = (
 _3DGS_SCHEDULE = (
     f"its schedule of {PUBLISHED_ITERATIONS:,} iterations (warm-up, degree of colour, start and interval of density "
     "control, resets of opacity) moves in proportion to the total here, but neither decides nor resets more "
-    f"often than every {LEAST_INTERVAL} iterations"
+    f"often than every {MIN_INTERVAL} iterations"
 )
 _ABLATIONS = [
-    Method("full", "VDGS (full)", full, cites="VDGS, sections IV-B and IV-C"),
-    Method("baseline", "baseline: coarse alone", coarse_alone, COARSE_ONLY, cites="VDGS, Table II (a)"),
-    Method(
+    BenchMethod("full", "VDGS (full)", full_method, citation="VDGS, sections IV-B and IV-C"),
+    BenchMethod("baseline", "baseline: coarse alone", coarse_only, COARSE_STAGES, citation="VDGS, Table II (a)"),
+    BenchMethod(
         "baseline-mean",
         "baseline with a mean of models",
-        coarse_alone_averaged,
-        COARSE_ONLY,
-        differs="ends as the blocks of `full` do: with a mean of models, where they have one",
+        coarse_only_averaged,
+        COARSE_STAGES,
+        differs="ends as the blocks of `full_method` do: with a mean of models, where they have one",
     ),
-    Method("coarse", "coarse stage, as blocks begin", full, COARSE_ONLY, less="iterations of the coarse stage only"),
-    Method(
+    BenchMethod(
+        "coarse",
+        "coarse stage, as blocks begin",
+        full_method,
+        COARSE_STAGES,
+        less="iterations of the coarse stage only",
+    ),
+    BenchMethod(
         "coarse-as-long",
         "coarse alone, as long as one block",
-        coarse_as_long,
-        COARSE_ONLY,
-        differs="ends with its last model; the blocks of `full` with a mean of models, where the preset says so",
+        coarse_same_iterations,
+        COARSE_STAGES,
+        differs="ends with its last model; the blocks of `full_method` with a mean of models, where the preset says so",
         less="iterations of the coarse stage and one block: as much time, if all blocks are trained at once",
     ),
-    Method(
+    BenchMethod(
         "printed",
         "VDGS, blocks as printed",
-        as_printed,
-        cites="VDGS, sections IV-B and IV-C",
+        as_in_paper,
+        citation="VDGS, sections IV-B and IV-C",
         differs="blocks of the paper: frozen decoder, even use of photographs, the coarse stage's rates again, full "
         "size, no mean of models, whole photographs, share of 0.45, its compensation; growth, coarse stage and cut as "
-        "`full`; where the paper is silent, the choices of the preset `paper`",
+        "`full_method`; where the paper is silent, the choices of the preset `paper`",
     ),
-    Method("whole-photographs", "VDGS (full), whole photographs", in_whole_photographs(full)),
-    Method("no-blocking", "w/o blocking", without_blocking, cites="VDGS, Table II (b)"),
-    Method(
+    BenchMethod("whole-photographs", "VDGS (full), whole photographs", with_full_images(full_method)),
+    BenchMethod("no-blocking", "w/o blocking", without_blocking, citation="VDGS, Table II (b)"),
+    BenchMethod(
         "no-blocking-as-long",
         "w/o blocking, as long as one block",
-        without_blocking_as_long,
+        without_blocking_same_time,
         less="photographs of the coarse stage and one block: as much time, if all blocks are trained at once",
     ),
-    Method("no-blocking-plain", "w/o blocking nor anchor generation", growing_plainly(without_blocking)),
-    Method(
+    BenchMethod("no-blocking-plain", "w/o blocking nor anchor generation", disable_compensation(without_blocking)),
+    BenchMethod(
         "no-blocking-as-long-plain",
         "w/o blocking nor anchor generation, as long as one block",
-        growing_plainly(without_blocking_as_long),
+        disable_compensation(without_blocking_same_time),
         differs="to be read against `no-anchor-generation`",
         less="photographs of the coarse stage and one block: as much time, if all blocks are trained at once",
     ),
-    Method("no-anchor-generation", "w/o anchor generation", without_anchor_generation, cites="VDGS, Table II (c)"),
+    BenchMethod("no-anchor-generation", "w/o anchor generation", without_compensation, citation="VDGS, Table II (c)"),
 ]
 _OTHERS = [
-    Method(
-        "3dgs", "3DGS", explicit_gaussians("mean"), EXPLICIT, cites=_3DGS, leaves_out=_3DGS_LEAVES_OUT,
+    BenchMethod(
+        "3dgs", "3DGS", explicit_gaussians("mean"), GS3D_STAGES, citation=_3DGS, omissions=_3DGS_LEAVES_OUT,
         differs=f"background of the mean colour of the photographs, as ours; {_3DGS_SCHEDULE}",
     ),
-    Method(
-        "3dgs-black", "3DGS, black background", explicit_gaussians("black"), EXPLICIT, cites=_3DGS,
-        leaves_out=_3DGS_LEAVES_OUT, differs=f"background black, as published; {_3DGS_SCHEDULE}",
+    BenchMethod(
+        "3dgs-black", "3DGS, black background", explicit_gaussians("black"), GS3D_STAGES, citation=_3DGS,
+        omissions=_3DGS_LEAVES_OUT, differs=f"background black, as published; {_3DGS_SCHEDULE}",
     ),
-    Method(
-        "scaffold-gs", "Scaffold-GS", densely(coarse_alone), COARSE_ONLY,
-        cites="Lu et al., Scaffold-GS: Structured 3D Gaussians for View-Adaptive Rendering, CVPR 2024",
-        leaves_out=("its starts, background, rates and volume weight: they are those of our coarse stage",),
+    BenchMethod(
+        "scaffold-gs", "Scaffold-GS", with_dense_adam(coarse_only), COARSE_STAGES,
+        citation="Lu et al., Scaffold-GS: Structured 3D Gaussians for View-Adaptive Rendering, CVPR 2024",
+        omissions=("its starts, background, rates and volume weight: they are those of our coarse stage",),
         differs="its dense Adam; `baseline` is the same with ours, which moves only what a photograph shows",
     ),
-    Method(
-        "vastgaussian", "VastGaussian partition", partitioned_by("vastgaussian"),
-        cites="Lin et al., VastGaussian: Vast 3D Gaussians for Large Scene Reconstruction, CVPR 2024",
-        leaves_out=_COMMON,
+    BenchMethod(
+        "vastgaussian", "VastGaussian partition", with_partition_strategy("vastgaussian"),
+        citation="Lin et al., VastGaussian: Vast 3D Gaussians for Large Scene Reconstruction, CVPR 2024",
+        omissions=_COMMON,
     ),
-    Method(
-        "citygaussian", "CityGaussian partition", partitioned_by("citygaussian"),
-        cites="Liu et al., CityGaussian: Real-time High-quality Large-Scale Scene Rendering with Gaussians, ECCV 2024",
-        leaves_out=_COMMON,
+    BenchMethod(
+        "citygaussian", "CityGaussian partition", with_partition_strategy("citygaussian"),
+        citation="Liu et al., CityGaussian: Real-time High-quality Large-Scale Scene Rendering with Gaussians, ECCV 2024",
+        omissions=_COMMON,
     ),
-    Method(
-        "dogs", "DOGS partition", partitioned_by("dogs"),
-        cites="Chen and Lee, DOGS: Distributed-Oriented Gaussian Splatting via Gaussian Consensus, NeurIPS 2024",
-        leaves_out=_COMMON,
+    BenchMethod(
+        "dogs", "DOGS partition", with_partition_strategy("dogs"),
+        citation="Chen and Lee, DOGS: Distributed-Oriented Gaussian Splatting via Gaussian Consensus, NeurIPS 2024",
+        omissions=_COMMON,
     ),
 ]  # fmt: skip
-_BLOCKS = [Method(f"blocks-{count}", f"{count} block{'s' * (count > 1)}", in_blocks(count)) for count in BLOCKS]
+_BLOCKS = [
+    BenchMethod(f"blocks-{count}", f"{count} block{'s' * (count > 1)}", with_block_count(count)) for count in BLOCKS
+]
 #: Plain growth: after few steps compensated growth costs one block more than several (reports/findings.md).
 _EACH_AS_LONG = [
-    Method(
+    BenchMethod(
         "each-half", "half as many blocks, each as long, w/o anchor generation",
-        growing_plainly(times_as_many_blocks(0.5)), less="iterations: of blocks half as many",
+        disable_compensation(with_more_blocks(0.5)), less="iterations: of blocks half as many",
     ),
     *(
-        Method(
+        BenchMethod(
             f"each-{factor}-times", f"{factor} times as many blocks, each as long, w/o anchor generation",
-            growing_plainly(times_as_many_blocks(factor)), more=f"iterations: of blocks {factor} times as many",
+            disable_compensation(with_more_blocks(factor)), more=f"iterations: of blocks {factor} times as many",
         )
         for factor in (2, 4)
     ),
 ]  # fmt: skip
 _COARSE_COMPENSATED = [
-    Method(
+    BenchMethod(
         f"coarse-compensated-{added_to}",
         f"coarse stage, compensation as printed, {added_to}s",
-        coarse_compensated(CompensationConfig(added_to=added_to)),
-        COARSE_ONLY,
+        coarse_with_compensation(CompensationConfig(added_to=added_to)),
+        COARSE_STAGES,
         less="iterations of the coarse stage only",
         differs=f"to be read against `coarse`; {_GATE}",
     )
@@ -190,83 +198,83 @@ _COARSE_COMPENSATED = [
 ]
 #: What compensation is made of: g, and the lower gate for what few cameras see, which is our choice.
 _COARSE_PARTS = [
-    Method(
+    BenchMethod(
         "coarse-compensated-literal-gate", "coarse stage, compensation of means, gate as for all",
-        coarse_compensated(CompensationConfig(gate="literal")), COARSE_ONLY,
+        coarse_with_compensation(CompensationConfig(gate="literal")), COARSE_STAGES,
         less="iterations of the coarse stage only", differs="to be read against `coarse-compensated-mean`",
     ),
-    Method(
+    BenchMethod(
         "coarse-lower-gate", "coarse stage, lower gate where few cameras look, g = 0",
-        coarse_compensated(CompensationConfig(beta_g=1e-9)), COARSE_ONLY,
+        coarse_with_compensation(CompensationConfig(beta_g=1e-9)), COARSE_STAGES,
         less="iterations of the coarse stage only", differs="to be read against `coarse`; g is a billionth, since "
         "the gate is lower only where g is above 0",
     ),
 ]  # fmt: skip
 _LONGER = [
-    Method(
+    BenchMethod(
         f"longer-{factor}", f"VDGS (full), blocks {factor} times as long", with_longer_blocks(factor),
         more=f"iterations: {factor} times as many for blocks",
     )
     for factor in (2, 4)
 ]  # fmt: skip
 _CHOICES = [
-    Method("frozen-decoder", "frozen decoder", with_block(decoder="frozen")),
-    Method("even-sampling", "photographs used alike", with_block(sampling="even")),
-    Method("by-votes", "photographs by votes", with_block(sampling="shares")),
-    Method("share-0.45", "cameras above a share of 0.45", with_assignment(threshold=0.45)),
-    Method(
+    BenchMethod("frozen-decoder", "frozen decoder", with_block(decoder="frozen")),
+    BenchMethod("even-sampling", "photographs used alike", with_block(sampling="even")),
+    BenchMethod("by-votes", "photographs by votes", with_block(sampling="shares")),
+    BenchMethod("share-0.45", "cameras above a share of 0.45", with_assignment(threshold=0.45)),
+    BenchMethod(
         "literal-assignment", "eq. 7 as printed", with_assignment(mode="literal", threshold=0.45),
         differs="eq. 7 with its threshold of 0.45: to be read against `share-0.45`",
     ),
-    Method("leave-one-out", "cameras by leave-one-out", with_assignment(mode="leave_one_out")),
-    Method(
+    BenchMethod("leave-one-out", "cameras by leave-one-out", with_assignment(mode="leave_one_out")),
+    BenchMethod(
         "frustum", "cameras by frusta", with_assignment(mode="frustum"),
         differs="the share is one of the block's anchors, not of pixels",
     ),
-    Method(
+    BenchMethod(
         "printed-rates", "the coarse stage's rates again",
         with_block(offset_rate=1.0, scale_rate=1.0, feature_rate=1.0),
     ),
-    Method(
+    BenchMethod(
         "damped-rates", "damped rates", with_block(offset_rate=0.4, scale_rate=0.8, feature_rate=1.0),
         differs="0.4 and 0.8 times the coarse stage's rates of offsets and scales, with which CityGaussian fine-tunes",
     ),
-    Method(
+    BenchMethod(
         "printed-damped", "blocks as printed, damped rates",
-        lambda config, budget: with_block(offset_rate=0.4, scale_rate=0.8)(as_printed(config, budget), budget),
+        lambda config, budget: with_block(offset_rate=0.4, scale_rate=0.8)(as_in_paper(config, budget), budget),
         differs="`printed` with the rates of `damped-rates`: what earlier versions took for printed",
     ),
-    Method("dense-adam", "dense Adam", densely(full), differs="in the coarse stage and in blocks"),
-    Method(
-        "compensation-of-sums", "compensation as printed, of sums", with_compensation_of_sums,
+    BenchMethod("dense-adam", "dense Adam", with_dense_adam(full_method), differs="in the coarse stage and in blocks"),
+    BenchMethod(
+        "compensation-of-sums", "compensation as printed, of sums", with_summed_compensation,
         differs=f"T_low = 0.20, β_g = 2, γ = 0.9; {_GATE}; g is added to the sums of gradients",
     ),
-    Method("half-size", "photographs halved at first", with_block(resolutions=((0.0, 2), (0.3, 1)))),
-    Method("last-model", "the last model, no mean", with_block(average=0.0)),
-    Method(
-        "printed-compensation", "compensation as printed", lambda config, _: with_printed_compensation(config),
+    BenchMethod("half-size", "photographs halved at first", with_block(resolutions=((0.0, 2), (0.3, 1)))),
+    BenchMethod("last-model", "the last model, no mean", with_block(average=0.0)),
+    BenchMethod(
+        "printed-compensation", "compensation as printed", lambda config, _: with_paper_compensation(config),
         differs=f"T_low = 0.20, β_g = 2, γ = 0.9; {_GATE}",
     ),
-    Method("no-context", "without context", with_block(context=False)),
-    Method("free-ring", "free ring", with_block(ring="free")),
-    Method(
-        "free-best-seen", "free ring, merged by best seen", best_seen(with_block(ring="free")),
+    BenchMethod("no-context", "without context", with_block(context=False)),
+    BenchMethod("free-ring", "free ring", with_block(ring="free")),
+    BenchMethod(
+        "free-best-seen", "free ring, merged by best seen", with_max_visibility_merge(with_block(ring="free")),
         differs="to be read against `free-ring`",
     ),
-    Method(
+    BenchMethod(
         "ramp", "ramp ring, frozen decoder", with_block(ring="ramp", decoder="frozen"),
         differs="to be read against `frozen-decoder`: a ramp needs one",
     ),
-    Method(
+    BenchMethod(
         "ramp-best-seen", "ramp ring, frozen decoder, merged by best seen",
-        best_seen(with_block(ring="ramp", decoder="frozen")), differs="to be read against `ramp`",
+        with_max_visibility_merge(with_block(ring="ramp", decoder="frozen")), differs="to be read against `ramp`",
     ),
-    Method("literal-gate", "literal gate", with_literal_gate),
+    BenchMethod("literal-gate", "literal gate", with_paper_gate),
 ]  # fmt: skip
 _WHOLE = "whole photographs"
 _AS_PRINTED = f"{_WHOLE}; all other settings of compensation are the paper's"
 _SWEEPS = [
-    Method("plain-growth", "no compensation", in_whole_photographs(without_anchor_generation), differs=_WHOLE),
+    BenchMethod("plain-growth", "no compensation", with_full_images(without_compensation), differs=_WHOLE),
     *_sweep("lambda-vis", "λ_vis", LAMBDA_VIS, with_lambda_vis, _WHOLE),
     *_sweep("t-low", "T_low", T_LOW, with_t_low, _AS_PRINTED),
     *_sweep("beta-g", "β_g", BETA_G, with_beta_g, _AS_PRINTED),
@@ -274,11 +282,11 @@ _SWEEPS = [
 ]
 
 
-def _cell(lambda_vis: float, added_to: Literal["mean", "sum"] | None, t_low: float) -> Method:
+def _cell(lambda_vis: float, added_to: Literal["mean", "sum"] | None, t_low: float) -> BenchMethod:
     name = f"cell-{lambda_vis:g}-" + ("off" if added_to is None else f"{added_to}-{t_low:g}")
     grown = "plain growth" if added_to is None else f"compensation of {added_to}s, T_low = {t_low:g}"
-    return Method(
-        name, f"λ_vis = {lambda_vis:g}, {grown}", factorial(lambda_vis, added_to, t_low),
+    return BenchMethod(
+        name, f"λ_vis = {lambda_vis:g}, {grown}", factorial_cell(lambda_vis, added_to, t_low),
         differs=f"each block has {FACTORIAL_CAMERAS} cameras: those whose best block it is, and those that show it "
         f"best besides; β_g = 2, γ = 0.9; {_GATE}",
     )  # fmt: skip
@@ -292,30 +300,30 @@ _FACTORIAL = [
 ]
 
 #: Of the threshold of growth: whether compensated growth is more than that.
-EAGER = (0.5, 0.25)
+LOWER_THRESHOLDS = (0.5, 0.25)
 _EAGER = [
     *(
-        Method(
+        BenchMethod(
             f"coarse-threshold-{factor:g}", f"coarse stage, plain growth at {factor:g} of the threshold",
-            eager_coarse(factor), COARSE_ONLY, less="iterations of the coarse stage only",
+            coarse_with_lower_threshold(factor), COARSE_STAGES, less="iterations of the coarse stage only",
             differs="to be read against `coarse`",
         )
-        for factor in EAGER
+        for factor in LOWER_THRESHOLDS
     ),
     *(
-        Method(
+        BenchMethod(
             f"cell-1-threshold-{factor:g}", f"λ_vis = 1, plain growth at {factor:g} of the threshold",
-            eager(factorial(1.0, None, FACTORIAL_T_LOW[0]), factor),
+            with_lower_threshold(factorial_cell(1.0, None, FACTORIAL_T_LOW[0]), factor),
             differs=f"each block has {FACTORIAL_CAMERAS} cameras: read it against `cell-1-off`",
         )
-        for factor in EAGER
+        for factor in LOWER_THRESHOLDS
     ),
 ]  # fmt: skip
 
 #: The cells of the factorial.
 FACTORIAL = tuple(method.name for method in _FACTORIAL)
 #: Every method by name.
-METHODS: dict[str, Method] = {
+METHODS: dict[str, BenchMethod] = {
     method.name: method
     for group in (
         _ABLATIONS, _OTHERS, _BLOCKS, _EACH_AS_LONG, _COARSE_COMPENSATED, _COARSE_PARTS, _LONGER, _CHOICES, _SWEEPS,

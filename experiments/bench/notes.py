@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from experiments.bench.definitions import Method
-from experiments.bench.grids import SEEN_BY, all_bounds_of
-from experiments.bench.plan import Plan
-from experiments.bench.quoted import CONTRADICTIONS, EFFICIENCY, QUOTED
-from experiments.bench.results import Result
-from experiments.bench.verdict import Line
+from experiments.bench.definitions import BenchMethod
+from experiments.bench.grids import VISIBILITY_SOURCE_NOTES, all_group_bounds
+from experiments.bench.plan import BenchPlan
+from experiments.bench.quoted import PAPER_CONTRADICTIONS, PAPER_EFFICIENCY, PAPER_NUMBERS
+from experiments.bench.results import BenchResult
+from experiments.bench.verdict import ClaimCheck
 from experiments.bench.writing import escape_markdown as plain
 from vdgs.partition.strategies import STRATEGIES
 
 
-def notes_of(plan: Plan, results: Sequence[Result], lines: Sequence[Line], figure: bool) -> list[str]:
+def make_notes(plan: BenchPlan, results: Sequence[BenchResult], lines: Sequence[ClaimCheck], figure: bool) -> list[str]:
     """Verdict, figure, fairness, failures, sources, scenes, and the paper's contradictions."""
     parts = []
     if lines:
@@ -26,13 +26,13 @@ def notes_of(plan: Plan, results: Sequence[Result], lines: Sequence[Line], figur
     lost = [each for each in results if each.state != "done" or each.why]
     said = [f"{each.method} on {each.scene}, seed {each.seed}: {each.state}. {each.why}" for each in lost]
     parts.append(_list("Missing", [*said, *_not_rendered(plan)]))
-    parts.append(_list("Where the figures are from", _origins(results)))
+    parts.append(_list("Where the figures are from", _provenance_notes(results)))
     parts.append(_list("Methods", map(_method, plan.methods)))
     parts.append(_list("Scenes", [f"{scene.title}: {scene.note}" for scene in plan.scenes if scene.note]))
-    if plan.table.name in QUOTED:
-        parts.append(_list("The paper's own numbers", CONTRADICTIONS))
+    if plan.table.name in PAPER_NUMBERS:
+        parts.append(_list("The paper's own numbers", PAPER_CONTRADICTIONS))
     if plan.table.name == "efficiency":
-        parts.append(_list("Quoted from the paper", EFFICIENCY))
+        parts.append(_list("Quoted from the paper", PAPER_EFFICIENCY))
     return [part for part in parts if part]
 
 
@@ -43,7 +43,7 @@ _PARTS = (
 )
 
 
-def _not_rendered(plan: Plan) -> list[str]:
+def _not_rendered(plan: BenchPlan) -> list[str]:
     """For which scenes and seeds another program left no renders, while it did for others."""
     return [
         f"{method.title} on {scene.title}: no renders for seed {', '.join(map(str, seeds))}."
@@ -54,7 +54,7 @@ def _not_rendered(plan: Plan) -> list[str]:
     ]
 
 
-def _fairness(plan: Plan) -> str:
+def _fairness(plan: BenchPlan) -> str:
     said = [
         "Same photographs, sparse points, split and total of iterations for all methods of a scene, but for rows of "
         "which it is said below that they get less or more; where a cut gives fewer blocks than asked for, a method "
@@ -79,7 +79,7 @@ def _fairness(plan: Plan) -> str:
     return _list("What each method got", said)
 
 
-def _limit(plan: Plan) -> str:
+def _limit(plan: BenchPlan) -> str:
     """--max-anchors, for methods with anchors and for 3DGS."""
     per_anchor = plan.runs[0].config.training.anchors.offsets
     return (
@@ -89,17 +89,17 @@ def _limit(plan: Plan) -> str:
     )
 
 
-def _groups(plan: Plan, results: Sequence[Result]) -> list[str]:
+def _groups(plan: BenchPlan, results: Sequence[BenchResult]) -> list[str]:
     """What V of each scene is, and the V of each group."""
     said = ["The same pixels for all methods and seeds; equal V is never split, so groups may differ in size."]
     for scene in plan.scenes:
         of = next((each for each in results if each.scene == scene.name and each.groups), None)
         if of is not None:
-            said.append(f"{scene.title}: {SEEN_BY[of.seen_by]}. {all_bounds_of(of)}")
+            said.append(f"{scene.title}: {VISIBILITY_SOURCE_NOTES[of.seen_by]}. {all_group_bounds(of)}")
     return said if len(said) > 1 else []
 
 
-def _origins(results: Sequence[Result]) -> list[str]:
+def _provenance_notes(results: Sequence[BenchResult]) -> list[str]:
     """When and on what which runs were trained: of several machines only figures of the same one compare in seconds."""
     runs: dict[str, dict[int, list[str]]] = {}
     for each in results:
@@ -113,12 +113,12 @@ def _origins(results: Sequence[Result]) -> list[str]:
     ]
 
 
-def _method(method: Method) -> str:
-    left = list(method.leaves_out)
+def _method(method: BenchMethod) -> str:
+    left = list(method.omissions)
     strategy = STRATEGIES.get(method.name)
     if strategy is not None:
-        left = [*strategy.leaves_out, *left]
-    text = f"{method.title} (`{method.name}`)" if not method.cites else f"{method.title} ({method.cites})"
+        left = [*strategy.omissions, *left]
+    text = f"{method.title} (`{method.name}`)" if not method.citation else f"{method.title} ({method.citation})"
     if method.differs:
         text += f": {method.differs}"
     if method.less:

@@ -7,22 +7,22 @@ from datetime import date
 from pathlib import Path
 
 from vdgs import __version__
-from vdgs.distributed.node_check import instructions
-from vdgs.runs.config_file import commit
+from vdgs.distributed.node_check import cpu_instruction_set
+from vdgs.runs.config_file import git_commit
 
-_PROCESSORS = Path("/proc/cpuinfo")
+_CPUINFO_FILE = Path("/proc/cpuinfo")
 
 
-def origin(threads: int) -> str:
+def describe_provenance(threads: int) -> str:
     """This day and machine, and the commit (outside a checkout: the version) of this package."""
-    of = sha[:7] if (sha := commit()) else __version__
+    of = sha[:7] if (sha := git_commit()) else __version__
     cores = f"{threads} thread{'s' * (threads > 1)}"
-    return f"{date.today().isoformat()}, {cores} of {_processor()} ({instructions()}), {of}"
+    return f"{date.today().isoformat()}, {cores} of {_processor()} ({cpu_instruction_set()}), {of}"
 
 
 def _processor() -> str:
     try:
-        named = [line for line in _PROCESSORS.read_text().splitlines() if line.startswith("model name")]
+        named = [line for line in _CPUINFO_FILE.read_text().splitlines() if line.startswith("model name")]
     except OSError:
         named = []
     return named[0].partition(":")[2].strip() if named else platform.processor() or platform.machine()

@@ -9,22 +9,22 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from experiments.bench.definitions import EXPLICIT, Budget, Method, Scene, Table
-from experiments.bench.explicit import gaussians_config
-from experiments.bench.folders import scenes_of
+from experiments.bench.definitions import GS3D_STAGES, BenchMethod, BenchScene, BenchTable, Budget
+from experiments.bench.explicit import gs3d_config
+from experiments.bench.folders import resolve_scenes
 from experiments.bench.methods import METHODS
-from experiments.bench.renders import folder_of, foreign_method, identity
+from experiments.bench.renders import method_from_renders, renders_digest, renders_folder
 from experiments.bench.tables import TABLES
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.method import MethodConfig
 from vdgs.config.serialization import to_dict
-from vdgs.config.validation_rules import validate
+from vdgs.config.validation_rules import validate_config
 from vdgs.errors import VdgsError
-from vdgs.runs.stage_keys import counted
+from vdgs.runs.stage_keys import hashable_settings
 
 
 @dataclass(frozen=True)
-class Choices:
+class PlanOptions:
     """What a person may change about a table without changing what is compared."""
 
     seeds: int | None = None
@@ -68,20 +68,20 @@ class PlannedRun:
         plain = to_dict(self.config)
         # A method without blocks does not depend on their settings.
         sections = list(plain) if "blocks" in self.stages else ["training"]
-        settings = {section: counted(section, plain[section]) for section in sections}
+        settings = {section: hashable_settings(section, plain[section]) for section in sections}
         content = [self.stages, settings, dict(capture), dict(measured)]
-        if self.stages == EXPLICIT:
-            content.append(to_dict(gaussians_config(self.config)))
+        if self.stages == GS3D_STAGES:
+            content.append(to_dict(gs3d_config(self.config)))
         return _digest(content)
 
 
 @dataclass(frozen=True)
-class Plan:
+class BenchPlan:
     """All runs of a table."""
 
-    table: Table
-    scenes: tuple[Scene, ...]
-    methods: tuple[Method, ...]
+    table: BenchTable
+    scenes: tuple[BenchScene, ...]
+    methods: tuple[BenchMethod, ...]
     seeds: tuple[int, ...]
     budgets: Mapping[str, Budget]
     #: Coarse stages that several runs share, to be trained first.
@@ -100,25 +100,25 @@ class Plan:
         return next((run for run in self.coarse + self.runs if run.scene == scene and "coarse" in run.stages), None)
 
 
-def make_plan(name: str, choices: Choices) -> Plan:
+def make_plan(name: str, options: PlanOptions) -> BenchPlan:
     """Raises VdgsError for a scene or method that does not exist and for settings that do not work, CaptureError for a
     folder that is no capture."""
     table = TABLES[name]
-    scenes = scenes_of(choices.scenes or table.scenes, choices.options, choices.validation)
-    methods = tuple(_method(each) for each in choices.methods or table.methods)
-    seeds = table.seeds if choices.seeds is None else tuple(range(choices.seeds))
+    scenes = resolve_scenes(options.scenes or table.scenes, options.options, options.validation)
+    methods = tuple(_method(each) for each in options.methods or table.methods)
+    seeds = table.seeds if options.seeds is None else tuple(range(options.seeds))
     if not seeds:
         raise VdgsError("--seeds must be at least 1")
-    foreign = _foreign(choices, scenes, seeds)
+    foreign = _render_methods(options, scenes, seeds)
     budgets: dict[str, Budget] = {}
     answers: dict[tuple[str, str, int], PlannedRun] = {}
     coarse, runs = list[PlannedRun](), list[PlannedRun]()
     for scene in scenes:
-        budgets[scene.name] = budget = _budget(scene, choices)
+        budgets[scene.name] = budget = _budget(scene, options)
         for seed in seeds:
-            base = _limited(scene.base(budget, seed, budget.total / scene.budget.total), choices)
+            base = _limit_anchors(scene.base(budget, seed, budget.total / scene.budget.total), options)
             planned = [_planned(scene, method, budget, base, seed) for method in methods]
-            planned += _foreign_runs(scene, foreign, base, seed)
+            planned += _render_runs(scene, foreign, base, seed)
             shared, planned = _share_coarse(planned)
             coarse += shared
             taken: dict[str, PlannedRun] = {}
@@ -126,18 +126,20 @@ def make_plan(name: str, choices: Choices) -> Plan:
                 same = taken.setdefault(run.key({}, {}), run)
                 answers[scene.name, run.method, seed] = same
             runs += taken.values()
-    return Plan(
-        table, scenes, methods + foreign, seeds, budgets, tuple(coarse), tuple(runs), answers, choices.max_anchors,
-        choices.validation,
+    return BenchPlan(
+        table, scenes, methods + foreign, seeds, budgets, tuple(coarse), tuple(runs), answers, options.max_anchors,
+        options.validation,
     )  # fmt: skip
 
 
-def _foreign(choices: Choices, scenes: Sequence[Scene], seeds: Sequence[int]) -> tuple[Method, ...]:
+def _render_methods(
+    options: PlanOptions, scenes: Sequence[BenchScene], seeds: Sequence[int]
+) -> tuple[BenchMethod, ...]:
     """The methods whose renders are given. Raises VdgsError for a name that is taken or a folder without renders."""
-    found = list[Method]()
-    for text in choices.renders:
-        method = foreign_method(text, [*METHODS.values(), *found])
-        if not any(folder_of(method, scene.name, seed) for scene in scenes for seed in seeds):
+    found = list[BenchMethod]()
+    for text in options.renders:
+        method = method_from_renders(text, [*METHODS.values(), *found])
+        if not any(renders_folder(method, scene.name, seed) for scene in scenes for seed in seeds):
             names = ", ".join(scene.name for scene in scenes)
             raise VdgsError(
                 f"--renders {text!r}: {method.renders} holds no renders. They are looked for in folders named after "
@@ -147,12 +149,12 @@ def _foreign(choices: Choices, scenes: Sequence[Scene], seeds: Sequence[int]) ->
     return tuple(found)
 
 
-def _foreign_runs(scene: Scene, methods: Sequence[Method], base: MethodConfig, seed: int) -> list[PlannedRun]:
+def _render_runs(scene: BenchScene, methods: Sequence[BenchMethod], base: MethodConfig, seed: int) -> list[PlannedRun]:
     """The runs that measure what others rendered of a scene, where they did."""
-    found = [(method, folder_of(method, scene.name, seed)) for method in methods]
+    found = [(method, renders_folder(method, scene.name, seed)) for method in methods]
     return [
         PlannedRun(scene.name, method.name, seed, Path("runs", scene.name, f"renders-{method.name}", str(seed)),
-                   method.stages, base, renders=folder, identity=identity(folder))
+                   method.stages, base, renders=folder, identity=renders_digest(folder))
         for method, folder in found if folder is not None
     ]  # fmt: skip
 
@@ -161,36 +163,36 @@ def _digest(content: Any) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:16]
 
 
-def _method(name: str) -> Method:
+def _method(name: str) -> BenchMethod:
     if name not in METHODS:
         raise VdgsError(f"there is no method {name!r}. There are: {', '.join(METHODS)}")
     return METHODS[name]
 
 
-def _budget(scene: Scene, choices: Choices) -> Budget:
-    factor = choices.scale_iterations
-    if choices.iterations_total is not None:
-        factor = choices.iterations_total / scene.budget.total
+def _budget(scene: BenchScene, options: PlanOptions) -> Budget:
+    factor = options.scale_iterations
+    if options.iterations_total is not None:
+        factor = options.iterations_total / scene.budget.total
     if factor <= 0:
         raise VdgsError("--scale-iterations and --iterations-total must be positive")
     return scene.budget.scaled(factor)
 
 
-def _limited(config: MethodConfig, choices: Choices) -> MethodConfig:
+def _limit_anchors(config: MethodConfig, options: PlanOptions) -> MethodConfig:
     """With --max-anchors: a scene may hold so many, all its blocks together too."""
-    if not choices.max_anchors:
+    if not options.max_anchors:
         return config
     training, block = config.training, config.block
     return replace(
         config,
-        training=replace(training, growth=replace(training.growth, max_anchors=choices.max_anchors)),
-        block=replace(block, max_anchors_total=choices.max_anchors),
+        training=replace(training, growth=replace(training.growth, max_anchors=options.max_anchors)),
+        block=replace(block, max_anchors_total=options.max_anchors),
     )
 
 
-def _planned(scene: Scene, method: Method, budget: Budget, base: MethodConfig, seed: int) -> PlannedRun:
+def _planned(scene: BenchScene, method: BenchMethod, budget: Budget, base: MethodConfig, seed: int) -> PlannedRun:
     config = method.settings(base, budget)
-    problems = validate(config)
+    problems = validate_config(config)
     if problems:
         raise VdgsError(f"{method.name} on {scene.name}: these settings do not work:\n  " + "\n  ".join(problems))
     return PlannedRun(scene.name, method.name, seed, Path("runs", scene.name, method.name, str(seed)), method.stages,
@@ -203,7 +205,7 @@ def _share_coarse(planned: Sequence[PlannedRun]) -> tuple[list[PlannedRun], list
     shared: dict[str, PlannedRun] = {}
     for run in planned:
         digest = _coarse_digest(run)
-        if ("blocks" in run.stages or run.method == AS_BLOCKS_BEGIN) and digest not in shared:
+        if ("blocks" in run.stages or run.method == SHARED_COARSE_NAME) and digest not in shared:
             folder = Path("runs", run.scene, f"shared-coarse-{digest}", str(run.seed))
             # Nothing but what it depends on: which methods share it, and so are asked for, must not change it.
             alone = MethodConfig(training=run.config.training)
@@ -218,9 +220,9 @@ def _share_coarse(planned: Sequence[PlannedRun]) -> tuple[list[PlannedRun], list
 
 
 #: The method that is what blocks begin with.
-AS_BLOCKS_BEGIN = "coarse"
+SHARED_COARSE_NAME = "coarse"
 
 
 def _coarse_digest(run: PlannedRun) -> str:
-    settings = counted("training", to_dict(run.config.training))
+    settings = hashable_settings("training", to_dict(run.config.training))
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]

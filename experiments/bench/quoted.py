@@ -7,17 +7,17 @@ whose row says 24.04. In Table IV T_low = 0.30 and beta_g = 3.0 beat the default
 
 from __future__ import annotations
 
-Triple = tuple[float, float, float]
+MetricTriple = tuple[float, float, float]
 
-COLUMNS = ("PSNR", "SSIM", "LPIPS")
-CONTRADICTIONS = (
+METRIC_COLUMNS = ("PSNR", "SSIM", "LPIPS")
+PAPER_CONTRADICTIONS = (
     "The full method on Residence is quoted with PSNR 24.03 (Tables I and IV), 24.01 (Table II, equal to the row of 4 "
     "blocks of Table III) and 24.04 (Table III, 8 blocks, the number that the setup names).",
     "In Table IV, T_low = 0.30 (24.06) and β_g = 3.0 (24.08) are above the defaults (24.03) that are printed in bold; "
     "of SSIM, β_g = 0.5 (0.8471) is the best.",
 )
 
-_TABLE1: dict[str, dict[str, Triple]] = {
+_TABLE1: dict[str, dict[str, MetricTriple]] = {
     "Switch-NeRF": {
         "residence": (22.57, 0.654, 0.352), "sci-art": (26.51, 0.795, 0.271), "rubble": (24.31, 0.562, 0.478),
         "building": (21.54, 0.579, 0.397),
@@ -57,7 +57,7 @@ _TABLE1: dict[str, dict[str, Triple]] = {
 }  # fmt: skip
 
 
-def _residence(rows: dict[str, Triple]) -> dict[str, dict[str, Triple]]:
+def _residence(rows: dict[str, MetricTriple]) -> dict[str, dict[str, MetricTriple]]:
     return {name: {"residence": row} for name, row in rows.items()}
 
 
@@ -88,10 +88,10 @@ _TABLE4 = _residence(
 )  # fmt: skip
 
 #: Per table: row -> scene -> (PSNR, SSIM, LPIPS) after colour correction, A100.
-QUOTED: dict[str, dict[str, dict[str, Triple]]] = {
+PAPER_NUMBERS: dict[str, dict[str, dict[str, MetricTriple]]] = {
     "table1": _TABLE1, "table2": _TABLE2, "toy": _TABLE2, "table3": _TABLE3, "table4": _TABLE4,
 }  # fmt: skip
-EFFICIENCY = (
+PAPER_EFFICIENCY = (
     "Residence, 8 blocks: 1.48 h for the blocks on 8 GPUs in parallel (11.85 GPU-hours), about 5.4 GB peak memory a "
     "block, merged model 847 MB, 42.96 frames per second; coarse stage of 100 000 iterations about 5 h (A100 40 GB).",
 )

@@ -21,28 +21,28 @@ from jaxtyping import Float
 from rich.console import Console
 from torch import Tensor
 
-from experiments.bench.definitions import RENDERS, Method
+from experiments.bench.definitions import RENDER_STAGES, BenchMethod
 from vdgs.captures.capture import Capture, View
 from vdgs.errors import VdgsError
-from vdgs.evaluation.evaluate_model import evaluate
-from vdgs.evaluation.evaluate_run import cached_photographs
-from vdgs.evaluation.image_io import file_stems
+from vdgs.evaluation.evaluate_model import evaluate_model
+from vdgs.evaluation.evaluate_run import cached_reference_views
+from vdgs.evaluation.image_io import unique_file_stems
 from vdgs.evaluation.lpips import load_lpips
-from vdgs.evaluation.renderable_model import MeasuredModel
-from vdgs.system.tensors import size_and_checksum
+from vdgs.evaluation.renderable_model import RenderableModel
+from vdgs.system.tensors import file_size_and_crc32
 
 #: What a row may be called: it also names a folder, and stands in tables of three languages and in a figure.
-NAMES = re.compile(r"[A-Za-z0-9][A-Za-z0-9 .+_()-]*")
+NAME_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9 .+_()-]*")
 #: Missing files that an error names, at most.
-NAMED = 5
+MAX_LISTED = 5
 
 
-def foreign_method(text: str, known: Iterable[Method]) -> Method:
+def method_from_renders(text: str, known_methods: Iterable[BenchMethod]) -> BenchMethod:
     """A method from NAME=FOLDER. Raises VdgsError if it is not that, if a known method has the name, or without
     the folder."""
     title, _, folder = text.partition("=")
     title = title.strip()
-    if not folder or not NAMES.fullmatch(title):
+    if not folder or not NAME_PATTERN.fullmatch(title):
         raise VdgsError(
             f"--renders {text!r}: give a name (letters a to z, digits, spaces, . + - _ and brackets) and a folder, as "
             "in OpenSplat=renders/opensplat"
@@ -50,15 +50,15 @@ def foreign_method(text: str, known: Iterable[Method]) -> Method:
     if not Path(folder).is_dir():
         raise VdgsError(f"--renders {text!r}: {folder!r} is not a folder")
     name = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
-    if any(name == method.name or title == method.title for method in known):
+    if any(name == method.name or title == method.title for method in known_methods):
         raise VdgsError(f"--renders {text!r}: there is a method {title!r} already; choose another name")
-    return Method(
-        name, title, lambda config, _: config, RENDERS, renders=Path(folder),
+    return BenchMethod(
+        name, title, lambda config, _: config, RENDER_STAGES, renders=Path(folder),
         differs="rendered by another program; what it was given and what it cost is not known here",
     )  # fmt: skip
 
 
-def folder_of(method: Method, scene: str, seed: int) -> Path | None:
+def renders_folder(method: BenchMethod, scene: str, seed: int) -> Path | None:
     """Where the renders of a scene and seed are; None where there are none."""
     if method.renders is None:
         return None
@@ -67,23 +67,23 @@ def folder_of(method: Method, scene: str, seed: int) -> Path | None:
     return next((folder for folder in folders if any(folder.glob("*.png"))), None)
 
 
-def identity(folder: Path) -> str:
+def renders_digest(folder: Path) -> str:
     """What tells these renders from any others."""
     crc = 0
     for file in sorted(folder.glob("*.png")):
-        crc = zlib.crc32(f"{file.name} {size_and_checksum(file)}".encode(), crc)
+        crc = zlib.crc32(f"{file.name} {file_size_and_crc32(file)}".encode(), crc)
     return f"{crc:08x}"
 
 
 def check_renders(folder: Path, views: Sequence[View]) -> list[Path]:
     """The render of every view, in order. Raises VdgsError, naming files, unless all are there in the size of the
     photographs."""
-    files = [folder / f"{stem}.png" for stem in file_stems([view.name for view in views])]
+    files = [folder / f"{stem}.png" for stem in unique_file_stems([view.name for view in views])]
     missing = [f"{file.name} ({view.name})" for file, view in zip(files, views, strict=True) if not file.exists()]
     if missing:
-        more = f" and {len(missing) - NAMED} more" if len(missing) > NAMED else ""
+        more = f" and {len(missing) - MAX_LISTED} more" if len(missing) > MAX_LISTED else ""
         raise VdgsError(
-            f"{folder}: lacks {len(missing)} of {len(files)} views: {', '.join(missing[:NAMED])}{more}. Each is needed "
+            f"{folder}: lacks {len(missing)} of {len(files)} views: {', '.join(missing[:MAX_LISTED])}{more}. Each is needed "
             "under that name, as PNG in the size of the photograph."
         )
     for file, view in zip(files, views, strict=True):
@@ -100,13 +100,13 @@ def measure_renders(capture: Capture, folder: Path, output: Path, lpips_weights:
     files = check_renders(folder, views)
     of_camera = {id(view.camera): (file, view) for file, view in zip(files, views, strict=True)}
     lpips, note = load_lpips(lpips_weights)
-    model = MeasuredModel(render=lambda camera: _Render(_read(*of_camera[id(camera)])), timed=False)
-    with cached_photographs(views) as photographs:
-        evaluate(photographs, model, output, lpips=lpips, lpips_note=note, console=console)
+    model = RenderableModel(render=lambda camera: _LoadedRender(_read(*of_camera[id(camera)])), timed=False)
+    with cached_reference_views(views) as photographs:
+        evaluate_model(photographs, model, output, lpips=lpips, lpips_note=note, console=console)
 
 
 @dataclass(frozen=True)
-class _Render:
+class _LoadedRender:
     image: Float[Tensor, "h w 3"]
 
 

@@ -8,22 +8,22 @@ from pathlib import Path
 from typing import Any
 
 from experiments.baselines.gs3d.run import gaussians_folder
-from experiments.bench.definitions import EXPLICIT
-from experiments.bench.measure import FRUSTA_FILE, GROUPS_FILE, evaluated
-from experiments.bench.plan import Plan, PlannedRun
-from experiments.bench.worker import RECORD
-from vdgs.distributed.executor import Outcome
+from experiments.bench.definitions import GS3D_STAGES
+from experiments.bench.measure import FRUSTA_FILE, GROUPS_FILE, final_evaluation_folder
+from experiments.bench.plan import BenchPlan, PlannedRun
+from experiments.bench.worker import RECORD_FILE
+from vdgs.distributed.executor import TaskResult
 from vdgs.errors import VdgsError
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.stage_folder import Status
+from vdgs.runs.stage_folder import StatusRecord
 from vdgs.system.atomic_files import read_json
 
 #: What evaluations report, raw and after colour correction.
-QUALITY = ("psnr", "ssim", "lpips_vgg", "lpips_vgg_01", "psnr_cc", "ssim_cc", "lpips_vgg_cc", "lpips_vgg_01_cc")
+QUALITY_KEYS = ("psnr", "ssim", "lpips_vgg", "lpips_vgg_01", "psnr_cc", "ssim_cc", "lpips_vgg_cc", "lpips_vgg_01_cc")
 #: The same in neutral colours, of views that are drawn exposed as their neighbours in the flight.
-NEUTRAL = ("psnr_neutral", "ssim_neutral")
+REFERENCE_EXPOSURE_KEYS = ("psnr_neutral", "ssim_neutral")
 #: Over the pixels that training cameras see: how opaque they are, PSNR by background, errors of depth; and veils.
-SOLIDITY = (
+COVERAGE_KEYS = (
     "solid_share", "psnr_seen_own", "psnr_seen_black", "psnr_seen_white", "depth_error_median_expected",
     "depth_error_median_median", "depth_within_1_percent_expected", "depth_within_1_percent_median",
     "splats_larger_than_picture",
@@ -31,7 +31,7 @@ SOLIDITY = (
 
 
 @dataclass(frozen=True)
-class Result:
+class BenchResult:
     """One method on one scene with one seed."""
 
     scene: str
@@ -56,36 +56,44 @@ class Result:
     origin: str = ""
 
 
-def gather(
-    plan: Plan, output: Path, ended: Mapping[str, Outcome], keys: Mapping[str, str], known: Mapping[str, Result]
-) -> list[Result]:
+def collect_results(
+    plan: BenchPlan,
+    output: Path,
+    ended: Mapping[str, TaskResult],
+    keys: Mapping[str, str],
+    cached: Mapping[str, BenchResult],
+) -> list[BenchResult]:
     """The results of every (scene, method, seed) of a plan, from its run folders, or known by the keys of runs."""
     results = []
     for (scene, method, seed), run in plan.answers.items():
-        if keys[run.name] in known:
-            results.append(replace(known[keys[run.name]], scene=scene, method=method, seed=seed))
+        if keys[run.name] in cached:
+            results.append(replace(cached[keys[run.name]], scene=scene, method=method, seed=seed))
             continue
         end = ended.get(run.name)
         state, why = (end.state, end.why) if end else ("missing", "")
-        result = Result(scene, method, seed, state, why, str(run.folder), key=keys[run.name])
+        result = BenchResult(scene, method, seed, state, why, str(run.folder), key=keys[run.name])
         if state == "done":
             try:
                 result = _read(output, run, result)
             except (VdgsError, KeyError, TypeError, FileNotFoundError) as error:
-                result = Result(scene, method, seed, "failed", f"its results cannot be read: {error}", str(run.folder))
+                result = BenchResult(
+                    scene, method, seed, "failed", f"its results cannot be read: {error}", str(run.folder)
+                )
         results.append(result)
     return results
 
 
-def as_json(results: list[Result]) -> list[dict[str, Any]]:
+def results_to_json(results: list[BenchResult]) -> list[dict[str, Any]]:
     return [asdict(result) for result in results]
 
 
-def _read(output: Path, planned: PlannedRun, result: Result) -> Result:
+def _read(output: Path, planned: PlannedRun, result: BenchResult) -> BenchResult:
     """The result with the figures that the run left."""
     run = RunFolder(output / planned.folder)
-    metrics, record = read_json(evaluated(run.path) / "metrics.json"), read_json(run.path / RECORD)
-    figures: dict[str, float | None] = {name: metrics.get(name) for name in (*QUALITY, *NEUTRAL, *SOLIDITY)}
+    metrics, record = read_json(final_evaluation_folder(run.path) / "metrics.json"), read_json(run.path / RECORD_FILE)
+    figures: dict[str, float | None] = {
+        name: metrics.get(name) for name in (*QUALITY_KEYS, *REFERENCE_EXPOSURE_KEYS, *COVERAGE_KEYS)
+    }
     figures |= {"model_bytes": metrics.get("model_bytes"), "fps": metrics["fps"]}
     if planned.renders is None:
         figures |= _sizes(metrics, planned) | _costs(run, planned.stages, record.get("seconds", {}))
@@ -115,7 +123,7 @@ def _sizes(metrics: Mapping[str, Any], planned: PlannedRun) -> dict[str, float |
     return {"anchors": anchors, "gaussians": decoded if explicit is None else explicit}
 
 
-def _photographs_drawn(status: Status) -> float:
+def _photographs_drawn(status: StatusRecord) -> float:
     """How many photographs' worth of pixels a stage drew: fewer than its steps where these draw parts."""
     return float(status.photographs if status.photographs is not None else status.iteration or 0)
 
@@ -124,7 +132,7 @@ def _costs(run: RunFolder, names: Sequence[str], stages: Mapping[str, float]) ->
     """Iterations, photographs drawn, seconds, memory and cameras of a run with the stages `names`. The shared coarse
     stage counts in full for each run that takes it."""
     blocks = "blocks" in names
-    coarse = (gaussians_folder(run) if tuple(names) == EXPLICIT else run.coarse).status()
+    coarse = (gaussians_folder(run) if tuple(names) == GS3D_STAGES else run.coarse).status()
     trained = [folder.status() for folder in run.block_folders()] if blocks else []
     rows = run.partition_record().blocks if blocks else ()
     seconds = [float(each.seconds or 0) for each in trained]

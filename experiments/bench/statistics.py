@@ -20,7 +20,7 @@ class Summary:
     count: int
 
 
-def summarise(values: Iterable[float | None]) -> Summary | None:
+def summarize(values: Iterable[float | None]) -> Summary | None:
     """None where no value is known. Unknown values (None, NaN) are left out."""
     known = [value for value in values if value is not None and not math.isnan(value)]
     if not known:
@@ -28,7 +28,7 @@ def summarise(values: Iterable[float | None]) -> Summary | None:
     return Summary(fmean(known), stdev(known) if len(known) > 1 else None, len(known))
 
 
-def marks(values: Sequence[float | None], digits: int, higher_is_better: bool = True) -> list[Mark]:
+def rank_marks(values: Sequence[float | None], digits: int, higher_is_better: bool = True) -> list[Mark]:
     """Best and second best of a column, as rounded to the digits that are shown; equals share a mark.
 
     A column with fewer than two known values has none.
@@ -42,7 +42,7 @@ def marks(values: Sequence[float | None], digits: int, higher_is_better: bool = 
 
 
 @dataclass(frozen=True)
-class Difference:
+class SeedDifference:
     """Of two methods over the seeds that both have: mean, the larger of their spreads (None: one seed), and the
     difference of each seed. Methods that share a coarse stage differ by far less than seeds do, so that a difference
     below the spread can still have the same sign in all of them."""
@@ -52,21 +52,21 @@ class Difference:
     by_seed: tuple[float, ...]
 
     @property
-    def beyond_spread(self) -> bool | None:
+    def exceeds_spread(self) -> bool | None:
         """Above zero by more than the spread; None where one seed says nothing about it."""
         return None if self.spread is None else self.mean > self.spread
 
 
-def difference(ours: Mapping[int, float | None], theirs: Mapping[int, float | None]) -> Difference | None:
+def paired_difference(ours: Mapping[int, float | None], theirs: Mapping[int, float | None]) -> SeedDifference | None:
     """Ours - theirs, by seed. None without a common seed."""
     pairs = [
         (value, other)
         for seed, value in ours.items()
         if value is not None and (other := theirs.get(seed)) is not None
     ]  # fmt: skip
-    mine, others = (summarise(pair[side] for pair in pairs) for side in (0, 1))
+    mine, others = (summarize(pair[side] for pair in pairs) for side in (0, 1))
     if mine is None or others is None:
         return None
     spreads = [each.spread for each in (mine, others) if each.spread is not None]
     by_seed = tuple(value - other for value, other in pairs)
-    return Difference(mine.mean - others.mean, max(spreads, default=None), by_seed)
+    return SeedDifference(mine.mean - others.mean, max(spreads, default=None), by_seed)

@@ -2,34 +2,34 @@
 
 from __future__ import annotations
 
-from experiments.bench.definitions import Group, Table
-from experiments.bench.methods import BETA_G, BLOCKS, EAGER, FACTORIAL, GAMMA, LAMBDA_VIS, T_LOW
+from experiments.bench.definitions import BenchTable, MethodGroup
+from experiments.bench.methods import BETA_G, BLOCKS, FACTORIAL, GAMMA, LAMBDA_VIS, LOWER_THRESHOLDS, T_LOW
 
-LAB = ("lab-uneven", "lab-distant", "lab-even")
+LAB_SCENES = ("lab-uneven", "lab-distant", "lab-even")
 #: Where the paper's premise holds.
-REGIME = ("regime-uneven",)
+REGIME_SCENES = ("regime-uneven",)
 
 
-def _sweep(title: str, prefix: str, values: tuple[float, ...]) -> Group:
-    return Group(title, tuple(f"{prefix}-{value:g}" for value in values))
+def _sweep(title: str, prefix: str, values: tuple[float, ...]) -> MethodGroup:
+    return MethodGroup(title, tuple(f"{prefix}-{value:g}" for value in values))
 
 
 _SWEEPS = (
-    Group("plain growth", ("plain-growth",)),
+    MethodGroup("plain growth", ("plain-growth",)),
     _sweep("(a) visibility weight λ_vis", "lambda-vis", LAMBDA_VIS),
     _sweep("(b) low-visibility threshold T_low", "t-low", T_LOW),
     _sweep("(c) compensation scale β_g", "beta-g", BETA_G),
     _sweep("(d) decay factor γ", "gamma", GAMMA),
 )
 _MORE_ANCHORS = (
-    Group(
+    MethodGroup(
         "four blocks",
-        ("cell-1-off", "cell-1-sum-0.2", "cell-1-mean-0.2", *(f"cell-1-threshold-{factor:g}" for factor in EAGER)),
+        ("cell-1-off", "cell-1-sum-0.2", "cell-1-mean-0.2", *(f"cell-1-threshold-{factor:g}" for factor in LOWER_THRESHOLDS)),
     ),
-    Group(
+    MethodGroup(
         "coarse stage alone",
         ("coarse", "coarse-compensated-sum", "coarse-compensated-mean", "coarse-compensated-literal-gate",
-         "coarse-lower-gate", *(f"coarse-threshold-{factor:g}" for factor in EAGER)),
+         "coarse-lower-gate", *(f"coarse-threshold-{factor:g}" for factor in LOWER_THRESHOLDS)),
     ),
 )  # fmt: skip
 _ABLATION = (
@@ -49,7 +49,7 @@ _ABLATION = (
 )
 
 #: Each departs from the full method in one choice, or says beside it in what else.
-CHOICES = (
+CHOICE_METHODS = (
     "full", "frozen-decoder", "even-sampling", "by-votes", "printed-rates", "damped-rates", "half-size", "last-model",
     "whole-photographs", "no-anchor-generation", "printed-compensation", "compensation-of-sums", "share-0.45",
     "literal-assignment", "leave-one-out", "frustum", "no-context", "free-ring", "free-best-seen", "ramp",
@@ -57,50 +57,50 @@ CHOICES = (
 )  # fmt: skip
 
 #: Every table by name.
-TABLES: dict[str, Table] = {
+TABLES: dict[str, BenchTable] = {
     table.name: table
     for table in (
-        Table(
+        BenchTable(
             "table1", "Table I: methods × scenes",
-            ("3dgs", "3dgs-black", "scaffold-gs", "baseline-mean", "vastgaussian", "citygaussian", "dogs", "full"), LAB,
+            ("3dgs", "3dgs-black", "scaffold-gs", "baseline-mean", "vastgaussian", "citygaussian", "dogs", "full"), LAB_SCENES,
         ),
-        Table("table2", "Table II: training strategies", _ABLATION, LAB),
-        Table(
-            "table3", "Table III: number of blocks", tuple(f"blocks-{count}" for count in BLOCKS), LAB[:1],
+        BenchTable("table2", "Table II: training strategies", _ABLATION, LAB_SCENES),
+        BenchTable(
+            "table3", "Table III: number of blocks", tuple(f"blocks-{count}" for count in BLOCKS), LAB_SCENES[:1],
             ours="blocks-8",
         ),
-        Table(
-            "table4", "Table IV: parameters", tuple(name for group in _SWEEPS for name in group.methods), LAB[:1],
+        BenchTable(
+            "table4", "Table IV: parameters", tuple(name for group in _SWEEPS for name in group.methods), LAB_SCENES[:1],
             seeds=(0,), groups=_SWEEPS, ours="lambda-vis-1",
         ),
-        Table(
+        BenchTable(
             "table3-each", "Table III: number of blocks, each trained as long, plain growth",
             (
                 "coarse", "no-blocking-as-long-plain", "each-half", "no-anchor-generation", "each-2-times",
                 "each-4-times",
             ),
-            REGIME, ours="no-anchor-generation",
+            REGIME_SCENES, ours="no-anchor-generation",
         ),
-        Table(
-            "factorial", "Factorial: cut by visibility × compensation × T_low, equally many cameras", FACTORIAL, REGIME,
+        BenchTable(
+            "factorial", "Factorial: cut by visibility × compensation × T_low, equally many cameras", FACTORIAL, REGIME_SCENES,
             ours="cell-1-mean-0.2",
         ),
-        Table(
+        BenchTable(
             "coarse-compensation", "Compensation in the coarse stage alone",
-            ("coarse", "coarse-compensated-mean", "coarse-compensated-sum"), REGIME, ours="coarse-compensated-mean",
+            ("coarse", "coarse-compensated-mean", "coarse-compensated-sum"), REGIME_SCENES, ours="coarse-compensated-mean",
         ),
-        Table(
+        BenchTable(
             "more-anchors", "Compensated growth, its parts, and plain growth at lower thresholds",
-            tuple(name for group in _MORE_ANCHORS for name in group.methods), REGIME, groups=_MORE_ANCHORS,
+            tuple(name for group in _MORE_ANCHORS for name in group.methods), REGIME_SCENES, groups=_MORE_ANCHORS,
             ours="cell-1-mean-0.2",
         ),
-        Table(
+        BenchTable(
             "longer", "Blocks trained longer",
-            ("coarse", "baseline", "baseline-mean", "full", "longer-2", "longer-4"), LAB[:2],
+            ("coarse", "baseline", "baseline-mean", "full", "longer-2", "longer-4"), LAB_SCENES[:2],
         ),
-        Table("choices", "Our choices, one at a time", CHOICES, LAB[:1], seeds=(0,)),
-        Table("efficiency", "Efficiency", ("baseline", "baseline-mean", "full"), LAB[:1], seeds=(0,)),
-        Table(
+        BenchTable("choices", "Our choices, one at a time", CHOICE_METHODS, LAB_SCENES[:1], seeds=(0,)),
+        BenchTable("efficiency", "Efficiency", ("baseline", "baseline-mean", "full"), LAB_SCENES[:1], seeds=(0,)),
+        BenchTable(
             "toy", "Toy: the training strategies on a tiny town",
             ("baseline", "no-blocking", "no-anchor-generation", "full"), ("tiny",), seeds=(0,),
         ),

@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from experiments.bench.grids import bounds_of
-from experiments.bench.plan import Plan
-from experiments.bench.results import Result
-from experiments.bench.statistics import Difference, difference, summarise
+from experiments.bench.grids import group_bounds
+from experiments.bench.plan import BenchPlan
+from experiments.bench.results import BenchResult
+from experiments.bench.statistics import SeedDifference, paired_difference, summarize
 
 #: dB by which the full method may fall behind where many cameras look, and on even flights.
-ALLOWED_DB = 0.1
+TOLERANCE_DB = 0.1
 
 
 @dataclass(frozen=True)
-class Line:
+class ClaimCheck:
     """A question about a scene, its answer (None: cannot be said), and the numbers."""
 
     scene: str
@@ -28,7 +28,7 @@ class Line:
         return f"{self.scene}: {self.question}: {word} ({self.numbers})"
 
 
-def verdict(plan: Plan, results: Sequence[Result]) -> list[Line]:
+def check_claims(plan: BenchPlan, results: Sequence[BenchResult]) -> list[ClaimCheck]:
     """For each scene with the full method: uneven ones by group, even ones against the best."""
     lines = []
     ours = plan.table.ours
@@ -52,54 +52,56 @@ def verdict(plan: Plan, results: Sequence[Result]) -> list[Line]:
     return lines
 
 
-def _has_answer(plan: Plan, scene: str, method: str) -> bool:
+def _has_answer(plan: BenchPlan, scene: str, method: str) -> bool:
     """Another program may have left no renders of a scene."""
     return any((scene, method, seed) in plan.answers for seed in plan.seeds)
 
 
-def _same_runs(plan: Plan, scene: str, ours: str, other: str) -> bool:
+def _same_runs(plan: BenchPlan, scene: str, ours: str, other: str) -> bool:
     """Two rows of a sweep may have the same settings: nothing is to be compared."""
     return all(plan.answers.get((scene, ours, s)) == plan.answers.get((scene, other, s)) for s in plan.seeds)
 
 
-def _uneven(scene: str, results: Sequence[Result], ours: str, other: str, titles: dict[str, str]) -> list[Line]:
+def _uneven(
+    scene: str, results: Sequence[BenchResult], ours: str, other: str, titles: dict[str, str]
+) -> list[ClaimCheck]:
     bounds = next((result.groups for result in results if result.groups), ())
     groups = len(bounds)
     least = _difference(results, ours, other, "psnr@0")
     best = _difference(results, ours, other, f"psnr@{groups - 1}")
     name = f"{titles[ours]} against {titles[other]}"
     if groups == 0 or least is None or best is None:
-        return [Line(scene, name, None, "no common results")]
-    more, fine = least.beyond_spread, best.mean >= -ALLOWED_DB
-    poorly, well = (f"(V {bounds_of(bounds[end])})" for end in (0, -1))
+        return [ClaimCheck(scene, name, None, "no common results")]
+    more, fine = least.exceeds_spread, best.mean >= -TOLERANCE_DB
+    poorly, well = (f"(V {group_bounds(bounds[end])})" for end in (0, -1))
     return [
-        Line(scene, f"{name}, better where least seen {poorly} by more than the spread", more, _numbers(least)),
-        Line(scene, f"{name}, at most {ALLOWED_DB} dB below where best seen {well}", fine, _numbers(best)),
+        ClaimCheck(scene, f"{name}, better where least seen {poorly} by more than the spread", more, _numbers(least)),
+        ClaimCheck(scene, f"{name}, at most {TOLERANCE_DB} dB below where best seen {well}", fine, _numbers(best)),
     ]
 
 
-def _even(scene: str, results: Sequence[Result], ours: str, titles: dict[str, str]) -> Line:
-    means = {name: summarise(_by_seed(results, name, "psnr").values()) for name in titles}
+def _even(scene: str, results: Sequence[BenchResult], ours: str, titles: dict[str, str]) -> ClaimCheck:
+    means = {name: summarize(_by_seed(results, name, "psnr").values()) for name in titles}
     known = {name: each.mean for name, each in means.items() if each is not None}
-    question = f"{titles[ours]} within {ALLOWED_DB} dB of the best (even coverage)"
+    question = f"{titles[ours]} within {TOLERANCE_DB} dB of the best (even coverage)"
     if ours not in known or len(known) < 2:
-        return Line(scene, question, None, "no results to compare")
+        return ClaimCheck(scene, question, None, "no results to compare")
     best = max(known, key=lambda name: known[name])
     behind = known[best] - known[ours]
-    return Line(
-        scene, question, behind <= ALLOWED_DB, f"{known[ours]:.2f} dB, best {titles[best]} {known[best]:.2f} dB"
+    return ClaimCheck(
+        scene, question, behind <= TOLERANCE_DB, f"{known[ours]:.2f} dB, best {titles[best]} {known[best]:.2f} dB"
     )
 
 
-def _difference(results: Sequence[Result], ours: str, other: str, key: str) -> Difference | None:
-    return difference(_by_seed(results, ours, key), _by_seed(results, other, key))
+def _difference(results: Sequence[BenchResult], ours: str, other: str, key: str) -> SeedDifference | None:
+    return paired_difference(_by_seed(results, ours, key), _by_seed(results, other, key))
 
 
-def _by_seed(results: Sequence[Result], method: str, key: str) -> dict[int, float | None]:
+def _by_seed(results: Sequence[BenchResult], method: str, key: str) -> dict[int, float | None]:
     return {result.seed: result.figures.get(key) for result in results if result.method == method}
 
 
-def _numbers(each: Difference) -> str:
+def _numbers(each: SeedDifference) -> str:
     if each.spread is None:
         return f"{each.mean:+.2f} dB, one seed, spread unknown"
     seeds = ", ".join(f"{one:+.2f}" for one in each.by_seed)

@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from vdgs.runs.run_context import RunContext
 
 #: In the run folder: state, key, why, seconds of each stage.
-RECORD = "bench.json"
+RECORD_FILE = "bench.json"
 
 
 @dataclass(frozen=True)
-class Job:
+class BenchJob:
     """What the file says."""
 
     capture: Path
@@ -50,69 +50,69 @@ class Job:
         write_json(path, {name: _plain(value) for name, value in vars(self).items()})
 
     @staticmethod
-    def read(path: Path) -> Job:
+    def read(path: Path) -> BenchJob:
         values = read_json(path)
         for name in ("capture", "output", "coarse_from", "lpips_weights", "renders"):
             values[name] = None if values[name] is None else Path(values[name])
-        return Job(**values | {"stages": tuple(values["stages"])})
+        return BenchJob(**values | {"stages": tuple(values["stages"])})
 
 
 @dataclass(frozen=True)
-class _Working:
+class _JobContext:
     """What the stages work with."""
 
-    job: Job
+    job: BenchJob
     context: RunContext
     console: Any
 
 
-def _coarse(at: _Working) -> None:
-    from vdgs.config.checkpointing import WatchOptions
+def _coarse(at: _JobContext) -> None:
+    from vdgs.config.checkpointing import CheckpointOptions
     from vdgs.pipeline.train_coarse import train_coarse
 
     if at.job.coarse_from is not None:
-        take_coarse(at.job.coarse_from, at.job.output)
-    train_coarse(at.context, WatchOptions(), at.console)
+        link_coarse_stage(at.job.coarse_from, at.job.output)
+    train_coarse(at.context, CheckpointOptions(), at.console)
 
 
-def _partition(at: _Working) -> None:
-    from vdgs.pipeline.count_visibility import measure_visibility
+def _partition(at: _JobContext) -> None:
+    from vdgs.pipeline.count_visibility import count_run_visibility
     from vdgs.pipeline.partition_stage import partition_run
 
-    measure_visibility(at.context, at.console)
+    count_run_visibility(at.context, at.console)
     partition_run(at.context, at.console)
 
 
-def _blocks(at: _Working) -> None:
-    from vdgs.config.checkpointing import WatchOptions
+def _blocks(at: _JobContext) -> None:
+    from vdgs.config.checkpointing import CheckpointOptions
     from vdgs.pipeline.train_blocks import train_blocks
 
-    train_blocks(at.context, WatchOptions(), at.job.block_jobs, at.console)
+    train_blocks(at.context, CheckpointOptions(), at.job.block_jobs, at.console)
 
 
-def _merge(at: _Working) -> None:
-    from vdgs.pipeline.merge_blocks import merge_run
+def _merge(at: _JobContext) -> None:
+    from vdgs.pipeline.merge_blocks import merge_run_blocks
 
-    merge_run(at.context, False, at.console)
+    merge_run_blocks(at.context, False, at.console)
 
 
-def _evaluate(at: _Working) -> None:
-    from vdgs.pipeline.evaluate_stage import Measuring, evaluate_stage
+def _evaluate(at: _JobContext) -> None:
+    from vdgs.pipeline.evaluate_stage import EvaluationRequest, evaluate_stage
 
     evaluate_stage(
         at.context,
-        Measuring(path=at.context.run.path, which="best", lpips_weights=at.job.lpips_weights, bins=at.job.bins),
+        EvaluationRequest(path=at.context.run.path, which="best", lpips_weights=at.job.lpips_weights, bins=at.job.bins),
         at.console,
     )
 
 
-def _gaussians(at: _Working) -> None:
-    from experiments.bench.explicit import train_explicit
+def _gaussians(at: _JobContext) -> None:
+    from experiments.bench.explicit import train_gs3d
 
-    train_explicit(at.context.run, at.context.capture, at.job.lpips_weights, at.console)
+    train_gs3d(at.context.run, at.context.capture, at.job.lpips_weights, at.console)
 
 
-def _renders(at: _Working) -> None:
+def _renders(at: _JobContext) -> None:
     from experiments.bench.renders import measure_renders
 
     assert at.job.renders is not None
@@ -121,19 +121,19 @@ def _renders(at: _Working) -> None:
 
 
 #: What a method may name as its stages. Each does nothing, or the same again, where it is done.
-STAGES: dict[str, Callable[[_Working], None]] = {
+STAGES: dict[str, Callable[[_JobContext], None]] = {
     "coarse": _coarse, "partition": _partition, "blocks": _blocks, "merge": _merge, "evaluate": _evaluate,
     "gaussians": _gaussians, "renders": _renders,
 }  # fmt: skip
 
 
-def take_coarse(source: Path, target: Path) -> None:
+def link_coarse_stage(source: Path, target: Path) -> None:
     """Give a run the finished coarse stage of another with the same settings; the model is linked, not copied.
 
     Raises VdgsError if the other run has none. The keys of both are the same because the settings are; were they not,
     the coarse stage would be trained again.
     """
-    from vdgs.pipeline.dense_points import FILE
+    from vdgs.pipeline.dense_points import DENSE_POINTS_FILE
 
     if (target / "coarse" / "model.safetensors").exists():
         return
@@ -142,7 +142,7 @@ def take_coarse(source: Path, target: Path) -> None:
     partial = target / f".coarse.{os.getpid()}"
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
-    for name in ("key", "status.json", "log.jsonl", FILE):
+    for name in ("key", "status.json", "log.jsonl", DENSE_POINTS_FILE):
         if (source / "coarse" / name).exists():
             shutil.copy2(source / "coarse" / name, partial / name)
     model = source / "coarse" / "model.safetensors"
@@ -155,31 +155,31 @@ def take_coarse(source: Path, target: Path) -> None:
     shutil.copy2(source / "capture.json", target / "capture.json")
 
 
-def work(job: Job) -> None:
+def run_job(job: BenchJob) -> None:
     """All stages of a job, noting how long each took; the record says done only at the end."""
     from rich.console import Console
 
-    from experiments.bench.origin import origin
+    from experiments.bench.origin import describe_provenance
     from vdgs.kernels import configure_threads
 
     configure_threads(job.threads)
     with _opened(job) as context:
-        working = _Working(job, context, Console(soft_wrap=True))
+        working = _JobContext(job, context, Console(soft_wrap=True))
         record = _record(job)
-        write_json(job.output / RECORD, record)  # what an interrupted run leaves is not what it was before
+        write_json(job.output / RECORD_FILE, record)  # what an interrupted run leaves is not what it was before
         for name in job.stages:
             began = time.monotonic()
             STAGES[name](working)
             record["seconds"][name] = record["seconds"].get(name, 0.0) + time.monotonic() - began
-            write_json(job.output / RECORD, record)
-        write_json(job.output / RECORD, record | {"state": "done", "origin": origin(job.threads)})
+            write_json(job.output / RECORD_FILE, record)
+        write_json(job.output / RECORD_FILE, record | {"state": "done", "origin": describe_provenance(job.threads)})
 
 
 @contextmanager
-def _opened(job: Job) -> Iterator[RunContext]:
+def _opened(job: BenchJob) -> Iterator[RunContext]:
     """The run, driven, with its capture. Where renders are measured the folder is no run: nothing is trained there."""
     from vdgs.captures.loading import load_capture
-    from vdgs.runs.create_or_resume import driven_run
+    from vdgs.runs.create_or_resume import exclusive_run
     from vdgs.runs.run_context import RunContext
     from vdgs.runs.run_folder import RunFolder
 
@@ -188,13 +188,13 @@ def _opened(job: Job) -> Iterator[RunContext]:
         yield RunContext(RunFolder(job.output), load_capture(job.capture, options))
         return
     method = from_dict(MethodConfig, job.method)
-    with driven_run(job.capture, job.output, options, method, redo=job.redo) as context:
+    with exclusive_run(job.capture, job.output, options, method, overwrite=job.redo) as context:
         yield context
 
 
-def _record(job: Job) -> dict[str, Any]:
+def _record(job: BenchJob) -> dict[str, Any]:
     """What is noted so far for the same key, so that the time of an interrupted run adds up."""
-    file = job.output / RECORD
+    file = job.output / RECORD_FILE
     before = read_json(file) if file.exists() else {}
     seconds = before.get("seconds", {}) if before.get("key") == job.key else {}
     return {"state": "running", "key": job.key, "seconds": seconds}
@@ -210,12 +210,12 @@ def main(arguments: list[str]) -> int:
 
     configure_threads()  # before anything imports torch
     from vdgs.distributed.task_process import stop_when_parent_dies
-    from vdgs.system.stop_signals import stop_requests
+    from vdgs.system.stop_signals import catch_stop_signals
 
     stop_when_parent_dies()
     try:
-        with stop_requests(interrupts=True):
-            work(Job.read(Path(arguments[0])))
+        with catch_stop_signals(interrupts=True):
+            run_job(BenchJob.read(Path(arguments[0])))
     except VdgsError as error:
         print(f"vdgs bench: {error}", file=sys.stderr)
         return 130 if isinstance(error, Stopped) else 1

@@ -7,7 +7,7 @@ import io
 import re
 from collections.abc import Sequence
 
-from experiments.bench.grids import Cell, Grid
+from experiments.bench.grids import ResultTable, TableCell
 
 _LATEX = {
     "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "$": r"\$",
@@ -32,7 +32,7 @@ def escape_latex(text: str) -> str:
     return "".join(_SYMBOLS.get(part) or "".join(_LATEX.get(letter, letter) for letter in part) for part in parts)
 
 
-def number(cell: Cell) -> str:
+def format_cell(cell: TableCell) -> str:
     """`24.03 ± 0.05`; the dash stands for unknown."""
     if cell.summary is None:
         return "–"
@@ -41,18 +41,18 @@ def number(cell: Cell) -> str:
     return text if spread is None else f"{text} ± {spread:.{cell.digits}f}"
 
 
-def markdown(grids: Sequence[Grid], heading: str, paragraphs: Sequence[str]) -> str:
+def to_markdown(grids: Sequence[ResultTable], heading: str, paragraphs: Sequence[str]) -> str:
     """A document: heading, the grids, and paragraphs (already Markdown)."""
     parts = [f"# {escape_markdown(heading)}", *(_markdown_grid(grid) for grid in grids), *paragraphs]
     return "\n\n".join(parts) + "\n"
 
 
-def latex(grids: Sequence[Grid]) -> str:
+def to_latex(grids: Sequence[ResultTable]) -> str:
     """One `table` for each grid; they need the package booktabs."""
     return "% Made by `vdgs bench`. Needs \\usepackage{booktabs}.\n\n" + "\n\n".join(map(_latex_grid, grids)) + "\n"
 
 
-def tidy_csv(grids: Sequence[Grid]) -> str:
+def to_tidy_csv(grids: Sequence[ResultTable]) -> str:
     """One line for each number: grid, group, row, column, mean, spread, seeds, mark."""
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
@@ -70,7 +70,7 @@ def tidy_csv(grids: Sequence[Grid]) -> str:
     return file.getvalue()
 
 
-def _markdown_grid(grid: Grid) -> str:
+def _markdown_grid(grid: ResultTable) -> str:
     lines = [f"## {escape_markdown(grid.title)}", ""]
     lines.append("| method | " + " | ".join(map(escape_markdown, grid.columns)) + " |")
     lines.append("|---|" + "---:|" * len(grid.columns))
@@ -84,12 +84,12 @@ def _markdown_grid(grid: Grid) -> str:
     return "\n".join(lines)
 
 
-def _markdown_cell(cell: Cell) -> str:
-    text = number(cell)
+def _markdown_cell(cell: TableCell) -> str:
+    text = format_cell(cell)
     return {"best": f"**{text}**", "second": f"<u>{text}</u>", "": text}[cell.mark]
 
 
-def _latex_grid(grid: Grid) -> str:
+def _latex_grid(grid: ResultTable) -> str:
     lines = [r"\begin{table}[htbp]", r"\centering", rf"\caption{{{escape_latex(grid.title)}}}"]
     lines.append(rf"\label{{tab:{re.sub('[^a-z0-9-]', '-', grid.name.lower())}}}")
     lines += [r"\begin{tabular}{l" + "r" * len(grid.columns) + "}", r"\toprule"]
@@ -104,6 +104,6 @@ def _latex_grid(grid: Grid) -> str:
     return "\n".join([*lines, r"\end{table}"])
 
 
-def _latex_cell(cell: Cell) -> str:
-    text = escape_latex(number(cell)).replace("\u202f", r"\,")
+def _latex_cell(cell: TableCell) -> str:
+    text = escape_latex(format_cell(cell)).replace("\u202f", r"\,")
     return {"best": rf"\textbf{{{text}}}", "second": rf"\underline{{{text}}}", "": text}[cell.mark]

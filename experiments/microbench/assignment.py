@@ -30,11 +30,11 @@ from experiments.microbench.stopwatch import medians_ms
 from vdgs.config.method import AssignmentConfig
 from vdgs.geometry.camera import Camera
 from vdgs.kernels import cpu as kernels
-from vdgs.kernels.cpu.extension import set_threads, threads
+from vdgs.kernels.cpu.extension import get_num_threads, set_num_threads
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.partition.assignment.score_matrix import score_matrix
+from vdgs.partition.assignment.score_matrix import compute_score_matrix
 from vdgs.partition.blocks import Block, Blocks
 
 MODES = get_args(get_type_hints(AssignmentConfig)["mode"])
@@ -76,7 +76,7 @@ def strip(visible: int, blocks: int, cameras: int) -> tuple[AnchorModel, list[Ca
     return AnchorModel(
         anchors=anchors,
         decoder=Decoder.initial(10, False, 0, 1, g),
-        voxel=spacing,
+        voxel_size=spacing,
         background=(0.5, 0.5, 0.5),
     ), views
 
@@ -93,13 +93,13 @@ def slices(model: AnchorModel, count: int) -> Blocks:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--run", type=Path, help="a trained run whose training views are scored")
-    parser.add_argument("--threads", type=int, default=threads())
+    parser.add_argument("--threads", type=int, default=get_num_threads())
     parser.add_argument("--visible", type=int, default=20_000, help="anchors in a view")
     parser.add_argument("--blocks", type=int, default=8)
     parser.add_argument("--cameras", type=int, default=40)
     parser.add_argument("--repeats", type=int, default=3)
     arguments = parser.parse_args()
-    set_threads(arguments.threads)
+    set_num_threads(arguments.threads)
     torch.set_num_threads(arguments.threads)
     print(describe())
     if arguments.run:
@@ -116,7 +116,7 @@ def main() -> None:
         f"{np.mean(seen):,.0f} in a view, {arguments.threads} thread(s)"
     )
     work: dict[str, Callable[[], object]] = {
-        mode: partial(score_matrix, model, blocks, cameras, AssignmentConfig(mode=mode)) for mode in MODES
+        mode: partial(compute_score_matrix, model, blocks, cameras, AssignmentConfig(mode=mode)) for mode in MODES
     }
     times = medians_ms(work, arguments.repeats)
     for mode, ms in times.items():

@@ -42,10 +42,10 @@ def main() -> None:
     """Print one line for each operation."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--points", type=int, default=1_000_000)
-    parser.add_argument("--threads", type=int, default=extension.threads())
+    parser.add_argument("--threads", type=int, default=extension.get_num_threads())
     parser.add_argument("--rounds", type=int, default=7)
     arguments = parser.parse_args()
-    extension.set_threads(arguments.threads)
+    extension.set_num_threads(arguments.threads)
     torch.set_num_threads(arguments.threads)
     print(describe())
     print(f"{arguments.points} points, median ms of {arguments.rounds}")

@@ -6,8 +6,8 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from vdgs.kernels.cuda.launch import OPTIONS, read_header, read_source
-from vdgs.kernels.cuda.nvrtc import Nvrtc, Target, nvrtc
+from vdgs.kernels.cuda.launch import COMPILE_OPTIONS, read_header, read_source
+from vdgs.kernels.cuda.nvrtc import CompileTarget, Nvrtc, get_nvrtc
 
 
 @dataclass(frozen=True)
@@ -21,15 +21,15 @@ class Resources:
 
 
 def resources_of(
-    name: str, target: Target, headers: Sequence[str] = (), compiler: Nvrtc | None = None
+    name: str, target: CompileTarget, headers: Sequence[str] = (), compiler: Nvrtc | None = None
 ) -> tuple[Resources, ...]:
     """Of each kernel of a source of `vdgs.kernels.cuda`, compiled for a target (machine code, not PTX).
 
     Raises CompileError, CudaUnavailable.
     """
     texts = {title: read_header(title) for title in headers}
-    options = (*OPTIONS, "--ptxas-options=-v")
-    _, log = (compiler or nvrtc()).compile_and_tell(name, read_source(name), texts, target, options)
+    options = (*COMPILE_OPTIONS, "--ptxas-options=-v")
+    _, log = (compiler or get_nvrtc()).compile_with_log(name, read_source(name), texts, target, options)
     return tuple(
         _read(kernel, text) for kernel, text in re.findall(r"entry function '(\w+)'(.*?)Compile time", log, re.S)
     )

@@ -91,7 +91,7 @@ def report_decode(v: int, k: int, repeats: int, isas: list[str]) -> None:
 
 def use(isa: str, threads: int) -> None:
     """Run the kernels of one instruction set on so many threads."""
-    chosen = extension.load(isa)
+    chosen = extension.load_extension(isa)
     chosen.set_threads(threads)
     mock.patch.object(extension, "native", return_value=chosen).start()
 
@@ -123,7 +123,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--anchors", type=int, nargs="*", default=[20_000, 100_000])
     parser.add_argument("--offsets", type=int, default=10)
-    parser.add_argument("--isa", nargs="*", default=list(extension.supported()))
+    parser.add_argument("--isa", nargs="*", default=list(extension.supported_isas()))
     parser.add_argument("--cull", type=int, default=1_000_000)
     parser.add_argument("--repeats", type=int, default=15)
     options = parser.parse_args()

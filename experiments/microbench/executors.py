@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 
 from experiments.microbench.machine import describe
-from vdgs.distributed.ray_executor import connected
+from vdgs.distributed.ray_executor import connect
 from vdgs.runs.run_folder import RunFolder
 
 ENGINES = ("local", "ray")
@@ -41,7 +41,7 @@ def train(run: Path, engine: str, jobs: int) -> float:
 def start_of_ray() -> float:
     """Seconds that a Ray of this machine takes to start and to end, with nothing to do."""
     began = time.perf_counter()
-    with connected(None):
+    with connect(None):
         pass
     return time.perf_counter() - began
 

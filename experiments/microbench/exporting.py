@@ -32,14 +32,14 @@ from vdgs.config.commands import ExportRequest
 from vdgs.export import export_run
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.ground_frame import GroundFrame
-from vdgs.kernels import choose, set_threads, threads
+from vdgs.kernels import get_backend, get_num_threads, set_num_threads
 from vdgs.kernels.kernel_types import FEATURE_SIZE
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.runs.open_run import TrainedRun
+from vdgs.runs.open_run import OpenedRun
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.stage_folder import Status
+from vdgs.runs.stage_folder import StatusRecord
 
 OFFSETS, ANCHORS_PER_VIEW, SEEN_BY, SPACING = 10, 1600, 10, 1.0
 WIDTH, HEIGHT = 400, 300
@@ -54,7 +54,7 @@ def made_up(anchors: int) -> tuple[AnchorModel, list[Camera]]:
     generator = torch.Generator().manual_seed(0)
     row, column = torch.arange(anchors) // side, torch.arange(anchors) % side
     positions = torch.stack([column, row, torch.rand(anchors, generator=generator)], 1).float() * SPACING
-    positions = positions[choose(positions.device).morton_order(positions)]
+    positions = positions[get_backend(positions.device).morton_order(positions)]
     log_scales = torch.randn(anchors, 6, generator=generator) * 0.2 + math.log(0.7 * SPACING)
     tensors = Decoder.initial(OFFSETS, True, 0, 0, generator).tensors()
     # Every Gaussian is drawn, and none hides all behind it.
@@ -63,7 +63,7 @@ def made_up(anchors: int) -> tuple[AnchorModel, list[Camera]]:
     model = AnchorModel(
         anchors=Anchors(positions, torch.randn(anchors, FEATURE_SIZE, generator=generator),
                 0.4 * torch.randn(anchors, OFFSETS, 3, generator=generator), log_scales),
-        decoder=Decoder.from_tensors(tensors), voxel=SPACING, background=(0.5, 0.5, 0.5),
+        decoder=Decoder.from_tensors(tensors), voxel_size=SPACING, background=(0.5, 0.5, 0.5),
     )  # fmt: skip
     count = max(4, anchors // ANCHORS_PER_VIEW)
     # A picture holds SEEN_BY / count of the ground: its width at 4 to 3, from one focal length of 400 pixels.
@@ -105,16 +105,16 @@ def one(anchors: int, folder: Path, names: list[str], measure: bool) -> None:
     )
     capture = Capture(
         root=folder, source="made up", images=".", views=views, points=np.zeros((1, 3)),
-        point_colours=np.zeros((1, 3), np.uint8), ground=ground,
+        point_colors=np.zeros((1, 3), np.uint8), ground=ground,
     )  # fmt: skip
     file = folder / "run" / "coarse" / "model.safetensors"
     model.save(file)
-    run = TrainedRun(
-        folder=RunFolder(folder / "run"), model=model, model_path=file, name="coarse", status=Status(), key="key",
+    run = OpenedRun(
+        folder=RunFolder(folder / "run"), model=model, model_path=file, name="coarse", status=StatusRecord(), key="key",
         caution="", capture=capture,
     )  # fmt: skip
     export_run.open_run = lambda *_: run
-    set_threads(threads())
+    set_num_threads(get_num_threads())
     began, before = time.monotonic(), time.process_time()
     asked = ExportRequest(run=folder / "run", to=tuple(folder / name for name in names), measure=measure, device="cpu")
     record = export_run.export_run(asked, Console(quiet=True))

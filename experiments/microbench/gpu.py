@@ -31,8 +31,8 @@ from experiments.microbench import gpu_parity, step
 from experiments.microbench.cuda_resources import resources_of
 from experiments.microbench.machine import describe
 from vdgs.cli.main import main as vdgs
-from vdgs.kernels.cuda.driver import CudaUnavailable, cuda_driver
-from vdgs.kernels.cuda.nvrtc import Target, nvrtc
+from vdgs.kernels.cuda.driver import CudaUnavailable, get_cuda_driver
+from vdgs.kernels.cuda.nvrtc import CompileTarget, get_nvrtc
 from vdgs.kernels.gpu import rasterizer
 from vdgs.kernels.gsplat.rasterize import GsplatUnavailable
 
@@ -106,8 +106,8 @@ class Report:
 def find_card() -> Machine | str:
     """The first card, or why none can be used."""
     try:
-        driver = cuda_driver()
-        compiler = nvrtc()
+        driver = get_cuda_driver()
+        compiler = get_nvrtc()
         cards = driver.cards()
     except CudaUnavailable as error:
         return str(error)
@@ -124,7 +124,7 @@ def find_card() -> Machine | str:
 
 
 def print_resources(machine: Machine) -> None:
-    target: Target = nvrtc().target_for(machine.capability)
+    target: CompileTarget = get_nvrtc().target_for(machine.capability)
     if target.is_ptx:
         print(f"this NVRTC is older than the card: {target.name}, which the driver compiles on")
         return
@@ -183,7 +183,7 @@ def command(*arguments: str) -> None:
 
 def time_steps(machine: Machine, sizes: Sizes) -> None:
     for name in rasterisers():
-        os.environ[rasterizer.VARIABLE] = name
+        os.environ[rasterizer.RASTERIZER_ENV_VAR] = name
         for visible, width, height in sizes.steps:
             state, camera, target = step.prepare(visible, width, height, device=machine.device)
             times: dict[str, list[float]] = {phase: [] for phase in step.PHASES}
@@ -195,13 +195,13 @@ def time_steps(machine: Machine, sizes: Sizes) -> None:
                 f"{name:7} {width}x{height}, {seen} visible anchors, {splats} splats: {sum(medians.values()):.2f} ms "
                 f"({parts})", flush=True,
             )  # fmt: skip
-    os.environ.pop(rasterizer.VARIABLE, None)
+    os.environ.pop(rasterizer.RASTERIZER_ENV_VAR, None)
 
 
 def rasterisers() -> list[str]:
     """Those that can be used."""
     try:
-        rasterizer.chosen("gsplat")
+        rasterizer.select_rasterizer("gsplat")
     except GsplatUnavailable as error:
         print(f"without gsplat: {error}")
         return ["cuda"]

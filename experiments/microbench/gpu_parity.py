@@ -18,9 +18,16 @@ from torch import Tensor
 from experiments.microbench.step import scene
 from vdgs.kernels import cuda, gsplat
 from vdgs.kernels.gsplat.rasterize import GsplatUnavailable
-from vdgs.kernels.kernel_types import AdamState, AnchorSplats, DecoderWeights, SplatGradients, Splats, Statistics
-from vdgs.kernels.operations import Operations
-from vdgs.kernels.torch_ref.ellipsoids import logarithms
+from vdgs.kernels.kernel_types import (
+    AdamState,
+    AnchorSplats,
+    DecoderWeights,
+    DensificationStats,
+    SplatGradients,
+    Splats,
+)
+from vdgs.kernels.operations import KernelBackend
+from vdgs.kernels.torch_ref.ellipsoids import log_covariances
 from vdgs.model.decoder import Decoder
 
 #: Largest difference of a value, of a gradient and share of whole numbers that differ.
@@ -59,7 +66,7 @@ class Place:
         """The same numbers on any device."""
         return torch.randn(shape, generator=generator(seed)).to(self.device)
 
-    def decoded(self, kernels: Operations, leaves: tuple[Tensor, ...] | None = None) -> tuple[Tensor, AnchorSplats]:
+    def decoded(self, kernels: KernelBackend, leaves: tuple[Tensor, ...] | None = None) -> tuple[Tensor, AnchorSplats]:
         a = self.anchors
         rows = kernels.cull(a.positions, a.log_scales, self.camera)
         features, offsets, log_scales = leaves or (a.features, a.offsets, a.log_scales)
@@ -82,12 +89,12 @@ def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def cull(kernels: Operations, place: Place) -> Results:
+def cull(kernels: KernelBackend, place: Place) -> Results:
     rows = kernels.cull(place.anchors.positions, place.anchors.log_scales, place.camera)
     return {"whole rows": member(rows, len(place.anchors))}
 
 
-def decode(kernels: Operations, place: Place) -> Results:
+def decode(kernels: KernelBackend, place: Place) -> Results:
     a = place.anchors
     leaves = tuple(t.detach().clone().requires_grad_(True) for t in (a.features, a.offsets, a.log_scales))
     rows, splats = place.decoded(kernels, leaves)
@@ -106,21 +113,21 @@ def decode(kernels: Operations, place: Place) -> Results:
     return found | {f"gradient {i}": gradient for i, gradient in enumerate(gradients)}
 
 
-def decode_to_train(kernels: Operations, place: Place) -> Results:
+def decode_to_train(kernels: KernelBackend, place: Place) -> Results:
     """Drawn in the order that splats are given with: where each of them stands is left to the card."""
     a = place.anchors
     rows = kernels.cull(a.positions, a.log_scales, place.camera)
-    splats = kernels.decode_to_train(
+    splats = kernels.decode_for_training(
         a.positions, a.features, a.offsets, a.log_scales, place.weights, place.camera, rows
     )
-    raster, pullback = kernels.rasterise_vjp(splats, place.background, place.width, place.height)
+    raster, pullback = kernels.rasterize_vjp(splats, place.background, place.width, place.height)
     gradients = pullback(place.random(place.height, place.width, 3))
     count = torch.tensor([float(len(splats.source))])
     sums = torch.stack([gradients.colours.sum(), gradients.opacities.sum()])
     return {"image": raster.image, "volume": splats.volume, "splats": count, "gradients added up": sums}
 
 
-def decode_backward_adam(kernels: Operations, place: Place) -> Results:
+def decode_backward_adam(kernels: KernelBackend, place: Place) -> Results:
     """First moments say what the gradients were; how far Adam moves says nothing where a gradient is near zero."""
     rows, splats = place.decoded(kernels)
     a, k = place.anchors, place.anchors.offsets.shape[1]
@@ -147,7 +154,7 @@ def decode_backward_adam(kernels: Operations, place: Place) -> Results:
     return moments | decoder | {"whole updates": updates}
 
 
-def project(kernels: Operations, place: Place) -> Results:
+def project(kernels: KernelBackend, place: Place) -> Results:
     a = place.anchors
     # Of different lengths: to turn a ball changes nothing, and the gradient would be all rounding.
     scales = (a.log_scales[:, :3] + 0.5 * place.random(len(a), 3, seed=4)).exp()
@@ -162,35 +169,35 @@ def project(kernels: Operations, place: Place) -> Results:
     return {name: t.detach() for name, t in values.items()} | {"whole valid": found.valid} | named
 
 
-def rasterise(kernels: Operations, place: Place) -> Results:
+def rasterise(kernels: KernelBackend, place: Place) -> Results:
     """With depth, as pictures for people are drawn; median depth jumps from splat to splat."""
-    raster = kernels.rasterise(place.splats(), place.background, place.width, place.height, depth=True)
+    raster = kernels.rasterize(place.splats(), place.background, place.width, place.height, depth=True)
     assert raster.depth is not None
     found = {"image": raster.image, "alpha": raster.alpha, "depth": raster.depth}
     return found if raster.median_depth is None else found | {"whole median depth": raster.median_depth}
 
 
-def rasterise_vjp(kernels: Operations, place: Place) -> Results:
-    raster, pullback = kernels.rasterise_vjp(place.splats(), place.background, place.width, place.height)
+def rasterise_vjp(kernels: KernelBackend, place: Place) -> Results:
+    raster, pullback = kernels.rasterize_vjp(place.splats(), place.background, place.width, place.height)
     shape = (place.height, place.width)
     gradients = pullback(place.random(*shape, 3), place.random(*shape))._asdict()
     named = {f"gradient {name}": gradient for name, gradient in gradients.items() if gradient is not None}
     return {"image": raster.image, "alpha": raster.alpha} | named
 
 
-def shares(kernels: Operations, place: Place) -> Results:
+def shares(kernels: KernelBackend, place: Place) -> Results:
     wanted = place.random(place.height, place.width, 3).sigmoid()
     return kernels.shares(place.splats(), place.background, place.width, place.height, wanted)._asdict()
 
 
-def photometric_loss(kernels: Operations, place: Place) -> Results:
+def photometric_loss(kernels: KernelBackend, place: Place) -> Results:
     image = place.random(place.height, place.width, 3).sigmoid().requires_grad_(True)
     found = kernels.photometric_loss(image, place.target, place.mask)
     (gradient,) = torch.autograd.grad(found.loss, image)
     return {"loss": found.loss.detach(), "l1": found.l1, "ssim": found.ssim, "gradient": gradient}
 
 
-def adam_rows(kernels: Operations, place: Place) -> Results:
+def adam_rows(kernels: KernelBackend, place: Place) -> Results:
     features = place.anchors.features.clone()
     state = AdamState(features, torch.zeros_like(features), torch.zeros_like(features), 1e-2, early=5.0)
     rows = torch.arange(0, len(features), 3).to(place.device)
@@ -199,10 +206,10 @@ def adam_rows(kernels: Operations, place: Place) -> Results:
     return {"parameter": state.parameter, "first": state.first, "second": state.second}
 
 
-def add_view_statistics(kernels: Operations, place: Place) -> Results:
+def add_view_statistics(kernels: KernelBackend, place: Place) -> Results:
     rows, splats = place.decoded(kernels)
     inside = kernels.mark_visible(place.anchors.positions[rows], place.camera)
-    sums = Statistics.zeros(len(place.anchors), place.anchors.offsets.shape[1], place.device)
+    sums = DensificationStats.zeros(len(place.anchors), place.anchors.offsets.shape[1], place.device)
     by_px = splats.means_px * 1e-3
     kernels.add_view_statistics(
         sums, rows, inside, splats.source, splats.opacities, by_px, place.width, place.height
@@ -210,53 +217,53 @@ def add_view_statistics(kernels: Operations, place: Place) -> Results:
     return sums.tensors()
 
 
-def count_visibility(kernels: Operations, place: Place) -> Results:
+def count_visibility(kernels: KernelBackend, place: Place) -> Results:
     return {"whole V": kernels.count_visibility(place.anchors.positions, [place.camera] * 3)}
 
 
-def mark_visible(kernels: Operations, place: Place) -> Results:
+def mark_visible(kernels: KernelBackend, place: Place) -> Results:
     return {"whole marks": kernels.mark_visible(place.anchors.positions, place.camera)}
 
 
-def cell_keys(kernels: Operations, place: Place) -> Results:
+def cell_keys(kernels: KernelBackend, place: Place) -> Results:
     return {"whole keys": keys_of(kernels, place)}
 
 
-def cell_centres(kernels: Operations, place: Place) -> Results:
-    return {"centres": kernels.cell_centres(keys_of(kernels, place), 0.5, place.background)}
+def cell_centres(kernels: KernelBackend, place: Place) -> Results:
+    return {"centres": kernels.cell_centers(keys_of(kernels, place), 0.5, place.background)}
 
 
-def group_cells(kernels: Operations, place: Place) -> Results:
+def group_cells(kernels: KernelBackend, place: Place) -> Results:
     unique, group = kernels.group_cells(keys_of(kernels, place))
     return {"whole keys": unique, "whole groups": group}
 
 
-def group_max(kernels: Operations, place: Place) -> Results:
+def group_max(kernels: KernelBackend, place: Place) -> Results:
     unique, group = kernels.group_cells(keys_of(kernels, place))
     return {"greatest": kernels.group_max(place.anchors.features, group, len(unique))}
 
 
-def contains(kernels: Operations, place: Place) -> Results:
+def contains(kernels: KernelBackend, place: Place) -> Results:
     keys = keys_of(kernels, place)
     return {"whole": kernels.contains(keys[::2].contiguous(), keys)}
 
 
-def morton_order(kernels: Operations, place: Place) -> Results:
+def morton_order(kernels: KernelBackend, place: Place) -> Results:
     return {"whole order": kernels.morton_order(place.anchors.positions)}
 
 
-def keys_of(kernels: Operations, place: Place) -> Tensor:
+def keys_of(kernels: KernelBackend, place: Place) -> Tensor:
     return kernels.cell_keys(place.anchors.positions, 0.5, place.background)
 
 
-def harmonic_colours(kernels: Operations, place: Place) -> Results:
+def harmonic_colours(kernels: KernelBackend, place: Place) -> Results:
     means, count = place.anchors.positions, len(place.anchors)
     rows = torch.arange(0, count, 3).to(place.device)
     coefficients = place.random(count, 48)
-    return {"colours": kernels.harmonic_colours(means[rows], coefficients, rows, place.background, 3)}
+    return {"colours": kernels.harmonic_colors(means[rows], coefficients, rows, place.background, 3)}
 
 
-def fit_harmonics(kernels: Operations, place: Place) -> Results:
+def fit_harmonics(kernels: KernelBackend, place: Place) -> Results:
     """Twenty pairs of each Gaussian, so that the third degree is known."""
     pairs = 20 * (len(place.anchors) // 20)
     directions = torch.nn.functional.normalize(place.random(pairs, 3), dim=1)
@@ -265,12 +272,12 @@ def fit_harmonics(kernels: Operations, place: Place) -> Results:
     return {"coefficients": kernels.fit_harmonics(directions, place.random(pairs, 3, seed=2), weights, starts, 3, 1e-3)}
 
 
-def mean_ellipsoids(kernels: Operations, place: Place) -> Results:
+def mean_ellipsoids(kernels: KernelBackend, place: Place) -> Results:
     """Three pairs of each Gaussian. As logarithms: where two axes are alike, rounding names them."""
     pairs = 3 * (len(place.anchors) // 3)
     shapes = place.random(pairs, 3), place.random(pairs, 4, seed=2)
     starts = torch.arange(0, pairs, 3).to(place.device)
-    return {"means": logarithms(*kernels.mean_ellipsoids(*shapes, place.random(pairs).abs() + 0.1, starts))}
+    return {"means": log_covariances(*kernels.mean_ellipsoids(*shapes, place.random(pairs).abs() + 0.1, starts))}
 
 
 def member(rows: Tensor, count: int) -> Tensor:
@@ -281,7 +288,7 @@ def member(rows: Tensor, count: int) -> Tensor:
 
 
 #: By the name of the operation.
-CASES: dict[str, Callable[[Operations, Place], Results]] = {
+CASES: dict[str, Callable[[KernelBackend, Place], Results]] = {
     case.__name__: case
     for case in (
         adam_rows, add_view_statistics, cell_centres, cell_keys, contains, count_visibility, cull, decode,

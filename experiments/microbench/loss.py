@@ -36,10 +36,10 @@ def step(implementation: ModuleType, width: int, height: int, masked: bool) -> C
 def main() -> None:
     """Print one line for each size."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--threads", type=int, default=extension.threads())
+    parser.add_argument("--threads", type=int, default=extension.get_num_threads())
     parser.add_argument("--rounds", type=int, default=5)
     arguments = parser.parse_args()
-    extension.set_threads(arguments.threads)
+    extension.set_num_threads(arguments.threads)
     torch.set_num_threads(arguments.threads)
     print(describe())
     print(f"loss + gradient, median ms of {arguments.rounds}")

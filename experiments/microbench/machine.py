@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from vdgs.kernels.cpu.extension import isa, supported
-from vdgs.kernels.thread_count import cores
+from vdgs.kernels.cpu.extension import active_isa, supported_isas
+from vdgs.kernels.thread_count import cpu_count
 
 
 def describe() -> str:
     """Processor, cores, instruction sets, load and versions, one per line."""
     lines = [
         f"command      {' '.join([Path(sys.executable).name, *sys.argv])}",
-        f"processor    {_processor()}, {cores()} cores for this process",
-        f"native       {isa()} of {', '.join(supported())}",
+        f"processor    {_processor()}, {cpu_count()} cores for this process",
+        f"native       {active_isa()} of {', '.join(supported_isas())}",
         f"memory       {_memory_gib():.0f} GiB",
         f"load         {os.getloadavg()[0]:.1f} over the last minute, before the start",
         f"system       {platform.system()} {platform.release()}, Python {platform.python_version()}",

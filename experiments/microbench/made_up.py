@@ -91,7 +91,7 @@ def model(positions: np.ndarray, extent_m: float) -> AnchorModel:
     return AnchorModel(
         anchors=anchors,
         decoder=Decoder.initial(OFFSETS, False, 0, 1, g),
-        voxel=spacing,
+        voxel_size=spacing,
         background=(0.5, 0.5, 0.5),
     )
 
@@ -162,7 +162,7 @@ class _Cells:
             for y in range(max(0, row - 2), min(self.cells, row + 3))
         ]
         found = np.concatenate(near)
-        found = found[camera.sees(self.points[found])]
+        found = found[camera.in_frustum(self.points[found])]
         chosen = np.random.default_rng(seed).permutation(found)[:SEEN_EACH]
         return np.sort(chosen)
 

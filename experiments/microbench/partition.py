@@ -23,8 +23,8 @@ from experiments.microbench.visibility import flight
 from vdgs.config.method import PartitionConfig
 from vdgs.kernels.cpu import extension
 from vdgs.partition.blocks import Blocks
-from vdgs.partition.partition_scene import cut_scene
-from vdgs.visibility.visibility_counts import visibility_of
+from vdgs.partition.partition_scene import partition_scene
+from vdgs.visibility.visibility_counts import count_visibility
 
 EXTENT_M = 2000.0
 #: Places whose owner is compared with brute force.
@@ -65,19 +65,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--anchors", type=int, default=1_000_000)
     parser.add_argument("--cameras", type=int, default=1_000)
-    parser.add_argument("--threads", type=int, default=extension.threads())
+    parser.add_argument("--threads", type=int, default=extension.get_num_threads())
     arguments = parser.parse_args()
-    extension.set_threads(arguments.threads)
+    extension.set_num_threads(arguments.threads)
     torch.set_num_threads(arguments.threads)
     print(describe())
     print(f"{arguments.anchors} anchors, {arguments.cameras} cameras")
     positions, cameras = town(arguments.anchors), flight(arguments.cameras, EXTENT_M, 120.0, 45.0)
-    views = timed("V of all anchors", lambda: visibility_of(torch.from_numpy(positions).float(), cameras)).numpy()
+    views = timed("V of all anchors", lambda: count_visibility(torch.from_numpy(positions).float(), cameras)).numpy()
     generator = np.random.default_rng(2)
     for count, balanced in ((8, False), (8, True), (16, False)):
         config = PartitionConfig(blocks=count, balanced=balanced)
         title = f"cut into {count} blocks{', balanced' if balanced else ''}"
-        blocks = timed(title, lambda config=config: cut_scene(positions, views, config, seed=0)[0])  # type: ignore[misc]
+        blocks = timed(title, lambda config=config: partition_scene(positions, views, config, seed=0)[0])  # type: ignore[misc]
     corners = [len(shapely.get_coordinates(block.core)) for block in blocks.items]
     print(f"{'corners of the cores':>52} {min(corners)} to {max(corners)}")
     look_up(blocks, generator.uniform(0, EXTENT_M, (1_000_000, 2)), "in the box")

@@ -31,8 +31,8 @@ import numpy as np
 import torch
 
 from experiments.microbench.machine import describe
-from vdgs.kernels.cpu.extension import load, supported
-from vdgs.kernels.cpu.rasterize import rasterise
+from vdgs.kernels.cpu.extension import load_extension, supported_isas
+from vdgs.kernels.cpu.rasterize import rasterize
 from vdgs.kernels.kernel_types import Splats
 
 COUNTS = (20_000, 200_000, 1_000_000)
@@ -95,7 +95,7 @@ class Timing:
 
 class Ours:
     def __init__(self, isa: str, scene: Scene, threads: int) -> None:
-        self.module, self.threads, self.scene = load(isa), threads, scene
+        self.module, self.threads, self.scene = load_extension(isa), threads, scene
         self.tensors = [torch.from_numpy(a).requires_grad_() for a in scene.rows()]
         self.background = torch.from_numpy(scene.background)
         self.gradient = torch.from_numpy(scene.picture_gradient)
@@ -108,7 +108,7 @@ class Ours:
         size = self.scene.width, self.scene.height
         means, conics, colours, opacities, depths = self.tensors
         splats = Splats(means, conics, depths, colours, opacities)
-        raster = rasterise(splats, self.background, *size, module=self.module)
+        raster = rasterize(splats, self.background, *size, module=self.module)
         middle = time.perf_counter()
         torch.autograd.backward(raster.image, self.gradient)
         return middle - start, time.perf_counter() - middle
@@ -146,15 +146,15 @@ class Prototype:
 
 def scenes_of_run(run: Path, views: int) -> list[tuple[str, Scene]]:
     """What the first test views of a trained run draw."""
-    from vdgs.model.renderer import decode_rows, visible_rows
+    from vdgs.model.renderer import cull_anchors, decode_anchors
     from vdgs.runs.open_run import open_run
 
     opened, scenes = open_run(run), []
     for view in opened.capture.test_views[:views]:
         camera = view.camera
-        seen = visible_rows(opened.model.anchors, camera)
+        seen = cull_anchors(opened.model.anchors, camera)
         with torch.no_grad():
-            splats = decode_rows(opened.model.anchors, seen, opened.model.decoder.for_image(None), camera)
+            splats = decode_anchors(opened.model.anchors, seen, opened.model.decoder.weights_for_image(None), camera)
         rows = (splats.means_px, splats.conics, splats.colours, splats.opacities, splats.depths)
         gradient = np.random.default_rng(1).normal(size=(camera.height, camera.width, 3)).astype(np.float32)
         background = np.array(opened.model.background, np.float32)
@@ -173,7 +173,7 @@ def build_prototype(source: Path, folder: Path) -> dict[str, Any]:
     subprocess.run(
         ["cmake", "--build", str(folder), "-j2", "--target", *targets], check=True, stdout=subprocess.DEVNULL
     )
-    return {isa: _import_from(folder, name) for isa, name in PROTOTYPE_BUILDS.items() if isa in supported()}
+    return {isa: _import_from(folder, name) for isa, name in PROTOTYPE_BUILDS.items() if isa in supported_isas()}
 
 
 def _import_from(folder: Path, name: str) -> Any:
@@ -254,11 +254,11 @@ def main() -> None:
     parser.add_argument("--prototype", type=Path, help="source folder of the study to compare with")
     parser.add_argument("--run", type=Path, help="a trained run whose first test views are drawn")
     parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--isa", nargs="*", default=[i for i in supported() if i != "portable"] or ["portable"])
+    parser.add_argument("--isa", nargs="*", default=[i for i in supported_isas() if i != "portable"] or ["portable"])
     parser.add_argument("--counts", nargs="*", type=int, default=list(COUNTS), help="numbers of splats")
     arguments = parser.parse_args()
     print(describe())
-    limits = {isa: load(isa).blend_limit() for isa in arguments.isa}
+    limits = {isa: load_extension(isa).blend_limit() for isa in arguments.isa}
     print(
         "blend limit ",
         ", ".join(f"{isa} {limit / 1e9:.2f} G pairs/s a core" for isa, limit in limits.items()),

@@ -40,7 +40,7 @@ from experiments.microbench import made_up
 from experiments.microbench.machine import describe
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.partition.blocks import Blocks
-from vdgs.system.memory.process_memory import forget_peak, peak_memory_bytes
+from vdgs.system.memory.process_memory import peak_memory_bytes, reset_peak_memory
 
 #: Blocks of a cut, of an assignment and of a merge; cameras that an assignment scores.
 BLOCKS, SCORED = 16, 30
@@ -76,44 +76,44 @@ class Measured:
 
 
 def _visibility(case: Case, folder: Path) -> Work:
-    from vdgs.visibility.visibility_counts import visibility_of
+    from vdgs.visibility.visibility_counts import count_visibility
 
     extent = made_up.extent_of(case.photographs)
     positions, cameras = torch.from_numpy(made_up.places(case.anchors, extent)), made_up.flight(case.photographs)
-    return lambda: visibility_of(positions, cameras)
+    return lambda: count_visibility(positions, cameras)
 
 
 def _seen_places(case: Case) -> tuple[np.ndarray, np.ndarray]:
     """Anchors and how many photographs hold each."""
-    from vdgs.visibility.visibility_counts import visibility_of
+    from vdgs.visibility.visibility_counts import count_visibility
 
     positions = made_up.places(case.anchors, made_up.extent_of(case.photographs))
-    return positions, visibility_of(torch.from_numpy(positions), made_up.flight(case.photographs)).numpy()
+    return positions, count_visibility(torch.from_numpy(positions), made_up.flight(case.photographs)).numpy()
 
 
 def _cut(case: Case, folder: Path) -> Work:
     from vdgs.config.method import PartitionConfig
-    from vdgs.partition.partition_scene import cut_scene
+    from vdgs.partition.partition_scene import partition_scene
 
     positions, views = _seen_places(case)
-    return lambda: cut_scene(positions, views, PartitionConfig(blocks=BLOCKS), seed=0)
+    return lambda: partition_scene(positions, views, PartitionConfig(blocks=BLOCKS), seed=0)
 
 
 def _owners(case: Case, folder: Path) -> Work:
-    from vdgs.partition.blocks import places_of
+    from vdgs.partition.blocks import xy_positions
 
     blocks, positions, _ = _cut_site(case)
-    return lambda: blocks.owner(places_of(positions))
+    return lambda: blocks.owner(xy_positions(positions))
 
 
 def _cut_site(case: Case) -> tuple[Blocks, np.ndarray, np.ndarray]:
     """Blocks as the method cuts them, of some of the anchors; where all anchors are, and their V."""
     from vdgs.config.method import PartitionConfig
-    from vdgs.partition.partition_scene import cut_scene
+    from vdgs.partition.partition_scene import partition_scene
 
     positions, views = _seen_places(case)
     some = slice(None, None, max(1, case.anchors // 200_000))
-    return cut_scene(positions[some], views[some], PartitionConfig(blocks=BLOCKS), seed=0)[0], positions, views
+    return partition_scene(positions[some], views[some], PartitionConfig(blocks=BLOCKS), seed=0)[0], positions, views
 
 
 def _rows(case: Case, folder: Path) -> Work:
@@ -133,10 +133,10 @@ def _figures(case: Case, folder: Path) -> Work:
 
     def draw() -> None:
         names = ("x (m)", "y (m)")
-        block_maps.draw_visibility_map(folder / "map.png", positions, views, cameras, names)
-        block_maps.draw_blocks(folder / "blocks.png", positions, views, cameras, used, [("cut", blocks)], names)
-        block_maps.draw_block_facts(folder / "facts.png", positions, views, blocks, used, "m", blocks)
-        block_maps.draw_scores(folder / "scores.png", np.random.default_rng(0).random(used.shape), used)
+        block_maps.plot_anchor_visibility(folder / "map.png", positions, views, cameras, names)
+        block_maps.plot_blocks(folder / "blocks.png", positions, views, cameras, used, [("cut", blocks)], names)
+        block_maps.plot_block_stats(folder / "facts.png", positions, views, blocks, used, "m", blocks)
+        block_maps.plot_scores(folder / "scores.png", np.random.default_rng(0).random(used.shape), used)
 
     return draw
 
@@ -148,19 +148,19 @@ def _site_model(case: Case) -> AnchorModel:
 
 def _assignment(case: Case, folder: Path) -> Work:
     from vdgs.config.method import AssignmentConfig
-    from vdgs.partition.assignment.score_matrix import score_matrix
+    from vdgs.partition.assignment.score_matrix import compute_score_matrix
 
     model, blocks = _site_model(case), made_up.slices(made_up.extent_of(case.photographs), BLOCKS)
     cameras = made_up.flight(case.photographs)[:: max(1, case.photographs // SCORED)][:SCORED]
-    return lambda: score_matrix(model, blocks, cameras, AssignmentConfig())
+    return lambda: compute_score_matrix(model, blocks, cameras, AssignmentConfig())
 
 
 def _start(case: Case, folder: Path) -> Work:
-    from vdgs.model.scale_bounds import largest_log_scales
+    from vdgs.model.scale_bounds import max_log_scales
 
     positions = torch.from_numpy(made_up.places(case.anchors, made_up.extent_of(case.photographs)))
     cameras = made_up.flight(case.photographs)
-    return lambda: largest_log_scales(positions, cameras)
+    return lambda: max_log_scales(positions, cameras)
 
 
 def _save(case: Case, folder: Path) -> Work:
@@ -175,20 +175,20 @@ def _load(case: Case, folder: Path) -> Work:
 
 def _merge(case: Case, folder: Path) -> Work:
     from vdgs.config.method import MergeConfig
-    from vdgs.partition.blocks import places_of
-    from vdgs.partition.merging import merge
+    from vdgs.partition.blocks import xy_positions
+    from vdgs.partition.merging import merge_blocks
 
     blocks, cameras = made_up.slices(made_up.extent_of(case.photographs), BLOCKS), made_up.flight(case.photographs)
     files = [folder / f"block_{index}.safetensors" for index in range(len(blocks))]
 
     def write() -> None:
         whole = _site_model(case)
-        owner = torch.from_numpy(blocks.owner(places_of(whole.anchors.positions)))
+        owner = torch.from_numpy(blocks.owner(xy_positions(whole.anchors.positions)))
         for index, file in enumerate(files):
             AnchorModel(
                 anchors=whole.anchors.select(owner == index),
                 decoder=whole.decoder,
-                voxel=whole.voxel,
+                voxel_size=whole.voxel_size,
                 background=whole.background,
             ).save(file)
         whole.save(folder / "coarse.safetensors")
@@ -199,7 +199,7 @@ def _merge(case: Case, folder: Path) -> Work:
     def work() -> None:
         coarse = AnchorModel.load(folder / "coarse.safetensors")
         trained = [partial(AnchorModel.load, file) for file in files]
-        merged, _ = merge(coarse, trained, blocks, of_block, MergeConfig())
+        merged, _ = merge_blocks(coarse, trained, blocks, of_block, MergeConfig())
         merged.save(folder / "merged.safetensors")
 
     return work
@@ -218,12 +218,12 @@ def _open(case: Case, folder: Path) -> Work:
 
 
 def _facts(case: Case, folder: Path) -> Work:
-    from vdgs.captures.capture_metadata import capture_facts
+    from vdgs.captures.capture_metadata import capture_metadata
     from vdgs.captures.loading import load_capture
-    from vdgs.captures.validation import refuse_unsound
+    from vdgs.captures.validation import require_valid
 
     capture = load_capture(_capture(case, folder))
-    return lambda: (capture_facts(capture), refuse_unsound(capture))
+    return lambda: (capture_metadata(capture), require_valid(capture))
 
 
 def _command(case: Case, folder: Path, *words: str) -> Work:
@@ -274,7 +274,7 @@ def measure_here(case: Case) -> Measured:
     load = os.getloadavg()[0]
     with tempfile.TemporaryDirectory() as folder:
         work = STAGES[case.stage](case, Path(folder))
-        forget_peak()
+        reset_peak_memory()
         before, wall, processor = peak_memory_bytes(), time.perf_counter(), time.process_time()
         work()
         wall, processor = time.perf_counter() - wall, time.process_time() - processor

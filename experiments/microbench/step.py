@@ -32,16 +32,16 @@ import torch
 from experiments.microbench.machine import describe
 from vdgs.config.method import TrainConfig
 from vdgs.geometry.camera import Camera
-from vdgs.kernels import choose, set_threads
+from vdgs.kernels import get_backend, set_num_threads
 from vdgs.kernels.kernel_types import OrderedSplats
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.model.renderer import decode_rows_to_train, visible_rows
-from vdgs.system.checkpoints import save_state
-from vdgs.system.memory.process_memory import forget_peak, peak_memory_bytes
-from vdgs.training import Stage, Surroundings, start_state, to_saved
-from vdgs.training.optimizer import rates_at
-from vdgs.training.training_step import draw_view, move_anchors
+from vdgs.model.renderer import cull_anchors, decode_anchors_for_training
+from vdgs.system.checkpoints import save_checkpoint
+from vdgs.system.memory.process_memory import peak_memory_bytes, reset_peak_memory
+from vdgs.training import FrozenAnchors, TrainingProblem, initial_state, to_checkpoint
+from vdgs.training.optimizer import learning_rates_at
+from vdgs.training.training_step import backward_and_step, render_for_training
 
 PHASES = ("cull", "decode", "around", "rasterise", "loss", "solid", "backward", "move", "statistics")
 
@@ -85,21 +85,23 @@ def timed_phase(
 
 def one_step(
     state: Any, camera: Camera, target: torch.Tensor, step: int, times: dict[str, list[float]],
-    synchronise: Callable[[], None] | None = None, surroundings: Surroundings | None = None,
+    synchronise: Callable[[], None] | None = None, surroundings: FrozenAnchors | None = None,
 ) -> tuple[int, int]:  # fmt: skip
     """The work of vdgs.training.train_step, phase by phase, where the anchors are; `synchronise` waits for it."""
     device = state.anchors.positions.device
-    kernels, rates = choose(device), rates_at(TrainConfig().rates, 0.1)
+    kernels, rates = get_backend(device), learning_rates_at(TrainConfig().rates, 0.1)
 
     def timed(phase: str, work: Callable[[], Any]) -> Any:
         return timed_phase(times, phase, work, synchronise)
 
-    weights = state.decoder.for_image(0)
+    weights = state.decoder.weights_for_image(0)
     with torch.no_grad():
-        rows = timed("cull", lambda: visible_rows(state.anchors, camera))
-        waiting = [timed("decode", lambda: decode_rows_to_train(state.anchors, rows, weights, camera))]
+        rows = timed("cull", lambda: cull_anchors(state.anchors, camera))
+        waiting = [timed("decode", lambda: decode_anchors_for_training(state.anchors, rows, weights, camera))]
         around = timed("around", lambda: None if surroundings is None else decoded(surroundings, camera))
-        view = timed("rasterise", lambda: draw_view(waiting.pop(), camera, torch.zeros(3, device=device), around))
+        view = timed(
+            "rasterise", lambda: render_for_training(waiting.pop(), camera, torch.zeros(3, device=device), around)
+        )
     view.image.requires_grad_(True)
 
     def loss() -> torch.Tensor:
@@ -110,9 +112,9 @@ def one_step(
     gradients = timed("backward", lambda: view.backward(image_gradient, 0.01))
 
     def move() -> None:
-        states = state.optimiser.anchor_states(state.anchors, rates, TrainConfig().early)
-        move_anchors(state.anchors, rows, gradients, weights, camera, states, state.optimiser.updates)
-        state.optimiser.update_decoder(state.decoder, rates, step)
+        states = state.optimizer.anchor_states(state.anchors, rates, TrainConfig().early)
+        backward_and_step(state.anchors, rows, gradients, weights, camera, states, state.optimizer.updates)
+        state.optimizer.update_decoder(state.decoder, rates, step)
 
     timed("move", move)
     timed("statistics", lambda: kernels.add_view_statistics(
@@ -122,10 +124,10 @@ def one_step(
     return len(rows), len(view.source)
 
 
-def decoded(surroundings: Surroundings, camera: Camera) -> OrderedSplats:
+def decoded(surroundings: FrozenAnchors, camera: Camera) -> OrderedSplats:
     """What lies around a block, as the view sees it."""
-    anchors, weights = surroundings.anchors, surroundings.decoder.for_image(0)
-    return decode_rows_to_train(anchors, visible_rows(anchors, camera), weights, camera)
+    anchors, weights = surroundings.anchors, surroundings.decoder.weights_for_image(0)
+    return decode_anchors_for_training(anchors, cull_anchors(anchors, camera), weights, camera)
 
 
 def prepare(
@@ -136,24 +138,26 @@ def prepare(
     anchors = anchors.to(device)
     decoder = Decoder.initial(10, False, 0, 1, torch.Generator().manual_seed(0)).to(device)
     nothing: Any = None  # no photographs: a random target instead
-    state = start_state(
-        anchors, decoder, Stage(config=TrainConfig(), images=nothing, image_count=1, voxel=1.0, camera_height=1.0)
+    state = initial_state(
+        anchors,
+        decoder,
+        TrainingProblem(config=TrainConfig(), images=nothing, image_count=1, voxel_size=1.0, camera_height=1.0),
     )
     target = torch.randint(0, 256, (height, width, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(1))
     return state, camera, target.to(device)
 
 
-def cut(state: Any, own: float) -> tuple[Any, Surroundings]:
+def cut(state: Any, own: float) -> tuple[Any, FrozenAnchors]:
     """The training of the leftmost share of the anchors, and the others, which stay."""
     x = state.anchors.positions[:, 0]
     left = x < torch.quantile(x, own)
     nothing: Any = None
-    block = start_state(
+    block = initial_state(
         state.anchors.select(left),
         state.decoder,
-        Stage(config=TrainConfig(), images=nothing, image_count=1, voxel=1.0, camera_height=1.0),
+        TrainingProblem(config=TrainConfig(), images=nothing, image_count=1, voxel_size=1.0, camera_height=1.0),
     )
-    return block, Surroundings(state.anchors.select(~left), state.decoder.copy())
+    return block, FrozenAnchors(state.anchors.select(~left), state.decoder.copy())
 
 
 def measure(visible: int, width: int, height: int, repeats: int, own: float) -> None:
@@ -183,10 +187,10 @@ def print_peaks(visible: int, hidden: int) -> None:
     for step in range(1, 4):
         one_step(state, camera, target, step, {phase: [] for phase in PHASES})
     steps = peak_memory_bytes()
-    forget_peak()
+    reset_peak_memory()
     before = peak_memory_bytes()
     with tempfile.TemporaryDirectory() as folder:
-        save_state(Path(folder), to_saved(state))
+        save_checkpoint(Path(folder), to_checkpoint(state))
     print(imported, steps, peak_memory_bytes() - before)
 
 
@@ -211,7 +215,7 @@ def main() -> None:
     if arguments.peak:
         print_peaks(*arguments.peak)
         return
-    set_threads(arguments.threads)
+    set_num_threads(arguments.threads)
     print(describe())
     for width, height in ((400, 300), (800, 600)):
         measure(arguments.visible, width, height, arguments.repeats, arguments.own)

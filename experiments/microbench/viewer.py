@@ -31,9 +31,9 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 from support.viewer import Guest
 from vdgs.captures.camera_height import FOV_DEG
 from vdgs.geometry.camera import Camera
-from vdgs.rendering.camera_paths import look_at
+from vdgs.rendering.camera_paths import look_at_pose
 from vdgs.runs.open_run import open_run
-from vdgs.viewer.navigation import whole_scene
+from vdgs.viewer.navigation import overview_pose
 
 SERVER = "import sys\nfrom vdgs.cli.main import main\nmain(sys.argv[1:])"
 #: How often a visitor's mouse moves, a second.
@@ -42,12 +42,12 @@ MOVES = 30.0
 
 def around(run: Path, width: int, height: int):
     """A camera on a circle about the scene, by its angle in radians."""
-    stand = whole_scene(open_run(run).capture)
+    stand = overview_pose(open_run(run).capture)
     away, focal = stand.position - stand.look_at, 0.5 * height / math.tan(math.radians(FOV_DEG / 2))
 
     def camera(angle: float) -> Camera:
         turn = np.array([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1.0]])
-        pose = look_at(stand.look_at + turn @ away, stand.look_at)
+        pose = look_at_pose(stand.look_at + turn @ away, stand.look_at)
         return Camera(
             camera_from_world=pose, fx=focal, fy=focal, cx=width / 2, cy=height / 2, width=width, height=height
         )
@@ -185,7 +185,7 @@ def main() -> None:
             f"{1e3 * one['rest']:.0f} ms after the camera came to rest"
         )
         before = server.memory_info().rss
-        found = together([lambda n=n: moving(address, camera, asked.seconds, 0.7 * n) for n in range(asked.visitors)])
+        found = together([lambda n=n: moving(address, camera, asked.seconds, 0.7 * n) for n in range(asked.sessions)])
         rates, gaps = [each["rate"] for each in found], [each["gap"] for each in found]
         print(
             f"{len(found)} visitors for {asked.seconds:g} s: {min(rates):.1f} to {max(rates):.1f} pictures a second "
@@ -193,7 +193,7 @@ def main() -> None:
             f"{1e3 * max(gaps):.0f} ms; memory {before / 1e6:.0f} -> {server.memory_info().rss / 1e6:.0f} MB"
         )
         if asked.load:
-            load(address, camera, asked.visitors, asked.load, server)
+            load(address, camera, asked.sessions, asked.load, server)
     finally:
         started.process.send_signal(signal.SIGINT)
         started.process.wait()

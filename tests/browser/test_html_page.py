@@ -14,11 +14,11 @@ from support.commands import wait_until
 from support.gaussians import psnr
 from support.viewer import needs_browser, open_page
 from vdgs.export.formats import registry
-from vdgs.export.formats.export_scene import Page, Scene
+from vdgs.export.formats.export_scene import ExportScene, InitialView
 from vdgs.geometry.camera import Camera
-from vdgs.kernels.spherical_harmonics import dc_of_colours
-from vdgs.model.gaussians import Gaussians, draw_gaussians
-from vdgs.rendering.camera_paths import look_at
+from vdgs.kernels.spherical_harmonics import rgb_to_sh
+from vdgs.model.gaussians import Gaussians, render_gaussians
+from vdgs.rendering.camera_paths import look_at_pose
 
 pytestmark = [pytest.mark.browser, needs_browser, pytest.mark.xdist_group("viewer")]
 
@@ -38,19 +38,19 @@ def two_floors() -> Gaussians:
     return Gaussians(
         means=torch.from_numpy(means), log_scales=torch.tensor([0.13, 0.13, 0.02]).log().repeat(count, 1),
         quaternions=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1), logits=torch.full((count,), 5.0),
-        dc=dc_of_colours(torch.from_numpy(colours.astype(np.float32))), rest=torch.zeros(count, 0, 3),
+        dc=rgb_to_sh(torch.from_numpy(colours.astype(np.float32))), rest=torch.zeros(count, 0, 3),
     )  # fmt: skip
 
 
 def test_a_browser_without_network_draws_what_we_draw(tmp_path):
     gaussians, background = two_floors(), (0.8, 0.75, 0.5)
-    page = Page((-1.0, -8.0, 6.0), (0.0, 0.0, 0.0), background, "two floors")
-    registry.write(tmp_path / "scene.html", replace(Scene.of(gaussians), page=page))
-    pose = look_at(np.array(page.position), np.array(page.target))
+    page = InitialView((-1.0, -8.0, 6.0), (0.0, 0.0, 0.0), background, "two floors")
+    registry.write_scene(tmp_path / "scene.html", replace(ExportScene.of(gaussians), page=page))
+    pose = look_at_pose(np.array(page.position), np.array(page.target))
     focal = 0.5 * 480 / np.tan(np.radians(25))
     camera = Camera(camera_from_world=pose, fx=focal, fy=focal, cx=320.0, cy=240.0, width=640, height=480)
     with torch.no_grad():
-        expected = draw_gaussians(gaussians, camera, torch.tensor(background), 0)[0].image.clamp(0, 1).numpy()
+        expected = render_gaussians(gaussians, camera, torch.tensor(background), 0)[0].image.clamp(0, 1).numpy()
     part = slice(60, 440), slice(320, 580)  # beside what the client says of software rendering
     with open_page((tmp_path / "scene.html").as_uri(), 640, 480, offline=True) as shown:
 

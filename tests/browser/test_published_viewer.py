@@ -24,7 +24,7 @@ from support.commands import wait_until
 from support.gaussians import overhead, picture, psnr, random_gaussians
 from support.viewer import needs_browser, open_page
 from vdgs.export.formats import registry
-from vdgs.export.formats.export_scene import Scene
+from vdgs.export.formats.export_scene import ExportScene
 
 pytestmark = [pytest.mark.browser, needs_browser]
 
@@ -81,7 +81,7 @@ def served(folder: Path) -> Iterator[str]:
 )
 def test_a_published_viewer_shows_what_we_draw(tmp_path):
     gaussians, camera = random_gaussians(300, 2), overhead(size=SIZE)
-    registry.write(tmp_path / "scene.ply", Scene.of(gaussians))
+    registry.write_scene(tmp_path / "scene.ply", ExportScene.of(gaussians))
     (tmp_path / "node_modules").symlink_to(MODULES.resolve())
     view = {
         "position": camera.position.tolist(), "target": (camera.position + camera.forward).tolist(),

@@ -18,7 +18,7 @@ from support.commands import wait_until
 from support.viewer import expected, needs_browser, open_page, quiet, trained
 from vdgs.geometry.camera import Camera
 from vdgs.runs.open_run import open_run
-from vdgs.viewer.client_session import NAMES, Visitor
+from vdgs.viewer.client_session import LAYER_LABELS, ClientSession
 from vdgs.viewer.server import serve
 
 pytestmark = [pytest.mark.browser, needs_browser, pytest.mark.xdist_group("viewer")]
@@ -40,7 +40,7 @@ def viewer(run):
         yield opened
 
 
-def in_window(visitor: Visitor) -> Camera | None:
+def in_window(visitor: ClientSession) -> Camera | None:
     """Where a visitor stands, with the pixels of the whole window: a browser that is short of time asks for fewer,
     and shows them as large. None until it has laid out its window."""
     camera = visitor.camera
@@ -56,10 +56,10 @@ def beside_the_panel(picture: np.ndarray) -> np.ndarray:
 
 @quiet
 def test_a_browser_shows_the_scene(viewer):
-    wait_until(lambda: not viewer.visitors)
+    wait_until(lambda: not viewer.sessions)
     with open_page(viewer.door.address(), *WINDOW) as page:
-        wait_until(lambda: viewer.visitors)
-        (visitor,) = viewer.visitors.values()
+        wait_until(lambda: viewer.sessions)
+        (visitor,) = viewer.sessions.values()
         wait_until(lambda: in_window(visitor))
 
         def differs() -> float:
@@ -82,24 +82,24 @@ def test_a_browser_shows_the_scene(viewer):
 
 @quiet
 def test_a_browser_shows_every_layer_and_goes_where_buttons_lead(viewer):
-    wait_until(lambda: not viewer.visitors)
+    wait_until(lambda: not viewer.sessions)
     with open_page(viewer.door.address(), *WINDOW) as page:
-        wait_until(lambda: viewer.visitors)
-        (visitor,) = viewer.visitors.values()
+        wait_until(lambda: viewer.sessions)
+        (visitor,) = viewer.sessions.values()
         wait_until(lambda: in_window(visitor))
 
         def painted() -> np.ndarray:
             """What the visitor should see now."""
             camera = in_window(visitor)
-            return beside_the_panel(visitor.errand(lambda: visitor.painter.paint(visitor.shown, camera, camera)))
+            return beside_the_panel(visitor.submit(lambda: visitor.painter.paint(visitor.shown, camera, camera)))
 
         def seen() -> np.ndarray:
             return beside_the_panel(page.screenshot())
 
         shown = {}
-        for name in NAMES:
+        for name in LAYER_LABELS:
             visitor._layer.value = name
-            wait_until(lambda name=name: visitor.shown.layer == NAMES[name])
+            wait_until(lambda name=name: visitor.shown.layer == LAYER_LABELS[name])
             wait_until(lambda: np.abs(seen() - painted()).mean() < 6)
             shown[name] = seen()
         for one, other in combinations(shown, 2):

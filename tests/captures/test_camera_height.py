@@ -15,7 +15,7 @@ from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.method import TrainConfig
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.ground_frame import GroundFrame
-from vdgs.training import Stage
+from vdgs.training import TrainingProblem
 from vdgs.training.training_loop import _volume_weight
 
 
@@ -27,7 +27,7 @@ def capture_of(scene: TinyScene) -> Capture:
     )
     frame = GroundFrame(scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, how="as it is")
     return Capture(
-        root=Path(), source="colmap", images="images", views=views, points=scene.points, point_colours=scene.colours,
+        root=Path(), source="colmap", images="images", views=views, points=scene.points, point_colors=scene.colours,
         ground=frame,
     )  # fmt: skip
 
@@ -55,7 +55,9 @@ def plain_height(capture: Capture) -> float:
 def volume_weight(capture: Capture) -> float:
     nothing: object = None  # no photographs
     return _volume_weight(
-        Stage(config=TrainConfig(), images=nothing, image_count=1, voxel=1.0, camera_height=camera_height(capture))
+        TrainingProblem(
+            config=TrainConfig(), images=nothing, image_count=1, voxel_size=1.0, camera_height=camera_height(capture)
+        )
     )  # type: ignore[arg-type]
 
 
@@ -77,7 +79,7 @@ def test_cameras_that_look_up_give_volumes_the_weight_of_their_distance(below):
     capture = capture_of(about_a_tower(below))
     assert plain_height(capture) <= 0
     assert 20 < camera_height(capture) < 32
-    from_above = TrainConfig().loss.volume_weight / (25 / 10) ** 3  # a flight 25 above the ground
+    from_above = TrainConfig().loss.volume_reg / (25 / 10) ** 3  # a flight 25 above the ground
     assert 0.4 * from_above < volume_weight(capture) < 2 * from_above
 
 

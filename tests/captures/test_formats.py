@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from support.captures import TinyScene, moved, tiny_scene, to_source, write_colmap, write_images, write_ply
 from support.dataset_layouts import DRB, OPENGL, halves, matrixcity_frames, write_matrixcity, write_mega_nerf
 from vdgs.captures.capture import Capture
-from vdgs.captures.formats.json_poses import intrinsics_of
+from vdgs.captures.formats.json_poses import parse_intrinsics
 from vdgs.captures.formats.ply_reader import read_point_cloud
 from vdgs.captures.formats.source_capture import Intrinsics
 from vdgs.captures.loading import load_capture
@@ -35,7 +35,7 @@ def assert_sees_the_scene(capture: Capture, scene: TinyScene, rename=lambda name
     """Every point falls on the same pixel as in the scene that was written."""
     assert len(capture.views) == len(scene.cameras)
     assert len(capture.points) == len(scene.points)
-    np.testing.assert_array_equal(capture.point_colours, scene.colours)
+    np.testing.assert_array_equal(capture.point_colors, scene.colours)
     for view in capture.views:
         camera = scene.cameras[rename(view.name)]
         expected, depth = camera.project(scene.points)
@@ -237,7 +237,7 @@ def test_fisheyes_are_read_as_such(says):
     """nerfstudio names the model; instant-ngp knows `is_fisheye` and no model. Both mean k1...k4 of OpenCV's."""
     lens = {"fl_x": 50.0, "fl_y": 51.0, "cx": 32.0, "cy": 24.0, "w": 64, "h": 48}
     lens |= {"k1": 0.04, "k2": 0.03, "k3": 0.02, "k4": 0.01}
-    found = intrinsics_of({}, lens | says, Path("a.png"), Path("transforms.json"))
+    found = parse_intrinsics({}, lens | says, Path("a.png"), Path("transforms.json"))
     assert found == Intrinsics("OPENCV_FISHEYE", (50.0, 51.0, 32.0, 24.0, 0.04, 0.03, 0.02, 0.01), 64, 48)
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from support.captures import data_folder, moved, tiny_scene, to_source, write_colmap
 from vdgs.captures.formats.source_capture import Intrinsics, SourceCapture, SourceView
-from vdgs.captures.ground_estimation import CAMERA_HEIGHT, find_ground_frame, rotation_to_z, transform_pose
+from vdgs.captures.ground_estimation import NOMINAL_CAMERA_HEIGHT, find_ground_frame, rotation_to_z, transform_pose
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -71,7 +71,7 @@ def test_the_estimated_up_axis_is_up(tmp_path_factory, seed):
     assert (frame.rotation @ rotation)[2, 2] > np.cos(np.radians(3))
     assert not warnings
     heights = [frame.to_ground(camera.position[None])[0, 2] for camera in scene.cameras.values()]
-    assert np.median(heights) == pytest.approx(CAMERA_HEIGHT)
+    assert np.median(heights) == pytest.approx(NOMINAL_CAMERA_HEIGHT)
     assert np.median(frame.to_ground(scene.points)[:, 2]) == pytest.approx(0, abs=1e-9)
     assert not frame.metric
 
@@ -301,7 +301,7 @@ def test_on_real_flights_the_estimate_agrees_with_the_georeference(name, degrees
             for v in capture.views
         ),
         points=capture.points,
-        colours=capture.point_colours,
+        colours=capture.point_colors,
     )
     frame, _ = find_ground_frame(source, folder / "sparse", CaptureOptions())
     assert np.degrees(np.arccos(frame.rotation[2, 2])) < degrees

@@ -12,8 +12,8 @@ import torch
 from PIL import Image
 
 from vdgs.captures.capture import View
-from vdgs.captures.image_cache import ImageCache, load_picture
-from vdgs.captures.image_files import decode_mask, decode_photograph, read_header
+from vdgs.captures.image_cache import ImageCache, load_image
+from vdgs.captures.image_files import decode_image, decode_mask, read_header
 from vdgs.errors import CaptureError
 from vdgs.geometry.camera import Camera
 
@@ -93,9 +93,9 @@ def test_prefetched_pictures_are_ready_and_decoded_once(views, monkeypatch):
 
     def counting(view):
         decoded.append(threading.current_thread().name)
-        return load_picture(view)
+        return load_image(view)
 
-    monkeypatch.setattr("vdgs.captures.image_cache.load_picture", counting)
+    monkeypatch.setattr("vdgs.captures.image_cache.load_image", counting)
     with ImageCache(views, 10**6) as cache:
         cache.prefetch([4, 5, 6, 4])
         for index in (4, 5, 6):
@@ -165,21 +165,21 @@ def test_grey_sixteen_bit_alpha_and_palette(tmp_path):
     rgb = picture()
     deep = (rgb.astype(np.uint16) * 257)[:, :, ::-1]
     cv2.imwrite(str(tmp_path / "deep.png"), deep)
-    np.testing.assert_array_equal(decode_photograph(tmp_path / "deep.png")[0], rgb)
+    np.testing.assert_array_equal(decode_image(tmp_path / "deep.png")[0], rgb)
     Image.fromarray(rgb[:, :, 0]).save(tmp_path / "grey.png")
-    np.testing.assert_array_equal(decode_photograph(tmp_path / "grey.png")[0], np.repeat(rgb[:, :, :1], 3, axis=2))
+    np.testing.assert_array_equal(decode_image(tmp_path / "grey.png")[0], np.repeat(rgb[:, :, :1], 3, axis=2))
     alpha = np.full((HEIGHT, WIDTH, 1), 255, np.uint8)
     Image.fromarray(np.concatenate([rgb, alpha], axis=2)).save(tmp_path / "opaque.png")
-    pixels, opaque = decode_photograph(tmp_path / "opaque.png")
+    pixels, opaque = decode_image(tmp_path / "opaque.png")
     np.testing.assert_array_equal(pixels, rgb)
     assert opaque is None
     alpha[:, :20] = 0
     Image.fromarray(np.concatenate([rgb, alpha], axis=2)).save(tmp_path / "holes.png")
-    _, opaque = decode_photograph(tmp_path / "holes.png")
+    _, opaque = decode_image(tmp_path / "holes.png")
     assert opaque is not None
     np.testing.assert_array_equal(opaque, alpha[:, :, 0] > 0)
     Image.fromarray(rgb).quantize(8).save(tmp_path / "palette.png")
-    assert decode_photograph(tmp_path / "palette.png")[0].shape == rgb.shape
+    assert decode_image(tmp_path / "palette.png")[0].shape == rgb.shape
     Image.fromarray(rgb).convert("CMYK").save(tmp_path / "print.jpg")
     with pytest.raises(CaptureError, match="CMYK; convert"):
         read_header(tmp_path / "print.jpg")
@@ -190,7 +190,7 @@ def test_exif_orientation_is_not_applied(tmp_path):
     exif = Image.Exif()
     exif[0x0112] = 6
     Image.fromarray(picture()).save(tmp_path / "turned.jpg", exif=exif, quality=95)
-    assert decode_photograph(tmp_path / "turned.jpg")[0].shape == (HEIGHT, WIDTH, 3)
+    assert decode_image(tmp_path / "turned.jpg")[0].shape == (HEIGHT, WIDTH, 3)
     assert read_header(tmp_path / "turned.jpg").width == WIDTH
 
 
@@ -227,7 +227,7 @@ def test_damaged_files_end_in_a_picture_or_in_an_error_that_names_them(tmp_path,
             damaged[position] ^= 1 << int(generator.integers(0, 8))
         file = tmp_path / f"damaged{suffix}"
         file.write_bytes(bytes(damaged))
-        for read in (read_header, decode_photograph):
+        for read in (read_header, decode_image):
             try:
                 read(file)
             except CaptureError as error:

@@ -17,12 +17,12 @@ from PIL import Image
 from support.captures import TinyScene, data_folder, render_plane, tiny_scene, write_colmap, write_images
 from vdgs.captures import undistortion
 from vdgs.captures.formats.source_capture import Intrinsics, SourceView
-from vdgs.captures.image_cache import load_picture
+from vdgs.captures.image_cache import load_image
 from vdgs.captures.image_checks import check_images
-from vdgs.captures.image_files import decode_photograph
-from vdgs.captures.image_matching import fit_to_image, scaled
+from vdgs.captures.image_files import decode_image
+from vdgs.captures.image_matching import fit_to_image, scale_intrinsics
 from vdgs.captures.loading import load_capture
-from vdgs.captures.undistortion import ImageFile, pinhole_for, sampling_map
+from vdgs.captures.undistortion import ImageFile, sampling_map, undistorted_pinhole
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 
@@ -65,11 +65,11 @@ def test_pixels_cameras_and_points_agree(folder, scene):
     capture = load_capture(folder, UP)
     differences = []
     for view in capture.views:
-        image = load_picture(view).image.numpy()
+        image = load_image(view).image.numpy()
         pixels, _ = view.camera.project(capture.points)
-        inside = view.camera.sees(capture.points)
+        inside = view.camera.in_frustum(capture.points)
         x, y = pixels[inside].astype(int).T
-        differences.append(np.abs(image[y, x].astype(int) - capture.point_colours[inside]).mean())
+        differences.append(np.abs(image[y, x].astype(int) - capture.point_colors[inside]).mean())
     assert np.mean(differences) < 12
 
 
@@ -93,7 +93,7 @@ def test_cameras_follow_the_actual_image_size(folder, scene):
         assert (b.camera.width, b.camera.height) == (16, 12)
         assert b.camera.fx == pytest.approx(a.camera.fx / 4)
         assert c.camera.cx == pytest.approx(a.camera.cx / 2)
-        assert load_picture(c).image.shape == (24, 32, 3)
+        assert load_image(c).image.shape == (24, 32, 3)
 
 
 @given(st.integers(100, 5000), st.integers(100, 5000), st.integers(1, 8), st.booleans())
@@ -130,9 +130,9 @@ def test_up_to_ten_images_that_do_not_fit_are_listed(folder, scene):
 
 def test_scaling_keeps_lens_parameters_and_the_field_of_view():
     lens = Intrinsics("OPENCV", (800.0, 810.0, 320.0, 240.0, 0.1, 0.01, 0.001, 0.002), 640, 480)
-    half = scaled(lens, 320, 240)
+    half = scale_intrinsics(lens, 320, 240)
     assert half.params == (400.0, 405.0, 160.0, 120.0, 0.1, 0.01, 0.001, 0.002)
-    single = scaled(Intrinsics("SIMPLE_RADIAL", (800.0, 320.0, 240.0, 0.1), 640, 480), 320, 240)
+    single = scale_intrinsics(Intrinsics("SIMPLE_RADIAL", (800.0, 320.0, 240.0, 0.1), 640, 480), 320, 240)
     assert single == Intrinsics("SIMPLE_RADIAL", (400.0, 160.0, 120.0, 0.1), 320, 240)
 
 
@@ -294,7 +294,7 @@ def test_a_list_saved_with_a_byte_order_mark_is_the_same_list(folder, scene):
 def test_photographs_are_shrunk_by_any_factor(folder, downscale):
     """Sides are rounded down, so that they are not those of the camera to the last digit."""
     for view in load_capture(folder, up(downscale=downscale)).views:
-        assert load_picture(view).image.shape == (view.camera.height, view.camera.width, 3)
+        assert load_image(view).image.shape == (view.camera.height, view.camera.width, 3)
 
 
 def test_photographs_are_not_shrunk_to_nothing(folder):
@@ -309,7 +309,7 @@ def test_max_images_keeps_a_compact_patch_and_what_it_sees(folder):
     farthest = max(np.linalg.norm(view.camera.position - middle) for view in part.views)
     left_out = [view for view in whole.views if view.name not in {v.name for v in part.views}]
     assert all(np.linalg.norm(view.camera.position - middle) >= farthest - 1e-9 for view in left_out)
-    assert all(any(view.camera.sees(point[None])[0] for view in part.views) for point in part.points)
+    assert all(any(view.camera.in_frustum(point[None])[0] for view in part.views) for point in part.points)
 
 
 # ------------------------------------------------------------------------------------- pixels and lenses
@@ -350,7 +350,7 @@ def test_grey_photographs_and_masks_of_sixteen_bits_pass_the_check(folder, scene
     (folder / "masks").mkdir()
     cv2.imwrite(str(folder / "masks" / first), keep)
     checked = check_images(load_capture(folder, UP))
-    assert (checked.files, checked.masked_share) == (13, pytest.approx(0.5 / 12))
+    assert (checked.files, checked.masked_fraction) == (13, pytest.approx(0.5 / 12))
     assert [each for each in checked.warnings if "one colour only" in each] == [
         f"photographs of one colour only, which teach nothing but that: 1 ({third})."
     ]
@@ -397,9 +397,9 @@ def test_undistorting_gives_the_pinhole_picture(tmp_path, model, extra):
     assert any("undistorted into" in warning for warning in capture.warnings)
     for view in capture.views:
         truth = replace(view.camera, camera_from_world=scene.cameras[view.name].camera_from_world)
-        straight = decode_photograph(view.image_path)[0].astype(float)
+        straight = decode_image(view.image_path)[0].astype(float)
         assert np.abs(straight - render_plane(truth)).mean() < 3.0
-    mask = load_picture(capture.views[2]).mask
+    mask = load_image(capture.views[2]).mask
     assert mask is not None
     assert mask.float().mean() == pytest.approx(0.5, abs=0.03)
     assert mask[:, :60].all()
@@ -427,15 +427,15 @@ def test_the_map_of_a_lens_is_made_once_for_all_its_photographs(tmp_path, monkey
     assert [photo.name for photo in straight] == [photo.name for photo in photographs]
     for photo, before in zip(straight, photographs, strict=True):  # each by its own lens, whose sizes differ
         lens = before.intrinsics
-        assert photo.intrinsics == (pinhole_for(lens) if lens.distorted else lens)
-        assert decode_photograph(photo.path)[0].shape[1::-1] == (photo.intrinsics.width, photo.intrinsics.height)
+        assert photo.intrinsics == (undistorted_pinhole(lens) if lens.is_distorted else lens)
+        assert decode_image(photo.path)[0].shape[1::-1] == (photo.intrinsics.width, photo.intrinsics.height)
     assert undistortion.undistort(tmp_path / "straight", photographs) == straight
     assert asked == lenses
 
 
 def test_a_map_takes_little_more_memory_than_itself():
     lens = Intrinsics("OPENCV", (900.0, 905.0, 640.0, 480.0, -0.1, 0.02, 0.004, -0.003), 1280, 960)
-    pinhole = pinhole_for(lens)
+    pinhole = undistorted_pinhole(lens)
     tracemalloc.start()
     whole = sampling_map(lens, pinhole)
     peak = tracemalloc.get_traced_memory()[1]

@@ -16,11 +16,11 @@ from support.captures import tiny_scene, write_colmap
 from support.flights import write_photograph
 from vdgs.captures.georeference import match_gps, read_gps
 from vdgs.captures.loading import load_capture
-from vdgs.captures.name_resolution import Lookup, Names, listable, without_suffix
+from vdgs.captures.name_resolution import ImageNameIndex, NameLookup, match_key, to_colmap_name
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
-from vdgs.sfm.gps_priors import find_positions
-from vdgs.sfm.image_list import collect
+from vdgs.sfm.gps_priors import read_gps_priors
+from vdgs.sfm.image_list import collect_images
 
 #: Two photographs of one name, as cards have them.
 CARD = ["100MEDIA/DJI_0001.JPG", "100MEDIA/DJI_0002.JPG", "101MEDIA/DJI_0001.JPG"]
@@ -92,13 +92,13 @@ def test_other_folders_and_extensions_still_match(tmp_path):
 
 def test_blanks_and_accents_are_alike_in_tables_and_photographs(tmp_path):
     folder = card(tmp_path / "card", "höhe  0.jpg", "x 1.jpg", apart("é/x 1.jpg"))
-    names = [photo.name for photo in collect([folder]).photographs]
+    names = [photo.name for photo in collect_images([folder]).photographs]
     assert names == ["höhe__0.jpg", "x_1.jpg", "é/x_1.jpg"]
     table = tmp_path / "gps.csv"
     rows = ["Höhe  0.jpg,1", "x 1.jpg,1.1", "É/x 1.jpg,1.2"]
     for way in (lambda text: text, apart):
         table.write_text(way("name,lat,lon,alt\n" + "".join(f"{row},20,5\n" for row in rows)), encoding="utf-8")
-        found = find_positions(collect([folder]).photographs, table, (1, 2))
+        found = read_gps_priors(collect_images([folder]).photographs, table, (1, 2))
         assert found.index.tolist() == [0, 1, 2]
         assert np.diff(found.enu[:, 1]) == pytest.approx([11e3, 11e3], rel=0.02)
 
@@ -106,10 +106,10 @@ def test_blanks_and_accents_are_alike_in_tables_and_photographs(tmp_path):
 @given(st.lists(st.text("ab é\u0301.", min_size=1, max_size=4), min_size=1, max_size=3))
 def test_every_name_finds_itself_however_its_letters_are_written(parts):
     name = "/".join(parts)
-    lookup = Lookup([(name, 1), ("other.jpg", 2)])
-    for written in (name, apart(name), listable(name), listable(name).upper()):
+    lookup = NameLookup([(name, 1), ("other.jpg", 2)])
+    for written in (name, apart(name), to_colmap_name(name), to_colmap_name(name).upper()):
         assert 1 in lookup.find(written)[1]
-    assert without_suffix(apart(name)) == without_suffix(name)
+    assert match_key(apart(name)) == match_key(name)
 
 
 # ------------------------------------------------------------------------------------------- cards, captures
@@ -121,12 +121,12 @@ def test_names_that_become_one_are_refused(tmp_path, names):
     if len(list(folder.iterdir())) < 4:
         pytest.skip("this file system holds one of the two only")
     with pytest.raises(CaptureError, match=r"would be called .* Rename one of the two"):
-        collect([folder])
+        collect_images([folder])
 
 
 def test_folders_that_become_one_are_numbered(tmp_path):
     card(tmp_path, *(f"{folder}/x.jpg" for folder in ("a b", "a_b")), "a_b/y.jpg")
-    seen = collect([tmp_path / "a b", tmp_path / "a_b"])
+    seen = collect_images([tmp_path / "a b", tmp_path / "a_b"])
     assert {photo.name.split("/")[0] for photo in seen.photographs} == {"a_b_1", "a_b_2"}
 
 
@@ -147,6 +147,6 @@ def test_images_and_masks_are_found_however_their_letters_are_written(tmp_path):
 
 
 def test_the_same_letters_come_before_the_same_stem():
-    names = Names({apart("é.jpg"): Path(), "é.png": Path()})
+    names = ImageNameIndex({apart("é.jpg"): Path(), "é.png": Path()})
     assert names.find("é.jpg") == apart("é.jpg")
     assert names.find("é.tif") is None

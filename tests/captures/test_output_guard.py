@@ -10,18 +10,18 @@ import pytest
 from rich.console import Console
 
 from experiments.bench.bench import BenchSettings, run_bench
-from experiments.bench.plan import Choices
+from experiments.bench.plan import PlanOptions
 from support.captures import tiny_scene, write_colmap
 from support.dataset_layouts import write_mega_nerf
 from vdgs.captures.loading import load_capture
-from vdgs.captures.output_guard import refuse_among_inputs, refuse_in_a_capture
+from vdgs.captures.output_guard import check_not_among_inputs, check_not_in_capture
 from vdgs.config.capture_options import CaptureOptions
-from vdgs.config.commands import MapRequest
+from vdgs.config.commands import OrthoRequest
 from vdgs.config.presets import PRESETS
 from vdgs.errors import VdgsError
-from vdgs.rendering.ortho.render_ortho import map_run
+from vdgs.rendering.ortho.render_ortho import render_ortho
 from vdgs.report.capture_report import inspect_capture
-from vdgs.runs.create_or_resume import begin_run
+from vdgs.runs.create_or_resume import create_or_resume_run
 from vdgs.runs.run_context import RunContext
 from vdgs.synth import SynthOptions, generate
 
@@ -45,14 +45,14 @@ INSIDE = ("images_4", "images_4/run", "images_4/film.mp4", "masks", "masks/new/r
 @pytest.mark.parametrize("inside", INSIDE)
 def test_inputs_of_any_capture_are_known_without_reading_it(root: Path, inside: str) -> None:
     with pytest.raises(VdgsError, match="is for inputs of the capture"):
-        refuse_in_a_capture(root / inside)
+        check_not_in_capture(root / inside)
 
 
 @pytest.mark.parametrize("beside", ["", "run", "renders/images", "images_by_me", "undistorted/images", "film.mp4"])
 def test_other_places_in_a_capture_are_free(root: Path, beside: str) -> None:
     before, capture = contents(root), load_capture(root)
-    refuse_in_a_capture(root / beside)  # raises nothing
-    refuse_among_inputs(root / beside, capture)
+    check_not_in_capture(root / beside)  # raises nothing
+    check_not_among_inputs(root / beside, capture)
     assert contents(root) == before  # nor makes what it was asked about
 
 
@@ -62,7 +62,7 @@ def test_relative_names_and_links_lead_to_the_same_folder(root: Path, monkeypatc
     monkeypatch.chdir(root / "sparse")
     for name in ("../images_4", "../../link/run", "../../film.mp4", "../../link/../images_4"):
         with pytest.raises(VdgsError, match="images_4"):
-            refuse_in_a_capture(Path(name))
+            check_not_in_capture(Path(name))
 
 
 def test_photographs_elsewhere_and_under_other_names_are_known(root: Path, tmp_path: Path) -> None:
@@ -72,8 +72,8 @@ def test_photographs_elsewhere_and_under_other_names_are_known(root: Path, tmp_p
     capture = load_capture(root, CaptureOptions(images="photos"))
     for output in (store, store / "run", root / "photos" / "run"):
         with pytest.raises(VdgsError, match="is for inputs"):
-            refuse_among_inputs(output, capture)
-    refuse_among_inputs(tmp_path / "card" / "run", capture)
+            check_not_among_inputs(output, capture)
+    check_not_among_inputs(tmp_path / "card" / "run", capture)
 
 
 def test_what_single_photographs_are_links_to_is_known(root: Path, tmp_path: Path) -> None:
@@ -82,7 +82,7 @@ def test_what_single_photographs_are_links_to_is_known(root: Path, tmp_path: Pat
     shutil.move(photograph, tmp_path / "store")
     photograph.symlink_to(tmp_path / "store" / photograph.name)
     with pytest.raises(VdgsError, match="store"):
-        refuse_among_inputs(tmp_path / "store", load_capture(root))
+        check_not_among_inputs(tmp_path / "store", load_capture(root))
 
 
 def test_photographs_in_the_root_leave_folders_beside_them_free(tmp_path: Path) -> None:
@@ -90,20 +90,20 @@ def test_photographs_in_the_root_leave_folders_beside_them_free(tmp_path: Path) 
     for photograph in (tmp_path / "flat" / "images").iterdir():
         shutil.move(photograph, tmp_path / "flat")
     capture = load_capture(tmp_path / "flat", CaptureOptions(images="."))
-    refuse_among_inputs(tmp_path / "flat" / "run", capture)
+    check_not_among_inputs(tmp_path / "flat" / "run", capture)
     with pytest.raises(VdgsError, match="is for inputs"):
-        refuse_among_inputs(tmp_path / "flat", capture)
+        check_not_among_inputs(tmp_path / "flat", capture)
 
 
 def test_the_layout_of_mega_nerf_is_known(tmp_path: Path) -> None:
     write_mega_nerf(tmp_path / "mill", tiny_scene())
     for inside in ("train/rgbs", "val/rgbs/run", "train/metadata"):
         with pytest.raises(VdgsError, match="is for inputs"):
-            refuse_in_a_capture(tmp_path / "mill" / inside)
+            check_not_in_capture(tmp_path / "mill" / inside)
 
 
 def begin(root: Path, output: Path) -> None:
-    begin_run(root, output, CaptureOptions(), PRESETS["laptop"])
+    create_or_resume_run(root, output, CaptureOptions(), PRESETS["laptop"])
 
 
 def inspect(root: Path, output: Path) -> None:
@@ -115,13 +115,13 @@ def synth(_: Path, output: Path) -> None:
 
 
 def bench(_: Path, output: Path) -> None:
-    run_bench(BenchSettings("toy", output, Choices()), Console(quiet=True))
+    run_bench(BenchSettings("toy", output, PlanOptions()), Console(quiet=True))
 
 
 def map_scene(root: Path, output: Path) -> None:
     pytest.importorskip("rasterio")
-    asked = MapRequest(run=root.parent / "run", output=output)
-    map_run(RunContext.from_path(asked.run), asked, Console(quiet=True))
+    asked = OrthoRequest(run=root.parent / "run", output=output)
+    render_ortho(RunContext.from_path(asked.run), asked, Console(quiet=True))
 
 
 @pytest.mark.parametrize("verb", [begin, inspect, synth, bench, map_scene])
@@ -147,5 +147,5 @@ def test_a_folder_that_cannot_be_read_is_no_capture(tmp_path: Path, monkeypatch:
         raise PermissionError(13, os.strerror(13), str(path))
 
     monkeypatch.setattr("vdgs.captures.output_guard.find_models", refuse)
-    refuse_in_a_capture(tmp_path / "images" / "run")
+    check_not_in_capture(tmp_path / "images" / "run")
     assert not list(tmp_path.iterdir())

@@ -16,23 +16,23 @@ from hypothesis import strategies as st
 
 from support.captures import TinyScene, render_plane, tiny_scene, write_colmap
 from support.commands import vdgs
-from vdgs.captures.capture import Sightings, View
-from vdgs.captures.formats.colmap_records import SIGHTINGS, some_of
-from vdgs.captures.image_cache import ImageCache, Picture
-from vdgs.captures.photometric_gains import LEAST_LIGHT, PointColours, point_colours
+from vdgs.captures.capture import Observations, View
+from vdgs.captures.formats.colmap_records import MAX_OBSERVATIONS, sample_observations
+from vdgs.captures.image_cache import DecodedImage, ImageCache
+from vdgs.captures.photometric_gains import LOG_OFFSET, PointColors, collect_point_colors
 from vdgs.config.presets import PRESETS
 from vdgs.model.anchor_model import AnchorModel
 
 SCENE = tiny_scene(columns=5, rows=4)
 CAMERAS = list(SCENE.cameras.values())
-SPREAD = PRESETS["laptop"].training.exposure_spread
+SPREAD = PRESETS["laptop"].training.exposure_min_spread
 
 
 def views_of(scene: TinyScene) -> list[View]:
     """Views that know all points in their pictures."""
     views = []
     for name, camera in scene.cameras.items():
-        numbers = np.flatnonzero(camera.sees(scene.points))
+        numbers = np.flatnonzero(camera.in_frustum(scene.points))
         pixels, _ = camera.project(scene.points[numbers])
         rays = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
         views.append(
@@ -42,7 +42,7 @@ def views_of(scene: TinyScene) -> list[View]:
                 image_path=Path(name),
                 mask_path=None,
                 split="train",
-                sightings=Sightings(scene.points[numbers], rays, numbers),
+                sightings=Observations(scene.points[numbers], rays, numbers),
             )
         )
     return views
@@ -58,7 +58,7 @@ class Photographed(ImageCache):
 
     def __init__(
         self, gains: np.ndarray, views: Sequence[View] = VIEWS, downscales: Sequence[float] = (1,),
-        change: Callable[[int, np.ndarray], Picture] = lambda _, picture: Picture(torch.from_numpy(picture), None),
+        change: Callable[[int, np.ndarray], DecodedImage] = lambda _, picture: DecodedImage(torch.from_numpy(picture), None),
     ) -> None:  # fmt: skip
         super().__init__(views, 0, downscales)
         self.gains, self.change, self.asked = gains, change, set[tuple[int, float]]()
@@ -66,14 +66,14 @@ class Photographed(ImageCache):
     def prefetch(self, indices: Iterable[int], downscale: float = 1) -> None:
         pass
 
-    def get(self, index: int, downscale: float = 1) -> Picture:
+    def get(self, index: int, downscale: float = 1) -> DecodedImage:
         self.asked.add((index, downscale))
-        light = 0.5 * (render_plane(self.camera(index, downscale)) + LEAST_LIGHT) * np.exp(self.gains[index])
-        return self.change(index, (light - LEAST_LIGHT).round().clip(0, 255).astype(np.uint8))
+        light = 0.5 * (render_plane(self.camera(index, downscale)) + LOG_OFFSET) * np.exp(self.gains[index])
+        return self.change(index, (light - LOG_OFFSET).round().clip(0, 255).astype(np.uint8))
 
 
-def looked_at(images: ImageCache) -> PointColours:
-    colours = point_colours(images, lambda _done, _of: None)
+def looked_at(images: ImageCache) -> PointColors:
+    colours = collect_point_colors(images, lambda _done, _of: None)
     assert colours is not None
     return colours
 
@@ -95,14 +95,14 @@ def test_gains_are_found_whatever_the_place_looks_like(seed, size):
     found = np.stack(list(colours.gains().values()))
     assert np.abs(found - gains).max() < 0.02 + 0.05 * size  # points lie beside the middles of pixels
     of_uniform = size / np.sqrt(3)
-    assert 0.6 * of_uniform - 0.01 < colours.difference() < 1.2 * of_uniform + 0.01
+    assert 0.6 * of_uniform - 0.01 < colours.gain_spread() < 1.2 * of_uniform + 0.01
 
 
 def test_photographs_of_one_exposure_are_equally_bright():
-    assert looked_at(Photographed(NONE)).difference() < 0.007 < SPREAD
+    assert looked_at(Photographed(NONE)).gain_spread() < 0.007 < SPREAD
 
 
-def chain(drift: float, count: int, sees: int = 6, noise: float = 0.02) -> PointColours:
+def chain(drift: float, count: int, sees: int = 6, noise: float = 0.02) -> PointColors:
     """A flight of one strip, whose every photograph is brighter than the last by `drift`: new points enter each, 40 of
     them, and stay for the next ones."""
     generator = np.random.default_rng(count)
@@ -112,48 +112,48 @@ def chain(drift: float, count: int, sees: int = 6, noise: float = 0.02) -> Point
     look = generator.uniform(0, 5, (len(first), 3))[point]
     colour = look + (drift * image)[:, None] + generator.normal(0, noise, (len(image), 3))
     order = np.argsort(image, kind="stable")
-    return PointColours(image[order], point[order], colour[order])
+    return PointColors(image[order], point[order], colour[order])
 
 
 @pytest.mark.parametrize("count", [20, 100, 1000])
 def test_a_drift_counts_by_what_it_makes_in_one_place_however_long_the_flight(count):
     """Six photographs show a place: 0 to 5 times the drift, whose standard deviation is 1.87 drifts."""
-    assert chain(0.02, count).difference() == pytest.approx(0.02 * np.std(range(6), ddof=1), rel=0.1)
-    assert chain(0.0, count).difference() < 0.004
+    assert chain(0.02, count).gain_spread() == pytest.approx(0.02 * np.std(range(6), ddof=1), rel=0.1)
+    assert chain(0.0, count).gain_spread() < 0.004
 
 
 def test_what_moves_before_a_photograph_hardly_makes_it_brighter():
     """A quarter of a photograph is white: the mean of its colours is brighter by more than 0.25."""
 
-    def hidden(index: int, picture: np.ndarray) -> Picture:
+    def hidden(index: int, picture: np.ndarray) -> DecodedImage:
         if index == 3:
             picture[:, : picture.shape[1] // 4] = 255
-        return Picture(torch.from_numpy(picture), None)
+        return DecodedImage(torch.from_numpy(picture), None)
 
     shown = [Photographed(NONE, change=change).get(3).image.numpy() for change in (whole, hidden)]
-    before, after = (np.log(each + LEAST_LIGHT).mean() for each in shown)
+    before, after = (np.log(each + LOG_OFFSET).mean() for each in shown)
     assert after > before + 0.25
     assert np.abs(gains_of(Photographed(NONE, change=hidden))[3]).max() < 0.08
 
 
-def whole(_: int, picture: np.ndarray) -> Picture:
-    return Picture(torch.from_numpy(picture), None)
+def whole(_: int, picture: np.ndarray) -> DecodedImage:
+    return DecodedImage(torch.from_numpy(picture), None)
 
 
 def test_what_is_masked_is_not_looked_at():
     """Every second photograph is black but for its right, as undistorted or transparent ones are."""
 
-    def masked(index: int, picture: np.ndarray) -> Picture:
+    def masked(index: int, picture: np.ndarray) -> DecodedImage:
         kept = np.ones(picture.shape[:2], np.uint8)
         kept[:, : picture.shape[1] // 2] = index % 2 == 0
-        return Picture(torch.from_numpy(picture * kept[..., None]), torch.from_numpy(kept))
+        return DecodedImage(torch.from_numpy(picture * kept[..., None]), torch.from_numpy(kept))
 
-    assert looked_at(Photographed(NONE, change=masked)).difference() < 0.01
+    assert looked_at(Photographed(NONE, change=masked)).gain_spread() < 0.01
 
-    def black(index: int, picture: np.ndarray) -> Picture:
+    def black(index: int, picture: np.ndarray) -> DecodedImage:
         return masked(index, picture)._replace(mask=None)
 
-    assert looked_at(Photographed(NONE, change=black)).difference() > 0.2, "or the mask would say nothing"
+    assert looked_at(Photographed(NONE, change=black)).gain_spread() > 0.2, "or the mask would say nothing"
 
 
 def numbered(change: Callable[[int, np.ndarray], np.ndarray]) -> list[View]:
@@ -175,9 +175,9 @@ def test_points_that_one_photograph_shows_say_nothing():
     assert np.array_equal(gains_of(Photographed(gains, few)), gains_of(Photographed(gains, lone)))
 
 
-def part(sightings: Sightings | None, which: slice) -> Sightings:
+def part(sightings: Observations | None, which: slice) -> Observations:
     assert sightings is not None
-    return Sightings(sightings.points[which], sightings.rays[which], sightings.numbers[which])
+    return Observations(sightings.points[which], sightings.rays[which], sightings.numbers[which])
 
 
 def test_a_photograph_that_shares_hardly_a_point_is_not_compared():
@@ -187,7 +187,7 @@ def test_a_photograph_that_shares_hardly_a_point_is_not_compared():
     gains[7] = 0.6
     colours = looked_at(Photographed(gains, lost))
     assert sorted(colours.gains()) == [index for index in range(len(VIEWS)) if index != 7]
-    assert colours.difference() < 0.007
+    assert colours.gain_spread() < 0.007
 
 
 @pytest.mark.parametrize(
@@ -201,7 +201,7 @@ def test_a_photograph_that_shares_hardly_a_point_is_not_compared():
     ids=["no points", "none shared", "none inside", "one photograph"],
 )
 def test_where_no_points_are_shared_nothing_is_known(views):
-    assert point_colours(Photographed(NONE, views), lambda _done, _of: None) is None
+    assert collect_point_colors(Photographed(NONE, views), lambda _done, _of: None) is None
 
 
 @pytest.mark.parametrize(("side", "asked"), [(64, 1), (1000, 1), (2000, 2), (4000, 4)])
@@ -217,7 +217,7 @@ def test_of_many_photographs_some_are_looked_at():
     told: list[tuple[int, int]] = []
     gains = some_gains(3)
     images = Photographed(gains)
-    colours = point_colours(images, lambda done, of: told.append((done, of)), most_images=7)
+    colours = collect_point_colors(images, lambda done, of: told.append((done, of)), most_images=7)
     assert colours is not None
     assert told == [(done, 7) for done in range(7)]
     found = colours.gains()
@@ -227,22 +227,22 @@ def test_of_many_photographs_some_are_looked_at():
 
 @pytest.mark.parametrize("number", [np.inf, -np.inf, np.nan, 1e30, 2.0**63, -1.0])
 def test_numbers_of_no_point_are_no_points(number):
-    numbers, _ = some_of(np.array([5.0, number, 7.0]), np.zeros((3, 2)))
+    numbers, _ = sample_observations(np.array([5.0, number, 7.0]), np.zeros((3, 2)))
     assert numbers.tolist() == [5, 7]
     assert numbers.dtype == np.int64
 
 
-@given(seed=st.integers(0, 1000), count=st.integers(1, 3 * SIGHTINGS))
+@given(seed=st.integers(0, 1000), count=st.integers(1, 3 * MAX_OBSERVATIONS))
 def test_photographs_remember_the_same_of_the_points_that_they_share(seed, count):
     """What a photograph remembers of the many points of a region, one of fewer of them remembers too."""
     generator = np.random.default_rng(seed)
-    numbers = generator.choice(2**40, 3 * SIGHTINGS, replace=False)
+    numbers = generator.choice(2**40, 3 * MAX_OBSERVATIONS, replace=False)
     pixels = generator.uniform(0, 100, (len(numbers), 2))
     fewer = np.sort(generator.choice(len(numbers), count, replace=False))
-    of_all, places = some_of(numbers, pixels)
-    of_some, _ = some_of(numbers[fewer], pixels[fewer])
-    assert len(of_all) == SIGHTINGS
-    assert len(of_some) == min(SIGHTINGS, count)
+    of_all, places = sample_observations(numbers, pixels)
+    of_some, _ = sample_observations(numbers[fewer], pixels[fewer])
+    assert len(of_all) == MAX_OBSERVATIONS
+    assert len(of_some) == min(MAX_OBSERVATIONS, count)
     assert set(of_all) & set(numbers[fewer]) <= set(of_some)
     where = [int(np.flatnonzero(numbers == number)[0]) for number in of_all]
     assert where == sorted(where)
@@ -252,9 +252,9 @@ def test_photographs_remember_the_same_of_the_points_that_they_share(seed, count
 def test_points_that_are_remembered_lie_all_over_a_photograph():
     numbers = np.arange(1, 20_001)  # as a matcher numbers them: along the picture
     pixels = np.column_stack([numbers / 20_000, np.zeros(len(numbers))])
-    _, places = some_of(numbers, pixels)
+    _, places = sample_observations(numbers, pixels)
     shares, _ = np.histogram(places[:, 0], bins=4, range=(0, 1))
-    assert (shares > 0.6 * SIGHTINGS / 4).all()
+    assert (shares > 0.6 * MAX_OBSERVATIONS / 4).all()
 
 
 SETTINGS = ("--preset", "laptop", "--iterations", "20", "--anchors.offsets", "3", "--up", "z")

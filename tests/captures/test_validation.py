@@ -14,10 +14,10 @@ from rich.console import Console
 
 from support.captures import TinyScene, look_down, moved, tiny_scene, write_colmap, write_images, write_ply
 from support.commands import vdgs
-from vdgs.captures.formats.colmap_records import SIGHTINGS
-from vdgs.captures.image_checks import check_images, rounding_of
+from vdgs.captures.formats.colmap_records import MAX_OBSERVATIONS
+from vdgs.captures.image_checks import check_images, detect_rounding
 from vdgs.captures.loading import load_capture
-from vdgs.captures.validation import judge, refuse_unsound
+from vdgs.captures.validation import require_valid, validate_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.report.capture_report import inspect_capture, print_report
@@ -63,9 +63,11 @@ def turned_about(scene: TinyScene) -> TinyScene:
 @pytest.mark.parametrize(("model", "extra"), [("PINHOLE", ()), ("SIMPLE_RADIAL", (0.0,))])
 def test_a_true_capture_reprojects_onto_itself(tmp_path, scene, text, model, extra):
     write_colmap(tmp_path, scene, text=text, model=model, extra=extra, tracks=True)
-    found = judge(load_capture(tmp_path))
+    found = validate_capture(load_capture(tmp_path))
     assert found.reprojection_px == pytest.approx(0, abs=1e-6)
-    assert found.sightings == sum(min(SIGHTINGS, camera.sees(scene.points).sum()) for camera in scene.cameras.values())
+    assert found.sightings == sum(
+        min(MAX_OBSERVATIONS, camera.in_frustum(scene.points).sum()) for camera in scene.cameras.values()
+    )
     assert not found.problems
     assert not found.warnings
 
@@ -74,8 +76,8 @@ def test_errors_are_in_pixels_as_used_whatever_the_lens(tmp_path, scene):
     """Features moved by one pixel of a 64 px photograph are half a pixel off at half its size."""
     shown = replace(scene, cameras={name: replace(c, cx=c.cx + 1) for name, c in scene.cameras.items()})
     write_colmap(tmp_path, scene, shown=shown, tracks=True)
-    assert judge(load_capture(tmp_path)).reprojection_px == pytest.approx(1)
-    assert judge(load_capture(tmp_path, CaptureOptions(downscale=2))).reprojection_px == pytest.approx(0.5)
+    assert validate_capture(load_capture(tmp_path)).reprojection_px == pytest.approx(1)
+    assert validate_capture(load_capture(tmp_path, CaptureOptions(downscale=2))).reprojection_px == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -84,7 +86,7 @@ def test_mirrored_points_are_refused(tmp_path, scene, axis):
     mirrored = raised.points * np.where(np.arange(3) == axis, -1, 1)
     write_colmap(tmp_path, with_points(raised, mirrored), shown=raised, tracks=True)
     with pytest.raises(CaptureError, match=r"cannot become a scene(?s:.)*median reprojection error is"):
-        refuse_unsound(load_capture(tmp_path))
+        require_valid(load_capture(tmp_path))
 
 
 @pytest.mark.parametrize(
@@ -101,7 +103,7 @@ def test_mirrored_points_are_refused(tmp_path, scene, axis):
 def test_what_cannot_work_is_refused_without_tracks(tmp_path, scene, broken, message):
     write_colmap(tmp_path, broken(scene), shown=scene if len(broken(scene).cameras) == 12 else None)
     with pytest.raises(CaptureError, match=message):
-        refuse_unsound(load_capture(tmp_path))
+        require_valid(load_capture(tmp_path))
 
 
 def test_one_wrong_pose_is_named(tmp_path, scene):
@@ -110,7 +112,7 @@ def test_one_wrong_pose_is_named(tmp_path, scene):
         if index == 4 else camera.camera_from_world,
     )  # fmt: skip
     write_colmap(tmp_path, wrong, shown=scene, tracks=True)
-    found = judge(load_capture(tmp_path))
+    found = validate_capture(load_capture(tmp_path))
     assert not found.problems
     assert any("poses of 1 of 12 photographs are wrong" in each and "frame_004" in each for each in found.warnings)
 
@@ -119,12 +121,12 @@ def test_doubts_are_warnings(tmp_path, scene):
     far = scene.points.copy()
     far[:260] += [60, 0, 0]
     write_colmap(tmp_path / "far", with_points(scene, far))
-    assert any("(V = 0)" in each for each in judge(load_capture(tmp_path / "far")).warnings)
+    assert any("(V = 0)" in each for each in validate_capture(load_capture(tmp_path / "far")).warnings)
     close = with_cameras(scene, lambda index, _: look_down(np.array([5 + 0.018 * index, 4.0, 10])))
     write_colmap(tmp_path / "close", close)
-    assert any("depth will be poor" in each for each in judge(load_capture(tmp_path / "close")).warnings)
+    assert any("depth will be poor" in each for each in validate_capture(load_capture(tmp_path / "close")).warnings)
     write_colmap(tmp_path / "few", with_points(scene, scene.points[:20]))
-    assert any("only 20 distinct" in each for each in judge(load_capture(tmp_path / "few")).warnings)
+    assert any("only 20 distinct" in each for each in validate_capture(load_capture(tmp_path / "few")).warnings)
 
 
 def printed(capture, output: Path) -> str:
@@ -172,7 +174,7 @@ def test_survey_coordinates_lose_nothing(tmp_path, scene):
     np.testing.assert_allclose(far.points, near.points, atol=1e-6)
     for one, other in zip(near.views, far.views, strict=True):
         np.testing.assert_allclose(other.camera.camera_from_world, one.camera.camera_from_world, atol=1e-6)
-    assert judge(far).reprojection_px == pytest.approx(0, abs=1e-5)
+    assert validate_capture(far).reprojection_px == pytest.approx(0, abs=1e-5)
     assert not far.warnings
     np.testing.assert_allclose(near.points.astype(np.float32), near.points, atol=1e-5)
 
@@ -187,11 +189,11 @@ def test_coordinates_that_lost_their_digits_are_told(tmp_path, scene):
 @pytest.mark.parametrize(("step", "distance"), [(0.5, 40.0), (0.1, 30.0), (10.0, 100.0), (1 / 32, 10.0)])
 def test_the_step_of_rounded_coordinates_is_found(step, distance):
     points = np.random.default_rng(0).uniform(0, 1000, (400, 3)) + UTM
-    assert rounding_of(points, distance) == 0
-    assert rounding_of(np.round(points / step) * step, distance) == pytest.approx(step)
-    assert rounding_of(np.round(points / step) * step, 2000 * step) == 0  # finer than a pixel
+    assert detect_rounding(points, distance) == 0
+    assert detect_rounding(np.round(points / step) * step, distance) == pytest.approx(step)
+    assert detect_rounding(np.round(points / step) * step, 2000 * step) == 0  # finer than a pixel
     terraces = np.column_stack([points[:, :2], np.round(points[:, 2] / 100) * 100])
-    assert rounding_of(terraces, distance) == 0
+    assert detect_rounding(terraces, distance) == 0
 
 
 # ----------------------------------------------------------------------------------------------- masks
@@ -215,7 +217,7 @@ def write_masks(folder: Path, names, size=(48, 64), keep: int = 255, left_out: i
 def test_masks_are_counted(folder, scene):
     write_masks(folder, scene.cameras)
     capture = load_capture(folder)
-    assert check_images(capture).masked_share == pytest.approx(0.5)
+    assert check_images(capture).masked_fraction == pytest.approx(0.5)
     assert not capture.warnings
     assert "Masks of 12 of 12 photographs; 50.0% masked out" in printed(capture, folder / "out")
 
@@ -225,7 +227,7 @@ def test_masks_of_some_photographs_are_a_warning(folder, scene):
     capture = load_capture(folder)
     assert any("1 of 12 photographs have a mask" in warning for warning in capture.warnings)
     assert any("belong to no photograph and are not used (of_nothing.png)" in each for each in capture.warnings)
-    assert check_images(capture).masked_share == pytest.approx(0.5 / 12)
+    assert check_images(capture).masked_fraction == pytest.approx(0.5 / 12)
 
 
 def test_a_folder_without_masks_is_told_and_refused_where_it_was_asked_for(folder):
@@ -320,8 +322,8 @@ def test_points_beside_transforms_are_judged_by_what_cameras_see(tmp_path, scene
     write_ply(tmp_path / "points3D.ply", scene.points, scene.colours)
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}), encoding="utf-8")
     with pytest.raises(CaptureError, match="OpenGL's axes"):
-        refuse_unsound(load_capture(tmp_path))
+        require_valid(load_capture(tmp_path))
     for frame in frames:
         frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ flip).tolist()
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}), encoding="utf-8")
-    assert refuse_unsound(load_capture(tmp_path)).share_seen > 0.9
+    assert require_valid(load_capture(tmp_path)).seen_fraction > 0.9

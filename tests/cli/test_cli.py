@@ -13,8 +13,8 @@ from rich.console import Console
 from support.clusters import copy_run
 from support.commands import PATIENCE_SECONDS, entry_point, vdgs
 from vdgs import cli
-from vdgs.cli.common import as_typed, open_console
-from vdgs.cli.main import HELP, VERBS, main
+from vdgs.cli.common import absolute_command_line, make_console
+from vdgs.cli.main import COMMANDS, HELP, main
 
 HEAVY = ("torch", "numpy", "matplotlib", "pycolmap", "cv2", "scipy")
 
@@ -32,12 +32,12 @@ def test_help_imports_nothing_heavy(arguments):
 
 
 def test_every_verb_is_in_the_help_and_has_an_action():
-    for verb in VERBS:
+    for verb in COMMANDS:
         assert f"  {verb} " in HELP
         assert callable(getattr(cli, verb))
 
 
-@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize("verb", COMMANDS)
 def test_every_verb_explains_itself(verb, capsys):
     with pytest.raises(SystemExit) as ended:
         main([verb, "--help"])
@@ -96,7 +96,7 @@ def test_settings_that_do_not_work_are_named(tmp_path):
 
 def test_quiet_leaves_what_a_person_must_know(capsys):
     for quiet, heard in ((True, ""), (False, "trained\n")):
-        console = open_console(quiet)
+        console = make_console(quiet)
         console.print("trained", highlight=False)
         console.print("[yellow]warning[/] it may run out of memory", highlight=False)
         said = capsys.readouterr()
@@ -105,7 +105,8 @@ def test_quiet_leaves_what_a_person_must_know(capsys):
 
 
 @pytest.mark.parametrize(
-    ("verb", "does"), [("report", "vdgs.report.write_report"), ("map", "vdgs.rendering.ortho.render_ortho.map_run")]
+    ("verb", "does"),
+    [("report", "vdgs.report.write_report"), ("map", "vdgs.rendering.ortho.render_ortho.render_ortho")],
 )
 def test_verbs_that_show_a_result_can_be_quiet(verb, does, monkeypatch, capsys):
     def done(*given: object) -> Path:
@@ -126,9 +127,11 @@ def test_verbs_that_show_a_result_can_be_quiet(verb, does, monkeypatch, capsys):
 def test_the_command_that_is_kept_works_in_every_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     typed = ["my place", "--output", "run", "--redo", "--blocks", "2", "--quiet"]
-    kept = as_typed("run", typed, (Path("my place"), Path("run")))
+    kept = absolute_command_line("run", typed, (Path("my place"), Path("run")))
     assert shlex.split(kept) == ["vdgs", "run", f"{tmp_path}/my place", "--output", f"{tmp_path}/run", "--blocks", "2"]
-    assert f"--output={tmp_path}/run" in as_typed("run", ["my place", "--output=run"], (Path("my place"), Path("run")))
+    assert f"--output={tmp_path}/run" in absolute_command_line(
+        "run", ["my place", "--output=run"], (Path("my place"), Path("run"))
+    )
 
 
 def test_the_arguments_are_parsed_once(uncut, monkeypatch, tmp_path, capsys):

@@ -11,22 +11,22 @@ import pytest
 
 from vdgs.cli.doctor import doctor_report as doctor_report
 from vdgs.cli.doctor import system_checks as doctor
-from vdgs.cli.doctor.check import Check
-from vdgs.cli.doctor.doctor_report import healthy, print_report, report
+from vdgs.cli.doctor.check import SystemCheck
+from vdgs.cli.doctor.doctor_report import is_healthy, print_report, run_checks
 
 pytestmark = pytest.mark.xdist_group("doctor")
 
 
 @pytest.fixture(scope="module")
-def checks() -> list[Check]:
-    return report()
+def checks() -> list[SystemCheck]:
+    return run_checks()
 
 
-def by_name(checks: list[Check]) -> dict[str, Check]:
+def by_name(checks: list[SystemCheck]) -> dict[str, SystemCheck]:
     return {check.name: check for check in checks}
 
 
-def test_every_subject_is_reported(checks: list[Check]):
+def test_every_subject_is_reported(checks: list[SystemCheck]):
     names = by_name(checks)
     for name in ("vdgs", "python", "dependencies", "processor", "native kernels", "threads"):
         assert name in names
@@ -38,7 +38,7 @@ def test_every_subject_is_reported(checks: list[Check]):
         assert check.state in ("ok", "note") or check.remedy
 
 
-def test_extras_come_from_the_metadata(checks: list[Check]):
+def test_extras_come_from_the_metadata(checks: list[SystemCheck]):
     names = by_name(checks)
     groups = doctor._required()
     assert {"synth", "lpips", "tensorboard", "test"} <= set(groups)
@@ -53,9 +53,9 @@ def test_extras_come_from_the_metadata(checks: list[Check]):
 
 
 def test_the_exit_code_follows_what_is_essential(capsys: pytest.CaptureFixture):
-    fine = [Check("torch", "ok", "2.13", essential=True), Check("extra synth", "missing", "lacks x", "pip")]
-    broken = [*fine, Check("native kernels", "missing", "not built", "build them", essential=True)]
-    assert healthy(fine)
+    fine = [SystemCheck("torch", "ok", "2.13", essential=True), SystemCheck("extra synth", "missing", "lacks x", "pip")]
+    broken = [*fine, SystemCheck("native kernels", "missing", "not built", "build them", essential=True)]
+    assert is_healthy(fine)
     assert print_report(checks=fine) == 0
     assert "Everything essential works" in capsys.readouterr().out
     assert print_report(checks=broken) == 1
@@ -64,7 +64,7 @@ def test_the_exit_code_follows_what_is_essential(capsys: pytest.CaptureFixture):
     assert "build them" in out
 
 
-def test_as_json(checks: list[Check], capsys: pytest.CaptureFixture):
+def test_as_json(checks: list[SystemCheck], capsys: pytest.CaptureFixture):
     code = print_report(as_json=True, checks=checks)
     content = json.loads(capsys.readouterr().out)
     assert content["healthy"] == (code == 0)
@@ -100,11 +100,11 @@ def test_kernels_in_use_and_missing(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_broken_part_is_reported_not_raised(monkeypatch: pytest.MonkeyPatch):
-    def explode() -> list[Check]:
+    def explode() -> list[SystemCheck]:
         raise OSError("no such device")
 
-    monkeypatch.setattr(doctor_report, "LOOKS", (explode, doctor._disk))
-    first, disk = report()
+    monkeypatch.setattr(doctor_report, "CHECKS", (explode, doctor._disk))
+    first, disk = run_checks()
     assert (first.name, first.state, first.works) == ("explode", "broken", False)
     assert "no such device" in first.value
     assert disk.state in ("ok", "note")

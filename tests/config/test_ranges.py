@@ -14,18 +14,18 @@ from experiments.bench.cli import BenchArguments
 from vdgs.cli.capture_cmds import InspectArguments, SynthArguments
 from vdgs.cli.export_cmd import ExportArguments
 from vdgs.cli.main import main
-from vdgs.cli.ortho_cmd import MapArguments
+from vdgs.cli.ortho_cmd import OrthoArguments
 from vdgs.cli.result_cmds import EvalArguments, RenderArguments
-from vdgs.cli.run_cmd import CoarseArguments, RunArguments
+from vdgs.cli.run_cmd import RunArguments, TrainCoarseArguments
 from vdgs.cli.sfm_cmd import SfmArguments
-from vdgs.cli.stage_cmds import MergeArguments, PartitionArguments, TrainArguments
+from vdgs.cli.stage_cmds import MergeArguments, PartitionArguments, TrainBlocksArguments
 from vdgs.cli.view_cmd import ViewArguments
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.method import MethodConfig, PartitionConfig
 from vdgs.config.presets import PRESETS
-from vdgs.config.ranges import Number, Range, numbers, problems, refuse
+from vdgs.config.ranges import NumericSetting, Range, check_ranges, find_range_errors, iter_numbers
 from vdgs.config.serialization import from_dict, to_dict
-from vdgs.config.validation_rules import validate
+from vdgs.config.validation_rules import validate_config
 from vdgs.errors import VdgsError
 from vdgs.synth.options import SynthOptions
 
@@ -37,13 +37,13 @@ ARGUMENTS: tuple[Any, ...] = (
     EvalArguments(run=HERE),
     RenderArguments(run=HERE, output=HERE),
     PartitionArguments(run=HERE),
-    TrainArguments(run=HERE),
+    TrainBlocksArguments(run=HERE),
     MergeArguments(HERE),
-    MapArguments(run=HERE),
+    OrthoArguments(run=HERE),
     ExportArguments(run=HERE),
     SfmArguments(photographs=(HERE,), output=HERE),
     ViewArguments(run=HERE),
-    CoarseArguments(capture=HERE, output=HERE),
+    TrainCoarseArguments(capture=HERE, output=HERE),
     RunArguments(capture=HERE, output=HERE),
     MethodConfig(),
     *PRESETS.values(),
@@ -52,35 +52,35 @@ ARGUMENTS: tuple[Any, ...] = (
 
 @pytest.mark.parametrize("asked", ARGUMENTS, ids=lambda asked: type(asked).__name__)
 def test_every_number_has_a_range_that_holds_its_default(asked):
-    assert [each.option for each in numbers(asked) if each.range is None] == []
-    assert problems(asked) == []
-    assert all(math.isfinite(each.range.most) for each in numbers(asked) if each.range is not None)
+    assert [each.option for each in iter_numbers(asked) if each.range is None] == []
+    assert find_range_errors(asked) == []
+    assert all(math.isfinite(each.range.most) for each in iter_numbers(asked) if each.range is not None)
 
 
 def test_numbers_are_found_wherever_they_stand():
     """So the test above can fail."""
-    found = {each.option: each for each in numbers(MethodConfig())}
+    found = {each.option: each for each in iter_numbers(MethodConfig())}
     assert found["--blocks"].value == 8
     assert {"--rates.offsets", "--resolutions", "--block.growth.until"} <= found.keys()
-    assert [each.value for each in numbers(MethodConfig().training.rates)][:2] == [0.01, 1e-4]
+    assert [each.value for each in iter_numbers(MethodConfig().training.rates)][:2] == [0.01, 1e-4]
     auto = PartitionConfig(blocks="auto")
-    assert next(each for each in numbers(auto) if each.path == ("blocks",)) == Number(
+    assert next(each for each in iter_numbers(auto) if each.path == ("blocks",)) == NumericSetting(
         ("blocks",), None, Range(1, 10_000)
     )
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300, -1e300])
 def test_no_range_holds_what_is_no_sensible_number(value):
-    ranges = {each.range for asked in ARGUMENTS for each in numbers(asked)}
+    ranges = {each.range for asked in ARGUMENTS for each in iter_numbers(asked)}
     assert not any(each.holds(value) for each in ranges if each is not None)
 
 
 def test_ends_belong_to_a_range_unless_it_says_otherwise():
     assert [Range(0, 1).holds(end) for end in (0, 1)] == [True, True]
     assert [Range(0, 1, above=True).holds(end) for end in (0, 1)] == [False, True]
-    assert [Range(0, 1, below=True).holds(end) for end in (0, 1)] == [True, False]
-    assert [Range(2, 3, or_zero=True).holds(value) for value in (0, 1, 2)] == [True, False, True]
-    assert str(Range(0, 1, above=True, or_zero=True)) == "0, or above 0 and at most 1"
+    assert [Range(0, 1, exclusive_max=True).holds(end) for end in (0, 1)] == [True, False]
+    assert [Range(2, 3, allow_zero=True).holds(value) for value in (0, 1, 2)] == [True, False, True]
+    assert str(Range(0, 1, above=True, allow_zero=True)) == "0, or above 0 and at most 1"
 
 
 def test_each_number_out_of_range_is_named_as_the_command_line_names_it():
@@ -90,12 +90,12 @@ def test_each_number_out_of_range_is_named_as_the_command_line_names_it():
         partition=replace(method.partition, lambda_vis=math.nan),
         block=replace(method.block, growth=replace(method.block.growth, until=2.0)),
     )
-    assert validate(wrong) == [
+    assert validate_config(wrong) == [
         "--lambda-vis nan: must be at least 0 and at most 1000",
         "--block.growth.until 2.0: must be at least 0 and at most 1",
     ]
     with pytest.raises(VdgsError, match=r"--downscale 0\.5: must be at least 1"):
-        refuse(CaptureOptions(downscale=0.5))
+        check_ranges(CaptureOptions(downscale=0.5))
     with pytest.raises(VdgsError, match=r"(?s)--images 1: .*--overlap nan: "):
         SynthOptions(images=1, overlap=math.nan).resolved()
 

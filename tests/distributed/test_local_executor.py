@@ -13,10 +13,10 @@ import pytest
 from support.commands import PATIENCE_SECONDS, wait_until
 from support.shard_scripts import job, run
 from vdgs.distributed import local_executor
-from vdgs.distributed.executor import Lines, Listener, Outcome, Task
+from vdgs.distributed.executor import LogListener, Task, TaskListener, TaskResult
 from vdgs.distributed.local_executor import LocalExecutor
-from vdgs.distributed.shard_runner import Piece
-from vdgs.distributed.task_process import PARENT, stop_when_parent_dies
+from vdgs.distributed.shard_runner import Shard
+from vdgs.distributed.task_process import PARENT_PID_VARIABLE, stop_when_parent_dies
 from vdgs.runs.stage_folder import StageFolder
 
 FINE = 'tell("done", iteration=10, iterations=10, psnr_training=25.5, anchors=1234)'
@@ -31,7 +31,7 @@ sys.exit(130)
 """
 
 
-class Told(Listener):
+class Told(TaskListener):
     """What it was told, in order."""
 
     def __init__(self):
@@ -40,7 +40,7 @@ class Told(Listener):
     def started(self, task: Task, attempt: int) -> None:
         self.news.append((task.name, attempt))
 
-    def ended(self, task: Task, outcome: Outcome) -> None:
+    def ended(self, task: Task, outcome: TaskResult) -> None:
         self.news.append((task.name, outcome.state))
 
 
@@ -121,7 +121,7 @@ def test_a_job_that_someone_else_stopped_is_not_started_again(tmp_path):
 
 def test_memory_that_ran_out_lowers_the_number_at_once(tmp_path, monkeypatch):
     kills = iter([5, 6, 6, 6])
-    monkeypatch.setattr(local_executor, "out_of_memory_kills", lambda: next(kills))
+    monkeypatch.setattr(local_executor, "oom_kill_count", lambda: next(kills))
     script = """
         if not (folder / "state").exists() and block == 0:
             (folder / "state").touch()
@@ -164,7 +164,7 @@ def test_a_full_disk_is_named(tmp_path):
 
 
 def test_a_command_that_is_not_there_is_named(tmp_path):
-    (outcome,), _ = run([Piece(0, StageFolder(tmp_path), ["/nowhere/python"])])
+    (outcome,), _ = run([Shard(0, StageFolder(tmp_path), ["/nowhere/python"])])
     assert outcome.state == "failed"
     assert "/nowhere/python" in outcome.why
 
@@ -172,7 +172,7 @@ def test_a_command_that_is_not_there_is_named(tmp_path):
 def test_a_folder_that_another_process_holds_is_waited_for(tmp_path):
     made, said = job(tmp_path, 0, FINE), []
 
-    class Holding(Lines):
+    class Holding(LogListener):
         """Lets go of the folder once it hears that it is waited for."""
 
         def waits(self, task: Task) -> None:
@@ -259,7 +259,7 @@ print("OUTCOMES", json.dumps([[o.state, o.attempts, o.why] for o in outcomes]))
 class Driver:
     """A process that runs jobs; begins once the first two say that they are ready."""
 
-    def __init__(self, jobs: list[Piece], root: Path):
+    def __init__(self, jobs: list[Shard], root: Path):
         self._looks, self._root = root / "looks", root
         argument = json.dumps([[made.index, str(made.folder.path), made.command] for made in jobs])
         command = [sys.executable, "-c", DRIVER, argument, str(self._looks)]
@@ -328,12 +328,12 @@ def test_a_job_ends_with_a_driver_that_was_killed(tmp_path):
 
 
 def test_a_process_without_a_driver_is_not_watched(monkeypatch):
-    monkeypatch.delenv(PARENT, raising=False)
+    monkeypatch.delenv(PARENT_PID_VARIABLE, raising=False)
     assert stop_when_parent_dies() is None
-    monkeypatch.setenv(PARENT, "no number")
+    monkeypatch.setenv(PARENT_PID_VARIABLE, "no number")
     assert stop_when_parent_dies() is None
-    monkeypatch.setenv(PARENT, str(os.getppid()))
+    monkeypatch.setenv(PARENT_PID_VARIABLE, str(os.getppid()))
     watch = stop_when_parent_dies(0.01)
     assert watch is not None
     assert watch.is_alive()
-    assert PARENT not in os.environ  # what this process starts has another parent
+    assert PARENT_PID_VARIABLE not in os.environ  # what this process starts has another parent

@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from vdgs.distributed.progress_table import progress_line, progress_table
-from vdgs.distributed.shard_progress import Figures, PieceProgress, read_figures, seconds_left_overall
+from vdgs.distributed.progress_table import build_progress_table, progress_line
+from vdgs.distributed.shard_progress import ProgressStats, ShardProgress, read_progress_stats, seconds_left_overall
 from vdgs.distributed.shard_runner import default_jobs
-from vdgs.distributed.task_process import explanation
+from vdgs.distributed.task_process import error_message
 
 
 @given(st.dictionaries(st.sampled_from(["iteration", "iterations", "psnr_training", "anchors", "seconds_left",
@@ -20,11 +20,11 @@ from vdgs.distributed.task_process import explanation
 def test_any_status_can_be_shown(tmp_path_factory, status):
     path = tmp_path_factory.getbasetemp() / "any_status.json"
     path.write_text(json.dumps({"state": "running", **status}))
-    row = PieceProgress(0)
+    row = ShardProgress(0)
     row.started()
-    row.observe(read_figures(path), 1.0)
+    row.observe(read_progress_stats(path), 1.0)
     console = Console(file=io.StringIO(), width=200)
-    console.print(progress_table([row, PieceProgress(1)], 1, 10))
+    console.print(build_progress_table([row, ShardProgress(1)], 1, 10))
     assert "0/2 done" in console.file.getvalue()
     assert "1 running" in progress_line([row], 1)
 
@@ -44,12 +44,12 @@ def test_default_jobs_on_known_machines():
 
 
 def test_time_left_follows_from_speed_and_what_waits():
-    first, second, third = rows = [PieceProgress(i) for i in range(3)]
+    first, second, third = rows = [ShardProgress(i) for i in range(3)]
     assert seconds_left_overall(rows, 2) is None
     first.started()
-    first.observe(Figures(iteration=0, iterations=100), 0.0)
+    first.observe(ProgressStats(iteration=0, iterations=100), 0.0)
     first.observe(None, 5.0)  # a reading that failed
-    first.observe(Figures(iteration=50, iterations=100), 10.0)
+    first.observe(ProgressStats(iteration=50, iterations=100), 10.0)
     assert first.speed == pytest.approx(5.0)
     assert seconds_left_overall(rows, 1) == pytest.approx(10 + 20 + 20)
     assert seconds_left_overall(rows, 2) == pytest.approx(25)
@@ -58,25 +58,25 @@ def test_time_left_follows_from_speed_and_what_waits():
 
 
 def test_a_new_attempt_has_a_speed_of_its_own():
-    row = PieceProgress(0)
+    row = ShardProgress(0)
     row.started()
     for second in range(3):
-        row.observe(Figures(iteration=100 * second, iterations=1000), float(second))
-    row.observe(Figures(iteration=50, iterations=1000), 10.0)
+        row.observe(ProgressStats(iteration=100 * second, iterations=1000), float(second))
+    row.observe(ProgressStats(iteration=50, iterations=1000), 10.0)
     assert row.speed is None
 
 
 def test_the_table_fits_the_screen_and_keeps_what_matters():
-    rows = [PieceProgress(i) for i in range(40)]
+    rows = [ShardProgress(i) for i in range(40)]
     rows[37].started()
     rows[38].state = "failed"
     console = Console(file=io.StringIO(), width=80)
-    figures = Figures(
+    figures = ProgressStats(
         iteration=11_200, iterations=15_000, psnr=24.31, anchors=1_234_567, seconds_left=5000.0,
         memory_bytes=1_400_000_000,
     )  # fmt: skip
     rows[37].observe(figures, 0.0)
-    console.print(progress_table(rows, 2, 5))
+    console.print(build_progress_table(rows, 2, 5))
     lines = [line for line in console.file.getvalue().splitlines() if line.strip()]
     assert len(lines) <= 5 + 5
     assert "…" not in "".join(lines)  # nothing is cut off on a narrow terminal
@@ -91,7 +91,7 @@ def test_the_message_is_found_among_the_output(tmp_path):
     output.write_bytes(
         b"vdgs train: old\n--- again\nnoise\r\x1b[31m 50 %\x1b[0m\nvdgs train: a.jpg: gone\nPut it back\n\n"
     )
-    assert explanation(output) == "a.jpg: gone\nPut it back"
+    assert error_message(output) == "a.jpg: gone\nPut it back"
     output.write_bytes(b"Traceback\n  somewhere\nValueError: \xff\x07no\n")
-    assert explanation(output) == "ValueError: �no"
-    assert explanation(tmp_path / "missing") == ""
+    assert error_message(output) == "ValueError: �no"
+    assert error_message(tmp_path / "missing") == ""

@@ -13,29 +13,37 @@ from vdgs.cli import run_cmd
 from vdgs.config.executor_options import ExecutorOptions, SlurmOptions
 from vdgs.config.presets import PRESETS
 from vdgs.distributed import node_check
-from vdgs.distributed.backend_selection import Machine, choose
-from vdgs.distributed.executor import Begun, End, Lines, Listener, Needs, Task
-from vdgs.distributed.node_check import Question, examine
-from vdgs.distributed.resource_allocation import Work, by_queue, exceeds, on_cluster, on_this_machine
-from vdgs.distributed.scheduler import Policy, run_crew
+from vdgs.distributed.backend_selection import MachineResources, select_backend
+from vdgs.distributed.executor import AttemptResult, AttemptStarted, LogListener, Task, TaskListener, TaskResources
+from vdgs.distributed.node_check import NodeRequirements, check_node
+from vdgs.distributed.resource_allocation import (
+    ShardWorkload,
+    allocate_cluster,
+    allocate_local,
+    allocate_queue,
+    exceeds_memory,
+)
+from vdgs.distributed.scheduler import ExecutionPolicy, run_tasks
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
-from vdgs.runs.stage_folder import StageFolder, Status
-from vdgs.system.memory.memory_estimate import decoded_bytes, estimate, need_of_block
+from vdgs.runs.stage_folder import StageFolder, StatusRecord
+from vdgs.system.memory.memory_estimate import block_workload, decoded_image_bytes, estimate_memory
 
 GB = 10**9
-SAVED = End(130, out_of_time=True)
+SAVED = AttemptResult(130, out_of_time=True)
 
 
 class Scripted:
     """An engine whose attempts end as a list says, one after the other; it remembers what they asked for."""
 
-    def __init__(self, ends: list[End | OSError], most_memory: int | None = None, there: tuple[str, ...] = ()):
+    def __init__(
+        self, ends: list[AttemptResult | OSError], most_memory: int | None = None, there: tuple[str, ...] = ()
+    ):
         self.most_memory, self._ends, self._there = most_memory, list(ends), there
-        self.asked: list[tuple[str, int, Needs]] = []
+        self.asked: list[tuple[str, int, TaskResources]] = []
 
     def start(self, tasks):
-        self.asked += [(task.name, attempt, task.needs) for task, attempt in tasks]
+        self.asked += [(task.name, attempt, task.resources) for task, attempt in tasks]
         return [self._next() for _ in tasks]
 
     def find(self, task):
@@ -51,10 +59,10 @@ class Scripted:
 
 @dataclass
 class Attempt:
-    end: End
-    begun: Begun | None = field(default_factory=lambda: Begun(0, "node-7"))
+    end: AttemptResult
+    begun: AttemptStarted | None = field(default_factory=lambda: AttemptStarted(0, "node-7"))
 
-    def look(self) -> End:
+    def look(self) -> AttemptResult:
         return self.end
 
     def ask_to_stop(self) -> None:
@@ -63,7 +71,7 @@ class Attempt:
     kill = ask_to_stop
 
 
-class Heard(Lines):
+class Heard(LogListener):
     """All that is said of the tasks."""
 
     def __init__(self):
@@ -76,13 +84,15 @@ class Heard(Lines):
 
 def run(folder: Path, engine: Scripted, task: Task | None = None, retries: int = 2):
     heard = Heard()
-    task = task or Task(name="block 00", command=["train"], output=folder / "output.log", needs=Needs(1, 4 * GB))
-    (outcome,) = run_crew([task], engine, Policy(1, retries, 1e-6), heard)
+    task = task or Task(
+        name="block 00", command=["train"], output=folder / "output.log", resources=TaskResources(1, 4 * GB)
+    )
+    (outcome,) = run_tasks([task], engine, ExecutionPolicy(1, retries, 1e-6), heard)
     return outcome, heard.lines
 
 
 def test_memory_that_ran_out_is_asked_for_up_to_what_the_largest_node_has(tmp_path):
-    killed = End(-9, out_of_memory=True)
+    killed = AttemptResult(-9, out_of_memory=True)
     engine = Scripted([killed, killed, killed], most_memory=7 * GB)
     outcome, lines = run(tmp_path, engine)
     assert [needs.memory_bytes for _, _, needs in engine.asked] == [4 * GB, 6 * GB, 7 * GB]
@@ -92,8 +102,8 @@ def test_memory_that_ran_out_is_asked_for_up_to_what_the_largest_node_has(tmp_pa
 
 
 def test_a_lost_place_is_worded_and_the_task_tried_a_bounded_number_of_times(tmp_path):
-    lost = End(None, "the loss of its node node-7")
-    outcome, lines = run(tmp_path, Scripted([lost, End(0)]))
+    lost = AttemptResult(None, "the loss of its node node-7")
+    outcome, lines = run(tmp_path, Scripted([lost, AttemptResult(0)]))
     assert (outcome.state, outcome.attempts) == ("done", 2)
     assert lines[1].startswith("block 00: crashed by the loss of its node node-7; continues from its last checkpoint")
     outcome, _ = run(tmp_path, Scripted([lost] * 3))
@@ -107,11 +117,11 @@ def test_a_time_limit_costs_no_attempt_as_long_as_the_task_gets_further(tmp_path
 
     class Further(Scripted):
         def start(self, tasks):
-            folder.set_status(Status(state="running", iteration=10 * min(len(self.asked) + 1, 6)))
+            folder.set_status(StatusRecord(state="running", iteration=10 * min(len(self.asked) + 1, 6)))
             return super().start(tasks)
 
     task = Task(name="block 00", command=["train"], output=tmp_path / "output.log", folder=folder.path)
-    engine = Further([SAVED] * 5 + [End(0)])
+    engine = Further([SAVED] * 5 + [AttemptResult(0)])
     outcome, lines = run(tmp_path, engine, task, retries=0)
     assert (outcome.state, outcome.attempts) == ("done", 1)
     assert sum("saved and waits for another turn" in line for line in lines) == 5
@@ -121,7 +131,7 @@ def test_a_time_limit_costs_no_attempt_as_long_as_the_task_gets_further(tmp_path
 
 
 def test_what_an_earlier_driver_began_is_watched_and_not_begun_again(tmp_path):
-    engine = Scripted([End(0)], there=("block 00",))
+    engine = Scripted([AttemptResult(0)], there=("block 00",))
     outcome, lines = run(tmp_path, engine)
     assert (outcome.state, engine.asked) == ("done", [])
     assert lines == ["block 00 on node-7 again"]
@@ -144,8 +154,10 @@ places = st.lists(st.builds(Place, st.integers(1, 64), st.integers(GB, 10**12)),
 
 @given(places, st.integers(1, 40), st.integers(0, 8), st.integers(10**8, 10**11))
 def test_blocks_find_room_on_a_cluster(places, blocks, jobs, each):
-    share = on_cluster(Work(pieces=blocks, piece_bytes=each, jobs=jobs), places, ExecutorOptions(executor="ray"))
-    needs, most = share.needs, max(place.memory_bytes for place in places)
+    share = allocate_cluster(
+        ShardWorkload(pieces=blocks, shard_bytes=each, jobs=jobs), places, ExecutorOptions(executor="ray")
+    )
+    needs, most = share.resources, max(place.memory_bytes for place in places)
     assert share.at_once == min(blocks, jobs or blocks)
     assert 1 <= needs.processors <= max(place.processors for place in places)
     room = sum(place.processors // needs.processors for place in places)
@@ -154,72 +166,79 @@ def test_blocks_find_room_on_a_cluster(places, blocks, jobs, each):
 
 
 works = st.builds(
-    Work, st.integers(1, 60), st.integers(10**8, 10**11), st.just(0), st.sampled_from([0.0, 0.5, 20.0]),
+    ShardWorkload, st.integers(1, 60), st.integers(10**8, 10**11), st.just(0), st.sampled_from([0.0, 0.5, 20.0]),
     photographs_bytes=st.integers(0, 10**12),
 )  # fmt: skip
 
 
 @given(works, st.integers(1, 128), st.integers(0, 10**12))
 def test_blocks_at_once_and_their_photographs_fit_into_one_machine(work, cores, free):
-    share = on_this_machine(work, cores, free)
+    share = allocate_local(work, cores, free)
     photographs = min(work.photographs_bytes, 1e9 * share.image_gb)
-    assert share.at_once == 1 or share.at_once * (work.piece_bytes + photographs) <= free + 1
-    assert share.at_once == 1 or not exceeds(work, share.at_once, free)
-    assert exceeds(replace(work, image_gb=0), 1, free) or on_this_machine(replace(work, image_gb=0), 1, free).image_gb
+    assert share.at_once == 1 or share.at_once * (work.shard_bytes + photographs) <= free + 1
+    assert share.at_once == 1 or not exceeds_memory(work, share.at_once, free)
+    assert (
+        exceeds_memory(replace(work, image_gb=0), 1, free)
+        or allocate_local(replace(work, image_gb=0), 1, free).image_gb
+    )
 
 
 def test_large_photographs_leave_room_for_fewer_blocks():
     """Photographs of 20 MP: 3 GB for the picture of a block and 16 GB for those that are kept."""
-    large = Work(pieces=32, piece_bytes=3_800_000_000, photographs_bytes=10**11)
-    share = on_this_machine(large, 32, 64 * GB)
+    large = ShardWorkload(pieces=32, shard_bytes=3_800_000_000, photographs_bytes=10**11)
+    share = allocate_local(large, 32, 64 * GB)
     assert (share.at_once, share.image_gb) == (12, 16 / 12)
-    assert on_this_machine(replace(large, image_gb=40), 32, 64 * GB).at_once == 6
+    assert allocate_local(replace(large, image_gb=40), 32, 64 * GB).at_once == 6
     # Small ones need no quarter of the memory.
-    small = Work(pieces=32, piece_bytes=2 * GB, photographs_bytes=10**7)
-    assert on_this_machine(small, 32, 64 * GB).at_once == 31
+    small = ShardWorkload(pieces=32, shard_bytes=2 * GB, photographs_bytes=10**7)
+    assert allocate_local(small, 32, 64 * GB).at_once == 31
 
 
 def test_two_small_blocks_fit_into_a_laptop_with_4_gb_free():
     """`make demo`: 56 photographs of 400 x 300 pixels, four blocks; with more anchors than it has."""
     cameras = [Camera(camera_from_world=np.eye(4), fx=1, fy=1, cx=0, cy=0, width=400, height=300)] * 56
-    largest = need_of_block(PRESETS["laptop"], 100_000, 200_000, 400 * 300)
-    work = Work(pieces=4, piece_bytes=estimate(largest).total, photographs_bytes=decoded_bytes(cameras))
-    assert on_this_machine(work, 2, 4 * GB).at_once == 2
-    assert not exceeds(work, 2, 4 * GB)
+    largest = block_workload(PRESETS["laptop"], 100_000, 200_000, 400 * 300)
+    work = ShardWorkload(
+        pieces=4, shard_bytes=estimate_memory(largest).total, photographs_bytes=decoded_image_bytes(cameras)
+    )
+    assert allocate_local(work, 2, 4 * GB).at_once == 2
+    assert not exceeds_memory(work, 2, 4 * GB)
 
 
 def test_photographs_give_way_to_blocks_that_a_person_asked_for():
-    work = Work(pieces=4, piece_bytes=3 * GB, jobs=2, photographs_bytes=10**11)
-    assert on_this_machine(work, 4, 7 * GB).image_gb == 0.5
-    assert on_this_machine(work, 4, 6 * GB).image_gb == 0.1
-    assert [exceeds(work, 2, free) for free in (6 * GB, 7 * GB)] == [True, False]
-    assert exceeds(replace(work, image_gb=2), 2, 7 * GB)
+    work = ShardWorkload(pieces=4, shard_bytes=3 * GB, jobs=2, photographs_bytes=10**11)
+    assert allocate_local(work, 4, 7 * GB).image_gb == 0.5
+    assert allocate_local(work, 4, 6 * GB).image_gb == 0.1
+    assert [exceeds_memory(work, 2, free) for free in (6 * GB, 7 * GB)] == [True, False]
+    assert exceeds_memory(replace(work, image_gb=2), 2, 7 * GB)
 
 
 def test_people_are_told_what_blocks_and_their_photographs_take(question):
-    work = Work(pieces=4, piece_bytes=2 * GB, photographs_bytes=10**11)
-    with choose(ExecutorOptions(), work, Machine(4, 8 * GB), lambda: question) as chosen:
+    work = ShardWorkload(pieces=4, shard_bytes=2 * GB, photographs_bytes=10**11)
+    with select_backend(ExecutorOptions(), work, MachineResources(4, 8 * GB), lambda: question) as chosen:
         assert "a block takes at most 2.00 GB and 667 MB for photographs, of 8.00 GB free" in chosen.line
         assert chosen.line.startswith("3 at once")
         assert not chosen.notes
-    with choose(ExecutorOptions(), replace(work, jobs=4), Machine(4, 8 * GB), lambda: question) as chosen:
+    with select_backend(
+        ExecutorOptions(), replace(work, jobs=4), MachineResources(4, 8 * GB), lambda: question
+    ) as chosen:
         assert "4 at once may run out of memory. What helps: less --jobs" in chosen.notes[0]
 
 
 def test_what_a_person_asks_for_is_asked_of_the_cluster():
-    asked = ExecutorOptions(executor="ray", processors=3, memory_gb=5, gpus=0.5)
+    asked = ExecutorOptions(executor="ray", processors=3, mem_gb=5, gpus=0.5)
     for share in (
-        on_cluster(Work(pieces=4, piece_bytes=GB), [Place(8, 64 * GB)], asked),
-        by_queue(Work(pieces=4, piece_bytes=GB), asked),
+        allocate_cluster(ShardWorkload(pieces=4, shard_bytes=GB), [Place(8, 64 * GB)], asked),
+        allocate_queue(ShardWorkload(pieces=4, shard_bytes=GB), asked),
     ):
-        assert share.needs == Needs(3, 5 * GB, 0.5)
+        assert share.resources == TaskResources(3, 5 * GB, 0.5)
     assert (
-        on_cluster(
-            Work(pieces=4, piece_bytes=GB, image_gb=2), [Place(8, 64 * GB)], ExecutorOptions(executor="ray")
+        allocate_cluster(
+            ShardWorkload(pieces=4, shard_bytes=GB, image_gb=2), [Place(8, 64 * GB)], ExecutorOptions(executor="ray")
         ).image_gb
         == 2
     )
-    assert on_this_machine(Work(pieces=8, piece_bytes=2 * GB, image_gb=4), 2, 8 * GB).image_gb == 2
+    assert allocate_local(ShardWorkload(pieces=8, shard_bytes=2 * GB, image_gb=4), 2, 8 * GB).image_gb == 2
 
 
 @pytest.mark.parametrize(
@@ -248,22 +267,22 @@ def test_where_blocks_could_not_be_trained_no_coarse_model_is_trained_before_tha
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     write_colmap(tmp_path / "capture", tiny_scene())
     with pytest.raises(VdgsError, match=said):
-        run_cmd.run([str(tmp_path / "capture"), "--output", str(tmp_path / "run"), *options])
+        run_cmd.run_command([str(tmp_path / "capture"), "--output", str(tmp_path / "run"), *options])
     assert not (tmp_path / "run").exists()
 
 
 @pytest.fixture
-def question(tmp_path) -> Question:
+def question(tmp_path) -> NodeRequirements:
     photograph = tmp_path / "a.jpg"
     photograph.write_bytes(b"pixels")
     (tmp_path / "run").mkdir()
-    return Question(tmp_path / "run", [photograph])
+    return NodeRequirements(tmp_path / "run", [photograph])
 
 
 def test_a_machine_that_sees_the_same_can_work_on_a_run(question):
     with question.asked() as plain:
-        assert examine(plain)["problems"] == []
-    assert examine(question.plain())["problems"] == []  # nobody waits for the answer
+        assert check_node(plain)["problems"] == []
+    assert check_node(question.to_dict())["problems"] == []  # nobody waits for the answer
     assert list(question.folder.iterdir()) == []
 
 
@@ -271,7 +290,7 @@ def test_what_a_machine_does_not_see_is_named(question, monkeypatch):
     with question.asked() as plain:
 
         def said(**other) -> str:
-            (problem,) = examine(plain | other)["problems"]
+            (problem,) = check_node(plain | other)["problems"]
             return problem
 
         assert "there is no /elsewhere" in said(folder="/elsewhere")
@@ -292,12 +311,12 @@ def test_what_a_machine_does_not_see_is_named(question, monkeypatch):
 
 def test_of_many_photographs_some_are_looked_for(question):
     many = replace(question, files=[question.folder / f"{number}.jpg" for number in range(1000)])
-    names = [name for name, _ in many.plain()["files"]]
+    names = [name for name, _ in many.to_dict()["files"]]
     assert names[0].endswith("/0.jpg")
     assert names[-1].endswith("/999.jpg")
     assert len(names) < 12
 
 
 def test_listeners_need_not_listen():
-    listener, task = Listener(), Task(name="a", command=["b"], output=Path("c"))
+    listener, task = TaskListener(), Task(name="a", command=["b"], output=Path("c"))
     assert listener.placed(task, "node", False) is listener.paused(task, "") is None

@@ -18,15 +18,15 @@ from support.captures import render_plane
 from support.hand_made_models import camera_above, opaque_plane, quadrant_of, quadrants
 from vdgs.captures.capture import View
 from vdgs.errors import RunError
-from vdgs.evaluation.block_seams import SEAM_VIEWS, BlockInputs, block_table, evaluate_blocks
+from vdgs.evaluation.block_seams import MAX_SEAM_VIEWS, BlockInputs, evaluate_blocks, make_block_table
 from vdgs.evaluation.by_block import (
-    NOTHING,
+    NO_BLOCK,
     BlockMetrics,
     SeamMetrics,
-    blocks_shown,
+    block_label_map,
     border_lines,
     border_pixels,
-    label_map,
+    visible_blocks,
 )
 from vdgs.evaluation.renderable_model import ReferenceViews
 from vdgs.geometry.camera import Camera
@@ -70,7 +70,7 @@ def plane_depth(camera: Camera, alpha: float = 1.0) -> Raster:
 @pytest.mark.parametrize("alpha", [1.0, 0.6])
 def test_labels_are_those_of_the_places_seen(camera: Camera, alpha: float):
     """Places projected by the camera fall on pixels with the label of their own block."""
-    labels = label_map(plane_depth(camera, alpha), camera, quadrants())
+    labels = block_label_map(plane_depth(camera, alpha), camera, quadrants())
     places = np.random.default_rng(0).uniform(-4, 4, (4000, 2))
     pixels, depth = camera.project(np.column_stack([places, np.zeros(len(places))]))
     inside = (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < [camera.width, camera.height]).all(axis=1)
@@ -85,7 +85,7 @@ def test_labels_are_those_of_the_places_seen(camera: Camera, alpha: float):
 def test_a_pixel_shows_what_lies_at_its_centre():
     quarter = 0.25 * 4.0 / 60.0  # of a pixel, on the ground
     camera = camera_above(-quarter, quarter)
-    labels = label_map(plane_depth(camera), camera, quadrants())
+    labels = block_label_map(plane_depth(camera), camera, quadrants())
     right, top = np.arange(64) >= 32, np.arange(48) < 24
     assert (labels == 2 * right[None, :] + top[:, None]).all()
 
@@ -93,16 +93,16 @@ def test_a_pixel_shows_what_lies_at_its_centre():
 def test_the_sky_has_no_label():
     camera = CAMERAS[2]
     drawn = plane_depth(camera)
-    labels = label_map(drawn, camera, quadrants())
-    assert ((labels == NOTHING) == (drawn.alpha.numpy() == 0)).all()
-    assert (labels == NOTHING).any()
-    assert (label_map(plane_depth(camera, 0.4), camera, quadrants()) == NOTHING).all()
+    labels = block_label_map(drawn, camera, quadrants())
+    assert ((labels == NO_BLOCK) == (drawn.alpha.numpy() == 0)).all()
+    assert (labels == NO_BLOCK).any()
+    assert (block_label_map(plane_depth(camera, 0.4), camera, quadrants()) == NO_BLOCK).all()
 
 
 def test_labels_of_a_render():
     camera, model = camera_above(0.3, -0.2, tilt_deg=8, yaw_deg=30), opaque_plane()
-    drawn = label_map(render(model, camera, depth=True), camera, quadrants())
-    exact = label_map(plane_depth(camera), camera, quadrants())
+    drawn = block_label_map(render(model, camera, depth=True), camera, quadrants())
+    exact = block_label_map(plane_depth(camera), camera, quadrants())
     seen = drawn >= 0
     assert seen.mean() > 0.9
     assert (drawn == exact)[seen].mean() > 0.98
@@ -111,7 +111,7 @@ def test_labels_of_a_render():
 
 def test_labels_need_depth():
     with pytest.raises(ValueError, match="depth"):
-        label_map(render(opaque_plane(), CAMERAS[0]), CAMERAS[0], quadrants())
+        block_label_map(render(opaque_plane(), CAMERAS[0]), CAMERAS[0], quadrants())
 
 
 label_maps = arrays(np.int16, st.tuples(st.integers(1, 9), st.integers(1, 9)), elements=st.integers(-1, 2))
@@ -141,7 +141,7 @@ def test_border_pixels_by_exhaustion(labels: np.ndarray, width_px: float):
 
 def test_the_edge_of_what_is_drawn_is_no_border():
     labels = np.zeros((20, 20), np.int16)
-    labels[:, 10:] = NOTHING
+    labels[:, 10:] = NO_BLOCK
     assert not border_pixels(labels).any()
 
 
@@ -154,7 +154,7 @@ def halves(height: int = 60, width: int = 120) -> np.ndarray:
 def test_psnr_by_block_pools_pixels():
     rng = np.random.default_rng(0)
     views = [(halves(), rng.uniform(0, 0.1, (60, 120))) for _ in range(3)]
-    views[1][0][:10] = NOTHING
+    views[1][0][:10] = NO_BLOCK
     mask = rng.random((60, 120)) < 0.7
     pooled = BlockMetrics(3, ["coarse", "merged"])
     for labels, errors in views:
@@ -167,17 +167,17 @@ def test_psnr_by_block_pools_pixels():
         assert row["psnr_merged"] == pytest.approx(row["psnr_coarse"] + 10 * np.log10(4))
     assert pooled.rows()[2]["pixels"] == 0
     assert np.isnan(pooled.rows()[2]["psnr_coarse"])
-    assert pooled.everywhere()["pixels"] == sum(row["pixels"] for row in pooled.rows())
+    assert pooled.overall()["pixels"] == sum(row["pixels"] for row in pooled.rows())
 
 
 def test_slivers_of_a_block_are_left_out():
     labels = halves()
     labels[0, :36], labels[1, :35] = 2, 3  # 0.5 % of 7200 pixels are 36
-    assert blocks_shown(labels, 5) == [0, 1, 2]
+    assert visible_blocks(labels, 5) == [0, 1, 2]
     pooled = BlockMetrics(5, ["alone"])
     pooled.add(labels, {"alone": np.where(labels == 3, np.nan, 0.01)})
     assert [row["pixels"] for row in pooled.rows()] == [3600 - 71, 3600, 36, 0, 0]
-    assert pooled.everywhere()["psnr_alone"] == pytest.approx(20.0)
+    assert pooled.overall()["psnr_alone"] == pytest.approx(20.0)
 
 
 def seams_of(coarse: np.ndarray, merged: np.ndarray, labels: np.ndarray, mask: np.ndarray | None = None) -> dict:
@@ -224,7 +224,7 @@ def test_a_border_in_a_hard_place_is_no_seam():
 
 def test_pixels_that_do_not_count():
     labels, errors = halves(), np.full((60, 120), 0.1)
-    labels[:20], errors[:20] = NOTHING, np.nan
+    labels[:20], errors[:20] = NO_BLOCK, np.nan
     mask = np.ones((60, 120), bool)
     mask[-10:], errors[-10:] = False, np.nan
     figures = seams_of(errors, errors, labels, mask)
@@ -258,7 +258,7 @@ class Plane:
 
     def merged(self, camera: Camera) -> Raster:
         drawn = self._off(plane_depth(camera), 0.04)
-        border = torch.from_numpy(border_pixels(label_map(drawn, camera, quadrants())))
+        border = torch.from_numpy(border_pixels(block_label_map(drawn, camera, quadrants())))
         return drawn._replace(image=torch.where(border[..., None], 0.5 * drawn.image + 0.2, drawn.image))
 
     def block(self, index: int, camera: Camera) -> Raster | None:
@@ -314,9 +314,9 @@ def test_blocks_are_measured_in_the_exposure_of_the_view(tmp_path: Path):
 
 
 def test_pictures_of_the_views_with_most_borders(tmp_path: Path):
-    cameras = [camera_above(x, 1.0) for x in np.linspace(0, 2, SEAM_VIEWS + 2)]
+    cameras = [camera_above(x, 1.0) for x in np.linspace(0, 2, MAX_SEAM_VIEWS + 2)]
     result = Plane(cameras).evaluate(tmp_path)
-    most = sorted(result["views"], key=lambda row: -row["border_pixels"])[:SEAM_VIEWS]
+    most = sorted(result["views"], key=lambda row: -row["border_pixels"])[:MAX_SEAM_VIEWS]
     names = {file.stem for file in (tmp_path / "seams").iterdir()}
     assert names == {Path(row["name"]).stem for row in most}
 
@@ -326,7 +326,7 @@ def test_masked_pixels_change_nothing(tmp_path: Path):
     mask[:, :32] = True
     plane = Plane(CAMERAS[:1])
     result = plane.evaluate(tmp_path, mask)
-    labels = label_map(plane_depth(CAMERAS[0]), CAMERAS[0], quadrants())
+    labels = block_label_map(plane_depth(CAMERAS[0]), CAMERAS[0], quadrants())
     assert result["all"]["pixels"] == 48 * 32
     assert result["views"][0]["border_pixels"] == (border_pixels(labels) & mask).sum()
     assert sum(row["pixels"] for row in result["blocks"]) == 48 * 32
@@ -335,7 +335,7 @@ def test_masked_pixels_change_nothing(tmp_path: Path):
 def test_the_block_alone_is_measured_where_it_is_shown(tmp_path: Path):
     """A block's own render may be anything elsewhere."""
     camera = CAMERAS[0]
-    labels = label_map(plane_depth(camera), camera, quadrants())
+    labels = block_label_map(plane_depth(camera), camera, quadrants())
     plane = Plane([camera])
 
     def own_place_only(index: int, camera: Camera) -> Raster:
@@ -351,11 +351,11 @@ def test_the_block_alone_is_measured_where_it_is_shown(tmp_path: Path):
 def test_the_table_says_what_was_found(tmp_path: Path):
     result = Plane(CAMERAS[:2]).evaluate(tmp_path)
     text = StringIO()
-    Console(file=text, width=200).print(block_table(result))
+    Console(file=text, width=200).print(make_block_table(result))
     assert f"{result['blocks'][1]['psnr_merged']:.2f}" in text.getvalue()
     assert f"merged over coarse {result['seams']['seam_mae']:.3f}" in text.getvalue()
     lonely = StringIO()
-    Console(file=lonely, width=200).print(block_table(Plane([ONE_BLOCK]).evaluate(tmp_path)))
+    Console(file=lonely, width=200).print(make_block_table(Plane([ONE_BLOCK]).evaluate(tmp_path)))
     assert "no border" in lonely.getvalue()
 
 

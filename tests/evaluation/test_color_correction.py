@@ -7,7 +7,7 @@ import pytest
 
 from support.photographs import photograph, psnr
 from vdgs.evaluation import metrics
-from vdgs.evaluation.color_correction import correct_colours, correct_colours_affinely
+from vdgs.evaluation.color_correction import correct_colors, correct_colors_affine
 
 
 def directly_corrected(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
@@ -35,7 +35,7 @@ def distorted(reference: np.ndarray) -> np.ndarray:
 def test_a_change_of_exposure_and_white_balance_is_undone():
     reference = photograph(np.random.default_rng(0), 96, 128)
     image = distorted(reference)
-    result = correct_colours(image, reference)
+    result = correct_colors(image, reference)
     assert result.fitted
     assert psnr(image, reference) < 30
     assert psnr(metrics.to_8bit(result.image), reference) > 45
@@ -44,15 +44,15 @@ def test_a_change_of_exposure_and_white_balance_is_undone():
 def test_an_affine_map_undoes_exposure_and_white_balance_and_nothing_that_is_curved():
     reference = photograph(np.random.default_rng(0), 96, 128)
     image = distorted(reference)
-    result = correct_colours_affinely(image, reference)
+    result = correct_colors_affine(image, reference)
     assert result.fitted
     assert psnr(metrics.to_8bit(result.image), reference) > 45
     curved = metrics.to_8bit((reference / 255) ** 2)
-    affine, quadratic = correct_colours_affinely(curved, reference), correct_colours(curved, reference)
+    affine, quadratic = correct_colors_affine(curved, reference), correct_colors(curved, reference)
     assert psnr(curved, reference) < psnr(metrics.to_8bit(affine.image), reference)
     assert psnr(metrics.to_8bit(affine.image), reference) < psnr(metrics.to_8bit(quadratic.image), reference) - 3
     black = np.zeros_like(reference)
-    assert not correct_colours_affinely(black, reference).fitted
+    assert not correct_colors_affine(black, reference).fitted
 
 
 def test_equals_the_direct_computation():
@@ -61,7 +61,7 @@ def test_equals_the_direct_computation():
     reference[:10] = 255  # saturated in the reference, in one channel only for some
     reference[12:16, :, 1] = 0
     image = metrics.to_8bit(distorted(reference) / 255 + rng.normal(0, 0.05, reference.shape))
-    result = correct_colours(image, reference)
+    result = correct_colors(image, reference)
     np.testing.assert_allclose(result.image, directly_corrected(image, reference), atol=1e-6)
 
 
@@ -69,8 +69,8 @@ def test_memory_is_bounded_without_changing_the_result():
     rng = np.random.default_rng(2)
     reference = photograph(rng)
     image = distorted(reference)
-    whole = correct_colours(image, reference).image
-    np.testing.assert_allclose(correct_colours(image, reference, chunk=97).image, whole, atol=1e-9)
+    whole = correct_colors(image, reference).image
+    np.testing.assert_allclose(correct_colors(image, reference, chunk=97).image, whole, atol=1e-9)
 
 
 def test_pixels_outside_the_mask_do_not_steer_the_fit():
@@ -80,21 +80,21 @@ def test_pixels_outside_the_mask_do_not_steer_the_fit():
     mask[:, :40] = True
     odd = image.copy()
     odd[:, 40:] = 255 - odd[:, 40:]
-    inside = correct_colours(image, reference, mask).image[mask]
-    np.testing.assert_array_equal(correct_colours(odd, reference, mask).image[mask], inside)
+    inside = correct_colors(image, reference, mask).image[mask]
+    np.testing.assert_array_equal(correct_colors(odd, reference, mask).image[mask], inside)
 
 
 @pytest.mark.parametrize("value", [0, 255])
 def test_a_saturated_image_comes_back_as_it_is(value: int):
     reference = photograph(np.random.default_rng(4))
     image = np.full_like(reference, value)
-    result = correct_colours(image, reference)
+    result = correct_colors(image, reference)
     assert not result.fitted
     np.testing.assert_array_equal(metrics.to_8bit(result.image), image)
 
 
 def test_grey_images_have_collinear_features_and_still_fit():
     grey = np.repeat(photograph(np.random.default_rng(5))[..., :1], 3, axis=2)
-    result = correct_colours(metrics.to_8bit(grey / 255 * 0.8 + 0.1), grey)
+    result = correct_colors(metrics.to_8bit(grey / 255 * 0.8 + 0.1), grey)
     assert result.fitted
     assert psnr(metrics.to_8bit(result.image), grey) > 45

@@ -19,10 +19,10 @@ from rich.console import Console
 from support.photographs import as_render, load_mask, noisy, photograph, psnr, real_photographs, ssim, view
 from vdgs.errors import CaptureError, RunError, TrainingDiverged
 from vdgs.evaluation import comparison_images, image_io, metrics
-from vdgs.evaluation.evaluate_model import evaluate
+from vdgs.evaluation.evaluate_model import evaluate_model
 from vdgs.evaluation.lpips import Lpips, LpipsScores
-from vdgs.evaluation.renderable_model import EvaluationSettings, MeasuredModel, ModelFacts, ReferenceViews
-from vdgs.system.atomic_files import jsonable, write_json
+from vdgs.evaluation.renderable_model import EvaluationSettings, ModelMetadata, ReferenceViews, RenderableModel
+from vdgs.system.atomic_files import to_jsonable, write_json
 
 pytestmark = pytest.mark.xdist_group("evaluate")
 
@@ -64,9 +64,9 @@ def read(path: Path):
 
 
 def test_what_is_written_is_what_was_measured(city: City, tmp_path: Path):
-    facts = ModelFacts(n_anchors=1234, model_bytes=10**6)
-    model = MeasuredModel(render=city.render, visibility_map=city.visibility, facts=facts)
-    result = evaluate(city.taken, model, tmp_path, lpips_note="LPIPS is null: no weights.")
+    facts = ModelMetadata(n_anchors=1234, model_bytes=10**6)
+    model = RenderableModel(render=city.render, visibility_map=city.visibility, facts=facts)
+    result = evaluate_model(city.taken, model, tmp_path, lpips_note="LPIPS is null: no weights.")
     assert result == read(tmp_path / "metrics.json")
     rows = read(tmp_path / "per_view.json")
     assert [row["name"] for row in rows] == NAMES
@@ -87,7 +87,7 @@ def test_what_is_written_is_what_was_measured(city: City, tmp_path: Path):
 
 
 def test_quality_by_visibility(city: City, tmp_path: Path):
-    result = evaluate(city.taken, MeasuredModel(render=city.render, visibility_map=city.visibility), tmp_path)
+    result = evaluate_model(city.taken, RenderableModel(render=city.render, visibility_map=city.visibility), tmp_path)
     empty, *bins = result["by_visibility"]
     assert empty["lower"] is None
     assert empty["pixels"] == 4 * 2 * 64
@@ -103,7 +103,9 @@ def test_quality_by_visibility(city: City, tmp_path: Path):
 
 def test_the_same_twice(city: City, tmp_path: Path):
     for folder in ("one", "two"):
-        evaluate(city.taken, MeasuredModel(render=city.render, visibility_map=city.visibility), tmp_path / folder)
+        evaluate_model(
+            city.taken, RenderableModel(render=city.render, visibility_map=city.visibility), tmp_path / folder
+        )
     one, two = (read(tmp_path / folder / "metrics.json") for folder in ("one", "two"))
     assert {**one, "fps": 0} == {**two, "fps": 0}
     for file in (tmp_path / "one").rglob("*.png"):
@@ -115,7 +117,7 @@ def test_masks_are_respected(city: City, tmp_path: Path):
     mask[:, :32] = 255
     cv2.imwrite(str(tmp_path / "mask.png"), mask)
     masked = view(NAMES[0], mask=tmp_path / "mask.png")
-    result = evaluate(replace(city.taken, views=[masked]), MeasuredModel(render=city.render), tmp_path / "out")
+    result = evaluate_model(replace(city.taken, views=[masked]), RenderableModel(render=city.render), tmp_path / "out")
     left = psnr(city.renders[0][:, :32], city.photographs[0][:, :32])
     assert result["psnr"] == pytest.approx(left, abs=1e-9)
     assert read(tmp_path / "out" / "per_view.json")[0]["kept_pixels"] == 48 * 32
@@ -126,7 +128,7 @@ def test_a_view_that_is_masked_entirely_leaves_the_means_alone(city: City, tmp_p
         return np.full((48, 64), which.name != NAMES[1])
 
     taken = replace(city.taken, load_mask=load_mask)
-    result = evaluate(taken, MeasuredModel(render=city.render), tmp_path)
+    result = evaluate_model(taken, RenderableModel(render=city.render), tmp_path)
     rows = read(tmp_path / "per_view.json")
     assert rows[1]["psnr"] is rows[1]["ssim_cc"] is None
     assert result["psnr"] == pytest.approx(np.mean([rows[i]["psnr"] for i in (0, 2, 3)]))
@@ -136,7 +138,7 @@ def test_a_perfect_render_is_null_not_infinity(city: City, tmp_path: Path):
     def perfect(camera):
         return as_render(city.photographs[round(camera.camera_from_world[0, 3])])
 
-    result = evaluate(city.taken, MeasuredModel(render=perfect), tmp_path)
+    result = evaluate_model(city.taken, RenderableModel(render=perfect), tmp_path)
     assert result["psnr"] is None
     assert result["ssim"] == pytest.approx(1.0)
 
@@ -150,20 +152,20 @@ def test_lpips_is_measured_raw_and_corrected(city: City, tmp_path: Path):
             error = float(metrics.squared_error(image, reference).mean())
             return LpipsScores(error, 2 * error)
 
-    result = evaluate(city.taken, MeasuredModel(render=city.render), tmp_path, lpips=Fake())
+    result = evaluate_model(city.taken, RenderableModel(render=city.render), tmp_path, lpips=Fake())
     rows = read(tmp_path / "per_view.json")
     assert result["lpips_vgg_01"] == pytest.approx(2 * result["lpips_vgg"])
     assert rows[0]["lpips_vgg_cc"] == pytest.approx(10 ** (-rows[0]["psnr_cc"] / 10))
-    plain = EvaluationSettings(colour_correction=False, comparisons=False, contact_views=2)
-    result = evaluate(city.taken, MeasuredModel(render=city.render), tmp_path / "plain", settings=plain)
+    plain = EvaluationSettings(color_correction=False, comparisons=False, contact_sheet_views=2)
+    result = evaluate_model(city.taken, RenderableModel(render=city.render), tmp_path / "plain", settings=plain)
     assert result["psnr_cc"] is None
     assert not (tmp_path / "plain" / "comparisons").exists()
 
 
 def test_the_table_shows_the_figures(city: City, tmp_path: Path):
     out = StringIO()
-    result = evaluate(
-        city.taken, MeasuredModel(render=city.render, visibility_map=city.visibility), tmp_path,
+    result = evaluate_model(
+        city.taken, RenderableModel(render=city.render, visibility_map=city.visibility), tmp_path,
         lpips_note="LPIPS is null: no weights.", console=Console(file=out, width=100),
     )  # fmt: skip
     text = out.getvalue()
@@ -180,10 +182,10 @@ def test_pictures_are_measured_in_the_exposure_that_the_model_knows_beside_neutr
     )
     settings = EvaluationSettings(exposed="in the exposure of its neighbours")
     out = StringIO()
-    neutral = MeasuredModel(render=city.render, visibility_map=city.visibility)
-    evaluate(photographs, neutral, tmp_path / "plain", settings=settings)
+    neutral = RenderableModel(render=city.render, visibility_map=city.visibility)
+    evaluate_model(photographs, neutral, tmp_path / "plain", settings=settings)
     model = replace(neutral, exposure=lambda v: gains[v.name])
-    evaluate(photographs, model, tmp_path / "exposed", settings=settings, console=Console(file=out, width=120))
+    evaluate_model(photographs, model, tmp_path / "exposed", settings=settings, console=Console(file=out, width=120))
     plain, result = (read(tmp_path / folder / "metrics.json") for folder in ("plain", "exposed"))
     assert plain["psnr_neutral"] is plain["ssim_neutral"] is None
     assert plain["notes"] == []
@@ -210,23 +212,23 @@ def test_pictures_are_measured_in_the_exposure_that_the_model_knows_beside_neutr
 
 
 def test_what_cannot_be_evaluated_is_said(city: City, tmp_path: Path):
-    model = MeasuredModel(render=city.render)
+    model = RenderableModel(render=city.render)
     with pytest.raises(RunError, match="no test views"):
-        evaluate(replace(city.taken, views=[]), model, tmp_path)
+        evaluate_model(replace(city.taken, views=[]), model, tmp_path)
     with pytest.raises(CaptureError, match=r"a/b.jpg is 60 x 48 pixels, its camera 64 x 48"):
-        evaluate(replace(city.taken, load_image=lambda v: city.load_image(v)[:, :60]), model, tmp_path)
+        evaluate_model(replace(city.taken, load_image=lambda v: city.load_image(v)[:, :60]), model, tmp_path)
     with pytest.raises(CaptureError, match=r"gone\.png"):
-        evaluate(replace(city.taken, views=[view(NAMES[0], mask=tmp_path / "gone.png")]), model, tmp_path)
+        evaluate_model(replace(city.taken, views=[view(NAMES[0], mask=tmp_path / "gone.png")]), model, tmp_path)
     broken = as_render(city.renders[0])
     broken.image[3, 4, 1] = torch.nan
     with pytest.raises(TrainingDiverged, match="not finite"):
-        evaluate(city.taken, MeasuredModel(render=lambda camera: broken), tmp_path)
+        evaluate_model(city.taken, RenderableModel(render=lambda camera: broken), tmp_path)
     assert not (tmp_path / "metrics.json").exists()
 
 
 @given(st.lists(st.text("ab/.\\_: é", min_size=1, max_size=8), min_size=1, max_size=8))
 def test_every_view_has_its_own_plain_file_name(names: list[str]):
-    stems = image_io.file_stems(names)
+    stems = image_io.unique_file_stems(names)
     assert len({stem.casefold() for stem in stems}) == len(names)
     for stem in stems:
         assert not set(stem) & set('/\\:*?"<>|')
@@ -235,30 +237,30 @@ def test_every_view_has_its_own_plain_file_name(names: list[str]):
 
 def test_readable_file_names():
     names = ["a/b.jpg", "c/b.jpg", "a/b.png", "A/B.JPG", "DJI_0018.JPG"]
-    assert image_io.file_stems(names) == ["a__b", "c__b", "a__b_png", "A__B_JPG", "DJI_0018"]
+    assert image_io.unique_file_stems(names) == ["a__b", "c__b", "a__b_png", "A__B_JPG", "DJI_0018"]
 
 
 def test_json_has_no_nan(tmp_path):
     value = {"a": [np.float32("nan"), math.inf, np.int64(3)], "b": (None, "x", True)}
-    assert jsonable(value) == {"a": [None, None, 3], "b": [None, "x", True]}
+    assert to_jsonable(value) == {"a": [None, None, 3], "b": [None, "x", True]}
     with pytest.raises(ValueError, match="not JSON compliant"):
         write_json(tmp_path / "strict.json", value["a"][1:2])
     assert not list(tmp_path.iterdir())
 
 
 def test_the_colour_map_grows_with_the_error():
-    ramp = comparison_images.colourise(np.linspace(0, 0.3, 64)[None], limit=0.2).astype(int)
+    ramp = comparison_images.colorize(np.linspace(0, 0.3, 64)[None], limit=0.2).astype(int)
     brightness = ramp.sum(axis=2)[0]
     assert (np.diff(brightness) >= 0).all()
     assert brightness[0] < 20
     assert (ramp[0, 45:] == ramp[0, -1]).all()
-    assert comparison_images.colourise(np.array([[np.nan]]), 0.2).tolist() == [[[255, 255, 255]]]
+    assert comparison_images.colorize(np.array([[np.nan]]), 0.2).tolist() == [[[255, 255, 255]]]
 
 
 @pytest.mark.parametrize("size", [(48, 64), (300, 20), (900, 1400)])
 def test_a_comparison_of_any_size(size: tuple[int, int]):
     reference = photograph(np.random.default_rng(1), *size)
-    picture = comparison_images.comparison(reference, reference, "a name " * 3, "30.00 dB")
+    picture = comparison_images.draw_comparison(reference, reference, "a name " * 3, "30.00 dB")
     width, height = comparison_images.panel_size(
         size[1], size[0], comparison_images.PANEL_MIN_PX, comparison_images.PANEL_MAX_PX
     )
@@ -278,7 +280,7 @@ def test_on_photographs(tmp_path: Path):
         return as_render(noisy(cv2.GaussianBlur(photographs[index], (0, 0), 1.0), rng, 0.01))
 
     taken = ReferenceViews(views, lambda v: photographs[int(v.name[0])], load_mask)
-    result = evaluate(taken, MeasuredModel(render=render), tmp_path)
+    result = evaluate_model(taken, RenderableModel(render=render), tmp_path)
     assert 20 < result["psnr"] < 40
     assert result["psnr_cc"] >= result["psnr"]
     assert 0.3 < result["ssim"] < 1

@@ -138,7 +138,7 @@ def test_what_is_missing_is_said_in_one_line(backbone, nowhere: Path):
 
 
 def test_the_download_of_torch_is_found(backbone, heads, nowhere: Path):
-    cached = lpips.cached_weights()
+    cached = lpips.default_weights_path()
     assert nowhere in cached.parents
     cached.parent.mkdir(parents=True)
     torch.save(backbone, cached)

@@ -12,7 +12,7 @@ from scipy.signal import convolve2d
 
 from support.photographs import noisy, photograph, psnr, real_photographs, ssim
 from vdgs.evaluation import metrics
-from vdgs.evaluation.by_visibility import VisibilityHistogram, bounds_of, quantile_groups, view_bins
+from vdgs.evaluation.by_visibility import VisibilityHistogram, format_bounds, quantile_groups, view_bins
 
 
 def direct_ssim_map(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
@@ -141,7 +141,7 @@ def test_bins_are_of_whole_cameras():
     for each in bins:
         inside = (np.rint(visibility) >= each["lower"]) & (np.rint(visibility) <= each["upper"])
         assert inside.sum() == each["pixels"]
-    assert [bounds_of(*ends) for ends in ((3.0, 5.0), (4.0, 4.0), (9.0, 12345.0))] == [
+    assert [format_bounds(*ends) for ends in ((3.0, 5.0), (4.0, 4.0), (9.0, 12345.0))] == [
         "3 to 5", "4", "9 to 12,345",
     ]  # fmt: skip
 

@@ -19,11 +19,11 @@ from rich.console import Console
 
 from support.photographs import load_mask, photograph, psnr, view
 from vdgs.evaluation import metrics
-from vdgs.evaluation.coverage import seen_map
-from vdgs.evaluation.depth_errors import NAMES, DepthErrors, errors_of_view
-from vdgs.evaluation.evaluate_model import evaluate
-from vdgs.evaluation.opacity_coverage import PSNRS_SEEN, Rendered, larger_than_picture
-from vdgs.evaluation.renderable_model import MeasuredModel, ReferenceViews
+from vdgs.evaluation.coverage import coverage_map
+from vdgs.evaluation.depth_errors import METRIC_NAMES, DepthErrors, compute_depth_errors
+from vdgs.evaluation.evaluate_model import evaluate_model
+from vdgs.evaluation.opacity_coverage import COVERED_PSNR_KEYS, RenderedImage, count_oversized_splats
+from vdgs.evaluation.renderable_model import ReferenceViews, RenderableModel
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import Raster, Splats
 
@@ -63,8 +63,8 @@ def read(path: Path):
 
 
 def test_what_is_opaque_everywhere_is_solid_before_any_background(tmp_path: Path):
-    model = MeasuredModel(render=veil(1.0), seen_map=seen_from(40), background=BACKGROUND)
-    result = evaluate(TAKEN, model, tmp_path)
+    model = RenderableModel(render=veil(1.0), coverage_map=seen_from(40), background=BACKGROUND)
+    result = evaluate_model(TAKEN, model, tmp_path)
     assert (result["solid_share"], result["seen_pixels"]) == (1.0, 2 * 40 * HEIGHT)
     assert result["psnr_seen_own"] == result["psnr_seen_black"] == result["psnr_seen_white"]
     rows = read(tmp_path / "per_view.json")
@@ -77,7 +77,9 @@ def test_what_is_opaque_everywhere_is_solid_before_any_background(tmp_path: Path
 
 
 def test_a_veil_is_not_solid_and_shows_what_is_behind_it(tmp_path: Path):
-    result = evaluate(TAKEN, MeasuredModel(render=veil(0.5), seen_map=seen_from(40), background=BACKGROUND), tmp_path)
+    result = evaluate_model(
+        TAKEN, RenderableModel(render=veil(0.5), coverage_map=seen_from(40), background=BACKGROUND), tmp_path
+    )
     assert result["solid_share"] == 0.0
     expected = []
     for taken in PHOTOGRAPHS:
@@ -91,7 +93,7 @@ def test_a_veil_is_not_solid_and_shows_what_is_behind_it(tmp_path: Path):
 @given(st.floats(0, 1), st.tuples(*[st.floats(0, 1)] * 3))
 def test_before_its_own_background_a_picture_is_itself(alpha: float, background: tuple[float, float, float]):
     image = PHOTOGRAPHS[0].astype(np.float32) / 255
-    rendered = Rendered(image, np.full(image.shape[:2], alpha, np.float32), background)
+    rendered = RenderedImage(image, np.full(image.shape[:2], alpha, np.float32), background)
     assert np.array_equal(rendered.before(background), PHOTOGRAPHS[0])
 
 
@@ -118,22 +120,22 @@ def above(x: float, width: int = WIDTH, pitch: float = 90.0) -> Camera:
 def test_seen_are_the_places_that_three_cameras_hold_whatever_splats_reach_beyond():
     trained = [above(x) for x in (0.0, 1.0, 2.0)]
     whole = np.ones((HEIGHT, WIDTH))
-    seen = seen_map(plain_at(10.0, whole), trained)(above(4.0))
+    seen = coverage_map(plain_at(10.0, whole), trained)(above(4.0))
     # Ground from -8 to 8 lies in the first picture, the right edge of what all three hold; the view begins at -4.
     assert seen[:, :48].all()
     assert not seen[:, 48:].any()
-    assert not seen_map(plain_at(10.0, whole), trained[:2])(above(4.0)).any()
+    assert not coverage_map(plain_at(10.0, whole), trained[:2])(above(4.0)).any()
 
 
 def test_open_pixels_are_at_the_depth_of_their_neighbours_and_sky_is_not_seen():
     trained = [above(0.0)] * 3
     holes = np.ones((HEIGHT, WIDTH))
     holes[20:25, 30:40] = 0.2
-    assert seen_map(plain_at(10.0, holes), trained)(above(0.0)).all()
-    assert not seen_map(plain_at(10.0, np.zeros((HEIGHT, WIDTH))), trained)(above(0.0)).any()
+    assert coverage_map(plain_at(10.0, holes), trained)(above(0.0)).all()
+    assert not coverage_map(plain_at(10.0, np.zeros((HEIGHT, WIDTH))), trained)(above(0.0)).any()
     ahead = above(0.0, pitch=0.0)
     lower = np.repeat(np.arange(HEIGHT)[:, None] >= HEIGHT // 2, WIDTH, axis=1)
-    seen = seen_map(plain_at(10.0, lower * 1.0), [ahead] * 3)(ahead)
+    seen = coverage_map(plain_at(10.0, lower * 1.0), [ahead] * 3)(ahead)
     assert np.array_equal(seen, lower)
 
 
@@ -147,10 +149,10 @@ def test_half_open_splats_beyond_what_cameras_cover_are_not_seen_by_the_depth_at
         return plain_at(10.0, opacity)(camera)._replace(median_depth=torch.from_numpy(deep.astype(np.float32)))
 
     wide = [above(0.0, width=400)] * 3
-    assert not seen_map(draw, trained)(floats)[:, 32:].any()
-    assert seen_map(draw, wide)(floats).all(), "ground that cameras hold has to be solid, however open it is"
+    assert not coverage_map(draw, trained)(floats)[:, 32:].any()
+    assert coverage_map(draw, wide)(floats).all(), "ground that cameras hold has to be solid, however open it is"
     ghost = plain_at(10.0, np.full((HEIGHT, WIDTH), 0.6))
-    assert seen_map(ghost, wide)(floats).all()
+    assert coverage_map(ghost, wide)(floats).all()
 
 
 def test_masks_in_an_evaluation(tmp_path: Path):
@@ -160,32 +162,32 @@ def test_masks_in_an_evaluation(tmp_path: Path):
         alpha[:, 32:] = 0.0
         return veil(1.0)(camera)._replace(alpha=alpha)
 
-    everywhere = MeasuredModel(render=half_open, seen_map=seen_from(WIDTH), background=BACKGROUND)
-    assert evaluate(TAKEN, everywhere, tmp_path / "whole")["solid_share"] == 0.5
+    everywhere = RenderableModel(render=half_open, coverage_map=seen_from(WIDTH), background=BACKGROUND)
+    assert evaluate_model(TAKEN, everywhere, tmp_path / "whole")["solid_share"] == 0.5
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[:, 32:] = 255
     cv2.imwrite(str(tmp_path / "mask.png"), mask)
     masked = replace(TAKEN, views=[view("one.jpg", mask=tmp_path / "mask.png")], load_image=lambda _: PHOTOGRAPHS[0])
-    assert evaluate(masked, everywhere, tmp_path / "masked")["solid_share"] == 0.0
+    assert evaluate_model(masked, everywhere, tmp_path / "masked")["solid_share"] == 0.0
 
 
 def test_what_is_not_known_is_null(tmp_path: Path):
     opaque = veil(1.0)
-    names = ("solid_share", *PSNRS_SEEN, *NAMES, "splats_larger_than_picture", "largest_splats")
-    result = evaluate(TAKEN, MeasuredModel(render=opaque, background=BACKGROUND), tmp_path / "no V")
+    names = ("solid_share", *COVERED_PSNR_KEYS, *METRIC_NAMES, "splats_larger_than_picture", "largest_splats")
+    result = evaluate_model(TAKEN, RenderableModel(render=opaque, background=BACKGROUND), tmp_path / "no V")
     assert {result[name] for name in names} == {None}
-    image_only = MeasuredModel(
-        render=lambda camera: SimpleNamespace(image=opaque(camera).image), seen_map=seen_from(40)
+    image_only = RenderableModel(
+        render=lambda camera: SimpleNamespace(image=opaque(camera).image), coverage_map=seen_from(40)
     )
-    result = evaluate(TAKEN, image_only, tmp_path / "no alpha")
+    result = evaluate_model(TAKEN, image_only, tmp_path / "no alpha")
     assert result["psnr_seen_own"] > 10
     assert {result[name] for name in names if name != "psnr_seen_own"} == {None}
     row = read(tmp_path / "no alpha" / "per_view.json")[0]
     assert row["alpha"] is None
     assert row["seen_pixels"] == 40 * HEIGHT
     assert not (tmp_path / "no alpha" / "alpha").exists()
-    result = evaluate(
-        TAKEN, MeasuredModel(render=opaque, seen_map=seen_from(0), background=BACKGROUND), tmp_path / "none seen"
+    result = evaluate_model(
+        TAKEN, RenderableModel(render=opaque, coverage_map=seen_from(0), background=BACKGROUND), tmp_path / "none seen"
     )
     assert {result[name] for name in names} == {None}
 
@@ -201,20 +203,20 @@ def test_errors_of_depth_are_exact_shares_of_the_camera_height():
     truth = np.array([[10.0, 10.0, 10.0, np.inf]])
     drawn = drawn_at(10.5, np.array([[1.0, 0.75, 0.5, 1.0]]))
     seen = np.ones((1, 4), bool)
-    errors = errors_of_view(drawn, truth, seen, camera_height=20.0)
+    errors = compute_depth_errors(drawn, truth, seen, camera_height=20.0)
     assert errors["expected"].tolist() == [0.025, 0.025, np.inf]  # what is not drawn counts; the sky does not
     assert errors["median"].tolist() == [0.025, 0.025, np.inf]
-    assert errors_of_view(drawn, truth, ~seen, 20.0)["median"].size == 0
-    assert "median" not in errors_of_view(drawn._replace(median_depth=None), truth, seen, 20.0)
+    assert compute_depth_errors(drawn, truth, ~seen, 20.0)["median"].size == 0
+    assert "median" not in compute_depth_errors(drawn._replace(median_depth=None), truth, seen, 20.0)
 
 
 def test_depth_in_an_evaluation(tmp_path: Path):
-    model = MeasuredModel(
-        render=veil(1.0), seen_map=seen_from(40), background=BACKGROUND, camera_height=100.0,
+    model = RenderableModel(
+        render=veil(1.0), coverage_map=seen_from(40), background=BACKGROUND, camera_height=100.0,
         true_depth=lambda which: np.full((HEIGHT, WIDTH), 50.0 if which.name == "one.jpg" else 56.0),
         render_depth=lambda camera: drawn_at(50.5, np.ones((HEIGHT, WIDTH))),
     )  # fmt: skip
-    result = evaluate(TAKEN, model, tmp_path)
+    result = evaluate_model(TAKEN, model, tmp_path)
     rows = read(tmp_path / "per_view.json")
     assert [row["depth_error_median_expected"] for row in rows] == pytest.approx([0.005, 0.055], rel=1e-3)
     assert [row["depth_error_median_median"] for row in rows] == pytest.approx([0.005, 0.065], rel=1e-3)
@@ -222,7 +224,7 @@ def test_depth_in_an_evaluation(tmp_path: Path):
     assert result["depth_within_1_percent_expected"] == 0.5
     assert result["depth_error_median_expected"] == pytest.approx(0.005, rel=1e-3)
     empty = replace(model, render_depth=lambda camera: drawn_at(50.5, np.zeros((HEIGHT, WIDTH))))
-    result = evaluate(TAKEN, empty, tmp_path / "empty")
+    result = evaluate_model(TAKEN, empty, tmp_path / "empty")
     assert result["depth_error_median_expected"] is None  # infinite
     assert result["depth_within_1_percent_expected"] == 0.0
     with pytest.raises(ValueError, match="camera_height"):
@@ -236,7 +238,7 @@ def test_the_median_of_pooled_errors(values: list[float]):
         pooled.add(np.array(part))
     exact = sorted(values)[(len(values) - 1) // 2]
     assert pooled.median() == pytest.approx(exact, rel=1e-3, abs=1e-30)
-    assert pooled.share_near() == np.mean(np.array(values) <= 0.01)
+    assert pooled.near_share() == np.mean(np.array(values) <= 0.01)
 
 
 def splat(sigma_px: float, opacity: float, x: float = 32.0, angle: float = 0.6, aspect: float = 8.0) -> tuple:
@@ -263,7 +265,7 @@ def limit(opacity: float) -> float:
 def test_a_splat_is_larger_than_the_picture_if_its_ellipse_is_longer(opacity: float, angle: float, aspect: float):
     for factor, expected in ((0.99, 0), (1.01, 1)):
         one = splat(factor * limit(opacity), opacity, angle=angle, aspect=aspect)
-        assert larger_than_picture(splats(one), WIDTH, HEIGHT) == expected
+        assert count_oversized_splats(splats(one), WIDTH, HEIGHT) == expected
 
 
 def test_only_splats_that_are_drawn_count_wherever_their_centre_lies():
@@ -272,7 +274,7 @@ def test_only_splats_that_are_drawn_count_wherever_their_centre_lies():
     not_drawn = splat(large, 0.9, x=-1e5), splat(large, 0.0), splat(large, 0.5 / 255)
     broken = ((32.0, 24.0), (1e-6, 1e-3, 1e-6), 0.9), ((32.0, 24.0), (np.nan, 0.0, 1e-6), 0.9)
     small = splat(0.5 * limit(0.9), 0.9)
-    assert larger_than_picture(splats(*drawn, *not_drawn, *broken, small), WIDTH, HEIGHT) == 2
+    assert count_oversized_splats(splats(*drawn, *not_drawn, *broken, small), WIDTH, HEIGHT) == 2
 
 
 def test_large_splats_of_all_views_and_where_most_are(tmp_path: Path):
@@ -282,15 +284,17 @@ def test_large_splats_of_all_views_and_where_most_are(tmp_path: Path):
         return splats(*[large] * (1 + 2 * number(camera)), splat(1.0, 0.9))
 
     out = StringIO()
-    model = MeasuredModel(render=veil(1.0), seen_map=seen_from(40), background=BACKGROUND, splats_of=splats_of)
-    result = evaluate(TAKEN, model, tmp_path, console=Console(file=out, width=100))
+    model = RenderableModel(
+        render=veil(1.0), coverage_map=seen_from(40), background=BACKGROUND, decode_splats=splats_of
+    )
+    result = evaluate_model(TAKEN, model, tmp_path, console=Console(file=out, width=100))
     assert result["splats_larger_than_picture"] == 4
     assert (result["largest_splats"], result["largest_splats_view"]) == (3, "two.jpg")
     assert [row["largest_splats"] for row in read(tmp_path / "per_view.json")] == [1, 3]
     assert "larger than the picture: 4" in out.getvalue()
     assert "100.00%" in out.getvalue()
-    none = replace(model, splats_of=lambda camera: splats(splat(1.0, 0.9)))
-    result = evaluate(TAKEN, none, tmp_path / "none")
+    none = replace(model, decode_splats=lambda camera: splats(splat(1.0, 0.9)))
+    result = evaluate_model(TAKEN, none, tmp_path / "none")
     assert (result["splats_larger_than_picture"], result["largest_splats_view"]) == (0, None)
 
 

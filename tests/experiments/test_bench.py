@@ -14,9 +14,9 @@ from rich.console import Console
 
 from experiments.bench import bench
 from experiments.bench.bench import BenchSettings, run_bench
-from experiments.bench.grids import bounds_of
-from experiments.bench.plan import Choices
-from experiments.bench.seen import seen_by_frusta, seen_truly
+from experiments.bench.grids import group_bounds
+from experiments.bench.plan import PlanOptions
+from experiments.bench.seen import visibility_from_frusta, visibility_from_truth
 from support.commands import begun, is_free, vdgs, wait_until
 from support.forking import start_tasks
 from vdgs.config.capture_options import CaptureOptions
@@ -30,7 +30,7 @@ SMALL = ("--methods", "baseline", "full", "--scale-iterations", "0.1", "--jobs",
 
 def settings(output: Path, scale: float = 0.1) -> BenchSettings:
     """The same in this process."""
-    return BenchSettings("toy", output, Choices(methods=("baseline", "full"), scale_iterations=scale), jobs=2)
+    return BenchSettings("toy", output, PlanOptions(methods=("baseline", "full"), scale_iterations=scale), jobs=2)
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +97,7 @@ def test_generated_scenes_are_grouped_by_the_true_visibility(benched):
     results = json.loads((benched / "toy" / "results.json").read_text())["results"]
     assert {each["seen_by"] for each in results} == {"truth"}
     root = benched / "captures" / "tiny"
-    seen = seen_truly(root, CaptureOptions())
+    seen = visibility_from_truth(root, CaptureOptions())
     assert seen is not None
     counted = np.concatenate([seen.visibility_map(view.camera).ravel() for view in seen.capture.test_views])
     assert np.nanmin(counted) >= 1  # what no training camera sees is nobody's fault
@@ -106,13 +106,13 @@ def test_generated_scenes_are_grouped_by_the_true_visibility(benched):
     for group in groups:
         assert ((counted >= group["lower"]) & (counted <= group["upper"])).sum() == group["pixels"]
     assert "truly see the surface" in (benched / "toy" / "table.md").read_text()
-    assert f"(V {bounds_of(groups[0])})" in (benched / "toy" / "verdict.txt").read_text()
+    assert f"(V {group_bounds(groups[0])})" in (benched / "toy" / "verdict.txt").read_text()
 
 
 def test_frusta_hold_at_least_what_is_truly_seen(benched):
     """The paper counts frusta, which hidden surfaces lie in too: groups by both stand in the table."""
     root = benched / "captures" / "tiny"
-    truly, frusta = seen_truly(root, CaptureOptions()), seen_by_frusta(root, CaptureOptions())
+    truly, frusta = visibility_from_truth(root, CaptureOptions()), visibility_from_frusta(root, CaptureOptions())
     assert truly is not None
     assert frusta is not None
     more, unseen, pixels = 0, 0, 0
@@ -134,17 +134,17 @@ def test_frusta_hold_at_least_what_is_truly_seen(benched):
 
 def test_the_truth_is_that_of_the_views_that_are_used(benched):
     root = benched / "captures" / "tiny"
-    small = seen_truly(root, CaptureOptions(downscale=2.0, validation=True))
+    small = visibility_from_truth(root, CaptureOptions(downscale=2.0, validation=True))
     assert small is not None
     assert all(view.name.startswith("validation") for view in small.capture.test_views)
     for view in small.capture.test_views:
         assert small.visibility_map(view.camera).shape == (36, 48) == (view.camera.height, view.camera.width)
-    assert seen_truly(root, CaptureOptions(max_images=20)) is None  # fewer train than the truth counts
-    assert seen_truly(root, CaptureOptions(split="every")) is None
+    assert visibility_from_truth(root, CaptureOptions(max_images=20)) is None  # fewer train than the truth counts
+    assert visibility_from_truth(root, CaptureOptions(split="every")) is None
 
 
 def test_sky_belongs_to_no_group(benched, tmp_path, monkeypatch):
-    seen = seen_truly(benched / "captures" / "tiny", CaptureOptions())
+    seen = visibility_from_truth(benched / "captures" / "tiny", CaptureOptions())
     assert seen is not None
 
     def with_sky(camera: Camera) -> np.ndarray:
@@ -152,7 +152,7 @@ def test_sky_belongs_to_no_group(benched, tmp_path, monkeypatch):
         below[:10] = np.nan
         return below
 
-    monkeypatch.setattr(bench, "seen_truly", lambda *_: replace(seen, counted=with_sky, identity="with sky"))
+    monkeypatch.setattr(bench, "visibility_from_truth", lambda *_: replace(seen, counted=with_sky, identity="with sky"))
     shutil.copytree(benched, tmp_path / "copy")
     pixels = sum(int(np.isfinite(with_sky(view.camera)).sum()) for view in seen.capture.test_views)
     for result in run_bench(settings(tmp_path / "copy"), Console(file=io.StringIO())):
@@ -182,7 +182,7 @@ def test_one_bench_at_a_time_in_a_folder(tmp_path):
 
 
 def test_data_that_is_not_there_is_named(tmp_path):
-    asked = BenchSettings("table2", tmp_path, Choices(scenes=("residence",)))
+    asked = BenchSettings("table2", tmp_path, PlanOptions(scenes=("residence",)))
     with pytest.raises(VdgsError, match="--data"):
         run_bench(asked, Console(file=io.StringIO()))
     with pytest.raises(VdgsError, match="residence-pixsfm"):

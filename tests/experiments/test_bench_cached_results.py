@@ -9,9 +9,9 @@ import pytest
 from rich.console import Console
 
 from experiments.bench.bench import BenchSettings, run_bench
-from experiments.bench.known import left_to_train, on_the_same_pixels, read_known
-from experiments.bench.plan import Choices, make_plan
-from experiments.bench.results import Result
+from experiments.bench.known import drop_cached_runs, match_pixel_groups, read_cached_results
+from experiments.bench.plan import PlanOptions, make_plan
+from experiments.bench.results import BenchResult
 from support.bench import InThisProcess, write_data
 from vdgs.errors import VdgsError
 
@@ -19,11 +19,11 @@ pytestmark = pytest.mark.xdist_group("bench known")
 
 
 def asked(data: Path, output: Path, seeds: int = 1, known: tuple[Path, ...] = (), total: int = 40) -> BenchSettings:
-    choices = Choices(seeds, ("copr",), ("coarse", "baseline"), iterations_total=total, max_anchors=300)
+    choices = PlanOptions(seeds, ("copr",), ("coarse", "baseline"), iterations_total=total, max_anchors=300)
     return BenchSettings("table2", output, choices, data, known=known)
 
 
-def bench(settings: BenchSettings) -> tuple[dict[tuple[str, int], Result], str]:
+def bench(settings: BenchSettings) -> tuple[dict[tuple[str, int], BenchResult], str]:
     said = io.StringIO()
     return {(each.method, each.seed): each for each in run_bench(settings, Console(file=said))}, said.getvalue()
 
@@ -47,7 +47,7 @@ def there(data, tmp_path_factory) -> Path:
 
 
 def known_psnr(file: Path, method: str) -> float:
-    return next(each.figures["psnr"] for each in read_known([file]).values() if each.method == method)
+    return next(each.figures["psnr"] for each in read_cached_results([file]).values() if each.method == method)
 
 
 @pytest.fixture(autouse=True)
@@ -86,20 +86,20 @@ def test_another_seed_is_trained_beside_it(data, there, tmp_path):
 
 def test_other_settings_are_another_run(data, there, tmp_path):
     plan = make_plan("table2", asked(data, tmp_path, total=60).choices)
-    known = read_known([there])
+    known = read_cached_results([there])
     assert all(run.key({}, {}) not in known for run in plan.runs)
 
 
 def test_a_coarse_stage_that_only_known_runs_share_is_not_trained():
-    plan = make_plan("toy", Choices(methods=("baseline", "full", "no-blocking")))
+    plan = make_plan("toy", PlanOptions(methods=("baseline", "full", "no-blocking")))
     keys = {run.name: run.name for run in plan.coarse + plan.runs}
     full, other = (next(run for run in plan.runs if run.method == name) for name in ("full", "no-blocking"))
-    known = {name: Result("tiny", "any", 0, "done") for name in (full.name, other.name)}
+    known = {name: BenchResult("tiny", "any", 0, "done") for name in (full.name, other.name)}
     assert plan.coarse
-    assert not left_to_train(plan, keys, known).coarse
-    assert left_to_train(plan, keys, {full.name: known[full.name]}).coarse == plan.coarse
-    assert left_to_train(plan, keys, {}) == plan
-    assert not left_to_train(plan, keys, dict.fromkeys(keys, known[full.name])).scenes
+    assert not drop_cached_runs(plan, keys, known).coarse
+    assert drop_cached_runs(plan, keys, {full.name: known[full.name]}).coarse == plan.coarse
+    assert drop_cached_runs(plan, keys, {}) == plan
+    assert not drop_cached_runs(plan, keys, dict.fromkeys(keys, known[full.name])).scenes
 
 
 @pytest.mark.parametrize("content", ["[]", "{}", '{"results": [{"state": "done"}]}', '{"results": 3}', "no JSON"])
@@ -107,18 +107,18 @@ def test_a_file_of_another_kind_is_named(tmp_path, content):
     file = tmp_path / "results.json"
     file.write_text(content)
     with pytest.raises(VdgsError, match=r"results\.json"):
-        read_known([file])
+        read_cached_results([file])
 
 
 def test_groups_of_other_pixels_are_not_compared(there):
-    first, second = read_known([there]).values()
+    first, second = read_cached_results([there]).values()
     groups = tuple({"lower": 1, "upper": 2, "pixels": pixels} for pixels in (10, 12))
     alike = [replace(first, groups=groups), replace(second, groups=groups), replace(second, groups=())]
-    assert on_the_same_pixels(alike, {}) == alike
+    assert match_pixel_groups(alike, {}) == alike
     known = replace(first, groups=groups[::-1], figures={"psnr": 20.0, "psnr@0": 19.0, "psnr@frusta0": 18.0})
-    here, gone = on_the_same_pixels([alike[1], known], {known.key: known})
+    here, gone = match_pixel_groups([alike[1], known], {known.key: known})
     assert here == alike[1]
     assert gone.figures == {"psnr": 20.0}
     assert not gone.groups
     assert "other pixels" in gone.why
-    assert on_the_same_pixels([known, alike[1]], {known.key: known}) == [gone, here]  # whichever comes first
+    assert match_pixel_groups([known, alike[1]], {known.key: known}) == [gone, here]  # whichever comes first

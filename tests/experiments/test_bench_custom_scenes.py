@@ -14,14 +14,14 @@ from rich.console import Console
 from experiments.bench import bench
 from experiments.bench.bench import BenchSettings, run_bench
 from experiments.bench.definitions import Budget
-from experiments.bench.folders import budget_for, scenes_of
-from experiments.bench.plan import Choices, make_plan
-from experiments.bench.results import Result
+from experiments.bench.folders import budget_for, resolve_scenes
+from experiments.bench.plan import PlanOptions, make_plan
+from experiments.bench.results import BenchResult
 from experiments.bench.scenes import LAPTOP_BUDGET, SCENES
 from support.bench import InThisProcess
 from support.captures import tiny_scene, write_colmap
 from vdgs.config.capture_options import CaptureOptions
-from vdgs.config.method import with_iterations
+from vdgs.config.method import resolve_iterations
 from vdgs.config.presets import PRESETS
 from vdgs.errors import CaptureError, VdgsError
 
@@ -31,7 +31,7 @@ PLAIN = CaptureOptions()
 
 
 def names(*texts: object, options: CaptureOptions = PLAIN) -> list[str]:
-    return [scene.name for scene in scenes_of([str(text) for text in texts], options, False)]
+    return [scene.name for scene in resolve_scenes([str(text) for text in texts], options, False)]
 
 
 @pytest.fixture(scope="module")
@@ -45,8 +45,8 @@ def captures(tmp_path_factory) -> Path:
 
 def test_a_name_is_a_name_and_a_folder_a_folder(captures, monkeypatch):
     monkeypatch.chdir(captures)
-    assert scenes_of(["copr", "tiny"], PLAIN, False) == (SCENES["copr"], SCENES["tiny"])
-    (folder,) = scenes_of(["./copr"], PLAIN, False)
+    assert resolve_scenes(["copr", "tiny"], PLAIN, False) == (SCENES["copr"], SCENES["tiny"])
+    (folder,) = resolve_scenes(["./copr"], PLAIN, False)
     assert (folder.name, folder.folder, folder.capture) == ("copr-2", captures / "copr", None)
     assert names("2023/site", "tiny", "copr") == ["site", "tiny", "copr"]
     assert names("My place (2024)") == ["My-place-2024"]
@@ -65,7 +65,7 @@ def test_every_scene_has_a_name_of_its_own(captures):
 @given(st.integers(1, 5_000))
 def test_iterations_go_by_the_photographs_as_in_the_preset(training):
     budget, laptop = budget_for(training), PRESETS["laptop"].training
-    assert budget.coarse == with_iterations(laptop, training).iterations
+    assert budget.coarse == resolve_iterations(laptop, training).iterations
     assert budget.blocks * budget.per_block == pytest.approx(budget.coarse, abs=budget.blocks)
     assert budget.blocks == LAPTOP_BUDGET.blocks
 
@@ -78,7 +78,7 @@ def test_small_captures_have_the_budget_of_the_small_ones_with_names():
 
 def test_the_plan_reads_them_as_asked(captures):
     options = CaptureOptions(downscale=2.0, test_every=3, georef=Path("georef.json"))
-    choices = Choices(scenes=(str(captures / "copr"), "tiny"), seeds=1, options=replace(options, georef=None))
+    choices = PlanOptions(scenes=(str(captures / "copr"), "tiny"), seeds=1, options=replace(options, georef=None))
     plan = make_plan("table2", choices)
     scene = plan.scenes[0]
     assert plan.scenes[1] == SCENES["tiny"]
@@ -87,7 +87,7 @@ def test_the_plan_reads_them_as_asked(captures):
     full = plan.answers["copr-2", "full", 0].config
     assert (full.training.iterations, full.partition.blocks, full.assignment.min_cameras) == (3_000, 4, 16)
     with pytest.raises(VdgsError, match=r"--downscale, --test-every, --georef: say how a capture is read"):
-        make_plan("table2", Choices(scenes=("tiny",), options=options))
+        make_plan("table2", PlanOptions(scenes=("tiny",), options=options))
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,7 @@ def test_the_plan_reads_them_as_asked(captures):
 )
 def test_what_is_no_capture_is_refused_before_any_work(captures, tmp_path, monkeypatch, text, options, error, said):
     monkeypatch.chdir(captures)
-    asked = BenchSettings("table2", tmp_path / "out", Choices(scenes=("tiny", text), options=options))
+    asked = BenchSettings("table2", tmp_path / "out", PlanOptions(scenes=("tiny", text), options=options))
     with pytest.raises(error, match=said):
         run_bench(asked, Console(file=io.StringIO()))
     assert not (tmp_path / "out").exists()
@@ -110,13 +110,13 @@ def test_what_is_no_capture_is_refused_before_any_work(captures, tmp_path, monke
 
 def test_what_cannot_be_held_out_is_refused_too(tmp_path):
     write_colmap(tmp_path / "two", tiny_scene(columns=2, rows=1))
-    make_plan("table2", Choices(scenes=(str(tmp_path / "two"),)))
+    make_plan("table2", PlanOptions(scenes=(str(tmp_path / "two"),)))
     with pytest.raises(CaptureError):
-        make_plan("table2", Choices(scenes=(str(tmp_path / "two"),), validation=True))
+        make_plan("table2", PlanOptions(scenes=(str(tmp_path / "two"),), validation=True))
 
 
-def benched(folder: Path, output: Path) -> list[Result]:
-    choices = Choices(
+def benched(folder: Path, output: Path) -> list[BenchResult]:
+    choices = PlanOptions(
         scenes=(str(folder),), seeds=1, methods=("baseline",), iterations_total=24, options=CaptureOptions(downscale=2)
     )
     return run_bench(BenchSettings("table2", output, choices), Console(file=io.StringIO()))

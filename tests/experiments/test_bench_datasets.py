@@ -39,7 +39,7 @@ def data(tmp_path_factory) -> Path:
     )  # fmt: skip
     generate(folder / "town", options)
     town = load_capture(folder / "town")
-    scene = TinyScene({view.name: view.camera for view in town.views}, town.points, town.point_colours)
+    scene = TinyScene({view.name: view.camera for view in town.views}, town.points, town.point_colors)
 
     residence = folder / "residence-pixsfm"
     renamed = write_mega_nerf(residence, scene)

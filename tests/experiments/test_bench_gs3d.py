@@ -10,14 +10,14 @@ from hypothesis import strategies as st
 
 from experiments.baselines.gs3d import session as gaussian_session
 from experiments.baselines.gs3d.run import gaussians_folder
-from experiments.baselines.gs3d.schedule import LEAST_INTERVAL, PUBLISHED_ITERATIONS, scheduled
-from experiments.baselines.gs3d.training import GaussiansConfig
+from experiments.baselines.gs3d.schedule import MIN_INTERVAL, PUBLISHED_ITERATIONS, scale_schedule
+from experiments.baselines.gs3d.training import Gs3dConfig
 from experiments.bench import bench
-from experiments.bench.explicit import gaussians_config
+from experiments.bench.explicit import gs3d_config
 from experiments.bench.measure import GROUPS_FILE
-from experiments.bench.notes import notes_of
-from experiments.bench.plan import Choices, make_plan
-from experiments.bench.results import Result
+from experiments.bench.notes import make_notes
+from experiments.bench.plan import PlanOptions, make_plan
+from experiments.bench.results import BenchResult
 from support.bench import InThisProcess, benched, write_data
 from vdgs.config.method import MethodConfig
 from vdgs.errors import RunError, Stopped
@@ -28,19 +28,19 @@ pytestmark = pytest.mark.xdist_group("bench_explicit")
 
 
 def test_the_published_length_has_the_published_schedule():
-    assert scheduled(PUBLISHED_ITERATIONS) == GaussiansConfig()
+    assert scale_schedule(PUBLISHED_ITERATIONS) == Gs3dConfig()
 
 
 @given(st.integers(1, 2_000_000))
 def test_a_schedule_is_one_whatever_its_length(iterations):
-    config, published = scheduled(iterations), GaussiansConfig()
+    config, published = scale_schedule(iterations), Gs3dConfig()
     starts = [start for start, _ in config.resolutions]
     assert starts == sorted(starts)
     assert starts[0] == 0
     assert [factor for _, factor in config.resolutions] == [4, 2, 1]
     assert config.degree_interval >= 1
-    assert config.density.interval >= LEAST_INTERVAL
-    assert config.density.reset_interval >= LEAST_INTERVAL
+    assert config.density.interval >= MIN_INTERVAL
+    assert config.density.reset_interval >= MIN_INTERVAL
     # Below the end of density control by as much as in the published schedule.
     assert config.density.start <= config.density.until * iterations
     rounding = (0.5 + 1e-9) / iterations
@@ -48,28 +48,28 @@ def test_a_schedule_is_one_whatever_its_length(iterations):
 
 
 def test_long_and_short_schedules_move_in_proportion():
-    long, short = scheduled(300_000), scheduled(6_000)
+    long, short = scale_schedule(300_000), scale_schedule(6_000)
     assert (long.density.start, long.density.interval, long.density.reset_interval) == (5_000, 1_000, 30_000)
     assert (short.density.start, short.density.interval, short.density.reset_interval) == (100, 100, 600)
     assert (short.degree_interval, short.resolutions) == (200, ((0, 4), (50, 2), (100, 1)))
 
 
 def test_its_settings_are_those_of_the_table():
-    plan = make_plan("table1", Choices(seeds=2, scenes=("tiny",), max_anchors=700))
+    plan = make_plan("table1", PlanOptions(seeds=2, scenes=("tiny",), max_anchors=700))
     ours, black = plan.answers["tiny", "3dgs", 1], plan.answers["tiny", "3dgs-black", 1]
-    config = gaussians_config(ours.config)
+    config = gs3d_config(ours.config)
     assert (config.iterations, config.seed, config.background) == (600, 1, "mean")
     assert config.density.max_gaussians == 7_000
-    assert gaussians_config(black.config) == replace(config, background="black")
+    assert gs3d_config(black.config) == replace(config, background="black")
     assert ours.folder != black.folder
     assert ours.coarse_from is None
     reference = plan.reference("tiny")
     assert reference is not None
     assert "coarse" in reference.stages
-    assert any("7,000" in note for note in notes_of(plan, list[Result](), [], False))
-    alone = make_plan("table1", Choices(scenes=("tiny",), methods=("3dgs",)))
+    assert any("7,000" in note for note in make_notes(plan, list[BenchResult](), [], False))
+    alone = make_plan("table1", PlanOptions(scenes=("tiny",), methods=("3dgs",)))
     assert alone.reference("tiny") is None
-    assert gaussians_config(alone.runs[0].config).density.max_gaussians == 0
+    assert gs3d_config(alone.runs[0].config).density.max_gaussians == 0
     assert alone.runs[0].key({}, {}) != replace(alone.runs[0], config=MethodConfig()).key({}, {})
 
 

@@ -6,21 +6,21 @@ from dataclasses import replace
 import pytest
 
 from experiments.bench.cli import BenchArguments
-from experiments.bench.definitions import Budget, Method, Scene
+from experiments.bench.definitions import BenchMethod, BenchScene, Budget
 from experiments.bench.methods import METHODS
-from experiments.bench.plan import Choices, make_plan
-from experiments.bench.quoted import QUOTED
+from experiments.bench.plan import PlanOptions, make_plan
+from experiments.bench.quoted import PAPER_NUMBERS
 from experiments.bench.scenes import PUBLISHED, SCENES
 from experiments.bench.tables import TABLES
 from experiments.bench.worker import STAGES
-from vdgs.config.method import block_training
+from vdgs.config.method import block_train_config
 from vdgs.config.presets import PRESETS
-from vdgs.config.serialization import differences, to_dict
-from vdgs.config.validation_rules import validate
+from vdgs.config.serialization import diff_settings, to_dict
+from vdgs.config.validation_rules import validate_config
 from vdgs.errors import VdgsError
 
 
-def total_iterations(method: Method, scene: Scene) -> int:
+def total_iterations(method: BenchMethod, scene: BenchScene) -> int:
     config = method.settings(scene.base(scene.budget, 0), scene.budget)
     if "blocks" not in method.stages:
         return config.training.iterations
@@ -31,7 +31,7 @@ def total_iterations(method: Method, scene: Scene) -> int:
 def test_every_method_works_on_every_scene_and_gets_the_same_iterations(scene):
     for method in METHODS.values():
         config = method.settings(scene.base(scene.budget, 7), scene.budget)
-        assert validate(config) == []
+        assert validate_config(config) == []
         assert config.training.seed == 7
         assert set(method.stages) <= set(STAGES)
         if method.less:
@@ -49,7 +49,7 @@ def test_tables_name_what_exists(table):
     assert set(table.scenes) <= SCENES.keys()
     assert table.ours in table.methods
     assert not table.groups or [name for group in table.groups for name in group.methods] == list(table.methods)
-    plan = make_plan(table.name, Choices())
+    plan = make_plan(table.name, PlanOptions())
     assert plan.answers.keys() == {
         (scene, method, seed) for scene in table.scenes for method in table.methods for seed in table.seeds
     }
@@ -96,8 +96,8 @@ def test_more_anchors_by_plain_growth_differ_from_it_in_the_threshold_alone():
     for factor in (0.5, 0.25):
         line = f"growth.threshold: {threshold} -> {factor * threshold}"
         eager = f"threshold-{factor:g}"
-        assert differences(settings["cell-1-off"], settings[f"cell-1-{eager}"]) == [f"block.{line}"]
-        assert differences(settings["coarse"], settings[f"coarse-{eager}"]) == [f"training.{line}"]
+        assert diff_settings(settings["cell-1-off"], settings[f"cell-1-{eager}"]) == [f"block.{line}"]
+        assert diff_settings(settings["coarse"], settings[f"coarse-{eager}"]) == [f"training.{line}"]
     assert not settings["cell-1-off"]["block"]["compensation"]["enabled"]
 
 
@@ -136,12 +136,12 @@ def test_blocks_as_printed_take_back_what_the_laptop_changes():
 def test_presets_of_the_paper_restart_the_coarse_stage_and_literal_leaves_our_choices_out():
     paper, literal = PRESETS["paper"], PRESETS["literal"]
     for each in (paper, literal):
-        loop = block_training(each, 100)
+        loop = block_train_config(each, 100)
         assert (loop.rates, loop.growth) == (each.training.rates, each.training.growth)
         assert (loop.iterations, loop.early, loop.average) == (50_000, 1.0, 0.0)
         assert (each.partition.blocks, each.partition.expansion, each.assignment.threshold) == (8, 0.4, 0.45)
     own = {
-        line.split(":")[0] for line in differences(to_dict(paper), to_dict(literal))
+        line.split(":")[0] for line in diff_settings(to_dict(paper), to_dict(literal))
     }  # fmt: skip
     assert own == {
         "assignment.best_block", "assignment.min_cameras", "assignment.mode", "block.background_noise",
@@ -150,16 +150,16 @@ def test_presets_of_the_paper_restart_the_coarse_stage_and_literal_leaves_our_ch
         "training.anchors.fill_gaps", "training.anchors.outlier_distance", "training.loss.background",
         "training.loss.background_noise",
     }  # fmt: skip
-    assert not validate(literal)
+    assert not validate_config(literal)
 
 
 def test_comparators_that_published_dense_adam_have_it():
     scene = SCENES["lab-uneven"]
     base = scene.base(scene.budget, 0)
     scaffold, baseline = (METHODS[name].settings(base, scene.budget) for name in ("scaffold-gs", "baseline"))
-    assert scaffold == replace(baseline, training=replace(baseline.training, adam="dense"))
-    assert block_training(METHODS["dense-adam"].settings(base, scene.budget), 100).adam == "dense"
-    assert baseline.training.adam == "visible"
+    assert scaffold == replace(baseline, training=replace(baseline.training, optimizer="dense"))
+    assert block_train_config(METHODS["dense-adam"].settings(base, scene.budget), 100).optimizer == "dense"
+    assert baseline.training.optimizer == "visible"
     merged = {name: METHODS[name].settings(base, scene.budget).merge.rule for name in METHODS}
     assert {name for name, rule in merged.items() if rule == "best_seen"} == {"free-best-seen", "ramp-best-seen"}
 
@@ -172,7 +172,7 @@ def test_a_sweep_of_t_low_is_not_overruled_by_the_quantile_of_the_laptop():
 
 
 def test_runs_with_the_same_settings_are_one_run():
-    plan = make_plan("table4", Choices(scenes=("residence",)))
+    plan = make_plan("table4", PlanOptions(scenes=("residence",)))
     defaults = [plan.answers["residence", name, 0] for name in ("lambda-vis-1", "t-low-0.2", "beta-g-2", "gamma-0.9")]
     assert len({run.folder for run in defaults}) == 1
     assert len(plan.runs) == 17 - 3
@@ -180,18 +180,18 @@ def test_runs_with_the_same_settings_are_one_run():
 
 
 def test_the_coarse_row_trains_nothing_of_its_own():
-    plan = make_plan("table2", Choices(scenes=("tiny",), seeds=1))
+    plan = make_plan("table2", PlanOptions(scenes=("tiny",), seeds=1))
     (shared,) = plan.coarse
     assert plan.answers["tiny", "coarse", 0].coarse_from == shared.folder
     assert plan.answers["tiny", "coarse-as-long", 0].coarse_from is None
     assert plan.answers["tiny", "baseline", 0].coarse_from is None
     # Whatever stands beside it: a table with blocks, later in the same folder, finds what blocks begin with.
-    assert make_plan("table2", Choices(scenes=("tiny",), seeds=1, methods=("coarse",))).coarse == (shared,)
+    assert make_plan("table2", PlanOptions(scenes=("tiny",), seeds=1, methods=("coarse",))).coarse == (shared,)
 
 
 def test_a_shared_coarse_stage_does_not_depend_on_the_methods_asked_for():
     some, others = (
-        make_plan("table1", Choices(scenes=("tiny",), seeds=1, methods=methods)).coarse
+        make_plan("table1", PlanOptions(scenes=("tiny",), seeds=1, methods=methods)).coarse
         for methods in (("no-blocking", "full"), ("dogs", "blocks-4", "3dgs"))
     )
     assert some == others
@@ -199,7 +199,7 @@ def test_a_shared_coarse_stage_does_not_depend_on_the_methods_asked_for():
 
 
 def test_choices_change_the_budget_for_all_alike():
-    plan = make_plan("table2", Choices(scenes=("tiny",), seeds=2, iterations_total=1200, max_anchors=1000))
+    plan = make_plan("table2", PlanOptions(scenes=("tiny",), seeds=2, iterations_total=1200, max_anchors=1000))
     assert plan.budgets["tiny"] == Budget(600, 2, 300)
     assert plan.seeds == (0, 1)
     full = plan.answers["tiny", "full", 1].config
@@ -208,17 +208,17 @@ def test_choices_change_the_budget_for_all_alike():
     for method in ("full", "no-blocking", "printed"):  # whatever the number of blocks
         config = plan.answers["tiny", method, 1].config
         assert (config.training.growth.max_anchors, config.block.max_anchors_total) == (1000, 1000)
-    for wrong in (Choices(scenes=("nowhere",)), Choices(methods=("magic",)), Choices(seeds=0),
-                  Choices(scale_iterations=0.0)):  # fmt: skip
+    for wrong in (PlanOptions(scenes=("nowhere",)), PlanOptions(methods=("magic",)), PlanOptions(seeds=0),
+                  PlanOptions(scale_iterations=0.0)):  # fmt: skip
         with pytest.raises(VdgsError):
             make_plan("table2", wrong)
 
 
 def test_the_paper_is_quoted_as_printed():
-    table = QUOTED["table1"]
+    table = PAPER_NUMBERS["table1"]
     assert table["VDGS"]["residence"] == (24.03, 0.845, 0.188)
     assert table["Momentum-GS"]["block-all"] == (29.11, 0.881, 0.180)
-    assert QUOTED["table2"]["(d) Full"]["residence"] == QUOTED["table3"]["4 blocks"]["residence"]
+    assert PAPER_NUMBERS["table2"]["(d) Full"]["residence"] == PAPER_NUMBERS["table3"]["4 blocks"]["residence"]
     assert {scene for row in table.values() for scene in row} == set(PUBLISHED)
     titles = {METHODS[name].title for name in TABLES["table4"].methods}
-    assert QUOTED["table4"].keys() == titles - {"β_g = 0.1", "no compensation"}  # ours, not in the paper
+    assert PAPER_NUMBERS["table4"].keys() == titles - {"β_g = 0.1", "no compensation"}  # ours, not in the paper

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from experiments.bench import bench
-from experiments.bench.measure import evaluated
-from experiments.bench.notes import notes_of
-from experiments.bench.plan import Choices, make_plan
-from experiments.bench.results import NEUTRAL, SOLIDITY
-from experiments.bench.verdict import verdict
+from experiments.bench.measure import final_evaluation_folder
+from experiments.bench.notes import make_notes
+from experiments.bench.plan import PlanOptions, make_plan
+from experiments.bench.results import COVERAGE_KEYS, REFERENCE_EXPOSURE_KEYS
+from experiments.bench.verdict import check_claims
 from support.bench import InThisProcess, benched, write_data
 from vdgs.errors import VdgsError
 from vdgs.evaluation import image_io
@@ -46,7 +46,7 @@ def here(monkeypatch) -> None:
 def theirs(output, tmp_path) -> Path:
     """Its renders, as another program would leave them."""
     folder = tmp_path / "theirs"
-    shutil.copytree(evaluated(output / "runs" / "copr" / "baseline" / "0") / "renders", folder / "copr")
+    shutil.copytree(final_evaluation_folder(output / "runs" / "copr" / "baseline" / "0") / "renders", folder / "copr")
     return folder
 
 
@@ -55,15 +55,15 @@ def test_renders_of_our_own_measure_as_our_own(data, output, theirs):
     ours, foreign = both["baseline"], both["some-program-2"]
     quality = {
         name: value for name, value in ours.figures.items()
-        if name.startswith(("psnr", "ssim", "lpips")) and name not in (*SOLIDITY, *NEUTRAL)
+        if name.startswith(("psnr", "ssim", "lpips")) and name not in (*COVERAGE_KEYS, *REFERENCE_EXPOSURE_KEYS)
     }  # fmt: skip
     assert quality["psnr"]
     assert quality["psnr@0"]
     assert {name: foreign.figures[name] for name in quality} == quality
     assert (foreign.groups, foreign.seen_by) == (ours.groups, ours.seen_by)
-    for of_alpha in SOLIDITY:  # an opaque picture does not say
+    for of_alpha in COVERAGE_KEYS:  # an opaque picture does not say
         assert foreign.figures[of_alpha] is None, of_alpha
-    for of_colours in NEUTRAL:  # nor what it would be in another exposure
+    for of_colours in REFERENCE_EXPOSURE_KEYS:  # nor what it would be in another exposure
         assert ours.figures[of_colours] is not None, of_colours
         assert foreign.figures[of_colours] is None, of_colours
     assert ours.figures["solid_share"] is not None
@@ -94,7 +94,9 @@ def test_other_renders_are_measured_again(data, output, theirs):
     (theirs / "copr" / "0").mkdir()
     assert psnr() < before
     (theirs / "copr" / "0").rmdir()
-    shutil.copytree(evaluated(output / "runs" / "copr" / "baseline" / "0") / "renders", theirs / "copr" / "0")
+    shutil.copytree(
+        final_evaluation_folder(output / "runs" / "copr" / "baseline" / "0") / "renders", theirs / "copr" / "0"
+    )
     assert psnr() == before
 
 
@@ -160,14 +162,14 @@ def test_renders_that_cannot_be_measured_are_named_before_anything_is_trained(da
 )
 def test_what_cannot_be_a_row_is_refused(text, why, tmp_path):
     with pytest.raises(VdgsError, match=why):
-        make_plan("table1", Choices(scenes=("copr",), renders=(text.format(folder=tmp_path),)))
+        make_plan("table1", PlanOptions(scenes=("copr",), renders=(text.format(folder=tmp_path),)))
 
 
 def test_scenes_and_seeds_without_renders_are_left_out_and_named(tmp_path):
     for folder in ("copr", "copr/2", "brighton/1"):
         (tmp_path / folder).mkdir(parents=True)
         (tmp_path / folder / "view.png").write_bytes(b"")
-    choices = Choices(
+    choices = PlanOptions(
         seeds=3, scenes=("copr", "brighton", "seneca"), methods=("baseline",), renders=(f"mine={tmp_path}",)
     )
     plan = make_plan("table1", choices)
@@ -175,8 +177,8 @@ def test_scenes_and_seeds_without_renders_are_left_out_and_named(tmp_path):
     assert mine == {
         ("copr", 0): tmp_path / "copr", ("copr", 2): tmp_path / "copr/2", ("brighton", 1): tmp_path / "brighton/1"
     }  # fmt: skip
-    missing = next(note for note in notes_of(plan, [], [], False) if note.startswith("## Missing"))
+    missing = next(note for note in make_notes(plan, [], [], False) if note.startswith("## Missing"))
     assert [line.split(": ", 1)[1] for line in missing.splitlines()[2:]] == [
         "no renders for seed 1.", "no renders for seed 0, 2.", "no renders for seed 0, 1, 2."
     ]  # fmt: skip
-    assert not [line for line in verdict(plan, []) if line.scene.startswith("seneca") and "mine" in line.question]
+    assert not [line for line in check_claims(plan, []) if line.scene.startswith("seneca") and "mine" in line.question]

@@ -9,42 +9,42 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from experiments.bench.figure import draw_groups
-from experiments.bench.grids import Cell, Grid, Row, grids_of
+from experiments.bench.figure import plot_visibility_groups
+from experiments.bench.grids import ResultTable, TableCell, TableRow, make_result_tables
 from experiments.bench.measure import group_names
-from experiments.bench.notes import notes_of
-from experiments.bench.plan import Choices, make_plan
-from experiments.bench.results import Result
-from experiments.bench.statistics import Summary, difference, marks, summarise
-from experiments.bench.verdict import verdict
-from experiments.bench.writing import escape_latex, escape_markdown, latex, markdown, tidy_csv
+from experiments.bench.notes import make_notes
+from experiments.bench.plan import PlanOptions, make_plan
+from experiments.bench.results import BenchResult
+from experiments.bench.statistics import Summary, paired_difference, rank_marks, summarize
+from experiments.bench.verdict import check_claims
+from experiments.bench.writing import escape_latex, escape_markdown, to_latex, to_markdown, to_tidy_csv
 
 
 def test_mean_and_spread():
-    assert summarise([1.0, 2.0, 3.0]) == Summary(2.0, 1.0, 3)
-    assert summarise([2.5, None, math.nan]) == Summary(2.5, None, 1)
-    assert summarise([None]) is None
-    both = difference({0: 2.0, 1: 3.0, 2: None}, {0: 1.0, 1: 1.0, 3: 9.0})
+    assert summarize([1.0, 2.0, 3.0]) == Summary(2.0, 1.0, 3)
+    assert summarize([2.5, None, math.nan]) == Summary(2.5, None, 1)
+    assert summarize([None]) is None
+    both = paired_difference({0: 2.0, 1: 3.0, 2: None}, {0: 1.0, 1: 1.0, 3: 9.0})
     assert both is not None
     assert (both.mean, both.by_seed) == (1.5, (1.0, 2.0))
     assert both.spread == pytest.approx(math.sqrt(0.5))
-    assert both.beyond_spread
-    one = difference({0: 2.0}, {0: 1.0})
+    assert both.exceeds_spread
+    one = paired_difference({0: 2.0}, {0: 1.0})
     assert one is not None
-    assert one.beyond_spread is None
-    assert difference({0: 1.0}, {1: 1.0}) is None
+    assert one.exceeds_spread is None
+    assert paired_difference({0: 1.0}, {1: 1.0}) is None
 
 
 def test_marks():
-    assert marks([1.0, 3.0, 2.0, None], 2) == ["", "best", "second", ""]
-    assert marks([1.0, 3.0, 2.0], 2, higher_is_better=False) == ["best", "", "second"]
-    assert marks([1.001, 1.004, 0.5], 2) == ["best", "best", "second"]  # equal as shown
-    assert marks([1.0, None], 2) == ["", ""]
+    assert rank_marks([1.0, 3.0, 2.0, None], 2) == ["", "best", "second", ""]
+    assert rank_marks([1.0, 3.0, 2.0], 2, higher_is_better=False) == ["best", "", "second"]
+    assert rank_marks([1.001, 1.004, 0.5], 2) == ["best", "best", "second"]  # equal as shown
+    assert rank_marks([1.0, None], 2) == ["", ""]
 
 
 @given(st.lists(st.none() | st.floats(-50, 50), max_size=12), st.integers(0, 3))
 def test_no_value_without_mark_is_above_one_with_it(values, digits):
-    given_marks = marks(values, digits)
+    given_marks = rank_marks(values, digits)
     shown = [None if value is None else round(value, digits) for value in values]
     best = [value for value, mark in zip(shown, given_marks, strict=True) if mark == "best"]
     second = [value for value, mark in zip(shown, given_marks, strict=True) if mark == "second"]
@@ -53,7 +53,7 @@ def test_no_value_without_mark_is_above_one_with_it(values, digits):
     assert all(a > b for a in second for b in rest)
 
 
-def made(gains: dict[str, tuple[float, float]], seeds: int = 3, method_failed: str = "") -> list[Result]:
+def made(gains: dict[str, tuple[float, float]], seeds: int = 3, method_failed: str = "") -> list[BenchResult]:
     """Results on `lab-uneven` with PSNR 20 in all four groups, plus `gains` in the least and the best seen."""
     bounds = tuple({"lower": float(i), "upper": float(i + 1), "pixels": 10} for i in range(4))
     results = []
@@ -65,16 +65,16 @@ def made(gains: dict[str, tuple[float, float]], seeds: int = 3, method_failed: s
             figures |= {f"psnr_cc@{i}": figures[f"psnr@{i}"] for i in range(4)}
             failed = name == method_failed
             results.append(
-                Result("lab-uneven", name, seed, "failed", "it | broke", "runs/x")
+                BenchResult("lab-uneven", name, seed, "failed", "it | broke", "runs/x")
                 if failed
-                else Result("lab-uneven", name, seed, "done", "", "runs/x", figures, bounds, "truth")
+                else BenchResult("lab-uneven", name, seed, "done", "", "runs/x", figures, bounds, "truth")
             )
     return results
 
 
-def answers(results: list[Result], **choices) -> list[bool | None]:
-    plan = make_plan("table2", Choices(scenes=("lab-uneven",), methods=("baseline", "full"), **choices))
-    return [line.answer for line in verdict(plan, results)]
+def answers(results: list[BenchResult], **choices) -> list[bool | None]:
+    plan = make_plan("table2", PlanOptions(scenes=("lab-uneven",), methods=("baseline", "full"), **choices))
+    return [line.answer for line in check_claims(plan, results)]
 
 
 def test_the_verdict_asks_for_more_than_the_spread_and_allows_a_tenth():
@@ -83,24 +83,24 @@ def test_the_verdict_asks_for_more_than_the_spread_and_allows_a_tenth():
     assert answers(made(nothing | {"full": (0.09, -0.11)})) == [False, False]  # the spread of seeds is 0.1
     assert answers(made(nothing | {"full": (0.5, 0.0)}, seeds=1), seeds=1) == [None, True]
     assert answers(made(nothing | {"full": (0.5, 0.0)}, method_failed="full")) == [None]
-    plan = make_plan("table2", Choices(scenes=("lab-uneven",), methods=("baseline", "full")))
-    least, _ = verdict(plan, made(nothing | {"full": (0.5, 0.0)}))
+    plan = make_plan("table2", PlanOptions(scenes=("lab-uneven",), methods=("baseline", "full")))
+    least, _ = check_claims(plan, made(nothing | {"full": (0.5, 0.0)}))
     assert least.numbers == "+0.50 dB, spread 0.10, 3 seeds: +0.50, +0.50, +0.50"  # each against the same seed
 
 
 def test_rows_that_are_the_same_run_are_not_compared():
-    plan = make_plan("table4", Choices(scenes=("residence",)))
-    assert len(verdict(plan, [])) == 17 - 4  # lambda-vis-1 is what the three other defaults are, too
+    plan = make_plan("table4", PlanOptions(scenes=("residence",)))
+    assert len(check_claims(plan, [])) == 17 - 4  # lambda-vis-1 is what the three other defaults are, too
 
 
 def test_an_even_scene_is_judged_against_the_best():
-    plan = make_plan("table2", Choices(scenes=("lab-even",)))
+    plan = make_plan("table2", PlanOptions(scenes=("lab-even",)))
     results = [
-        Result("lab-even", name, seed, "done", figures={"psnr": psnr})
+        BenchResult("lab-even", name, seed, "done", figures={"psnr": psnr})
         for name, psnr in (("baseline", 21.0), ("full", 20.85), ("no-blocking", 20.0))
         for seed in plan.seeds
     ]
-    (line,) = verdict(plan, results)
+    (line,) = check_claims(plan, results)
     assert line.answer is False
     assert "21.00" in str(line)
 
@@ -119,12 +119,16 @@ def test_escapes_read_well():
 
 
 def test_grids_are_written_in_every_form():
-    cells = (Cell(Summary(24.034, 0.051, 3), 2, "best"), Cell(Summary(23.0, None, 1), 2, "second"), Cell(None, 2))
-    grid = Grid("g", "Title_1", ("a", "b|c", "d"), (Row("head"), Row("x_y", cells)), ("a note",))
-    text = markdown([grid], "H", [])
+    cells = (
+        TableCell(Summary(24.034, 0.051, 3), 2, "best"),
+        TableCell(Summary(23.0, None, 1), 2, "second"),
+        TableCell(None, 2),
+    )
+    grid = ResultTable("g", "Title_1", ("a", "b|c", "d"), (TableRow("head"), TableRow("x_y", cells)), ("a note",))
+    text = to_markdown([grid], "H", [])
     assert r"| x\_y | **24.03 ± 0.05** | <u>23.00</u> | – |" in text
-    assert r"\textbf{24.03 $\pm$ 0.05} & \underline{23.00} & --" in latex([grid])
-    rows = list(csv.DictReader(io.StringIO(tidy_csv([grid]))))
+    assert r"\textbf{24.03 $\pm$ 0.05} & \underline{23.00} & --" in to_latex([grid])
+    rows = list(csv.DictReader(io.StringIO(to_tidy_csv([grid]))))
     assert [(row["group"], row["column"], row["mark"]) for row in rows] == [
         ("head", "a", "best"),
         ("head", "b|c", "second"),
@@ -133,38 +137,40 @@ def test_grids_are_written_in_every_form():
 
 
 def test_solidity_is_a_table_where_it_is_known():
-    plan = make_plan("table2", Choices(scenes=("lab-uneven",), methods=("baseline", "full")))
+    plan = make_plan("table2", PlanOptions(scenes=("lab-uneven",), methods=("baseline", "full")))
     results = made({"baseline": (0, 0), "full": (1, 0)})
-    assert not [grid for grid in grids_of(plan, results) if grid.name == "solidity-lab-uneven"]
+    assert not [grid for grid in make_result_tables(plan, results) if grid.name == "solidity-lab-uneven"]
     for result, share in zip(results, (0.5, 0.5, 0.5, 0.9, 0.9, 0.9), strict=True):
         result.figures.update({"solid_share": share, "splats_larger_than_picture": None})
-    (grid,) = [grid for grid in grids_of(plan, results) if grid.name == "solidity-lab-uneven"]
+    (grid,) = [grid for grid in make_result_tables(plan, results) if grid.name == "solidity-lab-uneven"]
     assert grid.columns == ("opaque % ↑",)
-    assert "| VDGS (full) | **90.00 ± 0.00** |" in markdown([grid], "T", [])
+    assert "| VDGS (full) | **90.00 ± 0.00** |" in to_markdown([grid], "T", [])
 
 
 def test_methods_that_fit_exposures_are_compared_with_others_in_neutral_colours():
-    plan = make_plan("table2", Choices(scenes=("lab-uneven",), methods=("baseline", "full")))
+    plan = make_plan("table2", PlanOptions(scenes=("lab-uneven",), methods=("baseline", "full")))
     results = made({"baseline": (0, 0), "full": (1, 0)})
-    assert not [grid for grid in grids_of(plan, results) if grid.name == "neutral"]
+    assert not [grid for grid in make_result_tables(plan, results) if grid.name == "neutral"]
     for result in results[:3]:
         result.figures.update({"psnr": 20.5, "ssim": 0.61})
     for result in results[3:]:
         result.figures.update({"psnr": 30.0, "ssim": 0.9, "psnr_neutral": 20.25, "ssim_neutral": 0.6})
-    (grid,) = [grid for grid in grids_of(plan, results) if grid.name == "neutral"]
-    text = markdown([grid], "T", [])
+    (grid,) = [grid for grid in make_result_tables(plan, results) if grid.name == "neutral"]
+    text = to_markdown([grid], "T", [])
     assert "| VDGS (full) | <u>20.25 ± 0.00</u> | <u>0.600 ± 0.000</u> |" in text
     assert "| **20.50 ± 0.00** | **0.610 ± 0.000** |" in text
 
 
 def test_failures_are_shown_and_leave_a_gap(tmp_path):
-    plan = make_plan("table2", Choices(scenes=("lab-uneven",), methods=("baseline", "full")))
+    plan = make_plan("table2", PlanOptions(scenes=("lab-uneven",), methods=("baseline", "full")))
     results = made({"baseline": (0, 0), "full": (1, 0)}, method_failed="full")
-    text = markdown(grids_of(plan, results), "T", notes_of(plan, results, verdict(plan, results), False))
+    text = to_markdown(
+        make_result_tables(plan, results), "T", make_notes(plan, results, check_claims(plan, results), False)
+    )
     assert "full on lab-uneven, seed 2: failed. it \\| broke" in text
     assert re.search(r"\| VDGS \(full\) \| – \|", text)
-    assert draw_groups(tmp_path / "groups.png", plan, results)
-    assert not draw_groups(tmp_path / "none.png", plan, [])
+    assert plot_visibility_groups(tmp_path / "groups.png", plan, results)
+    assert not plot_visibility_groups(tmp_path / "none.png", plan, [])
     assert not (tmp_path / "none.png").exists()
 
 
@@ -176,20 +182,20 @@ def test_groups_have_names():
 @pytest.mark.parametrize(("validation", "views"), [(False, "Test views"), (True, "Validation views")])
 def test_a_table_says_which_views_it_is_measured_on(validation, views):
     results = made({}, seeds=1)
-    plan = make_plan("table2", Choices(scenes=("lab-uneven",), methods=("baseline", "full"), validation=validation))
-    titles = [grid.title for grid in grids_of(plan, results)]
+    plan = make_plan("table2", PlanOptions(scenes=("lab-uneven",), methods=("baseline", "full"), validation=validation))
+    titles = [grid.title for grid in make_result_tables(plan, results)]
     assert titles[0].startswith(f"{views}, raw")
     assert titles[1].startswith(f"{views}, colour-corrected")
 
 
 def test_methods_that_get_more_are_no_rivals():
-    plan = make_plan("longer", Choices(scenes=("lab-even",)))
+    plan = make_plan("longer", PlanOptions(scenes=("lab-even",)))
     results = [
-        Result("lab-even", name, seed, "done", figures={"psnr": psnr})
+        BenchResult("lab-even", name, seed, "done", figures={"psnr": psnr})
         for name, psnr in (("baseline", 20.95), ("full", 21.0), ("longer-2", 22.0))
         for seed in range(3)
     ]
-    (line,) = verdict(plan, results)
+    (line,) = check_claims(plan, results)
     assert line.answer is True
     assert "longer" not in str(line)
     assert "times as long" not in str(line)

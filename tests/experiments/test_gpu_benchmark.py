@@ -12,7 +12,7 @@ from support.fake_device import CARD, pretended_card
 from support.fake_gsplat import needs_gsplat
 from support.gpu_on_host import build, install
 from vdgs.kernels import device_selection
-from vdgs.kernels.operations import OPERATIONS
+from vdgs.kernels.operations import OPERATION_NAMES
 
 pytest.importorskip("embreex", reason="synth: pip install 'vdgs[synth]'")
 pytestmark = [
@@ -37,7 +37,7 @@ def test_all_of_it_runs_and_agrees(drivers, compiled_code, tmp_path, monkeypatch
         code = gpu.main(["--small", "--capture", str(tmp_path / "capture"), "--iterations", "4"], machine)
     said = capsys.readouterr()
     assert code == 0, said.err
-    for operation in OPERATIONS:
+    for operation in OPERATION_NAMES:
         assert f"{operation}: " in said.out or f"{operation} by cuda: " in said.out
     for kernel in ("rasterise_backward", "mark_anchors", "write_rows", "add_view", "move_anchors"):
         assert f"{kernel:22}" in said.out

@@ -13,16 +13,16 @@ from experiments.baselines.gs3d import run as comparator
 from experiments.baselines.gs3d import session as gaussian_session
 from experiments.baselines.gs3d.density import DensityConfig
 from experiments.baselines.gs3d.model import (
-    GaussiansModel,
+    GaussianModel,
 )
 from experiments.baselines.gs3d.training import (
-    GaussiansConfig,
+    Gs3dConfig,
     train,
 )
 from support.captures import tiny_scene, write_colmap
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
-from vdgs.config.checkpointing import WatchOptions
+from vdgs.config.checkpointing import CheckpointOptions
 from vdgs.errors import RunError, Stopped, VdgsError
 from vdgs.evaluation.renderable_model import EvaluationSettings
 from vdgs.geometry.camera import Camera
@@ -32,7 +32,7 @@ from vdgs.runs.stage_folder import StageFolder
 pytestmark = pytest.mark.xdist_group("gaussians")
 
 DENSITY = DensityConfig(start=15, interval=10, until=0.5, dense=0.08, reset_interval=40)
-SHORT = GaussiansConfig(iterations=60, resolutions=((0, 2), (30, 1)), density=DENSITY)
+SHORT = Gs3dConfig(iterations=60, resolutions=((0, 2), (30, 1)), density=DENSITY)
 QUIET = Console(quiet=True)
 
 
@@ -46,7 +46,7 @@ def capture(tmp_path_factory):
 @pytest.fixture(scope="module")
 def trained(capture, tmp_path_factory):
     run_ = RunFolder(tmp_path_factory.mktemp("run"))
-    result = comparator.run_gaussians(
+    result = comparator.run_gs3d(
         run_, capture, SHORT, QUIET, visibility_map=lambda camera: np.full((camera.height, camera.width), 3.0)
     )
     return SimpleNamespace(run=run_, result=result, folder=StageFolder(run_.path / "gaussians"))
@@ -58,7 +58,7 @@ def test_a_run_leaves_model_log_and_figures(trained):
     assert written["model"] == "3dgs"
     assert written["psnr"] > 12
     assert written["by_visibility"][0]["lower"] == written["by_visibility"][-1]["upper"] == 3.0
-    model = GaussiansModel.load(trained.folder.model)
+    model = GaussianModel.load(trained.folder.model)
     assert written["n_gaussians"] == len(model.gaussians)
     lines = [json.loads(line) for line in trained.folder.log.read_text().splitlines()]
     assert [line["iteration"] for line in lines] == [20, 30, 50]
@@ -69,7 +69,7 @@ def test_a_run_leaves_model_log_and_figures(trained):
 
 def test_a_finished_run_is_only_read(trained, capture):
     before = trained.folder.model.stat().st_mtime_ns
-    comparator.train_gaussians(capture, SHORT, trained.folder.path, QUIET)
+    comparator.train_gs3d(capture, SHORT, trained.folder.path, QUIET)
     assert trained.folder.model.stat().st_mtime_ns == before
 
 
@@ -79,28 +79,28 @@ def test_a_stopped_run_continues_from_its_last_state(trained, capture, tmp_path,
 
     monkeypatch.setattr(gaussian_session, "train", stopped)
     with pytest.raises(Stopped, match="37"):
-        comparator.train_gaussians(capture, SHORT, tmp_path, QUIET, options=WatchOptions(save_every=10))
+        comparator.train_gs3d(capture, SHORT, tmp_path, QUIET, options=CheckpointOptions(save_every=10))
     assert StageFolder(tmp_path).status().state == "stopped"
     monkeypatch.undo()
-    comparator.train_gaussians(capture, SHORT, tmp_path, QUIET)
+    comparator.train_gs3d(capture, SHORT, tmp_path, QUIET)
     assert StageFolder(tmp_path).model.read_bytes() == trained.folder.model.read_bytes()
 
 
 def test_other_settings_and_other_captures_are_refused(trained, capture, tmp_path):
     with pytest.raises(RunError, match="iterations: 60 -> 61"):
-        comparator.train_gaussians(capture, replace(SHORT, iterations=61), trained.folder.path, QUIET)
+        comparator.train_gs3d(capture, replace(SHORT, iterations=61), trained.folder.path, QUIET)
     write_colmap(tmp_path, tiny_scene(seed=1))
     other = load_capture(tmp_path, CaptureOptions(up="z"))
     with pytest.raises(RunError, match="is not the capture"):
-        comparator.train_gaussians(other, SHORT, trained.folder.path, QUIET)
+        comparator.train_gs3d(other, SHORT, trained.folder.path, QUIET)
     with pytest.raises(RunError, match="is not the capture"):
-        comparator.evaluate_gaussians(GaussiansModel.load(trained.folder.model), other, tmp_path / "evaluation")
+        comparator.evaluate_gs3d(GaussianModel.load(trained.folder.model), other, tmp_path / "evaluation")
 
 
 def test_the_background_is_black_or_that_of_the_photographs(trained, capture, tmp_path):
-    assert GaussiansModel.load(trained.folder.model).background == (0.0, 0.0, 0.0)
+    assert GaussianModel.load(trained.folder.model).background == (0.0, 0.0, 0.0)
     mean = replace(SHORT, iterations=1, background="mean")
-    model = comparator.train_gaussians(capture, mean, tmp_path, QUIET)
+    model = comparator.train_gs3d(capture, mean, tmp_path, QUIET)
     assert all(0.3 < value < 0.7 for value in model.background)
     away = Camera(
         camera_from_world=np.diag([1.0, 1, 1, 1]), fx=20.0, fy=20.0, cx=4.0, cy=4.0, width=8, height=8
@@ -113,14 +113,14 @@ def test_the_background_is_black_or_that_of_the_photographs(trained, capture, tm
 def test_settings_that_do_not_work_are_named(capture, tmp_path):
     wrong = replace(SHORT, iterations=0, resolutions=((5, 1),), degree=4)
     with pytest.raises(VdgsError, match=r"(?s)iterations.*degree.*resolutions"):
-        comparator.train_gaussians(capture, wrong, tmp_path / "run", QUIET)
+        comparator.train_gs3d(capture, wrong, tmp_path / "run", QUIET)
     assert not (tmp_path / "run").exists()
 
 
 def test_a_model_is_measured_without_its_folder(trained, capture, tmp_path):
-    model = GaussiansModel.load(trained.folder.model)
-    result = comparator.evaluate_gaussians(
-        model, capture, tmp_path, settings=EvaluationSettings(comparisons=False, colour_correction=False)
+    model = GaussianModel.load(trained.folder.model)
+    result = comparator.evaluate_gs3d(
+        model, capture, tmp_path, settings=EvaluationSettings(comparisons=False, color_correction=False)
     )
     assert result["psnr"] == pytest.approx(trained.result["psnr"])
     assert result["by_visibility"] is None
@@ -128,7 +128,7 @@ def test_a_model_is_measured_without_its_folder(trained, capture, tmp_path):
 
 @pytest.mark.parametrize("damage", ["truncate", "text", "nan", "missing", "bits"])
 def test_a_damaged_model_is_refused(trained, tmp_path, damage):
-    path, model = tmp_path / "model.safetensors", GaussiansModel.load(trained.folder.model)
+    path, model = tmp_path / "model.safetensors", GaussianModel.load(trained.folder.model)
     if damage == "nan":
         model = replace(model, gaussians=replace(model.gaussians, means=model.gaussians.means * float("nan")))
     model.save(path)
@@ -141,4 +141,4 @@ def test_a_damaged_model_is_refused(trained, tmp_path, damage):
     elif damage == "bits":
         path.write_bytes(path.read_bytes()[:-1] + b"\x01")
     with pytest.raises(VdgsError, match=r"model\.safetensors"):
-        GaussiansModel.load(path)
+        GaussianModel.load(path)

@@ -12,34 +12,34 @@ from rich.console import Console
 from experiments.baselines.gs3d import training as gaussian_training
 from experiments.baselines.gs3d.density import DensityConfig
 from experiments.baselines.gs3d.model import (
-    GaussiansModel,
-    initial_gaussians,
+    GaussianModel,
+    initialize_gaussians,
 )
-from experiments.baselines.gs3d.session import train_watched
+from experiments.baselines.gs3d.session import train_with_checkpoints
 from experiments.baselines.gs3d.training import (
-    GaussianRates,
-    GaussiansConfig,
-    GaussiansStage,
-    degree_at,
+    Gs3dConfig,
+    Gs3dLearningRates,
+    Gs3dProblem,
     downscale_at,
     from_saved,
-    rates_at,
+    gs3d_train_step,
+    initial_state,
+    learning_rates_at,
     scene_extent,
-    start_state,
+    sh_degree_at,
     to_saved,
     train,
-    train_step,
 )
 from support.checkerboard import Photographs
-from vdgs.config.checkpointing import WatchOptions
+from vdgs.config.checkpointing import CheckpointOptions
 from vdgs.errors import TrainingDiverged, VdgsError
-from vdgs.kernels import cpu, set_threads, threads
+from vdgs.kernels import cpu, get_num_threads, set_num_threads
 from vdgs.runs.stage_folder import StageFolder
-from vdgs.system.checkpoints import load_newest, save_state
+from vdgs.system.checkpoints import load_latest_checkpoint, save_checkpoint
 
 pytestmark = pytest.mark.xdist_group("gaussian_training")
 
-CONFIG = GaussiansConfig(
+CONFIG = Gs3dConfig(
     iterations=80,
     resolutions=((0, 2), (20, 1)),
     degree_interval=25,
@@ -47,15 +47,15 @@ CONFIG = GaussiansConfig(
 )
 
 
-def stage(config: GaussiansConfig = CONFIG) -> GaussiansStage:
-    return GaussiansStage(config, Photographs(), 8, scene_extent(Photographs().cameras))
+def stage(config: Gs3dConfig = CONFIG) -> Gs3dProblem:
+    return Gs3dProblem(config, Photographs(), 8, scene_extent(Photographs().cameras))
 
 
-def start(config: GaussiansConfig = CONFIG):
+def start(config: Gs3dConfig = CONFIG):
     rng = np.random.default_rng(0)
     points = np.concatenate([rng.uniform(-4, 4, (300, 2)), np.zeros((300, 1))], axis=1)
     grey = np.full((300, 3), 128, np.uint8)
-    return start_state(initial_gaussians(points, grey, config.initial_opacity, config.degree))
+    return initial_state(initialize_gaussians(points, grey, config.initial_opacity, config.degree))
 
 
 def run(state, stage_, until: int | None = None):
@@ -80,7 +80,7 @@ def test_training_learns_the_place():
         CONFIG, iterations=400, density=replace(CONFIG.density, interval=50, until=0.5, reset_interval=1000)
     )
     state = run(start(longer), stage(longer))
-    photographs, model = Photographs(), GaussiansModel(state.gaussians, (0.0, 0.0, 0.0), {})
+    photographs, model = Photographs(), GaussianModel(state.gaussians, (0.0, 0.0, 0.0), {})
     errors = []
     for index in range(8):
         picture = model.render(photographs.camera(index)).image
@@ -94,20 +94,20 @@ def test_a_stopped_and_continued_run_has_the_same_bits(unbroken, tmp_path):
     for stop_at in (1, 19, 20, 27, 40, 79):
         run(state, stage(), until=stop_at)
         assert state.iteration == stop_at
-        save_state(tmp_path, to_saved(state))
-        saved, _ = load_newest(tmp_path)
+        save_checkpoint(tmp_path, to_saved(state))
+        saved, _ = load_latest_checkpoint(tmp_path)
         assert saved is not None
         state = from_saved(saved)
     assert bits(run(state, stage())) == bits(unbroken)
 
 
 def test_the_number_of_threads_changes_no_bit(unbroken):
-    before = threads()
+    before = get_num_threads()
     try:
-        set_threads(1 if before > 1 else 3)
+        set_num_threads(1 if before > 1 else 3)
         assert bits(run(start(), stage())) == bits(unbroken)
     finally:
-        set_threads(before)
+        set_num_threads(before)
 
 
 def memory_runs_out(monkeypatch, where: str, at_call: int, room=gaussian_training) -> None:
@@ -125,9 +125,9 @@ def memory_runs_out(monkeypatch, where: str, at_call: int, room=gaussian_trainin
 def watched(folder: StageFolder):
     folder.path.mkdir(exist_ok=True)
     console = Console(file=io.StringIO())
-    saved, _ = load_newest(folder.checkpoints)
+    saved, _ = load_latest_checkpoint(folder.checkpoints)
     state = start() if saved is None else from_saved(saved)
-    train_watched(folder, state, stage(), WatchOptions(), console)
+    train_with_checkpoints(folder, state, stage(), CheckpointOptions(), console)
     return state
 
 
@@ -173,14 +173,14 @@ def test_growth_keeps_everything_aligned_and_resets_opacities(unbroken):
 def test_opacities_are_reset_with_their_moments():
     state = run(start(), stage(), until=39)
     assert float(state.gaussians.logits.sigmoid().max()) > 0.05
-    train_step(state, stage())
+    gs3d_train_step(state, stage())
     assert float(state.gaussians.logits.sigmoid().max()) <= 0.01 + 1e-6
     assert not state.moments.first["logits"].any()
     assert state.moments.first["means"].any()
 
 
 def test_bands_of_colour_are_released_one_after_the_other():
-    assert [degree_at(i, CONFIG) for i in (0, 24, 25, 50, 75, 79)] == [0, 0, 1, 2, 3, 3]
+    assert [sh_degree_at(i, CONFIG) for i in (0, 24, 25, 50, 75, 79)] == [0, 0, 1, 2, 3, 3]
     state = run(start(), stage(), until=25)
     assert not state.gaussians.rest.any()
     run(state, stage(), until=50)
@@ -189,14 +189,14 @@ def test_bands_of_colour_are_released_one_after_the_other():
 
 
 def test_the_schedules():
-    assert [downscale_at(i, GaussiansConfig()) for i in (0, 249, 250, 499, 500, 9999)] == [4, 4, 2, 2, 1, 1]
-    config = GaussiansConfig(iterations=100, rates=GaussianRates())
-    assert rates_at(config, 3.0, 0)["means"] == pytest.approx(3 * 1.6e-4)
-    assert rates_at(config, 3.0, 50)["means"] == pytest.approx(3 * 1.6e-5)
-    assert rates_at(config, 3.0, 100)["means"] == pytest.approx(3 * 1.6e-6)
-    assert rates_at(config, 3.0, 100)["dc"] == pytest.approx(20 * rates_at(config, 9.0, 0)["rest"])
+    assert [downscale_at(i, Gs3dConfig()) for i in (0, 249, 250, 499, 500, 9999)] == [4, 4, 2, 2, 1, 1]
+    config = Gs3dConfig(iterations=100, rates=Gs3dLearningRates())
+    assert learning_rates_at(config, 3.0, 0)["means"] == pytest.approx(3 * 1.6e-4)
+    assert learning_rates_at(config, 3.0, 50)["means"] == pytest.approx(3 * 1.6e-5)
+    assert learning_rates_at(config, 3.0, 100)["means"] == pytest.approx(3 * 1.6e-6)
+    assert learning_rates_at(config, 3.0, 100)["dc"] == pytest.approx(20 * learning_rates_at(config, 9.0, 0)["rest"])
 
 
 def test_a_loss_that_is_not_a_number_stops_training():
     with pytest.raises(TrainingDiverged, match="iteration 1"):
-        train_step(start(), replace(stage(), background=(float("nan"), 0.0, 0.0)))
+        gs3d_train_step(start(), replace(stage(), background=(float("nan"), 0.0, 0.0)))

@@ -13,16 +13,16 @@ import torch
 from support.gaussians import overhead, picture, psnr, random_gaussians
 from vdgs.errors import VdgsError
 from vdgs.export.formats import registry, spz
-from vdgs.export.formats.export_scene import Y_UP, Facts, Scene
-from vdgs.export.formats.simplify import cell_of, thinned
+from vdgs.export.formats.export_scene import Y_UP, ExportMetadata, ExportScene
+from vdgs.export.formats.simplify import cell_indices, simplify
 from vdgs.export.formats.tiles_3d import write_tiles
 from vdgs.geometry.geodesy import geodetic_from_ecef
-from vdgs.model.gaussian_transform import covariances, transformed
-from vdgs.model.gaussians import Gaussians, draw_gaussians
+from vdgs.model.gaussian_transform import gaussian_covariances, transform_gaussians
+from vdgs.model.gaussians import Gaussians, render_gaussians
 
 pytestmark = pytest.mark.xdist_group("export_tiles")
 
-PLACE = Facts(geodetic=(48.13, 11.57, 512.0))
+PLACE = ExportMetadata(geodetic=(48.13, 11.57, 512.0))
 
 
 def tiles_of(tileset: Path) -> list[tuple[dict, int, Gaussians]]:
@@ -47,12 +47,12 @@ def tile(path: Path) -> Gaussians:
     packed = primitive["extensions"]["KHR_gaussian_splatting"]["extensions"]["KHR_gaussian_splatting_compression_spz_2"]
     view = gltf["bufferViews"][packed["bufferView"]]
     content = zlib.decompress(data[28 + length : 28 + length + view["byteLength"]], 31)
-    gaussians = spz.decoded(content, path)
+    gaussians = spz.decode_spz(content, path)
     assert gltf["accessors"][primitive["attributes"]["POSITION"]]["count"] == len(gaussians)
     # CesiumJS tells the degree of spherical harmonics by how many attributes are named so.
     assert sum("SH_DEGREE" in name for name in primitive["attributes"]) == gaussians.rest.shape[1]
-    moved = transformed(gaussians, 1.0, np.eye(3), np.array(gltf["nodes"][0]["translation"]))
-    return transformed(moved, 1.0, Y_UP.T, np.zeros(3))
+    moved = transform_gaussians(gaussians, 1.0, np.eye(3), np.array(gltf["nodes"][0]["translation"]))
+    return transform_gaussians(moved, 1.0, Y_UP.T, np.zeros(3))
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def town() -> Gaussians:
 @pytest.fixture(scope="module")
 def written(town, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("tiles") / "tileset.json"
-    write_tiles(path, Scene.of(town, PLACE), most=120)
+    write_tiles(path, ExportScene.of(town, PLACE), max_gaussians=120)
     return path
 
 
@@ -77,8 +77,8 @@ def test_the_leaves_hold_the_scene(written, town):
     near = torch.cdist(town.means.double(), means.double()).argmin(1)
     assert len(near.unique()) == len(town)
     torch.testing.assert_close(means[near], town.means, atol=4e-4, rtol=0)
-    shapes = torch.cat([covariances(each) for each in leaves])[near]
-    error = (shapes - covariances(town)).norm(dim=(1, 2)) / covariances(town).norm(dim=(1, 2))
+    shapes = torch.cat([gaussian_covariances(each) for each in leaves])[near]
+    error = (shapes - gaussian_covariances(town)).norm(dim=(1, 2)) / gaussian_covariances(town).norm(dim=(1, 2))
     assert float(error.median()) < 0.05
 
 
@@ -125,12 +125,12 @@ def test_older_tiles_go_when_new_ones_are_there(tmp_path, town):
     path = tmp_path / "tileset.json"
     (tmp_path / "mine.txt").write_text("stays")
     for _ in range(2):
-        notes = registry.write(path, Scene.of(some))
+        notes = registry.write_scene(path, ExportScene.of(some))
     assert any("centre of the Earth" in note for note in notes)
     assert sorted(each.name for each in tmp_path.iterdir()) == ["mine.txt", "tiles-2", "tileset.json"]
     broken = replace(some, dc=some.dc * float("inf"))
     with pytest.raises(VdgsError, match="not finite"):
-        registry.write(path, Scene(chunks=[broken], count=50, degree=1))
+        registry.write_scene(path, ExportScene(chunks=[broken], count=50, degree=1))
     assert sorted(each.name for each in tmp_path.iterdir()) == ["mine.txt", "tiles-2", "tileset.json"]
     assert len(tiles_of(path)[0][2]) == 50
 
@@ -141,15 +141,15 @@ def listed(folder: Path) -> list[str]:
 
 
 def test_only_tiles_of_ours_ever_go(tmp_path, town):
-    path, some = tmp_path / "tileset.json", Scene.of(town.select(torch.arange(50)))
+    path, some = tmp_path / "tileset.json", ExportScene.of(town.select(torch.arange(50)))
     for mine in ("tiles-photos/a.jpg", "tiles-1/a.jpg", "tiles-2/0.glb", "tiles-/0.glb"):
         (tmp_path / mine).parent.mkdir()
         (tmp_path / mine).write_text("mine")
     before = listed(tmp_path)
-    registry.write(path, some)
+    registry.write_scene(path, some)
     assert listed(tmp_path) == sorted([*before, "tiles-3", "tiles-3/0.glb", "tileset.json"])
     (tmp_path / "tiles-3" / "notes.txt").write_text("mine")
-    registry.write(path, some)
+    registry.write_scene(path, some)
     assert listed(tmp_path) == sorted(
         [*before, "tiles-3", "tiles-3/notes.txt", "tiles-4", "tiles-4/0.glb", "tileset.json"]
     )
@@ -170,7 +170,7 @@ def test_what_a_strange_tileset_names_stays(tmp_path, town, generator, uri):
     root = {"content": {"uri": str(tmp_path) + uri if str(uri).startswith("/") else uri}}
     strange = {"asset": {"version": "1.1", "generator": generator}, "root": root}
     (folder / "tileset.json").write_text(json.dumps(strange) if generator else "{")
-    registry.write(folder / "tileset.json", Scene.of(town.select(torch.arange(50))))
+    registry.write_scene(folder / "tileset.json", ExportScene.of(town.select(torch.arange(50))))
     for mine in ("tiles-2/0.glb", "at/tiles-2/0.glb", "at/mine/0.glb"):
         assert (tmp_path / mine).read_text() == "mine"
 
@@ -178,7 +178,7 @@ def test_what_a_strange_tileset_names_stays(tmp_path, town, generator, uri):
 def test_a_crowd_on_one_spot_ends_in_one_tile(tmp_path):
     crowd = random_gaussians(300, 0)
     crowd = replace(crowd, means=torch.zeros(300, 3))
-    write_tiles(tmp_path / "tileset.json", Scene.of(crowd), most=50)
+    write_tiles(tmp_path / "tileset.json", ExportScene.of(crowd), max_gaussians=50)
     leaves = [gaussians for entry, _, gaussians in tiles_of(tmp_path / "tileset.json") if "children" not in entry]
     assert [len(each) for each in leaves] == [300]
 
@@ -206,13 +206,13 @@ def surface(side: int = 60, step: float = 0.1, opacity: float = 0.98) -> Gaussia
 @pytest.mark.parametrize("most", [900, 300, 100])
 def test_a_thinned_surface_has_no_holes_and_keeps_its_colours(most):
     fine = surface()
-    coarse, edge = thinned(fine, most)
+    coarse, edge = simplify(fine, most)
     assert most / 4 < len(coarse) <= most
     assert edge > 0.1
     camera = replace(overhead(height=7.0, aside=0.01, size=64), fx=90.0, fy=90.0)  # sees the middle of it
 
     def drawn(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
-        raster, _ = draw_gaussians(gaussians, camera, torch.zeros(3), 0)
+        raster, _ = render_gaussians(gaussians, camera, torch.zeros(3), 0)
         return raster.image.numpy(), raster.alpha.numpy()
 
     (image, alpha), (coarse_image, coarse_alpha) = drawn(fine), drawn(coarse)
@@ -224,15 +224,15 @@ def test_a_thinned_surface_has_no_holes_and_keeps_its_colours(most):
 
 def test_faint_things_stay_faint():
     fine = surface(opacity=0.1)
-    coarse, _ = thinned(fine, 200)
+    coarse, _ = simplify(fine, 200)
     camera = replace(overhead(height=7.0, aside=0.01, size=64), fx=90.0, fy=90.0)
-    means = [draw_gaussians(each, camera, torch.zeros(3), 0)[0].alpha.mean().item() for each in (fine, coarse)]
+    means = [render_gaussians(each, camera, torch.zeros(3), 0)[0].alpha.mean().item() for each in (fine, coarse)]
     assert means[1] == pytest.approx(means[0], abs=0.08)
 
 
 def test_nothing_changes_where_nothing_must_be_merged():
     some = random_gaussians(100, 2)
-    same, edge = thinned(some, 100)
+    same, edge = simplify(some, 100)
     assert same is some
     assert edge == 0
 
@@ -247,10 +247,10 @@ def test_no_far_thing_decides_how_much_of_a_scene_is_left(far, share):
         scene = replace(some, means=some.means * torch.tensor([1.0, 1.0, flat]))
         if far:
             away = some.select(torch.arange(len(far)))
-            scene = scene.extended(replace(away, means=torch.tensor([[x, 0.0, 0.0] for x in far])))
-        coarse, edge = thinned(scene, most)
+            scene = scene.concat(replace(away, means=torch.tensor([[x, 0.0, 0.0] for x in far])))
+        coarse, edge = simplify(scene, most)
         assert 0.8 * most <= len(coarse) <= most
-        again, same = thinned(scene, most)
+        again, same = simplify(scene, most)
         assert same == edge
         assert torch.equal(again.means, coarse.means)
         for x in far:
@@ -261,16 +261,16 @@ def test_cells_of_a_grid_too_large_to_number_hold_what_lies_together():
     means = torch.tensor([[0.0, 0.0, 0.0], [1e9, 1e9, 1e9], [0.5, 0.5, 0.5], [0.5, 1.5, 0.5], [1e9, 1e9, -1e9]])
     near, far = torch.tensor([[3.0, 3.0, 3.0]]).double(), means.double()
     expected = [1, 4, 1, 2, 3, 0]
-    assert cell_of(torch.cat([far, far[4:] - 1e9]), 1.0).tolist() == expected
+    assert cell_indices(torch.cat([far, far[4:] - 1e9]), 1.0).tolist() == expected
     # The same order as where all of the grid is numbered.
     small = torch.cat([torch.rand(200, 3, generator=torch.Generator().manual_seed(0)).double() * 4, near])
     beyond = torch.cat([small, torch.tensor([[1e8, 1e8, 1e8]]).double()])
-    assert torch.equal(cell_of(beyond, 0.5)[:-1], cell_of(small, 0.5))
+    assert torch.equal(cell_indices(beyond, 0.5)[:-1], cell_indices(small, 0.5))
 
 
 def test_what_has_one_place_becomes_one():
     crowd = random_gaussians(300, 0)
-    coarse, _ = thinned(replace(crowd, means=torch.zeros(300, 3)), 100)
+    coarse, _ = simplify(replace(crowd, means=torch.zeros(300, 3)), 100)
     assert len(coarse) == 1
 
 
@@ -278,7 +278,7 @@ def test_what_is_alone_in_its_cell_stays_as_it_is():
     some = random_gaussians(60, 2)
     some.means[:59] = some.means[:59] * 0.001
     some.means[59] = torch.tensor([50.0, 50.0, 0.0])
-    coarse, _ = thinned(some, 20)
+    coarse, _ = simplify(some, 20)
     kept = coarse.select((coarse.means == some.means[59]).all(1))
     assert len(kept) == 1
     for name, tensor in kept.tensors().items():
@@ -289,5 +289,5 @@ def test_coarser_levels_still_look_like_the_scene():
     some = random_gaussians(3000, 2, reach=6.0)
     some = replace(some, means=some.means * torch.tensor([1.0, 1.0, 0.05]), logits=some.logits + 2)
     from_afar = replace(overhead(height=40.0, aside=3.0, size=48), fx=90.0, fy=90.0)
-    coarse, _ = thinned(some, 700)
+    coarse, _ = simplify(some, 700)
     assert psnr(picture(coarse, from_afar), picture(some, from_afar)) > 24

@@ -14,20 +14,20 @@ from scipy.spatial.transform import Rotation
 
 from support.hand_made_models import camera_above, model_at
 from vdgs.export import bake as bake_module
-from vdgs.export.bake import Survey, bake, survey
-from vdgs.export.color_refinement import Baked, refit
-from vdgs.export.formats.export_scene import Scene
-from vdgs.export.formats.gaussian_store import spooled
-from vdgs.export.gaussian_optimization import refine
-from vdgs.export.novel_cameras import between, endless, round_count, rounds
+from vdgs.export.bake import BakeContributions, bake, collect_contributions
+from vdgs.export.color_refinement import BakedGaussians, refine_colors
+from vdgs.export.formats.export_scene import ExportScene
+from vdgs.export.formats.gaussian_store import write_store
+from vdgs.export.gaussian_optimization import optimize_gaussians
+from vdgs.export.novel_cameras import color_iteration_cameras, color_iteration_count, endless_cameras, novel_cameras
 from vdgs.geometry.camera import Camera
-from vdgs.kernels.kernel_types import DecoderWeights, HeadWeights
-from vdgs.kernels.spherical_harmonics import function_count
-from vdgs.kernels.torch_ref.ellipsoids import logarithms
-from vdgs.model.anchor_model import AnchorModel, Part
-from vdgs.model.decode_world import places, spawned
+from vdgs.kernels.kernel_types import DecoderWeights, MlpWeights
+from vdgs.kernels.spherical_harmonics import num_sh_bases
+from vdgs.kernels.torch_ref.ellipsoids import log_covariances
+from vdgs.model.anchor_model import AnchorModel, DecoderSpan
+from vdgs.model.decode_world import decode_world, gaussian_means
 from vdgs.model.decoder import Decoder
-from vdgs.model.gaussians import Gaussians, draw_gaussians
+from vdgs.model.gaussians import Gaussians, render_gaussians
 from vdgs.model.renderer import decode_view, render
 
 VIEWS = [camera_above(0.3, -0.2), camera_above(-2.0, 1.0, tilt_deg=30.0), camera_above(1.5, 2.0, tilt_deg=-25.0)]
@@ -40,7 +40,7 @@ def scattered(n: int = 200, seed: int = 0) -> np.ndarray:
 def blind(decoder: Decoder) -> Decoder:
     """The decoder without a view of where it is seen from."""
 
-    def without(head: HeadWeights) -> HeadWeights:
+    def without(head: MlpWeights) -> MlpWeights:
         w1 = head.w1.clone()
         w1[:, 32:] = 0.0
         return replace(head, w1=w1)
@@ -52,14 +52,14 @@ def blind(decoder: Decoder) -> Decoder:
     )
 
 
-def baked(seen: Survey, degree: int = 3, kept: np.ndarray | None = None) -> Gaussians:
+def baked(seen: BakeContributions, degree: int = 3, kept: np.ndarray | None = None) -> Gaussians:
     parts = list(bake(seen, np.flatnonzero(seen.pixels > 0) if kept is None else kept, degree))
     return Gaussians(**{name: torch.cat([part.tensors()[name] for part in parts]) for name in parts[0].tensors()})
 
 
 def drawn(gaussians: Gaussians, model: AnchorModel, camera) -> np.ndarray:
     with torch.no_grad():
-        picture, _ = draw_gaussians(gaussians, camera, torch.tensor(model.background), gaussians.degree)
+        picture, _ = render_gaussians(gaussians, camera, torch.tensor(model.background), gaussians.degree)
     return picture.image.numpy()
 
 
@@ -68,12 +68,12 @@ def test_what_is_spawned_is_what_the_kernels_decode():
     k = model.anchors.offsets.shape[1]
     for camera in VIEWS:
         rows, splats = decode_view(model, camera)
-        world = spawned(model.anchors, rows, model.decoder.weights, camera)
+        world = decode_world(model.anchors, rows, model.decoder.weights, camera)
         row, offset = splats.source.long() // k, splats.source.long() % k
         assert torch.allclose(world.colours[row, offset], splats.colours, atol=1e-5)
         assert torch.allclose(world.opacities[row, offset], splats.opacities, atol=1e-5)
         assert torch.allclose(world.scales[row, offset].prod(-1), splats.volumes, rtol=1e-3)
-        pixels, _ = camera.project(places(model.anchors)[rows][row, offset].double().numpy())
+        pixels, _ = camera.project(gaussian_means(model.anchors)[rows][row, offset].double().numpy())
         assert np.allclose(pixels, splats.means_px.numpy(), atol=1e-2)
 
 
@@ -81,9 +81,11 @@ def test_what_is_spawned_is_what_the_kernels_decode():
 @pytest.mark.parametrize("parts", [(), (80, 0, 120)])
 def test_a_model_that_looks_alike_from_everywhere_is_baked_as_it_is(degree, parts):
     model = model_at(scattered())
-    model = replace(model, decoder=blind(model.decoder), parts=tuple(Part(n, blind(model.decoder)) for n in parts))
-    gaussians = baked(survey(model, VIEWS), degree)
-    assert gaussians.rest.shape[1:] == (function_count(degree) - 1, 3)
+    model = replace(
+        model, decoder=blind(model.decoder), parts=tuple(DecoderSpan(n, blind(model.decoder)) for n in parts)
+    )
+    gaussians = baked(collect_contributions(model, VIEWS), degree)
+    assert gaussians.rest.shape[1:] == (num_sh_bases(degree) - 1, 3)
     for camera in VIEWS:
         assert np.abs(drawn(gaussians, model, camera) - render(model, camera).image.numpy()).max() < 0.01
 
@@ -95,7 +97,7 @@ def test_more_harmonics_come_nearer_to_a_model_that_looks_different_from_everywh
     still = blind(model.decoder)
     model = replace(model, decoder=replace(still, weights=replace(still.weights, colour=steep)))
     views = [camera_above(x, y, tilt_deg=tilt) for x in (-2, 0, 2) for y in (-2, 0, 2) for tilt in (-30, 0, 30)]
-    seen = survey(model, views)
+    seen = collect_contributions(model, views)
     errors = []
     for degree in (0, 1, 2, 3):
         gaussians = baked(seen, degree)
@@ -106,29 +108,29 @@ def test_more_harmonics_come_nearer_to_a_model_that_looks_different_from_everywh
 
 def test_only_what_views_show_is_kept_and_pixels_count_what_is_drawn():
     model = model_at(scattered())
-    seen = survey(model, VIEWS)
+    seen = collect_contributions(model, VIEWS)
     assert 0 < np.count_nonzero(seen.pixels) < seen.pixels.size
     assert seen.pixels.sum() == pytest.approx(sum(float(render(model, v).alpha.sum()) for v in VIEWS), rel=1e-2)
-    away = survey(model, [camera_above(500.0, 500.0)])
+    away = collect_contributions(model, [camera_above(500.0, 500.0)])
     assert not away.pixels.any()
     assert list(bake(away, np.zeros(0, np.int64), 3)) == []
     with pytest.raises(ValueError, match="cameras"):
-        survey(model, [])
+        collect_contributions(model, [])
 
 
 def test_parts_do_not_change_what_is_baked(monkeypatch):
     model = model_at(scattered())
-    seen = survey(model, VIEWS)
+    seen = collect_contributions(model, VIEWS)
     kept = np.flatnonzero(seen.pixels > 0)[::3]
     whole, done = baked(seen, 3, kept), list[int]()
     expected = whole.tensors()
-    monkeypatch.setattr(bake_module, "ANCHORS_AT_ONCE", 17)
+    monkeypatch.setattr(bake_module, "ANCHORS_PER_PART", 17)
     parts = list(bake(seen, kept, 3, done.append))
     assert len(parts) > 5
     assert done[-1] == len(kept) == len(whole)
     joined = {name: torch.cat([part.tensors()[name] for part in parts]) for name in whole.tensors()}
     # Ellipsoids as a whole: where two axes are alike, rounding decides where these two point.
-    shapes = [logarithms(each.pop("log_scales"), each.pop("quaternions")) for each in (joined, expected)]
+    shapes = [log_covariances(each.pop("log_scales"), each.pop("quaternions")) for each in (joined, expected)]
     assert torch.allclose(*shapes, atol=1e-5)
     for name, tensor in expected.items():
         assert torch.allclose(joined[name], tensor, atol=1e-5), name
@@ -136,10 +138,10 @@ def test_parts_do_not_change_what_is_baked(monkeypatch):
 
 def test_places_and_numbers_of_what_is_kept():
     model = model_at(scattered())
-    seen = survey(model, VIEWS)
+    seen = collect_contributions(model, VIEWS)
     kept = np.flatnonzero(seen.pixels > 0)
     gaussians = baked(seen, 0, kept)
-    assert torch.equal(gaussians.means, places(model.anchors).reshape(-1, 3)[torch.from_numpy(kept)])
+    assert torch.equal(gaussians.means, gaussian_means(model.anchors).reshape(-1, 3)[torch.from_numpy(kept)])
     assert torch.allclose(gaussians.quaternions.norm(dim=1), torch.ones(len(kept)), atol=1e-5)
     assert all(bool(torch.isfinite(tensor).all()) for tensor in gaussians.tensors().values())
 
@@ -147,7 +149,7 @@ def test_places_and_numbers_of_what_is_kept():
 def steep(model: AnchorModel) -> AnchorModel:
     """The model with colours, opacities and shapes that change much with where it is seen from."""
 
-    def steeper(head: HeadWeights) -> HeadWeights:
+    def steeper(head: MlpWeights) -> MlpWeights:
         return replace(head, w1=torch.cat([head.w1[:, :32], 6 * head.w1[:, 32:]], 1))
 
     weights = model.decoder.weights
@@ -155,15 +157,15 @@ def steep(model: AnchorModel) -> AnchorModel:
     return replace(model, decoder=replace(model.decoder, weights=heads))
 
 
-def on_disk(seen: Survey, kept: np.ndarray, folder: Path, degree: int = 3) -> Baked:
-    return Baked(
+def on_disk(seen: BakeContributions, kept: np.ndarray, folder: Path, degree: int = 3) -> BakedGaussians:
+    return BakedGaussians(
         seen.model,
         kept,
-        spooled(Scene(chunks=bake(seen, kept, degree), count=len(kept), degree=degree), folder / "spool"),
+        write_store(ExportScene(chunks=bake(seen, kept, degree), count=len(kept), degree=degree), folder / "spool"),
     )
 
 
-def error(shown: Baked, views: Sequence[Camera]) -> float:
+def error(shown: BakedGaussians, views: Sequence[Camera]) -> float:
     """Mean squared, of what is baked against what the model shows by it."""
     gaussians = shown.spool.rows(np.arange(len(shown.spool.means)))
     pairs = [(drawn(gaussians, shown.model, view), shown.drawn(view)[0].numpy()) for view in views]
@@ -175,14 +177,14 @@ GRID = [camera_above(x, y, tilt_deg=tilt) for x in (-2, 0, 2) for y in (-2, 0, 2
 
 @pytest.mark.parametrize("degree", [0, 3])
 def test_colours_stand_in_for_opacities_and_shapes_that_change(tmp_path, degree):
-    seen = survey(steep(model_at(scattered())), GRID)
+    seen = collect_contributions(steep(model_at(scattered())), GRID)
     shown = on_disk(seen, np.flatnonzero(seen.pixels > 0), tmp_path, degree)
-    errors, others = [error(shown, GRID)], [error(shown, between(GRID, 9))]
+    errors, others = [error(shown, GRID)], [error(shown, novel_cameras(GRID, 9))]
     opacities = shown.spool.rows(np.arange(9)).logits
     for number in range(2):
-        refit(shown, [*GRID, *between(GRID, number)])
+        refine_colors(shown, [*GRID, *novel_cameras(GRID, number)])
         errors.append(error(shown, GRID))
-        others.append(error(shown, between(GRID, 9)))
+        others.append(error(shown, novel_cameras(GRID, 9)))
     assert errors == sorted(errors, reverse=True)
     assert others == sorted(others, reverse=True)
     if degree:
@@ -193,25 +195,25 @@ def test_colours_stand_in_for_opacities_and_shapes_that_change(tmp_path, degree)
 def test_a_part_of_a_scene_is_compared_with_that_part(tmp_path):
     model = model_at(scattered())
     model = replace(model, decoder=blind(model.decoder))
-    seen = survey(model, VIEWS)
+    seen = collect_contributions(model, VIEWS)
     part = np.flatnonzero((seen.pixels > 0) & (np.arange(len(seen.pixels)) < len(seen.pixels) // 3))
     shown = on_disk(seen, part, tmp_path)
     before = shown.spool.rows(np.arange(len(part)))
-    refit(shown, VIEWS)
+    refine_colors(shown, VIEWS)
     after = shown.spool.rows(np.arange(len(part)))
     # Nothing changes with the direction, so nothing is missing: what was left out is not painted onto what stays.
     assert (after.dc - before.dc).abs().max() < 0.02
-    assert np.array_equal(shown.of_anchors(np.arange(len(model.anchors))), np.arange(len(part)))
+    assert np.array_equal(shown.rows_of_anchors(np.arange(len(model.anchors))), np.arange(len(part)))
 
 
 def test_refining_comes_nearer_and_ends_when_its_time_is_over(tmp_path):
-    seen = survey(steep(model_at(scattered())), GRID)
+    seen = collect_contributions(steep(model_at(scattered())), GRID)
     shown = on_disk(seen, np.flatnonzero(seen.pixels > 0), tmp_path, degree=1)
-    refit(shown, GRID)
+    refine_colors(shown, GRID)
     before, means = error(shown, GRID), np.array(shown.spool.means)
     ticks = iter(range(1000))
     passed: list[float] = []
-    assert refine(shown, endless(GRID), 80.0, passed.append, clock=lambda: next(ticks)) == 79
+    assert optimize_gaussians(shown, endless_cameras(GRID), 80.0, passed.append, clock=lambda: next(ticks)) == 79
     assert passed == list(range(1, 80))
     assert error(shown, GRID) < 0.9 * before
     assert np.array_equal(shown.spool.rows(np.arange(len(means))).means.numpy(), means)
@@ -220,7 +222,7 @@ def test_refining_comes_nearer_and_ends_when_its_time_is_over(tmp_path):
 def test_cameras_between_lie_among_neighbours_that_look_alike_and_are_never_the_same():
     turned = camera_above(0.0, 0.0, tilt_deg=80.0)
     cameras = [*GRID, turned]
-    found = [*between(cameras, 0), *between(cameras, 1)]
+    found = [*novel_cameras(cameras, 0), *novel_cameras(cameras, 1)]
     assert len(found) == 2 * len(GRID)  # nobody looks as that one does
     assert len({camera.position.tobytes() for camera in found}) == len(found)
     for camera, own in zip(found, [*GRID, *GRID], strict=True):
@@ -229,45 +231,51 @@ def test_cameras_between_lie_among_neighbours_that_look_alike_and_are_never_the_
         alike = np.array([each.position for each in GRID if own.forward @ each.forward > 0.7])
         assert (camera.position >= alike.min(0) - 1e-9).all()
         assert (camera.position <= alike.max(0) + 1e-9).all()
-    assert between(VIEWS[:1], 0) == []
-    assert [each.position.tolist() for each in between(VIEWS, 3)] == [
-        each.position.tolist() for each in between(VIEWS, 3)
+    assert novel_cameras(VIEWS[:1], 0) == []
+    assert [each.position.tolist() for each in novel_cameras(VIEWS, 3)] == [
+        each.position.tolist() for each in novel_cameras(VIEWS, 3)
     ]
 
 
 def test_rounds_look_from_between_and_the_last_one_at_the_photographs_too():
     """A camera without neighbours stays in all of them: nobody else looks there."""
     cameras = [*GRID, camera_above(0.0, 0.0, tilt_deg=80.0)]
-    planned = rounds(cameras, 4)
+    planned = color_iteration_cameras(cameras, 4)
     known = {camera.position.tobytes() for camera in GRID}
     assert [len(each) for each in planned] == [len(cameras)] * 3 + [len(cameras) + len(GRID)]
     for each in planned[:3]:
         assert each[-1].position == pytest.approx(cameras[-1].position)
         assert not known & {camera.position.tobytes() for camera in each[:-1]}
     assert list(planned[3][: len(cameras)]) == cameras
-    assert rounds(cameras, 0) == ()
-    assert len(rounds(cameras, 1)) == 1
-    assert (round_count(None, 10**6), round_count(None, 10**7), round_count(3, 10**7)) == (8, 1, 3)
+    assert color_iteration_cameras(cameras, 0) == ()
+    assert len(color_iteration_cameras(cameras, 1)) == 1
+    assert (
+        color_iteration_count(None, 10**6),
+        color_iteration_count(None, 10**7),
+        color_iteration_count(3, 10**7),
+    ) == (8, 1, 3)
 
 
 def test_more_rounds_come_nearer_where_none_of_them_looked(tmp_path):
-    seen = survey(steep(model_at(scattered())), GRID)
+    seen = collect_contributions(steep(model_at(scattered())), GRID)
     errors = []
     for count in (0, 1, 3, 6):
         (folder := tmp_path / str(count)).mkdir()
         shown = on_disk(seen, np.flatnonzero(seen.pixels > 0), folder)
-        for each in rounds(GRID, count):
-            refit(shown, each)
-        errors.append(error(shown, between(GRID, 99)))
+        for each in color_iteration_cameras(GRID, count):
+            refine_colors(shown, each)
+        errors.append(error(shown, novel_cameras(GRID, 99)))
     assert errors == sorted(errors, reverse=True)
     assert errors[-1] < 0.6 * errors[1]
 
 
 def test_cameras_to_refine_by_never_end_nor_come_again_but_for_those_of_photographs():
-    shown = list(islice(endless(GRID), 4 * len(GRID)))
+    shown = list(islice(endless_cameras(GRID), 4 * len(GRID)))
     places = [camera.position.tobytes() for camera in shown]
     known = {camera.position.tobytes() for camera in GRID}
-    of_rounds = {camera.position.tobytes() for cameras in rounds(GRID, 6) for camera in cameras} - known
+    of_rounds = {
+        camera.position.tobytes() for cameras in color_iteration_cameras(GRID, 6) for camera in cameras
+    } - known
     others = [place for place in places if place not in known]
     assert len(others) == len(set(others)) == 2 * len(GRID)
     assert not of_rounds & set(others)

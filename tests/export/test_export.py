@@ -18,18 +18,18 @@ from vdgs.config.commands import ExportRequest
 from vdgs.errors import VdgsError
 from vdgs.export import export_run as export_module
 from vdgs.export import local_bake
-from vdgs.export.bake import survey
-from vdgs.export.export_run import RECORD, export_run
+from vdgs.export.bake import collect_contributions
+from vdgs.export.export_run import RECORD_FILE, export_run
 from vdgs.export.formats import registry
-from vdgs.export.local_frame import FAR, frame_of
+from vdgs.export.local_frame import MAX_LOCAL_COORDINATE, make_local_frame
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.geodesy import ecef_from_geodetic, enu_axes
-from vdgs.model.anchor_model import AnchorModel, Part
-from vdgs.model.gaussians import draw_gaussians
+from vdgs.model.anchor_model import AnchorModel, DecoderSpan
+from vdgs.model.gaussians import render_gaussians
 from vdgs.model.renderer import render
-from vdgs.runs.open_run import TrainedRun
+from vdgs.runs.open_run import OpenedRun
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.stage_folder import Status
+from vdgs.runs.stage_folder import StatusRecord
 from vdgs.system.atomic_files import read_json
 
 #: Far from the middle of its UTM zone: grid north is 1.1 degrees off.
@@ -40,7 +40,7 @@ QUIET = Console(quiet=True)
 def scattered(parts: tuple[int, ...] = ()) -> AnchorModel:
     places = np.random.default_rng(0).uniform((-3, -3, 0), (3, 3, 0.5), (200, 3))
     model = model_at(places)
-    return replace(model, parts=tuple(Part(count, model.decoder) for count in parts))
+    return replace(model, parts=tuple(DecoderSpan(count, model.decoder) for count in parts))
 
 
 @pytest.fixture
@@ -52,8 +52,8 @@ def export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     ) -> dict[str, Any]:
         file, shown = tmp_path / "run" / "merged" / "model.safetensors", model or scattered()
         shown.save(file)
-        opened = TrainedRun(
-            folder=RunFolder(tmp_path / "run"), model=shown, model_path=file, name="merged", status=Status(), key="k",
+        opened = OpenedRun(
+            folder=RunFolder(tmp_path / "run"), model=shown, model_path=file, name="merged", status=StatusRecord(), key="k",
             caution="", capture=capture_at(origin),
         )  # fmt: skip
         monkeypatch.setattr(export_module, "open_run", lambda *_: opened)
@@ -67,16 +67,16 @@ def export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 def test_all_files_of_one_baking_hold_the_same_scene(export, tmp_path: Path):
     record = export("a.ply", "b.splat", "c.ply", "d.points.ply", sh_degree=2)
-    whole, small = registry.read(tmp_path / "a.ply"), registry.read(tmp_path / "b.splat")
+    whole, small = registry.read_gaussians(tmp_path / "a.ply"), registry.read_gaussians(tmp_path / "b.splat")
     assert record["gaussians"] == len(whole) == len(small)
     assert whole.degree == 2
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "c.ply").read_bytes()
     model = scattered()
     for view in capture_at(None).train_views:
         with torch.no_grad():
-            drawn = draw_gaussians(whole, view.camera, torch.tensor(model.background), 2)[0].image
+            drawn = render_gaussians(whole, view.camera, torch.tensor(model.background), 2)[0].image
         assert (drawn - render(model, view.camera).image).abs().mean() < 0.01
-    assert read_json(tmp_path / "run" / RECORD) == record
+    assert read_json(tmp_path / "run" / RECORD_FILE) == record
     assert [Path(file["file"]).name for file in record["files"]] == ["a.ply", "b.splat", "c.ply", "d.points.ply"]
     assert not list(tmp_path.glob(".baking-*"))
 
@@ -93,10 +93,10 @@ def test_the_size_of_tiles_is_theirs_alone(export, tmp_path: Path):
 def test_files_about_a_place_on_earth_keep_its_origin_apart(export, tmp_path: Path):
     pytest.importorskip("pyproj")
     export("utm.ply", "enu.ply", origin=PLACE, crs="EPSG:32632")
-    frame = frame_of(ground(PLACE), "EPSG:32632", np.zeros(3))
-    assert max(np.abs(frame.facts.origin)) > FAR
+    frame = make_local_frame(ground(PLACE), "EPSG:32632", np.zeros(3))
+    assert max(np.abs(frame.facts.origin)) > MAX_LOCAL_COORDINATE
     assert all(value % 100 == 0 for value in frame.facts.origin)
-    local = registry.read(tmp_path / "utm.ply")
+    local = registry.read_gaussians(tmp_path / "utm.ply")
     assert float(local.means.abs().max()) < 100
     back = frame.to_ground(local)
     assert float(back.means[:, :2].abs().max()) < 20
@@ -106,7 +106,7 @@ def test_files_about_a_place_on_earth_keep_its_origin_apart(export, tmp_path: Pa
     # In the default system, metres east and north of the origin, nothing is turned.
     export("plain.ply", origin=PLACE)
     export("local.ply")
-    plain, local_bake = registry.read(tmp_path / "plain.ply"), registry.read(tmp_path / "local.ply")
+    plain, local_bake = registry.read_gaussians(tmp_path / "plain.ply"), registry.read_gaussians(tmp_path / "local.ply")
     assert torch.allclose(plain.means, local_bake.means, atol=1e-4)
 
 
@@ -137,7 +137,7 @@ def test_a_scene_far_from_its_origin_stays_where_it_is_on_earth(export, tmp_path
     looking_down_at(monkeypatch, 3000.0)
     model = moved(scattered(), torch.full((200,), 3000.0))
     export("a.spz", "a.ply", model=model, origin=PLACE)
-    near, whole = registry.read(tmp_path / "a.spz"), registry.read(tmp_path / "a.ply")
+    near, whole = registry.read_gaussians(tmp_path / "a.spz"), registry.read_gaussians(tmp_path / "a.ply")
     facts = read_json(tmp_path / "a.spz.json")
     assert facts["origin"] == [0, 0, 0]
     assert facts["geodetic"] != list(PLACE)
@@ -159,14 +159,14 @@ def test_a_scene_far_from_its_origin_stays_where_it_is_on_earth(export, tmp_path
 def test_a_frame_and_back_is_where_it_was():
     pytest.importorskip("pyproj")
     model = scattered()
-    seen = survey(model, [view.camera for view in capture_at(None).train_views])
+    seen = collect_contributions(model, [view.camera for view in capture_at(None).train_views])
     gaussians = next(iter(local_bake.bake(seen, np.flatnonzero(seen.pixels > 0), 3)))
     for crs in ("EPSG:32632", "enu", "local"):
-        frame = frame_of(ground(PLACE), crs, np.zeros(3))
+        frame = make_local_frame(ground(PLACE), crs, np.zeros(3))
         back = frame.to_ground(frame.place(gaussians))
         for name in ("means", "log_scales", "rest"):
             assert torch.allclose(getattr(back, name), getattr(gaussians, name), atol=1e-3), (crs, name)
-    frame = frame_of(ground(PLACE), "enu", np.array([5000.0, -3000.0, 20.0]), far=1000.0)
+    frame = make_local_frame(ground(PLACE), "enu", np.array([5000.0, -3000.0, 20.0]), max_coordinate=1000.0)
     back = frame.to_ground(frame.place(gaussians))
     assert torch.allclose(back.means, gaussians.means, atol=1e-3)
 
@@ -176,7 +176,7 @@ def test_boxes_blocks_and_numbers_choose(export, tmp_path: Path):
     assert export("few.ply", max_gaussians=50)["gaussians"] == 50
     assert export("many.ply", max_gaussians=whole + 1)["gaussians"] == whole
     box = export("box.ply", bbox=(-1.0, -1.0, 2.0, 0.5))["gaussians"]
-    inside = registry.read(tmp_path / "box.ply").means
+    inside = registry.read_gaussians(tmp_path / "box.ply").means
     assert 0 < box < whole
     assert float(inside[:, 0].min()) >= -1.0
     assert float(inside[:, 1].max()) <= 0.5
@@ -185,7 +185,7 @@ def test_boxes_blocks_and_numbers_choose(export, tmp_path: Path):
     assert first + second == whole
     assert min(first, second) > 0
     # Those that are left out make less of the photographs than those that stay.
-    seen = survey(scattered(), [view.camera for view in capture_at(None).train_views])
+    seen = collect_contributions(scattered(), [view.camera for view in capture_at(None).train_views])
     assert np.sort(seen.pixels)[::-1][:50].sum() > 0.3 * seen.pixels.sum()
 
 
@@ -248,7 +248,7 @@ def test_a_scene_too_wide_for_a_format_is_refused_before_it_is_baked(export, mon
 def test_a_scene_far_from_its_origin_is_placed_near_one(export, tmp_path, monkeypatch):
     looking_down_at(monkeypatch, 3000.0)
     export("a.spz", "a.ply", model=moved(scattered(), torch.full((200,), 3000.0)))
-    near, whole = registry.read(tmp_path / "a.spz"), registry.read(tmp_path / "a.ply")
+    near, whole = registry.read_gaussians(tmp_path / "a.spz"), registry.read_gaussians(tmp_path / "a.ply")
     origin = torch.tensor(read_json(tmp_path / "a.spz.json")["origin"])
     assert origin.tolist() == [3000.0, 0.0, 0.0]
     assert torch.allclose(near.means + origin, whole.means, atol=1e-3)
@@ -259,17 +259,17 @@ def test_a_file_goes_without_the_few_that_lie_beyond_its_reach(export, tmp_path,
     positions = model.anchors.positions.clone()
     positions[7] = torch.tensor([0.0, 0.0, -5000.0])
     model = replace(model, anchors=replace(model.anchors, positions=positions))
-    real = survey(model, [view.camera for view in capture_at(None).train_views])
+    real = collect_contributions(model, [view.camera for view in capture_at(None).train_views])
     pixels = real.pixels.copy()
     k = model.anchors.offsets.shape[1]
     there = slice(7 * k, 8 * k)
     pixels[there] = 0.01
-    monkeypatch.setattr(local_bake, "survey", lambda *_: replace(real, pixels=pixels))
+    monkeypatch.setattr(local_bake, "collect_contributions", lambda *_: replace(real, pixels=pixels))
     monkeypatch.setattr(local_bake, "bake", lambda seen, kept, degree, _: iter([random_gaussians(len(kept), degree)]))
-    monkeypatch.setattr(local_bake, "refit", lambda *_: None)
+    monkeypatch.setattr(local_bake, "refine_colors", lambda *_: None)
     record = export("all.ply", "near.spz", model=model)
     assert [file["gaussians"] for file in record["files"]] == [record["gaussians"], record["gaussians"] - k]
-    assert len(registry.read(tmp_path / "near.spz")) == record["gaussians"] - k
+    assert len(registry.read_gaussians(tmp_path / "near.spz")) == record["gaussians"] - k
     pixels[there] = pixels.sum()
     with pytest.raises(VdgsError, match="2048"):
         export("near.spz", model=model)
@@ -279,7 +279,7 @@ def test_a_disk_that_fills_leaves_nothing(export, tmp_path: Path, monkeypatch):
     def full(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(local_bake, "spooled", full)
+    monkeypatch.setattr(local_bake, "write_store", full)
     with pytest.raises(VdgsError, match="No space left"):
         export("a.ply")
     assert [path.name for path in tmp_path.iterdir()] == ["run"]

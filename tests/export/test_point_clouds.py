@@ -10,7 +10,7 @@ from support.gaussians import random_gaussians
 from vdgs.captures.formats.ply_reader import read_point_cloud
 from vdgs.errors import VdgsError
 from vdgs.export.formats import registry
-from vdgs.export.formats.export_scene import Facts, Scene
+from vdgs.export.formats.export_scene import ExportMetadata, ExportScene
 
 laspy = pytest.importorskip("laspy")
 ORIGIN = (690_000.5, 5_334_000.25, 512.75)
@@ -21,7 +21,9 @@ def test_points_stand_where_the_map_says(tmp_path, ending):
     some = random_gaussians(500, 1, reach=800.0)
     path = tmp_path / f"a{ending}"
     chunks = iter([some.select(torch.arange(200)), some.select(torch.arange(200, 500))])
-    registry.write(path, Scene(chunks=chunks, count=500, degree=1, facts=Facts(ORIGIN, "EPSG:32632")))
+    registry.write_scene(
+        path, ExportScene(chunks=chunks, count=500, degree=1, facts=ExportMetadata(ORIGIN, "EPSG:32632"))
+    )
     read = laspy.read(path)
     assert len(read.points) == 500
     assert read.header.are_points_compressed == (ending == ".laz")
@@ -35,7 +37,7 @@ def test_points_stand_where_the_map_says(tmp_path, ending):
 
 def test_without_a_map_coordinates_are_local(tmp_path):
     some = random_gaussians(20, 0)
-    registry.write(tmp_path / "a.laz", Scene.of(some))
+    registry.write_scene(tmp_path / "a.laz", ExportScene.of(some))
     read = laspy.read(tmp_path / "a.laz")
     np.testing.assert_allclose(read.xyz, some.means.numpy(), atol=0.00051)
     assert read.header.parse_crs() is None
@@ -43,20 +45,22 @@ def test_without_a_map_coordinates_are_local(tmp_path):
 
 def test_a_wrong_map_is_refused_before_work(tmp_path):
     with pytest.raises(VdgsError, match="'EPSG:1' is not understood"):
-        registry.check(tmp_path / "a.laz", Scene(chunks=[], count=5, degree=0, facts=Facts(crs="EPSG:1")))
+        registry.check_export(
+            tmp_path / "a.laz", ExportScene(chunks=[], count=5, degree=0, facts=ExportMetadata(crs="EPSG:1"))
+        )
 
 
 def test_missing_packages_are_named(tmp_path, monkeypatch):
     there = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "lazrs" else there(name))
     with pytest.raises(VdgsError, match=r"needs lazrs, not installed.*pip install 'vdgs\[geo\]'"):
-        registry.check(tmp_path / "a.laz", Scene(chunks=[], count=5, degree=0))
-    registry.check(tmp_path / "a.las", Scene(chunks=[], count=5, degree=0))
+        registry.check_export(tmp_path / "a.laz", ExportScene(chunks=[], count=5, degree=0))
+    registry.check_export(tmp_path / "a.las", ExportScene(chunks=[], count=5, degree=0))
 
 
 def test_a_point_cloud_has_colours_and_opacity(tmp_path):
     some = random_gaussians(40, 2)
-    notes = registry.write(tmp_path / "a.points.ply", Scene.of(some, Facts(ORIGIN)))
+    notes = registry.write_scene(tmp_path / "a.points.ply", ExportScene.of(some, ExportMetadata(ORIGIN)))
     assert "these are points" in notes[0]
     places, shown = read_point_cloud(tmp_path / "a.points.ply")
     np.testing.assert_array_equal(places, some.means.numpy())

@@ -14,14 +14,14 @@ import torch
 from support.gaussians import overhead, picture, psnr, random_gaussians
 from vdgs.errors import VdgsError
 from vdgs.export.formats import export_scene, registry, spz
-from vdgs.export.formats.export_scene import Y_DOWN, Y_UP, Facts, Scene, beside
+from vdgs.export.formats.export_scene import Y_DOWN, Y_UP, ExportMetadata, ExportScene, metadata_path
 from vdgs.export.formats.gaussian_ply import read_ply
-from vdgs.export.formats.parallel_gzip import gzipped
-from vdgs.export.formats.quaternion_canonical import with_small_turns
-from vdgs.model.gaussian_transform import covariances, transformed
+from vdgs.export.formats.parallel_gzip import gzip_blocks
+from vdgs.export.formats.quaternion_canonical import canonicalize_quaternions
+from vdgs.model.gaussian_transform import gaussian_covariances, transform_gaussians
 from vdgs.model.gaussians import Gaussians
 
-PLACED = Facts(origin=(690_000.0, 5_334_000.25, 512.0), crs="EPSG:32632", geodetic=(48.13, 11.57, 512.0))
+PLACED = ExportMetadata(origin=(690_000.0, 5_334_000.25, 512.0), crs="EPSG:32632", geodetic=(48.13, 11.57, 512.0))
 #: PSNR of what is read back, drawn, against the scene as it was: at least.
 CLOSE = {".ply": 100, ".spz": 38, ".splat": 38}
 
@@ -47,7 +47,7 @@ def independent(path: Path) -> Gaussians:
 
 
 def turned(gaussians: Gaussians, matrix: np.ndarray) -> Gaussians:
-    return transformed(gaussians, 1.0, matrix, np.zeros(3))
+    return transform_gaussians(gaussians, 1.0, matrix, np.zeros(3))
 
 
 def flat(gaussians: Gaussians) -> Gaussians:
@@ -58,15 +58,15 @@ def flat(gaussians: Gaussians) -> Gaussians:
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_a_ply_keeps_every_bit(tmp_path, degree):
     written = random_gaussians(300, degree)
-    assert registry.write(tmp_path / "a.ply", Scene.of(written, PLACED)) == ()
-    for read in (registry.read(tmp_path / "a.ply"), independent(tmp_path / "a.ply")):
+    assert registry.write_scene(tmp_path / "a.ply", ExportScene.of(written, PLACED)) == ()
+    for read in (registry.read_gaussians(tmp_path / "a.ply"), independent(tmp_path / "a.ply")):
         for name in ("means", "log_scales", "logits", "dc", "rest"):
             assert torch.equal(getattr(read, name), getattr(written, name)), name
-        torch.testing.assert_close(covariances(read), covariances(written))
+        torch.testing.assert_close(gaussian_covariances(read), gaussian_covariances(written))
 
 
 def test_a_ply_says_where_it_stands_and_has_the_layout_that_all_read(tmp_path):
-    registry.write(tmp_path / "a.ply", Scene.of(random_gaussians(3, 3), PLACED))
+    registry.write_scene(tmp_path / "a.ply", ExportScene.of(random_gaussians(3, 3), PLACED))
     data = (tmp_path / "a.ply").read_bytes()
     header = data[: data.index(b"end_header\n") + 11].decode("ascii").splitlines()
     assert header[:2] == ["ply", "format binary_little_endian 1.0"]
@@ -79,18 +79,18 @@ def test_a_ply_says_where_it_stands_and_has_the_layout_that_all_read(tmp_path):
 
 
 def test_wkt_of_several_lines_stays_one_comment(tmp_path):
-    facts = Facts(crs='PROJCRS["Straße",\n  BASEGEOGCRS["x"],\nend_header\n]')
+    facts = ExportMetadata(crs='PROJCRS["Straße",\n  BASEGEOGCRS["x"],\nend_header\n]')
     written = random_gaussians(5, 1)
-    registry.write(tmp_path / "a.ply", Scene.of(written, facts))
-    assert torch.equal(registry.read(tmp_path / "a.ply").means, written.means)
+    registry.write_scene(tmp_path / "a.ply", ExportScene.of(written, facts))
+    assert torch.equal(registry.read_gaussians(tmp_path / "a.ply").means, written.means)
 
 
 @pytest.mark.parametrize("version", [2, 3])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_an_spz_is_what_niantics_code_reads(tmp_path, version, degree):
     written = random_gaussians(400, degree)
-    spz.write_spz(tmp_path / "a.spz", Scene.of(written), version)
-    theirs, ours = independent(tmp_path / "a.spz"), turned(registry.read(tmp_path / "a.spz"), Y_UP)
+    spz.write_spz(tmp_path / "a.spz", ExportScene.of(written), version)
+    theirs, ours = independent(tmp_path / "a.spz"), turned(registry.read_gaussians(tmp_path / "a.spz"), Y_UP)
     wanted = turned(written, Y_UP)
     for read in (theirs, ours):
         torch.testing.assert_close(read.means, wanted.means, atol=0.5 / 4096 + 1e-6, rtol=0)
@@ -99,43 +99,45 @@ def test_an_spz_is_what_niantics_code_reads(tmp_path, version, degree):
         torch.testing.assert_close(read.logits.sigmoid(), wanted.logits.sigmoid(), atol=0.5 / 255 + 1e-5, rtol=0)
         torch.testing.assert_close(read.dc, wanted.dc, atol=0.5 / 255 / 0.15 + 1e-5, rtol=0)
         torch.testing.assert_close(read.rest, wanted.rest, atol=0.5 / 128 + 1e-4, rtol=0)
-        error = (covariances(read) - covariances(wanted)).norm(dim=(1, 2)) / covariances(wanted).norm(dim=(1, 2))
+        error = (gaussian_covariances(read) - gaussian_covariances(wanted)).norm(dim=(1, 2)) / gaussian_covariances(
+            wanted
+        ).norm(dim=(1, 2))
         assert float(error.max()) < 0.08
-    torch.testing.assert_close(covariances(ours), covariances(theirs), rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(gaussian_covariances(ours), gaussian_covariances(theirs), rtol=1e-4, atol=1e-6)
     torch.testing.assert_close(ours.rest, theirs.rest, atol=1e-5, rtol=0)
 
 
 def test_axes_named_anew_give_the_same_shapes_with_small_turns():
     some = random_gaussians(500, 0)
     some = replace(some, quaternions=torch.nn.functional.normalize(some.quaternions, dim=-1))
-    small = with_small_turns(some)
-    torch.testing.assert_close(covariances(small), covariances(some), rtol=1e-4, atol=1e-6)
+    small = canonicalize_quaternions(some)
+    torch.testing.assert_close(gaussian_covariances(small), gaussian_covariances(some), rtol=1e-4, atol=1e-6)
     assert float(small.quaternions[:, 0].min()) > 0.85
 
 
 def test_what_changes_with_no_direction_stays_so_in_an_spz(tmp_path):
     written = random_gaussians(50, 3)
     written = replace(written, rest=torch.zeros_like(written.rest))
-    registry.write(tmp_path / "a.spz", Scene.of(written))
+    registry.write_scene(tmp_path / "a.spz", ExportScene.of(written))
     assert torch.equal(independent(tmp_path / "a.spz").rest, written.rest)
 
 
 @pytest.mark.parametrize("ending", sorted(CLOSE))
 def test_what_is_read_back_draws_the_same_picture(tmp_path, ending):
     written = random_gaussians(300, 0 if ending == ".splat" else 3)
-    registry.write(tmp_path / f"a{ending}", Scene.of(written))
-    assert psnr(picture(registry.read(tmp_path / f"a{ending}")), picture(written)) > CLOSE[ending]
+    registry.write_scene(tmp_path / f"a{ending}", ExportScene.of(written))
+    assert psnr(picture(registry.read_gaussians(tmp_path / f"a{ending}")), picture(written)) > CLOSE[ending]
 
 
 def test_chunks_and_their_sizes_make_no_difference(tmp_path, monkeypatch):
     whole = random_gaussians(100, 2)
     parts = [whole.select(torch.arange(a, b)) for a, b in ((0, 1), (1, 40), (40, 40), (40, 100))]
-    names = [f"a{each.ending}" for each in registry.FORMATS if each.ending not in ("tileset.json", ".sog")]
+    names = [f"a{each.suffix}" for each in registry.FORMATS if each.suffix not in ("tileset.json", ".sog")]
     for name in names:
-        registry.write(tmp_path / f"1{name}", Scene.of(whole, PLACED))
-    monkeypatch.setattr(export_scene, "ROWS", 16)
+        registry.write_scene(tmp_path / f"1{name}", ExportScene.of(whole, PLACED))
+    monkeypatch.setattr(export_scene, "CHUNK_SIZE", 16)
     for name in names:
-        registry.write(tmp_path / f"2{name}", Scene(chunks=iter(parts), count=100, degree=2, facts=PLACED))
+        registry.write_scene(tmp_path / f"2{name}", ExportScene(chunks=iter(parts), count=100, degree=2, facts=PLACED))
         one, other = (tmp_path / f"{i}{name}" for i in (1, 2))
         if name.endswith((".laz", ".las")):
             continue  # tested by their numbers: headers hold a date
@@ -145,13 +147,15 @@ def test_chunks_and_their_sizes_make_no_difference(tmp_path, monkeypatch):
 
 def test_a_splat_is_its_32_bytes(tmp_path):
     written = random_gaussians(200, 1)
-    lost = registry.write(tmp_path / "a.splat", Scene.of(written, PLACED))
+    lost = registry.write_scene(tmp_path / "a.splat", ExportScene.of(written, PLACED))
     assert "colours no longer change with the viewing direction" in lost
     rows = np.frombuffer((tmp_path / "a.splat").read_bytes(), "<f4,<f4,<f4,<f4,<f4,<f4,u4,u4")
     assert len(rows) == 200
     wanted, theirs = turned(written, Y_DOWN), independent(tmp_path / "a.splat")
     torch.testing.assert_close(theirs.means, wanted.means)
-    difference = (covariances(theirs) - covariances(wanted)).norm(dim=(1, 2)) / covariances(wanted).norm(dim=(1, 2))
+    difference = (gaussian_covariances(theirs) - gaussian_covariances(wanted)).norm(dim=(1, 2)) / gaussian_covariances(
+        wanted
+    ).norm(dim=(1, 2))
     assert float(difference.max()) < 0.05
     np.testing.assert_array_equal(np.stack([rows[f"f{i}"] for i in range(3)], 1), wanted.means.numpy())
     np.testing.assert_allclose(
@@ -159,7 +163,7 @@ def test_a_splat_is_its_32_bytes(tmp_path):
     )
     alpha = np.ascontiguousarray(rows["f6"]).view(np.uint8).reshape(-1, 4)[:, 3]
     np.testing.assert_allclose(alpha / 255, wanted.logits.sigmoid().numpy(), atol=0.5 / 255 + 1e-6)
-    facts = json.loads(beside(tmp_path / "a.splat").read_text())
+    facts = json.loads(metadata_path(tmp_path / "a.splat").read_text())
     assert facts["origin"] == [690_000.0, 5_334_000.25, 512.0]
     assert facts["axes"].startswith("x west, y down")
 
@@ -167,7 +171,7 @@ def test_a_splat_is_its_32_bytes(tmp_path):
 @pytest.mark.parametrize("degree", [0, 2, 3])
 def test_a_sog_is_read_by_others(tmp_path, degree):
     written = random_gaussians(500, degree)
-    notes = registry.write(tmp_path / "a.sog", Scene.of(written))
+    notes = registry.write_scene(tmp_path / "a.sog", ExportScene.of(written))
     assert "positions are rounded" in notes[0]
     read, wanted = independent(tmp_path / "a.sog"), turned(written, Y_DOWN)
     near = torch.cdist(wanted.means, read.means).argmin(1)  # in Morton order
@@ -200,7 +204,7 @@ def glb_arrays(path: Path) -> tuple[pygltflib.GLTF2, dict[str, np.ndarray]]:
 @pytest.mark.parametrize("degree", [0, 3])
 def test_a_glb_holds_the_turned_scene_with_all_its_bits(tmp_path, degree):
     written = random_gaussians(250, degree)
-    assert registry.write(tmp_path / "a.glb", Scene.of(written, PLACED)) == ()
+    assert registry.write_scene(tmp_path / "a.glb", ExportScene.of(written, PLACED)) == ()
     gltf, found = glb_arrays(tmp_path / "a.glb")
     wanted, prefix = turned(written, Y_UP), "KHR_gaussian_splatting:"
     primitive = gltf.meshes[0].primitives[0]
@@ -215,7 +219,7 @@ def test_a_glb_holds_the_turned_scene_with_all_its_bits(tmp_path, degree):
     np.testing.assert_allclose(found[prefix + "SCALE"], wanted.log_scales.exp().numpy(), rtol=1e-6)
     np.testing.assert_allclose(found[prefix + "OPACITY"][:, 0], wanted.logits.sigmoid().numpy(), rtol=1e-6)
     wxyz = torch.from_numpy(found[prefix + "ROTATION"][:, [3, 0, 1, 2]].copy())
-    torch.testing.assert_close(covariances(replace(wanted, quaternions=wxyz)), covariances(wanted))
+    torch.testing.assert_close(gaussian_covariances(replace(wanted, quaternions=wxyz)), gaussian_covariances(wanted))
     np.testing.assert_array_equal(found[prefix + "SH_DEGREE_0_COEF_0"], wanted.dc.numpy())
     further = [
         found[f"{prefix}SH_DEGREE_{band}_COEF_{i}"] for band in range(1, degree + 1) for i in range(2 * band + 1)
@@ -234,21 +238,21 @@ def test_what_no_spz_can_hold_is_refused_before_work(tmp_path):
 
     far = random_gaussians(4, 0)
     far.means[2, 1] = 2500.0
-    known = Scene(chunks=chunks(), count=4, degree=0, bounds=((-3, -3, -1), (3, 2500, 1)))
+    known = ExportScene(chunks=chunks(), count=4, degree=0, bounds=((-3, -3, -1), (3, 2500, 1)))
     with pytest.raises(VdgsError, match=r"2500 m from the origin.*tileset\.json"):
-        registry.write(tmp_path / "a.spz", known)
+        registry.write_scene(tmp_path / "a.spz", known)
     assert not asked
     with pytest.raises(VdgsError, match="2500 m from the origin"):
-        registry.write(tmp_path / "a.spz", replace(known, bounds=None))
+        registry.write_scene(tmp_path / "a.spz", replace(known, bounds=None))
     assert list(tmp_path.iterdir()) == []
     far.means[2, 1] = -2047.9
-    registry.write(tmp_path / "a.spz", Scene.of(far))
-    torch.testing.assert_close(registry.read(tmp_path / "a.spz").means, far.means, atol=2e-4, rtol=0)
+    registry.write_scene(tmp_path / "a.spz", ExportScene.of(far))
+    torch.testing.assert_close(registry.read_gaussians(tmp_path / "a.spz").means, far.means, atol=2e-4, rtol=0)
 
 
 def test_wide_tiles_give_up_bits_after_the_point(tmp_path):
     wide = random_gaussians(50, 1, reach=9000.0)
-    (tmp_path / "a.spz").write_bytes(spz.encoded(wide, 2))
+    (tmp_path / "a.spz").write_bytes(spz.encode_spz(wide, 2))
     torch.testing.assert_close(independent(tmp_path / "a.spz").means, wide.means, atol=1 / 512 + 1e-3, rtol=0)
 
 
@@ -257,7 +261,7 @@ def test_what_bytes_cannot_hold_is_counted(tmp_path):
     bright.dc[:3] = 9.0
     bright.log_scales[4] = 7.0
     bright.log_scales[5:7, 2] = -14.0
-    notes = registry.write(tmp_path / "a.spz", Scene.of(bright))
+    notes = registry.write_scene(tmp_path / "a.spz", ExportScene.of(bright))
     assert notes == (
         "1 of 10 Gaussians are larger than 377 units and were cut to that",
         "2 of 10 Gaussians are thinner than 0.00005 units and became as thick as that, which nobody sees",
@@ -265,14 +269,14 @@ def test_what_bytes_cannot_hold_is_counted(tmp_path):
     )
 
 
-@pytest.mark.parametrize("ending", [each.ending for each in registry.FORMATS])
+@pytest.mark.parametrize("ending", [each.suffix for each in registry.FORMATS])
 def test_numbers_that_are_none_leave_no_file(tmp_path, ending):
     name = ending if ending == "tileset.json" else f"a{ending}"
     (tmp_path / name).write_text("before")
     broken = random_gaussians(20, 1)
     broken.logits[13] = float("nan")
     with pytest.raises(VdgsError, match="Gaussian 13: its logits are not finite"):
-        registry.write(tmp_path / name, Scene(chunks=iter([broken]), count=20, degree=1))
+        registry.write_scene(tmp_path / name, ExportScene(chunks=iter([broken]), count=20, degree=1))
     assert [each.name for each in tmp_path.iterdir()] == [name]
     assert (tmp_path / name).read_text() == "before"
 
@@ -280,25 +284,27 @@ def test_numbers_that_are_none_leave_no_file(tmp_path, ending):
 def test_scenes_that_are_not_what_they_announce_are_refused(tmp_path):
     some = random_gaussians(20, 1)
     with pytest.raises(ValueError, match="21 Gaussians were announced, 20 came"):
-        registry.write(tmp_path / "a.ply", Scene(chunks=[some], count=21, degree=1))
+        registry.write_scene(tmp_path / "a.ply", ExportScene(chunks=[some], count=21, degree=1))
     with pytest.raises(ValueError, match="degree 1, announced was 3"):
-        registry.write(tmp_path / "a.ply", Scene(chunks=[some], count=20, degree=3))
+        registry.write_scene(tmp_path / "a.ply", ExportScene(chunks=[some], count=20, degree=3))
     with pytest.raises(VdgsError, match="no Gaussians"):
-        registry.write(tmp_path / "a.ply", Scene(chunks=[], count=0, degree=3))
+        registry.write_scene(tmp_path / "a.ply", ExportScene(chunks=[], count=0, degree=3))
     assert list(tmp_path.iterdir()) == []
 
 
 def test_endings_choose_formats(tmp_path):
-    endings = [registry.format_of(Path(name)).ending for name in ("a.ply", "B.PLY", "a.points.ply", "x/tileset.json")]
+    endings = [
+        registry.format_from_path(Path(name)).suffix for name in ("a.ply", "B.PLY", "a.points.ply", "x/tileset.json")
+    ]
     assert endings == [".ply", ".ply", ".points.ply", "tileset.json"]
     for name in ("a.obj", "a", "mytileset.json", ".ply"):
         with pytest.raises(VdgsError, match=r"no format is known.*\.ply \(3DGS PLY.*tileset\.json"):
-            registry.format_of(Path(name))
+            registry.format_from_path(Path(name))
     with pytest.raises(VdgsError, match=r"written but not read.*\.ply, \.spz, \.splat"):
-        registry.read(tmp_path / "a.glb")
+        registry.read_gaussians(tmp_path / "a.glb")
     (tmp_path / "a.ply").mkdir()
     with pytest.raises(VdgsError, match="is a folder"):
-        registry.check(tmp_path / "a.ply", Scene(chunks=[], count=1, degree=0))
+        registry.check_export(tmp_path / "a.ply", ExportScene(chunks=[], count=1, degree=0))
 
 
 @pytest.mark.parametrize("ending", [".ply", ".spz", ".splat"])
@@ -306,14 +312,14 @@ def test_endings_choose_formats(tmp_path):
 def test_damaged_files_are_named(tmp_path, ending, what):
     path = tmp_path / f"a{ending}"
     if what != "missing":
-        registry.write(path, Scene.of(random_gaussians(30, 1)))
+        registry.write_scene(path, ExportScene.of(random_gaussians(30, 1)))
         path.write_bytes(path.read_bytes()[:-5] if what == "cut" else b"something else")
     with pytest.raises(VdgsError, match=str(path)):
-        registry.read(path)
+        registry.read_gaussians(path)
 
 
 def test_point_clouds_and_text_are_no_scenes(tmp_path):
-    registry.write(tmp_path / "a.points.ply", Scene.of(random_gaussians(3, 0)))
+    registry.write_scene(tmp_path / "a.points.ply", ExportScene.of(random_gaussians(3, 0)))
     with pytest.raises(VdgsError, match="no PLY of 3DGS"):
         read_ply(tmp_path / "a.points.ply")
 
@@ -322,22 +328,22 @@ def test_a_stream_that_is_packed_in_parallel_is_one_gzip_member():
     rng = np.random.default_rng(0)
     parts = [rng.integers(0, 9, size, dtype=np.uint8).tobytes() for size in (0, 5, 3 << 20, 1, 1 << 20)]
     unpacker = zlib.decompressobj(31)
-    assert unpacker.decompress(b"".join(gzipped(parts))) == b"".join(parts)
+    assert unpacker.decompress(b"".join(gzip_blocks(parts))) == b"".join(parts)
     assert unpacker.eof
     assert unpacker.unused_data == b""
 
 
 def test_a_glb_beyond_4_gib_is_refused_before_work(tmp_path):
     with pytest.raises(VdgsError, match=r"GiB as glTF, and a GLB holds 4 GiB.*tileset\.json"):
-        registry.check(tmp_path / "a.glb", Scene(chunks=[], count=20_000_000, degree=3))
+        registry.check_export(tmp_path / "a.glb", ExportScene(chunks=[], count=20_000_000, degree=3))
 
 
 def test_more_than_every_reader_of_spz_opens_is_said(tmp_path, monkeypatch):
     some = random_gaussians(50, 0)
-    monkeypatch.setattr(spz, "MOST_EVERYWHERE", 50)
-    assert registry.write(tmp_path / "a.spz", Scene.of(some)) == ()
-    monkeypatch.setattr(spz, "MOST_EVERYWHERE", 49)
-    (note,) = registry.write(tmp_path / "a.spz", Scene.of(some))
+    monkeypatch.setattr(spz, "MAX_READABLE_POINTS", 50)
+    assert registry.write_scene(tmp_path / "a.spz", ExportScene.of(some)) == ()
+    monkeypatch.setattr(spz, "MAX_READABLE_POINTS", 49)
+    (note,) = registry.write_scene(tmp_path / "a.spz", ExportScene.of(some))
     assert "--max-gaussians 49" in note
     assert "tileset.json" in note
 

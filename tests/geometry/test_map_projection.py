@@ -8,7 +8,7 @@ import pytest
 from vdgs.errors import VdgsError
 from vdgs.geometry.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_enu
 from vdgs.geometry.ground_frame import GroundFrame
-from vdgs.geometry.map_projection import Placement
+from vdgs.geometry.map_projection import MapProjection
 
 pyproj = pytest.importorskip("pyproj")
 
@@ -32,17 +32,17 @@ SYSTEMS = [None, "enu", "source", "local", "EPSG:2056", "EPSG:25832", "epsg:4978
 
 @pytest.mark.parametrize("crs", SYSTEMS)
 def test_there_and_back_to_a_micrometre(crs):
-    placement = Placement.of(frame(), crs)
+    placement = MapProjection.of(frame(), crs)
     points = scattered()
     np.testing.assert_allclose(placement.to_ground(placement.places(points)), points, rtol=0, atol=2e-6)
 
 
 @pytest.mark.parametrize("origin", [BERN, (-33.9, -70.6, 900.0), (64.1, -21.9, 20.0), (-17.0, 179.9999, 5.0)])
 def test_the_default_is_the_utm_zone_as_pyproj_has_it(origin):
-    placement = Placement.of(frame(origin))
+    placement = MapProjection.of(frame(origin))
     zone = int((origin[1] + 180) // 6) + 1
     assert placement.crs == f"EPSG:{(32600 if origin[0] > 0 else 32700) + zone}"
-    assert (placement.unit, placement.metres) == ("m", 1.0)
+    assert (placement.unit, placement.meters_per_unit) == ("m", 1.0)
     points = scattered()
     latitude, longitude, height = geodetic_from_enu(points, origin).T
     x, y = pyproj.Proj(placement.crs)(longitude, latitude)
@@ -51,7 +51,7 @@ def test_the_default_is_the_utm_zone_as_pyproj_has_it(origin):
 
 
 def test_a_local_similarity_turns_by_the_meridian_convergence_and_scales_by_the_map():
-    placement = Placement.of(frame())
+    placement = MapProjection.of(frame())
     centre = np.array([350.0, -200.0, 10.0])
     found = placement.similarity_at(centre)
     scale, rotation = found.scale, found.rotation
@@ -69,7 +69,7 @@ def test_a_local_similarity_turns_by_the_meridian_convergence_and_scales_by_the_
 
 @pytest.mark.parametrize("crs", SYSTEMS[:-1])  # Web Mercator stretches north more than east: no similarity does that
 def test_a_local_similarity_keeps_to_the_map_over_a_hundred_metres(crs):
-    placement = Placement.of(frame(), crs)
+    placement = MapProjection.of(frame(), crs)
     centre = np.array([600.0, 500.0, -20.0])
     near = centre + scattered(reach=(50.0, 50.0, 20.0))
     found = placement.similarity_at(centre).apply(near)
@@ -86,38 +86,41 @@ def test_a_moved_frame_keeps_its_axes_and_its_place_on_earth():
     points = scattered()
     for crs in ("EPSG:32632", "EPSG:4978"):
         np.testing.assert_allclose(
-            Placement.of(moved, crs).places(points - shift), Placement.of(first, crs).places(points), rtol=0, atol=1e-5
+            MapProjection.of(moved, crs).places(points - shift),
+            MapProjection.of(first, crs).places(points),
+            rtol=0,
+            atol=1e-5,
         )
     # enu is level at the frame's own origin, whatever its axes are.
-    rising = Placement.of(moved, "enu").places(np.array([[0.0, 0, 0], [0, 0, 1]]))
+    rising = MapProjection.of(moved, "enu").places(np.array([[0.0, 0, 0], [0, 0, 1]]))
     np.testing.assert_allclose(rising[0], 0, atol=1e-9)
     assert np.degrees(np.arccos(rising[1, 2])) == pytest.approx(np.degrees(np.hypot(25, 17) / 6378), rel=0.02)
 
 
 def test_source_is_the_world_of_the_capture():
     ground, points = frame(), scattered()
-    np.testing.assert_allclose(Placement.of(ground, "source").places(ground.to_ground(points)), points, atol=1e-9)
+    np.testing.assert_allclose(MapProjection.of(ground, "source").places(ground.to_ground(points)), points, atol=1e-9)
 
 
 def test_geocentric_places_are_those_of_geodesy():
     points = scattered()
     expected = points @ enu_axes(*BERN[:2]) + ecef_from_geodetic(np.array([BERN]))
-    np.testing.assert_allclose(Placement.of(frame(), "EPSG:4978").places(points), expected, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(MapProjection.of(frame(), "EPSG:4978").places(points), expected, rtol=0, atol=1e-6)
 
 
 def test_feet_are_feet_up_as_across():
     ground = frame((40.7, -73.9, 10.0))
-    feet, metres = Placement.of(ground, "EPSG:2263"), Placement.of(ground)
+    feet, metres = MapProjection.of(ground, "EPSG:2263"), MapProjection.of(ground)
     assert feet.unit == "US survey foot"
     up = np.array([[0.0, 0, 0], [0, 0, 30]])
-    rise = np.diff(feet.places(up)[:, 2])[0] * feet.metres
+    rise = np.diff(feet.places(up)[:, 2])[0] * feet.meters_per_unit
     assert rise == pytest.approx(np.diff(metres.places(up)[:, 2])[0], abs=1e-6)
     assert "foot" in feet.heights
 
 
 def test_what_a_place_outside_the_area_of_a_system_gets_is_a_note():
-    assert any("outside" in note for note in Placement.of(frame(), "EPSG:32611").notes)
-    assert Placement.of(frame(), "EPSG:32632").notes == ()
+    assert any("outside" in note for note in MapProjection.of(frame(), "EPSG:32611").notes)
+    assert MapProjection.of(frame(), "EPSG:32632").notes == ()
 
 
 @pytest.mark.parametrize(
@@ -133,7 +136,7 @@ def test_what_a_place_outside_the_area_of_a_system_gets_is_a_note():
 )
 def test_systems_that_make_no_map_are_named(crs, message):
     with pytest.raises(VdgsError, match=message):
-        Placement.of(frame(), crs)
+        MapProjection.of(frame(), crs)
 
 
 @pytest.mark.parametrize(
@@ -148,7 +151,7 @@ def test_systems_that_make_no_map_are_named(crs, message):
 )
 def test_systems_that_count_to_the_west_are_named_with_one_that_does_not(crs, origin, message):
     with pytest.raises(VdgsError, match=message):
-        Placement.of(frame(origin), crs)
+        MapProjection.of(frame(origin), crs)
 
 
 @pytest.mark.parametrize(
@@ -162,7 +165,7 @@ def test_systems_that_count_to_the_west_are_named_with_one_that_does_not(crs, or
     ],
 )
 def test_systems_to_the_east_and_north_are_no_mirror(crs, origin):
-    placement = Placement.of(frame(origin), crs)
+    placement = MapProjection.of(frame(origin), crs)
     corner = placement.places(np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0], [0, 0, 10]]))
     assert np.linalg.det(corner[1:] - corner[0]) > 0
     assert np.linalg.det(placement.similarity_at(np.zeros(3)).rotation) > 0
@@ -171,17 +174,17 @@ def test_systems_to_the_east_and_north_are_no_mirror(crs, origin):
 @pytest.mark.parametrize("metric", [True, False])
 def test_without_a_georeference_there_is_the_ground_frame_and_the_source(metric):
     ground = frame(None, metric=metric)
-    local = Placement.of(ground)
+    local = MapProjection.of(ground)
     assert (local.crs, local.unit, local.wkt) == ("local", "m" if metric else "units", None)
     np.testing.assert_array_equal(local.places(scattered()), scattered())
-    assert Placement.of(ground, "source").crs == "source"
+    assert MapProjection.of(ground, "source").crs == "source"
     for crs in ("enu", "EPSG:32632"):
         with pytest.raises(VdgsError, match=r"not georeferenced.*--crs local"):
-            Placement.of(ground, crs)
+            MapProjection.of(ground, crs)
 
 
 def test_without_pyproj_the_remedy_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyproj", None)
     with pytest.raises(VdgsError, match=r"pip install 'vdgs\[geo\]'"):
-        Placement.of(frame(), "EPSG:32632")
-    assert Placement.of(frame(), "enu").unit == "m"
+        MapProjection.of(frame(), "EPSG:32632")
+    assert MapProjection.of(frame(), "enu").unit == "m"

@@ -18,7 +18,7 @@ from support.captures import tiny_scene, write_colmap
 from support.commands import begun, entry_point, limit_files, vdgs
 from vdgs.errors import VdgsError
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.pipeline.dense_points import PIXELS_A_POINT
+from vdgs.pipeline.dense_points import PIXELS_PER_POINT
 from vdgs.runs.open_run import open_run
 from vdgs.system.tensors import read_tensors
 
@@ -29,7 +29,7 @@ SETTINGS = (
     "--growth.start", "40", "--growth.interval", "20", "--growth.statistics-from", "20", "--growth.gate", "0.05",
 )  # fmt: skip
 #: As many as the ten training photographs of a tiny scene can bear beside eighty sparse points; stereo finds more.
-STEREO = f"stereo: {10 * 64 * 48 // PIXELS_A_POINT - 80} points"
+STEREO = f"stereo: {10 * 64 * 48 // PIXELS_PER_POINT - 80} points"
 
 
 @pytest.fixture(scope="module")

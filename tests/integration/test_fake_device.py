@@ -15,8 +15,16 @@ from support.fake_device import CARD, pretended_card
 from support.fake_gsplat import needs_gsplat
 from support.gpu_on_host import build, install
 from vdgs import kernels
-from vdgs.config.method import CompensationConfig, GrowthConfig
-from vdgs.training import Stage, Surroundings, TrainingState, start_state, to_saved, train_step, training_loop
+from vdgs.config.method import CompensationConfig, DensifyConfig
+from vdgs.training import (
+    FrozenAnchors,
+    TrainingProblem,
+    TrainingState,
+    initial_state,
+    to_checkpoint,
+    train_step,
+    training_loop,
+)
 
 pytestmark = [
     pytest.mark.slow,
@@ -26,23 +34,23 @@ pytestmark = [
 CPU = torch.device("cpu")
 #: Growth, compensation, a new order and the mean of models all happen within few steps.
 BUSY = {
-    "growth": GrowthConfig(interval=2, statistics_from=0, start=2, threshold=1e-6, gate=0.1, until=0.5),
+    "growth": DensifyConfig(interval=2, stats_start=0, start=2, threshold=1e-6, gate=0.1, until=0.5),
     "compensation": CompensationConfig(enabled=True, t_low=1.0),
     "iterations": 8,
     "average": 0.4,
 }
 
 
-def begun(device: torch.device, **changes: Any) -> tuple[TrainingState, Stage]:
+def begun(device: torch.device, **changes: Any) -> tuple[TrainingState, TrainingProblem]:
     """A block among frozen surroundings, about to be trained on a device."""
     anchors, decoder = coarse()
     away = replace(anchors, positions=anchors.positions + torch.tensor([3.0, 0.0, 0.0]))
-    stage = Stage(
-        config=replace(CONFIG, **changes), images=Photographs(), image_count=8, voxel=0.4, camera_height=5.0,
-        kind="block", background=(0.3, 0.4, 0.5), surroundings=Surroundings(away.to(device), decoder.to(device)),
+    stage = TrainingProblem(
+        config=replace(CONFIG, **changes), images=Photographs(), image_count=8, voxel_size=0.4, camera_height=5.0,
+        kind="block", background=(0.3, 0.4, 0.5), surroundings=FrozenAnchors(away.to(device), decoder.to(device)),
         device=device,
     )  # fmt: skip
-    return start_state(anchors.to(device), decoder.copy().to(device), stage), stage
+    return initial_state(anchors.to(device), decoder.copy().to(device), stage), stage
 
 
 def trained_on(device: torch.device, steps: int, **changes: Any) -> TrainingState:
@@ -77,9 +85,9 @@ def rasteriser(request, drivers, compiled_code, monkeypatch) -> str:
 
 def test_a_step_on_another_device_makes_the_numbers_of_the_processor(monkeypatch, rasteriser):
     with pretended_card():
-        found = to_saved(trained_on(CARD, 1)).tensors
-    monkeypatch.setenv(kernels.VARIABLE, "reference")
-    expected = to_saved(trained_on(CPU, 1)).tensors
+        found = to_checkpoint(trained_on(CARD, 1)).tensors
+    monkeypatch.setenv(kernels.KERNELS_ENV_VAR, "reference")
+    expected = to_checkpoint(trained_on(CPU, 1)).tensors
     assert found.keys() == expected.keys()
     for name, tensor in expected.items():
         torch.testing.assert_close(found[name], tensor, rtol=1e-3, atol=1e-5)
@@ -93,7 +101,7 @@ def test_steps_have_the_same_bits_whichever_block_comes_first(monkeypatch, drive
         for driver in drivers.values():
             monkeypatch.setattr(driver, "order", order)
         with pretended_card():
-            found.append(to_saved(trained_on(CARD, 2)).tensors)
+            found.append(to_checkpoint(trained_on(CARD, 2)).tensors)
     for other in found[1:]:
         assert all(torch.equal(tensor, other[name]) for name, tensor in found[0].items())
 
@@ -115,11 +123,11 @@ def test_a_step_waits_for_the_card_only_where_it_must(rasteriser):
 
 
 def test_growth_a_new_order_and_the_mean_stay_on_the_device(monkeypatch, rasteriser):
-    monkeypatch.setattr(training_loop, "REORDER_INTERVAL", 5)
+    monkeypatch.setattr(training_loop, "SORT_INTERVAL", 5)
     with pretended_card():
         state = trained_on(CARD, 8, **BUSY)
         devices = {tensor.device.type for group in state.groups().values() for tensor in group.values()}
-        devices |= {tensor.device.type for tensor in to_saved(state).tensors.values()}
+        devices |= {tensor.device.type for tensor in to_checkpoint(state).tensors.values()}
     assert devices == {"cuda"}
     assert state.average is not None
     assert len(state.anchors) != len(coarse()[0])  # some have come, others have gone
@@ -136,8 +144,8 @@ def test_mixed_devices_are_found(monkeypatch, rasteriser):
 
 
 def test_cards_take_the_composed_set_and_the_processor_its_own(monkeypatch):
-    assert kernels.choose(CARD).__name__ == "vdgs.kernels.gpu"
-    assert kernels.choose(CPU).__name__ == "vdgs.kernels.cpu"
+    assert kernels.get_backend(CARD).__name__ == "vdgs.kernels.gpu"
+    assert kernels.get_backend(CPU).__name__ == "vdgs.kernels.cpu"
     for name in ("reference", "composed"):
-        monkeypatch.setenv(kernels.VARIABLE, name)
-        assert kernels.choose(CPU).__name__ == f"vdgs.kernels.{name}"
+        monkeypatch.setenv(kernels.KERNELS_ENV_VAR, name)
+        assert kernels.get_backend(CPU).__name__ == f"vdgs.kernels.{name}"

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from support.shard_scripts import job, run
-from vdgs.distributed.executor import End
-from vdgs.distributed.node_check import Question
-from vdgs.distributed.ray_actor import Keeper, Order
+from vdgs.distributed.executor import AttemptResult
+from vdgs.distributed.node_check import NodeRequirements
+from vdgs.distributed.ray_actor import RayTaskActor, RayTaskSpec
 
 pytestmark = pytest.mark.slow
 
@@ -65,11 +65,11 @@ def test_what_the_kernel_ends_for_want_of_memory_is_known_as_such_and_started_ag
 
 def test_who_keeps_a_command_on_a_node_says_so_too(tmp_path, greedy):
     made = job(tmp_path, 0, greedy)
-    order = Order(
+    order = RayTaskSpec(
         command=tuple(made.command), output=str(made.output), environment={}, attempt=1, python=sys.executable,
-        question=Question(tmp_path, ()).plain(),
+        question=NodeRequirements(tmp_path, ()).to_dict(),
     )  # fmt: skip
-    for expected in (End(-signal.SIGKILL, out_of_memory=True), End(0)):
-        keeper = Keeper(order, collect_seconds=1e6)  # when nobody collects, it would end this process
+    for expected in (AttemptResult(-signal.SIGKILL, out_of_memory=True), AttemptResult(0)):
+        keeper = RayTaskActor(order, collect_seconds=1e6)  # when nobody collects, it would end this process
         keeper.begin()
         assert keeper.end() == expected

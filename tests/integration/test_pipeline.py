@@ -13,15 +13,15 @@ import torch
 
 from support.captures import tiny_scene, write_colmap
 from support.commands import begun, do_tasks_here, entry_point, is_free, vdgs, wait_until
-from vdgs.evaluation.isolated_blocks import BlocksAlone
+from vdgs.evaluation.isolated_blocks import IsolatedBlocks
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.decoder import Decoder
 from vdgs.partition.assignment.score_file import load_scores
-from vdgs.partition.blocks import load_blocks, places_of
-from vdgs.pipeline.dense_points import PIXELS_A_POINT
+from vdgs.partition.blocks import load_blocks, xy_positions
+from vdgs.pipeline.dense_points import PIXELS_PER_POINT
 from vdgs.runs.open_run import open_run
 from vdgs.runs.run_folder import RunFolder
-from vdgs.visibility.visibility_counts import visibility_of
+from vdgs.visibility.visibility_counts import count_visibility
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("pipeline")]
 
@@ -142,7 +142,7 @@ def test_a_run_leaves_what_the_documents_say(unbroken):
 def test_the_merged_scene_is_the_cores_of_the_blocks(unbroken):
     blocks, merged = load_blocks(unbroken / "partition/blocks.geojson"), AnchorModel.load(unbroken / MERGED)
     assert len(blocks) == 2
-    owner = blocks.owner(places_of(merged.anchors.positions))
+    owner = blocks.owner(xy_positions(merged.anchors.positions))
     for index in range(2):
         own = AnchorModel.load(unbroken / f"blocks/{index:02d}/model.safetensors").anchors
         part = merged.anchors.select(torch.from_numpy(owner == index))
@@ -174,7 +174,7 @@ def test_blocks_as_printed_leave_one_decoder(unbroken, copied):
 
 def test_a_block_alone_stands_among_coarse_anchors_with_the_coarse_decoder(unbroken):
     run, coarse = RunFolder(unbroken), AnchorModel.load(unbroken / "coarse/model.safetensors")
-    alone = BlocksAlone(run, coarse).assembled(1)
+    alone = IsolatedBlocks(run, coarse).assemble(1)
     own = AnchorModel.load(unbroken / "blocks/01/model.safetensors")
     assert [part.count for part in alone.parts] == [len(own.anchors), len(alone.anchors) - len(own.anchors)]
     assert [bits(part.decoder) for part in alone.parts] == [bits(own.decoder), bits(coarse.decoder)]
@@ -197,8 +197,8 @@ def test_every_camera_serves_a_block_and_v_is_brute_force(unbroken):
     assert (assignment.cameras.sum(axis=0) >= 4).all()
     opened = open_run(unbroken, "coarse")
     cameras = [view.camera for view in opened.capture.train_views]
-    brute = sum(camera.sees(opened.model.anchors.positions.double().numpy()).astype(int) for camera in cameras)
-    assert np.array_equal(visibility_of(opened.model.anchors.positions, cameras).numpy(), brute)
+    brute = sum(camera.in_frustum(opened.model.anchors.positions.double().numpy()).astype(int) for camera in cameras)
+    assert np.array_equal(count_visibility(opened.model.anchors.positions, cameras).numpy(), brute)
 
 
 def test_a_finished_run_does_nothing_again(capture, copied):
@@ -276,7 +276,7 @@ def swallow_ctrl_c() -> None:
         with suppress(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
 
-    run_pipeline.measure_visibility = measure_visibility  # type: ignore[assignment]
+    run_pipeline.count_run_visibility = measure_visibility  # type: ignore[assignment]
 
 
 def test_ctrl_c_between_stages_stops_the_run_and_the_same_command_continues(capture, copied):
@@ -327,7 +327,7 @@ def test_a_dry_run_counts_what_stereo_may_add(tmp_path):
     planned = vdgs(
         "run", tmp_path / "capture", "--output", tmp_path / "run", *SETTINGS, "--dry-run", prepare=time_few_steps
     )
-    assert f"and at most {10 * 64 * 48 // PIXELS_A_POINT - 80} where stereo finds ground" in planned.stdout
+    assert f"and at most {10 * 64 * 48 // PIXELS_PER_POINT - 80} where stereo finds ground" in planned.stdout
     assert "and with those of stereo" in " ".join(planned.stdout.split())
 
 
@@ -371,8 +371,8 @@ def test_a_missing_block_stops_the_merge_unless_the_coarse_model_may_stand_in(co
     assert done.returncode == 0, done.stderr
     blocks, merged = load_blocks(copied / "partition/blocks.geojson"), AnchorModel.load(copied / MERGED)
     coarse = AnchorModel.load(copied / "coarse/model.safetensors").anchors
-    stood_in = coarse.positions[torch.from_numpy(blocks.owner(places_of(coarse.positions)) == 1)]
-    held = merged.anchors.positions[torch.from_numpy(blocks.owner(places_of(merged.anchors.positions)) == 1)]
+    stood_in = coarse.positions[torch.from_numpy(blocks.owner(xy_positions(coarse.positions)) == 1)]
+    held = merged.anchors.positions[torch.from_numpy(blocks.owner(xy_positions(merged.anchors.positions)) == 1)]
     assert torch.equal(stood_in, held)
 
 

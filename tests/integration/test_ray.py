@@ -61,7 +61,7 @@ def another_code() -> None:
     """Let this process take itself for another version of vdgs."""
     from vdgs.distributed import node_check
 
-    node_check.code_identity = lambda: "of this machine"  # type: ignore[assignment]
+    node_check.code_digest = lambda: "of this machine"  # type: ignore[assignment]
 
 
 def test_a_run_starts_a_ray_of_its_own_for_each_job():

@@ -14,12 +14,19 @@ from vdgs.config.commands import RunRequest
 from vdgs.config.executor_options import ExecutorOptions
 from vdgs.errors import RunError, Stopped
 from vdgs.export import bake, bake_plan
-from vdgs.export.bake import Shown
-from vdgs.export.bake_io import load_added, load_lacking, load_shown, save_added, save_lacking, save_shown
-from vdgs.export.color_refinement import Lacking
-from vdgs.export.formats.gaussian_store import flat, opened, unflattened
+from vdgs.export.bake import ViewContributions
+from vdgs.export.bake_io import (
+    load_color_updates,
+    load_contributions,
+    load_residual,
+    save_color_updates,
+    save_contributions,
+    save_residual,
+)
+from vdgs.export.color_refinement import ColorResidual
+from vdgs.export.formats.gaussian_store import flatten, open_store, unflatten
 from vdgs.pipeline import run_pipeline
-from vdgs.rendering.ortho.tile_renderer import Tile
+from vdgs.rendering.ortho.tile_renderer import OrthoTile
 from vdgs.rendering.ortho.tile_shards import load_tile, save_tile
 from vdgs.runs.run_context import RunContext
 
@@ -72,7 +79,7 @@ def test_detail_from_photographs_is_the_same_in_shards(uncut, mapped, tmp_path):
 
 
 def test_a_tile_that_is_damaged_is_named(tmp_path):
-    tile = Tile(np.zeros((2, 3, 3), np.uint8), np.ones((2, 3), np.uint8), np.zeros((2, 3), np.float32),
+    tile = OrthoTile(np.zeros((2, 3, 3), np.uint8), np.ones((2, 3), np.uint8), np.zeros((2, 3), np.float32),
                 np.full((2, 3), 7, np.uint16))  # fmt: skip
     save_tile(tmp_path / "1.npz", tile)
     read = load_tile(tmp_path / "1.npz")
@@ -83,13 +90,13 @@ def test_a_tile_that_is_damaged_is_named(tmp_path):
 
 
 def test_a_run_sends_its_maps_where_its_blocks_go_and_stops_when_asked(tmp_path, monkeypatch):
-    monkeypatch.setattr(run_pipeline, "can_map", lambda: True)
+    monkeypatch.setattr(run_pipeline, "has_ortho_dependencies", lambda: True)
     wishes = []
-    monkeypatch.setattr(run_pipeline, "map_run", lambda context, asked, console, wish: wishes.append(wish))
+    monkeypatch.setattr(run_pipeline, "render_ortho", lambda context, asked, console, wish: wishes.append(wish))
     for executor in ("local", "slurm"):
         asked = RunRequest(capture=tmp_path, output=tmp_path, jobs=3, where=ExecutorOptions(executor=executor))
         run_pipeline._map(RunContext.from_path(tmp_path), asked, Console(quiet=True))
-    assert [(wish.sends, wish.jobs, wish.where.executor) for wish in wishes] == [
+    assert [(wish.is_distributed, wish.jobs, wish.where.executor) for wish in wishes] == [
         (False, 0, "local"),
         (True, 3, "slurm"),
     ]
@@ -97,14 +104,14 @@ def test_a_run_sends_its_maps_where_its_blocks_go_and_stops_when_asked(tmp_path,
     def stopped(*_):
         raise Stopped("Stopped")
 
-    monkeypatch.setattr(run_pipeline, "map_run", stopped)
+    monkeypatch.setattr(run_pipeline, "render_ortho", stopped)
     with pytest.raises(Stopped):
         run_pipeline._map(RunContext.from_path(tmp_path), asked, Console(quiet=True))
 
 
 def small_parts() -> None:
     """Let so few anchors be fitted at once, and shards be so small, that a small scene has several for each step."""
-    bake.ANCHORS_AT_ONCE, bake_plan.VIEWS_OF_SHARD, bake_plan.PARTS_OF_SHARD = 64, (8, 100, 8), (2, 50, 8)
+    bake.ANCHORS_PER_PART, bake_plan.VIEWS_OF_SHARD, bake_plan.PARTS_OF_SHARD = 64, (8, 100, 8), (2, 50, 8)
 
 
 def small_parts_here() -> None:
@@ -161,22 +168,26 @@ def test_what_is_chosen_is_baked_alike_in_shards_and_moved_on_by_the_driver(uncu
 
 def test_what_views_show_and_lack_is_read_back_to_the_last_bit_and_named_if_damaged(tmp_path):
     numbers = torch.arange(0, 10, 2, dtype=torch.int32)
-    shown = Shown(numbers, torch.rand(5))
-    lacking = Lacking(numbers, torch.rand(5).half(), torch.rand(5, 3).half())
+    shown = ViewContributions(numbers, torch.rand(5))
+    lacking = ColorResidual(numbers, torch.rand(5).half(), torch.rand(5, 3).half())
     rows, colours = np.array([3, 7]), torch.rand(2, 4, 3)
-    save_shown(tmp_path / "1.npy", shown)
-    save_lacking(tmp_path / "2.npy", lacking)
-    save_added(tmp_path / "3.npy", rows, colours)
-    pairs = [(shown, load_shown(tmp_path / "1.npy")), (lacking, load_lacking(tmp_path / "2.npy"))]
+    save_contributions(tmp_path / "1.npy", shown)
+    save_residual(tmp_path / "2.npy", lacking)
+    save_color_updates(tmp_path / "3.npy", rows, colours)
+    pairs = [(shown, load_contributions(tmp_path / "1.npy")), (lacking, load_residual(tmp_path / "2.npy"))]
     for one, read in pairs:
         assert all(torch.equal(value, getattr(read, name)) for name, value in vars(one).items())
-    read_rows, read_colours = load_added(tmp_path / "3.npy")
+    read_rows, read_colours = load_color_updates(tmp_path / "3.npy")
     assert read_rows.tolist() == [3, 7]
     assert torch.equal(read_colours, colours)
-    gaussians = unflattened(torch.rand(6, 23), 1)
-    flat(gaussians).tofile(tmp_path / "0.spool")
-    assert torch.equal(opened(tmp_path / "0.spool", 1).rows(np.array([4, 1])).rest, gaussians.rest[[4, 1]])
-    for name, load in (("1.npy", load_shown), ("2.npy", load_lacking), ("0.spool", lambda file: opened(file, 1))):
+    gaussians = unflatten(torch.rand(6, 23), 1)
+    flatten(gaussians).tofile(tmp_path / "0.spool")
+    assert torch.equal(open_store(tmp_path / "0.spool", 1).rows(np.array([4, 1])).rest, gaussians.rest[[4, 1]])
+    for name, load in (
+        ("1.npy", load_contributions),
+        ("2.npy", load_residual),
+        ("0.spool", lambda file: open_store(file, 1)),
+    ):
         os.truncate(tmp_path / name, (tmp_path / name).stat().st_size - 6)
         with pytest.raises(RunError, match=rf"{name}: is missing or damaged .* Delete"):
             load(tmp_path / name)

@@ -20,10 +20,10 @@ pytest.importorskip("embreex")
 import pycolmap
 
 from support.flights import FOCAL, ORIGIN, Flight, write_photograph
-from vdgs.captures.image_cache import load_picture
+from vdgs.captures.image_cache import load_image
 from vdgs.captures.loading import load_capture
-from vdgs.captures.reconstruction import facts_rows, read_reconstruction
-from vdgs.captures.validation import judge
+from vdgs.captures.reconstruction import read_reconstruction, report_rows
+from vdgs.captures.validation import validate_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RunRequest
 from vdgs.config.presets import PRESETS
@@ -31,17 +31,17 @@ from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, RunError, VdgsError
 from vdgs.geometry.geodesy import enu_from_geodetic
 from vdgs.geometry.similarity import Similarity
-from vdgs.pipeline.dry_run import plan_run
-from vdgs.pipeline.run_pipeline import with_capture
+from vdgs.pipeline.dry_run import estimate_run
+from vdgs.pipeline.run_pipeline import reconstruct_if_needed
 from vdgs.report import write_report
-from vdgs.runs.create_or_resume import begin_run
+from vdgs.runs.create_or_resume import create_or_resume_run
 from vdgs.sfm import feature_extraction, feature_matching, georegistration, incremental_mapper
-from vdgs.sfm.georegistration import Placed, Unplaced, move, place
-from vdgs.sfm.gps_priors import find_positions
-from vdgs.sfm.image_list import collect
+from vdgs.sfm.georegistration import AlignmentFailure, Georegistration, georegister, transform_model
+from vdgs.sfm.gps_priors import read_gps_priors
+from vdgs.sfm.image_list import collect_images
 from vdgs.sfm.reconstruct import reconstruct
-from vdgs.sfm.workspace import call
-from vdgs.system.stop_signals import stop_requests
+from vdgs.sfm.workspace import call_cancellable
+from vdgs.system.stop_signals import catch_stop_signals
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("sfm")]
 
@@ -89,8 +89,8 @@ def test_all_photographs_are_placed_where_they_were_taken(made, flight):
         assert np.linalg.norm(view.camera.position + shift - truth.position) < 0.4  # metres, 45 of them up
         assert view.camera.forward @ truth.forward > np.cos(np.radians(1.5))
         assert view.camera.fx == pytest.approx(FOCAL, rel=0.02)
-    assert judge(capture).problems == ()
-    assert judge(capture).reprojection_px < 1
+    assert validate_capture(capture).problems == ()
+    assert validate_capture(capture).reprojection_px < 1
 
 
 def test_photographs_come_in_exact_sizes_and_stay_as_they_were(made, flight):
@@ -109,9 +109,9 @@ def test_facts_name_what_came_out_and_what_was_left_out(made):
     assert "cut off" in why["cut.jpg"]
     assert "features" in why["grey.jpg"]
     assert max(facts.residual_rms_m) < 0.3
-    assert facts.focal_held
+    assert facts.focal_fixed
     assert facts.cameras[0].focal_after_px == pytest.approx(FOCAL)
-    assert any("9 of 11" in value for _, value in facts_rows(facts))
+    assert any("9 of 11" in value for _, value in report_rows(facts))
     assert (made / "reconstruction.png").stat().st_size > 10_000
 
 
@@ -129,14 +129,14 @@ def test_the_same_command_does_nothing_and_an_option_only_what_depends_on_it(mad
         monkeypatch.setattr(room, name, lambda *_: pytest.fail("was done already"))
     asked = SfmRequest(photographs=(flight.folder,), output=output, threads=1, options=SfmOptions(max_size=200))
     reconstruct(asked, console())
-    assert max(load_capture(output).views[0].camera.whole_size) <= 200
-    assert judge(load_capture(output)).reprojection_px < 1
+    assert max(load_capture(output).views[0].camera.full_size) <= 200
+    assert validate_capture(load_capture(output)).reprojection_px < 1
     assert not (output / "work").exists()
 
 
 def test_what_was_interrupted_goes_on(flight, tmp_path, monkeypatch):
     output = tmp_path / "capture"
-    request = SfmRequest(photographs=(flight.folder,), output=output, threads=1, options=SfmOptions(neighbours=3))
+    request = SfmRequest(photographs=(flight.folder,), output=output, threads=1, options=SfmOptions(num_neighbors=3))
     with monkeypatch.context() as patch:
         calls = []
 
@@ -144,9 +144,9 @@ def test_what_was_interrupted_goes_on(flight, tmp_path, monkeypatch):
             calls.append(function.__name__)
             if len(calls) == 3:
                 raise KeyboardInterrupt
-            return call(function, *arguments, **named)
+            return call_cancellable(function, *arguments, **named)
 
-        patch.setattr(feature_extraction, "call", stopped)
+        patch.setattr(feature_extraction, "call_cancellable", stopped)
         with pytest.raises(KeyboardInterrupt):
             reconstruct(request, console())
     with pytest.raises(CaptureError, match="is not finished"):
@@ -155,9 +155,9 @@ def test_what_was_interrupted_goes_on(flight, tmp_path, monkeypatch):
 
     def counted(function, *arguments, **named):
         extracted.extend(arguments[2])
-        return call(function, *arguments, **named)
+        return call_cancellable(function, *arguments, **named)
 
-    monkeypatch.setattr(feature_extraction, "call", counted)
+    monkeypatch.setattr(feature_extraction, "call_cancellable", counted)
     facts = reconstruct(request, console())
     assert facts.registered == 9
     assert len(extracted) == 10 - 4  # four were searched before, in two calls
@@ -183,7 +183,7 @@ def test_without_positions_the_scale_is_arbitrary_and_said_so(flight, tmp_path):
     assert not (tmp_path / "capture/georef.json").exists()
     capture = load_capture(tmp_path / "capture")
     assert not capture.ground.metric
-    masks = [load_picture(view).mask for view in capture.views]
+    masks = [load_image(view).mask for view in capture.views]
     assert [mask is not None for mask in masks] == [k == 2 for k in range(6)]
     assert not masks[2][:45].any()
     assert masks[2][55:].all()
@@ -218,17 +218,17 @@ def test_other_things_are_not_written_over_and_a_full_disk_is_told_before(flight
 def test_one_line_of_photographs_is_placed_by_attitudes_or_views(made, flight, attitudes):
     """Positions along a line leave a turn about it open."""
     model = pycolmap.Reconstruction(made / "work" / "models" / "0")
-    move(model, Similarity(0.3, np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), np.array([5.0, 6, 7])))
-    line = collect([flight.folder]).photographs[:3]
+    transform_model(model, Similarity(0.3, np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), np.array([5.0, 6, 7])))
+    line = collect_images([flight.folder]).photographs[:3]
     for image in list(model.images.values()):
         if image.name not in {photo.name for photo in line}:
             model.deregister_frame(image.frame_id)
     line = [photo if attitudes else replace(photo, attitude=None) for photo in line]
-    placed = place(model, line, find_positions(line, None, (1.0, 2.0)))
-    assert isinstance(placed, Placed)
+    placed = georegister(model, line, read_gps_priors(line, None, (1.0, 2.0)))
+    assert isinstance(placed, Georegistration)
     assert "along one line" in placed.how
     assert np.abs(placed.residuals).max() < 0.7
-    move(model, placed.similarity)
+    transform_model(model, placed.similarity)
     for image in (image for image in model.images.values() if image.has_pose):
         assert image.viewing_direction()[2] < -np.cos(np.radians(8))
 
@@ -237,13 +237,13 @@ def test_one_line_of_photographs_is_placed_by_attitudes_or_views(made, flight, a
 @pytest.mark.parametrize(("smaller", "believed"), [(1, True), (12, False)])
 def test_positions_that_are_wrong_by_as_much_as_the_flight_is_wide_tell_no_scale(made, flight, smaller, believed, line):
     """Metres wrong, as a phone is: of the nine photographs 9 m apart, and of as many around an object."""
-    photographs = [photo for photo in collect([flight.folder]).photographs if photo.name in flight.names]
+    photographs = [photo for photo in collect_images([flight.folder]).photographs if photo.name in flight.names]
     model = pycolmap.Reconstruction(made / "work" / "models" / "0")
-    positions = find_positions(photographs, None, (3.0, 3.0) if line else (0.1, 0.1))
+    positions = read_gps_priors(photographs, None, (3.0, 3.0) if line else (0.1, 0.1))
     drift = np.random.default_rng(4).normal(0, 0.9, positions.enu.shape)
-    placed = place(model, photographs, replace(positions, enu=positions.enu / smaller + drift))
-    assert isinstance(placed, Placed) == believed
-    if isinstance(placed, Unplaced):
+    placed = georegister(model, photographs, replace(positions, enu=positions.enu / smaller + drift))
+    assert isinstance(placed, Georegistration) == believed
+    if isinstance(placed, AlignmentFailure):
         assert "disagree" in placed.why
         assert "over a flight of" in placed.why
         assert "--gcp" in placed.remedy
@@ -254,8 +254,8 @@ def test_positions_that_are_wrong_by_as_much_as_the_flight_is_wide_tell_no_scale
 def test_positions_that_disagree_leave_the_scale_arbitrary_and_say_why(made, flight, tmp_path, monkeypatch):
     output, said = tmp_path / "capture", console()
     shutil.copytree(made, output, symlinks=True)
-    found = Unplaced("the positions disagree by 2 m", "give better ones")
-    monkeypatch.setattr(georegistration, "place", lambda *_: found)
+    found = AlignmentFailure("the positions disagree by 2 m", "give better ones")
+    monkeypatch.setattr(georegistration, "georegister", lambda *_: found)
     facts = reconstruct(
         SfmRequest(photographs=(flight.folder,), output=output, threads=1, options=SfmOptions(max_size=200)), said
     )
@@ -285,10 +285,10 @@ def asked(flight: Flight, output: Path) -> RunRequest:
 def test_a_run_of_photographs_makes_them_a_capture_first_and_reports_how(made, flight, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(made, run / "capture", symlinks=True)  # as the stage leaves it
-    request = with_capture(replace(asked(flight, run), sfm=SfmOptions()), console())
+    request = reconstruct_if_needed(replace(asked(flight, run), sfm=SfmOptions()), console())
     assert request.capture == run / "capture"
-    assert with_capture(request, console()) == request  # a capture is taken as it is
-    context = begin_run(request.capture, request.output, request.options, request.method(), redo=False)
+    assert reconstruct_if_needed(request, console()) == request  # a capture is taken as it is
+    context = create_or_resume_run(request.capture, request.output, request.options, request.method(), overwrite=False)
     folder, capture = context.run, context.capture
     assert capture.ground.metric
     page = write_report(folder).read_text()
@@ -298,7 +298,7 @@ def test_a_run_of_photographs_makes_them_a_capture_first_and_reports_how(made, f
 
 def test_a_dry_run_of_photographs_looks_and_writes_nothing(flight, tmp_path):
     said = console()
-    assert plan_run(asked(flight, tmp_path / "run"), said) is None
+    assert estimate_run(asked(flight, tmp_path / "run"), said) is None
     assert "10 of 10" in said.file.getvalue()
     assert list(tmp_path.iterdir()) == []
 
@@ -306,7 +306,7 @@ def test_a_dry_run_of_photographs_looks_and_writes_nothing(flight, tmp_path):
 def test_a_run_among_other_files_is_refused_before_the_work(flight, tmp_path):
     (tmp_path / "thesis.txt").write_text("three years")
     with pytest.raises(RunError, match="holds other files"):
-        with_capture(asked(flight, tmp_path), console())
+        reconstruct_if_needed(asked(flight, tmp_path), console())
 
 
 def test_an_interrupted_call_is_waited_for():
@@ -319,6 +319,6 @@ def test_an_interrupted_call_is_waited_for():
             Event().wait(0.001)
         ended.append(True)
 
-    with pytest.raises(KeyboardInterrupt), stop_requests(interrupts=True):
-        call(long)
+    with pytest.raises(KeyboardInterrupt), catch_stop_signals(interrupts=True):
+        call_cancellable(long)
     assert ended

@@ -19,18 +19,18 @@ import pycolmap
 
 from support.flights import ORIGIN, Flight, copy_folder, fly, grid, write_photograph
 from vdgs.captures.loading import load_capture
-from vdgs.captures.reconstruction import ReconstructionFacts, read_reconstruction
+from vdgs.captures.reconstruction import ReconstructionReport, read_reconstruction
 from vdgs.config.commands import RunRequest
 from vdgs.config.presets import PRESETS
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.geodesy import enu_from_geodetic
-from vdgs.pipeline.run_pipeline import with_capture
+from vdgs.pipeline.run_pipeline import reconstruct_if_needed
 from vdgs.sfm import capture_writer, feature_extraction, feature_matching, incremental_mapper
 from vdgs.sfm.reconstruct import reconstruct
-from vdgs.sfm.workspace import Work, call
-from vdgs.system.stop_signals import stop_requests
+from vdgs.sfm.workspace import Workspace, call_cancellable
+from vdgs.system.stop_signals import catch_stop_signals
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("sfm")]
 
@@ -54,7 +54,7 @@ def pixels_of(file: Path) -> np.ndarray:
         return np.array(image)
 
 
-def whole_capture(output: Path, flight: Flight, facts: ReconstructionFacts) -> None:
+def whole_capture(output: Path, flight: Flight, facts: ReconstructionReport) -> None:
     """Everything is there, in all sizes, and lies where it was."""
     assert facts.registered == len(flight.cameras)
     capture = load_capture(output)
@@ -62,7 +62,7 @@ def whole_capture(output: Path, flight: Flight, facts: ReconstructionFacts) -> N
     shift = enu_from_geodetic(np.array([capture.ground.origin_geo]), ORIGIN)[0]
     for view, truth in zip(capture.views, flight.cameras, strict=True):
         assert np.linalg.norm(view.camera.position + shift - truth.position) < 0.5
-    for folder, _ in capture_writer.SIZES:
+    for folder, _ in capture_writer.IMAGE_SIZES:
         assert sorted(path.name for path in (output / folder).iterdir()) == flight.names
     assert not (output / "work").exists()
 
@@ -86,7 +86,7 @@ def test_two_folders_two_cameras_landscape_and_portrait_become_one_scene(flight,
         training=PRESETS["laptop"].training, photographs=(tmp_path / "second",),
     )  # fmt: skip
     said = console()
-    found = with_capture(request, said)
+    found = reconstruct_if_needed(request, said)
     assert found.capture == tmp_path / "run" / "capture"
     assert found.photographs == ()
     capture = load_capture(found.capture)
@@ -101,7 +101,7 @@ def test_two_folders_two_cameras_landscape_and_portrait_become_one_scene(flight,
         card, number = view.name.split("/")[0], int(view.name.split("_")[1].split(".")[0])
         truth = flight.cameras[2 * number + (card == "first")]
         assert np.linalg.norm(view.camera.position + shift - truth.position) < 0.8
-    assert with_capture(request, console()) == found  # the same command finds it made
+    assert reconstruct_if_needed(request, console()) == found  # the same command finds it made
 
 
 def test_portrait_and_landscape_stand_beside_each_other(flight, tmp_path):
@@ -114,7 +114,7 @@ def test_portrait_and_landscape_stand_beside_each_other(flight, tmp_path):
         write_photograph(card / name, pixels, k, place, 6 if k in (3, 4, 5) else 1)
     facts = reconstruct(SfmRequest(photographs=(card,), output=tmp_path / "capture", threads=1), console())
     assert facts.registered == 9
-    sizes = {view.name: view.camera.whole_size for view in load_capture(tmp_path / "capture").views}
+    sizes = {view.name: view.camera.full_size for view in load_capture(tmp_path / "capture").views}
     assert {name for name, (width, height) in sizes.items() if height > width} == set(flight.names[3:6])
 
 
@@ -122,7 +122,7 @@ def test_more_folders_beside_a_capture_are_refused(flight, tmp_path):
     (tmp_path / "sparse").mkdir()
     request = RunRequest(capture=tmp_path, output=tmp_path / "run", preset="laptop", photographs=(flight.folder,))
     with pytest.raises(VdgsError, match="only folders of photographs alone can be several"):
-        with_capture(request, console())
+        reconstruct_if_needed(request, console())
 
 
 # ------------------------------------------------------------------------------------------------- parts
@@ -187,8 +187,8 @@ STEPS = {
 def test_ctrl_c_at_each_step_keeps_what_is_done_and_the_same_command_goes_on(
     flight, begun, tmp_path, monkeypatch, step
 ):
-    monkeypatch.setattr(feature_matching, "AT_ONCE", 4)
-    monkeypatch.setattr(incremental_mapper, "LEAST_BETWEEN", 2)
+    monkeypatch.setattr(feature_matching, "PAIRS_PER_THREAD", 4)
+    monkeypatch.setattr(incremental_mapper, "MIN_SNAPSHOT_INTERVAL", 2)
     room, name, after = STEPS[step]
     output, stop, function = tmp_path / "capture", Stopper(after), getattr(room, name)
     if step in begun:
@@ -202,7 +202,7 @@ def test_ctrl_c_at_each_step_keeps_what_is_done_and_the_same_command_goes_on(
 
     with monkeypatch.context() as patch:
         patch.setattr(room, name, then_stopped)
-        with pytest.raises(KeyboardInterrupt), stop_requests(interrupts=True):
+        with pytest.raises(KeyboardInterrupt), catch_stop_signals(interrupts=True):
             reconstruct(request, console())
     with pytest.raises(CaptureError, match="is not finished"):
         load_capture(output)
@@ -215,7 +215,7 @@ def test_ctrl_c_at_each_step_keeps_what_is_done_and_the_same_command_goes_on(
             matched.append(named["pairing_options"].match_list_path)
         if called is pycolmap.incremental_mapping:
             mapped.append(named["input_path"])
-        return call(called, *arguments, **named)
+        return call_cancellable(called, *arguments, **named)
 
     for each in (feature_extraction, feature_matching, incremental_mapper):
         monkeypatch.setattr(each, "call", counted)
@@ -234,35 +234,35 @@ def test_ctrl_c_at_each_step_keeps_what_is_done_and_the_same_command_goes_on(
 
 
 def test_only_whole_snapshots_are_gone_on_from_and_the_largest_of_them(tmp_path):
-    work = Work(tmp_path)
+    work = Workspace(tmp_path)
 
     def snapshot(name: str, placed: int) -> None:
         (work.snapshots / name).mkdir(parents=True)
         (work.snapshots / name / "images.bin").write_bytes(placed.to_bytes(8, "little"))
 
-    incremental_mapper.keep_snapshots(work)
-    assert incremental_mapper._largest_kept(work) is None
+    incremental_mapper.save_snapshots(work)
+    assert incremental_mapper._largest_snapshot(work) is None
     for name, placed, kept in (("1", 7, 7), ("2", 12, 12), ("3", 5, 12), ("4", 110, 110)):
         snapshot(name, placed)
-        incremental_mapper.keep_snapshots(work)
+        incremental_mapper.save_snapshots(work)
         assert [path.name for path in work.kept.iterdir()] == [str(kept)]
         assert not any(work.snapshots.iterdir())
-    incremental_mapper.forget_models(work)
+    incremental_mapper.delete_models(work)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_another_focal_length_begins_mapping_anew(flight, begun, tmp_path, monkeypatch):
     output, stop = tmp_path / "capture", Stopper(5)
     copy_folder(begun["mapping"], output)
-    monkeypatch.setattr(incremental_mapper, "LEAST_BETWEEN", 2)
-    keep = incremental_mapper.keep_snapshots
+    monkeypatch.setattr(incremental_mapper, "MIN_SNAPSHOT_INTERVAL", 2)
+    keep = incremental_mapper.save_snapshots
     with monkeypatch.context() as patch:
-        patch.setattr(incremental_mapper, "keep_snapshots", lambda work: (keep(work), stop()))
-        with pytest.raises(KeyboardInterrupt), stop_requests(interrupts=True):
+        patch.setattr(incremental_mapper, "save_snapshots", lambda work: (keep(work), stop()))
+        with pytest.raises(KeyboardInterrupt), catch_stop_signals(interrupts=True):
             reconstruct(SfmRequest(photographs=(flight.folder,), output=output, threads=1), console())
     assert any((output / "work" / "kept").iterdir())
     monkeypatch.setattr(
-        incremental_mapper, "find_models", lambda work, *_: pytest.fail("kept") if work.kept.exists() else done()
+        incremental_mapper, "run_mapper", lambda work, *_: pytest.fail("kept") if work.kept.exists() else done()
     )
 
     def done():
@@ -309,13 +309,13 @@ def test_a_disk_that_is_full_for_the_database_is_said_and_nothing_is_lost(flight
     if step in begun:
         copy_folder(begun[step], output)
     request = SfmRequest(photographs=(flight.folder,), output=output, threads=1)
-    monkeypatch.setattr(feature_matching, "AT_ONCE", 4)
+    monkeypatch.setattr(feature_matching, "PAIRS_PER_THREAD", 4)
 
     def full(function, *arguments, **named):
         full.calls += 1
         if full.calls == 3:
-            return call(lambda cancellation_token: fail("SQLite error: database or disk is full"))
-        return call(function, *arguments, **named)
+            return call_cancellable(lambda cancellation_token: fail("SQLite error: database or disk is full"))
+        return call_cancellable(function, *arguments, **named)
 
     def fail(why: str):
         raise RuntimeError(why)
@@ -326,7 +326,7 @@ def test_a_disk_that_is_full_for_the_database_is_said_and_nothing_is_lost(flight
         with pytest.raises(VdgsError, match=r"the disk is full .* the same command then goes on"):
             reconstruct(request, console())
     calls = []
-    monkeypatch.setattr(room, "call", lambda *a, **n: (calls.append(a[0]), call(*a, **n))[1])
+    monkeypatch.setattr(room, "call", lambda *a, **n: (calls.append(a[0]), call_cancellable(*a, **n))[1])
     whole_capture(output, flight, reconstruct(request, console()))
     assert len(calls) < (5 if room is feature_extraction else 9)  # of five, and nine with the four pairs of each
     shutil.rmtree(output)

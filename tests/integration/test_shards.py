@@ -25,28 +25,28 @@ from vdgs.distributed import run_shard as entry
 from vdgs.distributed.job_folders import clear, remove
 from vdgs.distributed.job_labels import shard_kind
 from vdgs.distributed.shard import WORKERS, Results, Shard, run_shard, shard_session
-from vdgs.distributed.sharded_job import REQUEST, ShardedJob, ShardNeeds, Wish, spans_of
+from vdgs.distributed.sharded_job import REQUEST, ExecutionOptions, ShardedJob, ShardNeeds, split_ranges
 from vdgs.errors import RunError, Stopped, VdgsError
-from vdgs.evaluation.block_seams import BlockFigures
+from vdgs.evaluation.block_seams import BlockViewMetrics
 from vdgs.evaluation.by_block import BlockMetrics, SeamMetrics
 from vdgs.evaluation.by_visibility import VisibilityHistogram
 from vdgs.evaluation.comparison_images import Thumbnail
 from vdgs.evaluation.depth_errors import DepthErrors
-from vdgs.evaluation.view_metrics import ViewFigures
-from vdgs.evaluation.view_metrics_io import load_view, save_view
-from vdgs.pipeline.evaluate_stage import is_measured
+from vdgs.evaluation.view_metrics import ViewMetrics
+from vdgs.evaluation.view_metrics_io import load_view_metrics, save_view_metrics
+from vdgs.pipeline.evaluate_stage import is_evaluated
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.system.atomic_files import write_json
-from vdgs.system.file_locks import hold
-from vdgs.system.stop_signals import stop_if_asked, stop_requests
+from vdgs.system.file_locks import lock_folder
+from vdgs.system.stop_signals import catch_stop_signals, check_stop_requested
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("shards")]  # one worker, which trains once
 
 
 @given(st.integers(1, 5000), st.integers(1, 5), st.integers(5, 40), st.integers(1, 30))
 def test_spans_hold_every_item_once_and_are_about_equal(items, least, most, shards):
-    spans = spans_of(items, least, most, shards)
+    spans = split_ranges(items, least, most, shards)
     assert [item for span in spans for item in span] == list(range(items))
     lengths = [len(span) for span in spans]
     assert max(lengths) <= most
@@ -99,10 +99,12 @@ def test_what_views_come_to_merges_to_the_bits_of_one_count_and_is_read_back_to_
         }
         pixels = rng.integers(0, 255, (3, 4, 3), np.uint8)
         cell = Thumbnail("ü", "1 dB", pixels, pixels[::-1].copy()) if place % 2 else None
-        save_view(
-            tmp_path / "1.npz", ViewFigures(row, own, {"median": depth}, cell), BlockFigures(row, of_blocks, of_seams)
+        save_view_metrics(
+            tmp_path / "1.npz",
+            ViewMetrics(row, own, {"median": depth}, cell),
+            BlockViewMetrics(row, of_blocks, of_seams),
         )
-        read, read_blocks = load_view(tmp_path / "1.npz")
+        read, read_blocks = load_view_metrics(tmp_path / "1.npz")
         assert repr(read.row) == repr(row) == repr(read_blocks.row)
         assert (read.cell is None) == (cell is None)
         if cell is not None:
@@ -115,7 +117,7 @@ def test_what_views_come_to_merges_to_the_bits_of_one_count_and_is_read_back_to_
         errors_parts.merge(read.depth_errors["median"])
     assert parts.bins(5) == whole.bins(5)
     for one, other in ((whole, parts), (blocks, blocks_parts), (seams, seams_parts), (errors, errors_parts)):
-        ours, theirs = one.arrays(), other.arrays()
+        ours, theirs = one.to_arrays(), other.to_arrays()
         assert {name: each.tobytes() for name, each in ours.items()} == {
             n: each.tobytes() for n, each in theirs.items()
         }
@@ -124,24 +126,24 @@ def test_what_views_come_to_merges_to_the_bits_of_one_count_and_is_read_back_to_
 def test_a_file_of_a_view_that_is_damaged_is_named(tmp_path):
     file = tmp_path / "03/1.npz"
     with pytest.raises(RunError, match=r"1\.npz: is missing or damaged .* Delete .*03 and run"):
-        load_view(file)
-    save_view(file, ViewFigures({}))
+        load_view_metrics(file)
+    save_view_metrics(file, ViewMetrics({}))
     file.write_bytes(file.read_bytes()[:-40])
     with pytest.raises(RunError, match="is missing or damaged"):
-        load_view(file)
+        load_view_metrics(file)
 
 
 def test_a_shard_says_how_far_it_is_and_how_it_ended(tmp_path):
     folder = StageFolder(tmp_path / "00")
     with shard_session(folder, 1, 3) as tell:
-        assert folder.is_held()
+        assert folder.is_locked_elsewhere()
         assert (folder.status().state, folder.status().iteration, folder.status().iterations) == ("running", 1, 3)
         tell(3)
     assert (folder.status().state, folder.status().iteration) == ("done", 3)
     with pytest.raises(VdgsError, match="gone"), shard_session(folder, 1, 3):
         raise VdgsError("a.jpg: gone")
     assert (folder.status().state, folder.status().why) == ("failed", "a.jpg: gone")
-    with pytest.raises(Stopped, match="Stopped after 2 of 3"), stop_requests():
+    with pytest.raises(Stopped, match="Stopped after 2 of 3"), catch_stop_signals():
         _stopped_at_two(folder)
     assert (folder.status().state, folder.status().iteration) == ("stopped", 2)
 
@@ -151,7 +153,7 @@ def _stopped_at_two(folder: StageFolder) -> None:
         tell(2)
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(0.01)
-        stop_if_asked()
+        check_stop_requested()
 
 
 @dataclass(frozen=True)
@@ -203,7 +205,10 @@ def test_workers_are_there():
 def test_a_job_keeps_what_is_done_and_is_gathered_in_the_order_of_its_items(tmp_path, halves, monkeypatch):
     monkeypatch.setattr("vdgs.distributed.backend_selection.LocalExecutor", CommandsHere)
     job, console = job_of(tmp_path, "this"), Console(file=io.StringIO(), width=200)
-    needs, wish = ShardNeeds(1, lambda: pytest.fail("asked of this machine")), Wish(ExecutorOptions(), jobs=2)
+    needs, wish = (
+        ShardNeeds(1, lambda: pytest.fail("asked of this machine")),
+        ExecutionOptions(ExecutorOptions(), jobs=2),
+    )
     with pytest.raises(AssertionError, match="exit code 1"), job.held():
         job.run(needs, wish, console)
     assert job.left == [1]
@@ -253,7 +258,11 @@ def test_shards_of_other_jobs_go_unless_they_are_at_work(tmp_path):
         job.mark_queued()
     with wanted.shard(0).locked(), pytest.raises(RunError, match="that an earlier command sent out"):
         clear(tmp_path)
-    with hold(wanted.folder), pytest.raises(RunError, match="another vdgs process gathers shards there"), other.held():
+    with (
+        lock_folder(wanted.folder),
+        pytest.raises(RunError, match="another vdgs process gathers shards there"),
+        other.held(),
+    ):
         pass
     assert wanted.folder.exists()
 
@@ -334,11 +343,11 @@ def test_exposed_views_are_the_same_in_shards_and_where_a_file_is_compared(uncut
     assert all(row["psnr"] != row["psnr_neutral"] for row in rows)
     assert figures["psnr_neutral"] == pytest.approx(np.mean([row["psnr_neutral"] for row in rows]))
     one = evaluated(measured)
-    assert is_measured(RunFolder(run), "coarse", None, 4)
+    assert is_evaluated(RunFolder(run), "coarse", None, 4)
     status = json.loads((measured / "status.json").read_text())
     assert status.pop("exposed") == "interpolated and metered"
     (measured / "status.json").write_text(json.dumps(status))  # as if measured in neutral colours
-    assert not is_measured(RunFolder(run), "coarse", None, 4)
+    assert not is_evaluated(RunFolder(run), "coarse", None, 4)
     done = vdgs("eval", run, "--jobs", "2", prepare=do_tasks_here)
     assert done.returncode == 0, done.stderr + done.stdout
     assert "2 of 2 shards done" in done.stdout

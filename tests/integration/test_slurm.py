@@ -24,9 +24,9 @@ from support.commands import Command, begun, do_tasks_here, vdgs, wait_until
 from support.slurm import is_installed, real, stand_in
 from vdgs.config.executor_options import SlurmOptions
 from vdgs.distributed import slurm_commands
-from vdgs.distributed.executor import Needs
-from vdgs.distributed.slurm_commands import Element, Fate, Listed, SlurmError
-from vdgs.distributed.slurm_executor import script
+from vdgs.distributed.executor import TaskResources
+from vdgs.distributed.slurm_commands import ArrayTaskId, JobState, QueueEntry, SlurmError
+from vdgs.distributed.slurm_executor import make_batch_script
 
 pytestmark = [
     pytest.mark.slow,
@@ -88,7 +88,7 @@ def let_go_on_at_once(element: str) -> None:
     """Spare a job that was put back into the queue the two minutes that SLURM lets it wait."""
     if is_real():
         wait_until(
-            lambda: ("PENDING", element) in {(each.state, str(each.element)) for each in slurm_commands.listed("")}
+            lambda: ("PENDING", element) in {(each.state, str(each.task_id)) for each in slurm_commands.list_queue("")}
         )
         subprocess.run(["scontrol", "update", f"JobId={element}", "StartTime=now"], check=True)
 
@@ -180,10 +180,10 @@ def test_where_there_is_no_slurm_it_is_said(cut, monkeypatch):
 
 def test_a_script_asks_for_what_a_block_needs(tmp_path):
     options = SlurmOptions(
-        partition="gpu", account="lab", time="8:00:00", grace_seconds=300, setup="module load cuda",
+        partition="gpu", account="lab", time="8:00:00", grace_seconds=300, setup_command="module load cuda",
         options=("--qos=long",),
     )  # fmt: skip
-    lines = script(tmp_path / "vdgs-a", 8, Needs(4, 5 << 30, 1), options, 3).splitlines()
+    lines = make_batch_script(tmp_path / "vdgs-a", 8, TaskResources(4, 5 << 30, 1), options, 3).splitlines()
     for asked in (
         "--array=0-7%3", "--cpus-per-task=4", "--mem=5120M", "--gres=gpu:1", "--partition=gpu", "--account=lab",
         "--time=8:00:00", "--signal=B:USR1@300", "--requeue", "--qos=long",
@@ -191,7 +191,7 @@ def test_a_script_asks_for_what_a_block_needs(tmp_path):
         assert f"#SBATCH {asked}" in lines
     assert lines[-2] == "module load cuda"
     assert lines[-1].startswith("exec ")
-    plain = script(tmp_path / "vdgs-a", 2, Needs(1), SlurmOptions(), 2)
+    plain = make_batch_script(tmp_path / "vdgs-a", 2, TaskResources(1), SlurmOptions(), 2)
     assert not any(word in plain for word in ("--mem", "--gres", "--partition", "--account", "--time", "%2"))
 
 
@@ -210,13 +210,13 @@ def answers(monkeypatch, **said: str | None) -> None:
 
 def test_what_slurm_says_is_read(monkeypatch):
     answers(monkeypatch, squeue="12|3|RUNNING|vdgs-a-1|n07\n12|4|PENDING|vdgs-a-1|\n13|N/A|RUNNING|other|n01\n")
-    assert slurm_commands.listed("vdgs-a-") == [
-        Listed(Element("12", 3), "RUNNING", "vdgs-a-1", "n07"), Listed(Element("12", 4), "PENDING", "vdgs-a-1", "")
+    assert slurm_commands.list_queue("vdgs-a-") == [
+        QueueEntry(ArrayTaskId("12", 3), "RUNNING", "vdgs-a-1", "n07"), QueueEntry(ArrayTaskId("12", 4), "PENDING", "vdgs-a-1", "")
     ]  # fmt: skip
-    element = Element("12", 3)
+    element = ArrayTaskId("12", 3)
     answers(monkeypatch, scontrol="JobId=15 ArrayJobId=12 JobState=NODE_FAIL Reason=NodeDown NodeList=n07\n")
-    assert slurm_commands.fate(element) == Fate("NODE_FAIL", "n07")
+    assert slurm_commands.query_job_state(element) == JobState("NODE_FAIL", "n07")
     answers(monkeypatch, scontrol=None, sacct="REQUEUED|n01\nCANCELLED by 1000|n07\n")
-    assert slurm_commands.fate(element) == Fate("CANCELLED", "n07")
+    assert slurm_commands.query_job_state(element) == JobState("CANCELLED", "n07")
     answers(monkeypatch, scontrol=None)
-    assert slurm_commands.fate(element) is None
+    assert slurm_commands.query_job_state(element) is None

@@ -17,7 +17,7 @@ from vdgs.model.anchor_model import AnchorModel
 from vdgs.partition.assignment.score_file import load_scores
 from vdgs.runs.open_run import open_run
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.visibility_store import visibility_of_run
+from vdgs.runs.visibility_store import get_run_visibility
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("composition")]
 
@@ -29,8 +29,8 @@ def runs(native_small, tmp_path_factory) -> tuple[Path, Path, Path]:
     twin, shared = folder / "twin", folder / "shared"
     shutil.copytree(native_small.coarse, shared)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(kernels.VARIABLE, "reference")
-        assert kernels.choose(torch.device("cpu")) is torch_ref
+        patch.setenv(kernels.KERNELS_ENV_VAR, "reference")
+        assert kernels.get_backend(torch.device("cpu")) is torch_ref
         train_coarse(native_small.capture, twin)
         after_the_coarse_stage(twin)
         after_the_coarse_stage(shared)
@@ -52,7 +52,7 @@ def test_both_sets_learn_the_place_alike(runs):
 def test_from_one_coarse_model_both_cut_assign_and_measure_alike(runs):
     native, _, shared = runs
     opened = [open_run(run, "coarse") for run in (native, shared)]
-    seen = [visibility_of_run(run, [view.camera for view in run.capture.train_views]) for run in opened]
+    seen = [get_run_visibility(run, [view.camera for view in run.capture.train_views]) for run in opened]
     assert torch.equal(*seen)
     assert (native / "partition" / "blocks.geojson").read_bytes() == (
         shared / "partition" / "blocks.geojson"

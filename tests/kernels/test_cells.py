@@ -27,7 +27,7 @@ def cloud(n: int, seed: int = 0, dtype=torch.float32) -> torch.Tensor:
 def test_a_cell_holds_its_positions_and_its_centre(implementation):
     positions, origin = cloud(2_000, dtype=torch.float64), torch.tensor([3.0, -2.0, 1.0], dtype=torch.float64)
     keys = implementation.cell_keys(positions, 0.7, origin)
-    centres = implementation.cell_centres(keys, 0.7, origin)
+    centres = implementation.cell_centers(keys, 0.7, origin)
     assert torch.all((positions - centres).abs() <= 0.35 + 1e-9)
     assert torch.equal(implementation.cell_keys(centres, 0.7, origin), keys)
     assert torch.all(keys >= 0)
@@ -49,7 +49,7 @@ def test_positions_that_do_not_fit_are_refused(implementation, bad):
         implementation.cell_keys(positions, 1.0, torch.zeros(3))
     edge = torch.tensor([[2.0**20 - 1, -(2.0**20), 0.0]])
     assert torch.equal(
-        implementation.cell_centres(implementation.cell_keys(edge, 1.0, torch.zeros(3)), 1.0, torch.zeros(3)),
+        implementation.cell_centers(implementation.cell_keys(edge, 1.0, torch.zeros(3)), 1.0, torch.zeros(3)),
         edge + 0.5,
     )
 

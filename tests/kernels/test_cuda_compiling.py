@@ -14,14 +14,14 @@ from support.commands import python_begun
 from support.cuda_on_host import COMPILER, needs_nvrtc
 from vdgs.errors import VdgsError
 from vdgs.kernels.cuda import compile_cache, launch, nvrtc
-from vdgs.kernels.cuda.nvrtc import CompileError, CudaUnavailable, Found, Nvrtc, Target
+from vdgs.kernels.cuda.nvrtc import CompileError, CompileTarget, CudaUnavailable, Nvrtc, NvrtcLibrary
 
 ARCHITECTURES = (75, 80, 86, 89, 90, 100, 120)
 
 
 @pytest.fixture(autouse=True)
 def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv(compile_cache.VARIABLE, str(tmp_path / "code"))
+    monkeypatch.setenv(compile_cache.CUDA_CACHE_ENV_VAR, str(tmp_path / "code"))
 
 
 class StandIn:
@@ -69,7 +69,7 @@ SOURCES = {
 def test_every_source_compiles_for_every_card_and_spills_nothing(source, architecture):
     """Of 64 registers, four blocks of 256 threads fit on every card, of 255 one; of 16 KiB shared memory four."""
     headers, kernels = SOURCES[source]
-    found = resources_of(source, Target(f"sm_{architecture}"), headers, COMPILER)
+    found = resources_of(source, CompileTarget(f"sm_{architecture}"), headers, COMPILER)
     assert {each.kernel for each in found} == kernels
     for each in found:
         print(f"sm_{architecture} {each}")
@@ -89,14 +89,14 @@ def test_shared_headers_lean_on_nothing_of_the_processors():
 
 @needs_nvrtc
 def test_compiled_code_names_its_kernels():
-    code = launch.compile_source("loss.cu", Target("sm_86"))
+    code = launch.compile_source("loss.cu", CompileTarget("sm_86"))
     assert code[:4] == b"\x7fELF"
     assert all(kernel.encode() in code for kernel in SOURCES["loss.cu"][1])
 
 
 @needs_nvrtc
 def test_ptx_names_the_kernels():
-    code = launch.compile_source("loss.cu", Target("compute_75"))
+    code = launch.compile_source("loss.cu", CompileTarget("compute_75"))
     assert b".target sm_75" in code
     assert b".entry photometric_forward" in code
 
@@ -106,7 +106,9 @@ def test_ptx_names_the_kernels():
 def test_the_mathematics_of_the_processor_compiles_for_every_card(architecture):
     """gaussian_math.h is written once for both: every function of it in one kernel."""
     headers = {name: launch.read_header(name) for name in ("gaussian_math.h", "image_formation.h")}
-    code = COMPILER.compile("gaussian.cu", GAUSSIAN, headers, Target(f"sm_{architecture}"), launch.OPTIONS)
+    code = COMPILER.compile(
+        "gaussian.cu", GAUSSIAN, headers, CompileTarget(f"sm_{architecture}"), launch.COMPILE_OPTIONS
+    )
     assert b"there_and_back" in code
 
 
@@ -133,11 +135,11 @@ extern "C" __global__ void there_and_back(const float* camera, const float* anch
 
 
 def test_machine_code_for_what_the_compiler_knows_and_ptx_for_newer_cards():
-    compiler = Nvrtc(StandIn(50, 90, 75, 86), Found("stand-in", "a test"))
+    compiler = Nvrtc(StandIn(50, 90, 75, 86), NvrtcLibrary("stand-in", "a test"))
     assert compiler.version == (12, 4)
-    assert compiler.target_for((8, 6)) == Target("sm_86")
-    assert compiler.target_for((8, 9)) == Target("compute_86")
-    assert compiler.target_for((12, 0)) == Target("compute_90")
+    assert compiler.target_for((8, 6)) == CompileTarget("sm_86")
+    assert compiler.target_for((8, 9)) == CompileTarget("compute_86")
+    assert compiler.target_for((12, 0)) == CompileTarget("compute_90")
     assert compiler.target_for((12, 0)).is_ptx
     assert not compiler.target_for((9, 0)).is_ptx
     with pytest.raises(CudaUnavailable, match=r"capability 5\.0 and newer; this one has 3\.7"):
@@ -147,10 +149,10 @@ def test_machine_code_for_what_the_compiler_knows_and_ptx_for_newer_cards():
 @needs_nvrtc
 def test_a_compile_error_comes_with_the_log():
     with pytest.raises(CompileError, match=r'(?s)broken\.cu.*sm_80.*identifier "wrong" is undefined') as raised:
-        COMPILER.compile("broken.cu", "__global__ void f() { wrong(); }", {}, Target("sm_80"), ())
+        COMPILER.compile("broken.cu", "__global__ void f() { wrong(); }", {}, CompileTarget("sm_80"), ())
     assert isinstance(raised.value, VdgsError)
     with pytest.raises(CompileError, match=r"absent\.h"):
-        COMPILER.compile("broken.cu", '#include "absent.h"', {}, Target("sm_80"), ())
+        COMPILER.compile("broken.cu", '#include "absent.h"', {}, CompileTarget("sm_80"), ())
 
 
 def test_torchs_own_compiler_comes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -158,30 +160,30 @@ def test_torchs_own_compiler_comes_first(tmp_path: Path, monkeypatch: pytest.Mon
         (tmp_path / folder).parent.mkdir(parents=True)
         (tmp_path / folder).touch()
     (tmp_path / "nvidia/cu13/lib/libnvrtc-builtins.so.13.5").touch()
-    monkeypatch.setattr(nvrtc, "PATTERN", "libnvrtc*.so*")
+    monkeypatch.setattr(nvrtc, "LIBRARY_PATTERN", "libnvrtc*.so*")
     monkeypatch.setattr(nvrtc, "_wheel_folders", lambda: sorted(tmp_path.glob("nvidia/*/lib")))
     monkeypatch.setattr(torch.version, "cuda", "12.8")
-    own, *others = nvrtc.candidates()
+    own, *others = nvrtc.find_nvrtc()
     assert (Path(own.path).name, own.origin) == ("libnvrtc.so.12", "torch's CUDA build")
     assert Path(others[0].path).name == "libnvrtc.so.13"
     assert others[-1].origin == "the system"
     monkeypatch.setattr(torch.version, "cuda", None)
-    first, second, *_ = nvrtc.candidates()
+    first, second, *_ = nvrtc.find_nvrtc()
     assert [Path(each.path).name for each in (first, second)] == ["libnvrtc.so.13", "libnvrtc.so.12"]
     assert first.origin == "the wheel nvidia-cuda-nvrtc"
 
 
 def test_without_a_compiler_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(nvrtc, "candidates", lambda: iter([Found("/nowhere/libnvrtc.so.13", "a test")]))
+    monkeypatch.setattr(nvrtc, "find_nvrtc", lambda: iter([NvrtcLibrary("/nowhere/libnvrtc.so.13", "a test")]))
     with pytest.raises(CudaUnavailable, match=r"pip install nvidia-cuda-nvrtc.*Tried: /nowhere"):
-        nvrtc.nvrtc.__wrapped__()
+        nvrtc.get_nvrtc.__wrapped__()
 
 
 def test_a_library_that_is_another_is_refused(monkeypatch: pytest.MonkeyPatch):
     libc = ctypes.util.find_library("c")
-    monkeypatch.setattr(nvrtc, "candidates", lambda: iter([Found(str(libc), "a test")]))
+    monkeypatch.setattr(nvrtc, "find_nvrtc", lambda: iter([NvrtcLibrary(str(libc), "a test")]))
     with pytest.raises(CudaUnavailable, match="nvrtcVersion"):
-        nvrtc.nvrtc.__wrapped__()
+        nvrtc.get_nvrtc.__wrapped__()
 
 
 PARTS = {"source": "a", "target": "sm_80"}
@@ -191,45 +193,45 @@ class TestCache:
     def test_made_once_and_found_again(self):
         made = []
         for _ in range(3):
-            assert compile_cache.cached("k", PARTS, lambda: made.append(1) or b"code") == b"code"
+            assert compile_cache.load_or_compile("k", PARTS, lambda: made.append(1) or b"code") == b"code"
         assert len(made) == 1
         (entry,) = compile_cache.cache_folder().iterdir()
         assert entry.name.startswith("k-")
 
     @pytest.mark.parametrize("part", ["source", "target", "header h", "options", "NVRTC"])
     def test_everything_that_it_is_made_from_counts(self, part):
-        assert compile_cache.cached("k", PARTS, lambda: b"old") == b"old"
-        assert compile_cache.cached("k", PARTS | {part: "other"}, lambda: b"new") == b"new"
-        assert compile_cache.cached("k", PARTS, lambda: b"never") == b"old"
+        assert compile_cache.load_or_compile("k", PARTS, lambda: b"old") == b"old"
+        assert compile_cache.load_or_compile("k", PARTS | {part: "other"}, lambda: b"new") == b"new"
+        assert compile_cache.load_or_compile("k", PARTS, lambda: b"never") == b"old"
 
     def test_a_name_is_told_from_a_text(self):
-        assert compile_cache.key_of({"ab": "c"}) != compile_cache.key_of({"a": "bc"})
+        assert compile_cache.digest_parts({"ab": "c"}) != compile_cache.digest_parts({"a": "bc"})
 
     @pytest.mark.parametrize("damage", [lambda b: b[:-1], lambda b: b[:20], lambda b: b"", lambda b: b[:-1] + b"?"])
     def test_a_damaged_entry_is_made_again(self, damage):
-        compile_cache.cached("k", PARTS, lambda: b"code")
+        compile_cache.load_or_compile("k", PARTS, lambda: b"code")
         (entry,) = compile_cache.cache_folder().iterdir()
         whole = entry.read_bytes()
         entry.write_bytes(damage(whole))
-        assert compile_cache.cached("k", PARTS, lambda: b"code") == b"code"
+        assert compile_cache.load_or_compile("k", PARTS, lambda: b"code") == b"code"
         assert entry.read_bytes() == whole
 
     def test_a_folder_that_cannot_be_made_costs_nothing_but_time(self, tmp_path, monkeypatch):
         (tmp_path / "file").touch()
-        monkeypatch.setenv(compile_cache.VARIABLE, str(tmp_path / "file" / "below"))
-        assert compile_cache.cached("k", PARTS, lambda: b"code") == b"code"
+        monkeypatch.setenv(compile_cache.CUDA_CACHE_ENV_VAR, str(tmp_path / "file" / "below"))
+        assert compile_cache.load_or_compile("k", PARTS, lambda: b"code") == b"code"
 
     def test_processes_at_once(self):
         code = "from vdgs.kernels.cuda.compile_cache import cached\n"
         code += "for _ in range(3): assert cached('k', {'source': 'same'}, lambda: b'x' * 100_000) == b'x' * 100_000"
-        environment = {compile_cache.VARIABLE: str(compile_cache.cache_folder())}
+        environment = {compile_cache.CUDA_CACHE_ENV_VAR: str(compile_cache.cache_folder())}
         with python_begun(code, **environment) as one, python_begun(code, **environment) as other:
             assert [each.finished().returncode for each in (one, other)] == [0, 0]
         (entry,) = compile_cache.cache_folder().iterdir()  # and no temporary file beside it
         assert entry.stat().st_size > 100_000
 
     def test_the_folder_follows_the_platform(self, monkeypatch):
-        monkeypatch.delenv(compile_cache.VARIABLE)
+        monkeypatch.delenv(compile_cache.CUDA_CACHE_ENV_VAR)
         monkeypatch.setattr(compile_cache.sys, "platform", "linux")
         monkeypatch.setenv("XDG_CACHE_HOME", "/somewhere")
         assert compile_cache.cache_folder() == Path("/somewhere/vdgs/cuda")
@@ -243,6 +245,6 @@ class TestCache:
         made = []
         for text in ("#define N 1", "#define N 2"):
             monkeypatch.setattr(launch, "read_header", lambda name, text=text: text)
-            made.append(launch.compile_source("s.cu", Target("compute_80"), headers=("h.h",)))
+            made.append(launch.compile_source("s.cu", CompileTarget("compute_80"), headers=("h.h",)))
         first, second = made
         assert first != second or len(list(compile_cache.cache_folder().iterdir())) == 2

@@ -12,8 +12,8 @@ from support.decode_scenes import CAMERAS, anchors, ellipse_touches_image, looki
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.cpu.cull import cull as native
 from vdgs.kernels.cuda.cull import PROGRAM, cull
-from vdgs.kernels.cuda.driver import cuda_driver
-from vdgs.kernels.cuda.launch import Program, read_source
+from vdgs.kernels.cuda.driver import get_cuda_driver
+from vdgs.kernels.cuda.launch import CudaProgram, read_source
 from vdgs.kernels.torch_ref.cull import cull as reference
 
 pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_cull")]
@@ -27,7 +27,7 @@ def library(tmp_path_factory):
 def kept(
     positions: torch.Tensor, log_scales: torch.Tensor, camera: Camera, library: ctypes.CDLL, order: int = 0
 ) -> torch.Tensor:
-    program = Program(name=PROGRAM.name, driver=HostDriver(library, order), headers=PROGRAM.headers)
+    program = CudaProgram(name=PROGRAM.name, driver=HostDriver(library, order), headers=PROGRAM.headers)
     return cull(positions, log_scales, camera, program=program)
 
 
@@ -92,7 +92,7 @@ def test_unsuitable_anchors_are_refused(library):
 @pytest.mark.gpu
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_a_card_gives_what_the_reference_gives(camera):
-    cuda_driver()
+    get_cuda_driver()
     positions, log_scales = anchors(20_000, seed=2)
     rows = cull(positions.cuda(), log_scales.cuda(), camera).cpu()
     assert (torch.diff(rows) > 0).all()

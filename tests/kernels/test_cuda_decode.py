@@ -12,14 +12,14 @@ import torch
 from support.cuda_on_host import ORDERS, HostDriver, build_on_host, needs_a_compiler, needs_nvrtc
 from support.decode_scenes import Scene, looking_down, moved_by, turned
 from vdgs.geometry.camera import Camera
-from vdgs.kernels.cuda.decode import PROGRAM, decode, decode_to_train, sources_of
+from vdgs.kernels.cuda.decode import PROGRAM, decode, decode_for_training, expand_sources
 from vdgs.kernels.cuda.decode_adam import decode_backward_adam
-from vdgs.kernels.cuda.driver import cuda_driver
-from vdgs.kernels.cuda.launch import Program, read_header, read_source
+from vdgs.kernels.cuda.driver import get_cuda_driver
+from vdgs.kernels.cuda.launch import CudaProgram, read_header, read_source
 from vdgs.kernels.cuda.packed_camera import PackedCamera
-from vdgs.kernels.cuda.splat_capacity import Room
+from vdgs.kernels.cuda.splat_capacity import SplatCapacity
 from vdgs.kernels.kernel_types import AdamState, AnchorSplats, SplatGradients, Splats, TrainingSplats
-from vdgs.kernels.splat_segments import Shown
+from vdgs.kernels.splat_segments import SplatMask
 from vdgs.kernels.torch_ref.decode import decode as reference
 from vdgs.kernels.torch_ref.decode_adam import decode_backward_adam as by_reference
 
@@ -39,7 +39,7 @@ def library(tmp_path_factory):
 
 
 def decoded(scene: Scene, camera: Camera, library: ctypes.CDLL, rows=None, order: int = 0) -> AnchorSplats:
-    program = Program(name=PROGRAM.name, driver=HostDriver(library, order), headers=PROGRAM.headers)
+    program = CudaProgram(name=PROGRAM.name, driver=HostDriver(library, order), headers=PROGRAM.headers)
     anchors = scene.positions, scene.features, scene.offsets, scene.log_scales
     with torch.no_grad():
         return decode(*anchors, scene.weights, camera, rows, program=program)
@@ -47,16 +47,16 @@ def decoded(scene: Scene, camera: Camera, library: ctypes.CDLL, rows=None, order
 
 def scattered(scene: Scene, camera: Camera, library: ctypes.CDLL, rows=None, order: int = 0) -> TrainingSplats:
     """As a training step is given them."""
-    program = Program(name=PROGRAM.name, driver=HostDriver(library, order), headers=PROGRAM.headers)
-    return decode_to_train(*scene.arguments, camera, rows, program=program)
+    program = CudaProgram(name=PROGRAM.name, driver=HostDriver(library, order), headers=PROGRAM.headers)
+    return decode_for_training(*scene.arguments, camera, rows, program=program)
 
 
 def put_in_order(splats: TrainingSplats, library: ctypes.CDLL) -> dict[str, torch.Tensor]:
     """All that is known of each splat, in the order of the anchors."""
     order = splats.runs.order(len(splats.source))
-    program = Program(name=PROGRAM.name, driver=HostDriver(library), headers=PROGRAM.headers)
+    program = CudaProgram(name=PROGRAM.name, driver=HostDriver(library), headers=PROGRAM.headers)
     named = {field.name: getattr(splats, field.name) for field in fields(Splats)}
-    named["source"] = sources_of(splats.source, program=program)
+    named["source"] = expand_sources(splats.source, program=program)
     return {name: tensor[order] for name, tensor in named.items()}
 
 
@@ -125,13 +125,13 @@ def test_for_training_splats_are_the_same_in_another_order(order, library):
     splats, expected = scattered(scene, turned(), library, rows, order), decoded(scene, turned(), library, rows)
     found = put_in_order(splats, library)
     assert all(torch.equal(tensor, getattr(expected, name)) for name, tensor in found.items())
-    in_rows = sources_of(
-        splats.source, program=Program(name=PROGRAM.name, driver=HostDriver(library), headers=PROGRAM.headers)
+    in_rows = expand_sources(
+        splats.source, program=CudaProgram(name=PROGRAM.name, driver=HostDriver(library), headers=PROGRAM.headers)
     )
     assert torch.equal(in_rows, expected.source) is (order == 0)  # other orders of blocks do give another one
     torch.testing.assert_close(splats.volume, expected.volumes.mean())
     assert torch.equal(splats.volume, scattered(scene, turned(), library, rows).volume)
-    again = Shown.of(expected.source, len(rows), 10)
+    again = SplatMask.of(expected.source, len(rows), 10)
     assert torch.equal(again.bits, splats.source.bits)
     assert torch.equal(again.runs.lengths, splats.runs.lengths)
 
@@ -144,14 +144,14 @@ def test_nothing_to_show_has_no_mean_volume(library):
     assert len(scattered(Scene.random(9, 4), turned(), library, torch.arange(0)).source) == 0
 
 
-class Narrow(Room):
+class Narrow(SplatCapacity):
     """As if a view had needed less than the next one."""
 
     def for_anchors(self, count, offsets, device):
         return 11
 
 
-class Watched(Program):
+class Watched(CudaProgram):
     """Looks behind the room that a kernel is told of."""
 
     spare = 500
@@ -174,22 +174,22 @@ def test_where_there_is_too_little_room_they_are_decoded_once_more(order, librar
     scene = Scene.random(40, 10)
     program = Watched(name=PROGRAM.name, driver=HostDriver(library, order), headers=PROGRAM.headers)
     with torch.no_grad():
-        found = decode(*scene.arguments, turned(), program=program, room=Narrow())
+        found = decode(*scene.arguments, turned(), program=program, capacity=Narrow())
     assert [name for name, *_ in program.driver.launched] == ["decode_anchors"] * 2
     expected = decoded(scene, turned(), library)
     assert all(torch.equal(getattr(found, field.name), getattr(expected, field.name)) for field in fields(AnchorSplats))
 
 
 def test_room_follows_what_views_need():
-    room, device = Room(), torch.device("cpu")
+    room, device = SplatCapacity(), torch.device("cpu")
     assert 5000 < room.for_anchors(1000, 10, device) < 10_000  # half of the offsets, before any view is known
     assert room.for_anchors(10, 10, device) == 100  # never more than there are offsets
-    room.learn(1000, 10, device, 2000)
+    room.update(1000, 10, device, 2000)
     once = room.for_anchors(1000, 10, device)
     assert 2000 < once < 3000
-    room.learn(1000, 10, device, 1000)
+    room.update(1000, 10, device, 1000)
     assert 2000 < room.for_anchors(1000, 10, device) < once  # slowly forgotten
-    room.learn(500, 10, device, 4000)
+    room.update(500, 10, device, 4000)
     assert 8000 < room.for_anchors(1000, 10, device) <= 10_000
     assert room.for_anchors(1000, 4, device) < 4000  # other models have other offsets
 
@@ -208,7 +208,7 @@ def test_barriers_that_are_missing_are_noticed(tmp_path):
 @needs_a_compiler
 def test_where_autograd_follows_the_reference_decodes(library):
     scene = Scene.random(10, 4).to(torch.float32)
-    program = Program(name=PROGRAM.name, driver=HostDriver(library), headers=PROGRAM.headers)
+    program = CudaProgram(name=PROGRAM.name, driver=HostDriver(library), headers=PROGRAM.headers)
     anchors = scene.positions, scene.features, scene.offsets, scene.log_scales
     splats = decode(*anchors, scene.weights, turned(), program=program)
     assert splats.opacities.requires_grad
@@ -235,7 +235,7 @@ def _names(declaration: str) -> list[str]:
 @pytest.mark.gpu
 @pytest.mark.parametrize("name", CAMERAS)
 def test_a_card_gives_what_the_reference_gives(name):
-    cuda_driver()
+    get_cuda_driver()
     scene = Scene.random(500, 10)
     weights = scene.weights.map(lambda t: t.cuda())
     anchors = (t.cuda() for t in (scene.positions, scene.features, scene.offsets, scene.log_scales))
@@ -251,7 +251,7 @@ class TestMoving:
     def moving(self, library):
         return partial(
             decode_backward_adam,
-            program=Program(name=PROGRAM.name, driver=HostDriver(library), headers=PROGRAM.headers),
+            program=CudaProgram(name=PROGRAM.name, driver=HostDriver(library), headers=PROGRAM.headers),
         )
 
     @pytest.mark.parametrize("name", CAMERAS)
@@ -321,7 +321,7 @@ class TestMoving:
     def test_the_order_in_which_threads_take_turns_changes_no_bit(self, order, library):
         results = []
         for turns in (0, order):
-            program = Program(name=PROGRAM.name, driver=HostDriver(library, turns), headers=PROGRAM.headers)
+            program = CudaProgram(name=PROGRAM.name, driver=HostDriver(library, turns), headers=PROGRAM.headers)
             moving = partial(decode_backward_adam, program=program)
             results.append(moved_by(moving, Scene.random(17, 10), turned(), torch.arange(17)))
         assert all(torch.equal(one, other) for one, other in zip(results[0][1], results[1][1], strict=True))
@@ -333,7 +333,7 @@ class TestMoving:
         without = build_on_host(PROGRAM.name, tmp_path, before + after)
         scene, results = Scene.random(9, 4), []
         for turns in (0, 1):
-            program = Program(name=PROGRAM.name, driver=HostDriver(without, turns), headers=PROGRAM.headers)
+            program = CudaProgram(name=PROGRAM.name, driver=HostDriver(without, turns), headers=PROGRAM.headers)
             results.append(moved_by(partial(decode_backward_adam, program=program), scene, turned(), torch.arange(9)))
         assert not all(torch.equal(one, other) for one, other in zip(results[0][1], results[1][1], strict=True))
 

@@ -14,8 +14,8 @@ from torch._subclasses import FakeTensorMode
 
 from vdgs.errors import VdgsError
 from vdgs.kernels.cuda import driver as driver_module
-from vdgs.kernels.cuda.driver import CudaDriver, CudaUnavailable, DriverError, cuda_driver
-from vdgs.kernels.cuda.launch import Program, common_device, pack
+from vdgs.kernels.cuda.driver import CudaDriver, CudaUnavailable, DriverError, get_cuda_driver
+from vdgs.kernels.cuda.launch import CudaProgram, common_device, pack_arguments
 
 CARD = torch.device("cuda", 1)
 
@@ -100,7 +100,7 @@ def test_a_kernel_goes_to_torchs_stream_and_context():
     library = StandIn()
     driver = CudaDriver(library)
     function = driver.function(driver.load(b"code", CARD), "kernel")
-    values, pointers = pack([ctypes.c_int(3)])
+    values, pointers = pack_arguments([ctypes.c_int(3)])
     driver.launch(function, (4, 3, 2), (16, 8, 1), CARD, pointers)
     assert library.launched == (6, (4, 3, 2, 16, 8, 1), 77, pointers)
     assert values[0].value == 3
@@ -125,7 +125,7 @@ def test_an_error_of_the_driver_says_what_to_do(function, code, words):
 
     def use() -> None:
         driver.load(b"code", CARD)
-        driver.launch(6, (1, 1, 1), (1, 1, 1), CARD, pack([ctypes.c_int(0)])[1])
+        driver.launch(6, (1, 1, 1), (1, 1, 1), CARD, pack_arguments([ctypes.c_int(0)])[1])
 
     with pytest.raises(DriverError, match=words) as raised:
         use()
@@ -139,7 +139,7 @@ def test_no_card_and_no_driver(monkeypatch: pytest.MonkeyPatch):
         CudaDriver(StandIn(cuInit=100))
     monkeypatch.setattr(driver_module, "LIBRARY", "libcuda-that-is-not-there.so")
     with pytest.raises(CudaUnavailable, match=r"no NVIDIA driver here.*--device cpu"):
-        cuda_driver.__wrapped__()
+        get_cuda_driver.__wrapped__()
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
@@ -153,7 +153,7 @@ def test_the_benchmark_says_that_there_is_no_gpu():
 
 def test_arguments_are_packed_as_the_driver_reads_them():
     tensor = torch.arange(3.0)
-    values, pointers = pack([tensor, None, ctypes.c_int(-7), ctypes.c_float(0.25)])
+    values, pointers = pack_arguments([tensor, None, ctypes.c_int(-7), ctypes.c_float(0.25)])
     kinds = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_float)
     read = [ctypes.cast(at, ctypes.POINTER(kind)).contents.value for at, kind in zip(pointers, kinds, strict=True)]
     assert read == [tensor.data_ptr(), None, -7, 0.25]
@@ -203,9 +203,9 @@ class TestChecks:
     )
     def test_sides_out_of_range(self, grid, block):
         with pytest.raises(ValueError, match="cannot be launched"):
-            Program(name="loss.cu", driver=Counting()).launch("kernel", grid, block, torch.zeros(1))
+            CudaProgram(name="loss.cu", driver=Counting()).launch("kernel", grid, block, torch.zeros(1))
 
     def test_an_empty_grid_is_nothing_to_do(self):
         driver = Counting()
-        Program(name="loss.cu", driver=driver).launch("kernel", (0, 3), (32,), torch.zeros(1))
+        CudaProgram(name="loss.cu", driver=driver).launch("kernel", (0, 3), (32,), torch.zeros(1))
         assert driver.launched == 0

@@ -11,8 +11,8 @@ import torch
 from support.cuda_on_host import HostDriver, build_on_host, needs_a_compiler, needs_nvrtc
 from support.loss_scenes import scene, with_gradient
 from vdgs.kernels.cuda import loss as cuda
-from vdgs.kernels.cuda.driver import CudaUnavailable, cuda_driver
-from vdgs.kernels.cuda.launch import Program, read_source
+from vdgs.kernels.cuda.driver import CudaUnavailable, get_cuda_driver
+from vdgs.kernels.cuda.launch import CudaProgram, read_source
 from vdgs.kernels.torch_ref import loss as reference
 
 pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_loss")]
@@ -39,10 +39,10 @@ def numbered(tmp_path_factory):
 
 @pytest.fixture
 def program(library):
-    return Program(name="loss.cu", driver=HostDriver(library))
+    return CudaProgram(name="loss.cu", driver=HostDriver(library))
 
 
-def on_host(program: Program, image, target, mask=None, **options):
+def on_host(program: CudaProgram, image, target, mask=None, **options):
     leaf = image.clone().requires_grad_()
     result = cuda.photometric_loss(leaf, target, mask, program=program, **options)
     (gradient,) = torch.autograd.grad(result.loss, leaf)
@@ -52,7 +52,7 @@ def on_host(program: Program, image, target, mask=None, **options):
 def test_the_window_is_that_of_the_reference():
     text = read_source("loss.cu").split("kWindow[kTaps] = {")[1].split("}")[0]
     weights = [float(each.strip().rstrip("f")) for each in text.split(",")]
-    assert np.array_equal(np.float32(weights), reference.window(torch.float32).numpy())
+    assert np.array_equal(np.float32(weights), reference.gaussian_window(torch.float32).numpy())
 
 
 @needs_a_compiler
@@ -74,7 +74,7 @@ def test_no_barrier_is_missing(program, library):
     """The order in which the threads of a block take turns changes no bit."""
     image, target, mask = scene(40, 35, kept=0.8)
     result, gradient = on_host(program, image, target, mask)
-    turned = Program(name="loss.cu", driver=HostDriver(library, order=1))
+    turned = CudaProgram(name="loss.cu", driver=HostDriver(library, order=1))
     again, gradient_again = on_host(turned, image, target, mask)
     assert torch.equal(gradient, gradient_again)
     assert [float(value.detach()) for value in result] == [float(value.detach()) for value in again]
@@ -89,7 +89,7 @@ def test_a_missing_barrier_would_be_noticed(barrier, numbered):
 
     def loss_and_gradient(left: int, order: int) -> tuple[float, bytes]:
         left_out.value = left
-        result, gradient = on_host(Program(name="loss.cu", driver=HostDriver(numbered, order)), image, target)
+        result, gradient = on_host(CudaProgram(name="loss.cu", driver=HostDriver(numbered, order)), image, target)
         return float(result.loss.detach()), gradient.numpy().tobytes()
 
     assert loss_and_gradient(barrier, 0) != loss_and_gradient(barrier, 1)
@@ -160,7 +160,7 @@ def test_tensors_in_main_memory_never_reach_a_card():
 @pytest.mark.parametrize("kept", [None, 0.7, 0.02])
 @pytest.mark.parametrize(("height", "width"), [*SIZES, (300, 401)])
 def test_a_card_gives_what_the_reference_gives(height, width, kept):
-    cuda_driver()
+    get_cuda_driver()
     image, target, mask = scene(height, width, kept=kept)
     there = [None if tensor is None else tensor.cuda() for tensor in (image, target, mask)]
     truth, truth_gradient = with_gradient(reference, image.double(), target, mask)

@@ -20,11 +20,11 @@ from support.rasterize_scenes import (
     make_scene,
     splats_of,
 )
-from vdgs.kernels.cuda.driver import cuda_driver
-from vdgs.kernels.cuda.launch import Program, read_source
-from vdgs.kernels.cuda.rasterize import PROGRAM, rasterise, rasterise_vjp
+from vdgs.kernels.cuda.driver import get_cuda_driver
+from vdgs.kernels.cuda.launch import CudaProgram, read_source
+from vdgs.kernels.cuda.rasterize import PROGRAM, rasterize, rasterize_vjp
 from vdgs.kernels.kernel_types import Raster, Splats
-from vdgs.kernels.torch_ref.rasterize import rasterise as reference
+from vdgs.kernels.torch_ref.rasterize import rasterize as reference
 
 pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_rasterise")]
 
@@ -67,8 +67,8 @@ int maybe_syncthreads_or(int number, int mine) { return number == left_out ? min
 
 
 def drawn(scene: Scene, library: ctypes.CDLL, order: int = 0, depth: bool = True) -> Raster:
-    program = Program(name="rasterise.cu", driver=HostDriver(library, order), headers=PROGRAM.headers)
-    return rasterise(*splats_of(scene.tensors), scene.width, scene.height, depth=depth, program=program)
+    program = CudaProgram(name="rasterise.cu", driver=HostDriver(library, order), headers=PROGRAM.headers)
+    return rasterize(*splats_of(scene.tensors), scene.width, scene.height, depth=depth, program=program)
 
 
 def bits_of(scene: Scene, library: ctypes.CDLL, order: int) -> list[bytes]:
@@ -103,7 +103,7 @@ def test_no_barrier_is_missing(order, library):
 @pytest.mark.parametrize("seed", [0, 1, 3])
 def test_wherever_splats_stand_picture_and_gradients_have_the_same_bits(seed, library):
     """Where depths are equal, the order that splats are given with decides."""
-    program = Program(name="rasterise.cu", driver=HostDriver(library), headers=PROGRAM.headers)
+    program = CudaProgram(name="rasterise.cu", driver=HostDriver(library), headers=PROGRAM.headers)
     scene = SCENES["ordinary"]
     splats, background = splats_of(scene.tensors)
     level = replace(splats, depths=(splats.depths / 40).floor() + 1)
@@ -113,7 +113,7 @@ def test_wherever_splats_stand_picture_and_gradients_have_the_same_bits(seed, li
     size, wanted = (scene.width, scene.height), torch.randn(scene.height, scene.width, 3)
 
     def found(drawn: Splats) -> tuple[torch.Tensor, ...]:
-        raster, pullback = rasterise_vjp(drawn, background, *size, program=program)
+        raster, pullback = rasterize_vjp(drawn, background, *size, program=program)
         gradients = pullback(wanted)
         return raster.image, *gradients[:4], gradients.background
 
@@ -125,20 +125,20 @@ def test_wherever_splats_stand_picture_and_gradients_have_the_same_bits(seed, li
     # It is by the order: as rows alone, they make another picture.
     rows = Splats(*(getattr(moved, field.name) for field in fields(Splats)))
     assert not torch.equal(image, found(rows)[0])
-    assert torch.equal(image, rasterise(moved, background, *size, program=program).image)
+    assert torch.equal(image, rasterize(moved, background, *size, program=program).image)
 
 
 def test_splats_joined_with_others_keep_the_order_of_each():
     one, first = in_runs(splats_of(SCENES["ordinary"].tensors)[0], 5)
     other, second = in_runs(splats_of(SCENES["tiny"].tensors)[0], 4, 1)
-    both = one.joined(other)
+    both = one.concat(other)
     expected = torch.cat([first, second + len(first)])
     assert torch.equal(both.runs.order(len(expected)).long(), expected)
-    alone = replace(one, runs=None).joined(other)
+    alone = replace(one, runs=None).concat(other)
     assert torch.equal(
         alone.runs.order(len(expected)).long(), torch.cat([torch.arange(len(first)), expected[len(first) :]])
     )
-    assert replace(one, runs=None).joined(replace(other, runs=None)).runs is None
+    assert replace(one, runs=None).concat(replace(other, runs=None)).runs is None
 
 
 @needs_a_compiler
@@ -194,12 +194,12 @@ class TestMeaning:
     def test_the_way_back_overwrites_what_it_may(self, library):
         scene, program = (
             SCENES["ordinary"],
-            Program(name="rasterise.cu", driver=HostDriver(library), headers=PROGRAM.headers),
+            CudaProgram(name="rasterise.cu", driver=HostDriver(library), headers=PROGRAM.headers),
         )
         splats, background = splats_of([tensor.detach().clone() for tensor in scene.tensors])
         by_alpha = torch.randn(scene.height, scene.width, generator=torch.Generator().manual_seed(0))
-        expected = rasterise_vjp(splats, background, scene.width, scene.height, program=program)[1](None, by_alpha)
-        _, pullback = rasterise_vjp(splats, background, scene.width, scene.height, program=program)
+        expected = rasterize_vjp(splats, background, scene.width, scene.height, program=program)[1](None, by_alpha)
+        _, pullback = rasterize_vjp(splats, background, scene.width, scene.height, program=program)
         found = pullback(None, by_alpha, over=(splats.means_px, splats.conics))
         assert found.means_px is splats.means_px
         assert found.depths is expected.depths is None
@@ -208,33 +208,36 @@ class TestMeaning:
 
     @pytest.mark.parametrize("name", SCENES)
     def test_gradients_of_the_first_splats_alone_have_the_bits_that_they_have_among_all(self, name, library):
-        scene, program = SCENES[name], Program(name="rasterise.cu", driver=HostDriver(library), headers=PROGRAM.headers)
+        scene, program = (
+            SCENES[name],
+            CudaProgram(name="rasterise.cu", driver=HostDriver(library), headers=PROGRAM.headers),
+        )
         size, (splats, background) = (scene.width, scene.height), splats_of([each.detach() for each in scene.tensors])
         assert_first_gradients_are_those_of_all(
-            lambda: rasterise_vjp(splats, background, *size, program=program)[1], len(splats.depths), *size
+            lambda: rasterize_vjp(splats, background, *size, program=program)[1], len(splats.depths), *size
         )
 
     def test_unsuitable_tensors_are_refused(self, library):
         splats, background = splats_of(SCENES["ordinary"].to(torch.float64).tensors)
-        program = Program(name="rasterise.cu", driver=HostDriver(library), headers=PROGRAM.headers)
+        program = CudaProgram(name="rasterise.cu", driver=HostDriver(library), headers=PROGRAM.headers)
         with pytest.raises(TypeError, match="float32"):
-            rasterise(splats, background, 37, 29, program=program)
+            rasterize(splats, background, 37, 29, program=program)
         with pytest.raises(ValueError, match="width"):
-            rasterise(*splats_of(SCENES["ordinary"].tensors), 0, 29, program=program)
+            rasterize(*splats_of(SCENES["ordinary"].tensors), 0, 29, program=program)
 
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("name", SCENES)
 def test_a_card_gives_what_the_reference_gives(name):
-    cuda_driver()
+    get_cuda_driver()
     scene, exact_scene = SCENES[name].to(torch.float32), SCENES[name].to(torch.float64)
     there = [tensor.detach().cuda().requires_grad_() for tensor in scene.tensors]
-    found = rasterise(*splats_of(there), scene.width, scene.height, depth=True)
+    found = rasterize(*splats_of(there), scene.width, scene.height, depth=True)
     exact = reference(*splats_of(exact_scene.tensors), scene.width, scene.height, depth=True)
     here = Raster(*(tensor.cpu() for tensor in found))
     assert_same_picture(here, exact, 1e-4)
     gradients = torch.autograd.grad(loss_of(here), there)
-    once_more = rasterise(*splats_of(there), scene.width, scene.height, depth=True)
+    once_more = rasterize(*splats_of(there), scene.width, scene.height, depth=True)
     again = torch.autograd.grad(loss_of(Raster(*(tensor.cpu() for tensor in once_more))), there)
     for ours, expected in zip(gradients, torch.autograd.grad(loss_of(exact), exact_scene.tensors), strict=True):
         assert_close(ours.cpu(), expected, 2e-3 if name == "edge-on" else 1e-3)

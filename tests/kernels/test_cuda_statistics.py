@@ -11,10 +11,10 @@ import torch
 
 from support.cuda_on_host import ORDERS, HostDriver, build_on_host, needs_a_compiler, needs_nvrtc
 from support.decode_scenes import view_statistics
-from vdgs.kernels.cuda.driver import cuda_driver
-from vdgs.kernels.cuda.launch import Program, read_source
+from vdgs.kernels.cuda.driver import get_cuda_driver
+from vdgs.kernels.cuda.launch import CudaProgram, read_source
 from vdgs.kernels.cuda.statistics import PROGRAM, add_view_statistics
-from vdgs.kernels.kernel_types import Statistics
+from vdgs.kernels.kernel_types import DensificationStats
 from vdgs.kernels.torch_ref.statistics import add_view_statistics as by_reference
 
 pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_statistics")]
@@ -28,7 +28,7 @@ def library(tmp_path_factory):
 def on_host(library: ctypes.CDLL, order: int = 0):
     return partial(
         add_view_statistics,
-        program=Program(name=PROGRAM.name, driver=HostDriver(library, order), headers=PROGRAM.headers),
+        program=CudaProgram(name=PROGRAM.name, driver=HostDriver(library, order), headers=PROGRAM.headers),
     )
 
 
@@ -36,7 +36,7 @@ def added(add, inputs, sums, views: int = 2) -> list[torch.Tensor]:
     """The sums after so many views."""
     sums = [each.clone() for each in sums]
     for _ in range(views):
-        add(Statistics(*sums), *inputs)
+        add(DensificationStats(*sums), *inputs)
     return sums
 
 
@@ -68,11 +68,11 @@ def test_nothing_drawn_counts_only_the_visible_that_are_inside(library):
     sums = [torch.zeros(4, 3), torch.zeros(4, 3), torch.zeros(4), torch.zeros(4)]
     nothing = torch.zeros(0, dtype=torch.int32)
     visible, inside = torch.tensor([0, 1, 3]), torch.tensor([True, False, True])
-    on_host(library)(Statistics(*sums), visible, inside, nothing, torch.zeros(0), torch.zeros(0, 2), 8, 8)
+    on_host(library)(DensificationStats(*sums), visible, inside, nothing, torch.zeros(0), torch.zeros(0, 2), 8, 8)
     assert not any(bool(s.any()) for s in sums[:3])
     assert sums[3].tolist() == [1, 0, 0, 1]
     nobody = torch.zeros(0, dtype=torch.int64)
-    on_host(library)(Statistics(*sums), nobody, inside[:0], nothing, torch.zeros(0), torch.zeros(0, 2), 8, 8)
+    on_host(library)(DensificationStats(*sums), nobody, inside[:0], nothing, torch.zeros(0), torch.zeros(0, 2), 8, 8)
     assert sums[3].tolist() == [1, 0, 0, 1]
 
 
@@ -82,29 +82,29 @@ class TestRefusals:
         (visible, inside, source, *rest), sums = view_statistics(0, 40)
         source[-1] = len(visible) * 7
         with pytest.raises(IndexError):
-            on_host(library)(Statistics(*sums), visible, inside, source, *rest)
+            on_host(library)(DensificationStats(*sums), visible, inside, source, *rest)
 
     def test_a_mask_that_does_not_fit(self, library):
         (visible, inside, *rest), sums = view_statistics(0, 40)
         with pytest.raises((ValueError, TypeError), match="inside"):
-            on_host(library)(Statistics(*sums), visible, inside[1:], *rest)
+            on_host(library)(DensificationStats(*sums), visible, inside[1:], *rest)
 
     def test_splats_that_are_not_as_many_as_sources(self, library):
         (visible, inside, source, opacities, gradient_px, *size), sums = view_statistics(0, 40)
         with pytest.raises((ValueError, TypeError), match="opacities"):
-            on_host(library)(Statistics(*sums), visible, inside, source, opacities[1:], gradient_px, *size)
+            on_host(library)(DensificationStats(*sums), visible, inside, source, opacities[1:], gradient_px, *size)
 
     def test_other_types(self, library):
         (visible, inside, source, opacities, *rest), sums = view_statistics(0, 40)
         with pytest.raises(TypeError, match="opacities must be float32"):
-            on_host(library)(Statistics(*sums), visible, inside, source, opacities.double(), *rest)
+            on_host(library)(DensificationStats(*sums), visible, inside, source, opacities.double(), *rest)
         with pytest.raises(TypeError, match="source"):
-            on_host(library)(Statistics(*sums), visible, inside, source.long(), opacities, *rest)
+            on_host(library)(DensificationStats(*sums), visible, inside, source.long(), opacities, *rest)
 
 
 @pytest.mark.gpu
 def test_a_card_gives_what_the_reference_gives():
-    cuda_driver()
+    get_cuda_driver()
     inputs, sums = view_statistics(0)
     there = [t.cuda() if isinstance(t, torch.Tensor) else t for t in inputs]
     found = added(add_view_statistics, there, [s.cuda() for s in sums])

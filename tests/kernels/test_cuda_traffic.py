@@ -22,16 +22,16 @@ from support.rasterize_scenes import in_runs, make_scene, splats_of
 from vdgs.kernels.cuda import compile_cache
 from vdgs.kernels.cuda.cull import PROGRAM as CULL
 from vdgs.kernels.cuda.cull import cull
-from vdgs.kernels.cuda.decode import ANCHORS_OF_A_BLOCK, decode_to_train, sources_of
+from vdgs.kernels.cuda.decode import ANCHORS_PER_BLOCK, decode_for_training, expand_sources
 from vdgs.kernels.cuda.decode import PROGRAM as DECODE
 from vdgs.kernels.cuda.decode_adam import decode_backward_adam
 from vdgs.kernels.cuda.loss import PROGRAM as LOSS
 from vdgs.kernels.cuda.loss import photometric_loss
 from vdgs.kernels.cuda.rasterize import PROGRAM as RASTERISE
-from vdgs.kernels.cuda.rasterize import rasterise_vjp
+from vdgs.kernels.cuda.rasterize import rasterize_vjp
 from vdgs.kernels.cuda.statistics import PROGRAM as STATISTICS
 from vdgs.kernels.cuda.statistics import add_view_statistics
-from vdgs.kernels.kernel_types import Statistics
+from vdgs.kernels.kernel_types import DensificationStats
 
 GCC = (compiler := host_compiler()) and "Free Software" in subprocess.run(
     [compiler, "--version"], capture_output=True, text=True, check=False
@@ -83,12 +83,12 @@ def counted(tmp_path_factory, compiled_code) -> Counted:
         return made
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(compile_cache.VARIABLE, str(compiled_code))
+        patch.setenv(compile_cache.CUDA_CACHE_ENV_VAR, str(compiled_code))
         source, opaque = count(DECODE, decoding)
         positions, log_scales = anchors(2048, seed=1)
         rows = count(CULL, lambda program: cull(positions, log_scales, CAMERAS[0], program=program))
         inputs, sums = view_statistics(0, 300, K)
-        count(STATISTICS, lambda program: add_view_statistics(Statistics(*sums), *inputs, program=program))
+        count(STATISTICS, lambda program: add_view_statistics(DensificationStats(*sums), *inputs, program=program))
         drawn, entries = count(RASTERISE, drawing)
         count(LOSS, comparing)
     showing = len(torch.unique(source // K))
@@ -97,20 +97,20 @@ def counted(tmp_path_factory, compiled_code) -> Counted:
 
 def decoding(program: CountedProgram):
     scene, rows = Scene.random(V, K, spread=3.0), torch.arange(V)
-    shown = decode_to_train(*scene.arguments, turned(), rows, program=program).source
-    source = sources_of(shown, program=program)
+    shown = decode_for_training(*scene.arguments, turned(), rows, program=program).source
+    source = expand_sources(shown, program=program)
     with torch.no_grad():
         viewing = scene.positions - torch.from_numpy(turned().position).float()
         distance = viewing.norm(dim=-1, keepdim=True)
         inputs = torch.cat([scene.features, viewing / distance, distance], -1)
-        opaque = int((scene.weights.opacity.outputs(inputs) > 0).sum())
+        opaque = int((scene.weights.opacity.forward(inputs) > 0).sum())
     moved_by(partial(decode_backward_adam, program=program), scene, turned(), rows)
     return source, opaque
 
 
 def drawing(program: CountedProgram) -> tuple[int, int]:
     splats, background = splats_of([t.detach().float() for t in make_scene(200, WIDTH, HEIGHT).tensors])
-    _, pullback = rasterise_vjp(in_runs(splats, RUNS)[0], background, WIDTH, HEIGHT, program=program)
+    _, pullback = rasterize_vjp(in_runs(splats, RUNS)[0], background, WIDTH, HEIGHT, program=program)
     pullback(torch.randn(HEIGHT, WIDTH, 3), torch.randn(HEIGHT, WIDTH))
     return len(splats.means_px), len(pullback.entries.owners)
 
@@ -165,7 +165,7 @@ def test_of_anchors_is_read_what_they_are_made_of_and_no_more(counted):
     assert 0 < counted.showing < V
     assert counted.splats < counted.opaque
     assert read.once == V * (8 + 12 + 128 + 24) + 12 * counted.opaque + 4
-    assert written.once == 40 * counted.splats + 4 * V + 12 * V // ANCHORS_OF_A_BLOCK + 4
+    assert written.once == 40 * counted.splats + 4 * V + 12 * V // ANCHORS_PER_BLOCK + 4
     assert len(counted.traffic["decode_anchors"]) == len({each.argument for each in counted.traffic["decode_anchors"]})
 
 
@@ -175,7 +175,7 @@ def test_on_the_way_back_each_number_that_moves_is_read_once_and_written_once(co
     assert [each.once for each in moved] == [V * 3 * 272] * 2
     read, written = counted.of("move_anchors", but=f"{WEIGHTS}|{PRODUCTS}|lacking|roots")
     # Rows, what shows, updates; where splats begin, once for eight; positions.
-    around = 8 * V + 4 * V + 4 * V + 4 * V // ANCHORS_OF_A_BLOCK + 12 * counted.showing
+    around = 8 * V + 4 * V + 4 * V + 4 * V // ANCHORS_PER_BLOCK + 12 * counted.showing
     assert read.once == V * 3 * 272 + around + 36 * counted.splats
     assert written.once == V * (3 * 272 + 4)
     features = counted.of("move_anchors", "features$")[0]
@@ -206,7 +206,7 @@ def test_what_is_written_for_others_is_written_once(counted):
     """Sources, for statistics; the order of splats, for equal depths in the own rasteriser."""
     read, written = counted.of("name_splats")
     assert written.once == 4 * counted.splats
-    assert read.once == 4 * V + 4 * V // ANCHORS_OF_A_BLOCK
+    assert read.once == 4 * V + 4 * V // ANCHORS_PER_BLOCK
     read, written = counted.of("order_splats")
     assert written.once == 4 * counted.drawn
     assert read.once == 8 * RUNS

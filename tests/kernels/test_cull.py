@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from support.decode_scenes import CAMERAS, anchors, ellipse_touches_image, looking_down
-from vdgs.geometry.camera import NEAR
+from vdgs.geometry.camera import NEAR_PLANE
 from vdgs.kernels.cpu import extension
 from vdgs.kernels.cpu.cull import cull as native_cull
 from vdgs.kernels.torch_ref.cull import cull as twin_cull
@@ -34,14 +34,14 @@ def test_keeps_little_else(cull, camera):
     assert len(kept) < 1.5 * int(touching.sum())
     assert (torch.diff(kept) > 0).all()
     _, depths = camera.project(positions[kept].double().numpy())
-    assert (depths > NEAR).all()
+    assert (depths > NEAR_PLANE).all()
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
 @pytest.mark.parametrize("n", [0, 1, 15, 17, 5000])
-@pytest.mark.parametrize("isa", extension.supported())
+@pytest.mark.parametrize("isa", extension.supported_isas())
 def test_native_equals_the_twin(camera, n, isa, monkeypatch):
-    monkeypatch.setattr(extension, "native", lambda: extension.load(isa))
+    monkeypatch.setattr(extension, "get_extension", lambda: extension.load_extension(isa))
     positions, log_scales = anchors(n, seed=2)
     ours = set(native_cull(positions, log_scales, camera).tolist())
     twin = set(twin_cull(positions.double(), log_scales.double(), camera).tolist())

@@ -15,7 +15,7 @@ from vdgs.kernels.kernel_types import AnchorSplats, DecoderWeights
 from vdgs.kernels.torch_ref.decode import decode as twin_decode
 
 CAMERAS = [looking_down(), looking_down("orthographic"), turned(), turned().cropped(20, 5, 50, 40)]
-EVERY_ISA = pytest.mark.parametrize("isa", extension.supported())
+EVERY_ISA = pytest.mark.parametrize("isa", extension.supported_isas())
 BOTH = pytest.mark.parametrize("decode", [twin_decode, native_decode])
 NUMBERS = ("means_px", "conics", "depths", "colours", "opacities", "volumes")
 
@@ -169,11 +169,11 @@ def test_nothing_visible_and_nothing_opaque(decode, v, opaque):
         assert tensor.grad is None or not tensor.grad.any()
 
 
-@pytest.mark.parametrize("isa", ["twin", *extension.supported()])
+@pytest.mark.parametrize("isa", ["twin", *extension.supported_isas()])
 def test_what_is_not_a_number_is_dropped_and_spoils_nothing(isa, monkeypatch):
     decode = twin_decode if isa == "twin" else native_decode
     if isa != "twin":
-        monkeypatch.setattr(extension, "native", lambda: extension.load(isa))
+        monkeypatch.setattr(extension, "get_extension", lambda: extension.load_extension(isa))
     camera, nan = CAMERAS[0], float("nan")
     scene = Scene.random(60, spread=1.0)
     spoilt, offset = divmod(int(decode(*scene.arguments, camera).source[60]), 10)
@@ -213,8 +213,8 @@ def results(scene: Scene, camera) -> list[torch.Tensor]:
 
 @EVERY_ISA
 def test_any_number_of_threads_gives_the_same_bits(isa, monkeypatch):
-    chosen = extension.load(isa)
-    monkeypatch.setattr(extension, "native", lambda: chosen)
+    chosen = extension.load_extension(isa)
+    monkeypatch.setattr(extension, "get_extension", lambda: chosen)
     scene, threads = Scene.random(1500, seed=5), chosen.threads()
     try:
         runs = []
@@ -229,7 +229,7 @@ def test_any_number_of_threads_gives_the_same_bits(isa, monkeypatch):
 
 @EVERY_ISA
 def test_every_instruction_set_equals_the_twin(isa, monkeypatch):
-    monkeypatch.setattr(extension, "native", lambda: extension.load(isa))
+    monkeypatch.setattr(extension, "get_extension", lambda: extension.load_extension(isa))
     assert_same(Scene.random(330, seed=6), CAMERAS[2])
     assert_same(Scene.random(37, k=3, with_distance=True, seed=6), CAMERAS[1])
 
@@ -248,7 +248,7 @@ def test_shapes_that_do_not_belong_together_are_refused():
 
 @EVERY_ISA
 def test_activations_are_exact_to_a_few_units_in_the_last_place(isa, monkeypatch):
-    monkeypatch.setattr(extension, "native", lambda: extension.load(isa))
+    monkeypatch.setattr(extension, "get_extension", lambda: extension.load_extension(isa))
     scene = Scene.random(16, k=32, spread=0.2)
     raw_opacities, raw_colours = torch.linspace(0.005, 4, 32), torch.linspace(-10, 10, 96)
     opacity, colour = scene.weights.opacity, scene.weights.colour

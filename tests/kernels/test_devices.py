@@ -15,8 +15,8 @@ from vdgs.errors import VdgsError
 from vdgs.kernels import cpu, cuda, device_selection, gpu, gsplat, operations, torch_ref
 from vdgs.kernels.cuda import driver
 from vdgs.kernels.cuda import nvrtc as nvrtc_module
-from vdgs.kernels.cuda.driver import Card, CudaUnavailable
-from vdgs.kernels.device_selection import Choice, DeviceUnavailable, choose
+from vdgs.kernels.cuda.driver import CudaUnavailable, GpuInfo
+from vdgs.kernels.device_selection import DeviceUnavailable, SelectedDevice, select_device
 from vdgs.kernels.gpu import rasterizer
 from vdgs.kernels.gsplat.rasterize import GsplatUnavailable
 
@@ -24,42 +24,42 @@ from vdgs.kernels.gsplat.rasterize import GsplatUnavailable
 @pytest.fixture
 def _two_cards(monkeypatch: pytest.MonkeyPatch):
     """As if this were a machine with two cards."""
-    cards = [Card(index, "Card", 8 * 10**9, (8, 6)) for index in (0, 1)]
-    monkeypatch.setattr(driver, "cuda_driver", lambda: SimpleNamespace(cards=lambda: cards))
-    monkeypatch.setattr(nvrtc_module, "nvrtc", lambda: None)
+    cards = [GpuInfo(index, "Card", 8 * 10**9, (8, 6)) for index in (0, 1)]
+    monkeypatch.setattr(driver, "get_cuda_driver", lambda: SimpleNamespace(cards=lambda: cards))
+    monkeypatch.setattr(nvrtc_module, "get_nvrtc", lambda: None)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
 
 
 def test_the_sets_are_complete():
-    assert tuple(sorted(operations.ON_A_CARD)) == operations.OPERATIONS
-    for name in operations.OPERATIONS:
+    assert tuple(sorted(operations.GPU_BACKENDS)) == operations.OPERATION_NAMES
+    for name in operations.OPERATION_NAMES:
         assert all(callable(getattr(room, name)) for room in (cpu, torch_ref, gpu))
 
 
-@pytest.mark.parametrize("operation", operations.OPERATIONS)
+@pytest.mark.parametrize("operation", operations.OPERATION_NAMES)
 def test_the_table_says_who_does_what(operation):
     """Each operation of the composed set is the one that the table names; where it names two, both have it."""
-    ways = [import_module(f"vdgs.kernels.{way}") for way in operations.taken(operation, "cuda")]
+    ways = [import_module(f"vdgs.kernels.{way}") for way in operations.backends_for(operation, "cuda")]
     found = getattr(gpu, operation)
     assert all(hasattr(way, operation) for way in ways)
     if len(ways) == 1:
         assert found is getattr(ways[0], operation)
     else:
         assert found.__module__ == "vdgs.kernels.gpu.rasterizer"
-    assert operations.taken(operation, "cpu") == ("native",)
-    assert operations.taken(operation, "mps") == ("reference",)
+    assert operations.backends_for(operation, "cpu") == ("native",)
+    assert operations.backends_for(operation, "mps") == ("reference",)
 
 
 class TestWhichRasteriserDraws:
     @pytest.fixture(autouse=True)
     def _asked_anew(self):
-        rasterizer.chosen.cache_clear()
+        rasterizer.select_rasterizer.cache_clear()
         yield
-        rasterizer.chosen.cache_clear()
+        rasterizer.select_rasterizer.cache_clear()
 
     def test_gsplat_where_it_can_be_used_but_not_for_depth(self, monkeypatch):
-        monkeypatch.delenv(rasterizer.VARIABLE, raising=False)
-        monkeypatch.setattr(rasterizer, "load", lambda: None)
+        monkeypatch.delenv(rasterizer.RASTERIZER_ENV_VAR, raising=False)
+        monkeypatch.setattr(rasterizer, "load_gsplat", lambda: None)
         assert rasterizer._drawing(depth=False) is gsplat
         assert rasterizer._drawing(depth=True) is cuda
 
@@ -67,63 +67,65 @@ class TestWhichRasteriserDraws:
         def none() -> None:
             raise GsplatUnavailable("gsplat is not here")
 
-        monkeypatch.setattr(rasterizer, "load", none)
-        assert rasterizer.chosen("") is rasterizer.chosen("cuda") is cuda
+        monkeypatch.setattr(rasterizer, "load_gsplat", none)
+        assert rasterizer.select_rasterizer("") is rasterizer.select_rasterizer("cuda") is cuda
         with pytest.raises(GsplatUnavailable, match="not here"):
-            rasterizer.chosen("gsplat")
+            rasterizer.select_rasterizer("gsplat")
 
     def test_another_word_is_refused(self):
         with pytest.raises(VdgsError, match="VDGS_RASTERISER must be gsplat, cuda or not set"):
-            rasterizer.chosen("native")
+            rasterizer.select_rasterizer("native")
 
 
 def test_auto_takes_the_processor_until_a_card_has_run_it():
-    assert choose("auto") == Choice("cpu", "vdgs has not been run on a GPU yet; --device cuda asks for the card")
-    assert choose("cpu") == Choice("cpu", "as asked for")
+    assert select_device("auto") == SelectedDevice(
+        "cpu", "vdgs has not been run on a GPU yet; --device cuda asks for the card"
+    )
+    assert select_device("cpu") == SelectedDevice("cpu", "as asked for")
 
 
 @pytest.mark.parametrize("asked", ["cuda", "cuda:1"])
 def test_a_card_that_cannot_be_used_is_refused(asked, monkeypatch):
     monkeypatch.setattr(device_selection, "_no_card", lambda index: f"there is no card {index}")
     with pytest.raises(DeviceUnavailable, match=rf"--device {asked}: there is no card \d\. Use --device cpu"):
-        choose(asked)
+        select_device(asked)
 
 
 @pytest.mark.parametrize("asked", ["gpu", "cuda:", "cuda:x", "CPU", "", "cuda:0 "])
 def test_other_words_are_refused(asked):
     with pytest.raises(VdgsError, match="choose auto, cpu, cuda or cuda:0"):
-        choose(asked)
+        select_device(asked)
 
 
 @pytest.mark.usefixtures("_two_cards")
 class TestWithCards:
     def test_the_card_that_is_asked_for(self):
-        assert choose("cuda") == Choice("cuda:0", "as asked for")
-        assert choose("cuda:1").device == "cuda:1"
-        assert choose("auto").device == "cpu"
+        assert select_device("cuda") == SelectedDevice("cuda:0", "as asked for")
+        assert select_device("cuda:1").device == "cuda:1"
+        assert select_device("auto").device == "cpu"
 
     def test_auto_takes_the_first_card_once_one_has_run_it(self, monkeypatch):
-        monkeypatch.setattr(device_selection, "RUN_ON_A_CARD", True)
-        assert choose("auto") == Choice("cuda:0", "there is a card that can be used")
+        monkeypatch.setattr(device_selection, "GPU_VERIFIED", True)
+        assert select_device("auto") == SelectedDevice("cuda:0", "there is a card that can be used")
 
     def test_a_card_that_is_not_there(self):
         with pytest.raises(DeviceUnavailable, match="no card 2; the driver knows 2"):
-            choose("cuda:2")
+            select_device("cuda:2")
 
     def test_auto_without_a_driver_is_the_processor(self, monkeypatch):
         def none() -> None:
             raise CudaUnavailable("There is no NVIDIA driver here")
 
-        monkeypatch.setattr(driver, "cuda_driver", none)
-        monkeypatch.setattr(device_selection, "RUN_ON_A_CARD", True)
-        assert choose("auto") == Choice("cpu", "There is no NVIDIA driver here")
+        monkeypatch.setattr(driver, "get_cuda_driver", none)
+        monkeypatch.setattr(device_selection, "GPU_VERIFIED", True)
+        assert select_device("auto") == SelectedDevice("cpu", "There is no NVIDIA driver here")
         with pytest.raises(DeviceUnavailable, match="no NVIDIA driver here"):
-            choose("cuda")
+            select_device("cuda")
 
     def test_a_torch_without_cuda(self, monkeypatch):
         monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
         with pytest.raises(DeviceUnavailable, match="this torch"):
-            choose("cuda")
+            select_device("cuda")
 
 
 def test_deciding_needs_no_torch():
@@ -167,18 +169,18 @@ def test_a_device_that_can_is_no_news(device, tmp_path, monkeypatch, capsys):
 def test_doctor_says_what_there_is(monkeypatch: pytest.MonkeyPatch, tmp_path):
     monkeypatch.setenv("VDGS_CUDA_CACHE", str(tmp_path))
     (tmp_path / "loss.cu-sm_86-0.bin").touch()
-    cards = [Card(0, "A card", 24 * 10**9, (8, 6))]
+    cards = [GpuInfo(0, "A card", 24 * 10**9, (8, 6))]
     monkeypatch.setattr(
-        doctor_cuda, "cuda_driver", lambda: SimpleNamespace(cards=lambda: cards, version=lambda: (12, 8))
+        doctor_cuda, "get_cuda_driver", lambda: SimpleNamespace(cards=lambda: cards, version=lambda: (12, 8))
     )
-    found = nvrtc_module.Found("/somewhere/libnvrtc.so.13", "the wheel nvidia-cuda-nvrtc")
-    monkeypatch.setattr(doctor_cuda, "nvrtc", lambda: SimpleNamespace(version=(13, 0), found=found))
-    lines = {check.name: check for check in doctor_cuda.looks()}
+    found = nvrtc_module.NvrtcLibrary("/somewhere/libnvrtc.so.13", "the wheel nvidia-cuda-nvrtc")
+    monkeypatch.setattr(doctor_cuda, "get_nvrtc", lambda: SimpleNamespace(version=(13, 0), found=found))
+    lines = {check.name: check for check in doctor_cuda.cuda_checks()}
     assert lines["CUDA card 0"].value == "A card, 24.0 GB, compute capability 8.6; driver for CUDA 12.8"
     assert lines["NVRTC"].value == "13.0, from the wheel nvidia-cuda-nvrtc: /somewhere/libnvrtc.so.13"
     assert lines["CUDA kernels"].value.startswith("compiled code in")
     assert lines["CUDA kernels"].value.endswith("1 entries")
-    assert lines["on cpu: native"].value == f"all {len(operations.OPERATIONS)} operations"
+    assert lines["on cpu: native"].value == f"all {len(operations.OPERATION_NAMES)} operations"
     assert lines["on cuda: cuda"].value == (
         "add_view_statistics, cull, decode, decode_backward_adam, decode_to_train, photometric_loss, shares"
     )
@@ -192,8 +194,8 @@ def test_doctor_where_there_is_nothing(monkeypatch: pytest.MonkeyPatch):
     def none() -> None:
         raise CudaUnavailable("not here. pip install something")
 
-    monkeypatch.setattr(doctor_cuda, "cuda_driver", none)
-    monkeypatch.setattr(doctor_cuda, "nvrtc", none)
-    lines = {check.name: check for check in doctor_cuda.looks()}
+    monkeypatch.setattr(doctor_cuda, "get_cuda_driver", none)
+    monkeypatch.setattr(doctor_cuda, "get_nvrtc", none)
+    lines = {check.name: check for check in doctor_cuda.cuda_checks()}
     assert lines["CUDA driver"].state == lines["NVRTC"].state == "note"
     assert "pip install something" in lines["NVRTC"].remedy

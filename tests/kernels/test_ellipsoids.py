@@ -11,7 +11,7 @@ from support.instruction_sets import on_threads, using
 from vdgs.kernels.cpu import ellipsoids as native
 from vdgs.kernels.cpu import extension
 from vdgs.kernels.torch_ref import ellipsoids as reference
-from vdgs.kernels.torch_ref.ellipsoids import ellipsoids, logarithms
+from vdgs.kernels.torch_ref.ellipsoids import from_log_covariances, log_covariances
 
 BOTH = pytest.mark.parametrize("kernels", [native, reference], ids=["native", "reference"])
 
@@ -28,12 +28,12 @@ def seen(counts: list[int], seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, 
 @given(counts=st.lists(st.integers(1, 20), min_size=1, max_size=70), seed=st.integers(0, 10**6))
 def test_every_instruction_set_means_what_the_twin_means(counts, seed):
     given_pairs = seen(counts, seed)
-    expected = logarithms(*reference.mean_ellipsoids(*given_pairs))
-    for isa in extension.supported():
+    expected = log_covariances(*reference.mean_ellipsoids(*given_pairs))
+    for isa in extension.supported_isas():
         with using(isa):
             found = native.mean_ellipsoids(*given_pairs)
         # Ellipsoids as a whole: where two axes are alike, rounding decides where these two point.
-        torch.testing.assert_close(logarithms(*found), expected, atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(log_covariances(*found), expected, atol=1e-5, rtol=1e-5)
         torch.testing.assert_close(found[1].norm(dim=1), torch.ones(len(counts)))
 
 
@@ -41,8 +41,8 @@ def test_every_instruction_set_means_what_the_twin_means(counts, seed):
 def test_the_logarithm_of_the_mean_is_the_mean_of_the_logarithms(kernels):
     log_scales, quaternions, weights, starts = seen([4] * 50)
     shares = (weights.view(-1, 4) / weights.view(-1, 4).sum(1, keepdim=True))[..., None]
-    expected = (logarithms(log_scales, quaternions).view(-1, 4, 6) * shares).sum(1)
-    found = logarithms(*kernels.mean_ellipsoids(log_scales, quaternions, weights, starts))
+    expected = (log_covariances(log_scales, quaternions).view(-1, 4, 6) * shares).sum(1)
+    found = log_covariances(*kernels.mean_ellipsoids(log_scales, quaternions, weights, starts))
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
 
 
@@ -53,7 +53,9 @@ def test_of_alike_ellipsoids_and_axes_the_mean_is_each(kernels, scales):
     quaternions = torch.randn(1, 4, generator=torch.Generator().manual_seed(1)).expand(3, 4)
     for turned in (quaternions, torch.tensor([[1.0, 0, 0, 0]]).expand(3, 4)):
         found = kernels.mean_ellipsoids(log_scales, turned, torch.tensor([1e-3, 1.0, 1e3]), torch.tensor([0]))
-        torch.testing.assert_close(logarithms(*found), logarithms(log_scales[:1], turned[:1]), atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(
+            log_covariances(*found), log_covariances(log_scales[:1], turned[:1]), atol=1e-5, rtol=1e-5
+        )
 
 
 @BOTH
@@ -78,13 +80,13 @@ def test_threads_change_no_bit():
 def test_the_mean_of_ellipsoids_minds_neither_the_order_nor_the_signs_of_axes():
     generator = torch.Generator().manual_seed(0)
     scales, turns = torch.randn(400, 3, generator=generator), torch.randn(400, 4, generator=generator)
-    logarithm = logarithms(scales, turns)
-    named = ellipsoids(logarithm)
-    torch.testing.assert_close(logarithms(*named), logarithm, atol=1e-5, rtol=0)
+    logarithm = log_covariances(scales, turns)
+    named = from_log_covariances(logarithm)
+    torch.testing.assert_close(log_covariances(*named), logarithm, atol=1e-5, rtol=0)
     torch.testing.assert_close(named[0].sort(1).values, scales.sort(1).values, atol=1e-5, rtol=0)
     torch.testing.assert_close(named[1].norm(dim=1), torch.ones(400))
     # The same ellipsoids with axes named anew are the same logarithms, so they have the same mean.
     quarter = torch.tensor([0.5**0.5, 0.5**0.5, 0.0, 0.0])  # about x: y becomes z
     w, x, y, z = turns.unbind(1)
     anew = torch.stack([w - x, w + x, y + z, z - y], 1) * quarter[0]
-    torch.testing.assert_close(logarithms(scales[:, [0, 2, 1]], -anew), logarithm, atol=1e-4, rtol=0)
+    torch.testing.assert_close(log_covariances(scales[:, [0, 2, 1]], -anew), logarithm, atol=1e-4, rtol=0)

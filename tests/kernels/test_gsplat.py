@@ -18,10 +18,10 @@ from support.rasterize_scenes import (
     splats_of,
 )
 from vdgs.errors import VdgsError
-from vdgs.kernels.gsplat import rasterise_vjp, rasterize
-from vdgs.kernels.gsplat.rasterize import GsplatUnavailable, load, reach_px
-from vdgs.kernels.torch_ref.rasterize import rasterise as reference
-from vdgs.kernels.torch_ref.rasterize import rasterise_vjp as reference_vjp
+from vdgs.kernels.gsplat import rasterize, rasterize_vjp
+from vdgs.kernels.gsplat.rasterize import GsplatUnavailable, load_gsplat, splat_radii_px
+from vdgs.kernels.torch_ref.rasterize import rasterize as reference
+from vdgs.kernels.torch_ref.rasterize import rasterize_vjp as reference_vjp
 
 SCENES = {
     "ordinary": make_scene(120, 37, 29),
@@ -63,7 +63,7 @@ def test_it_draws_and_differentiates_what_the_reference_does(name):
 def test_the_way_back_gives_what_training_asks_for():
     """Gradients of the means in pixels and of the conics go where they are wanted; a picture without depth has none."""
     scene, exact = SCENES["ordinary"], SCENES["ordinary"].to(torch.float64)
-    raster, pullback = rasterise_vjp(*splats_of(scene.tensors), scene.width, scene.height)
+    raster, pullback = rasterize_vjp(*splats_of(scene.tensors), scene.width, scene.height)
     _, exactly = reference_vjp(*splats_of(exact.tensors), scene.width, scene.height)
     assert (raster.depth, raster.median_depth) == (None, None)
     assert not raster.image.requires_grad
@@ -85,7 +85,7 @@ def test_gradients_of_the_first_splats_are_those_that_they_have_among_all():
     scene = SCENES["ordinary"]
     size, (splats, background) = (scene.width, scene.height), splats_of(scene.tensors)
     assert_first_gradients_are_those_of_all(
-        lambda: rasterise_vjp(splats, background, *size)[1], len(splats.depths), *size
+        lambda: rasterize_vjp(splats, background, *size)[1], len(splats.depths), *size
     )
 
 
@@ -101,7 +101,7 @@ def test_without_compiled_kernels_the_error_says_so(monkeypatch: pytest.MonkeyPa
     for name in ("gsplat", "gsplat.cuda._backend"):
         monkeypatch.setitem(sys.modules, name, SimpleNamespace(_C=None))  # type: ignore[arg-type]
     with pytest.raises(GsplatUnavailable, match="no CUDA toolkit"):
-        load()
+        load_gsplat()
 
 
 @pytest.mark.parametrize("column", range(5))
@@ -109,7 +109,7 @@ def test_without_compiled_kernels_the_error_says_so(monkeypatch: pytest.MonkeyPa
 def test_rows_that_are_not_finite_are_not_drawn(column, value):
     tensors = [tensor.detach().clone() for tensor in SCENES["ordinary"].tensors]
     tensors[column].view(len(tensors[column]), -1)[3, 0] = value
-    reach = reach_px(splats_of(tensors)[0])
+    reach = splat_radii_px(splats_of(tensors)[0])
     assert torch.all(reach[3] == 0)
     assert torch.any(reach > 0)
 
@@ -118,7 +118,7 @@ def test_rows_that_are_not_finite_are_not_drawn(column, value):
 def test_conics_that_are_not_positive_definite_are_not_drawn(conic):
     tensors = [tensor.detach().clone() for tensor in SCENES["ordinary"].tensors]
     tensors[1][5] = torch.tensor(conic)
-    assert torch.all(reach_px(splats_of(tensors)[0])[5] == 0)
+    assert torch.all(splat_radii_px(splats_of(tensors)[0])[5] == 0)
 
 
 def test_without_gsplat_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch):

@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from support.instruction_sets import on_threads, using
-from vdgs.export.bake import RIDGE
+from vdgs.export.bake import RIDGE_WEIGHT
 from vdgs.kernels.cpu import extension
 from vdgs.kernels.cpu import harmonics as native
-from vdgs.kernels.spherical_harmonics import basis, function_count, view_colours
+from vdgs.kernels.spherical_harmonics import eval_sh_bases, eval_sh_colors, num_sh_bases
 from vdgs.kernels.torch_ref import harmonics as reference
 
 BOTH = pytest.mark.parametrize("kernels", [native, reference], ids=["native", "reference"])
@@ -35,14 +35,14 @@ def seen(counts: list[int], seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, 
 def test_each_regression_is_solved_as_if_it_were_alone(kernels, degree):
     counts = [1, 30, 2, 17, 2, 90, *range(1, 40)]
     directions, colours, weights, starts = seen(counts, 1)
-    together = kernels.fit_harmonics(directions, colours, weights, starts, degree, RIDGE)
-    f = function_count(degree)
+    together = kernels.fit_harmonics(directions, colours, weights, starts, degree, RIDGE_WEIGHT)
+    f = num_sh_bases(degree)
     assert together.shape == (len(counts), f, 3)
     for number, (start, count) in enumerate(zip(starts.tolist(), counts, strict=True)):
         part = slice(start, start + count)
-        functions = basis(directions[part].double(), degree)
+        functions = eval_sh_bases(directions[part].double(), degree)
         share = (weights[part].double() / weights[part].double().sum())[:, None]
-        ridge = torch.diag(torch.tensor([0.0] + (f - 1) * [RIDGE], dtype=torch.float64))
+        ridge = torch.diag(torch.tensor([0.0] + (f - 1) * [RIDGE_WEIGHT], dtype=torch.float64))
         matrix = functions.T @ (share * functions) + ridge
         alone = torch.linalg.solve(matrix, functions.T @ (share * (colours[part].double() - 0.5)))
         torch.testing.assert_close(together[number].double(), alone, atol=1e-5, rtol=1e-4)
@@ -54,10 +54,10 @@ def test_each_regression_is_solved_as_if_it_were_alone(kernels, degree):
 )
 def test_every_instruction_set_fits_what_the_twin_fits(counts, degree, seed):
     given_pairs = seen(counts, seed)
-    expected = reference.fit_harmonics(*given_pairs, degree, RIDGE)
-    for isa in extension.supported():
+    expected = reference.fit_harmonics(*given_pairs, degree, RIDGE_WEIGHT)
+    for isa in extension.supported_isas():
         with using(isa):
-            found = native.fit_harmonics(*given_pairs, degree, RIDGE)
+            found = native.fit_harmonics(*given_pairs, degree, RIDGE_WEIGHT)
         torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-4)
 
 
@@ -67,11 +67,11 @@ def test_harmonics_that_were_seen_from_everywhere_are_found_again(kernels, degre
     generator = torch.Generator().manual_seed(degree)
     m, views = 5, 400
     dc = 0.3 * torch.randn(m, 3, generator=generator)
-    rest = 0.03 * torch.randn(m, function_count(degree) - 1, 3, generator=generator)
+    rest = 0.03 * torch.randn(m, num_sh_bases(degree) - 1, 3, generator=generator)
     directions = unit(m * views, generator)
-    colours = view_colours(dc.repeat_interleave(views, 0), rest.repeat_interleave(views, 0), directions, degree)
+    colours = eval_sh_colors(dc.repeat_interleave(views, 0), rest.repeat_interleave(views, 0), directions, degree)
     weights = 0.5 + torch.rand(m * views, generator=generator)
-    found = kernels.fit_harmonics(directions, colours, weights, torch.arange(m) * views, degree, RIDGE)
+    found = kernels.fit_harmonics(directions, colours, weights, torch.arange(m) * views, degree, RIDGE_WEIGHT)
     assert torch.allclose(found[:, 0], dc, atol=0.02)
     # The ridge shrinks by RIDGE against the mean square of a function, 1 / (4 pi).
     assert torch.allclose(found[:, 1:], rest, atol=0.03)
@@ -80,10 +80,10 @@ def test_harmonics_that_were_seen_from_everywhere_are_found_again(kernels, degre
 @BOTH
 def test_one_view_says_one_colour_for_all_directions(kernels):
     colour, one = torch.tensor([[0.2, 0.5, 0.9]]), torch.tensor([[0.0, 0.0, -1.0]])
-    found = kernels.fit_harmonics(one, colour, torch.ones(1), torch.tensor([0]), 3, RIDGE)
-    shown = view_colours(found[:, 0], found[:, 1:], one, 3)
+    found = kernels.fit_harmonics(one, colour, torch.ones(1), torch.tensor([0]), 3, RIDGE_WEIGHT)
+    shown = eval_sh_colors(found[:, 0], found[:, 1:], one, 3)
     assert torch.allclose(shown, colour, atol=0.01)
-    sideways = view_colours(found[:, 0], found[:, 1:], torch.tensor([[1.0, 0.0, 0.0]]), 3)
+    sideways = eval_sh_colors(found[:, 0], found[:, 1:], torch.tensor([[1.0, 0.0, 0.0]]), 3)
     assert (sideways - colour).abs().max() < 0.25
 
 
@@ -91,9 +91,9 @@ def test_one_view_says_one_colour_for_all_directions(kernels):
 @pytest.mark.parametrize("count", [1, 2, 50])
 def test_many_looks_from_one_place_are_a_number(kernels, count):
     directions, colours = torch.tensor([[0.6, 0.0, -0.8]]).repeat(count, 1), torch.full((count, 3), 0.75)
-    found = kernels.fit_harmonics(directions, colours, torch.full((count,), 1e-3), torch.tensor([0]), 3, RIDGE)
+    found = kernels.fit_harmonics(directions, colours, torch.full((count,), 1e-3), torch.tensor([0]), 3, RIDGE_WEIGHT)
     assert torch.isfinite(found).all()
-    shown = view_colours(found[:, 0], found[:, 1:], directions[:1], 3)
+    shown = eval_sh_colors(found[:, 0], found[:, 1:], directions[:1], 3)
     torch.testing.assert_close(shown, colours[:1], atol=1e-3, rtol=0)
 
 
@@ -102,11 +102,13 @@ def test_what_no_fit_can_be_made_of_is_refused(kernels):
     directions, colours, weights, _ = seen([3, 2])
     for starts in ([0, 5], [1, 3], [0, 0], [2, 1], []):
         with pytest.raises(ValueError, match="pair"):
-            kernels.fit_harmonics(directions, colours, weights, torch.tensor(starts, dtype=torch.int64), 1, RIDGE)
+            kernels.fit_harmonics(
+                directions, colours, weights, torch.tensor(starts, dtype=torch.int64), 1, RIDGE_WEIGHT
+            )
     nothing = torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, dtype=torch.int64)
-    assert kernels.fit_harmonics(*nothing, 2, RIDGE).shape == (0, 9, 3)
+    assert kernels.fit_harmonics(*nothing, 2, RIDGE_WEIGHT).shape == (0, 9, 3)
     with pytest.raises(ValueError, match="degree"):
-        kernels.fit_harmonics(directions, colours, weights, torch.tensor([0, 3]), 4, RIDGE)
+        kernels.fit_harmonics(directions, colours, weights, torch.tensor([0, 3]), 4, RIDGE_WEIGHT)
 
 
 @settings(max_examples=30)
@@ -114,16 +116,16 @@ def test_what_no_fit_can_be_made_of_is_refused(kernels):
 def test_every_instruction_set_shows_what_the_twin_shows(n, degree, seed):
     """Coefficients stand apart, among other numbers, as in a file; rows in any order, some twice."""
     generator = torch.Generator().manual_seed(seed)
-    width = 3 * function_count(degree)
+    width = 3 * num_sh_bases(degree)
     table = torch.randn(n, width + 7, generator=generator)
     coefficients = table[:, 5 : 5 + width]
     rows = torch.randint(n, (2 * n,), generator=generator)
     means, eye = 9 * torch.randn(len(rows), 3, generator=generator), torch.tensor([0.3, -0.4, 20.0])
-    expected = reference.harmonic_colours(means, coefficients, rows, eye, degree)
-    for isa in extension.supported():
+    expected = reference.harmonic_colors(means, coefficients, rows, eye, degree)
+    for isa in extension.supported_isas():
         with using(isa):
-            shown = native.harmonic_colours(means, coefficients, rows, eye, degree)
-            one = native.harmonic_colours(means[:1], coefficients, rows[:1], means[0], degree)
+            shown = native.harmonic_colors(means, coefficients, rows, eye, degree)
+            one = native.harmonic_colors(means[:1], coefficients, rows[:1], means[0], degree)
         torch.testing.assert_close(shown, expected, atol=2e-5, rtol=1e-5)
         assert torch.isfinite(one).all()  # seen from its own centre
 
@@ -133,9 +135,9 @@ def test_rows_and_coefficients_that_do_not_fit_are_refused(kernels):
     means, eye = torch.zeros(1, 3), torch.ones(3)
     for row in (-1, 4):
         with pytest.raises(IndexError, match="outside the 4"):
-            kernels.harmonic_colours(means, torch.zeros(4, 12), torch.tensor([row]), eye, 1)
+            kernels.harmonic_colors(means, torch.zeros(4, 12), torch.tensor([row]), eye, 1)
     with pytest.raises(ValueError, match="degree 2 has 27 coefficients, not 12"):
-        kernels.harmonic_colours(means, torch.zeros(4, 12), torch.tensor([0]), eye, 2)
+        kernels.harmonic_colors(means, torch.zeros(4, 12), torch.tensor([0]), eye, 2)
 
 
 def test_any_number_of_threads_gives_the_same_bits():
@@ -146,7 +148,7 @@ def test_any_number_of_threads_gives_the_same_bits():
     found = []
     for threads in (1, 3):
         with on_threads(threads):
-            found.append((native.fit_harmonics(*pairs, 3, RIDGE),
-                          native.harmonic_colours(means, table, rows, torch.zeros(3), 3)))  # fmt: skip
+            found.append((native.fit_harmonics(*pairs, 3, RIDGE_WEIGHT),
+                          native.harmonic_colors(means, table, rows, torch.zeros(3), 3)))  # fmt: skip
     for one, many in zip(*found, strict=True):
         assert torch.equal(one, many)

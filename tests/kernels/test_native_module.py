@@ -9,31 +9,31 @@ import pytest
 
 from support.commands import python
 from vdgs.kernels.cpu import extension as native_module
-from vdgs.kernels.cpu.extension import NativeUnavailable, load, native, supported
+from vdgs.kernels.cpu.extension import NativeUnavailable, get_extension, load_extension, supported_isas
 
-ISAS = supported()
+ISAS = supported_isas()
 
 
 def elementwise(isa: str, name: str, x: np.ndarray) -> np.ndarray:
     out = np.empty_like(x)
-    load(isa).check.elementwise(name, x, out)
+    load_extension(isa).check.elementwise(name, x, out)
     return out
 
 
 def test_best_supported_module_is_chosen() -> None:
     assert "portable" in ISAS
     wanted = os.environ.get("VDGS_ISA") or ISAS[0]
-    assert native().isa == wanted == native_module.isa()
+    assert get_extension().isa == wanted == native_module.active_isa()
 
 
 @pytest.mark.parametrize("isa", ISAS)
 def test_every_supported_module_loads_in_one_process(isa: str) -> None:
-    assert load(isa).isa == isa
+    assert load_extension(isa).isa == isa
 
 
 def test_unknown_instruction_set_is_refused_by_name() -> None:
     with pytest.raises(NativeUnavailable, match=r"no kernels for 'sse9'.*avx512, avx2, portable"):
-        load("sse9")
+        load_extension("sse9")
 
 
 def test_environment_chooses_instruction_set_and_threads() -> None:
@@ -66,7 +66,7 @@ def test_missing_build_says_how_to_build(monkeypatch: pytest.MonkeyPatch) -> Non
 
 def test_threads_must_be_positive() -> None:
     with pytest.raises(ValueError, match="at least 1"):
-        native_module.set_threads(0)
+        native_module.set_num_threads(0)
 
 
 @pytest.mark.parametrize("isa", ISAS)
@@ -105,7 +105,7 @@ def test_functions_at_the_limits(isa: str) -> None:
 
 @pytest.mark.parametrize("isa", ISAS)
 def test_shuffles(isa: str) -> None:
-    check = load(isa).check
+    check = load_extension(isa).check
     generator = np.random.default_rng(0)
     rows = generator.normal(size=(16, 3)).astype(np.float32)
     out = np.empty(96, np.float32)
@@ -130,7 +130,7 @@ def test_shuffles(isa: str) -> None:
 @pytest.mark.parametrize("isa", ISAS)
 @pytest.mark.parametrize("threads", [1, 2, 5])
 def test_every_task_runs_once(isa: str, threads: int) -> None:
-    module = load(isa)
+    module = load_extension(isa)
     before = module.threads()
     module.set_threads(threads)
     try:
@@ -142,7 +142,7 @@ def test_every_task_runs_once(isa: str, threads: int) -> None:
 
 @pytest.mark.parametrize("isa", ISAS)
 def test_an_exception_in_a_task_reaches_the_caller(isa: str) -> None:
-    check = load(isa).check
+    check = load_extension(isa).check
     for bad in (0, 500, 999):
         with pytest.raises(RuntimeError, match="on purpose"):
             check.sum_of_tasks(1000, bad)

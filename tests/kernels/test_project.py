@@ -93,9 +93,9 @@ def test_what_is_not_valid_is_zero_and_has_no_gradient(camera):
 
 @pytest.mark.parametrize("camera", CAMERAS)
 @pytest.mark.parametrize("make", [awkward, lambda: gaussians(333, seed=3), lambda: gaussians(0)])
-@pytest.mark.parametrize("isa", extension.supported())
+@pytest.mark.parametrize("isa", extension.supported_isas())
 def test_native_equals_the_twin(camera, make, isa, monkeypatch):
-    monkeypatch.setattr(extension, "native", lambda: extension.load(isa))
+    monkeypatch.setattr(extension, "get_extension", lambda: extension.load_extension(isa))
     exact = [t.float().double().requires_grad_() for t in make()]
     single = [t.detach().float().requires_grad_() for t in exact]
     twin = twin_project(*exact, camera)
@@ -138,9 +138,9 @@ def test_moving_the_world_and_the_camera_together_changes_nothing(seed, angle):
     torch.testing.assert_close(a.conics, b.conics)
 
 
-@pytest.mark.parametrize("isa", extension.supported())
+@pytest.mark.parametrize("isa", extension.supported_isas())
 def test_the_constants_of_the_kernels_are_those_of_the_twins(isa):
-    for name, value in extension.load(isa).constants.items():
+    for name, value in extension.load_extension(isa).constants.items():
         assert value == pytest.approx(getattr(constants, name), rel=1e-6), name
 
 

@@ -27,13 +27,13 @@ from support.rasterize_scenes import (
     splats_of,
 )
 from vdgs.kernels import constants
-from vdgs.kernels.cpu.extension import load, supported
-from vdgs.kernels.cpu.rasterize import rasterise, rasterise_vjp, shares
+from vdgs.kernels.cpu.extension import load_extension, supported_isas
+from vdgs.kernels.cpu.rasterize import rasterize, rasterize_vjp, splat_contributions
 from vdgs.kernels.kernel_types import Raster, Splats
-from vdgs.kernels.torch_ref.rasterize import rasterise as reference
-from vdgs.kernels.torch_ref.splat_contributions import shares as twin
+from vdgs.kernels.torch_ref.rasterize import rasterize as reference
+from vdgs.kernels.torch_ref.splat_contributions import splat_contributions as twin
 
-ISAS = supported()
+ISAS = supported_isas()
 NAMES = ("means_px", "conics", "colours", "opacities", "depths", "background")
 
 
@@ -52,7 +52,7 @@ SCENES = {
 
 
 def draw(scene: Scene, isa: str, depth: bool = True) -> Raster:
-    return rasterise(*splats_of(scene.tensors), scene.width, scene.height, depth=depth, module=load(isa))
+    return rasterize(*splats_of(scene.tensors), scene.width, scene.height, depth=depth, module=load_extension(isa))
 
 
 @cache
@@ -67,7 +67,7 @@ def exact_of(scene: Scene) -> tuple[Raster, list[Tensor]]:
 @pytest.mark.parametrize("isa", ISAS)
 def test_constants_are_those_of_python(isa: str) -> None:
     for name in ("ALPHA_MIN", "ALPHA_MAX", "TRANSMITTANCE_MIN", "MEDIAN_TRANSMITTANCE"):
-        assert getattr(load(isa), name) == pytest.approx(getattr(constants, name), rel=1e-6)
+        assert getattr(load_extension(isa), name) == pytest.approx(getattr(constants, name), rel=1e-6)
 
 
 @pytest.mark.parametrize("isa", ISAS)
@@ -87,10 +87,10 @@ def test_picture_and_gradients_equal_the_reference(name: str, isa: str) -> None:
 @pytest.mark.parametrize("depth", [False, True])
 def test_gradients_of_the_first_splats_alone_have_the_bits_that_they_have_among_all(name: str, isa: str, depth: bool):
     scene = SCENES[name]
-    size, module = (scene.width, scene.height), load(isa)
+    size, module = (scene.width, scene.height), load_extension(isa)
     splats, background = splats_of(tuple(tensor.detach() for tensor in scene.tensors))
     assert_first_gradients_are_those_of_all(
-        lambda: rasterise_vjp(splats, background, *size, depth=depth, module=module)[1], len(splats.depths), *size
+        lambda: rasterize_vjp(splats, background, *size, depth=depth, module=module)[1], len(splats.depths), *size
     )
 
 
@@ -102,10 +102,10 @@ def test_so_they_have_in_several_slabs(order: str, isa: str):
     if order != "as they come":
         rows = splats.depths.argsort(descending=order == "far first")
         splats = Splats(*(getattr(splats, field.name)[rows] for field in fields(Splats)))
-    module = load(isa)
-    assert rasterise_vjp(splats, background, 20, 18, module=module)[1].frame.statistics["slabs"] > 1  # type: ignore
+    module = load_extension(isa)
+    assert rasterize_vjp(splats, background, 20, 18, module=module)[1].frame.statistics["slabs"] > 1  # type: ignore
     assert_first_gradients_are_those_of_all(
-        lambda: rasterise_vjp(splats, background, 20, 18, module=module)[1], len(splats.depths), 20, 18
+        lambda: rasterize_vjp(splats, background, 20, 18, module=module)[1], len(splats.depths), 20, 18
     )
 
 
@@ -114,13 +114,13 @@ def test_so_they_have_in_several_slabs(order: str, isa: str):
 def test_shares_are_what_each_splat_makes_of_the_picture_and_of_what_it_lacks(name: str, isa: str) -> None:
     scene, exact = SCENES[name].to(torch.float32), SCENES[name].to(torch.float64)
     wanted = torch.rand(scene.height, scene.width, 3, generator=torch.Generator().manual_seed(3))
-    size, module = (scene.width, scene.height), load(isa)
+    size, module = (scene.width, scene.height), load_extension(isa)
     splats, background = splats_of(tuple(tensor.detach() for tensor in scene.tensors))
     expected = twin(*splats_of(tuple(tensor.detach() for tensor in exact.tensors)), *size, wanted.double())
-    found = shares(splats, background, *size, wanted, module=module)
+    found = splat_contributions(splats, background, *size, wanted, module=module)
     assert_close(found.pixels, expected.pixels, 5e-5)
     assert_close(found.missing, expected.missing, 5e-5)
-    alone = shares(splats, background, *size, module=module)
+    alone = splat_contributions(splats, background, *size, module=module)
     assert torch.equal(alone.pixels, found.pixels)
     assert not alone.missing.any()
 
@@ -130,9 +130,9 @@ def test_shares_have_the_same_bits_for_any_number_of_threads(threads: int) -> No
     scene = make_scene(3000, 200, 150, seed=4).to(torch.float32)
     splats, background = splats_of(tuple(tensor.detach() for tensor in scene.tensors))
     wanted = torch.rand(150, 200, 3, generator=torch.Generator().manual_seed(0))
-    expected = shares(splats, background, 200, 150, wanted)
+    expected = splat_contributions(splats, background, 200, 150, wanted)
     with on_threads(threads):
-        again = shares(splats, background, 200, 150, wanted)
+        again = splat_contributions(splats, background, 200, 150, wanted)
     assert torch.equal(again.pixels, expected.pixels)
     assert torch.equal(again.missing, expected.missing)
 
@@ -220,7 +220,7 @@ def test_slabs_change_nothing(isa: str, hole: bool) -> None:
     """So many entries per tile that the splats come in several slabs, and finished tiles are skipped."""
     exact, exact_gradients = exact_of(crowd(hole))
     scene = crowd(hole).to(torch.float32)
-    module, picture = load(isa), [torch.empty(18, 20, 3), *(torch.empty(18, 20) for _ in range(3))]
+    module, picture = load_extension(isa), [torch.empty(18, 20, 3), *(torch.empty(18, 20) for _ in range(3))]
     rows = [t.detach().numpy() for t in scene.tensors[:5]]
     counted = module.rasterise_forward(
         *rows, (0.2, 0.3, 0.4), 20, 18, *(p.numpy() for p in picture), counting=True
@@ -244,7 +244,7 @@ def everything(scene: Scene, isa: str) -> list[np.ndarray]:
 
 @pytest.mark.parametrize("isa", ISAS)
 def test_same_bits_for_any_number_of_threads(isa: str) -> None:
-    module = load(isa)
+    module = load_extension(isa)
     before = module.threads()
     scene = make_scene(40_000, 90, 70, opacity=1.0)
     try:
@@ -284,10 +284,10 @@ def test_several_python_threads_draw_at_once(isa: str) -> None:
 def test_a_forked_child_draws_the_same() -> None:
     scene = make_scene(3000, 80, 60)
     args = [t.detach() for t in scene.tensors]
-    expected = rasterise(*splats_of(args), 80, 60).image
+    expected = rasterize(*splats_of(args), 80, 60).image
     child = os.fork()
     if child == 0:
-        same = torch.equal(rasterise(*splats_of(args), 80, 60).image, expected)
+        same = torch.equal(rasterize(*splats_of(args), 80, 60).image, expected)
         os._exit(0 if same else 1)
     assert os.waitpid(child, 0)[1] == 0
 
@@ -305,7 +305,7 @@ def test_rows_that_are_not_finite_are_not_drawn(isa: str, value: float) -> None:
         spoiled.append(t.requires_grad_())
     actual = draw(Scene(tuple(spoiled), 40, 30), isa)
     without = [t.detach()[kept] if len(t) == 60 else t.detach() for t in scene.tensors]
-    expected = rasterise(*splats_of(without), 40, 30, depth=True, module=load(isa))
+    expected = rasterize(*splats_of(without), 40, 30, depth=True, module=load_extension(isa))
     for a, e in zip(actual, expected, strict=True):
         assert torch.equal(a, e)
     loss_of(actual).backward()
@@ -356,7 +356,7 @@ def test_order_of_the_rows_does_not_matter() -> None:
     scene = make_scene(500, 50, 40)
     order = torch.randperm(500, generator=torch.Generator().manual_seed(0))
     shuffled = [t.detach()[order] if len(t) == 500 else t.detach() for t in scene.tensors]
-    assert torch.equal(rasterise(*splats_of(shuffled), 50, 40).image, draw(scene, ISAS[0]).image)
+    assert torch.equal(rasterize(*splats_of(shuffled), 50, 40).image, draw(scene, ISAS[0]).image)
 
 
 def test_inputs_may_be_strided() -> None:
@@ -368,7 +368,7 @@ def test_inputs_may_be_strided() -> None:
     assert not strided[0].is_contiguous()
     assert not strided[3].is_contiguous()
     strided = [t.requires_grad_() for t in strided]
-    raster = rasterise(*splats_of(strided), 40, 30)
+    raster = rasterize(*splats_of(strided), 40, 30)
     assert torch.equal(raster.image, draw(scene, ISAS[0]).image)
     raster.image.transpose(0, 1).square().sum().backward()
     draw(scene, ISAS[0]).image.square().sum().backward()
@@ -379,9 +379,9 @@ def test_inputs_may_be_strided() -> None:
 def test_only_what_is_asked_for_gets_gradients() -> None:
     scene = make_scene(100, 30, 30)
     tensors = [t.detach() for t in scene.tensors]
-    assert not rasterise(*splats_of(tensors), 30, 30).image.requires_grad
+    assert not rasterize(*splats_of(tensors), 30, 30).image.requires_grad
     tensors[2].requires_grad_()
-    raster = rasterise(*splats_of(tensors), 30, 30)
+    raster = rasterize(*splats_of(tensors), 30, 30)
     assert raster.depth is None
     assert raster.median_depth is None
     raster.alpha.sum().backward()
@@ -420,14 +420,14 @@ def test_wrong_tensors_are_named(change, error: type[Exception], message: str) -
     for name, tensor in zip(("means_px", "conics", "colours", "opacities", "depths"), tensors[:5], strict=True):
         object.__setattr__(splats, name, tensor)
     with pytest.raises(error, match=message):
-        inspect.unwrap(rasterise)(splats, tensors[5], 10, 10)
+        inspect.unwrap(rasterize)(splats, tensors[5], 10, 10)
 
 
 @pytest.mark.parametrize(("width", "height"), [(0, 5), (5, -1), (2**20, 1)])
 def test_impossible_pictures_are_refused(width: int, height: int) -> None:
     tensors = [t.detach() for t in make_scene(3, 10, 10).tensors]
     with pytest.raises(ValueError, match="must be from 1 to"):
-        rasterise(*splats_of(tensors), width, height)
+        rasterize(*splats_of(tensors), width, height)
 
 
 def test_frames_are_reused_across_sizes() -> None:
@@ -437,6 +437,6 @@ def test_frames_are_reused_across_sizes() -> None:
         scene = make_scene(n, width, height, seed=seed)
         fresh = everything(scene, ISAS[0])
         gc.collect()
-        load(ISAS[0]).drop_idle_frames()
+        load_extension(ISAS[0]).drop_idle_frames()
         for a, b in zip(fresh, everything(scene, ISAS[0]), strict=True):
             np.testing.assert_array_equal(a, b)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from vdgs.kernels.spherical_harmonics import basis, dc_of_colours, function_count, view_colours
+from vdgs.kernels.spherical_harmonics import eval_sh_bases, eval_sh_colors, num_sh_bases, rgb_to_sh
 
 
 def quadrature() -> tuple[torch.Tensor, torch.Tensor]:
@@ -23,14 +23,14 @@ def quadrature() -> tuple[torch.Tensor, torch.Tensor]:
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_the_functions_are_orthonormal(degree):
     directions, weights = quadrature()
-    values = basis(directions, degree)
-    torch.testing.assert_close((values * weights[:, None]).T @ values, torch.eye(function_count(degree)).double())
+    values = eval_sh_bases(directions, degree)
+    torch.testing.assert_close((values * weights[:, None]).T @ values, torch.eye(num_sh_bases(degree)).double())
 
 
 def test_the_functions_have_their_known_values():
     x, y, z = torch.eye(3, dtype=torch.float64)
     diagonal = (x + y) / math.sqrt(2)
-    values = basis(torch.stack([x, y, z, diagonal]), 3)
+    values = eval_sh_bases(torch.stack([x, y, z, diagonal]), 3)
     torch.testing.assert_close(values[:, 0], torch.full((4,), 0.28209479177387814).double())
     # (1,-1), (1,0), (1,1) look along -y, z, -x.
     torch.testing.assert_close(values[0, 1:4], -0.4886025119029199 * x.flip(0))
@@ -46,25 +46,25 @@ def test_the_functions_have_their_known_values():
 
 def test_a_parity_belongs_to_each_band():
     directions, _ = quadrature()
-    there, back = basis(directions, 3), basis(-directions, 3)
+    there, back = eval_sh_bases(directions, 3), eval_sh_bases(-directions, 3)
     for band in range(4):
         part = slice(band**2, (band + 1) ** 2)
         torch.testing.assert_close(back[:, part], (-1) ** band * there[:, part])
 
 
 def test_colours_follow_the_viewing_direction():
-    dc = dc_of_colours(torch.tensor([[0.2, 0.5, 0.9]]))
+    dc = rgb_to_sh(torch.tensor([[0.2, 0.5, 0.9]]))
     rest = torch.zeros(1, 15, 3)
     right = torch.tensor([[1.0, 0, 0]])
-    torch.testing.assert_close(view_colours(dc, rest, right, 3), torch.tensor([[0.2, 0.5, 0.9]]))
+    torch.testing.assert_close(eval_sh_colors(dc, rest, right, 3), torch.tensor([[0.2, 0.5, 0.9]]))
     rest[0, 2, 0] = -1.0  # grows with x
-    assert view_colours(dc, rest, right, 1)[0, 0] > 0.5 > view_colours(dc, rest, -right, 1)[0, 0]
-    assert float(view_colours(dc, rest, -right, 1)[0, 0]) == 0.0  # not below black
-    torch.testing.assert_close(view_colours(dc, rest, -right, 0), torch.tensor([[0.2, 0.5, 0.9]]))
+    assert eval_sh_colors(dc, rest, right, 1)[0, 0] > 0.5 > eval_sh_colors(dc, rest, -right, 1)[0, 0]
+    assert float(eval_sh_colors(dc, rest, -right, 1)[0, 0]) == 0.0  # not below black
+    torch.testing.assert_close(eval_sh_colors(dc, rest, -right, 0), torch.tensor([[0.2, 0.5, 0.9]]))
     with pytest.raises(ValueError, match="further coefficients"):
-        view_colours(dc, rest[:, :3], right, 2)
+        eval_sh_colors(dc, rest[:, :3], right, 2)
     with pytest.raises(ValueError, match="degree"):
-        basis(right, 4)
+        eval_sh_bases(right, 4)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -74,9 +74,9 @@ def test_colours_have_the_gradients_of_finite_differences(degree):
     def draw(*shape: int) -> torch.Tensor:
         return (0.1 * torch.randn(*shape, generator=generator, dtype=torch.float64)).requires_grad_()
 
-    dc, rest, towards = draw(5, 3), draw(5, function_count(degree) - 1, 3), draw(5, 3)
+    dc, rest, towards = draw(5, 3), draw(5, num_sh_bases(degree) - 1, 3), draw(5, 3)
 
     def colours(dc, rest, towards):
-        return view_colours(dc, rest, torch.nn.functional.normalize(towards, dim=-1), degree)
+        return eval_sh_colors(dc, rest, torch.nn.functional.normalize(towards, dim=-1), degree)
 
     assert torch.autograd.gradcheck(colours, (dc, rest, towards))

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from support.instruction_sets import every_instruction_set, on_threads, using
-from vdgs.geometry.camera import NEAR, Camera
+from vdgs.geometry.camera import NEAR_PLANE, Camera
 from vdgs.kernels.cpu import visibility as native
 from vdgs.kernels.torch_ref import visibility as reference
 
@@ -44,7 +44,7 @@ def flight(count: int, height_m: float = 100.0, extent_m: float = 1000.0, seed: 
 
 
 def brute_force(points: torch.Tensor, cameras: list[Camera]) -> torch.Tensor:
-    seen = [camera.sees(points.double().numpy()) for camera in cameras]
+    seen = [camera.in_frustum(points.double().numpy()) for camera in cameras]
     return torch.from_numpy(np.sum(seen, axis=0, dtype=np.int32))
 
 
@@ -102,7 +102,9 @@ def test_points_at_the_border_of_the_image_are_decided_in_float64(model, offset_
 
 def test_points_about_the_camera_and_on_the_near_plane():
     camera = Camera(camera_from_world=np.eye(4), fx=100.0, fy=100.0, cx=50.0, cy=50.0, width=100, height=100)
-    points = torch.tensor([[0, 0, 0], [0, 0, NEAR], [0, 0, NEAR * 1.01], [0, 0, -1], [0, 0, 1.0]], dtype=torch.float64)
+    points = torch.tensor(
+        [[0, 0, 0], [0, 0, NEAR_PLANE], [0, 0, NEAR_PLANE * 1.01], [0, 0, -1], [0, 0, 1.0]], dtype=torch.float64
+    )
     for implementation in (reference, native):
         assert implementation.mark_visible(points, camera).tolist() == [False, False, True, False, True]
 

@@ -11,10 +11,10 @@ import torch
 from support.hand_made_models import camera_above, model_at, quadrant_of, quadrants
 from vdgs.config.method import MergeConfig
 from vdgs.errors import VdgsError
-from vdgs.model.anchor_model import AnchorModel, ModelMetadata, Part
+from vdgs.model.anchor_model import AnchorModel, DecoderSpan, ModelMetadata
 from vdgs.model.anchors import Anchors
-from vdgs.model.renderer import decode_view, render, render_values
-from vdgs.partition.merging import merge
+from vdgs.model.renderer import decode_view, render, render_scalar_map
+from vdgs.partition.merging import merge_blocks
 
 VIEWS = [camera_above(0.3, -0.2), camera_above(-2.0, 1.0, tilt_deg=30.0), camera_above(40.0, 40.0)]
 
@@ -25,13 +25,13 @@ def scattered(n: int = 300, seed: int = 0) -> np.ndarray:
 
 def in_parts(model: AnchorModel, counts: tuple[int, ...], seeds: tuple[int, ...]) -> AnchorModel:
     decoders = [model_at(np.zeros((1, 3)), decoder_seed=seed).decoder for seed in seeds]
-    return replace(model, parts=tuple(map(Part, counts, decoders)))
+    return replace(model, parts=tuple(map(DecoderSpan, counts, decoders)))
 
 
 @pytest.mark.parametrize("counts", [(300,), (100, 200), (0, 120, 0, 180), (299, 1, 0)])
 def test_parts_with_the_same_decoder_are_one_model(counts):
     model = model_at(scattered())
-    parted = replace(model, parts=tuple(Part(count, model.decoder) for count in counts))
+    parted = replace(model, parts=tuple(DecoderSpan(count, model.decoder) for count in counts))
     values = torch.arange(300.0)
     for view in VIEWS:
         assert torch.equal(render(model, view).image, render(parted, view).image)
@@ -39,7 +39,8 @@ def test_parts_with_the_same_decoder_are_one_model(counts):
         assert torch.equal(whole[0], pieces[0])
         assert torch.equal(whole[1].source, pieces[1].source)
         assert torch.equal(
-            render_values(model, values, view).nan_to_num(-1), render_values(parted, values, view).nan_to_num(-1)
+            render_scalar_map(model, values, view).nan_to_num(-1),
+            render_scalar_map(parted, values, view).nan_to_num(-1),
         )
 
 
@@ -53,7 +54,9 @@ def test_every_part_is_decoded_by_its_own_decoder():
             rows = torch.arange(first, last)
             alone.append(
                 decode_view(
-                    AnchorModel(anchors=model.anchors.select(rows), decoder=decoder, voxel=0.1, background=(0, 0, 0)),
+                    AnchorModel(
+                        anchors=model.anchors.select(rows), decoder=decoder, voxel_size=0.1, background=(0, 0, 0)
+                    ),
                     view,
                 )[1]
             )
@@ -102,14 +105,14 @@ def test_the_merged_scene_decodes_each_block_as_it_was_trained():
     coarse = model_at(scattered())
     blocks, cameras = quadrants(), [VIEWS[:2]] * 4
     trained = trained_apart(coarse, own=True)
-    merged, _ = merge(coarse, trained, blocks, cameras, MergeConfig())
+    merged, _ = merge_blocks(coarse, trained, blocks, cameras, MergeConfig())
     assert [part.count for part in merged.parts] == [len(model.anchors) for model in trained if model is not None]
     for part, model in zip(merged.parts, trained, strict=True):
         assert model is not None
         given, own = part.decoder.tensors(), model.decoder.tensors()
         assert given.keys() == own.keys()
         assert all(torch.equal(given[name], own[name]) for name in own)
-    frozen, _ = merge(coarse, trained_apart(coarse, own=False), blocks, cameras, MergeConfig())
+    frozen, _ = merge_blocks(coarse, trained_apart(coarse, own=False), blocks, cameras, MergeConfig())
     assert frozen.parts == ()
 
 
@@ -117,7 +120,7 @@ def test_the_coarse_decoder_stands_in_with_its_anchors():
     coarse = model_at(scattered())
     trained = trained_apart(coarse, own=True)
     trained[2] = None
-    merged, _ = merge(coarse, trained, quadrants(), [VIEWS[:2]] * 4, MergeConfig(), allow_missing=True)
+    merged, _ = merge_blocks(coarse, trained, quadrants(), [VIEWS[:2]] * 4, MergeConfig(), allow_missing=True)
     assert merged.parts[2].decoder is coarse.decoder
     owner = quadrant_of(coarse.anchors.positions[:, :2].numpy())
     assert merged.parts[2].count == int((owner == 2).sum())

@@ -16,16 +16,16 @@ from scipy.spatial import cKDTree
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
 from vdgs.model.initialization.stereo import (
-    Cell,
+    FusionCell,
     StereoInputs,
     StereoView,
-    dense_points,
-    depth_of_pair,
+    compute_dense_points,
     fusion,
+    pair_depth,
     view_selection,
 )
-from vdgs.model.initialization.stereo.fusion import SIZES, SPACING
-from vdgs.model.initialization.stereo.rectification import Rectified
+from vdgs.model.initialization.stereo.fusion import CELL_SCALES, MIN_SPACING
+from vdgs.model.initialization.stereo.rectification import RectifiedPair
 
 HEIGHT, ROOF, HALF = 20.0, 4.0, 5.0  # of the flight, of a roof about the origin, and half its edge
 SLOPE = 0.05
@@ -87,7 +87,7 @@ def flight() -> list[Camera]:
 def points_of(cameras: list[Camera], tmp_path, threads: int = 1, read=None, cell: float = 0.6, pixels: float = 0.0):
     read = read or (lambda index: (photograph(cameras[index]), None))
     inputs = StereoInputs(cameras, sparse(), sparse(), read)
-    return dense_points(inputs, Cell(cell, pixels), tmp_path, lambda done, of: None, threads)
+    return compute_dense_points(inputs, FusionCell(cell, pixels), tmp_path, lambda done, of: None, threads)
 
 
 def height_at(points: np.ndarray) -> np.ndarray:
@@ -107,12 +107,12 @@ def height_at(points: np.ndarray) -> np.ndarray:
 def test_a_place_lies_in_the_same_row_and_as_far_left_as_its_depth_says(x, y, tilt, turn, focal, place):
     assume(np.hypot(x, y) > 0.5)
     pair = camera(0.0, 0.0, 0.1, 0.3), camera(x, y, tilt, turn, focal)
-    common = Rectified.of(*pair)
+    common = RectifiedPair.of(*pair)
     assume(common is not None)
     found = []
     for which, each in enumerate(pair):
         pixel, _ = each.project(np.array([place]))
-        there = np.linalg.inv(common.to_photograph(each, which)) @ [*(pixel[0] - 0.5), 1.0]
+        there = np.linalg.inv(common.homography_to_image(each, which)) @ [*(pixel[0] - 0.5), 1.0]
         found.append(there[:2] / there[2])
     depth = float(common.rotation[2] @ (np.array(place) - pair[0].position))
     assert found[0][1] == pytest.approx(found[1][1], abs=1e-6)
@@ -123,7 +123,7 @@ def test_a_place_lies_in_the_same_row_and_as_far_left_as_its_depth_says(x, y, ti
 @pytest.mark.parametrize("second", [(4.0, 0.0, 0.0, 0.0), (0.0, 4.0, 0.1, 0.0), (-3.0, 3.0, -0.1, 2.0)])
 def test_the_depth_of_a_pair_is_the_true_one(second):
     first = camera(0.0, 0.0, 0.05)
-    found, true = depth_of_pair(view(first), view(camera(*second))), true_depth(first)
+    found, true = pair_depth(view(first), view(camera(*second))), true_depth(first)
     assert found is not None
     known = found > 0
     assert known.mean() > 0.5
@@ -135,11 +135,11 @@ def test_the_depth_of_a_pair_is_the_true_one(second):
 
 def test_pairs_without_a_common_plane_have_no_depth():
     first = view(camera(0.0, 0.0))
-    assert depth_of_pair(first, first) is None  # no baseline
+    assert pair_depth(first, first) is None  # no baseline
     behind = camera(0.0, 0.0)
     pose = behind.camera_from_world.copy()
     pose[2, 3] += 8.0  # 8 further up: along the line of sight
-    assert depth_of_pair(first, view(replace(behind, camera_from_world=pose))) is None
+    assert pair_depth(first, view(replace(behind, camera_from_world=pose))) is None
 
 
 def test_points_lie_on_the_ground_and_cover_it(tmp_path):
@@ -161,10 +161,10 @@ def test_cells_are_as_large_as_pixels_are(tmp_path):
     right = [camera(x, y) for x in (3.0, 6.0, 9.0) for y in (-3.0, 0.0, 3.0)]
     points = points_of([*left, *right], tmp_path, cell=0.4, pixels=6.0).points
     spacing = cKDTree(points).query(points, k=2)[0][:, 1]
-    assert spacing.min() > SPACING * 0.4 - 1e-9
+    assert spacing.min() > MIN_SPACING * 0.4 - 1e-9
     fine, coarse = (np.abs(points[:, 1]) < 2) & (points[:, 0] < -6), points[:, 0] > 6
     assert np.median(spacing[fine]) < 0.5
-    assert np.median(spacing[coarse]) > SPACING * 0.8 - 1e-9
+    assert np.median(spacing[coarse]) > MIN_SPACING * 0.8 - 1e-9
     assert np.quantile(height_at(points[coarse]), 0.95) < 0.02 * HEIGHT
     wanted = np.array([(x, y) for x in np.arange(7.0, 10.0, 0.5) for y in np.arange(-3.0, 3.0, 0.5)])
     assert (cKDTree(points[:, :2]).query(wanted)[0] < 0.8).mean() > 0.9
@@ -172,10 +172,10 @@ def test_cells_are_as_large_as_pixels_are(tmp_path):
 
 @given(st.lists(st.floats(1e-6, 1e3), min_size=1, max_size=20), st.floats(0.01, 10), st.floats(0, 10))
 def test_a_cell_is_hardly_larger_or_smaller_than_its_pixels_ask_for(widths, least, pixels):
-    asked, edges = pixels * np.array(widths), least * SIZES[Cell(least, pixels).sizes(np.array(widths))]
+    asked, edges = pixels * np.array(widths), least * CELL_SCALES[FusionCell(least, pixels).sizes(np.array(widths))]
     assert (edges >= least).all()
     assert (edges <= np.maximum(least, 1.42 * asked)).all()
-    assert (edges >= np.minimum(least * SIZES[-1], 0.7 * asked)).all()
+    assert (edges >= np.minimum(least * CELL_SCALES[-1], 0.7 * asked)).all()
 
 
 def test_the_same_points_for_any_number_of_threads(tmp_path):
@@ -227,14 +227,14 @@ def test_what_a_mask_leaves_out_starts_nothing(tmp_path):
 def test_every_step_is_told_and_may_stop_the_work(tmp_path):
     told = []
     inputs = StereoInputs(flight(), sparse(), sparse(), lambda index: (photograph(flight()[index]), None))
-    dense_points(inputs, Cell(0.6, 0.0), tmp_path, lambda done, of: told.append((done, of)))
+    compute_dense_points(inputs, FusionCell(0.6, 0.0), tmp_path, lambda done, of: told.append((done, of)))
     assert told == [(step, 18) for step in range(1, 19)]
 
     def stop(done: int, of: int) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        dense_points(inputs, Cell(0.6, 0.0), tmp_path, stop)
+        compute_dense_points(inputs, FusionCell(0.6, 0.0), tmp_path, stop)
     assert not list(tmp_path.iterdir())
 
 

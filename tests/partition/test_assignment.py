@@ -15,12 +15,18 @@ from rich.console import Console
 from support.assignment import CONFIG, MODES, camera, hand_made, scene, skyward, strips
 from vdgs.errors import RunError
 from vdgs.kernels import cpu as kernels
-from vdgs.partition.assignment.assign_cameras import ABOVE_THRESHOLD, BEST_BLOCK, NOT_ASSIGNED, TOPPED_UP, assign
-from vdgs.partition.assignment.assignment_tables import assignment_rows, assignment_table, explain
+from vdgs.partition.assignment.assign_cameras import (
+    ABOVE_THRESHOLD,
+    BEST_BLOCK,
+    NOT_ASSIGNED,
+    TOPPED_UP,
+    assign_cameras,
+)
+from vdgs.partition.assignment.assignment_tables import assignment_rows, explain_assignment, make_assignment_table
 from vdgs.partition.assignment.score_file import load_scores, save_scores
-from vdgs.partition.assignment.score_matrix import score_matrix
-from vdgs.partition.block_records import AssignedBlock
-from vdgs.system.records import plain, record_of
+from vdgs.partition.assignment.score_matrix import compute_score_matrix
+from vdgs.partition.block_records import BlockCamerasRecord
+from vdgs.system.records import record_from_dict, record_to_dict
 
 # Whom each block gets
 
@@ -40,7 +46,7 @@ def test_laws_of_assignment(matrix, mode, floor):
     scores = hand_made(*matrix, mode=mode)
     config = replace(CONFIG, mode=mode, min_cameras=floor)
     threshold = 0.05 if mode == "leave_one_out" else 0.45
-    result = assign(scores, config)
+    result = assign_cameras(scores, config)
     seen = scores.held > 0
     assert result.cameras.any(axis=1).all(), "every camera serves a block"
     assert np.array_equal(result.cameras, result.why != NOT_ASSIGNED)
@@ -58,50 +64,50 @@ def test_laws_of_assignment(matrix, mode, floor):
     for row, block in zip(*np.nonzero(result.why == BEST_BLOCK), strict=True):
         best = scores.scores[row, seen[row]].max() if seen[row].any() else scores.scores[row].max()
         assert scores.scores[row, block] == best
-    assert np.array_equal(assign(scores, config).why, result.why)
+    assert np.array_equal(assign_cameras(scores, config).why, result.why)
 
 
 @pytest.mark.parametrize("mode", ["coverage", "literal"])
 def test_without_its_best_block_a_camera_may_train_nothing(mode):
     scores = np.array([[0.9, 0.1], [0.3, 0.2], [0.0, 0.5]])
     given = hand_made(scores, np.ones((3, 2), int), mode=mode)
-    literal = assign(given, replace(CONFIG, mode=mode, best_block=False, min_cameras=0))
+    literal = assign_cameras(given, replace(CONFIG, mode=mode, best_block=False, min_cameras=0))
     assert np.array_equal(literal.cameras, scores > 0.45)
-    assert assign(given, replace(CONFIG, mode=mode, min_cameras=0)).cameras.any(axis=1).all()
+    assert assign_cameras(given, replace(CONFIG, mode=mode, min_cameras=0)).cameras.any(axis=1).all()
 
 
 def test_equal_scores_are_settled_by_anchors_held_and_then_by_index():
     scores = hand_made([[0.2, 0.2, 0.2]] * 4, [[1, 2, 2], [1, 1, 1], [3, 0, 0], [1, 1, 0]])
-    result = assign(scores, replace(CONFIG, min_cameras=2))
+    result = assign_cameras(scores, replace(CONFIG, min_cameras=2))
     assert np.argmax(result.why == BEST_BLOCK, axis=1).tolist() == [1, 0, 0, 0]
     assert np.flatnonzero(result.why[:, 1] == TOPPED_UP).tolist() == [1]
     assert np.flatnonzero(result.why[:, 2] == TOPPED_UP).tolist() == [0, 1]
 
 
 def test_a_camera_that_sees_nothing_joins_the_block_beneath_it():
-    scores = score_matrix(scene(), strips(4), [skyward()], CONFIG)
+    scores = compute_score_matrix(scene(), strips(4), [skyward()], CONFIG)
     assert scores.beneath.tolist() == [3]
-    assert assign(scores, CONFIG).why.tolist() == [[0, 0, 0, BEST_BLOCK]]
+    assert assign_cameras(scores, CONFIG).why.tolist() == [[0, 0, 0, BEST_BLOCK]]
 
 
 def test_a_camera_over_the_ring_alone_is_not_taken_for_it():
     """It would draw anchors that do not move, and teach nothing."""
     scores = hand_made([[0.9, 0.6]], [[0, 5]])
-    assert assign(scores, CONFIG).why.tolist() == [[NOT_ASSIGNED, ABOVE_THRESHOLD]]
-    assert assign(replace(scores, mode="literal"), CONFIG).why.tolist() == [[ABOVE_THRESHOLD, ABOVE_THRESHOLD]]
+    assert assign_cameras(scores, CONFIG).why.tolist() == [[NOT_ASSIGNED, ABOVE_THRESHOLD]]
+    assert assign_cameras(replace(scores, mode="literal"), CONFIG).why.tolist() == [[ABOVE_THRESHOLD, ABOVE_THRESHOLD]]
 
 
 def test_a_block_without_cameras_complains_and_says_why():
-    scores = score_matrix(scene(), strips(4), [camera(2.0), camera(8.0)], CONFIG)
-    lines = assign(scores, replace(CONFIG, min_cameras=5)).complaints
+    scores = compute_score_matrix(scene(), strips(4), [camera(2.0), camera(8.0)], CONFIG)
+    lines = assign_cameras(scores, replace(CONFIG, min_cameras=5)).complaints
     assert [line.split(":")[0] for line in lines] == ["Block 2", "Block 3"]
     assert "no training camera sees any of its 225 anchors" in lines[1]
-    (unpicked,) = assign(hand_made([[0.3, 0.2]]), CONFIG).complaints
+    (unpicked,) = assign_cameras(hand_made([[0.3, 0.2]]), CONFIG).complaints
     assert "1 training camera(s) see" in unpicked
     assert "best: 0.2" in unpicked
     nothing = replace(hand_made([[1.0, 0.0]]), anchors=np.array([7, 0]))
-    assert "Block 1 holds no anchors" in assign(nothing, CONFIG).complaints[0]
-    assert assign(hand_made([[0.3, 0.2]]), replace(CONFIG, min_cameras=1)).complaints == []
+    assert "Block 1 holds no anchors" in assign_cameras(nothing, CONFIG).complaints[0]
+    assert assign_cameras(hand_made([[0.3, 0.2]]), replace(CONFIG, min_cameras=1)).complaints == []
 
 
 # What is kept and shown
@@ -109,8 +115,8 @@ def test_a_block_without_cameras_complains_and_says_why():
 
 @pytest.fixture
 def saved(tmp_path):
-    scores = score_matrix(scene(), strips(4), [camera(2.0), camera(8.0), skyward()], CONFIG)
-    result = assign(scores, CONFIG)
+    scores = compute_score_matrix(scene(), strips(4), [camera(2.0), camera(8.0), skyward()], CONFIG)
+    result = assign_cameras(scores, CONFIG)
     path = tmp_path / "partition" / "scores.npz"
     save_scores(path, ["a.jpg", "b/ö.jpg", "c.jpg"], scores, result)
     return path, scores, result
@@ -133,8 +139,8 @@ def test_what_is_saved_is_loaded(saved):
 
 
 def test_the_scores_of_no_camera_at_all_can_be_saved(tmp_path):
-    scores = score_matrix(scene(), strips(2), [], CONFIG)
-    result = assign(scores, CONFIG)
+    scores = compute_score_matrix(scene(), strips(2), [], CONFIG)
+    result = assign_cameras(scores, CONFIG)
     assert len(result.complaints) == 2
     save_scores(tmp_path / "none.npz", [], scores, result)
     assert load_scores(tmp_path / "none.npz").scores.scores.shape == (0, 2)
@@ -174,14 +180,14 @@ def test_a_file_whose_arrays_disagree_is_refused(saved):
 
 def test_anyone_can_ask_why(saved):
     names, scores, result = load_scores(saved[0])
-    rows = explain(names, scores, result, "b/ö.jpg")
+    rows = explain_assignment(names, scores, result, "b/ö.jpg")
     assert [row.block for row in rows[:1]] == [1]
     assert rows[0].why == "above the threshold"
     assert [row.score for row in rows[1:]] == sorted((row.score for row in rows[1:]), reverse=True)
     assert {row.why for row in rows[1:]} == {"not assigned"}
     assert sorted(row.block for row in rows) == [0, 1, 2, 3]
     with pytest.raises(RunError, match="no training view 'z'"):
-        explain(names, scores, result, "z")
+        explain_assignment(names, scores, result, "z")
 
 
 def test_the_table_counts_what_was_decided(saved):
@@ -196,9 +202,9 @@ def test_the_table_counts_what_was_decided(saved):
         assert row.area == pytest.approx(36.0)
     assert rows[3].mean_v == 0.0 < rows[0].mean_v
     console = Console(width=100, file=io.StringIO())
-    console.print(assignment_table(rows))
+    console.print(make_assignment_table(rows))
     lines = [line.split() for line in console.file.getvalue().splitlines()]
     assert [line[:2] for line in lines if line and line[0].isdigit()] == [
         [str(row.block), str(row.cameras)] for row in rows
     ]
-    assert [record_of(AssignedBlock, json.loads(json.dumps(plain(row)))) for row in rows] == rows
+    assert [record_from_dict(BlockCamerasRecord, json.loads(json.dumps(record_to_dict(row)))) for row in rows] == rows

@@ -14,15 +14,15 @@ from vdgs.config.method import AssignmentConfig
 from vdgs.geometry.camera import Camera
 from vdgs.kernels import cpu as kernels
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.model.renderer import decode_rows, render, visible_rows
-from vdgs.partition.assignment.score_matrix import score_matrix, select_splats
+from vdgs.model.renderer import cull_anchors, decode_anchors, render
+from vdgs.partition.assignment.score_matrix import compute_score_matrix, select_splats
 from vdgs.partition.blocks import Blocks
 
 
 @pytest.mark.parametrize("mode", RENDERED)
 def test_one_block_is_the_whole_scene(mode):
     config = replace(CONFIG, mode=mode)
-    scores = score_matrix(scene(), strips(1), [*flight(), skyward()], config)
+    scores = compute_score_matrix(scene(), strips(1), [*flight(), skyward()], config)
     assert np.array_equal(scores.covered[:, 0], [1.0] * 9 + [0.0])
     assert np.array_equal(scores.held[:, 0] > 0, [True] * 9 + [False])
     if mode == "leave_one_out":
@@ -36,13 +36,13 @@ def test_the_splats_of_a_block_draw_what_the_block_alone_draws(instructions):
     model, blocks, view = scene(), strips(3), camera(8.0, tilt_deg=30.0)
     places = model.anchors.positions[:, :2].double().numpy()
     with using(instructions), torch.no_grad():
-        rows = visible_rows(model.anchors, view)
-        splats = decode_rows(model.anchors, rows, model.decoder.weights, view)
+        rows = cull_anchors(model.anchors, view)
+        splats = decode_anchors(model.anchors, rows, model.decoder.weights, view)
         anchor = rows[splats.source.long() // 4]
         for index in range(3):
-            reached = torch.from_numpy(blocks.reaches(index, places))
+            reached = torch.from_numpy(blocks.in_expanded(index, places))
             some = select_splats(splats, reached[anchor].nonzero().squeeze(1))
-            ours = kernels.rasterise(some, torch.zeros(3), view.width, view.height)
+            ours = kernels.rasterize(some, torch.zeros(3), view.width, view.height)
             alone = render(replace(model, anchors=model.anchors.select(reached)), view, background=(0.0, 0.0, 0.0))
             assert torch.equal(ours.image, alone.image)
             assert torch.equal(ours.alpha, alone.alpha)
@@ -53,11 +53,11 @@ def expected_scores(mode: str, model: AnchorModel, blocks: Blocks, view: Camera)
     positions, black = model.anchors.positions, (0.0, 0.0, 0.0)
     places = positions[:, :2].double().numpy()
     part = lambda keep: replace(model, anchors=model.anchors.select(torch.from_numpy(keep)))  # noqa: E731
-    small = view.within(CONFIG.longest_side_px)
+    small = view.limit_size(CONFIG.image_size)
     full, scores = render(model, small, background=black), []
     for index in range(len(blocks)):
         own = blocks.owner(places) == index
-        block = render(part(blocks.reaches(index, places)), small, background=black)
+        block = render(part(blocks.in_expanded(index, places)), small, background=black)
         alike = (block.image - full.image).abs().mean(-1) < CONFIG.tau
         if mode == "coverage":
             drawn = full.alpha > 0.5
@@ -65,7 +65,7 @@ def expected_scores(mode: str, model: AnchorModel, blocks: Blocks, view: Camera)
         elif mode == "literal":
             scores.append(float(alike.float().mean()))
         elif mode == "frustum":
-            scores.append(float(view.sees(positions.double().numpy()[own]).mean()))
+            scores.append(float(view.in_frustum(positions.double().numpy()[own]).mean()))
         else:
             rest = render(part(~own), small, background=black).image
             target = (full.image.clamp(0, 1) * 255).round().to(torch.uint8)
@@ -76,13 +76,15 @@ def expected_scores(mode: str, model: AnchorModel, blocks: Blocks, view: Camera)
 @pytest.mark.parametrize("mode", MODES)
 def test_scores_are_what_whole_renders_give(mode):
     blocks, views = strips(4), flight()[1:4]
-    scores = score_matrix(scene(), blocks, views, replace(CONFIG, mode=mode))
+    scores = compute_score_matrix(scene(), blocks, views, replace(CONFIG, mode=mode))
     expected = [expected_scores(mode, scene(), blocks, view) for view in views]
     assert scores.scores == pytest.approx(np.array(expected), abs=3e-3)
     assert np.count_nonzero(scores.scores > 0.1) >= 3
     everything = scene().anchors.positions.double().numpy()
     owner = blocks.owner(everything[:, :2])
-    assert scores.held.tolist() == [np.bincount(owner[view.sees(everything)], minlength=4).tolist() for view in views]
+    assert scores.held.tolist() == [
+        np.bincount(owner[view.in_frustum(everything)], minlength=4).tolist() for view in views
+    ]
     assert scores.anchors.tolist() == np.bincount(owner, minlength=4).tolist()
     assert np.isnan(scores.covered).all() == (mode == "frustum")
 
@@ -90,17 +92,17 @@ def test_scores_are_what_whole_renders_give(mode):
 def test_empty_pixels_count_in_literal_mode_alone():
     """From high above, the scene fills a small part of the picture: the rest matches any block, however far."""
     views = [camera(WIDTH / 2, height=60.0)]
-    literal, coverage = (score_matrix(scene(), strips(4), views, replace(CONFIG, mode=m)) for m in MODES[1::-1])
+    literal, coverage = (compute_score_matrix(scene(), strips(4), views, replace(CONFIG, mode=m)) for m in MODES[1::-1])
     assert (literal.scores > 0.8).all()
     assert (coverage.scores < 0.5).all()
     assert np.array_equal(literal.covered, coverage.scores)
-    empty = score_matrix(scene(), strips(4), [skyward()], replace(CONFIG, mode="literal"))
+    empty = compute_score_matrix(scene(), strips(4), [skyward()], replace(CONFIG, mode="literal"))
     assert (empty.scores == 1).all()
 
 
 @pytest.mark.parametrize("mode", ["coverage", "leave_one_out", "frustum"])
 def test_a_block_out_of_view_scores_nothing(mode):
-    scores = score_matrix(scene(), strips(4), [camera(2.0)], replace(CONFIG, mode=mode))
+    scores = compute_score_matrix(scene(), strips(4), [camera(2.0)], replace(CONFIG, mode=mode))
     assert scores.scores[0, 0] > 0.05
     assert scores.scores[0, 2:].tolist() == [0.0, 0.0]
     assert scores.held[0, 2:].tolist() == [0, 0]
@@ -111,9 +113,11 @@ def test_scores_depend_on_no_other_camera_and_on_no_number_of_threads(mode):
     config, views, blocks = replace(CONFIG, mode=mode), flight(), strips(3)
     order, told = np.random.default_rng(1).permutation(len(views)), []
     with on_threads(1):
-        alone = score_matrix(scene(), blocks, views, config)
+        alone = compute_score_matrix(scene(), blocks, views, config)
     with on_threads(3):
-        shuffled = score_matrix(scene(), blocks, [views[i] for i in order], config, lambda *done: told.append(done))
+        shuffled = compute_score_matrix(
+            scene(), blocks, [views[i] for i in order], config, lambda *done: told.append(done)
+        )
     for name in ("scores", "held", "covered", "beneath"):
         assert np.array_equal(getattr(alone, name)[order], getattr(shuffled, name), equal_nan=name == "covered")
     assert told == [(i + 1, 9) for i in range(9)]
@@ -121,5 +125,5 @@ def test_scores_depend_on_no_other_camera_and_on_no_number_of_threads(mode):
 
 def test_pictures_are_made_smaller_and_never_larger():
     big = replace(camera(0.0), width=6400, height=4800)
-    assert (big.within(CONFIG.longest_side_px).width, big.within(CONFIG.longest_side_px).height) == (48, 36)
-    assert camera(0.0).within(AssignmentConfig().longest_side_px).width == 64
+    assert (big.limit_size(CONFIG.image_size).width, big.limit_size(CONFIG.image_size).height) == (48, 36)
+    assert camera(0.0).limit_size(AssignmentConfig().image_size).width == 64

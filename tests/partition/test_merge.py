@@ -18,9 +18,9 @@ from vdgs.kernels import cpu as kernels
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.renderer import render
-from vdgs.partition.block_records import MergedBlock
+from vdgs.partition.block_records import MergedBlockRecord
 from vdgs.partition.blocks import Block, Blocks
-from vdgs.partition.merging import giver_of_places, merge
+from vdgs.partition.merging import block_of_points, merge_blocks
 
 OWNER, BEST_SEEN = MergeConfig("owner"), MergeConfig("best_seen")
 NO_CAMERAS = [[]] * 4
@@ -52,10 +52,16 @@ def places(model: AnchorModel) -> np.ndarray:
 def test_merging_one_block_is_the_identity(config: MergeConfig):
     core = shapely.box(-1, -1, 1, 1)
     blocks, coarse, trained = Blocks((Block(core, core.buffer(0.4)),)), scattered(50), scattered(80, seed=1)
-    merged, became = merge(coarse, [trained], blocks, [[camera_above(0, 0)]], config)
+    merged, became = merge_blocks(coarse, [trained], blocks, [[camera_above(0, 0)]], config)
     assert bits(merged.anchors) == bits(trained.anchors)
-    assert (merged.voxel, merged.background, merged.metadata) == (coarse.voxel, coarse.background, coarse.metadata)
-    assert replace(became[0], unseen=0) == MergedBlock(block=0, trained=80, kept=80, dropped=0, from_coarse=0, unseen=0)
+    assert (merged.voxel_size, merged.background, merged.metadata) == (
+        coarse.voxel_size,
+        coarse.background,
+        coarse.metadata,
+    )
+    assert replace(became[0], unseen=0) == MergedBlockRecord(
+        block=0, trained=80, kept=80, dropped=0, coarse_fallback=0, unseen=0
+    )
 
 
 @settings(max_examples=25)
@@ -66,8 +72,8 @@ def test_the_merged_scene_is_a_disjoint_union(seed: int, config: MergeConfig):
     blocks, coarse = quadrants(), scattered(40, seed)
     trained = [scattered(int(rng.integers(0, 60)), seed + 1 + i) for i in range(4)]
     cameras = [[camera_above(*rng.uniform(-3, 3, 2)) for _ in range(rng.integers(0, 4))] for _ in range(4)]
-    merged, became = merge(coarse, trained, blocks, cameras, config)
-    givers = [giver_of_places(each.anchors.positions, blocks, cameras, config) for each in trained]
+    merged, became = merge_blocks(coarse, trained, blocks, cameras, config)
+    givers = [block_of_points(each.anchors.positions, blocks, cameras, config) for each in trained]
     expected = [
         row
         for i, each in enumerate(trained)
@@ -84,17 +90,17 @@ def test_the_merged_scene_is_a_disjoint_union(seed: int, config: MergeConfig):
 def test_untrained_blocks_give_the_coarse_scene_back(config: MergeConfig):
     """Every place has one giver: nothing is lost and nothing is doubled where the blocks overlap."""
     blocks, coarse = quadrants(), scattered(500)
-    trained = [part(coarse, blocks.reaches(i, places(coarse))) for i in range(4)]
+    trained = [part(coarse, blocks.in_expanded(i, places(coarse))) for i in range(4)]
     assert sum(len(each.anchors) for each in trained) > 550  # the rings do overlap
     cameras = [[camera_above(x, y)] for x, y in ((-1, -1), (-1, 1), (1, -1), (1, 1))]
-    merged, _ = merge(coarse, trained, blocks, cameras, config)
+    merged, _ = merge_blocks(coarse, trained, blocks, cameras, config)
     assert sorted(rows(merged.anchors)) == sorted(rows(coarse.anchors))
 
 
 def test_the_owner_gives():
     blocks, coarse = quadrants(), scattered(300)
     trained = [scattered(300, seed=i + 1) for i in range(4)]
-    merged, became = merge(coarse, trained, blocks, NO_CAMERAS, OWNER)
+    merged, became = merge_blocks(coarse, trained, blocks, NO_CAMERAS, OWNER)
     expected = [
         row for i, each in enumerate(trained) for row in rows(part(each, quadrant_of(places(each)) == i).anchors)
     ]
@@ -105,7 +111,7 @@ def test_the_owner_gives():
 def test_a_merged_plane_is_drawn_as_the_coarse_one():
     coarse = opaque_plane()
     trained = [part(coarse, quadrant_of(places(coarse)) == i) for i in range(4)]
-    merged, _ = merge(coarse, trained, quadrants(), NO_CAMERAS, OWNER)
+    merged, _ = merge_blocks(coarse, trained, quadrants(), NO_CAMERAS, OWNER)
     camera = camera_above(0.3, -0.2, tilt_deg=10)
     difference = render(merged, camera).image - render(coarse, camera).image
     assert float(render(coarse, camera).alpha.min()) > 0.9
@@ -123,7 +129,7 @@ def test_what_the_owner_did_not_see_is_coarse_still():
         features = torch.where(seen[:, None], own.anchors.features + 1, own.anchors.features)
         trained.append(replace(own, anchors=replace(own.anchors, features=features)))
         unseen.append(int((~seen).sum()))
-    merged, became = merge(coarse, trained, blocks, cameras, OWNER)
+    merged, became = merge_blocks(coarse, trained, blocks, cameras, OWNER)
     assert min(unseen) > 0
     assert [each.unseen for each in became] == unseen
     assert len(set(rows(merged.anchors)) & set(rows(coarse.anchors))) == sum(unseen)
@@ -137,14 +143,14 @@ def test_best_seen_prefers_the_cameras_that_see_it_most():
 
     def giver(*views: int) -> list[int]:
         cameras = [above[:count] for count in views]
-        return giver_of_places(positions, blocks, cameras, BEST_SEEN).tolist()
+        return block_of_points(positions, blocks, cameras, BEST_SEEN).tolist()
 
     assert giver(1, 0, 2, 0) == [2, 0, 0]  # reached by 0 and 2; the second place by 0 alone
     assert giver(2, 0, 2, 0) == [0, 0, 0]  # of equals the owner
     assert giver(0, 3, 0, 3) == [0, 0, 0]  # those that do not reach it have no say
     corner = torch.tensor([[-0.5, -0.5, 0.0]])
     cameras = [[], [camera_above(0, 0)], [camera_above(0, 0)], []]
-    assert giver_of_places(corner, blocks, cameras, BEST_SEEN).tolist() == [1]  # else the first
+    assert block_of_points(corner, blocks, cameras, BEST_SEEN).tolist() == [1]  # else the first
 
 
 def test_a_missing_block_stops_the_merge():
@@ -153,10 +159,10 @@ def test_a_missing_block_stops_the_merge():
     with pytest.raises(
         VdgsError, match=r"blocks 1, 3 are not trained[^`]*vdgs train RUN --block 1\n.*--block 3"
     ) as error:
-        merge(coarse, some, quadrants(), NO_CAMERAS, OWNER)
+        merge_blocks(coarse, some, quadrants(), NO_CAMERAS, OWNER)
     assert "--incomplete" in str(error.value)
     with pytest.raises(VdgsError, match=r"^block 0 is not trained"):
-        merge(coarse, [None, *some[2:3] * 3], quadrants(), NO_CAMERAS, OWNER)
+        merge_blocks(coarse, [None, *some[2:3] * 3], quadrants(), NO_CAMERAS, OWNER)
 
 
 @pytest.mark.parametrize("config", [OWNER, BEST_SEEN])
@@ -165,10 +171,10 @@ def test_coarse_anchors_stand_in_for_a_missing_block(config: MergeConfig):
     trained: list[AnchorModel | None] = [scattered(300, seed=i + 1) for i in range(4)]
     trained[2] = None
     cameras = [[camera_above(0, 0, 8.0)] * (2 if i == 3 else 1) for i in range(4)]
-    merged, became = merge(coarse, trained, blocks, cameras, config, allow_missing=True)
+    merged, became = merge_blocks(coarse, trained, blocks, cameras, config, allow_missing=True)
     stood_in = rows(part(coarse, quadrant_of(places(coarse)) == 2).anchors)
     assert set(rows(merged.anchors)) & set(rows(coarse.anchors)) == set(stood_in)
-    assert became[2].from_coarse == became[2].kept + became[2].from_coarse == len(stood_in)
+    assert became[2].coarse_fallback == became[2].kept + became[2].coarse_fallback == len(stood_in)
     others = part(merged, quadrant_of(places(merged)) == 2).anchors
     assert sorted(rows(others)) == sorted(stood_in)  # nobody else gives there
 
@@ -176,29 +182,29 @@ def test_coarse_anchors_stand_in_for_a_missing_block(config: MergeConfig):
 def test_a_missing_block_is_given_nothing_of_others():
     """However many of its cameras see its ring: it has no anchors there, and a hole would be left."""
     blocks, coarse = quadrants(), scattered(500)
-    trained: list[AnchorModel | None] = [part(coarse, blocks.reaches(i, places(coarse))) for i in range(4)]
+    trained: list[AnchorModel | None] = [part(coarse, blocks.in_expanded(i, places(coarse))) for i in range(4)]
     trained[2] = None
     cameras = [[camera_above(0, 0, 8.0)] * (3 if i == 2 else 1) for i in range(4)]
-    merged, _ = merge(coarse, trained, blocks, cameras, BEST_SEEN, allow_missing=True)
+    merged, _ = merge_blocks(coarse, trained, blocks, cameras, BEST_SEEN, allow_missing=True)
     assert sorted(rows(merged.anchors)) == sorted(rows(coarse.anchors))
 
 
 def test_all_blocks_missing_is_the_coarse_scene():
     coarse = scattered()
-    merged, became = merge(coarse, [None] * 4, quadrants(), NO_CAMERAS, OWNER, allow_missing=True)
+    merged, became = merge_blocks(coarse, [None] * 4, quadrants(), NO_CAMERAS, OWNER, allow_missing=True)
     assert sorted(rows(merged.anchors)) == sorted(rows(coarse.anchors))
-    assert sum(each.from_coarse for each in became) == len(coarse.anchors)
+    assert sum(each.coarse_fallback for each in became) == len(coarse.anchors)
 
 
 def test_a_block_of_another_coarse_model_is_refused():
     coarse, own = scattered(), scattered(seed=1)
     stranger = model_at(np.zeros((3, 3)), decoder_seed=1)
     with pytest.raises(VdgsError, match=r"block 2 was trained from another coarse model.*vdgs train RUN --block 2"):
-        merge(coarse, [own, own, stranger, own], quadrants(), NO_CAMERAS, OWNER)
+        merge_blocks(coarse, [own, own, stranger, own], quadrants(), NO_CAMERAS, OWNER)
     with pytest.raises(VdgsError, match="block 0 was trained from another"):
-        merge(coarse, [replace(own, voxel=0.2), own, own, own], quadrants(), NO_CAMERAS, OWNER)
+        merge_blocks(coarse, [replace(own, voxel_size=0.2), own, own, own], quadrants(), NO_CAMERAS, OWNER)
 
 
 def test_as_many_models_as_blocks():
     with pytest.raises(ValueError, match="3 models and 4 camera lists for 4 blocks"):
-        merge(scattered(), [scattered()] * 3, quadrants(), NO_CAMERAS, OWNER)
+        merge_blocks(scattered(), [scattered()] * 3, quadrants(), NO_CAMERAS, OWNER)

@@ -23,8 +23,8 @@ from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu
 from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.partition import clustering
 from vdgs.partition.blocks import Block, Blocks, load_blocks, save_blocks, save_blocks_wgs84
-from vdgs.partition.boundary import alpha_shape, widen
-from vdgs.partition.partition_scene import choose_block_count, cut_scene
+from vdgs.partition.boundary import alpha_shape, expand_core
+from vdgs.partition.partition_scene import choose_block_count, partition_scene
 from vdgs.pipeline.train_blocks import _block_bytes
 from vdgs.runs.run_folder import RunFolder
 
@@ -39,7 +39,7 @@ def town(n: int = 4000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def cut(positions: np.ndarray, views: np.ndarray, count: int = 4, **settings: object) -> Blocks:
-    return cut_scene(positions, views, PartitionConfig(blocks=count, **settings), seed=0)[0]
+    return partition_scene(positions, views, PartitionConfig(blocks=count, **settings), seed=0)[0]
 
 
 def owners(blocks: Blocks, positions: np.ndarray) -> np.ndarray:
@@ -105,7 +105,7 @@ def test_every_place_has_one_owner_and_cores_are_disjoint_within_their_boundarie
     for block in blocks.items:
         assert block.core.is_valid
         assert block.expanded.is_valid
-        assert block.core.difference(block.expanded).area == 0
+        assert block.core.gain_spread(block.expanded).area == 0
         assert block.expanded.area > 1.2 * block.core.area
     generator = np.random.default_rng(4)
     places = np.concatenate(
@@ -118,7 +118,7 @@ def test_every_place_has_one_owner_and_cores_are_disjoint_within_their_boundarie
     for index, block in enumerate(blocks.items):
         inside = shapely.contains_xy(block.core, places)
         assert (owner[inside] == index).all()
-        reached = blocks.reaches(index, places)
+        reached = blocks.in_expanded(index, places)
         assert reached[owner == index].all()
         assert np.array_equal(reached, shapely.contains_xy(block.expanded, places) | (owner == index))
 
@@ -136,7 +136,7 @@ def test_the_first_of_equally_near_cores_owns_a_place_and_no_place_is_no_trouble
 
 def test_one_block_owns_everything() -> None:
     positions, views = town(500)
-    blocks, warnings = cut_scene(positions, views, PartitionConfig(blocks=1), seed=0)
+    blocks, warnings = partition_scene(positions, views, PartitionConfig(blocks=1), seed=0)
     assert len(blocks) == 1
     assert warnings == []
     assert shapely.contains_xy(blocks.items[0].core, positions[:, :2]).all()
@@ -195,7 +195,7 @@ def test_balanced_blocks_hold_about_equally_many_anchors() -> None:
 def test_weights_of_balanced_clusters_are_those_of_a_look_at_all_costs_in_each_step(count: int, digits: int) -> None:
     """Ties too, among features that were rounded."""
     features = np.round(np.random.default_rng(count).normal(size=(60 * count, 3)), digits)
-    squares = clustering._squares(features, features[:count])
+    squares = clustering._squared_distances(features, features[:count])
     share, weights = 60, np.zeros(count)
     for _ in range(clustering.BALANCED_SWEEPS * count):
         costs = squares - weights
@@ -224,7 +224,7 @@ def test_anchors_that_cannot_be_cut_are_refused() -> None:
     with pytest.raises(VdgsError, match="--blocks 0"):
         cut(three, views, 0)
     with pytest.raises(ValueError, match="choose_block_count"):
-        cut_scene(three, views, PartitionConfig(blocks="auto"), 0)
+        partition_scene(three, views, PartitionConfig(blocks="auto"), 0)
 
 
 @pytest.mark.parametrize("count", [2, 3])
@@ -237,7 +237,7 @@ def test_a_handful_of_anchors_or_a_line_of_them_is_cut(count: int) -> None:
 
 def notes(positions: np.ndarray, views: np.ndarray, count: int, **settings: object) -> str:
     """What people are told of a cut."""
-    return " ".join(cut_scene(positions, views, PartitionConfig(blocks=count, **settings), seed=0)[1])
+    return " ".join(partition_scene(positions, views, PartitionConfig(blocks=count, **settings), seed=0)[1])
 
 
 def test_fewer_blocks_than_asked_for_are_said_with_the_reason() -> None:
@@ -326,8 +326,8 @@ def test_an_alpha_shape_follows_a_bay_and_widening_follows_the_area() -> None:
     assert shape.area == pytest.approx(58, rel=0.05)
     assert shapely.covers(shape, shapely.points(points)).all()
     disc = shapely.Point(3, 4).buffer(5, quad_segs=64)
-    assert widen(disc, 0.4).area == pytest.approx(1.96 * disc.area, rel=0.01)
-    assert widen(disc, 0.0) is disc
+    assert expand_core(disc, 0.4).area == pytest.approx(1.96 * disc.area, rel=0.01)
+    assert expand_core(disc, 0.0) is disc
     assert alpha_shape(np.array([[0.0, 0], [1, 1], [2, 2]]), 1.0) is None
 
 
@@ -341,7 +341,7 @@ def test_what_is_read_owns_what_was_written(tmp_path: Path) -> None:
     read = load_blocks(tmp_path / "blocks.geojson")
     places = np.random.default_rng(9).uniform(-50, 150, (5000, 2))
     assert np.array_equal(read.owner(places), blocks.owner(places))
-    assert all(np.array_equal(read.reaches(k, places), blocks.reaches(k, places)) for k in range(4))
+    assert all(np.array_equal(read.in_expanded(k, places), blocks.in_expanded(k, places)) for k in range(4))
     features = json.loads((tmp_path / "blocks.geojson").read_text())["features"]
     assert [f["properties"]["anchors"] for f in features] == [0, 0, 1, 1, 2, 2, 3, 3]
 
@@ -375,7 +375,7 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("origin", [(47.3, 8.5, 440.0), (-17.0, 179.9999, 20.0), (-33.9, -70.6, 900.0)])
 def test_blocks_on_the_map(tmp_path: Path, origin: tuple[float, float, float]) -> None:
-    ring = shapely.box(-400, -300, 500, 300).difference(shapely.box(-50, -50, 60, 50))
+    ring = shapely.box(-400, -300, 500, 300).gain_spread(shapely.box(-50, -50, 60, 50))
     hole = shapely.box(-50, -50, 60, 50)
     blocks = Blocks((Block(ring, ring.buffer(40)), Block(hole, hole.buffer(10))))
     ground = GroundFrame(

@@ -17,15 +17,15 @@ from vdgs.geometry.camera import Camera
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.model.scale_bounds import REACH, SPAN, largest_log_scales
+from vdgs.model.scale_bounds import MAX_IMAGE_FRACTION, MAX_SIGMA, max_log_scales
 from vdgs.partition import boundary
 from vdgs.partition.assignment import score_matrix as scoring
 from vdgs.partition.blocks import Block, Blocks
-from vdgs.partition.merging import merge
-from vdgs.partition.polygon_lookup import Cores
+from vdgs.partition.merging import merge_blocks
+from vdgs.partition.polygon_lookup import BlockCores
 from vdgs.synth import synthetic_points, true_visibility
-from vdgs.visibility.frustum import Frusta, project
-from vdgs.visibility.spatial_groups import GROUP, Groups
+from vdgs.visibility.frustum import Frusta, project_points
+from vdgs.visibility.spatial_groups import GROUP_SIZE, SpatialGroups
 
 
 def flight(count: int, extent: float, seed: int = 0) -> list[Camera]:
@@ -55,22 +55,22 @@ def site(count: int, extent: float, seed: int = 1) -> torch.Tensor:
 # ------------------------------------------------------------------------------ places about a camera
 
 
-@pytest.mark.parametrize("count", [1, GROUP - 1, GROUP, 20 * GROUP + 3])
+@pytest.mark.parametrize("count", [1, GROUP_SIZE - 1, GROUP_SIZE, 20 * GROUP_SIZE + 3])
 def test_groups_lose_no_place_that_a_camera_holds(count: int) -> None:
     places = site(count, 400.0)
-    groups = Groups.of(places)
+    groups = SpatialGroups.of(places)
     asked = 0
     for camera in flight(40, 400.0):
         rows = groups.about(camera)
         asked += len(rows)
         assert torch.equal(rows, rows.unique())
-        inside = project(places, camera).inside.nonzero().squeeze(1)
+        inside = project_points(places, camera).inside.nonzero().squeeze(1)
         assert np.isin(inside.numpy(), rows.numpy()).all()
-    if count > 10 * GROUP:
+    if count > 10 * GROUP_SIZE:
         assert asked < 0.5 * 40 * count, "a camera looks at the groups about its frustum only"
 
 
-@pytest.mark.parametrize("count", [1, GROUP, 12 * GROUP + 3])
+@pytest.mark.parametrize("count", [1, GROUP_SIZE, 12 * GROUP_SIZE + 3])
 def test_many_cameras_asked_at_once_answer_as_each_alone(count: int) -> None:
     places, cameras = site(count, 400.0), flight(40, 400.0)
     cameras[7] = Camera(
@@ -78,26 +78,26 @@ def test_many_cameras_asked_at_once_answer_as_each_alone(count: int) -> None:
     )
     frusta = Frusta.of(cameras)
     together = frusta.project(places)
-    alone = [project(places, camera) for camera in cameras]
+    alone = [project_points(places, camera) for camera in cameras]
     inside = torch.stack([each.inside for each in alone])
     assert torch.equal(together.inside, inside)
     for name in ("column", "row", "depth", "distance"):
         one_by_one = torch.stack([getattr(each, name) for each in alone])
         torch.testing.assert_close(getattr(together, name)[inside], one_by_one[inside], rtol=1e-5, atol=1e-3)
     seen = torch.zeros(len(cameras), count, dtype=torch.bool)
-    for rows, watching in Groups.of(places).watched(frusta):
+    for rows, watching in SpatialGroups.of(places).visible_groups(frusta):
         seen[watching[:, None], rows] |= frusta.take(watching).project(places[rows]).inside
     assert torch.equal(seen, inside), "no place is lost, and each is in one group"
 
 
 def test_a_camera_inside_a_group_and_coincident_places_are_held() -> None:
-    places = torch.zeros(3 * GROUP, 3)
+    places = torch.zeros(3 * GROUP_SIZE, 3)
     pose = np.eye(4)
     pose[:3, 3] = [0.0, 0.0, 0.5]
     camera = Camera(camera_from_world=pose, fx=90.0, fy=80.0, cx=60.0, cy=41.0, width=120, height=80)
-    assert len(Groups.of(places).about(camera)) == len(places)
-    spread = site(GROUP, 1.0)
-    assert len(Groups.of(spread).about(camera)) == GROUP
+    assert len(SpatialGroups.of(places).about(camera)) == len(places)
+    spread = site(GROUP_SIZE, 1.0)
+    assert len(SpatialGroups.of(spread).about(camera)) == GROUP_SIZE
 
 
 def test_bounds_of_sizes_are_those_of_all_cameras_asked_about_all_places() -> None:
@@ -108,14 +108,14 @@ def test_bounds_of_sizes_are_those_of_all_cameras_asked_about_all_places() -> No
     held = torch.full_like(places[:, 0], math.inf)
     near = held.clone()
     for camera in cameras:
-        seen = project(places, camera)
+        seen = project_points(places, camera)
         span = max(camera.width, camera.height) / max(camera.fx, camera.fy)
         held = torch.where(seen.inside, torch.minimum(held, span * seen.depth), held)
         near = torch.minimum(near, span * seen.distance)
-    expected = (torch.where(held.isfinite(), held, near) * (SPAN / (2.0 * REACH))).log()
+    expected = (torch.where(held.isfinite(), held, near) * (MAX_IMAGE_FRACTION / (2.0 * MAX_SIGMA))).log()
     assert held.isinf().any()
     assert held.isfinite().any()
-    torch.testing.assert_close(largest_log_scales(places, cameras), expected, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(max_log_scales(places, cameras), expected, rtol=1e-6, atol=1e-6)
 
 
 # ---------------------------------------------------------------------------------------- many blocks
@@ -138,7 +138,7 @@ def test_of_many_cores_the_nearest_is_found_among_all_and_among_some(count: int)
     generator = np.random.default_rng(5)
     places = np.concatenate([generator.uniform(-2, 16, (count, 2)), generator.normal(0, 1e5, (count // 20, 2))])
     distance = np.stack([shapely.distance(shape, shapely.points(places)) for shape in shapes], axis=1)
-    cores = Cores(shapes)
+    cores = BlockCores(shapes)
     assert np.array_equal(cores.nearest(places), distance.argmin(axis=1))
     among = np.sort(generator.permutation(len(shapes))[:60])
     assert np.array_equal(cores.nearest(places, among), among[distance[:, among].argmin(axis=1)])
@@ -152,8 +152,8 @@ def test_reaching_with_known_owners_is_reaching() -> None:
     owner = blocks.owner(places)
     for index in range(len(blocks)):
         plain = shapely.contains_xy(blocks.items[index].expanded, places[:, 0], places[:, 1]) | (owner == index)
-        assert np.array_equal(blocks.reaches(index, places), plain)
-        assert np.array_equal(blocks.reaches(index, places, owner), plain)
+        assert np.array_equal(blocks.in_expanded(index, places), plain)
+        assert np.array_equal(blocks.in_expanded(index, places, owner), plain)
 
 
 def test_the_strongest_cluster_of_a_cell_is_found_in_windows_as_over_all_cells() -> None:
@@ -170,10 +170,10 @@ def test_the_strongest_cluster_of_a_cell_is_found_in_windows_as_over_all_cells()
         expected[nearby > most] = label
         most = np.maximum(most, nearby)
     expected.ravel()[np.bincount(flat, minlength=expected.size) == 0] = -1
-    assert np.array_equal(boundary._strongest(labels, flat, shape, count), expected)
+    assert np.array_equal(boundary._dominant_cluster(labels, flat, shape, count), expected)
 
 
-@pytest.mark.parametrize("flags", [boundary.MOST_FLAGS, 0])
+@pytest.mark.parametrize("flags", [boundary.MAX_DENSE_CELLS, 0])
 def test_the_first_point_of_each_cell(flags: int) -> None:
     points = np.random.default_rng(8).normal(0, 5, (5000, 2))
     seen, expected = set(), []
@@ -191,23 +191,23 @@ def test_a_block_that_a_view_does_not_reach_scores_as_if_it_were_drawn(mode: str
     pose[:3, 3] = -pose[:3, :3] @ [2.0, 2.0, 4.0]
     camera = Camera(camera_from_world=pose, fx=40.0, fy=40.0, cx=24.0, cy=18.0, width=48, height=36)
     config = AssignmentConfig(mode=mode)  # type: ignore[arg-type]
-    found = scoring.score_matrix(model, blocks, [camera], config)
-    members = scoring._Members.of(model, blocks)
+    found = scoring.compute_score_matrix(model, blocks, [camera], config)
+    members = scoring._BlockMembers.of(model, blocks)
     rows, splats = scoring.decode_view(model, camera)
-    full = scoring.draw(splats, camera, splats.means_px.new_zeros(3))
+    full = scoring.rasterize_splats(splats, camera, splats.means_px.new_zeros(3))
     anchor = rows[splats.source.long() // model.anchors.offsets.shape[1]]
     drawn = members.reached[:, anchor].any(dim=1)
     assert drawn.any()
     assert not drawn.all()
     for index in (~drawn).nonzero().squeeze(1).tolist():
-        alone = scoring._draw_some(splats, members.reached[index, anchor], full, camera)
+        alone = scoring._render_subset(splats, members.reached[index, anchor], full, camera)
         expected = {
-            "coverage": lambda alone=alone: scoring.covered_share(alone, full, config.tau),
-            "literal": lambda alone=alone: scoring.alike_share(alone, full, config.tau),
+            "coverage": lambda alone=alone: scoring.drawn_coverage_ratio(alone, full, config.tau),
+            "literal": lambda alone=alone: scoring.coverage_ratio(alone, full, config.tau),
             "leave_one_out": lambda: 0.0,
         }[mode]()
         assert found.scores[0, index] == np.float32(expected)
-        assert found.covered[0, index] == np.float32(scoring.covered_share(alone, full, config.tau))
+        assert found.covered[0, index] == np.float32(scoring.drawn_coverage_ratio(alone, full, config.tau))
 
 
 def small_model(count: int, extent: float = 12.0) -> AnchorModel:
@@ -219,7 +219,7 @@ def small_model(count: int, extent: float = 12.0) -> AnchorModel:
         torch.full((count, 6), -1.0),
     )  # fmt: skip
     return AnchorModel(
-        anchors=anchors, decoder=Decoder.initial(4, False, 0, 1, g), voxel=0.1, background=(0.5, 0.5, 0.5)
+        anchors=anchors, decoder=Decoder.initial(4, False, 0, 1, g), voxel_size=0.1, background=(0.5, 0.5, 0.5)
     )
 
 
@@ -235,7 +235,7 @@ def test_blocks_that_are_opened_one_by_one_merge_to_the_same_bits() -> None:
         AnchorModel(
             anchors=model.anchors.select(owner == index),
             decoder=model.decoder,
-            voxel=0.1,
+            voxel_size=0.1,
             background=model.background,
         )
         for index in range(3)
@@ -250,13 +250,13 @@ def test_blocks_that_are_opened_one_by_one_merge_to_the_same_bits() -> None:
         return load
 
     cameras = [flight(2, 12.0, seed) for seed in range(3)]
-    expected, facts = merge(model, trained, blocks, cameras, MergeConfig())
-    merged, same_facts = merge(model, [opener(index) for index in range(3)], blocks, cameras, MergeConfig())
+    expected, facts = merge_blocks(model, trained, blocks, cameras, MergeConfig())
+    merged, same_facts = merge_blocks(model, [opener(index) for index in range(3)], blocks, cameras, MergeConfig())
     assert open_now == [0, 1, 2], "each is opened once, after the one before"
     assert facts == same_facts
     for name, tensor in expected.anchors.tensors().items():
         assert torch.equal(tensor, merged.anchors.tensors()[name])
-    with_gap, _ = merge(model, [opener(0), None, opener(2)], blocks, cameras, MergeConfig(), allow_missing=True)
+    with_gap, _ = merge_blocks(model, [opener(0), None, opener(2)], blocks, cameras, MergeConfig(), allow_missing=True)
     assert len(with_gap.anchors) == len(merged.anchors)
 
 
@@ -265,11 +265,11 @@ def test_blocks_that_are_opened_one_by_one_merge_to_the_same_bits() -> None:
 
 def test_matches_are_drawn_alike_in_any_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     cameras, places = flight(9, 60.0), site(300, 60.0).double().numpy()
-    visible = np.stack([camera.sees(places) for camera in cameras], axis=1)
+    visible = np.stack([camera.in_frustum(places) for camera in cameras], axis=1)
     home = np.random.default_rng(1).integers(0, 9, len(places))
-    whole = synthetic_points._matched(cameras, places, home, visible, np.random.default_rng(2))
-    monkeypatch.setattr(synthetic_points, "_PAIRS", 70)
-    pieces = synthetic_points._matched(cameras, places, home, visible, np.random.default_rng(2))
+    whole = synthetic_points._recognized_views(cameras, places, home, visible, np.random.default_rng(2))
+    monkeypatch.setattr(synthetic_points, "_PAIRS_PER_CHUNK", 70)
+    pieces = synthetic_points._recognized_views(cameras, places, home, visible, np.random.default_rng(2))
     assert whole.any()
     assert np.array_equal(whole, pieces)
 
@@ -286,6 +286,6 @@ def test_cameras_about_places_are_all_that_see_any() -> None:
         middle = np.random.default_rng(seed).uniform(0, 500, 2)
         places = np.random.default_rng(seed).normal([*middle, 3.0], [15, 15, 2], (50, 3))
         about = true_visibility._about(cameras, places)
-        assert {id(c) for c in cameras if c.sees(places).any()} <= {id(c) for c in about}
+        assert {id(c) for c in cameras if c.in_frustum(places).any()} <= {id(c) for c in about}
         assert len(about) < len(cameras)
     assert true_visibility._about(cameras, np.zeros((0, 3))) == []

@@ -8,13 +8,13 @@ from hypothesis import strategies as st
 
 from support.captures import tiny_scene
 from vdgs.config.method import AssignmentConfig
-from vdgs.partition.assignment.assign_cameras import assign
+from vdgs.partition.assignment.assign_cameras import assign_cameras
 from vdgs.partition.assignment.score_file import load_scores, save_scores
-from vdgs.partition.assignment.score_matrix import Scores
+from vdgs.partition.assignment.score_matrix import ScoreMatrix
 from vdgs.partition.strategies import STRATEGIES
 from vdgs.partition.strategies.citygaussian import contract, expand
 from vdgs.partition.strategies.strategy import grid_shape
-from vdgs.partition.strategies.vastgaussian import covered_share
+from vdgs.partition.strategies.vastgaussian import box_coverage
 
 SCENE = tiny_scene(6, 4)
 CAMERAS = list(SCENE.cameras.values())
@@ -26,10 +26,10 @@ def anchors(count: int = 2000) -> np.ndarray:
     return np.column_stack([flat, generator.normal(0, 0.1, count)])
 
 
-def scores_of(blocks, mode: str) -> Scores:
+def scores_of(blocks, mode: str) -> ScoreMatrix:
     shape = (len(CAMERAS), len(blocks))
     beneath = blocks.owner(np.array([camera.position[:2] for camera in CAMERAS]))
-    return Scores(
+    return ScoreMatrix(
         mode=mode, scores=np.zeros(shape, np.float32), held=np.ones(shape, np.int32),
         covered=np.zeros(shape, np.float32), anchors=np.ones(shape[1], np.int64), beneath=beneath,
     )  # fmt: skip
@@ -39,7 +39,7 @@ def scores_of(blocks, mode: str) -> Scores:
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 8])
 def test_cells_are_disjoint_and_every_anchor_has_a_home(name, count):
     positions = anchors()
-    blocks, warnings = STRATEGIES[name].cut(positions, CAMERAS, count)
+    blocks, warnings = STRATEGIES[name].partition(positions, CAMERAS, count)
     assert len(blocks) == count
     assert warnings == []
     cores = [block.core for block in blocks.items]
@@ -52,14 +52,14 @@ def test_cells_are_disjoint_and_every_anchor_has_a_home(name, count):
 def test_cells_without_anchors_are_no_blocks(name):
     positions = anchors()
     corner = positions[(positions[:, 0] < 8) & (positions[:, 1] < 4)]
-    blocks, warnings = STRATEGIES[name].cut(corner, CAMERAS, 8)
+    blocks, warnings = STRATEGIES[name].partition(corner, CAMERAS, 8)
     assert 1 <= len(blocks) <= 8
     assert bool(warnings) == (len(blocks) < 8)
     assert np.bincount(blocks.owner(corner[:, :2]), minlength=len(blocks)).min() > 0
 
 
 def test_vastgaussian_gives_every_cell_as_many_cameras_and_a_fifth_more_room():
-    blocks, _ = STRATEGIES["vastgaussian"].cut(anchors(), CAMERAS, 4)
+    blocks, _ = STRATEGIES["vastgaussian"].partition(anchors(), CAMERAS, 4)
     centres = np.array([camera.position[:2] for camera in CAMERAS])
     assert np.bincount(blocks.owner(centres)).tolist() == [6, 6, 6, 6]
     for block in blocks.items:
@@ -70,12 +70,12 @@ def test_vastgaussian_gives_every_cell_as_many_cameras_and_a_fifth_more_room():
 def test_vastgaussian_scores_by_the_area_of_the_projected_box():
     camera = CAMERAS[0]
     everywhere = np.array([[x, y, z] for z in (-1.0, 0.0) for y in (-99.0, 99.0) for x in (-99.0, 99.0)])
-    assert covered_share(everywhere, camera) == pytest.approx(1.0)
-    assert covered_share(everywhere + np.array([500, 0, 0]), camera) == pytest.approx(0.0, abs=1e-6)
-    assert covered_share(everywhere + np.array([0, 0, 100]), camera) == 0.0  # behind it
+    assert box_coverage(everywhere, camera) == pytest.approx(1.0)
+    assert box_coverage(everywhere + np.array([500, 0, 0]), camera) == pytest.approx(0.0, abs=1e-6)
+    assert box_coverage(everywhere + np.array([0, 0, 100]), camera) == 0.0  # behind it
     strategy, positions = STRATEGIES["vastgaussian"], anchors()
-    blocks, _ = strategy.cut(positions, CAMERAS, 4)
-    scores = strategy.rescored(scores_of(blocks, "frustum"), positions, blocks, CAMERAS)
+    blocks, _ = strategy.partition(positions, CAMERAS, 4)
+    scores = strategy.adjust_scores(scores_of(blocks, "frustum"), positions, blocks, CAMERAS)
     rows = np.arange(len(CAMERAS))
     assert (scores.scores[rows, scores.beneath] == 1).all()
     assert ((scores.scores >= 0) & (scores.scores <= 1)).all()
@@ -84,11 +84,11 @@ def test_vastgaussian_scores_by_the_area_of_the_projected_box():
 
 def test_citygaussian_cameras_join_the_block_that_they_stand_in():
     strategy, positions = STRATEGIES["citygaussian"], anchors()
-    blocks, _ = strategy.cut(positions, CAMERAS, 4)
+    blocks, _ = strategy.partition(positions, CAMERAS, 4)
     config = strategy.assignment(AssignmentConfig(min_cameras=0))
     assert config.mode == "leave_one_out"
-    scores = strategy.rescored(scores_of(blocks, config.mode), positions, blocks, CAMERAS)
-    assigned = assign(scores, config).cameras
+    scores = strategy.adjust_scores(scores_of(blocks, config.mode), positions, blocks, CAMERAS)
+    assigned = assign_cameras(scores, config).cameras
     assert np.array_equal(assigned, np.eye(len(blocks), dtype=bool)[scores.beneath])
 
 
@@ -97,7 +97,7 @@ def test_dogs_cells_turn_with_the_scene_and_are_equal():
     positions = anchors()
     turned = np.column_stack([positions[:, :2] @ turn.T, positions[:, 2]])
     for place in (positions, turned):
-        blocks, _ = STRATEGIES["dogs"].cut(place, CAMERAS, 4)
+        blocks, _ = STRATEGIES["dogs"].partition(place, CAMERAS, 4)
         areas = np.array([block.core.area for block in blocks.items])
         assert areas == pytest.approx(np.full(4, areas[0]))
         assert [block.expanded.area for block in blocks.items] == pytest.approx(list(1.96 * areas))
@@ -121,9 +121,9 @@ def test_a_grid_has_as_many_cells_as_asked_for(count, aspect):
 @pytest.mark.parametrize("name", STRATEGIES)
 def test_scores_can_be_saved_and_read(name, tmp_path):
     strategy, positions = STRATEGIES[name], anchors()
-    blocks, _ = strategy.cut(positions, CAMERAS, 4)
+    blocks, _ = strategy.partition(positions, CAMERAS, 4)
     config = strategy.assignment(AssignmentConfig())
-    scores = strategy.rescored(scores_of(blocks, config.mode), positions, blocks, CAMERAS)
-    assignment = assign(scores, config)
+    scores = strategy.adjust_scores(scores_of(blocks, config.mode), positions, blocks, CAMERAS)
+    assignment = assign_cameras(scores, config)
     save_scores(tmp_path / "scores.npz", list(SCENE.cameras), scores, assignment)
     assert np.array_equal(load_scores(tmp_path / "scores.npz").assignment.cameras, assignment.cameras)

@@ -9,18 +9,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from experiments.bench.plan import Choices, make_plan
+from experiments.bench.plan import PlanOptions, make_plan
 from support.captures import tiny_scene, write_colmap
 from vdgs.config.capture_options import CaptureOptions
-from vdgs.config.checkpointing import WatchOptions
-from vdgs.config.method import BlockConfig, GrowthConfig, MethodConfig, block_limit
-from vdgs.config.validation_rules import validate
-from vdgs.pipeline.count_visibility import measure_visibility
-from vdgs.pipeline.merge_blocks import merge_run
+from vdgs.config.checkpointing import CheckpointOptions
+from vdgs.config.method import BlockConfig, DensifyConfig, MethodConfig, max_block_anchors
+from vdgs.config.validation_rules import validate_config
+from vdgs.pipeline.count_visibility import count_run_visibility
+from vdgs.pipeline.merge_blocks import merge_run_blocks
 from vdgs.pipeline.partition_stage import partition_run
 from vdgs.pipeline.train_block import train_block
 from vdgs.pipeline.train_coarse import train_coarse
-from vdgs.runs.create_or_resume import begin_run
+from vdgs.runs.create_or_resume import create_or_resume_run
 from vdgs.runs.run_folder import RunFolder
 
 counts = st.lists(st.integers(0, 10**6), min_size=1, max_size=16).filter(any)
@@ -28,7 +28,7 @@ counts = st.lists(st.integers(0, 10**6), min_size=1, max_size=16).filter(any)
 
 @given(owned=counts, total=st.integers(1, 10**8))
 def test_shares_hold_the_total_whatever_the_blocks(owned, total):
-    limits = [block_limit(BlockConfig(max_anchors_total=total), each, sum(owned)) for each in owned]
+    limits = [max_block_anchors(BlockConfig(max_anchors_total=total), each, sum(owned)) for each in owned]
     # Growth stops at the limit and removes nothing.
     held = [max(each, limit) for each, limit in zip(owned, limits, strict=True) if each]
     assert sum(held) <= max(total, sum(owned))
@@ -37,27 +37,27 @@ def test_shares_hold_the_total_whatever_the_blocks(owned, total):
 
 
 def test_no_total_is_no_limit_and_a_block_may_have_one_of_its_own():
-    assert block_limit(BlockConfig(), 10, 30) == 0
-    alone = BlockConfig(growth=GrowthConfig(max_anchors=50))
-    assert block_limit(alone, 10, 30) == 50
-    assert block_limit(replace(alone, max_anchors_total=90), 10, 30) == 30
-    assert block_limit(replace(alone, max_anchors_total=900), 10, 30) == 50
-    assert validate(MethodConfig(block=BlockConfig(max_anchors_total=-1)))
+    assert max_block_anchors(BlockConfig(), 10, 30) == 0
+    alone = BlockConfig(growth=DensifyConfig(max_anchors=50))
+    assert max_block_anchors(alone, 10, 30) == 50
+    assert max_block_anchors(replace(alone, max_anchors_total=90), 10, 30) == 30
+    assert max_block_anchors(replace(alone, max_anchors_total=900), 10, 30) == 50
+    assert validate_config(MethodConfig(block=BlockConfig(max_anchors_total=-1)))
 
 
 def eager(max_anchors: int) -> MethodConfig:
     """The full method of a table with that limit, in four blocks that grow wherever they may from the first step on."""
-    choices = Choices(seeds=1, scenes=("copr",), methods=("full",), max_anchors=max_anchors)
+    choices = PlanOptions(seeds=1, scenes=("copr",), methods=("full",), max_anchors=max_anchors)
     (planned,) = make_plan("table1", choices).runs
     config, growth = planned.config, planned.config.block.growth
     growth = replace(
-        growth, interval=4, statistics_from=0, start=1, until=1.0, threshold=1e-12, gate=0.0, coarsest_cell=2.0,
-        prune_views=1e9,
+        growth, interval=4, stats_start=0, start=1, until=1.0, threshold=1e-12, gate=0.0, coarsest_voxels=2.0,
+        prune_view_fraction=1e9,
     )  # fmt: skip
     return replace(
         config,
         training=replace(config.training, iterations=1, resolutions=((0.0, 1),)),
-        assignment=replace(config.assignment, min_cameras=4, longest_side_px=32),
+        assignment=replace(config.assignment, min_cameras=4, image_size=32),
         block=replace(
             config.block, iterations=16, growth=growth, average=0.0, crop="off", sampling="even",
             resolutions=((0.0, 1),),
@@ -75,14 +75,14 @@ def place(tmp_path_factory) -> Path:
 def merged(capture: Path, output: Path, max_anchors: int) -> tuple[RunFolder, int, int]:
     """A run, and how many anchors its coarse model and its merged scene have."""
     console = Console(file=io.StringIO())
-    context = begin_run(capture, output, CaptureOptions(), eager(max_anchors))
+    context = create_or_resume_run(capture, output, CaptureOptions(), eager(max_anchors))
     run = context.run
-    train_coarse(context, WatchOptions(), console)
-    measure_visibility(context, console)
+    train_coarse(context, CheckpointOptions(), console)
+    count_run_visibility(context, console)
     partition_run(context, console)
     for index in range(len(run.partition_record().blocks)):
-        train_block(context, index, WatchOptions(), console)
-    merge_run(context, False, console)
+        train_block(context, index, CheckpointOptions(), console)
+    merge_run_blocks(context, False, console)
     return run, run.coarse.status().anchors, run.merged.status().anchors
 
 

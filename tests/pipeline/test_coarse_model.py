@@ -13,28 +13,28 @@ from support.captures import tiny_scene, write_colmap
 from support.fake_device import CARD, pretended_card
 from support.hand_made_models import model_at
 from vdgs.captures.capture import Capture
-from vdgs.captures.capture_metadata import capture_facts
+from vdgs.captures.capture_metadata import capture_metadata
 from vdgs.config.capture_options import CaptureOptions
-from vdgs.config.checkpointing import WatchOptions
-from vdgs.config.method import AnchorConfig, GrowthConfig, MethodConfig, TrainConfig
+from vdgs.config.checkpointing import CheckpointOptions
+from vdgs.config.method import AnchorConfig, DensifyConfig, MethodConfig, TrainConfig
 from vdgs.errors import RunError
 from vdgs.model.anchor_model import AnchorModel, ModelMetadata
-from vdgs.pipeline.count_visibility import measure_visibility
+from vdgs.pipeline.count_visibility import count_run_visibility
 from vdgs.pipeline.train_coarse import train_coarse
-from vdgs.runs.create_or_resume import begin_run
+from vdgs.runs.create_or_resume import create_or_resume_run
 from vdgs.runs.open_run import open_run
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.run_status import standing_of
-from vdgs.runs.stage_folder import Status
-from vdgs.runs.visibility_store import keep_visibility
+from vdgs.runs.run_status import get_run_status
+from vdgs.runs.stage_folder import StatusRecord
+from vdgs.runs.visibility_store import load_or_count_visibility
 from vdgs.system.atomic_files import write_json
-from vdgs.system.tensors import identity
+from vdgs.system.tensors import file_id
 
 UP, QUIET = CaptureOptions(up="z"), Console(quiet=True)
 #: Some steps, at the end of which all that was seen is taken for transparent.
-LAST = GrowthConfig(
-    interval=20, statistics_from=0, start=20, levels=0, prune_opacity=1e6, prune_views=0.0, until=1.0
+LAST = DensifyConfig(
+    interval=20, stats_start=0, start=20, levels=0, prune_opacity=1e6, prune_view_fraction=0.0, until=1.0
 )  # fmt: skip
 METHOD = MethodConfig(
     TrainConfig(iterations=20, anchors=AnchorConfig(offsets=2, fill_gaps=False), growth=LAST, average=0.0)
@@ -42,22 +42,22 @@ METHOD = MethodConfig(
 
 
 def begin(folder: Path, method: MethodConfig, redo: bool | None = None) -> tuple[RunFolder, Capture]:
-    context = begin_run(folder / "place", folder / "run", UP, method, redo=redo)
+    context = create_or_resume_run(folder / "place", folder / "run", UP, method, overwrite=redo)
     return context.run, context.capture
 
 
 def train(run: RunFolder, capture: Capture) -> None:
-    train_coarse(RunContext(run, capture), WatchOptions(), QUIET)
+    train_coarse(RunContext(run, capture), CheckpointOptions(), QUIET)
 
 
 def finished(run: RunFolder, capture: Capture, model: AnchorModel) -> None:
     """A coarse stage that is done with a model."""
-    write_json(run.capture_file, capture_facts(capture))
-    run.coarse.discard_unless(run.keys().coarse)
-    metadata = ModelMetadata(key=run.keys().coarse, capture=capture_facts(capture))
+    write_json(run.capture_file, capture_metadata(capture))
+    run.coarse.reset_unless(run.keys().coarse)
+    metadata = ModelMetadata(key=run.keys().coarse, capture=capture_metadata(capture))
     replace(model, metadata=metadata).save(run.coarse.model)
     count = len(model.anchors)
-    run.coarse.set_status(Status(state="done", iteration=6, anchors=count, model=identity(run.coarse.model)))
+    run.coarse.set_status(StatusRecord(state="done", iteration=6, anchors=count, model=file_id(run.coarse.model)))
 
 
 def test_training_that_leaves_no_anchors_is_not_done_and_says_what_to_change(tmp_path):
@@ -69,7 +69,7 @@ def test_training_that_leaves_no_anchors_is_not_done_and_says_what_to_change(tmp
         with pytest.raises(RunError, match=r"coarse: .*no anchors(?s:.*)--growth\.prune-opacity(?s:.*)--redo"):
             train(run, capture)
         assert not run.coarse.model.exists()
-        assert standing_of(run).of("coarse").state == "failed"
+        assert get_run_status(run).of("coarse").state == "failed"
     kept = replace(METHOD, training=replace(METHOD.training, growth=replace(LAST, prune_opacity=0.0)))
     with pytest.raises(RunError, match="--redo"):
         begin(tmp_path, kept, redo=False)
@@ -84,7 +84,7 @@ def test_a_model_without_anchors_of_an_earlier_version_is_refused_too(tmp_path):
     with pytest.raises(RunError, match="no anchors"):
         train(run, capture)
     with pytest.raises(RunError, match="no anchors"):
-        measure_visibility(RunContext(run), QUIET)
+        count_run_visibility(RunContext(run), QUIET)
 
 
 def test_visibility_that_is_counted_on_a_card_is_handed_on_in_main_memory(tmp_path):
@@ -93,7 +93,7 @@ def test_visibility_that_is_counted_on_a_card_is_handed_on_in_main_memory(tmp_pa
     run, capture = begin(tmp_path, METHOD)
     finished(run, capture, model_at([[-1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [90.0, 0.0, 0.0]]))
     with pretended_card():
-        counted = keep_visibility(open_run(run.path, "coarse", CARD)).numpy()
-        kept = keep_visibility(open_run(run.path, "coarse", CARD)).numpy()
+        counted = load_or_count_visibility(open_run(run.path, "coarse", CARD)).numpy()
+        kept = load_or_count_visibility(open_run(run.path, "coarse", CARD)).numpy()
     assert counted[2] == 0 < counted[0]
-    assert kept.tolist() == counted.tolist() == keep_visibility(open_run(run.path, "coarse")).tolist()
+    assert kept.tolist() == counted.tolist() == load_or_count_visibility(open_run(run.path, "coarse")).tolist()

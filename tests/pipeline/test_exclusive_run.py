@@ -15,20 +15,20 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from experiments.bench.worker import Job, work
+from experiments.bench.worker import BenchJob, run_job
 from support.captures import tiny_scene, write_colmap
 from support.flights import write_photograph
-from vdgs.captures.capture_metadata import capture_facts
+from vdgs.captures.capture_metadata import capture_metadata
 from vdgs.cli.main import main
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RunRequest
 from vdgs.config.presets import PRESETS
 from vdgs.config.serialization import to_dict
 from vdgs.errors import RunError
-from vdgs.pipeline.run_pipeline import with_capture
-from vdgs.runs.create_or_resume import begin_run, driven_run
+from vdgs.pipeline.run_pipeline import reconstruct_if_needed
+from vdgs.runs.create_or_resume import create_or_resume_run, exclusive_run
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.stage_folder import Status
+from vdgs.runs.stage_folder import StatusRecord
 from vdgs.system.atomic_files import write_json
 
 #: Another process that drives a run: it holds the lock of which it is told until its input ends.
@@ -63,13 +63,13 @@ def place(tmp_path: Path) -> Path:
 @pytest.fixture
 def run(place: Path, tmp_path: Path) -> RunFolder:
     """A run with a finished coarse model and a block, as far as its files say so."""
-    context = begin_run(place, tmp_path / "run", CaptureOptions(), METHOD, redo=False)
+    context = create_or_resume_run(place, tmp_path / "run", CaptureOptions(), METHOD, overwrite=False)
     run, capture = context.run, context.capture
-    write_json(run.capture_file, capture_facts(capture))
+    write_json(run.capture_file, capture_metadata(capture))
     for stage in (run.coarse, run.block(0)):
-        stage.discard_unless(run.keys().coarse if stage == run.coarse else run.keys().blocks)
+        stage.reset_unless(run.keys().coarse if stage == run.coarse else run.keys().blocks)
         stage.model.write_bytes(b"a model")
-        stage.set_status(Status(state="done", iteration=3000, model="7-any"))
+        stage.set_status(StatusRecord(state="done", iteration=3000, model="7-any"))
     return run
 
 
@@ -126,24 +126,24 @@ def test_a_block_is_trained_beside_who_drives_the_run(run, capsys):
 
 def test_who_takes_a_run_up_drives_it(place, tmp_path):
     method = PRESETS["laptop"]
-    with driven_run(place, tmp_path / "run", CaptureOptions(), method, redo=False) as context:
+    with exclusive_run(place, tmp_path / "run", CaptureOptions(), method, overwrite=False) as context:
         run = context.run
-        assert run.is_driven()
+        assert run.is_running()
         with pytest.raises(RunError, match=AT_WORK):
-            begin_run(place, run.path, CaptureOptions(), method, redo=True)
-    assert not run.is_driven()
-    begin_run(place, run.path, CaptureOptions(), method, redo=False)
+            create_or_resume_run(place, run.path, CaptureOptions(), method, overwrite=True)
+    assert not run.is_running()
+    create_or_resume_run(place, run.path, CaptureOptions(), method, overwrite=False)
 
 
 def test_a_bench_does_not_begin_what_another_process_drives(run, place):
-    job = Job(
+    job = BenchJob(
         place, to_dict(CaptureOptions()), to_dict(PRESETS["laptop"]), ("coarse",), run.path, None, "key", None, 4, 1, 1,
         redo=True,
     )  # fmt: skip
     with driven_elsewhere(run):
         before = contents(run)
         with pytest.raises(RunError, match=AT_WORK):
-            work(job)
+            run_job(job)
         assert contents(run) == before
 
 
@@ -158,7 +158,7 @@ def test_photographs_are_not_made_a_capture_under_a_run_that_is_driven(tmp_path)
         capture=photographs, output=run.path, preset="laptop", threads=1, training=PRESETS["laptop"].training
     )
     with driven_elsewhere(run), pytest.raises(RunError, match=AT_WORK):
-        with_capture(request, Console(file=io.StringIO()))
+        reconstruct_if_needed(request, Console(file=io.StringIO()))
     assert not run.own_capture.exists()
 
 
@@ -167,5 +167,5 @@ def test_a_run_among_other_files_leaves_nothing_there(place, tmp_path):
     thesis.parent.mkdir()
     thesis.write_text("three years")
     with pytest.raises(RunError, match="holds other files"):
-        begin_run(place, thesis.parent, CaptureOptions(), PRESETS["laptop"])
+        create_or_resume_run(place, thesis.parent, CaptureOptions(), PRESETS["laptop"])
     assert list(thesis.parent.iterdir()) == [thesis]

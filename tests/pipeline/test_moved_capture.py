@@ -12,15 +12,15 @@ from rich.console import Console
 from support.captures import tiny_scene, write_colmap
 from vdgs.cli.main import main
 from vdgs.config.capture_options import CaptureOptions
-from vdgs.config.checkpointing import WatchOptions
+from vdgs.config.checkpointing import CheckpointOptions
 from vdgs.config.commands import RenderRequest
 from vdgs.config.method import AnchorConfig, MethodConfig, TrainConfig
 from vdgs.errors import CaptureError, RunError, VdgsError
 from vdgs.pipeline.train_coarse import train_coarse
 from vdgs.rendering.render_run import render_run
-from vdgs.runs.create_or_resume import begin_run
-from vdgs.runs.open_run import open_capture, open_model, open_run, remember_capture
-from vdgs.runs.run_cameras import flight_of, kept_flight
+from vdgs.runs.create_or_resume import create_or_resume_run
+from vdgs.runs.open_run import open_capture, open_model, open_run, relocate_capture
+from vdgs.runs.run_cameras import load_run_cameras, run_cameras_of_capture
 from vdgs.runs.run_folder import RunFolder
 
 pytestmark = pytest.mark.xdist_group("moved_capture")
@@ -35,7 +35,7 @@ def trained(tmp_path_factory) -> Path:
     """A folder with a capture, `place`, and a coarse model of it, `run`."""
     folder = tmp_path_factory.mktemp("moved")
     write_colmap(folder / "place", tiny_scene())
-    train_coarse(begin_run(folder / "place", folder / "run", UP, METHOD), WatchOptions(), QUIET)
+    train_coarse(create_or_resume_run(folder / "place", folder / "run", UP, METHOD), CheckpointOptions(), QUIET)
     return folder
 
 
@@ -59,22 +59,22 @@ def folder(trained, tmp_path) -> Path:
 def test_another_option_is_named_and_not_the_capture(trained, options, line):
     for redo in (None, False):
         with pytest.raises(RunError, match=line) as caught:
-            begin_run(trained / "place", trained / "run", options, METHOD, redo=redo)
+            create_or_resume_run(trained / "place", trained / "run", options, METHOD, overwrite=redo)
         assert "is not the capture" not in str(caught.value)
 
 
 def test_redo_takes_another_option(folder):
-    context = begin_run(folder / "place", folder / "run", replace(UP, downscale=2.0), METHOD, redo=True)
+    context = create_or_resume_run(folder / "place", folder / "run", replace(UP, downscale=2.0), METHOD, overwrite=True)
     run = context.run
-    assert not run.coarse.holds_work()
-    train_coarse(context, WatchOptions(), QUIET)
+    assert not run.coarse.has_output()
+    train_coarse(context, CheckpointOptions(), QUIET)
     assert open_run(run.path).capture.views[0].camera.width == 32
-    begin_run(folder / "place", folder / "run", replace(UP, downscale=2.0), METHOD, redo=False)
+    create_or_resume_run(folder / "place", folder / "run", replace(UP, downscale=2.0), METHOD, overwrite=False)
 
 
 @pytest.mark.parametrize("redo", [None, False])
 def test_a_capture_that_moved_is_taken_where_it_is_given(folder, redo):
-    run = begin_run(folder / "place", folder / "run", UP, METHOD, redo=redo).run
+    run = create_or_resume_run(folder / "place", folder / "run", UP, METHOD, overwrite=redo).run
     assert open_run(run.path).capture.root == folder / "place"
     assert run.coarse.is_done(run.keys().coarse)
 
@@ -83,22 +83,22 @@ def test_what_needs_the_capture_says_how_to_name_it(folder):
     run = RunFolder(folder / "run")
     with pytest.raises(CaptureError, match=r"gone/place: the capture of .* is not there.*--capture PATH"):
         open_run(run.path)
-    remember_capture(run, folder / "place")
+    relocate_capture(run, folder / "place")
     assert open_run(run.path).capture.root == folder / "place"
 
 
 def test_another_capture_is_not_remembered(folder, tmp_path):
     write_colmap(tmp_path / "other", tiny_scene(points=300))
     with pytest.raises(RunError, match="is not the capture that"):
-        remember_capture(RunFolder(folder / "run"), tmp_path / "other")
+        relocate_capture(RunFolder(folder / "run"), tmp_path / "other")
     assert "gone" in (folder / "run" / "config.yaml").read_text()
 
 
 def test_the_kept_flight_is_that_of_the_capture(trained):
     run = RunFolder(trained / "run")
-    kept = kept_flight(run, open_model(run).model.metadata.capture)
+    kept = load_run_cameras(run, open_model(run).model.metadata.capture)
     assert kept is not None
-    read = flight_of(open_capture(run))
+    read = run_cameras_of_capture(open_capture(run))
     assert [name for name, _ in kept.train + kept.test] == [name for name, _ in read.train + read.test]
     for (_, ours), (_, theirs) in zip(kept.train, read.train, strict=True):
         assert (ours.packed == theirs.packed).all()
@@ -131,15 +131,15 @@ def test_nothing_is_drawn_among_the_photographs_though_they_are_not_read(trained
     shutil.copytree(trained / "place", tmp_path / "place")
     (tmp_path / "place" / "images").rename(tmp_path / "place" / "photos")
     options = replace(UP, images="photos")
-    context = begin_run(tmp_path / "place", tmp_path / "run", options, METHOD)
+    context = create_or_resume_run(tmp_path / "place", tmp_path / "run", options, METHOD)
     run, capture = context.run, context.capture
-    train_coarse(context, WatchOptions(), QUIET)
-    flight = kept_flight(run, open_model(run).model.metadata.capture)
+    train_coarse(context, CheckpointOptions(), QUIET)
+    flight = load_run_cameras(run, open_model(run).model.metadata.capture)
     assert flight is not None
-    assert flight.inputs == flight_of(capture).inputs
-    assert flight.height == flight_of(capture).height
+    assert flight.inputs == run_cameras_of_capture(capture).inputs
+    assert flight.height == run_cameras_of_capture(capture).height
     (tmp_path / "place").rename(tmp_path / "moved")
-    remember_capture(run, tmp_path / "moved")
+    relocate_capture(run, tmp_path / "moved")
     for inside in ("", "new", "film.mp4"):
         with pytest.raises(VdgsError, match="photos, which is for inputs of the capture"):
             render_run(RenderRequest(run=run.path, output=tmp_path / "moved" / "photos" / inside, device="cpu"), QUIET)
@@ -178,7 +178,7 @@ def test_damaged_cameras_are_said_or_read_anew(folder, tmp_path, text):
 
 
 def test_pictures_too_large_for_memory_are_refused_before_they_are_drawn(trained, tmp_path, monkeypatch):
-    monkeypatch.setattr("vdgs.rendering.render_run.available_bytes", lambda: 1_000_000)
+    monkeypatch.setattr("vdgs.rendering.render_run.available_memory_bytes", lambda: 1_000_000)
     with pytest.raises(VdgsError, match=r"a picture of 1000x750 takes about \d+ MB.*smaller --width"):
         render_run(RenderRequest(run=trained / "run", output=tmp_path / "o", width=1000, device="cpu"), QUIET)
     with pytest.raises(VdgsError, match=r"pictures of 12000x\d+ are too large|takes about"):

@@ -19,12 +19,12 @@ from vdgs.config.method import PartitionConfig
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.partition.blocks import Block, Blocks
-from vdgs.pipeline.partition_stage import how_cut
+from vdgs.pipeline.partition_stage import describe_partition
 from vdgs.plots.partition import block_maps as figures
-from vdgs.plots.partition.block_stats import PALETTE, block_colour, block_facts
-from vdgs.plots.partition.score_heatmap import order_of_cameras
-from vdgs.plots.style import DPI, titles
-from vdgs.plots.visibility_map import without_speckles
+from vdgs.plots.partition.block_stats import BLOCK_PALETTE, block_color, compute_block_stats
+from vdgs.plots.partition.score_heatmap import sort_cameras
+from vdgs.plots.style import DPI, draw_titles
+from vdgs.plots.visibility_map import remove_speckles
 
 #: Names of x and y.
 METRES = ("east (m)", "north (m)")
@@ -82,14 +82,14 @@ def test_all_figures_of_all_scenes(tmp_path: Path, name: str) -> None:
     cut, assigned = grid(blocks), scores > 0.7
     compare = grid(blocks + 1) if blocks > 1 else None
     file = tmp_path / "figure.png"
-    cuts = [("λ_vis = 1", cut)] + ([] if compare is None else [(figures.BY_PLACE, compare)])
-    figures.draw_blocks(file, positions, views, cameras, assigned, cuts, METRES)
+    cuts = [("λ_vis = 1", cut)] + ([] if compare is None else [(figures.SPATIAL_ONLY_LABEL, compare)])
+    figures.plot_blocks(file, positions, views, cameras, assigned, cuts, METRES)
     check(file)
-    figures.draw_block_facts(file, positions, views, cut, assigned, "m", compare)
+    figures.plot_block_stats(file, positions, views, cut, assigned, "m", compare)
     check(file)
-    figures.draw_scores(file, scores, assigned)
+    figures.plot_scores(file, scores, assigned)
     check(file)
-    figures.draw_visibility_map(file, positions, views, cameras, ("x (units)", "y (units)"))
+    figures.plot_anchor_visibility(file, positions, views, cameras, ("x (units)", "y (units)"))
     check(file)
 
 
@@ -97,11 +97,11 @@ def test_the_comparison_stands_beside_or_below(tmp_path: Path) -> None:
     positions, views, cameras, scores = scene(300, 5, 2)
     alone, both, wide = (tmp_path / f"{name}.png" for name in ("alone", "both", "wide"))
     cut, assigned = grid(2), scores > 0.5
-    figures.draw_blocks(alone, positions, views, cameras, assigned, [("not cut", cut)], METRES)
-    compared = [("λ_vis = 1", cut), (figures.BY_PLACE, grid(2))]
-    figures.draw_blocks(both, positions, views, cameras, assigned, compared, METRES)
+    figures.plot_blocks(alone, positions, views, cameras, assigned, [("not cut", cut)], METRES)
+    compared = [("λ_vis = 1", cut), (figures.SPATIAL_ONLY_LABEL, grid(2))]
+    figures.plot_blocks(both, positions, views, cameras, assigned, compared, METRES)
     stretched = positions * np.float32([10, 1, 1])
-    figures.draw_blocks(wide, stretched, views, cameras, assigned, compared, METRES)
+    figures.plot_blocks(wide, stretched, views, cameras, assigned, compared, METRES)
     one, two, three = (check(file).shape for file in (alone, both, wide))
     assert two[1] > 1.5 * one[1]
     assert two[0] == one[0]
@@ -109,13 +109,13 @@ def test_the_comparison_stands_beside_or_below(tmp_path: Path) -> None:
 
 
 def test_blocks_have_colours_of_their_own_and_show_them(tmp_path: Path) -> None:
-    colours = np.array([to_rgb(colour) for colour in PALETTE])
+    colours = np.array([to_rgb(colour) for colour in BLOCK_PALETTE])
     assert len(colours) == 16
     assert min(np.linalg.norm(a - b) for a, b in itertools.combinations(colours, 2)) > 0.2
-    assert block_colour(16) == block_colour(0) != block_colour(1)
+    assert block_color(16) == block_color(0) != block_color(1)
     positions, views, _, scores = scene(50, 3, 16)
     file = tmp_path / "facts.png"
-    figures.draw_block_facts(file, positions, views, grid(16), scores > 2, "m", None)
+    figures.plot_block_stats(file, positions, views, grid(16), scores > 2, "m", None)
     picture = check(file).reshape(-1, 3)
     for colour in colours:  # the area of each block is a bar of its colour
         assert (np.abs(picture - colour).max(axis=1) < 0.01).sum() > 100
@@ -123,7 +123,7 @@ def test_blocks_have_colours_of_their_own_and_show_them(tmp_path: Path) -> None:
 
 def test_facts_are_those_of_the_anchors_that_a_block_owns() -> None:
     positions = np.array([[10, 5, 0], [20, 5, 0], [30, 5, 9], [90, 5, 0]], np.float32)
-    facts = block_facts(positions, np.array([2, 4, 6, 7], np.int32), grid(4))
+    facts = compute_block_stats(positions, np.array([2, 4, 6, 7], np.int32), grid(4))
     assert facts.anchors.tolist() == [2, 1, 0, 1]
     np.testing.assert_allclose(facts.area, 2500)
     np.testing.assert_allclose(facts.mean, [3, 6, np.nan, 7])
@@ -133,7 +133,7 @@ def test_facts_are_those_of_the_anchors_that_a_block_owns() -> None:
 
 def test_cameras_are_sorted_by_best_block_then_score() -> None:
     scores = np.array([[0.1, 0.5], [0.9, 0.2], [0, 0], [0.0, 0.8], [0.3, 0.1]], np.float32)
-    order, best = order_of_cameras(scores)
+    order, best = sort_cameras(scores)
     assert order.tolist() == [1, 4, 3, 0, 2]
     assert best.tolist() == [0, 0, 1, 1, 2], "the one without any score comes last"
 
@@ -143,7 +143,7 @@ def test_assigned_cameras_are_marked(tmp_path: Path, cameras: int) -> None:
     wanted = np.random.default_rng(0).random((cameras, 4)) > 0.6
 
     def red(assigned: np.ndarray) -> float:
-        figures.draw_scores(tmp_path / "scores.png", np.full((cameras, 4), 0.9, np.float32), assigned)
+        figures.plot_scores(tmp_path / "scores.png", np.full((cameras, 4), 0.9, np.float32), assigned)
         picture = check(tmp_path / "scores.png")[150:-100, :-150]  # without words and the scale
         return float(picture[..., 0].sum() - picture[..., 1].sum())
 
@@ -155,13 +155,13 @@ def test_many_anchors_are_thinned_and_the_heading_counts_cameras_beyond_the_map(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     headings = []
-    monkeypatch.setattr(figures, "titles", lambda figure, *lines: headings.append(lines))
-    positions, views, cameras, _ = scene(figures.MOST_DRAWN + 1, 3, 1)
+    monkeypatch.setattr(figures, "draw_titles", lambda figure, *lines: headings.append(lines))
+    positions, views, cameras, _ = scene(figures.MAX_DRAWN_ANCHORS + 1, 3, 1)
     far = cameras[0].camera_from_world.copy()
     far[0, 3] = -500.0
     cameras.append(Camera(camera_from_world=far, fx=400, fy=400, cx=200, cy=150, width=400, height=300))
     assigned = np.ones((4, 1), bool)
-    figures.draw_blocks(tmp_path / "blocks.png", positions, views, cameras, assigned, [("not cut", grid(1))], METRES)
+    figures.plot_blocks(tmp_path / "blocks.png", positions, views, cameras, assigned, [("not cut", grid(1))], METRES)
     assert headings[0][1] == "60,001 anchors (60,000 drawn)  ·  4 training cameras (1 beyond the map)"
 
 
@@ -187,12 +187,12 @@ def test_the_border_of_coverage_has_no_speckles() -> None:
     speckled = covered.copy()
     speckled[60:62, 60] = speckled[100, 20:90] = speckled[41:120, 80:82] = False  # a hole, a slit, a longer one
     speckled[10:15, 150:155] = speckled[180, 180] = True  # islands
-    differs = without_speckles(speckled) ^ covered
+    differs = remove_speckles(speckled) ^ covered
     assert not differs[without_edges(covered)].any()
     speckled[80:120, 30:70] = False  # a hole worth showing
-    assert not without_speckles(speckled)[90:110, 40:60].any()
+    assert not remove_speckles(speckled)[90:110, 40:60].any()
     for kind in (np.zeros, np.ones):
-        np.testing.assert_array_equal(without_speckles(kind((50, 60), bool)), kind((50, 60), bool))
+        np.testing.assert_array_equal(remove_speckles(kind((50, 60), bool)), kind((50, 60), bool))
 
 
 def without_edges(covered: np.ndarray) -> np.ndarray:
@@ -204,7 +204,7 @@ def without_edges(covered: np.ndarray) -> np.ndarray:
 def test_titles_stay_on_the_figure(width: float) -> None:
     figure = Figure(figsize=(width, 4.0), dpi=DPI)
     FigureCanvasAgg(figure)
-    titles(figure, "a name", "facts of all kinds, " * 6, "a note")
+    draw_titles(figure, "a name", "facts of all kinds, " * 6, "a note")
     assert all(line.get_window_extent().x1 <= figure.bbox.x1 for line in figure.texts)
 
 
@@ -216,7 +216,7 @@ def test_axes_are_east_and_north_only_where_the_place_is_known() -> None:
 
 
 def test_a_cut_is_called_by_its_strategy() -> None:
-    assert how_cut(PartitionConfig(lambda_vis=0.7)) == "λ_vis = 0.7"
-    assert how_cut(PartitionConfig(blocks=1)) == "not cut"
-    names = [how_cut(PartitionConfig(strategy=name)) for name in ("vastgaussian", "citygaussian", "dogs")]
+    assert describe_partition(PartitionConfig(lambda_vis=0.7)) == "λ_vis = 0.7"
+    assert describe_partition(PartitionConfig(blocks=1)) == "not cut"
+    names = [describe_partition(PartitionConfig(strategy=name)) for name in ("vastgaussian", "citygaussian", "dogs")]
     assert names == ["VastGaussian partition", "CityGaussian partition", "DOGS partition"]

@@ -18,21 +18,21 @@ from rich.console import Console
 from support.captures import look_down
 from support.hand_made_models import model_at, opaque_plane
 from vdgs.captures.capture import Capture, View
-from vdgs.config.commands import MapRequest
+from vdgs.config.commands import OrthoRequest
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.ground_frame import GroundFrame
-from vdgs.geometry.map_projection import Placement
+from vdgs.geometry.map_projection import MapProjection
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.decoder import Decoder
 from vdgs.model.renderer import render
 from vdgs.rendering.ortho import detail_transfer, ortho_folder, render_ortho, tile_renderer
-from vdgs.rendering.ortho.detail_transfer import Sharpener
-from vdgs.rendering.ortho.geotiff import CACHE_BYTES, bounded_cache
-from vdgs.rendering.ortho.nadir_camera import Overhead
-from vdgs.rendering.ortho.pixel_grid import TILE_PX, Grid, extent_of, grid_over, ground_sampling
-from vdgs.rendering.ortho.previews import hillshade, round_length
-from vdgs.rendering.ortho.tile_renderer import NO_COUNT, NO_HEIGHT, Surveyor, samples_for
+from vdgs.rendering.ortho.detail_transfer import DetailTransfer
+from vdgs.rendering.ortho.geotiff import GDAL_CACHE_BYTES, limit_gdal_cache
+from vdgs.rendering.ortho.nadir_camera import NadirCamera
+from vdgs.rendering.ortho.pixel_grid import TILE_PX, PixelGrid, capture_extent, grid_from_bbox, ground_sampling_distance
+from vdgs.rendering.ortho.previews import floor_to_nice_length, hillshade
+from vdgs.rendering.ortho.tile_renderer import NODATA_COUNT, NODATA_HEIGHT, TileRenderer, samples_per_side
 from vdgs.runs.run_context import RunContext
 
 rasterio = pytest.importorskip("rasterio")
@@ -63,8 +63,8 @@ def model_of(places: np.ndarray) -> AnchorModel:
     return replace(plane, anchors=anchors)
 
 
-def surveyor_of(model: AnchorModel, capture: Capture, placement: Placement, *given, **named) -> Surveyor:
-    return Surveyor(model, Overhead.of(capture, placement), *given, **named)
+def surveyor_of(model: AnchorModel, capture: Capture, placement: MapProjection, *given, **named) -> TileRenderer:
+    return TileRenderer(model, NadirCamera.of(capture, placement), *given, **named)
 
 
 GROUND, TOP = surface(-10, -10, 10, 10, 0.0), surface(*HOUSE, ROOF)
@@ -92,7 +92,7 @@ def capture_of(points: np.ndarray, origin: tuple[float, float, float] | None = P
     )
     return Capture(
         root=Path("place"), source="colmap", images="images", views=tuple(views), points=points,
-        point_colours=np.zeros((len(points), 3), np.uint8), ground=ground,
+        point_colors=np.zeros((len(points), 3), np.uint8), ground=ground,
     )  # fmt: skip
 
 
@@ -105,8 +105,8 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         status = SimpleNamespace(model="1-2")
         opened = SimpleNamespace(folder=ortho_folder, capture=capture, model=model, name="coarse", status=status)
         monkeypatch.setattr(RunContext, "open_model", lambda *_: opened)
-        request = MapRequest(run=tmp_path / "run", device="cpu", **asked)
-        return render_ortho.map_run(
+        request = OrthoRequest(run=tmp_path / "run", device="cpu", **asked)
+        return render_ortho.render_ortho(
             RunContext.from_path(request.run), request, Console(file=sys.stderr, soft_wrap=True)
         )
 
@@ -127,11 +127,11 @@ def test_every_place_falls_on_its_pixel_to_a_tenth(crs, away):
     centre = np.array([*away, 0.0])
     places = centre + np.random.default_rng(1).uniform(-1, 1, (200, 3)) * (10, 10, 5)
     capture = capture_of(places)
-    placement = Placement.of(capture.ground, crs)
+    placement = MapProjection.of(capture.ground, crs)
     exact = placement.places(places)
     x, y = placement.places(centre[None])[0, :2]
-    grid = Grid(float(x) - 10.24, float(y) + 10.24, 0.04, 512, 512)
-    pixels, _ = Overhead.of(capture, placement).camera(grid).project(places)
+    grid = PixelGrid(float(x) - 10.24, float(y) + 10.24, 0.04, 512, 512)
+    pixels, _ = NadirCamera.of(capture, placement).camera(grid).project(places)
     expected = np.stack([(exact[:, 0] - grid.left) / grid.gsd, (grid.top - exact[:, 1]) / grid.gsd], axis=1)
     assert np.abs(pixels - expected).max() < 0.1
 
@@ -140,7 +140,7 @@ def test_files_open_at_the_right_place_with_the_right_heights(house, make):
     capture, model = house
     ortho_folder = make(capture, model, gsd=0.1)
     corners = np.array([[HOUSE[0], HOUSE[1], ROOF], [HOUSE[2], HOUSE[3], ROOF]])
-    easting, northing, height = Placement.of(capture.ground).places(corners.mean(axis=0, keepdims=True))[0]
+    easting, northing, height = MapProjection.of(capture.ground).places(corners.mean(axis=0, keepdims=True))[0]
     with rasterio.open(ortho_folder / "dsm.tif") as file:
         assert file.crs.to_epsg() == 32632
         heights = file.read(1)
@@ -153,7 +153,7 @@ def test_files_open_at_the_right_place_with_the_right_heights(house, make):
     # What a photograph shows in some pixel is there in the map.
     camera = capture.views[2].camera
     depth = render(model, camera, depth=True).median_depth
-    place = Placement.of(capture.ground).places(camera.unproject(depth.numpy())[24, 32][None])[0]
+    place = MapProjection.of(capture.ground).places(camera.unproject(depth.numpy())[24, 32][None])[0]
     with rasterio.open(ortho_folder / "dsm.tif") as file:
         assert file.read(1)[file.index(*place[:2])] == pytest.approx(place[2], abs=0.05)
 
@@ -162,7 +162,11 @@ def test_files_are_cloud_optimised_and_say_what_they_are(house, make):
     ortho_folder = make(*house, gsd=0.03)
     names = {file.name for file in ortho_folder.iterdir()}
     assert names == {"orthophoto.tif", "dsm.tif", "visibility.tif", "hillshade.png", "preview.png", "map.json"}
-    layers = {"orthophoto": (4, "uint8", None), "dsm": (1, "float32", NO_HEIGHT), "visibility": (1, "uint16", NO_COUNT)}
+    layers = {
+        "orthophoto": (4, "uint8", None),
+        "dsm": (1, "float32", NODATA_HEIGHT),
+        "visibility": (1, "uint16", NODATA_COUNT),
+    }
     for name, (count, dtype, nodata) in layers.items():
         with rasterio.open(ortho_folder / f"{name}.tif") as file:
             assert (file.count, file.dtypes[0], file.nodata) == (count, dtype, nodata)
@@ -179,7 +183,7 @@ def test_files_are_cloud_optimised_and_say_what_they_are(house, make):
 
 def test_overviews_have_no_height_between_roof_and_street_either(house, make):
     ortho_folder = make(*house, gsd=0.03)
-    for name, nothing in (("dsm", NO_HEIGHT), ("visibility", NO_COUNT)):
+    for name, nothing in (("dsm", NODATA_HEIGHT), ("visibility", NODATA_COUNT)):
         with rasterio.open(ortho_folder / f"{name}.tif") as file:
             whole, factors = file.read(1), file.overviews(1)
         assert factors
@@ -194,8 +198,8 @@ def test_overviews_have_no_height_between_roof_and_street_either(house, make):
 def test_walls_do_not_smear(house, samples):
     """No pixel has a height between ground and roof: not at an edge, not where samples are put together."""
     capture, model = house
-    surveyor = surveyor_of(model, capture, Placement.of(capture.ground, "local"), samples)
-    tile = surveyor.tile(Grid(-4.0, 5.0, 0.1, 130, 100))
+    surveyor = surveyor_of(model, capture, MapProjection.of(capture.ground, "local"), samples)
+    tile = surveyor.tile(PixelGrid(-4.0, 5.0, 0.1, 130, 100))
     heights = tile.heights[tile.alpha > 0]
     assert tile.alpha.mean() > 250
     between = (heights > 0.2) & (heights < ROOF - 0.2)
@@ -210,10 +214,10 @@ def test_a_map_ends_with_the_scene_and_not_with_what_cameras_see_behind_it(house
     turns = np.linspace(0, 2 * np.pi, 12, endpoint=False)
     views = tuple(replace(capture.views[0], camera=looking_in(30.0, turn)) for turn in turns)
     hills = np.array([(600 * np.cos(turn), 600 * np.sin(turn), 5.0) for turn in np.linspace(0, 6, len(GROUND) // 9)])
-    around, placement = replace(capture, views=views), Placement.of(capture.ground, "local")
-    assert np.mean([view.camera.sees(hills) for view in views]) > 2 / len(views)  # each is in two and more
+    around, placement = replace(capture, views=views), MapProjection.of(capture.ground, "local")
+    assert np.mean([view.camera.in_frustum(hills) for view in views]) > 2 / len(views)  # each is in two and more
     behind = replace(around, points=np.concatenate([capture.points, hills]))
-    assert extent_of(behind, placement) == pytest.approx(extent_of(around, placement), abs=0.5)
+    assert capture_extent(behind, placement) == pytest.approx(capture_extent(around, placement), abs=0.5)
 
 
 def looking_in(distance: float, turn: float) -> Camera:
@@ -227,9 +231,9 @@ def looking_in(distance: float, turn: float) -> Camera:
 
 def test_tiles_show_what_one_picture_shows(house):
     capture, model = house
-    surveyor = surveyor_of(model, capture, Placement.of(capture.ground))
-    x0, y0, x1, y1 = extent_of(capture, surveyor.above.placement)
-    grid = grid_over((x0, y0, x1, y1), 0.2)
+    surveyor = surveyor_of(model, capture, MapProjection.of(capture.ground))
+    x0, y0, x1, y1 = capture_extent(capture, surveyor.above.placement)
+    grid = grid_from_bbox((x0, y0, x1, y1), 0.2)
     whole = surveyor.tile(grid)
     for column, row, part in grid.tiles(40):
         tile = surveyor.tile(part)
@@ -242,18 +246,18 @@ def test_tiles_show_what_one_picture_shows(house):
 
 def test_visibility_counts_cameras_and_what_none_sees_is_blank(house):
     capture, model = house
-    surveyor = surveyor_of(model, capture, Placement.of(capture.ground, "local"))
-    grid = Grid(-10.0, 10.0, 0.25, 80, 80)
+    surveyor = surveyor_of(model, capture, MapProjection.of(capture.ground, "local"))
+    grid = PixelGrid(-10.0, 10.0, 0.25, 80, 80)
     tile = surveyor.tile(grid)
     x, y = np.meshgrid(grid.left + (np.arange(80) + 0.5) * 0.25, grid.top - (np.arange(80) + 0.5) * 0.25)
     shown = tile.alpha > 0
     places = np.stack([x[shown], y[shown], tile.heights[shown]], axis=1)
-    count = sum(view.camera.sees(places).astype(int) for view in capture.train_views)
+    count = sum(view.camera.in_frustum(places).astype(int) for view in capture.train_views)
     assert (tile.visibility[shown] == count).mean() > 0.999
     assert tile.visibility[shown].min() >= 1
     assert not shown.all()  # beyond all pictures, though the model is opaque there
-    assert set(np.unique(tile.visibility[~shown])) == {NO_COUNT}
-    assert set(np.unique(tile.heights[~shown])) == {np.float32(NO_HEIGHT)}
+    assert set(np.unique(tile.visibility[~shown])) == {NODATA_COUNT}
+    assert set(np.unique(tile.heights[~shown])) == {np.float32(NODATA_HEIGHT)}
 
 
 def test_what_hangs_as_high_as_cameras_is_not_in_the_map_and_a_tower_is():
@@ -262,11 +266,13 @@ def test_what_hangs_as_high_as_cameras_is_not_in_the_map_and_a_tower_is():
     capture = capture_of(np.concatenate([GROUND, TOP, tower]))
     model = model_of(np.concatenate([GROUND, TOP, tower, veil]))
     tower_seen = replace(capture, views=(*capture.views, replace(capture.views[0], camera=_above(5.0, 5.0, 60.0))))
-    surveyor = surveyor_of(model, tower_seen, Placement.of(capture.ground, "local"))
-    grid = Grid(-3.0, 6.5, 0.25, 40, 40)
+    surveyor = surveyor_of(model, tower_seen, MapProjection.of(capture.ground, "local"))
+    grid = PixelGrid(-3.0, 6.5, 0.25, 40, 40)
     heights = surveyor.tile(grid).heights
     assert heights.max() == pytest.approx(24.0, abs=0.1)
-    low = surveyor_of(model, capture, Placement.of(capture.ground, "local")).tile(Grid(-3.0, 0.0, 0.25, 12, 12))
+    low = surveyor_of(model, capture, MapProjection.of(capture.ground, "local")).tile(
+        PixelGrid(-3.0, 0.0, 0.25, 12, 12)
+    )
     assert low.heights[low.alpha > 0].max() < 1.0
 
 
@@ -291,10 +297,10 @@ def test_a_capture_without_georeference_has_a_map_that_says_so(house, make, caps
 
 def test_without_options_pixels_are_those_of_the_photographs(house, make):
     capture, model = house
-    assert ground_sampling(capture, 1.0) == pytest.approx(20 / 80, rel=0.1)
+    assert ground_sampling_distance(capture, 1.0) == pytest.approx(20 / 80, rel=0.1)
     with rasterio.open(make(capture, model) / "orthophoto.tif") as file:
         assert file.res[0] == pytest.approx(0.25, rel=0.1)
-    assert [samples_for(gsd, 0.1) for gsd in (0.02, 0.1, 0.3, 5.0)] == [1, 1, 3, 4]
+    assert [samples_per_side(gsd, 0.1) for gsd in (0.02, 0.1, 0.3, 5.0)] == [1, 1, 3, 4]
 
 
 @pytest.mark.parametrize(
@@ -347,10 +353,10 @@ def test_maps_of_others_are_not_written_over(house, make, tmp_path, monkeypatch,
         (tmp_path / "map.json").write_text(facts)
     before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
     with pytest.raises(VdgsError, match=r"holds dsm\.tif.*Nothing was drawn"):
-        render_ortho.map_run(context, MapRequest(run=tmp_path / "run", output=tmp_path), Console(quiet=True))
+        render_ortho.render_ortho(context, OrthoRequest(run=tmp_path / "run", output=tmp_path), Console(quiet=True))
     with pytest.raises(VdgsError, match="is a file"):
-        render_ortho.map_run(
-            context, MapRequest(run=tmp_path / "run", output=tmp_path / "dsm.tif"), Console(quiet=True)
+        render_ortho.render_ortho(
+            context, OrthoRequest(run=tmp_path / "run", output=tmp_path / "dsm.tif"), Console(quiet=True)
         )
     assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
 
@@ -371,15 +377,15 @@ def test_a_map_killed_while_its_files_take_their_places_is_known_as_ours_and_as_
             make(capture, model, gsd=0.5)
     run = SimpleNamespace(path=make.path, merged=SimpleNamespace(status=lambda: SimpleNamespace(model="1-2")))
     assert (make.path / "maps" / "dsm.tif").exists()
-    assert not render_ortho.is_mapped(run)
+    assert not render_ortho.is_ortho_current(run)
     make(capture, model, gsd=0.4)
-    assert render_ortho.is_mapped(run)
+    assert render_ortho.is_ortho_current(run)
 
 
 def test_a_disk_without_room_is_named_before_anything_is_drawn(house, make, monkeypatch):
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(10, 9, 1))
-    monkeypatch.setattr(tile_renderer.Surveyor, "tile", lambda *_: pytest.fail("drawn"))
+    monkeypatch.setattr(tile_renderer.TileRenderer, "tile", lambda *_: pytest.fail("drawn"))
     with pytest.raises(VdgsError, match=r"0 MB are free\. Give a larger --gsd"):
         make(*house, gsd=0.2)
 
@@ -391,7 +397,7 @@ def test_a_map_that_fails_leaves_the_old_one_whole(house, make, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(render_ortho, "preview_png", full)
+    monkeypatch.setattr(render_ortho, "write_preview", full)
     with pytest.raises(VdgsError, match=r"No space left on device.*maps that were there are kept"):
         make(*house, gsd=0.4)
     assert {file.name: file.read_bytes() for file in ortho_folder.iterdir()} == before
@@ -404,7 +410,7 @@ def test_without_rasterio_the_remedy_is_named(house, make, monkeypatch):
 
 
 def test_lines_of_a_grid_are_at_multiples_of_its_pixels():
-    grid = grid_over((100.03, 50.0, 101.97, 51.0), 0.1)
+    grid = grid_from_bbox((100.03, 50.0, 101.97, 51.0), 0.1)
     np.testing.assert_allclose(grid.bounds, (100.0, 50.0, 102.0, 51.0), atol=1e-9)
     assert (grid.width, grid.height, grid.tile_count(8)) == (20, 10, 6)
     assert sum(part.width * part.height for _, _, part in grid.tiles(8)) == 200
@@ -423,7 +429,7 @@ def test_light_of_a_hillshade():
 
 @pytest.mark.parametrize(("about", "length"), [(10.0, 10.0), (9.9, 5.0), (0.23, 0.2), (499.0, 200.0)])
 def test_scale_bars_are_round(about, length):
-    assert round_length(about) == pytest.approx(length)
+    assert floor_to_nice_length(about) == pytest.approx(length)
 
 
 def pattern(places: np.ndarray) -> np.ndarray:
@@ -449,8 +455,8 @@ def photographed(capture: Capture, model: AnchorModel, folder: Path, woven: floa
 def test_detail_comes_from_the_photographs_where_they_see_the_place(house, tmp_path, woven):
     capture, model = house
     capture = photographed(capture, model, tmp_path, woven)
-    grid = Grid(-3.0, 5.0, 0.08, 120, 100)
-    placement, sharpener = Placement.of(capture.ground, "local"), Sharpener(model, capture)
+    grid = PixelGrid(-3.0, 5.0, 0.08, 120, 100)
+    placement, sharpener = MapProjection.of(capture.ground, "local"), DetailTransfer(model, capture)
     plain = surveyor_of(model, capture, placement).tile(grid)
     sharp = surveyor_of(model, capture, placement, sharpener=sharpener).tile(grid)
     sharpener.close()
@@ -493,12 +499,12 @@ def misted(capture: Capture, folder: Path) -> Capture:
 @pytest.mark.parametrize("most", [12, 2])
 def test_detail_knows_no_borders_of_tiles(house, tmp_path, monkeypatch, most):
     """Also where only some of the photographs are looked up."""
-    monkeypatch.setattr(detail_transfer, "_MOST_VIEWS", most)
+    monkeypatch.setattr(detail_transfer, "_MAX_VIEWS", most)
     capture, _ = house
     capture, model = misted(capture, tmp_path), grey(GROUND)
-    sharpener = Sharpener(model, capture)
-    surveyor = surveyor_of(model, capture, Placement.of(capture.ground, "local"), sharpener=sharpener)
-    grid = Grid(-8.0, 4.0, 0.08, 200, 100)
+    sharpener = DetailTransfer(model, capture)
+    surveyor = surveyor_of(model, capture, MapProjection.of(capture.ground, "local"), sharpener=sharpener)
+    grid = PixelGrid(-8.0, 4.0, 0.08, 200, 100)
     whole = surveyor.tile(grid).colours
     joined = np.zeros_like(whole)
     for column, row, part in grid.tiles(50):
@@ -512,5 +518,5 @@ def test_detail_knows_no_borders_of_tiles(house, tmp_path, monkeypatch, most):
 
 def test_gdal_may_keep_megabytes_of_a_map_and_not_bytes():
     """With less than a row of tiles, each row of a preview decodes them again: minutes for a small map."""
-    with bounded_cache():
-        assert rasterio.env.get_gdal_config("GDAL_CACHEMAX") == CACHE_BYTES > 100 * TILE_PX * TILE_PX * 4
+    with limit_gdal_cache():
+        assert rasterio.env.get_gdal_config("GDAL_CACHEMAX") == GDAL_CACHE_BYTES > 100 * TILE_PX * TILE_PX * 4

@@ -16,15 +16,17 @@ from scipy.spatial.transform import Rotation
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.ground_frame import GroundFrame
-from vdgs.rendering.camera_paths import flyover, frame_count, interpolate, look_at, orbit
+from vdgs.rendering.camera_paths import flyover, frame_count, interpolate, look_at_pose, orbit
 from vdgs.rendering.path_io import load_path
-from vdgs.rendering.video import VideoWriter, best_encoder
+from vdgs.rendering.video import VideoWriter, default_encoder
 
 TEMPLATE = Camera(camera_from_world=np.eye(4), fx=400.0, fy=410.0, cx=160.0, cy=90.0, width=320, height=180)
 
 
 def standing(position, target, **changes) -> Camera:
-    return replace(TEMPLATE, camera_from_world=look_at(np.array(position, float), np.array(target, float)), **changes)
+    return replace(
+        TEMPLATE, camera_from_world=look_at_pose(np.array(position, float), np.array(target, float)), **changes
+    )
 
 
 def write(folder: Path, content) -> Path:
@@ -126,7 +128,7 @@ def test_single_and_repeated_keyframes():
 
 
 def test_a_file_with_everything(tmp_path: Path):
-    pose = look_at(np.array([1.0, 2, 3]), np.array([4.0, 5, 0]))
+    pose = look_at_pose(np.array([1.0, 2, 3]), np.array([4.0, 5, 0]))
     entries = [
         {"position": [0, 0, 30], "look_at": [0, 20, 0], "fov_deg": 60},
         {
@@ -203,7 +205,7 @@ def test_a_path_of_nerfstudio_leads_back_to_the_capture(place: str, tmp_path: Pa
     motion, scale = oriented @ applied, 0.0125
     said = {"transform": motion[:3].astype(np.float32).tolist(), "scale": scale}
     (tmp_path / place / "dataparser_transforms.json").write_text(json.dumps(said))
-    poses = [look_at(np.array([x, 4.0, 30]), np.array([x, 20.0, 0])) for x in (-40.0, 0.0, 55.0)]
+    poses = [look_at_pose(np.array([x, 4.0, 30]), np.array([x, 20.0, 0])) for x in (-40.0, 0.0, 55.0)]
     file = tmp_path / "data/camera_paths/a.json"
     file.write_text(json.dumps(of_nerfstudio(motion, scale, poses)))
     rotation = Rotation.from_euler("xyz", [1.2, 0.3, -0.4]).as_matrix()
@@ -218,7 +220,7 @@ def test_a_path_of_nerfstudio_leads_back_to_the_capture(place: str, tmp_path: Pa
 
 
 def test_a_path_of_nerfstudio_without_its_frame_is_refused(tmp_path: Path):
-    content = of_nerfstudio(np.eye(4), 1.0, [look_at(np.array([0.0, 0, 9]), np.array([0.0, 1, 0]))])
+    content = of_nerfstudio(np.eye(4), 1.0, [look_at_pose(np.array([0.0, 0, 9]), np.array([0.0, 1, 0]))])
     file = write(tmp_path, content)
     with pytest.raises(VdgsError, match=r"outputs/NAME/METHOD/DATE/dataparser_transforms.json") as caught:
         load_path(file, TEMPLATE, capture=tmp_path / "capture")
@@ -390,7 +392,7 @@ def test_a_film_that_fails_leaves_nothing(tmp_path: Path):
 
 def test_a_missing_encoder_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("vdgs.rendering.video.importlib.util.find_spec", lambda name: None)
-    assert best_encoder() == "mpeg4"
+    assert default_encoder() == "mpeg4"
     monkeypatch.setattr("vdgs.rendering.video.cv2.VideoWriter.fourcc", lambda *letters: 0, raising=False)
 
     class Closed:

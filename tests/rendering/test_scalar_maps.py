@@ -12,15 +12,15 @@ from matplotlib.colors import to_rgb
 
 from vdgs.config.commands import RenderRequest
 from vdgs.errors import VdgsError
-from vdgs.plots.style import SEEN
+from vdgs.plots.style import VISIBILITY_CMAP
 from vdgs.rendering import colorbar, render_folder
 from vdgs.rendering.render_run import _check
-from vdgs.rendering.scalar_maps import NOTHING, alpha_scale, depth_scale, depth_span, seen_scale
+from vdgs.rendering.scalar_maps import NO_DATA_COLOR, alpha_scale, depth_range, depth_scale, visibility_scale
 
 SCALES = {
     "depth": depth_scale((31.7, 48.2), "m"),
-    "visibility": seen_scale(np.arange(14)),
-    "many views": seen_scale(np.arange(1200)),
+    "visibility": visibility_scale(np.arange(14)),
+    "many views": visibility_scale(np.arange(1200)),
     "alpha": alpha_scale(),
 }
 
@@ -31,9 +31,9 @@ def picture(names: list[str], place: Path, text: bytes = b"picture") -> None:
 
 
 def rendered(place: Path, names: list[str]) -> None:
-    earlier = render_folder.begin(place, names)
+    earlier = render_folder.begin_render(place, names)
     picture(names, place)
-    render_folder.finish(place, earlier, names, {"kind": "image"})
+    render_folder.finish_render(place, earlier, names, {"kind": "image"})
 
 
 def names_in(place: Path) -> list[str]:
@@ -53,7 +53,7 @@ def test_what_no_render_wrote_is_never_touched(tmp_path: Path) -> None:
     rendered(tmp_path, ["a.png"])
     picture(["mine.png"], tmp_path, b"mine")
     with pytest.raises(VdgsError, match=r"1 files or folders that no render wrote \(mine\.png\)"):
-        render_folder.begin(tmp_path, ["mine.png"])
+        render_folder.begin_render(tmp_path, ["mine.png"])
     assert (tmp_path / "mine.png").read_bytes() == b"mine"
     assert json.loads((tmp_path / "render.json").read_text())["files"] == ["a.png"]
 
@@ -63,7 +63,7 @@ def test_a_list_that_is_not_ours_claims_nothing(tmp_path: Path, text: str) -> No
     picture(["a.png"], tmp_path)
     (tmp_path / "render.json").write_text(text)
     with pytest.raises(VdgsError, match=r"2 files or folders that no render wrote \(a\.png, render\.json\)"):
-        render_folder.begin(tmp_path, ["a.png"])
+        render_folder.begin_render(tmp_path, ["a.png"])
 
 
 def test_a_list_that_was_edited_reaches_nothing_else(tmp_path: Path) -> None:
@@ -79,30 +79,30 @@ def test_a_list_that_was_edited_reaches_nothing_else(tmp_path: Path) -> None:
 
 def test_a_render_that_was_cut_off_is_known_again(tmp_path: Path) -> None:
     rendered(tmp_path, ["a.png", "b.png"])
-    render_folder.begin(tmp_path, ["c.png", "d.png"])
+    render_folder.begin_render(tmp_path, ["c.png", "d.png"])
     picture(["c.png"], tmp_path)  # and here the power fails
-    assert render_folder.begin(tmp_path, ["e.png"]) == ["a.png", "b.png", "c.png"]
-    render_folder.finish(tmp_path, ["a.png", "b.png", "c.png"], [], {})
+    assert render_folder.begin_render(tmp_path, ["e.png"]) == ["a.png", "b.png", "c.png"]
+    render_folder.finish_render(tmp_path, ["a.png", "b.png", "c.png"], [], {})
     assert names_in(tmp_path) == ["render.json"]
 
 
 def test_a_file_is_no_folder(tmp_path: Path) -> None:
     (tmp_path / "film").write_bytes(b"")
     with pytest.raises(VdgsError, match="is a file"):
-        render_folder.begin(tmp_path / "film", ["a.png"])
+        render_folder.begin_render(tmp_path / "film", ["a.png"])
 
 
 def test_the_range_of_depths_holds_every_view() -> None:
     near, far = np.full((4, 5), 10.0), np.full((4, 5), 90.0)
     far[0, 0] = np.nan
-    low, high = depth_span([near, far, np.full((4, 5), np.nan)], 7.0)
+    low, high = depth_range([near, far, np.full((4, 5), np.nan)], 7.0)
     assert (low, high) == (10.0, 90.0)
-    assert depth_span([np.full((2, 2), np.nan)], 7.0) == (0.0, 14.0)
+    assert depth_range([np.full((2, 2), np.nan)], 7.0) == (0.0, 14.0)
     scale = depth_scale((low, high), "m")
     assert scale.low <= low < high <= scale.high
-    ground = scale.coloured(np.array([[10.0, 90.0, np.nan]]))
+    ground = scale.colorize(np.array([[10.0, 90.0, np.nan]]))
     assert len(np.unique(ground.reshape(-1, 3), axis=0)) == 3
-    assert tuple(ground[0, 2]) == NOTHING
+    assert tuple(ground[0, 2]) == NO_DATA_COLOR
 
 
 @pytest.mark.parametrize("span", [(0.0, 20.0), (30.0, 30.0), (1e-4, 2e-4), (0.0, 0.0), (12.0, 4000.0)])
@@ -115,10 +115,10 @@ def test_depths_of_any_range_have_round_numbers(span: tuple[float, float]) -> No
 
 
 def test_v_has_the_colours_of_all_other_figures_and_whole_steps() -> None:
-    scale = seen_scale(np.array([0, 1, 4, 10]))
-    drawn = scale.coloured(np.array([[0.0, 0.4, 0.6, 9.8, 10.0, 10.4]])) / 255
-    np.testing.assert_allclose(drawn[0, 0], SEEN(0.0)[:3], atol=0.01)
-    np.testing.assert_allclose(drawn[0, -1], SEEN(1.0)[:3], atol=0.01)
+    scale = visibility_scale(np.array([0, 1, 4, 10]))
+    drawn = scale.colorize(np.array([[0.0, 0.4, 0.6, 9.8, 10.0, 10.4]])) / 255
+    np.testing.assert_allclose(drawn[0, 0], VISIBILITY_CMAP(0.0)[:3], atol=0.01)
+    np.testing.assert_allclose(drawn[0, -1], VISIBILITY_CMAP(1.0)[:3], atol=0.01)
     assert (drawn[0, 0] == drawn[0, 1]).all()
     assert (drawn[0, 3] == drawn[0, 5]).all()
     assert (drawn[0, 1] != drawn[0, 2]).any()
@@ -131,7 +131,7 @@ def test_v_has_the_colours_of_all_other_figures_and_whole_steps() -> None:
 def test_legends_fit_below_every_picture(name: str, size: tuple[int, int]) -> None:
     scale, (height, width) = SCALES[name], size
     picture = np.full((height, width, 3), 7, np.uint8)
-    whole = colorbar.with_legend(picture, scale)
+    whole = colorbar.add_colorbar(picture, scale)
     assert whole.shape[1] == width
     assert whole.shape[0] % 2 == 0
     np.testing.assert_array_equal(whole[:height], picture)
@@ -142,7 +142,7 @@ def test_legends_fit_below_every_picture(name: str, size: tuple[int, int]) -> No
         ink = np.round(np.array(to_rgb("#1c1e22")) * 255)
         assert (strip == ink).all(axis=-1).sum() > 10
         for value in (scale.low, scale.high):  # the bar shows both ends
-            colour = scale.coloured(np.full((1, 1), value))[0, 0].astype(int)
+            colour = scale.colorize(np.full((1, 1), value))[0, 0].astype(int)
             assert (np.abs(strip - colour).max(axis=-1) < 8).any()
 
 

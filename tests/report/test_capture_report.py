@@ -18,8 +18,8 @@ from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.geometry.row_sampling import sample_points
 from vdgs.report.capture_report import inspect_capture, print_report
-from vdgs.report.capture_stats import length
-from vdgs.visibility.visibility_counts import imbalance, visibility_of
+from vdgs.report.capture_stats import format_length
+from vdgs.visibility.visibility_counts import count_visibility, visibility_stats
 
 
 @pytest.fixture
@@ -30,7 +30,9 @@ def capture(tmp_path):
 
 def test_visibility_is_a_count_of_frusta(capture):
     """V against one projection at a time, written out."""
-    visibility = visibility_of(torch.from_numpy(capture.points), [view.camera for view in capture.train_views]).numpy()
+    visibility = count_visibility(
+        torch.from_numpy(capture.points), [view.camera for view in capture.train_views]
+    ).numpy()
     for index in range(0, len(capture.points), 17):
         seen = 0
         for view in capture.train_views:
@@ -44,7 +46,9 @@ def test_visibility_is_a_count_of_frusta(capture):
 
 def test_the_report_says_what_is_there(capture, tmp_path):
     report = inspect_capture(capture, tmp_path / "out")
-    visibility = visibility_of(torch.from_numpy(capture.points), [view.camera for view in capture.train_views]).numpy()
+    visibility = count_visibility(
+        torch.from_numpy(capture.points), [view.camera for view in capture.train_views]
+    ).numpy()
     assert (report.photographs, report.train, report.test) == (12, 10, 2)
     assert report.image_sizes == [(64, 48)]
     assert report.image_bytes == 12 * 64 * 48 * 3
@@ -79,7 +83,7 @@ def test_the_table_is_printed_with_its_warnings(tmp_path):
 @given(st.lists(st.integers(0, 1000), min_size=1, max_size=60))
 def test_gini_is_the_mean_difference(values):
     array = np.array(values)
-    found = imbalance(array).gini
+    found = visibility_stats(array).gini
     if array.sum() == 0:
         assert found == 0
         return
@@ -92,12 +96,12 @@ def test_samples_are_repeatable_and_lengths_are_for_people():
     np.testing.assert_array_equal(sample_points(points, 100), sample_points(points, 100))
     assert len(np.unique(sample_points(points, 100)[:, 0])) == 100
     assert sample_points(points, 1000) is points
-    assert (length(0.0567, "m"), length(12.3, "m"), length(0.05, "units")) == (
+    assert (format_length(0.0567, "m"), format_length(12.3, "m"), format_length(0.05, "units")) == (
         "5.67 cm",
         "12.3 m",
         "0.05 units",
     )
-    assert length(None, "m") == "unknown"
+    assert format_length(None, "m") == "unknown"
 
 
 @pytest.mark.capture

@@ -15,9 +15,9 @@ from PIL import Image
 from vdgs.errors import RunError
 from vdgs.report import write_report
 from vdgs.report.charts import running_median
-from vdgs.report.embedded_images import MOST_BYTES, reduced
-from vdgs.report.formatting import gain
-from vdgs.report.html_page import escaped
+from vdgs.report.embedded_images import MAX_BYTES, reduce_image
+from vdgs.report.formatting import format_difference
+from vdgs.report.html_page import escape_html
 from vdgs.runs.run_folder import RunFolder
 
 pytestmark = pytest.mark.xdist_group("report")
@@ -396,12 +396,12 @@ def test_the_report_stays_small_with_many_views_and_large_pictures(tmp_path):
 
 
 def test_a_picture_keeps_its_shape_and_stands_on_white():
-    wide = reduced(Image.new("RGBA", (4000, 1000), (0, 0, 0, 0)))
+    wide = reduce_image(Image.new("RGBA", (4000, 1000), (0, 0, 0, 0)))
     assert (wide.width, wide.height, wide.kind) == (1600, 400, "png")
     noise = Image.fromarray(np.random.default_rng(1).integers(0, 256, (900, 900, 3), dtype=np.uint8))
-    small = reduced(noise)
+    small = reduce_image(noise)
     assert small.kind == "jpeg"
-    assert len(small.content) <= MOST_BYTES
+    assert len(small.content) <= MAX_BYTES
 
 
 def test_running_medians_pass_over_gaps():
@@ -410,5 +410,5 @@ def test_running_medians_pass_over_gaps():
 
 
 def test_words():
-    assert [gain(1.0, before) for before in (1.25, 1.001, None)] == ["−0.25", "+0.00", "–"]
-    assert escaped("<a>&\"'\x01") == "&lt;a&gt;&amp;&quot;&#x27;\N{REPLACEMENT CHARACTER}"
+    assert [format_difference(1.0, before) for before in (1.25, 1.001, None)] == ["−0.25", "+0.00", "–"]
+    assert escape_html("<a>&\"'\x01") == "&lt;a&gt;&amp;&quot;&#x27;\N{REPLACEMENT CHARACTER}"

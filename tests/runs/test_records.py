@@ -5,18 +5,18 @@ import json
 import pytest
 
 from vdgs.errors import RunError, VdgsError
-from vdgs.partition.block_records import AssignedBlock, CutBlock, MergedBlock, PartitionRecord
+from vdgs.partition.block_records import BlockCamerasRecord, BlockRecord, MergedBlockRecord, PartitionRecord
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.stage_folder import StageFolder, Status
-from vdgs.system.records import known, plain, record_of
+from vdgs.runs.stage_folder import StageFolder, StatusRecord
+from vdgs.system.records import record_from_dict, record_to_compact_dict, record_to_dict
 
-MERGED = Status(
+MERGED = StatusRecord(
     state="done",
     anchors=3,
     blocks_trained=1,
     blocks=(
-        MergedBlock(block=0, trained=3, kept=2, dropped=1, from_coarse=0, unseen=1),
-        MergedBlock(block=1, trained=0, kept=0, dropped=0, from_coarse=1, unseen=0),
+        MergedBlockRecord(block=0, trained=3, kept=2, dropped=1, coarse_fallback=0, unseen=1),
+        MergedBlockRecord(block=1, trained=0, kept=0, dropped=0, coarse_fallback=1, unseen=0),
     ),
     block_models=("a-1", None),
     seconds=1.0,
@@ -31,7 +31,7 @@ CUT = PartitionRecord(
     warnings=("a warning",),
     complaints=(),
     blocks=(
-        AssignedBlock(
+        BlockCamerasRecord(
             block=0,
             cameras=2,
             above_threshold=1,
@@ -44,22 +44,24 @@ CUT = PartitionRecord(
             area=2.5,
         ),
     ),
-    spatial=(CutBlock(0, 5, 2.5, 1.5, 0.5),),
+    spatial=(BlockRecord(0, 5, 2.5, 1.5, 0.5),),
     seconds=3.0,
     peak_memory_bytes=4,
 )
 
 
-@pytest.mark.parametrize("record", [Status(), Status(state="running", iteration=3, seconds_left=7), MERGED, CUT])
-@pytest.mark.parametrize("written", [plain, known])
+@pytest.mark.parametrize(
+    "record", [StatusRecord(), StatusRecord(state="running", iteration=3, seconds_left=7), MERGED, CUT]
+)
+@pytest.mark.parametrize("written", [record_to_dict, record_to_compact_dict])
 def test_what_is_read_is_what_was_written(record, written):
-    assert record_of(type(record), json.loads(json.dumps(written(record)))) == record
+    assert record_from_dict(type(record), json.loads(json.dumps(written(record)))) == record
 
 
 def test_what_is_missing_or_foreign_in_a_status_is_left_out(tmp_path):
     folder = StageFolder(tmp_path)
     folder.status_file.write_text('{"state": "done", "seconds": 3, "psnr_training": null, "of_the_future": [1]}')
-    assert folder.status() == Status(state="done", seconds=3.0)
+    assert folder.status() == StatusRecord(state="done", seconds=3.0)
 
 
 @pytest.mark.parametrize(

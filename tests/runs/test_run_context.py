@@ -15,7 +15,7 @@ from support.clusters import copy_run
 from support.commands import CommandsHere
 from vdgs.cli.main import main
 from vdgs.distributed import backend_selection
-from vdgs.distributed.executor import Listener, Outcome, Task
+from vdgs.distributed.executor import Task, TaskListener, TaskResult
 from vdgs.errors import VdgsError
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.runs import create_or_resume, open_run
@@ -49,7 +49,7 @@ class Reads:
         reads = self
 
         class TasksHere(CommandsHere):
-            def run(self, tasks: Sequence[Task], listener: Listener) -> list[Outcome]:
+            def run(self, tasks: Sequence[Task], listener: TaskListener) -> list[TaskResult]:
                 outcomes = []
                 for task in tasks:
                     reads.process = task.name

@@ -7,18 +7,18 @@ import pytest
 import yaml
 
 from support.captures import tiny_scene, write_colmap
-from vdgs.captures.capture_metadata import capture_facts
+from vdgs.captures.capture_metadata import capture_metadata
 from vdgs.config.capture_options import CaptureOptions
-from vdgs.config.method import BlockConfig, GrowthConfig, MethodConfig, TrainConfig, with_iterations
+from vdgs.config.method import BlockConfig, DensifyConfig, MethodConfig, TrainConfig, resolve_iterations
 from vdgs.config.presets import PRESETS
-from vdgs.config.serialization import differences, from_dict, to_dict
-from vdgs.config.validation_rules import validate
+from vdgs.config.serialization import diff_settings, from_dict, to_dict
+from vdgs.config.validation_rules import validate_config
 from vdgs.errors import RunError
-from vdgs.runs.create_or_resume import begin_run
+from vdgs.runs.create_or_resume import create_or_resume_run
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
-from vdgs.runs.stage_folder import StageFolder, Status
-from vdgs.runs.stage_keys import NEEDS, counted, stage_keys
+from vdgs.runs.stage_folder import StageFolder, StatusRecord
+from vdgs.runs.stage_keys import REQUIRED_SETTINGS, hashable_settings, stage_keys
 from vdgs.system.atomic_files import write_json, write_text
 
 
@@ -102,11 +102,11 @@ def test_the_log_is_cut_at_the_state_that_training_continues_from(tmp_path):
 
 
 def test_differences_name_nested_settings():
-    assert differences({"a": {"b": 1, "c": 2}}, {"a": {"b": 1, "c": 3}}) == ["a.c: 2 -> 3"]
+    assert diff_settings({"a": {"b": 1, "c": 2}}, {"a": {"b": 1, "c": 3}}) == ["a.c: 2 -> 3"]
 
 
 def test_presets_are_valid():
-    assert all(validate(preset) == [] for preset in PRESETS.values())
+    assert all(validate_config(preset) == [] for preset in PRESETS.values())
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -124,40 +124,40 @@ def test_a_change_that_costs_trained_work_needs_redo(tmp_path):
     run = RunFolder(tmp_path / "run")
     run.begin(settings())
     other = replace(settings(), partition=replace(settings().partition, lambda_vis=0.7))
-    run.change_settings(other, redo=False)  # nothing is trained yet
-    run.block(0).discard_unless(run.keys().blocks)
+    run.change_settings(other, overwrite=False)  # nothing is trained yet
+    run.block(0).reset_unless(run.keys().blocks)
     run.block(0).model.write_bytes(b"a trained block")
     with pytest.raises(RunError, match=r"--lambda-vis: 0\.7 -> 1\.0(?s:.*)a block useless. Add --redo"):
-        run.change_settings(settings(), redo=False)
+        run.change_settings(settings(), overwrite=False)
     assert run.settings() == other
-    assert run.change_settings(settings(), redo=True) == ["--lambda-vis: 0.7 -> 1.0"]
+    assert run.change_settings(settings(), overwrite=True) == ["--lambda-vis: 0.7 -> 1.0"]
     assert run.settings() == settings()
 
 
 def test_a_stage_deletes_what_was_made_for_other_settings_and_nothing_else(tmp_path):
     folder = StageFolder(tmp_path / "stage")
-    folder.discard_unless("a")
+    folder.reset_unless("a")
     folder.model.write_bytes(b"model")
-    folder.set_status(Status(state="done", iteration=3))
-    folder.discard_unless("a")
+    folder.set_status(StatusRecord(state="done", iteration=3))
+    folder.reset_unless("a")
     assert folder.is_done("a")
     assert not folder.is_done("b")
-    folder.discard_unless("b")
+    folder.reset_unless("b")
     assert not folder.model.exists()
-    assert folder.status() == Status(state="new")
+    assert folder.status() == StatusRecord(state="new")
     assert folder.key() == "b"
 
 
 def test_work_of_unknown_settings_is_not_taken_over(tmp_path):
     folder = StageFolder(tmp_path / "stage")
-    folder.discard_unless("a")
+    folder.reset_unless("a")
     folder.model.write_bytes(b"model")
-    folder.set_status(Status(state="done"))
+    folder.set_status(StatusRecord(state="done"))
     folder.status_file.unlink()  # as the message about a damaged one advises: the key stays known
-    folder.discard_unless("a")
+    folder.reset_unless("a")
     assert folder.model.exists()
     folder.key_file.unlink()
-    folder.discard_unless("a")
+    folder.reset_unless("a")
     assert not folder.model.exists()
 
 
@@ -195,24 +195,24 @@ def test_blocks_share_the_run_and_one_process_works_on_each(tmp_path):
 
 def test_validation_names_each_problem():
     bad = MethodConfig(TrainConfig(iterations=-1, resolutions=((0.5, 2),)))
-    assert len(validate(bad)) == 2
+    assert len(validate_config(bad)) == 2
 
 
 def test_automatic_iterations_follow_the_number_of_photographs():
     automatic = TrainConfig(iterations=0)
-    assert [with_iterations(automatic, views).iterations for views in (5, 145, 9000)] == [3000, 8700, 30_000]
-    assert with_iterations(TrainConfig(iterations=7), 9000).iterations == 7
+    assert [resolve_iterations(automatic, views).iterations for views in (5, 145, 9000)] == [3000, 8700, 30_000]
+    assert resolve_iterations(TrainConfig(iterations=7), 9000).iterations == 7
 
 
 def test_every_setting_counts_beside_the_one_that_it_needs():
     settings = {"capture": {"images": None}} | to_dict(MethodConfig())
     for path in _leaves(settings):
-        beside = _changed(settings, (path[0], NEEDS[path])) if path in NEEDS else settings
+        beside = _changed(settings, (path[0], REQUIRED_SETTINGS[path])) if path in REQUIRED_SETTINGS else settings
         assert _counted(_changed(beside, path)) != _counted(beside), path
 
 
 def _counted(settings: dict) -> dict:
-    return {section: counted(section, values) for section, values in settings.items()}
+    return {section: hashable_settings(section, values) for section, values in settings.items()}
 
 
 def _leaves(settings: dict, above: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
@@ -231,26 +231,26 @@ def _changed(settings: dict, path: tuple[str, ...]) -> dict:
 
 def test_a_ramp_needs_a_frozen_decoder():
     ramp = BlockConfig(ring="ramp", decoder="own")
-    assert any("ramp needs --block.decoder frozen" in each for each in validate(MethodConfig(block=ramp)))
-    assert validate(MethodConfig(block=replace(ramp, decoder="frozen"))) == []
+    assert any("ramp needs --block.decoder frozen" in each for each in validate_config(MethodConfig(block=ramp)))
+    assert validate_config(MethodConfig(block=replace(ramp, decoder="frozen"))) == []
 
 
 @pytest.mark.parametrize(
     ("average", "until", "problems"), [(0.0, 1.0, 0), (0.3, 0.99, 0), (0.3, 1.0, 1), (1.0, 0.5, 1), (-0.1, 0.5, 1)]
 )
 def test_a_mean_needs_an_end_of_growth(average, until, problems):
-    growth = GrowthConfig(until=until)
+    growth = DensifyConfig(until=until)
     coarse = MethodConfig(training=TrainConfig(average=average, growth=growth))
     block = MethodConfig(block=BlockConfig(average=average, growth=growth))
-    assert [len(validate(each)) for each in (coarse, block)] == [problems, problems]
-    assert all("growth.until" in each or "average" in each for each in validate(coarse) + validate(block))
+    assert [len(validate_config(each)) for each in (coarse, block)] == [problems, problems]
+    assert all("growth.until" in each or "average" in each for each in validate_config(coarse) + validate_config(block))
 
 
 @pytest.mark.parametrize(("begins", "problems"), [(0.5, 0), (0.51, 1)])
 def test_a_mean_is_of_models_of_one_image_size(begins, problems):
-    settings = {"average": 0.5, "growth": GrowthConfig(until=0.4), "resolutions": ((0.0, 2), (begins, 1))}
-    assert len(validate(MethodConfig(training=TrainConfig(**settings)))) == problems
-    assert len(validate(MethodConfig(block=BlockConfig(**settings)))) == problems
+    settings = {"average": 0.5, "growth": DensifyConfig(until=0.4), "resolutions": ((0.0, 2), (begins, 1))}
+    assert len(validate_config(MethodConfig(training=TrainConfig(**settings)))) == problems
+    assert len(validate_config(MethodConfig(block=BlockConfig(**settings)))) == problems
 
 
 def test_a_run_whose_blocks_are_at_work_is_taken_up_again_but_not_changed(tmp_path):
@@ -258,10 +258,10 @@ def test_a_run_whose_blocks_are_at_work_is_taken_up_again_but_not_changed(tmp_pa
     place, method = tmp_path / "capture", PRESETS["laptop"]
     other = replace(method, partition=replace(method.partition, lambda_vis=0.7))
     write_colmap(place, tiny_scene())
-    context = begin_run(place, tmp_path / "run", CaptureOptions(), method, redo=False)
+    context = create_or_resume_run(place, tmp_path / "run", CaptureOptions(), method, overwrite=False)
     run, capture = context.run, context.capture
-    write_json(run.capture_file, capture_facts(capture))
+    write_json(run.capture_file, capture_metadata(capture))
     with run.locked(shared=True):
-        begin_run(place, run.path, CaptureOptions(), method, redo=False)
+        create_or_resume_run(place, run.path, CaptureOptions(), method, overwrite=False)
         with pytest.raises(RunError, match="another vdgs process"):
-            begin_run(place, run.path, CaptureOptions(), other, redo=True)
+            create_or_resume_run(place, run.path, CaptureOptions(), other, overwrite=True)

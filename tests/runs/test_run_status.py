@@ -21,16 +21,16 @@ from vdgs.config.method import MergeConfig, MethodConfig
 from vdgs.errors import RunError
 from vdgs.model.anchor_model import ModelMetadata
 from vdgs.report import write_report
-from vdgs.report.status_cli import NOT_WHOLE, next_step, whole_standing
-from vdgs.runs.model_integrity import load_vouched
+from vdgs.report.status_cli import EXIT_INCOMPLETE, full_run_status, next_step
+from vdgs.runs.model_integrity import load_verified
 from vdgs.runs.open_run import open_model, open_run
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
-from vdgs.runs.run_status import OTHER_BLOCKS, OTHER_CUT, OTHER_MODEL, OTHER_SETTINGS, standing_of
-from vdgs.runs.stage_folder import Status
+from vdgs.runs.run_status import OTHER_BLOCKS, OTHER_MODEL, OTHER_PARTITION, OTHER_SETTINGS, get_run_status
+from vdgs.runs.stage_folder import StatusRecord
 from vdgs.system.atomic_files import write_json
-from vdgs.system.file_locks import hold, is_locked
-from vdgs.system.tensors import identity
+from vdgs.system.file_locks import is_locked, lock_folder
+from vdgs.system.tensors import file_id
 
 PLACES = [[-1.0, -1.0, 0.0], [1.0, 1.0, 0.0]]
 COMMAND = "vdgs run here --output there"
@@ -38,12 +38,12 @@ COMMAND = "vdgs run here --output there"
 
 def trained(folder, key: str, seed: int, block: int | None = None) -> str:
     """A finished stage with a model of its own; what tells the model from others."""
-    folder.discard_unless(key)
+    folder.reset_unless(key)
     replace(model_at(PLACES, seed), metadata=ModelMetadata(key=key, block=block)).save(folder.model)
     folder.set_status(
-        Status(state="done", iteration=40, iterations=40, anchors=2, seconds=3.0, model=identity(folder.model))
+        StatusRecord(state="done", iteration=40, iterations=40, anchors=2, seconds=3.0, model=file_id(folder.model))
     )
-    return identity(folder.model)
+    return file_id(folder.model)
 
 
 def measured(folder: Path, model: str, psnr: float, name: str) -> None:
@@ -74,7 +74,7 @@ def run(tmp_path) -> RunFolder:
 
 
 def states(run: RunFolder) -> dict[str, str]:
-    return {stage.name: stage.state for stage in whole_standing(run).stages if stage.state != "done"}
+    return {stage.name: stage.state for stage in full_run_status(run).stages if stage.state != "done"}
 
 
 def change(run: RunFolder, section: str, **settings: object) -> None:
@@ -113,32 +113,32 @@ def test_a_whole_run_is_whole(run, capsys):
 def test_what_other_settings_make_out_of_date_is_shown_nowhere_as_done(run, section, setting, stale, then, capsys):
     change(run, section, **setting)
     assert states(run) == dict.fromkeys([*stale, "report"], "stale")
-    assert command_line("status", run.path) == NOT_WHOLE
+    assert command_line("status", run.path) == EXIT_INCOMPLETE
     assert f"next: vdgs {then} {run.path}" in capsys.readouterr().out
     page = write_report(run).read_text()
     assert "24.75" not in page  # of the merged model
     assert "merged.jpg" not in page
     assert "Coarse model: PSNR 21.25 dB" in page
     assert f"evaluation: {OTHER_MODEL}; it is left out" in page
-    assert (f"out of date: {OTHER_CUT}" in page) == ("block 0" in stale)
+    assert (f"out of date: {OTHER_PARTITION}" in page) == ("block 0" in stale)
     assert states(run) == dict.fromkeys(stale, "stale")  # but the report, which says so
 
 
 def test_other_settings_of_the_coarse_stage_leave_nothing(run):
     change(run, "training", seed=4)
-    assert set(states(run)) == {stage.name for stage in whole_standing(run).stages}
-    assert standing_of(run).next_command() == COMMAND
+    assert set(states(run)) == {stage.name for stage in full_run_status(run).stages}
+    assert get_run_status(run).next_command() == COMMAND
     assert "Nothing is evaluated yet." in write_report(run).read_text()
 
 
 def test_a_coarse_model_trained_again_makes_all_that_was_built_on_it_out_of_date(run):
     trained(run.coarse, run.keys().coarse, seed=9)
-    assert [stage.name for stage in standing_of(run).stages if stage.state == "done"] == ["coarse"]
+    assert [stage.name for stage in get_run_status(run).stages if stage.state == "done"] == ["coarse"]
 
 
 def test_a_block_trained_again_makes_the_merged_model_out_of_date(run):
     trained(run.block(1), run.keys().blocks, seed=9, block=1)
-    standing = standing_of(run)
+    standing = get_run_status(run)
     assert (standing.of("merge").state, standing.of("merge").why) == ("stale", OTHER_BLOCKS)
     assert standing.of("evaluation").state == "stale"
     assert standing.next_command() == COMMAND  # which merges and measures again
@@ -159,15 +159,15 @@ def test_figures_that_nothing_vouches_for_are_shown_with_a_caution(run):
 
 
 def test_what_fails_and_stops_is_said_with_its_reason(run):
-    run.block(0).set_status(Status(state="failed", iteration=7, iterations=40, why="out of memory\nmore of it"))
-    run.block(1).set_status(Status(state="running", iteration=9, iterations=40))
-    standing = standing_of(run)
+    run.block(0).set_status(StatusRecord(state="failed", iteration=7, iterations=40, why="out of memory\nmore of it"))
+    run.block(1).set_status(StatusRecord(state="running", iteration=9, iterations=40))
+    standing = get_run_status(run)
     assert (standing.of("block 0").state, standing.of("block 0").why) == ("failed", "out of memory")
     assert standing.of("block 1").state == "stopped"  # no process works on it
     assert standing.next_command() == COMMAND  # which takes it to its end
     with run.block(1).locked():
         assert is_locked(run.block(1).path)
-        standing = standing_of(run)
+        standing = get_run_status(run)
         assert standing.of("block 1").state == "running"
         assert standing.next_command() == ""
         assert "at work" in next_step(standing)
@@ -176,7 +176,7 @@ def test_what_fails_and_stops_is_said_with_its_reason(run):
 def test_a_run_is_at_work_between_two_stages_too(run):
     run.merged.model.unlink()
     with run.driven():
-        assert next_step(whole_standing(run)) == "nothing to type: it is at work"
+        assert next_step(full_run_status(run)) == "nothing to type: it is at work"
         with pytest.raises(RunError, match="another vdgs process"), run.driven():
             pass
 
@@ -185,7 +185,7 @@ def test_looking_changes_nothing_and_survives_damage(run):
     run.coarse.status_file.write_text('{"state": ')
     (run.partition / "partition.json").write_text("[")
     before = {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()}
-    standing = standing_of(run)
+    standing = get_run_status(run)
     assert {standing.of(name).state for name in ("coarse", "partition", "block 0", "merge")} == {"unknown"}
     assert {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()} == before
 
@@ -193,18 +193,18 @@ def test_looking_changes_nothing_and_survives_damage(run):
 @pytest.mark.parametrize("number", [errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK])
 def test_a_run_is_read_where_no_file_can_be_locked(run, monkeypatch, capsys, number):
     """Lustre without `-o flock`, some of FUSE: finished runs are looked at there, and nothing works on one."""
-    run.block(1).set_status(Status(state="running", iteration=9, iterations=40))
+    run.block(1).set_status(StatusRecord(state="running", iteration=9, iterations=40))
     for folder in (run.block(1).path, run.path / ".run"):
-        with hold(folder):
+        with lock_folder(folder):
             pass
 
     def refuse(*_: object) -> None:
         raise OSError(number, "Function not implemented")
 
     monkeypatch.setattr(fcntl, "flock", refuse)
-    assert standing_of(run).of("block 1").state == "stopped"
-    assert not run.is_driven()
-    assert command_line("status", run.path) == NOT_WHOLE
+    assert get_run_status(run).of("block 1").state == "stopped"
+    assert not run.is_running()
+    assert command_line("status", run.path) == EXIT_INCOMPLETE
     assert command_line("report", run.path) == 0
     assert open_model(run, "coarse").name == "coarse"
     with pytest.raises(OSError, match="not implemented"):
@@ -222,7 +222,7 @@ def test_a_folder_without_a_run_is_an_error(tmp_path, capsys):
 
 def test_programs_read_the_same(run, capsys):
     change(run, "merge", rule="best_seen")
-    assert command_line("status", run.path, "--json") == NOT_WHOLE
+    assert command_line("status", run.path, "--json") == EXIT_INCOMPLETE
     facts = json.loads(capsys.readouterr().out)
     assert not facts["whole"]
     assert facts["next"] == f"vdgs merge {shlex.quote(str(run.path))}"
@@ -231,64 +231,64 @@ def test_programs_read_the_same(run, capsys):
 
 def test_models_that_were_copied_to_where_they_do_not_belong_are_refused(run):
     key, zero, one = run.keys().blocks, run.block(0), run.block(1)
-    assert len(load_vouched(zero, key, 0).anchors) == len(PLACES)
+    assert len(load_verified(zero, key, 0).anchors) == len(PLACES)
     own, other = zero.model.read_bytes(), one.model.read_bytes()
     zero.model.write_bytes(other)
     with pytest.raises(RunError, match=r"is the model of block 1\. Put back .* or delete"):
-        load_vouched(zero, key, 0)
-    assert standing_of(run).of("block 0").state == "stale"
-    assert standing_of(run).next_command().startswith("delete ")
+        load_verified(zero, key, 0)
+    assert get_run_status(run).of("block 0").state == "stale"
+    assert get_run_status(run).next_command().startswith("delete ")
     zero.model.write_bytes(own)
     model = model_at(PLACES, seed=8)  # of the right block, but not what was trained here
     replace(model, metadata=ModelMetadata(key=key, block=0)).save(zero.model)
     with pytest.raises(RunError, match=r"not the model that status\.json beside it speaks of"):
-        load_vouched(zero, key, 0)
+        load_verified(zero, key, 0)
     with pytest.raises(RunError, match="of other settings or of another run"):
-        load_vouched(one, "0123", 1)
+        load_verified(one, "0123", 1)
     with pytest.raises(RunError, match="a model of the whole scene"):
-        load_vouched(run.merged, run.keys().merge, 0)
+        load_verified(run.merged, run.keys().merge, 0)
 
 
 @pytest.fixture
 def opened_without_photographs(monkeypatch):
     monkeypatch.setattr("vdgs.runs.open_run.open_capture", lambda run: SimpleNamespace(test_views=(), train_views=()))
-    monkeypatch.setattr("vdgs.runs.open_run.refuse_another_capture", lambda *_: None)
+    monkeypatch.setattr("vdgs.runs.open_run.check_same_capture", lambda *_: None)
 
 
 def test_the_model_that_is_opened_says_what_it_is(run, opened_without_photographs):
     opened = open_run(run.path)
-    assert (opened.name, opened.caution) == ("merged", "")
+    assert (opened.name, opened.warning) == ("merged", "")
     assert opened.line.startswith("merged model (2 anchors, ")
     change(run, "partition", lambda_vis=0.9)
     opened = open_run(run.path)
     assert opened.name == "coarse"
-    assert f"this is the coarse model, not the merged one: there is one that was {OTHER_SETTINGS}" in opened.caution
-    assert f"vdgs partition {run.path}" in opened.caution
-    assert open_run(run.path, "coarse").caution == ""  # as was asked for
+    assert f"this is the coarse model, not the merged one: there is one that was {OTHER_SETTINGS}" in opened.warning
+    assert f"vdgs partition {run.path}" in opened.warning
+    assert open_run(run.path, "coarse").warning == ""  # as was asked for
     with pytest.raises(RunError, match=f"no merged model of its settings yet .*{OTHER_SETTINGS}.*vdgs partition"):
         open_run(run.path, "merged")
     change(run, "partition", lambda_vis=1.0)
     run.merged.model.unlink()
-    assert "there is none yet" in open_run(run.path).caution
+    assert "there is none yet" in open_run(run.path).warning
 
 
 def test_a_merged_model_of_other_blocks_is_opened_with_a_caution(run, opened_without_photographs):
     trained(run.block(1), run.keys().blocks, seed=9, block=1)
     opened = open_run(run.path)
     assert opened.name == "merged"
-    assert OTHER_BLOCKS in opened.caution
-    assert f"vdgs merge {run.path}" in opened.caution
+    assert OTHER_BLOCKS in opened.warning
+    assert f"vdgs merge {run.path}" in opened.warning
 
 
 def test_the_command_that_began_a_run_is_advised_while_the_settings_are_its_own(run):
     run.merged.model.unlink()
-    assert standing_of(run).next_command() == COMMAND
+    assert get_run_status(run).next_command() == COMMAND
     other = replace(run.settings(), merge=MergeConfig("best_seen"))
-    run.change_settings(other, redo=True)
+    run.change_settings(other, overwrite=True)
     assert run.config.command() is None
-    assert standing_of(run).next_command() == f"vdgs merge {run.path}"
-    run.change_settings(replace(run.settings(), merge=MergeConfig()), redo=True, command="vdgs run anew")
-    assert standing_of(run).next_command() == "vdgs run anew"
+    assert get_run_status(run).next_command() == f"vdgs merge {run.path}"
+    run.change_settings(replace(run.settings(), merge=MergeConfig()), overwrite=True, command="vdgs run anew")
+    assert get_run_status(run).next_command() == "vdgs run anew"
 
 
 def test_a_copy_of_a_run_is_not_continued_where_the_run_lies(run, tmp_path):
@@ -301,4 +301,4 @@ def test_a_copy_of_a_run_is_not_continued_where_the_run_lies(run, tmp_path):
 
 def test_settings_that_cannot_be_read_are_to_be_mended(run):
     run.config_file.write_text(run.config_file.read_text().replace("iterations: ", "iterations: many #", 1))
-    assert standing_of(run).next_command() == f"mend {run.config_file}"
+    assert get_run_status(run).next_command() == f"mend {run.config_file}"

@@ -13,12 +13,12 @@ from vdgs.runs.stage_keys import stage_keys
 
 PLAIN = MethodConfig()
 CHANGED = {
-    "adam": replace(PLAIN, training=replace(PLAIN.training, adam="dense")),
-    "stereo": replace(PLAIN, training=replace(PLAIN.training, anchors=replace(PLAIN.training.anchors, stereo=True))),
+    "adam": replace(PLAIN, training=replace(PLAIN.training, optimizer="dense")),
+    "stereo": replace(PLAIN, training=replace(PLAIN.training, anchors=replace(PLAIN.training.anchors, mvs=True))),
     "exposure": replace(PLAIN, training=replace(PLAIN.training, exposure=True)),
-    "spread": replace(PLAIN, training=replace(PLAIN.training, exposure=True, exposure_spread=0.1)),
+    "spread": replace(PLAIN, training=replace(PLAIN.training, exposure=True, exposure_min_spread=0.1)),
     "bound": replace(
-        PLAIN, training=replace(PLAIN.training, anchors=replace(PLAIN.training.anchors, bound_sizes=False))
+        PLAIN, training=replace(PLAIN.training, anchors=replace(PLAIN.training.anchors, bound_scales=False))
     ),
 }
 
@@ -45,6 +45,6 @@ def test_settings_of_blocks_and_assignment_leave_what_is_before_them():
 
 
 def test_a_setting_counts_only_beside_the_one_that_it_needs():
-    alone = replace(PLAIN, training=replace(PLAIN.training, exposure_spread=0.1))
+    alone = replace(PLAIN, training=replace(PLAIN.training, exposure_min_spread=0.1))
     assert keys(alone) == keys(PLAIN)
     assert keys(CHANGED["spread"]).coarse != keys(CHANGED["exposure"]).coarse

@@ -18,14 +18,14 @@ import pyproj
 
 from support.flights import ALTITUDE_M, HEIGHT, ORIGIN, WIDTH, Flight, copy_folder, sightings, write_photograph
 from vdgs.captures.loading import load_capture
-from vdgs.captures.reconstruction import facts_rows, read_reconstruction, survey_table
+from vdgs.captures.reconstruction import gcp_table, read_reconstruction, report_rows
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu
-from vdgs.sfm.gcp_list import Control, check_near, read_control
-from vdgs.sfm.image_list import Collection, LeftOut, collect
+from vdgs.sfm.gcp_list import GcpList, check_gcps_near, read_gcp_list
+from vdgs.sfm.image_list import ExcludedImage, ImageList, collect_images
 from vdgs.sfm.reconstruct import reconstruct
-from vdgs.sfm.reconstruction_plan import prepare
+from vdgs.sfm.reconstruction_plan import plan_reconstruction
 
 pytestmark = pytest.mark.xdist_group("sfm")
 
@@ -91,13 +91,13 @@ def write_list(file: Path, flight: Flight, points, header="EPSG:32719", system=N
     ],
 )
 def test_all_ways_to_name_a_system_lead_to_the_same_places(flight, points, tmp_path, header, system):
-    control = read_control(
-        write_list(tmp_path / "gcp_list.txt", flight, points, header, system), collect([flight.folder]), ()
+    control = read_gcp_list(
+        write_list(tmp_path / "gcp_list.txt", flight, points, header, system), collect_images([flight.folder]), ()
     )
     assert [point.name for point in control.points] == list(NAMES)
     truth = np.array([seen[-1] + SURVEY_OFF for seen in points])
     assert np.abs(control.enu(ORIGIN) - truth).max() < 0.001
-    assert control.places_the_model
+    assert control.has_control_points
     for point, seen in zip(control.points, points, strict=True):
         for sighting in point.sightings:
             number = flight.names.index(sighting.photograph)
@@ -111,11 +111,11 @@ def test_pixels_are_those_of_the_file_before_it_is_turned(tmp_path, orientation)
     (tmp_path / "card").mkdir()
     for k in range(3):
         write_photograph(tmp_path / "card" / f"p{k}.jpg", pixels, k, None, orientation)
-    photo = collect([tmp_path / "card"]).photographs[0]
+    photo = collect_images([tmp_path / "card"]).photographs[0]
     with Image.open(photo.path) as image:
         upright = np.array(ImageOps.exif_transpose(image).convert("L"))
     row, column = np.unravel_index(int(upright.argmax()), upright.shape)
-    assert photo.upright((100.5, 30.5)) == pytest.approx((column + 0.5, row + 0.5))
+    assert photo.to_upright_pixel((100.5, 30.5)) == pytest.approx((column + 0.5, row + 0.5))
     assert (photo.stored_size, (photo.height, photo.width)) == ((160, 120), upright.shape)
 
 
@@ -160,59 +160,61 @@ def test_bad_lists_are_refused_with_the_line_and_the_remedy(flight, tmp_path, wh
     else:
         file.write_text(what if isinstance(what, str) else listed(flight, *what))
     with pytest.raises(CaptureError, match=said) as refused:
-        read_control(file, collect([flight.folder]), ())
+        read_gcp_list(file, collect_images([flight.folder]), ())
     assert str(file) in str(refused.value)
 
 
 def test_files_that_are_no_lists_are_refused(flight, tmp_path):
-    collection = collect([flight.folder])
+    collection = collect_images([flight.folder])
     with pytest.raises(CaptureError, match="cannot be read"):
-        read_control(tmp_path / "none.txt", collection, ())
+        read_gcp_list(tmp_path / "none.txt", collection, ())
     with pytest.raises(CaptureError, match="not a text file"):
-        read_control(flight.folder / flight.names[0], collection, ())
+        read_gcp_list(flight.folder / flight.names[0], collection, ())
     (tmp_path / "two.txt").write_text("\n".join(listed(flight).splitlines()[:5]))
     with pytest.raises(CaptureError, match=r"2 points .* and 3 are needed.*--check-points all"):
-        read_control(tmp_path / "two.txt", collection, ())
-    assert len(read_control(tmp_path / "two.txt", collection, ("all",)).points) == 2
+        read_gcp_list(tmp_path / "two.txt", collection, ())
+    assert len(read_gcp_list(tmp_path / "two.txt", collection, ("all",)).points) == 2
     (tmp_path / "sound.txt").write_text(listed(flight))
     with pytest.raises(CaptureError, match=r"--check-points gate: .* has a, b, c"):
-        read_control(tmp_path / "sound.txt", collection, ("gate",))
+        read_gcp_list(tmp_path / "sound.txt", collection, ("gate",))
     with pytest.raises(VdgsError, match="give it with --gcp"):
-        prepare(
+        plan_reconstruction(
             SfmRequest(photographs=(flight.folder,), output=tmp_path / "out", options=SfmOptions(check_points=("a",)))
         )
 
 
 def test_points_along_a_line_and_in_another_zone_are_refused(flight, tmp_path):
-    collection = collect([flight.folder])
+    collection = collect_images([flight.folder])
     row = [{"x": 300_000.0 + k // 2, "y": 6_290_000.0 + k // 2, "z": 1.0} for k in range(6)]
     (tmp_path / "row.txt").write_text(listed(flight, *row))
     with pytest.raises(CaptureError, match="along one line"):
-        read_control(tmp_path / "row.txt", collection, ())
+        read_gcp_list(tmp_path / "row.txt", collection, ())
     (tmp_path / "zone.txt").write_text(listed(flight, header="EPSG:32718"))
     with pytest.raises(CaptureError, match=r"km from the photographs.*UTM zone 18S"):
-        prepare(
+        plan_reconstruction(
             SfmRequest(
                 photographs=(flight.folder,), output=tmp_path / "out", options=SfmOptions(gcp=tmp_path / "zone.txt")
             )
         )
-    check_near(read_control(tmp_path / "zone.txt", collection, ()), np.zeros((0, 3)), ORIGIN, tmp_path / "zone.txt")
+    check_gcps_near(
+        read_gcp_list(tmp_path / "zone.txt", collection, ()), np.zeros((0, 3)), ORIGIN, tmp_path / "zone.txt"
+    )
 
 
 def test_names_may_be_of_folders_without_endings_in_other_letters_and_with_blanks(flight, tmp_path):
-    photographs = collect([flight.folder]).photographs
-    collection = Collection(
+    photographs = collect_images([flight.folder]).photographs
+    collection = ImageList(
         (flight.folder,),
         (replace(photographs[0], name="one/DJI_0001.JPG"), replace(photographs[1], name="two/DJI_0001.JPG"),
          replace(photographs[2], name="the_mill.JPG")),
-        (LeftOut("cut.jpg", "it is cut off"),), 0,
+        (ExcludedImage("cut.jpg", "it is cut off"),), 0,
     )  # fmt: skip
 
-    def read(*photographs: str) -> Control:
+    def read(*photographs: str) -> GcpList:
         lines = [line.split() for line in listed(flight).splitlines()[1:]]
         written = ["\t".join([*line[:5], *photographs[k % 2 : k % 2 + 1], line[6]]) for k, line in enumerate(lines)]
         (tmp_path / "list.txt").write_text("\n".join(["EPSG:32719", *written]))
-        return read_control(tmp_path / "list.txt", collection, ())
+        return read_gcp_list(tmp_path / "list.txt", collection, ())
 
     control = read("Two\\dji_0001.jpg", "The Mill")
     assert [each.photograph for each in control.points[0].sightings] == ["two/DJI_0001.JPG", "the_mill.JPG"]
@@ -242,9 +244,9 @@ def test_control_points_hold_a_model_where_they_were_surveyed(made, flight, poin
     file = write_list(tmp_path / "gcp_list.txt", flight, points)
     facts, capture, said = surveyed(made, flight, tmp_path, file, "well", "fence")
     assert "5 place the model, 2 are held out" in said
-    assert [each.used_as for each in facts.survey] == ["control"] * 4 + ["check"] * 2 + ["control"]
-    assert max(facts.survey_rmse_m("check")) < 0.12  # a pixel shows 0.13 m
-    assert max(facts.survey_rmse_m("control")) < 0.12
+    assert [each.role for each in facts.survey] == ["control"] * 4 + ["check"] * 2 + ["control"]
+    assert max(facts.gcp_rmse_m("check")) < 0.12  # a pixel shows 0.13 m
+    assert max(facts.gcp_rmse_m("control")) < 0.12
     assert np.mean([each.residual_m for each in facts.photographs if each.residual_m], axis=0) == pytest.approx(
         SURVEY_OFF, abs=0.3
     )
@@ -252,18 +254,18 @@ def test_control_points_hold_a_model_where_they_were_surveyed(made, flight, poin
     for view, truth in zip(capture.views, flight.cameras, strict=True):
         assert np.linalg.norm(view.camera.position + shift - truth.position - SURVEY_OFF) < 0.6
     assert "heights as in gcp_list.txt" in facts.altitude_reference
-    rows = dict(facts_rows(facts))
+    rows = dict(report_rows(facts))
     assert rows["Control points"].startswith("5, place the model: RMSE 0.")
     assert rows["Check points"].startswith("2, held out: RMSE 0.")
-    assert [row[0] for row in survey_table(facts)] == list(NAMES)
+    assert [row[0] for row in gcp_table(facts)] == list(NAMES)
     assert read_reconstruction(tmp_path / "capture") == facts
 
 
 def test_check_points_measure_a_model_that_gps_placed(made, flight, points, tmp_path):
     file = write_list(tmp_path / "gcp_list.txt", flight, points)
     facts, capture, _ = surveyed(made, flight, tmp_path, file, "all")
-    assert facts.survey_rmse_m("control") is None
-    across, up = np.array(facts.survey_rmse_m("check")[:2]), facts.survey_rmse_m("check")[2]
+    assert facts.gcp_rmse_m("control") is None
+    across, up = np.array(facts.gcp_rmse_m("check")[:2]), facts.gcp_rmse_m("check")[2]
     assert across == pytest.approx(np.abs(SURVEY_OFF[:2]), abs=0.3)
     assert up == pytest.approx(SURVEY_OFF[2], abs=2.5)  # straight down from one height, nothing else tells the depth
     assert max(facts.residual_rms_m) < 0.3  # it lies where GPS says
@@ -280,7 +282,7 @@ def test_a_point_that_does_not_fit_and_marks_that_are_wrong_are_named(made, flig
     facts, _, said = surveyed(made, flight, tmp_path, write_list(tmp_path / "gcp_list.txt", flight, moved))
     assert "the control point gate does not fit the others" in said
     assert "the surveyed point north_west is marked" in said
-    assert max(facts.survey_rmse_m("control")) < 0.4
+    assert max(facts.gcp_rmse_m("control")) < 0.4
     off = {each.name: each.residual_m for each in facts.survey}["gate"]
     assert off == pytest.approx((0, -6, 0), abs=0.6)
     assert pytest.approx(facts.height_m, abs=4) == ALTITUDE_M

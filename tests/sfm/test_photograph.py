@@ -19,32 +19,38 @@ from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.geometry.geodesy import geodetic_from_enu
 from vdgs.sfm import pair_selection
-from vdgs.sfm.focal_length import CALIBRATED, Lens, find_lens
-from vdgs.sfm.georegistration import tilt_against_attitudes
-from vdgs.sfm.gps_priors import find_positions
-from vdgs.sfm.image_list import collect, only_photographs
-from vdgs.sfm.image_metadata import Photograph, Unusable, of_aircraft, of_gimbal, read_photograph
-from vdgs.sfm.incremental_mapper import holds_focal
-from vdgs.sfm.preflight import look_at
-from vdgs.sfm.reconstruction_plan import prepare
-from vdgs.sfm.xmp import LONGEST_PACKET, number, read_xmp
+from vdgs.sfm.focal_length import CALIBRATED_SOURCE, Lens, read_lens
+from vdgs.sfm.georegistration import tilt_from_attitudes
+from vdgs.sfm.gps_priors import read_gps_priors
+from vdgs.sfm.image_list import collect_images, is_image_folder
+from vdgs.sfm.image_metadata import (
+    ImageMetadata,
+    UnusableImage,
+    attitude_from_aircraft,
+    attitude_from_gimbal,
+    read_image_metadata,
+)
+from vdgs.sfm.incremental_mapper import should_fix_focal
+from vdgs.sfm.preflight import make_preflight_report
+from vdgs.sfm.reconstruction_plan import plan_reconstruction
+from vdgs.sfm.xmp import MAX_PACKET_BYTES, first_number, read_xmp
 
 NOISE = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
 
 
-def photograph(folder: Path, number: int, enu: tuple[float, float, float] | None = (0, 0, 40), **more) -> Photograph:
+def photograph(folder: Path, number: int, enu: tuple[float, float, float] | None = (0, 0, 40), **more) -> ImageMetadata:
     folder.mkdir(parents=True, exist_ok=True)
     pixels = np.roll(NOISE, number, axis=0)
     write_photograph(folder / f"p{number:02d}.jpg", pixels, number, None if enu is None else np.array(enu), **more)
-    return read_photograph(folder / f"p{number:02d}.jpg", f"p{number:02d}.jpg")
+    return read_image_metadata(folder / f"p{number:02d}.jpg", f"p{number:02d}.jpg")
 
 
-def flight(folder: Path, count: int = 6) -> list[Photograph]:
+def flight(folder: Path, count: int = 6) -> list[ImageMetadata]:
     return [photograph(folder, k, (10.0 * (k % 3), 12.0 * (k // 3), 40.0 + k % 2)) for k in range(count)]
 
 
 def positions_of(photographs):
-    return find_positions(photographs, None, (1.0, 2.0))
+    return read_gps_priors(photographs, None, (1.0, 2.0))
 
 
 # --------------------------------------------------------------------------------------------------- reading
@@ -55,7 +61,7 @@ def test_a_photograph_says_where_it_was_taken_and_through_what(tmp_path):
     truth = geodetic_from_enu(np.array([[30.0, -20.0, 41.5]]), ORIGIN)[0]
     assert seen.place == pytest.approx(truth[:2], abs=1e-8)  # south and west
     assert seen.altitude == pytest.approx(truth[2], abs=1e-3)
-    assert (seen.width, seen.height, seen.above_takeoff) == (160, 120, 41.5)
+    assert (seen.width, seen.height, seen.relative_altitude) == (160, 120, 41.5)
     assert seen.lens is not None
     assert seen.lens.focal == pytest.approx(FOCAL_MM / SENSOR_MM)  # though EXIF's sizes are those of the original
     assert pytest.approx(FOCAL / 400) == seen.lens.focal
@@ -77,19 +83,19 @@ def test_orientation_swaps_the_sides_and_what_the_drone_says_of_them(tmp_path):
 def test_rtk_says_how_accurate_it_is(tmp_path):
     xmp = 'drone-dji:RtkStdLon="0.012" drone-dji:RtkStdLat="0.015" drone-dji:RtkStdHgt="0.03"'
     seen = [photograph(tmp_path, k, (9.0 * k, 0, 40), xmp=xmp) for k in range(3)]
-    assert positions_of(seen).deviations[0] == pytest.approx([0.012, 0.015, 0.03])
-    assert positions_of([replace(each, deviations=None) for each in seen]).deviations[0] == pytest.approx([1, 1, 2])
+    assert positions_of(seen).gps_std[0] == pytest.approx([0.012, 0.015, 0.03])
+    assert positions_of([replace(each, gps_std=None) for each in seen]).gps_std[0] == pytest.approx([1, 1, 2])
 
 
 def test_exif_says_how_accurate_a_phone_is_where_rtk_does_not(tmp_path):
     seen = [photograph(tmp_path, k, (9.0 * k, 0, 40), error_m=4.5) for k in range(3)]
     assert [each.error_m for each in seen] == [4.5] * 3
-    assert positions_of(seen).deviations[0] == pytest.approx([4.5, 4.5, 9])
-    better = [replace(each, deviations=(0.02, 0.02, 0.04)) for each in seen]
-    assert positions_of(better).deviations[0] == pytest.approx([0.02, 0.02, 0.04])
+    assert positions_of(seen).gps_std[0] == pytest.approx([4.5, 4.5, 9])
+    better = [replace(each, gps_std=(0.02, 0.02, 0.04)) for each in seen]
+    assert positions_of(better).gps_std[0] == pytest.approx([0.02, 0.02, 0.04])
     table = tmp_path / "gps.csv"
     table.write_text("name,lat,lon,alt\n" + "".join(f"p{k:02d},10.{k:04d},20,5\n" for k in range(3)))
-    assert find_positions(seen, table, (1.0, 2.0)).deviations[0] == pytest.approx([1, 1, 2])
+    assert read_gps_priors(seen, table, (1.0, 2.0)).gps_std[0] == pytest.approx([1, 1, 2])
     for nothing in (0.0, 99_999.0):
         assert photograph(tmp_path, 5, (0, 0, 40), error_m=nothing).error_m is None
 
@@ -99,8 +105,8 @@ def test_what_is_cut_off_is_named_and_nothing_else_is_raised(tmp_path, cut):
     photograph(tmp_path, 1)
     file = tmp_path / "p01.jpg"
     file.write_bytes(file.read_bytes()[:cut])
-    with pytest.raises(Unusable, match="copy it again"):
-        read_photograph(file, file.name)
+    with pytest.raises(UnusableImage, match="copy it again"):
+        read_image_metadata(file, file.name)
 
 
 def test_damaged_heads_are_read_or_refused(tmp_path):
@@ -112,8 +118,8 @@ def test_damaged_heads_are_read_or_refused(tmp_path):
         for _ in range(20):
             damaged[draw.randrange(800)] = draw.randrange(256)
         (tmp_path / "damaged.jpg").write_bytes(damaged)
-        with suppress(Unusable):  # no other error comes
-            read_photograph(tmp_path / "damaged.jpg", "damaged.jpg")
+        with suppress(UnusableImage):  # no other error comes
+            read_image_metadata(tmp_path / "damaged.jpg", "damaged.jpg")
             read += 1
     assert 0 < read < 150
 
@@ -131,15 +137,19 @@ def test_xmp_is_read_as_attributes_and_as_elements_and_expands_nothing():
     bomb += b"<z:Roll>-2.5</z:Roll>"
     values = read_xmp(bomb)
     assert values["y:Alt"] == "&c;"
-    assert (number(values, "y:Height"), number(values, "z:Roll"), number(values, "y:Alt")) == (39.8, -2.5, None)
-    assert read_xmp(b" " * LONGEST_PACKET + b' y:Height="1"') == {}
-    assert number({"a:b": "nan", "a:c": "inf"}, "a:b", "a:c") is None
+    assert (first_number(values, "y:Height"), first_number(values, "z:Roll"), first_number(values, "y:Alt")) == (
+        39.8,
+        -2.5,
+        None,
+    )
+    assert read_xmp(b" " * MAX_PACKET_BYTES + b' y:Height="1"') == {}
+    assert first_number({"a:b": "nan", "a:c": "inf"}, "a:b", "a:c") is None
 
 
 def test_an_enormous_packet_is_no_trouble(tmp_path):
     photograph(tmp_path, 1, None)
     add_xmp(tmp_path / "p01.jpg", b'y:A="1" ' * 8000)
-    assert read_photograph(tmp_path / "p01.jpg", "p01.jpg").place is None
+    assert read_image_metadata(tmp_path / "p01.jpg", "p01.jpg").place is None
 
 
 # ------------------------------------------------------------------------------------------------------ lens
@@ -160,18 +170,20 @@ def test_an_enormous_packet_is_no_trouble(tmp_path):
 )  # fmt: skip
 def test_the_focal_length_is_the_best_that_is_known(tags, details, xmp, focal):
     for width, height in ((1600, 900), (900, 1600), (800, 450)):
-        lens = find_lens(tags, details, xmp, width, height)
+        lens = read_lens(tags, details, xmp, width, height)
         assert (lens and lens.focal) == (focal and pytest.approx(focal, abs=1e-3))
 
 
 def test_attitudes_of_gimbal_and_aircraft_agree_straight_down():
-    level = of_aircraft(30, 0, 0)
-    assert of_gimbal(30, -90, 0).camera_from_enu == pytest.approx(level.camera_from_enu, abs=1e-12)
+    level = attitude_from_aircraft(30, 0, 0)
+    assert attitude_from_gimbal(30, -90, 0).camera_from_enu == pytest.approx(level.camera_from_enu, abs=1e-12)
     ahead = -level.camera_from_enu[1]
     assert ahead == pytest.approx([0.5, np.sqrt(0.75), 0], abs=1e-12)  # the top of the picture looks where it flies
-    assert of_aircraft(0, 10, 0).camera_from_enu[2] @ [0, 1, 0] > 0.17  # nose up: the view swings ahead
-    assert of_aircraft(0, 0, 10).camera_from_enu[2] @ [1, 0, 0] < -0.17  # right wing down: it swings to the left
-    assert np.linalg.det(of_gimbal(12, -60, 5).camera_from_enu) == pytest.approx(1)
+    assert attitude_from_aircraft(0, 10, 0).camera_from_enu[2] @ [0, 1, 0] > 0.17  # nose up: the view swings ahead
+    assert (
+        attitude_from_aircraft(0, 0, 10).camera_from_enu[2] @ [1, 0, 0] < -0.17
+    )  # right wing down: it swings to the left
+    assert np.linalg.det(attitude_from_gimbal(12, -60, 5).camera_from_enu) == pytest.approx(1)
 
 
 # ------------------------------------------------------------------------------------------------- positions
@@ -194,12 +206,12 @@ def test_a_tilted_model_is_told_from_a_camera_that_hangs_askew(tmp_path, tilt, a
         pycolmap.Camera(model="PINHOLE", width=160, height=120, params=[100, 100, 80, 60], camera_id=1)
     )
     for k, heading in enumerate(headings * (6 // len(headings) + 1)):
-        photo = replace(photograph(tmp_path, k), attitude=of_gimbal(heading, -90 + k % 3, 0))
+        photo = replace(photograph(tmp_path, k), attitude=attitude_from_gimbal(heading, -90 + k % 3, 0))
         photographs.append(photo)
         truth = turn((0, 1, 0), askew) @ photo.attitude.camera_from_enu
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(truth @ turn((1, 0, 0), tilt)), np.zeros(3))
         model.add_image_with_trivial_frame(pycolmap.Image(name=photo.name, camera_id=1, image_id=k + 1), pose)
-    assert tilt_against_attitudes(model, photographs) == pytest.approx(said, abs=0.25)
+    assert tilt_from_attitudes(model, photographs) == pytest.approx(said, abs=0.25)
 
 
 def test_positions_that_cannot_be_are_left_out_and_named(tmp_path):
@@ -223,9 +235,9 @@ def test_a_table_of_positions_wins(tmp_path):
     seen = flight(tmp_path)
     table = tmp_path / "gps.csv"
     table.write_text("name,lat,lon,alt\n" + "".join(f"p{k:02d},10.{k:04d},20,5\n" for k in range(4)))
-    found = find_positions(seen, table, (0.5, 0.7))
+    found = read_gps_priors(seen, table, (0.5, 0.7))
     assert (len(found), found.source, found.origin[1]) == (4, "gps.csv", 20)
-    assert found.deviations[0] == pytest.approx([0.5, 0.5, 0.7])
+    assert found.gps_std[0] == pytest.approx([0.5, 0.5, 0.7])
 
 
 def test_a_long_corridor_has_no_outliers(tmp_path):
@@ -242,7 +254,7 @@ def test_what_is_not_used_is_named_with_its_reason(tmp_path):
     (tmp_path / "copy.jpg").write_bytes((tmp_path / "p03.jpg").read_bytes())
     (tmp_path / "p04.png").write_bytes((tmp_path / "p05.jpg").read_bytes() + b"\0")
     (tmp_path / "cut.jpg").write_bytes((tmp_path / "p02.jpg").read_bytes()[:4000])
-    found = collect([tmp_path])
+    found = collect_images([tmp_path])
     reasons = {each.name: each.why for each in found.left_out}
     assert "cut off" in reasons["cut.jpg"]
     assert "copy of copy.jpg" in reasons["p03.jpg"]
@@ -255,7 +267,7 @@ def test_folders_are_told_apart(tmp_path):
         flight(tmp_path / name, 2)
     (tmp_path / "b/card/p01.jpg").write_bytes((tmp_path / "b/card/p01.jpg").read_bytes() + b"\0")
     (tmp_path / "b/card/p00.jpg").write_bytes((tmp_path / "b/card/p00.jpg").read_bytes() + b"\0")
-    found = collect([tmp_path / "a/card", tmp_path / "b/card"])
+    found = collect_images([tmp_path / "a/card", tmp_path / "b/card"])
     assert [photo.name for photo in found.photographs] == [f"card_{n}/p0{k}.jpg" for n in (1, 2) for k in (0, 1)]
 
 
@@ -271,17 +283,17 @@ def test_folders_are_told_apart(tmp_path):
 def test_too_few_photographs_are_refused_with_words(tmp_path, fill, said):
     fill(tmp_path / "card")
     with pytest.raises(CaptureError, match=said):
-        collect([tmp_path / "card"])
+        collect_images([tmp_path / "card"])
 
 
 def test_outputs_among_photographs_are_refused(tmp_path):
     flight(tmp_path / "card")
     for output in ("card", "card/out"):
         with pytest.raises(VdgsError, match="among the photographs"):
-            prepare(SfmRequest(photographs=(tmp_path / "card",), output=tmp_path / output))
-    assert only_photographs(tmp_path / "card")
+            plan_reconstruction(SfmRequest(photographs=(tmp_path / "card",), output=tmp_path / output))
+    assert is_image_folder(tmp_path / "card")
     (tmp_path / "card/sparse").mkdir()
-    assert not only_photographs(tmp_path / "card")  # a capture that lacks something is told so
+    assert not is_image_folder(tmp_path / "card")  # a capture that lacks something is told so
 
 
 # -------------------------------------------------------------------------------------------- look and plan
@@ -289,7 +301,7 @@ def test_outputs_among_photographs_are_refused(tmp_path):
 
 def test_the_look_says_what_the_flight_is(tmp_path):
     seen = flight(tmp_path, 9)
-    found = look_at(collect([tmp_path]), positions_of(seen))
+    found = make_preflight_report(collect_images([tmp_path]), positions_of(seen))
     assert found.height_m == pytest.approx(40, abs=1)
     assert found.gsd_m == pytest.approx(found.height_m / (0.85 * 160))
     assert found.forward_overlap == pytest.approx(1 - 10 / (found.height_m / 0.85 * 0.75), abs=0.02)
@@ -300,22 +312,22 @@ def test_the_look_says_what_the_flight_is(tmp_path):
 
 def test_other_days_and_small_files_are_remarked(tmp_path):
     seen = flight(tmp_path)
-    kept = collect([tmp_path])
+    kept = collect_images([tmp_path])
     other = replace(seen[0], taken="2026:08:01 10:00:00", bytes=100)
-    found = look_at(replace(kept, photographs=(other, *kept.photographs[1:])), positions_of(seen))
+    found = make_preflight_report(replace(kept, photographs=(other, *kept.photographs[1:])), positions_of(seen))
     assert any("taken on 2 days" in each for each in found.warnings)
     assert any("p00.jpg" in each and "smaller files" in each for each in found.warnings)
 
 
 def test_the_focal_length_is_held_where_the_flight_cannot_tell_it(tmp_path):
     seen = flight(tmp_path)
-    oblique = [replace(photo, attitude=of_gimbal(0, -50, 0)) for photo in seen]
-    heights = [replace(photo, above_takeoff=30.0 + 20 * k) for k, photo in enumerate(seen)]
+    oblique = [replace(photo, attitude=attitude_from_gimbal(0, -50, 0)) for photo in seen]
+    heights = [replace(photo, relative_altitude=30.0 + 20 * k) for k, photo in enumerate(seen)]
     unknown = [replace(photo, lens=None) for photo in seen]
     where = positions_of(seen)
-    held = [holds_focal(each, where, SfmOptions())[0] for each in (seen, oblique, heights, unknown)]
+    held = [should_fix_focal(each, where, SfmOptions())[0] for each in (seen, oblique, heights, unknown)]
     assert held == [True, False, False, False]
-    assert holds_focal(oblique, where, SfmOptions(focal="hold"))[0]
+    assert should_fix_focal(oblique, where, SfmOptions(focal="hold"))[0]
 
 
 def circle(radius: float) -> np.ndarray:
@@ -346,16 +358,16 @@ def test_without_attitudes_the_focal_length_is_held_where_positions_are_those_of
     tmp_path, places, wrong_m, held
 ):
     """Older drones and cameras on wings record nothing but positions; phones and hands record no more."""
-    silent = replace(photograph(tmp_path, 0), attitude=None, above_takeoff=None)
+    silent = replace(photograph(tmp_path, 0), attitude=None, relative_altitude=None)
     silent = replace(silent, place=None) if places is None else silent
     photographs = [silent] * (10 if places is None else len(places))
     where = positions_of(photographs)
     if places is not None:
         enu = places + np.random.default_rng(3).normal(0, wrong_m, places.shape)
-        where = replace(where, index=np.arange(len(enu)), enu=enu, deviations=np.tile([1.0, 1, 2], (len(enu), 1)))
-    assert holds_focal(photographs, where, SfmOptions())[0] is held
-    calibrated = [replace(photo, lens=Lens(0.7, CALIBRATED)) for photo in photographs]
-    assert holds_focal(calibrated, where, SfmOptions())[0]
+        where = replace(where, index=np.arange(len(enu)), enu=enu, gps_std=np.tile([1.0, 1, 2], (len(enu), 1)))
+    assert should_fix_focal(photographs, where, SfmOptions())[0] is held
+    calibrated = [replace(photo, lens=Lens(0.7, CALIBRATED_SOURCE)) for photo in photographs]
+    assert should_fix_focal(calibrated, where, SfmOptions())[0]
 
 
 # ----------------------------------------------------------------------------------------------------- pairs
@@ -364,7 +376,7 @@ def test_without_attitudes_the_focal_length_is_held_where_positions_are_those_of
 @given(st.integers(2, 40), st.integers(1, 8), st.integers(0, 4))
 def test_pairs_are_sorted_and_none_is_of_one_photograph(count, following, doublings):
     order = list(np.random.default_rng(count).permutation(count))
-    chosen = pair_selection.in_order(order, following, doublings) | pair_selection.near(
+    chosen = pair_selection.sequential_pairs(order, following, doublings) | pair_selection.spatial_pairs(
         np.random.default_rng(0).random((count, 3)), 4
     )
     assert all(0 <= i < j < count for i, j in chosen)
@@ -373,12 +385,12 @@ def test_pairs_are_sorted_and_none_is_of_one_photograph(count, following, doubli
 
 def test_near_ones_are_matched_and_those_without_a_place_are_not():
     places = np.array([[0, 0, 9], [1, 0, 5], [2, 0, 9], [90, 0, 9], [np.nan, 0, 0]])
-    assert pair_selection.near(places, 1) == {(0, 1), (1, 2), (2, 3)}
+    assert pair_selection.spatial_pairs(places, 1) == {(0, 1), (1, 2), (2, 3)}
 
 
 def test_photographs_that_look_alike_find_each_other():
     rng = np.random.default_rng(0)
     kinds = rng.integers(0, 255, (2, 30, 128))
     looks = [(kinds[k % 2] + rng.normal(0, 3, (30, 128))).clip(0, 255).astype(np.uint8) for k in range(30)]
-    chosen = pair_selection.alike(looks, [0, 1])
+    chosen = pair_selection.retrieval_pairs(looks, [0, 1])
     assert sum((i + j) % 2 == 0 for i, j in chosen) > 0.95 * len(chosen)

@@ -16,7 +16,7 @@ pytest.importorskip("embreex")
 import pycolmap
 
 from support.flights import Flight, copy_folder, write_photograph
-from vdgs.captures.image_cache import load_picture
+from vdgs.captures.image_cache import load_image
 from vdgs.captures.image_files import decode_mask
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
@@ -25,11 +25,11 @@ from vdgs.config.presets import PRESETS
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.sfm import feature_extraction, incremental_mapper, reconstruct
-from vdgs.sfm.image_list import collect
-from vdgs.sfm.mask_files import kept_of, write_upright_masks
-from vdgs.sfm.reconstruction_plan import prepare, tell
-from vdgs.sfm.run_request import sfm_request
-from vdgs.sfm.workspace import Work, quiet_colmap
+from vdgs.sfm.image_list import collect_images
+from vdgs.sfm.mask_files import read_keep_mask, write_upright_masks
+from vdgs.sfm.reconstruction_plan import plan_reconstruction, print_plan
+from vdgs.sfm.run_request import make_sfm_request
+from vdgs.sfm.workspace import Workspace, silence_colmap
 
 pytestmark = pytest.mark.xdist_group("sfm")
 
@@ -78,7 +78,7 @@ def test_masks_beside_photographs_are_masks(tmp_path, asked, names, masks):
     photographs(tmp_path, *(names.format(k) for k in range(4)))
     for k in range(3):
         write_mask(tmp_path / masks.format(k), left_half())
-    found = collect([tmp_path / asked])
+    found = collect_images([tmp_path / asked])
     assert len(found.photographs) == 4
     assert (found.left_out, found.other_files) == ((), 0)
     assert [photo.mask and photo.mask.name for photo in found.photographs] == [
@@ -86,7 +86,7 @@ def test_masks_beside_photographs_are_masks(tmp_path, asked, names, masks):
     ]  # fmt: skip
     assert any("3 of 4 photographs have a mask" in note for note in found.notes)
     said = console()
-    tell(prepare(SfmRequest(photographs=(tmp_path / asked,), output=tmp_path.parent / "new")), said)
+    print_plan(plan_reconstruction(SfmRequest(photographs=(tmp_path / asked,), output=tmp_path.parent / "new")), said)
     assert "3 of 4 photographs have one" in said.file.getvalue()
 
 
@@ -94,23 +94,25 @@ def test_masks_of_nothing_and_of_other_shapes_are_named(tmp_path):
     photographs(tmp_path, *(f"{k}.jpg" for k in range(3)))
     mask = write_mask(tmp_path / "masks/0_legs.png", left_half())
     with pytest.raises(CaptureError, match=r"masks: holds 1 masks, none of them .*\(0\.png; 0_legs\.png is there\)"):
-        collect([tmp_path])
+        collect_images([tmp_path])
     write_mask(tmp_path / "masks/0.png", left_half())
-    assert any("1 masks belong to no photograph" in note and mask.name in note for note in collect([tmp_path]).notes)
+    assert any(
+        "1 masks belong to no photograph" in note and mask.name in note for note in collect_images([tmp_path]).notes
+    )
     wrong = write_mask(tmp_path / "masks/1.png", left_half(160, 120))
     with pytest.raises(CaptureError, match=r"1\.png: is 120x160, but its photograph 1\.jpg is 160x120"):
-        collect([tmp_path])
+        collect_images([tmp_path])
     wrong.unlink()
     alone = tmp_path / "alone"
     photographs(alone, *(f"masks/{k}.jpg" for k in range(3)))
-    assert len(collect([alone]).photographs) == 3  # of masks, at the carnival
+    assert len(collect_images([alone]).photographs) == 3  # of masks, at the carnival
 
 
 def test_other_folders_of_masks_are_asked_of_captures_only(tmp_path):
     options = CaptureOptions(masks="legs")
     training = PRESETS["laptop"].training
     with pytest.raises(VdgsError, match="--masks legs: names a folder of a capture"):
-        sfm_request(
+        make_sfm_request(
             RunRequest(capture=tmp_path, output=tmp_path / "run", preset="laptop", options=options, training=training)
         )
 
@@ -128,12 +130,12 @@ def test_masks_turn_with_their_photographs(tmp_path, orientation):
     with Image.open(tmp_path / "turned.png") as image:
         truth = np.array(ImageOps.exif_transpose(image)) > 0
     (tmp_path / "turned.png").unlink()
-    found = collect([tmp_path]).photographs
-    assert np.array_equal(kept_of(found[0]), truth)
-    assert kept_of(found[1]) is None
+    found = collect_images([tmp_path]).photographs
+    assert np.array_equal(read_keep_mask(found[0]), truth)
+    assert read_keep_mask(found[1]) is None
     if orientation >= 5:  # as programs write it that turn photographs themselves
         write_mask(tmp_path / "masks/0.png", truth)
-        assert np.array_equal(kept_of(found[0]), truth)
+        assert np.array_equal(read_keep_mask(found[0]), truth)
 
 
 def test_transparency_is_a_mask_and_both_count(tmp_path):
@@ -143,12 +145,12 @@ def test_transparency_is_a_mask_and_both_count(tmp_path):
     upper = np.zeros((120, 160), bool)
     upper[:60] = True
     write_mask(tmp_path / "masks/1.png", upper)
-    first, second, third = collect([tmp_path]).photographs
-    assert np.array_equal(kept_of(first), left_half())
-    assert np.array_equal(kept_of(second), left_half() & upper)
-    assert kept_of(third) is None
+    first, second, third = collect_images([tmp_path]).photographs
+    assert np.array_equal(read_keep_mask(first), left_half())
+    assert np.array_equal(read_keep_mask(second), left_half() & upper)
+    assert read_keep_mask(third) is None
     said = console()
-    tell(prepare(SfmRequest(photographs=(tmp_path,), output=tmp_path.parent / "new")), said)
+    print_plan(plan_reconstruction(SfmRequest(photographs=(tmp_path,), output=tmp_path.parent / "new")), said)
     assert "1 of 3 photographs have one; 3 have an alpha channel" in said.file.getvalue()
 
 
@@ -164,16 +166,16 @@ def masked(nine, tmp_path) -> Flight:
 
 
 def test_features_lie_where_masks_are_white(masked, tmp_path):
-    quiet_colmap()
-    collection = collect([masked.folder])
+    silence_colmap()
+    collection = collect_images([masked.folder])
     seen = (collection.photographs[0], collection.photographs[5])
     black = write_mask(tmp_path / "black.png", np.zeros((300, 400), bool))
     seen = (*seen, replace(collection.photographs[1], mask=black))
-    work, kinds = Work(tmp_path / "work"), feature_extraction.kinds_of(seen)
-    feature_extraction.open_database(work, kinds)
-    feature_extraction.stand_upright(work, seen)
+    work, kinds = Workspace(tmp_path / "work"), feature_extraction.group_by_camera(seen)
+    feature_extraction.create_database(work, kinds)
+    feature_extraction.write_upright_images(work, seen)
     write_upright_masks(work, seen, 1)
-    counts = feature_extraction.find_features(work, kinds, 300, 500, 1, console())
+    counts = feature_extraction.extract_features(work, kinds, 300, 500, 1, console())
     database = pycolmap.Database.open(work.database)
     found = {image.name: image.image_id for image in database.read_all_images()}
     x, y = np.asarray(database.read_keypoints(found[seen[0].name]))[:, :2].T
@@ -182,7 +184,7 @@ def test_features_lie_where_masks_are_white(masked, tmp_path):
     assert 0 < counts[seen[0].name] < counts[seen[1].name]
     assert counts[seen[2].name] == 0
     with pytest.raises(CaptureError, match="shows only 0 features where its mask is white"):
-        feature_extraction.without_features(seen, counts)
+        feature_extraction.images_without_features(seen, counts)
 
 
 def test_masks_are_written_with_the_capture_and_what_depends_on_them_is_done_again(nine_begun, masked, tmp_path):
@@ -191,14 +193,14 @@ def test_masks_are_written_with_the_capture_and_what_depends_on_them_is_done_aga
     first = masked.folder / f"masks/{masked.names[0]}.png"
     for change in (lambda: None, lambda: write_mask(first, ~left_half(300, 400)), first.unlink):
         change()
-        keys.append(reconstruct._keys(prepare(request)))
+        keys.append(reconstruct._keys(plan_reconstruction(request)))
     for step in ("features", "matches", "model", "capture"):
         assert len({each[step] for each in keys}) == 3
 
     copy_folder(nine_begun["writing"], output)
     write_mask(first, left_half(300, 400))
-    prepared, work = prepare(request), Work(output / "work")
-    write_upright_masks(work, prepared.collection.photographs, 1)
+    prepared, work = plan_reconstruction(request), Workspace(output / "work")
+    write_upright_masks(work, prepared.image_list.photographs, 1)
     model = incremental_mapper.read_models(work)[0]
     write_mask(output / "masks/old.png", left_half())  # of other masks
     reconstruct._write(prepared, work, model, "key", 1, console())
@@ -207,9 +209,9 @@ def test_masks_are_written_with_the_capture_and_what_depends_on_them_is_done_aga
     names = {view.name: view.mask_path and view.mask_path.name for view in capture.views}
     assert names == {name: f"{name}.png" if k < 2 else None for k, name in enumerate(masked.names)}
     assert len(list((output / "masks").iterdir())) == 2
-    picture, size = load_picture(capture.views[0]), capture.views[0].camera.whole_size
+    picture, size = load_image(capture.views[0]), capture.views[0].camera.full_size
     assert tuple(picture.mask.shape) == size[::-1]
     truth = decode_mask(first, *size)
     assert (picture.mask.numpy().astype(bool) == truth).mean() > 0.97
     quarter = load_capture(output, CaptureOptions(images="images_4")).views[0]
-    assert load_picture(quarter).mask.float().mean() == pytest.approx(truth.mean(), abs=0.05)
+    assert load_image(quarter).mask.float().mean() == pytest.approx(truth.mean(), abs=0.05)

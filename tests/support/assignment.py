@@ -15,12 +15,12 @@ from vdgs.geometry.camera import Camera
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.partition.assignment.score_matrix import Scores
+from vdgs.partition.assignment.score_matrix import ScoreMatrix
 from vdgs.partition.blocks import Block, Blocks
 
 MODES = ("coverage", "literal", "leave_one_out", "frustum")
 RENDERED = MODES[:3]
-CONFIG = AssignmentConfig(longest_side_px=48, min_cameras=0)
+CONFIG = AssignmentConfig(image_size=48, min_cameras=0)
 WIDTH = 24.0
 
 
@@ -41,7 +41,9 @@ def scene() -> AnchorModel:
     tensors = Decoder.initial(4, False, 0, 1, g).tensors()
     tensors["opacity_b2"] = tensors["opacity_b2"] + 3.0  # what is in view is opaque
     tensors["colour_b2"] = tensors["colour_b2"] + 1.0  # and lighter than the black behind it
-    return AnchorModel(anchors=anchors, decoder=Decoder.from_tensors(tensors), voxel=0.4, background=(0.5, 0.5, 0.5))
+    return AnchorModel(
+        anchors=anchors, decoder=Decoder.from_tensors(tensors), voxel_size=0.4, background=(0.5, 0.5, 0.5)
+    )
 
 
 def strips(count: int, margin: float = 0.5) -> Blocks:
@@ -65,11 +67,11 @@ def skyward() -> Camera:
     return camera(22.0, height=5.0, tilt_deg=180.0)
 
 
-def hand_made(scores, held=None, mode="coverage") -> Scores:
+def hand_made(scores, held=None, mode="coverage") -> ScoreMatrix:
     values = np.array(scores, np.float32)
     held = (values > 0).astype(np.int32) if held is None else np.array(held, np.int32)
     anchors = np.full(values.shape[1], 1000, np.int64)
-    return Scores(
+    return ScoreMatrix(
         mode=mode, scores=values, held=held, covered=values.copy(), anchors=anchors,
         beneath=np.zeros(len(values), np.int64),
     )  # fmt: skip

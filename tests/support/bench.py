@@ -10,12 +10,12 @@ from pathlib import Path
 from rich.console import Console
 
 from experiments.bench.bench import BenchSettings, run_bench
-from experiments.bench.plan import Choices
-from experiments.bench.results import Result
-from experiments.bench.worker import Job, work
+from experiments.bench.plan import PlanOptions
+from experiments.bench.results import BenchResult
+from experiments.bench.worker import BenchJob, run_job
 from support.captures import tiny_scene, write_colmap
 from support.commands import threads_as_before
-from vdgs.distributed.executor import Listener, Outcome, Task
+from vdgs.distributed.executor import Task, TaskListener, TaskResult
 
 
 @dataclass(frozen=True)
@@ -24,11 +24,11 @@ class InThisProcess:
 
     at_once: int
 
-    def run(self, tasks: Sequence[Task], _listener: Listener) -> list[Outcome]:
+    def run(self, tasks: Sequence[Task], _listener: TaskListener) -> list[TaskResult]:
         with threads_as_before():
             for task in tasks:
-                work(replace(Job.read(Path(task.command[-1])), threads=1))
-        return [Outcome(name=task.name, state="done") for task in tasks]
+                run_job(replace(BenchJob.read(Path(task.command[-1])), threads=1))
+        return [TaskResult(name=task.name, state="done") for task in tasks]
 
 
 def write_data(folder: Path) -> None:
@@ -39,9 +39,9 @@ def write_data(folder: Path) -> None:
 
 def benched(
     data: Path, output: Path, *methods: str, total: int = 40, redo: bool = False, renders: tuple[str, ...] = ()
-) -> dict[str, Result]:
+) -> dict[str, BenchResult]:
     """Table I of that scene with these methods, one seed."""
-    choices = Choices(
+    choices = PlanOptions(
         seeds=1, scenes=("copr",), methods=methods, iterations_total=total, max_anchors=300, renders=renders
     )
     asked = BenchSettings("table1", output, choices, data, redo=redo)

@@ -9,19 +9,19 @@ import shapely
 import torch
 
 from support.checkerboard import Photographs
-from vdgs.config.method import AnchorConfig, BlockConfig, CompensationConfig, GrowthConfig, TrainConfig
+from vdgs.config.method import AnchorConfig, BlockConfig, CompensationConfig, DensifyConfig, TrainConfig
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.model.initialization.initialize import initial_anchors
-from vdgs.partition.block_regions import drawn_by, holds, ramp, split_anchors
+from vdgs.model.initialization.initialize import initialize_anchors
+from vdgs.partition.block_regions import growth_mask, lr_ramp, split_trainable_anchors, visible_anchors
 from vdgs.partition.blocks import Block, Blocks
-from vdgs.training import Stage, Surroundings, TrainingState, start_state
+from vdgs.training import FrozenAnchors, TrainingProblem, TrainingState, initial_state
 
 CONFIG = TrainConfig(
     iterations=40,
     anchors=AnchorConfig(offsets=4),
-    growth=GrowthConfig(
-        interval=10, statistics_from=0, start=10, until=1.0, threshold=1e-6, coarsest_cell=4.0, gate=0.05
+    growth=DensifyConfig(
+        interval=10, stats_start=0, start=10, until=1.0, threshold=1e-6, coarsest_voxels=4.0, gate=0.05
     ),
     compensation=CompensationConfig(t_low=0.5),
 )
@@ -37,7 +37,9 @@ BLOCKS = Blocks(
 def coarse() -> tuple[Anchors, Decoder]:
     x, y = np.meshgrid(np.arange(-3.9, 4, 0.4), np.arange(-3.1, 3.2, 0.4))
     points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
-    anchors, _ = initial_anchors(points, np.zeros((x.size, 3), np.uint8), [], AnchorConfig(offsets=4, voxel=0.4))
+    anchors, _ = initialize_anchors(
+        points, np.zeros((x.size, 3), np.uint8), [], AnchorConfig(offsets=4, voxel_size=0.4)
+    )
     generator = torch.Generator().manual_seed(0)
     anchors = replace(
         anchors,
@@ -47,14 +49,16 @@ def coarse() -> tuple[Anchors, Decoder]:
     return anchors, Decoder.initial(4, False, 0, 8, generator)
 
 
-def block_stage(config: BlockConfig, index: int = 0, training: TrainConfig = CONFIG) -> tuple[Stage, TrainingState]:
+def block_stage(
+    config: BlockConfig, index: int = 0, training: TrainConfig = CONFIG
+) -> tuple[TrainingProblem, TrainingState]:
     anchors, decoder = coarse()
     photographs = Photographs()
-    own, around = split_anchors(anchors, BLOCKS, index, config)
-    surroundings = anchors.select(around & drawn_by(anchors, photographs.cameras))
-    stage = Stage(
-        config=training, images=photographs, image_count=8, voxel=0.4, camera_height=5.0, frozen_decoder=True,
-        surroundings=Surroundings(surroundings, decoder), may_hold=holds(BLOCKS, index, config),
-        mobility=ramp(BLOCKS, index, config),
+    own, around = split_trainable_anchors(anchors, BLOCKS, index, config)
+    surroundings = anchors.select(around & visible_anchors(anchors, photographs.cameras))
+    stage = TrainingProblem(
+        config=training, images=photographs, image_count=8, voxel_size=0.4, camera_height=5.0, frozen_decoder=True,
+        surroundings=FrozenAnchors(surroundings, decoder), may_hold=growth_mask(BLOCKS, index, config),
+        lr_mask=lr_ramp(BLOCKS, index, config),
     )  # fmt: skip
-    return stage, start_state(anchors.select(own), decoder, stage)
+    return stage, initial_state(anchors.select(own), decoder, stage)

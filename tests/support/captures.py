@@ -141,7 +141,7 @@ def write_colmap(
 def _features(camera: Camera, points: np.ndarray, tracks: bool) -> list[tuple[float, float, int]]:
     """x, y and the number of the point of what a picture shows; without tracks one feature of no point."""
     unmatched = [(1.0, 2.0, -1)]
-    pixels, seen = camera.project(points)[0], camera.sees(points)
+    pixels, seen = camera.project(points)[0], camera.in_frustum(points)
     return unmatched + [(*pixels[index], int(index) + 1) for index in np.flatnonzero(seen)] if tracks else unmatched
 
 

@@ -33,7 +33,7 @@ from support.forking import fork_tasks
 from support.pausing import Pause, pause_where_asked
 
 if TYPE_CHECKING:
-    from vdgs.distributed.executor import Listener, Outcome, Task
+    from vdgs.distributed.executor import Task, TaskListener, TaskResult
 
 #: What nothing takes that still goes on, however busy the machine is. The limit of a whole test is larger still.
 PATIENCE_SECONDS = 900.0
@@ -58,8 +58,8 @@ class CommandsHere:
 
     at_once: int
 
-    def run(self, tasks: Sequence[Task], _listener: Listener) -> list[Outcome]:
-        from vdgs.distributed.executor import Outcome
+    def run(self, tasks: Sequence[Task], _listener: TaskListener) -> list[TaskResult]:
+        from vdgs.distributed.executor import TaskResult
 
         for task in tasks:
             python, option, extension, *arguments = task.command
@@ -68,7 +68,7 @@ class CommandsHere:
             with task.output.open("a") as output, redirect_stdout(output), redirect_stderr(output), threads_as_before():
                 code = _exit_code(importlib.import_module(extension).main, arguments)
             assert not code, f"{task.name}: exit code {code}, see {task.output}"
-        return [Outcome(name=task.name, state="done", attempts=1) for task in tasks]
+        return [TaskResult(name=task.name, state="done", attempts=1) for task in tasks]
 
 
 def _exit_code(main: Callable[[list[str]], int | None], arguments: list[str]) -> object:
@@ -85,11 +85,11 @@ def threads_as_before() -> Iterator[None]:
 
     from vdgs.kernels.cpu import extension
 
-    kernels, of_torch = extension.threads(), torch.get_num_threads()
+    kernels, of_torch = extension.get_num_threads(), torch.get_num_threads()
     try:
         yield
     finally:
-        extension.set_threads(kernels)
+        extension.set_num_threads(kernels)
         torch.set_num_threads(of_torch)
 
 

@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from vdgs.kernels.cuda import launch, nvrtc
-from vdgs.kernels.cuda.driver import Grid
+from vdgs.kernels.cuda.driver import GridSize
 from vdgs.kernels.cuda.launch import read_source
 from vdgs.kernels.cuda.nvrtc import CudaUnavailable, Nvrtc
 
@@ -82,7 +82,7 @@ class HostDriver:
         self._library, self.order, self.device_type = library, order, device_type
         #: Modules loaded and kernels launched: (name, grid, block).
         self.loaded: list[bytes] = []
-        self.launched: list[tuple[str, Grid, Grid]] = []
+        self.launched: list[tuple[str, GridSize, GridSize]] = []
         self._names: dict[int, str] = {}
 
     def capability(self, device: torch.device) -> tuple[int, int]:
@@ -98,7 +98,7 @@ class HostDriver:
         self._names[address] = name
         return address
 
-    def launch(self, function: int, grid: Grid, block: Grid, device: torch.device, arguments: Any) -> None:
+    def launch(self, function: int, grid: GridSize, block: GridSize, device: torch.device, arguments: Any) -> None:
         self.launched.append((self._names[function], grid, block))
         whole = self._library.host_launch(
             ctypes.c_void_p(function), (ctypes.c_uint * 3)(*grid), (ctypes.c_uint * 3)(*block), arguments,
@@ -109,7 +109,7 @@ class HostDriver:
 
 
 try:
-    COMPILER: Nvrtc | None = nvrtc.nvrtc()
+    COMPILER: Nvrtc | None = nvrtc.get_nvrtc()
 except CudaUnavailable:
     COMPILER = None
 

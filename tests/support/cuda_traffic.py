@@ -11,7 +11,7 @@ from pathlib import Path
 from torch import Tensor
 
 from support.cuda_on_host import HostDriver, build_on_host
-from vdgs.kernels.cuda.launch import Argument, Program, read_source
+from vdgs.kernels.cuda.launch import CudaProgram, KernelArgument, read_source
 
 
 @dataclass(frozen=True)
@@ -37,16 +37,16 @@ class Traffic:
     written: Bytes
 
 
-class CountedProgram(Program):
+class CountedProgram(CudaProgram):
     """A program whose launches are counted."""
 
-    def __init__(self, program: Program, folder: Path):
+    def __init__(self, program: CudaProgram, folder: Path):
         self._library = build_on_host(program.name, folder, counted=True)
         super().__init__(name=program.name, driver=HostDriver(self._library), headers=program.headers)
         self.traffic: list[Traffic] = []
         self._launches = 0
 
-    def launch(self, kernel: str, grid: Sequence[int], block: Sequence[int], *arguments: Argument) -> None:
+    def launch(self, kernel: str, grid: Sequence[int], block: Sequence[int], *arguments: KernelArgument) -> None:
         named = list(zip(parameters_of(self.name, kernel), arguments, strict=True))
         tensors = [(name, argument) for name, argument in named if isinstance(argument, Tensor) and argument.numel()]
         count, whole = len(tensors), ctypes.c_ulonglong

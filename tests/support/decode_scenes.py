@@ -11,7 +11,7 @@ from torch import Tensor
 from vdgs.geometry.camera import Camera, CameraModel
 from vdgs.kernels import cpu
 from vdgs.kernels.kernel_types import AdamState, DecoderWeights, SplatGradients
-from vdgs.kernels.splat_segments import Shown
+from vdgs.kernels.splat_segments import SplatMask
 from vdgs.kernels.torch_ref.project import project
 
 
@@ -127,7 +127,7 @@ def view_statistics(seed: int, n: int = 3000, k: int = 7):
 
 def moved_by(
     kernels, scene: Scene, camera: Camera, rows: torch.Tensor, frozen: bool = False, spoil: bool = False,
-    shown: Shown | None = None,
+    shown: SplatMask | None = None,
 ):  # fmt: skip
     """Whether all was finite, and after a step of Adam: parameters and moments, updates, gradients of the decoder.
     `shown`: where splats stand, if not in the order of the anchors."""
@@ -154,7 +154,7 @@ def moved_by(
     return bool(finite), [t for state in states for t in state[:3]], updates, found
 
 
-def elsewhere(gradients: SplatGradients, shown: Shown) -> SplatGradients:
+def elsewhere(gradients: SplatGradients, shown: SplatMask) -> SplatGradients:
     """Gradients of splats in their order, as those of splats that stand otherwise; what these looked like is lost."""
     order = shown.runs.order(len(shown))
     moved = {}

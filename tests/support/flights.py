@@ -18,10 +18,10 @@ from rich.console import Console
 from vdgs.config.sfm_options import SfmRequest
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.geodesy import geodetic_from_enu
-from vdgs.synth.flight_cameras import look_from
-from vdgs.synth.image_renderer import photograph
-from vdgs.synth.lighting import sky_map
-from vdgs.synth.ray_tracing import Tracer
+from vdgs.synth.flight_cameras import pose_from_angles
+from vdgs.synth.image_renderer import render_image
+from vdgs.synth.lighting import make_sky_map
+from vdgs.synth.ray_tracing import RayTracer
 from vdgs.synth.town import build_town
 
 #: Where the town lies: latitude, longitude in degrees, altitude in metres. South and west, where signs go wrong.
@@ -52,7 +52,7 @@ def grid(strips: int, each: int, step: float) -> list[Camera]:
             along = (k if strip % 2 == 0 else each - 1 - k) - (each - 1) / 2
             place = np.array([step * along, step * (strip - (strips - 1) / 2), ALTITUDE_M + rng.normal(0, 0.5)])
             heading = np.pi / 2 if strip % 2 == 0 else -np.pi / 2
-            pose = look_from(place, np.radians(rng.normal(0, 2)), heading, np.radians(rng.normal(0, 1)))
+            pose = pose_from_angles(place, np.radians(rng.normal(0, 2)), heading, np.radians(rng.normal(0, 1)))
             cameras.append(
                 Camera(
                     camera_from_world=pose, fx=FOCAL, fy=FOCAL, cx=WIDTH / 2, cy=HEIGHT / 2, width=WIDTH, height=HEIGHT
@@ -65,12 +65,12 @@ def fly(folder: Path, cameras: Sequence[Camera], extent: float = 60.0) -> Flight
     """Take the photographs and write them with what a drone writes."""
     folder.mkdir(parents=True)
     town = build_town(3, extent)
-    tracer = Tracer(town.mesh)
+    tracer = RayTracer(town.mesh)
     flight = Flight(folder, list(cameras))
     with ThreadPoolExecutor(1) as pool:
-        sky = sky_map(tracer, town.terrain, town.zones, extent / 2 + 20, pool)
+        sky = make_sky_map(tracer, town.terrain, town.zones, extent / 2 + 20, pool)
     for k, (name, camera) in enumerate(zip(flight.names, cameras, strict=True)):
-        pixels = photograph(town, tracer, sky, camera, 1, np.ones(3))
+        pixels = render_image(town, tracer, sky, camera, 1, np.ones(3))
         write_photograph(folder / name, pixels, k, camera.position)
     return flight
 
@@ -104,7 +104,7 @@ def copy_folder(of: Path, to: Path) -> None:
 def sightings(cameras: Sequence[Camera], points: np.ndarray, extent: float = 60.0) -> list[dict[int, np.ndarray]]:
     """For each place over the town (x, y) the pixels [2] at which cameras, by their numbers, see its ground; and, under
     -1, the place on the ground itself [3]."""
-    tracer = Tracer(build_town(3, extent).mesh)
+    tracer = RayTracer(build_town(3, extent).mesh)
     found = []
     for x, y in points:
         above = np.array([[x, y, 300.0]], np.float32)
@@ -113,7 +113,7 @@ def sightings(cameras: Sequence[Camera], points: np.ndarray, extent: float = 60.
         for k, camera in enumerate(cameras):
             away = ground - camera.position
             hit = tracer.cast(camera.position[None].astype(np.float32), away[None].astype(np.float32))
-            if camera.sees(ground[None])[0] and abs(hit.distance[0] - 1) < 1e-3:
+            if camera.in_frustum(ground[None])[0] and abs(hit.distance[0] - 1) < 1e-3:
                 seen[k] = camera.project(ground[None])[0][0]
         found.append(seen)
     return found

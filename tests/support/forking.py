@@ -19,7 +19,7 @@ from multiprocessing.process import BaseProcess
 from types import SimpleNamespace
 from typing import IO
 
-from vdgs.distributed.task_process import PARENT
+from vdgs.distributed.task_process import PARENT_PID_VARIABLE
 
 #: Seconds between two looks at a process that is waited for.
 GLANCE_SECONDS = 0.01
@@ -104,6 +104,6 @@ def _become(orders: Connection, module: str, arguments: list[str], output: str, 
     os.dup2(os.open(output, os.O_WRONLY | os.O_APPEND), 1)
     os.dup2(1, 2)
     os.environ.clear()
-    os.environ.update(environment | {PARENT: str(os.getppid())})
+    os.environ.update(environment | {PARENT_PID_VARIABLE: str(os.getppid())})
     fork_tasks()
     sys.exit(importlib.import_module(module).main(arguments))

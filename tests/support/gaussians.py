@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from vdgs.geometry.camera import Camera
-from vdgs.model.gaussians import Gaussians, draw_gaussians
+from vdgs.model.gaussians import Gaussians, render_gaussians
 
 
 def random_gaussians(count: int, degree: int, seed: int = 0, reach: float = 3.0) -> Gaussians:
@@ -43,7 +43,7 @@ def overhead(height: float = 8.0, aside: float = 2.0, size: int = 96) -> Camera:
 def picture(gaussians: Gaussians, camera: Camera | None = None) -> np.ndarray:
     """What a camera sees before black, RGB in 0 .. 1."""
     with torch.no_grad():
-        raster, _ = draw_gaussians(gaussians, camera or overhead(), torch.zeros(3), gaussians.degree)
+        raster, _ = render_gaussians(gaussians, camera or overhead(), torch.zeros(3), gaussians.degree)
     return raster.image.clamp(0, 1).numpy()
 
 

@@ -34,13 +34,13 @@ def install(
     drivers: dict[str, HostDriver], code: Path, monkeypatch: pytest.MonkeyPatch, device_type: str, rasteriser: str
 ) -> None:
     """Let tensors of a kind of device be computed on by the composed set, with one of its rasterisers."""
-    monkeypatch.setenv(compile_cache.VARIABLE, str(code))
+    monkeypatch.setenv(compile_cache.CUDA_CACHE_ENV_VAR, str(code))
     for program in PROGRAMS:
         driver = drivers[program.name]
         driver.device_type = device_type
         for name, value in (("driver", driver), ("_functions", {}), ("_modules", {})):
             monkeypatch.setattr(program, name, value)
     fake_gsplat.install(monkeypatch)
-    monkeypatch.setenv(choosing.VARIABLE, rasteriser)
-    choosing.chosen.cache_clear()
-    adam.tables_on.cache_clear()
+    monkeypatch.setenv(choosing.RASTERIZER_ENV_VAR, rasteriser)
+    choosing.select_rasterizer.cache_clear()
+    adam.bias_correction_tables.cache_clear()

@@ -45,7 +45,11 @@ def model_at(positions: np.ndarray, seed: int = 0, decoder_seed: int = 0) -> Anc
     )
     decoder = Decoder.initial(OFFSETS, False, 0, 0, torch.Generator().manual_seed(decoder_seed))
     return AnchorModel(
-        anchors=anchors, decoder=decoder, voxel=0.1, background=(0.1, 0.2, 0.3), metadata=ModelMetadata(version="plane")
+        anchors=anchors,
+        decoder=decoder,
+        voxel_size=0.1,
+        background=(0.1, 0.2, 0.3),
+        metadata=ModelMetadata(version="plane"),
     )
 
 
@@ -87,5 +91,5 @@ def capture_at(origin: tuple[float, float, float] | None) -> Capture:
     points = np.zeros((1, 3))
     return Capture(
         root=Path("place"), source="colmap", images="images", views=tuple(views), points=points,
-        point_colours=np.zeros((1, 3), np.uint8), ground=ground(origin),
+        point_colors=np.zeros((1, 3), np.uint8), ground=ground(origin),
     )  # fmt: skip

@@ -11,22 +11,22 @@ import pytest
 from vdgs.kernels.cpu import extension
 
 #: Runs a test once for every instruction set that this processor supports.
-every_instruction_set = pytest.mark.parametrize("instructions", extension.supported())
+every_instruction_set = pytest.mark.parametrize("instructions", extension.supported_isas())
 
 
 @contextmanager
 def using(instructions: str) -> Iterator[None]:
     """Run the kernels built for one instruction set."""
-    with patch.object(extension, "native", lambda: extension.load(instructions)):
+    with patch.object(extension, "native", lambda: extension.load_extension(instructions)):
         yield
 
 
 @contextmanager
 def on_threads(count: int) -> Iterator[None]:
     """Let the kernels use `count` threads."""
-    before = extension.threads()
-    extension.set_threads(count)
+    before = extension.get_num_threads()
+    extension.set_num_threads(count)
     try:
         yield
     finally:
-        extension.set_threads(before)
+        extension.set_num_threads(before)

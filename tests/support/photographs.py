@@ -43,7 +43,7 @@ def load_mask(view: View) -> np.ndarray | None:
 
 def psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
     """PSNR in dB over all kept pixels and channels, as an evaluation puts it together."""
-    return metrics.psnr_of(metrics.masked_mean(metrics.squared_error(image, reference), mask))
+    return metrics.psnr_from_mse(metrics.masked_mean(metrics.squared_error(image, reference), mask))
 
 
 def ssim(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:

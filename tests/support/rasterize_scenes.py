@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from vdgs.kernels.kernel_types import OrderedSplats, Raster, RasterPullback, Splats
-from vdgs.kernels.splat_segments import Runs
+from vdgs.kernels.splat_segments import SplatSegments
 
 
 def assert_first_gradients_are_those_of_all(
@@ -49,7 +49,7 @@ def in_runs(splats: Splats, runs: int, seed: int = 0) -> tuple[OrderedSplats, Te
     moved = {field.name: torch.empty_like(getattr(splats, field.name)) for field in fields(Splats)}
     for name, tensor in moved.items():
         tensor[order] = getattr(splats, name).detach()
-    return OrderedSplats(**moved, runs=Runs(begins.to(torch.int32), lengths.to(torch.int32))), order
+    return OrderedSplats(**moved, runs=SplatSegments(begins.to(torch.int32), lengths.to(torch.int32))), order
 
 
 @dataclass(frozen=True)

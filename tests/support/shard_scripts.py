@@ -11,7 +11,7 @@ from rich.console import Console
 
 from support.commands import PATIENCE_SECONDS
 from vdgs.distributed.local_executor import LocalExecutor
-from vdgs.distributed.shard_runner import Piece, run_pieces
+from vdgs.distributed.shard_runner import Shard, run_shards
 from vdgs.runs.stage_folder import StageFolder
 
 #: What every fake block begins with: it knows its folder, can say how far it is, and lists the SIGTERMs it gets.
@@ -31,14 +31,14 @@ def wait_for(condition):
 """
 
 
-def job(root: Path, index: int, script: str) -> Piece:
+def job(root: Path, index: int, script: str) -> Shard:
     folder = StageFolder(root / f"{index:02d}")
     who = f"block = {index}\n"
-    return Piece(index, folder, [sys.executable, "-S", "-c", PRELUDE + who + textwrap.dedent(script), str(folder.path)])
+    return Shard(index, folder, [sys.executable, "-S", "-c", PRELUDE + who + textwrap.dedent(script), str(folder.path)])
 
 
 def run(jobs, *, at_once=2, retries=2, terminal=False):
     """Outcomes, and what was printed."""
     console = Console(file=io.StringIO(), width=120, height=40, force_terminal=terminal, color_system=None)
-    outcomes = run_pieces(jobs, LocalExecutor(at_once, retries, poll_seconds=0.02), console)
+    outcomes = run_shards(jobs, LocalExecutor(at_once, retries, poll_seconds=0.02), console)
     return outcomes, console.file.getvalue()

@@ -8,10 +8,10 @@ import numpy as np
 import torch
 
 from support.checkerboard import Photographs
-from vdgs.config.method import AnchorConfig, GrowthConfig, TrainConfig
+from vdgs.config.method import AnchorConfig, DensifyConfig, TrainConfig
 from vdgs.model.decoder import Decoder
-from vdgs.model.initialization.initialize import initial_anchors
-from vdgs.training import Stage, start_state, to_saved, train
+from vdgs.model.initialization.initialize import initialize_anchors
+from vdgs.training import TrainingProblem, initial_state, to_checkpoint, train
 
 BLACK = (0.0, 0.0, 0.0)
 
@@ -20,23 +20,23 @@ CONFIG = TrainConfig(
     iterations=60,
     resolutions=((0.0, 2), (0.5, 1)),
     anchors=AnchorConfig(offsets=4, appearance=3),
-    growth=GrowthConfig(interval=10, statistics_from=5, start=20, until=0.9, threshold=1e-6, gate=0.05),
+    growth=DensifyConfig(interval=10, stats_start=5, start=20, until=0.9, threshold=1e-6, gate=0.05),
 )
 
 
-def stage(config: TrainConfig = CONFIG) -> Stage:
-    return Stage(config=config, images=Photographs(), image_count=8, voxel=0.4, camera_height=5.0)
+def stage(config: TrainConfig = CONFIG) -> TrainingProblem:
+    return TrainingProblem(config=config, images=Photographs(), image_count=8, voxel_size=0.4, camera_height=5.0)
 
 
 def start(config: TrainConfig = CONFIG):
     rng = np.random.default_rng(0)
     points = np.concatenate([rng.uniform(-4, 4, (300, 2)), np.zeros((300, 1))], axis=1)
-    anchors, _ = initial_anchors(
-        points, np.full((300, 3), 128, np.uint8), Photographs().cameras, replace(config.anchors, voxel=0.4)
+    anchors, _ = initialize_anchors(
+        points, np.full((300, 3), 128, np.uint8), Photographs().cameras, replace(config.anchors, voxel_size=0.4)
     )
     generator = torch.Generator().manual_seed(config.seed)
     decoder = Decoder.initial(config.anchors.offsets, False, config.anchors.appearance, 8, generator)
-    return start_state(anchors, decoder, stage(config))
+    return initial_state(anchors, decoder, stage(config))
 
 
 def run(state, stage_, until: int | None = None):
@@ -48,4 +48,4 @@ def run(state, stage_, until: int | None = None):
 
 
 def bits(state) -> dict[str, bytes]:
-    return {name: tensor.numpy().tobytes() for name, tensor in to_saved(state).tensors.items()}
+    return {name: tensor.numpy().tobytes() for name, tensor in to_checkpoint(state).tensors.items()}

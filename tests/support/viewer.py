@@ -29,7 +29,7 @@ from support.commands import vdgs
 from vdgs.evaluation.metrics import to_8bit
 from vdgs.geometry.camera import Camera
 from vdgs.model.renderer import render
-from vdgs.viewer.server import Viewer
+from vdgs.viewer.server import ViewerServer
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 #: A busy machine may need long; nothing waits so long where all is well.
@@ -49,7 +49,7 @@ def trained(folder: Path) -> Path:
     return folder / "run"
 
 
-def expected(viewer: Viewer, camera: Camera) -> np.ndarray:
+def expected(viewer: ViewerServer, camera: Camera) -> np.ndarray:
     return to_8bit(render(viewer.scene.run.model, camera).image.numpy())
 
 

@@ -11,21 +11,21 @@ import pytest
 
 pytest.importorskip("embreex")
 
-from vdgs.captures.ground_truth import load_truth, pack_depth, unpack_depth
+from vdgs.captures.ground_truth import load_ground_truth, pack_depth, unpack_depth
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import VdgsError
 from vdgs.synth import SynthOptions, generate
-from vdgs.synth.flight_cameras import fly, pinhole
-from vdgs.synth.flight_stats import flight_imbalance, survey
+from vdgs.synth.flight_cameras import make_camera, make_flight_cameras
+from vdgs.synth.flight_stats import compute_flight_stats, sample_visible_points
 from vdgs.synth.mesh import Material, MeshBuilder
 from vdgs.synth.options import ResolvedOptions
-from vdgs.synth.perturbations import disturbed, exposure_gains, with_outliers
-from vdgs.synth.ray_tracing import Tracer
+from vdgs.synth.perturbations import add_outliers, exposure_gains, perturb_cameras
+from vdgs.synth.ray_tracing import RayTracer
 from vdgs.synth.synthetic_points import SparseCloud
-from vdgs.synth.test_cameras import held_out_cameras
+from vdgs.synth.test_cameras import make_test_cameras
 from vdgs.synth.town import Town, build_town
-from vdgs.synth.true_visibility import count_visibility, surface_places, view_truth
+from vdgs.synth.true_visibility import count_visibility, sample_surface_points, view_ground_truth
 
 pytestmark = pytest.mark.xdist_group("synth_flights")
 
@@ -39,8 +39,8 @@ def town() -> Town:
 
 
 @pytest.fixture(scope="module")
-def tracer(town: Town) -> Tracer:
-    return Tracer(town.mesh)
+def tracer(town: Town) -> RayTracer:
+    return RayTracer(town.mesh)
 
 
 @pytest.fixture(scope="module")
@@ -56,8 +56,10 @@ def options_of(flight: str, images: int = 60, **more: object) -> ResolvedOptions
 
 @pytest.mark.parametrize("flight", FLIGHTS)
 @pytest.mark.parametrize("images", [41, 120])
-def test_flights_take_what_was_asked_for_and_hit_nothing(flight: str, images: int, town: Town, tracer: Tracer) -> None:
-    cameras = fly(options_of(flight, images), town)
+def test_flights_take_what_was_asked_for_and_hit_nothing(
+    flight: str, images: int, town: Town, tracer: RayTracer
+) -> None:
+    cameras = make_flight_cameras(options_of(flight, images), town)
     assert len(cameras) == images
     places = np.stack([camera.position for camera in cameras])
     down = tracer.cast(places.astype(np.float32), np.tile(np.float32([0, 0, -1]), (images, 1)))
@@ -66,12 +68,12 @@ def test_flights_take_what_was_asked_for_and_hit_nothing(flight: str, images: in
     assert steepest < -np.cos(np.radians(70 if flight in ("distant", "orbits") else 52)), "too near to the horizon"
 
 
-def test_each_flight_is_uneven_in_its_own_way(town: Town, tracer: Tracer) -> None:
+def test_each_flight_is_uneven_in_its_own_way(town: Town, tracer: RayTracer) -> None:
     found, share_in_middle, far = {}, {}, {}
     for flight in FLIGHTS:
-        cameras = fly(options_of(flight), town)
-        places, views = survey(tracer, town.mesh, cameras, 60.0, np.random.default_rng(0))
-        found[flight] = flight_imbalance(views, len(cameras))
+        cameras = make_flight_cameras(options_of(flight), town)
+        places, views = sample_visible_points(tracer, town.mesh, cameras, 60.0, np.random.default_rng(0))
+        found[flight] = compute_flight_stats(views, len(cameras))
         far[flight] = (np.abs(places[:, :2]).max(1) > 90).sum()
         at = np.array([camera.position[:2] for camera in cameras])
         share_in_middle[flight] = np.mean(np.abs(at).max(1) < 0.22 * 120)
@@ -82,27 +84,27 @@ def test_each_flight_is_uneven_in_its_own_way(town: Town, tracer: Tracer) -> Non
 
 
 @pytest.mark.parametrize("flight", FLIGHTS)
-def test_test_views_fall_all_over_what_was_seen(flight: str, town: Town, tracer: Tracer) -> None:
+def test_test_views_fall_all_over_what_was_seen(flight: str, town: Town, tracer: RayTracer) -> None:
     options = options_of(flight, width=64, height=48)
-    training = fly(options, town)
-    places, views = survey(tracer, town.mesh, training, 60.0, np.random.default_rng(0))
-    held = held_out_cameras(tracer, town.terrain, training, places, 8, options, np.random.default_rng(3))
+    training = make_flight_cameras(options, town)
+    places, views = sample_visible_points(tracer, town.mesh, training, 60.0, np.random.default_rng(0))
+    held = make_test_cameras(tracer, town.terrain, training, places, 8, options, np.random.default_rng(3))
     by_tests = count_visibility(tracer, held, places) > 0
     every_eighth = count_visibility(tracer, training[::8][:8], places) > 0
     poor = views <= np.percentile(views, 25)
     assert by_tests[poor].mean() > every_eighth[poor].mean(), "poorly seen places are tested on less than by n-th"
-    shares = [(view_truth(tracer, camera, training)[1] > 0).mean() for camera in held]
+    shares = [(view_ground_truth(tracer, camera, training)[1] > 0).mean() for camera in held]
     assert np.mean(shares) > 0.85, "tests show what no training photograph saw"
 
 
 def test_overlap_sets_the_altitude(town: Town) -> None:
     heights = [
-        np.median([camera.position[2] for camera in fly(options_of("even", overlap=overlap), town)])
+        np.median([camera.position[2] for camera in make_flight_cameras(options_of("even", overlap=overlap), town)])
         for overlap in (0.6, 0.8)
     ]
     assert heights[1] / heights[0] == pytest.approx(2.0, rel=0.15)
     with pytest.raises(VdgsError, match=r"--overlap 0\.1 with"):
-        fly(options_of("even", overlap=0.1), town)
+        make_flight_cameras(options_of("even", overlap=0.1), town)
 
 
 def test_what_stands_in_between_hides() -> None:
@@ -113,17 +115,17 @@ def test_what_stands_in_between_hides() -> None:
     for ring in (ground, roof):
         builder.polygon(ring, Material.PLASTER, np.ones(3))
     mesh = builder.build()
-    camera = pinhole(np.eye(4), options_of("even", width=64, height=64))
+    camera = make_camera(np.eye(4), options_of("even", width=64, height=64))
     rigid = np.eye(4)
     rigid[:3, :3] = np.diag([1.0, -1.0, -1.0])
     rigid[:3, 3] = [0, 0, 40]
     above = replace(camera, camera_from_world=rigid)
     places = np.array([(0, 0, 0), (0, 0, 10), (12, 0, 0), (200, 0, 0)], float)
-    assert count_visibility(Tracer(mesh), [above, above], places).tolist() == [0, 2, 2, 0]
-    depth, views = view_truth(Tracer(mesh), above, [above])
+    assert count_visibility(RayTracer(mesh), [above, above], places).tolist() == [0, 2, 2, 0]
+    depth, views = view_ground_truth(RayTracer(mesh), above, [above])
     assert set(np.unique(np.round(depth))) == {30.0, 40.0}
     assert (views == 1).all()
-    spread = surface_places(mesh, 50.0, 4000, np.random.default_rng(0))
+    spread = sample_surface_points(mesh, 50.0, 4000, np.random.default_rng(0))
     assert np.mean(spread[:, 2] > 5) == pytest.approx(100 / 10100, abs=0.01)
 
 
@@ -138,7 +140,7 @@ def test_a_generated_capture_is_split_by_its_own_lists(capture: Path) -> None:
 
 
 def test_truth_is_read_back_at_the_size_in_use(capture: Path) -> None:
-    truth = load_truth(capture)
+    truth = load_ground_truth(capture)
     whole = load_capture(capture, CaptureOptions(up="z"))
     half = load_capture(capture, CaptureOptions(up="z", downscale=2))
     for view, small in zip(whole.test_views, half.test_views, strict=True):
@@ -151,7 +153,7 @@ def test_truth_is_read_back_at_the_size_in_use(capture: Path) -> None:
     with pytest.raises(VdgsError, match="test and validation"):
         truth.visibility_map(whole.train_views[0])
     with pytest.raises(VdgsError, match="no truth"):
-        load_truth(capture / "images")
+        load_ground_truth(capture / "images")
 
 
 def test_the_flight_says_how_uneven_it_is(capture: Path) -> None:
@@ -180,9 +182,9 @@ def test_depth_is_kept_to_a_few_thousandths_of_a_percent() -> None:
 
 
 def test_noise_has_the_size_that_was_asked_for(town: Town) -> None:
-    cameras = fly(options_of("even", images=120), town)
+    cameras = make_flight_cameras(options_of("even", images=120), town)
     shifts = []
-    for true, noisy in zip(cameras, disturbed(cameras, 0.8, 60.0, np.random.default_rng(0)), strict=True):
+    for true, noisy in zip(cameras, perturb_cameras(cameras, 0.8, 60.0, np.random.default_rng(0)), strict=True):
         below = true.position + true.forward * 60.0
         shifts.append((noisy.project(below[None])[0] - true.project(below[None])[0])[0])
     assert np.std(shifts) == pytest.approx(0.8, rel=0.2)
@@ -193,7 +195,7 @@ def test_noise_has_the_size_that_was_asked_for(town: Town) -> None:
 
 
 def test_outliers_lie_on_a_ray_that_saw_them(town: Town) -> None:
-    cameras = fly(options_of("even", images=3), town)
+    cameras = make_flight_cameras(options_of("even", images=3), town)
     rng = np.random.default_rng(0)
     places = rng.normal(0, 10, (50, 3))
     point, image = np.repeat(np.arange(50), 3), np.tile(np.arange(3), 50)
@@ -202,7 +204,7 @@ def test_outliers_lie_on_a_ray_that_saw_them(town: Town) -> None:
         observed_point=point, observed_image=image, observed_px=rng.normal(size=(150, 2)),
         visibility=np.ones((50, 3), bool), outliers=np.zeros(50, bool),
     )  # fmt: skip
-    wrong = with_outliers(cloud, cameras, 0.2, rng)
+    wrong = add_outliers(cloud, cameras, 0.2, rng)
     assert wrong.outliers.sum() == 10
     np.testing.assert_array_equal(wrong.points[~wrong.outliers], places[~wrong.outliers])
     true_ray, ray = (each[wrong.outliers] - cameras[0].position for each in (places, wrong.points))

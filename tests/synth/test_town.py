@@ -14,17 +14,17 @@ from PIL import Image
 pytest.importorskip("embreex")
 import pycolmap
 
-from vdgs.captures.ground_truth import load_truth
+from vdgs.captures.ground_truth import load_ground_truth
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import VdgsError
-from vdgs.evaluation.evaluate_run import true_depth
+from vdgs.evaluation.evaluate_run import make_true_depth
 from vdgs.geometry.camera import Camera
 from vdgs.synth import SynthOptions, generate
-from vdgs.synth.image_renderer import sample_offsets
-from vdgs.synth.streets import street_plan
+from vdgs.synth.image_renderer import pixel_sample_offsets
+from vdgs.synth.streets import make_street_plan
 from vdgs.synth.town import build_town
-from vdgs.synth.zones import Zone
+from vdgs.synth.zones import LandUse
 
 pytestmark = pytest.mark.xdist_group("synth")
 
@@ -99,7 +99,7 @@ def test_every_track_is_truly_seen(capture: Path, model: pycolmap.Reconstruction
 def test_depth_maps_agree_with_the_tracks(capture: Path, model: pycolmap.Reconstruction) -> None:
     with np.load(capture / "truth" / "points.npz", allow_pickle=False) as points:
         places = points["places"]
-    truth = load_truth(capture)
+    truth = load_ground_truth(capture)
     agreeing, total = 0, 0
     for camera, name, _, _, rows in observations(model):
         depth = truth.depth(name)
@@ -122,10 +122,10 @@ def test_true_depth_is_in_units_of_the_ground_frame(capture: Path) -> None:
     """Sparse points, which loading brings into the ground frame, lie at the true depth of the pixels that show them."""
     loaded = load_capture(capture, CaptureOptions())
     assert abs(loaded.ground.scale - 1.0) > 0.1, "or metres and units would be the same"
-    depth_of = true_depth(loaded, loaded.views)
+    depth_of = make_true_depth(loaded, loaded.views)
     assert depth_of is not None
     for view in loaded.test_views:
-        pixels, depths = view.camera.project(loaded.points[view.camera.sees(loaded.points)])
+        pixels, depths = view.camera.project(loaded.points[view.camera.in_frustum(loaded.points)])
         column, row = np.floor(pixels).astype(int).T
         error = np.abs(depths - depth_of(view)[row, column]) / depths
         assert np.median(error) < 0.01  # some are hidden in this view
@@ -135,8 +135,8 @@ def test_true_depth_is_in_units_of_the_ground_frame(capture: Path) -> None:
 
 def test_there_is_no_true_depth_of_what_was_not_written(capture: Path, tmp_path: Path) -> None:
     loaded = load_capture(capture, CaptureOptions())
-    assert true_depth(loaded, [replace(loaded.views[0], name="stranger.jpg")]) is None
-    assert true_depth(replace(loaded, root=tmp_path), loaded.views) is None
+    assert make_true_depth(loaded, [replace(loaded.views[0], name="stranger.jpg")]) is None
+    assert make_true_depth(replace(loaded, root=tmp_path), loaded.views) is None
 
 
 def test_the_same_options_give_the_same_bytes(capture: Path, tmp_path: Path) -> None:
@@ -211,7 +211,7 @@ def test_options_import_no_numerics() -> None:
 
 
 def test_plan_coordinates_invert() -> None:
-    plan = street_plan(np.random.default_rng(0), 200.0)
+    plan = make_street_plan(np.random.default_rng(0), 200.0)
     p, q = np.random.default_rng(1).uniform(-150, 150, (2, 200))
     back = plan.to_plan(*plan.to_world(p, q))
     np.testing.assert_allclose(back, (p, q), atol=1e-4)
@@ -221,8 +221,8 @@ def test_every_seed_gives_a_town_of_its_own() -> None:
     towns = [build_town(seed, 50.0) for seed in (0, 1)]
     assert towns[0].mesh.vertices.shape != towns[1].mesh.vertices.shape
     for town in towns:
-        square_metres = np.bincount(town.zones.cells.ravel(), minlength=len(Zone)) * town.zones.cell**2
-        assert (square_metres[[Zone.LAWN, Zone.BUILDING, Zone.SQUARE]] > 400).all()
+        square_metres = np.bincount(town.zones.cells.ravel(), minlength=len(LandUse)) * town.zones.cell**2
+        assert (square_metres[[LandUse.LAWN, LandUse.BUILDING, LandUse.SQUARE]] > 400).all()
         assert np.isfinite(town.mesh.vertices).all()
         assert np.isfinite(town.mesh.normals).all()
         assert town.mesh.faces.max() < len(town.mesh.vertices)
@@ -230,7 +230,7 @@ def test_every_seed_gives_a_town_of_its_own() -> None:
 
 @pytest.mark.parametrize("count", [1, 4, 7, 9])
 def test_samples_surround_the_pixel_centre(count: int) -> None:
-    offsets = sample_offsets(count)
+    offsets = pixel_sample_offsets(count)
     assert offsets.shape == (count, 2)
     assert np.abs(offsets).max() < 0.8
     assert np.abs(offsets.mean(0)).max() < 1e-12

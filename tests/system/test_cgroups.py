@@ -10,7 +10,7 @@ import pytest
 
 from vdgs.cli.doctor import system_checks as doctor
 from vdgs.system.memory import process_memory
-from vdgs.system.memory.cgroups import GroupLimit, group_limits, slurm_limit
+from vdgs.system.memory.cgroups import CgroupLimit, cgroup_limits, slurm_memory_limit
 
 GB = 10**9
 #: What version 1 says where there is no limit.
@@ -30,11 +30,11 @@ class Machine:
         self.mounts.append(f"31 23 0:28 {root} {mounted} rw,relatime shared:9 - {kind} {kind} {options}")
         return mounted
 
-    def limits(self, groups: str) -> list[GroupLimit]:
+    def limits(self, groups: str) -> list[CgroupLimit]:
         """As seen by a process whose /proc/self/cgroup has these lines."""
         (self.folder / "cgroup").write_text(groups)
         (self.folder / "mountinfo").write_text("\n".join(self.mounts) + "\n")
-        return group_limits(self.folder)
+        return cgroup_limits(self.folder)
 
 
 @pytest.fixture
@@ -56,7 +56,7 @@ def first(folder: Path, most: int, used: int, droppable: int = 0) -> None:
     (folder / "memory.stat").write_text(f"inactive_file 1\ntotal_inactive_file {droppable}\n")
 
 
-def least(limits: list[GroupLimit]) -> int:
+def least(limits: list[CgroupLimit]) -> int:
     return min(limit.free for limit in limits)
 
 
@@ -67,7 +67,7 @@ def test_a_job_of_slurm_is_limited_by_the_group_above_its_step(machine):
     second(job, 32 * GB, 3 * GB)
     second(job / "step_batch/user/task_0", "max", 3 * GB)
     own = "0::/system.slice/slurmstepd.scope/job_7/step_batch/user/task_0\n"
-    assert machine.limits(own) == [GroupLimit(32 * GB, 3 * GB)]
+    assert machine.limits(own) == [CgroupLimit(32 * GB, 3 * GB)]
     # The least room counts, not the least limit.
     second(job.parent, 40 * GB, 38 * GB)
     assert least(machine.limits(own)) == 2 * GB
@@ -98,7 +98,7 @@ def test_the_root_that_a_container_sees_limits_it(group, machine):
 def test_a_container_may_be_told_the_names_of_its_host(group, machine):
     """Version 1 without a namespace: the mount's root is the container's group."""
     first(machine.mount("memory", 1, root="/docker/4f"), 8 * GB, GB)
-    assert machine.limits(f"4:memory:{group}") == [GroupLimit(8 * GB, GB)]
+    assert machine.limits(f"4:memory:{group}") == [CgroupLimit(8 * GB, GB)]
 
 
 def test_names_that_mountinfo_escapes_are_found(machine):
@@ -107,11 +107,11 @@ def test_names_that_mountinfo_escapes_are_found(machine):
 
 
 def test_without_a_limit_or_control_groups_there_is_none(machine, tmp_path):
-    assert group_limits(tmp_path / "nowhere") == []
+    assert cgroup_limits(tmp_path / "nowhere") == []
     second(machine.mount("cgroup", 2) / "user.slice", "max", GB)
     assert machine.limits("0::/user.slice/session-2.scope") == []
     (tmp_path / "cgroup").write_text("what is this")
-    assert group_limits(tmp_path) == []
+    assert cgroup_limits(tmp_path) == []
 
 
 def test_a_group_that_uses_more_than_its_limit_leaves_nothing_and_needs_no_statistics(machine):
@@ -132,8 +132,8 @@ def test_a_group_that_uses_more_than_its_limit_leaves_nothing_and_needs_no_stati
     ],
 )
 def test_what_a_job_of_slurm_asked_for(asked, limit):
-    assert slurm_limit({"SLURM_JOB_ID": "7", **asked}) == limit
-    assert slurm_limit(asked) is None  # sbatch's own variables in a shell, not in a job
+    assert slurm_memory_limit({"SLURM_JOB_ID": "7", **asked}) == limit
+    assert slurm_memory_limit(asked) is None  # sbatch's own variables in a shell, not in a job
 
 
 @pytest.fixture
@@ -145,24 +145,24 @@ def large(monkeypatch) -> None:
 
 
 def test_a_process_may_take_what_its_group_leaves(large, monkeypatch):
-    for groups, free in (([], 500), ([GroupLimit(NONE, GB)], 500), ([GroupLimit(32 * GB, 2 * GB)], 30)):
-        monkeypatch.setattr(process_memory, "group_limits", lambda groups=groups: groups)
-        assert process_memory.available_bytes() == free * GB
+    for groups, free in (([], 500), ([CgroupLimit(NONE, GB)], 500), ([CgroupLimit(32 * GB, 2 * GB)], 30)):
+        monkeypatch.setattr(process_memory, "cgroup_limits", lambda groups=groups: groups)
+        assert process_memory.available_memory_bytes() == free * GB
 
 
 def test_a_job_that_no_group_limits_takes_what_it_asked_for(large, monkeypatch):
-    monkeypatch.setattr(process_memory, "group_limits", lambda: [GroupLimit(NONE, GB)])
+    monkeypatch.setattr(process_memory, "cgroup_limits", lambda: [CgroupLimit(NONE, GB)])
     monkeypatch.setenv("SLURM_JOB_ID", "7")
     monkeypatch.setenv("SLURM_MEM_PER_NODE", str(64 << 10))
-    taken = (64 << 30) - process_memory.available_bytes()
+    taken = (64 << 30) - process_memory.available_memory_bytes()
     assert 0 < taken < 20 * GB  # this process and its children
-    monkeypatch.setattr(process_memory, "group_limits", lambda: [GroupLimit(128 * GB, GB)])
-    assert process_memory.available_bytes() == 127 * GB
+    monkeypatch.setattr(process_memory, "cgroup_limits", lambda: [CgroupLimit(128 * GB, GB)])
+    assert process_memory.available_memory_bytes() == 127 * GB
 
 
 def test_the_doctor_sees_the_same_limit(large, monkeypatch):
-    monkeypatch.setattr(doctor, "group_limits", lambda: [GroupLimit(NONE, GB), GroupLimit(32 * GB, 2 * GB)])
+    monkeypatch.setattr(doctor, "cgroup_limits", lambda: [CgroupLimit(NONE, GB), CgroupLimit(32 * GB, 2 * GB)])
     (check,) = doctor._memory()
     assert check.value.startswith("30.0 GB free, limited to 32.0 GB by a control group")
-    monkeypatch.setattr(doctor, "group_limits", list)
+    monkeypatch.setattr(doctor, "cgroup_limits", list)
     assert doctor._memory()[0].value == "500.0 GB free of 512.0 GB"

@@ -10,22 +10,22 @@ import torch
 from safetensors import SafetensorError
 
 from vdgs.errors import VdgsError
-from vdgs.system.atomic_files import write_atomically
-from vdgs.system.checkpoints import SavedState, load_newest, remove_leftovers, save_state
+from vdgs.system.atomic_files import write_atomic
+from vdgs.system.checkpoints import Checkpoint, load_latest_checkpoint, remove_partial_files, save_checkpoint
 
 
-def state(iteration: int) -> SavedState:
+def state(iteration: int) -> Checkpoint:
     generator = torch.Generator().manual_seed(iteration)
-    return SavedState(iteration, {"loss": "nan"}, {"a": torch.randn(50, 3, generator=generator), "b": torch.arange(4)})
+    return Checkpoint(iteration, {"loss": "nan"}, {"a": torch.randn(50, 3, generator=generator), "b": torch.arange(4)})
 
 
-def same(left: SavedState, right: SavedState) -> bool:
+def same(left: Checkpoint, right: Checkpoint) -> bool:
     return left.iteration == right.iteration and all(torch.equal(left.tensors[k], right.tensors[k]) for k in "ab")
 
 
 def test_what_is_saved_is_loaded(tmp_path):
-    save_state(tmp_path, state(7))
-    loaded, complaints = load_newest(tmp_path)
+    save_checkpoint(tmp_path, state(7))
+    loaded, complaints = load_latest_checkpoint(tmp_path)
     assert loaded is not None
     assert same(loaded, state(7))
     assert complaints == []
@@ -33,7 +33,7 @@ def test_what_is_saved_is_loaded(tmp_path):
 
 def test_the_two_newest_are_kept(tmp_path):
     for iteration in (1, 2, 3, 4):
-        save_state(tmp_path, state(iteration))
+        save_checkpoint(tmp_path, state(iteration))
     assert sorted(p.name for p in tmp_path.iterdir()) == [
         f"{i:08d}.{e}" for i in (3, 4) for e in ("json", "safetensors")
     ]
@@ -41,8 +41,8 @@ def test_the_two_newest_are_kept(tmp_path):
 
 @pytest.mark.parametrize("damage", ["truncate", "flip", "delete", "json"])
 def test_a_damaged_state_falls_back_to_the_one_before(tmp_path, damage):
-    save_state(tmp_path, state(1))
-    save_state(tmp_path, state(2))
+    save_checkpoint(tmp_path, state(1))
+    save_checkpoint(tmp_path, state(2))
     newest = tmp_path / "00000002.safetensors"
     data = bytearray(newest.read_bytes())
     if damage == "truncate":
@@ -54,7 +54,7 @@ def test_a_damaged_state_falls_back_to_the_one_before(tmp_path, damage):
         newest.unlink()
     else:
         newest.with_suffix(".json").write_text("{")
-    loaded, complaints = load_newest(tmp_path)
+    loaded, complaints = load_latest_checkpoint(tmp_path)
     assert loaded is not None
     assert same(loaded, state(1))
     assert len(complaints) == 1
@@ -62,33 +62,33 @@ def test_a_damaged_state_falls_back_to_the_one_before(tmp_path, damage):
 
 
 def test_nothing_whole_is_said(tmp_path):
-    save_state(tmp_path, state(1))
+    save_checkpoint(tmp_path, state(1))
     (tmp_path / "00000001.safetensors").write_bytes(b"")
-    loaded, complaints = load_newest(tmp_path)
+    loaded, complaints = load_latest_checkpoint(tmp_path)
     assert loaded is None
     assert len(complaints) == 1
 
 
 def test_leftovers_of_a_cut_off_write_are_removed(tmp_path):
-    save_state(tmp_path, state(1))
+    save_checkpoint(tmp_path, state(1))
     (tmp_path / ".00000002.safetensors.99.tmp").write_bytes(b"half")
     (tmp_path / "00000003.safetensors").write_bytes(b"no json yet")
-    remove_leftovers(tmp_path)
+    remove_partial_files(tmp_path)
     assert sorted(p.suffix for p in tmp_path.iterdir()) == [".json", ".safetensors"]
     assert json.loads((tmp_path / "00000001.json").read_text())["iteration"] == 1
 
 
 def test_a_refusing_disk_is_reported_and_loses_nothing(tmp_path):
-    save_state(tmp_path, state(1))
+    save_checkpoint(tmp_path, state(1))
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (300, before[1]))  # writes beyond fail, as on a full disk
     try:
         with pytest.raises(VdgsError, match=r"00000002\.safetensors: cannot be written.*continues"):
-            save_state(tmp_path, state(2))
+            save_checkpoint(tmp_path, state(2))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["00000001.json", "00000001.safetensors"]
-    loaded, _ = load_newest(tmp_path)
+    loaded, _ = load_latest_checkpoint(tmp_path)
     assert loaded is not None
     assert same(loaded, state(1))
 
@@ -109,4 +109,4 @@ def test_the_remedy_fits_what_the_disk_refused(tmp_path, error, advice):
         raise error
 
     with pytest.raises(VdgsError, match=rf"a\.json: cannot be written .*\. {advice}"):
-        write_atomically(tmp_path / "a.json", write)
+        write_atomic(tmp_path / "a.json", write)

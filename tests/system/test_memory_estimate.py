@@ -26,24 +26,24 @@ from vdgs.config.method import CompensationConfig
 from vdgs.config.presets import PRESETS
 from vdgs.geometry.camera import Camera
 from vdgs.system.memory.memory_estimate import (
-    COMPENSATED_GROWTH,
-    GROWTH,
-    Need,
-    advice,
+    MAX_COMPENSATED_GROWTH,
+    MAX_GROWTH,
+    TrainingWorkload,
+    block_workload,
     bytes_per_anchor,
-    describe,
-    estimate,
-    largest_picture,
-    most_growth,
-    need_of_block,
+    describe_memory,
+    estimate_memory,
+    max_growth_factor,
+    max_image_pixels,
+    memory_advice,
 )
-from vdgs.system.memory.process_memory import available_bytes, is_out_of_memory
+from vdgs.system.memory.process_memory import available_memory_bytes, is_out_of_memory
 from vdgs.training.session import memory_advice
 from vdgs.training.session import trainer as watching
-from vdgs.training.session.memory_advice import announce
+from vdgs.training.session.memory_advice import print_memory_estimate
 
 needs = st.builds(
-    Need,
+    TrainingWorkload,
     anchors=st.integers(1, 10**7),
     max_anchors=st.integers(0, 10**7),
     offsets=st.integers(1, 20),
@@ -64,11 +64,14 @@ def test_an_anchor_takes_what_was_measured():
 
 @given(needs)
 def test_what_is_more_takes_more(need):
-    found = estimate(need)
+    found = estimate_memory(need)
     assert found.start <= found.total
     for name in ("anchors", "offsets", "pixels", "images_bytes", "surroundings"):
-        assert estimate(replace(need, **{name: 2 * getattr(need, name)})).total >= found.total
-    assert estimate(replace(need, max_anchors=need.anchors)).total == estimate(replace(need, max_anchors=1)).total
+        assert estimate_memory(replace(need, **{name: 2 * getattr(need, name)})).total >= found.total
+    assert (
+        estimate_memory(replace(need, max_anchors=need.anchors)).total
+        == estimate_memory(replace(need, max_anchors=1)).total
+    )
 
 
 def test_the_picture_of_a_block_counts_in_the_largest_size_that_it_trains_with():
@@ -76,10 +79,10 @@ def test_the_picture_of_a_block_counts_in_the_largest_size_that_it_trains_with()
         Camera(camera_from_world=np.eye(4), fx=1, fy=1, cx=0, cy=0, width=width, height=height)
         for width, height in ((4000, 3000), (5472, 3648), (3648, 5472))
     ]
-    assert largest_picture(cameras, ((0.0, 4), (0.1, 2), (0.4, 1))) == 5472 * 3648
-    assert largest_picture(cameras, ((0.0, 4), (0.5, 2))) == 2736 * 1824
-    paper, laptop = (need_of_block(PRESETS[name], 50_000, 400_000, 5472 * 3648) for name in ("paper", "laptop"))
-    assert estimate(laptop).picture == 150 * 5472 * 3648
+    assert max_image_pixels(cameras, ((0.0, 4), (0.1, 2), (0.4, 1))) == 5472 * 3648
+    assert max_image_pixels(cameras, ((0.0, 4), (0.5, 2))) == 2736 * 1824
+    paper, laptop = (block_workload(PRESETS[name], 50_000, 400_000, 5472 * 3648) for name in ("paper", "laptop"))
+    assert estimate_memory(laptop).picture == 150 * 5472 * 3648
     assert (laptop.averaged, paper.averaged) == (True, False)
     assert (laptop.grown, paper.grown) == (150_000, 750_000)
     assert laptop.surroundings == 350_000
@@ -87,15 +90,15 @@ def test_the_picture_of_a_block_counts_in_the_largest_size_that_it_trains_with()
 
 def test_growth_below_a_fixed_threshold_is_expected_to_be_large():
     """On a real capture nearly all anchors are seen by fewer than a fifth of the cameras."""
-    growths = {name: most_growth(preset.block.compensation) for name, preset in PRESETS.items()}
-    assert growths == {"paper": COMPENSATED_GROWTH, "literal": COMPENSATED_GROWTH, "laptop": GROWTH}
+    growths = {name: max_growth_factor(preset.block.compensation) for name, preset in PRESETS.items()}
+    assert growths == {"paper": MAX_COMPENSATED_GROWTH, "literal": MAX_COMPENSATED_GROWTH, "laptop": MAX_GROWTH}
     lowest = CompensationConfig(t_low_quantile=0.25)
-    assert most_growth(lowest) == most_growth(PRESETS["paper"].training.compensation) == GROWTH
+    assert max_growth_factor(lowest) == max_growth_factor(PRESETS["paper"].training.compensation) == MAX_GROWTH
 
 
 @given(needs)
 def test_a_mean_of_models_takes_one_more_model(need):
-    plain, averaged = (estimate(replace(need, averaged=each)) for each in (False, True))
+    plain, averaged = (estimate_memory(replace(need, averaged=each)) for each in (False, True))
     assert averaged.start == plain.start
     more = averaged.total - plain.total
     assert more == pytest.approx(4 * (32 + 6 + 3 * need.offsets) * need.grown, abs=1, rel=1e-9)
@@ -103,43 +106,47 @@ def test_a_mean_of_models_takes_one_more_model(need):
 
 @pytest.mark.parametrize(("kind", "option"), [("coarse", "--average 0"), ("block", "--block.average 0")])
 def test_the_mean_may_be_given_up(kind, option):
-    need = Need(anchors=1_000_000, max_anchors=0, offsets=10, seen=0.4, pixels=10**6, images_bytes=10**8, averaged=True)
-    (found,) = [each for each in advice(need, kind, 10**9) if option in each.setting]
-    assert found.saves == estimate(need).total - estimate(replace(need, averaged=False)).total
-    assert not [each for each in advice(replace(need, averaged=False), kind, 10**9) if option in each.setting]
+    need = TrainingWorkload(
+        anchors=1_000_000, max_anchors=0, offsets=10, seen=0.4, pixels=10**6, images_bytes=10**8, averaged=True
+    )
+    (found,) = [each for each in memory_advice(need, kind, 10**9) if option in each.setting]
+    assert found.saved_bytes == estimate_memory(need).total - estimate_memory(replace(need, averaged=False)).total
+    assert not [each for each in memory_advice(replace(need, averaged=False), kind, 10**9) if option in each.setting]
 
 
 @pytest.mark.parametrize("kind", ["coarse", "block"])
 @given(need=needs, share=st.floats(0.01, 0.9))
 def test_advice_is_worth_its_words(kind, need, share):
-    whole = estimate(need).total
-    found = advice(need, kind, int(share * whole))
-    assert [each.saves for each in found] == sorted((each.saves for each in found), reverse=True)
+    whole = estimate_memory(need).total
+    found = memory_advice(need, kind, int(share * whole))
+    assert [each.saved_bytes for each in found] == sorted((each.saved_bytes for each in found), reverse=True)
     for each in found:
-        assert whole / 100 < each.saves <= whole
+        assert whole / 100 < each.saved_bytes <= whole
         assert "--" in each.setting
 
 
 @pytest.mark.parametrize("averaged", [False, True])
 def test_the_limit_of_anchors_makes_it_fit(averaged):
-    need = Need(
+    need = TrainingWorkload(
         anchors=1_000_000, max_anchors=0, offsets=10, seen=0.4, pixels=10**6, images_bytes=10**8, averaged=averaged
     )
     missing = 10**9
-    (limit,) = [each for each in advice(need, "coarse", missing) if "max-anchors" in each.setting]
+    (limit,) = [each for each in memory_advice(need, "coarse", missing) if "max-anchors" in each.setting]
     given = int(limit.setting.split()[1])
     assert need.anchors < given < need.grown
-    saved = estimate(need).total - estimate(replace(need, max_anchors=given)).total
-    assert missing <= saved == limit.saves <= 1.01 * missing
+    saved = estimate_memory(need).total - estimate_memory(replace(need, max_anchors=given)).total
+    assert missing <= saved == limit.saved_bytes <= 1.01 * missing
     # Growth that would have to be undone is not promised.
-    (least,) = [each for each in advice(need, "coarse", 10**12) if "max-anchors" in each.setting]
+    (least,) = [each for each in memory_advice(need, "coarse", 10**12) if "max-anchors" in each.setting]
     assert least.setting.startswith("--growth.max-anchors 1000000 ")
 
 
 def test_the_line_for_people_says_what_takes_it_and_what_there_is():
-    line = describe(
-        estimate(
-            Need(anchors=100_000, max_anchors=200_000, offsets=10, seen=0.5, pixels=10**6, images_bytes=2 * 10**8)
+    line = describe_memory(
+        estimate_memory(
+            TrainingWorkload(
+                anchors=100_000, max_anchors=200_000, offsets=10, seen=0.5, pixels=10**6, images_bytes=2 * 10**8
+            )
         ),
         3 * 10**9,
     )
@@ -155,17 +162,19 @@ def test_the_line_for_people_says_what_takes_it_and_what_there_is():
     ],
 )
 def test_a_warning_comes_before_training_where_it_will_not_fit(kind, said, monkeypatch, capsys):
-    need = Need(anchors=1_000_000, max_anchors=0, offsets=10, seen=0.4, pixels=2 * 10**7, images_bytes=10**9)
+    need = TrainingWorkload(
+        anchors=1_000_000, max_anchors=0, offsets=10, seen=0.4, pixels=2 * 10**7, images_bytes=10**9
+    )
     taken = psutil.Process().memory_info().rss  # it grows with the tests that ran before
-    monkeypatch.setattr(memory_advice, "available_bytes", lambda: int(5.4e9) - taken)
-    announce(need, kind, Console(width=2000))
+    monkeypatch.setattr(memory_advice, "available_memory_bytes", lambda: int(5.4e9) - taken)
+    print_memory_estimate(need, kind, Console(width=2000))
     line, warning, *_ = capsys.readouterr().out.splitlines()
     assert line.startswith("memory by estimate")
     assert warning.startswith("warning it may run out of memory: ")
     assert ("--growth.max-anchors 1000000" in warning) == (kind == "coarse")
     assert warning.endswith(said)
-    monkeypatch.setattr(memory_advice, "available_bytes", lambda: 10**11)
-    announce(need, kind, Console(width=2000))
+    monkeypatch.setattr(memory_advice, "available_memory_bytes", lambda: 10**11)
+    print_memory_estimate(need, kind, Console(width=2000))
     assert "warning" not in capsys.readouterr().out
 
 
@@ -197,7 +206,7 @@ def test_a_limit_of_the_process_counts():
         "resource.setrlimit(resource.RLIMIT_AS, (vms + 10**8,) * 2); print(available_bytes())"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert 0 < int(done.stdout) <= 10**8 < available_bytes()
+    assert 0 < int(done.stdout) <= 10**8 < available_memory_bytes()
 
 
 # ------------------------------------------------------------------------------------------ for real

@@ -7,7 +7,7 @@ from contextlib import suppress
 import pytest
 
 from vdgs.errors import Interrupted
-from vdgs.system.stop_signals import stop_if_asked, stop_requests
+from vdgs.system.stop_signals import catch_stop_signals, check_stop_requested
 
 NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -24,7 +24,7 @@ def handlers_as_before():
 
 
 def test_requests_are_noted_in_their_order():
-    with stop_requests(hangup=True) as asked:
+    with catch_stop_signals(hangup=True) as asked:
         assert not asked
         for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM, signal.SIGINT):
             signal.raise_signal(number)
@@ -33,7 +33,7 @@ def test_requests_are_noted_in_their_order():
 
 @pytest.mark.parametrize("first", [signal.SIGINT, signal.SIGTERM])
 def test_the_second_ctrl_c_interrupts_where_asked_for(first):
-    with stop_requests(second_interrupts=True) as asked:
+    with catch_stop_signals(second_interrupts=True) as asked:
         signal.raise_signal(first)
         signal.raise_signal(signal.SIGTERM)  # a scheduler that asks twice is no impatient person
         with pytest.raises(KeyboardInterrupt):
@@ -44,41 +44,41 @@ def test_the_second_ctrl_c_interrupts_where_asked_for(first):
 def test_hangup_stays_ignored_under_nohup_and_is_left_alone_where_not_asked_for():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with stop_requests(hangup=True) as asked:
+        with catch_stop_signals(hangup=True) as asked:
             signal.raise_signal(signal.SIGHUP)
             assert not asked
     finally:
         signal.signal(signal.SIGHUP, before)
-    with stop_requests():
+    with catch_stop_signals():
         assert signal.getsignal(signal.SIGHUP) == before
 
 
 def test_a_request_that_the_inner_work_had_no_time_for_stops_the_outer():
     """Ctrl-C with the last step of a stage: the stage is complete, what comes after it must not begin."""
-    with stop_requests(interrupts=True) as outer:
-        with stop_requests(second_interrupts=True) as inner:
+    with catch_stop_signals(interrupts=True) as outer:
+        with catch_stop_signals(second_interrupts=True) as inner:
             signal.raise_signal(signal.SIGINT)
         assert list(outer) == list(inner) == [signal.SIGINT]
         with pytest.raises(Interrupted):
-            stop_if_asked()
-    stop_if_asked()  # another command in this process was not asked
+            check_stop_requested()
+    check_stop_requested()  # another command in this process was not asked
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupt_that_was_swallowed_is_not_forgotten(number):
-    with stop_requests(interrupts=True):
-        stop_if_asked()
+    with catch_stop_signals(interrupts=True):
+        check_stop_requested()
         with suppress(KeyboardInterrupt):  # as in a callback of a library
             signal.raise_signal(number)
         with pytest.raises(Interrupted):
-            stop_if_asked()
+            check_stop_requested()
 
 
 def test_outside_the_main_thread_nothing_is_noted():
     seen = []
 
     def work() -> None:
-        with stop_requests(hangup=True) as asked:
+        with catch_stop_signals(hangup=True) as asked:
             seen.append((list(asked), signal.getsignal(signal.SIGINT)))
 
     before = signal.getsignal(signal.SIGINT)

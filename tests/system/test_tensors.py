@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from vdgs.system.tensors import DTYPES, checksum, read_whole, size_and_checksum, write_tensors
+from vdgs.system.tensors import DTYPES, file_size_and_crc32, read_tensors_unchecked, tensors_crc32, write_tensors
 
 SHAPES = st.lists(st.integers(0, 4), max_size=3)
 
@@ -33,7 +33,7 @@ def test_the_bytes_are_those_of_the_library(tmp_path_factory, kinds, note):
     write_tensors(folder / "ours", tensors, note)
     save_file(tensors, folder / "theirs", metadata=note)
     assert (folder / "ours").read_bytes() == (folder / "theirs").read_bytes()
-    ours = read_whole(folder / "ours")
+    ours = read_tensors_unchecked(folder / "ours")
     assert ours.keys() == tensors.keys()
     for name, expected in tensors.items():
         assert ours[name].dtype == expected.dtype
@@ -65,16 +65,16 @@ def test_a_damaged_file_is_an_error(tmp_path, spoil):
     changed = {"cut": data[:-4], "shape": data.replace(b"[6]", b"[7]"), "header": data.replace(b"{", b"!", 1)}
     path.write_bytes(changed[spoil])
     with pytest.raises(ValueError, match=r"a has not|Expecting value"):
-        read_whole(path)
+        read_tensors_unchecked(path)
 
 
 def test_checksums_are_crc_32(tmp_path):
     tensors = {"b": torch.arange(5.0), "a": torch.arange(12).reshape(3, 4).t()}
     path = tmp_path / "t"
     write_tensors(path, tensors)
-    assert size_and_checksum(path) == (path.stat().st_size, zlib.crc32(path.read_bytes()))
+    assert file_size_and_crc32(path) == (path.stat().st_size, zlib.crc32(path.read_bytes()))
     raw = tensors["a"].contiguous().numpy().tobytes() + tensors["b"].numpy().tobytes()
-    assert checksum(tensors) == zlib.crc32(raw)
+    assert tensors_crc32(tensors) == zlib.crc32(raw)
 
 
 TRANSIENT = """

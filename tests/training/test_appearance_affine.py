@@ -17,17 +17,17 @@ from support.checkerboard import Photographs
 from support.hand_made_models import capture_at
 from support.small_training import CONFIG, bits, run, stage, start
 from vdgs.captures.capture import Capture, View
-from vdgs.captures.capture_order import places_in_flights
-from vdgs.evaluation.auto_exposure import Metering, learnt, metered
-from vdgs.evaluation.opacity_coverage import Rendered
-from vdgs.evaluation.view_exposures import Exposures, as_photographed, exposures_of
+from vdgs.captures.capture_order import flight_positions
+from vdgs.evaluation.auto_exposure import AutoExposure, fit_auto_exposure, log_luminance
+from vdgs.evaluation.opacity_coverage import RenderedImage
+from vdgs.evaluation.view_exposures import ViewExposures, apply_exposure, make_exposures
 from vdgs.geometry.camera import Camera
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.model.exposure import REACH, exposed, exposure_of, interpolated, neutral_exposures
+from vdgs.model.exposure import MAX_FLIGHT_GAP, apply_exposure, exposure_matrix, interpolate_exposure, zero_exposures
 from vdgs.model.renderer import render
-from vdgs.training import Stage, from_saved, start_state, to_saved, train_step
+from vdgs.training import TrainingProblem, from_checkpoint, initial_state, to_checkpoint, train_step
 
 pytestmark = pytest.mark.xdist_group("training")
 
@@ -45,13 +45,13 @@ class Unequal(Photographs):
 @given(seed=st.integers(0, 1000), images=st.integers(1, 12))
 def test_over_all_photographs_the_mean_is_neutral(seed, images):
     departures = torch.randn(images, 3, 4, generator=torch.Generator().manual_seed(seed)).double()
-    mean = torch.stack([exposure_of(departures, image) for image in range(images)]).mean(0)
+    mean = torch.stack([exposure_matrix(departures, image) for image in range(images)]).mean(0)
     assert torch.allclose(mean, torch.eye(3, 4).double(), atol=1e-12)
 
 
 def test_neutral_exposures_change_no_colour():
     picture = torch.rand(5, 7, 3)
-    assert torch.equal(exposed(picture, exposure_of(neutral_exposures(4), 2)), picture)
+    assert torch.equal(apply_exposure(picture, exposure_matrix(zero_exposures(4), 2)), picture)
 
 
 def test_an_exposure_maps_colours():
@@ -59,7 +59,7 @@ def test_an_exposure_maps_colours():
     model = torch.tensor([[2.0, 0.0, 0.0, 0.1], [0.0, 1.0, 0.0, 0.0], [0.0, 0.5, 0.5, -0.1]])
     red, green, blue = picture.unbind(-1)
     expected = torch.stack([2 * red + 0.1, green, 0.5 * green + 0.5 * blue - 0.1], dim=-1)
-    assert torch.allclose(exposed(picture, model), expected, atol=1e-6)
+    assert torch.allclose(apply_exposure(picture, model), expected, atol=1e-6)
 
 
 NEUTRAL = torch.eye(3, 4).double()
@@ -75,42 +75,42 @@ def test_what_drifts_evenly_along_a_flight_is_known_between_its_photographs(plac
     start, drift = random_departures(2)
     departures = torch.stack([start + number * drift for number in sorted(places)])
     nearest = min(places, key=lambda number: abs(number - place))
-    found = interpolated(departures, images, place)
-    if abs(nearest - place) > REACH:
+    found = interpolate_exposure(departures, images, place)
+    if abs(nearest - place) > MAX_FLIGHT_GAP:
         assert torch.equal(found, NEUTRAL)
     elif min(places) <= place <= max(places):
         assert torch.allclose(found, NEUTRAL + start + place * drift - departures.mean(0), atol=1e-12)
     else:
-        assert torch.equal(found, exposure_of(departures, images[nearest]))
+        assert torch.equal(found, exposure_matrix(departures, images[nearest]))
 
 
 def test_a_photograph_with_an_exposure_has_its_own_and_one_far_from_all_none():
     departures = random_departures(3)
     images = {2: 0, 3: 2, 30: 1}
     for place, image in images.items():
-        assert torch.equal(interpolated(departures, images, place), exposure_of(departures, image))
-    assert torch.equal(interpolated(departures, images, 38), exposure_of(departures, 1))
-    for far in (39, 3 + REACH + 1, 30 - REACH - 1):
-        assert torch.equal(interpolated(departures, images, far), NEUTRAL)
-    assert torch.equal(interpolated(departures, {}, 2), NEUTRAL)
+        assert torch.equal(interpolate_exposure(departures, images, place), exposure_matrix(departures, image))
+    assert torch.equal(interpolate_exposure(departures, images, 38), exposure_matrix(departures, 1))
+    for far in (39, 3 + MAX_FLIGHT_GAP + 1, 30 - MAX_FLIGHT_GAP - 1):
+        assert torch.equal(interpolate_exposure(departures, images, far), NEUTRAL)
+    assert torch.equal(interpolate_exposure(departures, {}, 2), NEUTRAL)
 
 
 def test_where_all_photographs_depart_alike_any_is_neutral():
     departures = random_departures(1).expand(4, 3, 4)
     for place in range(8):
-        assert torch.allclose(interpolated(departures, {1: 3, 2: 0, 6: 1}, place), NEUTRAL, atol=1e-12)
+        assert torch.allclose(interpolate_exposure(departures, {1: 3, 2: 0, 6: 1}, place), NEUTRAL, atol=1e-12)
 
 
 def test_photographs_of_a_folder_follow_each_other_as_their_numbers_do():
     names = ["b/DJI_10.JPG", "b/DJI_2.JPG", "a/7.jpg", "DJI_3.JPG", "b/DJI_1_2.JPG", "b/c/DJI_4.JPG", "b/DJI_1.JPG",
              "b/DJI_02.JPG", "b/x.JPG"]  # fmt: skip
-    found = places_in_flights(names)
+    found = flight_positions(names)
     assert list(found) != names
     assert found.keys() == {*names}
     assert sorted((name for name in names if found[name].flight == "b"), key=lambda name: found[name].number) == [
         "b/DJI_1.JPG", "b/DJI_1_2.JPG", "b/DJI_02.JPG", "b/DJI_2.JPG", "b/DJI_10.JPG", "b/x.JPG"
     ]  # fmt: skip
-    assert places_in_flights(["train/2.jpg", "val/3.jpg", "train/10.jpg"])["val/3.jpg"] == ("", 1)
+    assert flight_positions(["train/2.jpg", "val/3.jpg", "train/10.jpg"])["val/3.jpg"] == ("", 1)
     assert [found[name].number for name in ("a/7.jpg", "DJI_3.JPG", "b/c/DJI_4.JPG")] == [0, 0, 0]
     assert len({place.flight for place in found.values()}) == 4
 
@@ -136,14 +136,14 @@ def nothing() -> Anchors:
     return Anchors(torch.zeros(0, 3), torch.zeros(0, 32), torch.zeros(0, 2, 3), torch.zeros(0, 6))
 
 
-class Lit(Exposures):
+class Lit(ViewExposures):
     """Exposures over a place whose views are as light as they say."""
 
     def __init__(self, capture: Capture, departures: torch.Tensor, light: Callable[[View], float]):
         plain = Decoder.initial(2, False, 0, 0, torch.Generator())
         decoder = replace(plain, exposure=departures.float())
         super().__init__(
-            AnchorModel(anchors=nothing(), decoder=decoder, voxel=0.4, background=(0.0, 0.0, 0.0)), capture
+            AnchorModel(anchors=nothing(), decoder=decoder, voxel_size=0.4, background=(0.0, 0.0, 0.0)), capture
         )
         self._light = light
 
@@ -160,7 +160,7 @@ def test_test_views_have_the_exposure_between_their_neighbours_of_the_same_fligh
     views = {view.name: view for view in capture.views}
 
     def own(name: str) -> torch.Tensor:
-        return exposure_of(departures, names.index(name))
+        return exposure_matrix(departures, names.index(name))
 
     for name in names:
         assert torch.equal(found(views[name]), own(name))
@@ -186,7 +186,7 @@ def test_a_camera_that_meters_exposes_what_is_brighter_less(slope):
     fitted = torch.tensor([gain(view) for view in views])[:, None, None] * torch.eye(3, 4)
     fitted /= fitted.mean(0)[0, 0]  # what all have in common is the scene's
     found = Lit(capture, fitted - torch.eye(3, 4), lambda view: light[view.name])
-    assert found.metering.slope == pytest.approx(slope, abs=0.02)
+    assert found.auto_exposure.slope == pytest.approx(slope, abs=0.02)
     for view in capture.test_views:
         wanted = gain(view) / np.mean([gain(other) for other in views])
         assert found(view)[1, 1] == pytest.approx(wanted, rel=0.01 if slope else 0.001)
@@ -195,36 +195,36 @@ def test_a_camera_that_meters_exposes_what_is_brighter_less(slope):
 
 def test_a_model_without_exposures_has_none():
     plain = Decoder.initial(2, False, 0, 0, torch.Generator())
-    model = AnchorModel(anchors=nothing(), decoder=plain, voxel=0.4, background=(0.0, 0.0, 0.0))
-    assert exposures_of(model, flown(a="tx")) is None
+    model = AnchorModel(anchors=nothing(), decoder=plain, voxel_size=0.4, background=(0.0, 0.0, 0.0))
+    assert make_exposures(model, flown(a="tx")) is None
 
 
 def test_the_middle_of_a_picture_is_metered_whatever_its_size():
     picture = np.full((48, 64, 3), 0.2)
     picture[16:32, 20:44] = 0.6
     whole = np.log(picture.mean())
-    assert metered(picture) > whole + 0.2
-    assert metered(np.repeat(np.repeat(picture, 2, 0), 2, 1)) == pytest.approx(metered(picture), abs=0.01)
-    assert metered(0.5 * picture) == pytest.approx(metered(picture) - np.log(2), abs=0.01)
-    assert np.isfinite(metered(np.zeros((4, 4, 3))))
+    assert log_luminance(picture) > whole + 0.2
+    assert log_luminance(np.repeat(np.repeat(picture, 2, 0), 2, 1)) == pytest.approx(log_luminance(picture), abs=0.01)
+    assert log_luminance(0.5 * picture) == pytest.approx(log_luminance(picture) - np.log(2), abs=0.01)
+    assert np.isfinite(log_luminance(np.zeros((4, 4, 3))))
 
 
 @given(st.floats(-1.5, 1.0), st.integers(0, 1000))
 def test_the_law_of_metering_is_learnt_or_left(slope, seed):
     rng = np.random.default_rng(seed)
     brighter = rng.normal(0, 0.2, 40)
-    assert learnt(brighter, slope * brighter).slope == pytest.approx(np.clip(slope, -1, 0), abs=1e-6)
-    assert learnt(brighter, slope * brighter).gain(0.0) == 1.0
-    alone, metered_too = learnt(brighter, slope * brighter).unforetold
+    assert fit_auto_exposure(brighter, slope * brighter).slope == pytest.approx(np.clip(slope, -1, 0), abs=1e-6)
+    assert fit_auto_exposure(brighter, slope * brighter).gain(0.0) == 1.0
+    alone, metered_too = fit_auto_exposure(brighter, slope * brighter).residual_error
     assert alone == pytest.approx(abs(slope) * np.sqrt(np.mean(brighter**2)))
     beyond = abs(slope - np.clip(slope, -1, 0))
     assert metered_too == pytest.approx(beyond * np.sqrt(np.mean(brighter**2)), abs=1e-9)
     noise = rng.normal(0, 0.2, 40)
-    unrelated = learnt(brighter, noise - brighter * (noise @ brighter) / (brighter @ brighter))
+    unrelated = fit_auto_exposure(brighter, noise - brighter * (noise @ brighter) / (brighter @ brighter))
     assert unrelated.slope == 0.0
-    assert learnt(brighter[:7], -brighter[:7]).slope == 0.0
-    assert learnt(np.zeros(40), noise).slope == 0.0
-    steep = Metering(-0.5, 0.3)
+    assert fit_auto_exposure(brighter[:7], -brighter[:7]).slope == 0.0
+    assert fit_auto_exposure(np.zeros(40), noise).slope == 0.0
+    steep = AutoExposure(-0.5, 0.3)
     assert steep.gain(5.0) == steep.gain(0.3) < 1 < steep.gain(-0.3)
 
 
@@ -232,19 +232,19 @@ def test_the_law_of_metering_is_learnt_or_left(slope, seed):
 def test_a_picture_is_exposed_as_in_training_and_neutral_leaves_every_bit(seed):
     generator = torch.Generator().manual_seed(seed)
     picture, model = torch.rand(5, 7, 3, generator=generator), NEUTRAL + random_departures(1, seed)[0]
-    found = as_photographed(picture.numpy(), model)
+    found = apply_exposure(picture.numpy(), model)
     assert found.dtype == np.float32
-    np.testing.assert_allclose(found, exposed(picture.double(), model).numpy(), atol=1e-6)
-    assert np.array_equal(as_photographed(picture.numpy(), NEUTRAL), picture.numpy())
+    np.testing.assert_allclose(found, apply_exposure(picture.double(), model).numpy(), atol=1e-6)
+    assert np.array_equal(apply_exposure(picture.numpy(), NEUTRAL), picture.numpy())
 
 
 def test_before_another_background_the_exposed_scene_stays_as_it_is():
     """Exposed, then put before black: as if its own colours were exposed and black stood behind them."""
     scene, alpha = torch.rand(5, 7, 3).numpy(), torch.rand(5, 7).numpy()
     behind, model = (0.2, 0.4, 0.6), NEUTRAL + 0.5 * random_departures(1)[0]
-    rendered = Rendered(alpha[..., None] * scene + (1 - alpha[..., None]) * np.float32(behind), alpha, behind)
+    rendered = RenderedImage(alpha[..., None] * scene + (1 - alpha[..., None]) * np.float32(behind), alpha, behind)
     black = rendered.exposed(model).before((0.0, 0.0, 0.0))
-    expected = (alpha[..., None] * as_photographed(scene, model)).clip(0, 1) * 255
+    expected = (alpha[..., None] * apply_exposure(scene, model)).clip(0, 1) * 255
     assert np.abs(black - expected).max() < 0.501
     assert replace(rendered, background=None).exposed(model).background is None
 
@@ -252,9 +252,9 @@ def test_before_another_background_the_exposed_scene_stays_as_it_is():
 def fitted(config=CONFIG, kind: str = "coarse") -> tuple:
     """A state whose photographs have exposures, and its stage."""
     plain = start(config)
-    decoder = replace(plain.decoder, exposure=neutral_exposures(8))
-    given_stage: Stage = replace(stage(config), images=Unequal(), kind=kind)
-    return start_state(plain.anchors, decoder, given_stage), given_stage
+    decoder = replace(plain.decoder, exposure=zero_exposures(8))
+    given_stage: TrainingProblem = replace(stage(config), images=Unequal(), kind=kind)
+    return initial_state(plain.anchors, decoder, given_stage), given_stage
 
 
 def test_the_gradient_is_that_of_finite_differences():
@@ -265,7 +265,7 @@ def test_the_gradient_is_that_of_finite_differences():
     picture, target = torch.rand(40, 48, 3, generator=generator), torch.rand(40, 48, 3, generator=generator)
 
     def cost(departures: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
-        return ((exposed(image, exposure_of(departures, 3)) - target.double()) ** 2).sum()
+        return ((apply_exposure(image, exposure_matrix(departures, 3)) - target.double()) ** 2).sum()
 
     leaves = state.decoder.exposure.detach().double().requires_grad_(True), picture.double().requires_grad_(True)
     found = torch.autograd.grad(cost(*leaves), leaves)
@@ -283,12 +283,16 @@ def test_photographs_of_unequal_brightness_are_told_from_the_scene():
     state, unequal = fitted(config)
     plain = run(start(config), replace(stage(config), images=Unequal()))
     run(state, unequal)
-    brightness = torch.tensor([float(state.decoder.exposure_of(i).detach()[:, :3].sum(1).mean()) for i in range(8)])
+    brightness = torch.tensor(
+        [float(state.decoder.exposure_for_image(i).detach()[:, :3].sum(1).mean()) for i in range(8)]
+    )
     assert float(torch.corrcoef(torch.stack([brightness, GAINS]))[0, 1]) > 0.9
 
     def error(trained) -> float:
         """Against the place as it is, at the mean brightness."""
-        model = AnchorModel(anchors=trained.anchors, decoder=trained.decoder, voxel=0.4, background=(0.0, 0.0, 0.0))
+        model = AnchorModel(
+            anchors=trained.anchors, decoder=trained.decoder, voxel_size=0.4, background=(0.0, 0.0, 0.0)
+        )
         truth, errors = Photographs(), []
         for index, camera in enumerate(truth.cameras):
             picture = truth.get(index)[0] * (0.7 / 255)
@@ -317,9 +321,9 @@ def test_a_stopped_run_and_a_file_keep_them(tmp_path):
     whole = bits(run(state, unequal))
     state, _ = fitted()
     run(state, unequal, until=33)
-    again = run(from_saved(to_saved(state), unequal), unequal)
+    again = run(from_checkpoint(to_checkpoint(state), unequal), unequal)
     assert bits(again) == whole
-    AnchorModel(anchors=again.anchors, decoder=again.decoder, voxel=0.4, background=(0.0, 0.0, 0.0)).save(
+    AnchorModel(anchors=again.anchors, decoder=again.decoder, voxel_size=0.4, background=(0.0, 0.0, 0.0)).save(
         tmp_path / "model.safetensors"
     )
     read = AnchorModel.load(tmp_path / "model.safetensors")

@@ -9,18 +9,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from support.small_training import CONFIG, run, stage, start
-from vdgs.config.method import GrowthConfig, TrainConfig
-from vdgs.model.anchors import TRAINED
-from vdgs.system.checkpoints import load_newest, save_state
-from vdgs.training import from_saved, to_saved, train_step, training_loop
-from vdgs.training.weight_averaging import MODELS, counts_in_mean
+from vdgs.config.method import DensifyConfig, TrainConfig
+from vdgs.model.anchors import TRAINED_TENSORS
+from vdgs.system.checkpoints import load_latest_checkpoint, save_checkpoint
+from vdgs.training import from_checkpoint, to_checkpoint, train_step, training_loop
+from vdgs.training.weight_averaging import NUM_AVERAGED_MODELS, is_averaged_step
 
 #: Growth ends at iteration 30, the mean begins after 36.
 MEAN = replace(CONFIG, average=0.4, growth=replace(CONFIG.growth, until=0.5))
 
 
 def tensors_of(anchors, decoder) -> dict[str, np.ndarray]:
-    named = {name: getattr(anchors, name) for name in TRAINED} | decoder.tensors()
+    named = {name: getattr(anchors, name) for name in TRAINED_TENSORS} | decoder.tensors()
     return {name: tensor.detach().numpy().copy() for name, tensor in named.items()}
 
 
@@ -30,8 +30,8 @@ def tensors_of(anchors, decoder) -> dict[str, np.ndarray]:
     until=st.floats(0.0, 0.99),
 )
 def test_the_mean_is_one_of_many_models_after_growth_and_of_the_last(iterations, average, until):
-    config = TrainConfig(iterations=iterations, average=average, growth=GrowthConfig(until=until))
-    counted = [i for i in range(1, iterations + 1) if counts_in_mean(i, config)]
+    config = TrainConfig(iterations=iterations, average=average, growth=DensifyConfig(until=until))
+    counted = [i for i in range(1, iterations + 1) if is_averaged_step(i, config)]
     if average == 0:
         assert counted == []
         return
@@ -39,11 +39,11 @@ def test_the_mean_is_one_of_many_models_after_growth_and_of_the_last(iterations,
     assert counted[-1] == iterations
     assert counted[0] > iterations - window
     assert len(set(np.diff(counted))) <= 1  # evenly
-    assert min(window - 1, 0.6 * MODELS) <= len(counted) <= 2 * MODELS
+    assert min(window - 1, 0.6 * NUM_AVERAGED_MODELS) <= len(counted) <= 2 * NUM_AVERAGED_MODELS
 
 
 def test_it_is_the_mean_of_the_models_and_changes_none_of_them(monkeypatch):
-    monkeypatch.setattr(training_loop, "REORDER_INTERVAL", 10**9)  # rows must stay where they are to be added up here
+    monkeypatch.setattr(training_loop, "SORT_INTERVAL", 10**9)  # rows must stay where they are to be added up here
     plain, averaged = start(MEAN), start(MEAN)
     off, on = stage(replace(MEAN, average=0.0)), stage(MEAN)
     models = []
@@ -68,14 +68,14 @@ def test_without_it_the_result_is_the_last_model():
 
 
 def test_a_stopped_and_continued_run_ends_with_the_same_mean(tmp_path, monkeypatch):
-    monkeypatch.setattr(training_loop, "REORDER_INTERVAL", 7)
+    monkeypatch.setattr(training_loop, "SORT_INTERVAL", 7)
     unbroken = tensors_of(*run(start(MEAN), stage(MEAN)).result())
     state = start(MEAN)
     for stop_at in (20, 37, 38, 50):
-        save_state(tmp_path, to_saved(run(state, stage(MEAN), until=stop_at)))
-        saved, _ = load_newest(tmp_path)
+        save_checkpoint(tmp_path, to_checkpoint(run(state, stage(MEAN), until=stop_at)))
+        saved, _ = load_latest_checkpoint(tmp_path)
         assert saved is not None
-        state = from_saved(saved, stage(MEAN))
+        state = from_checkpoint(saved, stage(MEAN))
     continued = tensors_of(*run(state, stage(MEAN)).result())
     assert all(np.array_equal(continued[name], value) for name, value in unbroken.items())
 
@@ -84,7 +84,7 @@ def test_rows_of_the_mean_follow_their_anchors(monkeypatch):
     """Put into Morton order within the mean or not: the same anchors have the same means."""
 
     def by_place(interval: int) -> np.ndarray:
-        monkeypatch.setattr(training_loop, "REORDER_INTERVAL", interval)
+        monkeypatch.setattr(training_loop, "SORT_INTERVAL", interval)
         anchors, _ = run(start(MEAN), stage(MEAN)).result()
         rows = np.concatenate([each.reshape(len(anchors), -1).numpy() for each in anchors.tensors().values()], axis=1)
         return rows[np.lexsort(rows.T[:3])]

@@ -11,18 +11,27 @@ from support.checkerboard import Photographs
 from vdgs.config.method import (
     BlockConfig,
     CompensationConfig,
-    GrowthConfig,
+    DensifyConfig,
     MethodConfig,
-    block_training,
+    block_train_config,
 )
 from vdgs.model.anchors import Anchors
-from vdgs.model.renderer import visible_rows
-from vdgs.partition.block_regions import drawn_by, holds, ramp, split_anchors
-from vdgs.partition.blocks import Block, Blocks, places_of
-from vdgs.training import Stage, Surroundings, TrainingState, from_saved, start_state, to_saved, train, views_in_cycle
+from vdgs.model.renderer import cull_anchors
+from vdgs.partition.block_regions import growth_mask, lr_ramp, split_trainable_anchors, visible_anchors
+from vdgs.partition.blocks import Block, Blocks, xy_positions
+from vdgs.training import (
+    FrozenAnchors,
+    TrainingProblem,
+    TrainingState,
+    from_checkpoint,
+    initial_state,
+    to_checkpoint,
+    train,
+    views_in_cycle,
+)
 
 
-def finish(stage: Stage, state: TrainingState, until: int = 1000) -> TrainingState:
+def finish(stage: TrainingProblem, state: TrainingState, until: int = 1000) -> TrainingState:
     train(state, stage, stop=lambda: state.iteration >= until, after_step=lambda *_: None)
     return state
 
@@ -51,7 +60,7 @@ def test_a_block_with_a_decoder_of_its_own_leaves_the_surroundings_theirs():
     shared = state.decoder
     before = {name: tensor.clone() for name, tensor in shared.tensors().items()}
     stage = replace(stage, frozen_decoder=False)
-    own = start_state(state.anchors, shared.copy(), stage)
+    own = initial_state(state.anchors, shared.copy(), stage)
     finish(stage, own)
     assert all(torch.equal(tensor, before[name]) for name, tensor in shared.tensors().items())
     assert stage.surroundings.decoder is shared
@@ -64,24 +73,24 @@ def test_new_anchors_stand_in_the_core():
     before = len(state.anchors)
     finish(stage, state)
     assert len(state.anchors) > before
-    assert (BLOCKS.owner(places_of(state.anchors.positions)) == 0).all()
+    assert (BLOCKS.owner(xy_positions(state.anchors.positions)) == 0).all()
 
 
 def test_every_anchor_is_own_or_around_and_only_what_cameras_draw_is_held():
     anchors, _ = coarse()
-    own, around = split_anchors(anchors, BLOCKS, 0, BlockConfig())
+    own, around = split_trainable_anchors(anchors, BLOCKS, 0, BlockConfig())
     assert torch.equal(own, ~around)
     cameras = Photographs().cameras
-    drawn = drawn_by(anchors, cameras)
+    drawn = visible_anchors(anchors, cameras)
     for camera in cameras:
-        assert drawn[visible_rows(anchors, camera)].all()
+        assert drawn[cull_anchors(anchors, camera)].all()
     far = replace(anchors, positions=anchors.positions + 100)
-    assert not drawn_by(far, cameras).any()
+    assert not visible_anchors(far, cameras).any()
 
 
 def test_without_context_only_the_ring_is_drawn():
     anchors, _ = coarse()
-    _, around = split_anchors(anchors, BLOCKS, 0, BlockConfig(context=False))
+    _, around = split_trainable_anchors(anchors, BLOCKS, 0, BlockConfig(context=False))
     x = anchors.positions[around, 0]
     assert len(x) > 0
     assert float(x.min()) >= 0
@@ -91,7 +100,7 @@ def test_without_context_only_the_ring_is_drawn():
 def test_a_free_ring_moves_and_a_ramp_moves_it_less():
     moved = {}
     for ring in ("free", "ramp"):
-        stage, state = block_stage(BlockConfig(ring=ring), training=replace(CONFIG, growth=GrowthConfig(levels=0)))
+        stage, state = block_stage(BlockConfig(ring=ring), training=replace(CONFIG, growth=DensifyConfig(levels=0)))
         before = state.anchors.features.clone()
         ring_rows = state.anchors.positions[:, 0] > 0.5  # beyond the middle of the ring
         finish(stage, state, until=10)
@@ -100,7 +109,7 @@ def test_a_free_ring_moves_and_a_ramp_moves_it_less():
 
 
 def test_the_ramp_falls_from_core_to_boundary():
-    mobility = ramp(BLOCKS, 0, BlockConfig(ring="ramp"))
+    mobility = lr_ramp(BLOCKS, 0, BlockConfig(ring="ramp"))
     assert mobility is not None
     at = torch.tensor([[-2.0, 0, 0], [0.25, 0, 0], [0.5, 0, 0], [0.75, 0, 0], [-50, 0, 0]])
     expected = torch.tensor([1.0, 0.75, 0.5, 0.25, 1.0])
@@ -110,9 +119,9 @@ def test_the_ramp_falls_from_core_to_boundary():
 def test_the_ramp_falls_into_a_hole_as_it_does_outwards():
     """Outskirts lie around a dense centre."""
     middle = shapely.Point(0, 0)
-    outskirts = Block(middle.buffer(20, 64).difference(middle.buffer(12, 64)),
-                      middle.buffer(25, 64).difference(middle.buffer(7, 64)))  # fmt: skip
-    mobility = ramp(
+    outskirts = Block(middle.buffer(20, 64).gain_spread(middle.buffer(12, 64)),
+                      middle.buffer(25, 64).gain_spread(middle.buffer(7, 64)))  # fmt: skip
+    mobility = lr_ramp(
         Blocks((outskirts, Block(middle.buffer(12, 64), middle.buffer(14, 64)))), 0, BlockConfig(ring="ramp")
     )
     assert mobility is not None
@@ -123,7 +132,7 @@ def test_the_ramp_falls_into_a_hole_as_it_does_outwards():
 def test_ground_that_the_block_owns_beyond_its_boundary_moves_in_full():
     bent = shapely.union(shapely.box(-10, -10, 10, -6), shapely.box(-10, -10, -6, 10))
     blocks = Blocks((Block(bent, bent.buffer(1)), Block(shapely.box(20, 20, 30, 30), shapely.box(19, 19, 31, 31))))
-    mobility = ramp(blocks, 0, BlockConfig(ring="ramp"))
+    mobility = lr_ramp(blocks, 0, BlockConfig(ring="ramp"))
     assert mobility is not None
     assert mobility(torch.tensor([[9.0, 9.0, 0.0], [0.0, 0.0, 0.0], [-8.0, 5.0, 0.0]])).tolist() == [1.0, 1.0, 1.0]
 
@@ -131,19 +140,19 @@ def test_ground_that_the_block_owns_beyond_its_boundary_moves_in_full():
 def test_one_block_without_surroundings_is_plain_training():
     whole = Blocks((Block(shapely.box(-9, -9, 9, 9), shapely.box(-10, -10, 10, 10)),))
     anchors, decoder = coarse()
-    own, around = split_anchors(anchors, whole, 0, BlockConfig())
+    own, around = split_trainable_anchors(anchors, whole, 0, BlockConfig())
     assert own.all()
     states = []
     for surroundings, may_hold in (
         (None, None),
-        (Surroundings(anchors.select(around), decoder), holds(whole, 0, BlockConfig())),
+        (FrozenAnchors(anchors.select(around), decoder), growth_mask(whole, 0, BlockConfig())),
     ):
-        stage = Stage(
-            config=CONFIG, images=Photographs(), image_count=8, voxel=0.4, camera_height=5.0, frozen_decoder=True,
+        stage = TrainingProblem(
+            config=CONFIG, images=Photographs(), image_count=8, voxel_size=0.4, camera_height=5.0, frozen_decoder=True,
             surroundings=surroundings, may_hold=may_hold,
         )  # fmt: skip
         copied = anchors.select(torch.arange(len(anchors)))
-        states.append(finish(stage, start_state(copied, decoder, stage)))
+        states.append(finish(stage, initial_state(copied, decoder, stage)))
     assert rows_of(states[0].anchors) == rows_of(states[1].anchors)
 
 
@@ -153,10 +162,10 @@ def test_a_stopped_and_continued_block_has_the_same_bits():
     stage, state = block_stage(BlockConfig())
     for until in (7, 10, 25):
         finish(stage, state, until)
-        state = from_saved(to_saved(state), stage)
+        state = from_checkpoint(to_checkpoint(state), stage)
     finish(stage, state)
-    for name, tensor in to_saved(unbroken).tensors.items():
-        assert torch.equal(tensor, to_saved(state).tensors[name]), name
+    for name, tensor in to_checkpoint(unbroken).tensors.items():
+        assert torch.equal(tensor, to_checkpoint(state).tensors[name]), name
 
 
 @pytest.mark.parametrize("change", [{"beta_g": 0.0}, {"t_low": 0.0}])
@@ -171,15 +180,15 @@ def test_compensation_that_adds_nothing_is_plain_growth_bit_for_bit(change):
 
 
 def test_a_cycle_lasts_from_decision_to_decision():
-    stage = Stage(
-        config=replace(CONFIG, growth=GrowthConfig(interval=3, statistics_from=0, start=6)),
+    stage = TrainingProblem(
+        config=replace(CONFIG, growth=DensifyConfig(interval=3, stats_start=0, start=6)),
         images=Photographs(),
         image_count=8,
-        voxel=1,
+        voxel_size=1,
         camera_height=1,
     )
     assert len(views_in_cycle(6, stage)) == 6  # the first cycle counts since the statistics began
-    late = replace(stage, config=replace(CONFIG, growth=GrowthConfig(interval=3, statistics_from=4, start=6)))
+    late = replace(stage, config=replace(CONFIG, growth=DensifyConfig(interval=3, stats_start=4, start=6)))
     assert len(views_in_cycle(6, late)) == 2  # the statistics began after the cycle would have
     assert len(views_in_cycle(12, stage)) == 3  # steps 10 to 12, within one epoch, which has no view twice
     assert not {*views_in_cycle(12, stage)} & {*views_in_cycle(15, stage)}
@@ -188,12 +197,12 @@ def test_a_cycle_lasts_from_decision_to_decision():
 def test_rates_and_growth_restart_and_iterations_scale():
     """The paper prints neither rates nor a start of growth for blocks: those of the coarse stage, unless asked."""
     method = MethodConfig(block=BlockConfig(scale_iterations=0.1))
-    config = block_training(method, 500)
+    config = block_train_config(method, 500)
     assert config.iterations == 5000
-    assert (config.growth.statistics_from, config.growth.start) == (50, 150)
+    assert (config.growth.stats_start, config.growth.start) == (50, 150)
     assert config.rates == method.training.rates
-    damped = block_training(replace(method, block=BlockConfig(offset_rate=0.4, scale_rate=0.8)), 500)
+    damped = block_train_config(replace(method, block=BlockConfig(offset_rate=0.4, scale_rate=0.8)), 500)
     assert damped.rates.offsets == pytest.approx((0.004, 4e-5))
     assert damped.rates.log_scales == pytest.approx((0.0056, 0.0056))
     assert damped.rates.features == method.training.rates.features
-    assert block_training(replace(method, block=BlockConfig(iterations=0)), 33).iterations == 500
+    assert block_train_config(replace(method, block=BlockConfig(iterations=0)), 33).iterations == 500

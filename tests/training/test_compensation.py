@@ -10,24 +10,24 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vdgs.config.method import CompensationConfig, GrowthConfig
-from vdgs.kernels.kernel_types import Statistics
+from vdgs.config.method import CompensationConfig, DensifyConfig
+from vdgs.kernels.kernel_types import DensificationStats
 from vdgs.model.anchors import Anchors
 from vdgs.training.compensation import (
-    Compensation,
+    CompensationState,
     begin_cycle,
     compensate,
-    cycle_facts,
     cycle_gradient,
-    low_visibility,
+    cycle_log,
+    low_visibility_mask,
     update_cache,
 )
-from vdgs.training.densification import decide
-from vdgs.training.per_anchor_tensors import remap_rows
+from vdgs.training.densification import decide_densification
+from vdgs.training.per_anchor_tensors import index_rows
 
 K = 3
 PAPER = CompensationConfig()
-GROWTH = GrowthConfig(threshold=1.0, levels=2, coarsest_cell=1.0)
+GROWTH = DensifyConfig(threshold=1.0, levels=2, coarsest_voxels=1.0)
 ALL, NONE = torch.ones(1, dtype=torch.bool), torch.zeros(1, dtype=torch.bool)
 
 
@@ -41,7 +41,7 @@ def some_anchors(n: int, seed: int = 0) -> Anchors:
     )
 
 
-def see(statistics: Statistics, times: torch.Tensor, mean: torch.Tensor) -> None:
+def see(statistics: DensificationStats, times: torch.Tensor, mean: torch.Tensor) -> None:
     """A cycle in which each offset is drawn so many times with that mean gradient."""
     statistics.drawn += times
     statistics.gradient += times * mean
@@ -49,16 +49,16 @@ def see(statistics: Statistics, times: torch.Tensor, mean: torch.Tensor) -> None
     statistics.opacity += times.sum(1)
 
 
-def one_offset(times: float = 0.0, mean: float = 0.0) -> Statistics:
-    statistics = Statistics.zeros(1, 1)
+def one_offset(times: float = 0.0, mean: float = 0.0) -> DensificationStats:
+    statistics = DensificationStats.zeros(1, 1)
     see(statistics, torch.tensor([[times]]), torch.tensor([[mean]]))
     return statistics
 
 
-def simulate(config: CompensationConfig | None, seed: int, cycles: int = 4, growth: GrowthConfig = GROWTH):
+def simulate(config: CompensationConfig | None, seed: int, cycles: int = 4, growth: DensifyConfig = GROWTH):
     """Anchors and statistics after some cycles of random views; without compensation where config is None."""
     anchors = some_anchors(25, seed)
-    statistics, memory = Statistics.zeros(25, K), Compensation.zeros(25, K)
+    statistics, memory = DensificationStats.zeros(25, K), CompensationState.zeros(25, K)
     for cycle in range(cycles):
         g = torch.Generator().manual_seed(1000 * seed + cycle)
         n = len(anchors)
@@ -66,26 +66,29 @@ def simulate(config: CompensationConfig | None, seed: int, cycles: int = 4, grow
         see(statistics, torch.floor(60 * share[:, None] * torch.rand(n, K, generator=g)), torch.rand(n, K, generator=g))
         change = None
         if config is not None:
-            low, threshold = low_visibility(share, config)
+            low, threshold = low_visibility_mask(share, config)
             update_cache(memory, statistics, low, config)
             change = compensate(memory, low, threshold, growth, config)
-        decision = decide(anchors, statistics, 1.0, growth, g, compensated=change)
+        decision = decide_densification(anchors, statistics, 1.0, growth, g, compensated=change)
         kept = torch.cat([decision.kept, torch.ones(len(decision.added), dtype=torch.bool)])
-        anchors = anchors.extended(decision.added).select(kept)
-        statistics, memory = Statistics(**remapped(statistics, kept)), Compensation(**remapped(memory, kept))
+        anchors = anchors.concat(decision.added).select(kept)
+        statistics, memory = (
+            DensificationStats(**remapped(statistics, kept)),
+            CompensationState(**remapped(memory, kept)),
+        )
         begin_cycle(memory, statistics)
     return anchors, statistics, memory
 
 
-def remapped(kept_per_anchor: Statistics | Compensation, kept: torch.Tensor) -> dict[str, torch.Tensor]:
+def remapped(kept_per_anchor: DensificationStats | CompensationState, kept: torch.Tensor) -> dict[str, torch.Tensor]:
     """As training keeps them beside the anchors: new rows are zero."""
     group = kept_per_anchor.tensors()
     count = len(kept) - len(next(iter(group.values())))
-    remap_rows(group, {name: tensor.new_zeros(count, *tensor.shape[1:]) for name, tensor in group.items()}, kept)
+    index_rows(group, {name: tensor.new_zeros(count, *tensor.shape[1:]) for name, tensor in group.items()}, kept)
     return group
 
 
-def bits(anchors: Anchors, statistics: Statistics) -> list[bytes]:
+def bits(anchors: Anchors, statistics: DensificationStats) -> list[bytes]:
     return [tensor.numpy().tobytes() for tensor in (*anchors.tensors().values(), *statistics.tensors().values())]
 
 
@@ -116,7 +119,7 @@ def test_with_the_papers_weights_more_grows_and_twice_the_same():
 )
 def test_the_cache_follows_the_recursion(cycles, beta, gamma):
     config = CompensationConfig(beta_g=beta, gamma=gamma)
-    statistics, memory, expected = one_offset(), Compensation.zeros(1, 1), 0.0
+    statistics, memory, expected = one_offset(), CompensationState.zeros(1, 1), 0.0
     for low, times, mean in cycles:
         see(statistics, torch.tensor([[float(times)]]), torch.tensor([[mean]]))
         update_cache(memory, statistics, ALL if low else NONE, config)
@@ -126,7 +129,7 @@ def test_the_cache_follows_the_recursion(cycles, beta, gamma):
 
 
 def test_two_cycles_by_hand():
-    statistics, memory = one_offset(times=10, mean=0.5), Compensation.zeros(1, 1)
+    statistics, memory = one_offset(times=10, mean=0.5), CompensationState.zeros(1, 1)
     update_cache(memory, statistics, ALL, PAPER)
     assert float(memory.cache) == 1.0  # 2 x 0.5
     begin_cycle(memory, statistics)
@@ -138,10 +141,10 @@ def test_two_cycles_by_hand():
 
 
 def test_fed_steadily_the_statistic_tends_to_21_times_its_size():
-    memory, sizes = Compensation.zeros(1, 1), []
+    memory, sizes = CompensationState.zeros(1, 1), []
     for _ in range(150):
         statistics = one_offset(times=10, mean=0.5)
-        begin_cycle(memory, Statistics.zeros(1, 1))
+        begin_cycle(memory, DensificationStats.zeros(1, 1))
         update_cache(memory, statistics, ALL, PAPER)
         sizes.append(float(memory.cache) + 0.5)
     assert sizes[0] == pytest.approx(3 * 0.5)
@@ -154,7 +157,7 @@ def test_what_is_added_to_the_sum_is_divided_by_the_draws(added_to, expected):
     """Eight draws of a mean of 0.5, and g = 1: parents are those whose statistic reaches the threshold."""
     config = replace(PAPER, added_to=added_to)
     for threshold, asks in ((0.999 * expected, True), (1.001 * expected, False)):
-        statistics, memory = one_offset(times=8.5, mean=0.5), Compensation.zeros(1, 1)
+        statistics, memory = one_offset(times=8.5, mean=0.5), CompensationState.zeros(1, 1)
         statistics.drawn.fill_(8.0)
         statistics.gradient.fill_(4.0)
         update_cache(memory, statistics, ALL, config)
@@ -165,7 +168,7 @@ def test_what_is_added_to_the_sum_is_divided_by_the_draws(added_to, expected):
         anchors = replace(anchors, offsets=100.0 + anchors.offsets[:, :1])
         seeds = range(12)  # an offset that asks is kept by half of them
         grown = [
-            len(decide(anchors, Statistics(**{n: t.clone() for n, t in statistics.tensors().items()}), 1.0, growth,
+            len(decide_densification(anchors, DensificationStats(**{n: t.clone() for n, t in statistics.tensors().items()}), 1.0, growth,
                        torch.Generator().manual_seed(seed), compensated=change).added)
             for seed in seeds
         ]  # fmt: skip
@@ -173,16 +176,16 @@ def test_what_is_added_to_the_sum_is_divided_by_the_draws(added_to, expected):
 
 
 def test_what_is_not_judged_keeps_counting_and_the_cycle_is_still_its_own():
-    statistics, memory = one_offset(times=30, mean=2.0), Compensation.zeros(1, 1)
+    statistics, memory = one_offset(times=30, mean=2.0), CompensationState.zeros(1, 1)
     anchors = some_anchors(1)
     anchors = replace(anchors, offsets=anchors.offsets[:, :1])
-    decide(anchors, statistics, 1.0, GROWTH, torch.Generator())  # 30 times is not 40: carried over
+    decide_densification(anchors, statistics, 1.0, GROWTH, torch.Generator())  # 30 times is not 40: carried over
     begin_cycle(memory, statistics)
     see(statistics, torch.tensor([[5.0]]), torch.tensor([[0.5]]))
     assert float(statistics.drawn) == 35
     assert float(cycle_gradient(memory, statistics)) == pytest.approx(0.5)
     see(statistics, torch.tensor([[10.0]]), torch.tensor([[0.5]]))
-    decide(anchors, statistics, 1.0, GROWTH, torch.Generator())  # 45 times: judged
+    decide_densification(anchors, statistics, 1.0, GROWTH, torch.Generator())  # 45 times: judged
     begin_cycle(memory, statistics)
     assert float(statistics.drawn) == 0
     see(statistics, torch.tensor([[3.0]]), torch.tensor([[0.7]]))
@@ -191,7 +194,7 @@ def test_what_is_not_judged_keeps_counting_and_the_cycle_is_still_its_own():
 
 def test_fewer_than_the_threshold_means_fewer():
     share = torch.tensor([0.0, 19 / 100, 20 / 100, 21 / 100, 1.0])
-    low, threshold = low_visibility(share, PAPER)
+    low, threshold = low_visibility_mask(share, PAPER)
     assert low.tolist() == [True, True, False, False, False]
     assert threshold == 0.2
 
@@ -199,7 +202,7 @@ def test_fewer_than_the_threshold_means_fewer():
 @given(shares=st.lists(st.integers(0, 20), max_size=30), quantile=st.sampled_from([0.1, 0.25, 0.5, 0.9]))
 def test_a_quantile_of_the_anchors_that_some_camera_sees_is_met_as_nearly_as_ties_allow(shares, quantile):
     share = torch.tensor(shares, dtype=torch.float32) / 20
-    low, threshold = low_visibility(share, replace(PAPER, t_low_quantile=quantile))
+    low, threshold = low_visibility_mask(share, replace(PAPER, t_low_quantile=quantile))
     seen = share > 0
     if not seen.any():
         assert not low.any()
@@ -211,7 +214,7 @@ def test_a_quantile_of_the_anchors_that_some_camera_sees_is_met_as_nearly_as_tie
     possible = [int((share[seen] <= limit).sum()) for limit in (0.0, *share[seen].tolist())]
     assert abs(int(low[seen].sum()) - wished) == min(abs(size - wished) for size in possible)
     order = torch.randperm(len(share), generator=torch.Generator().manual_seed(0))
-    assert torch.equal(low_visibility(share[order], replace(PAPER, t_low_quantile=quantile))[0], low[order])
+    assert torch.equal(low_visibility_mask(share[order], replace(PAPER, t_low_quantile=quantile))[0], low[order])
 
 
 @pytest.mark.parametrize(
@@ -225,18 +228,18 @@ def test_a_quantile_of_the_anchors_that_some_camera_sees_is_met_as_nearly_as_tie
     ],
 )
 def test_shares_that_tie_do_not_empty_the_set(shares, expected):
-    low, _ = low_visibility(torch.tensor(shares), replace(PAPER, t_low_quantile=0.25))
+    low, _ = low_visibility_mask(torch.tensor(shares), replace(PAPER, t_low_quantile=0.25))
     assert low.tolist() == [True] * expected + [False] * (len(shares) - expected)
 
 
 def test_an_empty_set_of_those_seen_shows_in_the_facts():
     n, config = 10, replace(PAPER, t_low_quantile=0.25)
-    anchors, statistics, memory = some_anchors(n), Statistics.zeros(n, K), Compensation.zeros(n, K)
+    anchors, statistics, memory = some_anchors(n), DensificationStats.zeros(n, K), CompensationState.zeros(n, K)
     share = torch.tensor([0.0] * 2 + [1.0] * 8)
-    low, threshold = low_visibility(share, config)
+    low, threshold = low_visibility_mask(share, config)
     change = compensate(memory, low, threshold, GROWTH, config)
-    decision = decide(anchors, statistics, 1.0, GROWTH, torch.Generator(), compensated=change)
-    facts = cycle_facts(change, share, threshold, decision, config)
+    decision = decide_densification(anchors, statistics, 1.0, GROWTH, torch.Generator(), compensated=change)
+    facts = cycle_log(change, share, threshold, decision, config)
     assert (facts["low_share"], facts["low_share_of_seen"], facts["t_low"]) == (0.2, 0.0, 1.0)
 
 
@@ -246,7 +249,7 @@ def test_an_empty_set_of_those_seen_shows_in_the_facts():
 )
 def test_the_gate_of_low_visibility(gate, interval, expected):
     growth, config = replace(GROWTH, interval=interval), replace(PAPER, gate=gate)
-    change = compensate(Compensation.zeros(1, 1), ALL, config.t_low, growth, config)
+    change = compensate(CompensationState.zeros(1, 1), ALL, config.t_low, growth, config)
     assert change.gate == pytest.approx(expected)
 
 
@@ -254,12 +257,14 @@ def test_the_gate_of_low_visibility(gate, interval, expected):
 def test_an_offset_drawn_nine_times_is_judged_only_by_the_scaled_gate(gate, judged):
     config = replace(PAPER, gate=gate)
     n = 30
-    anchors, statistics, memory = some_anchors(n), Statistics.zeros(n, K), Compensation.zeros(n, K)
+    anchors, statistics, memory = some_anchors(n), DensificationStats.zeros(n, K), CompensationState.zeros(n, K)
     see(statistics, torch.full((n, K), 9.0), torch.full((n, K), 0.5))
     low = torch.arange(n) < 20
     update_cache(memory, statistics, low, config)
     change = compensate(memory, low, 0.2, GROWTH, config)
-    decision = decide(anchors, statistics, 1.0, GROWTH, torch.Generator().manual_seed(0), compensated=change)
+    decision = decide_densification(
+        anchors, statistics, 1.0, GROWTH, torch.Generator().manual_seed(0), compensated=change
+    )
     assert (len(decision.added) > 0) == judged
     assert (statistics.drawn == 0).all(1).tolist() == [judged and bool(each) for each in low]
 
@@ -270,22 +275,24 @@ def test_a_poorly_seen_place_grows_where_plain_growth_sees_nothing():
     east = anchors.positions[:, 0] > 0
     results = {}
     for name, config in (("plain", None), ("compensated", PAPER)):
-        statistics, memory = Statistics.zeros(n, K), Compensation.zeros(n, K)
+        statistics, memory = DensificationStats.zeros(n, K), CompensationState.zeros(n, K)
         # East: 12 of 100 views, west: 60; everywhere 80 % of the gradient that asks for an anchor.
         times = torch.where(east, 12.0, 60.0)[:, None].expand(n, K)
         see(statistics, times, torch.full((n, K), 0.8))
         change = None
         if config is not None:
-            low, threshold = low_visibility(torch.where(east, 0.12, 0.6), config)
+            low, threshold = low_visibility_mask(torch.where(east, 0.12, 0.6), config)
             update_cache(memory, statistics, low, config)
             change = compensate(memory, low, threshold, GROWTH, config)
-        decision = decide(anchors, statistics, 1.0, GROWTH, torch.Generator().manual_seed(0), compensated=change)
+        decision = decide_densification(
+            anchors, statistics, 1.0, GROWTH, torch.Generator().manual_seed(0), compensated=change
+        )
         results[name] = decision, change
     assert len(results["plain"][0].added) == 0
     decision, change = results["compensated"]
     assert len(decision.added) > 50
     assert float(decision.added.positions[:, 0].min()) > -5  # offsets reach some units beyond their anchor
-    facts = cycle_facts(change, torch.where(east, 0.12, 0.6), 0.2, decision, CompensationConfig())
+    facts = cycle_log(change, torch.where(east, 0.12, 0.6), 0.2, decision, CompensationConfig())
     assert facts["grown_low"] == len(decision.added)
     assert facts["grown_other"] == 0
     assert facts["low_share"] == facts["low_share_of_seen"] == pytest.approx(float(east.float().mean()))
@@ -295,7 +302,7 @@ def test_a_poorly_seen_place_grows_where_plain_growth_sees_nothing():
 
 
 def test_what_is_remembered_is_added_only_where_few_cameras_see():
-    memory = Compensation.zeros(3, K)
+    memory = CompensationState.zeros(3, K)
     memory.cache += 0.5
     change = compensate(memory, torch.tensor([True, False, True]), 0.2, GROWTH, PAPER)
     assert change.added.tolist() == [[0.5] * K, [0.0] * K, [0.5] * K]
@@ -304,17 +311,19 @@ def test_what_is_remembered_is_added_only_where_few_cameras_see():
 def test_what_grows_plainly_grows_compensated_too():
     growth = replace(GROWTH, levels=1)  # finer levels see the anchors of coarser ones
     n = 300
-    anchors, memory = some_anchors(n), Compensation.zeros(n, K)
+    anchors, memory = some_anchors(n), CompensationState.zeros(n, K)
     g = torch.Generator().manual_seed(1)
     times, mean = torch.full((n, K), 50.0), 2 * torch.rand(n, K, generator=g)
     low = torch.arange(n) % 3 == 0
-    statistics = [Statistics.zeros(n, K), Statistics.zeros(n, K)]
+    statistics = [DensificationStats.zeros(n, K), DensificationStats.zeros(n, K)]
     for each in statistics:
         see(each, times, mean)
     update_cache(memory, statistics[1], low, PAPER)
     change = compensate(memory, low, 0.2, growth, PAPER)
-    plain = decide(anchors, statistics[0], 1.0, growth, torch.Generator().manual_seed(2))
-    more = decide(anchors, statistics[1], 1.0, growth, torch.Generator().manual_seed(2), compensated=change)
+    plain = decide_densification(anchors, statistics[0], 1.0, growth, torch.Generator().manual_seed(2))
+    more = decide_densification(
+        anchors, statistics[1], 1.0, growth, torch.Generator().manual_seed(2), compensated=change
+    )
     plain_cells, more_cells = ({tuple(row) for row in d.added.positions.tolist()} for d in (plain, more))
     assert plain_cells < more_cells
     assert more.grown_low + more.grown_other == len(more.added)
@@ -324,13 +333,13 @@ def test_what_grows_plainly_grows_compensated_too():
 
 
 def test_facts_without_low_visibility_are_null():
-    anchors, statistics, memory = some_anchors(2), Statistics.zeros(2, K), Compensation.zeros(2, K)
+    anchors, statistics, memory = some_anchors(2), DensificationStats.zeros(2, K), CompensationState.zeros(2, K)
     change = compensate(memory, torch.zeros(2, dtype=torch.bool), 0.2, GROWTH, PAPER)
-    facts = cycle_facts(
+    facts = cycle_log(
         change,
         torch.ones(2),
         0.2,
-        decide(anchors, statistics, 1.0, GROWTH, torch.Generator(), compensated=change),
+        decide_densification(anchors, statistics, 1.0, GROWTH, torch.Generator(), compensated=change),
         CompensationConfig(),
     )
     assert facts["mean_cache"] is None
@@ -339,7 +348,7 @@ def test_facts_without_low_visibility_are_null():
 
 
 def test_statistics_of_other_anchors_are_refused():
-    memory, statistics = Compensation.zeros(2, K), Statistics.zeros(3, K)
+    memory, statistics = CompensationState.zeros(2, K), DensificationStats.zeros(3, K)
     with pytest.raises(ValueError, match=r"\[2, 3\].*\[3, 3\]"):
         begin_cycle(memory, statistics)
     with pytest.raises(ValueError, match=r"\[2, 3\].*\[3, 3\]"):
@@ -347,7 +356,7 @@ def test_statistics_of_other_anchors_are_refused():
 
 
 def test_the_snapshots_are_copies():
-    statistics, memory = one_offset(times=5, mean=1.0), Compensation.zeros(1, 1)
+    statistics, memory = one_offset(times=5, mean=1.0), CompensationState.zeros(1, 1)
     begin_cycle(memory, statistics)
     see(statistics, torch.tensor([[1.0]]), torch.tensor([[3.0]]))
     assert float(memory.drawn_before) == 5

@@ -16,23 +16,23 @@ from vdgs.config.method import BlockConfig, MethodConfig
 from vdgs.errors import RunError
 from vdgs.kernels import cpu, torch_ref
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.model.renderer import paint
-from vdgs.partition.block_regions import split_anchors
-from vdgs.training import from_saved, to_saved, train, train_step
+from vdgs.model.renderer import render_scalar
+from vdgs.partition.block_regions import split_trainable_anchors
+from vdgs.training import from_checkpoint, to_checkpoint, train, train_step
 from vdgs.training.crops import (
-    CUT_OFF,
-    LEAST_SHARE,
+    FULL_AREA_FRACTION,
+    FULL_IMAGE,
+    FULL_IMAGE_EVERY,
     MARGIN,
-    MOST_STEPS,
-    NEARLY_ALL,
-    WHOLE,
-    WHOLE_EVERY,
+    MAX_STEP_FACTOR,
+    MIN_CONTRIBUTION,
+    TAIL_FRACTION,
     Crop,
     _crop,
+    compute_crops,
     crop_at,
-    crops_of,
-    load_or_find,
-    mean_area,
+    load_or_compute_crops,
+    mean_crop_area,
     steps_for,
 )
 
@@ -46,7 +46,7 @@ def drawn(scene: Scene, camera, part, kernels) -> torch.Tensor:
     rows = kernels.cull(scene.positions, scene.log_scales, camera)
     part = camera.cropped(*part)
     splats = kernels.decode(scene.positions, scene.features, scene.offsets, scene.log_scales, scene.weights, part, rows)
-    return kernels.rasterise(splats, torch.tensor([0.1, 0.5, 0.9]), part.width, part.height).image
+    return kernels.rasterize(splats, torch.tensor([0.1, 0.5, 0.9]), part.width, part.height).image
 
 
 @pytest.mark.parametrize("kernels", [cpu, torch_ref], ids=["native", "twin"])
@@ -82,7 +82,7 @@ def test_a_part_keeps_the_size_of_the_whole_and_must_lie_in_it():
     camera = looking_down()
     part = camera.cropped(10, 5, 50, 40).cropped(1, 1, 20, 20)
     assert (part.width, part.height) == (19, 19)
-    assert part.whole_size == (64, 48)
+    assert part.full_size == (64, 48)
     assert (part.cx, part.cy) == (camera.cx - 11, camera.cy - 6)
     for bad in ((-1, 0, 5, 5), (0, 0, 65, 5), (5, 0, 5, 5), (0, 9, 5, 4)):
         with pytest.raises(ValueError, match="no part of a picture of 64x48"):
@@ -110,70 +110,70 @@ def model_and_own() -> tuple[AnchorModel, torch.Tensor]:
     """A plane of opaque anchors and those of the western block."""
     anchors, decoder = coarse()
     anchors = replace(anchors, log_scales=torch.full_like(anchors.log_scales, -1.0))
-    own, _ = split_anchors(anchors, BLOCKS, 0, BlockConfig())
-    return AnchorModel(anchors=anchors, decoder=decoder, voxel=0.4, background=(0.0, 0.0, 0.0)), own
+    own, _ = split_trainable_anchors(anchors, BLOCKS, 0, BlockConfig())
+    return AnchorModel(anchors=anchors, decoder=decoder, voxel_size=0.4, background=(0.0, 0.0, 0.0)), own
 
 
 def test_parts_hold_nearly_all_that_shows_the_block_and_little_else():
     model, own = model_and_own()
     camera = looking_down(width=128, height=96)
-    (crop,) = crops_of(model, own, [camera])
+    (crop,) = compute_crops(model, own, [camera])
     left, top, right, bottom = crop.pixels(128, 96)
-    shown = paint(model, own.float(), camera)[0].numpy() >= LEAST_SHARE
+    shown = render_scalar(model, own.float(), camera)[0].numpy() >= MIN_CONTRIBUTION
     assert shown.sum() > 1000
     assert not shown[:, 80:].any()  # the block is the western half
-    assert shown[top:bottom, left:right].sum() >= (1 - 4 * CUT_OFF) * shown.sum()
+    assert shown[top:bottom, left:right].sum() >= (1 - 4 * TAIL_FRACTION) * shown.sum()
     columns, rows = np.flatnonzero(shown.any(0)), np.flatnonzero(shown.any(1))
     margin = MARGIN * 128 + 1
     assert left >= columns[0] - margin
     assert right <= columns[-1] + 1 + margin
     assert top >= rows[0] - margin
     assert bottom <= rows[-1] + 1 + margin
-    assert crop.area < NEARLY_ALL
+    assert crop.area < FULL_AREA_FRACTION
 
 
 def test_what_shows_nothing_or_nearly_everything_of_the_block_stays_whole():
     model, own = model_and_own()
     camera = looking_down()
-    assert crops_of(model, torch.zeros_like(own), [camera]) == (WHOLE,)
-    assert crops_of(model, torch.ones_like(own), [camera]) == (WHOLE,)
+    assert compute_crops(model, torch.zeros_like(own), [camera]) == (FULL_IMAGE,)
+    assert compute_crops(model, torch.ones_like(own), [camera]) == (FULL_IMAGE,)
 
 
 def test_the_mean_area_is_that_of_the_photographs_as_they_are_used():
-    crops = [WHOLE, Crop(0, 0, 0.5, 0.5)]
-    every = 1 / WHOLE_EVERY
-    assert mean_area(crops, None) == pytest.approx(every + (1 - every) * 0.625)
-    assert mean_area(crops, (1.0, 3.0)) == pytest.approx(every + (1 - every) * (1 + 3 * 0.25) / 4)
+    crops = [FULL_IMAGE, Crop(0, 0, 0.5, 0.5)]
+    every = 1 / FULL_IMAGE_EVERY
+    assert mean_crop_area(crops, None) == pytest.approx(every + (1 - every) * 0.625)
+    assert mean_crop_area(crops, (1.0, 3.0)) == pytest.approx(every + (1 - every) * (1 + 3 * 0.25) / 4)
 
 
 def test_now_and_then_a_whole_photograph_is_drawn():
     """What a block lets stand beyond the parts must be seen by some step."""
     crops = (Crop(0, 0, 0.5, 0.5),) * 3
-    drawn = [crop_at(crops, 1, iteration) for iteration in range(5 * WHOLE_EVERY)]
-    assert drawn.count(WHOLE) == 5
-    assert set(drawn) == {WHOLE, crops[1]}
-    assert crop_at(None, 1, 0) == WHOLE
+    drawn = [crop_at(crops, 1, iteration) for iteration in range(5 * FULL_IMAGE_EVERY)]
+    assert drawn.count(FULL_IMAGE) == 5
+    assert set(drawn) == {FULL_IMAGE, crops[1]}
+    assert crop_at(None, 1, 0) == FULL_IMAGE
 
 
 def test_few_pixels_make_more_steps_but_not_endlessly_many():
     assert steps_for(100, 1.0) == 100
     assert steps_for(100, 0.5) == 200
-    assert steps_for(100, 1e-4) == MOST_STEPS * 100
+    assert steps_for(100, 1e-4) == MAX_STEP_FACTOR * 100
 
 
 def test_parts_are_found_once_and_kept(tmp_path):
     def never():
         raise AssertionError("looked for again")
 
-    path, found = tmp_path / "crops.json", (WHOLE, Crop(0.1, 0.2, 1 / 3, 0.9))
-    assert load_or_find(path, 2, lambda: found) == found
-    assert load_or_find(path, 2, never) == found
+    path, found = tmp_path / "crops.json", (FULL_IMAGE, Crop(0.1, 0.2, 1 / 3, 0.9))
+    assert load_or_compute_crops(path, 2, lambda: found) == found
+    assert load_or_compute_crops(path, 2, never) == found
     with pytest.raises(RunError, match=r"crops\.json: is damaged \(3 parts .* were expected\)\. Delete it"):
-        load_or_find(path, 3, never)
+        load_or_compute_crops(path, 3, never)
     for damage in ("{}", '{"crops": [[0, 0, 1]]}', '{"crops": [[0, 0, 2, 1], [0, 0, 1, 1]]}', "nothing", "[1]"):
         path.write_text(damage)
         with pytest.raises(RunError, match=r"crops\.json"):
-            load_or_find(path, 2, never)
+            load_or_compute_crops(path, 2, never)
 
 
 def test_single_pixels_far_away_do_not_open_a_part_wide():
@@ -196,13 +196,13 @@ def in_parts(stage, crop: Crop):
 
 def trained_bits(stage, state, until: int = 1000) -> dict[str, bytes]:
     train(state, stage, stop=lambda: state.iteration >= until, after_step=lambda *_: None)
-    return {name: tensor.numpy().tobytes() for name, tensor in to_saved(state).tensors.items()}
+    return {name: tensor.numpy().tobytes() for name, tensor in to_checkpoint(state).tensors.items()}
 
 
 def test_whole_parts_are_whole_photographs_bit_for_bit():
     stage, state = block_stage(BlockConfig())
     _, other = block_stage(BlockConfig())
-    assert trained_bits(stage, state) == trained_bits(in_parts(stage, WHOLE), other)
+    assert trained_bits(stage, state) == trained_bits(in_parts(stage, FULL_IMAGE), other)
 
 
 def test_a_block_in_parts_is_stopped_and_continued_with_the_same_bits():
@@ -210,7 +210,7 @@ def test_a_block_in_parts_is_stopped_and_continued_with_the_same_bits():
     stage = in_parts(stage, Crop(0.1, 0.0, 0.7, 1.0))
     _, broken = block_stage(BlockConfig())
     trained_bits(stage, broken, until=17)
-    assert trained_bits(stage, from_saved(to_saved(broken), stage)) == trained_bits(stage, state)
+    assert trained_bits(stage, from_checkpoint(to_checkpoint(broken), stage)) == trained_bits(stage, state)
 
 
 def test_anchors_outside_of_all_parts_do_not_move():
@@ -218,7 +218,7 @@ def test_anchors_outside_of_all_parts_do_not_move():
     before = state.anchors.features.clone()
     positions = state.anchors.positions.clone()
     stage = in_parts(stage, Crop(0.0, 0.0, 0.5, 0.5))
-    for _ in range(WHOLE_EVERY - 1):
+    for _ in range(FULL_IMAGE_EVERY - 1):
         train_step(state, stage)
     seen = torch.zeros(len(before), dtype=torch.bool)
     for camera in stage.images.cameras:

@@ -7,15 +7,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vdgs.config.method import GrowthConfig
+from vdgs.config.method import DensifyConfig
 from vdgs.kernels import cpu
-from vdgs.kernels.kernel_types import Statistics
+from vdgs.kernels.kernel_types import DensificationStats
 from vdgs.model.anchors import Anchors
 from vdgs.training import densification
-from vdgs.training.densification import decide
+from vdgs.training.densification import decide_densification
 
 K = 4
-ALWAYS = GrowthConfig(gate=0.0, levels=1, coarsest_cell=1.0, threshold=1.0)
+ALWAYS = DensifyConfig(gate=0.0, levels=1, coarsest_voxels=1.0, threshold=1.0)
 
 
 def anchors(n: int, seed: int = 0) -> Anchors:
@@ -28,10 +28,10 @@ def anchors(n: int, seed: int = 0) -> Anchors:
     )
 
 
-def statistics(n: int, gradient: float = 10.0, seed: int = 0) -> Statistics:
+def statistics(n: int, gradient: float = 10.0, seed: int = 0) -> DensificationStats:
     g = torch.Generator().manual_seed(seed)
     drawn = torch.ones(n, K)
-    return Statistics(gradient * torch.rand(n, K, generator=g), drawn, torch.ones(n), torch.ones(n))
+    return DensificationStats(gradient * torch.rand(n, K, generator=g), drawn, torch.ones(n), torch.ones(n))
 
 
 def cell_of(points: torch.Tensor, cell: float) -> set[tuple[int, ...]]:
@@ -45,7 +45,7 @@ def test_new_anchors_are_centred_in_empty_cells_that_hold_a_strong_offset(n, see
     stats = statistics(n, seed=seed)
     strong = stats.gradient >= ALWAYS.threshold
     means = before.positions[:, None] + before.offsets * before.log_scales[:, None, :3].exp()
-    added = decide(before, stats, cell, ALWAYS, torch.Generator().manual_seed(seed)).added
+    added = decide_densification(before, stats, cell, ALWAYS, torch.Generator().manual_seed(seed)).added
     new = cell_of(added.positions, cell)
     assert len(new) == len(added)
     assert new.isdisjoint(cell_of(before.positions, cell))
@@ -60,7 +60,7 @@ def test_the_random_keep_follows_its_share():
     before, stats = anchors(20_000), statistics(20_000)
     stats.gradient[:] = 10.0
     before.positions[:, 0] = torch.arange(20_000) * 10.0 - 1e5
-    added = decide(before, stats, 0.2, ALWAYS, torch.Generator().manual_seed(1)).added
+    added = decide_densification(before, stats, 0.2, ALWAYS, torch.Generator().manual_seed(1)).added
     assert 0.48 < len(added) / (20_000 * K) < 0.52
 
 
@@ -72,10 +72,10 @@ def test_features_are_the_elementwise_maximum_of_the_parents():
         log_scales=torch.zeros(2, 6),
     )
     parents.offsets[0, 0, 0], parents.offsets[1, 0, 0] = 5.0, -5.0  # both Gaussians lie at x = 5
-    config = GrowthConfig(gate=0.0, levels=1, coarsest_cell=1.0)
+    config = DensifyConfig(gate=0.0, levels=1, coarsest_voxels=1.0)
     for seed in range(50):
-        stats = Statistics(torch.ones(2, 1), torch.ones(2, 1), torch.ones(2), torch.ones(2))
-        added = decide(parents, stats, 1.0, config, torch.Generator().manual_seed(seed)).added
+        stats = DensificationStats(torch.ones(2, 1), torch.ones(2, 1), torch.ones(2), torch.ones(2))
+        added = decide_densification(parents, stats, 1.0, config, torch.Generator().manual_seed(seed)).added
         if len(added) and bool((added.features[0] >= 0).all()):
             torch.testing.assert_close(added.features[0], parents.features.amax(0))
             return
@@ -87,26 +87,26 @@ def test_what_lies_beyond_the_lattice_does_not_grow():
     stats.gradient[:] = 10.0
     before.positions[0] = 1e9
     before.positions[1] = float("inf")
-    added = decide(before, stats, 1.0, ALWAYS, torch.Generator().manual_seed(0)).added
+    added = decide_densification(before, stats, 1.0, ALWAYS, torch.Generator().manual_seed(0)).added
     assert 0 < len(added) <= K
     assert float(added.positions.abs().max()) < 1000
 
 
 def test_weak_gradients_and_unseen_offsets_grow_nothing():
     before = anchors(30)
-    weak = Statistics(torch.full((30, K), 0.5), torch.ones(30, K), torch.ones(30), torch.ones(30))
-    assert len(decide(before, weak, 1.0, ALWAYS, torch.Generator()).added) == 0
-    gated = GrowthConfig(gate=0.4, interval=100, threshold=0.0)
-    unseen = Statistics(torch.full((30, K), 9.0), torch.full((30, K), 40.0), torch.ones(30), torch.ones(30))
-    assert len(decide(before, unseen, 1.0, gated, torch.Generator()).added) == 0
+    weak = DensificationStats(torch.full((30, K), 0.5), torch.ones(30, K), torch.ones(30), torch.ones(30))
+    assert len(decide_densification(before, weak, 1.0, ALWAYS, torch.Generator()).added) == 0
+    gated = DensifyConfig(gate=0.4, interval=100, threshold=0.0)
+    unseen = DensificationStats(torch.full((30, K), 9.0), torch.full((30, K), 40.0), torch.ones(30), torch.ones(30))
+    assert len(decide_densification(before, unseen, 1.0, gated, torch.Generator()).added) == 0
 
 
 def test_statistics_are_reset_only_where_they_were_judged():
     stats = statistics(2)
     stats.drawn = torch.tensor([[41.0, 40.0, 0.0, 90.0], [1.0, 2.0, 3.0, 41.0]])
     stats.seen = torch.tensor([81.0, 80.0])
-    config = GrowthConfig(gate=0.4, prune_views=0.8, interval=100, levels=0)
-    decide(anchors(2), stats, 1.0, config, torch.Generator())
+    config = DensifyConfig(gate=0.4, prune_view_fraction=0.8, interval=100, levels=0)
+    decide_densification(anchors(2), stats, 1.0, config, torch.Generator())
     assert stats.drawn.tolist() == [[0, 40, 0, 0], [1, 2, 3, 0]]
     assert stats.seen.tolist() == [0, 80]
 
@@ -115,24 +115,24 @@ def test_faint_anchors_go_once_they_were_seen_often_enough():
     stats = statistics(3)
     stats.seen = torch.tensor([100.0, 100.0, 10.0])
     stats.opacity = torch.tensor([0.4, 0.6, 0.0])  # limit 0.005 per view
-    config = GrowthConfig(levels=0, interval=100)
-    decision = decide(anchors(3), stats, 1.0, config, torch.Generator())
+    config = DensifyConfig(levels=0, interval=100)
+    decision = decide_densification(anchors(3), stats, 1.0, config, torch.Generator())
     assert decision.kept.tolist() == [False, True, True]
     assert decision.pruned == 1
 
 
 def test_the_budget_serves_the_strongest_first():
     before, stats = anchors(200), statistics(200)
-    free = decide(before, statistics(200), 0.1, ALWAYS, torch.Generator().manual_seed(0)).added
-    config = GrowthConfig(gate=0.0, levels=1, coarsest_cell=1.0, threshold=1.0, max_anchors=210)
-    capped = decide(before, stats, 0.1, config, torch.Generator().manual_seed(0)).added
+    free = decide_densification(before, statistics(200), 0.1, ALWAYS, torch.Generator().manual_seed(0)).added
+    config = DensifyConfig(gate=0.0, levels=1, coarsest_voxels=1.0, threshold=1.0, max_anchors=210)
+    capped = decide_densification(before, stats, 0.1, config, torch.Generator().manual_seed(0)).added
     assert len(free) > 10
     assert len(capped) == 10
     assert cell_of(capped.positions, 0.1) <= cell_of(free.positions, 0.1)
 
 
 def test_a_view_is_counted_where_it_was_drawn():
-    stats = Statistics.zeros(5, K)
+    stats = DensificationStats.zeros(5, K)
     visible = torch.tensor([1, 3])
     source = torch.tensor([0, 2, K + 1], dtype=torch.int32)  # anchor 1: offsets 0, 2; anchor 3: offset 1
     gradient = torch.tensor([[3.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
@@ -147,9 +147,11 @@ def test_a_view_is_counted_where_it_was_drawn():
 
 def test_surroundings_occupy_cells_but_neither_grow_nor_go():
     before = anchors(60)
-    free = decide(before, statistics(60), 1.0, ALWAYS, torch.Generator().manual_seed(0))
+    free = decide_densification(before, statistics(60), 1.0, ALWAYS, torch.Generator().manual_seed(0))
     neighbours = torch.cat([free.added.positions[::2], torch.full((1, 3), 1e9)])  # one is beyond the lattice
-    decision = decide(before, statistics(60), 1.0, ALWAYS, torch.Generator().manual_seed(0), surroundings=neighbours)
+    decision = decide_densification(
+        before, statistics(60), 1.0, ALWAYS, torch.Generator().manual_seed(0), frozen_positions=neighbours
+    )
     assert torch.equal(decision.added.positions, free.added.positions[1::2])
     assert torch.equal(decision.added.features, free.added.features[1::2])
     assert len(decision.kept) == 60
@@ -157,21 +159,21 @@ def test_surroundings_occupy_cells_but_neither_grow_nor_go():
 
 def test_new_anchors_stay_where_they_may_be_and_no_budget_is_spent_elsewhere():
     before, coins = anchors(200), torch.Generator
-    config = GrowthConfig(gate=0.0, levels=2, coarsest_cell=1.0, threshold=1.0)
+    config = DensifyConfig(gate=0.0, levels=2, coarsest_voxels=1.0, threshold=1.0)
 
     def east(places: torch.Tensor) -> torch.Tensor:
         return places[:, 0] >= 0
 
-    free = decide(before, statistics(200), 0.5, config, coins().manual_seed(0)).added
-    held = decide(before, statistics(200), 0.5, config, coins().manual_seed(0), may_hold=east).added
+    free = decide_densification(before, statistics(200), 0.5, config, coins().manual_seed(0)).added
+    held = decide_densification(before, statistics(200), 0.5, config, coins().manual_seed(0), growth_mask=east).added
     assert torch.equal(held.positions, free.positions[east(free.positions)])
     assert 0 < len(held) < len(free)
-    budget = GrowthConfig(gate=0.0, levels=2, coarsest_cell=1.0, threshold=1.0, max_anchors=220)
-    few = decide(before, statistics(200), 0.5, budget, coins().manual_seed(0), may_hold=east).added
+    budget = DensifyConfig(gate=0.0, levels=2, coarsest_voxels=1.0, threshold=1.0, max_anchors=220)
+    few = decide_densification(before, statistics(200), 0.5, budget, coins().manual_seed(0), growth_mask=east).added
     assert len(few) == 20
     assert bool(east(few.positions).all())
-    none = decide(
-        before, statistics(200), 0.5, config, coins().manual_seed(0), may_hold=lambda places: places[:, 0] > 1e6
+    none = decide_densification(
+        before, statistics(200), 0.5, config, coins().manual_seed(0), growth_mask=lambda places: places[:, 0] > 1e6
     )
     assert len(none.added) == 0
 
@@ -180,10 +182,10 @@ def test_the_order_of_anchors_does_not_decide_where_new_ones_come(monkeypatch):
     monkeypatch.setattr(densification, "_random", lambda index, count, generator: torch.ones(len(index)))
     before, stats = anchors(80), statistics(80)
     order = torch.randperm(80, generator=torch.Generator().manual_seed(1))
-    config = GrowthConfig(gate=0.0, levels=3, coarsest_cell=4.0, threshold=1.0)
-    turned = Statistics(**{name: tensor[order] for name, tensor in stats.tensors().items()})
-    moved = decide(before.select(order), turned, 1.0, config, torch.Generator()).added
-    added = decide(before, stats, 1.0, config, torch.Generator()).added
+    config = DensifyConfig(gate=0.0, levels=3, coarsest_voxels=4.0, threshold=1.0)
+    turned = DensificationStats(**{name: tensor[order] for name, tensor in stats.tensors().items()})
+    moved = decide_densification(before.select(order), turned, 1.0, config, torch.Generator()).added
+    added = decide_densification(before, stats, 1.0, config, torch.Generator()).added
     assert len(added) > 50
     assert torch.equal(moved.positions, added.positions)
     assert torch.equal(moved.features, added.features)

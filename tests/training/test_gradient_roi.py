@@ -11,11 +11,11 @@ from support.block_training import block_stage, coarse
 from support.checkerboard import Photographs
 from support.rasterize_scenes import make_scene, splats_of
 from vdgs.config.method import BlockConfig
-from vdgs.kernels import choose
+from vdgs.kernels import get_backend
 from vdgs.kernels.kernel_types import Splats
-from vdgs.training import Stage, Surroundings, TrainingState, start_state, train_step, training_loop
+from vdgs.training import FrozenAnchors, TrainingProblem, TrainingState, initial_state, train_step, training_loop
 from vdgs.training.crops import Crop
-from vdgs.training.gradient_roi import box_reached
+from vdgs.training.gradient_roi import splat_bounds
 
 SCENES = {
     "ordinary": make_scene(40, 61, 47),
@@ -32,8 +32,8 @@ def test_the_box_holds_every_pixel_that_a_splat_changes(name):
     for i in range(len(splats.depths)):
         one = Splats(*(getattr(splats, field)[i : i + 1] for field in ("means_px", "conics", "depths", "colours")),
                      splats.opacities[i : i + 1])  # fmt: skip
-        alpha = choose(torch.device("cpu")).rasterise(one, background, scene.width, scene.height).alpha
-        box = box_reached(one, scene.width, scene.height)
+        alpha = get_backend(torch.device("cpu")).rasterize(one, background, scene.width, scene.height).alpha
+        box = splat_bounds(one, scene.width, scene.height)
         if box is None:
             assert not alpha.any()
             continue
@@ -47,10 +47,10 @@ def test_the_box_holds_every_pixel_that_a_splat_changes(name):
 def test_splats_that_are_not_drawn_open_no_box():
     splats, _ = splats_of([each.detach().clone() for each in SCENES["ordinary"].tensors])
     faint = replace(splats, opacities=torch.full_like(splats.opacities, 1e-3))
-    assert box_reached(faint, 61, 47) is None
+    assert splat_bounds(faint, 61, 47) is None
     lost = replace(splats, means_px=torch.full_like(splats.means_px, torch.nan))
-    assert box_reached(lost, 61, 47) is None
-    assert box_reached(Splats(*(getattr(splats, name)[:0] for name in vars(splats))), 61, 47) is None
+    assert splat_bounds(lost, 61, 47) is None
+    assert splat_bounds(Splats(*(getattr(splats, name)[:0] for name in vars(splats))), 61, 47) is None
 
 
 @dataclass
@@ -72,7 +72,7 @@ class Masked(Photographs):
         return image, mask
 
 
-def step(monkeypatch: pytest.MonkeyPatch, stage: Stage, own: bool, narrowing: bool) -> Stepped:
+def step(monkeypatch: pytest.MonkeyPatch, stage: TrainingProblem, own: bool, narrowing: bool) -> Stepped:
     """The westernmost anchors, small, are the block; the others strew their Gaussians far over it and beyond."""
     anchors, decoder = coarse()
     west = anchors.positions[:, 0] < -2.6
@@ -80,19 +80,19 @@ def step(monkeypatch: pytest.MonkeyPatch, stage: Stage, own: bool, narrowing: bo
     small = replace(small, log_scales=torch.full_like(small.log_scales, -2.0))
     others = anchors.select(~west)
     others = replace(others, offsets=8 * others.offsets)
-    stage = replace(stage, frozen_decoder=not own, surroundings=Surroundings(others, decoder.copy()))
-    state, drawn = start_state(small, decoder, stage), []
+    stage = replace(stage, frozen_decoder=not own, surroundings=FrozenAnchors(others, decoder.copy()))
+    state, drawn = initial_state(small, decoder, stage), []
     with monkeypatch.context() as patch:
         if not narrowing:
-            patch.setattr(training_loop, "narrow", lambda stage, splats, camera, box: box)
-        draw = training_loop.draw_view
-        patch.setattr(training_loop, "draw_view", lambda *given: drawn.append(given) or draw(*given))
+            patch.setattr(training_loop, "crop_to_gradient_support", lambda stage, splats, camera, box: box)
+        draw = training_loop.render_for_training
+        patch.setattr(training_loop, "render_for_training", lambda *given: drawn.append(given) or draw(*given))
         train_step(state, stage)
     ((_, camera, _, around),) = drawn
     return Stepped(state, camera.width * camera.height, len(around.depths))
 
 
-def stages() -> dict[str, Stage]:
+def stages() -> dict[str, TrainingProblem]:
     stage, _ = block_stage(BlockConfig())
     return {
         "whole": stage,
@@ -110,8 +110,8 @@ def test_a_step_moves_a_block_as_if_it_had_drawn_all(monkeypatch, name, own):
     ours, theirs = found.state, expected.state
     # Adam's first moments are a tenth of the gradients.
     for one, other in (
-        *((ours.optimiser.anchors.first[name], each) for name, each in theirs.optimiser.anchors.first.items()),
-        *((ours.optimiser.decoder.first[name], each) for name, each in theirs.optimiser.decoder.first.items()),
+        *((ours.optimizer.anchors.first[name], each) for name, each in theirs.optimizer.anchors.first.items()),
+        *((ours.optimizer.decoder.first[name], each) for name, each in theirs.optimizer.decoder.first.items()),
         (ours.statistics.gradient, theirs.statistics.gradient),
     ):  # fmt: skip
         assert torch.allclose(one, other, rtol=1e-3, atol=1e-5 * float(other.abs().max()))
@@ -123,7 +123,7 @@ def test_a_step_moves_a_block_as_if_it_had_drawn_all(monkeypatch, name, own):
 def test_a_block_with_nothing_around_it_draws_all(monkeypatch):
     stage, state = block_stage(BlockConfig())
     nothing = stage.surroundings.anchors.select(torch.zeros(0, dtype=torch.int64))
-    camera, drawn, draw = stage.images.camera(0), [], training_loop.draw_view
-    monkeypatch.setattr(training_loop, "draw_view", lambda *given: drawn.append(given[1]) or draw(*given))
-    train_step(state, replace(stage, surroundings=Surroundings(nothing, state.decoder)))
+    camera, drawn, draw = stage.images.camera(0), [], training_loop.render_for_training
+    monkeypatch.setattr(training_loop, "render_for_training", lambda *given: drawn.append(given[1]) or draw(*given))
+    train_step(state, replace(stage, surroundings=FrozenAnchors(nothing, state.decoder)))
     assert [(each.width, each.height) for each in drawn] == [(camera.width, camera.height)]

@@ -9,9 +9,9 @@ import torch
 
 from support.block_training import CONFIG, block_stage
 from vdgs.config.method import BlockConfig, CompensationConfig
-from vdgs.training import TrainingState, to_saved
-from vdgs.training.per_anchor_tensors import remap, remap_rows
-from vdgs.training.weight_averaging import Average
+from vdgs.training import TrainingState, to_checkpoint
+from vdgs.training.per_anchor_tensors import index_anchors, index_rows
+from vdgs.training.weight_averaging import ModelAverage
 
 
 @pytest.mark.parametrize("pruned", [0, 3])
@@ -25,7 +25,7 @@ def test_rows_of_old_and_new_are_kept(pruned, added):
     order = torch.randperm(10 + added, generator=generator)
     for rows in (kept, order):
         tensors = dict(before)
-        remap_rows(tensors, more, rows)
+        index_rows(tensors, more, rows)
         for name, tensor in tensors.items():
             assert torch.equal(tensor, torch.cat([before[name], more[name]])[rows])
 
@@ -34,7 +34,7 @@ def full_state() -> TrainingState:
     """A state of a block that keeps everything there is, every row of everything different."""
     training = replace(CONFIG, compensation=CompensationConfig(enabled=True))
     _, state = block_stage(BlockConfig(), training=training)
-    state.average = Average.of(state.anchors, state.decoder)
+    state.average = ModelAverage.of(state.anchors, state.decoder)
     for group in state.groups().values():
         for place, tensor in enumerate(group.values()):
             tensor.copy_(torch.arange(tensor.numel()).reshape(tensor.shape) + 0.5 * place)
@@ -46,7 +46,7 @@ def test_nothing_that_has_a_row_for_each_anchor_is_left_out():
     state = full_state()
     n, known = len(state.anchors), {f"{name}.{key}" for name, group in state.groups().items() for key in group}
     assert n > 50  # more than any dimension of the decoder
-    found = {name for name, tensor in to_saved(state).tensors.items() if tensor.ndim and tensor.shape[0] == n}
+    found = {name for name, tensor in to_checkpoint(state).tensors.items() if tensor.ndim and tensor.shape[0] == n}
     assert found == known
 
 
@@ -56,7 +56,7 @@ def test_all_that_is_kept_moves_with_its_anchor():
     before = {name: {key: t.clone() for key, t in group.items()} for name, group in state.groups().items()}
     added = state.anchors.select(torch.tensor([3, 1]))
     order = torch.randperm(n + 2, generator=torch.Generator().manual_seed(0))[:-5]
-    remap(state, {"anchors": added.tensors()}, 2, order)
+    index_anchors(state, {"anchors": added.tensors()}, 2, order)
     for name, group in state.groups().items():
         for key, tensor in group.items():
             old = before[name][key]

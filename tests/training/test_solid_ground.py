@@ -13,15 +13,15 @@ from hypothesis import strategies as st
 
 from support.block_training import block_stage
 from support.checkerboard import Photographs
-from vdgs.config.method import BlockConfig, GrowthConfig, LossConfig
-from vdgs.geometry.camera import NEAR, Camera
+from vdgs.config.method import BlockConfig, DensifyConfig, LossConfig
+from vdgs.geometry.camera import NEAR_PLANE, Camera
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.ground import BELOW_HORIZON_DEG, below_horizon
 from vdgs.model.renderer import decode_view, render
-from vdgs.model.scale_bounds import REACH, SPAN, SPREAD, largest_log_scales
-from vdgs.training import Stage, train
+from vdgs.model.scale_bounds import MAX_IMAGE_FRACTION, MAX_OFFSET_FACTOR, MAX_SIGMA, max_log_scales
+from vdgs.training import TrainingProblem, train
 from vdgs.training.target import background_at
-from vdgs.visibility.frustum import project
+from vdgs.visibility.frustum import project_points
 
 FOCAL, WIDTH, HEIGHT = 100.0, 200, 160
 
@@ -40,14 +40,14 @@ def camera_at(x: float = 0.0, height: float = 20.0, tilt: float = 0.0) -> Camera
 @given(seed=st.integers(0, 1000), tilt=st.floats(-1.5, 1.5))
 def test_points_fall_where_the_camera_says(seed, tilt):
     points, camera = np.random.default_rng(seed).uniform(-30, 30, (200, 3)), camera_at(tilt=tilt)
-    seen = project(torch.from_numpy(points), camera)
-    assert np.array_equal(seen.inside.numpy(), camera.sees(points))
+    seen = project_points(torch.from_numpy(points), camera)
+    assert np.array_equal(seen.inside.numpy(), camera.in_frustum(points))
     pixels, depth = camera.project(points)
     inside = seen.inside.numpy()
     assert np.allclose(np.stack([seen.column, seen.row], axis=1)[inside], pixels[inside])
     assert np.allclose(seen.depth, depth)
     assert np.allclose(seen.distance, np.linalg.norm(points - camera.position, axis=1))
-    assert depth[inside].min(initial=1.0) > NEAR
+    assert depth[inside].min(initial=1.0) > NEAR_PLANE
 
 
 @settings(max_examples=20)
@@ -76,11 +76,11 @@ class Grey(Photographs):
 def light_through(loss: LossConfig) -> float:
     """The median of 1 - alpha, of a model that was trained before the colour of grey."""
     stage, state = block_stage(BlockConfig())
-    config = replace(stage.config, iterations=300, loss=loss, growth=GrowthConfig(levels=0, start=10_000))
+    config = replace(stage.config, iterations=300, loss=loss, growth=DensifyConfig(levels=0, start=10_000))
     photographs, grey = Grey(), (128 / 255,) * 3
     stage = replace(stage, config=config, background=grey, surroundings=None, images=photographs)
     train(state, stage, stop=lambda: False, after_step=lambda *_: None)
-    model = state.model(stage.voxel, grey)
+    model = state.model(stage.voxel_size, grey)
     return float((1.0 - render(model, photographs.camera(0)).alpha.clamp(0, 1)).quantile(0.5))
 
 
@@ -88,14 +88,14 @@ def test_ground_becomes_opaque_although_the_background_has_its_colour():
     """Without backgrounds of random colour light shines through, with them nearly none does."""
     board = light_through(LossConfig())
     assert board < 0.02
-    assert light_through(LossConfig(background_noise=0.0)) > 3 * board
+    assert light_through(LossConfig(random_background=0.0)) > 3 * board
 
 
 def test_backgrounds_are_of_all_colours_the_same_for_a_seed_and_no_others_without_noise():
     stage, _ = block_stage(BlockConfig())
 
     def colours(share: float) -> torch.Tensor:
-        loss = LossConfig(background_noise=share)
+        loss = LossConfig(random_background=share)
         changed = replace(stage, config=replace(stage.config, loss=loss), background=(0.2, 0.5, 0.8))
         return torch.stack([background_at(changed, iteration) for iteration in range(500)])
 
@@ -120,48 +120,51 @@ def test_no_camera_that_holds_a_place_is_veiled_from_there(seed):
     rng = np.random.default_rng(seed)
     points = torch.from_numpy(rng.uniform(-15, 15, (300, 3)) * [1, 1, 0.3])
     cameras = [camera_at(x, height, tilt) for x, height, tilt in rng.uniform([-10, 8, -0.5], [10, 30, 0.5], (5, 3))]
-    diameter = 2 * REACH * largest_log_scales(points, cameras).exp().numpy()
+    diameter = 2 * MAX_SIGMA * max_log_scales(points, cameras).exp().numpy()
     held = np.zeros(len(points), bool)
     longest = np.zeros(len(points))
     for camera in cameras:
-        inside = camera.sees(points.numpy())
+        inside = camera.in_frustum(points.numpy())
         depth = camera.project(points.numpy())[1]
         longest[inside] = np.maximum(longest, diameter * FOCAL / depth)[inside]
         held |= inside
     assert held.sum() > 10
-    assert longest[held].max() <= SPAN * WIDTH * (1 + 1e-6)
-    assert longest[held].min() > SPAN * WIDTH * 0.999  # no smaller than it must be
+    assert longest[held].max() <= MAX_IMAGE_FRACTION * WIDTH * (1 + 1e-6)
+    assert longest[held].min() > MAX_IMAGE_FRACTION * WIDTH * 0.999  # no smaller than it must be
 
 
 def test_what_no_camera_holds_is_bounded_by_the_nearest_and_nothing_without_cameras():
     beside = torch.tensor([[500.0, 0.0, 20.0]])
-    bound = largest_log_scales(beside, [camera_at(), camera_at(100.0)]).exp()
-    assert float(bound) == pytest.approx(400.0 * WIDTH / FOCAL * SPAN / (2 * REACH), rel=1e-5)
-    assert largest_log_scales(beside, []).tolist() == [math.inf]
+    bound = max_log_scales(beside, [camera_at(), camera_at(100.0)]).exp()
+    assert float(bound) == pytest.approx(400.0 * WIDTH / FOCAL * MAX_IMAGE_FRACTION / (2 * MAX_SIGMA), rel=1e-5)
+    assert max_log_scales(beside, []).tolist() == [math.inf]
 
 
 def test_an_anchor_in_the_centre_of_a_camera_has_a_size_that_can_be_trained():
-    assert largest_log_scales(torch.tensor([[0.0, 0.0, 20.0]]), [camera_at()]).isfinite().all()
+    assert max_log_scales(torch.tensor([[0.0, 0.0, 20.0]]), [camera_at()]).isfinite().all()
 
 
 def test_training_leaves_no_gaussian_larger_than_its_bound_nor_far_from_its_anchor():
     """Scales begin too large, of Gaussians and of the unit of their offsets; anchors that grow are bounded too."""
     stage, state = block_stage(BlockConfig())
-    growth = GrowthConfig(interval=10, statistics_from=0, start=10, until=0.8, threshold=1e-6, gate=0.05)
+    growth = DensifyConfig(interval=10, stats_start=0, start=10, until=0.8, threshold=1e-6, gate=0.05)
     config = replace(stage.config, iterations=47, average=0.1, growth=growth)
     cameras = Photographs().cameras
-    stage = replace(stage, config=config, largest=lambda places: largest_log_scales(places, cameras) - 3.0)
-    state.largest = stage.largest_at(state.anchors.positions)
+    stage = replace(stage, config=config, max_log_scale=lambda places: max_log_scales(places, cameras) - 3.0)
+    state.max_log_scale = stage.max_log_scale_at(state.anchors.positions)
     state.anchors.log_scales.add_(4.0)
     before = len(state.anchors)
     train(state, stage, stop=lambda: False, after_step=lambda *_: None)
     anchors, decoder = state.result()
     assert len(anchors) != before
-    bound = largest_log_scales(anchors.positions, cameras) - 3.0
-    for scales, most in ((anchors.log_scales[:, :3], bound + math.log(SPREAD)), (anchors.log_scales[:, 3:], bound)):
+    bound = max_log_scales(anchors.positions, cameras) - 3.0
+    for scales, most in (
+        (anchors.log_scales[:, :3], bound + math.log(MAX_OFFSET_FACTOR)),
+        (anchors.log_scales[:, 3:], bound),
+    ):
         assert (scales <= most[:, None] + 1e-5).all()
         assert (scales > most[:, None] - 0.5).any()
-    model = AnchorModel(anchors=anchors, decoder=decoder, voxel=stage.voxel, background=(0.0, 0.0, 0.0))
+    model = AnchorModel(anchors=anchors, decoder=decoder, voxel_size=stage.voxel_size, background=(0.0, 0.0, 0.0))
     for camera in cameras:
         rows, splats = decode_view(model, camera)
         of = rows[splats.source.long() // anchors.offsets.shape[1]]
@@ -171,5 +174,5 @@ def test_training_leaves_no_gaussian_larger_than_its_bound_nor_far_from_its_anch
 
 def test_an_unbounded_stage_changes_no_scale():
     stage, state = block_stage(BlockConfig())
-    assert isinstance(stage, Stage)
-    assert torch.equal(state.largest, torch.full((len(state.anchors),), math.inf))
+    assert isinstance(stage, TrainingProblem)
+    assert torch.equal(state.max_log_scale, torch.full((len(state.anchors),), math.inf))

@@ -10,18 +10,18 @@ from hypothesis import strategies as st
 
 from support.checkerboard import Photographs
 from support.small_training import BLACK, CONFIG, bits, run, stage, start
-from vdgs.config.method import AnchorConfig, RateConfig
+from vdgs.config.method import AnchorConfig, LearningRateConfig
 from vdgs.errors import TrainingDiverged, VdgsError
 from vdgs.kernels import cpu
-from vdgs.kernels.cpu.extension import set_threads, threads
+from vdgs.kernels.cpu.extension import get_num_threads, set_num_threads
 from vdgs.model.anchor_model import AnchorModel, ModelMetadata
-from vdgs.model.initialization.initialize import initial_anchors
+from vdgs.model.initialization.initialize import initialize_anchors
 from vdgs.model.renderer import render
-from vdgs.system.checkpoints import load_newest, save_state
-from vdgs.training import downscale_at, from_saved, to_saved, train_step, view_at
+from vdgs.system.checkpoints import load_latest_checkpoint, save_checkpoint
+from vdgs.training import downscale_at, from_checkpoint, to_checkpoint, train_step, view_at
 from vdgs.training.crops import Crop, crop_at
-from vdgs.training.optimizer import rates_at
-from vdgs.training.training_step import coast_anchors
+from vdgs.training.optimizer import learning_rates_at
+from vdgs.training.training_step import step_unseen_anchors
 
 pytestmark = pytest.mark.xdist_group("training")
 
@@ -33,11 +33,11 @@ def unbroken():
 
 def test_training_learns_the_place():
     state = run(start(longer := replace(CONFIG, iterations=400)), stage(longer))
-    model = AnchorModel(anchors=state.anchors, decoder=state.decoder, voxel=0.4, background=BLACK)
+    model = AnchorModel(anchors=state.anchors, decoder=state.decoder, voxel_size=0.4, background=BLACK)
     photographs = Photographs()
     errors = []
     for index in range(8):
-        picture = render(model, photographs.camera(index), image=index).image
+        picture = render(model, photographs.camera(index), image_index=index).image
         errors.append(float(((picture - photographs.get(index)[0].float() / 255) ** 2).mean()))
     before = float(torch.var(photographs.get(0)[0].float() / 255))
     assert np.mean(errors) < 0.2 * before
@@ -49,20 +49,20 @@ def test_a_stopped_and_continued_run_has_the_same_bits(unbroken, tmp_path):
     for stop_at in (1, 13, 20, 33, 59):
         run(state, stage(), until=stop_at)
         assert state.iteration == stop_at
-        save_state(tmp_path, to_saved(state))
-        saved, _ = load_newest(tmp_path)
+        save_checkpoint(tmp_path, to_checkpoint(state))
+        saved, _ = load_latest_checkpoint(tmp_path)
         assert saved is not None
-        state = from_saved(saved, stage())
+        state = from_checkpoint(saved, stage())
     assert bits(run(state, stage())) == bits(unbroken)
 
 
 def test_the_number_of_threads_changes_no_bit(unbroken):
-    before = threads()
+    before = get_num_threads()
     try:
-        set_threads(1 if before > 1 else 3)
+        set_num_threads(1 if before > 1 else 3)
         assert bits(run(start(), stage())) == bits(unbroken)
     finally:
-        set_threads(before)
+        set_num_threads(before)
 
 
 def test_another_seed_is_another_run(unbroken):
@@ -101,7 +101,7 @@ def test_the_resolution_schedule():
 
 def test_parameters_state_and_statistics_stay_aligned(unbroken):
     n = len(unbroken.anchors)
-    tensors = {name: t for name, t in to_saved(unbroken).tensors.items() if "decoder" not in name}
+    tensors = {name: t for name, t in to_checkpoint(unbroken).tensors.items() if "decoder" not in name}
     assert {t.shape[0] for t in tensors.values()} == {n}
 
 
@@ -117,7 +117,7 @@ def test_anchors_that_no_camera_sees_keep_their_bits():
 
 @pytest.mark.parametrize("crops", [None, (Crop(0.0, 0.1, 0.5, 0.6),) * 8])
 def test_anchors_are_seen_by_the_pictures_that_hold_their_centres(crops):
-    config = replace(CONFIG, growth=replace(CONFIG.growth, statistics_from=0, start=1000))
+    config = replace(CONFIG, growth=replace(CONFIG.growth, stats_start=0, start=1000))
     seen_by = replace(stage(config), crops=crops)
     state = start(config)
     expected = torch.zeros(len(state.anchors))
@@ -125,7 +125,7 @@ def test_anchors_are_seen_by_the_pictures_that_hold_their_centres(crops):
         camera = Photographs().camera(view_at(iteration, 8, 0), downscale_at(iteration, config))
         crop = crop_at(crops, 0, iteration)
         part = camera.cropped(*crop.pixels(camera.width, camera.height))
-        expected += torch.from_numpy(part.sees(state.anchors.positions.double().numpy()))
+        expected += torch.from_numpy(part.in_frustum(state.anchors.positions.double().numpy()))
         train_step(state, seen_by)
     assert torch.equal(state.statistics.seen, expected)
     assert 0 < float(expected.mean()) < 12
@@ -158,13 +158,15 @@ def test_transparent_anchors_go_where_they_are_seen_and_stay_just_outside_of_all
 @pytest.mark.parametrize("first_seen", [0, 10_000])
 def test_the_first_step_of_an_anchor_is_the_same_whenever_it_is_seen_first(first_seen):
     """An anchor that was never seen keeps everything; seen first, it moves as it would have at once."""
-    config = replace(CONFIG, iterations=20_000, rates=RateConfig(features=(0.01, 0.01), log_scales=(0.01, 0.01)))
+    config = replace(
+        CONFIG, iterations=20_000, rates=LearningRateConfig(features=(0.01, 0.01), log_scales=(0.01, 0.01))
+    )
     state = start(config)
     state.iteration = first_seen
     before = state.anchors.select(torch.arange(len(state.anchors)))
     one_view = replace(stage(replace(config, growth=replace(config.growth, until=0.0))), image_count=1)
     train_step(state, one_view)
-    updates = state.optimiser.updates
+    updates = state.optimizer.updates
     assert set(updates.tolist()) == {0, 1}
     for name, rate in (("features", 0.01), ("log_scales", 0.01)):
         moved = (getattr(state.anchors, name) - getattr(before, name)).abs()
@@ -174,19 +176,19 @@ def test_the_first_step_of_an_anchor_is_the_same_whenever_it_is_seen_first(first
 
 def test_dense_adam_moves_what_a_view_does_not_show_along_its_moments():
     """All anchors, one photograph a step: parameters and moments are those of torch's Adam on whole tensors."""
-    config = replace(CONFIG, adam="dense", growth=replace(CONFIG.growth, until=0.0), resolutions=((0.0, 1),))
+    config = replace(CONFIG, optimizer="dense", growth=replace(CONFIG.growth, until=0.0), resolutions=((0.0, 1),))
     state, given = start(config), replace(stage(config), frozen_decoder=True)
     far = state.anchors.positions[:, 0] > 2.5  # the last views alone show it
     before = state.anchors.select(far)
     for _ in range(9):
         train_step(state, given)
-    assert set(state.optimiser.updates.tolist()) == {9}
-    last, moments = state.anchors.select(torch.arange(len(far))), state.optimiser.anchors
+    assert set(state.optimizer.updates.tolist()) == {9}
+    last, moments = state.anchors.select(torch.arange(len(far))), state.optimizer.anchors
     first = {name: t.clone() for name, t in moments.first.items()}
     second = {name: t.clone() for name, t in moments.second.items()}
     nothing = torch.empty(0, dtype=torch.int64)
-    rates = rates_at(config.rates, 9 / config.iterations)
-    coast_anchors(state.anchors, nothing, state.optimiser.anchor_states(state.anchors, rates, 1.0), 10)
+    rates = learning_rates_at(config.rates, 9 / config.iterations)
+    step_unseen_anchors(state.anchors, nothing, state.optimizer.anchor_states(state.anchors, rates, 1.0), 10)
     for name in ("features", "offsets", "log_scales"):
         m, v = 0.9 * first[name], 0.999 * second[name]
         step = rates[name] * (m / (1 - 0.9**10)) / ((v / (1 - 0.999**10)).sqrt() + 1e-15)
@@ -198,9 +200,9 @@ def test_dense_adam_moves_what_a_view_does_not_show_along_its_moments():
 
 def test_visible_and_dense_adam_are_one_where_all_is_seen():
     """The first step moves what it shows, and nothing else has a moment to follow."""
-    states = [start(replace(CONFIG, adam=adam)) for adam in ("visible", "dense")]
+    states = [start(replace(CONFIG, optimizer=adam)) for adam in ("visible", "dense")]
     for state, adam in zip(states, ("visible", "dense"), strict=True):
-        train_step(state, stage(replace(CONFIG, adam=adam)))
+        train_step(state, stage(replace(CONFIG, optimizer=adam)))
     visible, dense = (bits(state) for state in states)
     assert {name for name in visible if visible[name] != dense[name]} == {"updates.anchors"}
 
@@ -218,7 +220,7 @@ METADATA = ModelMetadata(version="0.1.0", iterations=20, key="0123", block=2, vi
 
 def test_a_model_is_loaded_as_it_was_saved(unbroken, tmp_path):
     model = AnchorModel(
-        anchors=unbroken.anchors, decoder=unbroken.decoder, voxel=0.4, background=BLACK, metadata=METADATA
+        anchors=unbroken.anchors, decoder=unbroken.decoder, voxel_size=0.4, background=BLACK, metadata=METADATA
     )
     model.save(tmp_path / "model.safetensors")
     again = AnchorModel.load(tmp_path / "model.safetensors")
@@ -233,7 +235,7 @@ def test_a_damaged_model_is_refused(unbroken, tmp_path, damage):
     anchors = unbroken.anchors
     if damage == "nan":
         anchors = replace(anchors, features=anchors.features * float("nan"))
-    AnchorModel(anchors=anchors, decoder=unbroken.decoder, voxel=0.4, background=BLACK).save(path)
+    AnchorModel(anchors=anchors, decoder=unbroken.decoder, voxel_size=0.4, background=BLACK).save(path)
     if damage == "truncate":
         path.write_bytes(path.read_bytes()[:1000])
     elif damage == "text":
@@ -247,7 +249,7 @@ def test_a_damaged_model_is_refused(unbroken, tmp_path, damage):
 def test_anchors_start_on_the_voxel_grid():
     points = np.array([[0.1, 0.0, 0.0], [0.2, 0.0, 0.0], [5.0, 5.0, 5.0]])
     colours = np.array([[255, 0, 0], [0, 0, 0], [0, 255, 0]], np.uint8)
-    anchors, voxel = initial_anchors(points, colours, [], AnchorConfig(voxel=1.0, colour_start=True))
+    anchors, voxel = initialize_anchors(points, colours, [], AnchorConfig(voxel_size=1.0, from_colors=True))
     assert voxel == 1.0
     assert anchors.positions.tolist() == [[0, 0, 0], [5, 5, 5]]
     torch.testing.assert_close(anchors.features[:, :3], torch.tensor([[0.0, -1, -1], [-1, 1, -1]]))
@@ -257,12 +259,12 @@ def test_points_far_from_all_others_start_no_anchor():
     ground = np.random.default_rng(0).uniform(-5, 5, (500, 3)) * [1, 1, 0.02]
     deep = np.array([[0.0, 0.0, -300.0], [0.1, 0.0, -300.0]])
     points, colours = np.concatenate([ground, deep]), np.zeros((502, 3), np.uint8)
-    kept, _ = initial_anchors(points, colours, [], AnchorConfig(voxel=0.1))
+    kept, _ = initialize_anchors(points, colours, [], AnchorConfig(voxel_size=0.1))
     assert float(kept.positions[:, 2].min()) > -1
-    everything, _ = initial_anchors(points, colours, [], AnchorConfig(voxel=0.1, outlier_distance=0.0))
+    everything, _ = initialize_anchors(points, colours, [], AnchorConfig(voxel_size=0.1, outlier_distance=0.0))
     assert float(everything.positions[:, 2].min()) == pytest.approx(-300)
 
 
 def test_one_distinct_point_is_too_few():
     with pytest.raises(VdgsError, match="distinct sparse point"):
-        initial_anchors(np.zeros((4, 3)), np.zeros((4, 3), np.uint8), [], AnchorConfig())
+        initialize_anchors(np.zeros((4, 3)), np.zeros((4, 3), np.uint8), [], AnchorConfig())

@@ -8,43 +8,43 @@ import pytest
 
 pytest.importorskip("viser", reason="viser is not installed (pip install 'vdgs[viewer]')")
 
-from vdgs.viewer.access_control import Door
-from vdgs.viewer.server import invitation
+from vdgs.viewer.access_control import AccessControl
+from vdgs.viewer.server import startup_message
 
 
 def test_the_door_knows_its_own_name():
-    alone = Door("127.0.0.1", None, 8080)
+    alone = AccessControl("127.0.0.1", None, 8080)
     for host in ("localhost:8080", "127.0.0.1:9", "[::1]:8080", "LOCALHOST"):
-        assert alone.refusal("/", {"Host": host}) is None
+        assert alone.deny_reason("/", {"Host": host}) is None
     for host in ("", "localhost.evil.example", "evil.example:8080", "[", "127.0.0.1.evil.example"):
-        assert alone.refusal("/", {"Host": host}) is not None
-    assert alone.refusal("/", {"Host": "localhost:8080", "Origin": "http://localhost:8080"}) is None
-    assert alone.refusal("/", {"Host": "localhost:8080", "Origin": "http://localhost:9999"}) is not None
-    assert alone.refusal("/", {"Host": "localhost:8080", "Origin": "null"}) is not None
-    assert Door("0.0.0.0", "abc", 7).address() == "http://localhost:7/?token=abc"
-    guarded = Door("0.0.0.0", "abc", 7)
-    assert guarded.refusal("/?token=abc", {"Host": "x"}) is None
-    assert guarded.refusal("/?token=ab%C3%A9", {"Host": "x"}) is not None
-    assert guarded.refusal("/", {"Host": "x", "Cookie": "vdgs_view_8=abc"}) is not None
-    assert guarded.refusal("/", {"Host": "x", "Cookie": 'a=b; vdgs_view_7="abc"'}) is None
+        assert alone.deny_reason("/", {"Host": host}) is not None
+    assert alone.deny_reason("/", {"Host": "localhost:8080", "Origin": "http://localhost:8080"}) is None
+    assert alone.deny_reason("/", {"Host": "localhost:8080", "Origin": "http://localhost:9999"}) is not None
+    assert alone.deny_reason("/", {"Host": "localhost:8080", "Origin": "null"}) is not None
+    assert AccessControl("0.0.0.0", "abc", 7).address() == "http://localhost:7/?token=abc"
+    guarded = AccessControl("0.0.0.0", "abc", 7)
+    assert guarded.deny_reason("/?token=abc", {"Host": "x"}) is None
+    assert guarded.deny_reason("/?token=ab%C3%A9", {"Host": "x"}) is not None
+    assert guarded.deny_reason("/", {"Host": "x", "Cookie": "vdgs_view_8=abc"}) is not None
+    assert guarded.deny_reason("/", {"Host": "x", "Cookie": 'a=b; vdgs_view_7="abc"'}) is None
 
 
 def test_others_are_told_an_address_that_they_can_use(monkeypatch):
     monkeypatch.setattr(socket, "gethostname", lambda: "Drone-7.lab")
-    everyone = Door("0.0.0.0", "abc", 7)
-    said = "\n".join(invitation("merged model", everyone))
+    everyone = AccessControl("0.0.0.0", "abc", 7)
+    said = "\n".join(startup_message("merged model", everyone))
     assert said.startswith("merged model: http://localhost:7/?token=abc\n")
     assert "http://Drone-7.lab:7/?token=abc" in said
     # Browsers write names small; the page's own socket comes with its origin.
     own = {"Host": "drone-7.lab:7", "Origin": "http://drone-7.lab:7"}
-    assert everyone.refusal("/?token=abc", own) is None
-    assert everyone.refusal("/", {**own, "Cookie": "vdgs_view_7=abc"}) is None
-    assert everyone.refusal("/", own) is not None
-    assert everyone.refusal("/?token=abc", {**own, "Origin": "http://evil.example"}) is not None
+    assert everyone.deny_reason("/?token=abc", own) is None
+    assert everyone.deny_reason("/", {**own, "Cookie": "vdgs_view_7=abc"}) is None
+    assert everyone.deny_reason("/", own) is not None
+    assert everyone.deny_reason("/?token=abc", {**own, "Origin": "http://evil.example"}) is not None
     # The address that was asked for is everyone's; nobody else can open that of this machine alone.
-    for door in (Door("192.168.1.5", "abc", 7), Door("127.0.0.1", None, 7)):
-        assert door.address_elsewhere() is None
-        assert "Drone-7" not in "\n".join(invitation("merged model", door))
+    for door in (AccessControl("192.168.1.5", "abc", 7), AccessControl("127.0.0.1", None, 7)):
+        assert door.network_url() is None
+        assert "Drone-7" not in "\n".join(startup_message("merged model", door))
     monkeypatch.setattr(socket, "gethostname", lambda: "localhost.localdomain")
-    assert everyone.address_elsewhere() is None
-    assert "IP address in place of localhost" in "\n".join(invitation("merged model", everyone))
+    assert everyone.network_url() is None
+    assert "IP address in place of localhost" in "\n".join(startup_message("merged model", everyone))

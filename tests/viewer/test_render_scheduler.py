@@ -9,8 +9,16 @@ import pytest
 
 from support.captures import camera_at
 from vdgs.geometry.camera import Camera
-from vdgs.viewer.layers import Shown
-from vdgs.viewer.render_scheduler import FEWEST_PX, REST, ROUND, TURN_ANCHORS, Frame, Studio, shrunk
+from vdgs.viewer.layers import DisplayOptions
+from vdgs.viewer.render_scheduler import (
+    ANCHORS_PER_TURN,
+    MIN_PREVIEW_PIXELS,
+    REST_SECONDS,
+    ROUND_SECONDS,
+    RenderedFrame,
+    RenderScheduler,
+    limit_pixels,
+)
 
 
 class Clock:
@@ -28,16 +36,16 @@ class Slow:
     def __init__(self, clock: Clock, per_px: float = 0.0) -> None:
         self.clock, self.per_px, self.settled, self.drawn = clock, per_px, 0, 0
 
-    def key(self, shown: Shown) -> object:
+    def key(self, shown: DisplayOptions) -> object:
         return id(self)
 
-    def in_view(self, shown: Shown, camera: Camera) -> int:
+    def in_view(self, shown: DisplayOptions, camera: Camera) -> int:
         return 0
 
-    def settle(self, shown: Shown, whole: Camera) -> None:
+    def settle(self, shown: DisplayOptions, whole: Camera) -> None:
         self.settled += 1
 
-    def paint(self, shown: Shown, camera: Camera, whole: Camera, most: int | None = None) -> np.ndarray:
+    def paint(self, shown: DisplayOptions, camera: Camera, whole: Camera, most: int | None = None) -> np.ndarray:
         self.clock.now += self.per_px * camera.width * camera.height
         return np.zeros((camera.height, camera.width, 3), np.uint8)
 
@@ -45,26 +53,26 @@ class Slow:
 @pytest.fixture
 def studio():
     clock = Clock()
-    return Studio(clock), clock
+    return RenderScheduler(clock), clock
 
 
-def sit(studio: Studio, painter: Slow) -> tuple[object, list[Frame], list[Exception]]:
-    frames, errors = list[Frame](), list[Exception]()
-    return studio.seat(painter, frames.append, errors.append), frames, errors
+def sit(studio: RenderScheduler, painter: Slow) -> tuple[object, list[RenderedFrame], list[Exception]]:
+    frames, errors = list[RenderedFrame](), list[Exception]()
+    return studio.add_session(painter, frames.append, errors.append), frames, errors
 
 
 def test_small_while_moving_and_full_at_rest(studio):
     studio, clock = studio
     seat, frames, _ = sit(studio, Slow(clock, 1e-6))
     for x in range(5):
-        studio.ask(seat, camera_at(x, 0, width=1280), Shown())
+        studio.request_frame(seat, camera_at(x, 0, width=1280), DisplayOptions())
         assert studio.step() == 0
         wait = studio.step()
         assert wait is not None
-        assert 0 < wait <= REST  # nothing to do until it rests
+        assert 0 < wait <= REST_SECONDS  # nothing to do until it rests
     assert [frame.full for frame in frames] == [False] * 5
     assert all(frame.picture.shape[1] <= 640 for frame in frames)
-    clock.now += REST
+    clock.now += REST_SECONDS
     while studio.step() == 0:
         pass
     assert [frame.full for frame in frames] == [False] * 5 + [True]
@@ -77,17 +85,17 @@ def test_a_camera_that_moves_on_leaves_nothing_to_be_finished(studio):
     studio, clock = studio
     seat, frames, _ = sit(studio, Slow(clock, 1e-6))
     for x in range(2):  # the second picture is drawn in turns: the first one told how long they take
-        studio.ask(seat, camera_at(x, 0, width=1280), Shown())
+        studio.request_frame(seat, camera_at(x, 0, width=1280), DisplayOptions())
         studio.step()
-        clock.now += REST
+        clock.now += REST_SECONDS
         studio.step()
     count = len(frames)
     assert seat.work is not None
-    studio.ask(seat, camera_at(9, 0, width=1280), Shown())
+    studio.request_frame(seat, camera_at(9, 0, width=1280), DisplayOptions())
     studio.step()
     assert not frames[-1].full
     assert frames[-1].camera.position[0] == pytest.approx(9.0)
-    clock.now += REST
+    clock.now += REST_SECONDS
     while studio.step() == 0:
         pass
     assert [frame.full for frame in frames[count:]] == [False, True]
@@ -96,10 +104,13 @@ def test_a_camera_that_moves_on_leaves_nothing_to_be_finished(studio):
 
 def test_quick_pictures_are_as_large_as_time_allows(studio):
     studio, clock = studio
-    for per_px, least, most in ((1e-3, FEWEST_PX * 0.9, FEWEST_PX), (1e-9, 640 * 480 * 0.98, 640 * 480)):
+    for per_px, least, most in (
+        (1e-3, MIN_PREVIEW_PIXELS * 0.9, MIN_PREVIEW_PIXELS),
+        (1e-9, 640 * 480 * 0.98, 640 * 480),
+    ):
         seat, frames, _ = sit(studio, Slow(clock, per_px))
         for x in range(20):
-            studio.ask(seat, camera_at(x, 0, width=1600), Shown())
+            studio.request_frame(seat, camera_at(x, 0, width=1600), DisplayOptions())
             studio.step()
         height, width = frames[-1].picture.shape[:2]
         assert least <= width * height <= most
@@ -113,7 +124,7 @@ class Decoding(Slow):
         super().__init__(clock)
         self.per_anchor, self.times = per_anchor, [1, 5, 15, 45]
 
-    def paint(self, shown: Shown, camera: Camera, whole: Camera, most: int | None = None) -> np.ndarray:
+    def paint(self, shown: DisplayOptions, camera: Camera, whole: Camera, most: int | None = None) -> np.ndarray:
         counts = [100_000 // times for times in self.times]
         self.drawn = counts[0] if most is None else next((c for c in counts if c <= most), counts[-1])
         self.clock.now += self.per_anchor * self.drawn
@@ -128,12 +139,12 @@ def test_a_round_of_all_who_move_stays_short(studio, moving, drawn):
     for x in range(8):
         began = clock.now
         for seat in seats:
-            studio.ask(seat, camera_at(x, 0, width=1280), Shown())
+            studio.request_frame(seat, camera_at(x, 0, width=1280), DisplayOptions())
         for _ in seats:
             assert studio.step() == 0
         taken = clock.now - began
     assert [painter.drawn for painter in painters] == [drawn] * moving
-    assert taken <= ROUND * 1.05
+    assert taken <= ROUND_SECONDS * 1.05
 
 
 def test_who_is_alone_on_a_fast_machine_sees_the_model_itself_while_moving(studio):
@@ -141,7 +152,7 @@ def test_who_is_alone_on_a_fast_machine_sees_the_model_itself_while_moving(studi
     painter = Decoding(clock, 1e-7)
     seat, _, _ = sit(studio, painter)
     for x in range(3):
-        studio.ask(seat, camera_at(x, 0, width=1280), Shown())
+        studio.request_frame(seat, camera_at(x, 0, width=1280), DisplayOptions())
         studio.step()
     assert painter.drawn == 100_000
 
@@ -150,15 +161,15 @@ def test_two_who_rest_at_the_same_place_share_a_picture(studio):
     studio, clock = studio
 
     class Alike(Slow):
-        def key(self, shown: Shown) -> object:
+        def key(self, shown: DisplayOptions) -> object:
             return "one scene"
 
     one, other, elsewhere = (sit(studio, Alike(clock, 1e-7)) for _ in range(3))
     for (seat, _, _), x in ((one, 0), (other, 0), (elsewhere, 1)):
-        studio.ask(seat, camera_at(x, 0, width=640), Shown())
+        studio.request_frame(seat, camera_at(x, 0, width=640), DisplayOptions())
     for _ in range(3):
         studio.step()
-    clock.now += REST
+    clock.now += REST_SECONDS
     while studio.step() == 0:
         pass
     full = [frames[-1] for _, frames, _ in (one, other, elsewhere)]
@@ -170,11 +181,11 @@ def test_two_who_rest_at_the_same_place_share_a_picture(studio):
 def test_a_full_picture_of_much_is_drawn_in_parts(studio):
     studio, clock = studio
     painter = Slow(clock)
-    painter.in_view = lambda shown, camera: 5 * TURN_ANCHORS  # type: ignore[method-assign]
+    painter.in_view = lambda shown, camera: 5 * ANCHORS_PER_TURN  # type: ignore[method-assign]
     seat, frames, _ = sit(studio, painter)
-    studio.ask(seat, camera_at(0, 0, width=1280), Shown())
+    studio.request_frame(seat, camera_at(0, 0, width=1280), DisplayOptions())
     studio.step()
-    clock.now += REST
+    clock.now += REST_SECONDS
     steps = 0
     while studio.step() == 0:
         steps += 1
@@ -187,17 +198,19 @@ def test_visitors_take_turns_and_moving_ones_go_first(studio):
     order: list[int] = []
     seats = []
     for number in range(3):
-        seat = studio.seat(Slow(clock, 1e-7), lambda frame, n=number: order.append(n), pytest.fail)
+        seat = studio.add_session(Slow(clock, 1e-7), lambda frame, n=number: order.append(n), pytest.fail)
         seats.append(seat)
     for _ in range(4):
         for seat in seats:
-            studio.ask(seat, camera_at(0, 0, width=1280), Shown())
+            studio.request_frame(seat, camera_at(0, 0, width=1280), DisplayOptions())
         for _ in seats:
             studio.step()
     assert sorted(order[:3]) == [0, 1, 2]
     assert all(order.count(number) == 4 for number in range(3))
-    clock.now += REST
-    studio.ask(seats[1], camera_at(1, 0, width=1280), Shown())  # the others rest and wait for full pictures
+    clock.now += REST_SECONDS
+    studio.request_frame(
+        seats[1], camera_at(1, 0, width=1280), DisplayOptions()
+    )  # the others rest and wait for full pictures
     studio.step()
     assert order[-1] == 1
 
@@ -205,7 +218,7 @@ def test_visitors_take_turns_and_moving_ones_go_first(studio):
 def test_who_left_is_drawn_for_no_more(studio):
     studio, clock = studio
     seat, frames, _ = sit(studio, Slow(clock))
-    studio.ask(seat, camera_at(0, 0), Shown())
+    studio.request_frame(seat, camera_at(0, 0), DisplayOptions())
     studio.leave(seat)
     assert studio.step() is None
     assert not frames
@@ -221,12 +234,12 @@ def test_one_visitors_trouble_is_theirs_alone(studio):
     broken, _, errors = sit(studio, Broken(clock))
     other, frames, _ = sit(studio, Slow(clock))
     for seat in (broken, other):
-        studio.ask(seat, camera_at(0, 0, width=640), Shown())
+        studio.request_frame(seat, camera_at(0, 0, width=640), DisplayOptions())
     assert (studio.step(), studio.step()) == (0, 0)
     assert [str(error) for error in errors] == ["no picture"]
     assert len(frames) == 1
-    assert studio.errand(lambda: 3).done() is False
-    future = studio.errand(lambda: 1 // 0)
+    assert studio.submit(lambda: 3).done() is False
+    future = studio.submit(lambda: 1 // 0)
     studio.step()
     studio.step()
     with pytest.raises(ZeroDivisionError):
@@ -235,9 +248,9 @@ def test_one_visitors_trouble_is_theirs_alone(studio):
 
 def test_nobody_waits_for_errands_of_a_studio_that_closes(studio):
     studio, _ = studio
-    before = studio.errand(lambda: 3)
+    before = studio.submit(lambda: 3)
     studio.close()
-    after = studio.errand(lambda: 4)
+    after = studio.submit(lambda: 4)
     for future in (before, after):
         with pytest.raises(CancelledError):
             future.result(timeout=0)
@@ -247,10 +260,10 @@ def test_a_small_canvas_is_drawn_once(studio):
     studio, clock = studio
     seat, frames, _ = sit(studio, Slow(clock))
     camera = camera_at(0, 0, width=160)
-    assert shrunk(camera, 1e6) is camera
-    studio.ask(seat, camera, Shown())
+    assert limit_pixels(camera, 1e6) is camera
+    studio.request_frame(seat, camera, DisplayOptions())
     studio.step()
-    clock.now += REST
+    clock.now += REST_SECONDS
     while studio.step() == 0:
         pass
     assert [frame.picture.shape for frame in frames] == [(120, 160, 3)] * len(frames)

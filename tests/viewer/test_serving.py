@@ -26,18 +26,18 @@ from support.commands import vdgs, wait_until
 from support.viewer import Guest, expected, quiet, trained
 from vdgs.errors import RunError, VdgsError
 from vdgs.geometry.camera import Camera
-from vdgs.rendering.camera_paths import look_at
+from vdgs.rendering.camera_paths import look_at_pose
 from vdgs.rendering.path_io import load_path
 from vdgs.runs.open_run import open_run
 from vdgs.runs.run_folder import RunFolder
 from vdgs.viewer import navigation
-from vdgs.viewer.client_session import Visitor
+from vdgs.viewer.client_session import ClientSession
 from vdgs.viewer.layers import Painter
-from vdgs.viewer.live_run import newest, open_or_last_saved, standing_lines
+from vdgs.viewer.live_run import open_run_or_checkpoint, run_file_times, run_status_markdown
 from vdgs.viewer.path_panel import PathPanel
-from vdgs.viewer.point_panel import PlacePanel
-from vdgs.viewer.render_scheduler import KEPT, Seat
-from vdgs.viewer.server import free_port, serve
+from vdgs.viewer.point_panel import PointPanel
+from vdgs.viewer.render_scheduler import MAX_CACHED_IMAGES, RenderSession
+from vdgs.viewer.server import find_free_port, serve
 
 pytestmark = pytest.mark.xdist_group("viewer")
 
@@ -63,7 +63,7 @@ def guest(viewer):
 
 def above(x: float = 0.0, y: float = 0.0, width: int = 320, height: int = 240) -> Camera:
     focal = 0.5 * height / math.tan(math.radians(25))
-    pose = look_at(np.array([x, y - 2.0, 9.0]), np.array([x, y, 0.0]))
+    pose = look_at_pose(np.array([x, y - 2.0, 9.0]), np.array([x, y, 0.0]))
     return Camera(camera_from_world=pose, fx=focal, fy=focal, cx=width / 2, cy=height / 2, width=width, height=height)
 
 
@@ -111,7 +111,7 @@ def test_a_double_click_turns_about_the_place(viewer, guest):
     camera = above(width=640, height=480)
     guest.stand(camera)
     guest.full_picture(camera)
-    (visitor,) = viewer.visitors.values()
+    (visitor,) = viewer.sessions.values()
     visitor.place.clock = lambda: 0.0  # all at the same time
     x, y = camera.project(np.array([[0.8, -0.6, 0.0]]))[0][0]
     guest.click(x / 640, y / 480)
@@ -137,7 +137,7 @@ def test_a_path_is_set_and_saved(viewer, guest, tmp_path):
         guest.stand(camera)
         guest.full_picture(camera)
         guest.choose("Key frame", "Add")
-        visitor = list(viewer.visitors.values())[-1]
+        visitor = list(viewer.sessions.values())[-1]
         wait_until(lambda visitor=visitor, count=count: len(visitor.path.keyframes) == count)
     guest.choose("Path", "Save")
     parts = b""
@@ -154,11 +154,11 @@ def test_a_path_is_set_and_saved(viewer, guest, tmp_path):
 
 @quiet
 def test_visitors_that_vanish_are_forgotten(viewer):
-    wait_until(lambda: not viewer.visitors)
+    wait_until(lambda: not viewer.sessions)
     guests = [Guest(viewer.door.address()) for _ in range(4)]
     for number, guest in enumerate(guests):
         guest.stand(above(0.1 * number))
-    wait_until(lambda: len(viewer.visitors) == 4)
+    wait_until(lambda: len(viewer.sessions) == 4)
     for guest in guests[:3]:
         guest.stand(above(0.5))
         guest.vanish()
@@ -166,39 +166,39 @@ def test_visitors_that_vanish_are_forgotten(viewer):
     guests[3].stand(camera)
     guests[3].assert_sees(expected(viewer, camera))
     guests[3].close()
-    wait_until(lambda: not viewer.visitors)
-    assert not viewer.studio._seats
+    wait_until(lambda: not viewer.sessions)
+    assert not viewer.scheduler._seats
 
 
 @quiet
 def test_many_visits_leave_nothing_behind(viewer):
     """Counted in objects: what a process weighs depends on its allocator, and on what else was at work."""
-    kinds = (Visitor, Painter, Seat, PlacePanel, PathPanel, viser.ClientHandle)
+    kinds = (ClientSession, Painter, RenderSession, PointPanel, PathPanel, viser.ClientHandle)
 
     def there() -> dict[type, int]:
         gc.collect()
         return {kind: sum(isinstance(each, kind) for each in gc.get_objects()) for kind in kinds}
 
-    wait_until(lambda: not viewer.visitors)
+    wait_until(lambda: not viewer.sessions)
     for number in range(6):
         guest = Guest(viewer.door.address())
         guest.stand(above(0.1 * number))
         guest.full_picture(above(0.1 * number))
         guest.choose("Layer", "Depth")
         (guest.vanish if number % 2 else guest.close)()
-    wait_until(lambda: not viewer.visitors)
+    wait_until(lambda: not viewer.sessions)
     wait_until(lambda: not any(there().values()))
-    assert len(viewer.studio._full_pictures) <= KEPT
+    assert len(viewer.scheduler._full_pictures) <= MAX_CACHED_IMAGES
 
 
 @quiet
 def test_a_photograph_lies_over_the_model_until_one_leaves(viewer, guest):
     guest.stand(above())
     guest.full_picture(above())
-    wait_until(lambda: len(viewer.visitors) == 1)
-    (visitor,) = viewer.visitors.values()
+    wait_until(lambda: len(viewer.sessions) == 1)
+    (visitor,) = viewer.sessions.values()
     taken = viewer.scene.capture.views[0].camera
-    visitor.look_from(0)
+    visitor.view_image(0)
     assert visitor.shown.photograph == 0
     guest.stand(above(0.2))  # was on its way when the browser was told to go
     wait_until(lambda: visitor.camera.position[0] == pytest.approx(0.2))
@@ -266,7 +266,7 @@ def test_others_need_the_token(run):
 
 @quiet
 def test_a_canvas_that_is_too_large_is_drawn_smaller(viewer, monkeypatch):
-    monkeypatch.setattr(navigation, "MOST_PX", 320 * 240)
+    monkeypatch.setattr(navigation, "MAX_CANVAS_PIXELS", 320 * 240)
     guest = Guest(viewer.door.address())
     guest.stand(above(width=200_000, height=150_000))
     guest.assert_sees(expected(viewer, above()))
@@ -279,12 +279,12 @@ def test_ports_and_hosts_that_cannot_be_used_are_said_before_any_work(run):
         taken.listen()
         port = taken.getsockname()[1]
         with pytest.raises(VdgsError, match=f"--port {port}: cannot be used"):
-            free_port("127.0.0.1", port)
+            find_free_port("127.0.0.1", port)
         done = vdgs("view", run, "--port", port)
         assert done.returncode == 1
         assert f"--port {port}" in done.stderr
     with pytest.raises(VdgsError, match="no address of this machine"):
-        free_port("no.such.host.invalid", None)
+        find_free_port("no.such.host.invalid", None)
     assert "--port 70000" in vdgs("view", run, "--port", "70000").stderr
 
 
@@ -321,28 +321,28 @@ def test_a_run_that_trains_is_shown_as_it_was_saved_last(run, viewer, guest, tmp
     unfinished = tmp_path / "run"
     shutil.copytree(run, unfinished)
     finished = open_run(unfinished)
-    assert open_or_last_saved(unfinished).name == "coarse"
-    before = newest(RunFolder(unfinished))
+    assert open_run_or_checkpoint(unfinished).name == "coarse"
+    before = run_file_times(RunFolder(unfinished))
     (unfinished / "coarse/model.safetensors").unlink()
     status = json.loads((unfinished / "coarse/status.json").read_text())
     (unfinished / "coarse/status.json").write_text(json.dumps({**status, "state": "stopped"}))
-    assert newest(RunFolder(unfinished)) != before
-    last = open_or_last_saved(unfinished)
+    assert run_file_times(RunFolder(unfinished)) != before
+    last = open_run_or_checkpoint(unfinished)
     assert last.name == "training"
-    assert "60 iterations" in last.caution
+    assert "60 iterations" in last.warning
     assert np.array_equal(last.model.anchors.features, finished.model.anchors.features)
-    assert "**coarse** stopped" in standing_lines(RunFolder(unfinished))
+    assert "**coarse** stopped" in run_status_markdown(RunFolder(unfinished))
     with pytest.raises(RunError):
-        open_or_last_saved(unfinished, "merged")
+        open_run_or_checkpoint(unfinished, "merged")
     for file in (unfinished / "coarse/checkpoints").iterdir():
         file.unlink()
     with pytest.raises(RunError, match="no model and no checkpoint yet"):
-        open_or_last_saved(unfinished)
+        open_run_or_checkpoint(unfinished)
     # Whoever looks sees the newer model, and how far training is.
     camera = above()
     guest.stand(camera)
     guest.full_picture(camera)
-    viewer.tell(standing_lines(RunFolder(run)))
+    viewer.tell(run_status_markdown(RunFolder(run)))
     shown = viewer.scene.run
     viewer.show(last)
     guest.assert_sees(expected(viewer, camera))
@@ -359,7 +359,7 @@ def test_blocks_that_train_are_shown_with_what_they_have(run, tmp_path):
     for command in (("visibility", cut), ("partition", cut, "--blocks", "2")):
         done = vdgs(*command)
         assert done.returncode == 0, done.stderr
-    assert open_or_last_saved(cut).name == "coarse"
+    assert open_run_or_checkpoint(cut).name == "coarse"
     done = vdgs("train", cut, "--block", "1", "--block.iterations", "20", "--save-every", "10")
     assert done.returncode == 0, done.stderr
     folder = cut / "blocks/01"
@@ -368,8 +368,8 @@ def test_blocks_that_train_are_shown_with_what_they_have(run, tmp_path):
         if unfinished:
             (folder / "model.safetensors").unlink()
             (folder / "status.json").write_text(json.dumps({**status, "state": "stopped"}))
-        shown = open_or_last_saved(cut)
+        shown = open_run_or_checkpoint(cut)
         assert shown.name == "training"
-        assert "1 of 2 blocks" in shown.caution
+        assert "1 of 2 blocks" in shown.warning
         assert len(shown.model.anchors) > 0
-        assert "**block 1**" in standing_lines(RunFolder(cut))
+        assert "**block 1**" in run_status_markdown(RunFolder(cut))

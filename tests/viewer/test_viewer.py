@@ -17,28 +17,28 @@ from scipy.spatial.transform import Rotation
 from support.captures import camera_at, look_down
 from support.hand_made_models import opaque_plane, quadrants
 from vdgs.captures.capture import Capture, View
-from vdgs.evaluation.auto_exposure import metered
+from vdgs.evaluation.auto_exposure import log_luminance
 from vdgs.evaluation.metrics import to_8bit
-from vdgs.evaluation.view_exposures import as_photographed
+from vdgs.evaluation.view_exposures import apply_exposure
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.ground_frame import GroundFrame
-from vdgs.model.anchor_model import AnchorModel, Part
-from vdgs.model.exposure import exposure_of
+from vdgs.model.anchor_model import AnchorModel, DecoderSpan
+from vdgs.model.exposure import exposure_matrix
 from vdgs.model.renderer import render
 from vdgs.partition.blocks import save_blocks
-from vdgs.rendering.camera_paths import look_at
+from vdgs.rendering.camera_paths import look_at_pose
 from vdgs.rendering.path_io import load_path
-from vdgs.runs.open_run import TrainedRun
+from vdgs.runs.open_run import OpenedRun
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.stage_folder import Status
+from vdgs.runs.stage_folder import StatusRecord
 from vdgs.viewer import navigation, overlays
-from vdgs.viewer.image_comparison import laid_over, nearest_view
-from vdgs.viewer.keyframes import at_time, path_json
-from vdgs.viewer.layers import LAYERS, Painter, Shown
-from vdgs.viewer.lod import Levels
+from vdgs.viewer.image_comparison import nearest_view_index, warp_image
+from vdgs.viewer.keyframes import camera_at_time, path_json
+from vdgs.viewer.layers import LAYERS, DisplayOptions, Painter
+from vdgs.viewer.lod import LodPyramid
 from vdgs.viewer.measurement import Ruler
-from vdgs.viewer.picking import place_at, position_at, thumbnail
-from vdgs.viewer.viewer_scene import Scene
+from vdgs.viewer.picking import pick_point, pick_position, thumbnail
+from vdgs.viewer.viewer_scene import ViewerScene
 
 pytestmark = pytest.mark.xdist_group("viewer_scene")
 
@@ -53,7 +53,7 @@ def two_floors() -> AnchorModel:
     return replace(ground, anchors=type(ground.anchors)(**tensors))
 
 
-def photographed(folder: Path, model: AnchorModel, change: Callable[[int, np.ndarray], np.ndarray]) -> Scene:
+def photographed(folder: Path, model: AnchorModel, change: Callable[[int, np.ndarray], np.ndarray]) -> ViewerScene:
     """Nine photographs that a model has itself drawn, each changed by its number, all of them masked where a mask
     `N.mask.png` lies beside; the last one tests."""
     views = []
@@ -76,14 +76,14 @@ def photographed(folder: Path, model: AnchorModel, change: Callable[[int, np.nda
     )
     capture = Capture(
         root=folder, source="colmap", images=".", views=tuple(views), points=points,
-        point_colours=np.full((len(points), 3), 99, np.uint8), ground=ground,
+        point_colors=np.full((len(points), 3), 99, np.uint8), ground=ground,
     )  # fmt: skip
-    run = TrainedRun(
-        folder=RunFolder(folder / "run"), model=model, model_path=folder / "model", name="merged", status=Status(),
+    run = OpenedRun(
+        folder=RunFolder(folder / "run"), model=model, model_path=folder / "model", name="merged", status=StatusRecord(),
         key="key", caution="", capture=capture,
     )  # fmt: skip
     coarse = replace(run, model=opaque_plane(), name="coarse")
-    return Scene(run, lambda name: coarse)
+    return ViewerScene(run, lambda name: coarse)
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +103,7 @@ def scene(tmp_path_factory):
 @pytest.mark.parametrize("layer", LAYERS)
 @pytest.mark.parametrize("model", ["merged", "both"])
 def test_rows_drawn_one_after_another_are_the_whole_picture(scene, layer, model):
-    camera, shown = camera_at(0.3, -0.5, tilt=20.0), Shown(layer, model, 0.4)
+    camera, shown = camera_at(0.3, -0.5, tilt=20.0), DisplayOptions(layer, model, 0.4)
     painter = Painter(scene)
     painter.settle(shown, camera)
     whole = painter.paint(shown, camera, camera)
@@ -113,7 +113,7 @@ def test_rows_drawn_one_after_another_are_the_whole_picture(scene, layer, model)
 
 def test_layers_show_what_they_say(scene):
     camera, painter = camera_at(0.0, 0.0, 6.0), Painter(scene)
-    drawn = {layer: painter.paint(Shown(layer), camera, camera) for layer in LAYERS}
+    drawn = {layer: painter.paint(DisplayOptions(layer), camera, camera) for layer in LAYERS}
     assert np.array_equal(drawn["colour"], to_8bit(render(scene.model("merged"), camera).image.numpy()))
     names = list(drawn)
     for a in names:
@@ -127,20 +127,20 @@ def test_layers_show_what_they_say(scene):
     )
     assert np.abs(west - east).max() > 25
     for layer in ("depth", "visibility", "alpha", "error"):
-        scale = painter.scale(Shown(layer))
+        scale = painter.scale(DisplayOptions(layer))
         assert scale is not None
         assert scale.low < scale.high
-    assert painter.scale(Shown("colour")) is None
+    assert painter.scale(DisplayOptions("colour")) is None
 
 
 def test_photographs_that_the_model_draws_itself_show_no_error_and_others_do(scene):
     camera = scene.capture.views[4].camera
-    painter, shown = Painter(scene), Shown("error")
-    values = painter._comparison.error_in("merged", camera, camera)
+    painter, shown = Painter(scene), DisplayOptions("error")
+    values = painter._comparison.error_map("merged", camera, camera)
     assert np.isfinite(values).mean() > 0.9
     assert np.nanmax(values) < 0.01
     # The coarse model has no roof: where that is, its picture differs.
-    assert np.nanmax(painter._comparison.error_in("coarse", camera, camera)) > 0.05
+    assert np.nanmax(painter._comparison.error_map("coarse", camera, camera)) > 0.05
     assert painter.paint(replace(shown, model="coarse"), camera, camera).shape == (48, 64, 3)
 
 
@@ -150,12 +150,12 @@ def test_an_exposure_of_the_photograph_is_no_error_of_the_model(tmp_path):
     model = two_floors()
     model = replace(model, decoder=replace(model.decoder, exposure=fitted - torch.eye(3, 4)))
     # What all have in common is the scene's; the test photograph is the last of the flight, exposed as the one before.
-    own = [exposure_of(fitted - torch.eye(3, 4), min(number, 7)).double() for number in range(9)]
-    scene = photographed(tmp_path, model, lambda number, image: as_photographed(image, own[number]))
+    own = [exposure_matrix(fitted - torch.eye(3, 4), min(number, 7)).double() for number in range(9)]
+    scene = photographed(tmp_path, model, lambda number, image: apply_exposure(image, own[number]))
     comparison = Painter(scene)._comparison
     for index in (0, 3, 8):
         camera = scene.capture.views[index].camera
-        values = comparison.error_in("merged", camera, camera)
+        values = comparison.error_map("merged", camera, camera)
         assert np.isfinite(values).mean() > 0.8
         assert np.nanmax(values) < 0.01
     scene.close()
@@ -164,11 +164,11 @@ def test_an_exposure_of_the_photograph_is_no_error_of_the_model(tmp_path):
 def test_what_is_metered_of_thinner_models_differs_little(scene):
     """The law takes many pictures: they are drawn from as many anchors as visitors can wait for."""
     dense = opaque_plane(spacing=0.03)
-    opened = Scene(replace(scene.run, model=dense))
+    opened = ViewerScene(replace(scene.run, model=dense))
     for camera in (camera_at(0.0, 0.0, 5.0), camera_at(-1.0, 0.5, 6.0, 20.0)):
         level, _ = opened.level("merged", camera, 5_000)
         assert len(level.model.anchors) < len(dense.anchors) / 4
-        whole, thin = (metered(render(each, camera).image.clamp(0, 1).numpy()) for each in (dense, level.model))
+        whole, thin = (log_luminance(render(each, camera).image.clamp(0, 1).numpy()) for each in (dense, level.model))
         assert abs(whole - thin) < 0.03
 
 
@@ -183,11 +183,11 @@ def test_what_is_masked_in_the_photograph_is_no_error_of_the_model(tmp_path):
     scene = photographed(tmp_path, two_floors(), spoiled)
     comparison = Painter(scene)._comparison
     masked, other = (scene.capture.views[index].camera for index in (4, 0))
-    values = comparison.error_in("merged", masked, masked)
+    values = comparison.error_map("merged", masked, masked)
     assert np.isnan(values[10:30, 20:50]).all()
     assert np.nanmax(values) < 0.01
     assert np.isfinite(values).mean() > 0.7
-    assert np.nanmax(comparison.error_in("merged", other, other)) > 0.1  # not masked: an error
+    assert np.nanmax(comparison.error_map("merged", other, other)) > 0.1  # not masked: an error
     scene.close()
 
 
@@ -195,26 +195,26 @@ def test_a_newer_model_is_compared_anew(tmp_path):
     model = two_floors()
     scene = photographed(tmp_path, model, lambda number, image: image)
     comparison, camera = Painter(scene)._comparison, scene.capture.views[4].camera
-    assert np.nanmax(comparison.error_in("merged", camera, camera)) < 0.01
+    assert np.nanmax(comparison.error_map("merged", camera, camera)) < 0.01
     # One that happens to lie where the older one lay in memory.
     object.__setattr__(model, "anchors", opaque_plane().anchors)
     scene.show(scene.run)
-    assert np.nanmax(comparison.error_in("merged", camera, camera)) > 0.05
+    assert np.nanmax(comparison.error_map("merged", camera, camera)) > 0.05
     scene.close()
 
 
 def test_two_models_stand_side_by_side(scene):
     camera, painter = camera_at(0.0, 0.0, 6.0), Painter(scene)
-    merged, coarse = (painter.paint(Shown("colour", name), camera, camera) for name in ("merged", "coarse"))
-    both = painter.paint(Shown("colour", "both", 0.5), camera, camera)
+    merged, coarse = (painter.paint(DisplayOptions("colour", name), camera, camera) for name in ("merged", "coarse"))
+    both = painter.paint(DisplayOptions("colour", "both", 0.5), camera, camera)
     assert np.array_equal(both[:, 32:], merged[:, 32:])
     assert np.array_equal(both[:, :31], coarse[:, :31])
     for split, alone in ((0.0, merged), (1.0, coarse)):
-        assert np.array_equal(painter.paint(Shown("colour", "both", split), camera, camera), alone)
+        assert np.array_equal(painter.paint(DisplayOptions("colour", "both", split), camera, camera), alone)
 
 
 def test_depth_keeps_its_colours_while_the_camera_moves(scene):
-    painter, shown = Painter(scene), Shown("depth")
+    painter, shown = Painter(scene), DisplayOptions("depth")
     high, low = camera_at(0, 0, 6.0), camera_at(0, 0, 3.0)
     painter.settle(shown, high)
     before = painter.scale(shown)
@@ -232,9 +232,9 @@ def test_quick_pictures_of_much_are_drawn_with_fewer_larger_gaussians(parts):
     model = two_floors()
     if parts:
         counts = (300, len(model.anchors) - 300)
-        model = replace(model, parts=tuple(Part(count, model.decoder) for count in counts))
+        model = replace(model, parts=tuple(DecoderSpan(count, model.decoder) for count in counts))
     camera = camera_at(0.0, 0.0, 6.0)
-    levels = Levels(model)
+    levels = LodPyramid(model)
     assert levels.of(camera)[0].model is model
     assert levels.of(camera, 10_000)[0].model is model
     few, count = levels.of(camera, 400)
@@ -254,30 +254,30 @@ def test_quick_pictures_of_much_are_drawn_with_fewer_larger_gaussians(parts):
 
 def test_a_photograph_lies_over_the_model_however_the_camera_turns(scene):
     taken = scene.capture.views[4].camera
-    photograph, there = laid_over(scene, 4, taken)
+    photograph, there = warp_image(scene, 4, taken)
     assert there.all()
     assert np.abs(photograph.astype(int) - to_8bit(render(scene.model("merged"), taken).image.numpy())).max() <= 1
     turned = Camera(
         camera_from_world=look_down(taken.position, 14.0, 80.0), fx=90.0, fy=90.0, cx=40.0, cy=30.0, width=80, height=60
     )
-    photograph, there = laid_over(scene, 4, turned)
+    photograph, there = warp_image(scene, 4, turned)
     model = to_8bit(render(scene.model("merged"), turned).image.numpy())
     assert 0.2 < there.mean() < 1
     assert np.abs(photograph.astype(int) - model)[there].mean() < 12
-    assert not laid_over(scene, 4, replace(turned, camera_from_world=look_down(taken.position, 180.0)))[1].any()
+    assert not warp_image(scene, 4, replace(turned, camera_from_world=look_down(taken.position, 180.0)))[1].any()
 
 
 def test_the_photograph_is_left_of_its_slider(scene):
     camera, painter = scene.capture.views[0].camera, Painter(scene)
-    picture = painter.paint(Shown("alpha", photograph=0, photograph_split=0.25), camera, camera)
-    alone = painter.paint(Shown("alpha"), camera, camera)
+    picture = painter.paint(DisplayOptions("alpha", photograph=0, photograph_split=0.25), camera, camera)
+    alone = painter.paint(DisplayOptions("alpha"), camera, camera)
     assert np.array_equal(picture[:, 16:], alone[:, 16:])
-    assert np.abs(picture[:, :15].astype(int) - laid_over(scene, 0, camera)[0][:, :15]).max() == 0
+    assert np.abs(picture[:, :15].astype(int) - warp_image(scene, 0, camera)[0][:, :15]).max() == 0
 
 
 def test_the_nearest_photograph_is_that_of_the_place_and_direction(scene):
     for index, view in enumerate(scene.capture.views):
-        assert nearest_view(scene, view.camera) == index
+        assert nearest_view_index(scene, view.camera) == index
 
 
 # ------------------------------------------------------------------------------------- places
@@ -288,25 +288,25 @@ def test_a_clicked_pixel_is_the_place_that_it_shows(scene, x, y):
     camera = camera_at(0.2, -0.3, 6.0, tilt=15.0, width=640)
     height = 1.5 if max(abs(x), abs(y)) < 0.8 else 0.0
     pixel, _ = camera.project(np.array([[x, y, height]]))
-    found = position_at(scene.model("merged"), camera, *pixel[0])
+    found = pick_position(scene.model("merged"), camera, *pixel[0])
     assert found is not None
     again, _ = camera.project(found[None])
     assert np.abs(again - pixel).max() < 1e-6
     assert np.linalg.norm(found[:2] - [x, y]) < 6.0 / camera.fx  # a pixel on the ground
     assert abs(found[2] - height) < 0.05  # depth is that of a splat's centre
-    assert position_at(scene.model("merged"), camera_at(50, 50), 3.0, 3.0) is None
-    assert position_at(scene.model("merged"), camera, -1.0, 3.0) is None
+    assert pick_position(scene.model("merged"), camera_at(50, 50), 3.0, 3.0) is None
+    assert pick_position(scene.model("merged"), camera, -1.0, 3.0) is None
 
 
 def test_a_place_knows_who_sees_it_and_what_stands_between(scene):
-    place = place_at(scene, "merged", np.array([0.3, -0.2, 0.0]))  # below the roof
-    lies_in = [view for view in scene.capture.views if view.camera.sees(place.position[None])[0]]
-    assert len(place.sights) == len(lies_in)
+    place = pick_point(scene, "merged", np.array([0.3, -0.2, 0.0]))  # below the roof
+    lies_in = [view for view in scene.capture.views if view.camera.in_frustum(place.position[None])[0]]
+    assert len(place.hits) == len(lies_in)
     assert place.seen_by == sum(view.split == "train" for view in lies_in)
-    assert not any(sight.free for sight in place.sights if sight.name == "4.png")
-    above = place_at(scene, "merged", np.array([0.3, -0.2, 1.5]))
-    assert all(sight.free for sight in above.sights)
-    assert [s.unit_per_px for s in above.sights] == sorted(s.unit_per_px for s in above.sights)
+    assert not any(sight.free for sight in place.hits if sight.name == "4.png")
+    above = pick_point(scene, "merged", np.array([0.3, -0.2, 1.5]))
+    assert all(sight.free for sight in above.hits)
+    assert [s.ground_sampling for s in above.hits] == sorted(s.ground_sampling for s in above.hits)
     assert above.block == 2
     assert above.coordinates[0] == "east 0.30, north -0.20, up 1.50 m (ground frame)"
     latitude, longitude = (float(part.strip(" °")) for part in above.coordinates[1].split(",")[:2])
@@ -314,7 +314,7 @@ def test_a_place_knows_who_sees_it_and_what_stands_between(scene):
 
 
 def test_a_thumbnail_marks_the_place(scene):
-    sight = place_at(scene, "merged", np.array([0.3, -0.2, 1.5])).sights[0]
+    sight = pick_point(scene, "merged", np.array([0.3, -0.2, 1.5])).hits[0]
     small = thumbnail(scene, sight)
     assert max(small.shape[:2]) == 320
     red = (small[..., 0] > 200) & (small[..., 1] < 120) & (small[..., 2] < 100)
@@ -325,22 +325,22 @@ def test_a_ruler_measures(scene):
     ruler = Ruler("m")
     for corner in ((0, 0, 0), (3, 4, 0), (3, 4, 2)):
         ruler.add(np.array(corner, float))
-    assert (ruler.distance(), ruler.rise()) == (7.0, 2.0)
+    assert (ruler.distance(), ruler.height_difference()) == (7.0, 2.0)
     ruler.clear()
     for corner in ((0, 0, 5), (2, 0, 1), (2, 3, 0), (0, 3, 0)):
         ruler.add(np.array(corner, float))
     assert ruler.area() == 6.0
-    assert "area **6.00 m²**" in ruler.words()
+    assert "area **6.00 m²**" in ruler.to_markdown()
 
 
 def test_lines_lie_where_cameras_and_borders_are(scene):
-    lines, colours = overlays.frusta(scene)
+    lines, colours = overlays.camera_frusta(scene)
     assert lines.shape == (8 * 9, 2, 3)
     assert colours.shape == lines.shape
     assert np.allclose(lines[:4, 0], scene.capture.views[0].camera.position, atol=1e-5)
     corners, _ = scene.capture.views[0].camera.project(lines[:4, 1].astype(float))
     assert corners == pytest.approx(np.array([[0, 0], [64, 0], [64, 48], [0, 48]]), abs=0.01)
-    lines, _ = overlays.borders(scene)
+    lines, _ = overlays.block_borders(scene)
     assert np.abs(lines[..., :2]).max() == pytest.approx(4.0)
     assert lines[..., 2].min() >= -0.1
     assert len(overlays.sparse_points(scene)[0]) == len(scene.capture.points)
@@ -350,55 +350,55 @@ def test_lines_lie_where_cameras_and_borders_are(scene):
 
 
 def test_the_browsers_camera_is_ours():
-    pose = look_at(np.array([3.0, -8.0, 6.0]), np.array([1.0, 2.0, 0.0]))
+    pose = look_at_pose(np.array([3.0, -8.0, 6.0]), np.array([1.0, 2.0, 0.0]))
     wxyz = np.roll(Rotation.from_matrix(pose[:3, :3].T).as_quat(), 1)
-    camera = navigation.camera_of(wxyz, np.array([3.0, -8.0, 6.0]), math.radians(60), 800, 600)
+    camera = navigation.camera_from_browser(wxyz, np.array([3.0, -8.0, 6.0]), math.radians(60), 800, 600)
     assert np.allclose(camera.camera_from_world, pose)
     assert camera.fy == pytest.approx(300 / math.tan(math.radians(30)))
     for broken in (np.zeros(4), np.array([np.nan, 0, 0, 1])):
         with pytest.raises(ValueError, match="no camera"):
-            navigation.camera_of(broken, np.zeros(3), 1.0, 8, 8)
+            navigation.camera_from_browser(broken, np.zeros(3), 1.0, 8, 8)
     with pytest.raises(ValueError, match="no camera"):
-        navigation.camera_of(wxyz, np.zeros(3), 1.0, 0, 8)
+        navigation.camera_from_browser(wxyz, np.zeros(3), 1.0, 0, 8)
 
 
 def test_no_canvas_is_larger_than_can_be_drawn():
     def of(width: int, height: int) -> Camera:
-        return navigation.camera_of(np.array([1.0, 0, 0, 0]), np.zeros(3), 1.0, width, height)
+        return navigation.camera_from_browser(np.array([1.0, 0, 0, 0]), np.zeros(3), 1.0, width, height)
 
-    most = navigation.most_pixels(1 << 40)
+    most = navigation.max_render_pixels(1 << 40)
     for width, height in ((1280, 800), (3840, 2160), (7680, 4320)):
         whole = of(width, height)
-        assert navigation.drawable(whole, most) is whole
+        assert navigation.limit_resolution(whole, most) is whole
     for width, height in ((200_000, 200_000), (200_000, 100), (1, 10**9), (20_000, 1)):
-        asked, drawn = of(width, height), navigation.drawable(of(width, height), most)
+        asked, drawn = of(width, height), navigation.limit_resolution(of(width, height), most)
         assert drawn.width * drawn.height <= most
         assert max(drawn.width, drawn.height) <= 16_384
         assert drawn.fy / drawn.height == pytest.approx(asked.fy / asked.height)  # it sees the same
     # Little memory is left: small pictures, but pictures.
-    assert navigation.drawable(of(1280, 800), navigation.most_pixels(20_000_000)).height == 353
-    assert navigation.drawable(of(1280, 800), navigation.most_pixels(0)).width == 1
+    assert navigation.limit_resolution(of(1280, 800), navigation.max_render_pixels(20_000_000)).height == 353
+    assert navigation.limit_resolution(of(1280, 800), navigation.max_render_pixels(0)).width == 1
 
 
 def test_buttons_lead_where_they_say(scene):
-    stand = navigation.whole_scene(scene.capture)
+    stand = navigation.overview_pose(scene.capture)
     whole = Camera(
-        camera_from_world=look_at(stand.position, stand.look_at), fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640,
+        camera_from_world=look_at_pose(stand.position, stand.look_at), fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640,
         height=480,
     )  # fmt: skip
-    assert all(whole.sees(np.array([[x, y, 0.0]]))[0] for x in (-1.5, 1.5) for y in (-1.5, 1.5))
-    above = navigation.from_above(stand)
+    assert all(whole.in_frustum(np.array([[x, y, 0.0]]))[0] for x in (-1.5, 1.5) for y in (-1.5, 1.5))
+    above = navigation.top_down_pose(stand)
     assert np.allclose(above.look_at, stand.look_at)
     assert np.linalg.norm(above.position[:2] - above.look_at[:2]) < 0.01 * above.distance
-    east = navigation.Stand(np.array([5.0, 0.0, 3.0]), np.zeros(3))
-    north = navigation.north_up(east)
+    east = navigation.CameraPose(np.array([5.0, 0.0, 3.0]), np.zeros(3))
+    north = navigation.north_up_pose(east)
     assert north.position == pytest.approx(np.array([0.0, -5.0, 3.0]))
-    near = navigation.nearer(east, np.array([1.0, 1.0, 0.0]))
+    near = navigation.zoom_to(east, np.array([1.0, 1.0, 0.0]))
     assert near.distance < east.distance
     taken = camera_at(1.0, 2.0, 4.0, 0.0, 30.0)
-    there = navigation.stand_of(taken, 4.0)
+    there = navigation.pose_from_camera(taken, 4.0)
     looking = Camera(
-        camera_from_world=look_at(there.position, there.look_at), fx=64.0, fy=64.0, cx=32.0, cy=24.0, width=64,
+        camera_from_world=look_at_pose(there.position, there.look_at), fx=64.0, fy=64.0, cx=32.0, cy=24.0, width=64,
         height=48,
     )  # fmt: skip
     assert np.allclose(looking.camera_from_world, taken.camera_from_world, atol=0.02)  # its upper edge stays up
@@ -407,7 +407,7 @@ def test_buttons_lead_where_they_say(scene):
 def test_all_of_a_photograph_fits_the_canvas():
     camera = Camera(camera_from_world=np.eye(4), fx=100.0, fy=100.0, cx=80.0, cy=60.0, width=160, height=120)
     for aspect in (0.5, 1.0, 3.0):
-        fov = navigation.fov_for(camera, aspect)
+        fov = navigation.fov_to_fit(camera, aspect)
         focal = 0.5 / math.tan(fov / 2)  # of a canvas one high
         assert focal * 160 / 100 <= aspect + 1e-9
         assert focal * 120 / 100 <= 1 + 1e-9
@@ -424,8 +424,8 @@ def test_a_path_is_read_back_as_it_was_set(tmp_path):
         assert (first.fx, first.width, first.height) == (second.fx, second.width, second.height)
     content = json.loads(file.read_text())
     assert np.array_equal(content["keyframes"][1]["camera_from_world"], frames[1].camera_from_world)
-    assert np.allclose(at_time(frames, 4.0, 0.0).camera_from_world, frames[0].camera_from_world)
-    assert np.allclose(at_time(frames, 4.0, 99.0).camera_from_world, frames[-1].camera_from_world)
+    assert np.allclose(camera_at_time(frames, 4.0, 0.0).camera_from_world, frames[0].camera_from_world)
+    assert np.allclose(camera_at_time(frames, 4.0, 99.0).camera_from_world, frames[-1].camera_from_world)
     with pytest.raises(ValueError, match="at least one"):
         path_json([], 1.0)
 
@@ -433,11 +433,11 @@ def test_a_path_is_read_back_as_it_was_set(tmp_path):
 def test_the_newest_photograph_file_is_not_needed_to_look(scene, tmp_path: Path):
     """A photograph that is gone is one layer's trouble."""
     views = tuple(replace(view, image_path=tmp_path / "gone.png") for view in scene.capture.views)
-    without = Scene(replace(scene.run, capture=replace(scene.capture, views=views)))
+    without = ViewerScene(replace(scene.run, capture=replace(scene.capture, views=views)))
     camera = camera_at(0, 0)
-    assert Painter(without).paint(Shown(), camera, camera).shape == (48, 64, 3)
+    assert Painter(without).paint(DisplayOptions(), camera, camera).shape == (48, 64, 3)
     from vdgs.errors import CaptureError
 
     with pytest.raises(CaptureError, match=r"gone\.png"):
-        Painter(without).paint(Shown("error"), camera, camera)
+        Painter(without).paint(DisplayOptions("error"), camera, camera)
     without.close()

@@ -12,16 +12,16 @@ from hypothesis import strategies as st
 
 from support.captures import look_down
 from vdgs.config.method import TrainConfig
-from vdgs.geometry.camera import NEAR, Camera, CameraModel
+from vdgs.geometry.camera import NEAR_PLANE, Camera, CameraModel
 from vdgs.model.anchors import Anchors
-from vdgs.training.schedule import shares_for
+from vdgs.training.schedule import view_sampling_weights
 from vdgs.visibility.visibility_counts import (
-    effective_count,
-    imbalance,
-    normalised,
-    share_in_cycle,
-    visibility_of,
-    votes_of,
+    count_visibility,
+    effective_sample_size,
+    normalize_visibility,
+    visibility_ratio,
+    visibility_sampling_weights,
+    visibility_stats,
 )
 
 
@@ -51,48 +51,48 @@ def test_v_is_the_number_of_frusta_that_hold_an_anchor(model: CameraModel) -> No
         pixels, depth = camera.project(points)
         for value, border in ((pixels[:, 0], 0), (pixels[:, 0], 64), (pixels[:, 1], 0), (pixels[:, 1], 48)):
             borderless &= np.abs(value - border) > 1e-3
-        borderless &= np.abs(depth - NEAR) > 1e-4
+        borderless &= np.abs(depth - NEAR_PLANE) > 1e-4
     points = points[borderless]
-    expected = sum(camera.sees(points).astype(int) for camera in cameras)
-    views = visibility_of(torch.from_numpy(points).float(), cameras)
+    expected = sum(camera.in_frustum(points).astype(int) for camera in cameras)
+    views = count_visibility(torch.from_numpy(points).float(), cameras)
     assert views.dtype == torch.int32
     assert views.tolist() == expected.tolist()
     assert len(set(views.tolist())) > 3
     behind = [torch.from_numpy(camera.position - camera.forward).float()[None] for camera in cameras[:5]]
-    alone = [int(visibility_of(place, [camera])) for place, camera in zip(behind, cameras[:5], strict=True)]
+    alone = [int(count_visibility(place, [camera])) for place, camera in zip(behind, cameras[:5], strict=True)]
     assert alone == [0] * 5
 
 
 def test_the_left_and_upper_border_belong_to_the_image_the_right_and_lower_do_not() -> None:
     camera = Camera(camera_from_world=np.eye(4), fx=32.0, fy=32.0, cx=32.0, cy=16.0, width=64, height=32)
-    places = [[-1, 0, 1], [1, 0, 1], [0, -0.5, 1], [0, 0.5, 1], [0, 0, 1], [0, 0, -1], [0, 0, NEAR / 2]]
+    places = [[-1, 0, 1], [1, 0, 1], [0, -0.5, 1], [0, 0.5, 1], [0, 0, 1], [0, 0, -1], [0, 0, NEAR_PLANE / 2]]
     points = np.array(places, np.float64)
-    assert visibility_of(torch.from_numpy(points).float(), [camera]).tolist() == [1, 0, 1, 0, 1, 0, 0]
-    assert camera.sees(points).tolist() == [True, False, True, False, True, False, False]
+    assert count_visibility(torch.from_numpy(points).float(), [camera]).tolist() == [1, 0, 1, 0, 1, 0, 0]
+    assert camera.in_frustum(points).tolist() == [True, False, True, False, True, False, False]
 
 
 def test_v_does_not_depend_on_the_order_of_cameras_and_no_camera_sees_nothing() -> None:
     cameras, points = flight(12), torch.from_numpy(cloud(500)).float()
-    assert torch.equal(visibility_of(points, cameras), visibility_of(points, cameras[::-1]))
-    assert visibility_of(points, []).tolist() == [0] * 500
+    assert torch.equal(count_visibility(points, cameras), count_visibility(points, cameras[::-1]))
+    assert count_visibility(points, []).tolist() == [0] * 500
 
 
 def test_a_view_counts_once_in_a_cycle_at_whatever_resolution() -> None:
     cameras, points = flight(7), torch.from_numpy(cloud(800)).float()
-    share = share_in_cycle(points, cameras)
-    again = share_in_cycle(points, [*cameras, cameras[0], cameras[3].resized(32, 24), cameras[3].resized(16, 12)])
+    share = visibility_ratio(points, cameras)
+    again = visibility_ratio(points, [*cameras, cameras[0], cameras[3].resized(32, 24), cameras[3].resized(16, 12)])
     assert torch.equal(share, again)
-    assert torch.equal(share, visibility_of(points, cameras).float() / 7)
+    assert torch.equal(share, count_visibility(points, cameras).float() / 7)
     moved = replace(cameras[0], cx=cameras[0].cx + 4)
-    assert not torch.equal(share, share_in_cycle(points, [*cameras, moved]))
+    assert not torch.equal(share, visibility_ratio(points, [*cameras, moved]))
     with pytest.raises(ValueError, match="without cameras"):
-        share_in_cycle(points, [])
+        visibility_ratio(points, [])
 
 
 def test_normalised_visibility_spans_zero_to_one_and_is_zero_where_all_are_alike() -> None:
-    assert normalised(np.array([3, 7, 5])) == pytest.approx([0, 1, 0.5])
-    assert normalised(np.array([4, 4])).tolist() == [0, 0]
-    assert len(normalised(np.array([], np.int64))) == 0
+    assert normalize_visibility(np.array([3, 7, 5])) == pytest.approx([0, 1, 0.5])
+    assert normalize_visibility(np.array([4, 4])).tolist() == [0, 0]
+    assert len(normalize_visibility(np.array([], np.int64))) == 0
 
 
 @given(st.lists(st.integers(0, 50), min_size=1, max_size=30))
@@ -100,24 +100,24 @@ def test_gini_is_the_mean_difference_of_two_anchors(views: list[int]) -> None:
     values = np.array(views, np.float64)
     mean = values.mean()
     expected = np.abs(values[:, None] - values[None]).mean() / (2 * mean) if mean else 0.0
-    assert imbalance(np.array(views)).gini == pytest.approx(expected, abs=1e-12)
+    assert visibility_stats(np.array(views)).gini == pytest.approx(expected, abs=1e-12)
 
 
 def test_imbalance_in_numbers() -> None:
-    facts = imbalance(np.arange(101))
+    facts = visibility_stats(np.arange(101))
     assert facts.mean == 50
     assert facts.quantiles == {5: 5, 25: 25, 50: 50, 75: 75, 95: 95}
     assert facts.share_below == {3: 3 / 101, 5: 5 / 101, 10: 10 / 101}
     with pytest.raises(ValueError, match="no anchors"):
-        imbalance(np.array([], np.int64))
+        visibility_stats(np.array([], np.int64))
 
 
 def test_every_anchor_divides_its_vote_among_the_cameras_that_hold_it() -> None:
     cameras, points = flight(20), torch.from_numpy(cloud(500))
-    held = np.array([visibility_of(points, [camera]).numpy() > 0 for camera in cameras])
+    held = np.array([count_visibility(points, [camera]).numpy() > 0 for camera in cameras])
     seen = held.sum(0)
     expected = [sum(1.0 / seen[i] for i in np.flatnonzero(row)) for row in held]
-    shares = votes_of(points, cameras)
+    shares = visibility_sampling_weights(points, cameras)
     assert np.allclose(shares, expected)
     assert np.isclose(sum(shares), (seen > 0).sum())
 
@@ -126,9 +126,9 @@ def test_every_anchor_divides_its_vote_among_the_cameras_that_hold_it() -> None:
 def test_photographs_used_alike_are_worth_their_number_and_one_that_outweighs_all_is_worth_one(
     count: int, weight: float
 ) -> None:
-    assert effective_count([weight] * count) == pytest.approx(count)
-    assert effective_count([weight] * count + [0.0] * 7) == pytest.approx(count)
-    assert effective_count([weight] * count + [1e9 * weight]) == pytest.approx(1.0)
+    assert effective_sample_size([weight] * count) == pytest.approx(count)
+    assert effective_sample_size([weight] * count + [0.0] * 7) == pytest.approx(count)
+    assert effective_sample_size([weight] * count + [1e9 * weight]) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(("sampling", "ratio"), [("even", None), ("shares", 9.0), ("roots", 3.0)])
@@ -147,7 +147,7 @@ def test_how_often_a_photograph_with_nine_times_the_votes_is_used(sampling: str,
     ]
     positions = torch.tensor([[0.0, 0.0, 0.0]] + [[100.0, 0.0, 0.0]] * 9)
     anchors = Anchors(positions, torch.zeros(10, 32), torch.zeros(10, 1, 3), torch.zeros(10, 6))
-    shares = shares_for(TrainConfig(sampling=sampling), anchors, cameras)
+    shares = view_sampling_weights(TrainConfig(sampling=sampling), anchors, cameras)
     assert (None if shares is None else shares[1] / shares[0]) == (ratio and pytest.approx(ratio))
 
 
@@ -160,5 +160,5 @@ def test_a_camera_alone_over_a_place_has_the_votes_of_all_its_anchors() -> None:
 
     crowd, lonely = [above(0.0)] * 9, above(100.0)
     points = torch.tensor([[0.0, 0.0, 0.0]] * 9 + [[100.0, 0.0, 0.0]] * 9)
-    assert np.allclose(votes_of(points, [*crowd, lonely]), [1.0] * 9 + [9.0])
-    assert votes_of(torch.zeros(0, 3), crowd) == (1.0,) * 9
+    assert np.allclose(visibility_sampling_weights(points, [*crowd, lonely]), [1.0] * 9 + [9.0])
+    assert visibility_sampling_weights(torch.zeros(0, 3), crowd) == (1.0,) * 9

@@ -13,7 +13,7 @@ from vdgs.kernels.rotations import rotation_matrices
 from vdgs.model.gaussians import Gaussians
 
 #: A Gaussian is split into so many (3DGS section 5.2).
-PARTS = 2
+SPLIT_COUNT = 2
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class DensityConfig:
 
 
 @dataclass(frozen=True)
-class Change:
+class DensificationResult:
     """What one decision does: first append `added`, then keep `kept` of all n + a."""
 
     added: Gaussians
@@ -56,12 +56,12 @@ class Change:
     pruned: int
 
 
-def sizes(gaussians: Gaussians) -> Float[Tensor, " n"]:
+def max_scales(gaussians: Gaussians) -> Float[Tensor, " n"]:
     """The largest standard deviation of each Gaussian."""
     return gaussians.log_scales.max(dim=1).values.exp()
 
 
-def control_density(
+def adaptive_density_control(
     gaussians: Gaussians,
     gradient: Float[Tensor, " n"],
     extent: float,
@@ -69,34 +69,34 @@ def control_density(
     generator: torch.Generator,
     *,
     prune_large: bool,
-) -> Change:
+) -> DensificationResult:
     """One decision. `gradient` is the mean norm over the views that a Gaussian was visible in, `extent` the size of
     the scene in units of the ground frame. Clones stand where their original stands (program: it is the moments of
     Adam that part them)."""
     asks = _within_limit(gradient, gradient >= config.threshold, config.max_gaussians)
-    large = sizes(gaussians) > config.dense * extent
+    large = max_scales(gaussians) > config.dense * extent
     clones, parents = asks & ~large, asks & large
-    added = gaussians.select(clones).extended(split(gaussians.select(parents), config.shrink, generator))
-    everything = gaussians.extended(added)
+    added = gaussians.select(clones).concat(split_gaussians(gaussians.select(parents), config.shrink, generator))
+    everything = gaussians.concat(added)
     unfit = everything.logits.sigmoid() < config.prune_opacity
     if prune_large:
-        unfit |= sizes(everything) > config.prune_size * extent
+        unfit |= max_scales(everything) > config.prune_size * extent
     replaced = torch.cat([parents, parents.new_zeros(len(added))])
-    return Change(
+    return DensificationResult(
         added, ~(unfit | replaced), int(clones.sum()), int(parents.sum()), int((unfit & ~replaced).sum())
     )  # fmt: skip
 
 
-def split(parents: Gaussians, shrink: float, generator: torch.Generator) -> Gaussians:
+def split_gaussians(parents: Gaussians, shrink: float, generator: torch.Generator) -> Gaussians:
     """PARTS for each of p parents, [p PARTS], all first parts before all second ones: their means are drawn from the
     parent's own distribution, their scales divided by `shrink`, everything else is the parent's."""
-    parts = parents.select(torch.arange(len(parents)).repeat(PARTS))
+    parts = parents.select(torch.arange(len(parents)).repeat(SPLIT_COUNT))
     along_axes = torch.randn(len(parts), 3, generator=generator) * parts.log_scales.exp()
     moved = (rotation_matrices(parts.quaternions) @ along_axes[:, :, None])[:, :, 0]
     return replace(parts, means=parts.means + moved, log_scales=parts.log_scales - math.log(shrink))
 
 
-def reset_logits(logits: Float[Tensor, " n"], opacity: float) -> Float[Tensor, " n"]:
+def cap_opacity_logits(logits: Float[Tensor, " n"], opacity: float) -> Float[Tensor, " n"]:
     """Opacities (before the sigmoid) of at most `opacity`."""
     return logits.clamp(max=math.log(opacity / (1 - opacity)))
 

@@ -2,7 +2,7 @@
 
 Dimensions: n Gaussians of the model, r = (degree + 1)² - 1 further coefficients of colour. Float32, ground frame.
 Source: Kerbl, Kopanas, Leimkühler and Drettakis, "3D Gaussian Splatting for Real-Time Radiance Field Rendering",
-2023 (3DGS below); its equations 5 and 6 are in `kernels.project`, 2 and 3 in `kernels.rasterise`.
+2023 (3DGS below); its equations 5 and 6 are in `kernels.project`, 2 and 3 in `kernels.rasterize`.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from scipy.spatial import cKDTree
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import Raster
-from vdgs.kernels.spherical_harmonics import MAX_DEGREE, dc_of_colours, function_count
-from vdgs.model.gaussians import Gaussians, draw_gaussians, visible_rows
-from vdgs.system.atomic_files import write_atomically
-from vdgs.system.tensors import checksum, read_tensors, write_tensors
+from vdgs.kernels.spherical_harmonics import MAX_SH_DEGREE, num_sh_bases, rgb_to_sh
+from vdgs.model.gaussians import Gaussians, render_gaussians, visible_gaussian_rows
+from vdgs.system.atomic_files import write_atomic
+from vdgs.system.tensors import read_tensors, tensors_crc32, write_tensors
 
-FORMAT = "vdgs-gaussians-1"
+FILE_FORMAT = "vdgs-gaussians-1"
 #: The smallest first size, as a share of the median one: coincident points would have none.
-LEAST_SPACING = 1e-3
+MIN_SPACING = 1e-3
 
 
-def initial_gaussians(
+def initialize_gaussians(
     points: Float[np.ndarray, "n 3"], colours: UInt8[np.ndarray, "n 3"], opacity: float, degree: int
 ) -> Gaussians:
     """A round Gaussian at each sparse point, as wide as its mean distance to the three nearest others (3DGS section
@@ -42,20 +42,20 @@ def initial_gaussians(
         raise VdgsError(f"The capture has {n} sparse point(s); at least 2 are needed. Run the reconstruction again.")
     distances, _ = cKDTree(points).query(points, k=min(4, n), workers=1)
     spacing = distances[:, 1:].mean(axis=1)
-    least = LEAST_SPACING * float(np.median(spacing)) or LEAST_SPACING
+    least = MIN_SPACING * float(np.median(spacing)) or MIN_SPACING
     log_scales = torch.from_numpy(np.log(np.maximum(spacing, least)).astype(np.float32))
     return Gaussians(
         means=torch.from_numpy(points.astype(np.float32)),
         log_scales=log_scales[:, None].repeat(1, 3),
         quaternions=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
         logits=torch.full((n,), math.log(opacity / (1 - opacity))),
-        dc=dc_of_colours(torch.from_numpy(colours.astype(np.float32) / 255.0)),
-        rest=torch.zeros(n, function_count(degree) - 1, 3),
+        dc=rgb_to_sh(torch.from_numpy(colours.astype(np.float32) / 255.0)),
+        rest=torch.zeros(n, num_sh_bases(degree) - 1, 3),
     )
 
 
 @dataclass(frozen=True)
-class GaussiansModel:
+class GaussianModel:
     """A trained scene of explicit Gaussians."""
 
     gaussians: Gaussians
@@ -67,30 +67,30 @@ class GaussiansModel:
     @torch.no_grad()
     def render(self, camera: Camera, *, depth: bool = False) -> Raster:
         """One view: image [h, w, 3] (not clamped), alpha [h, w], depth [h, w] or None."""
-        seen = self.gaussians.select(visible_rows(self.gaussians, camera))
-        return draw_gaussians(seen, camera, torch.tensor(self.background), seen.degree, depth)[0]
+        seen = self.gaussians.select(visible_gaussian_rows(self.gaussians, camera))
+        return render_gaussians(seen, camera, torch.tensor(self.background), seen.degree, depth)[0]
 
     def save(self, path: Path) -> None:
         """Write one safetensors file, atomically."""
         tensors = self.gaussians.tensors()
-        facts = {"background": self.background, "facts": dict(self.facts), "crc32": checksum(tensors)}
-        header = {FORMAT: json.dumps(facts)}
-        write_atomically(path, lambda temporary: write_tensors(temporary, tensors, header))
+        facts = {"background": self.background, "facts": dict(self.facts), "crc32": tensors_crc32(tensors)}
+        header = {FILE_FORMAT: json.dumps(facts)}
+        write_atomic(path, lambda temporary: write_tensors(temporary, tensors, header))
 
     @staticmethod
-    def load(path: Path) -> GaussiansModel:
+    def load(path: Path) -> GaussianModel:
         """Read a model. Raises VdgsError if the file is missing, damaged or not a model of Gaussians."""
         tensors, header = read_tensors(path)
-        if FORMAT not in header:
-            raise VdgsError(f"{path}: is not a vdgs model of explicit Gaussians (its header has no {FORMAT!r})")
+        if FILE_FORMAT not in header:
+            raise VdgsError(f"{path}: is not a vdgs model of explicit Gaussians (its header has no {FILE_FORMAT!r})")
         try:
-            known = json.loads(header[FORMAT])
-            if known["crc32"] != checksum(tensors):
+            known = json.loads(header[FILE_FORMAT])
+            if known["crc32"] != tensors_crc32(tensors):
                 raise ValueError("its checksum does not agree")
             gaussians = Gaussians(**tensors)
             _check(gaussians)
             red, green, blue = (float(value) for value in known["background"])
-            return GaussiansModel(gaussians, (red, green, blue), known["facts"])
+            return GaussianModel(gaussians, (red, green, blue), known["facts"])
         except (KeyError, ValueError, TypeError) as error:
             raise VdgsError(
                 f"{path}: is damaged or incomplete ({error}). Delete it and train again: it is rebuilt from the last "
@@ -101,7 +101,7 @@ class GaussiansModel:
 def _check(gaussians: Gaussians) -> None:
     """Raise ValueError unless shapes and types agree with each other and all numbers are finite."""
     n = len(gaussians)
-    counts = [function_count(degree) - 1 for degree in range(MAX_DEGREE + 1)]
+    counts = [num_sh_bases(degree) - 1 for degree in range(MAX_SH_DEGREE + 1)]
     rest = gaussians.rest.shape[1] if gaussians.rest.ndim == 3 else -1
     if rest not in counts:
         raise ValueError(f"{rest} further coefficients of colour belong to no degree")

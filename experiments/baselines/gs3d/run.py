@@ -25,34 +25,34 @@ import numpy as np
 from jaxtyping import Float
 from rich.console import Console
 
-from experiments.baselines.gs3d.model import GaussiansModel
-from experiments.baselines.gs3d.session import continue_or_start, finish, train_watched
-from experiments.baselines.gs3d.training import GaussiansConfig, GaussiansStage, scene_extent
+from experiments.baselines.gs3d.model import GaussianModel
+from experiments.baselines.gs3d.session import finish_training, resume_or_start, train_with_checkpoints
+from experiments.baselines.gs3d.training import Gs3dConfig, Gs3dProblem, scene_extent
 from vdgs import __version__
 from vdgs.captures.camera_height import camera_height
 from vdgs.captures.capture import Capture
-from vdgs.captures.capture_metadata import capture_facts, refuse_another_capture
+from vdgs.captures.capture_metadata import capture_metadata, check_same_capture
 from vdgs.captures.image_cache import ImageCache
-from vdgs.captures.validation import refuse_unworkable
-from vdgs.config.checkpointing import WatchOptions
-from vdgs.config.serialization import differences, to_dict
+from vdgs.captures.validation import require_trainable
+from vdgs.config.checkpointing import CheckpointOptions
+from vdgs.config.serialization import diff_settings, to_dict
 from vdgs.errors import RunError, VdgsError
-from vdgs.evaluation.coverage import seen_map
-from vdgs.evaluation.evaluate_model import evaluate
-from vdgs.evaluation.evaluate_run import cached_photographs, true_depth
+from vdgs.evaluation.coverage import coverage_map
+from vdgs.evaluation.evaluate_model import evaluate_model
+from vdgs.evaluation.evaluate_run import cached_reference_views, make_true_depth
 from vdgs.evaluation.lpips import load_lpips
-from vdgs.evaluation.renderable_model import EvaluationSettings, MeasuredModel, ModelFacts
+from vdgs.evaluation.renderable_model import EvaluationSettings, ModelMetadata, RenderableModel
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import Raster
-from vdgs.kernels.spherical_harmonics import MAX_DEGREE
+from vdgs.kernels.spherical_harmonics import MAX_SH_DEGREE
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.system.atomic_files import read_json, write_json
-from vdgs.training import mean_colour
-from vdgs.training.session.trainer import image_budget
+from vdgs.training import mean_image_color
+from vdgs.training.session.trainer import image_cache_bytes
 
 #: What metrics.json calls this method.
-NAME = "3dgs"
+METHOD_NAME = "3dgs"
 
 VisibilityMap = Callable[[Camera], Float[np.ndarray, "h w"]]
 
@@ -62,70 +62,70 @@ def gaussians_folder(run: RunFolder) -> StageFolder:
     return StageFolder(run.path / "gaussians")
 
 
-def run_gaussians(
+def run_gs3d(
     run: RunFolder,
     capture: Capture,
-    config: GaussiansConfig,
+    config: Gs3dConfig,
     console: Console,
     *,
-    options: WatchOptions | None = None,
+    options: CheckpointOptions | None = None,
     visibility_map: VisibilityMap | None = None,
     lpips_weights: Path | None = None,
 ) -> dict[str, Any]:
     """Train (or continue) in RUN/gaussians and measure into RUN/evaluation. Returns what metrics.json holds.
 
-    Raises what `train_gaussians` and `evaluate_gaussians` raise.
+    Raises what `train_gs3d` and `evaluate_gs3d` raise.
     """
     folder = gaussians_folder(run)
     with run.locked():
-        model = train_gaussians(capture, config, folder.path, console, options=options)
-        write_json(run.capture_file, capture_facts(capture))
-    return evaluate_gaussians(
+        model = train_gs3d(capture, config, folder.path, console, options=options)
+        write_json(run.capture_file, capture_metadata(capture))
+    return evaluate_gs3d(
         model, capture, run.evaluation, console,
         visibility_map=visibility_map, lpips_weights=lpips_weights, trained=folder,
     )  # fmt: skip
 
 
-def train_gaussians(
+def train_gs3d(
     capture: Capture,
-    config: GaussiansConfig,
+    config: Gs3dConfig,
     output: Path,
     console: Console,
     *,
-    options: WatchOptions | None = None,
-) -> GaussiansModel:
+    options: CheckpointOptions | None = None,
+) -> GaussianModel:
     """Train, or continue, 3DGS on the training views of a capture; if it is finished, only read the model.
 
     Raises VdgsError for settings that do not work, RunError where `output` holds another run, CaptureError for a
     capture that cannot become a scene or damaged photographs, Stopped after Ctrl-C or SIGTERM (state saved),
     TrainingDiverged (last good state kept).
     """
-    options, folder = options or WatchOptions(), StageFolder(output)
+    options, folder = options or CheckpointOptions(), StageFolder(output)
     options.check()
     _check(config)
     with folder.locked():
         _begin(folder, capture, config)
         if folder.is_done():
             console.print(f"{folder.model}: already trained; nothing to do", highlight=False)
-            return GaussiansModel.load(folder.model)
-        refuse_unworkable(capture, console)
+            return GaussianModel.load(folder.model)
+        require_trainable(capture, console)
         views = capture.train_views
         factors = tuple(sorted({factor for _, factor in config.resolutions}))
-        with ImageCache(views, image_budget(options), downscales=factors) as images:
+        with ImageCache(views, image_cache_bytes(options), downscales=factors) as images:
             extent, background = scene_extent([view.camera for view in views]), (0.0, 0.0, 0.0)
             if config.background == "mean":
-                background = mean_colour(images, len(views), factors[-1])
-            stage = GaussiansStage(config, images, len(views), extent, background)
-            state = continue_or_start(folder, capture, config, console)
-            train_watched(folder, state, stage, options, console)
-        facts = {"capture": capture_facts(capture), "version": __version__, "iterations": state.iteration}
-        model = GaussiansModel(state.gaussians, stage.background, facts)
-        finish(folder, state, model, console)
+                background = mean_image_color(images, len(views), factors[-1])
+            stage = Gs3dProblem(config, images, len(views), extent, background)
+            state = resume_or_start(folder, capture, config, console)
+            train_with_checkpoints(folder, state, stage, options, console)
+        facts = {"capture": capture_metadata(capture), "version": __version__, "iterations": state.iteration}
+        model = GaussianModel(state.gaussians, stage.background, facts)
+        finish_training(folder, state, model, console)
         return model
 
 
-def evaluate_gaussians(
-    model: GaussiansModel,
+def evaluate_gs3d(
+    model: GaussianModel,
     capture: Capture,
     output: Path,
     console: Console | None = None,
@@ -141,20 +141,20 @@ def evaluate_gaussians(
     are no figures by visibility. `trained` is where the model was trained, for its size, time and memory. Raises
     RunError without test views or for another capture than the model's.
     """
-    refuse_another_capture(output, model.facts.get("capture", {}), capture)
+    check_same_capture(output, model.facts.get("capture", {}), capture)
     lpips, note = load_lpips(lpips_weights)
 
     def render_depth(camera: Camera) -> Raster:
         return model.render(camera, depth=True)
 
-    measured = MeasuredModel(
-        render=model.render, visibility_map=visibility_map, facts=_facts(trained), background=model.background,
-        seen_map=seen_map(render_depth, [view.camera for view in capture.train_views]),
-        true_depth=true_depth(capture, capture.test_views), render_depth=render_depth,
+    measured = RenderableModel(
+        render=model.render, visibility_map=visibility_map, facts=_model_metadata(trained), background=model.background,
+        coverage_map=coverage_map(render_depth, [view.camera for view in capture.train_views]),
+        true_depth=make_true_depth(capture, capture.test_views), render_depth=render_depth,
         camera_height=camera_height(capture),
     )  # fmt: skip
-    with cached_photographs(capture.test_views) as photographs:
-        result = evaluate(
+    with cached_reference_views(capture.test_views) as photographs:
+        result = evaluate_model(
             photographs, measured, output, lpips=lpips, lpips_note=note, settings=settings, console=console
         )
     of_gaussians = {**dict(result), "n_gaussians": len(model.gaussians)}
@@ -162,22 +162,22 @@ def evaluate_gaussians(
     return of_gaussians
 
 
-def _facts(trained: StageFolder | None) -> ModelFacts:
+def _model_metadata(trained: StageFolder | None) -> ModelMetadata:
     if trained is None:
-        return ModelFacts(model=NAME)
+        return ModelMetadata(model=METHOD_NAME)
     status = trained.status()
-    return ModelFacts(
-        model=NAME, model_bytes=trained.model.stat().st_size,
+    return ModelMetadata(
+        model=METHOD_NAME, model_bytes=trained.model.stat().st_size,
         train_seconds=status.seconds, peak_memory_bytes=status.peak_memory_bytes,
     )  # fmt: skip
 
 
-def _check(config: GaussiansConfig) -> None:
+def _check(config: Gs3dConfig) -> None:
     """Raise VdgsError for settings that do not work."""
     starts = [start for start, _ in config.resolutions]
     problems = {
         "iterations must be at least 1": config.iterations >= 1,
-        f"degree must be from 0 to {MAX_DEGREE}": 0 <= config.degree <= MAX_DEGREE,
+        f"degree must be from 0 to {MAX_SH_DEGREE}": 0 <= config.degree <= MAX_SH_DEGREE,
         "degree_interval, density.interval and density.reset_interval must be at least 1": min(
             config.degree_interval, config.density.interval, config.density.reset_interval
         )
@@ -196,17 +196,17 @@ def _check(config: GaussiansConfig) -> None:
         raise VdgsError("These settings of 3DGS do not work:\n  " + "\n  ".join(wrong))
 
 
-def _begin(folder: StageFolder, capture: Capture, config: GaussiansConfig) -> None:
+def _begin(folder: StageFolder, capture: Capture, config: Gs3dConfig) -> None:
     """Note settings and capture of a new run, or refuse others than those of the run that is there."""
     file = folder.path / "settings.json"
     if not file.exists():
-        write_json(file, {"method": NAME, "settings": to_dict(config), "capture": capture_facts(capture)})
+        write_json(file, {"method": METHOD_NAME, "settings": to_dict(config), "capture": capture_metadata(capture)})
         return
     known = read_json(file)
-    if not isinstance(known, dict) or known.get("method") != NAME or not isinstance(known.get("settings"), dict):
+    if not isinstance(known, dict) or known.get("method") != METHOD_NAME or not isinstance(known.get("settings"), dict):
         raise RunError(f"{file}: is damaged or of another method. Choose another output folder.")
-    refuse_another_capture(file, known.get("capture") or {}, capture)
-    changed = differences(known["settings"], to_dict(config))
+    check_same_capture(file, known.get("capture") or {}, capture)
+    changed = diff_settings(known["settings"], to_dict(config))
     if changed:
         raise RunError(
             f"{file}: this run was started with other settings:\n  " + "\n  ".join(changed)

@@ -12,82 +12,80 @@ from collections.abc import Callable
 
 from rich.console import Console
 
-from experiments.baselines.gs3d.model import GaussiansModel, initial_gaussians
+from experiments.baselines.gs3d.model import GaussianModel, initialize_gaussians
 from experiments.baselines.gs3d.training import (
-    GaussiansConfig,
-    GaussiansReport,
-    GaussiansStage,
-    GaussiansState,
-    degree_at,
+    Gs3dConfig,
+    Gs3dProblem,
+    Gs3dState,
+    Gs3dStepReport,
     downscale_at,
     from_saved,
-    start_state,
+    initial_state,
+    sh_degree_at,
     to_saved,
     train,
 )
 from vdgs.captures.capture import Capture
-from vdgs.config.checkpointing import WatchOptions
-from vdgs.runs.stage_folder import StageFolder, Status
-from vdgs.system.checkpoints import save_state
-from vdgs.training.session.training_progress import LOG_INTERVAL, PLAIN_SECONDS
-from vdgs.training.session.training_session import Keeper, Watched, restore_or_start, watch
+from vdgs.config.checkpointing import CheckpointOptions
+from vdgs.runs.stage_folder import StageFolder, StatusRecord
+from vdgs.system.checkpoints import save_checkpoint
+from vdgs.training.session.training_progress import LINE_INTERVAL_SECONDS, LOG_INTERVAL
+from vdgs.training.session.training_session import Checkpointer, TrainingSession, restore_or_start, run_session
 
 
-def continue_or_start(
-    folder: StageFolder, capture: Capture, config: GaussiansConfig, console: Console
-) -> GaussiansState:
+def resume_or_start(folder: StageFolder, capture: Capture, config: Gs3dConfig, console: Console) -> Gs3dState:
     """The state of the newest whole checkpoint, or a new one; the log ends where the state does.
 
     Raises RunError for a state that this version cannot read.
     """
 
-    def start() -> GaussiansState:
-        points, colours = capture.points, capture.point_colours
-        return start_state(initial_gaussians(points, colours, config.initial_opacity, config.degree))
+    def start() -> Gs3dState:
+        points, colours = capture.points, capture.point_colors
+        return initial_state(initialize_gaussians(points, colours, config.initial_opacity, config.degree))
 
     return restore_or_start(folder, config.iterations, start, from_saved, "Choose another output folder.", console)
 
 
-def train_watched(
-    folder: StageFolder, state: GaussiansState, stage: GaussiansStage, options: WatchOptions, console: Console
+def train_with_checkpoints(
+    folder: StageFolder, state: Gs3dState, stage: Gs3dProblem, options: CheckpointOptions, console: Console
 ) -> None:
-    """Train to the end, showing, logging and saving on the way. Raises what `watch` raises."""
-    journal = _Journal(folder, stage.config, console)
-    training = Watched(
+    """Train to the end, showing, logging and saving on the way. Raises what `run_session` raises."""
+    journal = _TrainingLog(folder, stage.config, console)
+    training = TrainingSession(
         folder=folder, state=state,
-        to_saved=lambda: to_saved(state),
+        to_checkpoint=lambda: to_saved(state),
         status=lambda: journal.status(state),
         size=lambda: f"{len(state.gaussians):,} Gaussians",
-        after_divergence="",
-        save_memory=lambda: "Set density.max_gaussians or use smaller photographs, in another output folder.",
+        divergence_hint="",
+        memory_hint=lambda: "Set density.max_gaussians or use smaller photographs, in another output folder.",
         whole=lambda: state.whole,
     )  # fmt: skip
 
     def loop(stop: Callable[[], bool]) -> bool:
-        keeper = Keeper(training, options.save_every)
+        keeper = Checkpointer(training, options.save_every)
 
-        def after_step(state: GaussiansState, report: GaussiansReport) -> None:
+        def after_step(state: Gs3dState, report: Gs3dStepReport) -> None:
             keeper.tick()
             journal.step(state, report)
             keeper.keep(training.status)
 
         return train(state, stage, stop=stop, after_step=after_step)
 
-    watch(training, loop)
+    run_session(training, loop)
 
 
-class _Journal:
+class _TrainingLog:
     """log.jsonl and a line now and then."""
 
-    def __init__(self, folder: StageFolder, config: GaussiansConfig, console: Console):
+    def __init__(self, folder: StageFolder, config: Gs3dConfig, console: Console):
         self._folder, self._config, self._console = folder, config, console
         self._shown = time.monotonic()
 
-    def step(self, state: GaussiansState, report: GaussiansReport) -> None:
+    def step(self, state: Gs3dState, report: Gs3dStepReport) -> None:
         """Log and show one step."""
         if state.iteration % LOG_INTERVAL == 0 or report.cloned is not None:
             self._log(state, report)
-        if time.monotonic() - self._shown > PLAIN_SECONDS:
+        if time.monotonic() - self._shown > LINE_INTERVAL_SECONDS:
             self._shown = time.monotonic()
             self._console.print(
                 f"{state.iteration}/{self._config.iterations}  loss {state.loss:.4f}  PSNR {state.psnr:.2f} dB  "
@@ -95,20 +93,20 @@ class _Journal:
                 highlight=False,
             )
 
-    def status(self, state: GaussiansState) -> Status:
+    def status(self, state: Gs3dState) -> StatusRecord:
         """Where training stands."""
-        return Status(
+        return StatusRecord(
             state="running", iteration=state.iteration, iterations=self._config.iterations,
             psnr_training=_number(state.psnr), seconds=round(state.seconds, 1),
             peak_memory_bytes=state.peak_memory_bytes,
         )  # fmt: skip
 
-    def _log(self, state: GaussiansState, report: GaussiansReport) -> None:
+    def _log(self, state: Gs3dState, report: Gs3dStepReport) -> None:
         done = state.iteration - 1
         record = {
             "iteration": state.iteration, "loss": report.loss, "l1": report.l1, "ssim": report.ssim,
             "psnr_smoothed": _number(state.psnr), "gaussians": len(state.gaussians), "visible": report.visible,
-            "downscale": downscale_at(done, self._config), "degree": degree_at(done, self._config),
+            "downscale": downscale_at(done, self._config), "degree": sh_degree_at(done, self._config),
             "cloned": report.cloned, "split": report.split, "pruned": report.pruned,
             "seconds": round(state.seconds, 3),
         }  # fmt: skip
@@ -116,11 +114,11 @@ class _Journal:
             file.write(json.dumps(record) + "\n")
 
 
-def finish(folder: StageFolder, state: GaussiansState, model: GaussiansModel, console: Console) -> None:
+def finish_training(folder: StageFolder, state: Gs3dState, model: GaussianModel, console: Console) -> None:
     """Save the model of a run that is complete, mark it done and say so."""
-    save_state(folder.checkpoints, to_saved(state))
+    save_checkpoint(folder.checkpoints, to_saved(state))
     model.save(folder.model)
-    status = Status(
+    status = StatusRecord(
         state="done", iteration=state.iteration, iterations=state.iteration,
         seconds=state.seconds, psnr_training=_number(state.psnr), peak_memory_bytes=state.peak_memory_bytes,
     )  # fmt: skip

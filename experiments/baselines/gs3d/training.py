@@ -14,21 +14,21 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from experiments.baselines.gs3d.density import DensityConfig, control_density, reset_logits
+from experiments.baselines.gs3d.density import DensityConfig, adaptive_density_control, cap_opacity_logits
 from vdgs.errors import TrainingDiverged
 from vdgs.geometry.camera import Camera
-from vdgs.kernels import choose
-from vdgs.kernels.kernel_types import AdamState, Finite
-from vdgs.model.gaussians import Gaussians, draw_gaussians, visible_rows
-from vdgs.system.checkpoints import SavedState
-from vdgs.training import PSNR_INTERVAL, TrainingImages, view_at
-from vdgs.training.optimizer import Moments
-from vdgs.training.per_anchor_tensors import Group, remap
-from vdgs.training.training_loop import KEEP_LOSS, KEEP_PSNR, psnr_of, smoothed
+from vdgs.kernels import get_backend
+from vdgs.kernels.kernel_types import AdamState, IsFinite
+from vdgs.model.gaussians import Gaussians, render_gaussians, visible_gaussian_rows
+from vdgs.system.checkpoints import Checkpoint
+from vdgs.training import PSNR_LOG_INTERVAL, TrainingImages, view_at
+from vdgs.training.optimizer import AdamMoments
+from vdgs.training.per_anchor_tensors import TensorGroup, index_anchors
+from vdgs.training.training_loop import LOSS_DECAY, PSNR_DECAY, exponential_mean, training_psnr
 
 
 @dataclass(frozen=True)
-class GaussianRates:
+class Gs3dLearningRates:
     """Learning rates of Adam (values: the authors' program; section 5.1 of 3DGS names the schedule)."""
 
     means: tuple[float, float] = (1.6e-4, 1.6e-6)
@@ -46,7 +46,7 @@ class GaussianRates:
 
 
 @dataclass(frozen=True)
-class GaussiansConfig:
+class Gs3dConfig:
     """3DGS (Kerbl et al. 2023). Sections are those of its paper; "program": the authors' published program."""
 
     iterations: int = 30_000
@@ -66,17 +66,17 @@ class GaussiansConfig:
     background: Literal["black", "mean"] = "black"
     """Colour behind the scene (program: black). `mean` is that of the training photographs, as this project's own
     method has it: to tell what the method gains from what its background does (choice)."""
-    rates: GaussianRates = field(default_factory=GaussianRates)
+    rates: Gs3dLearningRates = field(default_factory=Gs3dLearningRates)
     """Learning rates."""
     density: DensityConfig = field(default_factory=DensityConfig)
     """Where Gaussians are added and removed."""
 
 
 @dataclass(frozen=True)
-class GaussiansStage:
+class Gs3dProblem:
     """What training works on: the same for all iterations."""
 
-    config: GaussiansConfig
+    config: Gs3dConfig
     images: TrainingImages
     image_count: int
     #: Size of the scene in units of the ground frame (`scene_extent`).
@@ -85,12 +85,12 @@ class GaussiansStage:
 
 
 @dataclass
-class GaussiansState:
+class Gs3dState:
     """All that changes during training. `iteration` steps have been made."""
 
     iteration: int
     gaussians: Gaussians
-    moments: Moments
+    moments: AdamMoments
     #: Since the last decision: sum of the norms of dL/d(mean) in NDC, and in how many views each was visible, [n].
     gradient: Tensor
     views: Tensor
@@ -104,20 +104,20 @@ class GaussiansState:
     #: Zeros between steps, in the shape of each tensor of the Gaussians: where gradients are put. Not saved.
     room: dict[str, Tensor] = field(default_factory=dict)
 
-    def take_groups(self) -> dict[str, Group]:
+    def take_groups(self) -> dict[str, TensorGroup]:
         """What is kept per Gaussian and outlives a decision, no longer held here: see `per_anchor.remap`."""
         groups = {"gaussians": self.gaussians.tensors(), "first": self.moments.first, "second": self.moments.second}
         self.put_groups({name: {key: t[:0] for key, t in group.items()} for name, group in groups.items()})
         return groups
 
-    def put_groups(self, groups: dict[str, Group]) -> None:
+    def put_groups(self, groups: dict[str, TensorGroup]) -> None:
         """The inverse of `take_groups`."""
         self.gaussians = Gaussians(**groups["gaussians"])
-        self.moments = Moments(groups["first"], groups["second"])
+        self.moments = AdamMoments(groups["first"], groups["second"])
 
 
 @dataclass(frozen=True)
-class GaussiansReport:
+class Gs3dStepReport:
     """What one step did, for the log."""
 
     loss: float
@@ -135,132 +135,136 @@ def scene_extent(cameras: list[Camera]) -> float:
     return max(1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()), 1e-6)
 
 
-def start_state(gaussians: Gaussians) -> GaussiansState:
+def initial_state(gaussians: Gaussians) -> Gs3dState:
     """A state before the first step. The tensors are moved in place: give copies of what must stay."""
     n = len(gaussians)
-    return GaussiansState(0, gaussians, Moments.zeros(gaussians.tensors()), torch.zeros(n), torch.zeros(n))
+    return Gs3dState(0, gaussians, AdamMoments.zeros(gaussians.tensors()), torch.zeros(n), torch.zeros(n))
 
 
-def degree_at(iteration: int, config: GaussiansConfig) -> int:
+def sh_degree_at(iteration: int, config: Gs3dConfig) -> int:
     """Degree of the spherical harmonics at this iteration (from 0)."""
     return min(iteration // config.degree_interval, config.degree)
 
 
-def downscale_at(iteration: int, config: GaussiansConfig) -> int:
+def downscale_at(iteration: int, config: Gs3dConfig) -> int:
     """Factor by which images are shrunk at this iteration (from 0)."""
     return [factor for start, factor in config.resolutions if iteration >= start][-1]
 
 
-def rates_at(config: GaussiansConfig, extent: float, iteration: int) -> dict[str, float]:
+def learning_rates_at(config: Gs3dConfig, extent: float, iteration: int) -> dict[str, float]:
     """Learning rate of each tensor of `Gaussians` at this iteration (from 0)."""
     first, last = config.rates.means
     means = extent * first * (last / first) ** (iteration / config.iterations)
     return {name: getattr(config.rates, name) for name in Gaussians.__dataclass_fields__} | {"means": means}
 
 
-def train_step(state: GaussiansState, stage: GaussiansStage) -> GaussiansReport:
+def gs3d_train_step(state: Gs3dState, stage: Gs3dProblem) -> Gs3dStepReport:
     """One step: render a training view, compare, move all Gaussians, count, perhaps clone, split and prune.
 
     Changes `state` in place. Raises TrainingDiverged if the loss or a gradient is not finite.
     """
     config, iteration = stage.config, state.iteration
-    downscale, degree = downscale_at(iteration, config), degree_at(iteration, config)
+    downscale, degree = downscale_at(iteration, config), sh_degree_at(iteration, config)
     view = view_at(iteration, stage.image_count, config.seed)
     target, mask = stage.images.get(view, downscale)
     camera = stage.images.camera(view, downscale)
 
-    rows = visible_rows(state.gaussians, camera)
+    rows = visible_gaussian_rows(state.gaussians, camera)
     seen = {name: t.index_select(0, rows).requires_grad_() for name, t in state.gaussians.tensors().items()}
     behind = state.gaussians.means.new_tensor(stage.background)
-    raster, means_px = draw_gaussians(Gaussians(**seen), camera, behind, degree)
-    kernels = choose(raster.image.device)
+    raster, means_px = render_gaussians(Gaussians(**seen), camera, behind, degree)
+    kernels = get_backend(raster.image.device)
     found = kernels.photometric_loss(raster.image, target, mask, ssim_weight=config.ssim_weight)
     value = float(found.loss.detach())
     if not math.isfinite(value):
         raise TrainingDiverged(f"The loss is {value} at iteration {iteration + 1}.")
     *gradients, of_means_px = torch.autograd.grad(found.loss, [*seen.values(), means_px], materialize_grads=True)
-    psnr = psnr_of(raster.image.detach(), target, mask) if (iteration + 1) % PSNR_INTERVAL == 0 else None
-    _make_room(state)
+    psnr = training_psnr(raster.image.detach(), target, mask) if (iteration + 1) % PSNR_LOG_INTERVAL == 0 else None
+    _allocate_gradients(state)
     state.whole = False
-    _move(state, rows, dict(zip(seen, gradients, strict=True)), rates_at(config, stage.extent, iteration), degree)
+    _adam_step(
+        state, rows, dict(zip(seen, gradients, strict=True)), learning_rates_at(config, stage.extent, iteration), degree
+    )
     state.iteration += 1
 
-    report = GaussiansReport(value, float(found.l1), float(found.ssim), len(rows))
+    report = Gs3dStepReport(value, float(found.l1), float(found.ssim), len(rows))
     if state.iteration <= config.density.until * config.iterations:
-        _count(state, rows, of_means_px, camera)
-        report = replace(report, **_control(state, stage))
+        _accumulate_gradients(state, rows, of_means_px, camera)
+        report = replace(report, **_densify(state, stage))
     _smooth(state, value, psnr)
     state.whole = True
     return report
 
 
-def _make_room(state: GaussiansState) -> None:
+def _allocate_gradients(state: Gs3dState) -> None:
     """Room for gradients, where growth has taken it away: before anything moves, since it is large."""
     for name, tensor in state.gaussians.tensors().items():
         if name not in state.room:
             state.room[name] = torch.zeros_like(tensor)
 
 
-def _move(
-    state: GaussiansState, rows: Int64[Tensor, " v"], gradients: dict[str, Tensor], rates: dict[str, float], degree: int
+def _adam_step(
+    state: Gs3dState, rows: Int64[Tensor, " v"], gradients: dict[str, Tensor], rates: dict[str, float], degree: int
 ) -> None:
     """One step of Adam for all Gaussians: those that the view does not show move on by their moments (program)."""
-    finite: Finite = True
+    finite: IsFinite = True
     for name, tensor in state.gaussians.tensors().items():
         if name == "rest" and not degree:
             continue  # gradients and moments are zero: nothing moves
         everywhere = state.room[name].index_copy_(0, rows, gradients[name])
         moved = AdamState(tensor, state.moments.first[name], state.moments.second[name], rates[name])
-        finite = choose(tensor.device).adam_rows(moved, None, everywhere, state.iteration + 1) & finite
+        finite = get_backend(tensor.device).adam_rows(moved, None, everywhere, state.iteration + 1) & finite
         everywhere.index_fill_(0, rows, 0.0)
     if not finite:
         raise TrainingDiverged(f"A gradient is not a finite number at iteration {state.iteration + 1}.")
 
 
-def _count(state: GaussiansState, rows: Int64[Tensor, " v"], of_px: Float[Tensor, "v 2"], camera: Camera) -> None:
+def _accumulate_gradients(
+    state: Gs3dState, rows: Int64[Tensor, " v"], of_px: Float[Tensor, "v 2"], camera: Camera
+) -> None:
     """Add the norms of the gradients of the means, in NDC: these run over [-1, 1] across the image."""
     state.gradient[rows] += torch.hypot(of_px[:, 0] * (camera.width / 2), of_px[:, 1] * (camera.height / 2))
     state.views[rows] += 1
 
 
-def _control(state: GaussiansState, stage: GaussiansStage) -> dict[str, Any]:
+def _densify(state: Gs3dState, stage: Gs3dProblem) -> dict[str, Any]:
     """Clone, split and prune, and reset opacities, where it is time. Returns what GaussiansReport says of it."""
     config, done = stage.config.density, state.iteration
     facts: dict[str, Any] = {}
     if done > config.start and done % config.interval == 0:
         generator = torch.Generator().manual_seed(stage.config.seed * 1_000_003 + done)
-        change = control_density(
+        change = adaptive_density_control(
             state.gaussians, state.gradient / state.views.clamp(min=1), stage.extent, config, generator,
             prune_large=done > config.reset_interval,
         )  # fmt: skip
         _apply(state, change.added, change.kept)
         facts = {"cloned": change.cloned, "split": change.split, "pruned": change.pruned}
     if done % config.reset_interval == 0:
-        state.gaussians.logits.copy_(reset_logits(state.gaussians.logits, config.reset_opacity))
+        state.gaussians.logits.copy_(cap_opacity_logits(state.gaussians.logits, config.reset_opacity))
         state.moments.first["logits"].zero_()
         state.moments.second["logits"].zero_()
     return facts
 
 
-def _apply(state: GaussiansState, added: Gaussians, kept: Tensor) -> None:
+def _apply(state: Gs3dState, added: Gaussians, kept: Tensor) -> None:
     """Append Gaussians without moments, then keep some of all; the statistics begin again."""
     state.room = {}
-    remap(state, {"gaussians": added.tensors()}, len(added), kept)
+    index_anchors(state, {"gaussians": added.tensors()}, len(added), kept)
     state.gradient, state.views = torch.zeros(len(state.gaussians)), torch.zeros(len(state.gaussians))
 
 
-def _smooth(state: GaussiansState, loss: float, psnr: float | None) -> None:
-    state.loss = smoothed(state.loss, loss, KEEP_LOSS)
+def _smooth(state: Gs3dState, loss: float, psnr: float | None) -> None:
+    state.loss = exponential_mean(state.loss, loss, LOSS_DECAY)
     if psnr is not None:
-        state.psnr = smoothed(state.psnr, psnr, KEEP_PSNR)
+        state.psnr = exponential_mean(state.psnr, psnr, PSNR_DECAY)
 
 
 def train(
-    state: GaussiansState,
-    stage: GaussiansStage,
+    state: Gs3dState,
+    stage: Gs3dProblem,
     *,
     stop: Callable[[], bool],
-    after_step: Callable[[GaussiansState, GaussiansReport], None],
+    after_step: Callable[[Gs3dState, Gs3dStepReport], None],
     prefetch: int = 4,
 ) -> bool:
     """Steps until the last iteration or until `stop()` is true. True if complete. `after_step` sees every step."""
@@ -270,12 +274,12 @@ def train(
             return False
         for ahead in range(state.iteration + 1, min(state.iteration + 1 + prefetch, config.iterations)):
             stage.images.prefetch([view_at(ahead, stage.image_count, config.seed)], downscale_at(ahead, config))
-        report = train_step(state, stage)
+        report = gs3d_train_step(state, stage)
         after_step(state, report)
     return True
 
 
-def to_saved(state: GaussiansState) -> SavedState:
+def to_saved(state: Gs3dState) -> Checkpoint:
     """The whole state as tensors and facts."""
     tensors = {f"gaussians.{name}": tensor for name, tensor in state.gaussians.tensors().items()}
     tensors |= {f"first.{name}": tensor for name, tensor in state.moments.first.items()}
@@ -283,17 +287,17 @@ def to_saved(state: GaussiansState) -> SavedState:
     tensors |= {"gradient": state.gradient, "views": state.views}
     facts = {"loss": repr(state.loss), "psnr": repr(state.psnr), "seconds": state.seconds,
              "peak_memory_bytes": state.peak_memory_bytes}  # fmt: skip
-    return SavedState(state.iteration, facts, tensors)
+    return Checkpoint(state.iteration, facts, tensors)
 
 
-def from_saved(saved: SavedState) -> GaussiansState:
-    """The inverse of `to_saved`, bit for bit. Raises KeyError or TypeError if something is missing."""
+def from_saved(saved: Checkpoint) -> Gs3dState:
+    """The inverse of `to_checkpoint`, bit for bit. Raises KeyError or TypeError if something is missing."""
 
     def part(prefix: str) -> dict[str, Tensor]:
         return {k.removeprefix(prefix): v for k, v in saved.tensors.items() if k.startswith(prefix)}
 
-    return GaussiansState(
-        saved.iteration, Gaussians(**part("gaussians.")), Moments(part("first."), part("second.")),
+    return Gs3dState(
+        saved.iteration, Gaussians(**part("gaussians.")), AdamMoments(part("first."), part("second.")),
         saved.tensors["gradient"], saved.tensors["views"], float(saved.facts["loss"]), float(saved.facts["psnr"]),
         float(saved.facts["seconds"]), int(saved.facts["peak_memory_bytes"]),
     )  # fmt: skip

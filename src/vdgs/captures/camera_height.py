@@ -16,47 +16,49 @@ from vdgs.captures.capture import Capture
 from vdgs.geometry.similarity import geometric_median
 
 #: Cameras that are no higher above the points than this share of their distance to them fly at no height (choice).
-LEAST_HEIGHT = 0.02
+MIN_HEIGHT_RATIO = 0.02
 
 
-class Reach(NamedTuple):
+class ViewDistance(NamedTuple):
     """A typical distance from cameras to what they see; whether it is their height above the points."""
 
     length: float
     is_height: bool
 
 
-def reach(centres: Float[np.ndarray, "c 3"], points: Float[np.ndarray, "p 3"], up: Float[np.ndarray, "3"]) -> Reach:
+def view_distance(
+    centres: Float[np.ndarray, "c 3"], points: Float[np.ndarray, "p 3"], up: Float[np.ndarray, "3"]
+) -> ViewDistance:
     """Median height of the cameras above the median point along `up`, a unit vector; where there is none to speak of,
     the median distance of the cameras to the geometric median of the points. 0 if all lies in one place."""
     height = float(np.median(centres @ up) - np.median(points @ up))
     distance = float(np.median(np.linalg.norm(centres - geometric_median(points), axis=1)))
-    return Reach(height, True) if height > LEAST_HEIGHT * distance else Reach(distance, False)
+    return ViewDistance(height, True) if height > MIN_HEIGHT_RATIO * distance else ViewDistance(distance, False)
 
 
 def camera_height(capture: Capture) -> float:
     """How high the training cameras fly above the sparse points, or where they do not, how far they are from them
-    (`reach`); above 0 in any case."""
+    (`view_distance`); above 0 in any case."""
     centres = np.array([view.camera.position for view in capture.train_views])
-    return max(reach(centres, capture.points, np.array([0.0, 0.0, 1.0])).length, 1e-9)
+    return max(view_distance(centres, capture.points, np.array([0.0, 0.0, 1.0])).length, 1e-9)
 
 
 #: Vertical angle of view of a first look (choice).
 FOV_DEG = 50.0
 
 
-class Overview(NamedTuple):
+class DefaultView(NamedTuple):
     """Where to stand and what to look at, ground frame; z is up."""
 
     position: Float[np.ndarray, "3"]
     target: Float[np.ndarray, "3"]
 
 
-def overview(capture: Capture) -> Overview:
+def default_view(capture: Capture) -> DefaultView:
     """All of the flight from the south, half from above."""
     middle, half = _extent(capture)
     distance = max(1.5 * camera_height(capture), 1.3 * half / math.tan(math.radians(FOV_DEG / 2)))
-    return Overview(middle + distance * np.array([0.0, -math.sqrt(0.5), math.sqrt(0.5)]), middle)
+    return DefaultView(middle + distance * np.array([0.0, -math.sqrt(0.5), math.sqrt(0.5)]), middle)
 
 
 def _extent(capture: Capture) -> tuple[Float[np.ndarray, "3"], float]:

@@ -13,7 +13,7 @@ from vdgs.geometry.ground_frame import GroundFrame
 
 
 @dataclass(frozen=True, eq=False)
-class Sightings:
+class Observations:
     """Points [m, 3] that a photograph shows, in the world of its camera, and where it shows them: x/z and y/z of the
     camera's rays [m, 2], all float64; and their numbers [m] int64, the same in all photographs of a capture."""
 
@@ -21,7 +21,7 @@ class Sightings:
     rays: np.ndarray
     numbers: np.ndarray
 
-    def errors_px(self, camera: Camera) -> np.ndarray:
+    def reprojection_errors_px(self, camera: Camera) -> np.ndarray:
         """Reprojection errors [m] in pixels of a pinhole camera in the same world; infinite behind it."""
         pixels, depth = camera.project(self.points)
         found = self.rays * (camera.fx, camera.fy) + (camera.cx, camera.cy)
@@ -42,7 +42,7 @@ class View:
     mask_path: Path | None
     split: Split
     #: Some of the points that the capture says this photograph shows, where it says so (ground frame).
-    sightings: Sightings | None = None
+    sightings: Observations | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -57,7 +57,7 @@ class Capture:
     views: tuple[View, ...]
     #: Sparse points [n, 3] float64 in the ground frame, and their colours [n, 3] uint8.
     points: np.ndarray
-    point_colours: np.ndarray
+    point_colors: np.ndarray
     ground: GroundFrame
     #: What a person should know but need not mend.
     warnings: tuple[str, ...] = field(default=())

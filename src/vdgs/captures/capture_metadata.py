@@ -14,7 +14,7 @@ from vdgs.errors import RunError
 from vdgs.system.documents import CaptureMetadata
 
 
-def capture_facts(capture: Capture) -> CaptureMetadata:
+def capture_metadata(capture: Capture) -> CaptureMetadata:
     """What capture.json and a model say about where they come from."""
     ground = capture.ground
     return {
@@ -28,26 +28,26 @@ def capture_facts(capture: Capture) -> CaptureMetadata:
             "axes_geo": ground.axes_geo,
         },
         "warnings": list(capture.warnings),
-        "fingerprint": fingerprint(capture),
+        "fingerprint": capture_fingerprint(capture),
     }  # fmt: skip
 
 
-def fingerprint(capture: Capture) -> dict[str, int]:
+def capture_fingerprint(capture: Capture) -> dict[str, int]:
     """CRC-32 of each part of a capture that results depend on. Photographs count by name and size in bytes."""
     return {
         "choice of training and test photographs": _crc(*(f"{view.name}:{view.split}" for view in capture.views)),
         "photographs": _crc(*(f"{view.name}:{view.image_path.stat().st_size}" for view in capture.views)),
         "cameras or ground frame": _crc(*(_camera_bytes(view) for view in capture.views)),
-        "sparse points": _crc(capture.points.tobytes(), capture.point_colours.tobytes()),
+        "sparse points": _crc(capture.points.tobytes(), capture.point_colors.tobytes()),
     }
 
 
-def refuse_another_capture(source: Path, before: CaptureMetadata | Mapping[str, Any] | None, capture: Capture) -> None:
+def check_same_capture(source: Path, before: CaptureMetadata | Mapping[str, Any] | None, capture: Capture) -> None:
     """Raise RunError, naming what changed, unless `capture` is the one that `before` (capture_facts) describes."""
     known = (before or {}).get("fingerprint")
     if not isinstance(known, Mapping):
         raise RunError(f"{source}: does not say which capture the run belongs to. It is damaged; start a new --output.")
-    changed = [part for part, crc in fingerprint(capture).items() if known.get(part) != crc]
+    changed = [part for part, crc in capture_fingerprint(capture).items() if known.get(part) != crc]
     if changed:
         raise RunError(
             f"{capture.root}: is not the capture that {source} was made from any more; changed: {', '.join(changed)}. "

@@ -9,10 +9,10 @@ from pathlib import PurePosixPath
 from typing import NamedTuple
 
 #: Folders that part the photographs of a flight into those that train and others.
-SPLITS = {"train", "val", "test"}
+SPLIT_FOLDER_NAMES = {"train", "val", "test"}
 
 
-class Place(NamedTuple):
+class FlightPosition(NamedTuple):
     """Where in a flight a photograph was taken."""
 
     #: The folder of its name: photographs of other folders belong to other flights.
@@ -21,14 +21,16 @@ class Place(NamedTuple):
     number: int
 
 
-def places_in_flights(names: Iterable[str]) -> dict[str, Place]:
+def flight_positions(names: Iterable[str]) -> dict[str, FlightPosition]:
     """The place of each photograph, by its name: within its folder in natural order, DJI_2 before DJI_10. Folders of
     splits (Mega-NeRF's train/ and val/) do not part a flight."""
     flights = defaultdict[str, list[str]](list)
     for name in names:
-        flights["/".join(part for part in PurePosixPath(name).parent.parts if part not in SPLITS)].append(name)
+        flights["/".join(part for part in PurePosixPath(name).parent.parts if part not in SPLIT_FOLDER_NAMES)].append(
+            name
+        )
     return {
-        name: Place(flight, number)
+        name: FlightPosition(flight, number)
         for flight, taken in flights.items()
         for number, name in enumerate(sorted(taken, key=_natural))
     }

@@ -15,7 +15,7 @@ from vdgs.captures.formats.colmap import count_images, find_models, partial_mode
 from vdgs.captures.formats.matrixcity import pose_files, read_matrixcity
 from vdgs.captures.formats.mega_nerf import is_mega_nerf, read_mega_nerf
 from vdgs.captures.formats.source_capture import SourceCapture
-from vdgs.captures.formats.transforms import FILE, only_it_says, read_transforms
+from vdgs.captures.formats.transforms import TRANSFORMS_FILE, exclusive_information, read_transforms
 from vdgs.captures.reconstruction import is_reconstruction
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -26,16 +26,16 @@ def read_source(root: Path, options: CaptureOptions) -> SourceCapture:
 
     Raises `CaptureError` where there is none, and as the readers do.
     """
-    here = [name for name, (is_here, _) in FORMATS.items() if is_here(root)]
+    here = [name for name, (is_here, _) in READERS.items() if is_here(root)]
     if options.format != "auto":
         if options.format not in here:
             found = f"It holds: {', '.join(here)}." if here else "It holds none that is known."
             raise CaptureError(f"{root}: --format {options.format}, but the folder holds no such capture. {found}")
-        return FORMATS[options.format][1](root, options)
+        return READERS[options.format][1](root, options)
     if here[:2] == ["colmap", "transforms"]:
         return _of_both(root, options)
     if here:
-        return FORMATS[here[0]][1](root, options)
+        return READERS[here[0]][1](root, options)
     if is_reconstruction(root):
         raise CaptureError(
             f"{root}: is not finished: vdgs sfm was stopped. The command that began it goes on "
@@ -52,16 +52,16 @@ def _of_both(root: Path, options: CaptureOptions) -> SourceCapture:
     """One of a COLMAP model and transforms.json, with a note about the other."""
     model = _biggest(find_models(root)).relative_to(root)
     theirs = f"the COLMAP model in {model}" if model.parts else "the COLMAP model"
-    says = only_it_says(root / FILE)
+    says = exclusive_information(root / TRANSFORMS_FILE)
     if not says:
-        note = f"{theirs} is read; {FILE} beside it is not (--format transforms reads that instead)."
+        note = f"{theirs} is read; {TRANSFORMS_FILE} beside it is not (--format transforms reads that instead)."
         source = _read_colmap(root, options)
         return replace(source, warnings=(note, *source.warnings))
     try:
         source = read_transforms(root, options)
     except CaptureError as error:
         raise CaptureError(f"{error}\nOr read {theirs} instead: --format colmap") from error
-    note = f"{FILE} is read, for its {says}; {theirs} is not (--format colmap reads that instead)."
+    note = f"{TRANSFORMS_FILE} is read, for its {says}; {theirs} is not (--format colmap reads that instead)."
     return replace(source, warnings=(note, *source.warnings))
 
 
@@ -112,9 +112,9 @@ def image_folder(root: Path, options: CaptureOptions) -> tuple[str, list[str]]:
 
 
 #: Of each format, in the order in which they are looked for: whether a folder holds it, and its reader.
-FORMATS: dict[str, tuple[Callable[[Path], object], Callable[[Path, CaptureOptions], SourceCapture]]] = {
+READERS: dict[str, tuple[Callable[[Path], object], Callable[[Path, CaptureOptions], SourceCapture]]] = {
     "mega-nerf": (is_mega_nerf, read_mega_nerf),
     "matrixcity": (pose_files, read_matrixcity),
     "colmap": (find_models, _read_colmap),
-    "transforms": (lambda root: (root / FILE).is_file(), read_transforms),
+    "transforms": (lambda root: (root / TRANSFORMS_FILE).is_file(), read_transforms),
 }

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vdgs.captures.name_resolution import Lookup, ambiguity
+from vdgs.captures.name_resolution import NameLookup, ambiguity_message
 from vdgs.errors import CaptureError
 
 _Find = Callable[[str], tuple[tuple[int, int], list[int]]]
@@ -93,7 +93,7 @@ def match_gps(names: Sequence[str], rows: Sequence[GpsRow], file: Path) -> tuple
     not those of the images, by what lies in them. Raises `CaptureError` where a name may be of several images, where
     several rows place one image differently, and if no name matches: then it is another flight's table.
     """
-    lookup = Lookup((name, index) for index, name in enumerate(names))
+    lookup = NameLookup((name, index) for index, name in enumerate(names))
     found = _best_rows(names, rows, lookup.find, file) or _best_rows(names, rows, lookup.find_elsewhere, file)
     if not found:
         raise CaptureError(
@@ -116,7 +116,9 @@ def _best_rows(names: Sequence[str], rows: Sequence[GpsRow], find: _Find, file: 
         best = min(rank for rank, _, _ in claims)
         (which, row), *others = [(which, row) for rank, which, row in claims if rank == best]
         if len(which) > 1:
-            raise CaptureError(f"{file}: line {row.line}: {ambiguity(row.name, names[which[0]], names[which[1]])}")
+            raise CaptureError(
+                f"{file}: line {row.line}: {ambiguity_message(row.name, names[which[0]], names[which[1]])}"
+            )
         other = next((each for _, each in others if each.position != row.position), None)
         if other is not None:
             raise CaptureError(

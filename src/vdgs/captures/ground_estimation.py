@@ -10,7 +10,7 @@ Where the up axis and the scale come from, in this order:
 
 All arithmetic is float64. Choice: in a frame that is not georeferenced the origin is the median sparse point,
 so z = 0 is the median height of the ground; where metres are unknown the median camera flies at
-`CAMERA_HEIGHT`, or is so far from the points where it is not above them (`heights`).
+`NOMINAL_CAMERA_HEIGHT`, or is so far from the points where it is not above them (`heights`).
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-from vdgs.captures.camera_height import reach
-from vdgs.captures.formats.source_capture import KnownWorld, SourceCapture
+from vdgs.captures.camera_height import view_distance
+from vdgs.captures.formats.source_capture import SourceCapture, WorldPrior
 from vdgs.captures.georeference import match_gps, read_georef, read_gps
 from vdgs.captures.up_axis import estimate_up
 from vdgs.config.capture_options import CaptureOptions
@@ -30,20 +30,20 @@ from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu
 from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.geometry.similarity import (
     Similarity,
-    disagreement,
+    describe_disagreement,
     fit_similarity_robust,
     geometric_median,
     is_collinear,
 )
 
 #: Median camera height above the ground, in units, where the capture has no metres (choice).
-CAMERA_HEIGHT = 10.0
+NOMINAL_CAMERA_HEIGHT = 10.0
 #: Georeferenced worlds farther than this from their origin are shifted, so that float32 stays below 0.1 mm.
 FAR_FROM_ORIGIN_M = 1000.0
 #: Cameras farther than this from the origin of an ENU world are not in it: they have turned by half a degree.
-FARTHEST_ENU_M = 50_000.0
+MAX_ENU_DISTANCE_M = 50_000.0
 #: A told up axis farther than this from the estimated one is worth a warning.
-SUSPICIOUS_DEG = 30.0
+MAX_UP_DEVIATION_DEG = 30.0
 AXES = {
     sign + name: factor * np.eye(3)[index]
     for index, name in enumerate("xyz")
@@ -114,7 +114,7 @@ def _georeferenced(scene: _Scene, file: Path, warnings: list[str]) -> GroundFram
     if shift.any():
         how = f"{how}, origin moved by {np.abs(shift).max():.0f} m"
     frame = GroundFrame(scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, how=how, origin_geo=origin)
-    if np.linalg.norm(middle) > FARTHEST_ENU_M:
+    if np.linalg.norm(middle) > MAX_ENU_DISTANCE_M:
         warnings.append(
             f"{file.name}: the cameras are {np.linalg.norm(middle) / 1000:,.0f} km away from the origin, where its "
             "east, north and up do not hold. Are these projected coordinates (UTM) instead of ENU? Metres and up "
@@ -127,9 +127,9 @@ def _georeferenced(scene: _Scene, file: Path, warnings: list[str]) -> GroundFram
 def _shifted(frame: GroundFrame, shift: np.ndarray, how: str) -> GroundFrame:
     """The frame with its origin moved; the axes stay those of the first origin."""
     assert frame.origin_geo is not None
-    moved = geodetic_from_enu(-shift[None], frame.origin_geo, frame.level_at)[0]
+    moved = geodetic_from_enu(-shift[None], frame.origin_geo, frame.axes_origin)[0]
     origin = (float(moved[0]), float(moved[1]), float(moved[2]))
-    return replace(frame, translation=frame.translation + shift, how=how, origin_geo=origin, axes_geo=frame.level_at)
+    return replace(frame, translation=frame.translation + shift, how=how, origin_geo=origin, axes_geo=frame.axes_origin)
 
 
 def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | None:
@@ -151,7 +151,7 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
         )
         return None
     residuals = similarity.apply(centres) - enu
-    how_far = disagreement(residuals, enu, inliers)
+    how_far = describe_disagreement(residuals, enu, inliers)
     if how_far:
         warnings.append(
             f"{file.name}: GPS and camera positions disagree ({how_far}); it is ignored and the frame is estimated."
@@ -176,7 +176,7 @@ def _compare_up(scene: _Scene, frame: GroundFrame, warnings: list[str]) -> None:
     doubts: list[str] = []
     up, _ = estimate_up(scene.centres, scene.rotations, scene.points, doubts)
     angle = float(np.degrees(np.arccos(np.clip(frame.rotation[2] @ up, -1, 1))))
-    if angle > SUSPICIOUS_DEG and not doubts:
+    if angle > MAX_UP_DEVIATION_DEG and not doubts:
         warnings.append(
             f"up is {angle:.0f} degrees away from what cameras and points suggest (used: {frame.how}). "
             "If the scene looks tilted, give --up."
@@ -198,8 +198,8 @@ def rotation_to_z(up: np.ndarray) -> np.ndarray:
 
 
 def _unscaled(scene: _Scene, rotation: np.ndarray, how: str, warnings: list[str]) -> GroundFrame:
-    """A frame without metres: the median camera flies at `CAMERA_HEIGHT` above the median point."""
-    length, is_height = reach(scene.centres, scene.points, rotation[2])
+    """A frame without metres: the median camera flies at `NOMINAL_CAMERA_HEIGHT` above the median point."""
+    length, is_height = view_distance(scene.centres, scene.points, rotation[2])
     if not is_height:
         warnings.append(
             "the cameras are not above the points; the scale is set by their distance instead. "
@@ -207,10 +207,10 @@ def _unscaled(scene: _Scene, rotation: np.ndarray, how: str, warnings: list[str]
         )
     if not length > 0:
         raise CaptureError("all cameras and points lie in one place; this is no scene. Check the sparse model.")
-    return _centred(scene, rotation, CAMERA_HEIGHT / length, False, f"{how}; median camera height = 10 units")
+    return _centred(scene, rotation, NOMINAL_CAMERA_HEIGHT / length, False, f"{how}; median camera height = 10 units")
 
 
-def _promised(scene: _Scene, world: KnownWorld, warnings: list[str]) -> GroundFrame:
+def _promised(scene: _Scene, world: WorldPrior, warnings: list[str]) -> GroundFrame:
     """The frame that a format promises; its scale is chosen where the format knows no metres."""
     if world.metric:
         return _centred(scene, world.rotation, world.scale, True, world.how)

@@ -28,7 +28,7 @@ _STEPS = 65534
 
 
 @dataclass(frozen=True, eq=False)
-class Truth:
+class GroundTruth:
     """Truth by photograph name, read from disk when asked for. Names may come with or without their extension."""
 
     folder: Path
@@ -54,7 +54,7 @@ class Truth:
         """The true depth in metres at the size at which the view is used (nearest pixel); inf for sky."""
         return self._at_size(self.depth(view.name), view.camera)
 
-    def knows_depth(self, view: View) -> bool:
+    def has_depth(self, view: View) -> bool:
         """Whether this photograph's depth was written."""
         return any(self._file(kind, view.name).is_file() for kind in ("views", "depth"))
 
@@ -72,17 +72,17 @@ class Truth:
         return self.folder / kind / f"{Path(name).stem}.npz"
 
 
-def has_truth(capture_root: Path) -> bool:
+def has_ground_truth(capture_root: Path) -> bool:
     """Whether a capture was generated and written with its truth."""
     return (Path(capture_root) / _FOLDER / "views").is_dir()
 
 
-def load_truth(capture_root: Path) -> Truth:
+def load_ground_truth(capture_root: Path) -> GroundTruth:
     """The truth of a generated capture. Raises VdgsError if it was written without."""
     folder = Path(capture_root) / _FOLDER
-    if not has_truth(capture_root):
+    if not has_ground_truth(capture_root):
         raise VdgsError(f"{folder}: no truth here. Only generated captures have it: vdgs synth OUTPUT --truth.")
-    return Truth(folder)
+    return GroundTruth(folder)
 
 
 def pack_depth(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -14,15 +14,15 @@ import torch
 from torch import Tensor
 
 from vdgs.captures.capture import View
-from vdgs.captures.image_files import decode_mask, decode_photograph, same_shape
+from vdgs.captures.image_files import decode_image, decode_mask, same_aspect
 from vdgs.errors import CaptureError
 from vdgs.geometry.camera import Camera
 
 #: Prefetches beyond this many are dropped: a hint, not a promise.
-LONGEST_QUEUE = 16
+MAX_PREFETCH = 16
 
 
-class Picture(NamedTuple):
+class DecodedImage(NamedTuple):
     """Pixels [h, w, 3] uint8 RGB, and the mask [h, w] uint8 (1 = keep, 0 = leave out) where there is one."""
 
     image: Tensor
@@ -52,9 +52,9 @@ class ImageCache:
         self.views = tuple(views)
         self.budget_bytes = budget_bytes
         self.downscales = tuple(downscales)
-        self._kept: OrderedDict[tuple[int, float], Picture] = OrderedDict()
+        self._kept: OrderedDict[tuple[int, float], DecodedImage] = OrderedDict()
         self._bytes = 0
-        self._pending: dict[tuple[int, float], Future[Picture]] = {}
+        self._pending: dict[tuple[int, float], Future[DecodedImage]] = {}
         self._lock = threading.Lock()
         self._pool = ThreadPoolExecutor(max_workers=threads, thread_name_prefix="images")
         self._closed = False
@@ -75,7 +75,7 @@ class ImageCache:
         camera = self.views[index].camera
         return camera.resized(*self._size(index, downscale)) if downscale != 1 else camera
 
-    def get(self, index: int, downscale: float = 1) -> Picture:
+    def get(self, index: int, downscale: float = 1) -> DecodedImage:
         """The picture of view `index`. Raises `CaptureError` naming the file if it cannot be decoded."""
         key = self._key(index, downscale)
         with self._lock:
@@ -104,9 +104,9 @@ class ImageCache:
             with self._lock:
                 if key in self._kept or key in self._pending:
                     continue
-                if len(self._pending) >= LONGEST_QUEUE:
+                if len(self._pending) >= MAX_PREFETCH:
                     return
-                future: Future[Picture] = Future()
+                future: Future[DecodedImage] = Future()
                 self._pending[key] = future
                 self._pool.submit(self._run, key, future)
 
@@ -135,7 +135,7 @@ class ImageCache:
         camera = self.views[index].camera
         return max(1, int(camera.width / downscale)), max(1, int(camera.height / downscale))
 
-    def _run(self, key: tuple[int, float], future: Future[Picture]) -> None:
+    def _run(self, key: tuple[int, float], future: Future[DecodedImage]) -> None:
         """Make the picture, keep it, hand it to all who wait. A failure stays until `get` raises it."""
         try:
             if self._closed:
@@ -149,55 +149,55 @@ class ImageCache:
             self._pending.pop(key, None)
         future.set_result(picture)
 
-    def _keep(self, key: tuple[int, float], picture: Picture) -> None:
-        if picture.nbytes > self.budget_bytes or self._closed:
+    def _keep(self, key: tuple[int, float], image: DecodedImage) -> None:
+        if image.nbytes > self.budget_bytes or self._closed:
             return
-        self._kept[key] = picture
-        self._bytes += picture.nbytes
+        self._kept[key] = image
+        self._bytes += image.nbytes
         while self._bytes > self.budget_bytes:
             _, dropped = self._kept.popitem(last=False)
             self._bytes -= dropped.nbytes
 
-    def _make(self, index: int, downscale: float) -> Picture:
+    def _make(self, index: int, downscale: float) -> DecodedImage:
         if downscale == 1:
-            return load_picture(self.views[index])
+            return load_image(self.views[index])
         with self._lock:
             full = self._kept.get((index, 1))
-        full = full or load_picture(self.views[index])
-        return shrink(full, *self._size(index, downscale))
+        full = full or load_image(self.views[index])
+        return resize_area(full, *self._size(index, downscale))
 
 
-def load_picture(view: View) -> Picture:
+def load_image(view: View) -> DecodedImage:
     """Decode a view's photograph and mask at the size of its camera."""
-    pixels, opaque = decode_photograph(view.image_path)
+    pixels, opaque = decode_image(view.image_path)
     height, width = pixels.shape[:2]
     keep = opaque
     if view.mask_path is not None:
         masked = decode_mask(view.mask_path, width, height)
         keep = masked if opaque is None else masked & opaque
-    picture = Picture(
+    picture = DecodedImage(
         torch.from_numpy(np.ascontiguousarray(pixels)),
         None if keep is None else torch.from_numpy(keep.astype(np.uint8)),
     )
     camera = view.camera
-    if not same_shape((camera.width, camera.height), (width, height)):
+    if not same_aspect((camera.width, camera.height), (width, height)):
         raise CaptureError(
             f"{view.image_path}: is {width}x{height} now, but was another shape when the capture was read "
             f"(camera {camera.width}x{camera.height}). Do not change images while they are in use."
         )
-    return shrink(picture, camera.width, camera.height)
+    return resize_area(picture, camera.width, camera.height)
 
 
-def shrink(picture: Picture, width: int, height: int) -> Picture:
+def resize_area(photo: DecodedImage, width: int, height: int) -> DecodedImage:
     """The picture at another size by area averaging.
 
     A shrunk pixel is kept only if everything that it covers is kept: else masked colours would bleed in.
     """
-    if picture.image.shape[:2] == (height, width):
-        return picture
-    image = cv2.resize(picture.image.numpy(), (width, height), interpolation=cv2.INTER_AREA)
+    if photo.image.shape[:2] == (height, width):
+        return photo
+    image = cv2.resize(photo.image.numpy(), (width, height), interpolation=cv2.INTER_AREA)
     mask = None
-    if picture.mask is not None:
-        share = cv2.resize(picture.mask.numpy().astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+    if photo.mask is not None:
+        share = cv2.resize(photo.mask.numpy().astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
         mask = torch.from_numpy((share >= 1 - 1e-4).astype(np.uint8))
-    return Picture(torch.from_numpy(image), mask)
+    return DecodedImage(torch.from_numpy(image), mask)

@@ -10,51 +10,51 @@ from typing import Literal
 import numpy as np
 
 from vdgs.captures.capture import Capture, View
-from vdgs.captures.formats.source_capture import listing
-from vdgs.captures.image_files import pillow_quietly, share_kept, verify
+from vdgs.captures.formats.source_capture import format_list
+from vdgs.captures.image_files import kept_fraction, pillow_without_limits, verify_image
 from vdgs.errors import CaptureError
 
 #: Rounding by this share of the distance between cameras and points is about a pixel (choice).
-VISIBLE_SHARE = 1e-3
+MAX_ROUNDING_RATIO = 1e-3
 #: An axis with fewer distinct values may be made of steps (floors, terraces), not rounded.
-LEAST_VALUES = 20
+MIN_DISTINCT_VALUES = 20
 #: How far a rounded value may be off its step, as a share of it.
-SLACK = 1e-3
+STEP_TOLERANCE = 1e-3
 
 
-def rounding_of(points: np.ndarray, distance: float) -> float:
+def detect_rounding(points: np.ndarray, distance: float) -> float:
     """The step to which some axis of the points [n, 3] is rounded, in their unit; 0 where none can be seen from
     `distance`. Steps are powers of two (float32) and of ten (decimals)."""
-    least = VISIBLE_SHARE * distance
+    least = MAX_ROUNDING_RATIO * distance
     if not least > 0:
         return 0.0
     powers = np.concatenate([2.0 ** np.arange(-20, 21), 10.0 ** np.arange(-6, 7)])
     steps = [step for step in sorted(powers, reverse=True) if least <= step <= distance]
-    axes = [axis for axis in points.T if len(np.unique(axis)) >= LEAST_VALUES]
+    axes = [axis for axis in points.T if len(np.unique(axis)) >= MIN_DISTINCT_VALUES]
     return max((_step(axis, steps) for axis in axes), default=0.0)
 
 
 def _step(values: np.ndarray, steps: list[float]) -> float:
     """The largest of the steps, in falling order, of which all values are multiples; 0 for none."""
     for step in steps:
-        if (np.abs(values / step - np.round(values / step)) <= SLACK).all():
+        if (np.abs(values / step - np.round(values / step)) <= STEP_TOLERANCE).all():
             return float(step)
     return 0.0
 
 
-DECODERS = 2
+NUM_DECODER_THREADS = 2
 #: Masks that leave out more than this share of the photographs may be inverted.
-MUCH_MASKED = 0.6
+MAX_MASKED_FRACTION = 0.6
 
 
 @dataclass(frozen=True)
-class CheckedImages:
+class ImageCheckReport:
     """What decoding all photographs and masks told."""
 
     #: Files that were decoded.
     files: int
     #: Share of the pixels of these photographs that masks and transparency leave out.
-    masked_share: float
+    masked_fraction: float
     #: What a person should know but need not mend.
     warnings: tuple[str, ...] = ()
 
@@ -68,8 +68,8 @@ class _CheckedView:
 
 
 def check_images(
-    capture: Capture, which: Literal["all"] | int = "all", progress: Callable[[int, int], None] | None = None
-) -> CheckedImages:
+    capture: Capture, sample: Literal["all"] | int = "all", on_progress: Callable[[int, int], None] | None = None
+) -> ImageCheckReport:
     """Decode photographs and masks once.
 
     `which` is "all" or the number of views to check, spread evenly. `progress(done, total)` is called
@@ -77,39 +77,39 @@ def check_images(
     or transparency leave nothing, and where no photograph shows more than one colour.
     """
     views = capture.views
-    if which != "all":
-        chosen = np.unique(np.linspace(0, len(views) - 1, min(max(which, 1), len(views))).round().astype(int))
+    if sample != "all":
+        chosen = np.unique(np.linspace(0, len(views) - 1, min(max(sample, 1), len(views))).round().astype(int))
         views = tuple(views[index] for index in chosen)
     checked: list[_CheckedView] = []
-    with pillow_quietly(), ThreadPoolExecutor(DECODERS) as pool:
+    with pillow_without_limits(), ThreadPoolExecutor(NUM_DECODER_THREADS) as pool:
         for view in pool.map(_check_view, views):
             checked.append(view)
-            if progress is not None:
-                progress(len(checked), len(views))
+            if on_progress is not None:
+                on_progress(len(checked), len(views))
     folder, files = capture.root / capture.images, len(views) + sum(view.mask_path is not None for view in views)
     problems = [view.problem for view in checked if view.problem is not None]
     if problems:
         raise CaptureError(
             f"{folder}: {len(problems)} of {len(views)} photographs or their masks cannot be used. "
-            f"Copy them again, or remove them from the model.{listing(problems)}"
+            f"Copy them again, or remove them from the model.{format_list(problems)}"
         )
     blank = [view.name for view in checked if view.blank]
     if len(blank) == len(checked):
         raise CaptureError(f"{folder}: every photograph is of one colour only. Copy the photographs again.")
     masked = 1.0 - sum(view.kept for view in checked) / len(checked)
-    return CheckedImages(files, masked, tuple(_warnings(blank, masked)))
+    return ImageCheckReport(files, masked, tuple(_warnings(blank, masked)))
 
 
 def _check_view(view: View) -> _CheckedView:
     """A photograph and its mask, decoded."""
     try:
-        photograph = verify(view.image_path)
+        photograph = verify_image(view.image_path)
         if view.mask_path is not None:
-            verify(view.mask_path)
-        kept = share_kept(view.image_path, view.mask_path, photograph.may_be_transparent)
+            verify_image(view.mask_path)
+        kept = kept_fraction(view.image_path, view.mask_path, photograph.may_be_transparent)
     except CaptureError as error:
         return _CheckedView(view.name, str(error))
-    return _CheckedView(view.name, None, not photograph.shows, kept)
+    return _CheckedView(view.name, None, not photograph.has_content, kept)
 
 
 def _warnings(blank: list[str], masked: float) -> list[str]:
@@ -117,6 +117,6 @@ def _warnings(blank: list[str], masked: float) -> list[str]:
     if blank:
         shown = ", ".join(blank[:5]) + (", ..." if len(blank) > 5 else "")
         found.append(f"photographs of one colour only, which teach nothing but that: {len(blank)} ({shown}).")
-    if masked > MUCH_MASKED:
+    if masked > MAX_MASKED_FRACTION:
         found.append(f"masks leave out {masked:.0%} of the photographs. White is kept: are they inverted?")
     return found

@@ -16,26 +16,26 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from vdgs.captures.name_resolution import on_disk
+from vdgs.captures.name_resolution import find_file
 from vdgs.errors import CaptureError
 from vdgs.system.memory.process_memory import is_out_of_memory
 
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"}
 #: Headers that announce more pixels than this are refused rather than decoded.
-LARGEST_IMAGE_PX = 1_000_000_000
+MAX_IMAGE_PX = 1_000_000_000
 #: A photograph or mask with a shorter side than this (pixels) shows nothing: a thumbnail, what is left of a file, or
 #: what --downscale leaves (choice).
-LEAST_SIDE_PX = 8
+MIN_SIDE_PX = 8
 #: Two sizes are of one shape if one is the other shrunk evenly, each side rounded by less than this (pixels).
 ROUNDING_PX = 1.0
 #: A mask keeps what is at least so bright, of 255; an alpha channel what is at least so opaque (choice).
-MASK_LEVEL = 128
+MASK_THRESHOLD = 128
 #: Pillow's modes that we know how to bring to 8-bit RGB.
-KNOWN_MODES = {"RGB", "RGBA", "L", "LA", "P", "1", "I;16", "I;16B", "I;16L"}
+SUPPORTED_MODES = {"RGB", "RGBA", "L", "LA", "P", "1", "I;16", "I;16B", "I;16L"}
 
 
 @dataclass(frozen=True)
-class Header:
+class ImageHeader:
     """What an image file says before its pixels."""
 
     width: int
@@ -44,7 +44,7 @@ class Header:
 
 
 @contextmanager
-def pillow_quietly() -> Iterator[None]:
+def pillow_without_limits() -> Iterator[None]:
     """Pillow without its warnings and its limit of 89 megapixels (aerial cameras exceed it; ours is judged
     below).
 
@@ -59,29 +59,29 @@ def pillow_quietly() -> Iterator[None]:
             Image.MAX_IMAGE_PIXELS = limit
 
 
-def read_header(path: Path) -> Header:
+def read_header(path: Path) -> ImageHeader:
     """Size and mode without decoding. Raises `CaptureError` for unreadable, huge, tiny or CMYK images."""
     try:
-        with pillow_quietly(), Image.open(path) as image:
+        with pillow_without_limits(), Image.open(path) as image:
             # Mode I is 32 bits a pixel, but for PNG files of 16 bits as older versions of Pillow open them.
             mode = "I;16" if (image.mode, image.format) == ("I", "PNG") else image.mode
-            header = Header(image.width, image.height, mode)
+            header = ImageHeader(image.width, image.height, mode)
     except FileNotFoundError:
         raise CaptureError(f"{path}: no such image.") from None
     except Exception as error:  # Pillow's parsers raise many kinds on damaged headers
         raise CaptureError(f"{path}: not an image that can be read ({error}). Copy it again.") from None
-    if header.width * header.height > LARGEST_IMAGE_PX:
+    if header.width * header.height > MAX_IMAGE_PX:
         raise CaptureError(f"{path}: announces {header.width}x{header.height} pixels; the file is damaged.")
-    if min(header.width, header.height) < LEAST_SIDE_PX:
+    if min(header.width, header.height) < MIN_SIDE_PX:
         raise CaptureError(
             f"{path}: is {header.width}x{header.height} pixels, too small to show anything. Copy the image again."
         )
-    if header.mode not in KNOWN_MODES:
+    if header.mode not in SUPPORTED_MODES:
         raise CaptureError(f"{path}: has the colour mode {header.mode}; convert it to 8-bit RGB.")
     return header
 
 
-def same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:
+def same_aspect(one: tuple[int, int], other: tuple[int, int]) -> bool:
     """Whether two sizes (width, height) can be of one picture, shrunk evenly and rounded in any way."""
     (width, height), (wide, high) = sorted((one, other))
     low = max((width - ROUNDING_PX) / wide, (height - ROUNDING_PX) / high)
@@ -101,10 +101,10 @@ def find_images(folder: Path) -> dict[str, Path]:
 def find_mask(folder: Path, name: str) -> Path | None:
     """The mask of an image: name.jpg.png (COLMAP) or name.png, or the image's own name."""
     candidates = (name + ".png", str(Path(name).with_suffix(".png")), name)
-    return next((found for found in (on_disk(folder, each) for each in candidates) if found is not None), None)
+    return next((found for found in (find_file(folder, each) for each in candidates) if found is not None), None)
 
 
-def decode_photograph(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+def decode_image(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     """Pixels [h, w, 3] uint8 RGB, and where the file has transparency its opaque part [h, w] bool.
 
     Grey becomes RGB, 16 bits become 8; an alpha channel is a mask (choice: opaque from one half up), never
@@ -119,13 +119,13 @@ def decode_photograph(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
         return cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB), None
     if pixels.shape[2] == 3:
         return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), None
-    opaque = pixels[:, :, 3] >= MASK_LEVEL
+    opaque = pixels[:, :, 3] >= MASK_THRESHOLD
     return cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGB), None if opaque.all() else opaque
 
 
 def decode_mask(path: Path, width: int, height: int) -> np.ndarray:
     """What a mask keeps (white), [height, width] bool; a mask of another size is resampled to the image's."""
-    keep = _lightness(path) >= MASK_LEVEL
+    keep = _lightness(path) >= MASK_THRESHOLD
     if keep.shape == (height, width):
         return keep
     return cv2.resize(keep.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
@@ -133,7 +133,7 @@ def decode_mask(path: Path, width: int, height: int) -> np.ndarray:
 
 def _lightness(mask: Path) -> np.ndarray:
     """The brightest channel of a mask at its own size, [h, w] uint8."""
-    return decode_photograph(mask)[0].max(axis=2)
+    return decode_image(mask)[0].max(axis=2)
 
 
 def _decode(path: Path) -> np.ndarray:
@@ -159,14 +159,14 @@ def _decode(path: Path) -> np.ndarray:
         raise CaptureError(f"{path}: cannot be decoded ({error}). Copy it again or remove it.") from None
 
 
-class Verified(NamedTuple):
+class VerifiedImage(NamedTuple):
     """What decoding an image told: whether it shows more than one colour, and whether it may be transparent."""
 
-    shows: bool
+    has_content: bool
     may_be_transparent: bool
 
 
-def verify(path: Path) -> Verified:
+def verify_image(path: Path) -> VerifiedImage:
     """Decode every byte of an image file once. Raises `CaptureError` naming a file that is truncated or damaged.
 
     OpenCV fills the missing part of a truncated file with grey and says nothing; Pillow is strict. JPEGs are
@@ -181,7 +181,7 @@ def verify(path: Path) -> Verified:
             transparent = "A" in image.getbands() or "transparency" in image.info
     except Exception as error:  # any complaint of a decoder is what we came for
         raise CaptureError(f"{path}: {error}") from None
-    return Verified(any(high != low for low, high in ranges), transparent)
+    return VerifiedImage(any(high != low for low, high in ranges), transparent)
 
 
 def _extremes(image: Image.Image, band: str) -> tuple[float, float]:
@@ -192,22 +192,22 @@ def _extremes(image: Image.Image, band: str) -> tuple[float, float]:
     return image.getchannel(band).getextrema()  # type: ignore[return-value]
 
 
-def share_kept(photograph: Path, mask: Path | None, may_be_transparent: bool) -> float:
+def kept_fraction(photograph: Path, mask: Path | None, may_be_transparent: bool) -> float:
     """The share of a photograph that its mask and its transparency keep; 1 without either.
 
     Raises `CaptureError` where they keep nothing.
     """
-    opaque = decode_photograph(photograph)[1] if may_be_transparent else None
+    opaque = decode_image(photograph)[1] if may_be_transparent else None
     keep = opaque
     if mask is not None:
         light = _lightness(mask)
-        if not (light >= MASK_LEVEL).any():
+        if not (light >= MASK_THRESHOLD).any():
             hint = "Scale its values to 0 and 255" if light.any() else "Turn it round if it is inverted"
             raise CaptureError(
                 f"{mask}: leaves nothing of its photograph. White is kept, and the brightest value here is "
                 f"{light.max()} of 255. {hint}, or remove the photograph from the model."
             )
-        keep = light >= MASK_LEVEL if opaque is None else decode_mask(mask, *opaque.shape[::-1]) & opaque
+        keep = light >= MASK_THRESHOLD if opaque is None else decode_mask(mask, *opaque.shape[::-1]) & opaque
     if keep is not None and not keep.any():
         raise CaptureError(
             f"{photograph}: is transparent everywhere that it is not masked; nothing of it is left. Remove its "

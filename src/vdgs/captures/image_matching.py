@@ -7,32 +7,30 @@ from pathlib import Path
 
 import numpy as np
 
-from vdgs.captures.formats.source_capture import SINGLE_FOCAL, Intrinsics, SourceCapture, SourceView, listing
-from vdgs.captures.image_files import find_images, read_header, same_shape
+from vdgs.captures.formats.source_capture import SINGLE_FOCAL, Intrinsics, SourceCapture, SourceView, format_list
+from vdgs.captures.image_files import find_images, read_header, same_aspect
 from vdgs.captures.mask_matching import check_mask, find_masks
-from vdgs.captures.name_resolution import Names
+from vdgs.captures.name_resolution import ImageNameIndex
 from vdgs.captures.undistortion import ImageFile
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 
 #: Photographs whose size differs from that of most by more than this share are mentioned; rounding differs by less.
-OTHER_FACTOR = 0.2
+MAX_SIZE_DEVIATION = 0.2
 
 
 @dataclass(frozen=True, eq=False)
-class FoundView:
+class MatchedView:
     """A view whose image was found."""
 
     view: SourceView
     file: ImageFile
 
 
-def find_photographs(
-    root: Path, source: SourceCapture, options: CaptureOptions, warnings: list[str]
-) -> list[FoundView]:
+def match_images(root: Path, source: SourceCapture, options: CaptureOptions, warnings: list[str]) -> list[MatchedView]:
     """Every view with its image file; images without a camera become a warning, the reverse an error."""
     folder = root / source.images
-    available = Names(find_images(folder)) if folder.is_dir() else Names({})
+    available = ImageNameIndex(find_images(folder)) if folder.is_dir() else ImageNameIndex({})
     paths: list[Path] = []
     missing: list[str] = []
     for view in source.views:
@@ -43,7 +41,7 @@ def find_photographs(
     if missing:
         raise CaptureError(
             f"{folder}: {len(missing)} of {len(source.views)} images that have a camera are missing. Copy "
-            f"them there, or choose another folder with --images.{listing(missing)}"
+            f"them there, or choose another folder with --images.{format_list(missing)}"
         )
     named = set(paths)
     others = {
@@ -62,9 +60,9 @@ def find_photographs(
 
 def _fitted(
     root: Path, source: SourceCapture, paths: list[Path], options: CaptureOptions, warnings: list[str]
-) -> list[FoundView]:
+) -> list[MatchedView]:
     """The views with their images, masks and intrinsics at the images' sizes; collects what does not fit."""
-    photographs, problems = list[FoundView](), list[str]()
+    photographs, problems = list[MatchedView](), list[str]()
     masks = find_masks(root, source.views, options, warnings)
     for view, path in zip(source.views, paths, strict=True):
         mask = masks[view.name]
@@ -72,22 +70,22 @@ def _fitted(
             intrinsics = fit_to_image(view, path)
             if mask is not None:
                 check_mask(mask, path)
-            photographs.append(FoundView(view, ImageFile(view.name, path, mask, intrinsics)))
+            photographs.append(MatchedView(view, ImageFile(view.name, path, mask, intrinsics)))
         except CaptureError as error:
             problems.append(str(error))
     if len(problems) > 1:
-        raise CaptureError(f"{root / source.images}: {len(problems)} images cannot be used.{listing(problems)}")
+        raise CaptureError(f"{root / source.images}: {len(problems)} images cannot be used.{format_list(problems)}")
     if problems:
         raise CaptureError(problems[0])
     warnings += _shrunk_otherwise(photographs)
     return photographs
 
 
-def _shrunk_otherwise(photographs: list[FoundView]) -> list[str]:
+def _shrunk_otherwise(photographs: list[MatchedView]) -> list[str]:
     """A warning where some photographs are shrunk by another factor than most: thumbnails among the photographs."""
     factors = np.array([photo.file.intrinsics.width / photo.view.intrinsics.width for photo in photographs])
     usual = float(np.median(factors))
-    others = np.flatnonzero(np.abs(factors / usual - 1) > OTHER_FACTOR)
+    others = np.flatnonzero(np.abs(factors / usual - 1) > MAX_SIZE_DEVIATION)
     if not len(others):
         return []
     names = ", ".join(photographs[index].view.name for index in others[:5]) + (", ..." if len(others) > 5 else "")
@@ -106,7 +104,7 @@ def fit_to_image(view: SourceView, path: Path) -> Intrinsics:
     header, intrinsics = read_header(path), view.intrinsics
     if (header.width, header.height) == (intrinsics.width, intrinsics.height):
         return intrinsics
-    if not same_shape((header.width, header.height), (intrinsics.width, intrinsics.height)):
+    if not same_aspect((header.width, header.height), (intrinsics.width, intrinsics.height)):
         turned = (header.width > header.height) != (intrinsics.width > intrinsics.height)
         hint = "The image is turned by a quarter (EXIF orientation applied?). " if turned else ""
         raise CaptureError(
@@ -114,14 +112,14 @@ def fit_to_image(view: SourceView, path: Path) -> Intrinsics:
             f"{intrinsics.width}x{intrinsics.height}: another shape, so the two do not belong together. "
             f"{hint}Use the images that the model was made from, or shrink them evenly."
         )
-    return scaled(intrinsics, header.width, header.height)
+    return scale_intrinsics(intrinsics, header.width, header.height)
 
 
-def scaled(intrinsics: Intrinsics, width: int, height: int) -> Intrinsics:
+def scale_intrinsics(intrinsics: Intrinsics, width: int, height: int) -> Intrinsics:
     """Intrinsics for the same picture at another size; lens distortion parameters do not depend on it."""
     sx, sy = width / intrinsics.width, height / intrinsics.height
     (fx, fy), (cx, cy) = intrinsics.focal, intrinsics.principal_point
-    if not intrinsics.distorted:
+    if not intrinsics.is_distorted:
         return Intrinsics("PINHOLE", (fx * sx, fy * sy, cx * sx, cy * sy), width, height)
     head = (fx * (sx + sy) / 2,) if intrinsics.model in SINGLE_FOCAL else (fx * sx, fy * sy)
     tail = intrinsics.params[len(head) + 2 :]

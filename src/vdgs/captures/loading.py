@@ -7,24 +7,24 @@ from pathlib import Path
 
 import numpy as np
 
-from vdgs.captures.capture import Capture, Sightings, View
+from vdgs.captures.capture import Capture, Observations, View
 from vdgs.captures.format_dispatch import read_source
-from vdgs.captures.formats.source_capture import SourceCapture, listing
+from vdgs.captures.formats.source_capture import SourceCapture, format_list
 from vdgs.captures.ground_estimation import find_ground_frame, transform_pose
-from vdgs.captures.image_checks import rounding_of
-from vdgs.captures.image_files import LEAST_SIDE_PX
-from vdgs.captures.image_matching import FoundView, find_photographs
-from vdgs.captures.output_guard import refuse_among_files
-from vdgs.captures.splits import choose_splits, nearest_to_middle
+from vdgs.captures.image_checks import detect_rounding
+from vdgs.captures.image_files import MIN_SIDE_PX
+from vdgs.captures.image_matching import MatchedView, match_images
+from vdgs.captures.output_guard import check_not_among_files
+from vdgs.captures.splits import assign_splits, select_central_views
 from vdgs.captures.undistortion import ImageFile, undistort
 from vdgs.config.capture_options import CaptureOptions
-from vdgs.config.ranges import problems
+from vdgs.config.ranges import find_range_errors
 from vdgs.errors import CaptureError
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.ground_frame import GroundFrame
 
 #: Points farther from the cameras than this many times their spread are strays of the matching.
-FAR_POINT = 100.0
+MAX_DISTANCE_RATIO = 100.0
 
 
 def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
@@ -41,7 +41,7 @@ def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
     source = read_source(root, options)
     warnings = list(source.warnings)
     source = _without_bad_points(source, warnings)
-    photographs = find_photographs(root, source, options, warnings)
+    photographs = match_images(root, source, options, warnings)
     photographs = _undistorted(root, photographs, options, warnings)
     _refuse_tiny(photographs, options)
     ground, ground_warnings = find_ground_frame(source, root, options)
@@ -49,23 +49,23 @@ def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
     points, colours = ground.to_ground(source.points), source.colours
     if options.max_images is not None and options.max_images < len(views):
         warnings.append(f"using the {options.max_images} of {len(views)} photographs nearest to the middle.")
-        views = nearest_to_middle(views, options.max_images)
+        views = select_central_views(views, options.max_images)
         seen = np.zeros(len(points), bool)
         for view in views:
-            seen |= view.camera.sees(points)
+            seen |= view.camera.in_frustum(points)
         points, colours = points[seen], colours[seen]
         if not seen.any():
             raise CaptureError(f"{root}: the chosen {options.max_images} photographs see no points; use more.")
     explicit = {photo.view.name: photo.view.split for photo in photographs}
-    views = choose_splits(root, views, explicit, options, warnings)
+    views = assign_splits(root, views, explicit, options, warnings)
     return Capture(
         root=root, source=source.source, images=source.images, views=tuple(views), points=points,
-        point_colours=colours, ground=ground, warnings=(*warnings, *ground_warnings),
+        point_colors=colours, ground=ground, warnings=(*warnings, *ground_warnings),
     )  # fmt: skip
 
 
 def _check_options(options: CaptureOptions) -> None:
-    found = problems(options)
+    found = find_range_errors(options)
     if found:
         raise CaptureError("\n  ".join(found))
     for flag, folder in (("--images", options.images), ("--masks", options.masks)):
@@ -86,14 +86,14 @@ def _without_bad_points(source: SourceCapture, warnings: list[str]) -> SourceCap
     middle = np.median(centres, axis=0)
     distance = np.linalg.norm(np.where(finite[:, None], source.points, middle) - middle, axis=1)
     spread = max(float(np.quantile(np.linalg.norm(centres - middle, axis=1), 0.9)), float(np.median(distance[finite])))
-    keep = finite & (distance <= FAR_POINT * spread)
+    keep = finite & (distance <= MAX_DISTANCE_RATIO * spread)
     if not keep.all():
         warnings.append(
             f"{(~finite).sum()} points that are not finite and {(finite & ~keep).sum()} points farther than "
-            f"{FAR_POINT:.0f}x the spread of the cameras were left out of {len(keep)}."
+            f"{MAX_DISTANCE_RATIO:.0f}x the spread of the cameras were left out of {len(keep)}."
         )
     far = float(np.median(distance[keep]))
-    step = rounding_of(source.points[keep], far)
+    step = detect_rounding(source.points[keep], far)
     if step:
         warnings.append(
             f"the sparse points are rounded to {step:.3g} of their world's units, {step / far:.1%} of their distance "
@@ -107,10 +107,10 @@ def _without_bad_points(source: SourceCapture, warnings: list[str]) -> SourceCap
 
 
 def _undistorted(
-    root: Path, photographs: list[FoundView], options: CaptureOptions, warnings: list[str]
-) -> list[FoundView]:
+    root: Path, photographs: list[MatchedView], options: CaptureOptions, warnings: list[str]
+) -> list[MatchedView]:
     """Pinhole photographs only: undistorts on request, else refuses lens distortion."""
-    bent = [photo for photo in photographs if photo.file.intrinsics.distorted]
+    bent = [photo for photo in photographs if photo.file.intrinsics.is_distorted]
     if not bent:
         return photographs
     if not options.undistort:
@@ -118,25 +118,25 @@ def _undistorted(
         raise CaptureError(
             f"{root}: {len(bent)} photographs have a camera with lens distortion ({', '.join(models)}); "
             "training needs a pinhole. Add --undistort, or run colmap image_undistorter."
-            f"{listing(photo.view.name for photo in bent)}"
+            f"{format_list(photo.view.name for photo in bent)}"
         )
     folder = options.undistorted_folder or root / "undistorted" / (options.images or "images")
     files = [photo.file for photo in photographs]
-    refuse_among_files(folder, root, [path for file in files for path in (file.path, file.mask) if path is not None])
+    check_not_among_files(folder, root, [path for file in files for path in (file.path, file.mask) if path is not None])
     straight = undistort(folder, files)
     warnings.append(f"{len(bent)} photographs were undistorted into {folder}.")
-    return [FoundView(photo.view, file) for photo, file in zip(photographs, straight, strict=True)]
+    return [MatchedView(photo.view, file) for photo, file in zip(photographs, straight, strict=True)]
 
 
-def _refuse_tiny(photographs: list[FoundView], options: CaptureOptions) -> None:
+def _refuse_tiny(photographs: list[MatchedView], options: CaptureOptions) -> None:
     """Raise CaptureError where so little is left of a photograph by --downscale that it shows nothing."""
     smallest = min((photo.file for photo in photographs), key=lambda file: min(_size(file)))
     (width, height), factor = _size(smallest), options.downscale
-    if factor > 1 and min(width, height) / factor < LEAST_SIDE_PX:
+    if factor > 1 and min(width, height) / factor < MIN_SIDE_PX:
         raise CaptureError(
             f"--downscale {factor:g}: photographs of {width}x{height} would be {int(width / factor)}x"
             f"{int(height / factor)} ({smallest.path}), too few pixels to show anything. Give at most "
-            f"{max(1, min(width, height) // LEAST_SIDE_PX)}."
+            f"{max(1, min(width, height) // MIN_SIDE_PX)}."
         )
 
 
@@ -144,7 +144,7 @@ def _size(file: ImageFile) -> tuple[int, int]:
     return file.intrinsics.width, file.intrinsics.height
 
 
-def _view(photo: FoundView, options: CaptureOptions, ground: GroundFrame) -> View:
+def _view(photo: MatchedView, options: CaptureOptions, ground: GroundFrame) -> View:
     intrinsics = photo.file.intrinsics
     (fx, fy), (cx, cy) = intrinsics.focal, intrinsics.principal_point
     width, height = intrinsics.width, intrinsics.height
@@ -154,7 +154,7 @@ def _view(photo: FoundView, options: CaptureOptions, ground: GroundFrame) -> Vie
         width, height = int(width / options.downscale), int(height / options.downscale)
         camera = camera.resized(width, height)
     seen = photo.view.sightings
-    sightings = None if seen is None else Sightings(ground.to_ground(seen.points), seen.rays, seen.numbers)
+    sightings = None if seen is None else Observations(ground.to_ground(seen.points), seen.rays, seen.numbers)
     return View(
         name=photo.view.name, camera=camera, image_path=photo.file.path, mask_path=photo.file.mask, split="train",
         sightings=sightings,

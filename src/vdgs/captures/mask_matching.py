@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from vdgs.captures.formats.source_capture import SourceView
-from vdgs.captures.image_files import find_images, find_mask, read_header, same_shape
+from vdgs.captures.image_files import find_images, find_mask, read_header, same_aspect
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 
@@ -66,7 +66,7 @@ def check_mask(mask: Path, photograph: Path) -> None:
     if not mask.is_file():
         raise CaptureError(f"{mask}: no such mask, though {photograph.name} is said to have it. Copy it there.")
     header, wanted = read_header(mask), read_header(photograph)
-    if not same_shape((header.width, header.height), (wanted.width, wanted.height)):
+    if not same_aspect((header.width, header.height), (wanted.width, wanted.height)):
         raise CaptureError(
             f"{mask}: is {header.width}x{header.height}, but its photograph is {wanted.width}x{wanted.height}: another "
             "shape, so the two do not belong together. Make the mask from this photograph."

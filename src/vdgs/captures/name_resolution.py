@@ -11,37 +11,37 @@ from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 from typing import Generic, TypeVar
 
-Thing = TypeVar("Thing")
+T = TypeVar("T")
 
 
-def composed(name: str) -> str:
+def to_nfc(name: str) -> str:
     """The name with accented letters in one piece."""
     return unicodedata.normalize("NFC", name)
 
 
-def listable(name: str) -> str:
+def to_colmap_name(name: str) -> str:
     """The name as COLMAP's lists, which part words at blanks, can hold it: `_` for each blank, letters composed."""
-    return "".join("_" if letter.isspace() else letter for letter in composed(name))
+    return "".join("_" if letter.isspace() else letter for letter in to_nfc(name))
 
 
-def without_suffix(name: str) -> str:
+def match_key(name: str) -> str:
     """The key by which names match across extensions: no suffix, lower case."""
     path = PurePosixPath(name)
-    return composed((str(path.with_suffix("")) if path.suffix else name).lower())
+    return to_nfc((str(path.with_suffix("")) if path.suffix else name).lower())
 
 
-def stem_of(name: str) -> str:
+def match_stem(name: str) -> str:
     """The key by which photographs are matched across folders and extensions: file stem, lower case."""
-    return composed(PurePosixPath(name.replace("\\", "/")).stem.lower())
+    return to_nfc(PurePosixPath(name.replace("\\", "/")).stem.lower())
 
 
-def on_disk(folder: Path, name: str) -> Path | None:
+def find_file(folder: Path, name: str) -> Path | None:
     """The file of this name below a folder, whichever way its letters are written there; None where there is none."""
-    ways = dict.fromkeys((name, composed(name), unicodedata.normalize("NFD", name)))
+    ways = dict.fromkeys((name, to_nfc(name), unicodedata.normalize("NFD", name)))
     return next((folder / way for way in ways if (folder / way).is_file()), None)
 
 
-class Names:
+class ImageNameIndex:
     """Looks images up by name: exactly, else by the only one that differs in how its letters are written, else by the
     only one that differs in extension or case."""
 
@@ -49,27 +49,27 @@ class Names:
         self.images = images
         self._alike: tuple[dict[str, list[str]], ...] = ({}, {})
         for name in images:
-            for alike, key in zip(self._alike, (composed(name), without_suffix(name)), strict=True):
+            for alike, key in zip(self._alike, (to_nfc(name), match_key(name)), strict=True):
                 alike.setdefault(key, []).append(name)
 
     def find(self, name: str) -> str | None:
         """The name on disk, or None."""
         if name in self.images:
             return name
-        for alike, key in zip(self._alike, (composed(name), without_suffix(name)), strict=True):
+        for alike, key in zip(self._alike, (to_nfc(name), match_key(name)), strict=True):
             if len(alike.get(key, [])) == 1:
                 return alike[key][0]
         return None
 
 
-class Lookup(Generic[Thing]):
+class NameLookup(Generic[T]):
     """Finds things by what people write of their names: the whole path, the end of it, or what it is the end of; in
     other letters (case, `_` for blanks), with another extension."""
 
-    def __init__(self, named: Iterable[tuple[str, Thing]]) -> None:
-        self._exact: dict[str, list[Thing]] = {}
-        self._whole: dict[str, list[Thing]] = {}
-        self._ending: dict[str, list[Thing]] = {}
+    def __init__(self, named: Iterable[tuple[str, T]]) -> None:
+        self._exact: dict[str, list[T]] = {}
+        self._whole: dict[str, list[T]] = {}
+        self._ending: dict[str, list[T]] = {}
         for name, thing in named:
             self._exact.setdefault(_posix(name), []).append(thing)
             for spelled in dict.fromkeys(_spellings(name)):
@@ -77,7 +77,7 @@ class Lookup(Generic[Thing]):
                 for ending in _endings(spelled):
                     self._ending.setdefault(ending, []).append(thing)
 
-    def find(self, name: str) -> tuple[tuple[int, int], list[Thing]]:
+    def find(self, name: str) -> tuple[tuple[int, int], list[T]]:
         """What a name means, and how well it says so (less is better). Several things where it says too little; none
         where nothing has this name, or only in another folder."""
         exact = self._exact.get(_posix(name))
@@ -90,25 +90,25 @@ class Lookup(Generic[Thing]):
                     return (level, way), found
         return (3, 0), []
 
-    def find_elsewhere(self, name: str) -> tuple[tuple[int, int], list[Thing]]:
+    def find_elsewhere(self, name: str) -> tuple[tuple[int, int], list[T]]:
         """What has the name's file name, in whichever folder."""
         return self.find(PurePosixPath(_posix(name)).name)
 
 
-def ambiguity(written: str, one: str, other: str) -> str:
+def ambiguity_message(written: str, one: str, other: str) -> str:
     """What to tell people who wrote a name that may be either of two."""
     apart = PurePosixPath(one).parent != PurePosixPath(other).parent
     return f"{written!r} may be {one} or {other}: write {'the folder too' if apart else 'it as it stands here'}."
 
 
 def _posix(name: str) -> str:
-    return str(PurePosixPath(composed(name).replace("\\", "/")))
+    return str(PurePosixPath(to_nfc(name).replace("\\", "/")))
 
 
 def _spellings(name: str) -> tuple[str, str]:
     """A name in ever less exact ways: in lower case with `_` for blanks, then without its extension."""
-    folded = listable(_posix(name).lower())
-    return folded, without_suffix(folded)
+    folded = to_colmap_name(_posix(name).lower())
+    return folded, match_key(folded)
 
 
 def _endings(path: str) -> list[str]:

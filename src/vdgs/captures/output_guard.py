@@ -19,11 +19,11 @@ _USUAL = re.compile(r"images(_\d+)?|masks|sparse|colmap", re.IGNORECASE)
 _MEGA_NERF = ("rgbs", "metadata")
 
 
-def refuse_in_a_capture(output: Path) -> None:
+def check_not_in_capture(output: Path) -> None:
     """Raise VdgsError where `output` lies in a folder of inputs of some capture, known by its name and its neighbours.
 
     `output` is a file or folder that need not be there yet; links and `..` are followed. Reads no capture, so that it
-    can be asked before anything else; `refuse_among_inputs` knows folders of other names too.
+    can be asked before anything else; `check_not_among_inputs` knows folders of other names too.
     """
     real = Path(os.path.realpath(output))
     for folder in (real, *real.parents):
@@ -34,13 +34,13 @@ def refuse_in_a_capture(output: Path) -> None:
             raise _error(output, folder, parent.parent)
 
 
-def refuse_among_inputs(output: Path, capture: Capture) -> None:
+def check_not_among_inputs(output: Path, capture: Capture) -> None:
     """Raise VdgsError where `output` lies among the photographs or masks of this capture, wherever they are, or among
-    the inputs of any other (`refuse_in_a_capture`)."""
-    refuse_among_folders(output, capture.root, folders_of_inputs(capture))
+    the inputs of any other (`check_not_in_capture`)."""
+    check_not_among_folders(output, capture.root, input_folders(capture))
 
 
-def folders_of_inputs(capture: Capture) -> list[Path]:
+def input_folders(capture: Capture) -> list[Path]:
     """The folders that hold photographs or masks of a capture, wherever they are."""
     files = [view.image_path for view in capture.views]
     files += [view.mask_path for view in capture.views if view.mask_path is not None]
@@ -49,20 +49,20 @@ def folders_of_inputs(capture: Capture) -> list[Path]:
     return _folders_of(files)
 
 
-def refuse_among_files(output: Path, root: Path, files: Sequence[Path]) -> None:
+def check_not_among_files(output: Path, root: Path, files: Sequence[Path]) -> None:
     """Raise VdgsError where `output` lies in, or is, a folder that holds one of the `files` of the capture in `root`.
 
     What the files are links to counts too.
     """
-    refuse_among_folders(output, root, _folders_of(files))
+    check_not_among_folders(output, root, _folders_of(files))
 
 
-def refuse_among_folders(output: Path, root: Path, folders: Sequence[Path]) -> None:
+def check_not_among_folders(output: Path, root: Path, folders: Sequence[Path]) -> None:
     """Raise VdgsError where `output` lies in, or is, one of the `folders` with inputs of the capture in `root`.
 
     Where inputs lie in the root itself, folders beside them are free.
     """
-    refuse_in_a_capture(output)
+    check_not_in_capture(output)
     real = Path(os.path.realpath(output))
     around = {_identity(folder) for folder in (real, *real.parents)} - {None}
     whole_capture = Path(os.path.realpath(root))

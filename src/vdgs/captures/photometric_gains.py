@@ -16,25 +16,25 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import LinearOperator, cg
 
 from vdgs.captures.capture import View
-from vdgs.captures.image_cache import ImageCache, Picture, shrink
+from vdgs.captures.image_cache import DecodedImage, ImageCache, resize_area
 
 #: So many photographs are looked at, evenly taken.
-AT_MOST = 500
+MAX_IMAGES = 500
 #: They are looked at with so many pixels along their longest side, or fewer where they have fewer.
 LONGEST_SIDE_PX = 512
 #: They are blurred by this share of it, and by half a pixel at least: points are not found to the pixel, and edges fall
 #: on either side.
 BLUR = 0.006
 #: Added to colours of 0 to 255 before their logarithm is taken: nothing is quite black, and noise is.
-LEAST_LIGHT = 4.0
+LOG_OFFSET = 4.0
 #: Of a photograph that shares fewer points with others nothing is known.
-LEAST_POINTS = 20
+MIN_SHARED_POINTS = 20
 #: So many times each photograph's gain is moved by the median of what its points leave.
-MEDIANS = 5
+MEDIAN_ITERATIONS = 5
 
 
 @dataclass(frozen=True, eq=False)
-class PointColours:
+class PointColors:
     """Points as photographs show them: s sightings, of point `point[s]` in photograph `image[s]` (in the order of
     photographs), whose colour has the logarithm `colour[s]` there. Every point is shown by two photographs or more."""
 
@@ -48,7 +48,7 @@ class PointColours:
         gains = self._fitted(image, len(numbers))
         return dict(zip(numbers.tolist(), gains - gains.mean(axis=0), strict=True))
 
-    def difference(self) -> float:
+    def gain_spread(self) -> float:
         """How differently photographs show the same point for their gains: the standard deviation of the gains of those
         that show it, over all points and colours; about a share of their brightness. Slow drifts count by what they
         make between photographs of one place."""
@@ -83,16 +83,16 @@ class PointColours:
         operator = LinearOperator((count, count), matvec=normal, dtype=np.float64)
         gains = np.stack([cg(operator, wanted)[0] for wanted in by_image(departures).T], axis=1)
         starts = np.flatnonzero(np.diff(image)) + 1
-        for _ in range(MEDIANS):
+        for _ in range(MEDIAN_ITERATIONS):
             left = departures - gains[image] + mean(gains[image])[self.point]
             medians = np.stack([np.median(rows, axis=0) for rows in np.split(left, starts)])
             gains = gains + medians
         return gains
 
 
-def point_colours(
-    images: ImageCache, tell: Callable[[int, int], None], most_images: int = AT_MOST
-) -> PointColours | None:
+def collect_point_colors(
+    images: ImageCache, on_progress: Callable[[int, int], None], most_images: int = MAX_IMAGES
+) -> PointColors | None:
     """What photographs show of the points that several of them show; None where these are too few to compare any: not
     every capture says which photograph shows which point.
 
@@ -103,7 +103,7 @@ def point_colours(
     shows = [index for index in chosen if images.views[index].sightings is not None]
     factor, found = _factor(images), []
     for done, index in enumerate(shows):
-        tell(done, len(shows))
+        on_progress(done, len(shows))
         images.prefetch(shows[done : done + 3], factor)
         numbers, colours = _seen(images.views[index], images.get(index, factor))
         found.append((np.full(len(numbers), index), numbers, colours))
@@ -118,46 +118,46 @@ def _factor(images: ImageCache) -> float:
     return max((each for each in images.downscales if side / each >= LONGEST_SIDE_PX), default=min(images.downscales))
 
 
-def _seen(view: View, picture: Picture) -> tuple[Int64[np.ndarray, " m"], Float[np.ndarray, "m 3"]]:
+def _seen(view: View, image: DecodedImage) -> tuple[Int64[np.ndarray, " m"], Float[np.ndarray, "m 3"]]:
     """The numbers of points that a photograph shows, each once, and logarithms of their colours in it."""
     assert view.sightings is not None
-    side = max(picture.image.shape[:2])
+    side = max(image.image.shape[:2])
     if side > LONGEST_SIDE_PX:
-        height, width = (max(1, round(each * LONGEST_SIDE_PX / side)) for each in picture.image.shape[:2])
-        picture = shrink(picture, width, height)
-    height, width = picture.image.shape[:2]
+        height, width = (max(1, round(each * LONGEST_SIDE_PX / side)) for each in image.image.shape[:2])
+        image = resize_area(image, width, height)
+    height, width = image.image.shape[:2]
     camera = view.camera.resized(width, height)
     pixels = view.sightings.rays * (camera.fx, camera.fy) + (camera.cx, camera.cy)
     numbers, once = np.unique(view.sightings.numbers, return_index=True)
     inside = ((pixels[once] >= 0) & (pixels[once] < (width, height))).all(axis=1)
     column, row = np.floor(pixels[once][inside]).astype(np.int64).T
-    light, counts = _blurred(picture)
+    light, counts = _blurred(image)
     kept = counts[row, column]
-    return numbers[inside][kept], np.log(light[row, column][kept].astype(np.float64) + LEAST_LIGHT)
+    return numbers[inside][kept], np.log(light[row, column][kept].astype(np.float64) + LOG_OFFSET)
 
 
-def _blurred(picture: Picture) -> tuple[Float[np.ndarray, "h w 3"], np.ndarray]:
+def _blurred(image: DecodedImage) -> tuple[Float[np.ndarray, "h w 3"], np.ndarray]:
     """A photograph, blurred, and which of its pixels count: nothing of what is masked gets into them."""
-    sigma = max(BLUR * max(picture.image.shape[:2]), 0.5)
-    light = picture.image.numpy().astype(np.float32)
-    if picture.mask is None:
+    sigma = max(BLUR * max(image.image.shape[:2]), 0.5)
+    light = image.image.numpy().astype(np.float32)
+    if image.mask is None:
         return cv2.GaussianBlur(light, (0, 0), sigma), np.ones(light.shape[:2], bool)
-    counts = picture.mask.numpy() > 0
+    counts = image.mask.numpy() > 0
     weight = counts.astype(np.float32)
     share = cv2.GaussianBlur(weight, (0, 0), sigma)[..., None]
     return cv2.GaussianBlur(light * weight[..., None], (0, 0), sigma) / np.maximum(share, 1e-6), counts
 
 
-def _compared(image: np.ndarray, number: np.ndarray, colour: np.ndarray) -> PointColours | None:
+def _compared(image: np.ndarray, number: np.ndarray, colour: np.ndarray) -> PointColors | None:
     """The sightings that say something: of points that several photographs show, in photographs that share enough."""
     shared = _shared(number)
-    enough = np.bincount(image[shared], minlength=int(image.max(initial=0)) + 1) >= LEAST_POINTS
+    enough = np.bincount(image[shared], minlength=int(image.max(initial=0)) + 1) >= MIN_SHARED_POINTS
     kept = shared & enough[image]
     kept[kept] = _shared(number[kept])
     if not kept.any():
         return None
     _, point = np.unique(number[kept], return_inverse=True)
-    return PointColours(image[kept], point.astype(np.int64), colour[kept])
+    return PointColors(image[kept], point.astype(np.int64), colour[kept])
 
 
 def _shared(number: np.ndarray) -> np.ndarray:

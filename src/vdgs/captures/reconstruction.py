@@ -8,17 +8,17 @@ from pathlib import Path
 
 from vdgs.errors import CaptureError
 from vdgs.system.atomic_files import read_json
-from vdgs.system.records import record_of
+from vdgs.system.records import record_from_dict
 
-FILE, FIGURE = "reconstruction.json", "reconstruction.png"
+RECONSTRUCTION_FILE, RECONSTRUCTION_FIGURE = "reconstruction.json", "reconstruction.png"
 #: The folder of one that is not finished, or whose intermediate files are kept.
-WORK = "work"
+WORK_FOLDER = "work"
 #: What says in it, and in the capture, which steps are done.
-STEPS = "steps.json"
+STEPS_FILE = "steps.json"
 
 
 @dataclass(frozen=True, kw_only=True)
-class CameraFacts:
+class CameraReport:
     """One camera before and after; the focal length in pixels of its longer side's size."""
 
     name: str
@@ -32,7 +32,7 @@ class CameraFacts:
 
 
 @dataclass(frozen=True)
-class PhotographFacts:
+class ImageReport:
     """One photograph: placed minus recorded position in metres, where both are known; or why it is left out."""
 
     name: str
@@ -41,11 +41,11 @@ class PhotographFacts:
 
 
 @dataclass(frozen=True)
-class SurveyFacts:
+class GcpReport:
     """One surveyed point, as the model has it."""
 
     name: str
-    used_as: str
+    role: str
     """`control`: the model was brought to it; `check`: held out and measured; `not used`: it fits nothing."""
     photographs: int
     """Placed photographs that show it; 0: too few to tell its place."""
@@ -56,7 +56,7 @@ class SurveyFacts:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReconstructionFacts:
+class ReconstructionReport:
     """What a person should know about a reconstruction."""
 
     found: int
@@ -74,8 +74,8 @@ class ReconstructionFacts:
     origin: tuple[float, ...] | None
     residual_rms_m: tuple[float, ...] | None
     """East, north, up."""
-    positions_left_out: int
-    focal_held: bool
+    positions_rejected: int
+    focal_fixed: bool
     focal_reason: str
     height_m: float | None
     """Median height of the cameras over the median point."""
@@ -84,18 +84,18 @@ class ReconstructionFacts:
     """Median angle of the views to straight down."""
     attitude_difference_deg: float | None
     """Between down as the model has it and as the drone recorded it, without how the camera hangs on the drone."""
-    cameras: tuple[CameraFacts, ...]
-    photographs: tuple[PhotographFacts, ...]
+    cameras: tuple[CameraReport, ...]
+    photographs: tuple[ImageReport, ...]
     warnings: tuple[str, ...]
     advice: tuple[str, ...]
     seconds: float
     """Of the last part of the work, where it was interrupted."""
-    survey: tuple[SurveyFacts, ...] = ()
+    survey: tuple[GcpReport, ...] = ()
     """Surveyed points, those that placed the model and those held out."""
 
-    def survey_rmse_m(self, used_as: str) -> tuple[float, float, float] | None:
+    def gcp_rmse_m(self, used_as: str) -> tuple[float, float, float] | None:
         """East, north and up of check points, or of control points; None where there are none."""
-        known = [each.residual_m for each in self.survey if each.used_as == used_as and each.residual_m]
+        known = [each.residual_m for each in self.survey if each.role == used_as and each.residual_m]
         if not known:
             return None
         east, north, up = (math.sqrt(sum(value**2 for value in axis) / len(known)) for axis in zip(*known, strict=True))
@@ -104,80 +104,83 @@ class ReconstructionFacts:
 
 def is_reconstruction(root: Path) -> bool:
     """Whether a folder is a capture made of photographs here, finished or not."""
-    return (root / FILE).is_file() or (root / WORK / STEPS).is_file()
+    return (root / RECONSTRUCTION_FILE).is_file() or (root / WORK_FOLDER / STEPS_FILE).is_file()
 
 
-def read_reconstruction(root: Path) -> ReconstructionFacts | None:
+def read_reconstruction(root: Path) -> ReconstructionReport | None:
     """The facts of a capture that was made of photographs here; None for others. CaptureError if they are damaged."""
-    file = root / FILE
+    file = root / RECONSTRUCTION_FILE
     if not file.is_file():
         return None
     try:
-        return record_of(ReconstructionFacts, read_json(file))
+        return record_from_dict(ReconstructionReport, read_json(file))
     except ValueError as error:
         raise CaptureError(f"{file}: is damaged ({error}). Remove it to do without.") from error
 
 
-def facts_rows(facts: ReconstructionFacts) -> list[tuple[str, str]]:
+def report_rows(metadata: ReconstructionReport) -> list[tuple[str, str]]:
     """The facts as pairs of what and how much, for tables."""
-    parts = f" (parts that do not hold together: {', '.join(map(str, facts.components))})"
+    parts = f" (parts that do not hold together: {', '.join(map(str, metadata.components))})"
     rows = [
-        ("Photographs placed", f"{facts.registered} of {facts.found}" + (parts if len(facts.components) > 1 else "")),
+        (
+            "Photographs placed",
+            f"{metadata.registered} of {metadata.found}" + (parts if len(metadata.components) > 1 else ""),
+        ),
         (
             "Reconstruction",
-            f"{facts.points:,} points, seen by {facts.track_length:.1f} photographs each; reprojection error "
-            f"{facts.reprojection_px:.2f} px",
+            f"{metadata.points:,} points, seen by {metadata.track_length:.1f} photographs each; reprojection error "
+            f"{metadata.reprojection_px:.2f} px",
         ),
-        ("Georeference", facts.georeferenced),
+        ("Georeference", metadata.georeferenced),
     ]
-    if facts.residual_rms_m is not None:
-        east, north, up = facts.residual_rms_m
-        left_out = f"; {facts.positions_left_out} positions not trusted" if facts.positions_left_out else ""
+    if metadata.residual_rms_m is not None:
+        east, north, up = metadata.residual_rms_m
+        left_out = f"; {metadata.positions_rejected} positions not trusted" if metadata.positions_rejected else ""
         rows.append(("Position residuals", f"RMS {east:.2f} m east, {north:.2f} m north, {up:.2f} m up{left_out}"))
-    rows += _survey_rows(facts)
-    held = "held" if facts.focal_held else "fitted"
-    for camera in facts.cameras:
+    rows += _survey_rows(metadata)
+    held = "held" if metadata.focal_fixed else "fitted"
+    for camera in metadata.cameras:
         rows.append(
             (
                 "Lens",
                 f"{camera.name}: focal length {camera.focal_before_px:.0f} px by {camera.focal_source}, "
-                f"{camera.focal_after_px:.0f} px now ({held}: {facts.focal_reason}), k {camera.radial_distortion:+.4f}",
+                f"{camera.focal_after_px:.0f} px now ({held}: {metadata.focal_reason}), k {camera.radial_distortion:+.4f}",
             )
         )
-    if facts.height_m is not None:
-        recorded = f", {facts.recorded_height_m:.1f} m recorded" if facts.recorded_height_m is not None else ""
-        rows.append(("Flying height", f"{facts.height_m:.1f} m over the median point{recorded}"))
-    if facts.tilt_deg is not None:
-        against = facts.attitude_difference_deg
+    if metadata.height_m is not None:
+        recorded = f", {metadata.recorded_height_m:.1f} m recorded" if metadata.recorded_height_m is not None else ""
+        rows.append(("Flying height", f"{metadata.height_m:.1f} m over the median point{recorded}"))
+    if metadata.tilt_deg is not None:
+        against = metadata.attitude_difference_deg
         recorded = f"; down is {against:.1f}° from what the drone recorded" if against is not None else ""
-        rows.append(("Tilt of the views", f"{facts.tilt_deg:.1f}° (median){recorded}"))
+        rows.append(("Tilt of the views", f"{metadata.tilt_deg:.1f}° (median){recorded}"))
     return rows
 
 
-def _survey_rows(facts: ReconstructionFacts) -> list[tuple[str, str]]:
+def _survey_rows(metadata: ReconstructionReport) -> list[tuple[str, str]]:
     rows = []
     for label, used_as, what in (
         ("Control points", "control", "place the model"),
         ("Check points", "check", "held out"),
     ):
-        rmse = facts.survey_rmse_m(used_as)
+        rmse = metadata.gcp_rmse_m(used_as)
         if rmse is not None:
             east, north, up = rmse
-            count = sum(each.used_as == used_as and each.residual_m is not None for each in facts.survey)
+            count = sum(each.role == used_as and each.residual_m is not None for each in metadata.survey)
             rows.append((label, f"{count}, {what}: RMSE {east:.3f} m east, {north:.3f} m north, {up:.3f} m up"))
     return rows
 
 
-def survey_table(facts: ReconstructionFacts) -> list[tuple[str, str, str, str, str, str, str]]:
+def gcp_table(metadata: ReconstructionReport) -> list[tuple[str, str, str, str, str, str, str]]:
     """Surveyed points as rows of words: name, what for, photographs, east, north, up in metres, pixels."""
     rows = []
-    for each in facts.survey:
+    for each in metadata.survey:
         off = [f"{value:+.3f}" for value in each.residual_m] if each.residual_m else ["–"] * 3
         pixels = f"{each.error_px:.1f}" if each.error_px is not None else "–"
-        rows.append((each.name, each.used_as, str(each.photographs), *off, pixels))
+        rows.append((each.name, each.role, str(each.photographs), *off, pixels))
     return rows  # type: ignore[return-value]
 
 
-def left_out_lines(facts: ReconstructionFacts) -> list[str]:
+def excluded_lines(metadata: ReconstructionReport) -> list[str]:
     """Photographs that are not used, each with the reason."""
-    return [f"{photo.name}: {photo.left_out}" for photo in facts.photographs if photo.left_out is not None]
+    return [f"{photo.name}: {photo.left_out}" for photo in metadata.photographs if photo.left_out is not None]

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from vdgs.captures.capture import Split, View
-from vdgs.captures.formats.source_capture import listing
-from vdgs.captures.name_resolution import Names
+from vdgs.captures.formats.source_capture import format_list
+from vdgs.captures.name_resolution import ImageNameIndex
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 
@@ -23,7 +23,7 @@ from vdgs.errors import CaptureError
 TEST_LIST, VALIDATION_LIST = "test.txt", "validation.txt"
 
 
-def nearest_to_middle(views: list[View], count: int) -> list[View]:
+def select_central_views(views: list[View], count: int) -> list[View]:
     """The `count` views nearest to the median camera centre: a compact patch keeps its overlap."""
     centres = np.stack([view.camera.position for view in views])
     distance = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
@@ -31,7 +31,7 @@ def nearest_to_middle(views: list[View], count: int) -> list[View]:
     return [views[index] for index in chosen]
 
 
-def choose_splits(
+def assign_splits(
     root: Path,
     views: list[View],
     explicit: Mapping[str, Split | None],
@@ -44,7 +44,7 @@ def choose_splits(
     gives it. Raises `CaptureError` if a side stays empty or a list names what is no photograph.
     """
     views = sorted(views, key=lambda view: view.name)
-    names = Names({name: root / name for name in explicit})
+    names = ImageNameIndex({name: root / name for name in explicit})
     splits = _splits(root, views, explicit, options, names)
     chosen = [replace(view, split=split) for view, split in zip(views, splits, strict=True) if split is not None]
     unlisted = [view.name for view, split in zip(views, splits, strict=True) if split is None]
@@ -70,7 +70,7 @@ def choose_splits(
 
 
 def _splits(
-    root: Path, views: list[View], explicit: Mapping[str, Split | None], options: CaptureOptions, names: Names
+    root: Path, views: list[View], explicit: Mapping[str, Split | None], options: CaptureOptions, names: ImageNameIndex
 ) -> list[Split | None]:
     """The split of each view: by the list asked for, the capture's list, its format (None where that knows others
     only), or every n-th."""
@@ -100,7 +100,7 @@ def _with_validation_list(views: list[View], listed: set[str], validation: bool)
     return [replace(view, split="test" if view.name in listed else "train") for view in kept]
 
 
-def _listed(file: Path, names: Names, some: bool) -> set[str]:
+def _listed(file: Path, names: ImageNameIndex, some: bool) -> set[str]:
     """The photographs named in a text file, one a line; extensions and case may differ. CaptureError for a list that
     cannot be read, names what is no photograph, or names nothing where `some` are needed."""
     try:
@@ -119,6 +119,6 @@ def _listed(file: Path, names: Names, some: bool) -> set[str]:
     if unknown:
         raise CaptureError(
             f"{file}: {len(unknown)} of its names are not photographs of this capture. "
-            f"Write one image name a line, or ignore lists with --split every.{listing(unknown)}"
+            f"Write one image name a line, or ignore lists with --split every.{format_list(unknown)}"
         )
     return {match for match in found.values() if match is not None}

@@ -16,11 +16,11 @@ import cv2
 import numpy as np
 
 from vdgs.captures.formats.source_capture import Intrinsics
-from vdgs.captures.image_files import decode_mask, decode_photograph
+from vdgs.captures.image_files import decode_image, decode_mask
 from vdgs.errors import CaptureError
 
 JPEG_QUALITY = 95
-THREADS = 2
+NUM_THREADS = 2
 #: Pixels of a sampling map that are made at once.
 STRIP_PX = 1 << 18
 
@@ -43,12 +43,12 @@ def undistort(folder: Path, photographs: list[ImageFile]) -> list[ImageFile]:
     distortion pass through. Raises `CaptureError` if the folder cannot be written or an image cannot be
     decoded.
     """
-    bent = [photo for photo in photographs if photo.intrinsics.distorted]
-    targets = {lens: pinhole_for(lens) for lens in dict.fromkeys(photo.intrinsics for photo in bent)}
+    bent = [photo for photo in photographs if photo.intrinsics.is_distorted]
+    targets = {lens: undistorted_pinhole(lens) for lens in dict.fromkeys(photo.intrinsics for photo in bent)}
     # Lens by lens, so that few maps are kept at a time, however many lenses there are.
     numbers = {lens: number for number, lens in enumerate(targets)}
     bent.sort(key=lambda photo: numbers[photo.intrinsics])
-    lock, kept = threading.Lock(), lru_cache(THREADS)(sampling_map)
+    lock, kept = threading.Lock(), lru_cache(NUM_THREADS)(sampling_map)
 
     def map_of(lens: Intrinsics) -> np.ndarray:
         with lock:  # whoever needs the same one waits for it
@@ -59,7 +59,7 @@ def undistort(folder: Path, photographs: list[ImageFile]) -> list[ImageFile]:
 
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with ThreadPoolExecutor(THREADS) as pool:
+        with ThreadPoolExecutor(NUM_THREADS) as pool:
             straight = dict(zip((photo.name for photo in bent), pool.map(one, bent), strict=True))
         return [straight.get(photo.name, photo) for photo in photographs]
     except OSError as error:
@@ -69,7 +69,7 @@ def undistort(folder: Path, photographs: list[ImageFile]) -> list[ImageFile]:
         ) from error
 
 
-def pinhole_for(intrinsics: Intrinsics) -> Intrinsics:
+def undistorted_pinhole(intrinsics: Intrinsics) -> Intrinsics:
     """The pinhole camera whose picture holds no blank pixels (COLMAP's own choice of size and centre)."""
     import pycolmap  # 60 MB of memory: only for lenses that need it
 
@@ -127,7 +127,7 @@ def _undistort_one(
 def _write_straight(photo: ImageFile, grid: np.ndarray, target: Path, mask_target: Path) -> bool:
     """Write the straightened image (`grid` as of `sampling_map`), and its mask if there is one (from a file or from
     transparency)."""
-    pixels, keep = decode_photograph(photo.path)
+    pixels, keep = decode_image(photo.path)
     if photo.mask is not None:
         masked = decode_mask(photo.mask, pixels.shape[1], pixels.shape[0])
         keep = masked if keep is None else masked & keep

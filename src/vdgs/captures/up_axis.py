@@ -14,19 +14,19 @@ import numpy as np
 from vdgs.geometry.similarity import geometric_median
 
 #: Below this cosine between up and the mean view the sign of up is taken from the heights instead.
-LEVEL_VIEW = 0.1
+MIN_VIEW_COSINE = 0.1
 #: The length of the mean image-up from which photographs have the same side up: views within 25 degrees of level, or
 #: of one heading (choice).
-SAME_SIDE_UP = 0.9
+MIN_UP_AGREEMENT = 0.9
 #: From this cosine between up and the mean image-up that says which way up is, where the view says it less (choice).
-UPRIGHT = 0.5
+MIN_UPRIGHT_COSINE = 0.5
 #: Nobody rolls cameras by so much (squared sine, mean): an axis that asks for it is not up (choice). Right vectors that
 #: spread by less are parallel; they fit a hillside too, so that only an axis along them is ruled out.
-ROLLED, ALONG_RIGHTS = float(np.sin(np.radians(10.0))) ** 2, 0.5
+MAX_ROLL, MAX_ROLL_PARALLEL = float(np.sin(np.radians(10.0))) ** 2, 0.5
 #: An axis is clearly the better up if it asks for less than this share of the other's roll (choice).
-CLEARLY_LESS = 0.25
+MAX_ROLL_RATIO = 0.25
 #: Roll for which right vectors count as much as the mean image-up does: where they spread by less, that decides.
-PRIOR = 0.002
+ROLL_PRIOR = 0.002
 HINT = "--up x|y|z|-x|-y|-z says it outright."
 
 
@@ -39,12 +39,12 @@ def estimate_up(
     source world. All of it turns with the world (no per-axis medians).
     """
     rights, image_up, forward = rotations[:, 0], -rotations[:, 1].mean(axis=0), rotations[:, 2].mean(axis=0)
-    same_side = float(np.linalg.norm(image_up)) >= SAME_SIDE_UP
-    parallel = bool(np.linalg.eigvalsh(rights.T @ rights / len(rights))[1] < ROLLED)
+    same_side = float(np.linalg.norm(image_up)) >= MIN_UP_AGREEMENT
+    parallel = bool(np.linalg.eigvalsh(rights.T @ rights / len(rights))[1] < MAX_ROLL)
     up, uncertain = _least_variance(centres, points)
     how = "least variance of cameras and points"
-    neither = abs(forward @ up) < LEVEL_VIEW and abs(image_up @ up) < UPRIGHT
-    rolled = _roll(rights, up) > (ALONG_RIGHTS if parallel else ROLLED)
+    neither = abs(forward @ up) < MIN_VIEW_COSINE and abs(image_up @ up) < MIN_UPRIGHT_COSINE
+    rolled = _roll(rights, up) > (MAX_ROLL_PARALLEL if parallel else MAX_ROLL)
     if same_side and (neither or rolled or (uncertain and not parallel)):
         up, how = _level(rights, image_up), "level cameras"
         if parallel:
@@ -58,9 +58,9 @@ def estimate_up(
             f"Look at the figures of `vdgs inspect`; {HINT}"
         )
     own, looking = float(image_up @ up), float(forward @ up)
-    if abs(own) >= max(UPRIGHT, abs(looking)):
+    if abs(own) >= max(MIN_UPRIGHT_COSINE, abs(looking)):
         return (-up if own < 0 else up), f"{how}, upper sides of the photographs up"
-    if abs(looking) >= LEVEL_VIEW:
+    if abs(looking) >= MIN_VIEW_COSINE:
         if same_side and parallel and 2 * abs(own) < abs(looking) and not _turn_about(up, rights, image_up):
             warnings.append(
                 "all photographs look the same way with the same side up: straight down on ground, or level at a "
@@ -100,12 +100,12 @@ def _roll(rights: np.ndarray, up: np.ndarray) -> float:
 def _turn_about(axis: np.ndarray, rights: np.ndarray, image_up: np.ndarray) -> bool:
     """Whether right vectors [n, 3] turn about an axis clearly more than they leave the plane across it: the yaw of
     flights that look along it."""
-    return _roll(rights, axis) < CLEARLY_LESS * _roll(rights, image_up / np.linalg.norm(image_up))
+    return _roll(rights, axis) < MAX_ROLL_RATIO * _roll(rights, image_up / np.linalg.norm(image_up))
 
 
 def _level(rights: np.ndarray, image_up: np.ndarray) -> np.ndarray:
     """Up of cameras that are held level, of either sign: most orthogonal to their right vectors [n, 3], and near their
     mean image-up where those are too parallel to tell."""
     mean = image_up / np.linalg.norm(image_up)
-    moment = rights.T @ rights / len(rights) + PRIOR * (np.eye(3) - np.outer(mean, mean))
+    moment = rights.T @ rights / len(rights) + ROLL_PRIOR * (np.eye(3) - np.outer(mean, mean))
     return np.asarray(np.linalg.eigh(moment)[1][:, 0])

@@ -20,25 +20,25 @@ from vdgs.captures.image_checks import check_images
 from vdgs.errors import CaptureError
 from vdgs.geometry.row_sampling import sample_points
 from vdgs.geometry.similarity import geometric_median
-from vdgs.visibility.visibility_counts import visibility_of
+from vdgs.visibility.visibility_counts import count_visibility
 
 #: Sparse points looked at when there are more.
-MOST_POINTS = 20_000
+MAX_POINTS = 20_000
 #: Choices. Shares of the points that no training camera sees: nothing could be trained; much is missing.
-UNSEEN_REFUSED, UNSEEN_DOUBTFUL = 0.95, 0.5
+MAX_UNSEEN, WARN_UNSEEN = 0.95, 0.5
 #: Median reprojection errors in pixels: fine detail is lost; not what any adjustment leaves (structure-from-motion
 #: drops what is off by more than 4 pixels of the full size), where it also is this share of the longer side.
-REPROJECTION_DOUBTFUL_PX, REPROJECTION_REFUSED_PX, REPROJECTION_REFUSED = 1.5, 3.0, 0.005
+WARN_REPROJECTION_PX, MAX_REPROJECTION_PX, MAX_REPROJECTION_RATIO = 1.5, 3.0, 0.005
 #: How far the cameras' places move the scene in their pictures, in pixels: no depth; as a share of the longer side:
 #: poor depth.
-PARALLAX_REFUSED_PX, PARALLAX_DOUBTFUL = 1.0, 0.02
+MIN_PARALLAX_PX, WARN_PARALLAX_RATIO = 1.0, 0.02
 #: Fewer distinct points than this span no surface; fewer than the second are hardly a model of a place.
-FEW_REFUSED, FEW_DOUBTFUL = 4, 50
-NAMES_SHOWN = 5
+MIN_DISTINCT_POINTS, WARN_DISTINCT_POINTS = 4, 50
+MAX_NAMES_SHOWN = 5
 
 
 @dataclass(frozen=True)
-class Soundness:
+class ValidationReport:
     """What was found; `problems` make training pointless, `warnings` may be meant."""
 
     #: Median reprojection error in pixels of the photographs as used, where the capture has tracks; infinite where most
@@ -47,18 +47,18 @@ class Soundness:
     #: Points in photographs that it was measured on.
     sightings: int
     #: Share of the sparse points that at least one training camera holds in its frustum.
-    share_seen: float
+    seen_fraction: float
     problems: tuple[str, ...]
     warnings: tuple[str, ...]
 
 
-def judge(capture: Capture) -> Soundness:
+def validate_capture(capture: Capture) -> ValidationReport:
     """Look at cameras and sparse points of a capture. O(points x cameras) on at most 20 000 points; pixels are not
     decoded."""
-    points = sample_points(capture.points, MOST_POINTS)
+    points = sample_points(capture.points, MAX_POINTS)
     findings = _Findings([], [])
     cameras = [view.camera for view in capture.train_views]
-    seen = visibility_of(torch.from_numpy(np.ascontiguousarray(points)), cameras).numpy() > 0
+    seen = count_visibility(torch.from_numpy(np.ascontiguousarray(points)), cameras).numpy() > 0
     errors = {view.name: _errors(view) for view in capture.views if view.sightings is not None}
     pooled = np.concatenate(list(errors.values())) if errors else np.zeros(0)
     _judge_points(capture, findings)
@@ -66,18 +66,18 @@ def judge(capture: Capture) -> Soundness:
     _judge_seen(capture, points, float(seen.mean()), findings)
     if len(pooled):
         _judge_reprojection(capture, errors, float(np.median(pooled)), findings)
-    return Soundness(
+    return ValidationReport(
         reprojection_px=float(np.median(pooled)) if len(pooled) else None, sightings=len(pooled),
-        share_seen=float(seen.mean()), problems=tuple(findings.problems), warnings=tuple(findings.warnings),
+        seen_fraction=float(seen.mean()), problems=tuple(findings.problems), warnings=tuple(findings.warnings),
     )  # fmt: skip
 
 
-def refuse_unsound(capture: Capture, soundness: Soundness | None = None) -> Soundness:
-    """What `judge` says of a capture. Raises `CaptureError` where it cannot become a scene."""
-    soundness = soundness or judge(capture)
-    if soundness.problems:
-        raise CaptureError(f"{capture.root}: cannot become a scene.\n  " + "\n  ".join(soundness.problems))
-    return soundness
+def require_valid(capture: Capture, report: ValidationReport | None = None) -> ValidationReport:
+    """What `validate_capture` says of a capture. Raises `CaptureError` where it cannot become a scene."""
+    report = report or validate_capture(capture)
+    if report.problems:
+        raise CaptureError(f"{capture.root}: cannot become a scene.\n  " + "\n  ".join(report.problems))
+    return report
 
 
 @dataclass(frozen=True)
@@ -88,17 +88,17 @@ class _Findings:
 
 def _errors(view: View) -> np.ndarray:
     assert view.sightings is not None
-    return view.sightings.errors_px(view.camera)
+    return view.sightings.reprojection_errors_px(view.camera)
 
 
 def _judge_points(capture: Capture, findings: _Findings) -> None:
     distinct = len(np.unique(capture.points, axis=0))
-    if distinct < FEW_REFUSED:
+    if distinct < MIN_DISTINCT_POINTS:
         findings.problems.append(
             f"The model holds {distinct} distinct sparse point(s), from which no surface can start. Run the "
             "structure-from-motion again."
         )
-    elif distinct < FEW_DOUBTFUL:
+    elif distinct < WARN_DISTINCT_POINTS:
         findings.warnings.append(
             f"there are only {distinct} distinct sparse points; the scene starts from them. Was the model cut down?"
         )
@@ -115,12 +115,12 @@ def _judge_places(capture: Capture, points: np.ndarray, findings: _Findings) -> 
     spread = 2 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
     parallax = float(np.median([view.camera.fx for view in views])) * spread / max(distance, 1e-12)
     unit = capture.ground.unit
-    if parallax < PARALLAX_REFUSED_PX:
+    if parallax < MIN_PARALLAX_PX:
         findings.problems.append(
             f"All {len(views)} training cameras are at one place (within {spread:.2g} {unit}, {distance:.3g} {unit} "
             "from the points): photographs that only turn about one place show no depth. Check the poses."
         )
-    elif parallax < PARALLAX_DOUBTFUL * _longest_side(views):
+    elif parallax < WARN_PARALLAX_RATIO * _longest_side(views):
         findings.warnings.append(
             f"all training cameras are within {spread:.2g} {unit}, {distance:.3g} {unit} from the points: the scene "
             f"moves by {parallax:.1f} px at most between the photographs, and depth will be poor."
@@ -130,7 +130,7 @@ def _judge_places(capture: Capture, points: np.ndarray, findings: _Findings) -> 
 def _judge_seen(capture: Capture, points: np.ndarray, share_seen: float, findings: _Findings) -> None:
     cameras = [view.camera for view in capture.train_views]
     unseen = 1 - share_seen
-    if unseen >= UNSEEN_REFUSED:
+    if unseen >= MAX_UNSEEN:
         behind = float(np.mean([(camera.project(points)[1] <= 0).mean() for camera in cameras]))
         findings.problems.append(
             f"No training camera sees {unseen:.0%} of the sparse points (V = 0); {behind:.0%} of the points lie behind "
@@ -139,13 +139,13 @@ def _judge_seen(capture: Capture, points: np.ndarray, share_seen: float, finding
             "camera-from-world)? Export the model again."
         )
         return
-    if unseen >= UNSEEN_DOUBTFUL:
+    if unseen >= WARN_UNSEEN:
         findings.warnings.append(
             f"no training camera sees {unseen:.0%} of the sparse points (V = 0). Points of other photographs, or a "
             "model whose cameras and points do not belong together?"
         )
     places = torch.from_numpy(np.ascontiguousarray(points))
-    blind = [view.name for view in capture.views if not bool(visibility_of(places, [view.camera]).any())]
+    blind = [view.name for view in capture.views if not bool(count_visibility(places, [view.camera]).any())]
     if blind:
         findings.warnings.append(
             f"{len(blind)} of {len(capture.views)} photographs show none of the sparse points ({_some(blind)})."
@@ -153,15 +153,15 @@ def _judge_seen(capture: Capture, points: np.ndarray, share_seen: float, finding
 
 
 def _judge_reprojection(capture: Capture, errors: dict[str, np.ndarray], median: float, findings: _Findings) -> None:
-    refused = max(REPROJECTION_REFUSED_PX, REPROJECTION_REFUSED * _longest_side(capture.views))
+    refused = max(MAX_REPROJECTION_PX, MAX_REPROJECTION_RATIO * _longest_side(capture.views))
     if median > refused:
         findings.problems.append(
             f"The sparse points do not fall where the photographs show them: the median reprojection error is "
-            f"{reprojection_words(median)}. Points or poses were changed (mirrored, moved, scaled) or are of another "
+            f"{format_reprojection(median)}. Points or poses were changed (mirrored, moved, scaled) or are of another "
             "reconstruction; export the model again."
         )
         return
-    if median > REPROJECTION_DOUBTFUL_PX:
+    if median > WARN_REPROJECTION_PX:
         findings.warnings.append(
             f"the median reprojection error is {median:.1f} px; the scene will be blurred. Were poses or points "
             "rounded, or the model not adjusted after it was changed?"
@@ -174,7 +174,7 @@ def _judge_reprojection(capture: Capture, errors: dict[str, np.ndarray], median:
         )
 
 
-def reprojection_words(median_px: float) -> str:
+def format_reprojection(median_px: float) -> str:
     """A median reprojection error for people."""
     return f"{median_px:.2f} px" if np.isfinite(median_px) else "infinite: most points lie behind the cameras"
 
@@ -184,15 +184,15 @@ def _longest_side(views: Sequence[View]) -> float:
 
 
 def _some(names: list[str]) -> str:
-    return ", ".join(names[:NAMES_SHOWN]) + (", ..." if len(names) > NAMES_SHOWN else "")
+    return ", ".join(names[:MAX_NAMES_SHOWN]) + (", ..." if len(names) > MAX_NAMES_SHOWN else "")
 
 
-def refuse_unworkable(capture: Capture, console: Console) -> None:
+def require_trainable(capture: Capture, console: Console) -> None:
     """Say what is doubtful about a capture and what masks leave out. Raises `CaptureError` for one that cannot become a
     scene, and for photographs or masks that are damaged."""
-    soundness = refuse_unsound(capture)
+    soundness = require_valid(capture)
     checked = check_images(capture)
     for warning in (*capture.warnings, *soundness.warnings, *checked.warnings):
         console.print(f"[yellow]note[/] {escape(warning)}", highlight=False)
-    if checked.masked_share:
-        console.print(f"masks leave out {checked.masked_share:.1%} of the photographs", highlight=False)
+    if checked.masked_fraction:
+        console.print(f"masks leave out {checked.masked_fraction:.1%} of the photographs", highlight=False)

@@ -24,4 +24,4 @@ def bench(arguments: list[str]) -> None:
             "the package `experiments` is missing, which an installation does not hold: clone the repository of vdgs, "
             "and run `python -m experiments.bench` in its root."
         ) from error
-    cli.bench(arguments)
+    cli.bench_command(arguments)

@@ -1,4 +1,4 @@
-"""Verbs about captures: look at one (`inspect`), generate one (`synth`)."""
+"""Verbs about captures: look at one (`inspect_command`), generate one (`synth_command`)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from vdgs.cli.common import open_console, parse
+from vdgs.cli.common import make_console, parse_arguments
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.synth.options import SynthOptions
 
@@ -27,21 +27,21 @@ class InspectArguments:
     options: Annotated[CaptureOptions, arg(name="")] = field(default_factory=CaptureOptions)
 
 
-def inspect(arguments: list[str]) -> None:
-    asked = parse(InspectArguments, arguments, "vdgs inspect")
+def inspect_command(arguments: list[str]) -> None:
+    asked = parse_arguments(InspectArguments, arguments, "vdgs inspect")
     from vdgs.captures.image_checks import check_images
     from vdgs.captures.loading import load_capture
-    from vdgs.captures.output_guard import refuse_among_inputs, refuse_in_a_capture
+    from vdgs.captures.output_guard import check_not_among_inputs, check_not_in_capture
     from vdgs.captures.reconstruction import read_reconstruction
     from vdgs.errors import CaptureError
     from vdgs.report.capture_report import inspect_capture, print_report
 
-    refuse_in_a_capture(asked.output)
+    check_not_in_capture(asked.output)
     capture = load_capture(asked.capture, asked.options)
-    refuse_among_inputs(asked.output, capture)
+    check_not_among_inputs(asked.output, capture)
     checked = check_images(capture) if asked.check else None
     report = inspect_capture(capture, asked.output, checked)
-    print_report(report, reconstruction=read_reconstruction(capture.root))
+    print_report(report, reconstruction_report=read_reconstruction(capture.root))
     if report.problems:
         raise CaptureError(f"{capture.root}: cannot become a scene; see the problems above.")
 
@@ -57,13 +57,13 @@ class SynthArguments:
     options: Annotated[SynthOptions, arg(name="")] = field(default_factory=SynthOptions)
 
 
-def synth(arguments: list[str]) -> None:
-    asked = parse(SynthArguments, arguments, "vdgs synth")
+def synth_command(arguments: list[str]) -> None:
+    asked = parse_arguments(SynthArguments, arguments, "vdgs synth")
     from rich.progress import Progress, TaskID
 
     from vdgs.synth import generate
 
-    console = open_console(asked.quiet)
+    console = make_console(asked.quiet)
     with Progress(console=console, disable=not console.is_terminal) as bar:
         tasks: dict[str, TaskID] = {}
 

@@ -6,17 +6,17 @@ Nothing heavy is imported before the options are parsed, so that help and usage 
 from __future__ import annotations
 
 from vdgs.cli.bench_cmd import bench
-from vdgs.cli.capture_cmds import inspect, synth
-from vdgs.cli.doctor_cmd import doctor
-from vdgs.cli.export_cmd import export
-from vdgs.cli.ortho_cmd import map
-from vdgs.cli.result_cmds import eval, render, report, status
-from vdgs.cli.run_cmd import coarse, run
-from vdgs.cli.sfm_cmd import sfm
-from vdgs.cli.stage_cmds import merge, partition, train, visibility
-from vdgs.cli.view_cmd import view
+from vdgs.cli.capture_cmds import inspect_command, synth_command
+from vdgs.cli.doctor_cmd import doctor_command
+from vdgs.cli.export_cmd import export_command
+from vdgs.cli.ortho_cmd import ortho_command
+from vdgs.cli.result_cmds import eval_command, render_command, report_command, status_command
+from vdgs.cli.run_cmd import run_command, train_coarse_command
+from vdgs.cli.sfm_cmd import sfm_command
+from vdgs.cli.stage_cmds import merge_command, partition_command, train_blocks_command, visibility_command
+from vdgs.cli.view_cmd import view_command
 
 __all__ = [
-    "bench", "coarse", "doctor", "eval", "export", "inspect", "map", "merge", "partition", "render", "report", "run",
-    "sfm", "status", "synth", "train", "view", "visibility",
+    "bench", "train_coarse_command", "doctor_command", "eval_command", "export_command", "inspect_command", "ortho_command", "merge_command", "partition_command", "render_command", "report_command", "run_command",
+    "sfm_command", "status_command", "synth_command", "train_blocks_command", "view_command", "visibility_command",
 ]  # fmt: skip

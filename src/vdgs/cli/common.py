@@ -12,10 +12,10 @@ import tyro
 
 from vdgs.config.method import MethodConfig
 from vdgs.config.presets import PRESETS, PresetName
-from vdgs.config.ranges import refuse
+from vdgs.config.ranges import check_ranges
 
 #: What lines begin with that are printed even where a person asked for quiet.
-LOUD = ("[yellow]", "[red]")
+ALWAYS_PRINTED_PREFIXES = ("[yellow]", "[red]")
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -26,13 +26,15 @@ if TYPE_CHECKING:
 Parsed = TypeVar("Parsed")
 
 
-def parse(kind: type[Parsed], arguments: list[str], prog: str, default: Parsed | None = None) -> Parsed:
+def parse_arguments(
+    arguments_type: type[Parsed], arguments: list[str], prog: str, default: Parsed | None = None
+) -> Parsed:
     """The arguments of a verb. Raises VdgsError for a number that is outside its range (`settings.ranges`)."""
     if default is None:
-        asked = tyro.cli(kind, args=arguments, prog=prog)
+        asked = tyro.cli(arguments_type, args=arguments, prog=prog)
     else:
-        asked = tyro.cli(kind, args=arguments, prog=prog, default=default)
-    refuse(asked)
+        asked = tyro.cli(arguments_type, args=arguments, prog=prog, default=default)
+    check_ranges(asked)
     return asked
 
 
@@ -57,7 +59,7 @@ def parse_for_run(
 ) -> tuple[Parsed, RunFolder, MethodConfig]:
     """The arguments of a verb, the run that they name and its settings, which are the `defaults`.
 
-    Raises what `parse` raises, RunError where the run is none, VdgsError where another option names a run.
+    Raises what `parse_arguments` raises, RunError where the run is none, VdgsError where another option names a run.
     """
     named = next((Path(each) for each in arguments if (Path(each) / "config.yaml").is_file()), None)
     if named is None:
@@ -66,7 +68,7 @@ def parse_for_run(
         from vdgs.runs.run_folder import RunFolder
 
         method = RunFolder(named).method()
-    asked = parse(kind, arguments, prog, defaults(method))
+    asked = parse_arguments(kind, arguments, prog, defaults(method))
     from vdgs.errors import VdgsError
     from vdgs.runs.run_folder import RunFolder
 
@@ -77,29 +79,29 @@ def parse_for_run(
     return asked, run, own
 
 
-def change_settings(run: RunFolder, method: MethodConfig, redo: bool, quiet: bool = False) -> None:
+def update_run_settings(run: RunFolder, method: MethodConfig, overwrite: bool, quiet: bool = False) -> None:
     """Give the run other settings for later stages, if they are other. RunError where another process drives it."""
-    from vdgs.config.validation_rules import validate
+    from vdgs.config.validation_rules import validate_config
     from vdgs.errors import VdgsError
 
-    problems = validate(method)
+    problems = validate_config(method)
     if problems:
         raise VdgsError("These settings do not work:\n  " + "\n  ".join(problems))
     wanted = replace(run.settings(), **vars(method))
     if wanted != run.settings():
         with run.driven(), run.locked():
-            for line in run.change_settings(wanted, redo):
-                open_console(quiet).print(f"[yellow]changed[/] {line}", highlight=False)
+            for line in run.change_settings(wanted, overwrite):
+                make_console(quiet).print(f"[yellow]changed[/] {line}", highlight=False)
 
 
-def use_device(asked: str) -> str:
+def select_device(name: str) -> str:
     """Which device computes, decided before any work begins. Raises VdgsError for one that cannot."""
-    from vdgs.kernels.device_selection import choose
+    from vdgs.kernels.device_selection import select_device
 
-    return choose(asked).device
+    return select_device(name).device
 
 
-def open_console(quiet: bool = False) -> Console:
+def make_console(quiet: bool = False) -> Console:
     """Where verbs print to; with `quiet` only notes and warnings are, on standard error."""
     from rich.console import Console
 
@@ -110,7 +112,7 @@ def open_console(quiet: bool = False) -> Console:
         """Prints what a person must know, and leaves out how work goes."""
 
         def print(self, *objects: Any, **options: Any) -> None:
-            if objects and str(objects[0]).startswith(LOUD):
+            if objects and str(objects[0]).startswith(ALWAYS_PRINTED_PREFIXES):
                 super().print(*objects, **options)
 
         def rule(self, *_: Any, **__: Any) -> None:
@@ -119,7 +121,7 @@ def open_console(quiet: bool = False) -> Console:
     return Warnings(soft_wrap=True, stderr=True, force_terminal=False, force_interactive=False)
 
 
-def as_typed(verb: str, arguments: list[str], paths: tuple[Path, ...]) -> str:
+def absolute_command_line(verb: str, arguments: list[str], paths: tuple[Path, ...]) -> str:
     """The command that was given, for every folder to type it in: paths are whole, `--redo` and `--quiet` left out."""
     whole = {str(path): str(path.resolve()) for path in paths}
     kept = [each for each in arguments if each not in ("--redo", "--quiet")]

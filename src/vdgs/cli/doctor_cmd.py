@@ -1,10 +1,10 @@
-"""The verb about this machine: `doctor`."""
+"""The verb about this machine: `doctor_command`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from vdgs.cli.common import parse
+from vdgs.cli.common import parse_arguments
 
 
 @dataclass(frozen=True)
@@ -15,8 +15,8 @@ class DoctorArguments:
     """Print JSON instead of a table."""
 
 
-def doctor(arguments: list[str]) -> int:
-    asked = parse(DoctorArguments, arguments, "vdgs doctor")
+def doctor_command(arguments: list[str]) -> int:
+    asked = parse_arguments(DoctorArguments, arguments, "vdgs doctor")
     from vdgs.cli.doctor.doctor_report import print_report
 
     return print_report(as_json=asked.json)

@@ -1,4 +1,4 @@
-"""The verb that writes a scene for other programs: `export`."""
+"""The verb that writes a scene for other programs: `export_command`."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Annotated
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from vdgs.cli.common import open_console, parse, use_device
+from vdgs.cli.common import make_console, parse_arguments, select_device
 from vdgs.config.commands import ExportRequest
 from vdgs.config.executor_options import ExecutorOptions
-from vdgs.config.ranges import WORKERS
+from vdgs.config.ranges import WORKER_COUNT
 from vdgs.kernels import configure_threads
 
 
@@ -27,23 +27,23 @@ class ExportArguments(ExportRequest):
     scene is baked once (docs/export.md)."""
     quiet: bool = False
     """Print nothing but notes, warnings and errors."""
-    jobs: Annotated[int, WORKERS] = 0
+    jobs: Annotated[int, WORKER_COUNT] = 0
     """Shards of the baking done at once, each in a process of its own; 0: on this machine one process bakes all, a
     cluster as many as it has room for."""
     where: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
 
 
-def export(arguments: list[str]) -> None:
-    asked = parse(ExportArguments, arguments, "vdgs export")
-    device, console = use_device(asked.device), open_console(asked.quiet)
+def export_command(arguments: list[str]) -> None:
+    asked = parse_arguments(ExportArguments, arguments, "vdgs export")
+    device, console = select_device(asked.device), make_console(asked.quiet)
     configure_threads(asked.threads)
-    from vdgs.distributed.sharded_job import Wish
+    from vdgs.distributed.sharded_job import ExecutionOptions
     from vdgs.export.export_run import export_run
 
     asked.where.check()
-    export_run(replace(asked, device=device), console, Wish(asked.where, asked.jobs, device=device))
+    export_run(replace(asked, device=device), console, ExecutionOptions(asked.where, asked.jobs, device=device))
     from vdgs.report.write_report import write_report
-    from vdgs.runs.run_folder import REPORT, RunFolder
+    from vdgs.runs.run_folder import REPORT_FILE, RunFolder
 
-    if any(path.suffix.lower() == ".html" for path in asked.to) and (asked.run / REPORT).exists():
+    if any(path.suffix.lower() == ".html" for path in asked.to) and (asked.run / REPORT_FILE).exists():
         write_report(RunFolder(asked.run))  # it leads to the page

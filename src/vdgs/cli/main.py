@@ -39,12 +39,12 @@ vdgs VERB --help explains the options of a verb. A capture is a folder with imag
 transforms.json (nerfstudio), train/ and val/ (Mega-NeRF) or the layout of MatrixCity; `sfm` makes one of photographs.
 """
 
-VERBS = (
+COMMANDS = (
     "inspect", "run", "sfm", "status", "coarse", "visibility", "partition", "train", "merge", "eval", "report",
     "view", "render", "map", "export", "synth", "bench", "doctor",
 )  # fmt: skip
 #: Verbs that take up what they left when they were interrupted.
-CONTINUES = ("run", "sfm", "coarse", "train", "bench")
+RESUMABLE_COMMANDS = ("run", "sfm", "coarse", "train", "bench")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -59,30 +59,30 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
         print(f"vdgs {__version__}")
         return
-    if arguments[0] not in VERBS:
-        print(f"{HELP}\nvdgs: there is no verb {arguments[0]!r}{_like(arguments[0])}", file=sys.stderr)
+    if arguments[0] not in COMMANDS:
+        print(f"{HELP}\nvdgs: there is no verb {arguments[0]!r}{_suggestion(arguments[0])}", file=sys.stderr)
         sys.exit(2)
-    sys.exit(_run(arguments[0], arguments[1:]))
+    sys.exit(_run_command(arguments[0], arguments[1:]))
 
 
-def _like(word: str) -> str:
+def _suggestion(word: str) -> str:
     """A question about the verb that may be meant."""
     import difflib
 
-    like = difflib.get_close_matches(word.lower().lstrip("-"), [*VERBS, "help"], n=1)
+    like = difflib.get_close_matches(word.lower().lstrip("-"), [*COMMANDS, "help"], n=1)
     return f"; did you mean {like[0]!r}?" if like else ""
 
 
-def _run(verb: str, arguments: list[str]) -> int:
+def _run_command(command: str, arguments: list[str]) -> int:
     from vdgs.kernels import configure_threads
 
     configure_threads()  # before anything imports torch
     from vdgs.cli import commands
     from vdgs.system.exit_codes import exit_code_of
 
-    action: Callable[[list[str]], Any] = getattr(commands, verb)
-    again = "continues: what is finished is kept" if verb in CONTINUES else "begins it anew"
-    return exit_code_of(f"vdgs {verb}", lambda: action(arguments), f"The same command {again}.")
+    action: Callable[[list[str]], Any] = getattr(commands, command)
+    again = "continues: what is finished is kept" if command in RESUMABLE_COMMANDS else "begins it anew"
+    return exit_code_of(f"vdgs {command}", lambda: action(arguments), f"The same command {again}.")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The verb that makes maps of a run: `map`."""
+"""The verb that makes maps of a run: `ortho_command`."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from vdgs.cli.common import open_console, parse, use_device
-from vdgs.config.commands import MapRequest
+from vdgs.cli.common import make_console, parse_arguments, select_device
+from vdgs.config.commands import OrthoRequest
 from vdgs.config.executor_options import ExecutorOptions
-from vdgs.config.ranges import WORKERS
+from vdgs.config.ranges import WORKER_COUNT
 from vdgs.kernels import configure_threads
 
 
 @dataclass(frozen=True, kw_only=True)
-class MapArguments(MapRequest):
+class OrthoArguments(OrthoRequest):
     """Make maps of a run: orthophoto, surface model and visibility as GeoTIFFs, hillshade and preview as PNG.
 
     Needs rasterio and pyproj: pip install 'vdgs[geo]'.
@@ -24,7 +24,7 @@ class MapArguments(MapRequest):
 
     run: Positional[Path]
     """Run folder."""
-    jobs: Annotated[int, WORKERS] = 0
+    jobs: Annotated[int, WORKER_COUNT] = 0
     """Shards of the tiles drawn at once, each in a process of its own; 0: on this machine one process draws all, a
     cluster as many as it has room for."""
     quiet: bool = False
@@ -32,14 +32,14 @@ class MapArguments(MapRequest):
     where: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
 
 
-def map(arguments: list[str]) -> None:
-    asked = parse(MapArguments, arguments, "vdgs map")
-    device = use_device(asked.device)
+def ortho_command(arguments: list[str]) -> None:
+    asked = parse_arguments(OrthoArguments, arguments, "vdgs map")
+    device = select_device(asked.device)
     configure_threads(asked.threads)
-    from vdgs.distributed.sharded_job import Wish
-    from vdgs.rendering.ortho.render_ortho import map_run
+    from vdgs.distributed.sharded_job import ExecutionOptions
+    from vdgs.rendering.ortho.render_ortho import render_ortho
     from vdgs.runs.run_context import RunContext
 
     asked.where.check()
-    wish = Wish(asked.where, asked.jobs, device=device)
-    map_run(RunContext.from_path(asked.run), replace(asked, device=device), open_console(asked.quiet), wish)
+    wish = ExecutionOptions(asked.where, asked.jobs, device=device)
+    render_ortho(RunContext.from_path(asked.run), replace(asked, device=device), make_console(asked.quiet), wish)

@@ -1,4 +1,4 @@
-"""Verbs that show what a run came to: `status`, `eval`, `report`, `render`."""
+"""Verbs that show what a run came to: `status_command`, `eval_command`, `report_command`, `render_command`."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from vdgs.cli.common import open_console, parse, use_device
-from vdgs.config.commands import BINS, ModelName, RenderRequest
+from vdgs.cli.common import make_console, parse_arguments, select_device
+from vdgs.config.commands import BIN_COUNT_RANGE, ModelName, RenderRequest
 from vdgs.config.executor_options import ExecutorOptions
-from vdgs.config.ranges import WORKERS
+from vdgs.config.ranges import WORKER_COUNT
 from vdgs.kernels import configure_threads
 
 
@@ -30,18 +30,18 @@ class StatusArguments:
     """Print JSON instead of lines."""
 
 
-def status(arguments: list[str]) -> int:
-    asked = parse(StatusArguments, arguments, "vdgs status")
-    from vdgs.report.status_cli import NOT_WHOLE, print_status, status_facts
+def status_command(arguments: list[str]) -> int:
+    asked = parse_arguments(StatusArguments, arguments, "vdgs status")
+    from vdgs.report.status_cli import EXIT_INCOMPLETE, print_status, status_json
     from vdgs.runs.run_folder import RunFolder
 
     if not asked.json:
-        return print_status(RunFolder(asked.run), open_console())
+        return print_status(RunFolder(asked.run), make_console())
     import json
 
-    facts = status_facts(RunFolder(asked.run))
+    facts = status_json(RunFolder(asked.run))
     print(json.dumps(facts, indent=1, ensure_ascii=False))
-    return 0 if facts["whole"] else NOT_WHOLE
+    return 0 if facts["whole"] else EXIT_INCOMPLETE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,12 +60,12 @@ class EvalArguments:
     """Where the capture lies now, if it was moved; the run remembers it."""
     lpips_weights: Path | None = None
     """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
-    bins: Annotated[int, BINS] = 4
+    bins: Annotated[int, BIN_COUNT_RANGE] = 4
     """Number of visibility quantiles by which metrics are reported."""
-    jobs: Annotated[int, WORKERS] = 0
+    jobs: Annotated[int, WORKER_COUNT] = 0
     """Shards of the views measured at once, each in a process of its own; 0: on this machine one process measures all,
     a cluster as many as it has room for."""
-    threads: Annotated[int, WORKERS] = 0
+    threads: Annotated[int, WORKER_COUNT] = 0
     """Threads of the kernels; 0 for all cores."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
@@ -74,21 +74,21 @@ class EvalArguments:
     where: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
 
 
-def eval(arguments: list[str]) -> None:
-    asked = parse(EvalArguments, arguments, "vdgs eval")
-    from vdgs.distributed.sharded_job import Wish
-    from vdgs.pipeline.evaluate_stage import Measuring, evaluate_stage
+def eval_command(arguments: list[str]) -> None:
+    asked = parse_arguments(EvalArguments, arguments, "vdgs eval")
+    from vdgs.distributed.sharded_job import ExecutionOptions
+    from vdgs.pipeline.evaluate_stage import EvaluationRequest, evaluate_stage
     from vdgs.runs.run_context import RunContext
 
-    device, console = use_device(asked.device), open_console(asked.quiet)
-    measuring = Measuring(
+    device, console = select_device(asked.device), make_console(asked.quiet)
+    measuring = EvaluationRequest(
         path=asked.run, which=asked.model, lpips_weights=asked.lpips_weights, bins=asked.bins, views=asked.views,
         device=device,
     )  # fmt: skip
     configure_threads(asked.threads)
     context = RunContext.from_path(asked.run, asked.capture)
     asked.where.check()
-    evaluate_stage(context, measuring, console, Wish(asked.where, asked.jobs, device=device))
+    evaluate_stage(context, measuring, console, ExecutionOptions(asked.where, asked.jobs, device=device))
 
 
 @dataclass(frozen=True)
@@ -101,12 +101,12 @@ class ReportArguments:
     """Print nothing but notes, warnings and errors."""
 
 
-def report(arguments: list[str]) -> None:
-    asked = parse(ReportArguments, arguments, "vdgs report")
+def report_command(arguments: list[str]) -> None:
+    asked = parse_arguments(ReportArguments, arguments, "vdgs report")
     from vdgs.report import write_report
     from vdgs.runs.run_folder import RunFolder
 
-    open_console(asked.quiet).print(f"report: {write_report(RunFolder(asked.run))}", highlight=False)
+    make_console(asked.quiet).print(f"report: {write_report(RunFolder(asked.run))}", highlight=False)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,10 +119,10 @@ class RenderArguments(RenderRequest):
     """Print nothing but notes, warnings and errors."""
 
 
-def render(arguments: list[str]) -> None:
-    asked = parse(RenderArguments, arguments, "vdgs render")
+def render_command(arguments: list[str]) -> None:
+    asked = parse_arguments(RenderArguments, arguments, "vdgs render")
     from vdgs.rendering.render_run import render_run
 
-    device = use_device(asked.device)
+    device = select_device(asked.device)
     configure_threads(asked.threads)
-    render_run(replace(asked, device=device), open_console(asked.quiet))
+    render_run(replace(asked, device=device), make_console(asked.quiet))

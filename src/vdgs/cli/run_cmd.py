@@ -1,4 +1,4 @@
-"""Verbs that start a run from a capture: its first stage (`coarse`), all of them (`run`)."""
+"""Verbs that start a run from a capture: its first stage (`train_coarse_command`), all of them (`run_command`)."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ import tyro
 from tyro.conf import Positional, arg
 
 from vdgs.cli.common import (
-    as_typed,
-    open_console,
-    parse,
+    absolute_command_line,
+    make_console,
+    parse_arguments,
     preset_defaults,
-    use_device,
+    select_device,
 )
 from vdgs.config.capture_options import CaptureOptions
-from vdgs.config.checkpointing import WatchOptions
+from vdgs.config.checkpointing import CheckpointOptions
 from vdgs.config.commands import RunRequest
 from vdgs.config.executor_options import ExecutorOptions
 from vdgs.config.method import PartitionConfig, TrainConfig
 from vdgs.config.presets import PresetName
-from vdgs.config.ranges import WORKERS
+from vdgs.config.ranges import WORKER_COUNT
 from vdgs.kernels import configure_threads
 
 
 @dataclass(frozen=True, kw_only=True)
-class CoarseArguments:
+class TrainCoarseArguments:
     """Train the global anchor model of a capture. The same command continues a run that was stopped."""
 
     capture: Positional[Path]
@@ -38,7 +38,7 @@ class CoarseArguments:
     """`laptop`: a good result in minutes on a CPU. `paper`: the paper's 100 000 iterations, and our choices where it is
     silent: gaps filled, outliers left out, a background of the mean colour, of random colours in training, bounded
     sizes, only visible anchors moved. `literal`: none of those choices."""
-    threads: Annotated[int, WORKERS] = 0
+    threads: Annotated[int, WORKER_COUNT] = 0
     """Threads of the kernels; 0 for all cores. The result does not depend on it."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
@@ -46,22 +46,22 @@ class CoarseArguments:
     """Print nothing but notes, warnings and errors."""
     options: Annotated[CaptureOptions, arg(name="")] = field(default_factory=CaptureOptions)
     training: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
-    watching: Annotated[WatchOptions, arg(name="")] = field(default_factory=WatchOptions)
+    watching: Annotated[CheckpointOptions, arg(name="")] = field(default_factory=CheckpointOptions)
 
 
-def coarse(arguments: list[str]) -> None:
+def train_coarse_command(arguments: list[str]) -> None:
     preset, settings = preset_defaults(arguments)
-    default = CoarseArguments(capture=tyro.MISSING, output=tyro.MISSING, preset=preset, training=settings.training)
-    asked = parse(CoarseArguments, arguments, "vdgs coarse", default)
+    default = TrainCoarseArguments(capture=tyro.MISSING, output=tyro.MISSING, preset=preset, training=settings.training)
+    asked = parse_arguments(TrainCoarseArguments, arguments, "vdgs coarse", default)
     from vdgs.pipeline.train_coarse import train_coarse
-    from vdgs.runs.create_or_resume import begin_run
+    from vdgs.runs.create_or_resume import create_or_resume_run
 
-    device = use_device(asked.device)
+    device = select_device(asked.device)
     configure_threads(asked.threads)
     method = replace(settings, training=asked.training)
-    command = as_typed("coarse", arguments, (asked.capture, asked.output))
-    context = begin_run(asked.capture, asked.output, asked.options, method, command=command)
-    train_coarse(context, asked.watching, open_console(asked.quiet), device)
+    command = absolute_command_line("coarse", arguments, (asked.capture, asked.output))
+    context = create_or_resume_run(asked.capture, asked.output, asked.options, method, command=command)
+    train_coarse(context, asked.watching, make_console(asked.quiet), device)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,25 +82,25 @@ class RunArguments(RunRequest):
     options: Annotated[CaptureOptions, arg(name="")] = field(default_factory=CaptureOptions)
     training: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
     partition: Annotated[PartitionConfig, arg(name="")] = field(default_factory=PartitionConfig)
-    watching: Annotated[WatchOptions, arg(name="")] = field(default_factory=WatchOptions)
+    watching: Annotated[CheckpointOptions, arg(name="")] = field(default_factory=CheckpointOptions)
     where: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
 
 
-def run(arguments: list[str]) -> None:
+def run_command(arguments: list[str]) -> None:
     preset, settings = preset_defaults(arguments)
     default = RunArguments(
         capture=tyro.MISSING, output=tyro.MISSING, preset=preset, training=settings.training,
         partition=settings.partition, assignment=settings.assignment, block=settings.block, merge=settings.merge,
     )  # fmt: skip
-    asked = parse(RunArguments, arguments, "vdgs run", default)
-    device = use_device(asked.device)
+    asked = parse_arguments(RunArguments, arguments, "vdgs run", default)
+    device = select_device(asked.device)
     configure_threads(asked.threads)
     if asked.dry_run:
-        from vdgs.pipeline.dry_run import plan_run
+        from vdgs.pipeline.dry_run import estimate_run
 
-        plan_run(replace(asked, device=device), open_console())
+        estimate_run(replace(asked, device=device), make_console())
         return
-    from vdgs.pipeline.run_pipeline import run_all
+    from vdgs.pipeline.run_pipeline import run_pipeline
 
-    command = as_typed("run", arguments, (asked.capture, *asked.photographs, asked.output))
-    run_all(replace(asked, device=device), open_console(asked.quiet), command)
+    command = absolute_command_line("run", arguments, (asked.capture, *asked.photographs, asked.output))
+    run_pipeline(replace(asked, device=device), make_console(asked.quiet), command)

@@ -1,4 +1,4 @@
-"""The verb that makes a capture of photographs (`sfm`)."""
+"""The verb that makes a capture of photographs (`sfm_command`)."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from vdgs.cli.common import open_console, parse
-from vdgs.config.ranges import WORKERS, Named
+from vdgs.cli.common import make_console, parse_arguments
+from vdgs.config.ranges import WORKER_COUNT, FlagName
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 
 
@@ -28,19 +28,19 @@ class SfmArguments:
     need no folder and no extension where they are told apart without."""
     dry_run: bool = False
     """Only look: what the photographs say, what would be done and how long it takes. Writes nothing."""
-    threads: Annotated[int, WORKERS] = 0
+    threads: Annotated[int, WORKER_COUNT] = 0
     """Threads to use; 0 for all cores."""
     keep_work: bool = False
     """Keep COLMAP's database and models in OUTPUT/work once all is done."""
     quiet: bool = False
     """Print nothing but notes, warnings and errors."""
-    options: Annotated[SfmOptions, arg(name=""), Named("")] = field(default_factory=SfmOptions)
+    options: Annotated[SfmOptions, arg(name=""), FlagName("")] = field(default_factory=SfmOptions)
 
 
-def sfm(arguments: list[str]) -> None:
-    asked = parse(SfmArguments, arguments, "vdgs sfm")
+def sfm_command(arguments: list[str]) -> None:
+    asked = parse_arguments(SfmArguments, arguments, "vdgs sfm")
     from vdgs.errors import VdgsError
-    from vdgs.sfm.reconstruction_plan import prepare, tell
+    from vdgs.sfm.reconstruction_plan import plan_reconstruction, print_plan
 
     if not asked.photographs:
         raise VdgsError("name the folder of the photographs: vdgs sfm PHOTOGRAPHS --output CAPTURE")
@@ -48,9 +48,9 @@ def sfm(arguments: list[str]) -> None:
         photographs=asked.photographs, output=asked.output, gps=asked.gps, threads=asked.threads,
         keep_work=asked.keep_work, options=asked.options,
     )  # fmt: skip
-    console = open_console(asked.quiet)
+    console = make_console(asked.quiet)
     if asked.dry_run:
-        tell(prepare(request), console)
+        print_plan(plan_reconstruction(request), console)
         console.print("Nothing was written.", highlight=False)
         return
     from vdgs.sfm.reconstruct import reconstruct

@@ -1,4 +1,4 @@
-"""Verbs that take a run one stage further: `visibility`, `partition`, `train`, `merge`."""
+"""Verbs that take a run one stage further: `visibility_command`, `partition_command`, `train_blocks_command`, `merge_command`."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import tyro
 from tyro.conf import Positional, arg
 
 from vdgs.cli.common import (
-    change_settings,
-    open_console,
-    parse,
+    make_console,
+    parse_arguments,
     parse_for_run,
-    use_device,
+    select_device,
+    update_run_settings,
 )
-from vdgs.config.checkpointing import WatchOptions
+from vdgs.config.checkpointing import CheckpointOptions
 from vdgs.config.executor_options import ExecutorOptions
 from vdgs.config.method import AssignmentConfig, BlockConfig, MergeConfig, MethodConfig, PartitionConfig
-from vdgs.config.ranges import WORKERS, Range
+from vdgs.config.ranges import WORKER_COUNT, Range
 from vdgs.kernels import configure_threads
 
 
@@ -35,12 +35,12 @@ class VisibilityArguments:
     """Where the capture lies now, if it was moved; the run remembers it."""
 
 
-def visibility(arguments: list[str]) -> None:
-    asked = parse(VisibilityArguments, arguments, "vdgs visibility")
-    from vdgs.pipeline.count_visibility import measure_visibility
+def visibility_command(arguments: list[str]) -> None:
+    asked = parse_arguments(VisibilityArguments, arguments, "vdgs visibility")
+    from vdgs.pipeline.count_visibility import count_run_visibility
     from vdgs.runs.run_context import RunContext
 
-    measure_visibility(RunContext.from_path(asked.run, asked.capture), open_console(asked.quiet))
+    count_run_visibility(RunContext.from_path(asked.run, asked.capture), make_console(asked.quiet))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,10 +57,10 @@ class PartitionArguments:
     """Where the capture lies now, if it was moved; the run remembers it."""
     why: str | None = None
     """Name of a training photograph: also say how well it shows each block and why it was assigned or not."""
-    jobs: Annotated[int, WORKERS] = 0
+    jobs: Annotated[int, WORKER_COUNT] = 0
     """Shards of the cameras scored at once, each in a process of its own; 0: on this machine one process scores all, a
     cluster as many as it has room for."""
-    threads: Annotated[int, WORKERS] = 0
+    threads: Annotated[int, WORKER_COUNT] = 0
     """Threads of the kernels; 0 for all cores. The result does not depend on it."""
     device: str = "auto"
     """Where to draw what cameras see: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on
@@ -70,29 +70,29 @@ class PartitionArguments:
     where: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
 
 
-def partition(arguments: list[str]) -> None:
+def partition_command(arguments: list[str]) -> None:
     def defaults(method: MethodConfig) -> PartitionArguments:
         return PartitionArguments(run=tyro.MISSING, partition=method.partition, assignment=method.assignment)
 
     asked, run, method = parse_for_run(PartitionArguments, arguments, "vdgs partition", defaults)
-    from vdgs.distributed.sharded_job import Wish
+    from vdgs.distributed.sharded_job import ExecutionOptions
     from vdgs.pipeline.partition_stage import explain_view, partition_run
     from vdgs.runs.run_context import RunContext
 
-    device = use_device(asked.device)
+    device = select_device(asked.device)
     configure_threads(asked.threads)
     asked.where.check()
     context = RunContext.from_path(asked.run, asked.capture)
-    change_settings(
+    update_run_settings(
         run, replace(method, partition=asked.partition, assignment=asked.assignment), asked.redo, asked.quiet
     )
-    partition_run(context, open_console(asked.quiet), device, Wish(asked.where, asked.jobs, device=device))
+    partition_run(context, make_console(asked.quiet), device, ExecutionOptions(asked.where, asked.jobs, device=device))
     if asked.why is not None:
-        explain_view(run, asked.why, open_console(asked.quiet))
+        explain_view(run, asked.why, make_console(asked.quiet))
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainArguments:
+class TrainBlocksArguments:
     """Train the blocks of a run. The same command continues; blocks may also be trained on several machines."""
 
     run: Positional[Path]
@@ -103,38 +103,38 @@ class TrainArguments:
     """Only this block, in this process; without it all of them, several at once."""
     capture: Path | None = None
     """Where the capture lies now, if it was moved; the run remembers it."""
-    jobs: Annotated[int, WORKERS] = 0
+    jobs: Annotated[int, WORKER_COUNT] = 0
     """Blocks trained at once; 0 takes what cores and memory allow."""
     redo: bool = False
     """Allow other settings to discard blocks that are trained with the old ones."""
-    threads: Annotated[int, WORKERS] = 0
+    threads: Annotated[int, WORKER_COUNT] = 0
     """Threads of the kernels for --block; 0 for all cores. The result does not depend on it."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
     settings: Annotated[BlockConfig, arg(name="block")] = field(default_factory=BlockConfig)
-    watching: Annotated[WatchOptions, arg(name="")] = field(default_factory=WatchOptions)
+    watching: Annotated[CheckpointOptions, arg(name="")] = field(default_factory=CheckpointOptions)
     where: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
 
 
-def train(arguments: list[str]) -> None:
-    def defaults(method: MethodConfig) -> TrainArguments:
-        return TrainArguments(run=tyro.MISSING, settings=method.block)
+def train_blocks_command(arguments: list[str]) -> None:
+    def defaults(method: MethodConfig) -> TrainBlocksArguments:
+        return TrainBlocksArguments(run=tyro.MISSING, settings=method.block)
 
-    asked, run, method = parse_for_run(TrainArguments, arguments, "vdgs train", defaults)
-    device = use_device(asked.device)
+    asked, run, method = parse_for_run(TrainBlocksArguments, arguments, "vdgs train", defaults)
+    device = select_device(asked.device)
     from vdgs.runs.run_context import RunContext
 
     context = RunContext.from_path(asked.run, asked.capture)
-    change_settings(run, replace(method, block=asked.settings), asked.redo, asked.quiet)
+    update_run_settings(run, replace(method, block=asked.settings), asked.redo, asked.quiet)
     if asked.block is not None:
         from vdgs.pipeline.train_block import train_block
 
         configure_threads(asked.threads)
-        train_block(context, asked.block, asked.watching, open_console(asked.quiet), device)
+        train_block(context, asked.block, asked.watching, make_console(asked.quiet), device)
     else:
         from vdgs.pipeline.train_blocks import train_blocks
 
-        train_blocks(context, asked.watching, asked.jobs, open_console(asked.quiet), device, asked.where)
+        train_blocks(context, asked.watching, asked.jobs, make_console(asked.quiet), device, asked.where)
 
 
 @dataclass(frozen=True)
@@ -152,14 +152,14 @@ class MergeArguments:
     merge: Annotated[MergeConfig, arg(name="")] = field(default_factory=MergeConfig)
 
 
-def merge(arguments: list[str]) -> None:
+def merge_command(arguments: list[str]) -> None:
     def defaults(method: MethodConfig) -> MergeArguments:
         return MergeArguments(tyro.MISSING, merge=method.merge)
 
     asked, run, method = parse_for_run(MergeArguments, arguments, "vdgs merge", defaults)
-    from vdgs.pipeline.merge_blocks import merge_run
+    from vdgs.pipeline.merge_blocks import merge_run_blocks
     from vdgs.runs.run_context import RunContext
 
     context = RunContext.from_path(asked.run, asked.capture)
-    change_settings(run, replace(method, merge=asked.merge), redo=False, quiet=asked.quiet)
-    merge_run(context, asked.incomplete, open_console(asked.quiet))
+    update_run_settings(run, replace(method, merge=asked.merge), overwrite=False, quiet=asked.quiet)
+    merge_run_blocks(context, asked.incomplete, make_console(asked.quiet))

@@ -1,4 +1,4 @@
-"""The verb that shows a run in a browser: `view`."""
+"""The verb that shows a run in a browser: `view_command`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from vdgs.cli.common import open_console, parse, use_device
+from vdgs.cli.common import make_console, parse_arguments, select_device
 from vdgs.config.commands import ViewRequest
 from vdgs.kernels import configure_threads
 
@@ -24,10 +24,10 @@ class ViewArguments(ViewRequest):
     """Run folder."""
 
 
-def view(arguments: list[str]) -> None:
-    asked = parse(ViewArguments, arguments, "vdgs view")
+def view_command(arguments: list[str]) -> None:
+    asked = parse_arguments(ViewArguments, arguments, "vdgs view")
     from vdgs.viewer.server import view_run
 
-    device = use_device(asked.device)
+    device = select_device(asked.device)
     configure_threads(asked.threads)
-    view_run(replace(asked, device=device), open_console())
+    view_run(replace(asked, device=device), make_console())

@@ -6,25 +6,25 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from vdgs.config.ranges import MANY, Range
+from vdgs.config.ranges import MAX_COUNT, Range
 
 UpAxis = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
 SplitMode = Literal["auto", "explicit", "every"]
-Format = Literal["auto", "colmap", "transforms", "mega-nerf", "matrixcity"]
+CaptureFormat = Literal["auto", "colmap", "transforms", "mega-nerf", "matrixcity"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureOptions:
     """How to read a folder of photographs with cameras."""
 
-    format: Format = "auto"
+    format: CaptureFormat = "auto"
     """What to read where a folder holds captures of several formats. auto: of a COLMAP model and transforms.json the
     model, unless transforms.json lists training and test photographs or names masks."""
     images: str | None = None
     """Image folder to use, such as images_4. Default: images, or where absent the largest images_N."""
     downscale: Annotated[float, Range(1, 1000)] = 1.0
     """Extra shrink applied when images are loaded (2 = half the width and height)."""
-    test_every: Annotated[int, Range(2, MANY)] = 8
+    test_every: Annotated[int, Range(2, MAX_COUNT)] = 8
     """Every n-th photograph in name order is kept for testing (0, n, 2n, ...), as in 3DGS (llffhold)."""
     test_list: Path | None = None
     """Text file with the names of the test photographs, one a line. Default: test.txt in the capture folder, if any."""
@@ -43,7 +43,7 @@ class CaptureOptions:
     folder and no extension where they are told apart without."""
     georef: Path | None = None
     """georef.json saying that the world already is ENU metres. Default: the one in the capture folder."""
-    max_images: Annotated[int | None, Range(2, MANY)] = None
+    max_images: Annotated[int | None, Range(2, MAX_COUNT)] = None
     """Use only this many photographs: those nearest to the middle of the flight."""
     undistort: bool = False
     """Undistort photographs whose camera model has lens distortion (written once, then reused)."""

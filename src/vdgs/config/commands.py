@@ -7,26 +7,26 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from vdgs.config.capture_options import CaptureOptions
-from vdgs.config.checkpointing import WatchOptions
+from vdgs.config.checkpointing import CheckpointOptions
 from vdgs.config.executor_options import ExecutorOptions
 from vdgs.config.method import AssignmentConfig, BlockConfig, MergeConfig, MethodConfig, PartitionConfig, TrainConfig
 from vdgs.config.presets import PresetName
-from vdgs.config.ranges import LARGE, MANY, WORKERS, Named, Range
+from vdgs.config.ranges import MAX_COUNT, MAX_FLOAT, WORKER_COUNT, FlagName, Range
 from vdgs.config.sfm_options import SfmOptions
 
 #: Groups by visibility: with more than some dozens none holds enough pixels to say anything.
-BINS = Range(1, 100)
+BIN_COUNT_RANGE = Range(1, 100)
 #: Length and pace of a film; 0 leaves them to the path. Encoders take no more frames a second.
-SECONDS, FPS = Range(0, 86_400), Range(0, 1000)
+SECONDS_RANGE, FPS_RANGE = Range(0, 86_400), Range(0, 1000)
 #: The longest side of a picture that is drawn, in pixels: more than any film and any screen holds.
-LARGEST_SIDE_PX = 16_384
+MAX_RENDER_SIDE_PX = 16_384
 #: What drawing takes at most of memory for each pixel: the raster, its depth, pictures made of it.
-BYTES_PER_PIXEL = 100
+RENDER_BYTES_PER_PIXEL = 100
 #: Frames of one film: nearly two hours at 30 a second.
-MOST_FRAMES = 200_000
+MAX_FRAMES = 200_000
 
 #: Coordinates of maps: no system on Earth has larger ones (Earth-centred metres have seven digits).
-PLACE = Range(-1e9, 1e9)
+MAP_COORDINATE_RANGE = Range(-1e9, 1e9)
 
 #: `best` is the merged model where there is one for the run's settings, else the coarse one.
 ModelName = Literal["best", "coarse", "merged"]
@@ -48,29 +48,29 @@ class RunRequest:
     visible anchors moved. `literal`: the paper's numbers and none of those choices."""
     redo: bool = False
     """Allow other settings than the run has to discard what was trained with the old ones."""
-    jobs: Annotated[int, WORKERS] = 0
+    jobs: Annotated[int, WORKER_COUNT] = 0
     """Blocks trained at once, on a cluster also shards of other stages; 0 takes what there is room for."""
     incomplete: bool = False
     """Go on if a block fails: the coarse model stands in for it."""
-    maps: bool = True
+    ortho: bool = True
     """End with orthophoto, surface model and visibility as GeoTIFFs in RUN/maps, where `vdgs map` can make them."""
     lpips_weights: Path | None = None
     """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
-    bins: Annotated[int, BINS] = 4
+    bins: Annotated[int, BIN_COUNT_RANGE] = 4
     """Number of visibility quantiles by which metrics are reported."""
-    threads: Annotated[int, WORKERS] = 0
+    threads: Annotated[int, WORKER_COUNT] = 0
     """Threads of the kernels; 0 for all cores. The result does not depend on it."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
-    options: Annotated[CaptureOptions, Named("")] = field(default_factory=CaptureOptions)
+    options: Annotated[CaptureOptions, FlagName("")] = field(default_factory=CaptureOptions)
     sfm: SfmOptions = field(default_factory=SfmOptions)
-    training: Annotated[TrainConfig, Named("")] = field(default_factory=TrainConfig)
-    partition: Annotated[PartitionConfig, Named("")] = field(default_factory=PartitionConfig)
+    training: Annotated[TrainConfig, FlagName("")] = field(default_factory=TrainConfig)
+    partition: Annotated[PartitionConfig, FlagName("")] = field(default_factory=PartitionConfig)
     assignment: AssignmentConfig = field(default_factory=AssignmentConfig)
     block: BlockConfig = field(default_factory=BlockConfig)
     merge: MergeConfig = field(default_factory=MergeConfig)
-    watching: Annotated[WatchOptions, Named("")] = field(default_factory=WatchOptions)
-    where: Annotated[ExecutorOptions, Named("")] = field(default_factory=ExecutorOptions)
+    watching: Annotated[CheckpointOptions, FlagName("")] = field(default_factory=CheckpointOptions)
+    where: Annotated[ExecutorOptions, FlagName("")] = field(default_factory=ExecutorOptions)
     photographs: tuple[Path, ...] = ()
     """More folders of photographs, where the first is one of photographs alone."""
 
@@ -97,42 +97,42 @@ class RenderRequest:
     as you like, "frame": "source" (that of the capture's own cameras), "seconds", "fps", "closed", "interpolate". A key
     frame may also have "up", "width", "height", "fx", "fy", "cx", "cy", or in place of position and look_at a matrix
     "camera_from_world" (docs/conventions.md)."""
-    seconds: Annotated[float, SECONDS] = 0.0
+    seconds: Annotated[float, SECONDS_RANGE] = 0.0
     """Length of a camera path; 0: what its file says, or 12 seconds."""
-    fps: Annotated[float, FPS] = 0.0
+    fps: Annotated[float, FPS_RANGE] = 0.0
     """Frames per second of a camera path and of the video; 0: what its file says, or 30 (2 for separate views)."""
-    width: Annotated[int, Range(0, LARGEST_SIDE_PX)] = 0
+    width: Annotated[int, Range(0, MAX_RENDER_SIDE_PX)] = 0
     """Image width; 0 takes that of the training views."""
     capture: Path | None = None
     """Where the capture lies now; needed only where the run has lost its cameras.json."""
     kind: Literal["image", "depth", "visibility", "alpha"] = "image"
     """What to draw: the picture; the median depth, at which a pixel becomes half opaque (grey where it never does); the
     number of training cameras that see each place, V; or alpha, how opaque the scene is."""
-    legend: bool = True
+    colorbar: bool = True
     """Put a strip with the scale of the colours below each map; without it a map is as large as the image."""
     raw: bool = False
     """Also write the numbers of a map, NAME.npy beside NAME.png: float32 [height, width]. Depth is z along the view in
     units of the ground frame (metres where known); depth and V are NaN where nothing is drawn."""
     model: ModelName = "best"
     """Which model; `best` is the merged one where there is one."""
-    threads: Annotated[int, WORKERS] = 0
+    threads: Annotated[int, WORKER_COUNT] = 0
     """Threads of the kernels; 0 for all cores."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class MapRequest:
+class OrthoRequest:
     """Maps of a run as GeoTIFFs and pictures (`vdgs map`)."""
 
     run: Path
     """Run folder."""
     output: Path | None = None
     """Folder for the maps, not among photographs nor with such files of others; by default RUN/maps."""
-    gsd: Annotated[float | None, Range(0, LARGE, above=True)] = None
+    gsd: Annotated[float | None, Range(0, MAX_FLOAT, above=True)] = None
     """Side of a pixel in units of the map (metres, mostly); by default the median that a pixel of the training
     photographs shows of the ground, at the size at which they were used."""
-    bbox: Annotated[tuple[float, float, float, float] | None, PLACE] = None
+    bbox: Annotated[tuple[float, float, float, float] | None, MAP_COORDINATE_RANGE] = None
     """X0 Y0 X1 Y1 in coordinates of the map; by default what the training photographs show."""
     crs: str | None = None
     """Coordinates of the map: EPSG:n (EPSG:25832), `enu` (metres east and north of the scene's origin), `source` (those
@@ -141,7 +141,7 @@ class MapRequest:
     """Take the fine detail of the orthophoto from the photographs, where they truly see a place."""
     model: ModelName = "best"
     """Which model; `best` is the merged one where there is one."""
-    threads: Annotated[int, WORKERS] = 0
+    threads: Annotated[int, WORKER_COUNT] = 0
     """Threads of the kernels; 0 for all cores."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
@@ -161,19 +161,19 @@ class ExportRequest:
     """Which model; `best` is the merged one where there is one."""
     block: Annotated[int | None, Range(0, 10_000)] = None
     """Only what this block of the merged scene owns."""
-    bbox: Annotated[tuple[float, float, float, float] | None, PLACE] = None
+    bbox: Annotated[tuple[float, float, float, float] | None, MAP_COORDINATE_RANGE] = None
     """Only Gaussians whose centres lie within X0 Y0 X1 Y1, in coordinates of --crs."""
-    max_gaussians: Annotated[int, Range(0, MANY)] = 0
+    max_gaussians: Annotated[int, Range(0, MAX_COUNT)] = 0
     """Only so many Gaussians, those that make most of the training photographs; 0 for all."""
     sh_degree: Literal[0, 1, 2, 3] = 3
     """How colours change with the direction: spherical harmonics up to this degree. 0: not at all, and a fifth of the
     size."""
-    html_mb: Annotated[float, Range(1, 2000)] = 30.0
+    html_max_mb: Annotated[float, Range(1, 2000)] = 30.0
     """A .html file has at most so many MB: the scene is thinned until it fits."""
     rounds: Annotated[int | None, Range(0, 100)] = None
     """How often colours are fitted again to what the file's pictures lack of the model's. By default 8 times, or once
     where the anchors spawn more than four million Gaussians: more come nearer and take longer (docs/export.md)."""
-    refine: Annotated[float, SECONDS] = 0.0
+    optimize_seconds: Annotated[float, SECONDS_RANGE] = 0.0
     """Seconds for which all that is baked is moved towards the model's own pictures, after what is fitted in closed
     form; 0: not at all. Needs 0.7 kB of memory for each Gaussian of degree 3."""
     crs: str | None = None
@@ -182,7 +182,7 @@ class ExportRequest:
     for .laz and .las; else `local`. 3D Tiles of a georeferenced capture always stand on the globe (`enu`)."""
     measure: bool = True
     """Read a file back, draw the test views and say what was lost against the model itself."""
-    threads: Annotated[int, WORKERS] = 0
+    threads: Annotated[int, WORKER_COUNT] = 0
     """Threads of the kernels; 0 for all cores. The result does not depend on it, but for --refine."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
@@ -202,7 +202,7 @@ class ViewRequest:
     token of the printed address."""
     port: Annotated[int | None, Range(1, 65535)] = None
     """Port; by default the first free one from 8080."""
-    threads: Annotated[int, WORKERS] = 0
+    threads: Annotated[int, WORKER_COUNT] = 0
     """Threads of the kernels; 0 for all cores."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from vdgs.config.ranges import LARGE, WORKERS, Range, refuse
+from vdgs.config.ranges import MAX_FLOAT, WORKER_COUNT, Range, check_ranges
 
 #: What can run them.
 ExecutorName = Literal["local", "ray", "slurm"]
@@ -29,7 +29,7 @@ class SlurmOptions:
     """How long before the time limit a block is asked to save."""
     poll_seconds: Annotated[float, Range(0, 3600, above=True)] = 5.0
     """How often SLURM is asked what became of the jobs."""
-    setup: str = ""
+    setup_command: str = ""
     """A shell command run first in every job, such as `module load cuda`."""
     options: tuple[str, ...] = ()
     """More options for sbatch, each a word (`--slurm.options --qos=long --constraint=avx512`)."""
@@ -45,9 +45,9 @@ class ExecutorOptions:
     address: str | None = None
     """Ray: where the cluster is (`auto`, or `head:6379`); without it what RAY_ADDRESS says, else a Ray of this machine
     alone that ends with the command."""
-    processors: Annotated[int, WORKERS] = 0
+    processors: Annotated[int, WORKER_COUNT] = 0
     """Ray and SLURM: processors of a block or shard; 0 shares out those of the cluster (SLURM: 4)."""
-    memory_gb: Annotated[float, Range(0, LARGE)] = 0.0
+    mem_gb: Annotated[float, Range(0, MAX_FLOAT)] = 0.0
     """Ray and SLURM: memory of a block or shard; 0 takes what it needs by estimate. After an out-of-memory kill half as
     much more is asked for."""
     gpus: Annotated[float, Range(0, 64)] = 0.0
@@ -58,7 +58,7 @@ class ExecutorOptions:
         """Raise VdgsError for values that do not work, alone or together."""
         from vdgs.errors import VdgsError
 
-        refuse(self)
+        check_ranges(self)
         if self.executor == "slurm" and self.gpus != int(self.gpus):
             raise VdgsError(
                 f"--gpus {self.gpus:g}: SLURM gives whole GPUs. Where it is set up for shares: --gpus 0 and "

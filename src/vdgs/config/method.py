@@ -10,14 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
-from vdgs.config.ranges import LARGE, MANY, SHARE, Named, Range
+from vdgs.config.ranges import FRACTION, MAX_COUNT, MAX_FLOAT, FlagName, Range
 
 PartitionStrategy = Literal["visibility", "vastgaussian", "citygaussian", "dogs"]
 #: From which share of the iterations on images are shrunk by which factor.
-Resolutions = tuple[tuple[Annotated[float, SHARE], Annotated[int, Range(1, 1024)]], ...]
+ResolutionSchedule = tuple[tuple[Annotated[float, FRACTION], Annotated[int, Range(1, 1024)]], ...]
 
-RATE = Range(0, 100, above=True)
-FACTOR = Range(0, 1000, above=True)
+LEARNING_RATE_RANGE = Range(0, 100, above=True)
+FACTOR_RANGE = Range(0, 1000, above=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,76 +26,76 @@ class AnchorConfig:
 
     offsets: Annotated[int, Range(1, 32)] = 10
     """Gaussians per anchor (k)."""
-    voxel: Annotated[float, Range(0, LARGE)] = 0.0
+    voxel_size: Annotated[float, Range(0, MAX_FLOAT)] = 0.0
     """Edge of the initial voxel grid in units of the ground frame; 0 takes the median nearest-neighbour distance of the
     sparse points."""
-    outlier_distance: Annotated[float, Range(2, LARGE, or_zero=True)] = 30.0
+    outlier_distance: Annotated[float, Range(2, MAX_FLOAT, allow_zero=True)] = 30.0
     """Sparse points start no anchor where their fourth neighbour is this many times farther than the median one's; 0
     keeps all (choice: a few points deep below the ground become a backdrop that every camera sees through it)."""
     fill_gaps: bool = True
     """Also start anchors on ground that cameras see but that holds no sparse points: woods, water, fields (choice)."""
-    stereo: bool = False
+    mvs: bool = False
     """Also start anchors where pairs of photographs agree how far the ground is (semi-global matching, before
     training): where few photographs look, sparse points are few, and what starts at a wrong height stays there
     (choice)."""
-    bound_sizes: bool = True
+    bound_scales: bool = True
     """No Gaussian may be longer than a quarter of the pictures that train it: none can hang as a veil before a whole
     view. The unit of an anchor's offsets is bounded with them: its Gaussians stay about it (choice)."""
     distance: bool = False
     """Feed the distance between camera and anchor to the decoder too."""
     appearance: Annotated[int, Range(0, 1024)] = 0
     """Size of the appearance embedding of each training image (colour only); 0 for none."""
-    colour_start: bool = False
+    from_colors: bool = False
     """Start the features from the colours of the sparse points instead of zeros."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class RateConfig:
+class LearningRateConfig:
     """Learning rates of Adam; pairs decay exponentially from the first to the second value."""
 
-    offsets: Annotated[tuple[float, float], RATE] = (0.01, 1e-4)
+    offsets: Annotated[tuple[float, float], LEARNING_RATE_RANGE] = (0.01, 1e-4)
     """Offsets, in units of the anchor's own scale (choice: not multiplied by the size of the scene)."""
-    features: Annotated[tuple[float, float], RATE] = (0.0075, 0.0075)
+    features: Annotated[tuple[float, float], LEARNING_RATE_RANGE] = (0.0075, 0.0075)
     """Anchor features."""
-    log_scales: Annotated[tuple[float, float], RATE] = (0.007, 0.007)
+    log_scales: Annotated[tuple[float, float], LEARNING_RATE_RANGE] = (0.007, 0.007)
     """Logarithms of the anchor scales."""
-    opacity: Annotated[tuple[float, float], RATE] = (0.002, 2e-5)
+    opacity: Annotated[tuple[float, float], LEARNING_RATE_RANGE] = (0.002, 2e-5)
     """Opacity decoder."""
-    covariance: Annotated[tuple[float, float], RATE] = (0.004, 0.004)
+    covariance: Annotated[tuple[float, float], LEARNING_RATE_RANGE] = (0.004, 0.004)
     """Covariance decoder."""
-    colour: Annotated[tuple[float, float], RATE] = (0.008, 5e-5)
+    colour: Annotated[tuple[float, float], LEARNING_RATE_RANGE] = (0.008, 5e-5)
     """Colour decoder."""
-    appearance: Annotated[tuple[float, float], RATE] = (0.05, 5e-4)
+    appearance: Annotated[tuple[float, float], LEARNING_RATE_RANGE] = (0.05, 5e-4)
     """Appearance embedding."""
-    exposure: Annotated[tuple[float, float], RATE] = (0.001, 1e-4)
+    exposure: Annotated[tuple[float, float], LEARNING_RATE_RANGE] = (0.001, 1e-4)
     """Exposure of the photographs, where one is fitted."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class GrowthConfig:
+class DensifyConfig:
     """Where anchors are added and removed (Scaffold-GS, section 4.2 there)."""
 
-    interval: Annotated[int, Range(1, MANY)] = 100
+    interval: Annotated[int, Range(1, MAX_COUNT)] = 100
     """Iterations between two growth decisions."""
-    statistics_from: Annotated[int, Range(0, MANY)] = 500
+    stats_start: Annotated[int, Range(0, MAX_COUNT)] = 500
     """Iteration from which gradients and opacities are counted."""
-    start: Annotated[int, Range(0, MANY)] = 1500
+    start: Annotated[int, Range(0, MAX_COUNT)] = 1500
     """Iteration from which anchors grow and are pruned."""
-    until: Annotated[float, SHARE] = 0.5
+    until: Annotated[float, FRACTION] = 0.5
     """Share of the iterations after which growth and pruning end."""
-    threshold: Annotated[float, Range(0, MANY)] = 2e-4
+    threshold: Annotated[float, Range(0, MAX_COUNT)] = 2e-4
     """Mean norm of dL/d(mean) in NDC units above which an offset asks for a new anchor."""
     levels: Annotated[int, Range(0, 16)] = 3
     """Number of cell sizes tried; level i has threshold 2^i times and cells 4^i times finer."""
-    coarsest_cell: Annotated[float, Range(0, LARGE, above=True)] = 16.0
+    coarsest_voxels: Annotated[float, Range(0, MAX_FLOAT, above=True)] = 16.0
     """Edge of the coarsest cell, in voxels."""
-    gate: Annotated[float, Range(0, MANY)] = 0.4
+    gate: Annotated[float, Range(0, MAX_COUNT)] = 0.4
     """An offset is judged once it was rendered more often than this share of the interval."""
-    prune_opacity: Annotated[float, Range(0, LARGE)] = 0.005
+    prune_opacity: Annotated[float, Range(0, MAX_FLOAT)] = 0.005
     """An anchor goes when the opacity of its Gaussians, summed over them, averaged over the views, is below this."""
-    prune_views: Annotated[float, Range(0, MANY)] = 0.8
+    prune_view_fraction: Annotated[float, Range(0, MAX_COUNT)] = 0.8
     """... and it was seen more often than this share of the interval."""
-    max_anchors: Annotated[int, Range(0, MANY)] = 0
+    max_anchors: Annotated[int, Range(0, MAX_COUNT)] = 0
     """No growth beyond this many anchors; 0 for no limit. Nothing is removed to keep to it."""
 
 
@@ -105,17 +105,17 @@ class CompensationConfig:
 
     enabled: bool = True
     """Off: plain growth (the paper's "w/o Anchor Generation")."""
-    t_low: Annotated[float, SHARE] = 0.20
+    t_low: Annotated[float, FRACTION] = 0.20
     """T_low: an anchor is of low visibility (the set L) when fewer than this share of the cameras of a growth cycle
     hold it in their frustum."""
-    t_low_quantile: Annotated[float, Range(0, 1, below=True)] = 0.0
+    t_low_quantile: Annotated[float, Range(0, 1, exclusive_max=True)] = 0.0
     """Above 0: T_low is instead this quantile of the shares of the anchors that a camera of the cycle sees (choice: on
     a large scene nearly every anchor is below a fixed share). Anchors that tie there are in L all or none, whichever
     comes nearer to the quantile."""
-    beta_g: Annotated[float, Range(0, LARGE)] = 2.0
+    beta_g: Annotated[float, Range(0, MAX_FLOAT)] = 2.0
     """beta_g: weight of a cycle's mean gradient in the cache g. With the paper's 2, g is a sum that grows to twenty
     times the gradients it is made of; with 1 - gamma (the preset `laptop`) it is a mean over cycles."""
-    gamma: Annotated[float, SHARE] = 0.9
+    gamma: Annotated[float, FRACTION] = 0.9
     """gamma: decay of the cache g from cycle to cycle."""
     added_to: Literal["mean", "sum"] = "mean"
     """What g is added to when anchors grow; the paper says "the raw gradient statistics". `mean`: to the mean gradient,
@@ -130,14 +130,14 @@ class CompensationConfig:
 class LossConfig:
     """What training minimises."""
 
-    ssim_weight: Annotated[float, SHARE] = 0.2
+    ssim_weight: Annotated[float, FRACTION] = 0.2
     """Loss = (1 - w) L1 + w (1 - SSIM) + volume."""
-    volume_weight: Annotated[float, Range(0, LARGE)] = 0.01
+    volume_reg: Annotated[float, Range(0, MAX_FLOAT)] = 0.01
     """Weight of the mean product of the three scales of the Gaussians that are drawn."""
     background: Literal["mean", "black"] = "mean"
     """Colour behind the scene: the mean of the training photographs (choice: what no photograph shows is then drawn
     in a colour of the place), or black."""
-    background_noise: Annotated[float, SHARE] = 1.0
+    random_background: Annotated[float, FRACTION] = 1.0
     """So much of the background's colour is drawn anew for every step of training, from the whole RGB cube: ground that
     were left transparent could not borrow a colour from it (choice; the paper is silent on its background)."""
 
@@ -146,19 +146,19 @@ class LossConfig:
 class TrainConfig:
     """Training of the coarse stage."""
 
-    iterations: Annotated[int, Range(0, MANY)] = 100_000
+    iterations: Annotated[int, Range(0, MAX_COUNT)] = 100_000
     """Number of steps, one photograph each; 0 takes sixty for each training photograph, but at least 3000 and at
     most 30 000 (choice: with few photographs a model soon overfits, many need their time)."""
     sampling: Literal["even", "shares", "roots"] = "even"
     """How often each photograph is used. `even`: all alike (the paper). `shares`: every anchor has one vote, divided
     among the cameras that see it, and a photograph is used in proportion to its votes: most where few others look.
     `roots`: in proportion to the square root of its votes, which keeps more photographs in use (choice)."""
-    resolutions: Resolutions = ((0.0, 1),)
+    resolutions: ResolutionSchedule = ((0.0, 1),)
     """Resolution schedule: from this share of the iterations on, images are shrunk by this factor."""
-    average: Annotated[float, Range(0, 1, below=True)] = 0.0
+    average: Annotated[float, Range(0, 1, exclusive_max=True)] = 0.0
     """The stage ends with the mean of the models of this last share of its iterations, after growth and at full size; 0
     for the very last model (choice)."""
-    adam: Literal["visible", "dense"] = "visible"
+    optimizer: Literal["visible", "dense"] = "visible"
     """Which anchors a step moves, here and in blocks. `visible`: those that its photograph shows; the others keep
     parameters and moments (choice). `dense`: all of them, as in Scaffold-GS and 3DGS: what is not shown goes on along
     its moments, and the bias correction counts the steps of the stage."""
@@ -166,13 +166,13 @@ class TrainConfig:
     """Everything random follows from it: on the CPU the same seed gives the same bits."""
     anchors: AnchorConfig = field(default_factory=AnchorConfig)
     """The anchor model."""
-    rates: RateConfig = field(default_factory=RateConfig)
+    rates: LearningRateConfig = field(default_factory=LearningRateConfig)
     """Learning rates."""
     early: Annotated[float, Range(1, 1000)] = 1.0
     """Up to how many times faster an anchor moves while it has had few updates: after u of them, by the least of this
     and 1 / sqrt(1 - 0.999^u), which is 3 after 118 updates and 1.3 after 900 (choice: in short trainings an anchor is
     seen a few hundred times; 1 is Adam as it is)."""
-    growth: GrowthConfig = field(default_factory=GrowthConfig)
+    growth: DensifyConfig = field(default_factory=DensifyConfig)
     """Growth and pruning of anchors."""
     loss: LossConfig = field(default_factory=LossConfig)
     """The loss."""
@@ -181,7 +181,7 @@ class TrainConfig:
     is drawn in neutral colours, and compared with a test photograph in the exposure that the training photographs
     taken before and after it and what its camera meters foretell (no pixel of it is used). Blocks take it over as the
     coarse stage leaves it (choice)."""
-    exposure_spread: Annotated[float, Range(0, 1)] = 0.0
+    exposure_min_spread: Annotated[float, Range(0, 1)] = 0.0
     """Fit exposures only where photographs of the same places differ in brightness by at least this share of it, by the
     colours of the sparse points that several show: where photographs have one exposure, fitting some gains nothing and
     may cost (choice). At 0, and in a capture that does not say which photograph shows which point, they are always
@@ -208,7 +208,7 @@ class PartitionConfig:
     """A block is widened by this share of the radius of a disc of its area. While ring and context are frozen (the
     default) that decides what is drawn when cameras are assigned and nothing else: no anchor beyond the core is
     trained, however wide the ring is."""
-    block_memory_gb: Annotated[float, Range(0, LARGE, above=True)] = 4.0
+    block_memory_gb: Annotated[float, Range(0, MAX_FLOAT, above=True)] = 4.0
     """Memory that an average block may take in training, by estimate and beside the photographs that are kept; only
     `--blocks auto` looks at it. Larger blocks take more, and so do all where more blocks would have too few photographs
     (fifty) each."""
@@ -225,16 +225,16 @@ class AssignmentConfig:
     tau: Annotated[float, Range(0, 1, above=True)] = 0.05
     """tau: pixels differ when the mean absolute difference of their channels is above this (choice; not in the
     paper)."""
-    threshold: Annotated[float, SHARE] = 0.45
+    threshold: Annotated[float, FRACTION] = 0.45
     """Share of pixels (or, for `frustum`, of anchors) above which a camera is assigned."""
-    threshold_leave_one_out: Annotated[float, SHARE] = 0.05
+    threshold_leave_one_out: Annotated[float, FRACTION] = 0.05
     """The same for `leave_one_out` (peers: 0.05 to 0.12)."""
     best_block: bool = True
     """Every camera also joins its best block (choice: else one that is above the threshold nowhere trains nothing)."""
-    min_cameras: Annotated[int, Range(0, MANY)] = 100
+    min_cameras: Annotated[int, Range(0, MAX_COUNT)] = 100
     """Each block is topped up with the cameras that show it best to at least this many, as far as any show it (choice);
     0 leaves it as it is."""
-    longest_side_px: Annotated[int, Range(16, 16_384)] = 320
+    image_size: Annotated[int, Range(16, 16_384)] = 320
     """Size at which the renders are compared."""
 
 
@@ -242,32 +242,32 @@ class AssignmentConfig:
 class BlockConfig:
     """Training of each block from the coarse anchors of its place. Loss and seed are those of the coarse stage."""
 
-    iterations: Annotated[int, Range(0, MANY)] = 50_000
+    iterations: Annotated[int, Range(0, MAX_COUNT)] = 50_000
     """Steps for each block; 0 takes fifteen for each of its photographs, at least 500 and at most 15 000 (choice)."""
     scale_iterations: Annotated[float, Range(0, 1000, above=True)] = 1.0
     """Factor on the steps and on the start of statistics and growth, for scenes smaller than the paper's."""
     sampling: Literal["even", "shares", "roots"] = "even"
     """As in the coarse stage, by the votes of the anchors that the block moves: photographs that show little of the
     block are used little."""
-    resolutions: Resolutions = ((0.0, 1),)
+    resolutions: ResolutionSchedule = ((0.0, 1),)
     """Resolution schedule, as in the coarse stage."""
-    average: Annotated[float, Range(0, 1, below=True)] = 0.0
+    average: Annotated[float, Range(0, 1, exclusive_max=True)] = 0.0
     """As in the coarse stage."""
     crop: Literal["off", "steps", "pixels"] = "off"
     """Draw only the part of each photograph in which the block has a share, and all of it in every fourth step.
     `steps`: each step costs less; `pixels`: as many pixels are drawn as without, in up to four times more steps, so
     that each place of the scene is drawn more often: `iterations` then counts photographs, whatever their size
     (choice)."""
-    offset_rate: Annotated[float, FACTOR] = 1.0
+    offset_rate: Annotated[float, FACTOR_RANGE] = 1.0
     """The rates of the coarse stage start again, those of offsets times this (the paper prints no rates for blocks;
     CityGaussian fine-tunes with 0.4)."""
-    scale_rate: Annotated[float, FACTOR] = 1.0
+    scale_rate: Annotated[float, FACTOR_RANGE] = 1.0
     """... and those of log-scales times this (CityGaussian: 0.8)."""
-    feature_rate: Annotated[float, FACTOR] = 1.0
+    feature_rate: Annotated[float, FACTOR_RANGE] = 1.0
     """... and those of features times this."""
     early: Annotated[float, Range(1, 1000)] = 1.0
     """As `early` of the coarse stage, for the block's own updates: its anchors begin trained."""
-    background_noise: Annotated[float, SHARE] = 1.0
+    random_background: Annotated[float, FRACTION] = 1.0
     """As in the loss of the coarse stage: without, blocks make ground transparent that was opaque (choice)."""
     decoder: Literal["frozen", "own"] = "frozen"
     """`frozen`: as the coarse stage left it (the paper). `own`: each block trains its copy, which its anchors keep in
@@ -278,9 +278,9 @@ class BlockConfig:
     move as those of the core."""
     context: bool = True
     """Draw the anchors outside the block too, frozen (choice). Off: what the block's cameras see there is empty."""
-    growth: GrowthConfig = field(default_factory=GrowthConfig)
+    growth: DensifyConfig = field(default_factory=DensifyConfig)
     """Growth and pruning of anchors, by default as in the coarse stage: the paper says nothing else."""
-    max_anchors_total: Annotated[int, Range(0, MANY)] = 0
+    max_anchors_total: Annotated[int, Range(0, MAX_COUNT)] = 0
     """No growth beyond this many anchors of all blocks together; 0 for no limit. Each block has a share in proportion
     to the coarse anchors it owns. A block that starts with more grows none, and none of its anchors is removed for
     it: the merged scene has at most this many, or as many as the coarse model."""
@@ -301,9 +301,9 @@ class MergeConfig:
 class MethodConfig:
     """Everything that the result of a run depends on, but for the capture."""
 
-    training: Annotated[TrainConfig, Named("")] = field(default_factory=TrainConfig)
+    training: Annotated[TrainConfig, FlagName("")] = field(default_factory=TrainConfig)
     """The coarse stage."""
-    partition: Annotated[PartitionConfig, Named("")] = field(default_factory=PartitionConfig)
+    partition: Annotated[PartitionConfig, FlagName("")] = field(default_factory=PartitionConfig)
     """The cut into blocks."""
     assignment: AssignmentConfig = field(default_factory=AssignmentConfig)
     """Cameras of each block."""
@@ -314,32 +314,32 @@ class MethodConfig:
 
 
 #: How `iterations = 0` follows from the number of training photographs: steps for each, least, most.
-COARSE_STEPS, BLOCK_STEPS = (60, 3_000, 30_000), (15, 500, 15_000)
+AUTO_COARSE_ITERATIONS, AUTO_BLOCK_ITERATIONS = (60, 3_000, 30_000), (15, 500, 15_000)
 
 
-def with_iterations(config: TrainConfig, training_views: int) -> TrainConfig:
+def resolve_iterations(config: TrainConfig, num_views: int) -> TrainConfig:
     """The settings with `iterations = 0` replaced by what the number of training photographs asks for."""
-    return replace(config, iterations=config.iterations or _steps(training_views, *COARSE_STEPS))
+    return replace(config, iterations=config.iterations or _steps(num_views, *AUTO_COARSE_ITERATIONS))
 
 
-def block_limit(config: BlockConfig, anchors: int, of: int) -> int:
+def max_block_anchors(config: BlockConfig, num_anchors: int, total_anchors: int) -> int:
     """Up to how many anchors a block may grow that owns so many of all (`of`) coarse anchors; 0 for no limit.
 
     Shares are rounded down, so that together they are never more than the total. At least 1: no anchor of its own and
     no limit are different things.
     """
-    share = max(1, config.max_anchors_total * anchors // of) if config.max_anchors_total else 0
+    share = max(1, config.max_anchors_total * num_anchors // total_anchors) if config.max_anchors_total else 0
     limits = [limit for limit in (config.growth.max_anchors, share) if limit]
     return min(limits, default=0)
 
 
-def block_training(config: MethodConfig, views: int) -> TrainConfig:
+def block_train_config(config: MethodConfig, num_views: int) -> TrainConfig:
     """The settings of the training loop for one block with so many photographs."""
     block, scale = config.block, config.block.scale_iterations
     rates = config.training.rates
     return replace(
         config.training,
-        iterations=max(1, round(scale * (block.iterations or _steps(views, *BLOCK_STEPS)))),
+        iterations=max(1, round(scale * (block.iterations or _steps(num_views, *AUTO_BLOCK_ITERATIONS)))),
         sampling=block.sampling,
         average=block.average,
         early=block.early,
@@ -352,10 +352,10 @@ def block_training(config: MethodConfig, views: int) -> TrainConfig:
         ),
         growth=replace(
             block.growth,
-            statistics_from=round(scale * block.growth.statistics_from),
+            stats_start=round(scale * block.growth.stats_start),
             start=round(scale * block.growth.start),
         ),
-        loss=replace(config.training.loss, background_noise=block.background_noise),
+        loss=replace(config.training.loss, random_background=block.random_background),
         compensation=block.compensation,
     )
 

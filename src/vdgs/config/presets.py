@@ -22,11 +22,11 @@ from vdgs.config.method import (
     AssignmentConfig,
     BlockConfig,
     CompensationConfig,
-    GrowthConfig,
+    DensifyConfig,
+    LearningRateConfig,
     LossConfig,
     MethodConfig,
     PartitionConfig,
-    RateConfig,
     TrainConfig,
 )
 
@@ -36,25 +36,25 @@ PRESETS: dict[str, MethodConfig] = {
     "paper": MethodConfig(),
     "literal": MethodConfig(
         training=TrainConfig(
-            adam="dense",
-            anchors=AnchorConfig(outlier_distance=0.0, fill_gaps=False, bound_sizes=False),
-            loss=LossConfig(background="black", background_noise=0.0),
+            optimizer="dense",
+            anchors=AnchorConfig(outlier_distance=0.0, fill_gaps=False, bound_scales=False),
+            loss=LossConfig(background="black", random_background=0.0),
         ),
         assignment=AssignmentConfig(mode="literal", best_block=False, min_cameras=0),
         block=BlockConfig(
-            background_noise=0.0, context=False, compensation=CompensationConfig(gate="literal", added_to="sum")
+            random_background=0.0, context=False, compensation=CompensationConfig(gate="literal", added_to="sum")
         ),
     ),
     "laptop": MethodConfig(
         training=TrainConfig(
             iterations=0,
-            anchors=AnchorConfig(stereo=True),
+            anchors=AnchorConfig(mvs=True),
             exposure=True,
-            exposure_spread=0.015,
+            exposure_min_spread=0.015,
             resolutions=((0.0, 4), (0.1, 2), (0.4, 1)),
-            rates=RateConfig(offsets=(0.02, 2e-4), features=(0.015, 0.015), log_scales=(0.014, 0.014)),
+            rates=LearningRateConfig(offsets=(0.02, 2e-4), features=(0.015, 0.015), log_scales=(0.014, 0.014)),
             early=3.0,
-            growth=GrowthConfig(statistics_from=300, start=500, until=0.6, threshold=1e-4),
+            growth=DensifyConfig(stats_start=300, start=500, until=0.6, threshold=1e-4),
         ),
         partition=PartitionConfig(blocks="auto"),
         assignment=AssignmentConfig(threshold=0.1),
@@ -68,7 +68,7 @@ PRESETS: dict[str, MethodConfig] = {
             scale_rate=2.0,
             feature_rate=2.0,
             decoder="own",
-            growth=GrowthConfig(statistics_from=0, start=100, threshold=1e-4),
+            growth=DensifyConfig(stats_start=0, start=100, threshold=1e-4),
             compensation=CompensationConfig(enabled=False, t_low_quantile=0.25, beta_g=0.1),
         ),
     ),

@@ -16,13 +16,13 @@ from dataclasses import dataclass
 from types import UnionType
 from typing import Any
 
-from vdgs.config.serialization import hints_of
+from vdgs.config.serialization import field_hints
 from vdgs.errors import VdgsError
 
 #: More than anything that is counted: iterations, anchors, photographs.
-MANY = 1_000_000_000
+MAX_COUNT = 1_000_000_000
 #: Weights, factors and the like: beyond it float32 has no room left to compute with them.
-LARGE = 1_000_000
+MAX_FLOAT = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -33,39 +33,39 @@ class Range:
     most: float
     above: bool = False
     """The least itself is not possible."""
-    below: bool = False
+    exclusive_max: bool = False
     """Nor is the most."""
-    or_zero: bool = False
+    allow_zero: bool = False
     """0 is possible too, and means something else."""
 
     def holds(self, value: float) -> bool:
         """Whether a number lies in the range; no NaN and no infinity does."""
-        if self.or_zero and value == 0:
+        if self.allow_zero and value == 0:
             return True
         low = self.least < value if self.above else self.least <= value
-        high = value < self.most if self.below else value <= self.most
+        high = value < self.most if self.exclusive_max else value <= self.most
         return low and high
 
     def __str__(self) -> str:
         low = f"{'above' if self.above else 'at least'} {_plain(self.least)}"
-        high = f"{'below' if self.below else 'at most'} {_plain(self.most)}"
-        return f"{'0, or ' if self.or_zero else ''}{low} and {high}"
+        high = f"{'below' if self.exclusive_max else 'at most'} {_plain(self.most)}"
+        return f"{'0, or ' if self.allow_zero else ''}{low} and {high}"
 
 
 @dataclass(frozen=True)
-class Named:
+class FlagName:
     """What a group of settings is called on the command line, where that is not the name of its field."""
 
     name: str
 
 
-SHARE = Range(0, 1)
+FRACTION = Range(0, 1)
 #: Numbers of threads, processes and the like; 0 leaves the choice to the program.
-WORKERS = Range(0, 1024)
+WORKER_COUNT = Range(0, 1024)
 
 
 @dataclass(frozen=True)
-class Number:
+class NumericSetting:
     """One number of a group of settings: where it stands, what it is and may be."""
 
     #: Names of the fields down to it, by which the command line and config.yaml know it.
@@ -76,46 +76,46 @@ class Number:
     @property
     def option(self) -> str:
         """`--block.growth.max-anchors`."""
-        return option(self.path)
+        return to_flag(self.path)
 
 
-def option(path: tuple[str, ...]) -> str:
+def to_flag(path: tuple[str, ...]) -> str:
     """What the command line calls the setting at a path."""
     return "--" + ".".join(path).replace("_", "-")
 
 
-def problems(settings: Any, within: tuple[str, ...] = ()) -> list[str]:
+def find_range_errors(settings: Any, within: tuple[str, ...] = ()) -> list[str]:
     """One sentence for every number outside its range; empty if there is none. `within` names the groups around it."""
-    return [f"{each.option} {each.value}: must be {each.range}" for each in outside(settings, within)]
+    return [f"{each.option} {each.value}: must be {each.range}" for each in iter_out_of_range(settings, within)]
 
 
-def refuse(settings: Any) -> None:
+def check_ranges(settings: Any) -> None:
     """Raise VdgsError, naming each option, what it is and what it may be, unless every number is in its range."""
-    found = problems(settings)
+    found = find_range_errors(settings)
     if found:
         raise VdgsError(found[0] if len(found) == 1 else "\n  ".join(["These do not work:", *found]))
 
 
-def outside(settings: Any, within: tuple[str, ...] = ()) -> Iterator[Number]:
+def iter_out_of_range(settings: Any, within: tuple[str, ...] = ()) -> Iterator[NumericSetting]:
     """Every number that is outside its range."""
-    for each in numbers(settings, within):
+    for each in iter_numbers(settings, within):
         if each.value is not None and each.range is not None and not each.range.holds(each.value):
             yield each
 
 
-def numbers(settings: Any, within: tuple[str, ...] = ()) -> Iterator[Number]:
+def iter_numbers(settings: Any, within: tuple[str, ...] = ()) -> Iterator[NumericSetting]:
     """Every number of a dataclass and of those in it. Where a field may hold one but does not, its value is None."""
     kind: type = type(settings)
-    hints = hints_of(kind)
+    hints = field_hints(kind)
     for field in dataclasses.fields(settings):
         value, hint = getattr(settings, field.name), hints[field.name]
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
             names = [each.name for each in typing.get_args(hint)[1:] if isinstance(getattr(each, "name", None), str)]
             inner = names[0] if names else field.name
-            yield from numbers(value, (*within, inner) if inner else within)
+            yield from iter_numbers(value, (*within, inner) if inner else within)
         else:
             for number, bounds in _ranged(hint, value, None):
-                yield Number((*within, field.name), number, bounds)
+                yield NumericSetting((*within, field.name), number, bounds)
 
 
 def _ranged(hint: Any, value: Any, bounds: Range | None) -> Iterator[tuple[int | float | None, Range | None]]:

@@ -29,18 +29,18 @@ def to_dict(config: Any) -> dict[str, Any]:
 
 
 @cache
-def hints_of(kind: type) -> dict[str, Any]:
+def field_hints(kind: type) -> dict[str, Any]:
     """What each field of a config class holds, with its notes: texts of the source, which take long to evaluate."""
     return typing.get_type_hints(kind, include_extras=True)
 
 
-def differences(old: dict[str, Any], new: dict[str, Any], prefix: str = "") -> list[str]:
+def diff_settings(old: dict[str, Any], new: dict[str, Any], prefix: str = "") -> list[str]:
     """Lines that say which settings differ, e.g. `growth.threshold: 0.0002 -> 0.0004`."""
     lines = []
     for key in sorted(old.keys() | new.keys()):
         before, after = old.get(key), new.get(key)
         if isinstance(before, dict) and isinstance(after, dict):
-            lines += differences(before, after, f"{prefix}{key}.")
+            lines += diff_settings(before, after, f"{prefix}{key}.")
         elif before != after:
             lines.append(f"{prefix}{key}: {before} -> {after}")
     return lines
@@ -52,14 +52,14 @@ def from_dict(kind: type, values: Mapping[str, Any], where: str = "settings") ->
     Raises ValueError, naming the setting, for one that the class does not have or of another kind. `where` is the group
     that it all stands in.
     """
-    hints = hints_of(kind)
+    hints = field_hints(kind)
     unknown = sorted(values.keys() - hints.keys(), key=str)
     if unknown:
-        raise ValueError(f"{where or 'this file'} has no {unknown[0]!r}{suggestion(str(unknown[0]), hints)}")
+        raise ValueError(f"{where or 'this file'} has no {unknown[0]!r}{suggest(str(unknown[0]), hints)}")
     return kind(**{name: _read(hints[name], value, f"{where}.{name}".lstrip(".")) for name, value in values.items()})
 
 
-def suggestion(word: str, known: Iterable[str]) -> str:
+def suggest(word: str, known: Iterable[str]) -> str:
     """`; did you mean 'threshold'?` where a known word is like this one."""
     like = difflib.get_close_matches(word, list(known), n=1)
     return f"; did you mean {like[0]!r}?" if like else ""

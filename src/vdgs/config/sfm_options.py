@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-from vdgs.config.ranges import MANY, WORKERS, Named, Range
+from vdgs.config.ranges import MAX_COUNT, WORKER_COUNT, FlagName, Range
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,23 +17,23 @@ class SfmOptions:
     """The focal length. hold: that of EXIF and XMP; refine: fitted; auto: held where the flight cannot tell it from the
     height (straight down from one height, by what the drone recorded or by level positions all over an area) and where
     the maker calibrated it; fitted otherwise."""
-    neighbours: Annotated[int, Range(2, 1000)] = 16
+    num_neighbors: Annotated[int, Range(2, 1000)] = 16
     """Each photograph is matched with so many that were taken near it, where positions are known; with more where those
     show little of the same: facades, oblique views, several cameras at one place."""
-    exhaustive: Annotated[int, Range(0, MANY)] = 50
+    exhaustive_max: Annotated[int, Range(0, MAX_COUNT)] = 50
     """Without positions: up to so many photographs, all are matched with all; beyond it those next to each other in
     order, and those that look alike."""
-    feature_size: Annotated[int, Range(200, 100_000)] = 2000
+    max_image_size: Annotated[int, Range(200, 100_000)] = 2000
     """Photographs are shrunk to this many pixels of their longer side to find features."""
     features: Annotated[int, Range(200, 1_000_000)] = 8192
     """Features of a photograph, at most about so many."""
-    max_size: Annotated[int, Range(16, 1_000_000, or_zero=True)] = 0
+    max_size: Annotated[int, Range(16, 1_000_000, allow_zero=True)] = 0
     """Longer side of the photographs that are written into images/, in pixels; 0: as large as they are."""
     gcp: Path | None = None
     """gcp_list.txt (as for ODM): surveyed points and where photographs show them. The model is brought to them."""
     check_points: tuple[str, ...] = ()
     """Names of points of --gcp that are held out and only measured afterwards; all: every one."""
-    gps_deviation_m: Annotated[tuple[float, float], Range(0, 100_000, above=True)] = (1.0, 2.0)
+    gps_std_m: Annotated[tuple[float, float], Range(0, 100_000, above=True)] = (1.0, 2.0)
     """Standard deviation of GPS positions across and upwards, in metres, where the photographs say none themselves (RTK
     in XMP; GPSHPositioningError in EXIF, with heights as much worse as here)."""
 
@@ -45,6 +45,6 @@ class SfmRequest:
     photographs: tuple[Path, ...]
     output: Path
     gps: Path | None = None
-    threads: Annotated[int, WORKERS] = 0
+    threads: Annotated[int, WORKER_COUNT] = 0
     keep_work: bool = False
-    options: Annotated[SfmOptions, Named("")] = field(default_factory=SfmOptions)
+    options: Annotated[SfmOptions, FlagName("")] = field(default_factory=SfmOptions)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from vdgs.config.method import GrowthConfig, MethodConfig, Resolutions
-from vdgs.config.ranges import problems
+from vdgs.config.method import DensifyConfig, MethodConfig, ResolutionSchedule
+from vdgs.config.ranges import find_range_errors
 
 
-def validate(config: MethodConfig) -> list[str]:
+def validate_config(config: MethodConfig) -> list[str]:
     """What is wrong with the settings, one sentence each; empty if nothing is."""
-    found = problems(config)
+    found = find_range_errors(config)
     training, block = config.training, config.block
     found += _validate_schedule(training.average, training.growth, training.resolutions)
     found += [f"block.{each}" for each in _validate_schedule(block.average, block.growth, block.resolutions)]
@@ -21,12 +21,12 @@ def validate(config: MethodConfig) -> list[str]:
     return found
 
 
-def _validate_schedule(average: float, growth: GrowthConfig, resolutions: Resolutions) -> list[str]:
+def _validate_schedule(average: float, growth: DensifyConfig, resolutions: ResolutionSchedule) -> list[str]:
     """What does not fit together in the course of a training."""
     return _validate_resolutions(resolutions) + _validate_average(average, growth, resolutions)
 
 
-def _validate_resolutions(resolutions: Resolutions) -> list[str]:
+def _validate_resolutions(resolutions: ResolutionSchedule) -> list[str]:
     found = []
     if not resolutions or resolutions[0][0] != 0.0:
         found.append("resolutions must begin at share 0.0")
@@ -35,7 +35,7 @@ def _validate_resolutions(resolutions: Resolutions) -> list[str]:
     return found
 
 
-def _validate_average(average: float, growth: GrowthConfig, resolutions: Resolutions) -> list[str]:
+def _validate_average(average: float, growth: DensifyConfig, resolutions: ResolutionSchedule) -> list[str]:
     if not 0 < average < 1:
         return []
     if growth.until >= 1:

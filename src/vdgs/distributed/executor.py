@@ -19,7 +19,7 @@ EndState = Literal["done", "failed", "stopped"]
 
 
 @dataclass(frozen=True)
-class Needs:
+class TaskResources:
     """What a task asks of the place where it runs. Processes of this machine take what there is."""
 
     processors: int = 1
@@ -43,11 +43,11 @@ class Task:
     """The stage folder that the command locks while it works; while another process holds it, the task waits."""
     after: str | None = None
     """The name of the task, among those run with it, that must be done before this one starts."""
-    needs: Needs = field(default_factory=Needs)
+    resources: TaskResources = field(default_factory=TaskResources)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Outcome:
+class TaskResult:
     """How a task ended."""
 
     name: str
@@ -62,7 +62,7 @@ class Outcome:
     """The end of what a failed one printed."""
 
 
-class Listener:
+class TaskListener:
     """Is told what becomes of the tasks while they run; does nothing with it. Called in the thread that runs them."""
 
     def placed(self, task: Task, where: str, found: bool) -> None:
@@ -83,7 +83,7 @@ class Listener:
     def stopping(self, tasks: Sequence[Task]) -> None:
         """These run and were asked to save and end; no more are started."""
 
-    def ended(self, task: Task, outcome: Outcome) -> None:
+    def ended(self, task: Task, outcome: TaskResult) -> None:
         """It will not be started again, or never was."""
 
     def tick(self) -> None:
@@ -97,7 +97,7 @@ class Executor(Protocol):
     def at_once(self) -> int:
         """How many tasks run side by side, at most."""
 
-    def run(self, tasks: Sequence[Task], listener: Listener) -> list[Outcome]:
+    def run(self, tasks: Sequence[Task], listener: TaskListener) -> list[TaskResult]:
         """Run every task, in their order where there is a choice; the outcomes in the order of the tasks.
 
         One that fails stops no other but those that come `after` it. When this process is asked to stop (Ctrl-C,
@@ -106,36 +106,36 @@ class Executor(Protocol):
 
 
 #: Prints a line in a style of rich; the text is no markup.
-Say = Callable[[str, str], None]
+PrintLine = Callable[[str, str], None]
 
 
-class Lines(Listener):
+class LogListener(TaskListener):
     """Says what a person must know in any case: who waits, who crashed, who was asked to stop."""
 
-    def __init__(self, say: Say):
-        self.say = say
+    def __init__(self, print_line: PrintLine):
+        self.print_line = print_line
 
     def waits(self, task: Task) -> None:
-        self.say(f"{task.name}: waiting for another process that works on it", "yellow")
+        self.print_line(f"{task.name}: waiting for another process that works on it", "yellow")
 
     def paused(self, task: Task, why: str) -> None:
-        self.say(f"{task.name}: saved and waits for another turn" + (f" ({why})" if why else ""), "yellow")
+        self.print_line(f"{task.name}: saved and waits for another turn" + (f" ({why})" if why else ""), "yellow")
 
     def crashed(self, task: Task, how: str, attempts_left: int) -> None:
         text = f"{task.name}: crashed by {how}; continues from its last checkpoint, attempts left: {attempts_left}"
-        self.say(text, "yellow")
+        self.print_line(text, "yellow")
 
     def stopping(self, tasks: Sequence[Task]) -> None:
         names = ", ".join(task.name for task in tasks)
-        self.say(f"stopping: {names} will save and end (Ctrl-C again kills)", "yellow")
+        self.print_line(f"stopping: {names} will save and end (Ctrl-C again kills)", "yellow")
 
 
 #: Exit codes of the command line (cli.py).
-DONE, EXPLAINED, STOPPED = 0, (1, 2), 130
+EXIT_DONE, EXIT_EXPLAINED, EXIT_STOPPED = 0, (1, 2), 130
 
 
 @dataclass(frozen=True)
-class Begun:
+class AttemptStarted:
     """Where an attempt runs, and where its part of the output begins."""
 
     output_from: int = 0
@@ -144,7 +144,7 @@ class Begun:
 
 
 @dataclass(frozen=True)
-class End:
+class AttemptResult:
     """How an attempt ended."""
 
     code: int | None
@@ -161,10 +161,10 @@ class Attempt(Protocol):
     """An attempt at a task, wherever its process is."""
 
     @property
-    def begun(self) -> Begun | None:
+    def begun(self) -> AttemptStarted | None:
         """None while it waits for a place, or waits for one again."""
 
-    def look(self) -> End | None:
+    def look(self) -> AttemptResult | None:
         """How it ended; None while it goes on. Brings `begun` up to date."""
 
     def ask_to_stop(self) -> None:

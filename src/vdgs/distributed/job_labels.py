@@ -6,31 +6,31 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True, kw_only=True)
-class Kind:
+class JobLabels:
     """The words for the shards of a stage."""
 
     one: str
-    many: str
+    plural: str
     work: str
     """What is to be done with one: "train"."""
-    doing: str
+    activity: str
     """What it is at work with: "training"."""
     steps: str
     """What the numbers of `iteration` and `iterations` in its status file count, as the head of a column."""
-    pace: str
+    rate_unit: str
     """So many of them a second."""
-    trains: bool = False
+    shows_training_stats: bool = False
     """Whether it tells of anchors and PSNR while it runs."""
-    smaller: tuple[str, ...] = ()
+    memory_saving_options: tuple[str, ...] = ()
     """Options that let one take less memory."""
 
 
-BLOCKS = Kind(
-    one="block", many="blocks", work="train", doing="training", steps="iteration", pace="it/s", trains=True,
-    smaller=("more --blocks", "--block.growth.max-anchors"),
+BLOCK_LABELS = JobLabels(
+    one="block", plural="blocks", work="train", activity="training", steps="iteration", rate_unit="it/s", shows_training_stats=True,
+    memory_saving_options=("more --blocks", "--block.growth.max-anchors"),
 )  # fmt: skip
 
 
-def shard_kind(work: str, steps: str) -> Kind:
+def shard_kind(work: str, steps: str) -> JobLabels:
     """The words for shards that do something (`measure`) with items (`views`)."""
-    return Kind(one="shard", many="shards", work=work, doing="at work", steps=steps, pace=f"{steps}/s")
+    return JobLabels(one="shard", plural="shards", work=work, activity="at work", steps=steps, rate_unit=f"{steps}/s")

@@ -6,34 +6,34 @@ import signal
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from vdgs.distributed.executor import Begun, End, Listener, Outcome, Task
-from vdgs.distributed.scheduler import Policy, run_crew
-from vdgs.distributed.task_process import Process, out_of_memory_kills
+from vdgs.distributed.executor import AttemptResult, AttemptStarted, Task, TaskListener, TaskResult
+from vdgs.distributed.scheduler import ExecutionPolicy, run_tasks
+from vdgs.distributed.task_process import TaskProcess, oom_kill_count
 
 
 @dataclass(frozen=True)
-class LocalExecutor(Policy):
+class LocalExecutor(ExecutionPolicy):
     """Runs tasks in processes of this machine. A second Ctrl-C kills those that still run."""
 
-    def run(self, tasks: Sequence[Task], listener: Listener) -> list[Outcome]:
+    def run(self, tasks: Sequence[Task], listener: TaskListener) -> list[TaskResult]:
         """As `Executor.run`."""
-        return run_crew(tasks, _Processes(), self, listener)
+        return run_tasks(tasks, _LocalEngine(), self, listener)
 
 
-class _Processes:
+class _LocalEngine:
     """The engine: attempts that end with this process."""
 
     most_memory = None
 
     def __init__(self) -> None:
-        self._memory_kills = out_of_memory_kills()
+        self._memory_kills = oom_kill_count()
 
     def start(self, tasks: Sequence[tuple[Task, int]]) -> list[_LocalAttempt | OSError]:
         return [self._start(task, attempt) for task, attempt in tasks]
 
     def _start(self, task: Task, attempt: int) -> _LocalAttempt | OSError:
         try:
-            return _LocalAttempt(Process(task.command, task.output, task.environment, attempt), self)
+            return _LocalAttempt(TaskProcess(task.command, task.output, task.environment, attempt), self)
         except OSError as error:
             return error
 
@@ -45,21 +45,21 @@ class _Processes:
 
     def memory_ran_out(self) -> bool:
         """Whether the system has ended processes for want of memory since this was last asked."""
-        kills, before = out_of_memory_kills(), self._memory_kills
+        kills, before = oom_kill_count(), self._memory_kills
         self._memory_kills = kills
         return kills > before
 
 
 class _LocalAttempt:
-    def __init__(self, process: Process, engine: _Processes):
+    def __init__(self, process: TaskProcess, engine: _LocalEngine):
         self._process, self._engine = process, engine
-        self.begun = Begun(process.output_from)
+        self.begun = AttemptStarted(process.output_from)
 
-    def look(self) -> End | None:
+    def look(self) -> AttemptResult | None:
         code = self._process.poll()
         if code is None:
             return None
-        return End(code, out_of_memory=code == -signal.SIGKILL and self._engine.memory_ran_out())
+        return AttemptResult(code, out_of_memory=code == -signal.SIGKILL and self._engine.memory_ran_out())
 
     def ask_to_stop(self) -> None:
         self._process.terminate()

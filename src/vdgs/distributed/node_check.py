@@ -20,16 +20,16 @@ from vdgs import __version__
 from vdgs.captures.capture import View
 from vdgs.system.atomic_files import write_text
 from vdgs.system.documents import FitnessAnswer, FitnessQuestion
-from vdgs.system.file_locks import hold, is_locked
+from vdgs.system.file_locks import is_locked, lock_folder
 
 #: Files that are looked for by their size, at most (the first, the last and some between).
-MOST_FILES = 8
+MAX_CHECKED_FILES = 8
 #: Where Linux says what its processors can do, and what decides which kernels run, the best first.
-PROCESSOR, INSTRUCTIONS = Path("/proc/cpuinfo"), ("avx512f", "avx2")
+CPUINFO_FILE, INSTRUCTION_SETS = Path("/proc/cpuinfo"), ("avx512f", "avx2")
 
 
 @dataclass(frozen=True)
-class Question:
+class NodeRequirements:
     """What a machine must see to work on a run."""
 
     folder: Path
@@ -37,13 +37,13 @@ class Question:
     files: Sequence[Path]
     """Photographs and models that must be there, of the size that they have here."""
 
-    def plain(self, held: Path | None = None) -> FitnessQuestion:
+    def to_dict(self, held: Path | None = None) -> FitnessQuestion:
         """The question as plain values; `held` is a folder that this process holds."""
-        step = max(1, -(-len(self.files) // MOST_FILES))
+        step = max(1, -(-len(self.files) // MAX_CHECKED_FILES))
         chosen = [*self.files[::step], *self.files[-1:]]
         return {
             "folder": str(self.folder), "files": [(str(file), _size(file)) for file in chosen],
-            "code": code_identity(), "version": __version__, "held": None if held is None else str(held),
+            "code": code_digest(), "version": __version__, "held": None if held is None else str(held),
         }  # fmt: skip
 
     @contextmanager
@@ -51,28 +51,28 @@ class Question:
         """The question while this process holds a folder in the run folder, so that others can be asked to see that."""
         held = self.folder / f".fitness-{uuid4().hex}"
         try:
-            with hold(held):
+            with lock_folder(held):
                 write_text(held / "here", held.name)
-                yield self.plain(held)
+                yield self.to_dict(held)
         finally:
             for file in ("here", ".lock"):
                 (held / file).unlink(missing_ok=True)
             held.rmdir()
 
 
-def photographs_of(views: Sequence[View]) -> list[Path]:
+def image_and_mask_files(views: Sequence[View]) -> list[Path]:
     """The files of photographs, and of masks where they have any."""
     return [path for view in views for path in (view.image_path, view.mask_path) if path is not None]
 
 
-def examine(question: FitnessQuestion) -> FitnessAnswer:
+def check_node(requirements: FitnessQuestion) -> FitnessAnswer:
     """This machine's answer: its `node`, the `processor`'s instructions, and the `problems` that it sees, in words."""
-    problems = [*_folder(question), *_files(question["files"]), *_code(question)]
-    return {"node": socket.gethostname(), "processor": instructions(), "problems": problems}
+    problems = [*_folder(requirements), *_files(requirements["files"]), *_code(requirements)]
+    return {"node": socket.gethostname(), "processor": cpu_instruction_set(), "problems": problems}
 
 
 @cache
-def code_identity() -> str:
+def code_digest() -> str:
     """What tells this vdgs from every other: a digest of its Python files."""
     package, digest = Path(__file__).parents[1], hashlib.sha256()
     for file in sorted(package.rglob("*.py")):
@@ -81,8 +81,8 @@ def code_identity() -> str:
     return digest.hexdigest()[:16]
 
 
-def _folder(question: FitnessQuestion) -> list[str]:
-    folder, held = Path(question["folder"]), question["held"]
+def _folder(requirements: FitnessQuestion) -> list[str]:
+    folder, held = Path(requirements["folder"]), requirements["held"]
     if not folder.is_dir():
         return [f"there is no {folder}. All nodes must share the file system that it lies on"]
     if held is not None and not (Path(held) / "here").is_file():
@@ -112,10 +112,10 @@ def _files(files: Sequence[tuple[str, int]]) -> list[str]:
     return []
 
 
-def _code(question: FitnessQuestion) -> list[str]:
-    if question["version"] != __version__:
-        return [f"it has vdgs {__version__}, this machine {question['version']}. Install the same on all"]
-    if question["code"] != code_identity():
+def _code(requirements: FitnessQuestion) -> list[str]:
+    if requirements["version"] != __version__:
+        return [f"it has vdgs {__version__}, this machine {requirements['version']}. Install the same on all"]
+    if requirements["code"] != code_digest():
         return [f"its vdgs {__version__} is not the same code as this machine's. Install the same on all"]
     return []
 
@@ -128,10 +128,10 @@ def _size(file: Path) -> int:
         return -1
 
 
-def instructions() -> str:
+def cpu_instruction_set() -> str:
     """The instruction set that decides which kernels run here; without one of these, the machine's kind."""
     try:
-        flags = PROCESSOR.read_text(encoding="ascii", errors="replace")
+        flags = CPUINFO_FILE.read_text(encoding="ascii", errors="replace")
     except OSError:
         return platform.machine()
-    return next((name for name in INSTRUCTIONS if f" {name} " in flags), platform.machine())
+    return next((name for name in INSTRUCTION_SETS if f" {name} " in flags), platform.machine())

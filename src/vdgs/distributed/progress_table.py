@@ -11,28 +11,34 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from vdgs.distributed.job_labels import BLOCKS, Kind
-from vdgs.distributed.shard_progress import PieceProgress, State, seconds_left_overall
+from vdgs.distributed.job_labels import BLOCK_LABELS, JobLabels
+from vdgs.distributed.shard_progress import ShardProgress, ShardState, seconds_left_overall
 from vdgs.system.units import ABSENT, clock, data_size
 
 #: Seconds between two summary lines where there is no terminal to redraw.
-PLAIN_SECONDS = 15.0
+LOG_INTERVAL_SECONDS = 15.0
 #: Lines of the table that are not rows of shards: head, rules, totals, and one to spare for the prompt.
-FRAME_LINES = 7
+TABLE_FRAME_LINES = 7
 #: Columns of what trains.
-TRAINING = ("PSNR", "anchors")
-STYLES: dict[State, str] = {"queued": "dim", "running": "cyan", "done": "green", "failed": "red", "stopped": "yellow"}
+TRAINING_COLUMNS = ("PSNR", "anchors")
+STATE_STYLES: dict[ShardState, str] = {
+    "queued": "dim",
+    "running": "cyan",
+    "done": "green",
+    "failed": "red",
+    "stopped": "yellow",
+}
 
 
-class Board:
+class ProgressTable:
     """Shows rows until it is closed. Everything printed meanwhile goes through it, above the table."""
 
-    def __init__(self, console: Console, rows: list[PieceProgress], at_once: int, kind: Kind = BLOCKS):
-        self._console, self._rows, self._at_once, self._kind = console, rows, at_once, kind
+    def __init__(self, console: Console, rows: list[ShardProgress], at_once: int, labels: JobLabels = BLOCK_LABELS):
+        self._console, self._rows, self._at_once, self._kind = console, rows, at_once, labels
         self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
         self._last_line = time.monotonic()
 
-    def __enter__(self) -> Board:
+    def __enter__(self) -> ProgressTable:
         if self._live is not None:
             self._live.start()
         return self
@@ -42,40 +48,46 @@ class Board:
             self.show()
             self._live.stop()
 
-    def say(self, text: str, style: str = "") -> None:
+    def print_line(self, text: str, style: str = "") -> None:
         """A line that stays."""
         self._console.print(text, style=style, highlight=False, markup=False)
 
     def note(self, text: str) -> None:
         """A line about what the live table shows anyway: only where there is none."""
         if self._live is None:
-            self.say(text)
+            self.print_line(text)
 
     def show(self) -> None:
         """Redraw the table, or print the summary line if it is time."""
         if self._live is not None:
-            table = progress_table(self._rows, self._at_once, self._console.height - FRAME_LINES, self._kind)
+            table = build_progress_table(
+                self._rows, self._at_once, self._console.height - TABLE_FRAME_LINES, self._kind
+            )
             self._live.update(table, refresh=True)
-        elif self._open and time.monotonic() - self._last_line >= PLAIN_SECONDS:
+        elif self._open and time.monotonic() - self._last_line >= LOG_INTERVAL_SECONDS:
             self._last_line = time.monotonic()
-            self.say(progress_line(self._rows, self._at_once, self._kind))
+            self.print_line(progress_line(self._rows, self._at_once, self._kind))
 
     @property
     def _open(self) -> bool:
         return any(row.state in ("queued", "running") for row in self._rows)
 
 
-def progress_table(rows: list[PieceProgress], at_once: int, most: int, kind: Kind = BLOCKS) -> Table:
+def build_progress_table(
+    rows: list[ShardProgress], at_once: int, max_rows: int, labels: JobLabels = BLOCK_LABELS
+) -> Table:
     """One row for each shard and one with totals; of more than `most`, those that wait or are done are counted."""
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0), caption_justify="left")  # 80 columns
-    columns = (kind.one, "state", kind.steps, *TRAINING, kind.pace, "left", "memory", "tries")
-    chosen = [place for place, column in enumerate(columns) if kind.trains or column not in TRAINING]
+    columns = (labels.one, "state", labels.steps, *TRAINING_COLUMNS, labels.rate_unit, "left", "memory", "tries")
+    chosen = [
+        place for place, column in enumerate(columns) if labels.shows_training_stats or column not in TRAINING_COLUMNS
+    ]
     for column in (columns[place] for place in chosen):
         table.add_column(column, justify="left" if column == "state" else "right", no_wrap=True)
-    shown = _chosen(rows, max(most, 1))
+    shown = _visible_rows(rows, max(max_rows, 1))
     for row in shown:
         cells = _cells(row)
-        table.add_row(*(cells[place] for place in chosen), style=STYLES[row.state])
+        table.add_row(*(cells[place] for place in chosen), style=STATE_STYLES[row.state])
     if len(shown) < len(rows):
         hidden = [row for row in rows if row not in shown]
         table.caption = f"and {_states(hidden)}"
@@ -85,7 +97,7 @@ def progress_table(rows: list[PieceProgress], at_once: int, most: int, kind: Kin
     return table
 
 
-def progress_line(rows: list[PieceProgress], at_once: int, kind: Kind = BLOCKS) -> str:
+def progress_line(rows: list[ShardProgress], at_once: int, labels: JobLabels = BLOCK_LABELS) -> str:
     """The table in one line: counts, the shards that run, the time left."""
     running = [
         f"{row.index:02d}: {_iteration(row)}" + (f" {row.figures.psnr:.2f} dB" if row.figures.psnr is not None else "")
@@ -93,31 +105,33 @@ def progress_line(rows: list[PieceProgress], at_once: int, kind: Kind = BLOCKS) 
         if row.state == "running"
     ]
     left = seconds_left_overall(rows, at_once)
-    parts = [f"{kind.many}: {_states(rows)}", *running] + ([f"about {clock(left)} left"] if left is not None else [])
+    parts = [f"{labels.plural}: {_states(rows)}", *running] + (
+        [f"about {clock(left)} left"] if left is not None else []
+    )
     return " · ".join(parts)
 
 
-def _chosen(rows: list[PieceProgress], most: int) -> list[PieceProgress]:
-    if len(rows) <= most:
+def _visible_rows(rows: list[ShardProgress], max_rows: int) -> list[ShardProgress]:
+    if len(rows) <= max_rows:
         return rows
     urgency = {"running": 0, "failed": 1, "stopped": 2, "queued": 3, "done": 4}
-    urgent = sorted(rows, key=lambda row: urgency[row.state])[:most]
+    urgent = sorted(rows, key=lambda row: urgency[row.state])[:max_rows]
     return [row for row in rows if row in urgent]
 
 
-def _states(rows: Sequence[PieceProgress]) -> str:
+def _states(rows: Sequence[ShardProgress]) -> str:
     count = Counter(row.state for row in rows)
-    return ", ".join(f"{count[state]} {state}" for state in STYLES if count[state])
+    return ", ".join(f"{count[state]} {state}" for state in STATE_STYLES if count[state])
 
 
-def _iteration(row: PieceProgress) -> str:
+def _iteration(row: ShardProgress) -> str:
     figures = row.figures
     if figures.iteration is None:
         return "starting" if row.state == "running" else ABSENT
     return f"{figures.iteration:,}" + (f"/{figures.iterations:,}" if figures.iterations is not None else "")
 
 
-def _cells(row: PieceProgress) -> list[str]:
+def _cells(row: ShardProgress) -> list[str]:
     figures, running = row.figures, row.state == "running"
     return [
         f"{row.index:02d}",
@@ -132,7 +146,7 @@ def _cells(row: PieceProgress) -> list[str]:
     ]
 
 
-def _totals(rows: list[PieceProgress], at_once: int) -> list[str]:
+def _totals(rows: list[ShardProgress], at_once: int) -> list[str]:
     running = [row for row in rows if row.state == "running"]
     done = sum(row.state == "done" for row in rows)
     speeds = [row.speed for row in running if row.speed is not None]
@@ -151,7 +165,7 @@ def _totals(rows: list[PieceProgress], at_once: int) -> list[str]:
     ]
 
 
-def _percent(rows: list[PieceProgress]) -> str:
+def _percent(rows: list[ShardProgress]) -> str:
     """Share of the work done, a shard that says nothing counting as one that has not begun."""
     shares = []
     for row in rows:

@@ -14,17 +14,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from vdgs.distributed.executor import Begun, End
-from vdgs.distributed.node_check import examine
-from vdgs.distributed.task_process import Process, out_of_memory_kills
+from vdgs.distributed.executor import AttemptResult, AttemptStarted
+from vdgs.distributed.node_check import check_node
+from vdgs.distributed.task_process import TaskProcess, oom_kill_count
 from vdgs.system.documents import FitnessQuestion
 
 #: Seconds that the end of a command waits for a driver.
-COLLECT_SECONDS = 300.0
+RESULT_TIMEOUT_SECONDS = 300.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Order:
+class RayTaskSpec:
     """What a keeper is to run, in plain values."""
 
     command: tuple[str, ...]
@@ -38,7 +38,7 @@ class Order:
 
 
 @dataclass(frozen=True)
-class Unfit:
+class NodeRejected:
     """The node cannot work on the run."""
 
     node: str
@@ -47,38 +47,38 @@ class Unfit:
     why: str
 
 
-class Keeper:
+class RayTaskActor:
     """Runs one command. Its methods are called from several threads of the actor."""
 
-    def __init__(self, order: Order, collect_seconds: float = COLLECT_SECONDS):
+    def __init__(self, order: RayTaskSpec, collect_seconds: float = RESULT_TIMEOUT_SECONDS):
         self._order, self._collect_seconds = order, collect_seconds
-        self._process: Process | None = None
+        self._process: TaskProcess | None = None
         self._asked = False
         self._lock = threading.Lock()
-        self._memory_kills = out_of_memory_kills()
+        self._memory_kills = oom_kill_count()
 
-    def begin(self) -> Begun | Unfit:
-        """Start the command, unless it was started; where it runs. Raises OSError as `Process`."""
+    def begin(self) -> AttemptStarted | NodeRejected:
+        """Start the command, unless it was started; where it runs. Raises OSError as `TaskProcess`."""
         with self._lock:
-            answer = examine(self._order.question)
+            answer = check_node(self._order.question)
             if answer["problems"]:
-                return Unfit(answer["node"], _identity(), answer["problems"][0])
+                return NodeRejected(answer["node"], _node_id(), answer["problems"][0])
             if self._process is None:
                 order = self._order
                 command = [sys.executable if order.command[0] == order.python else order.command[0], *order.command[1:]]
-                self._process = Process(command, Path(order.output), order.environment, order.attempt)
-            return Begun(self._process.output_from, answer["node"])
+                self._process = TaskProcess(command, Path(order.output), order.environment, order.attempt)
+            return AttemptStarted(self._process.output_from, answer["node"])
 
-    def end(self) -> End | None:
+    def end(self) -> AttemptResult | None:
         """Wait for the end of the command; None if it was never started."""
         with self._lock:
             process = self._process
         if process is None:
             return None
         code = process.wait()
-        threading.Thread(target=self._go_unless_collected, daemon=True).start()
-        killed = code == -signal.SIGKILL and out_of_memory_kills() > self._memory_kills
-        return End(code, out_of_memory=killed)
+        threading.Thread(target=self._exit_unless_collected, daemon=True).start()
+        killed = code == -signal.SIGKILL and oom_kill_count() > self._memory_kills
+        return AttemptResult(code, out_of_memory=killed)
 
     def stop(self) -> None:
         """Ask the command to save and end, once."""
@@ -91,12 +91,12 @@ class Keeper:
         if self._process is not None:
             self._process.kill()
 
-    def _go_unless_collected(self) -> None:
+    def _exit_unless_collected(self) -> None:
         threading.Event().wait(self._collect_seconds)
         os._exit(0)
 
 
-def _identity() -> str:
+def _node_id() -> str:
     import ray
 
     return str(ray.get_runtime_context().get_node_id())

@@ -19,25 +19,33 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-from vdgs.distributed.executor import STOPPED, Attempt, Begun, End, Listener, Outcome, Task
-from vdgs.distributed.node_check import Question
-from vdgs.distributed.ray_actor import Keeper, Order, Unfit
-from vdgs.distributed.scheduler import Policy, run_crew
-from vdgs.distributed.task_process import PARENT
+from vdgs.distributed.executor import (
+    EXIT_STOPPED,
+    Attempt,
+    AttemptResult,
+    AttemptStarted,
+    Task,
+    TaskListener,
+    TaskResult,
+)
+from vdgs.distributed.node_check import NodeRequirements
+from vdgs.distributed.ray_actor import NodeRejected, RayTaskActor, RayTaskSpec
+from vdgs.distributed.scheduler import ExecutionPolicy, run_tasks
+from vdgs.distributed.task_process import PARENT_PID_VARIABLE
 from vdgs.errors import VdgsError
 from vdgs.system.documents import FitnessAnswer, FitnessQuestion
 
 NAMESPACE = "vdgs"
 #: Memory for Ray's own objects, of which there are none: the least that it takes.
-OBJECT_BYTES = 80 << 20
+OBJECT_STORE_BYTES = 80 << 20
 #: Seconds that a node gets to answer before anything starts.
-ANSWER_SECONDS = 300.0
+NODE_CHECK_TIMEOUT_SECONDS = 300.0
 #: How often a node that does not answer any more is asked again, where Ray says that it may come back.
-UNAVAILABLE = 20
+MAX_UNAVAILABLE_POLLS = 20
 
 
 @dataclass(frozen=True)
-class Node:
+class RayNode:
     """What a node of a cluster has."""
 
     identity: str
@@ -48,22 +56,22 @@ class Node:
 
 
 @contextmanager
-def connected(address: str | None) -> Iterator[None]:
+def connect(address: str | None) -> Iterator[None]:
     """Be a driver of a cluster: of the one at `address`, else that of RAY_ADDRESS, else a Ray of this machine alone.
 
     Raises VdgsError where there is no Ray, or none that answers.
     """
-    where = _place(address)
+    where = _resolve_address(address)
     variables, own = {"RAY_USAGE_STATS_ENABLED": "0"}, dict[str, Any]()
     if where == "local":
-        own = {"include_dashboard": False, "object_store_memory": OBJECT_BYTES}
+        own = {"include_dashboard": False, "object_store_memory": OBJECT_STORE_BYTES}
         variables["RAY_worker_niceness"] = "0"  # as tasks have it that are processes of this machine
         # Ray listens on all addresses: let in who has the token, which is nobody else.
         variables |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": _token()}
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:
-        with _driver(where, own):
+        with _ray_driver(where, own):
             yield
     finally:
         for name, value in before.items():
@@ -79,30 +87,30 @@ def _token() -> str:
     return secrets.token_hex(32)
 
 
-def refuse_unreachable(address: str | None) -> None:
+def check_reachable(address: str | None) -> None:
     """Raises VdgsError where there is no Ray, or none that answers at that address. None is started for it."""
-    if _place(address) == "local":
-        _refuse_without_ray()
+    if _resolve_address(address) == "local":
+        _require_ray()
     else:
-        with connected(address):
+        with connect(address):
             pass
 
 
-def _place(address: str | None) -> str:
+def _resolve_address(address: str | None) -> str:
     return address or os.environ.get("RAY_ADDRESS") or "local"
 
 
-def _refuse_without_ray() -> None:
+def _require_ray() -> None:
     if importlib.util.find_spec("ray") is None:
         raise VdgsError('Ray is not installed: pip install "vdgs[ray]"')
 
 
 @contextmanager
-def _driver(where: str, own: Mapping[str, Any]) -> Iterator[None]:
-    _refuse_without_ray()
+def _ray_driver(where: str, own: Mapping[str, Any]) -> Iterator[None]:
+    _require_ray()
     import ray
 
-    with _handlers_kept():
+    with _preserve_signal_handlers():
         try:
             ray.init(address=where, namespace=NAMESPACE, log_to_driver=False, logging_level="error", **own)
         except (ConnectionError, RuntimeError, ValueError, OSError, ray.exceptions.RayError) as error:
@@ -114,12 +122,12 @@ def _driver(where: str, own: Mapping[str, Any]) -> Iterator[None]:
     try:
         yield
     finally:
-        with _handlers_kept():
+        with _preserve_signal_handlers():
             ray.shutdown()
 
 
 @contextmanager
-def _handlers_kept() -> Iterator[None]:
+def _preserve_signal_handlers() -> Iterator[None]:
     """Ray sets handlers of signals; ours are put back."""
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -132,7 +140,7 @@ def _handlers_kept() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def nodes() -> list[Node]:
+def list_nodes() -> list[RayNode]:
     """The nodes that are there now and have processors."""
     import ray
 
@@ -141,7 +149,7 @@ def nodes() -> list[Node]:
         has = each["Resources"]
         if each["Alive"] and has.get("CPU", 0) >= 1:
             found.append(
-                Node(
+                RayNode(
                     each["NodeID"], each["NodeManagerHostname"], int(has["CPU"]), int(has.get("memory", 0)),
                     float(has.get("GPU", 0)),
                 )
@@ -149,21 +157,21 @@ def nodes() -> list[Node]:
     return found
 
 
-def ask_nodes(question: Question, there: Sequence[Node]) -> list[FitnessAnswer]:
+def check_nodes(requirements: NodeRequirements, ray_nodes: Sequence[RayNode]) -> list[FitnessAnswer]:
     """Every node's answer (`fitness.examine`), but for nodes that are gone meanwhile.
 
     Raises VdgsError, naming nodes and what is wrong, if one is unfit.
     """
     import ray
 
-    with question.asked() as plain:
-        asked = {node: _visit(node.identity, plain) for node in there}
+    with requirements.asked() as plain:
+        asked = {node: _check_node_remotely(node.identity, plain) for node in ray_nodes}
         answers, problems = list[FitnessAnswer](), list[str]()
         for node, answer in asked.items():
             try:
-                answers.append(ray.get(answer, timeout=ANSWER_SECONDS))
+                answers.append(ray.get(answer, timeout=NODE_CHECK_TIMEOUT_SECONDS))
             except ray.exceptions.RayError as error:
-                if node.identity in {each.identity for each in nodes()}:
+                if node.identity in {each.identity for each in list_nodes()}:
                     problems.append(f"node {node.name}: does not answer ({_last_line(error)})")
                 continue
             problems += [f"node {answers[-1]['node']}: {each}" for each in answers[-1]["problems"]]
@@ -172,7 +180,7 @@ def ask_nodes(question: Question, there: Sequence[Node]) -> list[FitnessAnswer]:
     return answers
 
 
-def _visit(node: str, question: FitnessQuestion) -> Any:
+def _check_node_remotely(node: str, requirements: FitnessQuestion) -> Any:
     """Ask one node. The function travels whole, for a node may have no vdgs."""
     import ray
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
@@ -181,41 +189,41 @@ def _visit(node: str, question: FitnessQuestion) -> Any:
         import socket
 
         try:
-            from vdgs.distributed.node_check import examine
+            from vdgs.distributed.node_check import check_node
         except ImportError as error:
             return {"node": socket.gethostname(), "processor": "", "problems": [f"vdgs is not installed ({error})"]}
-        return examine(question)
+        return check_node(requirements)
 
     there = NodeAffinitySchedulingStrategy(node, soft=False)
     return ray.remote(look).options(num_cpus=0, max_retries=0, scheduling_strategy=there).remote()
 
 
 @dataclass(frozen=True)
-class RayExecutor(Policy):
+class RayExecutor(ExecutionPolicy):
     """Runs tasks on the cluster that this process is connected to."""
 
-    question: Question | None = None
+    question: NodeRequirements | None = None
     """What a node must see; asked again where each task starts, for nodes may join late."""
 
-    def run(self, tasks: Sequence[Task], listener: Listener) -> list[Outcome]:
+    def run(self, tasks: Sequence[Task], listener: TaskListener) -> list[TaskResult]:
         """As `Executor.run`."""
         assert self.question is not None
-        return run_crew(tasks, _Cluster(self.question), self, listener)
+        return run_tasks(tasks, _RayEngine(self.question), self, listener)
 
 
-class _Cluster:
+class _RayEngine:
     """The engine."""
 
-    def __init__(self, question: Question):
-        self._question = question.plain()
-        self._run = hashlib.sha256(str(question.folder).encode()).hexdigest()[:12]
+    def __init__(self, requirements: NodeRequirements):
+        self._question = requirements.to_dict()
+        self._run = hashlib.sha256(str(requirements.folder).encode()).hexdigest()[:12]
         #: Nodes that were found to be unfit.
         self.unfit = set[str]()
-        self._keepers = _keepers()
+        self._keepers = _list_actors()
 
     @property
     def most_memory(self) -> int:
-        return max((node.memory_bytes for node in nodes()), default=0)
+        return max((node.memory_bytes for node in list_nodes()), default=0)
 
     def start(self, tasks: Sequence[tuple[Task, int]]) -> list[Attempt | OSError]:
         return [self._start(task, attempt) for task, attempt in tasks]
@@ -223,17 +231,17 @@ class _Cluster:
     def _start(self, task: Task, attempt: int) -> Attempt:
         import ray
 
-        order = Order(
+        order = RayTaskSpec(
             command=tuple(task.command), output=str(task.output), environment=_environment() | dict(task.environment),
             attempt=attempt, python=sys.executable, question=self._question,
         )  # fmt: skip
-        needs = task.needs
+        needs = task.resources
         options: dict[str, Any] = {"num_cpus": needs.processors, "num_gpus": needs.gpus}
         if needs.memory_bytes:
             options["memory"] = needs.memory_bytes
-        if self.unfit and any(node.identity not in self.unfit for node in nodes()):
+        if self.unfit and any(node.identity not in self.unfit for node in list_nodes()):
             options["label_selector"] = {"ray.io/node-id": f"!in({','.join(sorted(self.unfit))})"}
-        actor = ray.remote(Keeper).options(
+        actor = ray.remote(RayTaskActor).options(
             name=self._name(task, attempt), namespace=NAMESPACE, lifetime="detached", max_restarts=0, max_concurrency=8,
             **options,
         )  # fmt: skip
@@ -257,36 +265,36 @@ class _Cluster:
 
 
 class _RayAttempt:
-    def __init__(self, keeper: Any, cluster: _Cluster):
-        self._keeper, self._cluster = keeper, cluster
-        self._begin = keeper.begin.remote()
+    def __init__(self, actor: Any, cluster: _RayEngine):
+        self._keeper, self._cluster = actor, cluster
+        self._begin = actor.begin.remote()
         self._end: Any = None
-        self._over: End | None = None
+        self._over: AttemptResult | None = None
         self._unavailable = 0
-        self.begun: Begun | None = None
+        self.begun: AttemptStarted | None = None
 
-    def look(self) -> End | None:
+    def look(self) -> AttemptResult | None:
         import ray
 
         if self._over is None:
             try:
-                if self._end is None and _is_there(self._begin):
+                if self._end is None and _is_ready(self._begin):
                     self._began(ray.get(self._begin))
-                if self._end is not None and _is_there(self._end):
+                if self._end is not None and _is_ready(self._end):
                     self._over = ray.get(self._end)
             except ray.exceptions.ActorUnavailableError as error:
                 self._ask_again(error)
             except ray.exceptions.RayTaskError as error:  # there is no such command there, or no space
-                self._over = End(None, f"an error before its first line: {_last_line(error.cause or error)}")
+                self._over = AttemptResult(None, f"an error before its first line: {_last_line(error.cause or error)}")
             except ray.exceptions.RayError as error:
-                self._over = End(None, self._how(error), out_of_memory=_out_of_memory(error))
+                self._over = AttemptResult(None, self._how(error), out_of_memory=_out_of_memory(error))
             if self._over is not None:
                 self._dismiss()
         return self._over
 
     def ask_to_stop(self) -> None:
-        if self.look() is None and self.begun is None and not _is_there(self._begin):
-            self._over = End(STOPPED)
+        if self.look() is None and self.begun is None and not _is_ready(self._begin):
+            self._over = AttemptResult(EXIT_STOPPED)
             self._dismiss()
         elif self._over is None:
             self._keeper.stop.remote()
@@ -295,18 +303,18 @@ class _RayAttempt:
         if self._over is None:
             self._keeper.kill.remote()
 
-    def _began(self, answer: Begun | Unfit) -> None:
-        if isinstance(answer, Unfit):
+    def _began(self, answer: AttemptStarted | NodeRejected) -> None:
+        if isinstance(answer, NodeRejected):
             self._cluster.unfit.add(answer.identity)
-            self._over = End(None, f"a node that cannot work on the run, {answer.node}: {answer.why}")
+            self._over = AttemptResult(None, f"a node that cannot work on the run, {answer.node}: {answer.why}")
             return
         self.begun, self._end = answer, self._keeper.end.remote()
 
     def _ask_again(self, error: Exception) -> None:
         """The network to the keeper's node failed, and may work again."""
         self._unavailable += 1
-        if self._unavailable > UNAVAILABLE:
-            self._over = End(None, self._how(error))
+        if self._unavailable > MAX_UNAVAILABLE_POLLS:
+            self._over = AttemptResult(None, self._how(error))
         elif self._end is None:
             self._begin = self._keeper.begin.remote()
         else:
@@ -330,7 +338,7 @@ class _RayAttempt:
             ray.kill(self._keeper)
 
 
-def _keepers() -> list[str]:
+def _list_actors() -> list[str]:
     """Names of all keepers on the cluster that live."""
     import ray
 
@@ -340,10 +348,12 @@ def _keepers() -> list[str]:
 
 def _environment() -> dict[str, str]:
     """Variables of this process that decide how vdgs computes."""
-    return {name: value for name, value in os.environ.items() if name.startswith("VDGS_") and name != PARENT}
+    return {
+        name: value for name, value in os.environ.items() if name.startswith("VDGS_") and name != PARENT_PID_VARIABLE
+    }
 
 
-def _is_there(answer: Any) -> bool:
+def _is_ready(answer: Any) -> bool:
     import ray
 
     return bool(ray.wait([answer], timeout=0)[0])

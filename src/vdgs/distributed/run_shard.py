@@ -38,13 +38,13 @@ def _run(given: argparse.Namespace) -> None:
 
     from vdgs.distributed.shard import Shard, run_shard
     from vdgs.distributed.task_process import stop_when_parent_dies
-    from vdgs.kernels.device_selection import choose
+    from vdgs.kernels.device_selection import select_device
 
-    device = choose(given.device).device
+    device = select_device(given.device).device
     configure_threads(given.threads)
     stop_when_parent_dies()
     folder = Path(os.path.abspath(given.folder))
-    run_shard(Shard(folder, given.index, device, given.image_memory_gb, Console(soft_wrap=True)))
+    run_shard(Shard(folder, given.index, device, given.image_cache_gb, Console(soft_wrap=True)))
 
 
 if __name__ == "__main__":

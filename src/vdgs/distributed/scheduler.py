@@ -14,23 +14,34 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from vdgs.distributed.executor import DONE, EXPLAINED, STOPPED, Attempt, End, EndState, Engine, Listener, Outcome, Task
-from vdgs.distributed.task_process import explanation, last_lines
+from vdgs.distributed.executor import (
+    EXIT_DONE,
+    EXIT_EXPLAINED,
+    EXIT_STOPPED,
+    Attempt,
+    AttemptResult,
+    EndState,
+    Engine,
+    Task,
+    TaskListener,
+    TaskResult,
+)
+from vdgs.distributed.task_process import error_message, tail_lines
 from vdgs.errors import VdgsError
 from vdgs.runs.stage_folder import StageFolder
-from vdgs.system.stop_signals import stop_requests
+from vdgs.system.stop_signals import catch_stop_signals
 from vdgs.system.units import data_size
 
 #: Seconds that tasks get to save when this process fails itself, and between two looks at them meanwhile.
 GRACE_SECONDS, GRACE_POLL_SECONDS = 120.0, 0.05
 #: Free bytes below which a silent failure is put down to a full disk.
-FULL_BYTES = 1 << 20
+DISK_FULL_BYTES = 1 << 20
 #: What a task asks for after it was ended for want of memory, times what it asked for before (choice).
-MORE_MEMORY = 1.5
+MEMORY_RETRY_FACTOR = 1.5
 
 
 @dataclass(frozen=True)
-class Policy:
+class ExecutionPolicy:
     """How many tasks run side by side, how often one that crashes is started again, and how often all are looked at."""
 
     at_once: int
@@ -45,10 +56,12 @@ class Policy:
             raise ValueError(f"at_once is {self.at_once} and retries is {self.retries}: at least 1 and 0 are needed")
 
 
-def run_crew(tasks: Sequence[Task], engine: Engine, policy: Policy, listener: Listener) -> list[Outcome]:
+def run_tasks(
+    tasks: Sequence[Task], engine: Engine, policy: ExecutionPolicy, listener: TaskListener
+) -> list[TaskResult]:
     """As `Executor.run`, with the attempts of an engine. A second Ctrl-C kills those that still run."""
-    with stop_requests(hangup=True) as asked:
-        crew = _Crew([_Work(task) for task in tasks], engine, policy, listener)
+    with catch_stop_signals(hangup=True) as asked:
+        crew = _TaskScheduler([_TaskState(task) for task in tasks], engine, policy, listener)
         try:
             while not crew.step(asked):
                 time.sleep(policy.poll_seconds)
@@ -57,13 +70,13 @@ def run_crew(tasks: Sequence[Task], engine: Engine, policy: Policy, listener: Li
     return [work.outcome for work in crew.works if work.outcome is not None]
 
 
-class _Work:
+class _TaskState:
     """A task and the attempt that is made at it."""
 
     def __init__(self, task: Task):
         self.task = task
         self.attempt: Attempt | None = None
-        self.outcome: Outcome | None = None
+        self.outcome: TaskResult | None = None
         self.attempts = 0
         self.asked_to_stop = False
         #: Whether it was told that this attempt began, when it did, and where its output begins.
@@ -81,30 +94,30 @@ class _Work:
             self.attempt.ask_to_stop()
 
 
-class _Crew:
+class _TaskScheduler:
     """The tasks of one call."""
 
-    def __init__(self, works: list[_Work], engine: Engine, policy: Policy, listener: Listener):
+    def __init__(self, works: list[_TaskState], engine: Engine, policy: ExecutionPolicy, listener: TaskListener):
         self.works, self._engine, self._listener = works, engine, listener
         self._at_once, self._retries, self._patience = policy.at_once, policy.retries, policy.patience_seconds
         self._by_name = {work.task.name: work for work in works}
         self._waiting = deque(works)
         self._stopping = False
         for work in works:
-            self._take_over(work)
+            self._adopt(work)
 
     @property
-    def _running(self) -> list[_Work]:
+    def _running(self) -> list[_TaskState]:
         return [work for work in self.works if work.attempt is not None]
 
-    def step(self, asked: Sequence[int]) -> bool:
+    def step(self, signals: Sequence[int]) -> bool:
         """Judge what ended, pass on what was `asked` (signals), start what there is room for. True when all ended."""
         if self._running:
             self._engine.refresh()
         for work in self._running:
             self._look(work)
-        if asked:
-            self._stop(kill=signal.SIGINT in asked[1:])
+        if signals:
+            self._stop(kill=signal.SIGINT in signals[1:])
         self._start_ready()
         self._listener.tick()
         return not self._waiting and not self._running
@@ -123,22 +136,22 @@ class _Crew:
             assert work.attempt is not None
             work.attempt.kill()
 
-    def _take_over(self, work: _Work) -> None:
+    def _adopt(self, work: _TaskState) -> None:
         """Watch what an earlier driver began, if it still goes on."""
         attempt = self._engine.find(work.task)
         if attempt is not None:
             self._waiting.remove(work)
             work.attempt, work.found, work.attempts = attempt, True, 1
 
-    def _look(self, work: _Work) -> None:
+    def _look(self, work: _TaskState) -> None:
         assert work.attempt is not None
         end = work.attempt.look()
-        self._tell_begun(work)
+        self._report_start(work)
         if end is not None:
             work.attempt = None
             self._judge(work, end)
 
-    def _tell_begun(self, work: _Work) -> None:
+    def _report_start(self, work: _TaskState) -> None:
         """Pass on that an attempt has found a place, or lost it again."""
         assert work.attempt is not None
         begun = work.attempt.begun
@@ -152,7 +165,7 @@ class _Crew:
             self._listener.paused(work.task, "")
 
     def _start_ready(self) -> None:
-        ready = list[_Work]()
+        ready = list[_TaskState]()
         for work in list(self._waiting):
             before = self._by_name.get(work.task.after) if work.task.after is not None else None
             end = before.outcome if before is not None else None
@@ -166,7 +179,7 @@ class _Crew:
                 ready.append(work)
         self._start(ready)
 
-    def _start(self, ready: list[_Work]) -> None:
+    def _start(self, ready: list[_TaskState]) -> None:
         """Begin an attempt at each; the list is empty then."""
         works = list(ready)
         ready.clear()
@@ -176,14 +189,14 @@ class _Crew:
         attempts = self._engine.start([(work.task, work.attempts) for work in works]) if works else ()
         for work, attempt in zip(works, attempts, strict=True):
             if isinstance(attempt, OSError):
-                self._end(work, "failed", _refused(work.task, attempt))
+                self._end(work, "failed", _start_error_text(work.task, attempt))
             else:
                 work.attempt = attempt
-                self._tell_begun(work)
+                self._report_start(work)
 
-    def _held(self, work: _Work) -> bool:
+    def _held(self, work: _TaskState) -> bool:
         """Another process still works on the task, and patience is not at an end (then the task says so itself)."""
-        if work.task.folder is None or not StageFolder(work.task.folder).is_held():
+        if work.task.folder is None or not StageFolder(work.task.folder).is_locked_elsewhere():
             return False
         if work.held_since is None:
             work.held_since = time.monotonic()
@@ -202,36 +215,36 @@ class _Crew:
             if kill and work.attempt is not None:
                 work.attempt.kill()
 
-    def _judge(self, work: _Work, end: End) -> None:
-        code, why = end.code, explanation(work.task.output, work.output_from) if work.told else ""
-        if code == DONE:
+    def _judge(self, work: _TaskState, end: AttemptResult) -> None:
+        code, why = end.code, error_message(work.task.output, work.output_from) if work.told else ""
+        if code == EXIT_DONE:
             self._end(work, "done")
         elif self._stopping and not work.told:
             work.attempts -= 1
             self._end(work, "stopped", "not started")
         elif end.out_of_time and not self._stopping:
             self._out_of_time(work, why)
-        elif code == STOPPED:
+        elif code == EXIT_STOPPED:
             self._end(work, "stopped", why if work.asked_to_stop else f"stopped by someone else. {why}".strip())
-        elif code in EXPLAINED:
-            self._end(work, "failed", why or _without_words(work.task, _name(end)))
+        elif code in EXIT_EXPLAINED:
+            self._end(work, "failed", why or _silent_failure_text(work.task, _end_text(end)))
         elif self._stopping:
-            self._end(work, "stopped", f"ended by {_name(end)}; continues from its last checkpoint")
+            self._end(work, "stopped", f"ended by {_end_text(end)}; continues from its last checkpoint")
         else:
             self._crashed(work, end, why)
 
-    def _out_of_time(self, work: _Work, why: str) -> None:
+    def _out_of_time(self, work: _TaskState, why: str) -> None:
         """It saved and goes on in its next turn; no attempt is lost as long as it gets further from turn to turn."""
-        progress = progress_of(work.task.folder)
+        progress = stage_iteration(work.task.folder)
         if progress > work.progress:
             work.progress, work.attempts = progress, work.attempts - 1
             self._listener.paused(work.task, why)
             self._waiting.append(work)
         else:
-            self._crashed(work, End(None, "its time limit, before it got any further"), why)
+            self._crashed(work, AttemptResult(None, "its time limit, before it got any further"), why)
 
-    def _crashed(self, work: _Work, end: End, why: str) -> None:
-        how = _name(end)
+    def _crashed(self, work: _TaskState, end: AttemptResult, why: str) -> None:
+        how = _end_text(end)
         if end.out_of_memory:
             how += f" (out of memory; {self._after_memory_kill(work)})"
         work.held_since = None
@@ -242,29 +255,29 @@ class _Crew:
         self._listener.crashed(work.task, how, self._retries + 1 - work.attempts)
         self._waiting.append(work)
 
-    def _after_memory_kill(self, work: _Work) -> str:
+    def _after_memory_kill(self, work: _TaskState) -> str:
         """Ask for more memory, where places are found by needs, else run fewer at once; what to say of it."""
         most = self._engine.most_memory
         if most is None:
             self._at_once = max(1, self._at_once - 1)
             return f"from now on at most {self._at_once} at once"
-        needs = work.task.needs
-        more = min(round(MORE_MEMORY * needs.memory_bytes), max(most, needs.memory_bytes))
+        needs = work.task.resources
+        more = min(round(MEMORY_RETRY_FACTOR * needs.memory_bytes), max(most, needs.memory_bytes))
         if more <= needs.memory_bytes:
             return f"no node has more than the {data_size(needs.memory_bytes)} that it asked for"
-        work.task = replace(work.task, needs=replace(needs, memory_bytes=more))
+        work.task = replace(work.task, resources=replace(needs, memory_bytes=more))
         return f"it asks for {data_size(more)} now"
 
-    def _end(self, work: _Work, state: EndState, why: str = "") -> None:
+    def _end(self, work: _TaskState, state: EndState, why: str = "") -> None:
         seconds = time.monotonic() - work.began if work.attempts and work.began else 0.0
-        lines = tuple(last_lines(work.task.output, work.output_from)) if state == "failed" and work.told else ()
-        work.outcome = Outcome(
+        lines = tuple(tail_lines(work.task.output, work.output_from)) if state == "failed" and work.told else ()
+        work.outcome = TaskResult(
             name=work.task.name, state=state, attempts=work.attempts, seconds=seconds, why=why, last_lines=lines
         )
         self._listener.ended(work.task, work.outcome)
 
 
-def progress_of(folder: Path | None) -> int:
+def stage_iteration(folder: Path | None) -> int:
     """How many iterations the stage in a folder has told; 0 where it tells nothing."""
     if folder is None:
         return 0
@@ -274,7 +287,7 @@ def progress_of(folder: Path | None) -> int:
         return 0
 
 
-def _name(end: End) -> str:
+def _end_text(end: AttemptResult) -> str:
     code = end.code
     if code is None:
         return end.how
@@ -286,17 +299,17 @@ def _name(end: End) -> str:
         return f"signal {-code}"
 
 
-def _refused(task: Task, error: OSError) -> str:
+def _start_error_text(task: Task, error: OSError) -> str:
     return (
         f"{error.filename or task.output}: {error.strerror or error}. Free some space or mend the folder, "
         "then run the same command again."
     )
 
 
-def _without_words(task: Task, end: str) -> str:
+def _silent_failure_text(task: Task, end: str) -> str:
     """What to say of a task that failed and printed nothing."""
     folder = task.output.parent
     with suppress(OSError):
-        if shutil.disk_usage(folder).free < FULL_BYTES:
+        if shutil.disk_usage(folder).free < DISK_FULL_BYTES:
             return f"{folder}: the disk is full. Free some space, then run the same command again."
     return f"{end}, without a message"

@@ -15,10 +15,10 @@ from rich.console import Console
 from vdgs.config.serialization import from_dict
 from vdgs.distributed.sharded_job import REQUEST, ShardedJob
 from vdgs.errors import Interrupted, RunError, Stopped, VdgsError
-from vdgs.runs.stage_folder import StageFolder, Status
+from vdgs.runs.stage_folder import StageFolder, StatusRecord
 from vdgs.system.atomic_files import read_json
 from vdgs.system.memory.process_memory import peak_memory_bytes
-from vdgs.system.stop_signals import stop_if_asked
+from vdgs.system.stop_signals import check_stop_requested
 
 #: What does a shard, by the word that stands in the request: nothing that a file names is called but these.
 WORKERS = {
@@ -76,7 +76,7 @@ class Shard:
         done = len(span) - len(left)
         with shard_session(folder, done, len(span)) as tell, closing(results(left)) as writers:
             for item in left:
-                stop_if_asked()
+                check_stop_requested()
                 next(writers)(job.file(item))
                 done += 1
                 tell(done)
@@ -102,10 +102,10 @@ def shard_session(folder: StageFolder, done: int, total: int) -> Iterator[Callab
     began, noted = time.monotonic(), 0.0
     before = done
 
-    def status(state: str, why: str | None = None) -> Status:
+    def status(state: str, why: str | None = None) -> StatusRecord:
         taken = time.monotonic() - began
         left = round((total - done) * taken / (done - before)) if done > before else None
-        return Status(
+        return StatusRecord(
             state=state, why=why, iteration=done, iterations=total, seconds=taken, seconds_left=left,
             peak_memory_bytes=peak_memory_bytes(),
         )  # fmt: skip

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-State = Literal["queued", "running", "done", "failed", "stopped"]
+ShardState = Literal["queued", "running", "done", "failed", "stopped"]
 #: Readings of a status file between which the speed is measured.
-WINDOW = 20
+SPEED_WINDOW = 20
 #: No figure is larger, in whatever unit: beyond it the file is damaged.
-LARGEST = 1e12
+MAX_VALUE = 1e12
 
 
 @dataclass(frozen=True, kw_only=True)
-class Figures:
+class ProgressStats:
     """What a status file says; None where it says nothing that can be used."""
 
     iteration: int | None = None
@@ -27,7 +27,7 @@ class Figures:
     memory_bytes: int | None = None
 
 
-def read_figures(status_file: Path) -> Figures | None:
+def read_progress_stats(status_file: Path) -> ProgressStats | None:
     """The figures in a status file; None if it is missing or damaged.
 
     Never raises, unlike `StageFolder.status`: a table is not worth a run.
@@ -38,7 +38,7 @@ def read_figures(status_file: Path) -> Figures | None:
         return None
     if not isinstance(status, dict):
         return None
-    return Figures(
+    return ProgressStats(
         iteration=_count(status.get("iteration")),
         iterations=_count(status.get("iterations")),
         psnr=_number(status.get("psnr_training")),
@@ -55,7 +55,7 @@ def _number(value: Any) -> float | None:
         number = float(value)
     except OverflowError:
         return None
-    return number if 0 <= number <= LARGEST else None
+    return number if 0 <= number <= MAX_VALUE else None
 
 
 def _count(value: Any) -> int | None:
@@ -63,27 +63,27 @@ def _count(value: Any) -> int | None:
     return None if number is None else int(number)
 
 
-class PieceProgress:
+class ShardProgress:
     """What is known of a shard while the others run."""
 
     def __init__(self, index: int):
         self.index = index
-        self.state: State = "queued"
+        self.state: ShardState = "queued"
         self.attempts = 0
-        self.figures = Figures()
-        self._readings: deque[tuple[float, int]] = deque(maxlen=WINDOW)
+        self.figures = ProgressStats()
+        self._readings: deque[tuple[float, int]] = deque(maxlen=SPEED_WINDOW)
 
-    def observe(self, figures: Figures | None, now: float) -> None:
+    def observe(self, stats: ProgressStats | None, now: float) -> None:
         """Take what was read at `now` (seconds of any steady clock); what could not be read changes nothing."""
-        if figures is None:
+        if stats is None:
             return
-        self.figures = figures
-        if figures.iteration is None or self.state != "running":
+        self.figures = stats
+        if stats.iteration is None or self.state != "running":
             return
-        if self._readings and figures.iteration < self._readings[-1][1]:
+        if self._readings and stats.iteration < self._readings[-1][1]:
             self._readings.clear()  # a new attempt continues from an earlier state
-        if not self._readings or figures.iteration > self._readings[-1][1]:
-            self._readings.append((now, figures.iteration))
+        if not self._readings or stats.iteration > self._readings[-1][1]:
+            self._readings.append((now, stats.iteration))
 
     def started(self) -> None:
         """A new attempt begins: earlier readings say nothing of its speed."""
@@ -109,7 +109,7 @@ class PieceProgress:
         return max(iterations - iteration, 0) / speed
 
 
-def seconds_left_overall(rows: list[PieceProgress], at_once: int) -> float | None:
+def seconds_left_overall(rows: list[ShardProgress], at_once: int) -> float | None:
     """Estimated time until all shards are done; None before anything is known (complexity: one pass).
 
     Those that wait are taken to be as fast, and where they say nothing as long, as those that ran.

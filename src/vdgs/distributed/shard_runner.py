@@ -10,17 +10,17 @@ from pathlib import Path
 
 from rich.console import Console
 
-from vdgs.distributed.executor import Executor, Lines, Needs, Outcome, Task
-from vdgs.distributed.job_labels import BLOCKS, Kind
-from vdgs.distributed.progress_table import STYLES, Board
-from vdgs.distributed.shard_progress import PieceProgress, read_figures
+from vdgs.distributed.executor import Executor, LogListener, Task, TaskResources, TaskResult
+from vdgs.distributed.job_labels import BLOCK_LABELS, JobLabels
+from vdgs.distributed.progress_table import STATE_STYLES, ProgressTable
+from vdgs.distributed.shard_progress import ShardProgress, read_progress_stats
 from vdgs.errors import VdgsError
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.system.units import clock
 
 
 @dataclass(frozen=True)
-class Piece:
+class Shard:
     """A command that does one piece of work, such as training a block: it continues after an interruption, and does
     nothing once it is done."""
 
@@ -28,8 +28,8 @@ class Piece:
     folder: StageFolder
     """The command locks it and keeps its status file; its output is appended to `output.log` there."""
     command: list[str]
-    needs: Needs = field(default_factory=Needs)
-    kind: Kind = BLOCKS
+    resources: TaskResources = field(default_factory=TaskResources)
+    kind: JobLabels = BLOCK_LABELS
 
     @property
     def name(self) -> str:
@@ -40,37 +40,39 @@ class Piece:
         return self.folder.path / "output.log"
 
     def task(self) -> Task:
-        return Task(name=self.name, command=self.command, output=self.output, folder=self.folder.path, needs=self.needs)
+        return Task(
+            name=self.name, command=self.command, output=self.output, folder=self.folder.path, resources=self.resources
+        )
 
 
-def default_jobs(pieces: int, cores: int, memory_available: int, memory_each: int) -> tuple[int, int]:
+def default_jobs(shards: int, cores: int, memory_available: int, memory_each: int) -> tuple[int, int]:
     """How many pieces to do at once on the CPU, and with how many threads each (choice).
 
     As many as there are cores and memory (bytes) for, at least one: separate ones use cores better than the threads of
     one. The cores left over are shared out.
     """
-    fit = memory_available // memory_each if memory_each > 0 else pieces
-    jobs = max(1, min(pieces, cores, fit))
+    fit = memory_available // memory_each if memory_each > 0 else shards
+    jobs = max(1, min(shards, cores, fit))
     return jobs, max(1, cores // jobs)
 
 
-def run_pieces(pieces: Sequence[Piece], executor: Executor, console: Console) -> list[Outcome]:
+def run_shards(shards: Sequence[Shard], executor: Executor, console: Console) -> list[TaskResult]:
     """Run the command of every piece, with a live table; the outcomes in their order. One that fails stops no other."""
-    rows = [PieceProgress(piece.index) for piece in pieces]
-    for piece, row in zip(pieces, rows, strict=True):
-        row.observe(read_figures(piece.folder.status_file), time.monotonic())
-    kind = pieces[0].kind if pieces else BLOCKS
-    with Board(console, rows, executor.at_once, kind) as board:
-        outcomes = executor.run([piece.task() for piece in pieces], _Watcher(pieces, rows, board))
-    _summarise(pieces, kind, outcomes, console)
+    rows = [ShardProgress(piece.index) for piece in shards]
+    for piece, row in zip(shards, rows, strict=True):
+        row.observe(read_progress_stats(piece.folder.status_file), time.monotonic())
+    kind = shards[0].kind if shards else BLOCK_LABELS
+    with ProgressTable(console, rows, executor.at_once, kind) as board:
+        outcomes = executor.run([piece.task() for piece in shards], _ProgressListener(shards, rows, board))
+    _print_summary(shards, kind, outcomes, console)
     return outcomes
 
 
-class _Watcher(Lines):
+class _ProgressListener(LogListener):
     """Keeps the rows of the table as status files say."""
 
-    def __init__(self, pieces: Sequence[Piece], rows: Sequence[PieceProgress], board: Board):
-        super().__init__(board.say)
+    def __init__(self, pieces: Sequence[Shard], rows: Sequence[ShardProgress], board: ProgressTable):
+        super().__init__(board.print_line)
         self._board = board
         self._pairs = {piece.name: (piece, row) for piece, row in zip(pieces, rows, strict=True)}
         #: On which machine, in words, where it is not this one.
@@ -79,11 +81,11 @@ class _Watcher(Lines):
     def placed(self, task: Task, where: str, found: bool) -> None:
         self._where[task.name] = f" on {where}"
         if found:
-            self.say(f"{task.name}: is still at work on {where}, and is watched again", "")
+            self.print_line(f"{task.name}: is still at work on {where}, and is watched again", "")
 
     def started(self, task: Task, attempt: int) -> None:
         self._pairs[task.name][1].started()
-        self._board.note(f"{task.name}: started{self._where.get(task.name, '')}{_attempt(attempt)}")
+        self._board.note(f"{task.name}: started{self._where.get(task.name, '')}{_attempt_text(attempt)}")
 
     def paused(self, task: Task, why: str) -> None:
         super().paused(task, why)
@@ -95,18 +97,18 @@ class _Watcher(Lines):
         self._observe(task.name)
         self._pairs[task.name][1].state = "queued"
 
-    def ended(self, task: Task, outcome: Outcome) -> None:
+    def ended(self, task: Task, outcome: TaskResult) -> None:
         piece, row = self._pairs[task.name]
         self._observe(task.name)
         row.state, row.attempts = outcome.state, outcome.attempts
         if outcome.state == "failed":
-            self.say(f"{task.name}: failed", STYLES[outcome.state])
-            self.say("\n".join(f"  {line}" for line in outcome.last_lines or outcome.why.splitlines()), "")
+            self.print_line(f"{task.name}: failed", STATE_STYLES[outcome.state])
+            self.print_line("\n".join(f"  {line}" for line in outcome.last_lines or outcome.why.splitlines()), "")
         elif outcome.attempts:
-            took = f"{clock(outcome.seconds)}{_attempt(outcome.attempts)}"
+            took = f"{clock(outcome.seconds)}{_attempt_text(outcome.attempts)}"
             self._board.note(f"{task.name}: {outcome.state} after {took}")
         if outcome.attempts and outcome.state != "done":
-            _note_end(piece.folder, outcome)
+            _record_end(piece.folder, outcome)
 
     def tick(self) -> None:
         for name in self._pairs:
@@ -116,14 +118,14 @@ class _Watcher(Lines):
     def _observe(self, name: str) -> None:
         piece, row = self._pairs[name]
         if row.state == "running":
-            row.observe(read_figures(piece.folder.status_file), time.monotonic())
+            row.observe(read_progress_stats(piece.folder.status_file), time.monotonic())
 
 
-def _attempt(number: int) -> str:
+def _attempt_text(number: int) -> str:
     return f" (attempt {number})" if number > 1 else ""
 
 
-def _note_end(folder: StageFolder, outcome: Outcome) -> None:
+def _record_end(folder: StageFolder, outcome: TaskResult) -> None:
     """Let no status file say "running" of a piece that is not: a process that was killed could not write it itself."""
     # Not if another process has taken over, nor if the file is damaged.
     with suppress(VdgsError, OSError, ValueError), folder.locked():
@@ -132,18 +134,21 @@ def _note_end(folder: StageFolder, outcome: Outcome) -> None:
             folder.set_status(replace(status, state=outcome.state, why=outcome.why))
 
 
-def _summarise(pieces: Sequence[Piece], kind: Kind, outcomes: list[Outcome], console: Console) -> None:
+def _print_summary(shards: Sequence[Shard], labels: JobLabels, outcomes: list[TaskResult], console: Console) -> None:
     def say(text: str, style: str = "") -> None:
         console.print(text, style=style, highlight=False, markup=False)
 
-    unfinished = [(piece, outcome) for piece, outcome in zip(pieces, outcomes, strict=True) if outcome.state != "done"]
-    say(f"{len(pieces) - len(unfinished)} of {len(pieces)} {kind.many} done")
+    unfinished = [(piece, outcome) for piece, outcome in zip(shards, outcomes, strict=True) if outcome.state != "done"]
+    say(f"{len(shards) - len(unfinished)} of {len(shards)} {labels.plural} done")
     for piece, outcome in unfinished:
         if outcome.attempts:
-            say(f"{piece.name} {outcome.state}" + (f": {outcome.why}" if outcome.why else ""), STYLES[outcome.state])
+            say(
+                f"{piece.name} {outcome.state}" + (f": {outcome.why}" if outcome.why else ""),
+                STATE_STYLES[outcome.state],
+            )
         if outcome.state == "failed" and piece.output.is_file():
             say(f"  all of its output: {piece.output}")
     if waited := [piece.name for piece, outcome in unfinished if not outcome.attempts]:
-        say(f"not started: {', '.join(waited)}", STYLES["stopped"])
+        say(f"not started: {', '.join(waited)}", STATE_STYLES["stopped"])
     if unfinished:
-        say(f"The same command continues these {kind.many} and leaves those that are done.")
+        say(f"The same command continues these {labels.plural} and leaves those that are done.")

@@ -26,19 +26,19 @@ from rich.console import Console
 
 from vdgs.config.executor_options import ExecutorOptions
 from vdgs.config.serialization import to_dict
-from vdgs.distributed.backend_selection import Machine, choose
-from vdgs.distributed.executor import Outcome
+from vdgs.distributed.backend_selection import MachineResources, select_backend
+from vdgs.distributed.executor import TaskResult
 from vdgs.distributed.job_folders import SHARDS, clear, remove
-from vdgs.distributed.job_labels import Kind
-from vdgs.distributed.node_check import Question, code_identity
-from vdgs.distributed.resource_allocation import Share, Work
-from vdgs.distributed.shard_runner import Piece, run_pieces
+from vdgs.distributed.job_labels import JobLabels
+from vdgs.distributed.node_check import NodeRequirements, code_digest
+from vdgs.distributed.resource_allocation import Allocation, ShardWorkload
+from vdgs.distributed.shard_runner import Shard, run_shards
 from vdgs.errors import RunError, Stopped
-from vdgs.kernels import threads as threads_available
-from vdgs.runs.stage_folder import StageFolder, Status
+from vdgs.kernels import get_num_threads as threads_available
+from vdgs.runs.stage_folder import StageFolder, StatusRecord
 from vdgs.system.atomic_files import write_json
-from vdgs.system.file_locks import hold
-from vdgs.system.memory.process_memory import available_bytes
+from vdgs.system.file_locks import lock_folder
+from vdgs.system.memory.process_memory import available_memory_bytes
 
 #: The file in the folder of a job that says what is asked of its shards.
 REQUEST = "request.json"
@@ -49,7 +49,7 @@ Loaded = TypeVar("Loaded")
 
 
 @dataclass(frozen=True)
-class Wish:
+class ExecutionOptions:
     """What a person asks of the place where shards are done."""
 
     where: ExecutorOptions
@@ -60,7 +60,7 @@ class Wish:
     device: str = "cpu"
 
     @property
-    def sends(self) -> bool:
+    def is_distributed(self) -> bool:
         """Whether work goes out even if one process could do it: to a cluster, or to several processes at once."""
         return self.where.executor != "local" or self.jobs > 1
 
@@ -71,16 +71,16 @@ class ShardNeeds:
 
     memory_bytes: int
     """Memory of the largest by estimate, beside its photographs."""
-    question: Callable[[], Question]
+    question: Callable[[], NodeRequirements]
     """What machines must see; asked of other machines only."""
     photographs_bytes: int = 0
     """What all photographs of a shard take at most, decoded; 0 where it keeps none."""
 
 
-def spans_of(items: int, least: int, most: int, shards: int) -> tuple[range, ...]:
+def split_ranges(items: int, min_items: int, max_items: int, shards: int) -> tuple[range, ...]:
     """Items from 0, cut into spans of about equal length: so many `shards` as long as none is shorter than `least` or
     longer than `most`. Nothing but the number of items decides, so that any driver cuts the same."""
-    each = min(most, max(least, -(-items // shards)))
+    each = min(max_items, max(min_items, -(-items // shards)))
     count = max(1, -(-items // each))
     ends = [items * place // count for place in range(count + 1)]
     return tuple(range(begin, end) for begin, end in pairwise(ends))
@@ -98,7 +98,7 @@ class ShardedJob:
     request: Any
     """A dataclass of plain values, tuples, paths and such dataclasses."""
     folder: Path
-    kind: Kind
+    kind: JobLabels
     spans: tuple[range, ...]
     """The items of each shard."""
     suffix: str = ".npz"
@@ -106,11 +106,11 @@ class ShardedJob:
 
     @staticmethod
     def of(
-        worker: str, request: Any, output: Path, kind: Kind, depends_on: Any, spans: Sequence[range],
+        worker: str, request: Any, output: Path, kind: JobLabels, depends_on: Any, spans: Sequence[range],
         suffix: str = ".npz",
     ) -> ShardedJob:  # fmt: skip
         """The job for a folder whose results depend on these plain values, its spans and the code that does it."""
-        told = json.dumps([code_identity(), depends_on, [[span.start, span.stop] for span in spans]])
+        told = json.dumps([code_digest(), depends_on, [[span.start, span.stop] for span in spans]])
         folder = Path(os.path.abspath(output)) / SHARDS / hashlib.sha256(told.encode()).hexdigest()[:12]
         return ShardedJob(worker=worker, request=request, folder=folder, kind=kind, spans=tuple(spans), suffix=suffix)
 
@@ -149,17 +149,17 @@ class ShardedJob:
         """Be the one driver of this job, once what other jobs for the folder have left is removed. What this one leaves
         is removed at the end, if it is a good one. Raises as `clear`, and RunError where another driver is at work."""
         clear(self.output, self.key)
-        with hold(self.folder):
+        with lock_folder(self.folder):
             yield
             remove(self.folder)
 
-    def run(self, needs: ShardNeeds, wish: Wish, console: Console) -> None:
+    def run(self, needs: ShardNeeds, wish: ExecutionOptions, console: Console) -> None:
         """Do the shards that are left. Raises what `send` raises."""
         if left := self.left:
             self.send(left, len(self.spans), needs, wish, console)
 
     def send(
-        self, left: Sequence[int], of: int, needs: ShardNeeds, wish: Wish, console: Console,
+        self, left: Sequence[int], of: int, needs: ShardNeeds, wish: ExecutionOptions, console: Console,
         ready: Callable[[], None] | None = None,
     ) -> None:  # fmt: skip
         """Do these shards; `ready` is called once machines are known to be fit, before anything starts: without it
@@ -169,13 +169,13 @@ class ShardedJob:
         VdgsError where a machine of a cluster cannot do the work, before anything starts.
         """
         kind = self.kind
-        work = Work(
-            pieces=len(left), piece_bytes=needs.memory_bytes, jobs=wish.jobs, image_gb=wish.image_gb, kind=kind,
+        work = ShardWorkload(
+            pieces=len(left), shard_bytes=needs.memory_bytes, jobs=wish.jobs, image_gb=wish.image_gb, kind=kind,
             photographs_bytes=needs.photographs_bytes,
         )  # fmt: skip
-        machine = Machine(threads_available(), available_bytes())
-        with choose(wish.where, work, machine, needs.question) as chosen:
-            line = f"{len(left)} of {of} {kind.many} to {kind.work}, {chosen.line}"
+        machine = MachineResources(threads_available(), available_memory_bytes())
+        with select_backend(wish.where, work, machine, needs.question) as chosen:
+            line = f"{len(left)} of {of} {kind.plural} to {kind.work}, {chosen.line}"
             console.print(line, highlight=False)
             for note in chosen.notes:
                 console.print(note, highlight=False)
@@ -184,10 +184,10 @@ class ShardedJob:
             (ready or self.mark_queued)()
             share = chosen.share
             pieces = [
-                Piece(index, self.shard(index), self._command(index, share, wish.device), share.needs, kind)
+                Shard(index, self.shard(index), self._command(index, share, wish.device), share.resources, kind)
                 for index in left
             ]
-            outcomes = run_pieces(pieces, chosen.executor, console)
+            outcomes = run_shards(pieces, chosen.executor, console)
         self._raise_unless_done(outcomes, of)
 
     def gather(self, load: Callable[[Path], Loaded]) -> Iterator[Loaded]:
@@ -200,24 +200,24 @@ class ShardedJob:
             folder = self.shard(index)
             with suppress(RunError), folder.locked():
                 if not self.is_done(index):
-                    folder.set_status(Status(state="queued"))
+                    folder.set_status(StatusRecord(state="queued"))
 
-    def _command(self, index: int, share: Share, device: str) -> list[str]:
+    def _command(self, index: int, share: Allocation, device: str) -> list[str]:
         # A GPU that a shard is given is not this machine's.
-        device = "auto" if share.needs.gpus and device == "cpu" else device
+        device = "auto" if share.resources.gpus and device == "cpu" else device
         return [
             sys.executable, "-m", "vdgs.distributed.run_shard", str(self.folder), str(index), "--threads",
-            str(share.needs.processors), "--image-memory-gb", f"{share.image_gb:.3f}", "--device", device,
+            str(share.resources.processors), "--image-memory-gb", f"{share.image_gb:.3f}", "--device", device,
         ]  # fmt: skip
 
-    def _raise_unless_done(self, outcomes: Sequence[Outcome], of: int) -> None:
+    def _raise_unless_done(self, outcomes: Sequence[TaskResult], of: int) -> None:
         kind = self.kind
         if any(outcome.state == "stopped" for outcome in outcomes):
-            raise Stopped(f"Stopped; every {kind.one} that was {kind.doing} is saved. The same command continues.")
+            raise Stopped(f"Stopped; every {kind.one} that was {kind.activity} is saved. The same command continues.")
         failed = [outcome for outcome in outcomes if outcome.state != "done"]
         if failed:
             raise RunError(
-                f"{self.folder}: {len(failed)} of {of} {kind.many} failed:\n  "
+                f"{self.folder}: {len(failed)} of {of} {kind.plural} failed:\n  "
                 + "\n  ".join(f"{outcome.name}: {outcome.why}" for outcome in failed)
                 + f"\nTheir output is in {self.folder}/NN/output.log. The same command tries them again."
             )

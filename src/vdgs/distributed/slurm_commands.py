@@ -12,15 +12,15 @@ from pathlib import Path
 from vdgs.errors import VdgsError
 
 #: What is needed of it.
-COMMANDS = ("sbatch", "squeue", "scancel", "scontrol")
+SLURM_COMMANDS = ("sbatch", "squeue", "scancel", "scontrol")
 #: Seconds that a command gets: the controller of a busy cluster may take its time.
-ANSWER_SECONDS = 120.0
+COMMAND_TIMEOUT_SECONDS = 120.0
 #: States of squeue in which a job has a place. SUSPENDED keeps it.
-PLACED = ("RUNNING", "SUSPENDED", "COMPLETING", "STAGE_OUT", "SIGNALING")
+RUNNING_STATES = ("RUNNING", "SUSPENDED", "COMPLETING", "STAGE_OUT", "SIGNALING")
 
 
 @dataclass(frozen=True)
-class Element:
+class ArrayTaskId:
     """An element of an array of jobs."""
 
     array: str
@@ -32,21 +32,21 @@ class Element:
 
 
 @dataclass(frozen=True)
-class Listed:
+class QueueEntry:
     """An element as squeue lists it."""
 
-    element: Element
+    task_id: ArrayTaskId
     state: str
     name: str
     node: str
 
     @property
     def placed(self) -> bool:
-        return self.state in PLACED
+        return self.state in RUNNING_STATES
 
 
 @dataclass(frozen=True)
-class Fate:
+class JobState:
     """What SLURM says of an element that is not listed any more."""
 
     state: str
@@ -57,9 +57,9 @@ class SlurmError(VdgsError):
     """SLURM refused, or does not answer."""
 
 
-def refuse_without_slurm() -> None:
+def require_slurm() -> None:
     """Raise VdgsError where SLURM's commands are not there."""
-    if missing := [name for name in COMMANDS if shutil.which(name) is None]:
+    if missing := [name for name in SLURM_COMMANDS if shutil.which(name) is None]:
         raise VdgsError(f"There is no {', no '.join(missing)} here. Run vdgs where jobs are submitted to SLURM.")
 
 
@@ -72,62 +72,62 @@ def submit(script: Path) -> str:
     return _call(["sbatch", "--parsable", str(script)], environment=told).strip().split(";")[0]
 
 
-def listed(prefix: str) -> list[Listed]:
+def list_queue(prefix: str) -> list[QueueEntry]:
     """Elements of this user's that wait or run, of jobs whose names begin so."""
     lines = _call(["squeue", "--me", "--noheader", "--array", "--format=%F|%K|%T|%j|%N"]).splitlines()
     found = []
     for line in lines:
         array, index, state, name, node = (*line.strip().split("|"), "", "", "", "")[:5]
         if name.startswith(prefix) and index.isdecimal():
-            found.append(Listed(Element(array, int(index)), state, name, node))
+            found.append(QueueEntry(ArrayTaskId(array, int(index)), state, name, node))
     return found
 
 
-def fate(element: Element) -> Fate | None:
+def query_job_state(task_id: ArrayTaskId) -> JobState | None:
     """How an element ended that is not listed any more; None where nobody remembers."""
     try:
-        said = _call(["scontrol", "--oneliner", "show", "job", str(element)])
+        said = _call(["scontrol", "--oneliner", "show", "job", str(task_id)])
         facts = dict(word.partition("=")[::2] for word in said.split() if "=" in word)
         if facts.get("JobState"):
-            return Fate(facts["JobState"], _none(facts.get("NodeList", "")))
+            return JobState(facts["JobState"], _clean_node_name(facts.get("NodeList", "")))
     except SlurmError:
         pass  # the controller forgets ended jobs after some minutes; accounting may remember them
     if shutil.which("sacct") is None:
         return None
     try:
-        said = _call(["sacct", "-X", "-n", "-P", "-D", "-j", str(element), "-o", "State,NodeList"]).strip()
+        said = _call(["sacct", "-X", "-n", "-P", "-D", "-j", str(task_id), "-o", "State,NodeList"]).strip()
     except SlurmError:
         return None
     if not said:
         return None
     state, _, node = said.splitlines()[-1].partition("|")
-    return Fate(state.split(" ")[0], _none(node))  # "CANCELLED by 1000"
+    return JobState(state.split(" ")[0], _clean_node_name(node))  # "CANCELLED by 1000"
 
 
-def signal_batch(element: Element, name: str) -> None:
+def signal_batch(task_id: ArrayTaskId, name: str) -> None:
     """Send a signal to the script of an element."""
-    _call(["scancel", "--batch", f"--signal={name}", str(element)], check=False)
+    _call(["scancel", "--batch", f"--signal={name}", str(task_id)], check=False)
 
 
-def cancel(element: Element) -> None:
+def cancel(task_id: ArrayTaskId) -> None:
     """Take an element out of the queue, or end it."""
-    _call(["scancel", str(element)], check=False)
+    _call(["scancel", str(task_id)], check=False)
 
 
-def requeue(element: Element) -> bool:
+def requeue(task_id: ArrayTaskId) -> bool:
     """Put a running element back into the queue, which ends its script at once; False where SLURM refuses."""
-    done = subprocess.run(["scontrol", "requeue", str(element)], capture_output=True, text=True, check=False)
+    done = subprocess.run(["scontrol", "requeue", str(task_id)], capture_output=True, text=True, check=False)
     return done.returncode == 0
 
 
-def _none(node: str) -> str:
+def _clean_node_name(node: str) -> str:
     return "" if node in ("(null)", "None assigned", "None") else node
 
 
 def _call(command: Sequence[str], check: bool = True, environment: Mapping[str, str] | None = None) -> str:
     try:
         done = subprocess.run(
-            command, capture_output=True, text=True, timeout=ANSWER_SECONDS, check=False, env=environment
+            command, capture_output=True, text=True, timeout=COMMAND_TIMEOUT_SECONDS, check=False, env=environment
         )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise SlurmError(f"{command[0]}: {error}") from error

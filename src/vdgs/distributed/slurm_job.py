@@ -17,16 +17,16 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from vdgs.distributed.executor import EXPLAINED, STOPPED
-from vdgs.distributed.node_check import examine
-from vdgs.distributed.slurm_commands import Element, requeue
-from vdgs.distributed.task_process import Process, out_of_memory_kills
+from vdgs.distributed.executor import EXIT_EXPLAINED, EXIT_STOPPED
+from vdgs.distributed.node_check import check_node
+from vdgs.distributed.slurm_commands import ArrayTaskId, requeue
+from vdgs.distributed.task_process import TaskProcess, oom_kill_count
 from vdgs.system.atomic_files import read_json, write_json
 from vdgs.system.documents import JsonObject
 
 
 @dataclass(frozen=True, kw_only=True)
-class Record:
+class SlurmTaskRecord:
     """How far an element is, in FOLDER/n.json."""
 
     node: str
@@ -48,10 +48,10 @@ def record_file(folder: Path, index: int) -> Path:
     return folder / f"{index}.json"
 
 
-def read(folder: Path, index: int) -> Record | None:
+def read_task_record(folder: Path, index: int) -> SlurmTaskRecord | None:
     """What an element says of itself; None before it began, or while it is written."""
     try:
-        return Record(**read_json(record_file(folder, index)))
+        return SlurmTaskRecord(**read_json(record_file(folder, index)))
     except Exception:  # no such file, or not a whole one yet: asked again soon
         return None
 
@@ -59,34 +59,34 @@ def read(folder: Path, index: int) -> Record | None:
 def main(arguments: list[str]) -> int:
     """Do the task; its exit code."""
     folder, variables = Path(arguments[0]), os.environ
-    element = Element(variables["SLURM_ARRAY_JOB_ID"], int(variables["SLURM_ARRAY_TASK_ID"]))
+    element = ArrayTaskId(variables["SLURM_ARRAY_JOB_ID"], int(variables["SLURM_ARRAY_TASK_ID"]))
     turn = int(variables.get("SLURM_RESTART_COUNT", 0))
     written = read_json(folder / "tasks.json")
-    task, before = written["tasks"][str(element.index)], read(folder, element.index)
-    answer = examine(written["question"])
-    tell = _teller(
+    task, before = written["tasks"][str(element.index)], read_task_record(folder, element.index)
+    answer = check_node(written["question"])
+    tell = _record_updater(
         record_file(folder, element.index),
-        Record(node=socket.gethostname(), output_from=_size(task["output"]), turn=turn),
+        SlurmTaskRecord(node=socket.gethostname(), output_from=_size(task["output"]), turn=turn),
     )
     if answer["problems"]:
-        tell(code=EXPLAINED[0], unfit=answer["problems"][0])
-        return EXPLAINED[0]
-    kills = out_of_memory_kills()
-    process = Process(task["command"], Path(task["output"]), task["environment"], task["attempt"] + turn)
-    asked = _pass_on(process)
+        tell(code=EXIT_EXPLAINED[0], unfit=answer["problems"][0])
+        return EXIT_EXPLAINED[0]
+    kills = oom_kill_count()
+    process = TaskProcess(task["command"], Path(task["output"]), task["environment"], task["attempt"] + turn)
+    asked = _forward_signals(process)
     tell(output_from=process.output_from)
     code = process.wait()
-    if code != STOPPED or asked != [signal.SIGUSR1]:
-        tell(code=code, out_of_memory=code == -signal.SIGKILL and out_of_memory_kills() > kills)
+    if code != EXIT_STOPPED or asked != [signal.SIGUSR1]:
+        tell(code=code, out_of_memory=code == -signal.SIGKILL and oom_kill_count() > kills)
         return code if code >= 0 else 128 - code
-    progress = _progress(task)
+    progress = _task_progress(task)
     tell(code=code, out_of_time=True, progress=progress)
     if before is None or before.progress is None or progress > before.progress:
         requeue(element)  # ends this process if it works; else the driver submits it again
     return code
 
 
-def _pass_on(process: Process) -> list[int]:
+def _forward_signals(process: TaskProcess) -> list[int]:
     """Ask the process to save when this one is asked to; the signals that came, each once."""
     asked = list[int]()
 
@@ -100,7 +100,7 @@ def _pass_on(process: Process) -> list[int]:
     return asked
 
 
-def _teller(file: Path, record: Record) -> Callable[..., None]:
+def _record_updater(file: Path, record: SlurmTaskRecord) -> Callable[..., None]:
     """A function that adds to the record of this element."""
     known: JsonObject = asdict(record)
 
@@ -111,10 +111,10 @@ def _teller(file: Path, record: Record) -> Callable[..., None]:
     return tell
 
 
-def _progress(task: Mapping[str, Any]) -> int:
-    from vdgs.distributed.scheduler import progress_of
+def _task_progress(task: Mapping[str, Any]) -> int:
+    from vdgs.distributed.scheduler import stage_iteration
 
-    return progress_of(None if task["folder"] is None else Path(task["folder"]))
+    return stage_iteration(None if task["folder"] is None else Path(task["folder"]))
 
 
 def _size(output: str) -> int:

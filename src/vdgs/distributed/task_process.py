@@ -14,7 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 
 #: Environment variable with the process id of the driver; set for each task that a driver starts.
-PARENT = "VDGS_PARENT"
+PARENT_PID_VARIABLE = "VDGS_PARENT"
 
 
 def stop_when_parent_dies(poll_seconds: float = 1.0) -> threading.Thread | None:
@@ -25,15 +25,15 @@ def stop_when_parent_dies(poll_seconds: float = 1.0) -> threading.Thread | None:
     code between fork and exec, and does not end the task with the driver's thread.
     """
     try:
-        parent = int(os.environ.pop(PARENT, ""))
+        parent = int(os.environ.pop(PARENT_PID_VARIABLE, ""))
     except ValueError:
         return None
-    watch = threading.Thread(target=_watch, args=(parent, poll_seconds), name="parent", daemon=True)
+    watch = threading.Thread(target=_watch_parent, args=(parent, poll_seconds), name="parent", daemon=True)
     watch.start()
     return watch
 
 
-def _watch(parent: int, poll_seconds: float) -> None:
+def _watch_parent(parent: int, poll_seconds: float) -> None:
     while os.getppid() == parent:  # an orphan is adopted by another process
         time.sleep(poll_seconds)
     os.kill(os.getpid(), signal.SIGTERM)
@@ -42,12 +42,15 @@ def _watch(parent: int, poll_seconds: float) -> None:
 #: Bytes of output that are looked at, and lines that are shown.
 TAIL_BYTES, TAIL_LINES = 1 << 16, 12
 #: How the command line begins the message of an error (cli.py).
-MESSAGE = re.compile(r"vdgs \w+: ")
+ERROR_PREFIX = re.compile(r"vdgs \w+: ")
 #: Colours and cursor movements; other control characters.
-ESCAPES, CONTROLS = re.compile(r"\x1b\[[0-9;?]*[ -/]*[@-~]"), re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
+ANSI_ESCAPES, CONTROL_CHARACTERS = (
+    re.compile(r"\x1b\[[0-9;?]*[ -/]*[@-~]"),
+    re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]"),
+)
 
 
-def last_lines(output: Path, start: int = 0) -> list[str]:
+def tail_lines(output: Path, start: int = 0) -> list[str]:
     """The last lines after byte `start` that are not empty; none if the file cannot be read."""
     try:
         with output.open("rb") as handle:
@@ -58,27 +61,27 @@ def last_lines(output: Path, start: int = 0) -> list[str]:
         return []
     # A carriage return overwrites its line: what follows the last one is what a person saw.
     lines = [line.rstrip("\r\n").rpartition("\r")[2] for line in text.split("\n")]
-    clean = [CONTROLS.sub("", ESCAPES.sub("", line)).rstrip() for line in lines]
+    clean = [CONTROL_CHARACTERS.sub("", ANSI_ESCAPES.sub("", line)).rstrip() for line in lines]
     return [line for line in clean if line][-TAIL_LINES:]
 
 
-def explanation(output: Path, start: int = 0) -> str:
+def error_message(output: Path, start: int = 0) -> str:
     """The message that the command line ended with, else the last line; empty if there is no output."""
-    lines = last_lines(output, start)
+    lines = tail_lines(output, start)
     for place in reversed(range(len(lines))):
-        if MESSAGE.match(lines[place]):
-            return "\n".join([MESSAGE.sub("", lines[place]), *lines[place + 1 :]])
+        if ERROR_PREFIX.match(lines[place]):
+            return "\n".join([ERROR_PREFIX.sub("", lines[place]), *lines[place + 1 :]])
     return lines[-1] if lines else ""
 
 
-class Process:
+class TaskProcess:
     """A command in a session of its own, so that the terminal's Ctrl-C reaches its driver alone."""
 
     def __init__(self, command: Sequence[str], output: Path, environment: Mapping[str, str], attempt: int):
         """Start the command. Raises OSError if its output cannot be written or there is no such command."""
         output.parent.mkdir(parents=True, exist_ok=True)
         heading = f"--- {time.strftime('%Y-%m-%d %H:%M:%S')} attempt {attempt}: {shlex.join(command)}"
-        variables = {"PYTHONUNBUFFERED": "1", **environment, PARENT: str(os.getpid())}
+        variables = {"PYTHONUNBUFFERED": "1", **environment, PARENT_PID_VARIABLE: str(os.getpid())}
         with output.open("ab") as file:
             file.write(f"{heading}\n".encode())
             file.flush()
@@ -108,7 +111,7 @@ class Process:
                 os.killpg(self._process.pid, signal.SIGKILL)
 
 
-def out_of_memory_kills() -> int:
+def oom_kill_count() -> int:
     """How many processes the system has ended so far for want of memory; 0 where it does not say."""
     try:
         counters = Path("/proc/vmstat").read_text(encoding="ascii")

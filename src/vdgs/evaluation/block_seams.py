@@ -28,28 +28,28 @@ from vdgs.evaluation.by_block import (
     BORDER_PX,
     BlockMetrics,
     SeamMetrics,
-    blocks_shown,
+    block_label_map,
     border_lines,
     border_pixels,
-    label_map,
+    visible_blocks,
 )
-from vdgs.evaluation.metric_tables import shown
-from vdgs.evaluation.metrics import masked_mean, psnr_of, squared_error, to_8bit
+from vdgs.evaluation.metric_tables import format_value
+from vdgs.evaluation.metrics import masked_mean, psnr_from_mse, squared_error, to_8bit
 from vdgs.evaluation.renderable_model import ReferenceViews
-from vdgs.evaluation.view_exposures import as_photographed
+from vdgs.evaluation.view_exposures import apply_exposure
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import Raster
 from vdgs.partition.blocks import Blocks
-from vdgs.system.atomic_files import jsonable, write_json
+from vdgs.system.atomic_files import to_jsonable, write_json
 from vdgs.system.documents import BlockMetricsDocument, JsonObject
-from vdgs.system.stop_signals import stop_if_asked
+from vdgs.system.stop_signals import check_stop_requested
 
 #: Renders that are measured by block: without blocks, the block as it was trained, all blocks together.
-RENDERS = ("coarse", "alone", "merged")
+RENDER_NAMES = ("coarse", "alone", "merged")
 #: Pictures drawn at most: the views with the most border pixels.
-SEAM_VIEWS = 6
+MAX_SEAM_VIEWS = 6
 #: Borders of blocks and their numbers: bright on a dark rim, so that they show on any ground.
-LINE_COLOUR, RIM_COLOUR = (255, 236, 64), (20, 20, 20)
+LINE_COLOR, OUTLINE_COLOR = (255, 236, 64), (20, 20, 20)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -67,7 +67,7 @@ class SeamView:
     border: Bool[np.ndarray, "h w"]
 
     @property
-    def border_pixels(self) -> int:
+    def border_pixel_count(self) -> int:
         return int(np.count_nonzero(self.border))
 
 
@@ -87,11 +87,11 @@ class BlockInputs:
     def picture(self, rendered: Raster, view: View) -> UInt8[np.ndarray, "h w 3"]:
         """What is measured of a render."""
         pixels = rendered.image.detach().cpu().numpy()
-        return to_8bit(pixels if self.exposure is None else as_photographed(pixels, self.exposure(view)))
+        return to_8bit(pixels if self.exposure is None else apply_exposure(pixels, self.exposure(view)))
 
 
 @dataclass(frozen=True, eq=False)
-class BlockFigures:
+class BlockViewMetrics:
     """What one view says of the blocks."""
 
     row: JsonObject
@@ -108,39 +108,39 @@ def evaluate_blocks(inputs: BlockInputs, output: Path) -> BlockMetricsDocument:
     views = inputs.photographs.views
     if not views:
         raise RunError(f"{output}: there are no test views. Hold some out when the capture is read.")
-    measured, seen = list[BlockFigures](), list[SeamView]()
-    for view, stem in zip(views, image_io.file_stems([view.name for view in views]), strict=True):
-        stop_if_asked()
-        figures, picture = measure_view(view, stem, inputs)
+    measured, seen = list[BlockViewMetrics](), list[SeamView]()
+    for view, stem in zip(views, image_io.unique_file_stems([view.name for view in views]), strict=True):
+        check_stop_requested()
+        figures, picture = measure_block_view(view, stem, inputs)
         measured.append(figures)
         seen.append(picture)
-        seen = [seen[place] for place in worth_seeing([each.border_pixels for each in seen])]
+        seen = [seen[place] for place in select_seam_views([each.border_pixel_count for each in seen])]
     for each in seen:
-        save_picture(output / "seams" / f"{each.stem}.png", each)
-    return conclude(measured, len(inputs.blocks), output)
+        save_seam_image(output / "seams" / f"{each.stem}.png", each)
+    return summarize_blocks(measured, len(inputs.blocks), output)
 
 
-def worth_seeing(border_pixels: Sequence[int]) -> list[int]:
+def select_seam_views(border_pixels: Sequence[int]) -> list[int]:
     """Which of the views are drawn, by the number of border pixels of each: those with most, the first of equals."""
-    best = sorted(range(len(border_pixels)), key=lambda place: -border_pixels[place])[:SEAM_VIEWS]
+    best = sorted(range(len(border_pixels)), key=lambda place: -border_pixels[place])[:MAX_SEAM_VIEWS]
     return [place for place in best if border_pixels[place]]
 
 
-def save_picture(path: Path, view: SeamView) -> None:
-    image_io.write_png(path, np.asarray(seam_picture(view)))
+def save_seam_image(path: Path, view: SeamView) -> None:
+    image_io.write_png(path, np.asarray(draw_seam_image(view)))
 
 
-def conclude(measured: Iterable[BlockFigures], blocks: int, output: Path) -> BlockMetricsDocument:
+def summarize_blocks(per_view_metrics: Iterable[BlockViewMetrics], blocks: int, output: Path) -> BlockMetricsDocument:
     """Gather views, in their order, into what `by_block.json` holds, and write it: once its pictures are complete."""
-    by_block, seams, rows = BlockMetrics(blocks, RENDERS), SeamMetrics(), list[JsonObject]()
-    for figures in measured:
+    by_block, seams, rows = BlockMetrics(blocks, RENDER_NAMES), SeamMetrics(), list[JsonObject]()
+    for figures in per_view_metrics:
         by_block.merge(figures.by_block)
         seams.merge(figures.seams)
         rows.append(figures.row)
-    result: BlockMetricsDocument = jsonable(
+    result: BlockMetricsDocument = to_jsonable(
         {
             "blocks": by_block.rows(),
-            "all": by_block.everywhere(),
+            "all": by_block.overall(),
             "seams": {"border_px": BORDER_PX, **seams.figures()},
             "views": rows,
         }
@@ -149,15 +149,15 @@ def conclude(measured: Iterable[BlockFigures], blocks: int, output: Path) -> Blo
     return result
 
 
-def measure_view(view: View, stem: str, inputs: BlockInputs) -> tuple[BlockFigures, SeamView]:
+def measure_block_view(view: View, stem: str, inputs: BlockInputs) -> tuple[BlockViewMetrics, SeamView]:
     """Measure a view; what it comes to, and what a picture of it shows."""
-    by_block, seams = BlockMetrics(len(inputs.blocks), RENDERS), SeamMetrics()
+    by_block, seams = BlockMetrics(len(inputs.blocks), RENDER_NAMES), SeamMetrics()
     reference, mask = inputs.photographs.load_image(view), inputs.photographs.load_mask(view)
     drawn = inputs.render_merged(view.camera)
-    labels = label_map(drawn, view.camera, inputs.blocks)
+    labels = block_label_map(drawn, view.camera, inputs.blocks)
     coarse, merged = inputs.picture(inputs.render_coarse(view.camera), view), inputs.picture(drawn, view)
     squared = {"coarse": squared_error(coarse, reference), "merged": squared_error(merged, reference)}
-    alone = _alone(view, labels, reference, inputs)
+    alone = _isolated_errors(view, labels, reference, inputs)
     by_block.add(labels, squared | {"alone": alone}, mask)
     errors = {f"mse_{name}": values for name, values in squared.items()}
     errors["mae_coarse"] = comparison_images.absolute_error(coarse, reference)
@@ -170,23 +170,23 @@ def measure_view(view: View, stem: str, inputs: BlockInputs) -> tuple[BlockFigur
     )  # fmt: skip
     row = {
         "name": view.name,
-        "border_pixels": seen.border_pixels,
-        **{f"psnr_{name}": psnr_of(masked_mean(values, mask)) for name, values in squared.items()},
+        "border_pixels": seen.border_pixel_count,
+        **{f"psnr_{name}": psnr_from_mse(masked_mean(values, mask)) for name, values in squared.items()},
         **{f"psnr_{name}_border": _psnr_within(values, kept) for name, values in squared.items()},
     }
-    return BlockFigures(row, by_block, seams), seen
+    return BlockViewMetrics(row, by_block, seams), seen
 
 
 def _psnr_within(values: Float[np.ndarray, "h w"], where: Bool[np.ndarray, "h w"]) -> float | None:
-    return psnr_of(float(values[where].mean())) if where.any() else None
+    return psnr_from_mse(float(values[where].mean())) if where.any() else None
 
 
-def _alone(
+def _isolated_errors(
     view: View, labels: Int16[np.ndarray, "h w"], reference: UInt8[np.ndarray, "h w 3"], inputs: BlockInputs
 ) -> Float[np.ndarray, "h w"]:
     """Squared error of each block's own render where the block is shown, NaN where there is none."""
     errors = np.full(labels.shape, np.nan)
-    for index in blocks_shown(labels, len(inputs.blocks)):
+    for index in visible_blocks(labels, len(inputs.blocks)):
         rendered = inputs.render_block(index, view.camera)
         if rendered is not None:
             own = labels == index
@@ -194,7 +194,7 @@ def _alone(
     return errors
 
 
-def seam_picture(view: SeamView) -> Image.Image:
+def draw_seam_image(view: SeamView) -> Image.Image:
     """Coarse | merged | merged with the borders of blocks | error of the merged render, labelled."""
     height, width = view.labels.shape
     size = comparison_images.panel_size(width, height, comparison_images.PANEL_MIN_PX, comparison_images.PANEL_MAX_PX)
@@ -204,22 +204,22 @@ def seam_picture(view: SeamView) -> Image.Image:
     panels = [
         comparison_images.Panel(comparison_images.resize(view.coarse, size), "coarse", _caption(view.coarse, view)),
         comparison_images.Panel(comparison_images.resize(view.merged, size), "merged", _caption(view.merged, view)),
-        comparison_images.Panel(with_borders(view.merged, view.labels, size), "borders of blocks"),
+        comparison_images.Panel(draw_block_borders(view.merged, view.labels, size), "borders of blocks"),
         comparison_images.Panel(
-            comparison_images.resize(comparison_images.colourise(error, comparison_images.ERROR_LIMIT), size),
+            comparison_images.resize(comparison_images.colorize(error, comparison_images.ERROR_LIMIT), size),
             f"merged: {comparison_images.ERROR_LABEL}",
         ),
     ]
-    return comparison_images.row_of_panels(panels, view.name, comparison_images.ERROR_LIMIT)
+    return comparison_images.draw_panels(panels, view.name, comparison_images.ERROR_LIMIT)
 
 
 def _caption(image: UInt8[np.ndarray, "h w 3"], view: SeamView) -> str:
     errors = squared_error(image, view.reference)
     near = _psnr_within(errors, view.border)
-    return f"{psnr_of(masked_mean(errors, view.mask)):.2f} dB, near borders {shown(near, '{:.2f}')}"
+    return f"{psnr_from_mse(masked_mean(errors, view.mask)):.2f} dB, near borders {format_value(near, '{:.2f}')}"
 
 
-def with_borders(
+def draw_block_borders(
     image: UInt8[np.ndarray, "h w 3"], labels: Int16[np.ndarray, "h w"], size: tuple[int, int]
 ) -> Image.Image:
     """The picture at `size` (width, height) with thin lines between blocks and the number of each block."""
@@ -227,16 +227,16 @@ def with_borders(
     lines = border_lines(shown_labels)
     rim = cv2.dilate(lines.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     pixels = np.asarray(comparison_images.resize(image, size)).copy()
-    pixels[rim], pixels[lines] = RIM_COLOUR, LINE_COLOUR
+    pixels[rim], pixels[lines] = OUTLINE_COLOR, LINE_COLOR
     picture = Image.fromarray(pixels)
-    draw, face = ImageDraw.Draw(picture), comparison_images.font(max(12, size[0] // 34), bold=True)
-    for index in blocks_shown(shown_labels, int(shown_labels.max(initial=-1)) + 1):
-        place = _roomiest_place(shown_labels == index)
-        draw.text(place, str(index), LINE_COLOUR, face, anchor="mm", stroke_width=2, stroke_fill=RIM_COLOUR)
+    draw, face = ImageDraw.Draw(picture), comparison_images.load_font(max(12, size[0] // 34), bold=True)
+    for index in visible_blocks(shown_labels, int(shown_labels.max(initial=-1)) + 1):
+        place = _label_position(shown_labels == index)
+        draw.text(place, str(index), LINE_COLOR, face, anchor="mm", stroke_width=2, stroke_fill=OUTLINE_COLOR)
     return picture
 
 
-def _roomiest_place(region: Bool[np.ndarray, "h w"]) -> tuple[int, int]:
+def _label_position(region: Bool[np.ndarray, "h w"]) -> tuple[int, int]:
     """x, y of the pixel farthest from the region's edge and from the edge of the picture."""
     padded = np.pad(region.astype(np.uint8), 1)
     distance = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
@@ -244,10 +244,10 @@ def _roomiest_place(region: Bool[np.ndarray, "h w"]) -> tuple[int, int]:
     return column, row
 
 
-def block_table(result: Mapping[str, Any]) -> RenderableType:
+def make_block_table(result: Mapping[str, Any]) -> RenderableType:
     """What `by_block.json` holds, for the console."""
     table = Table(box=box.SIMPLE_HEAD, title="PSNR (dB) by block, over test pixels", title_justify="left")
-    for column in ("block", "pixels", *RENDERS, "merged − coarse"):
+    for column in ("block", "pixels", *RENDER_NAMES, "merged − coarse"):
         table.add_column(column, justify="right")
     for row in result["blocks"]:
         table.add_row(str(row["block"]), *_cells(row))
@@ -257,16 +257,20 @@ def block_table(result: Mapping[str, Any]) -> RenderableType:
 
 
 def _cells(row: Mapping[str, Any]) -> list[str]:
-    coarse, alone, merged = (row[f"psnr_{name}"] for name in RENDERS)
+    coarse, alone, merged = (row[f"psnr_{name}"] for name in RENDER_NAMES)
     gain = None if coarse is None or merged is None else merged - coarse
-    return [f"{row['pixels']:,}", *(shown(each, "{:.2f}") for each in (coarse, alone, merged)), shown(gain, "{:+.2f}")]
+    return [
+        f"{row['pixels']:,}",
+        *(format_value(each, "{:.2f}") for each in (coarse, alone, merged)),
+        format_value(gain, "{:+.2f}"),
+    ]
 
 
 def _seam_line(seams: Mapping[str, Any]) -> str:
     if not seams["border_pixels"]:
         return "no border between blocks is in sight"
-    coarse, merged = (shown(seams[f"mae_{name}"]["ratio"], "{:.3f}") for name in SeamMetrics.NAMES)
+    coarse, merged = (format_value(seams[f"mae_{name}"]["ratio"], "{:.3f}") for name in SeamMetrics.RENDER_NAMES)
     return (
         f"error within {seams['border_px']:.0f} px of a border over error elsewhere: merged {merged}, coarse {coarse} "
-        f"(which has no seams); merged over coarse {shown(seams['seam_mae'], '{:.3f}')}"
+        f"(which has no seams); merged over coarse {format_value(seams['seam_mae'], '{:.3f}')}"
     )

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int16
 
-from vdgs.evaluation.metrics import psnr_of
+from vdgs.evaluation.metrics import psnr_from_mse
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import Raster
 from vdgs.partition.blocks import Blocks
@@ -24,30 +24,30 @@ from vdgs.system.documents import JsonObject
 #: Pixels this near to a change of label belong to the border.
 BORDER_PX = 10.0
 #: Less opaque pixels count as showing nothing: their depth says little.
-DRAWN_ALPHA = 0.5
+MIN_ALPHA = 0.5
 #: A block is measured in the views of which it owns at least this share: a sliver tells little and costs a render.
-LEAST_SHARE = 0.005
+MIN_VIEW_SHARE = 0.005
 #: The label of a pixel where nothing is drawn.
-NOTHING = -1
+NO_BLOCK = -1
 
 
-def label_map(drawn: Raster, camera: Camera, blocks: Blocks) -> Int16[np.ndarray, "h w"]:
+def block_label_map(raster: Raster, camera: Camera, blocks: Blocks) -> Int16[np.ndarray, "h w"]:
     """The block that owns what each pixel shows, NOTHING where alpha is at most one half.
 
     The place is the centre of the pixel at the median depth: where a surface is, unlike the expected depth, which
     at the edge of a roof lies between roof and ground. Raises ValueError if the view was drawn without depth.
     """
-    if drawn.median_depth is None:
+    if raster.median_depth is None:
         raise ValueError("labels need a render with depth")
-    alpha = drawn.alpha.double().cpu().numpy()
-    seen = alpha > DRAWN_ALPHA
-    labels = np.full(alpha.shape, NOTHING, np.int16)
-    depth = drawn.median_depth.double().cpu().numpy()[seen]
-    labels[seen] = blocks.owner(_back_projected(np.argwhere(seen), depth, camera)[:, :2])
+    alpha = raster.alpha.double().cpu().numpy()
+    seen = alpha > MIN_ALPHA
+    labels = np.full(alpha.shape, NO_BLOCK, np.int16)
+    depth = raster.median_depth.double().cpu().numpy()[seen]
+    labels[seen] = blocks.owner(_unproject_pixels(np.argwhere(seen), depth, camera)[:, :2])
     return labels
 
 
-def _back_projected(pixels: np.ndarray, depth: Float[np.ndarray, " n"], camera: Camera) -> Float[np.ndarray, "n 3"]:
+def _unproject_pixels(pixels: np.ndarray, depth: Float[np.ndarray, " n"], camera: Camera) -> Float[np.ndarray, "n 3"]:
     """World points of pixels (row, column) [n, 2] at depths along the camera's axis; the inverse of `project`."""
     x = (pixels[:, 1] + 0.5 - camera.cx) / camera.fx
     y = (pixels[:, 0] + 0.5 - camera.cy) / camera.fy
@@ -78,16 +78,16 @@ def border_pixels(labels: Int16[np.ndarray, "h w"], width_px: float = BORDER_PX)
     return (distance <= width_px) & (labels >= 0)
 
 
-def blocks_shown(labels: Int16[np.ndarray, "h w"], blocks: int) -> list[int]:
+def visible_blocks(labels: Int16[np.ndarray, "h w"], blocks: int) -> list[int]:
     """The blocks that own at least LEAST_SHARE of the view."""
     counts = np.bincount(labels[labels >= 0].astype(np.int64), minlength=blocks)
-    return np.flatnonzero(counts >= max(1.0, LEAST_SHARE * labels.size)).tolist()
+    return np.flatnonzero(counts >= max(1.0, MIN_VIEW_SHARE * labels.size)).tolist()
 
 
 _AnyPooled = TypeVar("_AnyPooled", bound="_Pooled")
 
 
-class _Pooled:
+class _PooledErrors:
     """Pixels by group (blocks, or places), and sums of errors over them by name, one view after the other."""
 
     def __init__(self, groups: int, names: Sequence[str]) -> None:
@@ -100,7 +100,7 @@ class _Pooled:
         for name, total in self._sums.items():
             total += other._sums[name]
 
-    def arrays(self) -> dict[str, np.ndarray]:
+    def to_arrays(self) -> dict[str, np.ndarray]:
         """What was counted: for files."""
         return {
             "pixels": self._pixels, "names": np.array([*self._sums], np.str_), "sums": np.stack([*self._sums.values()]),
@@ -111,14 +111,14 @@ class _Pooled:
         """The inverse of `arrays`."""
         found = cls.__new__(cls)
         names = [str(name) for name in arrays["names"]]
-        _Pooled.__init__(found, len(arrays["pixels"]), names)
+        _PooledErrors.__init__(found, len(arrays["pixels"]), names)
         found._pixels += arrays["pixels"]
         for name, sums in zip(names, arrays["sums"], strict=True):
             found._sums[name] += sums
         return found
 
 
-class BlockMetrics(_Pooled):
+class BlockMetrics(_PooledErrors):
     """Squared errors of named renders, pooled by block; `add` each test view, then read `rows`."""
 
     def __init__(self, blocks: int, names: Sequence[str]) -> None:
@@ -130,9 +130,9 @@ class BlockMetrics(_Pooled):
         squared_errors: Mapping[str, Float[np.ndarray, "h w"]],
         mask: Bool[np.ndarray, "h w"] | None = None,
     ) -> None:
-        """Count one view. Only blocks of `blocks_shown` take part, so that all renders are measured on the same pixels;
+        """Count one view. Only blocks of `visible_blocks` take part, so that all renders are measured on the same pixels;
         a name whose errors are NaN there has no figure for that block."""
-        counted = np.isin(labels, blocks_shown(labels, len(self._pixels)))
+        counted = np.isin(labels, visible_blocks(labels, len(self._pixels)))
         if mask is not None:
             counted &= mask
         keys = labels[counted].astype(np.int64)
@@ -144,24 +144,24 @@ class BlockMetrics(_Pooled):
         """For each block: block, pixels, and `psnr_NAME` in dB of each render, NaN where it has none."""
         return [{"block": index, **self._figures([index])} for index in range(len(self._pixels))]
 
-    def everywhere(self) -> dict[str, float]:
+    def overall(self) -> dict[str, float]:
         """The same over the pixels of all blocks."""
         return self._figures(list(range(len(self._pixels))))
 
     def _figures(self, chosen: list[int]) -> dict[str, float]:
         pixels = int(self._pixels[chosen].sum())
         means = {name: float(sums[chosen].sum()) / pixels if pixels else np.nan for name, sums in self._sums.items()}
-        return {"pixels": pixels, **{f"psnr_{name}": psnr_of(mean) for name, mean in means.items()}}
+        return {"pixels": pixels, **{f"psnr_{name}": psnr_from_mse(mean) for name, mean in means.items()}}
 
 
-class SeamMetrics(_Pooled):
+class SeamMetrics(_PooledErrors):
     """Errors at the borders of blocks against errors elsewhere; `add` each test view, then read `figures`."""
 
     #: The renders that are compared. The coarse one has no seams: it says how hard the places at the borders are.
     NAMES = ("coarse", "merged")
 
     def __init__(self) -> None:
-        super().__init__(2, [f"{kind}_{name}" for kind in ("mae", "mse") for name in self.NAMES])
+        super().__init__(2, [f"{kind}_{name}" for kind in ("mae", "mse") for name in self.RENDER_NAMES])
 
     def add(
         self,
@@ -185,7 +185,7 @@ class SeamMetrics(_Pooled):
             border, elsewhere = (_ratio(float(sums[place]), float(self._pixels[place])) for place in (0, 1))
             result[name] = {"border": border, "elsewhere": elsewhere, "ratio": _ratio(border, elsewhere)}
         for kind in ("mae", "mse"):
-            coarse, merged = (result[f"{kind}_{name}"]["ratio"] for name in self.NAMES)
+            coarse, merged = (result[f"{kind}_{name}"]["ratio"] for name in self.RENDER_NAMES)
             result[f"seam_{kind}"] = _ratio(merged, coarse)
         return result
 

@@ -13,16 +13,16 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from vdgs.evaluation.metrics import psnr_of
+from vdgs.evaluation.metrics import psnr_from_mse
 
 #: Equal shares of pixels (or views) reported by default: quintiles.
-QUANTILE_BINS = 5
+DEFAULT_BINS = 5
 #: Sign, exponent and 11 bits of mantissa of a float32 remain: counts up to 4096 stay exact, fractions
 #: to 1 in 2,000, and no range need be known beforehand. The bits of non-negative floats sort as numbers.
 _DROPPED_BITS = 12
-KEYS = 1 << (31 - _DROPPED_BITS)
+NUM_KEYS = 1 << (31 - _DROPPED_BITS)
 
-Bin = dict[str, float | int | None]
+VisibilityBin = dict[str, float | int | None]
 
 
 class VisibilityHistogram:
@@ -32,8 +32,8 @@ class VisibilityHistogram:
     """
 
     def __init__(self, names: Sequence[str]) -> None:
-        self._counts = np.zeros(KEYS, np.int64)
-        self._sums = {name: np.zeros(KEYS) for name in names}
+        self._counts = np.zeros(NUM_KEYS, np.int64)
+        self._sums = {name: np.zeros(NUM_KEYS) for name in names}
         self._empty_count = 0
         self._empty_sums = dict.fromkeys(names, 0.0)
 
@@ -50,11 +50,11 @@ class VisibilityHistogram:
         kept = np.ones(visibility.shape, bool) if mask is None else mask
         empty = kept & np.isnan(visibility)
         seen = kept & ~empty
-        keys = key_of(np.rint(visibility[seen]))
-        self._counts += np.bincount(keys, minlength=KEYS)
+        keys = histogram_keys(np.rint(visibility[seen]))
+        self._counts += np.bincount(keys, minlength=NUM_KEYS)
         self._empty_count += int(empty.sum())
         for name, total in self._sums.items():
-            total += np.bincount(keys, weights=values[name][seen], minlength=KEYS)
+            total += np.bincount(keys, weights=values[name][seen], minlength=NUM_KEYS)
             self._empty_sums[name] += float(values[name][empty].sum())
 
     def merge(self, other: VisibilityHistogram) -> None:
@@ -71,7 +71,7 @@ class VisibilityHistogram:
     def names(self) -> list[str]:
         return [*self._sums]
 
-    def arrays(self) -> dict[str, np.ndarray]:
+    def to_arrays(self) -> dict[str, np.ndarray]:
         """What was counted, without the places where nothing was: for files."""
         keys = np.flatnonzero(self._counts)
         return {
@@ -91,38 +91,38 @@ class VisibilityHistogram:
             found._empty_sums[name] = float(empty)
         return found
 
-    def bins(self, n_bins: int = QUANTILE_BINS) -> list[Bin]:
+    def bins(self, n_bins: int = DEFAULT_BINS) -> list[VisibilityBin]:
         """Quantile bins, least visible first: lower and upper V (whole, inclusive), pixels, a figure per name.
 
         Equal values of V are never split, so bins may differ in size and fewer than `n_bins` may come
         back. Pixels where the model shows nothing, if any, lead as a bin without bounds (both None).
         """
-        result: list[Bin] = []
+        result: list[VisibilityBin] = []
         if self._empty_count:
             result.append(self._bin(None, None, self._empty_count, self._empty_sums))
         keys = np.flatnonzero(self._counts)
         for group in quantile_groups(self._counts[keys], n_bins):
             chosen = keys[group]
             sums = {name: float(total[chosen].sum()) for name, total in self._sums.items()}
-            lower, upper = value_of(chosen[[0, -1]])
+            lower, upper = histogram_values(chosen[[0, -1]])
             result.append(self._bin(float(lower), float(upper), int(self._counts[chosen].sum()), sums))
         return result
 
     @staticmethod
-    def _bin(lower: float | None, upper: float | None, pixels: int, sums: Mapping[str, float]) -> Bin:
-        figures: Bin = {"lower": lower, "upper": upper, "pixels": pixels}
+    def _bin(lower: float | None, upper: float | None, pixels: int, sums: Mapping[str, float]) -> VisibilityBin:
+        figures: VisibilityBin = {"lower": lower, "upper": upper, "pixels": pixels}
         for name, total in sums.items():
             mean = total / pixels
             if name.startswith("squared_error"):
-                figures[name.replace("squared_error", "psnr", 1)] = psnr_of(mean)
+                figures[name.replace("squared_error", "psnr", 1)] = psnr_from_mse(mean)
             else:
                 figures[name] = mean
         return figures
 
 
 def view_bins(
-    visibility: Sequence[float], figures: Sequence[Mapping[str, float | None]], n_bins: int = QUANTILE_BINS
-) -> list[Bin]:
+    visibility: Sequence[float], figures: Sequence[Mapping[str, float | None]], n_bins: int = DEFAULT_BINS
+) -> list[VisibilityBin]:
     """Quantile bins of whole test views by the mean V of what each sees, and their mean figures.
 
     Each figure is the mean over the views of the bin that have it (None where none has). Views without
@@ -132,10 +132,10 @@ def view_bins(
     order = [int(i) for i in np.argsort(visible, kind="stable") if np.isfinite(visible[i])]
     values, counts = np.unique(visible[order], return_counts=True)
     ends = np.concatenate([[0], np.cumsum(counts)])
-    result: list[Bin] = []
+    result: list[VisibilityBin] = []
     for group in quantile_groups(counts, n_bins):
         members = order[ends[group[0]] : ends[group[-1] + 1]]
-        entry: Bin = {
+        entry: VisibilityBin = {
             "lower": float(values[group[0]]),
             "upper": float(values[group[-1]]),
             "views": len(members),
@@ -146,7 +146,7 @@ def view_bins(
     return result
 
 
-def bounds_of(lower: float, upper: float) -> str:
+def format_bounds(lower: float, upper: float) -> str:
     """The least and the greatest V of a bin for people: `3 to 5`, or `4`."""
     return " to ".join(dict.fromkeys(f"{end:,.0f}" for end in (lower, upper)))
 
@@ -169,13 +169,13 @@ def quantile_groups(counts: np.ndarray, n_bins: int) -> list[np.ndarray]:
     return [np.flatnonzero(share == each) for each in np.unique(share)]
 
 
-def key_of(values: np.ndarray) -> np.ndarray:
+def histogram_keys(values: np.ndarray) -> np.ndarray:
     """Where non-negative numbers (infinity too) are counted in a histogram of KEYS places, in their order."""
     # Adding zero turns a negative zero, whose bits would be a huge key, into a positive one.
     positive = np.maximum(values, 0.0).astype(np.float32) + np.float32(0.0)
     return (positive.view(np.uint32) >> _DROPPED_BITS).astype(np.int64)
 
 
-def value_of(keys: np.ndarray) -> np.ndarray:
+def histogram_values(keys: np.ndarray) -> np.ndarray:
     """The least number, float32, that is counted at each place."""
     return (keys.astype(np.uint32) << _DROPPED_BITS).view(np.float32)

@@ -14,32 +14,32 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-ROUNDS = 5
+FIT_ITERATIONS = 5
 #: A value counts as saturated within half a level of 8 bits of black or white.
-SATURATION = 0.5 / 255
+SATURATION_MARGIN = 0.5 / 255
 #: Fewer usable pixels than this (ten for each coefficient) and nothing is fitted (choice).
 MIN_PIXELS = 100
 #: Pixels whose features are held at a time. Bounds the memory on large photographs, keeps the features
 #: in cache, and the products below the size at which OpenBLAS wakes threads (three times slower on two
 #: busy cores).
-CHUNK = 2048
+PIXELS_PER_CHUNK = 2048
 
 
 @dataclass(frozen=True, eq=False)
-class ColourCorrection:
+class ColorCorrection:
     """The corrected image, float64 [h, w, 3] in [0, 1], and whether there was enough to fit it."""
 
     image: Float[np.ndarray, "h w 3"]
     fitted: bool
 
 
-def correct_colours(
+def correct_colors(
     image: np.ndarray,
     reference: np.ndarray,
     mask: Bool[np.ndarray, "h w"] | None = None,
-    rounds: int = ROUNDS,
-    chunk: int = CHUNK,
-) -> ColourCorrection:
+    iterations: int = FIT_ITERATIONS,
+    chunk: int = PIXELS_PER_CHUNK,
+) -> ColorCorrection:
     """Warp the colours of `image` [h, w, 3] towards those of `reference`, both uint8 or floats in [0, 1].
 
     Each round regresses every channel of the reference on the features of the current estimate, over
@@ -48,46 +48,46 @@ def correct_colours(
     not the image that comes back. The features of `chunk` pixels are held at a time. With fewer than
     `MIN_PIXELS` usable pixels in any channel of any round the image comes back unchanged, `fitted` false.
     """
-    return _corrected(image, reference, mask, rounds, _quadratic, chunk)
+    return _correct(image, reference, mask, iterations, _quadratic, chunk)
 
 
-def correct_colours_affinely(
+def correct_colors_affine(
     image: np.ndarray, reference: np.ndarray, mask: Bool[np.ndarray, "h w"] | None = None
-) -> ColourCorrection:
-    """As `correct_colours`, but by one affine map of the colours, fitted once."""
-    return _corrected(image, reference, mask, 1, _affine)
+) -> ColorCorrection:
+    """As `correct_colors`, but by one affine map of the colours, fitted once."""
+    return _correct(image, reference, mask, 1, _affine)
 
 
-Features = Callable[[Float[np.ndarray, "3 n"]], np.ndarray]
+FeatureFunction = Callable[[Float[np.ndarray, "3 n"]], np.ndarray]
 
 
-def _corrected(
+def _correct(
     image: np.ndarray,
     reference: np.ndarray,
     mask: Bool[np.ndarray, "h w"] | None,
-    rounds: int,
-    features: Features,
-    chunk: int = CHUNK,
-) -> ColourCorrection:
+    iterations: int,
+    features: FeatureFunction,
+    chunk: int = PIXELS_PER_CHUNK,
+) -> ColorCorrection:
     start, target = _planes(image), _planes(reference)
     kept = True if mask is None else mask.reshape(1, -1)
     usable = kept & _unsaturated(start) & _unsaturated(target)
     current, fitted = start, True
-    for _ in range(rounds):
+    for _ in range(iterations):
         coefficients = _fit(current, target, usable & _unsaturated(current), features, chunk)
         if coefficients is None:
             current, fitted = start, False
             break
         warped = [np.clip(coefficients @ features(current[:, at]), 0.0, 1.0) for at in _chunks(current, chunk)]
         current = np.concatenate(warped, axis=1)
-    return ColourCorrection(np.ascontiguousarray(current.T).reshape(image.shape), fitted)
+    return ColorCorrection(np.ascontiguousarray(current.T).reshape(image.shape), fitted)
 
 
 def _fit(
     current: Float[np.ndarray, "3 n"],
     target: Float[np.ndarray, "3 n"],
     usable: Bool[np.ndarray, "3 n"],
-    features_of: Features,
+    features_of: FeatureFunction,
     chunk: int,
 ) -> Float[np.ndarray, "3 f"] | None:
     """Least squares per channel from its own usable pixels, through the normal equations."""
@@ -117,7 +117,7 @@ def _quadratic(rgb: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "10 n"]:
 
 
 def _unsaturated(rgb: np.ndarray) -> np.ndarray:
-    return (rgb >= SATURATION) & (rgb <= 1.0 - SATURATION)
+    return (rgb >= SATURATION_MARGIN) & (rgb <= 1.0 - SATURATION_MARGIN)
 
 
 def _planes(image: np.ndarray) -> Float[np.ndarray, "3 n"]:

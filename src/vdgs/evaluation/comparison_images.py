@@ -20,7 +20,7 @@ from PIL import Image, ImageDraw, ImageFont
 #: runs, so that two pictures can be held side by side.
 ERROR_LIMIT = 0.2
 #: Perceptually uniform: equal steps of error look equal.
-ERROR_COLOURS = "inferno"
+ERROR_CMAP = "inferno"
 ERROR_LABEL = "absolute error (0 to 1)"
 INK, FAINT, PAPER = (28, 30, 34), (120, 124, 130), (255, 255, 255)
 #: Panels are shown between these widths; the renders themselves are saved untouched.
@@ -54,11 +54,9 @@ def absolute_error(
     return np.abs(image.astype(np.int16) - reference.astype(np.int16)).mean(axis=2) / 255.0
 
 
-def colourise(
-    values: Float[np.ndarray, "h w"], limit: float, colours: str = ERROR_COLOURS
-) -> UInt8[np.ndarray, "h w 3"]:
+def colorize(values: Float[np.ndarray, "h w"], limit: float, cmap: str = ERROR_CMAP) -> UInt8[np.ndarray, "h w 3"]:
     """Values from 0 to `limit` (clipped) to colours; NaN becomes white."""
-    table = (mpl.colormaps[colours](np.linspace(0.0, 1.0, 256))[:, :3] * 255.0 + 0.5).astype(np.uint8)
+    table = (mpl.colormaps[cmap](np.linspace(0.0, 1.0, 256))[:, :3] * 255.0 + 0.5).astype(np.uint8)
     known = ~np.isnan(values)
     levels = np.clip(np.where(known, values, 0.0) / limit, 0.0, 1.0) * 255.0 + 0.5
     picture = table[levels.astype(np.uint8)]
@@ -66,11 +64,11 @@ def colourise(
     return picture
 
 
-def comparison(
+def draw_comparison(
     reference: UInt8[np.ndarray, "h w 3"],
     image: UInt8[np.ndarray, "h w 3"],
     title: str,
-    figures: str = "",
+    metrics_text: str = "",
     mask: np.ndarray | None = None,
     limit: float = ERROR_LIMIT,
 ) -> Image.Image:
@@ -80,12 +78,12 @@ def comparison(
     if mask is not None:
         error = np.where(mask, error, np.nan)
     size = panel_size(reference.shape[1], reference.shape[0], PANEL_MIN_PX, PANEL_MAX_PX)
-    photograph, render, errors = (resize(picture, size) for picture in (reference, image, colourise(error, limit)))
-    row = [Panel(photograph, "photograph"), Panel(render, "render", figures), Panel(errors, ERROR_LABEL)]
-    return row_of_panels(row, title, limit)
+    photograph, render, errors = (resize(picture, size) for picture in (reference, image, colorize(error, limit)))
+    row = [Panel(photograph, "photograph"), Panel(render, "render", metrics_text), Panel(errors, ERROR_LABEL)]
+    return draw_panels(row, title, limit)
 
 
-def row_of_panels(panels: Sequence[Panel], title: str, limit: float) -> Image.Image:
+def draw_panels(panels: Sequence[Panel], title: str, limit: float) -> Image.Image:
     """Pictures of one size side by side under a title; the last is an error, its colour bar stands at its right."""
     width, height = panels[0].picture.size
     count, unit = len(panels), max(12, width // 34)
@@ -95,17 +93,17 @@ def row_of_panels(panels: Sequence[Panel], title: str, limit: float) -> Image.Im
         "RGB", (2 * margin + count * (width + gap) + bar_width + ticks_width, head + height + margin), PAPER
     )
     draw = ImageDraw.Draw(canvas)
-    draw.text((margin, unit * 9 // 10), title, INK, font(unit * 11 // 10, bold=True))
+    draw.text((margin, unit * 9 // 10), title, INK, load_font(unit * 11 // 10, bold=True))
     for column, panel in enumerate(panels):
         left = margin + column * (width + gap)
         canvas.paste(panel.picture, (left, head))
-        draw.text((left, head - unit * 3 // 5), panel.label, FAINT, font(unit), anchor="ls")
-        draw.text((left + width, head - unit * 3 // 5), panel.figures, INK, font(unit), anchor="rs")
-    _colour_bar(canvas, (margin + count * (width + gap), head, bar_width, height), limit, unit)
+        draw.text((left, head - unit * 3 // 5), panel.label, FAINT, load_font(unit), anchor="ls")
+        draw.text((left + width, head - unit * 3 // 5), panel.figures, INK, load_font(unit), anchor="rs")
+    _draw_colorbar(canvas, (margin + count * (width + gap), head, bar_width, height), limit, unit)
     return canvas
 
 
-def contact_sheet(cells: list[Thumbnail], title: str, columns: int | None = None) -> Image.Image:
+def draw_contact_sheet(cells: list[Thumbnail], title: str, columns: int | None = None) -> Image.Image:
     """Cells in a grid, photograph above render, the name and the caption below each pair."""
     if not cells:
         raise ValueError("a contact sheet needs at least one view")
@@ -117,25 +115,32 @@ def contact_sheet(cells: list[Thumbnail], title: str, columns: int | None = None
     cell_height = 2 * height + between + text * 2 + gap
     canvas = Image.new("RGB", (gap + columns * (width + gap), head + rows * cell_height), PAPER)
     draw = ImageDraw.Draw(canvas)
-    draw.text((gap, 14), _fitted(title, font(22, bold=True), float(canvas.width - 2 * gap)), INK, font(22, bold=True))
-    draw.text((gap, 42), "photograph above, render below", FAINT, font(13))
+    draw.text(
+        (gap, 14),
+        _ellipsize(title, load_font(22, bold=True), float(canvas.width - 2 * gap)),
+        INK,
+        load_font(22, bold=True),
+    )
+    draw.text((gap, 42), "photograph above, render below", FAINT, load_font(13))
     for index, cell in enumerate(cells):
         left = gap + (index % columns) * (width + gap)
         top = head + (index // columns) * cell_height
         canvas.paste(Image.fromarray(cell.photograph), (left, top))
         canvas.paste(Image.fromarray(cell.render), (left, top + height + between))
         line = top + 2 * height + between + text // 3
-        draw.text((left + width, line), cell.caption, INK, font(text - 2), anchor="ra")
-        room = float(width - draw.textlength(cell.caption, font(text - 2)) - 10)
-        draw.text((left, line), _fitted(cell.name, font(text - 2), room), FAINT, font(text - 2))
+        draw.text((left + width, line), cell.caption, INK, load_font(text - 2), anchor="ra")
+        room = float(width - draw.textlength(cell.caption, load_font(text - 2)) - 10)
+        draw.text((left, line), _ellipsize(cell.name, load_font(text - 2), room), FAINT, load_font(text - 2))
     return canvas
 
 
-def thumbnail(picture: UInt8[np.ndarray, "h w 3"], width: int = THUMBNAIL_PX) -> UInt8[np.ndarray, "small_h small_w 3"]:
+def make_thumbnail(
+    image: UInt8[np.ndarray, "h w 3"], width: int = THUMBNAIL_PX
+) -> UInt8[np.ndarray, "small_h small_w 3"]:
     """The picture at the width of a contact sheet cell; a tall one is bounded by the same height."""
-    scale = width / max(picture.shape[1], picture.shape[0])
-    size = (max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale)))
-    return np.asarray(resize(picture, size))
+    scale = width / max(image.shape[1], image.shape[0])
+    size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
+    return np.asarray(resize(image, size))
 
 
 def panel_size(width: int, height: int, smallest: int, largest: int) -> tuple[int, int]:
@@ -144,9 +149,9 @@ def panel_size(width: int, height: int, smallest: int, largest: int) -> tuple[in
     return wanted, max(1, round(height * wanted / width))
 
 
-def resize(picture: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> Image.Image:
+def resize(pixels: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> Image.Image:
     """Reduced with a Lanczos filter, enlarged by repeating pixels (nothing is invented)."""
-    image = Image.fromarray(picture)
+    image = Image.fromarray(pixels)
     if image.size == size:
         return image
     method = Image.Resampling.LANCZOS if size[0] < image.width else Image.Resampling.NEAREST
@@ -154,17 +159,17 @@ def resize(picture: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> Image.
 
 
 @cache
-def font(size_px: int, bold: bool = False) -> ImageFont.FreeTypeFont:
+def load_font(size_px: int, bold: bool = False) -> ImageFont.FreeTypeFont:
     """DejaVu Sans as matplotlib ships it."""
     name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
     return ImageFont.truetype(str(Path(mpl.get_data_path()) / "fonts" / "ttf" / name), size_px)
 
 
-def _colour_bar(canvas: Image.Image, box: tuple[int, int, int, int], limit: float, unit: int) -> None:
+def _draw_colorbar(canvas: Image.Image, box: tuple[int, int, int, int], limit: float, unit: int) -> None:
     """A vertical bar (left, top, width, height), 0 at the foot, labelled at five places."""
     left, top, width, height = box
     ramp = np.broadcast_to(np.linspace(limit, 0.0, height)[:, None], (height, width))
-    canvas.paste(Image.fromarray(colourise(ramp, limit)), (left, top))
+    canvas.paste(Image.fromarray(colorize(ramp, limit)), (left, top))
     draw = ImageDraw.Draw(canvas)
     for tick in range(5):
         value = limit * tick / 4
@@ -172,10 +177,10 @@ def _colour_bar(canvas: Image.Image, box: tuple[int, int, int, int], limit: floa
         draw.line([(left + width, y), (left + width + unit // 3, y)], INK)
         anchor = {0: "ls", 4: "lt"}.get(tick, "lm")
         label = f"{value:.2f}" if tick < 4 else f"≥{value:.2f}"
-        draw.text((left + width + unit // 2, y), label, INK, font(unit), anchor=anchor)
+        draw.text((left + width + unit // 2, y), label, INK, load_font(unit), anchor=anchor)
 
 
-def _fitted(text: str, face: ImageFont.FreeTypeFont, room_px: float) -> str:
+def _ellipsize(text: str, face: ImageFont.FreeTypeFont, room_px: float) -> str:
     """The text, or its two ends with an ellipsis where there is no room for all of it."""
     if face.getlength(text) <= room_px:
         return text

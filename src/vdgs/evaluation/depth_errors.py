@@ -11,36 +11,38 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Bool, Float
 
-from vdgs.evaluation.by_block import DRAWN_ALPHA
-from vdgs.evaluation.by_visibility import KEYS, key_of, value_of
+from vdgs.evaluation.by_block import MIN_ALPHA
+from vdgs.evaluation.by_visibility import NUM_KEYS, histogram_keys, histogram_values
 from vdgs.kernels.kernel_types import Raster
 
 #: Errors up to this share of the camera height count as within one percent.
-NEAR = 0.01
+NEAR_THRESHOLD = 0.01
 #: Two depths of a pixel: the mean over what is blended, and where it becomes half opaque.
-KINDS = ("expected", "median")
+DEPTH_KINDS = ("expected", "median")
 #: What is reported of each kind.
-NAMES = tuple(f"{name}_{kind}" for kind in KINDS for name in ("depth_error_median", "depth_within_1_percent"))
+METRIC_NAMES = tuple(
+    f"{name}_{kind}" for kind in DEPTH_KINDS for name in ("depth_error_median", "depth_within_1_percent")
+)
 
 
 class DepthErrors:
     """Errors of pixels, of any number of views: counted in a histogram, so that memory does not grow with them."""
 
     def __init__(self) -> None:
-        self._counts = np.zeros(KEYS, np.int64)
+        self._counts = np.zeros(NUM_KEYS, np.int64)
         self._near = 0
 
     def add(self, errors: Float[np.ndarray, " n"]) -> None:
         """Count errors: shares of the camera height, or infinity."""
-        self._counts += np.bincount(key_of(errors), minlength=KEYS)
-        self._near += int(np.count_nonzero(errors <= NEAR))
+        self._counts += np.bincount(histogram_keys(errors), minlength=NUM_KEYS)
+        self._near += int(np.count_nonzero(errors <= NEAR_THRESHOLD))
 
     def merge(self, other: DepthErrors) -> None:
         """Count what another one counted."""
         self._counts += other._counts
         self._near += other._near
 
-    def arrays(self) -> dict[str, np.ndarray]:
+    def to_arrays(self) -> dict[str, np.ndarray]:
         """What was counted, without the places where nothing was: for files."""
         keys = np.flatnonzero(self._counts)
         return {"keys": keys, "counts": self._counts[keys], "near": np.array(self._near)}
@@ -62,17 +64,17 @@ class DepthErrors:
         if not self.count:
             return None
         middle = np.searchsorted(np.cumsum(self._counts), (self.count + 1) // 2)
-        return float(value_of(np.array([middle]))[0])
+        return float(histogram_values(np.array([middle]))[0])
 
-    def share_near(self) -> float | None:
+    def near_share(self) -> float | None:
         """Of the errors, how many are at most NEAR; exact."""
         return self._near / self.count if self.count else None
 
 
-def errors_of_view(
-    drawn: Raster,
-    truth: Float[np.ndarray, "h w"],
-    seen: Bool[np.ndarray, "h w"],
+def compute_depth_errors(
+    raster: Raster,
+    true_depth: Float[np.ndarray, "h w"],
+    covered: Bool[np.ndarray, "h w"],
     camera_height: float,
 ) -> dict[str, Float[np.ndarray, " n"]]:
     """|depth - truth| / camera height at the seen pixels of which the truth is known (not of the sky), by kind.
@@ -80,24 +82,24 @@ def errors_of_view(
     `truth` is the depth along the camera's axis, in the units of the model like `camera_height` (> 0), infinite for
     sky. `drawn` comes with depth; a kind that the renderer does not know is left out.
     """
-    counted = seen & np.isfinite(truth)
-    alpha = drawn.alpha.double().cpu().numpy()[counted]
-    shown = alpha > DRAWN_ALPHA
+    counted = covered & np.isfinite(true_depth)
+    alpha = raster.alpha.double().cpu().numpy()[counted]
+    shown = alpha > MIN_ALPHA
     found = {}
-    for kind, depth in zip(KINDS, (drawn.depth, drawn.median_depth), strict=True):
+    for kind, depth in zip(DEPTH_KINDS, (raster.depth, raster.median_depth), strict=True):
         if depth is None:
             continue
         depths = depth.double().cpu().numpy()[counted]
         if kind == "expected":
             depths = depths / np.where(shown, alpha, 1.0)
-        found[kind] = np.where(shown, np.abs(depths - truth[counted]) / camera_height, np.inf)
+        found[kind] = np.where(shown, np.abs(depths - true_depth[counted]) / camera_height, np.inf)
     return found
 
 
-def figures_of(errors: Mapping[str, DepthErrors]) -> dict[str, float | None]:
+def summarize_depth_errors(errors: Mapping[str, DepthErrors]) -> dict[str, float | None]:
     """What is reported, under NAMES; None of a kind that is not there."""
-    figures: dict[str, float | None] = dict.fromkeys(NAMES)
+    figures: dict[str, float | None] = dict.fromkeys(METRIC_NAMES)
     for kind, each in errors.items():
         figures[f"depth_error_median_{kind}"] = each.median()
-        figures[f"depth_within_1_percent_{kind}"] = each.share_near()
+        figures[f"depth_within_1_percent_{kind}"] = each.near_share()
     return figures

@@ -26,19 +26,27 @@ from vdgs.captures.capture import View
 from vdgs.errors import RunError
 from vdgs.evaluation import comparison_images, image_io
 from vdgs.evaluation.by_visibility import VisibilityHistogram, mean_or_none, view_bins
-from vdgs.evaluation.depth_errors import DepthErrors, figures_of
+from vdgs.evaluation.depth_errors import DepthErrors, summarize_depth_errors
 from vdgs.evaluation.lpips import Lpips
-from vdgs.evaluation.metric_tables import metrics_table
-from vdgs.evaluation.opacity_coverage import largest_splats_of_all, solidity_of_all
-from vdgs.evaluation.renderable_model import EvaluationSettings, MeasuredModel, ModelFacts, ReferenceViews
-from vdgs.evaluation.view_metrics import AFFINE, CORRECTED, NEUTRAL, RAW, ViewFigures, ViewInputs, measure_view
-from vdgs.system.atomic_files import jsonable, write_json
+from vdgs.evaluation.metric_tables import make_metrics_table
+from vdgs.evaluation.opacity_coverage import summarize_opacity_coverage, summarize_oversized_splats
+from vdgs.evaluation.renderable_model import EvaluationSettings, ModelMetadata, ReferenceViews, RenderableModel
+from vdgs.evaluation.view_metrics import (
+    AFFINE_KEYS,
+    CORRECTED_KEYS,
+    RAW_KEYS,
+    REFERENCE_EXPOSURE_KEYS,
+    ViewInputs,
+    ViewMetrics,
+    measure_view,
+)
+from vdgs.system.atomic_files import to_jsonable, write_json
 from vdgs.system.documents import EvaluationMetrics, JsonObject
-from vdgs.system.stop_signals import stop_if_asked
+from vdgs.system.stop_signals import check_stop_requested
 
 
 @dataclass(eq=False)
-class _Gathered:
+class _MetricTotals:
     """What accumulates over the views."""
 
     rows: list[JsonObject] = field(default_factory=list)
@@ -46,7 +54,7 @@ class _Gathered:
     histogram: VisibilityHistogram | None = None
     depth_errors: dict[str, DepthErrors] = field(default_factory=dict)
 
-    def add(self, figures: ViewFigures) -> None:
+    def add(self, figures: ViewMetrics) -> None:
         self.rows.append(figures.row)
         if figures.cell is not None:
             self.cells.append(figures.cell)
@@ -57,9 +65,9 @@ class _Gathered:
             self.depth_errors.setdefault(kind, DepthErrors()).merge(errors)
 
 
-def evaluate(
-    photographs: ReferenceViews,
-    model: MeasuredModel,
+def evaluate_model(
+    reference_views: ReferenceViews,
+    model: RenderableModel,
     output: Path,
     *,
     lpips: Lpips | None = None,
@@ -75,16 +83,16 @@ def evaluate(
     Raises RunError without views, CaptureError where a photograph or mask does not fit its camera,
     TrainingDiverged where a render is not finite.
     """
-    refuse_without_views(photographs.views, output)
-    inputs = ViewInputs(photographs, model, lpips, settings or EvaluationSettings(), output)
-    measured = (_unless_stopped(index, inputs) for index in range(len(photographs.views)))
-    return conclude(
+    require_views(reference_views.views, output)
+    inputs = ViewInputs(reference_views, model, lpips, settings or EvaluationSettings(), output)
+    measured = (_unless_stopped(index, inputs) for index in range(len(reference_views.views)))
+    return summarize_views(
         measured, model.facts, output,
         lpips_note=lpips_note, settings=inputs.settings, timed=model.timed, console=console,
     )  # fmt: skip
 
 
-def refuse_without_views(views: Sequence[View], output: Path) -> None:
+def require_views(views: Sequence[View], output: Path) -> None:
     """Raise RunError where there is nothing to measure."""
     if not views:
         raise RunError(
@@ -93,14 +101,14 @@ def refuse_without_views(views: Sequence[View], output: Path) -> None:
         )
 
 
-def _unless_stopped(index: int, inputs: ViewInputs) -> ViewFigures:
-    stop_if_asked()
+def _unless_stopped(index: int, inputs: ViewInputs) -> ViewMetrics:
+    check_stop_requested()
     return measure_view(index, inputs)
 
 
-def conclude(
-    measured: Iterable[ViewFigures],
-    facts: ModelFacts,
+def summarize_views(
+    per_view_metrics: Iterable[ViewMetrics],
+    metadata: ModelMetadata,
     output: Path,
     *,
     lpips_note: str,
@@ -108,43 +116,43 @@ def conclude(
     timed: bool,
     console: Console | None,
 ) -> EvaluationMetrics:
-    """Gather views, in their order, into the figures of all of them; otherwise as `evaluate`. One is held at a time."""
-    gathered = _Gathered()
-    for figures in measured:
+    """Gather views, in their order, into the figures of all of them; otherwise as `evaluate_model`. One is held at a time."""
+    gathered = _MetricTotals()
+    for figures in per_view_metrics:
         gathered.add(figures)
-    result = _summary(gathered, facts, lpips_note, settings, timed)
+    result = _summary(gathered, metadata, lpips_note, settings, timed)
     _write(output, result, gathered, settings.title)
     if console is not None:
-        console.print(metrics_table(result, f"{len(gathered.rows)} {settings.title}"))
+        console.print(make_metrics_table(result, f"{len(gathered.rows)} {settings.title}"))
     return result
 
 
 def _summary(
-    gathered: _Gathered, facts: ModelFacts, lpips_note: str, settings: EvaluationSettings, timed: bool
+    gathered: _MetricTotals, facts: ModelMetadata, lpips_note: str, settings: EvaluationSettings, timed: bool
 ) -> EvaluationMetrics:
     rows = gathered.rows
-    means = {name: mean_or_none([row[name] for row in rows]) for name in RAW + CORRECTED + AFFINE}
+    means = {name: mean_or_none([row[name] for row in rows]) for name in RAW_KEYS + CORRECTED_KEYS + AFFINE_KEYS}
     pixel_bins = gathered.histogram.bins(settings.visibility_bins) if gathered.histogram else None
     visible = [np.nan if row["mean_visibility"] is None else row["mean_visibility"] for row in rows]
-    figures = [{name: row[name] for name in RAW + CORRECTED + AFFINE} for row in rows]
+    figures = [{name: row[name] for name in RAW_KEYS + CORRECTED_KEYS + AFFINE_KEYS} for row in rows]
     unfitted = sum(row.get("colour_fitted") is False for row in rows)
     notes = [note for note in (lpips_note, _exposure_note(rows, settings)) if note]
     if unfitted:
         notes.append(f"colour correction: too few unsaturated pixels in {unfitted} views, left as they are")
     result = {
         **means,
-        **{name: mean_or_none([row.get(name) for row in rows]) for name in NEUTRAL},
+        **{name: mean_or_none([row.get(name) for row in rows]) for name in REFERENCE_EXPOSURE_KEYS},
         "by_visibility": pixel_bins,
         "views_by_visibility": view_bins(visible, figures, settings.visibility_bins) if pixel_bins else None,
-        **solidity_of_all(rows),
-        **figures_of(gathered.depth_errors),
-        **largest_splats_of_all(rows),
+        **summarize_opacity_coverage(rows),
+        **summarize_depth_errors(gathered.depth_errors),
+        **summarize_oversized_splats(rows),
         **asdict(facts),
         "fps": 1.0 / max(statistics.median(row["render_seconds"] for row in rows), 1e-9) if timed else None,
         settings.title.replace(" ", "_"): len(rows),
         "notes": notes,
     }
-    measured: EvaluationMetrics = jsonable(result)
+    measured: EvaluationMetrics = to_jsonable(result)
     return measured
 
 
@@ -158,13 +166,13 @@ def _exposure_note(rows: Sequence[Mapping[str, Any]], settings: EvaluationSettin
     return f"views are drawn and measured {settings.exposed}{without}; beside that in neutral colours"
 
 
-def _write(output: Path, result: Mapping[str, Any], gathered: _Gathered, title: str) -> None:
+def _write(output: Path, result: Mapping[str, Any], gathered: _MetricTotals, title: str) -> None:
     if gathered.cells:
         count = len(gathered.rows)
         shown = f"{len(gathered.cells)} of {count}" if len(gathered.cells) < count else f"{count}"
         psnr = "PSNR –" if result["psnr"] is None else f"PSNR {result['psnr']:.2f} dB"
         ssim = "SSIM –" if result["ssim"] is None else f"SSIM {result['ssim']:.3f}"
-        sheet = comparison_images.contact_sheet(gathered.cells, f"{shown} {title} · {psnr} · {ssim}")
+        sheet = comparison_images.draw_contact_sheet(gathered.cells, f"{shown} {title} · {psnr} · {ssim}")
         image_io.write_png(output / "contact_sheet.png", np.asarray(sheet))
-    write_json(output / "per_view.json", jsonable(gathered.rows))
+    write_json(output / "per_view.json", to_jsonable(gathered.rows))
     write_json(output / "metrics.json", result)  # last: where it stands, the rest is complete

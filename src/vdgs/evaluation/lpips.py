@@ -29,7 +29,7 @@ from vdgs.errors import VdgsError
 VGG16_FILE = "vgg16-397923af.pth"
 VGG16_URL = f"https://download.pytorch.org/models/{VGG16_FILE}"
 #: Convolutions of VGG16 by stage; a stage ends where LPIPS taps it and a 2 x 2 maximum follows.
-STAGES: tuple[tuple[tuple[int, int, int], ...], ...] = (
+VGG_STAGES: tuple[tuple[tuple[int, int, int], ...], ...] = (
     # (index in torchvision's `features`, channels in, channels out)
     ((0, 3, 64), (2, 64, 64)),
     ((5, 64, 128), (7, 128, 128)),
@@ -40,8 +40,8 @@ STAGES: tuple[tuple[tuple[int, int, int], ...], ...] = (
 #: Where the packages keep the linear heads.
 HEAD_FILES = {"torchmetrics": "functional/image/lpips_models/vgg.pth", "lpips": "weights/v0.1/vgg.pth"}
 #: ImageNet statistics on the [-1, 1] scale, constants of the metric.
-SHIFT = (-0.030, -0.088, -0.188)
-SCALE = (0.458, 0.448, 0.450)
+INPUT_SHIFT = (-0.030, -0.088, -0.188)
+INPUT_SCALE = (0.458, 0.448, 0.450)
 _EPSILON = 1e-10
 #: Four halvings must leave a pixel.
 MIN_SIDE_PX = 16
@@ -64,7 +64,7 @@ class Lpips:
         (`lin0.model.1.weight` ...); ValueError where one is missing or has another shape."""
         self._stages: list[list[tuple[Tensor, Tensor]]] = []
         self._heads: list[Tensor] = []
-        for number, stage in enumerate(STAGES):
+        for number, stage in enumerate(VGG_STAGES):
             layers = []
             for index, inputs, outputs in stage:
                 weight = _take(backbone, f"features.{index}.weight", (outputs, inputs, 3, 3))
@@ -81,7 +81,7 @@ class Lpips:
 
     @torch.inference_mode()
     def _distance(self, x: Float[Tensor, "1 3 h w"], y: Float[Tensor, "1 3 h w"]) -> float:
-        shift, scale = (torch.tensor(v).reshape(1, 3, 1, 1) for v in (SHIFT, SCALE))
+        shift, scale = (torch.tensor(v).reshape(1, 3, 1, 1) for v in (INPUT_SHIFT, INPUT_SCALE))
         x, y = (x - shift) / scale, (y - shift) / scale
         total = 0.0
         for number, (layers, head) in enumerate(zip(self._stages, self._heads, strict=True)):
@@ -97,8 +97,8 @@ def load_lpips(weights: Path | None = None, heads: Path | None = None) -> tuple[
     `weights` is torchvision's VGG16 state dict (.pth or .safetensors); without it torch's own download
     folder is looked at. Raises VdgsError where a file that was named, or found, cannot be used.
     """
-    refuse_missing(weights)
-    cached = cached_weights()
+    check_weights_file(weights)
+    cached = default_weights_path()
     source = weights or (cached if cached.is_file() else None)
     if source is None:
         return None, (
@@ -116,16 +116,16 @@ def load_lpips(weights: Path | None = None, heads: Path | None = None) -> tuple[
             f"{source} and {found} do not make LPIPS: {error}. The weights must be torchvision's VGG16 "
             f"({VGG16_URL}), the heads vgg.pth of torchmetrics or lpips."
         ) from error
-    return metric, f"LPIPS from {source.name} ({_origin(source)})"
+    return metric, f"LPIPS from {source.name} ({_weights_origin(source)})"
 
 
-def refuse_missing(weights: Path | None) -> None:
+def check_weights_file(weights: Path | None) -> None:
     """Raise VdgsError where weights are named and no such file is there."""
     if weights is not None and not weights.is_file():
         raise VdgsError(f"--lpips-weights {weights}: no such file; it should hold the VGG16 weights.")
 
 
-def cached_weights() -> Path:
+def default_weights_path() -> Path:
     """Where torch keeps torchvision's VGG16 once something has downloaded it (TORCH_HOME moves it)."""
     return Path(torch.hub.get_dir()) / "checkpoints" / VGG16_FILE
 
@@ -140,7 +140,7 @@ def find_heads() -> Path | None:
     return None
 
 
-def _origin(weights: Path) -> str:
+def _weights_origin(weights: Path) -> str:
     """Whether these are torchvision's weights: the name of its file holds the start of its SHA-256."""
     digest = hashlib.sha256()
     with weights.open("rb") as stream:

@@ -10,18 +10,18 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from vdgs.evaluation.by_visibility import bounds_of
+from vdgs.evaluation.by_visibility import format_bounds
 from vdgs.system.units import data_size
 
 #: key in metrics.json, what people call it, format
-FIGURES = (
+QUALITY_METRICS = (
     ("psnr", "PSNR (dB) ↑", "{:.2f}"),
     ("ssim", "SSIM ↑", "{:.4f}"),
     ("lpips_vgg", "LPIPS vgg ↓", "{:.4f}"),
     ("lpips_vgg_01", "LPIPS vgg, [0,1] input ↓", "{:.4f}"),
 )
 #: Of solidity: what is measured over the pixels that training cameras see; those that are null are not shown.
-SOLIDITY = (
+COVERAGE_METRICS = (
     ("solid_share", "opaque (alpha ≥ 0.95) ↑", "{:.2%}"),
     ("psnr_seen_own", "PSNR before its own background (dB) ↑", "{:.2f}"),
     ("psnr_seen_black", "PSNR before black (dB) ↑", "{:.2f}"),
@@ -33,7 +33,7 @@ SOLIDITY = (
 )
 
 
-def metrics_table(result: Mapping[str, Any], title: str) -> RenderableType:
+def make_metrics_table(result: Mapping[str, Any], title: str) -> RenderableType:
     """What `metrics.json` holds: quality raw, colour-corrected, after an affine map of the colours and, where pictures
     are exposed, in neutral colours; quality by visibility, solidity, size and speed."""
     quality = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
@@ -42,9 +42,9 @@ def metrics_table(result: Mapping[str, Any], title: str) -> RenderableType:
         besides["_neutral"] = "neutral colours"
     for column in ("", "raw", *besides.values()):
         quality.add_column(column, justify="left" if not column else "right")
-    for key, label, form in FIGURES:
-        others = (shown(result.get(f"{key}{suffix}"), form) for suffix in besides)
-        quality.add_row(label, shown(result[key], form), *others)
+    for key, label, form in QUALITY_METRICS:
+        others = (format_value(result.get(f"{key}{suffix}"), form) for suffix in besides)
+        quality.add_row(label, format_value(result[key], form), *others)
     parts: list[RenderableType] = [quality]
     if result["by_visibility"]:
         parts.append(_visibility_table(result["by_visibility"]))
@@ -57,7 +57,7 @@ def metrics_table(result: Mapping[str, Any], title: str) -> RenderableType:
     return Group(*parts)
 
 
-def shown(value: float | None, form: str) -> str:
+def format_value(value: float | None, form: str) -> str:
     """The figure, or a dash where there is none."""
     return "–" if value is None else form.format(value)
 
@@ -67,10 +67,10 @@ def _visibility_table(bins: list[Mapping[str, Any]]) -> Table:
     for column in ("V", "pixels", "PSNR (dB)", "SSIM", "PSNR cc"):
         table.add_column(column, justify="right")
     for each in bins:
-        bounds = "nothing drawn" if each["lower"] is None else bounds_of(each["lower"], each["upper"])
+        bounds = "nothing drawn" if each["lower"] is None else format_bounds(each["lower"], each["upper"])
         table.add_row(
-            bounds, f"{each['pixels']:,}", shown(each["psnr"], "{:.2f}"), shown(each["ssim"], "{:.4f}"),
-            shown(each.get("psnr_cc"), "{:.2f}"),
+            bounds, f"{each['pixels']:,}", format_value(each["psnr"], "{:.2f}"), format_value(each["ssim"], "{:.4f}"),
+            format_value(each.get("psnr_cc"), "{:.2f}"),
         )  # fmt: skip
     return table
 
@@ -82,7 +82,7 @@ def _solidity_table(result: Mapping[str, Any]) -> Table:
     )  # fmt: skip
     table.add_column("")
     table.add_column("", justify="right")
-    for key, label, form in SOLIDITY:
+    for key, label, form in COVERAGE_METRICS:
         if result[key] is not None:
             table.add_row(label, form.format(result[key]))
     return table

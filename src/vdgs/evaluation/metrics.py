@@ -34,7 +34,7 @@ def squared_error(image: UInt8[np.ndarray, "h w 3"], reference: UInt8[np.ndarray
     return np.einsum("hwc,hwc->hw", difference, difference) / (3.0 * 255.0**2)
 
 
-def psnr_of(mean_squared_error: float) -> float:
+def psnr_from_mse(mean_squared_error: float) -> float:
     """Peak signal-to-noise ratio in dB of a mean squared error on [0, 1]; inf where it is zero."""
     if mean_squared_error == 0.0:
         return float("inf")
@@ -52,14 +52,14 @@ def ssim_map(
     painted where nobody looks does not leak through the window into pixels that count.
     """
     _check(image, reference)
-    shown = shown_within(image, reference, mask)
+    shown = replace_masked(image, reference, mask)
     total = np.zeros(image.shape[:2])
     for channel in range(3):
         total += _ssim_channel(shown[..., channel] / 255.0, reference[..., channel] / 255.0)
     return total / 3.0
 
 
-def shown_within(
+def replace_masked(
     image: UInt8[np.ndarray, "h w 3"],
     reference: UInt8[np.ndarray, "h w 3"],
     mask: Bool[np.ndarray, "h w"] | None,

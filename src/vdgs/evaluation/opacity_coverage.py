@@ -18,40 +18,40 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from vdgs.evaluation.by_visibility import mean_or_none
-from vdgs.evaluation.metrics import psnr_of, squared_error, to_8bit
-from vdgs.evaluation.view_exposures import as_photographed
+from vdgs.evaluation.metrics import psnr_from_mse, squared_error, to_8bit
+from vdgs.evaluation.view_exposures import apply_exposure
 from vdgs.kernels.constants import ALPHA_MIN
 from vdgs.kernels.kernel_types import Splats
 
 #: At least this opaque, a pixel counts as solid.
-SOLID_ALPHA = 0.95
+OPAQUE_ALPHA = 0.95
 #: PSNR over seen pixels before the model's own background, a black and a white one.
-PSNRS_SEEN = ("psnr_seen_own", "psnr_seen_black", "psnr_seen_white")
+COVERED_PSNR_KEYS = ("psnr_seen_own", "psnr_seen_black", "psnr_seen_white")
 
-Colour = tuple[float, float, float]
-_BLACK: Colour = (0.0, 0.0, 0.0)
-_WHITE: Colour = (1.0, 1.0, 1.0)
+RgbColor = tuple[float, float, float]
+_BLACK: RgbColor = (0.0, 0.0, 0.0)
+_WHITE: RgbColor = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Rendered:
+class RenderedImage:
     """A view as it came from the renderer, before rounding."""
 
     image: Float[np.ndarray, "h w 3"]
     #: None: the renderer does not say.
     alpha: Float[np.ndarray, "h w"] | None
     #: What is behind the model in `image`; None: not known.
-    background: Colour | None = None
+    background: RgbColor | None = None
 
-    def exposed(self, exposure: Float[Tensor, "3 4"]) -> Rendered:
+    def exposed(self, exposure: Float[Tensor, "3 4"]) -> RenderedImage:
         """The view with the colour model of a photograph: all colours, the background's too. They may leave [0, 1]."""
         background = self.background
         if background is not None:
-            red, green, blue = as_photographed(np.array(background), exposure).tolist()
+            red, green, blue = apply_exposure(np.array(background), exposure).tolist()
             background = red, green, blue
-        return Rendered(as_photographed(self.image, exposure), self.alpha, background)
+        return RenderedImage(apply_exposure(self.image, exposure), self.alpha, background)
 
-    def before(self, colour: Colour) -> UInt8[np.ndarray, "h w 3"] | None:
+    def before(self, colour: RgbColor) -> UInt8[np.ndarray, "h w 3"] | None:
         """The picture in 8 bits with another background; None where alpha or its own background is not known."""
         if self.alpha is None or self.background is None:
             return None
@@ -60,35 +60,35 @@ class Rendered:
         return to_8bit(self.image + (1.0 - self.alpha)[..., None] * change)
 
 
-def solidity_of_view(
-    rendered: Rendered, reference: UInt8[np.ndarray, "h w 3"], seen: Bool[np.ndarray, "h w"] | None
+def measure_opacity_coverage(
+    rendered: RenderedImage, reference: UInt8[np.ndarray, "h w 3"], covered: Bool[np.ndarray, "h w"] | None
 ) -> dict[str, float | None]:
     """The figures of one view; None where alpha, the background or the seen pixels are not known, or there are none."""
     row: dict[str, float | None] = {"seen_pixels": None, "solid_pixels": None, "solid_share": None}
-    row |= dict.fromkeys(PSNRS_SEEN)
-    if seen is None:
+    row |= dict.fromkeys(COVERED_PSNR_KEYS)
+    if covered is None:
         return row
-    count = row["seen_pixels"] = int(np.count_nonzero(seen))
+    count = row["seen_pixels"] = int(np.count_nonzero(covered))
     if rendered.alpha is not None:
-        solid = row["solid_pixels"] = int(np.count_nonzero(rendered.alpha[seen] >= SOLID_ALPHA))
+        solid = row["solid_pixels"] = int(np.count_nonzero(rendered.alpha[covered] >= OPAQUE_ALPHA))
         row["solid_share"] = solid / count if count else None
     pictures = to_8bit(rendered.image), rendered.before(_BLACK), rendered.before(_WHITE)
-    for name, picture in zip(PSNRS_SEEN, pictures, strict=True):
+    for name, picture in zip(COVERED_PSNR_KEYS, pictures, strict=True):
         if picture is not None and count:
-            row[name] = psnr_of(float(squared_error(picture, reference)[seen].mean()))
+            row[name] = psnr_from_mse(float(squared_error(picture, reference)[covered].mean()))
     return row
 
 
-def solidity_of_all(rows: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
+def summarize_opacity_coverage(rows: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
     """The figures of all views, from the rows of each: shares of all seen pixels, means of PSNR over the views."""
     known = [row for row in rows if row["solid_pixels"] is not None]
     seen = sum(row["seen_pixels"] for row in known)
     solid = sum(row["solid_pixels"] for row in known)
     result = {"seen_pixels": seen, "solid_share": solid / seen} if seen else {"seen_pixels": None, "solid_share": None}
-    return result | {name: mean_or_none([row[name] for row in rows]) for name in PSNRS_SEEN}
+    return result | {name: mean_or_none([row[name] for row in rows]) for name in COVERED_PSNR_KEYS}
 
 
-def larger_than_picture(splats: Splats, width: int, height: int) -> int:
+def count_oversized_splats(splats: Splats, width: int, height: int) -> int:
     """How many splats are drawn into a picture (pixels) whose longer side their major diameter exceeds.
 
     A splat ends where its alpha falls to ALPHA_MIN: at sqrt(2 ln(opacity / ALPHA_MIN)) standard deviations. Its centre
@@ -109,7 +109,7 @@ def larger_than_picture(splats: Splats, width: int, height: int) -> int:
     return int((drawn & touching & (diameter > max(width, height))).sum())
 
 
-def largest_splats_of_all(rows: Sequence[Mapping[str, Any]]) -> dict[str, int | str | None]:
+def summarize_oversized_splats(rows: Sequence[Mapping[str, Any]]) -> dict[str, int | str | None]:
     """Splats larger than the picture over all views, and the view with most of them, from `largest_splats` of each."""
     known = [row for row in rows if row["largest_splats"] is not None]
     worst = max(known, key=lambda row: row["largest_splats"], default=None)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from vdgs.captures.capture import View
 from vdgs.evaluation import comparison_images
-from vdgs.evaluation.by_visibility import QUANTILE_BINS
+from vdgs.evaluation.by_visibility import DEFAULT_BINS
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import Raster, Splats
 
@@ -25,7 +25,7 @@ class RenderedView(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ModelFacts:
+class ModelMetadata:
     """What the evaluation reports of the model but cannot measure itself; None is unknown."""
 
     #: "coarse" or "merged".
@@ -40,27 +40,27 @@ class ModelFacts:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class MeasuredModel:
+class RenderableModel:
     """A model as the evaluation sees it. Whatever is None is not known, and so are the figures that need it."""
 
     #: Timed: the plain picture, with alpha if the renderer has it.
     render: Callable[[Camera], RenderedView]
     #: V per pixel [h, w], NaN where the model shows nothing; without it there are no figures by visibility.
     visibility_map: Callable[[Camera], Float[np.ndarray, "h w"]] | None = None
-    facts: ModelFacts = ModelFacts()
+    facts: ModelMetadata = ModelMetadata()
     #: Whether the time that `render` takes says anything.
     timed: bool = True
     #: What is behind the model in a render, RGB in [0, 1].
     background: tuple[float, float, float] | None = None
     #: Pixels that show what enough training cameras see (`evaluation.seen`); solidity and depth are measured on them.
-    seen_map: Callable[[Camera], Bool[np.ndarray, "h w"]] | None = None
+    coverage_map: Callable[[Camera], Bool[np.ndarray, "h w"]] | None = None
     #: Depth along the axis of a view's camera, inf for sky; then these two are needed as well: the model's own depth
     #: (not timed), and how high cameras are above ground. All in the units of the model.
     true_depth: Callable[[View], Float[np.ndarray, "h w"]] | None = None
     render_depth: Callable[[Camera], Raster] | None = None
     camera_height: float | None = None
     #: The splats that a view is drawn from.
-    splats_of: Callable[[Camera], Splats] | None = None
+    decode_splats: Callable[[Camera], Splats] | None = None
     #: The colour model of a view (`model.exposure`), in which its picture is measured; None: neutral colours.
     exposure: Callable[[View], Float[Tensor, "3 4"]] | None = None
 
@@ -75,9 +75,9 @@ class EvaluationSettings:
     """What to measure and draw."""
 
     #: Also report every figure after colour correction (fitted on the test image itself).
-    colour_correction: bool = True
+    color_correction: bool = True
     #: Bins by visibility, of about equal size.
-    visibility_bins: int = QUANTILE_BINS
+    visibility_bins: int = DEFAULT_BINS
     #: Write photograph | render | error for every view.
     comparisons: bool = True
     #: What the contact sheet calls the views, and, with _ between its words, metrics.json their number.
@@ -85,7 +85,7 @@ class EvaluationSettings:
     #: How pictures are exposed, if the model says how: what metrics.json notes of them.
     exposed: str = "in the exposure of each photograph"
     #: Views on the contact sheet at most, chosen evenly.
-    contact_views: int = 40
+    contact_sheet_views: int = 40
     #: Error at the bright end of the colour map, where white is 1.
     error_limit: float = comparison_images.ERROR_LIMIT
 

@@ -22,19 +22,19 @@ from vdgs.captures.capture import View
 from vdgs.errors import CaptureError, TrainingDiverged
 from vdgs.evaluation import comparison_images, image_io, metrics
 from vdgs.evaluation.by_visibility import VisibilityHistogram
-from vdgs.evaluation.color_correction import correct_colours, correct_colours_affinely
-from vdgs.evaluation.depth_errors import DepthErrors, errors_of_view, figures_of
+from vdgs.evaluation.color_correction import correct_colors, correct_colors_affine
+from vdgs.evaluation.depth_errors import DepthErrors, compute_depth_errors, summarize_depth_errors
 from vdgs.evaluation.lpips import MIN_SIDE_PX, Lpips
-from vdgs.evaluation.opacity_coverage import Rendered, larger_than_picture, solidity_of_view
-from vdgs.evaluation.renderable_model import EvaluationSettings, MeasuredModel, ReferenceViews
+from vdgs.evaluation.opacity_coverage import RenderedImage, count_oversized_splats, measure_opacity_coverage
+from vdgs.evaluation.renderable_model import EvaluationSettings, ReferenceViews, RenderableModel
 from vdgs.system.documents import JsonObject
 
-RAW = ("psnr", "ssim", "lpips_vgg", "lpips_vgg_01")
-CORRECTED = tuple(f"{name}_cc" for name in RAW)
+RAW_KEYS = ("psnr", "ssim", "lpips_vgg", "lpips_vgg_01")
+CORRECTED_KEYS = tuple(f"{name}_cc" for name in RAW_KEYS)
 #: After one affine map of the colours, which is fitted on the view too.
-AFFINE = ("psnr_affine", "ssim_affine")
+AFFINE_KEYS = ("psnr_affine", "ssim_affine")
 #: In neutral colours, where the other figures are of an exposed picture.
-NEUTRAL = ("psnr_neutral", "ssim_neutral")
+REFERENCE_EXPOSURE_KEYS = ("psnr_neutral", "ssim_neutral")
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class ViewInputs:
     """What views are measured with."""
 
     photographs: ReferenceViews
-    model: MeasuredModel
+    model: RenderableModel
     lpips: Lpips | None
     settings: EvaluationSettings
     output: Path
@@ -50,17 +50,19 @@ class ViewInputs:
     @cached_property
     def stems(self) -> list[str]:
         """The names of the files of each view."""
-        return image_io.file_stems([view.name for view in self.photographs.views])
+        return image_io.unique_file_stems([view.name for view in self.photographs.views])
 
     @cached_property
     def on_sheet(self) -> set[int]:
         """The views that the contact sheet shows: an even choice of all."""
         count = len(self.photographs.views)
-        return set(np.linspace(0, count - 1, min(count, self.settings.contact_views)).round().astype(int).tolist())
+        return set(
+            np.linspace(0, count - 1, min(count, self.settings.contact_sheet_views)).round().astype(int).tolist()
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class ViewFigures:
+class ViewMetrics:
     """What a view comes to."""
 
     row: JsonObject
@@ -74,7 +76,7 @@ class ViewFigures:
 
 
 @dataclass(frozen=True, eq=False)
-class _Pair:
+class _ImagePair:
     """A render (8 bits) against its photograph, and the mask of what counts."""
 
     image: UInt8[np.ndarray, "h w 3"]
@@ -82,59 +84,61 @@ class _Pair:
     mask: Bool[np.ndarray, "h w"] | None
 
 
-def measure_view(index: int, inputs: ViewInputs) -> ViewFigures:
+def measure_view(index: int, inputs: ViewInputs) -> ViewMetrics:
     """Render and measure one of the views, write its pictures; what it comes to.
 
     Raises CaptureError where its photograph or mask does not fit its camera, TrainingDiverged where the render is not
     finite.
     """
     view, stem, settings = inputs.photographs.views[index], inputs.stems[index], inputs.settings
-    reference, mask = _photograph(view, inputs.photographs)
+    reference, mask = _load_reference(view, inputs.photographs)
     neutral, seconds = _rendered(view, inputs.model)
     exposure = None if inputs.model.exposure is None else inputs.model.exposure(view)
     rendered = neutral if exposure is None else neutral.exposed(exposure)
     image = metrics.to_8bit(rendered.image)
     image_io.write_png(inputs.output / "renders" / f"{stem}.png", image)
-    raw = _Pair(image, reference, mask)
+    raw = _ImagePair(image, reference, mask)
     maps = _maps(raw, "")
     row: JsonObject = {
         "name": view.name,
         "render": f"renders/{stem}.png",
         "alpha": _write_alpha(inputs.output, stem, rendered),
-        **_figures(raw, maps, "", inputs.lpips),
-        **_neutral_figures(None if exposure is None else _Pair(metrics.to_8bit(neutral.image), reference, mask)),
+        **_metrics(raw, maps, "", inputs.lpips),
+        **_reference_exposure_metrics(
+            None if exposure is None else _ImagePair(metrics.to_8bit(neutral.image), reference, mask)
+        ),
         "exposure": None if exposure is None else exposure.tolist(),
     }
-    if settings.colour_correction:
-        correction = correct_colours(image, reference, mask)
-        corrected = _Pair(metrics.to_8bit(correction.image), reference, mask)
+    if settings.color_correction:
+        correction = correct_colors(image, reference, mask)
+        corrected = _ImagePair(metrics.to_8bit(correction.image), reference, mask)
         corrected_maps = _maps(corrected, "_cc")
-        row |= _figures(corrected, corrected_maps, "_cc", inputs.lpips)
+        row |= _metrics(corrected, corrected_maps, "_cc", inputs.lpips)
         row["colour_fitted"] = correction.fitted
-        affine = _Pair(metrics.to_8bit(correct_colours_affinely(image, reference, mask).image), reference, mask)
+        affine = _ImagePair(metrics.to_8bit(correct_colors_affine(image, reference, mask).image), reference, mask)
         affine_maps = _maps(affine, "_affine")
-        row |= _without_lpips(affine, affine_maps, "_affine")
+        row |= _metrics_without_lpips(affine, affine_maps, "_affine")
         maps |= corrected_maps | affine_maps
     else:
-        row |= dict.fromkeys((*CORRECTED, *AFFINE))
+        row |= dict.fromkeys((*CORRECTED_KEYS, *AFFINE_KEYS))
     visibility = None if inputs.model.visibility_map is None else np.asarray(inputs.model.visibility_map(view.camera))
     by_visibility, row["mean_visibility"] = _count_visibility(visibility, maps, mask)
-    seen = _seen(view, inputs.model, mask)
-    row |= solidity_of_view(rendered, reference, seen)
+    seen = _covered(view, inputs.model, mask)
+    row |= measure_opacity_coverage(rendered, reference, seen)
     depth_errors = _depth_errors(view, inputs.model, seen)
-    row |= figures_of(depth_errors)
-    row["largest_splats"] = _largest_splats(view, inputs.model)
+    row |= summarize_depth_errors(depth_errors)
+    row["largest_splats"] = _oversized_splats(view, inputs.model)
     row["kept_pixels"] = image.shape[0] * image.shape[1] if mask is None else int(mask.sum())
     row["render_seconds"] = seconds
     _draw_comparison(view, stem, raw, row, inputs)
     cell = None
     if index in inputs.on_sheet:
-        small = comparison_images.thumbnail(raw.reference), comparison_images.thumbnail(raw.image)
+        small = comparison_images.make_thumbnail(raw.reference), comparison_images.make_thumbnail(raw.image)
         cell = comparison_images.Thumbnail(view.name, f"{row['psnr']:.2f} dB", *small)
-    return ViewFigures(row, by_visibility, depth_errors, cell)
+    return ViewMetrics(row, by_visibility, depth_errors, cell)
 
 
-def _photograph(
+def _load_reference(
     view: View, photographs: ReferenceViews
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"] | None]:
     reference, mask = photographs.load_image(view), photographs.load_mask(view)
@@ -151,7 +155,7 @@ def _photograph(
     return reference, mask
 
 
-def _rendered(view: View, model: MeasuredModel) -> tuple[Rendered, float]:
+def _rendered(view: View, model: RenderableModel) -> tuple[RenderedImage, float]:
     """The render and the seconds it took, the GPU's work included."""
     with torch.inference_mode():
         _wait_for_gpu()
@@ -168,7 +172,7 @@ def _rendered(view: View, model: MeasuredModel) -> tuple[Rendered, float]:
             f"the render of {view.name} holds values that are not finite numbers: the model is damaged. "
             "Evaluate an earlier state, or train again with lower rates."
         )
-    return Rendered(pixels, None if alpha is None else _on_cpu(alpha), model.background), seconds
+    return RenderedImage(pixels, None if alpha is None else _on_cpu(alpha), model.background), seconds
 
 
 def _on_cpu(values: Tensor) -> np.ndarray:
@@ -176,7 +180,7 @@ def _on_cpu(values: Tensor) -> np.ndarray:
     return pixels
 
 
-def _write_alpha(output: Path, stem: str, rendered: Rendered) -> str | None:
+def _write_alpha(output: Path, stem: str, rendered: RenderedImage) -> str | None:
     """Write the picture of alpha, if it is known; its name in the output folder."""
     if rendered.alpha is None:
         return None
@@ -190,24 +194,26 @@ def _wait_for_gpu() -> None:
         torch.cuda.synchronize()
 
 
-def _maps(pair: _Pair, suffix: str) -> dict[str, Float[np.ndarray, "h w"]]:
+def _maps(pair: _ImagePair, suffix: str) -> dict[str, Float[np.ndarray, "h w"]]:
     return {
         f"squared_error{suffix}": metrics.squared_error(pair.image, pair.reference),
         f"ssim{suffix}": metrics.ssim_map(pair.image, pair.reference, pair.mask),
     }
 
 
-def _figures(pair: _Pair, maps: Mapping[str, np.ndarray], suffix: str, lpips: Lpips | None) -> dict[str, float | None]:
+def _metrics(
+    pair: _ImagePair, maps: Mapping[str, np.ndarray], suffix: str, lpips: Lpips | None
+) -> dict[str, float | None]:
     """The four figures of a pair; LPIPS is None without weights or where the image is too small for it."""
     figures: dict[str, float | None] = {
-        f"psnr{suffix}": metrics.psnr_of(metrics.masked_mean(maps[f"squared_error{suffix}"], pair.mask)),
+        f"psnr{suffix}": metrics.psnr_from_mse(metrics.masked_mean(maps[f"squared_error{suffix}"], pair.mask)),
         f"ssim{suffix}": metrics.masked_mean(maps[f"ssim{suffix}"], pair.mask),
         f"lpips_vgg{suffix}": None,
         f"lpips_vgg_01{suffix}": None,
     }
     nothing_kept = pair.mask is not None and not pair.mask.any()
     if lpips is not None and not nothing_kept and min(pair.image.shape[:2]) >= MIN_SIDE_PX:
-        scores = lpips(metrics.shown_within(pair.image, pair.reference, pair.mask), pair.reference)
+        scores = lpips(metrics.replace_masked(pair.image, pair.reference, pair.mask), pair.reference)
         figures[f"lpips_vgg{suffix}"], figures[f"lpips_vgg_01{suffix}"] = (
             scores.lpips_vgg,
             scores.lpips_vgg_01,
@@ -215,17 +221,17 @@ def _figures(pair: _Pair, maps: Mapping[str, np.ndarray], suffix: str, lpips: Lp
     return figures
 
 
-def _without_lpips(pair: _Pair, maps: Mapping[str, np.ndarray], suffix: str) -> dict[str, float | None]:
+def _metrics_without_lpips(pair: _ImagePair, maps: Mapping[str, np.ndarray], suffix: str) -> dict[str, float | None]:
     """PSNR and SSIM of a pair."""
-    figures = _figures(pair, maps, suffix, None)
+    figures = _metrics(pair, maps, suffix, None)
     return {name: figures[name] for name in (f"psnr{suffix}", f"ssim{suffix}")}
 
 
-def _neutral_figures(neutral: _Pair | None) -> dict[str, float | None]:
+def _reference_exposure_metrics(neutral: _ImagePair | None) -> dict[str, float | None]:
     """What the picture in neutral colours comes to; None where that is the picture which is measured anyway."""
     if neutral is None:
-        return dict.fromkeys(NEUTRAL)
-    return _without_lpips(neutral, _maps(neutral, "_neutral"), "_neutral")
+        return dict.fromkeys(REFERENCE_EXPOSURE_KEYS)
+    return _metrics_without_lpips(neutral, _maps(neutral, "_neutral"), "_neutral")
 
 
 def _count_visibility(
@@ -242,39 +248,41 @@ def _count_visibility(
     return histogram, float(visibility[seen].mean(dtype=np.float64)) if seen.any() else None
 
 
-def _seen(view: View, model: MeasuredModel, mask: Bool[np.ndarray, "h w"] | None) -> Bool[np.ndarray, "h w"] | None:
+def _covered(
+    view: View, model: RenderableModel, mask: Bool[np.ndarray, "h w"] | None
+) -> Bool[np.ndarray, "h w"] | None:
     """The seen pixels of a view, of those that its mask keeps."""
-    if model.seen_map is None:
+    if model.coverage_map is None:
         return None
-    seen = np.asarray(model.seen_map(view.camera))
+    seen = np.asarray(model.coverage_map(view.camera))
     return seen if mask is None else seen & mask
 
 
-def _depth_errors(view: View, model: MeasuredModel, seen: Bool[np.ndarray, "h w"] | None) -> dict[str, DepthErrors]:
+def _depth_errors(view: View, model: RenderableModel, seen: Bool[np.ndarray, "h w"] | None) -> dict[str, DepthErrors]:
     """How far the model's depth is from the truth in this view; nothing without a truth."""
     if model.true_depth is None or model.render_depth is None or model.camera_height is None or seen is None:
         return {}
     with torch.inference_mode():
         drawn = model.render_depth(view.camera)
-    found = errors_of_view(drawn, np.asarray(model.true_depth(view)), seen, model.camera_height)
+    found = compute_depth_errors(drawn, np.asarray(model.true_depth(view)), seen, model.camera_height)
     own = {kind: DepthErrors() for kind in found}
     for kind, errors in found.items():
         own[kind].add(errors)
     return own
 
 
-def _largest_splats(view: View, model: MeasuredModel) -> int | None:
+def _oversized_splats(view: View, model: RenderableModel) -> int | None:
     """How many of the splats of a view are larger than its picture."""
-    if model.splats_of is None:
+    if model.decode_splats is None:
         return None
     with torch.inference_mode():
-        return larger_than_picture(model.splats_of(view.camera), view.camera.width, view.camera.height)
+        return count_oversized_splats(model.decode_splats(view.camera), view.camera.width, view.camera.height)
 
 
-def _draw_comparison(view: View, stem: str, raw: _Pair, row: Mapping[str, Any], inputs: ViewInputs) -> None:
+def _draw_comparison(view: View, stem: str, raw: _ImagePair, row: Mapping[str, Any], inputs: ViewInputs) -> None:
     if not inputs.settings.comparisons:
         return
-    picture = comparison_images.comparison(
+    picture = comparison_images.draw_comparison(
         raw.reference, raw.image, view.name, f"{row['psnr']:.2f} dB   SSIM {row['ssim']:.3f}",
         raw.mask, inputs.settings.error_limit,
     )  # fmt: skip

@@ -14,8 +14,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from vdgs.errors import RunError
-from vdgs.export.bake import Shown
-from vdgs.export.color_refinement import Lacking
+from vdgs.export.bake import ViewContributions
+from vdgs.export.color_refinement import ColorResidual
 from vdgs.system.atomic_files import write_array
 
 
@@ -33,38 +33,38 @@ def load_array(path: Path, dtype: type, dimensions: int) -> np.ndarray:
     return np.asarray(array)
 
 
-def save_shown(path: Path, shown: Shown) -> None:
+def save_contributions(path: Path, contributions: ViewContributions) -> None:
     """Write what a view shows."""
-    write_array(path, np.stack([shown.gaussians.numpy(), shown.pixels.numpy().view(np.int32)]))
+    write_array(path, np.stack([contributions.gaussians.numpy(), contributions.pixels.numpy().view(np.int32)]))
 
 
-def load_shown(path: Path) -> Shown:
-    """The inverse of `save_shown`."""
+def load_contributions(path: Path) -> ViewContributions:
+    """The inverse of `save_contributions`."""
     columns = load_array(path, np.int32, 2)
-    return Shown(torch.from_numpy(columns[0]), torch.from_numpy(columns[1].view(np.float32)))
+    return ViewContributions(torch.from_numpy(columns[0]), torch.from_numpy(columns[1].view(np.float32)))
 
 
-def save_lacking(path: Path, lacking: Lacking) -> None:
+def save_residual(path: Path, residual: ColorResidual) -> None:
     """Write what a view lacks."""
-    halves = torch.cat([lacking.pixels[:, None], lacking.colours], 1).contiguous().numpy()
-    write_array(path, np.concatenate([lacking.gaussians.numpy()[None], halves.view(np.int32).reshape(2, -1)]))
+    halves = torch.cat([residual.pixels[:, None], residual.colours], 1).contiguous().numpy()
+    write_array(path, np.concatenate([residual.gaussians.numpy()[None], halves.view(np.int32).reshape(2, -1)]))
 
 
-def load_lacking(path: Path) -> Lacking:
-    """The inverse of `save_lacking`."""
+def load_residual(path: Path) -> ColorResidual:
+    """The inverse of `save_residual`."""
     columns = load_array(path, np.int32, 2)
     halves = torch.from_numpy(columns[1:].reshape(-1).view(np.float16).reshape(-1, 4))
-    return Lacking(torch.from_numpy(columns[0]), halves[:, 0], halves[:, 1:])
+    return ColorResidual(torch.from_numpy(columns[0]), halves[:, 0], halves[:, 1:])
 
 
-def save_added(path: Path, rows: Int[np.ndarray, " c"], colours: Float[Tensor, "c f 3"]) -> None:
+def save_color_updates(path: Path, rows: Int[np.ndarray, " c"], colours: Float[Tensor, "c f 3"]) -> None:
     """Write what is to be added to the colours of some Gaussians."""
     numbers = colours.flatten(1).numpy().view(np.int32)
     write_array(path, np.concatenate([rows.astype(np.int32)[:, None], numbers], axis=1))
 
 
-def load_added(path: Path) -> tuple[Int[np.ndarray, " c"], Float[Tensor, "c f 3"]]:
-    """The inverse of `save_added`."""
+def load_color_updates(path: Path) -> tuple[Int[np.ndarray, " c"], Float[Tensor, "c f 3"]]:
+    """The inverse of `save_color_updates`."""
     table = load_array(path, np.int32, 2)
     colours = np.ascontiguousarray(table[:, 1:]).view(np.float32).reshape(len(table), table.shape[1] // 3, 3)
     return table[:, 0].astype(np.int64), torch.from_numpy(colours)

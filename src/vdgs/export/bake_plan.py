@@ -4,7 +4,7 @@ Each step needs all of the one before. Shards are numbered through all steps, so
 
     survey              training views      what each shows
     fit                 parts of anchors    their Gaussians
-    compare, then mend  views, then parts   what pictures lack; what is added to colours. For each of the `rounds`
+    compare, then mend  views, then parts   what pictures lack; what is added to colours. For each of the `color_iteration_cameras`
 
     RUN/baking/shards/KEY/   of all shards together (`executors.sharded_job`): pixels.npy and kept.npy, from the survey;
                              N.spool, the Gaussians after N rounds of fitting colours, the last of them alone
@@ -19,31 +19,31 @@ from pathlib import Path
 from typing import Any, cast
 
 from vdgs.config.commands import ExportRequest, ModelName
-from vdgs.distributed.job_labels import Kind, shard_kind
-from vdgs.distributed.sharded_job import ShardedJob, spans_of
+from vdgs.distributed.job_labels import JobLabels, shard_kind
+from vdgs.distributed.sharded_job import ShardedJob, split_ranges
 from vdgs.export.bake import gaussian_count, part_count
 from vdgs.export.formats import registry
-from vdgs.export.local_frame import usual_crs
-from vdgs.export.novel_cameras import round_count, rounds
+from vdgs.export.local_frame import default_crs
+from vdgs.export.novel_cameras import color_iteration_cameras, color_iteration_count
 from vdgs.geometry.camera import Camera
-from vdgs.runs.open_run import TrainedRun
+from vdgs.runs.open_run import OpenedRun
 
 #: Where shards work, in the run folder.
-FOLDER = "baking"
+BAKE_FOLDER = "baking"
 #: Views and parts of a shard, least and most, and how many shards there are in between (choice): few, for each step
 #: starts its processes anew.
 VIEWS_OF_SHARD, PARTS_OF_SHARD = (16, 100, 8), (4, 50, 8)
 SURVEY = shard_kind("survey views", "views")
 FIT = shard_kind("fit Gaussians", "parts")
 COMPARE = shard_kind("compare pictures", "views")
-MEND = shard_kind("fit colours again", "parts")
+UPDATE_COLORS = shard_kind("fit colours again", "parts")
 
 
 @dataclass(frozen=True)
-class Step:
+class BakeStep:
     """A step of the work. Its items and shards are numbered through all steps."""
 
-    kind: Kind
+    kind: JobLabels
     round: int
     """0: before colours are fitted again."""
     items: range
@@ -51,40 +51,40 @@ class Step:
 
 
 @dataclass(frozen=True)
-class BakingWork:
+class BakePlan:
     """All steps of baking a scene."""
 
     job: ShardedJob
-    steps: tuple[Step, ...]
+    steps: tuple[BakeStep, ...]
     training: Sequence[Camera]
     rounds: tuple[Sequence[Camera], ...]
     """By which pictures are compared."""
 
     @staticmethod
-    def of(run: TrainedRun, asked: ExportRequest) -> BakingWork:
-        """What baking a run as it is asked for (`as_files_hold`) comes to, and what it depends on."""
+    def of(run: OpenedRun, request: ExportRequest) -> BakePlan:
+        """What baking a run as it is asked for (`drop_unused_sh_degrees`) comes to, and what it depends on."""
         training = [view.camera for view in run.capture.train_views]
-        planned = rounds(training, round_count(asked.rounds, gaussian_count(run.model)))
+        planned = color_iteration_cameras(training, color_iteration_count(request.rounds, gaussian_count(run.model)))
         steps, spans = _cut(len(training), [len(each) for each in planned], part_count(run.model))
-        output = run.folder.path / FOLDER
-        job = ShardedJob.of("baking", _request(run, asked), output, SURVEY, _depends_on(run, asked), spans, ".npy")
-        return BakingWork(job, steps, training, planned)
+        output = run.folder.path / BAKE_FOLDER
+        job = ShardedJob.of("baking", _request(run, request), output, SURVEY, _depends_on(run, request), spans, ".npy")
+        return BakePlan(job, steps, training, planned)
 
-    def steps_of(self, round_: int) -> list[Step]:
+    def steps_of_round(self, round_: int) -> list[BakeStep]:
         """From what comes before the Gaussians of a round to them; before the first, what views show is known."""
         return [step for step in self.steps if step.round == round_ and step.kind is not SURVEY]
 
-    def step(self, kind: Kind, round_: int = 0) -> Step:
+    def step(self, kind: JobLabels, round_: int = 0) -> BakeStep:
         return next(step for step in self.steps if step.kind is kind and step.round == round_)
 
-    def step_of_shard(self, index: int) -> Step:
+    def step_of_shard(self, index: int) -> BakeStep:
         return next(step for step in self.steps if index in step.shards)
 
-    def files(self, step: Step) -> list[Path]:
+    def files(self, step: BakeStep) -> list[Path]:
         """What the items of a step leave, in their order."""
         return [self.job.file(item) for item in step.items]
 
-    def cameras_of(self, round_: int) -> Sequence[Camera]:
+    def round_cameras(self, round_: int) -> Sequence[Camera]:
         """By which pictures are compared in a round, from 1 on."""
         return self.rounds[round_ - 1]
 
@@ -93,33 +93,33 @@ class BakingWork:
         return self.job.folder / "pixels.npy"
 
     @property
-    def kept_file(self) -> Path:
+    def selection_file(self) -> Path:
         return self.job.folder / "kept.npy"
 
-    def spool_file(self, round_: int) -> Path:
+    def store_file(self, round_: int) -> Path:
         return self.job.folder / f"{round_}.spool"
 
 
-def as_files_hold(asked: ExportRequest) -> ExportRequest:
+def drop_unused_sh_degrees(request: ExportRequest) -> ExportRequest:
     """Without colours that change with the direction where no file that is asked for holds them."""
-    if all(registry.format_of(path).fixed for path in asked.to):
-        return replace(asked, sh_degree=0)
-    return asked
+    if all(registry.format_from_path(path).fixed_colors for path in request.to):
+        return replace(request, sh_degree=0)
+    return request
 
 
-def _cut(views: int, rounds: Sequence[int], parts: int) -> tuple[tuple[Step, ...], list[range]]:
-    steps, spans, first = list[Step](), list[range](), 0
+def _cut(views: int, rounds: Sequence[int], parts: int) -> tuple[tuple[BakeStep, ...], list[range]]:
+    steps, spans, first = list[BakeStep](), list[range](), 0
     order = [(SURVEY, 0, views), (FIT, 0, parts)]
-    order += [(kind, i, n) for i, seen in enumerate(rounds, 1) for kind, n in ((COMPARE, seen), (MEND, parts))]
+    order += [(kind, i, n) for i, seen in enumerate(rounds, 1) for kind, n in ((COMPARE, seen), (UPDATE_COLORS, parts))]
     for kind, round_, items in order:
-        own = spans_of(items, *(VIEWS_OF_SHARD if kind in (SURVEY, COMPARE) else PARTS_OF_SHARD))
-        steps.append(Step(kind, round_, range(first, first + items), range(len(spans), len(spans) + len(own))))
+        own = split_ranges(items, *(VIEWS_OF_SHARD if kind in (SURVEY, COMPARE) else PARTS_OF_SHARD))
+        steps.append(BakeStep(kind, round_, range(first, first + items), range(len(spans), len(spans) + len(own))))
         spans += [range(first + span.start, first + span.stop) for span in own]
         first += items
     return tuple(steps), spans
 
 
-def _request(run: TrainedRun, asked: ExportRequest) -> ExportRequest:
+def _request(run: OpenedRun, asked: ExportRequest) -> ExportRequest:
     """What shards must know of what was asked for to find the same work."""
     return ExportRequest(
         run=Path(os.path.abspath(run.folder.path)), to=asked.to, model=cast(ModelName, run.name), block=asked.block,
@@ -128,9 +128,19 @@ def _request(run: TrainedRun, asked: ExportRequest) -> ExportRequest:
     )  # fmt: skip
 
 
-def _depends_on(run: TrainedRun, asked: ExportRequest) -> list[Any]:
+def _depends_on(run: OpenedRun, request: ExportRequest) -> list[Any]:
     """The model, the degree, how often colours are fitted, and what chooses among its Gaussians."""
-    crs = None if asked.bbox is None else asked.crs or usual_crs(run.capture.ground, asked.to[0])
-    box = None if asked.bbox is None else list(asked.bbox)
-    count = round_count(asked.rounds, gaussian_count(run.model))
-    return [run.name, run.key, run.status.model, asked.sh_degree, count, asked.block, box, crs, asked.max_gaussians]
+    crs = None if request.bbox is None else request.crs or default_crs(run.capture.ground, request.to[0])
+    box = None if request.bbox is None else list(request.bbox)
+    count = color_iteration_count(request.rounds, gaussian_count(run.model))
+    return [
+        run.name,
+        run.key,
+        run.status.model,
+        request.sh_degree,
+        count,
+        request.block,
+        box,
+        crs,
+        request.max_gaussians,
+    ]

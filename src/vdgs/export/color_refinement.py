@@ -20,21 +20,21 @@ import torch
 from jaxtyping import Float, Float16, Int, Int32
 from torch import Tensor
 
-from vdgs.export.bake import LEAST_PIXELS, RIDGE, part_count, part_size
-from vdgs.export.formats.gaussian_store import Spooled
-from vdgs.export.parallel import in_order, sorted_runs, span_of, view_by_view
+from vdgs.export.bake import MIN_PIXELS, RIDGE_WEIGHT, part_count, part_size
+from vdgs.export.formats.gaussian_store import GaussianStore
+from vdgs.export.parallel import index_range, map_views, parallel_map, sort_segments
 from vdgs.geometry.camera import Camera
-from vdgs.kernels import choose
+from vdgs.kernels import get_backend
 from vdgs.kernels.kernel_types import Splats
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.model.renderer import decode_view, draw
+from vdgs.model.renderer import decode_view, rasterize_splats
 
 #: After so many views or parts the pages of the spool are let go.
-LET_GO = 16
+FLUSH_EVERY = 16
 
 
 @dataclass(frozen=True, eq=False)
-class Lacking:
+class ColorResidual:
     """What one view lacks: for Gaussians, ascending, the pixels that each makes and the mean colour missing there."""
 
     gaussians: Int32[Tensor, " p"]
@@ -42,19 +42,19 @@ class Lacking:
     colours: Float16[Tensor, "p 3"]
 
 
-class Baked:
+class BakedGaussians:
     """Baked Gaussians on the disk, by the anchors that they come from."""
 
-    def __init__(self, model: AnchorModel, kept: Int[np.ndarray, " m"], spool: Spooled) -> None:
+    def __init__(self, model: AnchorModel, kept: Int[np.ndarray, " m"], spool: GaussianStore) -> None:
         self.model, self.spool = model, spool
         k = model.anchors.offsets.shape[1]
         #: Which of all that anchors spawn are baked: a file of a part of the scene is compared with that part.
-        self.chosen = torch.zeros(len(model.anchors) * k, dtype=torch.bool)
-        self.chosen[torch.from_numpy(kept)] = True
+        self.is_baked = torch.zeros(len(model.anchors) * k, dtype=torch.bool)
+        self.is_baked[torch.from_numpy(kept)] = True
         #: Where the Gaussians of each anchor begin.
         self.starts = np.searchsorted(kept, np.arange(len(model.anchors) + 1) * k)
 
-    def of_anchors(self, rows: Int[np.ndarray, " v"]) -> Int[np.ndarray, " p"]:
+    def rows_of_anchors(self, rows: Int[np.ndarray, " v"]) -> Int[np.ndarray, " p"]:
         """The Gaussians of anchors, both ascending."""
         first, counts = self.starts[rows], self.starts[rows + 1] - self.starts[rows]
         ends = np.cumsum(counts)
@@ -67,81 +67,87 @@ class Baked:
         rows, k = rows.cpu(), self.model.anchors.offsets.shape[1]
         source = splats.source.long().cpu()
         spawned = rows.index_select(0, source // k) * k + source % k
-        of_these = self.chosen.index_select(0, spawned).nonzero()[:, 0].to(splats.means_px.device)
+        of_these = self.is_baked.index_select(0, spawned).nonzero()[:, 0].to(splats.means_px.device)
         shown: Splats = splats
         if len(of_these) < len(source):
             shown = Splats(*(getattr(splats, field.name)[of_these] for field in fields(Splats)))
-        picture = draw(shown, camera, shown.means_px.new_tensor(self.model.background)).image
-        return picture.cpu(), self.of_anchors(rows.numpy())
+        picture = rasterize_splats(shown, camera, shown.means_px.new_tensor(self.model.background)).image
+        return picture.cpu(), self.rows_of_anchors(rows.numpy())
 
 
-def refit(baked: Baked, cameras: Sequence[Camera], after_view: Callable[[], None] = lambda: None) -> None:
+def refine_colors(
+    baked: BakedGaussians, cameras: Sequence[Camera], after_view: Callable[[], None] = lambda: None
+) -> None:
     """Add to the colours of all Gaussians, on the disk, what the pictures of these cameras lack."""
-    views, device = list[Lacking](), baked.model.anchors.positions.device
-    for view in view_by_view(lambda camera: lacking(baked, camera), cameras, device):
+    views, device = list[ColorResidual](), baked.model.anchors.positions.device
+    for view in map_views(lambda camera: view_residual(baked, camera), cameras, device):
         views.append(view)
-        if len(views) % LET_GO == 0:
-            baked.spool.let_go()
+        if len(views) % FLUSH_EVERY == 0:
+            baked.spool.release_pages()
         after_view()
-    parts = [rows_of(baked, number) for number in range(part_count(baked.model))]
-    done = in_order(lambda rows: baked.spool.add_colours(*added(baked, cameras, views, rows)), parts)
+    parts = [rows_of_part(baked, number) for number in range(part_count(baked.model))]
+    done = parallel_map(lambda rows: baked.spool.add_sh(*color_updates(baked, cameras, views, rows)), parts)
     for number, _ in enumerate(done):
-        if number % LET_GO == 0:
-            baked.spool.let_go()
+        if number % FLUSH_EVERY == 0:
+            baked.spool.release_pages()
 
 
-def rows_of(baked: Baked, number: int) -> range:
+def rows_of_part(baked: BakedGaussians, number: int) -> range:
     """The rows of the spool that a part fits; none of the last parts where few of all Gaussians are baked."""
     step, count = part_size(baked.model), len(baked.spool.means)
     return range(min(number * step, count), min((number + 1) * step, count))
 
 
 @torch.no_grad()
-def lacking(baked: Baked, camera: Camera) -> Lacking:
+def view_residual(baked: BakedGaussians, camera: Camera) -> ColorResidual:
     """What the baked Gaussians do not show of the model's picture."""
     wanted, numbers = baked.drawn(camera)
-    found = choose(torch.device("cpu")).shares(
+    found = get_backend(torch.device("cpu")).shares(
         _splats(baked.spool, numbers, camera), torch.tensor(baked.model.background), camera.width, camera.height, wanted
     )
-    shown = (found.pixels >= LEAST_PIXELS).nonzero()[:, 0]
+    shown = (found.pixels >= MIN_PIXELS).nonzero()[:, 0]
     pixels = found.pixels.index_select(0, shown)
-    return Lacking(
+    return ColorResidual(
         torch.from_numpy(numbers).index_select(0, shown).int(),
         pixels.half(),
         (found.missing.index_select(0, shown) / pixels[:, None]).half(),
     )
 
 
-def _splats(spool: Spooled, numbers: Int[np.ndarray, " p"], camera: Camera) -> Splats:
-    kernels, (means, log_scales, quaternions, logits) = choose(torch.device("cpu")), spool.ellipsoids(numbers)
+def _splats(spool: GaussianStore, numbers: Int[np.ndarray, " p"], camera: Camera) -> Splats:
+    kernels, (means, log_scales, quaternions, logits) = get_backend(torch.device("cpu")), spool.ellipsoids(numbers)
     seen = kernels.project(means, log_scales.exp(), quaternions, camera)
-    colours = kernels.harmonic_colours(means, spool.coefficients, torch.from_numpy(numbers), _eye(camera), spool.degree)
+    colours = kernels.harmonic_colors(
+        means, spool.coefficients, torch.from_numpy(numbers), _camera_center(camera), spool.degree
+    )
     opacities = torch.where(seen.valid, logits.sigmoid(), 0.0)
     return Splats(seen.means_px, seen.conics, seen.depths, colours, opacities)
 
 
-def _eye(camera: Camera) -> Float[Tensor, "3"]:
+def _camera_center(camera: Camera) -> Float[Tensor, "3"]:
     return torch.from_numpy(camera.position.astype(np.float32))
 
 
-def added(
-    baked: Baked, cameras: Sequence[Camera], views: Sequence[Lacking], rows: range
+def color_updates(
+    baked: BakedGaussians, cameras: Sequence[Camera], residuals: Sequence[ColorResidual], rows: range
 ) -> tuple[Int[np.ndarray, " c"], Float[Tensor, "c f 3"]]:
     """What is to be added to the colours of the Gaussians of some rows: of which, ascending, and how much."""
     means, columns = torch.from_numpy(baked.spool.means), list[tuple[Tensor, ...]]()
-    for camera, view in zip(cameras, views, strict=True):
-        low, high = span_of(view.gaussians, rows.start, rows.stop)
+    for camera, view in zip(cameras, residuals, strict=True):
+        low, high = index_range(view.gaussians, rows.start, rows.stop)
         if low < high:
             here = view.gaussians[low:high]
             # index_select, not an index: torch is five times as fast at it.
-            directions = torch.nn.functional.normalize(means.index_select(0, here) - _eye(camera), dim=1)
+            directions = torch.nn.functional.normalize(means.index_select(0, here) - _camera_center(camera), dim=1)
             columns.append((here, directions, view.colours[low:high].float(), view.pixels[low:high].float()))
     if not columns:
         return np.zeros(0, np.int64), torch.zeros(0, (baked.spool.degree + 1) ** 2, 3)
     numbers, *rest = (torch.cat(column) for column in zip(*columns, strict=True))
-    order, counts = sorted_runs(numbers, rows.start, len(rows))
+    order, counts = sort_segments(numbers, rows.start, len(rows))
     directions, colours, pixels = (column.index_select(0, order) for column in rest)
     changed = counts.nonzero()[:, 0]
     runs = (counts.cumsum(0) - counts)[changed]
-    found = choose(colours.device).fit_harmonics(directions, colours + 0.5, pixels, runs, baked.spool.degree, RIDGE)
+    found = get_backend(colours.device).fit_harmonics(
+        directions, colours + 0.5, pixels, runs, baked.spool.degree, RIDGE_WEIGHT
+    )
     return changed.numpy() + rows.start, found

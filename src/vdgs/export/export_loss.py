@@ -11,30 +11,30 @@ from jaxtyping import Float
 from torch import Tensor
 
 from vdgs.captures.capture import View
-from vdgs.evaluation.by_visibility import Bin, VisibilityHistogram
-from vdgs.evaluation.color_correction import correct_colours
-from vdgs.evaluation.evaluate_run import cached_photographs, coarse_of, visibility_map
-from vdgs.evaluation.metrics import masked_mean, psnr_of, squared_error, ssim_map, to_8bit
-from vdgs.evaluation.view_exposures import as_photographed, exposures_of
-from vdgs.export.formats.export_scene import joined
+from vdgs.evaluation.by_visibility import VisibilityBin, VisibilityHistogram
+from vdgs.evaluation.color_correction import correct_colors
+from vdgs.evaluation.evaluate_run import cached_reference_views, make_visibility_map, with_coarse_model
+from vdgs.evaluation.metrics import masked_mean, psnr_from_mse, squared_error, ssim_map, to_8bit
+from vdgs.evaluation.view_exposures import apply_exposure, make_exposures
+from vdgs.export.formats.export_scene import concatenate
 from vdgs.geometry.camera import Camera
-from vdgs.model.gaussians import Gaussians, draw_gaussians, visible_rows
+from vdgs.model.gaussians import Gaussians, render_gaussians, visible_gaussian_rows
 from vdgs.model.renderer import render
-from vdgs.runs.open_run import TrainedRun
+from vdgs.runs.open_run import OpenedRun
 
 #: Groups of pixels by visibility.
-BINS = 4
+VISIBILITY_BINS = 4
 #: Views that are drawn at most, evenly taken: more would say the same.
-MOST_VIEWS = 40
+MAX_VIEWS = 40
 
 
 @dataclass(frozen=True, kw_only=True)
-class Loss:
+class ExportLoss:
     """Means over the views, of the model and of the file; `by_visibility` as in metrics.json, with both."""
 
     #: How many were drawn, and of how many.
     views: int
-    views_there_are: int
+    views_available: int
     #: Which views: "test", or "training" where none is held out.
     of: str
     psnr: float
@@ -44,44 +44,46 @@ class Loss:
     psnr_cc_baked: float
     ssim: float
     ssim_baked: float
-    by_visibility: list[Bin]
+    by_visibility: list[VisibilityBin]
 
 
-def measured_views(run: TrainedRun) -> list[View]:
-    """The test views, or every tenth training view where there is none; at most `MOST_VIEWS`."""
+def views_to_measure(run: OpenedRun) -> list[View]:
+    """The test views, or every tenth training view where there is none; at most `MAX_VIEWS`."""
     views = list(run.capture.test_views) or list(run.capture.train_views)[::10]
-    return [views[i] for i in np.unique(np.linspace(0, len(views) - 1, min(MOST_VIEWS, len(views))).astype(int))]
+    return [views[i] for i in np.unique(np.linspace(0, len(views) - 1, min(MAX_VIEWS, len(views))).astype(int))]
 
 
-def loss_of(run: TrainedRun, pieces: Iterable[Gaussians], after_view: Callable[[], None] = lambda: None) -> Loss:
-    """Draw `measured_views` with the model and with Gaussians, which are in the ground frame, and compare both with the
+def measure_loss(
+    run: OpenedRun, chunks: Iterable[Gaussians], after_view: Callable[[], None] = lambda: None
+) -> ExportLoss:
+    """Draw `views_to_measure` with the model and with Gaussians, which are in the ground frame, and compare both with the
     photographs, in 8 bits as all metrics, and as `vdgs eval` in the exposure of each view where exposures were fitted:
     files hold neutral colours. Of the pieces only what those views show is kept in memory."""
-    views, exposure = measured_views(run), exposures_of(run.model, run.capture)
-    gaussians = _seen(pieces, [view.camera for view in views])
-    visibility = visibility_map(coarse_of(run))
+    views, exposure = views_to_measure(run), make_exposures(run.model, run.capture)
+    gaussians = _seen(chunks, [view.camera for view in views])
+    visibility = make_visibility_map(with_coarse_model(run))
     names = [f"{figure}{whose}" for figure in ("squared_error", "ssim") for whose in ("", "_baked")]
     histogram, rows = VisibilityHistogram(names), list[list[float]]()
-    with cached_photographs(views) as photographs:
+    with cached_reference_views(views) as photographs:
         for view in views:
             reference, mask = photographs.load_image(view), photographs.load_mask(view)
-            neutral = render(run.model, view.camera).image.cpu().numpy(), _picture(gaussians, run, view.camera)
-            exposed = neutral if exposure is None else [as_photographed(each, exposure(view)) for each in neutral]
+            neutral = render(run.model, view.camera).image.cpu().numpy(), _render_gaussians(gaussians, run, view.camera)
+            exposed = neutral if exposure is None else [apply_exposure(each, exposure(view)) for each in neutral]
             drawn = [to_8bit(each) for each in exposed]
-            corrected = [to_8bit(correct_colours(picture, reference, mask).image) for picture in drawn]
+            corrected = [to_8bit(correct_colors(picture, reference, mask).image) for picture in drawn]
             errors = [squared_error(picture, reference) for picture in (*drawn, *corrected)]
             likeness = [ssim_map(picture, reference, mask) for picture in drawn]
             histogram.add(visibility(view.camera), dict(zip(names, errors[:2] + likeness, strict=True)), mask)
-            psnrs = [psnr_of(masked_mean(error, mask)) for error in errors]
+            psnrs = [psnr_from_mse(masked_mean(error, mask)) for error in errors]
             rows.append([*psnrs, *(masked_mean(each, mask) for each in likeness)])
             after_view()
     tested = run.capture.test_views
     there_are, of = (len(tested), "test") if tested else (len(run.capture.train_views), "training")
     psnr, psnr_baked, psnr_cc, psnr_cc_baked, ssim, ssim_baked = np.mean(rows, axis=0).tolist()
-    return Loss(
-        views=len(views), views_there_are=there_are, of=of, psnr=psnr, psnr_baked=psnr_baked, psnr_cc=psnr_cc,
+    return ExportLoss(
+        views=len(views), views_available=there_are, of=of, psnr=psnr, psnr_baked=psnr_baked, psnr_cc=psnr_cc,
         psnr_cc_baked=psnr_cc_baked, ssim=ssim, ssim_baked=ssim_baked,
-        by_visibility=[dict(each) for each in histogram.bins(BINS)],
+        by_visibility=[dict(each) for each in histogram.bins(VISIBILITY_BINS)],
     )  # fmt: skip
 
 
@@ -92,15 +94,15 @@ def _seen(pieces: Iterable[Gaussians], cameras: Sequence[Camera]) -> Gaussians:
         seen = torch.zeros(len(piece), dtype=torch.bool)
         seen[:1] = not kept
         for camera in cameras:
-            seen[visible_rows(piece, camera)] = True
+            seen[visible_gaussian_rows(piece, camera)] = True
         kept.append(piece.select(seen))
-    return joined(kept)
+    return concatenate(kept)
 
 
 @torch.no_grad()
-def _picture(gaussians: Gaussians, run: TrainedRun, camera: Camera) -> Float[np.ndarray, "h w 3"]:
+def _render_gaussians(gaussians: Gaussians, run: OpenedRun, camera: Camera) -> Float[np.ndarray, "h w 3"]:
     background: Float[Tensor, "3"] = torch.tensor(run.model.background)
-    seen = gaussians.select(visible_rows(gaussians, camera))
-    raster, _ = draw_gaussians(seen, camera, background, seen.degree)
+    seen = gaussians.select(visible_gaussian_rows(gaussians, camera))
+    raster, _ = render_gaussians(seen, camera, background, seen.degree)
     pixels: np.ndarray = raster.image.numpy()
     return pixels

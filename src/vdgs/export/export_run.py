@@ -13,69 +13,71 @@ import numpy as np
 from jaxtyping import Int
 from rich.console import Console
 
-from vdgs.captures.camera_height import overview
-from vdgs.captures.output_guard import refuse_among_inputs, refuse_in_a_capture
+from vdgs.captures.camera_height import default_view
+from vdgs.captures.output_guard import check_not_among_inputs, check_not_in_capture
 from vdgs.config.commands import ExportRequest
-from vdgs.distributed.sharded_job import Wish
+from vdgs.distributed.sharded_job import ExecutionOptions
 from vdgs.errors import VdgsError
 from vdgs.export.bake import gaussian_count
-from vdgs.export.bake_plan import as_files_hold
-from vdgs.export.color_refinement import Baked
-from vdgs.export.distributed_bake import BakedElsewhere, baked_elsewhere, forget_shards
-from vdgs.export.export_loss import loss_of, measured_views
+from vdgs.export.bake_plan import drop_unused_sh_degrees
+from vdgs.export.color_refinement import BakedGaussians
+from vdgs.export.distributed_bake import DistributedBake, distributed_bake, forget_shards
+from vdgs.export.export_loss import measure_loss, views_to_measure
 from vdgs.export.formats import registry
-from vdgs.export.formats.export_scene import ROWS, Page, Scene
-from vdgs.export.formats.gaussian_store import Spooled
-from vdgs.export.formats.tiles_3d import NAME, tiles_of
-from vdgs.export.gaussian_optimization import refine
-from vdgs.export.gaussian_selection import bounds_of, chosen, frame_for, rows_for
-from vdgs.export.local_bake import BakedHere, bar_on
-from vdgs.export.local_frame import Frame
-from vdgs.export.novel_cameras import endless, round_count
+from vdgs.export.formats.export_scene import CHUNK_SIZE, ExportScene, InitialView
+from vdgs.export.formats.gaussian_store import GaussianStore
+from vdgs.export.formats.tiles_3d import TILESET_FILE, tileset_files
+from vdgs.export.gaussian_optimization import optimize_gaussians
+from vdgs.export.gaussian_selection import frame_for_file, local_bounds, select_gaussians, select_rows
+from vdgs.export.local_bake import LocalBake, make_progress_bar
+from vdgs.export.local_frame import LocalFrame
+from vdgs.export.novel_cameras import color_iteration_count, endless_cameras
 from vdgs.geometry.camera import Camera
 from vdgs.model.gaussians import Gaussians
-from vdgs.runs.open_run import TrainedRun, open_run
-from vdgs.runs.run_folder import REPORT
-from vdgs.system.atomic_files import jsonable, write_json
+from vdgs.runs.open_run import OpenedRun, open_run
+from vdgs.runs.run_folder import REPORT_FILE
+from vdgs.system.atomic_files import to_jsonable, write_json
 from vdgs.system.documents import ExportedFile, ExportMetadata, JsonObject
-from vdgs.system.stop_signals import stop_if_asked
+from vdgs.system.stop_signals import check_stop_requested
 
 #: What was written and lost, beside the run's other results.
-RECORD = "export.json"
+RECORD_FILE = "export.json"
 
 
 @dataclass(frozen=True, eq=False)
-class _Baked:
+class _BakedScene:
     """The Gaussians of a scene on the disk, in the ground frame."""
 
-    spool: Spooled
+    spool: GaussianStore
     degree: int
     #: How pages show it first, in the ground frame.
-    page: Page
+    page: InitialView
 
-    def scene(self, frame: Frame, rows: Int[np.ndarray, " r"]) -> Scene:
+    def scene(self, frame: LocalFrame, rows: Int[np.ndarray, " r"]) -> ExportScene:
         """What a writer is given: the Gaussians of these rows."""
         chunks = (frame.place(piece) for piece in self.pieces(rows))
-        bounds, page = bounds_of(frame, self.spool.means[rows]), _placed(self.page, frame)
-        return Scene(chunks=chunks, count=len(rows), degree=self.degree, facts=frame.facts, bounds=bounds, page=page)
+        bounds, page = local_bounds(frame, self.spool.means[rows]), _view_in_frame(self.page, frame)
+        return ExportScene(
+            chunks=chunks, count=len(rows), degree=self.degree, facts=frame.facts, bounds=bounds, page=page
+        )
 
     def pieces(self, rows: Int[np.ndarray, " r"]) -> Iterator[Gaussians]:
         """These Gaussians, some thousand at a time."""
-        for first in range(0, len(rows), ROWS):
-            stop_if_asked()
-            yield self.spool.rows(rows[first : first + ROWS])
-            self.spool.let_go()
+        for first in range(0, len(rows), CHUNK_SIZE):
+            check_stop_requested()
+            yield self.spool.rows(rows[first : first + CHUNK_SIZE])
+            self.spool.release_pages()
 
 
-def page_of(run: TrainedRun, most_bytes: int) -> Page:
+def make_initial_view(run: OpenedRun, most_bytes: int) -> InitialView:
     """All of the flight, before the colour that the model has behind it; ground frame."""
-    position, target = overview(run.capture)
+    position, target = default_view(run.capture)
     red, green, blue = (float(each) for each in run.model.background)
     title = run.capture.root.resolve().name or "scene"
-    return Page(_point(position), _point(target), (red, green, blue), title, most_bytes)
+    return InitialView(_point(position), _point(target), (red, green, blue), title, most_bytes)
 
 
-def _placed(page: Page, frame: Frame) -> Page:
+def _view_in_frame(page: InitialView, frame: LocalFrame) -> InitialView:
     """A page in local coordinates."""
     ground = np.array([page.position, page.target])
     position, target = frame.apply(ground)
@@ -87,7 +89,7 @@ def _point(place: np.ndarray) -> tuple[float, float, float]:
     return x, y, z
 
 
-def export_run(asked: ExportRequest, console: Console, wish: Wish | None = None) -> ExportMetadata:
+def export_run(request: ExportRequest, console: Console, execution: ExecutionOptions | None = None) -> ExportMetadata:
     """Write what was asked for, on a device that is chosen already; returns what RUN/export.json holds.
 
     The scene is baked in this process, or in shards where a `wish` sends them: the files are the same. Raises
@@ -95,20 +97,20 @@ def export_run(asked: ExportRequest, console: Console, wish: Wish | None = None)
     capture's inputs, an empty choice, and coordinates that a format or the capture does not have; and what
     `ShardedJob.send` raises.
     """
-    _check_names(asked.run, asked.to)
-    asked = as_files_hold(asked)
-    run = open_run(asked.run, asked.model, asked.device)
-    if run.caution:
-        console.print(f"[yellow]warning[/] {run.caution}", highlight=False)
-    for path in asked.to:
-        refuse_among_inputs(path, run.capture)
+    _check_names(request.run, request.to)
+    request = drop_unused_sh_degrees(request)
+    run = open_run(request.run, request.model, request.device)
+    if run.warning:
+        console.print(f"[yellow]warning[/] {run.warning}", highlight=False)
+    for path in request.to:
+        check_not_among_inputs(path, run.capture)
     centre = np.median(run.model.anchors.positions.cpu().double().numpy(), axis=0)
-    frames = {path: frame_for(path, run, asked, centre) for path in asked.to}
+    frames = {path: frame_for_file(path, run, request, centre) for path in request.to}
     began = time.monotonic()
-    with _baker(run, asked, wish, console) as baker:
+    with _make_baker(run, request, execution, console) as baker:
         pixels = baker.pixels()
-        kept = chosen(pixels, run, asked)
-        rows = rows_for(frames, run, pixels, kept, asked.sh_degree, console)
+        kept = select_gaussians(pixels, run, request)
+        rows = select_rows(frames, run, pixels, kept, request.sh_degree, console)
         console.print(
             f"{run.line}: {len(kept):,} Gaussians of {len(pixels):,} are drawn by the training cameras"
             + (" and asked for" if len(kept) < np.count_nonzero(pixels) else ""),
@@ -116,52 +118,52 @@ def export_run(asked: ExportRequest, console: Console, wish: Wish | None = None)
         )
         del pixels
         with baker.spool(kept) as spool:
-            _refined(Baked(run.model, kept, spool), baker.training, asked.refine, console)
-            baked = _Baked(spool, asked.sh_degree, page_of(run, int(asked.html_mb * 1e6)))
+            _optimize(BakedGaussians(run.model, kept, spool), baker.training, request.optimize_seconds, console)
+            baked = _BakedScene(spool, request.sh_degree, make_initial_view(run, int(request.html_max_mb * 1e6)))
             seconds = time.monotonic() - began
-            rounds = round_count(asked.rounds, gaussian_count(run.model))
+            rounds = color_iteration_count(request.rounds, gaussian_count(run.model))
             console.print(f"baked in {seconds:.1f} s, colours fitted again in {rounds} rounds", highlight=False)
-            files = [_write(path, baked.scene(frames[path], rows[path]), console) for path in asked.to]
-            losses = _losses(run, frames, baked, asked, console)
-    record: ExportMetadata = jsonable({
-        "model": run.name, "key": run.key, "gaussians": len(kept), "sh_degree": asked.sh_degree, "rounds": rounds,
-        "seconds_to_bake": seconds, "seconds_to_refine": asked.refine, "files": files, "losses": losses,
+            files = [_write(path, baked.scene(frames[path], rows[path]), console) for path in request.to]
+            losses = _measure_losses(run, frames, baked, request, console)
+    record: ExportMetadata = to_jsonable({
+        "model": run.name, "key": run.key, "gaussians": len(kept), "sh_degree": request.sh_degree, "rounds": rounds,
+        "seconds_to_bake": seconds, "seconds_to_refine": request.optimize_seconds, "files": files, "losses": losses,
     })  # fmt: skip
-    write_json(run.folder.path / RECORD, record)
+    write_json(run.folder.path / RECORD_FILE, record)
     return record
 
 
-def _baker(
-    run: TrainedRun, asked: ExportRequest, wish: Wish | None, console: Console
-) -> AbstractContextManager[BakedHere | BakedElsewhere]:
+def _make_baker(
+    run: OpenedRun, request: ExportRequest, execution: ExecutionOptions | None, console: Console
+) -> AbstractContextManager[LocalBake | DistributedBake]:
     """What bakes the scene: this process, or shards."""
-    if wish is not None and wish.sends:
-        return baked_elsewhere(run, asked, wish, console)
+    if execution is not None and execution.is_distributed:
+        return distributed_bake(run, request, execution, console)
     forget_shards(run)
-    return nullcontext(BakedHere(run, asked, console))
+    return nullcontext(LocalBake(run, request, console))
 
 
-def _refined(baked: Baked, training: Sequence[Camera], seconds: float, console: Console) -> None:
+def _optimize(baked: BakedGaussians, training: Sequence[Camera], seconds: float, console: Console) -> None:
     """Move all that is baked for so many seconds, by this process' clock."""
     if seconds <= 0:
         return
-    with bar_on(console) as bar:
+    with make_progress_bar(console) as bar:
         task = bar.add_task("refining", total=seconds)
 
         def after_step(passed: float) -> None:
-            stop_if_asked()
+            check_stop_requested()
             bar.update(task, completed=passed)
 
-        refine(baked, endless(training), seconds, after_step)
+        optimize_gaussians(baked, endless_cameras(training), seconds, after_step)
 
 
 def _check_names(run: Path, paths: tuple[Path, ...]) -> None:
     if not paths:
         raise VdgsError("Nothing to write: give --to FILE, such as --to scene.ply.")
     for path in paths:
-        registry.format_of(path)
-        refuse_in_a_capture(path)
-        if path.name.lower() == REPORT and os.path.realpath(path.parent) == os.path.realpath(run):
+        registry.format_from_path(path)
+        check_not_in_capture(path)
+        if path.name.lower() == REPORT_FILE and os.path.realpath(path.parent) == os.path.realpath(run):
             raise VdgsError(
                 f"--to {path}: is the report of the run, which would be overwritten, and written again over the page. "
                 "Choose another name, such as scene.html."
@@ -171,9 +173,9 @@ def _check_names(run: Path, paths: tuple[Path, ...]) -> None:
         raise VdgsError(f"--to {twice[0]}: is given twice.")
 
 
-def _write(path: Path, scene: Scene, console: Console) -> ExportedFile:
+def _write(path: Path, scene: ExportScene, console: Console) -> ExportedFile:
     began = time.monotonic()
-    lost = registry.write(path, scene)
+    lost = registry.write_scene(path, scene)
     seconds, size = time.monotonic() - began, _size(path)
     console.print(f"{path}: {size / 1e6:,.1f} MB in {seconds:.1f} s", highlight=False)
     for each in lost:
@@ -184,29 +186,29 @@ def _write(path: Path, scene: Scene, console: Console) -> ExportedFile:
 
 def _size(path: Path) -> int:
     """Bytes of a file, with the tiles that it names."""
-    tiles = tiles_of(path) if registry.format_of(path).ending == NAME else []
+    tiles = tileset_files(path) if registry.format_from_path(path).suffix == TILESET_FILE else []
     return sum(file.stat().st_size for file in (path, *tiles))
 
 
-def _losses(
-    run: TrainedRun, frames: dict[Path, Frame], baked: _Baked, asked: ExportRequest, console: Console
+def _measure_losses(
+    run: OpenedRun, frames: dict[Path, LocalFrame], baked: _BakedScene, request: ExportRequest, console: Console
 ) -> list[JsonObject]:
     """What each file that can be read back loses, or, where none can, the Gaussians that were written."""
-    if not asked.measure:
+    if not request.measure:
         return []
-    readable: list[Path | None] = [path for path in asked.to if registry.format_of(path).read]
+    readable: list[Path | None] = [path for path in request.to if registry.format_from_path(path).read]
     losses = []
-    with bar_on(console) as bar:
-        task = bar.add_task("comparing with the model", total=len(readable or [None]) * len(measured_views(run)))
+    with make_progress_bar(console) as bar:
+        task = bar.add_task("comparing with the model", total=len(readable or [None]) * len(views_to_measure(run)))
 
         def after_view() -> None:
-            stop_if_asked()
+            check_stop_requested()
             bar.advance(task)
 
         for path in readable or [None]:
             every = np.arange(len(baked.spool.means))
-            pieces = baked.pieces(every) if path is None else map(frames[path].to_ground, registry.pieces(path))
-            loss = loss_of(run, pieces, after_view)
+            pieces = baked.pieces(every) if path is None else map(frames[path].to_ground, registry.read_chunks(path))
+            loss = measure_loss(run, pieces, after_view)
             what = "as baked" if path is None else f"{path.name}, read back"
             console.print(
                 f"{what}, on {loss.views} {loss.of} views: PSNR {loss.psnr:.2f} → {loss.psnr_baked:.2f} dB "

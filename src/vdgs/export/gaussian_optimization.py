@@ -12,18 +12,18 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import torch
 
-from vdgs.export.color_refinement import Baked
+from vdgs.export.color_refinement import BakedGaussians
 from vdgs.geometry.camera import Camera
-from vdgs.kernels import choose
+from vdgs.kernels import get_backend
 from vdgs.kernels.kernel_types import AdamState
-from vdgs.model.gaussians import Gaussians, draw_gaussians
+from vdgs.model.gaussians import Gaussians, render_gaussians
 
 #: Learning rates: half of what trains Gaussians from nothing (3DGS), for these start near the end.
-RATES = {"dc": 1.25e-3, "rest": 6e-5, "logits": 0.025, "log_scales": 2.5e-3, "quaternions": 5e-4}
+LEARNING_RATES = {"dc": 1.25e-3, "rest": 6e-5, "logits": 0.025, "log_scales": 2.5e-3, "quaternions": 5e-4}
 
 
-def refine(
-    baked: Baked,
+def optimize_gaussians(
+    baked: BakedGaussians,
     cameras: Iterator[Camera],
     seconds: float,
     after_step: Callable[[float], None] = lambda passed: None,
@@ -38,7 +38,7 @@ def refine(
     named = gaussians.tensors()
     states = {
         name: AdamState(named[name], torch.zeros_like(named[name]), torch.zeros_like(named[name]), rate)
-        for name, rate in RATES.items() if named[name].numel()
+        for name, rate in LEARNING_RATES.items() if named[name].numel()
     }  # fmt: skip
     updates = torch.zeros(len(every), dtype=torch.int32)
     began, steps = clock(), 0
@@ -51,15 +51,15 @@ def refine(
 
 
 def _step(
-    baked: Baked, gaussians: Gaussians, camera: Camera, states: dict[str, AdamState], updates: torch.Tensor
+    baked: BakedGaussians, gaussians: Gaussians, camera: Camera, states: dict[str, AdamState], updates: torch.Tensor
 ) -> None:
     wanted, numbers = baked.drawn(camera)
     rows = torch.from_numpy(numbers)
     seen = gaussians.select(rows)
     moved = [seen.tensors()[name].requires_grad_() for name in states]
     with torch.enable_grad():
-        raster, _ = draw_gaussians(seen, camera, torch.tensor(baked.model.background), gaussians.degree)
+        raster, _ = render_gaussians(seen, camera, torch.tensor(baked.model.background), gaussians.degree)
         gradients = torch.autograd.grad((raster.image - wanted).square().sum(), moved, materialize_grads=True)
     updates[rows] += 1
     for state, gradient in zip(states.values(), gradients, strict=True):
-        choose(rows.device).adam_rows(state, rows, gradient, updates[rows])
+        get_backend(rows.device).adam_rows(state, rows, gradient, updates[rows])

@@ -12,30 +12,30 @@ from rich.console import Console
 from vdgs.config.commands import ExportRequest
 from vdgs.errors import VdgsError
 from vdgs.export.formats import registry
-from vdgs.export.formats.export_scene import Scene
-from vdgs.export.local_frame import FAR, Frame, frame_of, usual_crs
-from vdgs.geometry.map_projection import Placement
-from vdgs.model.decode_world import places
-from vdgs.runs.open_run import TrainedRun
+from vdgs.export.formats.export_scene import ExportScene
+from vdgs.export.local_frame import MAX_LOCAL_COORDINATE, LocalFrame, default_crs, make_local_frame
+from vdgs.geometry.map_projection import MapProjection
+from vdgs.model.decode_world import gaussian_means
+from vdgs.runs.open_run import OpenedRun
 
 #: A file goes without Gaussians beyond its reach where they make at most this part of what the training cameras see.
-MOST_BEYOND = 1e-3
+MAX_DROPPED_SHARE = 1e-3
 
 
-def chosen(pixels: Float[np.ndarray, " g"], run: TrainedRun, asked: ExportRequest) -> Int[np.ndarray, " m"]:
+def select_gaussians(pixels: Float[np.ndarray, " g"], run: OpenedRun, request: ExportRequest) -> Int[np.ndarray, " m"]:
     """The Gaussians to write, ascending: drawn by a training camera, of the block, within the box, most drawn first
     where they are too many. `pixels`: how many each makes. Raises VdgsError where none is left."""
     k = run.model.anchors.offsets.shape[1]
     wanted = pixels > 0
-    if asked.block is not None:
-        wanted &= np.repeat(_of_block(run, asked.block), k)
-    if asked.bbox is not None:
-        x0, y0, x1, y1 = asked.bbox
+    if request.block is not None:
+        wanted &= np.repeat(_anchors_of_block(run, request.block), k)
+    if request.bbox is not None:
+        x0, y0, x1, y1 = request.bbox
         if not (x0 < x1 and y0 < y1):
             raise VdgsError(f"--bbox {x0:g} {y0:g} {x1:g} {y1:g}: is empty. Give X0 Y0 X1 Y1, the lower corner first.")
-        crs = asked.crs or usual_crs(run.capture.ground, asked.to[0])
-        inside = Placement.of(run.capture.ground, crs).places(
-            places(run.model.anchors).cpu().double().reshape(-1, 3).numpy()
+        crs = request.crs or default_crs(run.capture.ground, request.to[0])
+        inside = MapProjection.of(run.capture.ground, crs).places(
+            gaussian_means(run.model.anchors).cpu().double().reshape(-1, 3).numpy()
         )
         wanted &= (inside[:, :2] >= (x0, y0)).all(1) & (inside[:, :2] <= (x1, y1)).all(1)
         if not wanted.any():
@@ -47,13 +47,13 @@ def chosen(pixels: Float[np.ndarray, " g"], run: TrainedRun, asked: ExportReques
     kept = np.flatnonzero(wanted)
     if not len(kept):
         raise VdgsError(f"{run.model_path}: no training camera draws anything of what was asked for.")
-    if 0 < asked.max_gaussians < len(kept):
-        most = np.argpartition(pixels[kept], -asked.max_gaussians)[-asked.max_gaussians :]
+    if 0 < request.max_gaussians < len(kept):
+        most = np.argpartition(pixels[kept], -request.max_gaussians)[-request.max_gaussians :]
         kept = np.sort(kept[most])
     return kept
 
 
-def _of_block(run: TrainedRun, block: int) -> np.ndarray:
+def _anchors_of_block(run: OpenedRun, block: int) -> np.ndarray:
     """Which anchors of a merged model a block has made."""
     counts = [part.count for part in run.model.parts]
     if run.name != "merged" or not 0 <= block < len(counts):
@@ -62,19 +62,21 @@ def _of_block(run: TrainedRun, block: int) -> np.ndarray:
     return np.repeat(np.arange(len(counts)) == block, counts)
 
 
-def frame_for(path: Path, run: TrainedRun, asked: ExportRequest, centre: np.ndarray) -> Frame:
+def frame_for_file(path: Path, run: OpenedRun, request: ExportRequest, centre: np.ndarray) -> LocalFrame:
     """The coordinates of a file: those that do not reach far have their origin nearby.
 
     3D Tiles stand on the globe wherever it is known how, whatever --crs says of other files: no map lies between.
     """
-    ground, kind = run.capture.ground, registry.format_of(path)
-    far = min(FAR, kind.reach / 2)
-    frame = frame_of(ground, asked.crs or usual_crs(ground, path), centre, far)  # which refuses what is no system
-    return frame_of(ground, "enu", centre, far) if kind.on_globe and ground.origin_geo is not None else frame
+    ground, kind = run.capture.ground, registry.format_from_path(path)
+    far = min(MAX_LOCAL_COORDINATE, kind.reach / 2)
+    frame = make_local_frame(
+        ground, request.crs or default_crs(ground, path), centre, far
+    )  # which refuses what is no system
+    return make_local_frame(ground, "enu", centre, far) if kind.on_globe and ground.origin_geo is not None else frame
 
 
-def rows_for(
-    frames: Mapping[Path, Frame], run: TrainedRun, pixels: Float[np.ndarray, " g"], kept: Int[np.ndarray, " m"],
+def select_rows(
+    frames: Mapping[Path, LocalFrame], run: OpenedRun, pixels: Float[np.ndarray, " g"], kept: Int[np.ndarray, " m"],
     degree: int, console: Console,
 ) -> dict[Path, Int[np.ndarray, " r"]]:  # fmt: skip
     """Which of the Gaussians each file is given. What a format cannot hold is said before the work.
@@ -82,14 +84,14 @@ def rows_for(
     A format that does not reach far goes without the few Gaussians that lie beyond and of which the photographs show
     next to nothing; more of them are refused.
     """
-    means = places(run.model.anchors).cpu().reshape(-1, 3).numpy()[kept]
+    means = gaussian_means(run.model.anchors).cpu().reshape(-1, 3).numpy()[kept]
     pixels = pixels[kept]
     rows = {}
     for path, frame in frames.items():
-        reach = registry.format_of(path).reach
+        reach = registry.format_from_path(path).reach
         beyond = (np.abs(_local(frame, means)) >= 0.999 * reach).any(1)
         share = float(pixels[beyond].sum() / pixels.sum())
-        if share > MOST_BEYOND:
+        if share > MAX_DROPPED_SHARE:
             beyond[:] = False  # it is refused below
         elif beyond.any():
             console.print(
@@ -99,26 +101,26 @@ def rows_for(
                 highlight=False,
             )
         rows[path] = np.flatnonzero(~beyond)
-        registry.check(
+        registry.check_export(
             path,
-            Scene(
+            ExportScene(
                 chunks=(),
                 count=len(rows[path]),
                 degree=degree,
                 facts=frame.facts,
-                bounds=bounds_of(frame, means[rows[path]]),
+                bounds=local_bounds(frame, means[rows[path]]),
             ),
         )
     return rows
 
 
-def _local(frame: Frame, means: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:
+def _local(frame: LocalFrame, means: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:
     local: np.ndarray = frame.apply(means.astype(np.float64))
     return local
 
 
-def bounds_of(
-    frame: Frame, means: Float[np.ndarray, "m 3"]
+def local_bounds(
+    frame: LocalFrame, means: Float[np.ndarray, "m 3"]
 ) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     """Lowest and highest local coordinates."""
     local = _local(frame, means)

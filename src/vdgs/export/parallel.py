@@ -13,15 +13,17 @@ import torch
 from jaxtyping import Int, Int32, Int64
 from torch import Tensor
 
-from vdgs.kernels import set_threads, threads
+from vdgs.kernels import get_num_threads, set_num_threads
 
 P = TypeVar("P")
 R = TypeVar("R")
 #: Beyond so many threads memory would grow more than speed.
-MOST = 8
+MAX_WORKERS = 8
 
 
-def sorted_runs(numbers: Int[Tensor, " p"], first: int, count: int) -> tuple[Int64[Tensor, " p"], Int64[Tensor, " m"]]:
+def sort_segments(
+    numbers: Int[Tensor, " p"], first: int, count: int
+) -> tuple[Int64[Tensor, " p"], Int64[Tensor, " m"]]:
     """How pairs whose Gaussians are given, of `count` from `first` on, are brought into the order of these, keeping
     their own among those of each; and how many pairs each of the `count` has.
 
@@ -33,7 +35,7 @@ def sorted_runs(numbers: Int[Tensor, " p"], first: int, count: int) -> tuple[Int
     return order, torch.from_numpy(np.bincount(keys, minlength=count))
 
 
-def span_of(ascending: Int32[Tensor, " p"], first: int, end: int) -> tuple[int, int]:
+def index_range(ascending: Int32[Tensor, " p"], first: int, end: int) -> tuple[int, int]:
     """Where those numbers begin and end that are at least `first` and below `end`.
 
     With bounds of another type numpy would copy all of the numbers.
@@ -42,13 +44,13 @@ def span_of(ascending: Int32[Tensor, " p"], first: int, end: int) -> tuple[int, 
     return int(low), int(high)
 
 
-def in_order(work: Callable[[P], R], parts: Iterable[P]) -> Iterator[R]:
+def parallel_map(work: Callable[[P], R], parts: Iterable[P]) -> Iterator[R]:
     """work(part) of every part, in their order, on as many threads as kernels use, which they share among the parts.
 
     Each part has one thread of torch, so that the last bits of a product do not depend on how many there are.
     """
-    workers = max(1, min(MOST, threads()))
-    with _shared_among(workers), ThreadPoolExecutor(workers) as pool:
+    workers = max(1, min(MAX_WORKERS, get_num_threads()))
+    with _divided_threads(workers), ThreadPoolExecutor(workers) as pool:
         under_way: deque[Future[R]] = deque()
         try:
             for part in parts:
@@ -62,19 +64,19 @@ def in_order(work: Callable[[P], R], parts: Iterable[P]) -> Iterator[R]:
                 each.cancel()
 
 
-def view_by_view(work: Callable[[P], R], views: Iterable[P], device: torch.device) -> Iterator[R]:
+def map_views(work: Callable[[P], R], views: Iterable[P], device: torch.device) -> Iterator[R]:
     """The same for views that are drawn on a device: side by side on the processor, one after the other on a card."""
-    return in_order(work, views) if device.type == "cpu" else map(work, views)
+    return parallel_map(work, views) if device.type == "cpu" else map(work, views)
 
 
 @contextmanager
-def _shared_among(workers: int) -> Iterator[None]:
+def _divided_threads(workers: int) -> Iterator[None]:
     """Parts side by side need few threads each: more would wait for each other (a tenth of the time, on two cores)."""
-    of_torch, of_kernels = torch.get_num_threads(), threads()
-    set_threads(max(1, of_kernels // workers))
+    of_torch, of_kernels = torch.get_num_threads(), get_num_threads()
+    set_num_threads(max(1, of_kernels // workers))
     torch.set_num_threads(1)
     try:
         yield
     finally:
-        set_threads(of_kernels)
+        set_num_threads(of_kernels)
         torch.set_num_threads(of_torch)

@@ -15,7 +15,7 @@ import numpy as np
 CameraModel = Literal["pinhole", "orthographic"]
 
 #: Points nearer than this (in units of the ground frame) are never drawn.
-NEAR = 0.01
+NEAR_PLANE = 0.01
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -54,19 +54,19 @@ class Camera:
         fx, fy, cx, cy, width, height, orthographic (0 or 1), near, width and height of the whole picture."""
         rigid = self.camera_from_world
         tail = [self.fx, self.fy, self.cx, self.cy, self.width, self.height,
-                float(self.model == "orthographic"), NEAR, *self.whole_size]  # fmt: skip
+                float(self.model == "orthographic"), NEAR_PLANE, *self.full_size]  # fmt: skip
         return np.concatenate([rigid[:3, :3].ravel(), rigid[:3, 3], tail]).astype(np.float32)
 
     @cached_property
-    def packed_exactly(self) -> np.ndarray:
+    def packed_float64(self) -> np.ndarray:
         """The first 20 numbers of `packed` in float64: what decides which places a frustum holds."""
         rigid = self.camera_from_world
         tail = [self.fx, self.fy, self.cx, self.cy, self.width, self.height,
-                float(self.model == "orthographic"), NEAR]  # fmt: skip
+                float(self.model == "orthographic"), NEAR_PLANE]  # fmt: skip
         return np.concatenate([rigid[:3, :3].ravel(), rigid[:3, 3], tail]).astype(np.float64)
 
     @property
-    def whole_size(self) -> tuple[int, int]:
+    def full_size(self) -> tuple[int, int]:
         """Width and height of the whole picture."""
         return self.whole or (self.width, self.height)
 
@@ -79,7 +79,7 @@ class Camera:
                 f"{self.width}x{self.height}"
             )
         return replace(
-            self, cx=self.cx - left, cy=self.cy - top, width=right - left, height=bottom - top, whole=self.whole_size
+            self, cx=self.cx - left, cy=self.cy - top, width=right - left, height=bottom - top, whole=self.full_size
         )
 
     def resized(self, width: int, height: int) -> Camera:
@@ -97,9 +97,9 @@ class Camera:
             height=height,
         )
 
-    def within(self, longest_side_px: int) -> Camera:
+    def limit_size(self, max_side_px: int) -> Camera:
         """The same view at most so many pixels wide and high; never enlarged."""
-        scale = min(1.0, longest_side_px / max(self.width, self.height))
+        scale = min(1.0, max_side_px / max(self.width, self.height))
         return self.resized(max(1, round(scale * self.width)), max(1, round(scale * self.height)))
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -122,8 +122,8 @@ class Camera:
         local = np.concatenate([across, np.asarray(depth, np.float64)[..., None]], axis=-1)
         return (local - self.camera_from_world[:3, 3]) @ self.camera_from_world[:3, :3]
 
-    def sees(self, points: np.ndarray) -> np.ndarray:
+    def in_frustum(self, points: np.ndarray) -> np.ndarray:
         """Which points fall inside the frustum: z > near and projected centre on the image, [n] bool."""
         pixels, depth = self.project(points)
         x, y = pixels[:, 0], pixels[:, 1]
-        return (depth > NEAR) & (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
+        return (depth > NEAR_PLANE) & (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)

@@ -12,20 +12,20 @@ from jaxtyping import Float
 from vdgs.errors import VdgsError
 
 #: Where the altitudes of photographs come from is not known here; what they are taken for is.
-ELLIPSOIDAL = "ellipsoidal (WGS 84), if the altitudes of the georeference are"
+ELLIPSOIDAL_REFERENCE = "ellipsoidal (WGS 84), if the altitudes of the georeference are"
 #: Half the side of the area, in degrees, for which the best operation between two systems is chosen.
 _AREA_DEG = 0.05
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Projection:
+class CrsTransform:
     """One system of the catalogue and the one operation that leads to it from WGS 84."""
 
     code: str
     name: str
     unit: str
     #: Metres per unit.
-    metres: float
+    meters_per_unit: float
     wkt: str
     heights: str
     notes: tuple[str, ...]
@@ -39,19 +39,19 @@ class Projection:
         x, y, z = self._transformer.transform(longitude, latitude, height)
         return np.stack([x, y, np.asarray(z) * self._height_factor], axis=1)
 
-    def to_geodetic(self, places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def to_geodetic(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """The inverse of `from_geodetic`."""
         # Between datums of two dimensions PROJ inverts to a millimetre only; once more, what is missing is a nanometre.
-        missed = places - self.from_geodetic(self._inverted(places))
-        return self._inverted(places + missed)
+        missed = points - self.from_geodetic(self._inverted(points))
+        return self._inverted(points + missed)
 
-    def _inverted(self, places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        x, y, z = places.T
+    def _inverted(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        x, y, z = points.T
         longitude, latitude, height = self._transformer.transform(x, y, z / self._height_factor, direction="INVERSE")
         return np.stack([latitude, longitude, height], axis=1)
 
 
-def utm_zone(latitude_deg: float, longitude_deg: float) -> str:
+def utm_epsg(latitude_deg: float, longitude_deg: float) -> str:
     """The code of the UTM zone (six degrees wide, WGS 84) of a place; beyond 84° north and 80° south, of UPS."""
     if latitude_deg >= 84 or latitude_deg <= -80:
         return "EPSG:32661" if latitude_deg > 0 else "EPSG:32761"
@@ -59,7 +59,7 @@ def utm_zone(latitude_deg: float, longitude_deg: float) -> str:
     return f"EPSG:{(32600 if latitude_deg >= 0 else 32700) + zone}"
 
 
-def open_projection(code: str, origin: tuple[float, float, float]) -> Projection:
+def open_crs(code: str, origin: tuple[float, float, float]) -> CrsTransform:
     """The system `EPSG:n` (or `EPSG:n+m` with heights) for a scene about `origin` (lat deg, lon deg, height m).
 
     Raises VdgsError for a code that is unknown, in degrees, of axes that are not east and north, of mixed units or with
@@ -79,7 +79,7 @@ def open_projection(code: str, origin: tuple[float, float, float]) -> Projection
     if not (crs.is_geocentric or _horizontal(crs).is_projected):
         raise VdgsError(
             f"--crs {code}: {crs.name} is not in metres across (degrees, or heights alone). Give a projected system, "
-            f"such as {utm_zone(*origin[:2])}, or leave --crs out."
+            f"such as {utm_epsg(*origin[:2])}, or leave --crs out."
         )
     _refuse_westward(crs, code, origin)
     axes = crs.axis_info
@@ -89,9 +89,11 @@ def open_projection(code: str, origin: tuple[float, float, float]) -> Projection
     transformer, notes = _operation(crs, code, origin)
     own_heights = len(axes) == 3
     unit = "m" if metres == 1.0 else axes[0].unit_name
-    heights = "from the middle of the Earth" if crs.is_geocentric else axes[2].name if own_heights else ELLIPSOIDAL
-    return Projection(
-        code=code, name=crs.name, unit=unit, metres=metres, wkt=crs.to_wkt(),
+    heights = (
+        "from the middle of the Earth" if crs.is_geocentric else axes[2].name if own_heights else ELLIPSOIDAL_REFERENCE
+    )
+    return CrsTransform(
+        code=code, name=crs.name, unit=unit, meters_per_unit=metres, wkt=crs.to_wkt(),
         heights=heights if unit == "m" else f"{heights}; in {unit}", notes=notes,
         _height_factor=1.0 if own_heights else 1 / metres, _transformer=transformer,
     )  # fmt: skip
@@ -111,7 +113,7 @@ def _refuse_westward(crs: Any, code: str, origin: tuple[float, float, float]) ->
         return
     twin = _of_name(f"{_horizontal(crs).name} East North")
     instead = (
-        f"Give its twin to the east and north, {twin}" if twin else f"Give another, such as {utm_zone(*origin[:2])}"
+        f"Give its twin to the east and north, {twin}" if twin else f"Give another, such as {utm_epsg(*origin[:2])}"
     )
     raise VdgsError(
         f"--crs {code}: {crs.name} counts to the {towards[0]} and {towards[1]}; maps and scenes need east and north. "

@@ -65,7 +65,7 @@ def enu_from_geodetic(
 ) -> np.ndarray:
     """(lat, lon, alt) [n, 3] to east-north-up metres [n, 3] about `origin` (lat, lon, alt).
 
-    `level_at` (lat, lon): the place whose east, north and up the axes are, where it is another one.
+    `axes_origin` (lat, lon): the place whose east, north and up the axes are, where it is another one.
     """
     centre = ecef_from_geodetic(np.array([origin]))
     return (ecef_from_geodetic(geodetic) - centre) @ enu_axes(*(level_at or origin[:2])).T

@@ -24,7 +24,7 @@ class GroundFrame(Similarity):
     axes_geo: tuple[float, float] | None = None
 
     @property
-    def level_at(self) -> tuple[float, float]:
+    def axes_origin(self) -> tuple[float, float]:
         """Latitude and longitude (deg) of the place whose east, north and up are the axes (georeferenced frames)."""
         if self.origin_geo is None:
             raise ValueError("a frame that is not georeferenced is level at no known place")

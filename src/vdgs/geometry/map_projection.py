@@ -15,21 +15,21 @@ import numpy as np
 from jaxtyping import Float
 
 from vdgs.errors import VdgsError
-from vdgs.geometry.crs import Projection, open_projection, utm_zone
+from vdgs.geometry.crs import CrsTransform, open_crs, utm_epsg
 from vdgs.geometry.geodesy import enu_axes, enu_from_geodetic, geodetic_from_enu
 from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.geometry.similarity import Similarity
 
-Places = Float[np.ndarray, "n 3"]
+MapPoints = Float[np.ndarray, "n 3"]
 
 #: What `--crs` may be, for messages and help.
-CHOICES = "EPSG:n (such as EPSG:25832), enu, source or local"
+CRS_CHOICES = "EPSG:n (such as EPSG:25832), enu, source or local"
 #: Half the distance in metres (or units) over which a local similarity is taken from the exact map (choice).
 _STEP = 20.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Placement:
+class MapProjection:
     """Coordinates of a target system for points of a ground frame. Made by `Placement.of`."""
 
     #: What `--crs` would say: "EPSG:32611", "enu", "source" or "local".
@@ -39,48 +39,48 @@ class Placement:
     #: What one unit of the target is called: "m", "US survey foot", "units".
     unit: str
     #: Metres per unit of the target; None where nobody knows them.
-    metres: float | None
+    meters_per_unit: float | None
     #: WKT 2 of a projected or geocentric system; None for the others, which no catalogue holds.
     wkt: str | None
     #: What the third coordinate counts from.
     heights: str
     #: What a person should know about the accuracy.
     notes: tuple[str, ...]
-    _forward: Callable[[Places], Places]
-    _backward: Callable[[Places], Places]
+    _forward: Callable[[MapPoints], MapPoints]
+    _backward: Callable[[MapPoints], MapPoints]
 
     @classmethod
-    def of(cls, ground: GroundFrame, crs: str | None = None) -> Placement:
-        """The placement of a ground frame in the system that `crs` names (`CHOICES`).
+    def of(cls, ground: GroundFrame, crs: str | None = None) -> MapProjection:
+        """The placement of a ground frame in the system that `crs` names (`CRS_CHOICES`).
 
         None: the UTM zone of the origin where the frame is georeferenced, else "local", the ground frame itself.
         Raises VdgsError for a system that is unknown, in degrees, not to the east and north, or needs a georeference
         that is not there, and where pyproj is not installed.
         """
-        asked = (crs or ("local" if ground.origin_geo is None else utm_zone(*ground.origin_geo[:2]))).strip()
+        asked = (crs or ("local" if ground.origin_geo is None else utm_epsg(*ground.origin_geo[:2]))).strip()
         if asked.lower() == "local":
             return _local(ground)
         if asked.lower() == "source":
             return _source(ground)
         if asked.lower() != "enu" and not asked.upper().startswith("EPSG:"):
-            raise VdgsError(f"--crs {asked}: is no coordinate system known here. Give {CHOICES}.")
+            raise VdgsError(f"--crs {asked}: is no coordinate system known here. Give {CRS_CHOICES}.")
         if ground.origin_geo is None:
             raise VdgsError(
                 f"--crs {asked}: the capture is not georeferenced ({ground.how}), so nobody knows where on Earth it "
                 "lies. Give positions when the run is started (--gps TABLE.csv or --georef FILE.json), or --crs local."
             )
-        return _enu(ground) if asked.lower() == "enu" else _projected(ground, open_projection(asked, ground.origin_geo))
+        return _enu(ground) if asked.lower() == "enu" else _projected(ground, open_crs(asked, ground.origin_geo))
 
-    def places(self, points: Places) -> Places:
+    def places(self, points: MapPoints) -> MapPoints:
         """Points of the ground frame [n, 3] to coordinates of the target (east or x, north or y, height), exactly.
 
         Raises VdgsError where the target's projection does not reach.
         """
         return self._checked(self._forward(np.asarray(points, np.float64)))
 
-    def to_ground(self, places: Places) -> Places:
+    def to_ground(self, points: MapPoints) -> MapPoints:
         """The inverse of `places`."""
-        return self._checked(self._backward(np.asarray(places, np.float64)))
+        return self._checked(self._backward(np.asarray(points, np.float64)))
 
     def similarity_at(self, centre: Float[np.ndarray, "3"]) -> Similarity:
         """The similarity from the ground frame to the target that is right about `centre`, a ground point [3].
@@ -99,64 +99,64 @@ class Placement:
         scale = float(np.sqrt(np.linalg.norm(np.cross(jacobian[:, 0], jacobian[:, 1]))))
         return Similarity(scale, rotation, self.places(centre[None])[0] - scale * rotation @ centre)
 
-    def _checked(self, found: Places) -> Places:
+    def _checked(self, found: MapPoints) -> MapPoints:
         if not np.isfinite(found).all():
             raise VdgsError(f"--crs {self.crs}: {self.name} does not reach this place. Give the system of its country.")
         return found
 
 
-def _local(ground: GroundFrame) -> Placement:
+def _local(ground: GroundFrame) -> MapProjection:
     if ground.metric:
         name, heights = "ground frame, local metres", "metres above the origin of the ground frame"
         axes = " (x east, y north)" if ground.origin_geo else ""
     else:
         name, heights = "ground frame, local units without known size", "units above the origin of the ground frame"
         axes = ""
-    return Placement(
-        crs="local", name=name + axes, unit=ground.unit, metres=1.0 if ground.metric else None, wkt=None,
+    return MapProjection(
+        crs="local", name=name + axes, unit=ground.unit, meters_per_unit=1.0 if ground.metric else None, wkt=None,
         heights=heights, notes=(), _forward=_same, _backward=_same,
     )  # fmt: skip
 
 
-def _source(ground: GroundFrame) -> Placement:
+def _source(ground: GroundFrame) -> MapProjection:
     metres = ground.scale if ground.metric else None
     unit = "m" if metres is not None and abs(metres - 1) < 1e-9 else "units"
     name, heights = "the capture's own coordinates", "the third coordinate of the capture's own world"
-    return Placement(
-        crs="source", name=name, unit=unit, metres=metres, wkt=None, heights=heights, notes=(),
+    return MapProjection(
+        crs="source", name=name, unit=unit, meters_per_unit=metres, wkt=None, heights=heights, notes=(),
         _forward=ground.apply_inverse, _backward=ground.to_ground,
     )  # fmt: skip
 
 
-def _enu(ground: GroundFrame) -> Placement:
+def _enu(ground: GroundFrame) -> MapProjection:
     """East, north and up at the origin of the ground frame, whose own axes may be those of another place."""
     assert ground.origin_geo is not None
     latitude, longitude, altitude = ground.origin_geo
-    turned = enu_axes(latitude, longitude) @ enu_axes(*ground.level_at).T
+    turned = enu_axes(latitude, longitude) @ enu_axes(*ground.axes_origin).T
     name = f"east, north, up about latitude {latitude:.7f}, longitude {longitude:.7f}, height {altitude:.2f} m"
     heights = f"metres above the horizon plane of the origin, which has the height {altitude:.2f} m"
-    return Placement(
-        crs="enu", name=name, unit="m", metres=1.0, wkt=None, heights=heights, notes=(),
+    return MapProjection(
+        crs="enu", name=name, unit="m", meters_per_unit=1.0, wkt=None, heights=heights, notes=(),
         _forward=lambda points: points @ turned.T, _backward=lambda places: places @ turned,
     )  # fmt: skip
 
 
-def _projected(ground: GroundFrame, projection: Projection) -> Placement:
-    origin, level_at = ground.origin_geo, ground.level_at
+def _projected(ground: GroundFrame, projection: CrsTransform) -> MapProjection:
+    origin, level_at = ground.origin_geo, ground.axes_origin
     assert origin is not None
 
-    def forward(points: Places) -> Places:
+    def forward(points: MapPoints) -> MapPoints:
         return projection.from_geodetic(geodetic_from_enu(points, origin, level_at))
 
-    def backward(places: Places) -> Places:
+    def backward(places: MapPoints) -> MapPoints:
         return enu_from_geodetic(projection.to_geodetic(places), origin, level_at)
 
-    return Placement(
+    return MapProjection(
         crs=projection.code, name=f"{projection.name} ({projection.code})", unit=projection.unit,
-        metres=projection.metres, wkt=projection.wkt, heights=projection.heights, notes=projection.notes,
+        meters_per_unit=projection.meters_per_unit, wkt=projection.wkt, heights=projection.heights, notes=projection.notes,
         _forward=forward, _backward=backward,
     )  # fmt: skip
 
 
-def _same(points: Places) -> Places:
+def _same(points: MapPoints) -> MapPoints:
     return points.copy()

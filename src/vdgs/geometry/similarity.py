@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Float
 
 #: Points whose second principal spread is below this share of the first lie on one line.
-COLLINEAR = 0.02
+MAX_COLLINEAR_RATIO = 0.02
 #: Matched points disagree where a fit leaves them farther off (RMS) than this share of their spread, or where fewer
 #: than this share of them trust it: what they say of scale and directions is chance (choice).
-MOST_OFF, LEAST_TRUSTED = 0.25, 0.5
+MAX_RELATIVE_RMS, MIN_INLIER_FRACTION = 0.25, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ def is_collinear(points: np.ndarray) -> bool:
     if len(points) < 3:
         return True
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(spread[1] <= COLLINEAR * spread[0])
+    return bool(spread[1] <= MAX_COLLINEAR_RATIO * spread[0])
 
 
 def fit_similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
@@ -51,7 +51,9 @@ def fit_similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
     return Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)
 
 
-def fit_similarity_robust(source: np.ndarray, target: np.ndarray, rounds: int = 500) -> tuple[Similarity, np.ndarray]:
+def fit_similarity_robust(
+    source: np.ndarray, target: np.ndarray, num_iterations: int = 500
+) -> tuple[Similarity, np.ndarray]:
     """Least median of squares over seeded triples, then least squares over the inliers.
 
     Inliers lie within 3 robust standard deviations (1.4826 * median residual) of the best triple's fit,
@@ -61,7 +63,7 @@ def fit_similarity_robust(source: np.ndarray, target: np.ndarray, rounds: int = 
     generator = np.random.default_rng(0)
     best = fit_similarity(source, target)
     best_median = np.median(_residuals(best, source, target))
-    for _ in range(rounds):
+    for _ in range(num_iterations):
         triple = generator.choice(len(source), size=3, replace=False)
         if is_collinear(source[triple]):
             continue
@@ -81,16 +83,16 @@ def fit_similarity_robust(source: np.ndarray, target: np.ndarray, rounds: int = 
     return best, inliers
 
 
-def disagreement(residuals: np.ndarray, targets: np.ndarray, trusted: np.ndarray) -> str:
+def describe_disagreement(residuals: np.ndarray, targets: np.ndarray, inliers: np.ndarray) -> str:
     """How far matched points are from agreeing on a similarity, in words; empty where they agree.
 
     residuals [n, 3] are of all points, `trusted` [n] bool are those that the fit trusts; targets [m, 3] in metres
     tell the spread.
     """
-    rms = float(np.sqrt((residuals[trusted] ** 2).sum(axis=1).mean()))
+    rms = float(np.sqrt((residuals[inliers] ** 2).sum(axis=1).mean()))
     spread = float(np.sqrt((targets - targets.mean(axis=0)).var(axis=0).sum()))
-    if trusted.mean() < LEAST_TRUSTED or rms > MOST_OFF * spread:
-        return f"{trusted.sum()} of {len(trusted)} agree, RMS {rms:.3g} m over a flight of {spread:.3g} m"
+    if inliers.mean() < MIN_INLIER_FRACTION or rms > MAX_RELATIVE_RMS * spread:
+        return f"{inliers.sum()} of {len(inliers)} agree, RMS {rms:.3g} m over a flight of {spread:.3g} m"
     return ""
 
 
@@ -98,13 +100,13 @@ def _residuals(similarity: Similarity, source: np.ndarray, target: np.ndarray) -
     return np.linalg.norm(similarity.apply(source) - target, axis=1)
 
 
-def geometric_median(points: np.ndarray, most: int = 20_000) -> np.ndarray:
+def geometric_median(points: np.ndarray, max_points: int = 20_000) -> np.ndarray:
     """The place [3] with the least summed distance to the points [n, 3] (Weiszfeld's iteration).
 
     Unlike a median per axis it turns and scales with the points, and unlike the mean a few strays do not
     move it. More than `most` points are thinned evenly.
     """
-    sample = points[:: max(1, -(-len(points) // most))]
+    sample = points[:: max(1, -(-len(points) // max_points))]
     centre = np.median(sample, axis=0)
     for _ in range(200):
         distance = np.linalg.norm(sample - centre, axis=1)

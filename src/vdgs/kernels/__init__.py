@@ -1,6 +1,6 @@
-"""The numerical operations, in interchangeable implementations, behind one door: `choose(device)`.
+"""The numerical operations, in interchangeable implementations, behind one door: `get_backend(device)`.
 
-`native` is C++ for the CPU, `reference` readable torch for any device (and the oracle of the tests). `Operations` in
+`native` is C++ for the CPU, `reference` readable torch for any device (and the oracle of the tests). `KernelBackend` in
 `operations.py` is the typed set that both offer; "d" marks those that torch can differentiate. `composed` is the set
 for NVIDIA GPUs, of `reference`, own kernels (`cuda`) and `gsplat`; a table in `operations.py` says which is which.
 Code outside this folder names no implementation.
@@ -44,27 +44,27 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import torch
 
-    from vdgs.kernels.operations import Operations
+    from vdgs.kernels.operations import KernelBackend
 
 #: Environment variable that takes another set than the device's own: `reference` or `composed`, for tests and doubts.
-VARIABLE = "VDGS_KERNELS"
+KERNELS_ENV_VAR = "VDGS_KERNELS"
 
 
-def choose(device: torch.device) -> Operations:
+def get_backend(device: torch.device) -> KernelBackend:
     """The operations for tensors on `device`: C++ on the CPU, the composed set on NVIDIA GPUs, torch elsewhere; on any
     device those that VDGS_KERNELS names, if it does.
 
     Raises VdgsError for another value of that variable.
     """
-    return _implementation(device.type, os.environ.get(VARIABLE, ""))
+    return _implementation(device.type, os.environ.get(KERNELS_ENV_VAR, ""))
 
 
 @cache
-def _implementation(device_type: str, wanted: str) -> Operations:
+def _implementation(device_type: str, wanted: str) -> KernelBackend:
     if wanted not in ("", "native", "reference", "composed"):
         from vdgs.errors import VdgsError
 
-        raise VdgsError(f"{VARIABLE} must be native, reference, composed or not set, not {wanted!r}.")
+        raise VdgsError(f"{KERNELS_ENV_VAR} must be native, reference, composed or not set, not {wanted!r}.")
     if wanted == "reference" or (wanted != "composed" and device_type not in ("cpu", "cuda")):
         from vdgs.kernels import torch_ref
 
@@ -78,21 +78,21 @@ def _implementation(device_type: str, wanted: str) -> Operations:
     return cpu
 
 
-def threads() -> int:
+def get_num_threads() -> int:
     """How many threads the operations use on the CPU."""
     from vdgs.kernels.cpu import extension
 
-    return extension.threads()
+    return extension.get_num_threads()
 
 
-def default_threads() -> int:
+def default_num_threads() -> int:
     """`VDGS_THREADS`, or the number of cores that this process may use; the kernels themselves are not loaded.
 
     Raises VdgsError for another value of that variable.
     """
     from vdgs.kernels import thread_count
 
-    return thread_count.default_threads()
+    return thread_count.default_num_threads()
 
 
 def configure_threads(count: int | None = None) -> None:
@@ -100,14 +100,14 @@ def configure_threads(count: int | None = None) -> None:
 
     Call it before torch is imported: torch's OpenMP threads must block, not spin, beside the kernels' own pool, and
     OMP_WAIT_POLICY is read once, when torch is loaded. A value that is set already stays. Without a count nothing heavy
-    is imported; with one, kernels and torch use so many threads, with 0 as many as `default_threads` says.
+    is imported; with one, kernels and torch use so many threads, with 0 as many as `default_num_threads` says.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     if count is not None:
-        set_threads(count or default_threads())
+        set_num_threads(count or default_num_threads())
 
 
-def set_threads(count: int) -> None:
+def set_num_threads(count: int) -> None:
     """Let the operations use up to `count` threads of the CPU, the calling one included; torch's own as well.
 
     Raises ValueError below 1.
@@ -116,5 +116,5 @@ def set_threads(count: int) -> None:
 
     from vdgs.kernels.cpu import extension
 
-    extension.set_threads(count)
+    extension.set_num_threads(count)
     torch.set_num_threads(count)

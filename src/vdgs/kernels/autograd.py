@@ -13,10 +13,10 @@ from torch.autograd.function import once_differentiable
 from vdgs.kernels.kernel_types import Raster, RasterGradients, RasterPullback, Splats
 
 #: From the tensors of splats (`Splats.tensors`) and the background to the picture and the way back from it.
-Draw = Callable[[tuple[Tensor, ...]], tuple[Raster, RasterPullback]]
+RasterizeFn = Callable[[tuple[Tensor, ...]], tuple[Raster, RasterPullback]]
 
 
-def differentiable(draw: Draw, splats: Splats, background: Tensor) -> Raster:
+def rasterize_with_autograd(draw: RasterizeFn, splats: Splats, background: Tensor) -> Raster:
     """The picture before a background [3]. Gradients of image, alpha and expected depth find back to splats and
     background, once: the second derivative is not defined, and asking for it raises RuntimeError."""
     return Raster(*_Drawn.apply(draw, *splats.tensors, background))
@@ -24,7 +24,7 @@ def differentiable(draw: Draw, splats: Splats, background: Tensor) -> Raster:
 
 class _Drawn(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, draw: Draw, *tensors: Tensor) -> Raster:
+    def forward(ctx: Any, draw: RasterizeFn, *tensors: Tensor) -> Raster:
         raster, ctx.pullback = draw(tensors)
         if raster.median_depth is not None:
             ctx.mark_non_differentiable(raster.median_depth)
@@ -38,7 +38,7 @@ class _Drawn(torch.autograd.Function):
         return None, *ctx.pullback(image, alpha, depth)
 
 
-def pulled_back(
+def vjp_from_autograd(
     draw: Callable[[Splats, Tensor], Raster], splats: Splats, background: Float[Tensor, "3"]
 ) -> tuple[Raster, RasterPullback]:
     """What a function draws that autograd can differentiate, and the way back, with autograd kept in here."""

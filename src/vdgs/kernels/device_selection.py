@@ -9,7 +9,7 @@ import re
 from dataclasses import dataclass
 
 from vdgs.errors import VdgsError
-from vdgs.kernels.operations import RUN_ON_A_CARD
+from vdgs.kernels.operations import GPU_VERIFIED
 
 
 class DeviceUnavailable(VdgsError):
@@ -17,43 +17,45 @@ class DeviceUnavailable(VdgsError):
 
 
 @dataclass(frozen=True)
-class Choice:
+class SelectedDevice:
     """A device (`cpu`, `cuda:0`) and why it was chosen."""
 
     device: str
     why: str
 
 
-def choose(asked: str) -> Choice:
+def select_device(device: str) -> SelectedDevice:
     """The device to use for `auto`, `cpu`, `cuda` or `cuda:i`.
 
     `auto` takes a card only once everything has been run on one. Raises DeviceUnavailable for a card that is not there
     or cannot be used, VdgsError for another word.
     """
-    named = re.fullmatch(r"auto|cpu|cuda(?::(\d+))?", asked)
+    named = re.fullmatch(r"auto|cpu|cuda(?::(\d+))?", device)
     if named is None:
-        raise VdgsError(f"--device {asked}: choose auto, cpu, cuda or cuda:0 (the number is that of the card)")
-    if asked == "cpu":
-        return Choice("cpu", "as asked for")
-    if asked == "auto" and not RUN_ON_A_CARD:
-        return Choice("cpu", "vdgs has not been run on a GPU yet; --device cuda asks for the card")
+        raise VdgsError(f"--device {device}: choose auto, cpu, cuda or cuda:0 (the number is that of the card)")
+    if device == "cpu":
+        return SelectedDevice("cpu", "as asked for")
+    if device == "auto" and not GPU_VERIFIED:
+        return SelectedDevice("cpu", "vdgs has not been run on a GPU yet; --device cuda asks for the card")
     index = int(named.group(1) or 0)
     reason = _no_card(index)
     if not reason:
-        return Choice(f"cuda:{index}", "as asked for" if asked != "auto" else "there is a card that can be used")
-    if asked == "auto":
-        return Choice("cpu", reason)
-    raise DeviceUnavailable(f"--device {asked}: {reason}. Use --device cpu, which does everything, or leave it out.")
+        return SelectedDevice(
+            f"cuda:{index}", "as asked for" if device != "auto" else "there is a card that can be used"
+        )
+    if device == "auto":
+        return SelectedDevice("cpu", reason)
+    raise DeviceUnavailable(f"--device {device}: {reason}. Use --device cpu, which does everything, or leave it out.")
 
 
 def _no_card(index: int) -> str:
     """Why a card cannot be used, in words; empty if it can."""
-    from vdgs.kernels.cuda.driver import cuda_driver
-    from vdgs.kernels.cuda.nvrtc import CudaUnavailable, nvrtc
+    from vdgs.kernels.cuda.driver import get_cuda_driver
+    from vdgs.kernels.cuda.nvrtc import CudaUnavailable, get_nvrtc
 
     try:
-        count = len(cuda_driver().cards())
-        nvrtc()
+        count = len(get_cuda_driver().cards())
+        get_nvrtc()
     except CudaUnavailable as error:
         return str(error).rstrip(".")
     import torch

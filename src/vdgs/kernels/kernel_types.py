@@ -13,13 +13,13 @@ import torch
 from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 
-from vdgs.kernels.splat_segments import Runs, Shown
+from vdgs.kernels.splat_segments import SplatMask, SplatSegments
 
 #: Whether all was finite: a bool, or on a card, which nobody has asked yet, a tensor that holds one.
-Finite = bool | Bool[Tensor, ""]
+IsFinite = bool | Bool[Tensor, ""]
 
 #: What each of m splats is of: see `TrainingSplats`.
-Sources = Int32[Tensor, "m"] | Shown
+SplatSources = Int32[Tensor, "m"] | SplatMask
 
 #: Numbers in an anchor's feature, and units in the hidden layer of every head.
 FEATURE_SIZE = 32
@@ -27,7 +27,7 @@ HIDDEN_SIZE = 32
 
 
 @dataclass(frozen=True, eq=False)
-class HeadWeights:
+class MlpWeights:
     """One MLP `w2 · relu(w1 · x + b1) + b2`, laid out as `torch.nn.Linear` does.
 
     `input` is 35 (feature, viewing direction) or 36 (and the distance to the camera).
@@ -42,7 +42,7 @@ class HeadWeights:
         """The four tensors in the order of the fields."""
         return self.w1, self.b1, self.w2, self.b2
 
-    def outputs(self, inputs: Float[Tensor, "v 36"]) -> Float[Tensor, "v output"]:
+    def forward(self, inputs: Float[Tensor, "v 36"]) -> Float[Tensor, "v output"]:
         """What the head makes of features, viewing directions and distances, the last of which it may not look at.
 
         Raises ValueError if its first layer is neither 35 nor 36 wide.
@@ -62,9 +62,9 @@ class DecoderWeights:
     `b1 + w_e · e`, made by the caller: it is the same for every anchor of a view.
     """
 
-    opacity: HeadWeights
-    covariance: HeadWeights
-    colour: HeadWeights
+    opacity: MlpWeights
+    covariance: MlpWeights
+    colour: MlpWeights
 
     def tensors(self) -> tuple[Tensor, ...]:
         """The twelve tensors, head by head."""
@@ -73,7 +73,7 @@ class DecoderWeights:
     @staticmethod
     def from_tensors(tensors: tuple[Tensor, ...]) -> DecoderWeights:
         """The inverse of `tensors`."""
-        return DecoderWeights(*(HeadWeights(*tensors[i : i + 4]) for i in (0, 4, 8)))
+        return DecoderWeights(*(MlpWeights(*tensors[i : i + 4]) for i in (0, 4, 8)))
 
     def map(self, change: Callable[[Tensor], Tensor]) -> DecoderWeights:
         """The same weights with `change` applied to each tensor."""
@@ -83,7 +83,7 @@ class DecoderWeights:
     def random(k: int, with_distance: bool, generator: torch.Generator) -> DecoderWeights:
         """Weights drawn as `torch.nn.Linear` draws them: uniform within 1/sqrt(inputs)."""
 
-        def head(outputs: int) -> HeadWeights:
+        def head(outputs: int) -> MlpWeights:
             inputs = FEATURE_SIZE + 3 + int(with_distance)
             shapes = [(HIDDEN_SIZE, inputs), (HIDDEN_SIZE,), (outputs, HIDDEN_SIZE), (outputs,)]
             bounds = [inputs**-0.5] * 2 + [HIDDEN_SIZE**-0.5] * 2
@@ -91,13 +91,13 @@ class DecoderWeights:
                 (2 * torch.rand(shape, generator=generator) - 1) * bound
                 for shape, bound in zip(shapes, bounds, strict=True)
             )
-            return HeadWeights(*draws)
+            return MlpWeights(*draws)
 
         return DecoderWeights(head(k), head(7 * k), head(3 * k))
 
 
 @dataclass(frozen=True, eq=False)
-class Projected:
+class ProjectedGaussians:
     """Gaussians on the image plane. Where `valid` is false, every number is zero."""
 
     means_px: Float[Tensor, "m 2"]
@@ -144,11 +144,11 @@ class OrderedSplats(Splats):
     """Splats that need not stand in the order in which equal depths are blended."""
 
     #: That order; None: the order of the rows. gsplat does not look at it.
-    runs: Runs | None
+    runs: SplatSegments | None
 
-    def joined(self, others: OrderedSplats) -> OrderedSplats:
+    def concat(self, others: OrderedSplats) -> OrderedSplats:
         """These splats followed by others, in the order of each."""
-        runs = Runs.joined(self.runs, len(self.depths), others.runs, len(others.depths), self.depths.device)
+        runs = SplatSegments.concat(self.runs, len(self.depths), others.runs, len(others.depths), self.depths.device)
         both = {
             field.name: torch.cat([getattr(self, field.name), getattr(others, field.name)]) for field in fields(Splats)
         }
@@ -160,7 +160,7 @@ class TrainingSplats(OrderedSplats):
     """What a training step needs to know of an anchor model as one camera sees it: no more than that."""
 
     #: As in `AnchorSplats`; a card may only know which offsets show.
-    source: Sources
+    source: SplatSources
     #: Mean volume of the splats; NaN if there are none.
     volume: Float[Tensor, ""]
 
@@ -185,7 +185,7 @@ class SplatGradients:
     #: By the volume of each: the same number for all.
     volume: float
     #: The splats themselves: see `TrainingSplats`. A card computes the values again.
-    source: Sources
+    source: SplatSources
     colour_values: Float[Tensor, "m 3"]
     opacity_values: Float[Tensor, "m"]
     #: By the depth of each; None is zero.
@@ -220,7 +220,7 @@ class Raster(NamedTuple):
     median_depth: Float[Tensor, "h w"] | None = None
 
 
-class Shares(NamedTuple):
+class SplatContributions(NamedTuple):
     """What each splat makes of a picture."""
 
     #: How many pixels: the sum of its weights over them.
@@ -250,7 +250,7 @@ class RasterPullback(Protocol):
         image: Tensor | None,
         alpha: Tensor | None = None,
         depth: Tensor | None = None,
-        over: tuple[Tensor, Tensor] | None = None,
+        out: tuple[Tensor, Tensor] | None = None,
         count: int | None = None,
     ) -> RasterGradients:
         """Gradients by image [h,w,3], alpha [h,w] and depth [h,w]; None is zero. To be called once.
@@ -261,7 +261,7 @@ class RasterPullback(Protocol):
         ...
 
 
-class Photometric(NamedTuple):
+class PhotometricLoss(NamedTuple):
     """Scalars of one image. Only `loss` carries a gradient."""
 
     loss: Float[Tensor, ""]
@@ -270,7 +270,7 @@ class Photometric(NamedTuple):
 
 
 @dataclass
-class Statistics:
+class DensificationStats:
     """What growth decides by: sums over the views since the last decision (float32; counts are exact up to 2^24)."""
 
     #: Norm of dL/d(mean) in NDC units, and how often the offset was drawn.
@@ -281,9 +281,9 @@ class Statistics:
     seen: Float[Tensor, "n"]
 
     @staticmethod
-    def zeros(n: int, k: int, device: torch.device | None = None) -> Statistics:
+    def zeros(n: int, k: int, device: torch.device | None = None) -> DensificationStats:
         """Those of anchors that no view has shown yet."""
-        return Statistics(*(torch.zeros(shape, device=device) for shape in ((n, k), (n, k), (n,), (n,))))
+        return DensificationStats(*(torch.zeros(shape, device=device) for shape in ((n, k), (n, k), (n,), (n,))))
 
     def tensors(self) -> dict[str, Tensor]:
         """The four by name."""

@@ -17,21 +17,21 @@ if TYPE_CHECKING:
         AdamState,
         AnchorSplats,
         DecoderWeights,
-        Finite,
-        Photometric,
-        Projected,
+        DensificationStats,
+        IsFinite,
+        PhotometricLoss,
+        ProjectedGaussians,
         Raster,
         RasterPullback,
-        Shares,
+        SplatContributions,
         SplatGradients,
         Splats,
-        Statistics,
         TrainingSplats,
     )
-    from vdgs.kernels.splat_segments import Shown
+    from vdgs.kernels.splat_segments import SplatMask
 
 
-class Operations(Protocol):
+class KernelBackend(Protocol):
     """What training, drawing and measuring call. Results are on the device of the arguments."""
 
     def cull(self, positions: Tensor, log_scales: Tensor, camera: Camera) -> Tensor: ...
@@ -47,7 +47,7 @@ class Operations(Protocol):
         rows: Tensor | None = None,
     ) -> AnchorSplats: ...
 
-    def decode_to_train(
+    def decode_for_training(
         self,
         positions: Tensor,
         features: Tensor,
@@ -67,44 +67,44 @@ class Operations(Protocol):
         rows: Tensor,
         gradients: SplatGradients,
         updates: Tensor,
-    ) -> tuple[Finite, tuple[Tensor, ...] | None]: ...
+    ) -> tuple[IsFinite, tuple[Tensor, ...] | None]: ...
 
-    def project(self, means: Tensor, scales: Tensor, quaternions: Tensor, camera: Camera) -> Projected: ...
+    def project(self, means: Tensor, scales: Tensor, quaternions: Tensor, camera: Camera) -> ProjectedGaussians: ...
 
-    def rasterise(
+    def rasterize(
         self, splats: Splats, background: Tensor, width: int, height: int, *, depth: bool = False
     ) -> Raster: ...
 
-    def rasterise_vjp(
+    def rasterize_vjp(
         self, splats: Splats, background: Tensor, width: int, height: int, *, depth: bool = False
     ) -> tuple[Raster, RasterPullback]: ...
 
     def shares(
         self, splats: Splats, background: Tensor, width: int, height: int, wanted: Tensor | None = None
-    ) -> Shares: ...
+    ) -> SplatContributions: ...
 
     def photometric_loss(
         self, image: Tensor, target: Tensor, mask: Tensor | None = None, *, ssim_weight: float = 0.2
-    ) -> Photometric: ...
+    ) -> PhotometricLoss: ...
 
     def adam_rows(
         self, state: AdamState, rows: Tensor | None, gradient: Tensor, step: int | Tensor, *, beta1: float = 0.9,
         beta2: float = 0.999, epsilon: float = 1e-15,
-    ) -> Finite: ...  # fmt: skip
+    ) -> IsFinite: ...  # fmt: skip
 
     def add_view_statistics(
         self,
-        statistics: Statistics,
+        statistics: DensificationStats,
         visible: Tensor,
         inside: Tensor,
-        source: Tensor | Shown,
+        source: Tensor | SplatMask,
         opacities: Tensor,
         gradient_px: Tensor,
         width: int,
         height: int,
     ) -> None: ...
 
-    def harmonic_colours(
+    def harmonic_colors(
         self, means: Tensor, coefficients: Tensor, rows: Tensor, eye: Tensor, degree: int
     ) -> Tensor: ...
 
@@ -122,7 +122,7 @@ class Operations(Protocol):
 
     def cell_keys(self, positions: Tensor, cell_size: float, origin: Tensor) -> Tensor: ...
 
-    def cell_centres(self, keys: Tensor, cell_size: float, origin: Tensor) -> Tensor: ...
+    def cell_centers(self, keys: Tensor, cell_size: float, origin: Tensor) -> Tensor: ...
 
     def group_cells(self, keys: Tensor) -> tuple[Tensor, Tensor]: ...
 
@@ -134,12 +134,12 @@ class Operations(Protocol):
 
 
 #: The names of the operations: each implementation's `__init__` imports them under these.
-OPERATIONS = tuple(sorted(name for name in vars(Operations) if not name.startswith("_")))
+OPERATION_NAMES = tuple(sorted(name for name in vars(KernelBackend) if not name.startswith("_")))
 
 #: By which implementation (a folder of `vdgs.kernels`) each operation is done on an NVIDIA card: torch's own arithmetic
 #: (`reference`), own kernels (`cuda`) or gsplat's. Of several the first that can be used; gsplat cannot tell median
 #: depth, so that pictures with depth are always drawn by the own kernels.
-ON_A_CARD: dict[str, tuple[str, ...]] = dict.fromkeys(OPERATIONS, ("reference",)) | {
+GPU_BACKENDS: dict[str, tuple[str, ...]] = dict.fromkeys(OPERATION_NAMES, ("reference",)) | {
     "add_view_statistics": ("cuda",),
     "cull": ("cuda",),
     "decode": ("cuda",),
@@ -152,9 +152,9 @@ ON_A_CARD: dict[str, tuple[str, ...]] = dict.fromkeys(OPERATIONS, ("reference",)
 }
 
 #: Whether all that has been run on a card. Until it is, `--device auto` takes the processor.
-RUN_ON_A_CARD = False
+GPU_VERIFIED = False
 
 
-def taken(operation: str, device_type: str) -> tuple[str, ...]:
+def backends_for(operation: str, device_type: str) -> tuple[str, ...]:
     """The implementations of an operation on a kind of device, the preferred one first."""
-    return ("native",) if device_type == "cpu" else ON_A_CARD[operation] if device_type == "cuda" else ("reference",)
+    return ("native",) if device_type == "cpu" else GPU_BACKENDS[operation] if device_type == "cuda" else ("reference",)

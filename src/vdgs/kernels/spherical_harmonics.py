@@ -12,23 +12,23 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-MAX_DEGREE = 3
+MAX_SH_DEGREE = 3
 #: The constant function Y_0^0.
-DC = sqrt(1 / (4 * pi))
+SH_C0 = sqrt(1 / (4 * pi))
 
 
-def function_count(degree: int) -> int:
+def num_sh_bases(degree: int) -> int:
     """How many functions there are up to this degree. Raises ValueError outside 0 .. 3."""
-    if not 0 <= degree <= MAX_DEGREE:
-        raise ValueError(f"the degree must be from 0 to {MAX_DEGREE}, not {degree}")
+    if not 0 <= degree <= MAX_SH_DEGREE:
+        raise ValueError(f"the degree must be from 0 to {MAX_SH_DEGREE}, not {degree}")
     return (degree + 1) ** 2
 
 
-def basis(directions: Float[Tensor, "m 3"], degree: int) -> Float[Tensor, "m f"]:
+def eval_sh_bases(directions: Float[Tensor, "m 3"], degree: int) -> Float[Tensor, "m f"]:
     """The functions up to `degree` at unit directions, f = (degree + 1)²; differentiable. Raises ValueError."""
-    function_count(degree)
+    num_sh_bases(degree)
     x, y, z = directions.unbind(-1)
-    values = [torch.full_like(x, DC)]
+    values = [torch.full_like(x, SH_C0)]
     if degree >= 1:
         a = sqrt(3 / (4 * pi))
         values += [-a * y, a * z, -a * x]
@@ -45,7 +45,7 @@ def basis(directions: Float[Tensor, "m 3"], degree: int) -> Float[Tensor, "m f"]
     return torch.stack(values, -1)
 
 
-def view_colours(
+def eval_sh_colors(
     dc: Float[Tensor, "m 3"], rest: Float[Tensor, "m r 3"], directions: Float[Tensor, "m 3"], degree: int
 ) -> Float[Tensor, "m 3"]:
     """RGB seen along unit directions (from the camera to the Gaussian): 1/2 + Σ c_lm Y_lm, not below 0.
@@ -53,16 +53,16 @@ def view_colours(
     `dc` are the coefficients of Y_0^0, `rest` those of the other functions, of which only the ones up to `degree` are
     looked at. Differentiable in all three. Raises ValueError where `rest` holds too few.
     """
-    used = function_count(degree) - 1
+    used = num_sh_bases(degree) - 1
     if rest.shape[1] < used:
         raise ValueError(f"degree {degree} needs {used} further coefficients, there are {rest.shape[1]}")
-    colours = 0.5 + DC * dc
+    colours = 0.5 + SH_C0 * dc
     if used:
-        weights = basis(directions, degree)[:, 1:]
+        weights = eval_sh_bases(directions, degree)[:, 1:]
         colours = colours + torch.bmm(weights[:, None], rest[:, :used])[:, 0]
     return colours.clamp_min(0.0)
 
 
-def dc_of_colours(colours: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
+def rgb_to_sh(colours: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
     """The coefficients of Y_0^0 that show these RGB colours in [0, 1] from everywhere."""
-    return (colours - 0.5) / DC
+    return (colours - 0.5) / SH_C0

@@ -6,15 +6,15 @@ import torch
 from torch import Tensor
 
 #: The largest picture side: tiles are numbered with 16 bits.
-MAX_SIDE = 16 * 32767
+MAX_IMAGE_SIDE_PX = 16 * 32767
 
 
 def check_splats(tensors: tuple[Tensor, ...], width: int, height: int, device_type: str | None = None) -> None:
     """Raise a clear error unless these are means_px, conics, colours, opacities, depths and a background, float32 (and
     on a kind of device, if one is named), and the sides those of a picture that can be drawn."""
     for name, side in (("width", width), ("height", height)):
-        if not 1 <= side <= MAX_SIDE:
-            raise ValueError(f"{name} must be from 1 to {MAX_SIDE} pixels, not {side}")
+        if not 1 <= side <= MAX_IMAGE_SIDE_PX:
+            raise ValueError(f"{name} must be from 1 to {MAX_IMAGE_SIDE_PX} pixels, not {side}")
     n = len(tensors[0]) if tensors[0].dim() else 0
     shapes = ((n, 2), (n, 3), (n, 3), (n,), (n,), (3,))
     names = ("means_px", "conics", "colours", "opacities", "depths", "background")

@@ -12,48 +12,50 @@ import torch
 from jaxtyping import Int32
 from torch import Tensor
 
-#: Consecutive visible anchors whose splats make one run of `Shown`: warps of a block of source/decode.cu.
-ANCHORS_OF_A_RUN = 8
+#: Consecutive visible anchors whose splats make one run of `SplatMask`: warps of a block of source/decode.cu.
+ANCHORS_PER_SEGMENT = 8
 
 
 @dataclass(frozen=True, eq=False)
-class Runs:
+class SplatSegments:
     """Where m splats stand that are ordered within runs, and the runs in any way: r of them, which may be empty."""
 
     #: The row at which each run begins, and how many rows it has; runs are named in the order that is meant.
-    begins: Int32[Tensor, " r"]
+    starts: Int32[Tensor, " r"]
     lengths: Int32[Tensor, " r"]
 
     def order(self, m: int) -> Int32[Tensor, " m"]:
         """The rows of the m splats in the order that is meant. Nothing waits for a card."""
         ends = self.lengths.cumsum(0, dtype=torch.int32)
         place = torch.arange(m, dtype=torch.int32, device=ends.device)
-        shift = self.begins - ends + self.lengths
+        shift = self.starts - ends + self.lengths
         return place + shift[torch.searchsorted(ends, place, right=True)]
 
     @staticmethod
-    def joined(first: Runs | None, m: int, second: Runs | None, n: int, device: torch.device) -> Runs | None:
+    def concat(
+        first: SplatSegments | None, m: int, second: SplatSegments | None, n: int, device: torch.device
+    ) -> SplatSegments | None:
         """Those of m splats followed by n others; None is one run, as the rows are."""
         if first is None and second is None:
             return None
-        first, second = first or Runs.one(m, device), second or Runs.one(n, device)
-        return Runs(torch.cat([first.begins, second.begins + m]), torch.cat([first.lengths, second.lengths]))
+        first, second = first or SplatSegments.one(m, device), second or SplatSegments.one(n, device)
+        return SplatSegments(torch.cat([first.starts, second.starts + m]), torch.cat([first.lengths, second.lengths]))
 
     @staticmethod
-    def one(m: int, device: torch.device) -> Runs:
+    def one(m: int, device: torch.device) -> SplatSegments:
         """m splats as the rows are."""
-        return Runs(*(torch.full((1,), number, dtype=torch.int32, device=device) for number in (0, m)))
+        return SplatSegments(*(torch.full((1,), number, dtype=torch.int32, device=device) for number in (0, m)))
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class SplatMask:
     """Which offsets each of v visible anchors shows, and where their m splats stand: in place of `source`
     (`AnchorSplats`), of which it has an eighth of the bytes."""
 
     #: Bit o is set where offset o has a splat; splats of an anchor are in the order of offsets.
     bits: Int32[Tensor, " v"]
-    #: Of `ANCHORS_OF_A_RUN` anchors each.
-    runs: Runs
+    #: Of `ANCHORS_PER_SEGMENT` anchors each.
+    runs: SplatSegments
     count: int
     offsets: int
 
@@ -61,18 +63,20 @@ class Shown:
         return self.count
 
     @staticmethod
-    def of(source: Int32[Tensor, " m"], v: int, offsets: int) -> Shown:
+    def of(source: Int32[Tensor, " m"], v: int, offsets: int) -> SplatMask:
         """From ascending sources. Nothing waits for a card."""
         anchor, offset = source // offsets, source % offsets
         bits = torch.zeros(v, dtype=torch.int32, device=source.device)
         bits.index_add_(0, anchor, torch.ones_like(source) << offset)
-        firsts = torch.arange(0, v + ANCHORS_OF_A_RUN, ANCHORS_OF_A_RUN, device=source.device).clamp(max=v) * offsets
+        firsts = (
+            torch.arange(0, v + ANCHORS_PER_SEGMENT, ANCHORS_PER_SEGMENT, device=source.device).clamp(max=v) * offsets
+        )
         bounds = torch.searchsorted(source, firsts.to(torch.int32), out_int32=True)
-        return Shown(bits, Runs(bounds[:-1].contiguous(), bounds.diff()), len(source), offsets)
+        return SplatMask(bits, SplatSegments(bounds[:-1].contiguous(), bounds.diff()), len(source), offsets)
 
 
-def tensor_of(source: Tensor | Shown) -> Tensor:
-    """Sources as a tensor. Raises TypeError for `Shown`, which only kernels of a card can read."""
-    if isinstance(source, Shown):
+def sources_tensor(source: Tensor | SplatMask) -> Tensor:
+    """Sources as a tensor. Raises TypeError for `SplatMask`, which only kernels of a card can read."""
+    if isinstance(source, SplatMask):
         raise TypeError("splats that a card has decoded for training can only be used on that card")
     return source

@@ -7,16 +7,16 @@ import os
 from vdgs.errors import VdgsError
 
 
-def cores() -> int:
+def cpu_count() -> int:
     """The number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def default_threads() -> int:
+def default_num_threads() -> int:
     """`VDGS_THREADS`, or the number of cores that this process may use. VdgsError for another value of the variable."""
     text = os.environ.get("VDGS_THREADS")
     if not text:
-        return cores()
+        return cpu_count()
     if not text.isdecimal() or int(text) < 1:
         raise VdgsError(f"VDGS_THREADS must be a whole number from 1, not {text!r}.")
     return int(text)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 
-def beside(values: Any, like: Tensor) -> Tensor:
+def to_like(values: Any, like: Tensor) -> Tensor:
     """A few numbers (an array, or a sequence of floats) on the device of a tensor and in its type."""
     given = values if isinstance(values, Tensor) else torch.as_tensor(values, dtype=torch.float64)
     return given.to(like.device, like.dtype, non_blocking=True)
@@ -25,7 +25,7 @@ def upload(tensor: Tensor, device: torch.device) -> Tensor:
     return tensor.pin_memory().to(device, non_blocking=True)
 
 
-def may_look(tensor: Tensor) -> bool:
+def is_host(tensor: Tensor) -> bool:
     """Whether looking at its numbers costs nothing: to ask a card means to wait for it, so that what is only checked to
     say clearly what is wrong is not checked there."""
     return tensor.device.type == "cpu"

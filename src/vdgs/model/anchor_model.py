@@ -19,21 +19,21 @@ from torch import Tensor
 
 from vdgs.errors import VdgsError
 from vdgs.kernels.kernel_types import FEATURE_SIZE
-from vdgs.model.anchors import TRAINED, Anchors
+from vdgs.model.anchors import TRAINED_TENSORS, Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.system.atomic_files import write_atomically
+from vdgs.system.atomic_files import write_atomic
 from vdgs.system.documents import CaptureMetadata
-from vdgs.system.tensors import REBUILD, checksum, read_tensors, write_tensors
+from vdgs.system.tensors import REBUILD_HINT, read_tensors, tensors_crc32, write_tensors
 
-FORMAT = "vdgs-anchors-1"
+ANCHOR_MODEL_FORMAT = "vdgs-anchors-1"
 #: Of a model whose blocks have decoders of their own: a reader that knows of one decoder must not take it.
-FORMAT_OF_PARTS = "vdgs-anchors-2"
+MULTI_DECODER_FORMAT = "vdgs-anchors-2"
 #: Anchors whose numbers are looked at together.
-CHECKED_ROWS = 1 << 16
+CHECK_CHUNK = 1 << 16
 
 
 @dataclass(frozen=True)
-class Part:
+class DecoderSpan:
     """So many anchors of a model, one after another, and the decoder that they share."""
 
     count: int
@@ -86,12 +86,12 @@ class AnchorModel:
     #: That of all anchors, or of the coarse stage where blocks have their own (`parts`).
     decoder: Decoder
     #: Edge of the voxel grid on which the anchors started, in units of the ground frame.
-    voxel: float
+    voxel_size: float
     #: Colour drawn where nothing is, RGB in [0, 1].
     background: tuple[float, float, float]
     metadata: ModelMetadata = ModelMetadata()
     #: A merged scene whose blocks trained decoders of their own: all anchors, block by block. Else empty.
-    parts: tuple[Part, ...] = ()
+    parts: tuple[DecoderSpan, ...] = ()
 
     def spans(self) -> list[tuple[int, int, Decoder]]:
         """Which rows of the anchors each decoder decodes: first, one past the last, decoder; ascending."""
@@ -110,40 +110,40 @@ class AnchorModel:
         for prefix, decoder in self._decoders():
             tensors |= {prefix + name: tensor for name, tensor in decoder.tensors().items()}
         content: dict[str, object] = {
-            "voxel": self.voxel,
+            "voxel": self.voxel_size,
             "background": self.background,
             "facts": self.metadata.to_dict(),
-            "crc32": checksum(tensors),
+            "crc32": tensors_crc32(tensors),
         }
         if self.parts:
             content["parts"] = [part.count for part in self.parts]
         # A single key: several would be written in an order that varies.
-        header = {FORMAT_OF_PARTS if self.parts else FORMAT: json.dumps(content)}
-        write_atomically(path, lambda temporary: write_tensors(temporary, tensors, header))
+        header = {MULTI_DECODER_FORMAT if self.parts else ANCHOR_MODEL_FORMAT: json.dumps(content)}
+        write_atomic(path, lambda temporary: write_tensors(temporary, tensors, header))
 
     @staticmethod
     def load(path: Path) -> AnchorModel:
         """Read a model. Raises VdgsError if the file is missing, damaged or not an anchor model."""
         tensors, header = read_tensors(path)
-        found = next((name for name in (FORMAT, FORMAT_OF_PARTS) if name in header), None)
+        found = next((name for name in (ANCHOR_MODEL_FORMAT, MULTI_DECODER_FORMAT) if name in header), None)
         if found is None:
-            raise VdgsError(f"{path}: is not a vdgs anchor model (its header has no {FORMAT!r})")
+            raise VdgsError(f"{path}: is not a vdgs anchor model (its header has no {ANCHOR_MODEL_FORMAT!r})")
         try:
-            anchors = Anchors(**{n: tensors[f"anchors.{n}"] for n in ("positions", *TRAINED)})
+            anchors = Anchors(**{n: tensors[f"anchors.{n}"] for n in ("positions", *TRAINED_TENSORS)})
             known = json.loads(header[found])
             decoder = _decoder_of(tensors, "decoder.")
-            counts = known["parts"] if found == FORMAT_OF_PARTS else []
-            parts = tuple(Part(int(n), _decoder_of(tensors, f"part.{i}.")) for i, n in enumerate(counts))
-            if known["crc32"] != checksum(tensors):
+            counts = known["parts"] if found == MULTI_DECODER_FORMAT else []
+            parts = tuple(DecoderSpan(int(n), _decoder_of(tensors, f"part.{i}.")) for i, n in enumerate(counts))
+            if known["crc32"] != tensors_crc32(tensors):
                 raise ValueError("its checksum does not agree")
             red, green, blue = (float(value) for value in known["background"])
             model = AnchorModel(
-                anchors=anchors, decoder=decoder, voxel=float(known["voxel"]), background=(red, green, blue),
+                anchors=anchors, decoder=decoder, voxel_size=float(known["voxel"]), background=(red, green, blue),
                 metadata=ModelMetadata.from_dict(known["facts"]), parts=parts,
             )  # fmt: skip
             model.check()
         except (KeyError, ValueError, TypeError) as error:
-            raise VdgsError(f"{path}: is damaged or incomplete ({error}). {REBUILD}") from error
+            raise VdgsError(f"{path}: is damaged or incomplete ({error}). {REBUILD_HINT}") from error
         return model
 
     def check(self) -> None:
@@ -160,7 +160,7 @@ class AnchorModel:
             if tuple(tensor.shape) != shape or tensor.dtype != torch.float32:
                 raise ValueError(f"{name} is {tensor.dtype} {tuple(tensor.shape)}, not float32 {shape}")
             # Piece by piece: what is finite takes more memory to say than the numbers do.
-            if not all(bool(torch.isfinite(piece).all()) for piece in tensor.split(CHECKED_ROWS)):
+            if not all(bool(torch.isfinite(piece).all()) for piece in tensor.split(CHECK_CHUNK)):
                 raise ValueError(f"{name} holds numbers that are not finite")
         for _, decoder in self._decoders():
             decoder.check(k)

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 #: The tensors of an anchor that training moves, in the order in which they are saved.
-TRAINED = ("features", "offsets", "log_scales")
+TRAINED_TENSORS = ("features", "offsets", "log_scales")
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Anchors:
         return self.positions.shape[0]
 
     def tensors(self) -> dict[str, Tensor]:
-        return {name: getattr(self, name) for name in ("positions", *TRAINED)}
+        return {name: getattr(self, name) for name in ("positions", *TRAINED_TENSORS)}
 
     def to(self, device: torch.device) -> Anchors:
         """The same anchors on a device; themselves where they are on it."""
@@ -38,6 +38,6 @@ class Anchors:
         """The anchors of the given rows (indices or mask)."""
         return Anchors(**{name: tensor[rows] for name, tensor in self.tensors().items()})
 
-    def extended(self, more: Anchors) -> Anchors:
+    def concat(self, more: Anchors) -> Anchors:
         """These anchors followed by others."""
         return Anchors(**{name: torch.cat([a, more.tensors()[name]]) for name, a in self.tensors().items()})

@@ -17,7 +17,7 @@ from vdgs.model.anchors import Anchors
 
 
 @dataclass(frozen=True, eq=False)
-class Spawned:
+class DecodedGaussians:
     """The k Gaussians of each anchor: all but their places depend on where they are seen from."""
 
     #: tanh of the opacity head: not drawn where it is 0 or less.
@@ -28,13 +28,15 @@ class Spawned:
     quaternions: Float[Tensor, "v k 4"]
 
 
-def places(anchors: Anchors) -> Float[Tensor, "v k 3"]:
+def gaussian_means(anchors: Anchors) -> Float[Tensor, "v k 3"]:
     """Where the Gaussians are, from wherever they are seen."""
     return anchors.positions[:, None] + anchors.offsets * anchors.log_scales[:, None, :3].exp()
 
 
 @torch.no_grad()
-def spawned(anchors: Anchors, rows: Int64[Tensor, " v"], weights: DecoderWeights, camera: Camera) -> Spawned:
+def decode_world(
+    anchors: Anchors, rows: Int64[Tensor, " v"], weights: DecoderWeights, camera: Camera
+) -> DecodedGaussians:
     """The Gaussians of the anchors of the given rows."""
     k = anchors.offsets.shape[1]
     ray = anchors.positions[rows] - torch.as_tensor(camera.position).to(anchors.positions)
@@ -44,10 +46,10 @@ def spawned(anchors: Anchors, rows: Int64[Tensor, " v"], weights: DecoderWeights
     else:
         direction = ray / distance
     inputs = torch.cat([anchors.features[rows], direction, distance], 1)
-    covariance = weights.covariance.outputs(inputs).unflatten(1, (k, 7))
-    return Spawned(
-        weights.opacity.outputs(inputs).tanh(),
-        weights.colour.outputs(inputs).unflatten(1, (k, 3)).sigmoid(),
+    covariance = weights.covariance.forward(inputs).unflatten(1, (k, 7))
+    return DecodedGaussians(
+        weights.opacity.forward(inputs).tanh(),
+        weights.colour.forward(inputs).unflatten(1, (k, 3)).sigmoid(),
         anchors.log_scales[rows, None, 3:].exp() * covariance[..., :3].sigmoid(),
         covariance[..., 3:],
     )

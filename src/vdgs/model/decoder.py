@@ -14,11 +14,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vdgs.kernels.kernel_types import FEATURE_SIZE, HIDDEN_SIZE, DecoderWeights, HeadWeights
-from vdgs.model.exposure import exposure_of
+from vdgs.kernels.kernel_types import FEATURE_SIZE, HIDDEN_SIZE, DecoderWeights, MlpWeights
+from vdgs.model.exposure import exposure_matrix
 
 HEADS = {"opacity": 1, "covariance": 7, "colour": 3}  # outputs per offset
-PARTS = ("w1", "b1", "w2", "b2")
+HEAD_TENSORS = ("w1", "b1", "w2", "b2")
 
 
 @dataclass(frozen=True)
@@ -33,29 +33,31 @@ class Decoder:
     exposure: Float[Tensor, "images 3 4"] | None = None
 
     @staticmethod
-    def initial(offsets: int, distance: bool, appearance: int, images: int, generator: torch.Generator) -> Decoder:
+    def initial(
+        num_offsets: int, view_distance: bool, appearance_dim: int, num_images: int, generator: torch.Generator
+    ) -> Decoder:
         """Uniform in +-1/sqrt(inputs), as torch.nn.Linear; embeddings start at 0."""
-        inputs = FEATURE_SIZE + 3 + int(distance)
+        inputs = FEATURE_SIZE + 3 + int(view_distance)
         tensors: dict[str, Tensor] = {}
         for head, per_offset in HEADS.items():
-            for layer, rows, columns in ((1, HIDDEN_SIZE, inputs), (2, offsets * per_offset, HIDDEN_SIZE)):
+            for layer, rows, columns in ((1, HIDDEN_SIZE, inputs), (2, num_offsets * per_offset, HIDDEN_SIZE)):
                 bound = columns**-0.5
                 tensors[f"{head}_w{layer}"] = _uniform((rows, columns), bound, generator)
                 tensors[f"{head}_b{layer}"] = _uniform((rows,), bound, generator)
-        if appearance:
-            tensors["appearance"] = torch.zeros(images, appearance)
-            tensors["appearance_weight"] = _uniform((HIDDEN_SIZE, appearance), appearance**-0.5, generator)
+        if appearance_dim:
+            tensors["appearance"] = torch.zeros(num_images, appearance_dim)
+            tensors["appearance_weight"] = _uniform((HIDDEN_SIZE, appearance_dim), appearance_dim**-0.5, generator)
         return Decoder.from_tensors(tensors)
 
     @staticmethod
     def from_tensors(tensors: Mapping[str, Tensor]) -> Decoder:
         """The inverse of `tensors`. Raises KeyError on a missing tensor."""
-        weights = DecoderWeights(*(HeadWeights(*(tensors[f"{head}_{part}"] for part in PARTS)) for head in HEADS))
+        weights = DecoderWeights(*(MlpWeights(*(tensors[f"{head}_{part}"] for part in HEAD_TENSORS)) for head in HEADS))
         optional = (tensors.get(name) for name in ("appearance", "appearance_weight", "exposure"))
         return Decoder(weights, *optional)
 
     def tensors(self) -> dict[str, Tensor]:
-        named = {f"{head}_{p}": getattr(getattr(self.weights, head), p) for head in HEADS for p in PARTS}
+        named = {f"{head}_{p}": getattr(getattr(self.weights, head), p) for head in HEADS for p in HEAD_TENSORS}
         if self.appearance is not None and self.appearance_weight is not None:
             named |= {"appearance": self.appearance, "appearance_weight": self.appearance_weight}
         if self.exposure is not None:
@@ -70,7 +72,7 @@ class Decoder:
         """The same numbers in tensors of their own."""
         return Decoder.from_tensors({name: tensor.detach().clone() for name, tensor in self.tensors().items()})
 
-    def for_image(self, image: int | None) -> DecoderWeights:
+    def weights_for_image(self, image: int | None) -> DecoderWeights:
         """The weights as one view sees them: with the embedding of training image `image`, or with the mean
         embedding for a view that was not trained on (choice)."""
         if self.appearance is None or self.appearance_weight is None:
@@ -79,9 +81,9 @@ class Decoder:
         colour = self.weights.colour
         return replace(self.weights, colour=replace(colour, b1=colour.b1 + self.appearance_weight @ embedding))
 
-    def exposure_of(self, image: int) -> Float[Tensor, "3 4"] | None:
+    def exposure_for_image(self, image: int) -> Float[Tensor, "3 4"] | None:
         """The colour model of a training image; None where none is fitted."""
-        return None if self.exposure is None else exposure_of(self.exposure, image)
+        return None if self.exposure is None else exposure_matrix(self.exposure, image)
 
     def check(self, offsets: int) -> None:
         """Raise ValueError unless all shapes fit `offsets` Gaussians per anchor and all numbers are finite."""

@@ -15,14 +15,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from vdgs.kernels.rotations import rotation_matrices
-from vdgs.kernels.spherical_harmonics import MAX_DEGREE, basis
+from vdgs.kernels.spherical_harmonics import MAX_SH_DEGREE, eval_sh_bases
 from vdgs.model.gaussians import Gaussians
 
 #: How far a rotation matrix may be from one, in each of its numbers.
 TOLERANCE = 1e-6
 
 
-def transformed(
+def transform_gaussians(
     gaussians: Gaussians, scale: float, rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"]
 ) -> Gaussians:
     """The Gaussians under x -> scale * rotation @ x + translation.
@@ -37,44 +37,44 @@ def transformed(
     return Gaussians(
         means=means.float(),
         log_scales=gaussians.log_scales + math.log(scale),
-        quaternions=quaternion_product(quaternion_of(rotation), gaussians.quaternions),
+        quaternions=multiply_quaternions(quaternion_from_matrix(rotation), gaussians.quaternions),
         logits=gaussians.logits,
         dc=gaussians.dc,
-        rest=rotate_harmonics(gaussians.rest, rotation),
+        rest=rotate_sh(gaussians.rest, rotation),
     )
 
 
-def rotate_harmonics(rest: Float[Tensor, "n r 3"], rotation: Float[np.ndarray, "3 3"]) -> Float[Tensor, "n r 3"]:
+def rotate_sh(rest: Float[Tensor, "n r 3"], rotation: Float[np.ndarray, "3 3"]) -> Float[Tensor, "n r 3"]:
     """Coefficients of the functions that show along R d what `rest` shows along d, for whole bands 1 .. degree <= 3.
 
     Raises ValueError for what is no rotation, and where `rest` holds a band only in part.
     """
     _check(rotation)
     degree = math.isqrt(rest.shape[1] + 1) - 1
-    if (degree + 1) ** 2 != rest.shape[1] + 1 or degree > MAX_DEGREE:
-        raise ValueError(f"{rest.shape[1]} further coefficients of colour belong to no degree up to {MAX_DEGREE}")
+    if (degree + 1) ** 2 != rest.shape[1] + 1 or degree > MAX_SH_DEGREE:
+        raise ValueError(f"{rest.shape[1]} further coefficients of colour belong to no degree up to {MAX_SH_DEGREE}")
     parts, start = [], 0
     for band in range(1, degree + 1):
         width = 2 * band + 1
-        matrix = band_rotation(band, rotation).to(rest)
+        matrix = sh_band_rotation(band, rotation).to(rest)
         parts.append(torch.einsum("ij,njc->nic", matrix, rest[:, start : start + width]))
         start += width
     return torch.cat(parts, 1) if parts else rest
 
 
-def band_rotation(band: int, rotation: Float[np.ndarray, "3 3"]) -> Float[Tensor, "f f"]:
+def sh_band_rotation(band: int, rotation: Float[np.ndarray, "3 3"]) -> Float[Tensor, "f f"]:
     """The matrix by which a rotation turns the coefficients of one band, f = 2 band + 1; float64, orthogonal.
 
     f'(d) = f(R^T d) is a function of the same band, so its values in more directions than the band has functions fix
-    its coefficients: whatever the order, signs and norm of the functions, which are those of `basis`.
+    its coefficients: whatever the order, signs and norm of the functions, which are those of `eval_sh_bases`.
     """
     directions = _directions()
     turned = directions @ torch.from_numpy(np.ascontiguousarray(rotation, np.float64))  # rows R^T d
     part = slice(band**2, (band + 1) ** 2)
-    return torch.linalg.lstsq(basis(directions, band)[:, part], basis(turned, band)[:, part]).solution
+    return torch.linalg.lstsq(eval_sh_bases(directions, band)[:, part], eval_sh_bases(turned, band)[:, part]).solution
 
 
-def quaternion_of(rotation: Float[np.ndarray, "3 3"]) -> Float[Tensor, "4"]:
+def quaternion_from_matrix(rotation: Float[np.ndarray, "3 3"]) -> Float[Tensor, "4"]:
     """The unit quaternion, wxyz, of a rotation matrix; float64."""
     m = np.asarray(rotation, np.float64)
     # The eigenvector of the largest eigenvalue: exact for every angle, half turns too (Bar-Itzhack, 2000).
@@ -90,7 +90,7 @@ def quaternion_of(rotation: Float[np.ndarray, "3 3"]) -> Float[Tensor, "4"]:
     return torch.from_numpy(vector if vector[0] >= 0 else -vector)
 
 
-def quaternion_product(left: Float[Tensor, "4"], right: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
+def multiply_quaternions(left: Float[Tensor, "4"], right: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
     """Quaternions (wxyz) of the rotations `right`, each followed by `left`; of the type of `right`."""
     w, x, y, z = left.tolist()
     matrix = torch.tensor([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]], dtype=torch.float64)
@@ -98,7 +98,7 @@ def quaternion_product(left: Float[Tensor, "4"], right: Float[Tensor, "n 4"]) ->
     return (right.double() @ matrix.T).to(right)
 
 
-def covariances(gaussians: Gaussians) -> Float[Tensor, "n 3 3"]:
+def gaussian_covariances(gaussians: Gaussians) -> Float[Tensor, "n 3 3"]:
     """R S S R^T of every Gaussian."""
     spread = rotation_matrices(gaussians.quaternions) * gaussians.log_scales.exp()[:, None, :]
     return spread @ spread.transpose(1, 2)

@@ -3,7 +3,7 @@ model is baked into.
 
 Dimensions: n Gaussians, r = (degree + 1)² - 1 further coefficients of colour. Float32, ground frame. Source: Kerbl,
 Kopanas, Leimkühler and Drettakis, "3D Gaussian Splatting for Real-Time Radiance Field Rendering", 2023 (3DGS); its
-equations 5 and 6 are in `kernels.project`, 2 and 3 in `kernels.rasterise`.
+equations 5 and 6 are in `kernels.project`, 2 and 3 in `kernels.rasterize`.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from vdgs.geometry.camera import Camera
-from vdgs.kernels import choose
+from vdgs.kernels import get_backend
 from vdgs.kernels.constants import ALPHA_MIN
 from vdgs.kernels.kernel_types import Raster, Splats
-from vdgs.kernels.spherical_harmonics import view_colours
+from vdgs.kernels.spherical_harmonics import eval_sh_colors
 
 #: Beyond so many standard deviations not even an opaque Gaussian reaches the least alpha that is drawn.
-REACH = math.sqrt(-2 * math.log(ALPHA_MIN))
+MAX_SIGMA = math.sqrt(-2 * math.log(ALPHA_MIN))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +51,7 @@ class Gaussians:
         """The Gaussians of the given rows (indices or mask)."""
         return Gaussians(**{name: tensor[rows] for name, tensor in self.tensors().items()})
 
-    def extended(self, more: Gaussians) -> Gaussians:
+    def concat(self, more: Gaussians) -> Gaussians:
         """These Gaussians followed by others."""
         return Gaussians(**{name: torch.cat([t, more.tensors()[name]]) for name, t in self.tensors().items()})
 
@@ -62,28 +62,28 @@ class Gaussians:
 
 
 @torch.no_grad()
-def visible_rows(gaussians: Gaussians, camera: Camera) -> Int64[Tensor, " v"]:
+def visible_gaussian_rows(gaussians: Gaussians, camera: Camera) -> Int64[Tensor, " v"]:
     """Rows of the Gaussians in front of the camera whose extent touches the image, ascending."""
-    kernels = choose(gaussians.means.device)
+    kernels = get_backend(gaussians.means.device)
     seen = kernels.project(gaussians.means, gaussians.log_scales.exp(), gaussians.quaternions, camera)
     a, b, c = seen.conics.unbind(-1)
     # The inverse of the conic [[a, b], [b, c]] is the covariance, its diagonal the variances along x and y.
     variances = torch.stack([c, a], -1) / (a * c - b * b)[:, None]
-    reach = REACH * variances.sqrt()
+    reach = MAX_SIGMA * variances.sqrt()
     low, high = seen.means_px + reach, seen.means_px - reach
     inside = (low > 0).all(-1) & (high[:, 0] < camera.width) & (high[:, 1] < camera.height)
     # A needle whose determinant is lost to rounding has no extent that could be compared: it is drawn.
     return (seen.valid & (inside | ~torch.isfinite(reach).all(-1))).nonzero()[:, 0]
 
 
-def draw_gaussians(
+def render_gaussians(
     gaussians: Gaussians, camera: Camera, background: Float[Tensor, "3"], degree: int, depth: bool = False
 ) -> tuple[Raster, Float[Tensor, "n 2"]]:
     """The picture, and the centres in pixels that it was drawn from (growth asks for their gradient).
 
     Differentiable in all tensors of `gaussians`.
     """
-    kernels = choose(gaussians.means.device)
+    kernels = get_backend(gaussians.means.device)
     projected = kernels.project(gaussians.means, gaussians.log_scales.exp(), gaussians.quaternions, camera)
     if camera.model == "pinhole":
         centre = torch.from_numpy(camera.position.astype(np.float32)).to(gaussians.means)
@@ -92,8 +92,8 @@ def draw_gaussians(
         directions = torch.from_numpy(camera.forward.astype(np.float32)).to(gaussians.means).expand(len(gaussians), 3)
     splats = Splats(
         projected.means_px, projected.conics, projected.depths,
-        view_colours(gaussians.dc, gaussians.rest, directions, degree),
+        eval_sh_colors(gaussians.dc, gaussians.rest, directions, degree),
         torch.where(projected.valid, gaussians.logits.sigmoid(), 0.0),
     )  # fmt: skip
-    raster = kernels.rasterise(splats, background, camera.width, camera.height, depth=depth)
+    raster = kernels.rasterize(splats, background, camera.width, camera.height, depth=depth)
     return raster, projected.means_px

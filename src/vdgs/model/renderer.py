@@ -10,41 +10,43 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from vdgs.geometry.camera import Camera
-from vdgs.kernels import choose
+from vdgs.kernels import get_backend
 from vdgs.kernels.kernel_types import AnchorSplats, DecoderWeights, Raster, Splats, TrainingSplats
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 
 
-def decode_rows(anchors: Anchors, rows: Int64[Tensor, " v"], weights: DecoderWeights, camera: Camera) -> AnchorSplats:
+def decode_anchors(
+    anchors: Anchors, rows: Int64[Tensor, " v"], weights: DecoderWeights, camera: Camera
+) -> AnchorSplats:
     """Splats of the anchors of the given rows, as this camera sees them."""
-    return choose(anchors.positions.device).decode(
+    return get_backend(anchors.positions.device).decode(
         anchors.positions, anchors.features, anchors.offsets, anchors.log_scales, weights, camera, rows
     )
 
 
-def decode_rows_to_train(
+def decode_anchors_for_training(
     anchors: Anchors, rows: Int64[Tensor, " v"], weights: DecoderWeights, camera: Camera
 ) -> TrainingSplats:
-    """As much of `decode_rows` as a training step asks for; on a card, not in the order of the rows."""
-    return choose(anchors.positions.device).decode_to_train(
+    """As much of `decode_anchors` as a training step asks for; on a card, not in the order of the rows."""
+    return get_backend(anchors.positions.device).decode_for_training(
         anchors.positions, anchors.features, anchors.offsets, anchors.log_scales, weights, camera, rows
     )
 
 
-def visible_rows(anchors: Anchors, camera: Camera) -> Int64[Tensor, " v"]:
+def cull_anchors(anchors: Anchors, camera: Camera) -> Int64[Tensor, " v"]:
     """Rows of the anchors that may touch a view, ascending."""
-    return choose(anchors.positions.device).cull(anchors.positions, anchors.log_scales, camera)
+    return get_backend(anchors.positions.device).cull(anchors.positions, anchors.log_scales, camera)
 
 
 def decode_view(
-    model: AnchorModel, camera: Camera, image: int | None = None
+    model: AnchorModel, camera: Camera, image_index: int | None = None
 ) -> tuple[Int64[Tensor, " v"], AnchorSplats]:
     """The rows that may touch a view and what they look like, each anchor by its own decoder; `source` counts rows.
 
     `image`: as in `render`.
     """
-    rows = visible_rows(model.anchors, camera)
+    rows = cull_anchors(model.anchors, camera)
     spans = model.spans()
     starts = rows.new_tensor([first for first, _, _ in spans] + [len(model.anchors)])
     bounds = torch.searchsorted(rows, starts).tolist()
@@ -53,7 +55,7 @@ def decode_view(
         for (first, last), (_, _, decoder) in zip(pairwise(bounds), spans, strict=True) if first < last
     ] or [(0, 0, model.decoder)]  # fmt: skip
     pieces = [
-        (first, decode_rows(model.anchors, rows[first:last], decoder.for_image(image), camera))
+        (first, decode_anchors(model.anchors, rows[first:last], decoder.weights_for_image(image_index), camera))
         for first, last, decoder in shown
     ]
     return rows, _joined(pieces, model.anchors.offsets.shape[1])
@@ -70,10 +72,10 @@ def _joined(pieces: list[tuple[int, AnchorSplats]], k: int) -> AnchorSplats:
     return AnchorSplats(**named, source=torch.cat([splats.source + first * k for first, splats in pieces]))
 
 
-def draw(splats: Splats, camera: Camera, background: Float[Tensor, "3"], depth: bool = False) -> Raster:
+def rasterize_splats(splats: Splats, camera: Camera, background: Float[Tensor, "3"], depth: bool = False) -> Raster:
     """Splats to image, alpha and (on request) expected depth, differentiable, and median depth, which is not."""
-    kernels = choose(splats.means_px.device)
-    return kernels.rasterise(splats, background, camera.width, camera.height, depth=depth)
+    kernels = get_backend(splats.means_px.device)
+    return kernels.rasterize(splats, background, camera.width, camera.height, depth=depth)
 
 
 @torch.no_grad()
@@ -83,19 +85,19 @@ def render(
     *,
     background: tuple[float, float, float] | None = None,
     depth: bool = False,
-    image: int | None = None,
+    image_index: int | None = None,
 ) -> Raster:
     """One view of a model: image [h, w, 3] (not clamped), alpha [h, w], expected and median depth [h, w] or None.
 
     `background` replaces the model's own. `image` is the index of a training image whose appearance to use;
     None takes the mean appearance.
     """
-    _, splats = decode_view(model, camera, image)
-    return draw(splats, camera, splats.means_px.new_tensor(background or model.background), depth)
+    _, splats = decode_view(model, camera, image_index)
+    return rasterize_splats(splats, camera, splats.means_px.new_tensor(background or model.background), depth)
 
 
 @torch.no_grad()
-def paint(
+def render_scalar(
     model: AnchorModel, values: Float[Tensor, " n"], camera: Camera
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
     """A value per anchor in place of its colour, on black: the sum of the values that a pixel shows, each by its part
@@ -104,16 +106,16 @@ def paint(
     k = model.anchors.offsets.shape[1]
     of_splat = values.to(rows.device)[rows][splats.source.long() // k].float()
     grey = replace(splats, colours=of_splat[:, None].expand(-1, 3).contiguous())
-    painted = draw(grey, camera, splats.means_px.new_zeros(3))
+    painted = rasterize_splats(grey, camera, splats.means_px.new_zeros(3))
     return painted.image[..., 0], painted.alpha
 
 
-def render_values(model: AnchorModel, values: Float[Tensor, " n"], camera: Camera) -> Float[Tensor, "h w"]:
+def render_scalar_map(model: AnchorModel, values: Float[Tensor, " n"], camera: Camera) -> Float[Tensor, "h w"]:
     """A value per anchor drawn as a map: the alpha-weighted mean at each pixel, NaN where nothing is drawn.
 
     Used for visibility maps (V at each pixel).
     """
     scale = float(values.max().clamp(min=1)) if len(values) else 1.0
-    painted, alpha = paint(model, values / scale, camera)
+    painted, alpha = render_scalar(model, values / scale, camera)
     value = painted / alpha.clamp(min=1e-6) * scale
     return torch.where(alpha > 0.5, value, torch.full_like(value, float("nan")))

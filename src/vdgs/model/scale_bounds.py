@@ -3,9 +3,9 @@
 A Gaussian that spans a whole picture and reaches beyond it is held in place by nothing: its edges lie outside of all
 photographs, and seen from between the cameras it hangs as a veil in front of everything. Rule (choice): in the picture
 of any training camera that holds the anchor's place, the ellipse within which one of its Gaussians is drawn at all
-(alpha of at least 1/255, at full opacity) is no longer than `SPAN` of the longer side.
+(alpha of at least 1/255, at full opacity) is no longer than `MAX_IMAGE_FRACTION` of the longer side.
 
-The three scales that are the unit of an anchor's offsets may be `SPREAD` times that. Nothing else keeps Gaussians about
+The three scales that are the unit of an anchor's offsets may be `MAX_OFFSET_FACTOR` times that. Nothing else keeps Gaussians about
 their anchor, where visibility, blocks, culling and growth take them to be. Unbounded, a few anchors of every real scene
 strew theirs over all of it, where they hang as patches in the colours of somewhere else.
 """
@@ -21,25 +21,25 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from vdgs.geometry.camera import NEAR, Camera
+from vdgs.geometry.camera import NEAR_PLANE, Camera
 from vdgs.kernels.constants import ALPHA_MIN
-from vdgs.visibility.frustum import Frusta, project
-from vdgs.visibility.spatial_groups import Groups
+from vdgs.visibility.frustum import Frusta, project_points
+from vdgs.visibility.spatial_groups import SpatialGroups
 
 #: Length of a Gaussian over the longer side of the picture, at most (choice: a Gaussian may lie nearer to a camera than
 #: its anchor, and a view nearer than all cameras. With larger bounds, views of a town held some that were larger than
 #: the picture: reports/solid-ground.md).
-SPAN = 0.25
+MAX_IMAGE_FRACTION = 0.25
 #: The unit of an anchor's offsets over the largest Gaussian's standard deviation, at most (choice: at 1, ground that
 #: few photographs show stays open; reports/solid-ground.md).
-SPREAD = 4.0
+MAX_OFFSET_FACTOR = 4.0
 #: From the middle of a Gaussian of opacity 1 to where it is no longer drawn, in standard deviations.
-REACH = math.sqrt(-2.0 * math.log(ALPHA_MIN))
+MAX_SIGMA = math.sqrt(-2.0 * math.log(ALPHA_MIN))
 #: Cameras that a group of places asks at once: what this keeps in memory is small, whatever the flight.
-AT_ONCE = 1024
+CAMERA_CHUNK = 1024
 
 
-def largest_log_scales(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Float[Tensor, " n"]:
+def max_log_scales(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Float[Tensor, " n"]:
     """The logarithm of the largest standard deviation that Gaussians of anchors at these places may have, in units of
     the ground frame: what the nearest of the cameras (pinholes) that hold the place allows; where none holds it, the
     nearest of all. Infinite without cameras. Time in proportion to what the cameras hold, O(n + c) memory."""
@@ -47,15 +47,15 @@ def largest_log_scales(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera
     if len(positions) == 0 or not cameras:
         return bound.log()
     frusta = Frusta.of(cameras, positions.device)
-    for rows, watching in Groups.of(positions).watched(frusta):
-        for some in watching.split(AT_ONCE):
+    for rows, watching in SpatialGroups.of(positions).visible_groups(frusta):
+        for some in watching.split(CAMERA_CHUNK):
             asked = frusta.take(some)
             seen = asked.project(positions[rows])
             allowed = torch.where(seen.inside, asked.span[:, None].to(positions) * seen.depth, math.inf)
             bound[rows] = torch.minimum(bound[rows], allowed.amin(dim=0))
     rows = bound.isinf().nonzero().squeeze(1)
     bound[rows] = _by_nearest(positions[rows], cameras, frusta.span.cpu().numpy())
-    return (bound * (SPAN / (2.0 * REACH))).log()
+    return (bound * (MAX_IMAGE_FRACTION / (2.0 * MAX_SIGMA))).log()
 
 
 def _by_nearest(
@@ -73,6 +73,6 @@ def _by_nearest(
         for chosen in np.unique(nearest):
             rows = torch.from_numpy(np.flatnonzero(nearest == chosen)).to(positions.device)
             # An anchor in a camera's very centre would get a size of zero, whose logarithm is no number to train.
-            distance = project(positions[rows], cameras[int(alike[chosen])]).distance.clamp(min=NEAR)
+            distance = project_points(positions[rows], cameras[int(alike[chosen])]).distance.clamp(min=NEAR_PLANE)
             near[rows] = torch.minimum(near[rows], span * distance)
     return near

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class CutBlock:
+class BlockRecord:
     """A block of a cut."""
 
     block: int
@@ -19,10 +19,10 @@ class CutBlock:
 
 
 @dataclass(frozen=True, kw_only=True)
-class AssignedBlock:
+class BlockCamerasRecord:
     """A block of a cut with its cameras, by the reason that brought them, and the anchors of core and widened block.
 
-    `mean_v`, `std_v` and `area` as in `CutBlock`.
+    `mean_v`, `std_v` and `area` as in `BlockRecord`.
     """
 
     block: int
@@ -52,22 +52,22 @@ class PartitionRecord:
     lambda_vis: float | None = None
     warnings: tuple[str, ...] = ()
     complaints: tuple[str, ...] = ()
-    blocks: tuple[AssignedBlock, ...] = ()
-    spatial: tuple[CutBlock, ...] = ()
+    blocks: tuple[BlockCamerasRecord, ...] = ()
+    spatial: tuple[BlockRecord, ...] = ()
     """The cut that place alone would give, to compare with."""
     seconds: float | None = None
     peak_memory_bytes: int | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
-class MergedBlock:
+class MergedBlockRecord:
     """What became of the anchors of a block when the scene was merged."""
 
     block: int
     trained: int
     kept: int
     dropped: int
-    from_coarse: int
+    coarse_fallback: int
     """Coarse anchors that stand in for a block that is missing."""
     unseen: int
     """Kept, but in the frustum of none of the block's cameras."""

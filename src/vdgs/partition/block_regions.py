@@ -18,48 +18,48 @@ from torch import Tensor
 from vdgs.config.method import BlockConfig
 from vdgs.geometry.camera import Camera
 from vdgs.model.anchors import Anchors
-from vdgs.model.renderer import visible_rows
-from vdgs.partition.blocks import Blocks, places_of
+from vdgs.model.renderer import cull_anchors
+from vdgs.partition.blocks import Blocks, xy_positions
 
 #: Cells on each side of the table of the ramp.
-RAMP_CELLS = 512
+RAMP_TABLE_SIZE = 512
 
 
-def split_anchors(anchors: Anchors, blocks: Blocks, index: int, config: BlockConfig) -> tuple[Tensor, Tensor]:
+def split_trainable_anchors(anchors: Anchors, blocks: Blocks, index: int, config: BlockConfig) -> tuple[Tensor, Tensor]:
     """What a block moves and what it only draws, as two masks [n].
 
     Own are the anchors that the block owns (with a ring that is not frozen: that it reaches). Around it are the ring
     and, with `config.context`, everything else.
     """
-    place = places_of(anchors.positions)
+    place = xy_positions(anchors.positions)
     owner = blocks.owner(place)
-    core, reached = owner == index, blocks.reaches(index, place, owner)
+    core, reached = owner == index, blocks.in_expanded(index, place, owner)
     own = core if config.ring == "frozen" else reached
     around = ~own if config.context else reached & ~own
     device = anchors.positions.device
     return torch.from_numpy(own).to(device), torch.from_numpy(around).to(device)
 
 
-def drawn_by(anchors: Anchors, cameras: Sequence[Camera]) -> Bool[Tensor, " n"]:
+def visible_anchors(anchors: Anchors, cameras: Sequence[Camera]) -> Bool[Tensor, " n"]:
     """Which anchors one of the cameras may draw."""
     drawn = torch.zeros_like(anchors.positions[:, 0], dtype=torch.bool)
     for camera in cameras:
-        drawn[visible_rows(anchors, camera)] = True
+        drawn[cull_anchors(anchors, camera)] = True
     return drawn
 
 
-def holds(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Tensor], Tensor]:
+def growth_mask(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Tensor], Tensor]:
     """Which places may get new anchors: those of which the merge keeps what stands there."""
 
     def inside(positions: Float[Tensor, "p 3"]) -> Bool[Tensor, " p"]:
-        place = places_of(positions)
-        kept = blocks.owner(place) == index if config.ring == "frozen" else blocks.reaches(index, place)
+        place = xy_positions(positions)
+        kept = blocks.owner(place) == index if config.ring == "frozen" else blocks.in_expanded(index, place)
         return torch.from_numpy(kept).to(positions.device)
 
     return inside
 
 
-def ramp(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Tensor], Tensor] | None:
+def lr_ramp(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Tensor], Tensor] | None:
     """The learning-rate mask of a ring that is a ramp: 1 wherever the block owns the place, and where another does,
     falling linearly from the core to 0 at the widened boundary.
 
@@ -69,12 +69,14 @@ def ramp(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Tensor], 
         return None
     block = blocks.items[index]
     low, high = np.array(block.expanded.bounds[:2]), np.array(block.expanded.bounds[2:])
-    centres = (np.indices((RAMP_CELLS, RAMP_CELLS)).reshape(2, -1).T + 0.5) / RAMP_CELLS * (high - low) + low
+    centres = (np.indices((RAMP_TABLE_SIZE, RAMP_TABLE_SIZE)).reshape(2, -1).T + 0.5) / RAMP_TABLE_SIZE * (
+        high - low
+    ) + low
     points = shapely.points(centres)
     inwards, outwards = shapely.distance(block.core, points), shapely.distance(block.expanded.boundary, points)
     share = np.where(shapely.contains(block.expanded, points), outwards / np.maximum(inwards + outwards, 1e-12), 0.0)
     share = np.where(blocks.owner(centres) == index, 1.0, share)
-    made = share.astype(np.float32).reshape(RAMP_CELLS, RAMP_CELLS), low, (high - low) / RAMP_CELLS
+    made = share.astype(np.float32).reshape(RAMP_TABLE_SIZE, RAMP_TABLE_SIZE), low, (high - low) / RAMP_TABLE_SIZE
 
     @cache
     def on(device: torch.device) -> list[Tensor]:
@@ -83,8 +85,8 @@ def ramp(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Tensor], 
     def rate_mask(positions: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:
         table, origin, cell = on(positions.device)
         cells: Int64[Tensor, "p 2"] = ((positions[:, :2].double() - origin) / cell).floor().long()
-        inside = ((cells >= 0) & (cells < RAMP_CELLS)).all(1)
-        cells = cells.clamp(0, RAMP_CELLS - 1)
+        inside = ((cells >= 0) & (cells < RAMP_TABLE_SIZE)).all(1)
+        cells = cells.clamp(0, RAMP_TABLE_SIZE - 1)
         # What the block moves beyond the table it owns.
         return torch.where(inside, table[cells[:, 0], cells[:, 1]], 1.0)
 

@@ -21,12 +21,12 @@ from torch import Tensor
 from vdgs.errors import RunError
 from vdgs.geometry.geodesy import geodetic_from_enu
 from vdgs.geometry.ground_frame import GroundFrame
-from vdgs.partition.polygon_lookup import Cores
+from vdgs.partition.polygon_lookup import BlockCores
 from vdgs.system.atomic_files import write_json
 from vdgs.system.documents import JsonObject
 
 
-def places_of(positions: Float[Tensor, "n 3"] | Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+def xy_positions(positions: Float[Tensor, "n 3"] | Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
     """x and y of anchors as all who ask for owners give them, in float64: the same bits have the same owner."""
     return torch.as_tensor(positions)[:, :2].double().cpu().numpy()
 
@@ -48,42 +48,47 @@ class Blocks:
     def __len__(self) -> int:
         return len(self.items)
 
-    def owner(self, places: Float[np.ndarray, "n 2"]) -> Int64[np.ndarray, " n"]:
+    def owner(self, points: Float[np.ndarray, "n 2"]) -> Int64[np.ndarray, " n"]:
         """The block of every place: whose core holds it, else whose core is nearest (the first of equals).
 
         A million places among sixteen cores take about a second. Raises ValueError if a place is not finite.
         """
-        return self._cores.nearest(places)
+        return self._cores.nearest(points)
 
     @cached_property
-    def _cores(self) -> Cores:
-        return Cores([block.core for block in self.items])
+    def _cores(self) -> BlockCores:
+        return BlockCores([block.core for block in self.items])
 
-    def reaches(
-        self, index: int, places: Float[np.ndarray, "n 2"], owner: Int64[np.ndarray, " n"] | None = None
+    def in_expanded(
+        self, index: int, points: Float[np.ndarray, "n 2"], owner: Int64[np.ndarray, " n"] | None = None
     ) -> Bool[np.ndarray, " n"]:
         """Which places belong to the widened block: inside its boundary, or owned by it. `owner` of the places saves
         asking for it, where several blocks are looked at."""
         boundary = self.items[index].expanded
-        reached = (self.owner(places) if owner is None else owner) == index
+        reached = (self.owner(points) if owner is None else owner) == index
         (west, south), (east, north) = np.array(boundary.bounds).reshape(2, 2)
-        x, y = places[:, 0], places[:, 1]
+        x, y = points[:, 0], points[:, 1]
         near = np.flatnonzero((x >= west) & (x <= east) & (y >= south) & (y <= north) & ~reached)
         reached[near] = shapely.contains_xy(boundary, x[near], y[near])
         return reached
 
 
 def save_blocks(
-    path: Path, blocks: Blocks, facts: Sequence[Mapping[str, object]], of_all: Mapping[str, Any] | None = None
+    path: Path,
+    blocks: Blocks,
+    properties: Sequence[Mapping[str, object]],
+    scene_properties: Mapping[str, Any] | None = None,
 ) -> None:
     """Write cores and widened boundaries as a FeatureCollection, atomically, with `facts` of each block and `of_all`.
 
     Coordinates keep all digits: what is read owns exactly what was written.
     """
-    write_json(path, _collection(blocks, facts) | dict(of_all or {}))
+    write_json(path, _feature_collection(blocks, properties) | dict(scene_properties or {}))
 
 
-def save_blocks_wgs84(path: Path, blocks: Blocks, facts: Sequence[Mapping[str, object]], ground: GroundFrame) -> None:
+def save_blocks_wgs84(
+    path: Path, blocks: Blocks, properties: Sequence[Mapping[str, object]], ground: GroundFrame
+) -> None:
     """The same in longitude, latitude (RFC 7946), for maps: every corner at the height of the ground frame's origin.
 
     Longitudes run on past 180 degrees where a scene lies across the antimeridian.
@@ -91,32 +96,32 @@ def save_blocks_wgs84(path: Path, blocks: Blocks, facts: Sequence[Mapping[str, o
     """
     if ground.origin_geo is None:
         raise ValueError(f"the ground frame ({ground.how}) is not georeferenced: blocks have no longitude")
-    origin, level_at = ground.origin_geo, ground.level_at
+    origin, level_at = ground.origin_geo, ground.axes_origin
 
     def on_earth(shape: shapely.Polygon) -> shapely.Polygon:
         turned = shapely.transform(shape, lambda places: _longitude_latitude(places, origin, level_at))
         return shapely.orient_polygons(turned)
 
     turned = Blocks(tuple(Block(on_earth(block.core), on_earth(block.expanded)) for block in blocks.items))
-    write_json(path, _collection(turned, facts))
+    write_json(path, _feature_collection(turned, properties))
 
 
 def _longitude_latitude(
     places: Float[np.ndarray, "n 2"], origin: tuple[float, float, float], level_at: tuple[float, float]
 ) -> Float[np.ndarray, "n 2"]:
     """Degrees of places east and north of `origin` (lat deg, lon deg, alt m), at its height; the axes are east and
-    north at `level_at` (lat deg, lon deg)."""
+    north at `axes_origin` (lat deg, lon deg)."""
     geodetic = geodetic_from_enu(np.column_stack([places, np.zeros(len(places))]), origin, level_at)
     longitude = geodetic[:, 1]
     return np.column_stack([longitude + 360 * np.round((origin[1] - longitude) / 360), geodetic[:, 0]])
 
 
-def _collection(blocks: Blocks, facts: Sequence[Mapping[str, object]]) -> JsonObject:
+def _feature_collection(blocks: Blocks, properties: Sequence[Mapping[str, object]]) -> JsonObject:
     """The FeatureCollection of cores and widened boundaries."""
     features = [
         {
             "type": "Feature",
-            "properties": {"block": index, "boundary": name, **facts[index]},
+            "properties": {"block": index, "boundary": name, **properties[index]},
             "geometry": shapely.geometry.mapping(shape),
         }
         for index, block in enumerate(blocks.items)

@@ -11,45 +11,45 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
 #: A cell is this many times the distance to a neighbour (its rank) that so large a share of the anchors has within.
-CELL_FACTOR, CELL_NEIGHBOUR, CELL_QUANTILE, CELL_SAMPLE = 2.0, 8, 0.95, 20_000
+CELL_FACTOR, CELL_NEIGHBOR_RANK, CELL_QUANTILE, CELL_SAMPLE = 2.0, 8, 0.95, 20_000
 #: A block of average size is at least so many cells across; the whole scene at most so many.
-LEAST_CELLS, MOST_CELLS = 6, 512
+MIN_CELLS, MAX_CELLS = 6, 512
 #: Components are looked for between these quantiles of the anchors, widened by half; what lies beyond is an outlier.
-WINDOW, WINDOW_MARGIN = (0.01, 0.99), 0.5
+WINDOW_QUANTILES, WINDOW_MARGIN = (0.01, 0.99), 0.5
 #: An α-shape is drawn through at most so many anchors.
-OUTLINE_POINTS = 20_000
+MAX_OUTLINE_POINTS = 20_000
 #: Cells of a grid that may have a number each in memory; of more, those with points are sorted.
-MOST_FLAGS = 1 << 24
+MAX_DENSE_CELLS = 1 << 24
 #: α in cells to begin with, and its growth until the shape is one polygon.
 ALPHA_CELLS, ALPHA_GROWTH = 1.0, 1.25
 #: Standard deviation of the weights with which the cells about a cell count for which cluster is the strongest there.
 SMOOTHING_CELLS = 1.5
 #: What smoothing reaches, four standard deviations, and closing, in cells.
 SMOOTHING_REACH, CLOSING_CELLS = 6, 2
-EIGHT = np.ones((3, 3), bool)
+EIGHT_NEIGHBORS = np.ones((3, 3), bool)
 
 
-def cores_of(
-    places: Float[np.ndarray, "n 2"], labels: Int64[np.ndarray, " n"], count: int
+def block_cores(
+    points: Float[np.ndarray, "n 2"], labels: Int64[np.ndarray, " n"], count: int
 ) -> list[shapely.Polygon | None]:
     """The core of every cluster: polygons without common area. None for a cluster that is the strongest nowhere.
 
     The largest connected component of each cluster, its α-shape with holes filled, simplified. Where two shapes
     overlap the smaller keeps its place: a dense centre becomes a hole in the core of the outskirts about it.
     """
-    cell = cell_size(places, count)
-    shapes = {label: _outline(members, cell) for label, members in _components(places, labels, count, cell).items()}
+    cell = cell_size(points, count)
+    shapes = {label: _outline(members, cell) for label, members in _components(points, labels, count, cell).items()}
     cores: list[shapely.Polygon | None] = [None] * count
-    taken = _Taken(list(shapes.values()))
+    taken = _TakenArea(list(shapes.values()))
     for place, label in sorted(enumerate(shapes), key=lambda each: (shapes[each[1]].area, each[1])):
-        core = _without_slivers(largest_part(shapes[label].difference(taken.about(place))), cell / 2)
+        core = _remove_slivers(largest_part(shapes[label].gain_spread(taken.about(place))), cell / 2)
         if not core.is_empty:
             cores[label] = core
             taken.take(place, core)
     return cores
 
 
-class _Taken:
+class _TakenArea:
     """What the cores of smaller shapes take of the plane; asked about one shape at a time, of all that there are."""
 
     def __init__(self, shapes: list[shapely.Polygon]) -> None:
@@ -69,7 +69,7 @@ class _Taken:
         self._cores[place] = core
 
 
-def widen(core: shapely.Polygon, expansion: float) -> shapely.Polygon:
+def expand_core(core: shapely.Polygon, expansion: float) -> shapely.Polygon:
     """The block's boundary: its core widened by `expansion` times the radius of a disc of its area (section IV-B).
 
     For a disc that is a factor of 1 + expansion about its centre (choice); it is defined for any other shape too, and
@@ -82,41 +82,41 @@ def widen(core: shapely.Polygon, expansion: float) -> shapely.Polygon:
     return largest_part(core.buffer(distance).simplify(distance / 100))
 
 
-def cell_size(places: Float[np.ndarray, "n 2"], count: int) -> float:
+def cell_size(points: Float[np.ndarray, "n 2"], count: int) -> float:
     """Edge of the cells on which components are found (choice): twice the distance within which 95 % of the anchors
     have eight neighbours, so that cells of sparse outskirts are seldom empty; within bounds set by the scene's size.
     """
-    extent = extent_of(places)
-    rank = min(CELL_NEIGHBOUR, len(places) - 1)
-    sample = places[:: -(-len(places) // CELL_SAMPLE)]
+    extent = scene_extent(points)
+    rank = min(CELL_NEIGHBOR_RANK, len(points) - 1)
+    sample = points[:: -(-len(points) // CELL_SAMPLE)]
     # Not balanced: built several times faster, and exact all the same.
-    tree = cKDTree(places, balanced_tree=False, compact_nodes=False)
+    tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
     distances = tree.query(sample, k=[rank + 1])[0]
     wanted = CELL_FACTOR * float(np.quantile(distances, CELL_QUANTILE))
-    return float(np.clip(wanted, extent / MOST_CELLS, extent / (LEAST_CELLS * np.sqrt(count))))
+    return float(np.clip(wanted, extent / MAX_CELLS, extent / (MIN_CELLS * np.sqrt(count))))
 
 
-def extent_of(places: Float[np.ndarray, "n 2"]) -> float:
+def scene_extent(points: Float[np.ndarray, "n 2"]) -> float:
     """How far places reach along the longer axis, outliers aside."""
-    low, high = np.quantile(places, WINDOW, axis=0)
-    return float((high - low).max()) or float(np.ptp(places, axis=0).max())
+    low, high = np.quantile(points, WINDOW_QUANTILES, axis=0)
+    return float((high - low).max()) or float(np.ptp(points, axis=0).max())
 
 
-def _components(places: np.ndarray, labels: np.ndarray, count: int, cell: float) -> dict[int, Float[np.ndarray, "m 2"]]:
+def _components(points: np.ndarray, labels: np.ndarray, count: int, cell: float) -> dict[int, Float[np.ndarray, "m 2"]]:
     """The anchors of each cluster's largest component: most anchors, over cells in which the cluster is strongest.
 
     Strongest about the cell, not only in it: borders drawn through mixed anchors would have fingers.
     """
-    low, high = np.quantile(places, WINDOW, axis=0)
+    low, high = np.quantile(points, WINDOW_QUANTILES, axis=0)
     margin = WINDOW_MARGIN * (high - low) + cell
-    inside = ((places >= low - margin) & (places <= high + margin)).all(axis=1)
-    places, labels = places[inside], labels[inside]
+    inside = ((points >= low - margin) & (points <= high + margin)).all(axis=1)
+    points, labels = points[inside], labels[inside]
     # Two empty cells about everything: a closing reaches no border.
-    index = ((places - places.min(axis=0)) / cell).astype(np.int64) + 2
+    index = ((points - points.min(axis=0)) / cell).astype(np.int64) + 2
     rows, columns = index.max(axis=0) + 3
     flat = index[:, 0] * columns + index[:, 1]
     del index
-    strongest = _strongest(labels, flat, (int(rows), int(columns)), count)
+    strongest = _dominant_cluster(labels, flat, (int(rows), int(columns)), count)
     own = np.flatnonzero(strongest.ravel()[flat] == labels)
     members = np.split(
         own[np.argsort(labels[own], kind="stable")], np.cumsum(np.bincount(labels[own], minlength=count))
@@ -126,15 +126,17 @@ def _components(places: np.ndarray, labels: np.ndarray, count: int, cell: float)
         at_home = members[label]
         if window is None or len(at_home) == 0:
             continue
-        window = _grown(window, CLOSING_CELLS, strongest.shape)
-        components = ndimage.label(ndimage.binary_closing(strongest[window] == label, EIGHT), EIGHT)[0]
+        window = _grow_window(window, CLOSING_CELLS, strongest.shape)
+        components = ndimage.label(
+            ndimage.binary_closing(strongest[window] == label, EIGHT_NEIGHBORS), EIGHT_NEIGHBORS
+        )[0]
         row, column = np.divmod(flat[at_home], columns)
         component = components[row - window[0].start, column - window[1].start]
-        found[label] = places[at_home[component == np.bincount(component).argmax()]]
+        found[label] = points[at_home[component == np.bincount(component).argmax()]]
     return found
 
 
-def _strongest(
+def _dominant_cluster(
     labels: Int64[np.ndarray, " n"], flat: Int64[np.ndarray, " n"], shape: tuple[int, int], count: int
 ) -> Int64[np.ndarray, "rows columns"]:
     """The cluster that is the strongest about each cell with anchors, else -1; `flat` is the cell of each anchor.
@@ -149,7 +151,7 @@ def _strongest(
         if len(cells) == 0:
             continue
         row, column = np.divmod(cells, shape[1])
-        window = _grown(
+        window = _grow_window(
             (slice(int(row.min()), int(row.max()) + 1), slice(int(column.min()), int(column.max()) + 1)),
             SMOOTHING_REACH, shape,
         )  # fmt: skip
@@ -164,7 +166,7 @@ def _strongest(
     return strongest
 
 
-def _grown(window: tuple[slice, slice], cells: int, shape: tuple[int, ...]) -> tuple[slice, slice]:
+def _grow_window(window: tuple[slice, slice], cells: int, shape: tuple[int, ...]) -> tuple[slice, slice]:
     """A window on a grid with so many cells more to every side, as far as the grid goes."""
     rows, columns = (
         slice(max(0, each.start - cells), min(size, each.stop + cells))
@@ -179,7 +181,7 @@ def _outline(points: Float[np.ndarray, "m 2"], cell: float) -> shapely.Polygon:
     thinned = points
     while True:
         thinned = points[_first_of_cells(points, spacing)]
-        if len(thinned) <= OUTLINE_POINTS:
+        if len(thinned) <= MAX_OUTLINE_POINTS:
             break
         spacing *= np.sqrt(2)
     shape = alpha_shape(thinned, ALPHA_CELLS * cell)
@@ -189,7 +191,7 @@ def _outline(points: Float[np.ndarray, "m 2"], cell: float) -> shapely.Polygon:
 
 
 def _first_of_cells(
-    points: Float[np.ndarray, "m 2"], edge: float, most_flags: int = MOST_FLAGS
+    points: Float[np.ndarray, "m 2"], edge: float, most_flags: int = MAX_DENSE_CELLS
 ) -> Int64[np.ndarray, " c"]:
     """The first point in each cell of a grid, ascending."""
     cells = np.floor(points / edge).astype(np.int64)
@@ -221,7 +223,7 @@ def alpha_shape(points: Float[np.ndarray, "m 2"], alpha: float) -> shapely.Polyg
     widest = radii[np.isfinite(radii)].max()
     while alpha < widest:
         kept = radii <= alpha
-        if len(np.unique(mesh.simplices[kept])) == len(corners) and _hang_together(mesh.neighbors, kept):
+        if len(np.unique(mesh.simplices[kept])) == len(corners) and _is_connected(mesh.neighbors, kept):
             break
         alpha *= ALPHA_GROWTH
     kept = radii <= alpha
@@ -238,7 +240,7 @@ def _circumradii(triangles: Float[np.ndarray, "t 3 2"]) -> Float[np.ndarray, " t
     return np.where(flat, np.inf, lengths.prod(axis=1) / np.where(flat, 1.0, 2 * twice_area))
 
 
-def _hang_together(neighbours: np.ndarray, kept: np.ndarray) -> bool:
+def _is_connected(neighbours: np.ndarray, kept: np.ndarray) -> bool:
     """Whether the kept triangles are connected through common edges."""
     start = np.repeat(np.arange(len(kept)), 3)
     end = neighbours.ravel()
@@ -248,7 +250,7 @@ def _hang_together(neighbours: np.ndarray, kept: np.ndarray) -> bool:
     return len(np.unique(labels[kept])) == 1
 
 
-def _without_slivers(shape: shapely.Polygon, width: float) -> shapely.Polygon:
+def _remove_slivers(shape: shapely.Polygon, width: float) -> shapely.Polygon:
     """The largest part of the shape that is more than twice `width` wide everywhere; a narrow shape stays as it is."""
     opened = largest_part(shape.buffer(-width).buffer(width, quad_segs=4).intersection(shape))
     return shape if opened.area < shape.area / 2 else opened

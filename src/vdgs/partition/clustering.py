@@ -10,62 +10,66 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from vdgs.errors import VdgsError
-from vdgs.visibility.visibility_counts import normalised
+from vdgs.visibility.visibility_counts import normalize_visibility
 
 #: Places are normalised between these quantiles and clipped: far outliers would squash the scene (choice).
-EXTENT = (0.01, 0.99)
+EXTENT_QUANTILES = (0.01, 0.99)
 #: Centres are fitted to at most so many anchors; all others join the nearest.
-FITTED = 300_000
+MAX_FIT_SAMPLES = 300_000
 #: k-means++ starts, of which the one of least inertia is kept; fewer where there are so many clusters that each costs
 #: much and tells little (clusters of all starts together).
-RESTARTS, RESTARTED_CLUSTERS = 8, 512
+NUM_RESTARTS, MAX_RESTARTED_CLUSTERS = 8, 512
 
 #: Anchors that are looked at first for being distinct.
-MOST_COMPARED = 5_000
+MAX_COMPARED = 5_000
 
 #: Balanced clusters: anchors fitted to (at least, and for each cluster), Lloyd rounds, sweeps over the weights.
-BALANCED_FITTED, BALANCED_FITTED_EACH = 30_000, 4_000
+BALANCED_MIN_SAMPLES, BALANCED_SAMPLES_PER_CLUSTER = 30_000, 4_000
 #: ... and at most so many distances from them to centres.
-BALANCED_DISTANCES = 100_000_000
-BALANCED_ROUNDS, BALANCED_SWEEPS = 30, 10
+BALANCED_MAX_DISTANCES = 100_000_000
+BALANCED_ITERATIONS, BALANCED_SWEEPS = 30, 10
 BALANCED_TOLERANCE = 0.01
 #: Distances from features to centres that are in memory at once.
-CHUNK = 3_200_000
+DISTANCES_PER_CHUNK = 3_200_000
 
 
-def features_of(
-    places: Float[np.ndarray, "n 2"], visibility: Int64[np.ndarray, " n"], lambda_vis: float
+def clustering_features(
+    points: Float[np.ndarray, "n 2"], visibility: Int64[np.ndarray, " n"], lambda_vis: float
 ) -> Float[np.ndarray, "n 3"]:
     """f_i = [x̂_i, ŷ_i, λ_vis V̂_i] (eq. 5), float64; x̂ and ŷ in [0, 1]."""
-    low, high = np.quantile(places, EXTENT, axis=0)
+    low, high = np.quantile(points, EXTENT_QUANTILES, axis=0)
     extent = np.where(high > low, high - low, 1.0)
-    unit = np.clip((places - low) / extent, 0.0, 1.0)
+    unit = np.clip((points - low) / extent, 0.0, 1.0)
     # Not 0 * V̂: without weight the visibility must leave no trace, not even -0.0.
-    third = lambda_vis * normalised(visibility) if lambda_vis else np.zeros(len(places))
+    third = lambda_vis * normalize_visibility(visibility) if lambda_vis else np.zeros(len(points))
     return np.column_stack([unit, third])
 
 
-def cluster(features: Float[np.ndarray, "n 3"], count: int, seed: int, balanced: bool) -> Int64[np.ndarray, " n"]:
+def cluster_anchors(
+    features: Float[np.ndarray, "n 3"], count: int, seed: int, balanced: bool
+) -> Int64[np.ndarray, " n"]:
     """Labels 0..count-1 by k-means++ (choice; the paper does not name its clustering).
 
     `balanced`: sizes within a few per cent of n / count, by a power diagram (choice).
     The same seed gives the same labels, whatever the number of threads. Raises VdgsError if there are fewer distinct
     anchors than clusters.
     """
-    refuse_too_many(count, features)
-    centres = _fit(_thinned(features, FITTED), count, seed)
+    check_distinct(count, features)
+    centres = _fit(_subsample(features, MAX_FIT_SAMPLES), count, seed)
     weights = np.zeros(count)
     if balanced:
-        most = min(max(BALANCED_FITTED, BALANCED_FITTED_EACH * count), max(BALANCED_DISTANCES // count, count))
-        sample = _thinned(features, most)
+        most = min(
+            max(BALANCED_MIN_SAMPLES, BALANCED_SAMPLES_PER_CLUSTER * count), max(BALANCED_MAX_DISTANCES // count, count)
+        )
+        sample = _subsample(features, most)
         centres, weights = _fit_balanced(sample, centres)
-    return _nearest(features, centres, weights)
+    return _assign_clusters(features, centres, weights)
 
 
-def refuse_too_many(count: int, rows: Float[np.ndarray, "n d"]) -> None:
+def check_distinct(count: int, rows: Float[np.ndarray, "n d"]) -> None:
     """Raises VdgsError if fewer than `count` of the rows are distinct."""
     # Nearly always a few thousand rows show it; sorting millions would take seconds.
-    if len(np.unique(_thinned(rows, MOST_COMPARED), axis=0)) >= count:
+    if len(np.unique(_subsample(rows, MAX_COMPARED), axis=0)) >= count:
         return
     distinct = len(np.unique(rows, axis=0))
     if distinct < count:
@@ -75,8 +79,8 @@ def refuse_too_many(count: int, rows: Float[np.ndarray, "n d"]) -> None:
         )
 
 
-def _thinned(features: np.ndarray, most: int) -> np.ndarray:
-    return features[:: -(-len(features) // most)]
+def _subsample(features: np.ndarray, max_count: int) -> np.ndarray:
+    return features[:: -(-len(features) // max_count)]
 
 
 def _fit(features: np.ndarray, count: int, seed: int) -> Float[np.ndarray, "count 3"]:
@@ -86,7 +90,7 @@ def _fit(features: np.ndarray, count: int, seed: int) -> Float[np.ndarray, "coun
 
     # One thread: sums of several threads differ in their last bits from run to run.
     with threadpool_limits(1):
-        restarts = max(1, min(RESTARTS, RESTARTED_CLUSTERS // count))
+        restarts = max(1, min(NUM_RESTARTS, MAX_RESTARTED_CLUSTERS // count))
         return KMeans(count, n_init=restarts, random_state=seed, copy_x=True).fit(features).cluster_centers_
 
 
@@ -98,8 +102,8 @@ def _fit_balanced(
     A feature belongs to the centre of least |f - c|² - w.
     """
     weights = np.zeros(len(centres))
-    for _ in range(BALANCED_ROUNDS):
-        squares = _squares(features, centres)
+    for _ in range(BALANCED_ITERATIONS):
+        squares = _squared_distances(features, centres)
         weights = _balance(squares, weights)
         labels = (squares - weights).argmin(axis=1)
         sizes = np.bincount(labels, minlength=len(centres))
@@ -109,7 +113,7 @@ def _fit_balanced(
         centres = moved
         if still:
             break
-    return centres, _balance(_squares(features, centres), weights)
+    return centres, _balance(_squared_distances(features, centres), weights)
 
 
 def _balance(squares: np.ndarray, weights: np.ndarray) -> Float[np.ndarray, " count"]:
@@ -139,16 +143,16 @@ def _balance(squares: np.ndarray, weights: np.ndarray) -> Float[np.ndarray, " co
     return weights - weights.mean()
 
 
-def _squares(features: np.ndarray, centres: np.ndarray) -> Float[np.ndarray, "n count"]:
+def _squared_distances(features: np.ndarray, centres: np.ndarray) -> Float[np.ndarray, "n count"]:
     return np.stack([((features - centre) ** 2).sum(axis=1) for centre in centres], axis=1)
 
 
-def _nearest(features: np.ndarray, centres: np.ndarray, weights: np.ndarray) -> Int64[np.ndarray, " n"]:
+def _assign_clusters(features: np.ndarray, centres: np.ndarray, weights: np.ndarray) -> Int64[np.ndarray, " n"]:
     """The centre of least |f - c|² - w, in chunks that keep memory small."""
-    chunk = max(1, CHUNK // len(centres))
+    chunk = max(1, DISTANCES_PER_CHUNK // len(centres))
     return np.concatenate(
         [
-            (_squares(features[start : start + chunk], centres) - weights).argmin(axis=1)
+            (_squared_distances(features[start : start + chunk], centres) - weights).argmin(axis=1)
             for start in range(0, len(features), chunk)
         ]
     )

@@ -19,23 +19,23 @@ from torch import Tensor
 from vdgs.config.method import MergeConfig
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
-from vdgs.model.anchor_model import AnchorModel, Part
+from vdgs.model.anchor_model import AnchorModel, DecoderSpan
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.partition.block_records import MergedBlock
-from vdgs.partition.blocks import Blocks, places_of
-from vdgs.visibility.visibility_counts import visibility_of
+from vdgs.partition.block_records import MergedBlockRecord
+from vdgs.partition.blocks import Blocks, xy_positions
+from vdgs.visibility.visibility_counts import count_visibility
 
 
-def merge(
+def merge_blocks(
     coarse: AnchorModel,
-    trained: Sequence[AnchorModel | Callable[[], AnchorModel] | None],
+    block_models: Sequence[AnchorModel | Callable[[], AnchorModel] | None],
     blocks: Blocks,
     cameras_of_block: Sequence[Sequence[Camera]],
     config: MergeConfig,
     *,
     allow_missing: bool = False,
-) -> tuple[AnchorModel, list[MergedBlock]]:
+) -> tuple[AnchorModel, list[MergedBlockRecord]]:
     """One model from the trained blocks, and what became of the anchors of each block.
 
     A trained model holds the anchors that its block was free to move: those that it owns, and those of its ring unless
@@ -47,40 +47,42 @@ def merge(
     Raises VdgsError for a missing block (unless allowed), and for a block that shows that it was not trained from
     `coarse`: by its grid, or by other bits of a frozen decoder.
     """
-    if not len(trained) == len(cameras_of_block) == len(blocks):
-        raise ValueError(f"{len(trained)} models and {len(cameras_of_block)} camera lists for {len(blocks)} blocks")
-    missing = [index for index, model in enumerate(trained) if model is None]
+    if not len(block_models) == len(cameras_of_block) == len(blocks):
+        raise ValueError(
+            f"{len(block_models)} models and {len(cameras_of_block)} camera lists for {len(blocks)} blocks"
+        )
+    missing = [index for index, model in enumerate(block_models) if model is None]
     if missing and not allow_missing:
         raise VdgsError(_missing_message(missing))
-    coarse_owner = blocks.owner(places_of(coarse.anchors.positions)) if missing else None
+    coarse_owner = blocks.owner(xy_positions(coarse.anchors.positions)) if missing else None
     selected, pieces, became, own = [], [], [], False
-    for index, given in enumerate(trained):
+    for index, given in enumerate(block_models):
         model = given() if callable(given) else given
         if model is None:
             assert coarse_owner is not None
             piece = coarse.anchors.select(torch.from_numpy(coarse_owner == index))
             trained_here, kept, from_coarse = 0, 0, len(piece)
         else:
-            _check_origin(index, model, coarse)
-            givers = giver_of_places(model.anchors.positions, blocks, cameras_of_block, config, missing)
+            _check_coarse_model(index, model, coarse)
+            givers = block_of_points(model.anchors.positions, blocks, cameras_of_block, config, missing)
             piece = model.anchors.select(torch.from_numpy(givers == index))
             trained_here, kept, from_coarse = len(model.anchors), len(piece), 0
             own = own or has_own_decoder(model)
-        unseen = int((visibility_of(piece.positions, cameras_of_block[index]) == 0).sum())
+        unseen = int((count_visibility(piece.positions, cameras_of_block[index]) == 0).sum())
         # A copy: a tensor of a file keeps all of the file in memory.
-        pieces.append(Part(len(piece), coarse.decoder if model is None else model.decoder.copy()))
+        pieces.append(DecoderSpan(len(piece), coarse.decoder if model is None else model.decoder.copy()))
         selected.append(piece.tensors())
         became.append(
-            MergedBlock(
+            MergedBlockRecord(
                 block=index,
                 trained=trained_here,
                 kept=kept,
                 dropped=trained_here - kept,
-                from_coarse=from_coarse,
+                coarse_fallback=from_coarse,
                 unseen=unseen,
             )
         )
-    return replace(coarse, anchors=_joined(selected), parts=tuple(pieces) if own else ()), became
+    return replace(coarse, anchors=_concatenate(selected), parts=tuple(pieces) if own else ()), became
 
 
 def has_own_decoder(model: AnchorModel) -> bool:
@@ -88,7 +90,7 @@ def has_own_decoder(model: AnchorModel) -> bool:
     return model.metadata.decoder == "own"
 
 
-def giver_of_places(
+def block_of_points(
     positions: Float[Tensor, "n 3"],
     blocks: Blocks,
     cameras_of_block: Sequence[Sequence[Camera]],
@@ -101,7 +103,7 @@ def giver_of_places(
     the owner, else the first. What a `missing` block owns stays with it, and it is given nothing more.
     O(n) memory; `best_seen` costs a count of visibility for each block.
     """
-    places = places_of(positions)
+    places = xy_positions(positions)
     owner = blocks.owner(places)
     if config.rule == "owner":
         return owner
@@ -112,7 +114,7 @@ def giver_of_places(
         rows = np.flatnonzero(owner == index)
         most[rows] = _visibility(positions, rows, cameras_of_block[index])
     for index in (each for each in range(len(blocks)) if each not in missing):
-        rows = np.flatnonzero(blocks.reaches(index, places, owner) & (owner != index) & ~np.isin(owner, missing))
+        rows = np.flatnonzero(blocks.in_expanded(index, places, owner) & (owner != index) & ~np.isin(owner, missing))
         visibility = _visibility(positions, rows, cameras_of_block[index])
         better = visibility > most[rows]
         giver[rows[better]], most[rows[better]] = index, visibility[better]
@@ -121,25 +123,29 @@ def giver_of_places(
 
 def _visibility(positions: Float[Tensor, "n 3"], rows: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     """V_i of the given rows over these cameras."""
-    return visibility_of(positions[torch.from_numpy(rows)], cameras).numpy()
+    return count_visibility(positions[torch.from_numpy(rows)], cameras).numpy()
 
 
-def _joined(pieces: Sequence[dict[str, Tensor]]) -> Anchors:
+def _concatenate(pieces: Sequence[dict[str, Tensor]]) -> Anchors:
     """One behind the other. Takes the tensors out of the pieces: only those of one name are in memory twice."""
     return Anchors(**{name: torch.cat([piece.pop(name) for piece in pieces]) for name in list(pieces[0])})
 
 
-def _check_origin(index: int, model: AnchorModel, coarse: AnchorModel) -> None:
+def _check_coarse_model(index: int, model: AnchorModel, coarse: AnchorModel) -> None:
     """Where blocks leave the decoder as it is, other bits are another coarse model."""
-    same = has_own_decoder(model) or _bits(model.decoder) == _bits(coarse.decoder)
-    if not same or model.anchors.offsets.shape[1] != coarse.anchors.offsets.shape[1] or model.voxel != coarse.voxel:
+    same = has_own_decoder(model) or _decoder_bytes(model.decoder) == _decoder_bytes(coarse.decoder)
+    if (
+        not same
+        or model.anchors.offsets.shape[1] != coarse.anchors.offsets.shape[1]
+        or model.voxel_size != coarse.voxel_size
+    ):
         raise VdgsError(
             f"block {index} was trained from another coarse model: its decoder or its grid differs. "
             f"Train it again: vdgs train RUN --block {index}"
         )
 
 
-def _bits(decoder: Decoder) -> dict[str, tuple[tuple[int, ...], bytes]]:
+def _decoder_bytes(decoder: Decoder) -> dict[str, tuple[tuple[int, ...], bytes]]:
     return {name: (tuple(t.shape), t.detach().numpy().tobytes()) for name, t in decoder.tensors().items()}
 
 

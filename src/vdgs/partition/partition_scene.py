@@ -11,20 +11,20 @@ from jaxtyping import Float, Int
 from vdgs.config.method import MethodConfig, PartitionConfig
 from vdgs.errors import VdgsError
 from vdgs.partition.blocks import Block, Blocks
-from vdgs.partition.boundary import LEAST_CELLS, cell_size, cores_of, extent_of, widen
-from vdgs.partition.clustering import cluster, features_of, refuse_too_many
-from vdgs.partition.polygon_lookup import Cores
-from vdgs.partition.principal_axes import principal_plane
-from vdgs.system.memory.memory_estimate import estimate, need_of_block
+from vdgs.partition.boundary import MIN_CELLS, block_cores, cell_size, expand_core, scene_extent
+from vdgs.partition.clustering import check_distinct, cluster_anchors, clustering_features
+from vdgs.partition.polygon_lookup import BlockCores
+from vdgs.partition.principal_axes import fit_principal_plane
+from vdgs.system.memory.memory_estimate import block_workload, estimate_memory
 
 #: A block that would own less than this share of the anchors of an average block is not worth training.
-LEAST_SHARE = 0.05
+MIN_BLOCK_SHARE = 0.05
 
 #: What `--blocks auto` reckons with (choice): photographs that an average block needs.
 CAMERAS_PER_BLOCK = 50
 
 
-def cut_scene(
+def partition_scene(
     positions: Float[np.ndarray, "n 3"], visibility: Int[np.ndarray, " n"], config: PartitionConfig, seed: int
 ) -> tuple[Blocks, list[str]]:
     """Cut a scene into blocks by the places of its anchors and their visibility V; and warnings for people.
@@ -35,43 +35,45 @@ def cut_scene(
     blocks about them). Raises VdgsError if the anchors cannot be cut; ValueError if the number of blocks is still
     "auto" (`choose_block_count`).
     """
-    ground = _checked(positions, visibility)
+    ground = _checked_positions(positions, visibility)
     if config.blocks == "auto":
         raise ValueError("the number of blocks is still 'auto': choose_block_count first")
     count = config.blocks
     if count < 1:
         raise VdgsError(f"--blocks {count}: a scene is cut into at least 1 block")
     if count == 1:
-        return _whole(ground, config.expansion), []
-    refuse_too_many(count, ground)
+        return _single_block(ground, config.expansion), []
+    check_distinct(count, ground)
     ground, visibility = _sorted(ground, np.asarray(visibility, np.int64))
-    plane = principal_plane(ground)
+    plane = fit_principal_plane(ground)
     places, visibility = _sorted(plane.places(ground), visibility)
-    features = features_of(places, visibility, config.lambda_vis)
-    labels = cluster(features, count, seed, config.balanced)
-    found = cores_of(places, labels, count)
+    features = clustering_features(places, visibility, config.lambda_vis)
+    labels = cluster_anchors(features, count, seed, config.balanced)
+    found = block_cores(places, labels, count)
     there = [core for core in found if core is not None]
-    cores = _worth_training(sorted(there, key=lambda core: (core.centroid.x, core.centroid.y)), places, count)
+    cores = _drop_tiny_blocks(sorted(there, key=lambda core: (core.centroid.x, core.centroid.y)), places, count)
     warnings = []
     if len(cores) < count:
         lost = [label for label, core in enumerate(found) if not any(core is kept for kept in cores)]
-        why = _why_fewer(places, labels, lost, count, config.lambda_vis)
+        why = _fewer_blocks_reason(places, labels, lost, count, config.lambda_vis)
         warnings.append(f"the scene is cut into {len(cores)} blocks instead of {count}: {why}")
     if len(cores) == 1:
-        return _whole(ground, config.expansion), warnings
+        return _single_block(ground, config.expansion), warnings
     grounded = [plane.to_ground(core) for core in cores]
-    return Blocks(tuple(Block(core, widen(core, config.expansion)) for core in grounded)), warnings
+    return Blocks(tuple(Block(core, expand_core(core, config.expansion)) for core in grounded)), warnings
 
 
-def _why_fewer(
-    places: Float[np.ndarray, "n 2"], labels: Int[np.ndarray, " n"], lost: Sequence[int], count: int, lambda_vis: float
+def _fewer_blocks_reason(
+    points: Float[np.ndarray, "n 2"], labels: Int[np.ndarray, " n"], lost: Sequence[int], count: int, lambda_vis: float
 ) -> str:
     """Why the `lost` of `count` clusters became no blocks, and what to do about it."""
-    cell, members = cell_size(places, count), [places[labels == label] for label in lost]
-    if any(len(each) >= LEAST_SHARE * len(places) / count and extent_of(each) < LEAST_CELLS * cell for each in members):
+    cell, members = cell_size(points, count), [points[labels == label] for label in lost]
+    if any(
+        len(each) >= MIN_BLOCK_SHARE * len(points) / count and scene_extent(each) < MIN_CELLS * cell for each in members
+    ):
         return (
-            f"blocks are told apart on cells of 1/{extent_of(places) / cell:.0f} of the scene's extent, and the other "
-            f"clusters are less than {LEAST_CELLS} such cells across. Fewer blocks avoid this; of places that lie "
+            f"blocks are told apart on cells of 1/{scene_extent(points) / cell:.0f} of the scene's extent, and the other "
+            f"clusters are less than {MIN_CELLS} such cells across. Fewer blocks avoid this; of places that lie "
             "far apart, each is better a run of its own."
         )
     if lambda_vis > 0:
@@ -98,13 +100,13 @@ def choose_block_count(n_anchors: int, n_cameras: int, image_pixels: int, method
     most = max(1, min(n_cameras // CAMERAS_PER_BLOCK, n_anchors))
 
     def fits(blocks: int) -> bool:
-        need = need_of_block(method, -(-n_anchors // blocks), n_anchors, image_pixels)
-        return estimate(need).total <= 1e9 * config.block_memory_gb
+        need = block_workload(method, -(-n_anchors // blocks), n_anchors, image_pixels)
+        return estimate_memory(need).total <= 1e9 * config.block_memory_gb
 
     return next((blocks for blocks in range(1, most + 1) if fits(blocks)), most)
 
 
-def _checked(positions: np.ndarray, visibility: np.ndarray) -> Float[np.ndarray, "n 2"]:
+def _checked_positions(positions: np.ndarray, visibility: np.ndarray) -> Float[np.ndarray, "n 2"]:
     """x, y of the anchors in float64."""
     ground = np.asarray(positions, np.float64)[:, :2]
     if len(ground) == 0:
@@ -116,33 +118,33 @@ def _checked(positions: np.ndarray, visibility: np.ndarray) -> Float[np.ndarray,
     return ground
 
 
-def _sorted(places: np.ndarray, visibility: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _sorted(points: np.ndarray, visibility: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A canonical order, so that sums and draws do not depend on the order of the anchors."""
-    order = np.lexsort((visibility, places[:, 1], places[:, 0]))
-    return places[order], visibility[order]
+    order = np.lexsort((visibility, points[:, 1], points[:, 0]))
+    return points[order], visibility[order]
 
 
-def _whole(ground: np.ndarray, expansion: float) -> Blocks:
+def _single_block(ground: np.ndarray, expansion: float) -> Blocks:
     """One block whose core holds every anchor; it owns every place."""
     low, high = ground.min(axis=0), ground.max(axis=0)
     margin = 0.01 * (high - low).max() + 1e-6 * np.abs(ground).max() + 1e-6
     core = shapely.box(*(low - margin), *(high + margin))
-    return Blocks((Block(core, widen(core, expansion)),))
+    return Blocks((Block(core, expand_core(core, expansion)),))
 
 
-def _worth_training(cores: list[shapely.Polygon], places: np.ndarray, count: int) -> list[shapely.Polygon]:
+def _drop_tiny_blocks(cores: list[shapely.Polygon], points: np.ndarray, count: int) -> list[shapely.Polygon]:
     """The cores that own more than a trifle of the anchors; at least one.
 
     The least goes first. What it owned goes to others of those that are left; nothing else changes its owner.
     """
-    found, left = Cores(cores), np.arange(len(cores))
-    owner = found.nearest(places)
+    found, left = BlockCores(cores), np.arange(len(cores))
+    owner = found.nearest(points)
     while len(left) > 1:
         owned = np.bincount(owner, minlength=len(cores))[left]
         least = int(owned.argmin())
-        if owned[least] >= LEAST_SHARE * len(places) / count:
+        if owned[least] >= MIN_BLOCK_SHARE * len(points) / count:
             break
         orphans = np.flatnonzero(owner == left[least])
         left = np.delete(left, least)
-        owner[orphans] = found.nearest(places[orphans], among=left)
+        owner[orphans] = found.nearest(points[orphans], among=left)
     return [cores[index] for index in left]

@@ -20,14 +20,14 @@ import shapely
 from jaxtyping import Float, Int64
 
 #: A cell is divided into so many by so many.
-DIVISION = 4
+SUBDIVISION = 4
 #: Cells that would hold fewer places than this cost more than the places themselves.
-PLACES_PER_CELL = 2
+POINTS_PER_CELL = 2
 #: Rounding of coordinates and distances, as a share of the largest coordinate.
-ROUNDING = 1e-13
+RELATIVE_TOLERANCE = 1e-13
 
 
-class _Pairs(NamedTuple):
+class _CandidatePairs(NamedTuple):
     """Cells or places by number, and the cores that are asked of each: ascending by `of`, then by `core`."""
 
     of: Int64[np.ndarray, " p"]
@@ -37,69 +37,73 @@ class _Pairs(NamedTuple):
         """Where the pairs of each cell or place begin; each has at least one."""
         return np.flatnonzero(np.diff(self.of, prepend=-1))
 
-    def inherited(self, parents: Int64[np.ndarray, " c"], count: int) -> _Pairs:
+    def inherited(self, parents: Int64[np.ndarray, " c"], count: int) -> _CandidatePairs:
         """The pairs of the children, in the order in which `parents` names their parents out of `count`."""
         sizes = np.bincount(self.of, minlength=count)
         begins = (np.cumsum(sizes) - sizes)[parents]
         sizes = sizes[parents]
         ends = np.cumsum(sizes)
         rank = np.arange(ends[-1] if len(ends) else 0) - np.repeat(ends - sizes, sizes)
-        return _Pairs(np.repeat(np.arange(len(parents)), sizes), self.core[np.repeat(begins, sizes) + rank])
+        return _CandidatePairs(np.repeat(np.arange(len(parents)), sizes), self.core[np.repeat(begins, sizes) + rank])
 
 
 @dataclass(frozen=True, eq=False)
-class Cores:
+class BlockCores:
     """Polygons on the plane without common area; at least one."""
 
     shapes: Sequence[shapely.Polygon]
 
     def nearest(
-        self, places: Float[np.ndarray, "n 2"], among: Int64[np.ndarray, " k"] | None = None
+        self, points: Float[np.ndarray, "n 2"], among: Int64[np.ndarray, " k"] | None = None
     ) -> Int64[np.ndarray, " n"]:
         """The core of every place: which holds it, else which is nearest; the first of equals. `among`: the cores, at
         least one and ascending, that are asked; by default all.
 
         Raises ValueError if a place is not finite.
         """
-        if not np.isfinite(places).all():
+        if not np.isfinite(points).all():
             raise ValueError("places that are not finite numbers have no owner")
         asked = np.arange(len(self.shapes)) if among is None else among
-        owner = np.full(len(places), asked[0], np.int64)
+        owner = np.full(len(points), asked[0], np.int64)
         if len(asked) == 1:
             return owner
         # Far places apart from the others: a box that holds them all would have to be divided many times.
-        far = ((places < self._box[0]) | (places > self._box[1])).any(axis=1)
+        far = ((points < self._box[0]) | (points > self._box[1])).any(axis=1)
         for some in (np.flatnonzero(~far), np.flatnonzero(far)):
             if len(some):
-                owner[some] = self._nearest(places[some], asked)
+                owner[some] = self._nearest(points[some], asked)
         return owner
 
-    def _nearest(self, places: Float[np.ndarray, "n 2"], asked: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " n"]:
-        owner = np.full(len(places), -1, np.int64)
-        left, pairs = self._decide_cells(places, owner, asked)
+    def _nearest(
+        self, points: Float[np.ndarray, "n 2"], candidates: Int64[np.ndarray, " k"]
+    ) -> Int64[np.ndarray, " n"]:
+        owner = np.full(len(points), -1, np.int64)
+        left, pairs = self._decide_cells(points, owner, candidates)
         if len(left):
-            owner[left] = self._first_nearest(places[left], pairs)
+            owner[left] = self._first_nearest(points[left], pairs)
         return owner
 
     def _decide_cells(
-        self, places: Float[np.ndarray, "n 2"], owner: Int64[np.ndarray, " n"], asked: Int64[np.ndarray, " k"]
-    ) -> tuple[Int64[np.ndarray, " m"], _Pairs]:
+        self, points: Float[np.ndarray, "n 2"], owner: Int64[np.ndarray, " n"], candidates: Int64[np.ndarray, " k"]
+    ) -> tuple[Int64[np.ndarray, " m"], _CandidatePairs]:
         """Fill in `owner` for the places of cells that belong to one core; the indices and candidates of the others.
 
         The cells of the first round divide the box of all places, those of the next the undecided cells of the last.
         """
-        low, high = places.min(axis=0), places.max(axis=0)
-        edge, least = float((high - low).max()), 1e3 * ROUNDING * float(np.abs(places).max())
-        left, parents = np.arange(len(places)), np.zeros(len(places), np.int64)
-        asked = self._about(low, high, asked)
-        corners, pairs = low[None], _Pairs(np.zeros(len(asked), np.int64), asked)
-        while edge > least and len(left) > PLACES_PER_CELL * len(corners) * DIVISION**2:
-            edge /= DIVISION
-            within = ((places[left] - corners[parents]) / edge).astype(np.int64).clip(0, DIVISION - 1)
-            cells, parents = _occupied(parents * DIVISION**2 + within[:, 0] * DIVISION + within[:, 1], len(corners))
-            above, inner = np.divmod(cells, DIVISION**2)
+        low, high = points.min(axis=0), points.max(axis=0)
+        edge, least = float((high - low).max()), 1e3 * RELATIVE_TOLERANCE * float(np.abs(points).max())
+        left, parents = np.arange(len(points)), np.zeros(len(points), np.int64)
+        candidates = self._about(low, high, candidates)
+        corners, pairs = low[None], _CandidatePairs(np.zeros(len(candidates), np.int64), candidates)
+        while edge > least and len(left) > POINTS_PER_CELL * len(corners) * SUBDIVISION**2:
+            edge /= SUBDIVISION
+            within = ((points[left] - corners[parents]) / edge).astype(np.int64).clip(0, SUBDIVISION - 1)
+            cells, parents = _occupied(
+                parents * SUBDIVISION**2 + within[:, 0] * SUBDIVISION + within[:, 1], len(corners)
+            )
+            above, inner = np.divmod(cells, SUBDIVISION**2)
             pairs = pairs.inherited(above, len(corners))
-            corners = corners[above] + edge * np.stack(np.divmod(inner, DIVISION), axis=1)
+            corners = corners[above] + edge * np.stack(np.divmod(inner, SUBDIVISION), axis=1)
             pairs = self._candidates(corners + edge / 2, edge * np.sqrt(0.5), pairs)
             starts = pairs.starts()
             sole = np.diff(starts, append=len(pairs.of)) == 1
@@ -107,41 +111,41 @@ class Cores:
             owner[left[decided]] = pairs.core[starts][parents[decided]]
             renumbered = np.cumsum(~sole) - 1
             open_pairs = ~sole[pairs.of]
-            pairs = _Pairs(renumbered[pairs.of[open_pairs]], pairs.core[open_pairs])
+            pairs = _CandidatePairs(renumbered[pairs.of[open_pairs]], pairs.core[open_pairs])
             left, corners = left[~decided], corners[~sole]
             parents = renumbered[parents[~decided]]
         return left, pairs.inherited(parents, len(corners))
 
     def _about(
-        self, low: Float[np.ndarray, "2"], high: Float[np.ndarray, "2"], asked: Int64[np.ndarray, " k"]
+        self, low: Float[np.ndarray, "2"], high: Float[np.ndarray, "2"], candidates: Int64[np.ndarray, " k"]
     ) -> Int64[np.ndarray, " some"]:
         """Those of the cores that can be the nearest to a place of a box, by their own boxes alone."""
-        lows, highs = self._boxes[asked, :2], self._boxes[asked, 2:]
+        lows, highs = self._boxes[candidates, :2], self._boxes[candidates, 2:]
         least = np.linalg.norm(np.maximum(np.maximum(lows - high, low - highs), 0.0), axis=1)
         most = np.linalg.norm(np.maximum(highs - low, high - lows), axis=1)
-        return asked[least <= most.min() * (1 + 1e-9) + ROUNDING * np.abs(self._box).max()]
+        return candidates[least <= most.min() * (1 + 1e-9) + RELATIVE_TOLERANCE * np.abs(self._box).max()]
 
-    def _candidates(self, centres: Float[np.ndarray, "c 2"], radius: float, pairs: _Pairs) -> _Pairs:
+    def _candidates(self, centres: Float[np.ndarray, "c 2"], radius: float, pairs: _CandidatePairs) -> _CandidatePairs:
         """Those of the pairs whose core can be the nearest to a place within `radius` of its cell's centre."""
         distance = self._distances(centres, pairs)
-        slack = 2 * radius + ROUNDING * (np.abs(centres).max() + np.abs(self._box).max())
+        slack = 2 * radius + RELATIVE_TOLERANCE * (np.abs(centres).max() + np.abs(self._box).max())
         near = distance <= np.minimum.reduceat(distance, pairs.starts())[pairs.of] + slack
-        return _Pairs(pairs.of[near], pairs.core[near])
+        return _CandidatePairs(pairs.of[near], pairs.core[near])
 
-    def _first_nearest(self, places: Float[np.ndarray, "n 2"], pairs: _Pairs) -> Int64[np.ndarray, " n"]:
+    def _first_nearest(self, points: Float[np.ndarray, "n 2"], pairs: _CandidatePairs) -> Int64[np.ndarray, " n"]:
         """The first of the cores that are nearest to each place."""
-        distance = self._distances(places, pairs)
+        distance = self._distances(points, pairs)
         nearest = np.flatnonzero(distance == np.minimum.reduceat(distance, pairs.starts())[pairs.of])
         return pairs.core[nearest[np.diff(pairs.of[nearest], prepend=-1) > 0]]
 
-    def _distances(self, places: Float[np.ndarray, "n 2"], pairs: _Pairs) -> Float[np.ndarray, " p"]:
+    def _distances(self, points: Float[np.ndarray, "n 2"], pairs: _CandidatePairs) -> Float[np.ndarray, " p"]:
         """From the place of each pair to its core, 0 inside."""
         distance = np.zeros(len(pairs.of))
         # A core at a time: whether it holds a place is asked of a prepared one, much faster than how far it is.
         order = np.argsort(pairs.core, kind="stable")
         cores, begins = np.unique(pairs.core[order], return_index=True)
         for core, rows in zip(cores.tolist(), np.split(order, begins[1:]), strict=True):
-            asked = places[pairs.of[rows]]
+            asked = points[pairs.of[rows]]
             outside = ~shapely.contains_xy(self.shapes[core], asked)
             distance[rows[outside]] = shapely.distance(self._edges[core], shapely.points(asked[outside]))
         return distance
@@ -165,7 +169,7 @@ class Cores:
 
 def _occupied(cell: Int64[np.ndarray, " n"], parents: int) -> tuple[Int64[np.ndarray, " c"], Int64[np.ndarray, " n"]]:
     """The distinct cells in ascending order, and the position in them of each; np.unique without its sort."""
-    there = np.zeros(parents * DIVISION**2, bool)
+    there = np.zeros(parents * SUBDIVISION**2, bool)
     there[cell] = True
     position = np.cumsum(there) - 1
     return np.flatnonzero(there), position[cell]

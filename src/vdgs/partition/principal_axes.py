@@ -9,8 +9,8 @@ import shapely
 from jaxtyping import Float
 
 #: The nearest share of the anchors decides about the axes: far outliers would turn them.
-KEPT_SHARE = 0.98
-ROUNDS = 3
+INLIER_SHARE = 0.98
+NUM_ITERATIONS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,7 @@ class PrincipalPlane:
         return shapely.transform(shape, lambda places: places @ self.axes.T + self.centre)
 
 
-def principal_plane(ground: Float[np.ndarray, "n 2"]) -> PrincipalPlane:
+def fit_principal_plane(ground: Float[np.ndarray, "n 2"]) -> PrincipalPlane:
     """The principal axes of places (float64), each signed so that its third moment is positive.
 
     Choice: the paper clusters on x, y as they are; then the cut would change with the heading of the ground frame,
@@ -38,9 +38,9 @@ def principal_plane(ground: Float[np.ndarray, "n 2"]) -> PrincipalPlane:
     """
     centre = ground.mean(axis=0)
     kept = ground
-    for _ in range(ROUNDS):
+    for _ in range(NUM_ITERATIONS):
         distance = np.linalg.norm(ground - centre, axis=1)
-        kept = ground[distance <= np.quantile(distance, KEPT_SHARE)]
+        kept = ground[distance <= np.quantile(distance, INLIER_SHARE)]
         centre = kept.mean(axis=0)
     local = kept - centre
     _, axes = np.linalg.eigh(local.T @ local)

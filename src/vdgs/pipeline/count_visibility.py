@@ -10,30 +10,30 @@ from dataclasses import asdict
 from rich.console import Console
 
 from vdgs.plots.partition import block_maps as figures
-from vdgs.runs.open_run import refuse_empty
+from vdgs.runs.open_run import check_has_anchors
 from vdgs.runs.run_context import RunContext
-from vdgs.runs.visibility_store import keep_visibility
-from vdgs.system.atomic_files import read_record, write_json
-from vdgs.visibility.visibility_counts import imbalance
+from vdgs.runs.visibility_store import load_or_count_visibility
+from vdgs.system.atomic_files import read_json_or_empty, write_json
+from vdgs.visibility.visibility_counts import visibility_stats
 
 
-def measure_visibility(context: RunContext, console: Console) -> None:
+def count_run_visibility(context: RunContext, console: Console) -> None:
     """V_i of every anchor: its distribution and a map from above. Skipped where it is there for this coarse model.
 
     RunError without a coarse model, or for one without anchors.
     """
     run = context.run
     file, key = run.visibility / "visibility.json", run.keys().visibility
-    if read_record(file).get("key") == key:
+    if read_json_or_empty(file).get("key") == key:
         console.print(f"{file}: already there; nothing to do", highlight=False)
         return
     with run.locked():
         opened = context.open_model("coarse")
-        refuse_empty(run, len(opened.model.anchors))
-        visibility = keep_visibility(opened).numpy()
+        check_has_anchors(run, len(opened.model.anchors))
+        visibility = load_or_count_visibility(opened).numpy()
         cameras = [view.camera for view in opened.capture.train_views]
-        facts = asdict(imbalance(visibility))
-        figures.draw_visibility_map(
+        facts = asdict(visibility_stats(visibility))
+        figures.plot_anchor_visibility(
             run.visibility / "map.png", opened.model.anchors.positions.numpy(), visibility, cameras,
             opened.capture.ground.axis_names,
         )  # fmt: skip

@@ -1,6 +1,6 @@
 """What dense stereo adds to the sparse points of a run: found once, before the coarse stage, and kept beside it.
 
-RUN/coarse/stereo.safetensors goes with the coarse stage: `StageFolder.discard_unless` removes it with all that was made
+RUN/coarse/stereo.safetensors goes with the coarse stage: `StageFolder.reset_unless` removes it with all that was made
 for other settings.
 """
 
@@ -18,90 +18,94 @@ from vdgs.captures.capture import Capture
 from vdgs.captures.image_cache import ImageCache
 from vdgs.config.method import AnchorConfig
 from vdgs.errors import VdgsError
-from vdgs.model.initialization.gap_filling import gap_points
-from vdgs.model.initialization.initialize import voxel_of
-from vdgs.model.initialization.stereo import Cell, DensePoints, StereoInputs, dense_points
+from vdgs.model.initialization.gap_filling import find_gap_points
+from vdgs.model.initialization.initialize import get_voxel_size
+from vdgs.model.initialization.stereo import DensePoints, FusionCell, StereoInputs, compute_dense_points
 from vdgs.runs.run_folder import RunFolder
-from vdgs.system.atomic_files import write_atomically
-from vdgs.system.tensors import checksum, read_tensors, write_tensors
-from vdgs.visibility.visibility_counts import visibility_of
+from vdgs.system.atomic_files import write_atomic
+from vdgs.system.tensors import read_tensors, tensors_crc32, write_tensors
+from vdgs.visibility.visibility_counts import count_visibility
 
-FORMAT = "vdgs-stereo-1"
-FILE = "stereo.safetensors"
+DENSE_POINTS_FORMAT = "vdgs-stereo-1"
+DENSE_POINTS_FILE = "stereo.safetensors"
 #: Edge of the cells that get a point each, in voxels and in pixels of the photographs as they are used: the larger of
 #: the two, and two, four or eight times that where pixels are so much larger than below the flight (choice). An anchor
 #: has ten Gaussians; growth makes more where that is too few.
 CELL_VOXELS, CELL_PX = 1.2, 3.0
 #: Photographs are to have so many pixels for each point that anchors start from, sparse and dense together: more
 #: anchors than that cost time and are learnt by heart (choice; reports/few-cameras.md). Seldom seen places come first.
-PIXELS_A_POINT = 180
+PIXELS_PER_POINT = 180
 
 
-def points_of_run(run: RunFolder, config: AnchorConfig) -> DensePoints | None:
+def load_dense_points(run: RunFolder, config: AnchorConfig) -> DensePoints | None:
     """What the coarse stage of the run found; None where its settings ask for none. VdgsError where the file is missing
     or damaged."""
-    return _read(run.coarse.path / FILE) if config.stereo else None
+    return _read(run.coarse.path / DENSE_POINTS_FILE) if config.mvs else None
 
 
-def find_points(
+def find_dense_points(
     run: RunFolder,
     capture: Capture,
     images: ImageCache,
     config: AnchorConfig,
-    tell: Callable[[int, int], None],
+    on_progress: Callable[[int, int], None],
     threads: int,
 ) -> DensePoints | None:
-    """As `points_of_run`, found and kept where they are not yet: dense points that lie away from the sparse ones, none
+    """As `load_dense_points`, found and kept where they are not yet: dense points that lie away from the sparse ones, none
     where those are as many as the photographs can bear.
 
     `images` are the training photographs; `tell(done, of)` is called after each step, and may raise.
     """
-    file = run.coarse.path / FILE
-    if not config.stereo or file.exists():
-        return points_of_run(run, config)
-    cameras, room = [view.camera for view in capture.train_views], room_for_points(capture)
+    file = run.coarse.path / DENSE_POINTS_FILE
+    if not config.mvs or file.exists():
+        return load_dense_points(run, config)
+    cameras, room = [view.camera for view in capture.train_views], max_dense_points(capture)
     if not room:
         nothing = DensePoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
         _write(file, nothing)
         return nothing
-    cell = cell_of(capture, config)
+    cell = fusion_cell(capture, config)
 
     def read(index: int) -> tuple[np.ndarray, np.ndarray | None]:
         picture = images.get(index)
         return picture.image.numpy(), None if picture.mask is None else picture.mask.numpy()
 
-    gaps = gap_points(capture.points, cameras, voxel_of(capture.points, config))
+    gaps = find_gap_points(capture.points, cameras, get_voxel_size(capture.points, config))
     inputs = StereoInputs(cameras, capture.points, np.concatenate([capture.points, gaps]), read)
-    found = dense_points(inputs, cell, run.coarse.path, tell, threads)
+    found = compute_dense_points(inputs, cell, run.coarse.path, on_progress, threads)
     if len(found.points):
         away = np.flatnonzero(cKDTree(capture.points).query(found.points, workers=1)[0] > cell.least / 2)
-        views = visibility_of(torch.from_numpy(found.points[away]), cameras).numpy()
+        views = count_visibility(torch.from_numpy(found.points[away]), cameras).numpy()
         kept = np.sort(away[np.argsort(views, kind="stable")[:room]])
         found = DensePoints(found.points[kept], found.colours[kept])
     _write(file, found)
     return found
 
 
-def room_for_points(capture: Capture) -> int:
+def max_dense_points(capture: Capture) -> int:
     """At most so many points are added to the sparse ones: photographs are to bear them all."""
     pixels = sum(view.camera.width * view.camera.height for view in capture.train_views)
-    return max(0, pixels // PIXELS_A_POINT - len(capture.points))
+    return max(0, pixels // PIXELS_PER_POINT - len(capture.points))
 
 
-def cell_of(capture: Capture, config: AnchorConfig) -> Cell:
+def fusion_cell(capture: Capture, config: AnchorConfig) -> FusionCell:
     """The cells that get a dense point each, in units of the ground frame."""
     focal = float(np.median([view.camera.fx for view in capture.train_views]))
-    return Cell(max(CELL_VOXELS * voxel_of(capture.points, config), CELL_PX * camera_height(capture) / focal), CELL_PX)
+    return FusionCell(
+        max(CELL_VOXELS * get_voxel_size(capture.points, config), CELL_PX * camera_height(capture) / focal), CELL_PX
+    )
 
 
 def _write(file: Path, found: DensePoints) -> None:
     tensors = {"points": torch.from_numpy(found.points), "colours": torch.from_numpy(found.colours)}
-    write_atomically(file, lambda temporary: write_tensors(temporary, tensors, {FORMAT: str(checksum(tensors))}))
+    write_atomic(
+        file, lambda temporary: write_tensors(temporary, tensors, {DENSE_POINTS_FORMAT: str(tensors_crc32(tensors))})
+    )
 
 
 def _read(file: Path) -> DensePoints:
     tensors, header = read_tensors(file)
     points, colours = (tensors.get(name) for name in ("points", "colours"))
-    if points is None or colours is None or header.get(FORMAT) != str(checksum(tensors)):
+    if points is None or colours is None or header.get(DENSE_POINTS_FORMAT) != str(tensors_crc32(tensors)):
         raise VdgsError(f"{file}: is damaged. Delete it and run the same command again: it is found anew.")
     return DensePoints(points.numpy(), colours.numpy())

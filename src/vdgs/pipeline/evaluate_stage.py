@@ -16,48 +16,48 @@ from vdgs.captures.capture import Capture
 from vdgs.config.commands import ModelName
 from vdgs.distributed.job_folders import clear
 from vdgs.distributed.job_labels import shard_kind
-from vdgs.distributed.node_check import Question, photographs_of
+from vdgs.distributed.node_check import NodeRequirements, image_and_mask_files
 from vdgs.distributed.shard import Results, Shard
-from vdgs.distributed.sharded_job import ShardedJob, ShardNeeds, Wish, spans_of
-from vdgs.evaluation.block_seams import SeamView, block_table, evaluate_blocks, save_picture, worth_seeing
-from vdgs.evaluation.block_seams import conclude as conclude_blocks
-from vdgs.evaluation.block_seams import measure_view as measure_view_of_blocks
-from vdgs.evaluation.evaluate_model import conclude, refuse_without_views
+from vdgs.distributed.sharded_job import ExecutionOptions, ShardedJob, ShardNeeds, split_ranges
+from vdgs.evaluation.block_seams import SeamView, evaluate_blocks, make_block_table, save_seam_image, select_seam_views
+from vdgs.evaluation.block_seams import measure_block_view as measure_view_of_blocks
+from vdgs.evaluation.block_seams import summarize_blocks as conclude_blocks
+from vdgs.evaluation.evaluate_model import require_views, summarize_views
 from vdgs.evaluation.evaluate_run import (
-    EVALUATION_IMAGES_BYTES,
-    Views,
-    cached_photographs,
+    IMAGE_CACHE_BYTES,
+    EvaluationSplit,
+    cached_reference_views,
+    check_bins,
     evaluate_run,
     evaluation_folder,
-    measured_model,
-    refuse_bins,
-    settings_of,
-    views_of,
+    make_evaluation_settings,
+    make_renderable_model,
+    select_views,
 )
-from vdgs.evaluation.image_io import file_stems
-from vdgs.evaluation.isolated_blocks import HELD_BYTES, block_inputs
+from vdgs.evaluation.image_io import unique_file_stems
+from vdgs.evaluation.isolated_blocks import CACHE_BYTES, make_block_inputs
 from vdgs.evaluation.lpips import load_lpips
-from vdgs.evaluation.renderable_model import ModelFacts
+from vdgs.evaluation.renderable_model import ModelMetadata
 from vdgs.evaluation.view_metrics import ViewInputs, measure_view
-from vdgs.evaluation.view_metrics_io import load_view, save_view
-from vdgs.runs.open_run import FoundModel, blocks_of, find_model
+from vdgs.evaluation.view_metrics_io import load_view_metrics, save_view_metrics
+from vdgs.runs.open_run import ModelLocation, load_run_blocks, locate_model
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
-from vdgs.system.atomic_files import read_json, read_record, write_bytes, write_json
+from vdgs.system.atomic_files import read_json, read_json_or_empty, write_bytes, write_json
 from vdgs.system.documents import MeasuredAs
-from vdgs.system.file_locks import hold
-from vdgs.system.memory.memory_estimate import drawing_bytes
-from vdgs.system.memory.process_memory import forget_peak, peak_memory_bytes
-from vdgs.system.records import plain, record_of
+from vdgs.system.file_locks import lock_folder
+from vdgs.system.memory.memory_estimate import render_bytes
+from vdgs.system.memory.process_memory import peak_memory_bytes, reset_peak_memory
+from vdgs.system.records import record_from_dict, record_to_dict
 
 #: Views of a shard, least and most, and how many shards there are in between (choice): a process of its own is worth
 #: some views, and what is lost with one is little.
 VIEWS_OF_SHARD = 3, 25, 16
-VIEWS = shard_kind("measure", "views")
+VIEW_LABELS = shard_kind("measure", "views")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Measuring:
+class EvaluationRequest:
     """Which figures are wanted."""
 
     path: Path
@@ -65,117 +65,128 @@ class Measuring:
     which: ModelName = "best"
     lpips_weights: Path | None = None
     bins: int = 4
-    views: Views = "test"
+    views: EvaluationSplit = "test"
     device: str = "cpu"
 
 
-def evaluate_stage(context: RunContext, asked: Measuring, console: Console, wish: Wish | None = None) -> None:
+def evaluate_stage(
+    context: RunContext, request: EvaluationRequest, console: Console, execution: ExecutionOptions | None = None
+) -> None:
     """Measure a model of a run; of the merged one, on test views, also block by block and at the seams.
 
     In this process, or in shards where a `wish` sends them: the figures are the same, but for times.
 
     Raises what `ShardedJob.send` raises, and RunError where another process measures the same.
     """
-    refuse_bins(asked.bins)
-    run = RunFolder(Path(os.path.abspath(asked.path)))  # as in `stages.train`: other machines may mount it so
-    found = find_model(run, asked.which)
-    output = evaluation_folder(run, found.name, asked.views)
-    if found.caution:
-        console.print(f"[yellow]warning[/] {found.caution}", highlight=False)
+    check_bins(request.bins)
+    run = RunFolder(Path(os.path.abspath(request.path)))  # as in `stages.train`: other machines may mount it so
+    found = locate_model(run, request.which)
+    output = evaluation_folder(run, found.name, request.views)
+    if found.warning:
+        console.print(f"[yellow]warning[/] {found.warning}", highlight=False)
     began = time.monotonic()
-    if wish is not None and wish.sends:
-        peak = _measure_in_shards(context, run, found, asked, wish, console)
+    if execution is not None and execution.is_distributed:
+        peak = _measure_in_shards(context, run, found, request, execution, console)
     else:
-        peak = _measure_here(context, found, asked, console)
-    record = _record_of(run, found.name, asked.lpips_weights, asked.bins)
+        peak = _measure_here(context, found, request, console)
+    record = _record_of(run, found.name, request.lpips_weights, request.bins)
     write_json(output / "status.json", record | {"seconds": time.monotonic() - began, "peak_memory_bytes": peak})
 
 
-def _measure_here(context: RunContext, found: FoundModel, asked: Measuring, console: Console) -> int:
+def _measure_here(context: RunContext, found: ModelLocation, request: EvaluationRequest, console: Console) -> int:
     """Measure in this process; the most memory that it took (bytes)."""
     run = context.run
-    output = evaluation_folder(run, found.name, asked.views)
-    with hold(output):
+    output = evaluation_folder(run, found.name, request.views)
+    with lock_folder(output):
         clear(output)
-        opened = context.open_model(asked.which, asked.device)
-        coarse = context.open_model("coarse", asked.device)
-        _announce(found, len(views_of(opened.capture, asked.views)), asked.views, console)
-        _forget(output)
-        forget_peak()
-        evaluate_run(opened, coarse, asked.lpips_weights, asked.bins, console, asked.views)
-        if _has_seams(run, found.name, asked.views):
-            with cached_photographs(opened.capture.test_views) as photographs:
-                console.print(block_table(evaluate_blocks(block_inputs(opened, coarse, photographs), output)))
+        opened = context.open_model(request.which, request.device)
+        coarse = context.open_model("coarse", request.device)
+        _announce(found, len(select_views(opened.capture, request.views)), request.views, console)
+        _delete_results(output)
+        reset_peak_memory()
+        evaluate_run(opened, coarse, request.lpips_weights, request.bins, console, request.views)
+        if _has_seams(run, found.name, request.views):
+            with cached_reference_views(opened.capture.test_views) as photographs:
+                console.print(make_block_table(evaluate_blocks(make_block_inputs(opened, coarse, photographs), output)))
     return peak_memory_bytes()
 
 
-def _announce(found: FoundModel, count: int, views: Views, console: Console) -> None:
+def _announce(found: ModelLocation, count: int, views: EvaluationSplit, console: Console) -> None:
     console.print(f"measuring the {found.line} on {count} {views} views", highlight=False)
 
 
-def _has_seams(run: RunFolder, name: str, views: Views) -> bool:
+def _has_seams(run: RunFolder, name: str, views: EvaluationSplit) -> bool:
     """Whether blocks and the seams between them are measured too."""
-    return views == "test" and name == "merged" and len(blocks_of(run)) > 1
+    return views == "test" and name == "merged" and len(load_run_blocks(run)) > 1
 
 
 def _measure_in_shards(
-    context: RunContext, run: RunFolder, found: FoundModel, asked: Measuring, wish: Wish, console: Console
+    context: RunContext,
+    run: RunFolder,
+    found: ModelLocation,
+    asked: EvaluationRequest,
+    wish: ExecutionOptions,
+    console: Console,
 ) -> int:
     """Let shards of the views be measured elsewhere, and join them; the most memory that one took (bytes). No model is
     in the memory of this process."""
     context.release_models()
     output, capture = evaluation_folder(run, found.name, asked.views), context.capture
-    views = views_of(capture, asked.views)
-    refuse_without_views(views, output)
+    views = select_views(capture, asked.views)
+    require_views(views, output)
     weights = None if asked.lpips_weights is None else Path(os.path.abspath(asked.lpips_weights))
     job = _job(run, found, replace(asked, path=run.path, which=found.name, lpips_weights=weights), len(views))
-    files = [run.config_file, run.coarse.model, found.stage.model, *photographs_of(views)]
-    with hold(output), job.held():
+    files = [run.config_file, run.coarse.model, found.stage.model, *image_and_mask_files(views)]
+    with lock_folder(output), job.held():
         _announce(found, len(views), asked.views, console)
-        _forget(output)
-        needs = ShardNeeds(_shard_bytes(run, found, asked, capture), lambda: Question(job.folder, files))
-        job.run(needs, replace(wish, image_gb=EVALUATION_IMAGES_BYTES / 1e9), console)
+        _delete_results(output)
+        needs = ShardNeeds(_shard_bytes(run, found, asked, capture), lambda: NodeRequirements(job.folder, files))
+        job.run(needs, replace(wish, image_gb=IMAGE_CACHE_BYTES / 1e9), console)
         _join(run, found, asked, job, console)
         return job.peak_memory_bytes
 
 
-def _job(run: RunFolder, found: FoundModel, asked: Measuring, count: int) -> ShardedJob:
+def _job(run: RunFolder, found: ModelLocation, asked: EvaluationRequest, count: int) -> ShardedJob:
     """The views in shards, and what their figures depend on."""
     blocks = [folder.status().model for folder in run.block_folders()] if found.name == "merged" else []
     depends_on = [
-        found.stage.status().model, found.key, run.coarse_identity(), blocks, str(asked.lpips_weights), asked.views
+        found.stage.status().model, found.key, run.coarse_model_id(), blocks, str(asked.lpips_weights), asked.views
     ]  # fmt: skip
     if exposed := _exposed(run):
         depends_on.append(exposed)
     output = evaluation_folder(run, found.name, asked.views)
-    return ShardedJob.of("views", asked, output, VIEWS, depends_on, spans_of(count, *VIEWS_OF_SHARD))
+    return ShardedJob.of("views", asked, output, VIEW_LABELS, depends_on, split_ranges(count, *VIEWS_OF_SHARD))
 
 
-def _shard_bytes(run: RunFolder, found: FoundModel, asked: Measuring, capture: Capture) -> int:
+def _shard_bytes(run: RunFolder, found: ModelLocation, asked: EvaluationRequest, capture: Capture) -> int:
     """Memory by estimate: the models that are drawn, blocks among them as far as they are held, and one picture."""
     models = [run.coarse.model, found.stage.model] + ([run.coarse.model] if found.name == "merged" else [])
-    held = HELD_BYTES if _has_seams(run, found.name, asked.views) else 0
-    pixels = max(view.camera.width * view.camera.height for view in views_of(capture, asked.views))
+    held = CACHE_BYTES if _has_seams(run, found.name, asked.views) else 0
+    pixels = max(view.camera.width * view.camera.height for view in select_views(capture, asked.views))
     files = sum(model.stat().st_size for model in models)
-    return drawing_bytes(files, min(held, files), pixels, asked.lpips_weights is not None)
+    return render_bytes(files, min(held, files), pixels, asked.lpips_weights is not None)
 
 
 def measure_shard(shard: Shard) -> None:
     """Measure a shard of the views. What they come to stays beside its status until all are joined; pictures go where
     they belong."""
-    asked = shard.request(Measuring)
+    asked = shard.request(EvaluationRequest)
     run, context = RunFolder(asked.path), RunContext.from_path(asked.path)
     opened, coarse = (context.open_model(which, shard.device) for which in (asked.which, "coarse"))
-    views = views_of(opened.capture, asked.views)
-    job = _job(run, find_model(run, asked.which), asked, len(views))
+    views = select_views(opened.capture, asked.views)
+    job = _job(run, locate_model(run, asked.which), asked, len(views))
 
     def results(left: Sequence[int]) -> Results:
-        with cached_photographs(views) as photographs:
+        with cached_reference_views(views) as photographs:
             lpips, note = load_lpips(asked.lpips_weights)
-            model = measured_model(opened, coarse, asked.views)
-            inputs = ViewInputs(photographs, model, lpips, settings_of(asked.bins, asked.views), job.output)
-            seams = block_inputs(opened, coarse, photographs) if _has_seams(run, opened.name, asked.views) else None
-            facts = {"model": plain(model.facts), "lpips_note": note}
+            model = make_renderable_model(opened, coarse, asked.views)
+            inputs = ViewInputs(
+                photographs, model, lpips, make_evaluation_settings(asked.bins, asked.views), job.output
+            )
+            seams = (
+                make_block_inputs(opened, coarse, photographs) if _has_seams(run, opened.name, asked.views) else None
+            )
+            facts = {"model": record_to_dict(model.facts), "lpips_note": note}
             write_json(job.shard(shard.index).path / "facts.json", facts)
             shard.console.print(f"measuring the {opened.line} on {len(left)} views", highlight=False)
             pictures = _SeamPictures(job, job.spans[shard.index]) if seams is not None else None
@@ -184,7 +195,7 @@ def measure_shard(shard: Shard) -> None:
                 if seams is not None and pictures is not None:
                     of_blocks, seen = measure_view_of_blocks(views[item], inputs.stems[item], seams)
                     pictures.keep(item, seen)
-                yield partial(save_view, figures=figures, of_blocks=of_blocks)
+                yield partial(save_view_metrics, figures=figures, of_blocks=of_blocks)
 
     shard.do(job, results)
 
@@ -194,40 +205,40 @@ class _SeamPictures:
 
     def __init__(self, job: ShardedJob, span: range):
         self._job = job
-        measured = {item: load_view(job.file(item))[1] for item in span if job.file(item).exists()}
+        measured = {item: load_view_metrics(job.file(item))[1] for item in span if job.file(item).exists()}
         self._borders = {item: figures.row["border_pixels"] for item, figures in measured.items() if figures}
 
     def keep(self, item: int, seen: SeamView) -> None:
         """Draw a view if it is worth seeing, and remove the picture of one that no longer is."""
-        self._borders[item] = seen.border_pixels
+        self._borders[item] = seen.border_pixel_count
         items = sorted(self._borders)
-        best = {items[place] for place in worth_seeing([self._borders[each] for each in items])}
+        best = {items[place] for place in select_seam_views([self._borders[each] for each in items])}
         if item in best:
-            save_picture(self._job.file(item, ".png"), seen)
+            save_seam_image(self._job.file(item, ".png"), seen)
         for other in set(items) - best:
             self._job.file(other, ".png").unlink(missing_ok=True)
 
 
-def _join(run: RunFolder, found: FoundModel, asked: Measuring, job: ShardedJob, console: Console) -> None:
+def _join(run: RunFolder, found: ModelLocation, request: EvaluationRequest, job: ShardedJob, console: Console) -> None:
     """Gather what the views came to, in their order, a view at a time."""
     facts = read_json(job.shard(0).path / "facts.json")
-    conclude(
-        (figures for figures, _ in job.gather(load_view)), record_of(ModelFacts, facts["model"]), job.output,
-        lpips_note=facts["lpips_note"], settings=settings_of(asked.bins, asked.views), timed=False, console=console,
+    summarize_views(
+        (figures for figures, _ in job.gather(load_view_metrics)), record_from_dict(ModelMetadata, facts["model"]), job.output,
+        lpips_note=facts["lpips_note"], settings=make_evaluation_settings(request.bins, request.views), timed=False, console=console,
     )  # fmt: skip
-    if _has_seams(run, found.name, asked.views):
-        figures = [each for _, each in job.gather(load_view) if each is not None]
-        stems = file_stems([each.row["name"] for each in figures])
-        for item in worth_seeing([each.row["border_pixels"] for each in figures]):
+    if _has_seams(run, found.name, request.views):
+        figures = [each for _, each in job.gather(load_view_metrics) if each is not None]
+        stems = unique_file_stems([each.row["name"] for each in figures])
+        for item in select_seam_views([each.row["border_pixels"] for each in figures]):
             write_bytes(job.output / "seams" / f"{stems[item]}.png", job.file(item, ".png").read_bytes())
-        console.print(block_table(conclude_blocks(figures, len(blocks_of(run)), job.output)))
+        console.print(make_block_table(conclude_blocks(figures, len(load_run_blocks(run)), job.output)))
     console.print(f"pictures and figures: {job.output}", highlight=False)
 
 
-def is_measured(run: RunFolder, name: str, lpips_weights: Path | None, bins: int) -> bool:
+def is_evaluated(run: RunFolder, name: str, lpips_weights: Path | None, bins: int) -> bool:
     """Whether the figures that are there are those of the model that is there, measured in this way."""
     wanted = _record_of(run, name, lpips_weights, bins)
-    record = read_record(evaluation_folder(run, name) / "status.json")
+    record = read_json_or_empty(evaluation_folder(run, name) / "status.json")
     return {key: record.get(key) for key in wanted} == wanted
 
 
@@ -246,7 +257,7 @@ def _exposed(run: RunFolder) -> str | None:
     return "interpolated and metered" if run.method().training.exposure else None
 
 
-def _forget(output: Path) -> None:
+def _delete_results(output: Path) -> None:
     """Delete what vouches for figures that are about to change, and what another cut may have left."""
     for stale in ("status.json", "metrics.json", "by_block.json"):
         (output / stale).unlink(missing_ok=True)

@@ -23,38 +23,43 @@ from rich.table import Table
 from vdgs.config.method import AssignmentConfig, MethodConfig, PartitionConfig
 from vdgs.distributed.job_folders import clear, remove
 from vdgs.distributed.job_labels import shard_kind
-from vdgs.distributed.node_check import Question, photographs_of
+from vdgs.distributed.node_check import NodeRequirements, image_and_mask_files
 from vdgs.distributed.shard import Results, Shard
-from vdgs.distributed.sharded_job import ShardedJob, ShardNeeds, Wish, spans_of
+from vdgs.distributed.sharded_job import ExecutionOptions, ShardedJob, ShardNeeds, split_ranges
 from vdgs.errors import RunError
 from vdgs.geometry.camera import Camera
-from vdgs.partition.assignment.assign_cameras import Assignment, assign
-from vdgs.partition.assignment.assignment_tables import assignment_rows, assignment_table, cut_rows, explain
-from vdgs.partition.assignment.score_file import load_part, load_scores, save_part, save_scores
-from vdgs.partition.assignment.score_matrix import Scorer, Scores, joined, score_matrix
-from vdgs.partition.block_records import AssignedBlock, PartitionRecord
+from vdgs.partition.assignment.assign_cameras import Assignment, assign_cameras
+from vdgs.partition.assignment.assignment_tables import (
+    assignment_rows,
+    block_rows,
+    explain_assignment,
+    make_assignment_table,
+)
+from vdgs.partition.assignment.score_file import load_score_rows, load_scores, save_score_rows, save_scores
+from vdgs.partition.assignment.score_matrix import CameraScorer, ScoreMatrix, compute_score_matrix, concatenate_scores
+from vdgs.partition.block_records import BlockCamerasRecord, PartitionRecord
 from vdgs.partition.blocks import Blocks, load_blocks, save_blocks, save_blocks_wgs84
-from vdgs.partition.partition_scene import choose_block_count, cut_scene
+from vdgs.partition.partition_scene import choose_block_count, partition_scene
 from vdgs.partition.strategies import STRATEGIES
 from vdgs.plots.partition import block_maps as figures
-from vdgs.runs.open_run import TrainedRun
+from vdgs.runs.open_run import OpenedRun
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.visibility_store import keep_visibility
+from vdgs.runs.visibility_store import load_or_count_visibility
 from vdgs.system.atomic_files import read_json, write_json
-from vdgs.system.file_locks import hold
-from vdgs.system.memory.memory_estimate import drawing_bytes, largest_picture
-from vdgs.system.memory.process_memory import forget_peak, peak_memory_bytes
-from vdgs.system.records import plain
-from vdgs.system.stop_signals import stop_if_asked
+from vdgs.system.file_locks import lock_folder
+from vdgs.system.memory.memory_estimate import max_image_pixels, render_bytes
+from vdgs.system.memory.process_memory import peak_memory_bytes, reset_peak_memory
+from vdgs.system.records import record_to_dict
+from vdgs.system.stop_signals import check_stop_requested
 
 #: Cameras that are scored and saved together; how many such groups a shard has, least and most, and how many shards
 #: there are in between (choice).
-CAMERAS_OF_ITEM = 8
+CAMERAS_PER_ITEM = 8
 ITEMS_OF_SHARD = 1, 8, 16
-CAMERAS = shard_kind("score cameras", "groups")
+CAMERA_LABELS = shard_kind("score cameras", "groups")
 #: The blocks that shards score cameras for, in the folder of the job.
-CUT = "blocks.geojson"
+SHARD_BLOCKS_FILE = "blocks.geojson"
 
 
 @dataclass(frozen=True)
@@ -69,7 +74,7 @@ class ScoreRequest:
 class _Scene:
     """What is cut: the coarse anchors and who sees them."""
 
-    opened: TrainedRun
+    opened: OpenedRun
     positions: Float[np.ndarray, "n 3"]
     visibility: Int[np.ndarray, " n"]
     cameras: list[Camera]
@@ -79,10 +84,12 @@ class _Scene:
         opened = context.open_model("coarse", device)
         cameras = [view.camera for view in opened.capture.train_views]
         positions = opened.model.anchors.positions.cpu().numpy()
-        return _Scene(opened, positions, keep_visibility(opened).numpy(), cameras)
+        return _Scene(opened, positions, load_or_count_visibility(opened).numpy(), cameras)
 
 
-def partition_run(context: RunContext, console: Console, device: str = "cpu", wish: Wish | None = None) -> None:
+def partition_run(
+    context: RunContext, console: Console, device: str = "cpu", execution: ExecutionOptions | None = None
+) -> None:
     """Cut the scene of a run and assign its cameras, drawing on a device; what is there for the same settings is kept.
 
     Cameras are scored in this process, or in shards where a `wish` sends them: the scores are the same. Raises RunError
@@ -95,7 +102,7 @@ def partition_run(context: RunContext, console: Console, device: str = "cpu", wi
         console.print(f"{run.partition}: already cut; nothing to do", highlight=False)
         return
     with run.locked():
-        forget_peak()
+        reset_peak_memory()
         began, method, scene = time.monotonic(), run.method(), _Scene.of(context, device)
         job, config = _job(run, len(scene.cameras)), _assignment(method)
         begun = _begun_cut(job)
@@ -105,15 +112,15 @@ def partition_run(context: RunContext, console: Console, device: str = "cpu", wi
             blocks, warnings = kept, list(before.warnings)
         else:
             blocks, warnings = _cut(scene, method)
-        sends = wish is not None and wish.sends
+        sends = execution is not None and execution.is_distributed
         clear(run.partition, job.key if sends else None)
-        if wish is not None and sends:
-            scores = _score_in_shards(run, scene, job, (blocks, warnings), wish, console)
+        if execution is not None and sends:
+            scores = _score_in_shards(run, scene, job, (blocks, warnings), execution, console)
         else:
             scores = _score(scene, blocks, config, console)
         if method.partition.strategy != "visibility":
-            scores = STRATEGIES[method.partition.strategy].rescored(scores, scene.positions, blocks, scene.cameras)
-        assignment = assign(scores, config)
+            scores = STRATEGIES[method.partition.strategy].adjust_scores(scores, scene.positions, blocks, scene.cameras)
+        assignment = assign_cameras(scores, config)
         for note in warnings + assignment.complaints:
             console.print(f"[yellow]note[/] {note}", highlight=False)
         rows = assignment_rows(blocks, scene.positions, scene.visibility, assignment)
@@ -124,13 +131,15 @@ def partition_run(context: RunContext, console: Console, device: str = "cpu", wi
             key=keys.partition, assignment_key=keys.assignment, strategy=method.partition.strategy,
             lambda_vis=method.partition.lambda_vis if method.partition.strategy == "visibility" else None,
             warnings=tuple(warnings), complaints=tuple(assignment.complaints), blocks=tuple(rows),
-            spatial=cut_rows(spatial, scene.positions, scene.visibility),
+            spatial=block_rows(spatial, scene.positions, scene.visibility),
             seconds=time.monotonic() - began, peak_memory_bytes=peak_memory_bytes(),
         )  # fmt: skip
-        write_json(run.partition / "partition.json", plain(record))  # last: where it stands, the rest is complete
+        write_json(
+            run.partition / "partition.json", record_to_dict(record)
+        )  # last: where it stands, the rest is complete
         if sends:
             remove(job.folder)
-    console.print(assignment_table(rows))
+    console.print(make_assignment_table(rows))
     console.print(f"figures: {run.partition / 'blocks.png'} and beside it", highlight=False)
 
 
@@ -140,24 +149,24 @@ def explain_view(run: RunFolder, view: str, console: Console) -> None:
     table = Table(box=box.SIMPLE_HEAD, title=view, title_justify="left")
     for heading in ("block", "score", "anchors held", "why"):
         table.add_column(heading, justify="left" if heading == "why" else "right")
-    for row in explain(names, scores, assignment, view):
+    for row in explain_assignment(names, scores, assignment, view):
         table.add_row(str(row.block), f"{row.score:.3f}", f"{row.held:,}", row.why)
     console.print(table)
 
 
 def _cut(scene: _Scene, method: MethodConfig) -> tuple[Blocks, list[str]]:
-    config, pixels = method.partition, largest_picture(scene.cameras, method.block.resolutions)
+    config, pixels = method.partition, max_image_pixels(scene.cameras, method.block.resolutions)
     count = choose_block_count(len(scene.visibility), len(scene.cameras), pixels, method)
     if config.strategy != "visibility":
-        return STRATEGIES[config.strategy].cut(scene.positions, scene.cameras, count)
-    return cut_scene(scene.positions, scene.visibility, replace(config, blocks=count), method.training.seed)
+        return STRATEGIES[config.strategy].partition(scene.positions, scene.cameras, count)
+    return partition_scene(scene.positions, scene.visibility, replace(config, blocks=count), method.training.seed)
 
 
 def _spatial(scene: _Scene, config: PartitionConfig, seed: int, cut: Blocks) -> Blocks:
     """The cut that place alone would give, to compare with."""
     if config.lambda_vis == 0 or len(cut) == 1:
         return cut
-    return cut_scene(scene.positions, scene.visibility, replace(config, blocks=len(cut), lambda_vis=0.0), seed)[0]
+    return partition_scene(scene.positions, scene.visibility, replace(config, blocks=len(cut), lambda_vis=0.0), seed)[0]
 
 
 def _record_before(run: RunFolder) -> PartitionRecord:
@@ -190,48 +199,53 @@ def _assignment(method: MethodConfig) -> AssignmentConfig:
     return method.assignment if strategy == "visibility" else STRATEGIES[strategy].assignment(method.assignment)
 
 
-def _score(scene: _Scene, blocks: Blocks, config: AssignmentConfig, console: Console) -> Scores:
+def _score(scene: _Scene, blocks: Blocks, config: AssignmentConfig, console: Console) -> ScoreMatrix:
     with Progress(console=console, disable=not console.is_terminal, transient=True) as bar:
         task = bar.add_task("assigning cameras")
 
         def show(done: int, total: int) -> None:
-            stop_if_asked()
+            check_stop_requested()
             bar.update(task, completed=done, total=total)
 
-        return score_matrix(scene.opened.model, blocks, scene.cameras, config, show)
+        return compute_score_matrix(scene.opened.model, blocks, scene.cameras, config, show)
 
 
 def _job(run: RunFolder, cameras: int) -> ShardedJob:
     """Groups of training cameras in shards; what their scores depend on."""
     request = ScoreRequest(Path(os.path.abspath(run.path)))
-    depends_on = [run.keys().assignment, run.coarse_identity(), cameras]
-    spans = spans_of(-(-cameras // CAMERAS_OF_ITEM), *ITEMS_OF_SHARD)
-    return ShardedJob.of("scores", request, run.partition, CAMERAS, depends_on, spans)
+    depends_on = [run.keys().assignment, run.coarse_model_id(), cameras]
+    spans = split_ranges(-(-cameras // CAMERAS_PER_ITEM), *ITEMS_OF_SHARD)
+    return ShardedJob.of("scores", request, run.partition, CAMERA_LABELS, depends_on, spans)
 
 
 def _begun_cut(job: ShardedJob) -> tuple[Blocks, list[str]] | None:
     """The blocks for which shards of an earlier command score cameras, and the warnings of their cut, if there are."""
-    file = job.folder / CUT
+    file = job.folder / SHARD_BLOCKS_FILE
     if not file.exists():
         return None
     return load_blocks(file), list(read_json(file)["warnings"])
 
 
 def _score_in_shards(
-    run: RunFolder, scene: _Scene, job: ShardedJob, cut: tuple[Blocks, list[str]], wish: Wish, console: Console
-) -> Scores:
+    run: RunFolder,
+    scene: _Scene,
+    job: ShardedJob,
+    cut: tuple[Blocks, list[str]],
+    wish: ExecutionOptions,
+    console: Console,
+) -> ScoreMatrix:
     """Let shards of the cameras be scored elsewhere, and join their rows."""
     blocks, warnings = cut
-    with hold(job.folder):  # from here on `job_folders` knows it as a job, whenever this process ends
-        save_blocks(job.folder / CUT, blocks, [{} for _ in blocks.items], {"warnings": warnings})
+    with lock_folder(job.folder):  # from here on `job_folders` knows it as a job, whenever this process ends
+        save_blocks(job.folder / SHARD_BLOCKS_FILE, blocks, [{} for _ in blocks.items], {"warnings": warnings})
     pixels = max(camera.width * camera.height for camera in scene.cameras)
-    model, photographs = run.coarse.model, photographs_of(scene.opened.capture.train_views)
+    model, photographs = run.coarse.model, image_and_mask_files(scene.opened.capture.train_views)
     needs = ShardNeeds(
-        drawing_bytes(model.stat().st_size, len(scene.positions) * len(blocks), pixels),
-        lambda: Question(job.folder, [run.config_file, model, *photographs]),
+        render_bytes(model.stat().st_size, len(scene.positions) * len(blocks), pixels),
+        lambda: NodeRequirements(job.folder, [run.config_file, model, *photographs]),
     )
     job.run(needs, wish, console)
-    return joined(list(job.gather(load_part)))
+    return concatenate_scores(list(job.gather(load_score_rows)))
 
 
 def score_shard(shard: Shard) -> None:
@@ -242,21 +256,21 @@ def score_shard(shard: Shard) -> None:
     cameras = [view.camera for view in opened.capture.train_views]
 
     def results(left: Sequence[int]) -> Results:
-        scorer = Scorer(opened.model, load_blocks(shard.folder / CUT), _assignment(run.method()))
+        scorer = CameraScorer(opened.model, load_blocks(shard.folder / SHARD_BLOCKS_FILE), _assignment(run.method()))
         for item in left:
-            scores = scorer.scores(cameras[item * CAMERAS_OF_ITEM : (item + 1) * CAMERAS_OF_ITEM])
-            yield partial(save_part, scores=scores)
+            scores = scorer.scores(cameras[item * CAMERAS_PER_ITEM : (item + 1) * CAMERAS_PER_ITEM])
+            yield partial(save_score_rows, scores=scores)
 
     shard.do(_job(run, len(cameras)), results)
 
 
 def _save(
-    folder: Path, scene: _Scene, blocks: Blocks, scores: Scores, assignment: Assignment, rows: Sequence[AssignedBlock]
+    folder: Path, scene: _Scene, blocks: Blocks, scores: ScoreMatrix, assignment: Assignment, rows: Sequence[BlockCamerasRecord]
 ) -> None:  # fmt: skip
     """The files that later stages read, and the place of the blocks on Earth where it is known."""
     for stale in ("partition.json", "blocks_wgs84.geojson"):
         (folder / stale).unlink(missing_ok=True)
-    facts = [plain(row) for row in rows]
+    facts = [record_to_dict(row) for row in rows]
     save_blocks(folder / "blocks.geojson", blocks, facts)
     ground = scene.opened.capture.ground
     if ground.origin_geo is not None:
@@ -266,26 +280,26 @@ def _save(
     )  # fmt: skip
 
 
-def how_cut(config: PartitionConfig) -> str:
+def describe_partition(config: PartitionConfig) -> str:
     """How a scene is cut, in a few words: λ_vis says nothing of the partitions of others, nor of one block."""
     if config.strategy != "visibility":
-        return STRATEGIES[config.strategy].cites.split(", ")[-2] + " partition"
+        return STRATEGIES[config.strategy].citation.split(", ")[-2] + " partition"
     return f"λ_vis = {config.lambda_vis:g}" if config.blocks != 1 else "not cut"
 
 
 def _draw(
-    folder: Path, scene: _Scene, blocks: Blocks, scores: Scores, assignment: Assignment, config: PartitionConfig,
+    folder: Path, scene: _Scene, blocks: Blocks, scores: ScoreMatrix, assignment: Assignment, config: PartitionConfig,
     spatial: Blocks,
 ) -> None:  # fmt: skip
     ours = config.strategy == "visibility" and config.lambda_vis > 0
     compare = spatial if ours and len(blocks) > 1 else None
-    cuts = [(how_cut(config), blocks)] + ([] if compare is None else [(figures.BY_PLACE, compare)])
-    figures.draw_blocks(
+    cuts = [(describe_partition(config), blocks)] + ([] if compare is None else [(figures.SPATIAL_ONLY_LABEL, compare)])
+    figures.plot_blocks(
         folder / "blocks.png", scene.positions, scene.visibility, scene.cameras, assignment.cameras, cuts,
         scene.opened.capture.ground.axis_names,
     )  # fmt: skip
-    figures.draw_block_facts(
+    figures.plot_block_stats(
         folder / "block_facts.png", scene.positions, scene.visibility, blocks, assignment.cameras,
         scene.opened.capture.ground.unit, compare,
     )  # fmt: skip
-    figures.draw_scores(folder / "scores.png", scores.scores, assignment.cameras)
+    figures.plot_scores(folder / "scores.png", scores.scores, assignment.cameras)

@@ -16,37 +16,45 @@ from rich.console import Console
 
 from vdgs import __version__
 from vdgs.captures.camera_height import camera_height
-from vdgs.captures.capture_metadata import capture_facts
+from vdgs.captures.capture_metadata import capture_metadata
 from vdgs.captures.image_cache import ImageCache
-from vdgs.config.checkpointing import WatchOptions
-from vdgs.config.method import block_limit, block_training
+from vdgs.config.checkpointing import CheckpointOptions
+from vdgs.config.method import block_train_config, max_block_anchors
 from vdgs.distributed.shard import Shard
 from vdgs.errors import RunError
 from vdgs.model.anchor_model import AnchorModel, ModelMetadata
-from vdgs.model.scale_bounds import largest_log_scales
-from vdgs.partition.block_regions import drawn_by, holds, ramp, split_anchors
+from vdgs.model.scale_bounds import max_log_scales
+from vdgs.partition.block_regions import growth_mask, lr_ramp, split_trainable_anchors, visible_anchors
 from vdgs.partition.blocks import Blocks
-from vdgs.runs.open_run import blocks_of, views_of_block
+from vdgs.runs.open_run import block_view_indices, load_run_blocks
 from vdgs.runs.run_context import RunContext
-from vdgs.runs.stage_folder import StageFolder, Status
-from vdgs.system.tensors import identity
-from vdgs.training import Stage, Surroundings, start_state
-from vdgs.training.crops import crops_of, load_or_find, mean_area, steps_for
-from vdgs.training.schedule import shares_for
-from vdgs.training.session.trainer import continue_or_start, finish, image_budget, note_without_growth, train_watched
-from vdgs.visibility.visibility_counts import effective_count
+from vdgs.runs.stage_folder import StageFolder, StatusRecord
+from vdgs.system.tensors import file_id
+from vdgs.training import FrozenAnchors, TrainingProblem, initial_state
+from vdgs.training.crops import compute_crops, load_or_compute_crops, mean_crop_area, steps_for
+from vdgs.training.schedule import view_sampling_weights
+from vdgs.training.session.trainer import (
+    finish_stage,
+    image_cache_bytes,
+    resume_or_start,
+    train_with_checkpoints,
+    warn_without_densification,
+)
+from vdgs.visibility.visibility_counts import effective_sample_size
 
 
-def train_block(context: RunContext, index: int, options: WatchOptions, console: Console, device: str = "cpu") -> None:
+def train_block(
+    context: RunContext, index: int, options: CheckpointOptions, console: Console, device: str = "cpu"
+) -> None:
     """Train, or continue, one block of a run on a device; nothing if it is finished.
 
     Works beside other blocks of the run, in this or in other processes. Raises RunError if the run is not cut into
-    blocks or has no such block, and what training raises (see `train_watched`).
+    blocks or has no such block, and what training raises (see `train_with_checkpoints`).
     """
     options.check()
     run = context.run
     with run.locked(shared=True):
-        blocks = blocks_of(run)
+        blocks = load_run_blocks(run)
         if not 0 <= index < len(blocks):
             raise RunError(f"{run.path}: has blocks 0 to {len(blocks) - 1}; there is no block {index}")
         folder, key = run.block(index), run.keys().blocks
@@ -54,60 +62,62 @@ def train_block(context: RunContext, index: int, options: WatchOptions, console:
             if folder.is_done(key):
                 console.print(f"{folder.model}: already trained; nothing to do", highlight=False)
                 return
-            folder.discard_unless(key)
+            folder.reset_unless(key)
             _train(context, index, blocks, options, console, torch.device(device))
 
 
 def train_shard(shard: Shard) -> None:
     """Train, or continue, a block of RUN/blocks as `vdgs train RUN` asks for it."""
-    options = replace(shard.request(WatchOptions), image_memory_gb=shard.image_gb)
+    options = replace(shard.request(CheckpointOptions), image_cache_gb=shard.image_gb)
     train_block(RunContext.from_path(shard.folder.parent), shard.index, options, shard.console, shard.device)
 
 
 def _train(
-    context: RunContext, index: int, blocks: Blocks, options: WatchOptions, console: Console, device: torch.device
+    context: RunContext, index: int, blocks: Blocks, options: CheckpointOptions, console: Console, device: torch.device
 ) -> None:
     run, opened = context.run, context.open_model("coarse", device)
     folder, method = run.block(index), run.method()
     capture, coarse = opened.capture, opened.model
-    chosen = views_of_block(run, capture, index)
+    chosen = block_view_indices(run, capture, index)
     views = [capture.train_views[i] for i in chosen]
     metadata = ModelMetadata(
-        capture=capture_facts(capture), version=__version__, block=index, views=len(views), key=run.keys().blocks
+        capture=capture_metadata(capture), version=__version__, block=index, views=len(views), key=run.keys().blocks
     )
-    own, around = split_anchors(coarse.anchors, blocks, index, method.block)
-    around &= drawn_by(coarse.anchors, [view.camera for view in views])
+    own, around = split_trainable_anchors(coarse.anchors, blocks, index, method.block)
+    around &= visible_anchors(coarse.anchors, [view.camera for view in views])
     anchors, surroundings = coarse.anchors.select(own), coarse.anchors.select(around)
     if not views or not len(anchors):
         _keep_coarse(folder, replace(coarse, anchors=anchors, metadata=metadata), len(views), console)
         return
     owned = [each.anchors_core for each in run.partition_record().blocks]
-    config = block_training(method, len(views))
-    limit = block_limit(method.block, owned[index], sum(owned))
+    config = block_train_config(method, len(views))
+    limit = max_block_anchors(method.block, owned[index], sum(owned))
     config = replace(config, growth=replace(config.growth, max_anchors=limit))
-    shares = shares_for(config, anchors, [view.camera for view in views])
+    shares = view_sampling_weights(config, anchors, [view.camera for view in views])
     began = time.monotonic()
     crops = None
     if method.block.crop != "off":
         cameras = [view.camera for view in views]
-        crops = load_or_find(folder.path / "crops.json", len(views), lambda: crops_of(coarse, own, cameras))
-    area = mean_area(crops, shares) if crops else 1.0
+        crops = load_or_compute_crops(
+            folder.path / "crops.json", len(views), lambda: compute_crops(coarse, own, cameras)
+        )
+    area = mean_crop_area(crops, shares) if crops else 1.0
     if method.block.crop == "pixels":
         config = replace(config, iterations=steps_for(config.iterations, area))
     prepared = time.monotonic() - began
-    note_without_growth(config, console, "--block.")
+    warn_without_densification(config, console, "--block.")
     factors = tuple(sorted({factor for _, factor in config.resolutions}))
     flown = [view.camera for view in capture.train_views]
-    with ImageCache(views, image_budget(options), downscales=factors) as images:
-        stage = Stage(
-            config=config, images=images, image_count=len(views), voxel=coarse.voxel,
+    with ImageCache(views, image_cache_bytes(options), downscales=factors) as images:
+        stage = TrainingProblem(
+            config=config, images=images, image_count=len(views), voxel_size=coarse.voxel_size,
             camera_height=camera_height(capture), kind="block", background=coarse.background, device=device,
-            frozen_decoder=method.block.decoder == "frozen", surroundings=Surroundings(surroundings, coarse.decoder),
-            may_hold=holds(blocks, index, method.block), mobility=ramp(blocks, index, method.block),
-            appearance_of=chosen, shares=shares, crops=crops,
-            largest=(lambda positions: largest_log_scales(positions, flown)) if config.anchors.bound_sizes else None,
+            frozen_decoder=method.block.decoder == "frozen", surroundings=FrozenAnchors(surroundings, coarse.decoder),
+            may_hold=growth_mask(blocks, index, method.block), lr_mask=lr_ramp(blocks, index, method.block),
+            image_indices=chosen, shares=shares, crops=crops,
+            max_log_scale=(lambda positions: max_log_scales(positions, flown)) if config.anchors.bound_scales else None,
         )  # fmt: skip
-        state = continue_or_start(folder, stage, lambda: start_state(anchors, coarse.decoder.copy(), stage), console)
+        state = resume_or_start(folder, stage, lambda: initial_state(anchors, coarse.decoder.copy(), stage), console)
         state.seconds += prepared
         parts = f", {area:.0%} of a photograph each" if crops else ""
         console.print(
@@ -115,14 +125,14 @@ def _train(
             f"of its own, {len(surroundings):,} around it, {config.iterations:,} iterations{parts}",
             highlight=False,
         )
-        train_watched(folder, state, stage, options, console)
+        train_with_checkpoints(folder, state, stage, options, console)
     metadata = replace(metadata, iterations=state.iteration, decoder=method.block.decoder)
-    finish(folder, state, state.model(coarse.voxel, coarse.background, metadata), console, area)
+    finish_stage(folder, state, state.model(coarse.voxel_size, coarse.background, metadata), console, area)
 
 
 def _views_served(count: int, of: int, shares: Sequence[float] | None) -> str:
     """How many views a block has, in words, and how many they are worth where some are used more than others."""
-    worth = f" (worth {effective_count(shares):.0f} used alike)" if shares else ""
+    worth = f" (worth {effective_sample_size(shares):.0f} used alike)" if shares else ""
     return f"{count} of {of} training views{worth}"
 
 
@@ -130,9 +140,9 @@ def _keep_coarse(folder: StageFolder, model: AnchorModel, views: int, console: C
     """A block that cannot be trained keeps what the coarse model has there, and says why."""
     why = "no camera sees it" if not views else "it holds no anchor"
     model.save(folder.model)
-    status = Status(
+    status = StatusRecord(
         state="done", iteration=0, iterations=0, anchors=len(model.anchors), seconds=0.0, why=why,
-        model=identity(folder.model),
+        model=file_id(folder.model),
     )  # fmt: skip
     folder.set_status(status)
     console.print(f"[yellow]note[/] this block stays as the coarse model has it: {why}", highlight=False)

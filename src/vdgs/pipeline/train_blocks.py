@@ -11,27 +11,27 @@ from pathlib import Path
 
 from rich.console import Console
 
-from vdgs.config.checkpointing import WatchOptions
+from vdgs.config.checkpointing import CheckpointOptions
 from vdgs.config.executor_options import ExecutorOptions
-from vdgs.distributed.job_labels import BLOCKS
-from vdgs.distributed.node_check import Question, photographs_of
-from vdgs.distributed.sharded_job import ShardedJob, ShardNeeds, Wish
+from vdgs.distributed.job_labels import BLOCK_LABELS
+from vdgs.distributed.node_check import NodeRequirements, image_and_mask_files
+from vdgs.distributed.sharded_job import ExecutionOptions, ShardedJob, ShardNeeds
 from vdgs.errors import RunError, VdgsError
 from vdgs.geometry.camera import Camera
-from vdgs.runs.open_run import blocks_of
+from vdgs.runs.open_run import load_run_blocks
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.stage_folder import StageFolder, Status
-from vdgs.system.memory.memory_estimate import decoded_bytes, estimate, largest_picture, need_of_block
+from vdgs.runs.stage_folder import StageFolder, StatusRecord
+from vdgs.system.memory.memory_estimate import block_workload, decoded_image_bytes, estimate_memory, max_image_pixels
 
 
 def train_blocks(
     context: RunContext,
-    options: WatchOptions,
+    options: CheckpointOptions,
     jobs: int,
     console: Console,
     device: str = "cpu",
-    where: ExecutorOptions | None = None,
+    executor_options: ExecutorOptions | None = None,
 ) -> None:
     """Train, or continue, all blocks of a run that are not finished, on this machine or `where` was asked for.
 
@@ -46,7 +46,7 @@ def train_blocks(
     run = RunFolder(Path(os.path.abspath(context.run.path)))
     began = time.monotonic()
     with run.locked(shared=True):
-        blocks, key = blocks_of(run), run.keys().blocks
+        blocks, key = load_run_blocks(run), run.keys().blocks
         _remove_beyond(run, len(blocks), console)
         left = [index for index in range(len(blocks)) if not run.block(index).is_done(key)]
         if not left:
@@ -54,26 +54,31 @@ def train_blocks(
             return
         context.release_models()  # the memory is for the blocks
         views = context.capture.train_views
-        cameras, files = [view.camera for view in views], [run.config_file, run.coarse.model, *photographs_of(views)]
+        cameras, files = (
+            [view.camera for view in views],
+            [run.config_file, run.coarse.model, *image_and_mask_files(views)],
+        )
         job = ShardedJob(
-            worker="block", request=options, folder=run.path / "blocks", kind=BLOCKS,
+            worker="block", request=options, folder=run.path / "blocks", kind=BLOCK_LABELS,
             spans=tuple(range(index, index + 1) for index in range(len(blocks))),
         )  # fmt: skip
-        needs = ShardNeeds(_block_bytes(run, cameras), lambda: Question(run.path, files), decoded_bytes(cameras))
+        needs = ShardNeeds(
+            _block_bytes(run, cameras), lambda: NodeRequirements(run.path, files), decoded_image_bytes(cameras)
+        )
 
         def ready() -> None:
             _note_discarded(run, left, key, console)
             for index in left:
                 _mark_queued(run.block(index), key)
 
-        wish = Wish(where or ExecutorOptions(), jobs, options.image_memory_gb, device)
+        wish = ExecutionOptions(executor_options or ExecutorOptions(), jobs, options.image_cache_gb, device)
         job.send(left, len(blocks), needs, wish, console, ready)
     console.print(f"blocks trained in {(time.monotonic() - began) / 60:.1f} min", highlight=False)
 
 
 def _note_discarded(run: RunFolder, left: list[int], key: str, console: Console) -> None:
     """Say which blocks were trained for another cut or with other settings: what they hold is about to go."""
-    old = [index for index in left if run.block(index).holds_work() and run.block(index).key() != key]
+    old = [index for index in left if run.block(index).has_output() and run.block(index).key() != key]
     if old:
         console.print(
             f"[yellow]note[/] trained for another cut or with other settings, and trained again: block"
@@ -88,9 +93,9 @@ def _mark_queued(folder: StageFolder, key: str) -> None:
     Not if another process trains it already: its status is then its own.
     """
     with suppress(RunError), folder.locked():
-        folder.discard_unless(key)
+        folder.reset_unless(key)
         if not folder.is_done(key):
-            folder.set_status(Status(state="queued"))
+            folder.set_status(StatusRecord(state="queued"))
 
 
 def _remove_beyond(run: RunFolder, count: int, console: Console) -> None:
@@ -105,5 +110,5 @@ def _block_bytes(run: RunFolder, cameras: Sequence[Camera]) -> int:
     """Memory by estimate that the largest block needs for the program, its picture, its anchors once they have grown,
     and those around it. Photographs that are kept have a budget of their own."""
     method, anchors = run.method(), [each.anchors_core for each in run.partition_record().blocks]
-    pixels = largest_picture(cameras, method.block.resolutions)
-    return estimate(need_of_block(method, max(anchors), sum(anchors), pixels)).total
+    pixels = max_image_pixels(cameras, method.block.resolutions)
+    return estimate_memory(block_workload(method, max(anchors), sum(anchors), pixels)).total

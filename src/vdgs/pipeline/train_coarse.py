@@ -11,34 +11,40 @@ from rich.console import Console
 from vdgs import __version__
 from vdgs.captures.camera_height import camera_height
 from vdgs.captures.capture import Capture
-from vdgs.captures.capture_metadata import capture_facts
+from vdgs.captures.capture_metadata import capture_metadata
 from vdgs.captures.image_cache import ImageCache
-from vdgs.captures.photometric_gains import point_colours
-from vdgs.captures.validation import refuse_unworkable
-from vdgs.config.checkpointing import WatchOptions
+from vdgs.captures.photometric_gains import collect_point_colors
+from vdgs.captures.validation import require_trainable
+from vdgs.config.checkpointing import CheckpointOptions
 from vdgs.config.method import TrainConfig
 from vdgs.model.anchor_model import ModelMetadata
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.model.exposure import neutral_exposures
-from vdgs.model.initialization.initialize import initial_anchors
+from vdgs.model.exposure import zero_exposures
+from vdgs.model.initialization.initialize import initialize_anchors
 from vdgs.model.initialization.stereo import DensePoints
-from vdgs.model.scale_bounds import largest_log_scales
-from vdgs.pipeline.dense_points import find_points
-from vdgs.runs.open_run import refuse_empty
-from vdgs.runs.run_cameras import keep_flight
+from vdgs.model.scale_bounds import max_log_scales
+from vdgs.pipeline.dense_points import find_dense_points
+from vdgs.runs.open_run import check_has_anchors
+from vdgs.runs.run_cameras import save_run_cameras
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.stage_folder import Status
+from vdgs.runs.stage_folder import StatusRecord
 from vdgs.system.atomic_files import write_json
-from vdgs.system.checkpoints import save_state
-from vdgs.system.stop_signals import stop_if_asked
-from vdgs.training import Stage, TrainingState, mean_colour, start_state, to_saved
-from vdgs.training.schedule import shares_for
-from vdgs.training.session.trainer import continue_or_start, finish, image_budget, note_without_growth, train_watched
+from vdgs.system.checkpoints import save_checkpoint
+from vdgs.system.stop_signals import check_stop_requested
+from vdgs.training import TrainingProblem, TrainingState, initial_state, mean_image_color, to_checkpoint
+from vdgs.training.schedule import view_sampling_weights
+from vdgs.training.session.trainer import (
+    finish_stage,
+    image_cache_bytes,
+    resume_or_start,
+    train_with_checkpoints,
+    warn_without_densification,
+)
 
 
-def train_coarse(context: RunContext, options: WatchOptions, console: Console, device: str = "cpu") -> None:
+def train_coarse(context: RunContext, options: CheckpointOptions, console: Console, device: str = "cpu") -> None:
     """Train, or continue, the coarse model of a run on a device; nothing if it is finished.
 
     Raises CaptureError for a capture that cannot become a scene or damaged photographs, Stopped after Ctrl-C or SIGTERM
@@ -48,53 +54,60 @@ def train_coarse(context: RunContext, options: WatchOptions, console: Console, d
     run = context.run
     folder, key = run.coarse, run.keys().coarse
     if folder.is_done(key):  # its blocks may be at work
-        refuse_empty(run, folder.status().anchors)
+        check_has_anchors(run, folder.status().anchors)
         console.print(f"{folder.model}: already trained; nothing to do", highlight=False)
         return
     with run.locked():
         capture = context.capture
-        refuse_unworkable(capture, console)
+        require_trainable(capture, console)
         config = run.method().training
-        note_without_growth(config, console)
-        write_json(run.capture_file, capture_facts(capture))
-        keep_flight(run, capture)
-        folder.discard_unless(key)
+        warn_without_densification(config, console)
+        write_json(run.capture_file, capture_metadata(capture))
+        save_run_cameras(run, capture)
+        folder.reset_unless(key)
         _train(run, capture, config, options, console, torch.device(device))
 
 
 def _train(
-    run: RunFolder, capture: Capture, config: TrainConfig, options: WatchOptions, console: Console, device: torch.device
+    run: RunFolder,
+    capture: Capture,
+    config: TrainConfig,
+    options: CheckpointOptions,
+    console: Console,
+    device: torch.device,
 ) -> None:
     folder = run.coarse
     factors = tuple(sorted({1, *(factor for _, factor in config.resolutions)}))  # 1: stereo sees them in full
-    with ImageCache(capture.train_views, image_budget(options), downscales=factors) as images:
+    with ImageCache(capture.train_views, image_cache_bytes(options), downscales=factors) as images:
         dense = _dense_points(run, capture, images, config, console)
-        stage, anchors = open_stage(capture, config, images, device, dense)
+        stage, anchors = build_coarse_problem(capture, config, images, device, dense)
 
         def begun() -> TrainingState:
             differ = _brightness(images, config, console)
-            fitted = config.exposure and (differ is None or differ >= config.exposure_spread)
+            fitted = config.exposure and (differ is None or differ >= config.exposure_min_spread)
             found = {"sparse_points": len(capture.points), "dense_points": None if dense is None else len(dense.points)}
-            write_json(folder.start_file, {**found, "brightness_differs": differ, "exposures": fitted})
-            return start(anchors, stage, fitted)
+            write_json(folder.initialization_file, {**found, "brightness_differs": differ, "exposures": fitted})
+            return initial_coarse_state(anchors, stage, fitted)
 
-        state = continue_or_start(folder, stage, begun, console)
+        state = resume_or_start(folder, stage, begun, console)
         _announce(capture, state, config, console)
-        train_watched(folder, state, stage, options, console)
+        train_with_checkpoints(folder, state, stage, options, console)
     _refuse_empty(run, state)
     metadata = ModelMetadata(
-        capture=capture_facts(capture), version=__version__, iterations=state.iteration, key=run.keys().coarse
+        capture=capture_metadata(capture), version=__version__, iterations=state.iteration, key=run.keys().coarse
     )
-    finish(folder, state, state.model(stage.voxel, stage.background, metadata), console)
+    finish_stage(folder, state, state.model(stage.voxel_size, stage.background, metadata), console)
 
 
 def _refuse_empty(run: RunFolder, state: TrainingState) -> None:
     """Raise RunError for a state without anchors, before its stage counts as done. It is kept: to come this far again
     would not help."""
     if not len(state.anchors):
-        save_state(run.coarse.checkpoints, to_saved(state))
-        run.coarse.set_status(Status(state="failed", iteration=state.iteration, why="training has removed all anchors"))
-    refuse_empty(run, len(state.anchors))
+        save_checkpoint(run.coarse.checkpoints, to_checkpoint(state))
+        run.coarse.set_status(
+            StatusRecord(state="failed", iteration=state.iteration, why="training has removed all anchors")
+        )
+    check_has_anchors(run, len(state.anchors))
 
 
 def _dense_points(
@@ -105,11 +118,11 @@ def _dense_points(
     wait = console.status("looking for ground by stereo")
 
     def tell(done: int, of: int) -> None:
-        stop_if_asked()
+        check_stop_requested()
         wait.update(f"looking for ground by stereo, {done / of:.0%}")
 
     with wait:
-        dense = find_points(run, capture, images, config.anchors, tell, torch.get_num_threads())
+        dense = find_dense_points(run, capture, images, config.anchors, tell, torch.get_num_threads())
     if dense is not None:
         added = f"{len(dense.points):,} points beside the sparse ones, {time.monotonic() - began:.0f} s"
         console.print(
@@ -122,23 +135,23 @@ def _dense_points(
 def _brightness(images: ImageCache, config: TrainConfig, console: Console) -> float | None:
     """By what share photographs of the same places differ in brightness; None where nothing depends on it, or the
     capture does not tell. Says what follows."""
-    if not (config.exposure and config.exposure_spread):
+    if not (config.exposure and config.exposure_min_spread):
         return None
     wait = console.status("comparing the photographs' brightness")
 
     def tell(done: int, of: int) -> None:
-        stop_if_asked()
+        check_stop_requested()
         wait.update(f"comparing the photographs' brightness, {done / of:.0%}")
 
     with wait:
-        colours = point_colours(images, tell)
+        colours = collect_point_colors(images, tell)
     if colours is None:
         console.print(
             "exposure: one is fitted to each photograph; whether they differ in brightness is not known, for the "
             "capture does not say which of them show the same points", highlight=False,
         )  # fmt: skip
         return None
-    found, spread = colours.difference(), config.exposure_spread
+    found, spread = colours.gain_spread(), config.exposure_min_spread
     said = "one is fitted to each" if found >= spread else f"less than {spread:.2%}, so none is fitted"
     console.print(
         f"exposure: photographs of the same places differ in brightness by {found:.2%}; {said}", highlight=False
@@ -146,40 +159,40 @@ def _brightness(images: ImageCache, config: TrainConfig, console: Console) -> fl
     return found
 
 
-def open_stage(
+def build_coarse_problem(
     capture: Capture,
     config: TrainConfig,
     images: ImageCache,
     device: torch.device | str,
     dense: DensePoints | None = None,
-) -> tuple[Stage, Anchors]:
+) -> tuple[TrainingProblem, Anchors]:
     """What the coarse stage works with, and the anchors that it starts from: at the sparse points, and the `dense`
     ones."""
     cameras = [view.camera for view in capture.train_views]
     # The voxel follows from the capture: recomputed when a run continues.
-    anchors, voxel = initial_anchors(capture.points, capture.point_colours, cameras, config.anchors, dense)
+    anchors, voxel = initialize_anchors(capture.points, capture.point_colors, cameras, config.anchors, dense)
     background = (0.0, 0.0, 0.0)
     if config.loss.background != "black":
         smallest = max(factor for _, factor in config.resolutions)
-        background = mean_colour(images, len(cameras), smallest)
-    stage = Stage(
-        config=config, images=images, image_count=len(cameras), voxel=voxel, camera_height=camera_height(capture),
-        background=background, shares=shares_for(config, anchors, cameras), device=torch.device(device),
-        largest=(lambda positions: largest_log_scales(positions, cameras)) if config.anchors.bound_sizes else None,
+        background = mean_image_color(images, len(cameras), smallest)
+    stage = TrainingProblem(
+        config=config, images=images, image_count=len(cameras), voxel_size=voxel, camera_height=camera_height(capture),
+        background=background, shares=view_sampling_weights(config, anchors, cameras), device=torch.device(device),
+        max_log_scale=(lambda positions: max_log_scales(positions, cameras)) if config.anchors.bound_scales else None,
     )  # fmt: skip
     return stage, anchors
 
 
-def start(anchors: Anchors, stage: Stage, exposures: bool) -> TrainingState:
+def initial_coarse_state(anchors: Anchors, stage: TrainingProblem, fit_exposures: bool) -> TrainingState:
     """The state before the first step, in which photographs have exposures to be fitted or have none."""
     config = stage.config
     generator = torch.Generator().manual_seed(config.seed)
     decoder = Decoder.initial(
         config.anchors.offsets, config.anchors.distance, config.anchors.appearance, stage.image_count, generator
     )
-    if exposures:
-        decoder = replace(decoder, exposure=neutral_exposures(stage.image_count))
-    return start_state(anchors.to(stage.device), decoder.to(stage.device), stage)
+    if fit_exposures:
+        decoder = replace(decoder, exposure=zero_exposures(stage.image_count))
+    return initial_state(anchors.to(stage.device), decoder.to(stage.device), stage)
 
 
 def _announce(capture: Capture, state: TrainingState, config: TrainConfig, console: Console) -> None:

@@ -8,33 +8,33 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
-INK, FAINT, ACCENT = "#22262b", "#6c757d", "#c1121f"
+INK, MUTED, ACCENT = "#22262b", "#6c757d", "#c1121f"
 #: From hardly seen (alarming) to seen often (calm); dark enough everywhere to stand on white.
-SEEN = LinearSegmentedColormap.from_list(
+VISIBILITY_CMAP = LinearSegmentedColormap.from_list(
     "seen", ["#9d0208", "#dc2f02", "#f48c06", "#e9c46a", "#8ab17d", "#2a9d8f", "#1f6f8b", "#14395b"]
 )
 DPI = 120
 
 
 #: Type in points: what is smaller cannot be read where a figure of a page's width is shown at a screen's.
-TEXT, NOTE = 11.0, 10.0
+TEXT_SIZE, NOTE_SIZE = 11.0, 10.0
 #: What a title that is too long shrinks to at most.
-SMALLEST = 4.0
+MIN_TITLE_SIZE = 4.0
 
 
-def titles(figure: Figure, name: str, facts: str, note: str) -> None:
+def draw_titles(figure: Figure, name: str, subtitle: str, note: str) -> None:
     """Three lines in the upper left corner, above 1.1 inches of free space; smaller where the figure is too narrow."""
     width, height = figure.get_size_inches()
-    lines = ((name, 0.38, 15.0, INK), (facts, 0.69, TEXT, FAINT), (note, 1.0, NOTE, FAINT))
+    lines = ((name, 0.38, 15.0, INK), (subtitle, 0.69, TEXT_SIZE, MUTED), (note, 1.0, NOTE_SIZE, MUTED))
     for text, down, size, colour in lines:
         weight = "bold" if colour == INK else "normal"
         line = figure.text(0.85 / width, 1 - down / height, text, fontsize=size, fontweight=weight, color=colour)
-        while line.get_window_extent().x1 > (width - 0.15) * figure.dpi and size > SMALLEST:
+        while line.get_window_extent().x1 > (width - 0.15) * figure.dpi and size > MIN_TITLE_SIZE:
             size *= 0.95  # hinted type does not shrink evenly
             line.set_fontsize(size)
 
 
-def placer(figure: Figure) -> Callable[[float, float, float, float], Axes]:
+def axes_placer(figure: Figure) -> Callable[[float, float, float, float], Axes]:
     """Places axes by left, bottom, width, height in inches."""
     width, height = figure.get_size_inches()
 
@@ -44,12 +44,12 @@ def placer(figure: Figure) -> Callable[[float, float, float, float], Axes]:
     return place
 
 
-def plain(axes: Axes) -> None:
+def style_axes(axes: Axes) -> None:
     """Thin ink: no box, faint ticks."""
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
     for side in ("left", "bottom"):
-        axes.spines[side].set_color(FAINT)
-    axes.tick_params(colors=FAINT, labelcolor=INK, labelsize=NOTE)
+        axes.spines[side].set_color(MUTED)
+    axes.tick_params(colors=MUTED, labelcolor=INK, labelsize=NOTE_SIZE)
     for label in (axes.xaxis.label, axes.yaxis.label):
-        label.set(color=INK, fontsize=TEXT)
+        label.set(color=INK, fontsize=TEXT_SIZE)

@@ -18,16 +18,26 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 from scipy.ndimage import binary_closing, binary_opening, gaussian_filter, label
 
 from vdgs.geometry.camera import Camera
-from vdgs.plots.style import ACCENT, DPI, INK, NOTE, SEEN, TEXT, placer, plain, titles
-from vdgs.visibility.visibility_counts import LIMITS, visibility_of
+from vdgs.plots.style import (
+    ACCENT,
+    DPI,
+    INK,
+    NOTE_SIZE,
+    TEXT_SIZE,
+    VISIBILITY_CMAP,
+    axes_placer,
+    draw_titles,
+    style_axes,
+)
+from vdgs.visibility.visibility_counts import LOW_VISIBILITY_LIMITS, count_visibility
 
-FIELD_CELLS = 240
+GRID_CELLS = 240
 #: Islands and holes of a smaller share of the map have no border.
-LEAST_PATCH = 0.001
+MIN_PATCH_SHARE = 0.001
 #: Points are thinned to so many, evenly over V: of more, they cover each other, and drawing takes minutes.
-MOST_DRAWN = 400_000
+MAX_DRAWN_POINTS = 400_000
 #: Width in points of the border.
-LINE = 0.9
+BORDER_LINE_WIDTH = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +52,7 @@ class CameraMarks:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class SeenMap:
+class VisibilityMapData:
     """What a map of V shows: points coloured by V, marked cameras, and (pale) V on level ground."""
 
     points: Float[np.ndarray, "n 3"]
@@ -63,74 +73,74 @@ class SeenMap:
     titles: tuple[str, str, str]
 
 
-def draw_seen_map(file: Path, seen: SeenMap) -> None:
+def plot_visibility_map(file: Path, data: VisibilityMapData) -> None:
     """Points and cameras from above, points coloured by V; beside it the histogram of V. Writes a PNG."""
-    width, height = map_size(seen.low, seen.high)
+    width, height = map_size_inches(data.low, data.high)
     figure = Figure(figsize=(width + 4.7, height + 2.05), dpi=DPI)
     canvas = FigureCanvasAgg(figure)
-    place = placer(figure)
+    place = axes_placer(figure)
     axes = place(0.85, 0.65, width, height)
-    top, norm = steps(seen.visibility)
-    lined = _ground(axes, seen, norm)
-    order = np.argsort(-seen.visibility, kind="stable")  # the poorly seen on top, so that none is hidden
-    order = order[:: -(-len(order) // MOST_DRAWN) or 1]
+    top, norm = visibility_color_norm(data.visibility)
+    lined = _ground(axes, data, norm)
+    order = np.argsort(-data.visibility, kind="stable")  # the poorly seen on top, so that none is hidden
+    order = order[:: -(-len(order) // MAX_DRAWN_POINTS) or 1]
     size = float(np.clip(6e4 / max(len(order), 1), 0.5, 7.0))
     axes.scatter(
-        seen.points[order, 0],
-        seen.points[order, 1],
-        c=np.minimum(seen.visibility[order], top),
+        data.points[order, 0],
+        data.points[order, 1],
+        c=np.minimum(data.visibility[order], top),
         s=size,
-        cmap=SEEN,
+        cmap=VISIBILITY_CMAP,
         norm=norm,
         linewidths=0,
     )
-    _cameras(axes, seen.marks)
+    _cameras(axes, data.marks)
     _legend(figure, axes, lined)
-    axes.set(xlim=(seen.low[0], seen.high[0]), ylim=(seen.low[1], seen.high[1]), aspect="equal")
-    axes.set(xlabel=seen.x_label, ylabel=seen.y_label)
+    axes.set(xlim=(data.low[0], data.high[0]), ylim=(data.low[1], data.high[1]), aspect="equal")
+    axes.set(xlabel=data.x_label, ylabel=data.y_label)
     start = 0.85 + width + 0.75
     bar, histogram = place(start, 0.65, 0.2, height), place(start + 0.24, 0.65, 2.3, height)
-    _histogram(bar, histogram, seen.visibility, top, norm, seen.noun)
-    plain(axes)
-    titles(figure, *seen.titles)
+    _histogram(bar, histogram, data.visibility, top, norm, data.noun)
+    style_axes(axes)
+    draw_titles(figure, *data.titles)
     canvas.print_png(file)  # type: ignore[arg-type]
 
 
-def _ground(axes: Axes, seen: SeenMap, norm: Normalize) -> bool:
+def _ground(axes: Axes, data: VisibilityMapData, norm: Normalize) -> bool:
     """V on the level ground pale, and the border of where it is at least 3: also where there are no points. Returns
     whether there is such a border."""
-    low, high, cameras = seen.low, seen.high, seen.marks[0].cameras
-    x = np.linspace(low[0], high[0], FIELD_CELLS)
-    y = np.linspace(low[1], high[1], FIELD_CELLS)
-    grid = np.stack([*np.meshgrid(x, y), np.full((FIELD_CELLS, FIELD_CELLS), seen.ground)], axis=-1)
-    field = visibility_of(torch.from_numpy(grid.reshape(-1, 3)), cameras).numpy().reshape(FIELD_CELLS, FIELD_CELLS)
+    low, high, cameras = data.low, data.high, data.marks[0].cameras
+    x = np.linspace(low[0], high[0], GRID_CELLS)
+    y = np.linspace(low[1], high[1], GRID_CELLS)
+    grid = np.stack([*np.meshgrid(x, y), np.full((GRID_CELLS, GRID_CELLS), data.ground)], axis=-1)
+    field = count_visibility(torch.from_numpy(grid.reshape(-1, 3)), cameras).numpy().reshape(GRID_CELLS, GRID_CELLS)
     axes.imshow(
         np.ma.masked_equal(field, 0),
         origin="lower",
         extent=(low[0], high[0], low[1], high[1]),
-        cmap=SEEN,
+        cmap=VISIBILITY_CMAP,
         norm=norm,
         alpha=0.22,
         interpolation="nearest",
         zorder=0,
     )
-    covered = without_speckles(field >= LIMITS[0])
+    covered = remove_speckles(field >= LOW_VISIBILITY_LIMITS[0])
     if covered.all() or not covered.any():
         return False
     smooth = gaussian_filter(covered.astype(np.float64), 1.0, mode="nearest")
-    axes.contour(x, y, smooth, levels=[0.5], colors=INK, linewidths=LINE, zorder=1)
+    axes.contour(x, y, smooth, levels=[0.5], colors=INK, linewidths=BORDER_LINE_WIDTH, zorder=1)
     return True
 
 
-def without_speckles(covered: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+def remove_speckles(covered: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """A map without slits and tongues narrower than three cells, and without islands and holes of less than
-    `LEAST_PATCH` of it: a border around each would be ink and no news."""
+    `MIN_PATCH_SHARE` of it: a border around each would be ink and no news."""
     around = np.ones((3, 3), bool)
     wide = np.pad(covered, 4, mode="edge")  # beyond the map is what its edge shows
     wide = binary_opening(binary_closing(wide, around), around)[4:-4, 4:-4]
     for kind in (True, False):
         patches, _ = label(wide == kind)
-        small = np.bincount(patches.ravel()) < LEAST_PATCH * wide.size
+        small = np.bincount(patches.ravel()) < MIN_PATCH_SHARE * wide.size
         small[0] = False  # what is of the other kind
         wide = wide ^ small[patches]
     return wide
@@ -144,7 +154,7 @@ def _cameras(axes: Axes, marks: Sequence[CameraMarks]) -> None:
             centres[:, 1],
             marker="^",
             s=mark.size,
-            linewidths=mark_edge(mark.size),
+            linewidths=marker_edge_width(mark.size),
             label=mark.label,
             zorder=3,
             facecolors=mark.face,
@@ -155,16 +165,22 @@ def _cameras(axes: Axes, marks: Sequence[CameraMarks]) -> None:
 def _legend(figure: Figure, axes: Axes, lined: bool) -> None:
     """One line between the titles and the map."""
     handles, _ = axes.get_legend_handles_labels()
-    border = Line2D([], [], color=INK, linewidth=LINE, label=f"border of V ≥ {LIMITS[0]} on level ground")
+    border = Line2D(
+        [],
+        [],
+        color=INK,
+        linewidth=BORDER_LINE_WIDTH,
+        label=f"border of V ≥ {LOW_VISIBILITY_LIMITS[0]} on level ground",
+    )
     width, height = figure.get_size_inches()
-    figure.legend(
-        handles=[*handles, border] if lined else handles, loc="upper left", ncols=3, fontsize=NOTE, frameon=False,
+    figure.colorbar(
+        handles=[*handles, border] if lined else handles, loc="upper left", ncols=3, fontsize=NOTE_SIZE, frameon=False,
         bbox_to_anchor=(0.85 / width, 1 - 1.13 / height), handletextpad=0.4, columnspacing=1.2, borderaxespad=0,
         borderpad=0.1,
     )  # fmt: skip
 
 
-def mark_edge(size: float) -> float:
+def marker_edge_width(size: float) -> float:
     """Width in points of the edge of a mark of `size` points²: the edge of a small mark must not cover it."""
     return min(0.8, 0.15 * size**0.5)
 
@@ -177,7 +193,9 @@ def _decimals(ticks: np.ndarray) -> int:
 def _histogram(bar: Axes, axes: Axes, visibility: np.ndarray, top: int, norm: Normalize, noun: str) -> None:
     """The colour scale, and growing out of it the histogram of V; the last step holds all above it."""
     levels = np.arange(top + 1)
-    bar.imshow(levels[:, None], origin="lower", extent=(0, 1, -0.5, top + 0.5), aspect="auto", cmap=SEEN, norm=norm)
+    bar.imshow(
+        levels[:, None], origin="lower", extent=(0, 1, -0.5, top + 0.5), aspect="auto", cmap=VISIBILITY_CMAP, norm=norm
+    )
     bar.set_xticks([])
     step = max(1, round(top / 10))
     ticks = [level for level in levels[::step] if level < top - step / 2] + [top]
@@ -185,17 +203,17 @@ def _histogram(bar: Axes, axes: Axes, visibility: np.ndarray, top: int, norm: No
     bar.set_yticks(ticks, [*map(str, ticks[:-1]), last])
     bar.set_ylabel(f"training cameras that see {noun}, V", labelpad=2)
     shares = np.bincount(np.minimum(visibility, top), minlength=top + 1) / len(visibility)
-    axes.barh(levels, shares, height=0.86, color=SEEN(norm(levels)))
+    axes.barh(levels, shares, height=0.86, color=VISIBILITY_CMAP(norm(levels)))
     median = min(float(np.median(visibility)), top)
     axes.plot([0, 1.12 * shares.max()], [median, median], color=INK, linewidth=0.8, linestyle=(0, (4, 3)))
-    axes.text(1.12 * shares.max(), median, " median", va="center", fontsize=NOTE, color=INK)
-    below = float((visibility < LIMITS[0]).mean())
+    axes.text(1.12 * shares.max(), median, " median", va="center", fontsize=NOTE_SIZE, color=INK)
+    below = float((visibility < LOW_VISIBILITY_LIMITS[0]).mean())
     note = axes.text(
-        shares[: LIMITS[0]].max() + 0.03 * shares.max(),
+        shares[: LOW_VISIBILITY_LIMITS[0]].max() + 0.03 * shares.max(),
         1,
-        f" {below:.1%} below {LIMITS[0]}",
+        f" {below:.1%} below {LOW_VISIBILITY_LIMITS[0]}",
         va="center",
-        fontsize=TEXT,
+        fontsize=TEXT_SIZE,
         fontweight="bold",
         color=ACCENT,
     )
@@ -203,26 +221,28 @@ def _histogram(bar: Axes, axes: Axes, visibility: np.ndarray, top: int, norm: No
         ylim=(-0.5, top + 0.5), xlim=(0, 1.4 * shares.max()), yticks=[], xlabel=f"share of the {noun.split()[-1]}s"
     )
     if note.get_window_extent().x1 > axes.figure.bbox.x1:  # too long beside the longest bar
-        note.set_text(f" {below:.1%}\n below {LIMITS[0]}")
+        note.set_text(f" {below:.1%}\n below {LOW_VISIBILITY_LIMITS[0]}")
     axes.xaxis.set_major_locator(MaxNLocator(4))
     axes.xaxis.set_major_formatter(PercentFormatter(1, decimals=_decimals(100 * axes.get_xticks())))
     for part in (bar, axes):
-        plain(part)
+        style_axes(part)
         part.spines[:].set_visible(False)
     bar.tick_params(axis="y", length=0)
 
 
-def steps(visibility: np.ndarray) -> tuple[int, Normalize]:
+def visibility_color_norm(visibility: np.ndarray) -> tuple[int, Normalize]:
     """The greatest V that has a colour of its own, and integer colour steps from 0 to it.
 
     The 99 % quantile: a few points that very many cameras see must not flatten the rest.
     """
-    top = max(int(np.quantile(visibility, 0.99)), LIMITS[-1])
-    return top, BoundaryNorm(np.arange(-0.5, top + 1), SEEN.N) if top < SEEN.N else Normalize(0, top)
+    top = max(int(np.quantile(visibility, 0.99)), LOW_VISIBILITY_LIMITS[-1])
+    return top, BoundaryNorm(np.arange(-0.5, top + 1), VISIBILITY_CMAP.N) if top < VISIBILITY_CMAP.N else Normalize(
+        0, top
+    )
 
 
-def map_size(low: np.ndarray, high: np.ndarray, widest: float = 8.0) -> tuple[float, float]:
+def map_size_inches(low: np.ndarray, high: np.ndarray, max_width: float = 8.0) -> tuple[float, float]:
     """Width and height of the map in inches: true to scale, within a page or a part of it that is so wide."""
     across, along = high - low
-    scale = min(widest / across, 8.5 / along)
+    scale = min(max_width / across, 8.5 / along)
     return float(max(across * scale, 2.5)), float(max(along * scale, 2.5))

@@ -11,16 +11,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from vdgs.config.commands import MOST_FRAMES
+from vdgs.config.commands import MAX_FRAMES
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
 
-FPS = 30.0
-SECONDS = 12.0
+DEFAULT_FPS = 30.0
+DEFAULT_SECONDS = 12.0
 #: A flyover looks down at least this far from straight down, so that what stands up is seen (choice).
 FLYOVER_TILT_DEG = 20.0
 #: Cameras of the flight that a flyover keeps at most; more would not be seen through the smoothing.
-_TRACK_CAMERAS = 400
+_MAX_TRACK_CAMERAS = 400
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,10 +33,10 @@ class CameraPath:
 
 def frame_count(seconds: float, fps: float) -> int:
     """Frames of a film, at least one. Raises VdgsError for more than can be drawn."""
-    if not seconds * fps <= MOST_FRAMES:
+    if not seconds * fps <= MAX_FRAMES:
         raise VdgsError(
             f"a film of {seconds:g} seconds at {fps:g} frames a second has {seconds * fps:,.0f} frames, more than "
-            f"{MOST_FRAMES:,}. Give fewer --seconds or less --fps."
+            f"{MAX_FRAMES:,}. Give fewer --seconds or less --fps."
         )
     return max(1, round(seconds * fps))
 
@@ -67,7 +67,7 @@ def interpolate(keyframes: Sequence[Camera], n_frames: int, closed: bool = False
     intrinsics = np.array([[camera.fx, camera.fy, camera.cx, camera.cy] for camera in resized])
     values = np.stack([np.interp(times, knots, column) for column in intrinsics.T], axis=1)
     return [
-        replace(first, camera_from_world=rigid_at(rotation, position), fx=fx, fy=fy, cx=cx, cy=cy)
+        replace(first, camera_from_world=pose_from_rotation(rotation, position), fx=fx, fy=fy, cx=cx, cy=cy)
         for rotation, position, (fx, fy, cx, cy) in zip(turned, spline(times), values.tolist(), strict=True)
     ]
 
@@ -76,8 +76,8 @@ def orbit(
     points: Float[np.ndarray, "n 3"],
     cameras: Sequence[Camera],
     template: Camera,
-    seconds: float = SECONDS,
-    fps: float = FPS,
+    seconds: float = DEFAULT_SECONDS,
+    fps: float = DEFAULT_FPS,
 ) -> CameraPath:
     """Once around the middle of the scene, looking at it, as high as the flight.
 
@@ -95,7 +95,7 @@ def orbit(
     frames = []
     for angle in np.linspace(0.0, 2.0 * np.pi, frame_count(seconds, fps), endpoint=False):
         level = (radii * [np.cos(angle), np.sin(angle)]) @ axes
-        pose = look_at(centre + np.append(level, height), centre)
+        pose = look_at_pose(centre + np.append(level, height), centre)
         frames.append(replace(template, camera_from_world=pose))
     return CameraPath(tuple(frames), fps)
 
@@ -103,8 +103,8 @@ def orbit(
 def flyover(
     cameras: Sequence[Camera],
     template: Camera,
-    seconds: float = SECONDS,
-    fps: float = FPS,
+    seconds: float = DEFAULT_SECONDS,
+    fps: float = DEFAULT_FPS,
     tilt_deg: float | None = None,
 ) -> CameraPath:
     """Along the track of the training cameras, smoothed, looking ahead and down.
@@ -131,12 +131,12 @@ def flyover(
     for position, angle in zip(track, heading, strict=True):
         level = np.array([np.cos(angle), np.sin(angle), 0.0])
         forward = ahead * level - np.array([0.0, 0.0, down])
-        pose = look_at(position, position + forward, up=level if tilt_deg < 45.0 else np.array([0.0, 0.0, 1.0]))
+        pose = look_at_pose(position, position + forward, up=level if tilt_deg < 45.0 else np.array([0.0, 0.0, 1.0]))
         frames.append(replace(template, camera_from_world=pose))
     return CameraPath(tuple(frames), fps)
 
 
-def look_at(position: np.ndarray, target: np.ndarray, up: Sequence[float] | np.ndarray = (0, 0, 1)) -> np.ndarray:
+def look_at_pose(position: np.ndarray, target: np.ndarray, up: Sequence[float] | np.ndarray = (0, 0, 1)) -> np.ndarray:
     """`camera_from_world` [4, 4] of a camera at `position` that sees `target` in its middle.
 
     `up` points to the upper edge of the image; where it is parallel to the view, north (+y) does.
@@ -145,16 +145,20 @@ def look_at(position: np.ndarray, target: np.ndarray, up: Sequence[float] | np.n
     forward = np.asarray(target, dtype=np.float64) - position
     length = np.linalg.norm(forward)
     if length <= 1e-12:
-        raise ValueError("`position` and `look_at` are the same point")
+        raise ValueError("`position` and `look_at_pose` are the same point")
     forward = forward / length
     right = np.cross(forward, np.asarray(up, dtype=np.float64))
     if np.linalg.norm(right) < 1e-6:
         right = np.cross(forward, [0.0, 1.0, 0.0] if abs(forward[1]) < 0.9 else [1.0, 0.0, 0.0])
     right /= np.linalg.norm(right)
-    return rigid_at(np.stack([right, np.cross(forward, right), forward]), np.asarray(position, dtype=np.float64))
+    return pose_from_rotation(
+        np.stack([right, np.cross(forward, right), forward]), np.asarray(position, dtype=np.float64)
+    )
 
 
-def rigid_at(rotation: Float[np.ndarray, "3 3"], position: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
+def pose_from_rotation(
+    rotation: Float[np.ndarray, "3 3"], position: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "4 4"]:
     """`camera_from_world` of a camera with this rotation standing at this place."""
     matrix = np.eye(4)
     matrix[:3, :3] = rotation
@@ -185,8 +189,8 @@ def _tangents(
 
 def _smooth_track(positions: Float[np.ndarray, "n 3"], n_frames: int) -> Float[np.ndarray, "f 3"]:
     """The positions as one even, smooth line of `n_frames` points."""
-    if len(positions) > _TRACK_CAMERAS:
-        positions = positions[np.linspace(0, len(positions) - 1, _TRACK_CAMERAS).round().astype(int)]
+    if len(positions) > _MAX_TRACK_CAMERAS:
+        positions = positions[np.linspace(0, len(positions) - 1, _MAX_TRACK_CAMERAS).round().astype(int)]
     chained = _neighbour_order(positions)
     if _length(chained) < 0.6 * _length(positions):
         positions = chained
@@ -194,10 +198,10 @@ def _smooth_track(positions: Float[np.ndarray, "n 3"], n_frames: int) -> Float[n
         return np.repeat(positions[:1], n_frames, axis=0)
     from scipy.ndimage import gaussian_filter1d
 
-    dense = _evenly(positions, max(16 * len(positions), n_frames))
+    dense = _resample_line(positions, max(16 * len(positions), n_frames))
     # Smoothing over about two cameras rounds the turns and takes out the jitter of single positions.
     smooth = gaussian_filter1d(dense, 2.0 * len(dense) / len(positions), axis=0, mode="nearest")
-    return _evenly(smooth, n_frames)
+    return _resample_line(smooth, n_frames)
 
 
 def _neighbour_order(positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -211,7 +215,7 @@ def _neighbour_order(positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "
     return positions[order]
 
 
-def _evenly(line: Float[np.ndarray, "n 3"], count: int) -> Float[np.ndarray, "m 3"]:
+def _resample_line(line: Float[np.ndarray, "n 3"], count: int) -> Float[np.ndarray, "m 3"]:
     """`count` points at even distances along a polyline."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     at = np.linspace(0.0, along[-1], count)

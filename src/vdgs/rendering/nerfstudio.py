@@ -18,25 +18,25 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from vdgs.captures.formats.json_poses import matrix_of, number, read_json
-from vdgs.captures.formats.source_capture import rigid
+from vdgs.captures.formats.json_poses import parse_matrix, parse_number, read_capture_json
+from vdgs.captures.formats.source_capture import to_rigid
 from vdgs.errors import VdgsError
 from vdgs.geometry.similarity import Similarity
-from vdgs.rendering.camera_paths import rigid_at
+from vdgs.rendering.camera_paths import pose_from_rotation
 
-FILE = "dataparser_transforms.json"
+TRANSFORMS_FILE = "dataparser_transforms.json"
 #: Scales beyond these are none of a scene.
-_LEAST, _MOST = 1e-9, 1e9
+_MIN_SCALE, _MAX_SCALE = 1e-9, 1e9
 
 
 def pose_in_source(camera_from_world: Float[np.ndarray, "4 4"], nerfstudio: Similarity) -> Float[np.ndarray, "4 4"]:
     """The pose in the source frame of a camera that stands in nerfstudio's."""
     turned = camera_from_world[:3, :3]
     position = -turned.T @ camera_from_world[:3, 3]
-    return rigid_at(turned @ nerfstudio.rotation, nerfstudio.apply_inverse(position[None])[0])
+    return pose_from_rotation(turned @ nerfstudio.rotation, nerfstudio.apply_inverse(position[None])[0])
 
 
-def frame_beside(path: Path, capture: Path | None) -> Similarity:
+def find_nerfstudio_frame(path: Path, capture: Path | None) -> Similarity:
     """From the source frame to that of a camera path, by the first file that says it: beside the path, one folder up
     (nerfstudio saves paths in camera_paths/ of its data), or in the folder of the capture.
 
@@ -44,22 +44,22 @@ def frame_beside(path: Path, capture: Path | None) -> Similarity:
     """
     beside = path.absolute().parent
     folders = [beside, beside.parent, *([] if capture is None else [capture])]
-    found = next((folder / FILE for folder in folders if (folder / FILE).is_file()), None)
+    found = next((folder / TRANSFORMS_FILE for folder in folders if (folder / TRANSFORMS_FILE).is_file()), None)
     if found is None:
-        raise VdgsError(_missing(path, folders))
-    content = read_json(found)
-    motion = rigid(matrix_of(content.get("transform"), found, "transform"), found, "transform")
-    scale = number(content, "scale", found)
-    if scale is None or not _LEAST < scale < _MOST:
+        raise VdgsError(_missing_message(path, folders))
+    content = read_capture_json(found)
+    motion = to_rigid(parse_matrix(content.get("transform"), found, "transform"), found, "transform")
+    scale = parse_number(content, "scale", found)
+    if scale is None or not _MIN_SCALE < scale < _MAX_SCALE:
         raise VdgsError(f"{found}: scale is {scale}; it must be a positive factor. Copy the file again.")
     return Similarity(scale, motion[:3, :3], scale * motion[:3, 3])
 
 
-def _missing(path: Path, folders: Sequence[Path]) -> str:
+def _missing_message(path: Path, folders: Sequence[Path]) -> str:
     looked = ", ".join(dict.fromkeys(str(folder) for folder in folders))
     return (
         f"{path}: is a camera path of nerfstudio, which turns, moves and scales a scene before it trains, and there is "
-        f"no {FILE} to say how (looked in {looked}). Copy it there from the folder of that training, "
-        f"outputs/NAME/METHOD/DATE/{FILE}. If the path is in the frame of the capture's own cameras, add "
+        f"no {TRANSFORMS_FILE} to say how (looked in {looked}). Copy it there from the folder of that training, "
+        f"outputs/NAME/METHOD/DATE/{TRANSFORMS_FILE}. If the path is in the frame of the capture's own cameras, add "
         '"frame": "source" to it.'
     )

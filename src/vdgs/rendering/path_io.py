@@ -32,12 +32,20 @@ from jaxtyping import Float
 
 from vdgs.config import commands
 from vdgs.config.ranges import Range
-from vdgs.config.serialization import suggestion
+from vdgs.config.serialization import suggest
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.ground_frame import GroundFrame
-from vdgs.rendering.camera_paths import FPS, SECONDS, CameraPath, frame_count, interpolate, look_at, rigid_at
-from vdgs.rendering.nerfstudio import frame_beside, pose_in_source
+from vdgs.rendering.camera_paths import (
+    DEFAULT_FPS,
+    DEFAULT_SECONDS,
+    CameraPath,
+    frame_count,
+    interpolate,
+    look_at_pose,
+    pose_from_rotation,
+)
+from vdgs.rendering.nerfstudio import find_nerfstudio_frame, pose_in_source
 
 #: What our own files may hold.
 _FILE_KEYS = ("frame", "seconds", "fps", "closed", "interpolate", "keyframes")
@@ -47,10 +55,10 @@ _SIZE = ("width", "height")
 _FRAME_KEYS = ("position", "look_at", "up", "camera_from_world", "fov_deg", *_INTRINSICS, *_SIZE)
 #: Focal lengths and principal points, in pixels.
 _FOCAL, _PIXELS = Range(0, 1e7, above=True), Range(-1e7, 1e7)
-_SIDE = Range(1, commands.LARGEST_SIDE_PX)
-_FOV_DEG = Range(0, 180, above=True, below=True)
+_SIDE = Range(1, commands.MAX_RENDER_SIDE_PX)
+_FOV_DEG = Range(0, 180, above=True, exclusive_max=True)
 #: Coordinates, in units of the ground frame or the capture's own.
-_FAR = 1e9
+_MAX_COORDINATE = 1e9
 
 
 def load_path(
@@ -74,19 +82,19 @@ def load_path(
             cameras, interpolated, frame = _from_nerfstudio(content, default)
         else:
             cameras, interpolated, frame = _from_keyframes(content, default)
-        rate = fps or _number(content, "fps", commands.FPS) or FPS
-        length = seconds or _number(content, "seconds", commands.SECONDS) or SECONDS
+        rate = fps or _number(content, "fps", commands.FPS_RANGE) or DEFAULT_FPS
+        length = seconds or _number(content, "seconds", commands.SECONDS_RANGE) or DEFAULT_SECONDS
         closed = _flag(content, "closed", False)
     except (TypeError, ValueError, OverflowError) as error:
         raise VdgsError(f"{file}: {error}. `vdgs render --help` says under --path what a camera path holds.") from error
     if frame == "nerfstudio":
-        known = frame_beside(file, capture)
+        known = find_nerfstudio_frame(file, capture)
         cameras = [replace(each, camera_from_world=pose_in_source(each.camera_from_world, known)) for each in cameras]
     if frame != "ground" and ground is not None:
         cameras = [_to_ground(camera, ground) for camera in cameras]
     if interpolated or (seconds is not None and len(cameras) > 1):
         cameras = interpolate(cameras, frame_count(length, rate), closed=closed)
-    return CameraPath(tuple(_one_size(cameras)), rate)
+    return CameraPath(tuple(_unify_size(cameras)), rate)
 
 
 def _read(file: Path) -> Mapping[str, Any]:
@@ -107,7 +115,7 @@ def _read(file: Path) -> Mapping[str, Any]:
 
 def _from_keyframes(content: Mapping[str, Any], default: Camera) -> tuple[list[Camera], bool, str]:
     """The cameras, whether there shall be others between them, and the frame that they are in."""
-    _know(content, _FILE_KEYS)
+    _check_keys(content, _FILE_KEYS)
     frames, frame = content.get("keyframes"), _frame(content, "ground")
     _require(isinstance(frames, list) and len(frames) > 0, "`keyframes` must be a list of at least one")
     cameras = []
@@ -127,14 +135,14 @@ def _frame(content: Mapping[str, Any], default: str) -> str:
 
 
 def _keyframe(entry: Mapping[str, Any], default: Camera) -> Camera:
-    _know(entry, _FRAME_KEYS)
+    _check_keys(entry, _FRAME_KEYS)
     if "camera_from_world" in entry:
         twice = [name for name in ("position", "look_at", "up") if name in entry]
         _require(not twice, f"camera_from_world already says where the camera is: leave out {', '.join(twice)}")
         pose = _matrix(entry["camera_from_world"], "camera_from_world")
     else:
         _require("position" in entry and "look_at" in entry, "give camera_from_world, or position and look_at")
-        pose = look_at(
+        pose = look_at_pose(
             _vector(entry["position"], "position"),
             _vector(entry["look_at"], "look_at"),
             _vector(entry.get("up", (0, 0, 1)), "up"),
@@ -172,12 +180,10 @@ def _from_nerfstudio(content: Mapping[str, Any], default: Camera) -> tuple[list[
     return cameras, False, _frame(content, "nerfstudio")
 
 
-def _know(entry: Mapping[str, Any], keys: Sequence[str]) -> None:
+def _check_keys(entry: Mapping[str, Any], keys: Sequence[str]) -> None:
     unknown = [str(key) for key in entry if key not in keys]
     if unknown:
-        raise ValueError(
-            f"there is no {unknown[0]!r}{suggestion(unknown[0], keys)} (possible here are {', '.join(keys)})"
-        )
+        raise ValueError(f"there is no {unknown[0]!r}{suggest(unknown[0], keys)} (possible here are {', '.join(keys)})")
 
 
 def _number(entry: Mapping[str, Any], name: str, bounds: Range) -> float | None:
@@ -211,7 +217,7 @@ def _matrix(value: Any, name: str) -> Float[np.ndarray, "4 4"]:
     _require(matrix.size == 16, f"{name} must be 4 x 4 numbers")
     matrix = matrix.reshape(4, 4)
     rotation = matrix[:3, :3]
-    finite = np.isfinite(matrix).all() and np.abs(matrix).max() <= _FAR
+    finite = np.isfinite(matrix).all() and np.abs(matrix).max() <= _MAX_COORDINATE
     rigid = finite and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(rotation) > 0
     last_row = np.allclose(matrix[3], [0, 0, 0, 1])
     _require(bool(rigid and last_row), f"{name} must be a rotation and a translation")
@@ -223,7 +229,7 @@ def _vector(value: Any, name: str) -> Float[np.ndarray, "3"]:
         vector = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
         vector = np.zeros(0)
-    whole = vector.shape == (3,) and bool(np.isfinite(vector).all()) and np.abs(vector).max() <= _FAR
+    whole = vector.shape == (3,) and bool(np.isfinite(vector).all()) and np.abs(vector).max() <= _MAX_COORDINATE
     _require(bool(whole), f"{name} must be three numbers")
     return vector
 
@@ -235,9 +241,11 @@ def _require(condition: bool, message: str) -> None:
 
 def _to_ground(camera: Camera, ground: GroundFrame) -> Camera:
     position = ground.to_ground(camera.position[None])[0]
-    return replace(camera, camera_from_world=rigid_at(camera.camera_from_world[:3, :3] @ ground.rotation.T, position))
+    return replace(
+        camera, camera_from_world=pose_from_rotation(camera.camera_from_world[:3, :3] @ ground.rotation.T, position)
+    )
 
 
-def _one_size(cameras: Sequence[Camera]) -> list[Camera]:
+def _unify_size(cameras: Sequence[Camera]) -> list[Camera]:
     """A film has one size: the first camera's."""
     return [camera.resized(cameras[0].width, cameras[0].height) for camera in cameras]

@@ -10,47 +10,49 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from vdgs.errors import VdgsError
-from vdgs.system.atomic_files import read_record, write_json
+from vdgs.system.atomic_files import read_json_or_empty, write_json
 
-LIST = "render.json"
+MANIFEST_FILE = "render.json"
 _WRITER = "vdgs render"
 
 
-def begin(folder: Path, names: Sequence[str]) -> list[str]:
+def begin_render(folder: Path, names: Sequence[str]) -> list[str]:
     """Make a folder ready for files of these names; returns those that an earlier render left in it.
 
-    They stay until `finish`. What is listed from here on are both, so that a render that was cut off is known again.
+    They stay until `finish_render`. What is listed from here on are both, so that a render that was cut off is known again.
     Raises VdgsError, before anything is written, for a folder that holds anything but an earlier render; hidden files
     count for nothing.
     """
     if folder.exists() and not folder.is_dir():
         raise VdgsError(f"{folder}: is a file. Give a folder for pictures, or a name that ends in .mp4 for a film.")
     present = {entry.name for entry in folder.iterdir() if not entry.name.startswith(".")} if folder.is_dir() else set()
-    earlier = _listed(folder) & present
-    foreign = sorted(present - earlier - ({LIST} if _is_ours(folder) else set()))
+    earlier = _listed_files(folder) & present
+    foreign = sorted(present - earlier - ({MANIFEST_FILE} if _has_manifest(folder) else set()))
     if foreign:
         shown = ", ".join(foreign[:3]) + (", ..." if len(foreign) > 3 else "")
         raise VdgsError(
             f"{folder}: holds {len(foreign)} files or folders that no render wrote ({shown}). Give a new or an empty "
             f"folder for --output; one that `vdgs render` filled is replaced."
         )
-    write_json(folder / LIST, {"written_by": _WRITER, "finished": False, "files": sorted(earlier | set(names))})
+    write_json(
+        folder / MANIFEST_FILE, {"written_by": _WRITER, "finished": False, "files": sorted(earlier | set(names))}
+    )
     return sorted(earlier)
 
 
-def finish(folder: Path, earlier: Sequence[str], names: Sequence[str], facts: Mapping[str, Any]) -> None:
+def finish_render(folder: Path, earlier: Sequence[str], names: Sequence[str], metadata: Mapping[str, Any]) -> None:
     """Remove what the earlier render left and this one did not write again; note what is there and what it shows."""
     for name in set(earlier) - set(names):
         (folder / name).unlink(missing_ok=True)
-    write_json(folder / LIST, {"written_by": _WRITER, "finished": True, **facts, "files": sorted(names)})
+    write_json(folder / MANIFEST_FILE, {"written_by": _WRITER, "finished": True, **metadata, "files": sorted(names)})
 
 
-def _is_ours(folder: Path) -> bool:
-    return read_record(folder / LIST).get("written_by") == _WRITER
+def _has_manifest(folder: Path) -> bool:
+    return read_json_or_empty(folder / MANIFEST_FILE).get("written_by") == _WRITER
 
 
-def _listed(folder: Path) -> set[str]:
+def _listed_files(folder: Path) -> set[str]:
     """The files in a folder that its list names: plain names of files only, whoever edited the list."""
-    files = read_record(folder / LIST).get("files") if _is_ours(folder) else None
+    files = read_json_or_empty(folder / MANIFEST_FILE).get("files") if _has_manifest(folder) else None
     names = {name for name in files if isinstance(name, str)} if isinstance(files, list) else set()
     return {name for name in names if PurePath(name).name == name and (folder / name).is_file()}

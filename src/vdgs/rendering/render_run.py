@@ -11,34 +11,34 @@ from jaxtyping import Float, UInt8
 from rich.console import Console
 from rich.progress import track
 
-from vdgs.captures.capture_metadata import refuse_another_capture
-from vdgs.captures.output_guard import refuse_among_folders, refuse_in_a_capture
-from vdgs.config.commands import BYTES_PER_PIXEL, LARGEST_SIDE_PX, RenderRequest
-from vdgs.config.ranges import refuse
+from vdgs.captures.capture_metadata import check_same_capture
+from vdgs.captures.output_guard import check_not_among_folders, check_not_in_capture
+from vdgs.config.commands import MAX_RENDER_SIDE_PX, RENDER_BYTES_PER_PIXEL, RenderRequest
+from vdgs.config.ranges import check_ranges
 from vdgs.errors import VdgsError
-from vdgs.evaluation.image_io import file_stems, write_png
+from vdgs.evaluation.image_io import unique_file_stems, write_png
 from vdgs.evaluation.metrics import to_8bit
 from vdgs.geometry.camera import Camera
 from vdgs.model.renderer import render
 from vdgs.rendering import camera_paths, render_folder
-from vdgs.rendering.colorbar import legend, with_legend
+from vdgs.rendering.colorbar import add_colorbar, draw_colorbar
 from vdgs.rendering.path_io import load_path
-from vdgs.rendering.scalar_maps import Map, map_of
+from vdgs.rendering.scalar_maps import ScalarMap, make_scalar_map
 from vdgs.rendering.video import VideoWriter
 from vdgs.runs.open_run import OpenedModel, open_capture, open_model
-from vdgs.runs.run_cameras import Flight, flight_of, kept_flight
+from vdgs.runs.run_cameras import RunCameras, load_run_cameras, run_cameras_of_capture
 from vdgs.runs.run_folder import RunFolder
 from vdgs.system.atomic_files import write_array
-from vdgs.system.memory.process_memory import available_bytes
-from vdgs.system.stop_signals import stop_if_asked
+from vdgs.system.memory.process_memory import available_memory_bytes
+from vdgs.system.stop_signals import check_stop_requested
 from vdgs.system.units import data_size
 
 #: Pace of a film of separate views.
-SLIDES_PER_SECOND = 2.0
+STILLS_FPS = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class _Frame:
+class _NamedImage:
     """One picture, with its legend or without, its name, and the numbers that it shows."""
 
     name: str
@@ -46,147 +46,153 @@ class _Frame:
     values: Float[np.ndarray, "h w"] | None
 
 
-def render_run(asked: RenderRequest, console: Console) -> None:
+def render_run(request: RenderRequest, console: Console) -> None:
     """Render what was asked for, on a device that is chosen already (`vdgs.kernels.device_selection`).
 
     Raises VdgsError for options that do not go together, an unusable path, codec or output, and for an output among the
     capture's inputs or in a folder that holds anything but an earlier render.
     """
     began = time.monotonic()
-    _check(asked)
-    refuse_in_a_capture(asked.output)
-    run = open_model(RunFolder(asked.run), asked.model, asked.device)
-    flight = _flight(asked, run)
-    refuse_among_folders(asked.output, flight.root, flight.inputs)
-    if run.caution:
-        console.print(f"[yellow]warning[/] {run.caution}", highlight=False)
-    named, fps = _cameras(asked, flight)
-    if asked.width:
-        named = [(name, camera.resized(asked.width, _height(camera, asked.width))) for name, camera in named]
-    _refuse_large(asked, [camera for _, camera in named])
-    if asked.output.suffix:
-        said = _write_film(asked, run, flight, named, fps, console)
+    _check(request)
+    check_not_in_capture(request.output)
+    run = open_model(RunFolder(request.run), request.model, request.device)
+    flight = _load_cameras(request, run)
+    check_not_among_folders(request.output, flight.root, flight.inputs)
+    if run.warning:
+        console.print(f"[yellow]warning[/] {run.warning}", highlight=False)
+    named, fps = _cameras(request, flight)
+    if request.width:
+        named = [(name, camera.resized(request.width, _height(camera, request.width))) for name, camera in named]
+    _check_size(request, [camera for _, camera in named])
+    if request.output.suffix:
+        said = _write_video(request, run, flight, named, fps, console)
     else:
-        said = _write_pictures(asked, run, flight, named, console)
-    console.print(f"{run.line}: {said}, drawn in {time.monotonic() - began:.1f} s: {asked.output}", highlight=False)
+        said = _write_images(request, run, flight, named, console)
+    console.print(f"{run.line}: {said}, drawn in {time.monotonic() - began:.1f} s: {request.output}", highlight=False)
 
 
-def _check(asked: RenderRequest) -> None:
-    refuse(asked)
-    if asked.raw and asked.kind == "image":
+def _check(request: RenderRequest) -> None:
+    check_ranges(request)
+    if request.raw and request.kind == "image":
         raise VdgsError("--raw writes the numbers of a map: it needs --kind depth, visibility or alpha.")
-    if asked.raw and asked.output.suffix:
-        raise VdgsError(f"{asked.output}: a film holds no numbers. Give a folder for --output, or leave out --raw.")
+    if request.raw and request.output.suffix:
+        raise VdgsError(f"{request.output}: a film holds no numbers. Give a folder for --output, or leave out --raw.")
 
 
-def _write_film(
-    asked: RenderRequest,
+def _write_video(
+    request: RenderRequest,
     run: OpenedModel,
-    flight: Flight,
+    flight: RunCameras,
     named: list[tuple[str, Camera]],
     fps: float,
     console: Console,
 ) -> str:
     """Draw the frames of a film; returns what to say of it."""
-    if asked.output.is_dir():
-        raise VdgsError(f"{asked.output}: is a folder. Give another name for the film.")
+    if request.output.is_dir():
+        raise VdgsError(f"{request.output}: is a folder. Give another name for the film.")
     sizes = {(camera.width, camera.height) for _, camera in named}
     if len(sizes) > 1:
         raise VdgsError(
-            f"{asked.output}: a film needs frames of one size, and these views have {len(sizes)}. Give a folder."
+            f"{request.output}: a film needs frames of one size, and these views have {len(sizes)}. Give a folder."
         )
-    with VideoWriter(asked.output, fps) as film:
-        drawn = _map(asked, run, flight, named)
-        for frame in _frames(asked, run, named, drawn, console):
+    with VideoWriter(request.output, fps) as film:
+        drawn = _scalar_map(request, run, flight, named)
+        for frame in _frames(request, run, named, drawn, console):
             film.write(frame.picture)
     (width, height), strip = sizes.pop(), ""
-    if drawn is not None and asked.legend:
-        rows = len(legend(drawn.scale, width, height))
+    if drawn is not None and request.colorbar:
+        rows = len(draw_colorbar(drawn.scale, width, height))
         height, strip = height + rows, f", the lowest {rows} rows of them the legend"
     return (
-        f"{_frames_of(len(named))} of {width // 2 * 2}x{height // 2 * 2} px{strip}, a film of {len(named) / fps:.1f} s "
+        f"{_frame_count_text(len(named))} of {width // 2 * 2}x{height // 2 * 2} px{strip}, a film of {len(named) / fps:.1f} s "
         f"at {fps:g} frames a second"
     )
 
 
-def _write_pictures(
-    asked: RenderRequest, run: OpenedModel, flight: Flight, named: list[tuple[str, Camera]], console: Console
+def _write_images(
+    request: RenderRequest, run: OpenedModel, flight: RunCameras, named: list[tuple[str, Camera]], console: Console
 ) -> str:
     """Draw pictures into a folder; returns what to say of them."""
-    kinds = (".png", ".npy") if asked.raw else (".png",)
+    kinds = (".png", ".npy") if request.raw else (".png",)
     names = [name + kind for name, _ in named for kind in kinds]
-    earlier = render_folder.begin(asked.output, names)
-    drawn = _map(asked, run, flight, named)
-    for frame in _frames(asked, run, named, drawn, console):
-        write_png(asked.output / f"{frame.name}.png", frame.picture)
-        if asked.raw and frame.values is not None:
-            write_array(asked.output / f"{frame.name}.npy", frame.values)
-    render_folder.finish(asked.output, earlier, names, _facts(asked, run, drawn))
+    earlier = render_folder.begin_render(request.output, names)
+    drawn = _scalar_map(request, run, flight, named)
+    for frame in _frames(request, run, named, drawn, console):
+        write_png(request.output / f"{frame.name}.png", frame.picture)
+        if request.raw and frame.values is not None:
+            write_array(request.output / f"{frame.name}.npy", frame.values)
+    render_folder.finish_render(request.output, earlier, names, _metadata(request, run, drawn))
     sizes = list(dict.fromkeys(f"{camera.width}x{camera.height} px" for _, camera in named))
-    said = f"{_frames_of(len(named))} of {sizes[0] if len(sizes) == 1 else f'{len(sizes)} sizes'}"
-    said += ", each with its numbers as .npy" if asked.raw else ""
+    said = f"{_frame_count_text(len(named))} of {sizes[0] if len(sizes) == 1 else f'{len(sizes)} sizes'}"
+    said += ", each with its numbers as .npy" if request.raw else ""
     return said + (f", in place of {len(earlier)} files of an earlier render" if earlier else "")
 
 
-def _frames_of(count: int) -> str:
+def _frame_count_text(count: int) -> str:
     return f"{count:,} frame{'' if count == 1 else 's'}"
 
 
-def _map(asked: RenderRequest, run: OpenedModel, flight: Flight, named: list[tuple[str, Camera]]) -> Map | None:
+def _scalar_map(
+    request: RenderRequest, run: OpenedModel, flight: RunCameras, named: list[tuple[str, Camera]]
+) -> ScalarMap | None:
     """The map that all views are drawn as; None for plain pictures."""
-    return None if asked.kind == "image" else map_of(asked.kind, run, flight, [camera for _, camera in named])
+    return (
+        None if request.kind == "image" else make_scalar_map(request.kind, run, flight, [camera for _, camera in named])
+    )
 
 
-def _facts(asked: RenderRequest, run: OpenedModel, drawn: Map | None) -> dict[str, object]:
+def _metadata(request: RenderRequest, run: OpenedModel, drawn: ScalarMap | None) -> dict[str, object]:
     """What render.json says of the pictures beside it."""
     facts: dict[str, object] = {
-        "run": str(asked.run.resolve()), "model": run.name, "kind": asked.kind,
-        "views": str(asked.path) if asked.path is not None else asked.views,
+        "run": str(request.run.resolve()), "model": run.name, "kind": request.kind,
+        "views": str(request.path) if request.path is not None else request.views,
     }  # fmt: skip
     if drawn is not None:
-        facts |= {"numbers": drawn.meaning, "colours_between": [drawn.scale.low, drawn.scale.high],
-                  "legend_below": asked.legend}  # fmt: skip
+        facts |= {"numbers": drawn.description, "colours_between": [drawn.scale.low, drawn.scale.high],
+                  "legend_below": request.colorbar}  # fmt: skip
     return facts
 
 
-def _flight(asked: RenderRequest, run: OpenedModel) -> Flight:
+def _load_cameras(request: RenderRequest, run: OpenedModel) -> RunCameras:
     """The cameras of the run: as it keeps them, else of its capture, which is asked too where it is named."""
     described = run.model.metadata.capture
-    kept = kept_flight(run.folder, described) if asked.capture is None else None
+    kept = load_run_cameras(run.folder, described) if request.capture is None else None
     if kept is not None:
         return kept
-    capture = open_capture(run.folder, asked.capture)
-    refuse_another_capture(run.model_path, described, capture)
-    return flight_of(capture)
+    capture = open_capture(run.folder, request.capture)
+    check_same_capture(run.model_path, described, capture)
+    return run_cameras_of_capture(capture)
 
 
-def _cameras(asked: RenderRequest, flight: Flight) -> tuple[list[tuple[str, Camera]], float]:
+def _cameras(request: RenderRequest, flight: RunCameras) -> tuple[list[tuple[str, Camera]], float]:
     """The cameras with their names, and the frames per second for a film of them."""
-    if asked.path is None and asked.views in ("test", "train"):
-        names, cameras = zip(*(flight.test if asked.views == "test" else flight.train), strict=True)
-        return list(zip(file_stems(list(names)), cameras, strict=True)), asked.fps or SLIDES_PER_SECOND
+    if request.path is None and request.views in ("test", "train"):
+        names, cameras = zip(*(flight.test if request.views == "test" else flight.train), strict=True)
+        return list(zip(unique_file_stems(list(names)), cameras, strict=True)), request.fps or STILLS_FPS
     template = flight.cameras[0]
-    length, rate = asked.seconds or camera_paths.SECONDS, asked.fps or camera_paths.FPS
-    if asked.path is not None:
-        path = load_path(asked.path, template, flight.ground, asked.seconds or None, asked.fps or None, flight.root)
-    elif asked.views == "orbit":
+    length, rate = request.seconds or camera_paths.DEFAULT_SECONDS, request.fps or camera_paths.DEFAULT_FPS
+    if request.path is not None:
+        path = load_path(
+            request.path, template, flight.ground, request.seconds or None, request.fps or None, flight.root
+        )
+    elif request.views == "orbit":
         path = camera_paths.orbit(flight.middle[None], flight.cameras, template, length, rate)
     else:
         path = camera_paths.flyover(flight.cameras, template, length, rate)
     return [(f"{i:05d}", camera) for i, camera in enumerate(path.cameras)], path.fps
 
 
-def _refuse_large(asked: RenderRequest, cameras: list[Camera]) -> None:
+def _check_size(request: RenderRequest, cameras: list[Camera]) -> None:
     """Raise VdgsError, before anything is drawn, for pictures that memory does not hold or nothing can show."""
     largest = max(cameras, key=lambda camera: camera.width * camera.height)
     size = f"{largest.width}x{largest.height}"
-    where = f"{asked.path}: " if asked.path is not None and not asked.width else ""
-    if max(largest.width, largest.height) > LARGEST_SIDE_PX:
+    where = f"{request.path}: " if request.path is not None and not request.width else ""
+    if max(largest.width, largest.height) > MAX_RENDER_SIDE_PX:
         raise VdgsError(
-            f"{where}pictures of {size} are too large: at most {LARGEST_SIDE_PX} pixels a side can be drawn. "
+            f"{where}pictures of {size} are too large: at most {MAX_RENDER_SIDE_PX} pixels a side can be drawn. "
             "Give a smaller --width."
         )
-    need, free = largest.width * largest.height * BYTES_PER_PIXEL, available_bytes()
+    need, free = largest.width * largest.height * RENDER_BYTES_PER_PIXEL, available_memory_bytes()
     if need > free:
         raise VdgsError(
             f"{where}a picture of {size} takes about {data_size(need)} to draw, and {data_size(free)} are free. "
@@ -199,14 +205,14 @@ def _height(camera: Camera, width: int) -> int:
 
 
 def _frames(
-    asked: RenderRequest, run: OpenedModel, named: list[tuple[str, Camera]], drawn: Map | None, console: Console
-) -> Iterator[_Frame]:
+    request: RenderRequest, run: OpenedModel, named: list[tuple[str, Camera]], drawn: ScalarMap | None, console: Console
+) -> Iterator[_NamedImage]:
     """One picture per camera, in order."""
     for name, camera in track(named, "rendering", console=console, disable=not console.is_terminal):
-        stop_if_asked()
+        check_stop_requested()
         if drawn is None:
-            yield _Frame(name, to_8bit(render(run.model, camera).image.cpu().numpy()), None)
+            yield _NamedImage(name, to_8bit(render(run.model, camera).image.cpu().numpy()), None)
             continue
         values = drawn.values(camera)
-        picture = drawn.scale.coloured(values)
-        yield _Frame(name, with_legend(picture, drawn.scale) if asked.legend else picture, values)
+        picture = drawn.scale.colorize(values)
+        yield _NamedImage(name, add_colorbar(picture, drawn.scale) if request.colorbar else picture, values)

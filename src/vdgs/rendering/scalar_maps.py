@@ -13,24 +13,24 @@ from matplotlib.colors import Normalize
 from matplotlib.ticker import MaxNLocator
 
 from vdgs.geometry.camera import Camera
-from vdgs.model.renderer import render, render_values
-from vdgs.plots.style import SEEN
-from vdgs.plots.visibility_map import steps
+from vdgs.model.renderer import render, render_scalar_map
+from vdgs.plots.style import VISIBILITY_CMAP
+from vdgs.plots.visibility_map import visibility_color_norm
 from vdgs.runs.open_run import OpenedModel
-from vdgs.runs.run_cameras import Flight
-from vdgs.runs.visibility_store import visibility_of_run
+from vdgs.runs.run_cameras import RunCameras
+from vdgs.runs.visibility_store import get_run_visibility
 
-MapKind = Literal["depth", "visibility", "alpha"]
+ScalarMapMode = Literal["depth", "visibility", "alpha"]
 
 #: Where there is nothing to draw; in none of the colour maps but that of alpha, which draws everywhere.
-NOTHING = (208, 211, 215)
+NO_DATA_COLOR = (208, 211, 215)
 #: The range of depths is that of so many views at most, spread over all, drawn so small (longer side): one for the
 #: whole film, found before its first frame.
-_PREVIEWS, _PREVIEW_PX = 24, 160
+_MAX_PREVIEWS, _PREVIEW_PX = 24, 160
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Scale:
+class ColorScale:
     """How numbers become colours: the same for all frames."""
 
     #: What the numbers are, with their unit: the longest first, for as much room as there is.
@@ -43,72 +43,76 @@ class Scale:
     #: Numbers to RGBA in 0 to 1.
     paint: Callable[[np.ndarray], np.ndarray]
     #: Whether a number may be missing (NaN).
-    gaps: bool = True
+    has_nodata: bool = True
 
-    def coloured(self, values: Shaped[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
-        """A map in colours, `NOTHING` where it is NaN."""
+    def colorize(self, values: Shaped[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+        """A map in colours, `NO_DATA_COLOR` where it is NaN."""
         known = np.isfinite(values)
         picture = (self.paint(np.where(known, values, self.low))[..., :3] * 255 + 0.5).astype(np.uint8)
-        picture[~known] = NOTHING
+        picture[~known] = NO_DATA_COLOR
         return picture
 
 
 @dataclass(frozen=True, eq=False)
-class Map:
+class ScalarMap:
     """A kind of map of one run: its values in a view (float32, NaN where there is nothing), their colours and words."""
 
     values: Callable[[Camera], Float[np.ndarray, "h w"]]
-    scale: Scale
+    scale: ColorScale
     #: What the numbers are, in a sentence.
-    meaning: str
+    description: str
 
 
-def map_of(kind: MapKind, run: OpenedModel, flight: Flight, cameras: Sequence[Camera]) -> Map:
+def make_scalar_map(
+    mode: ScalarMapMode, run: OpenedModel, run_cameras: RunCameras, cameras: Sequence[Camera]
+) -> ScalarMap:
     """The map of a model to be drawn in all of `cameras`; `flight` is that of its run."""
-    return {"depth": _depth, "visibility": _visibility, "alpha": _alpha}[kind](run, flight, cameras)
+    return {"depth": _depth, "visibility": _visibility, "alpha": _alpha}[mode](run, run_cameras, cameras)
 
 
-def _depth(run: OpenedModel, flight: Flight, cameras: Sequence[Camera]) -> Map:
+def _depth(run: OpenedModel, run_cameras: RunCameras, cameras: Sequence[Camera]) -> ScalarMap:
     def values(camera: Camera) -> Float[np.ndarray, "h w"]:
         raster = render(run.model, camera, depth=True)
         assert raster.median_depth is not None
         depth, alpha = raster.median_depth.cpu().numpy(), raster.alpha.cpu().numpy()
         return np.where(alpha > 0.5, depth, np.nan).astype(np.float32)
 
-    unit = flight.ground.unit
+    unit = run_cameras.ground.unit
     meaning = (
         f"Median depth: z along the view, in {unit} of the ground frame, at which a pixel becomes half opaque; NaN "
         "where it never does."
     )
-    span = depth_span((values(camera.within(_PREVIEW_PX)) for camera in _spread(cameras)), flight.height)
-    return Map(values, depth_scale(span, unit), meaning)
+    span = depth_range(
+        (values(camera.limit_size(_PREVIEW_PX)) for camera in _sample_cameras(cameras)), run_cameras.height
+    )
+    return ScalarMap(values, depth_scale(span, unit), meaning)
 
 
-def _spread(cameras: Sequence[Camera]) -> list[Camera]:
-    """At most `_PREVIEWS` of the cameras, evenly, the first and the last among them."""
-    places = np.linspace(0, len(cameras) - 1, min(len(cameras), _PREVIEWS)).round().astype(int)
+def _sample_cameras(cameras: Sequence[Camera]) -> list[Camera]:
+    """At most `_MAX_PREVIEWS` of the cameras, evenly, the first and the last among them."""
+    places = np.linspace(0, len(cameras) - 1, min(len(cameras), _MAX_PREVIEWS)).round().astype(int)
     return [cameras[index] for index in places]
 
 
-def depth_span(depths: Iterable[Float[np.ndarray, "_ _"]], otherwise: float) -> tuple[float, float]:
+def depth_range(depths: Iterable[Float[np.ndarray, "_ _"]], fallback: float) -> tuple[float, float]:
     """Least and greatest depth in these maps, without the outermost 1 % of each: no view may fall out of the colours.
 
     From 0 to twice `otherwise` where nothing is drawn in any.
     """
     ends = [np.nanquantile(depth, (0.01, 0.99)) for depth in depths if np.isfinite(depth).any()]
-    return (float(np.min(ends)), float(np.max(ends))) if ends else (0.0, 2.0 * otherwise)
+    return (float(np.min(ends)), float(np.max(ends))) if ends else (0.0, 2.0 * fallback)
 
 
-def depth_scale(span: tuple[float, float], unit: str) -> Scale:
+def depth_scale(depth_limits: tuple[float, float], unit: str) -> ColorScale:
     """Viridis between round numbers that hold the span."""
-    low, high = span
+    low, high = depth_limits
     if high - low <= 1e-3 * abs(high):  # one plane
         low, high = 0.99 * low, 1.01 * high or 1.0
     numbers = MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high)
     norm, colours = Normalize(numbers[0], numbers[-1], clip=True), mpl.colormaps["viridis"]
     words = [f"{number:g}" for number in np.round(numbers, 9)]
     words[0], words[-1] = f"≤ {words[0]}" if numbers[0] > 0 else words[0], f"≥ {words[-1]}"
-    return Scale(
+    return ColorScale(
         titles=(f"depth along the view ({unit})", f"depth ({unit})", unit),
         low=float(numbers[0]),
         high=float(numbers[-1]),
@@ -117,47 +121,47 @@ def depth_scale(span: tuple[float, float], unit: str) -> Scale:
     )
 
 
-def _visibility(run: OpenedModel, flight: Flight, cameras: Sequence[Camera]) -> Map:
-    counts = visibility_of_run(run, flight.cameras)
+def _visibility(run: OpenedModel, run_cameras: RunCameras, cameras: Sequence[Camera]) -> ScalarMap:
+    counts = get_run_visibility(run, run_cameras.cameras)
     meaning = (
         "V: how many training cameras see the place, the mean over the anchors that a pixel shows; NaN where alpha is "
         "at most 0.5."
     )
 
     def values(camera: Camera) -> Float[np.ndarray, "h w"]:
-        return render_values(run.model, counts.float(), camera).cpu().numpy().astype(np.float32)
+        return render_scalar_map(run.model, counts.float(), camera).cpu().numpy().astype(np.float32)
 
-    return Map(values, seen_scale(counts.cpu().numpy()), meaning)
+    return ScalarMap(values, visibility_scale(counts.cpu().numpy()), meaning)
 
 
-def seen_scale(counts: Shaped[np.ndarray, " n"]) -> Scale:
+def visibility_scale(counts: Shaped[np.ndarray, " n"]) -> ColorScale:
     """One colour for each whole V, those of all other figures of the project; the last holds all above it."""
-    top, norm = steps(counts)
+    top, norm = visibility_color_norm(counts)
     more = bool(counts.max() > top)
     every = max(1, round(top / 10))
     levels = [level for level in range(0, top + 1, every) if level == 0 or top - level >= every] + [top]
     ticks = [(float(level), f"≥ {level}" if more and level == top else str(level)) for level in dict.fromkeys(levels)]
-    return Scale(
+    return ColorScale(
         titles=("training cameras that see the place, V", "training cameras, V", "V"),
         low=-0.5,
         high=top + 0.5,
         ticks=tuple(ticks),
-        paint=lambda values: np.asarray(SEEN(norm(np.clip(np.rint(values), 0, top)))),
+        paint=lambda values: np.asarray(VISIBILITY_CMAP(norm(np.clip(np.rint(values), 0, top)))),
     )
 
 
-def _alpha(run: OpenedModel, flight: Flight, cameras: Sequence[Camera]) -> Map:
+def _alpha(run: OpenedModel, run_cameras: RunCameras, cameras: Sequence[Camera]) -> ScalarMap:
     def values(camera: Camera) -> Float[np.ndarray, "h w"]:
         return render(run.model, camera).alpha.cpu().numpy().astype(np.float32)
 
-    return Map(values, alpha_scale(), "Alpha: how opaque the scene is, from 0 (nothing) to 1.")
+    return ScalarMap(values, alpha_scale(), "Alpha: how opaque the scene is, from 0 (nothing) to 1.")
 
 
-def alpha_scale() -> Scale:
+def alpha_scale() -> ColorScale:
     """From black, where the scene is transparent, to white."""
     ticks = tuple((number / 4, f"{number / 4:g}") for number in range(5))
     grey = mpl.colormaps["gray"]
     titles = ("alpha: 0 nothing, 1 opaque", "alpha")
-    return Scale(
-        titles=titles, low=0.0, high=1.0, ticks=ticks, paint=lambda values: np.asarray(grey(values)), gaps=False
+    return ColorScale(
+        titles=titles, low=0.0, high=1.0, ticks=ticks, paint=lambda values: np.asarray(grey(values)), has_nodata=False
     )

@@ -23,7 +23,7 @@ from vdgs.errors import VdgsError
 Encoder = Literal["h264", "mpeg4"]
 
 
-def best_encoder() -> Encoder:
+def default_encoder() -> Encoder:
     """The encoder that `VideoWriter` uses unless told otherwise."""
     return "h264" if importlib.util.find_spec("imageio_ffmpeg") else "mpeg4"
 
@@ -39,7 +39,7 @@ class VideoWriter:
     def __init__(self, path: Path, fps: float, encoder: Encoder | None = None) -> None:
         if path.suffix.lower() != ".mp4":
             raise VdgsError(f"{path}: films are written as MP4; give a name that ends in .mp4.")
-        self.path, self.fps, self.encoder = path, fps, encoder or best_encoder()
+        self.path, self.fps, self.encoder = path, fps, encoder or default_encoder()
         self._partial = path.with_name(f".{path.stem}.{os.getpid()}.partial.mp4")
         self._shape: tuple[int, ...] | None = None
         self._opencv: Any = None

@@ -10,13 +10,15 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 
 from vdgs.captures.capture import Capture
-from vdgs.plots.style import DPI, INK, NOTE, SEEN, TEXT, plain
-from vdgs.plots.visibility_map import CameraMarks, SeenMap, draw_seen_map, steps
-from vdgs.report.capture_stats import CaptureReport, length
-from vdgs.visibility.visibility_counts import LIMITS
+from vdgs.plots.style import DPI, INK, NOTE_SIZE, TEXT_SIZE, VISIBILITY_CMAP, style_axes
+from vdgs.plots.visibility_map import CameraMarks, VisibilityMapData, plot_visibility_map, visibility_color_norm
+from vdgs.report.capture_stats import CaptureReport, format_length
+from vdgs.visibility.visibility_counts import LOW_VISIBILITY_LIMITS
 
 
-def draw_map(capture: Capture, report: CaptureReport, points: np.ndarray, visibility: np.ndarray, file: Path) -> None:
+def draw_capture_map(
+    capture: Capture, report: CaptureReport, points: np.ndarray, visibility: np.ndarray, file: Path
+) -> None:
     """Cameras and points from above, points coloured by V; beside it the histogram of V."""
     low, high = _frame(capture, points)
     marks = (
@@ -24,48 +26,50 @@ def draw_map(capture: Capture, report: CaptureReport, points: np.ndarray, visibi
         CameraMarks("test camera", [view.camera for view in capture.test_views], "white", INK),
     )
     x_label, y_label = capture.ground.axis_names
-    seen = SeenMap(
+    seen = VisibilityMapData(
         points=points, visibility=visibility, low=low, high=high, ground=float(np.median(capture.points[:, 2])),
         marks=marks, x_label=x_label, y_label=y_label, noun="a point", titles=_titles(capture, report),
     )  # fmt: skip
-    draw_seen_map(file, seen)
+    plot_visibility_map(file, seen)
 
 
-def draw_visibility(report: CaptureReport, visibility: np.ndarray, file: Path) -> None:
+def draw_visibility_histogram(report: CaptureReport, visibility: np.ndarray, file: Path) -> None:
     """How many points are seen at least so often, and the share that fewer than 3, 5, 10 cameras see."""
     figure = Figure(figsize=(10.5, 4.3), dpi=DPI, layout="constrained")
     figure.get_layout_engine().set(w_pad=0.12, h_pad=0.1)  # type: ignore[union-attr, call-arg]
     canvas = FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2, width_ratios=[1.7, 1])
-    top, norm = steps(visibility)
+    top, norm = visibility_color_norm(visibility)
     counts = np.arange(0, round(1.15 * top) + 2)
     at_least = np.array([(visibility >= count).mean() for count in counts])
     left.plot(counts, at_least, color=INK, linewidth=1.6, drawstyle="steps-mid")
     exactly = np.array([(visibility == count).mean() for count in counts])
-    left.bar(counts, exactly, width=0.86, color=SEEN(norm(np.minimum(counts, top))))
-    for limit in LIMITS:
+    left.bar(counts, exactly, width=0.86, color=VISIBILITY_CMAP(norm(np.minimum(counts, top))))
+    for limit in LOW_VISIBILITY_LIMITS:
         if limit <= visibility.max():
             share = float((visibility >= limit).mean())
-            left.plot([limit], [share], "o", color=SEEN(norm(limit)), markersize=7, markeredgecolor="white")
+            left.plot([limit], [share], "o", color=VISIBILITY_CMAP(norm(limit)), markersize=7, markeredgecolor="white")
             left.annotate(
                 f"{share:.1%} by {limit} or more",
                 (limit, share),
                 (9, 7),
                 textcoords="offset points",
-                fontsize=NOTE,
+                fontsize=NOTE_SIZE,
                 color=INK,
             )
     left.set(xlim=(-0.6, counts[-1]), ylim=(0, 1.08), xlabel="training cameras that see a point, V")
     left.set_title(
         "Share of the points seen by exactly V cameras (bars) and by at least V (line)",
         loc="left",
-        fontsize=TEXT,
+        fontsize=TEXT_SIZE,
         color=INK,
     )
-    shares = [report.share_below[limit] for limit in LIMITS]
-    rows = np.arange(len(LIMITS))[::-1]
-    right.barh(rows, shares, color=[SEEN(norm(min(limit - 1, top))) for limit in LIMITS], height=0.55)
-    right.set_yticks(rows, [f"fewer than {limit}" for limit in LIMITS])
+    shares = [report.share_below[limit] for limit in LOW_VISIBILITY_LIMITS]
+    rows = np.arange(len(LOW_VISIBILITY_LIMITS))[::-1]
+    right.barh(
+        rows, shares, color=[VISIBILITY_CMAP(norm(min(limit - 1, top))) for limit in LOW_VISIBILITY_LIMITS], height=0.55
+    )
+    right.set_yticks(rows, [f"fewer than {limit}" for limit in LOW_VISIBILITY_LIMITS])
     for row, share in zip(rows, shares, strict=True):
         inside = share > 0.8
         right.text(
@@ -74,13 +78,13 @@ def draw_visibility(report: CaptureReport, visibility: np.ndarray, file: Path) -
             f"{share:.1%}",
             va="center",
             ha="right" if inside else "left",
-            fontsize=NOTE,
+            fontsize=NOTE_SIZE,
             color="white" if inside else INK,
         )
     right.set(xlim=(0, min(1.0, max(0.3, 1.25 * max(shares)))), xlabel="share of the points")
-    right.set_title("Poorly seen", loc="left", fontsize=TEXT, color=INK)
+    right.set_title("Poorly seen", loc="left", fontsize=TEXT_SIZE, color=INK)
     for axes in (left, right):
-        plain(axes)
+        style_axes(axes)
     left.xaxis.set_major_locator(MaxNLocator(integer=True))
     left.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
     right.xaxis.set_major_formatter(PercentFormatter(1, decimals=0))
@@ -93,7 +97,7 @@ def _titles(capture: Capture, report: CaptureReport) -> tuple[str, str, str]:
     facts = [
         f"{report.points:,} points",
         f"camera height {report.camera_height[1]:.3g} {report.unit}",
-        f"{length(report.ground_sample_distance, report.unit)} per pixel",
+        f"{format_length(report.ground_sample_distance, report.unit)} per pixel",
         f"a point is seen by {report.visibility_quantiles[50]:g} training cameras (median)",
     ]
     return name, "  ·  ".join(facts), "points coloured by V; pale: V on level ground"

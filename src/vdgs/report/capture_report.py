@@ -13,50 +13,50 @@ from rich.markup import escape
 from rich.table import Table
 
 from vdgs.captures.capture import Capture
-from vdgs.captures.image_checks import CheckedImages
-from vdgs.captures.output_guard import refuse_among_inputs
-from vdgs.captures.reconstruction import ReconstructionFacts, facts_rows, left_out_lines
-from vdgs.captures.validation import judge, reprojection_words
+from vdgs.captures.image_checks import ImageCheckReport
+from vdgs.captures.output_guard import check_not_among_inputs
+from vdgs.captures.reconstruction import ReconstructionReport, excluded_lines, report_rows
+from vdgs.captures.validation import format_reprojection, validate_capture
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.row_sampling import sample_points
-from vdgs.report.capture_figures import draw_map, draw_visibility
-from vdgs.report.capture_stats import CaptureReport, length, measure
-from vdgs.system.atomic_files import jsonable, write_json
-from vdgs.visibility.visibility_counts import visibility_of
+from vdgs.report.capture_figures import draw_capture_map, draw_visibility_histogram
+from vdgs.report.capture_stats import CaptureReport, format_length, measure_capture
+from vdgs.system.atomic_files import to_jsonable, write_json
+from vdgs.visibility.visibility_counts import count_visibility
 
 #: Points looked at when there are more, and fewer where there are many cameras.
-MOST_POINTS = 200_000
-LEAST_POINTS = 20_000
-MOST_PROJECTIONS = 2e8
+MAX_POINTS = 200_000
+MIN_POINTS = 20_000
+MAX_PROJECTIONS = 2e8
 
 
-def inspect_capture(capture: Capture, output: Path, checked: CheckedImages | None = None) -> CaptureReport:
+def inspect_capture(capture: Capture, output: Path, image_check: ImageCheckReport | None = None) -> CaptureReport:
     """Measure the capture; write report.json and two figures into the folder `output` (made if absent).
 
     `checked` is what decoding its photographs told, where they were decoded. Raises VdgsError for an output among the
     capture's inputs.
     """
-    refuse_among_inputs(output, capture)
+    check_not_among_inputs(output, capture)
     output.mkdir(parents=True, exist_ok=True)
-    few_enough = int(np.clip(MOST_PROJECTIONS / len(capture.train_views), LEAST_POINTS, MOST_POINTS))
+    few_enough = int(np.clip(MAX_PROJECTIONS / len(capture.train_views), MIN_POINTS, MAX_POINTS))
     points = sample_points(capture.points, few_enough)
     visibility = _visibility(points, [view.camera for view in capture.train_views])
-    report = measure(capture, points, visibility, judge(capture), checked)
+    report = measure_capture(capture, points, visibility, validate_capture(capture), image_check)
     figures = [output / "visibility_map.png", output / "visibility.png"]
-    draw_map(capture, report, points, visibility, figures[0])
-    draw_visibility(report, visibility, figures[1])
+    draw_capture_map(capture, report, points, visibility, figures[0])
+    draw_visibility_histogram(report, visibility, figures[1])
     report = replace(report, figures=[file.name for file in figures])
-    write_json(output / "report.json", jsonable(asdict(report)))
+    write_json(output / "report.json", to_jsonable(asdict(report)))
     return report
 
 
 def _visibility(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     """V of points [n, 3], int64 [n]."""
-    return visibility_of(torch.from_numpy(np.ascontiguousarray(points)), cameras).numpy().astype(np.int64)
+    return count_visibility(torch.from_numpy(np.ascontiguousarray(points)), cameras).numpy().astype(np.int64)
 
 
 def print_report(
-    report: CaptureReport, console: Console | None = None, reconstruction: ReconstructionFacts | None = None
+    report: CaptureReport, console: Console | None = None, reconstruction_report: ReconstructionReport | None = None
 ) -> None:
     """The report as a table for people, with how the capture was made of photographs, where it was made here."""
     console = console or Console()
@@ -65,17 +65,17 @@ def print_report(
     table.add_column()
     for label, value in _rows(report):
         table.add_row(label, escape(value))
-    for label, value in facts_rows(reconstruction) if reconstruction is not None else ():
+    for label, value in report_rows(reconstruction_report) if reconstruction_report is not None else ():
         table.add_row(label, escape(value))
     console.print(table)
     for warning in report.warnings:
         console.print(f"[yellow]Warning:[/] {escape(warning)}", highlight=False)
     for problem in report.problems:
         console.print(f"[red]Problem:[/] {escape(problem)}", highlight=False)
-    if reconstruction is not None:
-        for line in left_out_lines(reconstruction):
+    if reconstruction_report is not None:
+        for line in excluded_lines(reconstruction_report):
             console.print(f"[yellow]Left out:[/] {escape(line)}", highlight=False)
-        for line in reconstruction.advice:
+        for line in reconstruction_report.advice:
             console.print(f"Next flight: {escape(line)}", highlight=False)
 
 
@@ -93,11 +93,11 @@ def _rows(report: CaptureReport) -> list[tuple[str, str]]:
             f"{report.images or '.'}/: {sizes}" + (f" and {more} more sizes" if more > 0 else "") + " px",
         ),
         ("Focal length", f"{report.focal_px:.1f} px ({report.field_of_view_deg:.0f}° across)"),
-        ("Sparse points", f"{report.points}, median spacing {length(report.point_spacing, unit)}"),
+        ("Sparse points", f"{report.points}, median spacing {format_length(report.point_spacing, unit)}"),
         ("Ground frame", report.ground + ("" if report.metric else " (not metric)")),
         ("Extent", " x ".join(f"{value:.4g}" for value in report.extent) + f" {unit} (1-99 % of the points)"),
         ("Camera height", f"{middle:.4g} {unit} (from {low:.4g} to {high:.4g}), tilt {report.tilt_deg:.1f}°"),
-        ("Ground sample distance", f"{length(report.ground_sample_distance, unit)} per pixel"),
+        ("Ground sample distance", f"{format_length(report.ground_sample_distance, unit)} per pixel"),
         ("Cameras per point V", quantiles),
         ("Poorly seen points", f"{below} cameras; Gini {report.visibility_gini:.2f}"),
         ("Masks", _masks(report)),
@@ -112,8 +112,10 @@ def _rows(report: CaptureReport) -> list[tuple[str, str]]:
 
 def _masks(report: CaptureReport) -> str:
     """How much of the photographs is left out."""
-    left_out = "photographs not decoded" if report.masked_share is None else f"{report.masked_share:.1%} masked out"
-    if not report.masks and not report.masked_share:
+    left_out = (
+        "photographs not decoded" if report.masked_fraction is None else f"{report.masked_fraction:.1%} masked out"
+    )
+    if not report.masks and not report.masked_fraction:
         return "none"
     transparent = "" if report.masks else ", by transparency"
     return f"of {report.masks} of {report.photographs} photographs; {left_out}{transparent}"
@@ -121,8 +123,8 @@ def _masks(report: CaptureReport) -> str:
 
 def _agreement(report: CaptureReport) -> str:
     """Whether the points lie where the photographs show them, and by what that was judged."""
-    seen = f"{report.share_seen:.1%} of the points lie in front of and inside a training camera"
+    seen = f"{report.seen_fraction:.1%} of the points lie in front of and inside a training camera"
     if not report.sightings:
         return f"{seen} (the capture has no tracks to reproject)"
-    error = reprojection_words(float("inf") if report.reprojection_px is None else report.reprojection_px)
+    error = format_reprojection(float("inf") if report.reprojection_px is None else report.reprojection_px)
     return f"median reprojection error {error} ({report.sightings} sightings of the model's tracks); {seen}"

@@ -14,10 +14,10 @@ import torch
 from scipy.spatial import cKDTree
 
 from vdgs.captures.capture import Capture
-from vdgs.captures.image_checks import CheckedImages
-from vdgs.captures.validation import Soundness
+from vdgs.captures.image_checks import ImageCheckReport
+from vdgs.captures.validation import ValidationReport
 from vdgs.geometry.row_sampling import sample_points
-from vdgs.visibility.visibility_counts import LIMITS, imbalance, visibility_of
+from vdgs.visibility.visibility_counts import LOW_VISIBILITY_LIMITS, count_visibility, visibility_stats
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,21 +59,25 @@ class CaptureReport:
     image_bytes: int
     #: Photographs with a mask, and the share of all pixels that masks and transparency leave out; None: not decoded.
     masks: int
-    masked_share: float | None
+    masked_fraction: float | None
     #: Median reprojection error in pixels as used, on so many sightings; None where the capture has no tracks, or where
     #: most of their points lie behind the cameras.
     reprojection_px: float | None
     sightings: int
     #: Share of the points that at least one training camera sees.
-    share_seen: float
+    seen_fraction: float
     #: What makes training pointless, and what a person should know but need not mend.
     problems: list[str]
     warnings: list[str]
     figures: list[str]
 
 
-def measure(
-    capture: Capture, points: np.ndarray, visibility: np.ndarray, soundness: Soundness, checked: CheckedImages | None
+def measure_capture(
+    capture: Capture,
+    points: np.ndarray,
+    visibility: np.ndarray,
+    validation: ValidationReport,
+    image_check: ImageCheckReport | None,
 ) -> CaptureReport:
     """The report on a capture, given (a sample of) its points and their V; `checked` None: nothing was decoded."""
     cameras = [view.camera for view in capture.views]
@@ -87,7 +91,7 @@ def measure(
     tilts = [np.degrees(np.arccos(np.clip(-camera.forward[2], -1, 1))) for camera in cameras]
     masked = sum(view.camera.width * view.camera.height for view in capture.views if view.mask_path)
     origin = capture.ground.origin_geo
-    seen = imbalance(visibility)
+    seen = visibility_stats(visibility)
     return CaptureReport(
         source=capture.source,
         images=capture.images,
@@ -113,15 +117,15 @@ def measure(
         share_below=seen.share_below,
         image_bytes=sum(3 * camera.width * camera.height for camera in cameras) + masked,
         masks=sum(view.mask_path is not None for view in capture.views),
-        masked_share=None if checked is None else checked.masked_share,
-        reprojection_px=soundness.reprojection_px,
-        sightings=soundness.sightings,
-        share_seen=float((visibility > 0).mean()),
-        problems=list(soundness.problems),
+        masked_fraction=None if image_check is None else image_check.masked_fraction,
+        reprojection_px=validation.reprojection_px,
+        sightings=validation.sightings,
+        seen_fraction=float((visibility > 0).mean()),
+        problems=list(validation.problems),
         warnings=[
             *capture.warnings,
-            *(checked.warnings if checked else ()),
-            *soundness.warnings,
+            *(image_check.warnings if image_check else ()),
+            *validation.warnings,
             *_findings(visibility),
         ],
         figures=[],
@@ -132,7 +136,7 @@ def _ground_sample_distance(capture: Capture, points: np.ndarray) -> float | Non
     few = np.ascontiguousarray(sample_points(points, 20_000))
     places, distances = torch.from_numpy(few), []
     for view in capture.views:
-        seen = np.flatnonzero(visibility_of(places, [view.camera]).numpy())
+        seen = np.flatnonzero(count_visibility(places, [view.camera]).numpy())
         if len(seen):
             distances.append(float(np.median(view.camera.project(few[seen])[1])) / view.camera.fx)
     return float(np.median(distances)) if distances else None
@@ -140,16 +144,16 @@ def _ground_sample_distance(capture: Capture, points: np.ndarray) -> float | Non
 
 def _findings(visibility: np.ndarray) -> list[str]:
     """What the visibility says that a person should know."""
-    thin = float((visibility < LIMITS[0]).mean())
+    thin = float((visibility < LOW_VISIBILITY_LIMITS[0]).mean())
     if thin <= 0.05:
         return []
     return [
-        f"{thin:.0%} of the points are seen by fewer than {LIMITS[0]} training cameras; "
+        f"{thin:.0%} of the points are seen by fewer than {LOW_VISIBILITY_LIMITS[0]} training cameras; "
         "expect these parts to come out poorly (see the map)."
     ]
 
 
-def length(value: float | None, unit: str) -> str:
+def format_length(value: float | None, unit: str) -> str:
     """A length for people: centimetres where metres would be small."""
     if value is None:
         return "unknown"

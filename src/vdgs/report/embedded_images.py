@@ -12,17 +12,17 @@ from pathlib import Path
 from PIL import Image
 
 #: Longest side in pixels, and bytes of one picture, at most. Twelve such pictures stay below 8 MB in base64.
-LONGEST_SIDE_PX, MOST_BYTES = 1600, 400_000
+MAX_SIDE_PX, MAX_BYTES = 1600, 400_000
 #: What is tried, in turn, on a picture that comes out too large: its share of the longest side, JPEG quality.
 REDUCTIONS = ((1.0, 85), (1.0, 72), (0.75, 72), (0.5, 72), (0.3, 60))
 
 
-class PictureError(Exception):
+class ImageReadError(Exception):
     """A picture that cannot be read."""
 
 
 @dataclass(frozen=True)
-class Picture:
+class EmbeddedImage:
     """An encoded picture and its size in pixels."""
 
     content: bytes
@@ -34,11 +34,11 @@ class Picture:
         return f"data:image/{self.kind};base64,{base64.b64encode(self.content).decode('ascii')}"
 
 
-def load_picture(path: Path) -> Picture:
+def load_embedded_image(path: Path) -> EmbeddedImage:
     """A PNG file, reduced; drawings stay PNG (sharp lines), photographs become JPEG. Raises PictureError."""
     try:
         with Image.open(path, formats=["PNG"]) as image:
-            return reduced(image)
+            return reduce_image(image)
     except (
         OSError,
         ValueError,
@@ -48,28 +48,28 @@ def load_picture(path: Path) -> Picture:
         zlib.error,
         Image.DecompressionBombError,
     ) as error:
-        raise PictureError(str(error).replace(str(path), path.name)) from error
+        raise ImageReadError(str(error).replace(str(path), path.name)) from error
 
 
-def reduced(image: Image.Image) -> Picture:
+def reduce_image(image: Image.Image) -> EmbeddedImage:
     """The picture within the bounds on side and bytes, on white where it is transparent."""
     flat = Image.new("RGB", image.size, "white")
     layer = image.convert("RGBA")
     flat.paste(layer, mask=layer)
-    flat = _within(flat, LONGEST_SIDE_PX)
-    drawing = _encoded(flat, "png")
-    photograph = _encoded(flat, "jpeg", quality=REDUCTIONS[0][1])
+    flat = _fit_within(flat, MAX_SIDE_PX)
+    drawing = _encode(flat, "png")
+    photograph = _encode(flat, "jpeg", quality=REDUCTIONS[0][1])
     # JPEG smears the lines of drawings, so PNG may cost a little more before it loses.
-    if len(drawing.content) <= min(MOST_BYTES, 2 * len(photograph.content)):
+    if len(drawing.content) <= min(MAX_BYTES, 2 * len(photograph.content)):
         return drawing
     for share, quality in REDUCTIONS:
-        picture = _encoded(_within(flat, int(share * LONGEST_SIDE_PX)), "jpeg", quality=quality)
-        if len(picture.content) <= MOST_BYTES:
+        picture = _encode(_fit_within(flat, int(share * MAX_SIDE_PX)), "jpeg", quality=quality)
+        if len(picture.content) <= MAX_BYTES:
             break
     return picture
 
 
-def _within(image: Image.Image, longest: int) -> Image.Image:
+def _fit_within(image: Image.Image, longest: int) -> Image.Image:
     scale = longest / max(image.size)
     if scale >= 1:
         return image
@@ -77,7 +77,7 @@ def _within(image: Image.Image, longest: int) -> Image.Image:
     return image.resize((width, height), Image.Resampling.LANCZOS)
 
 
-def _encoded(image: Image.Image, kind: str, **options: int) -> Picture:
+def _encode(image: Image.Image, format_name: str, **options: int) -> EmbeddedImage:
     buffer = io.BytesIO()
-    image.save(buffer, format=kind, **options)
-    return Picture(buffer.getvalue(), image.width, image.height, kind)
+    image.save(buffer, format=format_name, **options)
+    return EmbeddedImage(buffer.getvalue(), image.width, image.height, format_name)

@@ -5,24 +5,24 @@ from __future__ import annotations
 from vdgs.system.units import ABSENT
 
 
-def figure_of(value: float | None, form: str) -> str:
+def format_value(value: float | None, form: str) -> str:
     return ABSENT if value is None else form.format(value)
 
 
-def decibels(value: float | None) -> str:
-    return figure_of(value, "{:.2f}")
+def format_db(value: float | None) -> str:
+    return format_value(value, "{:.2f}")
 
 
-def similarity(value: float | None) -> str:
+def format_similarity(value: float | None) -> str:
     """SSIM, LPIPS."""
-    return figure_of(value, "{:.4f}")
+    return format_value(value, "{:.4f}")
 
 
-def share(value: float | None) -> str:
+def format_percent(value: float | None) -> str:
     return ABSENT if value is None else f"{100 * value:.1f} %"
 
 
-def gain(after: float | None, before: float | None, form: str = "{:+.2f}") -> str:
+def format_difference(after: float | None, before: float | None, form: str = "{:+.2f}") -> str:
     """The difference with its sign: a minus as in print, and never one before a zero."""
     if after is None or before is None:
         return ABSENT

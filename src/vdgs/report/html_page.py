@@ -7,14 +7,14 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NewType
 
-from vdgs.report.embedded_images import Picture
+from vdgs.report.embedded_images import EmbeddedImage
 
 #: Markup, as against text.
 Html = NewType("Html", str)
 
 #: The browser may load nothing: all is in the file.
-POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
-STYLE = """
+SECURITY_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+PAGE_STYLE = """
 :root { color-scheme: light; }
 * { box-sizing: border-box; }
 body { margin: 0; background: #fff; color: #22262b; font: 16px/1.5 system-ui, -apple-system, "Segoe UI", sans-serif; }
@@ -67,96 +67,98 @@ pre { overflow-x: auto; background: #f5f7f8; padding: 0.75rem; font-size: 0.8rem
 _FORBIDDEN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
-def escaped(text: str) -> Html:
+def escape_html(text: str) -> Html:
     """Text as markup: `<` and its like stand for themselves, characters that a page may not hold become �."""
     return Html(html.escape(_FORBIDDEN.sub("\N{REPLACEMENT CHARACTER}", text)))
 
 
-def joined(parts: Iterable[Html]) -> Html:
+def join_html(parts: Iterable[Html]) -> Html:
     return Html("\n".join(part for part in parts if part))
 
 
-def paragraph(text: str, kind: str = "") -> Html:
+def paragraph(text: str, css_class: str = "") -> Html:
     """`kind` is "", facts, verdict, note or absent."""
-    return Html(f"<p{_class(kind)}>{escaped(text)}</p>") if text else Html("")
+    return Html(f"<p{_class_attribute(css_class)}>{escape_html(text)}</p>") if text else Html("")
 
 
 def link(address: str, text: str, more: str = "") -> Html:
     """A paragraph that leads to a file, and what follows the link."""
-    return Html(f'<p><a href="{escaped(address)}">{escaped(text)}</a>{escaped(more)}</p>')
+    return Html(f'<p><a href="{escape_html(address)}">{escape_html(text)}</a>{escape_html(more)}</p>')
 
 
 def heading(text: str) -> Html:
-    return Html(f"<h3>{escaped(text)}</h3>")
+    return Html(f"<h3>{escape_html(text)}</h3>")
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[str]], caption: str = "", wordy: bool = False) -> Html:
+def table(
+    head: Sequence[str], rows: Sequence[Sequence[str]], caption: str = "", wrap_last_column: bool = False
+) -> Html:
     """Numbers stand to the right, but in the first column and, if `wordy`, the last. Nothing if there is no row."""
     if not rows:
         return Html("")
-    cells = "".join(f'<th scope="col">{escaped(cell)}</th>' for cell in head)
-    lines = "\n".join("<tr>" + "".join(f"<td>{escaped(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+    cells = "".join(f'<th scope="col">{escape_html(cell)}</th>' for cell in head)
+    lines = "\n".join("<tr>" + "".join(f"<td>{escape_html(cell)}</td>" for cell in row) + "</tr>" for row in rows)
     # The caption stands outside, so that it does not scroll with a wide table.
     return Html(
         f"{paragraph(caption, 'facts')}\n"
-        f'<div class="scroll"><table{_class("wordy" if wordy else "")}>\n<thead><tr>{cells}</tr></thead>\n'
+        f'<div class="scroll"><table{_class_attribute("wordy" if wrap_last_column else "")}>\n<thead><tr>{cells}</tr></thead>\n'
         f"<tbody>\n{lines}\n</tbody></table></div>"
     )
 
 
-def figure(picture: Picture | None, caption: str, alt: str, wide: bool = False, tall: bool = False) -> Html:
+def figure(image_data: EmbeddedImage | None, caption: str, alt: str, wide: bool = False, tall: bool = False) -> Html:
     """A picture that is `wide` is not squeezed to the width of a phone but scrolls; one that is
     `tall` does not fill a desk.
 
     Nothing if there is no picture.
     """
-    if picture is None:
+    if image_data is None:
         return Html("")
-    image = f'<img src="{picture.data_uri()}" width="{picture.width}" height="{picture.height}" alt="{escaped(alt)}">'
-    words = f"<figcaption>{escaped(caption)}</figcaption>" if caption else ""
+    image = f'<img src="{image_data.data_uri()}" width="{image_data.width}" height="{image_data.height}" alt="{escape_html(alt)}">'
+    words = f"<figcaption>{escape_html(caption)}</figcaption>" if caption else ""
     return Html(
-        f'<figure{_class("wide" if wide else "tall" if tall else "")}><div class="scroll">{image}</div>{words}</figure>'
+        f'<figure{_class_attribute("wide" if wide else "tall" if tall else "")}><div class="scroll">{image}</div>{words}</figure>'
     )
 
 
 def gallery(figures: Iterable[Html]) -> Html:
     """Small figures side by side, as many as fit."""
-    shown = joined(figures)
+    shown = join_html(figures)
     return Html(f'<div class="gallery">\n{shown}\n</div>') if shown else shown
 
 
 def details(summary: str, content: Html) -> Html:
     """What is shown on demand."""
-    return Html(f"<details><summary>{escaped(summary)}</summary>\n{content}\n</details>") if content else content
+    return Html(f"<details><summary>{escape_html(summary)}</summary>\n{content}\n</details>") if content else content
 
 
 def preformatted(text: str) -> Html:
-    return Html(f"<pre>{escaped(text)}</pre>")
+    return Html(f"<pre>{escape_html(text)}</pre>")
 
 
 def section(name: str, title: str, parts: Iterable[Html], notes: Iterable[str] = ()) -> Html:
     """A section that links reach as `#name`; `notes` say what of the run could not be read."""
-    body = joined([*(paragraph(note, "note") for note in notes), *parts])
-    return Html(f'<section id="{escaped(name)}">\n<h2>{escaped(title)}</h2>\n{body}\n</section>')
+    body = join_html([*(paragraph(note, "note") for note in notes), *parts])
+    return Html(f'<section id="{escape_html(name)}">\n<h2>{escape_html(title)}</h2>\n{body}\n</section>')
 
 
-def contents(entries: Iterable[tuple[str, str]]) -> Html:
+def table_of_contents(entries: Iterable[tuple[str, str]]) -> Html:
     """Links to sections, given as name and title."""
-    links = " ".join(f'<a href="#{escaped(name)}">{escaped(title)}</a>' for name, title in entries)
+    links = " ".join(f'<a href="#{escape_html(name)}">{escape_html(title)}</a>' for name, title in entries)
     return Html(f"<nav>{links}</nav>")
 
 
-def document(title: str, parts: Iterable[Html], facts: Mapping[str, str] | None = None) -> str:
+def document(title: str, parts: Iterable[Html], metadata: Mapping[str, str] | None = None) -> str:
     """A whole page; `facts` stand in its head, for programs."""
-    told = "".join(f'<meta name="{escaped(k)}" content="{escaped(v)}">\n' for k, v in (facts or {}).items())
+    told = "".join(f'<meta name="{escape_html(k)}" content="{escape_html(v)}">\n' for k, v in (metadata or {}).items())
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{escaped(POLICY)}">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{escape_html(SECURITY_POLICY)}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"{told}<title>{escaped(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n<main>\n"
-        f"{joined(parts)}\n</main>\n</body>\n</html>\n"
+        f"{told}<title>{escape_html(title)}</title>\n<style>{PAGE_STYLE}</style>\n</head>\n<body>\n<main>\n"
+        f"{join_html(parts)}\n</main>\n</body>\n</html>\n"
     )
 
 
-def _class(name: str) -> str:
+def _class_attribute(name: str) -> str:
     return f' class="{name}"' if name else ""

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from pathlib import PurePosixPath
 
-from vdgs.evaluation.by_visibility import bounds_of
-from vdgs.evaluation.image_io import file_stems
-from vdgs.report.charts import draw_gains, draw_pairs
-from vdgs.report.formatting import decibels, figure_of, gain, share, similarity
+from vdgs.evaluation.by_visibility import format_bounds
+from vdgs.evaluation.image_io import unique_file_stems
+from vdgs.report.charts import draw_gain_bars, draw_psnr_bars
+from vdgs.report.formatting import format_db, format_difference, format_percent, format_similarity, format_value
 from vdgs.report.html_page import Html, details, figure, gallery, paragraph, section, table
-from vdgs.report.run_reader import Record, Shown, Source
+from vdgs.report.run_reader import JsonRecord, ReportedRun, RunFiles
 from vdgs.system.units import ABSENT, count, data_size
 
-COARSE, MERGED = "coarse/evaluation", "evaluation"
+COARSE_EVALUATION, MERGED_EVALUATION = "coarse/evaluation", "evaluation"
 #: Rows of the table of test views, and pictures of seams, at most.
-MOST_VIEWS, MOST_SEAMS = 400, 3
+MAX_VIEW_ROWS, MAX_SEAM_IMAGES = 400, 3
 #: key in metrics.json, what people call it, format of a value and of a difference
-MEASURES = (
+METRICS = (
     ("psnr", "PSNR (dB) ↑", "{:.2f}", "{:+.2f}"),
     ("psnr_cc", "PSNR, colour-corrected (dB) ↑", "{:.2f}", "{:+.2f}"),
     ("psnr_neutral", "PSNR in neutral colours (dB) ↑", "{:.2f}", "{:+.2f}"),
@@ -39,15 +39,18 @@ MEASURES = (
 )
 
 
-def metrics_of(source: Source) -> tuple[Record, Record]:
+def read_metrics(source: RunFiles) -> tuple[JsonRecord, JsonRecord]:
     """Figures of the coarse and of the merged model; where nothing is merged yet, a run evaluates its coarse model."""
-    coarse, merged = source.record(f"{COARSE}/metrics.json"), source.record(f"{MERGED}/metrics.json")
+    coarse, merged = (
+        source.record(f"{COARSE_EVALUATION}/metrics.json"),
+        source.record(f"{MERGED_EVALUATION}/metrics.json"),
+    )
     if merged.text("model") == "coarse":
-        return coarse or merged, Record({})
+        return coarse or merged, JsonRecord({})
     return coarse, merged
 
 
-def verdict(coarse: Record, merged: Record) -> str:
+def result_summary(coarse: JsonRecord, merged: JsonRecord) -> str:
     """The result in one line."""
     before, after = coarse.number("psnr"), merged.number("psnr")
     if after is None and before is None:
@@ -55,33 +58,33 @@ def verdict(coarse: Record, merged: Record) -> str:
     if after is None or before is None:
         name, one = ("Coarse", coarse) if after is None else ("Merged", merged)
         return (
-            f"{name} model: PSNR {decibels(one.number('psnr'))} dB (colour-corrected "
-            f"{decibels(one.number('psnr_cc'))}), SSIM {similarity(one.number('ssim'))}."
+            f"{name} model: PSNR {format_db(one.number('psnr'))} dB (colour-corrected "
+            f"{format_db(one.number('psnr_cc'))}), SSIM {format_similarity(one.number('ssim'))}."
         )
     return (
-        f"Coarse → merged: PSNR {decibels(before)} → {decibels(after)} dB ({gain(after, before)}), colour-corrected "
+        f"Coarse → merged: PSNR {format_db(before)} → {format_db(after)} dB ({format_difference(after, before)}), colour-corrected "
         f"{_change(coarse, merged, 'psnr_cc', '{:.2f}')} dB; SSIM {_change(coarse, merged, 'ssim', '{:.4f}')}."
     )
 
 
-def _change(coarse: Record, merged: Record, key: str, form: str) -> str:
+def _change(coarse: JsonRecord, merged: JsonRecord, key: str, form: str) -> str:
     before, after = coarse.number(key), merged.number(key)
     signed = form.replace("{:", "{:+")
-    return f"{figure_of(before, form)} → {figure_of(after, form)} ({gain(after, before, signed)})"
+    return f"{format_value(before, form)} → {format_value(after, form)} ({format_difference(after, before, signed)})"
 
 
-def result_table(coarse: Record, merged: Record) -> Html:
+def result_table(coarse: JsonRecord, merged: JsonRecord) -> Html:
     """Every measure of both models and the difference; measures that neither has are left out."""
     rows = [
-        [label, figure_of(coarse.number(key), form), figure_of(merged.number(key), form),
-         gain(merged.number(key), coarse.number(key), signed)]
-        for key, label, form, signed in MEASURES
+        [label, format_value(coarse.number(key), form), format_value(merged.number(key), form),
+         format_difference(merged.number(key), coarse.number(key), signed)]
+        for key, label, form, signed in METRICS
         if (coarse.number(key), merged.number(key)) != (None, None)
     ]  # fmt: skip
     for key, label, words in (
         ("n_anchors", "anchors", count),
         ("model_bytes", "size of the model", data_size),
-        ("fps", "images drawn a second", lambda value: figure_of(value, "{:.1f}")),
+        ("fps", "images drawn a second", lambda value: format_value(value, "{:.1f}")),
         ("test_views", "test views", count),
     ):
         pair = coarse.number(key), merged.number(key)
@@ -92,24 +95,28 @@ def result_table(coarse: Record, merged: Record) -> Html:
     return Html("\n".join(lines))
 
 
-def views_section(shown: Shown) -> Html:
-    source = shown.source()
-    folder = MERGED if source.has(f"{MERGED}/per_view.json") else COARSE
+def views_section(report: ReportedRun) -> Html:
+    source = report.source()
+    folder = MERGED_EVALUATION if source.has(f"{MERGED_EVALUATION}/per_view.json") else COARSE_EVALUATION
     rows = [row for row in source.rows(f"{folder}/per_view.json") if row.number("psnr") is not None]
-    other = {row.text("name"): row for row in source.rows(f"{COARSE}/per_view.json")} if folder == MERGED else {}
+    other = (
+        {row.text("name"): row for row in source.rows(f"{COARSE_EVALUATION}/per_view.json")}
+        if folder == MERGED_EVALUATION
+        else {}
+    )
     parts: list[Html] = []
-    if not rows and not source.exists(f"{MERGED}/per_view.json", f"{COARSE}/per_view.json"):
+    if not rows and not source.exists(f"{MERGED_EVALUATION}/per_view.json", f"{COARSE_EVALUATION}/per_view.json"):
         parts.append(paragraph("No test view is evaluated yet.", "absent"))
     for kind, row in _best_median_worst(rows):
-        parts.append(_comparison(source, folder, kind, row, other.get(row.text("name"), Record({}))))
-    parts.append(_least_solid(source, folder, rows))
+        parts.append(_comparison(source, folder, kind, row, other.get(row.text("name"), JsonRecord({}))))
+    parts.append(_least_opaque_view(source, folder, rows))
     sheet = source.picture(f"{folder}/contact_sheet.png")
     parts.append(figure(sheet, "All test views (or an even choice of them).", "contact sheet of the test views", True))
     parts.append(details(f"All {len(rows)} test views in numbers", _views_table(rows, other)))
     return section("views", "Test views", parts, source.notes)
 
 
-def _best_median_worst(rows: list[Record]) -> list[tuple[str, Record]]:
+def _best_median_worst(rows: list[JsonRecord]) -> list[tuple[str, JsonRecord]]:
     """By PSNR; fewer where there are fewer than three views."""
     ranked = sorted(rows, key=lambda row: row.number("psnr") or 0.0)
     if not ranked:
@@ -118,11 +125,11 @@ def _best_median_worst(rows: list[Record]) -> list[tuple[str, Record]]:
     return [(kind, ranked[rank]) for rank, kind in sorted(chosen.items(), reverse=True)]
 
 
-def _comparison(source: Source, folder: str, kind: str, row: Record, coarse: Record) -> Html:
+def _comparison(source: RunFiles, folder: str, kind: str, row: JsonRecord, coarse: JsonRecord) -> Html:
     name, stem = row.text("name") or "unnamed", PurePosixPath(row.text("render") or "").stem
-    caption = f"{kind}: {name}, {decibels(row.number('psnr'))} dB, SSIM {similarity(row.number('ssim'))}"
+    caption = f"{kind}: {name}, {format_db(row.number('psnr'))} dB, SSIM {format_similarity(row.number('ssim'))}"
     if coarse.number("psnr") is not None:
-        caption += f" (coarse {decibels(coarse.number('psnr'))} dB)"
+        caption += f" (coarse {format_db(coarse.number('psnr'))} dB)"
     if row.number("mean_visibility") is not None:
         caption += f", mean V {row.number('mean_visibility'):.1f}"
     picture = source.picture(f"{folder}/comparisons/{stem}.png") if stem else None
@@ -131,7 +138,7 @@ def _comparison(source: Source, folder: str, kind: str, row: Record, coarse: Rec
     return figure(picture, f"{caption}.", f"photograph, render and error of {name}", True)
 
 
-def _least_solid(source: Source, folder: str, rows: list[Record]) -> Html:
+def _least_opaque_view(source: RunFiles, folder: str, rows: list[JsonRecord]) -> Html:
     """Alpha of the view with the lowest share of opaque pixels: where ground is half transparent, it is grey."""
     known = [(solid, row) for row in rows if (solid := row.number("solid_share")) is not None and row.text("alpha")]
     if not known:
@@ -140,32 +147,32 @@ def _least_solid(source: Source, folder: str, rows: list[Record]) -> Html:
     name, stem = row.text("name") or "unnamed", PurePosixPath(row.text("alpha") or "").stem
     caption = (
         f"Least solid: alpha of {name}, white is opaque. Of its pixels that at least 3 training cameras see, "
-        f"{share(solid)} have alpha of at least 0.95."
+        f"{format_percent(solid)} have alpha of at least 0.95."
     )
     return figure(source.picture(f"{folder}/alpha/{stem}.png"), caption, f"alpha of {name}")
 
 
-def _views_table(rows: list[Record], other: dict[str | None, Record]) -> Html:
+def _views_table(rows: list[JsonRecord], other: dict[str | None, JsonRecord]) -> Html:
     lines = []
-    for row in rows[:MOST_VIEWS]:
-        before = other.get(row.text("name"), Record({})).number("psnr")
+    for row in rows[:MAX_VIEW_ROWS]:
+        before = other.get(row.text("name"), JsonRecord({})).number("psnr")
         lines.append(
-            [row.text("name") or ABSENT, figure_of(row.number("mean_visibility"), "{:.2f}"), decibels(before),
-             decibels(row.number("psnr")), gain(row.number("psnr"), before), decibels(row.number("psnr_cc")),
-             similarity(row.number("ssim")), similarity(row.number("lpips_vgg")), share(row.number("solid_share")),
+            [row.text("name") or ABSENT, format_value(row.number("mean_visibility"), "{:.2f}"), format_db(before),
+             format_db(row.number("psnr")), format_difference(row.number("psnr"), before), format_db(row.number("psnr_cc")),
+             format_similarity(row.number("ssim")), format_similarity(row.number("lpips_vgg")), format_percent(row.number("solid_share")),
              count(row.number("largest_splats"))]
         )  # fmt: skip
     head = ["view", "mean V", "PSNR coarse", "PSNR", "Δ", "PSNR cc", "SSIM", "LPIPS vgg", "solid", "large splats"]
-    caption = f"The first {MOST_VIEWS} of {len(rows)}" if len(rows) > MOST_VIEWS else ""
+    caption = f"The first {MAX_VIEW_ROWS} of {len(rows)}" if len(rows) > MAX_VIEW_ROWS else ""
     return table(head, lines, caption)
 
 
-def by_visibility_section(shown: Shown) -> Html:
-    source = shown.source()
-    coarse, merged = metrics_of(source)
+def by_visibility_section(report: ReportedRun) -> Html:
+    source = report.source()
+    coarse, merged = read_metrics(source)
     bins = merged.rows("by_visibility") or coarse.rows("by_visibility")
     theirs = {_bounds(row): row for row in coarse.rows("by_visibility")}
-    pairs = [(theirs.get(_bounds(row), Record({})), row if merged else Record({})) for row in bins]
+    pairs = [(theirs.get(_bounds(row), JsonRecord({})), row if merged else JsonRecord({})) for row in bins]
     parts = [paragraph("Pixels of all test views, by the number V of training photographs that see the place drawn.")]
     if not bins:
         parts.append(paragraph("There are no figures by visibility yet.", "absent"))
@@ -176,36 +183,36 @@ def by_visibility_section(shown: Shown) -> Html:
     labels = [name.replace(" to ", "–").replace(" ", "\n") for name in names]
     parts.append(
         gallery(
-            [figure(draw_pairs(labels, before, after), "", "PSNR by visibility"),
-             figure(draw_gains(labels, gains), "", "gain of PSNR by visibility")]
+            [figure(draw_psnr_bars(labels, before, after), "", "PSNR by visibility"),
+             figure(draw_gain_bars(labels, gains), "", "gain of PSNR by visibility")]
         )
     )  # fmt: skip
     return section("by-visibility", "Quality by visibility", parts, source.notes)
 
 
-def _bounds(row: Record) -> str:
+def _bounds(row: JsonRecord) -> str:
     lower, upper = row.number("lower"), row.number("upper")
-    return "nothing drawn" if lower is None or upper is None else bounds_of(lower, upper)
+    return "nothing drawn" if lower is None or upper is None else format_bounds(lower, upper)
 
 
-def _bins_table(bins: list[Record], pairs: list[tuple[Record, Record]]) -> Html:
+def _bins_table(bins: list[JsonRecord], pairs: list[tuple[JsonRecord, JsonRecord]]) -> Html:
     rows = []
     for row, (coarse, merged) in zip(bins, pairs, strict=True):
         line = [_bounds(row), count(row.number("pixels"))]
         for key, form, signed in (("psnr", "{:.2f}", "{:+.2f}"), ("psnr_cc", "{:.2f}", "{:+.2f}"),
                                   ("ssim", "{:.4f}", "{:+.4f}")):  # fmt: skip
             before, after = coarse.number(key), merged.number(key)
-            line += [figure_of(before, form), figure_of(after, form), gain(after, before, signed)]
+            line += [format_value(before, form), format_value(after, form), format_difference(after, before, signed)]
         rows.append(line)
     head = ["V", "pixels", "PSNR coarse", "merged", "Δ", "PSNR cc coarse", "merged", "Δ", "SSIM coarse", "merged", "Δ"]
     return table(head, rows)
 
 
-def seams_section(shown: Shown) -> Html:
-    source = shown.source()
-    facts = source.record(f"{MERGED}/by_block.json")
+def seams_section(report: ReportedRun) -> Html:
+    source = report.source()
+    facts = source.record(f"{MERGED_EVALUATION}/by_block.json")
     parts: list[Html] = []
-    if not facts and not source.exists(f"{MERGED}/by_block.json"):
+    if not facts and not source.exists(f"{MERGED_EVALUATION}/by_block.json"):
         parts.append(paragraph("There are no figures by block: fewer than two blocks are merged.", "absent"))
     rows = [_block_row(count(row.number("block")), row) for row in facts.rows("blocks")]
     if rows and facts.inner("all"):
@@ -220,37 +227,44 @@ def seams_section(shown: Shown) -> Html:
         )
     )
     parts.append(paragraph(_seam_sentence(facts.inner("seams"))))
-    parts += _seam_pictures(source, facts.rows("views"))
+    parts += _seam_images(source, facts.rows("views"))
     return section("seams", "Per block, and the seams between blocks", parts, source.notes)
 
 
-def _block_row(name: str, row: Record) -> list[str]:
+def _block_row(name: str, row: JsonRecord) -> list[str]:
     before, alone, after = (row.number(f"psnr_{key}") for key in ("coarse", "alone", "merged"))
-    return [name, count(row.number("pixels")), decibels(before), decibels(alone), decibels(after), gain(after, before)]
+    return [
+        name,
+        count(row.number("pixels")),
+        format_db(before),
+        format_db(alone),
+        format_db(after),
+        format_difference(after, before),
+    ]
 
 
-def _seam_sentence(seams: Record) -> str:
+def _seam_sentence(seams: JsonRecord) -> str:
     ratio = seams.number("seam_mae")
     if ratio is None:
         return ""
     near, pixels = seams.number("border_px"), seams.number("border_pixels")
     return (
-        f"Within {figure_of(near, '{:g}')} px of a border between blocks ({count(pixels)} pixels), the error relative "
+        f"Within {format_value(near, '{:g}')} px of a border between blocks ({count(pixels)} pixels), the error relative "
         f"to elsewhere is {ratio:.2f} times what it is in the coarse model, which has no seams (mean absolute error; "
-        f"squared error {figure_of(seams.number('seam_mse'), '{:.2f}')}). 1 is no seam; above 1, borders got worse."
+        f"squared error {format_value(seams.number('seam_mse'), '{:.2f}')}). 1 is no seam; above 1, borders got worse."
     )
 
 
-def _seam_pictures(source: Source, views: list[Record]) -> list[Html]:
+def _seam_images(source: RunFiles, views: list[JsonRecord]) -> list[Html]:
     """The views in which most pixels lie near a border."""
     names = [row.text("name") or "" for row in views]
     near = [row.number("border_pixels") or 0.0 for row in views]
     found = [
-        (-pixels, name, f"{MERGED}/seams/{stem}.png")
-        for pixels, name, stem in zip(near, names, file_stems(names), strict=True)
-        if source.has(f"{MERGED}/seams/{stem}.png")
+        (-pixels, name, f"{MERGED_EVALUATION}/seams/{stem}.png")
+        for pixels, name, stem in zip(near, names, unique_file_stems(names), strict=True)
+        if source.has(f"{MERGED_EVALUATION}/seams/{stem}.png")
     ]
     return [
         figure(source.picture(file), f"{name}: the model before and after the merge.", f"seams in {name}", True)
-        for _, name, file in sorted(found)[:MOST_SEAMS]
+        for _, name, file in sorted(found)[:MAX_SEAM_IMAGES]
     ]

@@ -9,18 +9,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vdgs.report.embedded_images import Picture, PictureError, load_picture
+from vdgs.report.embedded_images import EmbeddedImage, ImageReadError, load_embedded_image
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.run_status import RunStanding, Standing
+from vdgs.runs.run_status import RunStatus, StageStatus
 
 #: Characters of one text, and entries of one list of texts, that a report shows.
-LONGEST_TEXT, MOST_TEXTS = 600, 40
+MAX_TEXT_CHARS, MAX_TEXTS = 600, 40
 #: Numbers beyond are damage.
-LARGEST = 1e30
+MAX_ABS_VALUE = 1e30
 
 
 @dataclass(frozen=True)
-class Record:
+class JsonRecord:
     """A JSON object in which anything may be missing or of another kind than expected."""
 
     values: Mapping[str, Any]
@@ -33,7 +33,7 @@ class Record:
         value = self.values.get(key)
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             return None
-        return float(value) if abs(value) <= LARGEST else None
+        return float(value) if abs(value) <= MAX_ABS_VALUE else None
 
     def text(self, key: str) -> str | None:
         value = self.values.get(key)
@@ -44,39 +44,39 @@ class Record:
         if not isinstance(values, list):
             return []
         found = [_shortened(value) for value in values if isinstance(value, str)]
-        more = len(found) - MOST_TEXTS
-        return found[:MOST_TEXTS] + ([f"… and {more} more"] if more > 0 else [])
+        more = len(found) - MAX_TEXTS
+        return found[:MAX_TEXTS] + ([f"… and {more} more"] if more > 0 else [])
 
-    def inner(self, key: str) -> Record:
+    def inner(self, key: str) -> JsonRecord:
         return _record(self.values.get(key))
 
-    def rows(self, key: str) -> list[Record]:
+    def rows(self, key: str) -> list[JsonRecord]:
         return _rows(self.values.get(key))
 
 
 @dataclass(frozen=True)
-class Shown:
+class ReportedRun:
     """The run that a report shows, and how far its stages are."""
 
     run: RunFolder
-    standing: RunStanding
+    status: RunStatus
 
-    def source(self) -> Source:
+    def source(self) -> RunFiles:
         """Its files, for one section: those that do not fit the run are left out."""
-        stale = {stage.folder: _out_of_date(stage) for stage in self.standing.stages if stage.state == "stale"}
-        return Source(self.run.path, stale)
+        stale = {stage.folder: _stale_note(stage) for stage in self.status.stages if stage.state == "stale"}
+        return RunFiles(self.run.path, stale)
 
-    def state_of(self, name: str) -> str:
+    def stage_state(self, name: str) -> str:
         """How far a stage is, in words."""
-        stage = self.standing.of(name)
-        state, why = STATES.get(stage.state, stage.state), stage.why
+        stage = self.status.of(name)
+        state, why = STATE_LABELS.get(stage.state, stage.state), stage.why
         if stage.state == "unknown" and stage.status is not None:  # the caution at the top says the rest
             state, why = stage.status.state, stage.status.why or ""
         return state + (f": {why}" if why else "")
 
-    def cautions(self) -> list[str]:
+    def warnings(self) -> list[str]:
         """What to say of all that is shown though nobody knows whether it fits."""
-        unknown = [stage for stage in self.standing.stages if stage.state == "unknown"]
+        unknown = [stage for stage in self.status.stages if stage.state == "unknown"]
         if not unknown:
             return []
         names = ", ".join(stage.name for stage in unknown)
@@ -84,16 +84,16 @@ class Shown:
 
 
 #: States that need more words than their name.
-STATES = {"stale": "out of date", "unknown": "not known"}
+STATE_LABELS = {"stale": "out of date", "unknown": "not known"}
 
 
-def _out_of_date(stage: Standing) -> str:
+def _stale_note(stage: StageStatus) -> str:
     """Why a stage is left out, in a sentence."""
     folder, why = stage.folder, stage.why
     return f"{folder}: {why}; it is left out. `vdgs status` says which command makes it anew."
 
 
-class Source:
+class RunFiles:
     """The files of a run folder, for one section: what cannot be read is left out, and `notes` says so.
 
     So are files below the folders in `stale`, each with the sentence that says why.
@@ -121,15 +121,15 @@ class Source:
             self.notes.append(why)
         return True
 
-    def record(self, name: str) -> Record:
+    def record(self, name: str) -> JsonRecord:
         """The JSON object of a file; empty if there is none."""
         return _record(self._json(name, dict))
 
-    def rows(self, name: str) -> list[Record]:
+    def rows(self, name: str) -> list[JsonRecord]:
         """The JSON objects of a file that lists them."""
         return _rows(self._json(name, list))
 
-    def lines(self, name: str) -> list[Record]:
+    def lines(self, name: str) -> list[JsonRecord]:
         """The JSON objects of a file with one on each line."""
         text = self.text(name)
         found, bad = [], 0
@@ -137,7 +137,7 @@ class Source:
             try:
                 record = _record(json.loads(line))
             except (ValueError, RecursionError):
-                record = Record({})
+                record = JsonRecord({})
             if record:
                 found.append(record)
             else:
@@ -155,14 +155,14 @@ class Source:
             self.notes.append(f"{name} cannot be read ({error.strerror or error}).")
             return None
 
-    def picture(self, name: str) -> Picture | None:
+    def picture(self, name: str) -> EmbeddedImage | None:
         """A PNG of the run, ready to embed; None if there is none."""
         path = self._root / name
         if not self.has(name):
             return None
         try:
-            return load_picture(path)
-        except PictureError as error:
+            return load_embedded_image(path)
+        except ImageReadError as error:
             self.notes.append(f"{name} is damaged or not a PNG ({error}); it is left out.")
             return None
 
@@ -187,12 +187,12 @@ def _are(count: int) -> str:
 
 
 def _shortened(text: str) -> str:
-    return text if len(text) <= LONGEST_TEXT else text[:LONGEST_TEXT] + "…"
+    return text if len(text) <= MAX_TEXT_CHARS else text[:MAX_TEXT_CHARS] + "…"
 
 
-def _record(value: Any) -> Record:
-    return Record(value if isinstance(value, dict) else {})
+def _record(value: Any) -> JsonRecord:
+    return JsonRecord(value if isinstance(value, dict) else {})
 
 
-def _rows(value: Any) -> list[Record]:
-    return [Record(each) for each in value if isinstance(each, dict)] if isinstance(value, list) else []
+def _rows(value: Any) -> list[JsonRecord]:
+    return [JsonRecord(each) for each in value if isinstance(each, dict)] if isinstance(value, list) else []

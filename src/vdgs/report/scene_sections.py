@@ -6,16 +6,16 @@ import os
 from pathlib import Path
 from urllib.parse import quote
 
-from vdgs.report.formatting import figure_of, share
+from vdgs.report.formatting import format_percent, format_value
 from vdgs.report.html_page import Html, figure, heading, link, paragraph, section, table
-from vdgs.report.run_reader import Record, Shown, Source
+from vdgs.report.run_reader import JsonRecord, ReportedRun, RunFiles
 from vdgs.system.units import ABSENT, count
 
 
-def page_link(shown: Shown) -> Html:
+def html_export_link(report: ReportedRun) -> Html:
     """The page to move through the scene with, where `vdgs export` wrote one of the model that the run has now."""
-    run = shown.run
-    record = Source(run.path).record("export.json")  # its own section tells of other files that cannot be read
+    run = report.run
+    record = RunFiles(run.path).record("export.json")  # its own section tells of other files that cannot be read
     stage = run.merged if record.text("model") == "merged" else run.coarse
     if record.text("key") is None or record.text("key") != stage.key():
         return Html("")
@@ -30,8 +30,8 @@ def page_link(shown: Shown) -> Html:
     return Html("")
 
 
-def visibility_section(shown: Shown) -> Html:
-    source = shown.source()
+def visibility_section(report: ReportedRun) -> Html:
+    source = report.source()
     facts = source.record("visibility/visibility.json")
     parts = [
         paragraph(
@@ -52,8 +52,8 @@ def visibility_section(shown: Shown) -> Html:
     return section("visibility", "The place and its visibility", parts, source.notes)
 
 
-def blocks_section(shown: Shown) -> Html:
-    source = shown.source()
+def blocks_section(report: ReportedRun) -> Html:
+    source = report.source()
     facts = source.record("partition/partition.json")
     parts: list[Html] = []
     if not facts and not source.exists("partition/partition.json"):
@@ -80,8 +80,8 @@ def blocks_section(shown: Shown) -> Html:
     return section("blocks", "Blocks", parts, source.notes)
 
 
-def assignment_section(shown: Shown) -> Html:
-    source = shown.source()
+def assignment_section(report: ReportedRun) -> Html:
+    source = report.source()
     facts = source.record("partition/partition.json")
     rows = facts.rows("blocks")
     parts: list[Html] = []
@@ -104,32 +104,32 @@ def assignment_section(shown: Shown) -> Html:
     return section("cameras", "Camera assignment", parts, source.notes)
 
 
-def _visibility_sentence(facts: Record) -> str:
-    quantiles, below = facts.inner("quantiles"), facts.inner("share_below")
+def _visibility_sentence(record: JsonRecord) -> str:
+    quantiles, below = record.inner("quantiles"), record.inner("share_below")
     parts = []
-    if facts.number("anchors") is not None:
-        parts.append(f"{count(facts.number('anchors'))} anchors, {count(facts.number('training_views'))} photographs")
+    if record.number("anchors") is not None:
+        parts.append(f"{count(record.number('anchors'))} anchors, {count(record.number('training_views'))} photographs")
     if quantiles.number("50") is not None:
         parts.append(f"the median anchor is seen by {quantiles.number('50'):g}")
     if below.number("3") is not None:
-        parts.append(f"{share(below.number('3'))} of the anchors by fewer than 3")
+        parts.append(f"{format_percent(below.number('3'))} of the anchors by fewer than 3")
     return "; ".join(parts) + "." if parts else ""
 
 
-def _distribution(facts: Record) -> Html:
-    quantiles, below = facts.inner("quantiles"), facts.inner("share_below")
+def _distribution(record: JsonRecord) -> Html:
+    quantiles, below = record.inner("quantiles"), record.inner("share_below")
     head = ["mean V", "Gini"]
-    row = [figure_of(facts.number("mean"), "{:.2f}"), figure_of(facts.number("gini"), "{:.3f}")]
+    row = [format_value(record.number("mean"), "{:.2f}"), format_value(record.number("gini"), "{:.3f}")]
     for percent in [key for key in quantiles.values if key.isdecimal()][:9]:
         head.append(f"{percent} %")
-        row.append(figure_of(quantiles.number(percent), "{:g}"))
+        row.append(format_value(quantiles.number(percent), "{:g}"))
     for limit in [key for key in below.values if key.isdecimal()][:9]:
         head.append(f"V < {limit}")
-        row.append(share(below.number(limit)))
+        row.append(format_percent(below.number(limit)))
     return table(head, [row], "V over all anchors: mean, inequality, quantiles, share below a limit")
 
 
-def _blocks_table(rows: list[Record], spatial: list[Record]) -> Html:
+def _blocks_table(rows: list[JsonRecord], spatial: list[JsonRecord]) -> Html:
     spread = {row.number("block"): row.number("std_v") for row in rows}
     head = ["block", "anchors of the core", "widened", "area of the core", "mean V", "cameras"]
     if any(value is not None for value in spread.values()):
@@ -138,19 +138,19 @@ def _blocks_table(rows: list[Record], spatial: list[Record]) -> Html:
     for row in rows:
         line = [
             count(row.number("block")), count(row.number("anchors_core")), count(row.number("anchors_expanded")),
-            figure_of(row.number("area"), "{:,.0f}"), figure_of(row.number("mean_v"), "{:.2f}"),
+            format_value(row.number("area"), "{:,.0f}"), format_value(row.number("mean_v"), "{:.2f}"),
             count(row.number("cameras")),
         ]  # fmt: skip
         if "std V" in head:
-            line.append(figure_of(row.number("std_v"), "{:.2f}"))
+            line.append(format_value(row.number("std_v"), "{:.2f}"))
         lines.append(line)
     ours = table(head, lines, "Areas are in square units of the ground frame (m² where the capture is metric)")
     if not spatial:
         return ours
     theirs = [
         [
-            count(row.number("block")), count(row.number("anchors_core")), figure_of(row.number("area"), "{:,.0f}"),
-            figure_of(row.number("mean_v"), "{:.2f}"), figure_of(row.number("std_v"), "{:.2f}"),
+            count(row.number("block")), count(row.number("anchors_core")), format_value(row.number("area"), "{:,.0f}"),
+            format_value(row.number("mean_v"), "{:.2f}"), format_value(row.number("std_v"), "{:.2f}"),
         ]
         for row in spatial
     ]  # fmt: skip
@@ -158,7 +158,7 @@ def _blocks_table(rows: list[Record], spatial: list[Record]) -> Html:
     return Html(ours + "\n" + heading("For comparison: cut by place alone (λ_vis = 0)") + "\n" + compared)
 
 
-def _cameras_table(rows: list[Record]) -> Html:
+def _cameras_table(rows: list[JsonRecord]) -> Html:
     keys = ("cameras", "above_threshold", "best_block", "topped_up")
     lines = [[count(row.number("block")), *(count(row.number(key)) for key in keys)] for row in rows]
     totals = [_total(rows, key) for key in keys]
@@ -167,20 +167,20 @@ def _cameras_table(rows: list[Record]) -> Html:
     return table(["block", "cameras", "above the threshold", "their best block", "topped up"], lines)
 
 
-def _total(rows: list[Record], key: str) -> str:
+def _total(rows: list[JsonRecord], key: str) -> str:
     values = [row.number(key) for row in rows]
     known = [value for value in values if value is not None]
     return count(sum(known)) if len(known) == len(values) else ABSENT
 
 
-def maps_section(shown: Shown) -> Html:
+def ortho_section(report: ReportedRun) -> Html:
     """The sheet of `vdgs map`, of the merged model that is there."""
-    source = shown.source()
+    source = report.source()
     facts = source.record("maps/map.json")
     parts: list[Html] = []
     if not facts:
         parts.append(paragraph("No maps were made of this run. `vdgs map RUN` makes them."))
-    elif facts.text("model_identity") != shown.run.merged.status().model:
+    elif facts.text("model_identity") != report.run.merged.status().model:
         parts.append(
             paragraph("The maps are of another model than the run has now; `vdgs map RUN` draws them anew.", "note")
         )

@@ -9,61 +9,61 @@ from dataclasses import replace
 from rich.console import Console
 from rich.markup import escape
 
-from vdgs.report.write_report import report_standing
-from vdgs.runs.run_folder import REPORT, RunFolder
-from vdgs.runs.run_status import RunStanding, Standing, standing_of
-from vdgs.runs.stage_folder import Status
+from vdgs.report.write_report import report_status
+from vdgs.runs.run_folder import REPORT_FILE, RunFolder
+from vdgs.runs.run_status import RunStatus, StageStatus, get_run_status
+from vdgs.runs.stage_folder import StatusRecord
 from vdgs.system.documents import RunStatusDocument, StageStatusDocument
 
 #: Exit code of `vdgs status` for a run that is not whole: something of it is missing, runs, failed or is out of date.
-NOT_WHOLE = 3
-STYLES = {
+EXIT_INCOMPLETE = 3
+STATE_STYLES = {
     "done": "green", "running": "cyan", "queued": "dim", "stopped": "yellow", "failed": "red", "stale": "yellow",
     "missing": "dim", "unknown": "yellow",
 }  # fmt: skip
 
 
-def whole_standing(run: RunFolder) -> RunStanding:
+def full_run_status(run: RunFolder) -> RunStatus:
     """How far a run is, its report included. Raises RunError for a folder that holds no run."""
     run.config_file.exists() or run.settings()  # which says that there is none
-    standing = standing_of(run)
-    return replace(standing, stages=(*standing.stages, report_standing(run, standing)))
+    standing = get_run_status(run)
+    return replace(standing, stages=(*standing.stages, report_status(run, standing)))
 
 
 def print_status(run: RunFolder, console: Console) -> int:
-    """Say how far every stage and block is and what to type next; 0 if the run is whole, else `NOT_WHOLE`."""
-    standing = whole_standing(run)
+    """Say how far every stage and block is and what to type next; 0 if the run is whole, else `EXIT_INCOMPLETE`."""
+    standing = full_run_status(run)
     width = max(len(stage.name) for stage in standing.stages)
     for stage in standing.stages:
-        said = "; ".join(part for part in (progress_of(stage.status), stage.why) if part)
-        state = f"[{STYLES[stage.state]}]{stage.state:<8}[/]"
+        said = "; ".join(part for part in (progress_text(stage.status), stage.why) if part)
+        state = f"[{STATE_STYLES[stage.state]}]{stage.state:<8}[/]"
         console.print(f"{stage.name:<{width}}  {state}  {escape(said)}".rstrip(), highlight=False)
     counted = Counter(stage.state for stage in standing.stages)
     console.print(", ".join(f"{count} {state}" for state, count in counted.items()), highlight=False)
     console.print(escape(f"next: {next_step(standing)}"), highlight=False)
-    return 0 if standing.whole else NOT_WHOLE
+    return 0 if standing.whole else EXIT_INCOMPLETE
 
 
-def status_facts(run: RunFolder) -> RunStatusDocument:
+def status_json(run: RunFolder) -> RunStatusDocument:
     """The same for programs."""
-    standing = whole_standing(run)
+    standing = full_run_status(run)
     return {
-        "run": str(run.path), "whole": standing.whole, "at_work": standing.at_work,
-        "next": standing.next_command() or None, "stages": [_facts(stage) for stage in standing.stages],
+        "run": str(run.path), "whole": standing.whole, "at_work": standing.is_running,
+        "next": standing.next_command() or None, "stages": [_stage_json(stage) for stage in standing.stages],
     }  # fmt: skip
 
 
-def next_step(standing: RunStanding) -> str:
+def next_step(status: RunStatus) -> str:
     """What a person does next, in a line."""
-    if command := standing.next_command():
+    if command := status.next_command():
         return command
-    if standing.at_work:
+    if status.is_running:
         return "nothing to type: it is at work"
-    run = shlex.quote(str(standing.path))
-    return f"open {standing.path / REPORT}, or film it: vdgs render {run} --views flyover --output flyover.mp4"
+    run = shlex.quote(str(status.path))
+    return f"open {status.path / REPORT_FILE}, or film it: vdgs render {run} --views flyover --output flyover.mp4"
 
 
-def progress_of(status: Status | None) -> str:
+def progress_text(status: StatusRecord | None) -> str:
     """How far training came, in a few words."""
     if status is None:
         return ""
@@ -83,8 +83,8 @@ def progress_of(status: Status | None) -> str:
     return ", ".join(parts)
 
 
-def _facts(stage: Standing) -> StageStatusDocument:
-    status = stage.status or Status()
+def _stage_json(stage: StageStatus) -> StageStatusDocument:
+    status = stage.status or StatusRecord()
     return {
         "stage": stage.name, "state": stage.state, "why": stage.why or None, "folder": stage.folder,
         "iteration": status.iteration, "iterations": status.iterations, "seconds_left": status.seconds_left,

@@ -10,31 +10,37 @@ import yaml
 
 from vdgs.errors import RunError
 from vdgs.report.cost_sections import costs_section, settings_section
-from vdgs.report.html_page import Html, contents, document, escaped, joined, paragraph
+from vdgs.report.html_page import Html, document, escape_html, join_html, paragraph, table_of_contents
 from vdgs.report.result_sections import (
     by_visibility_section,
-    metrics_of,
+    read_metrics,
+    result_summary,
     result_table,
     seams_section,
-    verdict,
     views_section,
 )
-from vdgs.report.run_reader import Record, Shown, Source
-from vdgs.report.scene_sections import assignment_section, blocks_section, maps_section, page_link, visibility_section
-from vdgs.report.sfm_section import photographs_section
+from vdgs.report.run_reader import JsonRecord, ReportedRun, RunFiles
+from vdgs.report.scene_sections import (
+    assignment_section,
+    blocks_section,
+    html_export_link,
+    ortho_section,
+    visibility_section,
+)
+from vdgs.report.sfm_section import sfm_section
 from vdgs.report.training_section import training_section
-from vdgs.runs.run_folder import REPORT, RunFolder
-from vdgs.runs.run_status import RunStanding, Standing, standing_of
+from vdgs.runs.run_folder import REPORT_FILE, RunFolder
+from vdgs.runs.run_status import RunStatus, StageStatus, get_run_status
 from vdgs.system.atomic_files import write_text
 
 #: name and title of the sections, for the links at the top
-CONTENTS = (
+SECTION_LINKS = (
     ("visibility", "visibility"), ("blocks", "blocks"), ("cameras", "cameras"), ("training", "training"),
     ("views", "test views"), ("maps", "maps"), ("by-visibility", "quality by visibility"), ("seams", "per block"),
     ("costs", "time and memory"), ("settings", "settings"),
 )  # fmt: skip
 #: Name of the line of the page that says which standing of the run it shows, and where it is to be found at the latest.
-STANDING, HEAD_CHARACTERS = "vdgs-standing", 2000
+STATUS_META_NAME, MAX_HEAD_CHARS = "vdgs-standing", 2000
 
 
 def write_report(run: RunFolder) -> Path:
@@ -45,8 +51,8 @@ def write_report(run: RunFolder) -> Path:
     """
     if not run.path.is_dir():
         raise RunError(f"{run.path}: is not a run folder. Train first: vdgs run CAPTURE --output RUN")
-    shown = Shown(run, standing_of(run))
-    photographs = photographs_section(shown)
+    shown = ReportedRun(run, get_run_status(run))
+    photographs = sfm_section(shown)
     sections = [
         *([photographs] if photographs else []),
         visibility_section(shown),
@@ -54,78 +60,80 @@ def write_report(run: RunFolder) -> Path:
         assignment_section(shown),
         training_section(shown),
         views_section(shown),
-        maps_section(shown),
+        ortho_section(shown),
         by_visibility_section(shown),
         seams_section(shown),
         costs_section(shown),
         settings_section(shown),
     ]
-    links = [*([("photographs", "photographs")] if photographs else []), *CONTENTS]
+    links = [*([("photographs", "photographs")] if photographs else []), *SECTION_LINKS]
     header, title = _header(shown)
-    path = run.path / REPORT
-    write_text(path, document(title, [header, contents(links), *sections], {STANDING: shown.standing.digest}))
+    path = run.path / REPORT_FILE
+    write_text(
+        path, document(title, [header, table_of_contents(links), *sections], {STATUS_META_NAME: shown.status.digest})
+    )
     return path
 
 
-def report_standing(run: RunFolder, standing: RunStanding) -> Standing:
+def report_status(run: RunFolder, status: RunStatus) -> StageStatus:
     """Whether the report is there and shows the run as it stands."""
-    path = run.path / REPORT
+    path = run.path / REPORT_FILE
     try:
         with path.open(encoding="utf-8", errors="replace") as file:
-            head = file.read(HEAD_CHARACTERS)
+            head = file.read(MAX_HEAD_CHARS)
     except OSError:
-        return Standing(name="report", state="missing", folder=REPORT)
-    if f'<meta name="{STANDING}" content="{standing.digest}">' in head:
-        return Standing(name="report", state="done", folder=REPORT)
-    return Standing(name="report", state="stale", folder=REPORT, why="the run went on since it was written")
+        return StageStatus(name="report", state="missing", folder=REPORT_FILE)
+    if f'<meta name="{STATUS_META_NAME}" content="{status.digest}">' in head:
+        return StageStatus(name="report", state="done", folder=REPORT_FILE)
+    return StageStatus(name="report", state="stale", folder=REPORT_FILE, why="the run went on since it was written")
 
 
-def _header(shown: Shown) -> tuple[Html, str]:
-    source = shown.source()
+def _header(report: ReportedRun) -> tuple[Html, str]:
+    source = report.source()
     config = _config(source)
     version = config.inner("vdgs")
     made_of = source.record("capture.json")
     name = _capture_name(config, made_of)
-    coarse, merged = metrics_of(source)
+    coarse, merged = read_metrics(source)
     title = f"{name} – vdgs report"
     facts = [
         f"Report of {datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
         f"run begun with vdgs {version.text('version') or 'of unknown version'}"
         + (f", commit {commit[:12]}" if (commit := version.text("commit")) else ""),
-        _photographs(made_of),
+        _image_counts(made_of),
     ]
     parts = [
-        Html(f"<h1>{escaped(name)}</h1>"),
+        Html(f"<h1>{escape_html(name)}</h1>"),
         paragraph(" · ".join(fact for fact in facts if fact), "facts"),
-        *(paragraph(note, "note") for note in [*source.notes, *shown.cautions()]),
-        paragraph(verdict(coarse, merged), "verdict"),
+        *(paragraph(note, "note") for note in [*source.notes, *report.warnings()]),
+        paragraph(result_summary(coarse, merged), "verdict"),
         result_table(coarse, merged),
-        page_link(shown),
+        html_export_link(report),
         *(paragraph(warning, "note") for warning in made_of.texts("warnings")),
     ]
-    return Html(f"<header>\n{joined(parts)}\n</header>"), title
+    return Html(f"<header>\n{join_html(parts)}\n</header>"), title
 
 
-def _config(source: Source) -> Record:
+def _config(source: RunFiles) -> JsonRecord:
     text = source.text("config.yaml")
     try:
         config = yaml.safe_load(text or "")
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         first = str(error).splitlines()[0] if str(error) else "unknown"
         source.notes.append(f"config.yaml is damaged, not valid YAML ({first}).")
-        return Record({})
-    return Record(config if isinstance(config, dict) else {})
+        return JsonRecord({})
+    return JsonRecord(config if isinstance(config, dict) else {})
 
 
-def _capture_name(config: Record, made_of: Record) -> str:
+def _capture_name(config: JsonRecord, capture_record: JsonRecord) -> str:
     """The last folder of the capture's path, whatever system wrote it."""
-    path = config.inner("capture").text("path") or made_of.text("root") or ""
+    path = config.inner("capture").text("path") or capture_record.text("root") or ""
     names = [part for part in re.split(r"[/\\]", path) if part not in ("", ".", "..")]
     return names[-1] if names else "A run without a name"
 
 
-def _photographs(made_of: Record) -> str:
-    training, test = (made_of.values.get(key) for key in ("training_views", "test_views"))
+def _image_counts(capture_record: JsonRecord) -> str:
+    training, test = (capture_record.values.get(key) for key in ("training_views", "test_views"))
     if not isinstance(training, list) or not isinstance(test, list):
         return ""
     return f"{len(training)} training and {len(test)} test photographs"

@@ -14,27 +14,27 @@ from pathlib import Path
 import yaml
 
 from vdgs import __version__
-from vdgs.config.ranges import option
-from vdgs.config.serialization import differences
+from vdgs.config.ranges import to_flag
+from vdgs.config.serialization import diff_settings
 from vdgs.errors import RunError
 from vdgs.runs.run_settings import SECTIONS, RunSettings
 from vdgs.system.atomic_files import write_text
 
 #: Those whose options have no prefix on the command line.
-PLAIN_SECTIONS = ("capture", "training", "partition")
+UNPREFIXED_SECTIONS = ("capture", "training", "partition")
 
 
-def option_of(setting: str) -> str:
+def setting_flag(setting: str) -> str:
     """`--lambda-vis` for partition.lambda_vis: how `vdgs run` calls a setting of config.yaml."""
     section, _, name = setting.partition(".")
-    return option((name,) if section in PLAIN_SECTIONS else (section, name))
+    return to_flag((name,) if section in UNPREFIXED_SECTIONS else (section, name))
 
 
-def changed_options(old: RunSettings, new: RunSettings, sections: Sequence[str] = SECTIONS) -> list[str]:
+def changed_flags(old: RunSettings, new: RunSettings, sections: Sequence[str] = SECTIONS) -> list[str]:
     """Lines that say which options differ between the settings of two runs; where the capture lies is none."""
     before, after = ({name: each.to_dict()[name] for name in sections} for each in (old, new))
-    paths = [line.partition(": ") for line in differences(before, after) if not line.startswith("capture.path: ")]
-    return [f"{option_of(path)}: {values}" for path, _, values in paths]
+    paths = [line.partition(": ") for line in diff_settings(before, after) if not line.startswith("capture.path: ")]
+    return [f"{setting_flag(path)}: {values}" for path, _, values in paths]
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class ConfigFile:
     path: Path
 
     def write(self, settings: RunSettings, command: str | None = None) -> None:
-        header = {"vdgs": {"version": __version__, "commit": commit()} | ({"command": command} if command else {})}
+        header = {"vdgs": {"version": __version__, "commit": git_commit()} | ({"command": command} if command else {})}
         write_text(self.path, yaml.safe_dump(header | settings.to_dict(), sort_keys=False, allow_unicode=True))
 
     def command(self) -> str | None:
@@ -100,7 +100,7 @@ def _makes_another(command: str, folder: Path) -> bool:
     return any(os.path.isabs(each) and os.path.realpath(each) != os.path.realpath(folder) for each in outputs)
 
 
-def commit() -> str | None:
+def git_commit() -> str | None:
     """The commit of the checkout that this package runs from; None outside a checkout of vdgs."""
     root = Path(__file__).resolve().parents[3]
     if not (root / ".git").exists() or not (root / "native").exists():

@@ -9,15 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from vdgs.captures.capture import Capture
-from vdgs.captures.capture_metadata import refuse_another_capture
+from vdgs.captures.capture_metadata import check_same_capture
 from vdgs.captures.loading import load_capture
-from vdgs.captures.output_guard import refuse_among_inputs, refuse_in_a_capture
-from vdgs.captures.reconstruction import FIGURE as RECONSTRUCTION_FIGURE
-from vdgs.captures.reconstruction import FILE as RECONSTRUCTION
-from vdgs.captures.validation import refuse_unsound
+from vdgs.captures.output_guard import check_not_among_inputs, check_not_in_capture
+from vdgs.captures.reconstruction import RECONSTRUCTION_FIGURE as RECONSTRUCTION_FIGURE
+from vdgs.captures.reconstruction import RECONSTRUCTION_FILE as RECONSTRUCTION
+from vdgs.captures.validation import require_valid
 from vdgs.config.capture_options import CaptureOptions
-from vdgs.config.method import MethodConfig, with_iterations
-from vdgs.config.validation_rules import validate
+from vdgs.config.method import MethodConfig, resolve_iterations
+from vdgs.config.validation_rules import validate_config
 from vdgs.errors import VdgsError
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
@@ -25,13 +25,13 @@ from vdgs.runs.run_settings import RunSettings
 from vdgs.system.atomic_files import read_json, write_bytes
 
 
-def begin_run(
+def create_or_resume_run(
     capture_path: Path,
     output: Path,
     capture_options: CaptureOptions,
     method: MethodConfig,
     *,
-    redo: bool | None = None,
+    overwrite: bool | None = None,
     command: str | None = None,
 ) -> RunContext:
     """Open the capture and a new run of it, or the run that is there if it was started with the same settings.
@@ -41,54 +41,54 @@ def begin_run(
     capture that cannot be used, RunError for other settings than the run's and for a run that another process drives,
     VdgsError for settings that do not work and for an output among inputs.
     """
-    with driven_run(capture_path, output, capture_options, method, redo=redo, command=command) as begun:
+    with exclusive_run(capture_path, output, capture_options, method, overwrite=overwrite, command=command) as begun:
         return begun
 
 
 @contextmanager
-def driven_run(
+def exclusive_run(
     capture_path: Path,
     output: Path,
     capture_options: CaptureOptions,
     method: MethodConfig,
     *,
-    redo: bool | None = None,
+    overwrite: bool | None = None,
     command: str | None = None,
 ) -> Iterator[RunContext]:
-    """As `begin_run`, for who takes the run from stage to stage: it is driven (`RunFolder.driven`) from before anything
+    """As `create_or_resume_run`, for who takes the run from stage to stage: it is driven (`RunFolder.driven`) from before anything
     of it is written or removed to the end of the `with`."""
-    problems = validate(method)
+    problems = validate_config(method)
     if problems:
         raise VdgsError("These settings do not work:\n  " + "\n  ".join(problems))
-    refuse_in_a_capture(output)
+    check_not_in_capture(output)
     # Whole paths, as config.yaml holds them: stages hand the capture on, also to other machines.
     capture_path, capture_options = capture_path.resolve(), _with_whole_paths(capture_options)
     capture = load_capture(capture_path, capture_options)
-    refuse_among_inputs(output, capture)
-    method = replace(method, training=with_iterations(method.training, len(capture.train_views)))
+    check_not_among_inputs(output, capture)
+    method = replace(method, training=resolve_iterations(method.training, len(capture.train_views)))
     run = RunFolder(output)
     if not run.config_file.exists():  # what cannot become a scene leaves no folder that other settings stumble over
-        refuse_unsound(capture)
-    run.refuse_strangers()
+        require_valid(capture)
+    run.check_output_empty()
     with run.driven():
-        _take_up(run, capture, capture_path, run_settings(capture_path, capture_options, method), redo, command)
+        _resume(run, capture, capture_path, run_settings(capture_path, capture_options, method), overwrite, command)
         yield RunContext(run, capture)
 
 
-def _take_up(
-    run: RunFolder, capture: Capture, capture_path: Path, settings: RunSettings, redo: bool | None,
+def _resume(
+    run: RunFolder, capture: Capture, capture_path: Path, settings: RunSettings, overwrite: bool | None,
     command: str | None,
 ) -> None:  # fmt: skip
     """Write down the settings of a run that this process drives, new ones or others; what they make useless goes."""
     with run.locked(shared=_goes_on(run, settings)):
-        read_anew = run.config_file.exists() and reads_otherwise(run, settings)
+        read_anew = run.config_file.exists() and capture_options_changed(run, settings)
         if run.capture_file.exists() and not read_anew:
-            refuse_another_capture(run.capture_file, read_json(run.capture_file), capture)
-        if redo is None or not run.config_file.exists():
+            check_same_capture(run.capture_file, read_json(run.capture_file), capture)
+        if overwrite is None or not run.config_file.exists():
             run.begin(settings, ("capture", "training"), command)
             run.move_capture(capture_path)
         else:
-            run.change_settings(settings, redo, command)
+            run.change_settings(settings, overwrite, command)
             if read_anew:  # nothing is left that was made of it; what the coarse stage writes takes its place
                 run.capture_file.unlink(missing_ok=True)
         _keep_reconstruction(capture.root, run.path)
@@ -100,7 +100,7 @@ def _goes_on(run: RunFolder, settings: RunSettings) -> bool:
     return run.config_file.exists() and run.capture_file.exists() and run.settings() == settings
 
 
-def reads_otherwise(run: RunFolder, settings: RunSettings) -> bool:
+def capture_options_changed(run: RunFolder, settings: RunSettings) -> bool:
     """Whether the run reads its capture with other options: it is their change then that has to be spoken of."""
     return run.settings().capture != settings.capture
 

@@ -11,17 +11,17 @@ import torch
 from jaxtyping import Bool
 
 from vdgs.captures.capture import Capture
-from vdgs.captures.capture_metadata import refuse_another_capture
+from vdgs.captures.capture_metadata import check_same_capture
 from vdgs.captures.loading import load_capture
 from vdgs.config.commands import ModelName
 from vdgs.errors import CaptureError, RunError
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.partition.assignment.score_file import load_scores
 from vdgs.partition.blocks import Blocks, load_blocks
-from vdgs.runs.model_integrity import load_vouched
+from vdgs.runs.model_integrity import load_verified
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.run_status import standing_of
-from vdgs.runs.stage_folder import StageFolder, Status
+from vdgs.runs.run_status import get_run_status
+from vdgs.runs.stage_folder import StageFolder, StatusRecord
 from vdgs.system.atomic_files import read_json
 
 
@@ -34,11 +34,11 @@ class OpenedModel:
     model_path: Path
     #: Which model it is, "coarse" or "merged", and the status of the stage that made it.
     name: str
-    status: Status
+    status: StatusRecord
     #: Of the settings that it was made with (`runs.keys`).
     key: str
     #: Why it is not the model that one would expect (no merged one, or one that is out of date); empty where it is.
-    caution: str
+    warning: str
 
     @property
     def line(self) -> str:
@@ -52,13 +52,13 @@ class OpenedModel:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainedRun(OpenedModel):
+class OpenedRun(OpenedModel):
     """A run opened for looking at it: one of its models, and its capture as it was trained on."""
 
     capture: Capture
 
 
-def open_run(path: Path, which: ModelName = "best", device: torch.device | str = "cpu") -> TrainedRun:
+def open_run(path: Path, which: ModelName = "best", device: torch.device | str = "cpu") -> OpenedRun:
     """Open a run, its model on a device.
 
     Raises RunError if it is none or not trained, CaptureError if its photographs are gone.
@@ -68,19 +68,19 @@ def open_run(path: Path, which: ModelName = "best", device: torch.device | str =
     return with_capture(open_model(folder, which, device), capture)
 
 
-def with_capture(opened: OpenedModel, capture: Capture) -> TrainedRun:
+def with_capture(opened: OpenedModel, capture: Capture) -> OpenedRun:
     """An opened model and the capture of its run. Raises RunError where it was made from another one."""
-    refuse_another_capture(opened.model_path, opened.model.metadata.capture, capture)
-    return TrainedRun(**vars(opened), capture=capture)
+    check_same_capture(opened.model_path, opened.model.metadata.capture, capture)
+    return OpenedRun(**vars(opened), capture=capture)
 
 
 def open_model(folder: RunFolder, which: ModelName = "best", device: torch.device | str = "cpu") -> OpenedModel:
     """Open a model of a run on a device, without the capture. Raises RunError if it is not trained."""
-    found = find_model(folder, which)
-    return found.opened(folder, load_vouched(found.stage, found.key).to(torch.device(device)))
+    found = locate_model(folder, which)
+    return found.opened(folder, load_verified(found.stage, found.key).to(torch.device(device)))
 
 
-def refuse_empty(folder: RunFolder, anchors: int | None) -> None:
+def check_has_anchors(folder: RunFolder, anchors: int | None) -> None:
     """Raise RunError where the coarse model of a run holds no anchors (None: not known): nothing can be built on it."""
     if anchors == 0:
         growth = folder.method().training.growth
@@ -93,13 +93,13 @@ def refuse_empty(folder: RunFolder, anchors: int | None) -> None:
 
 
 @dataclass(frozen=True)
-class FoundModel:
+class ModelLocation:
     """One of the models of a run, not read yet; as `OpenedModel`."""
 
     stage: StageFolder
     name: ModelName
     key: str
-    caution: str
+    warning: str
 
     @property
     def line(self) -> str:
@@ -110,7 +110,7 @@ class FoundModel:
         """The same with the model that was read of it."""
         return OpenedModel(
             folder=folder, model=model, model_path=self.stage.model, name=self.name, status=self.stage.status(),
-            key=self.key, caution=self.caution,
+            key=self.key, warning=self.warning,
         )  # fmt: skip
 
 
@@ -118,7 +118,7 @@ def _model_line(name: str, anchors: int, file: Path) -> str:
     return f"{name} model ({anchors:,} anchors, {file.stat().st_size / 1e6:,.1f} MB)"
 
 
-def find_model(folder: RunFolder, which: ModelName = "best") -> FoundModel:
+def locate_model(folder: RunFolder, which: ModelName = "best") -> ModelLocation:
     """Which model of a run is meant. Raises RunError if it is not trained."""
     keys, name = folder.keys(), which
     if which == "best":
@@ -126,12 +126,12 @@ def find_model(folder: RunFolder, which: ModelName = "best") -> FoundModel:
     stage, key = (folder.merged, keys.merge) if name == "merged" else (folder.coarse, keys.coarse)
     if not stage.is_done(key):
         raise RunError(_not_there(folder, name))
-    return FoundModel(stage, name, key, _caution(folder, name) if which != "coarse" else "")
+    return ModelLocation(stage, name, key, _caution(folder, name) if which != "coarse" else "")
 
 
 def _not_there(folder: RunFolder, name: str) -> str:
     """Why a model cannot be opened, and what to do."""
-    standing = standing_of(folder)
+    standing = get_run_status(folder)
     found = standing.of("merge" if name == "merged" else "coarse")
     why = f"state: {found.state}" + (f", {found.why}" if found.why else "")
     command = standing.next_command()
@@ -142,7 +142,7 @@ def _not_there(folder: RunFolder, name: str) -> str:
 
 def _caution(folder: RunFolder, name: str) -> str:
     """What to say of a model that is not the merged one, or of a merged one that is out of date."""
-    standing = standing_of(folder)
+    standing = get_run_status(folder)
     merged = standing.of("merge")
     if merged.state == "done":
         return merged.why
@@ -168,18 +168,18 @@ def open_capture(folder: RunFolder, at: Path | None = None) -> Capture:
     return load_capture(at or written, settings.capture)
 
 
-def remember_capture(folder: RunFolder, at: Path) -> Capture:
+def relocate_capture(folder: RunFolder, at: Path) -> Capture:
     """Let a run find its capture where it lies now; returns it. Raises RunError for another capture than the run's, and
     where another process works on the run or drives it."""
     capture = open_capture(folder, at.resolve())
     with folder.driven(), folder.locked():
         if folder.capture_file.exists():
-            refuse_another_capture(folder.capture_file, read_json(folder.capture_file), capture)
+            check_same_capture(folder.capture_file, read_json(folder.capture_file), capture)
         folder.move_capture(at)
     return capture
 
 
-def blocks_of(run: RunFolder) -> Blocks:
+def load_run_blocks(run: RunFolder) -> Blocks:
     """The blocks of a run, with cameras. Raises RunError unless they were made with the run's settings."""
     record, keys = run.partition_record(), run.keys()
     if (record.key, record.assignment_key) != (keys.partition, keys.assignment):
@@ -189,12 +189,12 @@ def blocks_of(run: RunFolder) -> Blocks:
     return load_blocks(run.partition / "blocks.geojson")
 
 
-def views_of_block(run: RunFolder, capture: Capture, index: int) -> list[int]:
+def block_view_indices(run: RunFolder, capture: Capture, index: int) -> list[int]:
     """Which training views, by number, serve a block."""
     return _views(_assigned(run, capture)[:, index])
 
 
-def views_of_blocks(run: RunFolder, capture: Capture) -> list[list[int]]:
+def all_block_view_indices(run: RunFolder, capture: Capture) -> list[list[int]]:
     """The same of every block, read once."""
     return [_views(of_block) for of_block in _assigned(run, capture).T]
 

@@ -13,8 +13,8 @@ from jaxtyping import Float
 
 from vdgs.captures.camera_height import camera_height
 from vdgs.captures.capture import Capture, View
-from vdgs.captures.capture_metadata import fingerprint
-from vdgs.captures.output_guard import folders_of_inputs
+from vdgs.captures.capture_metadata import capture_fingerprint
+from vdgs.captures.output_guard import input_folders
 from vdgs.errors import RunError
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.ground_frame import GroundFrame
@@ -24,7 +24,7 @@ from vdgs.system.documents import CaptureMetadata, JsonObject
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Flight:
+class RunCameras:
     """The cameras of a capture by the names of their photographs, in the ground frame."""
 
     train: tuple[tuple[str, Camera], ...]
@@ -44,36 +44,36 @@ class Flight:
         return [camera for _, camera in self.train]
 
 
-def flight_of(capture: Capture) -> Flight:
+def run_cameras_of_capture(capture: Capture) -> RunCameras:
     """The flight of a capture that is there."""
-    return Flight(
+    return RunCameras(
         train=tuple((view.name, view.camera) for view in capture.train_views),
         test=tuple((view.name, view.camera) for view in capture.test_views), ground=capture.ground,
         middle=np.median(capture.points, axis=0), height=camera_height(capture), root=capture.root,
-        inputs=tuple(folders_of_inputs(capture)),
+        inputs=tuple(input_folders(capture)),
     )  # fmt: skip
 
 
-def keep_flight(run: RunFolder, capture: Capture) -> None:
+def save_run_cameras(run: RunFolder, capture: Capture) -> None:
     """Write the flight of a capture into its run."""
     ground, root = capture.ground, capture.root.resolve()
     write_json(
         run.cameras_file,
         {
-            "fingerprint": fingerprint(capture),
+            "fingerprint": capture_fingerprint(capture),
             "ground_frame": {
                 "scale": ground.scale, "rotation": ground.rotation.tolist(), "translation": ground.translation.tolist(),
                 "metric": ground.metric, "how": ground.how, "origin_geo": ground.origin_geo,
             },
             "middle": np.median(capture.points, axis=0).tolist(),
             "camera_height": camera_height(capture),
-            "input_folders": [_within(root, folder) for folder in folders_of_inputs(capture)],
+            "input_folders": [_within(root, folder) for folder in input_folders(capture)],
             "views": [_plain(view) for view in capture.views],
         },
     )  # fmt: skip
 
 
-def kept_flight(run: RunFolder, capture: CaptureMetadata | None) -> Flight | None:
+def load_run_cameras(run: RunFolder, capture: CaptureMetadata | None) -> RunCameras | None:
     """The flight that the run keeps, if it is that of the capture that a model describes; None for a run of a version
     that kept none. RunError if the file is damaged."""
     if not run.cameras_file.exists():
@@ -91,7 +91,7 @@ def kept_flight(run: RunFolder, capture: CaptureMetadata | None) -> Flight | Non
             origin_geo=None if geo is None else tuple(geo),
         )  # fmt: skip
         views = [(each["split"], _view(each)) for each in record["views"]]
-        return Flight(
+        return RunCameras(
             train=tuple(view for split, view in views if split == "train"),
             test=tuple(view for split, view in views if split == "test"), ground=ground,
             middle=np.array(record["middle"], np.float64), height=float(record["camera_height"]), root=root,

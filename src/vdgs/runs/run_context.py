@@ -10,8 +10,8 @@ import torch
 from vdgs.captures.capture import Capture
 from vdgs.config.commands import ModelName
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.runs.model_integrity import load_vouched
-from vdgs.runs.open_run import FoundModel, TrainedRun, find_model, open_capture, remember_capture, with_capture
+from vdgs.runs.model_integrity import load_verified
+from vdgs.runs.open_run import ModelLocation, OpenedRun, locate_model, open_capture, relocate_capture, with_capture
 from vdgs.runs.run_folder import RunFolder
 
 
@@ -39,10 +39,10 @@ class RunContext:
     def from_path(path: Path, capture: Path | None = None) -> RunContext:
         """The run in a folder. `capture` is where the capture lies if it was moved: the run remembers it.
 
-        Raises what `remember_capture` raises.
+        Raises what `relocate_capture` raises.
         """
         run = RunFolder(path)
-        return RunContext(run, None if capture is None else remember_capture(run, capture))
+        return RunContext(run, None if capture is None else relocate_capture(run, capture))
 
     @property
     def capture(self) -> Capture:
@@ -51,12 +51,12 @@ class RunContext:
             self._capture = open_capture(self.run)
         return self._capture
 
-    def open_model(self, which: ModelName = "best", device: torch.device | str = "cpu") -> TrainedRun:
+    def open_model(self, which: ModelName = "best", device: torch.device | str = "cpu") -> OpenedRun:
         """A model of the run on a device, with the capture; nobody may change its tensors.
 
         Raises RunError if it is not trained or was made from another capture, CaptureError as `capture` does.
         """
-        capture, found = self.capture, find_model(self.run, which)
+        capture, found = self.capture, locate_model(self.run, which)
         return with_capture(found.opened(self.run, self._model(found, torch.device(device))), capture)
 
     def release_models(self, *names: str) -> None:
@@ -64,12 +64,12 @@ class RunContext:
         for name in names or tuple(self._models):
             self._models.pop(name, None)
 
-    def _model(self, found: FoundModel, device: torch.device) -> AnchorModel:
+    def _model(self, found: ModelLocation, device: torch.device) -> AnchorModel:
         """The model of a finished stage. Moved to another device, it leaves the one where it was."""
         cached, file = self._models.pop(found.name, None), found.stage.model.stat()
         identity = (found.key, found.stage.status().model, file.st_ino, file.st_size, file.st_mtime_ns)
         model = cached.model if cached is not None and cached.identity == identity else None
         del cached  # before another file is read: two models may not fit into the memory
-        model = (load_vouched(found.stage, found.key) if model is None else model).to(device)
+        model = (load_verified(found.stage, found.key) if model is None else model).to(device)
         self._models[found.name] = _CachedModel(identity, model)
         return model

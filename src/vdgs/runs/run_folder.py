@@ -12,16 +12,16 @@ from vdgs.captures.reconstruction import is_reconstruction
 from vdgs.config.method import MethodConfig
 from vdgs.errors import RunError, VdgsError
 from vdgs.partition.block_records import PartitionRecord
-from vdgs.runs.config_file import ConfigFile, changed_options
+from vdgs.runs.config_file import ConfigFile, changed_flags
 from vdgs.runs.run_settings import SECTIONS, RunSettings
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.stage_keys import StageKeys, stage_keys
 from vdgs.system.atomic_files import read_json
-from vdgs.system.file_locks import hold, seems_locked
-from vdgs.system.records import record_of
+from vdgs.system.file_locks import is_known_locked, lock_folder
+from vdgs.system.records import record_from_dict
 
 #: The page about a run, in its folder (`vdgs report`).
-REPORT = "report.html"
+REPORT_FILE = "report.html"
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class RunFolder:
         """What partition.json says; nothing if the scene is not cut yet. RunError if the file is damaged."""
         file = self.partition / "partition.json"
         try:
-            return record_of(PartitionRecord, read_json(file)) if file.exists() else PartitionRecord()
+            return record_from_dict(PartitionRecord, read_json(file)) if file.exists() else PartitionRecord()
         except (VdgsError, ValueError) as error:
             raise RunError(f"{file}: is damaged. Cut the scene again: vdgs partition {self.path}") from error
 
@@ -96,7 +96,7 @@ class RunFolder:
         same, and if the folder holds something else.
         """
         if self.config_file.exists():
-            changed = changed_options(self.settings(), settings, checked)
+            changed = changed_flags(self.settings(), settings, checked)
             if changed:
                 raise RunError(
                     f"{self.config_file}: this run was started with other settings:\n  "
@@ -104,10 +104,10 @@ class RunFolder:
                     + "\nGive the old settings to continue it, or another --output to start a new run."
                 )
             return
-        self.refuse_strangers()
+        self.check_output_empty()
         self.config.write(settings, command)
 
-    def refuse_strangers(self) -> None:
+    def check_output_empty(self) -> None:
         """Raise RunError where a new run would be begun among other files."""
         if self.config_file.exists():
             return
@@ -125,24 +125,24 @@ class RunFolder:
                 "Choose an empty or a new folder for --output."
             )
 
-    def change_settings(self, settings: RunSettings, redo: bool, command: str | None = None) -> list[str]:
+    def change_settings(self, settings: RunSettings, overwrite: bool, command: str | None = None) -> list[str]:
         """Give a run other settings; returns what changed, one line each. `command` as in `begin`.
 
         Raises RunError, with the differences, if trained work depends on what changed, unless `redo` allows to
-        lose it. Stages delete what was made for other settings when they next run (`StageFolder.discard_unless`).
+        lose it. Stages delete what was made for other settings when they next run (`StageFolder.reset_unless`).
         """
         old = self.settings()
         if old == settings:
             return []
-        changed = changed_options(old, settings)
-        after = stage_keys(settings, self.coarse_identity())
+        changed = changed_flags(old, settings)
+        after = stage_keys(settings, self.coarse_model_id())
         lost = []
-        if self.coarse.holds_work() and self.coarse.key() != after.coarse:
+        if self.coarse.has_output() and self.coarse.key() != after.coarse:
             lost.append("the coarse model")
-        blocks = [folder for folder in self.block_folders() if folder.holds_work() and folder.key() != after.blocks]
+        blocks = [folder for folder in self.block_folders() if folder.has_output() and folder.key() != after.blocks]
         if blocks:
             lost.append(f"{len(blocks)} blocks" if len(blocks) > 1 else "a block")
-        if lost and not redo:
+        if lost and not overwrite:
             raise RunError(
                 f"{self.config_file}: other settings than this run has:\n  " + "\n  ".join(changed)
                 + f"\nThey make {' and '.join(lost)} useless. Add --redo to train that again, give the old settings to "
@@ -150,7 +150,7 @@ class RunFolder:
             )  # fmt: skip
         self.config.write(settings, command)
         if self.coarse.path.exists():  # at once: nothing must be built on a model of other settings
-            self.coarse.discard_unless(after.coarse)
+            self.coarse.reset_unless(after.coarse)
         return changed
 
     def move_capture(self, to: Path) -> None:
@@ -173,9 +173,9 @@ class RunFolder:
 
     def keys(self) -> StageKeys:
         """The key of every stage, for the settings that config.yaml holds and the coarse model that is there."""
-        return stage_keys(self.settings(), self.coarse_identity())
+        return stage_keys(self.settings(), self.coarse_model_id())
 
-    def coarse_identity(self) -> str | None:
+    def coarse_model_id(self) -> str | None:
         """What tells the coarse model from any other; None while there is none."""
         return self.coarse.status().model
 
@@ -185,21 +185,21 @@ class RunFolder:
 
         RunError if another process stands in the way.
         """
-        with hold(self.path, shared):
+        with lock_folder(self.path, shared):
             yield
 
     @contextmanager
     def driven(self) -> Iterator[None]:
-        """Take this run from stage to stage, so that others can see it between two stages too (`is_driven`).
+        """Take this run from stage to stage, so that others can see it between two stages too (`is_running`).
 
         Whoever changes its settings holds it meanwhile: between two stages, and while a model is measured or drawn, a
         driver holds nothing else. RunError if another process drives the run.
         """
-        with hold(self._driver):
+        with lock_folder(self._driver):
             yield
 
-    def is_driven(self) -> bool:
-        return seems_locked(self._driver)
+    def is_running(self) -> bool:
+        return is_known_locked(self._driver)
 
     @property
     def _driver(self) -> Path:

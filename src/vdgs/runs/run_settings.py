@@ -16,7 +16,7 @@ from vdgs.config.method import (
     PartitionConfig,
     TrainConfig,
 )
-from vdgs.config.ranges import outside
+from vdgs.config.ranges import iter_out_of_range
 from vdgs.config.serialization import from_dict, to_dict
 
 #: The parts of config.yaml.
@@ -60,6 +60,6 @@ class RunSettings:
         options = from_dict(CaptureOptions, {k: v for k, v in capture.items() if k != "path"}, "capture")
         method = from_dict(MethodConfig, sections, "")
         for section in SECTIONS[1:]:
-            for each in outside(getattr(method, section), (section,)):
+            for each in iter_out_of_range(getattr(method, section), (section,)):
                 raise ValueError(f"{'.'.join(each.path)} is {each.value}; it must be {each.range}")
         return RunSettings.of(capture["path"], options, method)

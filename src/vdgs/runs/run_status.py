@@ -15,56 +15,56 @@ from typing import Literal
 
 from vdgs.errors import VdgsError
 from vdgs.partition.block_records import PartitionRecord
-from vdgs.runs.model_integrity import foreign, to_delete
+from vdgs.runs.model_integrity import integrity_error, path_to_delete
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
-from vdgs.runs.stage_folder import StageFolder, Status
+from vdgs.runs.stage_folder import StageFolder, StatusRecord
 from vdgs.runs.stage_keys import StageKeys, stage_keys
-from vdgs.system.atomic_files import read_record
-from vdgs.system.file_locks import seems_locked
+from vdgs.system.atomic_files import read_json_or_empty
+from vdgs.system.file_locks import is_known_locked
 
 #: `stale`: made with other settings, for another cut or from another model than the run has now. `unknown`: something
 #: is there, and no record says with which settings it was made.
-State = Literal["done", "running", "queued", "stopped", "failed", "stale", "missing", "unknown"]
+StageState = Literal["done", "running", "queued", "stopped", "failed", "stale", "missing", "unknown"]
 
 #: Why a result is stale, in words that end a sentence about it.
 OTHER_SETTINGS = "made with other settings than the run has now"
-OTHER_CUT = "trained for another cut or with other settings than the run has now"
+OTHER_PARTITION = "trained for another cut or with other settings than the run has now"
 OTHER_BLOCKS = "its blocks are not those that it was merged from"
 OTHER_MODEL = "measured with another model than the run has now"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Standing:
+class StageStatus:
     """How far one stage of a run, or one of its blocks, is."""
 
     name: str
-    state: State
+    state: StageState
     folder: str
     """What it made, inside the run."""
     why: str = ""
     """One line; empty where there is nothing to say."""
-    status: Status | None = None
+    status: StatusRecord | None = None
     """What the stage notes of itself, where it trains or merges."""
-    made: str = ""
+    output_id: str = ""
     """What tells what it made from any other."""
     remedy: str = ""
     """What to do before its command is of use."""
 
 
 @dataclass(frozen=True)
-class RunStanding:
+class RunStatus:
     """How far a run is."""
 
     path: Path
-    stages: tuple[Standing, ...]
+    stages: tuple[StageStatus, ...]
     """In the order in which they are made."""
     command: str | None = None
     """The command that began the run, where its settings are still those that it asked for."""
     driven: bool = False
     """A command takes it from stage to stage."""
 
-    def of(self, name: str) -> Standing:
+    def of(self, name: str) -> StageStatus:
         """A stage by its name: coarse, coarse evaluation, visibility, partition, cameras, block N, merge, evaluation.
 
         Raises KeyError for a name that there is not.
@@ -72,7 +72,7 @@ class RunStanding:
         return {stage.name: stage for stage in self.stages}[name]
 
     @property
-    def blocks(self) -> list[Standing]:
+    def blocks(self) -> list[StageStatus]:
         return [stage for stage in self.stages if stage.name.startswith("block ")]
 
     @property
@@ -81,18 +81,18 @@ class RunStanding:
         return all(stage.state == "done" for stage in self.stages)
 
     @property
-    def at_work(self) -> bool:
+    def is_running(self) -> bool:
         return self.driven or any(stage.state == "running" for stage in self.stages)
 
     @property
     def digest(self) -> str:
         """What tells this standing from any other: a report of it is out of date once it differs."""
-        content = [[stage.name, stage.state, stage.made] for stage in self.stages]
+        content = [[stage.name, stage.state, stage.output_id] for stage in self.stages]
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
     def next_command(self) -> str:
         """What to type next; empty while something runs, and where all is done."""
-        if self.at_work:
+        if self.is_running:
             return ""
         for stage in self.stages:
             if stage.state == "unknown":
@@ -107,7 +107,7 @@ class RunStanding:
     def _continues(self) -> bool:
         """The command that began the run takes it to its end: it asked for all stages, and for the settings that the
         run has."""
-        others = any(stage.state == "stale" and stage.why in (OTHER_SETTINGS, OTHER_CUT) for stage in self.stages)
+        others = any(stage.state == "stale" and stage.why in (OTHER_SETTINGS, OTHER_PARTITION) for stage in self.stages)
         return (self.command or "").startswith("vdgs run ") and not others
 
     def _command_for(self, stage: str) -> str:
@@ -122,25 +122,25 @@ class RunStanding:
         return f"vdgs {verbs.get(stage, f'train {run}')}"
 
 
-def standing_of(run: RunFolder, settings: RunSettings | None = None) -> RunStanding:
+def get_run_status(run: RunFolder, settings: RunSettings | None = None) -> RunStatus:
     """How far a run is, for its settings or for others. Reads only, and never fails on what it reads: what is damaged
     is `unknown`, and says why."""
     try:
-        keys, why = run.keys() if settings is None else stage_keys(settings, run.coarse_identity()), ""
+        keys, why = run.keys() if settings is None else stage_keys(settings, run.coarse_model_id()), ""
     except VdgsError as error:
         keys, why = None, _first_line(str(error))
-    return RunStanding(run.path, tuple(_Survey(run, keys, why).stages()), run.config.command(), run.is_driven())
+    return RunStatus(run.path, tuple(_StatusScanner(run, keys, why).stages()), run.config.command(), run.is_running())
 
 
 @dataclass(frozen=True)
-class _Survey:
+class _StatusScanner:
     """One look at a run, whose keys are None where they cannot be known."""
 
     run: RunFolder
     keys: StageKeys | None
     why_unknown: str
 
-    def stages(self) -> Iterator[Standing]:
+    def stages(self) -> Iterator[StageStatus]:
         run = self.run
         coarse = self._trained("coarse", run.coarse, self._key("coarse"), OTHER_SETTINGS, run.path)
         yield coarse
@@ -148,7 +148,7 @@ class _Survey:
         yield self._measured("coarse evaluation", run.coarse.path / "evaluation", coarse)
         yield from self._cut()
         blocks = [
-            self._trained(f"block {int(folder.path.name)}", folder, self._key("blocks"), OTHER_CUT, folder.path)
+            self._trained(f"block {int(folder.path.name)}", folder, self._key("blocks"), OTHER_PARTITION, folder.path)
             for folder in self._block_folders()
         ]
         yield from blocks
@@ -161,9 +161,9 @@ class _Survey:
 
     def _judged(
         self, name: str, folder: Path, there: bool, found: object, wanted: object, made: str, why: str = OTHER_SETTINGS
-    ) -> Standing:
+    ) -> StageStatus:
         """A stage whose record says with which settings it was made (`found`); None where it does not."""
-        state: State
+        state: StageState
         if not there:
             state, why = "missing", ""
         elif self.keys is None:
@@ -174,14 +174,14 @@ class _Survey:
             state = "stale"
         else:
             state, why = "done", ""
-        return Standing(name=name, state=state, folder=self._inside(folder), why=why, made=made)
+        return StageStatus(name=name, state=state, folder=self._inside(folder), why=why, output_id=made)
 
     def _inside(self, folder: Path) -> str:
         return folder.relative_to(self.run.path).as_posix()
 
-    def _visibility(self) -> Standing:
+    def _visibility(self) -> StageStatus:
         file = self.run.visibility / "visibility.json"
-        found = read_record(file).get("key")
+        found = read_json_or_empty(file).get("key")
         wanted = self._key("visibility")
         return self._judged("visibility", file.parent, file.exists(), found, wanted, str(found))
 
@@ -191,7 +191,7 @@ class _Survey:
         except VdgsError:
             return PartitionRecord()
 
-    def _cut(self) -> Iterator[Standing]:
+    def _cut(self) -> Iterator[StageStatus]:
         folder, record = self.run.partition, self._record()
         there = (folder / "partition.json").exists()
         cut = self._judged("partition", folder, there, record.key, self._key("partition"), str(record.key))
@@ -209,25 +209,25 @@ class _Survey:
         there = {int(folder.path.name): folder for folder in self.run.block_folders()}
         return [there.get(index, self.run.block(index)) for index in sorted({*there, *range(count)})]
 
-    def _trained(self, name: str, folder: StageFolder, key: str | None, other: str, locked: Path) -> Standing:
+    def _trained(self, name: str, folder: StageFolder, key: str | None, other: str, locked: Path) -> StageStatus:
         inside = self._inside(folder.path)
         try:
             status = folder.status()
         except VdgsError as error:
-            return Standing(name=name, state="unknown", folder=inside, why=_first_line(str(error)))
+            return StageStatus(name=name, state="unknown", folder=inside, why=_first_line(str(error)))
         state, why = self._state_of(folder, status, key, other, locked)
-        if state == "done" and (wrong := foreign(folder, key or "", _number(name))):
-            remedy = f"delete {to_delete(folder)}, then "
-            return Standing(
+        if state == "done" and (wrong := integrity_error(folder, key or "", _number(name))):
+            remedy = f"delete {path_to_delete(folder)}, then "
+            return StageStatus(
                 name=name, state="stale", folder=inside, why=f"model.safetensors is {wrong}", status=status,
                 remedy=remedy,
             )  # fmt: skip
-        return Standing(name=name, state=state, folder=inside, why=why, status=status, made=status.model or "")
+        return StageStatus(name=name, state=state, folder=inside, why=why, status=status, output_id=status.model or "")
 
     def _state_of(
-        self, folder: StageFolder, status: Status, key: str | None, other: str, locked: Path
-    ) -> tuple[State, str]:
-        if status.state == "new" and not folder.holds_work():
+        self, folder: StageFolder, status: StatusRecord, key: str | None, other: str, locked: Path
+    ) -> tuple[StageState, str]:
+        if status.state == "new" and not folder.has_output():
             return "missing", ""
         if self.keys is None:
             return "unknown", self.why_unknown
@@ -235,13 +235,13 @@ class _Survey:
             return "stale", other
         if status.state == "done":
             return ("done", status.why or "") if folder.model.exists() else ("missing", f"{folder.model.name} is gone")
-        if status.state == "running" and not seems_locked(locked):
+        if status.state == "running" and not is_known_locked(locked):
             return "stopped", "its process ended without a word; it continues from its last checkpoint"
         if status.state in ("running", "queued", "stopped", "failed"):
             return status.state, _first_line(status.why or "")  # type: ignore[return-value]
         return "stopped", "it has a checkpoint, and says nothing of itself"
 
-    def _merged(self, blocks: list[Standing]) -> Standing:
+    def _merged(self, blocks: list[StageStatus]) -> StageStatus:
         merged = self.run.merged
         found = self._trained("merge", merged, self._key("merge"), OTHER_SETTINGS, self.run.path)
         if found.state != "done" or found.status is None:
@@ -249,19 +249,26 @@ class _Survey:
         models = tuple((b.status.model if b.status else None) if b.state == "done" else None for b in blocks)
         stands_in = [block.name for block, model in zip(blocks, models, strict=True) if model is None]
         if found.status.block_models != models:
-            return Standing(
-                name="merge", state="stale", folder=found.folder, why=OTHER_BLOCKS, status=found.status, made=found.made
+            return StageStatus(
+                name="merge",
+                state="stale",
+                folder=found.folder,
+                why=OTHER_BLOCKS,
+                status=found.status,
+                output_id=found.output_id,
             )
         why = f"the coarse model stands in for {', '.join(stands_in)}" if stands_in else ""
-        return Standing(name="merge", state="done", folder=found.folder, why=why, status=found.status, made=found.made)
+        return StageStatus(
+            name="merge", state="done", folder=found.folder, why=why, status=found.status, output_id=found.output_id
+        )
 
-    def _measured(self, name: str, folder: Path, model: Standing) -> Standing:
+    def _measured(self, name: str, folder: Path, model: StageStatus) -> StageStatus:
         """Figures of a model: they are worth what the model is."""
         there = (folder / "metrics.json").exists()
-        record = read_record(folder / "status.json")
+        record = read_json_or_empty(folder / "status.json")
         made = json.dumps([record.get(each) for each in ("model", "lpips_weights", "bins")])
         found = record.get("model")
-        known = model.made if model.state == "done" else ""
+        known = model.output_id if model.state == "done" else ""
         return self._judged(name, folder, there, found, known or None, made, OTHER_MODEL)
 
 

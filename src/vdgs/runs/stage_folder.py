@@ -10,14 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vdgs.errors import RunError
-from vdgs.partition.block_records import MergedBlock
+from vdgs.partition.block_records import MergedBlockRecord
 from vdgs.system.atomic_files import read_json, write_json, write_text
-from vdgs.system.file_locks import hold
-from vdgs.system.records import known, record_of
+from vdgs.system.file_locks import lock_folder
+from vdgs.system.records import record_from_dict, record_to_compact_dict
 
 
 @dataclass(frozen=True, kw_only=True)
-class Status:
+class StatusRecord:
     """status.json; None for what a stage does not say."""
 
     state: str = "new"
@@ -38,7 +38,7 @@ class Status:
 
     # Of a merged scene:
     blocks_trained: int | None = None
-    blocks: tuple[MergedBlock, ...] | None = None
+    blocks: tuple[MergedBlockRecord, ...] | None = None
     block_models: tuple[str | None, ...] | None = None
     """`model` of each block; None for one that is missing."""
     merge_seconds: float | None = None
@@ -60,7 +60,7 @@ class StageFolder:
         return self.path / "log.jsonl"
 
     @property
-    def start_file(self) -> Path:
+    def initialization_file(self) -> Path:
         """What was found before the first step of the coarse stage."""
         return self.path / "start.json"
 
@@ -72,22 +72,22 @@ class StageFolder:
     def status_file(self) -> Path:
         return self.path / "status.json"
 
-    def status(self) -> Status:
+    def status(self) -> StatusRecord:
         """What `set_status` wrote last; state "new" if nothing did. RunError if the file is damaged."""
         if not self.status_file.exists():
-            return Status()
+            return StatusRecord()
         written = read_json(self.status_file)
         try:
             if isinstance(written, dict) and "state" not in written:
                 raise ValueError("it says no state")
-            return record_of(Status, written)
+            return record_from_dict(StatusRecord, written)
         except ValueError as error:
             raise RunError(
                 f"{self.status_file}: is damaged ({error}). Delete this file and run the same command again."
             ) from error
 
-    def set_status(self, status: Status) -> None:
-        write_json(self.status_file, known(status))
+    def set_status(self, status: StatusRecord) -> None:
+        write_json(self.status_file, record_to_compact_dict(status))
 
     @property
     def key_file(self) -> Path:
@@ -100,7 +100,7 @@ class StageFolder:
         except OSError:
             return None
 
-    def discard_unless(self, key: str) -> None:
+    def reset_unless(self, key: str) -> None:
         """Delete what is here unless it was made for these settings, and let the folder work for them from now on.
 
         What was made for other or unknown settings goes first and the key is written last: a folder never holds what
@@ -116,7 +116,7 @@ class StageFolder:
                     stale.unlink()
         write_text(self.key_file, key + "\n")
 
-    def holds_work(self) -> bool:
+    def has_output(self) -> bool:
         """Something was trained here."""
         return self.model.exists() or any(self.checkpoints.glob("*.json"))
 
@@ -127,10 +127,10 @@ class StageFolder:
     @contextmanager
     def locked(self) -> Iterator[None]:
         """Hold this stage for this process; RunError if another one works on it."""
-        with hold(self.path):
+        with lock_folder(self.path):
             yield
 
-    def is_held(self) -> bool:
+    def is_locked_elsewhere(self) -> bool:
         """Another process works on this stage. A folder that cannot be written is held by none."""
         try:
             with self.locked():

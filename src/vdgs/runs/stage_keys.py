@@ -14,7 +14,7 @@ from typing import Any
 from vdgs.runs.run_settings import RunSettings
 
 #: Each stage with the sections of config.yaml that it depends on and the stages it builds on.
-DEPENDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+STAGE_DEPENDENCIES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "coarse": (("capture", "training"), ()),
     "visibility": ((), ("coarse",)),
     "partition": (("partition",), ("visibility",)),
@@ -23,7 +23,7 @@ DEPENDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "merge": (("merge",), ("blocks",)),
 }
 #: Settings that do nothing without another.
-NEEDS: dict[tuple[str, ...], str] = {("training", "exposure_spread"): "exposure"}
+REQUIRED_SETTINGS: dict[tuple[str, ...], str] = {("training", "exposure_spread"): "exposure"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,15 +42,15 @@ def stage_keys(settings: RunSettings, coarse_model: str | None = None) -> StageK
     """Keys from the sections of config.yaml. What builds on the coarse stage also depends on the very model
     (`coarse_model`): trained again on another machine it may differ in its last bits."""
     keys, plain = dict[str, str](), settings.to_dict()
-    for stage, (sections, before) in DEPENDS.items():
+    for stage, (sections, before) in STAGE_DEPENDENCIES.items():
         # Where the capture lies is not what it is: a capture that moved keeps its results.
-        own = {name: counted(name, plain[name]) for name in sections}
+        own = {name: hashable_settings(name, plain[name]) for name in sections}
         content = [own, *(keys[name] for name in before), *([coarse_model] if before == ("coarse",) else [])]
         keys[stage] = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
     return StageKeys(**keys)
 
 
-def counted(section: str, settings: dict[str, Any]) -> dict[str, Any]:
+def hashable_settings(section: str, settings: dict[str, Any]) -> dict[str, Any]:
     """The settings of a section that keys are made of: one that needs another counts only beside it."""
-    idle = {("capture", "path"), *(each for each, needed in NEEDS.items() if not settings.get(needed))}
+    idle = {("capture", "path"), *(each for each, needed in REQUIRED_SETTINGS.items() if not settings.get(needed))}
     return {name: value for name, value in settings.items() if (section, name) not in idle}

@@ -15,54 +15,54 @@ import pycolmap
 from rich.console import Console
 
 from vdgs.captures.formats.source_capture import Intrinsics
-from vdgs.captures.image_files import decode_photograph
-from vdgs.captures.undistortion import pinhole_for, sampling_map
+from vdgs.captures.image_files import decode_image
+from vdgs.captures.undistortion import sampling_map, undistorted_pinhole
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
-from vdgs.sfm.mask_files import png_of, straight_mask
-from vdgs.sfm.workspace import Work, progress
+from vdgs.sfm.mask_files import encode_mask, undistort_mask
+from vdgs.sfm.workspace import Workspace, report_progress
 from vdgs.system.atomic_files import write_bytes
-from vdgs.system.stop_signals import stop_if_asked
+from vdgs.system.stop_signals import check_stop_requested
 
 #: Sides are multiples of this, so that the smaller sizes are exactly a half and a quarter.
-MULTIPLE = 4
+SIDE_MULTIPLE = 4
 #: The folders of the sizes, and by how much they are shrunk.
-SIZES = (("images", 1), ("images_2", 2), ("images_4", 4))
+IMAGE_SIZES = (("images", 1), ("images_2", 2), ("images_4", 4))
 JPEG_QUALITY = 95
 #: The folder of masks, of the largest size.
-MASKS = CaptureOptions.masks
+MASK_FOLDER = CaptureOptions.masks
 
 
 @dataclass(frozen=True, eq=False)
-class Straightened:
+class Undistortion:
     """How photographs of one camera lose their distortion: pixels [h, w, 2] of the original for those of the pinhole
     picture, how much that is then shrunk, and the camera that comes out."""
 
     grid: np.ndarray
-    shrunk: tuple[int, int]
-    """Width and height after shrinking, before the sides become multiples of `MULTIPLE`."""
+    resized: tuple[int, int]
+    """Width and height after shrinking, before the sides become multiples of `SIDE_MULTIPLE`."""
     intrinsics: Intrinsics
 
 
-def straighten(camera: pycolmap.Camera, max_size: int) -> Straightened:
+def make_undistortion(camera: pycolmap.Camera, max_size: int) -> Undistortion:
     """The pinhole camera and the way to it; `max_size` bounds the longer side (0: not at all)."""
     bent = _intrinsics(camera)
-    pinhole = pinhole_for(bent)
+    pinhole = undistorted_pinhole(bent)
     longer = max(pinhole.width, pinhole.height)
     scale = min(1.0, max_size / longer) if max_size else 1.0
     width, height = round(pinhole.width * scale), round(pinhole.height * scale)
     across, up = width / pinhole.width, height / pinhole.height
     (fx, fy), (cx, cy) = pinhole.focal, pinhole.principal_point
-    kept = width - width % MULTIPLE, height - height % MULTIPLE
+    kept = width - width % SIDE_MULTIPLE, height - height % SIDE_MULTIPLE
     target = Intrinsics("PINHOLE", (fx * across, fy * up, cx * across, cy * up), *kept)
-    return Straightened(sampling_map(bent, pinhole), (width, height), target)
+    return Undistortion(sampling_map(bent, pinhole), (width, height), target)
 
 
 def write_images(
     output: Path,
-    work: Work,
+    workspace: Workspace,
     names: Mapping[int, Sequence[str]],
-    lenses: Mapping[int, Straightened],
+    undistortions: Mapping[int, Undistortion],
     threads: int,
     console: Console,
 ) -> None:
@@ -72,64 +72,68 @@ def write_images(
     Raises CaptureError for photographs that cannot be decoded, VdgsError where the disk is full.
     """
     total, done = sum(len(each) for each in names.values()), 0
-    with progress(console, "photographs without distortion", total) as tell, ThreadPoolExecutor(threads) as pool:
+    with report_progress(console, "photographs without distortion", total) as tell, ThreadPoolExecutor(threads) as pool:
         for camera, members in names.items():
-            for _ in pool.map(partial(_write_one, output, work, lenses[camera]), members):
-                stop_if_asked()
+            for _ in pool.map(partial(_write_one, output, workspace, undistortions[camera]), members):
+                check_stop_requested()
                 done += 1
                 tell(done)
 
 
-def image_name(name: str) -> str:
+def jpeg_name(name: str) -> str:
     """What a photograph is called in the capture: JPEG, whatever it was."""
     return name if name.lower().endswith((".jpg", ".jpeg")) else f"{name}.jpg"
 
 
-def _write_one(output: Path, work: Work, lens: Straightened, name: str) -> None:
-    stop_if_asked()
-    if work.mask(name).is_file():
-        _write_mask(output, work.mask(name), lens, name)
-    targets = [output / folder / image_name(name) for folder, _ in SIZES]
+def _write_one(output: Path, workspace: Workspace, undistortion: Undistortion, name: str) -> None:
+    check_stop_requested()
+    if workspace.mask(name).is_file():
+        _write_mask(output, workspace.mask(name), undistortion, name)
+    targets = [output / folder / jpeg_name(name) for folder, _ in IMAGE_SIZES]
     if all(target.is_file() for target in targets):
         return
-    pixels, _ = decode_photograph(work.photographs / name)
-    straight = cv2.remap(pixels, lens.grid[..., 0], lens.grid[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    if straight.shape[1::-1] != lens.shrunk:
-        straight = cv2.resize(straight, lens.shrunk, interpolation=cv2.INTER_AREA)
-    straight = straight[: lens.intrinsics.height, : lens.intrinsics.width]
+    pixels, _ = decode_image(workspace.photographs / name)
+    straight = cv2.remap(
+        pixels, undistortion.grid[..., 0], undistortion.grid[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+    )
+    if straight.shape[1::-1] != undistortion.resized:
+        straight = cv2.resize(straight, undistortion.resized, interpolation=cv2.INTER_AREA)
+    straight = straight[: undistortion.intrinsics.height, : undistortion.intrinsics.width]
     settings = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111]
-    for target, (_, factor) in zip(targets, SIZES, strict=True):
-        size = lens.intrinsics.width // factor, lens.intrinsics.height // factor
+    for target, (_, factor) in zip(targets, IMAGE_SIZES, strict=True):
+        size = undistortion.intrinsics.width // factor, undistortion.intrinsics.height // factor
         small = straight if factor == 1 else cv2.resize(straight, size, interpolation=cv2.INTER_AREA)
         write_bytes(target, cv2.imencode(".jpg", cv2.cvtColor(small, cv2.COLOR_RGB2BGR), settings)[1].tobytes())
 
 
-def _write_mask(output: Path, mask: Path, lens: Straightened, name: str) -> None:
-    target = output / MASKS / f"{image_name(name)}.png"
+def _write_mask(output: Path, mask: Path, undistortion: Undistortion, name: str) -> None:
+    target = output / MASK_FOLDER / f"{jpeg_name(name)}.png"
     if not target.is_file():
-        keep = straight_mask(mask, lens.grid, lens.shrunk)[: lens.intrinsics.height, : lens.intrinsics.width]
-        write_bytes(target, png_of(keep))
+        keep = undistort_mask(mask, undistortion.grid, undistortion.resized)[
+            : undistortion.intrinsics.height, : undistortion.intrinsics.width
+        ]
+        write_bytes(target, encode_mask(keep))
 
 
-def write_model(output: Path, model: pycolmap.Reconstruction, lenses: Mapping[int, Straightened]) -> None:
+def write_model(output: Path, model: pycolmap.Reconstruction, undistortions: Mapping[int, Undistortion]) -> None:
     """Write sparse/0 with pinhole cameras: poses, points, and the observations that points have, without distortion."""
     straight = pycolmap.Reconstruction()
-    for number, lens in lenses.items():
+    for number, lens in undistortions.items():
         kept = lens.intrinsics
         camera = pycolmap.Camera(
             model="PINHOLE", width=kept.width, height=kept.height, params=list(kept.params), camera_id=number
         )
         straight.add_camera_with_trivial_rig(camera)
     places: dict[tuple[int, int], int] = {}
-    for image in _placed(model):
+    for image in _registered_images(model):
         seen = [k for k, point in enumerate(image.points2D) if point.has_point3D()]
         bent = np.array([image.points2D[k].xy for k in seen]).reshape(-1, 2)
         rays = np.asarray(model.cameras[image.camera_id].cam_from_img(bent)).reshape(-1, 2)
-        fx, fy, cx, cy = lenses[image.camera_id].intrinsics.params
+        fx, fy, cx, cy = undistortions[image.camera_id].intrinsics.params
         places |= {(image.image_id, k): place for place, k in enumerate(seen)}
         straight.add_image_with_trivial_frame(
             pycolmap.Image(
-                name=image_name(image.name), keypoints=rays * [fx, fy] + [cx, cy], camera_id=image.camera_id,
+                name=jpeg_name(image.name), keypoints=rays * [fx, fy] + [cx, cy], camera_id=image.camera_id,
                 image_id=image.image_id,
             ),
             image.cam_from_world(),
@@ -151,7 +155,7 @@ def write_model(output: Path, model: pycolmap.Reconstruction, lenses: Mapping[in
     os.replace(part, whole)
 
 
-def _placed(model: pycolmap.Reconstruction) -> Iterator[pycolmap.Image]:
+def _registered_images(model: pycolmap.Reconstruction) -> Iterator[pycolmap.Image]:
     return (model.images[number] for number in sorted(model.images) if model.images[number].has_pose)
 
 

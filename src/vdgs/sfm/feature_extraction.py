@@ -11,27 +11,27 @@ import pycolmap
 from PIL import Image, ImageOps
 from rich.console import Console
 
-from vdgs.captures.image_files import pillow_quietly
+from vdgs.captures.image_files import pillow_without_limits
 from vdgs.errors import CaptureError
-from vdgs.sfm.image_list import LeftOut
-from vdgs.sfm.image_metadata import Photograph
-from vdgs.sfm.workspace import Work, call, progress
-from vdgs.system.atomic_files import write_atomically
+from vdgs.sfm.image_list import ExcludedImage
+from vdgs.sfm.image_metadata import ImageMetadata
+from vdgs.sfm.workspace import Workspace, call_cancellable, report_progress
+from vdgs.system.atomic_files import write_atomic
 
 #: A focal length over the longer side where nothing says one: COLMAP's own guess.
-GUESSED_FOCAL = 1.2
+DEFAULT_FOCAL_FACTOR = 1.2
 #: Photographs of fewer pixels of their longer side, and all where there are so few, are searched at twice their size:
 #: three times the work, half as many points again.
-SMALL_PX, FEW_PHOTOGRAPHS = 1200, 40
+UPSAMPLE_BELOW_PX, UPSAMPLE_BELOW_IMAGES = 1200, 40
 #: Photographs that one call searches, for each thread: between two calls work can stop.
-AT_ONCE = 2
+IMAGES_PER_THREAD = 2
 #: Photographs with fewer features cannot be matched.
-FEW_FEATURES = 100
+MIN_FEATURES = 100
 _UPRIGHT_QUALITY = 97
 
 
 @dataclass(frozen=True, kw_only=True)
-class Kind:
+class CameraGroup:
     """Photographs that one camera took: the same maker, serial number, size and focal length."""
 
     camera: str
@@ -41,12 +41,12 @@ class Kind:
     known: bool
     """Whether something says the focal length."""
     source: str
-    photographs: tuple[Photograph, ...]
+    photographs: tuple[ImageMetadata, ...]
 
 
-def kinds_of(photographs: Sequence[Photograph]) -> list[Kind]:
+def group_by_camera(photographs: Sequence[ImageMetadata]) -> list[CameraGroup]:
     """Photographs by the cameras that they share, in the order of their first names; their numbers are 1, 2, ..."""
-    groups: dict[tuple[object, ...], list[Photograph]] = {}
+    groups: dict[tuple[object, ...], list[ImageMetadata]] = {}
     for photo in photographs:
         focal = photo.lens.focal if photo.lens else None
         groups.setdefault((photo.camera, photo.width, photo.height, focal and round(focal, 4)), []).append(photo)
@@ -54,10 +54,10 @@ def kinds_of(photographs: Sequence[Photograph]) -> list[Kind]:
     for members in groups.values():
         first = members[0]
         lens, longer = first.lens, max(first.width, first.height)
-        focal = (lens.focal if lens else GUESSED_FOCAL) * longer
+        focal = (lens.focal if lens else DEFAULT_FOCAL_FACTOR) * longer
         source = lens.source if lens else "a guess"
         kinds.append(
-            Kind(
+            CameraGroup(
                 camera=first.camera,
                 width=first.width,
                 height=first.height,
@@ -70,14 +70,14 @@ def kinds_of(photographs: Sequence[Photograph]) -> list[Kind]:
     return kinds
 
 
-def stand_upright(work: Work, photographs: Sequence[Photograph]) -> list[LeftOut]:
+def write_upright_images(workspace: Workspace, photographs: Sequence[ImageMetadata]) -> list[ExcludedImage]:
     """Fill the work folder with links to the photographs, and upright copies of those that EXIF says lie.
 
     Returns those that could not be decoded. Photographs themselves are never changed.
     """
     failed = []
     for photo in photographs:
-        target = work.photographs / photo.name
+        target = workspace.photographs / photo.name
         if target.exists():
             continue
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -88,12 +88,12 @@ def stand_upright(work: Work, photographs: Sequence[Photograph]) -> list[LeftOut
         try:
             _write_upright(photo.path, target)
         except (OSError, SyntaxError, ValueError) as error:
-            failed.append(LeftOut(photo.name, f"cannot be decoded ({error}): copy it again"))
+            failed.append(ExcludedImage(photo.name, f"cannot be decoded ({error}): copy it again"))
     return failed
 
 
 def _write_upright(source: Path, target: Path) -> None:
-    with pillow_quietly(), Image.open(source) as image:
+    with pillow_without_limits(), Image.open(source) as image:
         upright = ImageOps.exif_transpose(image).convert("RGB")
     kind = (
         "PNG" if target.suffix.lower() == ".png" else "TIFF" if target.suffix.lower() in (".tif", ".tiff") else "JPEG"
@@ -102,18 +102,18 @@ def _write_upright(source: Path, target: Path) -> None:
     def write(file: Path) -> None:
         upright.save(file, kind, quality=_UPRIGHT_QUALITY, subsampling=0)
 
-    write_atomically(target, write)
+    write_atomic(target, write)
 
 
-def open_database(work: Work, kinds: Sequence[Kind]) -> None:
+def create_database(workspace: Workspace, camera_groups: Sequence[CameraGroup]) -> None:
     """The database with one camera for each kind of photographs, unless it is there."""
-    work.path.mkdir(parents=True, exist_ok=True)
-    database = pycolmap.Database.open(work.database)
+    workspace.path.mkdir(parents=True, exist_ok=True)
+    database = pycolmap.Database.open(workspace.database)
     try:
-        if database.num_cameras() == len(kinds):
+        if database.num_cameras() == len(camera_groups):
             return
         database.clear_all_tables()
-        for kind in kinds:
+        for kind in camera_groups:
             params = [kind.focal_px, kind.width / 2, kind.height / 2, 0.0]
             camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=kind.width, height=kind.height, params=params)
             camera.has_prior_focal_length = kind.known
@@ -125,59 +125,69 @@ def open_database(work: Work, kinds: Sequence[Kind]) -> None:
         database.close()
 
 
-def find_features(
-    work: Work, kinds: Sequence[Kind], feature_size: int, most: int, threads: int, console: Console
+def extract_features(
+    workspace: Workspace,
+    camera_groups: Sequence[CameraGroup],
+    max_image_size: int,
+    max_num_features: int,
+    threads: int,
+    console: Console,
 ) -> dict[str, int]:
     """Features of all photographs into the database; those that are there already are kept. Returns their numbers."""
-    names = [photo.name for kind in kinds for photo in kind.photographs if (work.photographs / photo.name).exists()]
+    names = [
+        photo.name
+        for kind in camera_groups
+        for photo in kind.photographs
+        if (workspace.photographs / photo.name).exists()
+    ]
     count, done = len(names), 0
-    with progress(console, "features, photographs", count) as tell:
-        for number, kind in enumerate(kinds, 1):
-            missing = [photo.name for photo in kind.photographs if (work.photographs / photo.name).exists()]
-            there = feature_counts(work)
+    with report_progress(console, "features, photographs", count) as tell:
+        for number, kind in enumerate(camera_groups, 1):
+            missing = [photo.name for photo in kind.photographs if (workspace.photographs / photo.name).exists()]
+            there = count_features(workspace)
             done += sum(name in there for name in missing)
             missing = [name for name in missing if name not in there]
-            octave = -1 if is_searched_finely(max(kind.width, kind.height), feature_size, count) else 0
+            octave = -1 if is_upsampled(max(kind.width, kind.height), max_image_size, count) else 0
             for masked in (False, True):  # COLMAP takes masks for all photographs of a call, or for none
-                names = [name for name in missing if work.mask(name).exists() == masked]
-                for start in range(0, len(names), AT_ONCE * threads):
-                    chunk = names[start : start + AT_ONCE * threads]
-                    _extract(work, chunk, masked, number, octave, feature_size, most, threads)
+                names = [name for name in missing if workspace.mask(name).exists() == masked]
+                for start in range(0, len(names), IMAGES_PER_THREAD * threads):
+                    chunk = names[start : start + IMAGES_PER_THREAD * threads]
+                    _extract(workspace, chunk, masked, number, octave, max_image_size, max_num_features, threads)
                     done += len(chunk)
                     tell(done)
-    return feature_counts(work)
+    return count_features(workspace)
 
 
-def is_searched_finely(longer_side: int, feature_size: int, count: int) -> bool:
+def is_upsampled(longer_side: int, max_image_size: int, count: int) -> bool:
     """Whether photographs of this size, so many in all, are searched at twice their size."""
-    return min(longer_side, feature_size) < SMALL_PX or count <= FEW_PHOTOGRAPHS
+    return min(longer_side, max_image_size) < UPSAMPLE_BELOW_PX or count <= UPSAMPLE_BELOW_IMAGES
 
 
 def _extract(
-    work: Work,
+    workspace: Workspace,
     names: list[str],
     masked: bool,
     camera: int,
     first_octave: int,
-    feature_size: int,
-    most: int,
+    max_image_size: int,
+    max_num_features: int,
     threads: int,
 ) -> None:
     reader, options = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
     reader.existing_camera_id = camera
     if masked:
-        reader.mask_path = work.masks
-    options.num_threads, options.max_image_size, options.use_gpu = threads, feature_size, False
-    options.sift.first_octave, options.sift.max_num_features = first_octave, most
-    call(
-        pycolmap.extract_features, work.database, work.photographs, names, reader_options=reader,
+        reader.mask_path = workspace.masks
+    options.num_threads, options.max_image_size, options.use_gpu = threads, max_image_size, False
+    options.sift.first_octave, options.sift.max_num_features = first_octave, max_num_features
+    call_cancellable(
+        pycolmap.extract_features, workspace.database, workspace.photographs, names, reader_options=reader,
         extraction_options=options, device=pycolmap.Device.cpu,
     )  # fmt: skip
 
 
-def feature_counts(work: Work) -> dict[str, int]:
+def count_features(workspace: Workspace) -> dict[str, int]:
     """Numbers of features by the names of photographs in the database."""
-    database = pycolmap.Database.open(work.database)
+    database = pycolmap.Database.open(workspace.database)
     try:
         return {
             image.name: database.num_keypoints_for_image(image.image_id)
@@ -188,16 +198,16 @@ def feature_counts(work: Work) -> dict[str, int]:
         database.close()
 
 
-def without_features(photographs: Sequence[Photograph], counts: dict[str, int]) -> list[LeftOut]:
+def images_without_features(photographs: Sequence[ImageMetadata], counts: dict[str, int]) -> list[ExcludedImage]:
     """Photographs that COLMAP could not decode, or found nearly nothing in (outside their masks)."""
     found = []
     for photo in photographs:
         count = counts.get(photo.name)
         if count is None:
-            found.append(LeftOut(photo.name, "cannot be decoded: copy it again"))
-        elif count < FEW_FEATURES:
+            found.append(ExcludedImage(photo.name, "cannot be decoded: copy it again"))
+        elif count < MIN_FEATURES:
             where = " where its mask is white" if photo.may_be_masked else ""
-            found.append(LeftOut(photo.name, f"shows only {count} features{where}: blurred, dark, sky or water?"))
+            found.append(ExcludedImage(photo.name, f"shows only {count} features{where}: blurred, dark, sky or water?"))
     if len(photographs) - len(found) < 3:
         raise CaptureError(
             f"{len(photographs) - len(found)} of {len(photographs)} photographs show enough to be matched; a scene "

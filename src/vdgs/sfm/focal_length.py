@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from vdgs.sfm.xmp import number
+from vdgs.sfm.xmp import first_number
 
 #: Width in millimetres of the sensors of cameras that do not say it in EXIF, by EXIF's model.
 SENSOR_WIDTH_MM = {
@@ -17,15 +17,15 @@ SENSOR_WIDTH_MM = {
 #: Half the diagonal's meaning of "35 mm equivalent": that of a 36 x 24 mm picture.
 DIAGONAL_35_MM = math.hypot(36, 24)
 #: Wider pictures than this are cut from a sensor of 4 x 3 (films' shape, on drones).
-WIDEST_SENSOR = 1.6
+MAX_SENSOR_ASPECT = 1.6
 #: Focal lengths over the longer side beyond these are damage.
-SHORTEST, LONGEST = 0.2, 20.0
+MIN_FOCAL, MAX_FOCAL = 0.2, 20.0
 _INCH, _CENTIMETRE, _MILLIMETRE = 25.4, 10.0, 1.0
 _UNITS = {2: _INCH, 3: _CENTIMETRE, 4: _MILLIMETRE}
 
 
 #: What says a focal length that was measured, lens by lens.
-CALIBRATED = "the maker's calibration in XMP"
+CALIBRATED_SOURCE = "the maker's calibration in XMP"
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Lens:
     source: str
 
 
-def find_lens(
+def read_lens(
     tags: Mapping[int, Any], details: Mapping[int, Any], xmp: Mapping[str, str], width: int, height: int
 ) -> Lens | None:
     """What is best known of: the maker's calibration, EXIF's sensor, a table of sensors, the 35 mm equivalent."""
@@ -45,12 +45,12 @@ def find_lens(
     model = _model(tags)
     focal_mm, equivalent_mm = _number(details.get(0x920A)), _number(details.get(0xA405))
     ways = (
-        (_calibrated(xmp, original), CALIBRATED),
+        (_calibrated(xmp, original), CALIBRATED_SOURCE),
         (_by_sensor(focal_mm, _sensor(details, original)), "EXIF's focal length and sensor"),
         (_by_sensor(focal_mm, SENSOR_WIDTH_MM.get(model)), f"EXIF's focal length, the sensor of {model}"),
         (_by_equivalent(equivalent_mm, width, height), "EXIF's 35 mm equivalent"),
     )
-    return next((Lens(focal, source) for focal, source in ways if focal and SHORTEST < focal < LONGEST), None)
+    return next((Lens(focal, source) for focal, source in ways if focal and MIN_FOCAL < focal < MAX_FOCAL), None)
 
 
 def _number(value: Any) -> float | None:
@@ -72,7 +72,7 @@ def _calibrated(xmp: Mapping[str, str], original: float) -> float | None:
     try:
         focal = float(words[0])
     except ValueError:
-        focal = number(xmp, "drone-dji:CalibratedFocalLength") or 0.0
+        focal = first_number(xmp, "drone-dji:CalibratedFocalLength") or 0.0
     return focal / original if math.isfinite(focal) and focal > 0 else None
 
 
@@ -88,6 +88,6 @@ def _by_sensor(focal_mm: float | None, sensor_mm: float | None) -> float | None:
 
 def _by_equivalent(equivalent_mm: float | None, width: int, height: int) -> float | None:
     longer, shorter = max(width, height), min(width, height)
-    if longer > WIDEST_SENSOR * shorter:
+    if longer > MAX_SENSOR_ASPECT * shorter:
         shorter = round(longer * 3 / 4)
     return equivalent_mm / DIAGONAL_35_MM * math.hypot(longer, shorter) / longer if equivalent_mm else None

@@ -10,21 +10,21 @@ import pycolmap
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
-from vdgs.captures.reconstruction import SurveyFacts
+from vdgs.captures.reconstruction import GcpReport
 from vdgs.errors import CaptureError
 from vdgs.geometry.similarity import Similarity, fit_similarity, fit_similarity_robust, is_collinear
-from vdgs.sfm.gcp_list import LEAST_POINTS, LEAST_SIGHTINGS, Control, ControlPoint
-from vdgs.sfm.georegistration import move
-from vdgs.sfm.workspace import call
+from vdgs.sfm.gcp_list import MIN_CONTROL_POINTS, MIN_OBSERVATIONS, GcpList, GroundControlPoint
+from vdgs.sfm.georegistration import transform_model
+from vdgs.sfm.workspace import call_cancellable
 
 #: With so many points, one that does not fit the others is found and left out.
-ENOUGH_TO_DOUBT = 6
+MIN_POINTS_FOR_OUTLIERS = 6
 #: A mark is right to about so many pixels: what is farther off counts less.
-MARK_PX = 2.0
+MARK_SIGMA_PX = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class TriangulatedPoint:
     """A surveyed point as a model has it."""
 
     place: Float[np.ndarray, "3"]
@@ -33,14 +33,14 @@ class Seen:
     """RMS distance between where photographs show it and where the model puts it there."""
 
 
-def locate(model: pycolmap.Reconstruction, point: ControlPoint) -> Seen | None:
+def triangulate(model: pycolmap.Reconstruction, point: GroundControlPoint) -> TriangulatedPoint | None:
     """Where the placed photographs see a point; None where fewer than two show it from different places.
 
     The point nearest to all rays, then the least sum of its errors in the photographs, robustly.
     """
     images = {image.name: image for image in model.images.values() if image.has_pose}
     seen = [each for each in point.sightings if each.photograph in images]
-    if len({each.photograph for each in seen}) < LEAST_SIGHTINGS:
+    if len({each.photograph for each in seen}) < MIN_OBSERVATIONS:
         return None
     views = [images[each.photograph] for each in seen]
     cameras = [model.cameras[view.camera_id] for view in views]
@@ -50,7 +50,7 @@ def locate(model: pycolmap.Reconstruction, point: ControlPoint) -> Seen | None:
         np.append(np.asarray(camera.cam_from_img(pixel)).ravel()[:2], 1) @ pose[:, :3]
         for camera, pose, pixel in zip(cameras, poses, marked, strict=True)
     ]
-    start = _nearest(np.array([view.projection_center() for view in views]), np.array(rays))
+    start = _intersect_rays(np.array([view.projection_center() for view in views]), np.array(rays))
     if start is None:
         return None
 
@@ -63,12 +63,12 @@ def locate(model: pycolmap.Reconstruction, point: ControlPoint) -> Seen | None:
 
     if any((pose @ np.append(start, 1))[2] <= 0 for pose in poses):
         return None  # behind a camera: the marks are of different things
-    found = least_squares(errors, start, loss="soft_l1", f_scale=MARK_PX, x_scale="jac").x
-    return Seen(found, len(views), float(np.sqrt((errors(found).reshape(-1, 2) ** 2).sum(axis=1).mean())))
+    found = least_squares(errors, start, loss="soft_l1", f_scale=MARK_SIGMA_PX, x_scale="jac").x
+    return TriangulatedPoint(found, len(views), float(np.sqrt((errors(found).reshape(-1, 2) ** 2).sum(axis=1).mean())))
 
 
-def bring_to_control(
-    model: pycolmap.Reconstruction, control: Control, origin: tuple[float, float, float], hold_focal: bool, threads: int
+def adjust_to_gcps(
+    model: pycolmap.Reconstruction, gcps: GcpList, origin: tuple[float, float, float], fix_focal: bool, threads: int
 ) -> tuple[str, set[str]]:
     """Move a model to the points that are not held out, then bend it by them: a bundle adjustment in which they stay
     where they were surveyed. In place, metres east, north, up of `origin`. Returns how that was done, and
@@ -76,46 +76,46 @@ def bring_to_control(
 
     Raises CaptureError where fewer than three of the points are seen by placed photographs, or they lie along a line.
     """
-    targets = control.enu(origin)
-    used = [(k, seen) for k, seen in _located(model, control).items() if not control.points[k].held_out]
+    targets = gcps.enu(origin)
+    used = [(k, seen) for k, seen in _triangulate_all(model, gcps).items() if not gcps.points[k].is_check_point]
     rows = np.array([k for k, _ in used], int)
-    if len(used) < LEAST_POINTS or is_collinear(targets[rows]):
+    if len(used) < MIN_CONTROL_POINTS or is_collinear(targets[rows]):
         raise CaptureError(
-            f"{control.source}: {len(used)} of its points are shown by two placed photographs or more, not along one "
-            f"line; {LEAST_POINTS} are needed. Mark them in more photographs, or hold them out: --check-points all"
+            f"{gcps.source}: {len(used)} of its points are shown by two placed photographs or more, not along one "
+            f"line; {MIN_CONTROL_POINTS} are needed. Mark them in more photographs, or hold them out: --check-points all"
         )
     places = np.array([seen.place for _, seen in used])
-    similarity, trusted = _fit(places, targets[rows])
-    move(model, similarity)
+    similarity, trusted = _fit_to_gcps(places, targets[rows])
+    transform_model(model, similarity)
     kept = rows[trusted]
-    _adjust(model, [(control.points[k], targets[k]) for k in kept.tolist()], hold_focal, threads)
-    doubtful = {control.points[k].name for k in rows[~trusted].tolist()}
-    return f"{len(kept)} control points ({control.source}, {control.system})", doubtful
+    _bundle_adjust(model, [(gcps.points[k], targets[k]) for k in kept.tolist()], fix_focal, threads)
+    doubtful = {gcps.points[k].name for k in rows[~trusted].tolist()}
+    return f"{len(kept)} control points ({gcps.source}, {gcps.system})", doubtful
 
 
-def survey(
-    model: pycolmap.Reconstruction, control: Control, origin: tuple[float, float, float], doubtful: set[str]
-) -> tuple[SurveyFacts, ...]:
+def measure_gcps(
+    model: pycolmap.Reconstruction, gcps: GcpList, origin: tuple[float, float, float], outliers: set[str]
+) -> tuple[GcpReport, ...]:
     """What a placed model makes of all points: seen minus surveyed, metres east, north, up."""
-    targets, located = control.enu(origin), _located(model, control)
+    targets, located = gcps.enu(origin), _triangulate_all(model, gcps)
     facts = []
-    for k, point in enumerate(control.points):
+    for k, point in enumerate(gcps.points):
         seen = located.get(k)
-        used_as = "check" if point.held_out else "not used" if point.name in doubtful or not seen else "control"
+        used_as = "check" if point.is_check_point else "not used" if point.name in outliers or not seen else "control"
         if seen is None:
-            facts.append(SurveyFacts(point.name, used_as, 0))
+            facts.append(GcpReport(point.name, used_as, 0))
         else:
             off = tuple(float(value) for value in seen.place - targets[k])
-            facts.append(SurveyFacts(point.name, used_as, seen.photographs, off, seen.error_px))
+            facts.append(GcpReport(point.name, used_as, seen.photographs, off, seen.error_px))
     return tuple(facts)
 
 
-def _located(model: pycolmap.Reconstruction, control: Control) -> dict[int, Seen]:
-    found = ((k, locate(model, point)) for k, point in enumerate(control.points))
+def _triangulate_all(model: pycolmap.Reconstruction, gcps: GcpList) -> dict[int, TriangulatedPoint]:
+    found = ((k, triangulate(model, point)) for k, point in enumerate(gcps.points))
     return {k: seen for k, seen in found if seen is not None}
 
 
-def _nearest(centres: Float[np.ndarray, "n 3"], rays: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"] | None:
+def _intersect_rays(centres: Float[np.ndarray, "n 3"], rays: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"] | None:
     """The point with the least sum of squared distances to lines; None where they are parallel."""
     rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
@@ -125,16 +125,16 @@ def _nearest(centres: Float[np.ndarray, "n 3"], rays: Float[np.ndarray, "n 3"]) 
     return np.asarray(np.linalg.solve(total, np.einsum("nij,nj->i", across, centres)))
 
 
-def _fit(places: Float[np.ndarray, "n 3"], targets: Float[np.ndarray, "n 3"]) -> tuple[Similarity, np.ndarray]:
-    if len(places) < ENOUGH_TO_DOUBT:
-        return fit_similarity(places, targets), np.ones(len(places), bool)
-    return fit_similarity_robust(places, targets)
+def _fit_to_gcps(points: Float[np.ndarray, "n 3"], targets: Float[np.ndarray, "n 3"]) -> tuple[Similarity, np.ndarray]:
+    if len(points) < MIN_POINTS_FOR_OUTLIERS:
+        return fit_similarity(points, targets), np.ones(len(points), bool)
+    return fit_similarity_robust(points, targets)
 
 
-def _adjust(
+def _bundle_adjust(
     model: pycolmap.Reconstruction,
-    points: Sequence[tuple[ControlPoint, np.ndarray]],
-    hold_focal: bool,
+    points: Sequence[tuple[GroundControlPoint, np.ndarray]],
+    fix_focal: bool,
     threads: int,
 ) -> None:
     """Bundle adjustment with points that stay where they are, which are taken out of the model again."""
@@ -143,24 +143,24 @@ def _adjust(
         if image.has_pose:
             config.add_image(image.image_id)
             images[image.name] = image
-    fixed = [_add_fixed(model, images, point, target) for point, target in points]
+    fixed = [_add_fixed_point(model, images, point, target) for point, target in points]
     for number in fixed:
         config.add_constant_point(number)
     options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary, options.refine_focal_length = False, not hold_focal
+    options.print_summary, options.refine_focal_length = False, not fix_focal
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
     options.ceres.solver_options.num_threads = threads
     adjuster = pycolmap.create_default_bundle_adjuster(options, config, model)
     try:
-        call(lambda cancellation_token: adjuster.solve())
+        call_cancellable(lambda cancellation_token: adjuster.solve())
     finally:
         for number in fixed:
             model.delete_point3D(number)
     model.update_point_3d_errors()
 
 
-def _add_fixed(
-    model: pycolmap.Reconstruction, images: dict[str, pycolmap.Image], point: ControlPoint, target: np.ndarray
+def _add_fixed_point(
+    model: pycolmap.Reconstruction, images: dict[str, pycolmap.Image], point: GroundControlPoint, target: np.ndarray
 ) -> int:
     track = pycolmap.Track()
     for sighting in point.sightings:

@@ -11,27 +11,27 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from vdgs.captures.name_resolution import Lookup, ambiguity
+from vdgs.captures.name_resolution import NameLookup, ambiguity_message
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic
 from vdgs.geometry.similarity import is_collinear
-from vdgs.sfm.image_list import Collection
-from vdgs.sfm.image_metadata import Photograph
+from vdgs.sfm.image_list import ImageList
+from vdgs.sfm.image_metadata import ImageMetadata
 
 #: Fewer points fix no place, scale and directions.
-LEAST_POINTS = 3
+MIN_CONTROL_POINTS = 3
 #: Photographs that must show a point: one view tells a line, no place.
-LEAST_SIGHTINGS = 2
+MIN_OBSERVATIONS = 2
 #: Points farther from the photographs than this are in another zone, or east and north have changed places (metres).
-FAR_M = 20_000.0
+MAX_DISTANCE_M = 20_000.0
 #: A word for all points of the file, where some are named to be held out.
-ALL = "all"
+ALL_POINTS = "all"
 #: Larger files, and points higher above or below the sea, are none (bytes, metres).
-_LONGEST_FILE, _HIGHEST_M = 1 << 24, 20_000.0
+_MAX_FILE_BYTES, _MAX_HEIGHT_M = 1 << 24, 20_000.0
 
 
 @dataclass(frozen=True)
-class Sighting:
+class GcpObservation:
     """Where a photograph shows a point."""
 
     photograph: str
@@ -41,30 +41,30 @@ class Sighting:
 
 
 @dataclass(frozen=True)
-class ControlPoint:
+class GroundControlPoint:
     """A surveyed point."""
 
     name: str
     geodetic: tuple[float, float, float]
     """Latitude and longitude (WGS 84) in degrees, height in metres as the file has it."""
-    sightings: tuple[Sighting, ...]
-    held_out: bool
+    sightings: tuple[GcpObservation, ...]
+    is_check_point: bool
     """Only measured afterwards (a check point)."""
 
 
 @dataclass(frozen=True, eq=False)
-class Control:
+class GcpList:
     """All surveyed points of a file."""
 
-    points: tuple[ControlPoint, ...]
+    points: tuple[GroundControlPoint, ...]
     system: str
     """The coordinate system that the file names."""
     source: str
     notes: tuple[str, ...]
 
     @property
-    def places_the_model(self) -> bool:
-        return any(not point.held_out for point in self.points)
+    def has_control_points(self) -> bool:
+        return any(not point.is_check_point for point in self.points)
 
     def enu(self, origin: tuple[float, float, float]) -> Float[np.ndarray, "n 3"]:
         """All points in metres east, north, up of an origin."""
@@ -86,10 +86,10 @@ class _Line:
     name: str
 
 
-def read_control(file: Path, collection: Collection, held_out: Sequence[str]) -> Control:
+def read_gcp_list(file: Path, collection: ImageList, check_points: Sequence[str]) -> GcpList:
     """The points of a gcp_list.txt: a first line with the coordinate system, then x y z px py photograph [name].
 
-    Pixels are those of the file as it is, before EXIF's orientation, as ODM counts them. Points named in `held_out`
+    Pixels are those of the file as it is, before EXIF's orientation, as ODM counts them. Points named in `is_check_point`
     (`all`: every one) are check points. What photographs show that were left out is not used.
 
     Raises CaptureError for a file that cannot be read, a system that is unknown, lines that are none, photographs that
@@ -97,22 +97,22 @@ def read_control(file: Path, collection: Collection, held_out: Sequence[str]) ->
     """
     header, lines = _lines(file)
     by_name = _by_name(collection)
-    found = [(line, _sighting(line, by_name, file)) for line in lines]
-    transform, system = _system(header, file)
-    groups: dict[tuple[object, ...], list[tuple[_Line, Sighting | None]]] = {}
+    found = [(line, _observation(line, by_name, file)) for line in lines]
+    transform, system = _crs_transform(header, file)
+    groups: dict[tuple[object, ...], list[tuple[_Line, GcpObservation | None]]] = {}
     for line, sighting in found:
         groups.setdefault((line.name,) if line.name else line.place, []).append((line, sighting))
     names = [group[0][0].name or f"point {k}" for k, group in enumerate(groups.values(), 1)]
-    _check_held_out(held_out, names, file)
+    _check_held_out(check_points, names, file)
     points = []
     for name, group in zip(names, groups.values(), strict=True):
-        geodetic = _place([line for line, _ in group], name, transform, system, file)
+        geodetic = _geodetic([line for line, _ in group], name, transform, system, file)
         seen = tuple(sighting for _, sighting in group if sighting is not None)
-        points.append(ControlPoint(name, geodetic, seen, ALL in held_out or name in held_out))
+        points.append(GroundControlPoint(name, geodetic, seen, ALL_POINTS in check_points or name in check_points))
     return _checked(points, system, file)
 
 
-def _place(lines: Sequence[_Line], name: str, transform: Any, system: str, file: Path) -> tuple[float, float, float]:
+def _geodetic(lines: Sequence[_Line], name: str, transform: Any, system: str, file: Path) -> tuple[float, float, float]:
     """Latitude, longitude and height of a point that lines speak of."""
     first = lines[0]
     other = next((line for line in lines if line.place != first.place), None)
@@ -121,7 +121,7 @@ def _place(lines: Sequence[_Line], name: str, transform: Any, system: str, file:
             f"{file}: line {other.number}: the point {name} has another place in line {first.number}. Mend one of them."
         )
     latitude, longitude, height = (float(value) for value in transform(np.array([first.place]))[0])
-    if not all(map(math.isfinite, (latitude, longitude, height))) or abs(latitude) > 90 or abs(height) > _HIGHEST_M:
+    if not all(map(math.isfinite, (latitude, longitude, height))) or abs(latitude) > 90 or abs(height) > _MAX_HEIGHT_M:
         raise CaptureError(
             f"{file}: line {first.number}: {', '.join(f'{value:.10g}' for value in first.place)} is no place in "
             f"{system}. Is it the right system, and x (east) before y (north)?"
@@ -129,21 +129,21 @@ def _place(lines: Sequence[_Line], name: str, transform: Any, system: str, file:
     return latitude, longitude, height
 
 
-def check_near(control: Control, positions: np.ndarray, origin: tuple[float, float, float], file: Path) -> None:
+def check_gcps_near(gcps: GcpList, positions: np.ndarray, origin: tuple[float, float, float], file: Path) -> None:
     """Raise CaptureError where the points [n, 3] lie nowhere near the positions [m, 3] of the photographs."""
     if not len(positions):
         return
-    away = float(np.median(np.linalg.norm(control.enu(origin)[:, :2] - np.median(positions[:, :2], axis=0), axis=1)))
-    if away > FAR_M:
+    away = float(np.median(np.linalg.norm(gcps.enu(origin)[:, :2] - np.median(positions[:, :2], axis=0), axis=1)))
+    if away > MAX_DISTANCE_M:
         raise CaptureError(
-            f"{file}: its points lie {away / 1000:,.0f} km from the photographs. Is {control.system} the right system "
+            f"{file}: its points lie {away / 1000:,.0f} km from the photographs. Is {gcps.system} the right system "
             "and zone, and x (east) before y (north)?"
         )
 
 
 def _lines(file: Path) -> tuple[str, list[_Line]]:
     try:
-        if file.stat().st_size > _LONGEST_FILE:
+        if file.stat().st_size > _MAX_FILE_BYTES:
             raise CaptureError(f"{file}: is far too large for a list of control points.")
         text = file.read_text(encoding="utf-8-sig")
     except OSError as error:
@@ -172,14 +172,14 @@ def _line(text: str, number: int, file: Path) -> _Line:
     return _Line(number, (x, y, z), (across, down), photograph, name)
 
 
-def _system(header: str, file: Path) -> tuple[Any, str]:
+def _crs_transform(header: str, file: Path) -> tuple[Any, str]:
     """What brings x, y, z [n, 3] to latitude, longitude and height, and the name of their system."""
     try:
         import pyproj
     except ImportError:
         raise CaptureError(f"{file}: needs pyproj: pip install 'vdgs[geo]'.") from None
     try:
-        crs = pyproj.CRS.from_user_input(_named(header))
+        crs = pyproj.CRS.from_user_input(_crs_from_odm(header))
         flat = len(crs.axis_info) == 2
         change = pyproj.Transformer.from_crs(crs, "EPSG:4326" if flat else "EPSG:4979", always_xy=True)
     except pyproj.exceptions.ProjError:
@@ -199,7 +199,7 @@ def _system(header: str, file: Path) -> tuple[Any, str]:
     return to_geodetic, crs.name if crs.name != "unknown" else header
 
 
-def _named(header: str) -> str:
+def _crs_from_odm(header: str) -> str:
     """ODM's own words for systems, `WGS84` and `WGS84 UTM 15N`, as codes; others as they are."""
     words = header.upper().split()
     if words == ["WGS84"]:
@@ -209,13 +209,13 @@ def _named(header: str) -> str:
     return header
 
 
-def _by_name(collection: Collection) -> Lookup[Photograph | str]:
+def _by_name(collection: ImageList) -> NameLookup[ImageMetadata | str]:
     """Photographs, and names of those left out."""
-    left_out: list[tuple[str, Photograph | str]] = [(each.name, each.name) for each in collection.left_out]
-    return Lookup([*((photo.name, photo) for photo in collection.photographs), *left_out])
+    left_out: list[tuple[str, ImageMetadata | str]] = [(each.name, each.name) for each in collection.left_out]
+    return NameLookup([*((photo.name, photo) for photo in collection.photographs), *left_out])
 
 
-def _sighting(line: _Line, by_name: Lookup[Photograph | str], file: Path) -> Sighting | None:
+def _observation(line: _Line, by_name: NameLookup[ImageMetadata | str], file: Path) -> GcpObservation | None:
     """None in a photograph that was left out."""
     found = by_name.find(line.photograph)[1] or by_name.find_elsewhere(line.photograph)[1]
     where = f"{file}: line {line.number}:"
@@ -224,7 +224,7 @@ def _sighting(line: _Line, by_name: Lookup[Photograph | str], file: Path) -> Sig
     photo = found[0]
     if len(found) > 1:
         one, other = (each if isinstance(each, str) else each.name for each in found[:2])
-        raise CaptureError(f"{where} {ambiguity(line.photograph, one, other)}")
+        raise CaptureError(f"{where} {ambiguity_message(line.photograph, one, other)}")
     if isinstance(photo, str):
         return None
     width, height = photo.stored_size
@@ -233,31 +233,31 @@ def _sighting(line: _Line, by_name: Lookup[Photograph | str], file: Path) -> Sig
             f"{where} pixel {line.pixel[0]:g}, {line.pixel[1]:g} is outside {photo.name}, which has {width} x {height}."
             " Was the photograph made smaller since?"
         )
-    return Sighting(photo.name, photo.upright(line.pixel))
+    return GcpObservation(photo.name, photo.to_upright_pixel(line.pixel))
 
 
 def _check_held_out(held_out: Sequence[str], names: Sequence[str], file: Path) -> None:
-    unknown = [name for name in held_out if name not in names and name != ALL]
+    unknown = [name for name in held_out if name not in names and name != ALL_POINTS]
     if unknown:
-        raise CaptureError(f"--check-points {unknown[0]}: {file} has {', '.join(names[:20])}; or say {ALL}.")
+        raise CaptureError(f"--check-points {unknown[0]}: {file} has {', '.join(names[:20])}; or say {ALL_POINTS}.")
 
 
-def _checked(points: list[ControlPoint], system: str, file: Path) -> Control:
+def _checked(points: list[GroundControlPoint], system: str, file: Path) -> GcpList:
     """Without points that too few photographs show. Raises CaptureError where too few are left to place a model."""
-    seen = [point for point in points if len({each.photograph for each in point.sightings}) >= LEAST_SIGHTINGS]
+    seen = [point for point in points if len({each.photograph for each in point.sightings}) >= MIN_OBSERVATIONS]
     lonely = [point.name for point in points if point not in seen]
     notes = [f"{file.name}: only one photograph shows {', '.join(lonely[:5])}; not used."] if lonely else []
-    used = [point for point in seen if not point.held_out]
-    if not seen or (used and len(used) < LEAST_POINTS):
+    used = [point for point in seen if not point.is_check_point]
+    if not seen or (used and len(used) < MIN_CONTROL_POINTS):
         raise CaptureError(
-            f"{file}: {len(used)} points that {LEAST_SIGHTINGS} photographs show, and {LEAST_POINTS} are needed to "
-            f"place a scene{' (' + '; '.join(notes) + ')' if notes else ''}. With fewer: --check-points {ALL}"
+            f"{file}: {len(used)} points that {MIN_OBSERVATIONS} photographs show, and {MIN_CONTROL_POINTS} are needed to "
+            f"place a scene{' (' + '; '.join(notes) + ')' if notes else ''}. With fewer: --check-points {ALL_POINTS}"
         )
-    control = Control(tuple(seen), system, file.name, tuple(notes))
-    targets = control.enu(control.middle)[[not point.held_out for point in seen]]
+    control = GcpList(tuple(seen), system, file.name, tuple(notes))
+    targets = control.enu(control.middle)[[not point.is_check_point for point in seen]]
     if used and is_collinear(targets):
         raise CaptureError(
             f"{file}: its points lie along one line, about which a scene could still turn. Survey one beside it, or "
-            f"use them as check points: --check-points {ALL}"
+            f"use them as check points: --check-points {ALL_POINTS}"
         )
     return control

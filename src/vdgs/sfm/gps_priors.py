@@ -10,29 +10,29 @@ import numpy as np
 
 from vdgs.captures.georeference import match_gps, read_gps
 from vdgs.geometry.geodesy import enu_from_geodetic
-from vdgs.sfm.image_metadata import Photograph
+from vdgs.sfm.image_metadata import ImageMetadata
 
 #: Positions nearer than this to 0, 0 (degrees) are a receiver without satellites.
-NOWHERE_DEG = 0.01
+NULL_POSITION_DEG = 0.01
 #: A position so many times farther from the middle than the median one, and so many metres, is another flight's.
-FAR_TIMES, FAR_M = 10.0, 1000.0
+OUTLIER_FACTOR, OUTLIER_DISTANCE_M = 10.0, 1000.0
 #: Positions that spread less than this (metres) say nothing: the receiver kept the first, or nobody moved.
-LEAST_SPREAD_M = 2.0
+MIN_SPREAD_M = 2.0
 #: Fewer positions fix no scale and no directions.
-LEAST_POSITIONS = 3
+MIN_POSITIONS = 3
 #: No receiver is better than this, whatever it writes (metres).
-LEAST_DEVIATION_M = 0.01
+MIN_STD_M = 0.01
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Positions:
+class GpsPriors:
     """Positions in metres east, north, up of an origin, for those photographs that have one."""
 
     index: np.ndarray
     """Which photographs, [m] int."""
     enu: np.ndarray
     """[m, 3] float64."""
-    deviations: np.ndarray
+    gps_std: np.ndarray
     """Standard deviations [m, 3] in metres."""
     origin: tuple[float, float, float]
     """Latitude and longitude in degrees, altitude in metres."""
@@ -47,7 +47,7 @@ class Positions:
     @property
     def usable(self) -> bool:
         """Whether they can place a reconstruction."""
-        return len(self) >= LEAST_POSITIONS
+        return len(self) >= MIN_POSITIONS
 
     def rows(self, count: int) -> np.ndarray:
         """Positions of all photographs [count, 3], NaN where there is none."""
@@ -56,23 +56,21 @@ class Positions:
         return rows
 
 
-def find_positions(
-    photographs: Sequence[Photograph], table: Path | None, deviation_m: tuple[float, float]
-) -> Positions:
+def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, std_m: tuple[float, float]) -> GpsPriors:
     """Positions from a table (name, lat, lon, alt), or from the photographs themselves.
 
     Those at 0, 0 and those kilometres away from all others are left out with a note; all of them where they do not
     spread. Raises CaptureError for a table that cannot be read or is another flight's.
     """
-    geodetic, source, notes = _recorded(photographs, table)
+    geodetic, source, notes = _read_geodetic(photographs, table)
     names = [photo.name for photo in photographs]
     known = np.isfinite(geodetic[:, :2]).all(axis=1)
-    nowhere = known & (np.abs(geodetic[:, :2]) < NOWHERE_DEG).all(axis=1)
+    nowhere = known & (np.abs(geodetic[:, :2]) < NULL_POSITION_DEG).all(axis=1)
     if nowhere.any():
         notes.append(f"{_some(names, nowhere)}: the position is 0, 0 (no satellites yet); not used.")
     known &= ~nowhere
     if known.any():
-        far = known & _far(geodetic, known)
+        far = known & _outliers(geodetic, known)
         if far.any():
             notes.append(f"{_some(names, far)}: the position is far from all others; not used.")
         known &= ~far
@@ -83,13 +81,13 @@ def find_positions(
     index = np.flatnonzero(known)
     origin = _origin(geodetic[index])
     enu = enu_from_geodetic(geodetic[index], origin) if len(index) else np.zeros((0, 3))
-    if len(index) >= LEAST_POSITIONS and np.ptp(enu[:, :2], axis=0).max() < LEAST_SPREAD_M:
+    if len(index) >= MIN_POSITIONS and np.ptp(enu[:, :2], axis=0).max() < MIN_SPREAD_M:
         notes.append(
-            f"all {len(index)} positions are within {LEAST_SPREAD_M:g} m of each other: they tell neither scale nor "
+            f"all {len(index)} positions are within {MIN_SPREAD_M:g} m of each other: they tell neither scale nor "
             "north; not used."
         )
         index, enu = index[:0], enu[:0]
-    deviations = np.array([_deviation(photographs[i], table, deviation_m) for i in index.tolist()]).reshape(-1, 3)
+    deviations = np.array([_position_std(photographs[i], table, std_m) for i in index.tolist()]).reshape(-1, 3)
     kinds = (
         list(dict.fromkeys(photographs[i].altitude_type for i in index.tolist()))
         if table is None
@@ -97,13 +95,13 @@ def find_positions(
     )
     if len(kinds) > 1:
         notes.append(f"altitudes are of several kinds ({'; '.join(kinds)}): heights may not fit together.")
-    return Positions(
-        index=index, enu=enu, deviations=deviations, origin=origin, altitude_reference="; ".join(kinds), source=source,
+    return GpsPriors(
+        index=index, enu=enu, gps_std=deviations, origin=origin, altitude_reference="; ".join(kinds), source=source,
         notes=tuple(notes),
     )  # fmt: skip
 
 
-def _recorded(photographs: Sequence[Photograph], table: Path | None) -> tuple[np.ndarray, str, list[str]]:
+def _read_geodetic(photographs: Sequence[ImageMetadata], table: Path | None) -> tuple[np.ndarray, str, list[str]]:
     """Latitude, longitude, altitude [n, 3], NaN where unknown."""
     geodetic = np.full((len(photographs), 3), np.nan)
     if table is None:
@@ -116,7 +114,7 @@ def _recorded(photographs: Sequence[Photograph], table: Path | None) -> tuple[np
     return geodetic, table.name, []
 
 
-def _far(geodetic: np.ndarray, known: np.ndarray) -> np.ndarray:
+def _outliers(geodetic: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Positions that cannot be of this flight, [n] bool."""
     middle = np.median(geodetic[known], axis=0)
     level = geodetic.copy()
@@ -126,8 +124,8 @@ def _far(geodetic: np.ndarray, known: np.ndarray) -> np.ndarray:
     across = np.linalg.norm(enu[:, :2], axis=1)
     up = np.abs(level[:, 2] - np.median(altitudes))
     with np.errstate(invalid="ignore"):
-        return (across > max(FAR_M, FAR_TIMES * float(np.median(across[known])))) | (
-            up > max(FAR_M, FAR_TIMES * float(np.median(up[known])))
+        return (across > max(OUTLIER_DISTANCE_M, OUTLIER_FACTOR * float(np.median(across[known])))) | (
+            up > max(OUTLIER_DISTANCE_M, OUTLIER_FACTOR * float(np.median(up[known])))
         )
 
 
@@ -138,15 +136,15 @@ def _origin(geodetic: np.ndarray) -> tuple[float, float, float]:
     return latitude, longitude, altitude
 
 
-def _deviation(photo: Photograph, table: Path | None, deviation_m: tuple[float, float]) -> tuple[float, float, float]:
+def _position_std(photo: ImageMetadata, table: Path | None, std_m: tuple[float, float]) -> tuple[float, float, float]:
     """A table has `deviation_m` across and upwards; photographs have what a receiver with RTK says, or what EXIF says
     across and as much worse upwards as `deviation_m` is."""
-    across, up = deviation_m
-    if table is None and photo.deviations is not None:
-        east, north, height = (max(value, LEAST_DEVIATION_M) for value in photo.deviations)
+    across, up = std_m
+    if table is None and photo.gps_std is not None:
+        east, north, height = (max(value, MIN_STD_M) for value in photo.gps_std)
         return east, north, height
     if table is None and photo.error_m is not None:
-        error = max(photo.error_m, LEAST_DEVIATION_M)
+        error = max(photo.error_m, MIN_STD_M)
         return error, error, error * up / across
     return across, across, up
 

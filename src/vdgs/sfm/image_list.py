@@ -10,25 +10,25 @@ from hashlib import blake2b
 from pathlib import Path
 
 from vdgs.captures.formats.colmap import partial_model
-from vdgs.captures.formats.source_capture import listing
+from vdgs.captures.formats.source_capture import format_list
 from vdgs.captures.image_files import IMAGE_SUFFIXES
-from vdgs.captures.name_resolution import listable, without_suffix
+from vdgs.captures.name_resolution import match_key, to_colmap_name
 from vdgs.captures.output_guard import is_capture
 from vdgs.captures.reconstruction import is_reconstruction
 from vdgs.errors import CaptureError
-from vdgs.sfm.image_metadata import Photograph, Unusable, read_photograph
+from vdgs.sfm.image_metadata import ImageMetadata, UnusableImage, read_image_metadata
 from vdgs.sfm.mask_files import check_mask, find_masks
 
 #: Fewer photographs are no scene.
-LEAST_PHOTOGRAPHS = 3
+MIN_IMAGES = 3
 #: So many bytes at both ends of files of one size tell whether they are copies.
-_COMPARED = 1 << 16
+_DIGEST_BYTES = 1 << 16
 #: Two files beside a photograph that are no news.
-_SILENT = {".ds_store", "thumbs.db"}
+_IGNORED_FILES = {".ds_store", "thumbs.db"}
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class ExcludedImage:
     """A photograph that is not used, and why."""
 
     name: str
@@ -36,18 +36,18 @@ class LeftOut:
 
 
 @dataclass(frozen=True)
-class Collection:
+class ImageList:
     """Photographs in order of their names, and what else lay in their folders."""
 
     folders: tuple[Path, ...]
-    photographs: tuple[Photograph, ...]
-    left_out: tuple[LeftOut, ...]
+    photographs: tuple[ImageMetadata, ...]
+    left_out: tuple[ExcludedImage, ...]
     other_files: int
     notes: tuple[str, ...] = ()
     """What people should know of their masks."""
 
 
-def collect(folders: Sequence[Path]) -> Collection:
+def collect_images(folders: Sequence[Path]) -> ImageList:
     """Read the heads of all photographs in the folders and those below them.
 
     Raises CaptureError for folders that are not there or hold no photographs, captures, names that are alike but for
@@ -74,21 +74,21 @@ def collect(folders: Sequence[Path]) -> Collection:
     named = {name: path for name, path in named.items() if path in masks}
     with ThreadPoolExecutor(4) as pool:
         read = list(pool.map(_read, named.values(), named.keys(), masks.values()))
-    photographs = [each for each in read if isinstance(each, Photograph)]
-    left_out = [each for each in read if isinstance(each, LeftOut)]
-    photographs, doubled = _without_doubles(photographs)
+    photographs = [each for each in read if isinstance(each, ImageMetadata)]
+    left_out = [each for each in read if isinstance(each, ExcludedImage)]
+    photographs, doubled = _drop_duplicates(photographs)
     left_out += doubled
-    if len(photographs) < LEAST_PHOTOGRAPHS:
-        reasons = listing(f"{each.name}: {each.why}" for each in left_out)
+    if len(photographs) < MIN_IMAGES:
+        reasons = format_list(f"{each.name}: {each.why}" for each in left_out)
         raise CaptureError(
             f"{', '.join(map(str, folders))}: {len(photographs)} photograph{'s' if len(photographs) != 1 else ''} that "
-            f"can be used; a scene needs {LEAST_PHOTOGRAPHS} at the very least, and each place two or three that show "
+            f"can be used; a scene needs {MIN_IMAGES} at the very least, and each place two or three that show "
             f"it from different positions.{reasons}"
         )
-    return Collection(tuple(folders), tuple(photographs), tuple(left_out), others, tuple(notes))
+    return ImageList(tuple(folders), tuple(photographs), tuple(left_out), others, tuple(notes))
 
 
-def only_photographs(folder: Path) -> bool:
+def is_image_folder(folder: Path) -> bool:
     """Whether photographs lie in the folder or below it and no capture, whole or in part, is there."""
     if (
         not folder.is_dir()
@@ -98,10 +98,10 @@ def only_photographs(folder: Path) -> bool:
         or (folder / "sparse").exists()
     ):
         return False
-    return any(_is_photograph(path) for path in folder.rglob("*"))
+    return any(_is_image(path) for path in folder.rglob("*"))
 
 
-def _is_photograph(path: Path) -> bool:
+def _is_image(path: Path) -> bool:
     return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and path.is_file()
 
 
@@ -113,13 +113,13 @@ def _named(folders: Sequence[Path]) -> tuple[dict[str, Path], int]:
     seen = set[Path]()
     for folder, prefix in zip(folders, prefixes, strict=True):
         for path in sorted(folder.rglob("*")):
-            if not _is_photograph(path):
-                others += path.is_file() and path.name.lower() not in _SILENT
+            if not _is_image(path):
+                others += path.is_file() and path.name.lower() not in _IGNORED_FILES
                 continue
             real = path.resolve()
             if real not in seen:  # a folder and one inside it may both be named
                 seen.add(real)
-                name = listable(prefix + path.relative_to(folder).as_posix())
+                name = to_colmap_name(prefix + path.relative_to(folder).as_posix())
                 if name in found:
                     raise CaptureError(
                         f"{path}: would be called {name} in the capture, whose names have _ for blanks, as would "
@@ -133,34 +133,34 @@ def _prefixes(folders: Sequence[Path]) -> list[str]:
     """What tells photographs of several folders apart: the folders' own names, numbered where they are alike."""
     if len(folders) == 1:
         return [""]
-    names = [listable(folder.resolve().name) or "photographs" for folder in folders]
+    names = [to_colmap_name(folder.resolve().name) or "photographs" for folder in folders]
     counts = Counter(names)
     return [f"{name}_{k + 1}/" if counts[name] > 1 else f"{name}/" for k, name in enumerate(names)]
 
 
-def _read(path: Path, name: str, mask: Path | None) -> Photograph | LeftOut:
+def _read(path: Path, name: str, mask: Path | None) -> ImageMetadata | ExcludedImage:
     try:
-        photo = replace(read_photograph(path, name), mask=mask)
-    except Unusable as why:
-        return LeftOut(name, str(why))
+        photo = replace(read_image_metadata(path, name), mask=mask)
+    except UnusableImage as why:
+        return ExcludedImage(name, str(why))
     check_mask(photo)
     return photo
 
 
-def _without_doubles(photographs: list[Photograph]) -> tuple[list[Photograph], list[LeftOut]]:
+def _drop_duplicates(photographs: list[ImageMetadata]) -> tuple[list[ImageMetadata], list[ExcludedImage]]:
     """Leave out copies of the same file, and files whose names differ in their endings only."""
-    kept, left_out = list[Photograph](), list[LeftOut]()
+    kept, left_out = list[ImageMetadata](), list[ExcludedImage]()
     sizes = Counter(photo.bytes for photo in photographs)
     contents, stems = dict[tuple[int, bytes], str](), dict[str, str]()
     for photo in photographs:
-        stem = without_suffix(photo.name)
+        stem = match_key(photo.name)
         if stem in stems:
-            left_out.append(LeftOut(photo.name, f"has the name of {stems[stem]} with another ending"))
+            left_out.append(ExcludedImage(photo.name, f"has the name of {stems[stem]} with another ending"))
             continue
         if sizes[photo.bytes] > 1:
             content = photo.bytes, _digest(photo.path)
             if content in contents:
-                left_out.append(LeftOut(photo.name, f"is a copy of {contents[content]}"))
+                left_out.append(ExcludedImage(photo.name, f"is a copy of {contents[content]}"))
                 continue
             contents[content] = photo.name
         stems[stem] = photo.name
@@ -170,6 +170,6 @@ def _without_doubles(photographs: list[Photograph]) -> tuple[list[Photograph], l
 
 def _digest(path: Path) -> bytes:
     with path.open("rb") as file:
-        head = file.read(_COMPARED)
-        file.seek(max(0, path.stat().st_size - _COMPARED))
+        head = file.read(_DIGEST_BYTES)
+        file.seek(max(0, path.stat().st_size - _DIGEST_BYTES))
         return blake2b(head + file.read()).digest()

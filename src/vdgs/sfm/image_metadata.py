@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from vdgs.captures.image_files import KNOWN_MODES, LARGEST_IMAGE_PX, pillow_quietly
-from vdgs.sfm.focal_length import Lens, find_lens
-from vdgs.sfm.xmp import number, read_xmp
+from vdgs.captures.image_files import MAX_IMAGE_PX, SUPPORTED_MODES, pillow_without_limits
+from vdgs.sfm.focal_length import Lens, read_lens
+from vdgs.sfm.xmp import first_number, read_xmp
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class Attitude:
         return -self.camera_from_enu[:, 2]
 
 
-def of_gimbal(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Attitude:
+def attitude_from_gimbal(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Attitude:
     """Yaw is clockwise from north, pitch -90 is straight down, roll turns the picture about the view."""
     yaw, pitch, roll = np.radians([yaw_deg, pitch_deg, roll_deg])
     forward = np.array([np.sin(yaw) * np.cos(pitch), np.cos(yaw) * np.cos(pitch), np.sin(pitch)])
@@ -45,7 +45,7 @@ def of_gimbal(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Attitude:
     )
 
 
-def of_aircraft(heading_deg: float, pitch_deg: float, roll_deg: float) -> Attitude:
+def attitude_from_aircraft(heading_deg: float, pitch_deg: float, roll_deg: float) -> Attitude:
     """A camera fixed to an aircraft, looking down, its top forwards; pitch is nose up, roll right wing down."""
     h, p, r = np.radians([heading_deg, pitch_deg, roll_deg])
     about_down = np.array([[np.cos(h), -np.sin(h), 0], [np.sin(h), np.cos(h), 0], [0, 0, 1]])
@@ -57,23 +57,23 @@ def of_aircraft(heading_deg: float, pitch_deg: float, roll_deg: float) -> Attitu
 
 
 #: A shorter side below this shows too little to be matched: a thumbnail.
-LEAST_SIDE_PX = 100
+MIN_SIDE_PX = 100
 #: EXIF orientations that turn a photograph by a quarter: width and height change places.
-QUARTER_TURNS = (5, 6, 7, 8)
+TRANSPOSED_ORIENTATIONS = (5, 6, 7, 8)
 #: A receiver that is off by more has no position.
-LARGEST_ERROR_M = 1000.0
+MAX_GPS_ERROR_M = 1000.0
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
 _XMP_HEADER = b"http://ns.adobe.com/xap/1.0/\x00"
 #: The ends of a JPEG that may have been cut off are looked for in so many bytes at its end.
-_TAIL = 1 << 16
+_TAIL_BYTES = 1 << 16
 
 
-class Unusable(Exception):
+class UnusableImage(Exception):
     """A file that cannot be used as a photograph; the message says why."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Photograph:
+class ImageMetadata:
     """One photograph; sizes are those after it was turned upright."""
 
     name: str
@@ -92,11 +92,11 @@ class Photograph:
     """Latitude and longitude in degrees."""
     altitude: float | None
     altitude_type: str
-    deviations: tuple[float, float, float] | None
+    gps_std: tuple[float, float, float] | None
     """Standard deviations east, north and up in metres, where the receiver says them (RTK)."""
     error_m: float | None
     """How far the place may be off across, in metres, where EXIF says it (GPSHPositioningError)."""
-    above_takeoff: float | None
+    relative_altitude: float | None
     attitude: Attitude | None
     """Of the picture as the sensor has it; None for pictures that lay on their side."""
     bytes: int
@@ -118,10 +118,10 @@ class Photograph:
     @property
     def stored_size(self) -> tuple[int, int]:
         """Width and height of the file, before EXIF's orientation."""
-        turned = self.orientation in QUARTER_TURNS
+        turned = self.orientation in TRANSPOSED_ORIENTATIONS
         return (self.height, self.width) if turned else (self.width, self.height)
 
-    def upright(self, pixel: tuple[float, float]) -> tuple[float, float]:
+    def to_upright_pixel(self, pixel: tuple[float, float]) -> tuple[float, float]:
         """Where a pixel of the file, from its upper left corner, lies once the photograph is upright."""
         (x, y), (width, height) = pixel, self.stored_size
         return {
@@ -130,62 +130,62 @@ class Photograph:
         }[self.orientation]  # fmt: skip
 
 
-def read_photograph(path: Path, name: str) -> Photograph:
+def read_image_metadata(path: Path, name: str) -> ImageMetadata:
     """Read the head of a photograph; its pixels are not decoded, unless its end is missing.
 
-    Raises `Unusable` for files that are no image, too small, of colours that are not understood, or cut off.
+    Raises `UnusableImage` for files that are no image, too small, of colours that are not understood, or cut off.
     """
     try:
         size = path.stat().st_size
-        with pillow_quietly(), Image.open(path) as image:
+        with pillow_without_limits(), Image.open(path) as image:
             width, height = image.size
             _check(image)
             exif = image.getexif()
             tags, details, gps = dict(exif), dict(exif.get_ifd(_EXIF_IFD)), dict(exif.get_ifd(_GPS_IFD))
-            xmp = read_xmp(_packet(image))
+            xmp = read_xmp(_xmp_packet(image))
             transparent = "A" in image.getbands() or "transparency" in image.info
             if image.format == "JPEG" and not _has_end(path, size):
                 image.load()
-    except Unusable:
+    except UnusableImage:
         raise
     except OSError as error:
         why = "it is cut off" if "truncated" in str(error) else str(getattr(error, "strerror", None) or error)
-        raise Unusable(f"cannot be read ({why}): copy it again") from None
+        raise UnusableImage(f"cannot be read ({why}): copy it again") from None
     except (SyntaxError, ValueError, TypeError, KeyError, struct.error, OverflowError, MemoryError) as error:
-        raise Unusable(f"is damaged ({error}): copy it again") from None
+        raise UnusableImage(f"is damaged ({error}): copy it again") from None
     orientation = tags.get(0x0112, 1)
     orientation = orientation if orientation in range(1, 9) else 1
-    lens = find_lens(tags, details, xmp, width, height)
-    if orientation in QUARTER_TURNS:
+    lens = read_lens(tags, details, xmp, width, height)
+    if orientation in TRANSPOSED_ORIENTATIONS:
         width, height = height, width
     altitude, altitude_type = _altitude(gps, xmp)
     attitude = _attitude(xmp) if orientation == 1 else None
-    return Photograph(
+    return ImageMetadata(
         name=name, path=path, width=width, height=height, orientation=orientation, camera=_camera(tags, details, xmp),
-        lens=lens, taken=_text(details.get(0x9003)) or _text(tags.get(0x0132)), place=_place(gps), altitude=altitude,
-        altitude_type=altitude_type, deviations=_deviations(xmp), error_m=_error(gps),
-        above_takeoff=number(xmp, "drone-dji:RelativeAltitude", "sensefly:Height"), attitude=attitude, bytes=size,
+        lens=lens, taken=_text(details.get(0x9003)) or _text(tags.get(0x0132)), place=_lat_lon(gps), altitude=altitude,
+        altitude_type=altitude_type, gps_std=_rtk_std(xmp), error_m=_gps_error(gps),
+        relative_altitude=first_number(xmp, "drone-dji:RelativeAltitude", "sensefly:Height"), attitude=attitude, bytes=size,
         may_be_transparent=transparent,
     )  # fmt: skip
 
 
 def _check(image: Image.Image) -> None:
-    if image.width * image.height > LARGEST_IMAGE_PX:
-        raise Unusable(f"announces {image.width} x {image.height} pixels: it is damaged")
-    if min(image.size) < LEAST_SIDE_PX:
-        raise Unusable(f"has {image.width} x {image.height} pixels only: a thumbnail")
-    if image.mode not in KNOWN_MODES or image.mode.startswith("I"):
-        raise Unusable(f"has the colour mode {image.mode}: convert it to 8-bit RGB")
+    if image.width * image.height > MAX_IMAGE_PX:
+        raise UnusableImage(f"announces {image.width} x {image.height} pixels: it is damaged")
+    if min(image.size) < MIN_SIDE_PX:
+        raise UnusableImage(f"has {image.width} x {image.height} pixels only: a thumbnail")
+    if image.mode not in SUPPORTED_MODES or image.mode.startswith("I"):
+        raise UnusableImage(f"has the colour mode {image.mode}: convert it to 8-bit RGB")
 
 
 def _has_end(path: Path, size: int) -> bool:
     """Whether a JPEG's end marker is near its end, where only trailing data of makers may follow it."""
     with path.open("rb") as file:
-        file.seek(max(0, size - _TAIL))
+        file.seek(max(0, size - _TAIL_BYTES))
         return b"\xff\xd9" in file.read()
 
 
-def _packet(image: Image.Image) -> bytes:
+def _xmp_packet(image: Image.Image) -> bytes:
     for marker, content in getattr(image, "applist", ()):
         if marker == "APP1" and content.startswith(_XMP_HEADER):
             return bytes(content[len(_XMP_HEADER) :])
@@ -208,7 +208,7 @@ def _camera(tags: Mapping[int, Any], details: Mapping[int, Any], xmp: Mapping[st
     return f"{named or 'unknown camera'}{f' no. {serial}' if serial else ''}"
 
 
-def finite(value: Any) -> float | None:
+def finite_float(value: Any) -> float | None:
     """A number of EXIF (a rational, mostly) as a float; None for what is none, infinite or NaN."""
     try:
         result = float(value)
@@ -217,7 +217,7 @@ def finite(value: Any) -> float | None:
     return result if math.isfinite(result) else None
 
 
-def _place(gps: Mapping[int, Any]) -> tuple[float, float] | None:
+def _lat_lon(gps: Mapping[int, Any]) -> tuple[float, float] | None:
     latitude = _degrees(gps.get(2), _text(gps.get(1)).upper() == "S")
     longitude = _degrees(gps.get(4), _text(gps.get(3)).upper() == "W")
     if latitude is None or longitude is None or abs(latitude) > 90 or abs(longitude) > 180:
@@ -228,7 +228,7 @@ def _place(gps: Mapping[int, Any]) -> tuple[float, float] | None:
 def _degrees(value: Any, negative: bool) -> float | None:
     if not isinstance(value, (tuple, list)) or len(value) != 3:
         return None
-    parts = [finite(each) for each in value]
+    parts = [finite_float(each) for each in value]
     if any(part is None for part in parts):
         return None
     degrees = sum(part / 60**power for power, part in enumerate(parts) if part is not None)
@@ -238,38 +238,38 @@ def _degrees(value: Any, negative: bool) -> float | None:
 def _altitude(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[float | None, str]:
     """Altitude in metres and what it is measured from, as far as the file says."""
     below = gps.get(5) in (b"\x01", 1)
-    value = finite(gps.get(6))
+    value = finite_float(gps.get(6))
     if value is None:
-        value = number(xmp, "drone-dji:AbsoluteAltitude", "sensefly:AltitudeWGS84")
+        value = first_number(xmp, "drone-dji:AbsoluteAltitude", "sensefly:AltitudeWGS84")
     elif below:
         value = -value
     if value is None or abs(value) > 20_000:
         return None, ""
-    ellipsoidal = number(xmp, "sensefly:AltitudeWGS84")
+    ellipsoidal = first_number(xmp, "sensefly:AltitudeWGS84")
     if ellipsoidal is not None and abs(ellipsoidal - value) < 0.01:
         return value, "above the WGS 84 ellipsoid (AltitudeWGS84)"
     named = xmp.get("drone-dji:AltitudeType", "")
     return value, f"{named} as recorded" if named else "EXIF GPSAltitude as recorded, datum not stated"
 
 
-def _deviations(xmp: Mapping[str, str]) -> tuple[float, float, float] | None:
-    found = [number(xmp, f"drone-dji:RtkStd{which}") for which in ("Lon", "Lat", "Hgt")]
+def _rtk_std(xmp: Mapping[str, str]) -> tuple[float, float, float] | None:
+    found = [first_number(xmp, f"drone-dji:RtkStd{which}") for which in ("Lon", "Lat", "Hgt")]
     east, north, up = (value if value is not None and 0 < value < 100 else None for value in found)
     return None if east is None or north is None or up is None else (east, north, up)
 
 
-def _error(gps: Mapping[int, Any]) -> float | None:
+def _gps_error(gps: Mapping[int, Any]) -> float | None:
     """EXIF's GPSHPositioningError in metres; 0 and kilometres say nothing."""
-    value = finite(gps.get(0x1F))
-    return value if value is not None and 0 < value < LARGEST_ERROR_M else None
+    value = finite_float(gps.get(0x1F))
+    return value if value is not None and 0 < value < MAX_GPS_ERROR_M else None
 
 
 def _attitude(xmp: Mapping[str, str]) -> Attitude | None:
     """From the gimbal (DJI), or the aircraft that the camera is fixed to, which looks down when level (senseFly)."""
-    yaw, pitch, roll = (number(xmp, f"drone-dji:Gimbal{which}Degree") for which in ("Yaw", "Pitch", "Roll"))
+    yaw, pitch, roll = (first_number(xmp, f"drone-dji:Gimbal{which}Degree") for which in ("Yaw", "Pitch", "Roll"))
     if yaw is not None and pitch is not None and roll is not None:
-        return of_gimbal(yaw, pitch, roll)
-    yaw, pitch, roll = (number(xmp, f"sensefly:{which}") for which in ("Heading", "PitchAngle", "RollAngle"))
+        return attitude_from_gimbal(yaw, pitch, roll)
+    yaw, pitch, roll = (first_number(xmp, f"sensefly:{which}") for which in ("Heading", "PitchAngle", "RollAngle"))
     if yaw is not None and pitch is not None and roll is not None:
-        return of_aircraft(yaw, pitch, roll)
+        return attitude_from_aircraft(yaw, pitch, roll)
     return None

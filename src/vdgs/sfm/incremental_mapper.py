@@ -13,26 +13,28 @@ from rich.console import Console
 
 from vdgs.config.sfm_options import SfmOptions
 from vdgs.errors import CaptureError
-from vdgs.sfm.feature_extraction import Kind
-from vdgs.sfm.focal_length import CALIBRATED
-from vdgs.sfm.georegistration import is_line
-from vdgs.sfm.gps_priors import Positions
-from vdgs.sfm.image_metadata import Photograph
-from vdgs.sfm.preflight import OBLIQUE_DEG
-from vdgs.sfm.workspace import Work, call, progress
+from vdgs.sfm.feature_extraction import CameraGroup
+from vdgs.sfm.focal_length import CALIBRATED_SOURCE
+from vdgs.sfm.georegistration import is_nearly_collinear
+from vdgs.sfm.gps_priors import GpsPriors
+from vdgs.sfm.image_metadata import ImageMetadata
+from vdgs.sfm.preflight import OBLIQUE_ANGLE_DEG
+from vdgs.sfm.workspace import Workspace, call_cancellable, report_progress
 
 #: Oblique views, or heights that differ by so much of the flying height, let a flight tell the focal length (choice).
-OBLIQUE_SHARE, HEIGHTS_DIFFER = 0.15, 0.2
+MIN_OBLIQUE_SHARE, MIN_HEIGHT_SPREAD = 0.15, 0.2
 #: Of a way around something no tenth of the positions is nearer to the middle than this share of how far all are (RMS,
 #: both axes alike); of strips over an area it is (choice).
-AROUND = 0.8
+ORBIT_RADIUS_SHARE = 0.8
 #: Parts of fewer photographs than this are no model.
-SMALLEST_MODEL = 3
+MIN_MODEL_SIZE = 3
 #: What the mapper has is kept so many times on the way, each time by so many photographs more at least.
-SNAPSHOTS, LEAST_BETWEEN = 20, 5
+MAX_SNAPSHOTS, MIN_SNAPSHOT_INTERVAL = 20, 5
 
 
-def holds_focal(photographs: Sequence[Photograph], positions: Positions, options: SfmOptions) -> tuple[bool, str]:
+def should_fix_focal(
+    photographs: Sequence[ImageMetadata], positions: GpsPriors, options: SfmOptions
+) -> tuple[bool, str]:
     """Whether the focal length is held at what EXIF says, and why: over level ground from one height, straight down, a
     longer lens and a lower flight look the same. Where nothing says that the flight was one like this it is fitted: a
     wrong focal length that is held bends or tears all other scenes."""
@@ -41,29 +43,29 @@ def holds_focal(photographs: Sequence[Photograph], positions: Positions, options
     if any(photo.lens is None for photo in photographs):
         return False, "nothing says it for some photographs"
     tilts = [photo.attitude.tilt_deg for photo in photographs if photo.attitude]
-    if tilts and np.mean(np.array(tilts) > OBLIQUE_DEG) >= OBLIQUE_SHARE:
-        return False, f"{np.mean(np.array(tilts) > OBLIQUE_DEG):.0%} oblique views tell it"
-    heights = np.array([photo.above_takeoff for photo in photographs if photo.above_takeoff is not None])
-    if len(heights) >= 3 and _range(heights) > HEIGHTS_DIFFER * abs(np.median(heights)):
+    if tilts and np.mean(np.array(tilts) > OBLIQUE_ANGLE_DEG) >= MIN_OBLIQUE_SHARE:
+        return False, f"{np.mean(np.array(tilts) > OBLIQUE_ANGLE_DEG):.0%} oblique views tell it"
+    heights = np.array([photo.relative_altitude for photo in photographs if photo.relative_altitude is not None])
+    if len(heights) >= 3 and _range(heights) > MIN_HEIGHT_SPREAD * abs(np.median(heights)):
         return False, "flown at several heights, which tell it"
     if 2 * max(len(tilts), len(heights)) >= len(photographs):
         return True, "one height, straight down as far as known: the flight cannot tell it"
-    if all(photo.lens is not None and photo.lens.source == CALIBRATED for photo in photographs):
+    if all(photo.lens is not None and photo.lens.source == CALIBRATED_SOURCE for photo in photographs):
         return True, "calibrated by the maker"
-    if _surveys(positions):
+    if _is_survey_grid(positions):
         return True, "level strips over an area: the flight cannot tell it, if it looked straight down"
     return False, "nothing says that it was flown level, looking straight down"
 
 
-def _surveys(positions: Positions) -> bool:
+def _is_survey_grid(positions: GpsPriors) -> bool:
     """Whether photographs were taken from one height all over an area, as a survey is, and not around something."""
-    if not positions.usable or is_line(positions.enu, positions.deviations):
+    if not positions.usable or is_nearly_collinear(positions.enu, positions.gps_std):
         return False
     plane = positions.enu[:, :2] - positions.enu[:, :2].mean(axis=0)
     axes, spread, _ = np.linalg.svd(plane, full_matrices=False)
     spread, alike = spread / np.sqrt(len(plane)), np.linalg.norm(axes, axis=1) * np.sqrt(len(plane))
-    around = np.quantile(alike, 0.1) > AROUND * np.sqrt(2)
-    return not around and _range(positions.enu[:, 2]) <= HEIGHTS_DIFFER * spread[1]
+    around = np.quantile(alike, 0.1) > ORBIT_RADIUS_SHARE * np.sqrt(2)
+    return not around and _range(positions.enu[:, 2]) <= MIN_HEIGHT_SPREAD * spread[1]
 
 
 def _range(heights: np.ndarray) -> float:
@@ -71,10 +73,10 @@ def _range(heights: np.ndarray) -> float:
     return float(np.ptp(np.quantile(heights, [0.05, 0.95])))
 
 
-def write_priors(work: Work, photographs: Sequence[Photograph], positions: Positions) -> None:
+def write_pose_priors(workspace: Workspace, photographs: Sequence[ImageMetadata], positions: GpsPriors) -> None:
     """Positions with their covariances and, where the drone says it, which way is down."""
     row_of = {int(i): row for row, i in enumerate(positions.index)} if positions.usable else {}
-    database = pycolmap.Database.open(work.database)
+    database = pycolmap.Database.open(workspace.database)
     try:
         database.clear_pose_priors()
         images = {image.name: image for image in database.read_all_images()}
@@ -84,7 +86,7 @@ def write_priors(work: Work, photographs: Sequence[Photograph], positions: Posit
             prior = pycolmap.PosePrior(
                 corr_data_id=images[photo.name].data_id,
                 position=positions.enu[row_of[i]],
-                position_covariance=np.diag(positions.deviations[row_of[i]] ** 2),
+                position_covariance=np.diag(positions.gps_std[row_of[i]] ** 2),
                 coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
             )
             if photo.attitude is not None:
@@ -94,36 +96,39 @@ def write_priors(work: Work, photographs: Sequence[Photograph], positions: Posit
         database.close()
 
 
-def find_models(
-    work: Work, count: int, hold_focal: bool, with_positions: bool, threads: int, console: Console
+def run_mapper(
+    workspace: Workspace, count: int, fix_focal: bool, use_gps_priors: bool, threads: int, console: Console
 ) -> list[pycolmap.Reconstruction]:
     """All models that the mapper makes of the matches, that of most photographs first.
 
-    What it has is kept on the way, and goes on where it was stopped (`forget_models` first to begin anew). Raises
+    What it has is kept on the way, and goes on where it was stopped (`delete_models` first to begin anew). Raises
     CaptureError where it makes none.
     """
-    for folder in (work.models, work.snapshots):
+    for folder in (workspace.models, workspace.snapshots):
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-    options = _options(hold_focal, with_positions, threads)
-    options.snapshot_path, options.snapshot_frames_freq = work.snapshots, max(LEAST_BETWEEN, count // SNAPSHOTS)
-    begun = _largest_kept(work)
+    options = _options(fix_focal, use_gps_priors, threads)
+    options.snapshot_path, options.snapshot_frames_freq = (
+        workspace.snapshots,
+        max(MIN_SNAPSHOT_INTERVAL, count // MAX_SNAPSHOTS),
+    )
+    begun = _largest_snapshot(workspace)
     placed = int(begun.name) if begun else 2  # a model begins with two
-    with progress(console, f"mapping, {f'{placed} placed before, ' if begun else ''}photographs", count) as tell:
+    with report_progress(console, f"mapping, {f'{placed} placed before, ' if begun else ''}photographs", count) as tell:
 
         def one_more() -> None:
             nonlocal placed
             placed += 1
             tell(min(placed, count))
-            keep_snapshots(work)
+            save_snapshots(workspace)
 
         try:
-            models = call(
-                pycolmap.incremental_mapping, work.database, work.photographs, work.models, options,
+            models = call_cancellable(
+                pycolmap.incremental_mapping, workspace.database, workspace.photographs, workspace.models, options,
                 input_path=begun or "", next_image_callback=one_more,
             )  # fmt: skip
         except KeyboardInterrupt:
-            keep_snapshots(work)  # the mapper ended by itself: they are whole
+            save_snapshots(workspace)  # the mapper ended by itself: they are whole
             raise
         tell(count)
     if not models:
@@ -135,53 +140,55 @@ def find_models(
     return _sorted(list(models.values()))
 
 
-def keep_snapshots(work: Work) -> None:
+def save_snapshots(workspace: Workspace) -> None:
     """Put whole snapshots of the mapper where the same command goes on from, unless a larger one is there.
 
     To be called where the mapper does not write: then what is there is whole.
     """
-    for folder in sorted(work.snapshots.iterdir()) if work.snapshots.is_dir() else []:
-        before, count = _largest_kept(work), _placed_in(folder)
+    for folder in sorted(workspace.snapshots.iterdir()) if workspace.snapshots.is_dir() else []:
+        before, count = _largest_snapshot(workspace), _registered_count(folder)
         if before is None or count > int(before.name):
-            work.kept.mkdir(exist_ok=True)
-            os.replace(folder, work.kept / str(count))
+            workspace.kept.mkdir(exist_ok=True)
+            os.replace(folder, workspace.kept / str(count))
             if before is not None:
                 shutil.rmtree(before)
         else:
             shutil.rmtree(folder)
 
 
-def forget_models(work: Work) -> None:
+def delete_models(workspace: Workspace) -> None:
     """Remove all models, finished or not."""
-    for folder in (work.models, work.snapshots, work.kept):
+    for folder in (workspace.models, workspace.snapshots, workspace.kept):
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _largest_kept(work: Work) -> Path | None:
-    return max(work.kept.glob("*"), key=lambda folder: int(folder.name), default=None)
+def _largest_snapshot(workspace: Workspace) -> Path | None:
+    return max(workspace.kept.glob("*"), key=lambda folder: int(folder.name), default=None)
 
 
-def _placed_in(folder: Path) -> int:
+def _registered_count(folder: Path) -> int:
     """Number of photographs that a written model places: the first eight bytes of its images."""
     with (folder / "images.bin").open("rb") as file:
         return int.from_bytes(file.read(8), "little")
 
 
-def read_models(work: Work) -> list[pycolmap.Reconstruction]:
-    """What `find_models` found before."""
-    return _sorted([pycolmap.Reconstruction(folder) for folder in sorted(work.models.iterdir()) if folder.is_dir()])
+def read_models(workspace: Workspace) -> list[pycolmap.Reconstruction]:
+    """What `run_mapper` found before."""
+    return _sorted(
+        [pycolmap.Reconstruction(folder) for folder in sorted(workspace.models.iterdir()) if folder.is_dir()]
+    )
 
 
 def _sorted(models: list[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
     return sorted(models, key=lambda model: -model.num_reg_images())
 
 
-def _options(hold_focal: bool, with_positions: bool, threads: int) -> pycolmap.IncrementalPipelineOptions:
+def _options(fix_focal: bool, use_gps_priors: bool, threads: int) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = threads, 0
-    options.min_model_size = SMALLEST_MODEL
-    options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not hold_focal
-    options.use_prior_position = options.use_robust_loss_on_prior_position = with_positions
+    options.min_model_size = MIN_MODEL_SIZE
+    options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not fix_focal
+    options.use_prior_position = options.use_robust_loss_on_prior_position = use_gps_priors
     # Its solver takes minutes for each photograph that does not fit, and finds none in overlapping flights.
     options.structure_less_registration_fallback = False
     # Points that two photographs see are where the edges of a flight, and few photographs, have any.
@@ -189,7 +196,9 @@ def _options(hold_focal: bool, with_positions: bool, threads: int) -> pycolmap.I
     return options
 
 
-def kinds_after(model: pycolmap.Reconstruction, kinds: Sequence[Kind]) -> list[pycolmap.Camera | None]:
+def refined_cameras(
+    model: pycolmap.Reconstruction, camera_groups: Sequence[CameraGroup]
+) -> list[pycolmap.Camera | None]:
     """The fitted cameras in the order of the kinds of photographs; None for those without a placed photograph."""
     used = {image.camera_id for image in model.images.values() if image.has_pose}
-    return [model.cameras[k] if k in used and k in model.cameras else None for k in range(1, len(kinds) + 1)]
+    return [model.cameras[k] if k in used and k in model.cameras else None for k in range(1, len(camera_groups) + 1)]

@@ -10,17 +10,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from vdgs.captures.image_files import decode_mask, decode_photograph, find_images, find_mask, read_header, same_shape
+from vdgs.captures.image_files import decode_image, decode_mask, find_images, find_mask, read_header, same_aspect
 from vdgs.captures.mask_matching import mask_name
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
-from vdgs.sfm.image_metadata import Photograph
-from vdgs.sfm.workspace import Work
+from vdgs.sfm.image_metadata import ImageMetadata
+from vdgs.sfm.workspace import Workspace
 from vdgs.system.atomic_files import write_bytes
-from vdgs.system.stop_signals import stop_if_asked
+from vdgs.system.stop_signals import check_stop_requested
 
 #: What folders of masks are called, and one of the photographs that they may lie beside, as in captures.
-FOLDER, IMAGES = CaptureOptions.masks, "images"
+MASK_FOLDER, IMAGE_FOLDER = CaptureOptions.masks, "images"
 
 
 def find_masks(folders: Sequence[Path], files: Collection[Path]) -> tuple[dict[Path, Path | None], list[str]]:
@@ -40,20 +40,20 @@ def find_masks(folders: Sequence[Path], files: Collection[Path]) -> tuple[dict[P
     found = dict[Path, Path | None]()
     for file in photographs:
         found[file] = None
-        for parent, name in _ways(file, folders):
-            place = beside.get(parent, parent / FOLDER)
+        for parent, name in _mask_candidates(file, folders):
+            place = beside.get(parent, parent / MASK_FOLDER)
             if found[file] is None and is_folder(place):
                 beside[parent] = place
                 found[file] = find_mask(place, name)
-    return found, _remarks(sorted(beside.values()), found)
+    return found, _mask_notes(sorted(beside.values()), found)
 
 
-def check_mask(photo: Photograph) -> None:
+def check_mask(photo: ImageMetadata) -> None:
     """Raise CaptureError where a photograph's mask cannot be read or has another shape than it."""
     if photo.mask is None:
         return
     header = read_header(photo.mask)
-    if not any(same_shape((header.width, header.height), size) for size in (photo.stored_size, photo.size)):
+    if not any(same_aspect((header.width, header.height), size) for size in (photo.stored_size, photo.size)):
         width, height = photo.stored_size
         raise CaptureError(
             f"{photo.mask}: is {header.width}x{header.height}, but its photograph {photo.name} is {width}x{height}: "
@@ -66,30 +66,30 @@ def _masks_above(file: Path, folders: Sequence[Path]) -> Iterator[Path]:
     folder = next(folder for folder in folders if folder in file.parents)
     parts = file.relative_to(folder).parts[:-1]
     for k, part in enumerate(parts):
-        if part.lower() == FOLDER:
+        if part.lower() == MASK_FOLDER:
             yield folder.joinpath(*parts[: k + 1])
             return
 
 
-def _ways(file: Path, folders: Sequence[Path]) -> Iterator[tuple[Path, str]]:
+def _mask_candidates(file: Path, folders: Sequence[Path]) -> Iterator[tuple[Path, str]]:
     """Folders in whose `masks` a photograph's mask may lie, the nearest first, and what it is named like there."""
     above = [folder for folder in folders if folder in file.parents]
     top = min(above, key=lambda folder: len(folder.parts))
     for parent in file.parents:
         name = file.relative_to(parent)
         yield parent, name.as_posix()
-        if name.parts[0].lower() == IMAGES and len(name.parts) > 1:
+        if name.parts[0].lower() == IMAGE_FOLDER and len(name.parts) > 1:
             yield parent, name.relative_to(name.parts[0]).as_posix()
         if parent == top:
             break
-    if top.resolve().name.lower() == IMAGES:
+    if top.resolve().name.lower() == IMAGE_FOLDER:
         yield top.resolve().parent, file.relative_to(top).as_posix()
 
 
-def _remarks(places: Sequence[Path], found: dict[Path, Path | None]) -> list[str]:
+def _mask_notes(mask_folders: Sequence[Path], found: dict[Path, Path | None]) -> list[str]:
     """What people should know of these folders of masks; CaptureError where one has no mask of a photograph."""
     used, remarks = {mask for mask in found.values() if mask is not None}, list[str]()
-    for place in places:
+    for place in mask_folders:
         spare = [name for name, path in find_images(place).items() if path not in used]
         if spare and not any(place in mask.parents for mask in used):
             example = mask_name(next(iter(found)).name)
@@ -103,45 +103,45 @@ def _remarks(places: Sequence[Path], found: dict[Path, Path | None]) -> list[str
     without = [file for file, mask in found.items() if mask is None]
     if used and without:
         remarks.append(
-            f"{len(found) - len(without)} of {len(found)} photographs have a mask in {FOLDER}/; the others, such as "
+            f"{len(found) - len(without)} of {len(found)} photographs have a mask in {MASK_FOLDER}/; the others, such as "
             f"{without[0].name}, count whole."
         )
     return remarks
 
 
-def write_upright_masks(work: Work, photographs: Sequence[Photograph], threads: int) -> None:
+def write_upright_masks(workspace: Workspace, photographs: Sequence[ImageMetadata], threads: int) -> None:
     """Fill the work folder with masks of upright photographs, for those of which something is left out. What is there
     is kept. Raises CaptureError for a mask that cannot be decoded."""
     with ThreadPoolExecutor(threads) as pool:
-        for _ in pool.map(partial(_write_one, work), [photo for photo in photographs if photo.may_be_masked]):
-            stop_if_asked()
+        for _ in pool.map(partial(_write_one, workspace), [photo for photo in photographs if photo.may_be_masked]):
+            check_stop_requested()
 
 
-def kept_of(photo: Photograph) -> np.ndarray | None:
+def read_keep_mask(metadata: ImageMetadata) -> np.ndarray | None:
     """What counts of a photograph once it is upright, [h, w] bool; None: all of it.
 
     A mask is of the file as it is, before EXIF's orientation, unless only the upright photograph has its shape.
     """
-    keep = _opaque(photo) if photo.may_be_transparent else None
-    if photo.mask is None:
+    keep = _opaque(metadata) if metadata.may_be_transparent else None
+    if metadata.mask is None:
         return keep
-    header = read_header(photo.mask)
-    if same_shape((header.width, header.height), photo.stored_size):
-        masked = upright(decode_mask(photo.mask, *photo.stored_size), photo.orientation)
+    header = read_header(metadata.mask)
+    if same_aspect((header.width, header.height), metadata.stored_size):
+        masked = apply_orientation(decode_mask(metadata.mask, *metadata.stored_size), metadata.orientation)
     else:
-        masked = decode_mask(photo.mask, *photo.size)
+        masked = decode_mask(metadata.mask, *metadata.size)
     return masked if keep is None else masked & keep
 
 
-def _opaque(photo: Photograph) -> np.ndarray | None:
+def _opaque(photo: ImageMetadata) -> np.ndarray | None:
     try:
-        opaque = decode_photograph(photo.path)[1]
+        opaque = decode_image(photo.path)[1]
     except CaptureError:  # the search of features leaves damaged photographs out
         return None
-    return None if opaque is None else upright(opaque, photo.orientation)
+    return None if opaque is None else apply_orientation(opaque, photo.orientation)
 
 
-def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
+def apply_orientation(pixels: np.ndarray, orientation: int) -> np.ndarray:
     """Pixels [h, w] of a file turned and mirrored as EXIF's orientation says."""
     if orientation in (5, 6, 7, 8):
         pixels = pixels.T
@@ -149,26 +149,26 @@ def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
     return pixels[:: -1 if down else 1, :: -1 if across else 1]
 
 
-def _write_one(work: Work, photo: Photograph) -> None:
-    stop_if_asked()
-    target = work.mask(photo.name)
+def _write_one(workspace: Workspace, photo: ImageMetadata) -> None:
+    check_stop_requested()
+    target = workspace.mask(photo.name)
     if target.is_file():
         return
-    keep = kept_of(photo)
+    keep = read_keep_mask(photo)
     if keep is not None:
-        write_bytes(target, png_of(keep))
+        write_bytes(target, encode_mask(keep))
 
 
-def png_of(keep: np.ndarray) -> bytes:
+def encode_mask(keep: np.ndarray) -> bytes:
     """A mask [h, w] bool as a file: white is kept."""
     return cv2.imencode(".png", keep.astype(np.uint8) * 255)[1].tobytes()
 
 
-def straight_mask(mask: Path, grid: np.ndarray, shrunk: tuple[int, int]) -> np.ndarray:
+def undistort_mask(mask: Path, grid: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """A mask as its photograph becomes without distortion, [h, w] bool: of pixels that are shrunk together only those
     of which all is kept, so that what is masked does not bleed in."""
-    pixels = decode_photograph(mask)[0][..., 0]
+    pixels = decode_image(mask)[0][..., 0]
     straight = cv2.remap(pixels, grid[..., 0], grid[..., 1], cv2.INTER_NEAREST, borderValue=(0.0,))
-    if straight.shape[1::-1] != shrunk:
-        straight = cv2.resize(straight.astype(np.float32), shrunk, interpolation=cv2.INTER_AREA)
+    if straight.shape[1::-1] != size:
+        straight = cv2.resize(straight.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     return straight >= 255 * (1 - 1e-4)

@@ -12,29 +12,29 @@ import numpy as np
 from shapely import MultiPoint
 
 from vdgs.config.sfm_options import SfmOptions
-from vdgs.sfm.feature_extraction import is_searched_finely
-from vdgs.sfm.gps_priors import Positions
-from vdgs.sfm.image_list import Collection
-from vdgs.sfm.image_metadata import Photograph
+from vdgs.sfm.feature_extraction import is_upsampled
+from vdgs.sfm.gps_priors import GpsPriors
+from vdgs.sfm.image_list import ImageList
+from vdgs.sfm.image_metadata import ImageMetadata
 
 #: A file so much smaller than the median of its camera shows little: blurred, dark, water (choice).
-SMALL_FILE = 0.4
+SMALL_FILE_RATIO = 0.4
 #: Photographs with less overlap than this along the flight often cannot be joined (choice).
-LEAST_OVERLAP = 0.6
+MIN_OVERLAP = 0.6
 #: A place should be seen by so many photographs (choice).
-LEAST_VIEWS = 4.0
+MIN_VIEWS_PER_POINT = 4.0
 #: Views farther from straight down than this are oblique (degrees).
-OBLIQUE_DEG = 20.0
+OBLIQUE_ANGLE_DEG = 20.0
 #: Seconds of one core, measured on a Xeon without GPU (docs/sfm.md): a megapixel searched for features, a pair of
 #: photographs with 1000 features each compared (it goes with the square), a photograph placed, a megapixel written.
 #: Another machine may take half or twice as long.
 FEATURE_SECONDS, PAIR_SECONDS, MAPPING_SECONDS, WRITING_SECONDS = 0.25, 0.0055, 1.5, 0.05
 #: Features of a megapixel, about; searched finely three times as many, and it takes three times as long.
-FEATURES_A_MEGAPIXEL = 2500
+FEATURES_PER_MEGAPIXEL = 2500
 
 
 @dataclass(frozen=True, kw_only=True)
-class Look:
+class PreflightReport:
     """What the heads of the photographs tell."""
 
     photographs: int
@@ -55,15 +55,15 @@ class Look:
     height_from: str
     gsd_m: float | None
     forward_overlap: float | None
-    views_per_place: float | None
+    views_per_point: float | None
     """By how many photographs a place is seen, were the ground level and all views straight down."""
     oblique: int | None
-    """Views farther than `OBLIQUE_DEG` from straight down; None where no photograph says."""
+    """Views farther than `OBLIQUE_ANGLE_DEG` from straight down; None where no photograph says."""
     days: list[str]
     warnings: list[str]
 
 
-def look_at(collection: Collection, positions: Positions) -> Look:
+def make_preflight_report(collection: ImageList, positions: GpsPriors) -> PreflightReport:
     """All that can be said without decoding pixels."""
     photographs = collection.photographs
     height, height_from = flying_height(photographs)
@@ -73,7 +73,7 @@ def look_at(collection: Collection, positions: Positions) -> Look:
     days = sorted({photo.taken[:10] for photo in photographs if photo.taken})
     overlap, views = _overlap(photographs, positions, footprint), _views_per_place(positions, footprint)
     focal = _median(photo.lens.focal * max(photo.width, photo.height) for photo in photographs if photo.lens)
-    return Look(
+    return PreflightReport(
         photographs=len(photographs),
         masks=sum(photo.mask is not None for photo in photographs),
         transparent=sum(photo.may_be_transparent for photo in photographs),
@@ -82,37 +82,39 @@ def look_at(collection: Collection, positions: Positions) -> Look:
         positions=len(positions),
         spread_m=None if spread is None else (float(spread[0]), float(spread[1])),
         altitude_reference=positions.altitude_reference,
-        rtk=sum(photo.deviations is not None for photo in photographs),
+        rtk=sum(photo.gps_std is not None for photo in photographs),
         height_m=height, height_from=height_from,
         gsd_m=height / focal if height and focal else None,
-        forward_overlap=overlap, views_per_place=views,
-        oblique=sum(tilt > OBLIQUE_DEG for tilt in tilts) if tilts else None,
+        forward_overlap=overlap, views_per_point=views,
+        oblique=sum(tilt > OBLIQUE_ANGLE_DEG for tilt in tilts) if tilts else None,
         days=days,
         warnings=[*positions.notes, *collection.notes, *_warnings(collection, overlap, views, days)],
     )  # fmt: skip
 
 
-def seconds(photographs: Sequence[Photograph], pairs: int, options: SfmOptions, threads: int) -> float:
+def estimate_seconds(photographs: Sequence[ImageMetadata], pairs: int, options: SfmOptions, threads: int) -> float:
     """About how long the work takes, from what one core was measured to take."""
-    pixels = sum(_searched(photo, options.feature_size, len(photographs)) for photo in photographs) / 1e6
-    features = min(options.features, FEATURES_A_MEGAPIXEL * pixels / len(photographs))
+    pixels = sum(_searched_pixels(photo, options.max_image_size, len(photographs)) for photo in photographs) / 1e6
+    features = min(options.features, FEATURES_PER_MEGAPIXEL * pixels / len(photographs))
     written = sum(photo.width * photo.height for photo in photographs) / 1e6
     shared = FEATURE_SECONDS * pixels + PAIR_SECONDS * (features / 1000) ** 2 * pairs + WRITING_SECONDS * written
     return shared / max(1, threads) + MAPPING_SECONDS * len(photographs)
 
 
-def flying_height(photographs: Sequence[Photograph]) -> tuple[float | None, str]:
+def flying_height(photographs: Sequence[ImageMetadata]) -> tuple[float | None, str]:
     """Median height above the take-off in metres, and what says so."""
-    heights = [photo.above_takeoff for photo in photographs if photo.above_takeoff and photo.above_takeoff > 1]
+    heights = [
+        photo.relative_altitude for photo in photographs if photo.relative_altitude and photo.relative_altitude > 1
+    ]
     if 2 * len(heights) < len(photographs):
         return None, "the photographs do not say it"
     return statistics.median(heights), "above the take-off, by XMP"
 
 
-def _searched(photo: Photograph, feature_size: int, count: int) -> float:
+def _searched_pixels(photo: ImageMetadata, feature_size: int, count: int) -> float:
     """Pixels to search, three times as many where that is done finely."""
     longer = max(photo.width, photo.height)
-    times = 3 if is_searched_finely(longer, feature_size, count) else 1
+    times = 3 if is_upsampled(longer, feature_size, count) else 1
     return times * photo.width * photo.height * min(1.0, feature_size / longer) ** 2
 
 
@@ -121,7 +123,7 @@ def _median(values: object) -> float | None:
     return statistics.median(found) if found else None
 
 
-def _footprint(photographs: Sequence[Photograph], height: float | None) -> tuple[float, float] | None:
+def _footprint(photographs: Sequence[ImageMetadata], height: float | None) -> tuple[float, float] | None:
     """Longer and shorter side in metres of what a view straight down shows of level ground."""
     focal = _median(photo.lens.focal for photo in photographs if photo.lens)
     shape = _median(min(photo.width, photo.height) / max(photo.width, photo.height) for photo in photographs)
@@ -129,28 +131,28 @@ def _footprint(photographs: Sequence[Photograph], height: float | None) -> tuple
 
 
 def _overlap(
-    photographs: Sequence[Photograph], positions: Positions, footprint: tuple[float, float] | None
+    photographs: Sequence[ImageMetadata], positions: GpsPriors, footprint: tuple[float, float] | None
 ) -> float | None:
     """Along the flight, if the shorter side points forwards: from the steps between photographs in order of time."""
     if footprint is None or len(positions) < 3:
         return None
-    order = sorted(range(len(positions)), key=lambda row: _moment(photographs[int(positions.index[row])]))
+    order = sorted(range(len(positions)), key=lambda row: _time_key(photographs[int(positions.index[row])]))
     steps = np.linalg.norm(np.diff(positions.enu[order, :2], axis=0), axis=1)
     return float(np.clip(1 - np.median(steps) / footprint[1], 0, 1))
 
 
-def _moment(photo: Photograph) -> tuple[str, str]:
+def _time_key(photo: ImageMetadata) -> tuple[str, str]:
     return photo.taken, photo.name
 
 
-def _views_per_place(positions: Positions, footprint: tuple[float, float] | None) -> float | None:
+def _views_per_place(positions: GpsPriors, footprint: tuple[float, float] | None) -> float | None:
     if footprint is None or not positions.usable:
         return None
     area = MultiPoint(positions.enu[:, :2]).convex_hull.buffer(min(footprint) / 4).area
     return float(min(len(positions), len(positions) * footprint[0] * footprint[1] / area))
 
 
-def _warnings(collection: Collection, overlap: float | None, views: float | None, days: Sequence[str]) -> list[str]:
+def _warnings(collection: ImageList, overlap: float | None, views: float | None, days: Sequence[str]) -> list[str]:
     photographs, found = collection.photographs, list[str]()
     without = [photo.name for photo in photographs if photo.lens is None]
     if without:
@@ -158,26 +160,28 @@ def _warnings(collection: Collection, overlap: float | None, views: float | None
     small = _small_files(photographs)
     if small:
         found.append(f"{_first(small)}: far smaller files than the others: blurred, dark, or showing little?")
-    if overlap is not None and overlap < LEAST_OVERLAP:
-        found.append(f"they overlap by about {overlap:.0%} along the flight; below {LEAST_OVERLAP:.0%} gaps come.")
-    if views is not None and views < LEAST_VIEWS:
-        found.append(f"a place is seen by about {views:.1f} photographs; from {LEAST_VIEWS:g} on scenes become good.")
+    if overlap is not None and overlap < MIN_OVERLAP:
+        found.append(f"they overlap by about {overlap:.0%} along the flight; below {MIN_OVERLAP:.0%} gaps come.")
+    if views is not None and views < MIN_VIEWS_PER_POINT:
+        found.append(
+            f"a place is seen by about {views:.1f} photographs; from {MIN_VIEWS_PER_POINT:g} on scenes become good."
+        )
     moments = [when for when in (_time(photo.taken) for photo in photographs) if when is not None]
     if moments and max(moments) - min(moments) > timedelta(days=1):
         found.append(f"taken on {len(days)} days, {days[0]} to {days[-1]}: light, shadows and plants may differ.")
     return found
 
 
-def _small_files(photographs: Sequence[Photograph]) -> list[str]:
+def _small_files(photographs: Sequence[ImageMetadata]) -> list[str]:
     """Names of those with far fewer bytes than others of their camera and size."""
-    kinds: dict[tuple[str, int, str], list[Photograph]] = {}
+    kinds: dict[tuple[str, int, str], list[ImageMetadata]] = {}
     for photo in photographs:
         kinds.setdefault((photo.camera, photo.width * photo.height, photo.path.suffix.lower()), []).append(photo)
     return [
         photo.name
         for alike in kinds.values()
         for photo in alike
-        if photo.bytes < SMALL_FILE * statistics.median(each.bytes for each in alike)
+        if photo.bytes < SMALL_FILE_RATIO * statistics.median(each.bytes for each in alike)
     ]
 
 

@@ -15,11 +15,11 @@ from rich.console import Console
 
 from vdgs import __version__
 from vdgs.captures.reconstruction import (
-    FIGURE,
-    FILE,
-    WORK,
-    ReconstructionFacts,
-    SurveyFacts,
+    RECONSTRUCTION_FIGURE,
+    RECONSTRUCTION_FILE,
+    WORK_FOLDER,
+    GcpReport,
+    ReconstructionReport,
     is_reconstruction,
     read_reconstruction,
 )
@@ -36,71 +36,79 @@ from vdgs.sfm import (
     incremental_mapper,
     mask_files,
 )
-from vdgs.sfm.console_report import tell_facts
-from vdgs.sfm.image_list import LeftOut
-from vdgs.sfm.position_plots import draw_positions, draw_residuals
-from vdgs.sfm.reconstruction_plan import Prepared, check_disk, in_time, prepare, tell
-from vdgs.sfm.reconstruction_report import Outcome, facts_of, why_left_out
-from vdgs.sfm.workspace import Work, key_of, quiet_colmap
-from vdgs.system.atomic_files import jsonable, write_json
+from vdgs.sfm.console_report import print_reconstruction_report
+from vdgs.sfm.image_list import ExcludedImage
+from vdgs.sfm.position_plots import plot_positions, plot_residuals
+from vdgs.sfm.reconstruction_plan import (
+    ReconstructionPlan,
+    check_disk_space,
+    plan_reconstruction,
+    print_plan,
+    time_order,
+)
+from vdgs.sfm.reconstruction_report import ReconstructionResult, exclusion_reasons, make_reconstruction_report
+from vdgs.sfm.workspace import Workspace, cache_key, silence_colmap
+from vdgs.system.atomic_files import to_jsonable, write_json
 from vdgs.system.documents import JsonObject
-from vdgs.system.file_locks import hold
-from vdgs.system.records import plain
+from vdgs.system.file_locks import lock_folder
+from vdgs.system.records import record_to_dict
 
 #: Where the positions are shown before the work, inside the output.
-MAP = "photographs.png"
+POSITIONS_FIGURE = "photographs.png"
 
 
 def reconstruct(
-    request: SfmRequest, console: Console, alone: AbstractContextManager[None] | None = None
-) -> ReconstructionFacts:
+    request: SfmRequest, console: Console, lock: AbstractContextManager[None] | None = None
+) -> ReconstructionReport:
     """Make a capture of photographs in `request.output`, or go on with one that was begun.
 
     `alone` is held while anything is written; not where all is done already. Raises what it raises, CaptureError for
     photographs that cannot become one, VdgsError for an output that is something else and a disk that is full. What was
     done is kept.
     """
-    quiet_colmap()
-    prepared = prepare(request)
+    silence_colmap()
+    prepared = plan_reconstruction(request)
     output = request.output
-    work, keys = Work(output / WORK), _keys(prepared)
+    work, keys = Workspace(output / WORK_FOLDER), _keys(prepared)
     facts = read_reconstruction(output) if _is_finished(output, keys["capture"]) else None
     if facts is not None:
         console.print(f"{output}: made of these photographs already; nothing to do", highlight=False)
         return facts
-    _refuse_other_things(output)
-    tell(prepared, console)
-    check_disk(prepared)
-    with alone or nullcontext(), hold(output):
+    _check_output_folder(output)
+    print_plan(prepared, console)
+    check_disk_space(prepared)
+    with lock or nullcontext(), lock_folder(output):
         work.path.mkdir(exist_ok=True)
-        draw_positions(prepared.positions, in_time(prepared), "Where the photographs were taken", output / MAP)
+        plot_positions(
+            prepared.positions, time_order(prepared), "Where the photographs were taken", output / POSITIONS_FIGURE
+        )
         facts = _steps(prepared, work, keys, console)
         if not request.keep_work:
             work.remove()
-    tell_facts(facts, console)
+    print_reconstruction_report(facts, console)
     return facts
 
 
-def _keys(prepared: Prepared) -> dict[str, str]:
+def _keys(plan: ReconstructionPlan) -> dict[str, str]:
     """What each step depends on, each on those before it."""
-    options, positions = prepared.request.options, prepared.positions
+    options, positions = plan.request.options, plan.positions
     files = [
         (photo.name, photo.bytes, photo.path.stat().st_mtime_ns, photo.width, photo.height, photo.orientation)
-        for photo in prepared.collection.photographs
+        for photo in plan.image_list.photographs
     ]
-    lenses = [photo.lens and photo.lens.focal for photo in prepared.collection.photographs]
-    found = key_of(__version__, files, lenses, options.feature_size, options.features, *_masked(prepared))
-    placed = [positions.index.tolist(), positions.enu.tolist(), positions.deviations.tolist()]
-    matched = key_of(found, placed, options.neighbours, options.exhaustive)
-    mapped = key_of(matched, options.focal)
-    points = prepared.control.points if prepared.control else ()
-    capture = key_of(mapped, options.max_size, [plain(point) for point in points])
+    lenses = [photo.lens and photo.lens.focal for photo in plan.image_list.photographs]
+    found = cache_key(__version__, files, lenses, options.max_image_size, options.features, *_masked_images(plan))
+    placed = [positions.index.tolist(), positions.enu.tolist(), positions.gps_std.tolist()]
+    matched = cache_key(found, placed, options.num_neighbors, options.exhaustive_max)
+    mapped = cache_key(matched, options.focal)
+    points = plan.control.points if plan.control else ()
+    capture = cache_key(mapped, options.max_size, [record_to_dict(point) for point in points])
     return {"features": found, "matches": matched, "model": mapped, "capture": capture}
 
 
-def _masked(prepared: Prepared) -> list[tuple[Any, ...]]:
+def _masked_images(plan: ReconstructionPlan) -> list[tuple[Any, ...]]:
     """Photographs of which something may be left out, and what says so."""
-    masked = [photo for photo in prepared.collection.photographs if photo.may_be_masked]
+    masked = [photo for photo in plan.image_list.photographs if photo.may_be_masked]
     files = [photo.mask.stat() if photo.mask is not None else None for photo in masked]
     return [
         (photo.name, photo.may_be_transparent, file and (file.st_size, file.st_mtime_ns))
@@ -109,172 +117,190 @@ def _masked(prepared: Prepared) -> list[tuple[Any, ...]]:
 
 
 def _is_finished(output: Path, key: str) -> bool:
-    return (output / FILE).is_file() and Work(output).is_done("capture", key)
+    return (output / RECONSTRUCTION_FILE).is_file() and Workspace(output).is_done("capture", key)
 
 
-def _refuse_other_things(output: Path) -> None:
+def _check_output_folder(output: Path) -> None:
     """Only a new folder, an empty one, or one of an earlier reconstruction is written to."""
-    if output.is_dir() and not is_reconstruction(output) and _strangers(output):
+    if output.is_dir() and not is_reconstruction(output) and _has_foreign_files(output):
         raise VdgsError(f"{output}: holds other things already. Choose a new folder with --output.")
     if output.exists() and not output.is_dir():
         raise VdgsError(f"{output}: is a file. Choose a new folder with --output.")
 
 
-def _strangers(output: Path) -> bool:
+def _has_foreign_files(output: Path) -> bool:
     """Whether a folder holds anything but what a reconstruction begins with."""
-    return any(each.name not in (".lock", MAP) and each.suffix != ".tmp" for each in output.iterdir())
+    return any(each.name not in (".lock", POSITIONS_FIGURE) and each.suffix != ".tmp" for each in output.iterdir())
 
 
-def _steps(prepared: Prepared, work: Work, keys: dict[str, str], console: Console) -> ReconstructionFacts:
+def _steps(
+    plan: ReconstructionPlan, workspace: Workspace, keys: dict[str, str], console: Console
+) -> ReconstructionReport:
     began = time.monotonic()
-    request, output = prepared.request, prepared.request.output
-    photographs, threads = prepared.collection.photographs, prepared.threads
-    kinds = feature_extraction.kinds_of(photographs)
-    lost = _features(prepared, work, kinds, keys["features"], console)
+    request, output = plan.request, plan.request.output
+    photographs, threads = plan.image_list.photographs, plan.threads
+    kinds = feature_extraction.group_by_camera(photographs)
+    lost = _features(plan, workspace, kinds, keys["features"], console)
     usable = [photo for photo in photographs if photo.name not in {each.name for each in lost}]
-    pairs = _matches(prepared, work, keys["matches"], console)
-    held = incremental_mapper.holds_focal(photographs, prepared.positions, request.options)
-    models = _models(prepared, work, keys["model"], len(usable), held[0], console)
-    left_out = why_left_out(
-        models[0], models[1:], [photo.name for photo in photographs], feature_matching.verified_counts(work), lost
+    pairs = _matches(plan, workspace, keys["matches"], console)
+    held = incremental_mapper.should_fix_focal(photographs, plan.positions, request.options)
+    models = _models(plan, workspace, keys["model"], len(usable), held[0], console)
+    left_out = exclusion_reasons(
+        models[0],
+        models[1:],
+        [photo.name for photo in photographs],
+        feature_matching.count_verified_matches(workspace),
+        lost,
     )
-    placed, origin, surveyed = _place(models[0], prepared, held[0])
-    _write(prepared, work, models[0], keys["capture"], threads, console)
-    outcome = Outcome(
+    placed, origin, surveyed = _georegister(models[0], plan, held[0])
+    _write(plan, workspace, models[0], keys["capture"], threads, console)
+    outcome = ReconstructionResult(
         kinds=kinds, placed=placed, origin=origin, survey=surveyed, left_out=left_out,
         components=[model.num_reg_images() for model in models], pairs=pairs, held=held,
         seconds=time.monotonic() - began,
     )  # fmt: skip
-    facts = facts_of(models[0], prepared, outcome)
-    points = georegistration.points_of(models[0])
-    marks = dict(zip((each.name for each in surveyed), _places(prepared), strict=False))
-    draw_residuals(points, prepared.positions, outcome.on_earth, marks, output / FIGURE)
+    facts = make_reconstruction_report(models[0], plan, outcome)
+    points = georegistration.model_points(models[0])
+    marks = dict(zip((each.name for each in surveyed), _gcp_positions(plan), strict=False))
+    plot_residuals(points, plan.positions, outcome.georegistration, marks, output / RECONSTRUCTION_FIGURE)
     if origin is not None:
         write_json(output / "georef.json", _georef(facts, origin))
     capture_writer.write_model(output, models[0], _lenses(models[0], request.options.max_size))
-    write_json(output / FILE, jsonable(plain(facts)) | {"options": jsonable(to_dict(request.options))})
-    Work(output).finish("capture", keys["capture"])
+    write_json(
+        output / RECONSTRUCTION_FILE,
+        to_jsonable(record_to_dict(facts)) | {"options": to_jsonable(to_dict(request.options))},
+    )
+    Workspace(output).finish("capture", keys["capture"])
     return facts
 
 
 def _features(
-    prepared: Prepared, work: Work, kinds: Sequence[feature_extraction.Kind], key: str, console: Console
-) -> list[LeftOut]:
-    options, photographs = prepared.request.options, prepared.collection.photographs
-    if not work.is_begun("features", key):
-        work.remove()
-        work.begin("features", key)
-    feature_extraction.open_database(work, kinds)
-    failed = feature_extraction.stand_upright(work, photographs)
-    counts = feature_extraction.feature_counts(work)
-    if not work.is_done("features", key):
-        mask_files.write_upright_masks(work, photographs, prepared.threads)
-        counts = feature_extraction.find_features(
-            work, kinds, options.feature_size, options.features, prepared.threads, console
+    plan: ReconstructionPlan,
+    workspace: Workspace,
+    camera_groups: Sequence[feature_extraction.CameraGroup],
+    key: str,
+    console: Console,
+) -> list[ExcludedImage]:
+    options, photographs = plan.request.options, plan.image_list.photographs
+    if not workspace.is_begun("features", key):
+        workspace.remove()
+        workspace.begin("features", key)
+    feature_extraction.create_database(workspace, camera_groups)
+    failed = feature_extraction.write_upright_images(workspace, photographs)
+    counts = feature_extraction.count_features(workspace)
+    if not workspace.is_done("features", key):
+        mask_files.write_upright_masks(workspace, photographs, plan.threads)
+        counts = feature_extraction.extract_features(
+            workspace, camera_groups, options.max_image_size, options.features, plan.threads, console
         )
-        work.finish("features", key)
+        workspace.finish("features", key)
     named = {each.name for each in failed}
     return failed + [
-        each for each in feature_extraction.without_features(photographs, counts) if each.name not in named
+        each for each in feature_extraction.images_without_features(photographs, counts) if each.name not in named
     ]
 
 
-def _matches(prepared: Prepared, work: Work, key: str, console: Console) -> int:
-    photographs = prepared.collection.photographs
-    chosen = feature_matching.choose_pairs(work, photographs, prepared.positions, prepared.request.options)
-    there = feature_extraction.feature_counts(work)
+def _matches(plan: ReconstructionPlan, workspace: Workspace, key: str, console: Console) -> int:
+    photographs = plan.image_list.photographs
+    chosen = feature_matching.select_pairs(workspace, photographs, plan.positions, plan.request.options)
+    there = feature_extraction.count_features(workspace)
     chosen = [pair for pair in chosen if all(there.get(name) for name in pair)]
-    if work.is_done("matches", key):
+    if workspace.is_done("matches", key):
         return len(chosen)
-    if not work.is_begun("matches", key):
-        feature_matching.forget_matches(work)
-        work.begin("matches", key)
-    feature_matching.match(work, chosen, prepared.threads, console)
-    work.finish("matches", key)
+    if not workspace.is_begun("matches", key):
+        feature_matching.delete_matches(workspace)
+        workspace.begin("matches", key)
+    feature_matching.match_pairs(workspace, chosen, plan.threads, console)
+    workspace.finish("matches", key)
     return len(chosen)
 
 
 def _models(
-    prepared: Prepared, work: Work, key: str, count: int, hold_focal: bool, console: Console
+    plan: ReconstructionPlan, workspace: Workspace, key: str, count: int, fix_focal: bool, console: Console
 ) -> list[pycolmap.Reconstruction]:
-    if work.is_done("model", key):
-        return incremental_mapper.read_models(work)
-    if not work.is_begun("model", key):
-        incremental_mapper.forget_models(work)
-        work.begin("model", key)
-    incremental_mapper.write_priors(work, prepared.collection.photographs, prepared.positions)
-    models = incremental_mapper.find_models(
-        work, count, hold_focal, prepared.positions.usable, prepared.threads, console
-    )
-    work.finish("model", key)
+    if workspace.is_done("model", key):
+        return incremental_mapper.read_models(workspace)
+    if not workspace.is_begun("model", key):
+        incremental_mapper.delete_models(workspace)
+        workspace.begin("model", key)
+    incremental_mapper.write_pose_priors(workspace, plan.image_list.photographs, plan.positions)
+    models = incremental_mapper.run_mapper(workspace, count, fix_focal, plan.positions.usable, plan.threads, console)
+    workspace.finish("model", key)
     return models
 
 
-def _place(
-    model: pycolmap.Reconstruction, prepared: Prepared, hold_focal: bool
+def _georegister(
+    model: pycolmap.Reconstruction, plan: ReconstructionPlan, fix_focal: bool
 ) -> tuple[
-    georegistration.Placed | georegistration.Unplaced, tuple[float, float, float] | None, tuple[SurveyFacts, ...]
+    georegistration.Georegistration | georegistration.AlignmentFailure,
+    tuple[float, float, float] | None,
+    tuple[GcpReport, ...],
 ]:
     """Bring the model to metres east, north, up, its median point to height 0; the origin that this has on Earth, and
     what it makes of surveyed points."""
-    photographs, positions, control = prepared.collection.photographs, prepared.positions, prepared.control
+    photographs, positions, control = plan.image_list.photographs, plan.positions, plan.control
     doubtful = set[str]()
-    if control is not None and control.places_the_model:
-        how, doubtful = gcp_adjustment.bring_to_control(model, control, prepared.origin, hold_focal, prepared.threads)
-        placed: georegistration.Placed | georegistration.Unplaced = georegistration.as_it_lies(
-            model, photographs, positions, how
+    if control is not None and control.has_control_points:
+        how, doubtful = gcp_adjustment.adjust_to_gcps(model, control, plan.origin, fix_focal, plan.threads)
+        placed: georegistration.Georegistration | georegistration.AlignmentFailure = (
+            georegistration.registration_in_place(model, photographs, positions, how)
         )
     else:
-        placed = georegistration.place(model, photographs, positions)
-        if isinstance(placed, georegistration.Placed):
-            georegistration.move(model, placed.similarity)
-    if isinstance(placed, georegistration.Unplaced):
+        placed = georegistration.georegister(model, photographs, positions)
+        if isinstance(placed, georegistration.Georegistration):
+            georegistration.transform_model(model, placed.similarity)
+    if isinstance(placed, georegistration.AlignmentFailure):
         return placed, None, ()
-    surveyed = gcp_adjustment.survey(model, control, prepared.origin, doubtful) if control is not None else ()
-    ground = float(np.median(georegistration.points_of(model)[:, 2]))
-    georegistration.move(model, Similarity(1.0, np.eye(3), np.array([0.0, 0.0, -ground])))
-    latitude, longitude, altitude = prepared.origin
+    surveyed = gcp_adjustment.measure_gcps(model, control, plan.origin, doubtful) if control is not None else ()
+    ground = float(np.median(georegistration.model_points(model)[:, 2]))
+    georegistration.transform_model(model, Similarity(1.0, np.eye(3), np.array([0.0, 0.0, -ground])))
+    latitude, longitude, altitude = plan.origin
     return placed, (latitude, longitude, altitude + ground), surveyed
 
 
-def _places(prepared: Prepared) -> np.ndarray:
+def _gcp_positions(plan: ReconstructionPlan) -> np.ndarray:
     """Surveyed points [n, 3], none where nothing was placed."""
-    return prepared.control.enu(prepared.origin) if prepared.control else np.zeros((0, 3))
+    return plan.control.enu(plan.origin) if plan.control else np.zeros((0, 3))
 
 
-def _lenses(model: pycolmap.Reconstruction, max_size: int) -> dict[int, capture_writer.Straightened]:
+def _lenses(model: pycolmap.Reconstruction, max_size: int) -> dict[int, capture_writer.Undistortion]:
     used = sorted({image.camera_id for image in model.images.values() if image.has_pose})
-    return {number: capture_writer.straighten(model.cameras[number], max_size) for number in used}
+    return {number: capture_writer.make_undistortion(model.cameras[number], max_size) for number in used}
 
 
 def _write(
-    prepared: Prepared, work: Work, model: pycolmap.Reconstruction, key: str, threads: int, console: Console
+    plan: ReconstructionPlan,
+    workspace: Workspace,
+    model: pycolmap.Reconstruction,
+    key: str,
+    threads: int,
+    console: Console,
 ) -> None:
-    output = prepared.request.output
-    if not Work(output).is_begun("capture", key):
-        for name in (*(folder for folder, _ in capture_writer.SIZES), capture_writer.MASKS, "sparse"):
+    output = plan.request.output
+    if not Workspace(output).is_begun("capture", key):
+        for name in (*(folder for folder, _ in capture_writer.IMAGE_SIZES), capture_writer.MASK_FOLDER, "sparse"):
             shutil.rmtree(output / name, ignore_errors=True)
-        for name in (FILE, "georef.json", FIGURE):
+        for name in (RECONSTRUCTION_FILE, "georef.json", RECONSTRUCTION_FIGURE):
             (output / name).unlink(missing_ok=True)
-        Work(output).begin("capture", key)
+        Workspace(output).begin("capture", key)
     shutil.rmtree(output / "sparse", ignore_errors=True)
     names: dict[int, list[str]] = {}
     for image in sorted(model.images.values(), key=lambda image: image.name):
         if image.has_pose:
             names.setdefault(image.camera_id, []).append(image.name)
     capture_writer.write_images(
-        output, work, names, _lenses(model, prepared.request.options.max_size), threads, console
+        output, workspace, names, _lenses(model, plan.request.options.max_size), threads, console
     )
 
 
-def _georef(facts: ReconstructionFacts, origin: tuple[float, float, float]) -> JsonObject:
+def _georef(report: ReconstructionReport, origin: tuple[float, float, float]) -> JsonObject:
     latitude, longitude, altitude = origin
     return {
         "frame": "ENU, metres, x east y north z up",
         "origin_lat_deg": latitude, "origin_lon_deg": longitude, "origin_alt_m": altitude,
-        "alt_reference": facts.altitude_reference,
-        "method": f"bundle adjustment with positions as priors, then a similarity to the {facts.georeferenced}",
-        "gps_outliers_left_out": facts.positions_left_out,
-        "gps_residual_rms_m_xyz": list(facts.residual_rms_m or ()),
+        "alt_reference": report.altitude_reference,
+        "method": f"bundle adjustment with positions as priors, then a similarity to the {report.georeferenced}",
+        "gps_outliers_left_out": report.positions_rejected,
+        "gps_residual_rms_m_xyz": list(report.residual_rms_m or ()),
         "z0": "median height of the 3D points",
     }  # fmt: skip

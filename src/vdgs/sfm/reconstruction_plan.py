@@ -8,34 +8,34 @@ from pathlib import Path
 
 from rich.console import Console
 
-from vdgs.captures.output_guard import refuse_in_a_capture
-from vdgs.config.ranges import refuse
+from vdgs.captures.output_guard import check_not_in_capture
+from vdgs.config.ranges import check_ranges
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import VdgsError
-from vdgs.kernels import default_threads
+from vdgs.kernels import default_num_threads
 from vdgs.sfm import feature_matching, incremental_mapper
-from vdgs.sfm.console_report import tell_look
-from vdgs.sfm.gcp_list import Control, check_near, read_control
-from vdgs.sfm.gps_priors import Positions, find_positions
-from vdgs.sfm.image_list import Collection, collect
-from vdgs.sfm.preflight import Look, look_at, seconds
+from vdgs.sfm.console_report import print_preflight
+from vdgs.sfm.gcp_list import GcpList, check_gcps_near, read_gcp_list
+from vdgs.sfm.gps_priors import GpsPriors, read_gps_priors
+from vdgs.sfm.image_list import ImageList, collect_images
+from vdgs.sfm.preflight import PreflightReport, estimate_seconds, make_preflight_report
 from vdgs.system.units import data_size, rough_duration
 
 #: Bytes of disk for a feature, with its descriptor and its matches; and for a pixel of a written photograph.
-FEATURE_BYTES, PIXEL_BYTES = 250, 0.9
+BYTES_PER_FEATURE, BYTES_PER_PIXEL = 250, 0.9
 
 
 @dataclass(frozen=True, kw_only=True)
-class Prepared:
+class ReconstructionPlan:
     """What is known before the work."""
 
     request: SfmRequest
-    collection: Collection
-    positions: Positions
-    look: Look
+    image_list: ImageList
+    positions: GpsPriors
+    look: PreflightReport
     threads: int
     seconds: float
-    control: Control | None = None
+    control: GcpList | None = None
 
     @property
     def origin(self) -> tuple[float, float, float]:
@@ -43,64 +43,64 @@ class Prepared:
         return self.control.middle if self.control and not self.positions.usable else self.positions.origin
 
 
-def prepare(request: SfmRequest) -> Prepared:
+def plan_reconstruction(request: SfmRequest) -> ReconstructionPlan:
     """The look before the work; nothing is written. Raises CaptureError for photographs that cannot become one."""
-    refuse(request)
-    collection = collect(request.photographs)
-    refuse_among_photographs(request.output, collection)
-    positions = find_positions(collection.photographs, request.gps, request.options.gps_deviation_m)
-    control = _control(request.options, collection, positions)
-    look = look_at(collection, positions)
+    check_ranges(request)
+    collection = collect_images(request.photographs)
+    check_output_outside_images(request.output, collection)
+    positions = read_gps_priors(collection.photographs, request.gps, request.options.gps_std_m)
+    control = _read_gcps(request.options, collection, positions)
+    look = make_preflight_report(collection, positions)
     look = replace(look, warnings=[*look.warnings, *(control.notes if control else ())])
-    threads = request.threads or default_threads()
-    pairs = feature_matching.expected_pairs(collection.photographs, positions, request.options)
-    takes = seconds(collection.photographs, pairs, request.options, threads)
-    return Prepared(
-        request=request, collection=collection, positions=positions, look=look, threads=threads, seconds=takes,
+    threads = request.threads or default_num_threads()
+    pairs = feature_matching.estimate_pair_count(collection.photographs, positions, request.options)
+    takes = estimate_seconds(collection.photographs, pairs, request.options, threads)
+    return ReconstructionPlan(
+        request=request, image_list=collection, positions=positions, look=look, threads=threads, seconds=takes,
         control=control,
     )  # fmt: skip
 
 
-def _control(options: SfmOptions, collection: Collection, positions: Positions) -> Control | None:
+def _read_gcps(options: SfmOptions, collection: ImageList, positions: GpsPriors) -> GcpList | None:
     if options.gcp is None:
         if options.check_points:
             raise VdgsError("--check-points names points of a list: give it with --gcp")
         return None
-    control = read_control(options.gcp, collection, options.check_points)
-    check_near(control, positions.enu, positions.origin, options.gcp)
+    control = read_gcp_list(options.gcp, collection, options.check_points)
+    check_gcps_near(control, positions.enu, positions.origin, options.gcp)
     return control
 
 
-def tell(prepared: Prepared, console: Console) -> None:
+def print_plan(reconstruction_plan: ReconstructionPlan, console: Console) -> None:
     """Print the look, and what will be done."""
-    photographs, options = prepared.collection.photographs, prepared.request.options
-    pairs = feature_matching.expected_pairs(photographs, prepared.positions, options)
-    held, why = incremental_mapper.holds_focal(photographs, prepared.positions, options)
-    how = "near each other by their positions" if prepared.positions.usable else (
-        "all with all" if len(photographs) <= options.exhaustive else "next in order, and alike")  # fmt: skip
-    metres = "metres east, north, up, " if prepared.positions.usable or prepared.control else ""
+    photographs, options = reconstruction_plan.image_list.photographs, reconstruction_plan.request.options
+    pairs = feature_matching.estimate_pair_count(photographs, reconstruction_plan.positions, options)
+    held, why = incremental_mapper.should_fix_focal(photographs, reconstruction_plan.positions, options)
+    how = "near each other by their positions" if reconstruction_plan.positions.usable else (
+        "all with all" if len(photographs) <= options.exhaustive_max else "next in order, and alike")  # fmt: skip
+    metres = "metres east, north, up, " if reconstruction_plan.positions.usable or reconstruction_plan.control else ""
     plan = [
         f"features, about {pairs} pairs ({how}), poses and points, {metres}photographs without distortion",
-        *_plan_of(prepared.control),
+        *_gcp_plan_lines(reconstruction_plan.control),
         f"the focal length is {'held' if held else 'fitted'}: {why}",
-        f"about {rough_duration(prepared.seconds)} on {prepared.threads} threads, if they are idle",
+        f"about {rough_duration(reconstruction_plan.seconds)} on {reconstruction_plan.threads} threads, if they are idle",
     ]
-    tell_look(prepared.look, prepared.collection, plan, console)
+    print_preflight(reconstruction_plan.look, reconstruction_plan.image_list, plan, console)
 
 
-def _plan_of(control: Control | None) -> list[str]:
+def _gcp_plan_lines(control: GcpList | None) -> list[str]:
     if control is None:
         return []
-    held_out = sum(point.held_out for point in control.points)
+    held_out = sum(point.is_check_point for point in control.points)
     used = len(control.points) - held_out
     parts = [f"{used} place the model"] if used else []
     parts += [f"{held_out} are held out to measure it"] if held_out else []
     return [f"surveyed points of {control.source} ({control.system}): {', '.join(parts)}"]
 
 
-def refuse_among_photographs(output: Path, collection: Collection) -> None:
+def check_output_outside_images(output: Path, collection: ImageList) -> None:
     """Raise VdgsError where the output would lie among the photographs, or in a capture."""
-    refuse_in_a_capture(output)
+    check_not_in_capture(output)
     real = output.resolve()
     for folder in collection.folders:
         if real == folder.resolve() or folder.resolve() in real.parents:
@@ -110,26 +110,24 @@ def refuse_among_photographs(output: Path, collection: Collection) -> None:
             )
 
 
-def check_disk(prepared: Prepared) -> None:
-    photographs, options = prepared.collection.photographs, prepared.request.options
+def check_disk_space(plan: ReconstructionPlan) -> None:
+    photographs, options = plan.image_list.photographs, plan.request.options
     pixels = sum(photo.width * photo.height for photo in photographs)
-    needed = PIXEL_BYTES * 1.32 * pixels + FEATURE_BYTES * options.features * len(photographs)
+    needed = BYTES_PER_PIXEL * 1.32 * pixels + BYTES_PER_FEATURE * options.features * len(photographs)
     parent = next(
-        folder
-        for folder in (prepared.request.output.resolve(), *prepared.request.output.resolve().parents)
-        if folder.exists()
+        folder for folder in (plan.request.output.resolve(), *plan.request.output.resolve().parents) if folder.exists()
     )
     free = shutil.disk_usage(parent).free
     if free < needed:
         raise VdgsError(
-            f"{prepared.request.output}: needs about {data_size(needed)}, {data_size(free)} are free there. Free "
+            f"{plan.request.output}: needs about {data_size(needed)}, {data_size(free)} are free there. Free "
             "some space, choose another --output, or write smaller photographs (--max-size 2000)."
         )
 
 
-def in_time(prepared: Prepared) -> list[int]:
+def time_order(plan: ReconstructionPlan) -> list[int]:
     """Rows of the positions in the order in which the photographs were taken."""
-    photographs, index = prepared.collection.photographs, prepared.positions.index
+    photographs, index = plan.image_list.photographs, plan.positions.index
     return sorted(
         range(len(index)), key=lambda row: (photographs[int(index[row])].taken, photographs[int(index[row])].name)
     )

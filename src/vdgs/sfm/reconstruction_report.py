@@ -8,35 +8,35 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 
-from vdgs.captures.reconstruction import CameraFacts, PhotographFacts, ReconstructionFacts, SurveyFacts
-from vdgs.sfm.feature_extraction import Kind
-from vdgs.sfm.georegistration import Placed, Unplaced, points_of, tilt_against_attitudes
-from vdgs.sfm.gps_priors import Positions
-from vdgs.sfm.image_list import Collection, LeftOut
-from vdgs.sfm.incremental_mapper import kinds_after
-from vdgs.sfm.preflight import LEAST_OVERLAP, LEAST_VIEWS, OBLIQUE_DEG, Look
-from vdgs.sfm.reconstruction_plan import Prepared
+from vdgs.captures.reconstruction import CameraReport, GcpReport, ImageReport, ReconstructionReport
+from vdgs.sfm.feature_extraction import CameraGroup
+from vdgs.sfm.georegistration import AlignmentFailure, Georegistration, model_points, tilt_from_attitudes
+from vdgs.sfm.gps_priors import GpsPriors
+from vdgs.sfm.image_list import ExcludedImage, ImageList
+from vdgs.sfm.incremental_mapper import refined_cameras
+from vdgs.sfm.preflight import MIN_OVERLAP, MIN_VIEWS_PER_POINT, OBLIQUE_ANGLE_DEG, PreflightReport
+from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 
 #: A fitted focal length that left EXIF's by more than this share drifted, and so did a height over the recorded one.
-FOCAL_DRIFT, HEIGHT_DRIFT = 0.05, 0.15
+MAX_FOCAL_DRIFT, MAX_HEIGHT_DRIFT = 0.05, 0.15
 #: Degrees between down as the model has it and as the drone recorded it that are worth a word.
-TURNED_DEG = 3.0
+MAX_TILT_DEG = 3.0
 #: A mark so many pixels from where the model puts a surveyed point is wrong (choice).
-MARK_WRONG_PX = 8.0
+MAX_MARK_ERROR_PX = 8.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Outcome:
+class ReconstructionResult:
     """What the steps of a reconstruction left beside the model, which lies where it belongs."""
 
     #: Kinds of camera, as the features were found with.
-    kinds: Sequence[Kind]
+    kinds: Sequence[CameraGroup]
     #: How the model was placed by positions, or why not, and where its origin is (latitude, longitude, altitude).
-    placed: Placed | Unplaced
+    placed: Georegistration | AlignmentFailure
     origin: tuple[float, float, float] | None
     #: Surveyed points and how far off the model has them.
-    survey: tuple[SurveyFacts, ...]
-    left_out: Sequence[LeftOut]
+    survey: tuple[GcpReport, ...]
+    left_out: Sequence[ExcludedImage]
     #: Photographs of each part that came out, the largest first.
     components: Sequence[int]
     #: Pairs of photographs that were compared.
@@ -46,53 +46,55 @@ class Outcome:
     seconds: float
 
     @property
-    def on_earth(self) -> Placed | None:
-        return self.placed if isinstance(self.placed, Placed) else None
+    def georegistration(self) -> Georegistration | None:
+        return self.placed if isinstance(self.placed, Georegistration) else None
 
 
-def facts_of(model: pycolmap.Reconstruction, prepared: Prepared, outcome: Outcome) -> ReconstructionFacts:
+def make_reconstruction_report(
+    model: pycolmap.Reconstruction, plan: ReconstructionPlan, result: ReconstructionResult
+) -> ReconstructionReport:
     """The facts of a model that lies where it belongs."""
-    placed, held = outcome.on_earth, outcome.held
-    collection, positions, look = prepared.collection, prepared.positions, prepared.look
+    placed, held = result.georegistration, result.held
+    collection, positions, look = plan.image_list, plan.positions, plan.look
     images = [image for image in model.images.values() if image.has_pose]
     metric = placed is not None
     height = _height(model, images) if metric else None
     forwards = np.array([image.cam_from_world().rotation.matrix()[2] for image in images])
     tilt = float(np.median(np.degrees(np.arccos(np.clip(-forwards[:, 2], -1, 1))))) if metric else None
-    cameras = _cameras(model, outcome.kinds)
-    turned = tilt_against_attitudes(model, collection.photographs) if metric else None
+    cameras = _cameras(model, result.kinds)
+    turned = tilt_from_attitudes(model, collection.photographs) if metric else None
     warnings = [*look.warnings, *_warnings(cameras, held[0], height, look.height_m, turned)]
-    warnings += _survey_warnings(outcome.survey)
+    warnings += _survey_warnings(result.survey)
     advice = _advice(look, held[0], len(images), len(collection.photographs))
-    if isinstance(outcome.placed, Unplaced):
-        georeferenced = f"none: {outcome.placed.why}; scale, north and up are not known"
-        warnings.append(f"not georeferenced ({outcome.placed.why}): the scale of the scene is arbitrary.")
-        advice.append(outcome.placed.remedy)
+    if isinstance(result.placed, AlignmentFailure):
+        georeferenced = f"none: {result.placed.why}; scale, north and up are not known"
+        warnings.append(f"not georeferenced ({result.placed.why}): the scale of the scene is arbitrary.")
+        advice.append(result.placed.remedy)
     else:
-        georeferenced = outcome.placed.how
-    return ReconstructionFacts(
+        georeferenced = result.placed.how
+    return ReconstructionReport(
         found=len(collection.photographs) + len(collection.left_out), registered=len(images),
-        components=tuple(outcome.components), pairs=outcome.pairs, points=model.num_points3D(),
+        components=tuple(result.components), pairs=result.pairs, points=model.num_points3D(),
         track_length=float(model.compute_mean_track_length()),
         reprojection_px=float(model.compute_mean_reprojection_error()), georeferenced=georeferenced,
-        altitude_reference=_altitudes(prepared) if metric else "", origin=outcome.origin,
-        residual_rms_m=_rms(placed), positions_left_out=int((~placed.inliers).sum()) if placed else 0,
-        focal_held=held[0], focal_reason=held[1], height_m=height, recorded_height_m=look.height_m, tilt_deg=tilt,
+        altitude_reference=_altitudes(plan) if metric else "", origin=result.origin,
+        residual_rms_m=_rms(placed), positions_rejected=int((~placed.inliers).sum()) if placed else 0,
+        focal_fixed=held[0], focal_reason=held[1], height_m=height, recorded_height_m=look.height_m, tilt_deg=tilt,
         attitude_difference_deg=turned, cameras=cameras,
-        photographs=_photographs(collection, positions, placed, outcome.left_out), warnings=tuple(warnings),
+        photographs=_photographs(collection, positions, placed, result.left_out), warnings=tuple(warnings),
         advice=tuple(advice),
-        seconds=outcome.seconds,
-        survey=outcome.survey,
+        seconds=result.seconds,
+        survey=result.survey,
     )  # fmt: skip
 
 
-def why_left_out(
+def exclusion_reasons(
     model: pycolmap.Reconstruction,
     others: Sequence[pycolmap.Reconstruction],
     names: Sequence[str],
     matched: Mapping[str, int],
-    known: Sequence[LeftOut],
-) -> list[LeftOut]:
+    known: Sequence[ExcludedImage],
+) -> list[ExcludedImage]:
     """Every photograph that the model does not place, with the reason."""
     placed = {image.name for image in model.images.values() if image.has_pose}
     reasons = {each.name: each.why for each in known}
@@ -114,18 +116,18 @@ def why_left_out(
             if count == 0
             else f"agrees with {count} others in pairs, but shows too few of the points that they have in common"
         )
-        found.append(LeftOut(name, reasons.get(name, why)))
+        found.append(ExcludedImage(name, reasons.get(name, why)))
     return found
 
 
-def _altitudes(prepared: Prepared) -> str:
+def _altitudes(prepared: ReconstructionPlan) -> str:
     control = prepared.control
-    if control is not None and control.places_the_model:
+    if control is not None and control.has_control_points:
         return f"heights as in {control.source} ({control.system})"
     return prepared.positions.altitude_reference
 
 
-def _rms(placed: Placed | None) -> tuple[float, ...] | None:
+def _rms(placed: Georegistration | None) -> tuple[float, ...] | None:
     if placed is None or not placed.inliers.any():
         return None
     return tuple(float(value) for value in np.sqrt((placed.residuals[placed.inliers] ** 2).mean(axis=0)))
@@ -133,12 +135,12 @@ def _rms(placed: Placed | None) -> tuple[float, ...] | None:
 
 def _height(model: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]) -> float:
     heights = [image.projection_center()[2] for image in images]
-    return float(np.median(heights) - np.median(points_of(model)[:, 2]))
+    return float(np.median(heights) - np.median(model_points(model)[:, 2]))
 
 
-def _cameras(model: pycolmap.Reconstruction, kinds: Sequence[Kind]) -> tuple[CameraFacts, ...]:
+def _cameras(model: pycolmap.Reconstruction, kinds: Sequence[CameraGroup]) -> tuple[CameraReport, ...]:
     return tuple(
-        CameraFacts(
+        CameraReport(
             name=kind.camera,
             photographs=len(kind.photographs),
             width=kind.width,
@@ -148,67 +150,67 @@ def _cameras(model: pycolmap.Reconstruction, kinds: Sequence[Kind]) -> tuple[Cam
             focal_after_px=float(after.mean_focal_length()),
             radial_distortion=float(after.params[3]),
         )
-        for kind, after in zip(kinds, kinds_after(model, kinds), strict=True)
+        for kind, after in zip(kinds, refined_cameras(model, kinds), strict=True)
         if after is not None
     )
 
 
 def _photographs(
-    collection: Collection, positions: Positions, placed: Placed | None, left_out: Sequence[LeftOut]
-) -> tuple[PhotographFacts, ...]:
+    collection: ImageList, positions: GpsPriors, placed: Georegistration | None, left_out: Sequence[ExcludedImage]
+) -> tuple[ImageReport, ...]:
     why = {each.name: each.why for each in (*collection.left_out, *left_out)}
     names = sorted({*(photo.name for photo in collection.photographs), *why})
     residuals = {}
     if placed is not None:
         for row, residual in zip(placed.rows, placed.residuals, strict=True):
             residuals[collection.photographs[int(positions.index[row])].name] = tuple(float(v) for v in residual)
-    return tuple(PhotographFacts(name, residuals.get(name), why.get(name)) for name in names)
+    return tuple(ImageReport(name, residuals.get(name), why.get(name)) for name in names)
 
 
 def _warnings(
-    cameras: Sequence[CameraFacts], held: bool, height: float | None, recorded: float | None, turned: float | None
+    cameras: Sequence[CameraReport], held: bool, height: float | None, recorded: float | None, turned: float | None
 ) -> list[str]:
     found = []
     for camera in cameras:
         drift = camera.focal_after_px / camera.focal_before_px - 1
-        if not held and camera.focal_source != "a guess" and abs(drift) > FOCAL_DRIFT:
+        if not held and camera.focal_source != "a guess" and abs(drift) > MAX_FOCAL_DRIFT:
             found.append(
                 f"{camera.name}: the fitted focal length is {drift:+.0%} of what {camera.focal_source} says; if "
                 "heights look wrong, hold it: --focal hold"
             )
-    if height is not None and recorded is not None and abs(height / recorded - 1) > HEIGHT_DRIFT:
+    if height is not None and recorded is not None and abs(height / recorded - 1) > MAX_HEIGHT_DRIFT:
         found.append(
             f"the cameras are {height:.1f} m over the median point, the drone recorded {recorded:.1f} m over its "
             "take-off: another level of ground, or a focal length that is not right."
         )
-    if turned is not None and turned > TURNED_DEG:
+    if turned is not None and turned > MAX_TILT_DEG:
         found.append(f"down differs by {turned:.1f}° from what the drone recorded: the model may be tilted or bent.")
     return found
 
 
-def _survey_warnings(survey: Sequence[SurveyFacts]) -> list[str]:
+def _survey_warnings(survey: Sequence[GcpReport]) -> list[str]:
     found = []
     for each in survey:
         if each.residual_m is None:
             found.append(f"the surveyed point {each.name} is shown by too few placed photographs; not used.")
-        elif each.used_as == "not used":
+        elif each.role == "not used":
             found.append(f"the control point {each.name} does not fit the others; not used. Is its place right?")
-        if each.error_px is not None and each.error_px > MARK_WRONG_PX:
+        if each.error_px is not None and each.error_px > MAX_MARK_ERROR_PX:
             away = f"{each.error_px:.0f} px from where it must be seen"
             found.append(f"the surveyed point {each.name} is marked {away}. Look at its marks again.")
     return found
 
 
-def _advice(look: Look, held: bool, registered: int, found: int) -> list[str]:
+def _advice(look: PreflightReport, held: bool, registered: int, found: int) -> list[str]:
     """What to do better next flight."""
     advice = []
-    if look.forward_overlap is not None and look.forward_overlap < LEAST_OVERLAP:
+    if look.forward_overlap is not None and look.forward_overlap < MIN_OVERLAP:
         advice.append("fly slower or take photographs more often: 75 to 80 % overlap along the flight.")
-    if look.views_per_place is not None and look.views_per_place < 2 * LEAST_VIEWS:
+    if look.views_per_point is not None and look.views_per_point < 2 * MIN_VIEWS_PER_POINT:
         advice.append("fly the strips closer together, or a second grid across the first: every place in 8 or more.")
     if held and look.oblique is not None and look.oblique == 0:
         advice.append(
-            f"add oblique views (camera {OBLIQUE_DEG + 10:.0f}° or more from straight down) or a second height: walls "
+            f"add oblique views (camera {OBLIQUE_ANGLE_DEG + 10:.0f}° or more from straight down) or a second height: walls "
             "come out, and the focal length is fixed by the flight itself."
         )
     if registered < 0.9 * found:

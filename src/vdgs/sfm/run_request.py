@@ -7,24 +7,24 @@ from vdgs.config.commands import RunRequest
 from vdgs.config.sfm_options import SfmRequest
 from vdgs.errors import VdgsError
 from vdgs.runs.run_folder import RunFolder
-from vdgs.sfm.image_list import only_photographs
+from vdgs.sfm.image_list import is_image_folder
 
 
-def of_photographs(asked: RunRequest) -> bool:
+def is_image_input(request: RunRequest) -> bool:
     """Whether a run is asked for of photographs, not of a capture. VdgsError for several folders that are not all of
     photographs alone."""
-    if only_photographs(asked.capture):
+    if is_image_folder(request.capture):
         return True
-    if asked.photographs:
+    if request.photographs:
         raise VdgsError(
-            f"{asked.capture}: only folders of photographs alone can be several; a capture is given by itself."
+            f"{request.capture}: only folders of photographs alone can be several; a capture is given by itself."
         )
     return False
 
 
-def sfm_request(asked: RunRequest) -> SfmRequest:
+def make_sfm_request(request: RunRequest) -> SfmRequest:
     """Photographs into RUN/capture. Raises VdgsError for options that speak of a capture that is not there yet."""
-    options = asked.options
+    options = request.options
     for flag, value in (("--georef", options.georef), ("--up", None if options.up == "auto" else options.up)):
         if value is not None:
             raise VdgsError(f"{flag} is about a capture's world; photographs get theirs from their positions (--gps).")
@@ -33,12 +33,12 @@ def sfm_request(asked: RunRequest) -> SfmRequest:
             f"--masks {options.masks}: names a folder of a capture. Masks of photographs alone are those in "
             f"{CaptureOptions.masks}/ beside them: rename the folder."
         )
-    run = RunFolder(asked.output)
-    run.refuse_strangers()
+    run = RunFolder(request.output)
+    run.check_output_empty()
     return SfmRequest(
-        photographs=(asked.capture, *asked.photographs),
+        photographs=(request.capture, *request.photographs),
         output=run.own_capture,
         gps=options.gps,
-        threads=asked.threads,
-        options=asked.sfm,
+        threads=request.threads,
+        options=request.sfm,
     )

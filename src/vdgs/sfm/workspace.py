@@ -17,21 +17,21 @@ import pycolmap
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from vdgs.captures.reconstruction import STEPS
+from vdgs.captures.reconstruction import STEPS_FILE
 from vdgs.errors import CaptureError, VdgsError
-from vdgs.system.atomic_files import read_record, write_json
-from vdgs.system.stop_signals import stop_if_asked
+from vdgs.system.atomic_files import read_json_or_empty, write_json
+from vdgs.system.stop_signals import check_stop_requested
 from vdgs.system.units import rough_duration
 
 Result = TypeVar("Result")
 #: Seconds between two looks whether a person asked to stop.
-_GLANCE = 0.2
+_POLL_SECONDS = 0.2
 #: Work that takes fewer seconds needs no lines about how far it is.
-_QUIET = 30.0
+_MIN_LOG_SECONDS = 30.0
 
 
 @dataclass(frozen=True)
-class Work:
+class Workspace:
     """OUTPUT/work: links to the photographs, COLMAP's database, models, and what is done."""
 
     path: Path
@@ -85,7 +85,7 @@ class Work:
         shutil.rmtree(self.path, ignore_errors=True)
 
     def _steps(self, which: str) -> dict[str, str]:
-        steps = read_record(self.path / STEPS).get(which)
+        steps = read_json_or_empty(self.path / STEPS_FILE).get(which)
         return steps if isinstance(steps, dict) else {}
 
     def _note(self, which: str, step: str, key: str) -> None:
@@ -93,15 +93,15 @@ class Work:
         steps[which][step] = key
         if which == "begun":
             steps["done"].pop(step, None)
-        write_json(self.path / STEPS, steps)
+        write_json(self.path / STEPS_FILE, steps)
 
 
-def key_of(*parts: Any) -> str:
+def cache_key(*parts: Any) -> str:
     """A short key of anything that JSON can hold."""
     return blake2b(json.dumps(parts, sort_keys=True, default=str).encode(), digest_size=12).hexdigest()
 
 
-def call(function: Callable[..., Result], *arguments: Any, **named: Any) -> Result:
+def call_cancellable(function: Callable[..., Result], *arguments: Any, **named: Any) -> Result:
     """Call a long function of COLMAP beside this thread, so that Ctrl-C is heard and ends it where it is whole.
 
     Raises VdgsError for what COLMAP cannot do, and what asked to stop.
@@ -120,12 +120,12 @@ def call(function: Callable[..., Result], *arguments: Any, **named: Any) -> Resu
     try:
         thread.start()
         # Not by joining the thread: a join that is interrupted takes the thread for ended.
-        while not over.wait(_GLANCE):
+        while not over.wait(_POLL_SECONDS):
             pass
-        stop_if_asked()
+        check_stop_requested()
     except BaseException:
         token.cancel()
-        while not over.wait(_GLANCE) and thread.ident is not None:  # None: stopped before it began
+        while not over.wait(_POLL_SECONDS) and thread.ident is not None:  # None: stopped before it began
             pass
         raise
     thread.join()
@@ -141,12 +141,12 @@ def call(function: Callable[..., Result], *arguments: Any, **named: Any) -> Resu
 
 
 @contextmanager
-def progress(console: Console, title: str, total: int) -> Iterator[Callable[[int], None]]:
+def report_progress(console: Console, title: str, total: int) -> Iterator[Callable[[int], None]]:
     """A bar with the time left where the console is a terminal, else a line for every tenth; yields what tells how many
     are done."""
     if not console.is_terminal:
         console.print(f"{title}: {total}", highlight=False)
-        yield _Lines(title, total, console)
+        yield _ProgressLines(title, total, console)
         return
     columns = (
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"),
@@ -157,7 +157,7 @@ def progress(console: Console, title: str, total: int) -> Iterator[Callable[[int
         yield lambda done: bar.update(task, completed=done)
 
 
-class _Lines:
+class _ProgressLines:
     """How far work is, for logs: a line for every tenth, with the time left, and none in the first half minute."""
 
     def __init__(self, title: str, total: int, console: Console) -> None:
@@ -168,14 +168,14 @@ class _Lines:
         if self.first < 0:
             self.first = done  # what was done before tells nothing of the pace
         seconds, tenth = time.monotonic() - self.began, 10 * done // max(1, self.total)
-        if seconds < _QUIET or tenth <= self.told or done <= self.first or done >= self.total:
+        if seconds < _MIN_LOG_SECONDS or tenth <= self.told or done <= self.first or done >= self.total:
             return
         self.told = tenth
         left = seconds / (done - self.first) * (self.total - done)
         self.console.print(f"{self.title}: {done} of {self.total}, about {rough_duration(left)} left", highlight=False)
 
 
-def quiet_colmap() -> None:
+def silence_colmap() -> None:
     """COLMAP's own log is for its makers: errors come as exceptions, progress is shown here."""
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     pycolmap.set_random_seed(0)

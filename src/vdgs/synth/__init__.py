@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from vdgs.synth.options import SynthOptions
 
 if TYPE_CHECKING:
-    from vdgs.synth.flight_stats import FlightImbalance
+    from vdgs.synth.flight_stats import FlightStats
 
 __all__ = ["SynthOptions", "generate"]
 
@@ -20,8 +20,8 @@ __all__ = ["SynthOptions", "generate"]
 def generate(
     output: Path,
     options: SynthOptions | None = None,
-    progress: Callable[[str, int, int], None] | None = None,
-) -> FlightImbalance:
+    on_progress: Callable[[str, int, int], None] | None = None,
+) -> FlightStats:
     """Build a town, fly over it and write a COLMAP capture to `output` (which must not hold anything yet).
 
     Returns how unevenly the flight sees the place.
@@ -31,4 +31,4 @@ def generate(
     """
     from vdgs.synth.generation import generate as run
 
-    return run(Path(output), options or SynthOptions(), progress)
+    return run(Path(output), options or SynthOptions(), on_progress)

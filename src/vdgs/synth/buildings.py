@@ -1,6 +1,6 @@
 """Buildings: houses with pitched roofs, flat-roofed blocks, a church, a barn.
 
-Every building stands in its own `Frame`: front at negative y, floor at z = 0, foundations below.
+Every building stands in its own `ObjectFrame`: front at negative y, floor at z = 0, foundations below.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ import numpy as np
 
 from vdgs.synth import palette
 from vdgs.synth.mesh import Material, MeshBuilder
-from vdgs.synth.shapes import Box, Frame, Skin, box, face, frustum
+from vdgs.synth.shapes import Box, ObjectFrame, SurfaceMaterial, box, face, frustum
 
-STOREY = 2.7
+STOREY_HEIGHT = 2.7
 _FOUNDATION = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class House:
+class HouseStyle:
     """What makes one house unlike the next (metres; `pitch` is rise over run)."""
 
     width: float
@@ -27,24 +27,26 @@ class House:
     pitch: float
     hipped: bool
     walls: np.ndarray
-    roof: Skin
+    roof: SurfaceMaterial
     seed: float
 
     @property
     def eaves(self) -> float:
-        return self.storeys * STOREY + 0.3
+        return self.storeys * STOREY_HEIGHT + 0.3
 
 
-def foundation(builder: MeshBuilder, frame: Frame, shape: Box) -> None:
+def foundation(builder: MeshBuilder, frame: ObjectFrame, shape: Box) -> None:
     """A stone plinth that carries a building down into sloping ground."""
     plinth = Box(
         x0=shape.x0 - 0.06, x1=shape.x1 + 0.06, y0=shape.y0 - 0.06, y1=shape.y1 + 0.06, z0=-_FOUNDATION, z1=0.12
     )
-    stone = Skin(Material.STONE, palette.STONE * 0.75)
+    stone = SurfaceMaterial(Material.STONE, palette.STONE * 0.75)
     box(builder, frame, plinth, stone, stone)
 
 
-def pitched_roof(builder: MeshBuilder, frame: Frame, shape: Box, pitch: float, roof: Skin, hip: float = 0.0) -> float:
+def pitched_roof(
+    builder: MeshBuilder, frame: ObjectFrame, shape: Box, pitch: float, roof: SurfaceMaterial, hip: float = 0.0
+) -> float:
     """A roof whose ridge runs along x over a box, with eaves, fascias and a ridge cap; returns its rise.
 
     `hip` shortens the ridge at both ends by that part of half the depth: 0 gives gables, 1 a hipped roof.
@@ -62,7 +64,7 @@ def pitched_roof(builder: MeshBuilder, frame: Frame, shape: Box, pitch: float, r
     if hip > 0:
         face(builder, frame, np.array([eaves[1], eaves[2], ridge[1]]), roof)
         face(builder, frame, np.array([eaves[3], eaves[0], ridge[0]]), roof)
-    trim = Skin(Material.PAINT, palette.TRIM * 0.8)
+    trim = SurfaceMaterial(Material.PAINT, palette.TRIM * 0.8)
     for k in range(4):
         a, b = np.array(eaves[k]), np.array(eaves[(k + 1) % 4])
         if hip == 0 and k % 2:  # the verge climbs to the ridge and down again
@@ -74,11 +76,11 @@ def pitched_roof(builder: MeshBuilder, frame: Frame, shape: Box, pitch: float, r
             down = np.array([0, 0, -0.22])
             face(builder, frame, np.array([start + down, end + down, end, start]), trim)
     cap = Box(x0=r0, x1=r1, y0=middle - 0.16, y1=middle + 0.16, z0=top - 0.12, z1=top + 0.09)
-    box(builder, frame, cap, *(Skin(Material.PAINT, roof.colour * 0.8),) * 2)
+    box(builder, frame, cap, *(SurfaceMaterial(Material.PAINT, roof.colour * 0.8),) * 2)
     return rise
 
 
-def gables(builder: MeshBuilder, frame: Frame, shape: Box, pitch: float, skin: Skin) -> None:
+def gables(builder: MeshBuilder, frame: ObjectFrame, shape: Box, pitch: float, skin: SurfaceMaterial) -> None:
     """The triangles that close a gabled roof over a box."""
     middle, top = (shape.y0 + shape.y1) / 2, shape.z1 + (shape.y1 - shape.y0) / 2 * pitch
     for x, (a, b) in ((shape.x0, (shape.y1, shape.y0)), (shape.x1, (shape.y0, shape.y1))):
@@ -86,13 +88,13 @@ def gables(builder: MeshBuilder, frame: Frame, shape: Box, pitch: float, skin: S
         face(builder, frame, corners, skin)
 
 
-def house(builder: MeshBuilder, frame: Frame, style: House, rng: np.random.Generator) -> None:
+def house(builder: MeshBuilder, frame: ObjectFrame, style: HouseStyle, rng: np.random.Generator) -> None:
     """A house with windows and a door, its roof, a chimney, and now and then a wing or dormers."""
     w, d = style.width / 2, style.depth / 2
     body = Box(x0=-w, x1=w, y0=-d, y1=d, z0=0, z1=style.eaves)
-    windows = Skin(Material.WINDOWS, style.walls, style.seed)
-    plaster = Skin(Material.PLASTER, style.walls, style.seed)
-    front = Skin(Material.DOOR, style.walls, style.seed)
+    windows = SurfaceMaterial(Material.WINDOWS, style.walls, style.seed)
+    plaster = SurfaceMaterial(Material.PLASTER, style.walls, style.seed)
+    front = SurfaceMaterial(Material.DOOR, style.walls, style.seed)
     foundation(builder, frame, body)
     box(builder, frame, body, (front, windows, windows, windows))
     if not style.hipped:
@@ -107,38 +109,38 @@ def house(builder: MeshBuilder, frame: Frame, style: House, rng: np.random.Gener
         _dormers(builder, frame, style, plaster)
 
 
-def _chimney(builder: MeshBuilder, frame: Frame, x: float, y: float, eaves: float, rise: float) -> None:
-    brick = Skin(Material.BRICK, palette.BRICK)
+def _chimney(builder: MeshBuilder, frame: ObjectFrame, x: float, y: float, eaves: float, rise: float) -> None:
+    brick = SurfaceMaterial(Material.BRICK, palette.BRICK)
     top = eaves + rise + 0.8
     box(builder, frame, Box(x0=x - 0.4, x1=x + 0.4, y0=y - 0.3, y1=y + 0.3, z0=eaves, z1=top), brick, brick)
-    pot = Skin(Material.PAINT, palette.BRICK * 0.7)
-    dark = Skin(Material.DARK, palette.DARK)
+    pot = SurfaceMaterial(Material.PAINT, palette.BRICK * 0.7)
+    dark = SurfaceMaterial(Material.DARK, palette.DARK)
     for dx in (-0.18, 0.18):
         pots = Box(x0=x + dx - 0.12, x1=x + dx + 0.12, y0=y - 0.12, y1=y + 0.12, z0=top, z1=top + 0.35)
         box(builder, frame, pots, pot, dark)
 
 
-def _wing(builder: MeshBuilder, frame: Frame, style: House, rng: np.random.Generator) -> None:
+def _wing(builder: MeshBuilder, frame: ObjectFrame, style: HouseStyle, rng: np.random.Generator) -> None:
     """A wing that comes forward from one half of the house, under a roof of its own."""
     side = rng.choice([-1.0, 1.0])
     span, reach = 0.4 * style.width, 1.7
     turned = frame.moved(side * (style.width / 2 - span / 2 - 0.3), -style.depth / 4, turn=-np.pi / 2)
     body = Box(x0=-style.depth / 4, x1=style.depth / 4 + reach, y0=-span / 2, y1=span / 2, z0=0, z1=style.eaves - 0.35)
-    skin = Skin(Material.WINDOWS, style.walls, style.seed)
+    skin = SurfaceMaterial(Material.WINDOWS, style.walls, style.seed)
     foundation(builder, turned, body)
     box(builder, turned, body, skin)
-    gables(builder, turned, body, style.pitch, Skin(Material.PLASTER, style.walls, style.seed))
+    gables(builder, turned, body, style.pitch, SurfaceMaterial(Material.PLASTER, style.walls, style.seed))
     pitched_roof(builder, turned, body, style.pitch, style.roof)
 
 
-def _dormers(builder: MeshBuilder, frame: Frame, style: House, plaster: Skin) -> None:
+def _dormers(builder: MeshBuilder, frame: ObjectFrame, style: HouseStyle, plaster: SurfaceMaterial) -> None:
     """Two small gabled windows on the front slope."""
     run = 0.55 * style.depth / 2
     z = style.eaves + (style.depth / 2 - run) * style.pitch - 0.1
     for x in (-0.24 * style.width, 0.24 * style.width):
         turned = frame.moved(x, -run, z, turn=-np.pi / 2)
         body = Box(x0=-1.6, x1=0.15, y0=-0.7, y1=0.7, z0=0, z1=1.05)
-        glass = Skin(Material.GLASS, palette.DARK, style.seed)
+        glass = SurfaceMaterial(Material.GLASS, palette.DARK, style.seed)
         box(builder, turned, body, (plaster, glass, plaster, plaster))
         gables(builder, turned, body, 0.7, plaster)
         pitched_roof(builder, turned, body, 0.7, style.roof)
@@ -146,10 +148,10 @@ def _dormers(builder: MeshBuilder, frame: Frame, style: House, plaster: Skin) ->
 
 def flat_block(
     builder: MeshBuilder,
-    frame: Frame,
+    frame: ObjectFrame,
     size: tuple[float, float],
     storeys: int,
-    skins: tuple[Skin, Skin],
+    skins: tuple[SurfaceMaterial, SurfaceMaterial],
     rng: np.random.Generator,
 ) -> None:
     """A town block with shops below and a flat roof with parapet, stair hut, plant and skylights."""
@@ -158,11 +160,11 @@ def flat_block(
     body = Box(x0=-w, x1=w, y0=-d, y1=d, z0=0, z1=height)
     foundation(builder, frame, body)
     box(builder, frame, body, wall, roof)
-    parapet(builder, frame, body, Skin(Material.PAINT, wall.colour * 0.85))
-    metal, dark = Skin(Material.PAINT, palette.METAL), Skin(Material.DARK, palette.DARK)
+    parapet(builder, frame, body, SurfaceMaterial(Material.PAINT, wall.colour * 0.85))
+    metal, dark = SurfaceMaterial(Material.PAINT, palette.METAL), SurfaceMaterial(Material.DARK, palette.DARK)
     hx, hy = rng.uniform(-0.5, 0.5) * w, rng.uniform(-0.1, 0.5) * d
     hut = Box(x0=hx - 1.5, x1=hx + 1.5, y0=hy - 1.3, y1=hy + 1.3, z0=height, z1=height + 2.4)
-    box(builder, frame, hut, Skin(Material.PLASTER, wall.colour, wall.seed), metal)
+    box(builder, frame, hut, SurfaceMaterial(Material.PLASTER, wall.colour, wall.seed), metal)
     sunny = rng.random() < 0.45
     if sunny:
         solar_row(builder, frame, -0.8 * w, 0.8 * w, -0.7 * d, height)
@@ -172,15 +174,15 @@ def flat_block(
             continue
         if rng.random() < 0.5:
             unit = Box(x0=x - 0.8, x1=x + 0.8, y0=y - 0.6, y1=y + 0.6, z0=height, z1=height + 1.0)
-            box(builder, frame, unit, metal, Skin(Material.PAINT, palette.METAL * 0.8))
+            box(builder, frame, unit, metal, SurfaceMaterial(Material.PAINT, palette.METAL * 0.8))
             frustum(builder, frame.moved(x, y), (0.45, 0.45), (height + 1.0, height + 1.08), dark, dark, 10)
         else:
             light = Box(x0=x - 0.7, x1=x + 0.7, y0=y - 0.7, y1=y + 0.7, z0=height, z1=height + 0.45)
-            skin = Skin(Material.PAINT, palette.TRIM)
-            box(builder, frame, light, skin, Skin(Material.GLASS, palette.DARK), inset=(0.15, 0.15))
+            skin = SurfaceMaterial(Material.PAINT, palette.TRIM)
+            box(builder, frame, light, skin, SurfaceMaterial(Material.GLASS, palette.DARK), inset=(0.15, 0.15))
 
 
-def parapet(builder: MeshBuilder, frame: Frame, shape: Box, skin: Skin) -> None:
+def parapet(builder: MeshBuilder, frame: ObjectFrame, shape: Box, skin: SurfaceMaterial) -> None:
     """A low wall around a flat roof."""
     t, z0, z1 = 0.3, shape.z1 - 0.1, shape.z1 + 0.7
     for part in (
@@ -192,25 +194,25 @@ def parapet(builder: MeshBuilder, frame: Frame, shape: Box, skin: Skin) -> None:
         box(builder, frame, part, skin, skin)
 
 
-def solar_row(builder: MeshBuilder, frame: Frame, x0: float, x1: float, y: float, z: float) -> None:
+def solar_row(builder: MeshBuilder, frame: ObjectFrame, x0: float, x1: float, y: float, z: float) -> None:
     """A row of tilted solar panels."""
-    skin = Skin(Material.SOLAR, palette.DARK)
+    skin = SurfaceMaterial(Material.SOLAR, palette.DARK)
     panel = np.array(
         [(x0, y - 0.9, z + 0.25), (x1, y - 0.9, z + 0.25), (x1, y + 0.9, z + 0.95), (x0, y + 0.9, z + 0.95)]
     )
     face(builder, frame, panel, skin)
     back = np.array([(x1, y + 0.9, z), (x0, y + 0.9, z), (x0, y + 0.9, z + 0.95), (x1, y + 0.9, z + 0.95)])
-    face(builder, frame, back, Skin(Material.PAINT, palette.METAL))
+    face(builder, frame, back, SurfaceMaterial(Material.PAINT, palette.METAL))
 
 
-def church(builder: MeshBuilder, frame: Frame, scale: float) -> None:
+def church(builder: MeshBuilder, frame: ObjectFrame, scale: float) -> None:
     """A nave with apse and a square tower with a copper spire, its long side along x."""
     s = scale
-    stone = Skin(Material.STONE, palette.PALE_STONE, 0.3)
-    slate = Skin(Material.SLATE, palette.SLATE[0], 0.3)
+    stone = SurfaceMaterial(Material.STONE, palette.PALE_STONE, 0.3)
+    slate = SurfaceMaterial(Material.SLATE, palette.SLATE[0], 0.3)
     nave = Box(x0=-7 * s, x1=8 * s, y0=-4 * s, y1=4 * s, z0=0, z1=7 * s)
     foundation(builder, frame, nave)
-    walls = Skin(Material.OFFICE, palette.PALE_STONE, 0.97)
+    walls = SurfaceMaterial(Material.OFFICE, palette.PALE_STONE, 0.97)
     box(builder, frame, nave, walls)
     gables(builder, frame, nave, 1.05, stone)
     pitched_roof(builder, frame, nave, 1.05, slate)
@@ -226,44 +228,44 @@ def church(builder: MeshBuilder, frame: Frame, scale: float) -> None:
     _tower(builder, frame.moved(-9 * s, 0), s, stone)
 
 
-def _tower(builder: MeshBuilder, frame: Frame, s: float, stone: Skin) -> None:
+def _tower(builder: MeshBuilder, frame: ObjectFrame, s: float, stone: SurfaceMaterial) -> None:
     r, height = 2.7 * s, 15 * s
     shaft = Box(x0=-r, x1=r, y0=-r, y1=r, z0=0, z1=height)
     foundation(builder, frame, shaft)
-    box(builder, frame, shaft, Skin(Material.OFFICE, palette.PALE_STONE * 0.95, 0.97), stone)
+    box(builder, frame, shaft, SurfaceMaterial(Material.OFFICE, palette.PALE_STONE * 0.95, 0.97), stone)
     for z in (0.5 * height, height - 0.2):
         band = Box(x0=-r - 0.25, x1=r + 0.25, y0=-r - 0.25, y1=r + 0.25, z0=z, z1=z + 0.5)
         box(builder, frame, band, stone, stone)
     spire = Box(x0=-r, x1=r, y0=-r, y1=r, z0=height + 0.3, z1=height + 9.5 * s)
-    box(builder, frame, spire, Skin(Material.TILES, palette.COPPER, 0.2), None, inset=(r - 0.02, r - 0.02))
-    gold = Skin(Material.PAINT, palette.GOLD)
+    box(builder, frame, spire, SurfaceMaterial(Material.TILES, palette.COPPER, 0.2), None, inset=(r - 0.02, r - 0.02))
+    gold = SurfaceMaterial(Material.PAINT, palette.GOLD)
     top = height + 9.5 * s
     box(builder, frame, Box(x0=-0.12, x1=0.12, y0=-0.12, y1=0.12, z0=top, z1=top + 1.8), gold, gold)
     box(builder, frame, Box(x0=-0.6, x1=0.6, y0=-0.12, y1=0.12, z0=top + 0.9, z1=top + 1.2), gold, gold)
 
 
-def barn(builder: MeshBuilder, frame: Frame) -> None:
+def barn(builder: MeshBuilder, frame: ObjectFrame) -> None:
     """A red barn with white trim and a silo."""
     body = Box(x0=-8, x1=8, y0=-4.5, y1=4.5, z0=0, z1=4.6)
-    red = Skin(Material.TIMBER, palette.BARN_RED)
+    red = SurfaceMaterial(Material.TIMBER, palette.BARN_RED)
     foundation(builder, frame, body)
     box(builder, frame, body, red)
     gables(builder, frame, body, 0.75, red)
-    pitched_roof(builder, frame, body, 0.75, Skin(Material.SLATE, palette.METAL * 0.7))
+    pitched_roof(builder, frame, body, 0.75, SurfaceMaterial(Material.SLATE, palette.METAL * 0.7))
     for x in (-3.0, 3.0):
         door = np.array([(x - 1.6, -4.56, 0), (x + 1.6, -4.56, 0), (x + 1.6, -4.56, 3.2), (x - 1.6, -4.56, 3.2)])
-        face(builder, frame, door, Skin(Material.PAINT, palette.TRIM))
+        face(builder, frame, door, SurfaceMaterial(Material.PAINT, palette.TRIM))
     silo = frame.moved(11.5, 1.5)
-    steel = Skin(Material.PAINT, palette.METAL)
+    steel = SurfaceMaterial(Material.PAINT, palette.METAL)
     frustum(builder, silo, (2.1, 2.1), (-2, 9), steel, None, 18)
-    frustum(builder, silo, (2.1, 0), (9, 10.4), Skin(Material.PAINT, palette.METAL * 0.8), None, 18)
+    frustum(builder, silo, (2.1, 0), (9, 10.4), SurfaceMaterial(Material.PAINT, palette.METAL * 0.8), None, 18)
 
 
-def saw_tooth_hall(builder: MeshBuilder, frame: Frame, size: tuple[float, float], colour: np.ndarray) -> None:
+def sawtooth_hall(builder: MeshBuilder, frame: ObjectFrame, size: tuple[float, float], colour: np.ndarray) -> None:
     """A workshop with a saw-tooth roof: glazed steps to the back, sheets to the front."""
     w, d, height = size[0] / 2, size[1] / 2, 5.0
     body = Box(x0=-w, x1=w, y0=-d, y1=d, z0=0, z1=height)
-    wall = Skin(Material.BRICK, colour)
+    wall = SurfaceMaterial(Material.BRICK, colour)
     foundation(builder, frame, body)
     box(builder, frame, body, wall)
     teeth = max(2, round(size[1] / 4.5))
@@ -271,9 +273,9 @@ def saw_tooth_hall(builder: MeshBuilder, frame: Frame, size: tuple[float, float]
     for k in range(teeth):
         y0, y1, top = -d + k * step, -d + (k + 1) * step, height + 1.9
         sheet = np.array([(-w, y0, height), (w, y0, height), (w, y1, top), (-w, y1, top)])
-        face(builder, frame, sheet, Skin(Material.SLATE, palette.METAL * 0.8))
+        face(builder, frame, sheet, SurfaceMaterial(Material.SLATE, palette.METAL * 0.8))
         glazing = np.array([(w, y1, height), (-w, y1, height), (-w, y1, top), (w, y1, top)])
-        face(builder, frame, glazing, Skin(Material.GLASS, palette.DARK))
+        face(builder, frame, glazing, SurfaceMaterial(Material.GLASS, palette.DARK))
         for x, ends in ((-w, (y1, y0)), (w, (y0, y1))):
             side = [(x, ends[0], height), (x, ends[1], height), (x, y1, top)]
             face(builder, frame, np.array(side), wall)

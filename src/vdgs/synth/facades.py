@@ -9,16 +9,16 @@ import numpy as np
 
 from vdgs.synth.mesh import srgb
 from vdgs.synth.noise import cells, fade, line, smooth
-from vdgs.synth.surface import Surface, mix, shaded
+from vdgs.synth.surface import Surface, mix_colors, scale_color
 
-Shaded = tuple[np.ndarray, np.ndarray]
+AlbedoAndGloss = tuple[np.ndarray, np.ndarray]
 _GLASS = srgb("#2c3a48")
 _FRAME = srgb("#f1eee6")
 _SHUTTERS = np.stack([srgb(c) for c in ("#4f7a5a", "#7a3b32", "#47648a", "#8a6a44", "#d8d4c8")])
 _DOORS = np.stack([srgb(c) for c in ("#7a2f28", "#2f5a48", "#2f4a78", "#6b4a2c")])
 
 
-def _matt(colour: np.ndarray) -> Shaded:
+def _matt(colour: np.ndarray) -> AlbedoAndGloss:
     return colour.astype(np.float32), np.zeros(len(colour), np.float32)
 
 
@@ -27,15 +27,15 @@ def _grain_plane(s: Surface) -> tuple[np.ndarray, np.ndarray]:
     return s.uv[:, 0] + s.seed * 97, s.uv[:, 1] + s.seed * 53
 
 
-def plaster(s: Surface) -> Shaded:
+def plaster(s: Surface) -> AlbedoAndGloss:
     """Rendered wall: blotches, and dirt where rain splashes up."""
     u, v = _grain_plane(s)
     grain = 1 + 0.05 * smooth(u, v, 0.5, s.footprint) + 0.06 * smooth(u, v, 2.3)
     splash = 1 - 0.2 * np.exp(-np.maximum(s.uv[:, 1], 0) / 0.35)
-    return _matt(shaded(s.colour, grain * splash))
+    return _matt(scale_color(s.colour, grain * splash))
 
 
-def stone(s: Surface) -> Shaded:
+def stone(s: Surface) -> AlbedoAndGloss:
     """Ashlar: blocks of 0.9 by 0.45 m in half bond."""
     u, v = s.uv[:, 0] / np.float32(0.9), s.uv[:, 1] / np.float32(0.45)
     j = np.floor(v)
@@ -43,10 +43,10 @@ def stone(s: Surface) -> Shaded:
     i = np.floor(u)
     tint = 1 + 0.22 * (cells(i, j) - 0.5) * fade(0.5, s.footprint)
     joint = np.maximum(line((u - i) * 0.9, 0.03, s.footprint), line((v - j) * 0.45, 0.03, s.footprint))
-    return _matt(shaded(s.colour, (tint + 0.05 * smooth(*_grain_plane(s), 1.3)) * (1 - 0.3 * joint)))
+    return _matt(scale_color(s.colour, (tint + 0.05 * smooth(*_grain_plane(s), 1.3)) * (1 - 0.3 * joint)))
 
 
-def brick(s: Surface) -> Shaded:
+def brick(s: Surface) -> AlbedoAndGloss:
     """Courses of large bricks with pale joints."""
     u, v = s.uv[:, 0] / np.float32(0.5), s.uv[:, 1] / np.float32(0.22)
     j = np.floor(v)
@@ -54,17 +54,17 @@ def brick(s: Surface) -> Shaded:
     i = np.floor(u)
     tint = 1 + 0.4 * (cells(i, j) - 0.5) * fade(0.3, s.footprint)
     joint = np.maximum(line((u - i) * 0.5, 0.02, s.footprint), line((v - j) * 0.22, 0.02, s.footprint))
-    return _matt(mix(shaded(s.colour, tint), srgb("#c9bfb0"), 0.5 * joint))
+    return _matt(mix_colors(scale_color(s.colour, tint), srgb("#c9bfb0"), 0.5 * joint))
 
 
 def _panes(s: Surface, u: np.ndarray, v: np.ndarray, lit: np.ndarray) -> np.ndarray:
     """Glass of a window around (u, v) = its middle, with a glazing bar and now and then a curtain."""
     curtain = np.where((lit < 0.35)[:, None], srgb("#b8ab98") * 0.8, _GLASS * (0.7 + 0.6 * lit)[:, None])
     bars = np.maximum(line(u, 0.04, s.footprint), line(v - 0.15, 0.035, s.footprint))
-    return mix(curtain, _FRAME, 0.8 * bars)
+    return mix_colors(curtain, _FRAME, 0.8 * bars)
 
 
-def windows(s: Surface, door: bool = False) -> Shaded:
+def windows(s: Surface, door: bool = False) -> AlbedoAndGloss:
     """A house wall: evenly spaced windows with frames, sills and shutters; a door in the middle column."""
     colour, gloss = plaster(s)
     width, height = s.panel.T
@@ -94,12 +94,12 @@ def windows(s: Surface, door: bool = False) -> Shaded:
     return colour.astype(np.float32), np.where(pane, np.float32(0.7), gloss)
 
 
-def front(s: Surface) -> Shaded:
+def front(s: Surface) -> AlbedoAndGloss:
     """A house wall with its door."""
     return windows(s, door=True)
 
 
-def office(s: Surface) -> Shaded:
+def office(s: Surface) -> AlbedoAndGloss:
     """A town block: shop windows below, storeys of windows above; seeds over 0.95 are churches."""
     colour, gloss = plaster(s)
     width, height = s.panel.T
@@ -127,7 +127,7 @@ def office(s: Surface) -> Shaded:
     return colour.astype(np.float32), np.where(pane, np.float32(0.8), gloss)
 
 
-def tiles(s: Surface) -> Shaded:
+def tiles(s: Surface) -> AlbedoAndGloss:
     """Clay pantiles: rounded columns, courses with a shadow below, no two tiles alike, some moss."""
     u, v = s.uv[:, 0] / np.float32(0.36), s.uv[:, 1] / np.float32(0.46)
     i, j = np.floor(u), np.floor(v)
@@ -137,12 +137,12 @@ def tiles(s: Surface) -> Shaded:
     course = 1 - 0.3 * np.exp(-(v - j) * 5) * alike
     gu, gv = _grain_plane(s)
     weather = 1 + 0.09 * smooth(gu, gv, 2.6) + 0.06 * smooth(gv, gu, 0.9, s.footprint)
-    colour = shaded(s.colour, tint * roll * course * weather)
+    colour = scale_color(s.colour, tint * roll * course * weather)
     moss = np.clip(smooth(gu, gv, 1.7) * 0.5 - 0.55, 0, 0.45) * (s.seed > 0.4)
-    return _matt(mix(colour, srgb("#6f7a45"), moss))
+    return _matt(mix_colors(colour, srgb("#6f7a45"), moss))
 
 
-def slate(s: Surface) -> Shaded:
+def slate(s: Surface) -> AlbedoAndGloss:
     """Flat slates in half bond."""
     v = s.uv[:, 1] / np.float32(0.4)
     j = np.floor(v)
@@ -152,60 +152,60 @@ def slate(s: Surface) -> Shaded:
     tint = 1 + 0.36 * (cells(i, j, (s.seed * 512).astype(np.int32)) - 0.5) * alike
     edge = np.maximum(line((v - j) * 0.4, 0.04, s.footprint), line((u - i) * 0.4, 0.02, s.footprint))
     weather = 1 + 0.08 * smooth(*_grain_plane(s), 2.1)
-    return _matt(shaded(s.colour, tint * weather * (1 - 0.35 * edge)))
+    return _matt(scale_color(s.colour, tint * weather * (1 - 0.35 * edge)))
 
 
-def flat_roof(s: Surface) -> Shaded:
+def flat_roof(s: Surface) -> AlbedoAndGloss:
     """Bitumen in strips or gravel or a planted roof, with puddle stains; by seed."""
     u, v = _grain_plane(s)
     grain = 1 + 0.09 * smooth(u, v, 0.3, s.footprint) + 0.05 * smooth(u, v, 3.4)
     seam = line((s.uv[:, 0] / 1.4 % 1 - 0.5) * 1.4, 0.05, s.footprint) * (s.seed < 0.6)
     stain = np.clip(smooth(u, v, 4.6) - 0.6, 0, 0.8) * 0.3
-    bare = shaded(s.colour, grain * (1 - 0.22 * seam) * (1 - stain))
+    bare = scale_color(s.colour, grain * (1 - 0.22 * seam) * (1 - stain))
     border = np.minimum(np.minimum(*s.uv.T), np.minimum(*(s.panel - s.uv).T)) < 1.1
     planted = (s.seed > 0.72) & ~border
-    sedum = mix(srgb("#7f8f4a"), srgb("#a5764f"), np.clip(0.5 + 0.5 * smooth(u, v, 1.6), 0, 1))
+    sedum = mix_colors(srgb("#7f8f4a"), srgb("#a5764f"), np.clip(0.5 + 0.5 * smooth(u, v, 1.6), 0, 1))
     return _matt(np.where(planted[:, None], sedum * grain[:, None], bare))
 
 
-def timber(s: Surface) -> Shaded:
+def timber(s: Surface) -> AlbedoAndGloss:
     """Upright boards."""
     u = s.uv[:, 0] / np.float32(0.3)
     i = np.floor(u)
     tint = 1 + 0.3 * (cells(i, i * 0) - 0.5) * fade(0.3, s.footprint)
     gap = line((u - i) * 0.3, 0.025, s.footprint)
-    return _matt(shaded(s.colour, (tint + 0.06 * smooth(s.uv[:, 0] * 4, s.uv[:, 1], 0.9)) * (1 - 0.4 * gap)))
+    return _matt(scale_color(s.colour, (tint + 0.06 * smooth(s.uv[:, 0] * 4, s.uv[:, 1], 0.9)) * (1 - 0.4 * gap)))
 
 
-def paint(s: Surface) -> Shaded:
+def paint(s: Surface) -> AlbedoAndGloss:
     """Paint or sheet metal; seeds over 0.8 are polished."""
     u, v = _grain_plane(s)
-    return shaded(s.colour, 1 + 0.03 * smooth(u, v, 0.6)), np.where(s.seed > 0.8, np.float32(0.35), 0)
+    return scale_color(s.colour, 1 + 0.03 * smooth(u, v, 0.6)), np.where(s.seed > 0.8, np.float32(0.35), 0)
 
 
-def glass(s: Surface) -> Shaded:
+def glass(s: Surface) -> AlbedoAndGloss:
     """Dark glass."""
     rim = np.minimum(np.minimum(*s.uv.T), np.minimum(*(s.panel - s.uv).T))
-    colour = mix(shaded(_GLASS * 0.8, np.ones(len(rim))), _FRAME * 0.4, line(rim, 0.05, s.footprint))
+    colour = mix_colors(scale_color(_GLASS * 0.8, np.ones(len(rim))), _FRAME * 0.4, line(rim, 0.05, s.footprint))
     return colour, np.full(len(rim), 0.8, np.float32)
 
 
-def awning(s: Surface) -> Shaded:
+def awning(s: Surface) -> AlbedoAndGloss:
     """Broad stripes of colour and white."""
     stripe = ((s.uv[:, 0] / s.panel[:, 0] * np.float32(3.5)) % 1 < 0.5).astype(np.float32)
     fringe = 1 - 0.15 * np.exp(-s.uv[:, 1] / 0.15)
-    return _matt(mix(s.colour, _FRAME * 0.95, stripe) * fringe[:, None])
+    return _matt(mix_colors(s.colour, _FRAME * 0.95, stripe) * fringe[:, None])
 
 
-def solar(s: Surface) -> Shaded:
+def solar(s: Surface) -> AlbedoAndGloss:
     """Solar panels: blue cells, pale frames."""
     u, v = s.uv[:, 0], s.uv[:, 1]
     panel = np.maximum(line((u % 1.0) - 0.5, 0.05, s.footprint), line((v % 1.05) - 0.52, 0.05, s.footprint))
     cell = np.maximum(line((u % 0.2) - 0.1, 0.01, s.footprint), line((v % 0.2) - 0.1, 0.01, s.footprint))
-    colour = mix(shaded(srgb("#1f3566"), 1 + 0.2 * smooth(u, v, 1.0)), srgb("#c9d2dc"), 0.85 * panel)
-    return mix(colour, srgb("#7f93b8"), 0.3 * cell), np.full(len(u), 0.5, np.float32)
+    colour = mix_colors(scale_color(srgb("#1f3566"), 1 + 0.2 * smooth(u, v, 1.0)), srgb("#c9d2dc"), 0.85 * panel)
+    return mix_colors(colour, srgb("#7f93b8"), 0.3 * cell), np.full(len(u), 0.5, np.float32)
 
 
-def plain(s: Surface) -> Shaded:
+def plain(s: Surface) -> AlbedoAndGloss:
     """A colour and nothing else."""
     return _matt(s.colour)

@@ -23,17 +23,17 @@ _GOLDEN = np.pi * (3 - 5**0.5)
 
 
 @dataclass(frozen=True, eq=False)
-class Mission:
+class FlightPlan:
     """place [n, 2] m; tilt from straight down and heading clockwise from north [n] rad; climb [n]."""
 
     place: np.ndarray
     tilt: np.ndarray
     heading: np.ndarray
-    climb: np.ndarray
+    altitude_factor: np.ndarray
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Ground:
+class FlightArea:
     """What a mission is planned over: half the side of the square to cover and the altitude (m), how many photographs,
     an angle to begin at (rad), the streets, and the landmarks [k, 2] m, the chief one first."""
 
@@ -45,15 +45,15 @@ class Ground:
     landmarks: np.ndarray
 
 
-def _down(place: np.ndarray, heading: np.ndarray) -> Mission:
+def _down(place: np.ndarray, heading: np.ndarray) -> FlightPlan:
     """Photographs that look straight down."""
-    return Mission(place, np.zeros(len(place)), heading, np.ones(len(place)))
+    return FlightPlan(place, np.zeros(len(place)), heading, np.ones(len(place)))
 
 
-def _joined(parts: list[Mission]) -> Mission:
+def _joined(parts: list[FlightPlan]) -> FlightPlan:
     """One mission after the other."""
     names = ("place", "tilt", "heading", "climb")
-    return Mission(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+    return FlightPlan(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 def _spaced(path: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -67,7 +67,7 @@ def _spaced(path: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     return path[leg, 0] + share * ahead, np.arctan2(ahead[:, 0], ahead[:, 1])
 
 
-def _grid(half: float, count: int) -> Mission:
+def _grid(half: float, count: int) -> FlightPlan:
     """A lawn-mower grid that looks straight down."""
     lines = max(2, round(np.sqrt(count * 0.9)))
     rows = np.linspace(-half, half, lines)
@@ -76,7 +76,7 @@ def _grid(half: float, count: int) -> Mission:
     return _down(*_spaced(path, count))
 
 
-def _circuits(inner: float, outer: float, spacing: float, count: int) -> Mission:
+def _circuits(inner: float, outer: float, spacing: float, count: int) -> FlightPlan:
     """Square circuits around the town that look straight down, `spacing` apart, the last one at `outer`."""
     circuits = max(1, round((outer - inner) / spacing))
     radii = outer - (outer - inner) / circuits * np.arange(circuits)[::-1]
@@ -85,21 +85,21 @@ def _circuits(inner: float, outer: float, spacing: float, count: int) -> Mission
     return _down(*_spaced((radii[:, None, None, None] * sides).reshape(-1, 2, 2), count))
 
 
-def _obliques(half: float, count: int, phase: float) -> Mission:
+def _obliques(half: float, count: int, phase: float) -> FlightPlan:
     """An orbit on two radii that looks inwards, 28 to 45 degrees from straight down."""
     turn = phase + 2 * np.pi * np.arange(count) / max(count, 1)
     radius = half * np.where(np.arange(count) % 2 == 0, 0.58, 0.9)
     place = np.stack([radius * np.cos(turn), radius * np.sin(turn)], 1)
     tilt = np.radians(np.where(np.arange(count) % 3 == 0, 42, 31))
-    return Mission(place, tilt, np.arctan2(-place[:, 0], -place[:, 1]), np.full(count, _OBLIQUE_CLIMB))
+    return FlightPlan(place, tilt, np.arctan2(-place[:, 0], -place[:, 1]), np.full(count, _OBLIQUE_CLIMB))
 
 
-def _even(over: Ground) -> Mission:
+def _even(over: FlightArea) -> FlightPlan:
     oblique = round(0.27 * over.count)
     return _joined([_grid(0.8 * over.half, over.count - oblique), _obliques(over.half, oblique, over.phase)])
 
 
-def _uneven(over: Ground) -> Mission:
+def _uneven(over: FlightArea) -> FlightPlan:
     if over.half > _WIDE * over.altitude:
         return _uneven_wide(over)
     oblique, outskirts = round(0.27 * over.count), round(0.36 * over.count)
@@ -112,7 +112,7 @@ def _uneven(over: Ground) -> Mission:
     )
 
 
-def _uneven_wide(over: Ground) -> Mission:
+def _uneven_wide(over: FlightArea) -> FlightPlan:
     """The same over a wide place: most photographs over a centre that is a small part of it."""
     oblique, outskirts = round(0.2 * over.count), round(0.22 * over.count)
     return _joined(
@@ -124,7 +124,7 @@ def _uneven_wide(over: Ground) -> Mission:
     )
 
 
-def _distant(over: Ground) -> Mission:
+def _distant(over: FlightArea) -> FlightPlan:
     """A dense grid over the middle, and photographs that look far out: inwards across it, and away from it."""
     far = round(0.3 * over.count)
     turn = over.phase + _GOLDEN * np.arange(far)
@@ -132,11 +132,11 @@ def _distant(over: Ground) -> Mission:
     place = np.stack([radius * np.cos(turn), radius * np.sin(turn)], 1)
     outwards = np.arange(far) % 3 != 0
     heading = np.arctan2(place[:, 0], place[:, 1]) + np.where(outwards, 0, np.pi)
-    looking = Mission(place, np.radians(np.where(outwards, 60.0, 54.0)), heading, np.full(far, _OBLIQUE_CLIMB))
+    looking = FlightPlan(place, np.radians(np.where(outwards, 60.0, 54.0)), heading, np.full(far, _OBLIQUE_CLIMB))
     return _joined([_grid(0.3 * over.half, over.count - far), looking])
 
 
-def _orbits(over: Ground) -> Mission:
+def _orbits(over: FlightArea) -> FlightPlan:
     """Two rings of photographs about each landmark, all looking at its foot."""
     centres = np.resize(np.arange(len(over.landmarks)), over.count)
     rank = np.arange(over.count) // len(over.landmarks)
@@ -146,10 +146,10 @@ def _orbits(over: Ground) -> Mission:
     climb = np.where(rank % 2 == 0, 0.95, _OBLIQUE_CLIMB)
     tilt = np.arctan2(rings, climb * over.altitude)
     place = over.landmarks[centres] + rings[:, None] * away
-    return Mission(place, tilt, np.arctan2(-away[:, 0], -away[:, 1]), climb)
+    return FlightPlan(place, tilt, np.arctan2(-away[:, 0], -away[:, 1]), climb)
 
 
-def _corridor(over: Ground) -> Mission:
+def _corridor(over: FlightArea) -> FlightPlan:
     """Three lanes along the main street and beyond its ends: straight down in the middle, aslant at the sides."""
     lane = np.arange(over.count) % 3 - 1
     q = np.linspace(-1.25, 1.25, over.count) * over.half
@@ -158,11 +158,11 @@ def _corridor(over: Ground) -> Mission:
     ahead = np.stack(over.plan.to_world(p, q + 2.0), 1) - place
     heading = np.arctan2(ahead[:, 0], ahead[:, 1]) + np.where(lane > 0, np.pi, 0)
     tilt = np.radians(np.where(lane == 0, 0.0, 35.0))
-    return Mission(place, tilt, heading, np.where(lane == 0, 1.0, _OBLIQUE_CLIMB))
+    return FlightPlan(place, tilt, heading, np.where(lane == 0, 1.0, _OBLIQUE_CLIMB))
 
 
 #: The missions by the name of the option `--flight`.
-MISSIONS: dict[str, Callable[[Ground], Mission]] = {
+FLIGHT_PLANS: dict[str, Callable[[FlightArea], FlightPlan]] = {
     "even": _even,
     "uneven": _uneven,
     "distant": _distant,

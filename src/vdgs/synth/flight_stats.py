@@ -8,18 +8,18 @@ import numpy as np
 
 from vdgs.geometry.camera import Camera
 from vdgs.synth.mesh import Mesh
-from vdgs.synth.ray_tracing import Tracer
-from vdgs.synth.true_visibility import count_visibility, surface_places
-from vdgs.visibility.visibility_counts import imbalance
+from vdgs.synth.ray_tracing import RayTracer
+from vdgs.synth.true_visibility import count_visibility, sample_surface_points
+from vdgs.visibility.visibility_counts import visibility_stats
 
 #: Places drawn on the surface.
-_PLACES = 40_000
+_NUM_POINTS = 40_000
 #: The place reaches this far from the middle, in halves of the flown extent: what lies beyond is backdrop.
-_REACH = 2.0
+_AREA_FACTOR = 2.0
 
 
 @dataclass(frozen=True)
-class FlightImbalance:
+class FlightStats:
     """V over places spread evenly by area on the surface that at least one training photograph truly sees.
 
     V by percentile; Gini coefficient (0: all seen alike); share of the area with V below a limit.
@@ -41,17 +41,17 @@ class FlightImbalance:
         )
 
 
-def survey(
-    tracer: Tracer, mesh: Mesh, training: list[Camera], half_extent: float, rng: np.random.Generator
+def sample_visible_points(
+    tracer: RayTracer, mesh: Mesh, training: list[Camera], half_extent: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Places [n, 3] (m) of the surface that training truly sees, evenly by area, and V [n] of each (at least 1)."""
-    places = surface_places(mesh, _REACH * half_extent, _PLACES, rng)
+    places = sample_surface_points(mesh, _AREA_FACTOR * half_extent, _NUM_POINTS, rng)
     views = count_visibility(tracer, training, places)
     seen = views > 0
     return places[seen], views[seen]
 
 
-def flight_imbalance(views: np.ndarray, photographs: int) -> FlightImbalance:
+def compute_flight_stats(views: np.ndarray, photographs: int) -> FlightStats:
     """The distribution of V [n] in numbers."""
-    found = imbalance(views.astype(np.int64))
-    return FlightImbalance(photographs, found.mean, found.quantiles, found.gini, found.share_below)
+    found = visibility_stats(views.astype(np.int64))
+    return FlightStats(photographs, found.mean, found.quantiles, found.gini, found.share_below)

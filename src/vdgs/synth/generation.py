@@ -13,25 +13,25 @@ import numpy as np
 from PIL import Image
 
 from vdgs import __version__
-from vdgs.captures.output_guard import refuse_in_a_capture
+from vdgs.captures.output_guard import check_not_in_capture
 from vdgs.captures.splits import TEST_LIST, VALIDATION_LIST
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
 from vdgs.synth.colmap_writer import write_model
-from vdgs.synth.flight_cameras import flight_altitude, fly
-from vdgs.synth.flight_stats import FlightImbalance, flight_imbalance, survey
+from vdgs.synth.flight_cameras import flight_altitude, make_flight_cameras
+from vdgs.synth.flight_stats import FlightStats, compute_flight_stats, sample_visible_points
 from vdgs.synth.ground_truth_writer import write_cameras, write_flight, write_points, write_views
-from vdgs.synth.image_renderer import photograph
-from vdgs.synth.lighting import SkyMap, sky_map
+from vdgs.synth.image_renderer import render_image
+from vdgs.synth.lighting import SkyMap, make_sky_map
 from vdgs.synth.options import ResolvedOptions, SynthOptions
-from vdgs.synth.perturbations import disturbed, exposure_gains, with_outliers
-from vdgs.synth.ray_tracing import Tracer, require_embree
-from vdgs.synth.synthetic_points import Seeds, SparseCloud, pick_seeds, sparse_cloud
-from vdgs.synth.test_cameras import held_out_cameras
+from vdgs.synth.perturbations import add_outliers, exposure_gains, perturb_cameras
+from vdgs.synth.ray_tracing import RayTracer, require_embree
+from vdgs.synth.synthetic_points import SeedPoints, SparseCloud, make_sparse_cloud, sample_seed_points
+from vdgs.synth.test_cameras import make_test_cameras
 from vdgs.synth.town import Town, build_town
 from vdgs.system.atomic_files import write_text
 
-Progress = Callable[[str, int, int], None]
+ProgressCallback = Callable[[str, int, int], None]
 
 _NOTE = """# A generated capture
 
@@ -57,7 +57,7 @@ _TRUTH_NOTE = """- `truth/`: depth and true visibility (with occlusion) per pixe
 
 
 @dataclass(frozen=True, eq=False)
-class _PlannedViews:
+class _ViewPlan:
     """Names and true cameras of all photographs, the first `training` of which train; gains [n, 3]."""
 
     names: list[str]
@@ -66,17 +66,17 @@ class _PlannedViews:
     training: int
 
 
-def generate(output: Path, options: SynthOptions, progress: Progress | None = None) -> FlightImbalance:
+def generate(output: Path, options: SynthOptions, on_progress: ProgressCallback | None = None) -> FlightStats:
     """See `vdgs.synth.generate`."""
-    chosen, tell = options.resolved(), progress or _silent
-    refuse_in_a_capture(output)
+    chosen, tell = options.resolved(), on_progress or _silent
+    check_not_in_capture(output)
     require_embree()
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise VdgsError(f"{output} already exists and is not empty: name another folder, or remove it first.")
     partial = output.with_name(f".{output.name}.partial-{os.getpid()}")
     partial.mkdir(parents=True)
     try:
-        found = _fill(partial, chosen, tell)
+        found = _write_capture(partial, chosen, tell)
         if output.exists():
             output.rmdir()
         partial.rename(output)
@@ -90,17 +90,17 @@ def _silent(stage: str, done: int, total: int) -> None:
     pass
 
 
-def _fill(folder: Path, options: ResolvedOptions, tell: Progress) -> FlightImbalance:
+def _write_capture(folder: Path, options: ResolvedOptions, tell: ProgressCallback) -> FlightStats:
     """Write a complete capture into an empty folder."""
     tell("town", 0, 1)
     town = build_town(options.seed, options.extent_m)
-    tracer = Tracer(town.mesh)
+    tracer = RayTracer(town.mesh)
     tell("town", 1, 1)
     with ThreadPoolExecutor(options.workers or os.cpu_count() or 1) as pool:
-        sky = sky_map(tracer, town.terrain, town.zones, options.extent_m / 2 + 40, pool)
-        photographs, found = _plan(town, tracer, options)
+        sky = make_sky_map(tracer, town.terrain, town.zones, options.extent_m / 2 + 40, pool)
+        photographs, found = _plan_views(town, tracer, options)
         _write_lists(folder, photographs, options)
-        seeds = _take_pictures(folder / "images", town, tracer, sky, photographs, options, pool, tell)
+        seeds = _render_images(folder / "images", town, tracer, sky, photographs, options, pool, tell)
         cloud = _write_model(folder, town, tracer, photographs, seeds, options, tell)
         _write_truth(folder / "truth", tracer, photographs, cloud, found, options, pool, tell)
     note = _NOTE.format(
@@ -119,22 +119,22 @@ def _fill(folder: Path, options: ResolvedOptions, tell: Progress) -> FlightImbal
     return found
 
 
-def _plan(town: Town, tracer: Tracer, options: ResolvedOptions) -> tuple[_PlannedViews, FlightImbalance]:
+def _plan_views(town: Town, tracer: RayTracer, options: ResolvedOptions) -> tuple[_ViewPlan, FlightStats]:
     """The flight, the test and validation photographs, and how unevenly the flight sees the place."""
-    training = fly(options, town)
+    training = make_flight_cameras(options, town)
     half = options.extent_m / 2
-    places, views = survey(tracer, town.mesh, training, half, np.random.default_rng([options.seed, 8]))
+    places, views = sample_visible_points(tracer, town.mesh, training, half, np.random.default_rng([options.seed, 8]))
     names = [f"drone_{k + 1:04d}.jpg" for k in range(len(training))]
     cameras = list(training)
     for stream, kind, count in ((9, "test", options.test_images), (10, "validation", options.validation_images)):
         rng = np.random.default_rng([options.seed, stream])
-        cameras += held_out_cameras(tracer, town.terrain, training, places, count, options, rng)
+        cameras += make_test_cameras(tracer, town.terrain, training, places, count, options, rng)
         names += [f"{kind}_{k + 1:04d}.jpg" for k in range(count)]
     gains = exposure_gains(len(cameras), options.exposure_stops, np.random.default_rng([options.seed, 5]))
-    return _PlannedViews(names, cameras, gains, len(training)), flight_imbalance(views, len(training))
+    return _ViewPlan(names, cameras, gains, len(training)), compute_flight_stats(views, len(training))
 
 
-def _write_lists(folder: Path, photographs: _PlannedViews, options: ResolvedOptions) -> None:
+def _write_lists(folder: Path, photographs: _ViewPlan, options: ResolvedOptions) -> None:
     """`test.txt` and `validation.txt`, which loading a capture keeps to."""
     first = photographs.training
     test = photographs.names[first : first + options.test_images]
@@ -144,28 +144,28 @@ def _write_lists(folder: Path, photographs: _PlannedViews, options: ResolvedOpti
         write_text(folder / VALIDATION_LIST, "\n".join(validation) + "\n")
 
 
-def _take_pictures(
+def _render_images(
     folder: Path,
     town: Town,
-    tracer: Tracer,
+    tracer: RayTracer,
     sky: SkyMap,
-    photographs: _PlannedViews,
+    photographs: _ViewPlan,
     options: ResolvedOptions,
     pool: Executor,
-    tell: Progress,
-) -> list[Seeds]:
+    tell: ProgressCallback,
+) -> list[SeedPoints]:
     """Render and save every picture; returns the places picked in each training picture."""
     folder.mkdir()
     wanted = int(np.ceil(1.5 * options.points / photographs.training)) + 4
     total = len(photographs.names)
 
-    def take(k: int) -> Seeds | None:
+    def take(k: int) -> SeedPoints | None:
         camera = photographs.cameras[k]
-        image = photograph(town, tracer, sky, camera, options.samples_per_pixel, photographs.gains[k])
+        image = render_image(town, tracer, sky, camera, options.samples_per_pixel, photographs.gains[k])
         Image.fromarray(image).save(folder / photographs.names[k], quality=95, subsampling=0)
         if k >= photographs.training:
             return None
-        return pick_seeds(tracer, camera, image, wanted, np.random.default_rng([options.seed, 3, k]))
+        return sample_seed_points(tracer, camera, image, wanted, np.random.default_rng([options.seed, 3, k]))
 
     seeds = []
     tell("images", 0, total)
@@ -179,20 +179,20 @@ def _take_pictures(
 def _write_model(
     folder: Path,
     town: Town,
-    tracer: Tracer,
-    photographs: _PlannedViews,
-    seeds: list[Seeds],
+    tracer: RayTracer,
+    photographs: _ViewPlan,
+    seeds: list[SeedPoints],
     options: ResolvedOptions,
-    tell: Progress,
+    tell: ProgressCallback,
 ) -> SparseCloud:
     """The COLMAP model: points from training photographs only, poses of all."""
     tell("points", 0, 1)
     cameras, training = photographs.cameras, photographs.cameras[: photographs.training]
     rng = np.random.default_rng([options.seed, 4])
-    cloud = sparse_cloud(tracer, training, seeds, options.points, options.noise_px, rng)
-    cloud = with_outliers(cloud, training, options.outliers, np.random.default_rng([options.seed, 7]))
+    cloud = make_sparse_cloud(tracer, training, seeds, options.points, options.noise_px, rng)
+    cloud = add_outliers(cloud, training, options.outliers, np.random.default_rng([options.seed, 7]))
     altitude = flight_altitude(options, town.tallest)
-    poses = disturbed(cameras, options.pose_noise_px, altitude, np.random.default_rng([options.seed, 6]))
+    poses = perturb_cameras(cameras, options.pose_noise_px, altitude, np.random.default_rng([options.seed, 6]))
     write_model(folder / "sparse" / "0", poses, photographs.names, cloud)
     tell("points", 1, 1)
     return cloud
@@ -200,13 +200,13 @@ def _write_model(
 
 def _write_truth(
     folder: Path,
-    tracer: Tracer,
-    photographs: _PlannedViews,
+    tracer: RayTracer,
+    photographs: _ViewPlan,
     cloud: SparseCloud,
-    found: FlightImbalance,
+    found: FlightStats,
     options: ResolvedOptions,
     pool: Executor,
-    tell: Progress,
+    tell: ProgressCallback,
 ) -> None:
     """How uneven the flight is, always; everything else that is known if it was asked for."""
     write_flight(folder, options.flight, found)

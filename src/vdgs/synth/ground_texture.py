@@ -13,9 +13,9 @@ import numpy as np
 from vdgs.synth.mesh import srgb
 from vdgs.synth.noise import cells, fade, line, smooth
 from vdgs.synth.streets import KERB_RADIUS, PAVEMENT, StreetPlan
-from vdgs.synth.surface import mix, shaded
+from vdgs.synth.surface import mix_colors, scale_color
 from vdgs.synth.terrain import Terrain
-from vdgs.synth.zones import Zone, ZoneMap
+from vdgs.synth.zones import LandUse, LandUseMap
 
 _GRASS = [srgb("#6d9440"), srgb("#7ca348"), srgb("#8a9a4a")]
 _WHITE = srgb("#e9e8e2")
@@ -24,10 +24,10 @@ _WHITE = srgb("#e9e8e2")
 def grass(x: np.ndarray, y: np.ndarray, footprint: np.ndarray, dry: float = 0.3) -> np.ndarray:
     """Grass: large patches of lush and dry, tufts the size of a pixel."""
     patches = np.clip(0.5 + 0.35 * smooth(x, y, 9.0) + 0.2 * smooth(y, x, 2.7, footprint), 0, 1)
-    green = mix(_GRASS[0], _GRASS[1], patches)
+    green = mix_colors(_GRASS[0], _GRASS[1], patches)
     yellow = np.clip(dry * (smooth(x + 31, y - 17, 6.1) + 0.6), 0, 1)
     tufts = 1 + 0.16 * smooth(x, y, 0.62, footprint) + 0.13 * smooth(y, x, 0.27, footprint)
-    return shaded(mix(green, _GRASS[2], yellow), tufts)
+    return scale_color(mix_colors(green, _GRASS[2], yellow), tufts)
 
 
 def _lawn(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
@@ -42,7 +42,7 @@ def _meadow(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
     petal = np.hypot(x / 0.33 - i - 0.5, y / 0.33 - j - 0.5) < 0.38
     bloom = ((cells(i, j) < 0.5 * drift) & petal).astype(np.float32) * fade(0.33, footprint)
     petals = np.where((cells(i, j, 1) < 0.55)[:, None], srgb("#e8cf3e"), srgb("#efeae0"))
-    return mix(base, petals, bloom * 0.85)
+    return mix_colors(base, petals, bloom * 0.85)
 
 
 def _slabs(
@@ -54,7 +54,7 @@ def _slabs(
     tint = 1 + vary * (cells(i, j) - 0.5) * fade(size, footprint) + 0.05 * smooth(x, y, 1.9)
     edge = np.maximum(np.abs(u - i - 0.5), np.abs(v - j - 0.5))
     joint = line((0.5 - edge) * size, 0.035, footprint) * 0.4
-    return shaded(colour, (tint + 0.05 * smooth(x, y, 0.3, footprint)) * (1 - joint))
+    return scale_color(colour, (tint + 0.05 * smooth(x, y, 0.3, footprint)) * (1 - joint))
 
 
 def _asphalt(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
@@ -62,12 +62,12 @@ def _asphalt(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
     grain = 0.1 * smooth(x, y, 0.25, footprint) + 0.035 * smooth(y, x, 0.7, footprint)
     worn = 0.06 * smooth(x, y, 5.3) + 0.03 * smooth(y, x, 1.6, footprint)
     crack = line(smooth(x + 7, y, 6.3) * 1.2, 0.035, footprint) * (smooth(y, x, 9.1) > 0.1)
-    return shaded(srgb("#77777a"), (1 + grain + worn) * (1 - 0.35 * crack))
+    return scale_color(srgb("#77777a"), (1 + grain + worn) * (1 - 0.35 * crack))
 
 
 def _gravel(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
     grain = 0.16 * smooth(x, y, 0.3, footprint) + 0.1 * smooth(y, x, 1.4, footprint)
-    return shaded(srgb("#cdbb97"), 1 + grain)
+    return scale_color(srgb("#cdbb97"), 1 + grain)
 
 
 def _drive(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
@@ -89,17 +89,17 @@ def _square(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
     dark = ((i + j).astype(np.int32) & 1).astype(np.float32)
     edge = np.maximum(np.abs(x / 4.2 - i - 0.5), np.abs(y / 4.2 - j - 0.5))
     band = line((0.5 - edge) * 4.2, 0.2, footprint)
-    return mix(base * (1 - 0.26 * dark)[:, None], srgb("#e6dcc6"), band * 0.8)
+    return mix_colors(base * (1 - 0.26 * dark)[:, None], srgb("#e6dcc6"), band * 0.8)
 
 
 def _soil(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
     """A vegetable bed: rows of plants on dark soil."""
-    earth = shaded(srgb("#6b4c35"), 1 + 0.2 * smooth(x, y, 0.3, footprint))
+    earth = scale_color(srgb("#6b4c35"), 1 + 0.2 * smooth(x, y, 0.3, footprint))
     i, j = np.floor(x / 0.45), np.floor(y / 0.45)
     du, dv = x / 0.45 - i - 0.5, y / 0.45 - j - 0.5
     plant = (np.hypot(du, dv) < 0.2 + 0.25 * cells(i, j)).astype(np.float32)
     leaf = np.where((cells(np.floor(x / 1.5), j * 0, 3) < 0.5)[:, None], srgb("#7fae4a"), srgb("#5a8a4a"))
-    return mix(earth, leaf, plant * fade(0.45, footprint))
+    return mix_colors(earth, leaf, plant * fade(0.45, footprint))
 
 
 def _flowers(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
@@ -109,7 +109,7 @@ def _flowers(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
     j = np.floor(y / 0.24 + 0.5 * smooth(y, x, 0.9))
     palette = np.stack([srgb(c) for c in ("#d8342f", "#f0c22e", "#e86aa6", "#f4efe6", "#8d55b8")])
     kind = np.floor((smooth(x, y, 2.2) * 0.22 + 0.5) * 5 + 0.8 * cells(i, j)).astype(int) % 5
-    return mix(leaf, palette[kind], (cells(i, j, 2) < 0.72) * np.float32(0.9))
+    return mix_colors(leaf, palette[kind], (cells(i, j, 2) < 0.72) * np.float32(0.9))
 
 
 def _pitch(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
@@ -117,21 +117,21 @@ def _pitch(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
 
 
 def _court(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
-    return shaded(srgb("#b5573a"), 1 + 0.07 * smooth(x, y, 0.4, footprint) + 0.07 * smooth(x, y, 3.0))
+    return scale_color(srgb("#b5573a"), 1 + 0.07 * smooth(x, y, 0.4, footprint) + 0.07 * smooth(x, y, 3.0))
 
 
 def _white(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
-    return shaded(_WHITE, 0.88 + 0.08 * smooth(x, y, 0.5, footprint))
+    return scale_color(_WHITE, 0.88 + 0.08 * smooth(x, y, 0.5, footprint))
 
 
 def _woods(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
     leaves = grass(x, y, footprint, 0.3) * np.float32(0.5)
     litter = np.clip(0.5 + 0.4 * smooth(x, y, 1.3, footprint), 0, 1)
-    return mix(leaves, srgb("#6e5738"), litter)
+    return mix_colors(leaves, srgb("#6e5738"), litter)
 
 
 def _sand(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
-    return shaded(srgb("#e0cb98"), 1 + 0.07 * smooth(x, y, 0.4, footprint) + 0.05 * smooth(x, y, 1.8))
+    return scale_color(srgb("#e0cb98"), 1 + 0.07 * smooth(x, y, 0.4, footprint) + 0.05 * smooth(x, y, 1.8))
 
 
 def _rows(
@@ -141,10 +141,10 @@ def _rows(
     wander = x + 0.25 * np.sin(y * np.float32(0.21))
     ridge = 0.5 + 0.5 * np.cos(wander * np.float32(2 * np.pi / period)) * fade(period, footprint)
     grown = np.clip(ridge + 0.2 * smooth(x, y, 0.4, footprint), 0, 1)
-    colour = mix(furrow, crop, grown) * (1 + 0.1 * smooth(x, y, 11.0) + 0.07 * smooth(y, x, 2.1))[:, None]
+    colour = mix_colors(furrow, crop, grown) * (1 + 0.1 * smooth(x, y, 11.0) + 0.07 * smooth(y, x, 2.1))[:, None]
     tram = np.abs((wander / np.float32(18.0)) % 1 - 0.5) * 18.0
     track = np.maximum(line(tram - 0.8, 0.25, footprint), line(tram + 0.8, 0.25, footprint))
-    return mix(colour, furrow, 0.7 * track).astype(np.float32)
+    return mix_colors(colour, furrow, 0.7 * track).astype(np.float32)
 
 
 def _wheat(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
@@ -163,29 +163,29 @@ def _greens(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
     return _rows(x, y, footprint, 1.1, srgb("#7d6444"), srgb("#6fa045"))
 
 
-_IN_PLAN = (Zone.LAWN, Zone.SOIL, Zone.PATIO, Zone.DRIVE, Zone.SQUARE, Zone.WHEAT, Zone.LAVENDER,
-            Zone.PLOUGHED, Zone.GREENS)  # fmt: skip
-_PAINT: dict[Zone, Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]] = {
-    Zone.LAWN: _lawn,
-    Zone.PATH: _gravel,
-    Zone.PATIO: _patio,
-    Zone.DRIVE: _drive,
-    Zone.SOIL: _soil,
-    Zone.SQUARE: _square,
-    Zone.ASPHALT: _asphalt,
-    Zone.GRAVEL: _gravel,
-    Zone.PITCH: _pitch,
-    Zone.LINE: _white,
-    Zone.FLOWERS: _flowers,
-    Zone.MEADOW: _meadow,
-    Zone.WOODS: _woods,
-    Zone.SAND: _sand,
-    Zone.WHEAT: _wheat,
-    Zone.LAVENDER: _lavender,
-    Zone.PLOUGHED: _ploughed,
-    Zone.GREENS: _greens,
-    Zone.BUILDING: _drive,
-    Zone.COURT: _court,
+_IN_PLAN = (LandUse.LAWN, LandUse.SOIL, LandUse.PATIO, LandUse.DRIVE, LandUse.SQUARE, LandUse.WHEAT, LandUse.LAVENDER,
+            LandUse.PLOUGHED, LandUse.GREENS)  # fmt: skip
+_PAINT: dict[LandUse, Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]] = {
+    LandUse.LAWN: _lawn,
+    LandUse.PATH: _gravel,
+    LandUse.PATIO: _patio,
+    LandUse.DRIVE: _drive,
+    LandUse.SOIL: _soil,
+    LandUse.SQUARE: _square,
+    LandUse.ASPHALT: _asphalt,
+    LandUse.GRAVEL: _gravel,
+    LandUse.PITCH: _pitch,
+    LandUse.LINE: _white,
+    LandUse.FLOWERS: _flowers,
+    LandUse.MEADOW: _meadow,
+    LandUse.WOODS: _woods,
+    LandUse.SAND: _sand,
+    LandUse.WHEAT: _wheat,
+    LandUse.LAVENDER: _lavender,
+    LandUse.PLOUGHED: _ploughed,
+    LandUse.GREENS: _greens,
+    LandUse.BUILDING: _drive,
+    LandUse.COURT: _court,
 }
 
 
@@ -208,7 +208,7 @@ def _open_land(p: np.ndarray, q: np.ndarray, footprint: np.ndarray) -> np.ndarra
             colour[at] = paint(u[at], v[at], footprint[at])
     edge = np.minimum(31 - np.abs(a / 62 - i - 0.5) * 62, 42 - np.abs((b + shift) / 84 - j - 0.5) * 84)
     verge = np.clip((1.6 + 0.5 * smooth(p, q, 2.0) - edge) * 2, 0, 1)
-    return mix(colour, _woods(p, q, footprint), verge)
+    return mix_colors(colour, _woods(p, q, footprint), verge)
 
 
 def _street_colours(
@@ -230,12 +230,12 @@ def _street_colours(
     paint = np.maximum(paint, stop * np.float32(0.9))
     wheel = np.exp(-((np.abs(np.abs(across) - 0.5 * half) - 0.75) ** 2) * 6)
     worn = colour * (1 - 0.1 * wheel)[:, None]
-    return mix(worn, _WHITE * 0.9, paint * (0.82 + 0.1 * smooth(along, across, 0.8)))
+    return mix_colors(worn, _WHITE * 0.9, paint * (0.82 + 0.1 * smooth(along, across, 0.8)))
 
 
 def _streets(plan: StreetPlan, p: np.ndarray, q: np.ndarray, footprint: np.ndarray, colour: np.ndarray) -> np.ndarray:
     """Draw carriageways, kerbs and pavements over whatever lies below."""
-    by_p, by_q = plan.beside(p, q)
+    by_p, by_q = plan.nearest_street(p, q)
     out_p, out_q = by_p.outside, by_q.outside
     r = np.float32(KERB_RADIUS)
     corner = r - np.hypot(np.maximum(r - out_p, 0), np.maximum(r - out_q, 0))
@@ -250,7 +250,7 @@ def _streets(plan: StreetPlan, p: np.ndarray, q: np.ndarray, footprint: np.ndarr
     beyond, out_p, out_q = beyond[paved], out_p[paved], out_q[paved]
     surface = _pavement(p, q, fp)
     kerb = line(beyond - 0.1, 0.12, fp)
-    surface = mix(surface, srgb("#dcdad4"), kerb)
+    surface = mix_colors(surface, srgb("#dcdad4"), kerb)
     road = np.flatnonzero(beyond < 0)
     tar = _asphalt(p[road], q[road], fp[road])
     for inside, other, along, across, half in (
@@ -267,28 +267,28 @@ def _streets(plan: StreetPlan, p: np.ndarray, q: np.ndarray, footprint: np.ndarr
 
 
 def ground_albedo(
-    plan: StreetPlan, terrain: Terrain, zones: ZoneMap, x: np.ndarray, y: np.ndarray, footprint: np.ndarray
+    plan: StreetPlan, terrain: Terrain, zones: LandUseMap, x: np.ndarray, y: np.ndarray, footprint: np.ndarray
 ) -> np.ndarray:
     """Albedo of the ground at world places, [n, 3] float32 in linear light."""
     p, q = plan.to_plan(x, y)
     # ragged edges: nothing that grows ends in a line drawn with a ruler
     jx, jy = x + 0.12 * smooth(x, y, 0.8), y + 0.12 * smooth(y, x, 0.8)
-    zone = zones.at(jx, jy)
-    exact = zones.at(x, y)
-    ruled = np.isin(exact, (Zone.LINE, Zone.PATIO, Zone.DRIVE, Zone.SQUARE, Zone.ASPHALT, Zone.COURT))
-    zone = np.where(ruled | np.isin(zone, (Zone.LINE,)), exact, zone)
+    zone = zones.sample(jx, jy)
+    exact = zones.sample(x, y)
+    ruled = np.isin(exact, (LandUse.LINE, LandUse.PATIO, LandUse.DRIVE, LandUse.SQUARE, LandUse.ASPHALT, LandUse.COURT))
+    zone = np.where(ruled | np.isin(zone, (LandUse.LINE,)), exact, zone)
     colour = np.empty((len(x), 3), np.float32)
     for kind in np.unique(zone):
         at = np.flatnonzero(zone == kind)
-        if kind == Zone.OPEN:
+        if kind == LandUse.OPEN:
             colour[at] = _open_land(p[at], q[at], footprint[at])
             continue
         u, v = (p, q) if kind in _IN_PLAN else (x, y)
-        colour[at] = _PAINT[Zone(kind)](u[at], v[at], footprint[at])
+        colour[at] = _PAINT[LandUse(kind)](u[at], v[at], footprint[at])
     colour = _streets(plan, p, q, footprint, colour)
     for pond in terrain.ponds:
         near = np.flatnonzero(pond.distance(x, y) < 2.0)
         if len(near):
             shore = np.clip((1.4 - pond.distance(x[near], y[near])) / 0.8, 0, 1).astype(np.float32)
-            colour[near] = mix(colour[near], _sand(x[near], y[near], footprint[near]) * 0.75, shore)
+            colour[near] = mix_colors(colour[near], _sand(x[near], y[near], footprint[near]) * 0.75, shore)
     return colour

@@ -11,14 +11,14 @@ import numpy as np
 
 from vdgs.captures.ground_truth import pack_depth
 from vdgs.geometry.camera import Camera
-from vdgs.synth.flight_stats import FlightImbalance
-from vdgs.synth.ray_tracing import Tracer
+from vdgs.synth.flight_stats import FlightStats
+from vdgs.synth.ray_tracing import RayTracer
 from vdgs.synth.synthetic_points import SparseCloud
-from vdgs.synth.true_visibility import view_truth
+from vdgs.synth.true_visibility import view_ground_truth
 from vdgs.system.atomic_files import write_json
 
 
-def write_flight(folder: Path, flight: str, found: FlightImbalance) -> None:
+def write_flight(folder: Path, flight: str, found: FlightStats) -> None:
     """`flight.json`."""
     write_json(folder / "flight.json", {"flight": flight, **asdict(found)})
 
@@ -39,7 +39,7 @@ def write_points(folder: Path, cloud: SparseCloud) -> None:
 
 def write_views(
     folder: Path,
-    tracer: Tracer,
+    tracer: RayTracer,
     named: list[tuple[str, Camera]],
     training: int,
     pool: Executor,
@@ -52,7 +52,7 @@ def write_views(
 
     def write(index: int) -> None:
         name, camera = named[index]
-        depth, views = view_truth(tracer, camera, [] if index < training else seeing)
+        depth, views = view_ground_truth(tracer, camera, [] if index < training else seeing)
         packed, bounds = pack_depth(depth)
         file = f"{Path(name).stem}.npz"
         if index < training:

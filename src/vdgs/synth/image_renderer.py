@@ -6,25 +6,25 @@ import numpy as np
 
 from vdgs.geometry.camera import Camera
 from vdgs.synth.lighting import SkyMap, tone_map
-from vdgs.synth.ray_tracing import Tracer
+from vdgs.synth.ray_tracing import RayTracer
 from vdgs.synth.shading import radiance
 from vdgs.synth.town import Town
 
 #: Rays shaded at a time: their arrays stay in the cache.
 _CHUNK = 1 << 16
 #: How far samples spread beyond their pixel: a little softness against aliasing.
-_SPREAD = 1.15
+_SAMPLE_SPREAD = 1.15
 
 
-def sample_offsets(count: int) -> np.ndarray:
+def pixel_sample_offsets(count: int) -> np.ndarray:
     """Places of a pixel's samples around its centre, [count, 2] in pixels: rotated grid or R2 sequence."""
     if count == 1:
         return np.zeros((1, 2))
     if count == 4:
-        return _SPREAD * np.array([(-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125)])
+        return _SAMPLE_SPREAD * np.array([(-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125)])
     k = np.arange(count)[:, None]
     offsets = (0.5 + k * np.array([0.7548776662466927, 0.5698402909980532])) % 1
-    return _SPREAD * (offsets - offsets.mean(0))
+    return _SAMPLE_SPREAD * (offsets - offsets.mean(0))
 
 
 def pixel_rays(camera: Camera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -50,9 +50,11 @@ def pixel_centres(camera: Camera) -> np.ndarray:
     return np.stack([x.ravel(), y.ravel()], 1)
 
 
-def photograph(town: Town, tracer: Tracer, sky: SkyMap, camera: Camera, samples: int, gain: np.ndarray) -> np.ndarray:
+def render_image(
+    town: Town, tracer: RayTracer, sky: SkyMap, camera: Camera, samples: int, gain: np.ndarray
+) -> np.ndarray:
     """The picture that a camera takes, [height, width, 3] uint8; `gain` [3] is its exposure, per channel."""
-    centres, offsets = pixel_centres(camera), sample_offsets(samples)
+    centres, offsets = pixel_centres(camera), pixel_sample_offsets(samples)
     step = max(1, _CHUNK // samples)
     rows = []
     for start in range(0, len(centres), step):

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from vdgs.synth.ray_tracing import Tracer
+from vdgs.synth.ray_tracing import RayTracer
 from vdgs.synth.terrain import Terrain
-from vdgs.synth.zones import Zone, ZoneMap
+from vdgs.synth.zones import LandUse, LandUseMap
 
 SUN = np.array([-0.52, -0.44, 0.78], np.float32)
 SUN = SUN / np.linalg.norm(SUN)
@@ -34,7 +34,7 @@ class SkyMap:
     half_size: float
     cell: float
 
-    def at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    def sample(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Openness at world places by bilinear interpolation, [n] float32."""
         u = ((x + self.half_size) / self.cell - 0.5).astype(np.float32)
         v = ((y + self.half_size) / self.cell - 0.5).astype(np.float32)
@@ -54,7 +54,7 @@ def _remap_long(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return mapped.ravel()[: mapped.size - padded]
 
 
-def sky_map(tracer: Tracer, terrain: Terrain, zones: ZoneMap, half_size: float, pool: Executor) -> SkyMap:
+def make_sky_map(tracer: RayTracer, terrain: Terrain, zones: LandUseMap, half_size: float, pool: Executor) -> SkyMap:
     """Cast cosine-distributed rays from the ground; what lies inside buildings is filled from around."""
     cell = _CELL if half_size < _LARGE else 2 * _CELL
     side = int(np.ceil(2 * half_size / cell))
@@ -66,7 +66,7 @@ def sky_map(tracer: Tracer, terrain: Terrain, zones: ZoneMap, half_size: float, 
         return _openness(tracer, terrain, x[part], y[part], np.arange(len(x))[part])
 
     openness = np.concatenate(list(pool.map(free, range(0, len(x), _AT_ONCE)))).reshape(side, side)
-    open_air = (zones.at(x, y) != Zone.BUILDING).reshape(side, side).astype(np.float32)
+    open_air = (zones.sample(x, y) != LandUse.BUILDING).reshape(side, side).astype(np.float32)
     blur = 0.55 / cell
     blurred = cv2.GaussianBlur(openness * open_air, (0, 0), blur)
     weight = cv2.GaussianBlur(open_air, (0, 0), blur)
@@ -74,7 +74,7 @@ def sky_map(tracer: Tracer, terrain: Terrain, zones: ZoneMap, half_size: float, 
     return SkyMap(filled, half_size, cell)
 
 
-def _openness(tracer: Tracer, terrain: Terrain, x: np.ndarray, y: np.ndarray, index: np.ndarray) -> np.ndarray:
+def _openness(tracer: RayTracer, terrain: Terrain, x: np.ndarray, y: np.ndarray, index: np.ndarray) -> np.ndarray:
     """Share of the rays from the ground at x, y [n] that meet nothing within 30 m; `index` turns their pattern."""
     origins = np.stack([x, y, terrain.height(x, y) + 0.15], 1).astype(np.float32)
     free = np.zeros(len(x), np.float32)

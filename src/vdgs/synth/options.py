@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import Annotated, Literal
 
-from vdgs.config.commands import LARGEST_SIDE_PX
-from vdgs.config.ranges import WORKERS, Range, refuse
+from vdgs.config.commands import MAX_RENDER_SIDE_PX
+from vdgs.config.ranges import WORKER_COUNT, Range, check_ranges
 from vdgs.errors import VdgsError
 
-Size = Literal["toy", "village", "town", "district", "city"]
-Flight = Literal["uneven", "even", "distant", "orbits", "corridor"]
+SizeName = Literal["toy", "village", "town", "district", "city"]
+FlightName = Literal["uneven", "even", "distant", "orbits", "corridor"]
 
 _SIZES: dict[str, dict[str, float]] = {
     "toy": {"images": 24, "width": 96, "height": 72, "extent_m": 60.0, "points": 1500},
@@ -28,7 +28,7 @@ class SynthOptions:
 
     seed: Annotated[int, Range(0, 2**32 - 1)] = 0
     """The same seed and options give the same bytes."""
-    size: Size = "village"
+    size: SizeName = "village"
     """toy: 24 images of 96x72 over 60 m (seconds, for tests); village: 56 images of 400x300 over 120 m; town: 120
     images of 800x600 over 320 m; district: 150 images of 400x300 over 420 m, with towers and a lake; city: 600 images
     of 400x300 over 900 m."""
@@ -40,35 +40,35 @@ class SynthOptions:
     validation_images: Annotated[int | None, Range(0, 100_000)] = None
     """How many further photographs are kept apart from both, for choosing settings (validation.txt; used with
     --validation). Default: as many as test photographs."""
-    width: Annotated[int | None, Range(16, LARGEST_SIDE_PX)] = None
+    width: Annotated[int | None, Range(16, MAX_RENDER_SIDE_PX)] = None
     """Width of an image in pixels."""
-    height: Annotated[int | None, Range(16, LARGEST_SIDE_PX)] = None
+    height: Annotated[int | None, Range(16, MAX_RENDER_SIDE_PX)] = None
     """Height of an image in pixels."""
     samples_per_pixel: Annotated[int, Range(1, 1024)] = 4
     """Rays averaged in every pixel: more is smoother and slower."""
-    flight: Flight = "uneven"
+    flight: FlightName = "uneven"
     """uneven: dense over the centre, sparse over the outskirts, some obliques; even: one regular grid and obliques;
     distant: a dense middle and obliques far out, over land hardly seen; orbits: rings of obliques about landmarks;
     corridor: along the main street."""
-    overlap: Annotated[float | None, Range(0, 0.98, below=True)] = None
+    overlap: Annotated[float | None, Range(0, 0.98, exclusive_max=True)] = None
     """Share of its side that a photograph has in common with the next, were the flight an even grid: sets the
     altitude. Default: an altitude of half the extent, between 36 and 95 m."""
     points: Annotated[int | None, Range(10, 100_000_000)] = None
     """How many sparse points to aim for."""
-    noise_px: Annotated[float, Range(0, 100, below=True)] = 0.4
+    noise_px: Annotated[float, Range(0, 100, exclusive_max=True)] = 0.4
     """Standard deviation of the sparse points' observations, in pixels."""
     outliers: Annotated[float, Range(0, 0.5)] = 0.0
     """Share of the sparse points that are mismatches: at a wrong distance along a ray, as in real models."""
-    pose_noise_px: Annotated[float, Range(0, 100, below=True)] = 0.0
+    pose_noise_px: Annotated[float, Range(0, 100, exclusive_max=True)] = 0.0
     """Standard deviation of the error of the written poses, as the shift of the picture that it makes, in pixels."""
-    exposure_stops: Annotated[float, Range(0, 10, below=True)] = 0.0
+    exposure_stops: Annotated[float, Range(0, 10, exclusive_max=True)] = 0.0
     """Standard deviation of the photographs' exposure in stops; it drifts along the flight, its colour a little too."""
     extent_m: Annotated[float | None, Range(40, 1000)] = None
     """Side of the square that the flight covers, in metres."""
     truth: bool = False
     """Also write true depth, the true visibility (with occlusion) of test and validation photographs per pixel and
     of every sparse point, and true poses (folder `truth`)."""
-    workers: Annotated[int, WORKERS] = 0
+    workers: Annotated[int, WORKER_COUNT] = 0
     """Threads that render; 0 takes one per core. The result does not depend on it."""
 
     def resolved(self) -> ResolvedOptions:
@@ -81,7 +81,7 @@ class SynthOptions:
             raise VdgsError(f"--size {self.size}: there are only {', '.join(_SIZES)}.")
         if self.flight not in _FLIGHTS:
             raise VdgsError(f"--flight {self.flight}: there are only {', '.join(_FLIGHTS)}.")
-        refuse(self)
+        check_ranges(self)
         own = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "size"}
         chosen = own | {name: value if own[name] is None else own[name] for name, value in defaults.items()}
         for name in ("images", "width", "height", "points"):
@@ -104,7 +104,7 @@ class ResolvedOptions:
     width: int
     height: int
     samples_per_pixel: int
-    flight: Flight
+    flight: FlightName
     overlap: float | None
     points: int
     noise_px: float

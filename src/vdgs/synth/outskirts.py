@@ -10,7 +10,7 @@ from vdgs.synth.residential import terrace
 from vdgs.synth.site import Plot, Site
 from vdgs.synth.streets import PAVEMENT
 from vdgs.synth.trees import tree
-from vdgs.synth.zones import Zone
+from vdgs.synth.zones import LandUse
 
 _ROW = 17.0
 _FIELD = 40.0
@@ -55,13 +55,13 @@ def build_outskirts(site: Site, pond_plot: int) -> None:
 
 def _pitch(site: Site, plot: Plot) -> None:
     """A football pitch with its lines, goals and floodlights' shadows of trees along it."""
-    site.paint_all(plot, Zone.MEADOW)
+    site.paint_all(plot, LandUse.MEADOW)
     w, d, start = min(plot.width / 2 - 1, 15.0), 22.0, -plot.depth / 2 + 4
     middle = start + d
-    site.paint(plot, (-w - 1, w + 1), (start - 1, start + 2 * d + 1), Zone.PITCH)
+    site.paint(plot, (-w - 1, w + 1), (start - 1, start + 2 * d + 1), LandUse.PITCH)
 
     def lines(points: list[tuple[float, float]], closed: bool = False) -> None:
-        site.stroke(plot, [(a, middle + b) for a, b in points], 0.2, Zone.LINE, closed)
+        site.stroke(plot, [(a, middle + b) for a, b in points], 0.2, LandUse.LINE, closed)
 
     lines([(-w, -d), (w, -d), (w, d), (-w, d)], closed=True)
     lines([(-w, 0), (w, 0)])
@@ -76,10 +76,10 @@ def _pitch(site: Site, plot: Plot) -> None:
 def _farm(site: Site, plot: Plot) -> None:
     """A red barn with its silo on a yard, bales, and ploughed land behind."""
     rng, d = site.rng, plot.depth / 2
-    site.paint_all(plot, Zone.MEADOW)
-    site.paint(plot, (-plot.width / 2, plot.width / 2), (-d + 24, d), Zone.PLOUGHED)
-    site.paint(plot, (-14, 14), (-d + 1, -d + 17), Zone.GRAVEL)
-    site.paint(plot, (-2, 2), (-d - 1, -d + 3), Zone.GRAVEL)
+    site.paint_all(plot, LandUse.MEADOW)
+    site.paint(plot, (-plot.width / 2, plot.width / 2), (-d + 24, d), LandUse.PLOUGHED)
+    site.paint(plot, (-14, 14), (-d + 1, -d + 17), LandUse.GRAVEL)
+    site.paint(plot, (-2, 2), (-d - 1, -d + 3), LandUse.GRAVEL)
     frame = site.level(site.frame(plot, -2, -d + 12.5), 17, 10)
     barn(site.builder, frame)
     site.footprint(frame, (-8, 8), (-4.5, 4.5))
@@ -92,7 +92,7 @@ def _farm(site: Site, plot: Plot) -> None:
 
 def _orchard(site: Site, plot: Plot) -> None:
     """Rows of small fruit trees in the grass."""
-    site.paint_all(plot, Zone.MEADOW)
+    site.paint_all(plot, LandUse.MEADOW)
     kind = str(site.rng.choice(["round", "blossom"]))
     for a in np.arange(-plot.width / 2 + 3, plot.width / 2 - 2, 5.2):
         for b in np.arange(-plot.depth / 2 + 3, plot.depth / 2 - 2, 5.2):
@@ -103,7 +103,7 @@ def _orchard(site: Site, plot: Plot) -> None:
 
 def _woods(site: Site, plot: Plot) -> None:
     """A dense stand of mixed trees."""
-    site.paint_all(plot, Zone.WOODS)
+    site.paint_all(plot, LandUse.WOODS)
     for a in np.arange(-plot.width / 2 + 2, plot.width / 2 - 1, 4.4):
         for b in np.arange(-plot.depth / 2 + 3, plot.depth / 2 - 1, 4.4):
             if site.rng.random() < 0.85:
@@ -113,20 +113,20 @@ def _woods(site: Site, plot: Plot) -> None:
 
 
 def _lavender(site: Site, plot: Plot) -> None:
-    site.paint_all(plot, Zone.LAVENDER)
+    site.paint_all(plot, LandUse.LAVENDER)
 
 
 def _wheat(site: Site, plot: Plot) -> None:
-    site.paint_all(plot, Zone.WHEAT)
+    site.paint_all(plot, LandUse.WHEAT)
 
 
 def _greens(site: Site, plot: Plot) -> None:
-    site.paint_all(plot, Zone.GREENS)
+    site.paint_all(plot, LandUse.GREENS)
 
 
 def _bales(site: Site, plot: Plot) -> None:
     """A stubble field after the harvest."""
-    site.paint_all(plot, Zone.WHEAT)
+    site.paint_all(plot, LandUse.WHEAT)
     for a in np.arange(-plot.width / 2 + 4, plot.width / 2 - 3, 8.0):
         for b in np.arange(-plot.depth / 2 + 5, plot.depth / 2 - 3, 10.0):
             if site.rng.random() < 0.7:
@@ -137,8 +137,8 @@ def _bales(site: Site, plot: Plot) -> None:
 def _shore(site: Site, plot: Plot) -> None:
     """Grass around the pond, with reeds, willows and benches."""
     whole = plot.part(0, _FIELD / 2, plot.width, _ROW + _FIELD)
-    site.paint_all(whole, Zone.MEADOW)
-    site.paint(plot, (-plot.width / 2, plot.width / 2), (-_ROW / 2 + 2, -_ROW / 2 + 3.6), Zone.PATH)
+    site.paint_all(whole, LandUse.MEADOW)
+    site.paint(plot, (-plot.width / 2, plot.width / 2), (-_ROW / 2 + 2, -_ROW / 2 + 3.6), LandUse.PATH)
     rng, pond = site.rng, site.terrain.ponds[0]
     for angle in np.arange(0, 2 * np.pi, 0.33):
         away = rng.uniform(1.5, 7.0)
@@ -159,7 +159,7 @@ def _line_of_trees(site: Site, plot: Plot, a: float, kind: str) -> None:
 def on_street(site: Site, x: float, y: float) -> bool:
     """Whether a place in the world lies on a street or its pavement."""
     p, q = site.plan.to_plan(np.array([x]), np.array([y]))
-    return any(street.outside[0] < PAVEMENT + 1.5 for street in site.plan.beside(p, q))
+    return any(street.outside[0] < PAVEMENT + 1.5 for street in site.plan.nearest_street(p, q))
 
 
 def scatter_trees(site: Site, half_extent: float, count: int) -> None:
@@ -173,7 +173,7 @@ def scatter_trees(site: Site, half_extent: float, count: int) -> None:
             a, b = x + rng.normal(0, 3.5), y + rng.normal(0, 3.5)
             here = np.array([a]), np.array([b])
             wet = any(pond.distance(*here)[0] < 2 for pond in site.terrain.ponds)
-            if wet or site.zones.at(*here)[0] != Zone.OPEN or on_street(site, a, b):
+            if wet or site.zones.sample(*here)[0] != LandUse.OPEN or on_street(site, a, b):
                 continue
             p, q = site.plan.to_plan(*here)
             tree(site.builder, site.frame(Plot(float(p[0]), float(q[0]), 1, 1)), rng, kind, detail=2)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from vdgs.synth import palette
-from vdgs.synth.buildings import STOREY, barn, gables, pitched_roof
+from vdgs.synth.buildings import STOREY_HEIGHT, barn, gables, pitched_roof
 from vdgs.synth.mesh import Material
 from vdgs.synth.outskirts import on_street
-from vdgs.synth.shapes import Box, Frame, Skin, box
+from vdgs.synth.shapes import Box, ObjectFrame, SurfaceMaterial, box
 from vdgs.synth.site import Site
 from vdgs.synth.terrain import Pond
 from vdgs.synth.trees import tree
-from vdgs.synth.zones import Zone
+from vdgs.synth.zones import LandUse
 
 _HAMLETS, _WOODS = 12, 18
 #: From here (m beyond the half extent) to so many half extents, at most so many metres.
@@ -35,11 +35,11 @@ def build_periphery(site: Site, half_extent: float) -> None:
 def _free(site: Site, x: float, y: float) -> bool:
     here = np.array([x]), np.array([y])
     wet = any(pond.distance(*here)[0] < 4 for pond in site.terrain.ponds)
-    return not wet and site.zones.at(*here)[0] == Zone.OPEN and not on_street(site, x, y)
+    return not wet and site.zones.sample(*here)[0] == LandUse.OPEN and not on_street(site, x, y)
 
 
-def _stand(site: Site, x: float, y: float, angle: float = 0.0) -> Frame:
-    return Frame(x, y, float(site.terrain.height(np.array(x), np.array(y))), angle)
+def _stand(site: Site, x: float, y: float, angle: float = 0.0) -> ObjectFrame:
+    return ObjectFrame(x, y, float(site.terrain.height(np.array(x), np.array(y))), angle)
 
 
 def _hamlet(site: Site, x: float, y: float) -> None:
@@ -64,15 +64,15 @@ def _hamlet(site: Site, x: float, y: float) -> None:
                 tree(site.builder, _stand(site, c, e), rng, str(rng.choice(["round", "bush"])), detail=1)
 
 
-def _plain_house(site: Site, frame: Frame) -> None:
+def _plain_house(site: Site, frame: ObjectFrame) -> None:
     """Walls with windows under a gabled roof, and nothing else."""
     rng = site.rng
     w, d, storeys = rng.uniform(4.0, 6.5), rng.uniform(3.4, 4.2), int(rng.integers(1, 3))
-    body = Box(x0=-w, x1=w, y0=-d, y1=d, z0=-1.5, z1=storeys * STOREY + 0.3)
+    body = Box(x0=-w, x1=w, y0=-d, y1=d, z0=-1.5, z1=storeys * STOREY_HEIGHT + 0.3)
     colour, seed, pitch = palette.pick(rng, palette.PLASTER), float(rng.random()), rng.uniform(0.65, 0.95)
-    roof = Skin(Material.TILES, palette.pick(rng, palette.ROOF_TILES), seed)
-    box(site.builder, frame, body, Skin(Material.WINDOWS, colour, seed))
-    gables(site.builder, frame, body, pitch, Skin(Material.PLASTER, colour, seed))
+    roof = SurfaceMaterial(Material.TILES, palette.pick(rng, palette.ROOF_TILES), seed)
+    box(site.builder, frame, body, SurfaceMaterial(Material.WINDOWS, colour, seed))
+    gables(site.builder, frame, body, pitch, SurfaceMaterial(Material.PLASTER, colour, seed))
     pitched_roof(site.builder, frame, body, pitch, roof)
 
 

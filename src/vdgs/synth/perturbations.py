@@ -10,27 +10,27 @@ from vdgs.geometry.camera import Camera
 from vdgs.synth.synthetic_points import SparseCloud
 
 #: Exposure keeps this share of its deviation from one photograph to the next: clouds drift, they do not flicker.
-_DRIFT = 0.85
+_EXPOSURE_DRIFT = 0.85
 #: Colour temperature drifts along with exposure, by this share of it.
 _TINT = 0.2
 #: Mismatches put a point at its true distance times exp of a normal deviate of this size, and reproject worse.
-_STRAY = 0.35
-_STRAY_ERROR_PX = 3.0
+_OUTLIER_SHIFT = 0.35
+_OUTLIER_ERROR_PX = 3.0
 
 
 def exposure_gains(count: int, stops: float, rng: np.random.Generator) -> np.ndarray:
     """Linear gain per photograph and channel, [n, 3]: a drift with a standard deviation of `stops`."""
-    steps = rng.normal(0, 1, (count, 2)) * np.sqrt(1 - _DRIFT**2)
+    steps = rng.normal(0, 1, (count, 2)) * np.sqrt(1 - _EXPOSURE_DRIFT**2)
     walk = np.empty((count, 2))
     level = rng.normal(0, 1, 2)
     for k in range(count):
-        level = _DRIFT * level + steps[k]
+        level = _EXPOSURE_DRIFT * level + steps[k]
         walk[k] = level
     exposure, warmth = stops * walk[:, :1], _TINT * stops * walk[:, 1:]
     return np.exp2(exposure + warmth * np.array([1.0, 0.0, -1.0]))
 
 
-def disturbed(cameras: list[Camera], noise_px: float, altitude: float, rng: np.random.Generator) -> list[Camera]:
+def perturb_cameras(cameras: list[Camera], noise_px: float, altitude: float, rng: np.random.Generator) -> list[Camera]:
     """Cameras as a solver would give them: turned and moved so that pictures taken from `altitude` (m) shift by
     `noise_px` (standard deviation per axis), half the variance by turning and half by moving."""
     if noise_px == 0:
@@ -57,7 +57,7 @@ def _rotation(vector: np.ndarray) -> np.ndarray:
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
-def with_outliers(cloud: SparseCloud, cameras: list[Camera], share: float, rng: np.random.Generator) -> SparseCloud:
+def add_outliers(cloud: SparseCloud, cameras: list[Camera], share: float, rng: np.random.Generator) -> SparseCloud:
     """The cloud with a share of its points matched wrongly: each lies at a wrong distance along the ray of its first
     photograph (so many below ground, so many in the air) and is observed in two photographs only."""
     count = round(share * len(cloud.points))
@@ -67,8 +67,8 @@ def with_outliers(cloud: SparseCloud, cameras: list[Camera], share: float, rng: 
     points, errors, outliers = cloud.points.copy(), cloud.errors.copy(), cloud.outliers.copy()
     first = np.searchsorted(cloud.observed_point, strays)
     origins = np.stack([cameras[k].position for k in cloud.observed_image[first]])
-    points[strays] = origins + (points[strays] - origins) * np.exp(rng.normal(0, _STRAY, (count, 1)))
-    errors[strays] += np.abs(rng.normal(0, _STRAY_ERROR_PX, count))
+    points[strays] = origins + (points[strays] - origins) * np.exp(rng.normal(0, _OUTLIER_SHIFT, (count, 1)))
+    errors[strays] += np.abs(rng.normal(0, _OUTLIER_ERROR_PX, count))
     outliers[strays] = True
     rank = np.arange(len(cloud.observed_point)) - np.searchsorted(cloud.observed_point, cloud.observed_point)
     kept = ~outliers[cloud.observed_point] | (rank < 2)

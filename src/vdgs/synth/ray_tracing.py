@@ -10,11 +10,11 @@ import numpy as np
 from vdgs.errors import VdgsError
 from vdgs.synth.mesh import Mesh
 
-_FAR = np.float32(1e30)
+_MAX_DISTANCE = np.float32(1e30)
 
 
 @dataclass(frozen=True, eq=False)
-class Hits:
+class RayHits:
     """What rays met: triangle [n] int32 (-1: nothing), distance [n] m, barycentric u, v [n]."""
 
     triangle: np.ndarray
@@ -29,7 +29,7 @@ def require_embree() -> None:
         raise VdgsError('Generating a capture needs the ray caster Embree: pip install "vdgs[synth]".')
 
 
-class Tracer:
+class RayTracer:
     """A scene that answers rays; safe to ask from several threads at once.
 
     Raises VdgsError where Embree is not installed.
@@ -45,7 +45,7 @@ class Tracer:
         # the first ray builds the hierarchy; do it here, before threads share the scene
         self.cast(np.zeros((1, 3), np.float32), np.array([[0, 0, 1]], np.float32))
 
-    def cast(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
+    def cast(self, origins: np.ndarray, directions: np.ndarray) -> RayHits:
         """The first triangle along each ray; origins, directions [n, 3] float32."""
         found = self._scene.run(
             np.ascontiguousarray(origins, np.float32),
@@ -53,11 +53,11 @@ class Tracer:
             query="INTERSECT",
             output=True,
         )
-        return Hits(found["primID"], found["tfar"], found["u"], found["v"])
+        return RayHits(found["primID"], found["tfar"], found["u"], found["v"])
 
     def occluded(self, origins: np.ndarray, directions: np.ndarray, reach: np.ndarray | None = None) -> np.ndarray:
         """Whether anything lies within `reach` (in lengths of the directions; None: anywhere), [n] bool."""
-        far = np.full(len(origins), _FAR) if reach is None else np.ascontiguousarray(reach, np.float32)
+        far = np.full(len(origins), _MAX_DISTANCE) if reach is None else np.ascontiguousarray(reach, np.float32)
         found = self._scene.run(
             np.ascontiguousarray(origins, np.float32),
             np.ascontiguousarray(directions, np.float32),

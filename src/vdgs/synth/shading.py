@@ -8,7 +8,7 @@ from vdgs.synth import facades, nature
 from vdgs.synth.ground_texture import ground_albedo
 from vdgs.synth.lighting import BOUNCE_COLOUR, SKY_COLOUR, SUN, SUN_COLOUR, SkyMap, sky_colour
 from vdgs.synth.mesh import Material
-from vdgs.synth.ray_tracing import Hits, Tracer
+from vdgs.synth.ray_tracing import RayHits, RayTracer
 from vdgs.synth.surface import Surface
 from vdgs.synth.town import Town
 
@@ -35,7 +35,7 @@ _SHADERS = {
 
 
 def surface_at(
-    town: Town, hits: Hits, origins: np.ndarray, directions: np.ndarray, pixel_angle: float
+    town: Town, hits: RayHits, origins: np.ndarray, directions: np.ndarray, pixel_angle: float
 ) -> tuple[Surface, np.ndarray, np.ndarray]:
     """The surface at each hit (all must have hit), its material [n] and its geometric normal [n, 3]."""
     mesh, triangle = town.mesh, hits.triangle
@@ -81,7 +81,7 @@ def _ambient(town: Town, sky: SkyMap, surface: Surface, flat: np.ndarray, materi
     """Share of the sky that lights each place, [n]: from the map on the ground, ever more further up."""
     step = np.where((material == Material.GROUND)[:, None], 0, flat[:, :2]) * np.float32(0.7)
     x, y = surface.position[:, 0] + step[:, 0], surface.position[:, 1] + step[:, 1]
-    below = sky.at(x, y)
+    below = sky.sample(x, y)
     raised = np.flatnonzero((material != Material.GROUND) & (material != Material.WATER))
     height = np.zeros(len(x), np.float32)
     height[raised] = surface.position[raised, 2] - town.terrain.height(x[raised], y[raised])
@@ -91,12 +91,12 @@ def _ambient(town: Town, sky: SkyMap, surface: Surface, flat: np.ndarray, materi
 
 def radiance(
     town: Town,
-    tracer: Tracer,
+    tracer: RayTracer,
     sky: SkyMap,
     origins: np.ndarray,
     directions: np.ndarray,
     pixel_angle: float,
-) -> tuple[np.ndarray, Hits]:
+) -> tuple[np.ndarray, RayHits]:
     """Linear light that comes along rays [n, 3] float32, [n, 3], and what they met.
 
     `pixel_angle` is the angle between neighbouring pixels in radians.
@@ -106,7 +106,7 @@ def radiance(
     met = np.flatnonzero(hits.triangle >= 0)
     if not len(met):
         return light, hits
-    found = Hits(hits.triangle[met], hits.distance[met], hits.u[met], hits.v[met])
+    found = RayHits(hits.triangle[met], hits.distance[met], hits.u[met], hits.v[met])
     surface, material, flat = surface_at(town, found, origins[met], directions[met], pixel_angle)
     albedo, gloss = _albedo(town, surface, material)
     facing = np.clip(surface.normal @ SUN, 0, 1)

@@ -10,7 +10,7 @@ from vdgs.synth.mesh import Material, MeshBuilder
 
 
 @dataclass(frozen=True)
-class Frame:
+class ObjectFrame:
     """Where a thing stands (m) and where it faces: local x to its right, y to its back, z up."""
 
     x: float
@@ -25,10 +25,10 @@ class Frame:
         x, y = local[..., 0], local[..., 1]
         return np.stack([self.x + cos * x - sin * y, self.y + sin * x + cos * y, self.z + local[..., 2]], -1)
 
-    def moved(self, x: float, y: float, z: float = 0.0, turn: float = 0.0) -> Frame:
+    def moved(self, x: float, y: float, z: float = 0.0, turn: float = 0.0) -> ObjectFrame:
         """The frame of a thing that stands at local (x, y, z), turned by `turn` radians."""
         px, py, pz = self.world(np.array([x, y, z]))
-        return Frame(float(px), float(py), float(pz), self.angle + turn)
+        return ObjectFrame(float(px), float(py), float(pz), self.angle + turn)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +56,7 @@ SIDES = np.array([(0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)])
 
 
 @dataclass(frozen=True)
-class Skin:
+class SurfaceMaterial:
     """Material, linear colour and seed of a surface."""
 
     material: Material
@@ -64,17 +64,17 @@ class Skin:
     seed: float = 0.0
 
 
-def face(builder: MeshBuilder, frame: Frame, corners: np.ndarray, skin: Skin) -> None:
+def face(builder: MeshBuilder, frame: ObjectFrame, corners: np.ndarray, skin: SurfaceMaterial) -> None:
     """One planar polygon given in local coordinates."""
     builder.polygon(frame.world(corners), skin.material, skin.colour, skin.seed)
 
 
 def box(
     builder: MeshBuilder,
-    frame: Frame,
+    frame: ObjectFrame,
     shape: Box,
-    sides: Skin | tuple[Skin, Skin, Skin, Skin],
-    top: Skin | None = None,
+    sides: SurfaceMaterial | tuple[SurfaceMaterial, SurfaceMaterial, SurfaceMaterial, SurfaceMaterial],
+    top: SurfaceMaterial | None = None,
     inset: tuple[float, float] = (0.0, 0.0),
 ) -> None:
     """A box without a bottom; `inset` pulls the top edges in (x, y), `top` None leaves it open."""
@@ -88,11 +88,11 @@ def box(
 
 def frustum(
     builder: MeshBuilder,
-    frame: Frame,
+    frame: ObjectFrame,
     radii: tuple[float, float],
     heights: tuple[float, float],
-    skin: Skin,
-    cap: Skin | None = None,
+    skin: SurfaceMaterial,
+    cap: SurfaceMaterial | None = None,
     sides: int = 16,
 ) -> None:
     """A round (or many-sided) wall from radius to radius; a second radius near zero makes a cone."""

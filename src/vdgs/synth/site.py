@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from vdgs.synth.mesh import MeshBuilder
-from vdgs.synth.shapes import Frame
+from vdgs.synth.shapes import ObjectFrame
 from vdgs.synth.streets import PAVEMENT, StreetPlan
 from vdgs.synth.terrain import Terrain
-from vdgs.synth.zones import Zone, ZoneMap
+from vdgs.synth.zones import LandUse, LandUseMap
 
 
 @dataclass(frozen=True)
@@ -24,18 +24,18 @@ class Plot:
     q: float
     width: float
     depth: float
-    turns: int = 0
+    quarter_turns: int = 0
 
     def plan(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Local places to the plan."""
-        cos, sin = ((1, 0), (0, 1), (-1, 0), (0, -1))[self.turns % 4]
+        cos, sin = ((1, 0), (0, 1), (-1, 0), (0, -1))[self.quarter_turns % 4]
         a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
         return self.p + cos * a - sin * b, self.q + sin * a + cos * b
 
     def part(self, a: float, b: float, width: float, depth: float) -> Plot:
         """A smaller plot around local (a, b), facing the same way."""
         p, q = self.plan(np.array(a), np.array(b))
-        return Plot(float(p), float(q), width, depth, self.turns)
+        return Plot(float(p), float(q), width, depth, self.quarter_turns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,22 +44,22 @@ class Site:
 
     plan: StreetPlan
     terrain: Terrain
-    zones: ZoneMap
+    zones: LandUseMap
     builder: MeshBuilder
     rng: np.random.Generator
 
-    def frame(self, plot: Plot, a: float = 0.0, b: float = 0.0, turn: float = 0.0) -> Frame:
+    def frame(self, plot: Plot, a: float = 0.0, b: float = 0.0, turn: float = 0.0) -> ObjectFrame:
         """A thing on the ground at local (a, b) of a plot, facing the plot's front."""
         p, q = plot.plan(np.array(a), np.array(b))
         x, y = self.plan.to_world(p, q)
-        angle = self.plan.heading(float(p), float(q)) + plot.turns * np.pi / 2 + turn
-        return Frame(float(x), float(y), float(self.terrain.height(x, y)), angle)
+        angle = self.plan.heading(float(p), float(q)) + plot.quarter_turns * np.pi / 2 + turn
+        return ObjectFrame(float(x), float(y), float(self.terrain.height(x, y)), angle)
 
-    def level(self, frame: Frame, width: float, depth: float) -> Frame:
+    def level(self, frame: ObjectFrame, width: float, depth: float) -> ObjectFrame:
         """The frame lifted so that no corner of a footprint lies below the ground."""
         corners = frame.world(np.array([(sx * width / 2, sy * depth / 2, 0) for sx in (-1, 0, 1) for sy in (-1, 0, 1)]))
         top = float(self.terrain.height(corners[:, 0], corners[:, 1]).max())
-        return Frame(frame.x, frame.y, top + 0.1, frame.angle)
+        return ObjectFrame(frame.x, frame.y, top + 0.1, frame.angle)
 
     def ring(self, plot: Plot, a: tuple[float, float], b: tuple[float, float]) -> np.ndarray:
         """The world outline of a local rectangle, bent as the plan is bent, [k, 2]."""
@@ -69,29 +69,29 @@ class Site:
         across = np.concatenate([b[0] * ones, b[0] + (b[1] - b[0]) * t, b[1] * ones, b[1] + (b[0] - b[1]) * t])
         return np.stack(self.plan.to_world(*plot.plan(along, across)), axis=1)
 
-    def paint(self, plot: Plot, a: tuple[float, float], b: tuple[float, float], zone: Zone) -> None:
+    def paint(self, plot: Plot, a: tuple[float, float], b: tuple[float, float], zone: LandUse) -> None:
         """Cover a local rectangle of a plot."""
         self.zones.paint(self.ring(plot, a, b), zone)
 
-    def paint_all(self, plot: Plot, zone: Zone) -> None:
+    def paint_all(self, plot: Plot, zone: LandUse) -> None:
         """Cover a whole plot."""
         w, d = plot.width / 2, plot.depth / 2
         self.paint(plot, (-w, w), (-d, d), zone)
 
-    def footprint(self, frame: Frame, x: tuple[float, float], y: tuple[float, float]) -> None:
+    def footprint(self, frame: ObjectFrame, x: tuple[float, float], y: tuple[float, float]) -> None:
         """Mark what a building covers, so that light is not baked inside it."""
         corners = frame.world(np.array([(x[0], y[0], 0), (x[1], y[0], 0), (x[1], y[1], 0), (x[0], y[1], 0)]))
-        self.zones.paint(corners[:, :2], Zone.BUILDING)
+        self.zones.paint(corners[:, :2], LandUse.BUILDING)
 
     def stroke(
-        self, plot: Plot, points: list[tuple[float, float]], width: float, zone: Zone, closed: bool = False
+        self, plot: Plot, points: list[tuple[float, float]], width: float, zone: LandUse, closed: bool = False
     ) -> None:
         """Draw a local polyline."""
         local = np.array(points, np.float64)
         world = np.stack(self.plan.to_world(*plot.plan(local[:, 0], local[:, 1])), axis=1)
         self.zones.stroke(world, width, zone, closed)
 
-    def disc(self, plot: Plot, a: float, b: float, radius: float, zone: Zone) -> None:
+    def disc(self, plot: Plot, a: float, b: float, radius: float, zone: LandUse) -> None:
         """Cover a disc."""
         angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
         world = self.plan.to_world(*plot.plan(a + radius * np.cos(angle), b + radius * np.sin(angle)))
@@ -107,7 +107,7 @@ class Site:
         return Plot((p0 + p1) / 2, (q0 + q1) / 2, p1 - p0, q1 - q0)
 
 
-def turned(plot: Plot, turns: int) -> Plot:
+def rotate_plot(plot: Plot, turns: int) -> Plot:
     """The same rectangle seen from another side: its front is where local b is least."""
     swap = turns % 2 == 1
     return Plot(
@@ -115,5 +115,5 @@ def turned(plot: Plot, turns: int) -> Plot:
         plot.q,
         plot.depth if swap else plot.width,
         plot.width if swap else plot.depth,
-        plot.turns + turns,
+        plot.quarter_turns + turns,
     )

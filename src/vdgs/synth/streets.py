@@ -14,7 +14,7 @@ KERB_RADIUS = 2.6
 
 
 @dataclass(frozen=True, eq=False)
-class Beside:
+class NearestStreet:
     """Places beside a street (m, [n] float32).
 
     Signed offset from its centre line, distance outside its carriageway (negative: on it), half the
@@ -66,7 +66,7 @@ class StreetPlan:
         x, y = self.to_world(np.array([p - 2, p + 2]), np.array([q, q]))
         return float(np.arctan2(y[1] - y[0], x[1] - x[0]))
 
-    def beside(self, p: np.ndarray, q: np.ndarray) -> tuple[Beside, Beside]:
+    def nearest_street(self, p: np.ndarray, q: np.ndarray) -> tuple[NearestStreet, NearestStreet]:
         """What places in the plan [n] are beside: the nearest street along q, and the nearest along p."""
         return (
             self._nearest(p, q, self.p, self.p_half, self.q, self.q_half, self.p_main),
@@ -82,7 +82,7 @@ class StreetPlan:
         ends: np.ndarray,
         end_halves: np.ndarray,
         main: int,
-    ) -> Beside:
+    ) -> NearestStreet:
         index = np.searchsorted((positions[1:] + positions[:-1]) / 2, across)
         offset = (across - positions.astype(np.float32)[index]).astype(np.float32)
         half = halves.astype(np.float32)[index]
@@ -91,10 +91,10 @@ class StreetPlan:
         past = np.maximum(ends[0] - end_halves[0] - along, along - ends[-1] - end_halves[-1])
         past = np.where(index == main, 0, np.maximum(past, 0)).astype(np.float32)
         around_end = np.hypot(np.maximum(outside, 0), past)
-        return Beside(offset, np.where(past > 0, around_end, outside), half, past > 0)
+        return NearestStreet(offset, np.where(past > 0, around_end, outside), half, past > 0)
 
 
-def street_plan(rng: np.random.Generator, extent: float) -> StreetPlan:
+def make_street_plan(rng: np.random.Generator, extent: float) -> StreetPlan:
     """A plan for a town of about `extent` metres: a street every 42 m or so, two main ones that go on."""
     cells = max(2, round(extent / 42))
     spacing = 42.0

@@ -30,11 +30,11 @@ class Surface:
         return Surface(**{name: value[index] for name, value in vars(self).items()})
 
 
-def mix(a: np.ndarray, b: np.ndarray, share: np.ndarray) -> np.ndarray:
+def mix_colors(a: np.ndarray, b: np.ndarray, share: np.ndarray) -> np.ndarray:
     """Colours [n, 3] or [3] mixed by share [n]: 0 gives a, 1 gives b."""
     return a + (b - a) * share[:, None]
 
 
-def shaded(colour: np.ndarray, factor: np.ndarray) -> np.ndarray:
+def scale_color(colour: np.ndarray, factor: np.ndarray) -> np.ndarray:
     """A colour [3] or [n, 3] times a factor [n], [n, 3] float32."""
     return (colour * factor[:, None]).astype(np.float32)

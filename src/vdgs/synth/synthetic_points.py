@@ -14,17 +14,17 @@ import numpy as np
 
 from vdgs.geometry.camera import Camera
 from vdgs.synth.image_renderer import pixel_rays
-from vdgs.synth.ray_tracing import Tracer
-from vdgs.synth.true_visibility import true_visibility
+from vdgs.synth.ray_tracing import RayTracer
+from vdgs.synth.true_visibility import visibility_matrix
 
 #: Pictures that look at a place from directions further apart than this are never matched (degrees).
-_WIDEST = 65.0
+_MAX_VIEW_ANGLE_DEG = 65.0
 #: Pairs of a place and a picture whose directions are in memory at once.
-_PAIRS = 4_000_000
+_PAIRS_PER_CHUNK = 4_000_000
 
 
 @dataclass(frozen=True, eq=False)
-class Seeds:
+class SeedPoints:
     """Places [n, 3] (m, float64) picked in one image, and their colours [n, 3] uint8."""
 
     points: np.ndarray
@@ -49,7 +49,9 @@ class SparseCloud:
     outliers: np.ndarray
 
 
-def pick_seeds(tracer: Tracer, camera: Camera, image: np.ndarray, count: int, rng: np.random.Generator) -> Seeds:
+def sample_seed_points(
+    tracer: RayTracer, camera: Camera, image: np.ndarray, count: int, rng: np.random.Generator
+) -> SeedPoints:
     """About `count` surface places seen in an image [height, width, 3] uint8, denser where it has texture."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     slope = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
@@ -61,10 +63,10 @@ def pick_seeds(tracer: Tracer, camera: Camera, image: np.ndarray, count: int, rn
     hits = tracer.cast(origins, directions)
     met = (hits.triangle >= 0) & (hits.distance < 600)
     places = origins + directions.astype(np.float64) * hits.distance[:, None]
-    return Seeds(places[met], image[row, column][met])
+    return SeedPoints(places[met], image[row, column][met])
 
 
-def _matched(
+def _recognized_views(
     cameras: list[Camera],
     places: np.ndarray,
     home: np.ndarray,
@@ -75,14 +77,14 @@ def _matched(
     direction of the picture it was found in (`home`), [n, cameras] bool."""
     positions = np.stack([camera.position for camera in cameras])
     matched = np.zeros_like(visible)
-    step = max(1, _PAIRS // len(cameras))
+    step = max(1, _PAIRS_PER_CHUNK // len(cameras))
     for start in range(0, len(places), step):
         some = slice(start, start + step)
         ray = places[some, None] - positions
         ray /= np.linalg.norm(ray, axis=2, keepdims=True)
         own = ray[np.arange(len(ray)), home[some]]
         apart = np.degrees(np.arccos(np.clip(np.einsum("nkc,nc->nk", ray, own), -1, 1)))
-        chance = 0.9 * np.clip(1 - apart / _WIDEST, 0, 1)
+        chance = 0.9 * np.clip(1 - apart / _MAX_VIEW_ANGLE_DEG, 0, 1)
         matched[some] = visible[some] & (rng.random(chance.shape) < chance)
     matched[np.arange(len(places)), home] = visible[np.arange(len(places)), home]
     return matched
@@ -94,7 +96,7 @@ def observations_by_image(image: np.ndarray, count: int) -> list[np.ndarray]:
     return np.split(np.argsort(image, kind="stable"), ends[:-1])
 
 
-def _adjusted(
+def _refine_points(
     cameras: list[Camera], places: np.ndarray, point: np.ndarray, image: np.ndarray, noise: np.ndarray
 ) -> np.ndarray:
     """One Gauss-Newton step from the true places under noisy observations: points [n, 3].
@@ -118,16 +120,16 @@ def _adjusted(
             )
             @ rotation
         )
-        np.add.at(normal, point[at], np.einsum("nij,nik->njk", jacobian, jacobian))
-        np.add.at(right, point[at], np.einsum("nij,ni->nj", jacobian, noise[at]))
+        np.add.sample(normal, point[at], np.einsum("nij,nik->njk", jacobian, jacobian))
+        np.add.sample(right, point[at], np.einsum("nij,ni->nj", jacobian, noise[at]))
     damping = 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
     return places + np.linalg.solve(normal + damping, right[..., None])[..., 0]
 
 
-def sparse_cloud(
-    tracer: Tracer,
+def make_sparse_cloud(
+    tracer: RayTracer,
     cameras: list[Camera],
-    seeds: list[Seeds],
+    seeds: list[SeedPoints],
     count: int,
     noise_px: float,
     rng: np.random.Generator,
@@ -137,8 +139,8 @@ def sparse_cloud(
     places = np.concatenate([seed.points for seed in seeds])
     colours = np.concatenate([seed.colours for seed in seeds])
     home = np.repeat(np.arange(len(seeds)), [len(seed.points) for seed in seeds])
-    visible = true_visibility(tracer, cameras, places)
-    matched = _matched(cameras, places, home, visible, rng)
+    visible = visibility_matrix(tracer, cameras, places)
+    matched = _recognized_views(cameras, places, home, visible, rng)
     good = np.flatnonzero(matched.sum(1) >= 2)
     kept = np.sort(rng.permutation(good)[:count])
     places, colours, visible, matched = places[kept], colours[kept], visible[kept], matched[kept]
@@ -148,7 +150,7 @@ def sparse_cloud(
     for camera, at in zip(cameras, of_image, strict=True):
         truth[at] = camera.project(places[point[at]])[0]
     noise = rng.normal(0, noise_px, truth.shape) if noise_px > 0 else np.zeros_like(truth)
-    points = _adjusted(cameras, places, point, image, noise)
+    points = _refine_points(cameras, places, point, image, noise)
     observed = truth + noise
     residual = np.empty(len(point))
     for camera, at in zip(cameras, of_image, strict=True):

@@ -40,7 +40,7 @@ class Terrain:
     def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Height of the ground in metres at world x, y [n]."""
         x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
-        z = self.undisturbed(x, y)
+        z = self.height_without_ponds(x, y)
         for pond in self.ponds:
             away = pond.distance(x, y)
             bank = np.clip((away + 1.5) / 5.0, 0, 1)
@@ -48,7 +48,7 @@ class Terrain:
             z = bank * z + (1 - bank) * (pond.level - 0.9)
         return z
 
-    def undisturbed(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    def height_without_ponds(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """The height before any pond was dug."""
         a, b, c, d = self.phases
         gentle = 0.9 * np.sin(x / 41 + a) * np.cos(y / 53 + b) + 0.7 * np.sin(y / 37 + c)

@@ -11,27 +11,27 @@ import numpy as np
 from scipy.cluster.vq import kmeans2
 
 from vdgs.geometry.camera import Camera
-from vdgs.synth.flight_cameras import look_from, pinhole
+from vdgs.synth.flight_cameras import make_camera, pose_from_angles
 from vdgs.synth.options import ResolvedOptions
-from vdgs.synth.ray_tracing import Tracer
+from vdgs.synth.ray_tracing import RayTracer
 from vdgs.synth.terrain import Terrain
-from vdgs.synth.true_visibility import view_truth
+from vdgs.synth.true_visibility import view_ground_truth
 
 #: Share of a picture's surface that at least one, and at least two, training photographs must truly see (choice): where
 #: nothing was seen there is nothing to measure.
-_SEEN_ONCE, _SEEN_TWICE = 0.9, 0.75
+_MIN_SEEN_ONCE, _MIN_SEEN_TWICE = 0.9, 0.75
 #: How many poses are tried for a part before the best of them is taken.
-_TRIES = 10
+_MAX_TRIES = 10
 #: Tilts up to this (rad) are as good as any; where a part lies far off, the least tilt that reaches it is taken.
 _EASY_TILT = np.radians(45)
-_MOST_TILT = np.radians(62)
+_MAX_TILT = np.radians(62)
 
 
-def held_out_cameras(
-    tracer: Tracer,
+def make_test_cameras(
+    tracer: RayTracer,
     terrain: Terrain,
     training: list[Camera],
-    seen: np.ndarray,
+    visible_points: np.ndarray,
     count: int,
     options: ResolvedOptions,
     rng: np.random.Generator,
@@ -39,21 +39,28 @@ def held_out_cameras(
     """`count` cameras that look at places all over `seen` [n, 3] (m): what the training cameras truly see."""
     if count == 0:
         return []
-    _, part = kmeans2(seen[:, :2], min(count, len(seen)), minit="++", seed=rng)
+    _, part = kmeans2(visible_points[:, :2], min(count, len(visible_points)), minit="++", seed=rng)
     return [
-        _aimed(tracer, terrain, training, _middle(seen[part == k] if (part == k).any() else seen), options, rng)
+        _aim_camera(
+            tracer,
+            terrain,
+            training,
+            _central_point(visible_points[part == k] if (part == k).any() else visible_points),
+            options,
+            rng,
+        )
         for k in range(count)
     ]
 
 
-def _middle(places: np.ndarray) -> np.ndarray:
+def _central_point(points: np.ndarray) -> np.ndarray:
     """The place nearest to the middle of some places [n, 3]."""
-    away = np.linalg.norm(places[:, :2] - places[:, :2].mean(0), axis=1)
-    return places[away.argmin()]
+    away = np.linalg.norm(points[:, :2] - points[:, :2].mean(0), axis=1)
+    return points[away.argmin()]
 
 
-def _aimed(
-    tracer: Tracer,
+def _aim_camera(
+    tracer: RayTracer,
     terrain: Terrain,
     training: list[Camera],
     target: np.ndarray,
@@ -62,12 +69,12 @@ def _aimed(
 ) -> Camera:
     """A camera that looks at a place from where the drone has been, and of which training saw nearly everything."""
     best, best_share = None, -1.0
-    for _ in range(_TRIES):
+    for _ in range(_MAX_TRIES):
         camera = _pose(terrain, training, target, options, rng)
-        depth, views = view_truth(tracer, camera, training, step=max(1, options.width // 24))
+        depth, views = view_ground_truth(tracer, camera, training, step=max(1, options.width // 24))
         surface = np.isfinite(depth)
         once, twice = (views[surface] >= 1).mean(), (views[surface] >= 2).mean()
-        if once >= _SEEN_ONCE and twice >= _SEEN_TWICE:
+        if once >= _MIN_SEEN_ONCE and twice >= _MIN_SEEN_TWICE:
             return camera
         if once + twice > best_share:
             best, best_share = camera, once + twice
@@ -88,8 +95,8 @@ def _pose(
     easy = np.flatnonzero(tilt < _EASY_TILT)
     chosen = int(rng.choice(easy)) if len(easy) else int(tilt.argmin())
     x, y, _ = moved[chosen]
-    climb = positions[chosen, 2] - float(terrain.undisturbed(*positions[chosen, :2]))
-    position = np.array([x, y, float(terrain.undisturbed(x, y)) + climb * (1 + rng.normal(0, 0.02))])
+    climb = positions[chosen, 2] - float(terrain.height_without_ponds(*positions[chosen, :2]))
+    position = np.array([x, y, float(terrain.height_without_ponds(x, y)) + climb * (1 + rng.normal(0, 0.02))])
     heading = np.arctan2(across[chosen, 0], across[chosen, 1])
-    lean = min(float(tilt[chosen]), _MOST_TILT)
-    return pinhole(look_from(position, lean, heading, np.radians(rng.normal(0, 1.5))), options)
+    lean = min(float(tilt[chosen]), _MAX_TILT)
+    return make_camera(pose_from_angles(position, lean, heading, np.radians(rng.normal(0, 1.5))), options)

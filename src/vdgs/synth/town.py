@@ -13,11 +13,11 @@ from vdgs.synth.outskirts import build_outskirts, edge_plots, scatter_trees
 from vdgs.synth.periphery import build_periphery
 from vdgs.synth.residential import residential_block
 from vdgs.synth.site import Plot, Site
-from vdgs.synth.streets import PAVEMENT, StreetPlan, street_plan
+from vdgs.synth.streets import PAVEMENT, StreetPlan, make_street_plan
 from vdgs.synth.terrain import Pond, Terrain
-from vdgs.synth.towers import TALLEST, towers
+from vdgs.synth.towers import MAX_HEIGHT, towers
 from vdgs.synth.trees import tree
-from vdgs.synth.zones import ZoneMap
+from vdgs.synth.zones import LandUseMap
 
 #: A town with more streets than this each way is grand: it has towers and a lake.
 _GRAND = 9
@@ -32,34 +32,34 @@ class Town:
     mesh: Mesh
     plan: StreetPlan
     terrain: Terrain
-    zones: ZoneMap
+    zones: LandUseMap
     half_extent: float
     #: Places [k, 2] (m) worth flying around, the square first; and a height (m) that no building exceeds.
     landmarks: np.ndarray
     tallest: float
 
 
-def build_town(seed: int, extent: float) -> Town:
+def build_town(seed: int, extent_m: float) -> Town:
     """A town of about `extent` metres a side around the origin; the same arguments give the same town."""
     rng = np.random.default_rng([seed, 1])
-    plan = street_plan(rng, extent)
-    land = Terrain(extent / 2, tuple(float(v) for v in rng.uniform(0, 6, 4)))
-    zones = ZoneMap(half_size=float(np.abs(plan.p).max() * 1.3 + 85))
+    plan = make_street_plan(rng, extent_m)
+    land = Terrain(extent_m / 2, tuple(float(v) for v in rng.uniform(0, 6, 4)))
+    zones = LandUseMap(half_size=float(np.abs(plan.p).max() * 1.3 + 85))
     site = Site(plan, land, zones, MeshBuilder(), rng)
     plots = edge_plots(site)
     pond_plot = int(rng.integers(len(plots)))
     grand = len(plan.p) > _GRAND
-    ponds = [_pond(site, plots[pond_plot])] + ([_lake(site, plots, pond_plot, extent)] if grand else [])
+    ponds = [_pond(site, plots[pond_plot])] + ([_lake(site, plots, pond_plot, extent_m)] if grand else [])
     site = replace(site, terrain=replace(land, ponds=tuple(ponds)))
     landmarks = _blocks(site, grand)
     build_outskirts(site, pond_plot)
     _traffic(site)
-    scatter_trees(site, extent / 2 + 20, count=int(60 + extent / 2))
-    build_periphery(replace(site, rng=np.random.default_rng([seed, 11])), extent / 2)
+    scatter_trees(site, extent_m / 2 + 20, count=int(60 + extent_m / 2))
+    build_periphery(replace(site, rng=np.random.default_rng([seed, 11])), extent_m / 2)
     site.terrain.add_to(site.builder)
-    tallest = TALLEST if grand else _TALLEST_HOUSE
+    tallest = MAX_HEIGHT if grand else _TALLEST_HOUSE
     return Town(
-        mesh=site.builder.build(), plan=plan, terrain=site.terrain, zones=zones, half_extent=extent / 2,
+        mesh=site.builder.build(), plan=plan, terrain=site.terrain, zones=zones, half_extent=extent_m / 2,
         landmarks=landmarks, tallest=tallest,
     )  # fmt: skip
 
@@ -81,7 +81,7 @@ def _lake(site: Site, plots: list[Plot], pond_plot: int, extent: float) -> Pond:
 
     def room(plot: Plot) -> float:
         other = np.hypot(plot.p - plots[pond_plot].p, plot.q - plots[pond_plot].q)
-        along = abs((plot.p - main[0], plot.q - main[1])[plot.turns % 2])
+        along = abs((plot.p - main[0], plot.q - main[1])[plot.quarter_turns % 2])
         return float(min(other, 2 * along))
 
     plot = max(plots, key=room)

@@ -9,7 +9,7 @@ import numpy as np
 
 from vdgs.synth import palette
 from vdgs.synth.mesh import Material, MeshBuilder
-from vdgs.synth.shapes import Box, Frame, Skin, box, frustum
+from vdgs.synth.shapes import Box, ObjectFrame, SurfaceMaterial, box, frustum
 
 #: Least and greatest height of each kind of tree, m.
 _HEIGHTS = {
@@ -22,7 +22,7 @@ _HEIGHTS = {
 
 
 @dataclass(frozen=True, eq=False)
-class Crown:
+class TreeCrown:
     """A crown of unit radius about its own centre: vertices [v, 3], faces [f, 3], corner normals
     [f, 3, 3], and per corner how far out of the leaf mass it stands and how high, [f, 3, 2] in [0, 1]."""
 
@@ -57,7 +57,7 @@ def _sphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
     return vertices, faces
 
 
-def _finish(vertices: np.ndarray, faces: np.ndarray, openness: np.ndarray, softness: float) -> Crown:
+def _finish(vertices: np.ndarray, faces: np.ndarray, openness: np.ndarray, softness: float) -> TreeCrown:
     """Corner normals between those of the facets and those of a ball, so that crowns look round but leafy."""
     corners = vertices[faces]
     facet = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -67,11 +67,11 @@ def _finish(vertices: np.ndarray, faces: np.ndarray, openness: np.ndarray, softn
     normals /= np.linalg.norm(normals, axis=2, keepdims=True)
     low, high = vertices[:, 2].min(), vertices[:, 2].max()
     height = (vertices[:, 2] - low) / (high - low)
-    return Crown(vertices, faces, normals, np.stack([openness, height], 1)[faces])
+    return TreeCrown(vertices, faces, normals, np.stack([openness, height], 1)[faces])
 
 
 @lru_cache(maxsize=64)
-def _round_crown(variant: int, detail: int) -> Crown:
+def _round_crown(variant: int, detail: int) -> TreeCrown:
     """A ball of leaf clumps: every clump bulges out of the crown."""
     rng = np.random.default_rng([21, variant])
     vertices, faces = _sphere(detail)
@@ -86,7 +86,7 @@ def _round_crown(variant: int, detail: int) -> Crown:
 
 
 @lru_cache(maxsize=64)
-def _conifer_crown(variant: int) -> Crown:
+def _conifer_crown(variant: int) -> TreeCrown:
     """Skirts of branches, one above the other, with ragged rims."""
     rng = np.random.default_rng([22, variant])
     vertices: list[np.ndarray] = []
@@ -108,7 +108,9 @@ def _conifer_crown(variant: int) -> Crown:
     return _finish(np.vstack(vertices), np.vstack(faces), np.concatenate(openness), 0.25)
 
 
-def _plant(builder: MeshBuilder, crown: Crown, at: Frame, size: np.ndarray, colour: np.ndarray, seed: float) -> None:
+def _plant(
+    builder: MeshBuilder, crown: TreeCrown, at: ObjectFrame, size: np.ndarray, colour: np.ndarray, seed: float
+) -> None:
     """A crown scaled by `size` [3] and stood at a frame."""
     cos, sin = np.cos(at.angle), np.sin(at.angle)
     turn = np.array([(cos, -sin, 0), (sin, cos, 0), (0, 0, 1)])
@@ -122,7 +124,7 @@ def _plant(builder: MeshBuilder, crown: Crown, at: Frame, size: np.ndarray, colo
 
 def tree(
     builder: MeshBuilder,
-    frame: Frame,
+    frame: ObjectFrame,
     rng: np.random.Generator,
     kind: str = "round",
     height: float | None = None,
@@ -133,9 +135,9 @@ def tree(
     `detail` is how often the ball that its crown is made of is subdivided: 3 nearby, 1 far off.
     """
     tall = height or rng.uniform(*_HEIGHTS[kind])
-    at = Frame(frame.x, frame.y, frame.z, rng.uniform(0, 6.28))
+    at = ObjectFrame(frame.x, frame.y, frame.z, rng.uniform(0, 6.28))
     seed, variant = float(rng.random()), int(rng.integers(6))
-    bark = Skin(Material.BARK, palette.BARK)
+    bark = SurfaceMaterial(Material.BARK, palette.BARK)
     if kind == "conifer":
         colour = palette.pick(rng, palette.NEEDLES)
         frustum(builder, at, (0.25, 0.2), (-0.5, 0.2 * tall), bark, None, 6)
@@ -155,8 +157,8 @@ def tree(
     _plant(builder, _round_crown(variant, detail), centre, size, palette.pick(rng, leaves, 0.15), seed)
 
 
-def hedge(builder: MeshBuilder, frame: Frame, length: float, height: float = 1.1) -> None:
+def hedge(builder: MeshBuilder, frame: ObjectFrame, length: float, height: float = 1.1) -> None:
     """A clipped hedge along local x."""
-    leaf = Skin(Material.FOLIAGE, palette.HEDGE, -1.0)
+    leaf = SurfaceMaterial(Material.FOLIAGE, palette.HEDGE, -1.0)
     shape = Box(x0=-length / 2, x1=length / 2, y0=-0.35, y1=0.35, z0=-0.6, z1=height)
     box(builder, frame, shape, leaf, leaf, inset=(0.06, 0.08))

@@ -10,27 +10,27 @@ import numpy as np
 from vdgs.geometry.camera import Camera
 from vdgs.synth.image_renderer import pixel_centres, pixel_rays
 from vdgs.synth.mesh import Mesh
-from vdgs.synth.ray_tracing import Tracer
+from vdgs.synth.ray_tracing import RayTracer
 
 #: An occluder this near to a place (m, or as a share of the distance) is its own surface.
 _OWN_SURFACE, _OWN_SHARE = 0.03, 1e-4
 
 
-def in_sight(tracer: Tracer, camera: Camera, places: np.ndarray) -> np.ndarray:
+def visible_point_indices(tracer: RayTracer, camera: Camera, points: np.ndarray) -> np.ndarray:
     """Which places [n, 3] a camera sees: inside its frame and with nothing in between; their indices."""
-    inside = np.flatnonzero(camera.sees(places))
-    ray = places[inside] - camera.position
+    inside = np.flatnonzero(camera.in_frustum(points))
+    ray = points[inside] - camera.position
     length = np.linalg.norm(ray, axis=1)
     origins = np.broadcast_to(camera.position, ray.shape)
     reach = length - np.maximum(_OWN_SURFACE, _OWN_SHARE * length)
     return inside[~tracer.occluded(origins, ray / length[:, None], reach)]
 
 
-def true_visibility(tracer: Tracer, cameras: list[Camera], places: np.ndarray) -> np.ndarray:
+def visibility_matrix(tracer: RayTracer, cameras: list[Camera], points: np.ndarray) -> np.ndarray:
     """Which places [n, 3] each camera truly sees, [n, cameras] bool."""
-    visible = np.zeros((len(places), len(cameras)), bool)
+    visible = np.zeros((len(points), len(cameras)), bool)
     for k, camera in enumerate(cameras):
-        visible[in_sight(tracer, camera, places), k] = True
+        visible[visible_point_indices(tracer, camera, points), k] = True
     return visible
 
 
@@ -52,15 +52,17 @@ def _about(cameras: list[Camera], places: np.ndarray) -> list[Camera]:
     return [camera for camera, near in zip(cameras, held.tolist(), strict=True) if near]
 
 
-def count_visibility(tracer: Tracer, cameras: list[Camera], places: np.ndarray) -> np.ndarray:
+def count_visibility(tracer: RayTracer, cameras: list[Camera], points: np.ndarray) -> np.ndarray:
     """How many of the cameras truly see each place [n, 3], [n] uint16."""
-    count = np.zeros(len(places), np.uint16)
-    for camera in _about(cameras, places):
-        count[in_sight(tracer, camera, places)] += 1
+    count = np.zeros(len(points), np.uint16)
+    for camera in _about(cameras, points):
+        count[visible_point_indices(tracer, camera, points)] += 1
     return count
 
 
-def view_truth(tracer: Tracer, camera: Camera, training: list[Camera], step: int = 1) -> tuple[np.ndarray, np.ndarray]:
+def view_ground_truth(
+    tracer: RayTracer, camera: Camera, training: list[Camera], step: int = 1
+) -> tuple[np.ndarray, np.ndarray]:
     """Per pixel centre of a view (every `step`-th pixel): depth along the viewing axis, float32 m, inf for sky; and how
     many training cameras truly see the place met, uint16, 0 for sky. Both [height / step, width / step]."""
     shape = -(-camera.height // step), -(-camera.width // step)
@@ -76,7 +78,7 @@ def view_truth(tracer: Tracer, camera: Camera, training: list[Camera], step: int
     return depth.reshape(shape), count.reshape(shape)
 
 
-def surface_places(mesh: Mesh, half_size: float, count: int, rng: np.random.Generator) -> np.ndarray:
+def sample_surface_points(mesh: Mesh, half_size: float, count: int, rng: np.random.Generator) -> np.ndarray:
     """About `count` places [n, 3] spread evenly by area over all surfaces, inside and out, of a square around the
     origin; a place that nobody can see is among them like any other."""
     corners = mesh.vertices[mesh.faces]

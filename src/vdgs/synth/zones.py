@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 
-class Zone(IntEnum):
+class LandUse(IntEnum):
     """What covers the ground. OPEN is farmland, painted by formula; streets are drawn over every zone."""
 
     OPEN = 0
@@ -34,7 +34,7 @@ class Zone(IntEnum):
     COURT = 20
 
 
-class ZoneMap:
+class LandUseMap:
     """A square raster of zones around the origin of the world, [side, side] uint8, row by y.
 
     Its cells are as fine (m) as a map of tens of megabytes allows: lines of paint are 0.15 m wide.
@@ -46,23 +46,23 @@ class ZoneMap:
         side = int(np.ceil(2 * half_size / self.cell))
         self.cells = np.zeros((side, side), np.uint8)
 
-    def paint(self, ring: np.ndarray, zone: Zone) -> None:
+    def paint(self, ring: np.ndarray, zone: LandUse) -> None:
         """Fill a world polygon [k, 2] (metres)."""
         cv2.fillPoly(self.cells, [self._fixed_point(ring)], int(zone), lineType=cv2.LINE_8, shift=4)
 
-    def stroke(self, points: np.ndarray, width: float, zone: Zone, closed: bool = False) -> None:
+    def stroke(self, points: np.ndarray, width: float, zone: LandUse, closed: bool = False) -> None:
         """Draw a world polyline [k, 2] of a width in metres."""
         thickness = max(1, round(width / self.cell))
         cv2.polylines(self.cells, [self._fixed_point(points)], closed, int(zone), thickness, cv2.LINE_8, shift=4)
 
-    def at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    def sample(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """The zone at world places, [n] uint8; OPEN off the map."""
         side = self.cells.shape[0]
         column = ((x + self.half_size) * np.float32(1 / self.cell)).astype(np.int32)
         row = ((y + self.half_size) * np.float32(1 / self.cell)).astype(np.int32)
         outside = (np.abs(x) >= self.half_size - self.cell) | (np.abs(y) >= self.half_size - self.cell)
         column, row = np.clip(column, 0, side - 1), np.clip(row, 0, side - 1)
-        return np.where(outside, np.uint8(Zone.OPEN), self.cells[row, column])
+        return np.where(outside, np.uint8(LandUse.OPEN), self.cells[row, column])
 
     def _fixed_point(self, points: np.ndarray) -> np.ndarray:
         # cv2 takes sixteenths of a cell and puts cell centres at whole numbers

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 
-def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
+def write_atomic(path: Path, write: Callable[[Path], None]) -> None:
     """Let `write` fill a temporary file beside `path`, then rename it over `path`.
 
     Raises VdgsError, with the file and the remedy, when the disk refuses (full, read-only, ...);
@@ -38,7 +38,7 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
             temporary.unlink(missing_ok=True)
         why = getattr(error, "strerror", None) or error
         raise VdgsError(
-            f"{path}: cannot be written ({why}). {remedy(error)}, then run the same command again: it continues from "
+            f"{path}: cannot be written ({why}). {disk_hint(error)}, then run the same command again: it continues from "
             "the last good state."
         ) from error
     except BaseException:
@@ -46,7 +46,7 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
         raise
 
 
-def remedy(error: BaseException) -> str:
+def disk_hint(error: BaseException) -> str:
     """What to do about a file or folder that the system does not let us write: the beginning of a sentence."""
     number = getattr(error, "errno", None)
     if number is None:  # of safetensors: "I/O error: No space left on device (os error 28)"
@@ -69,7 +69,7 @@ def write_bytes(path: Path, content: bytes) -> None:
     def write(temporary: Path) -> None:
         temporary.write_bytes(content)
 
-    write_atomically(path, write)
+    write_atomic(path, write)
 
 
 def write_array(path: Path, values: np.ndarray) -> None:
@@ -80,7 +80,7 @@ def write_array(path: Path, values: np.ndarray) -> None:
         with temporary.open("wb") as handle:
             np.save(handle, values, allow_pickle=False)
 
-    write_atomically(path, write)
+    write_atomic(path, write)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -89,16 +89,16 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON atomically. ValueError for NaN and infinity, since JSON has no such numbers: see `jsonable`."""
+    """Write JSON atomically. ValueError for NaN and infinity, since JSON has no such numbers: see `to_jsonable`."""
     write_text(path, json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
 
 
-def jsonable(value: Any) -> Any:
+def to_jsonable(value: Any) -> Any:
     """The value with numpy scalars as Python numbers and NaN or infinity as None: measurements that there are not."""
     if isinstance(value, Mapping):
-        return {str(key): jsonable(each) for key, each in value.items()}
+        return {str(key): to_jsonable(each) for key, each in value.items()}
     if isinstance(value, (list, tuple)):
-        return [jsonable(each) for each in value]
+        return [to_jsonable(each) for each in value]
     if hasattr(value, "item"):  # of numpy, which files of text do without
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):
@@ -106,7 +106,7 @@ def jsonable(value: Any) -> Any:
     return value
 
 
-def read_record(path: Path) -> dict[str, Any]:
+def read_json_or_empty(path: Path) -> dict[str, Any]:
     """What a stage noted of itself in a JSON file; nothing if it is missing or damaged: it is then done again."""
     try:
         record = json.loads(path.read_text(encoding="utf-8"))

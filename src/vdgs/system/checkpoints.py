@@ -15,14 +15,14 @@ from typing import Any
 
 from torch import Tensor
 
-from vdgs.system.atomic_files import write_atomically, write_json
-from vdgs.system.tensors import read_whole, size_and_checksum, write_tensors
+from vdgs.system.atomic_files import write_atomic, write_json
+from vdgs.system.tensors import file_size_and_crc32, read_tensors_unchecked, write_tensors
 
-KEPT = 2
+NUM_CHECKPOINTS = 2
 
 
 @dataclass(frozen=True)
-class SavedState:
+class Checkpoint:
     """What a state holds: the iteration after which it was taken, small facts, tensors."""
 
     iteration: int
@@ -30,18 +30,18 @@ class SavedState:
     tensors: Mapping[str, Tensor]
 
 
-def save_state(folder: Path, state: SavedState) -> None:
+def save_checkpoint(folder: Path, state: Checkpoint) -> None:
     """Write a state and remove all but the newest two. Raises VdgsError if the disk refuses."""
     path = state_file(folder, state.iteration)
-    write_atomically(path, lambda temporary: write_tensors(temporary, state.tensors))
+    write_atomic(path, lambda temporary: write_tensors(temporary, state.tensors))
     # Of what the disk has, not of what was meant: read again, from the system's cache.
-    size, crc = size_and_checksum(path)
+    size, crc = file_size_and_crc32(path)
     sidecar = {"iteration": state.iteration, "bytes": size, "crc32": crc, "facts": dict(state.facts)}
     write_json(path.with_suffix(".json"), sidecar)
-    for old in sidecars(folder)[:-KEPT]:
+    for old in sidecars(folder)[:-NUM_CHECKPOINTS]:
         old.unlink()
         old.with_suffix(".safetensors").unlink(missing_ok=True)
-    remove_leftovers(folder)
+    remove_partial_files(folder)
 
 
 def state_file(folder: Path, iteration: int) -> Path:
@@ -54,7 +54,7 @@ def sidecars(folder: Path) -> list[Path]:
     return sorted(folder.glob("*.json"))
 
 
-def load_newest(folder: Path) -> tuple[SavedState | None, list[str]]:
+def load_latest_checkpoint(folder: Path) -> tuple[Checkpoint | None, list[str]]:
     """The newest state that is whole, and one sentence for each newer one that is not."""
     complaints: list[str] = []
     for sidecar in reversed(sidecars(folder)):
@@ -65,7 +65,7 @@ def load_newest(folder: Path) -> tuple[SavedState | None, list[str]]:
     return None, complaints
 
 
-def discard_after(folder: Path, iteration: int) -> None:
+def delete_checkpoints_after(folder: Path, iteration: int) -> None:
     """Delete checkpoints beyond `iteration`: damaged ones, which would count among those that are kept."""
     for sidecar in folder.glob("*.json"):
         if sidecar.stem.isdecimal() and int(sidecar.stem) > iteration:
@@ -73,18 +73,18 @@ def discard_after(folder: Path, iteration: int) -> None:
             sidecar.with_suffix(".safetensors").unlink(missing_ok=True)
 
 
-def _read(sidecar: Path) -> SavedState:
+def _read(sidecar: Path) -> Checkpoint:
     facts = json.loads(sidecar.read_text(encoding="utf-8"))
     path = sidecar.with_suffix(".safetensors")
-    size, crc = size_and_checksum(path)
+    size, crc = file_size_and_crc32(path)
     if size != facts["bytes"]:
         raise ValueError(f"{size} bytes instead of {facts['bytes']}")
     if crc != facts["crc32"]:
         raise ValueError("its checksum does not agree")
-    return SavedState(int(facts["iteration"]), facts["facts"], read_whole(path))
+    return Checkpoint(int(facts["iteration"]), facts["facts"], read_tensors_unchecked(path))
 
 
-def remove_leftovers(folder: Path) -> None:
+def remove_partial_files(folder: Path) -> None:
     """Delete what interrupted writes left behind: temporary files, tensors without their JSON."""
     for temporary in folder.glob(".*.tmp"):
         temporary.unlink(missing_ok=True)

@@ -14,10 +14,10 @@ def exit_code_of(name: str, action: Callable[[], Any], when_interrupted: str) ->
     `name` begins what is printed. What is no trouble of a person's is raised.
     """
     from vdgs.errors import Interrupted, Stopped, VdgsError
-    from vdgs.system.stop_signals import stop_requests
+    from vdgs.system.stop_signals import catch_stop_signals
 
     try:
-        with stop_requests(interrupts=True):
+        with catch_stop_signals(interrupts=True):
             return int(action() or 0)
     except (KeyboardInterrupt, Interrupted):
         print(f"{name}: interrupted. {when_interrupted}", file=sys.stderr)
@@ -48,7 +48,7 @@ def _remedy(error: OSError) -> str:
     if error.errno in (errno.EACCES, errno.EPERM):
         return ". See whose it is and who may use it (ls -l, chmod), or choose another."
     if error.errno in (errno.EROFS, errno.ENOSPC, errno.EDQUOT):
-        from vdgs.system.atomic_files import remedy
+        from vdgs.system.atomic_files import disk_hint
 
-        return f". {remedy(error)}."
+        return f". {disk_hint(error)}."
     return ""

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from vdgs.errors import RunError
-from vdgs.system.atomic_files import remedy
+from vdgs.system.atomic_files import disk_hint
 
 #: A lock that is taken is tried so often, with so many seconds between: one who only looks (`is_locked`) holds it too,
 #: for a moment.
@@ -33,7 +33,7 @@ def is_locked(folder: Path) -> bool:
     return False
 
 
-def seems_locked(folder: Path) -> bool:
+def is_known_locked(folder: Path) -> bool:
     """As `is_locked`, for those who only show or read what is there: where no file can be locked, none is."""
     try:
         return is_locked(folder)
@@ -42,7 +42,7 @@ def seems_locked(folder: Path) -> bool:
 
 
 @contextmanager
-def hold(folder: Path, shared: bool = False) -> Iterator[None]:
+def lock_folder(folder: Path, shared: bool = False) -> Iterator[None]:
     """Hold a folder for this process, alone or `shared`; it is made if it is not there.
 
     RunError if another process stands in the way, or the folder cannot be written.
@@ -53,7 +53,7 @@ def hold(folder: Path, shared: bool = False) -> Iterator[None]:
         # For reading and writing: NFS wants the one for a shared lock and the other for one that is not.
         handle = (folder / ".lock").open("a+b")
     except OSError as error:
-        raise RunError(f"{folder}: cannot be written ({error.strerror}). {remedy(error)}.") from error
+        raise RunError(f"{folder}: cannot be written ({error.strerror}). {disk_hint(error)}.") from error
     with handle:
         for attempt in range(LOCK_ATTEMPTS):
             try:

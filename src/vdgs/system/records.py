@@ -8,21 +8,21 @@ import typing
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
-Record = TypeVar("Record")
+R = TypeVar("R")
 
 
-def plain(record: Any) -> dict[str, Any]:
+def record_to_dict(record: Any) -> dict[str, Any]:
     """A record ready for JSON, every field of it."""
     return dataclasses.asdict(record)
 
 
-def known(record: Any) -> dict[str, Any]:
+def record_to_compact_dict(record: Any) -> dict[str, Any]:
     """A record ready for JSON, without the fields that are None."""
-    return {name: value for name, value in plain(record).items() if value is not None}
+    return {name: value for name, value in record_to_dict(record).items() if value is not None}
 
 
-def record_of(kind: type[Record], values: Any) -> Record:
-    """The inverse of `plain` and `known`. Keys that the class does not have are left out.
+def record_from_dict(kind: type[R], values: Any) -> R:
+    """The inverse of `record_to_dict` and `record_to_compact_dict`. Keys that the class does not have are left out.
 
     Raises ValueError, naming the field, for a value of another kind or one that is missing.
     """
@@ -48,7 +48,7 @@ def _read(hint: Any, value: Any, name: str) -> Any:
             raise ValueError(f"{name} is {_shown(value)}, not a list")
         return tuple(_read(arguments[0], each, name) for each in value)
     if dataclasses.is_dataclass(hint):
-        return record_of(typing.cast(type, hint), value)
+        return record_from_dict(typing.cast(type, hint), value)
     accepted = (int, float) if hint is float else hint
     if not isinstance(value, accepted) or (isinstance(value, bool) and hint is not bool):
         raise ValueError(f"{name} is {_shown(value)}")

@@ -1,7 +1,7 @@
 """Signals that ask this process to stop: noted, so that work ends where it is whole, instead of breaking it off.
 
 A request is noted by every context that lasts when it comes, so that one which the innermost had no time to serve (it
-came with the last step of a training) is served by those around it: `stop_if_asked`, which all that works long calls
+came with the last step of a training) is served by those around it: `check_stop_requested`, which all that works long calls
 where it is whole. An exception alone would not do: raised in a callback of a library, it may be swallowed there.
 """
 
@@ -19,7 +19,7 @@ _noted: list[list[int]] = []
 
 
 @contextmanager
-def stop_requests(
+def catch_stop_signals(
     *, hangup: bool = False, second_interrupts: bool = False, interrupts: bool = False
 ) -> Iterator[Sequence[int]]:
     """The signals that asked to stop while the context lasts, in their order: Ctrl-C (SIGINT) and SIGTERM.
@@ -54,7 +54,7 @@ def stop_requests(
         _noted.pop()
 
 
-def stop_if_asked() -> None:
+def check_stop_requested() -> None:
     """Raise Interrupted if a context that lasts has noted a request: also one whose exception was swallowed."""
     if any(_noted):
         raise Interrupted("interrupted. The same command continues.")

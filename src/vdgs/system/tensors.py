@@ -30,7 +30,7 @@ DTYPES = {
 _NAMES = {dtype: name for name, dtype in DTYPES.items()}
 _PIECE = 1 << 20
 #: What to do about a model that cannot be used.
-REBUILD = "Delete it and run the command that trained it again: it is rebuilt from the last checkpoint."
+REBUILD_HINT = "Delete it and run the command that trained it again: it is rebuilt from the last checkpoint."
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> None:
@@ -67,10 +67,10 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     except FileNotFoundError as error:
         raise VdgsError(f"{path}: is not there. Train first, or point to the right run.") from error
     except (OSError, SafetensorError, ValueError) as error:
-        raise VdgsError(f"{path}: cannot be read ({error}). {REBUILD}") from error
+        raise VdgsError(f"{path}: cannot be read ({error}). {REBUILD_HINT}") from error
 
 
-def read_whole(path: Path) -> dict[str, Tensor]:
+def read_tensors_unchecked(path: Path) -> dict[str, Tensor]:
     """All tensors of a file that `write_tensors` wrote, each read into memory of its own.
 
     Meant for files whose checksum is known to agree: raises OSError, ValueError or KeyError for others.
@@ -88,7 +88,7 @@ def read_whole(path: Path) -> dict[str, Tensor]:
     return tensors
 
 
-def size_and_checksum(path: Path) -> tuple[int, int]:
+def file_size_and_crc32(path: Path) -> tuple[int, int]:
     """Bytes and CRC-32 of a file, read piece by piece: states are large."""
     size = crc = 0
     with path.open("rb") as file:
@@ -97,13 +97,13 @@ def size_and_checksum(path: Path) -> tuple[int, int]:
     return size, crc
 
 
-def identity(path: Path) -> str:
+def file_id(path: Path) -> str:
     """What tells this file from any other."""
-    size, checksum = size_and_checksum(path)
+    size, checksum = file_size_and_crc32(path)
     return f"{size}-{checksum:08x}"
 
 
-def checksum(tensors: Mapping[str, Tensor]) -> int:
+def tensors_crc32(tensors: Mapping[str, Tensor]) -> int:
     """CRC-32 over the bytes of all tensors, in the order of their names."""
     crc = 0
     for name in sorted(tensors):

@@ -1,22 +1,22 @@
 """Training of anchors: one loop for the coarse stage and for blocks; what differs is data."""
 
 from vdgs.training.schedule import downscale_at, view_at, views_in_cycle
-from vdgs.training.target import mean_colour
-from vdgs.training.training_loop import PSNR_INTERVAL, train, train_step
+from vdgs.training.target import mean_image_color
+from vdgs.training.training_loop import PSNR_LOG_INTERVAL, train, train_step
 from vdgs.training.training_state import (
-    Stage,
+    FrozenAnchors,
     StepReport,
-    Surroundings,
     TrainingImages,
+    TrainingProblem,
     TrainingState,
-    from_saved,
+    from_checkpoint,
+    initial_state,
     result_from_saved,
-    start_state,
-    to_saved,
+    to_checkpoint,
 )
 
 __all__ = [
-    "PSNR_INTERVAL", "Stage", "StepReport", "Surroundings", "TrainingImages", "TrainingState", "downscale_at",
-    "from_saved", "mean_colour", "result_from_saved", "start_state", "to_saved", "train", "train_step", "view_at",
+    "PSNR_LOG_INTERVAL", "TrainingProblem", "StepReport", "FrozenAnchors", "TrainingImages", "TrainingState", "downscale_at",
+    "from_checkpoint", "mean_image_color", "result_from_saved", "initial_state", "to_checkpoint", "train", "train_step", "view_at",
     "views_in_cycle",
 ]  # fmt: skip

@@ -21,16 +21,16 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from vdgs.config.method import CompensationConfig, GrowthConfig
-from vdgs.kernels.kernel_types import Statistics
-from vdgs.training.densification import Compensated, Decision
+from vdgs.config.method import CompensationConfig, DensifyConfig
+from vdgs.kernels.kernel_types import DensificationStats
+from vdgs.training.densification import CompensatedGradient, DensificationDecision
 
 #: An offset of low visibility is judged only when it was drawn more often than this (choice).
-LEAST_GATE = 2.0
+MIN_SCALED_DRAWS = 2.0
 
 
 @dataclass
-class Compensation:
+class CompensationState:
     """What is remembered of each offset from cycle to cycle (float32).
 
     Growth statistics carry over from cycle to cycle until they are judged. What they were when the cycle began is
@@ -44,14 +44,14 @@ class Compensation:
     drawn_before: Float[Tensor, "n k"]
 
     @staticmethod
-    def zeros(n: int, k: int, device: torch.device | None = None) -> Compensation:
-        return Compensation(*(torch.zeros(n, k, device=device) for _ in range(3)))
+    def zeros(n: int, k: int, device: torch.device | None = None) -> CompensationState:
+        return CompensationState(*(torch.zeros(n, k, device=device) for _ in range(3)))
 
     def tensors(self) -> dict[str, Tensor]:
         return {item.name: getattr(self, item.name) for item in fields(self)}
 
 
-def low_visibility(share: Float[Tensor, " n"], config: CompensationConfig) -> tuple[Bool[Tensor, " n"], float]:
+def low_visibility_mask(ratio: Float[Tensor, " n"], config: CompensationConfig) -> tuple[Bool[Tensor, " n"], float]:
     """The set L = {c_k < T_low} of anchors, and the T_low used.
 
     `share` is c_k: the share in [0, 1] of the cycle's cameras whose frustum holds the anchor. With `t_low_quantile`
@@ -61,12 +61,12 @@ def low_visibility(share: Float[Tensor, " n"], config: CompensationConfig) -> tu
     all that are seen have the least share.
     """
     if config.t_low_quantile <= 0:
-        return share < config.t_low, config.t_low
-    some = share[share > 0].cpu().numpy()
+        return ratio < config.t_low, config.t_low
+    some = ratio[ratio > 0].cpu().numpy()
     if not len(some):
-        return torch.zeros_like(share, dtype=torch.bool), 0.0
+        return torch.zeros_like(ratio, dtype=torch.bool), 0.0
     # Not torch.quantile, which refuses more than 16 million numbers.
-    return share <= _highest_of(some, config.t_low_quantile), float(np.quantile(some, config.t_low_quantile))
+    return ratio <= _highest_of(some, config.t_low_quantile), float(np.quantile(some, config.t_low_quantile))
 
 
 def _highest_of(shares: Float[np.ndarray, " s"], quantile: float) -> float:
@@ -78,7 +78,7 @@ def _highest_of(shares: Float[np.ndarray, " s"], quantile: float) -> float:
     return float(values[nearest - 1]) if nearest else 0.0
 
 
-def begin_cycle(compensation: Compensation, statistics: Statistics) -> None:
+def begin_cycle(compensation: CompensationState, statistics: DensificationStats) -> None:
     """From here on the statistics count for the next cycle. To be called after the resets of a decision.
 
     Raises ValueError if the two do not describe the same offsets.
@@ -88,7 +88,7 @@ def begin_cycle(compensation: Compensation, statistics: Statistics) -> None:
     compensation.drawn_before.copy_(statistics.drawn)
 
 
-def cycle_gradient(compensation: Compensation, statistics: Statistics) -> Float[Tensor, "n k"]:
+def cycle_gradient(compensation: CompensationState, statistics: DensificationStats) -> Float[Tensor, "n k"]:
     """The mean gradient norm of each offset over the times it was drawn in this cycle; 0 where it was not."""
     _check_aligned(compensation, statistics)
     times = (statistics.drawn - compensation.drawn_before).clamp_(min=1)
@@ -96,7 +96,7 @@ def cycle_gradient(compensation: Compensation, statistics: Statistics) -> Float[
 
 
 def update_cache(
-    compensation: Compensation, statistics: Statistics, low: Bool[Tensor, " n"], config: CompensationConfig
+    compensation: CompensationState, statistics: DensificationStats, low: Bool[Tensor, " n"], config: CompensationConfig
 ) -> None:
     """End of a cycle, in place (eq. 10): g_k <- gamma g_k + beta_g times the cycle's mean gradient for k in L.
 
@@ -109,28 +109,28 @@ def update_cache(
 
 
 def compensate(
-    compensation: Compensation,
+    compensation: CompensationState,
     low: Bool[Tensor, " n"],
     threshold: float,
-    growth: GrowthConfig,
+    growth: DensifyConfig,
     config: CompensationConfig,
-) -> Compensated:
+) -> CompensatedGradient:
     """What this cycle's decision adds to the gradients, to their mean or their sum, and from when on it judges offsets
     of L.
 
     Gate `scaled` (choice): T_low times the plain gate, but at least twice and never more than the plain gate.
-    `threshold` is the T_low that `low_visibility` used.
+    `threshold` is the T_low that `low_visibility_mask` used.
     """
     plain = growth.gate * growth.interval
-    gate = plain if config.gate == "literal" else min(plain, max(LEAST_GATE, threshold * plain))
-    return Compensated(compensation.cache * low[:, None], low, gate, to_sum=config.added_to == "sum")
+    gate = plain if config.gate == "literal" else min(plain, max(MIN_SCALED_DRAWS, threshold * plain))
+    return CompensatedGradient(compensation.cache * low[:, None], low, gate, to_sum=config.added_to == "sum")
 
 
-def cycle_facts(
-    compensated: Compensated,
-    share: Float[Tensor, " n"],
+def cycle_log(
+    compensated: CompensatedGradient,
+    ratio: Float[Tensor, " n"],
     threshold: float,
-    decision: Decision,
+    decision: DensificationDecision,
     config: CompensationConfig,
 ) -> dict[str, float | None]:
     """JSON-able facts of one cycle for the log.
@@ -141,7 +141,7 @@ def cycle_facts(
     a parent in L, and the others; `pruned`: anchors removed.
     """
     low, offsets = int(compensated.low.sum()), compensated.added.shape[1]
-    seen = share > 0
+    seen = ratio > 0
     added = compensated.added.cpu().numpy()  # numpy sums in one order for any number of threads
     return {
         "low_share": low / max(len(compensated.low), 1),
@@ -155,7 +155,7 @@ def cycle_facts(
     }
 
 
-def _check_aligned(compensation: Compensation, statistics: Statistics) -> None:
+def _check_aligned(compensation: CompensationState, statistics: DensificationStats) -> None:
     if compensation.cache.shape != statistics.drawn.shape:
         raise ValueError(
             f"compensation is kept of {list(compensation.cache.shape)} offsets, "

@@ -18,30 +18,30 @@ from torch import Tensor
 from vdgs.errors import RunError, VdgsError
 from vdgs.geometry.camera import Camera
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.model.renderer import paint
+from vdgs.model.renderer import render_scalar
 from vdgs.system.atomic_files import read_json, write_json
 
 #: Longest side in pixels at which the parts are looked for.
-LONGEST_SIDE_PX = 320
+CROP_RENDER_SIDE_PX = 320
 #: A pixel shows a block where the block's anchors have at least this share in it (choice).
-LEAST_SHARE = 0.1
+MIN_CONTRIBUTION = 0.1
 #: So much of what a photograph shows of a block may lie outside of each side of its part: single pixels seen through
 #: gaps would else open it wide (choice).
-CUT_OFF = 0.005
+TAIL_FRACTION = 0.005
 #: The part is widened by this share of the photograph's longest side, on each side (choice). It also keeps off the
 #: block what SSIM sees at the border of a picture, where its windows of 11 pixels find nothing.
 MARGIN = 0.04
 #: A part as large as this is the whole photograph: nothing would be saved.
-NEARLY_ALL = 0.9
+FULL_AREA_FRACTION = 0.9
 #: Every so many steps draw the whole photograph (choice): what a block lets stand beyond the parts no step would else
 #: see, and it would stand in the pictures of other blocks once all are merged.
-WHOLE_EVERY = 4
+FULL_IMAGE_EVERY = 4
 #: Smaller parts make at most so many times more steps: a step costs something however little it draws (choice).
-MOST_STEPS = 4.0
+MAX_STEP_FACTOR = 4.0
 
 
 #: Left, top, right, bottom of a part of a picture in pixels: [left, right).
-Box = tuple[int, int, int, int]
+PixelBox = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Crop:
         """Share of the photograph's pixels."""
         return (self.right - self.left) * (self.bottom - self.top)
 
-    def pixels(self, width: int, height: int) -> Box:
+    def pixels(self, width: int, height: int) -> PixelBox:
         """Where it is in a photograph of that size, at least one pixel wide and high."""
         left, top = (math.floor(share * size) for share, size in ((self.left, width), (self.top, height)))
         left, top = min(left, width - 1), min(top, height - 1)
@@ -66,10 +66,10 @@ class Crop:
 
 
 #: The whole photograph.
-WHOLE = Crop(0.0, 0.0, 1.0, 1.0)
+FULL_IMAGE = Crop(0.0, 0.0, 1.0, 1.0)
 
 
-def crops_of(model: AnchorModel, own: Bool[Tensor, " n"], cameras: Sequence[Camera]) -> tuple[Crop, ...]:
+def compute_crops(model: AnchorModel, own: Bool[Tensor, " n"], cameras: Sequence[Camera]) -> tuple[Crop, ...]:
     """For each camera the part of its picture in which anchors `own` of the model have a share.
 
     The whole picture where that is nearly all of it, and where it is nothing: what a camera was given for is then not
@@ -80,48 +80,48 @@ def crops_of(model: AnchorModel, own: Bool[Tensor, " n"], cameras: Sequence[Came
 
 def _own_share(model: AnchorModel, own: Bool[Tensor, " n"], camera: Camera) -> Float[np.ndarray, "h w"]:
     """What share the anchors have in each pixel of a small picture."""
-    return paint(model, own.float(), camera.within(LONGEST_SIDE_PX))[0].cpu().numpy()
+    return render_scalar(model, own.float(), camera.limit_size(CROP_RENDER_SIDE_PX))[0].cpu().numpy()
 
 
 def _crop(share: Float[np.ndarray, "h w"]) -> Crop:
-    shown = share >= LEAST_SHARE
+    shown = share >= MIN_CONTRIBUTION
     if not shown.any():
-        return WHOLE
+        return FULL_IMAGE
     height, width = shown.shape
     margin = MARGIN * max(width, height)
     left, right = _span(shown.sum(0), margin)
     top, bottom = _span(shown.sum(1), margin)
     crop = Crop(left, top, right, bottom)
-    return WHOLE if crop.area >= NEARLY_ALL else crop
+    return FULL_IMAGE if crop.area >= FULL_AREA_FRACTION else crop
 
 
 def _span(counts: Int[np.ndarray, " s"], margin: float) -> tuple[float, float]:
-    """First and last place of a row of pixels, as shares of its length, between which all but `CUT_OFF` on each side
+    """First and last place of a row of pixels, as shares of its length, between which all but `TAIL_FRACTION` on each side
     of the counts lie, widened by `margin` pixels."""
     reached = np.cumsum(counts) / counts.sum()
-    first = int(np.searchsorted(reached, CUT_OFF, side="right"))
-    last = int(np.searchsorted(reached, 1 - CUT_OFF)) + 1
+    first = int(np.searchsorted(reached, TAIL_FRACTION, side="right"))
+    last = int(np.searchsorted(reached, 1 - TAIL_FRACTION)) + 1
     size = len(counts)
     return max(first - margin, 0) / size, min(last + margin, size) / size
 
 
 def crop_at(crops: Sequence[Crop] | None, view: int, iteration: int) -> Crop:
     """The part of a view that iteration (from 0) draws."""
-    return WHOLE if crops is None or (iteration + 1) % WHOLE_EVERY == 0 else crops[view]
+    return FULL_IMAGE if crops is None or (iteration + 1) % FULL_IMAGE_EVERY == 0 else crops[view]
 
 
-def mean_area(crops: Sequence[Crop], shares: Sequence[float] | None) -> float:
+def mean_crop_area(crops: Sequence[Crop], shares: Sequence[float] | None) -> float:
     """Share of a photograph that a step draws on average, photographs being used in proportion to `shares`."""
     part = float(np.average([crop.area for crop in crops], weights=shares))
-    return part + (1.0 - part) / WHOLE_EVERY
+    return part + (1.0 - part) / FULL_IMAGE_EVERY
 
 
-def steps_for(photographs: int, area: float) -> int:
+def steps_for(num_images: int, area: float) -> int:
     """How many steps, of pictures that are this share of a photograph, draw as much as so many photographs."""
-    return round(photographs * min(1.0 / area, MOST_STEPS))
+    return round(num_images * min(1.0 / area, MAX_STEP_FACTOR))
 
 
-def load_or_find(path: Path, count: int, find: Callable[[], tuple[Crop, ...]]) -> tuple[Crop, ...]:
+def load_or_compute_crops(path: Path, count: int, find: Callable[[], tuple[Crop, ...]]) -> tuple[Crop, ...]:
     """The crops of a file, or those found now and written to it: training that continues, perhaps on another machine
     or with another version, draws the same parts. Raises RunError for a file that does not hold `count` of them."""
     if not path.exists():

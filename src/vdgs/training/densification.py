@@ -1,7 +1,7 @@
 """Where anchors are added and removed: statistics, growing, pruning (Scaffold-GS section 4.2).
 
 Dimensions: n anchors, k offsets, v anchors visible in a view, m Gaussians drawn (splats), p parents.
-`Statistics` are kept per anchor and grow and shrink with them; all here are pure functions.
+`DensificationStats` are kept per anchor and grow and shrink with them; all here are pure functions.
 Plain growth and compensated growth (`vdgs.training.compensation`) are one policy: the latter adds to the gradients.
 """
 
@@ -15,9 +15,9 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from vdgs.config.method import GrowthConfig
-from vdgs.kernels import choose
-from vdgs.kernels.kernel_types import FEATURE_SIZE, Statistics
+from vdgs.config.method import DensifyConfig
+from vdgs.kernels import get_backend
+from vdgs.kernels.kernel_types import FEATURE_SIZE, DensificationStats
 from vdgs.model.anchors import Anchors
 
 #: Cells have keys within this many cells of the origin on each axis.
@@ -26,11 +26,11 @@ LATTICE_REACH = 2**20
 RANDOM_CHUNK = 2**20
 
 #: Which places [p, 3] may get a new anchor, as a mask [p].
-MayHold = Callable[[Tensor], Tensor]
+GrowthMask = Callable[[Tensor], Tensor]
 
 
 @dataclass(frozen=True)
-class Compensated:
+class CompensatedGradient:
     """What compensation changes in one decision (VDGS section IV-C); `compensation.compensate` makes it."""
 
     #: Added to the gradients: the cache g_k for offsets of low visibility (the set L), 0 for the others.
@@ -48,7 +48,7 @@ class Compensated:
 
 
 @dataclass(frozen=True)
-class Decision:
+class DensificationDecision:
     """What one growth step does to the anchors: first append `added`, then keep `kept` of all."""
 
     added: Anchors
@@ -74,23 +74,23 @@ class _Parents:
         return _Parents(self.index[mask], self.gradient[mask], self.low[mask])
 
 
-def mean_gradient(statistics: Statistics) -> Float[Tensor, "n k"]:
+def mean_gradient(statistics: DensificationStats) -> Float[Tensor, "n k"]:
     """Mean gradient norm over the times that an offset was drawn; 0 where it never was."""
     times = statistics.drawn.clamp(min=1)
     return torch.div(statistics.gradient, times, out=times)
 
 
-def decide(
+def decide_densification(
     anchors: Anchors,
-    statistics: Statistics,
+    statistics: DensificationStats,
     voxel: float,
-    config: GrowthConfig,
+    config: DensifyConfig,
     generator: torch.Generator,
     *,
-    compensated: Compensated | None = None,
-    surroundings: Float[Tensor, "s 3"] | None = None,
-    may_hold: MayHold | None = None,
-) -> Decision:
+    compensated: CompensatedGradient | None = None,
+    frozen_positions: Float[Tensor, "s 3"] | None = None,
+    growth_mask: GrowthMask | None = None,
+) -> DensificationDecision:
     """One growth decision (Scaffold-GS eqs. 9-10 and its pruning; with `compensated`, VDGS section IV-C).
 
     `surroundings` are positions of further anchors, which occupy cells but neither grow nor go; `may_hold` says which
@@ -102,20 +102,22 @@ def decide(
     """
     judged = _judged(statistics, config, compensated)
     parents = _parents(statistics, judged, config.threshold, compensated)
-    taken = [anchors.positions] if surroundings is None else [anchors.positions, surroundings]
-    added, grown_low = _grow(anchors, parents, taken, voxel, config, generator, may_hold)
+    taken = [anchors.positions] if frozen_positions is None else [anchors.positions, frozen_positions]
+    added, grown_low = _grow(anchors, parents, taken, voxel, config, generator, growth_mask)
     statistics.gradient[judged] = 0
     statistics.drawn[judged] = 0
 
-    old_enough = statistics.seen > config.prune_views * config.interval
+    old_enough = statistics.seen > config.prune_view_fraction * config.interval
     faint = statistics.opacity < config.prune_opacity * statistics.seen
     pruned = old_enough & faint
     statistics.opacity[old_enough] = 0
     statistics.seen[old_enough] = 0
-    return Decision(added, ~pruned, int(pruned.sum()), grown_low, len(added) - grown_low)
+    return DensificationDecision(added, ~pruned, int(pruned.sum()), grown_low, len(added) - grown_low)
 
 
-def _judged(statistics: Statistics, config: GrowthConfig, compensated: Compensated | None) -> Bool[Tensor, "n k"]:
+def _judged(
+    statistics: DensificationStats, config: DensifyConfig, compensated: CompensatedGradient | None
+) -> Bool[Tensor, "n k"]:
     """Offsets that were drawn often enough to be judged."""
     judged = statistics.drawn > config.gate * config.interval
     if compensated is not None:
@@ -124,7 +126,10 @@ def _judged(statistics: Statistics, config: GrowthConfig, compensated: Compensat
 
 
 def _parents(
-    statistics: Statistics, judged: Bool[Tensor, "n k"], threshold: float, compensated: Compensated | None
+    statistics: DensificationStats,
+    judged: Bool[Tensor, "n k"],
+    threshold: float,
+    compensated: CompensatedGradient | None,
 ) -> _Parents:
     """The judged offsets whose mean gradient, compensated, reaches the threshold of the first level."""
     gradient = mean_gradient(statistics)
@@ -142,9 +147,9 @@ def _grow(
     parents: _Parents,
     taken: Sequence[Float[Tensor, "_ 3"]],
     voxel: float,
-    config: GrowthConfig,
+    config: DensifyConfig,
     generator: torch.Generator,
-    may_hold: MayHold | None,
+    growth_mask: GrowthMask | None,
 ) -> tuple[Anchors, int]:
     """New anchors, at the centres of empty cells that hold a parent's Gaussian, and how many have a parent in L."""
     grown, grown_low = anchors.select(parents.index[:0]), 0
@@ -155,9 +160,9 @@ def _grow(
             break  # later levels ask for more
         count = anchors.offsets.shape[0] * anchors.offsets.shape[1]
         kept = parents.select(_random(parents.index, count, generator) > 0.5 ** (level + 1))
-        cell = voxel * config.coarsest_cell / 4.0**level
-        more, low = _fill_cells(anchors, kept, [*taken, grown.positions], cell, room, may_hold)
-        grown, grown_low = grown.extended(more), grown_low + low
+        cell = voxel * config.coarsest_voxels / 4.0**level
+        more, low = _fill_cells(anchors, kept, [*taken, grown.positions], cell, room, growth_mask)
+        grown, grown_low = grown.concat(more), grown_low + low
     return grown, grown_low
 
 
@@ -178,15 +183,15 @@ def _fill_cells(
     parents: _Parents,
     taken: Sequence[Float[Tensor, "_ 3"]],
     cell: float,
-    room: int | None,
-    may_hold: MayHold | None,
+    max_new: int | None,
+    growth_mask: GrowthMask | None,
 ) -> tuple[Anchors, int]:
     """One anchor at the centre of each cell that holds a parent's Gaussian, no anchor yet, and may hold one.
 
     Where `room` is short, the cells with the largest gradients are served first. Also says how many of the cells
     have a parent in L.
     """
-    kernels, k = choose(anchors.positions.device), anchors.offsets.shape[1]
+    kernels, k = get_backend(anchors.positions.device), anchors.offsets.shape[1]
     rows = parents.index // k
     means = anchors.positions[rows] + anchors.offsets[rows, parents.index % k] * anchors.log_scales[rows, :3].exp()
     within = _within_lattice(means, cell)
@@ -195,22 +200,24 @@ def _fill_cells(
     origin = means.new_full((3,), -0.5 * cell)
     cells, group = kernels.group_cells(kernels.cell_keys(means, cell, origin))
     chosen = ~_hold_any(cells, taken, cell, origin)
-    if may_hold is not None:
-        chosen[chosen.clone()] = may_hold(kernels.cell_centres(cells[chosen], cell, origin))
-    if room is not None and int(chosen.sum()) > room:
+    if growth_mask is not None:
+        chosen[chosen.clone()] = growth_mask(kernels.cell_centers(cells[chosen], cell, origin))
+    if max_new is not None and int(chosen.sum()) > max_new:
         strongest = kernels.group_max(parents.gradient[:, None], group, len(cells))[:, 0]
         strongest[~chosen] = -1.0
-        chosen = torch.zeros_like(chosen).index_fill_(0, strongest.argsort(descending=True, stable=True)[:room], True)
+        chosen = torch.zeros_like(chosen).index_fill_(
+            0, strongest.argsort(descending=True, stable=True)[:max_new], True
+        )
     served = chosen[group]
     place = (chosen.cumsum(0) - 1)[group[served]]
-    return _anchors_at(kernels.cell_centres(cells[chosen], cell, origin), place, parents.select(served), anchors, cell)
+    return _anchors_at(kernels.cell_centers(cells[chosen], cell, origin), place, parents.select(served), anchors, cell)
 
 
 def _anchors_at(
     centres: Float[Tensor, "c 3"], place: Int64[Tensor, " p"], parents: _Parents, anchors: Anchors, cell: float
 ) -> tuple[Anchors, int]:
     """New anchors at `centres`, the features the maximum of their parents', and how many have a parent in L."""
-    kernels, k, count = choose(centres.device), anchors.offsets.shape[1], len(centres)
+    kernels, k, count = get_backend(centres.device), anchors.offsets.shape[1], len(centres)
     new = Anchors(
         positions=centres,
         features=kernels.group_max(anchors.features[parents.index // k], place, count).reshape(count, FEATURE_SIZE),
@@ -224,7 +231,7 @@ def _hold_any(
     cells: Int64[Tensor, " c"], points: Sequence[Float[Tensor, "_ 3"]], cell: float, origin: Float[Tensor, "3"]
 ) -> Bool[Tensor, " c"]:
     """Which of the cells hold any of the points."""
-    kernels, full = choose(cells.device), torch.zeros_like(cells, dtype=torch.bool)
+    kernels, full = get_backend(cells.device), torch.zeros_like(cells, dtype=torch.bool)
     for some in points:
         within = _within_lattice(some, cell)
         some = some if bool(within.all()) else some[within]

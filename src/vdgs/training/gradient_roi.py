@@ -9,8 +9,8 @@ import torch
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.constants import ALPHA_MIN, SSIM_WINDOW_PX
 from vdgs.kernels.kernel_types import Splats
-from vdgs.training.crops import NEARLY_ALL, Box
-from vdgs.training.training_state import Stage
+from vdgs.training.crops import FULL_AREA_FRACTION, PixelBox
+from vdgs.training.training_state import TrainingProblem
 
 #: A pixel is in windows of SSIM around others, which look as far again.
 MARGIN_PX = SSIM_WINDOW_PX - 1
@@ -18,7 +18,7 @@ MARGIN_PX = SSIM_WINDOW_PX - 1
 SLACK_PX = 1.0
 
 
-def narrow(stage: Stage, splats: Splats, camera: Camera, box: Box) -> Box:
+def crop_to_gradient_support(stage: TrainingProblem, splats: Splats, camera: Camera, box: PixelBox) -> PixelBox:
     """What is to be drawn of a box of a view, which `camera` shows, so that gradients of a stage's splats in it are the
     same but for rounding. The means of the splats, in pixels of the box, become pixels of that, in place.
 
@@ -27,7 +27,7 @@ def narrow(stage: Stage, splats: Splats, camera: Camera, box: Box) -> Box:
     around = stage.surroundings
     if around is None or not len(around.anchors) or stage.device.type != "cpu":
         return box
-    part = part_reached(splats, camera)
+    part = splat_roi(splats, camera)
     if part is None:
         return box
     left, top, right, bottom = part
@@ -35,22 +35,22 @@ def narrow(stage: Stage, splats: Splats, camera: Camera, box: Box) -> Box:
     return box[0] + left, box[1] + top, box[0] + right, box[1] + bottom
 
 
-def part_reached(splats: Splats, camera: Camera) -> Box | None:
+def splat_roi(splats: Splats, camera: Camera) -> PixelBox | None:
     """The part of a picture that splats reach, with what the loss looks at beside it; None: all of it, nearly all, or
     none."""
-    reached = box_reached(splats, camera.width, camera.height)
+    reached = splat_bounds(splats, camera.width, camera.height)
     if reached is None:
         return None
     left, top, right, bottom = reached
     left, top = max(left - MARGIN_PX, 0), max(top - MARGIN_PX, 0)
     right, bottom = min(right + MARGIN_PX, camera.width), min(bottom + MARGIN_PX, camera.height)
-    if (right - left) * (bottom - top) >= NEARLY_ALL * camera.width * camera.height:
+    if (right - left) * (bottom - top) >= FULL_AREA_FRACTION * camera.width * camera.height:
         return None
     return left, top, right, bottom
 
 
 @torch.no_grad()
-def box_reached(splats: Splats, width: int, height: int) -> Box | None:
+def splat_bounds(splats: Splats, width: int, height: int) -> PixelBox | None:
     """The pixels of a picture in which splats may have an alpha of 1/255; None if there are none.
 
     On the ellipse a dx² + 2 b dx dy + c dy² = q, dx² reaches q c / (a c - b²). Of splats that are not drawn, because

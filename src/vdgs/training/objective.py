@@ -9,15 +9,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from vdgs.config.method import TrainConfig
-from vdgs.kernels import choose
+from vdgs.kernels import get_backend
 from vdgs.model.decoder import Decoder
-from vdgs.model.exposure import exposed
-from vdgs.training.target import Target
-from vdgs.training.training_step import TrainingView
+from vdgs.model.exposure import apply_exposure
+from vdgs.training.target import TrainingTarget
+from vdgs.training.training_step import RenderedTrainingView
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Objective:
+class LossGradients:
     """The loss of a picture without the volume term, and its gradient by the picture."""
 
     loss: Float[Tensor, ""]
@@ -29,16 +29,18 @@ class Objective:
     image: Float[Tensor, "h w 3"]
 
 
-def compare(drawn: TrainingView, target: Target, decoder: Decoder, number: int, config: TrainConfig) -> Objective:
+def compute_loss(
+    rendered: RenderedTrainingView, target: TrainingTarget, decoder: Decoder, image_index: int, config: TrainConfig
+) -> LossGradients:
     """Compare a picture with its photograph, which is the training image `number` of the capture.
 
     The gradient of the photograph's exposure, where one is fitted, is left in the decoder's `.grad`. All gradients are
     those of the whole photograph (`Target.share`).
     """
-    image = drawn.image.requires_grad_(True)
-    exposure = decoder.exposure_of(number)
-    shown = image if exposure is None else exposed(image, exposure)
-    kernels = choose(image.device)
+    image = rendered.image.requires_grad_(True)
+    exposure = decoder.exposure_for_image(image_index)
+    shown = image if exposure is None else apply_exposure(image, exposure)
+    kernels = get_backend(image.device)
     photometric = kernels.photometric_loss(shown, target.image, target.mask, ssim_weight=config.loss.ssim_weight)
     loss = photometric.loss.detach()
     fitted = [decoder.exposure] if decoder.exposure is not None and decoder.exposure.requires_grad else []
@@ -48,4 +50,4 @@ def compare(drawn: TrainingView, target: Target, decoder: Decoder, number: int, 
     if target.share != 1.0:
         for each in found:
             each.mul_(target.share)
-    return Objective(loss=loss, l1=photometric.l1, ssim=photometric.ssim, shown=shown.detach(), image=found[0])
+    return LossGradients(loss=loss, l1=photometric.l1, ssim=photometric.ssim, shown=shown.detach(), image=found[0])

@@ -8,68 +8,70 @@ import torch
 from jaxtyping import Int32
 from torch import Tensor
 
-from vdgs.config.method import RateConfig
-from vdgs.kernels import choose
-from vdgs.kernels.kernel_types import AdamState, Finite
-from vdgs.model.anchors import TRAINED, Anchors
+from vdgs.config.method import LearningRateConfig
+from vdgs.kernels import get_backend
+from vdgs.kernels.kernel_types import AdamState, IsFinite
+from vdgs.model.anchors import TRAINED_TENSORS, Anchors
 from vdgs.model.decoder import Decoder
 
 
 @dataclass
-class Moments:
+class AdamMoments:
     """First and second moments of each named parameter, shaped like it."""
 
     first: dict[str, Tensor]
     second: dict[str, Tensor]
 
     @staticmethod
-    def zeros(parameters: dict[str, Tensor]) -> Moments:
-        return Moments(
+    def zeros(parameters: dict[str, Tensor]) -> AdamMoments:
+        return AdamMoments(
             {name: torch.zeros_like(p) for name, p in parameters.items()},
             {name: torch.zeros_like(p) for name, p in parameters.items()},
         )
 
 
 @dataclass
-class Optimiser:
+class AnchorOptimizer:
     """Moments of all parameters, and what the bias correction counts: the updates of each anchor, [n] int32.
 
     The decoder moves in every step: its updates are the steps.
     """
 
-    anchors: Moments
-    decoder: Moments
+    anchors: AdamMoments
+    decoder: AdamMoments
     updates: Int32[Tensor, " n"]
 
     @staticmethod
-    def start(anchors: Anchors, decoder: Decoder) -> Optimiser:
-        trained = {name: tensor for name, tensor in anchors.tensors().items() if name in TRAINED}
+    def start(anchors: Anchors, decoder: Decoder) -> AnchorOptimizer:
+        trained = {name: tensor for name, tensor in anchors.tensors().items() if name in TRAINED_TENSORS}
         updates = torch.zeros_like(anchors.positions[:, 0], dtype=torch.int32)
-        return Optimiser(Moments.zeros(trained), Moments.zeros(decoder.tensors()), updates)
+        return AnchorOptimizer(AdamMoments.zeros(trained), AdamMoments.zeros(decoder.tensors()), updates)
 
-    def anchor_states(self, anchors: Anchors, rates: dict[str, float], early: float) -> list[AdamState]:
-        """What moves of the anchors, in the order of `TRAINED`; `early` as in `AdamState`."""
+    def anchor_states(self, anchors: Anchors, rates: dict[str, float], lr_boost: float) -> list[AdamState]:
+        """What moves of the anchors, in the order of `TRAINED_TENSORS`; `early` as in `AdamState`."""
         return [
-            AdamState(getattr(anchors, name), self.anchors.first[name], self.anchors.second[name], rates[name], early)
-            for name in TRAINED
+            AdamState(
+                getattr(anchors, name), self.anchors.first[name], self.anchors.second[name], rates[name], lr_boost
+            )
+            for name in TRAINED_TENSORS
         ]
 
-    def update_decoder(self, decoder: Decoder, rates: dict[str, float], step: int) -> Finite:
+    def update_decoder(self, decoder: Decoder, rates: dict[str, float], step: int) -> IsFinite:
         """Move the decoder's tensors by their `.grad`, in place; `step` counts from 1.
 
         False: a gradient is not finite.
         """
-        finite: Finite = True
+        finite: IsFinite = True
         for name, tensor in decoder.tensors().items():
             if tensor.grad is not None:
                 moments = self.decoder.first[name], self.decoder.second[name]
                 state = AdamState(tensor.detach(), *moments, rates[name.split("_")[0]])
-                finite = choose(tensor.device).adam_rows(state, None, tensor.grad, step) & finite
+                finite = get_backend(tensor.device).adam_rows(state, None, tensor.grad, step) & finite
                 tensor.grad = None
         return finite
 
 
-def rates_at(config: RateConfig, progress: float) -> dict[str, float]:
+def learning_rates_at(config: LearningRateConfig, progress: float) -> dict[str, float]:
     """Learning rates at a share of the stage in [0, 1]: exponential from the first to the second value."""
-    pairs = {name: getattr(config, name) for name in RateConfig.__dataclass_fields__}
+    pairs = {name: getattr(config, name) for name in LearningRateConfig.__dataclass_fields__}
     return {name: first * (last / first) ** progress for name, (first, last) in pairs.items()}

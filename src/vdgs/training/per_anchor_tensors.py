@@ -13,22 +13,22 @@ import torch
 from torch import Tensor
 
 #: Named tensors with one row for each anchor.
-Group = dict[str, Tensor]
+TensorGroup = dict[str, Tensor]
 
 
-class PerAnchor(Protocol):
+class PerAnchorTensors(Protocol):
     """What holds groups of tensors with one row for each anchor."""
 
-    def take_groups(self) -> dict[str, Group]:
+    def take_groups(self) -> dict[str, TensorGroup]:
         """All groups by name, no longer held elsewhere: each tensor can be let go as it is replaced."""
         ...
 
-    def put_groups(self, groups: dict[str, Group]) -> None:
+    def put_groups(self, groups: dict[str, TensorGroup]) -> None:
         """The inverse of `take_groups`."""
         ...
 
 
-def remap(state: PerAnchor, added: Mapping[str, Group], count: int, kept: Tensor) -> None:
+def index_anchors(state: PerAnchorTensors, added: Mapping[str, TensorGroup], count: int, kept: Tensor) -> None:
     """Append `count` rows to everything that the state keeps per anchor, then keep the rows `kept` (mask or order).
 
     `added` has the new rows of the groups that it names; those of the others are zero. Tensor by tensor: no more than
@@ -36,11 +36,11 @@ def remap(state: PerAnchor, added: Mapping[str, Group], count: int, kept: Tensor
     """
     groups = state.take_groups()
     for name, group in groups.items():
-        remap_rows(group, added.get(name) or {key: t.new_zeros(count, *t.shape[1:]) for key, t in group.items()}, kept)
+        index_rows(group, added.get(name) or {key: t.new_zeros(count, *t.shape[1:]) for key, t in group.items()}, kept)
     state.put_groups(groups)
 
 
-def remap_rows(group: Group, added: Mapping[str, Tensor], kept: Tensor) -> None:
+def index_rows(group: TensorGroup, added: Mapping[str, Tensor], kept: Tensor) -> None:
     """Append to each tensor the rows of its name in `added`, then keep the `kept` rows (mask or order); in place.
 
     Each old tensor is let go before the next is made: if nothing else holds it, no more than one is there twice.

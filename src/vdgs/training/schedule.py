@@ -11,8 +11,8 @@ import numpy as np
 from vdgs.config.method import TrainConfig
 from vdgs.geometry.camera import Camera
 from vdgs.model.anchors import Anchors
-from vdgs.training.training_state import Stage
-from vdgs.visibility.visibility_counts import votes_of
+from vdgs.training.training_state import TrainingProblem
+from vdgs.visibility.visibility_counts import visibility_sampling_weights
 
 
 def view_at(iteration: int, count: int, seed: int, shares: tuple[float, ...] | None = None) -> int:
@@ -43,7 +43,7 @@ def downscale_at(iteration: int, config: TrainConfig) -> int:
     return [factor for start, factor in config.resolutions if share >= start][-1]
 
 
-def views_in_cycle(iteration: int, stage: Stage) -> list[int]:
+def views_in_cycle(iteration: int, stage: TrainingProblem) -> list[int]:
     """The views, each once, that were used in the growth cycle which ends after `iteration` steps.
 
     A cycle lasts from one growth decision to the next; the first one starts with the statistics.
@@ -51,12 +51,12 @@ def views_in_cycle(iteration: int, stage: Stage) -> list[int]:
     growth = stage.config.growth
     begin = iteration - growth.interval
     if begin < growth.start:  # no decision was made before
-        begin = growth.statistics_from
+        begin = growth.stats_start
     used = range(max(min(begin, iteration - 1), 0), iteration)
     return sorted({view_at(each, stage.image_count, stage.config.seed, stage.shares) for each in used})
 
 
-def shares_for(config: TrainConfig, anchors: Anchors, cameras: Sequence[Camera]) -> tuple[float, ...] | None:
+def view_sampling_weights(config: TrainConfig, anchors: Anchors, cameras: Sequence[Camera]) -> tuple[float, ...] | None:
     """How often each training view is used, by the settings, for the anchors that training starts with.
 
     Roots, because a view with few votes also costs little (`training.crops`): a mean varies least for what it costs
@@ -64,5 +64,5 @@ def shares_for(config: TrainConfig, anchors: Anchors, cameras: Sequence[Camera])
     """
     if config.sampling == "even":
         return None
-    votes = votes_of(anchors.positions, cameras)
+    votes = visibility_sampling_weights(anchors.positions, cameras)
     return votes if config.sampling == "shares" else tuple(math.sqrt(share) for share in votes)

@@ -11,14 +11,16 @@ from torch import Tensor
 
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.transfer import upload
-from vdgs.training.crops import Box, crop_at
-from vdgs.training.training_state import Stage, TrainingImages
+from vdgs.training.crops import PixelBox, crop_at
+from vdgs.training.training_state import TrainingImages, TrainingProblem
 
 
-def mean_colour(images: TrainingImages, count: int, downscale: int, at_most: int = 32) -> tuple[float, float, float]:
+def mean_image_color(
+    images: TrainingImages, count: int, downscale: int, max_images: int = 32
+) -> tuple[float, float, float]:
     """Mean colour in [0, 1] of the pixels that count, over up to `at_most` evenly chosen training views."""
     total, pixels = np.zeros(3), 0
-    for index in np.unique(np.linspace(0, count - 1, min(count, at_most)).astype(int)):
+    for index in np.unique(np.linspace(0, count - 1, min(count, max_images)).astype(int)):
         image, mask = images.get(int(index), downscale)
         colours = image.numpy().reshape(-1, 3) if mask is None else image.numpy()[mask.numpy() > 0]
         total += colours.sum(0, dtype=np.float64)
@@ -27,9 +29,9 @@ def mean_colour(images: TrainingImages, count: int, downscale: int, at_most: int
     return red, green, blue
 
 
-def background_at(stage: Stage, iteration: int) -> Tensor:
+def background_at(stage: TrainingProblem, iteration: int) -> Tensor:
     """Colour [3] behind the scene at this iteration (from 0): from its own to a random one of the RGB cube."""
-    colour, share = torch.tensor(stage.background), stage.config.loss.background_noise
+    colour, share = torch.tensor(stage.background), stage.config.loss.random_background
     if share:
         generator = torch.Generator().manual_seed(stage.config.seed * 1_000_033 + iteration)
         # Drawn on the CPU: the same colours for any device.
@@ -38,7 +40,7 @@ def background_at(stage: Stage, iteration: int) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Target:
+class TrainingTarget:
     """A photograph or a part of it."""
 
     image: UInt8[Tensor, "h w 3"]
@@ -51,30 +53,32 @@ class Target:
     share: float = 1.0
 
 
-def box_at(stage: Stage, view: int, downscale: int, iteration: int) -> Box:
+def crop_box(stage: TrainingProblem, view: int, downscale: int, iteration: int) -> PixelBox:
     """The part of a view that iteration (from 0) is to draw."""
     camera = stage.images.camera(view, downscale)
     return crop_at(stage.crops, view, iteration).pixels(camera.width, camera.height)
 
 
-def target_at(stage: Stage, view: int, downscale: int, box: Box) -> Target:
+def make_target(stage: TrainingProblem, view: int, downscale: int, box: PixelBox) -> TrainingTarget:
     """A part of a view's photograph, on the stage's device."""
     image, mask = stage.images.get(view, downscale)
     whole, (left, top, right, bottom) = stage.images.camera(view, downscale), box
-    camera, inside = part_of(whole, box), (slice(top, bottom), slice(left, right))
+    camera, inside = crop_camera(whole, box), (slice(top, bottom), slice(left, right))
     # Counted and cut where the photograph is, before it is brought to the device.
-    of_whole = counted_in(mask, whole)
+    of_whole = count_valid_pixels(mask, whole)
     mask = None if mask is None else mask[inside]
-    share = 1.0 if camera is whole else counted_in(mask, camera) / max(of_whole, 1)
+    share = 1.0 if camera is whole else count_valid_pixels(mask, camera) / max(of_whole, 1)
     image = upload(image[inside], stage.device)
-    return Target(image=image, mask=None if mask is None else upload(mask, stage.device), camera=camera, share=share)
+    return TrainingTarget(
+        image=image, mask=None if mask is None else upload(mask, stage.device), camera=camera, share=share
+    )
 
 
-def part_of(whole: Camera, box: Box) -> Camera:
+def crop_camera(whole: Camera, box: PixelBox) -> Camera:
     """The camera of a part of a picture; itself for all of it."""
     return whole if box == (0, 0, whole.width, whole.height) else whole.cropped(*box)
 
 
-def counted_in(mask: UInt8[Tensor, "h w"] | None, camera: Camera) -> int:
+def count_valid_pixels(mask: UInt8[Tensor, "h w"] | None, camera: Camera) -> int:
     """How many pixels of a picture count."""
     return camera.width * camera.height if mask is None else int(mask.count_nonzero())

@@ -1,4 +1,4 @@
-"""The training loop: one for the coarse stage and for blocks; what differs is data (`Stage`).
+"""The training loop: one for the coarse stage and for blocks; what differs is data (`TrainingProblem`).
 
 Each step is a function of the state and the iteration number, and everything random is drawn from (seed, iteration).
 A run that is stopped and continued is therefore the run that was not.
@@ -16,30 +16,30 @@ from torch import Tensor
 
 from vdgs.errors import TrainingDiverged
 from vdgs.geometry.camera import Camera
-from vdgs.kernels import choose
+from vdgs.kernels import get_backend
 from vdgs.kernels.kernel_types import DecoderWeights, OrderedSplats, SplatGradients
-from vdgs.model.renderer import decode_rows_to_train, visible_rows
-from vdgs.model.scale_bounds import SPREAD
-from vdgs.training.densification_step import grow, reorder
-from vdgs.training.gradient_roi import narrow
-from vdgs.training.objective import compare
-from vdgs.training.optimizer import rates_at
+from vdgs.model.renderer import cull_anchors, decode_anchors_for_training
+from vdgs.model.scale_bounds import MAX_OFFSET_FACTOR
+from vdgs.training.densification_step import densify, sort_morton
+from vdgs.training.gradient_roi import crop_to_gradient_support
+from vdgs.training.objective import compute_loss
+from vdgs.training.optimizer import learning_rates_at
 from vdgs.training.schedule import downscale_at, view_at
-from vdgs.training.target import background_at, box_at, part_of, target_at
-from vdgs.training.training_state import Stage, StepReport, TrainingState
-from vdgs.training.training_step import coast_anchors, draw_view, move_anchors
-from vdgs.training.weight_averaging import Average, counts_in_mean
+from vdgs.training.target import background_at, crop_box, crop_camera, make_target
+from vdgs.training.training_state import StepReport, TrainingProblem, TrainingState
+from vdgs.training.training_step import backward_and_step, render_for_training, step_unseen_anchors
+from vdgs.training.weight_averaging import ModelAverage, is_averaged_step
 
 #: How much of the value before is kept at each step.
-KEEP_LOSS, KEEP_PSNR = 0.98, 0.9
+LOSS_DECAY, PSNR_DECAY = 0.98, 0.9
 
 
-def smoothed(before: float, value: float, keep: float) -> float:
+def exponential_mean(before: float, value: float, decay: float) -> float:
     """The exponential mean after one more value; NaN before the first."""
-    return value if math.isnan(before) else keep * before + (1 - keep) * value
+    return value if math.isnan(before) else decay * before + (1 - decay) * value
 
 
-def psnr_of(
+def training_psnr(
     image: Float[Tensor, "h w 3"], target: UInt8[Tensor, "h w 3"], mask: UInt8[Tensor, "h w"] | None
 ) -> float | None:
     """PSNR of a training view in dB; None where the mask keeps nothing."""
@@ -51,14 +51,14 @@ def psnr_of(
 #: Camera height above the ground to which volumes are referred, so that the volume term means the same in any unit.
 REFERENCE_HEIGHT = 10.0
 #: Every so many iterations anchors are put into Morton order, so that neighbours in space are neighbours in memory.
-REORDER_INTERVAL = 1000
+SORT_INTERVAL = 1000
 #: Every so many iterations sizes are brought back below their bounds, and whenever a model is averaged or complete.
 BOUND_INTERVAL = 10
 #: Every so many iterations the PSNR of the training view is taken, for people.
-PSNR_INTERVAL = 10
+PSNR_LOG_INTERVAL = 10
 
 
-def train_step(state: TrainingState, stage: Stage) -> StepReport:
+def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
     """One step: render a training view, compare, move what was visible, count, perhaps grow.
 
     Changes `state` in place. Raises TrainingDiverged if the loss or a gradient is not finite.
@@ -66,18 +66,18 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
     config, iteration = stage.config, state.iteration
     downscale = downscale_at(iteration, config)
     view = view_at(iteration, stage.image_count, config.seed, stage.shares)
-    box = box_at(stage, view, downscale, iteration)
-    camera = part_of(stage.images.camera(view, downscale), box)
+    box = crop_box(stage, view, downscale, iteration)
+    camera = crop_camera(stage.images.camera(view, downscale), box)
 
-    rows = visible_rows(state.anchors, camera)
-    weights = state.decoder.for_image(appearance_at(stage, view))
+    rows = cull_anchors(state.anchors, camera)
+    weights = state.decoder.weights_for_image(image_index_at(stage, view))
     background = background_at(stage, iteration)
     with torch.no_grad():
-        splats = decode_rows_to_train(state.anchors, rows, weights, camera)
-        target = target_at(stage, view, downscale, narrow(stage, splats, camera, box))
+        splats = decode_anchors_for_training(state.anchors, rows, weights, camera)
+        target = make_target(stage, view, downscale, crop_to_gradient_support(stage, splats, camera, box))
         around = _surroundings(stage, view, camera, target.camera)
-        drawn = draw_view(splats, target.camera, background, around)
-    compared = compare(drawn, target, state.decoder, appearance_at(stage, view), config)
+        drawn = render_for_training(splats, target.camera, background, around)
+    compared = compute_loss(drawn, target, state.decoder, image_index_at(stage, view), config)
     volume_weight, loss = _volume_weight(stage), compared.loss
     if volume_weight and len(drawn.source):
         loss = loss + volume_weight * drawn.volume
@@ -86,25 +86,27 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
     if not math.isfinite(value):
         raise TrainingDiverged(f"The loss is {value} at iteration {iteration + 1}.")
     gradients = drawn.backward(compared.image, volume_weight)
-    psnr = psnr_of(compared.shown, target.image, target.mask) if (iteration + 1) % PSNR_INTERVAL == 0 else None
+    psnr = (
+        training_psnr(compared.shown, target.image, target.mask) if (iteration + 1) % PSNR_LOG_INTERVAL == 0 else None
+    )
     state.whole = False
     _move(state, stage, rows, gradients, weights, camera)
 
     growing = iteration + 1 <= config.growth.until * config.iterations
-    if growing and iteration + 1 > config.growth.statistics_from:
+    if growing and iteration + 1 > config.growth.stats_start:
         # Seen is what V counts too: an anchor beside the picture may touch it, but is not to blame for showing nothing.
-        kernels = choose(stage.device)
+        kernels = get_backend(stage.device)
         inside = kernels.mark_visible(state.anchors.positions[rows], camera)
         kernels.add_view_statistics(
-            state.statistics, rows, inside, drawn.source, drawn.opacities, gradients.means_px, *camera.whole_size
+            state.statistics, rows, inside, drawn.source, drawn.opacities, gradients.means_px, *camera.full_size
         )
     state.iteration += 1
     report = StepReport(loss=value, l1=l1, ssim=ssim, visible=len(rows), splats=len(drawn.source))
     if growing and state.iteration >= config.growth.start and state.iteration % config.growth.interval == 0:
-        report = replace(report, **grow(state, stage))
-    if state.iteration % REORDER_INTERVAL == 0:
-        reorder(state)
-    last, averaged = state.iteration == config.iterations, counts_in_mean(state.iteration, config)
+        report = replace(report, **densify(state, stage))
+    if state.iteration % SORT_INTERVAL == 0:
+        sort_morton(state)
+    last, averaged = state.iteration == config.iterations, is_averaged_step(state.iteration, config)
     if state.iteration % BOUND_INTERVAL == 0 or averaged or last:
         _bound_sizes(state)
     if averaged:
@@ -115,41 +117,46 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
 
 
 @torch.no_grad()
-def _surroundings(stage: Stage, view: int, camera: Camera, part: Camera) -> OrderedSplats | None:
+def _surroundings(stage: TrainingProblem, view: int, camera: Camera, part: Camera) -> OrderedSplats | None:
     """The splats in a part of a view of the frozen anchors around a block: drawn, but out of autograd's sight."""
     around = stage.surroundings
     if around is None or not len(around.anchors):
         return None
-    weights = around.decoder.for_image(appearance_at(stage, view))
+    weights = around.decoder.weights_for_image(image_index_at(stage, view))
     # Of anchors that the whole view shows: one that strews its Gaussians may stand beside the part that they cover.
-    return decode_rows_to_train(around.anchors, visible_rows(around.anchors, camera), weights, part)
+    return decode_anchors_for_training(around.anchors, cull_anchors(around.anchors, camera), weights, part)
 
 
-def appearance_at(stage: Stage, view: int) -> int:
+def image_index_at(stage: TrainingProblem, view: int) -> int:
     """The number of a view among all training images of the capture."""
-    return view if stage.appearance_of is None else stage.appearance_of[view]
+    return view if stage.image_indices is None else stage.image_indices[view]
 
 
-def _volume_weight(stage: Stage) -> float:
+def _volume_weight(stage: TrainingProblem) -> float:
     """Weight of the mean volume in the loss, for the unit of this scene."""
-    return stage.config.loss.volume_weight / (stage.camera_height / REFERENCE_HEIGHT) ** 3
+    return stage.config.loss.volume_reg / (stage.camera_height / REFERENCE_HEIGHT) ** 3
 
 
 def _move(
-    state: TrainingState, stage: Stage, rows: Tensor, gradients: SplatGradients, weights: DecoderWeights, camera: Camera
+    state: TrainingState,
+    stage: TrainingProblem,
+    rows: Tensor,
+    gradients: SplatGradients,
+    weights: DecoderWeights,
+    camera: Camera,
 ) -> None:
     """One step of Adam for the visible anchors (where it is dense, for all) and the decoder."""
     config, step = stage.config, state.iteration + 1
-    rates = rates_at(config.rates, state.iteration / config.iterations)
-    states, updates = state.optimiser.anchor_states(state.anchors, rates, config.early), state.optimiser.updates
-    dense = config.adam == "dense"
+    rates = learning_rates_at(config.rates, state.iteration / config.iterations)
+    states, updates = state.optimizer.anchor_states(state.anchors, rates, config.early), state.optimizer.updates
+    dense = config.optimizer == "dense"
     if dense:
         updates.fill_(state.iteration)
-    finite = move_anchors(state.anchors, rows, gradients, weights, camera, states, updates, stage.mobility)
+    finite = backward_and_step(state.anchors, rows, gradients, weights, camera, states, updates, stage.lr_mask)
     if dense:
-        coast_anchors(state.anchors, rows, states, step, stage.mobility)
+        step_unseen_anchors(state.anchors, rows, states, step, stage.lr_mask)
         updates.fill_(step)
-    finite = state.optimiser.update_decoder(state.decoder, rates, step) & finite
+    finite = state.optimizer.update_decoder(state.decoder, rates, step) & finite
     if not finite:
         raise TrainingDiverged(f"A gradient is not a finite number at iteration {step}.")
 
@@ -159,23 +166,23 @@ def _bound_sizes(state: TrainingState) -> None:
     """Let no Gaussian be larger than pictures can show (the decoder only makes an anchor's scales smaller), nor an
     anchor strew them: the unit of its offsets is bounded too."""
     offsets, sizes = state.anchors.log_scales[:, :3], state.anchors.log_scales[:, 3:]
-    torch.minimum(sizes, state.largest[:, None], out=sizes)
-    torch.minimum(offsets, state.largest[:, None] + math.log(SPREAD), out=offsets)
+    torch.minimum(sizes, state.max_log_scale[:, None], out=sizes)
+    torch.minimum(offsets, state.max_log_scale[:, None] + math.log(MAX_OFFSET_FACTOR), out=offsets)
 
 
 def _average(state: TrainingState) -> None:
     """Count the model in the mean that the stage ends with."""
     if state.average is None:
-        state.average = Average.of(state.anchors, state.decoder)
+        state.average = ModelAverage.of(state.anchors, state.decoder)
     else:
         state.average.add(state.anchors, state.decoder)
 
 
 def _smooth(state: TrainingState, loss: float, psnr: float | None) -> None:
     """Update the smoothed loss and, where it was taken, PSNR (for people and for the divergence check)."""
-    state.loss = smoothed(state.loss, loss, KEEP_LOSS)
+    state.loss = exponential_mean(state.loss, loss, LOSS_DECAY)
     if psnr is not None:
-        state.psnr = smoothed(state.psnr, psnr, KEEP_PSNR)
+        state.psnr = exponential_mean(state.psnr, psnr, PSNR_DECAY)
     if state.iteration > 100:
         state.best_loss = min(state.best_loss, state.loss)
         if state.loss > 0.3 and state.loss > 4 * state.best_loss:
@@ -186,7 +193,7 @@ def _smooth(state: TrainingState, loss: float, psnr: float | None) -> None:
 
 def train(
     state: TrainingState,
-    stage: Stage,
+    stage: TrainingProblem,
     *,
     stop: Callable[[], bool],
     after_step: Callable[[TrainingState, StepReport], None],

@@ -1,4 +1,4 @@
-"""What training works on (`Stage`, the same for all iterations) and what changes (`TrainingState`, explicit and whole).
+"""What training works on (`TrainingProblem`, the same for all iterations) and what changes (`TrainingState`, explicit and whole).
 
 A state that is saved and loaded continues with the same bits.
 """
@@ -15,16 +15,16 @@ from torch import Tensor
 
 from vdgs.config.method import TrainConfig
 from vdgs.geometry.camera import Camera
-from vdgs.kernels.kernel_types import Statistics
+from vdgs.kernels.kernel_types import DensificationStats
 from vdgs.model.anchor_model import AnchorModel, ModelMetadata
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.system.checkpoints import SavedState
-from vdgs.training.compensation import Compensation
+from vdgs.system.checkpoints import Checkpoint
+from vdgs.training.compensation import CompensationState
 from vdgs.training.crops import Crop
-from vdgs.training.optimizer import Moments, Optimiser
-from vdgs.training.per_anchor_tensors import Group
-from vdgs.training.weight_averaging import Average
+from vdgs.training.optimizer import AdamMoments, AnchorOptimizer
+from vdgs.training.per_anchor_tensors import TensorGroup
+from vdgs.training.weight_averaging import ModelAverage
 
 #: What is trained: the whole scene, or one block of it.
 StageKind = Literal["coarse", "block"]
@@ -46,14 +46,14 @@ class TrainingState:
     iteration: int
     anchors: Anchors
     decoder: Decoder
-    statistics: Statistics
-    optimiser: Optimiser
+    statistics: DensificationStats
+    optimizer: AnchorOptimizer
     #: Largest log-scale that Gaussians of each anchor may have, [n] (`model.sizes`): anchors never move.
-    largest: Tensor
+    max_log_scale: Tensor
     #: Remembered gradients of compensated growth; None where growth is plain.
-    compensation: Compensation | None = None
+    compensation: CompensationState | None = None
     #: Mean of the last models, once it has begun (`averaging.counts_in_mean`).
-    average: Average | None = None
+    average: ModelAverage | None = None
     #: Smoothed loss, the smallest it has been, smoothed PSNR: of what is drawn of training views.
     loss: float = math.nan
     best_loss: float = math.inf
@@ -64,13 +64,13 @@ class TrainingState:
     #: False while a step changes tensors: one that is broken off there leaves no state that may be saved.
     whole: bool = True
 
-    def groups(self) -> dict[str, Group]:
+    def groups(self) -> dict[str, TensorGroup]:
         """All that is kept per anchor, by the names under which it is saved."""
-        moments = self.optimiser.anchors
+        moments = self.optimizer.anchors
         groups = {
             "anchors": self.anchors.tensors(), "statistics": self.statistics.tensors(),
             "first.anchors": moments.first, "second.anchors": moments.second,
-            "updates": {"anchors": self.optimiser.updates}, "largest": {"log_scale": self.largest},
+            "updates": {"anchors": self.optimizer.updates}, "largest": {"log_scale": self.max_log_scale},
         }  # fmt: skip
         if self.compensation is not None:
             groups["compensation"] = self.compensation.tensors()
@@ -78,20 +78,20 @@ class TrainingState:
             groups["average.anchors"] = self.average.anchors
         return groups
 
-    def take_groups(self) -> dict[str, Group]:
+    def take_groups(self) -> dict[str, TensorGroup]:
         """`groups`, which the state no longer holds: see `per_anchor.remap`."""
         groups = {name: dict(group) for name, group in self.groups().items()}
         self.put_groups({name: {key: t[:0] for key, t in group.items()} for name, group in groups.items()})
         return groups
 
-    def put_groups(self, groups: dict[str, Group]) -> None:
+    def put_groups(self, groups: dict[str, TensorGroup]) -> None:
         """The inverse of `take_groups`."""
-        self.anchors, self.statistics = Anchors(**groups["anchors"]), Statistics(**groups["statistics"])
-        self.optimiser.anchors = Moments(groups["first.anchors"], groups["second.anchors"])
-        self.optimiser.updates = groups["updates"]["anchors"]
-        self.largest = groups["largest"]["log_scale"]
+        self.anchors, self.statistics = Anchors(**groups["anchors"]), DensificationStats(**groups["statistics"])
+        self.optimizer.anchors = AdamMoments(groups["first.anchors"], groups["second.anchors"])
+        self.optimizer.updates = groups["updates"]["anchors"]
+        self.max_log_scale = groups["largest"]["log_scale"]
         if self.compensation is not None:
-            self.compensation = Compensation(**groups["compensation"])
+            self.compensation = CompensationState(**groups["compensation"])
         if self.average is not None:
             self.average.anchors = groups["average.anchors"]
 
@@ -110,12 +110,16 @@ class TrainingState:
         """The model of `result`."""
         anchors, decoder = self.result()
         return AnchorModel(
-            anchors=anchors, decoder=decoder, voxel=voxel, background=background, metadata=metadata or ModelMetadata()
+            anchors=anchors,
+            decoder=decoder,
+            voxel_size=voxel,
+            background=background,
+            metadata=metadata or ModelMetadata(),
         )
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class FrozenAnchors:
     """Anchors that stay as they are, with the decoder that they were trained with."""
 
     anchors: Anchors
@@ -123,13 +127,13 @@ class Surroundings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stage:
+class TrainingProblem:
     """What training works on: the same for all iterations."""
 
     config: TrainConfig
     images: TrainingImages
     image_count: int
-    voxel: float
+    voxel_size: float
     #: How high the cameras fly above the ground, or how far they are from the scene (`captures.heights`), in units of
     #: the ground frame.
     camera_height: float
@@ -140,15 +144,15 @@ class Stage:
     #: A block may leave the decoder as it is.
     frozen_decoder: bool = False
     #: The largest log-scale of Gaussians of anchors at places [p, 3]; None: any.
-    largest: Callable[[Tensor], Tensor] | None = None
+    max_log_scale: Callable[[Tensor], Tensor] | None = None
     #: What is drawn and never moves: ring and context of a block.
-    surroundings: Surroundings | None = None
+    surroundings: FrozenAnchors | None = None
     #: Which places [p, 3] may get new anchors; None: all.
     may_hold: Callable[[Tensor], Tensor] | None = None
     #: How far the anchors at places [p, 3] move, from 0 to 1 of a full step; None: all of it.
-    mobility: Callable[[Tensor], Tensor] | None = None
+    lr_mask: Callable[[Tensor], Tensor] | None = None
     #: Which training image of the whole capture each view is (for its appearance); None: the same number.
-    appearance_of: Sequence[int] | None = None
+    image_indices: Sequence[int] | None = None
     #: How often each view is used, in proportion; None: all alike.
     shares: tuple[float, ...] | None = None
     #: The part of each view to be drawn, or of that what a block's splats reach (`training.reach`); None: all of all.
@@ -156,9 +160,11 @@ class Stage:
     #: Where the arithmetic is done. Photographs and places come to it.
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
 
-    def largest_at(self, positions: Tensor) -> Tensor:
+    def max_log_scale_at(self, positions: Tensor) -> Tensor:
         """The largest log-scale [p] of Gaussians of anchors at places [p, 3]."""
-        return torch.full_like(positions[:, 0], math.inf) if self.largest is None else self.largest(positions)
+        return (
+            torch.full_like(positions[:, 0], math.inf) if self.max_log_scale is None else self.max_log_scale(positions)
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,7 +182,7 @@ class StepReport:
     cycle: dict[str, float | None] = field(default_factory=dict)
 
 
-def start_state(anchors: Anchors, decoder: Decoder, stage: Stage) -> TrainingState:
+def initial_state(anchors: Anchors, decoder: Decoder, stage: TrainingProblem) -> TrainingState:
     """A state before the first step. The anchors' tensors are moved in place: give copies of what must stay."""
     n, k, device = len(anchors), anchors.offsets.shape[1], anchors.positions.device
     for name, tensor in decoder.tensors().items():
@@ -184,54 +190,54 @@ def start_state(anchors: Anchors, decoder: Decoder, stage: Stage) -> TrainingSta
         # drift apart.
         shared = stage.kind == "block" and name.startswith(("appearance", "exposure"))
         tensor.requires_grad_(not stage.frozen_decoder and not shared)
-    compensation = Compensation.zeros(n, k, device) if stage.config.compensation.enabled else None
-    optimiser = Optimiser.start(anchors, decoder)
-    largest = stage.largest_at(anchors.positions)
-    statistics = Statistics.zeros(n, k, device)
+    compensation = CompensationState.zeros(n, k, device) if stage.config.compensation.enabled else None
+    optimiser = AnchorOptimizer.start(anchors, decoder)
+    largest = stage.max_log_scale_at(anchors.positions)
+    statistics = DensificationStats.zeros(n, k, device)
     return TrainingState(
-        iteration=0, anchors=anchors, decoder=decoder, statistics=statistics, optimiser=optimiser, largest=largest,
+        iteration=0, anchors=anchors, decoder=decoder, statistics=statistics, optimizer=optimiser, max_log_scale=largest,
         compensation=compensation,
     )  # fmt: skip
 
 
-def to_saved(state: TrainingState) -> SavedState:
+def to_checkpoint(state: TrainingState) -> Checkpoint:
     """The whole state as tensors and facts."""
     groups: dict[str, Mapping[str, Tensor]] = {**state.groups()}
     groups["decoder"] = {name: tensor.detach() for name, tensor in state.decoder.tensors().items()}
-    groups["first.decoder"] = state.optimiser.decoder.first
-    groups["second.decoder"] = state.optimiser.decoder.second
+    groups["first.decoder"] = state.optimizer.decoder.first
+    groups["second.decoder"] = state.optimizer.decoder.second
     if state.average is not None:
         groups["average.decoder"] = state.average.decoder
     tensors = {f"{name}.{key}": tensor for name, group in groups.items() for key, tensor in group.items()}
     facts = {"loss": repr(state.loss), "best_loss": repr(state.best_loss), "psnr": repr(state.psnr),
              "seconds": state.seconds, "peak_memory_bytes": state.peak_memory_bytes,
              "averaged": 0 if state.average is None else state.average.count}  # fmt: skip
-    return SavedState(state.iteration, facts, tensors)
+    return Checkpoint(state.iteration, facts, tensors)
 
 
-def result_from_saved(saved: SavedState) -> tuple[Anchors, Decoder]:
+def result_from_saved(saved: Checkpoint) -> tuple[Anchors, Decoder]:
     """As `TrainingState.result`, of a state that was saved."""
     anchors, averaged = _group(saved, "anchors"), bool(saved.facts.get("averaged", 0))
     anchors |= _group(saved, "average.anchors") if averaged else {}
     return Anchors(**anchors), Decoder.from_tensors(_group(saved, "average.decoder" if averaged else "decoder"))
 
 
-def _group(saved: SavedState, name: str) -> dict[str, Tensor]:
+def _group(saved: Checkpoint, name: str) -> dict[str, Tensor]:
     """The tensors of one group of a state that was saved, by their own names."""
     start = f"{name}."
     return {key.removeprefix(start): tensor for key, tensor in saved.tensors.items() if key.startswith(start)}
 
 
-def from_saved(saved: SavedState, stage: Stage) -> TrainingState:
-    """The inverse of `to_saved`, bit for bit, on the stage's device. Raises KeyError if a tensor is missing."""
+def from_checkpoint(saved: Checkpoint, stage: TrainingProblem) -> TrainingState:
+    """The inverse of `to_checkpoint`, bit for bit, on the stage's device. Raises KeyError if a tensor is missing."""
 
     def group(name: str) -> dict[str, Tensor]:
         return {key: tensor.to(stage.device) for key, tensor in _group(saved, name).items()}
 
-    state = start_state(Anchors(**group("anchors")), Decoder.from_tensors(group("decoder")), stage)
-    state.optimiser.decoder = Moments(group("first.decoder"), group("second.decoder"))
+    state = initial_state(Anchors(**group("anchors")), Decoder.from_tensors(group("decoder")), stage)
+    state.optimizer.decoder = AdamMoments(group("first.decoder"), group("second.decoder"))
     if averaged := saved.facts["averaged"]:
-        state.average = Average(averaged, group("average.anchors"), group("average.decoder"))
+        state.average = ModelAverage(averaged, group("average.anchors"), group("average.decoder"))
     state.put_groups({name: group(name) for name in state.groups()})
     state.iteration = saved.iteration
     state.loss, state.best_loss = float(saved.facts["loss"]), float(saved.facts["best_loss"])

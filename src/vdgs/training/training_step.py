@@ -2,7 +2,7 @@
 
 Autograd would hold a copy of the anchors in view and gradients beside all that they belong to. By hand, anchors are
 read where they stand, gradients of splats take the place of what is no longer needed, and an anchor moves as soon as
-its gradient is known. The bits are those of autograd through `decode` and `rasterise`, with Adam after it.
+its gradient is known. The bits are those of autograd through `decode` and `rasterize`, with Adam after it.
 """
 
 from __future__ import annotations
@@ -16,26 +16,26 @@ from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 from vdgs.geometry.camera import Camera
-from vdgs.kernels import choose
+from vdgs.kernels import get_backend
 from vdgs.kernels.kernel_types import (
     AdamState,
     DecoderWeights,
-    Finite,
+    IsFinite,
     OrderedSplats,
     RasterPullback,
-    Sources,
     SplatGradients,
+    SplatSources,
     TrainingSplats,
 )
-from vdgs.model.anchors import TRAINED, Anchors
+from vdgs.model.anchors import TRAINED_TENSORS, Anchors
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class TrainingView:
+class RenderedTrainingView:
     """A picture for training, and what the backward pass needs of the m splats of the anchors that are trained."""
 
     image: Float[Tensor, "h w 3"]
-    source: Sources
+    source: SplatSources
     colours: Float[Tensor, "m 3"]
     opacities: Float[Tensor, " m"]
     #: Mean volume of the splats; NaN if there are none.
@@ -46,7 +46,7 @@ class TrainingView:
 
     @torch.no_grad()
     def backward(self, image: Float[Tensor, "h w 3"], volume_weight: float) -> SplatGradients:
-        """Gradients of a loss: `image` by the picture, `volume_weight` by the mean volume. Call it once."""
+        """Gradients of a loss: `image` by the picture, `volume_reg` by the mean volume. Call it once."""
         m = len(self.source)
         found = self.pullback(image, None, None, over=self.room, count=m)
         # In float32, as autograd divides.
@@ -58,24 +58,24 @@ class TrainingView:
 
 
 @torch.no_grad()
-def draw_view(
+def render_for_training(
     splats: TrainingSplats,
     camera: Camera,
     background: Float[Tensor, "3"],
-    around: OrderedSplats | None = None,
-) -> TrainingView:
+    frozen_splats: OrderedSplats | None = None,
+) -> RenderedTrainingView:
     """Draw the splats of trained anchors with those `around` them. The tensors of `splats` are the view's from now on:
     their memory is used again."""
-    m, drawn = len(splats.source), splats if around is None else splats.joined(around)
-    kernels = choose(drawn.means_px.device)
-    raster, pullback = kernels.rasterise_vjp(drawn, background, camera.width, camera.height)
-    return TrainingView(
+    m, drawn = len(splats.source), splats if frozen_splats is None else splats.concat(frozen_splats)
+    kernels = get_backend(drawn.means_px.device)
+    raster, pullback = kernels.rasterize_vjp(drawn, background, camera.width, camera.height)
+    return RenderedTrainingView(
         image=raster.image, source=splats.source, colours=splats.colours, opacities=splats.opacities,
         volume=splats.volume, pullback=pullback, room=(drawn.means_px[:m], drawn.conics[:m]),
     )  # fmt: skip
 
 
-def move_anchors(
+def backward_and_step(
     anchors: Anchors,
     rows: Int64[Tensor, " v"],
     gradients: SplatGradients,
@@ -83,16 +83,16 @@ def move_anchors(
     camera: Camera,
     states: Sequence[AdamState],
     updates: Int32[Tensor, " n"],
-    mobility: Callable[[Tensor], Tensor] | None = None,
-) -> Finite:
+    lr_mask: Callable[[Tensor], Tensor] | None = None,
+) -> IsFinite:
     """Move the anchors of the given rows in place, and leave the decoder's gradients in its `.grad`.
 
-    `weights` are the decoder's as the view saw them, `states` those of `TRAINED`; `updates` counts how often each
-    anchor has moved; `mobility` is the learning-rate mask of `training.Stage`. False: a gradient is not finite, and
+    `weights` are the decoder's as the view saw them, `states` those of `TRAINED_TENSORS`; `updates` counts how often each
+    anchor has moved; `lr_mask` is the learning-rate mask of `training.Stage`. False: a gradient is not finite, and
     some anchors may have moved while others have not.
     """
-    slow = None if mobility is None else _SlowAnchors.of(anchors, rows, mobility)
-    finite, of_weights = choose(anchors.positions.device).decode_backward_adam(
+    slow = None if lr_mask is None else _SlowAnchors.of(anchors, rows, lr_mask)
+    finite, of_weights = get_backend(anchors.positions.device).decode_backward_adam(
         anchors.positions, states, weights, camera, rows, gradients, updates
     )
     if slow is not None:
@@ -117,27 +117,27 @@ class _Given(torch.autograd.Function):
 
 
 #: Rows that coast at a time: so many gradients of zero are held.
-COASTING = 2**14
+UNSEEN_CHUNK = 2**14
 
 
 @torch.no_grad()
-def coast_anchors(
+def step_unseen_anchors(
     anchors: Anchors,
     rows: Int64[Tensor, " v"],
     states: Sequence[AdamState],
     step: int,
-    mobility: Callable[[Tensor], Tensor] | None = None,
+    lr_mask: Callable[[Tensor], Tensor] | None = None,
 ) -> None:
     """Let every anchor but those of the given rows go on along its moments, in place: the step of Adam with no gradient
     that anchors make where a view does not show them and Adam is dense (Scaffold-GS, 3DGS).
 
-    `states` and `mobility` as in `move_anchors`; `step` counts from 1.
+    `states` and `lr_mask` as in `backward_and_step`; `step` counts from 1.
     """
     unseen = torch.ones_like(anchors.positions[:, 0], dtype=torch.bool).index_fill_(0, rows, False)
     rest = unseen.nonzero()[:, 0]
-    slow = None if mobility is None else _SlowAnchors.of(anchors, rest, mobility)
-    kernels = choose(anchors.positions.device)
-    for some in rest.split(COASTING):
+    slow = None if lr_mask is None else _SlowAnchors.of(anchors, rest, lr_mask)
+    kernels = get_backend(anchors.positions.device)
+    for some in rest.split(UNSEEN_CHUNK):
         for state in states:
             kernels.adam_rows(state, some, state.parameter.new_zeros(len(some), *state.parameter.shape[1:]), step)
     if slow is not None:
@@ -153,14 +153,14 @@ class _SlowAnchors:
     before: Anchors
 
     @staticmethod
-    def of(anchors: Anchors, rows: Tensor, mobility: Callable[[Tensor], Tensor]) -> _SlowAnchors:
-        share = mobility(anchors.positions[rows])
+    def of(anchors: Anchors, rows: Tensor, lr_mask: Callable[[Tensor], Tensor]) -> _SlowAnchors:
+        share = lr_mask(anchors.positions[rows])
         slow = (share < 1).nonzero()[:, 0]
         return _SlowAnchors(rows[slow], share[slow], anchors.select(rows[slow]))
 
     def hold_back(self, anchors: Anchors) -> None:
         """Take back the rest of the step, in place."""
-        for name in TRAINED:
+        for name in TRAINED_TENSORS:
             before, tensor = getattr(self.before, name), getattr(anchors, name)
             part = self.share.reshape(-1, *[1] * (before.ndim - 1))
             tensor[self.rows] = before + part * (tensor[self.rows] - before)

@@ -12,15 +12,15 @@ import torch
 from torch import Tensor
 
 from vdgs.config.method import TrainConfig
-from vdgs.model.anchors import TRAINED, Anchors
+from vdgs.model.anchors import TRAINED_TENSORS, Anchors
 from vdgs.model.decoder import Decoder
 
 #: The mean is one of about so many models: enough for it, and few enough to cost no time.
-MODELS = 100
+NUM_AVERAGED_MODELS = 100
 
 
 @dataclass
-class Average:
+class ModelAverage:
     """The mean of `count` models with the same anchors in the same order."""
 
     count: int
@@ -29,11 +29,11 @@ class Average:
     decoder: dict[str, Tensor]
 
     @staticmethod
-    def of(anchors: Anchors, decoder: Decoder) -> Average:
+    def of(anchors: Anchors, decoder: Decoder) -> ModelAverage:
         """The mean of one model, in tensors of its own."""
-        return Average(
+        return ModelAverage(
             1,
-            {name: getattr(anchors, name).clone() for name in TRAINED},
+            {name: getattr(anchors, name).clone() for name in TRAINED_TENSORS},
             {name: tensor.detach().clone() for name, tensor in decoder.tensors().items()},
         )
 
@@ -47,9 +47,9 @@ class Average:
             mean.lerp_(decoder.tensors()[name], 1 / self.count)
 
 
-def counts_in_mean(iteration: int, config: TrainConfig) -> bool:
-    """Whether the model after `iteration` steps is one of those averaged: about `MODELS`, evenly spread over the last
+def is_averaged_step(iteration: int, config: TrainConfig) -> bool:
+    """Whether the model after `iteration` steps is one of those averaged: about `NUM_AVERAGED_MODELS`, evenly spread over the last
     share `config.average` of the iterations, none of them before growth has ended; the very last one is."""
     begin = max(1 - config.average, config.growth.until) * config.iterations
-    every = max(1, round((config.iterations - begin) / MODELS))
+    every = max(1, round((config.iterations - begin) / NUM_AVERAGED_MODELS))
     return config.average > 0 and iteration > begin and (config.iterations - iteration) % every == 0

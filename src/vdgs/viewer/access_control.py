@@ -15,13 +15,13 @@ from http.cookies import CookieError, SimpleCookie
 from urllib.parse import parse_qs, urlsplit
 
 #: Names of the loopback address.
-LOOPBACK = ("localhost", "127.0.0.1", "::1")
+LOOPBACK_HOSTS = ("localhost", "127.0.0.1", "::1")
 #: Hosts that stand for all addresses of this machine.
-ALL = ("", "0.0.0.0", "::")
+ALL_INTERFACES = ("", "0.0.0.0", "::")
 
 
 @dataclass(frozen=True)
-class Door:
+class AccessControl:
     """Decides over each request by its path and its headers."""
 
     host: str
@@ -30,28 +30,30 @@ class Door:
     port: int
 
     @property
-    def cookie(self) -> str:
+    def cookie_name(self) -> str:
         """The cookie's name: browsers do not tell ports apart."""
         return f"vdgs_view_{self.port}"
 
     def address(self) -> str:
         """What to open in a browser on this machine."""
-        return self._address("localhost" if self.host in ALL else self.host)
+        return self._url("localhost" if self.host in ALL_INTERFACES else self.host)
 
-    def address_elsewhere(self) -> str | None:
+    def network_url(self) -> str | None:
         """What to open on another machine, by the name of this one, where `address` does not do there; None where it
         does, where no other machine can come in, and where this one has no name."""
         name = socket.gethostname()
-        return self._address(name) if self.host in ALL and name.partition(".")[0] not in ("", "localhost") else None
+        return (
+            self._url(name) if self.host in ALL_INTERFACES and name.partition(".")[0] not in ("", "localhost") else None
+        )
 
-    def _address(self, name: str) -> str:
+    def _url(self, name: str) -> str:
         name = f"[{name}]" if ":" in name else name
         return f"http://{name}:{self.port}/" + (f"?token={self.token}" if self.token else "")
 
-    def refusal(self, path: str, headers: Mapping[str, str]) -> str | None:
+    def deny_reason(self, path: str, headers: Mapping[str, str]) -> str | None:
         """Why a request may not come in; None if it may."""
         host = headers.get("Host", "")
-        if self.token is None and name_of(host) not in (*LOOPBACK, self.host):
+        if self.token is None and hostname_from_header(host) not in (*LOOPBACK_HOSTS, self.host):
             return "This server answers only to the name of this machine. Start it with --host to open it to others."
         origin = headers.get("Origin")
         if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
@@ -65,20 +67,20 @@ class Door:
         given = parse_qs(urlsplit(path).query).get("token", [""])[0]
         return self.token is not None and hmac.compare_digest(given.encode(), self.token.encode())
 
-    def set_cookie(self) -> str:
+    def set_cookie_header(self) -> str:
         """The header's value that lets the browser in from now on: for this site's own requests only."""
-        return f"{self.cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
+        return f"{self.cookie_name}={self.token}; HttpOnly; SameSite=Strict; Path=/"
 
     def _has_cookie(self, header: str) -> bool:
         try:
-            found = SimpleCookie(header).get(self.cookie)
+            found = SimpleCookie(header).get(self.cookie_name)
         except CookieError:
             return False
         assert self.token is not None
         return found is not None and hmac.compare_digest(found.value.encode(), self.token.encode())
 
 
-def name_of(host: str) -> str:
+def hostname_from_header(host: str) -> str:
     """The name in a Host header, without its port: "localhost" of "localhost:8080", "::1" of "[::1]:8080"."""
     try:
         return (urlsplit(f"//{host}").hostname or "").lower()
@@ -88,4 +90,4 @@ def name_of(host: str) -> str:
 
 def is_loopback(host: str) -> bool:
     """Only this machine reaches it."""
-    return host in LOOPBACK or host.startswith("127.")
+    return host in LOOPBACK_HOSTS or host.startswith("127.")

@@ -14,48 +14,48 @@ from rich.console import Console
 from vdgs.captures.camera_height import FOV_DEG, camera_height
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
-from vdgs.system.memory.process_memory import available_bytes
+from vdgs.system.memory.process_memory import available_memory_bytes
 from vdgs.viewer import navigation, overlays
-from vdgs.viewer.layers import LAYERS, Layer, Painter, Shown
-from vdgs.viewer.navigation import Stand
+from vdgs.viewer.layers import LAYERS, DisplayOptions, Layer, Painter
+from vdgs.viewer.navigation import CameraPose
 from vdgs.viewer.path_panel import PathPanel
-from vdgs.viewer.point_panel import PlacePanel
-from vdgs.viewer.render_scheduler import Frame, Studio
-from vdgs.viewer.viewer_scene import Scene
+from vdgs.viewer.point_panel import PointPanel
+from vdgs.viewer.render_scheduler import RenderedFrame, RenderScheduler
+from vdgs.viewer.viewer_scene import ViewerScene
 
 #: What layers are called in the panel.
-NAMES: dict[str, Layer] = {
+LAYER_LABELS: dict[str, Layer] = {
     "Colour": "colour", "Depth": "depth", "V: cameras that see it": "visibility", "Alpha: how opaque": "alpha",
     "Blocks": "blocks", "Error against nearest photograph": "error",
 }  # fmt: skip
-MODELS = {"Merged": "merged", "Coarse": "coarse", "Side by side": "both"}
+MODEL_LABELS = {"Merged": "merged", "Coarse": "coarse", "Side by side": "both"}
 #: JPEG quality of quick pictures and of full ones.
-_QUICK_QUALITY, _FULL_QUALITY = 70, 92
+_PREVIEW_QUALITY, _FULL_QUALITY = 70, 92
 _LEGEND_PX = 300
 #: Farther from where a photograph was taken than this share of the camera height, it no longer lies over the model.
-_AT_PHOTOGRAPH = 2e-3
+_IMAGE_POSE_TOLERANCE = 2e-3
 
 
-class Visitor:
+class ClientSession:
     """Between one browser and the studio. Callbacks of the browser come in any thread."""
 
-    def __init__(self, client: Any, scene: Scene, studio: Studio, console: Console) -> None:
-        self.client, self.scene, self.studio, self._console = client, scene, studio, console
+    def __init__(self, client: Any, scene: ViewerScene, scheduler: RenderScheduler, console: Console) -> None:
+        self.client, self.scene, self.scheduler, self._console = client, scene, scheduler, console
         self._lock = threading.RLock()
-        self._shown = Shown(model=scene.names[0])
+        self._shown = DisplayOptions(model=scene.names[0])
         self._camera: Camera | None = None
         # Found once: with another limit at every move, a camera that rests would seem to be another one.
-        self._most_px = navigation.most_pixels(available_bytes())
+        self._most_px = navigation.max_render_pixels(available_memory_bytes())
         self._arrived = False
         self._legend_of: object = None
         self.painter = Painter(scene)
-        self._seat = studio.seat(self.painter, self._deliver, self._failed)
+        self._seat = scheduler.add_session(self.painter, self._send_frame, self._on_render_error)
         self._build()
-        client.camera.on_update(lambda _: self._moved())
-        client.scene.on_click()(lambda event: self.place.clicked(event.screen_pos))
+        client.camera.on_update(lambda _: self._on_camera_moved())
+        client.scene.on_click()(lambda event: self.place.on_click(event.screen_pos))
         height = camera_height(scene.capture)
         client.camera.min_orbit_distance, client.camera.max_orbit_distance = 1e-3 * height, 200 * height
-        self._moved()
+        self._on_camera_moved()
 
     # ------------------------------------------------------------------------------------- what they see
 
@@ -65,45 +65,45 @@ class Visitor:
         return self._camera
 
     @property
-    def shown(self) -> Shown:
+    def shown(self) -> DisplayOptions:
         return self._shown
 
     @property
-    def stand(self) -> Stand:
+    def stand(self) -> CameraPose:
         """Where they are and what they look at."""
-        return Stand(np.array(self.client.camera.position), np.array(self.client.camera.look_at))
+        return CameraPose(np.array(self.client.camera.position), np.array(self.client.camera.look_at))
 
     def show(self, **changes: Any) -> None:
         """See something else from the same place."""
         with self._lock:
             self._shown = replace(self._shown, **changes)
             if self._camera is not None:
-                self.studio.ask(self._seat, self._camera, self._shown)
+                self.scheduler.request_frame(self._seat, self._camera, self._shown)
 
-    def go(self, stand: Stand, fov: float | None = None) -> None:
+    def move_to(self, pose: CameraPose, fov: float | None = None) -> None:
         """Stand elsewhere."""
         camera = self.client.camera
         with self.client.atomic():
             camera.up_direction = (0.0, 0.0, 1.0)
-            camera.position = tuple(stand.position)
-            camera.look_at = tuple(stand.look_at)
+            camera.position = tuple(pose.position)
+            camera.look_at = tuple(pose.look_at)
             if fov is not None:
                 camera.fov = float(fov)
-        self._moved(theirs=False)
+        self._on_camera_moved(from_browser=False)
 
-    def look_from(self, index: int) -> None:
+    def view_image(self, index: int) -> None:
         """Stand where a photograph was taken, with the photograph over the model."""
         taken = self.scene.capture.views[index].camera
         with self._lock:
             self._arrived = False
             self._shown = replace(self._shown, photograph=index)
             self._photograph.visible = True
-        self.go(
-            navigation.stand_of(taken, camera_height(self.scene.capture)),
-            navigation.fov_for(taken, self.client.camera.aspect),
+        self.move_to(
+            navigation.pose_from_camera(taken, camera_height(self.scene.capture)),
+            navigation.fov_to_fit(taken, self.client.camera.aspect),
         )
 
-    def model_changed(self) -> None:
+    def on_model_changed(self) -> None:
         """The run has a newer model."""
         names = ["both", *self.scene.names] if len(self.scene.names) > 1 else [*self.scene.names]
         model = self._shown.model if self._shown.model in names else self.scene.names[0]
@@ -118,76 +118,76 @@ class Visitor:
 
     def leave(self) -> None:
         self.path.stop()
-        self.studio.leave(self._seat)
+        self.scheduler.leave(self._seat)
 
-    def _moved(self, theirs: bool = True) -> None:
+    def _on_camera_moved(self, from_browser: bool = True) -> None:
         """Draw for where the camera is now: by the browser (`theirs`), which may still send older news after we told it
         to go elsewhere, or by us."""
         state = self.client.camera
         try:
-            camera = navigation.camera_of(
+            camera = navigation.camera_from_browser(
                 state.wxyz, state.position, state.fov, int(state.image_width), int(state.image_height)
             )
         except (ValueError, AssertionError):  # a canvas that is just being laid out
             return
-        camera = navigation.drawable(camera, self._most_px)
+        camera = navigation.limit_resolution(camera, self._most_px)
         with self._lock:
-            if self._camera is not None and is_same(camera, self._camera):
+            if self._camera is not None and is_same_view(camera, self._camera):
                 return  # the browser tells again what we know: the camera rests
             self._camera = camera
-            if theirs:
+            if from_browser:
                 self._leave_photograph(camera)
-            self.studio.ask(self._seat, camera, self._shown)
+            self.scheduler.request_frame(self._seat, camera, self._shown)
 
     def _leave_photograph(self, camera: Camera) -> None:
         index = self._shown.photograph
         if index is None:
             return
         away = float(np.linalg.norm(self.scene.capture.views[index].camera.position - camera.position))
-        if away <= _AT_PHOTOGRAPH * camera_height(self.scene.capture):
+        if away <= _IMAGE_POSE_TOLERANCE * camera_height(self.scene.capture):
             self._arrived = True
         elif self._arrived:
             self._shown = replace(self._shown, photograph=None)
             self._photograph.visible = False
 
-    def _deliver(self, frame: Frame) -> None:
+    def _send_frame(self, frame: RenderedFrame) -> None:
         """Send a picture, and its legend once the camera rests. In the studio's thread."""
-        quality = _FULL_QUALITY if frame.full else _QUICK_QUALITY
+        quality = _FULL_QUALITY if frame.full else _PREVIEW_QUALITY
         self.client.scene.set_background_image(frame.picture, format="jpeg", jpeg_quality=quality)
         self.client.flush()
         if frame.full:
             self._show_legend(frame.shown)
 
-    def _show_legend(self, shown: Shown) -> None:
-        if shown.layer in ("colour", "blocks"):
+    def _show_legend(self, display: DisplayOptions) -> None:
+        if display.layer in ("colour", "blocks"):
             self._legend.visible = False
             return
-        scale = self.painter.scale(shown)
+        scale = self.painter.scale(display)
         if scale is None:
             return
-        if self._legend_of != (shown.layer, shown.model, scale.low, scale.high):
-            from vdgs.rendering.colorbar import legend
+        if self._legend_of != (display.layer, display.model, scale.low, scale.high):
+            from vdgs.rendering.colorbar import draw_colorbar
 
-            self._legend.image = np.ascontiguousarray(legend(scale, _LEGEND_PX, 0))
-            self._legend_of = (shown.layer, shown.model, scale.low, scale.high)
+            self._legend.image = np.ascontiguousarray(draw_colorbar(scale, _LEGEND_PX, 0))
+            self._legend_of = (display.layer, display.model, scale.low, scale.high)
         self._legend.visible = True
 
-    def _failed(self, error: Exception) -> None:
+    def _on_render_error(self, error: Exception) -> None:
         """What they asked for cannot be drawn: say why, and show colours again."""
         self.notify("This cannot be drawn", str(error))
         if not isinstance(error, VdgsError):
             self._console.print(f"[yellow]warning[/] a picture could not be drawn: {error!r}", highlight=False)
         if self._shown.layer != "colour" or self._shown.photograph is not None:
-            self._layer.value = next(iter(NAMES))
+            self._layer.value = next(iter(LAYER_LABELS))
             self.show(layer="colour", photograph=None)
 
     def notify(self, title: str, body: str) -> None:
         self.client.add_notification(title, body, auto_close_seconds=8.0)
 
-    def errand(self, do: Callable[[], Any]) -> Any:
+    def submit(self, function: Callable[[], Any]) -> Any:
         """Have something done by the studio; None, and the visitor told, where it fails for a reason to be told."""
         try:
-            return self.studio.errand(do).result()
+            return self.scheduler.submit(function).result()
         except VdgsError as error:
             self.notify("This cannot be shown", str(error))
         except CancelledError:
@@ -198,11 +198,11 @@ class Visitor:
 
     def _build(self) -> None:
         gui = self.client.gui
-        self._layer = gui.add_dropdown("Layer", tuple(NAMES), hint=f"What is drawn: one of {len(LAYERS)} layers")
-        self._layer.on_update(lambda _: self.show(layer=NAMES[self._layer.value]))
+        self._layer = gui.add_dropdown("Layer", tuple(LAYER_LABELS), hint=f"What is drawn: one of {len(LAYERS)} layers")
+        self._layer.on_update(lambda _: self.show(layer=LAYER_LABELS[self._layer.value]))
         self._legend = gui.add_image(np.full((2, _LEGEND_PX, 3), 255, np.uint8), format="png", visible=False)
         several = len(self.scene.names) > 1
-        self._models = gui.add_dropdown("Model", tuple(MODELS), visible=several)
+        self._models = gui.add_dropdown("Model", tuple(MODEL_LABELS), visible=several)
         self._models.on_update(lambda _: self._choose_model())
         self._split = gui.add_slider("Coarse | merged", 0.0, 1.0, 0.01, 0.5, visible=False)
         self._split.on_update(lambda _: self.show(split=float(self._split.value)))
@@ -210,14 +210,14 @@ class Visitor:
         self._photograph.on_update(lambda _: self.show(photograph_split=float(self._photograph.value)))
         self._build_views()
         self._build_overlays()
-        self.place = PlacePanel(self)
+        self.place = PointPanel(self)
         self.path = PathPanel(self)
         self._training = gui.add_folder("Training", visible=False)
         with self._training:
             self._progress = gui.add_markdown("")
 
     def _choose_model(self) -> None:
-        model = MODELS[self._models.value]
+        model = MODEL_LABELS[self._models.value]
         self._split.visible = model == "both"
         self.show(model=model)
 
@@ -227,12 +227,12 @@ class Visitor:
 
         @buttons.on_click
         def _(_: Any) -> None:
-            change: dict[str, Callable[[], Stand]] = {
-                "All": lambda: navigation.whole_scene(self.scene.capture),
-                "From above": lambda: navigation.from_above(self.stand),
-                "North up": lambda: navigation.north_up(self.stand),
+            change: dict[str, Callable[[], CameraPose]] = {
+                "All": lambda: navigation.overview_pose(self.scene.capture),
+                "From above": lambda: navigation.top_down_pose(self.stand),
+                "North up": lambda: navigation.north_up_pose(self.stand),
             }
-            self.go(change[buttons.value](), np.radians(FOV_DEG))
+            self.move_to(change[buttons.value](), np.radians(FOV_DEG))
 
     def _build_overlays(self) -> None:
         gui = self.client.gui
@@ -253,16 +253,16 @@ class Visitor:
                 drawn.append(handle)
 
     def _add_borders(self) -> Any:
-        lines = self._lines("borders", overlays.borders, 3.0)
+        lines = self._lines("borders", overlays.block_borders, 3.0)
         if lines is None:
             self.notify("No borders", "The scene is not cut into blocks.")
         return lines
 
     def _add_cameras(self) -> Any:
-        return self._lines("cameras", overlays.frusta, 1.5)
+        return self._lines("cameras", overlays.camera_frusta, 1.5)
 
-    def _lines(self, name: str, of: Callable[[Scene], overlays.Segments], thickness: float) -> Any:
-        found = self.errand(lambda: of(self.scene))
+    def _lines(self, name: str, of: Callable[[ViewerScene], overlays.LineSegments], thickness: float) -> Any:
+        found = self.submit(lambda: of(self.scene))
         if found is None or not len(found[0]):
             return None
         return self.client.scene.add_line_segments(
@@ -275,7 +275,7 @@ class Visitor:
         return self.client.scene.add_point_cloud("/points", points, colours, point_size=size, precision="float32")
 
 
-def is_same(one: Camera, other: Camera) -> bool:
+def is_same_view(one: Camera, other: Camera) -> bool:
     """Whether two cameras show the same: to less than a hundredth of a pixel, at any size of a screen."""
     if (one.width, one.height) != (other.width, other.height) or abs(one.fy / other.fy - 1) > 1e-7:
         return False

@@ -10,22 +10,22 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from vdgs.captures.camera_height import camera_height
-from vdgs.captures.image_cache import shrink
-from vdgs.evaluation.view_exposures import as_photographed
+from vdgs.captures.image_cache import resize_area
+from vdgs.evaluation.view_exposures import apply_exposure
 from vdgs.geometry.camera import Camera
 from vdgs.model.renderer import render
-from vdgs.viewer.viewer_scene import Scene
+from vdgs.viewer.viewer_scene import ViewerScene
 
 #: Photographs are compared at most so large (longer side): an error map is for looking at.
-_COMPARED_PX = 800
+_MAX_COMPARE_PX = 800
 #: A place is what a photograph shows if the depths agree so well (share).
-_SAME_DEPTH = 0.03
+_DEPTH_TOLERANCE = 0.03
 #: Maps of errors that are kept.
-_KEPT = 6
+_MAX_CACHED = 6
 
 
 @dataclass(frozen=True, eq=False)
-class Misses:
+class ImageErrorMap:
     """How far a model, in the exposure of a photograph, is from it, in the photograph's own pixels."""
 
     camera: Camera
@@ -35,7 +35,7 @@ class Misses:
     depth: Float[np.ndarray, "h w"]
 
 
-def nearest_view(scene: Scene, camera: Camera) -> int:
+def nearest_view_index(scene: ViewerScene, camera: Camera) -> int:
     """The number of the photograph taken most nearly from where, and towards where, a camera looks.
 
     A distance of the flight's height counts as much as a turn of one radian (choice).
@@ -49,71 +49,75 @@ def nearest_view(scene: Scene, camera: Camera) -> int:
     return min(range(len(scene.capture.views)), key=lambda index: away(scene.capture.views[index].camera))
 
 
-class Comparison:
+class ImageComparison:
     """Errors against photographs, each found once and kept a while. Used from the thread that draws."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: ViewerScene) -> None:
         self._scene = scene
-        self._kept: OrderedDict[tuple[int, str, int], Misses] = OrderedDict()
+        self._kept: OrderedDict[tuple[int, str, int], ImageErrorMap] = OrderedDict()
 
-    def error_in(self, name: str, camera: Camera, whole: Camera) -> Float[np.ndarray, "h w"]:
+    def error_map(self, name: str, camera: Camera, whole: Camera) -> Float[np.ndarray, "h w"]:
         """The error against the photograph nearest to the `whole` view, as its part `camera` sees it; NaN where that
         photograph does not show the place, or is masked."""
-        misses = self._misses(name, nearest_view(self._scene, whole))
+        misses = self._cached_error_map(name, nearest_view_index(self._scene, whole))
         model = self._scene.model(name)
         depth = render(model, camera, depth=True).median_depth
         assert depth is not None
-        return _carried(misses, camera, depth.cpu().numpy())
+        return _reproject_error(misses, camera, depth.cpu().numpy())
 
-    def _misses(self, name: str, index: int) -> Misses:
+    def _cached_error_map(self, name: str, index: int) -> ImageErrorMap:
         key = (self._scene.generation, name, index)
         if key not in self._kept:
-            self._kept[key] = self._compared(name, index)
-            while len(self._kept) > _KEPT:
+            self._kept[key] = self._compute_error_map(name, index)
+            while len(self._kept) > _MAX_CACHED:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(key)
         return self._kept[key]
 
-    def _compared(self, name: str, index: int) -> Misses:
+    def _compute_error_map(self, name: str, index: int) -> ImageErrorMap:
         view = self._scene.capture.views[index]
-        camera, exposures = view.camera.within(_COMPARED_PX), self._scene.exposures(name)
-        photograph = shrink(self._scene.photographs.get(index), camera.width, camera.height)
+        camera, exposures = view.camera.limit_size(_MAX_COMPARE_PX), self._scene.exposures(name)
+        photograph = resize_area(self._scene.photographs.get(index), camera.width, camera.height)
         raster = render(self._scene.model(name), camera, depth=True)
         assert raster.median_depth is not None
         drawn = raster.image.cpu().numpy()
         if exposures is not None:
-            drawn = as_photographed(drawn, exposures(view))
+            drawn = apply_exposure(drawn, exposures(view))
         error = np.abs(drawn.clip(0, 1) - photograph.image.numpy() / 255.0).mean(axis=-1).astype(np.float32)
         if photograph.mask is not None:
             error[photograph.mask.numpy() == 0] = np.nan
-        return Misses(camera, error, raster.median_depth.cpu().numpy())
+        return ImageErrorMap(camera, error, raster.median_depth.cpu().numpy())
 
 
-def _carried(misses: Misses, camera: Camera, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+def _reproject_error(
+    error_map: ImageErrorMap, camera: Camera, depth: Float[np.ndarray, "h w"]
+) -> Float[np.ndarray, "h w"]:
     """Errors where `camera` sees them, from where the photograph does."""
     places = camera.unproject(depth).reshape(-1, 3)
-    pixels, away = misses.camera.project(places)
+    pixels, away = error_map.camera.project(places)
     x, y = ((pixels[:, axis] - 0.5).reshape(depth.shape).astype(np.float32) for axis in (0, 1))
-    there = cv2.remap(misses.depth, x, y, cv2.INTER_NEAREST, borderValue=0.0)
-    error = cv2.remap(misses.error, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    there = cv2.remap(error_map.depth, x, y, cv2.INTER_NEAREST, borderValue=0.0)
+    error = cv2.remap(error_map.error, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     away = away.reshape(depth.shape)
-    shown = (depth > 0) & (away > 0) & (there > 0) & (np.abs(there - away) <= _SAME_DEPTH * np.abs(away))
+    shown = (depth > 0) & (away > 0) & (there > 0) & (np.abs(there - away) <= _DEPTH_TOLERANCE * np.abs(away))
     return np.where(shown, error, np.nan).astype(np.float32)
 
 
-def picture_of(scene: Scene, index: int, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
+def load_resized_image(scene: ViewerScene, index: int, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
     """A photograph at a size. Raises CaptureError if it cannot be read."""
     pixels = scene.photographs.get(index).image.numpy()
     return np.ascontiguousarray(cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA))
 
 
-def laid_over(scene: Scene, index: int, camera: Camera) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
+def warp_image(
+    scene: ViewerScene, index: int, camera: Camera
+) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
     """A photograph as a camera at the same place sees it, however it is turned and however wide it looks, and where
     there is any: from one place, turning is a mapping of pixels to pixels."""
     taken = scene.capture.views[index].camera
     scale = min(1.0, camera.fx / taken.fx)
     taken = taken.resized(max(1, round(taken.width * scale)), max(1, round(taken.height * scale)))
-    picture = picture_of(scene, index, taken.width, taken.height)
+    picture = load_resized_image(scene, index, taken.width, taken.height)
     turn = camera.camera_from_world[:3, :3] @ taken.camera_from_world[:3, :3].T
     mapping = _intrinsics(camera) @ turn @ np.linalg.inv(_intrinsics(taken))
     size = (camera.width, camera.height)

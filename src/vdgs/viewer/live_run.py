@@ -11,20 +11,20 @@ import torch
 from vdgs.config.commands import ModelName
 from vdgs.errors import RunError, VdgsError
 from vdgs.model.anchor_model import AnchorModel, ModelMetadata
-from vdgs.partition.merging import merge
-from vdgs.runs.model_integrity import load_vouched
-from vdgs.runs.open_run import TrainedRun, blocks_of, open_capture, open_run, views_of_blocks
+from vdgs.partition.merging import merge_blocks
+from vdgs.runs.model_integrity import load_verified
+from vdgs.runs.open_run import OpenedRun, all_block_view_indices, load_run_blocks, open_capture, open_run
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.run_status import standing_of
+from vdgs.runs.run_status import get_run_status
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.system.checkpoints import sidecars
 from vdgs.training.session.trainer import model_from_checkpoint
 
 #: What a model is called that no stage has finished yet.
-UNFINISHED = "training"
+UNFINISHED_MODEL = "training"
 
 
-def open_or_last_saved(path: Path, which: ModelName = "best", device: str = "cpu") -> TrainedRun:
+def open_run_or_checkpoint(path: Path, which: ModelName = "best", device: str = "cpu") -> OpenedRun:
     """A run with its finished model or, of `best`, with what its training has saved last where that is further.
 
     Raises RunError where nothing is saved yet, and what `open_run` raises.
@@ -37,23 +37,26 @@ def open_or_last_saved(path: Path, which: ModelName = "best", device: str = "cpu
         return open_run(path, "merged", device)
     if run.coarse.is_done(keys.coarse):
         coarse = open_run(path, "coarse", device)
-        return _with_blocks(coarse) or coarse
-    return _unfinished_coarse(run, device)
+        return _with_trained_blocks(coarse) or coarse
+    return _coarse_from_checkpoint(run, device)
 
 
-def standing_lines(run: RunFolder) -> str:
+def run_status_markdown(run: RunFolder) -> str:
     """How far every stage and block is, in Markdown."""
-    from vdgs.report.status_cli import next_step, progress_of  # brings what draws charts: not before the first picture
+    from vdgs.report.status_cli import (  # brings what draws charts: not before the first picture
+        next_step,
+        progress_text,
+    )
 
-    standing = standing_of(run)
+    standing = get_run_status(run)
     lines = [
-        f"**{stage.name}** {stage.state}" + (f": {progress_of(stage.status)}" if progress_of(stage.status) else "")
+        f"**{stage.name}** {stage.state}" + (f": {progress_text(stage.status)}" if progress_text(stage.status) else "")
         for stage in standing.stages
     ]
     return "\n\n".join([*lines, f"next: {next_step(standing)}"])
 
 
-def newest(run: RunFolder) -> tuple[tuple[str, int], ...]:
+def run_file_times(run: RunFolder) -> tuple[tuple[str, int], ...]:
     """What tells the present models and checkpoints of a run from later ones: files, and when they were written."""
     trained = [run.coarse, *run.block_folders()]
     files = [folder.model for folder in (*trained, run.merged)]
@@ -68,7 +71,7 @@ def newest(run: RunFolder) -> tuple[tuple[str, int], ...]:
     return tuple(sorted(found))
 
 
-def _unfinished_coarse(run: RunFolder, device: str) -> TrainedRun:
+def _coarse_from_checkpoint(run: RunFolder, device: str) -> OpenedRun:
     """The coarse model as its training saved it last."""
     key = run.keys().coarse
     saved = model_from_checkpoint(run.coarse, key)
@@ -78,54 +81,56 @@ def _unfinished_coarse(run: RunFolder, device: str) -> TrainedRun:
             f"vdgs status {run.path}"
         )
     capture = open_capture(run)
-    colours = capture.point_colours.mean(axis=0) / 255 if len(capture.points) else np.zeros(3)
+    colours = capture.point_colors.mean(axis=0) / 255 if len(capture.points) else np.zeros(3)
     background = (float(colours[0]), float(colours[1]), float(colours[2]))
-    model = AnchorModel(anchors=saved.anchors, decoder=saved.decoder, voxel=1.0, background=background).to(
+    model = AnchorModel(anchors=saved.anchors, decoder=saved.decoder, voxel_size=1.0, background=background).to(
         torch.device(device)
     )
     why = f"this is the coarse model after {saved.iteration:,} iterations; its background is not known yet"
-    return TrainedRun(
-        folder=run, model=model, model_path=saved.file, name=UNFINISHED, status=run.coarse.status(), key=key,
+    return OpenedRun(
+        folder=run, model=model, model_path=saved.file, name=UNFINISHED_MODEL, status=run.coarse.status(), key=key,
         caution=why, capture=capture,
     )  # fmt: skip
 
 
-def _with_blocks(coarse: TrainedRun) -> TrainedRun | None:
+def _with_trained_blocks(coarse: OpenedRun) -> OpenedRun | None:
     """The coarse model with the anchors of every block that has saved some; None where none has."""
     run, keys = coarse.folder, coarse.folder.keys()
     try:
-        blocks = blocks_of(run)
+        blocks = load_run_blocks(run)
     except VdgsError:
         return None
     own = run.method().block.decoder != "frozen"
     trained: list[AnchorModel | None] = []
     for index in range(len(blocks)):
-        trained.append(_block_so_far(coarse, run.block(index), keys.blocks, index, own))
+        trained.append(_load_block_so_far(coarse, run.block(index), keys.blocks, index, own))
     if not any(trained):
         return None
     views = coarse.capture.train_views
-    cameras = [[views[view].camera for view in of_block] for of_block in views_of_blocks(run, coarse.capture)]
+    cameras = [[views[view].camera for view in of_block] for of_block in all_block_view_indices(run, coarse.capture)]
     model = coarse.model.to(torch.device("cpu"))
-    merged, _ = merge(model, trained, blocks, cameras, run.method().merge, allow_missing=True)
+    merged, _ = merge_blocks(model, trained, blocks, cameras, run.method().merge, allow_missing=True)
     shown = sum(each is not None for each in trained)
     why = f"this is the scene as {shown} of {len(blocks)} blocks have it so far; elsewhere it is the coarse model"
-    return replace(coarse, model=merged.to(coarse.device), name=UNFINISHED, caution=why)
+    return replace(coarse, model=merged.to(coarse.device), name=UNFINISHED_MODEL, warning=why)
 
 
-def _block_so_far(coarse: TrainedRun, folder: StageFolder, key: str, index: int, own: bool) -> AnchorModel | None:
+def _load_block_so_far(
+    coarse: OpenedRun, folder: StageFolder, key: str, index: int, own_decoder: bool
+) -> AnchorModel | None:
     try:
         if folder.is_done(key):
-            return load_vouched(folder, key, index)
+            return load_verified(folder, key, index)
         saved = model_from_checkpoint(folder, key)
     except VdgsError:
         return None
     if saved is None:
         return None
-    metadata = ModelMetadata(decoder="own" if own else None)
+    metadata = ModelMetadata(decoder="own" if own_decoder else None)
     return AnchorModel(
         anchors=saved.anchors,
         decoder=saved.decoder,
-        voxel=coarse.model.voxel,
+        voxel_size=coarse.model.voxel_size,
         background=coarse.model.background,
         metadata=metadata,
     )

@@ -16,15 +16,15 @@ from torch import Tensor
 from vdgs.geometry.camera import Camera
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
-from vdgs.model.renderer import visible_rows
+from vdgs.model.renderer import cull_anchors
 
 #: The first level has so many times fewer anchors than the model, each further one so many times fewer than the one
 #: before it: all together take 0.3 of the model's memory.
-FIRST, FURTHER = 5, 3
+FIRST_FACTOR, NEXT_FACTOR = 5, 3
 
 
 @dataclass(frozen=True, eq=False)
-class Level:
+class LodLevel:
     """A model, and which anchors of the whole one it holds; None: all."""
 
     model: AnchorModel
@@ -35,43 +35,43 @@ class Level:
         return values if self.kept is None else values[self.kept]
 
 
-class Levels:
+class LodPyramid:
     """A model and its thinner ones, each made when it is first needed."""
 
     def __init__(self, model: AnchorModel) -> None:
-        self._levels = [Level(model)]
+        self._levels = [LodLevel(model)]
 
-    def of(self, camera: Camera, most: int | None = None) -> tuple[Level, int]:
+    def of(self, camera: Camera, max_anchors: int | None = None) -> tuple[LodLevel, int]:
         """The model itself, or the finest level of which the camera sees at most so many anchors; and how many it
         sees of it, about."""
         whole = self._levels[0]
-        shown, number = len(visible_rows(whole.model.anchors, camera)), 0
-        if most is None:
+        shown, number = len(cull_anchors(whole.model.anchors, camera)), 0
+        if max_anchors is None:
             return whole, shown
-        while shown // times_of(number) > max(most, 1):
+        while shown // decimation_factor(number) > max(max_anchors, 1):
             number += 1
         while len(self._levels) <= number:
-            self._levels.append(thinned(whole.model, times_of(len(self._levels))))
-        return self._levels[number], shown // times_of(number)
+            self._levels.append(decimate(whole.model, decimation_factor(len(self._levels))))
+        return self._levels[number], shown // decimation_factor(number)
 
 
-def times_of(level: int) -> int:
+def decimation_factor(level: int) -> int:
     """How many times fewer anchors a level has than the model, which is level 0."""
-    return FIRST * FURTHER ** (level - 1) if level else 1
+    return FIRST_FACTOR * NEXT_FACTOR ** (level - 1) if level else 1
 
 
-def thinned(model: AnchorModel, times: int) -> Level:
+def decimate(model: AnchorModel, factor: int) -> LodLevel:
     """One anchor of so many, by chance but always the same, its Gaussians so much larger that they cover as much."""
     count, device = len(model.anchors), model.anchors.positions.device
     chance = torch.rand(count, generator=torch.Generator().manual_seed(0))
-    kept = (chance < 1 / times).to(device)
+    kept = (chance < 1 / factor).to(device)
     anchors = model.anchors.select(kept)
     log_scales = anchors.log_scales.clone()
-    log_scales[:, 3:] += 0.5 * math.log(times)
+    log_scales[:, 3:] += 0.5 * math.log(factor)
     sums = torch.cat([torch.zeros(1, dtype=torch.long), kept.long().cumsum(0).cpu()])
     parts, first = [], 0
     for part in model.parts:
         parts.append(replace(part, count=int(sums[first + part.count] - sums[first])))
         first += part.count
     fewer = Anchors(**{**anchors.tensors(), "log_scales": log_scales})
-    return Level(replace(model, anchors=fewer, parts=tuple(parts)), kept)
+    return LodLevel(replace(model, anchors=fewer, parts=tuple(parts)), kept)

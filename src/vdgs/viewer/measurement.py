@@ -13,8 +13,8 @@ class Ruler:
         self._unit = unit
         self._places: list[np.ndarray] = []
 
-    def add(self, place: Float[np.ndarray, "3"]) -> None:
-        self._places.append(np.asarray(place, np.float64))
+    def add(self, point: Float[np.ndarray, "3"]) -> None:
+        self._places.append(np.asarray(point, np.float64))
 
     def clear(self) -> None:
         self._places = []
@@ -26,7 +26,7 @@ class Ruler:
         """From place to place, in space."""
         return float(np.linalg.norm(np.diff(self.corners(), axis=0), axis=1).sum())
 
-    def rise(self) -> float:
+    def height_difference(self) -> float:
         """From the first place up to the last."""
         return float(self._places[-1][2] - self._places[0][2]) if self._places else 0.0
 
@@ -35,7 +35,7 @@ class Ruler:
         x, y = self.corners()[:, :2].T
         return 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)))
 
-    def words(self) -> str:
+    def to_markdown(self) -> str:
         """What was measured, in Markdown."""
         if not self._places:
             return ""
@@ -43,7 +43,7 @@ class Ruler:
             return "Click the next place."
         level = float(np.linalg.norm(np.diff(self.corners()[:, :2], axis=0), axis=1).sum())
         lines = [f"distance **{self.distance():,.2f} {self._unit}** ({level:,.2f} level)"]
-        lines.append(f"height difference **{self.rise():+,.2f} {self._unit}**, first to last")
+        lines.append(f"height difference **{self.height_difference():+,.2f} {self._unit}**, first to last")
         if len(self._places) > 2:
             lines.append(f"area **{self.area():,.2f} {self._unit}²** on the map")
         return "\n\n".join(lines)

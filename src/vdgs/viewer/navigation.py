@@ -8,21 +8,21 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from vdgs.captures.camera_height import overview
+from vdgs.captures.camera_height import default_view
 from vdgs.captures.capture import Capture
-from vdgs.config.commands import BYTES_PER_PIXEL, LARGEST_SIDE_PX
+from vdgs.config.commands import MAX_RENDER_SIDE_PX, RENDER_BYTES_PER_PIXEL
 from vdgs.geometry.camera import Camera
 
 #: Nearer to straight down than this, the direction on the map no longer follows from where one looks.
-_STEEP = 0.995
+_NADIR_COSINE = 0.995
 #: How far a view from straight above is tilted, so that it knows which way is north.
-_TILT = 1e-3
+_NADIR_TILT = 1e-3
 #: No canvas has more pixels: those of a screen of 8K (choice).
-MOST_PX = 7680 * 4320
+MAX_CANVAS_PIXELS = 7680 * 4320
 
 
 @dataclass(frozen=True, eq=False)
-class Stand:
+class CameraPose:
     """Where a visitor stands and what they look at, ground frame; z is up."""
 
     position: Float[np.ndarray, "3"]
@@ -34,7 +34,7 @@ class Stand:
         return float(np.linalg.norm(self.look_at - self.position))
 
 
-def camera_of(wxyz: np.ndarray, position: np.ndarray, fov: float, width: int, height: int) -> Camera:
+def camera_from_browser(wxyz: np.ndarray, position: np.ndarray, fov: float, width: int, height: int) -> Camera:
     """The browser's camera: `wxyz` turns camera axes (OpenCV) into the world, `fov` is vertical, in radians.
 
     Raises ValueError for what is no camera: numbers that are not finite, an empty canvas, an impossible angle.
@@ -43,69 +43,69 @@ def camera_of(wxyz: np.ndarray, position: np.ndarray, fov: float, width: int, he
     usable = np.isfinite(turn).all() and np.isfinite(place).all() and np.linalg.norm(turn) > 1e-6
     if not (usable and width > 0 and height > 0 and 1e-3 < fov < math.pi - 1e-3):
         raise ValueError("this is no camera")
-    rotation = _matrix_of(turn / np.linalg.norm(turn)).T
+    rotation = _rotation_matrix(turn / np.linalg.norm(turn)).T
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, -rotation @ place
     focal = 0.5 * height / math.tan(0.5 * fov)
     return Camera(camera_from_world=pose, fx=focal, fy=focal, cx=width / 2, cy=height / 2, width=width, height=height)
 
 
-def most_pixels(free: int) -> int:
+def max_render_pixels(free_bytes: int) -> int:
     """How many pixels a visitor's picture may have where so many bytes of memory are free."""
-    return max(1, min(MOST_PX, free // BYTES_PER_PIXEL))
+    return max(1, min(MAX_CANVAS_PIXELS, free_bytes // RENDER_BYTES_PER_PIXEL))
 
 
-def drawable(camera: Camera, most: int) -> Camera:
-    """The same view no larger than can be drawn, `most` pixels and `LARGEST_SIDE_PX` a side: the browser enlarges what
+def limit_resolution(camera: Camera, max_pixels: int) -> Camera:
+    """The same view no larger than can be drawn, `most` pixels and `MAX_RENDER_SIDE_PX` a side: the browser enlarges what
     comes. The very camera where it is no larger."""
     pixels, longest = camera.width * camera.height, max(camera.width, camera.height)
-    scale = min((most / pixels) ** 0.5, LARGEST_SIDE_PX / longest)
+    scale = min((max_pixels / pixels) ** 0.5, MAX_RENDER_SIDE_PX / longest)
     if scale >= 1.0:
         return camera
     return camera.resized(max(1, int(scale * camera.width)), max(1, int(scale * camera.height)))
 
 
-def _matrix_of(wxyz: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
+def _rotation_matrix(wxyz: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
     """The rotation of a unit quaternion: v -> v + 2w (u × v) + 2u × (u × v)."""
     w, (x, y, z) = wxyz[0], wxyz[1:]
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.eye(3) + 2.0 * (w * cross + cross @ cross)
 
 
-def whole_scene(capture: Capture) -> Stand:
+def overview_pose(capture: Capture) -> CameraPose:
     """All of the flight."""
-    return Stand(*overview(capture))
+    return CameraPose(*default_view(capture))
 
 
-def from_above(stand: Stand) -> Stand:
+def top_down_pose(pose: CameraPose) -> CameraPose:
     """The same place from straight above, north up."""
-    return Stand(stand.look_at + stand.distance * np.array([0.0, -_TILT, 1.0]), stand.look_at)
+    return CameraPose(pose.look_at + pose.distance * np.array([0.0, -_NADIR_TILT, 1.0]), pose.look_at)
 
 
-def north_up(stand: Stand) -> Stand:
+def north_up_pose(pose: CameraPose) -> CameraPose:
     """The same place, as steeply and as far, looking north."""
-    away = stand.position - stand.look_at
-    return Stand(stand.look_at + np.array([0.0, -np.hypot(away[0], away[1]) - 1e-9, away[2]]), stand.look_at)
+    away = pose.position - pose.look_at
+    return CameraPose(pose.look_at + np.array([0.0, -np.hypot(away[0], away[1]) - 1e-9, away[2]]), pose.look_at)
 
 
-def nearer(stand: Stand, place: Float[np.ndarray, "3"], share: float = 0.35) -> Stand:
+def zoom_to(pose: CameraPose, target: Float[np.ndarray, "3"], factor: float = 0.35) -> CameraPose:
     """Looking at a place in the same direction, from a share of the present distance to it."""
-    away = stand.position - stand.look_at
+    away = pose.position - pose.look_at
     towards = away / max(float(np.linalg.norm(away)), 1e-9)
-    return Stand(place + towards * share * float(np.linalg.norm(stand.position - place)), place)
+    return CameraPose(target + towards * factor * float(np.linalg.norm(pose.position - target)), target)
 
 
-def stand_of(camera: Camera, distance: float) -> Stand:
+def pose_from_camera(camera: Camera, distance: float) -> CameraPose:
     """Where a photograph was taken, looking where it looks `distance` away. One taken straight down is tilted by a
     hair, so that its upper edge stays up: z is up for whoever moves on from there."""
     forward, up = camera.forward, -camera.camera_from_world[1, :3]
-    if abs(forward[2]) > _STEEP:
-        forward = forward + 3 * _TILT * up
+    if abs(forward[2]) > _NADIR_COSINE:
+        forward = forward + 3 * _NADIR_TILT * up
     forward = forward / np.linalg.norm(forward)
-    return Stand(camera.position.copy(), camera.position + distance * forward)
+    return CameraPose(camera.position.copy(), camera.position + distance * forward)
 
 
-def fov_for(camera: Camera, aspect: float) -> float:
+def fov_to_fit(camera: Camera, aspect: float) -> float:
     """The vertical angle, in radians, at which a canvas (width over height) holds all of a photograph's."""
     vertical = 0.5 * camera.height / camera.fy
     across = 0.5 * camera.width / camera.fx / aspect

@@ -10,18 +10,18 @@ from jaxtyping import Float, UInt8
 
 from vdgs.captures.camera_height import camera_height
 from vdgs.geometry.camera import Camera
-from vdgs.viewer.viewer_scene import Scene, rgb_of
+from vdgs.viewer.viewer_scene import ViewerScene, block_rgb
 
 #: Borders follow the ground in steps of this share of the camera height; cameras are drawn so large (choices).
 _STEP, _SIZE = 0.1, 0.06
 #: Sparse points that a browser is sent at most.
-_MOST_POINTS = 150_000
+_MAX_POINTS = 150_000
 _GREY = (150, 150, 150)
 
-Segments = tuple[Float[np.ndarray, "s 2 3"], UInt8[np.ndarray, "s 2 3"]]
+LineSegments = tuple[Float[np.ndarray, "s 2 3"], UInt8[np.ndarray, "s 2 3"]]
 
 
-def borders(scene: Scene) -> Segments:
+def block_borders(scene: ViewerScene) -> LineSegments:
     """The cores of the blocks as segments that lie on the ground, each in its block's colour."""
     lines: list[np.ndarray] = []
     colours: list[tuple[int, int, int]] = []
@@ -31,29 +31,29 @@ def borders(scene: Scene) -> Segments:
         draped = np.column_stack([ring, _ground_below(scene, ring)])
         segments = np.stack([draped[:-1], draped[1:]], axis=1)
         lines.append(segments)
-        colours += [rgb_of(index)] * len(segments)
+        colours += [block_rgb(index)] * len(segments)
     return _segments(lines, colours)
 
 
-def _ground_below(scene: Scene, places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
+def _ground_below(scene: ViewerScene, points_xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
     """Heights of the sparse points about places: the median of the nearest eight."""
     points = scene.capture.points
     if not len(points):
-        return np.zeros(len(places))
+        return np.zeros(len(points_xy))
     from scipy.spatial import cKDTree  # not before the first picture
 
-    _, nearest = cKDTree(points[:, :2]).query(places, k=min(8, len(points)))
-    return np.asarray(np.median(points[:, 2][np.reshape(nearest, (len(places), -1))], axis=1))
+    _, nearest = cKDTree(points[:, :2]).query(points_xy, k=min(8, len(points)))
+    return np.asarray(np.median(points[:, 2][np.reshape(nearest, (len(points_xy), -1))], axis=1))
 
 
-def frusta(scene: Scene) -> Segments:
+def camera_frusta(scene: ViewerScene) -> LineSegments:
     """All cameras as small frusta, in the colour of the block that they stand above."""
     views = scene.capture.views
     size = _SIZE * camera_height(scene.capture)
     colours = [_GREY] * len(views)
     if scene.blocks is not None:
         owners = scene.blocks.owner(np.stack([view.camera.position[:2] for view in views]))
-        colours = [rgb_of(int(owner)) for owner in owners]
+        colours = [block_rgb(int(owner)) for owner in owners]
     lines = [_frustum(view.camera, size) for view in views]
     return _segments(lines, [colour for colour in colours for _ in range(8)])
 
@@ -69,14 +69,14 @@ def _frustum(camera: Camera, size: float) -> Float[np.ndarray, "8 2 3"]:
     return np.concatenate([spokes, np.stack([ring, np.roll(ring, -1, axis=0)], axis=1)])
 
 
-def sparse_points(scene: Scene) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
+def sparse_points(scene: ViewerScene) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
     """The sparse points and their colours, evenly thinned where there are many."""
     capture = scene.capture
-    every = max(1, -(-len(capture.points) // _MOST_POINTS))
-    return capture.points[::every].astype(np.float32), capture.point_colours[::every]
+    every = max(1, -(-len(capture.points) // _MAX_POINTS))
+    return capture.points[::every].astype(np.float32), capture.point_colors[::every]
 
 
-def _segments(lines: Sequence[np.ndarray], colours: Sequence[tuple[int, int, int]]) -> Segments:
+def _segments(lines: Sequence[np.ndarray], colours: Sequence[tuple[int, int, int]]) -> LineSegments:
     if not lines:
         return np.zeros((0, 2, 3), np.float32), np.zeros((0, 2, 3), np.uint8)
     each = np.asarray(colours, np.uint8)

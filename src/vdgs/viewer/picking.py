@@ -12,18 +12,18 @@ from vdgs.geometry.camera import Camera
 from vdgs.geometry.geodesy import geodetic_from_enu
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.renderer import render
-from vdgs.viewer.image_comparison import picture_of
-from vdgs.viewer.viewer_scene import Scene
+from vdgs.viewer.image_comparison import load_resized_image
+from vdgs.viewer.viewer_scene import ViewerScene
 
 #: A camera sees a place freely if what it draws there is so near to it (share of the depth; choice).
-_FREE = 0.02
+_OCCLUSION_TOLERANCE = 0.02
 #: Thumbnails: how large (longer side), and how large the part of the photograph about the place is (share).
-_THUMBNAIL_PX, _PART = 320, 0.5
-_MARK = (255, 60, 40)
+_THUMBNAIL_PX, _THUMBNAIL_CROP = 320, 0.5
+_MARKER_COLOR = (255, 60, 40)
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class ImageHit:
     """A photograph that a place lies in."""
 
     #: In `capture.views`.
@@ -32,13 +32,13 @@ class Sight:
     #: Where in the photograph, pixels.
     pixel: tuple[float, float]
     #: Units of the ground frame that a pixel shows there.
-    unit_per_px: float
+    ground_sampling: float
     #: Nothing stands between.
     free: bool
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class PickedPoint:
     """What is known of a place on the surface of the model."""
 
     position: Float[np.ndarray, "3"]
@@ -47,12 +47,12 @@ class Place:
     #: The block that owns it; None where the scene is not cut.
     block: int | None
     #: All photographs that it lies in, the test views too: those that see it freely first, then the nearest.
-    sights: tuple[Sight, ...]
+    hits: tuple[ImageHit, ...]
     #: Coordinates for people, a line each.
     coordinates: tuple[str, ...]
 
 
-def position_at(model: AnchorModel, camera: Camera, x: float, y: float) -> Float[np.ndarray, "3"] | None:
+def pick_position(model: AnchorModel, camera: Camera, x: float, y: float) -> Float[np.ndarray, "3"] | None:
     """The point of the surface (median depth) that the pixel at `x`, `y` shows; None where nothing is drawn.
 
     Pixels from the upper left corner; the point lies on the ray through exactly there.
@@ -71,56 +71,56 @@ def position_at(model: AnchorModel, camera: Camera, x: float, y: float) -> Float
     return (local - translation) @ rotation
 
 
-def place_at(scene: Scene, name: str, position: Float[np.ndarray, "3"]) -> Place:
+def pick_point(scene: ViewerScene, name: str, position: Float[np.ndarray, "3"]) -> PickedPoint:
     """All that is known of a place."""
     model, views = scene.model(name), scene.capture.views
     sights = []
     for index, view in enumerate(views):
-        if view.camera.sees(position[None])[0]:
-            sights.append(_sight(model, view.camera, index, view.name, position))
+        if view.camera.in_frustum(position[None])[0]:
+            sights.append(_image_hit(model, view.camera, index, view.name, position))
     seen_by = sum(views[sight.index].split == "train" for sight in sights)
     owner = None if scene.blocks is None else int(scene.blocks.owner(position[None, :2])[0])
-    ordered = tuple(sorted(sights, key=lambda sight: (not sight.free, sight.unit_per_px)))
-    return Place(position, seen_by, owner, ordered, coordinates_of(scene, position))
+    ordered = tuple(sorted(sights, key=lambda sight: (not sight.free, sight.ground_sampling)))
+    return PickedPoint(position, seen_by, owner, ordered, coordinate_lines(scene, position))
 
 
-def _sight(model: AnchorModel, camera: Camera, index: int, name: str, position: np.ndarray) -> Sight:
+def _image_hit(model: AnchorModel, camera: Camera, index: int, name: str, position: np.ndarray) -> ImageHit:
     pixels, depth = camera.project(position[None])
     x, y = float(pixels[0, 0]), float(pixels[0, 1])
     column, row = min(int(x), camera.width - 1), min(int(y), camera.height - 1)
     raster = render(model, camera.cropped(column, row, column + 1, row + 1), depth=True)
     assert raster.median_depth is not None
     drawn = float(raster.median_depth[0, 0])
-    free = drawn == 0 or drawn >= float(depth[0]) * (1 - _FREE)
-    return Sight(index, name, (x, y), float(depth[0]) / camera.fx, free)
+    free = drawn == 0 or drawn >= float(depth[0]) * (1 - _OCCLUSION_TOLERANCE)
+    return ImageHit(index, name, (x, y), float(depth[0]) / camera.fx, free)
 
 
-def coordinates_of(scene: Scene, position: Float[np.ndarray, "3"]) -> tuple[str, ...]:
+def coordinate_lines(scene: ViewerScene, position: Float[np.ndarray, "3"]) -> tuple[str, ...]:
     """A place in the ground frame, on Earth, and on the map, as far as they are known."""
     ground = scene.capture.ground
     x, y = ("east", "north") if ground.origin_geo else ("x", "y")
     lines = [f"{x} {position[0]:.2f}, {y} {position[1]:.2f}, up {position[2]:.2f} {ground.unit} (ground frame)"]
     if ground.origin_geo is not None:
-        latitude, longitude, height = geodetic_from_enu(position[None], ground.origin_geo, ground.level_at)[0]
+        latitude, longitude, height = geodetic_from_enu(position[None], ground.origin_geo, ground.axes_origin)[0]
         lines.append(f"{latitude:.7f}°, {longitude:.7f}°, {height:.2f} m (WGS 84)")
-    for placement in scene.placements:
+    for placement in scene.map_projections:
         east, north, up = placement.places(position[None])[0]
         lines.append(f"{east:,.2f}, {north:,.2f}, {up:,.2f} ({placement.name})")
     return tuple(lines)
 
 
-def thumbnail(scene: Scene, sight: Sight) -> UInt8[np.ndarray, "h w 3"]:
+def thumbnail(scene: ViewerScene, hit: ImageHit) -> UInt8[np.ndarray, "h w 3"]:
     """The part of a photograph about a place, which is marked. Raises CaptureError if it cannot be read."""
-    camera = scene.capture.views[sight.index].camera
-    picture = picture_of(scene, sight.index, camera.width, camera.height)
-    width, height = max(1, round(_PART * camera.width)), max(1, round(_PART * camera.height))
-    left = int(np.clip(sight.pixel[0] - width / 2, 0, camera.width - width))
-    top = int(np.clip(sight.pixel[1] - height / 2, 0, camera.height - height))
+    camera = scene.capture.views[hit.index].camera
+    picture = load_resized_image(scene, hit.index, camera.width, camera.height)
+    width, height = max(1, round(_THUMBNAIL_CROP * camera.width)), max(1, round(_THUMBNAIL_CROP * camera.height))
+    left = int(np.clip(hit.pixel[0] - width / 2, 0, camera.width - width))
+    top = int(np.clip(hit.pixel[1] - height / 2, 0, camera.height - height))
     part = picture[top : top + height, left : left + width]
     scale = _THUMBNAIL_PX / max(width, height)
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
     small = cv2.resize(part, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
-    centre = (round((sight.pixel[0] - left) * scale), round((sight.pixel[1] - top) * scale))
+    centre = (round((hit.pixel[0] - left) * scale), round((hit.pixel[1] - top) * scale))
     cv2.circle(small, centre, 9, (255, 255, 255), 3, cv2.LINE_AA)
-    cv2.circle(small, centre, 9, _MARK, 2, cv2.LINE_AA)
+    cv2.circle(small, centre, 9, _MARKER_COLOR, 2, cv2.LINE_AA)
     return np.asarray(small)

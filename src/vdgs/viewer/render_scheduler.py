@@ -4,7 +4,7 @@ All kernels run in this one thread; they take the cores themselves. Visitors tak
 before the next rows of a full one of anyone. A camera that moves on leaves nothing to be finished: what it last asked
 for counts, and what was begun for it before is dropped.
 
-The more visitors move, the less each picture may take, so that a round of all of them stays short (`ROUND`). What a
+The more visitors move, the less each picture may take, so that a round of all of them stays short (`ROUND_SECONDS`). What a
 picture takes follows from the anchors that it is drawn from, and from pixels only where those are few: each seat learns
 its seconds an anchor, and asks for as many as fit. Two visitors who rest at the same place get the same full picture.
 """
@@ -25,45 +25,47 @@ import numpy as np
 from jaxtyping import UInt8
 
 from vdgs.geometry.camera import Camera
-from vdgs.kernels.idle_memory import return_unused
-from vdgs.viewer.layers import Shown
+from vdgs.kernels.idle_memory import trim_heap
+from vdgs.viewer.layers import DisplayOptions
 
 #: A camera that has not moved for so long rests, seconds.
-REST = 0.1
+REST_SECONDS = 0.1
 #: A quick picture takes so long, and never has fewer pixels nor more than these.
-QUICK, FEWEST_PX, MOST_PX = 0.045, 240 * 160, 640 * 480
+PREVIEW_SECONDS, MIN_PREVIEW_PIXELS, MAX_PREVIEW_PIXELS = 0.045, 240 * 160, 640 * 480
 #: A quick picture of each visitor who moves takes so long together, and no picture is given less than this.
-ROUND, BRIEFEST = 0.12, 0.008
+ROUND_SECONDS, MIN_PREVIEW_SECONDS = 0.12, 0.008
 #: A quick picture is drawn from at most about so many anchors before it is known what they take, never from fewer.
-FIRST_ANCHORS, FEWEST_ANCHORS = 20_000, 2_000
+INITIAL_PREVIEW_ANCHORS, MIN_PREVIEW_ANCHORS = 20_000, 2_000
 #: Of a new measure of seconds an anchor, this share counts; the rest is what was known.
-LEARNING = 0.4
+SPEED_SMOOTHING = 0.4
 #: Rows of a full picture are drawn for so long before others have their turn, and from about so many anchors at once:
 #: what they decode to is memory.
-TURN, TURN_ANCHORS, MOST_TURNS = 0.1, 40_000, 24
+TURN_SECONDS, ANCHORS_PER_TURN, MAX_TURNS = 0.1, 40_000, 24
 #: Full pictures that are kept for others who stand at the same place.
-KEPT = 3
+MAX_CACHED_IMAGES = 3
 #: With nothing to do for so long (seconds), or after so many have left, memory is given back.
-IDLE, MOST_LEFT = 1.0, 16
+IDLE_SECONDS, MAX_LEFT_BEFORE_CLEANUP = 1.0, 16
 
 _Result = TypeVar("_Result")
 
 
 @runtime_checkable
-class Paints(Protocol):
+class PainterProtocol(Protocol):
     """Draws what one visitor asks for (`layers.Painter`)."""
 
     #: Anchors that the last picture was drawn from; 0 where that is not known.
     drawn: int
 
-    def settle(self, shown: Shown, whole: Camera) -> None: ...
-    def key(self, shown: Shown) -> Hashable: ...
-    def in_view(self, shown: Shown, camera: Camera) -> int: ...
-    def paint(self, shown: Shown, camera: Camera, whole: Camera, most: int | None = None) -> np.ndarray: ...
+    def settle(self, display: DisplayOptions, full_camera: Camera) -> None: ...
+    def key(self, display: DisplayOptions) -> Hashable: ...
+    def in_view(self, display: DisplayOptions, camera: Camera) -> int: ...
+    def paint(
+        self, display: DisplayOptions, camera: Camera, full_camera: Camera, max_anchors: int | None = None
+    ) -> np.ndarray: ...
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class RenderedFrame:
     """A picture for a visitor."""
 
     picture: UInt8[np.ndarray, "h w 3"]
@@ -71,53 +73,55 @@ class Frame:
     full: bool
     #: The view that it shows, at full size.
     camera: Camera
-    shown: Shown
+    shown: DisplayOptions
 
 
 @dataclass(eq=False, kw_only=True)
-class Seat:
+class RenderSession:
     """A visitor's place in the studio."""
 
-    painter: Paints
-    deliver: Callable[[Frame], None]
+    painter: PainterProtocol
+    on_frame: Callable[[RenderedFrame], None]
     #: Told why a picture could not be drawn.
-    failed: Callable[[Exception], None]
+    on_error: Callable[[Exception], None]
     #: What was asked for last, at full size.
-    asked: tuple[Camera, Shown] | None = None
-    quick_due: bool = False
+    asked: tuple[Camera, DisplayOptions] | None = None
+    preview_due: bool = False
     full_due: bool = False
     #: When the camera last moved.
     moved: float = 0.0
     #: A full picture that is being drawn.
     work: Iterator[None] | None = None
     #: Pixels that a quick picture may have, learned from what they take.
-    quick_px: float = 320 * 240
+    preview_pixels: float = 320 * 240
     #: Seconds that a quick picture takes for each of its anchors; 0 before there was any.
     per_anchor: float = 0.0
     #: Seconds that a pixel of a full picture took; 0 before there was any.
     per_px: float = 0.0
 
 
-class Studio:
+class RenderScheduler:
     """Draws for whoever has a seat. `step` does one piece of work; `run` does so until it is closed."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._seats: list[Seat] = []
+        self._seats: list[RenderSession] = []
         self._errands: deque[tuple[Future[Any], Callable[[], None]]] = deque()
         self._full_pictures: OrderedDict[Hashable, np.ndarray] = OrderedDict()
         self._changed = threading.Condition()
         self._closed = False
         self._left = 0
 
-    def seat(self, painter: Paints, deliver: Callable[[Frame], None], failed: Callable[[Exception], None]) -> Seat:
+    def add_session(
+        self, painter: PainterProtocol, deliver: Callable[[RenderedFrame], None], failed: Callable[[Exception], None]
+    ) -> RenderSession:
         """A place for a new visitor."""
-        seat = Seat(painter=painter, deliver=deliver, failed=failed)
+        seat = RenderSession(painter=painter, on_frame=deliver, on_error=failed)
         with self._changed:
             self._seats.append(seat)
         return seat
 
-    def leave(self, seat: Seat) -> None:
+    def leave(self, seat: RenderSession) -> None:
         """The visitor is gone; nothing more is drawn for them."""
         with self._changed:
             if seat in self._seats:
@@ -125,22 +129,22 @@ class Studio:
                 self._left += 1
             seat.work, seat.asked = None, None
 
-    def ask(self, seat: Seat, camera: Camera, shown: Shown) -> None:
+    def request_frame(self, seat: RenderSession, camera: Camera, display: DisplayOptions) -> None:
         """What a visitor wants to see now, at full size. Replaces what they wanted before."""
         with self._changed:
-            seat.asked, seat.moved = (camera, shown), self._clock()
-            seat.quick_due = seat.full_due = True
+            seat.asked, seat.moved = (camera, display), self._clock()
+            seat.preview_due = seat.full_due = True
             seat.work = None
             self._changed.notify()
 
-    def errand(self, do: Callable[[], _Result]) -> Future[_Result]:
+    def submit(self, function: Callable[[], _Result]) -> Future[_Result]:
         """Something else that needs the kernels: done next, in the thread that draws; cancelled once the studio closes,
         so that nobody waits for what does not come."""
         future: Future[_Result] = Future()
 
         def run() -> None:
             try:
-                future.set_result(do())
+                future.set_result(function())
             except BaseException as error:  # raised again in whoever waits
                 future.set_exception(error)
 
@@ -165,14 +169,14 @@ class Studio:
         """Work until `close`."""
         while True:
             wait = self.step()
-            if self._left >= MOST_LEFT:
+            if self._left >= MAX_LEFT_BEFORE_CLEANUP:
                 self._tidy()
             with self._changed:
                 if self._closed:
                     return
                 if wait == 0 or self._busy():
                     continue
-                told = self._changed.wait(IDLE if wait is None else wait)
+                told = self._changed.wait(IDLE_SECONDS if wait is None else wait)
                 if told or wait is not None or self._busy() or self._closed:
                     continue
             self._tidy()
@@ -183,10 +187,10 @@ class Studio:
         """Give back what pictures and visitors took: who left is held by circles of theirs."""
         self._left = 0
         gc.collect()
-        return_unused()
+        trim_heap()
 
     def _busy(self) -> bool:
-        return bool(self._errands) or any(seat.quick_due for seat in self._seats)
+        return bool(self._errands) or any(seat.preview_due for seat in self._seats)
 
     def step(self) -> float | None:
         """Do one piece of work. Returns 0 if there may be more, else seconds until there will be; None: not known."""
@@ -194,24 +198,24 @@ class Studio:
             errand = self._errands.popleft()[1] if self._errands else None
             now = self._clock()
             seat = None if errand else self._next(now)
-            quick = seat is not None and seat.quick_due
-            resting = [each.moved + REST - now for each in self._seats if each.full_due]
+            quick = seat is not None and seat.preview_due
+            resting = [each.moved + REST_SECONDS - now for each in self._seats if each.full_due]
         if errand is not None:
             errand()
             return 0
         if seat is None:
             return max(min(resting), 1e-3) if resting else None
         try:
-            self._draw_quick(seat) if quick else self._draw_on(seat)
+            self._draw_preview(seat) if quick else self._draw_next_rows(seat)
         except Exception as error:  # one visitor's trouble ends no other's pictures
             with self._changed:
-                seat.quick_due, seat.full_due, seat.work = False, False, None
-            seat.failed(error)
+                seat.preview_due, seat.full_due, seat.work = False, False, None
+            seat.on_error(error)
         return 0
 
-    def _next(self, now: float) -> Seat | None:
+    def _next(self, now: float) -> RenderSession | None:
         """Whose turn it is; they go to the end of the queue."""
-        for wants in (lambda s: s.quick_due, lambda s: s.full_due and now - s.moved >= REST - 1e-6):
+        for wants in (lambda s: s.preview_due, lambda s: s.full_due and now - s.moved >= REST_SECONDS - 1e-6):
             for seat in self._seats:
                 if seat.asked is not None and wants(seat):
                     self._seats.remove(seat)
@@ -219,33 +223,37 @@ class Studio:
                     return seat
         return None
 
-    def _draw_quick(self, seat: Seat) -> None:
+    def _draw_preview(self, seat: RenderSession) -> None:
         with self._changed:
-            asked, seat.quick_due = seat.asked, False
+            asked, seat.preview_due = seat.asked, False
         if asked is None:
             return
         whole, shown = asked
-        small = shrunk(whole, seat.quick_px)
+        small = limit_pixels(whole, seat.preview_pixels)
         if small is whole and not seat.full_due:
             return
         began = self._clock()
         allowed = self._allowed(began)
-        anchors = max(int(allowed / seat.per_anchor), FEWEST_ANCHORS) if seat.per_anchor else FIRST_ANCHORS
-        seat.deliver(Frame(seat.painter.paint(shown, small, small, anchors), False, whole, shown))
+        anchors = (
+            max(int(allowed / seat.per_anchor), MIN_PREVIEW_ANCHORS) if seat.per_anchor else INITIAL_PREVIEW_ANCHORS
+        )
+        seat.on_frame(RenderedFrame(seat.painter.paint(shown, small, small, anchors), False, whole, shown))
         taken = max(self._clock() - began, 1e-4)
         if seat.painter.drawn:
             measured = taken / seat.painter.drawn
-            seat.per_anchor += (LEARNING if seat.per_anchor else 1.0) * (measured - seat.per_anchor)
-        most = max(min(MOST_PX, whole.width * whole.height), FEWEST_PX)
-        seat.quick_px = float(np.clip(seat.quick_px * np.clip(allowed / taken, 0.5, 1.5), FEWEST_PX, most))
+            seat.per_anchor += (SPEED_SMOOTHING if seat.per_anchor else 1.0) * (measured - seat.per_anchor)
+        most = max(min(MAX_PREVIEW_PIXELS, whole.width * whole.height), MIN_PREVIEW_PIXELS)
+        seat.preview_pixels = float(
+            np.clip(seat.preview_pixels * np.clip(allowed / taken, 0.5, 1.5), MIN_PREVIEW_PIXELS, most)
+        )
 
     def _allowed(self, now: float) -> float:
         """Seconds that a quick picture may take: a fair share of a round of all who move."""
         with self._changed:
-            moving = sum(now - seat.moved < 2 * REST for seat in self._seats)
-        return min(QUICK, max(ROUND / max(moving, 1), BRIEFEST))
+            moving = sum(now - seat.moved < 2 * REST_SECONDS for seat in self._seats)
+        return min(PREVIEW_SECONDS, max(ROUND_SECONDS / max(moving, 1), MIN_PREVIEW_SECONDS))
 
-    def _draw_on(self, seat: Seat) -> None:
+    def _draw_next_rows(self, seat: RenderSession) -> None:
         """The next rows of a full picture."""
         with self._changed:
             asked = seat.asked
@@ -259,45 +267,45 @@ class Studio:
             if done and seat.work is work:
                 seat.work, seat.full_due = None, False
 
-    def _full(self, seat: Seat, whole: Camera, shown: Shown) -> Iterator[None]:
+    def _full(self, seat: RenderSession, full_camera: Camera, display: DisplayOptions) -> Iterator[None]:
         """Draw a full picture, turn by turn, and deliver it unless something else was asked for meanwhile."""
-        seat.painter.settle(shown, whole)
-        key = (view_of(whole), shown, seat.painter.key(shown))
+        seat.painter.settle(display, full_camera)
+        key = (camera_key(full_camera), display, seat.painter.key(display))
         if key in self._full_pictures:
             self._full_pictures.move_to_end(key)
-            seat.deliver(Frame(self._full_pictures[key], True, whole, shown))
+            seat.on_frame(RenderedFrame(self._full_pictures[key], True, full_camera, display))
             return
-        turns = round(seat.per_px * whole.width * whole.height / TURN)
-        turns = max(turns, -(-seat.painter.in_view(shown, whole) // TURN_ANCHORS), 1)
-        turns = min(turns, MOST_TURNS, whole.height)
-        edges = np.linspace(0, whole.height, turns + 1).round().astype(int).tolist()
+        turns = round(seat.per_px * full_camera.width * full_camera.height / TURN_SECONDS)
+        turns = max(turns, -(-seat.painter.in_view(display, full_camera) // ANCHORS_PER_TURN), 1)
+        turns = min(turns, MAX_TURNS, full_camera.height)
+        edges = np.linspace(0, full_camera.height, turns + 1).round().astype(int).tolist()
         parts, taken = [], 0.0
         for top, bottom in pairwise(edges):
             began = self._clock()
-            part = whole if turns == 1 else whole.cropped(0, top, whole.width, bottom)
-            parts.append(seat.painter.paint(shown, part, whole))
+            part = full_camera if turns == 1 else full_camera.cropped(0, top, full_camera.width, bottom)
+            parts.append(seat.painter.paint(display, part, full_camera))
             taken += self._clock() - began
-            if bottom != whole.height:
+            if bottom != full_camera.height:
                 yield
-        seat.per_px = taken / (whole.width * whole.height)
+        seat.per_px = taken / (full_camera.width * full_camera.height)
         picture = np.concatenate(parts)
         self._full_pictures[key] = picture
-        while len(self._full_pictures) > KEPT:
+        while len(self._full_pictures) > MAX_CACHED_IMAGES:
             self._full_pictures.popitem(last=False)
-        if seat.asked == (whole, shown):
-            seat.deliver(Frame(picture, True, whole, shown))
+        if seat.asked == (full_camera, display):
+            seat.on_frame(RenderedFrame(picture, True, full_camera, display))
 
 
-def view_of(camera: Camera) -> Hashable:
+def camera_key(camera: Camera) -> Hashable:
     """What tells a view from others: equal for two cameras that see the same, to the last bit."""
     return (
         camera.camera_from_world.tobytes(), camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height,
     )  # fmt: skip
 
 
-def shrunk(camera: Camera, pixels: float) -> Camera:
+def limit_pixels(camera: Camera, max_pixels: float) -> Camera:
     """The same view with at most so many pixels; the very camera where it has no more."""
-    share = (pixels / (camera.width * camera.height)) ** 0.5
+    share = (max_pixels / (camera.width * camera.height)) ** 0.5
     if share >= 1.0:
         return camera
     return camera.resized(max(1, int(camera.width * share)), max(1, int(camera.height * share)))

@@ -21,109 +21,109 @@ from rich.console import Console
 from vdgs.captures.camera_height import FOV_DEG, camera_height
 from vdgs.config.commands import ViewRequest
 from vdgs.errors import Interrupted, VdgsError
-from vdgs.kernels.idle_memory import return_unused
-from vdgs.runs.open_run import TrainedRun
+from vdgs.kernels.idle_memory import trim_heap
+from vdgs.runs.open_run import OpenedRun
 from vdgs.runs.run_folder import RunFolder
-from vdgs.system.memory.process_memory import share_arenas
-from vdgs.system.stop_signals import stop_if_asked, stop_requests
+from vdgs.system.memory.process_memory import limit_malloc_arenas
+from vdgs.system.stop_signals import catch_stop_signals, check_stop_requested
 from vdgs.viewer import navigation
-from vdgs.viewer.access_control import ALL, Door, is_loopback
-from vdgs.viewer.client_session import Visitor
-from vdgs.viewer.live_run import newest, open_or_last_saved, standing_lines
-from vdgs.viewer.render_scheduler import Studio
-from vdgs.viewer.viewer_scene import Scene
+from vdgs.viewer.access_control import ALL_INTERFACES, AccessControl, is_loopback
+from vdgs.viewer.client_session import ClientSession
+from vdgs.viewer.live_run import open_run_or_checkpoint, run_file_times, run_status_markdown
+from vdgs.viewer.render_scheduler import RenderScheduler
+from vdgs.viewer.viewer_scene import ViewerScene
 
 #: Where the search for a free port begins, and how many are tried.
-FIRST_PORT, TRIED_PORTS = 8080, 50
+FIRST_PORT, MAX_PORT_TRIES = 8080, 50
 #: So many bytes may wait in the system for a visitor's network before newer pictures take the place of older ones here.
-WAITING_BYTES = 64 << 10
+MAX_UNSENT_BYTES = 64 << 10
 #: How often a run that trains is looked at, seconds.
-LOOK_AGAIN = 2.0
+REFRESH_SECONDS = 2.0
 
 
-def view_run(asked: ViewRequest, console: Console, opened: Callable[[str], None] | None = None) -> None:
+def view_run(request: ViewRequest, console: Console, on_ready: Callable[[str], None] | None = None) -> None:
     """Serve a run until Ctrl-C. `opened` is called with the address once it can be opened.
 
     Raises VdgsError for a run without a model, an address that cannot be used, and where viser is not installed.
     """
     _require_viser()
-    share_arenas()
+    limit_malloc_arenas()
     # Visitors may vanish while a picture is on its way to them.
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
-    free_port(asked.host, asked.port)  # said before the run is opened
-    run = open_or_last_saved(asked.run, asked.model, asked.device)
-    if run.caution:
-        console.print(f"[yellow]warning[/] {run.caution}", highlight=False)
+    find_free_port(request.host, request.port)  # said before the run is opened
+    run = open_run_or_checkpoint(request.run, request.model, request.device)
+    if run.warning:
+        console.print(f"[yellow]warning[/] {run.warning}", highlight=False)
     # Ctrl-C is how it ends, not how it fails, from the moment that the address is printed. Asked for anew: what reads
     # captures has set a handler of its own.
     ending = contextlib.suppress(KeyboardInterrupt, Interrupted)
-    with ending, stop_requests(interrupts=True), serve(run, asked.host, asked.port, console) as viewer:
-        for line in invitation(run.line, viewer.door):
+    with ending, catch_stop_signals(interrupts=True), serve(run, request.host, request.port, console) as viewer:
+        for line in startup_message(run.line, viewer.door):
             console.print(line, highlight=False, soft_wrap=True)
-        if opened is not None:
-            opened(viewer.door.address())
-        _until_asked(viewer, asked, console)
+        if on_ready is not None:
+            on_ready(viewer.door.address())
+        _serve_until_stopped(viewer, request, console)
 
 
-def invitation(scene: str, door: Door) -> list[str]:
+def startup_message(scene: str, access: AccessControl) -> list[str]:
     """What to say once a scene can be opened: where, and by whom."""
-    lines = [f"{scene}: {door.address()}"]
-    if not door.token:
+    lines = [f"{scene}: {access.address()}"]
+    if not access.token:
         return [*lines, "Only this machine can open it (--host lets others in). Ctrl-C ends it."]
-    elsewhere = door.address_elsewhere()
+    elsewhere = access.network_url()
     if elsewhere is not None:
         lines.append(f"from other machines: {elsewhere}")
         lines.append("Where they do not know that name, write this machine's IP address in its place.")
-    elif door.host in ALL:
+    elif access.host in ALL_INTERFACES:
         lines.append("From other machines, write this machine's IP address in place of localhost.")
     return [*lines, "Whoever has this address can see the scene. Ctrl-C ends it."]
 
 
 @dataclass(eq=False, kw_only=True)
-class Viewer:
+class ViewerServer:
     """A server that runs."""
 
     server: Any
-    door: Door
-    scene: Scene
-    studio: Studio
-    visitors: dict[int, Visitor]
+    door: AccessControl
+    scene: ViewerScene
+    scheduler: RenderScheduler
+    sessions: dict[int, ClientSession]
     progress: str = ""
 
-    def show(self, run: TrainedRun) -> None:
+    def show(self, run: OpenedRun) -> None:
         """Let every visitor see a newer model."""
-        self.studio.errand(lambda: self.scene.show(run)).result()
-        for visitor in list(self.visitors.values()):
-            visitor.model_changed()
+        self.scheduler.submit(lambda: self.scene.show(run)).result()
+        for visitor in list(self.sessions.values()):
+            visitor.on_model_changed()
 
     def tell(self, progress: str) -> None:
         """How far training is, to every visitor who does not know it yet."""
         if progress != self.progress:
             self.progress = progress
-            for visitor in list(self.visitors.values()):
+            for visitor in list(self.sessions.values()):
                 visitor.tell(progress)
 
 
 @contextlib.contextmanager
-def serve(run: TrainedRun, host: str, port: int | None, console: Console) -> Iterator[Viewer]:
+def serve(run: OpenedRun, host: str, port: int | None, console: Console) -> Iterator[ViewerServer]:
     """A viewer of an opened run on a port (None: the first that is free), while the context lasts."""
-    scene, studio = Scene(run), Studio()
-    door, server = _listening(host, port)
-    viewer = Viewer(server=server, door=door, scene=scene, studio=studio, visitors={})
-    _place_newcomers(server, run)
+    scene, studio = ViewerScene(run), RenderScheduler()
+    door, server = _start_listening(host, port)
+    viewer = ViewerServer(server=server, door=door, scene=scene, scheduler=studio, sessions={})
+    _set_initial_camera(server, run)
 
     def comes(client: Any) -> None:
         generation = scene.generation
-        visitor = Visitor(client, scene, studio, console)
-        viewer.visitors[client.client_id] = visitor
+        visitor = ClientSession(client, scene, studio, console)
+        viewer.sessions[client.client_id] = visitor
         visitor.tell(viewer.progress)
         if scene.generation != generation:  # a newer model came while the panel was made
-            visitor.model_changed()
+            visitor.on_model_changed()
         if client.client_id not in server.get_clients():  # gone while the panel was made
             goes(client)
 
     def goes(client: Any) -> None:
-        visitor = viewer.visitors.pop(client.client_id, None)
+        visitor = viewer.sessions.pop(client.client_id, None)
         if visitor is not None:
             visitor.leave()
 
@@ -131,7 +131,7 @@ def serve(run: TrainedRun, host: str, port: int | None, console: Console) -> Ite
     # visitors who left are held by circles of viser's until one finds them.
     gc.collect()
     gc.freeze()
-    return_unused()  # what opening the run took beside what it left
+    trim_heap()  # what opening the run took beside what it left
     worker = threading.Thread(target=studio.run, name="studio", daemon=True)
     worker.start()
     server.on_client_connect(comes)
@@ -147,31 +147,31 @@ def serve(run: TrainedRun, host: str, port: int | None, console: Console) -> Ite
         gc.unfreeze()
 
 
-def _place_newcomers(server: Any, run: TrainedRun) -> None:
+def _set_initial_camera(server: Any, run: OpenedRun) -> None:
     """Where a browser stands when it first opens the page; one that connects again stays where it is."""
-    stand, height = navigation.whole_scene(run.capture), camera_height(run.capture)
+    stand, height = navigation.overview_pose(run.capture), camera_height(run.capture)
     start = server.initial_camera
     start.up, start.fov = (0.0, 0.0, 1.0), math.radians(FOV_DEG)
     start.position, start.look_at = tuple(stand.position), tuple(stand.look_at)
     start.near, start.far = 1e-3 * height, 1000 * height
 
 
-def _until_asked(viewer: Viewer, asked: ViewRequest, console: Console) -> None:
+def _serve_until_stopped(viewer: ViewerServer, request: ViewRequest, console: Console) -> None:
     """Serve, and follow a run that is not finished."""
-    folder = RunFolder(asked.run)
-    seen, follows = newest(folder), viewer.scene.run.name != "merged" and asked.model == "best"
+    folder = RunFolder(request.run)
+    seen, follows = run_file_times(folder), viewer.scene.run.name != "merged" and request.model == "best"
     looked = 0.0
     while True:
-        stop_if_asked()
+        check_stop_requested()
         time.sleep(0.2)
-        if not follows or time.monotonic() - looked < LOOK_AGAIN:
+        if not follows or time.monotonic() - looked < REFRESH_SECONDS:
             continue
         looked = time.monotonic()
-        viewer.tell(standing_lines(folder))
-        if (now := newest(folder)) == seen:
+        viewer.tell(run_status_markdown(folder))
+        if (now := run_file_times(folder)) == seen:
             continue
         try:
-            viewer.show(open_or_last_saved(asked.run, asked.model, asked.device))
+            viewer.show(open_run_or_checkpoint(request.run, request.model, request.device))
             seen, follows = now, viewer.scene.run.name != "merged"
         except VdgsError as error:  # it is just being written, or training began anew
             console.print(f"[yellow]waiting[/] {error}", highlight=False)
@@ -185,9 +185,9 @@ def _require_viser() -> None:
         raise VdgsError("vdgs view needs viser. Install it: pip install 'vdgs[viewer]'") from error
 
 
-def free_port(host: str, port: int | None) -> int:
+def find_free_port(host: str, port: int | None) -> int:
     """The port that was asked for, else the first free one. Raises VdgsError where there is none, or no such host."""
-    tried = range(FIRST_PORT, FIRST_PORT + TRIED_PORTS) if port is None else [port]
+    tried = range(FIRST_PORT, FIRST_PORT + MAX_PORT_TRIES) if port is None else [port]
     why: OSError | None = None
     for each in tried:
         try:
@@ -205,12 +205,12 @@ def free_port(host: str, port: int | None) -> int:
     raise VdgsError(f"--port {port}: cannot be used on {host} ({why}). Give another one.")
 
 
-def _listening(host: str, port: int | None) -> tuple[Door, Any]:
+def _start_listening(host: str, port: int | None) -> tuple[AccessControl, Any]:
     """A server that listens, and its door. A port that another program takes between the look and the start is passed
     over, unless it was asked for: VdgsError then."""
     token = None if is_loopback(host) else secrets.token_urlsafe(24)
-    for _ in range(TRIED_PORTS):
-        door = Door(host, token, free_port(host, port))
+    for _ in range(MAX_PORT_TRIES):
+        door = AccessControl(host, token, find_free_port(host, port))
         server = _start(door)
         if server is not None:
             return door, server
@@ -219,7 +219,7 @@ def _listening(host: str, port: int | None) -> tuple[Door, Any]:
     raise VdgsError(f"--port {door.port}: was taken meanwhile. Give the command again.")
 
 
-def _start(door: Door) -> Any:
+def _start(access: AccessControl) -> Any:
     """A viser server behind a door; None if its port was taken meanwhile."""
     import viser
     import websockets.asyncio.server as sockets
@@ -235,16 +235,16 @@ def _start(door: Door) -> Any:
     def serve_guarded(*args: Any, process_request: Any, **options: Any) -> Any:
         nonlocal guarded
         guarded = True
-        return unguarded(*args, process_request=_at_the_door(door, process_request), **options)
+        return unguarded(*args, process_request=_guard_requests(access, process_request), **options)
 
     # viser has no hook before its own answers. What it calls to listen is ours while it starts.
     sockets.serve = serve_guarded  # type: ignore[misc, assignment]
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # it prints a table of addresses without the token
-            server = Server(host=door.host, port=door.port, verbose=False)
+            server = Server(host=access.host, port=access.port, verbose=False)
     finally:
         sockets.serve = unguarded  # type: ignore[misc]
-    if not guarded or server.get_port() != door.port:
+    if not guarded or server.get_port() != access.port:
         with contextlib.redirect_stdout(io.StringIO()):  # it says that it stopped
             server.stop()
         return None
@@ -253,32 +253,32 @@ def _start(door: Door) -> Any:
     return server
 
 
-def _keep_short(connection: Any) -> None:
+def _limit_send_buffer(connection: Any) -> None:
     """Let nothing pile up in the system's buffers (Linux, macOS): over a slow network, pictures there grow old."""
     if hasattr(socket, "TCP_NOTSENT_LOWAT"):
         with contextlib.suppress(OSError, AttributeError):
             wire = connection.transport.get_extra_info("socket")
-            wire.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, WAITING_BYTES)
+            wire.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, MAX_UNSENT_BYTES)
 
 
-def _at_the_door(door: Door, inner: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+def _guard_requests(access: AccessControl, handler: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
     """What answers a request: a refusal, or what viser answers."""
     from websockets.datastructures import Headers
     from websockets.http11 import Response
 
     def answer(connection: Any, request: Any) -> Any:
-        refusal = door.refusal(request.path, request.headers)
+        refusal = access.deny_reason(request.path, request.headers)
         if refusal is not None:
             body = (refusal + "\n").encode()
             headers = Headers({"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))})
             return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", headers, body)
-        _keep_short(connection)
-        response = inner(connection, request)
+        _limit_send_buffer(connection)
+        response = handler(connection, request)
         if response is not None:
             response.headers["Referrer-Policy"] = "no-referrer"
             response.headers["X-Frame-Options"] = "DENY"
-            if door.has_token(request.path):
-                response.headers["Set-Cookie"] = door.set_cookie()
+            if access.has_token(request.path):
+                response.headers["Set-Cookie"] = access.set_cookie_header()
         return response
 
     return answer

@@ -14,36 +14,36 @@ from torch import Tensor
 
 from vdgs.captures.image_cache import ImageCache
 from vdgs.errors import VdgsError
-from vdgs.evaluation.view_exposures import Exposures, exposures_of
+from vdgs.evaluation.view_exposures import ViewExposures, make_exposures
 from vdgs.geometry.camera import Camera
-from vdgs.geometry.map_projection import Placement
+from vdgs.geometry.map_projection import MapProjection
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.renderer import render
-from vdgs.partition.blocks import Blocks, places_of
-from vdgs.runs.open_run import TrainedRun, blocks_of, open_run
-from vdgs.runs.visibility_store import visibility_of_run
-from vdgs.viewer.lod import Level, Levels
+from vdgs.partition.blocks import Blocks, xy_positions
+from vdgs.runs.open_run import OpenedRun, load_run_blocks, open_run
+from vdgs.runs.visibility_store import get_run_visibility
+from vdgs.viewer.lod import LodLevel, LodPyramid
 
 ModelChoice = Literal["coarse", "merged"]
 #: Photographs kept in memory, decoded (choice).
-_PHOTOGRAPH_BYTES = 128 << 20
+_IMAGE_CACHE_BYTES = 128 << 20
 #: What a camera meters is drawn from at most about so many anchors (choice): the law of it takes up to two hundred
 #: pictures, and all visitors wait meanwhile.
-_METERED_ANCHORS = 10_000
+_METERING_MAX_ANCHORS = 10_000
 
 
-class Scene:
+class ViewerScene:
     """One run, opened for visitors. Used from one thread, the one that draws."""
 
-    def __init__(self, run: TrainedRun, other: Callable[[str], TrainedRun] | None = None) -> None:
+    def __init__(self, run: OpenedRun, open_other: Callable[[str], OpenedRun] | None = None) -> None:
         self.run = run
         self.capture = run.capture
-        self._open = other or (lambda name: open_run(run.folder.path, name, run.device))  # type: ignore[arg-type]
-        self._runs: dict[str, TrainedRun] = {run.name: run}
+        self._open = open_other or (lambda name: open_run(run.folder.path, name, run.device))  # type: ignore[arg-type]
+        self._runs: dict[str, OpenedRun] = {run.name: run}
         self._seen: dict[str, Tensor] = {}
         self._tints: dict[str, Tensor] = {}
-        self._levels: dict[str, Levels] = {}
-        self._exposures: dict[str, Exposures | None] = {}
+        self._levels: dict[str, LodPyramid] = {}
+        self._exposures: dict[str, ViewExposures | None] = {}
         #: Grows with every newer model.
         self.generation = 0
 
@@ -52,7 +52,7 @@ class Scene:
         """The models that can be shown, the best first."""
         return ("merged", "coarse") if self.run.name == "merged" else (self.run.name,)
 
-    def opened(self, name: str) -> TrainedRun:
+    def opened(self, name: str) -> OpenedRun:
         """A model of the run; the one opened first where that has no such model."""
         if name not in self.names:
             name = self.run.name
@@ -64,13 +64,13 @@ class Scene:
     def model(self, name: str) -> AnchorModel:
         return self.opened(name).model
 
-    def level(self, name: str, camera: Camera, most: int | None = None) -> tuple[Level, int]:
+    def level(self, name: str, camera: Camera, max_anchors: int | None = None) -> tuple[LodLevel, int]:
         """What to draw of a model: itself, or one with at most so many anchors in view; and how many those are."""
         if name not in self._levels:
-            self._levels[name] = Levels(self.model(name))
-        return self._levels[name].of(camera, most)
+            self._levels[name] = LodPyramid(self.model(name))
+        return self._levels[name].of(camera, max_anchors)
 
-    def show(self, run: TrainedRun) -> None:
+    def show(self, run: OpenedRun) -> None:
         """Put a newer model in place of the one of its name."""
         self.run = run
         self._runs = {run.name: run}
@@ -82,17 +82,17 @@ class Scene:
         """V of every anchor of a model."""
         if name not in self._seen:
             cameras = [view.camera for view in self.capture.train_views]
-            self._seen[name] = visibility_of_run(self.opened(name), cameras).float()
+            self._seen[name] = get_run_visibility(self.opened(name), cameras).float()
         return self._seen[name]
 
-    def exposures(self, name: str) -> Exposures | None:
+    def exposures(self, name: str) -> ViewExposures | None:
         """The exposures that views are compared in with a model, as `vdgs eval` has them but for what is metered of
         thinner models; None where training fitted none."""
         if name not in self._exposures:
-            self._exposures[name] = exposures_of(
+            self._exposures[name] = make_exposures(
                 self.model(name),
                 self.capture,
-                lambda camera: render(self.level(name, camera, _METERED_ANCHORS)[0].model, camera),
+                lambda camera: render(self.level(name, camera, _METERING_MAX_ANCHORS)[0].model, camera),
             )
         return self._exposures[name]
 
@@ -100,34 +100,34 @@ class Scene:
     def blocks(self) -> Blocks | None:
         """The cut of the run; None before it is cut."""
         try:
-            return blocks_of(self.run.folder)
+            return load_run_blocks(self.run.folder)
         except VdgsError:
             return None
 
-    def tint(self, name: str) -> Float[Tensor, "n 3"]:
+    def block_tint(self, name: str) -> Float[Tensor, "n 3"]:
         """The colour of the block that owns each anchor, RGB in 0 to 1; grey where the scene is not cut."""
         if name not in self._tints:
             positions = self.model(name).anchors.positions
             if self.blocks is None:
                 colours = np.full((len(positions), 3), 0.6)
             else:
-                palette = np.stack([rgb_of(index) for index in range(len(self.blocks))])
-                colours = palette[self.blocks.owner(places_of(positions))] / 255.0
+                palette = np.stack([block_rgb(index) for index in range(len(self.blocks))])
+                colours = palette[self.blocks.owner(xy_positions(positions))] / 255.0
             self._tints[name] = torch.as_tensor(colours, dtype=torch.float32, device=positions.device)
         return self._tints[name]
 
     @cached_property
     def photographs(self) -> ImageCache:
         """The photographs of all views, by their number in `capture.views`."""
-        return ImageCache(self.capture.views, _PHOTOGRAPH_BYTES)
+        return ImageCache(self.capture.views, _IMAGE_CACHE_BYTES)
 
     @cached_property
-    def placements(self) -> tuple[Placement, ...]:
+    def map_projections(self) -> tuple[MapProjection, ...]:
         """The coordinates that a place is given in beside those of the ground frame: those of the map, if any."""
         if self.capture.ground.origin_geo is None:
             return ()
         try:
-            return (Placement.of(self.capture.ground),)
+            return (MapProjection.of(self.capture.ground),)
         except VdgsError:  # pyproj is not installed
             return ()
 
@@ -136,10 +136,10 @@ class Scene:
             self.photographs.close()
 
 
-def rgb_of(block: int) -> tuple[int, int, int]:
+def block_rgb(block: int) -> tuple[int, int, int]:
     """The colour of a block in all figures, 0 to 255."""
-    from vdgs.plots.partition.block_stats import block_colour  # brings matplotlib: not before the first picture
+    from vdgs.plots.partition.block_stats import block_color  # brings matplotlib: not before the first picture
 
-    colour = block_colour(block).lstrip("#")
+    colour = block_color(block).lstrip("#")
     red, green, blue = (int(colour[place : place + 2], 16) for place in (0, 2, 4))
     return red, green, blue

@@ -11,10 +11,10 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
-from vdgs.geometry.camera import NEAR, Camera
+from vdgs.geometry.camera import NEAR_PLANE, Camera
 
 
-class Projection(NamedTuple):
+class PointProjection(NamedTuple):
     """Places of n points in a picture, or of c pictures; where `inside` is false, column and row say nothing."""
 
     column: Float[Tensor, "*c n"]
@@ -57,7 +57,7 @@ class Frusta:
         """What the longer side of each picture spans at the unit of depth."""
         return torch.maximum(self.width, self.height) / torch.maximum(self.fx, self.fy)
 
-    def project(self, positions: Float[Tensor, "n 3"]) -> Projection:
+    def project(self, positions: Float[Tensor, "n 3"]) -> PointProjection:
         """Where the points fall in each picture, [c, n]. O(c n)."""
         rigid = self.camera_from_world.to(positions)
         local = positions @ rigid[:, :3, :3].transpose(1, 2) + rigid[:, None, :3, 3]
@@ -65,12 +65,12 @@ class Frusta:
             each[:, None].to(positions) for each in (self.fx, self.fy, self.cx, self.cy, self.width, self.height)
         )
         x, y, depth = local.permute(2, 0, 1).contiguous()
-        divisor = depth.clamp(min=NEAR)
+        divisor = depth.clamp(min=NEAR_PLANE)
         column, row = fx * x / divisor + cx, fy * y / divisor + cy
-        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (depth > NEAR)
-        return Projection(column, row, depth, (x * x + y * y + depth * depth).sqrt(), inside)
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (depth > NEAR_PLANE)
+        return PointProjection(column, row, depth, (x * x + y * y + depth * depth).sqrt(), inside)
 
 
-def project(positions: Float[Tensor, "n 3"], camera: Camera) -> Projection:
+def project_points(positions: Float[Tensor, "n 3"], camera: Camera) -> PointProjection:
     """Where the points fall in the picture of one camera. O(n)."""
-    return Projection(*(each[0] for each in Frusta.of([camera], positions.device).project(positions)))
+    return PointProjection(*(each[0] for each in Frusta.of([camera], positions.device).project(positions)))

@@ -9,34 +9,34 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from vdgs.geometry.camera import NEAR, Camera
-from vdgs.kernels import choose
+from vdgs.geometry.camera import NEAR_PLANE, Camera
+from vdgs.kernels import get_backend
 from vdgs.visibility.frustum import Frusta
 
 #: Places in a group.
-GROUP = 256
+GROUP_SIZE = 256
 #: What rounding in float32 may add to distances, as a share of the lengths that they are computed from.
 ROUNDING = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
-class Groups:
-    """Places along a Morton curve in groups of `GROUP`, and the ball that holds each group (float64)."""
+class SpatialGroups:
+    """Places along a Morton curve in groups of `GROUP_SIZE`, and the ball that holds each group (float64)."""
 
     order: Int64[Tensor, " n"]
     centres: Float[Tensor, "g 3"]
     radii: Float[Tensor, " g"]
 
     @staticmethod
-    def of(positions: Float[Tensor, "n 3"]) -> Groups:
+    def of(positions: Float[Tensor, "n 3"]) -> SpatialGroups:
         """O(n)."""
         known = torch.nan_to_num(positions.detach(), nan=0.0, posinf=0.0, neginf=0.0)
-        order = choose(positions.device).morton_order(known)
-        missing = -len(order) % GROUP
+        order = get_backend(positions.device).morton_order(known)
+        missing = -len(order) % GROUP_SIZE
         filled = torch.cat([order, order[-1:].expand(missing)]) if missing else order
-        grouped = known[filled].double().reshape(-1, GROUP, 3)
+        grouped = known[filled].double().reshape(-1, GROUP_SIZE, 3)
         low, high = grouped.amin(dim=1), grouped.amax(dim=1)
-        return Groups(order, (low + high) / 2, (high - low).norm(dim=1) / 2)
+        return SpatialGroups(order, (low + high) / 2, (high - low).norm(dim=1) / 2)
 
     def about(self, camera: Camera) -> Int64[Tensor, " some"]:
         """The places, ascending, that may fall into the picture of a pinhole camera: all that do, and few others.
@@ -45,13 +45,13 @@ class Groups:
         """
         frustum = Frusta.of([camera], self.centres.device)
         chosen = _may_hold(self.centres, self.radii, frustum)[0].nonzero()
-        rows = (chosen * GROUP + torch.arange(GROUP, device=chosen.device)).reshape(-1)
+        rows = (chosen * GROUP_SIZE + torch.arange(GROUP_SIZE, device=chosen.device)).reshape(-1)
         return self.order[rows[rows < len(self.order)]].sort().values
 
-    def watched(self, frusta: Frusta) -> Iterator[tuple[Int64[Tensor, " rows"], Int64[Tensor, " some"]]]:
+    def visible_groups(self, frusta: Frusta) -> Iterator[tuple[Int64[Tensor, " rows"], Int64[Tensor, " some"]]]:
         """The places of each group that any camera may hold, and the numbers of such cameras: all that do, and few
         others. O(c n / GROUP)."""
-        for number, rows in enumerate(self.order.split(GROUP)):
+        for number, rows in enumerate(self.order.split(GROUP_SIZE)):
             held = _may_hold(self.centres[number, None], self.radii[number, None], frusta)[:, 0]
             if held.any():
                 yield rows, held.nonzero().squeeze(1)
@@ -63,7 +63,7 @@ def _may_hold(centres: Float[Tensor, "g 3"], radii: Float[Tensor, " g"], frusta:
     local = centres @ turn.transpose(1, 2) + shift[:, None]
     x, y, z = local.permute(2, 0, 1)
     reach = radii + ROUNDING * (radii + centres.norm(dim=1) + shift.norm(dim=1)[:, None])
-    held = z + reach > NEAR
+    held = z + reach > NEAR_PLANE
     for focal, side, along in (
         (frusta.fx, frusta.cx, x), (-frusta.fx, frusta.width - frusta.cx, x),
         (frusta.fy, frusta.cy, y), (-frusta.fy, frusta.height - frusta.cy, y),

@@ -15,17 +15,17 @@ from jaxtyping import Float, Int, Int32
 from torch import Tensor
 
 from vdgs.geometry.camera import Camera
-from vdgs.kernels import choose
+from vdgs.kernels import get_backend
 
 #: Percentiles and limits by which visibility is described.
-QUANTILES = (5, 25, 50, 75, 95)
-LIMITS = (3, 5, 10)
+PERCENTILES = (5, 25, 50, 75, 95)
+LOW_VISIBILITY_LIMITS = (3, 5, 10)
 #: Keeps V̂ finite where all anchors are seen alike (eq. 5).
 EPSILON = 1e-8
 
 
 @dataclass(frozen=True)
-class Imbalance:
+class VisibilityStats:
     """How unevenly anchors are seen."""
 
     mean: float
@@ -37,32 +37,32 @@ class Imbalance:
     share_below: dict[int, float]
 
 
-def visibility_of(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Int32[Tensor, " n"]:
+def count_visibility(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Int32[Tensor, " n"]:
     """V_i of every anchor: the number of `cameras` (the training views) whose frustum holds it.
 
     Raises TypeError or ValueError unless positions are float32 or float64 [n, 3].
     """
-    return choose(positions.device).count_visibility(positions, cameras)
+    return get_backend(positions.device).count_visibility(positions, cameras)
 
 
-def votes_of(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> tuple[float, ...]:
+def visibility_sampling_weights(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> tuple[float, ...]:
     """How much of the training each camera deserves (choice): every anchor has one vote and divides it among the
     cameras that hold it, so that w_j = sum of 1 / V_i over the anchors i that camera j holds.
 
     The shares add up to the number of anchors that any camera holds; where that is none, all are 1.
     """
-    votes = 1.0 / visibility_of(positions, cameras).double().clamp(min=1)
-    shares = tuple(float(votes[visibility_of(positions, [camera]) > 0].sum()) for camera in cameras)
+    votes = 1.0 / count_visibility(positions, cameras).double().clamp(min=1)
+    shares = tuple(float(votes[count_visibility(positions, [camera]) > 0].sum()) for camera in cameras)
     return shares if any(shares) else (1.0,) * len(cameras)
 
 
-def effective_count(shares: Sequence[float]) -> float:
+def effective_sample_size(shares: Sequence[float]) -> float:
     """How many things used alike vary as much in the mean as these used in proportion to `shares`: (Σ w)² / Σ w²
     (Kish, Survey Sampling, 1965, section 11.7). At least one share is above 0."""
     return sum(shares) ** 2 / sum(share * share for share in shares)
 
 
-def normalised(visibility: Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+def normalize_visibility(visibility: Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """V̂_i = (V_i - min V) / (max V - min V + 1e-8), float64 in [0, 1) (eq. 5)."""
     count = np.asarray(visibility, np.float64)
     if len(count) == 0:
@@ -70,7 +70,7 @@ def normalised(visibility: Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     return (count - count.min()) / (np.ptp(count) + EPSILON)
 
 
-def share_in_cycle(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Float[Tensor, " n"]:
+def visibility_ratio(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Float[Tensor, " n"]:
     """c_k of every anchor (eq. 8): the share of the distinct cameras of a growth cycle whose frustum holds it, float32.
 
     A view that was drawn twice in the cycle, or at two resolutions, counts once. All offsets of an anchor share its
@@ -79,7 +79,7 @@ def share_in_cycle(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -
     if not cameras:
         raise ValueError("a growth cycle without cameras has no shares")
     distinct = list({_frustum(camera): camera for camera in cameras}.values())
-    return visibility_of(positions, distinct).float() / len(distinct)
+    return count_visibility(positions, distinct).float() / len(distinct)
 
 
 def _frustum(camera: Camera) -> tuple[bytes, tuple[float, ...], str]:
@@ -89,16 +89,16 @@ def _frustum(camera: Camera) -> tuple[bytes, tuple[float, ...], str]:
     return camera.camera_from_world.tobytes(), tuple(round(share, 9) for share in shares), camera.model
 
 
-def imbalance(visibility: Int[np.ndarray, " n"]) -> Imbalance:
+def visibility_stats(visibility: Int[np.ndarray, " n"]) -> VisibilityStats:
     """The distribution of V in numbers. Raises ValueError if there is no anchor."""
     count = np.asarray(visibility, np.float64)
     if len(count) == 0:
         raise ValueError("no anchors: their visibility has no distribution")
-    return Imbalance(
+    return VisibilityStats(
         mean=float(count.mean()),
-        quantiles={percent: float(np.percentile(count, percent)) for percent in QUANTILES},
+        quantiles={percent: float(np.percentile(count, percent)) for percent in PERCENTILES},
         gini=_gini(count),
-        share_below={limit: float((count < limit).mean()) for limit in LIMITS},
+        share_below={limit: float((count < limit).mean()) for limit in LOW_VISIBILITY_LIMITS},
     )
 
 

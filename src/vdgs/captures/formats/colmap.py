@@ -13,18 +13,18 @@ from pathlib import Path
 
 import numpy as np
 
-from vdgs.captures.capture import Sightings
-from vdgs.captures.formats.colmap_binary import cameras_binary, images_binary, points_binary
-from vdgs.captures.formats.colmap_records import ImageRecord, Points, no_points
-from vdgs.captures.formats.colmap_text import cameras_text, images_text, points_text
+from vdgs.captures.capture import Observations
+from vdgs.captures.formats.colmap_binary import read_cameras_binary, read_images_binary, read_points3D_binary
+from vdgs.captures.formats.colmap_records import ColmapImage, ColmapPoints, empty_points
+from vdgs.captures.formats.colmap_text import read_cameras_text, read_images_text, read_points3D_text
 from vdgs.captures.formats.source_capture import (
     Intrinsics,
     SourceView,
-    duplicates,
-    listing,
-    rays_of,
-    rigid,
+    find_duplicates,
+    format_list,
+    pixel_rays,
     safe_name,
+    to_rigid,
 )
 from vdgs.errors import CaptureError
 
@@ -68,11 +68,11 @@ def read_colmap(folder: Path) -> ColmapModel:
     cameras_file, images_file = folder / f"cameras{suffix}", folder / f"images{suffix}"
     points_file = folder / f"points3D{suffix}"
     try:
-        cameras = (cameras_binary if binary else cameras_text)(cameras_file)
-        records = list((images_binary if binary else images_text)(images_file))
-        points = no_points()
+        cameras = (read_cameras_binary if binary else read_cameras_text)(cameras_file)
+        records = list((read_images_binary if binary else read_images_text)(images_file))
+        points = empty_points()
         if points_file.is_file():
-            points = (points_binary if binary else points_text)(points_file)
+            points = (read_points3D_binary if binary else read_points3D_text)(points_file)
     except OSError as error:
         raise CaptureError(f"{error.filename or folder}: cannot be read ({error.strerror or error}).") from error
     return ColmapModel(folder, _views(records, cameras, points, images_file), points.positions, points.colours)
@@ -84,7 +84,7 @@ def count_images(folder: Path) -> int:
         if _format(folder) == ".bin":
             with (folder / "images.bin").open("rb") as stream:
                 return struct.unpack("<Q", stream.read(8))[0]
-        return sum(1 for _ in images_text(folder / "images.txt", with_points=False))
+        return sum(1 for _ in read_images_text(folder / "images.txt", with_points=False))
     except (OSError, struct.error, CaptureError):
         return -1
 
@@ -109,16 +109,16 @@ def _format(folder: Path) -> str | None:
 
 
 def _views(
-    records: list[ImageRecord], cameras: dict[int, Intrinsics], points: Points, file: Path
+    records: list[ColmapImage], cameras: dict[int, Intrinsics], points: ColmapPoints, file: Path
 ) -> tuple[SourceView, ...]:
     """Posed views in name order; raises on silly poses, unknown cameras and names given twice."""
     orphans = [f"{record.name} (camera {record.camera})" for record in records if record.camera not in cameras]
     if orphans:
         raise CaptureError(
             f"{file}: these images name a camera that is not in the cameras file. "
-            f"Both files must come from the same export.{listing(orphans)}"
+            f"Both files must come from the same export.{format_list(orphans)}"
         )
-    sorted_points = Points(*(column[np.argsort(points.numbers, kind="stable")] for column in points))
+    sorted_points = ColmapPoints(*(column[np.argsort(points.numbers, kind="stable")] for column in points))
     views = []
     for record in records:
         intrinsics = cameras[record.camera]
@@ -126,25 +126,25 @@ def _views(
         name, pose = safe_name(record.name, file), _pose(record, file)
         views.append(SourceView(name=name, camera_from_world=pose, intrinsics=intrinsics, sightings=sightings))
     views.sort(key=lambda view: view.name)
-    twice = duplicates(view.name for view in views)
+    twice = find_duplicates(view.name for view in views)
     if twice:
-        raise CaptureError(f"{file}: the same image name occurs more than once.{listing(twice)}")
+        raise CaptureError(f"{file}: the same image name occurs more than once.{format_list(twice)}")
     return tuple(views)
 
 
-def _sightings(record: ImageRecord, points: Points, intrinsics: Intrinsics) -> Sightings | None:
+def _sightings(record: ColmapImage, points: ColmapPoints, intrinsics: Intrinsics) -> Observations | None:
     """What an image says that it shows, of points sorted by number; None where it says nothing."""
     numbers, pixels = record.shown
     if not len(numbers) or not len(points.numbers):
         return None
     places = np.searchsorted(points.numbers, numbers).clip(max=len(points.numbers) - 1)
-    rays = rays_of(intrinsics, pixels)
+    rays = pixel_rays(intrinsics, pixels)
     known = (points.numbers[places] == numbers) & np.isfinite(rays).all(axis=1)
     known &= np.isfinite(points.positions[places]).all(axis=1)
-    return Sightings(points.positions[places[known]], rays[known], numbers[known]) if known.any() else None
+    return Observations(points.positions[places[known]], rays[known], numbers[known]) if known.any() else None
 
 
-def _pose(record: ImageRecord, file: Path) -> np.ndarray:
+def _pose(record: ColmapImage, file: Path) -> np.ndarray:
     label = f"image {record.name!r}"
     quaternion = np.array(record.quaternion)
     near = np.isfinite(quaternion).all() and np.abs(quaternion).max() < 2  # before squares overflow
@@ -156,7 +156,7 @@ def _pose(record: ImageRecord, file: Path) -> np.ndarray:
     pose = np.eye(4)
     pose[:3, :3] = rotation_from_quaternion(quaternion / np.linalg.norm(quaternion))
     pose[:3, 3] = record.translation
-    return rigid(pose, file, label)
+    return to_rigid(pose, file, label)
 
 
 def rotation_from_quaternion(quaternion: np.ndarray) -> np.ndarray:

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from vdgs.captures.formats.colmap_records import ImageRecord, Points, add_camera, some_of
+from vdgs.captures.formats.colmap_records import ColmapImage, ColmapPoints, add_camera, sample_observations
 from vdgs.captures.formats.source_capture import CAMERA_MODELS, Intrinsics
 from vdgs.errors import CaptureError
 
-LONGEST_NAME = 4096
+MAX_NAME_BYTES = 4096
 
 
 class _Cursor:
@@ -57,7 +57,7 @@ class _Cursor:
         self.offset += size
 
     def name(self) -> str:
-        end = self.data.find(b"\0", self.offset, self.offset + LONGEST_NAME)
+        end = self.data.find(b"\0", self.offset, self.offset + MAX_NAME_BYTES)
         if end < 0:
             raise self.fail("an image name does not end")
         raw, self.offset = self.data[self.offset : end], end + 1
@@ -71,7 +71,7 @@ class _Cursor:
             raise self.fail(f"{self.left} bytes are left over after the last record")
 
 
-def cameras_binary(file: Path) -> dict[int, Intrinsics]:
+def read_cameras_binary(file: Path) -> dict[int, Intrinsics]:
     cursor = _Cursor(file)
     cameras: dict[int, Intrinsics] = {}
     for _ in range(cursor.count(24 + 3 * 8, "cameras")):
@@ -85,7 +85,7 @@ def cameras_binary(file: Path) -> dict[int, Intrinsics]:
     return cameras
 
 
-def images_binary(file: Path) -> Iterator[ImageRecord]:
+def read_images_binary(file: Path) -> Iterator[ColmapImage]:
     cursor = _Cursor(file)
     for _ in range(cursor.count(4 + 7 * 8 + 4 + 1 + 8, "images")):
         _, *pose, camera = cursor.take("I7dI")
@@ -93,7 +93,9 @@ def images_binary(file: Path) -> Iterator[ImageRecord]:
         count = cursor.count(_IMAGE_POINT.itemsize, "image points")
         shown = np.frombuffer(cursor.data, _IMAGE_POINT, count, cursor.offset)
         cursor.skip(count * _IMAGE_POINT.itemsize)
-        yield ImageRecord(tuple(pose[:4]), tuple(pose[4:]), camera, name, some_of(shown["point"], shown["pixel"]))
+        yield ColmapImage(
+            tuple(pose[:4]), tuple(pose[4:]), camera, name, sample_observations(shown["point"], shown["pixel"])
+        )
     cursor.finish()
 
 
@@ -103,7 +105,7 @@ _IMAGE_POINT = np.dtype([("pixel", "<f8", 2), ("point", "<i8")])
 _POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")])
 
 
-def points_binary(file: Path) -> Points:
+def read_points3D_binary(file: Path) -> ColmapPoints:
     cursor = _Cursor(file)
     size, data = _POINT.itemsize, cursor.data
     count = cursor.count(size, "points")
@@ -120,4 +122,4 @@ def points_binary(file: Path) -> Points:
     cursor.offset = offset
     cursor.finish()
     records = np.frombuffer(buffer, _POINT)
-    return Points(records["id"].astype(np.int64), records["xyz"].astype(np.float64), records["rgb"].copy())
+    return ColmapPoints(records["id"].astype(np.int64), records["xyz"].astype(np.float64), records["rgb"].copy())

@@ -13,10 +13,10 @@ from vdgs.errors import CaptureError
 
 #: So many of the points that a photograph shows are remembered: enough to see whether cameras and points agree, and
 #: whether photographs are equally bright.
-SIGHTINGS = 400
+MAX_OBSERVATIONS = 400
 
 
-class Points(NamedTuple):
+class ColmapPoints(NamedTuple):
     """Points [n, 3] float64 and colours [n, 3] uint8 with the numbers [n] by which images name them."""
 
     numbers: np.ndarray
@@ -24,12 +24,12 @@ class Points(NamedTuple):
     colours: np.ndarray
 
 
-def no_points() -> Points:
-    return Points(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+def empty_points() -> ColmapPoints:
+    return ColmapPoints(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
 
 
 @dataclass(frozen=True, eq=False)
-class ImageRecord:
+class ColmapImage:
     quaternion: tuple[float, ...]  # wxyz
     translation: tuple[float, ...]
     camera: int
@@ -38,11 +38,11 @@ class ImageRecord:
     shown: tuple[np.ndarray, np.ndarray]
 
 
-def some_of(numbers: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """At most `SIGHTINGS` of an image's points that are points of the model, at random; copies. A point that one image
+def sample_observations(numbers: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """At most `MAX_OBSERVATIONS` of an image's points that are points of the model, at random; copies. A point that one image
     remembers is likely to be remembered by others that show it: chance depends on its number alone."""
     matched = np.flatnonzero((numbers >= 0) & (numbers < 2**63) & np.isfinite(pixels).all(axis=1))
-    few = np.sort(matched[np.argsort(_chance(numbers[matched].astype(np.int64)), kind="stable")[:SIGHTINGS]])
+    few = np.sort(matched[np.argsort(_chance(numbers[matched].astype(np.int64)), kind="stable")[:MAX_OBSERVATIONS]])
     return numbers[few].astype(np.int64), pixels[few]
 
 

@@ -7,7 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from vdgs.captures.formats.colmap_records import ImageRecord, Points, add_camera, no_points, some_of
+from vdgs.captures.formats.colmap_records import (
+    ColmapImage,
+    ColmapPoints,
+    add_camera,
+    empty_points,
+    sample_observations,
+)
 from vdgs.captures.formats.source_capture import MODEL_PARAMETERS, Intrinsics
 from vdgs.errors import CaptureError
 
@@ -27,7 +33,7 @@ def _bad_line(file: Path, number: int, expected: str) -> CaptureError:
     return CaptureError(f"{file}: line {number} should read '{expected}'. The file is damaged; export it again.")
 
 
-def cameras_text(file: Path) -> dict[int, Intrinsics]:
+def read_cameras_text(file: Path) -> dict[int, Intrinsics]:
     expected = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"
     cameras: dict[int, Intrinsics] = {}
     for number, line in _lines(file):
@@ -49,7 +55,7 @@ def cameras_text(file: Path) -> dict[int, Intrinsics]:
     return cameras
 
 
-def images_text(file: Path, with_points: bool = True) -> Iterator[ImageRecord]:
+def read_images_text(file: Path, with_points: bool = True) -> Iterator[ColmapImage]:
     """Two lines an image: the pose, then its points (which may be an empty line)."""
     lines = _lines(file)
     for number, line in lines:
@@ -64,7 +70,9 @@ def images_text(file: Path, with_points: bool = True) -> Iterator[ImageRecord]:
             raise _bad_line(file, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME") from None
         shown = next(lines, (number + 1, ""))
         triples = _triples(file, *shown) if with_points else np.zeros((0, 3))
-        yield ImageRecord(tuple(pose[:4]), tuple(pose[4:]), camera, name, some_of(triples[:, 2], triples[:, :2]))
+        yield ColmapImage(
+            tuple(pose[:4]), tuple(pose[4:]), camera, name, sample_observations(triples[:, 2], triples[:, :2])
+        )
 
 
 def _triples(file: Path, number: int, line: str) -> np.ndarray:
@@ -75,7 +83,7 @@ def _triples(file: Path, number: int, line: str) -> np.ndarray:
         raise _bad_line(file, number, "POINTS2D[] as (X, Y, POINT3D_ID)") from None
 
 
-def points_text(file: Path) -> Points:
+def read_points3D_text(file: Path) -> ColmapPoints:
     numbers: list[float] = []
     positions: list[list[float]] = []
     colours: list[list[int]] = []
@@ -95,5 +103,5 @@ def points_text(file: Path) -> Points:
         positions.append(position)
         colours.append(colour)
     if not positions:
-        return no_points()
-    return Points(np.array(numbers, np.float64), np.array(positions, np.float64), np.array(colours, np.uint8))
+        return empty_points()
+    return ColmapPoints(np.array(numbers, np.float64), np.array(positions, np.float64), np.array(colours, np.uint8))

@@ -17,7 +17,7 @@ from vdgs.system.documents import JsonObject
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def read_json(file: Path) -> JsonObject:
+def read_capture_json(file: Path) -> JsonObject:
     """The object in a JSON file. Raises `CaptureError` for anything else."""
     try:
         content = json.loads(file.read_text(encoding="utf-8-sig"))
@@ -30,7 +30,7 @@ def read_json(file: Path) -> JsonObject:
     return content
 
 
-def frames_of(content: JsonObject, file: Path) -> list[JsonObject]:
+def get_frames(content: JsonObject, file: Path) -> list[JsonObject]:
     """The list of frames. Raises `CaptureError` if there are none."""
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
@@ -38,7 +38,7 @@ def frames_of(content: JsonObject, file: Path) -> list[JsonObject]:
     return frames
 
 
-def matrix_of(value: object, file: Path, label: str) -> np.ndarray:
+def parse_matrix(value: object, file: Path, label: str) -> np.ndarray:
     """A matrix [3 or 4, 4] float64 from nested lists, completed to [4, 4]. Raises `CaptureError`."""
     try:
         matrix = np.array(value, dtype=np.float64)
@@ -51,7 +51,7 @@ def matrix_of(value: object, file: Path, label: str) -> np.ndarray:
     return result
 
 
-def number(source: JsonObject, key: str, file: Path) -> float | None:
+def parse_number(source: JsonObject, key: str, file: Path) -> float | None:
     """A finite number by key, or None where it is absent. Raises `CaptureError` for anything else."""
     value = source.get(key)
     if value is None:
@@ -68,7 +68,7 @@ def _finite(value: int | float) -> bool:
         return False
 
 
-def intrinsics_of(frame: JsonObject, common: JsonObject, image: Path, file: Path) -> Intrinsics:
+def parse_intrinsics(frame: JsonObject, common: JsonObject, image: Path, file: Path) -> Intrinsics:
     """Intrinsics of a frame, its own keys before the common ones (fl_x, fl_y, cx, cy, w, h, k1...p2).
 
     Focal lengths may be given as camera_angle_x, y (radians). Where w and h are absent the image's own
@@ -77,7 +77,7 @@ def intrinsics_of(frame: JsonObject, common: JsonObject, image: Path, file: Path
     values = {**common, **{key: value for key, value in frame.items() if value is not None}}
 
     def get(key: str, default: float | None = None) -> float | None:
-        value = number(values, key, file)
+        value = parse_number(values, key, file)
         return default if value is None else value
 
     width, height = get("w"), get("h")

@@ -15,8 +15,21 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from vdgs.captures.capture import Split
-from vdgs.captures.formats.json_poses import OPENGL_FROM_OPENCV, frames_of, intrinsics_of, matrix_of, read_json
-from vdgs.captures.formats.source_capture import KnownWorld, SourceCapture, SourceView, duplicates, listing, rigid
+from vdgs.captures.formats.json_poses import (
+    OPENGL_FROM_OPENCV,
+    get_frames,
+    parse_intrinsics,
+    parse_matrix,
+    read_capture_json,
+)
+from vdgs.captures.formats.source_capture import (
+    SourceCapture,
+    SourceView,
+    WorldPrior,
+    find_duplicates,
+    format_list,
+    to_rigid,
+)
 from vdgs.captures.formats.sparse_points import find_sparse_points
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -28,7 +41,7 @@ POSE_UNIT_M = 100.0
 BLOCK_ROTATION = 0.01
 #: Where a block keeps its images.
 IMAGE_FOLDERS = ("", "rgb", "input", "images")
-CITY = re.compile(r"block|_city|matrix", re.IGNORECASE)
+CITY_PATTERN = re.compile(r"block|_city|matrix", re.IGNORECASE)
 
 
 def pose_files(root: Path) -> list[tuple[Path, Split]]:
@@ -54,22 +67,22 @@ def read_matrixcity(root: Path, options: CaptureOptions) -> SourceCapture:
     views: list[SourceView] = []
     scales: set[float] = set()
     for file, split in files:
-        content = read_json(file)
-        for frame in frames_of(content, file):
+        content = read_capture_json(file)
+        for frame in get_frames(content, file):
             view, scale = _read_frame(root, frame, content, file, split)
             views.append(view)
             scales.add(scale)
-    twice = duplicates(view.name for view in views)
+    twice = find_duplicates(view.name for view in views)
     if twice:
-        raise CaptureError(f"{root}: the same image occurs more than once in the pose files.{listing(twice)}")
+        raise CaptureError(f"{root}: the same image occurs more than once in the pose files.{format_list(twice)}")
     if len(scales) > 1:
         raise CaptureError(f"{root}: some poses are in metres and some in units of 100 m. Use one kind of pose file.")
     poses = {view.name: view.camera_from_world for view in views}
     points, colours = find_sparse_points(root, poses, "MatrixCity's layout")
-    world = KnownWorld(np.eye(3), 1.0, False, "z is up by the format")
-    if CITY.search(str(root)) or any(CITY.search(view.name) for view in views):
+    world = WorldPrior(np.eye(3), 1.0, False, "z is up by the format")
+    if CITY_PATTERN.search(str(root)) or any(CITY_PATTERN.search(view.name) for view in views):
         unit = scales.pop()
-        world = KnownWorld(np.eye(3), unit, True, f"MatrixCity: z is up, unit {unit:.0f} m")
+        world = WorldPrior(np.eye(3), unit, True, f"MatrixCity: z is up, unit {unit:.0f} m")
     one_split = {view.split for view in views} == {"train"}
     if one_split:  # no test files: the split is ours to choose
         views = [
@@ -93,15 +106,15 @@ def _read_frame(
 ) -> tuple[SourceView, float]:
     """A view, and the unit of its world in metres if the file is MatrixCity's."""
     label = str(frame.get("file_path", frame.get("frame_index", "?")))
-    matrix = matrix_of(frame.get("transform_matrix", frame.get("rot_mat")), file, f"frame {label}")
+    matrix = parse_matrix(frame.get("transform_matrix", frame.get("rot_mat")), file, f"frame {label}")
     norm = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
     scaled = abs(norm / BLOCK_ROTATION - 1) < 0.01
     if scaled:
         matrix[:3, :3] /= BLOCK_ROTATION
     name, image = _find_image(root, frame, file, split)
-    pose = np.linalg.inv(rigid(matrix @ OPENGL_FROM_OPENCV, file, f"frame {label}"))
+    pose = np.linalg.inv(to_rigid(matrix @ OPENGL_FROM_OPENCV, file, f"frame {label}"))
     common = {key: value for key, value in content.items() if key != "frames"}
-    intrinsics = intrinsics_of(frame, common, image, file)
+    intrinsics = parse_intrinsics(frame, common, image, file)
     return SourceView(
         name=name, camera_from_world=pose, intrinsics=intrinsics, split=split, image_path=image
     ), 1.0 if scaled else POSE_UNIT_M

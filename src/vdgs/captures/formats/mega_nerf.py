@@ -16,23 +16,23 @@ from vdgs.captures.capture import Split
 from vdgs.captures.formats.json_poses import OPENGL_FROM_OPENCV
 from vdgs.captures.formats.source_capture import (
     Intrinsics,
-    KnownWorld,
     SourceCapture,
     SourceView,
+    WorldPrior,
     check_intrinsics,
-    listing,
-    rigid,
+    format_list,
+    to_rigid,
 )
 from vdgs.captures.formats.sparse_points import find_sparse_points
 from vdgs.captures.image_files import find_images
-from vdgs.captures.name_resolution import composed
+from vdgs.captures.name_resolution import to_nfc
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.system.documents import JsonObject
 
 #: Ground axes (right, forward, up) from DRB axes.
 GROUND_FROM_DRB = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
-FOLDERS: tuple[tuple[str, Split], ...] = (("train", "train"), ("val", "test"))
+SPLIT_FOLDERS: tuple[tuple[str, Split], ...] = (("train", "train"), ("val", "test"))
 
 
 def is_mega_nerf(root: Path) -> bool:
@@ -55,12 +55,12 @@ def read_mega_nerf(root: Path, options: CaptureOptions) -> SourceCapture:
         raise CaptureError(f"{file}: pose_scale_factor {scale} must be positive.")
     images = options.images or "rgbs"
     views: list[SourceView] = []
-    for folder, split in FOLDERS:
+    for folder, split in SPLIT_FOLDERS:
         views += _read_folder(root, folder, images, split, origin, scale)
     poses = {view.name: view.camera_from_world for view in views}
     points, colours = find_sparse_points(root, poses, "Mega-NeRF's layout", _aliases(root, views))
-    world = KnownWorld(GROUND_FROM_DRB, 1.0, True, "Mega-NeRF: x is down, metres by pose_scale_factor")
-    folders = tuple(root / folder / images for folder, _ in FOLDERS)
+    world = WorldPrior(GROUND_FROM_DRB, 1.0, True, "Mega-NeRF: x is down, metres by pose_scale_factor")
+    folders = tuple(root / folder / images for folder, _ in SPLIT_FOLDERS)
     return SourceCapture(
         source="mega-nerf", images=images, views=tuple(views), points=points, colours=colours, world=world,
         image_folders=folders,
@@ -71,15 +71,15 @@ def _read_folder(
     root: Path, folder: str, images: str, split: Split, origin: np.ndarray, scale: float
 ) -> list[SourceView]:
     metadata = sorted((root / folder / "metadata").glob("*.pt"))
-    present = {composed(Path(name).stem): path for name, path in find_images(root / folder / images).items()}
-    missing = [str(file) for file in metadata if composed(file.stem) not in present]
+    present = {to_nfc(Path(name).stem): path for name, path in find_images(root / folder / images).items()}
+    missing = [str(file) for file in metadata if to_nfc(file.stem) not in present]
     if missing:
         raise CaptureError(
             f"{root / folder / images}: {len(missing)} images named by metadata are missing. For "
             "UrbanScene3D, copy "
-            f"the raw photographs as Mega-NeRF's README says.{listing(missing)}"
+            f"the raw photographs as Mega-NeRF's README says.{format_list(missing)}"
         )
-    return [_read_view(file, present[composed(file.stem)], folder, split, origin, scale) for file in metadata]
+    return [_read_view(file, present[to_nfc(file.stem)], folder, split, origin, scale) for file in metadata]
 
 
 def _read_view(file: Path, image: Path, folder: str, split: Split, origin: np.ndarray, scale: float) -> SourceView:
@@ -89,7 +89,7 @@ def _read_view(file: Path, image: Path, folder: str, split: Split, origin: np.nd
     world_from_camera = np.eye(4)
     world_from_camera[:3] = _array(content, "c2w", (3, 4), file)
     world_from_camera[:3, 3] = world_from_camera[:3, 3] * scale + origin
-    pose = np.linalg.inv(rigid(world_from_camera @ OPENGL_FROM_OPENCV, file, "c2w"))
+    pose = np.linalg.inv(to_rigid(world_from_camera @ OPENGL_FROM_OPENCV, file, "c2w"))
     intrinsics = check_intrinsics(Intrinsics("PINHOLE", (fx, fy, cx, cy), width, height), file, image.name)
     return SourceView(
         name=f"{folder}/{image.name}", camera_from_world=pose, intrinsics=intrinsics, split=split, image_path=image

@@ -9,9 +9,9 @@ import numpy as np
 
 from vdgs.errors import CaptureError
 
-LONGEST_HEADER = 1 << 16
-GREY = 128
-TYPES = {
+MAX_HEADER_BYTES = 1 << 16
+GRAY = 128
+PLY_DTYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
     "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4",
     "float32": "<f4", "double": "<f8", "float64": "<f8",
@@ -47,7 +47,7 @@ def _header(data: bytes, file: Path) -> _Header:
     def fail(what: str) -> CaptureError:
         return CaptureError(f"{file}: {what}. A PLY point cloud with x, y, z (ascii or little-endian) is needed.")
 
-    end = data.find(b"end_header", 0, LONGEST_HEADER)
+    end = data.find(b"end_header", 0, MAX_HEADER_BYTES)
     start = data.find(b"\n", end) + 1
     if not data.startswith(b"ply") or end < 0 or start == 0:
         raise fail("has no PLY header")
@@ -64,9 +64,9 @@ def _header(data: bytes, file: Path) -> _Header:
             if element == "vertex":
                 count = int(words[2]) if words[2].isdecimal() and len(words[2]) < 12 else -2
         elif words and words[0] == "property" and element == "vertex":
-            if len(words) != 3 or words[1] not in TYPES or words[2] in dict(fields):
+            if len(words) != 3 or words[1] not in PLY_DTYPES or words[2] in dict(fields):
                 raise fail(f"has a vertex property that is not understood ({line.strip()!r})")
-            fields.append((words[2], TYPES[words[1]]))
+            fields.append((words[2], PLY_DTYPES[words[1]]))
     if form not in ("ascii", "binary_little_endian"):
         raise fail(f"is of format {form!r}")
     if count < 0 or not {"x", "y", "z"} <= set(dict(fields)):
@@ -103,8 +103,8 @@ def _too_short(header: _Header, file: Path) -> CaptureError:
 def _colours(vertices: np.ndarray) -> np.ndarray:
     names = vertices.dtype.names or ()
     if not {"red", "green", "blue"} <= set(names):
-        return np.full((len(vertices), 3), GREY, np.uint8)
+        return np.full((len(vertices), 3), GRAY, np.uint8)
     colours = np.stack([vertices[name].astype(np.float64) for name in ("red", "green", "blue")], axis=1)
-    colours = np.nan_to_num(colours, nan=GREY, posinf=255, neginf=0)
+    colours = np.nan_to_num(colours, nan=GRAY, posinf=255, neginf=0)
     unit = vertices["red"].dtype.kind == "f" and len(colours) and 0 < colours.max() <= 1
     return np.clip(np.round(colours * 255 if unit else colours), 0, 255).astype(np.uint8)

@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import numpy as np
 
-from vdgs.captures.capture import Sightings, Split
+from vdgs.captures.capture import Observations, Split
 from vdgs.errors import CaptureError
 
 #: COLMAP's camera models: identifier -> (name, number of parameters).
@@ -37,8 +37,8 @@ PINHOLE_WHEN_ZERO = {
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVISION",
     "DIVISION",
 }  # fmt: skip
-LARGEST_SIDE_PX = 100_000
-OFFENDERS_SHOWN = 10
+MAX_SIDE_PX = 100_000
+MAX_LISTED = 10
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Intrinsics:
         return self.params[start], self.params[start + 1]
 
     @property
-    def distorted(self) -> bool:
+    def is_distorted(self) -> bool:
         """True unless straight lines stay straight."""
         extra = self.params[3 if self.model in SINGLE_FOCAL else 4 :]
         return self.model not in PINHOLE_WHEN_ZERO or any(value != 0.0 for value in extra)
@@ -79,11 +79,11 @@ class SourceView:
     #: Where image and mask are, if the format says so itself; else they are looked up by name.
     image_path: Path | None = None
     mask_path: Path | None = None
-    sightings: Sightings | None = None
+    sightings: Observations | None = None
 
 
 @dataclass(frozen=True, eq=False)
-class KnownWorld:
+class WorldPrior:
     """What a format promises about its world: the similarity to a z-up frame.
 
     x_ground = scale * rotation @ x_source (the origin is chosen later).
@@ -104,21 +104,21 @@ class SourceCapture:
     views: tuple[SourceView, ...]
     points: np.ndarray
     colours: np.ndarray
-    world: KnownWorld | None = None
+    world: WorldPrior | None = None
     #: Folders in which every image should have a camera.
     image_folders: tuple[Path, ...] = ()
     warnings: tuple[str, ...] = field(default=())
 
 
-def listing(names: Iterable[str]) -> str:
+def format_list(names: Iterable[str]) -> str:
     """Up to ten names, one a line, and how many more there are."""
     names = list(names)
-    shown = "".join(f"\n  {name}" for name in names[:OFFENDERS_SHOWN])
-    more = len(names) - OFFENDERS_SHOWN
+    shown = "".join(f"\n  {name}" for name in names[:MAX_LISTED])
+    more = len(names) - MAX_LISTED
     return shown + (f"\n  ... and {more} more" if more > 0 else "")
 
 
-def duplicates(names: Iterable[str]) -> list[str]:
+def find_duplicates(names: Iterable[str]) -> list[str]:
     """Names that occur more than once, sorted."""
     return sorted(name for name, count in Counter(names).items() if count > 1)
 
@@ -148,7 +148,7 @@ def check_intrinsics(intrinsics: Intrinsics, file: Path, label: str) -> Intrinsi
     """The intrinsics, if they can belong to a real camera; else `CaptureError`."""
     width, height = intrinsics.width, intrinsics.height
     problem = None
-    if not (0 < width <= LARGEST_SIDE_PX and 0 < height <= LARGEST_SIDE_PX):
+    if not (0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX):
         problem = f"an image size of {width}x{height}"
     elif not np.isfinite(intrinsics.params).all():
         problem = f"parameters that are not numbers: {intrinsics.params}"
@@ -163,9 +163,9 @@ def check_intrinsics(intrinsics: Intrinsics, file: Path, label: str) -> Intrinsi
     return intrinsics
 
 
-def rays_of(intrinsics: Intrinsics, pixels: np.ndarray) -> np.ndarray:
+def pixel_rays(intrinsics: Intrinsics, pixels: np.ndarray) -> np.ndarray:
     """x/z and y/z [n, 2] of the rays through pixels [n, 2] of a camera, its lens undone; NaN where it has no ray."""
-    if not intrinsics.distorted:
+    if not intrinsics.is_distorted:
         return (pixels - intrinsics.principal_point) / intrinsics.focal
     import pycolmap  # 60 MB of memory: only for lenses that need it
 
@@ -174,7 +174,7 @@ def rays_of(intrinsics: Intrinsics, pixels: np.ndarray) -> np.ndarray:
     return np.asarray(camera.cam_from_img(pixels), dtype=np.float64).reshape(-1, 2)
 
 
-def rigid(matrix: np.ndarray, file: Path, label: str, tolerance: float = 5e-3) -> np.ndarray:
+def to_rigid(matrix: np.ndarray, file: Path, label: str, tolerance: float = 5e-3) -> np.ndarray:
     """A rigid motion [4, 4] float64 from one that is rigid up to rounding.
 
     The rotation is replaced by the nearest orthonormal one (SVD). Raises `CaptureError` if an entry is not

@@ -9,14 +9,14 @@ import numpy as np
 
 from vdgs.captures.formats.colmap import count_images, find_models, read_colmap
 from vdgs.captures.formats.ply_reader import read_point_cloud
-from vdgs.captures.name_resolution import stem_of
+from vdgs.captures.name_resolution import match_stem
 from vdgs.errors import CaptureError
 from vdgs.geometry.similarity import fit_similarity_robust, is_collinear
 
 #: Names under which a point cloud in the capture's own world is looked for.
 POINT_CLOUDS = ("points3D.ply", "sparse_pc.ply", "point_cloud.ply", "points.ply")
 #: A COLMAP model fits the poses if camera centres agree to this share of their spread (RMS).
-AGREEMENT = 0.02
+MAX_RELATIVE_RMS = 0.02
 
 
 def find_sparse_points(
@@ -57,7 +57,7 @@ def find_sparse_points(
     residual = np.linalg.norm(similarity.apply(source) - target, axis=1)[inliers]
     spread = float(np.sqrt(target.var(axis=0).sum()))
     rms = float(np.sqrt((residual**2).mean()))
-    if rms > AGREEMENT * spread or inliers.mean() < 0.5:
+    if rms > MAX_RELATIVE_RMS * spread or inliers.mean() < 0.5:
         raise CaptureError(
             f"{folder}: its camera positions disagree with those of {what} (RMS {rms:.3g} over a spread of "
             f"{spread:.3g}, {inliers.sum()} of {len(pairs)} agree); it is another reconstruction or naming."
@@ -77,7 +77,7 @@ def _match(theirs: list[str], ours: list[str], aliases: Mapping[str, str]) -> li
         return pairs
     stems: dict[str, list[str]] = {}
     for name in ours:
-        stems.setdefault(stem_of(name), []).append(name)
+        stems.setdefault(match_stem(name), []).append(name)
     unique = {stem: names[0] for stem, names in stems.items() if len(names) == 1}
-    by_stem = [(name, stem_of(aliases.get(name, name))) for name in theirs]
+    by_stem = [(name, match_stem(aliases.get(name, name))) for name in theirs]
     return [(name, unique[stem]) for name, stem in by_stem if stem in unique]

@@ -15,36 +15,43 @@ import numpy as np
 from vdgs.captures.capture import Split
 from vdgs.captures.formats.json_poses import (
     OPENGL_FROM_OPENCV,
-    frames_of,
-    intrinsics_of,
-    matrix_of,
-    number,
-    read_json,
+    get_frames,
+    parse_intrinsics,
+    parse_matrix,
+    parse_number,
+    read_capture_json,
 )
 from vdgs.captures.formats.ply_reader import read_point_cloud
-from vdgs.captures.formats.source_capture import SourceCapture, SourceView, duplicates, listing, rigid, safe_name
+from vdgs.captures.formats.source_capture import (
+    SourceCapture,
+    SourceView,
+    find_duplicates,
+    format_list,
+    safe_name,
+    to_rigid,
+)
 from vdgs.captures.formats.sparse_points import find_sparse_points
-from vdgs.captures.name_resolution import Names, on_disk
+from vdgs.captures.name_resolution import ImageNameIndex, find_file
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.system.documents import JsonObject
 
-FILE = "transforms.json"
+TRANSFORMS_FILE = "transforms.json"
 #: Its lists of photographs, and the side that each is of.
-LISTS: tuple[tuple[str, Split], ...] = (
+SPLIT_LISTS: tuple[tuple[str, Split], ...] = (
     ("train_filenames", "train"), ("val_filenames", "test"), ("test_filenames", "test"),
 )  # fmt: skip
 
 
-def only_it_says(file: Path) -> str:
+def exclusive_information(file: Path) -> str:
     """What a transforms.json says that a COLMAP model of its cameras cannot, for people; nothing if it says none of
     that, or cannot be read."""
     try:
-        content = read_json(file)
-        masked = any(frame.get("mask_path") for frame in frames_of(content, file))
+        content = read_capture_json(file)
+        masked = any(frame.get("mask_path") for frame in get_frames(content, file))
     except CaptureError:
         return ""
-    lists = "lists of training and test photographs" if any(content.get(key) for key, _ in LISTS) else ""
+    lists = "lists of training and test photographs" if any(content.get(key) for key, _ in SPLIT_LISTS) else ""
     return " and ".join(filter(None, (lists, "masks" if masked else "")))
 
 
@@ -55,9 +62,9 @@ def read_transforms(root: Path, options: CaptureOptions) -> SourceCapture:
     Raises `CaptureError` for missing images, non-rigid poses, unsafe names, lists of what is no frame, and where no
     point cloud is found.
     """
-    file = root / FILE
-    content = read_json(file)
-    frames = frames_of(content, file)
+    file = root / TRANSFORMS_FILE
+    content = read_capture_json(file)
+    frames = get_frames(content, file)
     names = [_name(frame, file, root) for frame in frames]
     folder = _common_folder(names)
     chosen = options.images or folder
@@ -67,13 +74,13 @@ def read_transforms(root: Path, options: CaptureOptions) -> SourceCapture:
     for frame, name in zip(frames, names, strict=True):
         short = name.removeprefix(folder + "/") if folder else name
         image = _image(root, f"{chosen}/{short}" if chosen else short)
-        world_from_camera = matrix_of(frame.get("transform_matrix"), file, f"frame {name!r}") @ OPENGL_FROM_OPENCV
-        in_file = rigid(world_from_camera, file, f"frame {name!r}")
+        world_from_camera = parse_matrix(frame.get("transform_matrix"), file, f"frame {name!r}") @ OPENGL_FROM_OPENCV
+        in_file = to_rigid(world_from_camera, file, f"frame {name!r}")
         pose, poses[short] = np.linalg.inv(undo(in_file)), np.linalg.inv(in_file)
-        intrinsics = intrinsics_of(frame, content, image, file)
+        intrinsics = parse_intrinsics(frame, content, image, file)
         mask = frame.get("mask_path")
         mask_path = safe_name(str(mask), file, "mask_path", root) if mask else None
-        mask_file = (on_disk(root, mask_path) or root / mask_path) if mask_path else None
+        mask_file = (find_file(root, mask_path) or root / mask_path) if mask_path else None
         views.append(
             SourceView(
                 name=short,
@@ -84,9 +91,9 @@ def read_transforms(root: Path, options: CaptureOptions) -> SourceCapture:
                 mask_path=mask_file,
             )
         )
-    twice = duplicates(view.name for view in views)
+    twice = find_duplicates(view.name for view in views)
     if twice:
-        raise CaptureError(f"{file}: the same image occurs more than once.{listing(twice)}")
+        raise CaptureError(f"{file}: the same image occurs more than once.{format_list(twice)}")
     points, colours = _points(root, content, file, poses)
     homogeneous = np.tile(np.eye(4), (len(points), 1, 1))
     homogeneous[:, :3, 3] = points
@@ -118,7 +125,7 @@ def _image(root: Path, name: str) -> Path:
     others = (
         str(other) for suffix in suffixes for other in (path.with_name(path.name + suffix), path.with_suffix(suffix))
     )
-    found = next((found for found in (on_disk(root, each) for each in (name, *others)) if found is not None), None)
+    found = next((found for found in (find_file(root, each) for each in (name, *others)) if found is not None), None)
     if found is None:
         raise CaptureError(
             f"{root / name}: no such image, though transforms.json names it. Copy it there, or see --images."
@@ -133,8 +140,8 @@ def _splits(content: JsonObject, names: list[str], file: Path, root: Path, optio
     where lists that are not ignored name what is no frame.
     """
     splits: dict[str, Split] = {}
-    frames, sides_listed, unknown = Names({name: root / name for name in names}), set[Split](), list[str]()
-    for key, side in LISTS:
+    frames, sides_listed, unknown = ImageNameIndex({name: root / name for name in names}), set[Split](), list[str]()
+    for key, side in SPLIT_LISTS:
         listed = content.get(key) or []
         if not isinstance(listed, list):
             raise CaptureError(f"{file}: {key!r} must be a list of names.")
@@ -145,7 +152,7 @@ def _splits(content: JsonObject, names: list[str], file: Path, root: Path, optio
     if unknown and options.split != "every":
         raise CaptureError(
             f"{file}: {len(unknown)} names in its lists of training and test photographs are not among its frames. "
-            f"Mend the lists, or ignore them with --split every.{listing(unknown)}"
+            f"Mend the lists, or ignore them with --split every.{format_list(unknown)}"
         )
     if len(sides_listed) == 1:
         rest: Split = "train" if "test" in sides_listed else "test"
@@ -157,8 +164,10 @@ def _undo_applied(content: JsonObject, file: Path) -> Callable[[np.ndarray], np.
     """A function that takes rigid world-from-camera matrices [..., 4, 4] back to the original world."""
     applied = np.eye(4)
     if content.get("applied_transform") is not None:
-        applied = rigid(matrix_of(content["applied_transform"], file, "applied_transform"), file, "applied_transform")
-    scale = number(content, "applied_scale", file) or 1.0
+        applied = to_rigid(
+            parse_matrix(content["applied_transform"], file, "applied_transform"), file, "applied_transform"
+        )
+    scale = parse_number(content, "applied_scale", file) or 1.0
     if not 1e-9 < scale < 1e9:
         raise CaptureError(f"{file}: applied_scale {scale} must be a positive factor.")
     original_from_world = np.linalg.inv(applied)
@@ -176,4 +185,4 @@ def _points(root: Path, content: JsonObject, file: Path, poses: dict[str, np.nda
     ply = content.get("ply_file_path")
     if ply is not None:
         return read_point_cloud(root / safe_name(str(ply), file, "ply_file_path", root))
-    return find_sparse_points(root, poses, FILE, option=" and give --format transforms")
+    return find_sparse_points(root, poses, TRANSFORMS_FILE, option=" and give --format transforms")

@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-State = Literal["ok", "note", "missing", "broken"]
+CheckState = Literal["ok", "note", "missing", "broken"]
 
 
 @dataclass(frozen=True)
-class Check:
+class SystemCheck:
     """One line of the report. Only an essential check that is missing or broken makes the exit code 1."""
 
     name: str
-    state: State
+    state: CheckState
     value: str
     #: What to do, empty where nothing need be done.
     remedy: str = ""

@@ -9,38 +9,38 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 
-from vdgs.cli.doctor.check import Check
-from vdgs.cli.doctor.system_checks import LOOKS
+from vdgs.cli.doctor.check import SystemCheck
+from vdgs.cli.doctor.system_checks import CHECKS
 
 
-def report() -> list[Check]:
+def run_checks() -> list[SystemCheck]:
     """Look at the machine; takes a few seconds (torch is imported), changes nothing and never raises."""
-    checks: list[Check] = []
-    for look in LOOKS:
+    checks: list[SystemCheck] = []
+    for look in CHECKS:
         try:
             checks += look()
         except Exception as error:  # the report must stand on a machine where anything may be broken
             name = getattr(look, "__name__", "check").strip("_")
-            checks.append(Check(name, "broken", f"{type(error).__name__}: {error}", "Reinstall vdgs.", True))
+            checks.append(SystemCheck(name, "broken", f"{type(error).__name__}: {error}", "Reinstall vdgs.", True))
     return checks
 
 
-def healthy(checks: list[Check]) -> bool:
+def is_healthy(checks: list[SystemCheck]) -> bool:
     """Whether everything essential works."""
     return all(check.works for check in checks)
 
 
-def print_report(as_json: bool = False, checks: list[Check] | None = None) -> int:
+def print_report(as_json: bool = False, checks: list[SystemCheck] | None = None) -> int:
     """Print the report as a table, or as JSON; returns the exit code, 0 if everything essential works."""
-    checks = report() if checks is None else checks
+    checks = run_checks() if checks is None else checks
     if as_json:
-        print(json.dumps({"healthy": healthy(checks), "checks": [asdict(check) for check in checks]}, indent=2))
+        print(json.dumps({"healthy": is_healthy(checks), "checks": [asdict(check) for check in checks]}, indent=2))
     else:
         _print_table(checks)
-    return 0 if healthy(checks) else 1
+    return 0 if is_healthy(checks) else 1
 
 
-def _print_table(checks: list[Check]) -> None:
+def _print_table(checks: list[SystemCheck]) -> None:
     try:
         from rich import box
         from rich.console import Console

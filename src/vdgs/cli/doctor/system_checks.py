@@ -18,8 +18,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from vdgs.cli.doctor.check import Check
-from vdgs.system.memory.cgroups import group_limits
+from vdgs.cli.doctor.check import SystemCheck
+from vdgs.system.memory.cgroups import cgroup_limits
 from vdgs.system.units import data_size
 
 #: What each extra adds, for people; an extra that is not listed is reported without a sentence.
@@ -35,32 +35,32 @@ EXTRAS = {
 }
 #: Imported for real, since these are the ones whose binary parts break.
 BINARY_MODULES = ("torch", "numpy", "scipy", "cv2", "PIL", "pycolmap", "safetensors", "matplotlib")
-LITTLE_DISK_BYTES = 5 * 10**9
+MIN_FREE_DISK_BYTES = 5 * 10**9
 
 
-def _versions() -> list[Check]:
+def _versions() -> list[SystemCheck]:
     python = platform.python_version()
     new_enough = sys.version_info >= (3, 11)
     remedy = "" if new_enough else "Install Python 3.11 or newer."
     return [
-        Check("vdgs", "ok", _version("vdgs") or "not installed, run from a checkout"),
-        Check("python", "ok" if new_enough else "broken", f"{python} on {platform.platform()}", remedy, True),
+        SystemCheck("vdgs", "ok", _version("vdgs") or "not installed, run from a checkout"),
+        SystemCheck("python", "ok" if new_enough else "broken", f"{python} on {platform.platform()}", remedy, True),
     ]
 
 
-def _dependencies() -> list[Check]:
+def _dependencies() -> list[SystemCheck]:
     """The packages that vdgs requires are installed, and the binary ones can be imported."""
     absent = [name for name in _required().get("", []) if _version(name) is None]
     broken = [f"{name} ({error})" for name in BINARY_MODULES if (error := _import_error(name))]
     if absent or broken:
         packages = " ".join(absent) or "--force-reinstall vdgs"
         found = ", ".join([*(f"{name} is not installed" for name in absent), *broken])
-        return [Check("dependencies", "broken", found, f"pip install {packages}", True)]
-    return [Check("dependencies", "ok", "all installed, all can be imported", essential=True)]
+        return [SystemCheck("dependencies", "broken", found, f"pip install {packages}", True)]
+    return [SystemCheck("dependencies", "ok", "all installed, all can be imported", essential=True)]
 
 
-def _processor() -> list[Check]:
-    return [Check("processor", "ok", f"{_processor_name()}, {_usable_cores()} of {os.cpu_count()} cores usable")]
+def _processor() -> list[SystemCheck]:
+    return [SystemCheck("processor", "ok", f"{_processor_name()}, {_usable_cores()} of {os.cpu_count()} cores usable")]
 
 
 def _processor_name() -> str:
@@ -78,7 +78,7 @@ def _usable_cores() -> int:
     return os.cpu_count() or 1
 
 
-def _kernels() -> list[Check]:
+def _kernels() -> list[SystemCheck]:
     """The C++ kernels: which builds load here, which one is in use."""
     module = _native_module()
     built, refused = [], []
@@ -89,66 +89,68 @@ def _kernels() -> list[Check]:
         except Exception as error:
             refused.append((name, error))
     if not built:
-        return [Check("native kernels", "missing", "not built", str(refused[-1][1]), True)]
+        return [SystemCheck("native kernels", "missing", "not built", str(refused[-1][1]), True)]
     supported = module.supported()
     unbuilt = [name for name, _ in refused if name in supported]
     value = f"{module.isa()} in use; available: {', '.join(built)}"
     if unbuilt:
         faster = f"The processor also runs {', '.join(unbuilt)}, which this installation lacks: reinstall vdgs."
-        return [Check("native kernels", "note", value, faster, True)]
-    return [Check("native kernels", "ok", value, essential=True)]
+        return [SystemCheck("native kernels", "note", value, faster, True)]
+    return [SystemCheck("native kernels", "ok", value, essential=True)]
 
 
 def _native_module() -> ModuleType:
     return importlib.import_module("vdgs.kernels.cpu.extension")
 
 
-def _threads() -> list[Check]:
+def _threads() -> list[SystemCheck]:
     import torch
 
-    native = _attempt(lambda: str(_native_module().threads())) or "none"
+    native = _run_check(lambda: str(_native_module().threads())) or "none"
     policy = os.environ.get("OMP_WAIT_POLICY", "")
-    checks = [Check("threads", "ok", f"kernels {native} (VDGS_THREADS), torch {torch.get_num_threads()}")]
+    checks = [SystemCheck("threads", "ok", f"kernels {native} (VDGS_THREADS), torch {torch.get_num_threads()}")]
     if policy.upper() == "PASSIVE":
-        return [*checks, Check("OMP_WAIT_POLICY", "ok", "PASSIVE")]
+        return [*checks, SystemCheck("OMP_WAIT_POLICY", "ok", "PASSIVE")]
     advice = "export OMP_WAIT_POLICY=PASSIVE: torch's spinning threads slow everything on a busy machine."
-    return [*checks, Check("OMP_WAIT_POLICY", "note", policy or "not set", advice)]
+    return [*checks, SystemCheck("OMP_WAIT_POLICY", "note", policy or "not set", advice)]
 
 
-def _memory() -> list[Check]:
+def _memory() -> list[SystemCheck]:
     import psutil
 
-    groups, memory = group_limits(), psutil.virtual_memory()
+    groups, memory = cgroup_limits(), psutil.virtual_memory()
     total = min([memory.total, *(group.limit for group in groups)])
     free = min([memory.available, *(group.free for group in groups)])
     if total < memory.total:
         by = "by a control group (container, SLURM job, systemd unit)"
-        return [Check("memory", "ok", f"{data_size(free)} free, limited to {data_size(total)} {by}")]
-    return [Check("memory", "ok", f"{data_size(free)} free of {data_size(total)}")]
+        return [SystemCheck("memory", "ok", f"{data_size(free)} free, limited to {data_size(total)} {by}")]
+    return [SystemCheck("memory", "ok", f"{data_size(free)} free of {data_size(total)}")]
 
 
-def _torch() -> list[Check]:
+def _torch() -> list[SystemCheck]:
     import torch
 
-    checks = [Check("torch", "ok", f"{torch.__version__}, built for CUDA {torch.version.cuda or '–'}", essential=True)]
+    checks = [
+        SystemCheck("torch", "ok", f"{torch.__version__}, built for CUDA {torch.version.cuda or '–'}", essential=True)
+    ]
     if torch.cuda.is_available():
         for index in range(torch.cuda.device_count()):
             device = torch.cuda.get_device_properties(index)
-            checks.append(Check(f"GPU {index}", "ok", f"{device.name}, {data_size(device.total_memory)}"))
+            checks.append(SystemCheck(f"GPU {index}", "ok", f"{device.name}, {data_size(device.total_memory)}"))
     elif shutil.which("nvidia-smi"):
         advice = "pip install --force-reinstall torch (the default build has CUDA); nvidia-smi tests the driver."
-        checks.append(Check("GPU", "note", "there is an NVIDIA driver, but this torch cannot use it", advice))
+        checks.append(SystemCheck("GPU", "note", "there is an NVIDIA driver, but this torch cannot use it", advice))
     else:
-        checks.append(Check("GPU", "note", "none: everything runs on the processor"))
+        checks.append(SystemCheck("GPU", "note", "none: everything runs on the processor"))
     return checks
 
 
-def _cuda() -> list[Check]:
-    checks: list[Check] = importlib.import_module("vdgs.cli.doctor.cuda_checks").looks()
+def _cuda() -> list[SystemCheck]:
+    checks: list[SystemCheck] = importlib.import_module("vdgs.cli.doctor.cuda_checks").looks()
     return checks
 
 
-def _extras() -> list[Check]:
+def _extras() -> list[SystemCheck]:
     """Each optional group of packages: present, or what it would add and how to get it."""
     checks = []
     for extra, packages in _required().items():
@@ -159,27 +161,27 @@ def _extras() -> list[Check]:
         adds = EXTRAS.get(extra, "")
         if absent:
             value = f"lacks {', '.join(absent)}" + (f": {adds}" if adds else "")
-            checks.append(Check(f"extra {extra}", "missing", value, f"pip install 'vdgs[{extra}]'"))
+            checks.append(SystemCheck(f"extra {extra}", "missing", value, f"pip install 'vdgs[{extra}]'"))
         else:
             listed = ", ".join(f"{name} {version}" for name, version in list(found.items())[:3])
             listed += f" and {len(found) - 3} more" if len(found) > 3 else ""
-            checks.append(Check(f"extra {extra}", "ok", listed + (f": {adds}" if adds else "")))
+            checks.append(SystemCheck(f"extra {extra}", "ok", listed + (f": {adds}" if adds else "")))
     return checks
 
 
-def _lpips() -> list[Check]:
+def _lpips() -> list[SystemCheck]:
     """Both files of LPIPS, without reading half a gigabyte."""
     lpips = importlib.import_module("vdgs.evaluation.lpips")
     heads, weights = lpips.find_heads(), lpips.cached_weights()
     if heads and weights.is_file():
-        return [Check("LPIPS", "ok", f"VGG16 weights in {weights.parent}")]
+        return [SystemCheck("LPIPS", "ok", f"VGG16 weights in {weights.parent}")]
     if heads:
         advice = f"Download {lpips.VGG16_URL} to {weights}, or give --lpips-weights PATH."
-        return [Check("LPIPS", "missing", "no VGG16 weights; LPIPS will be null", advice)]
-    return [Check("LPIPS", "missing", "no linear heads; LPIPS will be null", "pip install 'vdgs[lpips]'")]
+        return [SystemCheck("LPIPS", "missing", "no VGG16 weights; LPIPS will be null", advice)]
+    return [SystemCheck("LPIPS", "missing", "no linear heads; LPIPS will be null", "pip install 'vdgs[lpips]'")]
 
 
-def _film() -> list[Check]:
+def _video_encoding() -> list[SystemCheck]:
     """Encode a few frames for real."""
     import tempfile
 
@@ -195,18 +197,18 @@ def _film() -> list[Check]:
             for level in (0, 128, 255):
                 film.write(np.full((64, 96, 3), level, np.uint8))
     except Exception as error:
-        return [Check("film", "missing", f"{encoder}: {error}", "pip install imageio-ffmpeg")]
+        return [SystemCheck("film", "missing", f"{encoder}: {error}", "pip install imageio-ffmpeg")]
     if encoder == "mpeg4":
-        return [Check("film", "ok", "MPEG-4", "pip install imageio-ffmpeg for H.264, which browsers play too.")]
-    return [Check("film", "ok", "H.264")]
+        return [SystemCheck("film", "ok", "MPEG-4", "pip install imageio-ffmpeg for H.264, which browsers play too.")]
+    return [SystemCheck("film", "ok", "H.264")]
 
 
-def _disk() -> list[Check]:
+def _disk() -> list[SystemCheck]:
     usage = shutil.disk_usage(Path.cwd())
     value = f"{data_size(usage.free)} free of {data_size(usage.total)} in {Path.cwd()}"
-    if usage.free < LITTLE_DISK_BYTES:
-        return [Check("disk", "note", value, "Free some space: a run with its blocks may take several GB.")]
-    return [Check("disk", "ok", value)]
+    if usage.free < MIN_FREE_DISK_BYTES:
+        return [SystemCheck("disk", "note", value, "Free some space: a run with its blocks may take several GB.")]
+    return [SystemCheck("disk", "ok", value)]
 
 
 def _required() -> dict[str, list[str]]:
@@ -254,13 +256,13 @@ def _import_error(module: str) -> str:
     return ""
 
 
-def _attempt(look: Callable[[], str]) -> str | None:
+def _run_check(check: Callable[[], str]) -> str | None:
     try:
-        return look()
+        return check()
     except Exception:  # a missing figure is shown as missing
         return None
 
 
-LOOKS: tuple[Callable[[], list[Check]], ...] = (
-    _versions, _dependencies, _processor, _kernels, _threads, _memory, _torch, _cuda, _extras, _lpips, _film, _disk,
+CHECKS: tuple[Callable[[], list[SystemCheck]], ...] = (
+    _versions, _dependencies, _processor, _kernels, _threads, _memory, _torch, _cuda, _extras, _lpips, _video_encoding, _disk,
 )  # fmt: skip

@@ -7,36 +7,36 @@ from jaxtyping import Float, Int
 from sklearn.cluster import MiniBatchKMeans
 
 #: Entries of a codebook of numbers.
-ENTRIES = 256
+CODEBOOK_SIZE = 256
 #: So many numbers and rows are enough to learn from.
-NUMBERS, SAMPLE = 1 << 19, 1 << 16
-ROUNDS = 20
+SAMPLE_VALUES, SAMPLE_ROWS = 1 << 19, 1 << 16
+LLOYD_ITERATIONS = 20
 
 
-def codebook(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, "256"]:
+def fit_codebook(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, "256"]:
     """256 ascending values with small squared distances to the numbers (Lloyd's iteration on sorted numbers)."""
-    numbers = np.sort(_sample(values, NUMBERS).astype(np.float64))
+    numbers = np.sort(_sample(values, SAMPLE_VALUES).astype(np.float64))
     # Half by rank, half by place: crowds are told apart, and what is rare is not rounded far.
-    ranks = np.quantile(numbers, (np.arange(ENTRIES // 2) + 0.5) / (ENTRIES // 2))
-    entries = np.sort(np.concatenate([ranks, np.linspace(numbers[0], numbers[-1], ENTRIES - len(ranks))]))
+    ranks = np.quantile(numbers, (np.arange(CODEBOOK_SIZE // 2) + 0.5) / (CODEBOOK_SIZE // 2))
+    entries = np.sort(np.concatenate([ranks, np.linspace(numbers[0], numbers[-1], CODEBOOK_SIZE - len(ranks))]))
     sums = np.concatenate([[0.0], np.cumsum(numbers)])
-    for _ in range(ROUNDS):
+    for _ in range(LLOYD_ITERATIONS):
         edges = np.concatenate([[0], np.searchsorted(numbers, (entries[1:] + entries[:-1]) / 2), [len(numbers)]])
         held = np.diff(edges)
         entries = np.where(held > 0, np.diff(sums[edges]) / np.maximum(held, 1), entries)
     return np.sort(entries).astype(np.float32)
 
 
-def nearest_entries(values: Float[np.ndarray, "*shape"], entries: Float[np.ndarray, "256"]) -> np.ndarray:
+def quantize(values: Float[np.ndarray, "*shape"], entries: Float[np.ndarray, "256"]) -> np.ndarray:
     """The index of the entry next to each number, uint8 of the same shape."""
     return np.searchsorted((entries[1:] + entries[:-1]) / 2, values).astype(np.uint8)
 
 
-class Palette:
+class VectorCodebook:
     """Rows that stand for all rows: k-means, seeded, learnt from a sample."""
 
-    def __init__(self, sample: Float[np.ndarray, "n d"], most: int) -> None:
-        count = min(most, max(1, len(np.unique(sample, axis=0))))
+    def __init__(self, sample: Float[np.ndarray, "n d"], max_count: int) -> None:
+        count = min(max_count, max(1, len(np.unique(sample, axis=0))))
         means = MiniBatchKMeans(count, batch_size=8192, n_init=1, max_iter=10, random_state=0, init="random",
                                 reassignment_ratio=0.0)  # fmt: skip
         self.rows: np.ndarray = means.fit(sample).cluster_centers_.astype(np.float32)
@@ -49,6 +49,6 @@ class Palette:
         return np.concatenate(parts)
 
 
-def _sample(values: np.ndarray, most: int) -> np.ndarray:
+def _sample(values: np.ndarray, max_count: int) -> np.ndarray:
     """Evenly taken, first to last."""
-    return values if len(values) <= most else values[np.linspace(0, len(values) - 1, most).astype(np.int64)]
+    return values if len(values) <= max_count else values[np.linspace(0, len(values) - 1, max_count).astype(np.int64)]

@@ -1,6 +1,6 @@
 """What every writer is given: chunks of Gaussians, how many there are, and where on Earth they stand.
 
-Coordinates of a `Scene` are those of the ground frame: local, z up, float32. A format that has an up axis of its own
+Coordinates of a `ExportScene` are those of the ground frame: local, z up, float32. A format that has an up axis of its own
 turns them (`Y_UP`, `Y_DOWN`); its reader turns them back, so that what is read from disk can be drawn with the run's
 own cameras.
 """
@@ -21,13 +21,13 @@ from torch import Tensor
 
 from vdgs import __version__
 from vdgs.errors import VdgsError
-from vdgs.kernels.spherical_harmonics import DC
-from vdgs.model.gaussian_transform import transformed
+from vdgs.kernels.spherical_harmonics import SH_C0
+from vdgs.model.gaussian_transform import transform_gaussians
 from vdgs.model.gaussians import Gaussians
 from vdgs.system.atomic_files import write_json
 
 #: Writers work on so many Gaussians at a time, however large the chunks are that they are given: about 100 MB.
-ROWS = 1 << 17
+CHUNK_SIZE = 1 << 17
 #: x east, y up, z south: glTF and SPZ.
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 #: x west, y down, z south: what viewers of .splat and .sog turn by half a turn about z, so that it stands upright.
@@ -35,7 +35,7 @@ Y_DOWN = np.array([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]])
 
 
 @dataclass(frozen=True)
-class Facts:
+class ExportMetadata:
     """What a file should say beside the Gaussians, as far as its format can."""
 
     #: Added to local coordinates it gives those of `crs`; float64. Zero where there is none.
@@ -55,7 +55,7 @@ class Facts:
 
 
 @dataclass(frozen=True)
-class Page:
+class InitialView:
     """How a page first shows a scene, in local coordinates."""
 
     #: Where one stands and what one looks at.
@@ -65,37 +65,37 @@ class Page:
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
     title: str = "scene"
     #: The file may have so many bytes.
-    most_bytes: int = 30_000_000
+    max_bytes: int = 30_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scene:
+class ExportScene:
     """Gaussians on their way into a file. They are gone through once."""
 
     chunks: Iterable[Gaussians]
     count: int
     #: Degree of the spherical harmonics of every chunk.
     degree: int
-    facts: Facts = Facts()
+    facts: ExportMetadata = ExportMetadata()
     #: Lowest and highest coordinates of the means, where known beforehand: what cannot be held is refused before work.
     bounds: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
     #: For those formats that show the scene themselves; they find a view of their own where it is not given.
-    page: Page | None = None
+    page: InitialView | None = None
 
     @staticmethod
-    def of(gaussians: Gaussians, facts: Facts | None = None) -> Scene:
+    def of(gaussians: Gaussians, metadata: ExportMetadata | None = None) -> ExportScene:
         """A scene of Gaussians that are all in memory."""
         low, high = gaussians.means.amin(0).tolist(), gaussians.means.amax(0).tolist()
-        return Scene(
+        return ExportScene(
             chunks=[gaussians],
             count=len(gaussians),
             degree=gaussians.degree,
-            facts=facts or Facts(),
+            facts=metadata or ExportMetadata(),
             bounds=(tuple(low), tuple(high)),
         )
 
     def pieces(self, turn: Float[np.ndarray, "3 3"] | None = None) -> Iterator[Gaussians]:
-        """At most `ROWS` Gaussians at a time, on the CPU, unit quaternions, turned where asked.
+        """At most `CHUNK_SIZE` Gaussians at a time, on the CPU, unit quaternions, turned where asked.
 
         Raises VdgsError for numbers that are not finite, ValueError where chunks are not what was announced.
         """
@@ -103,9 +103,9 @@ class Scene:
         for chunk in self.chunks:
             if chunk.degree != self.degree:
                 raise ValueError(f"a chunk has degree {chunk.degree}, announced was {self.degree}")
-            for start in range(0, len(chunk), ROWS):
-                piece = _clean(chunk.select(torch.arange(start, min(start + ROWS, len(chunk)))), done)
-                yield piece if turn is None else transformed(piece, 1.0, turn, np.zeros(3))
+            for start in range(0, len(chunk), CHUNK_SIZE):
+                piece = _clean(chunk.select(torch.arange(start, min(start + CHUNK_SIZE, len(chunk)))), done)
+                yield piece if turn is None else transform_gaussians(piece, 1.0, turn, np.zeros(3))
                 done += len(piece)
         if done != self.count:
             raise ValueError(f"{self.count} Gaussians were announced, {done} came")
@@ -124,15 +124,15 @@ def _clean(piece: Gaussians, first: int) -> Gaussians:
     return Gaussians(**tensors)
 
 
-def joined(pieces: Iterable[Gaussians]) -> Gaussians:
+def concatenate(pieces: Iterable[Gaussians]) -> Gaussians:
     """Pieces of a scene, at least one, as one."""
     tensors = [piece.tensors() for piece in pieces]
     return Gaussians(**{name: torch.cat([each[name] for each in tensors]) for name in tensors[0]})
 
 
-def unturned(gaussians: Gaussians, turn: Float[np.ndarray, "3 3"]) -> Gaussians:
+def rotate_back(gaussians: Gaussians, rotation: Float[np.ndarray, "3 3"]) -> Gaussians:
     """Gaussians of a file back in the ground frame."""
-    return transformed(gaussians, 1.0, turn.T, np.zeros(3))
+    return transform_gaussians(gaussians, 1.0, rotation.T, np.zeros(3))
 
 
 def opacities(gaussians: Gaussians) -> Float[np.ndarray, " n"]:
@@ -141,36 +141,36 @@ def opacities(gaussians: Gaussians) -> Float[np.ndarray, " n"]:
     return opacity
 
 
-def sizes(gaussians: Gaussians) -> Float[np.ndarray, "n 3"]:
+def gaussian_scales(gaussians: Gaussians) -> Float[np.ndarray, "n 3"]:
     """Standard deviations along the Gaussians' own axes."""
     return np.exp(gaussians.log_scales.numpy())
 
 
-def logits_of(opacity: Float[np.ndarray, " n"], steps: int = 255) -> Float[Tensor, " n"]:
+def logits_from_opacity(opacity: Float[np.ndarray, " n"], steps: int = 255) -> Float[Tensor, " n"]:
     """Opacities before the sigmoid. Those of a file in steps are kept half a step away from 0 and 1."""
     return torch.logit(torch.from_numpy(np.clip(opacity, 0.5 / steps, 1 - 0.5 / steps).astype(np.float32)))
 
 
-def colours(gaussians: Gaussians) -> Float[np.ndarray, "n 3"]:
+def base_colors(gaussians: Gaussians) -> Float[np.ndarray, "n 3"]:
     """Colours without the part that changes with the direction; not clamped to 0 .. 1."""
-    return (0.5 + DC * gaussians.dc).numpy()
+    return (0.5 + SH_C0 * gaussians.dc).numpy()
 
 
-def bytes_of(unit: Float[np.ndarray, "*shape"]) -> np.ndarray:
+def to_uint8(unit: Float[np.ndarray, "*shape"]) -> np.ndarray:
     """0 .. 1 as uint8, rounded; what is beyond is cut off."""
     return np.clip(np.rint(unit * 255), 0, 255).astype(np.uint8)
 
 
-def beside(path: Path) -> Path:
+def metadata_path(path: Path) -> Path:
     """Where the facts of a file stand whose format has no room for them: FILE.json."""
     return path.with_name(path.name + ".json")
 
 
-def write_beside(path: Path, facts: Facts, frame: Mapping[str, Any]) -> None:
+def write_metadata_file(path: Path, metadata: ExportMetadata, frame: Mapping[str, Any]) -> None:
     """Write the facts beside a file, with what its axes mean."""
-    write_json(beside(path), {"file": path.name, **facts.known(), **frame})
+    write_json(metadata_path(path), {"file": path.name, **metadata.known(), **frame})
 
 
-def one_line(text: str) -> str:
+def ascii_line(text: str) -> str:
     """Text as one line of a header, in ASCII."""
     return json.dumps(" ".join(text.split()))[1:-1]

@@ -13,38 +13,38 @@ import numpy as np
 import torch
 
 from vdgs.errors import VdgsError
-from vdgs.export.formats.export_scene import ROWS, Facts, Scene, joined, one_line
-from vdgs.kernels.spherical_harmonics import MAX_DEGREE, function_count
+from vdgs.export.formats.export_scene import CHUNK_SIZE, ExportMetadata, ExportScene, ascii_line, concatenate
+from vdgs.kernels.spherical_harmonics import MAX_SH_DEGREE, num_sh_bases
 from vdgs.model.gaussians import Gaussians
-from vdgs.system.atomic_files import write_atomically
+from vdgs.system.atomic_files import write_atomic
 
-LONGEST_HEADER = 1 << 16
-TYPES = {
+MAX_HEADER_BYTES = 1 << 16
+PLY_TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
     "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4",
     "float32": "<f4", "double": "<f8", "float64": "<f8",
 }  # fmt: skip
-SCALES = tuple(f"scale_{axis}" for axis in range(3))
-ROTATION = tuple(f"rot_{part}" for part in range(4))
+SCALE_NAMES = tuple(f"scale_{axis}" for axis in range(3))
+ROTATION_NAMES = tuple(f"rot_{part}" for part in range(4))
 DC_NAMES = tuple(f"f_dc_{channel}" for channel in range(3))
 
 
-def properties(degree: int) -> tuple[str, ...]:
+def property_names(degree: int) -> tuple[str, ...]:
     """Names of the numbers of one Gaussian, in the order of the file."""
-    rest = tuple(f"f_rest_{index}" for index in range(3 * (function_count(degree) - 1)))
-    return ("x", "y", "z", "nx", "ny", "nz", *DC_NAMES, *rest, "opacity", *SCALES, *ROTATION)
+    rest = tuple(f"f_rest_{index}" for index in range(3 * (num_sh_bases(degree) - 1)))
+    return ("x", "y", "z", "nx", "ny", "nz", *DC_NAMES, *rest, "opacity", *SCALE_NAMES, *ROTATION_NAMES)
 
 
-def comments(facts: Facts) -> list[str]:
+def header_comments(metadata: ExportMetadata) -> list[str]:
     """Header lines that say where local coordinates stand, one fact each, as JSON."""
-    return [f"comment {name} {one_line(json.dumps(value))}" if not isinstance(value, str)
-            else f"comment {name} {one_line(value)}" for name, value in facts.known().items()]  # fmt: skip
+    return [f"comment {name} {ascii_line(json.dumps(value))}" if not isinstance(value, str)
+            else f"comment {name} {ascii_line(value)}" for name, value in metadata.known().items()]  # fmt: skip
 
 
-def write_ply(path: Path, scene: Scene) -> tuple[str, ...]:
+def write_ply(path: Path, scene: ExportScene) -> tuple[str, ...]:
     """Write the scene, atomically; loses nothing. Raises VdgsError."""
-    names = properties(scene.degree)
-    lines = ["ply", "format binary_little_endian 1.0", *comments(scene.facts), f"element vertex {scene.count}"]
+    names = property_names(scene.degree)
+    lines = ["ply", "format binary_little_endian 1.0", *header_comments(scene.facts), f"element vertex {scene.count}"]
     header = "\n".join([*lines, *(f"property float {name}" for name in names), "end_header", ""]).encode("ascii")
 
     def write(temporary: Path) -> None:
@@ -53,7 +53,7 @@ def write_ply(path: Path, scene: Scene) -> tuple[str, ...]:
             for piece in scene.pieces():
                 _rows(piece, len(names)).tofile(file)
 
-    write_atomically(path, write)
+    write_atomic(path, write)
     return ()
 
 
@@ -70,28 +70,28 @@ def _rows(piece: Gaussians, width: int) -> np.ndarray:
 
 
 def read_ply(path: Path) -> Gaussians:
-    """All Gaussians of a file: see `ply_pieces`."""
-    return joined(ply_pieces(path))
+    """All Gaussians of a file: see `read_ply_chunks`."""
+    return concatenate(read_ply_chunks(path))
 
 
-def ply_pieces(path: Path) -> Iterator[Gaussians]:
-    """The Gaussians of a binary PLY file of 3DGS, properties in any order, at most `ROWS` at a time.
+def read_ply_chunks(path: Path) -> Iterator[Gaussians]:
+    """The Gaussians of a binary PLY file of 3DGS, properties in any order, at most `CHUNK_SIZE` at a time.
 
     Raises VdgsError for a file that is missing, of another kind, or shorter than it announces.
     """
     layout, count, start = _header(path)
     names = layout.names or ()
     rest = sum(name.startswith("f_rest_") for name in names)
-    missing = [name for name in properties(0) if name not in names and not name.startswith("n")]
-    if missing or rest not in {3 * (function_count(degree) - 1) for degree in range(MAX_DEGREE + 1)}:
+    missing = [name for name in property_names(0) if name not in names and not name.startswith("n")]
+    if missing or rest not in {3 * (num_sh_bases(degree) - 1) for degree in range(MAX_SH_DEGREE + 1)}:
         what = f"has no {missing[0]}" if missing else f"has {rest} f_rest properties"
         raise VdgsError(f"{path}: {what}; this is no PLY of 3DGS. Point clouds have other layouts.")
     held = (path.stat().st_size - start) // layout.itemsize
     if held < count:
         raise VdgsError(f"{path}: announces {count} Gaussians but holds {held}. It is truncated; write it again.")
-    for first in range(0, max(count, 1), ROWS):
+    for first in range(0, max(count, 1), CHUNK_SIZE):
         try:
-            table = np.fromfile(path, layout, min(ROWS, count - first), offset=start + first * layout.itemsize)
+            table = np.fromfile(path, layout, min(CHUNK_SIZE, count - first), offset=start + first * layout.itemsize)
         except OSError as error:
             raise VdgsError(f"{path}: cannot be read ({error.strerror or error}).") from error
         yield _gaussians(table, rest)
@@ -104,7 +104,7 @@ def _gaussians(table: np.ndarray, rest: int) -> Gaussians:
     n = len(table)
     coefficients = columns(*(f"f_rest_{i}" for i in range(rest))) if rest else torch.zeros(n, 0)
     return Gaussians(
-        means=columns("x", "y", "z"), log_scales=columns(*SCALES), quaternions=columns(*ROTATION),
+        means=columns("x", "y", "z"), log_scales=columns(*SCALE_NAMES), quaternions=columns(*ROTATION_NAMES),
         logits=columns("opacity")[:, 0], dc=columns(*DC_NAMES),
         rest=coefficients.reshape(n, 3, rest // 3).transpose(1, 2).contiguous(),
     )  # fmt: skip
@@ -114,7 +114,7 @@ def _header(path: Path) -> tuple[np.dtype, int, int]:
     """Layout of a vertex, their number, and where they begin."""
     try:
         with path.open("rb") as file:
-            data = file.read(LONGEST_HEADER)
+            data = file.read(MAX_HEADER_BYTES)
     except OSError as error:
         raise VdgsError(f"{path}: cannot be read ({error.strerror or error}).") from error
     end = data.find(b"\nend_header")
@@ -130,9 +130,9 @@ def _header(path: Path) -> tuple[np.dtype, int, int]:
             elements += 1
             count = int(words[2]) if elements == 1 and words[1] == "vertex" and words[2].isdecimal() else count
         elif words[:1] == ["property"] and elements == 1:
-            if len(words) != 3 or words[1] not in TYPES:
+            if len(words) != 3 or words[1] not in PLY_TYPES:
                 raise VdgsError(f"{path}: has a property that is not understood ({' '.join(words)}).")
-            fields.append((words[2], TYPES[words[1]]))
+            fields.append((words[2], PLY_TYPES[words[1]]))
     if form != "binary_little_endian" or count < 0:
         raise VdgsError(f"{path}: is no binary PLY of vertices (format {form!r}). Write it as binary_little_endian.")
     return np.dtype(fields), count, start

@@ -13,15 +13,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from vdgs.errors import RunError
-from vdgs.export.formats.export_scene import ROWS, Scene
+from vdgs.export.formats.export_scene import CHUNK_SIZE, ExportScene
 from vdgs.model.gaussians import Gaussians
 
 #: Where a Gaussian's coefficients of the spherical harmonics begin: behind its mean, scales, quaternion and logit.
-COEFFICIENTS = 3 + 3 + 4 + 1
+GEOMETRY_VALUES = 3 + 3 + 4 + 1
 
 
 @dataclass(frozen=True, eq=False)
-class Spooled:
+class GaussianStore:
     """Gaussians in a file, of which memory holds only the means [n, 3]."""
 
     means: np.ndarray
@@ -32,31 +32,31 @@ class Spooled:
 
     def rows(self, rows: np.ndarray) -> Gaussians:
         """The Gaussians of the given rows (indices), in their order."""
-        return _unflattened(torch.from_numpy(np.array(self.table[rows])), self.shapes)
+        return _unflatten(torch.from_numpy(np.array(self.table[rows])), self.shapes)
 
     def ellipsoids(self, rows: np.ndarray) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Means [r, 3], log-scales [r, 3], quaternions [r, 4] and logits [r] of the given rows, in their order."""
-        columns = torch.from_numpy(self.table)[:, :COEFFICIENTS].index_select(0, torch.from_numpy(rows))
+        columns = torch.from_numpy(self.table)[:, :GEOMETRY_VALUES].index_select(0, torch.from_numpy(rows))
         means, log_scales, quaternions, logits = (each.contiguous() for each in columns.split([3, 3, 4, 1], 1))
         return means, log_scales, quaternions, logits[:, 0]
 
     @property
     def coefficients(self) -> Float[Tensor, "n c"]:
         """Of the spherical harmonics of all, on the disk: RGB of the constant function first."""
-        return torch.from_numpy(self.table)[:, COEFFICIENTS:]
+        return torch.from_numpy(self.table)[:, GEOMETRY_VALUES:]
 
     @property
     def degree(self) -> int:
         """Of the spherical harmonics."""
         return math.isqrt(self.shapes["rest"][0] + 1) - 1
 
-    def add_colours(self, rows: np.ndarray, added: Float[Tensor, "n f 3"]) -> None:
+    def add_sh(self, rows: np.ndarray, added: Float[Tensor, "n f 3"]) -> None:
         """Add to the coefficients of the Gaussians of the given rows, each named once: of the constant function first.
         Threads may do so at once for different rows."""
         if len(rows):
             self.table[rows, -added[0].numel() :] += added.reshape(len(added), -1).numpy()
 
-    def let_go(self) -> None:
+    def release_pages(self) -> None:
         """Leave to the system which pages of the file lie in memory. They do not count as this process' own then, and
         are there again when they are asked for. Called now and then by who looks at all Gaussians."""
         if self.pages is not None and hasattr(mmap, "MADV_DONTNEED"):
@@ -64,35 +64,35 @@ class Spooled:
 
     def replace(self, rows: np.ndarray, gaussians: Gaussians) -> None:
         """Write Gaussians in place of those of the given rows."""
-        for first in range(0, len(rows), ROWS):
-            part = slice(first, first + ROWS)
-            self.table[rows[part]] = flat(gaussians.select(torch.arange(len(gaussians))[part]))
+        for first in range(0, len(rows), CHUNK_SIZE):
+            part = slice(first, first + CHUNK_SIZE)
+            self.table[rows[part]] = flatten(gaussians.select(torch.arange(len(gaussians))[part]))
 
-    def sample(self, most: int) -> Gaussians:
+    def sample(self, max_count: int) -> Gaussians:
         """At most so many, evenly taken."""
         count = len(self.means)
-        return self.rows(np.unique(np.linspace(0, count - 1, min(most, count)).astype(np.int64)))
+        return self.rows(np.unique(np.linspace(0, count - 1, min(max_count, count)).astype(np.int64)))
 
 
-def spooled(scene: Scene, file: Path, turn: np.ndarray | None = None) -> Spooled:
+def write_store(scene: ExportScene, file: Path, rotation: np.ndarray | None = None) -> GaussianStore:
     """Write all numbers of a scene to a temporary file, turned where asked. The caller removes the file."""
     means, done = np.empty((scene.count, 3), np.float32), 0
     shapes: dict[str, tuple[int, ...]] = {}
     with file.open("wb") as handle:
-        for piece in scene.pieces(turn):
+        for piece in scene.pieces(rotation):
             shapes = shapes or {name: tuple(tensor.shape[1:]) for name, tensor in piece.tensors().items()}
-            flat(piece).tofile(handle)
+            flatten(piece).tofile(handle)
             means[done : done + len(piece)] = piece.means.numpy()
             done += len(piece)
     with file.open("r+b") as handle:
         pages = mmap.mmap(handle.fileno(), 0)
-    return Spooled(means, np.frombuffer(pages, np.float32).reshape(scene.count, -1), shapes, pages)
+    return GaussianStore(means, np.frombuffer(pages, np.float32).reshape(scene.count, -1), shapes, pages)
 
 
-def opened(file: Path, degree: int, writable: bool = False) -> Spooled:
-    """The Gaussians of this degree that `spooled` has written, on the disk, their means too. Raises RunError for a file
+def open_store(file: Path, degree: int, writable: bool = False) -> GaussianStore:
+    """The Gaussians of this degree that `write_store` has written, on the disk, their means too. Raises RunError for a file
     that is missing or damaged."""
-    shapes = shapes_of(degree)
+    shapes = value_shapes(degree)
     width = sum(int(np.prod(shape)) for shape in shapes.values())
     try:
         table = np.memmap(file, np.float32, "r+" if writable else "c").reshape(-1, width)
@@ -100,27 +100,27 @@ def opened(file: Path, degree: int, writable: bool = False) -> Spooled:
         raise RunError(
             f"{file}: is missing or damaged ({error}). Delete {file.parent} and run the same command again."
         ) from error
-    return Spooled(table[:, :3], table, shapes)
+    return GaussianStore(table[:, :3], table, shapes)
 
 
-def shapes_of(degree: int) -> dict[str, tuple[int, ...]]:
+def value_shapes(degree: int) -> dict[str, tuple[int, ...]]:
     """The numbers of a Gaussian, in their order."""
     rest = (degree + 1) ** 2 - 1
     return {"means": (3,), "log_scales": (3,), "quaternions": (4,), "logits": (), "dc": (3,), "rest": (rest, 3)}
 
 
-def unflattened(rows: Float[Tensor, "n w"], degree: int) -> Gaussians:
-    """The inverse of `flat`."""
-    return _unflattened(rows, shapes_of(degree))
+def unflatten(rows: Float[Tensor, "n w"], degree: int) -> Gaussians:
+    """The inverse of `flatten`."""
+    return _unflatten(rows, value_shapes(degree))
 
 
-def _unflattened(rows: Float[Tensor, "n w"], shapes: dict[str, tuple[int, ...]]) -> Gaussians:
+def _unflatten(rows: Float[Tensor, "n w"], shapes: dict[str, tuple[int, ...]]) -> Gaussians:
     parts = rows.split([int(np.prod(shape)) for shape in shapes.values()], 1)
     named = zip(shapes.items(), parts, strict=True)
     return Gaussians(**{name: part.reshape(len(rows), *shape).contiguous() for (name, shape), part in named})
 
 
-def flat(gaussians: Gaussians) -> Float[np.ndarray, "n w"]:
+def flatten(gaussians: Gaussians) -> Float[np.ndarray, "n w"]:
     """All numbers of each, as a spool holds them."""
     columns = [tensor.reshape(len(gaussians), -1) for tensor in gaussians.tensors().values()]
     return torch.cat(columns, 1).numpy()

@@ -1,7 +1,7 @@
 """glTF: one GLB of points that viewers with KHR_gaussian_splatting draw as Gaussians, and others as coloured points.
 
 Every number is kept as float32. glTF's y is up: positions, rotations and spherical harmonics are turned there. The
-second kind, `packed_tile`, holds an SPZ in their place (KHR_gaussian_splatting_compression_spz_2): what 3D Tiles need.
+second kind, `spz_glb`, holds an SPZ in their place (KHR_gaussian_splatting_compression_spz_2): what 3D Tiles need.
 """
 
 from __future__ import annotations
@@ -16,22 +16,30 @@ from typing import IO
 import numpy as np
 
 from vdgs.errors import VdgsError
-from vdgs.export.formats.export_scene import Y_UP, Facts, Scene, bytes_of, colours, opacities, sizes
+from vdgs.export.formats.export_scene import (
+    Y_UP,
+    ExportMetadata,
+    ExportScene,
+    base_colors,
+    gaussian_scales,
+    opacities,
+    to_uint8,
+)
 from vdgs.model.gaussians import Gaussians
-from vdgs.system.atomic_files import write_atomically
+from vdgs.system.atomic_files import write_atomic
 from vdgs.system.documents import JsonObject
 
 EXTENSION = "KHR_gaussian_splatting"
-PACKED = "KHR_gaussian_splatting_compression_spz_2"
-FLOAT, BYTE = 5126, 5121
+SPZ_EXTENSION = "KHR_gaussian_splatting_compression_spz_2"
+GL_FLOAT, GL_UNSIGNED_BYTE = 5126, 5121
 #: Lengths in a GLB are of 32 bits.
-LARGEST = 2**32 - 1
+MAX_LENGTH = 2**32 - 1
 #: What the JSON grows by at most once the bounds of the positions are known.
-ROOM = 256
+JSON_SLACK_BYTES = 256
 
 
 @dataclass(frozen=True)
-class Column:
+class VertexAttribute:
     """One attribute of all Gaussians, in one piece."""
 
     name: str
@@ -40,117 +48,127 @@ class Column:
     width: int
 
     @property
-    def bytes_each(self) -> int:
-        return self.width * (4 if self.component == FLOAT else 1)
+    def bytes_per_gaussian(self) -> int:
+        return self.width * (4 if self.component == GL_FLOAT else 1)
 
     def accessor(self, count: int) -> JsonObject:
-        normalised = {"normalized": True} if self.component == BYTE else {}
+        normalised = {"normalized": True} if self.component == GL_UNSIGNED_BYTE else {}
         return {"componentType": self.component, "count": count, "type": self.kind, **normalised}
 
 
-def attributes(degree: int) -> list[Column]:
+def vertex_attributes(degree: int) -> list[VertexAttribute]:
     """The columns of the uncompressed kind."""
     bands = [(band, index) for band in range(degree + 1) for index in range(2 * band + 1)]
     return [
-        Column("POSITION", "VEC3", FLOAT, 3), Column("COLOR_0", "VEC4", BYTE, 4),
-        Column(f"{EXTENSION}:ROTATION", "VEC4", FLOAT, 4), Column(f"{EXTENSION}:SCALE", "VEC3", FLOAT, 3),
-        Column(f"{EXTENSION}:OPACITY", "SCALAR", FLOAT, 1),
-        *(Column(f"{EXTENSION}:SH_DEGREE_{band}_COEF_{index}", "VEC3", FLOAT, 3) for band, index in bands),
+        VertexAttribute("POSITION", "VEC3", GL_FLOAT, 3), VertexAttribute("COLOR_0", "VEC4", GL_UNSIGNED_BYTE, 4),
+        VertexAttribute(f"{EXTENSION}:ROTATION", "VEC4", GL_FLOAT, 4), VertexAttribute(f"{EXTENSION}:SCALE", "VEC3", GL_FLOAT, 3),
+        VertexAttribute(f"{EXTENSION}:OPACITY", "SCALAR", GL_FLOAT, 1),
+        *(VertexAttribute(f"{EXTENSION}:SH_DEGREE_{band}_COEF_{index}", "VEC3", GL_FLOAT, 3) for band, index in bands),
     ]  # fmt: skip
 
 
-def size_of(scene: Scene) -> int:
+def gaussian_bytes(scene: ExportScene) -> int:
     """Bytes of the Gaussians in a GLB."""
-    return scene.count * sum(column.bytes_each for column in attributes(scene.degree))
+    return scene.count * sum(column.bytes_per_gaussian for column in vertex_attributes(scene.degree))
 
 
-def refuse_too_large(path: Path, scene: Scene) -> None:
+def check_glb_size(path: Path, scene: ExportScene) -> None:
     """Raise VdgsError where a GLB cannot hold so many Gaussians."""
-    if size_of(scene) + (1 << 16) > LARGEST:
+    if gaussian_bytes(scene) + (1 << 16) > MAX_LENGTH:
         raise VdgsError(
-            f"{path}: {scene.count} Gaussians take {size_of(scene) / 2**30:.1f} GiB as glTF, and a GLB holds 4 GiB. "
+            f"{path}: {scene.count} Gaussians take {gaussian_bytes(scene) / 2**30:.1f} GiB as glTF, and a GLB holds 4 GiB. "
             "Write 3D Tiles (a file named tileset.json) or .spz, or fewer Gaussians."
         )
 
 
-def write_glb(path: Path, scene: Scene) -> tuple[str, ...]:
+def write_glb(path: Path, scene: ExportScene) -> tuple[str, ...]:
     """Write the scene, atomically; loses nothing. Raises VdgsError."""
-    refuse_too_large(path, scene)
-    wanted = attributes(scene.degree)
-    starts = np.cumsum([0, *(column.bytes_each * scene.count for column in wanted)]).tolist()
+    check_glb_size(path, scene)
+    wanted = vertex_attributes(scene.degree)
+    starts = np.cumsum([0, *(column.bytes_per_gaussian * scene.count for column in wanted)]).tolist()
 
     def write(temporary: Path) -> None:
         low, high = np.full(3, np.inf, np.float32), np.full(3, -np.inf, np.float32)
-        room = len(_json(_document(wanted, scene, starts, np.zeros(3), np.zeros(3)))) + ROOM
+        room = len(_json(_document(wanted, scene, starts, np.zeros(3), np.zeros(3)))) + JSON_SLACK_BYTES
         data, done = 12 + 8 + (room + 3) // 4 * 4 + 8, 0
         with temporary.open("wb") as file:
             for piece in scene.pieces(Y_UP):
                 low, high = np.minimum(low, piece.means.numpy().min(0)), np.maximum(high, piece.means.numpy().max(0))
                 for column, start, values in zip(wanted, starts[:-1], _values(piece), strict=True):
-                    file.seek(data + start + done * column.bytes_each)
+                    file.seek(data + start + done * column.bytes_per_gaussian)
                     values.tofile(file)
                 done += len(piece)
             file.seek(0)
             described = _json(_document(wanted, scene, starts, low, high)).ljust((room + 3) // 4 * 4)
             _frame(file, described, starts[-1])
 
-    write_atomically(path, write)
+    write_atomic(path, write)
     return ()
 
 
 def _values(piece: Gaussians) -> Iterator[np.ndarray]:
     """The numbers of the columns, in their order."""
     yield piece.means.numpy()
-    yield bytes_of(np.concatenate([colours(piece), opacities(piece)[:, None]], 1))
+    yield to_uint8(np.concatenate([base_colors(piece), opacities(piece)[:, None]], 1))
     yield piece.quaternions.numpy()[:, [1, 2, 3, 0]]
-    yield sizes(piece)
+    yield gaussian_scales(piece)
     yield opacities(piece)
     yield piece.dc.numpy()
     for index in range(piece.rest.shape[1]):
         yield np.ascontiguousarray(piece.rest[:, index].numpy())
 
 
-def _document(wanted: list[Column], scene: Scene, starts: list[int], low: np.ndarray, high: np.ndarray) -> JsonObject:
+def _document(
+    wanted: list[VertexAttribute], scene: ExportScene, starts: list[int], low: np.ndarray, high: np.ndarray
+) -> JsonObject:
     accessors = [{"bufferView": index, **column.accessor(scene.count)} for index, column in enumerate(wanted)]
     accessors[0] |= {"min": [float(x) for x in low], "max": [float(x) for x in high]}
     views = [
-        {"buffer": 0, "byteOffset": start, "byteLength": column.bytes_each * scene.count, "target": 34962}
+        {"buffer": 0, "byteOffset": start, "byteLength": column.bytes_per_gaussian * scene.count, "target": 34962}
         for column, start in zip(wanted, starts[:-1], strict=True)
     ]
     splatting = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective",
                  "sortingMethod": "cameraDistance"}  # fmt: skip
     names = {column.name: index for index, column in enumerate(wanted)}
     return {
-        "asset": asset(scene.facts), "extensionsUsed": [EXTENSION],
+        "asset": asset_json(scene.facts), "extensionsUsed": [EXTENSION],
         "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [{"mode": 0, "attributes": names, "extensions": {EXTENSION: splatting}}]}],
         "accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": starts[-1]}],
     }  # fmt: skip
 
 
-def asset(facts: Facts) -> JsonObject:
+def asset_json(metadata: ExportMetadata) -> JsonObject:
     """glTF's and 3D Tiles' word on where a file comes from."""
-    return {"version": "2.0", "generator": facts.program, "extras": {**facts.known(), "axes": "x east, y up, z south"}}
+    return {
+        "version": "2.0",
+        "generator": metadata.program,
+        "extras": {**metadata.known(), "axes": "x east, y up, z south"},
+    }
 
 
-def packed_tile(gaussians: Gaussians, spz: bytes, translation: np.ndarray, facts: Facts) -> bytes:
+def spz_glb(gaussians: Gaussians, spz: bytes, translation: np.ndarray, metadata: ExportMetadata) -> bytes:
     """A GLB around an SPZ of the same Gaussians (y up), moved by `translation` [3] (y up) to their place.
 
     The attributes name what the SPZ yields, without data of their own. Degree 0 and opacity are not among them: they
     are COLOR_0, and CesiumJS tells the degree by the number of attributes.
     """
     count = len(gaussians)
-    columns = [Column("POSITION", "VEC3", FLOAT, 3), Column("COLOR_0", "VEC4", BYTE, 4),
-               Column(f"{EXTENSION}:SCALE", "VEC3", FLOAT, 3), Column(f"{EXTENSION}:ROTATION", "VEC4", FLOAT, 4),
-               *attributes(gaussians.degree)[6:]]  # fmt: skip
+    columns = [VertexAttribute("POSITION", "VEC3", GL_FLOAT, 3), VertexAttribute("COLOR_0", "VEC4", GL_UNSIGNED_BYTE, 4),
+               VertexAttribute(f"{EXTENSION}:SCALE", "VEC3", GL_FLOAT, 3), VertexAttribute(f"{EXTENSION}:ROTATION", "VEC4", GL_FLOAT, 4),
+               *vertex_attributes(gaussians.degree)[6:]]  # fmt: skip
     accessors = [column.accessor(count) for column in columns]
     means = gaussians.means.numpy()
     accessors[0] |= {"min": means.min(0).tolist(), "max": means.max(0).tolist()}
-    splatting = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "extensions": {PACKED: {"bufferView": 0}}}
+    splatting = {
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+        "extensions": {SPZ_EXTENSION: {"bufferView": 0}},
+    }
     names = {column.name: index for index, column in enumerate(columns)}
     described = _json({
-        "asset": {"version": "2.0", "generator": facts.program},
-        "extensionsUsed": [EXTENSION, PACKED], "extensionsRequired": [EXTENSION, PACKED],
+        "asset": {"version": "2.0", "generator": metadata.program},
+        "extensionsUsed": [EXTENSION, SPZ_EXTENSION], "extensionsRequired": [EXTENSION, SPZ_EXTENSION],
         "scene": 0, "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "translation": [float(x) for x in translation]}],
         "meshes": [{"primitives": [{"mode": 0, "attributes": names, "extensions": {EXTENSION: splatting}}]}],

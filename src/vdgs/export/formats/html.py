@@ -23,26 +23,33 @@ from jaxtyping import Float, UInt32
 
 from vdgs.captures.camera_height import FOV_DEG
 from vdgs.errors import VdgsError
-from vdgs.export.formats.export_scene import Page, Scene, bytes_of, colours, logits_of, opacities
-from vdgs.export.formats.simplify import axes_of, thinned
-from vdgs.kernels.spherical_harmonics import dc_of_colours
-from vdgs.model.gaussian_transform import covariances
+from vdgs.export.formats.export_scene import (
+    ExportScene,
+    InitialView,
+    base_colors,
+    logits_from_opacity,
+    opacities,
+    to_uint8,
+)
+from vdgs.export.formats.simplify import ellipsoid_axes, simplify
+from vdgs.kernels.spherical_harmonics import rgb_to_sh
+from vdgs.model.gaussian_transform import gaussian_covariances
 from vdgs.model.gaussians import Gaussians
 from vdgs.system.atomic_files import write_bytes
 
 #: Numbers of 32 bits a Gaussian.
-WORDS = 8
+WORDS_PER_GAUSSIAN = 8
 #: Lengths in the page are those of the scene times a power of two, with which the median Gaussian is about so large:
 #: covariances in float16 then hold all from 1/13 of it to 2000 times it.
-USUAL_SIZE = 0.1
+TARGET_MEDIAN_SIZE = 0.1
 #: No standard deviation above this, in lengths of the page: its square ends below the largest float16.
-LARGEST_SIZE = 250.0
+MAX_SIZE = 250.0
 #: Bytes a Gaussian takes are found on so many; they are right within this share.
-SAMPLE, SLACK = 1 << 15, 1.05
+SAMPLE_GAUSSIANS, SIZE_MARGIN = 1 << 15, 1.05
 #: Fewer than this are no scene.
-FEWEST = 1000
+MIN_GAUSSIANS = 1000
 #: z up to the y up of the client: a quarter turn about x, wxyz.
-_UPRIGHT = (0.7071067811865476, -0.7071067811865476, 0.0, 0.0)
+_Z_UP_TO_Y_UP = (0.7071067811865476, -0.7071067811865476, 0.0, 0.0)
 _EMBEDDED = re.compile(r'window\.__VISER_EMBED_DATA__="([A-Za-z0-9+/=]*)"')
 _FACTS = re.compile(r'<meta name="vdgs" content="([^"]*)"')
 #: The page may load nothing: all that it needs is in it.
@@ -64,7 +71,7 @@ _CAPTION = (
 )
 
 
-def refuse_without_viser(path: Path, scene: Scene) -> None:
+def check_viser(path: Path, scene: ExportScene) -> None:
     """Raise VdgsError where the package that holds the client is missing."""
     try:
         import viser  # noqa: F401
@@ -72,25 +79,25 @@ def refuse_without_viser(path: Path, scene: Scene) -> None:
         raise VdgsError(f"{path}: pages need viser. Install it: pip install 'vdgs[viewer]'") from error
 
 
-def write_html(path: Path, scene: Scene) -> tuple[str, ...]:
+def write_html(path: Path, scene: ExportScene) -> tuple[str, ...]:
     """Write the page, atomically. Returns what was lost. Raises VdgsError."""
-    whole = _of_fixed_colour(scene)
-    page = scene.page or _facing(whole)
+    whole = _without_sh(scene)
+    page = scene.page or _default_view(whole)
     factor = _factor(whole)
     kept = whole
-    while len(content := _document(kept, factor, page, scene)) > page.most_bytes:
-        kept = _fitting(whole, len(kept), factor, page)
+    while len(content := _document(kept, factor, page, scene)) > page.max_bytes:
+        kept = _thin_to_fit(whole, len(kept), factor, page)
     write_bytes(path, content)
     lost = ["colours do not change with the viewing direction"]
     if len(kept) < len(whole):
         lost.append(
             f"thinned from {len(whole):,} Gaussians to {len(kept):,}, for the page may have "
-            f"{page.most_bytes / 1e6:g} MB (--html-mb)"
+            f"{page.max_bytes / 1e6:g} MB (--html-mb)"
         )
     return tuple(lost)
 
 
-def html_pieces(path: Path) -> Iterator[Gaussians]:
+def read_html_chunks(path: Path) -> Iterator[Gaussians]:
     """The Gaussians of a page of ours, in the ground frame, all at once. Raises VdgsError if it is missing or none."""
     import msgspec
     import zstandard
@@ -107,61 +114,61 @@ def html_pieces(path: Path) -> Iterator[Gaussians]:
     known = json.loads(html.unescape(facts[1]))
     length = int.from_bytes(inner[:8], "little")
     (size,) = msgspec.msgpack.decode(inner[8 : 8 + length])["binaryBufferLengths"]
-    yield _unpacked(np.frombuffer(inner[-size:], np.uint32).reshape(-1, WORDS), known["factor"])
+    yield _unpacked(np.frombuffer(inner[-size:], np.uint32).reshape(-1, WORDS_PER_GAUSSIAN), known["factor"])
 
 
-def _of_fixed_colour(scene: Scene) -> Gaussians:
+def _without_sh(scene: ExportScene) -> Gaussians:
     """All of a scene in memory, without the coefficients that are not shown: 56 bytes each."""
     parts = [replace(piece, rest=torch.zeros(len(piece), 0, 3)) for piece in scene.pieces()]
     return Gaussians(**{name: torch.cat([part.tensors()[name] for part in parts]) for name in parts[0].tensors()})
 
 
-def _fitting(whole: Gaussians, tried: int, factor: float, page: Page) -> Gaussians:
+def _thin_to_fit(whole: Gaussians, tried: int, factor: float, page: InitialView) -> Gaussians:
     """The scene thinned to what there is room for, and by a tenth more than what was tried. Raises VdgsError."""
-    some = whole.select(torch.linspace(0, len(whole) - 1, min(SAMPLE, len(whole))).long())
-    frame = len(_client()) + 4096
-    each = SLACK * len(_recorded(_packed(some, factor), factor, page)) / len(some)
-    count = int(min((page.most_bytes - frame) / each, 0.9 * tried))
-    if count < FEWEST:
+    some = whole.select(torch.linspace(0, len(whole) - 1, min(SAMPLE_GAUSSIANS, len(whole))).long())
+    frame = len(_client_html()) + 4096
+    each = SIZE_MARGIN * len(_recording(_packed(some, factor), factor, page)) / len(some)
+    count = int(min((page.max_bytes - frame) / each, 0.9 * tried))
+    if count < MIN_GAUSSIANS:
         raise VdgsError(
-            f"A page of {page.most_bytes / 1e6:g} MB has no room for the scene: the client alone takes "
+            f"A page of {page.max_bytes / 1e6:g} MB has no room for the scene: the client alone takes "
             f"{frame / 1e6:.1f} MB. Allow more: --html-mb."
         )
-    return thinned(whole, count)[0]
+    return simplify(whole, count)[0]
 
 
 def _factor(gaussians: Gaussians) -> float:
     """The power of two that lengths are multiplied with."""
     usual = float(gaussians.log_scales.amax(1).median().exp())
-    return float(2.0 ** np.round(np.log2(USUAL_SIZE / max(usual, 1e-30))))
+    return float(2.0 ** np.round(np.log2(TARGET_MEDIAN_SIZE / max(usual, 1e-30))))
 
 
 def _packed(gaussians: Gaussians, factor: float) -> UInt32[np.ndarray, "n 8"]:
     """As the client's textures hold them."""
-    rows = np.zeros((len(gaussians), WORDS), np.uint32)
+    rows = np.zeros((len(gaussians), WORDS_PER_GAUSSIAN), np.uint32)
     rows[:, :3] = (factor * gaussians.means.numpy()).astype(np.float32).view(np.uint32)
-    largest = float(np.log(LARGEST_SIZE / factor))
+    largest = float(np.log(MAX_SIZE / factor))
     clamped = Gaussians(**{**gaussians.tensors(), "log_scales": gaussians.log_scales.clamp_max(largest)})
-    spread = factor**2 * covariances(clamped).numpy().reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
+    spread = factor**2 * gaussian_covariances(clamped).numpy().reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
     rows[:, 4:7] = np.ascontiguousarray(spread.astype(np.float16)).view(np.uint32)
-    shown = np.concatenate([colours(gaussians), opacities(gaussians)[:, None]], 1)
-    rows[:, 7:] = bytes_of(shown).view(np.uint32)
+    shown = np.concatenate([base_colors(gaussians), opacities(gaussians)[:, None]], 1)
+    rows[:, 7:] = to_uint8(shown).view(np.uint32)
     return rows
 
 
 def _unpacked(rows: UInt32[np.ndarray, "n 8"], factor: float) -> Gaussians:
     """The inverse of `_packed`, but for what is rounded."""
     upper = torch.from_numpy(np.ascontiguousarray(rows[:, 4:7]).view(np.float16).astype(np.float64)) / factor**2
-    log_scales, quaternions = axes_of(upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3))
+    log_scales, quaternions = ellipsoid_axes(upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3))
     rgba = np.ascontiguousarray(rows[:, 7:]).view(np.uint8).astype(np.float32) / 255
     return Gaussians(
         means=torch.from_numpy(np.ascontiguousarray(rows[:, :3]).view(np.float32) / np.float32(factor)),
-        log_scales=log_scales.float(), quaternions=quaternions.float(), logits=logits_of(rgba[:, 3]),
-        dc=dc_of_colours(torch.from_numpy(rgba[:, :3])), rest=torch.zeros(len(rows), 0, 3),
+        log_scales=log_scales.float(), quaternions=quaternions.float(), logits=logits_from_opacity(rgba[:, 3]),
+        dc=rgb_to_sh(torch.from_numpy(rgba[:, :3])), rest=torch.zeros(len(rows), 0, 3),
     )  # fmt: skip
 
 
-def _document(gaussians: Gaussians, factor: float, page: Page, scene: Scene) -> bytes:
+def _document(gaussians: Gaussians, factor: float, page: InitialView, scene: ExportScene) -> bytes:
     """The whole file."""
     title = html.escape(page.title)
     facts = {**scene.facts.known(), "axes": "z up", "gaussians": len(gaussians), "factor": factor}
@@ -169,7 +176,7 @@ def _document(gaussians: Gaussians, factor: float, page: Page, scene: Scene) -> 
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
         f'<meta name="vdgs" content="{html.escape(json.dumps(facts))}">{_WORKERS}'
     )
-    recording = _recorded(_packed(gaussians, factor), factor, page)
+    recording = _recording(_packed(gaussians, factor), factor, page)
     script = (
         f'<script>window.__VISER_EMBED_DATA__="{recording}";window.__VISER_EMBED_CONFIG__={{darkMode:false}};</script>'
     )
@@ -177,14 +184,14 @@ def _document(gaussians: Gaussians, factor: float, page: Page, scene: Scene) -> 
         f'<p style="{_CAPTION}">{title} · {len(gaussians):,} Gaussians, colours as seen from no particular side · '
         "left button turns, right moves, wheel goes nearer</p>"
     )
-    client = _client().replace("<title>Viser</title>", f"<title>{title}</title>", 1)
+    client = _client_html().replace("<title>Viser</title>", f"<title>{title}</title>", 1)
     client = client.replace('<meta charset="utf-8" />', f'<meta charset="utf-8" />{head}', 1)
     client = client.replace("</head>", f"{script}</head>", 1)
     before, after = client.rsplit("</body>", 1)
     return f"{before}{caption}</body>{after}".encode()
 
 
-def _client() -> str:
+def _client_html() -> str:
     """The page of viser's client, as the installed package has it."""
     import viser
 
@@ -198,7 +205,7 @@ def _client() -> str:
     return text
 
 
-def _recorded(rows: UInt32[np.ndarray, "n 8"], factor: float, page: Page) -> str:
+def _recording(rows: UInt32[np.ndarray, "n 8"], factor: float, page: InitialView) -> str:
     """What the client plays: where one stands, the colour behind, and the Gaussians. Base64."""
     from viser import _messages as messages
     from viser.infra import StateSerializer, WebsockMessageHandler
@@ -214,7 +221,7 @@ def _recorded(rows: UInt32[np.ndarray, "n 8"], factor: float, page: Page) -> str
 
     recording: StateSerializer = Nowhere().get_message_serializer(lambda message: True)
     said: list[Any] = [
-        messages.SetOrientationMessage("", _UPRIGHT),
+        messages.SetOrientationMessage("", _Z_UP_TO_Y_UP),
         messages.SetCameraUpDirectionMessage((0.0, 0.0, 1.0), initial=True),
         messages.SetCameraPositionMessage(tuple(position.tolist()), initial=True),
         messages.SetCameraLookAtMessage(tuple(target.tolist()), initial=True),
@@ -233,21 +240,21 @@ def _recorded(rows: UInt32[np.ndarray, "n 8"], factor: float, page: Page) -> str
 
 def _png(colour: tuple[float, float, float]) -> bytes:
     """A picture of one colour."""
-    pixels = np.broadcast_to(bytes_of(np.array(colour))[::-1], (2, 2, 3))
+    pixels = np.broadcast_to(to_uint8(np.array(colour))[::-1], (2, 2, 3))
     done, encoded = cv2.imencode(".png", np.ascontiguousarray(pixels))
     assert done
     return encoded.tobytes()
 
 
-def _facing(gaussians: Gaussians) -> Page:
+def _default_view(gaussians: Gaussians) -> InitialView:
     """A view of all from the south, half from above."""
     low, high = (np.quantile(gaussians.means.numpy(), q, axis=0) for q in (0.02, 0.98))
     middle: Float[np.ndarray, "3"] = (low + high) / 2
     away = max(float((high - low).max()), 1e-6)
     position = middle + away * np.array([0.0, -0.9, 0.9])
-    return Page(_three(position), _three(middle))
+    return InitialView(_float_triple(position), _float_triple(middle))
 
 
-def _three(place: Float[np.ndarray, "3"]) -> tuple[float, float, float]:
+def _float_triple(place: Float[np.ndarray, "3"]) -> tuple[float, float, float]:
     x, y, z = (float(each) for each in place)
     return x, y, z

@@ -12,17 +12,17 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 
-BLOCK = 1 << 20
+BLOCK_BYTES = 1 << 20
 #: Quantised numbers deflate hardly better at higher levels, in five times the time.
-LEVEL = 3
-HEADER = b"\x1f\x8b\x08\x00\x00\x00\x00\x00\x00\xff"
+COMPRESSION_LEVEL = 3
+GZIP_HEADER = b"\x1f\x8b\x08\x00\x00\x00\x00\x00\x00\xff"
 
 
-def gzipped(data: Iterable[bytes], level: int = LEVEL) -> Iterator[bytes]:
+def gzip_blocks(data: Iterable[bytes], level: int = COMPRESSION_LEVEL) -> Iterator[bytes]:
     """The pieces of a gzip file that holds the concatenated data. No more than a few blocks are in memory."""
     checksum, size = 0, 0
     workers = max(1, min(8, os.cpu_count() or 1))
-    yield HEADER
+    yield GZIP_HEADER
     with ThreadPoolExecutor(workers) as pool:
         under_way: deque[Future[bytes]] = deque()
         for block in _blocks(data):
@@ -44,5 +44,5 @@ def _deflated(block: bytes, level: int) -> bytes:
 def _blocks(data: Iterable[bytes]) -> Iterator[bytes]:
     for piece in data:
         view = memoryview(piece)
-        for start in range(0, len(view), BLOCK):
-            yield bytes(view[start : start + BLOCK])
+        for start in range(0, len(view), BLOCK_BYTES):
+            yield bytes(view[start : start + BLOCK_BYTES])

@@ -12,39 +12,39 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vdgs.errors import VdgsError
-from vdgs.export.formats.export_scene import Facts, Scene, bytes_of, colours, opacities
-from vdgs.export.formats.gaussian_ply import comments
-from vdgs.system.atomic_files import write_atomically
+from vdgs.export.formats.export_scene import ExportMetadata, ExportScene, base_colors, opacities, to_uint8
+from vdgs.export.formats.gaussian_ply import header_comments
+from vdgs.system.atomic_files import write_atomic
 
 if TYPE_CHECKING:
     import laspy
 
-LAYOUT = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3), ("opacity", "<f4")])
+POINT_DTYPE = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3), ("opacity", "<f4")])
 #: LAS keeps whole numbers of this, in units of the coordinates.
-STEP = 0.001
-LOST = ("sizes, rotations and changing colours are left out: these are points",)
+LAS_SCALE = 0.001
+LOSS_NOTES = ("sizes, rotations and changing colours are left out: these are points",)
 
 
-def write_points(path: Path, scene: Scene) -> tuple[str, ...]:
+def write_points(path: Path, scene: ExportScene) -> tuple[str, ...]:
     """Write x, y, z (ground frame), red, green, blue and opacity as PLY, atomically. Returns what was lost."""
     names = ["float x", "float y", "float z", "uchar red", "uchar green", "uchar blue", "float opacity"]
-    lines = ["ply", "format binary_little_endian 1.0", *comments(scene.facts), f"element vertex {scene.count}"]
+    lines = ["ply", "format binary_little_endian 1.0", *header_comments(scene.facts), f"element vertex {scene.count}"]
     header = "\n".join([*lines, *(f"property {name}" for name in names), "end_header", ""]).encode("ascii")
 
     def write(temporary: Path) -> None:
         with temporary.open("wb") as file:
             file.write(header)
             for piece in scene.pieces():
-                rows = np.empty(len(piece), LAYOUT)
-                rows["xyz"], rows["rgb"] = piece.means.numpy(), bytes_of(colours(piece))
+                rows = np.empty(len(piece), POINT_DTYPE)
+                rows["xyz"], rows["rgb"] = piece.means.numpy(), to_uint8(base_colors(piece))
                 rows["opacity"] = opacities(piece)
                 rows.tofile(file)
 
-    write_atomically(path, write)
-    return LOST
+    write_atomic(path, write)
+    return LOSS_NOTES
 
 
-def refuse_without_laspy(path: Path, scene: Scene) -> None:
+def check_las_dependencies(path: Path, scene: ExportScene) -> None:
     """Raise VdgsError where packages are missing that LAS and LAZ need."""
     needed = ["laspy", *(["lazrs"] if path.suffix.lower() == ".laz" else []), *(["pyproj"] if scene.facts.crs else [])]
     missing = [name for name in needed if importlib.util.find_spec(name) is None]
@@ -54,12 +54,12 @@ def refuse_without_laspy(path: Path, scene: Scene) -> None:
         _crs(path, scene.facts.crs)
 
 
-def write_laz(path: Path, scene: Scene) -> tuple[str, ...]:
+def write_laz(path: Path, scene: ExportScene) -> tuple[str, ...]:
     """Write a LAS 1.4 or, by the ending, LAZ file at origin + local coordinates, atomically, with the CRS as WKT.
 
     Returns what was lost. Raises VdgsError.
     """
-    refuse_without_laspy(path, scene)
+    check_las_dependencies(path, scene)
     import laspy
 
     compressed = path.suffix.lower() == ".laz"
@@ -71,32 +71,32 @@ def write_laz(path: Path, scene: Scene) -> tuple[str, ...]:
         ) as writer:  # fmt: skip
             origin = np.array(scene.facts.origin)
             for piece in scene.pieces():
-                writer.write_points(_las_points(piece.means.double().numpy() + origin, bytes_of(colours(piece)),
+                writer.write_points(_las_points(piece.means.double().numpy() + origin, to_uint8(base_colors(piece)),
                                                 opacities(piece), header))  # fmt: skip
 
-    write_atomically(path, write)
-    return LOST
+    write_atomic(path, write)
+    return LOSS_NOTES
 
 
-def _las_header(path: Path, facts: Facts) -> laspy.LasHeader:
+def _las_header(path: Path, metadata: ExportMetadata) -> laspy.LasHeader:
     import laspy
 
     header = laspy.LasHeader(version="1.4", point_format=7)
-    header.scales = np.full(3, STEP)
-    header.offsets = np.floor(np.array(facts.origin))
-    header.generating_software = facts.program[:32]
-    if facts.crs:
-        header.add_crs(_crs(path, facts.crs))
+    header.scales = np.full(3, LAS_SCALE)
+    header.offsets = np.floor(np.array(metadata.origin))
+    header.generating_software = metadata.program[:32]
+    if metadata.crs:
+        header.add_crs(_crs(path, metadata.crs))
     return header
 
 
 def _las_points(
-    places: np.ndarray, rgb: np.ndarray, opacity: np.ndarray, header: laspy.LasHeader
+    positions: np.ndarray, rgb: np.ndarray, opacity: np.ndarray, header: laspy.LasHeader
 ) -> laspy.ScaleAwarePointRecord:
     import laspy
 
-    points = laspy.ScaleAwarePointRecord.zeros(len(places), header=header)
-    points.x, points.y, points.z = places.T
+    points = laspy.ScaleAwarePointRecord.zeros(len(positions), header=header)
+    points.x, points.y, points.z = positions.T
     points.red, points.green, points.blue = rgb.T.astype(np.uint16) * 257
     points.intensity = np.rint(opacity * 65535).astype(np.uint16)
     points.return_number[:] = 1

@@ -19,9 +19,9 @@ from vdgs.kernels.rotations import rotation_matrices
 from vdgs.model.gaussians import Gaussians
 
 
-def with_small_turns(gaussians: Gaussians) -> Gaussians:
+def canonicalize_quaternions(gaussians: Gaussians) -> Gaussians:
     """Gaussians of the same shapes, by the rotations with the largest w. Takes and gives unit quaternions."""
-    group, columns = _namings()
+    group, columns = _axis_permutations()
     q = gaussians.quaternions
     # w of the product q p is the dot product of q with the conjugate of p.
     best = (q @ (group * torch.tensor([1.0, -1, -1, -1])).T).abs().argmax(1)
@@ -37,7 +37,7 @@ def with_small_turns(gaussians: Gaussians) -> Gaussians:
 
 
 @lru_cache(maxsize=1)
-def _namings() -> tuple[Float[Tensor, "24 4"], Tensor]:
+def _axis_permutations() -> tuple[Float[Tensor, "24 4"], Tensor]:
     """Quaternions (wxyz) of the 24 rotations of a cube, and which old axis each makes the first, second and third."""
     units = torch.eye(4)
     pairs = [units[i] + sign * units[j] for i, j in itertools.combinations(range(4), 2) for sign in (1, -1)]

@@ -8,123 +8,142 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vdgs.errors import VdgsError
-from vdgs.export.formats.export_scene import Scene, beside, joined
-from vdgs.export.formats.gaussian_ply import ply_pieces, write_ply
-from vdgs.export.formats.gltf import refuse_too_large, write_glb
-from vdgs.export.formats.html import html_pieces, refuse_without_viser, write_html
-from vdgs.export.formats.point_cloud import refuse_without_laspy, write_laz, write_points
+from vdgs.export.formats.export_scene import ExportScene, concatenate, metadata_path
+from vdgs.export.formats.gaussian_ply import read_ply_chunks, write_ply
+from vdgs.export.formats.gltf import check_glb_size, write_glb
+from vdgs.export.formats.html import check_viser, read_html_chunks, write_html
+from vdgs.export.formats.point_cloud import check_las_dependencies, write_laz, write_points
 from vdgs.export.formats.sog import write_sog
-from vdgs.export.formats.splat import splat_pieces, write_splat
-from vdgs.export.formats.spz import REACH, refuse_too_far, spz_pieces, write_spz
-from vdgs.export.formats.tiles_3d import NAME, refuse_other_names, write_tiles
+from vdgs.export.formats.splat import read_splat_chunks, write_splat
+from vdgs.export.formats.spz import MAX_COORDINATE, check_range, read_spz_chunks, write_spz
+from vdgs.export.formats.tiles_3d import TILESET_FILE, check_tileset_folder, write_tiles
 from vdgs.model.gaussians import Gaussians
 
 
 @dataclass(frozen=True, kw_only=True)
-class Format:
-    """One kind of file. `write` returns a sentence for each thing that was lost."""
+class ExportFormat:
+    """One kind of file. `write_scene` returns a sentence for each thing that was lost."""
 
     #: How the file's name ends, in lower case.
-    ending: str
+    suffix: str
     #: What it is, in a few words.
-    what: str
-    write: Callable[[Path, Scene], tuple[str, ...]]
+    description: str
+    write: Callable[[Path, ExportScene], tuple[str, ...]]
     #: Reads a file back into the ground frame, piece by piece, where that makes sense.
     read: Callable[[Path], Iterator[Gaussians]] | None = None
     #: Raises VdgsError for what can be known to fail before the first chunk is asked for.
-    check: Callable[[Path, Scene], None] = lambda path, scene: None
+    check: Callable[[Path, ExportScene], None] = lambda path, scene: None
     #: Whether facts are written to FILE.json, for the format has no room for them.
-    facts_beside: bool = False
+    writes_metadata_file: bool = False
     #: Coordinates lie below this, from the origin.
     reach: float = math.inf
     #: Whether its colours do not change with the direction: best baked so, where all files are of that kind.
-    fixed: bool = False
+    fixed_colors: bool = False
     #: Whether it stands on the globe, in no map's coordinates.
     on_globe: bool = False
 
 
 #: The longer endings first: `.points.ply` is a `.ply` too.
-FORMATS: tuple[Format, ...] = (
-    Format(ending=".points.ply", what="point cloud, local coordinates", write=write_points),
-    Format(ending=".ply", what="3DGS PLY, nothing lost", write=write_ply, read=ply_pieces),
-    Format(
-        ending=".spz",
-        what="SPZ, a sixth of the PLY or less",
+FORMATS: tuple[ExportFormat, ...] = (
+    ExportFormat(suffix=".points.ply", description="point cloud, local coordinates", write=write_points),
+    ExportFormat(suffix=".ply", description="3DGS PLY, nothing lost", write=write_ply, read=read_ply_chunks),
+    ExportFormat(
+        suffix=".spz",
+        description="SPZ, a sixth of the PLY or less",
         write=write_spz,
-        read=spz_pieces,
-        check=refuse_too_far,
-        facts_beside=True,
-        reach=REACH,
+        read=read_spz_chunks,
+        check=check_range,
+        writes_metadata_file=True,
+        reach=MAX_COORDINATE,
     ),
-    Format(
-        ending=".splat",
-        what="32 bytes a Gaussian, fixed colours",
+    ExportFormat(
+        suffix=".splat",
+        description="32 bytes a Gaussian, fixed colours",
         write=write_splat,
-        read=splat_pieces,
-        facts_beside=True,
+        read=read_splat_chunks,
+        writes_metadata_file=True,
     ),
-    Format(ending=".sog", what="PlayCanvas' SOG, a twelfth of the PLY or less", write=write_sog, facts_beside=True),
-    Format(
-        ending=".glb", what="glTF with KHR_gaussian_splatting, nothing lost", write=write_glb, check=refuse_too_large
+    ExportFormat(
+        suffix=".sog",
+        description="PlayCanvas' SOG, a twelfth of the PLY or less",
+        write=write_sog,
+        writes_metadata_file=True,
     ),
-    Format(
-        ending=NAME, what="3D Tiles for CesiumJS, in levels", write=write_tiles, check=refuse_other_names, on_globe=True
+    ExportFormat(
+        suffix=".glb",
+        description="glTF with KHR_gaussian_splatting, nothing lost",
+        write=write_glb,
+        check=check_glb_size,
     ),
-    Format(
-        ending=".html",
-        what="page that shows the scene offline",
+    ExportFormat(
+        suffix=TILESET_FILE,
+        description="3D Tiles for CesiumJS, in levels",
+        write=write_tiles,
+        check=check_tileset_folder,
+        on_globe=True,
+    ),
+    ExportFormat(
+        suffix=".html",
+        description="page that shows the scene offline",
         write=write_html,
-        read=html_pieces,
-        check=refuse_without_viser,
-        fixed=True,
+        read=read_html_chunks,
+        check=check_viser,
+        fixed_colors=True,
     ),
-    Format(ending=".laz", what="point cloud, map coordinates, compressed", write=write_laz, check=refuse_without_laspy),
-    Format(ending=".las", what="point cloud, map coordinates", write=write_laz, check=refuse_without_laspy),
+    ExportFormat(
+        suffix=".laz",
+        description="point cloud, map coordinates, compressed",
+        write=write_laz,
+        check=check_las_dependencies,
+    ),
+    ExportFormat(
+        suffix=".las", description="point cloud, map coordinates", write=write_laz, check=check_las_dependencies
+    ),
 )
 
 
-def format_of(path: Path) -> Format:
+def format_from_path(path: Path) -> ExportFormat:
     """The format that a file's name asks for. Raises VdgsError, naming those there are, for any other."""
     name = path.name.lower()
     for each in FORMATS:
-        if name == NAME == each.ending or (
-            each.ending[0] == "." and name.endswith(each.ending) and name != each.ending
+        if name == TILESET_FILE == each.suffix or (
+            each.suffix[0] == "." and name.endswith(each.suffix) and name != each.suffix
         ):
             return each
-    known = ", ".join(f"{each.ending} ({each.what})" for each in FORMATS)
+    known = ", ".join(f"{each.suffix} ({each.description})" for each in FORMATS)
     raise VdgsError(f"{path}: no format is known by this name. Let it end in one of: {known}.")
 
 
-def check(path: Path, scene: Scene) -> None:
+def check_export(path: Path, scene: ExportScene) -> None:
     """Raise VdgsError for what would fail: a name, a missing package, too many or too far. Asks for no chunk."""
-    chosen = format_of(path)
+    chosen = format_from_path(path)
     if scene.count < 1:
         raise VdgsError(f"{path}: the scene has no Gaussians, there is nothing to write.")
-    if path.is_dir() and chosen.ending != NAME:
+    if path.is_dir() and chosen.suffix != TILESET_FILE:
         raise VdgsError(f"{path}: is a folder. Give the name of a file.")
     chosen.check(path, scene)
 
 
-def write(path: Path, scene: Scene) -> tuple[str, ...]:
+def write_scene(path: Path, scene: ExportScene) -> tuple[str, ...]:
     """Write a scene in the format of the file's name, whole or not at all. Returns what was lost. Raises VdgsError."""
-    check(path, scene)
-    return format_of(path).write(path, scene)
+    check_export(path, scene)
+    return format_from_path(path).write(path, scene)
 
 
-def read(path: Path) -> Gaussians:
+def read_gaussians(path: Path) -> Gaussians:
     """Read Gaussians back, in the ground frame of the scene that was written. Raises VdgsError."""
-    return joined(pieces(path))
+    return concatenate(read_chunks(path))
 
 
-def pieces(path: Path) -> Iterator[Gaussians]:
+def read_chunks(path: Path) -> Iterator[Gaussians]:
     """The same, some thousand at a time."""
-    chosen = format_of(path)
+    chosen = format_from_path(path)
     if chosen.read is None:
-        able = ", ".join(each.ending for each in FORMATS if each.read)
+        able = ", ".join(each.suffix for each in FORMATS if each.read)
         raise VdgsError(f"{path}: such files are written but not read. Readable are: {able}.")
     return chosen.read(path)
 
 
-def written_by(path: Path) -> tuple[Path, ...]:
+def files_written(path: Path) -> tuple[Path, ...]:
     """The files that writing `path` replaces, beside the tiles of a tileset."""
-    return (path, beside(path)) if format_of(path).facts_beside else (path,)
+    return (path, metadata_path(path)) if format_from_path(path).writes_metadata_file else (path,)

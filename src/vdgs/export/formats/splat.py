@@ -13,25 +13,25 @@ import torch
 
 from vdgs.errors import VdgsError
 from vdgs.export.formats.export_scene import (
-    ROWS,
+    CHUNK_SIZE,
     Y_DOWN,
-    Scene,
-    bytes_of,
-    colours,
-    logits_of,
+    ExportScene,
+    base_colors,
+    gaussian_scales,
+    logits_from_opacity,
     opacities,
-    sizes,
-    unturned,
-    write_beside,
+    rotate_back,
+    to_uint8,
+    write_metadata_file,
 )
-from vdgs.kernels.spherical_harmonics import dc_of_colours
+from vdgs.kernels.spherical_harmonics import rgb_to_sh
 from vdgs.model.gaussians import Gaussians
-from vdgs.system.atomic_files import write_atomically
+from vdgs.system.atomic_files import write_atomic
 
-LAYOUT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
+SPLAT_DTYPE = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
 
 
-def write_splat(path: Path, scene: Scene) -> tuple[str, ...]:
+def write_splat(path: Path, scene: ExportScene) -> tuple[str, ...]:
     """Write the scene, atomically, and its facts beside it. Returns what was lost. Raises VdgsError."""
     clipped = 0
 
@@ -39,40 +39,40 @@ def write_splat(path: Path, scene: Scene) -> tuple[str, ...]:
         nonlocal clipped
         with temporary.open("wb") as file:
             for piece in scene.pieces(Y_DOWN):
-                rows = np.empty(len(piece), LAYOUT)
-                shown = colours(piece)
+                rows = np.empty(len(piece), SPLAT_DTYPE)
+                shown = base_colors(piece)
                 clipped += int(((shown < 0) | (shown > 1)).any(1).sum())
-                rows["mean"], rows["scale"] = piece.means.numpy(), sizes(piece)
-                rows["rgba"] = bytes_of(np.concatenate([shown, opacities(piece)[:, None]], 1))
+                rows["mean"], rows["scale"] = piece.means.numpy(), gaussian_scales(piece)
+                rows["rgba"] = to_uint8(np.concatenate([shown, opacities(piece)[:, None]], 1))
                 rows["rotation"] = np.clip(np.rint(piece.quaternions.numpy() * 128 + 128), 0, 255).astype(np.uint8)
                 rows.tofile(file)
 
-    write_atomically(path, write)
-    write_beside(path, scene.facts, {"axes": "x west, y down, z south"})
+    write_atomic(path, write)
+    write_metadata_file(path, scene.facts, {"axes": "x west, y down, z south"})
     lost = ["colours no longer change with the viewing direction"] if scene.degree else []
     if clipped:
         lost.append(f"{clipped} of {scene.count} colours lay outside of 0 .. 1 and were cut off")
     return tuple(lost)
 
 
-def splat_pieces(path: Path) -> Iterator[Gaussians]:
-    """The Gaussians of a file, in the ground frame, at most `ROWS` at a time. Raises VdgsError if it is missing or
+def read_splat_chunks(path: Path) -> Iterator[Gaussians]:
+    """The Gaussians of a file, in the ground frame, at most `CHUNK_SIZE` at a time. Raises VdgsError if it is missing or
     damaged."""
     try:
         rows = np.fromfile(path, np.uint8)
     except OSError as error:
         raise VdgsError(f"{path}: cannot be read ({error.strerror or error}).") from error
-    if not len(rows) or len(rows) % LAYOUT.itemsize:
+    if not len(rows) or len(rows) % SPLAT_DTYPE.itemsize:
         raise VdgsError(f"{path}: holds {len(rows)} bytes, which are no whole Gaussians of 32. Write it again.")
-    whole = rows.view(LAYOUT)
-    for first in range(0, len(whole), ROWS):
-        yield unturned(_gaussians(whole[first : first + ROWS]), Y_DOWN)
+    whole = rows.view(SPLAT_DTYPE)
+    for first in range(0, len(whole), CHUNK_SIZE):
+        yield rotate_back(_gaussians(whole[first : first + CHUNK_SIZE]), Y_DOWN)
 
 
 def _gaussians(table: np.ndarray) -> Gaussians:
     rgba = table["rgba"].astype(np.float32) / 255
     return Gaussians(
         means=torch.from_numpy(table["mean"].copy()), log_scales=torch.from_numpy(table["scale"].copy()).log(),
-        quaternions=torch.from_numpy((table["rotation"].astype(np.float32) - 128) / 128), logits=logits_of(rgba[:, 3]),
-        dc=dc_of_colours(torch.from_numpy(rgba[:, :3])), rest=torch.zeros(len(table), 0, 3),
+        quaternions=torch.from_numpy((table["rotation"].astype(np.float32) - 128) / 128), logits=logits_from_opacity(rgba[:, 3]),
+        dc=rgb_to_sh(torch.from_numpy(rgba[:, :3])), rest=torch.zeros(len(table), 0, 3),
     )  # fmt: skip

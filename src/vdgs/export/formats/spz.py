@@ -20,125 +20,125 @@ import torch
 
 from vdgs.errors import VdgsError
 from vdgs.export.formats.export_scene import (
-    ROWS,
+    CHUNK_SIZE,
     Y_UP,
-    Scene,
-    bytes_of,
-    joined,
-    logits_of,
+    ExportScene,
+    concatenate,
+    logits_from_opacity,
     opacities,
-    unturned,
-    write_beside,
+    rotate_back,
+    to_uint8,
+    write_metadata_file,
 )
-from vdgs.export.formats.parallel_gzip import gzipped
-from vdgs.export.formats.quaternion_canonical import with_small_turns
-from vdgs.kernels.spherical_harmonics import MAX_DEGREE, function_count
+from vdgs.export.formats.parallel_gzip import gzip_blocks
+from vdgs.export.formats.quaternion_canonical import canonicalize_quaternions
+from vdgs.kernels.spherical_harmonics import MAX_SH_DEGREE, num_sh_bases
 from vdgs.model.gaussians import Gaussians
-from vdgs.system.atomic_files import write_atomically
+from vdgs.system.atomic_files import write_atomic
 
 MAGIC = 0x5053474E
-HEADER = struct.Struct("<IIIBBBB")
+HEADER_STRUCT = struct.Struct("<IIIBBBB")
 FRACTION_BITS = 12
 #: Positions lie below this many units from the origin.
-REACH = 2**23 / 2**FRACTION_BITS
+MAX_COORDINATE = 2**23 / 2**FRACTION_BITS
 #: For long Niantic's reader opened no more Gaussians than this; programs that have it from then still refuse them.
-MOST_EVERYWHERE = 10_000_000
+MAX_READABLE_POINTS = 10_000_000
 COLOUR_SCALE = 0.15
 #: Columns in the order of the file.
-COLUMNS = ("positions", "alphas", "colours", "scales", "rotations", "harmonics")
-READ_IN = 1 << 22
+COLUMN_NAMES = ("positions", "alphas", "colours", "scales", "rotations", "harmonics")
+READ_BLOCK_BYTES = 1 << 22
 #: What a byte cannot hold, and what became of it.
-CUT = {
+CLAMP_NOTES = {
     "large": "Gaussians are larger than 377 units and were cut to that",
     "thin": "Gaussians are thinner than 0.00005 units and became as thick as that, which nobody sees",
     "colours": "colours lay far outside of 0 .. 1 and were cut off",
 }
 
 
-def refuse_too_far(path: Path, scene: Scene) -> None:
+def check_range(path: Path, scene: ExportScene) -> None:
     """Raise VdgsError where it is known beforehand that positions do not fit."""
-    if scene.bounds is not None and (far := float(np.abs(np.array(scene.bounds)).max())) >= REACH:
+    if scene.bounds is not None and (far := float(np.abs(np.array(scene.bounds)).max())) >= MAX_COORDINATE:
         raise _too_far(path, far)
 
 
-def write_spz(path: Path, scene: Scene, version: int = 3) -> tuple[str, ...]:
+def write_spz(path: Path, scene: ExportScene, version: int = 3) -> tuple[str, ...]:
     """Write the scene, atomically, and its facts beside it. Returns what was lost. Raises VdgsError.
 
     The file holds one quantity after the other: they wait in temporary files beside it, so memory stays small.
     """
-    refuse_too_far(path, scene)
-    cut = dict.fromkeys(CUT, 0)
+    check_range(path, scene)
+    cut = dict.fromkeys(CLAMP_NOTES, 0)
 
     def write(temporary: Path) -> None:
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
-            spools = {name: (Path(folder) / name).open("w+b") for name in COLUMNS}
+            spools = {name: (Path(folder) / name).open("w+b") for name in COLUMN_NAMES}
             try:
                 for piece in scene.pieces(Y_UP):
                     far = float(piece.means.abs().max())
-                    if far >= REACH - 1 / 2**FRACTION_BITS:
+                    if far >= MAX_COORDINATE - 1 / 2**FRACTION_BITS:
                         raise _too_far(path, far)
-                    for name, count in _beyond(piece).items():
+                    for name, count in _count_clamped(piece).items():
                         cut[name] += count
-                    for name, column in zip(COLUMNS, columns(piece, version), strict=True):
+                    for name, column in zip(COLUMN_NAMES, encode_columns(piece, version), strict=True):
                         column.tofile(spools[name])
                 with temporary.open("wb") as file:
-                    for part in gzipped(_stream(header(scene.count, scene.degree, version), spools)):
+                    for part in gzip_blocks(_stream(encode_header(scene.count, scene.degree, version), spools)):
                         file.write(part)
             finally:
                 for spool in spools.values():
                     spool.close()
 
-    write_atomically(path, write)
-    write_beside(path, scene.facts, {"axes": "x east, y up, z south"})
-    notes = [f"{cut[name]} of {scene.count} {what}" for name, what in CUT.items() if cut[name]]
-    if scene.count > MOST_EVERYWHERE:
+    write_atomic(path, write)
+    write_metadata_file(path, scene.facts, {"axes": "x east, y up, z south"})
+    notes = [f"{cut[name]} of {scene.count} {what}" for name, what in CLAMP_NOTES.items() if cut[name]]
+    if scene.count > MAX_READABLE_POINTS:
         notes.append(
-            f"holds {scene.count:,} Gaussians, and many programs open no SPZ of more than {MOST_EVERYWHERE:,}. For "
-            f"those, write fewer (--max-gaussians {MOST_EVERYWHERE}) or tileset.json"
+            f"holds {scene.count:,} Gaussians, and many programs open no SPZ of more than {MAX_READABLE_POINTS:,}. For "
+            f"those, write fewer (--max-gaussians {MAX_READABLE_POINTS}) or tileset.json"
         )
     return tuple(notes)
 
 
-def header(count: int, degree: int, version: int, fraction: int = FRACTION_BITS) -> bytes:
+def encode_header(count: int, degree: int, version: int, fraction: int = FRACTION_BITS) -> bytes:
     """The head of a file whose positions have `fraction` bits after the point."""
-    return HEADER.pack(MAGIC, version, count, degree, fraction, 0, 0)
+    return HEADER_STRUCT.pack(MAGIC, version, count, degree, fraction, 0, 0)
 
 
-def columns(piece: Gaussians, version: int, fraction: int = FRACTION_BITS) -> tuple[np.ndarray, ...]:
-    """The bytes of Gaussians whose y is up, a uint8 array [n, bytes] for each of `COLUMNS`."""
+def encode_columns(piece: Gaussians, version: int, fraction: int = FRACTION_BITS) -> tuple[np.ndarray, ...]:
+    """The bytes of Gaussians whose y is up, a uint8 array [n, bytes] for each of `COLUMN_NAMES`."""
     n = len(piece)
     if version < 3:
-        piece = with_small_turns(piece)
+        piece = canonicalize_quaternions(piece)
     fixed = np.rint(piece.means.double().numpy() * 2**fraction).astype("<i4")
     positions = np.ascontiguousarray(fixed).view(np.uint8).reshape(n, 3, 4)[:, :, :3].reshape(n, 9)
-    colours = bytes_of(piece.dc.numpy() * COLOUR_SCALE + 0.5)
+    colours = to_uint8(piece.dc.numpy() * COLOUR_SCALE + 0.5)
     scales = np.clip(np.rint((piece.log_scales.numpy() + 10) * 16), 0, 255).astype(np.uint8)
-    rotations = (_three_smallest if version >= 3 else _first_three)(piece.quaternions.numpy())
-    return positions, bytes_of(opacities(piece)[:, None]), colours, scales, rotations, _harmonics(piece.rest.numpy())
+    rotations = (_pack_quaternions_v3 if version >= 3 else _pack_quaternions_v2)(piece.quaternions.numpy())
+    return positions, to_uint8(opacities(piece)[:, None]), colours, scales, rotations, _harmonics(piece.rest.numpy())
 
 
-def encoded(gaussians: Gaussians, version: int) -> bytes:
+def encode_spz(gaussians: Gaussians, version: int) -> bytes:
     """A whole file, gzipped, of Gaussians in memory whose y is up.
 
     Where they reach farther than 2048 units, positions have fewer bits after the point; the file says how many.
     """
     reach = float(gaussians.means.abs().max()) + 1 / 2**FRACTION_BITS
     fraction = max(0, min(FRACTION_BITS, math.floor(math.log2(2**23 / reach))))
-    parts = [header(len(gaussians), gaussians.degree, version, fraction)]
-    parts += [column.tobytes() for column in columns(gaussians, version, fraction)]
-    return b"".join(gzipped(parts))
+    parts = [encode_header(len(gaussians), gaussians.degree, version, fraction)]
+    parts += [column.tobytes() for column in encode_columns(gaussians, version, fraction)]
+    return b"".join(gzip_blocks(parts))
 
 
-def _stream(first: bytes, spools: Mapping[str, IO[bytes]]) -> Iterator[bytes]:
+def _stream(first: bytes, columns: Mapping[str, IO[bytes]]) -> Iterator[bytes]:
     yield first
-    for spool in spools.values():
+    for spool in columns.values():
         spool.seek(0)
-        while piece := spool.read(READ_IN):
+        while piece := spool.read(READ_BLOCK_BYTES):
             yield piece
 
 
-def _beyond(piece: Gaussians) -> dict[str, int]:
-    """How many Gaussians have sizes or colours that bytes cannot hold, as in `CUT`."""
+def _count_clamped(piece: Gaussians) -> dict[str, int]:
+    """How many Gaussians have sizes or colours that bytes cannot hold, as in `CLAMP_NOTES`."""
     scales = (piece.log_scales + 10) * 16
     shown = piece.dc * COLOUR_SCALE + 0.5
     return {
@@ -157,13 +157,13 @@ def _harmonics(rest: np.ndarray) -> np.ndarray:
     return np.clip(coded, 0, 255).astype(np.uint8).reshape(n, 3 * r)
 
 
-def _first_three(quaternions: np.ndarray) -> np.ndarray:
+def _pack_quaternions_v2(quaternions: np.ndarray) -> np.ndarray:
     """Version 2: x, y, z of the rotation with w >= 0."""
     signed = np.where(quaternions[:, :1] < 0, -quaternions, quaternions)[:, 1:]
     return np.clip(np.rint(signed * 127.5 + 127.5), 0, 255).astype(np.uint8)
 
 
-def _three_smallest(quaternions: np.ndarray) -> np.ndarray:
+def _pack_quaternions_v3(quaternions: np.ndarray) -> np.ndarray:
     """Version 3: which of x, y, z, w is largest, and sign and size of the others in 1 + 9 bits each."""
     q = quaternions[:, [1, 2, 3, 0]]
     rows = np.arange(len(q))
@@ -177,8 +177,8 @@ def _three_smallest(quaternions: np.ndarray) -> np.ndarray:
     return packed.astype("<u4").view(np.uint8).reshape(-1, 4)
 
 
-def spz_pieces(path: Path) -> Iterator[Gaussians]:
-    """The Gaussians of a file of version 2 or 3, in the ground frame, at most `ROWS` at a time, but all of its
+def read_spz_chunks(path: Path) -> Iterator[Gaussians]:
+    """The Gaussians of a file of version 2 or 3, in the ground frame, at most `CHUNK_SIZE` at a time, but all of its
     bytes in memory, 64 for each. Raises VdgsError if it is damaged or another."""
     try:
         data = zlib.decompress(path.read_bytes(), 31)
@@ -186,29 +186,33 @@ def spz_pieces(path: Path) -> Iterator[Gaussians]:
         raise VdgsError(f"{path}: cannot be read ({error.strerror or error}).") from error
     except zlib.error as error:
         raise VdgsError(f"{path}: is no SPZ of versions 2 and 3, or damaged ({error}). Write it again.") from None
-    for piece in _decoded(data, path):
-        yield unturned(piece, Y_UP)
+    for piece in _decode(data, path):
+        yield rotate_back(piece, Y_UP)
 
 
-def decoded(data: bytes, path: Path) -> Gaussians:
+def decode_spz(data: bytes, path: Path) -> Gaussians:
     """Gaussians, y up, of an inflated file; `path` is for what is said of a damaged one (VdgsError)."""
-    return joined(_decoded(data, path))
+    return concatenate(_decode(data, path))
 
 
-def _decoded(data: bytes, path: Path) -> Iterator[Gaussians]:
-    if len(data) < HEADER.size or (fields := HEADER.unpack_from(data))[0] != MAGIC or fields[1] not in (2, 3):
+def _decode(data: bytes, path: Path) -> Iterator[Gaussians]:
+    if (
+        len(data) < HEADER_STRUCT.size
+        or (fields := HEADER_STRUCT.unpack_from(data))[0] != MAGIC
+        or fields[1] not in (2, 3)
+    ):
         raise VdgsError(f"{path}: is no SPZ of versions 2 and 3.")
     _, version, n, degree, fraction, _, _ = fields
-    rest = function_count(degree) - 1 if degree <= MAX_DEGREE else 0
+    rest = num_sh_bases(degree) - 1 if degree <= MAX_SH_DEGREE else 0
     widths = (9, 1, 3, 3, 4 if version == 3 else 3, 3 * rest)
-    if len(data) != HEADER.size + n * sum(widths):
+    if len(data) != HEADER_STRUCT.size + n * sum(widths):
         raise VdgsError(f"{path}: is shorter or longer than its {n} Gaussians. It is damaged; write it again.")
-    parts, start = [], HEADER.size
+    parts, start = [], HEADER_STRUCT.size
     for width in widths:
         parts.append(np.frombuffer(data, np.uint8, n * width, start).reshape(n, width))
         start += n * width
-    for first in range(0, max(n, 1), ROWS):
-        yield _gaussians([part[first : first + ROWS] for part in parts], version, fraction)
+    for first in range(0, max(n, 1), CHUNK_SIZE):
+        yield _gaussians([part[first : first + CHUNK_SIZE] for part in parts], version, fraction)
 
 
 def _gaussians(parts: Sequence[np.ndarray], version: int, fraction: int) -> Gaussians:
@@ -217,24 +221,24 @@ def _gaussians(parts: Sequence[np.ndarray], version: int, fraction: int) -> Gaus
     whole = np.zeros((n, 3, 4), np.uint8)
     whole[:, :, 1:] = positions.reshape(n, 3, 3)  # in the upper three bytes, so that the shift back carries the sign
     means = (whole.view("<i4")[:, :, 0] >> 8) / 2.0**fraction
-    quaternions = (_of_three_smallest if version == 3 else _of_first_three)(rotations)
+    quaternions = (_quaternions_v3 if version == 3 else _quaternions_v2)(rotations)
     return Gaussians(
         means=torch.from_numpy(means.astype(np.float32)),
         log_scales=torch.from_numpy(scales / np.float32(16) - 10),
         quaternions=torch.from_numpy(quaternions.astype(np.float32)),
-        logits=logits_of(alphas[:, 0] / np.float32(255)),
+        logits=logits_from_opacity(alphas[:, 0] / np.float32(255)),
         dc=torch.from_numpy((colours / np.float32(255) - np.float32(0.5)) / np.float32(COLOUR_SCALE)),
         rest=torch.from_numpy((harmonics.reshape(n, harmonics.shape[1] // 3, 3).astype(np.float32) - 128) / 128),
     )
 
 
-def _of_first_three(coded: np.ndarray) -> np.ndarray:
+def _quaternions_v2(coded: np.ndarray) -> np.ndarray:
     xyz = coded / 127.5 - 1
     w = np.sqrt(np.maximum(0, 1 - (xyz**2).sum(1, keepdims=True)))
     return np.concatenate([w, xyz], 1)
 
 
-def _of_three_smallest(coded: np.ndarray) -> np.ndarray:
+def _quaternions_v3(coded: np.ndarray) -> np.ndarray:
     packed = np.ascontiguousarray(coded).view("<u4")[:, 0]
     largest = packed >> np.uint32(30)
     q = np.zeros((len(packed), 4))
@@ -249,7 +253,7 @@ def _of_three_smallest(coded: np.ndarray) -> np.ndarray:
 
 def _too_far(path: Path, far: float) -> VdgsError:
     return VdgsError(
-        f"{path}: a Gaussian lies {far:.0f} m from the origin, and SPZ holds positions only within {REACH:.0f} m. "
+        f"{path}: a Gaussian lies {far:.0f} m from the origin, and SPZ holds positions only within {MAX_COORDINATE:.0f} m. "
         "Write a part of the scene or move its origin into its middle; or choose tileset.json, .glb or .ply, which "
         "hold any extent."
     )

@@ -21,34 +21,34 @@ import torch
 
 from vdgs.errors import VdgsError
 from vdgs.export.formats import spz
-from vdgs.export.formats.export_scene import Y_UP, Facts, Scene
-from vdgs.export.formats.gaussian_store import Spooled, spooled
-from vdgs.export.formats.gltf import EXTENSION, PACKED, packed_tile
-from vdgs.export.formats.simplify import thinned
+from vdgs.export.formats.export_scene import Y_UP, ExportMetadata, ExportScene
+from vdgs.export.formats.gaussian_store import GaussianStore, write_store
+from vdgs.export.formats.gltf import EXTENSION, SPZ_EXTENSION, spz_glb
+from vdgs.export.formats.simplify import simplify
 from vdgs.geometry.geodesy import ecef_from_geodetic, enu_axes
-from vdgs.kernels import choose
-from vdgs.model.gaussian_transform import covariances, transformed
-from vdgs.model.gaussians import REACH, Gaussians
+from vdgs.kernels import get_backend
+from vdgs.model.gaussian_transform import gaussian_covariances, transform_gaussians
+from vdgs.model.gaussians import MAX_SIGMA, Gaussians
 from vdgs.system.atomic_files import write_bytes, write_json
 from vdgs.system.documents import JsonObject
 
-NAME = "tileset.json"
+TILESET_FILE = "tileset.json"
 #: How tiles are named beside their tileset: the folder's number is one that nothing there has yet, the file says where
 #: in the quadtree it stands.
 _TILE = re.compile(r"tiles-[0-9]+/[0-3]+\.glb")
 #: Gaussians of a tile: about a megabyte with spherical harmonics of degree 3.
-MOST = 50_000
+MAX_GAUSSIANS_PER_TILE = 50_000
 #: The extension of glTF asks for version 2.
 SPZ_VERSION = 2
 #: Tiles are not divided below this share of the scene: what is closer together stays together, however many there are.
-DEEPEST = 16
+MAX_DEPTH = 16
 #: A merged level errs by so many edges of its cells. Viewers go on to finer tiles where the error is larger than (as
 #: usual) 16 pixels: cells are then 4 pixels wide.
-EDGES = 4.0
+ERROR_PER_CELL_EDGE = 4.0
 
 
 @dataclass(frozen=True)
-class Tile:
+class TilesetNode:
     """What the tileset says of a tile, what stands in it, and the box of all that it covers (z up)."""
 
     entry: JsonObject
@@ -58,27 +58,27 @@ class Tile:
     error: float
 
 
-def refuse_other_names(path: Path, scene: Scene) -> None:
+def check_tileset_folder(path: Path, scene: ExportScene) -> None:
     """Raise VdgsError where the folder belongs to something else."""
     if path.is_dir():
-        raise VdgsError(f"{path}: is a folder. 3D Tiles are written as FOLDER/{NAME}.")
+        raise VdgsError(f"{path}: is a folder. 3D Tiles are written as FOLDER/{TILESET_FILE}.")
 
 
-def write_tiles(path: Path, scene: Scene, most: int = MOST) -> tuple[str, ...]:
+def write_tiles(path: Path, scene: ExportScene, max_gaussians: int = MAX_GAUSSIANS_PER_TILE) -> tuple[str, ...]:
     """Write tiles beside `path` and then, atomically, the tileset that names them; the tiles of the one that was there
     before are removed last, and nothing else.
 
     The numbers of the scene wait in a file beside it; of them memory holds a place and an index each. Returns what was
     lost. Raises VdgsError.
     """
-    refuse_other_names(path, scene)
-    older = tiles_of(path)
+    check_tileset_folder(path, scene)
+    older = tileset_files(path)
     taken = [int(each.name[6:]) for each in path.parent.glob("tiles-*") if each.name[6:].isdecimal()]
     folder = path.parent / f"tiles-{1 + max(taken, default=0)}"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{NAME}.") as spool:
-            root = _Tree(spooled(scene, Path(spool) / "rows"), folder, scene.facts, most).built()
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{TILESET_FILE}.") as spool:
+            root = _TileQuadtree(write_store(scene, Path(spool) / "rows"), folder, scene.facts, max_gaussians).build()
         write_json(path, _tileset(root, scene.facts))
     except OSError as error:
         shutil.rmtree(folder, ignore_errors=True)
@@ -95,7 +95,7 @@ def write_tiles(path: Path, scene: Scene, most: int = MOST) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def tiles_of(path: Path) -> list[Path]:
+def tileset_files(path: Path) -> list[Path]:
     """The files that the tileset at `path` names, where it is one that `write_tiles` wrote; else none.
 
     Any other tileset, a damaged one, and what is named otherwise than our own tiles is not for us to touch.
@@ -124,22 +124,22 @@ def _remove(tiles: list[Path]) -> None:
             folder.rmdir()
 
 
-class _Tree:
+class _TileQuadtree:
     """The quadtree while it is built, from the leaves up."""
 
-    def __init__(self, scene: Spooled, folder: Path, facts: Facts, most: int) -> None:
-        self.scene, self.folder, self.facts, self.most = scene, folder, facts, most
+    def __init__(self, scene: GaussianStore, folder: Path, facts: ExportMetadata, max_count: int) -> None:
+        self.scene, self.folder, self.facts, self.most = scene, folder, facts, max_count
         # Along a Morton curve neighbours follow each other: tiles are smaller, and read from the disk in one go.
-        self.order = choose(torch.device("cpu")).morton_order(torch.from_numpy(scene.means)).numpy()
+        self.order = get_backend(torch.device("cpu")).morton_order(torch.from_numpy(scene.means)).numpy()
 
-    def built(self) -> Tile:
+    def build(self) -> TilesetNode:
         plane = self.scene.means[:, :2].astype(np.float64)
         low, high = plane.min(0), plane.max(0)
         half = max(float((high - low).max()) / 2, 1e-6)
         return self._tile(self.order, (low + high) / 2, half, "0")
 
-    def _tile(self, rows: np.ndarray, middle: np.ndarray, half: float, name: str) -> Tile:
-        if len(rows) <= self.most or len(name) > DEEPEST:
+    def _tile(self, rows: np.ndarray, middle: np.ndarray, half: float, name: str) -> TilesetNode:
+        if len(rows) <= self.most or len(name) > MAX_DEPTH:
             return self._written(self.scene.rows(rows), 0.0, [], name)
         quarter = (self.scene.means[rows, :2] >= middle) @ np.array([1, 2])
         children = [
@@ -149,32 +149,32 @@ class _Tree:
         ]  # fmt: skip
         together = children[0].gaussians
         for child in children[1:]:
-            together = together.extended(child.gaussians)
-        coarse, edge = thinned(together, self.most)
+            together = together.concat(child.gaussians)
+        coarse, edge = simplify(together, self.most)
         below = max(child.error for child in children)
         # A lone child is no coarser than its parent: errors must still grow towards the root.
-        return self._written(coarse, max(EDGES * edge, 1.25 * below, 1e-3), children, name)
+        return self._written(coarse, max(ERROR_PER_CELL_EDGE * edge, 1.25 * below, 1e-3), children, name)
 
-    def _written(self, gaussians: Gaussians, error: float, children: list[Tile], name: str) -> Tile:
+    def _written(self, gaussians: Gaussians, error: float, children: list[TilesetNode], name: str) -> TilesetNode:
         low, high = _box(gaussians)
         for child in children:
             low, high = np.minimum(low, child.low), np.maximum(high, child.high)
         middle = np.rint((gaussians.means.double().amin(0) + gaussians.means.double().amax(0)).numpy() / 2)
         file = self.folder / f"{name}.glb"
-        here = transformed(gaussians, 1.0, Y_UP, -(Y_UP @ middle))
-        write_bytes(file, packed_tile(here, spz.encoded(here, SPZ_VERSION), Y_UP @ middle, self.facts))
+        here = transform_gaussians(gaussians, 1.0, Y_UP, -(Y_UP @ middle))
+        write_bytes(file, spz_glb(here, spz.encode_spz(here, SPZ_VERSION), Y_UP @ middle, self.facts))
         entry: JsonObject = {
             "boundingVolume": {"box": _box_of(low, high)}, "geometricError": error,
             "content": {"uri": f"{self.folder.name}/{file.name}"},
         }  # fmt: skip
         if children:
             entry |= {"refine": "REPLACE", "children": [child.entry for child in children]}
-        return Tile(entry, gaussians, low, high, error)
+        return TilesetNode(entry, gaussians, low, high, error)
 
 
 def _box(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest coordinates that the Gaussians reach."""
-    reach = REACH * covariances(gaussians).diagonal(dim1=1, dim2=2).clamp_min(0).sqrt()
+    reach = MAX_SIGMA * gaussian_covariances(gaussians).diagonal(dim1=1, dim2=2).clamp_min(0).sqrt()
     return (gaussians.means - reach).amin(0).double().numpy(), (gaussians.means + reach).amax(0).double().numpy()
 
 
@@ -183,20 +183,20 @@ def _box_of(low: np.ndarray, high: np.ndarray) -> list[float]:
     return [*((low + high) / 2).tolist(), *np.diag((high - low) / 2).ravel().tolist()]
 
 
-def _tileset(root: Tile, facts: Facts) -> JsonObject:
-    needs = {"extensionsUsed": [EXTENSION, PACKED], "extensionsRequired": [EXTENSION, PACKED]}
-    top = {"transform": transform(facts), "refine": "REPLACE", **root.entry}
+def _tileset(root: TilesetNode, metadata: ExportMetadata) -> JsonObject:
+    needs = {"extensionsUsed": [EXTENSION, SPZ_EXTENSION], "extensionsRequired": [EXTENSION, SPZ_EXTENSION]}
+    top = {"transform": tile_transform(metadata), "refine": "REPLACE", **root.entry}
     return {
-        "asset": {"version": "1.1", "generator": facts.program, "extras": {**facts.known(), "axes": "east, north, up"}},
+        "asset": {"version": "1.1", "generator": metadata.program, "extras": {**metadata.known(), "axes": "east, north, up"}},
         "extensionsUsed": ["3DTILES_content_gltf"], "extensions": {"3DTILES_content_gltf": needs},
         "geometricError": max(2 * root.error, float(np.linalg.norm(root.high - root.low)) / 4), "root": top,
     }  # fmt: skip
 
 
-def transform(facts: Facts) -> list[float]:
+def tile_transform(metadata: ExportMetadata) -> list[float]:
     """4 × 4, column by column, from local coordinates to Earth-centred metres; the identity where no place is known."""
     matrix = np.eye(4)
-    if facts.geodetic is not None:
-        matrix[:3, :3] = enu_axes(facts.geodetic[0], facts.geodetic[1]).T
-        matrix[:3, 3] = ecef_from_geodetic(np.array([facts.geodetic]))[0]
+    if metadata.geodetic is not None:
+        matrix[:3, :3] = enu_axes(metadata.geodetic[0], metadata.geodetic[1]).T
+        matrix[:3, 3] = ecef_from_geodetic(np.array([metadata.geodetic]))[0]
     return [float(value) for value in matrix.T.ravel()]

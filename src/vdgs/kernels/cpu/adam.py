@@ -9,7 +9,7 @@ from torch import Tensor
 
 from vdgs.kernels.cpu import extension
 from vdgs.kernels.kernel_types import AdamState
-from vdgs.kernels.torch_ref.adam import StepFactors, check_rows, check_step
+from vdgs.kernels.torch_ref.adam import AdamStepFactors, check_rows, check_step
 
 
 def adam_rows(
@@ -39,13 +39,15 @@ def adam_rows(
     packed = gradient.detach().contiguous().view(gradient.shape[0], -1)
     chosen = None if rows is None else rows.contiguous()
     updates = None if isinstance(step, int) else step.contiguous()
-    finite: bool = extension.native().adam_rows(flat, chosen, packed, first, second, updates, *rounded(factors))
+    finite: bool = extension.get_extension().adam_rows(
+        flat, chosen, packed, first, second, updates, *round_factors(factors)
+    )
     if finite:
         # What autograd has saved of these no longer holds their values.
         torch.autograd.graph.increment_version(tensors)
     return finite
 
 
-def rounded(factors: StepFactors) -> StepFactors:
+def round_factors(factors: AdamStepFactors) -> AdamStepFactors:
     """The same with the tables in float32."""
     return factors._replace(rates=factors.rates.astype(np.float32), roots=factors.roots.astype(np.float32))

@@ -18,7 +18,7 @@ def packed_camera(camera: Camera) -> Tensor:
     return torch.from_numpy(camera.packed)
 
 
-def require_rows(rows: int, **arguments: tuple[Tensor, int]) -> None:
+def check_row_shapes(rows: int, **arguments: tuple[Tensor, int]) -> None:
     """Raise ValueError unless every named tensor is [rows, its width]: the kernels do not look again."""
     for name, (tensor, width) in arguments.items():
         if tuple(tensor.shape) != (rows, width):

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from vdgs.kernels.cpu import extension
 from vdgs.kernels.torch_ref import cells as reference
-from vdgs.kernels.torch_ref.cells import cell_centres
+from vdgs.kernels.torch_ref.cells import cell_centers
 
-__all__ = ["cell_centres", "cell_keys", "contains", "group_cells", "group_max", "morton_order"]
+__all__ = ["cell_centers", "cell_keys", "contains", "group_cells", "group_max", "morton_order"]
 
 
 def cell_keys(positions: Float[Tensor, "n 3"], cell_size: float, origin: Float[Tensor, "3"]) -> Int64[Tensor, "n"]:
@@ -18,8 +18,8 @@ def cell_keys(positions: Float[Tensor, "n 3"], cell_size: float, origin: Float[T
     reference.check_lattice(positions, cell_size, origin)
     keys = torch.empty(positions.shape[0], dtype=torch.int64)
     exact = origin.detach().to(torch.float64).contiguous()
-    if not extension.native().cell_keys(positions.detach().contiguous(), cell_size, exact, keys):
-        raise ValueError(reference.too_far(cell_size))
+    if not extension.get_extension().cell_keys(positions.detach().contiguous(), cell_size, exact, keys):
+        raise ValueError(reference.lattice_range_message(cell_size))
     return keys
 
 
@@ -28,7 +28,7 @@ def group_cells(keys: Int64[Tensor, "n"]) -> tuple[Int64[Tensor, "c"], Int64[Ten
     reference.check_keys(keys)
     keys = keys.contiguous()
     unique, group = torch.empty_like(keys), torch.empty_like(keys)
-    count = extension.native().group_cells(keys, unique, group)
+    count = extension.get_extension().group_cells(keys, unique, group)
     return unique[:count].clone(), group
 
 
@@ -37,7 +37,7 @@ def contains(table: Int64[Tensor, "a"], query: Int64[Tensor, "b"]) -> Bool[Tenso
     reference.check_keys(table)
     reference.check_keys(query)
     result = torch.empty(query.shape[0], dtype=torch.bool)
-    extension.native().contains(table.contiguous(), query.contiguous(), result)
+    extension.get_extension().contains(table.contiguous(), query.contiguous(), result)
     return result
 
 
@@ -45,7 +45,7 @@ def group_max(values: Float[Tensor, "n d"], group: Int64[Tensor, "n"], count: in
     """As `reference.cells.group_max`."""
     reference.check_groups(values, group, count)
     result = values.new_empty(count, values.shape[1])
-    extension.native().group_max(values.detach().contiguous(), group.contiguous(), result)
+    extension.get_extension().group_max(values.detach().contiguous(), group.contiguous(), result)
     return result
 
 
@@ -54,5 +54,5 @@ def morton_order(positions: Float[Tensor, "n 3"]) -> Int64[Tensor, "n"]:
     reference.check_positions(positions)
     order = torch.empty(positions.shape[0], dtype=torch.int64)
     if positions.shape[0]:
-        extension.native().morton_order(positions.detach().contiguous(), order)
+        extension.get_extension().morton_order(positions.detach().contiguous(), order)
     return order

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.cpu import extension
-from vdgs.kernels.cpu.arguments import contiguous, packed_camera, require_rows
+from vdgs.kernels.cpu.arguments import check_row_shapes, contiguous, packed_camera
 
 
 def cull(positions: Float[Tensor, "n 3"], log_scales: Float[Tensor, "n 6"], camera: Camera) -> Int64[Tensor, "v"]:
@@ -18,8 +18,8 @@ def cull(positions: Float[Tensor, "n 3"], log_scales: Float[Tensor, "n 6"], came
     The scales are read only where the centre does not already lie on the image. Raises ValueError
     where the shapes do not belong together.
     """
-    require_rows(positions.shape[0], positions=(positions, 3), log_scales=(log_scales, 6))
-    visible = extension.native().cull(
+    check_row_shapes(positions.shape[0], positions=(positions, 3), log_scales=(log_scales, 6))
+    visible = extension.get_extension().cull(
         contiguous(positions.detach()), contiguous(log_scales.detach()), packed_camera(camera)
     )
     indices = torch.empty(visible.count, dtype=torch.int64)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.cpu import extension
-from vdgs.kernels.cpu.arguments import contiguous, packed_camera, require_rows
+from vdgs.kernels.cpu.arguments import check_row_shapes, contiguous, packed_camera
 from vdgs.kernels.kernel_types import FEATURE_SIZE, AnchorSplats, DecoderWeights, TrainingSplats
 from vdgs.kernels.torch_ref.adam import check_indices
 
@@ -46,7 +46,7 @@ def decode(
 
 
 @torch.no_grad()
-def decode_to_train(
+def decode_for_training(
     positions: Float[Tensor, "n 3"],
     features: Float[Tensor, "n 32"],
     offsets: Float[Tensor, "n k 3"],
@@ -55,16 +55,16 @@ def decode_to_train(
     camera: Camera,
     rows: Int64[Tensor, "v"] | None = None,
 ) -> TrainingSplats:
-    """As `reference.decode.decode_to_train`, by `decode`."""
+    """As `reference.decode.decode_for_training`, by `decode`."""
     return TrainingSplats.of(decode(positions, features, offsets, log_scales, weights, camera, rows))
 
 
 def check_anchors(positions: Tensor, features: Tensor, offsets: Tensor, log_scales: Tensor) -> None:
     """Raise ValueError where the tensors of anchors do not belong together or k > 32."""
     k = offsets.shape[1]
-    if not 1 <= k <= extension.native().max_offsets:
-        raise ValueError(f"offsets per anchor must be 1 to {extension.native().max_offsets}, not {k}")
-    require_rows(
+    if not 1 <= k <= extension.get_extension().max_offsets:
+        raise ValueError(f"offsets per anchor must be 1 to {extension.get_extension().max_offsets}, not {k}")
+    check_row_shapes(
         positions.shape[0],
         positions=(positions, 3),
         features=(features, FEATURE_SIZE),
@@ -77,7 +77,7 @@ class _Decode(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, camera: Tensor, rows: Tensor | None, *tensors: Tensor) -> tuple[Tensor, ...]:
         inputs = [t.detach() for t in tensors]
-        *splats, source = map(torch.from_numpy, extension.native().decode(inputs[:4], rows, inputs[4:], camera))
+        *splats, source = map(torch.from_numpy, extension.get_extension().decode(inputs[:4], rows, inputs[4:], camera))
         ctx.save_for_backward(camera, *tensors, source, splats[3], splats[4])
         ctx.mark_non_differentiable(source)
         ctx.set_materialize_grads(False)
@@ -92,7 +92,7 @@ class _Decode(torch.autograd.Function):
         weights = [torch.empty_like(t) for t in inputs[4:]] if any(wanted[4:]) else None
         nothing: list[Tensor | None] = [None] * 12
         incoming = [None if g is None else g.contiguous() for g in gradients[:6]]
-        extension.native().decode_backward(
+        extension.get_extension().decode_backward(
             inputs[:4], inputs[4:], camera, source, colours, opacities, incoming, out, weights
         )
         return None, None, None, *out, *(weights or nothing)

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.cpu import extension
-from vdgs.kernels.cpu.adam import rounded
-from vdgs.kernels.cpu.arguments import contiguous, packed_camera, require_rows
+from vdgs.kernels.cpu.adam import round_factors
+from vdgs.kernels.cpu.arguments import check_row_shapes, contiguous, packed_camera
 from vdgs.kernels.cpu.decode import check_anchors
 from vdgs.kernels.kernel_types import AdamState, DecoderWeights, SplatGradients
-from vdgs.kernels.splat_segments import tensor_of
+from vdgs.kernels.splat_segments import sources_tensor
 from vdgs.kernels.torch_ref.adam import check_indices, check_updates, step_factors
 from vdgs.kernels.torch_ref.statistics import check_sources
 
@@ -43,7 +43,7 @@ def decode_backward_adam(
         raise ValueError("updates must be contiguous")
     for state in moved:
         _check_state(state)
-    source = tensor_of(gradients.source)
+    source = sources_tensor(gradients.source)
     check_sources(source, rows, offsets.shape[1])
     _check_splats(gradients)
     steps = [_step(state) for state in moved]
@@ -51,7 +51,7 @@ def decode_backward_adam(
     incoming = (gradients.means_px, gradients.conics, gradients.colours, gradients.opacities)
     wanted = any(t.requires_grad for t in weights.tensors())
     found = [torch.empty_like(t) for t in heads] if wanted else None
-    finite: bool = extension.native().decode_backward_adam(
+    finite: bool = extension.get_extension().decode_backward_adam(
         [contiguous(positions.detach()), *(state[0] for state in steps)], rows.contiguous(), heads,
         packed_camera(camera), source, contiguous(gradients.colour_values),
         contiguous(gradients.opacity_values), [contiguous(t) for t in incoming], gradients.volume, steps, updates,
@@ -64,7 +64,7 @@ def decode_backward_adam(
 
 def _step(state: AdamState) -> tuple[Any, ...]:
     """A parameter and its moments, the tables of its step, and the betas with epsilon."""
-    rates, roots, *rest = rounded(step_factors(state.learning_rate, None, early=state.early))
+    rates, roots, *rest = round_factors(step_factors(state.learning_rate, None, lr_boost=state.early))
     return (*(t.detach() for t in state[:3]), rates, roots, rest)
 
 
@@ -75,7 +75,7 @@ def _check_state(state: AdamState) -> None:
 
 
 def _check_splats(g: SplatGradients) -> None:
-    require_rows(
+    check_row_shapes(
         len(g.source),
         means_px=(g.means_px, 2), conics=(g.conics, 3), colours=(g.colours, 3), opacities=(g.opacities[:, None], 1),
         colour_values=(g.colour_values, 3), opacity_values=(g.opacity_values[:, None], 1),

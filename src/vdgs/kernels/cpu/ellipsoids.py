@@ -7,7 +7,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from vdgs.kernels.cpu import extension
-from vdgs.kernels.torch_ref.harmonics import check_runs
+from vdgs.kernels.torch_ref.harmonics import check_starts
 
 
 def mean_ellipsoids(
@@ -15,8 +15,8 @@ def mean_ellipsoids(
     starts: Int64[Tensor, " m"],
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 4"]]:  # fmt: skip
     """As `reference.ellipsoids.mean_ellipsoids`. Same bits for any number of threads."""
-    check_runs(starts, len(weights))
+    check_starts(starts, len(weights))
     found = torch.empty(len(starts), 3), torch.empty(len(starts), 4)
     given = (each.contiguous() for each in (log_scales, quaternions, weights))
-    extension.native().mean_ellipsoids(*given, starts, *found)
+    extension.get_extension().mean_ellipsoids(*given, starts, *found)
     return found

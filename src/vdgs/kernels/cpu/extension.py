@@ -13,7 +13,7 @@ from types import ModuleType
 from typing import Any
 
 from vdgs.errors import VdgsError
-from vdgs.kernels.thread_count import default_threads
+from vdgs.kernels.thread_count import default_num_threads
 
 #: Every instruction set that the kernels are built for, best first.
 INSTRUCTION_SETS = ("avx512", "avx2", "portable")
@@ -24,17 +24,17 @@ class NativeUnavailable(VdgsError):
 
 
 @cache
-def native() -> Any:
+def get_extension() -> Any:
     """The module that the kernels of this process use: `VDGS_ISA`, or the best that the processor runs.
 
     Raises NativeUnavailable if it is not built, or VDGS_ISA names what this processor cannot run.
     """
     wanted = os.environ.get("VDGS_ISA")
     if wanted:
-        return load(wanted)
-    for name in supported():
+        return load_extension(wanted)
+    for name in supported_isas():
         try:
-            return load(name)
+            return load_extension(name)
         except NativeUnavailable:
             if name == "portable":
                 raise
@@ -42,7 +42,7 @@ def native() -> Any:
 
 
 @cache
-def load(name: str) -> Any:
+def load_extension(name: str) -> Any:
     """The module for one instruction set, with the number of threads of this process set.
 
     Raises NativeUnavailable for an unknown name, an unsupported instruction set, or a missing build.
@@ -51,36 +51,36 @@ def load(name: str) -> Any:
         raise NativeUnavailable(
             f"VDGS_ISA: there are no kernels for {name!r}; choose one of {', '.join(INSTRUCTION_SETS)}."
         )
-    if name not in supported():
+    if name not in supported_isas():
         raise NativeUnavailable(
-            f"VDGS_ISA: this processor cannot run {name} kernels; it can run {', '.join(supported())}."
+            f"VDGS_ISA: this processor cannot run {name} kernels; it can run {', '.join(supported_isas())}."
         )
     module: Any = _import(name)
-    module.set_threads(default_threads())
+    module.set_threads(default_num_threads())
     return module
 
 
 @cache
-def supported() -> tuple[str, ...]:
+def supported_isas() -> tuple[str, ...]:
     """The instruction sets that this processor can run, best first; asked of the portable build."""
     return tuple(_import("portable").supported())
 
 
-def isa() -> str:
+def active_isa() -> str:
     """The instruction set of the kernels in use: avx512, avx2 or portable."""
-    return str(native().isa)
+    return str(get_extension().isa)
 
 
-def threads() -> int:
+def get_num_threads() -> int:
     """How many threads the kernels use."""
-    return int(native().threads())
+    return int(get_extension().threads())
 
 
-def set_threads(count: int) -> None:
+def set_num_threads(count: int) -> None:
     """Let the kernels use up to `count` threads, the calling one included. Raises ValueError below 1."""
     if count < 1:
         raise ValueError(f"the number of threads must be at least 1, not {count}")
-    native().set_threads(count)
+    get_extension().set_threads(count)
 
 
 def _import(name: str) -> ModuleType:

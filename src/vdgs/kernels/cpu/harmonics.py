@@ -7,20 +7,20 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from vdgs.kernels.cpu import extension
-from vdgs.kernels.spherical_harmonics import function_count
-from vdgs.kernels.torch_ref.harmonics import check_coefficients, check_runs
+from vdgs.kernels.spherical_harmonics import num_sh_bases
+from vdgs.kernels.torch_ref.harmonics import check_coefficients, check_starts
 
 
-def harmonic_colours(
+def harmonic_colors(
     means: Float[Tensor, "m 3"], coefficients: Float[Tensor, "n c"], rows: Int64[Tensor, " m"],
     eye: Float[Tensor, "3"], degree: int,
 ) -> Float[Tensor, "m 3"]:  # fmt: skip
-    """As `reference.harmonics.harmonic_colours`. Same bits for any number of threads."""
+    """As `reference.harmonics.harmonic_colors`. Same bits for any number of threads."""
     check_coefficients(coefficients, rows, degree)
     if coefficients.stride(1) != 1:
         coefficients = coefficients.contiguous()
     colours = torch.empty(len(rows), 3)
-    extension.native().harmonic_colours(means.contiguous(), coefficients, rows, eye.contiguous(), degree, colours)
+    extension.get_extension().harmonic_colors(means.contiguous(), coefficients, rows, eye.contiguous(), degree, colours)
     return colours
 
 
@@ -29,10 +29,10 @@ def fit_harmonics(
     starts: Int64[Tensor, " m"], degree: int, ridge: float,
 ) -> Float[Tensor, "m f 3"]:  # fmt: skip
     """As `reference.harmonics.fit_harmonics`. Same bits for any number of threads."""
-    f = function_count(degree)
-    check_runs(starts, len(weights))
+    f = num_sh_bases(degree)
+    check_starts(starts, len(weights))
     found = torch.empty(len(starts), 3 * f)
-    extension.native().fit_harmonics(
+    extension.get_extension().fit_harmonics(
         directions.contiguous(), colours.contiguous(), weights.contiguous(), starts, degree, ridge, found
     )
     return found.view(-1, f, 3)

@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from vdgs.kernels.cpu import extension
-from vdgs.kernels.kernel_types import Photometric
+from vdgs.kernels.kernel_types import PhotometricLoss
 from vdgs.kernels.torch_ref.loss import check_images
 
 
@@ -19,7 +19,7 @@ def photometric_loss(
     mask: UInt8[Tensor, "h w"] | None = None,
     *,
     ssim_weight: float = 0.2,
-) -> Photometric:
+) -> PhotometricLoss:
     """As `reference.loss.photometric_loss`, for float32 images. Differentiable once.
 
     The gradient is computed together with the loss where the image asks for one. Same bits for any number
@@ -28,14 +28,14 @@ def photometric_loss(
     check_images(image, target, mask)
     if image.dtype != torch.float32:
         raise TypeError(f"image must be float32, not {image.dtype}")
-    return Photometric(*_Photometric.apply(image, target, mask, ssim_weight))
+    return PhotometricLoss(*_Photometric.apply(image, target, mask, ssim_weight))
 
 
 class _Photometric(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float) -> Any:
         gradient = torch.empty(image.shape) if ctx.needs_input_grad[0] else None
-        values = extension.native().photometric_loss(
+        values = extension.get_extension().photometric_loss(
             image.detach().contiguous(),
             target.contiguous(),
             None if mask is None else mask.contiguous(),

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.cpu import extension
-from vdgs.kernels.cpu.arguments import contiguous, packed_camera, require_rows
-from vdgs.kernels.kernel_types import Projected
+from vdgs.kernels.cpu.arguments import check_row_shapes, contiguous, packed_camera
+from vdgs.kernels.kernel_types import ProjectedGaussians
 
 
 def project(
@@ -19,14 +19,14 @@ def project(
     scales: Float[Tensor, "m 3"],
     quaternions: Float[Tensor, "m 4"],
     camera: Camera,
-) -> Projected:
+) -> ProjectedGaussians:
     """Project Gaussians: see `vdgs.kernels.torch_ref.project.project`, of which this is the float32 twin.
 
     Raises ValueError where the shapes do not belong together.
     """
-    require_rows(means.shape[0], means=(means, 3), scales=(scales, 3), quaternions=(quaternions, 4))
+    check_row_shapes(means.shape[0], means=(means, 3), scales=(scales, 3), quaternions=(quaternions, 4))
     arguments = (contiguous(t) for t in (means, scales, quaternions))
-    return Projected(*_Project.apply(*arguments, packed_camera(camera)))
+    return ProjectedGaussians(*_Project.apply(*arguments, packed_camera(camera)))
 
 
 class _Project(torch.autograd.Function):
@@ -37,7 +37,7 @@ class _Project(torch.autograd.Function):
         means_px, conics, depths = means.new_empty(m, 2), means.new_empty(m, 3), means.new_empty(m)
         valid = torch.empty(m, dtype=torch.uint8)
         gaussians = [t.detach() for t in tensors[:3]]
-        extension.native().project(*gaussians, camera, means_px, conics, depths, valid)
+        extension.get_extension().project(*gaussians, camera, means_px, conics, depths, valid)
         ctx.save_for_backward(*tensors)
         visible = valid.view(torch.bool)
         ctx.mark_non_differentiable(visible)
@@ -48,5 +48,5 @@ class _Project(torch.autograd.Function):
         means, scales, quaternions, camera = (t.detach() for t in ctx.saved_tensors)
         out = [torch.empty_like(t) for t in (means, scales, quaternions)]
         incoming = [g.contiguous() for g in gradients[:3]]
-        extension.native().project_backward(means, scales, quaternions, camera, *incoming, *out)
+        extension.get_extension().project_backward(means, scales, quaternions, camera, *incoming, *out)
         return *out, None

@@ -9,13 +9,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vdgs.kernels.autograd import differentiable
+from vdgs.kernels.autograd import rasterize_with_autograd
 from vdgs.kernels.cpu import extension as native_module
-from vdgs.kernels.kernel_types import Raster, RasterGradients, RasterPullback, Shares, Splats
+from vdgs.kernels.kernel_types import Raster, RasterGradients, RasterPullback, SplatContributions, Splats
 from vdgs.kernels.splat_checks import check_splats
 
 
-def rasterise(
+def rasterize(
     splats: Splats,
     background: Float[Tensor, "3"],
     width: int,
@@ -37,10 +37,10 @@ def rasterise(
     Raises TypeError or ValueError for tensors of another type, device or shape, or a picture side
     outside 1 .. 524272. The second derivative is not defined: asking for it raises RuntimeError.
     """
-    return differentiable(lambda tensors: _draw(tensors, width, height, depth, module), splats, background)
+    return rasterize_with_autograd(lambda tensors: _draw(tensors, width, height, depth, module), splats, background)
 
 
-def rasterise_vjp(
+def rasterize_vjp(
     splats: Splats,
     background: Float[Tensor, "3"],
     width: int,
@@ -49,14 +49,14 @@ def rasterise_vjp(
     depth: bool = False,
     module: Any = None,
 ) -> tuple[Raster, RasterPullback]:
-    """`rasterise` without autograd: the picture, and the way back from it. Raises what `rasterise` raises.
+    """`rasterize` without autograd: the picture, and the way back from it. Raises what `rasterize` raises.
 
     Of the arguments nothing is kept: their memory may be used again before the way back.
     """
     return _draw((*splats.tensors, background), width, height, depth, module)
 
 
-def shares(
+def splat_contributions(
     splats: Splats,
     background: Float[Tensor, "3"],
     width: int,
@@ -64,12 +64,12 @@ def shares(
     wanted: Float[Tensor, "h w 3"] | None = None,
     *,
     module: Any = None,
-) -> Shares:
+) -> SplatContributions:
     """As `reference.shares.shares`: front to back a second time, four sums for each splat of a tile where the way back
-    of `rasterise` makes ten. The same bits for any number of threads."""
+    of `rasterize` makes ten. The same bits for any number of threads."""
     raster, pullback = _draw((*splats.tensors, background), width, height, False, module)
     lacking = torch.zeros_like(raster.image) if wanted is None else wanted - raster.image
-    found = Shares(torch.empty(pullback.count), torch.empty(pullback.count, 3))
+    found = SplatContributions(torch.empty(pullback.count), torch.empty(pullback.count, 3))
     pullback.module.rasterise_shares(pullback.frame, lacking.contiguous().numpy(), *(t.numpy() for t in found))
     return found
 
@@ -77,7 +77,7 @@ def shares(
 def _draw(tensors: tuple[Tensor, ...], width: int, height: int, depth: bool, module: Any) -> tuple[Raster, _Pullback]:
     """The picture of means_px, conics, colours, opacities, depths before a background, and the way back."""
     _check(tensors, width, height)
-    module = module or native_module.native()
+    module = module or native_module.get_extension()
     depths = (torch.empty(height, width), torch.empty(height, width)) if depth else (None, None)
     raster = Raster(torch.empty(height, width, 3), torch.empty(height, width), *depths)
     behind = tuple(tensors[5].tolist())

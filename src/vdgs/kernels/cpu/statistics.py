@@ -7,16 +7,16 @@ from jaxtyping import Bool, Float, Int32, Int64
 from torch import Tensor
 
 from vdgs.kernels.cpu import extension
-from vdgs.kernels.kernel_types import Statistics
-from vdgs.kernels.splat_segments import Shown, tensor_of
+from vdgs.kernels.kernel_types import DensificationStats
+from vdgs.kernels.splat_segments import SplatMask, sources_tensor
 from vdgs.kernels.torch_ref.statistics import check_inside, check_sources
 
 
 def add_view_statistics(
-    statistics: Statistics,
+    statistics: DensificationStats,
     visible: Int64[Tensor, "v"],
     inside: Bool[Tensor, "v"],
-    source: Int32[Tensor, "m"] | Shown,
+    source: Int32[Tensor, "m"] | SplatMask,
     opacities: Float[Tensor, "m"],
     gradient_px: Float[Tensor, "m 2"],
     width: int,
@@ -24,12 +24,12 @@ def add_view_statistics(
 ) -> None:
     """As `reference.statistics.add_view_statistics`, for contiguous float32. Same bits for any number of threads."""
     gradient = statistics.gradient
-    sources = tensor_of(source)
+    sources = sources_tensor(source)
     check_sources(sources, visible, gradient.shape[1])
     check_inside(inside, visible)
     if len(visible) and not (int(visible.min()) >= 0 and int(visible.max()) < len(gradient)):
         raise IndexError(f"a visible anchor lies outside the {len(gradient)} anchors")
-    extension.native().add_view_statistics(
+    extension.get_extension().add_view_statistics(
         visible, inside.contiguous().view(torch.uint8), sources, opacities.detach().contiguous(),
         gradient_px.contiguous(), width / 2, height / 2, gradient, statistics.drawn, statistics.opacity,
         statistics.seen,

@@ -28,14 +28,14 @@ def count_visibility(points: Float[Tensor, "n 3"], cameras: Sequence[Camera]) ->
     count = torch.zeros(points.shape[0], dtype=torch.int32)
     if len(cameras) == 0 or points.shape[0] == 0:
         return count
-    packed = np.stack([camera.packed_exactly for camera in cameras])
+    packed = np.stack([camera.packed_float64 for camera in cameras])
     points = points.detach().contiguous()
     if len(cameras) < SORT_FROM_CAMERAS:
-        extension.native().count_visibility(points, packed, count)
+        extension.get_extension().count_visibility(points, packed, count)
         return count
     order = morton_order(torch.nan_to_num(points, posinf=0.0, neginf=0.0))
     sorted_count = torch.empty_like(count)
-    extension.native().count_visibility(points[order], packed, sorted_count)
+    extension.get_extension().count_visibility(points[order], packed, sorted_count)
     count[order] = sorted_count
     return count
 

@@ -5,10 +5,10 @@ Not all operations of `vdgs.kernels` are here: `vdgs.kernels.gpu` adds what a ca
 
 from vdgs.kernels.cuda.cull import cull as cull
 from vdgs.kernels.cuda.decode import decode as decode
-from vdgs.kernels.cuda.decode import decode_to_train as decode_to_train
+from vdgs.kernels.cuda.decode import decode_for_training as decode_for_training
 from vdgs.kernels.cuda.decode_adam import decode_backward_adam as decode_backward_adam
 from vdgs.kernels.cuda.loss import photometric_loss as photometric_loss
-from vdgs.kernels.cuda.rasterize import rasterise as rasterise
-from vdgs.kernels.cuda.rasterize import rasterise_vjp as rasterise_vjp
-from vdgs.kernels.cuda.rasterize import shares as shares
+from vdgs.kernels.cuda.rasterize import rasterize as rasterize
+from vdgs.kernels.cuda.rasterize import rasterize_vjp as rasterize_vjp
+from vdgs.kernels.cuda.rasterize import splat_contributions as splat_contributions
 from vdgs.kernels.cuda.statistics import add_view_statistics as add_view_statistics

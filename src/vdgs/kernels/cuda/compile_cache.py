@@ -18,13 +18,13 @@ from vdgs.errors import VdgsError
 from vdgs.system.atomic_files import write_bytes
 
 #: Overrides the folder of compiled code.
-VARIABLE = "VDGS_CUDA_CACHE"
+CUDA_CACHE_ENV_VAR = "VDGS_CUDA_CACHE"
 MAGIC = b"vdgs code 1\n"
 
 
 def cache_folder() -> Path:
     """Where compiled code is kept: $VDGS_CUDA_CACHE, or the platform's folder for caches."""
-    if named := os.environ.get(VARIABLE):
+    if named := os.environ.get(CUDA_CACHE_ENV_VAR):
         return Path(named)
     if sys.platform == "win32":
         base = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
@@ -35,7 +35,7 @@ def cache_folder() -> Path:
     return base / "vdgs" / "cuda"
 
 
-def key_of(parts: Mapping[str, str]) -> str:
+def digest_parts(parts: Mapping[str, str]) -> str:
     """A digest of named texts: of the names, of the texts and of where one ends and the next begins."""
     digest = hashlib.sha256()
     for name, text in sorted(parts.items()):
@@ -44,12 +44,12 @@ def key_of(parts: Mapping[str, str]) -> str:
     return digest.hexdigest()
 
 
-def cached(name: str, parts: Mapping[str, str], make: Callable[[], bytes]) -> bytes:
+def load_or_compile(name: str, parts: Mapping[str, str], make: Callable[[], bytes]) -> bytes:
     """The code made from these parts: as it was kept, or made now and kept.
 
     `name` (for people) begins the file's name. A folder that cannot be read or written costs time, not the work.
     """
-    path = cache_folder() / f"{name}-{key_of(parts)[:40]}.bin"
+    path = cache_folder() / f"{name}-{digest_parts(parts)[:40]}.bin"
     if (code := _read(path)) is not None:
         return code
     code = make()

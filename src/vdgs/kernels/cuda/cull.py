@@ -9,17 +9,17 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from vdgs.geometry.camera import Camera
-from vdgs.kernels.cuda.launch import Program
+from vdgs.kernels.cuda.launch import CudaProgram
 from vdgs.kernels.cuda.packed_camera import PackedCamera
 
 #: Threads of a block, and anchors of a word: kThreads and kWarp of the source.
-THREADS, WORD = 256, 32
-PROGRAM = Program(name="cull.cu", headers=("gaussian_math.h", "image_formation.h"))
+THREADS, WARP_SIZE = 256, 32
+PROGRAM = CudaProgram(name="cull.cu", headers=("gaussian_math.h", "image_formation.h"))
 
 
 @torch.no_grad()
 def cull(
-    positions: Float[Tensor, "n 3"], log_scales: Float[Tensor, "n 6"], camera: Camera, *, program: Program = PROGRAM
+    positions: Float[Tensor, "n 3"], log_scales: Float[Tensor, "n 6"], camera: Camera, *, program: CudaProgram = PROGRAM
 ) -> Int64[Tensor, "v"]:
     """As `native.cull`, for float32 tensors on a CUDA device: indices, ascending, of the anchors that may touch the
     image.
@@ -36,7 +36,7 @@ def cull(
     if positions.dtype != torch.float32 or log_scales.dtype != torch.float32:
         raise TypeError(f"positions and log_scales must be float32, not {positions.dtype} and {log_scales.dtype}")
     count, grid, block = ctypes.c_longlong(n), (-(-n // THREADS),), (THREADS,)
-    marks, found = (positions.new_empty(-(-n // WORD), dtype=torch.int32) for _ in range(2))
+    marks, found = (positions.new_empty(-(-n // WARP_SIZE), dtype=torch.int32) for _ in range(2))
     anchors = positions.detach().contiguous(), log_scales.detach().contiguous()
     program.launch("mark_anchors", grid, block, *anchors, PackedCamera.of(camera), count, marks, found)
     ends = found.cumsum(0, dtype=torch.int32)

@@ -11,16 +11,16 @@ from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 from vdgs.geometry.camera import Camera
-from vdgs.kernels.cuda.decode import ANCHORS_OF_A_BLOCK, PROGRAM, by_lanes, check_decoder, sources_of
-from vdgs.kernels.cuda.launch import Argument, Program
+from vdgs.kernels.cuda.decode import ANCHORS_PER_BLOCK, PROGRAM, check_decoder, expand_sources, pack_head
+from vdgs.kernels.cuda.launch import CudaProgram, KernelArgument
 from vdgs.kernels.cuda.packed_camera import PackedCamera
-from vdgs.kernels.kernel_types import AdamState, DecoderWeights, Finite, HeadWeights, SplatGradients
-from vdgs.kernels.splat_segments import Shown
-from vdgs.kernels.torch_ref.adam import check_updates, tables_on
+from vdgs.kernels.kernel_types import AdamState, DecoderWeights, IsFinite, MlpWeights, SplatGradients
+from vdgs.kernels.splat_segments import SplatMask
+from vdgs.kernels.torch_ref.adam import bias_correction_tables, check_updates
 from vdgs.kernels.torch_ref.decode_adam import decode_backward_adam as by_torch
 
 #: Anchors whose parts of the decoder's gradients are held at once: whole blocks.
-PIECE = 2**14
+ANCHORS_PER_CHUNK = 2**14
 
 
 def decode_backward_adam(
@@ -32,9 +32,9 @@ def decode_backward_adam(
     gradients: SplatGradients,
     updates: Int32[Tensor, "n"],
     *,
-    program: Program = PROGRAM,
-    piece: int = PIECE,
-) -> tuple[Finite, tuple[Tensor, ...] | None]:
+    program: CudaProgram = PROGRAM,
+    piece: int = ANCHORS_PER_CHUNK,
+) -> tuple[IsFinite, tuple[Tensor, ...] | None]:
     """As `reference.decode_adam.decode_backward_adam`, for float32 tensors on a CUDA device.
 
     Gradients of anchors are never held: a warp takes an anchor from its splats to its new place. Those of the decoder
@@ -45,7 +45,7 @@ def decode_backward_adam(
     unsuitable tensors, CudaUnavailable where the kernel cannot be run.
     """
     if gradients.depths is not None:
-        named = replace(gradients, source=sources_of(gradients.source, program=program))
+        named = replace(gradients, source=expand_sources(gradients.source, program=program))
         return by_torch(positions, moved, weights, camera, rows, named, updates)
     check_updates(updates, len(positions))
     features, offsets, _ = moved
@@ -55,15 +55,15 @@ def decode_backward_adam(
     if len({state.early for state in moved}) > 1:
         raise ValueError("features, offsets and log-scales must be annealed alike")
     v, device, source = len(rows), positions.device, gradients.source
-    shown = source if isinstance(source, Shown) else Shown.of(source, v, k)
-    lacking, roots = (table.float() for table in tables_on(0.9, 0.999, device))
+    shown = source if isinstance(source, SplatMask) else SplatMask.of(source, v, k)
+    lacking, roots = (table.float() for table in bias_correction_tables(0.9, 0.999, device))
     broken = torch.zeros(1, dtype=torch.int32, device=device)
-    before: list[Argument] = [
+    before: list[KernelArgument] = [
         positions.contiguous(), *parts, *(ctypes.c_float(state.learning_rate) for state in moved),
         ctypes.c_float(features.early), *_weights(weights, k), PackedCamera.of(camera), rows.contiguous(),
     ]  # fmt: skip
-    after: list[Argument] = [
-        ctypes.c_int(k), ctypes.c_int(inputs), shown.bits, shown.runs.begins,
+    after: list[KernelArgument] = [
+        ctypes.c_int(k), ctypes.c_int(inputs), shown.bits, shown.runs.starts,
         *(t.contiguous() for t in (gradients.means_px, gradients.conics, gradients.colours, gradients.opacities)),
         ctypes.c_float(gradients.volume), updates, lacking, roots, ctypes.c_int(len(roots)), broken,
     ]  # fmt: skip
@@ -72,9 +72,9 @@ def decode_backward_adam(
     at_once = piece if wanted else max(v, 1)
     for first in range(0, v, at_once):
         count = min(at_once, v - first)
-        made = _Made.empty(count, k, inputs, positions) if wanted else None
+        made = _DecoderGradientBuffers.empty(count, k, inputs, positions) if wanted else None
         program.launch(
-            "move_anchors", (-(-count // ANCHORS_OF_A_BLOCK),), (32 * ANCHORS_OF_A_BLOCK,), *before,
+            "move_anchors", (-(-count // ANCHORS_PER_BLOCK),), (32 * ANCHORS_PER_BLOCK,), *before,
             ctypes.c_longlong(first), ctypes.c_longlong(count), *after, *(made.tensors() if made else [None] * 6),
         )  # fmt: skip
         if made and of_weights:
@@ -86,22 +86,22 @@ def decode_backward_adam(
 def _weights(weights: DecoderWeights, k: int) -> list[Tensor]:
     """As the kernel takes them: as they are multiplied forwards, then as they are multiplied backwards."""
     heads = weights.opacity, weights.covariance, weights.colour
-    opacity, covariance, colour = (by_lanes(head, k) for head in heads)
+    opacity, covariance, colour = (pack_head(head, k) for head in heads)
     back = (w.detach().contiguous() for head in heads for w in (head.w1, head.w2))
     return [*opacity, *covariance, *colour, *back]
 
 
-class _Made:
+class _DecoderGradientBuffers:
     """What each of some visible anchors adds to the gradients of the decoder."""
 
     def __init__(self, by_outputs: tuple[Tensor, ...], hidden: Tensor, by_hidden: Tensor, inputs: Tensor):
         self.by_outputs, self.hidden, self.by_hidden, self.inputs = by_outputs, hidden, by_hidden, inputs
 
     @staticmethod
-    def empty(count: int, k: int, inputs: int, like: Tensor) -> _Made:
+    def empty(count: int, k: int, inputs: int, like: Tensor) -> _DecoderGradientBuffers:
         by_outputs = tuple(like.new_empty(count, outputs * k) for outputs in (1, 7, 3))
         hidden, by_hidden = (like.new_empty(3, count, 32) for _ in range(2))
-        return _Made(by_outputs, hidden, by_hidden, like.new_empty(count, inputs))
+        return _DecoderGradientBuffers(by_outputs, hidden, by_hidden, like.new_empty(count, inputs))
 
     def tensors(self) -> list[Tensor]:
         return [*self.by_outputs, self.hidden, self.by_hidden, self.inputs]
@@ -111,7 +111,7 @@ class _Made:
         heads = zip(self.by_outputs, self.hidden, self.by_hidden, strict=True)
         return DecoderWeights(
             *(
-                HeadWeights(by_hidden.t() @ self.inputs, by_hidden.sum(0), by_output.t() @ hidden, by_output.sum(0))
+                MlpWeights(by_hidden.t() @ self.inputs, by_hidden.sum(0), by_output.t() @ hidden, by_output.sum(0))
                 for by_output, hidden, by_hidden in heads
             )
         ).tensors()

@@ -22,7 +22,7 @@ LIBRARY = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
 #: CUdevice_attribute.
 CAPABILITY_MAJOR, CAPABILITY_MINOR = 75, 76
 #: What to do about some CUresults; the driver's own words come before it.
-REMEDIES = {
+HINTS = {
     2: "The card's memory is full: draw smaller pictures or use --device cpu.",
     100: "No card is visible: look at nvidia-smi and CUDA_VISIBLE_DEVICES.",
     209: "The code is for another card: delete the folder of compiled code that `vdgs doctor` names.",
@@ -31,7 +31,7 @@ REMEDIES = {
     803: "The driver's library does not fit the driver that runs: restart the machine or reinstall the driver.",
 }
 
-Grid = tuple[int, int, int]
+GridSize = tuple[int, int, int]
 
 
 class DriverError(CudaUnavailable):
@@ -43,7 +43,7 @@ class DriverError(CudaUnavailable):
 
 
 @dataclass(frozen=True)
-class Card:
+class GpuInfo:
     """A GPU as the driver describes it."""
 
     index: int
@@ -68,7 +68,7 @@ class Driver(Protocol):
     def function(self, module: int, name: str) -> int:
         """A kernel of a module, by its unmangled name."""
 
-    def launch(self, function: int, grid: Grid, block: Grid, device: torch.device, arguments: Any) -> None:
+    def launch(self, function: int, grid: GridSize, block: GridSize, device: torch.device, arguments: Any) -> None:
         """Queue a kernel on torch's current stream of the device. `arguments`: a ctypes array of pointers to them."""
 
 
@@ -89,7 +89,7 @@ class CudaDriver:
         self._call("cuDriverGetVersion", ctypes.byref(found))
         return found.value // 1000, found.value % 1000 // 10
 
-    def cards(self) -> list[Card]:
+    def cards(self) -> list[GpuInfo]:
         """Every visible GPU."""
         count = ctypes.c_int()
         self._call("cuDeviceGetCount", ctypes.byref(count))
@@ -111,7 +111,7 @@ class CudaDriver:
         self._call("cuModuleGetFunction", ctypes.byref(function), ctypes.c_void_p(module), name.encode())
         return _handle(function)
 
-    def launch(self, function: int, grid: Grid, block: Grid, device: torch.device, arguments: Any) -> None:
+    def launch(self, function: int, grid: GridSize, block: GridSize, device: torch.device, arguments: Any) -> None:
         stream = torch.cuda.current_stream(device).cuda_stream
         with self._current(_index(device)):
             self._call(
@@ -132,13 +132,13 @@ class CudaDriver:
         finally:
             self._call("cuCtxPopCurrent_v2", ctypes.byref(ctypes.c_void_p()))
 
-    def _card(self, index: int) -> Card:
+    def _card(self, index: int) -> GpuInfo:
         device = self._device(index)
         name, memory = ctypes.create_string_buffer(256), ctypes.c_size_t()
         self._call("cuDeviceGetName", name, len(name), device)
         self._call("cuDeviceTotalMem_v2", ctypes.byref(memory), device)
         major, minor = (self._attribute(each, device) for each in (CAPABILITY_MAJOR, CAPABILITY_MINOR))
-        return Card(index, name.value.decode(errors="replace"), memory.value, (major, minor))
+        return GpuInfo(index, name.value.decode(errors="replace"), memory.value, (major, minor))
 
     def _device(self, index: int) -> ctypes.c_int:
         device = ctypes.c_int()
@@ -153,7 +153,7 @@ class CudaDriver:
     def _call(self, name: str, *arguments: Any) -> None:
         code = int(getattr(self._library, name)(*arguments))
         if code:
-            remedy = REMEDIES.get(code, "--device cpu works without the card.")
+            remedy = HINTS.get(code, "--device cpu works without the card.")
             raise DriverError(f"CUDA driver: {name} failed: {self._explain(code)}. {remedy}", code)
 
     def _explain(self, code: int) -> str:
@@ -164,7 +164,7 @@ class CudaDriver:
 
 
 @cache
-def cuda_driver() -> CudaDriver:
+def get_cuda_driver() -> CudaDriver:
     """The driver of this machine. Raises CudaUnavailable if there is none, or no card."""
     try:
         library = ctypes.CDLL(LIBRARY)

@@ -12,17 +12,17 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from vdgs.kernels.cuda.compile_cache import cached
-from vdgs.kernels.cuda.driver import Driver, Grid, cuda_driver
-from vdgs.kernels.cuda.nvrtc import Nvrtc, Target, nvrtc
+from vdgs.kernels.cuda.compile_cache import load_or_compile
+from vdgs.kernels.cuda.driver import Driver, GridSize, get_cuda_driver
+from vdgs.kernels.cuda.nvrtc import CompileTarget, Nvrtc, get_nvrtc
 
-OPTIONS = ("--std=c++17",)
+COMPILE_OPTIONS = ("--std=c++17",)
 #: Limits of every card since compute capability 3.0.
-MOST_BLOCKS: Grid = (2**31 - 1, 65535, 65535)
-MOST_THREADS = 1024
+MAX_GRID: GridSize = (2**31 - 1, 65535, 65535)
+MAX_THREADS_PER_BLOCK = 1024
 
 #: What a kernel may be given: a tensor (its data pointer), nothing (a null pointer), a ctypes number or a structure.
-Argument = Tensor | ctypes._SimpleCData | ctypes.Structure | None
+KernelArgument = Tensor | ctypes._SimpleCData | ctypes.Structure | None
 
 
 def read_source(name: str) -> str:
@@ -35,20 +35,29 @@ def read_header(name: str) -> str:
     return (Path(__file__).parents[1] / "shared" / name).read_text(encoding="utf-8")
 
 
-def compile_source(name: str, target: Target, *, headers: Sequence[str] = (), compiler: Nvrtc | None = None) -> bytes:
+def compile_source(
+    name: str, target: CompileTarget, *, headers: Sequence[str] = (), compiler: Nvrtc | None = None
+) -> bytes:
     """A source of this package with these shared headers, compiled, from the cache if it is there.
 
     Raises CompileError, CudaUnavailable.
     """
-    compiler = compiler or nvrtc()
+    compiler = compiler or get_nvrtc()
     source, texts = read_source(name), {title: read_header(title) for title in headers}
     parts = {f"header {title}": text for title, text in texts.items()}
-    parts |= {"source": source, "options": "\n".join(OPTIONS), "target": target.name, "NVRTC": str(compiler.version)}
-    return cached(f"{name}-{target.name}", parts, lambda: compiler.compile(name, source, texts, target, OPTIONS))
+    parts |= {
+        "source": source,
+        "options": "\n".join(COMPILE_OPTIONS),
+        "target": target.name,
+        "NVRTC": str(compiler.version),
+    }
+    return load_or_compile(
+        f"{name}-{target.name}", parts, lambda: compiler.compile(name, source, texts, target, COMPILE_OPTIONS)
+    )
 
 
 @dataclass(eq=False, kw_only=True)
-class Program:
+class CudaProgram:
     """The kernels of one source, compiled and loaded once for each device, at the first launch there."""
 
     name: str
@@ -60,21 +69,21 @@ class Program:
     _modules: dict[torch.device, int] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def launch(self, kernel: str, grid: Sequence[int], block: Sequence[int], *arguments: Argument) -> None:
+    def launch(self, kernel: str, grid: Sequence[int], block: Sequence[int], *arguments: KernelArgument) -> None:
         """Queue a kernel on torch's current stream of the device that its tensors are on.
 
         Grid and block have up to three sides; a grid with a side of zero is nothing to do. Raises ValueError for
         tensors that are not contiguous or of several devices, or for sides out of range; TypeError for tensors of
         another kind of device; CudaUnavailable and CompileError where the kernel cannot be made or run.
         """
-        driver = self.driver or cuda_driver()
+        driver = self.driver or get_cuda_driver()
         device = common_device(arguments, driver.device_type)
         blocks, threads = _sides(grid), _sides(block)
         _check_sides(blocks, threads)
         if 0 in blocks:
             return
         function = self._function(driver, device, kernel)
-        values, pointers = pack(arguments)
+        values, pointers = pack_arguments(arguments)
         driver.launch(function, blocks, threads, device, pointers)
         del values  # the driver has copied them; until then the pointers lead there
 
@@ -83,15 +92,15 @@ class Program:
             key = (device, kernel)
             if key not in self._functions:
                 if device not in self._modules:
-                    target = nvrtc().target_for(driver.capability(device))
+                    target = get_nvrtc().target_for(driver.capability(device))
                     code = compile_source(self.name, target, headers=self.headers)
                     self._modules[device] = driver.load(code, device)
                 self._functions[key] = driver.function(self._modules[device], kernel)
             return self._functions[key]
 
 
-def pack(
-    arguments: Sequence[Argument],
+def pack_arguments(
+    arguments: Sequence[KernelArgument],
 ) -> tuple[list[ctypes._SimpleCData | ctypes.Structure], ctypes.Array[ctypes.c_void_p]]:
     """What a launch is given: the values, which must outlive the call, and an array of pointers to them."""
     values = [_value(argument) for argument in arguments]
@@ -99,7 +108,7 @@ def pack(
     return values, pointers
 
 
-def common_device(arguments: Sequence[Argument], device_type: str) -> torch.device:
+def common_device(arguments: Sequence[KernelArgument], device_type: str) -> torch.device:
     """The device of all tensors. Raises TypeError or ValueError unless a kernel can read them all there."""
     tensors = [argument for argument in arguments if isinstance(argument, Tensor)]
     if not tensors:
@@ -115,7 +124,7 @@ def common_device(arguments: Sequence[Argument], device_type: str) -> torch.devi
     return tensors[0].device
 
 
-def _value(argument: Argument) -> ctypes._SimpleCData | ctypes.Structure:
+def _value(argument: KernelArgument) -> ctypes._SimpleCData | ctypes.Structure:
     if argument is None:
         return ctypes.c_void_p(0)
     if isinstance(argument, Tensor):
@@ -123,13 +132,13 @@ def _value(argument: Argument) -> ctypes._SimpleCData | ctypes.Structure:
     return argument
 
 
-def _sides(sides: Sequence[int]) -> Grid:
+def _sides(sides: Sequence[int]) -> GridSize:
     x, y, z = (*sides, 1, 1, 1)[:3]
     return x, y, z
 
 
-def _check_sides(grid: Grid, block: Grid) -> None:
-    if any(not 0 <= side <= most for side, most in zip(grid, MOST_BLOCKS, strict=True)):
-        raise ValueError(f"a grid of {grid} blocks cannot be launched; at most {MOST_BLOCKS}")
-    if min(block) < 1 or block[0] * block[1] * block[2] > MOST_THREADS or block[2] > 64:
-        raise ValueError(f"a block of {block} threads cannot be launched; at most {MOST_THREADS}")
+def _check_sides(grid: GridSize, block: GridSize) -> None:
+    if any(not 0 <= side <= most for side, most in zip(grid, MAX_GRID, strict=True)):
+        raise ValueError(f"a grid of {grid} blocks cannot be launched; at most {MAX_GRID}")
+    if min(block) < 1 or block[0] * block[1] * block[2] > MAX_THREADS_PER_BLOCK or block[2] > 64:
+        raise ValueError(f"a block of {block} threads cannot be launched; at most {MAX_THREADS_PER_BLOCK}")

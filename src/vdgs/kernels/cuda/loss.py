@@ -9,13 +9,13 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from vdgs.kernels.cuda.launch import Program
-from vdgs.kernels.kernel_types import Photometric
+from vdgs.kernels.cuda.launch import CudaProgram
+from vdgs.kernels.kernel_types import PhotometricLoss
 from vdgs.kernels.torch_ref.loss import check_images
 
 #: Side of the tile that one block of threads does: kTile of the source.
 TILE_PX = 16
-PROGRAM = Program(name="loss.cu")
+PROGRAM = CudaProgram(name="loss.cu")
 
 
 def photometric_loss(
@@ -24,8 +24,8 @@ def photometric_loss(
     mask: UInt8[Tensor, "h w"] | None = None,
     *,
     ssim_weight: float = 0.2,
-    program: Program = PROGRAM,
-) -> Photometric:
+    program: CudaProgram = PROGRAM,
+) -> PhotometricLoss:
     """As `reference.loss.photometric_loss`, for float32 images on a CUDA device. Differentiable once.
 
     Everything stays on the device and nothing waits for it. The gradient is computed together with the loss where the
@@ -35,13 +35,13 @@ def photometric_loss(
     check_images(image, target, mask)
     if image.dtype != torch.float32:
         raise TypeError(f"image must be float32, not {image.dtype}")
-    return Photometric(*_Photometric.apply(image, target, mask, ssim_weight, program))
+    return PhotometricLoss(*_Photometric.apply(image, target, mask, ssim_weight, program))
 
 
 class _Photometric(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, image: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float, program: Program
+        ctx: Any, image: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float, program: CudaProgram
     ) -> tuple[Tensor, ...]:
         pictures = [None if t is None else t.detach().contiguous() for t in (image, target, mask)]
         loss, l1, ssim, ctx.gradient = _run(pictures, ssim_weight, ctx.needs_input_grad[0], program)
@@ -57,10 +57,10 @@ class _Photometric(torch.autograd.Function):
 
 
 def _run(
-    pictures: list[Tensor | None], ssim_weight: float, with_gradient: bool, program: Program
+    images: list[Tensor | None], ssim_weight: float, with_gradient: bool, program: CudaProgram
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
     """Loss, L1, SSIM (scalars) and the gradient of the loss, for contiguous image, target and mask."""
-    image, _, mask = pictures
+    image, _, mask = images
     assert image is not None
     height, width, _ = image.shape
     size = ctypes.c_int(height), ctypes.c_int(width)
@@ -69,11 +69,11 @@ def _run(
 
     slopes = image.new_empty(3, height, width, 3) if with_gradient else None
     sums = image.new_empty(tiles, 2, dtype=torch.float64)
-    program.launch("photometric_forward", grid, block, *pictures, *size, slopes, sums)
+    program.launch("photometric_forward", grid, block, *images, *size, slopes, sums)
     kept = image.new_full((1,), height * width, dtype=torch.int64) if mask is None else (mask != 0).sum()
     loss, l1, ssim = (image.new_empty(()) for _ in range(3))
     program.launch("photometric_total", (1,), block, sums, ctypes.c_int(tiles), kept, weight, loss, l1, ssim)
     gradient = torch.empty_like(image) if with_gradient else None
     if gradient is not None:
-        program.launch("photometric_backward", grid, block, *pictures, *size, slopes, kept, weight, gradient)
+        program.launch("photometric_backward", grid, block, *images, *size, slopes, kept, weight, gradient)
     return loss, l1, ssim, gradient

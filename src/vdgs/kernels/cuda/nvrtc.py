@@ -20,11 +20,11 @@ from typing import Any
 from vdgs.errors import VdgsError
 
 #: How the library is called in a folder, by platform, and how the system's loader knows it.
-PATTERN = "nvrtc64_*.dll" if sys.platform == "win32" else "libnvrtc.so*"
+LIBRARY_PATTERN = "nvrtc64_*.dll" if sys.platform == "win32" else "libnvrtc.so*"
 SYSTEM_NAMES = ("libnvrtc.so.13", "libnvrtc.so.12", "libnvrtc.so")
 #: Where toolkits are installed, newest first by name; looked at last.
 SYSTEM_FOLDERS = ("/usr/local/cuda/lib64", "/usr/local/cuda-*/lib64", "/usr/lib/x86_64-linux-gnu")
-INSTALL = "pip install nvidia-cuda-nvrtc"
+INSTALL_HINT = "pip install nvidia-cuda-nvrtc"
 
 
 class CudaUnavailable(VdgsError):
@@ -36,7 +36,7 @@ class CompileError(VdgsError):
 
 
 @dataclass(frozen=True)
-class Found:
+class NvrtcLibrary:
     """A library that may be NVRTC: `origin` says in words where it comes from."""
 
     path: str
@@ -44,7 +44,7 @@ class Found:
 
 
 @dataclass(frozen=True)
-class Target:
+class CompileTarget:
     """What is compiled for a card: machine code (`sm_86`), or PTX (`compute_80`) that its driver compiles on."""
 
     name: str
@@ -54,40 +54,40 @@ class Target:
         return self.name.startswith("compute_")
 
 
-def candidates() -> Iterator[Found]:
+def find_nvrtc() -> Iterator[NvrtcLibrary]:
     """Every place where NVRTC may be: that of torch's own CUDA, other wheels (newest first), the system."""
     folders = _wheel_folders()
     major = _torch_cuda_major()
     if major is not None:
         own = [found for folder in folders for found in _in_folder(folder) if _major(found) == major]
-        yield from (Found(str(path), "torch's CUDA build") for path in own + _in_folder(_torch_folder()))
+        yield from (NvrtcLibrary(str(path), "torch's CUDA build") for path in own + _in_folder(_torch_folder()))
     wheels = [found for folder in folders for found in _in_folder(folder)]
     for path in sorted(wheels, key=lambda path: _major(path) or 0, reverse=True):
-        yield Found(str(path), "the wheel nvidia-cuda-nvrtc")
-    yield from (Found(name, "the system") for name in (*SYSTEM_NAMES, ctypes.util.find_library("nvrtc")) if name)
+        yield NvrtcLibrary(str(path), "the wheel nvidia-cuda-nvrtc")
+    yield from (NvrtcLibrary(name, "the system") for name in (*SYSTEM_NAMES, ctypes.util.find_library("nvrtc")) if name)
     for pattern in SYSTEM_FOLDERS:
         base, _, rest = pattern.partition("*")
         matches = sorted(Path("/").glob(pattern[1:]), reverse=True) if rest else [Path(base)]
-        yield from (Found(str(path), "the system") for folder in matches for path in _in_folder(folder))
+        yield from (NvrtcLibrary(str(path), "the system") for folder in matches for path in _in_folder(folder))
 
 
 @cache
-def nvrtc() -> Nvrtc:
+def get_nvrtc() -> Nvrtc:
     """The compiler of this process. Raises CudaUnavailable if there is none that loads."""
     refused = []
-    for found in candidates():
+    for found in find_nvrtc():
         try:
             return Nvrtc(ctypes.CDLL(found.path), found)
         except (OSError, AttributeError) as error:
             refused.append(f"{found.path} ({error})")
     tried = f" Tried: {'; '.join(refused)}." if refused else ""
-    raise CudaUnavailable(f"NVRTC, the CUDA compiler library, was not found. {INSTALL}.{tried}")
+    raise CudaUnavailable(f"NVRTC, the CUDA compiler library, was not found. {INSTALL_HINT}.{tried}")
 
 
 class Nvrtc:
     """The compiler. `library` offers NVRTC's C functions (a ctypes library, or a stand-in)."""
 
-    def __init__(self, library: Any, found: Found):
+    def __init__(self, library: Any, found: NvrtcLibrary):
         self._library, self.found = library, found
         major, minor = ctypes.c_int(), ctypes.c_int()
         self._call("nvrtcVersion", ctypes.byref(major), ctypes.byref(minor))
@@ -101,14 +101,14 @@ class Nvrtc:
         self._call("nvrtcGetSupportedArchs", found)
         return tuple(sorted(found))
 
-    def target_for(self, capability: tuple[int, int]) -> Target:
+    def target_for(self, capability: tuple[int, int]) -> CompileTarget:
         """Machine code for a card of this compute capability, or the newest PTX that it can take.
 
         Raises CudaUnavailable where the card is older than everything that this NVRTC compiles for.
         """
         wanted, known = 10 * capability[0] + capability[1], self.architectures()
         if wanted in known:
-            return Target(f"sm_{wanted}")
+            return CompileTarget(f"sm_{wanted}")
         older = [each for each in known if each < wanted]
         if not older:
             raise CudaUnavailable(
@@ -116,16 +116,16 @@ class Nvrtc:
                 f"capability {known[0] / 10:.1f} and newer; this one has {capability[0]}.{capability[1]}. "
                 "An older one may do: pip install nvidia-cuda-nvrtc-cu12."
             )
-        return Target(f"compute_{older[-1]}")
+        return CompileTarget(f"compute_{older[-1]}")
 
     def compile(
-        self, name: str, source: str, headers: Mapping[str, str], target: Target, options: Sequence[str]
+        self, name: str, source: str, headers: Mapping[str, str], target: CompileTarget, options: Sequence[str]
     ) -> bytes:
         """Cubin or PTX of a source whose `#include`s are among `headers`. Raises CompileError with the log."""
-        return self.compile_and_tell(name, source, headers, target, options)[0]
+        return self.compile_with_log(name, source, headers, target, options)[0]
 
-    def compile_and_tell(
-        self, name: str, source: str, headers: Mapping[str, str], target: Target, options: Sequence[str]
+    def compile_with_log(
+        self, name: str, source: str, headers: Mapping[str, str], target: CompileTarget, options: Sequence[str]
     ) -> tuple[bytes, str]:
         """`compile`, and the compiler's log."""
         program = ctypes.c_void_p()
@@ -160,7 +160,9 @@ class Nvrtc:
     def _call(self, name: str, *arguments: Any) -> None:
         code = getattr(self._library, name)(*arguments)
         if code:
-            raise CudaUnavailable(f"{self.found.path}: {name} failed ({self._explain(code)}). Reinstall: {INSTALL}.")
+            raise CudaUnavailable(
+                f"{self.found.path}: {name} failed ({self._explain(code)}). Reinstall: {INSTALL_HINT}."
+            )
 
     def _explain(self, code: int) -> str:
         say = self._library.nvrtcGetErrorString
@@ -171,7 +173,7 @@ class Nvrtc:
 
 def _in_folder(folder: Path) -> list[Path]:
     """NVRTC in a folder: the library itself, not its built-in headers nor its alternative builds."""
-    return sorted(path for path in folder.glob(PATTERN) if not re.search(r"builtins|\.alt\.", path.name))
+    return sorted(path for path in folder.glob(LIBRARY_PATTERN) if not re.search(r"builtins|\.alt\.", path.name))
 
 
 def _wheel_folders() -> list[Path]:

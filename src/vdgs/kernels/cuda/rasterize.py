@@ -9,62 +9,64 @@ import torch
 from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
-from vdgs.kernels.autograd import differentiable
-from vdgs.kernels.cuda.launch import Argument, Program
-from vdgs.kernels.kernel_types import OrderedSplats, Raster, RasterGradients, RasterPullback, Shares, Splats
+from vdgs.kernels.autograd import rasterize_with_autograd
+from vdgs.kernels.cuda.launch import CudaProgram, KernelArgument
+from vdgs.kernels.kernel_types import OrderedSplats, Raster, RasterGradients, RasterPullback, SplatContributions, Splats
 from vdgs.kernels.splat_checks import check_splats
-from vdgs.kernels.splat_segments import Runs
-from vdgs.kernels.torch_ref.splat_contributions import shares_by
+from vdgs.kernels.splat_segments import SplatSegments
+from vdgs.kernels.torch_ref.splat_contributions import splat_contributions_from_vjp
 
 #: Side of a tile, threads of a block and sums of an entry: kTile, kThreads and kSums of the source.
-TILE_PX, THREADS, SUMS = 16, 256, 10
-PROGRAM = Program(name="rasterise.cu", headers=("image_formation.h",))
+TILE_PX, THREADS, SUMS_PER_ENTRY = 16, 256, 10
+PROGRAM = CudaProgram(name="rasterise.cu", headers=("image_formation.h",))
 
 
-def rasterise(
+def rasterize(
     splats: Splats,
     background: Float[Tensor, "3"],
     width: int,
     height: int,
     *,
     depth: bool = False,
-    program: Program = PROGRAM,
+    program: CudaProgram = PROGRAM,
 ) -> Raster:
-    """As `native.rasterise`, for float32 tensors on a CUDA device; median depth included. Same bits every time.
+    """As `native.rasterize`, for float32 tensors on a CUDA device; median depth included. Same bits every time.
 
     Waits for the device once: how many entries (splats times the tiles that they reach) there is room to be made for.
     Backward takes 52 bytes an entry. Raises TypeError or ValueError for unsuitable tensors, CudaUnavailable where the
     kernels cannot be run.
     """
     runs = _runs_of(splats)
-    return differentiable(lambda tensors: _draw(tensors, runs, width, height, depth, program), splats, background)
+    return rasterize_with_autograd(
+        lambda tensors: _draw(tensors, runs, width, height, depth, program), splats, background
+    )
 
 
-def rasterise_vjp(
+def rasterize_vjp(
     splats: Splats,
     background: Float[Tensor, "3"],
     width: int,
     height: int,
     *,
     depth: bool = False,
-    program: Program = PROGRAM,
+    program: CudaProgram = PROGRAM,
 ) -> tuple[Raster, RasterPullback]:
-    """`rasterise` without autograd: the picture, and the way back from it, which reads the splats again."""
+    """`rasterize` without autograd: the picture, and the way back from it, which reads the splats again."""
     return _draw((*splats.tensors, background), _runs_of(splats), width, height, depth, program)
 
 
-def shares(
+def splat_contributions(
     splats: Splats,
     background: Float[Tensor, "3"],
     width: int,
     height: int,
     wanted: Float[Tensor, "h w 3"] | None = None,
-) -> Shares:
+) -> SplatContributions:
     """As `reference.shares.shares`, by the whole way back."""
-    return shares_by(rasterise_vjp, splats, background, width, height, wanted)
+    return splat_contributions_from_vjp(rasterize_vjp, splats, background, width, height, wanted)
 
 
-def _runs_of(splats: Splats) -> Runs | None:
+def _runs_of(splats: Splats) -> SplatSegments | None:
     return splats.runs if isinstance(splats, OrderedSplats) else None
 
 
@@ -81,7 +83,7 @@ class _Entries:
 
 
 def _draw(
-    tensors: tuple[Tensor, ...], runs: Runs | None, width: int, height: int, depth: bool, program: Program
+    tensors: tuple[Tensor, ...], runs: SplatSegments | None, width: int, height: int, depth: bool, program: CudaProgram
 ) -> tuple[Raster, RasterPullback]:
     """The picture of means_px, conics, colours, opacities, depths before a background, and the way back."""
     check_splats(tensors, width, height)
@@ -107,15 +109,15 @@ def _draw(
     )
 
 
-def _order(runs: Runs, m: int, program: Program) -> Int32[Tensor, " m"]:
+def _order(runs: SplatSegments, m: int, program: CudaProgram) -> Int32[Tensor, " m"]:
     """`Runs.order` in one pass: a warp a run."""
-    order, count = runs.begins.new_empty(m), len(runs.begins)
+    order, count = runs.starts.new_empty(m), len(runs.starts)
     ends = runs.lengths.cumsum(0, dtype=torch.int32)
-    program.launch("order_splats", _over(32 * count), (THREADS,), runs.begins, ends, ctypes.c_int(count), order)
+    program.launch("order_splats", _over(32 * count), (THREADS,), runs.starts, ends, ctypes.c_int(count), order)
     return order
 
 
-def _entries(splats: list[Tensor], runs: Runs | None, grid: tuple[int, int], program: Program) -> _Entries:
+def _entries(splats: list[Tensor], runs: SplatSegments | None, grid: tuple[int, int], program: CudaProgram) -> _Entries:
     means = splats[0]
     count, (columns, rows) = len(means), grid
     order = None if runs is None else _order(runs, count, program)
@@ -136,7 +138,7 @@ def _entries(splats: list[Tensor], runs: Runs | None, grid: tuple[int, int], pro
 class _Pullback:
     """What is kept of a picture for its backward pass: see `RasterPullback`."""
 
-    program: Program
+    program: CudaProgram
     splats: list[Tensor]
     background: Tensor
     entries: _Entries
@@ -157,8 +159,8 @@ class _Pullback:
         wanted = [None if g is None else g.contiguous() for g in (image, alpha, depth)]
         first = slice(count)
         kept = ctypes.c_longlong(len(means[first]))
-        sums = means.new_zeros(len(entries.owners), SUMS)
-        picture: list[Argument] = [self.raster.image, self.transmittance, self.last, self.raster.depth]
+        sums = means.new_zeros(len(entries.owners), SUMS_PER_ENTRY)
+        picture: list[KernelArgument] = [self.raster.image, self.transmittance, self.last, self.raster.depth]
         self.program.launch(
             "rasterise_backward", (-(-width // TILE_PX), -(-height // TILE_PX)), (THREADS,), *self.splats,
             entries.owners, entries.order, entries.bounds, ctypes.c_int(width), ctypes.c_int(height), *picture,

@@ -5,12 +5,12 @@ from __future__ import annotations
 import torch
 
 #: Room beyond what the views before needed, in parts of it and in splats.
-SLACK, SPARE = 1.125, 256
+MARGIN_FACTOR, MARGIN_SPLATS = 1.125, 256
 #: What a view needed counts this much less with each that follows.
-KEPT = 0.98
+DECAY = 0.98
 
 
-class Room:
+class SplatCapacity:
     """Splats for each anchor in view, on each device: the most that recent views needed.
 
     Views, models and threads share it: what it says costs memory or a second pass, never a bit of the result.
@@ -22,10 +22,10 @@ class Room:
     def for_anchors(self, count: int, offsets: int, device: torch.device) -> int:
         """Splats to make room for, of so many anchors with so many offsets: half of these until a view is known."""
         share = self._shares.get((str(device), offsets), offsets / 2)
-        return min(int(SLACK * share * count) + SPARE, count * offsets)
+        return min(int(MARGIN_FACTOR * share * count) + MARGIN_SPLATS, count * offsets)
 
-    def learn(self, count: int, offsets: int, device: torch.device, splats: int) -> None:
+    def update(self, count: int, offsets: int, device: torch.device, splats: int) -> None:
         """So many splats they were."""
         if count:
             key = str(device), offsets
-            self._shares[key] = max(splats / count, KEPT * self._shares.get(key, 0.0))
+            self._shares[key] = max(splats / count, DECAY * self._shares.get(key, 0.0))

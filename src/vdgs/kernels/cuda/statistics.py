@@ -8,38 +8,38 @@ import torch
 from jaxtyping import Bool, Float, Int32, Int64
 from torch import Tensor
 
-from vdgs.kernels.cuda.decode import sources_of
-from vdgs.kernels.cuda.launch import Program
-from vdgs.kernels.kernel_types import Statistics
-from vdgs.kernels.splat_segments import Shown
+from vdgs.kernels.cuda.decode import expand_sources
+from vdgs.kernels.cuda.launch import CudaProgram
+from vdgs.kernels.kernel_types import DensificationStats
+from vdgs.kernels.splat_segments import SplatMask
 from vdgs.kernels.torch_ref.statistics import check_inside, check_sources
 
 #: Threads of a block: kThreads of the source.
 THREADS = 256
-PROGRAM = Program(name="statistics.cu")
+PROGRAM = CudaProgram(name="statistics.cu")
 
 
 def add_view_statistics(
-    statistics: Statistics,
+    statistics: DensificationStats,
     visible: Int64[Tensor, "v"],
     inside: Bool[Tensor, "v"],
-    source: Int32[Tensor, "m"] | Shown,
+    source: Int32[Tensor, "m"] | SplatMask,
     opacities: Float[Tensor, "m"],
     gradient_px: Float[Tensor, "m 2"],
     width: int,
     height: int,
     *,
-    program: Program = PROGRAM,
+    program: CudaProgram = PROGRAM,
 ) -> None:
     """As `reference.statistics.add_view_statistics`, for tensors on a CUDA device; float32, and sums contiguous.
 
     One pass, same bits every time, nothing waits for the device, which does not look whether sources belong to the
     visible anchors. Raises ValueError or TypeError for unsuitable tensors, CudaUnavailable where the kernel cannot be
-    run. Anchors may come in any order; splats of one must stand together. Where only what shows is known (`Shown`), the
+    run. Anchors may come in any order; splats of one must stand together. Where only what shows is known (`SplatMask`), the
     sources are written out first.
     """
     sums, k = statistics.tensors(), statistics.gradient.shape[1]
-    sources = sources_of(source)
+    sources = expand_sources(source)
     check_sources(sources, visible, k)
     check_inside(inside, visible)
     _check_types(sums | {"opacities": opacities, "gradient_px": gradient_px}, sources)

@@ -12,43 +12,43 @@ from torch import Tensor
 
 from vdgs.errors import VdgsError
 from vdgs.kernels import cuda, gsplat
-from vdgs.kernels.gsplat.rasterize import GsplatUnavailable, load
+from vdgs.kernels.gsplat.rasterize import GsplatUnavailable, load_gsplat
 from vdgs.kernels.kernel_types import Raster, RasterPullback, Splats
 
 #: Environment variable that takes one of them: `gsplat` or `cuda`.
-VARIABLE = "VDGS_RASTERISER"
+RASTERIZER_ENV_VAR = "VDGS_RASTERISER"
 
 
-def rasterise(
+def rasterize(
     splats: Splats, background: Float[Tensor, "3"], width: int, height: int, *, depth: bool = False
 ) -> Raster:
-    """As `native.rasterise`, for float32 tensors on a GPU."""
-    return _drawing(depth).rasterise(splats, background, width, height, depth=depth)
+    """As `native.rasterize`, for float32 tensors on a GPU."""
+    return _drawing(depth).rasterize(splats, background, width, height, depth=depth)
 
 
-def rasterise_vjp(
+def rasterize_vjp(
     splats: Splats, background: Float[Tensor, "3"], width: int, height: int, *, depth: bool = False
 ) -> tuple[Raster, RasterPullback]:
-    """`rasterise` without autograd: the picture, and the way back from it, which may read the splats again."""
-    return _drawing(depth).rasterise_vjp(splats, background, width, height, depth=depth)
+    """`rasterize` without autograd: the picture, and the way back from it, which may read the splats again."""
+    return _drawing(depth).rasterize_vjp(splats, background, width, height, depth=depth)
 
 
 def _drawing(depth: bool) -> ModuleType:
-    return cuda if depth else chosen(os.environ.get(VARIABLE, ""))
+    return cuda if depth else select_rasterizer(os.environ.get(RASTERIZER_ENV_VAR, ""))
 
 
 @cache
-def chosen(asked: str) -> ModuleType:
+def select_rasterizer(name: str) -> ModuleType:
     """The implementation that is asked for, or the one that can be used. Raises GsplatUnavailable where gsplat is asked
     for and cannot be used, VdgsError for another word."""
-    if asked not in ("", "gsplat", "cuda"):
-        raise VdgsError(f"{VARIABLE} must be gsplat, cuda or not set, not {asked!r}.")
-    if asked == "cuda":
+    if name not in ("", "gsplat", "cuda"):
+        raise VdgsError(f"{RASTERIZER_ENV_VAR} must be gsplat, cuda or not set, not {name!r}.")
+    if name == "cuda":
         return cuda
     try:
-        load()
+        load_gsplat()
     except GsplatUnavailable:
-        if asked:
+        if name:
             raise
         return cuda
     return gsplat

@@ -4,5 +4,5 @@ Many cards have run it, and none the own kernels so far: where it is installed, 
 of training (`vdgs.kernels.gpu`). It follows gsplat 1.5.3 (docs/cuda.md).
 """
 
-from vdgs.kernels.gsplat.rasterize import rasterise as rasterise
-from vdgs.kernels.gsplat.rasterize import rasterise_vjp as rasterise_vjp
+from vdgs.kernels.gsplat.rasterize import rasterize as rasterize
+from vdgs.kernels.gsplat.rasterize import rasterize_vjp as rasterize_vjp

@@ -18,7 +18,7 @@ from jaxtyping import Float, Int32
 from torch import Tensor
 
 from vdgs.errors import VdgsError
-from vdgs.kernels.autograd import pulled_back
+from vdgs.kernels.autograd import vjp_from_autograd
 from vdgs.kernels.constants import ALPHA_MIN
 from vdgs.kernels.kernel_types import Raster, RasterPullback, Splats
 from vdgs.kernels.splat_checks import check_splats
@@ -31,7 +31,7 @@ class GsplatUnavailable(VdgsError):
     """gsplat is not installed or does not load."""
 
 
-def rasterise(
+def rasterize(
     splats: Splats,
     background: Float[Tensor, "3"],
     width: int,
@@ -40,18 +40,18 @@ def rasterise(
     depth: bool = False,
     engine: Any = None,
 ) -> Raster:
-    """As `native.rasterise`, for tensors on a GPU; depths must be positive (gsplat sorts by their bits).
+    """As `native.rasterize`, for tensors on a GPU; depths must be positive (gsplat sorts by their bits).
 
     Waits for the device once, in `isect_tiles`: for how many tiles the splats reach. `engine` offers gsplat's three
     functions (default: gsplat, which compiles its kernels when first used; that takes minutes and a CUDA toolkit).
     Raises GsplatUnavailable without gsplat, TypeError or ValueError for unsuitable tensors.
     """
-    engine = engine or load()
+    engine = engine or load_gsplat()
     check_splats((*splats.tensors, background), width, height)
     means_px, conics, colours, opacities, depths = splats.tensors
     if not len(means_px):
         return _empty(background, width, height, depth)
-    reach = reach_px(splats)
+    reach = splat_radii_px(splats)
     columns, rows = -(-width // TILE_PX), -(-height // TILE_PX)
     # gsplat draws several pictures at once: this is one.
     means, radii, near = means_px[None], reach[None], depths[None]
@@ -67,7 +67,7 @@ def rasterise(
     return Raster(picture[0, ..., :3], alpha[0, ..., 0], picture[0, ..., 3] if depth else None)
 
 
-def rasterise_vjp(
+def rasterize_vjp(
     splats: Splats,
     background: Float[Tensor, "3"],
     width: int,
@@ -76,16 +76,16 @@ def rasterise_vjp(
     depth: bool = False,
     engine: Any = None,
 ) -> tuple[Raster, RasterPullback]:
-    """`rasterise`, and the way back from it: gsplat's own derivative, those of the means in pixels among it."""
+    """`rasterize`, and the way back from it: gsplat's own derivative, those of the means in pixels among it."""
 
     def draw(splats: Splats, background: Tensor) -> Raster:
-        return rasterise(splats, background, width, height, depth=depth, engine=engine)
+        return rasterize(splats, background, width, height, depth=depth, engine=engine)
 
-    return pulled_back(draw, splats, background)
+    return vjp_from_autograd(draw, splats, background)
 
 
 @torch.no_grad()
-def reach_px(splats: Splats) -> Int32[Tensor, "m 2"]:
+def splat_radii_px(splats: Splats) -> Int32[Tensor, "m 2"]:
     """How far from its centre, in x and y, a splat's alpha is at least 1/255; 0 for one that is not to be drawn.
 
     Those are the splats of which a number is not finite, or whose conic is not positive definite. On the ellipse
@@ -105,7 +105,7 @@ def reach_px(splats: Splats) -> Int32[Tensor, "m 2"]:
     return torch.where(drawn[:, None], reach, torch.zeros_like(reach)).to(torch.int32)
 
 
-def load() -> Any:
+def load_gsplat() -> Any:
     """gsplat, as installed, its kernels compiled. Raises GsplatUnavailable, with what to do, if it cannot be used."""
     try:
         engine = importlib.import_module("gsplat")

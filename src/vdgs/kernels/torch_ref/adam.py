@@ -20,11 +20,11 @@ import torch
 from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
-from vdgs.kernels.kernel_types import AdamState, Finite
-from vdgs.kernels.transfer import may_look
+from vdgs.kernels.kernel_types import AdamState, IsFinite
+from vdgs.kernels.transfer import is_host
 
 
-class StepFactors(NamedTuple):
+class AdamStepFactors(NamedTuple):
     """What a step needs of its settings: parameter -= rate · m / (sqrt(v) · root + epsilon).
 
     `rates` and `roots` hold what follows from 1, 2, ... updates of a row, the last one also from all that are more.
@@ -47,7 +47,7 @@ def adam_rows(
     beta1: float = 0.9,
     beta2: float = 0.999,
     epsilon: float = 1e-15,
-) -> Finite:
+) -> IsFinite:
     """One step of Adam (Kingma and Ba 2015, algorithm 1) on the given rows, in place.
 
     `gradient` holds one row for each of `rows`, which ascend without repetition; None means all rows.
@@ -61,7 +61,7 @@ def adam_rows(
     check_rows(state, rows, gradient)
     factors = check_step(state, step, len(gradient), beta1, beta2, epsilon)
     finite: Tensor | None = torch.isfinite(gradient).all()
-    if may_look(gradient):
+    if is_host(gradient):
         if not bool(finite):
             return False
         finite = None
@@ -79,13 +79,13 @@ def adam_rows(
 
 
 def _of_rows(
-    factors: StepFactors, state: AdamState, step: int | Tensor, gradient: Tensor
+    factors: AdamStepFactors, state: AdamState, step: int | Tensor, gradient: Tensor
 ) -> tuple[float | Tensor, float | Tensor]:
     """Rate and root of each row of the gradient, shaped so that they multiply them; numbers if all share them."""
     if isinstance(step, int):
         return float(factors.rates[0]), float(factors.roots[0])
     # The rate changes with every step, these tables never: so they are on the card but once.
-    lacking, roots = tables_on(factors.beta1, factors.beta2, gradient.device)
+    lacking, roots = bias_correction_tables(factors.beta1, factors.beta2, gradient.device)
     place = (step.long() - 1).clamp(max=len(roots) - 1)
     root = roots[place]
     rate = root.clamp(max=state.early) * state.learning_rate / lacking[place]
@@ -94,7 +94,7 @@ def _of_rows(
 
 
 @cache
-def tables_on(beta1: float, beta2: float, device: torch.device) -> tuple[Tensor, Tensor]:
+def bias_correction_tables(beta1: float, beta2: float, device: torch.device) -> tuple[Tensor, Tensor]:
     """1 - beta1^u and 1 / sqrt(1 - beta2^u) for u = 1, 2, ... updates, in float64."""
     first, second = _lacking(beta1, beta2)
     return torch.from_numpy(first).to(device), torch.from_numpy(1 / np.sqrt(second)).to(device)
@@ -102,14 +102,14 @@ def tables_on(beta1: float, beta2: float, device: torch.device) -> tuple[Tensor,
 
 def check_step(
     state: AdamState, step: int | Tensor, count: int, beta1: float, beta2: float, epsilon: float
-) -> StepFactors:
+) -> AdamStepFactors:
     """The factors of a step of `count` rows: of one number of updates, or where a tensor has that of each row, of any.
 
     Raises ValueError or TypeError for settings out of range, and unless a tensor counts the updates of each row.
     """
     if isinstance(step, int):
         return step_factors(state.learning_rate, step, beta1, beta2, epsilon, state.early)
-    check_updates(step, count, least=1)
+    check_updates(step, count, min_updates=1)
     return step_factors(state.learning_rate, None, beta1, beta2, epsilon, state.early)
 
 
@@ -119,8 +119,8 @@ def step_factors(
     beta1: float = 0.9,
     beta2: float = 0.999,
     epsilon: float = 1e-15,
-    early: float = 1.0,
-) -> StepFactors:
+    lr_boost: float = 1.0,
+) -> AdamStepFactors:
     """The factors after so many updates, or after any number of them (None), with both bias corrections folded in.
 
     Raises ValueError for settings out of range.
@@ -135,10 +135,10 @@ def step_factors(
         raise ValueError(f"step counts from 1, got {updates}")
     else:
         first, second = np.array([1 - beta1**updates]), np.array([1 - beta2**updates])
-    if not (math.isfinite(early) and early >= 1):
-        raise ValueError(f"early must be finite and at least 1, got {early}")
+    if not (math.isfinite(lr_boost) and lr_boost >= 1):
+        raise ValueError(f"early must be finite and at least 1, got {lr_boost}")
     roots = 1 / np.sqrt(second)
-    return StepFactors(np.minimum(early, roots) * learning_rate / first, roots, beta1, beta2, epsilon)
+    return AdamStepFactors(np.minimum(lr_boost, roots) * learning_rate / first, roots, beta1, beta2, epsilon)
 
 
 @cache
@@ -172,14 +172,14 @@ def check_rows(state: AdamState, rows: Tensor | None, gradient: Tensor) -> None:
         raise ValueError(f"gradient is {list(gradient.shape)}, not {expected}: one row for each of the rows")
 
 
-def check_updates(updates: Tensor, count: int, least: int = 0) -> None:
+def check_updates(updates: Tensor, count: int, min_updates: int = 0) -> None:
     """Raise a clear error unless these are `count` numbers of updates, none below `least`."""
     if updates.dtype != torch.int32:
         raise TypeError(f"updates must be int32, not {updates.dtype}")
     if updates.shape != (count,):
         raise ValueError(f"updates must be [{count}], not {list(updates.shape)}")
-    if may_look(updates) and count and int(updates.min()) < least:
-        raise ValueError(f"updates count from {least}, got {int(updates.min())}")
+    if is_host(updates) and count and int(updates.min()) < min_updates:
+        raise ValueError(f"updates count from {min_updates}, got {int(updates.min())}")
 
 
 def check_indices(rows: Tensor, count: int) -> None:
@@ -188,7 +188,7 @@ def check_indices(rows: Tensor, count: int) -> None:
         raise TypeError(f"rows must be int64, not {rows.dtype}")
     if rows.ndim != 1:
         raise ValueError(f"rows must be [v], not {list(rows.shape)}")
-    if not len(rows) or not may_look(rows):
+    if not len(rows) or not is_host(rows):
         return
     if not bool((rows[1:] > rows[:-1]).all()):
         raise ValueError("rows must ascend without repetition")

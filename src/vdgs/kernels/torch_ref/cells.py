@@ -27,12 +27,12 @@ def cell_keys(positions: Float[Tensor, "n 3"], cell_size: float, origin: Float[T
     check_lattice(positions, cell_size, origin)
     index = torch.floor((positions.to(torch.float64) - origin.to(torch.float64)) / cell_size) + AXIS_OFFSET
     if not bool(((index >= 0) & (index <= AXIS_MASK)).all()):
-        raise ValueError(too_far(cell_size))
+        raise ValueError(lattice_range_message(cell_size))
     x, y, z = index.to(torch.int64).unbind(dim=1)
     return (x << (2 * AXIS_BITS)) | (y << AXIS_BITS) | z
 
 
-def cell_centres(keys: Int64[Tensor, "n"], cell_size: float, origin: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
+def cell_centers(keys: Int64[Tensor, "n"], cell_size: float, origin: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
     """Centre of each cell, in the type of `origin`."""
     shifts = torch.tensor([2 * AXIS_BITS, AXIS_BITS, 0], device=keys.device)
     index = ((keys[:, None] >> shifts) & AXIS_MASK) - AXIS_OFFSET
@@ -100,7 +100,7 @@ def _spread(index: Int64[Tensor, "n 3"]) -> Int64[Tensor, "n 3"]:
     return index
 
 
-def too_far(cell_size: float) -> str:
+def lattice_range_message(cell_size: float) -> str:
     """What to say where a position has no key."""
     return (
         f"a position lies beyond 2^20 cells of side {cell_size:g} from the origin, or is not finite: "

@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from vdgs.geometry.camera import NEAR, Camera
+from vdgs.geometry.camera import NEAR_PLANE, Camera
 from vdgs.kernels.constants import DILATION_PX2, FRUSTUM_MARGIN
-from vdgs.kernels.transfer import beside
+from vdgs.kernels.transfer import to_like
 
 
 @torch.no_grad()
@@ -21,14 +21,14 @@ def cull(positions: Float[Tensor, "n 3"], log_scales: Float[Tensor, "n 6"], came
     (u = clamp(x/z)) as in `project`; along y likewise. Choice: no anchor is dropped whose projected
     ellipse touches the image; a few are kept whose ellipse does not.
     """
-    rigid = beside(camera.camera_from_world, positions)
+    rigid = to_like(camera.camera_from_world, positions)
     local = positions @ rigid[:3, :3].T + rigid[:3, 3]
     sigma_squared = torch.exp(2 * log_scales[:, :3].amax(-1))
     z = local[:, 2]
-    near_enough = z > NEAR
+    near_enough = z > NEAR_PLANE
     for axis, focal, centre, size, whole in (
-        (0, camera.fx, camera.cx, camera.width, camera.whole_size[0]),
-        (1, camera.fy, camera.cy, camera.height, camera.whole_size[1]),
+        (0, camera.fx, camera.cx, camera.width, camera.full_size[0]),
+        (1, camera.fy, camera.cy, camera.height, camera.full_size[1]),
     ):
         if camera.model == "orthographic":
             pixel = focal * local[:, axis] + centre

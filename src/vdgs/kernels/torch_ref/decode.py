@@ -10,9 +10,9 @@ from torch import Tensor
 
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.constants import ALPHA_MIN
-from vdgs.kernels.kernel_types import AnchorSplats, DecoderWeights, Projected, TrainingSplats
+from vdgs.kernels.kernel_types import AnchorSplats, DecoderWeights, ProjectedGaussians, TrainingSplats
 from vdgs.kernels.torch_ref.project import project_with_variances
-from vdgs.kernels.transfer import beside
+from vdgs.kernels.transfer import to_like
 
 
 def decode(
@@ -40,7 +40,7 @@ def decode(
     anchors = _Anchors.of(positions, features, offsets, log_scales, weights, camera)
     usable = (anchors.opacities > 0) & anchors.finite[:, None] & torch.isfinite(offsets).all(-1)
     anchor, offset = usable.nonzero(as_tuple=True)
-    projected, variances, drawn = _spawned(anchors, anchor, offset, weights, camera)
+    projected, variances, drawn = _decode_offsets(anchors, anchor, offset, weights, camera)
     kept = (projected.valid & _on_image(projected.means_px, variances, drawn.opacities, camera)).nonzero()[:, 0]
     return AnchorSplats(
         **{name: getattr(drawn, name)[kept] for name in ("means_px", "conics", "depths", "colours", "opacities")},
@@ -50,7 +50,7 @@ def decode(
 
 
 @torch.no_grad()
-def decode_to_train(
+def decode_for_training(
     positions: Float[Tensor, "n 3"],
     features: Float[Tensor, "n 32"],
     offsets: Float[Tensor, "n k 3"],
@@ -64,7 +64,7 @@ def decode_to_train(
     return TrainingSplats.of(decode(positions, features, offsets, log_scales, weights, camera, rows))
 
 
-def decode_chosen(
+def decode_subset(
     positions: Float[Tensor, "v 3"],
     features: Float[Tensor, "v 32"],
     offsets: Float[Tensor, "v k 3"],
@@ -77,7 +77,7 @@ def decode_chosen(
     k = offsets.shape[1]
     anchors = _Anchors.of(positions, features, offsets, log_scales, weights, camera)
     chosen = source.long()
-    _, _, drawn = _spawned(anchors, chosen // k, chosen % k, weights, camera)
+    _, _, drawn = _decode_offsets(anchors, chosen // k, chosen % k, weights, camera)
     return replace(drawn, source=source)
 
 
@@ -109,20 +109,20 @@ class _Anchors:
             torch.where(finite[:, None], t, torch.zeros_like(t)) for t in (positions, viewing, features, log_scales)
         )
         inputs = torch.cat([features, viewing], -1)
-        opacities = torch.tanh(weights.opacity.outputs(inputs))
+        opacities = torch.tanh(weights.opacity.forward(inputs))
         return _Anchors(
             positions=positions, offsets=offsets, log_scales=log_scales, inputs=inputs, opacities=opacities,
             finite=finite,
         )  # fmt: skip
 
 
-def _spawned(
+def _decode_offsets(
     anchors: _Anchors, anchor: Int64[Tensor, "m"], offset: Int64[Tensor, "m"], weights: DecoderWeights, camera: Camera
-) -> tuple[Projected, Float[Tensor, "m 2"], AnchorSplats]:
+) -> tuple[ProjectedGaussians, Float[Tensor, "m 2"], AnchorSplats]:
     """What these offsets of these anchors become: projected, their variances along x and y, and all of it as splats."""
     k = anchors.offsets.shape[1]
-    covariance = weights.covariance.outputs(anchors.inputs).unflatten(1, (k, 7))[anchor, offset]
-    colour = torch.sigmoid(weights.colour.outputs(anchors.inputs).unflatten(1, (k, 3))[anchor, offset])
+    covariance = weights.covariance.forward(anchors.inputs).unflatten(1, (k, 7))[anchor, offset]
+    colour = torch.sigmoid(weights.colour.forward(anchors.inputs).unflatten(1, (k, 3))[anchor, offset])
     extent = torch.exp(anchors.log_scales)[anchor]
     means = anchors.positions[anchor] + anchors.offsets[anchor, offset] * extent[:, :3]
     scales = extent[:, 3:] * torch.sigmoid(covariance[:, :3])
@@ -137,10 +137,10 @@ def _spawned(
 
 def _viewing(positions: Tensor, camera: Camera) -> Float[Tensor, "v 4"]:
     """Viewing direction and distance of every anchor."""
-    ray = positions - beside(camera.position, positions)
+    ray = positions - to_like(camera.position, positions)
     distance = ray.norm(dim=-1, keepdim=True)
     level = camera.model == "orthographic"
-    direction = beside(camera.forward, positions).expand_as(ray) if level else ray / distance
+    direction = to_like(camera.forward, positions).expand_as(ray) if level else ray / distance
     return torch.cat([direction, distance], -1)
 
 
@@ -158,6 +158,6 @@ def _on_image(means_px: Tensor, variances: Tensor, opacity: Tensor, camera: Came
     """
     level = 2 * torch.log(opacity / ALPHA_MIN)
     reach = torch.sqrt(level.clamp(min=0)[:, None] * variances)
-    size = beside([camera.width, camera.height], means_px)
+    size = to_like([camera.width, camera.height], means_px)
     touches = (means_px + reach >= 0.5) & (means_px - reach <= size - 0.5)
     return touches.all(-1) & (level >= 0)

@@ -9,10 +9,10 @@ from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 from vdgs.geometry.camera import Camera
-from vdgs.kernels.kernel_types import AdamState, DecoderWeights, Finite, SplatGradients
-from vdgs.kernels.splat_segments import tensor_of
+from vdgs.kernels.kernel_types import AdamState, DecoderWeights, IsFinite, SplatGradients
+from vdgs.kernels.splat_segments import sources_tensor
 from vdgs.kernels.torch_ref.adam import adam_rows, check_updates
-from vdgs.kernels.torch_ref.decode import decode_chosen
+from vdgs.kernels.torch_ref.decode import decode_subset
 
 
 def decode_backward_adam(
@@ -23,7 +23,7 @@ def decode_backward_adam(
     rows: Int64[Tensor, "v"],
     gradients: SplatGradients,
     updates: Int32[Tensor, "n"],
-) -> tuple[Finite, tuple[Tensor, ...] | None]:
+) -> tuple[IsFinite, tuple[Tensor, ...] | None]:
     """Differentiate `decode(positions, *parameters, weights, camera, rows)`, and move these rows, in place.
 
     `moved` are features, offsets and log-scales; `gradients` are those of the splats that decoding gave. `updates` says
@@ -35,8 +35,8 @@ def decode_backward_adam(
     leaves = [state.parameter[rows].detach().requires_grad_(True) for state in moved]
     decoder = weights.map(lambda t: t.detach().requires_grad_(True))
     with torch.enable_grad():
-        source = tensor_of(gradients.source)
-        again = decode_chosen(positions[rows], leaves[0], leaves[1], leaves[2], decoder, camera, source)
+        source = sources_tensor(gradients.source)
+        again = decode_subset(positions[rows], leaves[0], leaves[1], leaves[2], decoder, camera, source)
         outputs = [again.means_px, again.conics, again.colours, again.opacities, again.volumes]
     received = [gradients.means_px, gradients.conics, gradients.colours, gradients.opacities,
                 torch.full_like(again.volumes, gradients.volume)]  # fmt: skip
@@ -44,7 +44,7 @@ def decode_backward_adam(
         outputs, received = [*outputs, again.depths], [*received, gradients.depths]
     found = torch.autograd.grad(outputs, [*leaves, *decoder.tensors()], received)
     counted = updates[rows] + 1
-    finite: Finite = True
+    finite: IsFinite = True
     for state, gradient in zip(moved, found, strict=False):
         finite = adam_rows(state, rows, gradient, counted) & finite
     updates[rows] = counted

@@ -13,12 +13,12 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from vdgs.kernels.rotations import rotation_matrices
-from vdgs.kernels.torch_ref.harmonics import check_runs
+from vdgs.kernels.torch_ref.harmonics import check_starts
 
 #: The six numbers of a symmetric matrix.
-UPPER = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+UPPER_TRIANGLE = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 #: Rounds of Jacobi's method: each squares what is left beside the diagonal, at the end.
-SWEEPS = 5
+JACOBI_SWEEPS = 5
 
 
 def mean_ellipsoids(
@@ -28,36 +28,36 @@ def mean_ellipsoids(
     """Logarithms of the scales and unit quaternions, wxyz, of the mean of each Gaussian, whose pairs begin at `starts`.
     The axes come in any order. Weights are positive. Raises ValueError unless each has a pair and the first begins with
     the first pair."""
-    check_runs(starts, len(weights))
+    check_starts(starts, len(weights))
     if not len(starts):
         return log_scales.new_empty(0, 3), quaternions.new_empty(0, 4)
     counts = torch.diff(starts, append=starts.new_tensor([len(weights)]))
     gaussian = torch.arange(len(starts), device=starts.device).repeat_interleave(counts)
     shares = weights.double()[:, None]
     sums = shares.new_zeros(len(starts), 7)
-    sums.index_add_(0, gaussian, torch.cat([shares * logarithms(log_scales, quaternions), shares], 1))
-    return ellipsoids(sums[:, :6] / sums[:, 6:])
+    sums.index_add_(0, gaussian, torch.cat([shares * log_covariances(log_scales, quaternions), shares], 1))
+    return from_log_covariances(sums[:, :6] / sums[:, 6:])
 
 
-def logarithms(log_scales: Float[Tensor, "p 3"], quaternions: Float[Tensor, "p 4"]) -> Float[Tensor, "p 6"]:
-    """R diag(ln s) Rᵀ, as in `UPPER`."""
+def log_covariances(log_scales: Float[Tensor, "p 3"], quaternions: Float[Tensor, "p 4"]) -> Float[Tensor, "p 6"]:
+    """R diag(ln s) Rᵀ, as in `UPPER_TRIANGLE`."""
     axes = rotation_matrices(quaternions)
     scaled = axes * log_scales[:, None]
-    return torch.stack([(scaled[:, i] * axes[:, j]).sum(1) for i, j in UPPER], 1)
+    return torch.stack([(scaled[:, i] * axes[:, j]).sum(1) for i, j in UPPER_TRIANGLE], 1)
 
 
-def ellipsoids(logarithm: Float[Tensor, "m 6"]) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 4"]]:
+def from_log_covariances(logarithm: Float[Tensor, "m 6"]) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 4"]]:
     """The inverse: logarithms of the scales and unit quaternions, wxyz. The axes come in any order.
 
     Jacobi's method (Golub and Van Loan, Matrix Computations, 8.5), of all matrices at once.
     """
     columns = logarithm.double().unbind(1)
     a = logarithm.new_empty(3, 3, len(logarithm), dtype=torch.float64)
-    for (i, j), column in zip(UPPER, columns, strict=True):
+    for (i, j), column in zip(UPPER_TRIANGLE, columns, strict=True):
         a[i, j] = a[j, i] = column
     q = torch.zeros_like(a[0, 0]).repeat(4, 1)
     q[0] = 1.0
-    for _ in range(SWEEPS):
+    for _ in range(JACOBI_SWEEPS):
         for i, j in ((0, 1), (1, 2), (2, 0)):
             half = _turn(a, i, j)
             q = _times(q, half.cos(), 3 - i - j, half.sin())

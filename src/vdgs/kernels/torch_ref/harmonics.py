@@ -13,15 +13,15 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from vdgs.kernels.spherical_harmonics import basis, function_count, view_colours
+from vdgs.kernels.spherical_harmonics import eval_sh_bases, eval_sh_colors, num_sh_bases
 
 #: So many regressions are solved together, of about as many pairs each: their matrices stay in the cache.
-TOGETHER = 2048
+BATCH_GAUSSIANS = 2048
 #: Pairs of those at most, unless one alone has more.
-PAIRS_TOGETHER = 1 << 16
+BATCH_PAIRS = 1 << 16
 
 
-def harmonic_colours(
+def harmonic_colors(
     means: Float[Tensor, "m 3"], coefficients: Float[Tensor, "n c"], rows: Int64[Tensor, " m"],
     eye: Float[Tensor, "3"], degree: int,
 ) -> Float[Tensor, "m 3"]:  # fmt: skip
@@ -33,7 +33,7 @@ def harmonic_colours(
     check_coefficients(coefficients, rows, degree)
     chosen = coefficients[rows].unflatten(1, (-1, 3))
     directions = torch.nn.functional.normalize(means - eye, dim=1)
-    return view_colours(chosen[:, 0], chosen[:, 1:], directions, degree)
+    return eval_sh_colors(chosen[:, 0], chosen[:, 1:], directions, degree)
 
 
 def fit_harmonics(
@@ -42,8 +42,8 @@ def fit_harmonics(
 ) -> Float[Tensor, "m f 3"]:  # fmt: skip
     """Coefficients of each Gaussian, whose pairs begin at `starts`. Directions are unit, from the camera; weights are
     not negative. Raises ValueError unless each has a pair and the first begins with the first pair."""
-    check_runs(starts, len(weights))
-    functions = basis(directions, degree)
+    check_starts(starts, len(weights))
+    functions = eval_sh_bases(directions, degree)
     f = functions.shape[1]
     known = torch.cat([functions, colours - 0.5], 1)
     pull = functions.new_full((f,), ridge, dtype=torch.float64)
@@ -68,7 +68,7 @@ def _alike(
     first = 0
     while first < len(order):
         most = int(counts[order[first]])
-        rows = order[first : first + max(1, min(TOGETHER, PAIRS_TOGETHER // most))]
+        rows = order[first : first + max(1, min(BATCH_GAUSSIANS, BATCH_PAIRS // most))]
         inside = torch.arange(most, device=starts.device)
         places = starts[rows, None] + inside
         yield rows, places.clamp(max=pairs - 1), inside < counts[rows, None]
@@ -77,13 +77,13 @@ def _alike(
 
 def check_coefficients(coefficients: Tensor, rows: Tensor, degree: int) -> None:
     """Raise ValueError unless they are of this degree, IndexError unless all rows are among them."""
-    if coefficients.shape[1] != 3 * function_count(degree):
-        raise ValueError(f"degree {degree} has {3 * function_count(degree)} coefficients, not {coefficients.shape[1]}")
+    if coefficients.shape[1] != 3 * num_sh_bases(degree):
+        raise ValueError(f"degree {degree} has {3 * num_sh_bases(degree)} coefficients, not {coefficients.shape[1]}")
     if len(rows) and not (int(rows.min()) >= 0 and int(rows.max()) < len(coefficients)):
         raise IndexError(f"a row lies outside the {len(coefficients)} Gaussians")
 
 
-def check_runs(starts: Tensor, pairs: int) -> None:
+def check_starts(starts: Tensor, pairs: int) -> None:
     """Raise ValueError unless pairs are cut into runs, each of at least one."""
     if not len(starts):
         if pairs:

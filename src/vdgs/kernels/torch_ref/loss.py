@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from vdgs.kernels.constants import SSIM_WINDOW_PX
-from vdgs.kernels.kernel_types import Photometric
+from vdgs.kernels.kernel_types import PhotometricLoss
 
 #: Standard deviation of the SSIM window in pixels.
 SIGMA_PX = 1.5
@@ -28,7 +28,7 @@ def photometric_loss(
     mask: UInt8[Tensor, "h w"] | None = None,
     *,
     ssim_weight: float = 0.2,
-) -> Photometric:
+) -> PhotometricLoss:
     """(1 - ssim_weight) · L1 + ssim_weight · (1 - SSIM) between `image` (in [0, 1]) and `target` / 255.
 
     Pixels where `mask` is zero do not count: there the image is replaced by the target, so that the
@@ -51,7 +51,7 @@ def photometric_loss(
     l1 = ((image - goal).abs() * kept).sum() / count
     dissimilarity = ((1 - _ssim_map(image, goal)) * kept).sum() / count
     loss = (1 - ssim_weight) * l1 + ssim_weight * dissimilarity
-    return Photometric(loss, l1.detach(), 1 - dissimilarity.detach())
+    return PhotometricLoss(loss, l1.detach(), 1 - dissimilarity.detach())
 
 
 def ssim_map(
@@ -64,7 +64,7 @@ def ssim_map(
     return _ssim_map(_unit_range(image), _unit_range(target))
 
 
-def window(dtype: torch.dtype = torch.float64) -> Float[Tensor, "taps"]:
+def gaussian_window(dtype: torch.dtype = torch.float64) -> Float[Tensor, "taps"]:
     """The separable Gaussian window, of sum 1."""
     offset = torch.arange(SSIM_WINDOW_PX, dtype=torch.float64) - SSIM_WINDOW_PX // 2
     weight = torch.exp(-(offset**2) / (2 * SIGMA_PX**2))
@@ -95,7 +95,7 @@ def _unit_range(image: Tensor) -> Float[Tensor, "h w c"]:
 
 
 def _blur(planes: Float[Tensor, "c h w"]) -> Float[Tensor, "c h w"]:
-    weight, half = window(planes.dtype).to(planes.device), SSIM_WINDOW_PX // 2
+    weight, half = gaussian_window(planes.dtype).to(planes.device), SSIM_WINDOW_PX // 2
     rows = conv2d(planes[:, None], weight[None, None, None, :], padding=(0, half))
     return conv2d(rows, weight[None, None, :, None], padding=(half, 0))[:, 0]
 

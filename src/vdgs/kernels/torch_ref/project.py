@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from vdgs.geometry.camera import NEAR, Camera
+from vdgs.geometry.camera import NEAR_PLANE, Camera
 from vdgs.kernels.constants import DILATION_PX2, FRUSTUM_MARGIN
-from vdgs.kernels.kernel_types import Projected
+from vdgs.kernels.kernel_types import ProjectedGaussians
 from vdgs.kernels.rotations import rotation_matrices
-from vdgs.kernels.transfer import beside
+from vdgs.kernels.transfer import to_like
 
 
 def project(
@@ -22,7 +22,7 @@ def project(
     scales: Float[Tensor, "m 3"],
     quaternions: Float[Tensor, "m 4"],
     camera: Camera,
-) -> Projected:
+) -> ProjectedGaussians:
     """Project Gaussians (world means, standard deviations along their axes, wxyz rotations).
 
     Quaternions are normalised here. Works in the precision of its arguments and is differentiable in
@@ -41,21 +41,21 @@ def project_with_variances(
     scales: Float[Tensor, "m 3"],
     quaternions: Float[Tensor, "m 4"],
     camera: Camera,
-) -> tuple[Projected, Float[Tensor, "m 2"]]:
+) -> tuple[ProjectedGaussians, Float[Tensor, "m 2"]]:
     """`project`, and the dilated variances along x and y in px² (one where not valid)."""
-    rigid = beside(camera.camera_from_world, means)
+    rigid = to_like(camera.camera_from_world, means)
     rotation, translation = rigid[:3, :3], rigid[:3, 3]
     local = means @ rotation.T + translation
     with torch.no_grad():
         valid = _is_valid(local, scales, quaternions, rotation, camera)
     # What is not valid is replaced before the arithmetic, so that 0 · NaN never enters a gradient.
     shown = valid[:, None]
-    local = torch.where(shown, local, beside([0.0, 0.0, 1.0], local))
+    local = torch.where(shown, local, to_like([0.0, 0.0, 1.0], local))
     scales = torch.where(shown, scales, torch.ones_like(scales))
-    quaternions = torch.where(shown, quaternions, beside([1.0, 0.0, 0.0, 0.0], quaternions))
+    quaternions = torch.where(shown, quaternions, to_like([1.0, 0.0, 0.0, 0.0], quaternions))
 
     conics, variances = _conics(*_axes_px(local, scales, quaternions, rotation, camera))
-    projected = Projected(
+    projected = ProjectedGaussians(
         means_px=torch.where(shown, _pixels(local, camera), 0.0),
         conics=torch.where(shown, conics, 0.0),
         depths=torch.where(valid, local[:, 2], 0.0),
@@ -80,8 +80,8 @@ def _axes_px(
         along_y = (camera.fy * rotation[1]).expand_as(local)
     else:
         z = local[:, 2:3]
-        limit_x = FRUSTUM_MARGIN * 0.5 * camera.whole_size[0] / camera.fx
-        limit_y = FRUSTUM_MARGIN * 0.5 * camera.whole_size[1] / camera.fy
+        limit_x = FRUSTUM_MARGIN * 0.5 * camera.full_size[0] / camera.fx
+        limit_y = FRUSTUM_MARGIN * 0.5 * camera.full_size[1] / camera.fy
         u = (local[:, 0:1] / z).clamp(-limit_x, limit_x)
         v = (local[:, 1:2] / z).clamp(-limit_y, limit_y)
         along_x = camera.fx / z * (rotation[0] - u * rotation[2])
@@ -109,4 +109,4 @@ def _is_valid(
     numbers = torch.cat([local, _pixels(local, camera), conics], -1)
     # An overflowing covariance divides finite by infinite: the conic vanishes instead of failing.
     proper = torch.isfinite(numbers).all(-1) & (conics[:, 0] > 0) & (conics[:, 2] > 0)
-    return proper & (local[:, 2] > NEAR)
+    return proper & (local[:, 2] > NEAR_PLANE)

@@ -6,12 +6,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vdgs.kernels.autograd import pulled_back
+from vdgs.kernels.autograd import vjp_from_autograd
 from vdgs.kernels.constants import ALPHA_MAX, ALPHA_MIN, MEDIAN_TRANSMITTANCE, TRANSMITTANCE_MIN
 from vdgs.kernels.kernel_types import Raster, RasterPullback, Splats
 
 
-def rasterise(
+def rasterize(
     splats: Splats,
     background: Float[Tensor, "3"],
     width: int,
@@ -45,7 +45,7 @@ def rasterise(
     return Raster(image, 1 - through, expected_depth, _median_depth(transmittance, depths))
 
 
-def rasterise_vjp(
+def rasterize_vjp(
     splats: Splats,
     background: Float[Tensor, "3"],
     width: int,
@@ -53,12 +53,12 @@ def rasterise_vjp(
     *,
     depth: bool = False,
 ) -> tuple[Raster, RasterPullback]:
-    """`rasterise` without autograd for the caller: the picture, and the way back from it (by autograd in here)."""
+    """`rasterize` without autograd for the caller: the picture, and the way back from it (by autograd in here)."""
 
     def draw(splats: Splats, background: Tensor) -> Raster:
-        return rasterise(splats, background, width, height, depth=depth)
+        return rasterize(splats, background, width, height, depth=depth)
 
-    return pulled_back(draw, splats, background)
+    return vjp_from_autograd(draw, splats, background)
 
 
 @torch.no_grad()

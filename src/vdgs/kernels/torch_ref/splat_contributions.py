@@ -8,37 +8,37 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vdgs.kernels.kernel_types import Raster, RasterPullback, Shares, Splats
-from vdgs.kernels.torch_ref.rasterize import rasterise_vjp
+from vdgs.kernels.kernel_types import Raster, RasterPullback, SplatContributions, Splats
+from vdgs.kernels.torch_ref.rasterize import rasterize_vjp
 
 
-def shares(
+def splat_contributions(
     splats: Splats,
     background: Float[Tensor, "3"],
     width: int,
     height: int,
     wanted: Float[Tensor, "h w 3"] | None = None,
-) -> Shares:
+) -> SplatContributions:
     """How many pixels each splat makes, the sum of its weights w = alpha T over them (3DGS, eq. 3), and the sum of w
     times what the picture lacks there of the wanted one (zero without).
 
     These are the derivatives of the sum of the expected depth by the depth of the splat, and, by its colour, of half of
-    the squared error of the picture, negated. Raises what `rasterise` raises.
+    the squared error of the picture, negated. Raises what `rasterize` raises.
     """
-    return shares_by(rasterise_vjp, splats, background, width, height, wanted)
+    return splat_contributions_from_vjp(rasterize_vjp, splats, background, width, height, wanted)
 
 
-def shares_by(
+def splat_contributions_from_vjp(
     draw: Callable[..., tuple[Raster, RasterPullback]],
     splats: Splats,
     background: Float[Tensor, "3"],
     width: int,
     height: int,
     wanted: Float[Tensor, "h w 3"] | None,
-) -> Shares:
-    """The same by any `rasterise_vjp`."""
+) -> SplatContributions:
+    """The same by any `rasterize_vjp`."""
     raster, pullback = draw(splats, background, width, height, depth=True)
     lacking = torch.zeros_like(raster.image) if wanted is None else wanted - raster.image
     found = pullback(lacking, None, torch.ones_like(raster.alpha))
     assert found.depths is not None
-    return Shares(found.depths, found.colours)
+    return SplatContributions(found.depths, found.colours)

@@ -6,16 +6,16 @@ import torch
 from jaxtyping import Bool, Float, Int32, Int64
 from torch import Tensor
 
-from vdgs.kernels.kernel_types import Statistics
-from vdgs.kernels.splat_segments import Shown, tensor_of
-from vdgs.kernels.transfer import may_look
+from vdgs.kernels.kernel_types import DensificationStats
+from vdgs.kernels.splat_segments import SplatMask, sources_tensor
+from vdgs.kernels.transfer import is_host
 
 
 def add_view_statistics(
-    statistics: Statistics,
+    statistics: DensificationStats,
     visible: Int64[Tensor, "v"],
     inside: Bool[Tensor, "v"],
-    source: Int32[Tensor, "m"] | Shown,
+    source: Int32[Tensor, "m"] | SplatMask,
     opacities: Float[Tensor, "m"],
     gradient_px: Float[Tensor, "m 2"],
     width: int,
@@ -31,7 +31,7 @@ def add_view_statistics(
     of each of them, before any change.
     """
     k = statistics.gradient.shape[1]
-    sources = tensor_of(source)
+    sources = sources_tensor(source)
     check_sources(sources, visible, k)
     check_inside(inside, visible)
     row = sources.long()
@@ -45,7 +45,7 @@ def add_view_statistics(
 
 def check_sources(source: Tensor, visible: Tensor, k: int) -> None:
     """Raise IndexError unless the ascending sources belong to the visible anchors."""
-    if may_look(source) and len(source) and not (int(source[0]) >= 0 and int(source[-1]) < len(visible) * k):
+    if is_host(source) and len(source) and not (int(source[0]) >= 0 and int(source[-1]) < len(visible) * k):
         raise IndexError(f"a source lies outside the {len(visible)} visible anchors of {k} offsets")
 
 

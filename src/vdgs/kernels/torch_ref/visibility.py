@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 
-from vdgs.geometry.camera import NEAR, Camera
-from vdgs.kernels.transfer import beside
+from vdgs.geometry.camera import NEAR_PLANE, Camera
+from vdgs.kernels.transfer import to_like
 
 
 def count_visibility(points: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Int32[Tensor, "n"]:
@@ -34,12 +34,12 @@ def mark_visible(points: Float[Tensor, "n 3"], camera: Camera) -> Bool[Tensor, "
     check_points(points)
     exact = points.detach().to(torch.float64)
     finite = torch.isfinite(exact).all(dim=1)
-    rigid = beside(camera.camera_from_world, exact)
+    rigid = to_like(camera.camera_from_world, exact)
     x, y, z = (torch.where(finite[:, None], exact, 0.0) @ rigid[:3, :3].T + rigid[:3, 3]).unbind(1)
     divisor = z if camera.model == "pinhole" else torch.ones_like(z)
     column, row = camera.fx * x / divisor + camera.cx, camera.fy * y / divisor + camera.cy
     inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    return finite & (z > NEAR) & inside
+    return finite & (z > NEAR_PLANE) & inside
 
 
 def check_points(points: Tensor) -> None:

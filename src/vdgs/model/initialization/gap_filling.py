@@ -17,20 +17,22 @@ from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 
 from vdgs.geometry.camera import Camera
-from vdgs.visibility.visibility_counts import visibility_of
+from vdgs.visibility.visibility_counts import count_visibility
 
 #: Edge of a grid cell in voxels; about as far apart as growth's coarsest cells can bridge.
 CELL_VOXELS = 4.0
 #: The grid reaches beyond the points by this share of their extent.
 MARGIN = 0.1
 #: Sparse points whose median height a gap takes.
-NEIGHBOURS = 16
+NUM_NEIGHBORS = 16
 #: At most this many gap points per sparse point; cells are widened until they fit.
-LARGEST_SHARE = 0.5
-MOST_CELLS = 4_000_000
+MAX_GAP_FRACTION = 0.5
+MAX_CELLS = 4_000_000
 
 
-def gap_points(points: Float[np.ndarray, "n 3"], cameras: Sequence[Camera], voxel: float) -> Float[np.ndarray, "g 3"]:
+def find_gap_points(
+    points: Float[np.ndarray, "n 3"], cameras: Sequence[Camera], voxel: float
+) -> Float[np.ndarray, "g 3"]:
     """Points [g, 3] (ground frame, z up) for the empty cells that a camera sees; none where the cover is complete.
 
     `points` are the sparse points, `voxel` the edge of the anchor grid. Deterministic. O(cells x cameras).
@@ -38,13 +40,13 @@ def gap_points(points: Float[np.ndarray, "n 3"], cameras: Sequence[Camera], voxe
     low, high = np.quantile(points[:, :2], 0.001, axis=0), np.quantile(points[:, :2], 0.999, axis=0)
     low, high = low - MARGIN * (high - low), high + MARGIN * (high - low)
     tree = cKDTree(points[:, :2])
-    cell = max(CELL_VOXELS * voxel, float(np.sqrt(np.prod(np.maximum(high - low, voxel)) / MOST_CELLS)))
+    cell = max(CELL_VOXELS * voxel, float(np.sqrt(np.prod(np.maximum(high - low, voxel)) / MAX_CELLS)))
     while True:
         centres = _empty_cells(points, low, high, cell)
         seen = _at_seen_heights(centres, points, tree, cameras)
-        if len(seen) <= LARGEST_SHARE * len(points):
+        if len(seen) <= MAX_GAP_FRACTION * len(points):
             return seen
-        cell *= float(np.sqrt(len(seen) / (LARGEST_SHARE * len(points)))) * 1.05
+        cell *= float(np.sqrt(len(seen) / (MAX_GAP_FRACTION * len(points)))) * 1.05
 
 
 def _empty_cells(points: np.ndarray, low: np.ndarray, high: np.ndarray, cell: float) -> Float[np.ndarray, "c 2"]:
@@ -64,7 +66,7 @@ def _at_seen_heights(
     """The centres lifted to the ground about them, where a camera sees them."""
     if not len(centres):
         return np.zeros((0, 3))
-    _, nearest = tree.query(centres, k=min(NEIGHBOURS, len(points)), workers=1)
+    _, nearest = tree.query(centres, k=min(NUM_NEIGHBORS, len(points)), workers=1)
     heights = np.median(points[np.asarray(nearest).reshape(len(centres), -1), 2], axis=1)
     lifted = np.column_stack([centres, heights])
-    return lifted[visibility_of(torch.from_numpy(lifted), cameras).numpy() > 0]
+    return lifted[count_visibility(torch.from_numpy(lifted), cameras).numpy() > 0]

@@ -15,13 +15,13 @@ from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import FEATURE_SIZE
 from vdgs.model.anchors import Anchors
-from vdgs.model.initialization.gap_filling import gap_points
+from vdgs.model.initialization.gap_filling import find_gap_points
 
 #: An outlier is known by its distance to this neighbour: small clusters of false matches are outliers too.
 OUTLIER_NEIGHBOUR = 4
 
 
-def automatic_voxel(points: np.ndarray) -> float:
+def auto_voxel_size(points: np.ndarray) -> float:
     """Median distance of the points [n, 3] to their nearest other point (choice; upstream forgets the root).
 
     Coincident points are counted once. Raises VdgsError with fewer than two distinct points.
@@ -36,7 +36,7 @@ def automatic_voxel(points: np.ndarray) -> float:
     return float(np.median(distances[:, 1]))
 
 
-def inliers(points: np.ndarray, factor: float) -> np.ndarray:
+def inlier_mask(points: np.ndarray, factor: float) -> np.ndarray:
     """Which points [n, 3] have their fourth nearest neighbour within `factor` times the median such distance."""
     if factor <= 0 or len(points) <= OUTLIER_NEIGHBOUR:
         return np.ones(len(points), bool)
@@ -45,12 +45,12 @@ def inliers(points: np.ndarray, factor: float) -> np.ndarray:
     return distances[:, 0] <= limit if limit > 0 else np.ones(len(points), bool)
 
 
-def voxel_of(points: np.ndarray, config: AnchorConfig) -> float:
-    """The edge of the voxel grid of the sparse points [n, 3]. Raises VdgsError as `automatic_voxel`."""
-    return config.voxel if config.voxel > 0 else automatic_voxel(points)
+def get_voxel_size(points: np.ndarray, config: AnchorConfig) -> float:
+    """The edge of the voxel grid of the sparse points [n, 3]. Raises VdgsError as `auto_voxel_size`."""
+    return config.voxel_size if config.voxel_size > 0 else auto_voxel_size(points)
 
 
-def initial_anchors(
+def initialize_anchors(
     points: np.ndarray,
     colours: np.ndarray,
     cameras: Sequence[Camera],
@@ -64,13 +64,13 @@ def initial_anchors(
     the logarithm of the mean distance to the three nearest other anchors, offsets at 0, features at 0 or at the
     colours. Raises VdgsError with fewer than two distinct points.
     """
-    voxel = voxel_of(points, config)
-    kept = inliers(points, config.outlier_distance)
+    voxel = get_voxel_size(points, config)
+    kept = inlier_mask(points, config.outlier_distance)
     points, colours = points[kept], colours[kept]
     if dense is not None:
         points, colours = (np.concatenate(pair) for pair in zip((points, colours), dense, strict=True))
     if config.fill_gaps:
-        gaps = gap_points(points, cameras, voxel)
+        gaps = find_gap_points(points, cameras, voxel)
         nearest = cKDTree(points).query(gaps, workers=1)[1] if len(gaps) else np.zeros(0, np.int64)
         points, colours = np.concatenate([points, gaps]), np.concatenate([colours, colours[nearest]])
     cells, owner = np.unique(np.round(points / voxel).astype(np.int64), axis=0, return_inverse=True)
@@ -82,7 +82,7 @@ def initial_anchors(
     else:
         spacing = np.full(n, voxel)
     features = np.zeros((n, FEATURE_SIZE))
-    if config.colour_start:
+    if config.from_colors:
         features[:, :3] = _mean_colours(colours, owner.reshape(-1), n) * 2.0 - 1.0
     as_tensor = lambda array: torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))  # noqa: E731
     anchors = Anchors(

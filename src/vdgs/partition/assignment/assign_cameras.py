@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Bool, Int8
 
 from vdgs.config.method import AssignmentConfig
-from vdgs.partition.assignment.score_matrix import Scores
+from vdgs.partition.assignment.score_matrix import ScoreMatrix
 
 #: What the numbers in `Assignment.why` mean.
 NOT_ASSIGNED, ABOVE_THRESHOLD, BEST_BLOCK, TOPPED_UP = range(4)
-WHY = ("not assigned", "above the threshold", "the view's best block", "topped up")
+REASONS = ("not assigned", "above the threshold", "the view's best block", "topped up")
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,13 +25,13 @@ class Assignment:
     """The cameras of every block: rows are cameras, columns blocks."""
 
     cameras: Bool[np.ndarray, "c b"]
-    #: The first reason that applied, as an index of `WHY`.
+    #: The first reason that applied, as an index of `REASONS`.
     why: Int8[np.ndarray, "c b"]
     #: One sentence for each block that has no camera, or that none of the cameras sees.
     complaints: list[str]
 
 
-def assign(scores: Scores, config: AssignmentConfig) -> Assignment:
+def assign_cameras(scores: ScoreMatrix, config: AssignmentConfig) -> Assignment:
     """Decide from the scores; the threshold is that of the mode in which they were made.
 
     1. A camera whose score is above the threshold joins, if its frustum holds any anchor of the block's core: without
@@ -56,10 +56,10 @@ def assign(scores: Scores, config: AssignmentConfig) -> Assignment:
         order = np.lexsort((-scores.held[:, block], -scores.scores[:, block]))
         candidates = order[seen[order, block] & (why[order, block] == NOT_ASSIGNED)]
         why[candidates[:missing], block] = TOPPED_UP
-    return Assignment(why != NOT_ASSIGNED, why, _complaints(scores, why, threshold))
+    return Assignment(why != NOT_ASSIGNED, why, _warnings(scores, why, threshold))
 
 
-def _best_blocks(scores: Scores) -> np.ndarray:
+def _best_blocks(scores: ScoreMatrix) -> np.ndarray:
     """The best block of every camera, [c]."""
     if not len(scores.scores):
         return np.zeros(0, np.int64)
@@ -69,7 +69,7 @@ def _best_blocks(scores: Scores) -> np.ndarray:
     return np.where(blank, scores.beneath, best)
 
 
-def _complaints(scores: Scores, why: np.ndarray, threshold: float) -> list[str]:
+def _warnings(scores: ScoreMatrix, why: np.ndarray, threshold: float) -> list[str]:
     complaints = []
     for block, anchors in enumerate(scores.anchors):
         watching = int(np.count_nonzero(scores.held[:, block]))

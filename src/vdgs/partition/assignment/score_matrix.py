@@ -22,19 +22,19 @@ from torch import Tensor
 
 from vdgs.config.method import AssignmentConfig
 from vdgs.geometry.camera import Camera
-from vdgs.kernels import choose, threads
+from vdgs.kernels import get_backend, get_num_threads
 from vdgs.kernels.kernel_types import Raster, Splats
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.model.renderer import decode_view, draw
-from vdgs.partition.blocks import Blocks, places_of
-from vdgs.visibility.visibility_counts import visibility_of
+from vdgs.model.renderer import decode_view, rasterize_splats
+from vdgs.partition.blocks import Blocks, xy_positions
+from vdgs.visibility.visibility_counts import count_visibility
 
 #: A pixel is drawn where its alpha is above this.
-DRAWN_ALPHA = 0.5
+MIN_ALPHA = 0.5
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Scores:
+class ScoreMatrix:
     """What assignment decides from: rows are cameras, columns blocks."""
 
     #: The mode that the scores were made in, as in AssignmentConfig.
@@ -51,13 +51,13 @@ class Scores:
     beneath: Int64[np.ndarray, " c"]
 
 
-def score_matrix(
+def compute_score_matrix(
     model: AnchorModel,
     blocks: Blocks,
     cameras: Sequence[Camera],
     config: AssignmentConfig,
-    progress: Callable[[int, int], None] | None = None,
-) -> Scores:
+    on_progress: Callable[[int, int], None] | None = None,
+) -> ScoreMatrix:
     """Score every camera for every block. `progress` is told (cameras done, all cameras) after each, in this thread.
 
     - `coverage` (choice): |{Δ < τ and alpha of the block > 0.5}| / |{alpha of the scene > 0.5}|; Δ (eq. 6) compares
@@ -66,76 +66,76 @@ def score_matrix(
     - `leave_one_out`: 1 - SSIM of the scene without the anchors that the block owns against the whole scene, 8 bits.
     - `frustum`: the share of the anchors that the block owns whose centre the camera holds; nothing is drawn.
 
-    Pictures are at most `config.longest_side_px` wide and high. The scores of a camera depend on no other camera and on
+    Pictures are at most `config.image_size` wide and high. The scores of a camera depend on no other camera and on
     no number of threads. Memory: O(n b) bytes, and one view for each thread.
     """
-    return Scorer(model, blocks, config).scores(cameras, progress)
+    return CameraScorer(model, blocks, config).scores(cameras, on_progress)
 
 
-class Scorer:
-    """Scores cameras, as many at a time as one likes (`score_matrix`)."""
+class CameraScorer:
+    """Scores cameras, as many at a time as one likes (`compute_score_matrix`)."""
 
     def __init__(self, model: AnchorModel, blocks: Blocks, config: AssignmentConfig):
         self._model, self._blocks, self._config = model, blocks, config
-        self._members = _Members.of(model, blocks)
+        self._members = _BlockMembers.of(model, blocks)
 
-    def scores(self, cameras: Sequence[Camera], progress: Callable[[int, int], None] | None = None) -> Scores:
+    def scores(self, cameras: Sequence[Camera], on_progress: Callable[[int, int], None] | None = None) -> ScoreMatrix:
         """The rows of some cameras."""
         shape, members, config = (len(cameras), len(self._blocks)), self._members, self._config
         scores, covered = np.zeros(shape, np.float32), np.full(shape, np.nan, np.float32)
         held = np.zeros(shape, np.int32)
         # Small pictures keep the threads of one kernel waiting for each other; those of several cameras do not.
-        workers = ThreadPoolExecutor(threads())
+        workers = ThreadPoolExecutor(get_num_threads())
         try:
             rows = workers.map(lambda camera: _score_camera(self._model, members, camera, config), cameras)
             for index, row in enumerate(rows):
                 held[index], scores[index], covered[index] = row
-                if progress is not None:
-                    progress(index + 1, len(cameras))
+                if on_progress is not None:
+                    on_progress(index + 1, len(cameras))
         finally:
             workers.shutdown(cancel_futures=True)
         positions = np.array([camera.position[:2] for camera in cameras], np.float64).reshape(-1, 2)
-        return Scores(
+        return ScoreMatrix(
             mode=config.mode, scores=scores, held=held, covered=covered, anchors=members.counts(),
             beneath=self._blocks.owner(positions),
         )  # fmt: skip
 
 
-def joined(parts: Sequence[Scores]) -> Scores:
+def concatenate_scores(parts: Sequence[ScoreMatrix]) -> ScoreMatrix:
     """The rows of several parts, one below the other; at least one part, all for the same blocks."""
     over = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ("scores", "held", "covered")}
     beneath = np.concatenate([part.beneath for part in parts])
-    return Scores(mode=parts[0].mode, **over, anchors=parts[0].anchors, beneath=beneath)
+    return ScoreMatrix(mode=parts[0].mode, **over, anchors=parts[0].anchors, beneath=beneath)
 
 
-def difference(block: Raster, full: Raster) -> Float[np.ndarray, "h w"]:
+def color_difference(block: Raster, full: Raster) -> Float[np.ndarray, "h w"]:
     """Δ(u) of eq. 6: the mean over the channels of the absolute difference."""
     apart = np.abs(block.image.cpu().numpy() - full.image.cpu().numpy())
     return (apart[..., 0] + apart[..., 1] + apart[..., 2]) / 3  # twice as fast as the mean over so short an axis
 
 
-def covered_share(block: Raster, full: Raster, tau: float) -> float:
+def drawn_coverage_ratio(block: Raster, full: Raster, tau: float) -> float:
     """Share of the pixels that the scene draws which the block alone draws, and draws alike; 0 where there are none."""
-    drawn = full.alpha.cpu().numpy() > DRAWN_ALPHA
-    both = drawn & (block.alpha.cpu().numpy() > DRAWN_ALPHA)
+    drawn = full.alpha.cpu().numpy() > MIN_ALPHA
+    both = drawn & (block.alpha.cpu().numpy() > MIN_ALPHA)
     if not both.any():
         return 0.0
-    return float(np.count_nonzero(both & (difference(block, full) < tau)) / np.count_nonzero(drawn))
+    return float(np.count_nonzero(both & (color_difference(block, full) < tau)) / np.count_nonzero(drawn))
 
 
-def alike_share(block: Raster, full: Raster, tau: float) -> float:
+def coverage_ratio(block: Raster, full: Raster, tau: float) -> float:
     """The coverage ratio of eq. 7 as printed: share of all pixels with Δ < τ, empty ones among them."""
-    return float(np.mean(difference(block, full) < tau))
+    return float(np.mean(color_difference(block, full) < tau))
 
 
 def dissimilarity(image: Float[Tensor, "h w 3"], full: Float[Tensor, "h w 3"]) -> float:
     """1 - SSIM of two pictures rounded to 8 bits."""
     rounded, target = ((each.clamp(0, 1) * 255 + 0.5).to(torch.uint8) for each in (image, full))
-    return 1.0 - float(choose(full.device).photometric_loss(rounded.float() / 255, target, None).ssim)
+    return 1.0 - float(get_backend(full.device).photometric_loss(rounded.float() / 255, target, None).ssim)
 
 
 @dataclass(frozen=True, eq=False)
-class _Members:
+class _BlockMembers:
     """Which anchors belong to which block, and the anchors sorted for counting."""
 
     owner: Int64[Tensor, " n"]
@@ -147,17 +147,17 @@ class _Members:
     bounds: list[int]
 
     @staticmethod
-    def of(model: AnchorModel, blocks: Blocks) -> _Members:
+    def of(model: AnchorModel, blocks: Blocks) -> _BlockMembers:
         positions = model.anchors.positions
-        places = places_of(positions)
+        places = xy_positions(positions)
         owner = blocks.owner(places)
         reached = np.empty((len(blocks), len(places)), bool)
         for index in range(len(blocks)):
-            reached[index] = blocks.reaches(index, places, owner)
-        near = choose(positions.device).morton_order(positions).cpu().numpy()
+            reached[index] = blocks.in_expanded(index, places, owner)
+        near = get_backend(positions.device).morton_order(positions).cpu().numpy()
         order = near[np.argsort(owner[near], kind="stable")]
         bounds = [0, *np.cumsum(np.bincount(owner, minlength=len(blocks))).tolist()]
-        return _Members(
+        return _BlockMembers(
             torch.from_numpy(owner).to(positions.device), torch.from_numpy(reached).to(positions.device),
             positions[order].contiguous(), bounds,
         )  # fmt: skip
@@ -168,59 +168,59 @@ class _Members:
 
     def held(self, camera: Camera) -> list[int]:
         """How many anchors of every block the frustum holds."""
-        seen = visibility_of(self.points, [camera])
+        seen = count_visibility(self.points, [camera])
         return [int(seen[a:b].sum()) for a, b in pairwise(self.bounds)]
 
 
 @torch.no_grad()  # holds for the thread that it is entered in
 def _score_camera(
-    model: AnchorModel, members: _Members, camera: Camera, config: AssignmentConfig
+    model: AnchorModel, members: _BlockMembers, camera: Camera, config: AssignmentConfig
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Held anchors, scores and covered shares of one camera for every block, [b] each."""
     held = np.array(members.held(camera), np.int32)
     if config.mode == "frustum":
         return held, held / np.maximum(members.counts(), 1), np.full(len(held), np.nan)
-    scores, covered = _rendered_scores(model, members, camera.within(config.longest_side_px), config)
+    scores, covered = _rendered_scores(model, members, camera.limit_size(config.image_size), config)
     return held, np.array(scores), np.array(covered)
 
 
 def _rendered_scores(
-    model: AnchorModel, members: _Members, camera: Camera, config: AssignmentConfig
+    model: AnchorModel, members: _BlockMembers, camera: Camera, config: AssignmentConfig
 ) -> tuple[list[float], list[float]]:
     """The scores of one camera for every block in a mode that draws, and its covered shares."""
     rows, splats = decode_view(model, camera)
     anchor = rows[splats.source.long() // model.anchors.offsets.shape[1]]
-    full = draw(splats, camera, splats.means_px.new_zeros(3))
+    full = rasterize_splats(splats, camera, splats.means_px.new_zeros(3))
     owner, reached = members.owner[anchor], members.reached[:, anchor]
     scores, covered = [], []
     blank = Raster(torch.zeros_like(full.image), torch.zeros_like(full.alpha), None)
-    alike_to_blank = alike_share(blank, full, config.tau) if config.mode == "literal" else 0.0
+    alike_to_blank = coverage_ratio(blank, full, config.tau) if config.mode == "literal" else 0.0
     # Most of many blocks are nowhere in a view: what they give is known.
     for index, shown in enumerate(reached.any(dim=1).tolist()):
         if not shown:
             covered.append(0.0)
             scores.append(alike_to_blank)
             continue
-        block = _draw_some(splats, reached[index], full, camera)
-        covered.append(covered_share(block, full, config.tau))
+        block = _render_subset(splats, reached[index], full, camera)
+        covered.append(drawn_coverage_ratio(block, full, config.tau))
         if config.mode == "literal":
-            scores.append(alike_share(block, full, config.tau))
+            scores.append(coverage_ratio(block, full, config.tau))
         elif config.mode == "leave_one_out":
-            rest = _draw_some(splats, owner != index, full, camera)
+            rest = _render_subset(splats, owner != index, full, camera)
             scores.append(0.0 if rest is full else dissimilarity(rest.image, full.image))
         else:
             scores.append(covered[-1])
     return scores, covered
 
 
-def _draw_some(splats: Splats, chosen: Bool[Tensor, " m"], full: Raster, camera: Camera) -> Raster:
+def _render_subset(splats: Splats, chosen: Bool[Tensor, " m"], full: Raster, camera: Camera) -> Raster:
     """The picture of some of the splats over black; `full`, that of all of them, where all are chosen."""
     rows = chosen.nonzero().squeeze(1)
     if len(rows) == len(chosen):
         return full
     if not len(rows):
         return Raster(torch.zeros_like(full.image), torch.zeros_like(full.alpha), None)
-    return draw(select_splats(splats, rows), camera, splats.means_px.new_zeros(3))
+    return rasterize_splats(select_splats(splats, rows), camera, splats.means_px.new_zeros(3))
 
 
 def select_splats(splats: Splats, rows: Int64[Tensor, " some"]) -> Splats:

@@ -16,34 +16,34 @@ from jaxtyping import Float
 
 from vdgs.config.method import AssignmentConfig
 from vdgs.geometry.camera import Camera
-from vdgs.partition.assignment.score_matrix import Scores
+from vdgs.partition.assignment.score_matrix import ScoreMatrix
 from vdgs.partition.blocks import Block, Blocks
-from vdgs.partition.principal_axes import principal_plane
-from vdgs.partition.strategies.strategy import KEPT, checked_ground, grid_shape, inhabited, stretched
+from vdgs.partition.principal_axes import fit_principal_plane
+from vdgs.partition.strategies.strategy import EXTENT_QUANTILES, checked_xy, grid_shape, nonempty_cells, scale_shape
 
 #: A cell is trained this many times as large.
-WIDENED = 1.4
+CELL_EXPANSION = 1.4
 #: A camera joins that holds this share of a cell's anchors (choice).
-HELD_SHARE = 0.25
+MIN_ANCHOR_SHARE = 0.25
 
 
 @dataclass(frozen=True)
 class Dogs:
     """Equal oriented cells without the consensus of the blocks."""
 
-    cites: str = "Chen and Lee, DOGS, NeurIPS 2024"
-    leaves_out: tuple[str, ...] = (
+    citation: str = "Chen and Lee, DOGS, NeurIPS 2024"
+    omissions: tuple[str, ...] = (
         "the consensus (ADMM) on what blocks share: each block's own cell is kept, its ring is frozen",
         "splitting by content: cells are equal; cameras join by the share of the cell's anchors that they hold",
     )
 
-    def cut(
+    def partition(
         self, positions: Float[np.ndarray, "n 3"], cameras: Sequence[Camera], count: int
     ) -> tuple[Blocks, list[str]]:
-        ground = checked_ground(positions)
-        plane = principal_plane(ground)
+        ground = checked_xy(positions)
+        plane = fit_principal_plane(ground)
         places = plane.places(ground)
-        low, high = np.quantile(places, KEPT, axis=0)
+        low, high = np.quantile(places, EXTENT_QUANTILES, axis=0)
         size = np.maximum(high - low, 1e-6 * float(np.abs(places).max()) + 1e-9)
         columns, rows = grid_shape(count, float(size[0] / size[1]))
         across, up = (low[i] + size[i] * np.linspace(0, 1, n + 1) for i, n in enumerate((columns, rows)))
@@ -52,12 +52,12 @@ class Dogs:
             for x0, x1 in itertools.pairwise(across)
             for y0, y1 in itertools.pairwise(up)
         ]
-        return inhabited([Block(core, stretched(core, WIDENED)) for core in cores], ground, count)
+        return nonempty_cells([Block(core, scale_shape(core, CELL_EXPANSION)) for core in cores], ground, count)
 
     def assignment(self, config: AssignmentConfig) -> AssignmentConfig:
-        return replace(config, mode="frustum", threshold=HELD_SHARE)
+        return replace(config, mode="frustum", threshold=MIN_ANCHOR_SHARE)
 
-    def rescored(
-        self, scores: Scores, positions: Float[np.ndarray, "n 3"], blocks: Blocks, cameras: Sequence[Camera]
-    ) -> Scores:
+    def adjust_scores(
+        self, scores: ScoreMatrix, positions: Float[np.ndarray, "n 3"], blocks: Blocks, cameras: Sequence[Camera]
+    ) -> ScoreMatrix:
         return scores

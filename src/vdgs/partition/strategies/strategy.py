@@ -13,23 +13,23 @@ from jaxtyping import Float
 from vdgs.config.method import AssignmentConfig
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
-from vdgs.partition.assignment.score_matrix import Scores
+from vdgs.partition.assignment.score_matrix import ScoreMatrix
 from vdgs.partition.blocks import Block, Blocks
 
 #: Outliers beyond these quantiles of the anchors do not decide how large the scene is.
-KEPT = (0.01, 0.99)
+EXTENT_QUANTILES = (0.01, 0.99)
 
 
-class Strategy(Protocol):
+class PartitionStrategy(Protocol):
     """A published partition. Blocks own every place, by core or nearest core, as ours do."""
 
     @property
-    def cites(self) -> str: ...
+    def citation(self) -> str: ...
 
     @property
-    def leaves_out(self) -> tuple[str, ...]: ...
+    def omissions(self) -> tuple[str, ...]: ...
 
-    def cut(
+    def partition(
         self, positions: Float[np.ndarray, "n 3"], cameras: Sequence[Camera], count: int
     ) -> tuple[Blocks, list[str]]:
         """At most `count` blocks from anchors and training cameras, and warnings for people."""
@@ -39,9 +39,9 @@ class Strategy(Protocol):
         """How cameras are scored and above which score they join; topping up stays as it is."""
         ...
 
-    def rescored(
-        self, scores: Scores, positions: Float[np.ndarray, "n 3"], blocks: Blocks, cameras: Sequence[Camera]
-    ) -> Scores:
+    def adjust_scores(
+        self, scores: ScoreMatrix, positions: Float[np.ndarray, "n 3"], blocks: Blocks, cameras: Sequence[Camera]
+    ) -> ScoreMatrix:
         """The scores with what the method adds to, or takes instead of, those of `assignment`."""
         ...
 
@@ -52,7 +52,7 @@ def grid_shape(count: int, aspect: float) -> tuple[int, int]:
     return min(shapes, key=lambda shape: abs(np.log(shape[0] / shape[1]) - np.log(max(aspect, 1e-9))))
 
 
-def checked_ground(positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+def checked_xy(positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
     """x, y in float64. Raises VdgsError if there is nothing to cut."""
     ground = np.asarray(positions, np.float64)[:, :2]
     if len(ground) == 0 or not np.isfinite(ground).all():
@@ -60,7 +60,7 @@ def checked_ground(positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 
     return ground
 
 
-def inhabited(cells: Sequence[Block], ground: Float[np.ndarray, "n 2"], count: int) -> tuple[Blocks, list[str]]:
+def nonempty_cells(cells: Sequence[Block], ground: Float[np.ndarray, "n 2"], count: int) -> tuple[Blocks, list[str]]:
     """The cells that own anchors, as blocks numbered along x."""
     owned = np.bincount(Blocks(tuple(cells)).owner(ground), minlength=len(cells))
     kept = [cell for cell, anchors in zip(cells, owned, strict=True) if anchors > 0]
@@ -71,6 +71,6 @@ def inhabited(cells: Sequence[Block], ground: Float[np.ndarray, "n 2"], count: i
     return Blocks(tuple(kept)), warnings
 
 
-def stretched(shape: shapely.Polygon, factor: float) -> shapely.Polygon:
+def scale_shape(shape: shapely.Polygon, factor: float) -> shapely.Polygon:
     """The shape `factor` times as large about its centre."""
     return shapely.affinity.scale(shape, factor, factor, origin="center")

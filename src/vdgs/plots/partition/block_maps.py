@@ -19,26 +19,39 @@ from matplotlib.path import Path as Outline
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.row_sampling import sample_points
 from vdgs.partition.blocks import Blocks
-from vdgs.plots.partition.block_stats import block_colour, block_facts, count_of, draw_block_facts, mixed, spread_note
-from vdgs.plots.partition.score_heatmap import draw_scores
-from vdgs.plots.style import DPI, FAINT, INK, NOTE, TEXT, placer, plain, titles
-from vdgs.plots.visibility_map import CameraMarks, SeenMap, draw_seen_map, map_size, mark_edge
+from vdgs.plots.partition.block_stats import (
+    block_color,
+    compute_block_stats,
+    mix_color,
+    plot_block_stats,
+    pluralize,
+    std_note,
+)
+from vdgs.plots.partition.score_heatmap import plot_scores
+from vdgs.plots.style import DPI, INK, MUTED, NOTE_SIZE, TEXT_SIZE, axes_placer, draw_titles, style_axes
+from vdgs.plots.visibility_map import (
+    CameraMarks,
+    VisibilityMapData,
+    map_size_inches,
+    marker_edge_width,
+    plot_visibility_map,
+)
 
-__all__ = ["draw_block_facts", "draw_blocks", "draw_scores", "draw_visibility_map"]
+__all__ = ["plot_block_stats", "plot_blocks", "plot_scores", "plot_anchor_visibility"]
 
 #: More anchors than these are thinned: on a map they only cover each other.
-MOST_DRAWN = 60_000
+MAX_DRAWN_ANCHORS = 60_000
 #: What the cut that is compared with is called.
-BY_PLACE = "λ_vis = 0: cut by place alone (numbers of its own)"
+SPATIAL_ONLY_LABEL = "λ_vis = 0: cut by place alone (numbers of its own)"
 #: The narrower side of a map is at least this share of the wider one: corridors stay legible.
-NARROWEST = 0.3
+MIN_ASPECT = 0.3
 #: Outlines widen a map of blocks by at most this share of its longer side, to each side.
-OUTLINES = 0.75
+MAX_OUTLINE_MARGIN = 0.75
 #: Width of a map of blocks: two stand beside each other on a page.
-MAP_INCHES = 6.2
+MAP_WIDTH_INCHES = 6.2
 
 
-def draw_visibility_map(
+def plot_anchor_visibility(
     file: Path,
     positions: Float[np.ndarray, "n 3"],
     visibility: Int[np.ndarray, " n"],
@@ -47,19 +60,19 @@ def draw_visibility_map(
 ) -> None:
     """Anchors from above coloured by V_i, cameras, and the histogram of V. Writes a PNG; `axes` are the names of x
     and y with their unit (`GroundFrame.axis_names`)."""
-    low, high = _frame(np.concatenate([_inner(positions[:, :2]), _places(cameras)]))
+    low, high = _map_corners(np.concatenate([_inner_quantiles(positions[:, :2]), _camera_xy(cameras)]))
     marks = CameraMarks("training camera", cameras, INK, "white", _mark_size(len(cameras)))
     facts = f"an anchor is seen by {np.median(visibility):g} training cameras (median)"
-    heading = (f"{count_of(len(visibility), 'anchor')} and {count_of(len(cameras), 'training camera')}", facts)
-    seen = SeenMap(
+    heading = (f"{pluralize(len(visibility), 'anchor')} and {pluralize(len(cameras), 'training camera')}", facts)
+    seen = VisibilityMapData(
         points=positions, visibility=visibility, low=low, high=high, ground=float(np.median(positions[:, 2])),
         marks=(marks,), x_label=axes[0], y_label=axes[1], noun="an anchor",
         titles=(*heading, "anchors coloured by V; pale: V on level ground"),
     )  # fmt: skip
-    draw_seen_map(file, seen)
+    plot_visibility_map(file, seen)
 
 
-def draw_blocks(
+def plot_blocks(
     file: Path,
     positions: Float[np.ndarray, "n 3"],
     visibility: Int[np.ndarray, " n"],
@@ -74,29 +87,29 @@ def draw_blocks(
     99 % of the anchors in x and in y and all outlines, if these do not lead far away. Writes a PNG; `names` are those
     of x and y with their unit (`GroundFrame.axis_names`).
     """
-    low, high, whole = _frame_of_blocks(_inner(positions[:, :2]), [cut for _, cut in cuts])
-    width, height = map_size(low, high, MAP_INCHES)
+    low, high, whole = _frame_of_blocks(_inner_quantiles(positions[:, :2]), [cut for _, cut in cuts])
+    width, height = map_size_inches(low, high, MAP_WIDTH_INCHES)
     (_, blocks), count = cuts[0], len(cuts)
     columns, rows = (count, 1) if width < 1.7 * height else (1, count)
     figure = Figure(figsize=(max(0.85 + columns * (width + 0.75), 7.5), 1.15 + rows * (height + 1.1)), dpi=DPI)
-    canvas, place = FigureCanvasAgg(figure), placer(figure)
-    shown = sample_points(positions[:, :2].astype(np.float64), MOST_DRAWN)
+    canvas, place = FigureCanvasAgg(figure), axes_placer(figure)
+    shown = sample_points(positions[:, :2].astype(np.float64), MAX_DRAWN_ANCHORS)
     for index, (name, cut) in enumerate(cuts):
         row, column = index // columns, index % columns
         left, bottom = 0.85 + column * (width + 0.75), 0.55 + (rows - 1 - row) * (height + 1.1)
         axes = place(left, bottom, width, height)
-        _cut(axes, cut, shown, low, high)
+        _plot_partition(axes, cut, shown, low, high)
         used = np.asarray(assigned.any(axis=1)) if cut is blocks else np.ones(len(cameras), bool)
-        _cameras(axes, _places(cameras), used)
-        spread = block_facts(positions, visibility, cut).spread
-        axes.set_title(f"{name}\n{spread_note(spread)}", loc="left", fontsize=TEXT, color=INK)
+        _cameras(axes, _camera_xy(cameras), used)
+        spread = compute_block_stats(positions, visibility, cut).spread
+        axes.set_title(f"{name}\n{std_note(spread)}", loc="left", fontsize=TEXT_SIZE, color=INK)
         axes.set(xlabel=names[0], ylabel=names[1])
-    _heading(figure, blocks, (len(positions), len(shown)), _places(cameras), (low, high), whole)
+    _heading(figure, blocks, (len(positions), len(shown)), _camera_xy(cameras), (low, high), whole)
     _legend(figure, bool(assigned.any(axis=1).all()))
     canvas.print_png(file)  # type: ignore[arg-type]
 
 
-def _places(cameras: Sequence[Camera]) -> Float[np.ndarray, "c 2"]:
+def _camera_xy(cameras: Sequence[Camera]) -> Float[np.ndarray, "c 2"]:
     return np.array([camera.position[:2] for camera in cameras], np.float64).reshape(-1, 2)
 
 
@@ -105,16 +118,16 @@ def _mark_size(cameras: int) -> float:
     return float(np.clip(9000 / max(cameras, 1), 8, 30))
 
 
-def _inner(places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "2 2"]:
+def _inner_quantiles(places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "2 2"]:
     """The 0.5 % and 99.5 % quantiles in x and in y."""
     return np.quantile(np.asarray(places, np.float64), (0.005, 0.995), axis=0)
 
 
-def _frame(corners: Float[np.ndarray, "n 2"], margin: float = 0.08) -> tuple[np.ndarray, np.ndarray]:
+def _map_corners(corners: Float[np.ndarray, "n 2"], margin: float = 0.08) -> tuple[np.ndarray, np.ndarray]:
     """Lower left and upper right corner of a map that holds `corners`, with a margin; neither a point nor a strip."""
     low, high = corners.min(axis=0), corners.max(axis=0)
     longest = float((high - low).max()) or 1.0
-    grow = np.maximum(margin * longest, (NARROWEST * longest - (high - low)) / 2)
+    grow = np.maximum(margin * longest, (MIN_ASPECT * longest - (high - low)) / 2)
     return low - grow, high + grow
 
 
@@ -122,27 +135,29 @@ def _frame_of_blocks(
     inner: Float[np.ndarray, "2 2"], cuts: Sequence[Blocks]
 ) -> tuple[np.ndarray, np.ndarray, bool]:  # fmt: skip
     """The corners of a map of blocks, and whether it holds all outlines. It holds them unless they reach farther beyond
-    the anchors than `OUTLINES` of the longer side: one stray block must not make a stamp of the map."""
+    the anchors than `MAX_OUTLINE_MARGIN` of the longer side: one stray block must not make a stamp of the map."""
     bounds = np.array([block.expanded.bounds for cut in cuts for block in cut.items]).reshape(-1, 2, 2)
     outlines = np.stack([bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)])
-    reach = OUTLINES * float(np.ptp(inner, axis=0).max())
+    reach = MAX_OUTLINE_MARGIN * float(np.ptp(inner, axis=0).max())
     held = np.clip(outlines, inner[0] - reach, inner[1] + reach)
-    low, high = _frame(np.concatenate([inner, held]), margin=0.03)
+    low, high = _map_corners(np.concatenate([inner, held]), margin=0.03)
     return low, high, bool(((outlines >= low) & (outlines <= high)).all())
 
 
-def _cut(axes: Axes, blocks: Blocks, shown: Float[np.ndarray, "n 2"], low: np.ndarray, high: np.ndarray) -> None:
+def _plot_partition(
+    axes: Axes, blocks: Blocks, shown: Float[np.ndarray, "n 2"], low: np.ndarray, high: np.ndarray
+) -> None:
     """Anchors in the colours of their blocks, cores and widened boundaries, and the numbers."""
     owner = blocks.owner(shown)
-    palette = np.array([to_rgb(block_colour(index)) for index in range(len(blocks))])
+    palette = np.array([to_rgb(block_color(index)) for index in range(len(blocks))])
     size = float(np.clip(3e4 / len(shown), 0.6, 7.0))
     axes.scatter(shown[:, 0], shown[:, 1], c=palette[owner], s=size, linewidths=0, alpha=0.75)
     window = shapely.box(*low, *high)
     for index, block in enumerate(blocks.items):
-        dark = mixed(block_colour(index), 0.65)
-        axes.add_patch(_patch(block.expanded, dark, 1.0, (0, (4, 3))))
-        axes.add_patch(_patch(block.core, INK, 1.1, "solid"))
-        place = _room(block.core, window)
+        dark = mix_color(block_color(index), 0.65)
+        axes.add_patch(_outline_patch(block.expanded, dark, 1.0, (0, (4, 3))))
+        axes.add_patch(_outline_patch(block.core, INK, 1.1, "solid"))
+        place = _label_position(block.core, window)
         if place is not None:
             axes.text(
                 *place, str(index), ha="center", va="center", fontsize=12 if len(blocks) <= 40 else 8,
@@ -150,17 +165,17 @@ def _cut(axes: Axes, blocks: Blocks, shown: Float[np.ndarray, "n 2"], low: np.nd
                 bbox={"boxstyle": "round,pad=0.25", "facecolor": "white", "edgecolor": dark, "linewidth": 0.8},
             )  # fmt: skip
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-    plain(axes)
+    style_axes(axes)
 
 
-def _patch(shape: shapely.Polygon, colour: object, width: float, style: object) -> PathPatch:
+def _outline_patch(shape: shapely.Polygon, colour: object, width: float, style: object) -> PathPatch:
     """The outline of a polygon, holes included."""
     rings = [Outline(np.asarray(ring.coords), closed=True) for ring in (shape.exterior, *shape.interiors)]
     whole = Outline.make_compound_path(*rings)
     return PathPatch(whole, facecolor="none", edgecolor=colour, linewidth=width, linestyle=style, zorder=2)
 
 
-def _room(core: shapely.Polygon, window: shapely.Polygon) -> tuple[float, float] | None:
+def _label_position(core: shapely.Polygon, window: shapely.Polygon) -> tuple[float, float] | None:
     """Where in the visible part of a core there is most room for its number; None where nothing of it is visible."""
     visible = [part for part in shapely.get_parts(core.intersection(window)) if part.area > 0]
     if not visible:
@@ -175,7 +190,7 @@ def _cameras(axes: Axes, places: Float[np.ndarray, "c 2"], used: Bool[np.ndarray
     size = 0.7 * _mark_size(len(places))
     for chosen, face, edge in ((used, INK, "white"), (~used, "white", INK)):
         axes.scatter(
-            places[chosen, 0], places[chosen, 1], marker="^", s=size, linewidths=mark_edge(size),
+            places[chosen, 0], places[chosen, 1], marker="^", s=size, linewidths=marker_edge_width(size),
             facecolors=face, edgecolors=edge, zorder=4,
         )  # fmt: skip
 
@@ -188,22 +203,22 @@ def _heading(
     the frame."""
     total, drawn = anchors
     outside = int((~((cameras >= frame[0]) & (cameras <= frame[1])).all(axis=1)).sum())
-    facts = count_of(total, "anchor") + (f" ({drawn:,} drawn)" if drawn < total else "")
-    seen = count_of(len(cameras), "training camera") + (f" ({outside:,} beyond the map)" if outside else "")
+    facts = pluralize(total, "anchor") + (f" ({drawn:,} drawn)" if drawn < total else "")
+    seen = pluralize(len(cameras), "training camera") + (f" ({outside:,} beyond the map)" if outside else "")
     beyond = "" if whole else "  ·  outlines run on beyond the map"
-    titles(figure, count_of(len(blocks), "block"), f"{facts}  ·  {seen}{beyond}", "")
+    draw_titles(figure, pluralize(len(blocks), "block"), f"{facts}  ·  {seen}{beyond}", "")
 
 
 def _legend(figure: Figure, all_used: bool) -> None:
     triangle = {"marker": "^", "linestyle": "none", "markersize": 5.5, "markeredgewidth": 0.7}
     lines = [
         Line2D([], [], color=INK, linewidth=1.1, label="core"),
-        Line2D([], [], color=FAINT, linewidth=1.0, linestyle=(0, (4, 3)), label="widened block"),
+        Line2D([], [], color=MUTED, linewidth=1.0, linestyle=(0, (4, 3)), label="widened block"),
         Line2D([], [], **triangle, color=INK, markeredgecolor="white", label="camera"),  # type: ignore[arg-type]
         Line2D([], [], **triangle, color="white", markeredgecolor=INK, label="camera of no block"),  # type: ignore[arg-type]
     ]
     width, height = figure.get_size_inches()
-    figure.legend(
+    figure.colorbar(
         handles=lines[:3] if all_used else lines, loc="upper left", bbox_to_anchor=(0.85 / width, 1 - 0.84 / height),
-        ncols=4, fontsize=NOTE, frameon=False, handletextpad=0.5, columnspacing=1.2, borderaxespad=0, borderpad=0,
+        ncols=4, fontsize=NOTE_SIZE, frameon=False, handletextpad=0.5, columnspacing=1.2, borderaxespad=0, borderpad=0,
     )  # fmt: skip

@@ -15,59 +15,59 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
-from vdgs.partition.blocks import Blocks, places_of
-from vdgs.plots.style import DPI, FAINT, INK, placer, plain, titles
+from vdgs.partition.blocks import Blocks, xy_positions
+from vdgs.plots.style import DPI, INK, MUTED, axes_placer, draw_titles, style_axes
 
 #: Colours of blocks 0 to 15; block 16 begins anew. Neighbours in the list differ most.
-PALETTE = (
+BLOCK_PALETTE = (
     "#4363d8", "#f58231", "#3cb44b", "#e6194b", "#911eb4", "#42c6e0", "#e0bd00", "#f032e6",
     "#9a6324", "#469990", "#a3cf3f", "#000075", "#f0a3c0", "#800000", "#b79be6", "#808000",
 )  # fmt: skip
 
 
-def block_colour(index: int) -> str:
+def block_color(index: int) -> str:
     """The colour of a block in all figures."""
-    return PALETTE[index % len(PALETTE)]
+    return BLOCK_PALETTE[index % len(BLOCK_PALETTE)]
 
 
-def count_of(number: int, noun: str) -> str:
+def pluralize(number: int, noun: str) -> str:
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
-def mixed(colour: str, scale: float, tone: float = 1.0) -> tuple[float, float, float]:
+def mix_color(colour: str, scale: float, tone: float = 1.0) -> tuple[float, float, float]:
     """The colour darkened by `scale`, then mixed with white; 1 and 1 leave it."""
     red, green, blue = (1 - tone * (1 - scale * part) for part in to_rgb(colour))
     return red, green, blue
 
 
 #: The rows of all blocks take at most so many inches, and from so few a row on they are numbered.
-TALLEST, LEAST_STEP = 40.0, 0.05
+MAX_HEIGHT_INCHES, MIN_ROW_INCHES = 40.0, 0.05
 
 
-def draw_block_facts(
+def plot_block_stats(
     file: Path,
     positions: Float[np.ndarray, "n 3"],
     visibility: Int[np.ndarray, " n"],
     blocks: Blocks,
     assigned: Bool[np.ndarray, "c b"],
     unit: str,
-    compare: Blocks | None,
+    comparison: Blocks | None,
 ) -> None:
     """Per block: anchors, cameras, area of the core, V and its standard deviation, which eq. 5 is meant to lower.
 
     The blocks of `compare` (λ_vis = 0) stand below in lighter tones. Writes a PNG; `unit` is that of places.
     """
-    ours = block_facts(positions, visibility, blocks)._replace(cameras=assigned.sum(axis=0))
-    groups = [ours] if compare is None else [ours, block_facts(positions, visibility, compare)]
+    ours = compute_block_stats(positions, visibility, blocks)._replace(cameras=assigned.sum(axis=0))
+    groups = [ours] if comparison is None else [ours, compute_block_stats(positions, visibility, comparison)]
     rows: list[Float[np.ndarray, " _"]] = [np.arange(len(blocks), dtype=np.float64)]
-    if compare is not None:
-        rows.append(len(blocks) + 2.5 + np.arange(len(compare)))
+    if comparison is not None:
+        rows.append(len(blocks) + 2.5 + np.arange(len(comparison)))
     count = float(rows[-1][-1] + 2)  # one row above the blocks names the cut
     # Inches; thousands of blocks make a picture that can still be opened, in which numbers are too small to be set.
-    step = min(float(np.clip(14 / count, 0.13, 0.3)), TALLEST / count)
-    set_numbers = step > LEAST_STEP
+    step = min(float(np.clip(14 / count, 0.13, 0.3)), MAX_HEIGHT_INCHES / count)
+    set_numbers = step > MIN_ROW_INCHES
     figure = Figure(figsize=(14.5, 2.15 + step * count), dpi=DPI)
-    canvas, place = FigureCanvasAgg(figure), placer(figure)
+    canvas, place = FigureCanvasAgg(figure), axes_placer(figure)
     panels = [place(1.15 + 2.65 * index, 0.65, 2.3, step * count) for index in range(5)]
     names = (
         "anchors of the core", "cameras assigned", f"area of the core ({unit}²)",
@@ -85,7 +85,7 @@ def draw_block_facts(
         _rows(axes, rows, index == 0 and set_numbers, step)
         axes.xaxis.set_major_locator(MaxNLocator(3, integer=index < 2, min_n_ticks=1))
     note = "mean over the blocks of the standard deviation of V within each: " + _both(groups)
-    captions = ("",) if compare is None else ("this cut", "cut by place alone, λ_vis = 0 (numbers of its own)")
+    captions = ("",) if comparison is None else ("this cut", "cut by place alone, λ_vis = 0 (numbers of its own)")
     for places, caption in zip(rows, captions, strict=True):
         panels[0].text(
             0,
@@ -97,11 +97,11 @@ def draw_block_facts(
             color=INK,
         )
     lower = "colours and numbers are those of the map of blocks"
-    titles(figure, count_of(len(blocks), "block"), note, lower)
+    draw_titles(figure, pluralize(len(blocks), "block"), note, lower)
     canvas.print_png(file)  # type: ignore[arg-type]
 
 
-class BlockFacts(NamedTuple):
+class BlockStats(NamedTuple):
     """What is drawn of each block; NaN where it owns no anchor."""
 
     anchors: Int[np.ndarray, " b"]
@@ -113,9 +113,11 @@ class BlockFacts(NamedTuple):
     spread: Float[np.ndarray, " b"]
 
 
-def block_facts(positions: Float[np.ndarray, "n 3"], visibility: Int[np.ndarray, " n"], blocks: Blocks) -> BlockFacts:
+def compute_block_stats(
+    positions: Float[np.ndarray, "n 3"], visibility: Int[np.ndarray, " n"], blocks: Blocks
+) -> BlockStats:
     """What a cut gives each block, without cameras; `visibility` are the V of the anchors."""
-    owner = blocks.owner(places_of(positions))
+    owner = blocks.owner(xy_positions(positions))
     # Sorted once: looked up for each block, thousands of blocks would take longer than their cut.
     order = np.argsort(owner, kind="stable")
     bounds = np.searchsorted(owner[order], np.arange(len(blocks) + 1))
@@ -125,15 +127,15 @@ def block_facts(positions: Float[np.ndarray, "n 3"], visibility: Int[np.ndarray,
         [(v.mean(), *np.quantile(v, (0.05, 0.95)), v.std()) if len(v) else nothing for v in seen], np.float64
     )
     area = np.array([block.core.area for block in blocks.items])
-    return BlockFacts(np.array([len(v) for v in seen]), None, area, *of_views.T)
+    return BlockStats(np.array([len(v) for v in seen]), None, area, *of_views.T)
 
 
 def _panel(
-    axes: Axes, index: int, facts: BlockFacts, rows: Float[np.ndarray, " b"], tone: float, step: float | None
+    axes: Axes, index: int, facts: BlockStats, rows: Float[np.ndarray, " b"], tone: float, step: float | None
 ) -> float:
     """One column of the block facts for one cut; returns where its longest bar ends. `step` is the height of a row in
     inches; without it no numbers stand beside the bars."""
-    colours = [mixed(block_colour(block), 1.0, tone) for block in range(len(rows))]
+    colours = [mix_color(block_color(block), 1.0, tone) for block in range(len(rows))]
     if index == 3:
         known = np.isfinite(facts.mean)
         axes.hlines(rows[known], facts.low[known], facts.high[known], np.array(colours)[known], linewidth=3)
@@ -150,7 +152,7 @@ def _panel(
                 transform=axes.get_yaxis_transform(),
                 va="center",
                 fontsize=8,
-                color=FAINT,
+                color=MUTED,
             )
             return 0.0
         right = np.nan_to_num(values.astype(np.float64))
@@ -163,7 +165,7 @@ def _panel(
         missing = label == "nan"
         axes.annotate(
             "no anchors" if missing else label, (0 if missing else end, row), (6, 0), textcoords="offset points",
-            va="center", fontsize=_font(step), color=FAINT if missing else INK,
+            va="center", fontsize=_font(step), color=MUTED if missing else INK,
         )  # fmt: skip
     return longest
 
@@ -180,7 +182,7 @@ def _bars(
 
 def _rows(axes: Axes, rows: list[Float[np.ndarray, " _"]], named: bool, step: float) -> None:
     """Block numbers at the left, and the ink of one panel."""
-    plain(axes)
+    style_axes(axes)
     axes.patch.set_visible(False)  # captions reach into the next panel
     numbers = [f"block {index}" for group in rows for index in range(len(group))]
     axes.set_yticks(*((np.concatenate(rows), numbers) if named else ([],)))
@@ -188,7 +190,7 @@ def _rows(axes: Axes, rows: list[Float[np.ndarray, " _"]], named: bool, step: fl
     axes.spines["left"].set_visible(False)
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,g}"))
     if len(rows) > 1:
-        axes.axhline(rows[1][0] - 1.7, color=FAINT, linewidth=0.6)
+        axes.axhline(rows[1][0] - 1.7, color=MUTED, linewidth=0.6)
 
 
 def _font(step: float) -> float:
@@ -204,7 +206,7 @@ def _number(value: float, index: int) -> str:
     return f"{value:,.0f}" if index < 2 or value >= 1000 else f"{value:.3g}"
 
 
-def _both(groups: list[BlockFacts]) -> str:
+def _both(groups: list[BlockStats]) -> str:
     ours = _mean_spread(groups[0].spread)
     return ours if len(groups) == 1 else f"{ours}; cut by place alone (λ_vis = 0): {_mean_spread(groups[1].spread)}"
 
@@ -214,6 +216,6 @@ def _mean_spread(spread: Float[np.ndarray, " b"]) -> str:
     return f"{known.mean():.2f}" if len(known) else "none"
 
 
-def spread_note(spread: Float[np.ndarray, " b"]) -> str:
+def std_note(spread: Float[np.ndarray, " b"]) -> str:
     """One line about the `spread` of all blocks, the standard deviation of V in each."""
     return f"standard deviation of V in a block: {_mean_spread(spread)} (mean over the blocks)"

@@ -12,30 +12,30 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
 
-from vdgs.plots.partition.block_stats import count_of
-from vdgs.plots.style import ACCENT, DPI, FAINT, INK, NOTE, TEXT, placer, plain, titles
+from vdgs.plots.partition.block_stats import pluralize
+from vdgs.plots.style import ACCENT, DPI, INK, MUTED, NOTE_SIZE, TEXT_SIZE, axes_placer, draw_titles, style_axes
 
 #: From no score to the highest; nothing in it resembles the mark of an assigned camera.
-SCORE = LinearSegmentedColormap.from_list("score", ["#f1f3f5", "#a9c7d6", "#1f6f8b", "#14395b"])
+SCORE_CMAP = LinearSegmentedColormap.from_list("score", ["#f1f3f5", "#a9c7d6", "#1f6f8b", "#14395b"])
 #: A cell is so many pixels wide before it is drawn, but a row of them no more than that, if that leaves a few each; the
 #: last ones are a gap.
-CELL, GAP = 60, 3
-LEAST_CELL, ROW = 12, 3000
+CELL_PX, GAP_PX = 60, 3
+MIN_CELL_PX, MAX_ROW_PX = 12, 3000
 #: Width of the mark of an assigned camera, in inches.
-MARK = 0.12
+MARK_INCHES = 0.12
 
 
-def draw_scores(file: Path, scores: Float[np.ndarray, "c b"], assigned: Bool[np.ndarray, "c b"]) -> None:
+def plot_scores(file: Path, scores: Float[np.ndarray, "c b"], assigned: Bool[np.ndarray, "c b"]) -> None:
     """Scores as a heat map: rows are cameras, by their best block and then by score. Writes a PNG.
 
     A red mark at the right of a cell says that the camera is assigned to the block.
     """
     cameras, blocks = scores.shape
-    order, best = order_of_cameras(scores)
+    order, best = sort_cameras(scores)
     width = float(np.clip(0.55 * blocks, 4.5, 14.0))
     height = float(np.clip(0.2 * cameras, 2.0, 9.0))
     figure = Figure(figsize=(1.75 + width + 1.3, height + 1.9), dpi=DPI)
-    canvas, place = FigureCanvasAgg(figure), placer(figure)
+    canvas, place = FigureCanvasAgg(figure), axes_placer(figure)
     axes = place(1.75, 0.65, width, height)
     norm = Normalize(min(0.0, float(scores.min(initial=0))), max(float(scores.max(initial=0)), 1e-6))
     if cameras:
@@ -44,26 +44,26 @@ def draw_scores(file: Path, scores: Float[np.ndarray, "c b"], assigned: Bool[np.
         # Sharp where every camera has a row of pixels, else averaged so that none is dropped.
         smooth = "nearest" if cameras <= height * DPI else "antialiased"
         axes.imshow(picture, aspect="auto", extent=extent, interpolation=smooth)
-        bar = figure.colorbar(ScalarMappable(norm, SCORE), cax=place(1.75 + width + 0.3, 0.65, 0.18, height))
-        bar.set_label("score", color=INK, fontsize=TEXT)
+        bar = figure.colorbar(ScalarMappable(norm, SCORE_CMAP), cax=place(1.75 + width + 0.3, 0.65, 0.18, height))
+        bar.set_label("score", color=INK, fontsize=TEXT_SIZE)
         bar.outline.set_visible(False)  # type: ignore[operator]
-        bar.ax.tick_params(colors=FAINT, labelcolor=INK, labelsize=NOTE)
+        bar.ax.tick_params(colors=MUTED, labelcolor=INK, labelsize=NOTE_SIZE)
     else:
-        axes.text(0.5, 0.5, "no cameras", ha="center", va="center", transform=axes.transAxes, color=FAINT)
+        axes.text(0.5, 0.5, "no cameras", ha="center", va="center", transform=axes.transAxes, color=MUTED)
         axes.set_xlim(-0.5, blocks - 0.5)
     step = max(1, int(np.ceil(0.3 * blocks / width)))
     axes.set_xticks(np.arange(0, blocks, step))
     axes.set_xlabel("block")
-    plain(axes)
+    style_axes(axes)
     _groups(axes, best, height)
     each = assigned.sum(axis=1)
     facts = f"a camera serves {each.mean():.2f} blocks on average, at most {each.max()}" if cameras else ""
     note = "cameras by best block, then by score; red: assigned"
-    titles(figure, f"{count_of(cameras, 'camera')}, {count_of(blocks, 'block')}", facts, note)
+    draw_titles(figure, f"{pluralize(cameras, 'camera')}, {pluralize(blocks, 'block')}", facts, note)
     canvas.print_png(file)  # type: ignore[arg-type]
 
 
-def order_of_cameras(scores: Float[np.ndarray, "c b"]) -> tuple[Int[np.ndarray, " c"], Int[np.ndarray, " c"]]:
+def sort_cameras(scores: Float[np.ndarray, "c b"]) -> tuple[Int[np.ndarray, " c"], Int[np.ndarray, " c"]]:
     """Cameras by best block, then from the highest score; and the best block of each in that order.
 
     Cameras without any score come last; their best block is that after the last one.
@@ -78,10 +78,10 @@ def _cells(
     scores: Float[np.ndarray, "c b"], assigned: Bool[np.ndarray, "c b"], norm: Normalize, inches: float
 ) -> np.ndarray:
     """The picture [c, cell * b, 3] of the matrix, whose cells are so many `inches` wide."""
-    cell = max(LEAST_CELL, min(CELL, ROW // scores.shape[1]))
-    gap = max(1, GAP * cell // CELL)
-    mark = int(np.clip(cell * MARK / inches, 2, cell // 4))
-    cells = np.repeat(SCORE(norm(scores))[:, :, None, :3], cell, axis=2)
+    cell = max(MIN_CELL_PX, min(CELL_PX, MAX_ROW_PX // scores.shape[1]))
+    gap = max(1, GAP_PX * cell // CELL_PX)
+    mark = int(np.clip(cell * MARK_INCHES / inches, 2, cell // 4))
+    cells = np.repeat(SCORE_CMAP(norm(scores))[:, :, None, :3], cell, axis=2)
     cells[:, :, cell - gap :] = 1.0
     cells[:, :, cell - gap - mark : cell - gap][assigned] = to_rgb(ACCENT)
     return cells.reshape(len(scores), -1, 3)
@@ -105,5 +105,5 @@ def _groups(axes: Axes, best: Int[np.ndarray, " c"], height: float) -> None:
         name = f"best: block {block}" if block < most else "no score"
         axes.annotate(
             f"{name} ({size:,})", (0, middle), (-8, 0), xycoords=axes.get_yaxis_transform(), textcoords="offset points",
-            ha="right", va="center", fontsize=NOTE, color=INK,
+            ha="right", va="center", fontsize=NOTE_SIZE, color=INK,
         )  # fmt: skip

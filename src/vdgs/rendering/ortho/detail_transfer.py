@@ -23,48 +23,48 @@ from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.renderer import render
 
 #: Photographs looked up for one place; bytes of photographs, and depth maps, that are kept between tiles.
-_MOST_VIEWS, _BUDGET_BYTES, _KEPT_DEPTHS = 12, 512_000_000, 32
+_MAX_VIEWS, _IMAGE_CACHE_BYTES, _MAX_CACHED_DEPTHS = 12, 512_000_000, 32
 #: Those of a tile are found by so many of its places; in between, one may be trusted this much more. How many places
 #: are looked at together.
-_PLACES, _MORE, _TOGETHER = 1000, 1.25, 16_384
+_SAMPLE_POINTS, _TRUST_MARGIN, _POINTS_PER_CHUNK = 1000, 1.25, 16_384
 #: A photograph counts by what it is trusted more than this share of the first that is not looked up: those that come
 #: and go from place to place do so without a step, and many that are trusted alike all count (choice).
-_SPARE = 0.99
+_MIN_TRUST_SHARE = 0.99
 #: How far behind the surface that a photograph shows a place may lie, in parts of its depth.
-_BEHIND = 0.01
+_DEPTH_TOLERANCE = 0.01
 #: How much a view straight from above is preferred: the power of the cosine. High, so that pixels are not means.
-_STRAIGHT = 24
+_NADIR_POWER = 24
 #: A photograph that differs from the scene by more than this (of 1, mean over the channels) shows something else there:
 #: what stood in between, what moved, or the wrong side of an edge.
-_ALIKE = 0.08
+_COLOR_SIGMA = 0.08
 #: Detail is finer than this many pixels of the map; photographs fade out over so many of theirs at their borders.
 _BLUR_PX, _BORDER_PX = 6.0, 12.0
 #: How far the blur reaches: detail is right so many pixels from the border of a picture.
 HALO_PX = round(4 * _BLUR_PX)
 
 
-class Held(NamedTuple):
+class CacheSizes(NamedTuple):
     """What a sharpener keeps between tiles, at most (bytes)."""
 
     pictures: int = 0
     depths: int = 0
 
 
-def held_bytes(sharp: bool, capture: Capture) -> Held:
+def cache_sizes(sharp: bool, capture: Capture) -> CacheSizes:
     """What drawing keeps of photographs, where detail is taken from them."""
     if not sharp:
-        return Held()
+        return CacheSizes()
     pixels = max(view.camera.width * view.camera.height for view in capture.train_views)
-    return Held(_BUDGET_BYTES, 4 * _KEPT_DEPTHS * pixels)
+    return CacheSizes(_IMAGE_CACHE_BYTES, 4 * _MAX_CACHED_DEPTHS * pixels)
 
 
-class Sharpener:
+class DetailTransfer:
     """Takes detail from the training photographs of a capture; remembers pictures and depths between tiles."""
 
     def __init__(self, model: AnchorModel, capture: Capture) -> None:
         self._model = model
         self._views = capture.train_views
-        self._pictures = ImageCache(self._views, _BUDGET_BYTES)
+        self._pictures = ImageCache(self._views, _IMAGE_CACHE_BYTES)
         self._depths: OrderedDict[int, Float[np.ndarray, "h w"]] = OrderedDict()
 
     def close(self) -> None:
@@ -78,11 +78,11 @@ class Sharpener:
         light, weight = np.zeros((len(points), 3), np.float32), np.zeros(len(points), np.float32)
         agreed = np.zeros(len(points), np.float32)
         drawn = colours[shown]
-        chosen = self._chosen(points)
-        least = self._least(chosen, points)
+        chosen = self._select_views(points)
+        least = self._min_trust(chosen, points)
         for index in chosen:
-            where, found, trust = self._look_up(index, points, least)
-            agreement = np.exp(-0.5 * (np.abs(found - drawn[where]).mean(axis=1) / _ALIKE) ** 2)
+            where, found, trust = self._sample_view(index, points, least)
+            agreement = np.exp(-0.5 * (np.abs(found - drawn[where]).mean(axis=1) / _COLOR_SIGMA) ** 2)
             light[where] += (trust * agreement)[:, None] * found
             agreed[where] += trust * agreement
             weight[where] += trust
@@ -95,22 +95,24 @@ class Sharpener:
         inside.ravel()[at] = 1.0
         return inside[..., None] * (detail - _blurred(detail) / np.maximum(_blurred(inside)[..., None], 1e-6))
 
-    def _chosen(self, points: Float[np.ndarray, "n 3"]) -> list[int]:
+    def _select_views(self, points: Float[np.ndarray, "n 3"]) -> list[int]:
         """The photographs that are among the most trusted ones at any of the places."""
-        some = points[:: max(1, len(points) // _PLACES)]
+        some = points[:: max(1, len(points) // _SAMPLE_POINTS)]
         trust = np.stack([_trust(view.camera, some) for view in self._views])
-        most = (trust > 0) & (_MORE * trust > _spared(trust))
+        most = (trust > 0) & (_TRUST_MARGIN * trust > _trust_threshold(trust))
         return [int(index) for index in np.flatnonzero(most.any(axis=1))]
 
-    def _least(self, chosen: list[int], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def _min_trust(self, chosen: list[int], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """How much a photograph must be trusted at each place to count there."""
-        if len(chosen) <= _MOST_VIEWS:
+        if len(chosen) <= _MAX_VIEWS:
             return np.zeros(len(points), np.float32)
         cameras = [self._views[index].camera for index in chosen]
-        parts = (points[first : first + _TOGETHER] for first in range(0, len(points), _TOGETHER))
-        return np.concatenate([_spared(np.stack([_trust(camera, part) for camera in cameras])) for part in parts])
+        parts = (points[first : first + _POINTS_PER_CHUNK] for first in range(0, len(points), _POINTS_PER_CHUNK))
+        return np.concatenate(
+            [_trust_threshold(np.stack([_trust(camera, part) for camera in cameras])) for part in parts]
+        )
 
-    def _look_up(
+    def _sample_view(
         self, index: int, points: Float[np.ndarray, "n 3"], least: Float[np.ndarray, " n"]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Rows of the places that a photograph truly sees, and is trusted at more than at least, their colours [m, 3]
@@ -123,11 +125,11 @@ class Sharpener:
         picture = self._pictures.get(index)
         pixels, depth = camera.project(points[rows])
         column, row = pixels.astype(np.int64).T
-        clear = depth <= (1 + _BEHIND) * self._depth(index)[row, column]
+        clear = depth <= (1 + _DEPTH_TOLERANCE) * self._depth(index)[row, column]
         if picture.mask is not None:
             clear &= picture.mask.numpy()[row, column] > 0
         rows = rows[clear]
-        found = _sampled(picture.image.numpy(), (pixels[clear] - 0.5).astype(np.float32))
+        found = _sample_image(picture.image.numpy(), (pixels[clear] - 0.5).astype(np.float32))
         return rows, found, trust[rows]
 
     def _depth(self, index: int) -> Float[np.ndarray, "h w"]:
@@ -140,12 +142,12 @@ class Sharpener:
         assert found is not None
         depth = found.cpu().numpy()
         self._depths[index] = np.where(depth > 0, depth, np.inf)
-        if len(self._depths) > _KEPT_DEPTHS:
+        if len(self._depths) > _MAX_CACHED_DEPTHS:
             self._depths.popitem(last=False)
         return self._depths[index]
 
 
-def _straight(camera: Camera, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+def _nadir_cosine(camera: Camera, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     """How straight from above a camera sees places: the cosine to the vertical, 0 from below."""
     rays = camera.position - points
     return (rays[:, 2] / np.linalg.norm(rays, axis=1)).clip(min=0.0)
@@ -157,22 +159,22 @@ def _trust(camera: Camera, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray
     border = np.minimum.reduce([pixels[:, 0], pixels[:, 1], camera.width - pixels[:, 0], camera.height - pixels[:, 1]])
     held = (depth > 0) & (border > 1.0)
     trust = np.zeros(len(points), np.float32)
-    trust[held] = _straight(camera, points[held]) ** _STRAIGHT * np.minimum(border[held] / _BORDER_PX, 1.0)
+    trust[held] = _nadir_cosine(camera, points[held]) ** _NADIR_POWER * np.minimum(border[held] / _BORDER_PX, 1.0)
     return trust
 
 
-def _spared(trust: Float[np.ndarray, "views n"]) -> Float[np.ndarray, " n"]:
-    """How much, at each place, a photograph is trusted that `_MOST_VIEWS` others make needless; 0 without so many."""
-    if len(trust) <= _MOST_VIEWS:
+def _trust_threshold(trust: Float[np.ndarray, "views n"]) -> Float[np.ndarray, " n"]:
+    """How much, at each place, a photograph is trusted that `_MAX_VIEWS` others make needless; 0 without so many."""
+    if len(trust) <= _MAX_VIEWS:
         return np.zeros(trust.shape[1], np.float32)
-    return _SPARE * np.partition(trust, -1 - _MOST_VIEWS, axis=0)[-1 - _MOST_VIEWS]
+    return _MIN_TRUST_SHARE * np.partition(trust, -1 - _MAX_VIEWS, axis=0)[-1 - _MAX_VIEWS]
 
 
 def _blurred(values: Float[np.ndarray, "h w ..."]) -> Float[np.ndarray, "h w ..."]:
     return cv2.GaussianBlur(values, (2 * HALO_PX + 1,) * 2, _BLUR_PX)
 
 
-def _sampled(image: np.ndarray, at: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+def _sample_image(image: np.ndarray, at: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
     """Colours in [0, 1] between the pixels of an image, cubic."""
     side = 1 << 14
     padded = np.zeros((-(-max(len(at), 1) // side) * side, 2), np.float32)

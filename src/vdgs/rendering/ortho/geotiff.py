@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 
 from vdgs.errors import VdgsError
-from vdgs.geometry.map_projection import Placement
-from vdgs.rendering.ortho.pixel_grid import TILE_PX, Grid
+from vdgs.geometry.map_projection import MapProjection
+from vdgs.rendering.ortho.pixel_grid import TILE_PX, PixelGrid
 
 #: What GDAL may keep of files in memory: in bytes, as rasterio takes it; GDAL itself would take 128 for megabytes.
-CACHE_BYTES = 128 << 20
+GDAL_CACHE_BYTES = 128 << 20
 
 
 @dataclass(frozen=True, kw_only=True)
-class Layer:
+class RasterLayer:
     """One file of a map: what its bands are called, their type, unit and what stands for nothing."""
 
     name: str
@@ -48,30 +48,32 @@ def require_rasterio() -> Any:
     return rasterio
 
 
-def bounded_cache() -> Any:
-    """A context in which GDAL keeps no more than `CACHE_BYTES` of files in memory, whatever the size of the machine."""
-    return require_rasterio().Env(GDAL_CACHEMAX=CACHE_BYTES)
+def limit_gdal_cache() -> Any:
+    """A context in which GDAL keeps no more than `GDAL_CACHE_BYTES` of files in memory, whatever the size of the machine."""
+    return require_rasterio().Env(GDAL_CACHEMAX=GDAL_CACHE_BYTES)
 
 
-def crs_of(placement: Placement) -> Any:
+def rasterio_crs(placement: MapProjection) -> Any:
     """The system as rasterio knows it: that of the catalogue, or a local one with name and unit."""
     crs = require_rasterio().crs.CRS
     if placement.wkt is not None:
         return crs.from_user_input(placement.crs)
-    unit = f'"metre",{placement.metres:g}' if placement.unit == "m" else '"unit of unknown size",1'
+    unit = f'"metre",{placement.meters_per_unit:g}' if placement.unit == "m" else '"unit of unknown size",1'
     name = placement.name.replace('"', "'")
     return crs.from_wkt(f'LOCAL_CS["{name}",UNIT[{unit}],AXIS["x",EAST],AXIS["y",NORTH]]')
 
 
 @contextmanager
-def writing(file: Path, layer: Layer, grid: Grid, placement: Placement, tags: dict[str, str]) -> Iterator[Any]:
+def open_geotiff(
+    file: Path, layer: RasterLayer, grid: PixelGrid, placement: MapProjection, tags: dict[str, str]
+) -> Iterator[Any]:
     """A tiled GeoTIFF open for `write_tile`; its name must end in .tif."""
     rasterio = require_rasterio()
     alpha = "alpha" in layer.bands
     options = {"photometric": "RGB", "alpha": "YES"} if alpha else {}
     with rasterio.open(
         file, "w", driver="GTiff", width=grid.width, height=grid.height, count=len(layer.bands), dtype=layer.dtype,
-        crs=crs_of(placement), transform=rasterio.Affine(grid.gsd, 0.0, grid.left, 0.0, -grid.gsd, grid.top),
+        crs=rasterio_crs(placement), transform=rasterio.Affine(grid.gsd, 0.0, grid.left, 0.0, -grid.gsd, grid.top),
         nodata=layer.nodata, tiled=True, blockxsize=TILE_PX, blockysize=TILE_PX, compress="DEFLATE", zlevel=1,
         bigtiff="IF_SAFER", **options,
     ) as stream:  # fmt: skip
@@ -89,7 +91,7 @@ def write_tile(stream: Any, column: int, row: int, values: np.ndarray) -> None:
     stream.write(values, window=window)
 
 
-def cloud_optimised(source: Path, file: Path, layer: Layer) -> None:
+def write_cog(source: Path, file: Path, layer: RasterLayer) -> None:
     """Rewrite a GeoTIFF as a cloud-optimised one: overviews, DEFLATE with a predictor.
 
     Raises OSError where the result is not what was written: GDAL closes files without a word when a disk is full.
@@ -105,9 +107,9 @@ def cloud_optimised(source: Path, file: Path, layer: Layer) -> None:
             raise OSError(f"{layer.name} came out damaged")
 
 
-def read_small(file: Path, longest_px: int) -> tuple[np.ndarray, float]:
+def read_overview(file: Path, max_px: int) -> tuple[np.ndarray, float]:
     """Bands [b, h, w] of a file at most so many pixels long, from its overviews, and how many pixels one stands for."""
     with require_rasterio().open(file) as stream:
-        factor = max(1.0, max(stream.width, stream.height) / longest_px)
+        factor = max(1.0, max(stream.width, stream.height) / max_px)
         shape = (stream.count, max(1, round(stream.height / factor)), max(1, round(stream.width / factor)))
         return stream.read(out_shape=shape), stream.height / shape[1]

@@ -7,67 +7,67 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from vdgs.captures.camera_height import reach
+from vdgs.captures.camera_height import view_distance
 from vdgs.captures.capture import Capture
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
-from vdgs.geometry.map_projection import Placement
+from vdgs.geometry.map_projection import MapProjection
 from vdgs.geometry.similarity import Similarity
-from vdgs.rendering.ortho.pixel_grid import Grid, ground_height
+from vdgs.rendering.ortho.pixel_grid import PixelGrid, ground_height
 
 #: Cameras by which the ceiling over a place is found, and the share of the sparse points about it that are under it.
-_NEIGHBOURS, _UNDER = 8, 0.995
+_NUM_NEIGHBORS, _POINT_QUANTILE = 8, 0.995
 #: How far, in pixels, the exact map may part from the similarity by which a tile is drawn.
 TOLERANCE_PX = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Ceiling:
+class ClipHeight:
     """How high over a place the scene ends and the air in which cameras fly begins, in the ground frame."""
 
     cameras: Float[np.ndarray, "c 3"]
     points: Float[np.ndarray, "p 3"]
-    flown: bool
+    cameras_above_scene: bool
 
     @staticmethod
-    def of(capture: Capture) -> Ceiling:
+    def of(capture: Capture) -> ClipHeight:
         cameras = np.array([view.camera.position for view in capture.train_views])
-        flown = reach(cameras, capture.points, np.array([0.0, 0.0, 1.0])).is_height
-        return Ceiling(cameras, capture.points, flown)
+        flown = view_distance(cameras, capture.points, np.array([0.0, 0.0, 1.0])).is_height
+        return ClipHeight(cameras, capture.points, flown)
 
-    def over(self, place: Float[np.ndarray, "3"], radius: float) -> float:
+    def over(self, point: Float[np.ndarray, "3"], radius: float) -> float:
         """z under which everything solid about `place` stands (choice).
 
         Where a drone flew there is air: what a model has as high as the cameras nearby hangs in front of them, unless
         the sparse points say that something stands there. Cameras that do not fly above the scene say nothing: then
         the ceiling is above all points.
         """
-        if not self.flown:
+        if not self.cameras_above_scene:
             return max(float(self.points[:, 2].max()), float(self.cameras[:, 2].max())) + radius
-        away = np.hypot(*(self.cameras[:, :2] - place[:2]).T)
-        near = self.cameras[np.argsort(away)[:_NEIGHBOURS]]
+        away = np.hypot(*(self.cameras[:, :2] - point[:2]).T)
+        near = self.cameras[np.argsort(away)[:_NUM_NEIGHBORS]]
         flying = float(np.median(near[:, 2]))
-        about = self.points[(np.abs(self.points[:, :2] - place[:2]) <= radius).all(axis=1), 2]
+        about = self.points[(np.abs(self.points[:, :2] - point[:2]) <= radius).all(axis=1), 2]
         if not len(about):
             return flying
         # Above the highest points by a tenth of their height: roofs are wider than the points on them.
-        top, low = float(np.quantile(about, _UNDER)), float(np.median(about))
+        top, low = float(np.quantile(about, _POINT_QUANTILE)), float(np.median(about))
         return max(flying, top + 0.1 * (top - low))
 
 
 @dataclass(frozen=True, eq=False)
-class Overhead:
+class NadirCamera:
     """Cameras above a capture, in the coordinates of a map."""
 
     capture: Capture
-    placement: Placement
-    ceiling: Ceiling
+    placement: MapProjection
+    clip_height: ClipHeight
 
     @staticmethod
-    def of(capture: Capture, placement: Placement) -> Overhead:
-        return Overhead(capture, placement, Ceiling.of(capture))
+    def of(capture: Capture, placement: MapProjection) -> NadirCamera:
+        return NadirCamera(capture, placement, ClipHeight.of(capture))
 
-    def camera(self, grid: Grid) -> Camera:
+    def camera(self, grid: PixelGrid) -> Camera:
         """The orthographic camera whose pixels are those of the grid, above everything solid.
 
         Raises VdgsError where the target's z is not up, or no similarity fits the target over the grid.
@@ -75,7 +75,7 @@ class Overhead:
         similarity, centre = self._similarity(grid)
         up = similarity.rotation[2]  # the target's, in the ground frame
         radius = 0.75 * max(grid.width, grid.height) * grid.gsd / similarity.scale
-        ceiling = self.ceiling.over(centre, max(radius, 1e-6))
+        ceiling = self.clip_height.over(centre, max(radius, 1e-6))
         above = centre + up * (ceiling - centre[2]) / up[2]
         pose = np.eye(4)
         pose[:3, :3] = np.diag([1.0, -1.0, -1.0]) @ similarity.rotation
@@ -86,7 +86,7 @@ class Overhead:
             height=grid.height, model="orthographic",
         )  # fmt: skip
 
-    def _similarity(self, grid: Grid) -> tuple[Similarity, Float[np.ndarray, "3"]]:
+    def _similarity(self, grid: PixelGrid) -> tuple[Similarity, Float[np.ndarray, "3"]]:
         """The similarity about the middle of the grid, and that place on the ground."""
         level = self.placement.places(np.array([[0.0, 0.0, ground_height(self.capture)]]))[0, 2]
         centre = self.placement.to_ground(np.array([[*grid.centre, level]]))[0]

@@ -8,41 +8,41 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from vdgs.captures.output_guard import refuse_in_a_capture
+from vdgs.captures.output_guard import check_not_in_capture
 from vdgs.errors import VdgsError
-from vdgs.system.atomic_files import read_record, write_json
+from vdgs.system.atomic_files import read_json_or_empty, write_json
 
-ORTHOPHOTO, DSM, VISIBILITY = "orthophoto.tif", "dsm.tif", "visibility.tif"
-HILLSHADE, PREVIEW, FACTS = "hillshade.png", "preview.png", "map.json"
-NAMES = (ORTHOPHOTO, DSM, VISIBILITY, HILLSHADE, PREVIEW, FACTS)
+ORTHOPHOTO_FILE, DSM_FILE, VISIBILITY_FILE = "orthophoto.tif", "dsm.tif", "visibility.tif"
+HILLSHADE_FILE, PREVIEW_FILE, METADATA_FILE = "hillshade.png", "preview.png", "map.json"
+FILE_NAMES = (ORTHOPHOTO_FILE, DSM_FILE, VISIBILITY_FILE, HILLSHADE_FILE, PREVIEW_FILE, METADATA_FILE)
 
 
-def software() -> str:
+def software_name() -> str:
     """What map.json calls the program that drew the files beside it."""
     from vdgs import __version__
 
     return f"vdgs {__version__}"
 
 
-def refuse_foreign(folder: Path) -> None:
+def check_output_folder(folder: Path) -> None:
     """Raise VdgsError where maps may not go: among inputs of a capture, or where files of their names are not ours."""
-    refuse_in_a_capture(folder)
+    check_not_in_capture(folder)
     if folder.exists() and not folder.is_dir():
         raise VdgsError(f"{folder}: is a file. Give a folder for the maps.")
-    there = [name for name in NAMES if os.path.lexists(folder / name)]
+    there = [name for name in FILE_NAMES if os.path.lexists(folder / name)]
     if there and not _is_ours(folder):
         raise VdgsError(
-            f"{folder}: holds {', '.join(there)}, and no {FACTS} says that `vdgs map` wrote them. Nothing was drawn. "
+            f"{folder}: holds {', '.join(there)}, and no {METADATA_FILE} says that `vdgs map` wrote them. Nothing was drawn. "
             "Give a new or an empty folder for --output; one with maps of vdgs gets the new ones in their place."
         )
 
 
 def _is_ours(folder: Path) -> bool:
-    return str(read_record(folder / FACTS).get("software")).startswith("vdgs ")
+    return str(read_json_or_empty(folder / METADATA_FILE).get("software")).startswith("vdgs ")
 
 
 @contextmanager
-def staged(folder: Path) -> Iterator[Path]:
+def staging_folder(folder: Path) -> Iterator[Path]:
     """A folder inside `folder` whose files come to stand in it when all are there; nothing is left if not.
 
     map.json comes last: while files take their places it says only whose they are. Raises VdgsError, with the remedy,
@@ -52,8 +52,8 @@ def staged(folder: Path) -> Iterator[Path]:
     try:
         staging.mkdir(parents=True, exist_ok=True)
         yield staging
-        write_json(folder / FACTS, {"software": software(), "finished": False})
-        for file in sorted(staging.iterdir(), key=lambda file: (file.name == FACTS, file.name)):
+        write_json(folder / METADATA_FILE, {"software": software_name(), "finished": False})
+        for file in sorted(staging.iterdir(), key=lambda file: (file.name == METADATA_FILE, file.name)):
             os.replace(file, folder / file.name)
     except OSError as error:  # rasterio's errors are such too
         raise VdgsError(

@@ -13,24 +13,24 @@ from scipy.spatial import cKDTree
 
 from vdgs.captures.capture import Capture
 from vdgs.errors import VdgsError
-from vdgs.geometry.map_projection import Placement
-from vdgs.visibility.visibility_counts import visibility_of
+from vdgs.geometry.map_projection import MapProjection
+from vdgs.visibility.visibility_counts import count_visibility
 
 #: Side of a tile in pixels: that of the blocks of the files, so that a tile is written as one.
 TILE_PX = 512
 #: A map ends beyond the sparse points that so many training cameras see, but for a share of them on every side, by a
 #: share of its size. What lies so many times farther from every camera than the median point is what they see behind
 #: the scene, with pixels as many times larger (choice).
-SEEN_BY, BEHIND = 2, 4.0
-_OUTSIDE, _BEYOND = 0.002, 0.03
+MIN_SEEN_BY, MAX_DISTANCE_RATIO = 2, 4.0
+_TRIM_QUANTILE, _MARGIN_SHARE = 0.002, 0.03
 #: No map has more pixels: a hundred thousand each way.
-MOST_PIXELS = 10_000_000_000
+MAX_PIXELS = 10_000_000_000
 #: Cameras by which the ground sampling is found.
-_CAMERAS = 60
+_MAX_GSD_CAMERAS = 60
 
 
 @dataclass(frozen=True)
-class Grid:
+class PixelGrid:
     """Pixels of `gsd` target units from the upper left corner (`left`, `top`): x to the right, y up."""
 
     left: float
@@ -49,15 +49,15 @@ class Grid:
         x0, y0, x1, y1 = self.bounds
         return ((x0 + x1) / 2, (y0 + y1) / 2)
 
-    def part(self, column: int, row: int, width: int, height: int) -> Grid:
+    def part(self, column: int, row: int, width: int, height: int) -> PixelGrid:
         """The pixels from `column` and `row` on."""
-        return Grid(self.left + column * self.gsd, self.top - row * self.gsd, self.gsd, width, height)
+        return PixelGrid(self.left + column * self.gsd, self.top - row * self.gsd, self.gsd, width, height)
 
-    def tiles(self, side: int = TILE_PX) -> Iterator[tuple[int, int, Grid]]:
+    def tiles(self, side: int = TILE_PX) -> Iterator[tuple[int, int, PixelGrid]]:
         """Column, row and pixels of every tile, row by row; the last ones are smaller."""
         return (self.tile(number, side) for number in range(self.tile_count(side)))
 
-    def tile(self, number: int, side: int = TILE_PX) -> tuple[int, int, Grid]:
+    def tile(self, number: int, side: int = TILE_PX) -> tuple[int, int, PixelGrid]:
         """The tile of this number among `tiles`, from 0."""
         row, column = (side * place for place in divmod(number, -(-self.width // side)))
         size = min(side, self.width - column), min(side, self.height - row)
@@ -67,10 +67,10 @@ class Grid:
         return -(-self.width // side) * -(-self.height // side)
 
 
-def grid_over(bbox: tuple[float, float, float, float], gsd: float) -> Grid:
+def grid_from_bbox(bbox: tuple[float, float, float, float], gsd: float) -> PixelGrid:
     """The grid that covers x0, y0, x1, y1, its lines at multiples of `gsd`: maps of one scene lie on each other.
 
-    Raises VdgsError for a size or a box that makes no map, and for one of more than `MOST_PIXELS`.
+    Raises VdgsError for a size or a box that makes no map, and for one of more than `MAX_PIXELS`.
     """
     x0, y0, x1, y1 = bbox
     if not (math.isfinite(gsd) and gsd > 0):
@@ -81,62 +81,62 @@ def grid_over(bbox: tuple[float, float, float, float], gsd: float) -> Grid:
     left, bottom = math.floor(x0 / gsd + 1e-6), math.floor(y0 / gsd + 1e-6)
     right, top = math.ceil(x1 / gsd - 1e-6), math.ceil(y1 / gsd - 1e-6)
     width, height = max(right - left, 1), max(top - bottom, 1)
-    if width * height > MOST_PIXELS:
-        coarser = gsd * math.sqrt(width * height / MOST_PIXELS)
+    if width * height > MAX_PIXELS:
+        coarser = gsd * math.sqrt(width * height / MAX_PIXELS)
         raise VdgsError(
-            f"--gsd {gsd:g}: the map would have {width} x {height} pixels, more than {MOST_PIXELS:.0e}. Give --gsd "
+            f"--gsd {gsd:g}: the map would have {width} x {height} pixels, more than {MAX_PIXELS:.0e}. Give --gsd "
             f"{_rounded_up(coarser):g} or larger, or a smaller --bbox."
         )
-    return Grid(left * gsd, top * gsd, gsd, width, height)
+    return PixelGrid(left * gsd, top * gsd, gsd, width, height)
 
 
-def extent_of(capture: Capture, placement: Placement) -> tuple[float, float, float, float]:
+def capture_extent(capture: Capture, placement: MapProjection) -> tuple[float, float, float, float]:
     """x0, y0, x1, y1 in target coordinates of what the training photographs show, by the sparse points.
 
     Raises VdgsError where there are too few points to tell.
     """
-    seen = visibility_of(torch.from_numpy(capture.points), [view.camera for view in capture.train_views]).numpy()
-    shown = capture.points[seen >= min(SEEN_BY, len(capture.train_views))]
-    shown = shown[_not_behind(shown, np.array([view.camera.position for view in capture.train_views]))]
+    seen = count_visibility(torch.from_numpy(capture.points), [view.camera for view in capture.train_views]).numpy()
+    shown = capture.points[seen >= min(MIN_SEEN_BY, len(capture.train_views))]
+    shown = shown[_not_in_background(shown, np.array([view.camera.position for view in capture.train_views]))]
     if len(shown) < 10:
         raise VdgsError(
-            f"{capture.root}: has {len(shown)} sparse points in {SEEN_BY} pictures or more, too few to tell what a map "
+            f"{capture.root}: has {len(shown)} sparse points in {MIN_SEEN_BY} pictures or more, too few to tell what a map "
             "should show. Give --bbox X0 Y0 X1 Y1."
         )
     places = placement.places(shown)[:, :2]
-    low, high = np.quantile(places, [_OUTSIDE, 1 - _OUTSIDE], axis=0)
-    beyond = _BEYOND * (high - low)
+    low, high = np.quantile(places, [_TRIM_QUANTILE, 1 - _TRIM_QUANTILE], axis=0)
+    beyond = _MARGIN_SHARE * (high - low)
     return (*(low - beyond).tolist(), *(high + beyond).tolist())
 
 
-def _not_behind(points: Float[np.ndarray, "n 3"], cameras: Float[np.ndarray, "c 3"]) -> Bool[np.ndarray, " n"]:
+def _not_in_background(points: Float[np.ndarray, "n 3"], cameras: Float[np.ndarray, "c 3"]) -> Bool[np.ndarray, " n"]:
     """Which points are of the scene, and not of what cameras see behind it."""
     distance = cKDTree(cameras).query(points, workers=1)[0]
-    return np.asarray(distance <= BEHIND * np.median(distance)) if len(points) else np.ones(0, bool)
+    return np.asarray(distance <= MAX_DISTANCE_RATIO * np.median(distance)) if len(points) else np.ones(0, bool)
 
 
-def refuse_elsewhere(grid: Grid, shown: tuple[float, float, float, float], placement: Placement) -> None:
+def check_grid_overlap(grid: PixelGrid, extent: tuple[float, float, float, float], placement: MapProjection) -> None:
     """Raise VdgsError where a grid lies wholly beside what the photographs show, by more than that is wide."""
-    x0, y0, x1, y1 = shown
+    x0, y0, x1, y1 = extent
     left, bottom, right, top = grid.bounds
     across, along = x1 - x0, y1 - y0
     if left > x1 + across or right < x0 - across or bottom > y1 + along or top < y0 - along:
         raise VdgsError(
             f"--bbox {' '.join(f'{v:g}' for v in grid.bounds)}: lies beside the scene, which spans "
-            f"{' '.join(f'{v:.1f}' for v in shown)} in {placement.name}."
+            f"{' '.join(f'{v:.1f}' for v in extent)} in {placement.name}."
         )
 
 
-def ground_sampling(capture: Capture, scale: float) -> float:
+def ground_sampling_distance(capture: Capture, scale: float) -> float:
     """The median size of a pixel of the training photographs on what they show, in target units, to two digits.
 
     `scale`: target units in one of the ground frame. Raises VdgsError where no photograph holds a sparse point.
     """
     views = capture.train_views
-    chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, _CAMERAS).round().astype(int))]
+    chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, _MAX_GSD_CAMERAS).round().astype(int))]
     sizes = []
     for view in chosen:
-        held = view.camera.sees(capture.points)
+        held = view.camera.in_frustum(capture.points)
         if held.any():
             depth = view.camera.project(capture.points[held])[1]
             sizes.append(float(np.median(depth)) / view.camera.fx)
@@ -152,7 +152,7 @@ def ground_height(capture: Capture) -> float:
     return float(np.median(capture.points[:, 2])) if len(capture.points) else 0.0
 
 
-def middle_of(capture: Capture) -> Float[np.ndarray, "3"]:
+def median_point(capture: Capture) -> Float[np.ndarray, "3"]:
     """The median sparse point [3]."""
     return np.median(capture.points, axis=0) if len(capture.points) else np.zeros(3)
 

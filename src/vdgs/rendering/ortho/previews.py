@@ -16,35 +16,35 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from vdgs.geometry.map_projection import Placement
-from vdgs.plots.style import DPI, FAINT, INK, SEEN, placer, plain, titles
-from vdgs.plots.visibility_map import steps
-from vdgs.rendering.ortho.geotiff import read_small
-from vdgs.rendering.ortho.pixel_grid import Grid
-from vdgs.rendering.ortho.tile_renderer import NO_COUNT, NO_HEIGHT
+from vdgs.geometry.map_projection import MapProjection
+from vdgs.plots.style import DPI, INK, MUTED, VISIBILITY_CMAP, axes_placer, draw_titles, style_axes
+from vdgs.plots.visibility_map import visibility_color_norm
+from vdgs.rendering.ortho.geotiff import read_overview
+from vdgs.rendering.ortho.pixel_grid import PixelGrid
+from vdgs.rendering.ortho.tile_renderer import NODATA_COUNT, NODATA_HEIGHT
 from vdgs.system.documents import MapMetadata
 
 #: The sun of a hillshade: from the north-west, half way up, as on printed maps.
 AZIMUTH_DEG, ALTITUDE_DEG = 315.0, 45.0
 #: Longest side of pictures, in pixels.
-LONGEST_PX = 2400
+MAX_IMAGE_PX = 2400
 _PANEL_PX = 1400
-HEIGHT_COLOURS = "terrain"
+HEIGHT_CMAP = "terrain"
 
 
 @dataclass(frozen=True)
-class Sheet:
+class PreviewSheet:
     """What a sheet says beside its pictures."""
 
     name: str
-    grid: Grid
-    placement: Placement
+    grid: PixelGrid
+    placement: MapProjection
     facts: MapMetadata
 
 
-def hillshade(heights: Float[np.ndarray, "h w"], pixel: float) -> Float[np.ndarray, "h w"]:
+def hillshade(heights: Float[np.ndarray, "h w"], pixel_size: float) -> Float[np.ndarray, "h w"]:
     """Light on a surface (NaN where there is none), 0 to 1, for pixels of so many units; level ground has 0.71."""
-    down, right = np.gradient(heights, pixel) if min(heights.shape) > 1 else (np.zeros_like(heights),) * 2
+    down, right = np.gradient(heights, pixel_size) if min(heights.shape) > 1 else (np.zeros_like(heights),) * 2
     # The normal is (-right, down, 1): rows run south, north is up.
     azimuth, altitude = np.radians(AZIMUTH_DEG), np.radians(ALTITUDE_DEG)
     sun = np.array([np.sin(azimuth) * np.cos(altitude), np.cos(azimuth) * np.cos(altitude), np.sin(altitude)])
@@ -52,9 +52,9 @@ def hillshade(heights: Float[np.ndarray, "h w"], pixel: float) -> Float[np.ndarr
     return np.where(np.isfinite(heights), np.nan_to_num(lit, nan=sun[2]).clip(0, 1), np.nan)
 
 
-def hillshade_png(dsm: Path, file: Path, grid: Grid) -> None:
-    """Grey relief with transparent holes, at most `LONGEST_PX` long."""
-    heights, factor = _heights(dsm, LONGEST_PX)
+def write_hillshade(dsm: Path, file: Path, grid: PixelGrid) -> None:
+    """Grey relief with transparent holes, at most `MAX_IMAGE_PX` long."""
+    heights, factor = _heights(dsm, MAX_IMAGE_PX)
     light = hillshade(heights, grid.gsd * factor)
     shown = np.isfinite(light)
     grey = (np.nan_to_num(light) * 255 + 0.5).astype(np.uint8)
@@ -63,7 +63,7 @@ def hillshade_png(dsm: Path, file: Path, grid: Grid) -> None:
     file.write_bytes(content.tobytes())
 
 
-def preview_png(orthophoto: Path, dsm: Path, visibility: Path, file: Path, sheet: Sheet) -> None:
+def write_preview(orthophoto: Path, dsm: Path, visibility: Path, file: Path, sheet: PreviewSheet) -> None:
     """Orthophoto, shaded heights and V side by side (above each other where the map is wide), each with its legend."""
     grid = sheet.grid
     x0, y0, x1, y1 = grid.bounds
@@ -71,10 +71,10 @@ def preview_png(orthophoto: Path, dsm: Path, visibility: Path, file: Path, sheet
     scale = min(5.2 / across, 6.4 / along)
     width, height = max(across * scale, 2.6), max(along * scale, 2.2)
     figure = Figure(figsize=(3 * width + 4.9, height + 2.3), dpi=DPI)
-    canvas, place = FigureCanvasAgg(figure), placer(figure)
-    rgba = np.moveaxis(read_small(orthophoto, _PANEL_PX)[0], 0, -1)
+    canvas, place = FigureCanvasAgg(figure), axes_placer(figure)
+    rgba = np.moveaxis(read_overview(orthophoto, _PANEL_PX)[0], 0, -1)
     heights, factor = _heights(dsm, _PANEL_PX)
-    counts = read_small(visibility, _PANEL_PX)[0][0]
+    counts = read_overview(visibility, _PANEL_PX)[0][0]
     panels = [place(0.95 + k * (width + 1.1) - (0.35 if k else 0.0), 0.8, width, height) for k in range(3)]
     panels[0].imshow(rgba, extent=(x0, x1, y0, y1), interpolation="nearest")
     _draw_heights(figure, panels[1], heights, hillshade(heights, grid.gsd * factor), sheet)
@@ -82,7 +82,7 @@ def preview_png(orthophoto: Path, dsm: Path, visibility: Path, file: Path, sheet
     for axes, title in zip(panels, ("orthophoto", "surface and its heights", "training cameras, V"), strict=True):
         axes.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", facecolor="#f3f1ec")
         axes.set_title(title, fontsize=10, color=INK, loc="left")
-        plain(axes)
+        style_axes(axes)
         for axis, most in ((axes.xaxis, 3), (axes.yaxis, 5)):
             axis.set_major_locator(MaxNLocator(most, steps=[1, 2, 5, 10]))
             axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.10g}".replace(",", " ")))
@@ -94,7 +94,7 @@ def preview_png(orthophoto: Path, dsm: Path, visibility: Path, file: Path, sheet
     _scale_bar(panels[0], grid, sheet.placement)
     _north(panels[0], "N" if east == "easting" else "y")
     facts = sheet.facts
-    titles(
+    draw_titles(
         figure, sheet.name,
         f"{sheet.placement.name}; {grid.width} x {grid.height} pixels of {grid.gsd:g} {sheet.placement.unit}; "
         f"{facts['model']} model, {facts['training_cameras']} training photographs",
@@ -104,30 +104,30 @@ def preview_png(orthophoto: Path, dsm: Path, visibility: Path, file: Path, sheet
 
 
 def _heights(dsm: Path, longest_px: int) -> tuple[Float[np.ndarray, "h w"], float]:
-    values, factor = read_small(dsm, longest_px)
-    return np.where(values[0] == np.float32(NO_HEIGHT), np.nan, values[0]).astype(np.float64), factor
+    values, factor = read_overview(dsm, longest_px)
+    return np.where(values[0] == np.float32(NODATA_HEIGHT), np.nan, values[0]).astype(np.float64), factor
 
 
-def _draw_heights(figure: Figure, axes: Axes, heights: np.ndarray, light: np.ndarray, sheet: Sheet) -> None:
+def _draw_heights(figure: Figure, axes: Axes, heights: np.ndarray, light: np.ndarray, sheet: PreviewSheet) -> None:
     x0, y0, x1, y1 = sheet.grid.bounds
     there = heights[np.isfinite(heights)]
     low, high = (float(v) for v in np.quantile(there, [0.005, 0.995])) if there.size else (0.0, 1.0)
     norm = Normalize(low, max(high, low + 1e-6))
-    colours = matplotlib.colormaps[HEIGHT_COLOURS](0.15 + 0.7 * norm(np.nan_to_num(heights, nan=low)).clip(0, 1))
+    colours = matplotlib.colormaps[HEIGHT_CMAP](0.15 + 0.7 * norm(np.nan_to_num(heights, nan=low)).clip(0, 1))
     colours[..., :3] *= (0.25 + 0.75 * np.nan_to_num(light) / np.sin(np.radians(ALTITUDE_DEG))).clip(0, 1.2)[..., None]
     colours[..., 3] = np.isfinite(heights)
     axes.imshow(colours.clip(0, 1), extent=(x0, x1, y0, y1), interpolation="nearest")
-    shown = matplotlib.colors.ListedColormap(matplotlib.colormaps[HEIGHT_COLOURS](np.linspace(0.15, 0.85, 256)))
+    shown = matplotlib.colors.ListedColormap(matplotlib.colormaps[HEIGHT_CMAP](np.linspace(0.15, 0.85, 256)))
     _legend(figure, axes, ScalarMappable(norm, shown), f"height ({sheet.placement.unit})")
 
 
-def _draw_counts(figure: Figure, axes: Axes, counts: np.ndarray, sheet: Sheet) -> None:
+def _draw_counts(figure: Figure, axes: Axes, counts: np.ndarray, sheet: PreviewSheet) -> None:
     x0, y0, x1, y1 = sheet.grid.bounds
-    there = counts != NO_COUNT
-    top, norm = steps(counts[there]) if there.any() else (10, Normalize(0, 10))
+    there = counts != NODATA_COUNT
+    top, norm = visibility_color_norm(counts[there]) if there.any() else (10, Normalize(0, 10))
     shown = np.ma.masked_array(np.minimum(counts, top), ~there)
-    axes.imshow(shown, extent=(x0, x1, y0, y1), cmap=SEEN, norm=norm, interpolation="nearest")
-    _legend(figure, axes, ScalarMappable(norm, SEEN), f"V, to {top}")
+    axes.imshow(shown, extent=(x0, x1, y0, y1), cmap=VISIBILITY_CMAP, norm=norm, interpolation="nearest")
+    _legend(figure, axes, ScalarMappable(norm, VISIBILITY_CMAP), f"V, to {top}")
 
 
 def _legend(figure: Figure, axes: Axes, colours: ScalarMappable, label: str) -> None:
@@ -141,14 +141,14 @@ def _legend(figure: Figure, axes: Axes, colours: ScalarMappable, label: str) -> 
     legend.locator = MaxNLocator(5, integer=True)
     legend.update_ticks()
     legend.minorticks_off()
-    bar.tick_params(labelsize=7, colors=FAINT, labelcolor=INK, length=2)
+    bar.tick_params(labelsize=7, colors=MUTED, labelcolor=INK, length=2)
     bar.set_title(label, fontsize=7, color=INK, loc="left", pad=4)
 
 
-def _scale_bar(axes: Axes, grid: Grid, placement: Placement) -> None:
+def _scale_bar(axes: Axes, grid: PixelGrid, placement: MapProjection) -> None:
     """A round length of about a quarter of the map, on white."""
     x0, y0, x1, y1 = grid.bounds
-    length = round_length((x1 - x0) / 4)
+    length = floor_to_nice_length((x1 - x0) / 4)
     left, low, thick = x0 + 0.05 * (x1 - x0), y0 + 0.05 * (y1 - y0), 0.012 * (y1 - y0)
     for k, colour in enumerate((INK, "white")):
         axes.add_patch(
@@ -169,7 +169,7 @@ def _north(axes: Axes, name: str) -> None:
     )  # fmt: skip
 
 
-def round_length(about: float) -> float:
+def floor_to_nice_length(limit: float) -> float:
     """The largest of 1, 2, 5 times a power of ten that is not above `about`."""
-    power = 10.0 ** np.floor(np.log10(about))
-    return float(max(step * power for step in (1, 2, 5) if step * power <= about * (1 + 1e-9)))
+    power = 10.0 ** np.floor(np.log10(limit))
+    return float(max(step * power for step in (1, 2, 5) if step * power <= limit * (1 + 1e-9)))

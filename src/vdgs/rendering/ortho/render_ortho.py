@@ -14,40 +14,49 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
-from vdgs.config.commands import MapRequest
+from vdgs.config.commands import OrthoRequest
 from vdgs.distributed.job_folders import clear
-from vdgs.distributed.sharded_job import Wish
+from vdgs.distributed.sharded_job import ExecutionOptions
 from vdgs.errors import VdgsError
-from vdgs.geometry.map_projection import Placement
-from vdgs.rendering.ortho.geotiff import Layer, bounded_cache, cloud_optimised, require_rasterio, write_tile, writing
-from vdgs.rendering.ortho.ortho_folder import (
-    DSM,
-    FACTS,
-    HILLSHADE,
-    ORTHOPHOTO,
-    PREVIEW,
-    VISIBILITY,
-    refuse_foreign,
-    software,
-    staged,
+from vdgs.geometry.map_projection import MapProjection
+from vdgs.rendering.ortho.geotiff import (
+    RasterLayer,
+    limit_gdal_cache,
+    open_geotiff,
+    require_rasterio,
+    write_cog,
+    write_tile,
 )
-from vdgs.rendering.ortho.ortho_plan import Plan, folder_of
-from vdgs.rendering.ortho.previews import Sheet, hillshade_png, preview_png
-from vdgs.rendering.ortho.tile_renderer import NO_COUNT, NO_HEIGHT, Tile
-from vdgs.rendering.ortho.tile_shards import drawn_elsewhere
-from vdgs.runs.open_run import find_model
+from vdgs.rendering.ortho.ortho_folder import (
+    DSM_FILE,
+    HILLSHADE_FILE,
+    METADATA_FILE,
+    ORTHOPHOTO_FILE,
+    PREVIEW_FILE,
+    VISIBILITY_FILE,
+    check_output_folder,
+    software_name,
+    staging_folder,
+)
+from vdgs.rendering.ortho.ortho_plan import OrthoPlan, output_folder
+from vdgs.rendering.ortho.previews import PreviewSheet, write_hillshade, write_preview
+from vdgs.rendering.ortho.tile_renderer import NODATA_COUNT, NODATA_HEIGHT, OrthoTile
+from vdgs.rendering.ortho.tile_shards import distributed_tiles
+from vdgs.runs.open_run import locate_model
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
-from vdgs.system.atomic_files import jsonable, read_record, write_json
+from vdgs.system.atomic_files import read_json_or_empty, to_jsonable, write_json
 from vdgs.system.documents import MapMetadata
-from vdgs.system.stop_signals import stop_if_asked
+from vdgs.system.stop_signals import check_stop_requested
 from vdgs.system.units import data_size
 
 #: What a map takes on the disk while it is written, in parts of its uncompressed size: tiles, overviews, the result.
 _DISK_SHARE = 2.4
 
 
-def map_run(context: RunContext, asked: MapRequest, console: Console, wish: Wish | None = None) -> Path:
+def render_ortho(
+    context: RunContext, request: OrthoRequest, console: Console, execution: ExecutionOptions | None = None
+) -> Path:
     """Write the maps of a run, on a device that is chosen already; returns their folder.
 
     Tiles are drawn in this process, or in shards where a `wish` sends them: the files are the same. Raises VdgsError,
@@ -56,12 +65,12 @@ def map_run(context: RunContext, asked: MapRequest, console: Console, wish: Wish
     `ShardedJob.send` raises.
     """
     require_rasterio()
-    refuse_foreign(folder_of(asked, asked.run))
+    check_output_folder(output_folder(request, request.run))
     began = time.monotonic()
-    if wish is not None and wish.sends:
-        facts, folder = _map_in_pieces(context, asked, wish, console)
+    if execution is not None and execution.is_distributed:
+        facts, folder = _render_sharded(context, request, execution, console)
     else:
-        facts, folder = _map_here(context, asked, console)
+        facts, folder = _render_locally(context, request, console)
     console.print(
         f"maps: {folder} ({facts['mapped_share']:.0%} of the pixels, {time.monotonic() - began:.0f} s)",
         highlight=False,
@@ -69,34 +78,36 @@ def map_run(context: RunContext, asked: MapRequest, console: Console, wish: Wish
     return folder
 
 
-def _map_here(context: RunContext, asked: MapRequest, console: Console) -> tuple[MapMetadata, Path]:
+def _render_locally(context: RunContext, request: OrthoRequest, console: Console) -> tuple[MapMetadata, Path]:
     """Draw in this process; what came out, and where."""
-    run = context.open_model(asked.model, asked.device)
-    plan = Plan.of(asked, run.folder.path, run.name, run.status.model, run.capture)
-    _announce(plan, console)
+    run = context.open_model(request.model, request.device)
+    plan = OrthoPlan.of(request, run.folder.path, run.name, run.status.model, run.capture)
+    _print_plan(plan, console)
     clear(plan.folder)
-    with plan.surveyor(run.model) as surveyor:
+    with plan.tile_renderer(run.model) as surveyor:
         return _write(plan, (surveyor.tile(part) for _, _, part in plan.grid.tiles()), console), plan.folder
 
 
-def _map_in_pieces(context: RunContext, asked: MapRequest, wish: Wish, console: Console) -> tuple[MapMetadata, Path]:
+def _render_sharded(
+    context: RunContext, request: OrthoRequest, execution: ExecutionOptions, console: Console
+) -> tuple[MapMetadata, Path]:
     """Let shards of the tiles be drawn elsewhere, and gather them one at a time. No model is in the memory of this
     process."""
     context.release_models()
-    run = RunFolder(Path(os.path.abspath(asked.run)))  # as in `stages.train`: other machines may mount it so
-    found, capture = find_model(run, asked.model), context.capture
-    plan = Plan.of(asked, run.path, found.name, found.stage.status().model, capture)
-    _announce(plan, console, in_pieces=True)
-    with drawn_elsewhere(plan, asked, run, found, wish, console) as tiles:
+    run = RunFolder(Path(os.path.abspath(request.run)))  # as in `stages.train`: other machines may mount it so
+    found, capture = locate_model(run, request.model), context.capture
+    plan = OrthoPlan.of(request, run.path, found.name, found.stage.status().model, capture)
+    _print_plan(plan, console, sharded=True)
+    with distributed_tiles(plan, request, run, found, execution, console) as tiles:
         return _write(plan, tiles, console), plan.folder
 
 
-def _write(plan: Plan, tiles: Iterable[Tile], console: Console) -> MapMetadata:
+def _write(plan: OrthoPlan, tiles: Iterable[OrthoTile], console: Console) -> MapMetadata:
     """Make maps of all tiles, which come in their order: files that come to stand in the folder together. Returns
     what map.json says."""
-    layers = layers_of(plan.placement)
-    with staged(plan.folder) as staging, bounded_cache():
-        facts = _facts(plan)
+    layers = raster_layers(plan.placement)
+    with staging_folder(plan.folder) as staging, limit_gdal_cache():
+        facts = _metadata(plan)
         facts |= _draw(plan, tiles, layers, staging, facts, console)
         if not facts["mapped_share"]:
             raise VdgsError(
@@ -105,66 +116,68 @@ def _write(plan: Plan, tiles: Iterable[Tile], console: Console) -> MapMetadata:
             )
         for layer in layers:
             rough = staging / f"rough-{layer.name}"
-            cloud_optimised(rough, staging / layer.name, layer)
+            write_cog(rough, staging / layer.name, layer)
             rough.unlink()
-        sheet = Sheet(plan.run_name, plan.grid, plan.placement, facts)
-        hillshade_png(staging / DSM, staging / HILLSHADE, plan.grid)
-        preview_png(staging / ORTHOPHOTO, staging / DSM, staging / VISIBILITY, staging / PREVIEW, sheet)
-        write_json(staging / FACTS, jsonable(facts))
+        sheet = PreviewSheet(plan.run_name, plan.grid, plan.placement, facts)
+        write_hillshade(staging / DSM_FILE, staging / HILLSHADE_FILE, plan.grid)
+        write_preview(
+            staging / ORTHOPHOTO_FILE, staging / DSM_FILE, staging / VISIBILITY_FILE, staging / PREVIEW_FILE, sheet
+        )
+        write_json(staging / METADATA_FILE, to_jsonable(facts))
     return facts
 
 
-def is_mapped(run: RunFolder) -> bool:
+def is_ortho_current(run: RunFolder) -> bool:
     """Whether RUN/maps shows the merged model that is there."""
-    drawn = read_record(run.path / "maps" / FACTS).get("model_identity")
+    drawn = read_json_or_empty(run.path / "maps" / METADATA_FILE).get("model_identity")
     return drawn is not None and drawn == run.merged.status().model
 
 
-def can_map() -> bool:
+def has_ortho_dependencies() -> bool:
     """Whether what `vdgs map` needs is installed."""
     return all(find_spec(name) is not None for name in ("rasterio", "pyproj"))
 
 
-def layers_of(placement: Placement) -> tuple[Layer, Layer, Layer]:
+def raster_layers(placement: MapProjection) -> tuple[RasterLayer, RasterLayer, RasterLayer]:
     """The files of a map."""
     return (
-        Layer(
-            name=ORTHOPHOTO,
+        RasterLayer(
+            name=ORTHOPHOTO_FILE,
             title="orthophoto: colours seen from straight above",
             bands=("red", "green", "blue", "alpha"),
             dtype="uint8",
             nodata=None,
             overviews="average",
         ),
-        Layer(
-            name=DSM,
+        RasterLayer(
+            name=DSM_FILE,
             title=f"surface model: {placement.heights}",
             bands=(f"height, {placement.heights}",),
             dtype="float32",
-            nodata=NO_HEIGHT,
+            nodata=NODATA_HEIGHT,
             overviews="nearest",
             unit=placement.unit,
         ),
-        Layer(
-            name=VISIBILITY,
+        RasterLayer(
+            name=VISIBILITY_FILE,
             title="V: training cameras whose picture holds the place",
             bands=("training cameras",),
             dtype="uint16",
-            nodata=NO_COUNT,
+            nodata=NODATA_COUNT,
             overviews="nearest",
             unit="cameras",
         ),
     )
 
 
-def _announce(plan: Plan, console: Console, in_pieces: bool = False) -> None:
+def _print_plan(plan: OrthoPlan, console: Console, sharded: bool = False) -> None:
     """Say how large the map will be; raise VdgsError where the disk has no room for it."""
     grid, placement, folder = plan.grid, plan.placement, plan.folder
     for note in placement.notes:
         console.print(f"[yellow]note[/] {note}", highlight=False)
     # What shards have drawn lies beside it until all is gathered.
-    share = _DISK_SHARE + 1 if in_pieces else _DISK_SHARE
-    needed = int(share * grid.width * grid.height * sum(layer.bytes_per_pixel for layer in layers_of(placement)))
+    share = _DISK_SHARE + 1 if sharded else _DISK_SHARE
+    needed = int(share * grid.width * grid.height * sum(layer.bytes_per_pixel for layer in raster_layers(placement)))
     needed += 5_000_000
     existing = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.exists())
     free = shutil.disk_usage(existing).free
@@ -182,7 +195,7 @@ def _announce(plan: Plan, console: Console, in_pieces: bool = False) -> None:
 
 
 def _draw(
-    plan: Plan, tiles: Iterable[Tile], layers: tuple[Layer, ...], staging: Path, facts: MapMetadata,
+    plan: OrthoPlan, tiles: Iterable[OrthoTile], layers: tuple[RasterLayer, ...], staging: Path, facts: MapMetadata,
     console: Console,
 ) -> MapMetadata:  # fmt: skip
     """Put all tiles into files beside the final ones; what came out. One tile is in memory at a time."""
@@ -192,7 +205,7 @@ def _draw(
     mapped, poorly, low, high = 0, 0, np.inf, -np.inf
     with ExitStack() as open_files:
         files = [
-            open_files.enter_context(writing(staging / f"rough-{layer.name}", layer, grid, plan.placement, tags))
+            open_files.enter_context(open_geotiff(staging / f"rough-{layer.name}", layer, grid, plan.placement, tags))
             for layer in layers
         ]
         shown_tiles = track(
@@ -200,7 +213,7 @@ def _draw(
             disable=not console.is_terminal,
         )  # fmt: skip
         for (column, row, _), tile in shown_tiles:
-            stop_if_asked()
+            check_stop_requested()
             shown = tile.alpha > 0
             if shown.any():
                 mapped += int(shown.sum())
@@ -215,15 +228,15 @@ def _draw(
     }  # fmt: skip
 
 
-def _bands(tile: Tile) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _bands(tile: OrthoTile) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     coloured = np.concatenate([tile.colours, tile.alpha[..., None]], axis=-1)
     return np.moveaxis(coloured, -1, 0), tile.heights[None], tile.visibility[None]
 
 
-def _facts(plan: Plan) -> MapMetadata:
+def _metadata(plan: OrthoPlan) -> MapMetadata:
     grid, placement, capture = plan.grid, plan.placement, plan.above.capture
     return {
-        "software": software(), "model": plan.model, "model_identity": plan.model_identity,
+        "software": software_name(), "model": plan.model, "model_identity": plan.model_identity,
         "crs": placement.crs, "crs_name": placement.name,
         "unit": placement.unit, "heights": placement.heights, "georeference": capture.ground.how,
         "gsd": grid.gsd, "width": grid.width, "height": grid.height, "bounds": list(grid.bounds),

@@ -12,22 +12,22 @@ from jaxtyping import Bool, Float, Int, UInt8, UInt16
 from vdgs.geometry.camera import Camera
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.renderer import render
-from vdgs.rendering.ortho.detail_transfer import HALO_PX, Sharpener
-from vdgs.rendering.ortho.nadir_camera import Overhead
-from vdgs.rendering.ortho.pixel_grid import Grid
-from vdgs.visibility.visibility_counts import visibility_of
+from vdgs.rendering.ortho.detail_transfer import HALO_PX, DetailTransfer
+from vdgs.rendering.ortho.nadir_camera import NadirCamera
+from vdgs.rendering.ortho.pixel_grid import PixelGrid
+from vdgs.visibility.visibility_counts import count_visibility
 
 #: At least this opaque, a pixel shows a surface: the median depth is that of half.
-DRAWN_ALPHA = 0.5
+MIN_ALPHA = 0.5
 #: What stands for no value in the files.
-NO_HEIGHT, NO_COUNT = -9999.0, 65535
+NODATA_HEIGHT, NODATA_COUNT = -9999.0, 65535
 #: Most samples per pixel, each way.
-_MOST_SAMPLES = 4
+_MAX_SAMPLES = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Tile:
-    """What a tile shows; nothing (0, `NO_HEIGHT`, `NO_COUNT`) where the scene is open or no camera looks."""
+class OrthoTile:
+    """What a tile shows; nothing (0, `NODATA_HEIGHT`, `NODATA_COUNT`) where the scene is open or no camera looks."""
 
     colours: UInt8[np.ndarray, "h w 3"]
     alpha: UInt8[np.ndarray, "h w"]
@@ -35,7 +35,7 @@ class Tile:
     visibility: UInt16[np.ndarray, "h w"]
 
 
-class _Seen(NamedTuple):
+class _PixelSurfaces(NamedTuple):
     """What pixels show, of which some are `shown`: for those, places in the ground frame and how many cameras look."""
 
     colours: Float[np.ndarray, "h w 3"]
@@ -45,40 +45,42 @@ class _Seen(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Surveyor:
+class TileRenderer:
     """Draws tiles of a map of one model."""
 
     model: AnchorModel
-    above: Overhead
+    above: NadirCamera
     #: Samples per pixel, each way.
     samples: int = 1
     #: Takes detail from the photographs, where that is asked for.
-    sharpener: Sharpener | None = None
+    sharpener: DetailTransfer | None = None
 
-    def tile(self, grid: Grid) -> Tile:
+    def tile(self, grid: PixelGrid) -> OrthoTile:
         """Draw the pixels of a grid, each from `samples`² of its own."""
-        fine = Grid(grid.left, grid.top, grid.gsd / self.samples, grid.width * self.samples, grid.height * self.samples)
+        fine = PixelGrid(
+            grid.left, grid.top, grid.gsd / self.samples, grid.width * self.samples, grid.height * self.samples
+        )
         through = self.above.camera(fine)
         camera = self.above.camera(grid) if self.samples > 1 else through
         seen = self._seen(through, camera)
         shown, colours = seen.shown, seen.colours
         if self.sharpener is not None and shown.any():
             # Drawn once more, with what lies about it; not cut from that, so that heights and V are those without.
-            around = self._seen(_widened(through, HALO_PX * self.samples), _widened(camera, HALO_PX))
+            around = self._seen(_pad_camera(through, HALO_PX * self.samples), _pad_camera(camera, HALO_PX))
             detail = self.sharpener.detail(around.points, around.colours, around.shown)
             colours = colours + detail[HALO_PX:-HALO_PX, HALO_PX:-HALO_PX]
-        tile = Tile(
+        tile = OrthoTile(
             np.zeros((*shown.shape, 3), np.uint8), np.zeros(shown.shape, np.uint8),
-            np.full(shown.shape, NO_HEIGHT, np.float32), np.full(shown.shape, NO_COUNT, np.uint16),
+            np.full(shown.shape, NODATA_HEIGHT, np.float32), np.full(shown.shape, NODATA_COUNT, np.uint16),
         )  # fmt: skip
         tile.colours[shown] = (colours[shown].clip(0, 1) * 255 + 0.5).astype(np.uint8)
         tile.alpha[shown] = 255
         if shown.any():
             tile.heights[shown] = self.above.placement.places(seen.points)[:, 2]
-        tile.visibility[shown] = seen.counts.clip(max=NO_COUNT - 1)
+        tile.visibility[shown] = seen.counts.clip(max=NODATA_COUNT - 1)
         return tile
 
-    def _seen(self, through: Camera, camera: Camera) -> _Seen:
+    def _seen(self, through: Camera, camera: Camera) -> _PixelSurfaces:
         """What the pixels of a camera show, each from `samples`² of those of the camera `through` which it is drawn."""
         with torch.inference_mode():
             raster = render(self.model, through, background=(0.0, 0.0, 0.0), depth=True)
@@ -87,30 +89,32 @@ class Surveyor:
         image = raster.image.cpu().numpy()
         light = np.stack([_blocks(image[..., c], self.samples).mean(axis=-1) for c in range(3)], axis=-1)
         depth = raster.median_depth.cpu().numpy().astype(np.float64)
-        depth[raster.alpha.cpu().numpy() < DRAWN_ALPHA] = np.nan
+        depth[raster.alpha.cpu().numpy() < MIN_ALPHA] = np.nan
         # One of the samples, not their mean: at a wall the mean is a height that nothing has.
         depth = _lower_median(_blocks(depth, self.samples))
-        shown = (opacity >= DRAWN_ALPHA) & np.isfinite(depth)
+        shown = (opacity >= MIN_ALPHA) & np.isfinite(depth)
         points = camera.unproject(np.where(shown, depth, 0.0))[shown]
-        counts = visibility_of(
+        counts = count_visibility(
             torch.from_numpy(points), [view.camera for view in self.above.capture.train_views]
         ).numpy()
         looked_at = counts > 0  # what no photograph shows, the model invents
         shown[shown] = looked_at
-        return _Seen(light / np.maximum(opacity, DRAWN_ALPHA)[..., None], shown, points[looked_at], counts[looked_at])
+        return _PixelSurfaces(
+            light / np.maximum(opacity, MIN_ALPHA)[..., None], shown, points[looked_at], counts[looked_at]
+        )
 
 
-def _widened(camera: Camera, by: int) -> Camera:
+def _pad_camera(camera: Camera, by: int) -> Camera:
     """The same camera with so many pixels more on every side."""
     return replace(
         camera, cx=camera.cx + by, cy=camera.cy + by, width=camera.width + 2 * by, height=camera.height + 2 * by
     )
 
 
-def samples_for(gsd: float, finest: float) -> int:
+def samples_per_side(gsd: float, finest: float) -> int:
     """Samples per pixel, each way, for a map coarser than the photographs: splats smaller than a pixel are drawn too
     large (they get 0.3 px² each)."""
-    return int(np.clip(round(gsd / finest), 1, _MOST_SAMPLES))
+    return int(np.clip(round(gsd / finest), 1, _MAX_SAMPLES))
 
 
 def _blocks(values: np.ndarray, side: int) -> np.ndarray:

@@ -17,87 +17,92 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from vdgs.config.commands import MapRequest
+from vdgs.config.commands import OrthoRequest
 from vdgs.distributed.job_labels import shard_kind
-from vdgs.distributed.node_check import Question, photographs_of
+from vdgs.distributed.node_check import NodeRequirements, image_and_mask_files
 from vdgs.distributed.shard import Results, Shard
-from vdgs.distributed.sharded_job import ShardedJob, ShardNeeds, Wish, spans_of
+from vdgs.distributed.sharded_job import ExecutionOptions, ShardedJob, ShardNeeds, split_ranges
 from vdgs.errors import RunError
-from vdgs.rendering.ortho.detail_transfer import HALO_PX, held_bytes
-from vdgs.rendering.ortho.ortho_plan import Plan
+from vdgs.rendering.ortho.detail_transfer import HALO_PX, cache_sizes
+from vdgs.rendering.ortho.ortho_plan import OrthoPlan
 from vdgs.rendering.ortho.pixel_grid import TILE_PX
-from vdgs.rendering.ortho.tile_renderer import Tile
-from vdgs.runs.open_run import FoundModel, open_run
+from vdgs.rendering.ortho.tile_renderer import OrthoTile
+from vdgs.runs.open_run import ModelLocation, open_run
 from vdgs.runs.run_folder import RunFolder
 from vdgs.system.atomic_files import write_bytes
-from vdgs.system.memory.memory_estimate import drawing_bytes
+from vdgs.system.memory.memory_estimate import render_bytes
 
 #: Tiles of a shard, least and most, and how many shards there are in between (choice).
 TILES_OF_SHARD = 2, 100, 16
-TILES = shard_kind("draw", "tiles")
+TILE_LABELS = shard_kind("draw", "tiles")
 
 
 @contextmanager
-def drawn_elsewhere(
-    plan: Plan, asked: MapRequest, run: RunFolder, found: FoundModel, wish: Wish, console: Console
-) -> Iterator[Iterator[Tile]]:
+def distributed_tiles(
+    plan: OrthoPlan,
+    request: OrthoRequest,
+    run: RunFolder,
+    model: ModelLocation,
+    execution: ExecutionOptions,
+    console: Console,
+) -> Iterator[Iterator[OrthoTile]]:
     """All tiles of a map, in their order, once shards have drawn them; what they left is removed at the end.
 
     Raises what `ShardedJob.send` raises, and RunError where another process draws the same map.
     """
-    request = MapRequest(
-        run=run.path, output=Path(os.path.abspath(plan.folder)), gsd=asked.gsd, bbox=asked.bbox, crs=asked.crs,
-        sharp=asked.sharp, model=found.name,
+    request = OrthoRequest(
+        run=run.path, output=Path(os.path.abspath(plan.folder)), gsd=request.gsd, bbox=request.bbox, crs=request.crs,
+        sharp=request.sharp, model=model.name,
     )  # fmt: skip
     job = _job(plan, request)
-    images = held_bytes(plan.sharp, plan.above.capture)
+    images = cache_sizes(plan.sharp, plan.above.capture)
     side = (TILE_PX + (2 * HALO_PX if plan.sharp else 0)) * plan.samples
-    files = [run.config_file, found.stage.model, *photographs_of(plan.above.capture.train_views)]
+    files = [run.config_file, model.stage.model, *image_and_mask_files(plan.above.capture.train_views)]
     needs = ShardNeeds(
-        drawing_bytes(found.stage.model.stat().st_size, images.depths, side * side),
-        lambda: Question(job.folder, files),
+        render_bytes(model.stage.model.stat().st_size, images.depths, side * side),
+        lambda: NodeRequirements(job.folder, files),
     )
     with job.held():
-        job.run(needs, replace(wish, image_gb=max(images.pictures, 1) / 1e9), console)
+        job.run(needs, replace(execution, image_gb=max(images.pictures, 1) / 1e9), console)
         yield job.gather(load_tile)
 
 
-def _job(plan: Plan, asked: MapRequest) -> ShardedJob:
+def _job(plan: OrthoPlan, asked: OrthoRequest) -> ShardedJob:
     """The tiles in shards, and what they depend on."""
     depends_on = [
         plan.model, plan.model_identity, plan.placement.crs, list(astuple(plan.grid)), plan.samples, plan.sharp
     ]  # fmt: skip
-    spans = spans_of(plan.grid.tile_count(), *TILES_OF_SHARD)
-    return ShardedJob.of("tiles", asked, plan.folder, TILES, depends_on, spans)
+    spans = split_ranges(plan.grid.tile_count(), *TILES_OF_SHARD)
+    return ShardedJob.of("tiles", asked, plan.folder, TILE_LABELS, depends_on, spans)
 
 
 def draw_shard(shard: Shard) -> None:
     """Draw a shard of the tiles. They stay beside its status until all are gathered."""
-    asked = shard.request(MapRequest)
+    asked = shard.request(OrthoRequest)
     opened = open_run(asked.run, asked.model, shard.device)
-    plan = Plan.of(asked, asked.run, opened.name, opened.status.model, opened.capture)
+    plan = OrthoPlan.of(asked, asked.run, opened.name, opened.status.model, opened.capture)
 
     def results(left: Sequence[int]) -> Results:
         shard.console.print(f"drawing {len(left)} tiles of the {opened.line}", highlight=False)
-        with plan.surveyor(opened.model) as surveyor:
+        with plan.tile_renderer(opened.model) as surveyor:
             for item in left:
                 yield partial(save_tile, tile=surveyor.tile(plan.grid.tile(item)[2]))
 
     shard.do(_job(plan, asked), results)
 
 
-def save_tile(path: Path, tile: Tile) -> None:
+def save_tile(path: Path, tile: OrthoTile) -> None:
     """Write an .npz file (without pickle), atomically."""
     buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **{each.name: getattr(tile, each.name) for each in fields(Tile)})
+    np.savez(buffer, allow_pickle=False, **{each.name: getattr(tile, each.name) for each in fields(OrthoTile)})
     write_bytes(path, buffer.getvalue())
 
 
-def load_tile(path: Path) -> Tile:
+def load_tile(path: Path) -> OrthoTile:
     """The inverse of `save_tile`. Raises RunError if the file is missing or damaged."""
     try:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
-            return Tile(**{each.name: file[each.name] for each in fields(Tile)})
+            return OrthoTile(**{each.name: file[each.name] for each in fields(OrthoTile)})
     # What zipfile and numpy raise on damaged bytes has no common base.
     except (OSError, ValueError, KeyError, TypeError, IndexError, EOFError, zipfile.BadZipFile) as error:
         raise RunError(

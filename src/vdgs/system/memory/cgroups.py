@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 #: What the kernel says of this process.
-PROCESS = Path("/proc/self")
+PROC_SELF = Path("/proc/self")
 
 
 @dataclass(frozen=True)
-class GroupLimit:
+class CgroupLimit:
     """What the processes of one control group may take together, and take now, in bytes."""
 
     limit: int
@@ -28,7 +28,7 @@ class GroupLimit:
         return max(0, self.limit - self.used)
 
 
-def group_limits(process: Path = PROCESS) -> list[GroupLimit]:
+def cgroup_limits(process: Path = PROC_SELF) -> list[CgroupLimit]:
     """The limits on this process: of its own control group and of all above it, for each binds; [] where none is set.
 
     Version 2 and version 1, whose limit is close to 2^63 where there is none. What Linux does not let us see (groups
@@ -40,7 +40,7 @@ def group_limits(process: Path = PROCESS) -> list[GroupLimit]:
     return []
 
 
-def slurm_limit(environment: Mapping[str, str] = os.environ) -> int | None:
+def slurm_memory_limit(environment: Mapping[str, str] = os.environ) -> int | None:
     """Bytes that the SLURM job asked for on this node; None outside of jobs, and where it asked for nothing.
 
     For clusters where SLURM sets no control group a limit: it may then count what the job takes and end it.
@@ -90,7 +90,7 @@ def _unescaped(field: str) -> str:
     return re.sub(r"\\([0-7]{3})", lambda found: chr(int(found[1], 8)), field)
 
 
-def _limit(folder: Path, version: int) -> GroupLimit | None:
+def _limit(folder: Path, version: int) -> CgroupLimit | None:
     """The limit of one group; None where it has none. Copies of files that can be dropped at once do not count."""
     names = ("memory.max", "memory.current") if version == 2 else ("memory.limit_in_bytes", "memory.usage_in_bytes")
     # `total_`: with the groups below, as usage counts them; version 2 counts all so.
@@ -100,5 +100,5 @@ def _limit(folder: Path, version: int) -> GroupLimit | None:
         with suppress(OSError, ValueError, KeyError):
             stat = dict(line.split() for line in (folder / "memory.stat").read_text().splitlines())
             used -= int(stat[droppable])
-        return GroupLimit(limit, max(0, used))
+        return CgroupLimit(limit, max(0, used))
     return None

@@ -9,36 +9,36 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from vdgs.config.method import CompensationConfig, MethodConfig, Resolutions, block_limit
+from vdgs.config.method import CompensationConfig, MethodConfig, ResolutionSchedule, max_block_anchors
 from vdgs.geometry.camera import Camera
 from vdgs.system.units import data_size
 
-Kind = Literal["coarse", "block"]
+TrainingKind = Literal["coarse", "block"]
 
 #: A process of vdgs with everything imported.
-PROGRAM_BYTES = 350_000_000
+PROCESS_BYTES = 350_000_000
 #: The picture being trained on: itself, its gradient, its target, what the rasteriser notes, the next ones in advance.
-BYTES_PER_PIXEL = 150
+TRAIN_BYTES_PER_PIXEL = 150
 #: What a step makes of an anchor in view, for each of its Gaussians (measured with ten: 1.55 kB an anchor).
 STEP_BYTES_PER_OFFSET = 155
 #: A picture that is measured: maps of errors and of V, each in double precision; the features of both pictures that
 #: LPIPS compares, its widest layer (choice: not measured).
-MEASURED_BYTES_PER_PIXEL, LPIPS_BYTES_PER_PIXEL = 400, 2000
+METRIC_BYTES_PER_PIXEL, LPIPS_BYTES_PER_PIXEL = 400, 2000
 #: Anchors may grow to so many times their number where nothing limits them (choice; real captures: 1.2 to 3).
-GROWTH = 3.0
+MAX_GROWTH = 3.0
 #: ... where growth is compensated below a fixed T_low, under which nearly all of a real capture is (choice; blocks of
 #: seneca had 6 and 12 times as many after a ninth of the steps of preset `paper`: reports/findings.md).
-COMPENSATED_GROWTH = 15.0
+MAX_COMPENSATED_GROWTH = 15.0
 #: Share of a block's anchors that one photograph may see, for the estimate before a block is opened (choice).
-SEEN = 0.5
+MAX_VISIBLE_FRACTION = 0.5
 #: Numbers of an anchor apart from its offsets: place, feature, log-scales.
-PLAIN_FLOATS = 3 + 32 + 6
+FLOATS_PER_ANCHOR = 3 + 32 + 6
 #: ... of which a mean of models holds all but the place, which never moves.
-PLACE_FLOATS = 3
+POSITION_FLOATS = 3
 
 
 @dataclass(frozen=True, kw_only=True)
-class Need:
+class TrainingWorkload:
     """What training works on, as far as memory is concerned."""
 
     #: Anchors when it starts, and at most (0: no limit, `growth` times as many).
@@ -56,8 +56,8 @@ class Need:
     surroundings: int = 0
     #: Whether training ends with a mean of models, which is kept beside the grown anchors.
     averaged: bool = False
-    #: How many times their number anchors may become where nothing limits them: `most_growth`.
-    growth: float = GROWTH
+    #: How many times their number anchors may become where nothing limits them: `max_growth_factor`.
+    growth: float = MAX_GROWTH
 
     @property
     def grown(self) -> int:
@@ -67,7 +67,7 @@ class Need:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class MemoryEstimate:
     """Bytes, by what takes them."""
 
     program: int
@@ -87,125 +87,129 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class Advice:
+class MemoryAdvice:
     """A setting that saves memory: its option, what it needs, and the bytes that it saves by estimate."""
 
     setting: str
-    saves: int
+    saved_bytes: int
 
     def __str__(self) -> str:
-        return f"{self.setting} saves about {data_size(self.saves)}"
+        return f"{self.setting} saves about {data_size(self.saved_bytes)}"
 
 
-def most_growth(config: CompensationConfig) -> float:
+def max_growth_factor(config: CompensationConfig) -> float:
     """How many times their number anchors may become where nothing limits them."""
-    return COMPENSATED_GROWTH if config.enabled and not config.t_low_quantile else GROWTH
+    return MAX_COMPENSATED_GROWTH if config.enabled and not config.t_low_quantile else MAX_GROWTH
 
 
-def largest_picture(cameras: Iterable[Camera], resolutions: Resolutions) -> int:
+def max_image_pixels(cameras: Iterable[Camera], resolutions: ResolutionSchedule) -> int:
     """Pixels of the largest photograph, at the largest size that a resolution schedule gives it."""
     factor = min(factor for _, factor in resolutions)
     return max((camera.width // factor) * (camera.height // factor) for camera in cameras)
 
 
-def decoded_bytes(cameras: Iterable[Camera]) -> int:
+def decoded_image_bytes(cameras: Iterable[Camera]) -> int:
     """What all photographs take decoded, in every size that a schedule asks for, each a quarter of the one before."""
     return 3 * sum(camera.width * camera.height for camera in cameras) * 4 // 3
 
 
-def need_of_block(method: MethodConfig, anchors: int, of: int, pixels: int) -> Need:
+def block_workload(method: MethodConfig, anchors: int, total_anchors: int, pixels: int) -> TrainingWorkload:
     """What training a block works on that has so many of all (`of`) coarse anchors and photographs of up to `pixels`;
     before it is opened, and beside what photographs take. A part of a photograph may be all of it."""
     block = method.block
-    return Need(
-        anchors=anchors, max_anchors=block_limit(block, anchors, of), offsets=method.training.anchors.offsets,
-        seen=SEEN, pixels=pixels, images_bytes=0, surroundings=of - anchors, averaged=block.average > 0,
-        growth=most_growth(block.compensation),
+    return TrainingWorkload(
+        anchors=anchors, max_anchors=max_block_anchors(block, anchors, total_anchors), offsets=method.training.anchors.offsets,
+        seen=MAX_VISIBLE_FRACTION, pixels=pixels, images_bytes=0, surroundings=total_anchors - anchors, averaged=block.average > 0,
+        growth=max_growth_factor(block.compensation),
     )  # fmt: skip
 
 
 def bytes_per_anchor(offsets: int, seen: float) -> float:
     """Parameters, two moments, a count of updates, a bound on size and statistics of an anchor, and what steps make of
     the share that is in view."""
-    kept = 3 * bytes_of_model(offsets) + 4 * (2 + 2 * offsets + 2)
+    kept = 3 * model_bytes_per_anchor(offsets) + 4 * (2 + 2 * offsets + 2)
     return kept + seen * STEP_BYTES_PER_OFFSET * offsets
 
 
-def bytes_of_model(offsets: int) -> int:
+def model_bytes_per_anchor(offsets: int) -> int:
     """Parameters of an anchor alone."""
-    return 4 * (PLAIN_FLOATS + 3 * offsets)
+    return 4 * (FLOATS_PER_ANCHOR + 3 * offsets)
 
 
-def bytes_of_mean(offsets: int) -> int:
+def swa_bytes_per_anchor(offsets: int) -> int:
     """What a mean of models holds of an anchor."""
-    return bytes_of_model(offsets) - 4 * PLACE_FLOATS
+    return model_bytes_per_anchor(offsets) - 4 * POSITION_FLOATS
 
 
-def _per_grown_anchor(need: Need) -> float:
-    mean = bytes_of_mean(need.offsets) if need.averaged else 0
+def _per_grown_anchor(need: TrainingWorkload) -> float:
+    mean = swa_bytes_per_anchor(need.offsets) if need.averaged else 0
     return bytes_per_anchor(need.offsets, need.seen) + mean
 
 
-def estimate(need: Need) -> Estimate:
+def estimate_memory(need: TrainingWorkload) -> MemoryEstimate:
     """What training takes, at its start and once its anchors have grown."""
     in_view = need.seen * STEP_BYTES_PER_OFFSET * need.offsets
-    frozen = need.surroundings * (bytes_of_model(need.offsets) + in_view)
+    frozen = need.surroundings * (model_bytes_per_anchor(need.offsets) + in_view)
     start = bytes_per_anchor(need.offsets, need.seen) * need.anchors
-    return Estimate(
-        PROGRAM_BYTES, need.images_bytes, BYTES_PER_PIXEL * need.pixels,
+    return MemoryEstimate(
+        PROCESS_BYTES, need.images_bytes, TRAIN_BYTES_PER_PIXEL * need.pixels,
         round(start + frozen), round(_per_grown_anchor(need) * need.grown + frozen),
     )  # fmt: skip
 
 
-def drawing_bytes(models: int, held: int, pixels: int, lpips: bool = False) -> int:
+def render_bytes(model_bytes: int, cached_bytes: int, pixels: int, lpips: bool = False) -> int:
     """What measuring pictures of `pixels` takes at most; `models` have so many bytes on the disk. They are held as
     they are there, and what drawing makes of their anchors is about as much again. `held`: other models beside them."""
     features = LPIPS_BYTES_PER_PIXEL if lpips else 0
-    return PROGRAM_BYTES + 2 * models + held + (MEASURED_BYTES_PER_PIXEL + features) * pixels
+    return PROCESS_BYTES + 2 * model_bytes + cached_bytes + (METRIC_BYTES_PER_PIXEL + features) * pixels
 
 
-def advice(need: Need, kind: Kind, to_save: int) -> list[Advice]:
+def memory_advice(need: TrainingWorkload, kind: TrainingKind, to_save: int) -> list[MemoryAdvice]:
     """Settings that help, the one that saves most first. `to_save` bytes decide how low a limit of anchors must be.
 
     What would save less than a hundredth of the whole is left out.
     """
-    whole = estimate(need)
+    whole = estimate_memory(need)
     found = [_fewer_anchors(need, kind, to_save)]
     if kind == "coarse":
-        smaller = estimate(replace(need, pixels=need.pixels // 4, images_bytes=need.images_bytes // 4))
+        smaller = estimate_memory(replace(need, pixels=need.pixels // 4, images_bytes=need.images_bytes // 4))
         found.append(
-            Advice("photographs of half the size (--downscale or --images images_N)", whole.total - smaller.total)
+            MemoryAdvice("photographs of half the size (--downscale or --images images_N)", whole.total - smaller.total)
         )
     else:
-        half = estimate(replace(need, anchors=need.anchors // 2))
-        found.append(Advice("vdgs partition with twice the --blocks (smaller blocks)", whole.total - half.total))
-        found.append(Advice("one less of --jobs (blocks at once)", whole.total))
+        half = estimate_memory(replace(need, anchors=need.anchors // 2))
+        found.append(MemoryAdvice("vdgs partition with twice the --blocks (smaller blocks)", whole.total - half.total))
+        found.append(MemoryAdvice("one less of --jobs (blocks at once)", whole.total))
     if need.averaged:
         option = "--average 0" if kind == "coarse" else "--block.average 0"
-        last = estimate(replace(need, averaged=False))
-        found.append(Advice(f"{option} (the last model instead of a mean)", whole.total - last.total))
+        last = estimate_memory(replace(need, averaged=False))
+        found.append(MemoryAdvice(f"{option} (the last model instead of a mean)", whole.total - last.total))
     kept = min(need.images_bytes, 50_000_000)
     found.append(
-        Advice(f"--image-memory-gb {kept / 1e9:.2f} (fewer photographs kept in memory)", need.images_bytes - kept)
+        MemoryAdvice(f"--image-memory-gb {kept / 1e9:.2f} (fewer photographs kept in memory)", need.images_bytes - kept)
     )
-    worth = [each for each in found if each.saves > whole.total / 100]
-    return sorted(worth, key=lambda each: -each.saves)
+    worth = [each for each in found if each.saved_bytes > whole.total / 100]
+    return sorted(worth, key=lambda each: -each.saved_bytes)
 
 
-def _fewer_anchors(need: Need, kind: Kind, to_save: int) -> Advice:
+def _fewer_anchors(need: TrainingWorkload, kind: TrainingKind, to_save: int) -> MemoryAdvice:
     """A limit of anchors that saves `to_save` bytes, if one does: growth can be forbidden, but no anchor removed."""
     option = "--growth.max-anchors" if kind == "coarse" else "--block.growth.max-anchors"
     too_many = to_save / _per_grown_anchor(need)
     limit = max(need.anchors, int(need.grown - too_many) // 1000 * 1000, 1)
-    saved = estimate(need).total - estimate(replace(need, max_anchors=limit)).total
-    return Advice(f"{option} {limit} (less growth)", saved)
+    saved = estimate_memory(need).total - estimate_memory(replace(need, max_anchors=limit)).total
+    return MemoryAdvice(f"{option} {limit} (less growth)", saved)
 
 
-def describe(found: Estimate, room: int) -> str:
+def describe_memory(estimate: MemoryEstimate, available_bytes: int) -> str:
     """One line: what is needed, what for, and what there is."""
-    grown = f", {data_size(found.grown_anchors)} once they have grown" if found.grown_anchors > found.anchors else ""
+    grown = (
+        f", {data_size(estimate.grown_anchors)} once they have grown"
+        if estimate.grown_anchors > estimate.anchors
+        else ""
+    )
     return (
-        f"memory by estimate: {data_size(found.start)} at the start, {data_size(found.total)} at most (photographs "
-        f"{data_size(found.images)}, one picture {data_size(found.picture)}, anchors "
-        f"{data_size(found.anchors)}{grown}); this process may take {data_size(room)}"
+        f"memory by estimate: {data_size(estimate.start)} at the start, {data_size(estimate.total)} at most (photographs "
+        f"{data_size(estimate.images)}, one picture {data_size(estimate.picture)}, anchors "
+        f"{data_size(estimate.anchors)}{grown}); this process may take {data_size(available_bytes)}"
     )

@@ -12,25 +12,31 @@ from pathlib import Path
 
 import psutil
 
-from vdgs.system.memory.cgroups import group_limits, slurm_limit
+from vdgs.system.memory.cgroups import cgroup_limits, slurm_memory_limit
 
 #: How the libraries word it: torch on the CPU (Linux, Windows), C++, OpenCV.
-OUT_OF_MEMORY = ("can't allocate memory", "not enough memory", "bad_alloc", "Insufficient memory", "CUDA out of memory")
+OUT_OF_MEMORY_MESSAGES = (
+    "can't allocate memory",
+    "not enough memory",
+    "bad_alloc",
+    "Insufficient memory",
+    "CUDA out of memory",
+)
 
 
 def is_out_of_memory(error: BaseException) -> bool:
     """Whether an exception means that memory could not be had, in main memory or on a card."""
     if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
         return True
-    return any(words in str(error) for words in OUT_OF_MEMORY)
+    return any(words in str(error) for words in OUT_OF_MEMORY_MESSAGES)
 
 
-def available_bytes() -> int:
+def available_memory_bytes() -> int:
     """What this process may still take: of the machine's free memory, of its control groups' (a container's, a SLURM
     job's, a systemd unit's), of its own limit. Where no group limits a SLURM job, of what the job asked for."""
-    memory, groups = psutil.virtual_memory(), group_limits()
+    memory, groups = psutil.virtual_memory(), cgroup_limits()
     free = [memory.available, *(group.free for group in groups)]
-    job = slurm_limit()
+    job = slurm_memory_limit()
     if job is not None and all(group.limit >= memory.total for group in groups):
         free.append(job - _taken_with_children())
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
@@ -50,7 +56,7 @@ def _taken_with_children() -> int:
 
 
 def peak_memory_bytes() -> int:
-    """Largest resident size of this process since it began, or since `forget_peak` where the system can forget."""
+    """Largest resident size of this process since it began, or since `reset_peak_memory` where the system can forget."""
     with suppress(OSError, ValueError, StopIteration):
         lines = Path("/proc/self/status").read_text().splitlines()
         return 1024 * int(next(line for line in lines if line.startswith("VmHWM")).split()[1])
@@ -58,7 +64,7 @@ def peak_memory_bytes() -> int:
     return int(peak if sys.platform == "darwin" else peak * 1024)
 
 
-def forget_peak() -> None:
+def reset_peak_memory() -> None:
     """Let the peak begin again at today's size, so that each stage of a run is measured apart (Linux)."""
     gc.collect()
     with suppress(OSError):
@@ -69,7 +75,7 @@ def forget_peak() -> None:
 _M_ARENA_MAX = -8
 
 
-def share_arenas(most: int = 2) -> None:
+def limit_malloc_arenas(max_arenas: int = 2) -> None:
     """Let all threads allocate from so few arenas (glibc): each of many threads else keeps what it has freed."""
     with suppress(OSError, AttributeError, TypeError):
-        ctypes.CDLL(None).mallopt(_M_ARENA_MAX, most)
+        ctypes.CDLL(None).mallopt(_M_ARENA_MAX, max_arenas)

@@ -8,65 +8,65 @@ import numpy as np
 import psutil
 from rich.console import Console
 
-from vdgs.model.renderer import visible_rows
+from vdgs.model.renderer import cull_anchors
 from vdgs.system.memory.memory_estimate import (
-    Advice,
-    Kind,
-    Need,
-    advice,
-    decoded_bytes,
-    describe,
-    estimate,
-    largest_picture,
-    most_growth,
+    MemoryAdvice,
+    TrainingKind,
+    TrainingWorkload,
+    decoded_image_bytes,
+    describe_memory,
+    estimate_memory,
+    max_growth_factor,
+    max_image_pixels,
+    memory_advice,
 )
-from vdgs.system.memory.process_memory import available_bytes
+from vdgs.system.memory.process_memory import available_memory_bytes
 from vdgs.system.units import data_size
-from vdgs.training import Stage, TrainingState
+from vdgs.training import TrainingProblem, TrainingState
 
 #: Views in which the anchors are counted, evenly chosen.
-VIEWS_COUNTED = 16
+MAX_COUNTED_VIEWS = 16
 #: After a failure: what a remedy should save, of all that the process takes.
-SAVE_SHARE = 0.3
+MIN_SAVED_FRACTION = 0.3
 
 
-def need_of(state: TrainingState, stage: Stage) -> Need:
+def training_workload(state: TrainingState, stage: TrainingProblem) -> TrainingWorkload:
     """What this training works on."""
     config, count = stage.config, stage.image_count
     cameras = [stage.images.camera(view) for view in range(count)]
-    chosen = np.unique(np.linspace(0, count - 1, min(count, VIEWS_COUNTED)).astype(int))
+    chosen = np.unique(np.linspace(0, count - 1, min(count, MAX_COUNTED_VIEWS)).astype(int))
     anchors = state.anchors
-    seen = [len(visible_rows(anchors, cameras[view])) for view in chosen]
-    photographs = decoded_bytes(cameras)
+    seen = [len(cull_anchors(anchors, cameras[view])) for view in chosen]
+    photographs = decoded_image_bytes(cameras)
     growing = config.growth.levels > 0 and state.iteration <= config.growth.until * config.iterations
-    return Need(
+    return TrainingWorkload(
         anchors=len(anchors),
         max_anchors=config.growth.max_anchors if growing else len(anchors),
         offsets=anchors.offsets.shape[1],
         seen=max(seen) / max(len(anchors), 1),
-        pixels=largest_picture(cameras, config.resolutions),
+        pixels=max_image_pixels(cameras, config.resolutions),
         images_bytes=min(photographs, getattr(stage.images, "budget_bytes", photographs)),
         surroundings=0 if stage.surroundings is None else len(stage.surroundings.anchors),
         averaged=config.average > 0,
-        growth=most_growth(config.compensation),
+        growth=max_growth_factor(config.compensation),
     )
 
 
-def announce(need: Need, kind: Kind, console: Console) -> None:
+def print_memory_estimate(need: TrainingWorkload, kind: TrainingKind, console: Console) -> None:
     """Say what training will take beside what there is; where that is too little, what helps."""
-    found = estimate(need)
-    room = available_bytes() + psutil.Process().memory_info().rss
-    console.print(describe(found, room), highlight=False)
+    found = estimate_memory(need)
+    room = available_memory_bytes() + psutil.Process().memory_info().rss
+    console.print(describe_memory(found, room), highlight=False)
     if found.total > room:
-        helpful = advice(need, kind, found.total - room)
+        helpful = memory_advice(need, kind, found.total - room)
         console.print(
             f"[yellow]warning[/] it may run out of memory: {data_size(found.total - room)} are missing by estimate. "
-            + what_helps(helpful, kind),
+            + format_memory_advice(helpful, kind),
             highlight=False,
         )
 
 
-def after_failure(need: Need, state: TrainingState, stage: Stage) -> str:
+def out_of_memory_hint(need: TrainingWorkload, state: TrainingState, stage: TrainingProblem) -> str:
     """What to change after training ran out of memory, with what each change saves by estimate."""
     kind, kept = stage.kind, getattr(stage.images, "nbytes", need.images_bytes)
     now = replace(
@@ -75,11 +75,13 @@ def after_failure(need: Need, state: TrainingState, stage: Stage) -> str:
     )  # fmt: skip
     # Growth cannot be undone where it led, so a limit is one for training that begins anew.
     before = replace(now, anchors=min(need.anchors, len(state.anchors)))
-    whole = estimate(now).total
-    return f"It took about {data_size(whole)}. " + what_helps(advice(before, kind, round(SAVE_SHARE * whole)), kind)
+    whole = estimate_memory(now).total
+    return f"It took about {data_size(whole)}. " + format_memory_advice(
+        memory_advice(before, kind, round(MIN_SAVED_FRACTION * whole)), kind
+    )
 
 
-def what_helps(found: list[Advice], kind: Kind) -> str:
+def format_memory_advice(found: list[MemoryAdvice], kind: TrainingKind) -> str:
     """The settings in one sentence, the most helpful first, and where each may be changed."""
     if not found:
         return "No setting would save much: this machine needs more memory."

@@ -10,30 +10,38 @@ from typing import Any
 
 from rich.console import Console
 
-from vdgs.config.checkpointing import WatchOptions
+from vdgs.config.checkpointing import CheckpointOptions
 from vdgs.config.method import TrainConfig
 from vdgs.errors import VdgsError
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.runs.stage_folder import StageFolder, Status
-from vdgs.system.checkpoints import load_newest, save_state, state_file
-from vdgs.system.memory.process_memory import available_bytes
-from vdgs.system.tensors import identity
+from vdgs.runs.stage_folder import StageFolder, StatusRecord
+from vdgs.system.checkpoints import load_latest_checkpoint, save_checkpoint, state_file
+from vdgs.system.memory.process_memory import available_memory_bytes
+from vdgs.system.tensors import file_id
 from vdgs.system.units import data_size
-from vdgs.training import Stage, StepReport, TrainingState, from_saved, result_from_saved, to_saved, train
-from vdgs.training.session.memory_advice import after_failure, announce, need_of
+from vdgs.training import (
+    StepReport,
+    TrainingProblem,
+    TrainingState,
+    from_checkpoint,
+    result_from_saved,
+    to_checkpoint,
+    train,
+)
+from vdgs.training.session.memory_advice import out_of_memory_hint, print_memory_estimate, training_workload
 from vdgs.training.session.training_progress import TrainingProgress
-from vdgs.training.session.training_session import Keeper, Watched, restore_or_start, watch
+from vdgs.training.session.training_session import Checkpointer, TrainingSession, restore_or_start, run_session
 
 
-def image_budget(options: WatchOptions) -> int:
+def image_cache_bytes(options: CheckpointOptions) -> int:
     """Bytes for decoded photographs."""
-    return int(options.image_memory_gb * 1e9) or available_bytes() // 4
+    return int(options.image_cache_gb * 1e9) or available_memory_bytes() // 4
 
 
 #: What to do about a diverging loss, in the coarse stage and in a block.
-AFTER_DIVERGENCE = {
+DIVERGENCE_HINTS = {
     "coarse": "Lower --rates.* or raise --growth.threshold in a new --output, and look at the photographs with "
     "`vdgs inspect`.",
     "block": "Lower --block.offset-rate, --block.scale-rate and --block.feature-rate or raise "
@@ -54,45 +62,50 @@ class CheckpointModel:
 def model_from_checkpoint(folder: StageFolder, key: str) -> CheckpointModel | None:
     """The model of the newest whole checkpoint of a stage; None without one, or if it is of other settings than
     `key`."""
-    saved = load_newest(folder.checkpoints)[0] if folder.key() == key else None
+    saved = load_latest_checkpoint(folder.checkpoints)[0] if folder.key() == key else None
     if saved is None:
         return None
     return CheckpointModel(*result_from_saved(saved), saved.iteration, state_file(folder.checkpoints, saved.iteration))
 
 
-def continue_or_start(
-    folder: StageFolder, stage: Stage, start: Callable[[], TrainingState], console: Console
+def resume_or_start(
+    folder: StageFolder, stage: TrainingProblem, start: Callable[[], TrainingState], console: Console
 ) -> TrainingState:
     """The state of the newest whole checkpoint, or a new one; the log ends where the state does.
 
     Raises RunError for a state that this version cannot read or that is beyond the last iteration.
     """
     return restore_or_start(
-        folder, stage.config.iterations, start, lambda saved: from_saved(saved, stage), "Start a new --output.", console
+        folder,
+        stage.config.iterations,
+        start,
+        lambda saved: from_checkpoint(saved, stage),
+        "Start a new --output.",
+        console,
     )
 
 
-def train_watched(
-    folder: StageFolder, state: TrainingState, stage: Stage, options: WatchOptions, console: Console
+def train_with_checkpoints(
+    folder: StageFolder, state: TrainingState, stage: TrainingProblem, options: CheckpointOptions, console: Console
 ) -> None:
     """Train to the end of the stage, showing, logging and saving on the way.
 
-    Says first how much memory it will take. Raises what `watch` raises.
+    Says first how much memory it will take. Raises what `run_session` raises.
     """
-    kind, need = stage.kind, need_of(state, stage)
-    announce(need, kind, console)
-    training = Watched(
+    kind, need = stage.kind, training_workload(state, stage)
+    print_memory_estimate(need, kind, console)
+    training = TrainingSession(
         folder=folder, state=state,
-        to_saved=lambda: to_saved(state),
-        status=lambda: Status(state="running", iteration=state.iteration, iterations=stage.config.iterations),
+        to_checkpoint=lambda: to_checkpoint(state),
+        status=lambda: StatusRecord(state="running", iteration=state.iteration, iterations=stage.config.iterations),
         size=lambda: f"{len(state.anchors):,} anchors",
-        after_divergence=AFTER_DIVERGENCE[kind],
-        save_memory=lambda: after_failure(need, state, stage),
+        divergence_hint=DIVERGENCE_HINTS[kind],
+        memory_hint=lambda: out_of_memory_hint(need, state, stage),
         whole=lambda: state.whole,
     )  # fmt: skip
 
     def loop(stop: Callable[[], bool]) -> bool:
-        keeper, board = Keeper(training, options.save_every), _board(folder, options, state.iteration)
+        keeper, board = Checkpointer(training, options.save_every), _board(folder, options, state.iteration)
         with TrainingProgress(console, folder, stage.config, state.iteration, board) as progress:
 
             def after_step(state: TrainingState, report: StepReport) -> None:
@@ -102,17 +115,19 @@ def train_watched(
 
             return train(state, stage, stop=stop, after_step=after_step)
 
-    watch(training, loop)
+    run_session(training, loop)
 
 
-def finish(folder: StageFolder, state: TrainingState, model: AnchorModel, console: Console, area: float = 1.0) -> None:
+def finish_stage(
+    folder: StageFolder, state: TrainingState, model: AnchorModel, console: Console, area: float = 1.0
+) -> None:
     """Save the model of a stage that is complete, mark it done and say so. `area`: mean share of a photograph that a
     step drew."""
-    save_state(folder.checkpoints, to_saved(state))
+    save_checkpoint(folder.checkpoints, to_checkpoint(state))
     model.save(folder.model)
-    status = Status(
+    status = StatusRecord(
         state="done", iteration=state.iteration, iterations=state.iteration,
-        photographs=round(area * state.iteration, 1), anchors=len(state.anchors), model=identity(folder.model),
+        photographs=round(area * state.iteration, 1), anchors=len(state.anchors), model=file_id(folder.model),
         seconds=state.seconds, psnr_training=None if math.isnan(state.psnr) else state.psnr,
         peak_memory_bytes=state.peak_memory_bytes,
     )  # fmt: skip
@@ -126,7 +141,7 @@ def finish(folder: StageFolder, state: TrainingState, model: AnchorModel, consol
     )
 
 
-def note_without_growth(config: TrainConfig, console: Console, prefix: str = "--") -> None:
+def warn_without_densification(config: TrainConfig, console: Console, prefix: str = "--") -> None:
     """Say so where growth would begin after it has ended; `prefix` is that of the stage's options."""
     if config.growth.levels and config.growth.until * config.iterations < config.growth.start:
         console.print(
@@ -137,7 +152,7 @@ def note_without_growth(config: TrainConfig, console: Console, prefix: str = "--
         )
 
 
-def _board(folder: StageFolder, options: WatchOptions, iteration: int) -> Any:
+def _board(folder: StageFolder, options: CheckpointOptions, iteration: int) -> Any:
     if not options.tensorboard:
         return None
     try:

@@ -13,16 +13,16 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from vdgs.config.method import TrainConfig
-from vdgs.runs.stage_folder import StageFolder, Status
+from vdgs.runs.stage_folder import StageFolder, StatusRecord
 from vdgs.system.units import clock
 from vdgs.training import StepReport, TrainingState, downscale_at
 
 #: Iterations between two lines of log.jsonl.
 LOG_INTERVAL = 50
 #: Seconds between two lines where there is no terminal to redraw.
-PLAIN_SECONDS = 15.0
+LINE_INTERVAL_SECONDS = 15.0
 #: What TensorBoard shows.
-BOARD = ("loss", "l1", "ssim", "psnr_smoothed", "anchors", "splats")
+TENSORBOARD_SCALARS = ("loss", "l1", "ssim", "psnr_smoothed", "anchors", "splats")
 
 
 class TrainingProgress:
@@ -56,7 +56,7 @@ class TrainingProgress:
         if state.iteration % 10 == 0:
             self._recent.append((now, state.iteration))
             self._bar.update(self._task, completed=state.iteration, description=self._line(state))
-        if not self._console.is_terminal and now - self._last_line > PLAIN_SECONDS:
+        if not self._console.is_terminal and now - self._last_line > LINE_INTERVAL_SECONDS:
             self._last_line = now
             self._console.print(self._line(state) + f"  {clock(self._seconds_left(state))} left", highlight=False)
         if state.iteration % LOG_INTERVAL == 0 or report.grown is not None:
@@ -67,9 +67,9 @@ class TrainingProgress:
         (then, first), (now, last) = self._recent[0], self._recent[-1]
         return (last - first) / (now - then) if now > then else 0.0
 
-    def status(self, state: TrainingState) -> Status:
+    def status(self, state: TrainingState) -> StatusRecord:
         """Where training stands."""
-        return Status(
+        return StatusRecord(
             state="running", iteration=state.iteration, iterations=self._config.iterations, anchors=len(state.anchors),
             psnr_training=None if math.isnan(state.psnr) else state.psnr, seconds=round(state.seconds, 1),
             seconds_left=round(self._seconds_left(state)), peak_memory_bytes=state.peak_memory_bytes,
@@ -100,5 +100,5 @@ class TrainingProgress:
         }  # fmt: skip
         self._log.write(json.dumps(record) + "\n")
         if self._board is not None:
-            for name in (name for name in BOARD if record[name] is not None):
+            for name in (name for name in TENSORBOARD_SCALARS if record[name] is not None):
                 self._board.add_scalar(name, record[name], state.iteration)

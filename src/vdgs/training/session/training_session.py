@@ -13,11 +13,11 @@ import cv2
 from rich.console import Console
 
 from vdgs.errors import RunError, Stopped, TrainingDiverged, VdgsError
-from vdgs.kernels.idle_memory import return_unused
-from vdgs.runs.stage_folder import StageFolder, Status
-from vdgs.system.checkpoints import SavedState, discard_after, load_newest, save_state
+from vdgs.kernels.idle_memory import trim_heap
+from vdgs.runs.stage_folder import StageFolder, StatusRecord
+from vdgs.system.checkpoints import Checkpoint, delete_checkpoints_after, load_latest_checkpoint, save_checkpoint
 from vdgs.system.memory.process_memory import is_out_of_memory, peak_memory_bytes
-from vdgs.system.stop_signals import stop_requests
+from vdgs.system.stop_signals import catch_stop_signals
 
 #: As what missing memory arrives, among others (`is_out_of_memory`): from Python and C++, torch, the system, OpenCV.
 MEMORY_ERRORS = (MemoryError, RuntimeError, OSError, cv2.error)
@@ -25,7 +25,7 @@ MEMORY_ERRORS = (MemoryError, RuntimeError, OSError, cv2.error)
 STATUS_SECONDS = 2.0
 
 
-class WatchedState(Protocol):
+class ResumableState(Protocol):
     """What every state of a training says of itself."""
 
     iteration: int
@@ -33,45 +33,45 @@ class WatchedState(Protocol):
     peak_memory_bytes: int
 
 
-State = TypeVar("State", bound=WatchedState)
+S = TypeVar("S", bound=ResumableState)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Watched:
+class TrainingSession:
     """A training as the one who watches it sees it."""
 
     folder: StageFolder
-    state: WatchedState
+    state: ResumableState
     #: The whole state as it is saved.
-    to_saved: Callable[[], SavedState]
+    to_checkpoint: Callable[[], Checkpoint]
     #: Where training stands.
-    status: Callable[[], Status]
+    status: Callable[[], StatusRecord]
     #: How large the model is, in words ("12,000 anchors").
     size: Callable[[], str]
     #: What a person may do about a loss that diverges, and about missing memory.
-    after_divergence: str
-    save_memory: Callable[[], str]
+    divergence_hint: str
+    memory_hint: Callable[[], str]
     #: Whether every step of the state is whole, so that it may be saved though a step was broken off.
     whole: Callable[[], bool]
 
     def save(self) -> None:
-        save_state(self.folder.checkpoints, self.to_saved())
+        save_checkpoint(self.folder.checkpoints, self.to_checkpoint())
 
 
 def restore_or_start(
     folder: StageFolder,
     iterations: int,
-    start: Callable[[], State],
-    restore: Callable[[SavedState], State],
+    start: Callable[[], S],
+    restore: Callable[[Checkpoint], S],
     advice: str,
     console: Console,
-) -> State:
+) -> S:
     """The state of the newest whole checkpoint, or a new one; the log ends where the state does.
 
     Raises RunError, with `advice`, for a state that this version cannot read, and for one beyond the last iteration.
     """
     folder.checkpoints.mkdir(parents=True, exist_ok=True)
-    saved, complaints = load_newest(folder.checkpoints)
+    saved, complaints = load_latest_checkpoint(folder.checkpoints)
     for complaint in complaints:
         console.print(f"[yellow]note[/] {complaint}")
     if saved is None:
@@ -85,13 +85,13 @@ def restore_or_start(
             raise RunError(f"{folder.checkpoints}: holds a state of another version ({error}). {advice}") from error
         if state.iteration > iterations:
             raise RunError(f"{folder.checkpoints}: is at iteration {state.iteration}, beyond {iterations}.")
-        discard_after(folder.checkpoints, state.iteration)
+        delete_checkpoints_after(folder.checkpoints, state.iteration)
         console.print(f"continuing at iteration {state.iteration}")
     folder.truncate_log(state.iteration)
     return state
 
 
-def watch(training: Watched, loop: Callable[[Callable[[], bool]], bool]) -> None:
+def run_session(training: TrainingSession, loop: Callable[[Callable[[], bool]], bool]) -> None:
     """Run `loop(stop)`, which trains until complete (True) or asked to stop, and note in status.json how it ends.
 
     Raises Stopped after Ctrl-C or SIGTERM (state saved), TrainingDiverged and VdgsError (out of memory, a photograph
@@ -99,23 +99,23 @@ def watch(training: Watched, loop: Callable[[Callable[[], bool]], bool]) -> None
     """
     folder, state = training.folder, training.state
     try:
-        with stop_requests(second_interrupts=True) as asked:
+        with catch_stop_signals(second_interrupts=True) as asked:
             folder.set_status(training.status())
             complete = loop(lambda: bool(asked))
     except TrainingDiverged as error:
-        folder.set_status(Status(state="failed", iteration=state.iteration, why=str(error)))
-        raise TrainingDiverged(f"{error} {_kept(folder)} {training.after_divergence}".rstrip()) from error
+        folder.set_status(StatusRecord(state="failed", iteration=state.iteration, why=str(error)))
+        raise TrainingDiverged(f"{error} {_kept(folder)} {training.divergence_hint}".rstrip()) from error
     except MEMORY_ERRORS as error:
         if not is_out_of_memory(error):
             raise
         traceback.clear_frames(error.__traceback__)  # they hold the pictures and splats of the step that failed
         kept = _rescue(training)
-        folder.set_status(Status(state="failed", iteration=state.iteration, why="out of memory"))
+        folder.set_status(StatusRecord(state="failed", iteration=state.iteration, why="out of memory"))
         raise VdgsError(
-            f"{folder.path}: out of memory with {training.size()}{_wanted(error)}. {kept} {training.save_memory()}"
+            f"{folder.path}: out of memory with {training.size()}{_wanted(error)}. {kept} {training.memory_hint()}"
         ) from error
     except VdgsError as error:  # a photograph that is gone, a full disk: every step so far is whole
-        folder.set_status(Status(state="failed", iteration=state.iteration, why=str(error)))
+        folder.set_status(StatusRecord(state="failed", iteration=state.iteration, why=str(error)))
         training.save()
         raise
     if not complete:
@@ -124,10 +124,10 @@ def watch(training: Watched, loop: Callable[[Callable[[], bool]], bool]) -> None
         raise Stopped(f"Stopped at iteration {state.iteration}; saved. The same command continues.")
 
 
-class Keeper:
+class Checkpointer:
     """After every step: the state's account of time and memory (across interruptions), checkpoints, status.json."""
 
-    def __init__(self, training: Watched, save_every: int):
+    def __init__(self, training: TrainingSession, save_every: int):
         self._training, self._save_every = training, save_every
         self._last = self._noted = time.monotonic()
 
@@ -138,7 +138,7 @@ class Keeper:
         state.peak_memory_bytes = max(state.peak_memory_bytes, peak_memory_bytes())
         self._last = now
 
-    def keep(self, status: Callable[[], Status], flush_log: Callable[[], None] | None = None) -> None:
+    def keep(self, status: Callable[[], StatusRecord], flush_log: Callable[[], None] | None = None) -> None:
         """Save the state and write the `status`, each where it is time.
 
         The log is flushed before the checkpoint is written: a run that continues there must not miss lines of it.
@@ -147,7 +147,7 @@ class Keeper:
         if training.state.iteration % self._save_every == 0:
             if flush_log is not None:
                 flush_log()
-            return_unused()
+            trim_heap()
             training.save()
         if time.monotonic() - self._noted > STATUS_SECONDS:
             self._noted = time.monotonic()
@@ -155,15 +155,15 @@ class Keeper:
 
 
 def _kept(folder: StageFolder) -> str:
-    kept, _ = load_newest(folder.checkpoints)
+    kept, _ = load_latest_checkpoint(folder.checkpoints)
     if kept is None:
         return "There is no checkpoint yet."
     return f"The checkpoint of iteration {kept.iteration} is kept in {folder.checkpoints}."
 
 
-def _rescue(training: Watched) -> str:
+def _rescue(training: TrainingSession) -> str:
     """Save the state after memory ran out, if every step of it is whole and there is room; what is kept then."""
-    return_unused()
+    trim_heap()
     folder = training.folder
     if training.whole():
         try:

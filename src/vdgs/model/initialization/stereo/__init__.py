@@ -11,8 +11,16 @@ knows what training does not: that neighbouring pixels mostly lie on one surface
 Nothing of it needs a GPU or a network; it is deterministic, for any number of threads.
 """
 
-from vdgs.model.initialization.stereo.fusion import Cell, DensePoints, StereoInputs, dense_points
-from vdgs.model.initialization.stereo.sgm import StereoView, depth_of_pair
-from vdgs.model.initialization.stereo.view_selection import partners
+from vdgs.model.initialization.stereo.fusion import DensePoints, FusionCell, StereoInputs, compute_dense_points
+from vdgs.model.initialization.stereo.sgm import StereoView, pair_depth
+from vdgs.model.initialization.stereo.view_selection import select_source_views
 
-__all__ = ["Cell", "DensePoints", "StereoInputs", "StereoView", "dense_points", "depth_of_pair", "partners"]
+__all__ = [
+    "FusionCell",
+    "DensePoints",
+    "StereoInputs",
+    "StereoView",
+    "compute_dense_points",
+    "pair_depth",
+    "select_source_views",
+]

@@ -24,33 +24,33 @@ from scipy.spatial import cKDTree
 
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
-from vdgs.model.initialization.stereo.sgm import AGREEMENT, StereoView, depth_of
-from vdgs.model.initialization.stereo.view_selection import held_by, partners
-from vdgs.system.atomic_files import remedy
+from vdgs.model.initialization.stereo.sgm import MAX_RELATIVE_DIFFERENCE, StereoView, multi_view_depth
+from vdgs.model.initialization.stereo.view_selection import points_in_view, select_source_views
+from vdgs.system.atomic_files import disk_hint
 from vdgs.system.units import data_size
-from vdgs.visibility.spatial_groups import Groups
+from vdgs.visibility.spatial_groups import SpatialGroups
 
 #: Photographs are matched at this longest side, and enlarged at most by so much: steps of a sixteenth of a column tell
 #: depth better in larger pictures (choice).
-LONGEST_SIDE_PX, LARGEST_ZOOM = 480, 1.5
+MATCHING_SIDE_PX, MAX_UPSCALE = 480, 1.5
 #: Depths are looked for between these quantiles of a photograph's sparse points, and this much nearer and farther.
-QUANTILES, MARGIN = (0.01, 0.99), 0.2
+DEPTH_QUANTILES, DEPTH_MARGIN = (0.01, 0.99), 0.2
 #: Edges of cells are the least one times these. Keys have room for so many.
-SIZES = 2.0 ** np.arange(4)
+CELL_SCALES = 2.0 ** np.arange(4)
 #: A cell holds a point where the confirmed pixels of all photographs in it would together cover so much of one of its
 #: faces: what is matched wrongly is strewn over many cells (choice; reports/few-cameras.md).
-LEAST_COVER = 0.05
+MIN_COVERAGE = 0.05
 #: Points keep so many cells from each other: a surface cuts the corners of cells, and each corner would have its own.
-SPACING = 0.7
+MIN_SPACING = 0.7
 #: A pixel counts where at least one partner agrees on its depth, and at least this share of those that hold the place:
 #: one among many agrees by chance. Not more, for some of them do not see it.
-LEAST_AGREED = 0.25
+MIN_AGREEING_FRACTION = 0.25
 #: Grey photographs that are held at a time.
-HELD = 256
+MAX_CACHED_VIEWS = 256
 #: Cells of photographs that are held at a time at least, before they are added up (72 bytes each).
-WAITING = 2**20
+MERGE_BATCH = 2**20
 #: Cells have keys within this many cells of the origin on each axis: 20 bits each, and the size on top.
-REACH = 2**19
+MAX_CELL_INDEX = 2**19
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class StereoInputs:
     read: Callable[[int], tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"] | None]]
 
 
-class Cell(NamedTuple):
+class FusionCell(NamedTuple):
     """The edge of cells that get a point each: the least, in units of the world, and in pixels of the photographs as
     they are used, where those are larger."""
 
@@ -73,9 +73,9 @@ class Cell(NamedTuple):
     pixels: float
 
     def sizes(self, pixel: Float[np.ndarray, " p"]) -> Int64[np.ndarray, " p"]:
-        """Which of `SIZES` cells have where a pixel is so wide."""
+        """Which of `CELL_SCALES` cells have where a pixel is so wide."""
         wide = np.log2(np.maximum(self.pixels * pixel / self.least, 1.0))
-        return np.minimum(np.rint(wide).astype(np.int64), len(SIZES) - 1)
+        return np.minimum(np.rint(wide).astype(np.int64), len(CELL_SCALES) - 1)
 
 
 class DensePoints(NamedTuple):
@@ -105,8 +105,8 @@ class _Cells:
         return _Cells.of(np.concatenate([each.keys for each in some]), np.concatenate([each.sums for each in some]))
 
 
-def dense_points(
-    inputs: StereoInputs, cell: Cell, scratch: Path, tell: Callable[[int, int], None], threads: int = 1
+def compute_dense_points(
+    inputs: StereoInputs, cell: FusionCell, scratch_dir: Path, on_progress: Callable[[int, int], None], threads: int = 1
 ) -> DensePoints:
     """Match every photograph with its partners, and give each cell that enough pixels lie in the mean of them. A pixel
     counts where the depths of partners confirm it.
@@ -116,26 +116,29 @@ def dense_points(
     confirming. Deterministic, whatever `threads`; raises what `read` raises, and VdgsError where the disk has no room.
     """
     cameras = [_matched_size(camera) for camera in inputs.cameras]
-    others, groups = partners(inputs.cameras, inputs.places), Groups.of(torch.from_numpy(inputs.points))
-    views = lru_cache(HELD)(lambda index: _view(inputs, groups, cameras[index], index))
+    others, groups = (
+        select_source_views(inputs.cameras, inputs.places),
+        SpatialGroups.of(torch.from_numpy(inputs.points)),
+    )
+    views = lru_cache(MAX_CACHED_VIEWS)(lambda index: _view(inputs, groups, cameras[index], index))
     width, height = max(each.width for each in cameras), max(each.height for each in cameras)
     steps, of = iter(range(1, 2 * len(cameras) + 1)), 2 * len(cameras)
-    with tempfile.TemporaryFile(dir=scratch) as file, ThreadPoolExecutor(max(1, threads)) as pool:
+    with tempfile.TemporaryFile(dir=scratch_dir) as file, ThreadPoolExecutor(max(1, threads)) as pool:
         shape = (len(cameras), height, width)
-        _reserve(file, 2 * math.prod(shape), scratch)
+        _reserve(file, 2 * math.prod(shape), scratch_dir)
         depths = np.memmap(file, np.float16, "r+", shape=shape)
 
         def match(index: int) -> None:
             if others[index]:
-                depth = depth_of(views(index), [views(other) for other in others[index]])
+                depth = multi_view_depth(views(index), [views(other) for other in others[index]])
                 depths[index, : depth.shape[0], : depth.shape[1]] = depth
 
         def confirm(index: int) -> _Cells:
-            return _confirmed(inputs, cameras, depths, index, others[index], cell)
+            return _geometric_consistency(inputs, cameras, depths, index, others[index], cell)
 
         for _ in pool.map(match, range(len(cameras))):
-            tell(next(steps), of)
-        found = _summed(_told(pool.map(confirm, range(len(cameras))), steps, of, tell))
+            on_progress(next(steps), of)
+        found = _summed(_report_progress(pool.map(confirm, range(len(cameras))), steps, of, on_progress))
         del depths
     return _fused(found, cell)
 
@@ -150,23 +153,25 @@ def _reserve(file: IO[bytes], size: int, folder: Path) -> None:
     except OSError as error:
         raise VdgsError(
             f"{folder}: depths of stereo need {data_size(size)} there for a while ({error.strerror}). "
-            f"{remedy(error)}, then run the same command again."
+            f"{disk_hint(error)}, then run the same command again."
         ) from error
 
 
-def _told(cells: Iterator[_Cells], steps: Iterator[int], of: int, tell: Callable[[int, int], None]) -> Iterator[_Cells]:
+def _report_progress(
+    cells: Iterator[_Cells], steps: Iterator[int], of: int, on_progress: Callable[[int, int], None]
+) -> Iterator[_Cells]:
     for each in cells:
-        tell(next(steps), of)
+        on_progress(next(steps), of)
         yield each
 
 
 def _matched_size(camera: Camera) -> Camera:
     longest = max(camera.width, camera.height)
-    zoom = min(LONGEST_SIDE_PX / longest, LARGEST_ZOOM)
+    zoom = min(MATCHING_SIDE_PX / longest, MAX_UPSCALE)
     return camera.resized(max(1, round(zoom * camera.width)), max(1, round(zoom * camera.height)))
 
 
-def _view(inputs: StereoInputs, groups: Groups, camera: Camera, index: int) -> StereoView:
+def _view(inputs: StereoInputs, groups: SpatialGroups, camera: Camera, index: int) -> StereoView:
     """A photograph grey, at the size at which it is matched."""
     picture, _ = inputs.read(index)
     small = camera.width < picture.shape[1]
@@ -174,13 +179,18 @@ def _view(inputs: StereoInputs, groups: Groups, camera: Camera, index: int) -> S
         cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), (camera.width, camera.height),
         interpolation=cv2.INTER_AREA if small else cv2.INTER_CUBIC,
     )  # fmt: skip
-    _, depth = camera.project(inputs.points[held_by(inputs.cameras[index], inputs.points, groups)])
-    near, far = np.quantile(depth, QUANTILES) if len(depth) else (1.0, 1.0)
-    return StereoView(camera, grey, float(near) * (1 - MARGIN), float(far) * (1 + MARGIN))
+    _, depth = camera.project(inputs.points[points_in_view(inputs.cameras[index], inputs.points, groups)])
+    near, far = np.quantile(depth, DEPTH_QUANTILES) if len(depth) else (1.0, 1.0)
+    return StereoView(camera, grey, float(near) * (1 - DEPTH_MARGIN), float(far) * (1 + DEPTH_MARGIN))
 
 
-def _confirmed(
-    inputs: StereoInputs, cameras: Sequence[Camera], depths: np.ndarray, index: int, others: Sequence[int], cell: Cell
+def _geometric_consistency(
+    inputs: StereoInputs,
+    cameras: Sequence[Camera],
+    depths: np.ndarray,
+    index: int,
+    others: Sequence[int],
+    cell: FusionCell,
 ) -> _Cells:
     """The cells in which confirmed pixels of a photograph lie."""
     camera = cameras[index]
@@ -191,7 +201,12 @@ def _confirmed(
     for other in others:
         inside, agrees = _told_by(places, cameras[other], depths[other])
         held, agreed = held + inside, agreed + agrees
-    confirmed = known & (agreed >= 1) & (agreed >= LEAST_AGREED * held) & (np.abs(places) < REACH * cell.least).all(-1)
+    confirmed = (
+        known
+        & (agreed >= 1)
+        & (agreed >= MIN_AGREEING_FRACTION * held)
+        & (np.abs(places) < MAX_CELL_INDEX * cell.least).all(-1)
+    )
     picture, mask = inputs.read(index)
     size = (camera.width, camera.height)
     if mask is not None:
@@ -200,24 +215,24 @@ def _confirmed(
     area = (depth[confirmed].astype(np.float64) ** 2 / (camera.fx * camera.fy))[:, None]
     values = np.concatenate([places[confirmed], colours[confirmed], np.ones_like(area), area], 1)
     sizes = cell.sizes(depth[confirmed].astype(np.float64) / inputs.cameras[index].fx)
-    edge = cell.least * SIZES[sizes]
-    x, y, z = (np.floor(values[:, axis] / edge).astype(np.int64) + REACH for axis in range(3))
+    edge = cell.least * CELL_SCALES[sizes]
+    x, y, z = (np.floor(values[:, axis] / edge).astype(np.int64) + MAX_CELL_INDEX for axis in range(3))
     return _Cells.of((sizes << 60) | (x << 40) | (y << 20) | z, values)
 
 
 def _told_by(
-    places: Float[np.ndarray, "h w 3"], camera: Camera, depths: Float[np.ndarray, "r c"]
+    points: Float[np.ndarray, "h w 3"], camera: Camera, depths: Float[np.ndarray, "r c"]
 ) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     """Which places another photograph holds in its picture, and which of them lie where its own depth says."""
-    pixels, distance = camera.project(places.reshape(-1, 3))
-    inside = camera.sees(places.reshape(-1, 3))
+    pixels, distance = camera.project(points.reshape(-1, 3))
+    inside = camera.in_frustum(points.reshape(-1, 3))
     column, row = (np.where(inside, pixels[:, axis], 0).astype(np.int64) for axis in (0, 1))
     there = np.asarray(depths[row, column], np.float64)
-    agrees = inside & (there > 0) & (np.abs(there - distance) < AGREEMENT * distance)
-    return inside.reshape(places.shape[:2]), agrees.reshape(places.shape[:2])
+    agrees = inside & (there > 0) & (np.abs(there - distance) < MAX_RELATIVE_DIFFERENCE * distance)
+    return inside.reshape(points.shape[:2]), agrees.reshape(points.shape[:2])
 
 
-def _summed(photographs: Iterable[_Cells], most_waiting: int = WAITING) -> _Cells:
+def _summed(photographs: Iterable[_Cells], most_waiting: int = MERGE_BATCH) -> _Cells:
     """The cells of all photographs. Those that wait to be added are at most as many as there are, or `most_waiting`:
     the time is that of one sum of all, and so are the bits, for each cell is summed in the order of the photographs."""
     total, waiting = _Cells(np.zeros(0, np.int64), np.zeros((0, 8))), list[_Cells]()
@@ -228,17 +243,17 @@ def _summed(photographs: Iterable[_Cells], most_waiting: int = WAITING) -> _Cell
     return _Cells.together([total, *waiting])
 
 
-def _fused(found: _Cells, cell: Cell) -> DensePoints:
+def _fused(found: _Cells, cell: FusionCell) -> DensePoints:
     """One point for each cell that the pixels of all photographs cover well enough; of two that lie too close that of
     the smaller cell, or of the better covered one."""
     means = np.zeros((0, 6))
-    for size, edge in enumerate(cell.least * SIZES):
-        sums = found.sums[(found.keys >> 60 == size) & (found.sums[:, 7] >= LEAST_COVER * edge**2)]
+    for size, edge in enumerate(cell.least * CELL_SCALES):
+        sums = found.sums[(found.keys >> 60 == size) & (found.sums[:, 7] >= MIN_COVERAGE * edge**2)]
         sums = sums[np.argsort(-sums[:, 7], kind="stable")]
         more = sums[:, :6] / sums[:, 6:7]
         if len(means):
-            more = more[cKDTree(means[:, :3]).query(more[:, :3], workers=1)[0] > SPACING * edge]
-        means = np.concatenate([means, more[_apart(more[:, :3], SPACING * edge)]])
+            more = more[cKDTree(means[:, :3]).query(more[:, :3], workers=1)[0] > MIN_SPACING * edge]
+        means = np.concatenate([means, more[_apart(more[:, :3], MIN_SPACING * edge)]])
     return DensePoints(means[:, :3], np.clip(np.rint(means[:, 3:]), 0, 255).astype(np.uint8))
 
 

@@ -14,16 +14,16 @@ from jaxtyping import Float
 from vdgs.geometry.camera import Camera
 
 #: Pairs that would have to be turned further than this from where they look together are not used: its cosine.
-LEAST_FACING = 0.7
+MIN_FACING_COSINE = 0.7
 #: A corner of a photograph this flat to the common plane would make the picture endless.
-LEAST_DEPTH = 0.15
+MIN_CORNER_DEPTH = 0.15
 #: A turned picture may have at most so many times the pixels of the photograph.
-LARGEST = 4.0
-SMALLEST_SIDE = 16
+MAX_AREA_RATIO = 4.0
+MIN_SIDE_PX = 16
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Rectified:
+class RectifiedPair:
     """The common picture plane of two cameras."""
 
     #: World to the common axes: x along the baseline, z where both look.
@@ -38,7 +38,7 @@ class Rectified:
     height: int
 
     @staticmethod
-    def of(first: Camera, second: Camera) -> Rectified | None:
+    def of(first: Camera, second: Camera) -> RectifiedPair | None:
         """None where the two stand too close, or one behind the other, for a common plane."""
         along = second.position - first.position
         baseline = float(np.linalg.norm(along))
@@ -48,7 +48,7 @@ class Rectified:
         z = first.forward + second.forward
         z = z - x * (x @ z)
         facing = float(np.linalg.norm(z)) / 2
-        if facing < LEAST_FACING:
+        if facing < MIN_FACING_COSINE:
             return None
         z = z / (2 * facing)
         rotation = np.stack([x, np.cross(z, x), z])
@@ -58,14 +58,14 @@ class Rectified:
         (left_a, top_a, right_a, low_a), (left_b, top_b, right_b, low_b) = boxes[0], boxes[1]
         top, low = max(top_a, top_b), min(low_a, low_b)
         width, height = int(np.ceil(max(right_a - left_a, right_b - left_b))), int(np.ceil(low - top))
-        if min(width, height) < SMALLEST_SIDE or width * height > LARGEST * first.width * first.height:
+        if min(width, height) < MIN_SIDE_PX or width * height > MAX_AREA_RATIO * first.width * first.height:
             return None
-        return Rectified(
+        return RectifiedPair(
             rotation=rotation, baseline=baseline, focal=first.fx, columns=(-left_a, -left_b), row=-top, width=width,
             height=height,
         )  # fmt: skip
 
-    def to_photograph(self, camera: Camera, which: int) -> Float[np.ndarray, "3 3"]:
+    def homography_to_image(self, camera: Camera, which: int) -> Float[np.ndarray, "3 3"]:
         """The homography from pixel indices of the common picture to those of a photograph (0 the first, 1 the
         second)."""
         matrix = np.array([[self.focal, 0, self.columns[which]], [0, self.focal, self.row], [0, 0, 1.0]])
@@ -96,7 +96,7 @@ def _corners(
     looks away from it."""
     ends = np.array([[x, y, 1.0] for x in (0, camera.width) for y in (0, camera.height)])
     rays = ends @ np.linalg.inv(_intrinsics(camera)).T @ camera.camera_from_world[:3, :3] @ rotation.T
-    if (rays[:, 2] <= LEAST_DEPTH).any():
+    if (rays[:, 2] <= MIN_CORNER_DEPTH).any():
         return None
     plane = focal * rays[:, :2] / rays[:, 2:]
     return (*plane.min(0), *plane.max(0))

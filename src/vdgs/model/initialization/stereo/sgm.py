@@ -11,18 +11,18 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from vdgs.geometry.camera import Camera
-from vdgs.model.initialization.stereo.rectification import Rectified
+from vdgs.model.initialization.stereo.rectification import RectifiedPair
 
 #: Side of the window that is compared, in pixels (choice).
 WINDOW = 5
 #: Depths are matched in at most so many steps of a column; pairs that would need more are too close to the ground.
-MOST_STEPS = 256
+MAX_DISPARITIES = 256
 #: Per cent by which the best match must beat the second: water and sky match anything.
-UNIQUENESS = 5
+UNIQUENESS_RATIO = 5
 #: Where grey values about a pixel, in a window of so many, deviate by less there is nothing to match (of 255; choice).
-LEAST_CONTRAST, CONTRAST_WINDOW = 2.0, 11
+MIN_CONTRAST, CONTRAST_WINDOW = 2.0, 11
 #: Two depths agree when they differ by less than this share.
-AGREEMENT = 0.01
+MAX_RELATIVE_DIFFERENCE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,25 +30,25 @@ class StereoView:
     """A photograph as it is matched: grey, at its camera's size, and the depths between which its ground lies."""
 
     camera: Camera
-    grey: UInt8[np.ndarray, "h w"]
+    gray: UInt8[np.ndarray, "h w"]
     nearest: float
-    farthest: float
+    max_depth: float
 
 
-def depth_of_pair(first: StereoView, second: StereoView) -> Float[np.ndarray, "h w"] | None:
+def pair_depth(first: StereoView, second: StereoView) -> Float[np.ndarray, "h w"] | None:
     """Depth along the axis of the first camera at its pixels, 0 where the two do not match both ways; None where they
     have no common picture plane."""
-    common = Rectified.of(first.camera, second.camera)
+    common = RectifiedPair.of(first.camera, second.camera)
     if common is None:
         return None
-    least = int(np.floor(common.disparity(first.farthest))) - 2
+    least = int(np.floor(common.disparity(first.max_depth))) - 2
     steps = -(-(int(np.ceil(common.disparity(first.nearest))) + 3 - least) // 16) * 16
     overlap = common.width + min(least, 0) - max(least + steps, 0)
-    if not 0 < steps <= MOST_STEPS or overlap <= WINDOW:
+    if not 0 < steps <= MAX_DISPARITIES or overlap <= WINDOW:
         return None
     turned = [
         cv2.warpPerspective(
-            view.grey, common.to_photograph(view.camera, which), (common.width, common.height),
+            view.gray, common.homography_to_image(view.camera, which), (common.width, common.height),
             flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
         )
         for which, view in enumerate((first, second))
@@ -61,20 +61,20 @@ def depth_of_pair(first: StereoView, second: StereoView) -> Float[np.ndarray, "h
         P1=8 * area,
         P2=32 * area,
         disp12MaxDiff=1,
-        uniquenessRatio=UNIQUENESS,
+        uniquenessRatio=UNIQUENESS_RATIO,
     )
     found = matcher.compute(turned[0], turned[1]).astype(np.float32) / 16.0
     # At the ends of the range lies what has its match beyond it, or nowhere.
     between = (found >= least + 1) & (found <= least + steps - 2)
     along = np.where(between, common.depth(found), 0.0).astype(np.float32)
     depth = _as_seen_by(first.camera, common, along)
-    return np.where((depth >= first.nearest) & (depth <= first.farthest), depth, np.float32(0))
+    return np.where((depth >= first.nearest) & (depth <= first.max_depth), depth, np.float32(0))
 
 
-def _as_seen_by(camera: Camera, common: Rectified, along: Float[np.ndarray, "r c"]) -> Float[np.ndarray, "h w"]:
+def _as_seen_by(camera: Camera, common: RectifiedPair, along: Float[np.ndarray, "r c"]) -> Float[np.ndarray, "h w"]:
     """Depth along the common axis, in the common picture, as depth along the axis of the first camera at its pixels."""
     grid = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), -1).astype(np.float64)
-    there = cv2.perspectiveTransform(grid, np.linalg.inv(common.to_photograph(camera, 0)))
+    there = cv2.perspectiveTransform(grid, np.linalg.inv(common.homography_to_image(camera, 0)))
     column, row = (there[..., axis].astype(np.float32) for axis in (0, 1))
     depth = cv2.remap(along, column, row, cv2.INTER_NEAREST, borderValue=0)
     axis = camera.forward @ common.rotation.T
@@ -85,21 +85,21 @@ def _as_seen_by(camera: Camera, common: Rectified, along: Float[np.ndarray, "r c
     return np.maximum(depth * (across @ axis), 0.0).astype(np.float32)
 
 
-def depth_of(view: StereoView, partners: Sequence[StereoView]) -> Float[np.ndarray, "h w"]:
+def multi_view_depth(view: StereoView, source_views: Sequence[StereoView]) -> Float[np.ndarray, "h w"]:
     """Depth at the pixels of a photograph, 0 where no pair tells it: of what its pairs say, what most agree on, their
     mean."""
-    depths = [depth for partner in partners if (depth := depth_of_pair(view, partner)) is not None]
+    depths = [depth for partner in source_views if (depth := pair_depth(view, partner)) is not None]
     if not depths:
-        return np.zeros(view.grey.shape, np.float32)
+        return np.zeros(view.gray.shape, np.float32)
     said = np.stack(depths)
     said[said <= 0] = np.nan
-    most, best = np.zeros(view.grey.shape, np.int32), np.full(view.grey.shape, np.nan, np.float32)
+    most, best = np.zeros(view.gray.shape, np.int32), np.full(view.gray.shape, np.nan, np.float32)
     for depth in said:
         count = _agrees(said, depth).sum(0)
         better = count > most
         most[better], best[better] = count[better], depth[better]
     agreeing = _agrees(said, best)
-    total = np.where(agreeing & _textured(view.grey), said, 0.0).sum(0)
+    total = np.where(agreeing & _textured(view.gray), said, 0.0).sum(0)
     return (total / np.maximum(agreeing.sum(0), 1)).astype(np.float32)
 
 
@@ -107,11 +107,11 @@ def _textured(grey: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Where there is something to match."""
     values, window = grey.astype(np.float32), (CONTRAST_WINDOW, CONTRAST_WINDOW)
     variance = cv2.blur(values * values, window) - cv2.blur(values, window) ** 2
-    textured: np.ndarray = variance > LEAST_CONTRAST**2
+    textured: np.ndarray = variance > MIN_CONTRAST**2
     return textured
 
 
 def _agrees(said: Float[np.ndarray, "p h w"], depth: Float[np.ndarray, "h w"]) -> np.ndarray:
     """Where each of several depths is that one, [p, h, w]; what is not known agrees with nothing."""
     with np.errstate(invalid="ignore"):
-        return np.abs(said - depth) < AGREEMENT * depth
+        return np.abs(said - depth) < MAX_RELATIVE_DIFFERENCE * depth

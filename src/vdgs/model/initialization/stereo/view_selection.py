@@ -15,60 +15,62 @@ from jaxtyping import Float, Int32, Int64
 from scipy.spatial import cKDTree
 
 from vdgs.geometry.camera import Camera
-from vdgs.visibility.spatial_groups import Groups
-from vdgs.visibility.visibility_counts import visibility_of
+from vdgs.visibility.spatial_groups import SpatialGroups
+from vdgs.visibility.visibility_counts import count_visibility
 
 #: So many others for each photograph.
-PARTNERS = 8
+NUM_SOURCE_VIEWS = 8
 #: Degrees between the rays of two photographs to a point at which they tell its depth best: at less depth is vague, at
 #: more pictures are less alike; the deviations of the two sides.
-BEST_ANGLE, BELOW, ABOVE = 12.0, 4.0, 12.0
+BEST_ANGLE_DEG, SIGMA_BELOW_DEG, SIGMA_ABOVE_DEG = 12.0, 4.0, 12.0
 #: So many of the places that a photograph shows speak for it, and fewer than so many do not.
-SPEAKERS, LEAST_SPEAKERS = 300, 8
+NUM_SAMPLE_POINTS, MIN_SAMPLE_POINTS = 300, 8
 #: Photographs that look at places nearest to one's own are asked: pairs of a large flight are too many to look at.
-ASKED = 64
+MAX_CANDIDATES = 64
 #: A partner must serve at least this share of what a photograph shows.
-LEAST_SERVED = 0.01
+MIN_COVERAGE_GAIN = 0.01
 
 
-def partners(cameras: Sequence[Camera], places: Float[np.ndarray, "n 3"], count: int = PARTNERS) -> list[list[int]]:
+def select_source_views(
+    cameras: Sequence[Camera], points: Float[np.ndarray, "n 3"], count: int = NUM_SOURCE_VIEWS
+) -> list[list[int]]:
     """For each camera up to `count` others that see places of its picture from elsewhere, best first; none for one that
     shows hardly any. `places` are those of the whole flight, roughly. Deterministic."""
-    views = visibility_of(torch.from_numpy(places), cameras).numpy()
-    groups = Groups.of(torch.from_numpy(places))
-    shown = [_speakers(held_by(camera, places, groups), views) for camera in cameras]
+    views = count_visibility(torch.from_numpy(points), cameras).numpy()
+    groups = SpatialGroups.of(torch.from_numpy(points))
+    shown = [_sample_points(points_in_view(camera, points, groups), views) for camera in cameras]
     centres = np.stack([camera.position for camera in cameras])
-    seen = [index for index, mine in enumerate(shown) if len(mine) >= LEAST_SPEAKERS]
+    seen = [index for index, mine in enumerate(shown) if len(mine) >= MIN_SAMPLE_POINTS]
     found: list[list[int]] = [[] for _ in cameras]
     if len(seen) < 2:
         return found
-    middles = np.stack([places[shown[index]].mean(0) for index in seen])
-    _, near = cKDTree(middles).query(middles, k=min(ASKED, len(seen)), workers=1)
+    middles = np.stack([points[shown[index]].mean(0) for index in seen])
+    _, near = cKDTree(middles).query(middles, k=min(MAX_CANDIDATES, len(seen)), workers=1)
     for index, others in zip(seen, near, strict=True):
         asked = np.array([seen[other] for other in np.sort(others) if seen[other] != index], np.int64)
-        mine = places[shown[index]]
-        sees = np.stack([cameras[other].sees(mine) for other in asked])
+        mine = points[shown[index]]
+        sees = np.stack([cameras[other].in_frustum(mine) for other in asked])
         need = 1.0 / views[shown[index]]
-        worth = _worth(centres[index], centres[asked], mine) * sees * (need / need.mean())
+        worth = _view_score(centres[index], centres[asked], mine) * sees * (need / need.mean())
         found[index] = [int(asked[k]) for k in _greedily(worth, count)]
     return found
 
 
-def held_by(camera: Camera, places: Float[np.ndarray, "n 3"], groups: Groups) -> Int64[np.ndarray, " s"]:
+def points_in_view(camera: Camera, points: Float[np.ndarray, "n 3"], groups: SpatialGroups) -> Int64[np.ndarray, " s"]:
     """The places, of which `groups` are made, in a camera's picture, ascending; without a look at all of them."""
     near = groups.about(camera).numpy()
-    return np.asarray(near[camera.sees(places[near])])
+    return np.asarray(near[camera.in_frustum(points[near])])
 
 
-def _speakers(rows: Int64[np.ndarray, " n"], views: Int32[np.ndarray, " m"]) -> Int64[np.ndarray, " s"]:
-    """At most `SPEAKERS` of the rows that are shown, each as likely as it is seldom seen."""
-    if len(rows) <= SPEAKERS:
+def _sample_points(rows: Int64[np.ndarray, " n"], views: Int32[np.ndarray, " m"]) -> Int64[np.ndarray, " s"]:
+    """At most `NUM_SAMPLE_POINTS` of the rows that are shown, each as likely as it is seldom seen."""
+    if len(rows) <= NUM_SAMPLE_POINTS:
         return rows
     upto = np.cumsum(1.0 / views[rows])
-    return rows[np.unique(np.searchsorted(upto, np.linspace(0, upto[-1] * (1 - 1e-9), SPEAKERS)))]
+    return rows[np.unique(np.searchsorted(upto, np.linspace(0, upto[-1] * (1 - 1e-9), NUM_SAMPLE_POINTS)))]
 
 
-def _worth(
+def _view_score(
     own: Float[np.ndarray, "3"], others: Float[np.ndarray, "c 3"], points: Float[np.ndarray, "p 3"]
 ) -> Float[np.ndarray, "c p"]:
     """What each other camera is worth for each point, 0 to 1: by the angle between the rays, and by how alike the
@@ -76,9 +78,9 @@ def _worth(
     mine, theirs = points - own, points[None] - others[:, None]
     near, far = np.linalg.norm(mine, axis=-1), np.linalg.norm(theirs, axis=-1)
     cosine = (theirs * mine).sum(-1) / np.maximum(near * far, 1e-12)
-    off = np.degrees(np.arccos(np.clip(cosine, -1, 1))) - BEST_ANGLE
+    off = np.degrees(np.arccos(np.clip(cosine, -1, 1))) - BEST_ANGLE_DEG
     alike = np.minimum(near / np.maximum(far, 1e-12), far / np.maximum(near, 1e-12))
-    worth: np.ndarray = alike * np.exp(-0.5 * (off / np.where(off < 0, BELOW, ABOVE)) ** 2)
+    worth: np.ndarray = alike * np.exp(-0.5 * (off / np.where(off < 0, SIGMA_BELOW_DEG, SIGMA_ABOVE_DEG)) ** 2)
     return worth
 
 
@@ -89,7 +91,7 @@ def _greedily(worth: Float[np.ndarray, "c p"], count: int) -> list[int]:
         gain = (worth / (1 + 2 * served)).sum(1)
         gain[chosen] = -1.0
         best = int(gain.argmax())
-        if gain[best] < LEAST_SERVED * worth.shape[1]:
+        if gain[best] < MIN_COVERAGE_GAIN * worth.shape[1]:
             break
         chosen.append(best)
         served += worth[best]
