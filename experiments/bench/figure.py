@@ -46,7 +46,7 @@ def plot_visibility_groups(file: Path, plan: BenchPlan, results: Sequence[BenchR
         axes = figure.add_axes((left / width, (0.7 + legend) / height, panel / width, PANEL_HEIGHT / height))
         _panel(axes, plan, [each for each in results if each.scene == scene.name], scene.title, index == 0)
     handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.colorbar(handles, labels, loc="lower left", bbox_to_anchor=(0.75 / width, 0.1 / height), ncols=columns,
+    figure.legend(handles, labels, loc="lower left", bbox_to_anchor=(0.75 / width, 0.1 / height), ncols=columns,
                   frameon=False, fontsize=9)  # fmt: skip
     bars = "bars: standard deviation over seeds" if len(plan.seeds) > 1 else "one seed"
     draw_titles(figure, plan.table.title, "PSNR by how many training cameras see the place (raw, dB)",

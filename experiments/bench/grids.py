@@ -61,8 +61,10 @@ QUALITY_COLUMNS = (
     TableColumn("LPIPS ↓", "lpips_vgg", 3, -1),
 )
 CORRECTED_COLUMNS = (
-    TableColumn("PSNR ↑", "psnr_cc"), TableColumn("SSIM ↑", "ssim_cc", 3), TableColumn("LPIPS ↓", "lpips_vgg_cc", 3, -1),
-)  # fmt: skip
+    TableColumn("PSNR ↑", "psnr_cc"),
+    TableColumn("SSIM ↑", "ssim_cc", 3),
+    TableColumn("LPIPS ↓", "lpips_vgg_cc", 3, -1),
+)
 REFERENCE_EXPOSURE_COLUMNS = TableColumn("PSNR ↑", "psnr_neutral"), TableColumn("SSIM ↑", "ssim_neutral", 3)
 COST_COLUMNS = (
     TableColumn("iterations", "iterations", 0, 0),

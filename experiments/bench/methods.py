@@ -139,35 +139,54 @@ _ABLATIONS = [
 ]
 _OTHERS = [
     BenchMethod(
-        "3dgs", "3DGS", explicit_gaussians("mean"), GS3D_STAGES, citation=_3DGS, omissions=_3DGS_LEAVES_OUT,
+        "3dgs",
+        "3DGS",
+        explicit_gaussians("mean"),
+        GS3D_STAGES,
+        citation=_3DGS,
+        omissions=_3DGS_LEAVES_OUT,
         differs=f"background of the mean colour of the photographs, as ours; {_3DGS_SCHEDULE}",
     ),
     BenchMethod(
-        "3dgs-black", "3DGS, black background", explicit_gaussians("black"), GS3D_STAGES, citation=_3DGS,
-        omissions=_3DGS_LEAVES_OUT, differs=f"background black, as published; {_3DGS_SCHEDULE}",
+        "3dgs-black",
+        "3DGS, black background",
+        explicit_gaussians("black"),
+        GS3D_STAGES,
+        citation=_3DGS,
+        omissions=_3DGS_LEAVES_OUT,
+        differs=f"background black, as published; {_3DGS_SCHEDULE}",
     ),
     BenchMethod(
-        "scaffold-gs", "Scaffold-GS", with_dense_adam(coarse_only), COARSE_STAGES,
+        "scaffold-gs",
+        "Scaffold-GS",
+        with_dense_adam(coarse_only),
+        COARSE_STAGES,
         citation="Lu et al., Scaffold-GS: Structured 3D Gaussians for View-Adaptive Rendering, CVPR 2024",
         omissions=("its starts, background, rates and volume weight: they are those of our coarse stage",),
         differs="its dense Adam; `baseline` is the same with ours, which moves only what a photograph shows",
     ),
     BenchMethod(
-        "vastgaussian", "VastGaussian partition", with_partition_strategy("vastgaussian"),
+        "vastgaussian",
+        "VastGaussian partition",
+        with_partition_strategy("vastgaussian"),
         citation="Lin et al., VastGaussian: Vast 3D Gaussians for Large Scene Reconstruction, CVPR 2024",
         omissions=_COMMON,
     ),
     BenchMethod(
-        "citygaussian", "CityGaussian partition", with_partition_strategy("citygaussian"),
+        "citygaussian",
+        "CityGaussian partition",
+        with_partition_strategy("citygaussian"),
         citation="Liu et al., CityGaussian: Real-time High-quality Large-Scale Scene Rendering with Gaussians, ECCV 2024",
         omissions=_COMMON,
     ),
     BenchMethod(
-        "dogs", "DOGS partition", with_partition_strategy("dogs"),
+        "dogs",
+        "DOGS partition",
+        with_partition_strategy("dogs"),
         citation="Chen and Lee, DOGS: Distributed-Oriented Gaussian Splatting via Gaussian Consensus, NeurIPS 2024",
         omissions=_COMMON,
     ),
-]  # fmt: skip
+]
 _BLOCKS = [
     BenchMethod(f"blocks-{count}", f"{count} block{'s' * (count > 1)}", with_block_count(count)) for count in BLOCKS
 ]

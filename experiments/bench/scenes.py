@@ -107,9 +107,14 @@ def _in_the_regime(flight: str) -> BenchScene:
 
 def _real(name: str) -> BenchScene:
     return BenchScene(
-        name, name, LAPTOP_BUDGET, capture=name, options={"images": "images_4", "downscale": 2.0}, override=_few_cameras,
+        name,
+        name,
+        LAPTOP_BUDGET,
+        capture=name,
+        options={"images": "images_4", "downscale": 2.0},
+        override=_few_cameras,
         note="A small real capture (COLMAP), read at an eighth of its size.",
-    )  # fmt: skip
+    )
 
 
 def _mega_nerf(name: str, title: str, uneven: bool) -> BenchScene:

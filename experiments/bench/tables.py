@@ -24,14 +24,25 @@ _SWEEPS = (
 _MORE_ANCHORS = (
     MethodGroup(
         "four blocks",
-        ("cell-1-off", "cell-1-sum-0.2", "cell-1-mean-0.2", *(f"cell-1-threshold-{factor:g}" for factor in LOWER_THRESHOLDS)),
+        (
+            "cell-1-off",
+            "cell-1-sum-0.2",
+            "cell-1-mean-0.2",
+            *(f"cell-1-threshold-{factor:g}" for factor in LOWER_THRESHOLDS),
+        ),
     ),
     MethodGroup(
         "coarse stage alone",
-        ("coarse", "coarse-compensated-sum", "coarse-compensated-mean", "coarse-compensated-literal-gate",
-         "coarse-lower-gate", *(f"coarse-threshold-{factor:g}" for factor in LOWER_THRESHOLDS)),
+        (
+            "coarse",
+            "coarse-compensated-sum",
+            "coarse-compensated-mean",
+            "coarse-compensated-literal-gate",
+            "coarse-lower-gate",
+            *(f"coarse-threshold-{factor:g}" for factor in LOWER_THRESHOLDS),
+        ),
     ),
-)  # fmt: skip
+)
 _ABLATION = (
     "coarse",
     "coarse-as-long",
@@ -61,48 +72,78 @@ TABLES: dict[str, BenchTable] = {
     table.name: table
     for table in (
         BenchTable(
-            "table1", "Table I: methods × scenes",
-            ("3dgs", "3dgs-black", "scaffold-gs", "baseline-mean", "vastgaussian", "citygaussian", "dogs", "full"), LAB_SCENES,
+            "table1",
+            "Table I: methods × scenes",
+            ("3dgs", "3dgs-black", "scaffold-gs", "baseline-mean", "vastgaussian", "citygaussian", "dogs", "full"),
+            LAB_SCENES,
         ),
         BenchTable("table2", "Table II: training strategies", _ABLATION, LAB_SCENES),
         BenchTable(
-            "table3", "Table III: number of blocks", tuple(f"blocks-{count}" for count in BLOCKS), LAB_SCENES[:1],
+            "table3",
+            "Table III: number of blocks",
+            tuple(f"blocks-{count}" for count in BLOCKS),
+            LAB_SCENES[:1],
             ours="blocks-8",
         ),
         BenchTable(
-            "table4", "Table IV: parameters", tuple(name for group in _SWEEPS for name in group.methods), LAB_SCENES[:1],
-            seeds=(0,), groups=_SWEEPS, ours="lambda-vis-1",
+            "table4",
+            "Table IV: parameters",
+            tuple(name for group in _SWEEPS for name in group.methods),
+            LAB_SCENES[:1],
+            seeds=(0,),
+            groups=_SWEEPS,
+            ours="lambda-vis-1",
         ),
         BenchTable(
-            "table3-each", "Table III: number of blocks, each trained as long, plain growth",
+            "table3-each",
+            "Table III: number of blocks, each trained as long, plain growth",
             (
-                "coarse", "no-blocking-as-long-plain", "each-half", "no-anchor-generation", "each-2-times",
+                "coarse",
+                "no-blocking-as-long-plain",
+                "each-half",
+                "no-anchor-generation",
+                "each-2-times",
                 "each-4-times",
             ),
-            REGIME_SCENES, ours="no-anchor-generation",
+            REGIME_SCENES,
+            ours="no-anchor-generation",
         ),
         BenchTable(
-            "factorial", "Factorial: cut by visibility × compensation × T_low, equally many cameras", FACTORIAL, REGIME_SCENES,
+            "factorial",
+            "Factorial: cut by visibility × compensation × T_low, equally many cameras",
+            FACTORIAL,
+            REGIME_SCENES,
             ours="cell-1-mean-0.2",
         ),
         BenchTable(
-            "coarse-compensation", "Compensation in the coarse stage alone",
-            ("coarse", "coarse-compensated-mean", "coarse-compensated-sum"), REGIME_SCENES, ours="coarse-compensated-mean",
+            "coarse-compensation",
+            "Compensation in the coarse stage alone",
+            ("coarse", "coarse-compensated-mean", "coarse-compensated-sum"),
+            REGIME_SCENES,
+            ours="coarse-compensated-mean",
         ),
         BenchTable(
-            "more-anchors", "Compensated growth, its parts, and plain growth at lower thresholds",
-            tuple(name for group in _MORE_ANCHORS for name in group.methods), REGIME_SCENES, groups=_MORE_ANCHORS,
+            "more-anchors",
+            "Compensated growth, its parts, and plain growth at lower thresholds",
+            tuple(name for group in _MORE_ANCHORS for name in group.methods),
+            REGIME_SCENES,
+            groups=_MORE_ANCHORS,
             ours="cell-1-mean-0.2",
         ),
         BenchTable(
-            "longer", "Blocks trained longer",
-            ("coarse", "baseline", "baseline-mean", "full", "longer-2", "longer-4"), LAB_SCENES[:2],
+            "longer",
+            "Blocks trained longer",
+            ("coarse", "baseline", "baseline-mean", "full", "longer-2", "longer-4"),
+            LAB_SCENES[:2],
         ),
         BenchTable("choices", "Our choices, one at a time", CHOICE_METHODS, LAB_SCENES[:1], seeds=(0,)),
         BenchTable("efficiency", "Efficiency", ("baseline", "baseline-mean", "full"), LAB_SCENES[:1], seeds=(0,)),
         BenchTable(
-            "toy", "Toy: the training strategies on a tiny town",
-            ("baseline", "no-blocking", "no-anchor-generation", "full"), ("tiny",), seeds=(0,),
+            "toy",
+            "Toy: the training strategies on a tiny town",
+            ("baseline", "no-blocking", "no-anchor-generation", "full"),
+            ("tiny",),
+            seeds=(0,),
         ),
     )
-}  # fmt: skip
+}

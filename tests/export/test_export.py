@@ -53,9 +53,15 @@ def export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         file, shown = tmp_path / "run" / "merged" / "model.safetensors", model or scattered()
         shown.save(file)
         opened = OpenedRun(
-            folder=RunFolder(tmp_path / "run"), model=shown, model_path=file, name="merged", status=StatusRecord(), key="k",
-            caution="", capture=capture_at(origin),
-        )  # fmt: skip
+            folder=RunFolder(tmp_path / "run"),
+            model=shown,
+            model_path=file,
+            name="merged",
+            status=StatusRecord(),
+            key="k",
+            caution="",
+            capture=capture_at(origin),
+        )
         monkeypatch.setattr(export_module, "open_run", lambda *_: opened)
         request = ExportRequest(
             run=tmp_path / "run", to=tuple(tmp_path / name for name in names), measure=False, device="cpu", **asked

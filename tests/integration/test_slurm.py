@@ -211,8 +211,9 @@ def answers(monkeypatch, **said: str | None) -> None:
 def test_what_slurm_says_is_read(monkeypatch):
     answers(monkeypatch, squeue="12|3|RUNNING|vdgs-a-1|n07\n12|4|PENDING|vdgs-a-1|\n13|N/A|RUNNING|other|n01\n")
     assert slurm_commands.list_queue("vdgs-a-") == [
-        QueueEntry(ArrayTaskId("12", 3), "RUNNING", "vdgs-a-1", "n07"), QueueEntry(ArrayTaskId("12", 4), "PENDING", "vdgs-a-1", "")
-    ]  # fmt: skip
+        QueueEntry(ArrayTaskId("12", 3), "RUNNING", "vdgs-a-1", "n07"),
+        QueueEntry(ArrayTaskId("12", 4), "PENDING", "vdgs-a-1", ""),
+    ]
     element = ArrayTaskId("12", 3)
     answers(monkeypatch, scontrol="JobId=15 ArrayJobId=12 JobState=NODE_FAIL Reason=NodeDown NodeList=n07\n")
     assert slurm_commands.query_job_state(element) == JobState("NODE_FAIL", "n07")

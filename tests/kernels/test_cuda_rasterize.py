@@ -200,7 +200,7 @@ class TestMeaning:
         by_alpha = torch.randn(scene.height, scene.width, generator=torch.Generator().manual_seed(0))
         expected = rasterize_vjp(splats, background, scene.width, scene.height, program=program)[1](None, by_alpha)
         _, pullback = rasterize_vjp(splats, background, scene.width, scene.height, program=program)
-        found = pullback(None, by_alpha, over=(splats.means_px, splats.conics))
+        found = pullback(None, by_alpha, out=(splats.means_px, splats.conics))
         assert found.means_px is splats.means_px
         assert found.depths is expected.depths is None
         for ours, theirs in zip(found, expected, strict=True):

@@ -70,7 +70,7 @@ def test_the_way_back_gives_what_training_asks_for():
     g = torch.Generator().manual_seed(3)
     by_image, by_alpha = torch.randn(29, 37, 3, generator=g), torch.randn(29, 37, generator=g)
     room = torch.zeros(len(scene.tensors[0]), 2), torch.zeros(len(scene.tensors[0]), 3)
-    found = pullback(by_image, by_alpha, over=room)
+    found = pullback(by_image, by_alpha, out=room)
     assert found.means_px is room[0]
     assert found.conics is room[1]
     assert found.depths is None

@@ -42,10 +42,22 @@ GLANCE_SECONDS = 0.01
 
 #: What the server imports, as far as it is there; the last ones are what commands import when they need it.
 IMPORTED = [
-    "vdgs.cli.main", "vdgs.cli", "vdgs.pipeline.run_pipeline", "vdgs.rendering.render_run", "experiments.bench.bench", "vdgs.export.export_run",
-    "vdgs.pipeline.train_block", "vdgs.kernels.cpu", "vdgs.kernels.torch_ref", "vdgs.kernels.autograd",
-    "typeguard", "contourpy", "PIL.PngImagePlugin", "sklearn.cluster", "rasterio",
-]  # fmt: skip
+    "vdgs.cli.main",
+    "vdgs.cli",
+    "vdgs.pipeline.run_pipeline",
+    "vdgs.rendering.render_run",
+    "experiments.bench.bench",
+    "vdgs.export.export_run",
+    "vdgs.pipeline.train_block",
+    "vdgs.kernels.cpu",
+    "vdgs.kernels.torch_ref",
+    "vdgs.kernels.autograd",
+    "typeguard",
+    "contourpy",
+    "PIL.PngImagePlugin",
+    "sklearn.cluster",
+    "rasterio",
+]
 # Only Linux forks safely what has imported this much.
 _PROCESSES = multiprocessing.get_context("forkserver" if sys.platform == "linux" else "spawn")
 if sys.platform == "linux":

@@ -136,9 +136,15 @@ def moved_by(
     g = torch.Generator().manual_seed(8)
     m = len(splats.source)
     gradients = SplatGradients(
-        means_px=0.1 * torch.randn(m, 2, generator=g), conics=torch.randn(m, 3, generator=g), colours=torch.randn(m, 3, generator=g),
-        opacities=torch.randn(m, generator=g), volume=0.3, source=splats.source, colour_values=splats.colours, opacity_values=splats.opacities,
-    )  # fmt: skip
+        means_px=0.1 * torch.randn(m, 2, generator=g),
+        conics=torch.randn(m, 3, generator=g),
+        colours=torch.randn(m, 3, generator=g),
+        opacities=torch.randn(m, generator=g),
+        volume=0.3,
+        source=splats.source,
+        colour_values=splats.colours,
+        opacity_values=splats.opacities,
+    )
     if spoil:
         gradients.means_px[0] = torch.nan
     if shown is not None:

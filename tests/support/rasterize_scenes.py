@@ -22,7 +22,7 @@ def assert_first_gradients_are_those_of_all(
     whole = pullback()(by_image, by_alpha)
     for count in sorted({0, min(1, splats), splats // 30, splats // 3, splats}):
         room = torch.full((count, 2), torch.nan), torch.full((count, 3), torch.nan)
-        *found, background = pullback()(by_image, by_alpha, over=room, count=count)
+        *found, background = pullback()(by_image, by_alpha, out=room, count=count)
         assert found[0] is room[0]
         assert found[1] is room[1]
         assert torch.equal(background, whole.background)

@@ -38,7 +38,7 @@ from vdgs.system.memory.memory_estimate import (
     memory_advice,
 )
 from vdgs.system.memory.process_memory import available_memory_bytes, is_out_of_memory
-from vdgs.training.session import memory_advice
+from vdgs.training.session import memory_advice as memory_advice_module
 from vdgs.training.session import trainer as watching
 from vdgs.training.session.memory_advice import print_memory_estimate
 
@@ -166,14 +166,14 @@ def test_a_warning_comes_before_training_where_it_will_not_fit(kind, said, monke
         anchors=1_000_000, max_anchors=0, offsets=10, seen=0.4, pixels=2 * 10**7, images_bytes=10**9
     )
     taken = psutil.Process().memory_info().rss  # it grows with the tests that ran before
-    monkeypatch.setattr(memory_advice, "available_memory_bytes", lambda: int(5.4e9) - taken)
+    monkeypatch.setattr(memory_advice_module, "available_memory_bytes", lambda: int(5.4e9) - taken)
     print_memory_estimate(need, kind, Console(width=2000))
     line, warning, *_ = capsys.readouterr().out.splitlines()
     assert line.startswith("memory by estimate")
     assert warning.startswith("warning it may run out of memory: ")
     assert ("--growth.max-anchors 1000000" in warning) == (kind == "coarse")
     assert warning.endswith(said)
-    monkeypatch.setattr(memory_advice, "available_memory_bytes", lambda: 10**11)
+    monkeypatch.setattr(memory_advice_module, "available_memory_bytes", lambda: 10**11)
     print_memory_estimate(need, kind, Console(width=2000))
     assert "warning" not in capsys.readouterr().out
 

@@ -20,7 +20,7 @@ from vdgs.captures.capture import Capture, View
 from vdgs.captures.capture_order import flight_positions
 from vdgs.evaluation.auto_exposure import AutoExposure, fit_auto_exposure, log_luminance
 from vdgs.evaluation.opacity_coverage import RenderedImage
-from vdgs.evaluation.view_exposures import ViewExposures, apply_exposure, make_exposures
+from vdgs.evaluation.view_exposures import ViewExposures, apply_exposure_numpy, make_exposures
 from vdgs.geometry.camera import Camera
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
@@ -232,10 +232,10 @@ def test_the_law_of_metering_is_learnt_or_left(slope, seed):
 def test_a_picture_is_exposed_as_in_training_and_neutral_leaves_every_bit(seed):
     generator = torch.Generator().manual_seed(seed)
     picture, model = torch.rand(5, 7, 3, generator=generator), NEUTRAL + random_departures(1, seed)[0]
-    found = apply_exposure(picture.numpy(), model)
+    found = apply_exposure_numpy(picture.numpy(), model)
     assert found.dtype == np.float32
     np.testing.assert_allclose(found, apply_exposure(picture.double(), model).numpy(), atol=1e-6)
-    assert np.array_equal(apply_exposure(picture.numpy(), NEUTRAL), picture.numpy())
+    assert np.array_equal(apply_exposure_numpy(picture.numpy(), NEUTRAL), picture.numpy())
 
 
 def test_before_another_background_the_exposed_scene_stays_as_it_is():
@@ -244,7 +244,7 @@ def test_before_another_background_the_exposed_scene_stays_as_it_is():
     behind, model = (0.2, 0.4, 0.6), NEUTRAL + 0.5 * random_departures(1)[0]
     rendered = RenderedImage(alpha[..., None] * scene + (1 - alpha[..., None]) * np.float32(behind), alpha, behind)
     black = rendered.exposed(model).before((0.0, 0.0, 0.0))
-    expected = (alpha[..., None] * apply_exposure(scene, model)).clip(0, 1) * 255
+    expected = (alpha[..., None] * apply_exposure_numpy(scene, model)).clip(0, 1) * 255
     assert np.abs(black - expected).max() < 0.501
     assert replace(rendered, background=None).exposed(model).background is None
 

@@ -168,10 +168,18 @@ def test_what_is_added_to_the_sum_is_divided_by_the_draws(added_to, expected):
         anchors = replace(anchors, offsets=100.0 + anchors.offsets[:, :1])
         seeds = range(12)  # an offset that asks is kept by half of them
         grown = [
-            len(decide_densification(anchors, DensificationStats(**{n: t.clone() for n, t in statistics.tensors().items()}), 1.0, growth,
-                       torch.Generator().manual_seed(seed), compensated=change).added)
+            len(
+                decide_densification(
+                    anchors,
+                    DensificationStats(**{n: t.clone() for n, t in statistics.tensors().items()}),
+                    1.0,
+                    growth,
+                    torch.Generator().manual_seed(seed),
+                    compensated=change,
+                ).added
+            )
             for seed in seeds
-        ]  # fmt: skip
+        ]
         assert any(grown) == asks
 
 

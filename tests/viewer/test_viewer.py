@@ -19,7 +19,7 @@ from support.hand_made_models import opaque_plane, quadrants
 from vdgs.captures.capture import Capture, View
 from vdgs.evaluation.auto_exposure import log_luminance
 from vdgs.evaluation.metrics import to_8bit
-from vdgs.evaluation.view_exposures import apply_exposure
+from vdgs.evaluation.view_exposures import apply_exposure_numpy
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.model.anchor_model import AnchorModel, DecoderSpan
@@ -79,9 +79,15 @@ def photographed(folder: Path, model: AnchorModel, change: Callable[[int, np.nda
         point_colors=np.full((len(points), 3), 99, np.uint8), ground=ground,
     )  # fmt: skip
     run = OpenedRun(
-        folder=RunFolder(folder / "run"), model=model, model_path=folder / "model", name="merged", status=StatusRecord(),
-        key="key", caution="", capture=capture,
-    )  # fmt: skip
+        folder=RunFolder(folder / "run"),
+        model=model,
+        model_path=folder / "model",
+        name="merged",
+        status=StatusRecord(),
+        key="key",
+        caution="",
+        capture=capture,
+    )
     coarse = replace(run, model=opaque_plane(), name="coarse")
     return ViewerScene(run, lambda name: coarse)
 
@@ -151,7 +157,7 @@ def test_an_exposure_of_the_photograph_is_no_error_of_the_model(tmp_path):
     model = replace(model, decoder=replace(model.decoder, exposure=fitted - torch.eye(3, 4)))
     # What all have in common is the scene's; the test photograph is the last of the flight, exposed as the one before.
     own = [exposure_matrix(fitted - torch.eye(3, 4), min(number, 7)).double() for number in range(9)]
-    scene = photographed(tmp_path, model, lambda number, image: apply_exposure(image, own[number]))
+    scene = photographed(tmp_path, model, lambda number, image: apply_exposure_numpy(image, own[number]))
     comparison = Painter(scene)._comparison
     for index in (0, 3, 8):
         camera = scene.capture.views[index].camera
@@ -383,9 +389,14 @@ def test_no_canvas_is_larger_than_can_be_drawn():
 def test_buttons_lead_where_they_say(scene):
     stand = navigation.overview_pose(scene.capture)
     whole = Camera(
-        camera_from_world=look_at_pose(stand.position, stand.look_at), fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640,
+        camera_from_world=look_at_pose(stand.position, stand.look_at),
+        fx=500.0,
+        fy=500.0,
+        cx=320.0,
+        cy=240.0,
+        width=640,
         height=480,
-    )  # fmt: skip
+    )
     assert all(whole.in_frustum(np.array([[x, y, 0.0]]))[0] for x in (-1.5, 1.5) for y in (-1.5, 1.5))
     above = navigation.top_down_pose(stand)
     assert np.allclose(above.look_at, stand.look_at)

@@ -17,6 +17,22 @@ from vdgs.cli.stage_cmds import merge_command, partition_command, train_blocks_c
 from vdgs.cli.view_cmd import view_command
 
 __all__ = [
-    "bench", "train_coarse_command", "doctor_command", "eval_command", "export_command", "inspect_command", "ortho_command", "merge_command", "partition_command", "render_command", "report_command", "run_command",
-    "sfm_command", "status_command", "synth_command", "train_blocks_command", "view_command", "visibility_command",
-]  # fmt: skip
+    "bench",
+    "train_coarse_command",
+    "doctor_command",
+    "eval_command",
+    "export_command",
+    "inspect_command",
+    "ortho_command",
+    "merge_command",
+    "partition_command",
+    "render_command",
+    "report_command",
+    "run_command",
+    "sfm_command",
+    "status_command",
+    "synth_command",
+    "train_blocks_command",
+    "view_command",
+    "visibility_command",
+]

@@ -147,9 +147,12 @@ def _slurm(
     share = allocate_queue(workload, executor_options)
     options = executor_options.slurm
     executor = SlurmExecutor(
-        at_once=share.at_once, poll_seconds=options.poll_seconds, patience_seconds=LOCK_TIMEOUT_SECONDS, question=requirements,
+        at_once=share.at_once,
+        poll_seconds=options.poll_seconds,
+        patience_seconds=LOCK_TIMEOUT_SECONDS,
+        question=requirements,
         options=options,
-    )  # fmt: skip
+    )
     return SelectedBackend(executor, share, f"as jobs of SLURM, {_resources_text(share)} each")
 
 

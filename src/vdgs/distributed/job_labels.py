@@ -26,9 +26,15 @@ class JobLabels:
 
 
 BLOCK_LABELS = JobLabels(
-    one="block", plural="blocks", work="train", activity="training", steps="iteration", rate_unit="it/s", shows_training_stats=True,
+    one="block",
+    plural="blocks",
+    work="train",
+    activity="training",
+    steps="iteration",
+    rate_unit="it/s",
+    shows_training_stats=True,
     memory_saving_options=("more --blocks", "--block.growth.max-anchors"),
-)  # fmt: skip
+)
 
 
 def shard_kind(work: str, steps: str) -> JobLabels:

@@ -36,7 +36,7 @@ from vdgs.evaluation.by_block import (
 from vdgs.evaluation.metric_tables import format_value
 from vdgs.evaluation.metrics import masked_mean, psnr_from_mse, squared_error, to_8bit
 from vdgs.evaluation.renderable_model import ReferenceViews
-from vdgs.evaluation.view_exposures import apply_exposure
+from vdgs.evaluation.view_exposures import apply_exposure_numpy
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import Raster
 from vdgs.partition.blocks import Blocks
@@ -87,7 +87,7 @@ class BlockInputs:
     def picture(self, rendered: Raster, view: View) -> UInt8[np.ndarray, "h w 3"]:
         """What is measured of a render."""
         pixels = rendered.image.detach().cpu().numpy()
-        return to_8bit(pixels if self.exposure is None else apply_exposure(pixels, self.exposure(view)))
+        return to_8bit(pixels if self.exposure is None else apply_exposure_numpy(pixels, self.exposure(view)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -84,7 +84,7 @@ def visible_blocks(labels: Int16[np.ndarray, "h w"], blocks: int) -> list[int]:
     return np.flatnonzero(counts >= max(1.0, MIN_VIEW_SHARE * labels.size)).tolist()
 
 
-_AnyPooled = TypeVar("_AnyPooled", bound="_Pooled")
+_AnyPooled = TypeVar("_AnyPooled", bound="_PooledErrors")
 
 
 class _PooledErrors:
@@ -158,7 +158,7 @@ class SeamMetrics(_PooledErrors):
     """Errors at the borders of blocks against errors elsewhere; `add` each test view, then read `figures`."""
 
     #: The renders that are compared. The coarse one has no seams: it says how hard the places at the borders are.
-    NAMES = ("coarse", "merged")
+    RENDER_NAMES = ("coarse", "merged")
 
     def __init__(self) -> None:
         super().__init__(2, [f"{kind}_{name}" for kind in ("mae", "mse") for name in self.RENDER_NAMES])

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from vdgs.evaluation.by_visibility import mean_or_none
 from vdgs.evaluation.metrics import psnr_from_mse, squared_error, to_8bit
-from vdgs.evaluation.view_exposures import apply_exposure
+from vdgs.evaluation.view_exposures import apply_exposure_numpy
 from vdgs.kernels.constants import ALPHA_MIN
 from vdgs.kernels.kernel_types import Splats
 
@@ -47,9 +47,9 @@ class RenderedImage:
         """The view with the colour model of a photograph: all colours, the background's too. They may leave [0, 1]."""
         background = self.background
         if background is not None:
-            red, green, blue = apply_exposure(np.array(background), exposure).tolist()
+            red, green, blue = apply_exposure_numpy(np.array(background), exposure).tolist()
             background = red, green, blue
-        return RenderedImage(apply_exposure(self.image, exposure), self.alpha, background)
+        return RenderedImage(apply_exposure_numpy(self.image, exposure), self.alpha, background)
 
     def before(self, colour: RgbColor) -> UInt8[np.ndarray, "h w 3"] | None:
         """The picture in 8 bits with another background; None where alpha or its own background is not known."""

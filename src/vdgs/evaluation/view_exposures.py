@@ -97,10 +97,10 @@ class ViewExposures:
         return picture
 
 
-def apply_exposure(
+def apply_exposure_numpy(
     image: Float[np.ndarray, "*shape 3"], exposure: Float[Tensor, "3 4"]
 ) -> Float[np.ndarray, "*shape 3"]:
-    """`model.exposure.exposed`, added up in one order: the bits of the result do not depend on the number of threads,
+    """`model.exposure.apply_exposure`, added up in one order: the bits of the result do not depend on the number of threads,
     so that views may be measured by several processes."""
     model = exposure.to(torch.float64).numpy()
     return (np.einsum("...c,dc->...d", image, model[:, :3]) + model[:, 3]).astype(image.dtype)

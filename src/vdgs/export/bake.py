@@ -85,7 +85,7 @@ def view_contributions(model: AnchorModel, camera: Camera) -> ViewContributions:
     k = model.anchors.offsets.shape[1]
     rows, splats = decode_view(model, camera)
     kernels = get_backend(rows.device)
-    pixels = kernels.shares(splats, splats.means_px.new_zeros(3), camera.width, camera.height).pixels
+    pixels = kernels.splat_contributions(splats, splats.means_px.new_zeros(3), camera.width, camera.height).pixels
     source = splats.source.long()
     kept = (pixels >= MIN_PIXELS).nonzero()[:, 0]
     source = source.index_select(0, kept)

@@ -102,7 +102,7 @@ def rows_of_part(baked: BakedGaussians, number: int) -> range:
 def view_residual(baked: BakedGaussians, camera: Camera) -> ColorResidual:
     """What the baked Gaussians do not show of the model's picture."""
     wanted, numbers = baked.drawn(camera)
-    found = get_backend(torch.device("cpu")).shares(
+    found = get_backend(torch.device("cpu")).splat_contributions(
         _splats(baked.spool, numbers, camera), torch.tensor(baked.model.background), camera.width, camera.height, wanted
     )
     shown = (found.pixels >= MIN_PIXELS).nonzero()[:, 0]

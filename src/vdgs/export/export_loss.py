@@ -15,7 +15,7 @@ from vdgs.evaluation.by_visibility import VisibilityBin, VisibilityHistogram
 from vdgs.evaluation.color_correction import correct_colors
 from vdgs.evaluation.evaluate_run import cached_reference_views, make_visibility_map, with_coarse_model
 from vdgs.evaluation.metrics import masked_mean, psnr_from_mse, squared_error, ssim_map, to_8bit
-from vdgs.evaluation.view_exposures import apply_exposure, make_exposures
+from vdgs.evaluation.view_exposures import apply_exposure_numpy, make_exposures
 from vdgs.export.formats.export_scene import concatenate
 from vdgs.geometry.camera import Camera
 from vdgs.model.gaussians import Gaussians, render_gaussians, visible_gaussian_rows
@@ -68,7 +68,7 @@ def measure_loss(
         for view in views:
             reference, mask = photographs.load_image(view), photographs.load_mask(view)
             neutral = render(run.model, view.camera).image.cpu().numpy(), _render_gaussians(gaussians, run, view.camera)
-            exposed = neutral if exposure is None else [apply_exposure(each, exposure(view)) for each in neutral]
+            exposed = neutral if exposure is None else [apply_exposure_numpy(each, exposure(view)) for each in neutral]
             drawn = [to_8bit(each) for each in exposed]
             corrected = [to_8bit(correct_colors(picture, reference, mask).image) for picture in drawn]
             errors = [squared_error(picture, reference) for picture in (*drawn, *corrected)]

@@ -152,10 +152,16 @@ def _projected(ground: GroundFrame, projection: CrsTransform) -> MapProjection:
         return enu_from_geodetic(projection.to_geodetic(places), origin, level_at)
 
     return MapProjection(
-        crs=projection.code, name=f"{projection.name} ({projection.code})", unit=projection.unit,
-        meters_per_unit=projection.meters_per_unit, wkt=projection.wkt, heights=projection.heights, notes=projection.notes,
-        _forward=forward, _backward=backward,
-    )  # fmt: skip
+        crs=projection.code,
+        name=f"{projection.name} ({projection.code})",
+        unit=projection.unit,
+        meters_per_unit=projection.meters_per_unit,
+        wkt=projection.wkt,
+        heights=projection.heights,
+        notes=projection.notes,
+        _forward=forward,
+        _backward=backward,
+    )
 
 
 def _same(points: MapPoints) -> MapPoints:

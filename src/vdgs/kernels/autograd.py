@@ -52,7 +52,7 @@ def vjp_from_autograd(
         image: Tensor | None,
         alpha: Tensor | None = None,
         depth: Tensor | None = None,
-        over: tuple[Tensor, Tensor] | None = None,
+        out: tuple[Tensor, Tensor] | None = None,
         count: int | None = None,
     ) -> RasterGradients:
         made = {"image": image, "alpha": alpha, "depth": depth}
@@ -62,9 +62,9 @@ def vjp_from_autograd(
             allow_unused=True, materialize_grads=True,
         )  # fmt: skip
         by_means, by_conics, by_colours, by_opacities, by_depths = (each[:count] for each in by_splats)
-        for place, gradient in zip(over or (), (by_means, by_conics), strict=False):
+        for place, gradient in zip(out or (), (by_means, by_conics), strict=False):
             place.copy_(gradient)
-        means, conics = over or (by_means, by_conics)
+        means, conics = out or (by_means, by_conics)
         of_depths = None if drawn.depth is None else by_depths
         return RasterGradients(means, conics, by_colours, by_opacities, of_depths, by_background)
 

@@ -79,7 +79,7 @@ class KernelBackend(Protocol):
         self, splats: Splats, background: Tensor, width: int, height: int, *, depth: bool = False
     ) -> tuple[Raster, RasterPullback]: ...
 
-    def shares(
+    def splat_contributions(
         self, splats: Splats, background: Tensor, width: int, height: int, wanted: Tensor | None = None
     ) -> SplatContributions: ...
 
@@ -144,11 +144,11 @@ GPU_BACKENDS: dict[str, tuple[str, ...]] = dict.fromkeys(OPERATION_NAMES, ("refe
     "cull": ("cuda",),
     "decode": ("cuda",),
     "decode_backward_adam": ("cuda",),
-    "decode_to_train": ("cuda",),
+    "decode_for_training": ("cuda",),
     "photometric_loss": ("cuda",),
-    "rasterise": ("gsplat", "cuda"),
-    "rasterise_vjp": ("gsplat", "cuda"),
-    "shares": ("cuda",),
+    "rasterize": ("gsplat", "cuda"),
+    "rasterize_vjp": ("gsplat", "cuda"),
+    "splat_contributions": ("cuda",),
 }
 
 #: Whether all that has been run on a card. Until it is, `--device auto` takes the processor.

@@ -162,12 +162,20 @@ def _plan(capture: Capture, method: MethodConfig, request: RunRequest) -> RunEst
     block = block_train_config(method, max(1, round(views * min(1.0, 1.5 / blocks))))
     coarse = _seconds(config, timed)
     return RunEstimate(
-        anchors=len(anchors), dense_points=dense, blocks=blocks, coarse_iterations=config.iterations,
-        block_iterations=block.iterations, jobs=share.at_once, free_bytes=free, coarse_bytes=whole, block_bytes=each,
+        anchors=len(anchors),
+        dense_points=dense,
+        blocks=blocks,
+        coarse_iterations=config.iterations,
+        block_iterations=block.iterations,
+        jobs=share.at_once,
+        free_bytes=free,
+        coarse_bytes=whole,
+        block_bytes=each,
         photographs_bytes=min(photographs, round(1e9 * share.image_gb)),
-        may_exceed_memory=whole > free or exceeds_memory(work, share.at_once, free), coarse_seconds=(coarse, coarse * (1 + more) / 2),
+        may_exceed_memory=whole > free or exceeds_memory(work, share.at_once, free),
+        coarse_seconds=(coarse, coarse * (1 + more) / 2),
         blocks_seconds=(blocks * _seconds(block, timed), blocks * _seconds(block, timed) * more),
-    )  # fmt: skip
+    )
 
 
 def _seconds_a_step(state: TrainingState, stage: object) -> float:

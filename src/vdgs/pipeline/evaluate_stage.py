@@ -191,11 +191,11 @@ def measure_shard(shard: Shard) -> None:
             shard.console.print(f"measuring the {opened.line} on {len(left)} views", highlight=False)
             pictures = _SeamPictures(job, job.spans[shard.index]) if seams is not None else None
             for item in left:
-                figures, of_blocks = measure_view(item, inputs), None
+                metrics, block_metrics = measure_view(item, inputs), None
                 if seams is not None and pictures is not None:
-                    of_blocks, seen = measure_view_of_blocks(views[item], inputs.stems[item], seams)
+                    block_metrics, seen = measure_view_of_blocks(views[item], inputs.stems[item], seams)
                     pictures.keep(item, seen)
-                yield partial(save_view_metrics, figures=figures, of_blocks=of_blocks)
+                yield partial(save_view_metrics, metrics=metrics, block_metrics=block_metrics)
 
     shard.do(job, results)
 
@@ -223,9 +223,14 @@ def _join(run: RunFolder, found: ModelLocation, request: EvaluationRequest, job:
     """Gather what the views came to, in their order, a view at a time."""
     facts = read_json(job.shard(0).path / "facts.json")
     summarize_views(
-        (figures for figures, _ in job.gather(load_view_metrics)), record_from_dict(ModelMetadata, facts["model"]), job.output,
-        lpips_note=facts["lpips_note"], settings=make_evaluation_settings(request.bins, request.views), timed=False, console=console,
-    )  # fmt: skip
+        (figures for figures, _ in job.gather(load_view_metrics)),
+        record_from_dict(ModelMetadata, facts["model"]),
+        job.output,
+        lpips_note=facts["lpips_note"],
+        settings=make_evaluation_settings(request.bins, request.views),
+        timed=False,
+        console=console,
+    )
     if _has_seams(run, found.name, request.views):
         figures = [each for _, each in job.gather(load_view_metrics) if each is not None]
         stems = unique_file_stems([each.row["name"] for each in figures])

@@ -173,7 +173,7 @@ def _legend(figure: Figure, axes: Axes, lined: bool) -> None:
         label=f"border of V ≥ {LOW_VISIBILITY_LIMITS[0]} on level ground",
     )
     width, height = figure.get_size_inches()
-    figure.colorbar(
+    figure.legend(
         handles=[*handles, border] if lined else handles, loc="upper left", ncols=3, fontsize=NOTE_SIZE, frameon=False,
         bbox_to_anchor=(0.85 / width, 1 - 1.13 / height), handletextpad=0.4, columnspacing=1.2, borderaxespad=0,
         borderpad=0.1,

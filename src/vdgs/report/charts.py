@@ -72,7 +72,7 @@ def draw_curves(
         axes.set_ylim(0, 1.08 * axes.dataLim.y1 or 1.0)
     _scale_axes(axes)
     if 1 < sum(bool(curve.name) for curve in curves) <= MAX_LEGEND_ENTRIES:
-        axes.colorbar(fontsize=8, frameon=False, ncols=1 + len(curves) // 6)
+        axes.legend(fontsize=8, frameon=False, ncols=1 + len(curves) // 6)
     return _to_image(figure)
 
 
@@ -90,7 +90,7 @@ def draw_psnr_bars(
         axes.bar_label(bars, ["" if v is None else f"{v:.1f}" for v in values], fontsize=7, color=INK, padding=1)
     _name_bars(axes, names)
     axes.set_ylim(0, 1.3 * max(axes.get_ylim()[1], 1e-3))
-    axes.colorbar(fontsize=8, frameon=False, ncols=2, loc="upper left")
+    axes.legend(fontsize=8, frameon=False, ncols=2, loc="upper left")
     return _to_image(figure)
 
 

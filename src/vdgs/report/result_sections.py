@@ -157,11 +157,19 @@ def _views_table(rows: list[JsonRecord], other: dict[str | None, JsonRecord]) ->
     for row in rows[:MAX_VIEW_ROWS]:
         before = other.get(row.text("name"), JsonRecord({})).number("psnr")
         lines.append(
-            [row.text("name") or ABSENT, format_value(row.number("mean_visibility"), "{:.2f}"), format_db(before),
-             format_db(row.number("psnr")), format_difference(row.number("psnr"), before), format_db(row.number("psnr_cc")),
-             format_similarity(row.number("ssim")), format_similarity(row.number("lpips_vgg")), format_percent(row.number("solid_share")),
-             count(row.number("largest_splats"))]
-        )  # fmt: skip
+            [
+                row.text("name") or ABSENT,
+                format_value(row.number("mean_visibility"), "{:.2f}"),
+                format_db(before),
+                format_db(row.number("psnr")),
+                format_difference(row.number("psnr"), before),
+                format_db(row.number("psnr_cc")),
+                format_similarity(row.number("ssim")),
+                format_similarity(row.number("lpips_vgg")),
+                format_percent(row.number("solid_share")),
+                count(row.number("largest_splats")),
+            ]
+        )
     head = ["view", "mean V", "PSNR coarse", "PSNR", "Δ", "PSNR cc", "SSIM", "LPIPS vgg", "solid", "large splats"]
     caption = f"The first {MAX_VIEW_ROWS} of {len(rows)}" if len(rows) > MAX_VIEW_ROWS else ""
     return table(head, lines, caption)

@@ -131,12 +131,25 @@ def _growth(logs: list[NamedLog]) -> list[Html]:
     limits = _series(cycles, "t_low")
     moving = len({value for curve in limits for value in curve.y}) > 1  # else the table below says it all
     charts = (
-        (draw_curves(_series(cycles, "low_share"), "share of anchors of low visibility", show_markers=True, from_zero=True),
-         "share of low visibility"),
-        (draw_curves(limits if moving else [], "T_low: c_k below it is low", show_markers=True, from_zero=True), "T_low"),
-        (draw_curves(_series(cycles, "mean_cache"), "mean gradient added, g", show_markers=True, from_zero=True), "cache"),
-        (draw_curves(grown, "anchors grown: low, dashed the others", show_markers=True, from_zero=True), "anchors grown"),
-    )  # fmt: skip
+        (
+            draw_curves(
+                _series(cycles, "low_share"), "share of anchors of low visibility", show_markers=True, from_zero=True
+            ),
+            "share of low visibility",
+        ),
+        (
+            draw_curves(limits if moving else [], "T_low: c_k below it is low", show_markers=True, from_zero=True),
+            "T_low",
+        ),
+        (
+            draw_curves(_series(cycles, "mean_cache"), "mean gradient added, g", show_markers=True, from_zero=True),
+            "cache",
+        ),
+        (
+            draw_curves(grown, "anchors grown: low, dashed the others", show_markers=True, from_zero=True),
+            "anchors grown",
+        ),
+    )
     return [
         heading("Compensated growth in the blocks"),
         paragraph(
@@ -154,9 +167,16 @@ def _growth_table(cycles: list[NamedLog]) -> Html:
         low, other = (sum(record.number(key) or 0 for record in records) for key in ("grown_low", "grown_other"))
         last = records[-1]
         rows.append(
-            [name, count(len(records)), count(low), count(other), format_percent(low / (low + other)) if low + other else "–",
-             format_percent(last.number("low_share")), format_value(last.number("t_low"), "{:.3g}"),
-             format_value(last.number("mean_cache"), "{:.2e}")]
-        )  # fmt: skip
+            [
+                name,
+                count(len(records)),
+                count(low),
+                count(other),
+                format_percent(low / (low + other)) if low + other else "–",
+                format_percent(last.number("low_share")),
+                format_value(last.number("t_low"), "{:.3g}"),
+                format_value(last.number("mean_cache"), "{:.2e}"),
+            ]
+        )
     head = ["", "cycles", "grown, low", "grown, other", "of it low", "low share, last", "T_low, last", "mean g, last"]
     return table(head, rows, "Sums over all cycles, and the last cycle")

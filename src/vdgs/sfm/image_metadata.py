@@ -161,12 +161,24 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
     altitude, altitude_type = _altitude(gps, xmp)
     attitude = _attitude(xmp) if orientation == 1 else None
     return ImageMetadata(
-        name=name, path=path, width=width, height=height, orientation=orientation, camera=_camera(tags, details, xmp),
-        lens=lens, taken=_text(details.get(0x9003)) or _text(tags.get(0x0132)), place=_lat_lon(gps), altitude=altitude,
-        altitude_type=altitude_type, gps_std=_rtk_std(xmp), error_m=_gps_error(gps),
-        relative_altitude=first_number(xmp, "drone-dji:RelativeAltitude", "sensefly:Height"), attitude=attitude, bytes=size,
+        name=name,
+        path=path,
+        width=width,
+        height=height,
+        orientation=orientation,
+        camera=_camera(tags, details, xmp),
+        lens=lens,
+        taken=_text(details.get(0x9003)) or _text(tags.get(0x0132)),
+        place=_lat_lon(gps),
+        altitude=altitude,
+        altitude_type=altitude_type,
+        gps_std=_rtk_std(xmp),
+        error_m=_gps_error(gps),
+        relative_altitude=first_number(xmp, "drone-dji:RelativeAltitude", "sensefly:Height"),
+        attitude=attitude,
+        bytes=size,
         may_be_transparent=transparent,
-    )  # fmt: skip
+    )
 
 
 def _check(image: Image.Image) -> None:

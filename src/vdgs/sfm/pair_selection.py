@@ -123,7 +123,7 @@ def retrieval_pairs(descriptors: Sequence[np.ndarray], queries: Sequence[int]) -
 def _vlad_descriptor(features: np.ndarray, words: MiniBatchKMeans) -> np.ndarray:
     centres, nearest = words.cluster_centers_, words.predict(features)
     sums = np.zeros_like(centres, dtype=np.float64)
-    np.add.sample(sums, nearest, features - centres[nearest])
+    np.add.at(sums, nearest, features - centres[nearest])
     sums = np.sign(sums) * np.sqrt(np.abs(sums))
     flat = sums.ravel()
     return flat / max(float(np.linalg.norm(flat)), 1e-12)

@@ -27,7 +27,7 @@ def plot_positions(positions: GpsPriors, order: Sequence[int], title: str, file:
         axes.plot(enu[:, 0], enu[:, 1], color=MUTED, linewidth=0.8)
         axes.plot(enu[:, 0], enu[:, 1], "o", color=INK, markersize=4)
         axes.plot(enu[:1, 0], enu[:1, 1], "o", color=ACCENT, markersize=7, label="the first")
-        axes.colorbar(frameon=False, loc="best")
+        axes.legend(frameon=False, loc="best")
         _write(figure, file)
 
 
@@ -60,7 +60,7 @@ def plot_residuals(
         )  # fmt: skip
     if placed is not None and not placed.inliers.all():
         axes.plot([], [], color=ACCENT, label="not trusted")
-        axes.colorbar(frameon=False, loc="best")
+        axes.legend(frameon=False, loc="best")
     for name, place in gcps.items():
         low, high = np.minimum(low, place[:2]), np.maximum(high, place[:2])
         axes.plot(*place[:2], "^", color=ACCENT, markersize=6, zorder=4)

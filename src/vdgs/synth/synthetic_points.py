@@ -120,8 +120,8 @@ def _refine_points(
             )
             @ rotation
         )
-        np.add.sample(normal, point[at], np.einsum("nij,nik->njk", jacobian, jacobian))
-        np.add.sample(right, point[at], np.einsum("nij,ni->nj", jacobian, noise[at]))
+        np.add.at(normal, point[at], np.einsum("nij,nik->njk", jacobian, jacobian))
+        np.add.at(right, point[at], np.einsum("nij,ni->nj", jacobian, noise[at]))
     damping = 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
     return places + np.linalg.solve(normal + damping, right[..., None])[..., 0]
 

@@ -16,7 +16,20 @@ from vdgs.training.training_state import (
 )
 
 __all__ = [
-    "PSNR_LOG_INTERVAL", "TrainingProblem", "StepReport", "FrozenAnchors", "TrainingImages", "TrainingState", "downscale_at",
-    "from_checkpoint", "mean_image_color", "result_from_saved", "initial_state", "to_checkpoint", "train", "train_step", "view_at",
+    "PSNR_LOG_INTERVAL",
+    "TrainingProblem",
+    "StepReport",
+    "FrozenAnchors",
+    "TrainingImages",
+    "TrainingState",
+    "downscale_at",
+    "from_checkpoint",
+    "mean_image_color",
+    "result_from_saved",
+    "initial_state",
+    "to_checkpoint",
+    "train",
+    "train_step",
+    "view_at",
     "views_in_cycle",
-]  # fmt: skip
+]

@@ -195,9 +195,14 @@ def initial_state(anchors: Anchors, decoder: Decoder, stage: TrainingProblem) ->
     largest = stage.max_log_scale_at(anchors.positions)
     statistics = DensificationStats.zeros(n, k, device)
     return TrainingState(
-        iteration=0, anchors=anchors, decoder=decoder, statistics=statistics, optimizer=optimiser, max_log_scale=largest,
+        iteration=0,
+        anchors=anchors,
+        decoder=decoder,
+        statistics=statistics,
+        optimizer=optimiser,
+        max_log_scale=largest,
         compensation=compensation,
-    )  # fmt: skip
+    )
 
 
 def to_checkpoint(state: TrainingState) -> Checkpoint:

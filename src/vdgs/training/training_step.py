@@ -48,7 +48,7 @@ class RenderedTrainingView:
     def backward(self, image: Float[Tensor, "h w 3"], volume_weight: float) -> SplatGradients:
         """Gradients of a loss: `image` by the picture, `volume_reg` by the mean volume. Call it once."""
         m = len(self.source)
-        found = self.pullback(image, None, None, over=self.room, count=m)
+        found = self.pullback(image, None, None, out=self.room, count=m)
         # In float32, as autograd divides.
         volume = float(torch.tensor(volume_weight) / m) if m else 0.0
         return SplatGradients(

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from vdgs.captures.camera_height import camera_height
 from vdgs.captures.image_cache import resize_area
-from vdgs.evaluation.view_exposures import apply_exposure
+from vdgs.evaluation.view_exposures import apply_exposure_numpy
 from vdgs.geometry.camera import Camera
 from vdgs.model.renderer import render
 from vdgs.viewer.viewer_scene import ViewerScene
@@ -82,7 +82,7 @@ class ImageComparison:
         assert raster.median_depth is not None
         drawn = raster.image.cpu().numpy()
         if exposures is not None:
-            drawn = apply_exposure(drawn, exposures(view))
+            drawn = apply_exposure_numpy(drawn, exposures(view))
         error = np.abs(drawn.clip(0, 1) - photograph.image.numpy() / 255.0).mean(axis=-1).astype(np.float32)
         if photograph.mask is not None:
             error[photograph.mask.numpy() == 0] = np.nan

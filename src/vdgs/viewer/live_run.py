@@ -89,7 +89,7 @@ def _coarse_from_checkpoint(run: RunFolder, device: str) -> OpenedRun:
     why = f"this is the coarse model after {saved.iteration:,} iterations; its background is not known yet"
     return OpenedRun(
         folder=run, model=model, model_path=saved.file, name=UNFINISHED_MODEL, status=run.coarse.status(), key=key,
-        caution=why, capture=capture,
+        warning=why, capture=capture,
     )  # fmt: skip
 
 

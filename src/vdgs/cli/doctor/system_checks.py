@@ -264,5 +264,16 @@ def _run_check(check: Callable[[], str]) -> str | None:
 
 
 CHECKS: tuple[Callable[[], list[SystemCheck]], ...] = (
-    _versions, _dependencies, _processor, _kernels, _threads, _memory, _torch, _cuda, _extras, _lpips, _video_encoding, _disk,
-)  # fmt: skip
+    _versions,
+    _dependencies,
+    _processor,
+    _kernels,
+    _threads,
+    _memory,
+    _torch,
+    _cuda,
+    _extras,
+    _lpips,
+    _video_encoding,
+    _disk,
+)

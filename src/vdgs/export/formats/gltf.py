@@ -60,11 +60,13 @@ def vertex_attributes(degree: int) -> list[VertexAttribute]:
     """The columns of the uncompressed kind."""
     bands = [(band, index) for band in range(degree + 1) for index in range(2 * band + 1)]
     return [
-        VertexAttribute("POSITION", "VEC3", GL_FLOAT, 3), VertexAttribute("COLOR_0", "VEC4", GL_UNSIGNED_BYTE, 4),
-        VertexAttribute(f"{EXTENSION}:ROTATION", "VEC4", GL_FLOAT, 4), VertexAttribute(f"{EXTENSION}:SCALE", "VEC3", GL_FLOAT, 3),
+        VertexAttribute("POSITION", "VEC3", GL_FLOAT, 3),
+        VertexAttribute("COLOR_0", "VEC4", GL_UNSIGNED_BYTE, 4),
+        VertexAttribute(f"{EXTENSION}:ROTATION", "VEC4", GL_FLOAT, 4),
+        VertexAttribute(f"{EXTENSION}:SCALE", "VEC3", GL_FLOAT, 3),
         VertexAttribute(f"{EXTENSION}:OPACITY", "SCALAR", GL_FLOAT, 1),
         *(VertexAttribute(f"{EXTENSION}:SH_DEGREE_{band}_COEF_{index}", "VEC3", GL_FLOAT, 3) for band, index in bands),
-    ]  # fmt: skip
+    ]
 
 
 def gaussian_bytes(scene: ExportScene) -> int:
@@ -154,9 +156,13 @@ def spz_glb(gaussians: Gaussians, spz: bytes, translation: np.ndarray, metadata:
     are COLOR_0, and CesiumJS tells the degree by the number of attributes.
     """
     count = len(gaussians)
-    columns = [VertexAttribute("POSITION", "VEC3", GL_FLOAT, 3), VertexAttribute("COLOR_0", "VEC4", GL_UNSIGNED_BYTE, 4),
-               VertexAttribute(f"{EXTENSION}:SCALE", "VEC3", GL_FLOAT, 3), VertexAttribute(f"{EXTENSION}:ROTATION", "VEC4", GL_FLOAT, 4),
-               *vertex_attributes(gaussians.degree)[6:]]  # fmt: skip
+    columns = [
+        VertexAttribute("POSITION", "VEC3", GL_FLOAT, 3),
+        VertexAttribute("COLOR_0", "VEC4", GL_UNSIGNED_BYTE, 4),
+        VertexAttribute(f"{EXTENSION}:SCALE", "VEC3", GL_FLOAT, 3),
+        VertexAttribute(f"{EXTENSION}:ROTATION", "VEC4", GL_FLOAT, 4),
+        *vertex_attributes(gaussians.degree)[6:],
+    ]
     accessors = [column.accessor(count) for column in columns]
     means = gaussians.means.numpy()
     accessors[0] |= {"min": means.min(0).tolist(), "max": means.max(0).tolist()}

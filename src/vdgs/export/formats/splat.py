@@ -72,7 +72,10 @@ def read_splat_chunks(path: Path) -> Iterator[Gaussians]:
 def _gaussians(table: np.ndarray) -> Gaussians:
     rgba = table["rgba"].astype(np.float32) / 255
     return Gaussians(
-        means=torch.from_numpy(table["mean"].copy()), log_scales=torch.from_numpy(table["scale"].copy()).log(),
-        quaternions=torch.from_numpy((table["rotation"].astype(np.float32) - 128) / 128), logits=logits_from_opacity(rgba[:, 3]),
-        dc=rgb_to_sh(torch.from_numpy(rgba[:, :3])), rest=torch.zeros(len(table), 0, 3),
-    )  # fmt: skip
+        means=torch.from_numpy(table["mean"].copy()),
+        log_scales=torch.from_numpy(table["scale"].copy()).log(),
+        quaternions=torch.from_numpy((table["rotation"].astype(np.float32) - 128) / 128),
+        logits=logits_from_opacity(rgba[:, 3]),
+        dc=rgb_to_sh(torch.from_numpy(rgba[:, :3])),
+        rest=torch.zeros(len(table), 0, 3),
+    )

@@ -187,10 +187,16 @@ def _tileset(root: TilesetNode, metadata: ExportMetadata) -> JsonObject:
     needs = {"extensionsUsed": [EXTENSION, SPZ_EXTENSION], "extensionsRequired": [EXTENSION, SPZ_EXTENSION]}
     top = {"transform": tile_transform(metadata), "refine": "REPLACE", **root.entry}
     return {
-        "asset": {"version": "1.1", "generator": metadata.program, "extras": {**metadata.known(), "axes": "east, north, up"}},
-        "extensionsUsed": ["3DTILES_content_gltf"], "extensions": {"3DTILES_content_gltf": needs},
-        "geometricError": max(2 * root.error, float(np.linalg.norm(root.high - root.low)) / 4), "root": top,
-    }  # fmt: skip
+        "asset": {
+            "version": "1.1",
+            "generator": metadata.program,
+            "extras": {**metadata.known(), "axes": "east, north, up"},
+        },
+        "extensionsUsed": ["3DTILES_content_gltf"],
+        "extensions": {"3DTILES_content_gltf": needs},
+        "geometricError": max(2 * root.error, float(np.linalg.norm(root.high - root.low)) / 4),
+        "root": top,
+    }
 
 
 def tile_transform(metadata: ExportMetadata) -> list[float]:

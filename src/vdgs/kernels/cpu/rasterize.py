@@ -103,11 +103,11 @@ class _Pullback:
         image: Tensor | None,
         alpha: Tensor | None = None,
         depth: Tensor | None = None,
-        over: tuple[Tensor, Tensor] | None = None,
+        out: tuple[Tensor, Tensor] | None = None,
         count: int | None = None,
     ) -> RasterGradients:
         n = self.count if count is None else count
-        means, conics = over or (torch.empty(n, 2), torch.empty(n, 3))
+        means, conics = out or (torch.empty(n, 2), torch.empty(n, 3))
         if not 0 <= n <= self.count or not len(means) == len(conics) == n:
             raise ValueError(f"gradients of {n} splats of {self.count} do not fit into {len(means)} and {len(conics)}")
         colours, opacities, background = torch.empty(n, 3), torch.empty(n), torch.empty(3)

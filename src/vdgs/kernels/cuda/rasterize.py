@@ -151,7 +151,7 @@ class _Pullback:
         image: Tensor | None,
         alpha: Tensor | None = None,
         depth: Tensor | None = None,
-        over: tuple[Tensor, Tensor] | None = None,
+        out: tuple[Tensor, Tensor] | None = None,
         count: int | None = None,
     ) -> RasterGradients:
         means, conics, colours, opacities, depths = self.splats
@@ -166,7 +166,7 @@ class _Pullback:
             entries.owners, entries.order, entries.bounds, ctypes.c_int(width), ctypes.c_int(height), *picture,
             *wanted, kept, sums,
         )  # fmt: skip
-        by_means, by_conics = over or (torch.empty_like(means[first]), torch.empty_like(conics[first]))
+        by_means, by_conics = out or (torch.empty_like(means[first]), torch.empty_like(conics[first]))
         by_colours, by_opacities = torch.empty_like(colours[first]), torch.empty_like(opacities[first])
         by_depths = None if self.raster.depth is None else torch.empty_like(depths[first])
         self.program.launch(

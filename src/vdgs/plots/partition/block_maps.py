@@ -218,7 +218,7 @@ def _legend(figure: Figure, all_used: bool) -> None:
         Line2D([], [], **triangle, color="white", markeredgecolor=INK, label="camera of no block"),  # type: ignore[arg-type]
     ]
     width, height = figure.get_size_inches()
-    figure.colorbar(
+    figure.legend(
         handles=lines[:3] if all_used else lines, loc="upper left", bbox_to_anchor=(0.85 / width, 1 - 0.84 / height),
         ncols=4, fontsize=NOTE_SIZE, frameon=False, handletextpad=0.5, columnspacing=1.2, borderaxespad=0, borderpad=0,
     )  # fmt: skip

@@ -118,10 +118,16 @@ def block_workload(method: MethodConfig, anchors: int, total_anchors: int, pixel
     before it is opened, and beside what photographs take. A part of a photograph may be all of it."""
     block = method.block
     return TrainingWorkload(
-        anchors=anchors, max_anchors=max_block_anchors(block, anchors, total_anchors), offsets=method.training.anchors.offsets,
-        seen=MAX_VISIBLE_FRACTION, pixels=pixels, images_bytes=0, surroundings=total_anchors - anchors, averaged=block.average > 0,
+        anchors=anchors,
+        max_anchors=max_block_anchors(block, anchors, total_anchors),
+        offsets=method.training.anchors.offsets,
+        seen=MAX_VISIBLE_FRACTION,
+        pixels=pixels,
+        images_bytes=0,
+        surroundings=total_anchors - anchors,
+        averaged=block.average > 0,
         growth=max_growth_factor(block.compensation),
-    )  # fmt: skip
+    )
 
 
 def bytes_per_anchor(offsets: int, seen: float) -> float:
