@@ -58,11 +58,11 @@ class BenchSettings:
     choices: PlanOptions
     data: Path | None = None
     jobs: int = 1
-    bins: int = 4
+    visibility_bins: int = 4
     lpips_weights: Path | None = None
-    redo: bool = False
+    overwrite: bool = False
     #: What other benches wrote as results.json: runs that they hold are not trained.
-    known: tuple[Path, ...] = ()
+    reuse_results: tuple[Path, ...] = ()
 
 
 def run_bench(settings: BenchSettings, console: Console) -> list[BenchResult]:
@@ -71,15 +71,15 @@ def run_bench(settings: BenchSettings, console: Console) -> list[BenchResult]:
     Raises VdgsError for settings that do not work, Stopped after Ctrl-C or SIGTERM (what is measured so far is
     written), and at the end if a run failed: the tables then say which and why.
     """
-    if settings.jobs < 1 or settings.bins < 1:
+    if settings.jobs < 1 or settings.visibility_bins < 1:
         raise VdgsError("--jobs and --bins must be at least 1")
     _check_output_outside_inputs(settings.output, plan := make_plan(settings.table, settings.choices))
     known, keys = (
-        read_cached_results(settings.known),
+        read_cached_results(settings.reuse_results),
         {run.name: _key(run, plan, settings) for run in plan.coarse + plan.runs},
     )
     left = drop_cached_runs(plan, keys, known)
-    if settings.known:
+    if settings.reuse_results:
         taken = len(plan.runs) - len(left.runs)
         console.print(f"{taken} of {len(plan.runs)} runs are known and not trained here", highlight=False)
     began = time.monotonic()
@@ -96,7 +96,7 @@ def run_bench(settings: BenchSettings, console: Console) -> list[BenchResult]:
     if failed:
         raise VdgsError(
             f"{len(failed)} of {len(ended)} runs failed; the tables leave them out:\n  "
-            + "\n  ".join(f"{each.name}: {each.why}" for each in failed)
+            + "\n  ".join(f"{each.name}: {each.reason}" for each in failed)
         )
     return results
 
@@ -120,9 +120,9 @@ def _captures(
             found[scene.name] = _capture(scene, settings, console)
         except VdgsError as error:
             names = [run.name for run in plan.coarse + plan.runs if run.scene == scene.name]
-            lost |= {name: TaskResult(name=name, state="failed", why=str(error)) for name in names}
+            lost |= {name: TaskResult(name=name, state="failed", reason=str(error)) for name in names}
     if lost and not found:
-        raise VdgsError(next(iter(lost.values())).why)
+        raise VdgsError(next(iter(lost.values())).reason)
     return found, lost
 
 
@@ -198,7 +198,7 @@ class _ProgressReporter(LogListener):
             return
         count = f"({self._total - self._left} of {self._total})"
         self.print_line(
-            f"{outcome.state:8} {task.name}  {outcome.seconds:.0f} s  {count} {outcome.why}",
+            f"{outcome.state:8} {task.name}  {outcome.seconds:.0f} s  {count} {outcome.reason}",
             STATE_STYLES[outcome.state],
         )
 
@@ -217,7 +217,7 @@ def _check_renders(run: PlannedRun, plan: BenchPlan, capture: Path, settings: Be
 def _check_same_settings(settings: BenchSettings, run: PlannedRun) -> None:
     """Raise VdgsError, before anything is trained, if the run's folder was filled with other settings."""
     folder = RunFolder(settings.output / run.folder)
-    if settings.redo or not folder.config_file.exists():
+    if settings.overwrite or not folder.config_file.exists():
         return
     wanted, held = to_dict(run.config), folder.settings().to_dict()
     if "blocks" not in run.stages:  # no other section matters to it
@@ -237,7 +237,7 @@ def _key(run: PlannedRun, plan: BenchPlan, settings: BenchSettings) -> str:
     scene = next(scene for scene in plan.scenes if scene.name == run.scene)
     options = hashable_settings("capture", to_dict(_options(scene, settings)))
     of = {"options": options, "scene": dict(scene.synth or scene.contents) or scene.capture}
-    return run.key(of, {"bins": settings.bins, "lpips": str(settings.lpips_weights)})
+    return run.key(of, {"bins": settings.visibility_bins, "lpips": str(settings.lpips_weights)})
 
 
 def _job(run: PlannedRun, plan: BenchPlan, capture: Path, key: str, settings: BenchSettings, threads: int) -> BenchJob:
@@ -246,8 +246,8 @@ def _job(run: PlannedRun, plan: BenchPlan, capture: Path, key: str, settings: Be
         capture.resolve(), to_dict(_options(scene, settings)), to_dict(run.config), run.stages,
         (settings.output / run.folder).resolve(),
         None if run.coarse_from is None else (settings.output / run.coarse_from).resolve(), key,
-        settings.lpips_weights and settings.lpips_weights.resolve(), settings.bins, threads,
-        threads if settings.jobs == 1 else 1, settings.redo,
+        settings.lpips_weights and settings.lpips_weights.resolve(), settings.visibility_bins, threads,
+        threads if settings.jobs == 1 else 1, settings.overwrite,
         run.renders and run.renders.resolve(),
     )  # fmt: skip
 
@@ -286,21 +286,21 @@ def _measure(
                         (settings.output / run.folder / file).unlink(missing_ok=True)
                 continue
             by_frusta = (
-                visibility_from_frusta(captures[scene.name], _options(scene, settings)) if seen.by == "truth" else None
+                visibility_from_frusta(captures[scene.name], _options(scene, settings)) if seen.source == "truth" else None
             )
             folders = [settings.output / run.folder for run in done]
             keys = {folder: read_json(folder / RECORD_FILE)["key"] for folder in folders}
             with console.status(f"{scene.name}: measuring by visibility") as status:
                 for each in (seen, by_frusta) if by_frusta is not None else (seen,):
                     measure_groups(
-                        each, keys, settings.bins,
+                        each, keys, settings.visibility_bins,
                         lambda text, scene=scene, status=status: status.update(f"{scene.name}: {text}"),  # type: ignore[misc]
                     )  # fmt: skip
             if by_frusta is None:
                 for folder in folders:
                     (folder / FRUSTA_FILE).unlink(missing_ok=True)
         except VdgsError as error:
-            failed |= {run.name: TaskResult(name=run.name, state="failed", why=str(error)) for run in done}
+            failed |= {run.name: TaskResult(name=run.name, state="failed", reason=str(error)) for run in done}
     return failed
 
 

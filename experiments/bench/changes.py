@@ -29,7 +29,7 @@ def coarse_only(config: MethodConfig, budget: Budget) -> MethodConfig:
 def coarse_only_averaged(config: MethodConfig, budget: Budget) -> MethodConfig:
     """All iterations in the coarse stage, which ends with a mean of models as blocks do."""
     alone = coarse_only(config, budget)
-    return replace(alone, training=replace(alone.training, average=config.block.average))
+    return replace(alone, training=replace(alone.training, swa_fraction=config.block.swa_fraction))
 
 
 def coarse_same_iterations(config: MethodConfig, budget: Budget) -> MethodConfig:
@@ -74,8 +74,8 @@ def as_in_paper(config: MethodConfig, _budget: Budget) -> MethodConfig:
         block=replace(
             plain.block,
             iterations=scene.iterations,
-            scale_iterations=scene.scale_iterations,
-            growth=scene.growth,
+            steps_scaler=scene.steps_scaler,
+            densify=scene.densify,
             max_anchors_total=scene.max_anchors_total,
         ),
     )
@@ -180,8 +180,8 @@ def with_lower_threshold(change: ConfigOverride, factor: float) -> ConfigOverrid
 
     def grown(config: MethodConfig, budget: Budget) -> MethodConfig:
         changed = change(config, budget)
-        growth = replace(changed.block.growth, threshold=factor * changed.block.growth.threshold)
-        return replace(changed, block=replace(changed.block, growth=growth))
+        growth = replace(changed.block.densify, grad_threshold=factor * changed.block.densify.grad_threshold)
+        return replace(changed, block=replace(changed.block, densify=growth))
 
     return grown
 
@@ -190,8 +190,8 @@ def coarse_with_lower_threshold(factor: float) -> ConfigOverride:
     """The coarse stage alone, plainly grown at `factor` times the threshold."""
 
     def change(config: MethodConfig, _budget: Budget) -> MethodConfig:
-        growth = replace(config.training.growth, threshold=factor * config.training.growth.threshold)
-        return replace(config, training=replace(config.training, growth=growth))
+        growth = replace(config.training.densify, grad_threshold=factor * config.training.densify.grad_threshold)
+        return replace(config, training=replace(config.training, densify=growth))
 
     return change
 

@@ -43,7 +43,7 @@ class BenchArguments:
     renders: tuple[str, ...] = ()
     """What other programs rendered of the test views, a row for each NAME=FOLDER (several after one --renders):
     FOLDER/SCENE/VIEW.png or FOLDER/SCENE/SEED/VIEW.png. Measured as all others (docs/bench.md)."""
-    known: tuple[Path, ...] = ()
+    reuse_results: tuple[Path, ...] = ()
     """results.json of other benches, of this machine or of others (several after one --known): runs with the same
     settings, seeds and scenes are taken from there and not trained, and the table says where each is from."""
     data: Path | None = None
@@ -56,11 +56,11 @@ class BenchArguments:
     """No growth beyond this many anchors, of the scene or of all blocks together; 0 for no limit."""
     jobs: Annotated[int, Range(1, 1024)] = 1
     """Runs at once; cores are shared among them."""
-    redo: bool = False
+    overwrite: bool = False
     """Allow other settings than those of the runs that are there to discard what they trained."""
     lpips_weights: Path | None = None
     """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
-    bins: Annotated[int, BIN_COUNT_RANGE] = 4
+    visibility_bins: Annotated[int, BIN_COUNT_RANGE] = 4
     """Number of groups by visibility."""
     quiet: bool = False
     """Print nothing but notes, warnings and errors."""
@@ -84,10 +84,10 @@ def bench_command(arguments: list[str]) -> None:
             choices,
             asked.data,
             asked.jobs,
-            asked.bins,
+            asked.visibility_bins,
             asked.lpips_weights,
-            asked.redo,
-            asked.known,
+            asked.overwrite,
+            asked.reuse_results,
         ),
         make_console(asked.quiet),
     )

@@ -50,7 +50,7 @@ class BenchMethod:
     #: What people read.
     title: str
     #: The method's settings from those of the full method with the scene's preset and the budget.
-    change: ConfigOverride
+    override: ConfigOverride
     #: Its stages in order (`worker.STAGES`).
     stages: tuple[str, ...] = BLOCK_STAGES
     #: Where it was published.
@@ -67,7 +67,7 @@ class BenchMethod:
     renders: Path | None = None
 
     def settings(self, base: MethodConfig, budget: Budget) -> MethodConfig:
-        return self.change(base, budget)
+        return self.override(base, budget)
 
 
 @dataclass(frozen=True)
@@ -99,18 +99,18 @@ class BenchScene:
         paper's method has and the preset `laptop` leaves out. `scale` is that of the budget to the scene's own: growth
         begins that much earlier or later, as in `block.scale_iterations`."""
         config = self.override(PRESETS[self.preset])
-        growth = config.training.growth
+        growth = config.training.densify
         early = replace(growth, stats_start=round(scale * growth.stats_start), start=round(scale * growth.start))
-        inner = config.block.growth
+        inner = config.block.densify
         earlier = replace(inner, stats_start=round(scale * inner.stats_start), start=round(scale * inner.start))
         return replace(
             config,
-            training=replace(config.training, iterations=budget.coarse, seed=seed, growth=early),
+            training=replace(config.training, iterations=budget.coarse, seed=seed, densify=early),
             partition=replace(config.partition, blocks=budget.blocks),
             block=replace(
                 config.block,
                 iterations=budget.per_block,
-                growth=earlier,
+                densify=earlier,
                 compensation=replace(config.block.compensation, enabled=True),
             ),
         )

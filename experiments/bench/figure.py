@@ -84,7 +84,7 @@ def _panel(axes: Axes, plan: BenchPlan, results: Sequence[BenchResult], title: s
         for name, group in zip(group_names(len(groups)), groups, strict=True)
     ]  # fmt: skip
     axes.set_xticks(places, [name.replace(" seen ", "\nseen ") for name in names])
-    seen_by = next(result.seen_by for result in results if result.groups)
+    seen_by = next(result.visibility_source for result in results if result.groups)
     axes.set_title(f"{title}, {VISIBILITY_LABELS[seen_by]}", fontsize=10.5, color=INK, loc="left")
     axes.grid(axis="y", color=MUTED, alpha=0.18, linewidth=0.7)
     if first:

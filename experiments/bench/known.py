@@ -71,10 +71,10 @@ def match_pixel_groups(results: Sequence[BenchResult], cached: Mapping[str, Benc
 def _grouped_alike(result: BenchResult, reference: BenchResult | None) -> bool:
     if reference is None or not result.groups:
         return True
-    return (result.seen_by, list(result.groups)) == (reference.seen_by, list(reference.groups))
+    return (result.visibility_source, list(result.groups)) == (reference.visibility_source, list(reference.groups))
 
 
 def _ungrouped(result: BenchResult) -> BenchResult:
     figures = {name: value for name, value in result.figures.items() if "@" not in name}
     why = "Its groups by visibility are of other pixels than those of the runs here: it has none in this table."
-    return replace(result, figures=figures, groups=(), frusta=(), why=why)
+    return replace(result, figures=figures, groups=(), frusta=(), reason=why)

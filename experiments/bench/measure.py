@@ -46,9 +46,9 @@ def measure_groups(
 
     `runs`: folder -> key. The test views are read once for all. Raises VdgsError where a picture is missing.
     """
-    file = FRUSTA_FILE if visibility.by == "frusta" else GROUPS_FILE
+    file = FRUSTA_FILE if visibility.source == "frusta" else GROUPS_FILE
     of = {
-        "seen_by": visibility.by,
+        "seen_by": visibility.source,
         "seen": visibility.identity,
         "bins": bins,
         "whole_cameras": True,

@@ -208,7 +208,7 @@ _COARSE_COMPENSATED = [
     BenchMethod(
         f"coarse-compensated-{added_to}",
         f"coarse stage, compensation as printed, {added_to}s",
-        coarse_with_compensation(CompensationConfig(added_to=added_to)),
+        coarse_with_compensation(CompensationConfig(target=added_to)),
         COARSE_STAGES,
         less="iterations of the coarse stage only",
         differs=f"to be read against `coarse`; {_GATE}",
@@ -219,7 +219,7 @@ _COARSE_COMPENSATED = [
 _COARSE_PARTS = [
     BenchMethod(
         "coarse-compensated-literal-gate", "coarse stage, compensation of means, gate as for all",
-        coarse_with_compensation(CompensationConfig(gate="literal")), COARSE_STAGES,
+        coarse_with_compensation(CompensationConfig(min_draws="literal")), COARSE_STAGES,
         less="iterations of the coarse stage only", differs="to be read against `coarse-compensated-mean`",
     ),
     BenchMethod(

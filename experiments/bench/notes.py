@@ -23,8 +23,8 @@ def make_notes(plan: BenchPlan, results: Sequence[BenchResult], lines: Sequence[
         parts.append("![PSNR by visibility](groups.png)")
     parts.append(_fairness(plan))
     parts.append(_list("Groups by visibility", _groups(plan, results)))
-    lost = [each for each in results if each.state != "done" or each.why]
-    said = [f"{each.method} on {each.scene}, seed {each.seed}: {each.state}. {each.why}" for each in lost]
+    lost = [each for each in results if each.state != "done" or each.reason]
+    said = [f"{each.method} on {each.scene}, seed {each.seed}: {each.state}. {each.reason}" for each in lost]
     parts.append(_list("Missing", [*said, *_not_rendered(plan)]))
     parts.append(_list("Where the figures are from", _provenance_notes(results)))
     parts.append(_list("Methods", map(_method, plan.methods)))
@@ -50,7 +50,7 @@ def _not_rendered(plan: BenchPlan) -> list[str]:
         for method in plan.methods
         if method.renders is not None
         for scene in plan.scenes
-        if (seeds := [seed for seed in plan.seeds if (scene.name, method.name, seed) not in plan.answers])
+        if (seeds := [seed for seed in plan.seeds if (scene.name, method.name, seed) not in plan.run_of])
     ]
 
 
@@ -81,7 +81,7 @@ def _fairness(plan: BenchPlan) -> str:
 
 def _limit(plan: BenchPlan) -> str:
     """--max-anchors, for methods with anchors and for 3DGS."""
-    per_anchor = plan.runs[0].config.training.anchors.offsets
+    per_anchor = plan.runs[0].config.training.anchors.num_offsets
     return (
         f"At most {plan.max_anchors:,} anchors for a whole scene, or as many as it starts with (a block may grow to "
         "its share, in proportion to the coarse anchors it owns; nothing is removed to keep to it); for 3DGS "
@@ -95,7 +95,7 @@ def _groups(plan: BenchPlan, results: Sequence[BenchResult]) -> list[str]:
     for scene in plan.scenes:
         of = next((each for each in results if each.scene == scene.name and each.groups), None)
         if of is not None:
-            said.append(f"{scene.title}: {VISIBILITY_SOURCE_NOTES[of.seen_by]}. {all_group_bounds(of)}")
+            said.append(f"{scene.title}: {VISIBILITY_SOURCE_NOTES[of.visibility_source]}. {all_group_bounds(of)}")
     return said if len(said) > 1 else []
 
 

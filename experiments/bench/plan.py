@@ -88,7 +88,7 @@ class BenchPlan:
     coarse: tuple[PlannedRun, ...]
     runs: tuple[PlannedRun, ...]
     #: (scene, method, seed) -> the run that answers for it: methods with the same settings share one.
-    answers: Mapping[tuple[str, str, int], PlannedRun]
+    run_of: Mapping[tuple[str, str, int], PlannedRun]
     #: Most anchors of a scene; 0 for no limit.
     max_anchors: int = 0
     #: Measured on held-out training views instead of on the test views.
@@ -185,7 +185,7 @@ def _limit_anchors(config: MethodConfig, options: PlanOptions) -> MethodConfig:
     training, block = config.training, config.block
     return replace(
         config,
-        training=replace(training, growth=replace(training.growth, max_anchors=options.max_anchors)),
+        training=replace(training, densify=replace(training.densify, max_anchors=options.max_anchors)),
         block=replace(block, max_anchors_total=options.max_anchors),
     )
 

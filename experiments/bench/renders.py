@@ -100,7 +100,7 @@ def measure_renders(capture: Capture, folder: Path, output: Path, lpips_weights:
     files = check_renders(folder, views)
     of_camera = {id(view.camera): (file, view) for file, view in zip(files, views, strict=True)}
     lpips, note = load_lpips(lpips_weights)
-    model = RenderableModel(render=lambda camera: _LoadedRender(_read(*of_camera[id(camera)])), timed=False)
+    model = RenderableModel(render=lambda camera: _LoadedRender(_read(*of_camera[id(camera)])), is_timed=False)
     with cached_reference_views(views) as photographs:
         evaluate_model(photographs, model, output, lpips=lpips, lpips_note=note, console=console)
 

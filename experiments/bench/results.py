@@ -39,7 +39,7 @@ class BenchResult:
     seed: int
     #: done, failed, stopped or missing.
     state: str
-    why: str = ""
+    reason: str = ""
     #: Relative to the output folder; methods with the same settings share one.
     folder: str = ""
     #: PSNR and the like over the test views, and of each group by visibility as `psnr@0`; None where unknown.
@@ -47,7 +47,7 @@ class BenchResult:
     #: By visibility, least seen first: lower, upper, pixels.
     groups: tuple[Mapping[str, Any], ...] = ()
     #: What V of the groups is (`seen.SeenBy`); empty without groups.
-    seen_by: str = ""
+    visibility_source: str = ""
     #: The same by V as the paper counts it, of generated scenes: figures as `psnr@frusta0`.
     frusta: tuple[Mapping[str, Any], ...] = ()
     #: Changes with everything that the result depends on, but for the version and the machine.
@@ -65,12 +65,12 @@ def collect_results(
 ) -> list[BenchResult]:
     """The results of every (scene, method, seed) of a plan, from its run folders, or known by the keys of runs."""
     results = []
-    for (scene, method, seed), run in plan.answers.items():
+    for (scene, method, seed), run in plan.run_of.items():
         if keys[run.name] in cached:
             results.append(replace(cached[keys[run.name]], scene=scene, method=method, seed=seed))
             continue
         end = ended.get(run.name)
-        state, why = (end.state, end.why) if end else ("missing", "")
+        state, why = (end.state, end.reason) if end else ("missing", "")
         result = BenchResult(scene, method, seed, state, why, str(run.folder), key=keys[run.name])
         if state == "done":
             try:
@@ -102,7 +102,7 @@ def _read(output: Path, planned: PlannedRun, result: BenchResult) -> BenchResult
     figures["unseen_share"] = measured.get("unseen_share")
     seen_by = measured["seen_by"] if bounds else ""
     origin = record.get("origin", "")
-    return replace(result, figures=figures, groups=bounds, seen_by=seen_by, frusta=by_frusta, origin=origin)
+    return replace(result, figures=figures, groups=bounds, visibility_source=seen_by, frusta=by_frusta, origin=origin)
 
 
 def _groups(file: Path, at: str, figures: dict[str, float | None]) -> tuple[tuple[dict[str, Any], ...], dict[str, Any]]:
@@ -119,13 +119,13 @@ def _sizes(metrics: Mapping[str, Any], planned: PlannedRun) -> dict[str, float |
     """Anchors, where the model has them, and Gaussians: those of an explicit model, or at most as many as the anchors
     decode to (those without opacity are not drawn)."""
     anchors, explicit = metrics.get("n_anchors"), metrics.get("n_gaussians")
-    decoded = None if anchors is None else anchors * planned.config.training.anchors.offsets
+    decoded = None if anchors is None else anchors * planned.config.training.anchors.num_offsets
     return {"anchors": anchors, "gaussians": decoded if explicit is None else explicit}
 
 
 def _photographs_drawn(status: StatusRecord) -> float:
     """How many photographs' worth of pixels a stage drew: fewer than its steps where these draw parts."""
-    return float(status.photographs if status.photographs is not None else status.iteration or 0)
+    return float(status.images_drawn if status.images_drawn is not None else status.iteration or 0)
 
 
 def _costs(run: RunFolder, names: Sequence[str], stages: Mapping[str, float]) -> dict[str, float | None]:

@@ -39,12 +39,12 @@ def _tiny(config: MethodConfig) -> MethodConfig:
         config,
         training=replace(
             training,
-            resolutions=((0.0, 1),),
-            growth=replace(training.growth, stats_start=50, start=100, interval=50, gate=0.1),
+            resolution_schedule=((0.0, 1),),
+            densify=replace(training.densify, stats_start=50, start=100, every=50, min_draw_fraction=0.1),
         ),
         assignment=replace(config.assignment, min_cameras=8, image_size=96),
         block=replace(
-            block, growth=replace(block.growth, stats_start=0, start=50, interval=50, gate=0.1)
+            block, densify=replace(block.densify, stats_start=0, start=50, every=50, min_draw_fraction=0.1)
         ),
     )  # fmt: skip
 
@@ -64,10 +64,10 @@ def _laboratory(config: MethodConfig) -> MethodConfig:
     return replace(
         config,
         training=replace(
-            training, resolutions=((0.0, 2), (0.2, 1)), growth=replace(training.growth, threshold=2e-4)
+            training, resolution_schedule=((0.0, 2), (0.2, 1)), densify=replace(training.densify, grad_threshold=2e-4)
         ),
         assignment=replace(config.assignment, image_size=96),
-        block=replace(block, growth=replace(block.growth, threshold=2e-4)),
+        block=replace(block, densify=replace(block.densify, grad_threshold=2e-4)),
     )  # fmt: skip
 
 

@@ -34,20 +34,20 @@ class PixelVisibility:
     capture: Capture
     #: Camera of a test view -> V [h, w] at its size, NaN where nothing is (sky) or nothing is drawn. Where no training
     #: camera looks a method may only guess: `make_visibility_map` is NaN there too.
-    counted: Callable[[Camera], Float[np.ndarray, "h w"]]
-    by: VisibilitySource
+    count_map: Callable[[Camera], Float[np.ndarray, "h w"]]
+    source: VisibilitySource
     #: Tells this V from any other: what was measured with another one is measured again.
     identity: str
 
     def visibility_map(self, camera: Camera) -> Float[np.ndarray, "h w"]:
         """V where some training camera looks, NaN elsewhere."""
-        views = self.counted(camera)
-        return views if self.by == "model" else np.where(views >= 1, views, np.nan)
+        views = self.count_map(camera)
+        return views if self.source == "model" else np.where(views >= 1, views, np.nan)
 
     def unseen(self, camera: Camera) -> Bool[np.ndarray, "h w"]:
         """Which pixels show something (no sky, as far as that is known) that no training camera sees."""
-        views = self.counted(camera)
-        return np.isnan(views) | (np.rint(views) == 0) if self.by == "model" else views == 0
+        views = self.count_map(camera)
+        return np.isnan(views) | (np.rint(views) == 0) if self.source == "model" else views == 0
 
 
 def visibility_from_truth(root: Path, options: CaptureOptions) -> PixelVisibility | None:
@@ -111,4 +111,4 @@ def _load_truth(root: Path, options: CaptureOptions) -> tuple[GroundTruth, Captu
 def visibility_from_model(reference: Path) -> PixelVisibility:
     """V as the coarse model of a run draws it. Raises RunError if it is not trained."""
     opened = open_run(reference, "coarse")
-    return PixelVisibility(opened.capture, make_visibility_map(opened), "model", str(opened.status.model))
+    return PixelVisibility(opened.capture, make_visibility_map(opened), "model", str(opened.status.model_id))

@@ -54,12 +54,12 @@ def check_claims(plan: BenchPlan, results: Sequence[BenchResult]) -> list[ClaimC
 
 def _has_answer(plan: BenchPlan, scene: str, method: str) -> bool:
     """Another program may have left no renders of a scene."""
-    return any((scene, method, seed) in plan.answers for seed in plan.seeds)
+    return any((scene, method, seed) in plan.run_of for seed in plan.seeds)
 
 
 def _same_runs(plan: BenchPlan, scene: str, ours: str, other: str) -> bool:
     """Two rows of a sweep may have the same settings: nothing is to be compared."""
-    return all(plan.answers.get((scene, ours, s)) == plan.answers.get((scene, other, s)) for s in plan.seeds)
+    return all(plan.run_of.get((scene, ours, s)) == plan.run_of.get((scene, other, s)) for s in plan.seeds)
 
 
 def _uneven(

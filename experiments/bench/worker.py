@@ -40,10 +40,10 @@ class BenchJob:
     coarse_from: Path | None
     key: str
     lpips_weights: Path | None
-    bins: int
+    visibility_bins: int
     threads: int
     block_jobs: int
-    redo: bool = False
+    overwrite: bool = False
     renders: Path | None = None
 
     def write(self, path: Path) -> None:
@@ -101,7 +101,7 @@ def _evaluate(at: _JobContext) -> None:
 
     evaluate_stage(
         at.context,
-        EvaluationRequest(path=at.context.run.path, which="best", lpips_weights=at.job.lpips_weights, bins=at.job.bins),
+        EvaluationRequest(path=at.context.run.path, which="best", lpips_weights=at.job.lpips_weights, visibility_bins=at.job.visibility_bins),
         at.console,
     )
 
@@ -188,7 +188,7 @@ def _opened(job: BenchJob) -> Iterator[RunContext]:
         yield RunContext(RunFolder(job.output), load_capture(job.capture, options))
         return
     method = from_dict(MethodConfig, job.method)
-    with exclusive_run(job.capture, job.output, options, method, overwrite=job.redo) as context:
+    with exclusive_run(job.capture, job.output, options, method, overwrite=job.overwrite) as context:
         yield context
 
 

@@ -75,7 +75,7 @@ def strip(visible: int, blocks: int, cameras: int) -> tuple[AnchorModel, list[Ca
         )
     return AnchorModel(
         anchors=anchors,
-        decoder=Decoder.initial(10, False, 0, 1, g),
+        decoder=Decoder.init_random(10, False, 0, 1, g),
         voxel_size=spacing,
         background=(0.5, 0.5, 0.5),
     ), views

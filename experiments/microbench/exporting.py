@@ -56,7 +56,7 @@ def made_up(anchors: int) -> tuple[AnchorModel, list[Camera]]:
     positions = torch.stack([column, row, torch.rand(anchors, generator=generator)], 1).float() * SPACING
     positions = positions[get_backend(positions.device).morton_order(positions)]
     log_scales = torch.randn(anchors, 6, generator=generator) * 0.2 + math.log(0.7 * SPACING)
-    tensors = Decoder.initial(OFFSETS, True, 0, 0, generator).tensors()
+    tensors = Decoder.init_random(OFFSETS, True, 0, 0, generator).tensors()
     # Every Gaussian is drawn, and none hides all behind it.
     tensors["opacity_w2"].zero_()
     tensors["opacity_b2"].fill_(0.2)
@@ -101,7 +101,7 @@ def one(anchors: int, folder: Path, names: list[str], measure: bool) -> None:
         for i, camera in enumerate(cameras)
     )
     ground = GroundFrame(
-        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, how="made up", origin_geo=None
+        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, description="made up", origin_geo=None
     )
     capture = Capture(
         root=folder, source="made up", images=".", views=views, points=np.zeros((1, 3)),
@@ -116,7 +116,7 @@ def one(anchors: int, folder: Path, names: list[str], measure: bool) -> None:
     export_run.open_run = lambda *_: run
     set_num_threads(get_num_threads())
     began, before = time.monotonic(), time.process_time()
-    asked = ExportRequest(run=folder / "run", to=tuple(folder / name for name in names), measure=measure, device="cpu")
+    asked = ExportRequest(run=folder / "run", to=tuple(folder / name for name in names), evaluate=measure, device="cpu")
     record = export_run.export_run(asked, Console(quiet=True))
     print(json.dumps({
         "anchors": anchors, "gaussians": record["gaussians"], "views": len(cameras),

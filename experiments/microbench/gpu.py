@@ -108,7 +108,7 @@ def find_card() -> Machine | str:
     try:
         driver = get_cuda_driver()
         compiler = get_nvrtc()
-        cards = driver.cards()
+        cards = driver.list_gpus()
     except CudaUnavailable as error:
         return str(error)
     if not torch.cuda.is_available():
@@ -116,7 +116,7 @@ def find_card() -> Machine | str:
     for card in cards:
         major, minor = card.capability
         print(f"card         {card.name}, {card.memory_bytes / 1e9:.1f} GB, compute capability {major}.{minor}")
-    print(f"NVRTC        {compiler.version[0]}.{compiler.version[1]}, from {compiler.found.origin}")
+    print(f"NVRTC        {compiler.version[0]}.{compiler.version[1]}, from {compiler.library_info.origin}")
     return Machine(
         torch.device("cuda"), torch.cuda.synchronize, torch.cuda.reset_peak_memory_stats,
         torch.cuda.max_memory_allocated, cards[0].capability,

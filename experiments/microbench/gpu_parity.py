@@ -57,7 +57,7 @@ class Place:
         self.device, self.width, self.height = device, width, height
         made, self.camera = scene(anchors, width, height, hidden=anchors)
         self.anchors = made.to(device)
-        self.weights: DecoderWeights = Decoder.initial(10, False, 0, 1, generator()).to(device).weights
+        self.weights: DecoderWeights = Decoder.init_random(10, False, 0, 1, generator()).to(device).weights
         self.target = torch.randint(256, (height, width, 3), generator=generator(), dtype=torch.uint8).to(device)
         self.mask = (torch.rand(height, width, generator=generator()) < 0.9).byte().to(device)
         self.background = torch.tensor([0.2, 0.3, 0.4]).to(device)
@@ -136,7 +136,7 @@ def decode_backward_adam(kernels: KernelBackend, place: Place) -> Results:
     gradients = SplatGradients(
         means_px=0.01 * place.random(count, 2)[drawn], conics=place.random(count, 3)[drawn],
         colours=place.random(count, 3)[drawn], opacities=place.random(count)[drawn], volume=0.1, source=splats.source,
-        colour_values=splats.colours, opacity_values=splats.opacities,
+        color_values=splats.colors, opacity_values=splats.opacities,
     )  # fmt: skip
     states = [
         AdamState(t.clone(), torch.zeros_like(t), torch.zeros_like(t), 1e-3)
@@ -187,7 +187,7 @@ def rasterise_vjp(kernels: KernelBackend, place: Place) -> Results:
 
 def shares(kernels: KernelBackend, place: Place) -> Results:
     wanted = place.random(place.height, place.width, 3).sigmoid()
-    return kernels.shares(place.splats(), place.background, place.width, place.height, wanted)._asdict()
+    return kernels.splat_contributions(place.splats(), place.background, place.width, place.height, wanted)._asdict()
 
 
 def photometric_loss(kernels: KernelBackend, place: Place) -> Results:
@@ -199,7 +199,7 @@ def photometric_loss(kernels: KernelBackend, place: Place) -> Results:
 
 def adam_rows(kernels: KernelBackend, place: Place) -> Results:
     features = place.anchors.features.clone()
-    state = AdamState(features, torch.zeros_like(features), torch.zeros_like(features), 1e-2, early=5.0)
+    state = AdamState(features, torch.zeros_like(features), torch.zeros_like(features), 1e-2, lr_boost=5.0)
     rows = torch.arange(0, len(features), 3).to(place.device)
     step = (rows % 50 + 1).to(torch.int32)
     assert kernels.adam_rows(state, rows, place.random(len(rows), features.shape[1]), step)

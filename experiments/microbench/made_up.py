@@ -90,7 +90,7 @@ def model(positions: np.ndarray, extent_m: float) -> AnchorModel:
     )
     return AnchorModel(
         anchors=anchors,
-        decoder=Decoder.initial(OFFSETS, False, 0, 1, g),
+        decoder=Decoder.init_random(OFFSETS, False, 0, 1, g),
         voxel_size=spacing,
         background=(0.5, 0.5, 0.5),
     )

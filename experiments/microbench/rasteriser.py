@@ -155,7 +155,7 @@ def scenes_of_run(run: Path, views: int) -> list[tuple[str, Scene]]:
         seen = cull_anchors(opened.model.anchors, camera)
         with torch.no_grad():
             splats = decode_anchors(opened.model.anchors, seen, opened.model.decoder.weights_for_image(None), camera)
-        rows = (splats.means_px, splats.conics, splats.colours, splats.opacities, splats.depths)
+        rows = (splats.means_px, splats.conics, splats.colors, splats.opacities, splats.depths)
         gradient = np.random.default_rng(1).normal(size=(camera.height, camera.width, 3)).astype(np.float32)
         background = np.array(opened.model.background, np.float32)
         means, conics, colours, opacities, depths = (row.numpy() for row in rows)

@@ -89,7 +89,7 @@ def one_step(
 ) -> tuple[int, int]:  # fmt: skip
     """The work of vdgs.training.train_step, phase by phase, where the anchors are; `synchronise` waits for it."""
     device = state.anchors.positions.device
-    kernels, rates = get_backend(device), learning_rates_at(TrainConfig().rates, 0.1)
+    kernels, rates = get_backend(device), learning_rates_at(TrainConfig().lr, 0.1)
 
     def timed(phase: str, work: Callable[[], Any]) -> Any:
         return timed_phase(times, phase, work, synchronise)
@@ -112,7 +112,7 @@ def one_step(
     gradients = timed("backward", lambda: view.backward(image_gradient, 0.01))
 
     def move() -> None:
-        states = state.optimizer.anchor_states(state.anchors, rates, TrainConfig().early)
+        states = state.optimizer.anchor_states(state.anchors, rates, TrainConfig().lr_warm_boost)
         backward_and_step(state.anchors, rows, gradients, weights, camera, states, state.optimizer.updates)
         state.optimizer.update_decoder(state.decoder, rates, step)
 
@@ -136,12 +136,12 @@ def prepare(
     device = device or torch.device("cpu")
     anchors, camera = scene(visible, width, height, hidden)
     anchors = anchors.to(device)
-    decoder = Decoder.initial(10, False, 0, 1, torch.Generator().manual_seed(0)).to(device)
+    decoder = Decoder.init_random(10, False, 0, 1, torch.Generator().manual_seed(0)).to(device)
     nothing: Any = None  # no photographs: a random target instead
     state = initial_state(
         anchors,
         decoder,
-        TrainingProblem(config=TrainConfig(), images=nothing, image_count=1, voxel_size=1.0, camera_height=1.0),
+        TrainingProblem(config=TrainConfig(), images=nothing, num_images=1, voxel_size=1.0, camera_height=1.0),
     )
     target = torch.randint(0, 256, (height, width, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(1))
     return state, camera, target.to(device)
@@ -155,7 +155,7 @@ def cut(state: Any, own: float) -> tuple[Any, FrozenAnchors]:
     block = initial_state(
         state.anchors.select(left),
         state.decoder,
-        TrainingProblem(config=TrainConfig(), images=nothing, image_count=1, voxel_size=1.0, camera_height=1.0),
+        TrainingProblem(config=TrainConfig(), images=nothing, num_images=1, voxel_size=1.0, camera_height=1.0),
     )
     return block, FrozenAnchors(state.anchors.select(~left), state.decoder.copy())
 

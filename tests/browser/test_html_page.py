@@ -37,8 +37,8 @@ def two_floors() -> Gaussians:
     count = len(means)
     return Gaussians(
         means=torch.from_numpy(means), log_scales=torch.tensor([0.13, 0.13, 0.02]).log().repeat(count, 1),
-        quaternions=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1), logits=torch.full((count,), 5.0),
-        dc=rgb_to_sh(torch.from_numpy(colours.astype(np.float32))), rest=torch.zeros(count, 0, 3),
+        quaternions=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1), opacity_logits=torch.full((count,), 5.0),
+        sh0=rgb_to_sh(torch.from_numpy(colours.astype(np.float32))), shN=torch.zeros(count, 0, 3),
     )  # fmt: skip
 
 

@@ -25,7 +25,7 @@ def capture_of(scene: TinyScene) -> Capture:
         View(name=name, camera=camera, image_path=Path(name), mask_path=None, split="train")
         for name, camera in scene.cameras.items()
     )
-    frame = GroundFrame(scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, how="as it is")
+    frame = GroundFrame(scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, description="as it is")
     return Capture(
         root=Path(), source="colmap", images="images", views=views, points=scene.points, point_colors=scene.colours,
         ground=frame,
@@ -56,7 +56,7 @@ def volume_weight(capture: Capture) -> float:
     nothing: object = None  # no photographs
     return _volume_weight(
         TrainingProblem(
-            config=TrainConfig(), images=nothing, image_count=1, voxel_size=1.0, camera_height=camera_height(capture)
+            config=TrainConfig(), images=nothing, num_images=1, voxel_size=1.0, camera_height=camera_height(capture)
         )
     )  # type: ignore[arg-type]
 

@@ -163,7 +163,7 @@ def test_damaged_files_end_in_a_message_or_a_model(tmp_path, stem, text, data):
         rotation = view.camera_from_world[:3, :3]
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
         assert np.isfinite(view.camera_from_world).all()
-    assert len(model.points) == len(model.colours)
+    assert len(model.points) == len(model.colors)
 
 
 def test_the_biggest_of_several_models_is_used(tmp_path):

@@ -166,7 +166,7 @@ def test_a_model_beside_transforms_json_is_read_and_told(tmp_path, scene):
     write_colmap(tmp_path, scene, sparse="colmap/sparse/0", tracks=True)
     capture = load_capture(tmp_path, CaptureOptions(up="z"))
     assert capture.source == "colmap"
-    assert all(view.sightings is not None for view in capture.views)
+    assert all(view.observations is not None for view in capture.views)
     assert capture.warnings == (
         "the COLMAP model in colmap/sparse/0 is read; transforms.json beside it is not (--format transforms reads that "
         "instead).",

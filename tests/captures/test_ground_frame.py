@@ -37,7 +37,7 @@ def source_of(scene) -> SourceCapture:
         )
         for name, camera in scene.cameras.items()
     )
-    return SourceCapture(source="colmap", images="images", views=views, points=scene.points, colours=scene.colours)
+    return SourceCapture(source="colmap", images="images", views=views, points=scene.points, colors=scene.colours)
 
 
 def ground_of(scene, tmp_path, **options):
@@ -301,7 +301,7 @@ def test_on_real_flights_the_estimate_agrees_with_the_georeference(name, degrees
             for v in capture.views
         ),
         points=capture.points,
-        colours=capture.point_colors,
+        colors=capture.point_colors,
     )
     frame, _ = find_ground_frame(source, folder / "sparse", CaptureOptions())
     assert np.degrees(np.arccos(frame.rotation[2, 2])) < degrees

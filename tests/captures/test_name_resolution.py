@@ -92,14 +92,14 @@ def test_other_folders_and_extensions_still_match(tmp_path):
 
 def test_blanks_and_accents_are_alike_in_tables_and_photographs(tmp_path):
     folder = card(tmp_path / "card", "höhe  0.jpg", "x 1.jpg", apart("é/x 1.jpg"))
-    names = [photo.name for photo in collect_images([folder]).photographs]
+    names = [photo.name for photo in collect_images([folder]).images]
     assert names == ["höhe__0.jpg", "x_1.jpg", "é/x_1.jpg"]
     table = tmp_path / "gps.csv"
     rows = ["Höhe  0.jpg,1", "x 1.jpg,1.1", "É/x 1.jpg,1.2"]
     for way in (lambda text: text, apart):
         table.write_text(way("name,lat,lon,alt\n" + "".join(f"{row},20,5\n" for row in rows)), encoding="utf-8")
-        found = read_gps_priors(collect_images([folder]).photographs, table, (1, 2))
-        assert found.index.tolist() == [0, 1, 2]
+        found = read_gps_priors(collect_images([folder]).images, table, (1, 2))
+        assert found.image_indices.tolist() == [0, 1, 2]
         assert np.diff(found.enu[:, 1]) == pytest.approx([11e3, 11e3], rel=0.02)
 
 
@@ -127,7 +127,7 @@ def test_names_that_become_one_are_refused(tmp_path, names):
 def test_folders_that_become_one_are_numbered(tmp_path):
     card(tmp_path, *(f"{folder}/x.jpg" for folder in ("a b", "a_b")), "a_b/y.jpg")
     seen = collect_images([tmp_path / "a b", tmp_path / "a_b"])
-    assert {photo.name.split("/")[0] for photo in seen.photographs} == {"a_b_1", "a_b_2"}
+    assert {photo.name.split("/")[0] for photo in seen.images} == {"a_b_1", "a_b_2"}
 
 
 def test_images_and_masks_are_found_however_their_letters_are_written(tmp_path):

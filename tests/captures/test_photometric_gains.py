@@ -42,7 +42,7 @@ def views_of(scene: TinyScene) -> list[View]:
                 image_path=Path(name),
                 mask_path=None,
                 split="train",
-                sightings=Observations(scene.points[numbers], rays, numbers),
+                observations=Observations(scene.points[numbers], rays, numbers),
             )
         )
     return views
@@ -159,15 +159,15 @@ def test_what_is_masked_is_not_looked_at():
 def numbered(change: Callable[[int, np.ndarray], np.ndarray]) -> list[View]:
     """Views whose points have other numbers: `change` of view and numbers."""
     return [
-        replace(view, sightings=replace(view.sightings, numbers=change(index, view.sightings.numbers)))
+        replace(view, observations=replace(view.observations, point_ids=change(index, view.observations.point_ids)))
         for index, view in enumerate(VIEWS)
-        if view.sightings is not None
+        if view.observations is not None
     ]
 
 
 def test_points_that_one_photograph_shows_say_nothing():
     """Each shows some of the points of the others and many of its own: those of its own tell as much as none."""
-    few = [replace(view, sightings=part(view.sightings, slice(0, 60))) for view in VIEWS]
+    few = [replace(view, observations=part(view.observations, slice(0, 60))) for view in VIEWS]
     lone = numbered(
         lambda index, numbers: np.where(np.arange(len(numbers)) < 60, numbers, numbers + 10**6 * (index + 1))
     )
@@ -177,12 +177,12 @@ def test_points_that_one_photograph_shows_say_nothing():
 
 def part(sightings: Observations | None, which: slice) -> Observations:
     assert sightings is not None
-    return Observations(sightings.points[which], sightings.rays[which], sightings.numbers[which])
+    return Observations(sightings.points[which], sightings.rays[which], sightings.point_ids[which])
 
 
 def test_a_photograph_that_shares_hardly_a_point_is_not_compared():
     """Three of its points, and those in the wrong colours."""
-    lost = [*VIEWS[:7], replace(VIEWS[7], sightings=part(VIEWS[7].sightings, slice(0, 3))), *VIEWS[8:]]
+    lost = [*VIEWS[:7], replace(VIEWS[7], observations=part(VIEWS[7].observations, slice(0, 3))), *VIEWS[8:]]
     gains = NONE.copy()
     gains[7] = 0.6
     colours = looked_at(Photographed(gains, lost))
@@ -193,9 +193,9 @@ def test_a_photograph_that_shares_hardly_a_point_is_not_compared():
 @pytest.mark.parametrize(
     "views",
     [
-        [replace(view, sightings=None) for view in VIEWS],
+        [replace(view, observations=None) for view in VIEWS],
         numbered(lambda index, numbers: numbers + 10**6 * index),
-        [replace(view, sightings=replace(view.sightings, rays=view.sightings.rays + 9)) for view in VIEWS],  # type: ignore[type-var]
+        [replace(view, observations=replace(view.observations, rays=view.observations.rays + 9)) for view in VIEWS],  # type: ignore[type-var]
         VIEWS[:1],
     ],
     ids=["no points", "none shared", "none inside", "one photograph"],

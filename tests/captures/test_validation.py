@@ -65,7 +65,7 @@ def test_a_true_capture_reprojects_onto_itself(tmp_path, scene, text, model, ext
     write_colmap(tmp_path, scene, text=text, model=model, extra=extra, tracks=True)
     found = validate_capture(load_capture(tmp_path))
     assert found.reprojection_px == pytest.approx(0, abs=1e-6)
-    assert found.sightings == sum(
+    assert found.num_observations == sum(
         min(MAX_OBSERVATIONS, camera.in_frustum(scene.points).sum()) for camera in scene.cameras.values()
     )
     assert not found.problems

@@ -33,7 +33,7 @@ def test_every_subject_is_reported(checks: list[SystemCheck]):
     for name in ("memory", "torch", "OMP_WAIT_POLICY", "LPIPS", "film", "disk"):
         assert name in names
     assert names["python"].state == "ok"
-    assert names["dependencies"].works
+    assert names["dependencies"].is_ok
     for check in checks:
         assert check.state in ("ok", "note") or check.remedy
 
@@ -46,7 +46,7 @@ def test_extras_come_from_the_metadata(checks: list[SystemCheck]):
     assert "vdgs" not in groups["test"]
     for extra in set(groups) - {""}:
         check = names[f"extra {extra}"]
-        assert check.works  # an extra is never essential
+        assert check.is_ok  # an extra is never essential
         if check.state == "missing":
             assert check.remedy == f"pip install 'vdgs[{extra}]'"
     assert names["extra test"].value.startswith("pytest")
@@ -90,12 +90,12 @@ def test_kernels_in_use_and_missing(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(doctor, "_native_module", lambda: native(avx512=unbuilt, avx2=1, portable=1))
     (check,) = doctor._kernels()
     assert check.state == "note"
-    assert check.works
+    assert check.is_ok
     assert check.value == "avx2 in use; available: avx2, portable"
     assert "avx512" in check.remedy
     monkeypatch.setattr(doctor, "_native_module", lambda: native(avx2=unbuilt, portable=unbuilt))
     (check,) = doctor._kernels()
-    assert not check.works
+    assert not check.is_ok
     assert "pip install -e ." in check.remedy
 
 
@@ -105,7 +105,7 @@ def test_a_broken_part_is_reported_not_raised(monkeypatch: pytest.MonkeyPatch):
 
     monkeypatch.setattr(doctor_report, "CHECKS", (explode, doctor._disk))
     first, disk = run_checks()
-    assert (first.name, first.state, first.works) == ("explode", "broken", False)
+    assert (first.name, first.state, first.is_ok) == ("explode", "broken", False)
     assert "no such device" in first.value
     assert disk.state in ("ok", "note")
 
@@ -113,7 +113,7 @@ def test_a_broken_part_is_reported_not_raised(monkeypatch: pytest.MonkeyPatch):
 def test_a_missing_dependency_has_its_command(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(doctor, "_required", lambda: {"": ["torch", "no-such-package"]})
     (check,) = doctor._dependencies()
-    assert not check.works
+    assert not check.is_ok
     assert check.remedy == "pip install no-such-package"
 
 

@@ -41,7 +41,7 @@ ARGUMENTS: tuple[Any, ...] = (
     MergeArguments(HERE),
     OrthoArguments(run=HERE),
     ExportArguments(run=HERE),
-    SfmArguments(photographs=(HERE,), output=HERE),
+    SfmArguments(images=(HERE,), output=HERE),
     ViewArguments(run=HERE),
     TrainCoarseArguments(capture=HERE, output=HERE),
     RunArguments(capture=HERE, output=HERE),
@@ -52,17 +52,17 @@ ARGUMENTS: tuple[Any, ...] = (
 
 @pytest.mark.parametrize("asked", ARGUMENTS, ids=lambda asked: type(asked).__name__)
 def test_every_number_has_a_range_that_holds_its_default(asked):
-    assert [each.option for each in iter_numbers(asked) if each.range is None] == []
+    assert [each.flag for each in iter_numbers(asked) if each.range is None] == []
     assert find_range_errors(asked) == []
-    assert all(math.isfinite(each.range.most) for each in iter_numbers(asked) if each.range is not None)
+    assert all(math.isfinite(each.range.max) for each in iter_numbers(asked) if each.range is not None)
 
 
 def test_numbers_are_found_wherever_they_stand():
     """So the test above can fail."""
-    found = {each.option: each for each in iter_numbers(MethodConfig())}
+    found = {each.flag: each for each in iter_numbers(MethodConfig())}
     assert found["--blocks"].value == 8
     assert {"--rates.offsets", "--resolutions", "--block.growth.until"} <= found.keys()
-    assert [each.value for each in iter_numbers(MethodConfig().training.rates)][:2] == [0.01, 1e-4]
+    assert [each.value for each in iter_numbers(MethodConfig().training.lr)][:2] == [0.01, 1e-4]
     auto = PartitionConfig(blocks="auto")
     assert next(each for each in iter_numbers(auto) if each.path == ("blocks",)) == NumericSetting(
         ("blocks",), None, Range(1, 10_000)
@@ -72,15 +72,15 @@ def test_numbers_are_found_wherever_they_stand():
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300, -1e300])
 def test_no_range_holds_what_is_no_sensible_number(value):
     ranges = {each.range for asked in ARGUMENTS for each in iter_numbers(asked)}
-    assert not any(each.holds(value) for each in ranges if each is not None)
+    assert not any(each.contains(value) for each in ranges if each is not None)
 
 
 def test_ends_belong_to_a_range_unless_it_says_otherwise():
-    assert [Range(0, 1).holds(end) for end in (0, 1)] == [True, True]
-    assert [Range(0, 1, above=True).holds(end) for end in (0, 1)] == [False, True]
-    assert [Range(0, 1, exclusive_max=True).holds(end) for end in (0, 1)] == [True, False]
-    assert [Range(2, 3, allow_zero=True).holds(value) for value in (0, 1, 2)] == [True, False, True]
-    assert str(Range(0, 1, above=True, allow_zero=True)) == "0, or above 0 and at most 1"
+    assert [Range(0, 1).contains(end) for end in (0, 1)] == [True, True]
+    assert [Range(0, 1, exclusive_min=True).contains(end) for end in (0, 1)] == [False, True]
+    assert [Range(0, 1, exclusive_max=True).contains(end) for end in (0, 1)] == [True, False]
+    assert [Range(2, 3, allow_zero=True).contains(value) for value in (0, 1, 2)] == [True, False, True]
+    assert str(Range(0, 1, exclusive_min=True, allow_zero=True)) == "0, or above 0 and at most 1"
 
 
 def test_each_number_out_of_range_is_named_as_the_command_line_names_it():
@@ -88,7 +88,7 @@ def test_each_number_out_of_range_is_named_as_the_command_line_names_it():
     wrong = replace(
         method,
         partition=replace(method.partition, lambda_vis=math.nan),
-        block=replace(method.block, growth=replace(method.block.growth, until=2.0)),
+        block=replace(method.block, densify=replace(method.block.densify, stop_fraction=2.0)),
     )
     assert validate_config(wrong) == [
         "--lambda-vis nan: must be at least 0 and at most 1000",

@@ -208,7 +208,7 @@ def test_a_failed_task_stops_only_those_that_come_after_it(tmp_path):
     assert [(o.name, o.state, o.attempts) for o in outcomes] == [
         ("a", "failed", 1), ("b", "failed", 0), ("c", "done", 1), ("d", "failed", 0)
     ]  # fmt: skip
-    assert [o.why for o in outcomes[:2]] == ["no such place", "a failed: no such place"]
+    assert [o.reason for o in outcomes[:2]] == ["no such place", "a failed: no such place"]
     assert told.news == [("a", 1), ("a", "failed"), ("b", "failed"), ("c", 1), ("d", "failed"), ("c", "done")]
 
 

@@ -21,7 +21,7 @@ def test_any_status_can_be_shown(tmp_path_factory, status):
     path = tmp_path_factory.getbasetemp() / "any_status.json"
     path.write_text(json.dumps({"state": "running", **status}))
     row = ShardProgress(0)
-    row.started()
+    row.restart()
     row.observe(read_progress_stats(path), 1.0)
     console = Console(file=io.StringIO(), width=200)
     console.print(build_progress_table([row, ShardProgress(1)], 1, 10))
@@ -46,7 +46,7 @@ def test_default_jobs_on_known_machines():
 def test_time_left_follows_from_speed_and_what_waits():
     first, second, third = rows = [ShardProgress(i) for i in range(3)]
     assert seconds_left_overall(rows, 2) is None
-    first.started()
+    first.restart()
     first.observe(ProgressStats(iteration=0, iterations=100), 0.0)
     first.observe(None, 5.0)  # a reading that failed
     first.observe(ProgressStats(iteration=50, iterations=100), 10.0)
@@ -59,7 +59,7 @@ def test_time_left_follows_from_speed_and_what_waits():
 
 def test_a_new_attempt_has_a_speed_of_its_own():
     row = ShardProgress(0)
-    row.started()
+    row.restart()
     for second in range(3):
         row.observe(ProgressStats(iteration=100 * second, iterations=1000), float(second))
     row.observe(ProgressStats(iteration=50, iterations=1000), 10.0)
@@ -68,7 +68,7 @@ def test_a_new_attempt_has_a_speed_of_its_own():
 
 def test_the_table_fits_the_screen_and_keeps_what_matters():
     rows = [ShardProgress(i) for i in range(40)]
-    rows[37].started()
+    rows[37].restart()
     rows[38].state = "failed"
     console = Console(file=io.StringIO(), width=80)
     figures = ProgressStats(

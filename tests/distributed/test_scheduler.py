@@ -60,12 +60,12 @@ class Scripted:
 @dataclass
 class Attempt:
     end: AttemptResult
-    begun: AttemptStarted | None = field(default_factory=lambda: AttemptStarted(0, "node-7"))
+    start_info: AttemptStarted | None = field(default_factory=lambda: AttemptStarted(0, "node-7"))
 
-    def look(self) -> AttemptResult:
+    def poll(self) -> AttemptResult:
         return self.end
 
-    def ask_to_stop(self) -> None:
+    def request_stop(self) -> None:
         raise AssertionError("nobody asked")
 
     kill = ask_to_stop
@@ -158,10 +158,10 @@ def test_blocks_find_room_on_a_cluster(places, blocks, jobs, each):
         ShardWorkload(pieces=blocks, shard_bytes=each, jobs=jobs), places, ExecutorOptions(executor="ray")
     )
     needs, most = share.resources, max(place.memory_bytes for place in places)
-    assert share.at_once == min(blocks, jobs or blocks)
-    assert 1 <= needs.processors <= max(place.processors for place in places)
-    room = sum(place.processors // needs.processors for place in places)
-    assert needs.processors == 1 or room >= share.at_once
+    assert share.max_concurrent == min(blocks, jobs or blocks)
+    assert 1 <= needs.cpus <= max(place.processors for place in places)
+    room = sum(place.processors // needs.cpus for place in places)
+    assert needs.cpus == 1 or room >= share.max_concurrent
     assert min(each, most) <= needs.memory_bytes <= most
 
 
@@ -175,8 +175,8 @@ works = st.builds(
 def test_blocks_at_once_and_their_photographs_fit_into_one_machine(work, cores, free):
     share = allocate_local(work, cores, free)
     photographs = min(work.photographs_bytes, 1e9 * share.image_gb)
-    assert share.at_once == 1 or share.at_once * (work.shard_bytes + photographs) <= free + 1
-    assert share.at_once == 1 or not exceeds_memory(work, share.at_once, free)
+    assert share.max_concurrent == 1 or share.max_concurrent * (work.shard_bytes + photographs) <= free + 1
+    assert share.max_concurrent == 1 or not exceeds_memory(work, share.max_concurrent, free)
     assert (
         exceeds_memory(replace(work, image_gb=0), 1, free)
         or allocate_local(replace(work, image_gb=0), 1, free).image_gb
@@ -185,13 +185,13 @@ def test_blocks_at_once_and_their_photographs_fit_into_one_machine(work, cores, 
 
 def test_large_photographs_leave_room_for_fewer_blocks():
     """Photographs of 20 MP: 3 GB for the picture of a block and 16 GB for those that are kept."""
-    large = ShardWorkload(pieces=32, shard_bytes=3_800_000_000, photographs_bytes=10**11)
+    large = ShardWorkload(pieces=32, shard_bytes=3_800_000_000, images_bytes=10**11)
     share = allocate_local(large, 32, 64 * GB)
-    assert (share.at_once, share.image_gb) == (12, 16 / 12)
-    assert allocate_local(replace(large, image_gb=40), 32, 64 * GB).at_once == 6
+    assert (share.max_concurrent, share.image_gb) == (12, 16 / 12)
+    assert allocate_local(replace(large, image_gb=40), 32, 64 * GB).max_concurrent == 6
     # Small ones need no quarter of the memory.
-    small = ShardWorkload(pieces=32, shard_bytes=2 * GB, photographs_bytes=10**7)
-    assert allocate_local(small, 32, 64 * GB).at_once == 31
+    small = ShardWorkload(pieces=32, shard_bytes=2 * GB, images_bytes=10**7)
+    assert allocate_local(small, 32, 64 * GB).max_concurrent == 31
 
 
 def test_two_small_blocks_fit_into_a_laptop_with_4_gb_free():
@@ -199,14 +199,14 @@ def test_two_small_blocks_fit_into_a_laptop_with_4_gb_free():
     cameras = [Camera(camera_from_world=np.eye(4), fx=1, fy=1, cx=0, cy=0, width=400, height=300)] * 56
     largest = block_workload(PRESETS["laptop"], 100_000, 200_000, 400 * 300)
     work = ShardWorkload(
-        pieces=4, shard_bytes=estimate_memory(largest).total, photographs_bytes=decoded_image_bytes(cameras)
+        pieces=4, shard_bytes=estimate_memory(largest).total, images_bytes=decoded_image_bytes(cameras)
     )
-    assert allocate_local(work, 2, 4 * GB).at_once == 2
+    assert allocate_local(work, 2, 4 * GB).max_concurrent == 2
     assert not exceeds_memory(work, 2, 4 * GB)
 
 
 def test_photographs_give_way_to_blocks_that_a_person_asked_for():
-    work = ShardWorkload(pieces=4, shard_bytes=3 * GB, jobs=2, photographs_bytes=10**11)
+    work = ShardWorkload(pieces=4, shard_bytes=3 * GB, jobs=2, images_bytes=10**11)
     assert allocate_local(work, 4, 7 * GB).image_gb == 0.5
     assert allocate_local(work, 4, 6 * GB).image_gb == 0.1
     assert [exceeds_memory(work, 2, free) for free in (6 * GB, 7 * GB)] == [True, False]
@@ -214,10 +214,10 @@ def test_photographs_give_way_to_blocks_that_a_person_asked_for():
 
 
 def test_people_are_told_what_blocks_and_their_photographs_take(question):
-    work = ShardWorkload(pieces=4, shard_bytes=2 * GB, photographs_bytes=10**11)
+    work = ShardWorkload(pieces=4, shard_bytes=2 * GB, images_bytes=10**11)
     with select_backend(ExecutorOptions(), work, MachineResources(4, 8 * GB), lambda: question) as chosen:
-        assert "a block takes at most 2.00 GB and 667 MB for photographs, of 8.00 GB free" in chosen.line
-        assert chosen.line.startswith("3 at once")
+        assert "a block takes at most 2.00 GB and 667 MB for photographs, of 8.00 GB free" in chosen.description
+        assert chosen.description.startswith("3 at once")
         assert not chosen.notes
     with select_backend(
         ExecutorOptions(), replace(work, jobs=4), MachineResources(4, 8 * GB), lambda: question
@@ -226,7 +226,7 @@ def test_people_are_told_what_blocks_and_their_photographs_take(question):
 
 
 def test_what_a_person_asks_for_is_asked_of_the_cluster():
-    asked = ExecutorOptions(executor="ray", processors=3, mem_gb=5, gpus=0.5)
+    asked = ExecutorOptions(executor="ray", cpus=3, mem_gb=5, gpus=0.5)
     for share in (
         allocate_cluster(ShardWorkload(pieces=4, shard_bytes=GB), [Place(8, 64 * GB)], asked),
         allocate_queue(ShardWorkload(pieces=4, shard_bytes=GB), asked),
@@ -319,4 +319,4 @@ def test_of_many_photographs_some_are_looked_for(question):
 
 def test_listeners_need_not_listen():
     listener, task = TaskListener(), Task(name="a", command=["b"], output=Path("c"))
-    assert listener.placed(task, "node", False) is listener.paused(task, "") is None
+    assert listener.on_placed(task, "node", False) is listener.on_paused(task, "") is None

@@ -180,7 +180,7 @@ def test_pictures_are_measured_in_the_exposure_that_the_model_knows_beside_neutr
     photographs = ReferenceViews(
         city.views, lambda v: (city.load_image(v) * float(gains[v.name][0, 0])).clip(0, 255).astype(np.uint8), load_mask
     )
-    settings = EvaluationSettings(exposed="in the exposure of its neighbours")
+    settings = EvaluationSettings(exposure_note="in the exposure of its neighbours")
     out = StringIO()
     neutral = RenderableModel(render=city.render, visibility_map=city.visibility)
     evaluate_model(photographs, neutral, tmp_path / "plain", settings=settings)

@@ -94,7 +94,7 @@ def test_a_veil_is_not_solid_and_shows_what_is_behind_it(tmp_path: Path):
 def test_before_its_own_background_a_picture_is_itself(alpha: float, background: tuple[float, float, float]):
     image = PHOTOGRAPHS[0].astype(np.float32) / 255
     rendered = RenderedImage(image, np.full(image.shape[:2], alpha, np.float32), background)
-    assert np.array_equal(rendered.before(background), PHOTOGRAPHS[0])
+    assert np.array_equal(rendered.over_background(background), PHOTOGRAPHS[0])
 
 
 def plain_at(depth: float, alpha: np.ndarray) -> Callable:

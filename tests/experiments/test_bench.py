@@ -117,7 +117,7 @@ def test_frusta_hold_at_least_what_is_truly_seen(benched):
     assert frusta is not None
     more, unseen, pixels = 0, 0, 0
     for view in truly.capture.test_views:
-        seen, held = truly.counted(view.camera), frusta.counted(view.camera)
+        seen, held = truly.count_map(view.camera), frusta.count_map(view.camera)
         assert np.array_equal(np.isnan(seen), np.isnan(held))  # sky
         assert np.mean(held[~np.isnan(held)] >= seen[~np.isnan(seen)]) > 0.99  # rounding at the edge of a picture
         more += np.nansum(held - seen)
@@ -152,7 +152,7 @@ def test_sky_belongs_to_no_group(benched, tmp_path, monkeypatch):
         below[:10] = np.nan
         return below
 
-    monkeypatch.setattr(bench, "visibility_from_truth", lambda *_: replace(seen, counted=with_sky, identity="with sky"))
+    monkeypatch.setattr(bench, "visibility_from_truth", lambda *_: replace(seen, count_map=with_sky, identity="with sky"))
     shutil.copytree(benched, tmp_path / "copy")
     pixels = sum(int(np.isfinite(with_sky(view.camera)).sum()) for view in seen.capture.test_views)
     for result in run_bench(settings(tmp_path / "copy"), Console(file=io.StringIO())):
@@ -166,7 +166,7 @@ def test_without_truth_pixels_are_grouped_anew_by_a_model(benched, tmp_path):
     shutil.rmtree(copy / "captures" / "tiny" / "truth")
     before, said = models(copy), io.StringIO()
     by_model = run_bench(settings(copy), Console(file=said))
-    assert {each.seen_by for each in by_model} == {"model"}
+    assert {each.visibility_source for each in by_model} == {"model"}
     assert not any(each.frusta for each in by_model)
     by_truth = json.loads((benched / "toy" / "results.json").read_text())["results"][0]
     assert by_model[0].groups != tuple(by_truth["groups"])

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.xdist_group("bench known")
 
 def asked(data: Path, output: Path, seeds: int = 1, known: tuple[Path, ...] = (), total: int = 40) -> BenchSettings:
     choices = PlanOptions(seeds, ("copr",), ("coarse", "baseline"), iterations_total=total, max_anchors=300)
-    return BenchSettings("table2", output, choices, data, known=known)
+    return BenchSettings("table2", output, choices, data, reuse_results=known)
 
 
 def bench(settings: BenchSettings) -> tuple[dict[tuple[str, int], BenchResult], str]:
@@ -120,5 +120,5 @@ def test_groups_of_other_pixels_are_not_compared(there):
     assert here == alike[1]
     assert gone.figures == {"psnr": 20.0}
     assert not gone.groups
-    assert "other pixels" in gone.why
+    assert "other pixels" in gone.reason
     assert match_pixel_groups([known, alike[1]], {known.key: known}) == [gone, here]  # whichever comes first

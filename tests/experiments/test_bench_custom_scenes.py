@@ -84,7 +84,7 @@ def test_the_plan_reads_them_as_asked(captures):
     assert plan.scenes[1] == SCENES["tiny"]
     assert dict(scene.options) == {"downscale": 2.0, "test_every": 3}
     assert "8 training and 4 test photographs of 32 x 24" in scene.note
-    full = plan.answers["copr-2", "full", 0].config
+    full = plan.run_of["copr-2", "full", 0].config
     assert (full.training.iterations, full.partition.blocks, full.assignment.min_cameras) == (3_000, 4, 16)
     with pytest.raises(VdgsError, match=r"--downscale, --test-every, --georef: say how a capture is read"):
         make_plan("table2", PlanOptions(scenes=("tiny",), options=options))

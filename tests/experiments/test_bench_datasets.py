@@ -67,7 +67,7 @@ def test_the_published_data_sets_are_benched(data, tmp_path):
         assert each["figures"]["psnr@0"] is not None
         assert each["seen_by"] == "model"  # nobody knows the truth about a photograph
         run, scene = RunFolder(tmp_path / each["folder"]), SCENES[each["scene"]]
-        assert run.method().block.growth.threshold == scene.base(scene.budget, 0).block.growth.threshold
+        assert run.method().block.densify.grad_threshold == scene.base(scene.budget, 0).block.densify.grad_threshold
         renders = sorted((run.evaluation / "renders").iterdir())
         assert len(renders) == {"residence": 4, "block-all": 3}[each["scene"]]  # the split that the layout brings
         scale = scene.options["downscale"]

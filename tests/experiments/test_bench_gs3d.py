@@ -56,7 +56,7 @@ def test_long_and_short_schedules_move_in_proportion():
 
 def test_its_settings_are_those_of_the_table():
     plan = make_plan("table1", PlanOptions(seeds=2, scenes=("tiny",), max_anchors=700))
-    ours, black = plan.answers["tiny", "3dgs", 1], plan.answers["tiny", "3dgs-black", 1]
+    ours, black = plan.run_of["tiny", "3dgs", 1], plan.run_of["tiny", "3dgs-black", 1]
     config = gs3d_config(ours.config)
     assert (config.iterations, config.seed, config.background) == (600, 1, "mean")
     assert config.density.max_gaussians == 7_000
@@ -91,7 +91,7 @@ def test_it_stands_beside_methods_with_anchors(data, tmp_path, monkeypatch):
     for name in ("psnr", "ssim", "psnr_cc", "psnr@0", "seconds", "peak_memory_bytes", "model_bytes", "fps"):
         assert explicit[name] is not None, name
     assert both["3dgs"].groups == both["scaffold-gs"].groups  # the same pixels
-    assert both["3dgs"].seen_by == "model"
+    assert both["3dgs"].visibility_source == "model"
     text = (tmp_path / "table1" / "table.md").read_text()
     assert "3DGS has no anchors" in text
     assert "3,000, as many as they decode to" in text
@@ -100,7 +100,7 @@ def test_it_stands_beside_methods_with_anchors(data, tmp_path, monkeypatch):
 def test_alone_it_has_no_groups_and_other_settings_train_it_again(data, tmp_path, monkeypatch):
     monkeypatch.setattr(bench, "LocalExecutor", InThisProcess)
     alone = benched(data, tmp_path, "3dgs")["3dgs"]
-    assert (alone.state, alone.groups, alone.seen_by) == ("done", (), "")
+    assert (alone.state, alone.groups, alone.visibility_source) == ("done", (), "")
     run = RunFolder(tmp_path / alone.folder)
     assert not (run.path / GROUPS_FILE).exists()
     with pytest.raises(RunError, match="has no coarse model"):

@@ -50,7 +50,7 @@ def test_tables_name_what_exists(table):
     assert table.ours in table.methods
     assert not table.groups or [name for group in table.groups for name in group.methods] == list(table.methods)
     plan = make_plan(table.name, PlanOptions())
-    assert plan.answers.keys() == {
+    assert plan.run_of.keys() == {
         (scene, method, seed) for scene in table.scenes for method in table.methods for seed in table.seeds
     }
     trained = {run.folder for run in plan.coarse}
@@ -91,8 +91,8 @@ def test_more_anchors_by_plain_growth_differ_from_it_in_the_threshold_alone():
     scene = SCENES["regime-uneven"]
     base = scene.base(scene.budget, 0)
     settings = {name: to_dict(METHODS[name].settings(base, scene.budget)) for name in TABLES["more-anchors"].methods}
-    threshold = base.training.growth.threshold
-    assert base.block.growth.threshold == threshold
+    threshold = base.training.densify.grad_threshold
+    assert base.block.densify.grad_threshold == threshold
     for factor in (0.5, 0.25):
         line = f"growth.threshold: {threshold} -> {factor * threshold}"
         eager = f"threshold-{factor:g}"
@@ -106,11 +106,11 @@ def test_blocks_as_printed_take_back_what_the_laptop_changes():
     base = scene.base(scene.budget, 0)
     printed, paper = METHODS["printed"].settings(base, scene.budget), PRESETS["paper"]
     assert printed != base
-    assert (printed.block.decoder, printed.block.sampling) == ("frozen", "even")
-    assert (printed.block.decoder, printed.block.sampling) == (paper.block.decoder, paper.block.sampling)
+    assert (printed.block.decoder, printed.block.view_sampling) == ("frozen", "even")
+    assert (printed.block.decoder, printed.block.view_sampling) == (paper.block.decoder, paper.block.view_sampling)
     assert printed.assignment.threshold == paper.assignment.threshold == 0.45
     # But for what belongs to the scene.
-    block = replace(paper.block, iterations=base.block.iterations, growth=base.block.growth)
+    block = replace(paper.block, iterations=base.block.iterations, densify=base.block.densify)
     assert printed.block == block
     assert printed.training == base.training
     alone = {
@@ -121,12 +121,12 @@ def test_blocks_as_printed_take_back_what_the_laptop_changes():
         )
     }  # fmt: skip
     assert alone["frozen-decoder"] == replace(base, block=replace(base.block, decoder="frozen"))
-    assert alone["even-sampling"] == replace(base, block=replace(base.block, sampling="even"))
+    assert alone["even-sampling"] == replace(base, block=replace(base.block, view_sampling="even"))
     again = {name: getattr(paper.block, name) for name in ("offset_rate", "scale_rate", "feature_rate")}
     assert set(again.values()) == {1.0}  # the paper prints no rates for blocks
     assert alone["printed-rates"] == replace(base, block=replace(base.block, **again))
-    assert alone["half-size"] == replace(base, block=replace(base.block, resolutions=((0.0, 2), (0.3, 1))))
-    assert alone["last-model"] == replace(base, block=replace(base.block, average=paper.block.average))
+    assert alone["half-size"] == replace(base, block=replace(base.block, resolution_schedule=((0.0, 2), (0.3, 1))))
+    assert alone["last-model"] == replace(base, block=replace(base.block, swa_fraction=paper.block.swa_fraction))
     compensation = paper.block.compensation
     assert alone["printed-compensation"] == replace(base, block=replace(base.block, compensation=compensation))
     assert all(each != base for each in alone.values())
@@ -137,8 +137,8 @@ def test_presets_of_the_paper_restart_the_coarse_stage_and_literal_leaves_our_ch
     paper, literal = PRESETS["paper"], PRESETS["literal"]
     for each in (paper, literal):
         loop = block_train_config(each, 100)
-        assert (loop.rates, loop.growth) == (each.training.rates, each.training.growth)
-        assert (loop.iterations, loop.early, loop.average) == (50_000, 1.0, 0.0)
+        assert (loop.lr, loop.densify) == (each.training.lr, each.training.densify)
+        assert (loop.iterations, loop.lr_warm_boost, loop.swa_fraction) == (50_000, 1.0, 0.0)
         assert (each.partition.blocks, each.partition.expansion, each.assignment.threshold) == (8, 0.4, 0.45)
     own = {
         line.split(":")[0] for line in diff_settings(to_dict(paper), to_dict(literal))
@@ -173,7 +173,7 @@ def test_a_sweep_of_t_low_is_not_overruled_by_the_quantile_of_the_laptop():
 
 def test_runs_with_the_same_settings_are_one_run():
     plan = make_plan("table4", PlanOptions(scenes=("residence",)))
-    defaults = [plan.answers["residence", name, 0] for name in ("lambda-vis-1", "t-low-0.2", "beta-g-2", "gamma-0.9")]
+    defaults = [plan.run_of["residence", name, 0] for name in ("lambda-vis-1", "t-low-0.2", "beta-g-2", "gamma-0.9")]
     assert len({run.folder for run in defaults}) == 1
     assert len(plan.runs) == 17 - 3
     assert len(plan.coarse) == 1
@@ -182,9 +182,9 @@ def test_runs_with_the_same_settings_are_one_run():
 def test_the_coarse_row_trains_nothing_of_its_own():
     plan = make_plan("table2", PlanOptions(scenes=("tiny",), seeds=1))
     (shared,) = plan.coarse
-    assert plan.answers["tiny", "coarse", 0].coarse_from == shared.folder
-    assert plan.answers["tiny", "coarse-as-long", 0].coarse_from is None
-    assert plan.answers["tiny", "baseline", 0].coarse_from is None
+    assert plan.run_of["tiny", "coarse", 0].coarse_from == shared.folder
+    assert plan.run_of["tiny", "coarse-as-long", 0].coarse_from is None
+    assert plan.run_of["tiny", "baseline", 0].coarse_from is None
     # Whatever stands beside it: a table with blocks, later in the same folder, finds what blocks begin with.
     assert make_plan("table2", PlanOptions(scenes=("tiny",), seeds=1, methods=("coarse",))).coarse == (shared,)
 
@@ -202,12 +202,12 @@ def test_choices_change_the_budget_for_all_alike():
     plan = make_plan("table2", PlanOptions(scenes=("tiny",), seeds=2, iterations_total=1200, max_anchors=1000))
     assert plan.budgets["tiny"] == Budget(600, 2, 300)
     assert plan.seeds == (0, 1)
-    full = plan.answers["tiny", "full", 1].config
+    full = plan.run_of["tiny", "full", 1].config
     # Growth starts later in proportion, as block.scale_iterations does it.
-    assert (full.training.growth.start, full.block.growth.start) == (200, 100)
+    assert (full.training.densify.start, full.block.densify.start) == (200, 100)
     for method in ("full", "no-blocking", "printed"):  # whatever the number of blocks
-        config = plan.answers["tiny", method, 1].config
-        assert (config.training.growth.max_anchors, config.block.max_anchors_total) == (1000, 1000)
+        config = plan.run_of["tiny", method, 1].config
+        assert (config.training.densify.max_anchors, config.block.max_anchors_total) == (1000, 1000)
     for wrong in (PlanOptions(scenes=("nowhere",)), PlanOptions(methods=("magic",)), PlanOptions(seeds=0),
                   PlanOptions(scale_iterations=0.0)):  # fmt: skip
         with pytest.raises(VdgsError):

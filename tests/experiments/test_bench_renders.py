@@ -60,7 +60,7 @@ def test_renders_of_our_own_measure_as_our_own(data, output, theirs):
     assert quality["psnr"]
     assert quality["psnr@0"]
     assert {name: foreign.figures[name] for name in quality} == quality
-    assert (foreign.groups, foreign.seen_by) == (ours.groups, ours.seen_by)
+    assert (foreign.groups, foreign.visibility_source) == (ours.groups, ours.visibility_source)
     for of_alpha in COVERAGE_KEYS:  # an opaque picture does not say
         assert foreign.figures[of_alpha] is None, of_alpha
     for of_colours in REFERENCE_EXPOSURE_KEYS:  # nor what it would be in another exposure
@@ -173,7 +173,7 @@ def test_scenes_and_seeds_without_renders_are_left_out_and_named(tmp_path):
         seeds=3, scenes=("copr", "brighton", "seneca"), methods=("baseline",), renders=(f"mine={tmp_path}",)
     )
     plan = make_plan("table1", choices)
-    mine = {(scene, seed): run.renders for (scene, method, seed), run in plan.answers.items() if method == "mine"}
+    mine = {(scene, seed): run.renders for (scene, method, seed), run in plan.run_of.items() if method == "mine"}
     assert mine == {
         ("copr", 0): tmp_path / "copr", ("copr", 2): tmp_path / "copr/2", ("brighton", 1): tmp_path / "brighton/1"
     }  # fmt: skip

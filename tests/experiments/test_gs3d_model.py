@@ -29,8 +29,8 @@ def some_gaussians(count: int = 40, seed: int = 0, degree: int = 1) -> Gaussians
     rng = np.random.default_rng(seed)
     points = np.concatenate([rng.uniform(-4, 4, (count, 2)), rng.uniform(-0.2, 0.2, (count, 1))], axis=1)
     start = initialize_gaussians(points, rng.integers(0, 255, (count, 3), dtype=np.uint8), 0.3, degree)
-    noise = torch.from_numpy(rng.normal(0, 0.3, start.rest.shape).astype(np.float32))
-    return replace(start, rest=noise, quaternions=torch.from_numpy(rng.normal(size=(count, 4)).astype(np.float32)))
+    noise = torch.from_numpy(rng.normal(0, 0.3, start.shN.shape).astype(np.float32))
+    return replace(start, shN=noise, quaternions=torch.from_numpy(rng.normal(size=(count, 4)).astype(np.float32)))
 
 
 @given(seed=st.integers(0, 10_000), size=st.floats(-3, 1.5))
@@ -38,7 +38,7 @@ def some_gaussians(count: int = 40, seed: int = 0, degree: int = 1) -> Gaussians
 def test_what_is_left_out_of_a_view_would_not_change_it(seed, size):
     everything = some_gaussians(seed=seed)
     everything = replace(
-        everything, log_scales=everything.log_scales + size, logits=torch.full_like(everything.logits, 6.0)
+        everything, log_scales=everything.log_scales + size, opacity_logits=torch.full_like(everything.opacity_logits, 6.0)
     )
     camera = Photographs().camera(seed % 8)
     rows = visible_gaussian_rows(everything, camera)
@@ -61,7 +61,7 @@ def test_a_gaussian_shows_another_colour_from_another_side():
     rest[0, 2, 0] = -0.6
     shown = Gaussians(
         means=torch.zeros(1, 3), log_scales=torch.zeros(1, 3), quaternions=torch.tensor([[1.0, 0, 0, 0]]),
-        logits=torch.full((1,), 5.0), dc=torch.zeros(1, 3), rest=rest,
+        opacity_logits=torch.full((1,), 5.0), sh0=torch.zeros(1, 3), shN=rest,
     )  # fmt: skip
     reds = []
     for x in (-3.0, 3.0):
@@ -77,9 +77,9 @@ def test_gaussians_start_as_the_sparse_points_say():
     colours = np.array([[255, 0, 51]] * 4, np.uint8)
     start = initialize_gaussians(points, colours, 0.1, 3)
     assert float(start.log_scales[0].exp().mean()) == pytest.approx((1 + 2 + 3) / 3)
-    torch.testing.assert_close(start.logits.sigmoid(), torch.full((4,), 0.1))
+    torch.testing.assert_close(start.opacity_logits.sigmoid(), torch.full((4,), 0.1))
     towards = torch.tensor([[0.0, 0, 1]]).expand(4, 3)
-    shown = eval_sh_colors(start.dc, start.rest, towards, start.degree)
+    shown = eval_sh_colors(start.sh0, start.shN, towards, start.sh_degree)
     torch.testing.assert_close(shown[0], torch.tensor([1.0, 0, 0.2]), atol=1e-6, rtol=0)
     twice = initialize_gaussians(np.zeros((5, 3)), np.zeros((5, 3), np.uint8), 0.1, 0)
     assert torch.isfinite(twice.log_scales).all()
@@ -94,7 +94,7 @@ def four(logits: float = 2.0) -> Gaussians:
     """Two small and two large Gaussians; the extent of their scene is 10, so 0.1 divides small from large."""
     start = some_gaussians(4)
     sizes = torch.tensor([0.02, 0.05, 0.5, 0.8]).log()
-    return replace(start, log_scales=sizes[:, None].repeat(1, 3), logits=torch.full((4,), logits))
+    return replace(start, log_scales=sizes[:, None].repeat(1, 3), opacity_logits=torch.full((4,), logits))
 
 
 def decide(gaussians: Gaussians, gradient: list[float], *, prune_large: bool = False, **changes):
@@ -113,7 +113,7 @@ def test_small_gaussians_are_cloned_and_large_ones_split():
     for name, tensor in change.added.tensors().items():
         assert torch.equal(tensor[0], before.tensors()[name][0])  # the clone
     torch.testing.assert_close(change.added.log_scales[1:].exp(), torch.full((2, 3), 0.5 / 1.6))
-    assert torch.equal(change.added.rest[1], before.rest[2])
+    assert torch.equal(change.added.rest[1], before.shN[2])
 
 
 def test_where_nothing_asks_nothing_changes():
@@ -124,7 +124,7 @@ def test_where_nothing_asks_nothing_changes():
 
 def test_faint_and_oversized_gaussians_go():
     faint = four()
-    faint.logits[1] = math.log(0.004 / 0.996)
+    faint.opacity_logits[1] = math.log(0.004 / 0.996)
     change = decide(faint, [0.0] * 4)
     assert change.kept.tolist() == [True, False, True, True]
     assert change.pruned == 1

@@ -50,7 +50,7 @@ def tile(path: Path) -> Gaussians:
     gaussians = spz.decode_spz(content, path)
     assert gltf["accessors"][primitive["attributes"]["POSITION"]]["count"] == len(gaussians)
     # CesiumJS tells the degree of spherical harmonics by how many attributes are named so.
-    assert sum("SH_DEGREE" in name for name in primitive["attributes"]) == gaussians.rest.shape[1]
+    assert sum("SH_DEGREE" in name for name in primitive["attributes"]) == gaussians.shN.shape[1]
     moved = transform_gaussians(gaussians, 1.0, np.eye(3), np.array(gltf["nodes"][0]["translation"]))
     return transform_gaussians(moved, 1.0, Y_UP.T, np.zeros(3))
 
@@ -197,9 +197,9 @@ def surface(side: int = 60, step: float = 0.1, opacity: float = 0.98) -> Gaussia
         means=torch.from_numpy(means * [1, 1, 0]).float(),
         log_scales=torch.log(torch.tensor([step, step, step / 20])).repeat(n, 1) - 0.3,
         quaternions=torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
-        logits=torch.full((n,), float(torch.logit(torch.tensor(opacity)))),
-        dc=torch.from_numpy(np.where(means[:, :1] < 0, [1.0, 0.0, -1.0], [-1.0, 1.0, 0.5])).float(),
-        rest=torch.zeros(n, 0, 3),
+        opacity_logits=torch.full((n,), float(torch.logit(torch.tensor(opacity)))),
+        sh0=torch.from_numpy(np.where(means[:, :1] < 0, [1.0, 0.0, -1.0], [-1.0, 1.0, 0.5])).float(),
+        shN=torch.zeros(n, 0, 3),
     )
 
 
@@ -287,7 +287,7 @@ def test_what_is_alone_in_its_cell_stays_as_it_is():
 
 def test_coarser_levels_still_look_like_the_scene():
     some = random_gaussians(3000, 2, reach=6.0)
-    some = replace(some, means=some.means * torch.tensor([1.0, 1.0, 0.05]), logits=some.logits + 2)
+    some = replace(some, means=some.means * torch.tensor([1.0, 1.0, 0.05]), opacity_logits=some.opacity_logits + 2)
     from_afar = replace(overhead(height=40.0, aside=3.0, size=48), fx=90.0, fy=90.0)
     coarse, _ = simplify(some, 700)
     assert psnr(picture(coarse, from_afar), picture(some, from_afar)) > 24

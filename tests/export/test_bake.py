@@ -48,7 +48,7 @@ def blind(decoder: Decoder) -> Decoder:
     weights = decoder.weights
     return replace(
         decoder,
-        weights=DecoderWeights(without(weights.opacity), without(weights.covariance), without(weights.colour)),
+        weights=DecoderWeights(without(weights.opacity), without(weights.covariance), without(weights.color)),
     )
 
 
@@ -59,7 +59,7 @@ def baked(seen: BakeContributions, degree: int = 3, kept: np.ndarray | None = No
 
 def drawn(gaussians: Gaussians, model: AnchorModel, camera) -> np.ndarray:
     with torch.no_grad():
-        picture, _ = render_gaussians(gaussians, camera, torch.tensor(model.background), gaussians.degree)
+        picture, _ = render_gaussians(gaussians, camera, torch.tensor(model.background), gaussians.sh_degree)
     return picture.image.numpy()
 
 
@@ -70,7 +70,7 @@ def test_what_is_spawned_is_what_the_kernels_decode():
         rows, splats = decode_view(model, camera)
         world = decode_world(model.anchors, rows, model.decoder.weights, camera)
         row, offset = splats.source.long() // k, splats.source.long() % k
-        assert torch.allclose(world.colours[row, offset], splats.colours, atol=1e-5)
+        assert torch.allclose(world.colours[row, offset], splats.colors, atol=1e-5)
         assert torch.allclose(world.opacities[row, offset], splats.opacities, atol=1e-5)
         assert torch.allclose(world.scales[row, offset].prod(-1), splats.volumes, rtol=1e-3)
         pixels, _ = camera.project(gaussian_means(model.anchors)[rows][row, offset].double().numpy())
@@ -82,20 +82,20 @@ def test_what_is_spawned_is_what_the_kernels_decode():
 def test_a_model_that_looks_alike_from_everywhere_is_baked_as_it_is(degree, parts):
     model = model_at(scattered())
     model = replace(
-        model, decoder=blind(model.decoder), parts=tuple(DecoderSpan(n, blind(model.decoder)) for n in parts)
+        model, decoder=blind(model.decoder), decoder_spans=tuple(DecoderSpan(n, blind(model.decoder)) for n in parts)
     )
     gaussians = baked(collect_contributions(model, VIEWS), degree)
-    assert gaussians.rest.shape[1:] == (num_sh_bases(degree) - 1, 3)
+    assert gaussians.shN.shape[1:] == (num_sh_bases(degree) - 1, 3)
     for camera in VIEWS:
         assert np.abs(drawn(gaussians, model, camera) - render(model, camera).image.numpy()).max() < 0.01
 
 
 def test_more_harmonics_come_nearer_to_a_model_that_looks_different_from_everywhere():
     model = model_at(scattered())
-    colour = model.decoder.weights.colour
+    colour = model.decoder.weights.color
     steep = replace(colour, w1=torch.cat([colour.w1[:, :32], 10 * colour.w1[:, 32:]], 1))
     still = blind(model.decoder)
-    model = replace(model, decoder=replace(still, weights=replace(still.weights, colour=steep)))
+    model = replace(model, decoder=replace(still, weights=replace(still.weights, color=steep)))
     views = [camera_above(x, y, tilt_deg=tilt) for x in (-2, 0, 2) for y in (-2, 0, 2) for tilt in (-30, 0, 30)]
     seen = collect_contributions(model, views)
     errors = []
@@ -153,7 +153,7 @@ def steep(model: AnchorModel) -> AnchorModel:
         return replace(head, w1=torch.cat([head.w1[:, :32], 6 * head.w1[:, 32:]], 1))
 
     weights = model.decoder.weights
-    heads = DecoderWeights(steeper(weights.opacity), steeper(weights.covariance), steeper(weights.colour))
+    heads = DecoderWeights(steeper(weights.opacity), steeper(weights.covariance), steeper(weights.color))
     return replace(model, decoder=replace(model.decoder, weights=heads))
 
 
@@ -168,7 +168,7 @@ def on_disk(seen: BakeContributions, kept: np.ndarray, folder: Path, degree: int
 def error(shown: BakedGaussians, views: Sequence[Camera]) -> float:
     """Mean squared, of what is baked against what the model shows by it."""
     gaussians = shown.spool.rows(np.arange(len(shown.spool.means)))
-    pairs = [(drawn(gaussians, shown.model, view), shown.drawn(view)[0].numpy()) for view in views]
+    pairs = [(drawn(gaussians, shown.model, view), shown.render_target(view)[0].numpy()) for view in views]
     return float(np.mean([(mine - wanted) ** 2 for mine, wanted in pairs]))
 
 
@@ -180,7 +180,7 @@ def test_colours_stand_in_for_opacities_and_shapes_that_change(tmp_path, degree)
     seen = collect_contributions(steep(model_at(scattered())), GRID)
     shown = on_disk(seen, np.flatnonzero(seen.pixels > 0), tmp_path, degree)
     errors, others = [error(shown, GRID)], [error(shown, novel_cameras(GRID, 9))]
-    opacities = shown.spool.rows(np.arange(9)).logits
+    opacities = shown.spool.rows(np.arange(9)).opacity_logits
     for number in range(2):
         refine_colors(shown, [*GRID, *novel_cameras(GRID, number)])
         errors.append(error(shown, GRID))
@@ -189,7 +189,7 @@ def test_colours_stand_in_for_opacities_and_shapes_that_change(tmp_path, degree)
     assert others == sorted(others, reverse=True)
     if degree:
         assert errors[-1] < 0.5 * errors[0]
-    assert torch.equal(shown.spool.rows(np.arange(9)).logits, opacities)
+    assert torch.equal(shown.spool.rows(np.arange(9)).opacity_logits, opacities)
 
 
 def test_a_part_of_a_scene_is_compared_with_that_part(tmp_path):
@@ -202,7 +202,7 @@ def test_a_part_of_a_scene_is_compared_with_that_part(tmp_path):
     refine_colors(shown, VIEWS)
     after = shown.spool.rows(np.arange(len(part)))
     # Nothing changes with the direction, so nothing is missing: what was left out is not painted onto what stays.
-    assert (after.dc - before.dc).abs().max() < 0.02
+    assert (after.sh0 - before.sh0).abs().max() < 0.02
     assert np.array_equal(shown.rows_of_anchors(np.arange(len(model.anchors))), np.arange(len(part)))
 
 

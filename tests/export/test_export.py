@@ -40,7 +40,7 @@ QUIET = Console(quiet=True)
 def scattered(parts: tuple[int, ...] = ()) -> AnchorModel:
     places = np.random.default_rng(0).uniform((-3, -3, 0), (3, 3, 0.5), (200, 3))
     model = model_at(places)
-    return replace(model, parts=tuple(DecoderSpan(count, model.decoder) for count in parts))
+    return replace(model, decoder_spans=tuple(DecoderSpan(count, model.decoder) for count in parts))
 
 
 @pytest.fixture
@@ -64,7 +64,7 @@ def export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         )
         monkeypatch.setattr(export_module, "open_run", lambda *_: opened)
         request = ExportRequest(
-            run=tmp_path / "run", to=tuple(tmp_path / name for name in names), measure=False, device="cpu", **asked
+            run=tmp_path / "run", to=tuple(tmp_path / name for name in names), evaluate=False, device="cpu", **asked
         )
         return export_run(request, QUIET)
 
@@ -75,7 +75,7 @@ def test_all_files_of_one_baking_hold_the_same_scene(export, tmp_path: Path):
     record = export("a.ply", "b.splat", "c.ply", "d.points.ply", sh_degree=2)
     whole, small = registry.read_gaussians(tmp_path / "a.ply"), registry.read_gaussians(tmp_path / "b.splat")
     assert record["gaussians"] == len(whole) == len(small)
-    assert whole.degree == 2
+    assert whole.sh_degree == 2
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "c.ply").read_bytes()
     model = scattered()
     for view in capture_at(None).train_views:
@@ -169,11 +169,11 @@ def test_a_frame_and_back_is_where_it_was():
     gaussians = next(iter(local_bake.bake(seen, np.flatnonzero(seen.pixels > 0), 3)))
     for crs in ("EPSG:32632", "enu", "local"):
         frame = make_local_frame(ground(PLACE), crs, np.zeros(3))
-        back = frame.to_ground(frame.place(gaussians))
+        back = frame.to_ground(frame.to_local(gaussians))
         for name in ("means", "log_scales", "rest"):
             assert torch.allclose(getattr(back, name), getattr(gaussians, name), atol=1e-3), (crs, name)
     frame = make_local_frame(ground(PLACE), "enu", np.array([5000.0, -3000.0, 20.0]), max_coordinate=1000.0)
-    back = frame.to_ground(frame.place(gaussians))
+    back = frame.to_ground(frame.to_local(gaussians))
     assert torch.allclose(back.means, gaussians.means, atol=1e-3)
 
 

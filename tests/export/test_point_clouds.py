@@ -22,15 +22,15 @@ def test_points_stand_where_the_map_says(tmp_path, ending):
     path = tmp_path / f"a{ending}"
     chunks = iter([some.select(torch.arange(200)), some.select(torch.arange(200, 500))])
     registry.write_scene(
-        path, ExportScene(chunks=chunks, count=500, degree=1, facts=ExportMetadata(ORIGIN, "EPSG:32632"))
+        path, ExportScene(chunks=chunks, count=500, degree=1, metadata=ExportMetadata(ORIGIN, "EPSG:32632"))
     )
     read = laspy.read(path)
     assert len(read.points) == 500
     assert read.header.are_points_compressed == (ending == ".laz")
     np.testing.assert_allclose(read.xyz, some.means.double().numpy() + np.array(ORIGIN), atol=0.0005 + 1e-9, rtol=0)
     assert read.header.parse_crs().to_epsg() == 32632
-    np.testing.assert_allclose(np.asarray(read.intensity) / 65535, some.logits.sigmoid().numpy(), atol=1e-5)
-    shown = np.clip(0.5 + 0.28209479 * some.dc.numpy(), 0, 1)
+    np.testing.assert_allclose(np.asarray(read.intensity) / 65535, some.opacity_logits.sigmoid().numpy(), atol=1e-5)
+    shown = np.clip(0.5 + 0.28209479 * some.sh0.numpy(), 0, 1)
     read_colours = np.stack([np.asarray(read[name]) for name in ("red", "green", "blue")], 1) / 65535
     np.testing.assert_allclose(read_colours, shown, atol=0.5 / 255 + 1e-6)
 
@@ -46,7 +46,7 @@ def test_without_a_map_coordinates_are_local(tmp_path):
 def test_a_wrong_map_is_refused_before_work(tmp_path):
     with pytest.raises(VdgsError, match="'EPSG:1' is not understood"):
         registry.check_export(
-            tmp_path / "a.laz", ExportScene(chunks=[], count=5, degree=0, facts=ExportMetadata(crs="EPSG:1"))
+            tmp_path / "a.laz", ExportScene(chunks=[], count=5, degree=0, metadata=ExportMetadata(crs="EPSG:1"))
         )
 
 
@@ -64,5 +64,5 @@ def test_a_point_cloud_has_colours_and_opacity(tmp_path):
     assert "these are points" in notes[0]
     places, shown = read_point_cloud(tmp_path / "a.points.ply")
     np.testing.assert_array_equal(places, some.means.numpy())
-    np.testing.assert_allclose(shown / 255, np.clip(0.5 + 0.28209479 * some.dc.numpy(), 0, 1), atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(shown / 255, np.clip(0.5 + 0.28209479 * some.sh0.numpy(), 0, 1), atol=0.5 / 255 + 1e-6)
     assert b"comment origin [690000.5, 5334000.25, 512.75]" in (tmp_path / "a.points.ply").read_bytes()

@@ -42,7 +42,7 @@ def independent(path: Path) -> Gaussians:
     rest = tensor("sh", n, -1, 3) if data["sh"] else torch.zeros(n, 0, 3)
     return Gaussians(
         means=tensor("positions", n, 3), log_scales=tensor("scales", n, 3), quaternions=tensor("rotations", n, 4),
-        logits=tensor("alphas", n), dc=tensor("colors", n, 3), rest=rest,
+        opacity_logits=tensor("alphas", n), sh0=tensor("colors", n, 3), shN=rest,
     )  # fmt: skip
 
 
@@ -52,7 +52,7 @@ def turned(gaussians: Gaussians, matrix: np.ndarray) -> Gaussians:
 
 def flat(gaussians: Gaussians) -> Gaussians:
     """Without the colours that change with the direction."""
-    return replace(gaussians, rest=gaussians.rest[:, :0])
+    return replace(gaussians, shN=gaussians.shN[:, :0])
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -96,15 +96,15 @@ def test_an_spz_is_what_niantics_code_reads(tmp_path, version, degree):
         torch.testing.assert_close(read.means, wanted.means, atol=0.5 / 4096 + 1e-6, rtol=0)
         sizes = (each.log_scales.sort(1).values for each in (read, wanted))  # version 2 names the axes anew
         torch.testing.assert_close(*sizes, atol=1 / 32 + 1e-5, rtol=0)
-        torch.testing.assert_close(read.logits.sigmoid(), wanted.logits.sigmoid(), atol=0.5 / 255 + 1e-5, rtol=0)
-        torch.testing.assert_close(read.dc, wanted.dc, atol=0.5 / 255 / 0.15 + 1e-5, rtol=0)
-        torch.testing.assert_close(read.rest, wanted.rest, atol=0.5 / 128 + 1e-4, rtol=0)
+        torch.testing.assert_close(read.opacity_logits.sigmoid(), wanted.opacity_logits.sigmoid(), atol=0.5 / 255 + 1e-5, rtol=0)
+        torch.testing.assert_close(read.sh0, wanted.sh0, atol=0.5 / 255 / 0.15 + 1e-5, rtol=0)
+        torch.testing.assert_close(read.shN, wanted.shN, atol=0.5 / 128 + 1e-4, rtol=0)
         error = (gaussian_covariances(read) - gaussian_covariances(wanted)).norm(dim=(1, 2)) / gaussian_covariances(
             wanted
         ).norm(dim=(1, 2))
         assert float(error.max()) < 0.08
     torch.testing.assert_close(gaussian_covariances(ours), gaussian_covariances(theirs), rtol=1e-4, atol=1e-6)
-    torch.testing.assert_close(ours.rest, theirs.rest, atol=1e-5, rtol=0)
+    torch.testing.assert_close(ours.shN, theirs.shN, atol=1e-5, rtol=0)
 
 
 def test_axes_named_anew_give_the_same_shapes_with_small_turns():
@@ -117,9 +117,9 @@ def test_axes_named_anew_give_the_same_shapes_with_small_turns():
 
 def test_what_changes_with_no_direction_stays_so_in_an_spz(tmp_path):
     written = random_gaussians(50, 3)
-    written = replace(written, rest=torch.zeros_like(written.rest))
+    written = replace(written, shN=torch.zeros_like(written.shN))
     registry.write_scene(tmp_path / "a.spz", ExportScene.of(written))
-    assert torch.equal(independent(tmp_path / "a.spz").rest, written.rest)
+    assert torch.equal(independent(tmp_path / "a.spz").shN, written.shN)
 
 
 @pytest.mark.parametrize("ending", sorted(CLOSE))
@@ -137,7 +137,7 @@ def test_chunks_and_their_sizes_make_no_difference(tmp_path, monkeypatch):
         registry.write_scene(tmp_path / f"1{name}", ExportScene.of(whole, PLACED))
     monkeypatch.setattr(export_scene, "CHUNK_SIZE", 16)
     for name in names:
-        registry.write_scene(tmp_path / f"2{name}", ExportScene(chunks=iter(parts), count=100, degree=2, facts=PLACED))
+        registry.write_scene(tmp_path / f"2{name}", ExportScene(chunks=iter(parts), count=100, degree=2, metadata=PLACED))
         one, other = (tmp_path / f"{i}{name}" for i in (1, 2))
         if name.endswith((".laz", ".las")):
             continue  # tested by their numbers: headers hold a date
@@ -162,7 +162,7 @@ def test_a_splat_is_its_32_bytes(tmp_path):
         np.stack([rows[f"f{i}"] for i in range(3, 6)], 1), wanted.log_scales.exp().numpy(), rtol=1e-6
     )
     alpha = np.ascontiguousarray(rows["f6"]).view(np.uint8).reshape(-1, 4)[:, 3]
-    np.testing.assert_allclose(alpha / 255, wanted.logits.sigmoid().numpy(), atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(alpha / 255, wanted.opacity_logits.sigmoid().numpy(), atol=0.5 / 255 + 1e-6)
     facts = json.loads(metadata_path(tmp_path / "a.splat").read_text())
     assert facts["origin"] == [690_000.0, 5_334_000.25, 512.0]
     assert facts["axes"].startswith("x west, y down")
@@ -179,8 +179,8 @@ def test_a_sog_is_read_by_others(tmp_path, degree):
     read = read.select(near)
     torch.testing.assert_close(read.means, wanted.means, atol=1e-3, rtol=0)
     torch.testing.assert_close(read.log_scales, wanted.log_scales, atol=0.05, rtol=0)
-    torch.testing.assert_close(read.dc, wanted.dc, atol=0.05, rtol=0)
-    torch.testing.assert_close(read.rest, wanted.rest, atol=0.02, rtol=0)
+    torch.testing.assert_close(read.sh0, wanted.sh0, atol=0.05, rtol=0)
+    torch.testing.assert_close(read.shN, wanted.shN, atol=0.02, rtol=0)
     assert psnr(picture(turned(read, Y_DOWN.T)), picture(written)) > 36
     with zipfile.ZipFile(tmp_path / "a.sog") as bundle:
         assert json.loads(bundle.read("meta.json"))["count"] == 500
@@ -217,15 +217,15 @@ def test_a_glb_holds_the_turned_scene_with_all_its_bits(tmp_path, degree):
     np.testing.assert_allclose(gltf.accessors[0].min, wanted.means.numpy().min(0))
     np.testing.assert_allclose(gltf.accessors[0].max, wanted.means.numpy().max(0))
     np.testing.assert_allclose(found[prefix + "SCALE"], wanted.log_scales.exp().numpy(), rtol=1e-6)
-    np.testing.assert_allclose(found[prefix + "OPACITY"][:, 0], wanted.logits.sigmoid().numpy(), rtol=1e-6)
+    np.testing.assert_allclose(found[prefix + "OPACITY"][:, 0], wanted.opacity_logits.sigmoid().numpy(), rtol=1e-6)
     wxyz = torch.from_numpy(found[prefix + "ROTATION"][:, [3, 0, 1, 2]].copy())
     torch.testing.assert_close(gaussian_covariances(replace(wanted, quaternions=wxyz)), gaussian_covariances(wanted))
-    np.testing.assert_array_equal(found[prefix + "SH_DEGREE_0_COEF_0"], wanted.dc.numpy())
+    np.testing.assert_array_equal(found[prefix + "SH_DEGREE_0_COEF_0"], wanted.sh0.numpy())
     further = [
         found[f"{prefix}SH_DEGREE_{band}_COEF_{i}"] for band in range(1, degree + 1) for i in range(2 * band + 1)
     ]
     if degree:
-        np.testing.assert_array_equal(np.stack(further, 1), wanted.rest.numpy())
+        np.testing.assert_array_equal(np.stack(further, 1), wanted.shN.numpy())
     assert found["COLOR_0"].dtype == np.uint8
 
 
@@ -258,7 +258,7 @@ def test_wide_tiles_give_up_bits_after_the_point(tmp_path):
 
 def test_what_bytes_cannot_hold_is_counted(tmp_path):
     bright = random_gaussians(10, 0)
-    bright.dc[:3] = 9.0
+    bright.sh0[:3] = 9.0
     bright.log_scales[4] = 7.0
     bright.log_scales[5:7, 2] = -14.0
     notes = registry.write_scene(tmp_path / "a.spz", ExportScene.of(bright))
@@ -274,7 +274,7 @@ def test_numbers_that_are_none_leave_no_file(tmp_path, ending):
     name = ending if ending == "tileset.json" else f"a{ending}"
     (tmp_path / name).write_text("before")
     broken = random_gaussians(20, 1)
-    broken.logits[13] = float("nan")
+    broken.opacity_logits[13] = float("nan")
     with pytest.raises(VdgsError, match="Gaussian 13: its logits are not finite"):
         registry.write_scene(tmp_path / name, ExportScene(chunks=iter([broken]), count=20, degree=1))
     assert [each.name for each in tmp_path.iterdir()] == [name]

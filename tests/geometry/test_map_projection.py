@@ -18,7 +18,7 @@ BERN = (46.95, 7.44, 560.0)
 def frame(origin=BERN, axes=None, metric=True):
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     return GroundFrame(
-        scale=2.0, rotation=turn, translation=np.array([3.0, -4, 5]), metric=metric, how="GPS", origin_geo=origin,
+        scale=2.0, rotation=turn, translation=np.array([3.0, -4, 5]), metric=metric, description="GPS", origin_geo=origin,
         axes_geo=axes,
     )  # fmt: skip
 
@@ -34,7 +34,7 @@ SYSTEMS = [None, "enu", "source", "local", "EPSG:2056", "EPSG:25832", "epsg:4978
 def test_there_and_back_to_a_micrometre(crs):
     placement = MapProjection.of(frame(), crs)
     points = scattered()
-    np.testing.assert_allclose(placement.to_ground(placement.places(points)), points, rtol=0, atol=2e-6)
+    np.testing.assert_allclose(placement.to_ground(placement.project(points)), points, rtol=0, atol=2e-6)
 
 
 @pytest.mark.parametrize("origin", [BERN, (-33.9, -70.6, 900.0), (64.1, -21.9, 20.0), (-17.0, 179.9999, 5.0)])
@@ -46,7 +46,7 @@ def test_the_default_is_the_utm_zone_as_pyproj_has_it(origin):
     points = scattered()
     latitude, longitude, height = geodetic_from_enu(points, origin).T
     x, y = pyproj.Proj(placement.crs)(longitude, latitude)
-    np.testing.assert_allclose(placement.places(points), np.stack([x, y, height], axis=1), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(placement.project(points), np.stack([x, y, height], axis=1), rtol=0, atol=1e-6)
     assert pyproj.CRS.from_wkt(placement.wkt).to_epsg() == int(placement.crs[5:])
 
 
@@ -73,7 +73,7 @@ def test_a_local_similarity_keeps_to_the_map_over_a_hundred_metres(crs):
     centre = np.array([600.0, 500.0, -20.0])
     near = centre + scattered(reach=(50.0, 50.0, 20.0))
     found = placement.similarity_at(centre).apply(near)
-    off = np.abs(found - placement.places(near))
+    off = np.abs(found - placement.project(near))
     assert off[:, :2].max() < 1e-3  # on a map of 10 cm a pixel: a hundredth of one
     assert off[:, 2].max() < 0.02
 
@@ -86,26 +86,26 @@ def test_a_moved_frame_keeps_its_axes_and_its_place_on_earth():
     points = scattered()
     for crs in ("EPSG:32632", "EPSG:4978"):
         np.testing.assert_allclose(
-            MapProjection.of(moved, crs).places(points - shift),
-            MapProjection.of(first, crs).places(points),
+            MapProjection.of(moved, crs).project(points - shift),
+            MapProjection.of(first, crs).project(points),
             rtol=0,
             atol=1e-5,
         )
     # enu is level at the frame's own origin, whatever its axes are.
-    rising = MapProjection.of(moved, "enu").places(np.array([[0.0, 0, 0], [0, 0, 1]]))
+    rising = MapProjection.of(moved, "enu").project(np.array([[0.0, 0, 0], [0, 0, 1]]))
     np.testing.assert_allclose(rising[0], 0, atol=1e-9)
     assert np.degrees(np.arccos(rising[1, 2])) == pytest.approx(np.degrees(np.hypot(25, 17) / 6378), rel=0.02)
 
 
 def test_source_is_the_world_of_the_capture():
     ground, points = frame(), scattered()
-    np.testing.assert_allclose(MapProjection.of(ground, "source").places(ground.to_ground(points)), points, atol=1e-9)
+    np.testing.assert_allclose(MapProjection.of(ground, "source").project(ground.to_ground(points)), points, atol=1e-9)
 
 
 def test_geocentric_places_are_those_of_geodesy():
     points = scattered()
     expected = points @ enu_axes(*BERN[:2]) + ecef_from_geodetic(np.array([BERN]))
-    np.testing.assert_allclose(MapProjection.of(frame(), "EPSG:4978").places(points), expected, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(MapProjection.of(frame(), "EPSG:4978").project(points), expected, rtol=0, atol=1e-6)
 
 
 def test_feet_are_feet_up_as_across():
@@ -113,9 +113,9 @@ def test_feet_are_feet_up_as_across():
     feet, metres = MapProjection.of(ground, "EPSG:2263"), MapProjection.of(ground)
     assert feet.unit == "US survey foot"
     up = np.array([[0.0, 0, 0], [0, 0, 30]])
-    rise = np.diff(feet.places(up)[:, 2])[0] * feet.meters_per_unit
-    assert rise == pytest.approx(np.diff(metres.places(up)[:, 2])[0], abs=1e-6)
-    assert "foot" in feet.heights
+    rise = np.diff(feet.project(up)[:, 2])[0] * feet.meters_per_unit
+    assert rise == pytest.approx(np.diff(metres.project(up)[:, 2])[0], abs=1e-6)
+    assert "foot" in feet.height_reference
 
 
 def test_what_a_place_outside_the_area_of_a_system_gets_is_a_note():
@@ -166,7 +166,7 @@ def test_systems_that_count_to_the_west_are_named_with_one_that_does_not(crs, or
 )
 def test_systems_to_the_east_and_north_are_no_mirror(crs, origin):
     placement = MapProjection.of(frame(origin), crs)
-    corner = placement.places(np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0], [0, 0, 10]]))
+    corner = placement.project(np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0], [0, 0, 10]]))
     assert np.linalg.det(corner[1:] - corner[0]) > 0
     assert np.linalg.det(placement.similarity_at(np.zeros(3)).rotation) > 0
 
@@ -176,7 +176,7 @@ def test_without_a_georeference_there_is_the_ground_frame_and_the_source(metric)
     ground = frame(None, metric=metric)
     local = MapProjection.of(ground)
     assert (local.crs, local.unit, local.wkt) == ("local", "m" if metric else "units", None)
-    np.testing.assert_array_equal(local.places(scattered()), scattered())
+    np.testing.assert_array_equal(local.project(scattered()), scattered())
     assert MapProjection.of(ground, "source").crs == "source"
     for crs in ("enu", "EPSG:32632"):
         with pytest.raises(VdgsError, match=r"not georeferenced.*--crs local"):

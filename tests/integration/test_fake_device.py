@@ -34,7 +34,7 @@ pytestmark = [
 CPU = torch.device("cpu")
 #: Growth, compensation, a new order and the mean of models all happen within few steps.
 BUSY = {
-    "growth": DensifyConfig(interval=2, stats_start=0, start=2, threshold=1e-6, gate=0.1, until=0.5),
+    "growth": DensifyConfig(every=2, stats_start=0, start=2, grad_threshold=1e-6, min_draw_fraction=0.1, stop_fraction=0.5),
     "compensation": CompensationConfig(enabled=True, t_low=1.0),
     "iterations": 8,
     "average": 0.4,
@@ -46,8 +46,8 @@ def begun(device: torch.device, **changes: Any) -> tuple[TrainingState, Training
     anchors, decoder = coarse()
     away = replace(anchors, positions=anchors.positions + torch.tensor([3.0, 0.0, 0.0]))
     stage = TrainingProblem(
-        config=replace(CONFIG, **changes), images=Photographs(), image_count=8, voxel_size=0.4, camera_height=5.0,
-        kind="block", background=(0.3, 0.4, 0.5), surroundings=FrozenAnchors(away.to(device), decoder.to(device)),
+        config=replace(CONFIG, **changes), images=Photographs(), num_images=8, voxel_size=0.4, camera_height=5.0,
+        kind="block", background=(0.3, 0.4, 0.5), frozen_anchors=FrozenAnchors(away.to(device), decoder.to(device)),
         device=device,
     )  # fmt: skip
     return initial_state(anchors.to(device), decoder.copy().to(device), stage), stage
@@ -129,7 +129,7 @@ def test_growth_a_new_order_and_the_mean_stay_on_the_device(monkeypatch, rasteri
         devices = {tensor.device.type for group in state.groups().values() for tensor in group.values()}
         devices |= {tensor.device.type for tensor in to_checkpoint(state).tensors.values()}
     assert devices == {"cuda"}
-    assert state.average is not None
+    assert state.model_average is not None
     assert len(state.anchors) != len(coarse()[0])  # some have come, others have gone
 
 

@@ -67,7 +67,7 @@ def test_who_keeps_a_command_on_a_node_says_so_too(tmp_path, greedy):
     made = job(tmp_path, 0, greedy)
     order = RayTaskSpec(
         command=tuple(made.command), output=str(made.output), environment={}, attempt=1, python=sys.executable,
-        question=NodeRequirements(tmp_path, ()).to_dict(),
+        requirements=NodeRequirements(tmp_path, ()).to_dict(),
     )  # fmt: skip
     for expected in (AttemptResult(-signal.SIGKILL, out_of_memory=True), AttemptResult(0)):
         keeper = RayTaskActor(order, collect_seconds=1e6)  # when nobody collects, it would end this process

@@ -112,12 +112,12 @@ def test_blocks_draw_parts_of_photographs_and_the_pixels_that_were_asked_for(unb
     for index, folder in enumerate(RunFolder(unbroken).block_folders()):
         status, cameras = folder.status(), load_scores(unbroken / "partition" / "scores.npz")[2].cameras
         assert status.iteration > 1.04 * BLOCK_ITERATIONS
-        assert status.photographs == pytest.approx(BLOCK_ITERATIONS, abs=1)
+        assert status.images_drawn == pytest.approx(BLOCK_ITERATIONS, abs=1)
         assert len(json.loads((folder.path / "crops.json").read_text())["crops"]) == cameras[:, index].sum()
     train_each(copied, "--block.crop", "steps")
     for folder in RunFolder(copied).block_folders():
         assert folder.status().iteration == BLOCK_ITERATIONS
-        assert folder.status().photographs < 0.96 * BLOCK_ITERATIONS
+        assert folder.status().images_drawn < 0.96 * BLOCK_ITERATIONS
         assert model(copied, folder.model) != model(unbroken, folder.model.relative_to(copied))
 
 
@@ -151,7 +151,7 @@ def test_the_merged_scene_is_the_cores_of_the_blocks(unbroken):
     assert len(merged.anchors) > len(coarse.anchors)
     assert bits(merged.decoder) == bits(coarse.decoder)
     blocks_own = [AnchorModel.load(unbroken / f"blocks/{index:02d}/model.safetensors").decoder for index in range(2)]
-    assert [bits(part.decoder) for part in merged.parts] == [bits(own) for own in blocks_own]
+    assert [bits(part.decoder) for part in merged.decoder_spans] == [bits(own) for own in blocks_own]
     assert len({tuple(bits(each).values()) for each in (coarse.decoder, *blocks_own)}) == 3
 
 
@@ -163,7 +163,7 @@ def test_blocks_as_printed_leave_one_decoder(unbroken, copied):
     train_each(copied, "--block.decoder", "frozen", "--block.sampling", "even")
     assert vdgs("merge", copied).returncode == 0
     coarse, merged = AnchorModel.load(copied / "coarse/model.safetensors"), AnchorModel.load(copied / MERGED)
-    assert merged.parts == ()
+    assert merged.decoder_spans == ()
     assert bits(merged.decoder) == bits(coarse.decoder)
     for index in range(2):
         block = AnchorModel.load(copied / f"blocks/{index:02d}/model.safetensors")
@@ -176,8 +176,8 @@ def test_a_block_alone_stands_among_coarse_anchors_with_the_coarse_decoder(unbro
     run, coarse = RunFolder(unbroken), AnchorModel.load(unbroken / "coarse/model.safetensors")
     alone = IsolatedBlocks(run, coarse).assemble(1)
     own = AnchorModel.load(unbroken / "blocks/01/model.safetensors")
-    assert [part.count for part in alone.parts] == [len(own.anchors), len(alone.anchors) - len(own.anchors)]
-    assert [bits(part.decoder) for part in alone.parts] == [bits(own.decoder), bits(coarse.decoder)]
+    assert [part.count for part in alone.decoder_spans] == [len(own.anchors), len(alone.anchors) - len(own.anchors)]
+    assert [bits(part.decoder) for part in alone.decoder_spans] == [bits(own.decoder), bits(coarse.decoder)]
     assert len(alone.anchors) > len(own.anchors)
 
 

@@ -94,7 +94,7 @@ def test_a_run_sends_its_maps_where_its_blocks_go_and_stops_when_asked(tmp_path,
     wishes = []
     monkeypatch.setattr(run_pipeline, "render_ortho", lambda context, asked, console, wish: wishes.append(wish))
     for executor in ("local", "slurm"):
-        asked = RunRequest(capture=tmp_path, output=tmp_path, jobs=3, where=ExecutorOptions(executor=executor))
+        asked = RunRequest(capture=tmp_path, output=tmp_path, jobs=3, executor_options=ExecutorOptions(executor=executor))
         run_pipeline._map(RunContext.from_path(tmp_path), asked, Console(quiet=True))
     assert [(wish.is_distributed, wish.jobs, wish.where.executor) for wish in wishes] == [
         (False, 0, "local"),
@@ -182,7 +182,7 @@ def test_what_views_show_and_lack_is_read_back_to_the_last_bit_and_named_if_dama
     assert torch.equal(read_colours, colours)
     gaussians = unflatten(torch.rand(6, 23), 1)
     flatten(gaussians).tofile(tmp_path / "0.spool")
-    assert torch.equal(open_store(tmp_path / "0.spool", 1).rows(np.array([4, 1])).rest, gaussians.rest[[4, 1]])
+    assert torch.equal(open_store(tmp_path / "0.spool", 1).rows(np.array([4, 1])).shN, gaussians.shN[[4, 1]])
     for name, load in (
         ("1.npy", load_contributions),
         ("2.npy", load_residual),

@@ -65,7 +65,7 @@ def flight(nine, tmp_path_factory) -> Flight:
 @pytest.fixture(scope="module")
 def made(flight, tmp_path_factory) -> Path:
     output = tmp_path_factory.mktemp("made") / "capture"
-    reconstruct(SfmRequest(photographs=(flight.folder,), output=output, threads=1, keep_work=True), console())
+    reconstruct(SfmRequest(image_folders=(flight.folder,), output=output, threads=1, keep_intermediate=True), console())
     return output
 
 
@@ -105,7 +105,7 @@ def test_facts_name_what_came_out_and_what_was_left_out(made):
     facts = read_reconstruction(made)
     assert facts is not None
     assert (facts.found, facts.registered, facts.components) == (11, 9, (9,))
-    why = {photo.name: photo.left_out for photo in facts.photographs if photo.left_out}
+    why = {photo.name: photo.excluded_reason for photo in facts.photographs if photo.excluded_reason}
     assert "cut off" in why["cut.jpg"]
     assert "features" in why["grey.jpg"]
     assert max(facts.residual_rms_m) < 0.3
@@ -119,7 +119,7 @@ def test_the_same_command_does_nothing_and_an_option_only_what_depends_on_it(mad
     output = tmp_path / "capture"
     shutil.copytree(made, output, symlinks=True)
     before = files(output)
-    reconstruct(SfmRequest(photographs=(flight.folder,), output=output, threads=1, keep_work=True), console())
+    reconstruct(SfmRequest(image_folders=(flight.folder,), output=output, threads=1, keep_intermediate=True), console())
     assert files(output) == before
     for room, name in (
         (feature_extraction, "find_features"),
@@ -127,7 +127,7 @@ def test_the_same_command_does_nothing_and_an_option_only_what_depends_on_it(mad
         (incremental_mapper, "find_models"),
     ):
         monkeypatch.setattr(room, name, lambda *_: pytest.fail("was done already"))
-    asked = SfmRequest(photographs=(flight.folder,), output=output, threads=1, options=SfmOptions(max_size=200))
+    asked = SfmRequest(image_folders=(flight.folder,), output=output, threads=1, options=SfmOptions(max_output_size=200))
     reconstruct(asked, console())
     assert max(load_capture(output).views[0].camera.full_size) <= 200
     assert validate_capture(load_capture(output)).reprojection_px < 1
@@ -136,7 +136,7 @@ def test_the_same_command_does_nothing_and_an_option_only_what_depends_on_it(mad
 
 def test_what_was_interrupted_goes_on(flight, tmp_path, monkeypatch):
     output = tmp_path / "capture"
-    request = SfmRequest(photographs=(flight.folder,), output=output, threads=1, options=SfmOptions(num_neighbors=3))
+    request = SfmRequest(image_folders=(flight.folder,), output=output, threads=1, options=SfmOptions(num_neighbors=3))
     with monkeypatch.context() as patch:
         calls = []
 
@@ -177,7 +177,7 @@ def test_without_positions_the_scale_is_arbitrary_and_said_so(flight, tmp_path):
         write_photograph(card / name, np.rot90(pixels).copy() if turned else pixels, k, None, 6 if turned else 1)
     before = files(card)
     said = console()
-    facts = reconstruct(SfmRequest(photographs=(card,), output=tmp_path / "capture", threads=1), said)
+    facts = reconstruct(SfmRequest(image_folders=(card,), output=tmp_path / "capture", threads=1), said)
     assert (facts.registered, facts.origin, facts.residual_rms_m) == (6, None, None)
     assert "scale of the scene is arbitrary" in said.file.getvalue()
     assert not (tmp_path / "capture/georef.json").exists()
@@ -199,18 +199,18 @@ def test_photographs_that_do_not_overlap_are_no_scene(tmp_path):
         (tmp_path / "card").mkdir(exist_ok=True)
         write_photograph(tmp_path / "card" / f"p{k}.jpg", pixels, k, np.array([50.0 * k, 0, 40]))
     with pytest.raises(CaptureError, match="no two photographs could be joined"):
-        reconstruct(SfmRequest(photographs=(tmp_path / "card",), output=tmp_path / "capture", threads=1), console())
+        reconstruct(SfmRequest(image_folders=(tmp_path / "card",), output=tmp_path / "capture", threads=1), console())
 
 
 def test_other_things_are_not_written_over_and_a_full_disk_is_told_before(flight, tmp_path, monkeypatch):
     (tmp_path / "full").mkdir()
     (tmp_path / "full/thesis.txt").write_text("three years")
     with pytest.raises(VdgsError, match="holds other things"):
-        reconstruct(SfmRequest(photographs=(flight.folder,), output=tmp_path / "full"), console())
+        reconstruct(SfmRequest(image_folders=(flight.folder,), output=tmp_path / "full"), console())
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1000))
     with pytest.raises(VdgsError, match="GB are free"):
-        reconstruct(SfmRequest(photographs=(flight.folder,), output=tmp_path / "new"), console())
+        reconstruct(SfmRequest(image_folders=(flight.folder,), output=tmp_path / "new"), console())
     assert not (tmp_path / "new").exists()
 
 
@@ -219,14 +219,14 @@ def test_one_line_of_photographs_is_placed_by_attitudes_or_views(made, flight, a
     """Positions along a line leave a turn about it open."""
     model = pycolmap.Reconstruction(made / "work" / "models" / "0")
     transform_model(model, Similarity(0.3, np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), np.array([5.0, 6, 7])))
-    line = collect_images([flight.folder]).photographs[:3]
+    line = collect_images([flight.folder]).images[:3]
     for image in list(model.images.values()):
         if image.name not in {photo.name for photo in line}:
             model.deregister_frame(image.frame_id)
     line = [photo if attitudes else replace(photo, attitude=None) for photo in line]
     placed = georegister(model, line, read_gps_priors(line, None, (1.0, 2.0)))
     assert isinstance(placed, Georegistration)
-    assert "along one line" in placed.how
+    assert "along one line" in placed.method
     assert np.abs(placed.residuals).max() < 0.7
     transform_model(model, placed.similarity)
     for image in (image for image in model.images.values() if image.has_pose):
@@ -237,15 +237,15 @@ def test_one_line_of_photographs_is_placed_by_attitudes_or_views(made, flight, a
 @pytest.mark.parametrize(("smaller", "believed"), [(1, True), (12, False)])
 def test_positions_that_are_wrong_by_as_much_as_the_flight_is_wide_tell_no_scale(made, flight, smaller, believed, line):
     """Metres wrong, as a phone is: of the nine photographs 9 m apart, and of as many around an object."""
-    photographs = [photo for photo in collect_images([flight.folder]).photographs if photo.name in flight.names]
+    photographs = [photo for photo in collect_images([flight.folder]).images if photo.name in flight.names]
     model = pycolmap.Reconstruction(made / "work" / "models" / "0")
     positions = read_gps_priors(photographs, None, (3.0, 3.0) if line else (0.1, 0.1))
     drift = np.random.default_rng(4).normal(0, 0.9, positions.enu.shape)
     placed = georegister(model, photographs, replace(positions, enu=positions.enu / smaller + drift))
     assert isinstance(placed, Georegistration) == believed
     if isinstance(placed, AlignmentFailure):
-        assert "disagree" in placed.why
-        assert "over a flight of" in placed.why
+        assert "disagree" in placed.reason
+        assert "over a flight of" in placed.reason
         assert "--gcp" in placed.remedy
     else:
         assert placed.similarity.scale == pytest.approx(1, abs=0.15)
@@ -257,7 +257,7 @@ def test_positions_that_disagree_leave_the_scale_arbitrary_and_say_why(made, fli
     found = AlignmentFailure("the positions disagree by 2 m", "give better ones")
     monkeypatch.setattr(georegistration, "georegister", lambda *_: found)
     facts = reconstruct(
-        SfmRequest(photographs=(flight.folder,), output=output, threads=1, options=SfmOptions(max_size=200)), said
+        SfmRequest(image_folders=(flight.folder,), output=output, threads=1, options=SfmOptions(max_output_size=200)), said
     )
     assert (facts.origin, facts.residual_rms_m) == (None, None)
     assert "disagree by 2 m" in facts.georeferenced

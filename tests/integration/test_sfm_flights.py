@@ -83,12 +83,12 @@ def test_two_folders_two_cameras_landscape_and_portrait_become_one_scene(flight,
             write_photograph(folder / f"DJI_{k // 2}.JPG", turned, k, place, 6 if k % 4 else 8, model="Other")
     request = RunRequest(
         capture=tmp_path / "first", output=tmp_path / "run", preset="laptop", threads=1,
-        training=PRESETS["laptop"].training, photographs=(tmp_path / "second",),
+        training=PRESETS["laptop"].training, extra_image_folders=(tmp_path / "second",),
     )  # fmt: skip
     said = console()
     found = reconstruct_if_needed(request, said)
     assert found.capture == tmp_path / "run" / "capture"
-    assert found.photographs == ()
+    assert found.extra_image_folders == ()
     capture = load_capture(found.capture)
     assert len(capture.views) == 9
     assert {view.name.split("/")[0] for view in capture.views} == {"first", "second"}
@@ -112,7 +112,7 @@ def test_portrait_and_landscape_stand_beside_each_other(flight, tmp_path):
         pixels, place = pixels_of(flight.folder / name), flight.cameras[k].position
         # the file as the sensor has it, and EXIF says that its right side is up
         write_photograph(card / name, pixels, k, place, 6 if k in (3, 4, 5) else 1)
-    facts = reconstruct(SfmRequest(photographs=(card,), output=tmp_path / "capture", threads=1), console())
+    facts = reconstruct(SfmRequest(image_folders=(card,), output=tmp_path / "capture", threads=1), console())
     assert facts.registered == 9
     sizes = {view.name: view.camera.full_size for view in load_capture(tmp_path / "capture").views}
     assert {name for name, (width, height) in sizes.items() if height > width} == set(flight.names[3:6])
@@ -120,7 +120,7 @@ def test_portrait_and_landscape_stand_beside_each_other(flight, tmp_path):
 
 def test_more_folders_beside_a_capture_are_refused(flight, tmp_path):
     (tmp_path / "sparse").mkdir()
-    request = RunRequest(capture=tmp_path, output=tmp_path / "run", preset="laptop", photographs=(flight.folder,))
+    request = RunRequest(capture=tmp_path, output=tmp_path / "run", preset="laptop", extra_image_folders=(flight.folder,))
     with pytest.raises(VdgsError, match="only folders of photographs alone can be several"):
         reconstruct_if_needed(request, console())
 
@@ -150,10 +150,10 @@ def beside(cameras: list[Camera], east: float) -> list[Camera]:
 def test_of_two_parts_the_larger_is_kept_and_the_other_named(tmp_path):
     flown = fly(tmp_path / "card", [*beside(grid(2, 3, 9.0), -60), *beside(grid(2, 2, 9.0), 60)], 220)
     said = console()
-    facts = reconstruct(SfmRequest(photographs=(flown.folder,), output=tmp_path / "capture", threads=1), said)
+    facts = reconstruct(SfmRequest(image_folders=(flown.folder,), output=tmp_path / "capture", threads=1), said)
     assert facts.components == (6, 4)
     assert facts.registered == 6
-    why = {photo.name: photo.left_out for photo in facts.photographs if photo.left_out}
+    why = {photo.name: photo.excluded_reason for photo in facts.photographs if photo.excluded_reason}
     assert sorted(why) == flown.names[6:]
     assert all("belongs to a part of 4 photographs that nothing joins to the rest" in reason for reason in why.values())
     assert "parts that do not hold together: 6, 4" in said.file.getvalue()
@@ -193,7 +193,7 @@ def test_ctrl_c_at_each_step_keeps_what_is_done_and_the_same_command_goes_on(
     output, stop, function = tmp_path / "capture", Stopper(after), getattr(room, name)
     if step in begun:
         copy_folder(begun[step], output)
-    request = SfmRequest(photographs=(flight.folder,), output=output, threads=1)
+    request = SfmRequest(image_folders=(flight.folder,), output=output, threads=1)
 
     def then_stopped(*arguments, **named):
         result = function(*arguments, **named)
@@ -245,7 +245,7 @@ def test_only_whole_snapshots_are_gone_on_from_and_the_largest_of_them(tmp_path)
     for name, placed, kept in (("1", 7, 7), ("2", 12, 12), ("3", 5, 12), ("4", 110, 110)):
         snapshot(name, placed)
         incremental_mapper.save_snapshots(work)
-        assert [path.name for path in work.kept.iterdir()] == [str(kept)]
+        assert [path.name for path in work.saved_snapshots.iterdir()] == [str(kept)]
         assert not any(work.snapshots.iterdir())
     incremental_mapper.delete_models(work)
     assert list(tmp_path.iterdir()) == []
@@ -259,7 +259,7 @@ def test_another_focal_length_begins_mapping_anew(flight, begun, tmp_path, monke
     with monkeypatch.context() as patch:
         patch.setattr(incremental_mapper, "save_snapshots", lambda work: (keep(work), stop()))
         with pytest.raises(KeyboardInterrupt), catch_stop_signals(interrupts=True):
-            reconstruct(SfmRequest(photographs=(flight.folder,), output=output, threads=1), console())
+            reconstruct(SfmRequest(image_folders=(flight.folder,), output=output, threads=1), console())
     assert any((output / "work" / "kept").iterdir())
     monkeypatch.setattr(
         incremental_mapper, "run_mapper", lambda work, *_: pytest.fail("kept") if work.kept.exists() else done()
@@ -270,7 +270,7 @@ def test_another_focal_length_begins_mapping_anew(flight, begun, tmp_path, monke
 
     with pytest.raises(CaptureError, match="begun anew"):
         reconstruct(
-            SfmRequest(photographs=(flight.folder,), output=output, threads=1, options=SfmOptions(focal="refine")),
+            SfmRequest(image_folders=(flight.folder,), output=output, threads=1, options=SfmOptions(focal="refine")),
             console(),
         )
 
@@ -283,7 +283,7 @@ def test_a_disk_that_fills_while_photographs_are_written_is_said_and_nothing_is_
 ):
     output, written = tmp_path / "capture", []
     copy_folder(begun["writing"], output)
-    request = SfmRequest(photographs=(flight.folder,), output=output, threads=1)
+    request = SfmRequest(image_folders=(flight.folder,), output=output, threads=1)
     write = Path.write_bytes
 
     def until_full(path: Path, content: bytes) -> int:
@@ -308,7 +308,7 @@ def test_a_disk_that_is_full_for_the_database_is_said_and_nothing_is_lost(flight
     output, room = tmp_path / "capture", STEPS[step][0]
     if step in begun:
         copy_folder(begun[step], output)
-    request = SfmRequest(photographs=(flight.folder,), output=output, threads=1)
+    request = SfmRequest(image_folders=(flight.folder,), output=output, threads=1)
     monkeypatch.setattr(feature_matching, "PAIRS_PER_THREAD", 4)
 
     def full(function, *arguments, **named):

@@ -142,7 +142,7 @@ def test_a_shard_says_how_far_it_is_and_how_it_ended(tmp_path):
     assert (folder.status().state, folder.status().iteration) == ("done", 3)
     with pytest.raises(VdgsError, match="gone"), shard_session(folder, 1, 3):
         raise VdgsError("a.jpg: gone")
-    assert (folder.status().state, folder.status().why) == ("failed", "a.jpg: gone")
+    assert (folder.status().state, folder.status().reason) == ("failed", "a.jpg: gone")
     with pytest.raises(Stopped, match="Stopped after 2 of 3"), catch_stop_signals():
         _stopped_at_two(folder)
     assert (folder.status().state, folder.status().iteration) == ("stopped", 2)
@@ -211,7 +211,7 @@ def test_a_job_keeps_what_is_done_and_is_gathered_in_the_order_of_its_items(tmp_
     )
     with pytest.raises(AssertionError, match="exit code 1"), job.held():
         job.run(needs, wish, console)
-    assert job.left == [1]
+    assert job.pending == [1]
     assert "3: has no half" in (job.shard(1).path / "output.log").read_text()
     (tmp_path / "go").touch()
     kept = job.file(2).stat().st_mtime_ns

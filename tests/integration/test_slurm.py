@@ -181,7 +181,7 @@ def test_where_there_is_no_slurm_it_is_said(cut, monkeypatch):
 def test_a_script_asks_for_what_a_block_needs(tmp_path):
     options = SlurmOptions(
         partition="gpu", account="lab", time="8:00:00", grace_seconds=300, setup_command="module load cuda",
-        options=("--qos=long",),
+        sbatch_args=("--qos=long",),
     )  # fmt: skip
     lines = make_batch_script(tmp_path / "vdgs-a", 8, TaskResources(4, 5 << 30, 1), options, 3).splitlines()
     for asked in (

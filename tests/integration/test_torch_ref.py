@@ -59,6 +59,6 @@ def test_from_one_coarse_model_both_cut_assign_and_measure_alike(runs):
     ).read_bytes()
     ours, theirs = (load_scores(RunFolder(run).partition / "scores.npz") for run in (native, shared))
     np.testing.assert_allclose(theirs.scores.scores, ours.scores.scores, atol=0.02)
-    np.testing.assert_array_equal(theirs.scores.held, ours.scores.held)
+    np.testing.assert_array_equal(theirs.scores.visible_anchors, ours.scores.visible_anchors)
     assert psnr(shared)[0] == pytest.approx(psnr(native)[0], abs=0.01)
     assert psnr(shared)[1] == pytest.approx(psnr(native)[1], abs=0.6)

@@ -53,7 +53,7 @@ def scattered(scene: Scene, camera: Camera, library: ctypes.CDLL, rows=None, ord
 
 def put_in_order(splats: TrainingSplats, library: ctypes.CDLL) -> dict[str, torch.Tensor]:
     """All that is known of each splat, in the order of the anchors."""
-    order = splats.runs.order(len(splats.source))
+    order = splats.segments.order(len(splats.source))
     program = CudaProgram(name=PROGRAM.name, driver=HostDriver(library), headers=PROGRAM.headers)
     named = {field.name: getattr(splats, field.name) for field in fields(Splats)}
     named["source"] = expand_sources(splats.source, program=program)
@@ -133,7 +133,7 @@ def test_for_training_splats_are_the_same_in_another_order(order, library):
     assert torch.equal(splats.volume, scattered(scene, turned(), library, rows).volume)
     again = SplatMask.of(expected.source, len(rows), 10)
     assert torch.equal(again.bits, splats.source.bits)
-    assert torch.equal(again.runs.lengths, splats.runs.lengths)
+    assert torch.equal(again.segments.lengths, splats.segments.lengths)
 
 
 @needs_a_compiler
@@ -182,16 +182,16 @@ def test_where_there_is_too_little_room_they_are_decoded_once_more(order, librar
 
 def test_room_follows_what_views_need():
     room, device = SplatCapacity(), torch.device("cpu")
-    assert 5000 < room.for_anchors(1000, 10, device) < 10_000  # half of the offsets, before any view is known
-    assert room.for_anchors(10, 10, device) == 100  # never more than there are offsets
+    assert 5000 < room.estimate(1000, 10, device) < 10_000  # half of the offsets, before any view is known
+    assert room.estimate(10, 10, device) == 100  # never more than there are offsets
     room.update(1000, 10, device, 2000)
-    once = room.for_anchors(1000, 10, device)
+    once = room.estimate(1000, 10, device)
     assert 2000 < once < 3000
     room.update(1000, 10, device, 1000)
-    assert 2000 < room.for_anchors(1000, 10, device) < once  # slowly forgotten
+    assert 2000 < room.estimate(1000, 10, device) < once  # slowly forgotten
     room.update(500, 10, device, 4000)
-    assert 8000 < room.for_anchors(1000, 10, device) <= 10_000
-    assert room.for_anchors(1000, 4, device) < 4000  # other models have other offsets
+    assert 8000 < room.estimate(1000, 10, device) <= 10_000
+    assert room.estimate(1000, 4, device) < 4000  # other models have other offsets
 
 
 @needs_a_compiler
@@ -343,7 +343,7 @@ class TestMoving:
         nothing = torch.zeros(0)
         none = SplatGradients(
             means_px=torch.zeros(0, 2), conics=torch.zeros(0, 3), colours=torch.zeros(0, 3), opacities=nothing,
-            volume=0.0, source=nothing.int(), colour_values=torch.zeros(0, 3), opacity_values=nothing,
+            volume=0.0, source=nothing.int(), color_values=torch.zeros(0, 3), opacity_values=nothing,
         )  # fmt: skip
         with pytest.raises(ValueError, match="annealed alike"):
             moving(scene.positions, states, scene.weights, turned(), torch.arange(4), none, torch.zeros(4).int())

@@ -89,7 +89,7 @@ def _streams(monkeypatch: pytest.MonkeyPatch):
 def test_cards_are_described():
     driver = CudaDriver(StandIn())
     assert driver.version() == (12, 8)
-    first, second = driver.cards()
+    first, second = driver.list_gpus()
     assert (first.index, first.name, first.memory_bytes, first.capability) == (0, "Card 70", 70 * 10**9, (8, 6))
     assert second.name == "Card 71"
     assert driver.capability(CARD) == (8, 6)

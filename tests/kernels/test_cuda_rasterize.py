@@ -108,7 +108,7 @@ def test_wherever_splats_stand_picture_and_gradients_have_the_same_bits(seed, li
     splats, background = splats_of(scene.tensors)
     level = replace(splats, depths=(splats.depths / 40).floor() + 1)
     moved, order = in_runs(level, 7, seed)
-    assert torch.equal(moved.runs.order(len(order)).long(), order)
+    assert torch.equal(moved.segments.order(len(order)).long(), order)
     assert not torch.equal(order, order.sort()[0])
     size, wanted = (scene.width, scene.height), torch.randn(scene.height, scene.width, 3)
 
@@ -133,12 +133,12 @@ def test_splats_joined_with_others_keep_the_order_of_each():
     other, second = in_runs(splats_of(SCENES["tiny"].tensors)[0], 4, 1)
     both = one.concat(other)
     expected = torch.cat([first, second + len(first)])
-    assert torch.equal(both.runs.order(len(expected)).long(), expected)
-    alone = replace(one, runs=None).concat(other)
+    assert torch.equal(both.segments.order(len(expected)).long(), expected)
+    alone = replace(one, segments=None).concat(other)
     assert torch.equal(
-        alone.runs.order(len(expected)).long(), torch.cat([torch.arange(len(first)), expected[len(first) :]])
+        alone.segments.order(len(expected)).long(), torch.cat([torch.arange(len(first)), expected[len(first) :]])
     )
-    assert replace(one, runs=None).concat(replace(other, runs=None)).runs is None
+    assert replace(one, segments=None).concat(replace(other, segments=None)).segments is None
 
 
 @needs_a_compiler

@@ -56,7 +56,7 @@ def test_splats_follow_the_definition(decode):
     inputs = torch.cat([scene.features[anchor], ray / ray.norm()])
     opacity, covariance, colour = (
         head.w2 @ torch.relu(head.w1 @ inputs + head.b1) + head.b2
-        for head in (scene.weights.opacity, scene.weights.covariance, scene.weights.colour)
+        for head in (scene.weights.opacity, scene.weights.covariance, scene.weights.color)
     )
     mean = x + scene.offsets[anchor, offset] * s[:3].exp()
     scale = s[3:].exp() * torch.sigmoid(covariance.reshape(4, 7)[offset, :3])
@@ -200,7 +200,7 @@ def test_weights_survive_a_walk_through_their_tensors():
     again = DecoderWeights.from_tensors(weights.tensors())
     assert all(a is b for a, b in zip(weights.tensors(), again.tensors(), strict=True))
     assert weights.covariance.w2.shape == (35, 32)
-    assert weights.map(lambda t: 2 * t).colour.w1.shape == (32, 36)
+    assert weights.map(lambda t: 2 * t).color.w1.shape == (32, 36)
 
 
 def results(scene: Scene, camera) -> list[torch.Tensor]:
@@ -251,14 +251,14 @@ def test_activations_are_exact_to_a_few_units_in_the_last_place(isa, monkeypatch
     monkeypatch.setattr(extension, "get_extension", lambda: extension.load_extension(isa))
     scene = Scene.random(16, k=32, spread=0.2)
     raw_opacities, raw_colours = torch.linspace(0.005, 4, 32), torch.linspace(-10, 10, 96)
-    opacity, colour = scene.weights.opacity, scene.weights.colour
+    opacity, colour = scene.weights.opacity, scene.weights.color
     opacity = replace(opacity, w2=torch.zeros_like(opacity.w2), b2=raw_opacities)
     colour = replace(colour, w2=torch.zeros_like(colour.w2), b2=raw_colours)
-    scene = replace(scene, weights=replace(scene.weights, opacity=opacity, colour=colour))
+    scene = replace(scene, weights=replace(scene.weights, opacity=opacity, color=colour))
     splats = native_decode(*scene.arguments, CAMERAS[0])
     offset = splats.source.long() % 32
     assert len(offset.unique()) > 25
     expected = torch.tanh(raw_opacities.double())[offset]
     torch.testing.assert_close(splats.opacities.double(), expected, rtol=1e-6, atol=0)
     expected = torch.sigmoid(raw_colours.double()).reshape(32, 3)[offset]
-    torch.testing.assert_close(splats.colours.double(), expected, rtol=1e-6, atol=0)
+    torch.testing.assert_close(splats.colors.double(), expected, rtol=1e-6, atol=0)

@@ -39,7 +39,7 @@ def gradients_of(scene: Scene, rows: torch.Tensor = ROWS, depths: bool = False) 
              for name in ("means_px", "conics", "colours", "opacities")}  # fmt: skip
     of_depth = torch.randn(splats.depths.shape, generator=g) if depths else None
     return SplatGradients(
-        **parts, volume=0.3, source=splats.source, colour_values=splats.colours, opacity_values=splats.opacities,
+        **parts, volume=0.3, source=splats.source, color_values=splats.colors, opacity_values=splats.opacities,
         depths=of_depth,
     )  # fmt: skip
 
@@ -66,7 +66,7 @@ def apart(scene: Scene, gradients: SplatGradients) -> list[torch.Tensor]:
     leaves = [state.parameter[ROWS].requires_grad_(True) for state in states]
     weights = scene.weights.map(lambda t: t.clone().requires_grad_(True))
     splats = cpu.decode(scene.positions[ROWS], *leaves, weights, CAMERA)
-    outputs = [splats.means_px, splats.conics, splats.colours, splats.opacities, splats.volumes]
+    outputs = [splats.means_px, splats.conics, splats.colors, splats.opacities, splats.volumes]
     received = [gradients.means_px, gradients.conics, gradients.colours, gradients.opacities,
                 torch.full_like(splats.volumes, gradients.volume)]  # fmt: skip
     if gradients.depths is not None:

@@ -187,7 +187,7 @@ def test_doctor_says_what_there_is(monkeypatch: pytest.MonkeyPatch, tmp_path):
     assert lines["on cuda: gsplat or cuda"].value == "rasterise, rasterise_vjp"
     assert "adam_rows" in lines["on cuda: reference"].value
     assert lines["--device auto"].value.startswith("cpu: vdgs has not been run on a GPU")
-    assert all(check.works for check in lines.values())
+    assert all(check.is_ok for check in lines.values())
 
 
 def test_doctor_where_there_is_nothing(monkeypatch: pytest.MonkeyPatch):

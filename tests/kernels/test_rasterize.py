@@ -119,10 +119,10 @@ def test_shares_are_what_each_splat_makes_of_the_picture_and_of_what_it_lacks(na
     expected = twin(*splats_of(tuple(tensor.detach() for tensor in exact.tensors)), *size, wanted.double())
     found = splat_contributions(splats, background, *size, wanted, module=module)
     assert_close(found.pixels, expected.pixels, 5e-5)
-    assert_close(found.missing, expected.missing, 5e-5)
+    assert_close(found.residual, expected.residual, 5e-5)
     alone = splat_contributions(splats, background, *size, module=module)
     assert torch.equal(alone.pixels, found.pixels)
-    assert not alone.missing.any()
+    assert not alone.residual.any()
 
 
 @pytest.mark.parametrize("threads", [1, 3, 8])
@@ -134,7 +134,7 @@ def test_shares_have_the_same_bits_for_any_number_of_threads(threads: int) -> No
     with on_threads(threads):
         again = splat_contributions(splats, background, 200, 150, wanted)
     assert torch.equal(again.pixels, expected.pixels)
-    assert torch.equal(again.missing, expected.missing)
+    assert torch.equal(again.residual, expected.residual)
 
 
 @settings(max_examples=25)

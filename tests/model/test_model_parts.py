@@ -25,13 +25,13 @@ def scattered(n: int = 300, seed: int = 0) -> np.ndarray:
 
 def in_parts(model: AnchorModel, counts: tuple[int, ...], seeds: tuple[int, ...]) -> AnchorModel:
     decoders = [model_at(np.zeros((1, 3)), decoder_seed=seed).decoder for seed in seeds]
-    return replace(model, parts=tuple(map(DecoderSpan, counts, decoders)))
+    return replace(model, decoder_spans=tuple(map(DecoderSpan, counts, decoders)))
 
 
 @pytest.mark.parametrize("counts", [(300,), (100, 200), (0, 120, 0, 180), (299, 1, 0)])
 def test_parts_with_the_same_decoder_are_one_model(counts):
     model = model_at(scattered())
-    parted = replace(model, parts=tuple(DecoderSpan(count, model.decoder) for count in counts))
+    parted = replace(model, decoder_spans=tuple(DecoderSpan(count, model.decoder) for count in counts))
     values = torch.arange(300.0)
     for view in VIEWS:
         assert torch.equal(render(model, view).image, render(parted, view).image)
@@ -50,7 +50,7 @@ def test_every_part_is_decoded_by_its_own_decoder():
         _, splats = decode_view(model, view)
         k = model.anchors.offsets.shape[1]
         alone = []
-        for first, last, decoder in model.spans():
+        for first, last, decoder in model.decoder_ranges():
             rows = torch.arange(first, last)
             alone.append(
                 decode_view(
@@ -60,7 +60,7 @@ def test_every_part_is_decoded_by_its_own_decoder():
                     view,
                 )[1]
             )
-        assert torch.equal(splats.colours, torch.cat([each.colours for each in alone]))
+        assert torch.equal(splats.colors, torch.cat([each.colors for each in alone]))
         assert torch.equal(splats.means_px, torch.cat([each.means_px for each in alone]))
         assert bool((splats.source.diff() > 0).all())
         assert int(splats.source[-1]) // k < 300
@@ -72,13 +72,13 @@ def test_a_file_keeps_parts(tmp_path):
     model = in_parts(model_at(scattered()), (120, 0, 180), (1, 2, 3))
     model.save(tmp_path / "model.safetensors")
     back = AnchorModel.load(tmp_path / "model.safetensors")
-    assert [part.count for part in back.parts] == [120, 0, 180]
+    assert [part.count for part in back.decoder_spans] == [120, 0, 180]
     assert torch.equal(render(back, VIEWS[0]).image, render(model, VIEWS[0]).image)
-    for ours, theirs in zip(back.parts, model.parts, strict=True):
+    for ours, theirs in zip(back.decoder_spans, model.decoder_spans, strict=True):
         assert all(torch.equal(t, theirs.decoder.tensors()[name]) for name, t in ours.decoder.tensors().items())
     plain = model_at(scattered())
     plain.save(tmp_path / "plain.safetensors")
-    assert AnchorModel.load(tmp_path / "plain.safetensors").parts == ()
+    assert AnchorModel.load(tmp_path / "plain.safetensors").decoder_spans == ()
 
 
 def test_parts_that_do_not_add_up_are_refused(tmp_path):
@@ -106,14 +106,14 @@ def test_the_merged_scene_decodes_each_block_as_it_was_trained():
     blocks, cameras = quadrants(), [VIEWS[:2]] * 4
     trained = trained_apart(coarse, own=True)
     merged, _ = merge_blocks(coarse, trained, blocks, cameras, MergeConfig())
-    assert [part.count for part in merged.parts] == [len(model.anchors) for model in trained if model is not None]
-    for part, model in zip(merged.parts, trained, strict=True):
+    assert [part.count for part in merged.decoder_spans] == [len(model.anchors) for model in trained if model is not None]
+    for part, model in zip(merged.decoder_spans, trained, strict=True):
         assert model is not None
         given, own = part.decoder.tensors(), model.decoder.tensors()
         assert given.keys() == own.keys()
         assert all(torch.equal(given[name], own[name]) for name in own)
     frozen, _ = merge_blocks(coarse, trained_apart(coarse, own=False), blocks, cameras, MergeConfig())
-    assert frozen.parts == ()
+    assert frozen.decoder_spans == ()
 
 
 def test_the_coarse_decoder_stands_in_with_its_anchors():
@@ -121,6 +121,6 @@ def test_the_coarse_decoder_stands_in_with_its_anchors():
     trained = trained_apart(coarse, own=True)
     trained[2] = None
     merged, _ = merge_blocks(coarse, trained, quadrants(), [VIEWS[:2]] * 4, MergeConfig(), allow_missing=True)
-    assert merged.parts[2].decoder is coarse.decoder
+    assert merged.decoder_spans[2].decoder is coarse.decoder
     owner = quadrant_of(coarse.anchors.positions[:, :2].numpy())
-    assert merged.parts[2].count == int((owner == 2).sum())
+    assert merged.decoder_spans[2].count == int((owner == 2).sum())

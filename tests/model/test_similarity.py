@@ -45,7 +45,7 @@ def test_leaving_out_the_harmonics_would_be_seen():
     """So the law above can fail."""
     turn = Rotation.from_euler("xyz", [90, 20, 40], degrees=True).as_matrix()
     scene, camera = random_gaussians(150, 3), overhead(size=48)
-    wrong = replace(transform_gaussians(scene, 1.0, turn, np.zeros(3)), rest=scene.rest)
+    wrong = replace(transform_gaussians(scene, 1.0, turn, np.zeros(3)), shN=scene.shN)
     assert psnr(picture(wrong, moved(camera, 1.0, turn, np.zeros(3))), picture(scene, camera)) < 30
 
 
@@ -55,8 +55,8 @@ def test_turned_harmonics_show_the_old_colours_along_turned_directions(degree):
     scene = random_gaussians(20, degree)
     directions = torch.nn.functional.normalize(torch.randn(20, 3, generator=torch.Generator().manual_seed(3)), dim=-1)
     turned = directions @ torch.from_numpy(turn.T).float()
-    after = eval_sh_colors(scene.dc, rotate_sh(scene.rest, turn), turned, degree)
-    torch.testing.assert_close(after, eval_sh_colors(scene.dc, scene.rest, directions, degree), atol=1e-5, rtol=0)
+    after = eval_sh_colors(scene.sh0, rotate_sh(scene.shN, turn), turned, degree)
+    torch.testing.assert_close(after, eval_sh_colors(scene.sh0, scene.shN, directions, degree), atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("band", [1, 2, 3])
@@ -82,4 +82,4 @@ def test_what_is_no_similarity_is_refused():
     with pytest.raises(ValueError, match="positive scale"):
         transform_gaussians(scene, 0.0, np.eye(3), np.zeros(3))
     with pytest.raises(ValueError, match="belong to no degree"):
-        rotate_sh(scene.rest[:, :2], np.eye(3))
+        rotate_sh(scene.shN[:, :2], np.eye(3))

@@ -47,31 +47,31 @@ def test_laws_of_assignment(matrix, mode, floor):
     config = replace(CONFIG, mode=mode, min_cameras=floor)
     threshold = 0.05 if mode == "leave_one_out" else 0.45
     result = assign_cameras(scores, config)
-    seen = scores.held > 0
+    seen = scores.visible_anchors > 0
     assert result.cameras.any(axis=1).all(), "every camera serves a block"
-    assert np.array_equal(result.cameras, result.why != NOT_ASSIGNED)
+    assert np.array_equal(result.cameras, result.reasons != NOT_ASSIGNED)
     above = (scores.scores > threshold) & (seen | (mode == "literal"))
-    assert np.array_equal(result.why == ABOVE_THRESHOLD, above)
+    assert np.array_equal(result.reasons == ABOVE_THRESHOLD, above)
     for block in range(seen.shape[1]):
         mine, watching = result.cameras[:, block], seen[:, block]
         assert mine.sum() >= min(floor, watching.sum()), "the floor is met, or all that see the block are there"
-        topped = result.why[:, block] == TOPPED_UP
+        topped = result.reasons[:, block] == TOPPED_UP
         assert not (topped & ~watching).any()
         assert not topped.any() or mine.sum() <= floor
         left = watching & ~mine
         if topped.any() and left.any():
             assert scores.scores[topped, block].min() >= scores.scores[left, block].max()
-    for row, block in zip(*np.nonzero(result.why == BEST_BLOCK), strict=True):
+    for row, block in zip(*np.nonzero(result.reasons == BEST_BLOCK), strict=True):
         best = scores.scores[row, seen[row]].max() if seen[row].any() else scores.scores[row].max()
         assert scores.scores[row, block] == best
-    assert np.array_equal(assign_cameras(scores, config).why, result.why)
+    assert np.array_equal(assign_cameras(scores, config).reasons, result.reasons)
 
 
 @pytest.mark.parametrize("mode", ["coverage", "literal"])
 def test_without_its_best_block_a_camera_may_train_nothing(mode):
     scores = np.array([[0.9, 0.1], [0.3, 0.2], [0.0, 0.5]])
     given = hand_made(scores, np.ones((3, 2), int), mode=mode)
-    literal = assign_cameras(given, replace(CONFIG, mode=mode, best_block=False, min_cameras=0))
+    literal = assign_cameras(given, replace(CONFIG, mode=mode, always_best=False, min_cameras=0))
     assert np.array_equal(literal.cameras, scores > 0.45)
     assert assign_cameras(given, replace(CONFIG, mode=mode, min_cameras=0)).cameras.any(axis=1).all()
 
@@ -79,35 +79,35 @@ def test_without_its_best_block_a_camera_may_train_nothing(mode):
 def test_equal_scores_are_settled_by_anchors_held_and_then_by_index():
     scores = hand_made([[0.2, 0.2, 0.2]] * 4, [[1, 2, 2], [1, 1, 1], [3, 0, 0], [1, 1, 0]])
     result = assign_cameras(scores, replace(CONFIG, min_cameras=2))
-    assert np.argmax(result.why == BEST_BLOCK, axis=1).tolist() == [1, 0, 0, 0]
-    assert np.flatnonzero(result.why[:, 1] == TOPPED_UP).tolist() == [1]
-    assert np.flatnonzero(result.why[:, 2] == TOPPED_UP).tolist() == [0, 1]
+    assert np.argmax(result.reasons == BEST_BLOCK, axis=1).tolist() == [1, 0, 0, 0]
+    assert np.flatnonzero(result.reasons[:, 1] == TOPPED_UP).tolist() == [1]
+    assert np.flatnonzero(result.reasons[:, 2] == TOPPED_UP).tolist() == [0, 1]
 
 
 def test_a_camera_that_sees_nothing_joins_the_block_beneath_it():
     scores = compute_score_matrix(scene(), strips(4), [skyward()], CONFIG)
-    assert scores.beneath.tolist() == [3]
-    assert assign_cameras(scores, CONFIG).why.tolist() == [[0, 0, 0, BEST_BLOCK]]
+    assert scores.nadir_block.tolist() == [3]
+    assert assign_cameras(scores, CONFIG).reasons.tolist() == [[0, 0, 0, BEST_BLOCK]]
 
 
 def test_a_camera_over_the_ring_alone_is_not_taken_for_it():
     """It would draw anchors that do not move, and teach nothing."""
     scores = hand_made([[0.9, 0.6]], [[0, 5]])
-    assert assign_cameras(scores, CONFIG).why.tolist() == [[NOT_ASSIGNED, ABOVE_THRESHOLD]]
-    assert assign_cameras(replace(scores, mode="literal"), CONFIG).why.tolist() == [[ABOVE_THRESHOLD, ABOVE_THRESHOLD]]
+    assert assign_cameras(scores, CONFIG).reasons.tolist() == [[NOT_ASSIGNED, ABOVE_THRESHOLD]]
+    assert assign_cameras(replace(scores, mode="literal"), CONFIG).reasons.tolist() == [[ABOVE_THRESHOLD, ABOVE_THRESHOLD]]
 
 
 def test_a_block_without_cameras_complains_and_says_why():
     scores = compute_score_matrix(scene(), strips(4), [camera(2.0), camera(8.0)], CONFIG)
-    lines = assign_cameras(scores, replace(CONFIG, min_cameras=5)).complaints
+    lines = assign_cameras(scores, replace(CONFIG, min_cameras=5)).warnings
     assert [line.split(":")[0] for line in lines] == ["Block 2", "Block 3"]
     assert "no training camera sees any of its 225 anchors" in lines[1]
-    (unpicked,) = assign_cameras(hand_made([[0.3, 0.2]]), CONFIG).complaints
+    (unpicked,) = assign_cameras(hand_made([[0.3, 0.2]]), CONFIG).warnings
     assert "1 training camera(s) see" in unpicked
     assert "best: 0.2" in unpicked
     nothing = replace(hand_made([[1.0, 0.0]]), anchors=np.array([7, 0]))
-    assert "Block 1 holds no anchors" in assign_cameras(nothing, CONFIG).complaints[0]
-    assert assign_cameras(hand_made([[0.3, 0.2]]), replace(CONFIG, min_cameras=1)).complaints == []
+    assert "Block 1 holds no anchors" in assign_cameras(nothing, CONFIG).warnings[0]
+    assert assign_cameras(hand_made([[0.3, 0.2]]), replace(CONFIG, min_cameras=1)).warnings == []
 
 
 # What is kept and shown
@@ -129,9 +129,9 @@ def test_what_is_saved_is_loaded(saved):
     assert loaded.mode == "coverage"
     for name in ("scores", "held", "covered", "anchors", "beneath"):
         assert np.array_equal(getattr(loaded, name), getattr(scores, name))
-    assert np.array_equal(decided.why, result.why)
+    assert np.array_equal(decided.reasons, result.why)
     assert np.array_equal(decided.cameras, result.cameras)
-    assert decided.complaints == result.complaints
+    assert decided.warnings == result.complaints
     assert len(result.complaints) == 2
     before = path.read_bytes()
     save_scores(path, names, loaded, decided)
@@ -141,7 +141,7 @@ def test_what_is_saved_is_loaded(saved):
 def test_the_scores_of_no_camera_at_all_can_be_saved(tmp_path):
     scores = compute_score_matrix(scene(), strips(2), [], CONFIG)
     result = assign_cameras(scores, CONFIG)
-    assert len(result.complaints) == 2
+    assert len(result.warnings) == 2
     save_scores(tmp_path / "none.npz", [], scores, result)
     assert load_scores(tmp_path / "none.npz").scores.scores.shape == (0, 2)
 
@@ -162,7 +162,7 @@ def test_missing_and_damaged_files_say_so(saved, tmp_path):
         except RunError:
             continue
         assert np.array_equal(loaded.scores.scores, scores.scores)
-        assert np.array_equal(loaded.assignment.why, result.why)
+        assert np.array_equal(loaded.assignment.reasons, result.why)
 
 
 def test_a_file_whose_arrays_disagree_is_refused(saved):
@@ -182,9 +182,9 @@ def test_anyone_can_ask_why(saved):
     names, scores, result = load_scores(saved[0])
     rows = explain_assignment(names, scores, result, "b/ö.jpg")
     assert [row.block for row in rows[:1]] == [1]
-    assert rows[0].why == "above the threshold"
+    assert rows[0].reason == "above the threshold"
     assert [row.score for row in rows[1:]] == sorted((row.score for row in rows[1:]), reverse=True)
-    assert {row.why for row in rows[1:]} == {"not assigned"}
+    assert {row.reason for row in rows[1:]} == {"not assigned"}
     assert sorted(row.block for row in rows) == [0, 1, 2, 3]
     with pytest.raises(RunError, match="no training view 'z'"):
         explain_assignment(names, scores, result, "z")

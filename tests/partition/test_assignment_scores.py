@@ -23,8 +23,8 @@ from vdgs.partition.blocks import Blocks
 def test_one_block_is_the_whole_scene(mode):
     config = replace(CONFIG, mode=mode)
     scores = compute_score_matrix(scene(), strips(1), [*flight(), skyward()], config)
-    assert np.array_equal(scores.covered[:, 0], [1.0] * 9 + [0.0])
-    assert np.array_equal(scores.held[:, 0] > 0, [True] * 9 + [False])
+    assert np.array_equal(scores.coverage[:, 0], [1.0] * 9 + [0.0])
+    assert np.array_equal(scores.visible_anchors[:, 0] > 0, [True] * 9 + [False])
     if mode == "leave_one_out":
         assert (scores.scores[:9, 0] > 0.5).all()
     else:
@@ -82,11 +82,11 @@ def test_scores_are_what_whole_renders_give(mode):
     assert np.count_nonzero(scores.scores > 0.1) >= 3
     everything = scene().anchors.positions.double().numpy()
     owner = blocks.owner(everything[:, :2])
-    assert scores.held.tolist() == [
+    assert scores.visible_anchors.tolist() == [
         np.bincount(owner[view.in_frustum(everything)], minlength=4).tolist() for view in views
     ]
     assert scores.anchors.tolist() == np.bincount(owner, minlength=4).tolist()
-    assert np.isnan(scores.covered).all() == (mode == "frustum")
+    assert np.isnan(scores.coverage).all() == (mode == "frustum")
 
 
 def test_empty_pixels_count_in_literal_mode_alone():
@@ -95,7 +95,7 @@ def test_empty_pixels_count_in_literal_mode_alone():
     literal, coverage = (compute_score_matrix(scene(), strips(4), views, replace(CONFIG, mode=m)) for m in MODES[1::-1])
     assert (literal.scores > 0.8).all()
     assert (coverage.scores < 0.5).all()
-    assert np.array_equal(literal.covered, coverage.scores)
+    assert np.array_equal(literal.coverage, coverage.scores)
     empty = compute_score_matrix(scene(), strips(4), [skyward()], replace(CONFIG, mode="literal"))
     assert (empty.scores == 1).all()
 
@@ -105,7 +105,7 @@ def test_a_block_out_of_view_scores_nothing(mode):
     scores = compute_score_matrix(scene(), strips(4), [camera(2.0)], replace(CONFIG, mode=mode))
     assert scores.scores[0, 0] > 0.05
     assert scores.scores[0, 2:].tolist() == [0.0, 0.0]
-    assert scores.held[0, 2:].tolist() == [0, 0]
+    assert scores.visible_anchors[0, 2:].tolist() == [0, 0]
 
 
 @pytest.mark.parametrize("mode", MODES)

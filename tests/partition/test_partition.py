@@ -283,9 +283,9 @@ def test_a_block_by_memory_takes_at_most_that_in_training(
     """By the estimate of the stage that trains it: its growth, its limits of anchors, its mean, its picture."""
     anchors, gb = 10**6, 1 + 150e-9 * pixels + 1.3 * offsets / 10
     method = PRESETS[preset]
-    growth = replace(method.block.growth, max_anchors=limits.get("max_anchors", 0))
-    block = replace(method.block, growth=growth, max_anchors_total=limits.get("max_anchors_total", 0))
-    training = replace(method.training, anchors=replace(method.training.anchors, offsets=offsets))
+    growth = replace(method.block.densify, max_anchors=limits.get("max_anchors", 0))
+    block = replace(method.block, densify=growth, max_anchors_total=limits.get("max_anchors_total", 0))
+    training = replace(method.training, anchors=replace(method.training.anchors, num_offsets=offsets))
     partition = PartitionConfig(blocks="auto", block_memory_gb=gb)
     method = MethodConfig(training, partition, method.assignment, block)
     count = choose_block_count(anchors, 50_000, pixels, method)
@@ -311,7 +311,7 @@ def test_more_growth_asks_for_more_blocks_and_limits_of_anchors_for_fewer() -> N
     plain = replace(paper.block, compensation=replace(paper.block.compensation, enabled=False))
     limited = replace(paper.block, max_anchors_total=10**6)
     assert count(paper.block) > count(plain) > count(limited)
-    assert count(replace(plain, average=0.5)) > count(plain)
+    assert count(replace(plain, swa_fraction=0.5)) > count(plain)
 
 
 # ----------------------------------------------------------------------------------------------- shapes
@@ -379,7 +379,7 @@ def test_blocks_on_the_map(tmp_path: Path, origin: tuple[float, float, float]) -
     hole = shapely.box(-50, -50, 60, 50)
     blocks = Blocks((Block(ring, ring.buffer(40)), Block(hole, hole.buffer(10))))
     ground = GroundFrame(
-        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, how="GPS", origin_geo=origin
+        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, description="GPS", origin_geo=origin
     )
     save_blocks_wgs84(tmp_path / "map.geojson", blocks, [{}, {}], ground)
     features = json.loads((tmp_path / "map.geojson").read_text())["features"]
@@ -410,5 +410,5 @@ def test_blocks_on_the_map(tmp_path: Path, origin: tuple[float, float, float]) -
             tmp_path / "map.geojson",
             blocks,
             [{}, {}],
-            GroundFrame(scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, how="-"),
+            GroundFrame(scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, description="-"),
         )

@@ -61,7 +61,7 @@ def test_groups_lose_no_place_that_a_camera_holds(count: int) -> None:
     groups = SpatialGroups.of(places)
     asked = 0
     for camera in flight(40, 400.0):
-        rows = groups.about(camera)
+        rows = groups.query_frustum(camera)
         asked += len(rows)
         assert torch.equal(rows, rows.unique())
         inside = project_points(places, camera).inside.nonzero().squeeze(1)
@@ -86,7 +86,7 @@ def test_many_cameras_asked_at_once_answer_as_each_alone(count: int) -> None:
         torch.testing.assert_close(getattr(together, name)[inside], one_by_one[inside], rtol=1e-5, atol=1e-3)
     seen = torch.zeros(len(cameras), count, dtype=torch.bool)
     for rows, watching in SpatialGroups.of(places).visible_groups(frusta):
-        seen[watching[:, None], rows] |= frusta.take(watching).project(places[rows]).inside
+        seen[watching[:, None], rows] |= frusta.select(watching).project(places[rows]).inside
     assert torch.equal(seen, inside), "no place is lost, and each is in one group"
 
 
@@ -95,9 +95,9 @@ def test_a_camera_inside_a_group_and_coincident_places_are_held() -> None:
     pose = np.eye(4)
     pose[:3, 3] = [0.0, 0.0, 0.5]
     camera = Camera(camera_from_world=pose, fx=90.0, fy=80.0, cx=60.0, cy=41.0, width=120, height=80)
-    assert len(SpatialGroups.of(places).about(camera)) == len(places)
+    assert len(SpatialGroups.of(places).query_frustum(camera)) == len(places)
     spread = site(GROUP_SIZE, 1.0)
-    assert len(SpatialGroups.of(spread).about(camera)) == GROUP_SIZE
+    assert len(SpatialGroups.of(spread).query_frustum(camera)) == GROUP_SIZE
 
 
 def test_bounds_of_sizes_are_those_of_all_cameras_asked_about_all_places() -> None:
@@ -207,7 +207,7 @@ def test_a_block_that_a_view_does_not_reach_scores_as_if_it_were_drawn(mode: str
             "leave_one_out": lambda: 0.0,
         }[mode]()
         assert found.scores[0, index] == np.float32(expected)
-        assert found.covered[0, index] == np.float32(scoring.drawn_coverage_ratio(alone, full, config.tau))
+        assert found.coverage[0, index] == np.float32(scoring.drawn_coverage_ratio(alone, full, config.tau))
 
 
 def small_model(count: int, extent: float = 12.0) -> AnchorModel:
@@ -219,7 +219,7 @@ def small_model(count: int, extent: float = 12.0) -> AnchorModel:
         torch.full((count, 6), -1.0),
     )  # fmt: skip
     return AnchorModel(
-        anchors=anchors, decoder=Decoder.initial(4, False, 0, 1, g), voxel_size=0.1, background=(0.5, 0.5, 0.5)
+        anchors=anchors, decoder=Decoder.init_random(4, False, 0, 1, g), voxel_size=0.1, background=(0.5, 0.5, 0.5)
     )
 
 

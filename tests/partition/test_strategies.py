@@ -30,8 +30,8 @@ def scores_of(blocks, mode: str) -> ScoreMatrix:
     shape = (len(CAMERAS), len(blocks))
     beneath = blocks.owner(np.array([camera.position[:2] for camera in CAMERAS]))
     return ScoreMatrix(
-        mode=mode, scores=np.zeros(shape, np.float32), held=np.ones(shape, np.int32),
-        covered=np.zeros(shape, np.float32), anchors=np.ones(shape[1], np.int64), beneath=beneath,
+        mode=mode, scores=np.zeros(shape, np.float32), visible_anchors=np.ones(shape, np.int32),
+        coverage=np.zeros(shape, np.float32), anchors=np.ones(shape[1], np.int64), nadir_block=beneath,
     )  # fmt: skip
 
 
@@ -77,7 +77,7 @@ def test_vastgaussian_scores_by_the_area_of_the_projected_box():
     blocks, _ = strategy.partition(positions, CAMERAS, 4)
     scores = strategy.adjust_scores(scores_of(blocks, "frustum"), positions, blocks, CAMERAS)
     rows = np.arange(len(CAMERAS))
-    assert (scores.scores[rows, scores.beneath] == 1).all()
+    assert (scores.scores[rows, scores.nadir_block] == 1).all()
     assert ((scores.scores >= 0) & (scores.scores <= 1)).all()
     assert len(np.unique(scores.scores)) > 4
 
@@ -89,7 +89,7 @@ def test_citygaussian_cameras_join_the_block_that_they_stand_in():
     assert config.mode == "leave_one_out"
     scores = strategy.adjust_scores(scores_of(blocks, config.mode), positions, blocks, CAMERAS)
     assigned = assign_cameras(scores, config).cameras
-    assert np.array_equal(assigned, np.eye(len(blocks), dtype=bool)[scores.beneath])
+    assert np.array_equal(assigned, np.eye(len(blocks), dtype=bool)[scores.nadir_block])
 
 
 def test_dogs_cells_turn_with_the_scene_and_are_equal():

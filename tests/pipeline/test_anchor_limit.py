@@ -38,7 +38,7 @@ def test_shares_hold_the_total_whatever_the_blocks(owned, total):
 
 def test_no_total_is_no_limit_and_a_block_may_have_one_of_its_own():
     assert max_block_anchors(BlockConfig(), 10, 30) == 0
-    alone = BlockConfig(growth=DensifyConfig(max_anchors=50))
+    alone = BlockConfig(densify=DensifyConfig(max_anchors=50))
     assert max_block_anchors(alone, 10, 30) == 50
     assert max_block_anchors(replace(alone, max_anchors_total=90), 10, 30) == 30
     assert max_block_anchors(replace(alone, max_anchors_total=900), 10, 30) == 50
@@ -49,18 +49,18 @@ def eager(max_anchors: int) -> MethodConfig:
     """The full method of a table with that limit, in four blocks that grow wherever they may from the first step on."""
     choices = PlanOptions(seeds=1, scenes=("copr",), methods=("full",), max_anchors=max_anchors)
     (planned,) = make_plan("table1", choices).runs
-    config, growth = planned.config, planned.config.block.growth
+    config, growth = planned.config, planned.config.block.densify
     growth = replace(
-        growth, interval=4, stats_start=0, start=1, until=1.0, threshold=1e-12, gate=0.0, coarsest_voxels=2.0,
+        growth, every=4, stats_start=0, start=1, stop_fraction=1.0, grad_threshold=1e-12, min_draw_fraction=0.0, coarsest_voxels=2.0,
         prune_view_fraction=1e9,
     )  # fmt: skip
     return replace(
         config,
-        training=replace(config.training, iterations=1, resolutions=((0.0, 1),)),
+        training=replace(config.training, iterations=1, resolution_schedule=((0.0, 1),)),
         assignment=replace(config.assignment, min_cameras=4, image_size=32),
         block=replace(
-            config.block, iterations=16, growth=growth, average=0.0, crop="off", sampling="even",
-            resolutions=((0.0, 1),),
+            config.block, iterations=16, densify=growth, swa_fraction=0.0, crop="off", view_sampling="even",
+            resolution_schedule=((0.0, 1),),
         ),
     )  # fmt: skip
 

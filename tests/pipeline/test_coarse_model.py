@@ -34,10 +34,10 @@ from vdgs.system.tensors import file_id
 UP, QUIET = CaptureOptions(up="z"), Console(quiet=True)
 #: Some steps, at the end of which all that was seen is taken for transparent.
 LAST = DensifyConfig(
-    interval=20, stats_start=0, start=20, levels=0, prune_opacity=1e6, prune_view_fraction=0.0, until=1.0
+    every=20, stats_start=0, start=20, num_levels=0, prune_opacity=1e6, prune_view_fraction=0.0, stop_fraction=1.0
 )  # fmt: skip
 METHOD = MethodConfig(
-    TrainConfig(iterations=20, anchors=AnchorConfig(offsets=2, fill_gaps=False), growth=LAST, average=0.0)
+    TrainConfig(iterations=20, anchors=AnchorConfig(num_offsets=2, fill_gaps=False), densify=LAST, swa_fraction=0.0)
 )
 
 
@@ -57,7 +57,7 @@ def finished(run: RunFolder, capture: Capture, model: AnchorModel) -> None:
     metadata = ModelMetadata(key=run.keys().coarse, capture=capture_metadata(capture))
     replace(model, metadata=metadata).save(run.coarse.model)
     count = len(model.anchors)
-    run.coarse.set_status(StatusRecord(state="done", iteration=6, anchors=count, model=file_id(run.coarse.model)))
+    run.coarse.set_status(StatusRecord(state="done", iteration=6, anchors=count, model_id=file_id(run.coarse.model)))
 
 
 def test_training_that_leaves_no_anchors_is_not_done_and_says_what_to_change(tmp_path):
@@ -70,7 +70,7 @@ def test_training_that_leaves_no_anchors_is_not_done_and_says_what_to_change(tmp
             train(run, capture)
         assert not run.coarse.model.exists()
         assert get_run_status(run).of("coarse").state == "failed"
-    kept = replace(METHOD, training=replace(METHOD.training, growth=replace(LAST, prune_opacity=0.0)))
+    kept = replace(METHOD, training=replace(METHOD.training, densify=replace(LAST, prune_opacity=0.0)))
     with pytest.raises(RunError, match="--redo"):
         begin(tmp_path, kept, redo=False)
     train(*begin(tmp_path, kept, redo=True))  # as it advised

@@ -37,7 +37,7 @@ DRIVER = (
     "sys.stdin.read()"
 )
 #: As `--preset laptop --block.ring free` gives them: blocks may be merged by either rule.
-METHOD = replace(PRESETS["laptop"], block=replace(PRESETS["laptop"].block, ring="free"))
+METHOD = replace(PRESETS["laptop"], block=replace(PRESETS["laptop"].block, margin="free"))
 OPTIONS = ("--preset", "laptop", "--block.ring", "free")
 AT_WORK = "another vdgs process works on this run"
 
@@ -69,7 +69,7 @@ def run(place: Path, tmp_path: Path) -> RunFolder:
     for stage in (run.coarse, run.block(0)):
         stage.reset_unless(run.keys().coarse if stage == run.coarse else run.keys().blocks)
         stage.model.write_bytes(b"a model")
-        stage.set_status(StatusRecord(state="done", iteration=3000, model="7-any"))
+        stage.set_status(StatusRecord(state="done", iteration=3000, model_id="7-any"))
     return run
 
 
@@ -138,7 +138,7 @@ def test_who_takes_a_run_up_drives_it(place, tmp_path):
 def test_a_bench_does_not_begin_what_another_process_drives(run, place):
     job = BenchJob(
         place, to_dict(CaptureOptions()), to_dict(PRESETS["laptop"]), ("coarse",), run.path, None, "key", None, 4, 1, 1,
-        redo=True,
+        overwrite=True,
     )  # fmt: skip
     with driven_elsewhere(run):
         before = contents(run)

@@ -25,7 +25,7 @@ from vdgs.runs.run_folder import RunFolder
 
 pytestmark = pytest.mark.xdist_group("moved_capture")
 
-METHOD = MethodConfig(TrainConfig(iterations=3, anchors=AnchorConfig(offsets=2)))
+METHOD = MethodConfig(TrainConfig(iterations=3, anchors=AnchorConfig(num_offsets=2)))
 UP = CaptureOptions(up="z")
 QUIET = Console(quiet=True)
 
@@ -102,7 +102,7 @@ def test_the_kept_flight_is_that_of_the_capture(trained):
     assert [name for name, _ in kept.train + kept.test] == [name for name, _ in read.train + read.test]
     for (_, ours), (_, theirs) in zip(kept.train, read.train, strict=True):
         assert (ours.packed == theirs.packed).all()
-    assert (kept.middle == read.middle).all()
+    assert (kept.scene_center == read.scene_center).all()
     assert (kept.ground.translation == read.ground.translation).all()
 
 
@@ -121,7 +121,7 @@ def test_views_and_orbits_are_drawn_without_the_photographs(trained, folder, tmp
 def test_maps_are_drawn_without_the_photographs_too(trained, folder, tmp_path):
     for kind in ("depth", "visibility", "alpha"):
         for run in (trained / "run", folder / "run"):
-            render_run(RenderRequest(run=run, output=tmp_path / run.parent.name / kind, kind=kind, device="cpu"), QUIET)
+            render_run(RenderRequest(run=run, output=tmp_path / run.parent.name / kind, mode=kind, device="cpu"), QUIET)
         ours, theirs = (sorted((tmp_path / each.name / kind).glob("*.png")) for each in (trained, folder))
         assert ours
         assert [file.read_bytes() for file in ours] == [file.read_bytes() for file in theirs]
@@ -136,8 +136,8 @@ def test_nothing_is_drawn_among_the_photographs_though_they_are_not_read(trained
     train_coarse(context, CheckpointOptions(), QUIET)
     flight = load_run_cameras(run, open_model(run).model.metadata.capture)
     assert flight is not None
-    assert flight.inputs == run_cameras_of_capture(capture).inputs
-    assert flight.height == run_cameras_of_capture(capture).height
+    assert flight.input_folders == run_cameras_of_capture(capture).input_folders
+    assert flight.camera_height == run_cameras_of_capture(capture).camera_height
     (tmp_path / "place").rename(tmp_path / "moved")
     relocate_capture(run, tmp_path / "moved")
     for inside in ("", "new", "film.mp4"):

@@ -209,7 +209,7 @@ def test_titles_stay_on_the_figure(width: float) -> None:
 
 
 def test_axes_are_east_and_north_only_where_the_place_is_known() -> None:
-    frame = GroundFrame(scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, how="")
+    frame = GroundFrame(scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, description="")
     assert frame.axis_names == ("x (m)", "y (m)")
     assert replace(frame, origin_geo=(50.8, -0.1, 60.0)).axis_names == METRES
     assert replace(frame, metric=False).axis_names == ("x (units)", "y (units)")

@@ -88,7 +88,7 @@ def capture_of(points: np.ndarray, origin: tuple[float, float, float] | None = P
             )
         )
     ground = GroundFrame(
-        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, how="hand-made", origin_geo=origin
+        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, description="hand-made", origin_geo=origin
     )
     return Capture(
         root=Path("place"), source="colmap", images="images", views=tuple(views), points=points,
@@ -128,8 +128,8 @@ def test_every_place_falls_on_its_pixel_to_a_tenth(crs, away):
     places = centre + np.random.default_rng(1).uniform(-1, 1, (200, 3)) * (10, 10, 5)
     capture = capture_of(places)
     placement = MapProjection.of(capture.ground, crs)
-    exact = placement.places(places)
-    x, y = placement.places(centre[None])[0, :2]
+    exact = placement.project(places)
+    x, y = placement.project(centre[None])[0, :2]
     grid = PixelGrid(float(x) - 10.24, float(y) + 10.24, 0.04, 512, 512)
     pixels, _ = NadirCamera.of(capture, placement).camera(grid).project(places)
     expected = np.stack([(exact[:, 0] - grid.left) / grid.gsd, (grid.top - exact[:, 1]) / grid.gsd], axis=1)
@@ -140,7 +140,7 @@ def test_files_open_at_the_right_place_with_the_right_heights(house, make):
     capture, model = house
     ortho_folder = make(capture, model, gsd=0.1)
     corners = np.array([[HOUSE[0], HOUSE[1], ROOF], [HOUSE[2], HOUSE[3], ROOF]])
-    easting, northing, height = MapProjection.of(capture.ground).places(corners.mean(axis=0, keepdims=True))[0]
+    easting, northing, height = MapProjection.of(capture.ground).project(corners.mean(axis=0, keepdims=True))[0]
     with rasterio.open(ortho_folder / "dsm.tif") as file:
         assert file.crs.to_epsg() == 32632
         heights = file.read(1)
@@ -153,7 +153,7 @@ def test_files_open_at_the_right_place_with_the_right_heights(house, make):
     # What a photograph shows in some pixel is there in the map.
     camera = capture.views[2].camera
     depth = render(model, camera, depth=True).median_depth
-    place = MapProjection.of(capture.ground).places(camera.unproject(depth.numpy())[24, 32][None])[0]
+    place = MapProjection.of(capture.ground).project(camera.unproject(depth.numpy())[24, 32][None])[0]
     with rasterio.open(ortho_folder / "dsm.tif") as file:
         assert file.read(1)[file.index(*place[:2])] == pytest.approx(place[2], abs=0.05)
 
@@ -199,7 +199,7 @@ def test_walls_do_not_smear(house, samples):
     """No pixel has a height between ground and roof: not at an edge, not where samples are put together."""
     capture, model = house
     surveyor = surveyor_of(model, capture, MapProjection.of(capture.ground, "local"), samples)
-    tile = surveyor.tile(PixelGrid(-4.0, 5.0, 0.1, 130, 100))
+    tile = surveyor.render_tile(PixelGrid(-4.0, 5.0, 0.1, 130, 100))
     heights = tile.heights[tile.alpha > 0]
     assert tile.alpha.mean() > 250
     between = (heights > 0.2) & (heights < ROOF - 0.2)
@@ -232,11 +232,11 @@ def looking_in(distance: float, turn: float) -> Camera:
 def test_tiles_show_what_one_picture_shows(house):
     capture, model = house
     surveyor = surveyor_of(model, capture, MapProjection.of(capture.ground))
-    x0, y0, x1, y1 = capture_extent(capture, surveyor.above.placement)
+    x0, y0, x1, y1 = capture_extent(capture, surveyor.nadir_camera.placement)
     grid = grid_from_bbox((x0, y0, x1, y1), 0.2)
-    whole = surveyor.tile(grid)
+    whole = surveyor.render_tile(grid)
     for column, row, part in grid.tiles(40):
-        tile = surveyor.tile(part)
+        tile = surveyor.render_tile(part)
         at = np.s_[row : row + part.height, column : column + part.width]
         # Grid north turns by a millionth from tile to tile; what lies between two splats may fall to the other.
         assert (np.abs(tile.colours.astype(int) - whole.colours[at]) <= 3).mean() > 0.995
@@ -248,7 +248,7 @@ def test_visibility_counts_cameras_and_what_none_sees_is_blank(house):
     capture, model = house
     surveyor = surveyor_of(model, capture, MapProjection.of(capture.ground, "local"))
     grid = PixelGrid(-10.0, 10.0, 0.25, 80, 80)
-    tile = surveyor.tile(grid)
+    tile = surveyor.render_tile(grid)
     x, y = np.meshgrid(grid.left + (np.arange(80) + 0.5) * 0.25, grid.top - (np.arange(80) + 0.5) * 0.25)
     shown = tile.alpha > 0
     places = np.stack([x[shown], y[shown], tile.heights[shown]], axis=1)
@@ -268,9 +268,9 @@ def test_what_hangs_as_high_as_cameras_is_not_in_the_map_and_a_tower_is():
     tower_seen = replace(capture, views=(*capture.views, replace(capture.views[0], camera=_above(5.0, 5.0, 60.0))))
     surveyor = surveyor_of(model, tower_seen, MapProjection.of(capture.ground, "local"))
     grid = PixelGrid(-3.0, 6.5, 0.25, 40, 40)
-    heights = surveyor.tile(grid).heights
+    heights = surveyor.render_tile(grid).heights
     assert heights.max() == pytest.approx(24.0, abs=0.1)
-    low = surveyor_of(model, capture, MapProjection.of(capture.ground, "local")).tile(
+    low = surveyor_of(model, capture, MapProjection.of(capture.ground, "local")).render_tile(
         PixelGrid(-3.0, 0.0, 0.25, 12, 12)
     )
     assert low.heights[low.alpha > 0].max() < 1.0
@@ -457,8 +457,8 @@ def test_detail_comes_from_the_photographs_where_they_see_the_place(house, tmp_p
     capture = photographed(capture, model, tmp_path, woven)
     grid = PixelGrid(-3.0, 5.0, 0.08, 120, 100)
     placement, sharpener = MapProjection.of(capture.ground, "local"), DetailTransfer(model, capture)
-    plain = surveyor_of(model, capture, placement).tile(grid)
-    sharp = surveyor_of(model, capture, placement, sharpener=sharpener).tile(grid)
+    plain = surveyor_of(model, capture, placement).render_tile(grid)
+    sharp = surveyor_of(model, capture, placement, sharpener=sharpener).render_tile(grid)
     sharpener.close()
     np.testing.assert_array_equal(sharp.heights, plain.heights)
     gained = (sharp.colours.astype(float) - plain.colours).mean(axis=-1) / 255
@@ -505,10 +505,10 @@ def test_detail_knows_no_borders_of_tiles(house, tmp_path, monkeypatch, most):
     sharpener = DetailTransfer(model, capture)
     surveyor = surveyor_of(model, capture, MapProjection.of(capture.ground, "local"), sharpener=sharpener)
     grid = PixelGrid(-8.0, 4.0, 0.08, 200, 100)
-    whole = surveyor.tile(grid).colours
+    whole = surveyor.render_tile(grid).colours
     joined = np.zeros_like(whole)
     for column, row, part in grid.tiles(50):
-        joined[row : row + part.height, column : column + part.width] = surveyor.tile(part).colours
+        joined[row : row + part.height, column : column + part.width] = surveyor.render_tile(part).colours
     sharpener.close()
     assert np.ptp(whole[..., 0].astype(int)) > 10
     off = np.abs(joined.astype(int) - whole)

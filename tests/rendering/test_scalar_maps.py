@@ -150,4 +150,4 @@ def test_numbers_are_of_maps_in_folders(tmp_path: Path) -> None:
     with pytest.raises(VdgsError, match="--raw"):
         _check(RenderRequest(run=tmp_path, output=tmp_path / "out", raw=True))
     with pytest.raises(VdgsError, match="a film holds no numbers"):
-        _check(RenderRequest(run=tmp_path, output=tmp_path / "film.mp4", kind="depth", raw=True))
+        _check(RenderRequest(run=tmp_path, output=tmp_path / "film.mp4", mode="depth", raw=True))

@@ -49,17 +49,17 @@ def test_the_report_says_what_is_there(capture, tmp_path):
     visibility = count_visibility(
         torch.from_numpy(capture.points), [view.camera for view in capture.train_views]
     ).numpy()
-    assert (report.photographs, report.train, report.test) == (12, 10, 2)
+    assert (report.num_images, report.train, report.test) == (12, 10, 2)
     assert report.image_sizes == [(64, 48)]
     assert report.image_bytes == 12 * 64 * 48 * 3
-    assert report.share_below[5] == pytest.approx((visibility < 5).mean())
+    assert report.fraction_below[5] == pytest.approx((visibility < 5).mean())
     assert report.visibility_quantiles[50] == np.median(visibility)
     assert report.camera_height[1] == pytest.approx(10, abs=0.1)
     assert report.ground_sample_distance == pytest.approx(10 / (0.9 * 64), rel=0.2)
     assert not report.metric
     stored = json.loads((tmp_path / "out" / "report.json").read_text(encoding="utf-8"))
     assert stored["points"] == report.points
-    assert stored["share_below"]["3"] == report.share_below[3]
+    assert stored["share_below"]["3"] == report.fraction_below[3]
     for name in report.figures:
         pixels = cv2.imread(str(tmp_path / "out" / name))
         assert pixels.shape[1] > 900

@@ -397,10 +397,10 @@ def test_the_report_stays_small_with_many_views_and_large_pictures(tmp_path):
 
 def test_a_picture_keeps_its_shape_and_stands_on_white():
     wide = reduce_image(Image.new("RGBA", (4000, 1000), (0, 0, 0, 0)))
-    assert (wide.width, wide.height, wide.kind) == (1600, 400, "png")
+    assert (wide.width, wide.height, wide.format) == (1600, 400, "png")
     noise = Image.fromarray(np.random.default_rng(1).integers(0, 256, (900, 900, 3), dtype=np.uint8))
     small = reduce_image(noise)
-    assert small.kind == "jpeg"
+    assert small.format == "jpeg"
     assert len(small.content) <= MAX_BYTES
 
 

@@ -21,7 +21,7 @@ MERGED = StatusRecord(
     block_models=("a-1", None),
     seconds=1.0,
     merge_seconds=0.25,
-    model="b-2",
+    model_id="b-2",
 )
 CUT = PartitionRecord(
     key="k",
@@ -29,7 +29,7 @@ CUT = PartitionRecord(
     strategy="visibility",
     lambda_vis=1.0,
     warnings=("a warning",),
-    complaints=(),
+    assignment_warnings=(),
     blocks=(
         BlockCamerasRecord(
             block=0,

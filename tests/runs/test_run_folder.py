@@ -29,22 +29,22 @@ def settings(**changes) -> RunSettings:
 
 def test_the_same_settings_continue(tmp_path):
     run = RunFolder(tmp_path / "run")
-    run.begin(settings())
-    run.begin(settings())
+    run.create_or_check(settings())
+    run.create_or_check(settings())
     assert run.settings() == settings()
 
 
 def test_changed_settings_are_refused_with_the_difference(tmp_path):
     run = RunFolder(tmp_path / "run")
-    run.begin(settings())
+    run.create_or_check(settings())
     with pytest.raises(RunError, match="seed: 0 -> 5"):
-        run.begin(settings(seed=5))
+        run.create_or_check(settings(seed=5))
 
 
 def test_a_folder_with_other_files_is_refused(tmp_path):
     (tmp_path / "holiday.jpg").write_bytes(b"x")
     with pytest.raises(RunError, match=r"holiday\.jpg"):
-        RunFolder(tmp_path).begin(settings())
+        RunFolder(tmp_path).create_or_check(settings())
 
 
 def test_one_process_at_a_time(tmp_path):
@@ -82,7 +82,7 @@ def test_a_setting_that_is_none_is_named(tmp_path, change, complaint):
 
 def test_settings_are_read_anew_where_the_file_changes(tmp_path):
     run = RunFolder(tmp_path / "run")
-    run.begin(settings())
+    run.create_or_check(settings())
     assert run.settings() == settings()
     run.config.write(settings(seed=7))
     assert run.settings() == settings(seed=7)
@@ -122,7 +122,7 @@ def test_an_unknown_setting_is_named():
 
 def test_a_change_that_costs_trained_work_needs_redo(tmp_path):
     run = RunFolder(tmp_path / "run")
-    run.begin(settings())
+    run.create_or_check(settings())
     other = replace(settings(), partition=replace(settings().partition, lambda_vis=0.7))
     run.change_settings(other, overwrite=False)  # nothing is trained yet
     run.block(0).reset_unless(run.keys().blocks)
@@ -194,7 +194,7 @@ def test_blocks_share_the_run_and_one_process_works_on_each(tmp_path):
 
 
 def test_validation_names_each_problem():
-    bad = MethodConfig(TrainConfig(iterations=-1, resolutions=((0.5, 2),)))
+    bad = MethodConfig(TrainConfig(iterations=-1, resolution_schedule=((0.5, 2),)))
     assert len(validate_config(bad)) == 2
 
 
@@ -230,7 +230,7 @@ def _changed(settings: dict, path: tuple[str, ...]) -> dict:
 
 
 def test_a_ramp_needs_a_frozen_decoder():
-    ramp = BlockConfig(ring="ramp", decoder="own")
+    ramp = BlockConfig(margin="ramp", decoder="own")
     assert any("ramp needs --block.decoder frozen" in each for each in validate_config(MethodConfig(block=ramp)))
     assert validate_config(MethodConfig(block=replace(ramp, decoder="frozen"))) == []
 
@@ -239,16 +239,16 @@ def test_a_ramp_needs_a_frozen_decoder():
     ("average", "until", "problems"), [(0.0, 1.0, 0), (0.3, 0.99, 0), (0.3, 1.0, 1), (1.0, 0.5, 1), (-0.1, 0.5, 1)]
 )
 def test_a_mean_needs_an_end_of_growth(average, until, problems):
-    growth = DensifyConfig(until=until)
-    coarse = MethodConfig(training=TrainConfig(average=average, growth=growth))
-    block = MethodConfig(block=BlockConfig(average=average, growth=growth))
+    growth = DensifyConfig(stop_fraction=until)
+    coarse = MethodConfig(training=TrainConfig(swa_fraction=average, densify=growth))
+    block = MethodConfig(block=BlockConfig(swa_fraction=average, densify=growth))
     assert [len(validate_config(each)) for each in (coarse, block)] == [problems, problems]
     assert all("growth.until" in each or "average" in each for each in validate_config(coarse) + validate_config(block))
 
 
 @pytest.mark.parametrize(("begins", "problems"), [(0.5, 0), (0.51, 1)])
 def test_a_mean_is_of_models_of_one_image_size(begins, problems):
-    settings = {"average": 0.5, "growth": DensifyConfig(until=0.4), "resolutions": ((0.0, 2), (begins, 1))}
+    settings = {"average": 0.5, "growth": DensifyConfig(stop_fraction=0.4), "resolutions": ((0.0, 2), (begins, 1))}
     assert len(validate_config(MethodConfig(training=TrainConfig(**settings)))) == problems
     assert len(validate_config(MethodConfig(block=BlockConfig(**settings)))) == problems
 

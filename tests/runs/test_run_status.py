@@ -41,7 +41,7 @@ def trained(folder, key: str, seed: int, block: int | None = None) -> str:
     folder.reset_unless(key)
     replace(model_at(PLACES, seed), metadata=ModelMetadata(key=key, block=block)).save(folder.model)
     folder.set_status(
-        StatusRecord(state="done", iteration=40, iterations=40, anchors=2, seconds=3.0, model=file_id(folder.model))
+        StatusRecord(state="done", iteration=40, iterations=40, anchors=2, seconds=3.0, model_id=file_id(folder.model))
     )
     return file_id(folder.model)
 
@@ -56,7 +56,7 @@ def measured(folder: Path, model: str, psnr: float, name: str) -> None:
 def run(tmp_path) -> RunFolder:
     """A whole run of two blocks, by hand, with its report."""
     run = RunFolder(tmp_path / "run")
-    run.begin(RunSettings.of("/nowhere", CaptureOptions(), MethodConfig()), command=COMMAND)
+    run.create_or_check(RunSettings.of("/nowhere", CaptureOptions(), MethodConfig()), command=COMMAND)
     coarse = trained(run.coarse, run.keys().coarse, 0)
     measured(run.coarse.path / "evaluation", coarse, 21.25, "coarse")
     keys = run.keys()
@@ -139,7 +139,7 @@ def test_a_coarse_model_trained_again_makes_all_that_was_built_on_it_out_of_date
 def test_a_block_trained_again_makes_the_merged_model_out_of_date(run):
     trained(run.block(1), run.keys().blocks, seed=9, block=1)
     standing = get_run_status(run)
-    assert (standing.of("merge").state, standing.of("merge").why) == ("stale", OTHER_BLOCKS)
+    assert (standing.of("merge").state, standing.of("merge").reason) == ("stale", OTHER_BLOCKS)
     assert standing.of("evaluation").state == "stale"
     assert standing.next_command() == COMMAND  # which merges and measures again
 
@@ -159,10 +159,10 @@ def test_figures_that_nothing_vouches_for_are_shown_with_a_caution(run):
 
 
 def test_what_fails_and_stops_is_said_with_its_reason(run):
-    run.block(0).set_status(StatusRecord(state="failed", iteration=7, iterations=40, why="out of memory\nmore of it"))
+    run.block(0).set_status(StatusRecord(state="failed", iteration=7, iterations=40, reason="out of memory\nmore of it"))
     run.block(1).set_status(StatusRecord(state="running", iteration=9, iterations=40))
     standing = get_run_status(run)
-    assert (standing.of("block 0").state, standing.of("block 0").why) == ("failed", "out of memory")
+    assert (standing.of("block 0").state, standing.of("block 0").reason) == ("failed", "out of memory")
     assert standing.of("block 1").state == "stopped"  # no process works on it
     assert standing.next_command() == COMMAND  # which takes it to its end
     with run.block(1).locked():

@@ -15,8 +15,8 @@ PLAIN = MethodConfig()
 CHANGED = {
     "adam": replace(PLAIN, training=replace(PLAIN.training, optimizer="dense")),
     "stereo": replace(PLAIN, training=replace(PLAIN.training, anchors=replace(PLAIN.training.anchors, mvs=True))),
-    "exposure": replace(PLAIN, training=replace(PLAIN.training, exposure=True)),
-    "spread": replace(PLAIN, training=replace(PLAIN.training, exposure=True, exposure_min_spread=0.1)),
+    "exposure": replace(PLAIN, training=replace(PLAIN.training, exposure_compensation=True)),
+    "spread": replace(PLAIN, training=replace(PLAIN.training, exposure_compensation=True, exposure_min_spread=0.1)),
     "bound": replace(
         PLAIN, training=replace(PLAIN.training, anchors=replace(PLAIN.training.anchors, bound_scales=False))
     ),
@@ -35,11 +35,11 @@ def test_a_setting_that_changes_training_changes_all_keys_after_it(name):
 
 
 def test_settings_of_blocks_and_assignment_leave_what_is_before_them():
-    block = replace(PLAIN.block, compensation=replace(PLAIN.block.compensation, added_to="sum"))
+    block = replace(PLAIN.block, compensation=replace(PLAIN.block.compensation, target="sum"))
     changed, plain = keys(replace(PLAIN, block=block)), keys(PLAIN)
     assert (changed.coarse, changed.assignment) == (plain.coarse, plain.assignment)
     assert changed.blocks != plain.blocks
-    changed = keys(replace(PLAIN, assignment=replace(PLAIN.assignment, best_block=False)))
+    changed = keys(replace(PLAIN, assignment=replace(PLAIN.assignment, always_best=False)))
     assert changed.partition == plain.partition
     assert changed.assignment != plain.assignment
 

@@ -54,7 +54,7 @@ def made(flight, nine_begun, tmp_path_factory) -> Path:
     """Placed by GPS; its features, matches and model are kept."""
     output = tmp_path_factory.mktemp("made") / "capture"
     copy_folder(nine_begun["writing"], output)
-    reconstruct(SfmRequest(photographs=(flight.folder,), output=output, threads=1, keep_work=True), console())
+    reconstruct(SfmRequest(image_folders=(flight.folder,), output=output, threads=1, keep_intermediate=True), console())
     return output
 
 
@@ -99,8 +99,8 @@ def test_all_ways_to_name_a_system_lead_to_the_same_places(flight, points, tmp_p
     assert np.abs(control.enu(ORIGIN) - truth).max() < 0.001
     assert control.has_control_points
     for point, seen in zip(control.points, points, strict=True):
-        for sighting in point.sightings:
-            number = flight.names.index(sighting.photograph)
+        for sighting in point.observations:
+            number = flight.names.index(sighting.image)
             assert sighting.pixel == pytest.approx(seen[number], abs=0.001)
 
 
@@ -111,7 +111,7 @@ def test_pixels_are_those_of_the_file_before_it_is_turned(tmp_path, orientation)
     (tmp_path / "card").mkdir()
     for k in range(3):
         write_photograph(tmp_path / "card" / f"p{k}.jpg", pixels, k, None, orientation)
-    photo = collect_images([tmp_path / "card"]).photographs[0]
+    photo = collect_images([tmp_path / "card"]).images[0]
     with Image.open(photo.path) as image:
         upright = np.array(ImageOps.exif_transpose(image).convert("L"))
     row, column = np.unravel_index(int(upright.argmax()), upright.shape)
@@ -179,7 +179,7 @@ def test_files_that_are_no_lists_are_refused(flight, tmp_path):
         read_gcp_list(tmp_path / "sound.txt", collection, ("gate",))
     with pytest.raises(VdgsError, match="give it with --gcp"):
         plan_reconstruction(
-            SfmRequest(photographs=(flight.folder,), output=tmp_path / "out", options=SfmOptions(check_points=("a",)))
+            SfmRequest(image_folders=(flight.folder,), output=tmp_path / "out", options=SfmOptions(check_points=("a",)))
         )
 
 
@@ -193,7 +193,7 @@ def test_points_along_a_line_and_in_another_zone_are_refused(flight, tmp_path):
     with pytest.raises(CaptureError, match=r"km from the photographs.*UTM zone 18S"):
         plan_reconstruction(
             SfmRequest(
-                photographs=(flight.folder,), output=tmp_path / "out", options=SfmOptions(gcp=tmp_path / "zone.txt")
+                image_folders=(flight.folder,), output=tmp_path / "out", options=SfmOptions(gcp=tmp_path / "zone.txt")
             )
         )
     check_gcps_near(
@@ -202,7 +202,7 @@ def test_points_along_a_line_and_in_another_zone_are_refused(flight, tmp_path):
 
 
 def test_names_may_be_of_folders_without_endings_in_other_letters_and_with_blanks(flight, tmp_path):
-    photographs = collect_images([flight.folder]).photographs
+    photographs = collect_images([flight.folder]).images
     collection = ImageList(
         (flight.folder,),
         (replace(photographs[0], name="one/DJI_0001.JPG"), replace(photographs[1], name="two/DJI_0001.JPG"),
@@ -217,7 +217,7 @@ def test_names_may_be_of_folders_without_endings_in_other_letters_and_with_blank
         return read_gcp_list(tmp_path / "list.txt", collection, ())
 
     control = read("Two\\dji_0001.jpg", "The Mill")
-    assert [each.photograph for each in control.points[0].sightings] == ["two/DJI_0001.JPG", "the_mill.JPG"]
+    assert [each.image for each in control.points[0].observations] == ["two/DJI_0001.JPG", "the_mill.JPG"]
     with pytest.raises(CaptureError, match=r"may be one/DJI_0001\.JPG or two/DJI_0001\.JPG: write the folder"):
         read("DJI_0001.JPG", "the mill.jpg")
     with pytest.raises(CaptureError, match="only one photograph shows a, b, c"):
@@ -234,7 +234,7 @@ def surveyed(made: Path, flight: Flight, tmp_path: Path, file: Path, *held_out: 
     options = SfmOptions(gcp=file, check_points=held_out)
     said = console()
     facts = reconstruct(
-        SfmRequest(photographs=(flight.folder,), output=output, threads=1, options=options, keep_work=True), said
+        SfmRequest(image_folders=(flight.folder,), output=output, threads=1, options=options, keep_intermediate=True), said
     )
     return facts, load_capture(output), said.file.getvalue()
 

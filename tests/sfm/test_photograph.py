@@ -59,7 +59,7 @@ def positions_of(photographs):
 def test_a_photograph_says_where_it_was_taken_and_through_what(tmp_path):
     seen = photograph(tmp_path, 1, (30.0, -20.0, 41.5))
     truth = geodetic_from_enu(np.array([[30.0, -20.0, 41.5]]), ORIGIN)[0]
-    assert seen.place == pytest.approx(truth[:2], abs=1e-8)  # south and west
+    assert seen.lat_lon == pytest.approx(truth[:2], abs=1e-8)  # south and west
     assert seen.altitude == pytest.approx(truth[2], abs=1e-3)
     assert (seen.width, seen.height, seen.relative_altitude) == (160, 120, 41.5)
     assert seen.lens is not None
@@ -89,7 +89,7 @@ def test_rtk_says_how_accurate_it_is(tmp_path):
 
 def test_exif_says_how_accurate_a_phone_is_where_rtk_does_not(tmp_path):
     seen = [photograph(tmp_path, k, (9.0 * k, 0, 40), error_m=4.5) for k in range(3)]
-    assert [each.error_m for each in seen] == [4.5] * 3
+    assert [each.gps_error_m for each in seen] == [4.5] * 3
     assert positions_of(seen).gps_std[0] == pytest.approx([4.5, 4.5, 9])
     better = [replace(each, gps_std=(0.02, 0.02, 0.04)) for each in seen]
     assert positions_of(better).gps_std[0] == pytest.approx([0.02, 0.02, 0.04])
@@ -97,7 +97,7 @@ def test_exif_says_how_accurate_a_phone_is_where_rtk_does_not(tmp_path):
     table.write_text("name,lat,lon,alt\n" + "".join(f"p{k:02d},10.{k:04d},20,5\n" for k in range(3)))
     assert read_gps_priors(seen, table, (1.0, 2.0)).gps_std[0] == pytest.approx([1, 1, 2])
     for nothing in (0.0, 99_999.0):
-        assert photograph(tmp_path, 5, (0, 0, 40), error_m=nothing).error_m is None
+        assert photograph(tmp_path, 5, (0, 0, 40), error_m=nothing).gps_error_m is None
 
 
 @pytest.mark.parametrize("cut", [0, 10, 200, 3000, -2000])
@@ -149,7 +149,7 @@ def test_xmp_is_read_as_attributes_and_as_elements_and_expands_nothing():
 def test_an_enormous_packet_is_no_trouble(tmp_path):
     photograph(tmp_path, 1, None)
     add_xmp(tmp_path / "p01.jpg", b'y:A="1" ' * 8000)
-    assert read_image_metadata(tmp_path / "p01.jpg", "p01.jpg").place is None
+    assert read_image_metadata(tmp_path / "p01.jpg", "p01.jpg").lat_lon is None
 
 
 # ------------------------------------------------------------------------------------------------------ lens
@@ -216,8 +216,8 @@ def test_a_tilted_model_is_told_from_a_camera_that_hangs_askew(tmp_path, tilt, a
 
 def test_positions_that_cannot_be_are_left_out_and_named(tmp_path):
     seen = flight(tmp_path)
-    seen[1] = replace(seen[1], place=(0.0, 0.0))
-    seen[2] = replace(seen[2], place=(ORIGIN[0] + 1, ORIGIN[1]))
+    seen[1] = replace(seen[1], lat_lon=(0.0, 0.0))
+    seen[2] = replace(seen[2], lat_lon=(ORIGIN[0] + 1, ORIGIN[1]))
     seen[3] = replace(seen[3], altitude=None)
     found = positions_of(seen)
     assert found.index.tolist() == [0, 4, 5]
@@ -255,11 +255,11 @@ def test_what_is_not_used_is_named_with_its_reason(tmp_path):
     (tmp_path / "p04.png").write_bytes((tmp_path / "p05.jpg").read_bytes() + b"\0")
     (tmp_path / "cut.jpg").write_bytes((tmp_path / "p02.jpg").read_bytes()[:4000])
     found = collect_images([tmp_path])
-    reasons = {each.name: each.why for each in found.left_out}
+    reasons = {each.name: each.reason for each in found.excluded}
     assert "cut off" in reasons["cut.jpg"]
     assert "copy of copy.jpg" in reasons["p03.jpg"]
     assert "another ending" in reasons["p04.png"]
-    assert (len(found.photographs), found.other_files) == (6, 1)
+    assert (len(found.images), found.other_files) == (6, 1)
 
 
 def test_folders_are_told_apart(tmp_path):
@@ -268,7 +268,7 @@ def test_folders_are_told_apart(tmp_path):
     (tmp_path / "b/card/p01.jpg").write_bytes((tmp_path / "b/card/p01.jpg").read_bytes() + b"\0")
     (tmp_path / "b/card/p00.jpg").write_bytes((tmp_path / "b/card/p00.jpg").read_bytes() + b"\0")
     found = collect_images([tmp_path / "a/card", tmp_path / "b/card"])
-    assert [photo.name for photo in found.photographs] == [f"card_{n}/p0{k}.jpg" for n in (1, 2) for k in (0, 1)]
+    assert [photo.name for photo in found.images] == [f"card_{n}/p0{k}.jpg" for n in (1, 2) for k in (0, 1)]
 
 
 @pytest.mark.parametrize(
@@ -290,7 +290,7 @@ def test_outputs_among_photographs_are_refused(tmp_path):
     flight(tmp_path / "card")
     for output in ("card", "card/out"):
         with pytest.raises(VdgsError, match="among the photographs"):
-            plan_reconstruction(SfmRequest(photographs=(tmp_path / "card",), output=tmp_path / output))
+            plan_reconstruction(SfmRequest(image_folders=(tmp_path / "card",), output=tmp_path / output))
     assert is_image_folder(tmp_path / "card")
     (tmp_path / "card/sparse").mkdir()
     assert not is_image_folder(tmp_path / "card")  # a capture that lacks something is told so
@@ -313,8 +313,8 @@ def test_the_look_says_what_the_flight_is(tmp_path):
 def test_other_days_and_small_files_are_remarked(tmp_path):
     seen = flight(tmp_path)
     kept = collect_images([tmp_path])
-    other = replace(seen[0], taken="2026:08:01 10:00:00", bytes=100)
-    found = make_preflight_report(replace(kept, photographs=(other, *kept.photographs[1:])), positions_of(seen))
+    other = replace(seen[0], datetime="2026:08:01 10:00:00", file_bytes=100)
+    found = make_preflight_report(replace(kept, images=(other, *kept.images[1:])), positions_of(seen))
     assert any("taken on 2 days" in each for each in found.warnings)
     assert any("p00.jpg" in each and "smaller files" in each for each in found.warnings)
 
@@ -359,7 +359,7 @@ def test_without_attitudes_the_focal_length_is_held_where_positions_are_those_of
 ):
     """Older drones and cameras on wings record nothing but positions; phones and hands record no more."""
     silent = replace(photograph(tmp_path, 0), attitude=None, relative_altitude=None)
-    silent = replace(silent, place=None) if places is None else silent
+    silent = replace(silent, lat_lon=None) if places is None else silent
     photographs = [silent] * (10 if places is None else len(places))
     where = positions_of(photographs)
     if places is not None:

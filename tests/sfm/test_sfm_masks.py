@@ -79,14 +79,14 @@ def test_masks_beside_photographs_are_masks(tmp_path, asked, names, masks):
     for k in range(3):
         write_mask(tmp_path / masks.format(k), left_half())
     found = collect_images([tmp_path / asked])
-    assert len(found.photographs) == 4
-    assert (found.left_out, found.other_files) == ((), 0)
-    assert [photo.mask and photo.mask.name for photo in found.photographs] == [
+    assert len(found.images) == 4
+    assert (found.excluded, found.other_files) == ((), 0)
+    assert [photo.mask and photo.mask.name for photo in found.images] == [
         *(Path(masks.format(k)).name for k in range(3)), None,
     ]  # fmt: skip
     assert any("3 of 4 photographs have a mask" in note for note in found.notes)
     said = console()
-    print_plan(plan_reconstruction(SfmRequest(photographs=(tmp_path / asked,), output=tmp_path.parent / "new")), said)
+    print_plan(plan_reconstruction(SfmRequest(image_folders=(tmp_path / asked,), output=tmp_path.parent / "new")), said)
     assert "3 of 4 photographs have one" in said.file.getvalue()
 
 
@@ -105,7 +105,7 @@ def test_masks_of_nothing_and_of_other_shapes_are_named(tmp_path):
     wrong.unlink()
     alone = tmp_path / "alone"
     photographs(alone, *(f"masks/{k}.jpg" for k in range(3)))
-    assert len(collect_images([alone]).photographs) == 3  # of masks, at the carnival
+    assert len(collect_images([alone]).images) == 3  # of masks, at the carnival
 
 
 def test_other_folders_of_masks_are_asked_of_captures_only(tmp_path):
@@ -130,7 +130,7 @@ def test_masks_turn_with_their_photographs(tmp_path, orientation):
     with Image.open(tmp_path / "turned.png") as image:
         truth = np.array(ImageOps.exif_transpose(image)) > 0
     (tmp_path / "turned.png").unlink()
-    found = collect_images([tmp_path]).photographs
+    found = collect_images([tmp_path]).images
     assert np.array_equal(read_keep_mask(found[0]), truth)
     assert read_keep_mask(found[1]) is None
     if orientation >= 5:  # as programs write it that turn photographs themselves
@@ -145,12 +145,12 @@ def test_transparency_is_a_mask_and_both_count(tmp_path):
     upper = np.zeros((120, 160), bool)
     upper[:60] = True
     write_mask(tmp_path / "masks/1.png", upper)
-    first, second, third = collect_images([tmp_path]).photographs
+    first, second, third = collect_images([tmp_path]).images
     assert np.array_equal(read_keep_mask(first), left_half())
     assert np.array_equal(read_keep_mask(second), left_half() & upper)
     assert read_keep_mask(third) is None
     said = console()
-    print_plan(plan_reconstruction(SfmRequest(photographs=(tmp_path,), output=tmp_path.parent / "new")), said)
+    print_plan(plan_reconstruction(SfmRequest(image_folders=(tmp_path,), output=tmp_path.parent / "new")), said)
     assert "1 of 3 photographs have one; 3 have an alpha channel" in said.file.getvalue()
 
 
@@ -168,9 +168,9 @@ def masked(nine, tmp_path) -> Flight:
 def test_features_lie_where_masks_are_white(masked, tmp_path):
     silence_colmap()
     collection = collect_images([masked.folder])
-    seen = (collection.photographs[0], collection.photographs[5])
+    seen = (collection.images[0], collection.images[5])
     black = write_mask(tmp_path / "black.png", np.zeros((300, 400), bool))
-    seen = (*seen, replace(collection.photographs[1], mask=black))
+    seen = (*seen, replace(collection.images[1], mask=black))
     work, kinds = Workspace(tmp_path / "work"), feature_extraction.group_by_camera(seen)
     feature_extraction.create_database(work, kinds)
     feature_extraction.write_upright_images(work, seen)
@@ -189,7 +189,7 @@ def test_features_lie_where_masks_are_white(masked, tmp_path):
 
 def test_masks_are_written_with_the_capture_and_what_depends_on_them_is_done_again(nine_begun, masked, tmp_path):
     output, keys = tmp_path / "capture", []
-    request = SfmRequest(photographs=(masked.folder,), output=output, threads=1, options=SfmOptions(max_size=200))
+    request = SfmRequest(image_folders=(masked.folder,), output=output, threads=1, options=SfmOptions(max_output_size=200))
     first = masked.folder / f"masks/{masked.names[0]}.png"
     for change in (lambda: None, lambda: write_mask(first, ~left_half(300, 400)), first.unlink):
         change()
@@ -200,7 +200,7 @@ def test_masks_are_written_with_the_capture_and_what_depends_on_them_is_done_aga
     copy_folder(nine_begun["writing"], output)
     write_mask(first, left_half(300, 400))
     prepared, work = plan_reconstruction(request), Workspace(output / "work")
-    write_upright_masks(work, prepared.image_list.photographs, 1)
+    write_upright_masks(work, prepared.image_list.images, 1)
     model = incremental_mapper.read_models(work)[0]
     write_mask(output / "masks/old.png", left_half())  # of other masks
     reconstruct._write(prepared, work, model, "key", 1, console())

@@ -38,7 +38,7 @@ def scene() -> AnchorModel:
         offsets=0.3 * torch.randn(n, 4, 3, generator=g),
         log_scales=torch.full((n, 6), float(np.log(0.6))),
     )
-    tensors = Decoder.initial(4, False, 0, 1, g).tensors()
+    tensors = Decoder.init_random(4, False, 0, 1, g).tensors()
     tensors["opacity_b2"] = tensors["opacity_b2"] + 3.0  # what is in view is opaque
     tensors["colour_b2"] = tensors["colour_b2"] + 1.0  # and lighter than the black behind it
     return AnchorModel(
@@ -72,6 +72,6 @@ def hand_made(scores, held=None, mode="coverage") -> ScoreMatrix:
     held = (values > 0).astype(np.int32) if held is None else np.array(held, np.int32)
     anchors = np.full(values.shape[1], 1000, np.int64)
     return ScoreMatrix(
-        mode=mode, scores=values, held=held, covered=values.copy(), anchors=anchors,
-        beneath=np.zeros(len(values), np.int64),
+        mode=mode, scores=values, visible_anchors=held, coverage=values.copy(), anchors=anchors,
+        nadir_block=np.zeros(len(values), np.int64),
     )  # fmt: skip

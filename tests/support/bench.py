@@ -44,5 +44,5 @@ def benched(
     choices = PlanOptions(
         seeds=1, scenes=("copr",), methods=methods, iterations_total=total, max_anchors=300, renders=renders
     )
-    asked = BenchSettings("table1", output, choices, data, redo=redo)
+    asked = BenchSettings("table1", output, choices, data, overwrite=redo)
     return {each.method: each for each in run_bench(asked, Console(file=io.StringIO()))}

@@ -19,9 +19,9 @@ from vdgs.training import FrozenAnchors, TrainingProblem, TrainingState, initial
 
 CONFIG = TrainConfig(
     iterations=40,
-    anchors=AnchorConfig(offsets=4),
-    growth=DensifyConfig(
-        interval=10, stats_start=0, start=10, until=1.0, threshold=1e-6, coarsest_voxels=4.0, gate=0.05
+    anchors=AnchorConfig(num_offsets=4),
+    densify=DensifyConfig(
+        every=10, stats_start=0, start=10, stop_fraction=1.0, grad_threshold=1e-6, coarsest_voxels=4.0, min_draw_fraction=0.05
     ),
     compensation=CompensationConfig(t_low=0.5),
 )
@@ -38,7 +38,7 @@ def coarse() -> tuple[Anchors, Decoder]:
     x, y = np.meshgrid(np.arange(-3.9, 4, 0.4), np.arange(-3.1, 3.2, 0.4))
     points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
     anchors, _ = initialize_anchors(
-        points, np.zeros((x.size, 3), np.uint8), [], AnchorConfig(offsets=4, voxel_size=0.4)
+        points, np.zeros((x.size, 3), np.uint8), [], AnchorConfig(num_offsets=4, voxel_size=0.4)
     )
     generator = torch.Generator().manual_seed(0)
     anchors = replace(
@@ -46,7 +46,7 @@ def coarse() -> tuple[Anchors, Decoder]:
         features=torch.randn(len(anchors), 32, generator=generator) * 0.3,
         offsets=torch.randn(len(anchors), 4, 3, generator=generator) * 0.3,
     )
-    return anchors, Decoder.initial(4, False, 0, 8, generator)
+    return anchors, Decoder.init_random(4, False, 0, 8, generator)
 
 
 def block_stage(
@@ -57,8 +57,8 @@ def block_stage(
     own, around = split_trainable_anchors(anchors, BLOCKS, index, config)
     surroundings = anchors.select(around & visible_anchors(anchors, photographs.cameras))
     stage = TrainingProblem(
-        config=training, images=photographs, image_count=8, voxel_size=0.4, camera_height=5.0, frozen_decoder=True,
-        surroundings=FrozenAnchors(surroundings, decoder), may_hold=growth_mask(BLOCKS, index, config),
+        config=training, images=photographs, num_images=8, voxel_size=0.4, camera_height=5.0, frozen_decoder=True,
+        frozen_anchors=FrozenAnchors(surroundings, decoder), growth_mask=growth_mask(BLOCKS, index, config),
         lr_mask=lr_ramp(BLOCKS, index, config),
     )  # fmt: skip
     return stage, initial_state(anchors.select(own), decoder, stage)

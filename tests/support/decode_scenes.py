@@ -142,7 +142,7 @@ def moved_by(
         opacities=torch.randn(m, generator=g),
         volume=0.3,
         source=splats.source,
-        colour_values=splats.colours,
+        color_values=splats.colors,
         opacity_values=splats.opacities,
     )
     if spoil:
@@ -162,7 +162,7 @@ def moved_by(
 
 def elsewhere(gradients: SplatGradients, shown: SplatMask) -> SplatGradients:
     """Gradients of splats in their order, as those of splats that stand otherwise; what these looked like is lost."""
-    order = shown.runs.order(len(shown))
+    order = shown.segments.order(len(shown))
     moved = {}
     for name in ("means_px", "conics", "colours", "opacities"):
         moved[name] = torch.empty_like(getattr(gradients, name))

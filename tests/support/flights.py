@@ -84,7 +84,7 @@ def folders_of_steps(flight: Flight, folder: Path) -> dict[str, Path]:
         for step, name in (("matching", "_matches"), ("mapping", "_models"), ("writing", "_write")):
             patch.setattr(reconstructing, name, _after_copying(getattr(reconstructing, name), output, folder / step))
         reconstructing.reconstruct(
-            SfmRequest(photographs=(flight.folder,), output=output, threads=1), Console(file=io.StringIO())
+            SfmRequest(image_folders=(flight.folder,), output=output, threads=1), Console(file=io.StringIO())
         )
     return {step: folder / step for step in ("matching", "mapping", "writing")}
 
@@ -108,11 +108,11 @@ def sightings(cameras: Sequence[Camera], points: np.ndarray, extent: float = 60.
     found = []
     for x, y in points:
         above = np.array([[x, y, 300.0]], np.float32)
-        ground = above[0] - [0, 0, tracer.cast(above, np.array([[0, 0, -1]], np.float32)).distance[0]]
+        ground = above[0] - [0, 0, tracer.intersect(above, np.array([[0, 0, -1]], np.float32)).distance[0]]
         seen = {-1: np.asarray(ground, np.float64)}
         for k, camera in enumerate(cameras):
             away = ground - camera.position
-            hit = tracer.cast(camera.position[None].astype(np.float32), away[None].astype(np.float32))
+            hit = tracer.intersect(camera.position[None].astype(np.float32), away[None].astype(np.float32))
             if camera.in_frustum(ground[None])[0] and abs(hit.distance[0] - 1) < 1e-3:
                 seen[k] = camera.project(ground[None])[0][0]
         found.append(seen)

@@ -20,9 +20,9 @@ def random_gaussians(count: int, degree: int, seed: int = 0, reach: float = 3.0)
         means=(torch.rand(count, 3, generator=generator) * 2 - 1) * torch.tensor([reach, reach, reach / 5]),
         log_scales=normal(count, 3) * 0.5 - 1.8,
         quaternions=normal(count, 4),
-        logits=normal(count) + 1,
-        dc=normal(count, 3) * 0.4,
-        rest=normal(count, (degree + 1) ** 2 - 1, 3) * 0.2,
+        opacity_logits=normal(count) + 1,
+        sh0=normal(count, 3) * 0.4,
+        shN=normal(count, (degree + 1) ** 2 - 1, 3) * 0.2,
     )
 
 
@@ -43,7 +43,7 @@ def overhead(height: float = 8.0, aside: float = 2.0, size: int = 96) -> Camera:
 def picture(gaussians: Gaussians, camera: Camera | None = None) -> np.ndarray:
     """What a camera sees before black, RGB in 0 .. 1."""
     with torch.no_grad():
-        raster, _ = render_gaussians(gaussians, camera or overhead(), torch.zeros(3), gaussians.degree)
+        raster, _ = render_gaussians(gaussians, camera or overhead(), torch.zeros(3), gaussians.sh_degree)
     return raster.image.clamp(0, 1).numpy()
 
 

@@ -43,7 +43,7 @@ def model_at(positions: np.ndarray, seed: int = 0, decoder_seed: int = 0) -> Anc
         offsets=0.1 * torch.randn(n, OFFSETS, 3, generator=g),
         log_scales=0.1 * torch.randn(n, 6, generator=g) - 1.0,
     )
-    decoder = Decoder.initial(OFFSETS, False, 0, 0, torch.Generator().manual_seed(decoder_seed))
+    decoder = Decoder.init_random(OFFSETS, False, 0, 0, torch.Generator().manual_seed(decoder_seed))
     return AnchorModel(
         anchors=anchors,
         decoder=decoder,
@@ -78,7 +78,7 @@ def camera_above(x: float, y: float, altitude: float = 4.0, tilt_deg: float = 0.
 
 def ground(origin: tuple[float, float, float] | None) -> GroundFrame:
     return GroundFrame(
-        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, how="hand-made", origin_geo=origin
+        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, description="hand-made", origin_geo=origin
     )
 
 

@@ -49,7 +49,7 @@ def in_runs(splats: Splats, runs: int, seed: int = 0) -> tuple[OrderedSplats, Te
     moved = {field.name: torch.empty_like(getattr(splats, field.name)) for field in fields(Splats)}
     for name, tensor in moved.items():
         tensor[order] = getattr(splats, name).detach()
-    return OrderedSplats(**moved, runs=SplatSegments(begins.to(torch.int32), lengths.to(torch.int32))), order
+    return OrderedSplats(**moved, segments=SplatSegments(begins.to(torch.int32), lengths.to(torch.int32))), order
 
 
 @dataclass(frozen=True)

@@ -18,14 +18,14 @@ BLACK = (0.0, 0.0, 0.0)
 
 CONFIG = TrainConfig(
     iterations=60,
-    resolutions=((0.0, 2), (0.5, 1)),
-    anchors=AnchorConfig(offsets=4, appearance=3),
-    growth=DensifyConfig(interval=10, stats_start=5, start=20, until=0.9, threshold=1e-6, gate=0.05),
+    resolution_schedule=((0.0, 2), (0.5, 1)),
+    anchors=AnchorConfig(num_offsets=4, appearance_dim=3),
+    densify=DensifyConfig(every=10, stats_start=5, start=20, stop_fraction=0.9, grad_threshold=1e-6, min_draw_fraction=0.05),
 )
 
 
 def stage(config: TrainConfig = CONFIG) -> TrainingProblem:
-    return TrainingProblem(config=config, images=Photographs(), image_count=8, voxel_size=0.4, camera_height=5.0)
+    return TrainingProblem(config=config, images=Photographs(), num_images=8, voxel_size=0.4, camera_height=5.0)
 
 
 def start(config: TrainConfig = CONFIG):
@@ -35,7 +35,7 @@ def start(config: TrainConfig = CONFIG):
         points, np.full((300, 3), 128, np.uint8), Photographs().cameras, replace(config.anchors, voxel_size=0.4)
     )
     generator = torch.Generator().manual_seed(config.seed)
-    decoder = Decoder.initial(config.anchors.offsets, False, config.anchors.appearance, 8, generator)
+    decoder = Decoder.init_random(config.anchors.num_offsets, False, config.anchors.appearance_dim, 8, generator)
     return initial_state(anchors, decoder, stage(config))
 
 

@@ -62,7 +62,7 @@ def test_flights_take_what_was_asked_for_and_hit_nothing(
     cameras = make_flight_cameras(options_of(flight, images), town)
     assert len(cameras) == images
     places = np.stack([camera.position for camera in cameras])
-    down = tracer.cast(places.astype(np.float32), np.tile(np.float32([0, 0, -1]), (images, 1)))
+    down = tracer.intersect(places.astype(np.float32), np.tile(np.float32([0, 0, -1]), (images, 1)))
     assert (down.distance > 5).all(), "a camera is inside a building or right above it"
     steepest = max(camera.forward[2] for camera in cameras)
     assert steepest < -np.cos(np.radians(70 if flight in ("distant", "orbits") else 52)), "too near to the horizon"
@@ -200,7 +200,7 @@ def test_outliers_lie_on_a_ray_that_saw_them(town: Town) -> None:
     places = rng.normal(0, 10, (50, 3))
     point, image = np.repeat(np.arange(50), 3), np.tile(np.arange(3), 50)
     cloud = SparseCloud(
-        places=places, points=places.copy(), colours=np.zeros((50, 3), np.uint8), errors=np.zeros(50),
+        true_points=places, points=places.copy(), colours=np.zeros((50, 3), np.uint8), errors=np.zeros(50),
         observed_point=point, observed_image=image, observed_px=rng.normal(size=(150, 2)),
         visibility=np.ones((50, 3), bool), outliers=np.zeros(50, bool),
     )  # fmt: skip

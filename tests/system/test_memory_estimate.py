@@ -82,9 +82,9 @@ def test_the_picture_of_a_block_counts_in_the_largest_size_that_it_trains_with()
     assert max_image_pixels(cameras, ((0.0, 4), (0.1, 2), (0.4, 1))) == 5472 * 3648
     assert max_image_pixels(cameras, ((0.0, 4), (0.5, 2))) == 2736 * 1824
     paper, laptop = (block_workload(PRESETS[name], 50_000, 400_000, 5472 * 3648) for name in ("paper", "laptop"))
-    assert estimate_memory(laptop).picture == 150 * 5472 * 3648
-    assert (laptop.averaged, paper.averaged) == (True, False)
-    assert (laptop.grown, paper.grown) == (150_000, 750_000)
+    assert estimate_memory(laptop).image == 150 * 5472 * 3648
+    assert (laptop.has_swa, paper.has_swa) == (True, False)
+    assert (laptop.max_grown_anchors, paper.max_grown_anchors) == (150_000, 750_000)
     assert laptop.surroundings == 350_000
 
 
@@ -107,11 +107,11 @@ def test_a_mean_of_models_takes_one_more_model(need):
 @pytest.mark.parametrize(("kind", "option"), [("coarse", "--average 0"), ("block", "--block.average 0")])
 def test_the_mean_may_be_given_up(kind, option):
     need = TrainingWorkload(
-        anchors=1_000_000, max_anchors=0, offsets=10, seen=0.4, pixels=10**6, images_bytes=10**8, averaged=True
+        anchors=1_000_000, max_anchors=0, offsets=10, seen=0.4, pixels=10**6, image_cache_bytes=10**8, has_swa=True
     )
     (found,) = [each for each in memory_advice(need, kind, 10**9) if option in each.setting]
-    assert found.saved_bytes == estimate_memory(need).total - estimate_memory(replace(need, averaged=False)).total
-    assert not [each for each in memory_advice(replace(need, averaged=False), kind, 10**9) if option in each.setting]
+    assert found.saved_bytes == estimate_memory(need).total - estimate_memory(replace(need, has_swa=False)).total
+    assert not [each for each in memory_advice(replace(need, has_swa=False), kind, 10**9) if option in each.setting]
 
 
 @pytest.mark.parametrize("kind", ["coarse", "block"])
@@ -128,12 +128,12 @@ def test_advice_is_worth_its_words(kind, need, share):
 @pytest.mark.parametrize("averaged", [False, True])
 def test_the_limit_of_anchors_makes_it_fit(averaged):
     need = TrainingWorkload(
-        anchors=1_000_000, max_anchors=0, offsets=10, seen=0.4, pixels=10**6, images_bytes=10**8, averaged=averaged
+        anchors=1_000_000, max_anchors=0, offsets=10, seen=0.4, pixels=10**6, image_cache_bytes=10**8, has_swa=averaged
     )
     missing = 10**9
     (limit,) = [each for each in memory_advice(need, "coarse", missing) if "max-anchors" in each.setting]
     given = int(limit.setting.split()[1])
-    assert need.anchors < given < need.grown
+    assert need.anchors < given < need.max_grown_anchors
     saved = estimate_memory(need).total - estimate_memory(replace(need, max_anchors=given)).total
     assert missing <= saved == limit.saved_bytes <= 1.01 * missing
     # Growth that would have to be undone is not promised.
@@ -145,7 +145,7 @@ def test_the_line_for_people_says_what_takes_it_and_what_there_is():
     line = describe_memory(
         estimate_memory(
             TrainingWorkload(
-                anchors=100_000, max_anchors=200_000, offsets=10, seen=0.5, pixels=10**6, images_bytes=2 * 10**8
+                anchors=100_000, max_anchors=200_000, offsets=10, seen=0.5, pixels=10**6, image_cache_bytes=2 * 10**8
             )
         ),
         3 * 10**9,
@@ -163,7 +163,7 @@ def test_the_line_for_people_says_what_takes_it_and_what_there_is():
 )
 def test_a_warning_comes_before_training_where_it_will_not_fit(kind, said, monkeypatch, capsys):
     need = TrainingWorkload(
-        anchors=1_000_000, max_anchors=0, offsets=10, seen=0.4, pixels=2 * 10**7, images_bytes=10**9
+        anchors=1_000_000, max_anchors=0, offsets=10, seen=0.4, pixels=2 * 10**7, image_cache_bytes=10**9
     )
     taken = psutil.Process().memory_info().rss  # it grows with the tests that ran before
     monkeypatch.setattr(memory_advice_module, "available_memory_bytes", lambda: int(5.4e9) - taken)

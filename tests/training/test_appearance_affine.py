@@ -140,7 +140,7 @@ class Lit(ViewExposures):
     """Exposures over a place whose views are as light as they say."""
 
     def __init__(self, capture: Capture, departures: torch.Tensor, light: Callable[[View], float]):
-        plain = Decoder.initial(2, False, 0, 0, torch.Generator())
+        plain = Decoder.init_random(2, False, 0, 0, torch.Generator())
         decoder = replace(plain, exposure=departures.float())
         super().__init__(
             AnchorModel(anchors=nothing(), decoder=decoder, voxel_size=0.4, background=(0.0, 0.0, 0.0)), capture
@@ -194,7 +194,7 @@ def test_a_camera_that_meters_exposes_what_is_brighter_less(slope):
 
 
 def test_a_model_without_exposures_has_none():
-    plain = Decoder.initial(2, False, 0, 0, torch.Generator())
+    plain = Decoder.init_random(2, False, 0, 0, torch.Generator())
     model = AnchorModel(anchors=nothing(), decoder=plain, voxel_size=0.4, background=(0.0, 0.0, 0.0))
     assert make_exposures(model, flown(a="tx")) is None
 
@@ -243,10 +243,10 @@ def test_before_another_background_the_exposed_scene_stays_as_it_is():
     scene, alpha = torch.rand(5, 7, 3).numpy(), torch.rand(5, 7).numpy()
     behind, model = (0.2, 0.4, 0.6), NEUTRAL + 0.5 * random_departures(1)[0]
     rendered = RenderedImage(alpha[..., None] * scene + (1 - alpha[..., None]) * np.float32(behind), alpha, behind)
-    black = rendered.exposed(model).before((0.0, 0.0, 0.0))
+    black = rendered.with_exposure(model).over_background((0.0, 0.0, 0.0))
     expected = (alpha[..., None] * apply_exposure_numpy(scene, model)).clip(0, 1) * 255
     assert np.abs(black - expected).max() < 0.501
-    assert replace(rendered, background=None).exposed(model).background is None
+    assert replace(rendered, background=None).with_exposure(model).background is None
 
 
 def fitted(config=CONFIG, kind: str = "coarse") -> tuple:
@@ -278,8 +278,8 @@ def test_the_gradient_is_that_of_finite_differences():
 
 
 def test_photographs_of_unequal_brightness_are_told_from_the_scene():
-    config = replace(CONFIG, iterations=300, rates=replace(CONFIG.rates, exposure=(0.005, 5e-4)))
-    config = replace(config, anchors=replace(config.anchors, appearance=0))
+    config = replace(CONFIG, iterations=300, lr=replace(CONFIG.lr, exposure=(0.005, 5e-4)))
+    config = replace(config, anchors=replace(config.anchors, appearance_dim=0))
     state, unequal = fitted(config)
     plain = run(start(config), replace(stage(config), images=Unequal()))
     run(state, unequal)

@@ -16,7 +16,7 @@ from vdgs.training import from_checkpoint, to_checkpoint, train_step, training_l
 from vdgs.training.weight_averaging import NUM_AVERAGED_MODELS, is_averaged_step
 
 #: Growth ends at iteration 30, the mean begins after 36.
-MEAN = replace(CONFIG, average=0.4, growth=replace(CONFIG.growth, until=0.5))
+MEAN = replace(CONFIG, swa_fraction=0.4, densify=replace(CONFIG.densify, stop_fraction=0.5))
 
 
 def tensors_of(anchors, decoder) -> dict[str, np.ndarray]:
@@ -30,7 +30,7 @@ def tensors_of(anchors, decoder) -> dict[str, np.ndarray]:
     until=st.floats(0.0, 0.99),
 )
 def test_the_mean_is_one_of_many_models_after_growth_and_of_the_last(iterations, average, until):
-    config = TrainConfig(iterations=iterations, average=average, growth=DensifyConfig(until=until))
+    config = TrainConfig(iterations=iterations, swa_fraction=average, densify=DensifyConfig(stop_fraction=until))
     counted = [i for i in range(1, iterations + 1) if is_averaged_step(i, config)]
     if average == 0:
         assert counted == []
@@ -45,7 +45,7 @@ def test_the_mean_is_one_of_many_models_after_growth_and_of_the_last(iterations,
 def test_it_is_the_mean_of_the_models_and_changes_none_of_them(monkeypatch):
     monkeypatch.setattr(training_loop, "SORT_INTERVAL", 10**9)  # rows must stay where they are to be added up here
     plain, averaged = start(MEAN), start(MEAN)
-    off, on = stage(replace(MEAN, average=0.0)), stage(MEAN)
+    off, on = stage(replace(MEAN, swa_fraction=0.0)), stage(MEAN)
     models = []
     for iteration in range(1, MEAN.iterations + 1):
         train_step(plain, off)
@@ -97,7 +97,7 @@ def test_rows_of_the_mean_follow_their_anchors(monkeypatch):
 
 @pytest.mark.parametrize("average", [0.0, 0.4])
 def test_anchors_that_never_move_keep_their_bits_in_the_mean(average):
-    config = replace(MEAN, average=average, growth=replace(MEAN.growth, levels=0))
+    config = replace(MEAN, swa_fraction=average, densify=replace(MEAN.densify, num_levels=0))
     state = start(config)
     far = state.anchors.positions[:, 0] > 3.5
     state.anchors.positions[far] += torch.tensor([1000.0, 0.0, 0.0])

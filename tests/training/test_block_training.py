@@ -46,10 +46,10 @@ def rows_of(anchors: Anchors) -> dict[bytes, bytes]:
 
 def test_ring_context_and_decoder_keep_their_bits():
     stage, state = block_stage(BlockConfig())
-    around, decoder = rows_of(stage.surroundings.anchors), {n: t.clone() for n, t in state.decoder.tensors().items()}
+    around, decoder = rows_of(stage.frozen_anchors.anchors), {n: t.clone() for n, t in state.decoder.tensors().items()}
     own = rows_of(state.anchors)
     finish(stage, state)
-    assert rows_of(stage.surroundings.anchors) == around
+    assert rows_of(stage.frozen_anchors.anchors) == around
     assert all(torch.equal(tensor, decoder[name]) for name, tensor in state.decoder.tensors().items())
     after = rows_of(state.anchors)
     assert sum(after.get(position) != row for position, row in own.items()) > 0.5 * len(own)
@@ -63,7 +63,7 @@ def test_a_block_with_a_decoder_of_its_own_leaves_the_surroundings_theirs():
     own = initial_state(state.anchors, shared.copy(), stage)
     finish(stage, own)
     assert all(torch.equal(tensor, before[name]) for name, tensor in shared.tensors().items())
-    assert stage.surroundings.decoder is shared
+    assert stage.frozen_anchors.decoder is shared
     moved = [not torch.equal(tensor, before[name]) for name, tensor in own.decoder.tensors().items()]
     assert all(moved)
 
@@ -90,7 +90,7 @@ def test_every_anchor_is_own_or_around_and_only_what_cameras_draw_is_held():
 
 def test_without_context_only_the_ring_is_drawn():
     anchors, _ = coarse()
-    _, around = split_trainable_anchors(anchors, BLOCKS, 0, BlockConfig(context=False))
+    _, around = split_trainable_anchors(anchors, BLOCKS, 0, BlockConfig(draw_outside=False))
     x = anchors.positions[around, 0]
     assert len(x) > 0
     assert float(x.min()) >= 0
@@ -100,7 +100,7 @@ def test_without_context_only_the_ring_is_drawn():
 def test_a_free_ring_moves_and_a_ramp_moves_it_less():
     moved = {}
     for ring in ("free", "ramp"):
-        stage, state = block_stage(BlockConfig(ring=ring), training=replace(CONFIG, growth=DensifyConfig(levels=0)))
+        stage, state = block_stage(BlockConfig(margin=ring), training=replace(CONFIG, densify=DensifyConfig(num_levels=0)))
         before = state.anchors.features.clone()
         ring_rows = state.anchors.positions[:, 0] > 0.5  # beyond the middle of the ring
         finish(stage, state, until=10)
@@ -109,7 +109,7 @@ def test_a_free_ring_moves_and_a_ramp_moves_it_less():
 
 
 def test_the_ramp_falls_from_core_to_boundary():
-    mobility = lr_ramp(BLOCKS, 0, BlockConfig(ring="ramp"))
+    mobility = lr_ramp(BLOCKS, 0, BlockConfig(margin="ramp"))
     assert mobility is not None
     at = torch.tensor([[-2.0, 0, 0], [0.25, 0, 0], [0.5, 0, 0], [0.75, 0, 0], [-50, 0, 0]])
     expected = torch.tensor([1.0, 0.75, 0.5, 0.25, 1.0])
@@ -122,7 +122,7 @@ def test_the_ramp_falls_into_a_hole_as_it_does_outwards():
     outskirts = Block(middle.buffer(20, 64).gain_spread(middle.buffer(12, 64)),
                       middle.buffer(25, 64).gain_spread(middle.buffer(7, 64)))  # fmt: skip
     mobility = lr_ramp(
-        Blocks((outskirts, Block(middle.buffer(12, 64), middle.buffer(14, 64)))), 0, BlockConfig(ring="ramp")
+        Blocks((outskirts, Block(middle.buffer(12, 64), middle.buffer(14, 64)))), 0, BlockConfig(margin="ramp")
     )
     assert mobility is not None
     at = torch.tensor([[15.0, 0, 0], [10.75, 0, 0], [0, 9.5, 0], [-8.25, 0, 0], [6.5, 0, 0]])
@@ -132,7 +132,7 @@ def test_the_ramp_falls_into_a_hole_as_it_does_outwards():
 def test_ground_that_the_block_owns_beyond_its_boundary_moves_in_full():
     bent = shapely.union(shapely.box(-10, -10, 10, -6), shapely.box(-10, -10, -6, 10))
     blocks = Blocks((Block(bent, bent.buffer(1)), Block(shapely.box(20, 20, 30, 30), shapely.box(19, 19, 31, 31))))
-    mobility = lr_ramp(blocks, 0, BlockConfig(ring="ramp"))
+    mobility = lr_ramp(blocks, 0, BlockConfig(margin="ramp"))
     assert mobility is not None
     assert mobility(torch.tensor([[9.0, 9.0, 0.0], [0.0, 0.0, 0.0], [-8.0, 5.0, 0.0]])).tolist() == [1.0, 1.0, 1.0]
 
@@ -148,8 +148,8 @@ def test_one_block_without_surroundings_is_plain_training():
         (FrozenAnchors(anchors.select(around), decoder), growth_mask(whole, 0, BlockConfig())),
     ):
         stage = TrainingProblem(
-            config=CONFIG, images=Photographs(), image_count=8, voxel_size=0.4, camera_height=5.0, frozen_decoder=True,
-            surroundings=surroundings, may_hold=may_hold,
+            config=CONFIG, images=Photographs(), num_images=8, voxel_size=0.4, camera_height=5.0, frozen_decoder=True,
+            frozen_anchors=surroundings, growth_mask=may_hold,
         )  # fmt: skip
         copied = anchors.select(torch.arange(len(anchors)))
         states.append(finish(stage, initial_state(copied, decoder, stage)))
@@ -181,14 +181,14 @@ def test_compensation_that_adds_nothing_is_plain_growth_bit_for_bit(change):
 
 def test_a_cycle_lasts_from_decision_to_decision():
     stage = TrainingProblem(
-        config=replace(CONFIG, growth=DensifyConfig(interval=3, stats_start=0, start=6)),
+        config=replace(CONFIG, densify=DensifyConfig(every=3, stats_start=0, start=6)),
         images=Photographs(),
-        image_count=8,
+        num_images=8,
         voxel_size=1,
         camera_height=1,
     )
     assert len(views_in_cycle(6, stage)) == 6  # the first cycle counts since the statistics began
-    late = replace(stage, config=replace(CONFIG, growth=DensifyConfig(interval=3, stats_start=4, start=6)))
+    late = replace(stage, config=replace(CONFIG, densify=DensifyConfig(every=3, stats_start=4, start=6)))
     assert len(views_in_cycle(6, late)) == 2  # the statistics began after the cycle would have
     assert len(views_in_cycle(12, stage)) == 3  # steps 10 to 12, within one epoch, which has no view twice
     assert not {*views_in_cycle(12, stage)} & {*views_in_cycle(15, stage)}
@@ -196,13 +196,13 @@ def test_a_cycle_lasts_from_decision_to_decision():
 
 def test_rates_and_growth_restart_and_iterations_scale():
     """The paper prints neither rates nor a start of growth for blocks: those of the coarse stage, unless asked."""
-    method = MethodConfig(block=BlockConfig(scale_iterations=0.1))
+    method = MethodConfig(block=BlockConfig(steps_scaler=0.1))
     config = block_train_config(method, 500)
     assert config.iterations == 5000
-    assert (config.growth.stats_start, config.growth.start) == (50, 150)
-    assert config.rates == method.training.rates
-    damped = block_train_config(replace(method, block=BlockConfig(offset_rate=0.4, scale_rate=0.8)), 500)
-    assert damped.rates.offsets == pytest.approx((0.004, 4e-5))
-    assert damped.rates.log_scales == pytest.approx((0.0056, 0.0056))
-    assert damped.rates.features == method.training.rates.features
+    assert (config.densify.stats_start, config.densify.start) == (50, 150)
+    assert config.lr == method.training.lr
+    damped = block_train_config(replace(method, block=BlockConfig(lr_scale_offsets=0.4, lr_scale_log_scales=0.8)), 500)
+    assert damped.lr.offsets == pytest.approx((0.004, 4e-5))
+    assert damped.lr.log_scales == pytest.approx((0.0056, 0.0056))
+    assert damped.lr.features == method.training.lr.features
     assert block_train_config(replace(method, block=BlockConfig(iterations=0)), 33).iterations == 500

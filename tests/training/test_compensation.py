@@ -27,7 +27,7 @@ from vdgs.training.per_anchor_tensors import index_rows
 
 K = 3
 PAPER = CompensationConfig()
-GROWTH = DensifyConfig(threshold=1.0, levels=2, coarsest_voxels=1.0)
+GROWTH = DensifyConfig(grad_threshold=1.0, num_levels=2, coarsest_voxels=1.0)
 ALL, NONE = torch.ones(1, dtype=torch.bool), torch.zeros(1, dtype=torch.bool)
 
 
@@ -70,7 +70,7 @@ def simulate(config: CompensationConfig | None, seed: int, cycles: int = 4, grow
             update_cache(memory, statistics, low, config)
             change = compensate(memory, low, threshold, growth, config)
         decision = decide_densification(anchors, statistics, 1.0, growth, g, compensated=change)
-        kept = torch.cat([decision.kept, torch.ones(len(decision.added), dtype=torch.bool)])
+        kept = torch.cat([decision.keep_mask, torch.ones(len(decision.added), dtype=torch.bool)])
         anchors = anchors.concat(decision.added).select(kept)
         statistics, memory = (
             DensificationStats(**remapped(statistics, kept)),
@@ -98,7 +98,7 @@ def bits(anchors: Anchors, statistics: DensificationStats) -> list[bytes]:
     config=st.sampled_from([replace(PAPER, beta_g=0.0), replace(PAPER, t_low=0.0)]),
 )
 def test_without_weight_or_threshold_it_is_plain_growth_bit_for_bit(seed, config):
-    growth = replace(GROWTH, threshold=0.6, gate=0.2)
+    growth = replace(GROWTH, grad_threshold=0.6, min_draw_fraction=0.2)
     plain, compensated = simulate(None, seed, growth=growth), simulate(config, seed, growth=growth)
     assert bits(*plain[:2]) == bits(*compensated[:2])
     assert len(plain[0]) > 25
@@ -155,14 +155,14 @@ def test_fed_steadily_the_statistic_tends_to_21_times_its_size():
 @pytest.mark.parametrize(("added_to", "expected"), [("mean", 0.5 + 1.0), ("sum", 0.5 + 1.0 / 8)])
 def test_what_is_added_to_the_sum_is_divided_by_the_draws(added_to, expected):
     """Eight draws of a mean of 0.5, and g = 1: parents are those whose statistic reaches the threshold."""
-    config = replace(PAPER, added_to=added_to)
+    config = replace(PAPER, target=added_to)
     for threshold, asks in ((0.999 * expected, True), (1.001 * expected, False)):
         statistics, memory = one_offset(times=8.5, mean=0.5), CompensationState.zeros(1, 1)
         statistics.drawn.fill_(8.0)
         statistics.gradient.fill_(4.0)
         update_cache(memory, statistics, ALL, config)
         assert float(memory.cache) == 1.0
-        growth = replace(GROWTH, threshold=threshold, levels=1, gate=0.05)
+        growth = replace(GROWTH, grad_threshold=threshold, num_levels=1, min_draw_fraction=0.05)
         change = compensate(memory, ALL, config.t_low, growth, config)
         anchors = some_anchors(1)
         anchors = replace(anchors, offsets=100.0 + anchors.offsets[:, :1])
@@ -256,14 +256,14 @@ def test_an_empty_set_of_those_seen_shows_in_the_facts():
     [("scaled", 100, 8.0), ("literal", 100, 40.0), ("scaled", 10, 2.0), ("scaled", 2, 0.8)],
 )
 def test_the_gate_of_low_visibility(gate, interval, expected):
-    growth, config = replace(GROWTH, interval=interval), replace(PAPER, gate=gate)
+    growth, config = replace(GROWTH, every=interval), replace(PAPER, min_draws=gate)
     change = compensate(CompensationState.zeros(1, 1), ALL, config.t_low, growth, config)
-    assert change.gate == pytest.approx(expected)
+    assert change.min_draws == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(("gate", "judged"), [("scaled", True), ("literal", False)])
 def test_an_offset_drawn_nine_times_is_judged_only_by_the_scaled_gate(gate, judged):
-    config = replace(PAPER, gate=gate)
+    config = replace(PAPER, min_draws=gate)
     n = 30
     anchors, statistics, memory = some_anchors(n), DensificationStats.zeros(n, K), CompensationState.zeros(n, K)
     see(statistics, torch.full((n, K), 9.0), torch.full((n, K), 0.5))
@@ -317,7 +317,7 @@ def test_what_is_remembered_is_added_only_where_few_cameras_see():
 
 
 def test_what_grows_plainly_grows_compensated_too():
-    growth = replace(GROWTH, levels=1)  # finer levels see the anchors of coarser ones
+    growth = replace(GROWTH, num_levels=1)  # finer levels see the anchors of coarser ones
     n = 300
     anchors, memory = some_anchors(n), CompensationState.zeros(n, K)
     g = torch.Generator().manual_seed(1)

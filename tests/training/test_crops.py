@@ -252,7 +252,7 @@ class Masked:
 def test_gradients_of_a_part_are_those_of_the_whole_photograph():
     """Statistics of growth, in which thresholds are given, must not depend on how much else is drawn. Where a mask
     keeps only a rectangle, its part has all the photograph's pixels that count."""
-    config = replace(block_stage(BlockConfig())[0].config, loss=replace(MethodConfig().training.loss, ssim_weight=0.0))
+    config = replace(block_stage(BlockConfig())[0].config, loss=replace(MethodConfig().training.loss, ssim_lambda=0.0))
     stage, whole = block_stage(BlockConfig(), training=config)
     _, part = block_stage(BlockConfig(), training=config)
     camera = stage.images.camera(0)

@@ -15,7 +15,7 @@ from vdgs.training import densification
 from vdgs.training.densification import decide_densification
 
 K = 4
-ALWAYS = DensifyConfig(gate=0.0, levels=1, coarsest_voxels=1.0, threshold=1.0)
+ALWAYS = DensifyConfig(min_draw_fraction=0.0, num_levels=1, coarsest_voxels=1.0, grad_threshold=1.0)
 
 
 def anchors(n: int, seed: int = 0) -> Anchors:
@@ -43,7 +43,7 @@ def cell_of(points: torch.Tensor, cell: float) -> set[tuple[int, ...]]:
 def test_new_anchors_are_centred_in_empty_cells_that_hold_a_strong_offset(n, seed, cell):
     before = anchors(n, seed)
     stats = statistics(n, seed=seed)
-    strong = stats.gradient >= ALWAYS.threshold
+    strong = stats.gradient >= ALWAYS.grad_threshold
     means = before.positions[:, None] + before.offsets * before.log_scales[:, None, :3].exp()
     added = decide_densification(before, stats, cell, ALWAYS, torch.Generator().manual_seed(seed)).added
     new = cell_of(added.positions, cell)
@@ -72,7 +72,7 @@ def test_features_are_the_elementwise_maximum_of_the_parents():
         log_scales=torch.zeros(2, 6),
     )
     parents.offsets[0, 0, 0], parents.offsets[1, 0, 0] = 5.0, -5.0  # both Gaussians lie at x = 5
-    config = DensifyConfig(gate=0.0, levels=1, coarsest_voxels=1.0)
+    config = DensifyConfig(min_draw_fraction=0.0, num_levels=1, coarsest_voxels=1.0)
     for seed in range(50):
         stats = DensificationStats(torch.ones(2, 1), torch.ones(2, 1), torch.ones(2), torch.ones(2))
         added = decide_densification(parents, stats, 1.0, config, torch.Generator().manual_seed(seed)).added
@@ -96,7 +96,7 @@ def test_weak_gradients_and_unseen_offsets_grow_nothing():
     before = anchors(30)
     weak = DensificationStats(torch.full((30, K), 0.5), torch.ones(30, K), torch.ones(30), torch.ones(30))
     assert len(decide_densification(before, weak, 1.0, ALWAYS, torch.Generator()).added) == 0
-    gated = DensifyConfig(gate=0.4, interval=100, threshold=0.0)
+    gated = DensifyConfig(min_draw_fraction=0.4, every=100, grad_threshold=0.0)
     unseen = DensificationStats(torch.full((30, K), 9.0), torch.full((30, K), 40.0), torch.ones(30), torch.ones(30))
     assert len(decide_densification(before, unseen, 1.0, gated, torch.Generator()).added) == 0
 
@@ -105,7 +105,7 @@ def test_statistics_are_reset_only_where_they_were_judged():
     stats = statistics(2)
     stats.drawn = torch.tensor([[41.0, 40.0, 0.0, 90.0], [1.0, 2.0, 3.0, 41.0]])
     stats.seen = torch.tensor([81.0, 80.0])
-    config = DensifyConfig(gate=0.4, prune_view_fraction=0.8, interval=100, levels=0)
+    config = DensifyConfig(min_draw_fraction=0.4, prune_view_fraction=0.8, every=100, num_levels=0)
     decide_densification(anchors(2), stats, 1.0, config, torch.Generator())
     assert stats.drawn.tolist() == [[0, 40, 0, 0], [1, 2, 3, 0]]
     assert stats.seen.tolist() == [0, 80]
@@ -115,16 +115,16 @@ def test_faint_anchors_go_once_they_were_seen_often_enough():
     stats = statistics(3)
     stats.seen = torch.tensor([100.0, 100.0, 10.0])
     stats.opacity = torch.tensor([0.4, 0.6, 0.0])  # limit 0.005 per view
-    config = DensifyConfig(levels=0, interval=100)
+    config = DensifyConfig(num_levels=0, every=100)
     decision = decide_densification(anchors(3), stats, 1.0, config, torch.Generator())
-    assert decision.kept.tolist() == [False, True, True]
+    assert decision.keep_mask.tolist() == [False, True, True]
     assert decision.pruned == 1
 
 
 def test_the_budget_serves_the_strongest_first():
     before, stats = anchors(200), statistics(200)
     free = decide_densification(before, statistics(200), 0.1, ALWAYS, torch.Generator().manual_seed(0)).added
-    config = DensifyConfig(gate=0.0, levels=1, coarsest_voxels=1.0, threshold=1.0, max_anchors=210)
+    config = DensifyConfig(min_draw_fraction=0.0, num_levels=1, coarsest_voxels=1.0, grad_threshold=1.0, max_anchors=210)
     capped = decide_densification(before, stats, 0.1, config, torch.Generator().manual_seed(0)).added
     assert len(free) > 10
     assert len(capped) == 10
@@ -154,12 +154,12 @@ def test_surroundings_occupy_cells_but_neither_grow_nor_go():
     )
     assert torch.equal(decision.added.positions, free.added.positions[1::2])
     assert torch.equal(decision.added.features, free.added.features[1::2])
-    assert len(decision.kept) == 60
+    assert len(decision.keep_mask) == 60
 
 
 def test_new_anchors_stay_where_they_may_be_and_no_budget_is_spent_elsewhere():
     before, coins = anchors(200), torch.Generator
-    config = DensifyConfig(gate=0.0, levels=2, coarsest_voxels=1.0, threshold=1.0)
+    config = DensifyConfig(min_draw_fraction=0.0, num_levels=2, coarsest_voxels=1.0, grad_threshold=1.0)
 
     def east(places: torch.Tensor) -> torch.Tensor:
         return places[:, 0] >= 0
@@ -168,7 +168,7 @@ def test_new_anchors_stay_where_they_may_be_and_no_budget_is_spent_elsewhere():
     held = decide_densification(before, statistics(200), 0.5, config, coins().manual_seed(0), growth_mask=east).added
     assert torch.equal(held.positions, free.positions[east(free.positions)])
     assert 0 < len(held) < len(free)
-    budget = DensifyConfig(gate=0.0, levels=2, coarsest_voxels=1.0, threshold=1.0, max_anchors=220)
+    budget = DensifyConfig(min_draw_fraction=0.0, num_levels=2, coarsest_voxels=1.0, grad_threshold=1.0, max_anchors=220)
     few = decide_densification(before, statistics(200), 0.5, budget, coins().manual_seed(0), growth_mask=east).added
     assert len(few) == 20
     assert bool(east(few.positions).all())
@@ -182,7 +182,7 @@ def test_the_order_of_anchors_does_not_decide_where_new_ones_come(monkeypatch):
     monkeypatch.setattr(densification, "_random", lambda index, count, generator: torch.ones(len(index)))
     before, stats = anchors(80), statistics(80)
     order = torch.randperm(80, generator=torch.Generator().manual_seed(1))
-    config = DensifyConfig(gate=0.0, levels=3, coarsest_voxels=4.0, threshold=1.0)
+    config = DensifyConfig(min_draw_fraction=0.0, num_levels=3, coarsest_voxels=4.0, grad_threshold=1.0)
     turned = DensificationStats(**{name: tensor[order] for name, tensor in stats.tensors().items()})
     moved = decide_densification(before.select(order), turned, 1.0, config, torch.Generator()).added
     added = decide_densification(before, stats, 1.0, config, torch.Generator()).added

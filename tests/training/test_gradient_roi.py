@@ -80,7 +80,7 @@ def step(monkeypatch: pytest.MonkeyPatch, stage: TrainingProblem, own: bool, nar
     small = replace(small, log_scales=torch.full_like(small.log_scales, -2.0))
     others = anchors.select(~west)
     others = replace(others, offsets=8 * others.offsets)
-    stage = replace(stage, frozen_decoder=not own, surroundings=FrozenAnchors(others, decoder.copy()))
+    stage = replace(stage, frozen_decoder=not own, frozen_anchors=FrozenAnchors(others, decoder.copy()))
     state, drawn = initial_state(small, decoder, stage), []
     with monkeypatch.context() as patch:
         if not narrowing:
@@ -96,7 +96,7 @@ def stages() -> dict[str, TrainingProblem]:
     stage, _ = block_stage(BlockConfig())
     return {
         "whole": stage,
-        "part": replace(stage, crops=(Crop(0.1, 0.1, 0.95, 0.9),) * stage.image_count),
+        "part": replace(stage, crops=(Crop(0.1, 0.1, 0.95, 0.9),) * stage.num_images),
         "masked": replace(stage, images=Masked()),
     }
 
@@ -122,8 +122,8 @@ def test_a_step_moves_a_block_as_if_it_had_drawn_all(monkeypatch, name, own):
 
 def test_a_block_with_nothing_around_it_draws_all(monkeypatch):
     stage, state = block_stage(BlockConfig())
-    nothing = stage.surroundings.anchors.select(torch.zeros(0, dtype=torch.int64))
+    nothing = stage.frozen_anchors.anchors.select(torch.zeros(0, dtype=torch.int64))
     camera, drawn, draw = stage.images.camera(0), [], training_loop.render_for_training
     monkeypatch.setattr(training_loop, "render_for_training", lambda *given: drawn.append(given[1]) or draw(*given))
-    train_step(state, replace(stage, surroundings=FrozenAnchors(nothing, state.decoder)))
+    train_step(state, replace(stage, frozen_anchors=FrozenAnchors(nothing, state.decoder)))
     assert [(each.width, each.height) for each in drawn] == [(camera.width, camera.height)]

@@ -34,7 +34,7 @@ def full_state() -> TrainingState:
     """A state of a block that keeps everything there is, every row of everything different."""
     training = replace(CONFIG, compensation=CompensationConfig(enabled=True))
     _, state = block_stage(BlockConfig(), training=training)
-    state.average = ModelAverage.of(state.anchors, state.decoder)
+    state.model_average = ModelAverage.of(state.anchors, state.decoder)
     for group in state.groups().values():
         for place, tensor in enumerate(group.values()):
             tensor.copy_(torch.arange(tensor.numel()).reshape(tensor.shape) + 0.5 * place)

@@ -76,9 +76,9 @@ class Grey(Photographs):
 def light_through(loss: LossConfig) -> float:
     """The median of 1 - alpha, of a model that was trained before the colour of grey."""
     stage, state = block_stage(BlockConfig())
-    config = replace(stage.config, iterations=300, loss=loss, growth=DensifyConfig(levels=0, start=10_000))
+    config = replace(stage.config, iterations=300, loss=loss, densify=DensifyConfig(num_levels=0, start=10_000))
     photographs, grey = Grey(), (128 / 255,) * 3
-    stage = replace(stage, config=config, background=grey, surroundings=None, images=photographs)
+    stage = replace(stage, config=config, background=grey, frozen_anchors=None, images=photographs)
     train(state, stage, stop=lambda: False, after_step=lambda *_: None)
     model = state.model(stage.voxel_size, grey)
     return float((1.0 - render(model, photographs.camera(0)).alpha.clamp(0, 1)).quantile(0.5))
@@ -147,8 +147,8 @@ def test_an_anchor_in_the_centre_of_a_camera_has_a_size_that_can_be_trained():
 def test_training_leaves_no_gaussian_larger_than_its_bound_nor_far_from_its_anchor():
     """Scales begin too large, of Gaussians and of the unit of their offsets; anchors that grow are bounded too."""
     stage, state = block_stage(BlockConfig())
-    growth = DensifyConfig(interval=10, stats_start=0, start=10, until=0.8, threshold=1e-6, gate=0.05)
-    config = replace(stage.config, iterations=47, average=0.1, growth=growth)
+    growth = DensifyConfig(every=10, stats_start=0, start=10, stop_fraction=0.8, grad_threshold=1e-6, min_draw_fraction=0.05)
+    config = replace(stage.config, iterations=47, swa_fraction=0.1, densify=growth)
     cameras = Photographs().cameras
     stage = replace(stage, config=config, max_log_scale=lambda places: max_log_scales(places, cameras) - 3.0)
     state.max_log_scale = stage.max_log_scale_at(state.anchors.positions)

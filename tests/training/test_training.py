@@ -117,7 +117,7 @@ def test_anchors_that_no_camera_sees_keep_their_bits():
 
 @pytest.mark.parametrize("crops", [None, (Crop(0.0, 0.1, 0.5, 0.6),) * 8])
 def test_anchors_are_seen_by_the_pictures_that_hold_their_centres(crops):
-    config = replace(CONFIG, growth=replace(CONFIG.growth, stats_start=0, start=1000))
+    config = replace(CONFIG, densify=replace(CONFIG.densify, stats_start=0, start=1000))
     seen_by = replace(stage(config), crops=crops)
     state = start(config)
     expected = torch.zeros(len(state.anchors))
@@ -132,7 +132,7 @@ def test_anchors_are_seen_by_the_pictures_that_hold_their_centres(crops):
 
 
 def test_transparent_anchors_go_where_they_are_seen_and_stay_just_outside_of_all_pictures():
-    config = replace(CONFIG, growth=replace(CONFIG.growth, threshold=1e9))
+    config = replace(CONFIG, densify=replace(CONFIG.densify, grad_threshold=1e9))
     state, nothing = start(config), replace(stage(config), frozen_decoder=True)
     with torch.no_grad():
         state.decoder.weights.opacity.w2[:] = 0.0
@@ -159,12 +159,12 @@ def test_transparent_anchors_go_where_they_are_seen_and_stay_just_outside_of_all
 def test_the_first_step_of_an_anchor_is_the_same_whenever_it_is_seen_first(first_seen):
     """An anchor that was never seen keeps everything; seen first, it moves as it would have at once."""
     config = replace(
-        CONFIG, iterations=20_000, rates=LearningRateConfig(features=(0.01, 0.01), log_scales=(0.01, 0.01))
+        CONFIG, iterations=20_000, lr=LearningRateConfig(features=(0.01, 0.01), log_scales=(0.01, 0.01))
     )
     state = start(config)
     state.iteration = first_seen
     before = state.anchors.select(torch.arange(len(state.anchors)))
-    one_view = replace(stage(replace(config, growth=replace(config.growth, until=0.0))), image_count=1)
+    one_view = replace(stage(replace(config, densify=replace(config.densify, stop_fraction=0.0))), num_images=1)
     train_step(state, one_view)
     updates = state.optimizer.updates
     assert set(updates.tolist()) == {0, 1}
@@ -176,7 +176,7 @@ def test_the_first_step_of_an_anchor_is_the_same_whenever_it_is_seen_first(first
 
 def test_dense_adam_moves_what_a_view_does_not_show_along_its_moments():
     """All anchors, one photograph a step: parameters and moments are those of torch's Adam on whole tensors."""
-    config = replace(CONFIG, optimizer="dense", growth=replace(CONFIG.growth, until=0.0), resolutions=((0.0, 1),))
+    config = replace(CONFIG, optimizer="dense", densify=replace(CONFIG.densify, stop_fraction=0.0), resolution_schedule=((0.0, 1),))
     state, given = start(config), replace(stage(config), frozen_decoder=True)
     far = state.anchors.positions[:, 0] > 2.5  # the last views alone show it
     before = state.anchors.select(far)
@@ -187,7 +187,7 @@ def test_dense_adam_moves_what_a_view_does_not_show_along_its_moments():
     first = {name: t.clone() for name, t in moments.first.items()}
     second = {name: t.clone() for name, t in moments.second.items()}
     nothing = torch.empty(0, dtype=torch.int64)
-    rates = learning_rates_at(config.rates, 9 / config.iterations)
+    rates = learning_rates_at(config.lr, 9 / config.iterations)
     step_unseen_anchors(state.anchors, nothing, state.optimizer.anchor_states(state.anchors, rates, 1.0), 10)
     for name in ("features", "offsets", "log_scales"):
         m, v = 0.9 * first[name], 0.999 * second[name]

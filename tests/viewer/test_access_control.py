@@ -21,7 +21,7 @@ def test_the_door_knows_its_own_name():
     assert alone.deny_reason("/", {"Host": "localhost:8080", "Origin": "http://localhost:8080"}) is None
     assert alone.deny_reason("/", {"Host": "localhost:8080", "Origin": "http://localhost:9999"}) is not None
     assert alone.deny_reason("/", {"Host": "localhost:8080", "Origin": "null"}) is not None
-    assert AccessControl("0.0.0.0", "abc", 7).address() == "http://localhost:7/?token=abc"
+    assert AccessControl("0.0.0.0", "abc", 7).local_url() == "http://localhost:7/?token=abc"
     guarded = AccessControl("0.0.0.0", "abc", 7)
     assert guarded.deny_reason("/?token=abc", {"Host": "x"}) is None
     assert guarded.deny_reason("/?token=ab%C3%A9", {"Host": "x"}) is not None

@@ -70,13 +70,13 @@ def test_small_while_moving_and_full_at_rest(studio):
         wait = studio.step()
         assert wait is not None
         assert 0 < wait <= REST_SECONDS  # nothing to do until it rests
-    assert [frame.full for frame in frames] == [False] * 5
-    assert all(frame.picture.shape[1] <= 640 for frame in frames)
+    assert [frame.is_full for frame in frames] == [False] * 5
+    assert all(frame.image.shape[1] <= 640 for frame in frames)
     clock.now += REST_SECONDS
     while studio.step() == 0:
         pass
-    assert [frame.full for frame in frames] == [False] * 5 + [True]
-    assert frames[-1].picture.shape == (960, 1280, 3)
+    assert [frame.is_full for frame in frames] == [False] * 5 + [True]
+    assert frames[-1].image.shape == (960, 1280, 3)
     assert frames[-1].camera.position[0] == pytest.approx(4.0)
     assert studio.step() is None
 
@@ -93,12 +93,12 @@ def test_a_camera_that_moves_on_leaves_nothing_to_be_finished(studio):
     assert seat.work is not None
     studio.request_frame(seat, camera_at(9, 0, width=1280), DisplayOptions())
     studio.step()
-    assert not frames[-1].full
+    assert not frames[-1].is_full
     assert frames[-1].camera.position[0] == pytest.approx(9.0)
     clock.now += REST_SECONDS
     while studio.step() == 0:
         pass
-    assert [frame.full for frame in frames[count:]] == [False, True]
+    assert [frame.is_full for frame in frames[count:]] == [False, True]
     assert all(frame.camera.position[0] == pytest.approx(9.0) for frame in frames[count:])
 
 
@@ -112,7 +112,7 @@ def test_quick_pictures_are_as_large_as_time_allows(studio):
         for x in range(20):
             studio.request_frame(seat, camera_at(x, 0, width=1600), DisplayOptions())
             studio.step()
-        height, width = frames[-1].picture.shape[:2]
+        height, width = frames[-1].image.shape[:2]
         assert least <= width * height <= most
         studio.leave(seat)
 
@@ -173,9 +173,9 @@ def test_two_who_rest_at_the_same_place_share_a_picture(studio):
     while studio.step() == 0:
         pass
     full = [frames[-1] for _, frames, _ in (one, other, elsewhere)]
-    assert all(frame.full for frame in full)
-    assert full[0].picture is full[1].picture
-    assert full[0].picture is not full[2].picture
+    assert all(frame.is_full for frame in full)
+    assert full[0].image is full[1].image
+    assert full[0].image is not full[2].image
 
 
 def test_a_full_picture_of_much_is_drawn_in_parts(studio):
@@ -190,7 +190,7 @@ def test_a_full_picture_of_much_is_drawn_in_parts(studio):
     while studio.step() == 0:
         steps += 1
     assert steps == 5
-    assert frames[-1].picture.shape == (960, 1280, 3)
+    assert frames[-1].image.shape == (960, 1280, 3)
 
 
 def test_visitors_take_turns_and_moving_ones_go_first(studio):
@@ -266,4 +266,4 @@ def test_a_small_canvas_is_drawn_once(studio):
     clock.now += REST_SECONDS
     while studio.step() == 0:
         pass
-    assert [frame.picture.shape for frame in frames] == [(120, 160, 3)] * len(frames)
+    assert [frame.image.shape for frame in frames] == [(120, 160, 3)] * len(frames)

@@ -246,7 +246,7 @@ def test_nothing_of_the_machine_is_reached(viewer):
 @quiet
 def test_others_need_the_token(run):
     with serve(open_run(run), "0.0.0.0", None, Console(file=sys.stderr)) as viewer:
-        address, token = viewer.door.address(), viewer.door.token
+        address, token = viewer.access.local_url(), viewer.access.token
         assert token is not None
         assert len(token) >= 32
         assert ask(address)[0] == 403

@@ -72,7 +72,7 @@ def photographed(folder: Path, model: AnchorModel, change: Callable[[int, np.nda
         )
     points = model.anchors.positions.double().numpy()
     ground = GroundFrame(
-        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, how="hand-made", origin_geo=PLACE
+        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, description="hand-made", origin_geo=PLACE
     )
     capture = Capture(
         root=folder, source="colmap", images=".", views=tuple(views), points=points,
@@ -111,7 +111,7 @@ def scene(tmp_path_factory):
 def test_rows_drawn_one_after_another_are_the_whole_picture(scene, layer, model):
     camera, shown = camera_at(0.3, -0.5, tilt=20.0), DisplayOptions(layer, model, 0.4)
     painter = Painter(scene)
-    painter.settle(shown, camera)
+    painter.update_depth_range(shown, camera)
     whole = painter.paint(shown, camera, camera)
     rows = [painter.paint(shown, camera.cropped(0, a, camera.width, b), camera) for a, b in ((0, 13), (13, 48))]
     assert np.array_equal(np.concatenate(rows), whole)
@@ -172,7 +172,7 @@ def test_what_is_metered_of_thinner_models_differs_little(scene):
     dense = opaque_plane(spacing=0.03)
     opened = ViewerScene(replace(scene.run, model=dense))
     for camera in (camera_at(0.0, 0.0, 5.0), camera_at(-1.0, 0.5, 6.0, 20.0)):
-        level, _ = opened.level("merged", camera, 5_000)
+        level, _ = opened.get_level("merged", camera, 5_000)
         assert len(level.model.anchors) < len(dense.anchors) / 4
         whole, thin = (log_luminance(render(each, camera).image.clamp(0, 1).numpy()) for each in (dense, level.model))
         assert abs(whole - thin) < 0.03
@@ -204,7 +204,7 @@ def test_a_newer_model_is_compared_anew(tmp_path):
     assert np.nanmax(comparison.error_map("merged", camera, camera)) < 0.01
     # One that happens to lie where the older one lay in memory.
     object.__setattr__(model, "anchors", opaque_plane().anchors)
-    scene.show(scene.run)
+    scene.replace_run(scene.run)
     assert np.nanmax(comparison.error_map("merged", camera, camera)) > 0.05
     scene.close()
 
@@ -222,11 +222,11 @@ def test_two_models_stand_side_by_side(scene):
 def test_depth_keeps_its_colours_while_the_camera_moves(scene):
     painter, shown = Painter(scene), DisplayOptions("depth")
     high, low = camera_at(0, 0, 6.0), camera_at(0, 0, 3.0)
-    painter.settle(shown, high)
+    painter.update_depth_range(shown, high)
     before = painter.scale(shown)
     painter.paint(shown, low, low)
     assert painter.scale(shown) is before
-    painter.settle(shown, low)
+    painter.update_depth_range(shown, low)
     after = painter.scale(shown)
     assert after is not None
     assert before is not None
@@ -238,16 +238,16 @@ def test_quick_pictures_of_much_are_drawn_with_fewer_larger_gaussians(parts):
     model = two_floors()
     if parts:
         counts = (300, len(model.anchors) - 300)
-        model = replace(model, parts=tuple(DecoderSpan(count, model.decoder) for count in counts))
+        model = replace(model, decoder_spans=tuple(DecoderSpan(count, model.decoder) for count in counts))
     camera = camera_at(0.0, 0.0, 6.0)
     levels = LodPyramid(model)
     assert levels.of(camera)[0].model is model
     assert levels.of(camera, 10_000)[0].model is model
     few, count = levels.of(camera, 400)
     assert 0 < count <= 400
-    assert few.kept is not None
-    assert len(few.model.anchors) == int(few.kept.sum()) < len(model.anchors) / 3
-    assert sum(part.count for part in few.model.parts) == (len(few.model.anchors) if parts else 0)
+    assert few.mask is not None
+    assert len(few.model.anchors) == int(few.mask.sum()) < len(model.anchors) / 3
+    assert sum(part.count for part in few.model.decoder_spans) == (len(few.model.anchors) if parts else 0)
     assert torch.equal(few.of(model.anchors.positions), few.model.anchors.positions)
     thin, whole = render(few.model, camera), render(model, camera)
     inner = slice(14, 34), slice(20, 44)
@@ -275,7 +275,7 @@ def test_a_photograph_lies_over_the_model_however_the_camera_turns(scene):
 
 def test_the_photograph_is_left_of_its_slider(scene):
     camera, painter = scene.capture.views[0].camera, Painter(scene)
-    picture = painter.paint(DisplayOptions("alpha", photograph=0, photograph_split=0.25), camera, camera)
+    picture = painter.paint(DisplayOptions("alpha", image_index=0, image_split=0.25), camera, camera)
     alone = painter.paint(DisplayOptions("alpha"), camera, camera)
     assert np.array_equal(picture[:, 16:], alone[:, 16:])
     assert np.abs(picture[:, :15].astype(int) - warp_image(scene, 0, camera)[0][:, :15]).max() == 0
@@ -308,10 +308,10 @@ def test_a_place_knows_who_sees_it_and_what_stands_between(scene):
     place = pick_point(scene, "merged", np.array([0.3, -0.2, 0.0]))  # below the roof
     lies_in = [view for view in scene.capture.views if view.camera.in_frustum(place.position[None])[0]]
     assert len(place.hits) == len(lies_in)
-    assert place.seen_by == sum(view.split == "train" for view in lies_in)
-    assert not any(sight.free for sight in place.hits if sight.name == "4.png")
+    assert place.visibility == sum(view.split == "train" for view in lies_in)
+    assert not any(sight.unoccluded for sight in place.hits if sight.name == "4.png")
     above = pick_point(scene, "merged", np.array([0.3, -0.2, 1.5]))
-    assert all(sight.free for sight in above.hits)
+    assert all(sight.unoccluded for sight in above.hits)
     assert [s.ground_sampling for s in above.hits] == sorted(s.ground_sampling for s in above.hits)
     assert above.block == 2
     assert above.coordinates[0] == "east 0.30, north -0.20, up 1.50 m (ground frame)"

@@ -107,7 +107,7 @@ def test_imbalance_in_numbers() -> None:
     facts = visibility_stats(np.arange(101))
     assert facts.mean == 50
     assert facts.quantiles == {5: 5, 25: 25, 50: 50, 75: 75, 95: 95}
-    assert facts.share_below == {3: 3 / 101, 5: 5 / 101, 10: 10 / 101}
+    assert facts.fraction_below == {3: 3 / 101, 5: 5 / 101, 10: 10 / 101}
     with pytest.raises(ValueError, match="no anchors"):
         visibility_stats(np.array([], np.int64))
 
@@ -147,7 +147,7 @@ def test_how_often_a_photograph_with_nine_times_the_votes_is_used(sampling: str,
     ]
     positions = torch.tensor([[0.0, 0.0, 0.0]] + [[100.0, 0.0, 0.0]] * 9)
     anchors = Anchors(positions, torch.zeros(10, 32), torch.zeros(10, 1, 3), torch.zeros(10, 6))
-    shares = view_sampling_weights(TrainConfig(sampling=sampling), anchors, cameras)
+    shares = view_sampling_weights(TrainConfig(view_sampling=sampling), anchors, cameras)
     assert (None if shares is None else shares[1] / shares[0]) == (ratio and pytest.approx(ratio))
 
 

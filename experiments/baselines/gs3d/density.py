@@ -78,7 +78,7 @@ def adaptive_density_control(
     clones, parents = asks & ~large, asks & large
     added = gaussians.select(clones).concat(split_gaussians(gaussians.select(parents), config.shrink, generator))
     everything = gaussians.concat(added)
-    unfit = everything.logits.sigmoid() < config.prune_opacity
+    unfit = everything.opacity_logits.sigmoid() < config.prune_opacity
     if prune_large:
         unfit |= max_scales(everything) > config.prune_size * extent
     replaced = torch.cat([parents, parents.new_zeros(len(added))])

@@ -48,9 +48,9 @@ def initialize_gaussians(
         means=torch.from_numpy(points.astype(np.float32)),
         log_scales=log_scales[:, None].repeat(1, 3),
         quaternions=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
-        logits=torch.full((n,), math.log(opacity / (1 - opacity))),
-        dc=rgb_to_sh(torch.from_numpy(colours.astype(np.float32) / 255.0)),
-        rest=torch.zeros(n, num_sh_bases(degree) - 1, 3),
+        opacity_logits=torch.full((n,), math.log(opacity / (1 - opacity))),
+        sh0=rgb_to_sh(torch.from_numpy(colours.astype(np.float32) / 255.0)),
+        shN=torch.zeros(n, num_sh_bases(degree) - 1, 3),
     )
 
 
@@ -62,18 +62,18 @@ class GaussianModel:
     #: Colour drawn where nothing is, RGB in [0, 1].
     background: tuple[float, float, float]
     #: JSON-able facts that travel with the file: ground frame, capture, version.
-    facts: Mapping[str, Any]
+    metadata: Mapping[str, Any]
 
     @torch.no_grad()
     def render(self, camera: Camera, *, depth: bool = False) -> Raster:
         """One view: image [h, w, 3] (not clamped), alpha [h, w], depth [h, w] or None."""
         seen = self.gaussians.select(visible_gaussian_rows(self.gaussians, camera))
-        return render_gaussians(seen, camera, torch.tensor(self.background), seen.degree, depth)[0]
+        return render_gaussians(seen, camera, torch.tensor(self.background), seen.sh_degree, depth)[0]
 
     def save(self, path: Path) -> None:
         """Write one safetensors file, atomically."""
         tensors = self.gaussians.tensors()
-        facts = {"background": self.background, "facts": dict(self.facts), "crc32": tensors_crc32(tensors)}
+        facts = {"background": self.background, "facts": dict(self.metadata), "crc32": tensors_crc32(tensors)}
         header = {FILE_FORMAT: json.dumps(facts)}
         write_atomic(path, lambda temporary: write_tensors(temporary, tensors, header))
 
@@ -102,7 +102,7 @@ def _check(gaussians: Gaussians) -> None:
     """Raise ValueError unless shapes and types agree with each other and all numbers are finite."""
     n = len(gaussians)
     counts = [num_sh_bases(degree) - 1 for degree in range(MAX_SH_DEGREE + 1)]
-    rest = gaussians.rest.shape[1] if gaussians.rest.ndim == 3 else -1
+    rest = gaussians.shN.shape[1] if gaussians.shN.ndim == 3 else -1
     if rest not in counts:
         raise ValueError(f"{rest} further coefficients of colour belong to no degree")
     shapes = {"means": (n, 3), "log_scales": (n, 3), "quaternions": (n, 4), "logits": (n,), "dc": (n, 3),

@@ -141,7 +141,7 @@ def evaluate_gs3d(
     are no figures by visibility. `trained` is where the model was trained, for its size, time and memory. Raises
     RunError without test views or for another capture than the model's.
     """
-    check_same_capture(output, model.facts.get("capture", {}), capture)
+    check_same_capture(output, model.metadata.get("capture", {}), capture)
     lpips, note = load_lpips(lpips_weights)
 
     def render_depth(camera: Camera) -> Raster:

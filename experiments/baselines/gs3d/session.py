@@ -58,16 +58,16 @@ def train_with_checkpoints(
         size=lambda: f"{len(state.gaussians):,} Gaussians",
         divergence_hint="",
         memory_hint=lambda: "Set density.max_gaussians or use smaller photographs, in another output folder.",
-        whole=lambda: state.whole,
+        is_consistent=lambda: state.is_consistent,
     )  # fmt: skip
 
     def loop(stop: Callable[[], bool]) -> bool:
         keeper = Checkpointer(training, options.save_every)
 
         def after_step(state: Gs3dState, report: Gs3dStepReport) -> None:
-            keeper.tick()
+            keeper.update_timers()
             journal.step(state, report)
-            keeper.keep(training.status)
+            keeper.save_if_due(training.status)
 
         return train(state, stage, stop=stop, after_step=after_step)
 

@@ -100,9 +100,9 @@ class Gs3dState:
     seconds: float = 0.0
     peak_memory_bytes: int = 0
     #: False while a step changes tensors: one that is broken off there leaves no state that may be saved.
-    whole: bool = True
+    is_consistent: bool = True
     #: Zeros between steps, in the shape of each tensor of the Gaussians: where gradients are put. Not saved.
-    room: dict[str, Tensor] = field(default_factory=dict)
+    scratch: dict[str, Tensor] = field(default_factory=dict)
 
     def take_groups(self) -> dict[str, TensorGroup]:
         """What is kept per Gaussian and outlives a decision, no longer held here: see `per_anchor.remap`."""
@@ -181,7 +181,7 @@ def gs3d_train_step(state: Gs3dState, stage: Gs3dProblem) -> Gs3dStepReport:
     *gradients, of_means_px = torch.autograd.grad(found.loss, [*seen.values(), means_px], materialize_grads=True)
     psnr = training_psnr(raster.image.detach(), target, mask) if (iteration + 1) % PSNR_LOG_INTERVAL == 0 else None
     _allocate_gradients(state)
-    state.whole = False
+    state.is_consistent = False
     _adam_step(
         state, rows, dict(zip(seen, gradients, strict=True)), learning_rates_at(config, stage.extent, iteration), degree
     )
@@ -192,15 +192,15 @@ def gs3d_train_step(state: Gs3dState, stage: Gs3dProblem) -> Gs3dStepReport:
         _accumulate_gradients(state, rows, of_means_px, camera)
         report = replace(report, **_densify(state, stage))
     _smooth(state, value, psnr)
-    state.whole = True
+    state.is_consistent = True
     return report
 
 
 def _allocate_gradients(state: Gs3dState) -> None:
     """Room for gradients, where growth has taken it away: before anything moves, since it is large."""
     for name, tensor in state.gaussians.tensors().items():
-        if name not in state.room:
-            state.room[name] = torch.zeros_like(tensor)
+        if name not in state.scratch:
+            state.scratch[name] = torch.zeros_like(tensor)
 
 
 def _adam_step(
@@ -211,7 +211,7 @@ def _adam_step(
     for name, tensor in state.gaussians.tensors().items():
         if name == "rest" and not degree:
             continue  # gradients and moments are zero: nothing moves
-        everywhere = state.room[name].index_copy_(0, rows, gradients[name])
+        everywhere = state.scratch[name].index_copy_(0, rows, gradients[name])
         moved = AdamState(tensor, state.moments.first[name], state.moments.second[name], rates[name])
         finite = get_backend(tensor.device).adam_rows(moved, None, everywhere, state.iteration + 1) & finite
         everywhere.index_fill_(0, rows, 0.0)
@@ -240,7 +240,7 @@ def _densify(state: Gs3dState, stage: Gs3dProblem) -> dict[str, Any]:
         _apply(state, change.added, change.kept)
         facts = {"cloned": change.cloned, "split": change.split, "pruned": change.pruned}
     if done % config.reset_interval == 0:
-        state.gaussians.logits.copy_(cap_opacity_logits(state.gaussians.logits, config.reset_opacity))
+        state.gaussians.opacity_logits.copy_(cap_opacity_logits(state.gaussians.opacity_logits, config.reset_opacity))
         state.moments.first["logits"].zero_()
         state.moments.second["logits"].zero_()
     return facts
@@ -248,7 +248,7 @@ def _densify(state: Gs3dState, stage: Gs3dProblem) -> dict[str, Any]:
 
 def _apply(state: Gs3dState, added: Gaussians, kept: Tensor) -> None:
     """Append Gaussians without moments, then keep some of all; the statistics begin again."""
-    state.room = {}
+    state.scratch = {}
     index_anchors(state, {"gaussians": added.tensors()}, len(added), kept)
     state.gradient, state.views = torch.zeros(len(state.gaussians)), torch.zeros(len(state.gaussians))
 
@@ -298,6 +298,6 @@ def from_saved(saved: Checkpoint) -> Gs3dState:
 
     return Gs3dState(
         saved.iteration, Gaussians(**part("gaussians.")), AdamMoments(part("first."), part("second.")),
-        saved.tensors["gradient"], saved.tensors["views"], float(saved.facts["loss"]), float(saved.facts["psnr"]),
-        float(saved.facts["seconds"]), int(saved.facts["peak_memory_bytes"]),
+        saved.tensors["gradient"], saved.tensors["views"], float(saved.metadata["loss"]), float(saved.metadata["psnr"]),
+        float(saved.metadata["seconds"]), int(saved.metadata["peak_memory_bytes"]),
     )  # fmt: skip

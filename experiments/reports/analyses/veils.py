@@ -26,7 +26,7 @@ from vdgs.runs.opening import open_capture, open_model
 
 def alone(model: AnchorModel, blocks: Blocks, chosen: list[int]) -> AnchorModel:
     """The anchors of some blocks, of a model whose anchors have one decoder."""
-    if len(model.spans()) != 1:
+    if len(model.decoder_ranges()) != 1:
         raise SystemExit("this model has several decoders: run with --block.decoder frozen")
     own = np.isin(blocks.owner(places_of(model.anchors.positions)), chosen)
     return replace(model, anchors=model.anchors.select(torch.from_numpy(own).nonzero()[:, 0]))

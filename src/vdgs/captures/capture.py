@@ -19,7 +19,7 @@ class Observations:
 
     points: np.ndarray
     rays: np.ndarray
-    numbers: np.ndarray
+    point_ids: np.ndarray
 
     def reprojection_errors_px(self, camera: Camera) -> np.ndarray:
         """Reprojection errors [m] in pixels of a pinhole camera in the same world; infinite behind it."""
@@ -42,7 +42,7 @@ class View:
     mask_path: Path | None
     split: Split
     #: Some of the points that the capture says this photograph shows, where it says so (ground frame).
-    sightings: Observations | None = None
+    observations: Observations | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

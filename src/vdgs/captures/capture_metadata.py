@@ -24,7 +24,7 @@ def capture_metadata(capture: Capture) -> CaptureMetadata:
         "points": len(capture.points),
         "ground_frame": {
             "scale": ground.scale, "rotation": ground.rotation.tolist(), "translation": ground.translation.tolist(),
-            "metric": ground.metric, "how": ground.how, "origin_geo": ground.origin_geo,
+            "metric": ground.metric, "how": ground.description, "origin_geo": ground.origin_geo,
             "axes_geo": ground.axes_geo,
         },
         "warnings": list(capture.warnings),

@@ -86,7 +86,7 @@ def _read_colmap(root: Path, options: CaptureOptions) -> SourceCapture:
             "images.bin, or triangulate: colmap point_triangulator."
         )
     return SourceCapture(
-        source="colmap", images=images, views=model.views, points=model.points, colours=model.colours,
+        source="colmap", images=images, views=model.views, points=model.points, colors=model.colors,
         image_folders=(root / images,), warnings=(*warnings, *image_warnings),
     )  # fmt: skip
 

@@ -113,7 +113,7 @@ def _georeferenced(scene: _Scene, file: Path, warnings: list[str]) -> GroundFram
     shift = np.where(np.abs(middle) > FAR_FROM_ORIGIN_M, -np.round(middle), 0.0)
     if shift.any():
         how = f"{how}, origin moved by {np.abs(shift).max():.0f} m"
-    frame = GroundFrame(scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, how=how, origin_geo=origin)
+    frame = GroundFrame(scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, description=how, origin_geo=origin)
     if np.linalg.norm(middle) > MAX_ENU_DISTANCE_M:
         warnings.append(
             f"{file.name}: the cameras are {np.linalg.norm(middle) / 1000:,.0f} km away from the origin, where its "
@@ -129,7 +129,7 @@ def _shifted(frame: GroundFrame, shift: np.ndarray, how: str) -> GroundFrame:
     assert frame.origin_geo is not None
     moved = geodetic_from_enu(-shift[None], frame.origin_geo, frame.axes_origin)[0]
     origin = (float(moved[0]), float(moved[1]), float(moved[2]))
-    return replace(frame, translation=frame.translation + shift, how=how, origin_geo=origin, axes_geo=frame.axes_origin)
+    return replace(frame, translation=frame.translation + shift, description=how, origin_geo=origin, axes_geo=frame.axes_origin)
 
 
 def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | None:
@@ -163,7 +163,7 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
     rms = float(np.sqrt((residuals[inliers] ** 2).sum(axis=1).mean()))
     how = f"GPS of {inliers.sum()} photographs, RMS {rms:.2f} m"
     frame = GroundFrame(
-        scale=similarity.scale, rotation=similarity.rotation, translation=similarity.translation, metric=True, how=how,
+        scale=similarity.scale, rotation=similarity.rotation, translation=similarity.translation, metric=True, description=how,
         origin_geo=origin,
     )  # fmt: skip
     frame = _shifted(frame, -_middle(frame.to_ground(scene.points)), how)
@@ -178,7 +178,7 @@ def _compare_up(scene: _Scene, frame: GroundFrame, warnings: list[str]) -> None:
     angle = float(np.degrees(np.arccos(np.clip(frame.rotation[2] @ up, -1, 1))))
     if angle > MAX_UP_DEVIATION_DEG and not doubts:
         warnings.append(
-            f"up is {angle:.0f} degrees away from what cameras and points suggest (used: {frame.how}). "
+            f"up is {angle:.0f} degrees away from what cameras and points suggest (used: {frame.description}). "
             "If the scene looks tilted, give --up."
         )
 
@@ -219,7 +219,7 @@ def _promised(scene: _Scene, world: WorldPrior, warnings: list[str]) -> GroundFr
 
 def _centred(scene: _Scene, rotation: np.ndarray, scale: float, metric: bool, how: str) -> GroundFrame:
     middle = _middle(scale * scene.points @ rotation.T)
-    return GroundFrame(scale=scale, rotation=rotation, translation=-middle, metric=metric, how=how)
+    return GroundFrame(scale=scale, rotation=rotation, translation=-middle, metric=metric, description=how)
 
 
 def _middle(points: np.ndarray) -> np.ndarray:

@@ -106,7 +106,7 @@ def _check_view(view: View) -> _CheckedView:
         photograph = verify_image(view.image_path)
         if view.mask_path is not None:
             verify_image(view.mask_path)
-        kept = kept_fraction(view.image_path, view.mask_path, photograph.may_be_transparent)
+        kept = kept_fraction(view.image_path, view.mask_path, photograph.has_alpha_channel)
     except CaptureError as error:
         return _CheckedView(view.name, str(error))
     return _CheckedView(view.name, None, not photograph.has_content, kept)

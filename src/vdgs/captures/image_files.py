@@ -163,7 +163,7 @@ class VerifiedImage(NamedTuple):
     """What decoding an image told: whether it shows more than one colour, and whether it may be transparent."""
 
     has_content: bool
-    may_be_transparent: bool
+    has_alpha_channel: bool
 
 
 def verify_image(path: Path) -> VerifiedImage:

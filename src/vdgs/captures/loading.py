@@ -46,7 +46,7 @@ def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
     _refuse_tiny(photographs, options)
     ground, ground_warnings = find_ground_frame(source, root, options)
     views = [_view(photo, options, ground) for photo in photographs]
-    points, colours = ground.to_ground(source.points), source.colours
+    points, colours = ground.to_ground(source.points), source.colors
     if options.max_images is not None and options.max_images < len(views):
         warnings.append(f"using the {options.max_images} of {len(views)} photographs nearest to the middle.")
         views = select_central_views(views, options.max_images)
@@ -100,7 +100,7 @@ def _without_bad_points(source: SourceCapture, warnings: list[str]) -> SourceCap
             "to the cameras: survey coordinates saved with too few digits (float32)? Subtract an origin in the place "
             "before saving, or save double precision."
         )
-    return replace(source, points=source.points[keep], colours=source.colours[keep])
+    return replace(source, points=source.points[keep], colors=source.colors[keep])
 
 
 # --------------------------------------------------------------------------------------- photographs
@@ -153,9 +153,9 @@ def _view(photo: MatchedView, options: CaptureOptions, ground: GroundFrame) -> V
     if options.downscale != 1:
         width, height = int(width / options.downscale), int(height / options.downscale)
         camera = camera.resized(width, height)
-    seen = photo.view.sightings
-    sightings = None if seen is None else Observations(ground.to_ground(seen.points), seen.rays, seen.numbers)
+    seen = photo.view.observations
+    sightings = None if seen is None else Observations(ground.to_ground(seen.points), seen.rays, seen.point_ids)
     return View(
         name=photo.view.name, camera=camera, image_path=photo.file.path, mask_path=photo.file.mask, split="train",
-        sightings=sightings,
+        observations=sightings,
     )  # fmt: skip

@@ -120,15 +120,15 @@ def _factor(images: ImageCache) -> float:
 
 def _seen(view: View, image: DecodedImage) -> tuple[Int64[np.ndarray, " m"], Float[np.ndarray, "m 3"]]:
     """The numbers of points that a photograph shows, each once, and logarithms of their colours in it."""
-    assert view.sightings is not None
+    assert view.observations is not None
     side = max(image.image.shape[:2])
     if side > LONGEST_SIDE_PX:
         height, width = (max(1, round(each * LONGEST_SIDE_PX / side)) for each in image.image.shape[:2])
         image = resize_area(image, width, height)
     height, width = image.image.shape[:2]
     camera = view.camera.resized(width, height)
-    pixels = view.sightings.rays * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-    numbers, once = np.unique(view.sightings.numbers, return_index=True)
+    pixels = view.observations.rays * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    numbers, once = np.unique(view.observations.point_ids, return_index=True)
     inside = ((pixels[once] >= 0) & (pixels[once] < (width, height))).all(axis=1)
     column, row = np.floor(pixels[once][inside]).astype(np.int64).T
     light, counts = _blurred(image)

@@ -37,7 +37,7 @@ class ImageReport:
 
     name: str
     residual_m: tuple[float, ...] | None = None
-    left_out: str | None = None
+    excluded_reason: str | None = None
 
 
 @dataclass(frozen=True)
@@ -183,4 +183,4 @@ def gcp_table(metadata: ReconstructionReport) -> list[tuple[str, str, str, str, 
 
 def excluded_lines(metadata: ReconstructionReport) -> list[str]:
     """Photographs that are not used, each with the reason."""
-    return [f"{photo.name}: {photo.left_out}" for photo in metadata.photographs if photo.left_out is not None]
+    return [f"{photo.name}: {photo.excluded_reason}" for photo in metadata.photographs if photo.excluded_reason is not None]

@@ -45,7 +45,7 @@ class ValidationReport:
     #: of their points lie behind the cameras.
     reprojection_px: float | None
     #: Points in photographs that it was measured on.
-    sightings: int
+    num_observations: int
     #: Share of the sparse points that at least one training camera holds in its frustum.
     seen_fraction: float
     problems: tuple[str, ...]
@@ -59,7 +59,7 @@ def validate_capture(capture: Capture) -> ValidationReport:
     findings = _Findings([], [])
     cameras = [view.camera for view in capture.train_views]
     seen = count_visibility(torch.from_numpy(np.ascontiguousarray(points)), cameras).numpy() > 0
-    errors = {view.name: _errors(view) for view in capture.views if view.sightings is not None}
+    errors = {view.name: _errors(view) for view in capture.views if view.observations is not None}
     pooled = np.concatenate(list(errors.values())) if errors else np.zeros(0)
     _judge_points(capture, findings)
     _judge_places(capture, points, findings)
@@ -67,7 +67,7 @@ def validate_capture(capture: Capture) -> ValidationReport:
     if len(pooled):
         _judge_reprojection(capture, errors, float(np.median(pooled)), findings)
     return ValidationReport(
-        reprojection_px=float(np.median(pooled)) if len(pooled) else None, sightings=len(pooled),
+        reprojection_px=float(np.median(pooled)) if len(pooled) else None, num_observations=len(pooled),
         seen_fraction=float(seen.mean()), problems=tuple(findings.problems), warnings=tuple(findings.warnings),
     )  # fmt: skip
 
@@ -87,8 +87,8 @@ class _Findings:
 
 
 def _errors(view: View) -> np.ndarray:
-    assert view.sightings is not None
-    return view.sightings.reprojection_errors_px(view.camera)
+    assert view.observations is not None
+    return view.observations.reprojection_errors_px(view.camera)
 
 
 def _judge_points(capture: Capture, findings: _Findings) -> None:

@@ -73,4 +73,4 @@ def synth_command(arguments: list[str]) -> None:
             bar.update(tasks[stage], completed=done)
 
         found = generate(asked.output, asked.options, show)
-    console.print(f"{found.line}\ncapture: {asked.output}", highlight=False)
+    console.print(f"{found.summary}\ncapture: {asked.output}", highlight=False)

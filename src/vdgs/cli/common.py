@@ -89,7 +89,7 @@ def update_run_settings(run: RunFolder, method: MethodConfig, overwrite: bool, q
         raise VdgsError("These settings do not work:\n  " + "\n  ".join(problems))
     wanted = replace(run.settings(), **vars(method))
     if wanted != run.settings():
-        with run.driven(), run.locked():
+        with run.drive_lock(), run.locked():
             for line in run.change_settings(wanted, overwrite):
                 make_console(quiet).print(f"[yellow]changed[/] {line}", highlight=False)
 

@@ -30,7 +30,7 @@ class ExportArguments(ExportRequest):
     jobs: Annotated[int, WORKER_COUNT] = 0
     """Shards of the baking done at once, each in a process of its own; 0: on this machine one process bakes all, a
     cluster as many as it has room for."""
-    where: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
+    executor_options: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
 
 
 def export_command(arguments: list[str]) -> None:
@@ -40,8 +40,8 @@ def export_command(arguments: list[str]) -> None:
     from vdgs.distributed.sharded_job import ExecutionOptions
     from vdgs.export.export_run import export_run
 
-    asked.where.check()
-    export_run(replace(asked, device=device), console, ExecutionOptions(asked.where, asked.jobs, device=device))
+    asked.executor_options.check()
+    export_run(replace(asked, device=device), console, ExecutionOptions(asked.executor_options, asked.jobs, device=device))
     from vdgs.report.write_report import write_report
     from vdgs.runs.run_folder import REPORT_FILE, RunFolder
 

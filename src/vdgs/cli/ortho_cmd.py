@@ -29,7 +29,7 @@ class OrthoArguments(OrthoRequest):
     cluster as many as it has room for."""
     quiet: bool = False
     """Print nothing but notes, warnings and errors."""
-    where: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
+    executor_options: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
 
 
 def ortho_command(arguments: list[str]) -> None:
@@ -40,6 +40,6 @@ def ortho_command(arguments: list[str]) -> None:
     from vdgs.rendering.ortho.render_ortho import render_ortho
     from vdgs.runs.run_context import RunContext
 
-    asked.where.check()
-    wish = ExecutionOptions(asked.where, asked.jobs, device=device)
+    asked.executor_options.check()
+    wish = ExecutionOptions(asked.executor_options, asked.jobs, device=device)
     render_ortho(RunContext.from_path(asked.run), replace(asked, device=device), make_console(asked.quiet), wish)

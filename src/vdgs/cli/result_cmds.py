@@ -60,7 +60,7 @@ class EvalArguments:
     """Where the capture lies now, if it was moved; the run remembers it."""
     lpips_weights: Path | None = None
     """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
-    bins: Annotated[int, BIN_COUNT_RANGE] = 4
+    visibility_bins: Annotated[int, BIN_COUNT_RANGE] = 4
     """Number of visibility quantiles by which metrics are reported."""
     jobs: Annotated[int, WORKER_COUNT] = 0
     """Shards of the views measured at once, each in a process of its own; 0: on this machine one process measures all,
@@ -71,7 +71,7 @@ class EvalArguments:
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
     quiet: bool = False
     """Print nothing but notes, warnings and errors."""
-    where: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
+    executor_options: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
 
 
 def eval_command(arguments: list[str]) -> None:
@@ -82,13 +82,13 @@ def eval_command(arguments: list[str]) -> None:
 
     device, console = select_device(asked.device), make_console(asked.quiet)
     measuring = EvaluationRequest(
-        path=asked.run, which=asked.model, lpips_weights=asked.lpips_weights, bins=asked.bins, views=asked.views,
+        path=asked.run, which=asked.model, lpips_weights=asked.lpips_weights, visibility_bins=asked.visibility_bins, views=asked.views,
         device=device,
     )  # fmt: skip
     configure_threads(asked.threads)
     context = RunContext.from_path(asked.run, asked.capture)
-    asked.where.check()
-    evaluate_stage(context, measuring, console, ExecutionOptions(asked.where, asked.jobs, device=device))
+    asked.executor_options.check()
+    evaluate_stage(context, measuring, console, ExecutionOptions(asked.executor_options, asked.jobs, device=device))
 
 
 @dataclass(frozen=True)

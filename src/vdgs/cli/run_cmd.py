@@ -46,7 +46,7 @@ class TrainCoarseArguments:
     """Print nothing but notes, warnings and errors."""
     options: Annotated[CaptureOptions, arg(name="")] = field(default_factory=CaptureOptions)
     training: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
-    watching: Annotated[CheckpointOptions, arg(name="")] = field(default_factory=CheckpointOptions)
+    checkpointing: Annotated[CheckpointOptions, arg(name="")] = field(default_factory=CheckpointOptions)
 
 
 def train_coarse_command(arguments: list[str]) -> None:
@@ -61,7 +61,7 @@ def train_coarse_command(arguments: list[str]) -> None:
     method = replace(settings, training=asked.training)
     command = absolute_command_line("coarse", arguments, (asked.capture, asked.output))
     context = create_or_resume_run(asked.capture, asked.output, asked.options, method, command=command)
-    train_coarse(context, asked.watching, make_console(asked.quiet), device)
+    train_coarse(context, asked.checkpointing, make_console(asked.quiet), device)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +73,7 @@ class RunArguments(RunRequest):
 
     capture: Positional[Path]
     """Folder of the capture, or of photographs alone: they become one in RUN/capture first (`vdgs sfm`)."""
-    photographs: Positional[tuple[Path, ...]] = ()
+    images: Positional[tuple[Path, ...]] = ()
     """More folders of photographs, where the first is one of photographs alone."""
     dry_run: bool = False
     """Only say what it would take: blocks, memory, time, by estimate and a few steps that are timed. Writes nothing."""
@@ -82,8 +82,8 @@ class RunArguments(RunRequest):
     options: Annotated[CaptureOptions, arg(name="")] = field(default_factory=CaptureOptions)
     training: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
     partition: Annotated[PartitionConfig, arg(name="")] = field(default_factory=PartitionConfig)
-    watching: Annotated[CheckpointOptions, arg(name="")] = field(default_factory=CheckpointOptions)
-    where: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
+    checkpointing: Annotated[CheckpointOptions, arg(name="")] = field(default_factory=CheckpointOptions)
+    executor_options: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
 
 
 def run_command(arguments: list[str]) -> None:
@@ -102,5 +102,5 @@ def run_command(arguments: list[str]) -> None:
         return
     from vdgs.pipeline.run_pipeline import run_pipeline
 
-    command = absolute_command_line("run", arguments, (asked.capture, *asked.photographs, asked.output))
+    command = absolute_command_line("run", arguments, (asked.capture, *asked.images, asked.output))
     run_pipeline(replace(asked, device=device), make_console(asked.quiet), command)

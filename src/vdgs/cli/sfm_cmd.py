@@ -18,7 +18,7 @@ class SfmArguments:
     """Photographs to a capture: features, matches, poses and points, metres and north from their positions, photographs
     without lens distortion in three sizes. The same command goes on where it was stopped. Photographs are only read."""
 
-    photographs: Positional[tuple[Path, ...]]
+    images: Positional[tuple[Path, ...]]
     """Folders of photographs, those below them included. A folder masks/ beside photographs has their masks (white =
     keep), named like them: name.png or name.jpg.png."""
     output: Path
@@ -30,7 +30,7 @@ class SfmArguments:
     """Only look: what the photographs say, what would be done and how long it takes. Writes nothing."""
     threads: Annotated[int, WORKER_COUNT] = 0
     """Threads to use; 0 for all cores."""
-    keep_work: bool = False
+    keep_intermediate: bool = False
     """Keep COLMAP's database and models in OUTPUT/work once all is done."""
     quiet: bool = False
     """Print nothing but notes, warnings and errors."""
@@ -42,11 +42,11 @@ def sfm_command(arguments: list[str]) -> None:
     from vdgs.errors import VdgsError
     from vdgs.sfm.reconstruction_plan import plan_reconstruction, print_plan
 
-    if not asked.photographs:
+    if not asked.images:
         raise VdgsError("name the folder of the photographs: vdgs sfm PHOTOGRAPHS --output CAPTURE")
     request = SfmRequest(
-        photographs=asked.photographs, output=asked.output, gps=asked.gps, threads=asked.threads,
-        keep_work=asked.keep_work, options=asked.options,
+        image_folders=asked.images, output=asked.output, gps=asked.gps, threads=asked.threads,
+        keep_intermediate=asked.keep_intermediate, options=asked.options,
     )  # fmt: skip
     console = make_console(asked.quiet)
     if asked.dry_run:

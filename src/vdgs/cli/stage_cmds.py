@@ -51,11 +51,11 @@ class PartitionArguments:
     """Run folder with a coarse model."""
     quiet: bool = False
     """Print nothing but notes, warnings and errors."""
-    redo: bool = False
+    overwrite: bool = False
     """Allow another cut to discard blocks that are trained."""
     capture: Path | None = None
     """Where the capture lies now, if it was moved; the run remembers it."""
-    why: str | None = None
+    explain: str | None = None
     """Name of a training photograph: also say how well it shows each block and why it was assigned or not."""
     jobs: Annotated[int, WORKER_COUNT] = 0
     """Shards of the cameras scored at once, each in a process of its own; 0: on this machine one process scores all, a
@@ -67,7 +67,7 @@ class PartitionArguments:
     it."""
     partition: Annotated[PartitionConfig, arg(name="")] = field(default_factory=PartitionConfig)
     assignment: AssignmentConfig = field(default_factory=AssignmentConfig)
-    where: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
+    executor_options: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
 
 
 def partition_command(arguments: list[str]) -> None:
@@ -81,14 +81,14 @@ def partition_command(arguments: list[str]) -> None:
 
     device = select_device(asked.device)
     configure_threads(asked.threads)
-    asked.where.check()
+    asked.executor_options.check()
     context = RunContext.from_path(asked.run, asked.capture)
     update_run_settings(
-        run, replace(method, partition=asked.partition, assignment=asked.assignment), asked.redo, asked.quiet
+        run, replace(method, partition=asked.partition, assignment=asked.assignment), asked.overwrite, asked.quiet
     )
-    partition_run(context, make_console(asked.quiet), device, ExecutionOptions(asked.where, asked.jobs, device=device))
-    if asked.why is not None:
-        explain_view(run, asked.why, make_console(asked.quiet))
+    partition_run(context, make_console(asked.quiet), device, ExecutionOptions(asked.executor_options, asked.jobs, device=device))
+    if asked.explain is not None:
+        explain_view(run, asked.explain, make_console(asked.quiet))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,36 +105,36 @@ class TrainBlocksArguments:
     """Where the capture lies now, if it was moved; the run remembers it."""
     jobs: Annotated[int, WORKER_COUNT] = 0
     """Blocks trained at once; 0 takes what cores and memory allow."""
-    redo: bool = False
+    overwrite: bool = False
     """Allow other settings to discard blocks that are trained with the old ones."""
     threads: Annotated[int, WORKER_COUNT] = 0
     """Threads of the kernels for --block; 0 for all cores. The result does not depend on it."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
-    settings: Annotated[BlockConfig, arg(name="block")] = field(default_factory=BlockConfig)
-    watching: Annotated[CheckpointOptions, arg(name="")] = field(default_factory=CheckpointOptions)
-    where: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
+    block_config: Annotated[BlockConfig, arg(name="block")] = field(default_factory=BlockConfig)
+    checkpointing: Annotated[CheckpointOptions, arg(name="")] = field(default_factory=CheckpointOptions)
+    executor_options: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
 
 
 def train_blocks_command(arguments: list[str]) -> None:
     def defaults(method: MethodConfig) -> TrainBlocksArguments:
-        return TrainBlocksArguments(run=tyro.MISSING, settings=method.block)
+        return TrainBlocksArguments(run=tyro.MISSING, block_config=method.block)
 
     asked, run, method = parse_for_run(TrainBlocksArguments, arguments, "vdgs train", defaults)
     device = select_device(asked.device)
     from vdgs.runs.run_context import RunContext
 
     context = RunContext.from_path(asked.run, asked.capture)
-    update_run_settings(run, replace(method, block=asked.settings), asked.redo, asked.quiet)
+    update_run_settings(run, replace(method, block=asked.block_config), asked.overwrite, asked.quiet)
     if asked.block is not None:
         from vdgs.pipeline.train_block import train_block
 
         configure_threads(asked.threads)
-        train_block(context, asked.block, asked.watching, make_console(asked.quiet), device)
+        train_block(context, asked.block, asked.checkpointing, make_console(asked.quiet), device)
     else:
         from vdgs.pipeline.train_blocks import train_blocks
 
-        train_blocks(context, asked.watching, asked.jobs, make_console(asked.quiet), device, asked.where)
+        train_blocks(context, asked.checkpointing, asked.jobs, make_console(asked.quiet), device, asked.executor_options)
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ class MergeArguments:
     """Print nothing but notes, warnings and errors."""
     capture: Path | None = None
     """Where the capture lies now, if it was moved; the run remembers it."""
-    incomplete: bool = False
+    allow_missing_blocks: bool = False
     """Let the coarse model stand in for blocks that are missing or failed."""
     merge: Annotated[MergeConfig, arg(name="")] = field(default_factory=MergeConfig)
 
@@ -162,4 +162,4 @@ def merge_command(arguments: list[str]) -> None:
 
     context = RunContext.from_path(asked.run, asked.capture)
     update_run_settings(run, replace(method, merge=asked.merge), overwrite=False, quiet=asked.quiet)
-    merge_run_blocks(context, asked.incomplete, make_console(asked.quiet))
+    merge_run_blocks(context, asked.allow_missing_blocks, make_console(asked.quiet))

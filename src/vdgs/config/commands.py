@@ -46,17 +46,17 @@ class RunRequest:
     of the mean colour, of random colours in training, bounded sizes, cameras by `coverage` and each in its best
     block, blocks topped up and drawn in their surroundings, a lower gate of compensated growth, g added to means, only
     visible anchors moved. `literal`: the paper's numbers and none of those choices."""
-    redo: bool = False
+    overwrite: bool = False
     """Allow other settings than the run has to discard what was trained with the old ones."""
     jobs: Annotated[int, WORKER_COUNT] = 0
     """Blocks trained at once, on a cluster also shards of other stages; 0 takes what there is room for."""
-    incomplete: bool = False
+    allow_missing_blocks: bool = False
     """Go on if a block fails: the coarse model stands in for it."""
     ortho: bool = True
     """End with orthophoto, surface model and visibility as GeoTIFFs in RUN/maps, where `vdgs map` can make them."""
     lpips_weights: Path | None = None
     """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
-    bins: Annotated[int, BIN_COUNT_RANGE] = 4
+    visibility_bins: Annotated[int, BIN_COUNT_RANGE] = 4
     """Number of visibility quantiles by which metrics are reported."""
     threads: Annotated[int, WORKER_COUNT] = 0
     """Threads of the kernels; 0 for all cores. The result does not depend on it."""
@@ -69,9 +69,9 @@ class RunRequest:
     assignment: AssignmentConfig = field(default_factory=AssignmentConfig)
     block: BlockConfig = field(default_factory=BlockConfig)
     merge: MergeConfig = field(default_factory=MergeConfig)
-    watching: Annotated[CheckpointOptions, FlagName("")] = field(default_factory=CheckpointOptions)
-    where: Annotated[ExecutorOptions, FlagName("")] = field(default_factory=ExecutorOptions)
-    photographs: tuple[Path, ...] = ()
+    checkpointing: Annotated[CheckpointOptions, FlagName("")] = field(default_factory=CheckpointOptions)
+    executor_options: Annotated[ExecutorOptions, FlagName("")] = field(default_factory=ExecutorOptions)
+    extra_image_folders: tuple[Path, ...] = ()
     """More folders of photographs, where the first is one of photographs alone."""
 
     def method(self) -> MethodConfig:
@@ -105,7 +105,7 @@ class RenderRequest:
     """Image width; 0 takes that of the training views."""
     capture: Path | None = None
     """Where the capture lies now; needed only where the run has lost its cameras.json."""
-    kind: Literal["image", "depth", "visibility", "alpha"] = "image"
+    mode: Literal["image", "depth", "visibility", "alpha"] = "image"
     """What to draw: the picture; the median depth, at which a pixel becomes half opaque (grey where it never does); the
     number of training cameras that see each place, V; or alpha, how opaque the scene is."""
     colorbar: bool = True
@@ -137,7 +137,7 @@ class OrthoRequest:
     crs: str | None = None
     """Coordinates of the map: EPSG:n (EPSG:25832), `enu` (metres east and north of the scene's origin), `source` (those
     of the capture) or `local` (the ground frame). By default the UTM zone of a georeferenced capture, else `local`."""
-    sharp: bool = False
+    detail_from_images: bool = False
     """Take the fine detail of the orthophoto from the photographs, where they truly see a place."""
     model: ModelName = "best"
     """Which model; `best` is the merged one where there is one."""
@@ -170,7 +170,7 @@ class ExportRequest:
     size."""
     html_max_mb: Annotated[float, Range(1, 2000)] = 30.0
     """A .html file has at most so many MB: the scene is thinned until it fits."""
-    rounds: Annotated[int | None, Range(0, 100)] = None
+    color_iterations: Annotated[int | None, Range(0, 100)] = None
     """How often colours are fitted again to what the file's pictures lack of the model's. By default 8 times, or once
     where the anchors spawn more than four million Gaussians: more come nearer and take longer (docs/export.md)."""
     optimize_seconds: Annotated[float, SECONDS_RANGE] = 0.0
@@ -180,7 +180,7 @@ class ExportRequest:
     """Coordinates of the files: EPSG:n (EPSG:25832), `enu` (metres east and north of the scene's origin), `source`
     (those of the capture) or `local` (the ground frame). By default `enu` where the capture is georeferenced, and UTM
     for .laz and .las; else `local`. 3D Tiles of a georeferenced capture always stand on the globe (`enu`)."""
-    measure: bool = True
+    evaluate: bool = True
     """Read a file back, draw the test views and say what was lost against the model itself."""
     threads: Annotated[int, WORKER_COUNT] = 0
     """Threads of the kernels; 0 for all cores. The result does not depend on it, but for --refine."""

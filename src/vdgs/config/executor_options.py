@@ -31,7 +31,7 @@ class SlurmOptions:
     """How often SLURM is asked what became of the jobs."""
     setup_command: str = ""
     """A shell command run first in every job, such as `module load cuda`."""
-    options: tuple[str, ...] = ()
+    sbatch_args: tuple[str, ...] = ()
     """More options for sbatch, each a word (`--slurm.options --qos=long --constraint=avx512`)."""
 
 
@@ -45,7 +45,7 @@ class ExecutorOptions:
     address: str | None = None
     """Ray: where the cluster is (`auto`, or `head:6379`); without it what RAY_ADDRESS says, else a Ray of this machine
     alone that ends with the command."""
-    processors: Annotated[int, WORKER_COUNT] = 0
+    cpus: Annotated[int, WORKER_COUNT] = 0
     """Ray and SLURM: processors of a block or shard; 0 shares out those of the cluster (SLURM: 4)."""
     mem_gb: Annotated[float, Range(0, MAX_FLOAT)] = 0.0
     """Ray and SLURM: memory of a block or shard; 0 takes what it needs by estimate. After an out-of-memory kill half as

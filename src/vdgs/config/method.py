@@ -16,15 +16,15 @@ PartitionStrategy = Literal["visibility", "vastgaussian", "citygaussian", "dogs"
 #: From which share of the iterations on images are shrunk by which factor.
 ResolutionSchedule = tuple[tuple[Annotated[float, FRACTION], Annotated[int, Range(1, 1024)]], ...]
 
-LEARNING_RATE_RANGE = Range(0, 100, above=True)
-FACTOR_RANGE = Range(0, 1000, above=True)
+LEARNING_RATE_RANGE = Range(0, 100, exclusive_min=True)
+FACTOR_RANGE = Range(0, 1000, exclusive_min=True)
 
 
 @dataclass(frozen=True, kw_only=True)
 class AnchorConfig:
     """The anchor model (Scaffold-GS, section III-B of the paper)."""
 
-    offsets: Annotated[int, Range(1, 32)] = 10
+    num_offsets: Annotated[int, Range(1, 32)] = 10
     """Gaussians per anchor (k)."""
     voxel_size: Annotated[float, Range(0, MAX_FLOAT)] = 0.0
     """Edge of the initial voxel grid in units of the ground frame; 0 takes the median nearest-neighbour distance of the
@@ -41,9 +41,9 @@ class AnchorConfig:
     bound_scales: bool = True
     """No Gaussian may be longer than a quarter of the pictures that train it: none can hang as a veil before a whole
     view. The unit of an anchor's offsets is bounded with them: its Gaussians stay about it (choice)."""
-    distance: bool = False
+    view_distance: bool = False
     """Feed the distance between camera and anchor to the decoder too."""
-    appearance: Annotated[int, Range(0, 1024)] = 0
+    appearance_dim: Annotated[int, Range(0, 1024)] = 0
     """Size of the appearance embedding of each training image (colour only); 0 for none."""
     from_colors: bool = False
     """Start the features from the colours of the sparse points instead of zeros."""
@@ -63,7 +63,7 @@ class LearningRateConfig:
     """Opacity decoder."""
     covariance: Annotated[tuple[float, float], LEARNING_RATE_RANGE] = (0.004, 0.004)
     """Covariance decoder."""
-    colour: Annotated[tuple[float, float], LEARNING_RATE_RANGE] = (0.008, 5e-5)
+    color: Annotated[tuple[float, float], LEARNING_RATE_RANGE] = (0.008, 5e-5)
     """Colour decoder."""
     appearance: Annotated[tuple[float, float], LEARNING_RATE_RANGE] = (0.05, 5e-4)
     """Appearance embedding."""
@@ -75,21 +75,21 @@ class LearningRateConfig:
 class DensifyConfig:
     """Where anchors are added and removed (Scaffold-GS, section 4.2 there)."""
 
-    interval: Annotated[int, Range(1, MAX_COUNT)] = 100
+    every: Annotated[int, Range(1, MAX_COUNT)] = 100
     """Iterations between two growth decisions."""
     stats_start: Annotated[int, Range(0, MAX_COUNT)] = 500
     """Iteration from which gradients and opacities are counted."""
     start: Annotated[int, Range(0, MAX_COUNT)] = 1500
     """Iteration from which anchors grow and are pruned."""
-    until: Annotated[float, FRACTION] = 0.5
+    stop_fraction: Annotated[float, FRACTION] = 0.5
     """Share of the iterations after which growth and pruning end."""
-    threshold: Annotated[float, Range(0, MAX_COUNT)] = 2e-4
+    grad_threshold: Annotated[float, Range(0, MAX_COUNT)] = 2e-4
     """Mean norm of dL/d(mean) in NDC units above which an offset asks for a new anchor."""
-    levels: Annotated[int, Range(0, 16)] = 3
+    num_levels: Annotated[int, Range(0, 16)] = 3
     """Number of cell sizes tried; level i has threshold 2^i times and cells 4^i times finer."""
     coarsest_voxels: Annotated[float, Range(0, MAX_FLOAT, above=True)] = 16.0
     """Edge of the coarsest cell, in voxels."""
-    gate: Annotated[float, Range(0, MAX_COUNT)] = 0.4
+    min_draw_fraction: Annotated[float, Range(0, MAX_COUNT)] = 0.4
     """An offset is judged once it was rendered more often than this share of the interval."""
     prune_opacity: Annotated[float, Range(0, MAX_FLOAT)] = 0.005
     """An anchor goes when the opacity of its Gaussians, summed over them, averaged over the views, is below this."""
@@ -117,11 +117,11 @@ class CompensationConfig:
     times the gradients it is made of; with 1 - gamma (the preset `laptop`) it is a mean over cycles."""
     gamma: Annotated[float, FRACTION] = 0.9
     """gamma: decay of the cache g from cycle to cycle."""
-    added_to: Literal["mean", "sum"] = "mean"
+    target: Literal["mean", "sum"] = "mean"
     """What g is added to when anchors grow; the paper says "the raw gradient statistics". `mean`: to the mean gradient,
     after the division by how often the offset was drawn. `sum`: to the sum before it, so that g is divided too: an
     offset that was drawn eight times gets an eighth of it."""
-    gate: Literal["scaled", "literal"] = "scaled"
+    min_draws: Literal["scaled", "literal"] = "scaled"
     """Above how many draws an offset of low visibility is judged: `scaled` takes T_low times the gate of the others, at
     least 2 (choice: within one cycle it can never pass theirs); `literal` the same as the others."""
 
@@ -130,7 +130,7 @@ class CompensationConfig:
 class LossConfig:
     """What training minimises."""
 
-    ssim_weight: Annotated[float, FRACTION] = 0.2
+    ssim_lambda: Annotated[float, FRACTION] = 0.2
     """Loss = (1 - w) L1 + w (1 - SSIM) + volume."""
     volume_reg: Annotated[float, Range(0, MAX_FLOAT)] = 0.01
     """Weight of the mean product of the three scales of the Gaussians that are drawn."""
@@ -149,13 +149,13 @@ class TrainConfig:
     iterations: Annotated[int, Range(0, MAX_COUNT)] = 100_000
     """Number of steps, one photograph each; 0 takes sixty for each training photograph, but at least 3000 and at
     most 30 000 (choice: with few photographs a model soon overfits, many need their time)."""
-    sampling: Literal["even", "shares", "roots"] = "even"
+    view_sampling: Literal["even", "shares", "roots"] = "even"
     """How often each photograph is used. `even`: all alike (the paper). `shares`: every anchor has one vote, divided
     among the cameras that see it, and a photograph is used in proportion to its votes: most where few others look.
     `roots`: in proportion to the square root of its votes, which keeps more photographs in use (choice)."""
-    resolutions: ResolutionSchedule = ((0.0, 1),)
+    resolution_schedule: ResolutionSchedule = ((0.0, 1),)
     """Resolution schedule: from this share of the iterations on, images are shrunk by this factor."""
-    average: Annotated[float, Range(0, 1, exclusive_max=True)] = 0.0
+    swa_fraction: Annotated[float, Range(0, 1, exclusive_max=True)] = 0.0
     """The stage ends with the mean of the models of this last share of its iterations, after growth and at full size; 0
     for the very last model (choice)."""
     optimizer: Literal["visible", "dense"] = "visible"
@@ -166,17 +166,17 @@ class TrainConfig:
     """Everything random follows from it: on the CPU the same seed gives the same bits."""
     anchors: AnchorConfig = field(default_factory=AnchorConfig)
     """The anchor model."""
-    rates: LearningRateConfig = field(default_factory=LearningRateConfig)
+    lr: LearningRateConfig = field(default_factory=LearningRateConfig)
     """Learning rates."""
-    early: Annotated[float, Range(1, 1000)] = 1.0
+    lr_warm_boost: Annotated[float, Range(1, 1000)] = 1.0
     """Up to how many times faster an anchor moves while it has had few updates: after u of them, by the least of this
     and 1 / sqrt(1 - 0.999^u), which is 3 after 118 updates and 1.3 after 900 (choice: in short trainings an anchor is
     seen a few hundred times; 1 is Adam as it is)."""
-    growth: DensifyConfig = field(default_factory=DensifyConfig)
+    densify: DensifyConfig = field(default_factory=DensifyConfig)
     """Growth and pruning of anchors."""
     loss: LossConfig = field(default_factory=LossConfig)
     """The loss."""
-    exposure: bool = False
+    exposure_compensation: bool = False
     """Fit a small colour model to each photograph: an affine map whose mean over all photographs is neutral. The scene
     is drawn in neutral colours, and compared with a test photograph in the exposure that the training photographs
     taken before and after it and what its camera meters foretell (no pixel of it is used). Blocks take it over as the
@@ -229,7 +229,7 @@ class AssignmentConfig:
     """Share of pixels (or, for `frustum`, of anchors) above which a camera is assigned."""
     threshold_leave_one_out: Annotated[float, FRACTION] = 0.05
     """The same for `leave_one_out` (peers: 0.05 to 0.12)."""
-    best_block: bool = True
+    always_best: bool = True
     """Every camera also joins its best block (choice: else one that is above the threshold nowhere trains nothing)."""
     min_cameras: Annotated[int, Range(0, MAX_COUNT)] = 100
     """Each block is topped up with the cameras that show it best to at least this many, as far as any show it (choice);
@@ -244,41 +244,41 @@ class BlockConfig:
 
     iterations: Annotated[int, Range(0, MAX_COUNT)] = 50_000
     """Steps for each block; 0 takes fifteen for each of its photographs, at least 500 and at most 15 000 (choice)."""
-    scale_iterations: Annotated[float, Range(0, 1000, above=True)] = 1.0
+    steps_scaler: Annotated[float, Range(0, 1000, above=True)] = 1.0
     """Factor on the steps and on the start of statistics and growth, for scenes smaller than the paper's."""
-    sampling: Literal["even", "shares", "roots"] = "even"
+    view_sampling: Literal["even", "shares", "roots"] = "even"
     """As in the coarse stage, by the votes of the anchors that the block moves: photographs that show little of the
     block are used little."""
-    resolutions: ResolutionSchedule = ((0.0, 1),)
+    resolution_schedule: ResolutionSchedule = ((0.0, 1),)
     """Resolution schedule, as in the coarse stage."""
-    average: Annotated[float, Range(0, 1, exclusive_max=True)] = 0.0
+    swa_fraction: Annotated[float, Range(0, 1, exclusive_max=True)] = 0.0
     """As in the coarse stage."""
     crop: Literal["off", "steps", "pixels"] = "off"
     """Draw only the part of each photograph in which the block has a share, and all of it in every fourth step.
     `steps`: each step costs less; `pixels`: as many pixels are drawn as without, in up to four times more steps, so
     that each place of the scene is drawn more often: `iterations` then counts photographs, whatever their size
     (choice)."""
-    offset_rate: Annotated[float, FACTOR_RANGE] = 1.0
+    lr_scale_offsets: Annotated[float, FACTOR_RANGE] = 1.0
     """The rates of the coarse stage start again, those of offsets times this (the paper prints no rates for blocks;
     CityGaussian fine-tunes with 0.4)."""
-    scale_rate: Annotated[float, FACTOR_RANGE] = 1.0
+    lr_scale_log_scales: Annotated[float, FACTOR_RANGE] = 1.0
     """... and those of log-scales times this (CityGaussian: 0.8)."""
-    feature_rate: Annotated[float, FACTOR_RANGE] = 1.0
+    lr_scale_features: Annotated[float, FACTOR_RANGE] = 1.0
     """... and those of features times this."""
-    early: Annotated[float, Range(1, 1000)] = 1.0
+    lr_warm_boost: Annotated[float, Range(1, 1000)] = 1.0
     """As `early` of the coarse stage, for the block's own updates: its anchors begin trained."""
     random_background: Annotated[float, FRACTION] = 1.0
     """As in the loss of the coarse stage: without, blocks make ground transparent that was opaque (choice)."""
     decoder: Literal["frozen", "own"] = "frozen"
     """`frozen`: as the coarse stage left it (the paper). `own`: each block trains its copy, which its anchors keep in
     the merged scene (choice: with a frozen decoder blocks overfit sooner where few cameras see them)."""
-    ring: Literal["frozen", "ramp", "free"] = "frozen"
+    margin: Literal["frozen", "ramp", "free"] = "frozen"
     """Anchors between core and widened boundary: `frozen` are drawn and never move (choice for "gradients at the
     boundary are suppressed"); `ramp`: their learning rate falls linearly to zero at the widened boundary; `free`
     move as those of the core."""
-    context: bool = True
+    draw_outside: bool = True
     """Draw the anchors outside the block too, frozen (choice). Off: what the block's cameras see there is empty."""
-    growth: DensifyConfig = field(default_factory=DensifyConfig)
+    densify: DensifyConfig = field(default_factory=DensifyConfig)
     """Growth and pruning of anchors, by default as in the coarse stage: the paper says nothing else."""
     max_anchors_total: Annotated[int, Range(0, MAX_COUNT)] = 0
     """No growth beyond this many anchors of all blocks together; 0 for no limit. Each block has a share in proportion
@@ -329,31 +329,31 @@ def max_block_anchors(config: BlockConfig, num_anchors: int, total_anchors: int)
     no limit are different things.
     """
     share = max(1, config.max_anchors_total * num_anchors // total_anchors) if config.max_anchors_total else 0
-    limits = [limit for limit in (config.growth.max_anchors, share) if limit]
+    limits = [limit for limit in (config.densify.max_anchors, share) if limit]
     return min(limits, default=0)
 
 
 def block_train_config(config: MethodConfig, num_views: int) -> TrainConfig:
     """The settings of the training loop for one block with so many photographs."""
-    block, scale = config.block, config.block.scale_iterations
-    rates = config.training.rates
+    block, scale = config.block, config.block.steps_scaler
+    rates = config.training.lr
     return replace(
         config.training,
         iterations=max(1, round(scale * (block.iterations or _steps(num_views, *AUTO_BLOCK_ITERATIONS)))),
-        sampling=block.sampling,
-        average=block.average,
-        early=block.early,
-        resolutions=block.resolutions,
-        rates=replace(
+        view_sampling=block.view_sampling,
+        swa_fraction=block.swa_fraction,
+        lr_warm_boost=block.lr_warm_boost,
+        resolution_schedule=block.resolution_schedule,
+        lr=replace(
             rates,
-            offsets=(block.offset_rate * rates.offsets[0], block.offset_rate * rates.offsets[1]),
-            log_scales=(block.scale_rate * rates.log_scales[0], block.scale_rate * rates.log_scales[1]),
-            features=(block.feature_rate * rates.features[0], block.feature_rate * rates.features[1]),
+            offsets=(block.lr_scale_offsets * rates.offsets[0], block.lr_scale_offsets * rates.offsets[1]),
+            log_scales=(block.lr_scale_log_scales * rates.log_scales[0], block.lr_scale_log_scales * rates.log_scales[1]),
+            features=(block.lr_scale_features * rates.features[0], block.lr_scale_features * rates.features[1]),
         ),
-        growth=replace(
-            block.growth,
-            stats_start=round(scale * block.growth.stats_start),
-            start=round(scale * block.growth.start),
+        densify=replace(
+            block.densify,
+            stats_start=round(scale * block.densify.stats_start),
+            start=round(scale * block.densify.start),
         ),
         loss=replace(config.training.loss, random_background=block.random_background),
         compensation=block.compensation,

@@ -29,26 +29,26 @@ MAX_FLOAT = 1_000_000
 class Range:
     """From `least` to `most`, both among them unless said otherwise."""
 
-    least: float
-    most: float
-    above: bool = False
+    min: float
+    max: float
+    exclusive_min: bool = False
     """The least itself is not possible."""
     exclusive_max: bool = False
     """Nor is the most."""
     allow_zero: bool = False
     """0 is possible too, and means something else."""
 
-    def holds(self, value: float) -> bool:
+    def contains(self, value: float) -> bool:
         """Whether a number lies in the range; no NaN and no infinity does."""
         if self.allow_zero and value == 0:
             return True
-        low = self.least < value if self.above else self.least <= value
-        high = value < self.most if self.exclusive_max else value <= self.most
+        low = self.min < value if self.exclusive_min else self.min <= value
+        high = value < self.max if self.exclusive_max else value <= self.max
         return low and high
 
     def __str__(self) -> str:
-        low = f"{'above' if self.above else 'at least'} {_plain(self.least)}"
-        high = f"{'below' if self.exclusive_max else 'at most'} {_plain(self.most)}"
+        low = f"{'above' if self.exclusive_min else 'at least'} {_plain(self.min)}"
+        high = f"{'below' if self.exclusive_max else 'at most'} {_plain(self.max)}"
         return f"{'0, or ' if self.allow_zero else ''}{low} and {high}"
 
 
@@ -74,7 +74,7 @@ class NumericSetting:
     range: Range | None
 
     @property
-    def option(self) -> str:
+    def flag(self) -> str:
         """`--block.growth.max-anchors`."""
         return to_flag(self.path)
 
@@ -86,7 +86,7 @@ def to_flag(path: tuple[str, ...]) -> str:
 
 def find_range_errors(settings: Any, within: tuple[str, ...] = ()) -> list[str]:
     """One sentence for every number outside its range; empty if there is none. `within` names the groups around it."""
-    return [f"{each.option} {each.value}: must be {each.range}" for each in iter_out_of_range(settings, within)]
+    return [f"{each.flag} {each.value}: must be {each.range}" for each in iter_out_of_range(settings, within)]
 
 
 def check_ranges(settings: Any) -> None:
@@ -99,7 +99,7 @@ def check_ranges(settings: Any) -> None:
 def iter_out_of_range(settings: Any, within: tuple[str, ...] = ()) -> Iterator[NumericSetting]:
     """Every number that is outside its range."""
     for each in iter_numbers(settings, within):
-        if each.value is not None and each.range is not None and not each.range.holds(each.value):
+        if each.value is not None and each.range is not None and not each.range.contains(each.value):
             yield each
 
 

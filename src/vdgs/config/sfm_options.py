@@ -25,9 +25,9 @@ class SfmOptions:
     order, and those that look alike."""
     max_image_size: Annotated[int, Range(200, 100_000)] = 2000
     """Photographs are shrunk to this many pixels of their longer side to find features."""
-    features: Annotated[int, Range(200, 1_000_000)] = 8192
+    max_num_features: Annotated[int, Range(200, 1_000_000)] = 8192
     """Features of a photograph, at most about so many."""
-    max_size: Annotated[int, Range(16, 1_000_000, allow_zero=True)] = 0
+    max_output_size: Annotated[int, Range(16, 1_000_000, allow_zero=True)] = 0
     """Longer side of the photographs that are written into images/, in pixels; 0: as large as they are."""
     gcp: Path | None = None
     """gcp_list.txt (as for ODM): surveyed points and where photographs show them. The model is brought to them."""
@@ -42,9 +42,9 @@ class SfmOptions:
 class SfmRequest:
     """Photographs to a capture (`vdgs sfm`)."""
 
-    photographs: tuple[Path, ...]
+    image_folders: tuple[Path, ...]
     output: Path
     gps: Path | None = None
     threads: Annotated[int, WORKER_COUNT] = 0
-    keep_work: bool = False
+    keep_intermediate: bool = False
     options: Annotated[SfmOptions, FlagName("")] = field(default_factory=SfmOptions)

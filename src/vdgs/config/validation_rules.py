@@ -10,13 +10,13 @@ def validate_config(config: MethodConfig) -> list[str]:
     """What is wrong with the settings, one sentence each; empty if nothing is."""
     found = find_range_errors(config)
     training, block = config.training, config.block
-    found += _validate_schedule(training.average, training.growth, training.resolutions)
-    found += [f"block.{each}" for each in _validate_schedule(block.average, block.growth, block.resolutions)]
-    if block.ring == "ramp" and block.decoder == "own":
+    found += _validate_schedule(training.swa_fraction, training.densify, training.resolution_schedule)
+    found += [f"block.{each}" for each in _validate_schedule(block.swa_fraction, block.densify, block.resolution_schedule)]
+    if block.margin == "ramp" and block.decoder == "own":
         found.append(
             "block.ring ramp needs --block.decoder frozen: a decoder that moves changes anchors that should stay"
         )
-    if config.merge.rule == "best_seen" and block.ring == "frozen":
+    if config.merge.rule == "best_seen" and block.margin == "frozen":
         found.append("merge.rule best_seen needs --block.ring ramp or free: a frozen ring has nothing to offer")
     return found
 
@@ -38,8 +38,8 @@ def _validate_resolutions(resolutions: ResolutionSchedule) -> list[str]:
 def _validate_average(average: float, growth: DensifyConfig, resolutions: ResolutionSchedule) -> list[str]:
     if not 0 < average < 1:
         return []
-    if growth.until >= 1:
+    if growth.stop_fraction >= 1:
         return ["average needs growth and pruning to end: growth.until must be below 1"]
-    if resolutions and resolutions[-1][0] > max(1 - average, growth.until):
+    if resolutions and resolutions[-1][0] > max(1 - average, growth.stop_fraction):
         return ["average would mix models of several image sizes: let the last of resolutions begin before it"]
     return []

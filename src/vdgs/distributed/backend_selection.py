@@ -30,7 +30,7 @@ class SelectedBackend:
 
     executor: Executor
     share: Allocation
-    line: str
+    description: str
     """Where they run and with what, in words."""
     notes: tuple[str, ...] = ()
     """What a person should know before it begins."""
@@ -85,18 +85,18 @@ def check_backend_reachable(executor_options: ExecutorOptions) -> None:
 
 def _local(workload: ShardWorkload, machine: MachineResources) -> SelectedBackend:
     share = allocate_local(workload, machine.cores, machine.free_bytes)
-    photographs = min(workload.photographs_bytes, round(1e9 * share.image_gb))
+    photographs = min(workload.images_bytes, round(1e9 * share.image_gb))
     beside = f" and {data_size(photographs)} for photographs" if photographs else ""
     line = (
-        f"{share.at_once} at once with {share.resources.processors} thread(s) each; by estimate a {workload.kind.one} takes "
+        f"{share.max_concurrent} at once with {share.resources.cpus} thread(s) each; by estimate a {workload.kind.singular} takes "
         f"at most {data_size(workload.shard_bytes)}{beside}, of {data_size(machine.free_bytes)} free"
     )
     note = (
-        f"[yellow]warning[/] {share.at_once} at once may run out of memory. What helps: "
+        f"[yellow]warning[/] {share.max_concurrent} at once may run out of memory. What helps: "
         f"{', '.join(('less --jobs', *workload.kind.memory_saving_options))}"
     )
-    short = exceeds_memory(workload, share.at_once, machine.free_bytes)
-    return SelectedBackend(LocalExecutor(share.at_once), share, line, (note,) if short else ())
+    short = exceeds_memory(workload, share.max_concurrent, machine.free_bytes)
+    return SelectedBackend(LocalExecutor(share.max_concurrent), share, line, (note,) if short else ())
 
 
 def _ray(executor_options: ExecutorOptions, workload: ShardWorkload, requirements: NodeRequirements) -> SelectedBackend:
@@ -110,7 +110,7 @@ def _ray(executor_options: ExecutorOptions, workload: ShardWorkload, requirement
     share = allocate_cluster(workload, there, executor_options)
     notes, needs = [], share.resources
     if not any(
-        node.processors >= needs.processors and node.memory_bytes >= needs.memory_bytes and node.gpus >= needs.gpus
+        node.cpus >= needs.cpus and node.memory_bytes >= needs.memory_bytes and node.gpus >= needs.gpus
         for node in there
     ):
         notes.append(
@@ -118,7 +118,7 @@ def _ray(executor_options: ExecutorOptions, workload: ShardWorkload, requirement
         )
     if needs.memory_bytes and needs.memory_bytes < workload.shard_bytes:
         notes.append(
-            f"[yellow]warning[/] by estimate a {workload.kind.one} takes at most {data_size(workload.shard_bytes)}, more than "
+            f"[yellow]warning[/] by estimate a {workload.kind.singular} takes at most {data_size(workload.shard_bytes)}, more than "
             "any node has."
             + (
                 f" What helps: {', '.join(workload.kind.memory_saving_options)}"
@@ -132,9 +132,9 @@ def _ray(executor_options: ExecutorOptions, workload: ShardWorkload, requirement
             f"[yellow]note[/] nodes have different processors ({', '.join(processors)}): what they compute differs in "
             "its last bits. With VDGS_ISA=avx2 (or portable) all compute alike"
         )
-    names = len(there), sum(node.processors for node in there)
+    names = len(there), sum(node.cpus for node in there)
     line = f"over {names[0]} node{'s' if names[0] > 1 else ''} of Ray with {names[1]} processors, {_resources_text(share)} each"
-    executor = RayExecutor(share.at_once, patience_seconds=LOCK_TIMEOUT_SECONDS, question=requirements)
+    executor = RayExecutor(share.max_concurrent, lock_timeout_seconds=LOCK_TIMEOUT_SECONDS, requirements=requirements)
     return SelectedBackend(executor, share, line, tuple(notes))
 
 
@@ -147,10 +147,10 @@ def _slurm(
     share = allocate_queue(workload, executor_options)
     options = executor_options.slurm
     executor = SlurmExecutor(
-        at_once=share.at_once,
+        max_concurrent=share.max_concurrent,
         poll_seconds=options.poll_seconds,
-        patience_seconds=LOCK_TIMEOUT_SECONDS,
-        question=requirements,
+        lock_timeout_seconds=LOCK_TIMEOUT_SECONDS,
+        requirements=requirements,
         options=options,
     )
     return SelectedBackend(executor, share, f"as jobs of SLURM, {_resources_text(share)} each")
@@ -158,7 +158,7 @@ def _slurm(
 
 def _resources_text(allocation: Allocation) -> str:
     needs = allocation.resources
-    parts = [f"{needs.processors} processor{'s' if needs.processors > 1 else ''}"]
+    parts = [f"{needs.cpus} processor{'s' if needs.cpus > 1 else ''}"]
     if needs.memory_bytes:
         parts.append(data_size(needs.memory_bytes))
     if needs.gpus:

@@ -22,7 +22,7 @@ EndState = Literal["done", "failed", "stopped"]
 class TaskResources:
     """What a task asks of the place where it runs. Processes of this machine take what there is."""
 
-    processors: int = 1
+    cpus: int = 1
     memory_bytes: int = 0
     """0: says nothing."""
     gpus: float = 0.0
@@ -56,7 +56,7 @@ class TaskResult:
     """0: it was not started."""
     seconds: float = 0.0
     """Of the last attempt."""
-    why: str = ""
+    reason: str = ""
     """Empty when done."""
     last_lines: tuple[str, ...] = ()
     """The end of what a failed one printed."""
@@ -65,28 +65,28 @@ class TaskResult:
 class TaskListener:
     """Is told what becomes of the tasks while they run; does nothing with it. Called in the thread that runs them."""
 
-    def placed(self, task: Task, where: str, found: bool) -> None:
+    def on_placed(self, task: Task, where: str, found: bool) -> None:
         """It runs on the machine `where`; `found` there, begun by a driver that died. Before `started`."""
 
-    def started(self, task: Task, attempt: int) -> None:
+    def on_started(self, task: Task, attempt: int) -> None:
         """An attempt, counted from 1, begins."""
 
-    def waits(self, task: Task) -> None:
+    def on_waiting(self, task: Task) -> None:
         """There is room for it, but another process works on it."""
 
-    def paused(self, task: Task, why: str) -> None:
+    def on_paused(self, task: Task, why: str) -> None:
         """It saved and lost its place; it will be continued. No attempt is lost."""
 
-    def crashed(self, task: Task, how: str, attempts_left: int) -> None:
+    def on_crashed(self, task: Task, how: str, attempts_left: int) -> None:
         """It will be started again."""
 
-    def stopping(self, tasks: Sequence[Task]) -> None:
+    def on_stopping(self, tasks: Sequence[Task]) -> None:
         """These run and were asked to save and end; no more are started."""
 
-    def ended(self, task: Task, outcome: TaskResult) -> None:
+    def on_ended(self, task: Task, outcome: TaskResult) -> None:
         """It will not be started again, or never was."""
 
-    def tick(self) -> None:
+    def on_tick(self) -> None:
         """Called regularly, after all other news."""
 
 
@@ -94,7 +94,7 @@ class Executor(Protocol):
     """An engine that runs tasks."""
 
     @property
-    def at_once(self) -> int:
+    def max_concurrent(self) -> int:
         """How many tasks run side by side, at most."""
 
     def run(self, tasks: Sequence[Task], listener: TaskListener) -> list[TaskResult]:
@@ -149,7 +149,7 @@ class AttemptResult:
 
     code: int | None
     """The exit code as `subprocess` counts (negative: a signal); None of one that was lost with its place."""
-    how: str = ""
+    reason: str = ""
     """Of a lost one: by what, in words."""
     out_of_memory: bool = False
     """The system, or the cluster, ended it for want of memory."""
@@ -161,13 +161,13 @@ class Attempt(Protocol):
     """An attempt at a task, wherever its process is."""
 
     @property
-    def begun(self) -> AttemptStarted | None:
+    def start_info(self) -> AttemptStarted | None:
         """None while it waits for a place, or waits for one again."""
 
-    def look(self) -> AttemptResult | None:
+    def poll(self) -> AttemptResult | None:
         """How it ended; None while it goes on. Brings `begun` up to date."""
 
-    def ask_to_stop(self) -> None:
+    def request_stop(self) -> None:
         """Ask it to save and end; one that waits for a place ends at once. Called once."""
 
     def kill(self) -> None:
@@ -178,13 +178,13 @@ class Engine(Protocol):
     """Begins attempts."""
 
     @property
-    def most_memory(self) -> int | None:
+    def max_memory_bytes(self) -> int | None:
         """Bytes that a task can ask for at most; None of an engine that finds no place by needs."""
 
     def start(self, tasks: Sequence[tuple[Task, int]]) -> Sequence[Attempt | OSError]:
         """Begin an attempt (of that number) at each task, or say what the system refuses."""
 
-    def find(self, task: Task) -> Attempt | None:
+    def find_running(self, task: Task) -> Attempt | None:
         """An attempt that a driver began which died since, and that goes on without it."""
 
     def refresh(self) -> None:

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 class JobLabels:
     """The words for the shards of a stage."""
 
-    one: str
+    singular: str
     plural: str
-    work: str
+    verb: str
     """What is to be done with one: "train"."""
     activity: str
     """What it is at work with: "training"."""
-    steps: str
+    step_unit: str
     """What the numbers of `iteration` and `iterations` in its status file count, as the head of a column."""
     rate_unit: str
     """So many of them a second."""
@@ -26,11 +26,11 @@ class JobLabels:
 
 
 BLOCK_LABELS = JobLabels(
-    one="block",
+    singular="block",
     plural="blocks",
-    work="train",
+    verb="train",
     activity="training",
-    steps="iteration",
+    step_unit="iteration",
     rate_unit="it/s",
     shows_training_stats=True,
     memory_saving_options=("more --blocks", "--block.growth.max-anchors"),
@@ -39,4 +39,4 @@ BLOCK_LABELS = JobLabels(
 
 def shard_kind(work: str, steps: str) -> JobLabels:
     """The words for shards that do something (`measure`) with items (`views`)."""
-    return JobLabels(one="shard", plural="shards", work=work, activity="at work", steps=steps, rate_unit=f"{steps}/s")
+    return JobLabels(singular="shard", plural="shards", verb=work, activity="at work", step_unit=steps, rate_unit=f"{steps}/s")

@@ -23,7 +23,7 @@ class LocalExecutor(ExecutionPolicy):
 class _LocalEngine:
     """The engine: attempts that end with this process."""
 
-    most_memory = None
+    max_memory_bytes = None
 
     def __init__(self) -> None:
         self._memory_kills = oom_kill_count()
@@ -37,7 +37,7 @@ class _LocalEngine:
         except OSError as error:
             return error
 
-    def find(self, _task: Task) -> None:
+    def find_running(self, _task: Task) -> None:
         """What a driver that died has left ends by itself (`parent`)."""
 
     def refresh(self) -> None:
@@ -53,15 +53,15 @@ class _LocalEngine:
 class _LocalAttempt:
     def __init__(self, process: TaskProcess, engine: _LocalEngine):
         self._process, self._engine = process, engine
-        self.begun = AttemptStarted(process.output_from)
+        self.start_info = AttemptStarted(process.output_offset)
 
-    def look(self) -> AttemptResult | None:
+    def poll(self) -> AttemptResult | None:
         code = self._process.poll()
         if code is None:
             return None
         return AttemptResult(code, out_of_memory=code == -signal.SIGKILL and self._engine.memory_ran_out())
 
-    def ask_to_stop(self) -> None:
+    def request_stop(self) -> None:
         self._process.terminate()
 
     def kill(self) -> None:

@@ -47,7 +47,7 @@ class NodeRequirements:
         }  # fmt: skip
 
     @contextmanager
-    def asked(self) -> Iterator[FitnessQuestion]:
+    def with_lock_probe(self) -> Iterator[FitnessQuestion]:
         """The question while this process holds a folder in the run folder, so that others can be asked to see that."""
         held = self.folder / f".fitness-{uuid4().hex}"
         try:

@@ -78,7 +78,7 @@ def build_progress_table(
 ) -> Table:
     """One row for each shard and one with totals; of more than `most`, those that wait or are done are counted."""
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0), caption_justify="left")  # 80 columns
-    columns = (labels.one, "state", labels.steps, *TRAINING_COLUMNS, labels.rate_unit, "left", "memory", "tries")
+    columns = (labels.singular, "state", labels.step_unit, *TRAINING_COLUMNS, labels.rate_unit, "left", "memory", "tries")
     chosen = [
         place for place, column in enumerate(columns) if labels.shows_training_stats or column not in TRAINING_COLUMNS
     ]
@@ -100,7 +100,7 @@ def build_progress_table(
 def progress_line(rows: list[ShardProgress], at_once: int, labels: JobLabels = BLOCK_LABELS) -> str:
     """The table in one line: counts, the shards that run, the time left."""
     running = [
-        f"{row.index:02d}: {_iteration(row)}" + (f" {row.figures.psnr:.2f} dB" if row.figures.psnr is not None else "")
+        f"{row.index:02d}: {_iteration(row)}" + (f" {row.stats.psnr:.2f} dB" if row.stats.psnr is not None else "")
         for row in rows
         if row.state == "running"
     ]
@@ -125,14 +125,14 @@ def _states(rows: Sequence[ShardProgress]) -> str:
 
 
 def _iteration(row: ShardProgress) -> str:
-    figures = row.figures
+    figures = row.stats
     if figures.iteration is None:
         return "starting" if row.state == "running" else ABSENT
     return f"{figures.iteration:,}" + (f"/{figures.iterations:,}" if figures.iterations is not None else "")
 
 
 def _cells(row: ShardProgress) -> list[str]:
-    figures, running = row.figures, row.state == "running"
+    figures, running = row.stats, row.state == "running"
     return [
         f"{row.index:02d}",
         row.state,
@@ -150,8 +150,8 @@ def _totals(rows: list[ShardProgress], at_once: int) -> list[str]:
     running = [row for row in rows if row.state == "running"]
     done = sum(row.state == "done" for row in rows)
     speeds = [row.speed for row in running if row.speed is not None]
-    memory = [row.figures.memory_bytes for row in running if row.figures.memory_bytes is not None]
-    anchors = [row.figures.anchors for row in rows if row.figures.anchors is not None]
+    memory = [row.stats.memory_bytes for row in running if row.stats.memory_bytes is not None]
+    anchors = [row.stats.anchors for row in rows if row.stats.anchors is not None]
     return [
         "all",
         f"{done}/{len(rows)} done",
@@ -169,7 +169,7 @@ def _percent(rows: list[ShardProgress]) -> str:
     """Share of the work done, a shard that says nothing counting as one that has not begun."""
     shares = []
     for row in rows:
-        iteration, iterations = row.figures.iteration, row.figures.iterations
+        iteration, iterations = row.stats.iteration, row.stats.iterations
         share = min((iteration or 0) / iterations, 1.0) if iterations else 0.0
         shares.append(1.0 if row.state == "done" else share)
     return f"{100 * sum(shares) / len(shares):.0f} %" if shares else ABSENT

@@ -33,7 +33,7 @@ class RayTaskSpec:
     attempt: int
     python: str
     """The driver's interpreter; a node takes its own instead."""
-    question: FitnessQuestion
+    requirements: FitnessQuestion
     """What the node must see (`fitness`): nodes join late."""
 
 
@@ -42,9 +42,9 @@ class NodeRejected:
     """The node cannot work on the run."""
 
     node: str
-    identity: str
+    node_id: str
     """What Ray calls the node."""
-    why: str
+    reason: str
 
 
 class RayTaskActor:
@@ -60,14 +60,14 @@ class RayTaskActor:
     def begin(self) -> AttemptStarted | NodeRejected:
         """Start the command, unless it was started; where it runs. Raises OSError as `TaskProcess`."""
         with self._lock:
-            answer = check_node(self._order.question)
+            answer = check_node(self._order.requirements)
             if answer["problems"]:
                 return NodeRejected(answer["node"], _node_id(), answer["problems"][0])
             if self._process is None:
                 order = self._order
                 command = [sys.executable if order.command[0] == order.python else order.command[0], *order.command[1:]]
                 self._process = TaskProcess(command, Path(order.output), order.environment, order.attempt)
-            return AttemptStarted(self._process.output_from, answer["node"])
+            return AttemptStarted(self._process.output_offset, answer["node"])
 
     def end(self) -> AttemptResult | None:
         """Wait for the end of the command; None if it was never started."""

@@ -48,9 +48,9 @@ MAX_UNAVAILABLE_POLLS = 20
 class RayNode:
     """What a node of a cluster has."""
 
-    identity: str
+    node_id: str
     name: str
-    processors: int
+    cpus: int
     memory_bytes: int
     gpus: float
 
@@ -164,14 +164,14 @@ def check_nodes(requirements: NodeRequirements, ray_nodes: Sequence[RayNode]) ->
     """
     import ray
 
-    with requirements.asked() as plain:
-        asked = {node: _check_node_remotely(node.identity, plain) for node in ray_nodes}
+    with requirements.with_lock_probe() as plain:
+        asked = {node: _check_node_remotely(node.node_id, plain) for node in ray_nodes}
         answers, problems = list[FitnessAnswer](), list[str]()
         for node, answer in asked.items():
             try:
                 answers.append(ray.get(answer, timeout=NODE_CHECK_TIMEOUT_SECONDS))
             except ray.exceptions.RayError as error:
-                if node.identity in {each.identity for each in list_nodes()}:
+                if node.node_id in {each.node_id for each in list_nodes()}:
                     problems.append(f"node {node.name}: does not answer ({_last_line(error)})")
                 continue
             problems += [f"node {answers[-1]['node']}: {each}" for each in answers[-1]["problems"]]
@@ -202,13 +202,13 @@ def _check_node_remotely(node: str, requirements: FitnessQuestion) -> Any:
 class RayExecutor(ExecutionPolicy):
     """Runs tasks on the cluster that this process is connected to."""
 
-    question: NodeRequirements | None = None
+    requirements: NodeRequirements | None = None
     """What a node must see; asked again where each task starts, for nodes may join late."""
 
     def run(self, tasks: Sequence[Task], listener: TaskListener) -> list[TaskResult]:
         """As `Executor.run`."""
-        assert self.question is not None
-        return run_tasks(tasks, _RayEngine(self.question), self, listener)
+        assert self.requirements is not None
+        return run_tasks(tasks, _RayEngine(self.requirements), self, listener)
 
 
 class _RayEngine:
@@ -222,7 +222,7 @@ class _RayEngine:
         self._keepers = _list_actors()
 
     @property
-    def most_memory(self) -> int:
+    def max_memory_bytes(self) -> int:
         return max((node.memory_bytes for node in list_nodes()), default=0)
 
     def start(self, tasks: Sequence[tuple[Task, int]]) -> list[Attempt | OSError]:
@@ -233,13 +233,13 @@ class _RayEngine:
 
         order = RayTaskSpec(
             command=tuple(task.command), output=str(task.output), environment=_environment() | dict(task.environment),
-            attempt=attempt, python=sys.executable, question=self._question,
+            attempt=attempt, python=sys.executable, requirements=self._question,
         )  # fmt: skip
         needs = task.resources
-        options: dict[str, Any] = {"num_cpus": needs.processors, "num_gpus": needs.gpus}
+        options: dict[str, Any] = {"num_cpus": needs.cpus, "num_gpus": needs.gpus}
         if needs.memory_bytes:
             options["memory"] = needs.memory_bytes
-        if self.unfit and any(node.identity not in self.unfit for node in list_nodes()):
+        if self.unfit and any(node.node_id not in self.unfit for node in list_nodes()):
             options["label_selector"] = {"ray.io/node-id": f"!in({','.join(sorted(self.unfit))})"}
         actor = ray.remote(RayTaskActor).options(
             name=self._name(task, attempt), namespace=NAMESPACE, lifetime="detached", max_restarts=0, max_concurrency=8,
@@ -247,7 +247,7 @@ class _RayEngine:
         )  # fmt: skip
         return _RayAttempt(actor.remote(order), self)
 
-    def find(self, task: Task) -> Attempt | None:
+    def find_running(self, task: Task) -> Attempt | None:
         import ray
 
         mine = [name for name in self._keepers if name.startswith(self._name(task, ""))]
@@ -271,9 +271,9 @@ class _RayAttempt:
         self._end: Any = None
         self._over: AttemptResult | None = None
         self._unavailable = 0
-        self.begun: AttemptStarted | None = None
+        self.start_info: AttemptStarted | None = None
 
-    def look(self) -> AttemptResult | None:
+    def poll(self) -> AttemptResult | None:
         import ray
 
         if self._over is None:
@@ -292,8 +292,8 @@ class _RayAttempt:
                 self._dismiss()
         return self._over
 
-    def ask_to_stop(self) -> None:
-        if self.look() is None and self.begun is None and not _is_ready(self._begin):
+    def request_stop(self) -> None:
+        if self.poll() is None and self.start_info is None and not _is_ready(self._begin):
             self._over = AttemptResult(EXIT_STOPPED)
             self._dismiss()
         elif self._over is None:
@@ -305,10 +305,10 @@ class _RayAttempt:
 
     def _began(self, answer: AttemptStarted | NodeRejected) -> None:
         if isinstance(answer, NodeRejected):
-            self._cluster.unfit.add(answer.identity)
-            self._over = AttemptResult(None, f"a node that cannot work on the run, {answer.node}: {answer.why}")
+            self._cluster.unfit.add(answer.node_id)
+            self._over = AttemptResult(None, f"a node that cannot work on the run, {answer.node}: {answer.reason}")
             return
-        self.begun, self._end = answer, self._keeper.end.remote()
+        self.start_info, self._end = answer, self._keeper.end.remote()
 
     def _ask_again(self, error: Exception) -> None:
         """The network to the keeper's node failed, and may work again."""
@@ -322,12 +322,12 @@ class _RayAttempt:
 
     def _how(self, error: Exception) -> str:
         text = str(error)
-        where = f" {self.begun.where}" if self.begun is not None else ""
+        where = f" {self.start_info.where}" if self.start_info is not None else ""
         if _out_of_memory(error):
             return f"Ray, to free memory on its node{where}"
         if "node has died" in text or "node was terminated" in text or "node died" in text:
             return f"the loss of its node{where}"
-        if self.begun is None:
+        if self.start_info is None:
             return f"an error before its first line: {_last_line(error)}"
         return f"the loss of its worker on node{where}"
 

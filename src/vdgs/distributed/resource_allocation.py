@@ -23,7 +23,7 @@ class NodeResources(Protocol):
     """A machine that pieces can be sent to."""
 
     @property
-    def processors(self) -> int:
+    def cpus(self) -> int:
         """At least one."""
 
     @property
@@ -43,7 +43,7 @@ class ShardWorkload:
     image_gb: float = 0.0
     """Memory for photographs that a person asked for; 0: by the memory that there is."""
     kind: JobLabels = BLOCK_LABELS
-    photographs_bytes: int = 0
+    images_bytes: int = 0
     """What all photographs of a piece take at most, decoded; 0 where it keeps none."""
 
 
@@ -51,7 +51,7 @@ class ShardWorkload:
 class Allocation:
     """What a piece gets."""
 
-    at_once: int
+    max_concurrent: int
     resources: TaskResources
     image_gb: float
 
@@ -67,7 +67,7 @@ def allocate_local(workload: ShardWorkload, cores: int, free_bytes: int) -> Allo
     at_once, threads = max(
         default_jobs(workload.pieces, cores, max(0, int(free_bytes - budget)), workload.shard_bytes),
         # Where all photographs take less than the budget.
-        default_jobs(workload.pieces, cores, free_bytes, workload.shard_bytes + workload.photographs_bytes),
+        default_jobs(workload.pieces, cores, free_bytes, workload.shard_bytes + workload.images_bytes),
     )
     if workload.jobs:
         at_once = min(workload.jobs, workload.pieces)
@@ -81,7 +81,7 @@ def exceeds_memory(workload: ShardWorkload, at_once: int, free_bytes: int) -> bo
     """Whether so many pieces at once may take more than one machine has free, with the least for photographs where
     nobody asked for more."""
     budget = 1e9 * (workload.image_gb or MIN_IMAGE_GB * at_once)
-    return at_once * workload.shard_bytes + min(budget, at_once * workload.photographs_bytes) > free_bytes
+    return at_once * workload.shard_bytes + min(budget, at_once * workload.images_bytes) > free_bytes
 
 
 def allocate_cluster(
@@ -93,10 +93,10 @@ def allocate_cluster(
     where that is less. `Work.image_gb` is of one piece here.
     """
     at_once = min(workload.pieces, workload.jobs or workload.pieces)
-    processors = executor_options.processors or _max_cpus(at_once, nodes)
+    processors = executor_options.cpus or _max_cpus(at_once, nodes)
     most = max(place.memory_bytes for place in nodes)
     whole = max(nodes, key=lambda place: place.memory_bytes)
-    share = whole.memory_bytes * min(1, processors / whole.processors) / 1e9
+    share = whole.memory_bytes * min(1, processors / whole.cpus) / 1e9
     beside = max(MIN_IMAGE_GB, share - workload.shard_bytes / 1e9)
     images = workload.image_gb or min(IMAGE_MEMORY_SHARE * share, beside)
     wanted = round(1e9 * executor_options.mem_gb) or workload.shard_bytes + round(1e9 * images)
@@ -110,12 +110,12 @@ def allocate_queue(workload: ShardWorkload, executor_options: ExecutorOptions) -
     images = workload.image_gb or DEFAULT_IMAGE_GB
     memory = round(1e9 * executor_options.mem_gb) or workload.shard_bytes + round(1e9 * images)
     return Allocation(
-        at_once, TaskResources(executor_options.processors or DEFAULT_CPUS, memory, executor_options.gpus), images
+        at_once, TaskResources(executor_options.cpus or DEFAULT_CPUS, memory, executor_options.gpus), images
     )
 
 
 def _max_cpus(at_once: int, nodes: Sequence[NodeResources]) -> int:
     """The largest number of processors with which so many pieces find room at once; 1 if none do."""
-    most = max(place.processors for place in nodes)
-    fitting = [each for each in range(1, most + 1) if sum(place.processors // each for place in nodes) >= at_once]
+    most = max(place.cpus for place in nodes)
+    fitting = [each for each in range(1, most + 1) if sum(place.cpus // each for place in nodes) >= at_once]
     return max(fitting, default=1)

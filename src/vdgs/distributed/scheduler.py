@@ -44,16 +44,16 @@ MEMORY_RETRY_FACTOR = 1.5
 class ExecutionPolicy:
     """How many tasks run side by side, how often one that crashes is started again, and how often all are looked at."""
 
-    at_once: int
+    max_concurrent: int
     retries: int = 2
     poll_seconds: float = 0.5
-    patience_seconds: float = 60.0
+    lock_timeout_seconds: float = 60.0
     """How long to wait for a process that still holds a task's folder, such as one whose driver was killed and that
     saves."""
 
     def __post_init__(self) -> None:
-        if self.at_once < 1 or self.retries < 0:
-            raise ValueError(f"at_once is {self.at_once} and retries is {self.retries}: at least 1 and 0 are needed")
+        if self.max_concurrent < 1 or self.retries < 0:
+            raise ValueError(f"at_once is {self.max_concurrent} and retries is {self.retries}: at least 1 and 0 are needed")
 
 
 def run_tasks(
@@ -91,7 +91,7 @@ class _TaskState:
     def ask_to_stop(self) -> None:
         if self.attempt is not None and not self.asked_to_stop:
             self.asked_to_stop = True
-            self.attempt.ask_to_stop()
+            self.attempt.request_stop()
 
 
 class _TaskScheduler:
@@ -99,7 +99,7 @@ class _TaskScheduler:
 
     def __init__(self, works: list[_TaskState], engine: Engine, policy: ExecutionPolicy, listener: TaskListener):
         self.works, self._engine, self._listener = works, engine, listener
-        self._at_once, self._retries, self._patience = policy.at_once, policy.retries, policy.patience_seconds
+        self._at_once, self._retries, self._patience = policy.max_concurrent, policy.retries, policy.lock_timeout_seconds
         self._by_name = {work.task.name: work for work in works}
         self._waiting = deque(works)
         self._stopping = False
@@ -115,11 +115,11 @@ class _TaskScheduler:
         if self._running:
             self._engine.refresh()
         for work in self._running:
-            self._look(work)
+            self._poll(work)
         if signals:
             self._stop(kill=signal.SIGINT in signals[1:])
         self._start_ready()
-        self._listener.tick()
+        self._listener.on_tick()
         return not self._waiting and not self._running
 
     def abandon(self) -> None:
@@ -130,7 +130,7 @@ class _TaskScheduler:
         left = self._running
         while left and time.monotonic() < end:
             self._engine.refresh()
-            left = [work for work in left if work.attempt is not None and work.attempt.look() is None]
+            left = [work for work in left if work.attempt is not None and work.attempt.poll() is None]
             time.sleep(GRACE_POLL_SECONDS if left else 0)
         for work in left:
             assert work.attempt is not None
@@ -138,14 +138,14 @@ class _TaskScheduler:
 
     def _adopt(self, work: _TaskState) -> None:
         """Watch what an earlier driver began, if it still goes on."""
-        attempt = self._engine.find(work.task)
+        attempt = self._engine.find_running(work.task)
         if attempt is not None:
             self._waiting.remove(work)
             work.attempt, work.found, work.attempts = attempt, True, 1
 
-    def _look(self, work: _TaskState) -> None:
+    def _poll(self, work: _TaskState) -> None:
         assert work.attempt is not None
-        end = work.attempt.look()
+        end = work.attempt.poll()
         self._report_start(work)
         if end is not None:
             work.attempt = None
@@ -154,15 +154,15 @@ class _TaskScheduler:
     def _report_start(self, work: _TaskState) -> None:
         """Pass on that an attempt has found a place, or lost it again."""
         assert work.attempt is not None
-        begun = work.attempt.begun
+        begun = work.attempt.start_info
         if begun is not None and not work.told:
             work.told, work.began, work.output_from = True, time.monotonic(), begun.output_from
             if begun.where:
-                self._listener.placed(work.task, begun.where, work.found)
-            self._listener.started(work.task, work.attempts)
+                self._listener.on_placed(work.task, begun.where, work.found)
+            self._listener.on_started(work.task, work.attempts)
         elif begun is None and work.told:
             work.told = False
-            self._listener.paused(work.task, "")
+            self._listener.on_paused(work.task, "")
 
     def _start_ready(self) -> None:
         ready = list[_TaskState]()
@@ -173,8 +173,8 @@ class _TaskScheduler:
             if end is not None and end.state != "done":
                 self._waiting.remove(work)
                 self._start(ready)
-                self._end(work, end.state, f"{end.name} {end.state}: {end.why}")
-            elif room and (before is None or end is not None) and not self._held(work):
+                self._end(work, end.state, f"{end.name} {end.state}: {end.reason}")
+            elif room and (before is None or end is not None) and not self._is_locked_elsewhere(work):
                 self._waiting.remove(work)
                 ready.append(work)
         self._start(ready)
@@ -194,13 +194,13 @@ class _TaskScheduler:
                 work.attempt = attempt
                 self._report_start(work)
 
-    def _held(self, work: _TaskState) -> bool:
+    def _is_locked_elsewhere(self, work: _TaskState) -> bool:
         """Another process still works on the task, and patience is not at an end (then the task says so itself)."""
         if work.task.folder is None or not StageFolder(work.task.folder).is_locked_elsewhere():
             return False
         if work.held_since is None:
             work.held_since = time.monotonic()
-            self._listener.waits(work.task)
+            self._listener.on_waiting(work.task)
         return time.monotonic() - work.held_since < self._patience
 
     def _stop(self, kill: bool) -> None:
@@ -209,7 +209,7 @@ class _TaskScheduler:
             while self._waiting:
                 self._end(self._waiting.popleft(), "stopped", "not started")
             if begun := [work.task for work in self._running if work.told]:
-                self._listener.stopping(begun)
+                self._listener.on_stopping(begun)
         for work in self._running:
             work.ask_to_stop()
             if kill and work.attempt is not None:
@@ -238,7 +238,7 @@ class _TaskScheduler:
         progress = stage_iteration(work.task.folder)
         if progress > work.progress:
             work.progress, work.attempts = progress, work.attempts - 1
-            self._listener.paused(work.task, why)
+            self._listener.on_paused(work.task, why)
             self._waiting.append(work)
         else:
             self._crashed(work, AttemptResult(None, "its time limit, before it got any further"), why)
@@ -252,12 +252,12 @@ class _TaskScheduler:
             times = f"crashed {work.attempts} times, at last by {how}" if self._retries else f"crashed by {how}"
             self._end(work, "failed", f"{times}. {why}".strip())
             return
-        self._listener.crashed(work.task, how, self._retries + 1 - work.attempts)
+        self._listener.on_crashed(work.task, how, self._retries + 1 - work.attempts)
         self._waiting.append(work)
 
     def _after_memory_kill(self, work: _TaskState) -> str:
         """Ask for more memory, where places are found by needs, else run fewer at once; what to say of it."""
-        most = self._engine.most_memory
+        most = self._engine.max_memory_bytes
         if most is None:
             self._at_once = max(1, self._at_once - 1)
             return f"from now on at most {self._at_once} at once"
@@ -272,9 +272,9 @@ class _TaskScheduler:
         seconds = time.monotonic() - work.began if work.attempts and work.began else 0.0
         lines = tuple(tail_lines(work.task.output, work.output_from)) if state == "failed" and work.told else ()
         work.outcome = TaskResult(
-            name=work.task.name, state=state, attempts=work.attempts, seconds=seconds, why=why, last_lines=lines
+            name=work.task.name, state=state, attempts=work.attempts, seconds=seconds, reason=why, last_lines=lines
         )
-        self._listener.ended(work.task, work.outcome)
+        self._listener.on_ended(work.task, work.outcome)
 
 
 def stage_iteration(folder: Path | None) -> int:
@@ -290,7 +290,7 @@ def stage_iteration(folder: Path | None) -> int:
 def _end_text(end: AttemptResult) -> str:
     code = end.code
     if code is None:
-        return end.how
+        return end.reason
     if code >= 0:
         return f"exit code {code}"
     try:

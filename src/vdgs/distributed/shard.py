@@ -106,7 +106,7 @@ def shard_session(folder: StageFolder, done: int, total: int) -> Iterator[Callab
         taken = time.monotonic() - began
         left = round((total - done) * taken / (done - before)) if done > before else None
         return StatusRecord(
-            state=state, why=why, iteration=done, iterations=total, seconds=taken, seconds_left=left,
+            state=state, reason=why, iteration=done, iterations=total, seconds=taken, seconds_left=left,
             peak_memory_bytes=peak_memory_bytes(),
         )  # fmt: skip
 

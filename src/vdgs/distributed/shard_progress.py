@@ -70,14 +70,14 @@ class ShardProgress:
         self.index = index
         self.state: ShardState = "queued"
         self.attempts = 0
-        self.figures = ProgressStats()
+        self.stats = ProgressStats()
         self._readings: deque[tuple[float, int]] = deque(maxlen=SPEED_WINDOW)
 
     def observe(self, stats: ProgressStats | None, now: float) -> None:
         """Take what was read at `now` (seconds of any steady clock); what could not be read changes nothing."""
         if stats is None:
             return
-        self.figures = stats
+        self.stats = stats
         if stats.iteration is None or self.state != "running":
             return
         if self._readings and stats.iteration < self._readings[-1][1]:
@@ -85,7 +85,7 @@ class ShardProgress:
         if not self._readings or stats.iteration > self._readings[-1][1]:
             self._readings.append((now, stats.iteration))
 
-    def started(self) -> None:
+    def restart(self) -> None:
         """A new attempt begins: earlier readings say nothing of its speed."""
         self.state, self.attempts = "running", self.attempts + 1
         self._readings.clear()
@@ -101,9 +101,9 @@ class ShardProgress:
     @property
     def seconds_left(self) -> float | None:
         """What the shard says itself, else what follows from its speed; None where neither is known."""
-        if self.figures.seconds_left is not None:
-            return self.figures.seconds_left
-        iteration, iterations, speed = self.figures.iteration, self.figures.iterations, self.speed
+        if self.stats.seconds_left is not None:
+            return self.stats.seconds_left
+        iteration, iterations, speed = self.stats.iteration, self.stats.iterations, self.speed
         if iteration is None or iterations is None or not speed:
             return None
         return max(iterations - iteration, 0) / speed
@@ -115,7 +115,7 @@ def seconds_left_overall(rows: list[ShardProgress], at_once: int) -> float | Non
     Those that wait are taken to be as fast, and where they say nothing as long, as those that ran.
     """
     speeds = [row.speed for row in rows if row.speed]
-    lengths = [row.figures.iterations for row in rows if row.figures.iterations]
+    lengths = [row.stats.iterations for row in rows if row.stats.iterations]
     speed = sum(speeds) / len(speeds) if speeds else None
     length = sum(lengths) / len(lengths) if lengths else None
     left = []
@@ -124,9 +124,9 @@ def seconds_left_overall(rows: list[ShardProgress], at_once: int) -> float | Non
             continue
         seconds = row.seconds_left if row.state == "running" else None
         if seconds is None:
-            iterations = row.figures.iterations or length
+            iterations = row.stats.iterations or length
             if speed is None or iterations is None:
                 return None
-            seconds = max(iterations - (row.figures.iteration or 0), 0) / speed
+            seconds = max(iterations - (row.stats.iteration or 0), 0) / speed
         left.append(seconds)
     return max(*left, sum(left) / at_once) if left else 0.0

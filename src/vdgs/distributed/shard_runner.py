@@ -29,11 +29,11 @@ class Shard:
     """The command locks it and keeps its status file; its output is appended to `output.log` there."""
     command: list[str]
     resources: TaskResources = field(default_factory=TaskResources)
-    kind: JobLabels = BLOCK_LABELS
+    labels: JobLabels = BLOCK_LABELS
 
     @property
     def name(self) -> str:
-        return f"{self.kind.one} {self.index:02d}"
+        return f"{self.labels.singular} {self.index:02d}"
 
     @property
     def output(self) -> Path:
@@ -61,8 +61,8 @@ def run_shards(shards: Sequence[Shard], executor: Executor, console: Console) ->
     rows = [ShardProgress(piece.index) for piece in shards]
     for piece, row in zip(shards, rows, strict=True):
         row.observe(read_progress_stats(piece.folder.status_file), time.monotonic())
-    kind = shards[0].kind if shards else BLOCK_LABELS
-    with ProgressTable(console, rows, executor.at_once, kind) as board:
+    kind = shards[0].labels if shards else BLOCK_LABELS
+    with ProgressTable(console, rows, executor.max_concurrent, kind) as board:
         outcomes = executor.run([piece.task() for piece in shards], _ProgressListener(shards, rows, board))
     _print_summary(shards, kind, outcomes, console)
     return outcomes
@@ -84,7 +84,7 @@ class _ProgressListener(LogListener):
             self.print_line(f"{task.name}: is still at work on {where}, and is watched again", "")
 
     def started(self, task: Task, attempt: int) -> None:
-        self._pairs[task.name][1].started()
+        self._pairs[task.name][1].restart()
         self._board.note(f"{task.name}: started{self._where.get(task.name, '')}{_attempt_text(attempt)}")
 
     def paused(self, task: Task, why: str) -> None:
@@ -103,7 +103,7 @@ class _ProgressListener(LogListener):
         row.state, row.attempts = outcome.state, outcome.attempts
         if outcome.state == "failed":
             self.print_line(f"{task.name}: failed", STATE_STYLES[outcome.state])
-            self.print_line("\n".join(f"  {line}" for line in outcome.last_lines or outcome.why.splitlines()), "")
+            self.print_line("\n".join(f"  {line}" for line in outcome.last_lines or outcome.reason.splitlines()), "")
         elif outcome.attempts:
             took = f"{clock(outcome.seconds)}{_attempt_text(outcome.attempts)}"
             self._board.note(f"{task.name}: {outcome.state} after {took}")
@@ -131,7 +131,7 @@ def _record_end(folder: StageFolder, outcome: TaskResult) -> None:
     with suppress(VdgsError, OSError, ValueError), folder.locked():
         status = folder.status()
         if status.state not in (outcome.state, "done"):
-            folder.set_status(replace(status, state=outcome.state, why=outcome.why))
+            folder.set_status(replace(status, state=outcome.state, reason=outcome.reason))
 
 
 def _print_summary(shards: Sequence[Shard], labels: JobLabels, outcomes: list[TaskResult], console: Console) -> None:
@@ -143,7 +143,7 @@ def _print_summary(shards: Sequence[Shard], labels: JobLabels, outcomes: list[Ta
     for piece, outcome in unfinished:
         if outcome.attempts:
             say(
-                f"{piece.name} {outcome.state}" + (f": {outcome.why}" if outcome.why else ""),
+                f"{piece.name} {outcome.state}" + (f": {outcome.reason}" if outcome.reason else ""),
                 STATE_STYLES[outcome.state],
             )
         if outcome.state == "failed" and piece.output.is_file():

@@ -52,7 +52,7 @@ Loaded = TypeVar("Loaded")
 class ExecutionOptions:
     """What a person asks of the place where shards are done."""
 
-    where: ExecutorOptions
+    executor_options: ExecutorOptions
     jobs: int = 0
     """Shards at once; 0: as many as there is room for."""
     image_gb: float = 0.0
@@ -62,7 +62,7 @@ class ExecutionOptions:
     @property
     def is_distributed(self) -> bool:
         """Whether work goes out even if one process could do it: to a cluster, or to several processes at once."""
-        return self.where.executor != "local" or self.jobs > 1
+        return self.executor_options.executor != "local" or self.jobs > 1
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ class ShardedJob:
         return self.shard(index).status().state == "done"
 
     @property
-    def left(self) -> list[int]:
+    def pending(self) -> list[int]:
         """The shards that are not done."""
         return [index for index in range(len(self.spans)) if not self.is_done(index)]
 
@@ -155,7 +155,7 @@ class ShardedJob:
 
     def run(self, needs: ShardNeeds, wish: ExecutionOptions, console: Console) -> None:
         """Do the shards that are left. Raises what `send` raises."""
-        if left := self.left:
+        if left := self.pending:
             self.send(left, len(self.spans), needs, wish, console)
 
     def send(
@@ -171,11 +171,11 @@ class ShardedJob:
         kind = self.kind
         work = ShardWorkload(
             pieces=len(left), shard_bytes=needs.memory_bytes, jobs=wish.jobs, image_gb=wish.image_gb, kind=kind,
-            photographs_bytes=needs.photographs_bytes,
+            images_bytes=needs.photographs_bytes,
         )  # fmt: skip
         machine = MachineResources(threads_available(), available_memory_bytes())
-        with select_backend(wish.where, work, machine, needs.question) as chosen:
-            line = f"{len(left)} of {of} {kind.plural} to {kind.work}, {chosen.line}"
+        with select_backend(wish.executor_options, work, machine, needs.question) as chosen:
+            line = f"{len(left)} of {of} {kind.plural} to {kind.verb}, {chosen.description}"
             console.print(line, highlight=False)
             for note in chosen.notes:
                 console.print(note, highlight=False)
@@ -196,7 +196,7 @@ class ShardedJob:
 
     def mark_queued(self) -> None:
         """Let the shards that are left say that they wait, but for those that are at work."""
-        for index in self.left:
+        for index in self.pending:
             folder = self.shard(index)
             with suppress(RunError), folder.locked():
                 if not self.is_done(index):
@@ -207,17 +207,17 @@ class ShardedJob:
         device = "auto" if share.resources.gpus and device == "cpu" else device
         return [
             sys.executable, "-m", "vdgs.distributed.run_shard", str(self.folder), str(index), "--threads",
-            str(share.resources.processors), "--image-memory-gb", f"{share.image_gb:.3f}", "--device", device,
+            str(share.resources.cpus), "--image-memory-gb", f"{share.image_gb:.3f}", "--device", device,
         ]  # fmt: skip
 
     def _raise_unless_done(self, outcomes: Sequence[TaskResult], of: int) -> None:
         kind = self.kind
         if any(outcome.state == "stopped" for outcome in outcomes):
-            raise Stopped(f"Stopped; every {kind.one} that was {kind.activity} is saved. The same command continues.")
+            raise Stopped(f"Stopped; every {kind.singular} that was {kind.activity} is saved. The same command continues.")
         failed = [outcome for outcome in outcomes if outcome.state != "done"]
         if failed:
             raise RunError(
                 f"{self.folder}: {len(failed)} of {of} {kind.plural} failed:\n  "
-                + "\n  ".join(f"{outcome.name}: {outcome.why}" for outcome in failed)
+                + "\n  ".join(f"{outcome.name}: {outcome.reason}" for outcome in failed)
                 + f"\nTheir output is in {self.folder}/NN/output.log. The same command tries them again."
             )

@@ -41,7 +41,7 @@ class QueueEntry:
     node: str
 
     @property
-    def placed(self) -> bool:
+    def is_running(self) -> bool:
         return self.state in RUNNING_STATES
 
 

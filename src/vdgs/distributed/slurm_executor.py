@@ -66,23 +66,23 @@ END_REASONS = {
 class SlurmExecutor(ExecutionPolicy):
     """Runs tasks as jobs of SLURM."""
 
-    question: NodeRequirements | None = None
+    requirements: NodeRequirements | None = None
     """What a node must see; asked where each job starts."""
     options: SlurmOptions = field(default_factory=SlurmOptions)
 
     def run(self, tasks: Sequence[Task], listener: TaskListener) -> list[TaskResult]:
         """As `Executor.run`."""
-        assert self.question is not None
+        assert self.requirements is not None
         # All go into the queue, where they wait without a driver too; SLURM lets so many at a time run.
-        everything = replace(self, at_once=max(1, len(tasks)))
-        return run_tasks(tasks, _SlurmEngine(self.question, self.options, self.at_once), everything, listener)
+        everything = replace(self, max_concurrent=max(1, len(tasks)))
+        return run_tasks(tasks, _SlurmEngine(self.requirements, self.options, self.max_concurrent), everything, listener)
 
 
 class _SlurmEngine:
     """The engine."""
 
     #: Nobody knows what the nodes have; SLURM says so when it is asked for too much.
-    most_memory = sys.maxsize
+    max_memory_bytes = sys.maxsize
 
     def __init__(self, requirements: NodeRequirements, options: SlurmOptions, at_once: int):
         self._question, self._options, self._at_once = requirements, options, at_once
@@ -103,7 +103,7 @@ class _SlurmEngine:
             begun |= self._submit(needs, group)
         return [begun[task.name] for task, _ in tasks]
 
-    def find(self, task: Task) -> Attempt | None:
+    def find_running(self, task: Task) -> Attempt | None:
         for element, each in self._there.items():
             folder = self._folder / each.name
             written = read_json_or_empty(folder / "tasks.json").get("tasks", {})
@@ -162,7 +162,7 @@ def make_batch_script(folder: Path, count: int, resources: TaskResources, option
         "array": f"0-{count - 1}" + (f"%{at_once}" if at_once < count else ""),
         "nodes": "1",
         "ntasks": "1",
-        "cpus-per-task": str(resources.processors),
+        "cpus-per-task": str(resources.cpus),
         "mem": f"{-(-resources.memory_bytes // (1 << 20))}M" if resources.memory_bytes else "",
         "gres": f"gpu:{resources.gpus:g}" if resources.gpus else "",
         "partition": options.partition,
@@ -173,7 +173,7 @@ def make_batch_script(folder: Path, count: int, resources: TaskResources, option
         "output": str(folder / "%a.out"),
     }
     lines = [f"#SBATCH --{name}={value}" for name, value in asked.items() if value]
-    lines += ["#SBATCH --requeue", *(f"#SBATCH {word}" for word in options.options)]
+    lines += ["#SBATCH --requeue", *(f"#SBATCH {word}" for word in options.sbatch_args)]
     job = shlex.join([sys.executable, "-m", "vdgs.distributed.slurm_job", str(folder)])
     setup = [options.setup_command] if options.setup_command else []
     return "\n".join(["#!/bin/bash", *lines, "", *setup, f"exec {job}", ""])
@@ -185,9 +185,9 @@ class _SlurmAttempt:
         self._over: AttemptResult | None = None
         self._missed = self._turn = 0
         self._cancelled = self._killed = False
-        self.begun: AttemptStarted | None = None
+        self.start_info: AttemptStarted | None = None
 
-    def look(self) -> AttemptResult | None:
+    def poll(self) -> AttemptResult | None:
         if self._over is None and self._queue.answers:
             listed, record = self._queue.listed(self._element), read_task_record(self._folder, self._element.index)
             if listed is not None:
@@ -199,14 +199,14 @@ class _SlurmAttempt:
 
     def _follow(self, listed: QueueEntry, record: SlurmTaskRecord | None) -> None:
         """Where it runs now, if it does; between two turns it runs nowhere, and be it for one look."""
-        if not listed.placed:
-            self.begun = None
+        if not listed.is_running:
+            self.start_info = None
         elif record is not None and record.code is None:  # else it says what the end of an earlier turn was
-            another, self._turn = self.begun is not None and record.turn != self._turn, record.turn
-            self.begun = None if another else AttemptStarted(record.output_from, record.node)
+            another, self._turn = self.start_info is not None and record.turn != self._turn, record.turn
+            self.start_info = None if another else AttemptStarted(record.output_from, record.node)
 
-    def ask_to_stop(self) -> None:
-        if self.begun is None:
+    def request_stop(self) -> None:
+        if self.start_info is None:
             self._cancelled = True
             cancel(self._element)
         else:
@@ -224,8 +224,8 @@ class _SlurmAttempt:
         if record is None or record.code is None:
             self._missed += 1
             return self._lost(record) if self._missed > MAX_MISSED_POLLS else None
-        if self.begun is None and not record.unfit:
-            self.begun = AttemptStarted(record.output_from, record.node)
+        if self.start_info is None and not record.unfit:
+            self.start_info = AttemptStarted(record.output_from, record.node)
         if record.unfit:
             return AttemptResult(None, f"a node that cannot work on the run, {record.node}: {record.unfit}")
         preempted = record.code == EXIT_STOPPED and not record.out_of_time and self._fate_state() == "PREEMPTED"

@@ -74,7 +74,7 @@ def main(arguments: list[str]) -> int:
     kills = oom_kill_count()
     process = TaskProcess(task["command"], Path(task["output"]), task["environment"], task["attempt"] + turn)
     asked = _forward_signals(process)
-    tell(output_from=process.output_from)
+    tell(output_from=process.output_offset)
     code = process.wait()
     if code != EXIT_STOPPED or asked != [signal.SIGUSR1]:
         tell(code=code, out_of_memory=code == -signal.SIGKILL and oom_kill_count() > kills)

@@ -86,7 +86,7 @@ class TaskProcess:
             file.write(f"{heading}\n".encode())
             file.flush()
             #: Where the output of this attempt begins.
-            self.output_from = file.tell()
+            self.output_offset = file.tell()
             self._process = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT,
                 env={**os.environ, **variables}, start_new_session=True,

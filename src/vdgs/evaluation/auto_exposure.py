@@ -36,7 +36,7 @@ class AutoExposure:
     #: Between -1 and 0.
     slope: float
     #: Brightness beyond what was learnt from counts as this much, either way.
-    reach: float
+    max_brightness: float
     #: By how much, as logarithms and in the root of the mean square, photographs are brighter than foretold by their
     #: neighbours alone, and by what is metered as well, each by a law that was learnt without it. NaN without any law.
     residual_error: tuple[float, float] = (math.nan, math.nan)
@@ -44,7 +44,7 @@ class AutoExposure:
     def gain(self, brighter: float) -> float:
         """The factor on the exposure of a photograph whose view is brighter than between its neighbours, by the
         logarithm."""
-        return float(np.exp(self.slope * np.clip(brighter, -self.reach, self.reach)))
+        return float(np.exp(self.slope * np.clip(brighter, -self.max_brightness, self.max_brightness)))
 
 
 def log_luminance(image: Float[np.ndarray, "h w 3"]) -> float:

@@ -84,7 +84,7 @@ class BlockInputs:
     blocks: Blocks
     exposure: Callable[[View], Float[Tensor, "3 4"]] | None = None
 
-    def picture(self, rendered: Raster, view: View) -> UInt8[np.ndarray, "h w 3"]:
+    def to_image(self, rendered: Raster, view: View) -> UInt8[np.ndarray, "h w 3"]:
         """What is measured of a render."""
         pixels = rendered.image.detach().cpu().numpy()
         return to_8bit(pixels if self.exposure is None else apply_exposure_numpy(pixels, self.exposure(view)))
@@ -155,7 +155,7 @@ def measure_block_view(view: View, stem: str, inputs: BlockInputs) -> tuple[Bloc
     reference, mask = inputs.photographs.load_image(view), inputs.photographs.load_mask(view)
     drawn = inputs.render_merged(view.camera)
     labels = block_label_map(drawn, view.camera, inputs.blocks)
-    coarse, merged = inputs.picture(inputs.render_coarse(view.camera), view), inputs.picture(drawn, view)
+    coarse, merged = inputs.to_image(inputs.render_coarse(view.camera), view), inputs.to_image(drawn, view)
     squared = {"coarse": squared_error(coarse, reference), "merged": squared_error(merged, reference)}
     alone = _isolated_errors(view, labels, reference, inputs)
     by_block.add(labels, squared | {"alone": alone}, mask)
@@ -190,7 +190,7 @@ def _isolated_errors(
         rendered = inputs.render_block(index, view.camera)
         if rendered is not None:
             own = labels == index
-            errors[own] = squared_error(inputs.picture(rendered, view), reference)[own]
+            errors[own] = squared_error(inputs.to_image(rendered, view), reference)[own]
     return errors
 
 

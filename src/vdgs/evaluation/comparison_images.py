@@ -44,7 +44,7 @@ class Panel:
 
     picture: Image.Image
     label: str
-    figures: str = ""
+    metrics_text: str = ""
 
 
 def absolute_error(
@@ -98,7 +98,7 @@ def draw_panels(panels: Sequence[Panel], title: str, limit: float) -> Image.Imag
         left = margin + column * (width + gap)
         canvas.paste(panel.picture, (left, head))
         draw.text((left, head - unit * 3 // 5), panel.label, FAINT, load_font(unit), anchor="ls")
-        draw.text((left + width, head - unit * 3 // 5), panel.figures, INK, load_font(unit), anchor="rs")
+        draw.text((left + width, head - unit * 3 // 5), panel.metrics_text, INK, load_font(unit), anchor="rs")
     _draw_colorbar(canvas, (margin + count * (width + gap), head, bar_width, height), limit, unit)
     return canvas
 

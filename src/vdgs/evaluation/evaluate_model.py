@@ -88,7 +88,7 @@ def evaluate_model(
     measured = (_unless_stopped(index, inputs) for index in range(len(reference_views.views)))
     return summarize_views(
         measured, model.facts, output,
-        lpips_note=lpips_note, settings=inputs.settings, timed=model.timed, console=console,
+        lpips_note=lpips_note, settings=inputs.settings, timed=model.is_timed, console=console,
     )  # fmt: skip
 
 
@@ -163,7 +163,7 @@ def _exposure_note(rows: Sequence[Mapping[str, Any]], settings: EvaluationSettin
         return ""
     alone = sum(np.array_equal(exposure, np.eye(3, 4)) for exposure in exposures)
     without = f"; {alone} of them neutral, for want of training photographs near by" if alone else ""
-    return f"views are drawn and measured {settings.exposed}{without}; beside that in neutral colours"
+    return f"views are drawn and measured {settings.exposure_note}{without}; beside that in neutral colours"
 
 
 def _write(output: Path, result: Mapping[str, Any], gathered: _MetricTotals, title: str) -> None:

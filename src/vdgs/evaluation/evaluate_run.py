@@ -75,7 +75,7 @@ def check_bins(bins: int) -> None:
 
 
 def make_evaluation_settings(bins: int, views: EvaluationSplit) -> EvaluationSettings:
-    return EvaluationSettings(visibility_bins=bins, title=f"{views} views", exposed=EXPOSURE_NOTES[views])
+    return EvaluationSettings(visibility_bins=bins, title=f"{views} views", exposure_note=EXPOSURE_NOTES[views])
 
 
 def select_views(capture: Capture, views: EvaluationSplit) -> list[View]:
@@ -91,7 +91,7 @@ def make_renderable_model(run: OpenedRun, coarse: OpenedRun, views: EvaluationSp
         model_bytes=run.model_path.stat().st_size,
         train_seconds=run.status.seconds,
         peak_memory_bytes=run.status.peak_memory_bytes,
-        model_identity=run.status.model,
+        model_identity=run.status.model_id,
         key=run.key,
     )
     return RenderableModel(

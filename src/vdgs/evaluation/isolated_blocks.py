@@ -63,7 +63,7 @@ class IsolatedBlocks:
         own = load_verified(self._run.block(index), self._key, index).to(self._coarse.anchors.positions.device)
         around = self._coarse.anchors.select(self._around[index])
         parts = DecoderSpan(len(own.anchors), own.decoder), DecoderSpan(len(around), self._coarse.decoder)
-        return replace(own, anchors=own.anchors.concat(around), parts=parts)
+        return replace(own, anchors=own.anchors.concat(around), decoder_spans=parts)
 
 
 def _bytes(model: AnchorModel) -> int:

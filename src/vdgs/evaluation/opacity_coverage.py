@@ -43,7 +43,7 @@ class RenderedImage:
     #: What is behind the model in `image`; None: not known.
     background: RgbColor | None = None
 
-    def exposed(self, exposure: Float[Tensor, "3 4"]) -> RenderedImage:
+    def with_exposure(self, exposure: Float[Tensor, "3 4"]) -> RenderedImage:
         """The view with the colour model of a photograph: all colours, the background's too. They may leave [0, 1]."""
         background = self.background
         if background is not None:
@@ -51,7 +51,7 @@ class RenderedImage:
             background = red, green, blue
         return RenderedImage(apply_exposure_numpy(self.image, exposure), self.alpha, background)
 
-    def before(self, colour: RgbColor) -> UInt8[np.ndarray, "h w 3"] | None:
+    def over_background(self, colour: RgbColor) -> UInt8[np.ndarray, "h w 3"] | None:
         """The picture in 8 bits with another background; None where alpha or its own background is not known."""
         if self.alpha is None or self.background is None:
             return None
@@ -72,7 +72,7 @@ def measure_opacity_coverage(
     if rendered.alpha is not None:
         solid = row["solid_pixels"] = int(np.count_nonzero(rendered.alpha[covered] >= OPAQUE_ALPHA))
         row["solid_share"] = solid / count if count else None
-    pictures = to_8bit(rendered.image), rendered.before(_BLACK), rendered.before(_WHITE)
+    pictures = to_8bit(rendered.image), rendered.over_background(_BLACK), rendered.over_background(_WHITE)
     for name, picture in zip(COVERED_PSNR_KEYS, pictures, strict=True):
         if picture is not None and count:
             row[name] = psnr_from_mse(float(squared_error(picture, reference)[covered].mean()))

@@ -49,7 +49,7 @@ class RenderableModel:
     visibility_map: Callable[[Camera], Float[np.ndarray, "h w"]] | None = None
     facts: ModelMetadata = ModelMetadata()
     #: Whether the time that `render` takes says anything.
-    timed: bool = True
+    is_timed: bool = True
     #: What is behind the model in a render, RGB in [0, 1].
     background: tuple[float, float, float] | None = None
     #: Pixels that show what enough training cameras see (`evaluation.seen`); solidity and depth are measured on them.
@@ -83,7 +83,7 @@ class EvaluationSettings:
     #: What the contact sheet calls the views, and, with _ between its words, metrics.json their number.
     title: str = "test views"
     #: How pictures are exposed, if the model says how: what metrics.json notes of them.
-    exposed: str = "in the exposure of each photograph"
+    exposure_note: str = "in the exposure of each photograph"
     #: Views on the contact sheet at most, chosen evenly.
     contact_sheet_views: int = 40
     #: Error at the bright end of the colour map, where white is 1.

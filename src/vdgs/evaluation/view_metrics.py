@@ -94,7 +94,7 @@ def measure_view(index: int, inputs: ViewInputs) -> ViewMetrics:
     reference, mask = _load_reference(view, inputs.photographs)
     neutral, seconds = _rendered(view, inputs.model)
     exposure = None if inputs.model.exposure is None else inputs.model.exposure(view)
-    rendered = neutral if exposure is None else neutral.exposed(exposure)
+    rendered = neutral if exposure is None else neutral.with_exposure(exposure)
     image = metrics.to_8bit(rendered.image)
     image_io.write_png(inputs.output / "renders" / f"{stem}.png", image)
     raw = _ImagePair(image, reference, mask)

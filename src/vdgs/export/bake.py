@@ -53,7 +53,7 @@ class BakeViews:
 
     model: AnchorModel
     cameras: Sequence[Camera]
-    shown: Sequence[ViewContributions]
+    contributions: Sequence[ViewContributions]
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +155,7 @@ def _gather_samples(views: BakeViews, wanted: Int[np.ndarray, " m"]) -> _ViewSam
     first, last = int(wanted[0]), int(wanted[-1])
     place_of = torch.full((last - first + 1,), -1, dtype=torch.int32)
     place_of[torch.from_numpy(wanted - first)] = torch.arange(len(wanted), dtype=torch.int32)
-    for camera, shown in zip(views.cameras, views.shown, strict=True):
+    for camera, shown in zip(views.cameras, views.contributions, strict=True):
         low, high = index_range(shown.gaussians, first, last + 1)
         if low == high:
             continue
@@ -182,7 +182,7 @@ def _decode_from(model: AnchorModel, gaussians: Tensor, camera: Camera) -> tuple
     offset = gaussians % k
     rows = rows.to(anchors.positions.device)
     pieces = []
-    for first, last, decoder in model.spans():
+    for first, last, decoder in model.decoder_ranges():
         low, high = torch.searchsorted(rows, rows.new_tensor([first, last])).tolist()
         if low < high:
             pieces.append(decode_world(anchors, rows[low:high], decoder.weights_for_image(None), camera))
@@ -212,9 +212,9 @@ def fit_gaussians(views: BakeViews, wanted: Int[np.ndarray, " m"], degree: int) 
         means=means.index_select(0, place * k + torch.from_numpy(wanted % k)),
         log_scales=log_scales,
         quaternions=quaternions,
-        logits=opacities.logit(),
-        dc=coefficients[:, 0].contiguous(),
-        rest=coefficients[:, 1:].contiguous(),
+        opacity_logits=opacities.logit(),
+        sh0=coefficients[:, 0].contiguous(),
+        shN=coefficients[:, 1:].contiguous(),
     )
 
 

@@ -61,7 +61,7 @@ class BakedGaussians:
         return np.repeat(first - ends + counts, counts) + np.arange(ends[-1] if len(ends) else 0)
 
     @torch.no_grad()
-    def drawn(self, camera: Camera) -> tuple[Float[Tensor, "h w 3"], Int[np.ndarray, " p"]]:
+    def render_target(self, camera: Camera) -> tuple[Float[Tensor, "h w 3"], Int[np.ndarray, " p"]]:
         """What the model shows by what is baked of it, and the Gaussians that may touch this view, ascending."""
         rows, splats = decode_view(self.model, camera)
         rows, k = rows.cpu(), self.model.anchors.offsets.shape[1]
@@ -101,7 +101,7 @@ def rows_of_part(baked: BakedGaussians, number: int) -> range:
 @torch.no_grad()
 def view_residual(baked: BakedGaussians, camera: Camera) -> ColorResidual:
     """What the baked Gaussians do not show of the model's picture."""
-    wanted, numbers = baked.drawn(camera)
+    wanted, numbers = baked.render_target(camera)
     found = get_backend(torch.device("cpu")).splat_contributions(
         _splats(baked.spool, numbers, camera), torch.tensor(baked.model.background), camera.width, camera.height, wanted
     )
@@ -110,7 +110,7 @@ def view_residual(baked: BakedGaussians, camera: Camera) -> ColorResidual:
     return ColorResidual(
         torch.from_numpy(numbers).index_select(0, shown).int(),
         pixels.half(),
-        (found.missing.index_select(0, shown) / pixels[:, None]).half(),
+        (found.residual.index_select(0, shown) / pixels[:, None]).half(),
     )
 
 

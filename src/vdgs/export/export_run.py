@@ -55,10 +55,10 @@ class _BakedScene:
 
     def scene(self, frame: LocalFrame, rows: Int[np.ndarray, " r"]) -> ExportScene:
         """What a writer is given: the Gaussians of these rows."""
-        chunks = (frame.place(piece) for piece in self.pieces(rows))
+        chunks = (frame.to_local(piece) for piece in self.pieces(rows))
         bounds, page = local_bounds(frame, self.spool.means[rows]), _view_in_frame(self.page, frame)
         return ExportScene(
-            chunks=chunks, count=len(rows), degree=self.degree, facts=frame.facts, bounds=bounds, page=page
+            chunks=chunks, count=len(rows), degree=self.degree, metadata=frame.facts, bounds=bounds, page=page
         )
 
     def pieces(self, rows: Int[np.ndarray, " r"]) -> Iterator[Gaussians]:
@@ -112,7 +112,7 @@ def export_run(request: ExportRequest, console: Console, execution: ExecutionOpt
         kept = select_gaussians(pixels, run, request)
         rows = select_rows(frames, run, pixels, kept, request.sh_degree, console)
         console.print(
-            f"{run.line}: {len(kept):,} Gaussians of {len(pixels):,} are drawn by the training cameras"
+            f"{run.summary}: {len(kept):,} Gaussians of {len(pixels):,} are drawn by the training cameras"
             + (" and asked for" if len(kept) < np.count_nonzero(pixels) else ""),
             highlight=False,
         )
@@ -121,7 +121,7 @@ def export_run(request: ExportRequest, console: Console, execution: ExecutionOpt
             _optimize(BakedGaussians(run.model, kept, spool), baker.training, request.optimize_seconds, console)
             baked = _BakedScene(spool, request.sh_degree, make_initial_view(run, int(request.html_max_mb * 1e6)))
             seconds = time.monotonic() - began
-            rounds = color_iteration_count(request.rounds, gaussian_count(run.model))
+            rounds = color_iteration_count(request.color_iterations, gaussian_count(run.model))
             console.print(f"baked in {seconds:.1f} s, colours fitted again in {rounds} rounds", highlight=False)
             files = [_write(path, baked.scene(frames[path], rows[path]), console) for path in request.to]
             losses = _measure_losses(run, frames, baked, request, console)
@@ -194,7 +194,7 @@ def _measure_losses(
     run: OpenedRun, frames: dict[Path, LocalFrame], baked: _BakedScene, request: ExportRequest, console: Console
 ) -> list[JsonObject]:
     """What each file that can be read back loses, or, where none can, the Gaussians that were written."""
-    if not request.measure:
+    if not request.evaluate:
         return []
     readable: list[Path | None] = [path for path in request.to if registry.format_from_path(path).read]
     losses = []

@@ -53,12 +53,12 @@ def optimize_gaussians(
 def _step(
     baked: BakedGaussians, gaussians: Gaussians, camera: Camera, states: dict[str, AdamState], updates: torch.Tensor
 ) -> None:
-    wanted, numbers = baked.drawn(camera)
+    wanted, numbers = baked.render_target(camera)
     rows = torch.from_numpy(numbers)
     seen = gaussians.select(rows)
     moved = [seen.tensors()[name].requires_grad_() for name in states]
     with torch.enable_grad():
-        raster, _ = render_gaussians(seen, camera, torch.tensor(baked.model.background), gaussians.degree)
+        raster, _ = render_gaussians(seen, camera, torch.tensor(baked.model.background), gaussians.sh_degree)
         gradients = torch.autograd.grad((raster.image - wanted).square().sum(), moved, materialize_grads=True)
     updates[rows] += 1
     for state, gradient in zip(states.values(), gradients, strict=True):

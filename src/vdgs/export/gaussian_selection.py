@@ -34,7 +34,7 @@ def select_gaussians(pixels: Float[np.ndarray, " g"], run: OpenedRun, request: E
         if not (x0 < x1 and y0 < y1):
             raise VdgsError(f"--bbox {x0:g} {y0:g} {x1:g} {y1:g}: is empty. Give X0 Y0 X1 Y1, the lower corner first.")
         crs = request.crs or default_crs(run.capture.ground, request.to[0])
-        inside = MapProjection.of(run.capture.ground, crs).places(
+        inside = MapProjection.of(run.capture.ground, crs).project(
             gaussian_means(run.model.anchors).cpu().double().reshape(-1, 3).numpy()
         )
         wanted &= (inside[:, :2] >= (x0, y0)).all(1) & (inside[:, :2] <= (x1, y1)).all(1)
@@ -55,7 +55,7 @@ def select_gaussians(pixels: Float[np.ndarray, " g"], run: OpenedRun, request: E
 
 def _anchors_of_block(run: OpenedRun, block: int) -> np.ndarray:
     """Which anchors of a merged model a block has made."""
-    counts = [part.count for part in run.model.parts]
+    counts = [part.count for part in run.model.decoder_spans]
     if run.name != "merged" or not 0 <= block < len(counts):
         have = f"has blocks 0 to {len(counts) - 1}" if counts else "is not made of blocks with decoders of their own"
         raise VdgsError(f"--block {block}: the {run.name} model {have}.")
@@ -68,7 +68,7 @@ def frame_for_file(path: Path, run: OpenedRun, request: ExportRequest, centre: n
     3D Tiles stand on the globe wherever it is known how, whatever --crs says of other files: no map lies between.
     """
     ground, kind = run.capture.ground, registry.format_from_path(path)
-    far = min(MAX_LOCAL_COORDINATE, kind.reach / 2)
+    far = min(MAX_LOCAL_COORDINATE, kind.max_coordinate / 2)
     frame = make_local_frame(
         ground, request.crs or default_crs(ground, path), centre, far
     )  # which refuses what is no system
@@ -88,7 +88,7 @@ def select_rows(
     pixels = pixels[kept]
     rows = {}
     for path, frame in frames.items():
-        reach = registry.format_from_path(path).reach
+        reach = registry.format_from_path(path).max_coordinate
         beyond = (np.abs(_local(frame, means)) >= 0.999 * reach).any(1)
         share = float(pixels[beyond].sum() / pixels.sum())
         if share > MAX_DROPPED_SHARE:
@@ -107,7 +107,7 @@ def select_rows(
                 chunks=(),
                 count=len(rows[path]),
                 degree=degree,
-                facts=frame.facts,
+                metadata=frame.facts,
                 bounds=local_bounds(frame, means[rows[path]]),
             ),
         )

@@ -35,7 +35,7 @@ class LocalBake:
         self._run, self._asked, self._console = run, request, console
         self.training = [view.camera for view in run.capture.train_views]
         self._rounds = color_iteration_cameras(
-            self.training, color_iteration_count(request.rounds, gaussian_count(run.model))
+            self.training, color_iteration_count(request.color_iterations, gaussian_count(run.model))
         )
         self._seen: BakeContributions | None = None
 

@@ -36,7 +36,7 @@ class LocalFrame(Similarity):
         apart = np.abs(self.rotation - np.eye(3)).max(), abs(self.scale - 1), np.abs(self.translation).max()
         return bool(max(apart) < IDENTITY_TOLERANCE)
 
-    def place(self, gaussians: Gaussians) -> Gaussians:
+    def to_local(self, gaussians: Gaussians) -> Gaussians:
         """Gaussians of the ground frame in local coordinates."""
         return (
             gaussians

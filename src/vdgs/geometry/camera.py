@@ -35,7 +35,7 @@ class Camera:
     height: int
     model: CameraModel = "pinhole"
     #: Width and height of the picture that this one is a part of (`cropped`); None: it is whole.
-    whole: tuple[int, int] | None = None
+    uncropped_size: tuple[int, int] | None = None
 
     @cached_property
     def position(self) -> np.ndarray:
@@ -68,7 +68,7 @@ class Camera:
     @property
     def full_size(self) -> tuple[int, int]:
         """Width and height of the whole picture."""
-        return self.whole or (self.width, self.height)
+        return self.uncropped_size or (self.width, self.height)
 
     def cropped(self, left: int, top: int, right: int, bottom: int) -> Camera:
         """The part of this picture with columns `left` to `right` and rows `top` to `bottom`, both without the last:
@@ -79,12 +79,12 @@ class Camera:
                 f"{self.width}x{self.height}"
             )
         return replace(
-            self, cx=self.cx - left, cy=self.cy - top, width=right - left, height=bottom - top, whole=self.full_size
+            self, cx=self.cx - left, cy=self.cy - top, width=right - left, height=bottom - top, uncropped_size=self.full_size
         )
 
     def resized(self, width: int, height: int) -> Camera:
         """The same view on an image of another size. Raises ValueError for a part of a picture."""
-        if self.whole is not None:
+        if self.uncropped_size is not None:
             raise ValueError("resize the whole picture, then take a part of it")
         sx, sy = width / self.width, height / self.height
         return replace(

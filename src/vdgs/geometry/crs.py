@@ -27,7 +27,7 @@ class CrsTransform:
     #: Metres per unit.
     meters_per_unit: float
     wkt: str
-    heights: str
+    height_reference: str
     notes: tuple[str, ...]
     #: The factor from metres to the heights of the system: systems without heights get them in their own unit.
     _height_factor: float
@@ -94,7 +94,7 @@ def open_crs(code: str, origin: tuple[float, float, float]) -> CrsTransform:
     )
     return CrsTransform(
         code=code, name=crs.name, unit=unit, meters_per_unit=metres, wkt=crs.to_wkt(),
-        heights=heights if unit == "m" else f"{heights}; in {unit}", notes=notes,
+        height_reference=heights if unit == "m" else f"{heights}; in {unit}", notes=notes,
         _height_factor=1.0 if own_heights else 1 / metres, _transformer=transformer,
     )  # fmt: skip
 

@@ -16,7 +16,7 @@ class GroundFrame(Similarity):
     #: True where one unit of the ground frame is one metre.
     metric: bool
     #: How the up axis and the scale were found, for people ("GPS of 18 images", "least variance", ...).
-    how: str
+    description: str
     #: Latitude (deg), longitude (deg), altitude (m) of the ground frame's origin (ENU), where known.
     origin_geo: tuple[float, float, float] | None = None
     #: Latitude and longitude (deg) of the place whose east, north and up are the axes, where it is not the origin: a

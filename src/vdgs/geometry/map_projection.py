@@ -43,7 +43,7 @@ class MapProjection:
     #: WKT 2 of a projected or geocentric system; None for the others, which no catalogue holds.
     wkt: str | None
     #: What the third coordinate counts from.
-    heights: str
+    height_reference: str
     #: What a person should know about the accuracy.
     notes: tuple[str, ...]
     _forward: Callable[[MapPoints], MapPoints]
@@ -66,12 +66,12 @@ class MapProjection:
             raise VdgsError(f"--crs {asked}: is no coordinate system known here. Give {CRS_CHOICES}.")
         if ground.origin_geo is None:
             raise VdgsError(
-                f"--crs {asked}: the capture is not georeferenced ({ground.how}), so nobody knows where on Earth it "
+                f"--crs {asked}: the capture is not georeferenced ({ground.description}), so nobody knows where on Earth it "
                 "lies. Give positions when the run is started (--gps TABLE.csv or --georef FILE.json), or --crs local."
             )
         return _enu(ground) if asked.lower() == "enu" else _projected(ground, open_crs(asked, ground.origin_geo))
 
-    def places(self, points: MapPoints) -> MapPoints:
+    def project(self, points: MapPoints) -> MapPoints:
         """Points of the ground frame [n, 3] to coordinates of the target (east or x, north or y, height), exactly.
 
         Raises VdgsError where the target's projection does not reach.
@@ -91,13 +91,13 @@ class MapProjection:
         """
         centre = np.asarray(centre, np.float64)
         steps = _STEP * np.concatenate([np.eye(3), -np.eye(3)])
-        ahead, behind = np.split(self.places(centre + steps), 2)
+        ahead, behind = np.split(self.project(centre + steps), 2)
         jacobian = (ahead - behind).T / (2 * _STEP)
         left, _, right = np.linalg.svd(jacobian)
         rotation = left @ right
         # The plane's own scale: a projection scales areas of the ground, heights it passes on.
         scale = float(np.sqrt(np.linalg.norm(np.cross(jacobian[:, 0], jacobian[:, 1]))))
-        return Similarity(scale, rotation, self.places(centre[None])[0] - scale * rotation @ centre)
+        return Similarity(scale, rotation, self.project(centre[None])[0] - scale * rotation @ centre)
 
     def _checked(self, found: MapPoints) -> MapPoints:
         if not np.isfinite(found).all():
@@ -114,7 +114,7 @@ def _local(ground: GroundFrame) -> MapProjection:
         axes = ""
     return MapProjection(
         crs="local", name=name + axes, unit=ground.unit, meters_per_unit=1.0 if ground.metric else None, wkt=None,
-        heights=heights, notes=(), _forward=_same, _backward=_same,
+        height_reference=heights, notes=(), _forward=_same, _backward=_same,
     )  # fmt: skip
 
 
@@ -123,7 +123,7 @@ def _source(ground: GroundFrame) -> MapProjection:
     unit = "m" if metres is not None and abs(metres - 1) < 1e-9 else "units"
     name, heights = "the capture's own coordinates", "the third coordinate of the capture's own world"
     return MapProjection(
-        crs="source", name=name, unit=unit, meters_per_unit=metres, wkt=None, heights=heights, notes=(),
+        crs="source", name=name, unit=unit, meters_per_unit=metres, wkt=None, height_reference=heights, notes=(),
         _forward=ground.apply_inverse, _backward=ground.to_ground,
     )  # fmt: skip
 
@@ -136,7 +136,7 @@ def _enu(ground: GroundFrame) -> MapProjection:
     name = f"east, north, up about latitude {latitude:.7f}, longitude {longitude:.7f}, height {altitude:.2f} m"
     heights = f"metres above the horizon plane of the origin, which has the height {altitude:.2f} m"
     return MapProjection(
-        crs="enu", name=name, unit="m", meters_per_unit=1.0, wkt=None, heights=heights, notes=(),
+        crs="enu", name=name, unit="m", meters_per_unit=1.0, wkt=None, height_reference=heights, notes=(),
         _forward=lambda points: points @ turned.T, _backward=lambda places: places @ turned,
     )  # fmt: skip
 
@@ -157,7 +157,7 @@ def _projected(ground: GroundFrame, projection: CrsTransform) -> MapProjection:
         unit=projection.unit,
         meters_per_unit=projection.meters_per_unit,
         wkt=projection.wkt,
-        heights=projection.heights,
+        height_reference=projection.height_reference,
         notes=projection.notes,
         _forward=forward,
         _backward=backward,

@@ -21,7 +21,7 @@ class SelectedDevice:
     """A device (`cpu`, `cuda:0`) and why it was chosen."""
 
     device: str
-    why: str
+    reason: str
 
 
 def select_device(device: str) -> SelectedDevice:
@@ -54,7 +54,7 @@ def _no_card(index: int) -> str:
     from vdgs.kernels.cuda.nvrtc import CudaUnavailable, get_nvrtc
 
     try:
-        count = len(get_cuda_driver().cards())
+        count = len(get_cuda_driver().list_gpus())
         get_nvrtc()
     except CudaUnavailable as error:
         return str(error).rstrip(".")

@@ -64,11 +64,11 @@ class DecoderWeights:
 
     opacity: MlpWeights
     covariance: MlpWeights
-    colour: MlpWeights
+    color: MlpWeights
 
     def tensors(self) -> tuple[Tensor, ...]:
         """The twelve tensors, head by head."""
-        return (*self.opacity.tensors(), *self.covariance.tensors(), *self.colour.tensors())
+        return (*self.opacity.tensors(), *self.covariance.tensors(), *self.color.tensors())
 
     @staticmethod
     def from_tensors(tensors: tuple[Tensor, ...]) -> DecoderWeights:
@@ -118,13 +118,13 @@ class Splats:
     conics: Float[Tensor, "m 3"]
     #: Along the viewing direction; equal ones are blended in the order of the rows.
     depths: Float[Tensor, "m"]
-    colours: Float[Tensor, "m 3"]
+    colors: Float[Tensor, "m 3"]
     opacities: Float[Tensor, "m"]
 
     @property
     def tensors(self) -> tuple[Tensor, ...]:
         """All that a rasteriser draws, in the order in which it takes them."""
-        return self.means_px, self.conics, self.colours, self.opacities, self.depths
+        return self.means_px, self.conics, self.colors, self.opacities, self.depths
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -144,15 +144,15 @@ class OrderedSplats(Splats):
     """Splats that need not stand in the order in which equal depths are blended."""
 
     #: That order; None: the order of the rows. gsplat does not look at it.
-    runs: SplatSegments | None
+    segments: SplatSegments | None
 
     def concat(self, others: OrderedSplats) -> OrderedSplats:
         """These splats followed by others, in the order of each."""
-        runs = SplatSegments.concat(self.runs, len(self.depths), others.runs, len(others.depths), self.depths.device)
+        runs = SplatSegments.concat(self.segments, len(self.depths), others.segments, len(others.depths), self.depths.device)
         both = {
             field.name: torch.cat([getattr(self, field.name), getattr(others, field.name)]) for field in fields(Splats)
         }
-        return OrderedSplats(**both, runs=runs)
+        return OrderedSplats(**both, segments=runs)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -169,7 +169,7 @@ class TrainingSplats(OrderedSplats):
         """The same splats."""
         s = splats
         return TrainingSplats(
-            means_px=s.means_px, conics=s.conics, depths=s.depths, colours=s.colours, opacities=s.opacities, runs=None,
+            means_px=s.means_px, conics=s.conics, depths=s.depths, colors=s.colors, opacities=s.opacities, segments=None,
             source=s.source, volume=s.volumes.mean(),
         )  # fmt: skip
 
@@ -186,7 +186,7 @@ class SplatGradients:
     volume: float
     #: The splats themselves: see `TrainingSplats`. A card computes the values again.
     source: SplatSources
-    colour_values: Float[Tensor, "m 3"]
+    color_values: Float[Tensor, "m 3"]
     opacity_values: Float[Tensor, "m"]
     #: By the depth of each; None is zero.
     depths: Float[Tensor, "m"] | None = None
@@ -201,7 +201,7 @@ class AdamState(NamedTuple):
     learning_rate: float
     #: Up to how many times faster than that a row moves that has had few updates: after u of them by
     #: min(early, 1 / sqrt(1 - beta2^u)) (choice; at 1 this is Adam).
-    early: float = 1.0
+    lr_boost: float = 1.0
 
 
 class Raster(NamedTuple):
@@ -226,7 +226,7 @@ class SplatContributions(NamedTuple):
     #: How many pixels: the sum of its weights over them.
     pixels: Float[Tensor, " m"]
     #: The sum of weight times what the picture lacks there.
-    missing: Float[Tensor, "m 3"]
+    residual: Float[Tensor, "m 3"]
 
 
 class RasterGradients(NamedTuple):

@@ -38,11 +38,11 @@ class SplatSegments:
         """Those of m splats followed by n others; None is one run, as the rows are."""
         if first is None and second is None:
             return None
-        first, second = first or SplatSegments.one(m, device), second or SplatSegments.one(n, device)
+        first, second = first or SplatSegments.single(m, device), second or SplatSegments.single(n, device)
         return SplatSegments(torch.cat([first.starts, second.starts + m]), torch.cat([first.lengths, second.lengths]))
 
     @staticmethod
-    def one(m: int, device: torch.device) -> SplatSegments:
+    def single(m: int, device: torch.device) -> SplatSegments:
         """m splats as the rows are."""
         return SplatSegments(*(torch.full((1,), number, dtype=torch.int32, device=device) for number in (0, m)))
 
@@ -55,7 +55,7 @@ class SplatMask:
     #: Bit o is set where offset o has a splat; splats of an anchor are in the order of offsets.
     bits: Int32[Tensor, " v"]
     #: Of `ANCHORS_PER_SEGMENT` anchors each.
-    runs: SplatSegments
+    segments: SplatSegments
     count: int
     offsets: int
 

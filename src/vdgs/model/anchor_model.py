@@ -91,18 +91,18 @@ class AnchorModel:
     background: tuple[float, float, float]
     metadata: ModelMetadata = ModelMetadata()
     #: A merged scene whose blocks trained decoders of their own: all anchors, block by block. Else empty.
-    parts: tuple[DecoderSpan, ...] = ()
+    decoder_spans: tuple[DecoderSpan, ...] = ()
 
-    def spans(self) -> list[tuple[int, int, Decoder]]:
+    def decoder_ranges(self) -> list[tuple[int, int, Decoder]]:
         """Which rows of the anchors each decoder decodes: first, one past the last, decoder; ascending."""
-        bounds = np.cumsum([0, *(part.count for part in self.parts)]).tolist()
-        spans = [(a, b, part.decoder) for (a, b), part in zip(pairwise(bounds), self.parts, strict=True)]
+        bounds = np.cumsum([0, *(part.count for part in self.decoder_spans)]).tolist()
+        spans = [(a, b, part.decoder) for (a, b), part in zip(pairwise(bounds), self.decoder_spans, strict=True)]
         return spans or [(0, len(self.anchors), self.decoder)]
 
     def to(self, device: torch.device) -> AnchorModel:
         """The same model on a device."""
-        parts = tuple(replace(part, decoder=part.decoder.to(device)) for part in self.parts)
-        return replace(self, anchors=self.anchors.to(device), decoder=self.decoder.to(device), parts=parts)
+        parts = tuple(replace(part, decoder=part.decoder.to(device)) for part in self.decoder_spans)
+        return replace(self, anchors=self.anchors.to(device), decoder=self.decoder.to(device), decoder_spans=parts)
 
     def save(self, path: Path) -> None:
         """Write one safetensors file, atomically."""
@@ -115,10 +115,10 @@ class AnchorModel:
             "facts": self.metadata.to_dict(),
             "crc32": tensors_crc32(tensors),
         }
-        if self.parts:
-            content["parts"] = [part.count for part in self.parts]
+        if self.decoder_spans:
+            content["parts"] = [part.count for part in self.decoder_spans]
         # A single key: several would be written in an order that varies.
-        header = {MULTI_DECODER_FORMAT if self.parts else ANCHOR_MODEL_FORMAT: json.dumps(content)}
+        header = {MULTI_DECODER_FORMAT if self.decoder_spans else ANCHOR_MODEL_FORMAT: json.dumps(content)}
         write_atomic(path, lambda temporary: write_tensors(temporary, tensors, header))
 
     @staticmethod
@@ -139,7 +139,7 @@ class AnchorModel:
             red, green, blue = (float(value) for value in known["background"])
             model = AnchorModel(
                 anchors=anchors, decoder=decoder, voxel_size=float(known["voxel"]), background=(red, green, blue),
-                metadata=ModelMetadata.from_dict(known["facts"]), parts=parts,
+                metadata=ModelMetadata.from_dict(known["facts"]), decoder_spans=parts,
             )  # fmt: skip
             model.check()
         except (KeyError, ValueError, TypeError) as error:
@@ -164,12 +164,12 @@ class AnchorModel:
                 raise ValueError(f"{name} holds numbers that are not finite")
         for _, decoder in self._decoders():
             decoder.check(k)
-        if self.parts and sum(part.count for part in self.parts) != n:
-            raise ValueError(f"its parts hold {sum(part.count for part in self.parts)} anchors, not {n}")
+        if self.decoder_spans and sum(part.count for part in self.decoder_spans) != n:
+            raise ValueError(f"its parts hold {sum(part.count for part in self.decoder_spans)} anchors, not {n}")
 
     def _decoders(self) -> list[tuple[str, Decoder]]:
         """Every decoder with what the names of its tensors begin with in a file."""
-        return [("decoder.", self.decoder)] + [(f"part.{i}.", part.decoder) for i, part in enumerate(self.parts)]
+        return [("decoder.", self.decoder)] + [(f"part.{i}.", part.decoder) for i, part in enumerate(self.decoder_spans)]
 
 
 def _decoder_of(tensors: Mapping[str, Tensor], prefix: str) -> Decoder:

@@ -49,7 +49,7 @@ def decode_world(
     covariance = weights.covariance.forward(inputs).unflatten(1, (k, 7))
     return DecodedGaussians(
         weights.opacity.forward(inputs).tanh(),
-        weights.colour.forward(inputs).unflatten(1, (k, 3)).sigmoid(),
+        weights.color.forward(inputs).unflatten(1, (k, 3)).sigmoid(),
         anchors.log_scales[rows, None, 3:].exp() * covariance[..., :3].sigmoid(),
         covariance[..., 3:],
     )

@@ -27,13 +27,13 @@ class Decoder:
 
     weights: DecoderWeights
     #: One row per training image, and its map to the colour head's hidden layer; None without appearance.
-    appearance: Float[Tensor, "images a"] | None = None
+    appearance_embedding: Float[Tensor, "images a"] | None = None
     appearance_weight: Float[Tensor, "32 a"] | None = None
     #: What each training image's colours depart from the mean (`model.exposure`); None: all are taken as they are.
     exposure: Float[Tensor, "images 3 4"] | None = None
 
     @staticmethod
-    def initial(
+    def init_random(
         num_offsets: int, view_distance: bool, appearance_dim: int, num_images: int, generator: torch.Generator
     ) -> Decoder:
         """Uniform in +-1/sqrt(inputs), as torch.nn.Linear; embeddings start at 0."""
@@ -58,8 +58,8 @@ class Decoder:
 
     def tensors(self) -> dict[str, Tensor]:
         named = {f"{head}_{p}": getattr(getattr(self.weights, head), p) for head in HEADS for p in HEAD_TENSORS}
-        if self.appearance is not None and self.appearance_weight is not None:
-            named |= {"appearance": self.appearance, "appearance_weight": self.appearance_weight}
+        if self.appearance_embedding is not None and self.appearance_weight is not None:
+            named |= {"appearance": self.appearance_embedding, "appearance_weight": self.appearance_weight}
         if self.exposure is not None:
             named["exposure"] = self.exposure
         return named
@@ -75,11 +75,11 @@ class Decoder:
     def weights_for_image(self, image: int | None) -> DecoderWeights:
         """The weights as one view sees them: with the embedding of training image `image`, or with the mean
         embedding for a view that was not trained on (choice)."""
-        if self.appearance is None or self.appearance_weight is None:
+        if self.appearance_embedding is None or self.appearance_weight is None:
             return self.weights
-        embedding = self.appearance.mean(0) if image is None else self.appearance[image]
-        colour = self.weights.colour
-        return replace(self.weights, colour=replace(colour, b1=colour.b1 + self.appearance_weight @ embedding))
+        embedding = self.appearance_embedding.mean(0) if image is None else self.appearance_embedding[image]
+        colour = self.weights.color
+        return replace(self.weights, color=replace(colour, b1=colour.b1 + self.appearance_weight @ embedding))
 
     def exposure_for_image(self, image: int) -> Float[Tensor, "3 4"] | None:
         """The colour model of a training image; None where none is fitted."""

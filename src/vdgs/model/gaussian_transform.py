@@ -38,9 +38,9 @@ def transform_gaussians(
         means=means.float(),
         log_scales=gaussians.log_scales + math.log(scale),
         quaternions=multiply_quaternions(quaternion_from_matrix(rotation), gaussians.quaternions),
-        logits=gaussians.logits,
-        dc=gaussians.dc,
-        rest=rotate_sh(gaussians.rest, rotation),
+        opacity_logits=gaussians.opacity_logits,
+        sh0=gaussians.sh0,
+        shN=rotate_sh(gaussians.shN, rotation),
     )
 
 

@@ -36,10 +36,10 @@ class Gaussians:
     #: Rotations, wxyz, of any length but zero.
     quaternions: Float[Tensor, "n 4"]
     #: Opacities before the sigmoid.
-    logits: Float[Tensor, " n"]
+    opacity_logits: Float[Tensor, " n"]
     #: Spherical harmonics: coefficients of the constant function, and of the others.
-    dc: Float[Tensor, "n 3"]
-    rest: Float[Tensor, "n r 3"]
+    sh0: Float[Tensor, "n 3"]
+    shN: Float[Tensor, "n r 3"]
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -56,9 +56,9 @@ class Gaussians:
         return Gaussians(**{name: torch.cat([t, more.tensors()[name]]) for name, t in self.tensors().items()})
 
     @property
-    def degree(self) -> int:
+    def sh_degree(self) -> int:
         """Degree of the spherical harmonics that there is room for."""
-        return math.isqrt(self.rest.shape[1] + 1) - 1
+        return math.isqrt(self.shN.shape[1] + 1) - 1
 
 
 @torch.no_grad()
@@ -92,8 +92,8 @@ def render_gaussians(
         directions = torch.from_numpy(camera.forward.astype(np.float32)).to(gaussians.means).expand(len(gaussians), 3)
     splats = Splats(
         projected.means_px, projected.conics, projected.depths,
-        eval_sh_colors(gaussians.dc, gaussians.rest, directions, degree),
-        torch.where(projected.valid, gaussians.logits.sigmoid(), 0.0),
+        eval_sh_colors(gaussians.sh0, gaussians.shN, directions, degree),
+        torch.where(projected.valid, gaussians.opacity_logits.sigmoid(), 0.0),
     )  # fmt: skip
     raster = kernels.rasterize(splats, background, camera.width, camera.height, depth=depth)
     return raster, projected.means_px

@@ -47,7 +47,7 @@ def decode_view(
     `image`: as in `render`.
     """
     rows = cull_anchors(model.anchors, camera)
-    spans = model.spans()
+    spans = model.decoder_ranges()
     starts = rows.new_tensor([first for first, _, _ in spans] + [len(model.anchors)])
     bounds = torch.searchsorted(rows, starts).tolist()
     shown = [
@@ -105,7 +105,7 @@ def render_scalar(
     rows, splats = decode_view(model, camera)
     k = model.anchors.offsets.shape[1]
     of_splat = values.to(rows.device)[rows][splats.source.long() // k].float()
-    grey = replace(splats, colours=of_splat[:, None].expand(-1, 3).contiguous())
+    grey = replace(splats, colors=of_splat[:, None].expand(-1, 3).contiguous())
     painted = rasterize_splats(grey, camera, splats.means_px.new_zeros(3))
     return painted.image[..., 0], painted.alpha
 

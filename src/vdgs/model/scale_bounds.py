@@ -49,12 +49,12 @@ def max_log_scales(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -
     frusta = Frusta.of(cameras, positions.device)
     for rows, watching in SpatialGroups.of(positions).visible_groups(frusta):
         for some in watching.split(CAMERA_CHUNK):
-            asked = frusta.take(some)
+            asked = frusta.select(some)
             seen = asked.project(positions[rows])
-            allowed = torch.where(seen.inside, asked.span[:, None].to(positions) * seen.depth, math.inf)
+            allowed = torch.where(seen.inside, asked.relative_extent[:, None].to(positions) * seen.depth, math.inf)
             bound[rows] = torch.minimum(bound[rows], allowed.amin(dim=0))
     rows = bound.isinf().nonzero().squeeze(1)
-    bound[rows] = _by_nearest(positions[rows], cameras, frusta.span.cpu().numpy())
+    bound[rows] = _by_nearest(positions[rows], cameras, frusta.relative_extent.cpu().numpy())
     return (bound * (MAX_IMAGE_FRACTION / (2.0 * MAX_SIGMA))).log()
 
 

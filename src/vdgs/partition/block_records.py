@@ -37,7 +37,7 @@ class BlockCamerasRecord:
     area: float
 
     @property
-    def added(self) -> int:
+    def extra_cameras(self) -> int:
         """Cameras below the threshold: their best block, or topped up."""
         return self.best_block + self.topped_up
 
@@ -51,7 +51,7 @@ class PartitionRecord:
     strategy: str | None = None
     lambda_vis: float | None = None
     warnings: tuple[str, ...] = ()
-    complaints: tuple[str, ...] = ()
+    assignment_warnings: tuple[str, ...] = ()
     blocks: tuple[BlockCamerasRecord, ...] = ()
     spatial: tuple[BlockRecord, ...] = ()
     """The cut that place alone would give, to compare with."""

@@ -34,8 +34,8 @@ def split_trainable_anchors(anchors: Anchors, blocks: Blocks, index: int, config
     place = xy_positions(anchors.positions)
     owner = blocks.owner(place)
     core, reached = owner == index, blocks.in_expanded(index, place, owner)
-    own = core if config.ring == "frozen" else reached
-    around = ~own if config.context else reached & ~own
+    own = core if config.margin == "frozen" else reached
+    around = ~own if config.draw_outside else reached & ~own
     device = anchors.positions.device
     return torch.from_numpy(own).to(device), torch.from_numpy(around).to(device)
 
@@ -53,7 +53,7 @@ def growth_mask(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Te
 
     def inside(positions: Float[Tensor, "p 3"]) -> Bool[Tensor, " p"]:
         place = xy_positions(positions)
-        kept = blocks.owner(place) == index if config.ring == "frozen" else blocks.in_expanded(index, place)
+        kept = blocks.owner(place) == index if config.margin == "frozen" else blocks.in_expanded(index, place)
         return torch.from_numpy(kept).to(positions.device)
 
     return inside
@@ -65,7 +65,7 @@ def lr_ramp(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Tensor
 
     Read from a table over the block, since it is asked in every step.
     """
-    if config.ring != "ramp":
+    if config.margin != "ramp":
         return None
     block = blocks.items[index]
     low, high = np.array(block.expanded.bounds[:2]), np.array(block.expanded.bounds[2:])

@@ -95,7 +95,7 @@ def save_blocks_wgs84(
     Raises ValueError if the frame is not georeferenced.
     """
     if ground.origin_geo is None:
-        raise ValueError(f"the ground frame ({ground.how}) is not georeferenced: blocks have no longitude")
+        raise ValueError(f"the ground frame ({ground.description}) is not georeferenced: blocks have no longitude")
     origin, level_at = ground.origin_geo, ground.axes_origin
 
     def on_earth(shape: shapely.Polygon) -> shapely.Polygon:

@@ -82,7 +82,7 @@ def merge_blocks(
                 unseen=unseen,
             )
         )
-    return replace(coarse, anchors=_concatenate(selected), parts=tuple(pieces) if own else ()), became
+    return replace(coarse, anchors=_concatenate(selected), decoder_spans=tuple(pieces) if own else ()), became
 
 
 def has_own_decoder(model: AnchorModel) -> bool:

@@ -46,7 +46,7 @@ def partition_scene(
     check_distinct(count, ground)
     ground, visibility = _sorted(ground, np.asarray(visibility, np.int64))
     plane = fit_principal_plane(ground)
-    places, visibility = _sorted(plane.places(ground), visibility)
+    places, visibility = _sorted(plane.to_plane(ground), visibility)
     features = clustering_features(places, visibility, config.lambda_vis)
     labels = cluster_anchors(features, count, seed, config.balanced)
     found = block_cores(places, labels, count)

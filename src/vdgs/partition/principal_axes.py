@@ -17,16 +17,16 @@ NUM_ITERATIONS = 3
 class PrincipalPlane:
     """x, y of the ground frame = centre + axes @ (place in the plane); `axes` is orthonormal, columns by variance."""
 
-    centre: Float[np.ndarray, "2"]
+    center: Float[np.ndarray, "2"]
     axes: Float[np.ndarray, "2 2"]
 
-    def places(self, ground: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    def to_plane(self, ground: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Places of the ground frame in the principal axes."""
-        return (ground - self.centre) @ self.axes
+        return (ground - self.center) @ self.axes
 
     def to_ground(self, shape: shapely.Polygon) -> shapely.Polygon:
         """A polygon back in the ground frame."""
-        return shapely.transform(shape, lambda places: places @ self.axes.T + self.centre)
+        return shapely.transform(shape, lambda places: places @ self.axes.T + self.center)
 
 
 def fit_principal_plane(ground: Float[np.ndarray, "n 2"]) -> PrincipalPlane:

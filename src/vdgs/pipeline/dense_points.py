@@ -74,10 +74,10 @@ def find_dense_points(
     inputs = StereoInputs(cameras, capture.points, np.concatenate([capture.points, gaps]), read)
     found = compute_dense_points(inputs, cell, run.coarse.path, on_progress, threads)
     if len(found.points):
-        away = np.flatnonzero(cKDTree(capture.points).query(found.points, workers=1)[0] > cell.least / 2)
+        away = np.flatnonzero(cKDTree(capture.points).query(found.points, workers=1)[0] > cell.min_edge / 2)
         views = count_visibility(torch.from_numpy(found.points[away]), cameras).numpy()
         kept = np.sort(away[np.argsort(views, kind="stable")[:room]])
-        found = DensePoints(found.points[kept], found.colours[kept])
+        found = DensePoints(found.points[kept], found.colors[kept])
     _write(file, found)
     return found
 
@@ -97,7 +97,7 @@ def fusion_cell(capture: Capture, config: AnchorConfig) -> FusionCell:
 
 
 def _write(file: Path, found: DensePoints) -> None:
-    tensors = {"points": torch.from_numpy(found.points), "colours": torch.from_numpy(found.colours)}
+    tensors = {"points": torch.from_numpy(found.points), "colours": torch.from_numpy(found.colors)}
     write_atomic(
         file, lambda temporary: write_tensors(temporary, tensors, {DENSE_POINTS_FORMAT: str(tensors_crc32(tensors))})
     )

@@ -68,7 +68,7 @@ class RunEstimate:
     free_bytes: int
     coarse_bytes: int
     block_bytes: int
-    photographs_bytes: int
+    images_bytes: int
     """Of one block, beside `block_bytes`."""
     may_exceed_memory: bool
     """Whether it may take more than is free."""
@@ -106,12 +106,12 @@ def _plan_photographs(run_request: RunRequest, console: Console) -> RunEstimate 
     if finished is not None:
         return estimate_run(
             replace(
-                run_request, capture=request.output, photographs=(), options=replace(run_request.options, gps=None)
+                run_request, capture=request.output, extra_image_folders=(), options=replace(run_request.options, gps=None)
             ),
             console,
         )
     print_plan(plan_reconstruction(request), console)
-    folders = " ".join(map(str, (run_request.capture, *run_request.photographs)))
+    folders = " ".join(map(str, (run_request.capture, *run_request.extra_image_folders)))
     console.print(
         f"Training can be estimated once they are a capture: vdgs sfm {folders} --output CAPTURE, then the same "
         "with CAPTURE. Nothing was written.",
@@ -135,28 +135,28 @@ def _standing(request: RunRequest, capture: Capture, method: MethodConfig, conso
 
 def _plan(capture: Capture, method: MethodConfig, request: RunRequest) -> RunEstimate:
     config, views = method.training, len(capture.train_views)
-    factors = sorted({factor for _, factor in (*config.resolutions, *method.block.resolutions)})
-    with ImageCache(capture.train_views, image_cache_bytes(request.watching), downscales=tuple(factors)) as images:
+    factors = sorted({factor for _, factor in (*config.resolution_schedule, *method.block.resolution_schedule)})
+    with ImageCache(capture.train_views, image_cache_bytes(request.checkpointing), downscales=tuple(factors)) as images:
         stage, anchors = build_coarse_problem(capture, config, images, request.device)
-        alone = training_workload(initial_coarse_state(anchors, stage, config.exposure), stage)
+        alone = training_workload(initial_coarse_state(anchors, stage, config.exposure_compensation), stage)
         timed = {}
         for factor in factors:
-            at_size = replace(stage, config=replace(config, resolutions=((0.0, factor),)))
-            timed[factor] = _seconds_a_step(initial_coarse_state(anchors, at_size, config.exposure), at_size)
+            at_size = replace(stage, config=replace(config, resolution_schedule=((0.0, factor),)))
+            timed[factor] = _seconds_a_step(initial_coarse_state(anchors, at_size, config.exposure_compensation), at_size)
     dense = max_dense_points(capture) if config.anchors.mvs else 0
     need, more = replace(alone, anchors=alone.anchors + dense), MAX_GROWTH * (1 + dense / max(alone.anchors, 1))
     cameras, free = [view.camera for view in capture.train_views], available_memory_bytes()
-    pixels = max_image_pixels(cameras, method.block.resolutions)
-    blocks = choose_block_count(need.grown, views, pixels, method)
-    each = estimate_memory(block_workload(method, -(-need.grown // blocks), need.grown, pixels)).total
+    pixels = max_image_pixels(cameras, method.block.resolution_schedule)
+    blocks = choose_block_count(need.max_grown_anchors, views, pixels, method)
+    each = estimate_memory(block_workload(method, -(-need.max_grown_anchors // blocks), need.max_grown_anchors, pixels)).total
     whole = estimate_memory(need).total
     photographs = decoded_image_bytes(cameras)
     work = ShardWorkload(
         pieces=blocks,
         shard_bytes=each,
         jobs=request.jobs,
-        image_gb=request.watching.image_cache_gb,
-        photographs_bytes=photographs,
+        image_gb=request.checkpointing.image_cache_gb,
+        images_bytes=photographs,
     )
     share = allocate_local(work, threads_available(), free)
     block = block_train_config(method, max(1, round(views * min(1.0, 1.5 / blocks))))
@@ -167,12 +167,12 @@ def _plan(capture: Capture, method: MethodConfig, request: RunRequest) -> RunEst
         blocks=blocks,
         coarse_iterations=config.iterations,
         block_iterations=block.iterations,
-        jobs=share.at_once,
+        jobs=share.max_concurrent,
         free_bytes=free,
         coarse_bytes=whole,
         block_bytes=each,
-        photographs_bytes=min(photographs, round(1e9 * share.image_gb)),
-        may_exceed_memory=whole > free or exceeds_memory(work, share.at_once, free),
+        images_bytes=min(photographs, round(1e9 * share.image_gb)),
+        may_exceed_memory=whole > free or exceeds_memory(work, share.max_concurrent, free),
         coarse_seconds=(coarse, coarse * (1 + more) / 2),
         blocks_seconds=(blocks * _seconds(block, timed), blocks * _seconds(block, timed) * more),
     )
@@ -192,10 +192,10 @@ def _seconds_a_step(state: TrainingState, stage: object) -> float:
 
 def _seconds(config: TrainConfig, timed: dict[int, float]) -> float:
     """Of all steps of a stage, each at the size that the schedule gives it."""
-    ends = [begin for begin, _ in config.resolutions[1:]] + [1.0]
+    ends = [begin for begin, _ in config.resolution_schedule[1:]] + [1.0]
     return sum(
         config.iterations * max(0.0, end - begin) * timed[factor]
-        for (begin, factor), end in zip(config.resolutions, ends, strict=True)
+        for (begin, factor), end in zip(config.resolution_schedule, ends, strict=True)
     )
 
 
@@ -215,7 +215,7 @@ def _print_estimate(plan: RunEstimate, method: MethodConfig, standing: RunStatus
         f"coarse model: {plan.anchors:,} anchors at the start{stereo}, {plan.coarse_iterations:,} iterations, at most "
         f"{data_size(plan.coarse_bytes)}, {_times(plan.coarse_seconds)}{done('coarse')}",
         f"{blocks}{chosen}: about {plan.block_iterations:,} iterations each, {plan.jobs} at once, at most "
-        f"{data_size(plan.block_bytes)} each and {data_size(plan.photographs_bytes)} for photographs, "
+        f"{data_size(plan.block_bytes)} each and {data_size(plan.images_bytes)} for photographs, "
         f"{per_block}{done(*names)}",
         f"memory that is free: {data_size(plan.free_bytes)}",
         "Times are of training alone, from steps timed now on this machine; the larger one is with "

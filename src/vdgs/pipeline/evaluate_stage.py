@@ -64,7 +64,7 @@ class EvaluationRequest:
     """The run folder."""
     which: ModelName = "best"
     lpips_weights: Path | None = None
-    bins: int = 4
+    visibility_bins: int = 4
     views: EvaluationSplit = "test"
     device: str = "cpu"
 
@@ -78,7 +78,7 @@ def evaluate_stage(
 
     Raises what `ShardedJob.send` raises, and RunError where another process measures the same.
     """
-    check_bins(request.bins)
+    check_bins(request.visibility_bins)
     run = RunFolder(Path(os.path.abspath(request.path)))  # as in `stages.train`: other machines may mount it so
     found = locate_model(run, request.which)
     output = evaluation_folder(run, found.name, request.views)
@@ -89,7 +89,7 @@ def evaluate_stage(
         peak = _measure_in_shards(context, run, found, request, execution, console)
     else:
         peak = _measure_here(context, found, request, console)
-    record = _record_of(run, found.name, request.lpips_weights, request.bins)
+    record = _record_of(run, found.name, request.lpips_weights, request.visibility_bins)
     write_json(output / "status.json", record | {"seconds": time.monotonic() - began, "peak_memory_bytes": peak})
 
 
@@ -104,7 +104,7 @@ def _measure_here(context: RunContext, found: ModelLocation, request: Evaluation
         _announce(found, len(select_views(opened.capture, request.views)), request.views, console)
         _delete_results(output)
         reset_peak_memory()
-        evaluate_run(opened, coarse, request.lpips_weights, request.bins, console, request.views)
+        evaluate_run(opened, coarse, request.lpips_weights, request.visibility_bins, console, request.views)
         if _has_seams(run, found.name, request.views):
             with cached_reference_views(opened.capture.test_views) as photographs:
                 console.print(make_block_table(evaluate_blocks(make_block_inputs(opened, coarse, photographs), output)))
@@ -112,7 +112,7 @@ def _measure_here(context: RunContext, found: ModelLocation, request: Evaluation
 
 
 def _announce(found: ModelLocation, count: int, views: EvaluationSplit, console: Console) -> None:
-    console.print(f"measuring the {found.line} on {count} {views} views", highlight=False)
+    console.print(f"measuring the {found.summary} on {count} {views} views", highlight=False)
 
 
 def _has_seams(run: RunFolder, name: str, views: EvaluationSplit) -> bool:
@@ -148,9 +148,9 @@ def _measure_in_shards(
 
 def _job(run: RunFolder, found: ModelLocation, asked: EvaluationRequest, count: int) -> ShardedJob:
     """The views in shards, and what their figures depend on."""
-    blocks = [folder.status().model for folder in run.block_folders()] if found.name == "merged" else []
+    blocks = [folder.status().model_id for folder in run.block_folders()] if found.name == "merged" else []
     depends_on = [
-        found.stage.status().model, found.key, run.coarse_model_id(), blocks, str(asked.lpips_weights), asked.views
+        found.stage.status().model_id, found.key, run.coarse_model_id(), blocks, str(asked.lpips_weights), asked.views
     ]  # fmt: skip
     if exposed := _exposed(run):
         depends_on.append(exposed)
@@ -181,14 +181,14 @@ def measure_shard(shard: Shard) -> None:
             lpips, note = load_lpips(asked.lpips_weights)
             model = make_renderable_model(opened, coarse, asked.views)
             inputs = ViewInputs(
-                photographs, model, lpips, make_evaluation_settings(asked.bins, asked.views), job.output
+                photographs, model, lpips, make_evaluation_settings(asked.visibility_bins, asked.views), job.output
             )
             seams = (
                 make_block_inputs(opened, coarse, photographs) if _has_seams(run, opened.name, asked.views) else None
             )
             facts = {"model": record_to_dict(model.facts), "lpips_note": note}
             write_json(job.shard(shard.index).path / "facts.json", facts)
-            shard.console.print(f"measuring the {opened.line} on {len(left)} views", highlight=False)
+            shard.console.print(f"measuring the {opened.summary} on {len(left)} views", highlight=False)
             pictures = _SeamPictures(job, job.spans[shard.index]) if seams is not None else None
             for item in left:
                 metrics, block_metrics = measure_view(item, inputs), None
@@ -227,7 +227,7 @@ def _join(run: RunFolder, found: ModelLocation, request: EvaluationRequest, job:
         record_from_dict(ModelMetadata, facts["model"]),
         job.output,
         lpips_note=facts["lpips_note"],
-        settings=make_evaluation_settings(request.bins, request.views),
+        settings=make_evaluation_settings(request.visibility_bins, request.views),
         timed=False,
         console=console,
     )
@@ -252,14 +252,14 @@ def _record_of(run: RunFolder, name: str, lpips_weights: Path | None, bins: int)
     keys = run.keys()
     key = keys.merge if name == "merged" else keys.coarse
     return {
-        "key": key, "model": stage.status().model, "lpips_weights": str(lpips_weights), "bins": bins,
+        "key": key, "model": stage.status().model_id, "lpips_weights": str(lpips_weights), "bins": bins,
         "exposed": _exposed(run),
     }  # fmt: skip
 
 
 def _exposed(run: RunFolder) -> str | None:
     """How views are exposed, if training fitted exposures; None in neutral colours."""
-    return "interpolated and metered" if run.method().training.exposure else None
+    return "interpolated and metered" if run.method().training.exposure_compensation else None
 
 
 def _delete_results(output: Path) -> None:

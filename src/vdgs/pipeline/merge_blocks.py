@@ -30,7 +30,7 @@ def merge_run_blocks(context: RunContext, allow_missing_blocks: bool, console: C
         key, keys = run.keys().merge, run.keys()
         blocks = load_run_blocks(run)
         done = [run.block(index).is_done(keys.blocks) for index in range(len(blocks))]
-        models = [run.block(i).status().model if whole else None for i, whole in enumerate(done)]
+        models = [run.block(i).status().model_id if whole else None for i, whole in enumerate(done)]
         if run.merged.is_done(key) and run.merged.status().block_models == tuple(models):
             console.print(f"{run.merged.model}: already merged; nothing to do", highlight=False)
             return
@@ -55,7 +55,7 @@ def merge_run_blocks(context: RunContext, allow_missing_blocks: bool, console: C
         stages = [opened.status, *trained_in]
         status = StatusRecord(
             state="done", anchors=len(merged.anchors), blocks_trained=sum(done), blocks=tuple(became),
-            block_models=tuple(models), model=file_id(run.merged.model),
+            block_models=tuple(models), model_id=file_id(run.merged.model),
             seconds=sum(each.seconds or 0.0 for each in stages),
             iterations=sum(each.iteration or 0 for each in stages),
             peak_memory_bytes=max(each.peak_memory_bytes or 0 for each in stages),
@@ -76,7 +76,7 @@ def _refuse(run: RunFolder, done: list[bool]) -> None:
         if not whole:
             found = standing.of(f"block {index}")
             state = "not trained yet" if found.state in ("missing", "queued") else found.state
-            lines.append(f"block {index}: {found.why if state == 'stale' else state}" + _because(state, found.why))
+            lines.append(f"block {index}: {found.reason if state == 'stale' else state}" + _because(state, found.reason))
     raise RunError(
         f"{run.path}: not all blocks are trained:\n  " + "\n  ".join(lines)
         + f"\nTrain them with `vdgs train {run.path}`, or give --incomplete to let the coarse model stand in for them."

@@ -121,7 +121,7 @@ def partition_run(
         if method.partition.strategy != "visibility":
             scores = STRATEGIES[method.partition.strategy].adjust_scores(scores, scene.positions, blocks, scene.cameras)
         assignment = assign_cameras(scores, config)
-        for note in warnings + assignment.complaints:
+        for note in warnings + assignment.warnings:
             console.print(f"[yellow]note[/] {note}", highlight=False)
         rows = assignment_rows(blocks, scene.positions, scene.visibility, assignment)
         _save(run.partition, scene, blocks, scores, assignment, rows)
@@ -130,7 +130,7 @@ def partition_run(
         record = PartitionRecord(
             key=keys.partition, assignment_key=keys.assignment, strategy=method.partition.strategy,
             lambda_vis=method.partition.lambda_vis if method.partition.strategy == "visibility" else None,
-            warnings=tuple(warnings), complaints=tuple(assignment.complaints), blocks=tuple(rows),
+            warnings=tuple(warnings), assignment_warnings=tuple(assignment.warnings), blocks=tuple(rows),
             spatial=block_rows(spatial, scene.positions, scene.visibility),
             seconds=time.monotonic() - began, peak_memory_bytes=peak_memory_bytes(),
         )  # fmt: skip
@@ -150,12 +150,12 @@ def explain_view(run: RunFolder, view: str, console: Console) -> None:
     for heading in ("block", "score", "anchors held", "why"):
         table.add_column(heading, justify="left" if heading == "why" else "right")
     for row in explain_assignment(names, scores, assignment, view):
-        table.add_row(str(row.block), f"{row.score:.3f}", f"{row.held:,}", row.why)
+        table.add_row(str(row.block), f"{row.score:.3f}", f"{row.visible_anchors:,}", row.reason)
     console.print(table)
 
 
 def _cut(scene: _Scene, method: MethodConfig) -> tuple[Blocks, list[str]]:
-    config, pixels = method.partition, max_image_pixels(scene.cameras, method.block.resolutions)
+    config, pixels = method.partition, max_image_pixels(scene.cameras, method.block.resolution_schedule)
     count = choose_block_count(len(scene.visibility), len(scene.cameras), pixels, method)
     if config.strategy != "visibility":
         return STRATEGIES[config.strategy].partition(scene.positions, scene.cameras, count)

@@ -43,12 +43,12 @@ def run_pipeline(request: RunRequest, console: Console, command: str | None = No
 
     Raises what the stages raise; all that was finished before stays, and the same command continues.
     """
-    check_backend_reachable(request.where)
+    check_backend_reachable(request.executor_options)
     check_ranges(request)
     check_weights_file(request.lpips_weights)
     request = reconstruct_if_needed(request, console)
     begun = exclusive_run(
-        request.capture, request.output, request.options, request.method(), overwrite=request.redo, command=command
+        request.capture, request.output, request.options, request.method(), overwrite=request.overwrite, command=command
     )
     with begun as context:
         _stages(context, request, console)
@@ -67,13 +67,13 @@ def reconstruct_if_needed(run_request: RunRequest, console: Console) -> RunReque
         raise VdgsError("These settings do not work:\n  " + "\n  ".join(problems))
     _title(console, "photographs")
     request = make_sfm_request(run_request)
-    reconstruct(request, console, RunFolder(run_request.output).driven())
-    return replace(run_request, capture=request.output, photographs=(), options=replace(run_request.options, gps=None))
+    reconstruct(request, console, RunFolder(run_request.output).drive_lock())
+    return replace(run_request, capture=request.output, extra_image_folders=(), options=replace(run_request.options, gps=None))
 
 
 def _stages(context: RunContext, request: RunRequest, console: Console) -> None:
     _title(console, "coarse model")
-    train_coarse(context, request.watching, console, request.device)
+    train_coarse(context, request.checkpointing, console, request.device)
     check_stop_requested()
     count_run_visibility(context, console)
     _measure(context, "coarse", request, console)
@@ -81,13 +81,13 @@ def _stages(context: RunContext, request: RunRequest, console: Console) -> None:
     partition_run(context, console, request.device, _wish(request))
     _title(console, "block training")
     try:
-        train_blocks(context, request.watching, request.jobs, console, request.device, request.where)
+        train_blocks(context, request.checkpointing, request.jobs, console, request.device, request.executor_options)
     except RunError as error:
-        if not request.incomplete:
+        if not request.allow_missing_blocks:
             raise
         console.print(f"[yellow]note[/] {error}", highlight=False)
     _title(console, "merge and evaluation")
-    merge_run_blocks(context, request.incomplete, console)
+    merge_run_blocks(context, request.allow_missing_blocks, console)
     _measure(context, "merged", request, console)
     context.release_models("coarse")
     _verdict(context.run, console)
@@ -124,11 +124,11 @@ def _measure(context: RunContext, which: Literal["coarse", "merged"], request: R
     """Evaluate a model unless that was done already, for this very model and in the same way."""
     check_stop_requested()
     run = context.run
-    if is_evaluated(run, which, request.lpips_weights, request.bins):
+    if is_evaluated(run, which, request.lpips_weights, request.visibility_bins):
         console.print(f"{evaluation_folder(run, which)}: already measured; nothing to do", highlight=False)
         return
     measuring = EvaluationRequest(
-        path=run.path, which=which, lpips_weights=request.lpips_weights, bins=request.bins, device=request.device
+        path=run.path, which=which, lpips_weights=request.lpips_weights, visibility_bins=request.visibility_bins, device=request.device
     )
     evaluate_stage(context, measuring, console, _wish(request))
 
@@ -136,7 +136,7 @@ def _measure(context: RunContext, which: Literal["coarse", "merged"], request: R
 def _wish(request: RunRequest) -> ExecutionOptions:
     """Where shards of stages other than the blocks are done: where blocks are trained, if that is a cluster."""
     return ExecutionOptions(
-        request.where, request.jobs if request.where.executor != "local" else 0, device=request.device
+        request.executor_options, request.jobs if request.executor_options.executor != "local" else 0, device=request.device
     )
 
 

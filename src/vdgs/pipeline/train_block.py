@@ -92,7 +92,7 @@ def _train(
     owned = [each.anchors_core for each in run.partition_record().blocks]
     config = block_train_config(method, len(views))
     limit = max_block_anchors(method.block, owned[index], sum(owned))
-    config = replace(config, growth=replace(config.growth, max_anchors=limit))
+    config = replace(config, densify=replace(config.densify, max_anchors=limit))
     shares = view_sampling_weights(config, anchors, [view.camera for view in views])
     began = time.monotonic()
     crops = None
@@ -106,15 +106,15 @@ def _train(
         config = replace(config, iterations=steps_for(config.iterations, area))
     prepared = time.monotonic() - began
     warn_without_densification(config, console, "--block.")
-    factors = tuple(sorted({factor for _, factor in config.resolutions}))
+    factors = tuple(sorted({factor for _, factor in config.resolution_schedule}))
     flown = [view.camera for view in capture.train_views]
     with ImageCache(views, image_cache_bytes(options), downscales=factors) as images:
         stage = TrainingProblem(
-            config=config, images=images, image_count=len(views), voxel_size=coarse.voxel_size,
+            config=config, images=images, num_images=len(views), voxel_size=coarse.voxel_size,
             camera_height=camera_height(capture), kind="block", background=coarse.background, device=device,
-            frozen_decoder=method.block.decoder == "frozen", surroundings=FrozenAnchors(surroundings, coarse.decoder),
-            may_hold=growth_mask(blocks, index, method.block), lr_mask=lr_ramp(blocks, index, method.block),
-            image_indices=chosen, shares=shares, crops=crops,
+            frozen_decoder=method.block.decoder == "frozen", frozen_anchors=FrozenAnchors(surroundings, coarse.decoder),
+            growth_mask=growth_mask(blocks, index, method.block), lr_mask=lr_ramp(blocks, index, method.block),
+            image_indices=chosen, view_weights=shares, crops=crops,
             max_log_scale=(lambda positions: max_log_scales(positions, flown)) if config.anchors.bound_scales else None,
         )  # fmt: skip
         state = resume_or_start(folder, stage, lambda: initial_state(anchors, coarse.decoder.copy(), stage), console)
@@ -141,8 +141,8 @@ def _keep_coarse(folder: StageFolder, model: AnchorModel, views: int, console: C
     why = "no camera sees it" if not views else "it holds no anchor"
     model.save(folder.model)
     status = StatusRecord(
-        state="done", iteration=0, iterations=0, anchors=len(model.anchors), seconds=0.0, why=why,
-        model=file_id(folder.model),
+        state="done", iteration=0, iterations=0, anchors=len(model.anchors), seconds=0.0, reason=why,
+        model_id=file_id(folder.model),
     )  # fmt: skip
     folder.set_status(status)
     console.print(f"[yellow]note[/] this block stays as the coarse model has it: {why}", highlight=False)

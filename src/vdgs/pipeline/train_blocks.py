@@ -110,5 +110,5 @@ def _block_bytes(run: RunFolder, cameras: Sequence[Camera]) -> int:
     """Memory by estimate that the largest block needs for the program, its picture, its anchors once they have grown,
     and those around it. Photographs that are kept have a budget of their own."""
     method, anchors = run.method(), [each.anchors_core for each in run.partition_record().blocks]
-    pixels = max_image_pixels(cameras, method.block.resolutions)
+    pixels = max_image_pixels(cameras, method.block.resolution_schedule)
     return estimate_memory(block_workload(method, max(anchors), sum(anchors), pixels)).total

@@ -77,14 +77,14 @@ def _train(
     device: torch.device,
 ) -> None:
     folder = run.coarse
-    factors = tuple(sorted({1, *(factor for _, factor in config.resolutions)}))  # 1: stereo sees them in full
+    factors = tuple(sorted({1, *(factor for _, factor in config.resolution_schedule)}))  # 1: stereo sees them in full
     with ImageCache(capture.train_views, image_cache_bytes(options), downscales=factors) as images:
         dense = _dense_points(run, capture, images, config, console)
         stage, anchors = build_coarse_problem(capture, config, images, device, dense)
 
         def begun() -> TrainingState:
             differ = _brightness(images, config, console)
-            fitted = config.exposure and (differ is None or differ >= config.exposure_min_spread)
+            fitted = config.exposure_compensation and (differ is None or differ >= config.exposure_min_spread)
             found = {"sparse_points": len(capture.points), "dense_points": None if dense is None else len(dense.points)}
             write_json(folder.initialization_file, {**found, "brightness_differs": differ, "exposures": fitted})
             return initial_coarse_state(anchors, stage, fitted)
@@ -105,7 +105,7 @@ def _refuse_empty(run: RunFolder, state: TrainingState) -> None:
     if not len(state.anchors):
         save_checkpoint(run.coarse.checkpoints, to_checkpoint(state))
         run.coarse.set_status(
-            StatusRecord(state="failed", iteration=state.iteration, why="training has removed all anchors")
+            StatusRecord(state="failed", iteration=state.iteration, reason="training has removed all anchors")
         )
     check_has_anchors(run, len(state.anchors))
 
@@ -135,7 +135,7 @@ def _dense_points(
 def _brightness(images: ImageCache, config: TrainConfig, console: Console) -> float | None:
     """By what share photographs of the same places differ in brightness; None where nothing depends on it, or the
     capture does not tell. Says what follows."""
-    if not (config.exposure and config.exposure_min_spread):
+    if not (config.exposure_compensation and config.exposure_min_spread):
         return None
     wait = console.status("comparing the photographs' brightness")
 
@@ -173,11 +173,11 @@ def build_coarse_problem(
     anchors, voxel = initialize_anchors(capture.points, capture.point_colors, cameras, config.anchors, dense)
     background = (0.0, 0.0, 0.0)
     if config.loss.background != "black":
-        smallest = max(factor for _, factor in config.resolutions)
+        smallest = max(factor for _, factor in config.resolution_schedule)
         background = mean_image_color(images, len(cameras), smallest)
     stage = TrainingProblem(
-        config=config, images=images, image_count=len(cameras), voxel_size=voxel, camera_height=camera_height(capture),
-        background=background, shares=view_sampling_weights(config, anchors, cameras), device=torch.device(device),
+        config=config, images=images, num_images=len(cameras), voxel_size=voxel, camera_height=camera_height(capture),
+        background=background, view_weights=view_sampling_weights(config, anchors, cameras), device=torch.device(device),
         max_log_scale=(lambda positions: max_log_scales(positions, cameras)) if config.anchors.bound_scales else None,
     )  # fmt: skip
     return stage, anchors
@@ -187,11 +187,11 @@ def initial_coarse_state(anchors: Anchors, stage: TrainingProblem, fit_exposures
     """The state before the first step, in which photographs have exposures to be fitted or have none."""
     config = stage.config
     generator = torch.Generator().manual_seed(config.seed)
-    decoder = Decoder.initial(
-        config.anchors.offsets, config.anchors.distance, config.anchors.appearance, stage.image_count, generator
+    decoder = Decoder.init_random(
+        config.anchors.num_offsets, config.anchors.view_distance, config.anchors.appearance_dim, stage.num_images, generator
     )
     if fit_exposures:
-        decoder = replace(decoder, exposure=zero_exposures(stage.image_count))
+        decoder = replace(decoder, exposure=zero_exposures(stage.num_images))
     return initial_state(anchors.to(stage.device), decoder.to(stage.device), stage)
 
 

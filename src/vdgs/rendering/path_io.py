@@ -54,9 +54,9 @@ _INTRINSICS = ("fx", "fy", "cx", "cy")
 _SIZE = ("width", "height")
 _FRAME_KEYS = ("position", "look_at", "up", "camera_from_world", "fov_deg", *_INTRINSICS, *_SIZE)
 #: Focal lengths and principal points, in pixels.
-_FOCAL, _PIXELS = Range(0, 1e7, above=True), Range(-1e7, 1e7)
+_FOCAL, _PIXELS = Range(0, 1e7, exclusive_min=True), Range(-1e7, 1e7)
 _SIDE = Range(1, commands.MAX_RENDER_SIDE_PX)
-_FOV_DEG = Range(0, 180, above=True, exclusive_max=True)
+_FOV_DEG = Range(0, 180, exclusive_min=True, exclusive_max=True)
 #: Coordinates, in units of the ground frame or the capture's own.
 _MAX_COORDINATE = 1e9
 
@@ -192,7 +192,7 @@ def _number(entry: Mapping[str, Any], name: str, bounds: Range) -> float | None:
     if value is None:
         return None
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    _require(is_number and bounds.holds(value), f"{name} is {value!r}; it must be a number, {bounds}")
+    _require(is_number and bounds.contains(value), f"{name} is {value!r}; it must be a number, {bounds}")
     return float(value)
 
 

@@ -57,7 +57,7 @@ def render_run(request: RenderRequest, console: Console) -> None:
     check_not_in_capture(request.output)
     run = open_model(RunFolder(request.run), request.model, request.device)
     flight = _load_cameras(request, run)
-    check_not_among_folders(request.output, flight.root, flight.inputs)
+    check_not_among_folders(request.output, flight.root, flight.input_folders)
     if run.warning:
         console.print(f"[yellow]warning[/] {run.warning}", highlight=False)
     named, fps = _cameras(request, flight)
@@ -68,12 +68,12 @@ def render_run(request: RenderRequest, console: Console) -> None:
         said = _write_video(request, run, flight, named, fps, console)
     else:
         said = _write_images(request, run, flight, named, console)
-    console.print(f"{run.line}: {said}, drawn in {time.monotonic() - began:.1f} s: {request.output}", highlight=False)
+    console.print(f"{run.summary}: {said}, drawn in {time.monotonic() - began:.1f} s: {request.output}", highlight=False)
 
 
 def _check(request: RenderRequest) -> None:
     check_ranges(request)
-    if request.raw and request.kind == "image":
+    if request.raw and request.mode == "image":
         raise VdgsError("--raw writes the numbers of a map: it needs --kind depth, visibility or alpha.")
     if request.raw and request.output.suffix:
         raise VdgsError(f"{request.output}: a film holds no numbers. Give a folder for --output, or leave out --raw.")
@@ -137,14 +137,14 @@ def _scalar_map(
 ) -> ScalarMap | None:
     """The map that all views are drawn as; None for plain pictures."""
     return (
-        None if request.kind == "image" else make_scalar_map(request.kind, run, flight, [camera for _, camera in named])
+        None if request.mode == "image" else make_scalar_map(request.mode, run, flight, [camera for _, camera in named])
     )
 
 
 def _metadata(request: RenderRequest, run: OpenedModel, drawn: ScalarMap | None) -> dict[str, object]:
     """What render.json says of the pictures beside it."""
     facts: dict[str, object] = {
-        "run": str(request.run.resolve()), "model": run.name, "kind": request.kind,
+        "run": str(request.run.resolve()), "model": run.name, "kind": request.mode,
         "views": str(request.path) if request.path is not None else request.views,
     }  # fmt: skip
     if drawn is not None:
@@ -176,7 +176,7 @@ def _cameras(request: RenderRequest, flight: RunCameras) -> tuple[list[tuple[str
             request.path, template, flight.ground, request.seconds or None, request.fps or None, flight.root
         )
     elif request.views == "orbit":
-        path = camera_paths.orbit(flight.middle[None], flight.cameras, template, length, rate)
+        path = camera_paths.orbit(flight.scene_center[None], flight.cameras, template, length, rate)
     else:
         path = camera_paths.flyover(flight.cameras, template, length, rate)
     return [(f"{i:05d}", camera) for i, camera in enumerate(path.cameras)], path.fps

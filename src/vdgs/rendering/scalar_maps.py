@@ -41,14 +41,14 @@ class ColorScale:
     #: Numbers that the legend names, with their words.
     ticks: tuple[tuple[float, str], ...]
     #: Numbers to RGBA in 0 to 1.
-    paint: Callable[[np.ndarray], np.ndarray]
+    colormap: Callable[[np.ndarray], np.ndarray]
     #: Whether a number may be missing (NaN).
     has_nodata: bool = True
 
     def colorize(self, values: Shaped[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
         """A map in colours, `NO_DATA_COLOR` where it is NaN."""
         known = np.isfinite(values)
-        picture = (self.paint(np.where(known, values, self.low))[..., :3] * 255 + 0.5).astype(np.uint8)
+        picture = (self.colormap(np.where(known, values, self.low))[..., :3] * 255 + 0.5).astype(np.uint8)
         picture[~known] = NO_DATA_COLOR
         return picture
 
@@ -83,7 +83,7 @@ def _depth(run: OpenedModel, run_cameras: RunCameras, cameras: Sequence[Camera])
         "where it never does."
     )
     span = depth_range(
-        (values(camera.limit_size(_PREVIEW_PX)) for camera in _sample_cameras(cameras)), run_cameras.height
+        (values(camera.limit_size(_PREVIEW_PX)) for camera in _sample_cameras(cameras)), run_cameras.camera_height
     )
     return ScalarMap(values, depth_scale(span, unit), meaning)
 
@@ -117,7 +117,7 @@ def depth_scale(depth_limits: tuple[float, float], unit: str) -> ColorScale:
         low=float(numbers[0]),
         high=float(numbers[-1]),
         ticks=tuple(zip(map(float, numbers), words, strict=True)),
-        paint=lambda values: np.asarray(colours(norm(values))),
+        colormap=lambda values: np.asarray(colours(norm(values))),
     )
 
 
@@ -146,7 +146,7 @@ def visibility_scale(counts: Shaped[np.ndarray, " n"]) -> ColorScale:
         low=-0.5,
         high=top + 0.5,
         ticks=tuple(ticks),
-        paint=lambda values: np.asarray(VISIBILITY_CMAP(norm(np.clip(np.rint(values), 0, top)))),
+        colormap=lambda values: np.asarray(VISIBILITY_CMAP(norm(np.clip(np.rint(values), 0, top)))),
     )
 
 
@@ -163,5 +163,5 @@ def alpha_scale() -> ColorScale:
     grey = mpl.colormaps["gray"]
     titles = ("alpha: 0 nothing, 1 opaque", "alpha")
     return ColorScale(
-        titles=titles, low=0.0, high=1.0, ticks=ticks, paint=lambda values: np.asarray(grey(values)), has_nodata=False
+        titles=titles, low=0.0, high=1.0, ticks=ticks, colormap=lambda values: np.asarray(grey(values)), has_nodata=False
     )

@@ -64,7 +64,7 @@ def draw_visibility_histogram(report: CaptureReport, visibility: np.ndarray, fil
         fontsize=TEXT_SIZE,
         color=INK,
     )
-    shares = [report.share_below[limit] for limit in LOW_VISIBILITY_LIMITS]
+    shares = [report.fraction_below[limit] for limit in LOW_VISIBILITY_LIMITS]
     rows = np.arange(len(LOW_VISIBILITY_LIMITS))[::-1]
     right.barh(
         rows, shares, color=[VISIBILITY_CMAP(norm(min(limit - 1, top))) for limit in LOW_VISIBILITY_LIMITS], height=0.55

@@ -84,10 +84,10 @@ def _rows(report: CaptureReport) -> list[tuple[str, str]]:
     sizes = ", ".join(f"{width} x {height}" for width, height in report.image_sizes[:3])
     more = len(report.image_sizes) - 3
     quantiles = ", ".join(f"{value:g} ({q} %)" for q, value in report.visibility_quantiles.items())
-    below = ", ".join(f"{share:.1%} by < {limit}" for limit, share in report.share_below.items())
+    below = ", ".join(f"{share:.1%} by < {limit}" for limit, share in report.fraction_below.items())
     low, middle, high = report.camera_height
     rows = [
-        ("Photographs", f"{report.photographs} ({report.train} train, {report.test} test), {report.source}"),
+        ("Photographs", f"{report.num_images} ({report.train} train, {report.test} test), {report.source}"),
         (
             "Images",
             f"{report.images or '.'}/: {sizes}" + (f" and {more} more sizes" if more > 0 else "") + " px",
@@ -118,13 +118,13 @@ def _masks(report: CaptureReport) -> str:
     if not report.masks and not report.masked_fraction:
         return "none"
     transparent = "" if report.masks else ", by transparency"
-    return f"of {report.masks} of {report.photographs} photographs; {left_out}{transparent}"
+    return f"of {report.masks} of {report.num_images} photographs; {left_out}{transparent}"
 
 
 def _agreement(report: CaptureReport) -> str:
     """Whether the points lie where the photographs show them, and by what that was judged."""
     seen = f"{report.seen_fraction:.1%} of the points lie in front of and inside a training camera"
-    if not report.sightings:
+    if not report.num_observations:
         return f"{seen} (the capture has no tracks to reproject)"
     error = format_reprojection(float("inf") if report.reprojection_px is None else report.reprojection_px)
-    return f"median reprojection error {error} ({report.sightings} sightings of the model's tracks); {seen}"
+    return f"median reprojection error {error} ({report.num_observations} sightings of the model's tracks); {seen}"

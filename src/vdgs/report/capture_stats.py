@@ -27,7 +27,7 @@ class CaptureReport:
     source: str
     images: str
     unit: str
-    photographs: int
+    num_images: int
     train: int
     test: int
     #: Distinct image sizes, (width, height) in pixels, most frequent first.
@@ -54,7 +54,7 @@ class CaptureReport:
     visibility_mean: float
     visibility_gini: float
     #: Share of points that fewer than 3, 5, 10 training cameras see.
-    share_below: dict[int, float]
+    fraction_below: dict[int, float]
     #: Bytes that all images take in memory, as uint8.
     image_bytes: int
     #: Photographs with a mask, and the share of all pixels that masks and transparency leave out; None: not decoded.
@@ -63,7 +63,7 @@ class CaptureReport:
     #: Median reprojection error in pixels as used, on so many sightings; None where the capture has no tracks, or where
     #: most of their points lie behind the cameras.
     reprojection_px: float | None
-    sightings: int
+    num_observations: int
     #: Share of the points that at least one training camera sees.
     seen_fraction: float
     #: What makes training pointless, and what a person should know but need not mend.
@@ -96,7 +96,7 @@ def measure_capture(
         source=capture.source,
         images=capture.images,
         unit=capture.ground.unit,
-        photographs=len(cameras),
+        num_images=len(cameras),
         train=len(capture.train_views),
         test=len(capture.test_views),
         image_sizes=[(int(w), int(h)) for w, h in sizes[np.argsort(-counts, kind="stable")]],
@@ -104,7 +104,7 @@ def measure_capture(
         field_of_view_deg=float(np.median(fields)),
         points=len(capture.points),
         point_spacing=float(np.median(spacing)),
-        ground=capture.ground.how,
+        ground=capture.ground.description,
         metric=capture.ground.metric,
         origin_geo=None if origin is None else (float(origin[0]), float(origin[1]), float(origin[2])),
         extent=tuple(float(value) for value in high - low),  # type: ignore[arg-type]
@@ -114,12 +114,12 @@ def measure_capture(
         visibility_quantiles=seen.quantiles,
         visibility_mean=seen.mean,
         visibility_gini=seen.gini,
-        share_below=seen.share_below,
+        fraction_below=seen.fraction_below,
         image_bytes=sum(3 * camera.width * camera.height for camera in cameras) + masked,
         masks=sum(view.mask_path is not None for view in capture.views),
         masked_fraction=None if image_check is None else image_check.masked_fraction,
         reprojection_px=validation.reprojection_px,
-        sightings=validation.sightings,
+        num_observations=validation.num_observations,
         seen_fraction=float((visibility > 0).mean()),
         problems=list(validation.problems),
         warnings=[

@@ -13,7 +13,7 @@ COST_CAPTION = "Blocks trained side by side count one by one; what is out of dat
 
 
 def costs_section(report: ReportedRun) -> Html:
-    source = report.source()
+    source = report.files()
     stages = [(name, record) for name, record in _stages(source, report) if record]
     rows = [[name, *_cost(record), report.stage_state(_stage_name(name))] for name, record in stages]
     counted = [record for name, record in stages if report.status.of(_stage_name(name)).state != "stale"]
@@ -53,7 +53,7 @@ def _stages(source: RunFiles, report: ReportedRun) -> list[tuple[str, JsonRecord
 
 
 def settings_section(report: ReportedRun) -> Html:
-    source = report.source()
+    source = report.files()
     text = source.text("config.yaml")
     parts: list[Html] = []
     if text is None:

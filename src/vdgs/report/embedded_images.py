@@ -28,10 +28,10 @@ class EmbeddedImage:
     content: bytes
     width: int
     height: int
-    kind: str = "png"
+    format: str = "png"
 
     def data_uri(self) -> str:
-        return f"data:image/{self.kind};base64,{base64.b64encode(self.content).decode('ascii')}"
+        return f"data:image/{self.format};base64,{base64.b64encode(self.content).decode('ascii')}"
 
 
 def load_embedded_image(path: Path) -> EmbeddedImage:

@@ -96,7 +96,7 @@ def result_table(coarse: JsonRecord, merged: JsonRecord) -> Html:
 
 
 def views_section(report: ReportedRun) -> Html:
-    source = report.source()
+    source = report.files()
     folder = MERGED_EVALUATION if source.has(f"{MERGED_EVALUATION}/per_view.json") else COARSE_EVALUATION
     rows = [row for row in source.rows(f"{folder}/per_view.json") if row.number("psnr") is not None]
     other = (
@@ -110,7 +110,7 @@ def views_section(report: ReportedRun) -> Html:
     for kind, row in _best_median_worst(rows):
         parts.append(_comparison(source, folder, kind, row, other.get(row.text("name"), JsonRecord({}))))
     parts.append(_least_opaque_view(source, folder, rows))
-    sheet = source.picture(f"{folder}/contact_sheet.png")
+    sheet = source.image(f"{folder}/contact_sheet.png")
     parts.append(figure(sheet, "All test views (or an even choice of them).", "contact sheet of the test views", True))
     parts.append(details(f"All {len(rows)} test views in numbers", _views_table(rows, other)))
     return section("views", "Test views", parts, source.notes)
@@ -132,7 +132,7 @@ def _comparison(source: RunFiles, folder: str, kind: str, row: JsonRecord, coars
         caption += f" (coarse {format_db(coarse.number('psnr'))} dB)"
     if row.number("mean_visibility") is not None:
         caption += f", mean V {row.number('mean_visibility'):.1f}"
-    picture = source.picture(f"{folder}/comparisons/{stem}.png") if stem else None
+    picture = source.image(f"{folder}/comparisons/{stem}.png") if stem else None
     if picture is None:
         return paragraph(f"{caption}. Its picture is not there.", "absent")
     return figure(picture, f"{caption}.", f"photograph, render and error of {name}", True)
@@ -149,7 +149,7 @@ def _least_opaque_view(source: RunFiles, folder: str, rows: list[JsonRecord]) ->
         f"Least solid: alpha of {name}, white is opaque. Of its pixels that at least 3 training cameras see, "
         f"{format_percent(solid)} have alpha of at least 0.95."
     )
-    return figure(source.picture(f"{folder}/alpha/{stem}.png"), caption, f"alpha of {name}")
+    return figure(source.image(f"{folder}/alpha/{stem}.png"), caption, f"alpha of {name}")
 
 
 def _views_table(rows: list[JsonRecord], other: dict[str | None, JsonRecord]) -> Html:
@@ -176,7 +176,7 @@ def _views_table(rows: list[JsonRecord], other: dict[str | None, JsonRecord]) ->
 
 
 def by_visibility_section(report: ReportedRun) -> Html:
-    source = report.source()
+    source = report.files()
     coarse, merged = read_metrics(source)
     bins = merged.rows("by_visibility") or coarse.rows("by_visibility")
     theirs = {_bounds(row): row for row in coarse.rows("by_visibility")}
@@ -217,14 +217,14 @@ def _bins_table(bins: list[JsonRecord], pairs: list[tuple[JsonRecord, JsonRecord
 
 
 def seams_section(report: ReportedRun) -> Html:
-    source = report.source()
+    source = report.files()
     facts = source.record(f"{MERGED_EVALUATION}/by_block.json")
     parts: list[Html] = []
     if not facts and not source.exists(f"{MERGED_EVALUATION}/by_block.json"):
         parts.append(paragraph("There are no figures by block: fewer than two blocks are merged.", "absent"))
     rows = [_block_row(count(row.number("block")), row) for row in facts.rows("blocks")]
-    if rows and facts.inner("all"):
-        rows.append(_block_row("all", facts.inner("all")))
+    if rows and facts.child("all"):
+        rows.append(_block_row("all", facts.child("all")))
     head = ["block", "pixels", "PSNR coarse", "PSNR alone", "PSNR merged", "merged − coarse"]
     parts.append(
         table(
@@ -234,7 +234,7 @@ def seams_section(report: ReportedRun) -> Html:
             "Alone: the block as trained, before the merge",
         )
     )
-    parts.append(paragraph(_seam_sentence(facts.inner("seams"))))
+    parts.append(paragraph(_seam_sentence(facts.child("seams"))))
     parts += _seam_images(source, facts.rows("views"))
     return section("seams", "Per block, and the seams between blocks", parts, source.notes)
 
@@ -273,6 +273,6 @@ def _seam_images(source: RunFiles, views: list[JsonRecord]) -> list[Html]:
         if source.has(f"{MERGED_EVALUATION}/seams/{stem}.png")
     ]
     return [
-        figure(source.picture(file), f"{name}: the model before and after the merge.", f"seams in {name}", True)
+        figure(source.image(file), f"{name}: the model before and after the merge.", f"seams in {name}", True)
         for _, name, file in sorted(found)[:MAX_SEAM_IMAGES]
     ]

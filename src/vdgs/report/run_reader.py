@@ -47,7 +47,7 @@ class JsonRecord:
         more = len(found) - MAX_TEXTS
         return found[:MAX_TEXTS] + ([f"… and {more} more"] if more > 0 else [])
 
-    def inner(self, key: str) -> JsonRecord:
+    def child(self, key: str) -> JsonRecord:
         return _record(self.values.get(key))
 
     def rows(self, key: str) -> list[JsonRecord]:
@@ -61,7 +61,7 @@ class ReportedRun:
     run: RunFolder
     status: RunStatus
 
-    def source(self) -> RunFiles:
+    def files(self) -> RunFiles:
         """Its files, for one section: those that do not fit the run are left out."""
         stale = {stage.folder: _stale_note(stage) for stage in self.status.stages if stage.state == "stale"}
         return RunFiles(self.run.path, stale)
@@ -69,9 +69,9 @@ class ReportedRun:
     def stage_state(self, name: str) -> str:
         """How far a stage is, in words."""
         stage = self.status.of(name)
-        state, why = STATE_LABELS.get(stage.state, stage.state), stage.why
+        state, why = STATE_LABELS.get(stage.state, stage.state), stage.reason
         if stage.state == "unknown" and stage.status is not None:  # the caution at the top says the rest
-            state, why = stage.status.state, stage.status.why or ""
+            state, why = stage.status.state, stage.status.reason or ""
         return state + (f": {why}" if why else "")
 
     def warnings(self) -> list[str]:
@@ -80,7 +80,7 @@ class ReportedRun:
         if not unknown:
             return []
         names = ", ".join(stage.name for stage in unknown)
-        return [f"It cannot be told whether these were made with the settings of the run: {names} ({unknown[0].why})."]
+        return [f"It cannot be told whether these were made with the settings of the run: {names} ({unknown[0].reason})."]
 
 
 #: States that need more words than their name.
@@ -89,7 +89,7 @@ STATE_LABELS = {"stale": "out of date", "unknown": "not known"}
 
 def _stale_note(stage: StageStatus) -> str:
     """Why a stage is left out, in a sentence."""
-    folder, why = stage.folder, stage.why
+    folder, why = stage.folder, stage.reason
     return f"{folder}: {why}; it is left out. `vdgs status` says which command makes it anew."
 
 
@@ -155,7 +155,7 @@ class RunFiles:
             self.notes.append(f"{name} cannot be read ({error.strerror or error}).")
             return None
 
-    def picture(self, name: str) -> EmbeddedImage | None:
+    def image(self, name: str) -> EmbeddedImage | None:
         """A PNG of the run, ready to embed; None if there is none."""
         path = self._root / name
         if not self.has(name):

@@ -31,7 +31,7 @@ def html_export_link(report: ReportedRun) -> Html:
 
 
 def visibility_section(report: ReportedRun) -> Html:
-    source = report.source()
+    source = report.files()
     facts = source.record("visibility/visibility.json")
     parts = [
         paragraph(
@@ -45,7 +45,7 @@ def visibility_section(report: ReportedRun) -> Html:
     elif not source.exists("visibility/visibility.json"):
         parts.append(paragraph("Visibility is not measured yet.", "absent"))
     parts.append(
-        figure(source.picture("visibility/map.png"), "The place from above, coloured by V.", "map of visibility", True)
+        figure(source.image("visibility/map.png"), "The place from above, coloured by V.", "map of visibility", True)
     )
     if facts and not source.has("visibility/map.png"):
         parts.append(paragraph("There is no map of it (visibility/map.png).", "absent"))
@@ -53,7 +53,7 @@ def visibility_section(report: ReportedRun) -> Html:
 
 
 def blocks_section(report: ReportedRun) -> Html:
-    source = report.source()
+    source = report.files()
     facts = source.record("partition/partition.json")
     parts: list[Html] = []
     if not facts and not source.exists("partition/partition.json"):
@@ -69,10 +69,10 @@ def blocks_section(report: ReportedRun) -> Html:
             )
         )
     parts += [paragraph(note, "note") for note in facts.texts("warnings") + facts.texts("complaints")]
-    parts.append(figure(source.picture("partition/blocks.png"), "The blocks from above.", "map of the blocks", True))
+    parts.append(figure(source.image("partition/blocks.png"), "The blocks from above.", "map of the blocks", True))
     parts.append(_blocks_table(rows, facts.rows("spatial")))
     parts.append(
-        figure(source.picture("partition/block_facts.png"), "What each block holds.", "sizes of the blocks", True)
+        figure(source.image("partition/block_facts.png"), "What each block holds.", "sizes of the blocks", True)
     )
     missing = [name for name in ("blocks.png", "block_facts.png") if facts and not source.has(f"partition/{name}")]
     if missing:
@@ -81,7 +81,7 @@ def blocks_section(report: ReportedRun) -> Html:
 
 
 def assignment_section(report: ReportedRun) -> Html:
-    source = report.source()
+    source = report.files()
     facts = source.record("partition/partition.json")
     rows = facts.rows("blocks")
     parts: list[Html] = []
@@ -95,7 +95,7 @@ def assignment_section(report: ReportedRun) -> Html:
         parts.append(_cameras_table(rows))
     else:
         parts.append(paragraph("No photographs are assigned to blocks yet.", "absent"))
-    scores = source.picture("partition/scores.png")
+    scores = source.image("partition/scores.png")
     parts.append(
         figure(scores, "Score of every photograph (row) for every block (column).", "matrix of scores", tall=True)
     )
@@ -105,7 +105,7 @@ def assignment_section(report: ReportedRun) -> Html:
 
 
 def _visibility_sentence(record: JsonRecord) -> str:
-    quantiles, below = record.inner("quantiles"), record.inner("share_below")
+    quantiles, below = record.child("quantiles"), record.child("share_below")
     parts = []
     if record.number("anchors") is not None:
         parts.append(f"{count(record.number('anchors'))} anchors, {count(record.number('training_views'))} photographs")
@@ -117,7 +117,7 @@ def _visibility_sentence(record: JsonRecord) -> str:
 
 
 def _distribution(record: JsonRecord) -> Html:
-    quantiles, below = record.inner("quantiles"), record.inner("share_below")
+    quantiles, below = record.child("quantiles"), record.child("share_below")
     head = ["mean V", "Gini"]
     row = [format_value(record.number("mean"), "{:.2f}"), format_value(record.number("gini"), "{:.3f}")]
     for percent in [key for key in quantiles.values if key.isdecimal()][:9]:
@@ -175,12 +175,12 @@ def _total(rows: list[JsonRecord], key: str) -> str:
 
 def ortho_section(report: ReportedRun) -> Html:
     """The sheet of `vdgs map`, of the merged model that is there."""
-    source = report.source()
+    source = report.files()
     facts = source.record("maps/map.json")
     parts: list[Html] = []
     if not facts:
         parts.append(paragraph("No maps were made of this run. `vdgs map RUN` makes them."))
-    elif facts.text("model_identity") != report.run.merged.status().model:
+    elif facts.text("model_identity") != report.run.merged.status().model_id:
         parts.append(
             paragraph("The maps are of another model than the run has now; `vdgs map RUN` draws them anew.", "note")
         )
@@ -193,5 +193,5 @@ def ortho_section(report: ReportedRun) -> Html:
                 + ": GeoTIFFs in maps/. Blank is what is not solid, or what no training photograph shows."
             )
         )
-        parts.append(figure(source.picture("maps/preview.png"), "The scene as maps.", "maps of the scene", True))
+        parts.append(figure(source.image("maps/preview.png"), "The scene as maps.", "maps of the scene", True))
     return section("maps", "Maps", parts, source.notes)

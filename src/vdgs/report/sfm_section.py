@@ -20,7 +20,7 @@ MAX_LISTED = 500
 
 def sfm_section(report: ReportedRun) -> Html:
     """Nothing where the capture came from elsewhere."""
-    source = report.source()
+    source = report.files()
     written = source.record(RECONSTRUCTION_FILE)
     if not written and not source.notes:
         return Html("")
@@ -37,7 +37,7 @@ def sfm_section(report: ReportedRun) -> Html:
         parts.append(heading("Surveyed points: seen minus surveyed"))
         parts.append(table(names, gcp_table(facts)))
     words = "The points from above; arrows lead from the recorded position of a photograph to where it was placed."
-    parts.append(figure(source.picture(RECONSTRUCTION_FIGURE), words, "residuals of the positions from above", True))
+    parts.append(figure(source.image(RECONSTRUCTION_FIGURE), words, "residuals of the positions from above", True))
     parts.append(_excluded_images(excluded_lines(facts)))
     if facts.advice:
         parts.append(heading("For the next flight"))

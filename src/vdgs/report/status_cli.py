@@ -35,20 +35,20 @@ def print_status(run: RunFolder, console: Console) -> int:
     standing = full_run_status(run)
     width = max(len(stage.name) for stage in standing.stages)
     for stage in standing.stages:
-        said = "; ".join(part for part in (progress_text(stage.status), stage.why) if part)
+        said = "; ".join(part for part in (progress_text(stage.status), stage.reason) if part)
         state = f"[{STATE_STYLES[stage.state]}]{stage.state:<8}[/]"
         console.print(f"{stage.name:<{width}}  {state}  {escape(said)}".rstrip(), highlight=False)
     counted = Counter(stage.state for stage in standing.stages)
     console.print(", ".join(f"{count} {state}" for state, count in counted.items()), highlight=False)
     console.print(escape(f"next: {next_step(standing)}"), highlight=False)
-    return 0 if standing.whole else EXIT_INCOMPLETE
+    return 0 if standing.is_complete else EXIT_INCOMPLETE
 
 
 def status_json(run: RunFolder) -> RunStatusDocument:
     """The same for programs."""
     standing = full_run_status(run)
     return {
-        "run": str(run.path), "whole": standing.whole, "at_work": standing.is_running,
+        "run": str(run.path), "whole": standing.is_complete, "at_work": standing.is_running,
         "next": standing.next_command() or None, "stages": [_stage_json(stage) for stage in standing.stages],
     }  # fmt: skip
 
@@ -86,6 +86,6 @@ def progress_text(status: StatusRecord | None) -> str:
 def _stage_json(stage: StageStatus) -> StageStatusDocument:
     status = stage.status or StatusRecord()
     return {
-        "stage": stage.name, "state": stage.state, "why": stage.why or None, "folder": stage.folder,
+        "stage": stage.name, "state": stage.state, "why": stage.reason or None, "folder": stage.folder,
         "iteration": status.iteration, "iterations": status.iterations, "seconds_left": status.seconds_left,
     }  # fmt: skip

@@ -24,7 +24,7 @@ def list_blocks(run: RunFolder) -> list[tuple[int, str]]:
 
 
 def training_section(report: ReportedRun) -> Html:
-    source, run = report.source(), report.run
+    source, run = report.files(), report.run
     parts = [heading("Coarse model"), _initialization_note(source.record("coarse/start.json"))]
     coarse = source.lines("coarse/log.jsonl")
     parts.append(_curves([("coarse", MERGED_COLOR, coarse)]))

@@ -85,13 +85,13 @@ def report_status(run: RunFolder, status: RunStatus) -> StageStatus:
         return StageStatus(name="report", state="missing", folder=REPORT_FILE)
     if f'<meta name="{STATUS_META_NAME}" content="{status.digest}">' in head:
         return StageStatus(name="report", state="done", folder=REPORT_FILE)
-    return StageStatus(name="report", state="stale", folder=REPORT_FILE, why="the run went on since it was written")
+    return StageStatus(name="report", state="stale", folder=REPORT_FILE, reason="the run went on since it was written")
 
 
 def _header(report: ReportedRun) -> tuple[Html, str]:
-    source = report.source()
+    source = report.files()
     config = _config(source)
-    version = config.inner("vdgs")
+    version = config.child("vdgs")
     made_of = source.record("capture.json")
     name = _capture_name(config, made_of)
     coarse, merged = read_metrics(source)
@@ -127,7 +127,7 @@ def _config(source: RunFiles) -> JsonRecord:
 
 def _capture_name(config: JsonRecord, capture_record: JsonRecord) -> str:
     """The last folder of the capture's path, whatever system wrote it."""
-    path = config.inner("capture").text("path") or capture_record.text("root") or ""
+    path = config.child("capture").text("path") or capture_record.text("root") or ""
     names = [part for part in re.split(r"[/\\]", path) if part not in ("", ".", "..")]
     return names[-1] if names else "A run without a name"
 

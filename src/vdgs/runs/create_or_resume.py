@@ -70,7 +70,7 @@ def exclusive_run(
     if not run.config_file.exists():  # what cannot become a scene leaves no folder that other settings stumble over
         require_valid(capture)
     run.check_output_empty()
-    with run.driven():
+    with run.drive_lock():
         _resume(run, capture, capture_path, run_settings(capture_path, capture_options, method), overwrite, command)
         yield RunContext(run, capture)
 
@@ -85,7 +85,7 @@ def _resume(
         if run.capture_file.exists() and not read_anew:
             check_same_capture(run.capture_file, read_json(run.capture_file), capture)
         if overwrite is None or not run.config_file.exists():
-            run.begin(settings, ("capture", "training"), command)
+            run.create_or_check(settings, ("capture", "training"), command)
             run.move_capture(capture_path)
         else:
             run.change_settings(settings, overwrite, command)

@@ -39,11 +39,11 @@ def integrity_error(stage: StageFolder, key: str, block: int | None = None) -> s
 def path_to_delete(stage: StageFolder) -> Path:
     """What to delete where the model is foreign: all of the stage if it came as a whole, checkpoints and all, else the
     model alone, which is then rebuilt from the last checkpoint."""
-    return stage.path if stage.status().model is not None and _size_agrees(stage) else stage.model
+    return stage.path if stage.status().model_id is not None and _size_agrees(stage) else stage.model
 
 
 def _size_agrees(stage: StageFolder) -> bool:
-    vouched = stage.status().model
+    vouched = stage.status().model_id
     return vouched is None or vouched.startswith(f"{stage.model.stat().st_size}-")
 
 
@@ -54,7 +54,7 @@ def load_verified(stage: StageFolder, key: str, block: int | None = None) -> Anc
     """
     model = AnchorModel.load(stage.model)
     wrong = integrity_error(stage, key, block)
-    if not wrong and stage.status().model not in (None, file_id(stage.model)):
+    if not wrong and stage.status().model_id not in (None, file_id(stage.model)):
         wrong = MODEL_MISMATCH
     if wrong:
         raise RunError(

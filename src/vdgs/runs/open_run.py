@@ -41,7 +41,7 @@ class OpenedModel:
     warning: str
 
     @property
-    def line(self) -> str:
+    def summary(self) -> str:
         """Which model it is, in a few words."""
         return _model_line(self.name, len(self.model.anchors), self.model_path)
 
@@ -83,7 +83,7 @@ def open_model(folder: RunFolder, which: ModelName = "best", device: torch.devic
 def check_has_anchors(folder: RunFolder, anchors: int | None) -> None:
     """Raise RunError where the coarse model of a run holds no anchors (None: not known): nothing can be built on it."""
     if anchors == 0:
-        growth = folder.method().training.growth
+        growth = folder.method().training.densify
         raise RunError(
             f"{folder.coarse.path}: the coarse model holds no anchors: in training all of them were taken for "
             f"transparent and removed. Give a smaller --growth.prune-opacity (it is {growth.prune_opacity:g}) or a "
@@ -102,7 +102,7 @@ class ModelLocation:
     warning: str
 
     @property
-    def line(self) -> str:
+    def summary(self) -> str:
         """Which model it is, in a few words."""
         return _model_line(self.name, self.stage.status().anchors or 0, self.stage.model)
 
@@ -133,7 +133,7 @@ def _not_there(folder: RunFolder, name: str) -> str:
     """Why a model cannot be opened, and what to do."""
     standing = get_run_status(folder)
     found = standing.of("merge" if name == "merged" else "coarse")
-    why = f"state: {found.state}" + (f", {found.why}" if found.why else "")
+    why = f"state: {found.state}" + (f", {found.reason}" if found.reason else "")
     command = standing.next_command()
     return f"{folder.path}: has no {name} model of its settings yet ({why})." + (
         f" Next: {command}" if command else " A process works on it: wait for it."
@@ -145,11 +145,11 @@ def _caution(folder: RunFolder, name: str) -> str:
     standing = get_run_status(folder)
     merged = standing.of("merge")
     if merged.state == "done":
-        return merged.why
+        return merged.reason
     again = f"Next: {command}" if (command := standing.next_command()) else "A process works on the run."
     if name == "merged":
-        return f"the merged model is out of date: {merged.why}. Merge again: vdgs merge {shlex.quote(str(folder.path))}"
-    state = f"there is one that was {merged.why}" if merged.state == "stale" else "there is none yet"
+        return f"the merged model is out of date: {merged.reason}. Merge again: vdgs merge {shlex.quote(str(folder.path))}"
+    state = f"there is one that was {merged.reason}" if merged.state == "stale" else "there is none yet"
     return f"this is the coarse model, not the merged one: {state}. {again}"
 
 
@@ -172,7 +172,7 @@ def relocate_capture(folder: RunFolder, at: Path) -> Capture:
     """Let a run find its capture where it lies now; returns it. Raises RunError for another capture than the run's, and
     where another process works on the run or drives it."""
     capture = open_capture(folder, at.resolve())
-    with folder.driven(), folder.locked():
+    with folder.drive_lock(), folder.locked():
         if folder.capture_file.exists():
             check_same_capture(folder.capture_file, read_json(folder.capture_file), capture)
         folder.move_capture(at)

@@ -31,12 +31,12 @@ class RunCameras:
     test: tuple[tuple[str, Camera], ...]
     ground: GroundFrame
     #: The median of the sparse points: what a film turns about.
-    middle: Float[np.ndarray, "3"]
+    scene_center: Float[np.ndarray, "3"]
     #: How high the training cameras fly (`captures.heights`).
-    height: float
+    camera_height: float
     #: Where the capture lies, and the folders that hold its photographs and masks: nothing is written there.
     root: Path
-    inputs: tuple[Path, ...]
+    input_folders: tuple[Path, ...]
 
     @property
     def cameras(self) -> list[Camera]:
@@ -49,8 +49,8 @@ def run_cameras_of_capture(capture: Capture) -> RunCameras:
     return RunCameras(
         train=tuple((view.name, view.camera) for view in capture.train_views),
         test=tuple((view.name, view.camera) for view in capture.test_views), ground=capture.ground,
-        middle=np.median(capture.points, axis=0), height=camera_height(capture), root=capture.root,
-        inputs=tuple(input_folders(capture)),
+        scene_center=np.median(capture.points, axis=0), camera_height=camera_height(capture), root=capture.root,
+        input_folders=tuple(input_folders(capture)),
     )  # fmt: skip
 
 
@@ -63,7 +63,7 @@ def save_run_cameras(run: RunFolder, capture: Capture) -> None:
             "fingerprint": capture_fingerprint(capture),
             "ground_frame": {
                 "scale": ground.scale, "rotation": ground.rotation.tolist(), "translation": ground.translation.tolist(),
-                "metric": ground.metric, "how": ground.how, "origin_geo": ground.origin_geo,
+                "metric": ground.metric, "how": ground.description, "origin_geo": ground.origin_geo,
             },
             "middle": np.median(capture.points, axis=0).tolist(),
             "camera_height": camera_height(capture),
@@ -87,15 +87,15 @@ def load_run_cameras(run: RunFolder, capture: CaptureMetadata | None) -> RunCame
         geo = frame["origin_geo"]
         ground = GroundFrame(
             scale=float(frame["scale"]), rotation=np.array(frame["rotation"], np.float64),
-            translation=np.array(frame["translation"], np.float64), metric=bool(frame["metric"]), how=str(frame["how"]),
+            translation=np.array(frame["translation"], np.float64), metric=bool(frame["metric"]), description=str(frame["how"]),
             origin_geo=None if geo is None else tuple(geo),
         )  # fmt: skip
         views = [(each["split"], _view(each)) for each in record["views"]]
         return RunCameras(
             train=tuple(view for split, view in views if split == "train"),
             test=tuple(view for split, view in views if split == "test"), ground=ground,
-            middle=np.array(record["middle"], np.float64), height=float(record["camera_height"]), root=root,
-            inputs=tuple(root / str(folder) for folder in record["input_folders"]),
+            scene_center=np.array(record["middle"], np.float64), camera_height=float(record["camera_height"]), root=root,
+            input_folders=tuple(root / str(folder) for folder in record["input_folders"]),
         )  # fmt: skip
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise RunError(

@@ -67,7 +67,7 @@ class RunContext:
     def _model(self, found: ModelLocation, device: torch.device) -> AnchorModel:
         """The model of a finished stage. Moved to another device, it leaves the one where it was."""
         cached, file = self._models.pop(found.name, None), found.stage.model.stat()
-        identity = (found.key, found.stage.status().model, file.st_ino, file.st_size, file.st_mtime_ns)
+        identity = (found.key, found.stage.status().model_id, file.st_ino, file.st_size, file.st_mtime_ns)
         model = cached.model if cached is not None and cached.identity == identity else None
         del cached  # before another file is read: two models may not fit into the memory
         model = (load_verified(found.stage, found.key) if model is None else model).to(device)

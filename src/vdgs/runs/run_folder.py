@@ -87,7 +87,7 @@ class RunFolder:
     def evaluation(self) -> Path:
         return self.path / "evaluation"
 
-    def begin(self, settings: RunSettings, checked: Sequence[str] = SECTIONS, command: str | None = None) -> None:
+    def create_or_check(self, settings: RunSettings, checked: Sequence[str] = SECTIONS, command: str | None = None) -> None:
         """Write the settings of a new run, or check that those of the run that is there are the same.
 
         `command` is the one that begins it, kept so that people can be told how to continue.
@@ -177,7 +177,7 @@ class RunFolder:
 
     def coarse_model_id(self) -> str | None:
         """What tells the coarse model from any other; None while there is none."""
-        return self.coarse.status().model
+        return self.coarse.status().model_id
 
     @contextmanager
     def locked(self, shared: bool = False) -> Iterator[None]:
@@ -189,7 +189,7 @@ class RunFolder:
             yield
 
     @contextmanager
-    def driven(self) -> Iterator[None]:
+    def drive_lock(self) -> Iterator[None]:
         """Take this run from stage to stage, so that others can see it between two stages too (`is_running`).
 
         Whoever changes its settings holds it meanwhile: between two stages, and while a model is measured or drawn, a

@@ -42,13 +42,13 @@ class StageStatus:
     state: StageState
     folder: str
     """What it made, inside the run."""
-    why: str = ""
+    reason: str = ""
     """One line; empty where there is nothing to say."""
     status: StatusRecord | None = None
     """What the stage notes of itself, where it trains or merges."""
     output_id: str = ""
     """What tells what it made from any other."""
-    remedy: str = ""
+    hint: str = ""
     """What to do before its command is of use."""
 
 
@@ -61,7 +61,7 @@ class RunStatus:
     """In the order in which they are made."""
     command: str | None = None
     """The command that began the run, where its settings are still those that it asked for."""
-    driven: bool = False
+    is_driven: bool = False
     """A command takes it from stage to stage."""
 
     def of(self, name: str) -> StageStatus:
@@ -76,13 +76,13 @@ class RunStatus:
         return [stage for stage in self.stages if stage.name.startswith("block ")]
 
     @property
-    def whole(self) -> bool:
+    def is_complete(self) -> bool:
         """Every stage is done, with the settings of the run."""
         return all(stage.state == "done" for stage in self.stages)
 
     @property
     def is_running(self) -> bool:
-        return self.driven or any(stage.state == "running" for stage in self.stages)
+        return self.is_driven or any(stage.state == "running" for stage in self.stages)
 
     @property
     def digest(self) -> str:
@@ -98,16 +98,16 @@ class RunStatus:
             if stage.state == "unknown":
                 return f"mend {shlex.quote(str(self.path / 'config.yaml'))}"
             if stage.state != "done":
-                if self._continues and not stage.remedy:
+                if self._continues and not stage.hint:
                     return self.command or ""
-                return stage.remedy + self._command_for(stage.name)
+                return stage.hint + self._command_for(stage.name)
         return ""
 
     @property
     def _continues(self) -> bool:
         """The command that began the run takes it to its end: it asked for all stages, and for the settings that the
         run has."""
-        others = any(stage.state == "stale" and stage.why in (OTHER_SETTINGS, OTHER_PARTITION) for stage in self.stages)
+        others = any(stage.state == "stale" and stage.reason in (OTHER_SETTINGS, OTHER_PARTITION) for stage in self.stages)
         return (self.command or "").startswith("vdgs run ") and not others
 
     def _command_for(self, stage: str) -> str:
@@ -174,7 +174,7 @@ class _StatusScanner:
             state = "stale"
         else:
             state, why = "done", ""
-        return StageStatus(name=name, state=state, folder=self._inside(folder), why=why, output_id=made)
+        return StageStatus(name=name, state=state, folder=self._inside(folder), reason=why, output_id=made)
 
     def _inside(self, folder: Path) -> str:
         return folder.relative_to(self.run.path).as_posix()
@@ -214,15 +214,15 @@ class _StatusScanner:
         try:
             status = folder.status()
         except VdgsError as error:
-            return StageStatus(name=name, state="unknown", folder=inside, why=_first_line(str(error)))
+            return StageStatus(name=name, state="unknown", folder=inside, reason=_first_line(str(error)))
         state, why = self._state_of(folder, status, key, other, locked)
         if state == "done" and (wrong := integrity_error(folder, key or "", _number(name))):
             remedy = f"delete {path_to_delete(folder)}, then "
             return StageStatus(
-                name=name, state="stale", folder=inside, why=f"model.safetensors is {wrong}", status=status,
-                remedy=remedy,
+                name=name, state="stale", folder=inside, reason=f"model.safetensors is {wrong}", status=status,
+                hint=remedy,
             )  # fmt: skip
-        return StageStatus(name=name, state=state, folder=inside, why=why, status=status, output_id=status.model or "")
+        return StageStatus(name=name, state=state, folder=inside, reason=why, status=status, output_id=status.model_id or "")
 
     def _state_of(
         self, folder: StageFolder, status: StatusRecord, key: str | None, other: str, locked: Path
@@ -234,11 +234,11 @@ class _StatusScanner:
         if folder.key() != key:
             return "stale", other
         if status.state == "done":
-            return ("done", status.why or "") if folder.model.exists() else ("missing", f"{folder.model.name} is gone")
+            return ("done", status.reason or "") if folder.model.exists() else ("missing", f"{folder.model.name} is gone")
         if status.state == "running" and not is_known_locked(locked):
             return "stopped", "its process ended without a word; it continues from its last checkpoint"
         if status.state in ("running", "queued", "stopped", "failed"):
-            return status.state, _first_line(status.why or "")  # type: ignore[return-value]
+            return status.state, _first_line(status.reason or "")  # type: ignore[return-value]
         return "stopped", "it has a checkpoint, and says nothing of itself"
 
     def _merged(self, blocks: list[StageStatus]) -> StageStatus:
@@ -246,20 +246,20 @@ class _StatusScanner:
         found = self._trained("merge", merged, self._key("merge"), OTHER_SETTINGS, self.run.path)
         if found.state != "done" or found.status is None:
             return found
-        models = tuple((b.status.model if b.status else None) if b.state == "done" else None for b in blocks)
+        models = tuple((b.status.model_id if b.status else None) if b.state == "done" else None for b in blocks)
         stands_in = [block.name for block, model in zip(blocks, models, strict=True) if model is None]
         if found.status.block_models != models:
             return StageStatus(
                 name="merge",
                 state="stale",
                 folder=found.folder,
-                why=OTHER_BLOCKS,
+                reason=OTHER_BLOCKS,
                 status=found.status,
                 output_id=found.output_id,
             )
         why = f"the coarse model stands in for {', '.join(stands_in)}" if stands_in else ""
         return StageStatus(
-            name="merge", state="done", folder=found.folder, why=why, status=found.status, output_id=found.output_id
+            name="merge", state="done", folder=found.folder, reason=why, status=found.status, output_id=found.output_id
         )
 
     def _measured(self, name: str, folder: Path, model: StageStatus) -> StageStatus:

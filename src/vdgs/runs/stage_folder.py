@@ -22,18 +22,18 @@ class StatusRecord:
 
     state: str = "new"
     """new (nothing is written yet), queued, running, stopped, done or failed."""
-    why: str | None = None
+    reason: str | None = None
     """Why it failed or stopped, or has nothing to train."""
     iteration: int | None = None
     iterations: int | None = None
-    photographs: float | None = None
+    images_drawn: float | None = None
     """How many photographs' worth of pixels were drawn; None where every iteration draws a whole one."""
     anchors: int | None = None
     psnr_training: float | None = None
     seconds: float | None = None
     seconds_left: int | None = None
     peak_memory_bytes: int | None = None
-    model: str | None = None
+    model_id: str | None = None
     """What tells the finished model from any other (`storage.tensors.identity`)."""
 
     # Of a merged scene:

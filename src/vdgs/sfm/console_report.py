@@ -21,7 +21,7 @@ def print_preflight(preflight: PreflightReport, collection: ImageList, plan: lis
         ("Cameras", _several([f"{name} ({n})" for name, n in preflight.cameras])),
     ]
     rows.append(("Sizes", _several([f"{width} x {height} ({n})" for width, height, n in preflight.sizes])))
-    if preflight.masks or preflight.transparent:
+    if preflight.num_masks or preflight.transparent:
         rows.append(("Masks", _masks_text(preflight)))
     if preflight.days:
         rows.append(
@@ -36,12 +36,12 @@ def print_preflight(preflight: PreflightReport, collection: ImageList, plan: lis
         seen = f"{preflight.forward_overlap:.0%} along the flight; a place is seen by about {preflight.views_per_point:.0f}"
         rows.append(("Overlap", f"about {seen}, were the ground level"))
     if preflight.oblique is not None:
-        rows.append(("Oblique views", f"{preflight.oblique} of {preflight.photographs}"))
+        rows.append(("Oblique views", f"{preflight.oblique} of {preflight.num_images}"))
     rows += [("Plan" if k == 0 else "", line) for k, line in enumerate(plan)]
     _table(rows, console)
     for warning in preflight.warnings:
         console.print(f"[yellow]note[/] {escape(warning)}", highlight=False)
-    _print_excluded([f"{each.name}: {each.why}" for each in collection.left_out], console)
+    _print_excluded([f"{each.name}: {each.reason}" for each in collection.excluded], console)
 
 
 def print_reconstruction_report(report: ReconstructionReport, console: Console) -> None:
@@ -71,14 +71,14 @@ def _table(rows: list[tuple[str, str]], console: Console) -> None:
 
 
 def _images_text(preflight: PreflightReport, collection: ImageList) -> str:
-    left_out = f", {len(collection.left_out)} left out" if collection.left_out else ""
+    left_out = f", {len(collection.excluded)} left out" if collection.excluded else ""
     others = f", {collection.other_files} other files beside them" if collection.other_files else ""
-    return f"{preflight.photographs}{left_out}{others}"
+    return f"{preflight.num_images}{left_out}{others}"
 
 
 def _masks_text(preflight: PreflightReport) -> str:
     alpha = f"{preflight.transparent} have an alpha channel, which counts as one" if preflight.transparent else ""
-    files = f"{preflight.masks} of {preflight.photographs} photographs have one" if preflight.masks else ""
+    files = f"{preflight.num_masks} of {preflight.num_images} photographs have one" if preflight.num_masks else ""
     return "; ".join(each for each in (files, alpha) if each)
 
 
@@ -88,7 +88,7 @@ def _positions_text(preflight: PreflightReport) -> str:
     east, north = preflight.spread_m
     rtk = f"; {preflight.rtk} say how accurate they are (RTK)" if preflight.rtk else ""
     spread = f"over {east:.0f} m x {north:.0f} m"
-    return f"{preflight.positions} of {preflight.photographs}, {spread}; altitude: {preflight.altitude_reference}{rtk}"
+    return f"{preflight.positions} of {preflight.num_images}, {spread}; altitude: {preflight.altitude_reference}{rtk}"
 
 
 def _several(values: list[str]) -> str:

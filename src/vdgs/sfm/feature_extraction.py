@@ -38,10 +38,10 @@ class CameraGroup:
     width: int
     height: int
     focal_px: float
-    known: bool
+    has_focal_prior: bool
     """Whether something says the focal length."""
     source: str
-    photographs: tuple[ImageMetadata, ...]
+    images: tuple[ImageMetadata, ...]
 
 
 def group_by_camera(photographs: Sequence[ImageMetadata]) -> list[CameraGroup]:
@@ -62,9 +62,9 @@ def group_by_camera(photographs: Sequence[ImageMetadata]) -> list[CameraGroup]:
                 width=first.width,
                 height=first.height,
                 focal_px=focal,
-                known=bool(lens),
+                has_focal_prior=bool(lens),
                 source=source,
-                photographs=tuple(members),
+                images=tuple(members),
             )
         )
     return kinds
@@ -77,7 +77,7 @@ def write_upright_images(workspace: Workspace, photographs: Sequence[ImageMetada
     """
     failed = []
     for photo in photographs:
-        target = workspace.photographs / photo.name
+        target = workspace.images / photo.name
         if target.exists():
             continue
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -116,7 +116,7 @@ def create_database(workspace: Workspace, camera_groups: Sequence[CameraGroup]) 
         for kind in camera_groups:
             params = [kind.focal_px, kind.width / 2, kind.height / 2, 0.0]
             camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=kind.width, height=kind.height, params=params)
-            camera.has_prior_focal_length = kind.known
+            camera.has_prior_focal_length = kind.has_focal_prior
             number = database.write_camera(camera)
             rig = pycolmap.Rig()
             rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, number))
@@ -137,13 +137,13 @@ def extract_features(
     names = [
         photo.name
         for kind in camera_groups
-        for photo in kind.photographs
-        if (workspace.photographs / photo.name).exists()
+        for photo in kind.images
+        if (workspace.images / photo.name).exists()
     ]
     count, done = len(names), 0
     with report_progress(console, "features, photographs", count) as tell:
         for number, kind in enumerate(camera_groups, 1):
-            missing = [photo.name for photo in kind.photographs if (workspace.photographs / photo.name).exists()]
+            missing = [photo.name for photo in kind.images if (workspace.images / photo.name).exists()]
             there = count_features(workspace)
             done += sum(name in there for name in missing)
             missing = [name for name in missing if name not in there]
@@ -180,7 +180,7 @@ def _extract(
     options.num_threads, options.max_image_size, options.use_gpu = threads, max_image_size, False
     options.sift.first_octave, options.sift.max_num_features = first_octave, max_num_features
     call_cancellable(
-        pycolmap.extract_features, workspace.database, workspace.photographs, names, reader_options=reader,
+        pycolmap.extract_features, workspace.database, workspace.images, names, reader_options=reader,
         extraction_options=options, device=pycolmap.Device.cpu,
     )  # fmt: skip
 
@@ -211,6 +211,6 @@ def images_without_features(photographs: Sequence[ImageMetadata], counts: dict[s
     if len(photographs) - len(found) < 3:
         raise CaptureError(
             f"{len(photographs) - len(found)} of {len(photographs)} photographs show enough to be matched; a scene "
-            f"needs 3. The first: {found[0].name} {found[0].why}."
+            f"needs 3. The first: {found[0].name} {found[0].reason}."
         )
     return found

@@ -54,7 +54,7 @@ def select_pairs(
         chosen |= pair_selection.retrieval_pairs(_descriptors(workspace, photographs), range(count))
     else:
         chosen = _spatial_pairs(photographs, positions, options)
-        lost = np.flatnonzero(~np.isfinite(positions.rows(count)).all(axis=1))
+        lost = np.flatnonzero(~np.isfinite(positions.all_positions(count)).all(axis=1))
         if len(lost):
             chosen |= pair_selection.retrieval_pairs(_descriptors(workspace, photographs), lost.tolist())
             place = {i: k for k, i in enumerate(order)}
@@ -78,12 +78,12 @@ def _spatial_pairs(
     """Pairs of those near each other, and of those next to each other in time, where a position is wrong."""
     unknown = np.full(3, np.nan)
     views = np.array([photo.attitude.camera_from_enu[2] if photo.attitude else unknown for photo in photographs])
-    near = pair_selection.spatial_pairs(positions.rows(len(photographs)), options.num_neighbors, views)
+    near = pair_selection.spatial_pairs(positions.all_positions(len(photographs)), options.num_neighbors, views)
     return near | pair_selection.sequential_pairs(_time_order(photographs), pair_selection.SEQUENTIAL_OVERLAP_WITH_GPS)
 
 
 def _time_order(photographs: Sequence[ImageMetadata]) -> list[int]:
-    return sorted(range(len(photographs)), key=lambda i: (photographs[i].taken, photographs[i].name))
+    return sorted(range(len(photographs)), key=lambda i: (photographs[i].datetime, photographs[i].name))
 
 
 def match_pairs(

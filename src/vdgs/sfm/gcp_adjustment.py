@@ -27,8 +27,8 @@ MARK_SIGMA_PX = 2.0
 class TriangulatedPoint:
     """A surveyed point as a model has it."""
 
-    place: Float[np.ndarray, "3"]
-    photographs: int
+    position: Float[np.ndarray, "3"]
+    num_images: int
     error_px: float
     """RMS distance between where photographs show it and where the model puts it there."""
 
@@ -39,10 +39,10 @@ def triangulate(model: pycolmap.Reconstruction, point: GroundControlPoint) -> Tr
     The point nearest to all rays, then the least sum of its errors in the photographs, robustly.
     """
     images = {image.name: image for image in model.images.values() if image.has_pose}
-    seen = [each for each in point.sightings if each.photograph in images]
-    if len({each.photograph for each in seen}) < MIN_OBSERVATIONS:
+    seen = [each for each in point.observations if each.image in images]
+    if len({each.image for each in seen}) < MIN_OBSERVATIONS:
         return None
-    views = [images[each.photograph] for each in seen]
+    views = [images[each.image] for each in seen]
     cameras = [model.cameras[view.camera_id] for view in views]
     poses = [np.asarray(view.cam_from_world().matrix()) for view in views]
     marked = np.array([each.pixel for each in seen])
@@ -84,13 +84,13 @@ def adjust_to_gcps(
             f"{gcps.source}: {len(used)} of its points are shown by two placed photographs or more, not along one "
             f"line; {MIN_CONTROL_POINTS} are needed. Mark them in more photographs, or hold them out: --check-points all"
         )
-    places = np.array([seen.place for _, seen in used])
+    places = np.array([seen.position for _, seen in used])
     similarity, trusted = _fit_to_gcps(places, targets[rows])
     transform_model(model, similarity)
     kept = rows[trusted]
     _bundle_adjust(model, [(gcps.points[k], targets[k]) for k in kept.tolist()], fix_focal, threads)
     doubtful = {gcps.points[k].name for k in rows[~trusted].tolist()}
-    return f"{len(kept)} control points ({gcps.source}, {gcps.system})", doubtful
+    return f"{len(kept)} control points ({gcps.source}, {gcps.crs})", doubtful
 
 
 def measure_gcps(
@@ -105,8 +105,8 @@ def measure_gcps(
         if seen is None:
             facts.append(GcpReport(point.name, used_as, 0))
         else:
-            off = tuple(float(value) for value in seen.place - targets[k])
-            facts.append(GcpReport(point.name, used_as, seen.photographs, off, seen.error_px))
+            off = tuple(float(value) for value in seen.position - targets[k])
+            facts.append(GcpReport(point.name, used_as, seen.num_images, off, seen.error_px))
     return tuple(facts)
 
 
@@ -163,8 +163,8 @@ def _add_fixed_point(
     model: pycolmap.Reconstruction, images: dict[str, pycolmap.Image], point: GroundControlPoint, target: np.ndarray
 ) -> int:
     track = pycolmap.Track()
-    for sighting in point.sightings:
-        image = images.get(sighting.photograph)
+    for sighting in point.observations:
+        image = images.get(sighting.image)
         if image is not None:
             image.points2D.append(pycolmap.Point2D(np.array(sighting.pixel)))
             track.add_element(image.image_id, len(image.points2D) - 1)

@@ -34,7 +34,7 @@ _MAX_FILE_BYTES, _MAX_HEIGHT_M = 1 << 24, 20_000.0
 class GcpObservation:
     """Where a photograph shows a point."""
 
-    photograph: str
+    image: str
     """Its name in the capture."""
     pixel: tuple[float, float]
     """From the upper left corner of the upright photograph; 0.5, 0.5 is the middle of its first pixel."""
@@ -47,7 +47,7 @@ class GroundControlPoint:
     name: str
     geodetic: tuple[float, float, float]
     """Latitude and longitude (WGS 84) in degrees, height in metres as the file has it."""
-    sightings: tuple[GcpObservation, ...]
+    observations: tuple[GcpObservation, ...]
     is_check_point: bool
     """Only measured afterwards (a check point)."""
 
@@ -57,7 +57,7 @@ class GcpList:
     """All surveyed points of a file."""
 
     points: tuple[GroundControlPoint, ...]
-    system: str
+    crs: str
     """The coordinate system that the file names."""
     source: str
     notes: tuple[str, ...]
@@ -71,7 +71,7 @@ class GcpList:
         return enu_from_geodetic(np.array([point.geodetic for point in self.points]), origin)
 
     @property
-    def middle(self) -> tuple[float, float, float]:
+    def median_origin(self) -> tuple[float, float, float]:
         """An origin, where positions give none."""
         latitude, longitude, height = np.median([point.geodetic for point in self.points], axis=0).tolist()
         return latitude, longitude, height
@@ -136,7 +136,7 @@ def check_gcps_near(gcps: GcpList, positions: np.ndarray, origin: tuple[float, f
     away = float(np.median(np.linalg.norm(gcps.enu(origin)[:, :2] - np.median(positions[:, :2], axis=0), axis=1)))
     if away > MAX_DISTANCE_M:
         raise CaptureError(
-            f"{file}: its points lie {away / 1000:,.0f} km from the photographs. Is {gcps.system} the right system "
+            f"{file}: its points lie {away / 1000:,.0f} km from the photographs. Is {gcps.crs} the right system "
             "and zone, and x (east) before y (north)?"
         )
 
@@ -211,8 +211,8 @@ def _crs_from_odm(header: str) -> str:
 
 def _by_name(collection: ImageList) -> NameLookup[ImageMetadata | str]:
     """Photographs, and names of those left out."""
-    left_out: list[tuple[str, ImageMetadata | str]] = [(each.name, each.name) for each in collection.left_out]
-    return NameLookup([*((photo.name, photo) for photo in collection.photographs), *left_out])
+    left_out: list[tuple[str, ImageMetadata | str]] = [(each.name, each.name) for each in collection.excluded]
+    return NameLookup([*((photo.name, photo) for photo in collection.images), *left_out])
 
 
 def _observation(line: _Line, by_name: NameLookup[ImageMetadata | str], file: Path) -> GcpObservation | None:
@@ -244,7 +244,7 @@ def _check_held_out(held_out: Sequence[str], names: Sequence[str], file: Path) -
 
 def _checked(points: list[GroundControlPoint], system: str, file: Path) -> GcpList:
     """Without points that too few photographs show. Raises CaptureError where too few are left to place a model."""
-    seen = [point for point in points if len({each.photograph for each in point.sightings}) >= MIN_OBSERVATIONS]
+    seen = [point for point in points if len({each.image for each in point.observations}) >= MIN_OBSERVATIONS]
     lonely = [point.name for point in points if point not in seen]
     notes = [f"{file.name}: only one photograph shows {', '.join(lonely[:5])}; not used."] if lonely else []
     used = [point for point in seen if not point.is_check_point]
@@ -254,7 +254,7 @@ def _checked(points: list[GroundControlPoint], system: str, file: Path) -> GcpLi
             f"place a scene{' (' + '; '.join(notes) + ')' if notes else ''}. With fewer: --check-points {ALL_POINTS}"
         )
     control = GcpList(tuple(seen), system, file.name, tuple(notes))
-    targets = control.enu(control.middle)[[not point.is_check_point for point in seen]]
+    targets = control.enu(control.median_origin)[[not point.is_check_point for point in seen]]
     if used and is_collinear(targets):
         raise CaptureError(
             f"{file}: its points lie along one line, about which a scene could still turn. Survey one beside it, or "

@@ -33,8 +33,8 @@ class Georegistration:
 
     similarity: Similarity
     """From the model's own world to metres east, north, up of the positions' origin."""
-    how: str
-    rows: np.ndarray
+    method: str
+    position_rows: np.ndarray
     """Which positions have a placed photograph, [m] rows of `GpsPriors`."""
     residuals: np.ndarray
     """Of them, placed minus recorded, metres [m, 3]."""
@@ -46,7 +46,7 @@ class Georegistration:
 class AlignmentFailure:
     """Why a model was not brought to a place on Earth, and what to do about it."""
 
-    why: str
+    reason: str
     remedy: str
 
 
@@ -131,8 +131,8 @@ def _match_positions(
     images: Mapping[str, pycolmap.Image], photographs: Sequence[ImageMetadata], positions: GpsPriors
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows [m] of the positions whose photographs are placed, where those were placed [m, 3], and the positions."""
-    rows = np.array([row for row, i in enumerate(positions.index) if photographs[int(i)].name in images], int)
-    names = [photographs[int(positions.index[row])].name for row in rows]
+    rows = np.array([row for row, i in enumerate(positions.image_indices) if photographs[int(i)].name in images], int)
+    names = [photographs[int(positions.image_indices[row])].name for row in rows]
     centres = np.array([images[name].projection_center() for name in names]).reshape(-1, 3)
     return rows, centres, positions.enu[rows]
 

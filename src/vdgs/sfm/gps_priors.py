@@ -28,7 +28,7 @@ MIN_STD_M = 0.01
 class GpsPriors:
     """Positions in metres east, north, up of an origin, for those photographs that have one."""
 
-    index: np.ndarray
+    image_indices: np.ndarray
     """Which photographs, [m] int."""
     enu: np.ndarray
     """[m, 3] float64."""
@@ -42,17 +42,17 @@ class GpsPriors:
     """What people should know: positions left out, and why."""
 
     def __len__(self) -> int:
-        return len(self.index)
+        return len(self.image_indices)
 
     @property
     def usable(self) -> bool:
         """Whether they can place a reconstruction."""
         return len(self) >= MIN_POSITIONS
 
-    def rows(self, count: int) -> np.ndarray:
+    def all_positions(self, count: int) -> np.ndarray:
         """Positions of all photographs [count, 3], NaN where there is none."""
         rows = np.full((count, 3), np.nan)
-        rows[self.index] = self.enu
+        rows[self.image_indices] = self.enu
         return rows
 
 
@@ -96,7 +96,7 @@ def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, st
     if len(kinds) > 1:
         notes.append(f"altitudes are of several kinds ({'; '.join(kinds)}): heights may not fit together.")
     return GpsPriors(
-        index=index, enu=enu, gps_std=deviations, origin=origin, altitude_reference="; ".join(kinds), source=source,
+        image_indices=index, enu=enu, gps_std=deviations, origin=origin, altitude_reference="; ".join(kinds), source=source,
         notes=tuple(notes),
     )  # fmt: skip
 
@@ -106,7 +106,7 @@ def _read_geodetic(photographs: Sequence[ImageMetadata], table: Path | None) -> 
     geodetic = np.full((len(photographs), 3), np.nan)
     if table is None:
         for row, photo in zip(geodetic, photographs, strict=True):
-            row[:2] = photo.place if photo.place is not None else np.nan
+            row[:2] = photo.lat_lon if photo.lat_lon is not None else np.nan
             row[2] = photo.altitude if photo.altitude is not None else np.nan
         return geodetic, "EXIF", []
     index, given = match_gps([photo.name for photo in photographs], read_gps(table), table)
@@ -143,8 +143,8 @@ def _position_std(photo: ImageMetadata, table: Path | None, std_m: tuple[float, 
     if table is None and photo.gps_std is not None:
         east, north, height = (max(value, MIN_STD_M) for value in photo.gps_std)
         return east, north, height
-    if table is None and photo.error_m is not None:
-        error = max(photo.error_m, MIN_STD_M)
+    if table is None and photo.gps_error_m is not None:
+        error = max(photo.gps_error_m, MIN_STD_M)
         return error, error, error * up / across
     return across, across, up
 

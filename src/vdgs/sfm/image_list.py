@@ -32,7 +32,7 @@ class ExcludedImage:
     """A photograph that is not used, and why."""
 
     name: str
-    why: str
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ class ImageList:
     """Photographs in order of their names, and what else lay in their folders."""
 
     folders: tuple[Path, ...]
-    photographs: tuple[ImageMetadata, ...]
-    left_out: tuple[ExcludedImage, ...]
+    images: tuple[ImageMetadata, ...]
+    excluded: tuple[ExcludedImage, ...]
     other_files: int
     notes: tuple[str, ...] = ()
     """What people should know of their masks."""
@@ -79,7 +79,7 @@ def collect_images(folders: Sequence[Path]) -> ImageList:
     photographs, doubled = _drop_duplicates(photographs)
     left_out += doubled
     if len(photographs) < MIN_IMAGES:
-        reasons = format_list(f"{each.name}: {each.why}" for each in left_out)
+        reasons = format_list(f"{each.name}: {each.reason}" for each in left_out)
         raise CaptureError(
             f"{', '.join(map(str, folders))}: {len(photographs)} photograph{'s' if len(photographs) != 1 else ''} that "
             f"can be used; a scene needs {MIN_IMAGES} at the very least, and each place two or three that show "
@@ -150,15 +150,15 @@ def _read(path: Path, name: str, mask: Path | None) -> ImageMetadata | ExcludedI
 def _drop_duplicates(photographs: list[ImageMetadata]) -> tuple[list[ImageMetadata], list[ExcludedImage]]:
     """Leave out copies of the same file, and files whose names differ in their endings only."""
     kept, left_out = list[ImageMetadata](), list[ExcludedImage]()
-    sizes = Counter(photo.bytes for photo in photographs)
+    sizes = Counter(photo.file_bytes for photo in photographs)
     contents, stems = dict[tuple[int, bytes], str](), dict[str, str]()
     for photo in photographs:
         stem = match_key(photo.name)
         if stem in stems:
             left_out.append(ExcludedImage(photo.name, f"has the name of {stems[stem]} with another ending"))
             continue
-        if sizes[photo.bytes] > 1:
-            content = photo.bytes, _digest(photo.path)
+        if sizes[photo.file_bytes] > 1:
+            content = photo.file_bytes, _digest(photo.path)
             if content in contents:
                 left_out.append(ExcludedImage(photo.name, f"is a copy of {contents[content]}"))
                 continue

@@ -86,21 +86,21 @@ class ImageMetadata:
     camera: str
     """Maker, model and serial number, as far as known."""
     lens: Lens | None
-    taken: str
+    datetime: str
     """Date and time as EXIF has them, 2026:06:23 16:31:59; empty where it says none."""
-    place: tuple[float, float] | None
+    lat_lon: tuple[float, float] | None
     """Latitude and longitude in degrees."""
     altitude: float | None
     altitude_type: str
     gps_std: tuple[float, float, float] | None
     """Standard deviations east, north and up in metres, where the receiver says them (RTK)."""
-    error_m: float | None
+    gps_error_m: float | None
     """How far the place may be off across, in metres, where EXIF says it (GPSHPositioningError)."""
     relative_altitude: float | None
     attitude: Attitude | None
     """Of the picture as the sensor has it; None for pictures that lay on their side."""
-    bytes: int
-    may_be_transparent: bool = False
+    file_bytes: int
+    has_alpha_channel: bool = False
     """Its file has an alpha channel, whatever that says."""
     mask: Path | None = None
     """White where it counts."""
@@ -108,7 +108,7 @@ class ImageMetadata:
     @property
     def may_be_masked(self) -> bool:
         """Whether something may be left out of it."""
-        return self.mask is not None or self.may_be_transparent
+        return self.mask is not None or self.has_alpha_channel
 
     @property
     def size(self) -> tuple[int, int]:
@@ -168,16 +168,16 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
         orientation=orientation,
         camera=_camera(tags, details, xmp),
         lens=lens,
-        taken=_text(details.get(0x9003)) or _text(tags.get(0x0132)),
-        place=_lat_lon(gps),
+        datetime=_text(details.get(0x9003)) or _text(tags.get(0x0132)),
+        lat_lon=_lat_lon(gps),
         altitude=altitude,
         altitude_type=altitude_type,
         gps_std=_rtk_std(xmp),
-        error_m=_gps_error(gps),
+        gps_error_m=_gps_error(gps),
         relative_altitude=first_number(xmp, "drone-dji:RelativeAltitude", "sensefly:Height"),
         attitude=attitude,
-        bytes=size,
-        may_be_transparent=transparent,
+        file_bytes=size,
+        has_alpha_channel=transparent,
     )
 
 

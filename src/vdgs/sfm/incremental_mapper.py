@@ -75,7 +75,7 @@ def _range(heights: np.ndarray) -> float:
 
 def write_pose_priors(workspace: Workspace, photographs: Sequence[ImageMetadata], positions: GpsPriors) -> None:
     """Positions with their covariances and, where the drone says it, which way is down."""
-    row_of = {int(i): row for row, i in enumerate(positions.index)} if positions.usable else {}
+    row_of = {int(i): row for row, i in enumerate(positions.image_indices)} if positions.usable else {}
     database = pycolmap.Database.open(workspace.database)
     try:
         database.clear_pose_priors()
@@ -124,7 +124,7 @@ def run_mapper(
 
         try:
             models = call_cancellable(
-                pycolmap.incremental_mapping, workspace.database, workspace.photographs, workspace.models, options,
+                pycolmap.incremental_mapping, workspace.database, workspace.images, workspace.models, options,
                 input_path=begun or "", next_image_callback=one_more,
             )  # fmt: skip
         except KeyboardInterrupt:
@@ -148,8 +148,8 @@ def save_snapshots(workspace: Workspace) -> None:
     for folder in sorted(workspace.snapshots.iterdir()) if workspace.snapshots.is_dir() else []:
         before, count = _largest_snapshot(workspace), _registered_count(folder)
         if before is None or count > int(before.name):
-            workspace.kept.mkdir(exist_ok=True)
-            os.replace(folder, workspace.kept / str(count))
+            workspace.saved_snapshots.mkdir(exist_ok=True)
+            os.replace(folder, workspace.saved_snapshots / str(count))
             if before is not None:
                 shutil.rmtree(before)
         else:
@@ -158,12 +158,12 @@ def save_snapshots(workspace: Workspace) -> None:
 
 def delete_models(workspace: Workspace) -> None:
     """Remove all models, finished or not."""
-    for folder in (workspace.models, workspace.snapshots, workspace.kept):
+    for folder in (workspace.models, workspace.snapshots, workspace.saved_snapshots):
         shutil.rmtree(folder, ignore_errors=True)
 
 
 def _largest_snapshot(workspace: Workspace) -> Path | None:
-    return max(workspace.kept.glob("*"), key=lambda folder: int(folder.name), default=None)
+    return max(workspace.saved_snapshots.glob("*"), key=lambda folder: int(folder.name), default=None)
 
 
 def _registered_count(folder: Path) -> int:

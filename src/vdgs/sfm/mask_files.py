@@ -122,7 +122,7 @@ def read_keep_mask(metadata: ImageMetadata) -> np.ndarray | None:
 
     A mask is of the file as it is, before EXIF's orientation, unless only the upright photograph has its shape.
     """
-    keep = _opaque(metadata) if metadata.may_be_transparent else None
+    keep = _opaque(metadata) if metadata.has_alpha_channel else None
     if metadata.mask is None:
         return keep
     header = read_header(metadata.mask)

@@ -36,9 +36,9 @@ def plot_residuals(
 ) -> None:
     """Points from above; of every photograph the recorded position, and an arrow to where it was placed; surveyed
     points by their names."""
-    factor, arrows = 1, placed is not None and len(placed.rows) > 0
+    factor, arrows = 1, placed is not None and len(placed.position_rows) > 0
     if placed is not None and arrows:
-        span = float(np.ptp(positions.enu[placed.rows, :2], axis=0).max())
+        span = float(np.ptp(positions.enu[placed.position_rows, :2], axis=0).max())
         longest = float(np.linalg.norm(placed.residuals[:, :2], axis=1).max())
         factor = next((n for n in (100, 50, 20, 10, 5, 2) if n * longest <= MAX_ARROW_SHARE * span), 1)
     title = (
@@ -51,7 +51,7 @@ def plot_residuals(
     low, high = np.quantile(few[:, :2], [0.01, 0.99], axis=0)
     axes.plot(few[:, 0], few[:, 1], "o", markersize=1.2, markeredgewidth=0, color=MUTED, alpha=0.6, zorder=1)
     if placed is not None and arrows:
-        at, move = positions.enu[placed.rows, :2], factor * placed.residuals[:, :2]
+        at, move = positions.enu[placed.position_rows, :2], factor * placed.residuals[:, :2]
         low, high = np.minimum(low, at.min(axis=0)), np.maximum(high, at.max(axis=0))
         axes.plot(at[:, 0], at[:, 1], "o", color=INK, markersize=3, zorder=2)
         axes.quiver(

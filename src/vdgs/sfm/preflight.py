@@ -37,8 +37,8 @@ FEATURES_PER_MEGAPIXEL = 2500
 class PreflightReport:
     """What the heads of the photographs tell."""
 
-    photographs: int
-    masks: int
+    num_images: int
+    num_masks: int
     """How many have a mask beside them."""
     transparent: int
     """How many have an alpha channel, which is a mask too."""
@@ -65,18 +65,18 @@ class PreflightReport:
 
 def make_preflight_report(collection: ImageList, positions: GpsPriors) -> PreflightReport:
     """All that can be said without decoding pixels."""
-    photographs = collection.photographs
+    photographs = collection.images
     height, height_from = flying_height(photographs)
     footprint = _footprint(photographs, height)
     spread = np.ptp(positions.enu[:, :2], axis=0) if len(positions) else None
     tilts = [photo.attitude.tilt_deg for photo in photographs if photo.attitude]
-    days = sorted({photo.taken[:10] for photo in photographs if photo.taken})
+    days = sorted({photo.datetime[:10] for photo in photographs if photo.datetime})
     overlap, views = _overlap(photographs, positions, footprint), _views_per_place(positions, footprint)
     focal = _median(photo.lens.focal * max(photo.width, photo.height) for photo in photographs if photo.lens)
     return PreflightReport(
-        photographs=len(photographs),
-        masks=sum(photo.mask is not None for photo in photographs),
-        transparent=sum(photo.may_be_transparent for photo in photographs),
+        num_images=len(photographs),
+        num_masks=sum(photo.mask is not None for photo in photographs),
+        transparent=sum(photo.has_alpha_channel for photo in photographs),
         cameras=Counter(photo.camera for photo in photographs).most_common(),
         sizes=[(*size, n) for size, n in Counter((p.width, p.height) for p in photographs).most_common()],
         positions=len(positions),
@@ -95,7 +95,7 @@ def make_preflight_report(collection: ImageList, positions: GpsPriors) -> Prefli
 def estimate_seconds(photographs: Sequence[ImageMetadata], pairs: int, options: SfmOptions, threads: int) -> float:
     """About how long the work takes, from what one core was measured to take."""
     pixels = sum(_searched_pixels(photo, options.max_image_size, len(photographs)) for photo in photographs) / 1e6
-    features = min(options.features, FEATURES_PER_MEGAPIXEL * pixels / len(photographs))
+    features = min(options.max_num_features, FEATURES_PER_MEGAPIXEL * pixels / len(photographs))
     written = sum(photo.width * photo.height for photo in photographs) / 1e6
     shared = FEATURE_SECONDS * pixels + PAIR_SECONDS * (features / 1000) ** 2 * pairs + WRITING_SECONDS * written
     return shared / max(1, threads) + MAPPING_SECONDS * len(photographs)
@@ -136,13 +136,13 @@ def _overlap(
     """Along the flight, if the shorter side points forwards: from the steps between photographs in order of time."""
     if footprint is None or len(positions) < 3:
         return None
-    order = sorted(range(len(positions)), key=lambda row: _time_key(photographs[int(positions.index[row])]))
+    order = sorted(range(len(positions)), key=lambda row: _time_key(photographs[int(positions.image_indices[row])]))
     steps = np.linalg.norm(np.diff(positions.enu[order, :2], axis=0), axis=1)
     return float(np.clip(1 - np.median(steps) / footprint[1], 0, 1))
 
 
 def _time_key(photo: ImageMetadata) -> tuple[str, str]:
-    return photo.taken, photo.name
+    return photo.datetime, photo.name
 
 
 def _views_per_place(positions: GpsPriors, footprint: tuple[float, float] | None) -> float | None:
@@ -153,7 +153,7 @@ def _views_per_place(positions: GpsPriors, footprint: tuple[float, float] | None
 
 
 def _warnings(collection: ImageList, overlap: float | None, views: float | None, days: Sequence[str]) -> list[str]:
-    photographs, found = collection.photographs, list[str]()
+    photographs, found = collection.images, list[str]()
     without = [photo.name for photo in photographs if photo.lens is None]
     if without:
         found.append(f"{_first(without)}: nothing says the focal length; it is fitted from a guess.")
@@ -166,7 +166,7 @@ def _warnings(collection: ImageList, overlap: float | None, views: float | None,
         found.append(
             f"a place is seen by about {views:.1f} photographs; from {MIN_VIEWS_PER_POINT:g} on scenes become good."
         )
-    moments = [when for when in (_time(photo.taken) for photo in photographs) if when is not None]
+    moments = [when for when in (_time(photo.datetime) for photo in photographs) if when is not None]
     if moments and max(moments) - min(moments) > timedelta(days=1):
         found.append(f"taken on {len(days)} days, {days[0]} to {days[-1]}: light, shadows and plants may differ.")
     return found
@@ -181,7 +181,7 @@ def _small_files(photographs: Sequence[ImageMetadata]) -> list[str]:
         photo.name
         for alike in kinds.values()
         for photo in alike
-        if photo.bytes < SMALL_FILE_RATIO * statistics.median(each.bytes for each in alike)
+        if photo.file_bytes < SMALL_FILE_RATIO * statistics.median(each.file_bytes for each in alike)
     ]
 
 

@@ -80,10 +80,10 @@ def reconstruct(
     with lock or nullcontext(), lock_folder(output):
         work.path.mkdir(exist_ok=True)
         plot_positions(
-            prepared.positions, time_order(prepared), "Where the photographs were taken", output / POSITIONS_FIGURE
+            prepared.gps_priors, time_order(prepared), "Where the photographs were taken", output / POSITIONS_FIGURE
         )
         facts = _steps(prepared, work, keys, console)
-        if not request.keep_work:
+        if not request.keep_intermediate:
             work.remove()
     print_reconstruction_report(facts, console)
     return facts
@@ -91,27 +91,27 @@ def reconstruct(
 
 def _keys(plan: ReconstructionPlan) -> dict[str, str]:
     """What each step depends on, each on those before it."""
-    options, positions = plan.request.options, plan.positions
+    options, positions = plan.request.options, plan.gps_priors
     files = [
-        (photo.name, photo.bytes, photo.path.stat().st_mtime_ns, photo.width, photo.height, photo.orientation)
-        for photo in plan.image_list.photographs
+        (photo.name, photo.file_bytes, photo.path.stat().st_mtime_ns, photo.width, photo.height, photo.orientation)
+        for photo in plan.image_list.images
     ]
-    lenses = [photo.lens and photo.lens.focal for photo in plan.image_list.photographs]
-    found = cache_key(__version__, files, lenses, options.max_image_size, options.features, *_masked_images(plan))
-    placed = [positions.index.tolist(), positions.enu.tolist(), positions.gps_std.tolist()]
+    lenses = [photo.lens and photo.lens.focal for photo in plan.image_list.images]
+    found = cache_key(__version__, files, lenses, options.max_image_size, options.max_num_features, *_masked_images(plan))
+    placed = [positions.image_indices.tolist(), positions.enu.tolist(), positions.gps_std.tolist()]
     matched = cache_key(found, placed, options.num_neighbors, options.exhaustive_max)
     mapped = cache_key(matched, options.focal)
-    points = plan.control.points if plan.control else ()
-    capture = cache_key(mapped, options.max_size, [record_to_dict(point) for point in points])
+    points = plan.gcps.points if plan.gcps else ()
+    capture = cache_key(mapped, options.max_output_size, [record_to_dict(point) for point in points])
     return {"features": found, "matches": matched, "model": mapped, "capture": capture}
 
 
 def _masked_images(plan: ReconstructionPlan) -> list[tuple[Any, ...]]:
     """Photographs of which something may be left out, and what says so."""
-    masked = [photo for photo in plan.image_list.photographs if photo.may_be_masked]
+    masked = [photo for photo in plan.image_list.images if photo.may_be_masked]
     files = [photo.mask.stat() if photo.mask is not None else None for photo in masked]
     return [
-        (photo.name, photo.may_be_transparent, file and (file.st_size, file.st_mtime_ns))
+        (photo.name, photo.has_alpha_channel, file and (file.st_size, file.st_mtime_ns))
         for photo, file in zip(masked, files, strict=True)
     ]
 
@@ -138,12 +138,12 @@ def _steps(
 ) -> ReconstructionReport:
     began = time.monotonic()
     request, output = plan.request, plan.request.output
-    photographs, threads = plan.image_list.photographs, plan.threads
+    photographs, threads = plan.image_list.images, plan.threads
     kinds = feature_extraction.group_by_camera(photographs)
     lost = _features(plan, workspace, kinds, keys["features"], console)
     usable = [photo for photo in photographs if photo.name not in {each.name for each in lost}]
     pairs = _matches(plan, workspace, keys["matches"], console)
-    held = incremental_mapper.should_fix_focal(photographs, plan.positions, request.options)
+    held = incremental_mapper.should_fix_focal(photographs, plan.gps_priors, request.options)
     models = _models(plan, workspace, keys["model"], len(usable), held[0], console)
     left_out = exclusion_reasons(
         models[0],
@@ -155,17 +155,17 @@ def _steps(
     placed, origin, surveyed = _georegister(models[0], plan, held[0])
     _write(plan, workspace, models[0], keys["capture"], threads, console)
     outcome = ReconstructionResult(
-        kinds=kinds, placed=placed, origin=origin, survey=surveyed, left_out=left_out,
-        components=[model.num_reg_images() for model in models], pairs=pairs, held=held,
+        camera_groups=kinds, registration=placed, origin=origin, survey=surveyed, excluded=left_out,
+        components=[model.num_reg_images() for model in models], pairs=pairs, focal_fixed=held,
         seconds=time.monotonic() - began,
     )  # fmt: skip
     facts = make_reconstruction_report(models[0], plan, outcome)
     points = georegistration.model_points(models[0])
     marks = dict(zip((each.name for each in surveyed), _gcp_positions(plan), strict=False))
-    plot_residuals(points, plan.positions, outcome.georegistration, marks, output / RECONSTRUCTION_FIGURE)
+    plot_residuals(points, plan.gps_priors, outcome.georegistration, marks, output / RECONSTRUCTION_FIGURE)
     if origin is not None:
         write_json(output / "georef.json", _georef(facts, origin))
-    capture_writer.write_model(output, models[0], _lenses(models[0], request.options.max_size))
+    capture_writer.write_model(output, models[0], _lenses(models[0], request.options.max_output_size))
     write_json(
         output / RECONSTRUCTION_FILE,
         to_jsonable(record_to_dict(facts)) | {"options": to_jsonable(to_dict(request.options))},
@@ -181,7 +181,7 @@ def _features(
     key: str,
     console: Console,
 ) -> list[ExcludedImage]:
-    options, photographs = plan.request.options, plan.image_list.photographs
+    options, photographs = plan.request.options, plan.image_list.images
     if not workspace.is_begun("features", key):
         workspace.remove()
         workspace.begin("features", key)
@@ -191,7 +191,7 @@ def _features(
     if not workspace.is_done("features", key):
         mask_files.write_upright_masks(workspace, photographs, plan.threads)
         counts = feature_extraction.extract_features(
-            workspace, camera_groups, options.max_image_size, options.features, plan.threads, console
+            workspace, camera_groups, options.max_image_size, options.max_num_features, plan.threads, console
         )
         workspace.finish("features", key)
     named = {each.name for each in failed}
@@ -201,8 +201,8 @@ def _features(
 
 
 def _matches(plan: ReconstructionPlan, workspace: Workspace, key: str, console: Console) -> int:
-    photographs = plan.image_list.photographs
-    chosen = feature_matching.select_pairs(workspace, photographs, plan.positions, plan.request.options)
+    photographs = plan.image_list.images
+    chosen = feature_matching.select_pairs(workspace, photographs, plan.gps_priors, plan.request.options)
     there = feature_extraction.count_features(workspace)
     chosen = [pair for pair in chosen if all(there.get(name) for name in pair)]
     if workspace.is_done("matches", key):
@@ -223,8 +223,8 @@ def _models(
     if not workspace.is_begun("model", key):
         incremental_mapper.delete_models(workspace)
         workspace.begin("model", key)
-    incremental_mapper.write_pose_priors(workspace, plan.image_list.photographs, plan.positions)
-    models = incremental_mapper.run_mapper(workspace, count, fix_focal, plan.positions.usable, plan.threads, console)
+    incremental_mapper.write_pose_priors(workspace, plan.image_list.images, plan.gps_priors)
+    models = incremental_mapper.run_mapper(workspace, count, fix_focal, plan.gps_priors.usable, plan.threads, console)
     workspace.finish("model", key)
     return models
 
@@ -238,7 +238,7 @@ def _georegister(
 ]:
     """Bring the model to metres east, north, up, its median point to height 0; the origin that this has on Earth, and
     what it makes of surveyed points."""
-    photographs, positions, control = plan.image_list.photographs, plan.positions, plan.control
+    photographs, positions, control = plan.image_list.images, plan.gps_priors, plan.gcps
     doubtful = set[str]()
     if control is not None and control.has_control_points:
         how, doubtful = gcp_adjustment.adjust_to_gcps(model, control, plan.origin, fix_focal, plan.threads)
@@ -260,7 +260,7 @@ def _georegister(
 
 def _gcp_positions(plan: ReconstructionPlan) -> np.ndarray:
     """Surveyed points [n, 3], none where nothing was placed."""
-    return plan.control.enu(plan.origin) if plan.control else np.zeros((0, 3))
+    return plan.gcps.enu(plan.origin) if plan.gcps else np.zeros((0, 3))
 
 
 def _lenses(model: pycolmap.Reconstruction, max_size: int) -> dict[int, capture_writer.Undistortion]:
@@ -289,7 +289,7 @@ def _write(
         if image.has_pose:
             names.setdefault(image.camera_id, []).append(image.name)
     capture_writer.write_images(
-        output, workspace, names, _lenses(model, plan.request.options.max_size), threads, console
+        output, workspace, names, _lenses(model, plan.request.options.max_output_size), threads, console
     )
 
 

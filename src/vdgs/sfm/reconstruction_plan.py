@@ -31,33 +31,33 @@ class ReconstructionPlan:
 
     request: SfmRequest
     image_list: ImageList
-    positions: GpsPriors
-    look: PreflightReport
+    gps_priors: GpsPriors
+    preflight: PreflightReport
     threads: int
-    seconds: float
-    control: GcpList | None = None
+    estimated_seconds: float
+    gcps: GcpList | None = None
 
     @property
     def origin(self) -> tuple[float, float, float]:
         """Of all metres east, north, up: latitude and longitude in degrees, altitude in metres."""
-        return self.control.middle if self.control and not self.positions.usable else self.positions.origin
+        return self.gcps.median_origin if self.gcps and not self.gps_priors.usable else self.gps_priors.origin
 
 
 def plan_reconstruction(request: SfmRequest) -> ReconstructionPlan:
     """The look before the work; nothing is written. Raises CaptureError for photographs that cannot become one."""
     check_ranges(request)
-    collection = collect_images(request.photographs)
+    collection = collect_images(request.image_folders)
     check_output_outside_images(request.output, collection)
-    positions = read_gps_priors(collection.photographs, request.gps, request.options.gps_std_m)
+    positions = read_gps_priors(collection.images, request.gps, request.options.gps_std_m)
     control = _read_gcps(request.options, collection, positions)
     look = make_preflight_report(collection, positions)
     look = replace(look, warnings=[*look.warnings, *(control.notes if control else ())])
     threads = request.threads or default_num_threads()
-    pairs = feature_matching.estimate_pair_count(collection.photographs, positions, request.options)
-    takes = estimate_seconds(collection.photographs, pairs, request.options, threads)
+    pairs = feature_matching.estimate_pair_count(collection.images, positions, request.options)
+    takes = estimate_seconds(collection.images, pairs, request.options, threads)
     return ReconstructionPlan(
-        request=request, image_list=collection, positions=positions, look=look, threads=threads, seconds=takes,
-        control=control,
+        request=request, image_list=collection, gps_priors=positions, preflight=look, threads=threads, estimated_seconds=takes,
+        gcps=control,
     )  # fmt: skip
 
 
@@ -73,19 +73,19 @@ def _read_gcps(options: SfmOptions, collection: ImageList, positions: GpsPriors)
 
 def print_plan(reconstruction_plan: ReconstructionPlan, console: Console) -> None:
     """Print the look, and what will be done."""
-    photographs, options = reconstruction_plan.image_list.photographs, reconstruction_plan.request.options
-    pairs = feature_matching.estimate_pair_count(photographs, reconstruction_plan.positions, options)
-    held, why = incremental_mapper.should_fix_focal(photographs, reconstruction_plan.positions, options)
-    how = "near each other by their positions" if reconstruction_plan.positions.usable else (
+    photographs, options = reconstruction_plan.image_list.images, reconstruction_plan.request.options
+    pairs = feature_matching.estimate_pair_count(photographs, reconstruction_plan.gps_priors, options)
+    held, why = incremental_mapper.should_fix_focal(photographs, reconstruction_plan.gps_priors, options)
+    how = "near each other by their positions" if reconstruction_plan.gps_priors.usable else (
         "all with all" if len(photographs) <= options.exhaustive_max else "next in order, and alike")  # fmt: skip
-    metres = "metres east, north, up, " if reconstruction_plan.positions.usable or reconstruction_plan.control else ""
+    metres = "metres east, north, up, " if reconstruction_plan.gps_priors.usable or reconstruction_plan.gcps else ""
     plan = [
         f"features, about {pairs} pairs ({how}), poses and points, {metres}photographs without distortion",
-        *_gcp_plan_lines(reconstruction_plan.control),
+        *_gcp_plan_lines(reconstruction_plan.gcps),
         f"the focal length is {'held' if held else 'fitted'}: {why}",
-        f"about {rough_duration(reconstruction_plan.seconds)} on {reconstruction_plan.threads} threads, if they are idle",
+        f"about {rough_duration(reconstruction_plan.estimated_seconds)} on {reconstruction_plan.threads} threads, if they are idle",
     ]
-    print_preflight(reconstruction_plan.look, reconstruction_plan.image_list, plan, console)
+    print_preflight(reconstruction_plan.preflight, reconstruction_plan.image_list, plan, console)
 
 
 def _gcp_plan_lines(control: GcpList | None) -> list[str]:
@@ -95,7 +95,7 @@ def _gcp_plan_lines(control: GcpList | None) -> list[str]:
     used = len(control.points) - held_out
     parts = [f"{used} place the model"] if used else []
     parts += [f"{held_out} are held out to measure it"] if held_out else []
-    return [f"surveyed points of {control.source} ({control.system}): {', '.join(parts)}"]
+    return [f"surveyed points of {control.source} ({control.crs}): {', '.join(parts)}"]
 
 
 def check_output_outside_images(output: Path, collection: ImageList) -> None:
@@ -111,9 +111,9 @@ def check_output_outside_images(output: Path, collection: ImageList) -> None:
 
 
 def check_disk_space(plan: ReconstructionPlan) -> None:
-    photographs, options = plan.image_list.photographs, plan.request.options
+    photographs, options = plan.image_list.images, plan.request.options
     pixels = sum(photo.width * photo.height for photo in photographs)
-    needed = BYTES_PER_PIXEL * 1.32 * pixels + BYTES_PER_FEATURE * options.features * len(photographs)
+    needed = BYTES_PER_PIXEL * 1.32 * pixels + BYTES_PER_FEATURE * options.max_num_features * len(photographs)
     parent = next(
         folder for folder in (plan.request.output.resolve(), *plan.request.output.resolve().parents) if folder.exists()
     )
@@ -127,7 +127,7 @@ def check_disk_space(plan: ReconstructionPlan) -> None:
 
 def time_order(plan: ReconstructionPlan) -> list[int]:
     """Rows of the positions in the order in which the photographs were taken."""
-    photographs, index = plan.image_list.photographs, plan.positions.index
+    photographs, index = plan.image_list.images, plan.gps_priors.image_indices
     return sorted(
-        range(len(index)), key=lambda row: (photographs[int(index[row])].taken, photographs[int(index[row])].name)
+        range(len(index)), key=lambda row: (photographs[int(index[row])].datetime, photographs[int(index[row])].name)
     )

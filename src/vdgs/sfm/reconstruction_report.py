@@ -30,50 +30,50 @@ class ReconstructionResult:
     """What the steps of a reconstruction left beside the model, which lies where it belongs."""
 
     #: Kinds of camera, as the features were found with.
-    kinds: Sequence[CameraGroup]
+    camera_groups: Sequence[CameraGroup]
     #: How the model was placed by positions, or why not, and where its origin is (latitude, longitude, altitude).
-    placed: Georegistration | AlignmentFailure
+    registration: Georegistration | AlignmentFailure
     origin: tuple[float, float, float] | None
     #: Surveyed points and how far off the model has them.
     survey: tuple[GcpReport, ...]
-    left_out: Sequence[ExcludedImage]
+    excluded: Sequence[ExcludedImage]
     #: Photographs of each part that came out, the largest first.
     components: Sequence[int]
     #: Pairs of photographs that were compared.
     pairs: int
     #: Whether the focal lengths of EXIF were held, and why.
-    held: tuple[bool, str]
+    focal_fixed: tuple[bool, str]
     seconds: float
 
     @property
     def georegistration(self) -> Georegistration | None:
-        return self.placed if isinstance(self.placed, Georegistration) else None
+        return self.registration if isinstance(self.registration, Georegistration) else None
 
 
 def make_reconstruction_report(
     model: pycolmap.Reconstruction, plan: ReconstructionPlan, result: ReconstructionResult
 ) -> ReconstructionReport:
     """The facts of a model that lies where it belongs."""
-    placed, held = result.georegistration, result.held
-    collection, positions, look = plan.image_list, plan.positions, plan.look
+    placed, held = result.georegistration, result.focal_fixed
+    collection, positions, look = plan.image_list, plan.gps_priors, plan.preflight
     images = [image for image in model.images.values() if image.has_pose]
     metric = placed is not None
     height = _height(model, images) if metric else None
     forwards = np.array([image.cam_from_world().rotation.matrix()[2] for image in images])
     tilt = float(np.median(np.degrees(np.arccos(np.clip(-forwards[:, 2], -1, 1))))) if metric else None
-    cameras = _cameras(model, result.kinds)
-    turned = tilt_from_attitudes(model, collection.photographs) if metric else None
+    cameras = _cameras(model, result.camera_groups)
+    turned = tilt_from_attitudes(model, collection.images) if metric else None
     warnings = [*look.warnings, *_warnings(cameras, held[0], height, look.height_m, turned)]
     warnings += _survey_warnings(result.survey)
-    advice = _advice(look, held[0], len(images), len(collection.photographs))
-    if isinstance(result.placed, AlignmentFailure):
-        georeferenced = f"none: {result.placed.why}; scale, north and up are not known"
-        warnings.append(f"not georeferenced ({result.placed.why}): the scale of the scene is arbitrary.")
-        advice.append(result.placed.remedy)
+    advice = _advice(look, held[0], len(images), len(collection.images))
+    if isinstance(result.registration, AlignmentFailure):
+        georeferenced = f"none: {result.registration.reason}; scale, north and up are not known"
+        warnings.append(f"not georeferenced ({result.registration.reason}): the scale of the scene is arbitrary.")
+        advice.append(result.registration.remedy)
     else:
-        georeferenced = result.placed.how
+        georeferenced = result.registration.method
     return ReconstructionReport(
-        found=len(collection.photographs) + len(collection.left_out), registered=len(images),
+        found=len(collection.images) + len(collection.excluded), registered=len(images),
         components=tuple(result.components), pairs=result.pairs, points=model.num_points3D(),
         track_length=float(model.compute_mean_track_length()),
         reprojection_px=float(model.compute_mean_reprojection_error()), georeferenced=georeferenced,
@@ -81,7 +81,7 @@ def make_reconstruction_report(
         residual_rms_m=_rms(placed), positions_rejected=int((~placed.inliers).sum()) if placed else 0,
         focal_fixed=held[0], focal_reason=held[1], height_m=height, recorded_height_m=look.height_m, tilt_deg=tilt,
         attitude_difference_deg=turned, cameras=cameras,
-        photographs=_photographs(collection, positions, placed, result.left_out), warnings=tuple(warnings),
+        photographs=_photographs(collection, positions, placed, result.excluded), warnings=tuple(warnings),
         advice=tuple(advice),
         seconds=result.seconds,
         survey=result.survey,
@@ -97,7 +97,7 @@ def exclusion_reasons(
 ) -> list[ExcludedImage]:
     """Every photograph that the model does not place, with the reason."""
     placed = {image.name for image in model.images.values() if image.has_pose}
-    reasons = {each.name: each.why for each in known}
+    reasons = {each.name: each.reason for each in known}
     for other in reversed(others):
         count = other.num_reg_images()
         for image in other.images.values():
@@ -121,10 +121,10 @@ def exclusion_reasons(
 
 
 def _altitudes(prepared: ReconstructionPlan) -> str:
-    control = prepared.control
+    control = prepared.gcps
     if control is not None and control.has_control_points:
-        return f"heights as in {control.source} ({control.system})"
-    return prepared.positions.altitude_reference
+        return f"heights as in {control.source} ({control.crs})"
+    return prepared.gps_priors.altitude_reference
 
 
 def _rms(placed: Georegistration | None) -> tuple[float, ...] | None:
@@ -142,7 +142,7 @@ def _cameras(model: pycolmap.Reconstruction, kinds: Sequence[CameraGroup]) -> tu
     return tuple(
         CameraReport(
             name=kind.camera,
-            photographs=len(kind.photographs),
+            photographs=len(kind.images),
             width=kind.width,
             height=kind.height,
             focal_before_px=float(kind.focal_px),
@@ -158,12 +158,12 @@ def _cameras(model: pycolmap.Reconstruction, kinds: Sequence[CameraGroup]) -> tu
 def _photographs(
     collection: ImageList, positions: GpsPriors, placed: Georegistration | None, left_out: Sequence[ExcludedImage]
 ) -> tuple[ImageReport, ...]:
-    why = {each.name: each.why for each in (*collection.left_out, *left_out)}
-    names = sorted({*(photo.name for photo in collection.photographs), *why})
+    why = {each.name: each.reason for each in (*collection.excluded, *left_out)}
+    names = sorted({*(photo.name for photo in collection.images), *why})
     residuals = {}
     if placed is not None:
-        for row, residual in zip(placed.rows, placed.residuals, strict=True):
-            residuals[collection.photographs[int(positions.index[row])].name] = tuple(float(v) for v in residual)
+        for row, residual in zip(placed.position_rows, placed.residuals, strict=True):
+            residuals[collection.images[int(positions.image_indices[row])].name] = tuple(float(v) for v in residual)
     return tuple(ImageReport(name, residuals.get(name), why.get(name)) for name in names)
 
 

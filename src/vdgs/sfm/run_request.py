@@ -15,7 +15,7 @@ def is_image_input(request: RunRequest) -> bool:
     photographs alone."""
     if is_image_folder(request.capture):
         return True
-    if request.photographs:
+    if request.extra_image_folders:
         raise VdgsError(
             f"{request.capture}: only folders of photographs alone can be several; a capture is given by itself."
         )
@@ -36,7 +36,7 @@ def make_sfm_request(request: RunRequest) -> SfmRequest:
     run = RunFolder(request.output)
     run.check_output_empty()
     return SfmRequest(
-        photographs=(request.capture, *request.photographs),
+        image_folders=(request.capture, *request.extra_image_folders),
         output=run.own_capture,
         gps=options.gps,
         threads=request.threads,

@@ -37,7 +37,7 @@ class Workspace:
     path: Path
 
     @property
-    def photographs(self) -> Path:
+    def images(self) -> Path:
         """Upright photographs by their names in the capture: links, or copies of those that lay on their side."""
         return self.path / "photographs"
 
@@ -64,7 +64,7 @@ class Workspace:
         return self.path / "snapshots"
 
     @property
-    def kept(self) -> Path:
+    def saved_snapshots(self) -> Path:
         """Whole models that mapping goes on from, by how many photographs they place."""
         return self.path / "kept"
 

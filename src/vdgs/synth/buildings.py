@@ -124,7 +124,7 @@ def _wing(builder: MeshBuilder, frame: ObjectFrame, style: HouseStyle, rng: np.r
     """A wing that comes forward from one half of the house, under a roof of its own."""
     side = rng.choice([-1.0, 1.0])
     span, reach = 0.4 * style.width, 1.7
-    turned = frame.moved(side * (style.width / 2 - span / 2 - 0.3), -style.depth / 4, turn=-np.pi / 2)
+    turned = frame.child(side * (style.width / 2 - span / 2 - 0.3), -style.depth / 4, turn=-np.pi / 2)
     body = Box(x0=-style.depth / 4, x1=style.depth / 4 + reach, y0=-span / 2, y1=span / 2, z0=0, z1=style.eaves - 0.35)
     skin = SurfaceMaterial(Material.WINDOWS, style.walls, style.seed)
     foundation(builder, turned, body)
@@ -138,7 +138,7 @@ def _dormers(builder: MeshBuilder, frame: ObjectFrame, style: HouseStyle, plaste
     run = 0.55 * style.depth / 2
     z = style.eaves + (style.depth / 2 - run) * style.pitch - 0.1
     for x in (-0.24 * style.width, 0.24 * style.width):
-        turned = frame.moved(x, -run, z, turn=-np.pi / 2)
+        turned = frame.child(x, -run, z, turn=-np.pi / 2)
         body = Box(x0=-1.6, x1=0.15, y0=-0.7, y1=0.7, z0=0, z1=1.05)
         glass = SurfaceMaterial(Material.GLASS, palette.DARK, style.seed)
         box(builder, turned, body, (plaster, glass, plaster, plaster))
@@ -175,7 +175,7 @@ def flat_block(
         if rng.random() < 0.5:
             unit = Box(x0=x - 0.8, x1=x + 0.8, y0=y - 0.6, y1=y + 0.6, z0=height, z1=height + 1.0)
             box(builder, frame, unit, metal, SurfaceMaterial(Material.PAINT, palette.METAL * 0.8))
-            frustum(builder, frame.moved(x, y), (0.45, 0.45), (height + 1.0, height + 1.08), dark, dark, 10)
+            frustum(builder, frame.child(x, y), (0.45, 0.45), (height + 1.0, height + 1.08), dark, dark, 10)
         else:
             light = Box(x0=x - 0.7, x1=x + 0.7, y0=y - 0.7, y1=y + 0.7, z0=height, z1=height + 0.45)
             skin = SurfaceMaterial(Material.PAINT, palette.TRIM)
@@ -216,8 +216,8 @@ def church(builder: MeshBuilder, frame: ObjectFrame, scale: float) -> None:
     box(builder, frame, nave, walls)
     gables(builder, frame, nave, 1.05, stone)
     pitched_roof(builder, frame, nave, 1.05, slate)
-    frustum(builder, frame.moved(8 * s, 0), (3.2 * s, 3.2 * s), (-2, 5 * s), stone, None, 14)
-    frustum(builder, frame.moved(8 * s, 0), (3.5 * s, 0), (5 * s, 7.4 * s), slate, None, 14)
+    frustum(builder, frame.child(8 * s, 0), (3.2 * s, 3.2 * s), (-2, 5 * s), stone, None, 14)
+    frustum(builder, frame.child(8 * s, 0), (3.5 * s, 0), (5 * s, 7.4 * s), slate, None, 14)
     for y in (-5.6 * s, 5.6 * s):  # side aisles under lean-to roofs
         aisle = Box(x0=-5 * s, x1=6 * s, y0=min(y, 0.6 * y), y1=max(y, 0.6 * y), z0=0, z1=3.4 * s)
         foundation(builder, frame, aisle)
@@ -225,7 +225,7 @@ def church(builder: MeshBuilder, frame: ObjectFrame, scale: float) -> None:
         edge = [(-5.3 * s, y * 1.05, 3.3 * s), (6.3 * s, y * 1.05, 3.3 * s)]
         wall = [(6.3 * s, 0.7 * y, 5.2 * s), (-5.3 * s, 0.7 * y, 5.2 * s)]
         face(builder, frame, np.array(edge + wall if y < 0 else edge[::-1] + wall[::-1]), slate)
-    _tower(builder, frame.moved(-9 * s, 0), s, stone)
+    _tower(builder, frame.child(-9 * s, 0), s, stone)
 
 
 def _tower(builder: MeshBuilder, frame: ObjectFrame, s: float, stone: SurfaceMaterial) -> None:
@@ -255,7 +255,7 @@ def barn(builder: MeshBuilder, frame: ObjectFrame) -> None:
     for x in (-3.0, 3.0):
         door = np.array([(x - 1.6, -4.56, 0), (x + 1.6, -4.56, 0), (x + 1.6, -4.56, 3.2), (x - 1.6, -4.56, 3.2)])
         face(builder, frame, door, SurfaceMaterial(Material.PAINT, palette.TRIM))
-    silo = frame.moved(11.5, 1.5)
+    silo = frame.child(11.5, 1.5)
     steel = SurfaceMaterial(Material.PAINT, palette.METAL)
     frustum(builder, silo, (2.1, 2.1), (-2, 9), steel, None, 18)
     frustum(builder, silo, (2.1, 0), (9, 10.4), SurfaceMaterial(Material.PAINT, palette.METAL * 0.8), None, 18)

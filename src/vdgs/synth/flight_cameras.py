@@ -70,7 +70,7 @@ def make_flight_cameras(options: ResolvedOptions, town: Town) -> list[Camera]:
     )
     cameras = []
     for (x, y), lean, turn, climb in zip(
-        mission.place, mission.tilt, mission.heading, mission.altitude_factor, strict=True
+        mission.position_xy, mission.tilt, mission.heading, mission.altitude_factor, strict=True
     ):
         x, y = x + rng.normal(0, 0.012 * options.extent_m), y + rng.normal(0, 0.012 * options.extent_m)
         ground = float(town.terrain.height_without_ponds(x, y))

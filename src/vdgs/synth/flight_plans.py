@@ -26,7 +26,7 @@ _GOLDEN = np.pi * (3 - 5**0.5)
 class FlightPlan:
     """place [n, 2] m; tilt from straight down and heading clockwise from north [n] rad; climb [n]."""
 
-    place: np.ndarray
+    position_xy: np.ndarray
     tilt: np.ndarray
     heading: np.ndarray
     altitude_factor: np.ndarray

@@ -32,7 +32,7 @@ class FlightStats:
     share_below: dict[int, float]
 
     @property
-    def line(self) -> str:
+    def summary(self) -> str:
         """For people, in one line."""
         quantiles = ", ".join(f"{share} %: {value:g}" for share, value in self.quantiles.items())
         return (
@@ -54,4 +54,4 @@ def sample_visible_points(
 def compute_flight_stats(views: np.ndarray, photographs: int) -> FlightStats:
     """The distribution of V [n] in numbers."""
     found = visibility_stats(views.astype(np.int64))
-    return FlightStats(photographs, found.mean, found.quantiles, found.gini, found.share_below)
+    return FlightStats(photographs, found.mean, found.quantiles, found.gini, found.fraction_below)

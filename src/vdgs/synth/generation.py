@@ -112,8 +112,8 @@ def _write_capture(folder: Path, options: ResolvedOptions, tell: ProgressCallbac
         points=len(cloud.points),
         noise_px=options.noise_px,
         truth=_TRUTH_NOTE if options.truth else "",
-        imbalance=found.line,
-        options="\n".join(f"- {line}" for line in options.lines),
+        imbalance=found.summary,
+        options="\n".join(f"- {line}" for line in options.to_lines),
     )
     (folder / "capture.md").write_text(note, encoding="utf-8")
     return found

@@ -33,7 +33,7 @@ def write_cameras(folder: Path, names: list[str], cameras: list[Camera], gains: 
 def write_points(folder: Path, cloud: SparseCloud) -> None:
     """`points.npz`: row k belongs to the point with id k + 1, column k to the image with id k + 1."""
     np.savez_compressed(
-        folder / "points.npz", places=cloud.places, visibility=cloud.visibility, outliers=cloud.outliers
+        folder / "points.npz", places=cloud.true_points, visibility=cloud.visibility, outliers=cloud.outliers
     )
 
 

@@ -116,7 +116,7 @@ class ResolvedOptions:
     workers: int
 
     @property
-    def lines(self) -> list[str]:
+    def to_lines(self) -> list[str]:
         """One `name: value` a line, for people; without what does not change the result."""
         stated = replace(self, workers=0)
         return [f"{name}: {value}" for name, value in vars(stated).items() if name != "workers"]

@@ -109,7 +109,7 @@ def playground(builder: MeshBuilder, frame: ObjectFrame) -> None:
     box(builder, frame, Box(x0=-1, x1=1, y0=-1, y1=1, z0=1.3, z1=1.45), yellow, yellow)
     box(builder, frame, Box(x0=-1.1, x1=1.1, y0=-1.1, y1=1.1, z0=2.6, z1=3.6), red, None, inset=(1.08, 1.08))
     face(builder, frame, np.array([(1, -0.4, 1.4), (3.6, -0.4, 0.2), (3.6, 0.4, 0.2), (1, 0.4, 1.4)]), yellow)
-    swing = frame.moved(-4.0, 0)
+    swing = frame.child(-4.0, 0)
     box(builder, swing, Box(x0=-0.06, x1=0.06, y0=-1.8, y1=1.8, z0=2.1, z1=2.25), red, red)
     for y in (-1.8, 1.8):
         for foot in (-0.9, 0.9):

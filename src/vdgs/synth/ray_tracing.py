@@ -43,9 +43,9 @@ class RayTracer:
         self._scene = EmbreeScene(robust=True)
         self._mesh = TriangleMesh(self._scene, mesh.vertices, mesh.faces)
         # the first ray builds the hierarchy; do it here, before threads share the scene
-        self.cast(np.zeros((1, 3), np.float32), np.array([[0, 0, 1]], np.float32))
+        self.intersect(np.zeros((1, 3), np.float32), np.array([[0, 0, 1]], np.float32))
 
-    def cast(self, origins: np.ndarray, directions: np.ndarray) -> RayHits:
+    def intersect(self, origins: np.ndarray, directions: np.ndarray) -> RayHits:
         """The first triangle along each ray; origins, directions [n, 3] float32."""
         found = self._scene.run(
             np.ascontiguousarray(origins, np.float32),

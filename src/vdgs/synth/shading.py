@@ -101,7 +101,7 @@ def radiance(
 
     `pixel_angle` is the angle between neighbouring pixels in radians.
     """
-    hits = tracer.cast(origins, directions)
+    hits = tracer.intersect(origins, directions)
     light = sky_colour(directions)
     met = np.flatnonzero(hits.triangle >= 0)
     if not len(met):

@@ -18,16 +18,16 @@ class ObjectFrame:
     z: float
     angle: float
 
-    def world(self, local: np.ndarray) -> np.ndarray:
+    def to_world(self, local: np.ndarray) -> np.ndarray:
         """Local points [..., 3] to the world."""
         local = np.asarray(local, np.float64)
         cos, sin = np.cos(self.angle), np.sin(self.angle)
         x, y = local[..., 0], local[..., 1]
         return np.stack([self.x + cos * x - sin * y, self.y + sin * x + cos * y, self.z + local[..., 2]], -1)
 
-    def moved(self, x: float, y: float, z: float = 0.0, turn: float = 0.0) -> ObjectFrame:
+    def child(self, x: float, y: float, z: float = 0.0, turn: float = 0.0) -> ObjectFrame:
         """The frame of a thing that stands at local (x, y, z), turned by `turn` radians."""
-        px, py, pz = self.world(np.array([x, y, z]))
+        px, py, pz = self.to_world(np.array([x, y, z]))
         return ObjectFrame(float(px), float(py), float(pz), self.angle + turn)
 
 
@@ -66,7 +66,7 @@ class SurfaceMaterial:
 
 def face(builder: MeshBuilder, frame: ObjectFrame, corners: np.ndarray, skin: SurfaceMaterial) -> None:
     """One planar polygon given in local coordinates."""
-    builder.polygon(frame.world(corners), skin.material, skin.colour, skin.seed)
+    builder.polygon(frame.to_world(corners), skin.material, skin.colour, skin.seed)
 
 
 def box(
@@ -78,7 +78,7 @@ def box(
     inset: tuple[float, float] = (0.0, 0.0),
 ) -> None:
     """A box without a bottom; `inset` pulls the top edges in (x, y), `top` None leaves it open."""
-    corners = frame.world(shape.corners(*inset))
+    corners = frame.to_world(shape.corners(*inset))
     skins = sides if isinstance(sides, tuple) else (sides,) * 4
     for ring, skin in zip(corners[SIDES], skins, strict=True):
         builder.polygon(ring, skin.material, skin.colour, skin.seed)
@@ -100,7 +100,7 @@ def frustum(
     ring = np.stack([np.cos(angle), np.sin(angle)], 1)
     low = np.column_stack([ring * radii[0], np.full(sides, heights[0])])
     high = np.column_stack([ring * max(radii[1], 1e-3), np.full(sides, heights[1])])
-    low, high = frame.world(low), frame.world(high)
+    low, high = frame.to_world(low), frame.to_world(high)
     for quad in np.stack([low, np.roll(low, -1, 0), np.roll(high, -1, 0), high], axis=1):
         builder.polygon(quad, skin.material, skin.colour, skin.seed)
     if cap is not None:

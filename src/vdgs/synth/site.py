@@ -57,7 +57,7 @@ class Site:
 
     def level(self, frame: ObjectFrame, width: float, depth: float) -> ObjectFrame:
         """The frame lifted so that no corner of a footprint lies below the ground."""
-        corners = frame.world(np.array([(sx * width / 2, sy * depth / 2, 0) for sx in (-1, 0, 1) for sy in (-1, 0, 1)]))
+        corners = frame.to_world(np.array([(sx * width / 2, sy * depth / 2, 0) for sx in (-1, 0, 1) for sy in (-1, 0, 1)]))
         top = float(self.terrain.height(corners[:, 0], corners[:, 1]).max())
         return ObjectFrame(frame.x, frame.y, top + 0.1, frame.angle)
 
@@ -80,7 +80,7 @@ class Site:
 
     def footprint(self, frame: ObjectFrame, x: tuple[float, float], y: tuple[float, float]) -> None:
         """Mark what a building covers, so that light is not baked inside it."""
-        corners = frame.world(np.array([(x[0], y[0], 0), (x[1], y[0], 0), (x[1], y[1], 0), (x[0], y[1], 0)]))
+        corners = frame.to_world(np.array([(x[0], y[0], 0), (x[1], y[0], 0), (x[1], y[1], 0), (x[0], y[1], 0)]))
         self.zones.paint(corners[:, :2], LandUse.BUILDING)
 
     def stroke(

@@ -38,7 +38,7 @@ class SparseCloud:
     visibility [n, images]: in the frame and not occluded (a superset of the observations); outliers [n]: matched
     wrongly, so that the point is not where its place is."""
 
-    places: np.ndarray
+    true_points: np.ndarray
     points: np.ndarray
     colours: np.ndarray
     errors: np.ndarray
@@ -60,7 +60,7 @@ def sample_seed_points(
     row, column = np.divmod(chosen, camera.width)
     pixels = np.stack([column, row], 1) + rng.uniform(0.02, 0.98, (len(chosen), 2))
     origins, directions = pixel_rays(camera, pixels)
-    hits = tracer.cast(origins, directions)
+    hits = tracer.intersect(origins, directions)
     met = (hits.triangle >= 0) & (hits.distance < 600)
     places = origins + directions.astype(np.float64) * hits.distance[:, None]
     return SeedPoints(places[met], image[row, column][met])
@@ -158,6 +158,6 @@ def make_sparse_cloud(
     errors = np.bincount(point, residual, len(places)) / np.maximum(np.bincount(point, minlength=len(places)), 1)
     wrong = np.zeros(len(places), bool)
     return SparseCloud(
-        places=places, points=points, colours=colours, errors=errors, observed_point=point, observed_image=image,
+        true_points=places, points=points, colours=colours, errors=errors, observed_point=point, observed_image=image,
         observed_px=observed, visibility=visible, outliers=wrong,
     )  # fmt: skip

@@ -42,7 +42,7 @@ def _tower(site: Site, frame: ObjectFrame, storeys: int) -> None:
     roof = SurfaceMaterial(Material.FLAT_ROOF, palette.pick(rng, palette.FLAT_ROOF), float(rng.random()))
     z = 0.0
     for size, floors, skin in (((16.0, 15.0), 2, pale), ((11.5, 11.0), storeys, wall), ((6.5, 6.0), 1, pale)):
-        flat_block(builder, frame.moved(0, 0, z), size, floors, (skin, roof), rng)
+        flat_block(builder, frame.child(0, 0, z), size, floors, (skin, roof), rng)
         z += floors * _STOREY + 0.6
     mast = SurfaceMaterial(Material.PAINT, palette.METAL)
-    frustum(builder, frame.moved(2.2, 2.0), (0.16, 0.05), (z, z + 5.0), mast, mast, 6)
+    frustum(builder, frame.child(2.2, 2.0), (0.16, 0.05), (z, z + 5.0), mast, mast, 6)

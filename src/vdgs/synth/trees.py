@@ -117,7 +117,7 @@ def _plant(
     normals = (crown.normals / size) @ turn.T
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     builder.part(
-        at.world(crown.vertices * size), crown.faces, Material.FOLIAGE, colour, seed,
+        at.to_world(crown.vertices * size), crown.faces, Material.FOLIAGE, colour, seed,
         uv=crown.openness, panel=size[[0, 2]], normals=normals,
     )  # fmt: skip
 
@@ -143,7 +143,7 @@ def tree(
         frustum(builder, at, (0.25, 0.2), (-0.5, 0.2 * tall), bark, None, 6)
         radius = tall * rng.uniform(0.2, 0.27)
         size = np.array([radius, radius, 0.46 * tall])
-        _plant(builder, _conifer_crown(variant), at.moved(0, 0, 0.56 * tall), size, colour, seed)
+        _plant(builder, _conifer_crown(variant), at.child(0, 0, 0.56 * tall), size, colour, seed)
         return
     leaves = {"blossom": palette.BLOSSOM}.get(kind, palette.LEAVES)
     if kind == "round" and rng.random() < 0.07:
@@ -153,7 +153,7 @@ def tree(
     if kind != "bush":
         frustum(builder, at, (0.05 * wide + 0.16, 0.12), (-0.5, tall - upright), bark, None, 7)
     size = np.array([wide, wide * rng.uniform(0.88, 1.1), upright])
-    centre = at.moved(0, 0, 0.35 * tall if kind == "bush" else tall - upright)
+    centre = at.child(0, 0, 0.35 * tall if kind == "bush" else tall - upright)
     _plant(builder, _round_crown(variant, detail), centre, size, palette.pick(rng, leaves, 0.15), seed)
 
 

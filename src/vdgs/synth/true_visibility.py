@@ -68,7 +68,7 @@ def view_ground_truth(
     shape = -(-camera.height // step), -(-camera.width // step)
     pixels = pixel_centres(camera).reshape(camera.height, camera.width, 2)[::step, ::step].reshape(-1, 2)
     origins, directions = pixel_rays(camera, pixels)
-    hits = tracer.cast(origins, directions)
+    hits = tracer.intersect(origins, directions)
     met = np.flatnonzero(hits.triangle >= 0)
     depth = np.full(len(pixels), np.inf, np.float32)
     depth[met] = hits.distance[met] * (directions[met] @ camera.forward.astype(np.float32))

@@ -26,7 +26,7 @@ class Checkpoint:
     """What a state holds: the iteration after which it was taken, small facts, tensors."""
 
     iteration: int
-    facts: Mapping[str, Any]
+    metadata: Mapping[str, Any]
     tensors: Mapping[str, Tensor]
 
 
@@ -36,7 +36,7 @@ def save_checkpoint(folder: Path, state: Checkpoint) -> None:
     write_atomic(path, lambda temporary: write_tensors(temporary, state.tensors))
     # Of what the disk has, not of what was meant: read again, from the system's cache.
     size, crc = file_size_and_crc32(path)
-    sidecar = {"iteration": state.iteration, "bytes": size, "crc32": crc, "facts": dict(state.facts)}
+    sidecar = {"iteration": state.iteration, "bytes": size, "crc32": crc, "facts": dict(state.metadata)}
     write_json(path.with_suffix(".json"), sidecar)
     for old in sidecars(folder)[:-NUM_CHECKPOINTS]:
         old.unlink()

@@ -121,9 +121,9 @@ def compensate(
     Gate `scaled` (choice): T_low times the plain gate, but at least twice and never more than the plain gate.
     `threshold` is the T_low that `low_visibility_mask` used.
     """
-    plain = growth.gate * growth.interval
-    gate = plain if config.gate == "literal" else min(plain, max(MIN_SCALED_DRAWS, threshold * plain))
-    return CompensatedGradient(compensation.cache * low[:, None], low, gate, to_sum=config.added_to == "sum")
+    plain = growth.min_draw_fraction * growth.every
+    gate = plain if config.min_draws == "literal" else min(plain, max(MIN_SCALED_DRAWS, threshold * plain))
+    return CompensatedGradient(compensation.cache * low[:, None], low, gate, to_sum=config.target == "sum")
 
 
 def cycle_log(

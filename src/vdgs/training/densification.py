@@ -38,7 +38,7 @@ class CompensatedGradient:
     #: The anchors of L.
     low: Bool[Tensor, " n"]
     #: An offset of L with g_k > 0 is judged once it was drawn more often than this (never later than without).
-    gate: float
+    min_draws: float
     #: Added to the sum of an offset's gradients, before it is divided by how often it was drawn; else to their mean.
     to_sum: bool = False
 
@@ -52,7 +52,7 @@ class DensificationDecision:
     """What one growth step does to the anchors: first append `added`, then keep `kept` of all."""
 
     added: Anchors
-    kept: Bool[Tensor, " n"]
+    keep_mask: Bool[Tensor, " n"]
     pruned: int
     #: New anchors in cells with at least one parent of low visibility, and the other new anchors.
     grown_low: int
@@ -101,13 +101,13 @@ def decide_densification(
     anchors that were, as upstream does; the others keep counting.
     """
     judged = _judged(statistics, config, compensated)
-    parents = _parents(statistics, judged, config.threshold, compensated)
+    parents = _parents(statistics, judged, config.grad_threshold, compensated)
     taken = [anchors.positions] if frozen_positions is None else [anchors.positions, frozen_positions]
     added, grown_low = _grow(anchors, parents, taken, voxel, config, generator, growth_mask)
     statistics.gradient[judged] = 0
     statistics.drawn[judged] = 0
 
-    old_enough = statistics.seen > config.prune_view_fraction * config.interval
+    old_enough = statistics.seen > config.prune_view_fraction * config.every
     faint = statistics.opacity < config.prune_opacity * statistics.seen
     pruned = old_enough & faint
     statistics.opacity[old_enough] = 0
@@ -119,9 +119,9 @@ def _judged(
     statistics: DensificationStats, config: DensifyConfig, compensated: CompensatedGradient | None
 ) -> Bool[Tensor, "n k"]:
     """Offsets that were drawn often enough to be judged."""
-    judged = statistics.drawn > config.gate * config.interval
+    judged = statistics.drawn > config.min_draw_fraction * config.every
     if compensated is not None:
-        judged |= (statistics.drawn > compensated.gate) & (compensated.added > 0)
+        judged |= (statistics.drawn > compensated.min_draws) & (compensated.added > 0)
     return judged
 
 
@@ -153,8 +153,8 @@ def _grow(
 ) -> tuple[Anchors, int]:
     """New anchors, at the centres of empty cells that hold a parent's Gaussian, and how many have a parent in L."""
     grown, grown_low = anchors.select(parents.index[:0]), 0
-    for level in range(config.levels):
-        parents = parents.select(parents.gradient >= config.threshold * 2.0**level)
+    for level in range(config.num_levels):
+        parents = parents.select(parents.gradient >= config.grad_threshold * 2.0**level)
         room = config.max_anchors - len(anchors) - len(grown) if config.max_anchors else None
         if not len(parents) or (room is not None and room <= 0):
             break  # later levels ask for more

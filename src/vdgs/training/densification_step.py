@@ -32,13 +32,13 @@ def densify(state: TrainingState, stage: TrainingProblem) -> Growth:
     generator = torch.Generator().manual_seed(config.seed * 1_000_003 + state.iteration)
     compensated, share, threshold = _compensate(state, stage)
     decision = decide_densification(
-        state.anchors, state.statistics, stage.voxel_size, config.growth, generator,
+        state.anchors, state.statistics, stage.voxel_size, config.densify, generator,
         compensated=compensated,
-        frozen_positions=None if stage.surroundings is None else stage.surroundings.anchors.positions,
-        growth_mask=stage.may_hold,
+        frozen_positions=None if stage.frozen_anchors is None else stage.frozen_anchors.anchors.positions,
+        growth_mask=stage.growth_mask,
     )  # fmt: skip
     before, added = len(state.anchors), len(decision.added)
-    kept = torch.cat([decision.kept, decision.kept.new_ones(added)])
+    kept = torch.cat([decision.keep_mask, decision.keep_mask.new_ones(added)])
     trim_heap()
     largest = stage.max_log_scale_at(decision.added.positions)
     new = {"anchors": decision.added.tensors(), "largest": {"log_scale": largest}}
@@ -47,8 +47,8 @@ def densify(state: TrainingState, stage: TrainingProblem) -> Growth:
     if state.compensation is not None:
         begin_cycle(state.compensation, state.statistics)
     cycle = {} if compensated is None else cycle_log(compensated, share, threshold, decision, config.compensation)
-    if config.growth.max_anchors:
-        cycle["budget_reached"] = before + added >= config.growth.max_anchors
+    if config.densify.max_anchors:
+        cycle["budget_reached"] = before + added >= config.densify.max_anchors
     return {"grown": added, "pruned": decision.pruned, "cycle": cycle}
 
 
@@ -61,7 +61,7 @@ def _compensate(state: TrainingState, stage: TrainingProblem) -> tuple[Compensat
     share = visibility_ratio(state.anchors.positions, cameras)
     low, threshold = low_visibility_mask(share, config.compensation)
     update_cache(state.compensation, state.statistics, low, config.compensation)
-    return compensate(state.compensation, low, threshold, config.growth, config.compensation), share, threshold
+    return compensate(state.compensation, low, threshold, config.densify, config.compensation), share, threshold
 
 
 def sort_morton(state: TrainingState) -> None:

@@ -24,7 +24,7 @@ def crop_to_gradient_support(stage: TrainingProblem, splats: Splats, camera: Cam
 
     On a card the whole box is drawn: the host would wait for the card's answer.
     """
-    around = stage.surroundings
+    around = stage.frozen_anchors
     if around is None or not len(around.anchors) or stage.device.type != "cpu":
         return box
     part = splat_roi(splats, camera)

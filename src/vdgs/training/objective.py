@@ -41,13 +41,13 @@ def compute_loss(
     exposure = decoder.exposure_for_image(image_index)
     shown = image if exposure is None else apply_exposure(image, exposure)
     kernels = get_backend(image.device)
-    photometric = kernels.photometric_loss(shown, target.image, target.mask, ssim_weight=config.loss.ssim_weight)
+    photometric = kernels.photometric_loss(shown, target.image, target.mask, ssim_weight=config.loss.ssim_lambda)
     loss = photometric.loss.detach()
     fitted = [decoder.exposure] if decoder.exposure is not None and decoder.exposure.requires_grad else []
     found = torch.autograd.grad(photometric.loss, [image, *fitted])
     for tensor, gradient in zip(fitted, found[1:], strict=True):
         tensor.grad = gradient
-    if target.share != 1.0:
+    if target.valid_fraction != 1.0:
         for each in found:
-            each.mul_(target.share)
+            each.mul_(target.valid_fraction)
     return LossGradients(loss=loss, l1=photometric.l1, ssim=photometric.ssim, shown=shown.detach(), image=found[0])

@@ -42,7 +42,7 @@ class AnchorOptimizer:
     updates: Int32[Tensor, " n"]
 
     @staticmethod
-    def start(anchors: Anchors, decoder: Decoder) -> AnchorOptimizer:
+    def zeros(anchors: Anchors, decoder: Decoder) -> AnchorOptimizer:
         trained = {name: tensor for name, tensor in anchors.tensors().items() if name in TRAINED_TENSORS}
         updates = torch.zeros_like(anchors.positions[:, 0], dtype=torch.int32)
         return AnchorOptimizer(AdamMoments.zeros(trained), AdamMoments.zeros(decoder.tensors()), updates)

@@ -40,7 +40,7 @@ def _epoch(epoch: int, count: int, seed: int, shares: tuple[float, ...] | None) 
 def downscale_at(iteration: int, config: TrainConfig) -> int:
     """Factor by which images are shrunk at this iteration (from 0)."""
     share = iteration / config.iterations
-    return [factor for start, factor in config.resolutions if share >= start][-1]
+    return [factor for start, factor in config.resolution_schedule if share >= start][-1]
 
 
 def views_in_cycle(iteration: int, stage: TrainingProblem) -> list[int]:
@@ -48,12 +48,12 @@ def views_in_cycle(iteration: int, stage: TrainingProblem) -> list[int]:
 
     A cycle lasts from one growth decision to the next; the first one starts with the statistics.
     """
-    growth = stage.config.growth
-    begin = iteration - growth.interval
+    growth = stage.config.densify
+    begin = iteration - growth.every
     if begin < growth.start:  # no decision was made before
         begin = growth.stats_start
     used = range(max(min(begin, iteration - 1), 0), iteration)
-    return sorted({view_at(each, stage.image_count, stage.config.seed, stage.shares) for each in used})
+    return sorted({view_at(each, stage.num_images, stage.config.seed, stage.view_weights) for each in used})
 
 
 def view_sampling_weights(config: TrainConfig, anchors: Anchors, cameras: Sequence[Camera]) -> tuple[float, ...] | None:
@@ -62,7 +62,7 @@ def view_sampling_weights(config: TrainConfig, anchors: Anchors, cameras: Sequen
     Roots, because a view with few votes also costs little (`training.crops`): a mean varies least for what it costs
     if strata are drawn in proportion to their weight over the root of their cost (Cochran, 1977, section 5.5).
     """
-    if config.sampling == "even":
+    if config.view_sampling == "even":
         return None
     votes = visibility_sampling_weights(anchors.positions, cameras)
-    return votes if config.sampling == "shares" else tuple(math.sqrt(share) for share in votes)
+    return votes if config.view_sampling == "shares" else tuple(math.sqrt(share) for share in votes)

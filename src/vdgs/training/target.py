@@ -50,7 +50,7 @@ class TrainingTarget:
     #: The share of the photograph's pixels that count in this part. Gradients are multiplied by it: those of a mean
     #: over the part become those of a mean over the whole picture, in which thresholds of growth are given (but for
     #: SSIM within its window of the part's border, where it sees nothing beyond).
-    share: float = 1.0
+    valid_fraction: float = 1.0
 
 
 def crop_box(stage: TrainingProblem, view: int, downscale: int, iteration: int) -> PixelBox:
@@ -70,7 +70,7 @@ def make_target(stage: TrainingProblem, view: int, downscale: int, box: PixelBox
     share = 1.0 if camera is whole else count_valid_pixels(mask, camera) / max(of_whole, 1)
     image = upload(image[inside], stage.device)
     return TrainingTarget(
-        image=image, mask=None if mask is None else upload(mask, stage.device), camera=camera, share=share
+        image=image, mask=None if mask is None else upload(mask, stage.device), camera=camera, valid_fraction=share
     )
 
 

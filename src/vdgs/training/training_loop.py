@@ -65,7 +65,7 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
     """
     config, iteration = stage.config, state.iteration
     downscale = downscale_at(iteration, config)
-    view = view_at(iteration, stage.image_count, config.seed, stage.shares)
+    view = view_at(iteration, stage.num_images, config.seed, stage.view_weights)
     box = crop_box(stage, view, downscale, iteration)
     camera = crop_camera(stage.images.camera(view, downscale), box)
 
@@ -89,11 +89,11 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
     psnr = (
         training_psnr(compared.shown, target.image, target.mask) if (iteration + 1) % PSNR_LOG_INTERVAL == 0 else None
     )
-    state.whole = False
+    state.is_consistent = False
     _move(state, stage, rows, gradients, weights, camera)
 
-    growing = iteration + 1 <= config.growth.until * config.iterations
-    if growing and iteration + 1 > config.growth.stats_start:
+    growing = iteration + 1 <= config.densify.stop_fraction * config.iterations
+    if growing and iteration + 1 > config.densify.stats_start:
         # Seen is what V counts too: an anchor beside the picture may touch it, but is not to blame for showing nothing.
         kernels = get_backend(stage.device)
         inside = kernels.mark_visible(state.anchors.positions[rows], camera)
@@ -102,7 +102,7 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
         )
     state.iteration += 1
     report = StepReport(loss=value, l1=l1, ssim=ssim, visible=len(rows), splats=len(drawn.source))
-    if growing and state.iteration >= config.growth.start and state.iteration % config.growth.interval == 0:
+    if growing and state.iteration >= config.densify.start and state.iteration % config.densify.every == 0:
         report = replace(report, **densify(state, stage))
     if state.iteration % SORT_INTERVAL == 0:
         sort_morton(state)
@@ -112,14 +112,14 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
     if averaged:
         _average(state)
     _smooth(state, value, psnr)
-    state.whole = True
+    state.is_consistent = True
     return report
 
 
 @torch.no_grad()
 def _surroundings(stage: TrainingProblem, view: int, camera: Camera, part: Camera) -> OrderedSplats | None:
     """The splats in a part of a view of the frozen anchors around a block: drawn, but out of autograd's sight."""
-    around = stage.surroundings
+    around = stage.frozen_anchors
     if around is None or not len(around.anchors):
         return None
     weights = around.decoder.weights_for_image(image_index_at(stage, view))
@@ -147,8 +147,8 @@ def _move(
 ) -> None:
     """One step of Adam for the visible anchors (where it is dense, for all) and the decoder."""
     config, step = stage.config, state.iteration + 1
-    rates = learning_rates_at(config.rates, state.iteration / config.iterations)
-    states, updates = state.optimizer.anchor_states(state.anchors, rates, config.early), state.optimizer.updates
+    rates = learning_rates_at(config.lr, state.iteration / config.iterations)
+    states, updates = state.optimizer.anchor_states(state.anchors, rates, config.lr_warm_boost), state.optimizer.updates
     dense = config.optimizer == "dense"
     if dense:
         updates.fill_(state.iteration)
@@ -172,10 +172,10 @@ def _bound_sizes(state: TrainingState) -> None:
 
 def _average(state: TrainingState) -> None:
     """Count the model in the mean that the stage ends with."""
-    if state.average is None:
-        state.average = ModelAverage.of(state.anchors, state.decoder)
+    if state.model_average is None:
+        state.model_average = ModelAverage.of(state.anchors, state.decoder)
     else:
-        state.average.add(state.anchors, state.decoder)
+        state.model_average.add(state.anchors, state.decoder)
 
 
 def _smooth(state: TrainingState, loss: float, psnr: float | None) -> None:
@@ -209,7 +209,7 @@ def train(
             return False
         ahead = range(state.iteration + 1, min(state.iteration + 1 + prefetch, config.iterations))
         for iteration in ahead:
-            view = view_at(iteration, stage.image_count, config.seed, stage.shares)
+            view = view_at(iteration, stage.num_images, config.seed, stage.view_weights)
             stage.images.prefetch([view], downscale_at(iteration, config))
         report = train_step(state, stage)
         after_step(state, report)

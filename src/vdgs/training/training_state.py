@@ -53,7 +53,7 @@ class TrainingState:
     #: Remembered gradients of compensated growth; None where growth is plain.
     compensation: CompensationState | None = None
     #: Mean of the last models, once it has begun (`averaging.counts_in_mean`).
-    average: ModelAverage | None = None
+    model_average: ModelAverage | None = None
     #: Smoothed loss, the smallest it has been, smoothed PSNR: of what is drawn of training views.
     loss: float = math.nan
     best_loss: float = math.inf
@@ -62,7 +62,7 @@ class TrainingState:
     seconds: float = 0.0
     peak_memory_bytes: int = 0
     #: False while a step changes tensors: one that is broken off there leaves no state that may be saved.
-    whole: bool = True
+    is_consistent: bool = True
 
     def groups(self) -> dict[str, TensorGroup]:
         """All that is kept per anchor, by the names under which it is saved."""
@@ -74,8 +74,8 @@ class TrainingState:
         }  # fmt: skip
         if self.compensation is not None:
             groups["compensation"] = self.compensation.tensors()
-        if self.average is not None:
-            groups["average.anchors"] = self.average.anchors
+        if self.model_average is not None:
+            groups["average.anchors"] = self.model_average.anchors
         return groups
 
     def take_groups(self) -> dict[str, TensorGroup]:
@@ -92,16 +92,16 @@ class TrainingState:
         self.max_log_scale = groups["largest"]["log_scale"]
         if self.compensation is not None:
             self.compensation = CompensationState(**groups["compensation"])
-        if self.average is not None:
-            self.average.anchors = groups["average.anchors"]
+        if self.model_average is not None:
+            self.model_average.anchors = groups["average.anchors"]
 
     def result(self) -> tuple[Anchors, Decoder]:
         """What training has arrived at: the mean of the last models where there is one, else the last one."""
-        if self.average is None:
+        if self.model_average is None:
             return self.anchors, self.decoder
         return (
-            Anchors(self.anchors.positions, **self.average.anchors),
-            Decoder.from_tensors(self.average.decoder),
+            Anchors(self.anchors.positions, **self.model_average.anchors),
+            Decoder.from_tensors(self.model_average.decoder),
         )
 
     def model(
@@ -132,7 +132,7 @@ class TrainingProblem:
 
     config: TrainConfig
     images: TrainingImages
-    image_count: int
+    num_images: int
     voxel_size: float
     #: How high the cameras fly above the ground, or how far they are from the scene (`captures.heights`), in units of
     #: the ground frame.
@@ -146,15 +146,15 @@ class TrainingProblem:
     #: The largest log-scale of Gaussians of anchors at places [p, 3]; None: any.
     max_log_scale: Callable[[Tensor], Tensor] | None = None
     #: What is drawn and never moves: ring and context of a block.
-    surroundings: FrozenAnchors | None = None
+    frozen_anchors: FrozenAnchors | None = None
     #: Which places [p, 3] may get new anchors; None: all.
-    may_hold: Callable[[Tensor], Tensor] | None = None
+    growth_mask: Callable[[Tensor], Tensor] | None = None
     #: How far the anchors at places [p, 3] move, from 0 to 1 of a full step; None: all of it.
     lr_mask: Callable[[Tensor], Tensor] | None = None
     #: Which training image of the whole capture each view is (for its appearance); None: the same number.
     image_indices: Sequence[int] | None = None
     #: How often each view is used, in proportion; None: all alike.
-    shares: tuple[float, ...] | None = None
+    view_weights: tuple[float, ...] | None = None
     #: The part of each view to be drawn, or of that what a block's splats reach (`training.reach`); None: all of all.
     crops: tuple[Crop, ...] | None = None
     #: Where the arithmetic is done. Photographs and places come to it.
@@ -191,7 +191,7 @@ def initial_state(anchors: Anchors, decoder: Decoder, stage: TrainingProblem) ->
         shared = stage.kind == "block" and name.startswith(("appearance", "exposure"))
         tensor.requires_grad_(not stage.frozen_decoder and not shared)
     compensation = CompensationState.zeros(n, k, device) if stage.config.compensation.enabled else None
-    optimiser = AnchorOptimizer.start(anchors, decoder)
+    optimiser = AnchorOptimizer.zeros(anchors, decoder)
     largest = stage.max_log_scale_at(anchors.positions)
     statistics = DensificationStats.zeros(n, k, device)
     return TrainingState(
@@ -211,18 +211,18 @@ def to_checkpoint(state: TrainingState) -> Checkpoint:
     groups["decoder"] = {name: tensor.detach() for name, tensor in state.decoder.tensors().items()}
     groups["first.decoder"] = state.optimizer.decoder.first
     groups["second.decoder"] = state.optimizer.decoder.second
-    if state.average is not None:
-        groups["average.decoder"] = state.average.decoder
+    if state.model_average is not None:
+        groups["average.decoder"] = state.model_average.decoder
     tensors = {f"{name}.{key}": tensor for name, group in groups.items() for key, tensor in group.items()}
     facts = {"loss": repr(state.loss), "best_loss": repr(state.best_loss), "psnr": repr(state.psnr),
              "seconds": state.seconds, "peak_memory_bytes": state.peak_memory_bytes,
-             "averaged": 0 if state.average is None else state.average.count}  # fmt: skip
+             "averaged": 0 if state.model_average is None else state.model_average.count}  # fmt: skip
     return Checkpoint(state.iteration, facts, tensors)
 
 
 def result_from_saved(saved: Checkpoint) -> tuple[Anchors, Decoder]:
     """As `TrainingState.result`, of a state that was saved."""
-    anchors, averaged = _group(saved, "anchors"), bool(saved.facts.get("averaged", 0))
+    anchors, averaged = _group(saved, "anchors"), bool(saved.metadata.get("averaged", 0))
     anchors |= _group(saved, "average.anchors") if averaged else {}
     return Anchors(**anchors), Decoder.from_tensors(_group(saved, "average.decoder" if averaged else "decoder"))
 
@@ -241,11 +241,11 @@ def from_checkpoint(saved: Checkpoint, stage: TrainingProblem) -> TrainingState:
 
     state = initial_state(Anchors(**group("anchors")), Decoder.from_tensors(group("decoder")), stage)
     state.optimizer.decoder = AdamMoments(group("first.decoder"), group("second.decoder"))
-    if averaged := saved.facts["averaged"]:
-        state.average = ModelAverage(averaged, group("average.anchors"), group("average.decoder"))
+    if averaged := saved.metadata["averaged"]:
+        state.model_average = ModelAverage(averaged, group("average.anchors"), group("average.decoder"))
     state.put_groups({name: group(name) for name in state.groups()})
     state.iteration = saved.iteration
-    state.loss, state.best_loss = float(saved.facts["loss"]), float(saved.facts["best_loss"])
-    state.psnr, state.seconds = float(saved.facts["psnr"]), float(saved.facts["seconds"])
-    state.peak_memory_bytes = int(saved.facts["peak_memory_bytes"])
+    state.loss, state.best_loss = float(saved.metadata["loss"]), float(saved.metadata["best_loss"])
+    state.psnr, state.seconds = float(saved.metadata["psnr"]), float(saved.metadata["seconds"])
+    state.peak_memory_bytes = int(saved.metadata["peak_memory_bytes"])
     return state

@@ -42,18 +42,18 @@ class RenderedTrainingView:
     volume: Float[Tensor, ""]
     pullback: RasterPullback
     #: What the gradients of means_px and conics of these splats may overwrite.
-    room: tuple[Tensor, Tensor]
+    scratch: tuple[Tensor, Tensor]
 
     @torch.no_grad()
     def backward(self, image: Float[Tensor, "h w 3"], volume_weight: float) -> SplatGradients:
         """Gradients of a loss: `image` by the picture, `volume_reg` by the mean volume. Call it once."""
         m = len(self.source)
-        found = self.pullback(image, None, None, out=self.room, count=m)
+        found = self.pullback(image, None, None, out=self.scratch, count=m)
         # In float32, as autograd divides.
         volume = float(torch.tensor(volume_weight) / m) if m else 0.0
         return SplatGradients(
             means_px=found.means_px, conics=found.conics, colours=found.colours, opacities=found.opacities,
-            volume=volume, source=self.source, colour_values=self.colours, opacity_values=self.opacities,
+            volume=volume, source=self.source, color_values=self.colours, opacity_values=self.opacities,
         )  # fmt: skip
 
 
@@ -70,8 +70,8 @@ def render_for_training(
     kernels = get_backend(drawn.means_px.device)
     raster, pullback = kernels.rasterize_vjp(drawn, background, camera.width, camera.height)
     return RenderedTrainingView(
-        image=raster.image, source=splats.source, colours=splats.colours, opacities=splats.opacities,
-        volume=splats.volume, pullback=pullback, room=(drawn.means_px[:m], drawn.conics[:m]),
+        image=raster.image, source=splats.source, colours=splats.colors, opacities=splats.opacities,
+        volume=splats.volume, pullback=pullback, scratch=(drawn.means_px[:m], drawn.conics[:m]),
     )  # fmt: skip
 
 

@@ -34,7 +34,7 @@ class AccessControl:
         """The cookie's name: browsers do not tell ports apart."""
         return f"vdgs_view_{self.port}"
 
-    def address(self) -> str:
+    def local_url(self) -> str:
         """What to open in a browser on this machine."""
         return self._url("localhost" if self.host in ALL_INTERFACES else self.host)
 

@@ -65,15 +65,15 @@ class ClientSession:
         return self._camera
 
     @property
-    def shown(self) -> DisplayOptions:
+    def display(self) -> DisplayOptions:
         return self._shown
 
     @property
-    def stand(self) -> CameraPose:
+    def pose(self) -> CameraPose:
         """Where they are and what they look at."""
         return CameraPose(np.array(self.client.camera.position), np.array(self.client.camera.look_at))
 
-    def show(self, **changes: Any) -> None:
+    def change_display(self, **changes: Any) -> None:
         """See something else from the same place."""
         with self._lock:
             self._shown = replace(self._shown, **changes)
@@ -96,7 +96,7 @@ class ClientSession:
         taken = self.scene.capture.views[index].camera
         with self._lock:
             self._arrived = False
-            self._shown = replace(self._shown, photograph=index)
+            self._shown = replace(self._shown, image_index=index)
             self._photograph.visible = True
         self.move_to(
             navigation.pose_from_camera(taken, camera_height(self.scene.capture)),
@@ -109,16 +109,16 @@ class ClientSession:
         model = self._shown.model if self._shown.model in names else self.scene.names[0]
         self._models.visible = len(self.scene.names) > 1
         self._legend_of = None
-        self.show(model=model)
+        self.change_display(model=model)
 
-    def tell(self, progress: str) -> None:
+    def set_progress(self, progress: str) -> None:
         """How far training is."""
         self._progress.content = progress
         self._training.visible = bool(progress)
 
-    def leave(self) -> None:
+    def close(self) -> None:
         self.path.stop()
-        self.scheduler.leave(self._seat)
+        self.scheduler.remove_session(self._seat)
 
     def _on_camera_moved(self, from_browser: bool = True) -> None:
         """Draw for where the camera is now: by the browser (`theirs`), which may still send older news after we told it
@@ -140,23 +140,23 @@ class ClientSession:
             self.scheduler.request_frame(self._seat, camera, self._shown)
 
     def _leave_photograph(self, camera: Camera) -> None:
-        index = self._shown.photograph
+        index = self._shown.image_index
         if index is None:
             return
         away = float(np.linalg.norm(self.scene.capture.views[index].camera.position - camera.position))
         if away <= _IMAGE_POSE_TOLERANCE * camera_height(self.scene.capture):
             self._arrived = True
         elif self._arrived:
-            self._shown = replace(self._shown, photograph=None)
+            self._shown = replace(self._shown, image_index=None)
             self._photograph.visible = False
 
     def _send_frame(self, frame: RenderedFrame) -> None:
         """Send a picture, and its legend once the camera rests. In the studio's thread."""
-        quality = _FULL_QUALITY if frame.full else _PREVIEW_QUALITY
-        self.client.scene.set_background_image(frame.picture, format="jpeg", jpeg_quality=quality)
+        quality = _FULL_QUALITY if frame.is_full else _PREVIEW_QUALITY
+        self.client.scene.set_background_image(frame.image, format="jpeg", jpeg_quality=quality)
         self.client.flush()
-        if frame.full:
-            self._show_legend(frame.shown)
+        if frame.is_full:
+            self._show_legend(frame.display)
 
     def _show_legend(self, display: DisplayOptions) -> None:
         if display.layer in ("colour", "blocks"):
@@ -177,9 +177,9 @@ class ClientSession:
         self.notify("This cannot be drawn", str(error))
         if not isinstance(error, VdgsError):
             self._console.print(f"[yellow]warning[/] a picture could not be drawn: {error!r}", highlight=False)
-        if self._shown.layer != "colour" or self._shown.photograph is not None:
+        if self._shown.layer != "colour" or self._shown.image_index is not None:
             self._layer.value = next(iter(LAYER_LABELS))
-            self.show(layer="colour", photograph=None)
+            self.change_display(layer="colour", photograph=None)
 
     def notify(self, title: str, body: str) -> None:
         self.client.add_notification(title, body, auto_close_seconds=8.0)
@@ -199,15 +199,15 @@ class ClientSession:
     def _build(self) -> None:
         gui = self.client.gui
         self._layer = gui.add_dropdown("Layer", tuple(LAYER_LABELS), hint=f"What is drawn: one of {len(LAYERS)} layers")
-        self._layer.on_update(lambda _: self.show(layer=LAYER_LABELS[self._layer.value]))
+        self._layer.on_update(lambda _: self.change_display(layer=LAYER_LABELS[self._layer.value]))
         self._legend = gui.add_image(np.full((2, _LEGEND_PX, 3), 255, np.uint8), format="png", visible=False)
         several = len(self.scene.names) > 1
         self._models = gui.add_dropdown("Model", tuple(MODEL_LABELS), visible=several)
         self._models.on_update(lambda _: self._choose_model())
         self._split = gui.add_slider("Coarse | merged", 0.0, 1.0, 0.01, 0.5, visible=False)
-        self._split.on_update(lambda _: self.show(split=float(self._split.value)))
+        self._split.on_update(lambda _: self.change_display(split=float(self._split.value)))
         self._photograph = gui.add_slider("Photograph | model", 0.0, 1.0, 0.01, 0.5, visible=False)
-        self._photograph.on_update(lambda _: self.show(photograph_split=float(self._photograph.value)))
+        self._photograph.on_update(lambda _: self.change_display(photograph_split=float(self._photograph.value)))
         self._build_views()
         self._build_overlays()
         self.place = PointPanel(self)
@@ -219,7 +219,7 @@ class ClientSession:
     def _choose_model(self) -> None:
         model = MODEL_LABELS[self._models.value]
         self._split.visible = model == "both"
-        self.show(model=model)
+        self.change_display(model=model)
 
     def _build_views(self) -> None:
         gui = self.client.gui
@@ -229,8 +229,8 @@ class ClientSession:
         def _(_: Any) -> None:
             change: dict[str, Callable[[], CameraPose]] = {
                 "All": lambda: navigation.overview_pose(self.scene.capture),
-                "From above": lambda: navigation.top_down_pose(self.stand),
-                "North up": lambda: navigation.north_up_pose(self.stand),
+                "From above": lambda: navigation.top_down_pose(self.pose),
+                "North up": lambda: navigation.north_up_pose(self.pose),
             }
             self.move_to(change[buttons.value](), np.radians(FOV_DEG))
 

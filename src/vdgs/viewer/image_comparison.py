@@ -77,7 +77,7 @@ class ImageComparison:
     def _compute_error_map(self, name: str, index: int) -> ImageErrorMap:
         view = self._scene.capture.views[index]
         camera, exposures = view.camera.limit_size(_MAX_COMPARE_PX), self._scene.exposures(name)
-        photograph = resize_area(self._scene.photographs.get(index), camera.width, camera.height)
+        photograph = resize_area(self._scene.images.get(index), camera.width, camera.height)
         raster = render(self._scene.model(name), camera, depth=True)
         assert raster.median_depth is not None
         drawn = raster.image.cpu().numpy()
@@ -105,7 +105,7 @@ def _reproject_error(
 
 def load_resized_image(scene: ViewerScene, index: int, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
     """A photograph at a size. Raises CaptureError if it cannot be read."""
-    pixels = scene.photographs.get(index).image.numpy()
+    pixels = scene.images.get(index).image.numpy()
     return np.ascontiguousarray(cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA))
 
 

@@ -45,8 +45,8 @@ class DisplayOptions:
     model: str = "merged"
     split: float = 0.5
     #: A photograph, by its number, laid over the picture left of `photograph_split`; None: no photograph.
-    photograph: int | None = None
-    photograph_split: float = 0.5
+    image_index: int | None = None
+    image_split: float = 0.5
 
 
 class Painter:
@@ -57,14 +57,14 @@ class Painter:
         self._comparison = ImageComparison(scene)
         self._depth: ColorScale | None = None
         #: Anchors that the last picture was drawn from: what its time is learned from.
-        self.drawn = 0
+        self.drawn_anchors = 0
 
-    def key(self, display: DisplayOptions) -> Hashable:
+    def cache_key(self, display: DisplayOptions) -> Hashable:
         """What a picture depends on beside the camera and what is shown: pictures of equal keys are equal."""
         depth = self._depth if display.layer == "depth" else None
         return self._scene.generation, None if depth is None else (depth.low, depth.high)
 
-    def settle(self, display: DisplayOptions, full_camera: Camera) -> None:
+    def update_depth_range(self, display: DisplayOptions, full_camera: Camera) -> None:
         """The camera has come to rest: the range of depths becomes that of what it sees."""
         if display.layer == "depth":
             from vdgs.rendering.scalar_maps import depth_range, depth_scale
@@ -80,16 +80,16 @@ class Painter:
         if display.layer == "depth":
             return self._depth
         if display.layer == "visibility":
-            return scalar_maps.visibility_scale(self._scene.seen(self._model(display)).cpu().numpy())
+            return scalar_maps.visibility_scale(self._scene.visibility(self._model(display)).cpu().numpy())
         if display.layer == "alpha":
             return scalar_maps.alpha_scale()
         return error_scale() if display.layer == "error" else None
 
-    def in_view(self, display: DisplayOptions, camera: Camera) -> int:
+    def count_visible_anchors(self, display: DisplayOptions, camera: Camera) -> int:
         """How many anchors a full picture is drawn from."""
         both = display.model == "both" and len(self._scene.names) > 1
         return sum(
-            self._scene.level(name, camera)[1] for name in (self._scene.names if both else [self._model(display)])
+            self._scene.get_level(name, camera)[1] for name in (self._scene.names if both else [self._model(display)])
         )
 
     def paint(
@@ -97,12 +97,12 @@ class Painter:
     ) -> UInt8[np.ndarray, "h w 3"]:
         """A picture, or rows of it: `camera` is `whole` or cropped from it, all columns. `most`: drawn from at most so
         many anchors."""
-        self.drawn = 0
+        self.drawn_anchors = 0
         if display.model == "both" and len(self._scene.names) > 1:
             picture = self._side_by_side(display, camera, full_camera, max_anchors)
         else:
             picture = self._render_model(self._model(display), display, camera, full_camera, max_anchors)
-        if display.photograph is not None:
+        if display.image_index is not None:
             picture = self._with_image(display, camera, picture)
         return picture
 
@@ -112,14 +112,14 @@ class Painter:
     def _render_model(
         self, name: str, display: DisplayOptions, camera: Camera, full_camera: Camera, max_anchors: int | None
     ) -> UInt8[np.ndarray, "h w 3"]:
-        level, count = self._scene.level(name, camera, max_anchors)
-        self.drawn += count
+        level, count = self._scene.get_level(name, camera, max_anchors)
+        self.drawn_anchors += count
         if display.layer == "colour":
             return to_8bit(render(level.model, camera).image.cpu().numpy())
         if display.layer == "blocks":
             return _render_block_tints(level.model, level.of(self._scene.block_tint(name)), camera)
         if display.layer == "depth" and self._depth is None:
-            self.settle(display, full_camera)
+            self.update_depth_range(display, full_camera)
         scale = self.scale(display)
         assert scale is not None
         return scale.colorize(self._values(name, level, display, camera, full_camera))
@@ -130,7 +130,7 @@ class Painter:
         if display.layer == "depth":
             return _depth(level.model, camera)
         if display.layer == "visibility":
-            return render_scalar_map(level.model, level.of(self._scene.seen(name)), camera).cpu().numpy()
+            return render_scalar_map(level.model, level.of(self._scene.visibility(name)), camera).cpu().numpy()
         if display.layer == "alpha":
             return render(level.model, camera).alpha.cpu().numpy()
         return self._comparison.error_map(name, camera, full_camera)
@@ -150,9 +150,9 @@ class Painter:
         return _draw_divider(np.concatenate(parts, axis=1), edge)
 
     def _with_image(self, display: DisplayOptions, camera: Camera, picture: np.ndarray) -> UInt8[np.ndarray, "h w 3"]:
-        assert display.photograph is not None
-        edge = split_column(display.photograph_split, camera.width)
-        photograph, there = warp_image(self._scene, display.photograph, camera)
+        assert display.image_index is not None
+        edge = split_column(display.image_split, camera.width)
+        photograph, there = warp_image(self._scene, display.image_index, camera)
         there[:, edge:] = False
         return _draw_divider(np.where(there[..., None], photograph, picture), edge)
 
@@ -183,9 +183,9 @@ def _render_block_tints(model: AnchorModel, tints: Tensor, camera: Camera) -> UI
     rows, splats = decode_view(model, camera)
     k = model.anchors.offsets.shape[1]
     tint = tints[rows][splats.source.long() // k]
-    colours = (1 - _TINT_STRENGTH) * splats.colours.mean(dim=1, keepdim=True) + _TINT_STRENGTH * tint
+    colours = (1 - _TINT_STRENGTH) * splats.colors.mean(dim=1, keepdim=True) + _TINT_STRENGTH * tint
     background = splats.means_px.new_tensor(model.background)
-    raster = rasterize_splats(replace(splats, colours=colours.contiguous()), camera, background)
+    raster = rasterize_splats(replace(splats, colors=colours.contiguous()), camera, background)
     return to_8bit(raster.image.cpu().numpy())
 
 
@@ -200,4 +200,4 @@ def error_scale() -> ColorScale:
     ticks = tuple((value, f"≥ {value:.0%}" if value == _MAX_ERROR else f"{value:.0%}") for value in numbers)
     titles = ("difference from the nearest photograph", "error of the photograph", "error")
     paint: Callable[[np.ndarray], np.ndarray] = lambda values: np.asarray(colours(values / _MAX_ERROR))  # noqa: E731
-    return ColorScale(titles=titles, low=0.0, high=_MAX_ERROR, ticks=ticks, paint=paint)
+    return ColorScale(titles=titles, low=0.0, high=_MAX_ERROR, ticks=ticks, colormap=paint)

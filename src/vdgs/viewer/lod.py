@@ -28,11 +28,11 @@ class LodLevel:
     """A model, and which anchors of the whole one it holds; None: all."""
 
     model: AnchorModel
-    kept: Bool[Tensor, " n"] | None = None
+    mask: Bool[Tensor, " n"] | None = None
 
     def of(self, values: Tensor) -> Tensor:
         """What is known of all anchors, of those that it holds."""
-        return values if self.kept is None else values[self.kept]
+        return values if self.mask is None else values[self.mask]
 
 
 class LodPyramid:
@@ -70,8 +70,8 @@ def decimate(model: AnchorModel, factor: int) -> LodLevel:
     log_scales[:, 3:] += 0.5 * math.log(factor)
     sums = torch.cat([torch.zeros(1, dtype=torch.long), kept.long().cumsum(0).cpu()])
     parts, first = [], 0
-    for part in model.parts:
+    for part in model.decoder_spans:
         parts.append(replace(part, count=int(sums[first + part.count] - sums[first])))
         first += part.count
     fewer = Anchors(**{**anchors.tensors(), "log_scales": log_scales})
-    return LodLevel(replace(model, anchors=fewer, parts=tuple(parts)), kept)
+    return LodLevel(replace(model, anchors=fewer, decoder_spans=tuple(parts)), kept)

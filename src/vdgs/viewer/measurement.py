@@ -19,12 +19,12 @@ class Ruler:
     def clear(self) -> None:
         self._places = []
 
-    def corners(self) -> Float[np.ndarray, "n 3"]:
+    def points(self) -> Float[np.ndarray, "n 3"]:
         return np.array(self._places, np.float64).reshape(-1, 3)
 
     def distance(self) -> float:
         """From place to place, in space."""
-        return float(np.linalg.norm(np.diff(self.corners(), axis=0), axis=1).sum())
+        return float(np.linalg.norm(np.diff(self.points(), axis=0), axis=1).sum())
 
     def height_difference(self) -> float:
         """From the first place up to the last."""
@@ -32,7 +32,7 @@ class Ruler:
 
     def area(self) -> float:
         """Of the polygon of the places on the map (level), closed from the last to the first."""
-        x, y = self.corners()[:, :2].T
+        x, y = self.points()[:, :2].T
         return 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)))
 
     def to_markdown(self) -> str:
@@ -41,7 +41,7 @@ class Ruler:
             return ""
         if len(self._places) == 1:
             return "Click the next place."
-        level = float(np.linalg.norm(np.diff(self.corners()[:, :2], axis=0), axis=1).sum())
+        level = float(np.linalg.norm(np.diff(self.points()[:, :2], axis=0), axis=1).sum())
         lines = [f"distance **{self.distance():,.2f} {self._unit}** ({level:,.2f} level)"]
         lines.append(f"height difference **{self.height_difference():+,.2f} {self._unit}**, first to last")
         if len(self._places) > 2:

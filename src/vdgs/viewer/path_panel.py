@@ -49,7 +49,7 @@ class PathPanel:
         count = len(self.keyframes)
         self._words.content = f"{count} key frame{'' if count == 1 else 's'}." if count else "No key frames yet."
 
-    def text(self) -> str:
+    def to_json(self) -> str:
         """The file. Raises ValueError without key frames."""
         return path_json(self.keyframes, float(self._seconds.value), bool(self._closed.value))
 
@@ -58,7 +58,7 @@ class PathPanel:
         if not self.keyframes:
             self._visitor.notify("No key frames", "Add key frames first.")
             return
-        self._visitor.client.send_file_download(_FILE_NAME, self.text().encode())
+        self._visitor.client.send_file_download(_FILE_NAME, self.to_json().encode())
 
     def play(self) -> None:
         """Move along the path, as fast as the film will."""
@@ -84,6 +84,6 @@ class PathPanel:
             self._stopping.set()
 
     def _move_camera(self, camera: Camera) -> None:
-        distance = self._visitor.stand.distance
+        distance = self._visitor.pose.distance
         fov = 2.0 * float(np.arctan(0.5 * camera.height / camera.fy))
         self._visitor.move_to(CameraPose(camera.position.copy(), camera.position + distance * camera.forward), fov)

@@ -34,7 +34,7 @@ class ImageHit:
     #: Units of the ground frame that a pixel shows there.
     ground_sampling: float
     #: Nothing stands between.
-    free: bool
+    unoccluded: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class PickedPoint:
 
     position: Float[np.ndarray, "3"]
     #: V: training cameras whose pictures it lies in.
-    seen_by: int
+    visibility: int
     #: The block that owns it; None where the scene is not cut.
     block: int | None
     #: All photographs that it lies in, the test views too: those that see it freely first, then the nearest.
@@ -80,7 +80,7 @@ def pick_point(scene: ViewerScene, name: str, position: Float[np.ndarray, "3"]) 
             sights.append(_image_hit(model, view.camera, index, view.name, position))
     seen_by = sum(views[sight.index].split == "train" for sight in sights)
     owner = None if scene.blocks is None else int(scene.blocks.owner(position[None, :2])[0])
-    ordered = tuple(sorted(sights, key=lambda sight: (not sight.free, sight.ground_sampling)))
+    ordered = tuple(sorted(sights, key=lambda sight: (not sight.unoccluded, sight.ground_sampling)))
     return PickedPoint(position, seen_by, owner, ordered, coordinate_lines(scene, position))
 
 
@@ -104,7 +104,7 @@ def coordinate_lines(scene: ViewerScene, position: Float[np.ndarray, "3"]) -> tu
         latitude, longitude, height = geodetic_from_enu(position[None], ground.origin_geo, ground.axes_origin)[0]
         lines.append(f"{latitude:.7f}°, {longitude:.7f}°, {height:.2f} m (WGS 84)")
     for placement in scene.map_projections:
-        east, north, up = placement.places(position[None])[0]
+        east, north, up = placement.project(position[None])[0]
         lines.append(f"{east:,.2f}, {north:,.2f}, {up:,.2f} ({placement.name})")
     return tuple(lines)
 

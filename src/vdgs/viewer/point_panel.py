@@ -47,14 +47,14 @@ class PointPanel:
         if camera is None:
             return
         double = self._is_double(screen)
-        name = visitor.shown.model if visitor.shown.model in visitor.scene.names else visitor.scene.names[0]
+        name = visitor.display.model if visitor.display.model in visitor.scene.names else visitor.scene.names[0]
         x, y = screen[0] * camera.width, screen[1] * camera.height
         position = visitor.submit(lambda: pick_position(visitor.scene.model(name), camera, x, y))
         if position is None:
             self._words.content = "Nothing is drawn there."
             return
         if double and not self._measuring:
-            visitor.move_to(navigation.CameraPose(visitor.stand.position, position))
+            visitor.move_to(navigation.CameraPose(visitor.pose.position, position))
             return
         if self._measuring:
             self._measure(position)
@@ -83,7 +83,7 @@ class PointPanel:
         self._clear()
         self._place = point
         self._words.content = point_markdown(point)
-        radius = 0.008 * float(np.linalg.norm(point.position - visitor.stand.position))
+        radius = 0.008 * float(np.linalg.norm(point.position - visitor.pose.position))
         self._things.append(
             visitor.client.scene.add_icosphere("/place", radius, color=(255, 60, 40), position=tuple(point.position))
         )
@@ -96,14 +96,14 @@ class PointPanel:
                 picture = visitor.submit(partial(thumbnail, visitor.scene, sight))
                 if picture is None:
                     continue
-                label = sight.name + ("" if sight.free else " (hidden there)")
+                label = sight.name + ("" if sight.unoccluded else " (hidden there)")
                 self._things.append(gui.add_image(picture, label=label, format="jpeg", jpeg_quality=85))
                 button = gui.add_button("Look from there", hint=sight.name)
                 button.on_click(lambda _, index=sight.index: visitor.view_image(index))
                 self._things.append(button)
 
     def _navigate(self, how: str) -> None:
-        place, stand = self._place, self._visitor.stand
+        place, stand = self._place, self._visitor.pose
         if place is None:
             return
         if how == "Orbit":
@@ -143,7 +143,7 @@ class PointPanel:
             self._line.remove()
             self._line = None
         self._measured.content = self._ruler.to_markdown()
-        points = self._ruler.corners()
+        points = self._ruler.points()
         if len(points) == 1:
             radius = 4e-3 * camera_height(self._visitor.scene.capture)
             self._line = self._visitor.client.scene.add_icosphere(
@@ -158,9 +158,9 @@ class PointPanel:
 
 def point_markdown(point: PickedPoint) -> str:
     """What is known of a place, in Markdown."""
-    free = sum(sight.free for sight in point.hits)
+    free = sum(sight.unoccluded for sight in point.hits)
     hidden = len(point.hits) - free
-    lines = [*point.coordinates, f"**V = {point.seen_by}** training cameras have it in their picture"]
+    lines = [*point.coordinates, f"**V = {point.visibility}** training cameras have it in their picture"]
     lines.append(f"{free} photographs see it freely" + (f", {hidden} with something in between" if hidden else ""))
     if point.block is not None:
         lines.append(f"block {point.block}")

@@ -54,11 +54,11 @@ class PainterProtocol(Protocol):
     """Draws what one visitor asks for (`layers.Painter`)."""
 
     #: Anchors that the last picture was drawn from; 0 where that is not known.
-    drawn: int
+    drawn_anchors: int
 
-    def settle(self, display: DisplayOptions, full_camera: Camera) -> None: ...
-    def key(self, display: DisplayOptions) -> Hashable: ...
-    def in_view(self, display: DisplayOptions, camera: Camera) -> int: ...
+    def update_depth_range(self, display: DisplayOptions, full_camera: Camera) -> None: ...
+    def cache_key(self, display: DisplayOptions) -> Hashable: ...
+    def count_visible_anchors(self, display: DisplayOptions, camera: Camera) -> int: ...
     def paint(
         self, display: DisplayOptions, camera: Camera, full_camera: Camera, max_anchors: int | None = None
     ) -> np.ndarray: ...
@@ -68,12 +68,12 @@ class PainterProtocol(Protocol):
 class RenderedFrame:
     """A picture for a visitor."""
 
-    picture: UInt8[np.ndarray, "h w 3"]
+    image: UInt8[np.ndarray, "h w 3"]
     #: Drawn at full size, with the camera at rest.
-    full: bool
+    is_full: bool
     #: The view that it shows, at full size.
     camera: Camera
-    shown: DisplayOptions
+    display: DisplayOptions
 
 
 @dataclass(eq=False, kw_only=True)
@@ -85,19 +85,19 @@ class RenderSession:
     #: Told why a picture could not be drawn.
     on_error: Callable[[Exception], None]
     #: What was asked for last, at full size.
-    asked: tuple[Camera, DisplayOptions] | None = None
+    requested: tuple[Camera, DisplayOptions] | None = None
     preview_due: bool = False
     full_due: bool = False
     #: When the camera last moved.
-    moved: float = 0.0
+    moved_at: float = 0.0
     #: A full picture that is being drawn.
-    work: Iterator[None] | None = None
+    job: Iterator[None] | None = None
     #: Pixels that a quick picture may have, learned from what they take.
     preview_pixels: float = 320 * 240
     #: Seconds that a quick picture takes for each of its anchors; 0 before there was any.
-    per_anchor: float = 0.0
+    seconds_per_anchor: float = 0.0
     #: Seconds that a pixel of a full picture took; 0 before there was any.
-    per_px: float = 0.0
+    seconds_per_pixel: float = 0.0
 
 
 class RenderScheduler:
@@ -121,20 +121,20 @@ class RenderScheduler:
             self._seats.append(seat)
         return seat
 
-    def leave(self, seat: RenderSession) -> None:
+    def remove_session(self, seat: RenderSession) -> None:
         """The visitor is gone; nothing more is drawn for them."""
         with self._changed:
             if seat in self._seats:
                 self._seats.remove(seat)
                 self._left += 1
-            seat.work, seat.asked = None, None
+            seat.job, seat.requested = None, None
 
     def request_frame(self, seat: RenderSession, camera: Camera, display: DisplayOptions) -> None:
         """What a visitor wants to see now, at full size. Replaces what they wanted before."""
         with self._changed:
-            seat.asked, seat.moved = (camera, display), self._clock()
+            seat.requested, seat.moved_at = (camera, display), self._clock()
             seat.preview_due = seat.full_due = True
-            seat.work = None
+            seat.job = None
             self._changed.notify()
 
     def submit(self, function: Callable[[], _Result]) -> Future[_Result]:
@@ -170,7 +170,7 @@ class RenderScheduler:
         while True:
             wait = self.step()
             if self._left >= MAX_LEFT_BEFORE_CLEANUP:
-                self._tidy()
+                self._free_memory()
             with self._changed:
                 if self._closed:
                     return
@@ -179,11 +179,11 @@ class RenderScheduler:
                 told = self._changed.wait(IDLE_SECONDS if wait is None else wait)
                 if told or wait is not None or self._busy() or self._closed:
                     continue
-            self._tidy()
+            self._free_memory()
             with self._changed:
                 self._changed.wait_for(lambda: self._busy() or self._closed)
 
-    def _tidy(self) -> None:
+    def _free_memory(self) -> None:
         """Give back what pictures and visitors took: who left is held by circles of theirs."""
         self._left = 0
         gc.collect()
@@ -199,7 +199,7 @@ class RenderScheduler:
             now = self._clock()
             seat = None if errand else self._next(now)
             quick = seat is not None and seat.preview_due
-            resting = [each.moved + REST_SECONDS - now for each in self._seats if each.full_due]
+            resting = [each.moved_at + REST_SECONDS - now for each in self._seats if each.full_due]
         if errand is not None:
             errand()
             return 0
@@ -209,7 +209,7 @@ class RenderScheduler:
             self._draw_preview(seat) if quick else self._draw_next_rows(seat)
         except Exception as error:  # one visitor's trouble ends no other's pictures
             with self._changed:
-                seat.preview_due, seat.full_due, seat.work = False, False, None
+                seat.preview_due, seat.full_due, seat.job = False, False, None
             seat.on_error(error)
         return 0
 
@@ -217,7 +217,7 @@ class RenderScheduler:
         """Whose turn it is; they go to the end of the queue."""
         for wants in (lambda s: s.preview_due, lambda s: s.full_due and now - s.moved >= REST_SECONDS - 1e-6):
             for seat in self._seats:
-                if seat.asked is not None and wants(seat):
+                if seat.requested is not None and wants(seat):
                     self._seats.remove(seat)
                     self._seats.append(seat)
                     return seat
@@ -225,7 +225,7 @@ class RenderScheduler:
 
     def _draw_preview(self, seat: RenderSession) -> None:
         with self._changed:
-            asked, seat.preview_due = seat.asked, False
+            asked, seat.preview_due = seat.requested, False
         if asked is None:
             return
         whole, shown = asked
@@ -235,13 +235,13 @@ class RenderScheduler:
         began = self._clock()
         allowed = self._allowed(began)
         anchors = (
-            max(int(allowed / seat.per_anchor), MIN_PREVIEW_ANCHORS) if seat.per_anchor else INITIAL_PREVIEW_ANCHORS
+            max(int(allowed / seat.seconds_per_anchor), MIN_PREVIEW_ANCHORS) if seat.seconds_per_anchor else INITIAL_PREVIEW_ANCHORS
         )
         seat.on_frame(RenderedFrame(seat.painter.paint(shown, small, small, anchors), False, whole, shown))
         taken = max(self._clock() - began, 1e-4)
-        if seat.painter.drawn:
-            measured = taken / seat.painter.drawn
-            seat.per_anchor += (SPEED_SMOOTHING if seat.per_anchor else 1.0) * (measured - seat.per_anchor)
+        if seat.painter.drawn_anchors:
+            measured = taken / seat.painter.drawn_anchors
+            seat.seconds_per_anchor += (SPEED_SMOOTHING if seat.seconds_per_anchor else 1.0) * (measured - seat.seconds_per_anchor)
         most = max(min(MAX_PREVIEW_PIXELS, whole.width * whole.height), MIN_PREVIEW_PIXELS)
         seat.preview_pixels = float(
             np.clip(seat.preview_pixels * np.clip(allowed / taken, 0.5, 1.5), MIN_PREVIEW_PIXELS, most)
@@ -250,33 +250,33 @@ class RenderScheduler:
     def _allowed(self, now: float) -> float:
         """Seconds that a quick picture may take: a fair share of a round of all who move."""
         with self._changed:
-            moving = sum(now - seat.moved < 2 * REST_SECONDS for seat in self._seats)
+            moving = sum(now - seat.moved_at < 2 * REST_SECONDS for seat in self._seats)
         return min(PREVIEW_SECONDS, max(ROUND_SECONDS / max(moving, 1), MIN_PREVIEW_SECONDS))
 
     def _draw_next_rows(self, seat: RenderSession) -> None:
         """The next rows of a full picture."""
         with self._changed:
-            asked = seat.asked
+            asked = seat.requested
             if asked is None:
                 return
-            if seat.work is None:
-                seat.work = self._full(seat, *asked)
-            work = seat.work
+            if seat.job is None:
+                seat.job = self._full(seat, *asked)
+            work = seat.job
         done = next(work, self) is self
         with self._changed:
-            if done and seat.work is work:
-                seat.work, seat.full_due = None, False
+            if done and seat.job is work:
+                seat.job, seat.full_due = None, False
 
     def _full(self, seat: RenderSession, full_camera: Camera, display: DisplayOptions) -> Iterator[None]:
         """Draw a full picture, turn by turn, and deliver it unless something else was asked for meanwhile."""
-        seat.painter.settle(display, full_camera)
-        key = (camera_key(full_camera), display, seat.painter.key(display))
+        seat.painter.update_depth_range(display, full_camera)
+        key = (camera_key(full_camera), display, seat.painter.cache_key(display))
         if key in self._full_pictures:
             self._full_pictures.move_to_end(key)
             seat.on_frame(RenderedFrame(self._full_pictures[key], True, full_camera, display))
             return
-        turns = round(seat.per_px * full_camera.width * full_camera.height / TURN_SECONDS)
-        turns = max(turns, -(-seat.painter.in_view(display, full_camera) // ANCHORS_PER_TURN), 1)
+        turns = round(seat.seconds_per_pixel * full_camera.width * full_camera.height / TURN_SECONDS)
+        turns = max(turns, -(-seat.painter.count_visible_anchors(display, full_camera) // ANCHORS_PER_TURN), 1)
         turns = min(turns, MAX_TURNS, full_camera.height)
         edges = np.linspace(0, full_camera.height, turns + 1).round().astype(int).tolist()
         parts, taken = [], 0.0
@@ -287,12 +287,12 @@ class RenderScheduler:
             taken += self._clock() - began
             if bottom != full_camera.height:
                 yield
-        seat.per_px = taken / (full_camera.width * full_camera.height)
+        seat.seconds_per_pixel = taken / (full_camera.width * full_camera.height)
         picture = np.concatenate(parts)
         self._full_pictures[key] = picture
         while len(self._full_pictures) > MAX_CACHED_IMAGES:
             self._full_pictures.popitem(last=False)
-        if seat.asked == (full_camera, display):
+        if seat.requested == (full_camera, display):
             seat.on_frame(RenderedFrame(picture, True, full_camera, display))
 
 

@@ -58,16 +58,16 @@ def view_run(request: ViewRequest, console: Console, on_ready: Callable[[str], N
     # captures has set a handler of its own.
     ending = contextlib.suppress(KeyboardInterrupt, Interrupted)
     with ending, catch_stop_signals(interrupts=True), serve(run, request.host, request.port, console) as viewer:
-        for line in startup_message(run.line, viewer.door):
+        for line in startup_message(run.summary, viewer.access):
             console.print(line, highlight=False, soft_wrap=True)
         if on_ready is not None:
-            on_ready(viewer.door.address())
+            on_ready(viewer.access.local_url())
         _serve_until_stopped(viewer, request, console)
 
 
 def startup_message(scene: str, access: AccessControl) -> list[str]:
     """What to say once a scene can be opened: where, and by whom."""
-    lines = [f"{scene}: {access.address()}"]
+    lines = [f"{scene}: {access.local_url()}"]
     if not access.token:
         return [*lines, "Only this machine can open it (--host lets others in). Ctrl-C ends it."]
     elsewhere = access.network_url()
@@ -84,24 +84,24 @@ class ViewerServer:
     """A server that runs."""
 
     server: Any
-    door: AccessControl
+    access: AccessControl
     scene: ViewerScene
     scheduler: RenderScheduler
     sessions: dict[int, ClientSession]
     progress: str = ""
 
-    def show(self, run: OpenedRun) -> None:
+    def replace_run(self, run: OpenedRun) -> None:
         """Let every visitor see a newer model."""
-        self.scheduler.submit(lambda: self.scene.show(run)).result()
+        self.scheduler.submit(lambda: self.scene.replace_run(run)).result()
         for visitor in list(self.sessions.values()):
             visitor.on_model_changed()
 
-    def tell(self, progress: str) -> None:
+    def set_progress(self, progress: str) -> None:
         """How far training is, to every visitor who does not know it yet."""
         if progress != self.progress:
             self.progress = progress
             for visitor in list(self.sessions.values()):
-                visitor.tell(progress)
+                visitor.set_progress(progress)
 
 
 @contextlib.contextmanager
@@ -109,14 +109,14 @@ def serve(run: OpenedRun, host: str, port: int | None, console: Console) -> Iter
     """A viewer of an opened run on a port (None: the first that is free), while the context lasts."""
     scene, studio = ViewerScene(run), RenderScheduler()
     door, server = _start_listening(host, port)
-    viewer = ViewerServer(server=server, door=door, scene=scene, scheduler=studio, sessions={})
+    viewer = ViewerServer(server=server, access=door, scene=scene, scheduler=studio, sessions={})
     _set_initial_camera(server, run)
 
     def comes(client: Any) -> None:
         generation = scene.generation
         visitor = ClientSession(client, scene, studio, console)
         viewer.sessions[client.client_id] = visitor
-        visitor.tell(viewer.progress)
+        visitor.set_progress(viewer.progress)
         if scene.generation != generation:  # a newer model came while the panel was made
             visitor.on_model_changed()
         if client.client_id not in server.get_clients():  # gone while the panel was made
@@ -125,7 +125,7 @@ def serve(run: OpenedRun, host: str, port: int | None, console: Console) -> Iter
     def goes(client: Any) -> None:
         visitor = viewer.sessions.pop(client.client_id, None)
         if visitor is not None:
-            visitor.leave()
+            visitor.close()
 
     # What is there by now stays. Left out of all later searches for garbage, it lets them be quick and frequent:
     # visitors who left are held by circles of viser's until one finds them.
@@ -167,11 +167,11 @@ def _serve_until_stopped(viewer: ViewerServer, request: ViewRequest, console: Co
         if not follows or time.monotonic() - looked < REFRESH_SECONDS:
             continue
         looked = time.monotonic()
-        viewer.tell(run_status_markdown(folder))
+        viewer.set_progress(run_status_markdown(folder))
         if (now := run_file_times(folder)) == seen:
             continue
         try:
-            viewer.show(open_run_or_checkpoint(request.run, request.model, request.device))
+            viewer.replace_run(open_run_or_checkpoint(request.run, request.model, request.device))
             seen, follows = now, viewer.scene.run.name != "merged"
         except VdgsError as error:  # it is just being written, or training began anew
             console.print(f"[yellow]waiting[/] {error}", highlight=False)

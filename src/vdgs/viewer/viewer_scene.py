@@ -52,7 +52,7 @@ class ViewerScene:
         """The models that can be shown, the best first."""
         return ("merged", "coarse") if self.run.name == "merged" else (self.run.name,)
 
-    def opened(self, name: str) -> OpenedRun:
+    def get_run(self, name: str) -> OpenedRun:
         """A model of the run; the one opened first where that has no such model."""
         if name not in self.names:
             name = self.run.name
@@ -62,15 +62,15 @@ class ViewerScene:
         return self._runs[name]
 
     def model(self, name: str) -> AnchorModel:
-        return self.opened(name).model
+        return self.get_run(name).model
 
-    def level(self, name: str, camera: Camera, max_anchors: int | None = None) -> tuple[LodLevel, int]:
+    def get_level(self, name: str, camera: Camera, max_anchors: int | None = None) -> tuple[LodLevel, int]:
         """What to draw of a model: itself, or one with at most so many anchors in view; and how many those are."""
         if name not in self._levels:
             self._levels[name] = LodPyramid(self.model(name))
         return self._levels[name].of(camera, max_anchors)
 
-    def show(self, run: OpenedRun) -> None:
+    def replace_run(self, run: OpenedRun) -> None:
         """Put a newer model in place of the one of its name."""
         self.run = run
         self._runs = {run.name: run}
@@ -78,11 +78,11 @@ class ViewerScene:
         self.generation += 1
         self.__dict__.pop("blocks", None)
 
-    def seen(self, name: str) -> Float[Tensor, " n"]:
+    def visibility(self, name: str) -> Float[Tensor, " n"]:
         """V of every anchor of a model."""
         if name not in self._seen:
             cameras = [view.camera for view in self.capture.train_views]
-            self._seen[name] = get_run_visibility(self.opened(name), cameras).float()
+            self._seen[name] = get_run_visibility(self.get_run(name), cameras).float()
         return self._seen[name]
 
     def exposures(self, name: str) -> ViewExposures | None:
@@ -92,7 +92,7 @@ class ViewerScene:
             self._exposures[name] = make_exposures(
                 self.model(name),
                 self.capture,
-                lambda camera: render(self.level(name, camera, _METERING_MAX_ANCHORS)[0].model, camera),
+                lambda camera: render(self.get_level(name, camera, _METERING_MAX_ANCHORS)[0].model, camera),
             )
         return self._exposures[name]
 
@@ -117,7 +117,7 @@ class ViewerScene:
         return self._tints[name]
 
     @cached_property
-    def photographs(self) -> ImageCache:
+    def images(self) -> ImageCache:
         """The photographs of all views, by their number in `capture.views`."""
         return ImageCache(self.capture.views, _IMAGE_CACHE_BYTES)
 
@@ -133,7 +133,7 @@ class ViewerScene:
 
     def close(self) -> None:
         if "photographs" in self.__dict__:
-            self.photographs.close()
+            self.images.close()
 
 
 def block_rgb(block: int) -> tuple[int, int, int]:

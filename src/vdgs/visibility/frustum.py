@@ -48,12 +48,12 @@ class Frusta:
         rigid_there = torch.from_numpy(rigid).to(device)
         return Frusta(camera_from_world=rigid_there, fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
 
-    def take(self, chosen: Int64[Tensor, " some"]) -> Frusta:
+    def select(self, chosen: Int64[Tensor, " some"]) -> Frusta:
         """Those of these numbers."""
         return Frusta(**{field.name: getattr(self, field.name)[chosen] for field in fields(self)})
 
     @property
-    def span(self) -> Float64[Tensor, " c"]:
+    def relative_extent(self) -> Float64[Tensor, " c"]:
         """What the longer side of each picture spans at the unit of depth."""
         return torch.maximum(self.width, self.height) / torch.maximum(self.fx, self.fy)
 

@@ -38,7 +38,7 @@ class SpatialGroups:
         low, high = grouped.amin(dim=1), grouped.amax(dim=1)
         return SpatialGroups(order, (low + high) / 2, (high - low).norm(dim=1) / 2)
 
-    def about(self, camera: Camera) -> Int64[Tensor, " some"]:
+    def query_frustum(self, camera: Camera) -> Int64[Tensor, " some"]:
         """The places, ascending, that may fall into the picture of a pinhole camera: all that do, and few others.
 
         O(n / GROUP + what it returns).

@@ -34,7 +34,7 @@ class VisibilityStats:
     #: Gini coefficient of V: 0 where all are seen alike, towards 1 where few anchors have all the views.
     gini: float
     #: Share of the anchors that fewer than so many cameras see.
-    share_below: dict[int, float]
+    fraction_below: dict[int, float]
 
 
 def count_visibility(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Int32[Tensor, " n"]:
@@ -98,7 +98,7 @@ def visibility_stats(visibility: Int[np.ndarray, " n"]) -> VisibilityStats:
         mean=float(count.mean()),
         quantiles={percent: float(np.percentile(count, percent)) for percent in PERCENTILES},
         gini=_gini(count),
-        share_below={limit: float((count < limit).mean()) for limit in LOW_VISIBILITY_LIMITS},
+        fraction_below={limit: float((count < limit).mean()) for limit in LOW_VISIBILITY_LIMITS},
     )
 
 

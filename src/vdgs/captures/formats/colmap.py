@@ -38,7 +38,7 @@ class ColmapModel:
     folder: Path
     views: tuple[SourceView, ...]
     points: np.ndarray
-    colours: np.ndarray
+    colors: np.ndarray
 
 
 def find_models(root: Path) -> list[Path]:
@@ -118,13 +118,13 @@ def _views(
             f"{file}: these images name a camera that is not in the cameras file. "
             f"Both files must come from the same export.{format_list(orphans)}"
         )
-    sorted_points = ColmapPoints(*(column[np.argsort(points.numbers, kind="stable")] for column in points))
+    sorted_points = ColmapPoints(*(column[np.argsort(points.point_ids, kind="stable")] for column in points))
     views = []
     for record in records:
         intrinsics = cameras[record.camera]
         sightings = _sightings(record, sorted_points, intrinsics)
         name, pose = safe_name(record.name, file), _pose(record, file)
-        views.append(SourceView(name=name, camera_from_world=pose, intrinsics=intrinsics, sightings=sightings))
+        views.append(SourceView(name=name, camera_from_world=pose, intrinsics=intrinsics, observations=sightings))
     views.sort(key=lambda view: view.name)
     twice = find_duplicates(view.name for view in views)
     if twice:
@@ -134,12 +134,12 @@ def _views(
 
 def _sightings(record: ColmapImage, points: ColmapPoints, intrinsics: Intrinsics) -> Observations | None:
     """What an image says that it shows, of points sorted by number; None where it says nothing."""
-    numbers, pixels = record.shown
-    if not len(numbers) or not len(points.numbers):
+    numbers, pixels = record.observations
+    if not len(numbers) or not len(points.point_ids):
         return None
-    places = np.searchsorted(points.numbers, numbers).clip(max=len(points.numbers) - 1)
+    places = np.searchsorted(points.point_ids, numbers).clip(max=len(points.point_ids) - 1)
     rays = pixel_rays(intrinsics, pixels)
-    known = (points.numbers[places] == numbers) & np.isfinite(rays).all(axis=1)
+    known = (points.point_ids[places] == numbers) & np.isfinite(rays).all(axis=1)
     known &= np.isfinite(points.positions[places]).all(axis=1)
     return Observations(points.positions[places[known]], rays[known], numbers[known]) if known.any() else None
 

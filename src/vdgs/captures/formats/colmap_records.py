@@ -19,7 +19,7 @@ MAX_OBSERVATIONS = 400
 class ColmapPoints(NamedTuple):
     """Points [n, 3] float64 and colours [n, 3] uint8 with the numbers [n] by which images name them."""
 
-    numbers: np.ndarray
+    point_ids: np.ndarray
     positions: np.ndarray
     colours: np.ndarray
 
@@ -35,7 +35,7 @@ class ColmapImage:
     camera: int
     name: str
     #: Some of the points that it shows: their numbers [m], and the pixels [m, 2] where.
-    shown: tuple[np.ndarray, np.ndarray]
+    observations: tuple[np.ndarray, np.ndarray]
 
 
 def sample_observations(numbers: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -96,7 +96,7 @@ def read_matrixcity(root: Path, options: CaptureOptions) -> SourceCapture:
             for v in views
         ]
     return SourceCapture(
-        source="matrixcity", images=options.images or "", views=tuple(views), points=points, colours=colours,
+        source="matrixcity", images=options.images or "", views=tuple(views), points=points, colors=colours,
         world=world,
     )  # fmt: skip
 

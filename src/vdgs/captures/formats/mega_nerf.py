@@ -62,7 +62,7 @@ def read_mega_nerf(root: Path, options: CaptureOptions) -> SourceCapture:
     world = WorldPrior(GROUND_FROM_DRB, 1.0, True, "Mega-NeRF: x is down, metres by pose_scale_factor")
     folders = tuple(root / folder / images for folder, _ in SPLIT_FOLDERS)
     return SourceCapture(
-        source="mega-nerf", images=images, views=tuple(views), points=points, colours=colours, world=world,
+        source="mega-nerf", images=images, views=tuple(views), points=points, colors=colours, world=world,
         image_folders=folders,
     )  # fmt: skip
 

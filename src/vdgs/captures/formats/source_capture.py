@@ -79,7 +79,7 @@ class SourceView:
     #: Where image and mask are, if the format says so itself; else they are looked up by name.
     image_path: Path | None = None
     mask_path: Path | None = None
-    sightings: Observations | None = None
+    observations: Observations | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +103,7 @@ class SourceCapture:
     images: str
     views: tuple[SourceView, ...]
     points: np.ndarray
-    colours: np.ndarray
+    colors: np.ndarray
     world: WorldPrior | None = None
     #: Folders in which every image should have a camera.
     image_folders: tuple[Path, ...] = ()

@@ -62,7 +62,7 @@ def find_sparse_points(
             f"{folder}: its camera positions disagree with those of {what} (RMS {rms:.3g} over a spread of "
             f"{spread:.3g}, {inliers.sum()} of {len(pairs)} agree); it is another reconstruction or naming."
         )
-    return similarity.apply(model.points), model.colours
+    return similarity.apply(model.points), model.colors
 
 
 def _centre(camera_from_world: np.ndarray) -> np.ndarray:

@@ -99,7 +99,7 @@ def read_transforms(root: Path, options: CaptureOptions) -> SourceCapture:
     homogeneous[:, :3, 3] = points
     moved = undo(homogeneous)[:, :3, 3]
     return SourceCapture(
-        source="transforms", images=chosen, views=tuple(views), points=moved, colours=colours,
+        source="transforms", images=chosen, views=tuple(views), points=moved, colors=colours,
         image_folders=(root / chosen,) if chosen else (),
     )  # fmt: skip
 

@@ -20,5 +20,5 @@ class SystemCheck:
     essential: bool = False
 
     @property
-    def works(self) -> bool:
+    def is_ok(self) -> bool:
         return not (self.essential and self.state in ("missing", "broken"))

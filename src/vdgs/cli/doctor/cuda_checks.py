@@ -19,7 +19,7 @@ def cuda_checks() -> list[SystemCheck]:
 def _gpus() -> list[SystemCheck]:
     try:
         driver: CudaDriver = get_cuda_driver()
-        cards = driver.cards()
+        cards = driver.list_gpus()
         major, minor = driver.version()
     except CudaUnavailable as error:
         return [SystemCheck("CUDA driver", "note", str(error))]
@@ -39,7 +39,7 @@ def _compiler() -> SystemCheck:
     except CudaUnavailable as error:
         return SystemCheck("NVRTC", "note", "not found: CUDA kernels cannot be compiled", str(error))
     version = f"{found.version[0]}.{found.version[1]}"
-    return SystemCheck("NVRTC", "ok", f"{version}, from {found.found.origin}: {found.found.path}")
+    return SystemCheck("NVRTC", "ok", f"{version}, from {found.library_info.origin}: {found.library_info.path}")
 
 
 def _kernels() -> SystemCheck:
@@ -59,4 +59,4 @@ def _operations() -> list[SystemCheck]:
 
 def _device() -> SystemCheck:
     choice = select_device("auto")
-    return SystemCheck("--device auto", "ok", f"{choice.device}: {choice.why}")
+    return SystemCheck("--device auto", "ok", f"{choice.device}: {choice.reason}")

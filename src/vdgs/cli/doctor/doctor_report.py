@@ -27,7 +27,7 @@ def run_checks() -> list[SystemCheck]:
 
 def is_healthy(checks: list[SystemCheck]) -> bool:
     """Whether everything essential works."""
-    return all(check.works for check in checks)
+    return all(check.is_ok for check in checks)
 
 
 def print_report(as_json: bool = False, checks: list[SystemCheck] | None = None) -> int:
@@ -55,11 +55,11 @@ def _print_table(checks: list[SystemCheck]) -> None:
     for column in ("", "", "found", "what to do"):
         table.add_column(column, overflow="fold")
     for check in checks:
-        sign, colour = signs[check.state] if check.works else ("✗", "bold red")
+        sign, colour = signs[check.state] if check.is_ok else ("✗", "bold red")
         table.add_row(Text(sign, colour), Text(check.name), Text(check.value), Text(check.remedy))
     console = Console()
     console.print(table)
-    broken = [check.name for check in checks if not check.works]
+    broken = [check.name for check in checks if not check.is_ok]
     if broken:
         console.print(Text(f"Not usable yet: {', '.join(broken)}. See the last column.", "bold red"))
     else:

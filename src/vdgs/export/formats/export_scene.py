@@ -49,7 +49,7 @@ class ExportMetadata:
     #: Who wrote the file.
     program: str = f"vdgs {__version__}"
 
-    def known(self) -> dict[str, object]:
+    def to_dict(self) -> dict[str, object]:
         """JSON-able, without what is not known."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
@@ -76,7 +76,7 @@ class ExportScene:
     count: int
     #: Degree of the spherical harmonics of every chunk.
     degree: int
-    facts: ExportMetadata = ExportMetadata()
+    metadata: ExportMetadata = ExportMetadata()
     #: Lowest and highest coordinates of the means, where known beforehand: what cannot be held is refused before work.
     bounds: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
     #: For those formats that show the scene themselves; they find a view of their own where it is not given.
@@ -89,8 +89,8 @@ class ExportScene:
         return ExportScene(
             chunks=[gaussians],
             count=len(gaussians),
-            degree=gaussians.degree,
-            facts=metadata or ExportMetadata(),
+            degree=gaussians.sh_degree,
+            metadata=metadata or ExportMetadata(),
             bounds=(tuple(low), tuple(high)),
         )
 
@@ -101,8 +101,8 @@ class ExportScene:
         """
         done = 0
         for chunk in self.chunks:
-            if chunk.degree != self.degree:
-                raise ValueError(f"a chunk has degree {chunk.degree}, announced was {self.degree}")
+            if chunk.sh_degree != self.degree:
+                raise ValueError(f"a chunk has degree {chunk.sh_degree}, announced was {self.degree}")
             for start in range(0, len(chunk), CHUNK_SIZE):
                 piece = _clean(chunk.select(torch.arange(start, min(start + CHUNK_SIZE, len(chunk)))), done)
                 yield piece if turn is None else transform_gaussians(piece, 1.0, turn, np.zeros(3))
@@ -137,7 +137,7 @@ def rotate_back(gaussians: Gaussians, rotation: Float[np.ndarray, "3 3"]) -> Gau
 
 def opacities(gaussians: Gaussians) -> Float[np.ndarray, " n"]:
     """In 0 .. 1."""
-    opacity: np.ndarray = expit(gaussians.logits.numpy())  # of scipy: torch's depends on where a number stands
+    opacity: np.ndarray = expit(gaussians.opacity_logits.numpy())  # of scipy: torch's depends on where a number stands
     return opacity
 
 
@@ -153,7 +153,7 @@ def logits_from_opacity(opacity: Float[np.ndarray, " n"], steps: int = 255) -> F
 
 def base_colors(gaussians: Gaussians) -> Float[np.ndarray, "n 3"]:
     """Colours without the part that changes with the direction; not clamped to 0 .. 1."""
-    return (0.5 + SH_C0 * gaussians.dc).numpy()
+    return (0.5 + SH_C0 * gaussians.sh0).numpy()
 
 
 def to_uint8(unit: Float[np.ndarray, "*shape"]) -> np.ndarray:
@@ -168,7 +168,7 @@ def metadata_path(path: Path) -> Path:
 
 def write_metadata_file(path: Path, metadata: ExportMetadata, frame: Mapping[str, Any]) -> None:
     """Write the facts beside a file, with what its axes mean."""
-    write_json(metadata_path(path), {"file": path.name, **metadata.known(), **frame})
+    write_json(metadata_path(path), {"file": path.name, **metadata.to_dict(), **frame})
 
 
 def ascii_line(text: str) -> str:

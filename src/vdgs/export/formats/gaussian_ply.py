@@ -38,13 +38,13 @@ def property_names(degree: int) -> tuple[str, ...]:
 def header_comments(metadata: ExportMetadata) -> list[str]:
     """Header lines that say where local coordinates stand, one fact each, as JSON."""
     return [f"comment {name} {ascii_line(json.dumps(value))}" if not isinstance(value, str)
-            else f"comment {name} {ascii_line(value)}" for name, value in metadata.known().items()]  # fmt: skip
+            else f"comment {name} {ascii_line(value)}" for name, value in metadata.to_dict().items()]  # fmt: skip
 
 
 def write_ply(path: Path, scene: ExportScene) -> tuple[str, ...]:
     """Write the scene, atomically; loses nothing. Raises VdgsError."""
     names = property_names(scene.degree)
-    lines = ["ply", "format binary_little_endian 1.0", *header_comments(scene.facts), f"element vertex {scene.count}"]
+    lines = ["ply", "format binary_little_endian 1.0", *header_comments(scene.metadata), f"element vertex {scene.count}"]
     header = "\n".join([*lines, *(f"property float {name}" for name in names), "end_header", ""]).encode("ascii")
 
     def write(temporary: Path) -> None:
@@ -58,12 +58,12 @@ def write_ply(path: Path, scene: ExportScene) -> tuple[str, ...]:
 
 
 def _rows(piece: Gaussians, width: int) -> np.ndarray:
-    n, rest = len(piece), piece.rest.shape[1]
+    n, rest = len(piece), piece.shN.shape[1]
     rows = np.zeros((n, width), "<f4")  # normals stay zero
     rows[:, 0:3] = piece.means.numpy()
-    rows[:, 6:9] = piece.dc.numpy()
-    rows[:, 9 : 9 + 3 * rest].reshape(n, 3, rest)[:] = piece.rest.numpy().transpose(0, 2, 1)  # channel by channel
-    rows[:, -8] = piece.logits.numpy()
+    rows[:, 6:9] = piece.sh0.numpy()
+    rows[:, 9 : 9 + 3 * rest].reshape(n, 3, rest)[:] = piece.shN.numpy().transpose(0, 2, 1)  # channel by channel
+    rows[:, -8] = piece.opacity_logits.numpy()
     rows[:, -7:-4] = piece.log_scales.numpy()
     rows[:, -4:] = piece.quaternions.numpy()
     return rows
@@ -105,8 +105,8 @@ def _gaussians(table: np.ndarray, rest: int) -> Gaussians:
     coefficients = columns(*(f"f_rest_{i}" for i in range(rest))) if rest else torch.zeros(n, 0)
     return Gaussians(
         means=columns("x", "y", "z"), log_scales=columns(*SCALE_NAMES), quaternions=columns(*ROTATION_NAMES),
-        logits=columns("opacity")[:, 0], dc=columns(*DC_NAMES),
-        rest=coefficients.reshape(n, 3, rest // 3).transpose(1, 2).contiguous(),
+        opacity_logits=columns("opacity")[:, 0], sh0=columns(*DC_NAMES),
+        shN=coefficients.reshape(n, 3, rest // 3).transpose(1, 2).contiguous(),
     )  # fmt: skip
 
 

@@ -43,7 +43,7 @@ class VertexAttribute:
     """One attribute of all Gaussians, in one piece."""
 
     name: str
-    kind: str
+    accessor_type: str
     component: int
     width: int
 
@@ -53,7 +53,7 @@ class VertexAttribute:
 
     def accessor(self, count: int) -> JsonObject:
         normalised = {"normalized": True} if self.component == GL_UNSIGNED_BYTE else {}
-        return {"componentType": self.component, "count": count, "type": self.kind, **normalised}
+        return {"componentType": self.component, "count": count, "type": self.accessor_type, **normalised}
 
 
 def vertex_attributes(degree: int) -> list[VertexAttribute]:
@@ -115,9 +115,9 @@ def _values(piece: Gaussians) -> Iterator[np.ndarray]:
     yield piece.quaternions.numpy()[:, [1, 2, 3, 0]]
     yield gaussian_scales(piece)
     yield opacities(piece)
-    yield piece.dc.numpy()
-    for index in range(piece.rest.shape[1]):
-        yield np.ascontiguousarray(piece.rest[:, index].numpy())
+    yield piece.sh0.numpy()
+    for index in range(piece.shN.shape[1]):
+        yield np.ascontiguousarray(piece.shN[:, index].numpy())
 
 
 def _document(
@@ -133,7 +133,7 @@ def _document(
                  "sortingMethod": "cameraDistance"}  # fmt: skip
     names = {column.name: index for index, column in enumerate(wanted)}
     return {
-        "asset": asset_json(scene.facts), "extensionsUsed": [EXTENSION],
+        "asset": asset_json(scene.metadata), "extensionsUsed": [EXTENSION],
         "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [{"mode": 0, "attributes": names, "extensions": {EXTENSION: splatting}}]}],
         "accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": starts[-1]}],
@@ -145,7 +145,7 @@ def asset_json(metadata: ExportMetadata) -> JsonObject:
     return {
         "version": "2.0",
         "generator": metadata.program,
-        "extras": {**metadata.known(), "axes": "x east, y up, z south"},
+        "extras": {**metadata.to_dict(), "axes": "x east, y up, z south"},
     }
 
 
@@ -161,7 +161,7 @@ def spz_glb(gaussians: Gaussians, spz: bytes, translation: np.ndarray, metadata:
         VertexAttribute("COLOR_0", "VEC4", GL_UNSIGNED_BYTE, 4),
         VertexAttribute(f"{EXTENSION}:SCALE", "VEC3", GL_FLOAT, 3),
         VertexAttribute(f"{EXTENSION}:ROTATION", "VEC4", GL_FLOAT, 4),
-        *vertex_attributes(gaussians.degree)[6:],
+        *vertex_attributes(gaussians.sh_degree)[6:],
     ]
     accessors = [column.accessor(count) for column in columns]
     means = gaussians.means.numpy()

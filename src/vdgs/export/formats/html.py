@@ -119,7 +119,7 @@ def read_html_chunks(path: Path) -> Iterator[Gaussians]:
 
 def _without_sh(scene: ExportScene) -> Gaussians:
     """All of a scene in memory, without the coefficients that are not shown: 56 bytes each."""
-    parts = [replace(piece, rest=torch.zeros(len(piece), 0, 3)) for piece in scene.pieces()]
+    parts = [replace(piece, shN=torch.zeros(len(piece), 0, 3)) for piece in scene.pieces()]
     return Gaussians(**{name: torch.cat([part.tensors()[name] for part in parts]) for name in parts[0].tensors()})
 
 
@@ -163,15 +163,15 @@ def _unpacked(rows: UInt32[np.ndarray, "n 8"], factor: float) -> Gaussians:
     rgba = np.ascontiguousarray(rows[:, 7:]).view(np.uint8).astype(np.float32) / 255
     return Gaussians(
         means=torch.from_numpy(np.ascontiguousarray(rows[:, :3]).view(np.float32) / np.float32(factor)),
-        log_scales=log_scales.float(), quaternions=quaternions.float(), logits=logits_from_opacity(rgba[:, 3]),
-        dc=rgb_to_sh(torch.from_numpy(rgba[:, :3])), rest=torch.zeros(len(rows), 0, 3),
+        log_scales=log_scales.float(), quaternions=quaternions.float(), opacity_logits=logits_from_opacity(rgba[:, 3]),
+        sh0=rgb_to_sh(torch.from_numpy(rgba[:, :3])), shN=torch.zeros(len(rows), 0, 3),
     )  # fmt: skip
 
 
 def _document(gaussians: Gaussians, factor: float, page: InitialView, scene: ExportScene) -> bytes:
     """The whole file."""
     title = html.escape(page.title)
-    facts = {**scene.facts.known(), "axes": "z up", "gaussians": len(gaussians), "factor": factor}
+    facts = {**scene.metadata.to_dict(), "axes": "z up", "gaussians": len(gaussians), "factor": factor}
     head = (
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
         f'<meta name="vdgs" content="{html.escape(json.dumps(facts))}">{_WORKERS}'

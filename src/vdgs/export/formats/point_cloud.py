@@ -28,7 +28,7 @@ LOSS_NOTES = ("sizes, rotations and changing colours are left out: these are poi
 def write_points(path: Path, scene: ExportScene) -> tuple[str, ...]:
     """Write x, y, z (ground frame), red, green, blue and opacity as PLY, atomically. Returns what was lost."""
     names = ["float x", "float y", "float z", "uchar red", "uchar green", "uchar blue", "float opacity"]
-    lines = ["ply", "format binary_little_endian 1.0", *header_comments(scene.facts), f"element vertex {scene.count}"]
+    lines = ["ply", "format binary_little_endian 1.0", *header_comments(scene.metadata), f"element vertex {scene.count}"]
     header = "\n".join([*lines, *(f"property {name}" for name in names), "end_header", ""]).encode("ascii")
 
     def write(temporary: Path) -> None:
@@ -46,12 +46,12 @@ def write_points(path: Path, scene: ExportScene) -> tuple[str, ...]:
 
 def check_las_dependencies(path: Path, scene: ExportScene) -> None:
     """Raise VdgsError where packages are missing that LAS and LAZ need."""
-    needed = ["laspy", *(["lazrs"] if path.suffix.lower() == ".laz" else []), *(["pyproj"] if scene.facts.crs else [])]
+    needed = ["laspy", *(["lazrs"] if path.suffix.lower() == ".laz" else []), *(["pyproj"] if scene.metadata.crs else [])]
     missing = [name for name in needed if importlib.util.find_spec(name) is None]
     if missing:
         raise VdgsError(f"{path}: needs {' and '.join(missing)}, not installed. Install with: pip install 'vdgs[geo]'")
-    if scene.facts.crs:
-        _crs(path, scene.facts.crs)
+    if scene.metadata.crs:
+        _crs(path, scene.metadata.crs)
 
 
 def write_laz(path: Path, scene: ExportScene) -> tuple[str, ...]:
@@ -63,13 +63,13 @@ def write_laz(path: Path, scene: ExportScene) -> tuple[str, ...]:
     import laspy
 
     compressed = path.suffix.lower() == ".laz"
-    header = _las_header(path, scene.facts)
+    header = _las_header(path, scene.metadata)
 
     def write(temporary: Path) -> None:
         with temporary.open("wb") as file, laspy.open(
             file, mode="w", header=header, do_compress=compressed, closefd=False
         ) as writer:  # fmt: skip
-            origin = np.array(scene.facts.origin)
+            origin = np.array(scene.metadata.origin)
             for piece in scene.pieces():
                 writer.write_points(_las_points(piece.means.double().numpy() + origin, to_uint8(base_colors(piece)),
                                                 opacities(piece), header))  # fmt: skip

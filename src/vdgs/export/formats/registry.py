@@ -36,7 +36,7 @@ class ExportFormat:
     #: Whether facts are written to FILE.json, for the format has no room for them.
     writes_metadata_file: bool = False
     #: Coordinates lie below this, from the origin.
-    reach: float = math.inf
+    max_coordinate: float = math.inf
     #: Whether its colours do not change with the direction: best baked so, where all files are of that kind.
     fixed_colors: bool = False
     #: Whether it stands on the globe, in no map's coordinates.
@@ -54,7 +54,7 @@ FORMATS: tuple[ExportFormat, ...] = (
         read=read_spz_chunks,
         check=check_range,
         writes_metadata_file=True,
-        reach=MAX_COORDINATE,
+        max_coordinate=MAX_COORDINATE,
     ),
     ExportFormat(
         suffix=".splat",

@@ -97,7 +97,7 @@ def merge_cells(gaussians: Gaussians, cells: Int64[Tensor, " n"]) -> Gaussians:
     """One Gaussian for each cell, in the order of their numbers."""
     count = _cell_count(cells)
     areas = _areas(gaussians.log_scales)
-    depth = -torch.log1p(-gaussians.logits.sigmoid().double().clamp_max(MAX_OPACITY))
+    depth = -torch.log1p(-gaussians.opacity_logits.sigmoid().double().clamp_max(MAX_OPACITY))
     cover = depth * areas
     weights = cover.clamp_min(1e-30)
 
@@ -116,8 +116,8 @@ def merge_cells(gaussians: Gaussians, cells: Int64[Tensor, " n"]) -> Gaussians:
     opacity = -torch.expm1(-cover_of_cell / _areas(log_scales))
     together = Gaussians(
         means=means.float(), log_scales=log_scales.float(), quaternions=quaternions.float(),
-        logits=torch.logit(opacity.clamp(1e-6, MAX_OPACITY)).float(), dc=pooled(gaussians.dc).float(),
-        rest=pooled(gaussians.rest).float(),
+        opacity_logits=torch.logit(opacity.clamp(1e-6, MAX_OPACITY)).float(), sh0=pooled(gaussians.sh0).float(),
+        shN=pooled(gaussians.shN).float(),
     )  # fmt: skip
     # What is alone in its cell stays as it is.
     alone = torch.bincount(cells, minlength=count) == 1

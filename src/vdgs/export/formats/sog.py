@@ -54,10 +54,10 @@ def write_sog(path: Path, scene: ExportScene) -> tuple[str, ...]:
             with zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as bundle:
                 for name, picture in images.encode().items():
                     bundle.writestr(f"{name}.webp", _webp(picture))
-                bundle.writestr("meta.json", json.dumps(images.meta(scene.facts), allow_nan=False))
+                bundle.writestr("meta.json", json.dumps(images.meta(scene.metadata), allow_nan=False))
 
     write_atomic(path, write)
-    write_metadata_file(path, scene.facts, {"axes": "x west, y down, z south"})
+    write_metadata_file(path, scene.metadata, {"axes": "x west, y down, z south"})
     notes = [f"positions are rounded, farthest from the origin to {100 * coarsest:.1f} cm (if units are metres)"]
     if scene.degree:
         notes.append(f"changing colours are taken from a palette of at most {MAX_SH_CENTROIDS}")
@@ -70,13 +70,13 @@ class _Images:
     def __init__(self, scene: GaussianStore) -> None:
         self.scene = scene
         sample = scene.sample(SAMPLE_ROWS)
-        self.count, self.degree = len(scene.means), sample.degree
+        self.count, self.degree = len(scene.means), sample.sh_degree
         self.low, self.high = _signed_log(scene.means.min(0)), _signed_log(scene.means.max(0))
         self.scales = fit_codebook(sample.log_scales.numpy().ravel())
-        self.colours = fit_codebook(sample.dc.numpy().ravel())
+        self.colours = fit_codebook(sample.sh0.numpy().ravel())
         self.palette: VectorCodebook | None = None
         if self.degree:
-            self.palette = VectorCodebook(sample.rest.numpy().reshape(len(sample), -1), MAX_SH_CENTROIDS)
+            self.palette = VectorCodebook(sample.shN.numpy().reshape(len(sample), -1), MAX_SH_CENTROIDS)
             self.harmonics = fit_codebook(self.palette.rows.ravel())
 
     def max_step(self) -> float:
@@ -104,7 +104,7 @@ class _Images:
         span = np.where(self.high > self.low, self.high - self.low, 1.0)
         places = np.rint((_signed_log(piece.means.numpy()) - self.low) / span * MAX_UINT16)
         whole = np.clip(places, 0, MAX_UINT16).astype(np.uint16)
-        shown = quantize(piece.dc.numpy(), self.colours)
+        shown = quantize(piece.sh0.numpy(), self.colours)
         pixels = {
             "means_l": (whole & 255).astype(np.uint8), "means_u": (whole >> 8).astype(np.uint8),
             "quats": _packed(piece.quaternions.numpy()),
@@ -112,7 +112,7 @@ class _Images:
             "sh0": np.concatenate([shown, to_uint8(opacities(piece))[:, None]], 1),
         }  # fmt: skip
         if self.palette:
-            labels = self.palette.nearest(piece.rest.numpy().reshape(len(piece), -1))
+            labels = self.palette.nearest(piece.shN.numpy().reshape(len(piece), -1))
             pixels["shN_labels"] = np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], 1).astype(np.uint8)
         return pixels
 
@@ -128,7 +128,7 @@ class _Images:
     def meta(self, facts: ExportMetadata) -> JsonObject:
         """What the JSON of the bundle says."""
         meta: JsonObject = {
-            "version": 2, "asset": {"generator": facts.program, "extras": facts.known()}, "count": self.count,
+            "version": 2, "asset": {"generator": facts.program, "extras": facts.to_dict()}, "count": self.count,
             "antialias": False,
             "means": {"mins": self.low.tolist(), "maxs": self.high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
             "scales": {"codebook": self.scales.tolist(), "files": ["scales.webp"]}, "quats": {"files": ["quats.webp"]},

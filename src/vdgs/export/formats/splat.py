@@ -48,7 +48,7 @@ def write_splat(path: Path, scene: ExportScene) -> tuple[str, ...]:
                 rows.tofile(file)
 
     write_atomic(path, write)
-    write_metadata_file(path, scene.facts, {"axes": "x west, y down, z south"})
+    write_metadata_file(path, scene.metadata, {"axes": "x west, y down, z south"})
     lost = ["colours no longer change with the viewing direction"] if scene.degree else []
     if clipped:
         lost.append(f"{clipped} of {scene.count} colours lay outside of 0 .. 1 and were cut off")
@@ -75,7 +75,7 @@ def _gaussians(table: np.ndarray) -> Gaussians:
         means=torch.from_numpy(table["mean"].copy()),
         log_scales=torch.from_numpy(table["scale"].copy()).log(),
         quaternions=torch.from_numpy((table["rotation"].astype(np.float32) - 128) / 128),
-        logits=logits_from_opacity(rgba[:, 3]),
-        dc=rgb_to_sh(torch.from_numpy(rgba[:, :3])),
-        rest=torch.zeros(len(table), 0, 3),
+        opacity_logits=logits_from_opacity(rgba[:, 3]),
+        sh0=rgb_to_sh(torch.from_numpy(rgba[:, :3])),
+        shN=torch.zeros(len(table), 0, 3),
     )

@@ -89,7 +89,7 @@ def write_spz(path: Path, scene: ExportScene, version: int = 3) -> tuple[str, ..
                     spool.close()
 
     write_atomic(path, write)
-    write_metadata_file(path, scene.facts, {"axes": "x east, y up, z south"})
+    write_metadata_file(path, scene.metadata, {"axes": "x east, y up, z south"})
     notes = [f"{cut[name]} of {scene.count} {what}" for name, what in CLAMP_NOTES.items() if cut[name]]
     if scene.count > MAX_READABLE_POINTS:
         notes.append(
@@ -111,10 +111,10 @@ def encode_columns(piece: Gaussians, version: int, fraction: int = FRACTION_BITS
         piece = canonicalize_quaternions(piece)
     fixed = np.rint(piece.means.double().numpy() * 2**fraction).astype("<i4")
     positions = np.ascontiguousarray(fixed).view(np.uint8).reshape(n, 3, 4)[:, :, :3].reshape(n, 9)
-    colours = to_uint8(piece.dc.numpy() * COLOUR_SCALE + 0.5)
+    colours = to_uint8(piece.sh0.numpy() * COLOUR_SCALE + 0.5)
     scales = np.clip(np.rint((piece.log_scales.numpy() + 10) * 16), 0, 255).astype(np.uint8)
     rotations = (_pack_quaternions_v3 if version >= 3 else _pack_quaternions_v2)(piece.quaternions.numpy())
-    return positions, to_uint8(opacities(piece)[:, None]), colours, scales, rotations, _harmonics(piece.rest.numpy())
+    return positions, to_uint8(opacities(piece)[:, None]), colours, scales, rotations, _harmonics(piece.shN.numpy())
 
 
 def encode_spz(gaussians: Gaussians, version: int) -> bytes:
@@ -124,7 +124,7 @@ def encode_spz(gaussians: Gaussians, version: int) -> bytes:
     """
     reach = float(gaussians.means.abs().max()) + 1 / 2**FRACTION_BITS
     fraction = max(0, min(FRACTION_BITS, math.floor(math.log2(2**23 / reach))))
-    parts = [encode_header(len(gaussians), gaussians.degree, version, fraction)]
+    parts = [encode_header(len(gaussians), gaussians.sh_degree, version, fraction)]
     parts += [column.tobytes() for column in encode_columns(gaussians, version, fraction)]
     return b"".join(gzip_blocks(parts))
 
@@ -140,7 +140,7 @@ def _stream(first: bytes, columns: Mapping[str, IO[bytes]]) -> Iterator[bytes]:
 def _count_clamped(piece: Gaussians) -> dict[str, int]:
     """How many Gaussians have sizes or colours that bytes cannot hold, as in `CLAMP_NOTES`."""
     scales = (piece.log_scales + 10) * 16
-    shown = piece.dc * COLOUR_SCALE + 0.5
+    shown = piece.sh0 * COLOUR_SCALE + 0.5
     return {
         "large": int((scales > 255.5).any(1).sum()),
         "thin": int((scales < -0.5).any(1).sum()),
@@ -226,9 +226,9 @@ def _gaussians(parts: Sequence[np.ndarray], version: int, fraction: int) -> Gaus
         means=torch.from_numpy(means.astype(np.float32)),
         log_scales=torch.from_numpy(scales / np.float32(16) - 10),
         quaternions=torch.from_numpy(quaternions.astype(np.float32)),
-        logits=logits_from_opacity(alphas[:, 0] / np.float32(255)),
-        dc=torch.from_numpy((colours / np.float32(255) - np.float32(0.5)) / np.float32(COLOUR_SCALE)),
-        rest=torch.from_numpy((harmonics.reshape(n, harmonics.shape[1] // 3, 3).astype(np.float32) - 128) / 128),
+        opacity_logits=logits_from_opacity(alphas[:, 0] / np.float32(255)),
+        sh0=torch.from_numpy((colours / np.float32(255) - np.float32(0.5)) / np.float32(COLOUR_SCALE)),
+        shN=torch.from_numpy((harmonics.reshape(n, harmonics.shape[1] // 3, 3).astype(np.float32) - 128) / 128),
     )
 
 

@@ -78,8 +78,8 @@ def write_tiles(path: Path, scene: ExportScene, max_gaussians: int = MAX_GAUSSIA
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{TILESET_FILE}.") as spool:
-            root = _TileQuadtree(write_store(scene, Path(spool) / "rows"), folder, scene.facts, max_gaussians).build()
-        write_json(path, _tileset(root, scene.facts))
+            root = _TileQuadtree(write_store(scene, Path(spool) / "rows"), folder, scene.metadata, max_gaussians).build()
+        write_json(path, _tileset(root, scene.metadata))
     except OSError as error:
         shutil.rmtree(folder, ignore_errors=True)
         raise VdgsError(
@@ -90,7 +90,7 @@ def write_tiles(path: Path, scene: ExportScene, max_gaussians: int = MAX_GAUSSIA
         raise
     _remove(older)
     notes = ["positions are rounded to 0.24 mm, colours and shapes to bytes"]
-    if scene.facts.geodetic is None:
+    if scene.metadata.geodetic is None:
         notes.append("the scene is not georeferenced: globes show it at the centre of the Earth")
     return tuple(notes)
 
@@ -190,7 +190,7 @@ def _tileset(root: TilesetNode, metadata: ExportMetadata) -> JsonObject:
         "asset": {
             "version": "1.1",
             "generator": metadata.program,
-            "extras": {**metadata.known(), "axes": "east, north, up"},
+            "extras": {**metadata.to_dict(), "axes": "east, north, up"},
         },
         "extensionsUsed": ["3DTILES_content_gltf"],
         "extensions": {"3DTILES_content_gltf": needs},

@@ -53,7 +53,7 @@ def decode_backward_adam(
     found = [torch.empty_like(t) for t in heads] if wanted else None
     finite: bool = extension.get_extension().decode_backward_adam(
         [contiguous(positions.detach()), *(state[0] for state in steps)], rows.contiguous(), heads,
-        packed_camera(camera), source, contiguous(gradients.colour_values),
+        packed_camera(camera), source, contiguous(gradients.color_values),
         contiguous(gradients.opacity_values), [contiguous(t) for t in incoming], gradients.volume, steps, updates,
         found, *([] if gradients.depths is None else [contiguous(gradients.depths)]),
     )  # fmt: skip
@@ -64,7 +64,7 @@ def decode_backward_adam(
 
 def _step(state: AdamState) -> tuple[Any, ...]:
     """A parameter and its moments, the tables of its step, and the betas with epsilon."""
-    rates, roots, *rest = round_factors(step_factors(state.learning_rate, None, lr_boost=state.early))
+    rates, roots, *rest = round_factors(step_factors(state.learning_rate, None, lr_boost=state.lr_boost))
     return (*(t.detach() for t in state[:3]), rates, roots, rest)
 
 
@@ -78,6 +78,6 @@ def _check_splats(g: SplatGradients) -> None:
     check_row_shapes(
         len(g.source),
         means_px=(g.means_px, 2), conics=(g.conics, 3), colours=(g.colours, 3), opacities=(g.opacities[:, None], 1),
-        colour_values=(g.colour_values, 3), opacity_values=(g.opacity_values[:, None], 1),
+        colour_values=(g.color_values, 3), opacity_values=(g.opacity_values[:, None], 1),
         **({} if g.depths is None else {"depths": (g.depths[:, None], 1)}),
     )  # fmt: skip

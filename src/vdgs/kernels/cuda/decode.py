@@ -54,7 +54,7 @@ def decode(
     if torch.is_grad_enabled() and any(t.requires_grad for t in (*anchors, *weights.tensors())):
         return by_torch(*anchors, weights, camera, rows)
     named, shown, _ = _decoded(anchors, weights, camera, rows, True, program, capacity)
-    order = shown.runs.order(len(shown))
+    order = shown.segments.order(len(shown))
     return AnchorSplats(**{name: tensor.index_select(0, order) for name, tensor in named.items()})
 
 
@@ -78,7 +78,7 @@ def decode_for_training(
     """
     anchors = (positions, features, offsets, log_scales)
     named, shown, sums = _decoded(anchors, weights, camera, rows, False, program, capacity)
-    return TrainingSplats(**named, runs=shown.runs, source=shown, volume=sums.sum() / len(shown))
+    return TrainingSplats(**named, segments=shown.segments, source=shown, volume=sums.sum() / len(shown))
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ def _decoded(
     positions, _, offsets, _ = anchors
     k, inputs = offsets.shape[1], weights.opacity.w1.shape[1]
     check_decoder(k, weights, anchors)
-    heads = [tensor for head in (weights.opacity, weights.covariance, weights.colour) for tensor in pack_head(head, k)]
+    heads = [tensor for head in (weights.opacity, weights.covariance, weights.color) for tensor in pack_head(head, k)]
     count = len(positions) if rows is None else len(rows)
     blocks = -(-count // ANCHORS_PER_BLOCK)
     bits, begins, lengths = (positions.new_empty(n, dtype=torch.int32) for n in (count, blocks, blocks))
@@ -139,7 +139,7 @@ def _decoded(
         )  # fmt: skip
         return made, total
 
-    capacity = room.for_anchors(count, k, positions.device)
+    capacity = room.estimate(count, k, positions.device)
     made, total = write(capacity)
     m = int(total) if count else 0
     room.update(count, k, positions.device, m)
@@ -157,7 +157,7 @@ def expand_sources(source: Tensor | SplatMask, *, program: CudaProgram = PROGRAM
     count = len(source.bits)
     program.launch(
         "name_splats", (-(-count // ANCHORS_PER_BLOCK),), (32 * ANCHORS_PER_BLOCK,), source.bits,
-        source.runs.starts, ctypes.c_longlong(count), ctypes.c_int(source.offsets), made,
+        source.segments.starts, ctypes.c_longlong(count), ctypes.c_int(source.offsets), made,
     )  # fmt: skip
     return made
 

@@ -52,7 +52,7 @@ def decode_backward_adam(
     k, inputs = offsets.parameter.shape[1], weights.opacity.w1.shape[1]
     parts = [getattr(state, name) for name in ("parameter", "first", "second") for state in moved]
     check_decoder(k, weights, (positions, *parts))
-    if len({state.early for state in moved}) > 1:
+    if len({state.lr_boost for state in moved}) > 1:
         raise ValueError("features, offsets and log-scales must be annealed alike")
     v, device, source = len(rows), positions.device, gradients.source
     shown = source if isinstance(source, SplatMask) else SplatMask.of(source, v, k)
@@ -60,10 +60,10 @@ def decode_backward_adam(
     broken = torch.zeros(1, dtype=torch.int32, device=device)
     before: list[KernelArgument] = [
         positions.contiguous(), *parts, *(ctypes.c_float(state.learning_rate) for state in moved),
-        ctypes.c_float(features.early), *_weights(weights, k), PackedCamera.of(camera), rows.contiguous(),
+        ctypes.c_float(features.lr_boost), *_weights(weights, k), PackedCamera.of(camera), rows.contiguous(),
     ]  # fmt: skip
     after: list[KernelArgument] = [
-        ctypes.c_int(k), ctypes.c_int(inputs), shown.bits, shown.runs.starts,
+        ctypes.c_int(k), ctypes.c_int(inputs), shown.bits, shown.segments.starts,
         *(t.contiguous() for t in (gradients.means_px, gradients.conics, gradients.colours, gradients.opacities)),
         ctypes.c_float(gradients.volume), updates, lacking, roots, ctypes.c_int(len(roots)), broken,
     ]  # fmt: skip
@@ -85,7 +85,7 @@ def decode_backward_adam(
 
 def _weights(weights: DecoderWeights, k: int) -> list[Tensor]:
     """As the kernel takes them: as they are multiplied forwards, then as they are multiplied backwards."""
-    heads = weights.opacity, weights.covariance, weights.colour
+    heads = weights.opacity, weights.covariance, weights.color
     opacity, covariance, colour = (pack_head(head, k) for head in heads)
     back = (w.detach().contiguous() for head in heads for w in (head.w1, head.w2))
     return [*opacity, *covariance, *colour, *back]

@@ -89,7 +89,7 @@ class CudaDriver:
         self._call("cuDriverGetVersion", ctypes.byref(found))
         return found.value // 1000, found.value % 1000 // 10
 
-    def cards(self) -> list[GpuInfo]:
+    def list_gpus(self) -> list[GpuInfo]:
         """Every visible GPU."""
         count = ctypes.c_int()
         self._call("cuDeviceGetCount", ctypes.byref(count))

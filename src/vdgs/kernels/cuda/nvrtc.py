@@ -88,7 +88,7 @@ class Nvrtc:
     """The compiler. `library` offers NVRTC's C functions (a ctypes library, or a stand-in)."""
 
     def __init__(self, library: Any, found: NvrtcLibrary):
-        self._library, self.found = library, found
+        self._library, self.library_info = library, found
         major, minor = ctypes.c_int(), ctypes.c_int()
         self._call("nvrtcVersion", ctypes.byref(major), ctypes.byref(minor))
         self.version = (major.value, minor.value)
@@ -112,7 +112,7 @@ class Nvrtc:
         older = [each for each in known if each < wanted]
         if not older:
             raise CudaUnavailable(
-                f"NVRTC {self.version[0]}.{self.version[1]} ({self.found.path}) compiles for cards of compute "
+                f"NVRTC {self.version[0]}.{self.version[1]} ({self.library_info.path}) compiles for cards of compute "
                 f"capability {known[0] / 10:.1f} and newer; this one has {capability[0]}.{capability[1]}. "
                 "An older one may do: pip install nvidia-cuda-nvrtc-cu12."
             )
@@ -161,7 +161,7 @@ class Nvrtc:
         code = getattr(self._library, name)(*arguments)
         if code:
             raise CudaUnavailable(
-                f"{self.found.path}: {name} failed ({self._explain(code)}). Reinstall: {INSTALL_HINT}."
+                f"{self.library_info.path}: {name} failed ({self._explain(code)}). Reinstall: {INSTALL_HINT}."
             )
 
     def _explain(self, code: int) -> str:

@@ -67,7 +67,7 @@ def splat_contributions(
 
 
 def _runs_of(splats: Splats) -> SplatSegments | None:
-    return splats.runs if isinstance(splats, OrderedSplats) else None
+    return splats.segments if isinstance(splats, OrderedSplats) else None
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ class SplatCapacity:
     def __init__(self) -> None:
         self._shares: dict[tuple[str, int], float] = {}
 
-    def for_anchors(self, count: int, offsets: int, device: torch.device) -> int:
+    def estimate(self, count: int, offsets: int, device: torch.device) -> int:
         """Splats to make room for, of so many anchors with so many offsets: half of these until a view is known."""
         share = self._shares.get((str(device), offsets), offsets / 2)
         return min(int(MARGIN_FACTOR * share * count) + MARGIN_SPLATS, count * offsets)

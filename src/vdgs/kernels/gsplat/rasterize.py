@@ -93,7 +93,7 @@ def splat_radii_px(splats: Splats) -> Int32[Tensor, "m 2"]:
     """
     opacities = splats.opacities
     rows = torch.cat(
-        [splats.means_px, splats.conics, splats.colours, opacities[:, None], splats.depths[:, None]], dim=1
+        [splats.means_px, splats.conics, splats.colors, opacities[:, None], splats.depths[:, None]], dim=1
     )
     a, b, c = splats.conics.unbind(dim=1)
     determinant = a * c - b * b

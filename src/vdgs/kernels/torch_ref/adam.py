@@ -30,8 +30,8 @@ class AdamStepFactors(NamedTuple):
     `rates` and `roots` hold what follows from 1, 2, ... updates of a row, the last one also from all that are more.
     """
 
-    rates: Float[np.ndarray, " t"]
-    roots: Float[np.ndarray, " t"]
+    step_sizes: Float[np.ndarray, " t"]
+    bias_roots: Float[np.ndarray, " t"]
     beta1: float
     beta2: float
     epsilon: float
@@ -83,12 +83,12 @@ def _of_rows(
 ) -> tuple[float | Tensor, float | Tensor]:
     """Rate and root of each row of the gradient, shaped so that they multiply them; numbers if all share them."""
     if isinstance(step, int):
-        return float(factors.rates[0]), float(factors.roots[0])
+        return float(factors.step_sizes[0]), float(factors.bias_roots[0])
     # The rate changes with every step, these tables never: so they are on the card but once.
     lacking, roots = bias_correction_tables(factors.beta1, factors.beta2, gradient.device)
     place = (step.long() - 1).clamp(max=len(roots) - 1)
     root = roots[place]
-    rate = root.clamp(max=state.early) * state.learning_rate / lacking[place]
+    rate = root.clamp(max=state.lr_boost) * state.learning_rate / lacking[place]
     shape = (-1, *[1] * (gradient.ndim - 1))
     return rate.to(gradient.dtype).reshape(shape), root.to(gradient.dtype).reshape(shape)
 
@@ -108,9 +108,9 @@ def check_step(
     Raises ValueError or TypeError for settings out of range, and unless a tensor counts the updates of each row.
     """
     if isinstance(step, int):
-        return step_factors(state.learning_rate, step, beta1, beta2, epsilon, state.early)
+        return step_factors(state.learning_rate, step, beta1, beta2, epsilon, state.lr_boost)
     check_updates(step, count, min_updates=1)
-    return step_factors(state.learning_rate, None, beta1, beta2, epsilon, state.early)
+    return step_factors(state.learning_rate, None, beta1, beta2, epsilon, state.lr_boost)
 
 
 def step_factors(

@@ -88,7 +88,7 @@ def initialize_anchors(
     anchors = Anchors(
         positions=as_tensor(positions),
         features=as_tensor(features),
-        offsets=torch.zeros(n, config.offsets, 3),
+        offsets=torch.zeros(n, config.num_offsets, 3),
         log_scales=as_tensor(np.repeat(np.log(spacing)[:, None], 6, axis=1)),
     )
     return anchors, voxel

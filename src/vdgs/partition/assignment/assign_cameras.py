@@ -26,9 +26,9 @@ class Assignment:
 
     cameras: Bool[np.ndarray, "c b"]
     #: The first reason that applied, as an index of `REASONS`.
-    why: Int8[np.ndarray, "c b"]
+    reasons: Int8[np.ndarray, "c b"]
     #: One sentence for each block that has no camera, or that none of the cameras sees.
-    complaints: list[str]
+    warnings: list[str]
 
 
 def assign_cameras(scores: ScoreMatrix, config: AssignmentConfig) -> Assignment:
@@ -44,16 +44,16 @@ def assign_cameras(scores: ScoreMatrix, config: AssignmentConfig) -> Assignment:
 
     "Best" is by score, among equals by anchors held, then by index.
     """
-    seen = scores.held > 0
+    seen = scores.visible_anchors > 0
     threshold = config.threshold_leave_one_out if scores.mode == "leave_one_out" else config.threshold
     why = np.zeros(scores.scores.shape, np.int8)
     why[(scores.scores > threshold) & (seen | (scores.mode == "literal"))] = ABOVE_THRESHOLD
-    if config.best_block:
+    if config.always_best:
         rows, best = np.arange(len(why)), _best_blocks(scores)
         why[rows, best] = np.where(why[rows, best] == NOT_ASSIGNED, BEST_BLOCK, why[rows, best])
     for block in range(len(scores.anchors)):
         missing = max(config.min_cameras - np.count_nonzero(why[:, block]), 0)
-        order = np.lexsort((-scores.held[:, block], -scores.scores[:, block]))
+        order = np.lexsort((-scores.visible_anchors[:, block], -scores.scores[:, block]))
         candidates = order[seen[order, block] & (why[order, block] == NOT_ASSIGNED)]
         why[candidates[:missing], block] = TOPPED_UP
     return Assignment(why != NOT_ASSIGNED, why, _warnings(scores, why, threshold))
@@ -63,16 +63,16 @@ def _best_blocks(scores: ScoreMatrix) -> np.ndarray:
     """The best block of every camera, [c]."""
     if not len(scores.scores):
         return np.zeros(0, np.int64)
-    seen = scores.held > 0
-    best = np.lexsort((-scores.held, -scores.scores, ~seen), axis=-1)[:, 0]
+    seen = scores.visible_anchors > 0
+    best = np.lexsort((-scores.visible_anchors, -scores.scores, ~seen), axis=-1)[:, 0]
     blank = ~seen.any(axis=1) & (scores.scores.max(axis=1) == scores.scores.min(axis=1))
-    return np.where(blank, scores.beneath, best)
+    return np.where(blank, scores.nadir_block, best)
 
 
 def _warnings(scores: ScoreMatrix, why: np.ndarray, threshold: float) -> list[str]:
     complaints = []
     for block, anchors in enumerate(scores.anchors):
-        watching = int(np.count_nonzero(scores.held[:, block]))
+        watching = int(np.count_nonzero(scores.visible_anchors[:, block]))
         if anchors == 0:
             complaints.append(f"Block {block} holds no anchors. Cut the scene into fewer blocks: --blocks.")
         elif watching == 0:

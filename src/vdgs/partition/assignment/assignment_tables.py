@@ -23,9 +23,9 @@ class AssignmentReason:
 
     block: int
     score: float
-    held: int
+    visible_anchors: int
     """Anchors of the block that the view holds."""
-    why: str
+    reason: str
     """A phrase."""
 
 
@@ -40,10 +40,10 @@ def explain_assignment(
         raise RunError(f"There is no training view {view!r}. Views are named as in the capture, such as {names[0]!r}.")
     c = names.index(view)
     rows = [
-        AssignmentReason(b, float(scores.scores[c, b]), int(scores.held[c, b]), REASONS[assignment.why[c, b]])
+        AssignmentReason(b, float(scores.scores[c, b]), int(scores.visible_anchors[c, b]), REASONS[assignment.reasons[c, b]])
         for b in range(len(scores.anchors))
     ]
-    return sorted(rows, key=lambda row: (row.why == REASONS[0], -row.score))
+    return sorted(rows, key=lambda row: (row.reason == REASONS[0], -row.score))
 
 
 def block_rows(
@@ -69,7 +69,7 @@ def assignment_rows(
     owner = blocks.owner(places)
     rows = []
     for index, block in enumerate(blocks.items):
-        own, why = owner == index, assignment.why[:, index]
+        own, why = owner == index, assignment.reasons[:, index]
         rows.append(
             BlockCamerasRecord(
                 block=index,

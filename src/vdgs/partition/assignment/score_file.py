@@ -43,9 +43,9 @@ def save_scores(path: Path, names: Sequence[str], scores: ScoreMatrix, assignmen
     buffer = io.BytesIO()
     np.savez(
         buffer, format=np.array(FILE_FORMAT), mode=np.array(scores.mode),
-        names=np.array(names, np.str_), complaints=np.array(assignment.complaints, np.str_),
-        scores=scores.scores, held=scores.held, covered=scores.covered, anchors=scores.anchors,
-        beneath=scores.beneath, why=assignment.why,
+        names=np.array(names, np.str_), complaints=np.array(assignment.warnings, np.str_),
+        scores=scores.scores, held=scores.visible_anchors, covered=scores.coverage, anchors=scores.anchors,
+        beneath=scores.nadir_block, why=assignment.reasons,
     )  # fmt: skip
     write_bytes(path, buffer.getvalue())
 

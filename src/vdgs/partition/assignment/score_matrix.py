@@ -42,13 +42,13 @@ class ScoreMatrix:
     #: Higher: the camera belongs more to the block.
     scores: Float[np.ndarray, "c b"]
     #: Anchors of the block's core (those that it owns) in the frustum of the camera.
-    held: Int32[np.ndarray, "c b"]
+    visible_anchors: Int32[np.ndarray, "c b"]
     #: Share of the drawn pixels that the block alone draws alike; NaN in mode `frustum`.
-    covered: Float[np.ndarray, "c b"]
+    coverage: Float[np.ndarray, "c b"]
     #: Anchors that each block owns.
     anchors: Int64[np.ndarray, " b"]
     #: The block that owns the place beneath each camera.
-    beneath: Int64[np.ndarray, " c"]
+    nadir_block: Int64[np.ndarray, " c"]
 
 
 def compute_score_matrix(
@@ -96,16 +96,16 @@ class CameraScorer:
             workers.shutdown(cancel_futures=True)
         positions = np.array([camera.position[:2] for camera in cameras], np.float64).reshape(-1, 2)
         return ScoreMatrix(
-            mode=config.mode, scores=scores, held=held, covered=covered, anchors=members.counts(),
-            beneath=self._blocks.owner(positions),
+            mode=config.mode, scores=scores, visible_anchors=held, coverage=covered, anchors=members.counts(),
+            nadir_block=self._blocks.owner(positions),
         )  # fmt: skip
 
 
 def concatenate_scores(parts: Sequence[ScoreMatrix]) -> ScoreMatrix:
     """The rows of several parts, one below the other; at least one part, all for the same blocks."""
     over = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ("scores", "held", "covered")}
-    beneath = np.concatenate([part.beneath for part in parts])
-    return ScoreMatrix(mode=parts[0].mode, **over, anchors=parts[0].anchors, beneath=beneath)
+    beneath = np.concatenate([part.nadir_block for part in parts])
+    return ScoreMatrix(mode=parts[0].mode, **over, anchors=parts[0].anchors, nadir_block=beneath)
 
 
 def color_difference(block: Raster, full: Raster) -> Float[np.ndarray, "h w"]:

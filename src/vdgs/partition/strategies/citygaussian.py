@@ -67,7 +67,7 @@ class CityGaussian:
     ) -> ScoreMatrix:
         """A camera also joins the block that it stands in: its score there is the highest possible."""
         changed = scores.scores.copy()
-        changed[np.arange(len(changed)), scores.beneath] = 1.0
+        changed[np.arange(len(changed)), scores.nadir_block] = 1.0
         return replace(scores, scores=changed)
 
 

@@ -42,7 +42,7 @@ class Dogs:
     ) -> tuple[Blocks, list[str]]:
         ground = checked_xy(positions)
         plane = fit_principal_plane(ground)
-        places = plane.places(ground)
+        places = plane.to_plane(ground)
         low, high = np.quantile(places, EXTENT_QUANTILES, axis=0)
         size = np.maximum(high - low, 1e-6 * float(np.abs(places).max()) + 1e-9)
         columns, rows = grid_shape(count, float(size[0] / size[1]))

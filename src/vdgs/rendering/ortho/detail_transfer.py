@@ -46,7 +46,7 @@ HALO_PX = round(4 * _BLUR_PX)
 class CacheSizes(NamedTuple):
     """What a sharpener keeps between tiles, at most (bytes)."""
 
-    pictures: int = 0
+    images: int = 0
     depths: int = 0
 
 

@@ -35,7 +35,7 @@ class ClipHeight:
         flown = view_distance(cameras, capture.points, np.array([0.0, 0.0, 1.0])).is_height
         return ClipHeight(cameras, capture.points, flown)
 
-    def over(self, point: Float[np.ndarray, "3"], radius: float) -> float:
+    def height_above(self, point: Float[np.ndarray, "3"], radius: float) -> float:
         """z under which everything solid about `place` stands (choice).
 
         Where a drone flew there is air: what a model has as high as the cameras nearby hangs in front of them, unless
@@ -75,7 +75,7 @@ class NadirCamera:
         similarity, centre = self._similarity(grid)
         up = similarity.rotation[2]  # the target's, in the ground frame
         radius = 0.75 * max(grid.width, grid.height) * grid.gsd / similarity.scale
-        ceiling = self.clip_height.over(centre, max(radius, 1e-6))
+        ceiling = self.clip_height.height_above(centre, max(radius, 1e-6))
         above = centre + up * (ceiling - centre[2]) / up[2]
         pose = np.eye(4)
         pose[:3, :3] = np.diag([1.0, -1.0, -1.0]) @ similarity.rotation
@@ -88,7 +88,7 @@ class NadirCamera:
 
     def _similarity(self, grid: PixelGrid) -> tuple[Similarity, Float[np.ndarray, "3"]]:
         """The similarity about the middle of the grid, and that place on the ground."""
-        level = self.placement.places(np.array([[0.0, 0.0, ground_height(self.capture)]]))[0, 2]
+        level = self.placement.project(np.array([[0.0, 0.0, ground_height(self.capture)]]))[0, 2]
         centre = self.placement.to_ground(np.array([[*grid.centre, level]]))[0]
         similarity = self.placement.similarity_at(centre)
         x0, y0, x1, y1 = grid.bounds

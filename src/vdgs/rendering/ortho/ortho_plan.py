@@ -40,11 +40,11 @@ class OrthoPlan:
     model: str
     """Which model, in a word; `model_identity` tells it from every other."""
     model_identity: str | None
-    above: NadirCamera
+    nadir_camera: NadirCamera
     grid: PixelGrid
     samples: int
     """Samples per pixel, each way."""
-    sharp: bool
+    detail_from_images: bool
     """Whether detail is taken from the photographs."""
 
     @staticmethod
@@ -59,22 +59,22 @@ class OrthoPlan:
         grid = grid_from_bbox(request.bbox or shown, finest if request.gsd is None else request.gsd)
         check_grid_overlap(grid, shown, placement)
         above = NadirCamera.of(capture, placement)
-        above.camera(grid.part(0, 0, 1, 1))  # a system that makes no map is refused here
+        above.camera(grid.subgrid(0, 0, 1, 1))  # a system that makes no map is refused here
         return OrthoPlan(
-            folder=folder, run_name=run.name, model=model, model_identity=model_identity, above=above, grid=grid,
-            samples=samples_per_side(grid.gsd, finest), sharp=request.sharp,
+            folder=folder, run_name=run.name, model=model, model_identity=model_identity, nadir_camera=above, grid=grid,
+            samples=samples_per_side(grid.gsd, finest), detail_from_images=request.detail_from_images,
         )  # fmt: skip
 
     @property
     def placement(self) -> MapProjection:
-        return self.above.placement
+        return self.nadir_camera.placement
 
     @contextmanager
     def tile_renderer(self, model: AnchorModel) -> Iterator[TileRenderer]:
         """What draws its tiles."""
-        sharpener = DetailTransfer(model, self.above.capture) if self.sharp else None
+        sharpener = DetailTransfer(model, self.nadir_camera.capture) if self.detail_from_images else None
         try:
-            yield TileRenderer(model, self.above, self.samples, sharpener)
+            yield TileRenderer(model, self.nadir_camera, self.samples, sharpener)
         finally:
             if sharpener is not None:
                 sharpener.close()

@@ -49,7 +49,7 @@ class PixelGrid:
         x0, y0, x1, y1 = self.bounds
         return ((x0 + x1) / 2, (y0 + y1) / 2)
 
-    def part(self, column: int, row: int, width: int, height: int) -> PixelGrid:
+    def subgrid(self, column: int, row: int, width: int, height: int) -> PixelGrid:
         """The pixels from `column` and `row` on."""
         return PixelGrid(self.left + column * self.gsd, self.top - row * self.gsd, self.gsd, width, height)
 
@@ -61,7 +61,7 @@ class PixelGrid:
         """The tile of this number among `tiles`, from 0."""
         row, column = (side * place for place in divmod(number, -(-self.width // side)))
         size = min(side, self.width - column), min(side, self.height - row)
-        return column, row, self.part(column, row, *size)
+        return column, row, self.subgrid(column, row, *size)
 
     def tile_count(self, side: int = TILE_PX) -> int:
         return -(-self.width // side) * -(-self.height // side)
@@ -103,7 +103,7 @@ def capture_extent(capture: Capture, placement: MapProjection) -> tuple[float, f
             f"{capture.root}: has {len(shown)} sparse points in {MIN_SEEN_BY} pictures or more, too few to tell what a map "
             "should show. Give --bbox X0 Y0 X1 Y1."
         )
-    places = placement.places(shown)[:, :2]
+    places = placement.project(shown)[:, :2]
     low, high = np.quantile(places, [_TRIM_QUANTILE, 1 - _TRIM_QUANTILE], axis=0)
     beyond = _MARGIN_SHARE * (high - low)
     return (*(low - beyond).tolist(), *(high + beyond).tolist())

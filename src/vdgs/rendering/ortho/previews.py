@@ -98,7 +98,7 @@ def write_preview(orthophoto: Path, dsm: Path, visibility: Path, file: Path, she
         figure, sheet.name,
         f"{sheet.placement.name}; {grid.width} x {grid.height} pixels of {grid.gsd:g} {sheet.placement.unit}; "
         f"{facts['model']} model, {facts['training_cameras']} training photographs",
-        f"Heights: {sheet.placement.heights}. Blank: nothing solid, or no photograph looks there.",
+        f"Heights: {sheet.placement.height_reference}. Blank: nothing solid, or no photograph looks there.",
     )  # fmt: skip
     canvas.print_png(file)  # type: ignore[arg-type]
 

@@ -81,11 +81,11 @@ def render_ortho(
 def _render_locally(context: RunContext, request: OrthoRequest, console: Console) -> tuple[MapMetadata, Path]:
     """Draw in this process; what came out, and where."""
     run = context.open_model(request.model, request.device)
-    plan = OrthoPlan.of(request, run.folder.path, run.name, run.status.model, run.capture)
+    plan = OrthoPlan.of(request, run.folder.path, run.name, run.status.model_id, run.capture)
     _print_plan(plan, console)
     clear(plan.folder)
     with plan.tile_renderer(run.model) as surveyor:
-        return _write(plan, (surveyor.tile(part) for _, _, part in plan.grid.tiles()), console), plan.folder
+        return _write(plan, (surveyor.render_tile(part) for _, _, part in plan.grid.tiles()), console), plan.folder
 
 
 def _render_sharded(
@@ -96,7 +96,7 @@ def _render_sharded(
     context.release_models()
     run = RunFolder(Path(os.path.abspath(request.run)))  # as in `stages.train`: other machines may mount it so
     found, capture = locate_model(run, request.model), context.capture
-    plan = OrthoPlan.of(request, run.path, found.name, found.stage.status().model, capture)
+    plan = OrthoPlan.of(request, run.path, found.name, found.stage.status().model_id, capture)
     _print_plan(plan, console, sharded=True)
     with distributed_tiles(plan, request, run, found, execution, console) as tiles:
         return _write(plan, tiles, console), plan.folder
@@ -130,7 +130,7 @@ def _write(plan: OrthoPlan, tiles: Iterable[OrthoTile], console: Console) -> Map
 def is_ortho_current(run: RunFolder) -> bool:
     """Whether RUN/maps shows the merged model that is there."""
     drawn = read_json_or_empty(run.path / "maps" / METADATA_FILE).get("model_identity")
-    return drawn is not None and drawn == run.merged.status().model
+    return drawn is not None and drawn == run.merged.status().model_id
 
 
 def has_ortho_dependencies() -> bool:
@@ -151,8 +151,8 @@ def raster_layers(placement: MapProjection) -> tuple[RasterLayer, RasterLayer, R
         ),
         RasterLayer(
             name=DSM_FILE,
-            title=f"surface model: {placement.heights}",
-            bands=(f"height, {placement.heights}",),
+            title=f"surface model: {placement.height_reference}",
+            bands=(f"height, {placement.height_reference}",),
             dtype="float32",
             nodata=NODATA_HEIGHT,
             overviews="nearest",
@@ -184,7 +184,7 @@ def _print_plan(plan: OrthoPlan, console: Console, sharded: bool = False) -> Non
     across, along = grid.width * grid.gsd, grid.height * grid.gsd
     console.print(
         f"map: {grid.width} x {grid.height} pixels of {grid.gsd:g} {placement.unit}, {across:.1f} x {along:.1f} "
-        f"{placement.unit}, {placement.name}; heights {placement.heights}; at most {data_size(needed)} on the disk",
+        f"{placement.unit}, {placement.name}; heights {placement.height_reference}; at most {data_size(needed)} on the disk",
         highlight=False,
     )
     if needed > free:
@@ -234,13 +234,13 @@ def _bands(tile: OrthoTile) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _metadata(plan: OrthoPlan) -> MapMetadata:
-    grid, placement, capture = plan.grid, plan.placement, plan.above.capture
+    grid, placement, capture = plan.grid, plan.placement, plan.nadir_camera.capture
     return {
         "software": software_name(), "model": plan.model, "model_identity": plan.model_identity,
         "crs": placement.crs, "crs_name": placement.name,
-        "unit": placement.unit, "heights": placement.heights, "georeference": capture.ground.how,
+        "unit": placement.unit, "heights": placement.height_reference, "georeference": capture.ground.description,
         "gsd": grid.gsd, "width": grid.width, "height": grid.height, "bounds": list(grid.bounds),
-        "samples_per_pixel": plan.samples**2, "sharpened": plan.sharp,
+        "samples_per_pixel": plan.samples**2, "sharpened": plan.detail_from_images,
         "training_cameras": len(capture.train_views),
         "notes": list(placement.notes),
     }  # fmt: skip

@@ -49,25 +49,25 @@ class TileRenderer:
     """Draws tiles of a map of one model."""
 
     model: AnchorModel
-    above: NadirCamera
+    nadir_camera: NadirCamera
     #: Samples per pixel, each way.
     samples: int = 1
     #: Takes detail from the photographs, where that is asked for.
-    sharpener: DetailTransfer | None = None
+    detail_transfer: DetailTransfer | None = None
 
-    def tile(self, grid: PixelGrid) -> OrthoTile:
+    def render_tile(self, grid: PixelGrid) -> OrthoTile:
         """Draw the pixels of a grid, each from `samples`² of its own."""
         fine = PixelGrid(
             grid.left, grid.top, grid.gsd / self.samples, grid.width * self.samples, grid.height * self.samples
         )
-        through = self.above.camera(fine)
-        camera = self.above.camera(grid) if self.samples > 1 else through
+        through = self.nadir_camera.camera(fine)
+        camera = self.nadir_camera.camera(grid) if self.samples > 1 else through
         seen = self._seen(through, camera)
         shown, colours = seen.shown, seen.colours
-        if self.sharpener is not None and shown.any():
+        if self.detail_transfer is not None and shown.any():
             # Drawn once more, with what lies about it; not cut from that, so that heights and V are those without.
             around = self._seen(_pad_camera(through, HALO_PX * self.samples), _pad_camera(camera, HALO_PX))
-            detail = self.sharpener.detail(around.points, around.colours, around.shown)
+            detail = self.detail_transfer.detail(around.points, around.colours, around.shown)
             colours = colours + detail[HALO_PX:-HALO_PX, HALO_PX:-HALO_PX]
         tile = OrthoTile(
             np.zeros((*shown.shape, 3), np.uint8), np.zeros(shown.shape, np.uint8),
@@ -76,7 +76,7 @@ class TileRenderer:
         tile.colours[shown] = (colours[shown].clip(0, 1) * 255 + 0.5).astype(np.uint8)
         tile.alpha[shown] = 255
         if shown.any():
-            tile.heights[shown] = self.above.placement.places(seen.points)[:, 2]
+            tile.heights[shown] = self.nadir_camera.placement.project(seen.points)[:, 2]
         tile.visibility[shown] = seen.counts.clip(max=NODATA_COUNT - 1)
         return tile
 
@@ -95,7 +95,7 @@ class TileRenderer:
         shown = (opacity >= MIN_ALPHA) & np.isfinite(depth)
         points = camera.unproject(np.where(shown, depth, 0.0))[shown]
         counts = count_visibility(
-            torch.from_numpy(points), [view.camera for view in self.above.capture.train_views]
+            torch.from_numpy(points), [view.camera for view in self.nadir_camera.capture.train_views]
         ).numpy()
         looked_at = counts > 0  # what no photograph shows, the model invents
         shown[shown] = looked_at

@@ -52,25 +52,25 @@ def distributed_tiles(
     """
     request = OrthoRequest(
         run=run.path, output=Path(os.path.abspath(plan.folder)), gsd=request.gsd, bbox=request.bbox, crs=request.crs,
-        sharp=request.sharp, model=model.name,
+        detail_from_images=request.detail_from_images, model=model.name,
     )  # fmt: skip
     job = _job(plan, request)
-    images = cache_sizes(plan.sharp, plan.above.capture)
-    side = (TILE_PX + (2 * HALO_PX if plan.sharp else 0)) * plan.samples
-    files = [run.config_file, model.stage.model, *image_and_mask_files(plan.above.capture.train_views)]
+    images = cache_sizes(plan.detail_from_images, plan.nadir_camera.capture)
+    side = (TILE_PX + (2 * HALO_PX if plan.detail_from_images else 0)) * plan.samples
+    files = [run.config_file, model.stage.model, *image_and_mask_files(plan.nadir_camera.capture.train_views)]
     needs = ShardNeeds(
         render_bytes(model.stage.model.stat().st_size, images.depths, side * side),
         lambda: NodeRequirements(job.folder, files),
     )
     with job.held():
-        job.run(needs, replace(execution, image_gb=max(images.pictures, 1) / 1e9), console)
+        job.run(needs, replace(execution, image_gb=max(images.images, 1) / 1e9), console)
         yield job.gather(load_tile)
 
 
 def _job(plan: OrthoPlan, asked: OrthoRequest) -> ShardedJob:
     """The tiles in shards, and what they depend on."""
     depends_on = [
-        plan.model, plan.model_identity, plan.placement.crs, list(astuple(plan.grid)), plan.samples, plan.sharp
+        plan.model, plan.model_identity, plan.placement.crs, list(astuple(plan.grid)), plan.samples, plan.detail_from_images
     ]  # fmt: skip
     spans = split_ranges(plan.grid.tile_count(), *TILES_OF_SHARD)
     return ShardedJob.of("tiles", asked, plan.folder, TILE_LABELS, depends_on, spans)
@@ -80,13 +80,13 @@ def draw_shard(shard: Shard) -> None:
     """Draw a shard of the tiles. They stay beside its status until all are gathered."""
     asked = shard.request(OrthoRequest)
     opened = open_run(asked.run, asked.model, shard.device)
-    plan = OrthoPlan.of(asked, asked.run, opened.name, opened.status.model, opened.capture)
+    plan = OrthoPlan.of(asked, asked.run, opened.name, opened.status.model_id, opened.capture)
 
     def results(left: Sequence[int]) -> Results:
-        shard.console.print(f"drawing {len(left)} tiles of the {opened.line}", highlight=False)
+        shard.console.print(f"drawing {len(left)} tiles of the {opened.summary}", highlight=False)
         with plan.tile_renderer(opened.model) as surveyor:
             for item in left:
-                yield partial(save_tile, tile=surveyor.tile(plan.grid.tile(item)[2]))
+                yield partial(save_tile, tile=surveyor.render_tile(plan.grid.tile(item)[2]))
 
     shard.do(_job(plan, asked), results)
 

@@ -51,16 +51,16 @@ class TrainingWorkload:
     #: Pixels of the largest photograph.
     pixels: int
     #: Decoded photographs that are kept.
-    images_bytes: int
+    image_cache_bytes: int
     #: Anchors that are drawn but never move.
     surroundings: int = 0
     #: Whether training ends with a mean of models, which is kept beside the grown anchors.
-    averaged: bool = False
+    has_swa: bool = False
     #: How many times their number anchors may become where nothing limits them: `max_growth_factor`.
     growth: float = MAX_GROWTH
 
     @property
-    def grown(self) -> int:
+    def max_grown_anchors(self) -> int:
         """Anchors at the end: `max_anchors` stops growth and removes nothing."""
         free = round(self.growth * self.anchors)
         return max(self.anchors, min(free, self.max_anchors)) if self.max_anchors else free
@@ -72,18 +72,18 @@ class MemoryEstimate:
 
     program: int
     images: int
-    picture: int
+    image: int
     anchors: int
     grown_anchors: int
 
     @property
     def start(self) -> int:
-        return self.program + self.images + self.picture + self.anchors
+        return self.program + self.images + self.image + self.anchors
 
     @property
     def total(self) -> int:
         """With anchors grown."""
-        return self.program + self.images + self.picture + self.grown_anchors
+        return self.program + self.images + self.image + self.grown_anchors
 
 
 @dataclass(frozen=True)
@@ -120,12 +120,12 @@ def block_workload(method: MethodConfig, anchors: int, total_anchors: int, pixel
     return TrainingWorkload(
         anchors=anchors,
         max_anchors=max_block_anchors(block, anchors, total_anchors),
-        offsets=method.training.anchors.offsets,
+        offsets=method.training.anchors.num_offsets,
         seen=MAX_VISIBLE_FRACTION,
         pixels=pixels,
-        images_bytes=0,
+        image_cache_bytes=0,
         surroundings=total_anchors - anchors,
-        averaged=block.average > 0,
+        has_swa=block.swa_fraction > 0,
         growth=max_growth_factor(block.compensation),
     )
 
@@ -148,7 +148,7 @@ def swa_bytes_per_anchor(offsets: int) -> int:
 
 
 def _per_grown_anchor(need: TrainingWorkload) -> float:
-    mean = swa_bytes_per_anchor(need.offsets) if need.averaged else 0
+    mean = swa_bytes_per_anchor(need.offsets) if need.has_swa else 0
     return bytes_per_anchor(need.offsets, need.seen) + mean
 
 
@@ -158,8 +158,8 @@ def estimate_memory(need: TrainingWorkload) -> MemoryEstimate:
     frozen = need.surroundings * (model_bytes_per_anchor(need.offsets) + in_view)
     start = bytes_per_anchor(need.offsets, need.seen) * need.anchors
     return MemoryEstimate(
-        PROCESS_BYTES, need.images_bytes, TRAIN_BYTES_PER_PIXEL * need.pixels,
-        round(start + frozen), round(_per_grown_anchor(need) * need.grown + frozen),
+        PROCESS_BYTES, need.image_cache_bytes, TRAIN_BYTES_PER_PIXEL * need.pixels,
+        round(start + frozen), round(_per_grown_anchor(need) * need.max_grown_anchors + frozen),
     )  # fmt: skip
 
 
@@ -178,7 +178,7 @@ def memory_advice(need: TrainingWorkload, kind: TrainingKind, to_save: int) -> l
     whole = estimate_memory(need)
     found = [_fewer_anchors(need, kind, to_save)]
     if kind == "coarse":
-        smaller = estimate_memory(replace(need, pixels=need.pixels // 4, images_bytes=need.images_bytes // 4))
+        smaller = estimate_memory(replace(need, pixels=need.pixels // 4, image_cache_bytes=need.image_cache_bytes // 4))
         found.append(
             MemoryAdvice("photographs of half the size (--downscale or --images images_N)", whole.total - smaller.total)
         )
@@ -186,13 +186,13 @@ def memory_advice(need: TrainingWorkload, kind: TrainingKind, to_save: int) -> l
         half = estimate_memory(replace(need, anchors=need.anchors // 2))
         found.append(MemoryAdvice("vdgs partition with twice the --blocks (smaller blocks)", whole.total - half.total))
         found.append(MemoryAdvice("one less of --jobs (blocks at once)", whole.total))
-    if need.averaged:
+    if need.has_swa:
         option = "--average 0" if kind == "coarse" else "--block.average 0"
-        last = estimate_memory(replace(need, averaged=False))
+        last = estimate_memory(replace(need, has_swa=False))
         found.append(MemoryAdvice(f"{option} (the last model instead of a mean)", whole.total - last.total))
-    kept = min(need.images_bytes, 50_000_000)
+    kept = min(need.image_cache_bytes, 50_000_000)
     found.append(
-        MemoryAdvice(f"--image-memory-gb {kept / 1e9:.2f} (fewer photographs kept in memory)", need.images_bytes - kept)
+        MemoryAdvice(f"--image-memory-gb {kept / 1e9:.2f} (fewer photographs kept in memory)", need.image_cache_bytes - kept)
     )
     worth = [each for each in found if each.saved_bytes > whole.total / 100]
     return sorted(worth, key=lambda each: -each.saved_bytes)
@@ -202,7 +202,7 @@ def _fewer_anchors(need: TrainingWorkload, kind: TrainingKind, to_save: int) -> 
     """A limit of anchors that saves `to_save` bytes, if one does: growth can be forbidden, but no anchor removed."""
     option = "--growth.max-anchors" if kind == "coarse" else "--block.growth.max-anchors"
     too_many = to_save / _per_grown_anchor(need)
-    limit = max(need.anchors, int(need.grown - too_many) // 1000 * 1000, 1)
+    limit = max(need.anchors, int(need.max_grown_anchors - too_many) // 1000 * 1000, 1)
     saved = estimate_memory(need).total - estimate_memory(replace(need, max_anchors=limit)).total
     return MemoryAdvice(f"{option} {limit} (less growth)", saved)
 
@@ -216,6 +216,6 @@ def describe_memory(estimate: MemoryEstimate, available_bytes: int) -> str:
     )
     return (
         f"memory by estimate: {data_size(estimate.start)} at the start, {data_size(estimate.total)} at most (photographs "
-        f"{data_size(estimate.images)}, one picture {data_size(estimate.picture)}, anchors "
+        f"{data_size(estimate.images)}, one picture {data_size(estimate.image)}, anchors "
         f"{data_size(estimate.anchors)}{grown}); this process may take {data_size(available_bytes)}"
     )

@@ -32,22 +32,22 @@ MIN_SAVED_FRACTION = 0.3
 
 def training_workload(state: TrainingState, stage: TrainingProblem) -> TrainingWorkload:
     """What this training works on."""
-    config, count = stage.config, stage.image_count
+    config, count = stage.config, stage.num_images
     cameras = [stage.images.camera(view) for view in range(count)]
     chosen = np.unique(np.linspace(0, count - 1, min(count, MAX_COUNTED_VIEWS)).astype(int))
     anchors = state.anchors
     seen = [len(cull_anchors(anchors, cameras[view])) for view in chosen]
     photographs = decoded_image_bytes(cameras)
-    growing = config.growth.levels > 0 and state.iteration <= config.growth.until * config.iterations
+    growing = config.densify.num_levels > 0 and state.iteration <= config.densify.stop_fraction * config.iterations
     return TrainingWorkload(
         anchors=len(anchors),
-        max_anchors=config.growth.max_anchors if growing else len(anchors),
+        max_anchors=config.densify.max_anchors if growing else len(anchors),
         offsets=anchors.offsets.shape[1],
         seen=max(seen) / max(len(anchors), 1),
-        pixels=max_image_pixels(cameras, config.resolutions),
-        images_bytes=min(photographs, getattr(stage.images, "budget_bytes", photographs)),
-        surroundings=0 if stage.surroundings is None else len(stage.surroundings.anchors),
-        averaged=config.average > 0,
+        pixels=max_image_pixels(cameras, config.resolution_schedule),
+        image_cache_bytes=min(photographs, getattr(stage.images, "budget_bytes", photographs)),
+        surroundings=0 if stage.frozen_anchors is None else len(stage.frozen_anchors.anchors),
+        has_swa=config.swa_fraction > 0,
         growth=max_growth_factor(config.compensation),
     )
 
@@ -68,10 +68,10 @@ def print_memory_estimate(need: TrainingWorkload, kind: TrainingKind, console: C
 
 def out_of_memory_hint(need: TrainingWorkload, state: TrainingState, stage: TrainingProblem) -> str:
     """What to change after training ran out of memory, with what each change saves by estimate."""
-    kind, kept = stage.kind, getattr(stage.images, "nbytes", need.images_bytes)
+    kind, kept = stage.kind, getattr(stage.images, "nbytes", need.image_cache_bytes)
     now = replace(
-        need, anchors=len(state.anchors), max_anchors=len(state.anchors), images_bytes=kept,
-        averaged=state.average is not None,
+        need, anchors=len(state.anchors), max_anchors=len(state.anchors), image_cache_bytes=kept,
+        has_swa=state.model_average is not None,
     )  # fmt: skip
     # Growth cannot be undone where it led, so a limit is one for training that begins anew.
     before = replace(now, anchors=min(need.anchors, len(state.anchors)))

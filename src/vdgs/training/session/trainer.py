@@ -101,7 +101,7 @@ def train_with_checkpoints(
         size=lambda: f"{len(state.anchors):,} anchors",
         divergence_hint=DIVERGENCE_HINTS[kind],
         memory_hint=lambda: out_of_memory_hint(need, state, stage),
-        whole=lambda: state.whole,
+        is_consistent=lambda: state.is_consistent,
     )  # fmt: skip
 
     def loop(stop: Callable[[], bool]) -> bool:
@@ -109,9 +109,9 @@ def train_with_checkpoints(
         with TrainingProgress(console, folder, stage.config, state.iteration, board) as progress:
 
             def after_step(state: TrainingState, report: StepReport) -> None:
-                keeper.tick()
+                keeper.update_timers()
                 progress.step(state, report)
-                keeper.keep(lambda: progress.status(state), progress.flush)
+                keeper.save_if_due(lambda: progress.status(state), progress.flush)
 
             return train(state, stage, stop=stop, after_step=after_step)
 
@@ -127,7 +127,7 @@ def finish_stage(
     model.save(folder.model)
     status = StatusRecord(
         state="done", iteration=state.iteration, iterations=state.iteration,
-        photographs=round(area * state.iteration, 1), anchors=len(state.anchors), model=file_id(folder.model),
+        images_drawn=round(area * state.iteration, 1), anchors=len(state.anchors), model_id=file_id(folder.model),
         seconds=state.seconds, psnr_training=None if math.isnan(state.psnr) else state.psnr,
         peak_memory_bytes=state.peak_memory_bytes,
     )  # fmt: skip
@@ -143,10 +143,10 @@ def finish_stage(
 
 def warn_without_densification(config: TrainConfig, console: Console, prefix: str = "--") -> None:
     """Say so where growth would begin after it has ended; `prefix` is that of the stage's options."""
-    if config.growth.levels and config.growth.until * config.iterations < config.growth.start:
+    if config.densify.num_levels and config.densify.stop_fraction * config.iterations < config.densify.start:
         console.print(
-            f"[yellow]note[/] no anchor will grow: growth starts at iteration {config.growth.start} and ends at "
-            f"{config.growth.until * config.iterations:.0f}. Give more {prefix}iterations or a smaller "
+            f"[yellow]note[/] no anchor will grow: growth starts at iteration {config.densify.start} and ends at "
+            f"{config.densify.stop_fraction * config.iterations:.0f}. Give more {prefix}iterations or a smaller "
             f"{prefix}growth.start.",
             highlight=False,
         )

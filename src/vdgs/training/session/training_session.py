@@ -52,7 +52,7 @@ class TrainingSession:
     divergence_hint: str
     memory_hint: Callable[[], str]
     #: Whether every step of the state is whole, so that it may be saved though a step was broken off.
-    whole: Callable[[], bool]
+    is_consistent: Callable[[], bool]
 
     def save(self) -> None:
         save_checkpoint(self.folder.checkpoints, self.to_checkpoint())
@@ -103,19 +103,19 @@ def run_session(training: TrainingSession, loop: Callable[[Callable[[], bool]], 
             folder.set_status(training.status())
             complete = loop(lambda: bool(asked))
     except TrainingDiverged as error:
-        folder.set_status(StatusRecord(state="failed", iteration=state.iteration, why=str(error)))
+        folder.set_status(StatusRecord(state="failed", iteration=state.iteration, reason=str(error)))
         raise TrainingDiverged(f"{error} {_kept(folder)} {training.divergence_hint}".rstrip()) from error
     except MEMORY_ERRORS as error:
         if not is_out_of_memory(error):
             raise
         traceback.clear_frames(error.__traceback__)  # they hold the pictures and splats of the step that failed
         kept = _rescue(training)
-        folder.set_status(StatusRecord(state="failed", iteration=state.iteration, why="out of memory"))
+        folder.set_status(StatusRecord(state="failed", iteration=state.iteration, reason="out of memory"))
         raise VdgsError(
             f"{folder.path}: out of memory with {training.size()}{_wanted(error)}. {kept} {training.memory_hint()}"
         ) from error
     except VdgsError as error:  # a photograph that is gone, a full disk: every step so far is whole
-        folder.set_status(StatusRecord(state="failed", iteration=state.iteration, why=str(error)))
+        folder.set_status(StatusRecord(state="failed", iteration=state.iteration, reason=str(error)))
         training.save()
         raise
     if not complete:
@@ -131,14 +131,14 @@ class Checkpointer:
         self._training, self._save_every = training, save_every
         self._last = self._noted = time.monotonic()
 
-    def tick(self) -> None:
+    def update_timers(self) -> None:
         """Add the time since the last step to the state's account."""
         now, state = time.monotonic(), self._training.state
         state.seconds += now - self._last
         state.peak_memory_bytes = max(state.peak_memory_bytes, peak_memory_bytes())
         self._last = now
 
-    def keep(self, status: Callable[[], StatusRecord], flush_log: Callable[[], None] | None = None) -> None:
+    def save_if_due(self, status: Callable[[], StatusRecord], flush_log: Callable[[], None] | None = None) -> None:
         """Save the state and write the `status`, each where it is time.
 
         The log is flushed before the checkpoint is written: a run that continues there must not miss lines of it.
@@ -165,7 +165,7 @@ def _rescue(training: TrainingSession) -> str:
     """Save the state after memory ran out, if every step of it is whole and there is room; what is kept then."""
     trim_heap()
     folder = training.folder
-    if training.whole():
+    if training.is_consistent():
         try:
             training.save()
         except (VdgsError, *MEMORY_ERRORS):

@@ -61,20 +61,20 @@ class StereoInputs:
 
     cameras: Sequence[Camera]
     points: Float[np.ndarray, "n 3"]
-    places: Float[np.ndarray, "p 3"]
-    read: Callable[[int], tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"] | None]]
+    sample_points: Float[np.ndarray, "p 3"]
+    read_image: Callable[[int], tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"] | None]]
 
 
 class FusionCell(NamedTuple):
     """The edge of cells that get a point each: the least, in units of the world, and in pixels of the photographs as
     they are used, where those are larger."""
 
-    least: float
-    pixels: float
+    min_edge: float
+    min_pixels: float
 
-    def sizes(self, pixel: Float[np.ndarray, " p"]) -> Int64[np.ndarray, " p"]:
+    def scale_index(self, pixel: Float[np.ndarray, " p"]) -> Int64[np.ndarray, " p"]:
         """Which of `CELL_SCALES` cells have where a pixel is so wide."""
-        wide = np.log2(np.maximum(self.pixels * pixel / self.least, 1.0))
+        wide = np.log2(np.maximum(self.min_pixels * pixel / self.min_edge, 1.0))
         return np.minimum(np.rint(wide).astype(np.int64), len(CELL_SCALES) - 1)
 
 
@@ -82,7 +82,7 @@ class DensePoints(NamedTuple):
     """Points [m, 3] float64 and their colours [m, 3] uint8."""
 
     points: Float[np.ndarray, "m 3"]
-    colours: UInt8[np.ndarray, "m 3"]
+    colors: UInt8[np.ndarray, "m 3"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +117,7 @@ def compute_dense_points(
     """
     cameras = [_matched_size(camera) for camera in inputs.cameras]
     others, groups = (
-        select_source_views(inputs.cameras, inputs.places),
+        select_source_views(inputs.cameras, inputs.sample_points),
         SpatialGroups.of(torch.from_numpy(inputs.points)),
     )
     views = lru_cache(MAX_CACHED_VIEWS)(lambda index: _view(inputs, groups, cameras[index], index))
@@ -173,7 +173,7 @@ def _matched_size(camera: Camera) -> Camera:
 
 def _view(inputs: StereoInputs, groups: SpatialGroups, camera: Camera, index: int) -> StereoView:
     """A photograph grey, at the size at which it is matched."""
-    picture, _ = inputs.read(index)
+    picture, _ = inputs.read_image(index)
     small = camera.width < picture.shape[1]
     grey = cv2.resize(
         cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), (camera.width, camera.height),
@@ -205,17 +205,17 @@ def _geometric_consistency(
         known
         & (agreed >= 1)
         & (agreed >= MIN_AGREEING_FRACTION * held)
-        & (np.abs(places) < MAX_CELL_INDEX * cell.least).all(-1)
+        & (np.abs(places) < MAX_CELL_INDEX * cell.min_edge).all(-1)
     )
-    picture, mask = inputs.read(index)
+    picture, mask = inputs.read_image(index)
     size = (camera.width, camera.height)
     if mask is not None:
         confirmed &= cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) > 0
     colours = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
     area = (depth[confirmed].astype(np.float64) ** 2 / (camera.fx * camera.fy))[:, None]
     values = np.concatenate([places[confirmed], colours[confirmed], np.ones_like(area), area], 1)
-    sizes = cell.sizes(depth[confirmed].astype(np.float64) / inputs.cameras[index].fx)
-    edge = cell.least * CELL_SCALES[sizes]
+    sizes = cell.scale_index(depth[confirmed].astype(np.float64) / inputs.cameras[index].fx)
+    edge = cell.min_edge * CELL_SCALES[sizes]
     x, y, z = (np.floor(values[:, axis] / edge).astype(np.int64) + MAX_CELL_INDEX for axis in range(3))
     return _Cells.of((sizes << 60) | (x << 40) | (y << 20) | z, values)
 
@@ -247,7 +247,7 @@ def _fused(found: _Cells, cell: FusionCell) -> DensePoints:
     """One point for each cell that the pixels of all photographs cover well enough; of two that lie too close that of
     the smaller cell, or of the better covered one."""
     means = np.zeros((0, 6))
-    for size, edge in enumerate(cell.least * CELL_SCALES):
+    for size, edge in enumerate(cell.min_edge * CELL_SCALES):
         sums = found.sums[(found.keys >> 60 == size) & (found.sums[:, 7] >= MIN_COVERAGE * edge**2)]
         sums = sums[np.argsort(-sums[:, 7], kind="stable")]
         more = sums[:, :6] / sums[:, 6:7]

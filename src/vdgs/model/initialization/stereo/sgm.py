@@ -31,7 +31,7 @@ class StereoView:
 
     camera: Camera
     gray: UInt8[np.ndarray, "h w"]
-    nearest: float
+    min_depth: float
     max_depth: float
 
 
@@ -42,7 +42,7 @@ def pair_depth(first: StereoView, second: StereoView) -> Float[np.ndarray, "h w"
     if common is None:
         return None
     least = int(np.floor(common.disparity(first.max_depth))) - 2
-    steps = -(-(int(np.ceil(common.disparity(first.nearest))) + 3 - least) // 16) * 16
+    steps = -(-(int(np.ceil(common.disparity(first.min_depth))) + 3 - least) // 16) * 16
     overlap = common.width + min(least, 0) - max(least + steps, 0)
     if not 0 < steps <= MAX_DISPARITIES or overlap <= WINDOW:
         return None
@@ -68,7 +68,7 @@ def pair_depth(first: StereoView, second: StereoView) -> Float[np.ndarray, "h w"
     between = (found >= least + 1) & (found <= least + steps - 2)
     along = np.where(between, common.depth(found), 0.0).astype(np.float32)
     depth = _as_seen_by(first.camera, common, along)
-    return np.where((depth >= first.nearest) & (depth <= first.max_depth), depth, np.float32(0))
+    return np.where((depth >= first.min_depth) & (depth <= first.max_depth), depth, np.float32(0))
 
 
 def _as_seen_by(camera: Camera, common: RectifiedPair, along: Float[np.ndarray, "r c"]) -> Float[np.ndarray, "h w"]:

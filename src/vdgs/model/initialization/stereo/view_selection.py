@@ -58,7 +58,7 @@ def select_source_views(
 
 def points_in_view(camera: Camera, points: Float[np.ndarray, "n 3"], groups: SpatialGroups) -> Int64[np.ndarray, " s"]:
     """The places, of which `groups` are made, in a camera's picture, ascending; without a look at all of them."""
-    near = groups.about(camera).numpy()
+    near = groups.query_frustum(camera).numpy()
     return np.asarray(near[camera.in_frustum(points[near])])
 
 
