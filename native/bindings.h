@@ -1,6 +1,6 @@
 // How a source file adds its functions to the Python module, with no central list:
 //
-//     VDGS_BIND(rasterise) { m.def("rasterise", ...); }
+//     VDGS_BIND(rasterize) { m.def("rasterize", ...); }
 //
 // The body runs once when the module is imported; `m` is the module.
 #pragma once

@@ -67,7 +67,7 @@ def _panel(axes: Axes, plan: BenchPlan, results: Sequence[BenchResult], title: s
     for index, method in enumerate(plan.methods):
         ours = method.name == plan.table.ours
         round_, place_in_round = (0, 0) if ours else divmod(others, len(METHOD_COLORS))
-        colour, marker = (ACCENT, "o") if ours else (METHOD_COLORS[place_in_round], MARKERS[place_in_round])
+        color, marker = (ACCENT, "o") if ours else (METHOD_COLORS[place_in_round], MARKERS[place_in_round])
         others += not ours
         summaries = [_of(results, method.name, group) for group in range(len(groups))]
         known = [(place, each) for place, each in zip(places, summaries, strict=True) if each is not None]
@@ -75,7 +75,7 @@ def _panel(axes: Axes, plan: BenchPlan, results: Sequence[BenchResult], title: s
         axes.errorbar(
             [place + shift for place, _ in known], [each.mean for _, each in known],
             yerr=[each.spread or 0.0 for _, each in known] if len(plan.seeds) > 1 else None,
-            color=colour, marker=marker, markersize=5.5, markerfacecolor="white" if round_ else colour,
+            color=color, marker=marker, markersize=5.5, markerfacecolor="white" if round_ else color,
             linestyle=LINES[round_ % len(LINES)], linewidth=2.2 if ours else 1.3, elinewidth=1.0, capsize=2.5,
             label=method.title, zorder=3 if ours else 2,
         )  # fmt: skip

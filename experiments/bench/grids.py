@@ -160,7 +160,7 @@ def _neutral(plan: BenchPlan, results: Sequence[BenchResult], title: str) -> lis
     """Quality in neutral colours, of all methods; nothing where no method is measured in others."""
     if all(result.figures.get("psnr_neutral") is None for result in results):
         return []
-    alike = [replace(result, figures=_in_neutral_colours(result.figures)) for result in results]
+    alike = [replace(result, figures=_in_neutral_colors(result.figures)) for result in results]
     return [
         _measured(
             plan, alike, "neutral", title, _for_scenes(plan, REFERENCE_EXPOSURE_COLUMNS), (REFERENCE_EXPOSURE_NOTE,)
@@ -168,7 +168,7 @@ def _neutral(plan: BenchPlan, results: Sequence[BenchResult], title: str) -> lis
     ]
 
 
-def _in_neutral_colours(figures: Mapping[str, float | None]) -> Mapping[str, float | None]:
+def _in_neutral_colors(figures: Mapping[str, float | None]) -> Mapping[str, float | None]:
     """The figures with those in neutral colours, which are the raw ones where nothing else is said."""
     if figures.get("psnr_neutral") is not None:
         return figures

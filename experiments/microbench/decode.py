@@ -58,7 +58,7 @@ def decode_times(decode: Callable[..., AnchorSplats], arguments: tuple, repeats:
     """Forward ms, backward ms (of the decoder alone), and how many splats came out."""
     camera = overhead_camera()
     splats = decode(*arguments, camera)
-    names = ("means_px", "conics", "depths", "colours", "opacities", "volumes")
+    names = ("means_px", "conics", "depths", "colors", "opacities", "volumes")
     outputs = [getattr(splats, name) for name in names]
     gradients = [torch.randn_like(t) for t in outputs]
     *tensors, weights = arguments

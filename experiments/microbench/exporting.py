@@ -87,7 +87,7 @@ def made_up(anchors: int) -> tuple[AnchorModel, list[Camera]]:
 def one(anchors: int, folder: Path, names: list[str], measure: bool) -> None:
     """Export one size and print what it took, as JSON."""
     model, cameras = made_up(anchors)
-    photograph = folder / "grey.png"
+    photograph = folder / "gray.png"
     Image.new("RGB", (WIDTH, HEIGHT), (128, 128, 128)).save(photograph)
     every = max(4, len(cameras) // TESTED)
     views = tuple(

@@ -39,7 +39,7 @@ from vdgs.kernels.gsplat.rasterize import GsplatUnavailable
 #: Sources and the headers that they include.
 SOURCES = {
     "cull.cu": ("gaussian_math.h", "image_formation.h"), "decode.cu": ("gaussian_math.h", "image_formation.h"),
-    "loss.cu": (), "rasterise.cu": ("image_formation.h",), "statistics.cu": (),
+    "loss.cu": (), "rasterize.cu": ("image_formation.h",), "statistics.cu": (),
 }  # fmt: skip
 #: How many dB the town may come out better or worse than on the processor: two trainings differ by rounding.
 TOWN_DB = 0.5
@@ -182,7 +182,7 @@ def command(*arguments: str) -> None:
 
 
 def time_steps(machine: Machine, sizes: Sizes) -> None:
-    for name in rasterisers():
+    for name in rasterizers():
         os.environ[rasterizer.RASTERIZER_ENV_VAR] = name
         for visible, width, height in sizes.steps:
             state, camera, target = step.prepare(visible, width, height, device=machine.device)
@@ -198,7 +198,7 @@ def time_steps(machine: Machine, sizes: Sizes) -> None:
     os.environ.pop(rasterizer.RASTERIZER_ENV_VAR, None)
 
 
-def rasterisers() -> list[str]:
+def rasterizers() -> list[str]:
     """Those that can be used."""
     try:
         rasterizer.select_rasterizer("gsplat")

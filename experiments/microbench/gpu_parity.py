@@ -102,7 +102,7 @@ def decode(kernels: KernelBackend, place: Place) -> Results:
     drawn = (rows[splats.source.long() // k] * k + splats.source.long() % k).detach()
     found: Results = {"whole splats": member(drawn, count * k)}
     loss: Any = 0.0
-    for name in ("means_px", "conics", "colours", "opacities", "volumes"):
+    for name in ("means_px", "conics", "colors", "opacities", "volumes"):
         values = getattr(splats, name)
         everywhere = values.new_zeros(count * k, *values.shape[1:])
         everywhere[drawn] = values.detach()
@@ -123,7 +123,7 @@ def decode_to_train(kernels: KernelBackend, place: Place) -> Results:
     raster, pullback = kernels.rasterize_vjp(splats, place.background, place.width, place.height)
     gradients = pullback(place.random(place.height, place.width, 3))
     count = torch.tensor([float(len(splats.source))])
-    sums = torch.stack([gradients.colours.sum(), gradients.opacities.sum()])
+    sums = torch.stack([gradients.colors.sum(), gradients.opacities.sum()])
     return {"image": raster.image, "volume": splats.volume, "splats": count, "gradients added up": sums}
 
 
@@ -135,7 +135,7 @@ def decode_backward_adam(kernels: KernelBackend, place: Place) -> Results:
     count = len(a) * k
     gradients = SplatGradients(
         means_px=0.01 * place.random(count, 2)[drawn], conics=place.random(count, 3)[drawn],
-        colours=place.random(count, 3)[drawn], opacities=place.random(count)[drawn], volume=0.1, source=splats.source,
+        colors=place.random(count, 3)[drawn], opacities=place.random(count)[drawn], volume=0.1, source=splats.source,
         color_values=splats.colors, opacity_values=splats.opacities,
     )  # fmt: skip
     states = [
@@ -169,7 +169,7 @@ def project(kernels: KernelBackend, place: Place) -> Results:
     return {name: t.detach() for name, t in values.items()} | {"whole valid": found.valid} | named
 
 
-def rasterise(kernels: KernelBackend, place: Place) -> Results:
+def rasterize(kernels: KernelBackend, place: Place) -> Results:
     """With depth, as pictures for people are drawn; median depth jumps from splat to splat."""
     raster = kernels.rasterize(place.splats(), place.background, place.width, place.height, depth=True)
     assert raster.depth is not None
@@ -177,7 +177,7 @@ def rasterise(kernels: KernelBackend, place: Place) -> Results:
     return found if raster.median_depth is None else found | {"whole median depth": raster.median_depth}
 
 
-def rasterise_vjp(kernels: KernelBackend, place: Place) -> Results:
+def rasterize_vjp(kernels: KernelBackend, place: Place) -> Results:
     raster, pullback = kernels.rasterize_vjp(place.splats(), place.background, place.width, place.height)
     shape = (place.height, place.width)
     gradients = pullback(place.random(*shape, 3), place.random(*shape))._asdict()
@@ -229,8 +229,8 @@ def cell_keys(kernels: KernelBackend, place: Place) -> Results:
     return {"whole keys": keys_of(kernels, place)}
 
 
-def cell_centres(kernels: KernelBackend, place: Place) -> Results:
-    return {"centres": kernels.cell_centers(keys_of(kernels, place), 0.5, place.background)}
+def cell_centers(kernels: KernelBackend, place: Place) -> Results:
+    return {"centers": kernels.cell_centers(keys_of(kernels, place), 0.5, place.background)}
 
 
 def group_cells(kernels: KernelBackend, place: Place) -> Results:
@@ -256,11 +256,11 @@ def keys_of(kernels: KernelBackend, place: Place) -> Tensor:
     return kernels.cell_keys(place.anchors.positions, 0.5, place.background)
 
 
-def harmonic_colours(kernels: KernelBackend, place: Place) -> Results:
+def harmonic_colors(kernels: KernelBackend, place: Place) -> Results:
     means, count = place.anchors.positions, len(place.anchors)
     rows = torch.arange(0, count, 3).to(place.device)
     coefficients = place.random(count, 48)
-    return {"colours": kernels.harmonic_colors(means[rows], coefficients, rows, place.background, 3)}
+    return {"colors": kernels.harmonic_colors(means[rows], coefficients, rows, place.background, 3)}
 
 
 def fit_harmonics(kernels: KernelBackend, place: Place) -> Results:
@@ -291,9 +291,9 @@ def member(rows: Tensor, count: int) -> Tensor:
 CASES: dict[str, Callable[[KernelBackend, Place], Results]] = {
     case.__name__: case
     for case in (
-        adam_rows, add_view_statistics, cell_centres, cell_keys, contains, count_visibility, cull, decode,
-        decode_to_train, decode_backward_adam, fit_harmonics, group_cells, group_max, harmonic_colours, mark_visible,
-        mean_ellipsoids, morton_order, photometric_loss, project, rasterise, rasterise_vjp,
+        adam_rows, add_view_statistics, cell_centers, cell_keys, contains, count_visibility, cull, decode,
+        decode_to_train, decode_backward_adam, fit_harmonics, group_cells, group_max, harmonic_colors, mark_visible,
+        mean_ellipsoids, morton_order, photometric_loss, project, rasterize, rasterize_vjp,
         shares,
     )
 }  # fmt: skip
@@ -306,7 +306,7 @@ def differences(device: torch.device, anchors: int, width: int, height: int) -> 
     here, there = Place(torch.device("cpu"), anchors, width, height), Place(device, anchors, width, height)
     for name, case in CASES.items():
         expected = case(cpu, here)
-        sets: dict[str, Any] = {"cuda": cuda, "gsplat": gsplat} if name.startswith("rasterise") else {"": gpu}
+        sets: dict[str, Any] = {"cuda": cuda, "gsplat": gsplat} if name.startswith("rasterize") else {"": gpu}
         for by, kernels in sets.items():
             with suppress(GsplatUnavailable):
                 yield from compared(name, by, case(kernels, there), expected)

@@ -49,14 +49,14 @@ class Scene:
     height: int
     means: np.ndarray
     conics: np.ndarray
-    colours: np.ndarray
+    colors: np.ndarray
     opacities: np.ndarray
     depths: np.ndarray
     background: np.ndarray
     picture_gradient: np.ndarray
 
     def rows(self) -> tuple[np.ndarray, ...]:
-        return self.means, self.conics, self.colours, self.opacities, self.depths
+        return self.means, self.conics, self.colors, self.opacities, self.depths
 
 
 def make_scene(n: int, width: int, height: int) -> Scene:
@@ -73,9 +73,9 @@ def make_scene(n: int, width: int, height: int) -> Scene:
     yy = (sin * long) ** 2 + (cos * short) ** 2 + 0.3
     conics = np.stack([yy, -xy, xx], axis=1) / (xx * yy - xy**2)[:, None]
     opacities = 1 / (1 + np.exp(-g.normal(0, 1.7, n)))
-    colours, depths = g.uniform(0, 1, (n, 3)), g.uniform(1, 100, n)
+    colors, depths = g.uniform(0, 1, (n, 3)), g.uniform(1, 100, n)
     gradient = np.random.default_rng(1).normal(size=(height, width, 3))
-    arrays = (means, conics, colours, opacities, depths, np.array([0.2, 0.3, 0.4]), gradient)
+    arrays = (means, conics, colors, opacities, depths, np.array([0.2, 0.3, 0.4]), gradient)
     return Scene(width, height, *(a.astype(np.float32) for a in arrays))
 
 
@@ -106,8 +106,8 @@ class Ours:
             tensor.grad = None
         start = time.perf_counter()
         size = self.scene.width, self.scene.height
-        means, conics, colours, opacities, depths = self.tensors
-        splats = Splats(means, conics, depths, colours, opacities)
+        means, conics, colors, opacities, depths = self.tensors
+        splats = Splats(means, conics, depths, colors, opacities)
         raster = rasterize(splats, self.background, *size, module=self.module)
         middle = time.perf_counter()
         torch.autograd.backward(raster.image, self.gradient)
@@ -118,7 +118,7 @@ class Ours:
         s = self.scene
         image, alpha = np.empty((s.height, s.width, 3), np.float32), np.empty((s.height, s.width), np.float32)
         background = tuple(float(c) for c in s.background)
-        frame = self.module.rasterise_forward(
+        frame = self.module.rasterize_forward(
             *s.rows(), background, s.width, s.height, image, alpha, None, None, counting=True
         )
         return int(frame.statistics["pairs"])
@@ -136,10 +136,10 @@ class Prototype:
             np.empty((s.height, s.width, 3), np.float32),
             np.empty((s.height, s.width), np.float32),
         )
-        rows = (s.means, s.conics, s.opacities, s.colours, s.depths, self.radii, s.background)
+        rows = (s.means, s.conics, s.opacities, s.colors, s.depths, self.radii, s.background)
         frame = self.module.forward(*rows, image, through, s.height, s.width, self.threads, False)
         middle = time.perf_counter()
-        outputs = [np.empty_like(a) for a in (s.means, s.conics, s.opacities, s.colours)]
+        outputs = [np.empty_like(a) for a in (s.means, s.conics, s.opacities, s.colors)]
         self.module.backward(frame, s.background, s.picture_gradient, None, *outputs, self.threads)
         return middle - start, time.perf_counter() - middle
 
@@ -158,9 +158,9 @@ def scenes_of_run(run: Path, views: int) -> list[tuple[str, Scene]]:
         rows = (splats.means_px, splats.conics, splats.colors, splats.opacities, splats.depths)
         gradient = np.random.default_rng(1).normal(size=(camera.height, camera.width, 3)).astype(np.float32)
         background = np.array(opened.model.background, np.float32)
-        means, conics, colours, opacities, depths = (row.numpy() for row in rows)
+        means, conics, colors, opacities, depths = (row.numpy() for row in rows)
         size = camera.width, camera.height
-        scene = Scene(*size, means, conics, colours, opacities, depths, background, gradient)
+        scene = Scene(*size, means, conics, colors, opacities, depths, background, gradient)
         scenes.append((f"{len(rows[0]) // 1000}k {camera.width}x{camera.height}", scene))
     return scenes
 

@@ -43,7 +43,7 @@ from vdgs.training import FrozenAnchors, TrainingProblem, initial_state, to_chec
 from vdgs.training.optimizer import learning_rates_at
 from vdgs.training.training_step import backward_and_step, render_for_training
 
-PHASES = ("cull", "decode", "around", "rasterise", "loss", "solid", "backward", "move", "statistics")
+PHASES = ("cull", "decode", "around", "rasterize", "loss", "solid", "backward", "move", "statistics")
 
 
 def scene(visible: int, width: int, height: int, hidden: int = 0) -> tuple[Anchors, Camera]:
@@ -100,7 +100,7 @@ def one_step(
         waiting = [timed("decode", lambda: decode_anchors_for_training(state.anchors, rows, weights, camera))]
         around = timed("around", lambda: None if surroundings is None else decoded(surroundings, camera))
         view = timed(
-            "rasterise", lambda: render_for_training(waiting.pop(), camera, torch.zeros(3, device=device), around)
+            "rasterize", lambda: render_for_training(waiting.pop(), camera, torch.zeros(3, device=device), around)
         )
     view.image.requires_grad_(True)
 

@@ -145,7 +145,7 @@ void adam_update(const AdamRows& state, const int64_t* rows, size_t count, const
   if (!updates) corrections.for_all(1);
   const size_t width = state.width, most = updates ? Corrections::most(width) : count;
   for (size_t begin = 0, stop = 0; begin < count; begin = stop) {
-    // Neighbours in the list that are neighbours in memory go together.
+    // Neighbors in the list that are neighbors in memory go together.
     const size_t end = std::min(count, begin + most);
     stop = rows ? begin + 1 : end;
     while (stop < end && rows[stop] == rows[stop - 1] + 1) ++stop;

@@ -1,4 +1,4 @@
-// Colours as spherical harmonics: what they show from a place, and their fit to what cameras saw. Sixteen Gaussians are
+// Colors as spherical harmonics: what they show from a place, and their fit to what cameras saw. Sixteen Gaussians are
 // lanes. The functions are those of vdgs.kernels.spherical_harmonics.
 #include <algorithm>
 #include <cmath>
@@ -44,7 +44,7 @@ VDGS_INLINE void basis(F16 x, F16 y, F16 z, F16* out) {
   }
 }
 
-// ------------------------------------------------------------------------------------------------ colours
+// ------------------------------------------------------------------------------------------------ colors
 
 struct Coefficients {
   const float* first;
@@ -52,7 +52,7 @@ struct Coefficients {
 };
 
 template <int degree>
-void show(const float* means, const int64_t* rows, Coefficients all, const float* eye, int64_t count, float* colours) {
+void show(const float* means, const int64_t* rows, Coefficients all, const float* eye, int64_t count, float* colors) {
   constexpr int f = functions(degree);
   alignas(64) float own[3 * f][kLanes] = {}, there[3][kLanes] = {};
   for (int64_t lane = 0; lane < count; ++lane) {
@@ -71,13 +71,13 @@ void show(const float* means, const int64_t* rows, Coefficients all, const float
     store(shown[channel], max(sum, splat(0.0f)));
   }
   for (int64_t lane = 0; lane < count; ++lane)
-    for (int channel = 0; channel < 3; ++channel) colours[3 * lane + channel] = shown[channel][lane];
+    for (int channel = 0; channel < 3; ++channel) colors[3 * lane + channel] = shown[channel][lane];
 }
 
 // ---------------------------------------------------------------------------------------------------- fit
 
 struct Pairs {
-  const float *directions, *colours, *weights;
+  const float *directions, *colors, *weights;
 };
 
 // The pairs of one group of Gaussians: where those of each lane begin and how many there are; lanes beyond have none.
@@ -86,9 +86,9 @@ struct Runs {
   int64_t most = 0;
 };
 
-// A direction, what was seen of the colour - 1/2, and its share of the Gaussian's weight, for every lane.
+// A direction, what was seen of the color - 1/2, and its share of the Gaussian's weight, for every lane.
 struct Seen {
-  alignas(64) float direction[3][kLanes] = {}, colour[3][kLanes] = {}, share[kLanes] = {};
+  alignas(64) float direction[3][kLanes] = {}, color[3][kLanes] = {}, share[kLanes] = {};
 };
 
 VDGS_INLINE void gather(const Pairs& pairs, const Runs& runs, const float* of_one, int64_t turn, Seen& seen) {
@@ -98,7 +98,7 @@ VDGS_INLINE void gather(const Pairs& pairs, const Runs& runs, const float* of_on
     const int64_t pair = runs.begin[lane] + turn;
     for (int i = 0; i < 3; ++i) {
       seen.direction[i][lane] = pairs.directions[3 * pair + i];
-      seen.colour[i][lane] = pairs.colours[3 * pair + i] - 0.5f;
+      seen.color[i][lane] = pairs.colors[3 * pair + i] - 0.5f;
     }
     seen.share[lane] = pairs.weights[pair] * of_one[lane];
   }
@@ -118,7 +118,7 @@ class Regression {
       alignas(64) Lanes weighted;
       for (int lane = 0; lane < kLanes; ++lane) weighted[lane] = double{seen.share[lane]} * there[i][lane];
       for (int j = 0; j <= i; ++j) add_product(matrix_[packed(i, j)], weighted, there[j]);
-      for (int c = 0; c < 3; ++c) add_product(right_[3 * i + c], weighted, seen.colour[c]);
+      for (int c = 0; c < 3; ++c) add_product(right_[3 * i + c], weighted, seen.color[c]);
     }
   }
 
@@ -222,10 +222,10 @@ void with_degree(int wanted, const Body& body) {
   if constexpr (degree < kMaxDegree) with_degree<degree + 1>(wanted, body);
 }
 
-void bound_fit(Matrix directions, Matrix colours, Vector weights, Numbers starts, int degree, double ridge,
+void bound_fit(Matrix directions, Matrix colors, Vector weights, Numbers starts, int degree, double ridge,
                Array<float, nb::ndim<2>> found) {
   nb::gil_scoped_release release;
-  const Pairs pairs{directions.data(), colours.data(), weights.data()};
+  const Pairs pairs{directions.data(), colors.data(), weights.data()};
   const int64_t m = static_cast<int64_t>(starts.shape(0)), p = static_cast<int64_t>(weights.shape(0));
   with_degree(degree, [&](auto of) {
     in_groups(m, [&](int64_t first, int64_t lanes) {
@@ -236,13 +236,13 @@ void bound_fit(Matrix directions, Matrix colours, Vector weights, Numbers starts
 }
 
 void bound_show(Matrix means, Rows coefficients, Numbers rows, Vector eye, int degree,
-                Array<float, nb::ndim<2>> colours) {
+                Array<float, nb::ndim<2>> colors) {
   nb::gil_scoped_release release;
   const Coefficients all{coefficients.data(), coefficients.stride(0)};
   with_degree(degree, [&](auto of) {
     in_groups(static_cast<int64_t>(rows.shape(0)), [&](int64_t first, int64_t lanes) {
       show<decltype(of)::value>(means.data() + 3 * first, rows.data() + first, all, eye.data(), lanes,
-                                colours.data() + 3 * first);
+                                colors.data() + 3 * first);
     });
   });
 }
@@ -250,10 +250,10 @@ void bound_show(Matrix means, Rows coefficients, Numbers rows, Vector eye, int d
 }  // namespace
 
 VDGS_BIND(harmonics) {
-  m.def("fit_harmonics", &bound_fit, nb::arg("directions"), nb::arg("colours"), nb::arg("weights"), nb::arg("starts"),
+  m.def("fit_harmonics", &bound_fit, nb::arg("directions"), nb::arg("colors"), nb::arg("weights"), nb::arg("starts"),
         nb::arg("degree"), nb::arg("ridge"), nb::arg("found"));
-  m.def("harmonic_colours", &bound_show, nb::arg("means"), nb::arg("coefficients"), nb::arg("rows"), nb::arg("eye"),
-        nb::arg("degree"), nb::arg("colours"));
+  m.def("harmonic_colors", &bound_show, nb::arg("means"), nb::arg("coefficients"), nb::arg("rows"), nb::arg("eye"),
+        nb::arg("degree"), nb::arg("colors"));
 }
 
 }  // namespace vdgs

@@ -1,6 +1,6 @@
 // L1 and SSIM with their gradient, fused.
 //
-// The image stays interleaved: a row is 3 * width lanes, and the horizontal neighbour of a lane is three
+// The image stays interleaved: a row is 3 * width lanes, and the horizontal neighbor of a lane is three
 // lanes away. The image is cut into tiles, and each tile is one task that walks down its rows once:
 //
 //   row r       read the image x and the target y; blur x, y, x²+y², xy along the row        -> moments

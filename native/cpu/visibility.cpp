@@ -1,11 +1,11 @@
 // A frustum is five half-spaces: n·p + d > 0 for the near plane and the four borders of the image (for a
-// pinhole x >= 0 says fx X + cx Z >= 0). Points come in blocks of neighbours; per block and camera
+// pinhole x >= 0 says fx X + cx Z >= 0). Points come in blocks of neighbors; per block and camera
 //
 //   all corners of the block's box inside every half-space    -> one count for the whole block
 //   all corners outside one half-space                        -> nothing
 //   else                                                      -> sixteen points at a time in float32.
 //
-// Float32 is exact enough because points are taken relative to the block's centre, whose own distance to
+// Float32 is exact enough because points are taken relative to the block's center, whose own distance to
 // each plane is computed in float64. What rounding could still decide, a point nearer to a plane than a bound
 // on the error, is computed again in float64: the result is that of brute force in float64.
 #include <algorithm>
@@ -83,11 +83,11 @@ bool sees(const ViewCamera& c, const double* p) {
   return x >= 0.0 && x < c.width && y >= 0.0 && y < c.height;
 }
 
-// Points about their centre, as columns.
+// Points about their center, as columns.
 struct Block {
   alignas(64) float column[3][kBlock];
   alignas(64) int32_t count[kBlock];
-  double centre[3], half[3], radius, magnitude;
+  double center[3], half[3], radius, magnitude;
   size_t size;
 };
 
@@ -96,7 +96,7 @@ bool finite(const Scalar* p) {
   return std::isfinite(p[0]) && std::isfinite(p[1]) && std::isfinite(p[2]);
 }
 
-// A point that is not finite, and the filling after the last, sit at the centre and their counts are ignored.
+// A point that is not finite, and the filling after the last, sit at the center and their counts are ignored.
 template <class Scalar>
 void fill(Block& block, const Scalar* points, size_t size) {
   double low[3], high[3];
@@ -113,15 +113,15 @@ void fill(Block& block, const Scalar* points, size_t size) {
   block.radius = block.magnitude = 0.0;
   for (int k = 0; k < 3; ++k) {
     const bool empty = low[k] > high[k];
-    block.centre[k] = empty ? 0.0 : 0.5 * low[k] + 0.5 * high[k];
+    block.center[k] = empty ? 0.0 : 0.5 * low[k] + 0.5 * high[k];
     block.half[k] = empty ? 0.0 : 0.5 * high[k] - 0.5 * low[k];
     block.radius += block.half[k];
-    block.magnitude += std::abs(block.centre[k]) + block.half[k];
+    block.magnitude += std::abs(block.center[k]) + block.half[k];
   }
   for (int k = 0; k < 3; ++k) {
     std::fill(block.column[k], block.column[k] + kBlock, 0.0f);
     for (size_t i = 0; i < size; ++i) {
-      if (finite(points + 3 * i)) block.column[k][i] = static_cast<float>(points[3 * i + k] - block.centre[k]);
+      if (finite(points + 3 * i)) block.column[k][i] = static_cast<float>(points[3 * i + k] - block.center[k]);
     }
   }
   std::fill(block.count, block.count + kBlock, 0);
@@ -129,7 +129,7 @@ void fill(Block& block, const Scalar* points, size_t size) {
 
 enum class Side { kInside, kOutside, kCut };
 
-// The planes that cut the block, about its centre and rounded, with the bound on their error.
+// The planes that cut the block, about its center and rounded, with the bound on their error.
 struct Cut {
   float normal[kPlanes][3], offset[kPlanes];
   float doubt = 0.0f;
@@ -140,7 +140,7 @@ Side cut_block(const Block& block, const Frustum& frustum, Cut& cut) {
   for (const Plane& plane : frustum.planes) {
     double distance = plane.offset, reach = 0.0;
     for (int k = 0; k < 3; ++k) {
-      distance += plane.normal[k] * block.centre[k];
+      distance += plane.normal[k] * block.center[k];
       reach += std::abs(plane.normal[k]) * block.half[k];
     }
     const double doubt = kRounding * (block.radius + std::abs(distance)) +

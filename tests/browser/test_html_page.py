@@ -33,12 +33,12 @@ def two_floors() -> Gaussians:
     above = floor[(x > 0) & (y > 0)] + [0, 0, 1.5]
     post = np.stack([np.full(12, -2.0), np.full(12, -1.0), np.linspace(0, 2, 12)], 1)
     means = np.concatenate([above, floor, post]).astype(np.float32)
-    colours = np.concatenate([np.full(above.shape, [0.9, 0.1, 0.1]), paint, np.full(post.shape, 0.95)])
+    colors = np.concatenate([np.full(above.shape, [0.9, 0.1, 0.1]), paint, np.full(post.shape, 0.95)])
     count = len(means)
     return Gaussians(
         means=torch.from_numpy(means), log_scales=torch.tensor([0.13, 0.13, 0.02]).log().repeat(count, 1),
         quaternions=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1), opacity_logits=torch.full((count,), 5.0),
-        sh0=rgb_to_sh(torch.from_numpy(colours.astype(np.float32))), shN=torch.zeros(count, 0, 3),
+        sh0=rgb_to_sh(torch.from_numpy(colors.astype(np.float32))), shN=torch.zeros(count, 0, 3),
     )  # fmt: skip
 
 

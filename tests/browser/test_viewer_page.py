@@ -104,7 +104,7 @@ def test_a_browser_shows_every_layer_and_goes_where_buttons_lead(viewer):
             shown[name] = seen()
         for one, other in combinations(shown, 2):
             assert np.abs(shown[one] - shown[other]).mean() > 3, (one, other)
-        visitor._layer.value = "Colour"
+        visitor._layer.value = "Color"
         for name, looks in (("From above", (0, 0, -1)), ("All", (0, 0.71, -0.71))):
             wait_until(lambda name=name: page.press(name))
             wait_until(lambda looks=looks: visitor.camera.forward == pytest.approx(looks, abs=0.02))

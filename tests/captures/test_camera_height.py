@@ -27,7 +27,7 @@ def capture_of(scene: TinyScene) -> Capture:
     )
     frame = GroundFrame(scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, description="as it is")
     return Capture(
-        root=Path(), source="colmap", images="images", views=views, points=scene.points, point_colors=scene.colours,
+        root=Path(), source="colmap", images="images", views=views, points=scene.points, point_colors=scene.colors,
         ground=frame,
     )  # fmt: skip
 
@@ -48,8 +48,8 @@ def about_a_tower(below: float) -> TinyScene:
 
 
 def plain_height(capture: Capture) -> float:
-    centres = np.array([view.camera.position for view in capture.train_views])
-    return float(np.median(centres[:, 2]) - np.median(capture.points[:, 2]))
+    centers = np.array([view.camera.position for view in capture.train_views])
+    return float(np.median(centers[:, 2]) - np.median(capture.points[:, 2]))
 
 
 def volume_weight(capture: Capture) -> float:
@@ -99,5 +99,5 @@ def test_moving_and_scaling_the_scene_changes_the_weight_as_it_changes_volumes(s
 def test_all_in_one_place_is_no_division_by_zero():
     scene = tiny_scene(points=3)
     place = next(iter(scene.cameras.values())).position
-    capture = capture_of(TinyScene(dict([next(iter(scene.cameras.items()))]), np.tile(place, (3, 1)), scene.colours))
+    capture = capture_of(TinyScene(dict([next(iter(scene.cameras.items()))]), np.tile(place, (3, 1)), scene.colors))
     assert 0 < camera_height(capture) < 1e-6

@@ -30,7 +30,7 @@ def assert_same(model, scene: TinyScene) -> None:
         assert view.intrinsics.focal == (camera.fx, camera.fy)
         assert view.intrinsics.principal_point == (camera.cx, camera.cy)
     np.testing.assert_array_equal(model.points, scene.points)
-    np.testing.assert_array_equal(model.colours, scene.colours)
+    np.testing.assert_array_equal(model.colors, scene.colors)
 
 
 @pytest.mark.parametrize("text", [False, True])
@@ -78,7 +78,7 @@ def test_binary_wins_over_text_and_names_may_hold_spaces_and_folders(tmp_path):
     renamed = TinyScene(
         dict(zip(["a/first flight.png", "b/2.png"], scene.cameras.values(), strict=True)),
         scene.points,
-        scene.colours,
+        scene.colors,
     )
     for text in (True, False):
         folder = write_colmap(tmp_path / str(text), renamed, text=text)
@@ -92,7 +92,7 @@ def test_binary_wins_over_text_and_names_may_hold_spaces_and_folders(tmp_path):
 )
 def test_names_that_leave_the_image_folder_are_refused(tmp_path, name):
     scene = tiny_scene(columns=1, rows=1)
-    bad = TinyScene({name: next(iter(scene.cameras.values()))}, scene.points, scene.colours)
+    bad = TinyScene({name: next(iter(scene.cameras.values()))}, scene.points, scene.colors)
     folder = write_colmap(tmp_path, bad, images=None)
     with pytest.raises(CaptureError, match="inside the image folder"):
         read_colmap(folder)
@@ -168,7 +168,7 @@ def test_damaged_files_end_in_a_message_or_a_model(tmp_path, stem, text, data):
 
 def test_the_biggest_of_several_models_is_used(tmp_path):
     whole = tiny_scene()
-    part = TinyScene(dict(list(whole.cameras.items())[:3]), whole.points[:50], whole.colours[:50])
+    part = TinyScene(dict(list(whole.cameras.items())[:3]), whole.points[:50], whole.colors[:50])
     write_colmap(tmp_path, part, images=None, sparse="sparse/0")
     write_colmap(tmp_path, whole, sparse="sparse/1")
     capture = load_capture(tmp_path, CaptureOptions(up="z"))

@@ -35,7 +35,7 @@ def assert_sees_the_scene(capture: Capture, scene: TinyScene, rename=lambda name
     """Every point falls on the same pixel as in the scene that was written."""
     assert len(capture.views) == len(scene.cameras)
     assert len(capture.points) == len(scene.points)
-    np.testing.assert_array_equal(capture.point_colors, scene.colours)
+    np.testing.assert_array_equal(capture.point_colors, scene.colors)
     for view in capture.views:
         camera = scene.cameras[rename(view.name)]
         expected, depth = camera.project(scene.points)
@@ -65,7 +65,7 @@ def write_transforms(root: Path, scene: TinyScene, applied: np.ndarray | None = 
     content |= changes
     root.mkdir(parents=True, exist_ok=True)
     (root / "transforms.json").write_text(json.dumps(content), encoding="utf-8")
-    write_ply(root / "sparse_pc.ply", scene.points @ world[:3, :3].T + world[:3, 3], scene.colours)
+    write_ply(root / "sparse_pc.ply", scene.points @ world[:3, :3].T + world[:3, 3], scene.colors)
     write_images(root / "images", scene)
     return content
 
@@ -105,7 +105,7 @@ def test_intrinsics_per_frame_splits_and_masks(tmp_path, scene):
         frame["mask_path"] = "masks/one.png"
     write_images(
         tmp_path / "masks",
-        TinyScene({"one.png": next(iter(scene.cameras.values()))}, scene.points, scene.colours),
+        TinyScene({"one.png": next(iter(scene.cameras.values()))}, scene.points, scene.colors),
     )
     content |= {"fl_x": 1.0, "train_filenames": names[:9], "test_filenames": names[9:]}
     (tmp_path / "transforms.json").write_text(json.dumps(content))
@@ -307,21 +307,21 @@ def test_damaged_transforms_json_ends_in_a_message_or_a_capture(tmp_path, data):
 
 @pytest.mark.parametrize("text", [False, True])
 def test_point_clouds_are_read_as_written(tmp_path, scene, text):
-    write_ply(tmp_path / "a.ply", scene.points, scene.colours, text=text)
-    points, colours = read_point_cloud(tmp_path / "a.ply")
+    write_ply(tmp_path / "a.ply", scene.points, scene.colors, text=text)
+    points, colors = read_point_cloud(tmp_path / "a.ply")
     np.testing.assert_array_equal(points, scene.points)
-    np.testing.assert_array_equal(colours, scene.colours)
+    np.testing.assert_array_equal(colors, scene.colors)
 
 
 def test_point_clouds_of_other_programs_are_read(tmp_path, scene):
     import trimesh
 
-    cloud = trimesh.PointCloud(scene.points, np.column_stack([scene.colours, np.full(len(scene.points), 255)]))
+    cloud = trimesh.PointCloud(scene.points, np.column_stack([scene.colors, np.full(len(scene.points), 255)]))
     for encoding in ("ascii", "binary"):
         (tmp_path / "a.ply").write_bytes(trimesh.exchange.ply.export_ply(cloud, encoding=encoding))
-        points, colours = read_point_cloud(tmp_path / "a.ply")
+        points, colors = read_point_cloud(tmp_path / "a.ply")
         np.testing.assert_allclose(points, scene.points, atol=1e-5)
-        np.testing.assert_array_equal(colours, scene.colours)
+        np.testing.assert_array_equal(colors, scene.colors)
 
 
 @FUZZ
@@ -335,8 +335,8 @@ def test_damaged_point_clouds_end_in_a_message_or_points(tmp_path, data, text):
         content[data.draw(st.integers(0, len(content) - 1))] ^= 1 << data.draw(st.integers(0, 7))
     file.write_bytes(bytes(content))
     with contextlib.suppress(CaptureError):
-        points, colours = read_point_cloud(file)
-        assert points.shape == colours.shape
+        points, colors = read_point_cloud(file)
+        assert points.shape == colors.shape
 
 
 # -------------------------------------------------------------------------------------------- Mega-NeRF
@@ -347,10 +347,10 @@ def test_mega_nerf(tmp_path, scene, points):
     """The split is the shipped one, down is x, and points may come from a COLMAP model in any world."""
     renamed = write_mega_nerf(tmp_path, scene)
     if points == "ply":
-        write_ply(tmp_path / "points3D.ply", scene.points @ DRB.T, scene.colours)
+        write_ply(tmp_path / "points3D.ply", scene.points @ DRB.T, scene.colors)
     else:
         of = scene if "originals" in points else TinyScene(
-            {Path(name).name: camera for name, camera in renamed.cameras.items()}, scene.points, scene.colours
+            {Path(name).name: camera for name, camera in renamed.cameras.items()}, scene.points, scene.colors
         )  # fmt: skip
         angle = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
         write_colmap(tmp_path, moved(of, 0.07, angle, np.array([1.0, 2, 3])), images=None)
@@ -367,7 +367,7 @@ def test_mistakes_in_mega_nerf_folders_are_named(tmp_path, scene):
     write_mega_nerf(tmp_path, scene)
     with pytest.raises(CaptureError, match=r"brings no 3D points(?s:.)*points3D\.ply"):
         load_capture(tmp_path)
-    write_ply(tmp_path / "points3D.ply", scene.points @ DRB.T, scene.colours)
+    write_ply(tmp_path / "points3D.ply", scene.points @ DRB.T, scene.colors)
     file = tmp_path / "train" / "metadata" / "000001.pt"
     whole = file.read_bytes()
     for content in (whole[:100], b"", b"not torch at all", whole[:-60]):
@@ -387,7 +387,7 @@ def test_a_foreign_colmap_model_is_refused(tmp_path, scene):
     write_mega_nerf(tmp_path, scene)
     shuffled = np.random.default_rng(0).permutation(list(scene.cameras))
     others = dict(zip(shuffled.tolist(), scene.cameras.values(), strict=True))
-    write_colmap(tmp_path, TinyScene(others, scene.points, scene.colours), images=None)
+    write_colmap(tmp_path, TinyScene(others, scene.points, scene.colors), images=None)
     with pytest.raises(CaptureError, match="disagree"):
         load_capture(tmp_path)
 
@@ -425,12 +425,12 @@ def test_matrixcity_blocks(tmp_path, scene):
         content = {"camera_angle_x": 2 * np.arctan(first.width / 2 / first.fx), "frames": frames}
         (tmp_path / block / "transforms.json").write_text(json.dumps(content))
         write_images(tmp_path / block / "rgb", part)
-    write_ply(tmp_path / "points3D.ply", scene.points, scene.colours)
+    write_ply(tmp_path / "points3D.ply", scene.points, scene.colors)
     capture = load_capture(tmp_path)
     assert capture.ground.metric
     both = {f"train/block_1/rgb/{n}": c for n, c in train.cameras.items()}
     both |= {f"test/block_1_test/rgb/{n}": c for n, c in test.cameras.items()}
-    assert_sees_the_scene(capture, TinyScene(both, scene.points, scene.colours))
+    assert_sees_the_scene(capture, TinyScene(both, scene.points, scene.colors))
     np.testing.assert_allclose(np.ptp(capture.points, axis=0), np.ptp(scene.points, axis=0), rtol=1e-9)
 
 

@@ -37,7 +37,7 @@ def source_of(scene) -> SourceCapture:
         )
         for name, camera in scene.cameras.items()
     )
-    return SourceCapture(source="colmap", images="images", views=views, points=scene.points, colors=scene.colours)
+    return SourceCapture(source="colmap", images="images", views=views, points=scene.points, colors=scene.colors)
 
 
 def ground_of(scene, tmp_path, **options):
@@ -131,7 +131,7 @@ def write_gps(file, scene, origin=ORIGIN, noise=0.0, wrong=()):
 
 
 @pytest.mark.parametrize("wrong", [(), (2, 7)])
-def test_gps_gives_metres_and_east_north_up(tmp_path, wrong):
+def test_gps_gives_meters_and_east_north_up(tmp_path, wrong):
     """Names match across extensions and case; positions that are wrong by 400 m are left out."""
     truth = tiny_scene()
     gps = write_gps(tmp_path / "gps.csv", truth, wrong=wrong)
@@ -189,7 +189,7 @@ def georef(file, **changes):
     file.write_text(json.dumps(content | changes), encoding="utf-8")
 
 
-def test_a_georeferenced_world_keeps_its_axes_and_metres(tmp_path):
+def test_a_georeferenced_world_keeps_its_axes_and_meters(tmp_path):
     georef(tmp_path / "georef.json")
     frame, _ = ground_of(tiny_scene(), tmp_path)
     np.testing.assert_array_equal(frame.rotation, np.eye(3))

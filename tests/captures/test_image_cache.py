@@ -161,13 +161,13 @@ def test_a_closed_cache_and_wrong_arguments_say_so(views):
 # ----------------------------------------------------------------------------------------------- kinds
 
 
-def test_grey_sixteen_bit_alpha_and_palette(tmp_path):
+def test_gray_sixteen_bit_alpha_and_palette(tmp_path):
     rgb = picture()
     deep = (rgb.astype(np.uint16) * 257)[:, :, ::-1]
     cv2.imwrite(str(tmp_path / "deep.png"), deep)
     np.testing.assert_array_equal(decode_image(tmp_path / "deep.png")[0], rgb)
-    Image.fromarray(rgb[:, :, 0]).save(tmp_path / "grey.png")
-    np.testing.assert_array_equal(decode_image(tmp_path / "grey.png")[0], np.repeat(rgb[:, :, :1], 3, axis=2))
+    Image.fromarray(rgb[:, :, 0]).save(tmp_path / "gray.png")
+    np.testing.assert_array_equal(decode_image(tmp_path / "gray.png")[0], np.repeat(rgb[:, :, :1], 3, axis=2))
     alpha = np.full((HEIGHT, WIDTH, 1), 255, np.uint8)
     Image.fromarray(np.concatenate([rgb, alpha], axis=2)).save(tmp_path / "opaque.png")
     pixels, opaque = decode_image(tmp_path / "opaque.png")

@@ -201,7 +201,7 @@ def test_symlinked_image_folders_are_fine(tmp_path, scene):
 def test_strays_among_the_points_are_dropped(tmp_path, scene):
     points = scene.points.copy()
     points[0], points[1], points[2] = [np.nan, 0, 0], [1e7, 0, 0], [0, np.inf, 0]
-    write_colmap(tmp_path, TinyScene(scene.cameras, points, scene.colours))
+    write_colmap(tmp_path, TinyScene(scene.cameras, points, scene.colors))
     capture = load_capture(tmp_path, UP)
     assert len(capture.points) == len(points) - 3
     assert any("2 points that are not finite and 1 points farther" in warning for warning in capture.warnings)
@@ -336,7 +336,7 @@ def test_truncated_jpegs_are_found_too(folder, scene):
         check_images(load_capture(folder, UP))
 
 
-def test_grey_photographs_and_masks_of_sixteen_bits_pass_the_check(folder, scene):
+def test_gray_photographs_and_masks_of_sixteen_bits_pass_the_check(folder, scene):
     """PNG and TIFF of either byte order; one of a single colour is told, and 32 bits are refused on sight."""
     first, second, third, *_ = sorted(scene.cameras)
     deep = {name: (render_plane(scene.cameras[name])[..., 0].astype(np.uint16)) * 257 for name in (first, second)}

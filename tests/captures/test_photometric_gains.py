@@ -73,9 +73,9 @@ class Photographed(ImageCache):
 
 
 def looked_at(images: ImageCache) -> PointColors:
-    colours = collect_point_colors(images, lambda _done, _of: None)
-    assert colours is not None
-    return colours
+    colors = collect_point_colors(images, lambda _done, _of: None)
+    assert colors is not None
+    return colors
 
 
 def gains_of(images: ImageCache) -> np.ndarray:
@@ -91,11 +91,11 @@ def some_gains(seed: int, size: float = 0.2, count: int = len(VIEWS)) -> np.ndar
 @given(seed=st.integers(0, 1000), size=st.floats(0.0, 0.3))
 def test_gains_are_found_whatever_the_place_looks_like(seed, size):
     gains = some_gains(seed, size)
-    colours = looked_at(Photographed(gains))
-    found = np.stack(list(colours.gains().values()))
+    colors = looked_at(Photographed(gains))
+    found = np.stack(list(colors.gains().values()))
     assert np.abs(found - gains).max() < 0.02 + 0.05 * size  # points lie beside the middles of pixels
     of_uniform = size / np.sqrt(3)
-    assert 0.6 * of_uniform - 0.01 < colours.gain_spread() < 1.2 * of_uniform + 0.01
+    assert 0.6 * of_uniform - 0.01 < colors.gain_spread() < 1.2 * of_uniform + 0.01
 
 
 def test_photographs_of_one_exposure_are_equally_bright():
@@ -110,9 +110,9 @@ def chain(drift: float, count: int, sees: int = 6, noise: float = 0.02) -> Point
     image = (first[:, None] + np.arange(sees)).reshape(-1)
     point = np.repeat(np.arange(len(first)), sees)
     look = generator.uniform(0, 5, (len(first), 3))[point]
-    colour = look + (drift * image)[:, None] + generator.normal(0, noise, (len(image), 3))
+    color = look + (drift * image)[:, None] + generator.normal(0, noise, (len(image), 3))
     order = np.argsort(image, kind="stable")
-    return PointColors(image[order], point[order], colour[order])
+    return PointColors(image[order], point[order], color[order])
 
 
 @pytest.mark.parametrize("count", [20, 100, 1000])
@@ -185,9 +185,9 @@ def test_a_photograph_that_shares_hardly_a_point_is_not_compared():
     lost = [*VIEWS[:7], replace(VIEWS[7], observations=part(VIEWS[7].observations, slice(0, 3))), *VIEWS[8:]]
     gains = NONE.copy()
     gains[7] = 0.6
-    colours = looked_at(Photographed(gains, lost))
-    assert sorted(colours.gains()) == [index for index in range(len(VIEWS)) if index != 7]
-    assert colours.gain_spread() < 0.007
+    colors = looked_at(Photographed(gains, lost))
+    assert sorted(colors.gains()) == [index for index in range(len(VIEWS)) if index != 7]
+    assert colors.gain_spread() < 0.007
 
 
 @pytest.mark.parametrize(
@@ -217,10 +217,10 @@ def test_of_many_photographs_some_are_looked_at():
     told: list[tuple[int, int]] = []
     gains = some_gains(3)
     images = Photographed(gains)
-    colours = collect_point_colors(images, lambda done, of: told.append((done, of)), most_images=7)
-    assert colours is not None
+    colors = collect_point_colors(images, lambda done, of: told.append((done, of)), most_images=7)
+    assert colors is not None
     assert told == [(done, 7) for done in range(7)]
-    found = colours.gains()
+    found = colors.gains()
     assert set(found) <= {index for index, _ in images.asked} <= set(range(len(VIEWS)))
     assert {0, len(VIEWS) - 1} <= {index for index, _ in images.asked}
 

@@ -23,13 +23,13 @@ def held(yaw: float, pitch: float) -> np.ndarray:
 
 
 def cameras(
-    centres: np.ndarray, yaw: float | Sequence[float], pitch: float, spread: tuple[float, float, float]
+    centers: np.ndarray, yaw: float | Sequence[float], pitch: float, spread: tuple[float, float, float]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Cameras at these places, each turned by normal `spread` (degrees) about its own right, down and forward: pitch,
     yaw and roll of one held level; pitch, roll and heading of one that looks down."""
-    off = np.radians(np.random.default_rng(4).normal(0, 1, (len(centres), 3)) * spread)
-    yaws = np.broadcast_to(yaw, len(centres))
-    return centres, np.stack([cv2.Rodrigues(turn)[0] @ held(y, pitch) for y, turn in zip(yaws, off, strict=True)])
+    off = np.radians(np.random.default_rng(4).normal(0, 1, (len(centers), 3)) * spread)
+    yaws = np.broadcast_to(yaw, len(centers))
+    return centers, np.stack([cv2.Rodrigues(turn)[0] @ held(y, pitch) for y, turn in zip(yaws, off, strict=True)])
 
 
 def box(*sides: tuple[float, float], count: int = 600) -> np.ndarray:
@@ -75,9 +75,9 @@ def flight(headings: Sequence[float], pitch: float, spread: tuple[float, float, 
 
 def off_by(scene: Scene, turn: np.ndarray) -> tuple[float, list[str]]:
     """Degrees between up as found and as it is, where the world is turned; and the warnings."""
-    centres, rotations, points = scene
+    centers, rotations, points = scene
     warnings: list[str] = []
-    up, how = estimate_up(centres @ turn.T, rotations @ turn.T, points @ turn.T, warnings)
+    up, how = estimate_up(centers @ turn.T, rotations @ turn.T, points @ turn.T, warnings)
     assert np.linalg.norm(up) == pytest.approx(1)
     assert how
     return float(np.degrees(np.arccos(np.clip(up @ turn[:, 2], -1, 1)))), warnings
@@ -111,10 +111,10 @@ def test_cameras_that_are_held_level_say_what_is_up(scene, within):
 @pytest.mark.parametrize("yaw", [0.0, [90.0, 270.0] * 12], ids=["ahead", "both sides"])
 def test_a_street_seen_one_way_has_an_up_that_is_off_by_the_pitch_and_says_so(yaw):
     """Houses stand close, so that across is the flat axis, along which nobody holds the bottom of a camera."""
-    centres, rotations, points = street(yaw, (1, 1, 1))
+    centers, rotations, points = street(yaw, (1, 1, 1))
     narrow = np.array([0.2, 1.0, 1.0])
     for turn in turns():
-        angle, warnings = off_by((centres * narrow, rotations, points * narrow), turn)
+        angle, warnings = off_by((centers * narrow, rotations, points * narrow), turn)
         assert angle < 5
         assert all("--up" in each for each in warnings)
         assert len(warnings) == 1

@@ -40,7 +40,7 @@ def with_cameras(scene: TinyScene, pose_of) -> TinyScene:
 
 
 def with_points(scene: TinyScene, points: np.ndarray) -> TinyScene:
-    return TinyScene(scene.cameras, points, scene.colours[: len(points)])
+    return TinyScene(scene.cameras, points, scene.colors[: len(points)])
 
 
 def below(scene: TinyScene) -> TinyScene:
@@ -319,7 +319,7 @@ def test_points_beside_transforms_are_judged_by_what_cameras_see(tmp_path, scene
          "transform_matrix": np.linalg.inv(c.camera_from_world).tolist()}
         for name, c in scene.cameras.items()
     ]  # fmt: skip
-    write_ply(tmp_path / "points3D.ply", scene.points, scene.colours)
+    write_ply(tmp_path / "points3D.ply", scene.points, scene.colors)
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}), encoding="utf-8")
     with pytest.raises(CaptureError, match="OpenGL's axes"):
         require_valid(load_capture(tmp_path))

@@ -82,7 +82,7 @@ def test_labels_are_those_of_the_places_seen(camera: Camera, alpha: float):
     assert len(set(expected)) > 1
 
 
-def test_a_pixel_shows_what_lies_at_its_centre():
+def test_a_pixel_shows_what_lies_at_its_center():
     quarter = 0.25 * 4.0 / 60.0  # of a pixel, on the ground
     camera = camera_above(-quarter, quarter)
     labels = block_label_map(plane_depth(camera), camera, quadrants())

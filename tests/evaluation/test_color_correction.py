@@ -93,8 +93,8 @@ def test_a_saturated_image_comes_back_as_it_is(value: int):
     np.testing.assert_array_equal(metrics.to_8bit(result.image), image)
 
 
-def test_grey_images_have_collinear_features_and_still_fit():
-    grey = np.repeat(photograph(np.random.default_rng(5))[..., :1], 3, axis=2)
-    result = correct_colors(metrics.to_8bit(grey / 255 * 0.8 + 0.1), grey)
+def test_gray_images_have_collinear_features_and_still_fit():
+    gray = np.repeat(photograph(np.random.default_rng(5))[..., :1], 3, axis=2)
+    result = correct_colors(metrics.to_8bit(gray / 255 * 0.8 + 0.1), gray)
     assert result.fitted
-    assert psnr(metrics.to_8bit(result.image), grey) > 45
+    assert psnr(metrics.to_8bit(result.image), gray) > 45

@@ -175,7 +175,7 @@ def test_the_table_shows_the_figures(city: City, tmp_path: Path):
     assert "LPIPS is null: no weights." in text
 
 
-def test_pictures_are_measured_in_the_exposure_that_the_model_knows_beside_neutral_colours(city: City, tmp_path: Path):
+def test_pictures_are_measured_in_the_exposure_that_the_model_knows_beside_neutral_colors(city: City, tmp_path: Path):
     gains = {name: torch.eye(3, 4) * gain for name, gain in zip(NAMES, (0.8, 1.0, 1.1, 0.9), strict=True)}
     photographs = ReferenceViews(
         city.views, lambda v: (city.load_image(v) * float(gains[v.name][0, 0])).clip(0, 255).astype(np.uint8), load_mask
@@ -248,7 +248,7 @@ def test_json_has_no_nan(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_the_colour_map_grows_with_the_error():
+def test_the_color_map_grows_with_the_error():
     ramp = comparison_images.colorize(np.linspace(0, 0.3, 64)[None], limit=0.2).astype(int)
     brightness = ramp.sum(axis=2)[0]
     assert (np.diff(brightness) >= 0).all()

@@ -127,7 +127,7 @@ def test_seen_are_the_places_that_three_cameras_hold_whatever_splats_reach_beyon
     assert not coverage_map(plain_at(10.0, whole), trained[:2])(above(4.0)).any()
 
 
-def test_open_pixels_are_at_the_depth_of_their_neighbours_and_sky_is_not_seen():
+def test_open_pixels_are_at_the_depth_of_their_neighbors_and_sky_is_not_seen():
     trained = [above(0.0)] * 3
     holes = np.ones((HEIGHT, WIDTH))
     holes[20:25, 30:40] = 0.2
@@ -268,7 +268,7 @@ def test_a_splat_is_larger_than_the_picture_if_its_ellipse_is_longer(opacity: fl
         assert count_oversized_splats(splats(one), WIDTH, HEIGHT) == expected
 
 
-def test_only_splats_that_are_drawn_count_wherever_their_centre_lies():
+def test_only_splats_that_are_drawn_count_wherever_their_center_lies():
     large = 10 * limit(0.9)
     drawn = splat(large, 0.9), splat(large, 0.9, x=-100.0)
     not_drawn = splat(large, 0.9, x=-1e5), splat(large, 0.0), splat(large, 0.5 / 255)

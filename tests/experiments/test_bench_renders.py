@@ -63,9 +63,9 @@ def test_renders_of_our_own_measure_as_our_own(data, output, theirs):
     assert (foreign.groups, foreign.visibility_source) == (ours.groups, ours.visibility_source)
     for of_alpha in COVERAGE_KEYS:  # an opaque picture does not say
         assert foreign.figures[of_alpha] is None, of_alpha
-    for of_colours in REFERENCE_EXPOSURE_KEYS:  # nor what it would be in another exposure
-        assert ours.figures[of_colours] is not None, of_colours
-        assert foreign.figures[of_colours] is None, of_colours
+    for of_colors in REFERENCE_EXPOSURE_KEYS:  # nor what it would be in another exposure
+        assert ours.figures[of_colors] is not None, of_colors
+        assert foreign.figures[of_colors] is None, of_colors
     assert ours.figures["solid_share"] is not None
     for cost in ("anchors", "gaussians", "iterations", "seconds", "peak_memory_bytes", "fps"):
         assert foreign.figures.get(cost) is None, cost

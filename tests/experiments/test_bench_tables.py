@@ -147,7 +147,7 @@ def test_solidity_is_a_table_where_it_is_known():
     assert "| VDGS (full) | **90.00 ± 0.00** |" in to_markdown([grid], "T", [])
 
 
-def test_methods_that_fit_exposures_are_compared_with_others_in_neutral_colours():
+def test_methods_that_fit_exposures_are_compared_with_others_in_neutral_colors():
     plan = make_plan("table2", PlanOptions(scenes=("lab-uneven",), methods=("baseline", "full")))
     results = made({"baseline": (0, 0), "full": (1, 0)})
     assert not [grid for grid in make_result_tables(plan, results) if grid.name == "neutral"]

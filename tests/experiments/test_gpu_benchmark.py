@@ -39,7 +39,7 @@ def test_all_of_it_runs_and_agrees(drivers, compiled_code, tmp_path, monkeypatch
     assert code == 0, said.err
     for operation in OPERATION_NAMES:
         assert f"{operation}: " in said.out or f"{operation} by cuda: " in said.out
-    for kernel in ("rasterise_backward", "mark_anchors", "write_rows", "add_view", "move_anchors"):
+    for kernel in ("rasterize_backward", "mark_anchors", "write_rows", "add_view", "move_anchors"):
         assert f"{kernel:22}" in said.out
     for line in ("rasterise_vjp by gsplat: gradient means_px", "a generated town", "cuda   "):
         assert line in said.out

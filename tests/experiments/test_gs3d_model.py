@@ -56,7 +56,7 @@ def test_what_lies_behind_or_beside_the_camera_is_not_visible():
     assert visible_gaussian_rows(placed, camera).tolist() == [0]
 
 
-def test_a_gaussian_shows_another_colour_from_another_side():
+def test_a_gaussian_shows_another_color_from_another_side():
     rest = torch.zeros(1, 3, 3)
     rest[0, 2, 0] = -0.6
     shown = Gaussians(
@@ -74,8 +74,8 @@ def test_a_gaussian_shows_another_colour_from_another_side():
 
 def test_gaussians_start_as_the_sparse_points_say():
     points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]])
-    colours = np.array([[255, 0, 51]] * 4, np.uint8)
-    start = initialize_gaussians(points, colours, 0.1, 3)
+    colors = np.array([[255, 0, 51]] * 4, np.uint8)
+    start = initialize_gaussians(points, colors, 0.1, 3)
     assert float(start.log_scales[0].exp().mean()) == pytest.approx((1 + 2 + 3) / 3)
     torch.testing.assert_close(start.opacity_logits.sigmoid(), torch.full((4,), 0.1))
     towards = torch.tensor([[0.0, 0, 1]]).expand(4, 3)
@@ -84,7 +84,7 @@ def test_gaussians_start_as_the_sparse_points_say():
     twice = initialize_gaussians(np.zeros((5, 3)), np.zeros((5, 3), np.uint8), 0.1, 0)
     assert torch.isfinite(twice.log_scales).all()
     with pytest.raises(VdgsError, match="at least 2"):
-        initialize_gaussians(points[:1], colours[:1], 0.1, 0)
+        initialize_gaussians(points[:1], colors[:1], 0.1, 0)
 
 
 # Control of density

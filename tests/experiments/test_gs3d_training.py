@@ -54,8 +54,8 @@ def stage(config: Gs3dConfig = CONFIG) -> Gs3dProblem:
 def start(config: Gs3dConfig = CONFIG):
     rng = np.random.default_rng(0)
     points = np.concatenate([rng.uniform(-4, 4, (300, 2)), np.zeros((300, 1))], axis=1)
-    grey = np.full((300, 3), 128, np.uint8)
-    return initial_state(initialize_gaussians(points, grey, config.initial_opacity, config.degree))
+    gray = np.full((300, 3), 128, np.uint8)
+    return initial_state(initialize_gaussians(points, gray, config.initial_opacity, config.degree))
 
 
 def run(state, stage_, until: int | None = None):
@@ -179,7 +179,7 @@ def test_opacities_are_reset_with_their_moments():
     assert state.moments.first["means"].any()
 
 
-def test_bands_of_colour_are_released_one_after_the_other():
+def test_bands_of_color_are_released_one_after_the_other():
     assert [sh_degree_at(i, CONFIG) for i in (0, 24, 25, 50, 75, 79)] == [0, 0, 1, 2, 3, 3]
     state = run(start(), stage(), until=25)
     assert not state.gaussians.rest.any()

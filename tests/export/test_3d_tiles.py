@@ -204,7 +204,7 @@ def surface(side: int = 60, step: float = 0.1, opacity: float = 0.98) -> Gaussia
 
 
 @pytest.mark.parametrize("most", [900, 300, 100])
-def test_a_thinned_surface_has_no_holes_and_keeps_its_colours(most):
+def test_a_thinned_surface_has_no_holes_and_keeps_its_colors(most):
     fine = surface()
     coarse, edge = simplify(fine, most)
     assert most / 4 < len(coarse) <= most

@@ -70,7 +70,7 @@ def test_what_is_spawned_is_what_the_kernels_decode():
         rows, splats = decode_view(model, camera)
         world = decode_world(model.anchors, rows, model.decoder.weights, camera)
         row, offset = splats.source.long() // k, splats.source.long() % k
-        assert torch.allclose(world.colours[row, offset], splats.colors, atol=1e-5)
+        assert torch.allclose(world.colors[row, offset], splats.colors, atol=1e-5)
         assert torch.allclose(world.opacities[row, offset], splats.opacities, atol=1e-5)
         assert torch.allclose(world.scales[row, offset].prod(-1), splats.volumes, rtol=1e-3)
         pixels, _ = camera.project(gaussian_means(model.anchors)[rows][row, offset].double().numpy())
@@ -92,8 +92,8 @@ def test_a_model_that_looks_alike_from_everywhere_is_baked_as_it_is(degree, part
 
 def test_more_harmonics_come_nearer_to_a_model_that_looks_different_from_everywhere():
     model = model_at(scattered())
-    colour = model.decoder.weights.color
-    steep = replace(colour, w1=torch.cat([colour.w1[:, :32], 10 * colour.w1[:, 32:]], 1))
+    color = model.decoder.weights.color
+    steep = replace(color, w1=torch.cat([color.w1[:, :32], 10 * color.w1[:, 32:]], 1))
     still = blind(model.decoder)
     model = replace(model, decoder=replace(still, weights=replace(still.weights, color=steep)))
     views = [camera_above(x, y, tilt_deg=tilt) for x in (-2, 0, 2) for y in (-2, 0, 2) for tilt in (-30, 0, 30)]
@@ -176,7 +176,7 @@ GRID = [camera_above(x, y, tilt_deg=tilt) for x in (-2, 0, 2) for y in (-2, 0, 2
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_colours_stand_in_for_opacities_and_shapes_that_change(tmp_path, degree):
+def test_colors_stand_in_for_opacities_and_shapes_that_change(tmp_path, degree):
     seen = collect_contributions(steep(model_at(scattered())), GRID)
     shown = on_disk(seen, np.flatnonzero(seen.pixels > 0), tmp_path, degree)
     errors, others = [error(shown, GRID)], [error(shown, novel_cameras(GRID, 9))]
@@ -219,7 +219,7 @@ def test_refining_comes_nearer_and_ends_when_its_time_is_over(tmp_path):
     assert np.array_equal(shown.spool.rows(np.arange(len(means))).means.numpy(), means)
 
 
-def test_cameras_between_lie_among_neighbours_that_look_alike_and_are_never_the_same():
+def test_cameras_between_lie_among_neighbors_that_look_alike_and_are_never_the_same():
     turned = camera_above(0.0, 0.0, tilt_deg=80.0)
     cameras = [*GRID, turned]
     found = [*novel_cameras(cameras, 0), *novel_cameras(cameras, 1)]

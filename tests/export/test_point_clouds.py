@@ -31,8 +31,8 @@ def test_points_stand_where_the_map_says(tmp_path, ending):
     assert read.header.parse_crs().to_epsg() == 32632
     np.testing.assert_allclose(np.asarray(read.intensity) / 65535, some.opacity_logits.sigmoid().numpy(), atol=1e-5)
     shown = np.clip(0.5 + 0.28209479 * some.sh0.numpy(), 0, 1)
-    read_colours = np.stack([np.asarray(read[name]) for name in ("red", "green", "blue")], 1) / 65535
-    np.testing.assert_allclose(read_colours, shown, atol=0.5 / 255 + 1e-6)
+    read_colors = np.stack([np.asarray(read[name]) for name in ("red", "green", "blue")], 1) / 65535
+    np.testing.assert_allclose(read_colors, shown, atol=0.5 / 255 + 1e-6)
 
 
 def test_without_a_map_coordinates_are_local(tmp_path):
@@ -58,7 +58,7 @@ def test_missing_packages_are_named(tmp_path, monkeypatch):
     registry.check_export(tmp_path / "a.las", ExportScene(chunks=[], count=5, degree=0))
 
 
-def test_a_point_cloud_has_colours_and_opacity(tmp_path):
+def test_a_point_cloud_has_colors_and_opacity(tmp_path):
     some = random_gaussians(40, 2)
     notes = registry.write_scene(tmp_path / "a.points.ply", ExportScene.of(some, ExportMetadata(ORIGIN)))
     assert "these are points" in notes[0]

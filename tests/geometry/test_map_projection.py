@@ -52,10 +52,10 @@ def test_the_default_is_the_utm_zone_as_pyproj_has_it(origin):
 
 def test_a_local_similarity_turns_by_the_meridian_convergence_and_scales_by_the_map():
     placement = MapProjection.of(frame())
-    centre = np.array([350.0, -200.0, 10.0])
-    found = placement.similarity_at(centre)
+    center = np.array([350.0, -200.0, 10.0])
+    found = placement.similarity_at(center)
     scale, rotation = found.scale, found.rotation
-    latitude, longitude, height = geodetic_from_enu(centre[None], BERN)[0]
+    latitude, longitude, height = geodetic_from_enu(center[None], BERN)[0]
     factors = pyproj.Proj(placement.crs).get_factors(longitude, latitude)
     turned = np.degrees(np.arctan2(rotation[1, 0], rotation[0, 0]))
     # The ground frame's north is that of its origin; meridians run together on the way to the centre.
@@ -68,11 +68,11 @@ def test_a_local_similarity_turns_by_the_meridian_convergence_and_scales_by_the_
 
 
 @pytest.mark.parametrize("crs", SYSTEMS[:-1])  # Web Mercator stretches north more than east: no similarity does that
-def test_a_local_similarity_keeps_to_the_map_over_a_hundred_metres(crs):
+def test_a_local_similarity_keeps_to_the_map_over_a_hundred_meters(crs):
     placement = MapProjection.of(frame(), crs)
-    centre = np.array([600.0, 500.0, -20.0])
-    near = centre + scattered(reach=(50.0, 50.0, 20.0))
-    found = placement.similarity_at(centre).apply(near)
+    center = np.array([600.0, 500.0, -20.0])
+    near = center + scattered(reach=(50.0, 50.0, 20.0))
+    found = placement.similarity_at(center).apply(near)
     off = np.abs(found - placement.project(near))
     assert off[:, :2].max() < 1e-3  # on a map of 10 cm a pixel: a hundredth of one
     assert off[:, 2].max() < 0.02
@@ -110,11 +110,11 @@ def test_geocentric_places_are_those_of_geodesy():
 
 def test_feet_are_feet_up_as_across():
     ground = frame((40.7, -73.9, 10.0))
-    feet, metres = MapProjection.of(ground, "EPSG:2263"), MapProjection.of(ground)
+    feet, meters = MapProjection.of(ground, "EPSG:2263"), MapProjection.of(ground)
     assert feet.unit == "US survey foot"
     up = np.array([[0.0, 0, 0], [0, 0, 30]])
     rise = np.diff(feet.project(up)[:, 2])[0] * feet.meters_per_unit
-    assert rise == pytest.approx(np.diff(metres.project(up)[:, 2])[0], abs=1e-6)
+    assert rise == pytest.approx(np.diff(meters.project(up)[:, 2])[0], abs=1e-6)
     assert "foot" in feet.height_reference
 
 

@@ -77,13 +77,13 @@ def drivers(tmp_path_factory):
 
 
 @pytest.fixture(params=["gsplat", "cuda"])
-def rasteriser(request, drivers, compiled_code, monkeypatch) -> str:
+def rasterizer(request, drivers, compiled_code, monkeypatch) -> str:
     """With each of the rasterisers that may draw on a card."""
     install(drivers, compiled_code, monkeypatch, "cuda", request.param)
     return request.param
 
 
-def test_a_step_on_another_device_makes_the_numbers_of_the_processor(monkeypatch, rasteriser):
+def test_a_step_on_another_device_makes_the_numbers_of_the_processor(monkeypatch, rasterizer):
     with pretended_card():
         found = to_checkpoint(trained_on(CARD, 1)).tensors
     monkeypatch.setenv(kernels.KERNELS_ENV_VAR, "reference")
@@ -106,7 +106,7 @@ def test_steps_have_the_same_bits_whichever_block_comes_first(monkeypatch, drive
         assert all(torch.equal(tensor, other[name]) for name, tensor in found[0].items())
 
 
-def test_a_step_waits_for_the_card_only_where_it_must(rasteriser):
+def test_a_step_waits_for_the_card_only_where_it_must(rasterizer):
     """In the steady state: without growth, and but for every tenth step, in which people are told a PSNR."""
     with pretended_card() as waits:
         state, stage = begun(CARD)
@@ -114,7 +114,7 @@ def test_a_step_waits_for_the_card_only_where_it_must(rasteriser):
         waits.clear()
         train_step(state, stage)
         # gsplat's wait of this kind is in its compiled part.
-        tiles = {"kernels/cuda/rasterize.py: _entries: _local_scalar_dense": 1} if rasteriser == "cuda" else {}
+        tiles = {"kernels/cuda/rasterize.py: _entries: _local_scalar_dense": 1} if rasterizer == "cuda" else {}
         surroundings = {
             "kernels/cuda/cull.py: cull: _local_scalar_dense": 2,
             "kernels/cuda/decode.py: _decoded: _local_scalar_dense": 2,
@@ -122,7 +122,7 @@ def test_a_step_waits_for_the_card_only_where_it_must(rasteriser):
         assert dict(waits) == WAITS | tiles | surroundings
 
 
-def test_growth_a_new_order_and_the_mean_stay_on_the_device(monkeypatch, rasteriser):
+def test_growth_a_new_order_and_the_mean_stay_on_the_device(monkeypatch, rasterizer):
     monkeypatch.setattr(training_loop, "SORT_INTERVAL", 5)
     with pretended_card():
         state = trained_on(CARD, 8, **BUSY)
@@ -133,7 +133,7 @@ def test_growth_a_new_order_and_the_mean_stay_on_the_device(monkeypatch, rasteri
     assert len(state.anchors) != len(coarse()[0])  # some have come, others have gone
 
 
-def test_mixed_devices_are_found(monkeypatch, rasteriser):
+def test_mixed_devices_are_found(monkeypatch, rasterizer):
     """The check can fail: with a background left in main memory, it does."""
     monkeypatch.setattr(training_loop, "background_at", lambda stage, iteration: torch.zeros(3))
     with (

@@ -170,16 +170,16 @@ def test_what_views_show_and_lack_is_read_back_to_the_last_bit_and_named_if_dama
     numbers = torch.arange(0, 10, 2, dtype=torch.int32)
     shown = ViewContributions(numbers, torch.rand(5))
     lacking = ColorResidual(numbers, torch.rand(5).half(), torch.rand(5, 3).half())
-    rows, colours = np.array([3, 7]), torch.rand(2, 4, 3)
+    rows, colors = np.array([3, 7]), torch.rand(2, 4, 3)
     save_contributions(tmp_path / "1.npy", shown)
     save_residual(tmp_path / "2.npy", lacking)
-    save_color_updates(tmp_path / "3.npy", rows, colours)
+    save_color_updates(tmp_path / "3.npy", rows, colors)
     pairs = [(shown, load_contributions(tmp_path / "1.npy")), (lacking, load_residual(tmp_path / "2.npy"))]
     for one, read in pairs:
         assert all(torch.equal(value, getattr(read, name)) for name, value in vars(one).items())
-    read_rows, read_colours = load_color_updates(tmp_path / "3.npy")
+    read_rows, read_colors = load_color_updates(tmp_path / "3.npy")
     assert read_rows.tolist() == [3, 7]
-    assert torch.equal(read_colours, colours)
+    assert torch.equal(read_colors, colors)
     gaussians = unflatten(torch.rand(6, 23), 1)
     flatten(gaussians).tofile(tmp_path / "0.spool")
     assert torch.equal(open_store(tmp_path / "0.spool", 1).rows(np.array([4, 1])).shN, gaussians.shN[[4, 1]])

@@ -55,8 +55,8 @@ def flight(nine, tmp_path_factory) -> Flight:
     """Nine photographs; one that shows nothing, one that is cut off, and a text beside them."""
     flown = Flight(tmp_path_factory.mktemp("flight") / "card", nine.cameras)
     shutil.copytree(nine.folder, flown.folder)
-    grey = np.full((300, 400, 3), 128, np.uint8)
-    write_photograph(flown.folder / "grey.jpg", grey, 50, np.array([0.0, 3.0, 45.0]))
+    gray = np.full((300, 400, 3), 128, np.uint8)
+    write_photograph(flown.folder / "gray.jpg", gray, 50, np.array([0.0, 3.0, 45.0]))
     (flown.folder / "cut.jpg").write_bytes((flown.folder / flown.names[0]).read_bytes()[:9000])
     (flown.folder / "notes.txt").write_text("windy")
     return flown
@@ -107,7 +107,7 @@ def test_facts_name_what_came_out_and_what_was_left_out(made):
     assert (facts.found, facts.registered, facts.components) == (11, 9, (9,))
     why = {photo.name: photo.excluded_reason for photo in facts.photographs if photo.excluded_reason}
     assert "cut off" in why["cut.jpg"]
-    assert "features" in why["grey.jpg"]
+    assert "features" in why["gray.jpg"]
     assert max(facts.residual_rms_m) < 0.3
     assert facts.focal_fixed
     assert facts.cameras[0].focal_after_px == pytest.approx(FOCAL)

@@ -40,17 +40,17 @@ def test_all_rows_are_torch_adam(implementation):
     generator = torch.Generator().manual_seed(5)
     parameter = torch.randn(37, 3, generator=generator)
     peer = parameter.clone().requires_grad_()
-    optimiser = torch.optim.Adam([peer], lr=0.01, eps=1e-15)
+    optimizer = torch.optim.Adam([peer], lr=0.01, eps=1e-15)
     first, second = torch.zeros_like(parameter), torch.zeros_like(parameter)
     for step in range(1, 8):
         gradient = torch.randn(37, 3, generator=generator) * 10.0 ** (step % 3 - 2)
         peer.grad = gradient.clone()
-        optimiser.step()
+        optimizer.step()
         rows = None if step % 2 else torch.arange(37)
         assert adam_rows(implementation, parameter, rows, gradient, first, second, learning_rate=0.01, step=step)
         torch.testing.assert_close(parameter, peer.detach(), rtol=1e-5, atol=1e-6)
-    torch.testing.assert_close(first, optimiser.state[peer]["exp_avg"])
-    torch.testing.assert_close(second, optimiser.state[peer]["exp_avg_sq"])
+    torch.testing.assert_close(first, optimizer.state[peer]["exp_avg"])
+    torch.testing.assert_close(second, optimizer.state[peer]["exp_avg_sq"])
 
 
 @BOTH

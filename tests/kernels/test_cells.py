@@ -24,12 +24,12 @@ def cloud(n: int, seed: int = 0, dtype=torch.float32) -> torch.Tensor:
 
 
 @BOTH
-def test_a_cell_holds_its_positions_and_its_centre(implementation):
+def test_a_cell_holds_its_positions_and_its_center(implementation):
     positions, origin = cloud(2_000, dtype=torch.float64), torch.tensor([3.0, -2.0, 1.0], dtype=torch.float64)
     keys = implementation.cell_keys(positions, 0.7, origin)
-    centres = implementation.cell_centers(keys, 0.7, origin)
-    assert torch.all((positions - centres).abs() <= 0.35 + 1e-9)
-    assert torch.equal(implementation.cell_keys(centres, 0.7, origin), keys)
+    centers = implementation.cell_centers(keys, 0.7, origin)
+    assert torch.all((positions - centers).abs() <= 0.35 + 1e-9)
+    assert torch.equal(implementation.cell_keys(centers, 0.7, origin), keys)
     assert torch.all(keys >= 0)
 
 

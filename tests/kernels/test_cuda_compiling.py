@@ -48,14 +48,14 @@ SOURCES = {
     "cull.cu": (("gaussian_math.h", "image_formation.h"), {"mark_anchors", "write_rows"}),
     "decode.cu": (("gaussian_math.h", "image_formation.h"), {"decode_anchors", "name_splats", "move_anchors"}),
     "loss.cu": ((), {"photometric_forward", "photometric_backward", "photometric_total"}),
-    "rasterise.cu": (
+    "rasterize.cu": (
         ("image_formation.h",),
         {
             "order_splats",
             "splat_tiles",
             "splat_entries",
-            "rasterise_forward",
-            "rasterise_backward",
+            "rasterize_forward",
+            "rasterize_backward",
             "gather_gradients",
         },
     ),

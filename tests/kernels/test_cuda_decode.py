@@ -342,7 +342,7 @@ class TestMoving:
         states = [AdamState(t, t, t, 0.1, early) for t, early in zip(scene.trainable[:3], (1.0, 2.0, 1.0), strict=True)]
         nothing = torch.zeros(0)
         none = SplatGradients(
-            means_px=torch.zeros(0, 2), conics=torch.zeros(0, 3), colours=torch.zeros(0, 3), opacities=nothing,
+            means_px=torch.zeros(0, 2), conics=torch.zeros(0, 3), colors=torch.zeros(0, 3), opacities=nothing,
             volume=0.0, source=nothing.int(), color_values=torch.zeros(0, 3), opacity_values=nothing,
         )  # fmt: skip
         with pytest.raises(ValueError, match="annealed alike"):

@@ -26,7 +26,7 @@ from vdgs.kernels.cuda.rasterize import PROGRAM, rasterize, rasterize_vjp
 from vdgs.kernels.kernel_types import Raster, Splats
 from vdgs.kernels.torch_ref.rasterize import rasterize as reference
 
-pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_rasterise")]
+pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_rasterize")]
 
 #: Whatever makes the threads of a block wait for each other.
 BARRIER = re.compile(r"__syncthreads(?:_and|_or)?\(")
@@ -46,13 +46,13 @@ SCENES = {
 
 @pytest.fixture(scope="module")
 def library(tmp_path_factory):
-    return build_on_host("rasterise.cu", tmp_path_factory.mktemp("host"))
+    return build_on_host("rasterize.cu", tmp_path_factory.mktemp("host"))
 
 
 @pytest.fixture(scope="module")
 def numbered(tmp_path_factory):
     """The kernels, of whose barriers one can be left out: that of the number `left_out`."""
-    text, number = read_source("rasterise.cu"), iter(range(BARRIERS))
+    text, number = read_source("rasterize.cu"), iter(range(BARRIERS))
     text = BARRIER.sub(lambda found: f"{found[0][:-1].replace('__', 'maybe_')}({next(number)}, ", text)
     assert next(number, None) is None
     text = text.replace(", )", ")")
@@ -63,11 +63,11 @@ void maybe_syncthreads(int number) { if (number != left_out) __syncthreads(); }
 int maybe_syncthreads_and(int number, int mine) { return number == left_out ? mine : __syncthreads_and(mine); }
 int maybe_syncthreads_or(int number, int mine) { return number == left_out ? mine : __syncthreads_or(mine); }
 """
-    return build_on_host("rasterise.cu", tmp_path_factory.mktemp("numbered"), before + text)
+    return build_on_host("rasterize.cu", tmp_path_factory.mktemp("numbered"), before + text)
 
 
 def drawn(scene: Scene, library: ctypes.CDLL, order: int = 0, depth: bool = True) -> Raster:
-    program = CudaProgram(name="rasterise.cu", driver=HostDriver(library, order), headers=PROGRAM.headers)
+    program = CudaProgram(name="rasterize.cu", driver=HostDriver(library, order), headers=PROGRAM.headers)
     return rasterize(*splats_of(scene.tensors), scene.width, scene.height, depth=depth, program=program)
 
 
@@ -103,7 +103,7 @@ def test_no_barrier_is_missing(order, library):
 @pytest.mark.parametrize("seed", [0, 1, 3])
 def test_wherever_splats_stand_picture_and_gradients_have_the_same_bits(seed, library):
     """Where depths are equal, the order that splats are given with decides."""
-    program = CudaProgram(name="rasterise.cu", driver=HostDriver(library), headers=PROGRAM.headers)
+    program = CudaProgram(name="rasterize.cu", driver=HostDriver(library), headers=PROGRAM.headers)
     scene = SCENES["ordinary"]
     splats, background = splats_of(scene.tensors)
     level = replace(splats, depths=(splats.depths / 40).floor() + 1)
@@ -194,7 +194,7 @@ class TestMeaning:
     def test_the_way_back_overwrites_what_it_may(self, library):
         scene, program = (
             SCENES["ordinary"],
-            CudaProgram(name="rasterise.cu", driver=HostDriver(library), headers=PROGRAM.headers),
+            CudaProgram(name="rasterize.cu", driver=HostDriver(library), headers=PROGRAM.headers),
         )
         splats, background = splats_of([tensor.detach().clone() for tensor in scene.tensors])
         by_alpha = torch.randn(scene.height, scene.width, generator=torch.Generator().manual_seed(0))
@@ -210,7 +210,7 @@ class TestMeaning:
     def test_gradients_of_the_first_splats_alone_have_the_bits_that_they_have_among_all(self, name, library):
         scene, program = (
             SCENES[name],
-            CudaProgram(name="rasterise.cu", driver=HostDriver(library), headers=PROGRAM.headers),
+            CudaProgram(name="rasterize.cu", driver=HostDriver(library), headers=PROGRAM.headers),
         )
         size, (splats, background) = (scene.width, scene.height), splats_of([each.detach() for each in scene.tensors])
         assert_first_gradients_are_those_of_all(
@@ -219,7 +219,7 @@ class TestMeaning:
 
     def test_unsuitable_tensors_are_refused(self, library):
         splats, background = splats_of(SCENES["ordinary"].to(torch.float64).tensors)
-        program = CudaProgram(name="rasterise.cu", driver=HostDriver(library), headers=PROGRAM.headers)
+        program = CudaProgram(name="rasterize.cu", driver=HostDriver(library), headers=PROGRAM.headers)
         with pytest.raises(TypeError, match="float32"):
             rasterize(splats, background, 37, 29, program=program)
         with pytest.raises(ValueError, match="width"):

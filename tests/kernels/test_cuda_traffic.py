@@ -27,7 +27,7 @@ from vdgs.kernels.cuda.decode import PROGRAM as DECODE
 from vdgs.kernels.cuda.decode_adam import decode_backward_adam
 from vdgs.kernels.cuda.loss import PROGRAM as LOSS
 from vdgs.kernels.cuda.loss import photometric_loss
-from vdgs.kernels.cuda.rasterize import PROGRAM as RASTERISE
+from vdgs.kernels.cuda.rasterize import PROGRAM as RASTERIZE
 from vdgs.kernels.cuda.rasterize import rasterize_vjp
 from vdgs.kernels.cuda.statistics import PROGRAM as STATISTICS
 from vdgs.kernels.cuda.statistics import add_view_statistics
@@ -89,7 +89,7 @@ def counted(tmp_path_factory, compiled_code) -> Counted:
         rows = count(CULL, lambda program: cull(positions, log_scales, CAMERAS[0], program=program))
         inputs, sums = view_statistics(0, 300, K)
         count(STATISTICS, lambda program: add_view_statistics(DensificationStats(*sums), *inputs, program=program))
-        drawn, entries = count(RASTERISE, drawing)
+        drawn, entries = count(RASTERIZE, drawing)
         count(LOSS, comparing)
     showing = len(torch.unique(source // K))
     return Counted(traffic, len(source), showing, opaque, (len(positions), len(rows)), len(inputs[2]), drawn, entries)
@@ -138,10 +138,10 @@ def test_the_table(counted):
         ("order of splats", "splat", counted.drawn, counted.of("order_splats")),
         ("tiles of splats", "splat", counted.drawn, counted.of("splat_tiles")),
         ("entries of splats", "splat", counted.drawn, counted.of("splat_entries")),
-        ("forward: splats", "entry", counted.entries, counted.of("rasterise_forward", but=PICTURE)),
-        ("forward: picture", "pixel", pixels, counted.of("rasterise_forward", PICTURE)),
-        ("backward: splats", "entry", counted.entries, counted.of("rasterise_backward", but=PICTURE)),
-        ("backward: picture", "pixel", pixels, counted.of("rasterise_backward", PICTURE)),
+        ("forward: splats", "entry", counted.entries, counted.of("rasterize_forward", but=PICTURE)),
+        ("forward: picture", "pixel", pixels, counted.of("rasterize_forward", PICTURE)),
+        ("backward: splats", "entry", counted.entries, counted.of("rasterize_backward", but=PICTURE)),
+        ("backward: picture", "pixel", pixels, counted.of("rasterize_backward", PICTURE)),
         ("gradients of splats", "splat", counted.drawn, counted.of("gather_gradients")),
         ("SSIM + L1: forward", "pixel", pixels, counted.of("photometric_forward")),
         ("SSIM + L1: backward", "pixel", pixels, counted.of("photometric_backward")),
@@ -242,8 +242,8 @@ def test_statistics_touch_each_splat_and_each_sum_once(counted):
 
 def test_pictures_are_written_once(counted):
     pixels = WIDTH * HEIGHT
-    assert counted.of("rasterise_forward", PICTURE)[1].once == 20 * pixels
-    assert counted.of("rasterise_backward", "sums")[1].once == 40 * counted.entries
+    assert counted.of("rasterize_forward", PICTURE)[1].once == 20 * pixels
+    assert counted.of("rasterize_backward", "sums")[1].once == 40 * counted.entries
     assert counted.of("gather_gradients", "by_")[1].once == 36 * counted.drawn
     assert counted.of("photometric_forward", "slopes")[1].once == 36 * pixels
     assert counted.of("photometric_backward", "gradient")[1].once == 12 * pixels

@@ -17,7 +17,7 @@ from vdgs.kernels.torch_ref.decode import decode as twin_decode
 CAMERAS = [looking_down(), looking_down("orthographic"), turned(), turned().cropped(20, 5, 50, 40)]
 EVERY_ISA = pytest.mark.parametrize("isa", extension.supported_isas())
 BOTH = pytest.mark.parametrize("decode", [twin_decode, native_decode])
-NUMBERS = ("means_px", "conics", "depths", "colours", "opacities", "volumes")
+NUMBERS = ("means_px", "conics", "depths", "colors", "opacities", "volumes")
 
 
 def weighted_sum(splats: AnchorSplats, seed: int = 0) -> torch.Tensor:
@@ -54,7 +54,7 @@ def test_splats_follow_the_definition(decode):
     x, s = scene.positions[anchor], scene.log_scales[anchor]
     ray = x - torch.as_tensor(camera.position).float()
     inputs = torch.cat([scene.features[anchor], ray / ray.norm()])
-    opacity, covariance, colour = (
+    opacity, covariance, color = (
         head.w2 @ torch.relu(head.w1 @ inputs + head.b1) + head.b2
         for head in (scene.weights.opacity, scene.weights.covariance, scene.weights.color)
     )
@@ -62,7 +62,7 @@ def test_splats_follow_the_definition(decode):
     scale = s[3:].exp() * torch.sigmoid(covariance.reshape(4, 7)[offset, :3])
     close = {"rtol": 1e-4, "atol": 1e-5}
     torch.testing.assert_close(splats.opacities[index], torch.tanh(opacity[offset]), **close)
-    torch.testing.assert_close(splats.colours[index], torch.sigmoid(colour.reshape(4, 3)[offset]), **close)
+    torch.testing.assert_close(splats.colors[index], torch.sigmoid(color.reshape(4, 3)[offset]), **close)
     torch.testing.assert_close(splats.volumes[index], scale.prod(), **close)
     pixels, depths = camera.project(mean[None].double().numpy())
     torch.testing.assert_close(splats.means_px[index].double(), torch.from_numpy(pixels[0]), rtol=1e-4, atol=1e-3)
@@ -250,15 +250,15 @@ def test_shapes_that_do_not_belong_together_are_refused():
 def test_activations_are_exact_to_a_few_units_in_the_last_place(isa, monkeypatch):
     monkeypatch.setattr(extension, "get_extension", lambda: extension.load_extension(isa))
     scene = Scene.random(16, k=32, spread=0.2)
-    raw_opacities, raw_colours = torch.linspace(0.005, 4, 32), torch.linspace(-10, 10, 96)
-    opacity, colour = scene.weights.opacity, scene.weights.color
+    raw_opacities, raw_colors = torch.linspace(0.005, 4, 32), torch.linspace(-10, 10, 96)
+    opacity, color = scene.weights.opacity, scene.weights.color
     opacity = replace(opacity, w2=torch.zeros_like(opacity.w2), b2=raw_opacities)
-    colour = replace(colour, w2=torch.zeros_like(colour.w2), b2=raw_colours)
-    scene = replace(scene, weights=replace(scene.weights, opacity=opacity, color=colour))
+    color = replace(color, w2=torch.zeros_like(color.w2), b2=raw_colors)
+    scene = replace(scene, weights=replace(scene.weights, opacity=opacity, color=color))
     splats = native_decode(*scene.arguments, CAMERAS[0])
     offset = splats.source.long() % 32
     assert len(offset.unique()) > 25
     expected = torch.tanh(raw_opacities.double())[offset]
     torch.testing.assert_close(splats.opacities.double(), expected, rtol=1e-6, atol=0)
-    expected = torch.sigmoid(raw_colours.double()).reshape(32, 3)[offset]
+    expected = torch.sigmoid(raw_colors.double()).reshape(32, 3)[offset]
     torch.testing.assert_close(splats.colors.double(), expected, rtol=1e-6, atol=0)

@@ -36,7 +36,7 @@ def gradients_of(scene: Scene, rows: torch.Tensor = ROWS, depths: bool = False) 
         splats = cpu.decode(*scene.arguments, CAMERA, rows)
     g = torch.Generator().manual_seed(8)
     parts = {name: torch.randn(getattr(splats, name).shape, generator=g)
-             for name in ("means_px", "conics", "colours", "opacities")}  # fmt: skip
+             for name in ("means_px", "conics", "colors", "opacities")}  # fmt: skip
     of_depth = torch.randn(splats.depths.shape, generator=g) if depths else None
     return SplatGradients(
         **parts, volume=0.3, source=splats.source, color_values=splats.colors, opacity_values=splats.opacities,
@@ -67,7 +67,7 @@ def apart(scene: Scene, gradients: SplatGradients) -> list[torch.Tensor]:
     weights = scene.weights.map(lambda t: t.clone().requires_grad_(True))
     splats = cpu.decode(scene.positions[ROWS], *leaves, weights, CAMERA)
     outputs = [splats.means_px, splats.conics, splats.colors, splats.opacities, splats.volumes]
-    received = [gradients.means_px, gradients.conics, gradients.colours, gradients.opacities,
+    received = [gradients.means_px, gradients.conics, gradients.colors, gradients.opacities,
                 torch.full_like(splats.volumes, gradients.volume)]  # fmt: skip
     if gradients.depths is not None:
         outputs, received = [*outputs, splats.depths], [*received, gradients.depths]
@@ -126,9 +126,9 @@ def test_rows_that_are_not_given_keep_their_bits():
 def test_a_gradient_that_is_not_a_number_is_reported_and_stays_out_of_its_anchor():
     scene = Scene.random(700, seed=2)
     gradients = gradients_of(scene)
-    spoilt = gradients.colours.clone()
+    spoilt = gradients.colors.clone()
     spoilt[100, 1] = float("nan")
-    finite, after = fused(cpu, scene, replace(gradients, colours=spoilt))
+    finite, after = fused(cpu, scene, replace(gradients, colors=spoilt))
     assert not finite
     assert all(bool(torch.isfinite(t).all()) for t in after[:9])
 

@@ -50,7 +50,7 @@ def test_the_table_says_who_does_what(operation):
     assert operations.backends_for(operation, "mps") == ("reference",)
 
 
-class TestWhichRasteriserDraws:
+class TestWhichRasterizerDraws:
     @pytest.fixture(autouse=True)
     def _asked_anew(self):
         rasterizer.select_rasterizer.cache_clear()

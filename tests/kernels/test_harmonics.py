@@ -34,8 +34,8 @@ def seen(counts: list[int], seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_each_regression_is_solved_as_if_it_were_alone(kernels, degree):
     counts = [1, 30, 2, 17, 2, 90, *range(1, 40)]
-    directions, colours, weights, starts = seen(counts, 1)
-    together = kernels.fit_harmonics(directions, colours, weights, starts, degree, RIDGE_WEIGHT)
+    directions, colors, weights, starts = seen(counts, 1)
+    together = kernels.fit_harmonics(directions, colors, weights, starts, degree, RIDGE_WEIGHT)
     f = num_sh_bases(degree)
     assert together.shape == (len(counts), f, 3)
     for number, (start, count) in enumerate(zip(starts.tolist(), counts, strict=True)):
@@ -44,7 +44,7 @@ def test_each_regression_is_solved_as_if_it_were_alone(kernels, degree):
         share = (weights[part].double() / weights[part].double().sum())[:, None]
         ridge = torch.diag(torch.tensor([0.0] + (f - 1) * [RIDGE_WEIGHT], dtype=torch.float64))
         matrix = functions.T @ (share * functions) + ridge
-        alone = torch.linalg.solve(matrix, functions.T @ (share * (colours[part].double() - 0.5)))
+        alone = torch.linalg.solve(matrix, functions.T @ (share * (colors[part].double() - 0.5)))
         torch.testing.assert_close(together[number].double(), alone, atol=1e-5, rtol=1e-4)
 
 
@@ -69,46 +69,46 @@ def test_harmonics_that_were_seen_from_everywhere_are_found_again(kernels, degre
     dc = 0.3 * torch.randn(m, 3, generator=generator)
     rest = 0.03 * torch.randn(m, num_sh_bases(degree) - 1, 3, generator=generator)
     directions = unit(m * views, generator)
-    colours = eval_sh_colors(dc.repeat_interleave(views, 0), rest.repeat_interleave(views, 0), directions, degree)
+    colors = eval_sh_colors(dc.repeat_interleave(views, 0), rest.repeat_interleave(views, 0), directions, degree)
     weights = 0.5 + torch.rand(m * views, generator=generator)
-    found = kernels.fit_harmonics(directions, colours, weights, torch.arange(m) * views, degree, RIDGE_WEIGHT)
+    found = kernels.fit_harmonics(directions, colors, weights, torch.arange(m) * views, degree, RIDGE_WEIGHT)
     assert torch.allclose(found[:, 0], dc, atol=0.02)
     # The ridge shrinks by RIDGE against the mean square of a function, 1 / (4 pi).
     assert torch.allclose(found[:, 1:], rest, atol=0.03)
 
 
 @BOTH
-def test_one_view_says_one_colour_for_all_directions(kernels):
-    colour, one = torch.tensor([[0.2, 0.5, 0.9]]), torch.tensor([[0.0, 0.0, -1.0]])
-    found = kernels.fit_harmonics(one, colour, torch.ones(1), torch.tensor([0]), 3, RIDGE_WEIGHT)
+def test_one_view_says_one_color_for_all_directions(kernels):
+    color, one = torch.tensor([[0.2, 0.5, 0.9]]), torch.tensor([[0.0, 0.0, -1.0]])
+    found = kernels.fit_harmonics(one, color, torch.ones(1), torch.tensor([0]), 3, RIDGE_WEIGHT)
     shown = eval_sh_colors(found[:, 0], found[:, 1:], one, 3)
-    assert torch.allclose(shown, colour, atol=0.01)
+    assert torch.allclose(shown, color, atol=0.01)
     sideways = eval_sh_colors(found[:, 0], found[:, 1:], torch.tensor([[1.0, 0.0, 0.0]]), 3)
-    assert (sideways - colour).abs().max() < 0.25
+    assert (sideways - color).abs().max() < 0.25
 
 
 @BOTH
 @pytest.mark.parametrize("count", [1, 2, 50])
 def test_many_looks_from_one_place_are_a_number(kernels, count):
-    directions, colours = torch.tensor([[0.6, 0.0, -0.8]]).repeat(count, 1), torch.full((count, 3), 0.75)
-    found = kernels.fit_harmonics(directions, colours, torch.full((count,), 1e-3), torch.tensor([0]), 3, RIDGE_WEIGHT)
+    directions, colors = torch.tensor([[0.6, 0.0, -0.8]]).repeat(count, 1), torch.full((count, 3), 0.75)
+    found = kernels.fit_harmonics(directions, colors, torch.full((count,), 1e-3), torch.tensor([0]), 3, RIDGE_WEIGHT)
     assert torch.isfinite(found).all()
     shown = eval_sh_colors(found[:, 0], found[:, 1:], directions[:1], 3)
-    torch.testing.assert_close(shown, colours[:1], atol=1e-3, rtol=0)
+    torch.testing.assert_close(shown, colors[:1], atol=1e-3, rtol=0)
 
 
 @BOTH
 def test_what_no_fit_can_be_made_of_is_refused(kernels):
-    directions, colours, weights, _ = seen([3, 2])
+    directions, colors, weights, _ = seen([3, 2])
     for starts in ([0, 5], [1, 3], [0, 0], [2, 1], []):
         with pytest.raises(ValueError, match="pair"):
             kernels.fit_harmonics(
-                directions, colours, weights, torch.tensor(starts, dtype=torch.int64), 1, RIDGE_WEIGHT
+                directions, colors, weights, torch.tensor(starts, dtype=torch.int64), 1, RIDGE_WEIGHT
             )
     nothing = torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, dtype=torch.int64)
     assert kernels.fit_harmonics(*nothing, 2, RIDGE_WEIGHT).shape == (0, 9, 3)
     with pytest.raises(ValueError, match="degree"):
-        kernels.fit_harmonics(directions, colours, weights, torch.tensor([0, 3]), 4, RIDGE_WEIGHT)
+        kernels.fit_harmonics(directions, colors, weights, torch.tensor([0, 3]), 4, RIDGE_WEIGHT)
 
 
 @settings(max_examples=30)

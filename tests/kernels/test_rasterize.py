@@ -34,7 +34,7 @@ from vdgs.kernels.torch_ref.rasterize import rasterize as reference
 from vdgs.kernels.torch_ref.splat_contributions import splat_contributions as twin
 
 ISAS = supported_isas()
-NAMES = ("means_px", "conics", "colours", "opacities", "depths", "background")
+NAMES = ("means_px", "conics", "colors", "opacities", "depths", "background")
 
 
 SCENES = {
@@ -222,7 +222,7 @@ def test_slabs_change_nothing(isa: str, hole: bool) -> None:
     scene = crowd(hole).to(torch.float32)
     module, picture = load_extension(isa), [torch.empty(18, 20, 3), *(torch.empty(18, 20) for _ in range(3))]
     rows = [t.detach().numpy() for t in scene.tensors[:5]]
-    counted = module.rasterise_forward(
+    counted = module.rasterize_forward(
         *rows, (0.2, 0.3, 0.4), 20, 18, *(p.numpy() for p in picture), counting=True
     ).statistics
     assert counted["slabs"] > 1
@@ -345,9 +345,9 @@ def test_opacity_outside_its_range(isa: str, opacity: float) -> None:
 @pytest.mark.parametrize("isa", ISAS)
 def test_equal_depths_keep_the_order_of_the_rows(isa: str) -> None:
     n = 40
-    colours = torch.eye(3).repeat(14, 1)[:n]
+    colors = torch.eye(3).repeat(14, 1)[:n]
     means, conics = torch.full((n, 2), 8.0), torch.tensor([[0.01, 0.0, 0.01]]).repeat(n, 1)
-    args = (means, conics, colours, torch.full((n,), 0.3), torch.full((n,), 5.0), torch.zeros(3))
+    args = (means, conics, colors, torch.full((n,), 0.3), torch.full((n,), 5.0), torch.zeros(3))
     first = draw(Scene(args, 16, 16), isa).image[8, 8]
     assert first[0] > first[1] > first[2]
 
@@ -417,7 +417,7 @@ def test_wrong_tensors_are_named(change, error: type[Exception], message: str) -
     tensors = [t.detach() for t in make_scene(9, 10, 10).tensors]
     change(tensors)
     splats = object.__new__(Splats)  # without the run-time types of the tests, here and below
-    for name, tensor in zip(("means_px", "conics", "colours", "opacities", "depths"), tensors[:5], strict=True):
+    for name, tensor in zip(("means_px", "conics", "colors", "opacities", "depths"), tensors[:5], strict=True):
         object.__setattr__(splats, name, tensor)
     with pytest.raises(error, match=message):
         inspect.unwrap(rasterize)(splats, tensors[5], 10, 10)

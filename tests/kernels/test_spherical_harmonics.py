@@ -52,7 +52,7 @@ def test_a_parity_belongs_to_each_band():
         torch.testing.assert_close(back[:, part], (-1) ** band * there[:, part])
 
 
-def test_colours_follow_the_viewing_direction():
+def test_colors_follow_the_viewing_direction():
     dc = rgb_to_sh(torch.tensor([[0.2, 0.5, 0.9]]))
     rest = torch.zeros(1, 15, 3)
     right = torch.tensor([[1.0, 0, 0]])
@@ -68,7 +68,7 @@ def test_colours_follow_the_viewing_direction():
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_colours_have_the_gradients_of_finite_differences(degree):
+def test_colors_have_the_gradients_of_finite_differences(degree):
     generator = torch.Generator().manual_seed(degree)
 
     def draw(*shape: int) -> torch.Tensor:
@@ -76,7 +76,7 @@ def test_colours_have_the_gradients_of_finite_differences(degree):
 
     dc, rest, towards = draw(5, 3), draw(5, num_sh_bases(degree) - 1, 3), draw(5, 3)
 
-    def colours(dc, rest, towards):
+    def colors(dc, rest, towards):
         return eval_sh_colors(dc, rest, torch.nn.functional.normalize(towards, dim=-1), degree)
 
-    assert torch.autograd.gradcheck(colours, (dc, rest, towards))
+    assert torch.autograd.gradcheck(colors, (dc, rest, towards))

@@ -50,7 +50,7 @@ def test_leaving_out_the_harmonics_would_be_seen():
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_turned_harmonics_show_the_old_colours_along_turned_directions(degree):
+def test_turned_harmonics_show_the_old_colors_along_turned_directions(degree):
     turn = Rotation.from_rotvec([0.3, -2.0, 1.1]).as_matrix()
     scene = random_gaussians(20, degree)
     directions = torch.nn.functional.normalize(torch.randn(20, 3, generator=torch.Generator().manual_seed(3)), dim=-1)

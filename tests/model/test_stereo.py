@@ -66,8 +66,8 @@ def photograph(of: Camera) -> np.ndarray:
     """What it shows, RGB: places are painted alike from wherever one looks."""
     places = of.unproject(true_depth(of))
     column, row = (((places[..., axis] + 25.0) * 10.0).astype(np.float32) for axis in (0, 1))
-    grey = cv2.remap(TEXTURE, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
-    return np.stack([grey, grey // 2, 255 - grey], -1)
+    gray = cv2.remap(TEXTURE, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+    return np.stack([gray, gray // 2, 255 - gray], -1)
 
 
 def view(of: Camera) -> StereoView:
@@ -151,7 +151,7 @@ def test_points_lie_on_the_ground_and_cover_it(tmp_path):
     cells = {tuple(cell) for cell in np.floor(found.points[:, :2] / 0.6).astype(int)}
     wanted = {(i, j) for i in range(-10, 10) for j in range(-10, 10)}
     assert len(wanted & cells) > 0.85 * len(wanted)
-    assert np.abs(found.colours[:, 2].astype(int) + found.colours[:, 0] - 255).max() <= 2  # as painted
+    assert np.abs(found.colors[:, 2].astype(int) + found.colors[:, 0] - 255).max() <= 2  # as painted
     assert not list(tmp_path.iterdir())  # nothing is left behind
 
 

@@ -168,11 +168,11 @@ def test_with_weight_the_cut_follows_visibility_across_a_uniform_field() -> None
     assert np.mean((owner == owner[flat.sum(axis=1).argmax()]) == seen) > 0.97
 
 
-def test_an_enclosed_dense_centre_keeps_its_place() -> None:
+def test_an_enclosed_dense_center_keeps_its_place() -> None:
     generator = np.random.default_rng(7)
     outskirts = generator.uniform(-50, 50, (6000, 2)) * [1.2, 1.0]
-    centre = generator.uniform(-12, 12, (3000, 2))
-    flat = np.concatenate([outskirts, centre])
+    center = generator.uniform(-12, 12, (3000, 2))
+    flat = np.concatenate([outskirts, center])
     within = (np.abs(flat) < 12).all(axis=1)
     positions = np.column_stack([flat, np.zeros(len(flat))])
     blocks = cut(positions, np.where(within, 60, 4), 2, lambda_vis=3.0)

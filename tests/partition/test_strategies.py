@@ -60,8 +60,8 @@ def test_cells_without_anchors_are_no_blocks(name):
 
 def test_vastgaussian_gives_every_cell_as_many_cameras_and_a_fifth_more_room():
     blocks, _ = STRATEGIES["vastgaussian"].partition(anchors(), CAMERAS, 4)
-    centres = np.array([camera.position[:2] for camera in CAMERAS])
-    assert np.bincount(blocks.owner(centres)).tolist() == [6, 6, 6, 6]
+    centers = np.array([camera.position[:2] for camera in CAMERAS])
+    assert np.bincount(blocks.owner(centers)).tolist() == [6, 6, 6, 6]
     for block in blocks.items:
         (x0, y0, x1, y1), (a0, b0, a1, b1) = block.core.bounds, block.expanded.bounds
         assert (a1 - a0, b1 - b0) == pytest.approx((1.2 * (x1 - x0), 1.2 * (y1 - y0)))

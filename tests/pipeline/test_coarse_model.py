@@ -63,7 +63,7 @@ def finished(run: RunFolder, capture: Capture, model: AnchorModel) -> None:
 def test_training_that_leaves_no_anchors_is_not_done_and_says_what_to_change(tmp_path):
     scene = tiny_scene()
     below = ((scene.points[:, :2] > 0) & (scene.points[:, :2] < (9, 6))).all(axis=1)  # of the flight: all are seen
-    write_colmap(tmp_path / "place", replace(scene, points=scene.points[below], colours=scene.colours[below]))
+    write_colmap(tmp_path / "place", replace(scene, points=scene.points[below], colors=scene.colors[below]))
     run, capture = begin(tmp_path, METHOD)
     for _ in range(2):  # the same command says the same
         with pytest.raises(RunError, match=r"coarse: .*no anchors(?s:.*)--growth\.prune-opacity(?s:.*)--redo"):

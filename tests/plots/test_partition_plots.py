@@ -27,7 +27,7 @@ from vdgs.plots.style import DPI, draw_titles
 from vdgs.plots.visibility_map import remove_speckles
 
 #: Names of x and y.
-METRES = ("east (m)", "north (m)")
+METERS = ("east (m)", "north (m)")
 
 
 def grid(count: int, side: float = 100.0) -> Blocks:
@@ -83,7 +83,7 @@ def test_all_figures_of_all_scenes(tmp_path: Path, name: str) -> None:
     compare = grid(blocks + 1) if blocks > 1 else None
     file = tmp_path / "figure.png"
     cuts = [("λ_vis = 1", cut)] + ([] if compare is None else [(figures.SPATIAL_ONLY_LABEL, compare)])
-    figures.plot_blocks(file, positions, views, cameras, assigned, cuts, METRES)
+    figures.plot_blocks(file, positions, views, cameras, assigned, cuts, METERS)
     check(file)
     figures.plot_block_stats(file, positions, views, cut, assigned, "m", compare)
     check(file)
@@ -97,28 +97,28 @@ def test_the_comparison_stands_beside_or_below(tmp_path: Path) -> None:
     positions, views, cameras, scores = scene(300, 5, 2)
     alone, both, wide = (tmp_path / f"{name}.png" for name in ("alone", "both", "wide"))
     cut, assigned = grid(2), scores > 0.5
-    figures.plot_blocks(alone, positions, views, cameras, assigned, [("not cut", cut)], METRES)
+    figures.plot_blocks(alone, positions, views, cameras, assigned, [("not cut", cut)], METERS)
     compared = [("λ_vis = 1", cut), (figures.SPATIAL_ONLY_LABEL, grid(2))]
-    figures.plot_blocks(both, positions, views, cameras, assigned, compared, METRES)
+    figures.plot_blocks(both, positions, views, cameras, assigned, compared, METERS)
     stretched = positions * np.float32([10, 1, 1])
-    figures.plot_blocks(wide, stretched, views, cameras, assigned, compared, METRES)
+    figures.plot_blocks(wide, stretched, views, cameras, assigned, compared, METERS)
     one, two, three = (check(file).shape for file in (alone, both, wide))
     assert two[1] > 1.5 * one[1]
     assert two[0] == one[0]
     assert three[1] < 1.2 * one[1]
 
 
-def test_blocks_have_colours_of_their_own_and_show_them(tmp_path: Path) -> None:
-    colours = np.array([to_rgb(colour) for colour in BLOCK_PALETTE])
-    assert len(colours) == 16
-    assert min(np.linalg.norm(a - b) for a, b in itertools.combinations(colours, 2)) > 0.2
+def test_blocks_have_colors_of_their_own_and_show_them(tmp_path: Path) -> None:
+    colors = np.array([to_rgb(color) for color in BLOCK_PALETTE])
+    assert len(colors) == 16
+    assert min(np.linalg.norm(a - b) for a, b in itertools.combinations(colors, 2)) > 0.2
     assert block_color(16) == block_color(0) != block_color(1)
     positions, views, _, scores = scene(50, 3, 16)
     file = tmp_path / "facts.png"
     figures.plot_block_stats(file, positions, views, grid(16), scores > 2, "m", None)
     picture = check(file).reshape(-1, 3)
-    for colour in colours:  # the area of each block is a bar of its colour
-        assert (np.abs(picture - colour).max(axis=1) < 0.01).sum() > 100
+    for color in colors:  # the area of each block is a bar of its colour
+        assert (np.abs(picture - color).max(axis=1) < 0.01).sum() > 100
 
 
 def test_facts_are_those_of_the_anchors_that_a_block_owns() -> None:
@@ -161,7 +161,7 @@ def test_many_anchors_are_thinned_and_the_heading_counts_cameras_beyond_the_map(
     far[0, 3] = -500.0
     cameras.append(Camera(camera_from_world=far, fx=400, fy=400, cx=200, cy=150, width=400, height=300))
     assigned = np.ones((4, 1), bool)
-    figures.plot_blocks(tmp_path / "blocks.png", positions, views, cameras, assigned, [("not cut", grid(1))], METRES)
+    figures.plot_blocks(tmp_path / "blocks.png", positions, views, cameras, assigned, [("not cut", grid(1))], METERS)
     assert headings[0][1] == "60,001 anchors (60,000 drawn)  ·  4 training cameras (1 beyond the map)"
 
 
@@ -211,7 +211,7 @@ def test_titles_stay_on_the_figure(width: float) -> None:
 def test_axes_are_east_and_north_only_where_the_place_is_known() -> None:
     frame = GroundFrame(scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, description="")
     assert frame.axis_names == ("x (m)", "y (m)")
-    assert replace(frame, origin_geo=(50.8, -0.1, 60.0)).axis_names == METRES
+    assert replace(frame, origin_geo=(50.8, -0.1, 60.0)).axis_names == METERS
     assert replace(frame, metric=False).axis_names == ("x (units)", "y (units)")
 
 

@@ -124,12 +124,12 @@ def house() -> tuple[Capture, AnchorModel]:
 @pytest.mark.parametrize("away", [(0.0, 0.0), (900.0, -700.0)])
 def test_every_place_falls_on_its_pixel_to_a_tenth(crs, away):
     """Through the camera that draws a tile, against the exact coordinates; 512 pixels of 4 cm, and 5 m high things."""
-    centre = np.array([*away, 0.0])
-    places = centre + np.random.default_rng(1).uniform(-1, 1, (200, 3)) * (10, 10, 5)
+    center = np.array([*away, 0.0])
+    places = center + np.random.default_rng(1).uniform(-1, 1, (200, 3)) * (10, 10, 5)
     capture = capture_of(places)
     placement = MapProjection.of(capture.ground, crs)
     exact = placement.project(places)
-    x, y = placement.project(centre[None])[0, :2]
+    x, y = placement.project(center[None])[0, :2]
     grid = PixelGrid(float(x) - 10.24, float(y) + 10.24, 0.04, 512, 512)
     pixels, _ = NadirCamera.of(capture, placement).camera(grid).project(places)
     expected = np.stack([(exact[:, 0] - grid.left) / grid.gsd, (grid.top - exact[:, 1]) / grid.gsd], axis=1)
@@ -158,7 +158,7 @@ def test_files_open_at_the_right_place_with_the_right_heights(house, make):
         assert file.read(1)[file.index(*place[:2])] == pytest.approx(place[2], abs=0.05)
 
 
-def test_files_are_cloud_optimised_and_say_what_they_are(house, make):
+def test_files_are_cloud_optimized_and_say_what_they_are(house, make):
     ortho_folder = make(*house, gsd=0.03)
     names = {file.name for file in ortho_folder.iterdir()}
     assert names == {"orthophoto.tif", "dsm.tif", "visibility.tif", "hillshade.png", "preview.png", "map.json"}
@@ -239,7 +239,7 @@ def test_tiles_show_what_one_picture_shows(house):
         tile = surveyor.render_tile(part)
         at = np.s_[row : row + part.height, column : column + part.width]
         # Grid north turns by a millionth from tile to tile; what lies between two splats may fall to the other.
-        assert (np.abs(tile.colours.astype(int) - whole.colours[at]) <= 3).mean() > 0.995
+        assert (np.abs(tile.colors.astype(int) - whole.colors[at]) <= 3).mean() > 0.995
         assert (np.abs(tile.heights - whole.heights[at]) < 0.01).mean() > 0.995
         assert (tile.visibility == whole.visibility[at]).mean() > 0.995
 
@@ -461,7 +461,7 @@ def test_detail_comes_from_the_photographs_where_they_see_the_place(house, tmp_p
     sharp = surveyor_of(model, capture, placement, sharpener=sharpener).render_tile(grid)
     sharpener.close()
     np.testing.assert_array_equal(sharp.heights, plain.heights)
-    gained = (sharp.colours.astype(float) - plain.colours).mean(axis=-1) / 255
+    gained = (sharp.colors.astype(float) - plain.colors).mean(axis=-1) / 255
     x = grid.left + (np.arange(120) + 0.5) * 0.08
     y = grid.top - (np.arange(100) + 0.5) * 0.08
     ground = plain.heights < 1.0
@@ -473,12 +473,12 @@ def test_detail_comes_from_the_photographs_where_they_see_the_place(house, tmp_p
     assert np.abs(gained[~ground]).mean() < 0.35 * np.abs(gained[ground]).mean()
 
 
-def grey(places: np.ndarray) -> AnchorModel:
+def gray(places: np.ndarray) -> AnchorModel:
     """The same splats, all of one grey."""
     model = model_of(places)
     tensors = {name: tensor.clone() for name, tensor in model.decoder.tensors().items()}
-    tensors["colour_w2"].zero_()
-    tensors["colour_b2"].zero_()
+    tensors["color_w2"].zero_()
+    tensors["color_b2"].zero_()
     return replace(model, decoder=Decoder.from_tensors(tensors))
 
 
@@ -501,14 +501,14 @@ def test_detail_knows_no_borders_of_tiles(house, tmp_path, monkeypatch, most):
     """Also where only some of the photographs are looked up."""
     monkeypatch.setattr(detail_transfer, "_MAX_VIEWS", most)
     capture, _ = house
-    capture, model = misted(capture, tmp_path), grey(GROUND)
+    capture, model = misted(capture, tmp_path), gray(GROUND)
     sharpener = DetailTransfer(model, capture)
     surveyor = surveyor_of(model, capture, MapProjection.of(capture.ground, "local"), sharpener=sharpener)
     grid = PixelGrid(-8.0, 4.0, 0.08, 200, 100)
-    whole = surveyor.render_tile(grid).colours
+    whole = surveyor.render_tile(grid).colors
     joined = np.zeros_like(whole)
     for column, row, part in grid.tiles(50):
-        joined[row : row + part.height, column : column + part.width] = surveyor.render_tile(part).colours
+        joined[row : row + part.height, column : column + part.width] = surveyor.render_tile(part).colors
     sharpener.close()
     assert np.ptp(whole[..., 0].astype(int)) > 10
     off = np.abs(joined.astype(int) - whole)

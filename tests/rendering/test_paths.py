@@ -312,12 +312,12 @@ def test_an_orbit_looks_at_the_scene_from_where_the_flight_was():
     points = np.random.default_rng(2).uniform([0, 0, -1], [36, 36, 1], (500, 3))
     path = orbit(points, cameras, TEMPLATE, seconds=4.0, fps=25.0)
     assert len(path.cameras) == 100
-    centre = np.median(points, axis=0)
+    center = np.median(points, axis=0)
     for camera in path.cameras:
         assert camera.position[2] == pytest.approx(30)
-        np.testing.assert_allclose(camera.project(centre[None])[0][0], [160, 90], atol=1e-6)
+        np.testing.assert_allclose(camera.project(center[None])[0][0], [160, 90], atol=1e-6)
     extent = np.ptp([camera.position for camera in cameras], axis=0).max()
-    assert max(np.linalg.norm(camera.position[:2] - centre[:2]) for camera in path.cameras) < extent
+    assert max(np.linalg.norm(camera.position[:2] - center[:2]) for camera in path.cameras) < extent
 
 
 @pytest.mark.parametrize("shuffled", [False, True])

@@ -114,7 +114,7 @@ def test_depths_of_any_range_have_round_numbers(span: tuple[float, float]) -> No
     assert all(len(words) <= 9 for _, words in scale.ticks)
 
 
-def test_v_has_the_colours_of_all_other_figures_and_whole_steps() -> None:
+def test_v_has_the_colors_of_all_other_figures_and_whole_steps() -> None:
     scale = visibility_scale(np.array([0, 1, 4, 10]))
     drawn = scale.colorize(np.array([[0.0, 0.4, 0.6, 9.8, 10.0, 10.4]])) / 255
     np.testing.assert_allclose(drawn[0, 0], VISIBILITY_CMAP(0.0)[:3], atol=0.01)
@@ -142,8 +142,8 @@ def test_legends_fit_below_every_picture(name: str, size: tuple[int, int]) -> No
         ink = np.round(np.array(to_rgb("#1c1e22")) * 255)
         assert (strip == ink).all(axis=-1).sum() > 10
         for value in (scale.low, scale.high):  # the bar shows both ends
-            colour = scale.colorize(np.full((1, 1), value))[0, 0].astype(int)
-            assert (np.abs(strip - colour).max(axis=-1) < 8).any()
+            color = scale.colorize(np.full((1, 1), value))[0, 0].astype(int)
+            assert (np.abs(strip - color).max(axis=-1) < 8).any()
 
 
 def test_numbers_are_of_maps_in_folders(tmp_path: Path) -> None:

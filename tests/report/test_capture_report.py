@@ -69,7 +69,7 @@ def test_the_report_says_what_is_there(capture, tmp_path):
 def test_the_table_is_printed_with_its_warnings(tmp_path):
     """Photographs of one corner only: most points are seen by hardly any camera, and the report says so."""
     scene = tiny_scene()
-    corner = TinyScene(dict(list(scene.cameras.items())[:3]), scene.points, scene.colours)
+    corner = TinyScene(dict(list(scene.cameras.items())[:3]), scene.points, scene.colors)
     write_colmap(tmp_path, corner)
     report = inspect_capture(load_capture(tmp_path, CaptureOptions(up="z")), tmp_path / "out")
     stream = io.StringIO()

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from vdgs.sfm.pair_selection import SHARED_NEIGHBOR_FACTOR, spatial_pairs
 
-NEIGHBOURS = 16
+NEIGHBORS = 16
 
 
 def strips(count: int, each: int, step: float, apart: float) -> tuple[np.ndarray, np.ndarray]:
@@ -19,7 +19,7 @@ def strips(count: int, each: int, step: float, apart: float) -> tuple[np.ndarray
 
 
 def nearest_in_the_plane(places: np.ndarray) -> set[tuple[int, int]]:
-    found = cKDTree(places[:, :2]).query(places[:, :2], k=NEIGHBOURS + 1)[1]
+    found = cKDTree(places[:, :2]).query(places[:, :2], k=NEIGHBORS + 1)[1]
     return {(min(i, j), max(i, j)) for i, row in enumerate(found.tolist()) for j in row if i != j}
 
 
@@ -36,33 +36,33 @@ def rig() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def test_a_facade_flown_in_columns_is_matched_across_columns(wrong_m):
     column, row = (each.ravel() for each in np.meshgrid(range(10), range(20), indexing="ij"))
     truth = np.stack([5.0 * column, 0.0 * row, 4.0 * row], axis=1)
-    chosen = spatial_pairs(truth + np.random.default_rng(0).normal(0, wrong_m, truth.shape), NEIGHBOURS)
+    chosen = spatial_pairs(truth + np.random.default_rng(0).normal(0, wrong_m, truth.shape), NEIGHBORS)
     beside = {
         (i, j) for i in range(200) for j in range(i) if abs(column[i] - column[j]) == 1 and abs(row[i] - row[j]) <= 1
     }
     assert len(beside) == 522
     assert sum((j, i) in chosen for i, j in beside) > 0.95 * len(beside)
-    assert len(chosen) < 200 * NEIGHBOURS * 1.1
+    assert len(chosen) < 200 * NEIGHBORS * 1.1
 
 
 def test_a_rig_of_five_lenses_is_matched_across_strips_with_those_that_look_the_same_way():
     places, views, of = rig()
-    chosen = np.array(sorted(spatial_pairs(places, NEIGHBOURS, views)))
+    chosen = np.array(sorted(spatial_pairs(places, NEIGHBORS, views)))
     one, other = chosen.T
     across = (np.abs(of[one] - of[other]) == 1) & (np.einsum("ni,ni->n", views[one], views[other]) > 0.99)
     for inner in np.flatnonzero((of > 0) & (of < 5)):  # with both strips beside
         strips_met = {int(of[k]) for pair in chosen[across] if inner in pair for k in pair}
         assert {of[inner] - 1, of[inner] + 1} <= strips_met
-    assert len(chosen) <= len(places) * NEIGHBOURS * 2
+    assert len(chosen) <= len(places) * NEIGHBORS * 2
 
 
 def test_a_rig_that_records_no_views_is_matched_across_strips_by_place():
     places, _, of = rig()
-    chosen = np.array(sorted(spatial_pairs(places, NEIGHBOURS)))
+    chosen = np.array(sorted(spatial_pairs(places, NEIGHBORS)))
     one, other = chosen.T
     across = chosen[np.abs(of[one] - of[other]) == 1]
     assert set(across.ravel().tolist()) == set(range(len(places)))
-    assert len(chosen) <= len(places) * NEIGHBOURS * SHARED_NEIGHBOR_FACTOR
+    assert len(chosen) <= len(places) * NEIGHBORS * SHARED_NEIGHBOR_FACTOR
 
 
 @pytest.mark.parametrize("wrong_m", [0.0, 1.0, 3.0])
@@ -78,12 +78,12 @@ def test_flights_straight_down_get_the_nearest_in_the_plane_and_no_more(wrong_m,
         each = each + rng.normal(0, 1e-6, each.shape)  # no two equally far
         looks = np.array([0, 0, -1.0]) + rng.normal(0, 0.08, each.shape)
         looks /= np.linalg.norm(looks, axis=1, keepdims=True)
-        assert spatial_pairs(each, NEIGHBOURS, looks if known else None) == nearest_in_the_plane(each)
-    assert spatial_pairs(places[:5], NEIGHBOURS) == {(i, j) for j in range(5) for i in range(j)}
+        assert spatial_pairs(each, NEIGHBORS, looks if known else None) == nearest_in_the_plane(each)
+    assert spatial_pairs(places[:5], NEIGHBORS) == {(i, j) for j in range(5) for i in range(j)}
 
 
 def test_pairs_of_before_are_all_kept_where_more_come():
     places, views, _ = rig()
     places = places + np.random.default_rng(2).normal(0, 0.5, places.shape)
     for looks in (views, None):
-        assert nearest_in_the_plane(places) < spatial_pairs(places, NEIGHBOURS, looks)
+        assert nearest_in_the_plane(places) < spatial_pairs(places, NEIGHBORS, looks)

@@ -40,7 +40,7 @@ def scene() -> AnchorModel:
     )
     tensors = Decoder.init_random(4, False, 0, 1, g).tensors()
     tensors["opacity_b2"] = tensors["opacity_b2"] + 3.0  # what is in view is opaque
-    tensors["colour_b2"] = tensors["colour_b2"] + 1.0  # and lighter than the black behind it
+    tensors["color_b2"] = tensors["color_b2"] + 1.0  # and lighter than the black behind it
     return AnchorModel(
         anchors=anchors, decoder=Decoder.from_tensors(tensors), voxel_size=0.4, background=(0.5, 0.5, 0.5)
     )

@@ -31,10 +31,10 @@ class TinyScene:
 
     cameras: dict[str, Camera]
     points: np.ndarray
-    colours: np.ndarray
+    colors: np.ndarray
 
 
-def ground_colour(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def ground_color(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """A smooth texture of the plane, [..., 3] uint8."""
     waves = [np.sin(0.7 * x + 0.2 * y), np.sin(0.5 * y - 0.3 * x + 1), np.cos(0.4 * x) * np.cos(0.6 * y)]
     return (127.5 + 100 * np.stack(waves, axis=-1)).astype(np.uint8)
@@ -79,7 +79,7 @@ def tiny_scene(
     low, high = np.array([-4.0, -4.0]), np.array([3.0 * columns + 1, 3.0 * rows + 1])
     flat = generator.uniform(low, high, (points, 2))
     cloud = np.column_stack([flat, generator.normal(0, 0.05, points)])
-    return TinyScene(cameras, cloud, ground_colour(cloud[:, 0], cloud[:, 1]))
+    return TinyScene(cameras, cloud, ground_color(cloud[:, 0], cloud[:, 1]))
 
 
 def render_plane(camera: Camera) -> np.ndarray:
@@ -90,8 +90,8 @@ def render_plane(camera: Camera) -> np.ndarray:
     distance = -camera.position[2] / np.where(directions[..., 2] < -1e-6, directions[..., 2], np.nan)
     hit = camera.position + distance[..., None] * directions
     seen = np.isfinite(distance)
-    colour = ground_colour(np.nan_to_num(hit[..., 0]), np.nan_to_num(hit[..., 1]))
-    return np.where(seen[..., None], colour, np.uint8(255))
+    color = ground_color(np.nan_to_num(hit[..., 0]), np.nan_to_num(hit[..., 1]))
+    return np.where(seen[..., None], color, np.uint8(255))
 
 
 def to_source(frame: GroundFrame, points: np.ndarray) -> np.ndarray:
@@ -107,7 +107,7 @@ def moved(scene: TinyScene, scale: float, rotation: np.ndarray, translation: np.
         pose[:3, :3] = camera.camera_from_world[:3, :3] @ rotation.T
         pose[:3, 3] = -pose[:3, :3] @ (scale * rotation @ camera.position + translation)
         cameras[name] = replace(camera, camera_from_world=pose)
-    return TinyScene(cameras, scale * scene.points @ rotation.T + translation, scene.colours)
+    return TinyScene(cameras, scale * scene.points @ rotation.T + translation, scene.colors)
 
 
 def write_images(folder: Path, scene: TinyScene, shown: TinyScene | None = None) -> None:
@@ -181,8 +181,8 @@ def _write_binary(folder: Path, scene: TinyScene, model: str, extra: tuple[float
         images += name.encode() + b"\0" + struct.pack("<Q", len(features[name]))
         images += b"".join(struct.pack("<ddq", *feature) for feature in features[name])
     points = struct.pack("<Q", len(scene.points))
-    for index, (point, colour) in enumerate(zip(scene.points, scene.colours, strict=True), 1):
-        points += struct.pack("<Q3d3Bd", index, *point, *colour, 0.5) + struct.pack("<Q", 0)
+    for index, (point, color) in enumerate(zip(scene.points, scene.colors, strict=True), 1):
+        points += struct.pack("<Q3d3Bd", index, *point, *color, 0.5) + struct.pack("<Q", 0)
     for stem, data in (("cameras", cameras), ("images", images), ("points3D", points)):
         (folder / f"{stem}.bin").write_bytes(data)
 
@@ -196,14 +196,14 @@ def _write_text(folder: Path, scene: TinyScene, model: str, extra: tuple[float, 
         numbers = " ".join(repr(float(value)) for value in (*quaternion_of(pose[:3, :3]), *pose[:3, 3]))
         shown = " ".join(f"{float(x)!r} {float(y)!r} {point}" for x, y, point in features[name])
         images += [f"{index} {numbers} {index} {name}", shown]
-    for index, (point, colour) in enumerate(zip(scene.points, scene.colours, strict=True), 1):
-        words = [*(repr(float(value)) for value in point), *(str(int(value)) for value in colour)]
+    for index, (point, color) in enumerate(zip(scene.points, scene.colors, strict=True), 1):
+        words = [*(repr(float(value)) for value in point), *(str(int(value)) for value in color)]
         points.append(f"{index} {' '.join(words)} 0.5")
     for stem, lines in (("cameras", cameras), ("images", images), ("points3D", points)):
         (folder / f"{stem}.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def write_ply(file: Path, points: np.ndarray, colours: np.ndarray, *, text: bool = False) -> None:
+def write_ply(file: Path, points: np.ndarray, colors: np.ndarray, *, text: bool = False) -> None:
     """Vertices x y z red green blue, ascii or little-endian."""
     kind = "ascii" if text else "binary_little_endian"
     header = f"ply\nformat {kind} 1.0\ncomment a cloud\nelement vertex {len(points)}\n"
@@ -212,11 +212,11 @@ def write_ply(file: Path, points: np.ndarray, colours: np.ndarray, *, text: bool
     if text:
         rows = [
             f"{float(p[0])!r} {float(p[1])!r} {float(p[2])!r} {c[0]} {c[1]} {c[2]}"
-            for p, c in zip(points, colours, strict=True)
+            for p, c in zip(points, colors, strict=True)
         ]
         file.write_text(header + "\n".join(rows) + "\n", encoding="ascii")
         return
-    body = b"".join(struct.pack("<3d3B", *p, *c) for p, c in zip(points, colours, strict=True))
+    body = b"".join(struct.pack("<3d3B", *p, *c) for p, c in zip(points, colors, strict=True))
     file.write_bytes(header.encode() + body)
 
 

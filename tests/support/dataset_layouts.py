@@ -44,9 +44,9 @@ def write_mega_nerf(root: Path, scene: TinyScene, scale: float = 50.0) -> TinySc
     torch.save({"origin_drb": torch.tensor(origin), "pose_scale_factor": scale}, root / "coordinates.pt")
     (root / "mappings.txt").write_text("\n".join(mappings))
     for name, camera in renamed.items():
-        one = TinyScene({Path(name).name: camera}, scene.points, scene.colours)
+        one = TinyScene({Path(name).name: camera}, scene.points, scene.colors)
         write_images(root / name.split("/")[0] / "rgbs", one)
-    return TinyScene(renamed, scene.points, scene.colours)
+    return TinyScene(renamed, scene.points, scene.colors)
 
 
 def matrixcity_frames(scene: TinyScene, block: str, unit: float) -> list[dict]:
@@ -70,7 +70,7 @@ def halves(scene: TinyScene, first: int = 9) -> tuple[TinyScene, TinyScene]:
     parts = []
     for part in (items[:first], items[first:]):
         cameras = {f"{index:04d}.png": camera for index, (_, camera) in enumerate(part)}
-        parts.append(TinyScene(cameras, scene.points, scene.colours))
+        parts.append(TinyScene(cameras, scene.points, scene.colors))
     return parts[0], parts[1]
 
 
@@ -89,5 +89,5 @@ def write_matrixcity(root: Path, train: TinyScene, test: TinyScene) -> TinyScene
         (root / f"transforms_{side}.json").write_text(json.dumps(content))
         write_images(city / block, part)
         both |= {f"{block}/{name}": camera for name, camera in part.cameras.items()}
-    write_ply(root / "points3D.ply", train.points / 100, train.colours)
-    return TinyScene(both, train.points, train.colours)
+    write_ply(root / "points3D.ply", train.points / 100, train.colors)
+    return TinyScene(both, train.points, train.colors)

@@ -138,7 +138,7 @@ def moved_by(
     gradients = SplatGradients(
         means_px=0.1 * torch.randn(m, 2, generator=g),
         conics=torch.randn(m, 3, generator=g),
-        colours=torch.randn(m, 3, generator=g),
+        colors=torch.randn(m, 3, generator=g),
         opacities=torch.randn(m, generator=g),
         volume=0.3,
         source=splats.source,
@@ -164,10 +164,10 @@ def elsewhere(gradients: SplatGradients, shown: SplatMask) -> SplatGradients:
     """Gradients of splats in their order, as those of splats that stand otherwise; what these looked like is lost."""
     order = shown.segments.order(len(shown))
     moved = {}
-    for name in ("means_px", "conics", "colours", "opacities"):
+    for name in ("means_px", "conics", "colors", "opacities"):
         moved[name] = torch.empty_like(getattr(gradients, name))
         moved[name][order.long()] = getattr(gradients, name)
     nothing = {
-        name: torch.full_like(getattr(gradients, name), torch.nan) for name in ("colour_values", "opacity_values")
+        name: torch.full_like(getattr(gradients, name), torch.nan) for name in ("color_values", "opacity_values")
     }
     return replace(gradients, source=shown, **moved, **nothing)

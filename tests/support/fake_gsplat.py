@@ -40,9 +40,9 @@ def intersect_tile(
     assert radii.dtype == torch.int32
     assert all(tensor.is_contiguous() for tensor in (means2d, radii, depths))
     most = torch.tensor([tile_width, tile_height], dtype=torch.float32)
-    centre, reach = means2d[0] / tile_size, radii[0].float() / tile_size
-    low = torch.minimum(torch.floor(centre - reach).nan_to_num().clamp(min=0), most).long()
-    high = torch.minimum(torch.ceil(centre + reach).nan_to_num().clamp(min=0), most).long()
+    center, reach = means2d[0] / tile_size, radii[0].float() / tile_size
+    low = torch.minimum(torch.floor(center - reach).nan_to_num().clamp(min=0), most).long()
+    high = torch.minimum(torch.ceil(center + reach).nan_to_num().clamp(min=0), most).long()
     sides = torch.where((radii[0] > 0).all(1, keepdim=True), high - low, 0)
     counts = sides.prod(1)
     owner = torch.repeat_interleave(torch.arange(len(counts)), counts)
@@ -67,10 +67,10 @@ def rasterize_to_pixels_3dgs_fwd(
     """Colours [1, h, w, channels], alphas [1, h, w, 1] and, as gsplat does, the last Gaussian of each pixel."""
     assert masks is None
     with torch.no_grad():
-        colours, alphas = _drawn(
+        colors, alphas = _drawn(
             (means2d, conics, colors, opacities), backgrounds, (width, height), tile_size, isect_offsets, flatten_ids
         )
-    return colours, alphas, torch.zeros(1, height, width, dtype=torch.int32)
+    return colors, alphas, torch.zeros(1, height, width, dtype=torch.int32)
 
 
 def rasterize_to_pixels_3dgs_bwd(
@@ -104,7 +104,7 @@ def _drawn(
 
 
 def _tile(
-    means: Tensor, conics: Tensor, colours: Tensor, opacities: Tensor, background: Tensor, origin: Tensor, side: int
+    means: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, background: Tensor, origin: Tensor, side: int
 ) -> Tensor:
     """Colours and alpha of a tile, [side, side, channels + 1]."""
     y, x = torch.meshgrid(torch.arange(side), torch.arange(side), indexing="ij")
@@ -119,5 +119,5 @@ def _tile(
     alpha = alpha.masked_fill(stopped, 0.0)
     before = torch.cat([torch.ones(1, side, side), torch.cumprod(1 - alpha, dim=0)])
     through = before[-1][..., None]
-    painted = torch.einsum("nhw,nc->hwc", alpha * before[:-1], colours) + through * background
+    painted = torch.einsum("nhw,nc->hwc", alpha * before[:-1], colors) + through * background
     return torch.cat([painted, 1 - through], dim=-1)

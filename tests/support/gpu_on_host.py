@@ -12,12 +12,12 @@ from support.cuda_on_host import HostDriver, build_on_host
 from vdgs.kernels.cuda import compile_cache, loss
 from vdgs.kernels.cuda.cull import PROGRAM as CULL
 from vdgs.kernels.cuda.decode import PROGRAM as DECODE
-from vdgs.kernels.cuda.rasterize import PROGRAM as RASTERISE
+from vdgs.kernels.cuda.rasterize import PROGRAM as RASTERIZE
 from vdgs.kernels.cuda.statistics import PROGRAM as STATISTICS
 from vdgs.kernels.gpu import rasterizer as choosing
 from vdgs.kernels.torch_ref import adam
 
-PROGRAMS = (loss.PROGRAM, RASTERISE, DECODE, CULL, STATISTICS)
+PROGRAMS = (loss.PROGRAM, RASTERIZE, DECODE, CULL, STATISTICS)
 
 
 def build(folder: Path) -> dict[str, HostDriver]:
@@ -31,7 +31,7 @@ def build(folder: Path) -> dict[str, HostDriver]:
 
 
 def install(
-    drivers: dict[str, HostDriver], code: Path, monkeypatch: pytest.MonkeyPatch, device_type: str, rasteriser: str
+    drivers: dict[str, HostDriver], code: Path, monkeypatch: pytest.MonkeyPatch, device_type: str, rasterizer: str
 ) -> None:
     """Let tensors of a kind of device be computed on by the composed set, with one of its rasterisers."""
     monkeypatch.setenv(compile_cache.CUDA_CACHE_ENV_VAR, str(code))
@@ -41,6 +41,6 @@ def install(
         for name, value in (("driver", driver), ("_functions", {}), ("_modules", {})):
             monkeypatch.setattr(program, name, value)
     fake_gsplat.install(monkeypatch)
-    monkeypatch.setenv(choosing.RASTERIZER_ENV_VAR, rasteriser)
+    monkeypatch.setenv(choosing.RASTERIZER_ENV_VAR, rasterizer)
     choosing.select_rasterizer.cache_clear()
     adam.bias_correction_tables.cache_clear()

@@ -32,8 +32,8 @@ def assert_first_gradients_are_those_of_all(
 
 def splats_of(tensors: tuple[Tensor, ...]) -> tuple[Splats, Tensor]:
     """Splats and background from means, conics, colours, opacities, depths and background."""
-    means, conics, colours, opacities, depths, background = tensors
-    return Splats(means, conics, depths, colours, opacities), background
+    means, conics, colors, opacities, depths, background = tensors
+    return Splats(means, conics, depths, colors, opacities), background
 
 
 def in_runs(splats: Splats, runs: int, seed: int = 0) -> tuple[OrderedSplats, Tensor]:

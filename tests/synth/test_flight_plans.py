@@ -200,7 +200,7 @@ def test_outliers_lie_on_a_ray_that_saw_them(town: Town) -> None:
     places = rng.normal(0, 10, (50, 3))
     point, image = np.repeat(np.arange(50), 3), np.tile(np.arange(3), 50)
     cloud = SparseCloud(
-        true_points=places, points=places.copy(), colours=np.zeros((50, 3), np.uint8), errors=np.zeros(50),
+        true_points=places, points=places.copy(), colors=np.zeros((50, 3), np.uint8), errors=np.zeros(50),
         observed_point=point, observed_image=image, observed_px=rng.normal(size=(150, 2)),
         visibility=np.ones((50, 3), bool), outliers=np.zeros(50, bool),
     )  # fmt: skip

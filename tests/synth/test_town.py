@@ -160,10 +160,10 @@ def test_pictures_show_something_everywhere(capture: Path) -> None:
 
 def test_the_world_is_metric_and_z_is_up(model: pycolmap.Reconstruction) -> None:
     points = np.array([point.xyz for point in model.points3D.values()])
-    centres = np.array([camera_of(image).position for image in model.images.values()])
+    centers = np.array([camera_of(image).position for image in model.images.values()])
     assert np.abs(np.median(points[:, 2])) < 8
-    assert (centres[:, 2] > 25).all()
-    assert points[:, 2].max() < centres[:, 2].min()
+    assert (centers[:, 2] > 25).all()
+    assert points[:, 2].max() < centers[:, 2].min()
 
 
 def test_a_folder_with_something_in_it_is_left_alone(tmp_path: Path) -> None:
@@ -221,15 +221,15 @@ def test_every_seed_gives_a_town_of_its_own() -> None:
     towns = [build_town(seed, 50.0) for seed in (0, 1)]
     assert towns[0].mesh.vertices.shape != towns[1].mesh.vertices.shape
     for town in towns:
-        square_metres = np.bincount(town.zones.cells.ravel(), minlength=len(LandUse)) * town.zones.cell**2
-        assert (square_metres[[LandUse.LAWN, LandUse.BUILDING, LandUse.SQUARE]] > 400).all()
+        square_meters = np.bincount(town.zones.cells.ravel(), minlength=len(LandUse)) * town.zones.cell**2
+        assert (square_meters[[LandUse.LAWN, LandUse.BUILDING, LandUse.SQUARE]] > 400).all()
         assert np.isfinite(town.mesh.vertices).all()
         assert np.isfinite(town.mesh.normals).all()
         assert town.mesh.faces.max() < len(town.mesh.vertices)
 
 
 @pytest.mark.parametrize("count", [1, 4, 7, 9])
-def test_samples_surround_the_pixel_centre(count: int) -> None:
+def test_samples_surround_the_pixel_center(count: int) -> None:
     offsets = pixel_sample_offsets(count)
     assert offsets.shape == (count, 2)
     assert np.abs(offsets).max() < 0.8

@@ -189,7 +189,7 @@ def test_a_warning_comes_before_training_where_it_will_not_fit(kind, said, monke
         cv2.error("OpenCV(4.9) alloc.cpp:73: error: (-4:Insufficient memory) Failed to allocate 9 bytes"),
     ],
 )
-def test_missing_memory_is_recognised(error):
+def test_missing_memory_is_recognized(error):
     assert is_out_of_memory(error)
 
 

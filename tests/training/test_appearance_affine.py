@@ -49,12 +49,12 @@ def test_over_all_photographs_the_mean_is_neutral(seed, images):
     assert torch.allclose(mean, torch.eye(3, 4).double(), atol=1e-12)
 
 
-def test_neutral_exposures_change_no_colour():
+def test_neutral_exposures_change_no_color():
     picture = torch.rand(5, 7, 3)
     assert torch.equal(apply_exposure(picture, exposure_matrix(zero_exposures(4), 2)), picture)
 
 
-def test_an_exposure_maps_colours():
+def test_an_exposure_maps_colors():
     picture = torch.rand(5, 7, 3)
     model = torch.tensor([[2.0, 0.0, 0.0, 0.1], [0.0, 1.0, 0.0, 0.0], [0.0, 0.5, 0.5, -0.1]])
     red, green, blue = picture.unbind(-1)
@@ -151,7 +151,7 @@ class Lit(ViewExposures):
         return np.full((4, 6, 3), self._light(view))
 
 
-def test_test_views_have_the_exposure_between_their_neighbours_of_the_same_flight():
+def test_test_views_have_the_exposure_between_their_neighbors_of_the_same_flight():
     capture = flown(a="tttxxxtttttt", b="x", c="xt")
     names = [view.name for view in capture.train_views]
     assert names[:3] == ["a/0.jpg", "a/1.jpg", "a/10.jpg"]  # rows of a model are in another order than the flight

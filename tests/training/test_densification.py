@@ -40,7 +40,7 @@ def cell_of(points: torch.Tensor, cell: float) -> set[tuple[int, ...]]:
 
 @settings(max_examples=25)
 @given(n=st.integers(1, 60), seed=st.integers(0, 1000), cell=st.sampled_from([0.5, 1.0, 2.5]))
-def test_new_anchors_are_centred_in_empty_cells_that_hold_a_strong_offset(n, seed, cell):
+def test_new_anchors_are_centered_in_empty_cells_that_hold_a_strong_offset(n, seed, cell):
     before = anchors(n, seed)
     stats = statistics(n, seed=seed)
     strong = stats.gradient >= ALWAYS.grad_threshold
@@ -50,8 +50,8 @@ def test_new_anchors_are_centred_in_empty_cells_that_hold_a_strong_offset(n, see
     assert len(new) == len(added)
     assert new.isdisjoint(cell_of(before.positions, cell))
     assert new <= cell_of(means[strong], cell)
-    centred = torch.round(added.positions / cell) * cell
-    torch.testing.assert_close(added.positions, centred, atol=1e-4, rtol=1e-5)
+    centered = torch.round(added.positions / cell) * cell
+    torch.testing.assert_close(added.positions, centered, atol=1e-4, rtol=1e-5)
     assert torch.all(added.offsets == 0)
     torch.testing.assert_close(added.log_scales, torch.full_like(added.log_scales, math.log(cell)))
 
@@ -148,9 +148,9 @@ def test_a_view_is_counted_where_it_was_drawn():
 def test_surroundings_occupy_cells_but_neither_grow_nor_go():
     before = anchors(60)
     free = decide_densification(before, statistics(60), 1.0, ALWAYS, torch.Generator().manual_seed(0))
-    neighbours = torch.cat([free.added.positions[::2], torch.full((1, 3), 1e9)])  # one is beyond the lattice
+    neighbors = torch.cat([free.added.positions[::2], torch.full((1, 3), 1e9)])  # one is beyond the lattice
     decision = decide_densification(
-        before, statistics(60), 1.0, ALWAYS, torch.Generator().manual_seed(0), frozen_positions=neighbours
+        before, statistics(60), 1.0, ALWAYS, torch.Generator().manual_seed(0), frozen_positions=neighbors
     )
     assert torch.equal(decision.added.positions, free.added.positions[1::2])
     assert torch.equal(decision.added.features, free.added.features[1::2])

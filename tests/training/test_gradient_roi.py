@@ -30,7 +30,7 @@ def test_the_box_holds_every_pixel_that_a_splat_changes(name):
     scene = SCENES[name]
     splats, background = splats_of([each.detach() for each in scene.tensors])
     for i in range(len(splats.depths)):
-        one = Splats(*(getattr(splats, field)[i : i + 1] for field in ("means_px", "conics", "depths", "colours")),
+        one = Splats(*(getattr(splats, field)[i : i + 1] for field in ("means_px", "conics", "depths", "colors")),
                      splats.opacities[i : i + 1])  # fmt: skip
         alpha = get_backend(torch.device("cpu")).rasterize(one, background, scene.width, scene.height).alpha
         box = splat_bounds(one, scene.width, scene.height)

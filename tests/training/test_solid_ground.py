@@ -66,7 +66,7 @@ def test_pixels_well_below_the_horizon_show_no_sky(tilt):
 # ------------------------------------------------------------------------------------------ backgrounds
 
 
-class Grey(Photographs):
+class Gray(Photographs):
     """Of a place that has the colour of the background."""
 
     def get(self, index: int, downscale: int = 1) -> tuple[torch.Tensor, None]:
@@ -77,37 +77,37 @@ def light_through(loss: LossConfig) -> float:
     """The median of 1 - alpha, of a model that was trained before the colour of grey."""
     stage, state = block_stage(BlockConfig())
     config = replace(stage.config, iterations=300, loss=loss, densify=DensifyConfig(num_levels=0, start=10_000))
-    photographs, grey = Grey(), (128 / 255,) * 3
-    stage = replace(stage, config=config, background=grey, frozen_anchors=None, images=photographs)
+    photographs, gray = Gray(), (128 / 255,) * 3
+    stage = replace(stage, config=config, background=gray, frozen_anchors=None, images=photographs)
     train(state, stage, stop=lambda: False, after_step=lambda *_: None)
-    model = state.model(stage.voxel_size, grey)
+    model = state.model(stage.voxel_size, gray)
     return float((1.0 - render(model, photographs.camera(0)).alpha.clamp(0, 1)).quantile(0.5))
 
 
-def test_ground_becomes_opaque_although_the_background_has_its_colour():
+def test_ground_becomes_opaque_although_the_background_has_its_color():
     """Without backgrounds of random colour light shines through, with them nearly none does."""
     board = light_through(LossConfig())
     assert board < 0.02
     assert light_through(LossConfig(random_background=0.0)) > 3 * board
 
 
-def test_backgrounds_are_of_all_colours_the_same_for_a_seed_and_no_others_without_noise():
+def test_backgrounds_are_of_all_colors_the_same_for_a_seed_and_no_others_without_noise():
     stage, _ = block_stage(BlockConfig())
 
-    def colours(share: float) -> torch.Tensor:
+    def colors(share: float) -> torch.Tensor:
         loss = LossConfig(random_background=share)
         changed = replace(stage, config=replace(stage.config, loss=loss), background=(0.2, 0.5, 0.8))
         return torch.stack([background_at(changed, iteration) for iteration in range(500)])
 
     own = torch.tensor([0.2, 0.5, 0.8])
-    every = colours(1.0)
-    assert torch.equal(every, colours(1.0))
+    every = colors(1.0)
+    assert torch.equal(every, colors(1.0))
     assert float(every.min()) >= 0
     assert float(every.max()) <= 1
     assert (every.amin(0) < 0.03).all()
     assert (every.amax(0) > 0.97).all()
-    torch.testing.assert_close(colours(0.25), own + 0.25 * (every - own))
-    assert (colours(0.0) == own).all()
+    torch.testing.assert_close(colors(0.25), own + 0.25 * (every - own))
+    assert (colors(0.0) == own).all()
 
 
 # ------------------------------------------------------------------------------------------------ the law of sizes
@@ -140,7 +140,7 @@ def test_what_no_camera_holds_is_bounded_by_the_nearest_and_nothing_without_came
     assert max_log_scales(beside, []).tolist() == [math.inf]
 
 
-def test_an_anchor_in_the_centre_of_a_camera_has_a_size_that_can_be_trained():
+def test_an_anchor_in_the_center_of_a_camera_has_a_size_that_can_be_trained():
     assert max_log_scales(torch.tensor([[0.0, 0.0, 20.0]]), [camera_at()]).isfinite().all()
 
 

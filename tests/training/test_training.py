@@ -116,7 +116,7 @@ def test_anchors_that_no_camera_sees_keep_their_bits():
 
 
 @pytest.mark.parametrize("crops", [None, (Crop(0.0, 0.1, 0.5, 0.6),) * 8])
-def test_anchors_are_seen_by_the_pictures_that_hold_their_centres(crops):
+def test_anchors_are_seen_by_the_pictures_that_hold_their_centers(crops):
     config = replace(CONFIG, densify=replace(CONFIG.densify, stats_start=0, start=1000))
     seen_by = replace(stage(config), crops=crops)
     state = start(config)
@@ -210,7 +210,7 @@ def test_visible_and_dense_adam_are_one_where_all_is_seen():
 def test_a_parameter_that_is_not_a_number_stops_training():
     state = start()
     with torch.no_grad():
-        state.decoder.weights.colour.w2[:] = float("nan")
+        state.decoder.weights.color.w2[:] = float("nan")
     with pytest.raises(TrainingDiverged, match="iteration 1"):
         train_step(state, stage())
 
@@ -248,8 +248,8 @@ def test_a_damaged_model_is_refused(unbroken, tmp_path, damage):
 
 def test_anchors_start_on_the_voxel_grid():
     points = np.array([[0.1, 0.0, 0.0], [0.2, 0.0, 0.0], [5.0, 5.0, 5.0]])
-    colours = np.array([[255, 0, 0], [0, 0, 0], [0, 255, 0]], np.uint8)
-    anchors, voxel = initialize_anchors(points, colours, [], AnchorConfig(voxel_size=1.0, from_colors=True))
+    colors = np.array([[255, 0, 0], [0, 0, 0], [0, 255, 0]], np.uint8)
+    anchors, voxel = initialize_anchors(points, colors, [], AnchorConfig(voxel_size=1.0, from_colors=True))
     assert voxel == 1.0
     assert anchors.positions.tolist() == [[0, 0, 0], [5, 5, 5]]
     torch.testing.assert_close(anchors.features[:, :3], torch.tensor([[0.0, -1, -1], [-1, 1, -1]]))
@@ -258,10 +258,10 @@ def test_anchors_start_on_the_voxel_grid():
 def test_points_far_from_all_others_start_no_anchor():
     ground = np.random.default_rng(0).uniform(-5, 5, (500, 3)) * [1, 1, 0.02]
     deep = np.array([[0.0, 0.0, -300.0], [0.1, 0.0, -300.0]])
-    points, colours = np.concatenate([ground, deep]), np.zeros((502, 3), np.uint8)
-    kept, _ = initialize_anchors(points, colours, [], AnchorConfig(voxel_size=0.1))
+    points, colors = np.concatenate([ground, deep]), np.zeros((502, 3), np.uint8)
+    kept, _ = initialize_anchors(points, colors, [], AnchorConfig(voxel_size=0.1))
     assert float(kept.positions[:, 2].min()) > -1
-    everything, _ = initialize_anchors(points, colours, [], AnchorConfig(voxel_size=0.1, outlier_distance=0.0))
+    everything, _ = initialize_anchors(points, colors, [], AnchorConfig(voxel_size=0.1, outlier_distance=0.0))
     assert float(everything.positions[:, 2].min()) == pytest.approx(-300)
 
 

@@ -120,7 +120,7 @@ def test_rows_drawn_one_after_another_are_the_whole_picture(scene, layer, model)
 def test_layers_show_what_they_say(scene):
     camera, painter = camera_at(0.0, 0.0, 6.0), Painter(scene)
     drawn = {layer: painter.paint(DisplayOptions(layer), camera, camera) for layer in LAYERS}
-    assert np.array_equal(drawn["colour"], to_8bit(render(scene.model("merged"), camera).image.numpy()))
+    assert np.array_equal(drawn["color"], to_8bit(render(scene.model("merged"), camera).image.numpy()))
     names = list(drawn)
     for a in names:
         assert all(not np.array_equal(drawn[a], drawn[b]) for b in names if b != a)
@@ -136,7 +136,7 @@ def test_layers_show_what_they_say(scene):
         scale = painter.scale(DisplayOptions(layer))
         assert scale is not None
         assert scale.low < scale.high
-    assert painter.scale(DisplayOptions("colour")) is None
+    assert painter.scale(DisplayOptions("color")) is None
 
 
 def test_photographs_that_the_model_draws_itself_show_no_error_and_others_do(scene):
@@ -211,15 +211,15 @@ def test_a_newer_model_is_compared_anew(tmp_path):
 
 def test_two_models_stand_side_by_side(scene):
     camera, painter = camera_at(0.0, 0.0, 6.0), Painter(scene)
-    merged, coarse = (painter.paint(DisplayOptions("colour", name), camera, camera) for name in ("merged", "coarse"))
-    both = painter.paint(DisplayOptions("colour", "both", 0.5), camera, camera)
+    merged, coarse = (painter.paint(DisplayOptions("color", name), camera, camera) for name in ("merged", "coarse"))
+    both = painter.paint(DisplayOptions("color", "both", 0.5), camera, camera)
     assert np.array_equal(both[:, 32:], merged[:, 32:])
     assert np.array_equal(both[:, :31], coarse[:, :31])
     for split, alone in ((0.0, merged), (1.0, coarse)):
-        assert np.array_equal(painter.paint(DisplayOptions("colour", "both", split), camera, camera), alone)
+        assert np.array_equal(painter.paint(DisplayOptions("color", "both", split), camera, camera), alone)
 
 
-def test_depth_keeps_its_colours_while_the_camera_moves(scene):
+def test_depth_keeps_its_colors_while_the_camera_moves(scene):
     painter, shown = Painter(scene), DisplayOptions("depth")
     high, low = camera_at(0, 0, 6.0), camera_at(0, 0, 3.0)
     painter.update_depth_range(shown, high)
@@ -340,9 +340,9 @@ def test_a_ruler_measures(scene):
 
 
 def test_lines_lie_where_cameras_and_borders_are(scene):
-    lines, colours = overlays.camera_frusta(scene)
+    lines, colors = overlays.camera_frusta(scene)
     assert lines.shape == (8 * 9, 2, 3)
-    assert colours.shape == lines.shape
+    assert colors.shape == lines.shape
     assert np.allclose(lines[:4, 0], scene.capture.views[0].camera.position, atol=1e-5)
     corners, _ = scene.capture.views[0].camera.project(lines[:4, 1].astype(float))
     assert corners == pytest.approx(np.array([[0, 0], [64, 0], [64, 48], [0, 48]]), abs=0.01)

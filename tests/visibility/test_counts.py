@@ -89,7 +89,7 @@ def test_a_view_counts_once_in_a_cycle_at_whatever_resolution() -> None:
         visibility_ratio(points, [])
 
 
-def test_normalised_visibility_spans_zero_to_one_and_is_zero_where_all_are_alike() -> None:
+def test_normalized_visibility_spans_zero_to_one_and_is_zero_where_all_are_alike() -> None:
     assert normalize_visibility(np.array([3, 7, 5])) == pytest.approx([0, 1, 0.5])
     assert normalize_visibility(np.array([4, 4])).tolist() == [0, 0]
     assert len(normalize_visibility(np.array([], np.int64))) == 0

@@ -33,7 +33,7 @@ MIN_SPACING = 1e-3
 
 
 def initialize_gaussians(
-    points: Float[np.ndarray, "n 3"], colours: UInt8[np.ndarray, "n 3"], opacity: float, degree: int
+    points: Float[np.ndarray, "n 3"], colors: UInt8[np.ndarray, "n 3"], opacity: float, degree: int
 ) -> Gaussians:
     """A round Gaussian at each sparse point, as wide as its mean distance to the three nearest others (3DGS section
     5.1), in its colour. Raises VdgsError with fewer than two points."""
@@ -49,7 +49,7 @@ def initialize_gaussians(
         log_scales=log_scales[:, None].repeat(1, 3),
         quaternions=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
         opacity_logits=torch.full((n,), math.log(opacity / (1 - opacity))),
-        sh0=rgb_to_sh(torch.from_numpy(colours.astype(np.float32) / 255.0)),
+        sh0=rgb_to_sh(torch.from_numpy(colors.astype(np.float32) / 255.0)),
         shN=torch.zeros(n, num_sh_bases(degree) - 1, 3),
     )
 

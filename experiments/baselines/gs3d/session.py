@@ -40,8 +40,8 @@ def resume_or_start(folder: StageFolder, capture: Capture, config: Gs3dConfig, c
     """
 
     def start() -> Gs3dState:
-        points, colours = capture.points, capture.point_colors
-        return initial_state(initialize_gaussians(points, colours, config.initial_opacity, config.degree))
+        points, colors = capture.points, capture.point_colors
+        return initial_state(initialize_gaussians(points, colors, config.initial_opacity, config.degree))
 
     return restore_or_start(folder, config.iterations, start, from_saved, "Choose another output folder.", console)
 

@@ -131,8 +131,8 @@ class Gs3dStepReport:
 
 def scene_extent(cameras: list[Camera]) -> float:
     """Radius of the cameras about their mean, times 1.1 (program); at least a tiny number."""
-    centres = np.array([camera.position for camera in cameras])
-    return max(1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()), 1e-6)
+    centers = np.array([camera.position for camera in cameras])
+    return max(1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()), 1e-6)
 
 
 def initial_state(gaussians: Gaussians) -> Gs3dState:

@@ -47,10 +47,10 @@ int64_t collect(const SplatGradients& in, int64_t s, int64_t first, int k, Incom
     put(fields + Incoming::kX, lane, in.means_px, 2, s);
     put(fields + Incoming::kConicXX, lane, in.conics, 3, s);
     put(fields + Incoming::kDepth, lane, in.depths, 1, s);
-    put(fields + Incoming::kRed, lane, in.colours, 3, s);
+    put(fields + Incoming::kRed, lane, in.colors, 3, s);
     put(fields + Incoming::kOpacity, lane, in.opacities, 1, s);
     fields[Incoming::kVolume][lane] = in.volumes ? in.volumes[s] : in.volume;
-    put(fields + Incoming::kRedValue, lane, in.colour_values, 3, s);
+    put(fields + Incoming::kRedValue, lane, in.color_values, 3, s);
     put(fields + Incoming::kOpacityValue, lane, in.opacity_values, 1, s);
     out.present[j] |= 1u << lane;
     some = true;
@@ -82,8 +82,8 @@ void offset_backward(const Camera& camera, const Batch& batch, const float* cova
   put(out.outputs + j * kLanes, field(Incoming::kOpacity) * fnma(opacity, opacity, splat(1.0f)));
   for (int i = 0; i < 7; ++i) put(out.outputs + (k + 7 * j + i) * kLanes, d.covariance[i]);
   for (int i = 0; i < 3; ++i) {
-    const F16 colour = field(Incoming::kRedValue + i);
-    put(out.outputs + (8 * k + 3 * j + i) * kLanes, field(Incoming::kRed + i) * fnma(colour, colour, colour));
+    const F16 color = field(Incoming::kRedValue + i);
+    put(out.outputs + (8 * k + 3 * j + i) * kLanes, field(Incoming::kRed + i) * fnma(color, color, color));
   }
   float* d_offset = out.offsets + 3 * j * kLanes;
   put(d_offset, d.offset.x), put(d_offset + kLanes, d.offset.y), put(d_offset + 2 * kLanes, d.offset.z);

@@ -75,7 +75,7 @@ nb::tuple decode_forward(const AnchorTensors& tensors, const MaybeIndices& rows,
   }();
   const size_t m = view.count, two = 2, three = 3;
   return nb::make_tuple(hand_over(view.means_px, m, two), hand_over(view.conics, m, three), hand_over(view.depths, m),
-                        hand_over(view.colours, m, three), hand_over(view.opacities, m), hand_over(view.volumes, m),
+                        hand_over(view.colors, m, three), hand_over(view.opacities, m), hand_over(view.volumes, m),
                         hand_over(view.source, m));
 }
 
@@ -102,7 +102,7 @@ class WeightGradients {
 };
 
 void backward(const AnchorTensors& tensors, const nb::list& weights, const Rows<const float>& camera,
-              const Rows<const int32_t>& source, const Rows<const float>& colours, const Rows<const float>& opacities,
+              const Rows<const int32_t>& source, const Rows<const float>& colors, const Rows<const float>& opacities,
               const std::array<MaybeGradient, 6>& gradients, const std::array<MaybeRows, 3>& out,
               const std::optional<nb::list>& weights_out) {
   const AnchorArrays anchors = anchor_arrays(tensors, std::nullopt);
@@ -111,7 +111,7 @@ void backward(const AnchorTensors& tensors, const nb::list& weights, const Rows<
   const WeightGradients summed(weights_out, layout);
   const Camera view = unpack_camera(camera.data());
   const SplatGradients in = {data(gradients[0]), data(gradients[1]), data(gradients[2]), data(gradients[3]),
-                             data(gradients[4]), data(gradients[5]), 0.0f, colours.data(), opacities.data(),
+                             data(gradients[4]), data(gradients[5]), 0.0f, colors.data(), opacities.data(),
                              source.data(), static_cast<int64_t>(source.shape(0))};
   {
     const nb::gil_scoped_release unlocked;
@@ -129,7 +129,7 @@ AdamRows adam_rows(const StepArguments& arguments, int width) {
 
 bool backward_adam(const AnchorTensors& tensors, const Array<const int64_t>& rows, const nb::list& weights,
                    const Rows<const float>& camera, const Rows<const int32_t>& source,
-                   const Rows<const float>& colours, const Rows<const float>& opacities,
+                   const Rows<const float>& colors, const Rows<const float>& opacities,
                    const std::array<Rows<const float>, 4>& gradients, float volume,
                    const std::array<StepArguments, 3>& steps, const Rows<int32_t>& updates,
                    const std::optional<nb::list>& weights_out, const MaybeGradient& depths) {
@@ -139,7 +139,7 @@ bool backward_adam(const AnchorTensors& tensors, const Array<const int64_t>& row
   const WeightGradients summed(weights_out, layout);
   const Camera view = unpack_camera(camera.data());
   const SplatGradients in = {gradients[0].data(), gradients[1].data(), data(depths), gradients[2].data(),
-                             gradients[3].data(), nullptr, volume, colours.data(), opacities.data(), source.data(),
+                             gradients[3].data(), nullptr, volume, colors.data(), opacities.data(), source.data(),
                              static_cast<int64_t>(source.shape(0))};
   const AnchorSteps moves = {adam_rows(steps[0], kFeatures), adam_rows(steps[1], 3 * anchors.k),
                              adam_rows(steps[2], 6), updates.data()};

@@ -65,7 +65,7 @@ class Wave {
 struct alignas(64) Outputs {
   float opacity[kMaxOffsets * kLanes];
   float covariance[7 * kMaxOffsets * kLanes];
-  float colour[3 * kMaxOffsets * kLanes];
+  float color[3 * kMaxOffsets * kLanes];
 };
 
 // Splats of one batch by offset and anchor, and which are kept (one bit per anchor).
@@ -105,7 +105,7 @@ void spawn_offset(const Camera& camera, const Batch& batch, const Outputs& outpu
   const M16 kept = wanted & p.valid & on_image(camera, p, opacity);
   out.kept[j] = bits(kept);
   if (none(kept)) return;
-  const float* rgb = outputs.colour + 3 * j * kLanes;
+  const float* rgb = outputs.color + 3 * j * kLanes;
   const F16 fields[12] = {p.drawn.x, p.drawn.y, p.drawn.conic_xx, p.drawn.conic_xy, p.drawn.conic_yy,
                           p.drawn.depth, sigmoid(load(rgb)), sigmoid(load(rgb + kLanes)),
                           sigmoid(load(rgb + 2 * kLanes)), opacity,
@@ -142,7 +142,7 @@ void decode_piece(const AnchorArrays& anchors, WeightLayout layout, const float*
     hidden_layer(weights, batch);
     if (!decode_opacity(layout, weights, batch, outputs)) continue;
     output_layer(layout, weights, 1, batch, outputs.covariance);
-    output_layer(layout, weights, 2, batch, outputs.colour);
+    output_layer(layout, weights, 2, batch, outputs.color);
     const I16 sources = first_sources(first, layout.k);
     for (int j = 0; j < layout.k; ++j) spawn_offset(camera, batch, outputs, sources + splat(j), j, spawned);
     emit(spawned, layout.k, out);
@@ -151,14 +151,14 @@ void decode_piece(const AnchorArrays& anchors, WeightLayout layout, const float*
 
 // Writes the splats of a piece as rows from m on.
 void write_piece(const Piece& piece, size_t m, const DecodedView& out) {
-  float *means_px = out.means_px.data(), *conics = out.conics.data(), *colours = out.colours.data();
+  float *means_px = out.means_px.data(), *conics = out.conics.data(), *colors = out.colors.data();
   float *depths = out.depths.data(), *opacities = out.opacities.data(), *volumes = out.volumes.data();
   int32_t* source = out.source.data();
   for (int64_t j = 0; j < piece.count; ++j) {
     const Splat& s = piece.splats[static_cast<size_t>(j)];
     means_px[2 * m] = s.x, means_px[2 * m + 1] = s.y;
     conics[3 * m] = s.conic_xx, conics[3 * m + 1] = s.conic_xy, conics[3 * m + 2] = s.conic_yy;
-    colours[3 * m] = s.red, colours[3 * m + 1] = s.green, colours[3 * m + 2] = s.blue;
+    colors[3 * m] = s.red, colors[3 * m + 1] = s.green, colors[3 * m + 2] = s.blue;
     depths[m] = s.depth, opacities[m] = s.opacity, volumes[m] = s.volume;
     source[m] = s.source;
     ++m;
@@ -187,7 +187,7 @@ DecodedView decode(const AnchorArrays& anchors, WeightLayout layout, const float
     parallel_for(n, [&](int64_t i) { write_piece(wave[i], begins[static_cast<size_t>(i)], view); });
   }
   const size_t m = view.count;
-  view.means_px.fit(2 * m), view.conics.fit(3 * m), view.depths.fit(m), view.colours.fit(3 * m);
+  view.means_px.fit(2 * m), view.conics.fit(3 * m), view.depths.fit(m), view.colors.fit(3 * m);
   view.opacities.fit(m), view.volumes.fit(m), view.source.fit(m);
   return view;
 }

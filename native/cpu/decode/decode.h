@@ -10,10 +10,10 @@ namespace vdgs {
 // The splats of a view in the order of their anchors: what `Splats` holds, field by field.
 struct DecodedView {
   explicit DecodedView(size_t most)
-      : means_px(2 * most), conics(3 * most), depths(most), colours(3 * most), opacities(most), volumes(most),
+      : means_px(2 * most), conics(3 * most), depths(most), colors(3 * most), opacities(most), volumes(most),
         source(most) {}
 
-  Column<float> means_px, conics, depths, colours, opacities, volumes;
+  Column<float> means_px, conics, depths, colors, opacities, volumes;
   Column<int32_t> source;
   size_t count = 0;
 };
@@ -23,9 +23,9 @@ DecodedView decode(const AnchorArrays& anchors, WeightLayout layout, const float
 // Gradients of the six outputs (any may be null: zero, but for the volumes, whose gradient is the same number
 // then), and the two outputs that save work.
 struct SplatGradients {
-  const float *means_px, *conics, *depths, *colours, *opacities, *volumes;
+  const float *means_px, *conics, *depths, *colors, *opacities, *volumes;
   float volume;
-  const float *colour_values, *opacity_values;
+  const float *color_values, *opacity_values;
   const int32_t* source;
   int64_t count;
 };

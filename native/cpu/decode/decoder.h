@@ -13,7 +13,7 @@ namespace vdgs {
 constexpr int kFeatures = 32;
 constexpr int kInputs = kFeatures + 5;  // feature, direction (3), distance, and one for the bias
 constexpr int kHidden = 32;
-constexpr int kHeads = 3;  // opacity, covariance, colour
+constexpr int kHeads = 3;  // opacity, covariance, color
 constexpr int kAllHidden = kHeads * kHidden;
 constexpr int kOutputs[kHeads] = {1, 7, 3};  // per offset
 constexpr int kOutputsPerOffset = 11;
@@ -126,8 +126,8 @@ inline void load_batch(const AnchorArrays& anchors, const Camera& camera, int64_
   batch.anchor.extent = {exp(load(columns[0])), exp(load(columns[1])), exp(load(columns[2]))};
   batch.anchor.size = {exp(load(columns[3])), exp(load(columns[4])), exp(load(columns[5]))};
 
-  const Vec3<F16> centre = constant<F16>(camera.centre);
-  const Vec3<F16> ray = {x.x - centre.x, x.y - centre.y, x.z - centre.z};
+  const Vec3<F16> center = constant<F16>(camera.center);
+  const Vec3<F16> ray = {x.x - center.x, x.y - center.y, x.z - center.z};
   const F16 distance = sqrt(dot(ray, ray));
   const Vec3<F16> direction =
       camera.orthographic ? constant<F16>(camera.forward) : (splat(1.0f) / distance) * ray;

@@ -27,20 +27,20 @@ class ViewDistance(NamedTuple):
 
 
 def view_distance(
-    centres: Float[np.ndarray, "c 3"], points: Float[np.ndarray, "p 3"], up: Float[np.ndarray, "3"]
+    centers: Float[np.ndarray, "c 3"], points: Float[np.ndarray, "p 3"], up: Float[np.ndarray, "3"]
 ) -> ViewDistance:
     """Median height of the cameras above the median point along `up`, a unit vector; where there is none to speak of,
     the median distance of the cameras to the geometric median of the points. 0 if all lies in one place."""
-    height = float(np.median(centres @ up) - np.median(points @ up))
-    distance = float(np.median(np.linalg.norm(centres - geometric_median(points), axis=1)))
+    height = float(np.median(centers @ up) - np.median(points @ up))
+    distance = float(np.median(np.linalg.norm(centers - geometric_median(points), axis=1)))
     return ViewDistance(height, True) if height > MIN_HEIGHT_RATIO * distance else ViewDistance(distance, False)
 
 
 def camera_height(capture: Capture) -> float:
     """How high the training cameras fly above the sparse points, or where they do not, how far they are from them
     (`view_distance`); above 0 in any case."""
-    centres = np.array([view.camera.position for view in capture.train_views])
-    return max(view_distance(centres, capture.points, np.array([0.0, 0.0, 1.0])).length, 1e-9)
+    centers = np.array([view.camera.position for view in capture.train_views])
+    return max(view_distance(centers, capture.points, np.array([0.0, 0.0, 1.0])).length, 1e-9)
 
 
 #: Vertical angle of view of a first look (choice).

@@ -56,7 +56,7 @@ class _Scene:
     """What the frame is found from: camera centres, camera_from_world rotations and finite points, source world."""
 
     names: list[str]
-    centres: np.ndarray
+    centers: np.ndarray
     rotations: np.ndarray
     points: np.ndarray
 
@@ -92,15 +92,15 @@ def find_ground_frame(source: SourceCapture, root: Path, options: CaptureOptions
         frame = _promised(scene, source.world, warnings)
         _compare_up(scene, frame, warnings)
         return frame, warnings
-    up, how = estimate_up(scene.centres, scene.rotations, scene.points, warnings)
+    up, how = estimate_up(scene.centers, scene.rotations, scene.points, warnings)
     return _unscaled(scene, rotation_to_z(up), how, warnings), warnings
 
 
 def _scene(source: SourceCapture) -> _Scene:
     poses = np.stack([view.camera_from_world for view in source.views])
-    centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+    centers = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
     points = source.points[np.isfinite(source.points).all(axis=1)]
-    return _Scene([view.name for view in source.views], centres, poses[:, :3, :3], points)
+    return _Scene([view.name for view in source.views], centers, poses[:, :3, :3], points)
 
 
 # ----------------------------------------------------------------------------------------- georeference
@@ -109,7 +109,7 @@ def _scene(source: SourceCapture) -> _Scene:
 def _georeferenced(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame:
     """Identity rotation in metres; the origin moves (by whole metres) only where float32 needs it."""
     origin, how = read_georef(file), f"world is ENU metres ({file.name})"
-    middle = np.median(scene.centres, axis=0)
+    middle = np.median(scene.centers, axis=0)
     shift = np.where(np.abs(middle) > FAR_FROM_ORIGIN_M, -np.round(middle), 0.0)
     if shift.any():
         how = f"{how}, origin moved by {np.abs(shift).max():.0f} m"
@@ -138,11 +138,11 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
     median = np.median(geodetic, axis=0)
     origin = (float(median[0]), float(median[1]), float(median[2]))
     enu = enu_from_geodetic(geodetic, origin)
-    centres = scene.centres[indices]
-    similarity, inliers = Similarity(1.0, np.eye(3), np.zeros(3)), np.ones(len(centres), bool)
-    fixed = not is_collinear(centres)
+    centers = scene.centers[indices]
+    similarity, inliers = Similarity(1.0, np.eye(3), np.zeros(3)), np.ones(len(centers), bool)
+    fixed = not is_collinear(centers)
     if fixed:
-        similarity, inliers = fit_similarity_robust(centres, enu)
+        similarity, inliers = fit_similarity_robust(centers, enu)
         fixed = not is_collinear(enu[inliers])
     if not fixed:
         warnings.append(
@@ -150,7 +150,7 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
             "fix no up axis; the frame is estimated from the cameras instead and is not metric."
         )
         return None
-    residuals = similarity.apply(centres) - enu
+    residuals = similarity.apply(centers) - enu
     how_far = describe_disagreement(residuals, enu, inliers)
     if how_far:
         warnings.append(
@@ -174,7 +174,7 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
 def _compare_up(scene: _Scene, frame: GroundFrame, warnings: list[str]) -> None:
     """Warn where the up axis that was told and the one that the cameras suggest contradict each other."""
     doubts: list[str] = []
-    up, _ = estimate_up(scene.centres, scene.rotations, scene.points, doubts)
+    up, _ = estimate_up(scene.centers, scene.rotations, scene.points, doubts)
     angle = float(np.degrees(np.arccos(np.clip(frame.rotation[2] @ up, -1, 1))))
     if angle > MAX_UP_DEVIATION_DEG and not doubts:
         warnings.append(
@@ -199,7 +199,7 @@ def rotation_to_z(up: np.ndarray) -> np.ndarray:
 
 def _unscaled(scene: _Scene, rotation: np.ndarray, how: str, warnings: list[str]) -> GroundFrame:
     """A frame without metres: the median camera flies at `NOMINAL_CAMERA_HEIGHT` above the median point."""
-    length, is_height = view_distance(scene.centres, scene.points, rotation[2])
+    length, is_height = view_distance(scene.centers, scene.points, rotation[2])
     if not is_height:
         warnings.append(
             "the cameras are not above the points; the scale is set by their distance instead. "
@@ -207,17 +207,17 @@ def _unscaled(scene: _Scene, rotation: np.ndarray, how: str, warnings: list[str]
         )
     if not length > 0:
         raise CaptureError("all cameras and points lie in one place; this is no scene. Check the sparse model.")
-    return _centred(scene, rotation, NOMINAL_CAMERA_HEIGHT / length, False, f"{how}; median camera height = 10 units")
+    return _centered(scene, rotation, NOMINAL_CAMERA_HEIGHT / length, False, f"{how}; median camera height = 10 units")
 
 
 def _promised(scene: _Scene, world: WorldPrior, warnings: list[str]) -> GroundFrame:
     """The frame that a format promises; its scale is chosen where the format knows no metres."""
     if world.metric:
-        return _centred(scene, world.rotation, world.scale, True, world.how)
+        return _centered(scene, world.rotation, world.scale, True, world.how)
     return _unscaled(scene, world.rotation, world.how, warnings)
 
 
-def _centred(scene: _Scene, rotation: np.ndarray, scale: float, metric: bool, how: str) -> GroundFrame:
+def _centered(scene: _Scene, rotation: np.ndarray, scale: float, metric: bool, how: str) -> GroundFrame:
     middle = _middle(scale * scene.points @ rotation.T)
     return GroundFrame(scale=scale, rotation=rotation, translation=-middle, metric=metric, description=how)
 
@@ -231,8 +231,8 @@ def transform_pose(camera_from_world: np.ndarray, frame: GroundFrame) -> np.ndar
     """The pose [4, 4] of the same camera in the ground frame: rotation re-orthonormalised, centre scaled."""
     rotation, translation = camera_from_world[:3, :3], camera_from_world[:3, 3]
     left, _, right = np.linalg.svd(rotation @ frame.rotation.T)
-    centre = frame.to_ground((-rotation.T @ translation)[None])[0]
+    center = frame.to_ground((-rotation.T @ translation)[None])[0]
     pose = np.eye(4)
     pose[:3, :3] = left @ right
-    pose[:3, 3] = -pose[:3, :3] @ centre
+    pose[:3, 3] = -pose[:3, :3] @ center
     return pose

@@ -46,21 +46,21 @@ def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
     _refuse_tiny(photographs, options)
     ground, ground_warnings = find_ground_frame(source, root, options)
     views = [_view(photo, options, ground) for photo in photographs]
-    points, colours = ground.to_ground(source.points), source.colors
+    points, colors = ground.to_ground(source.points), source.colors
     if options.max_images is not None and options.max_images < len(views):
         warnings.append(f"using the {options.max_images} of {len(views)} photographs nearest to the middle.")
         views = select_central_views(views, options.max_images)
         seen = np.zeros(len(points), bool)
         for view in views:
             seen |= view.camera.in_frustum(points)
-        points, colours = points[seen], colours[seen]
+        points, colors = points[seen], colors[seen]
         if not seen.any():
             raise CaptureError(f"{root}: the chosen {options.max_images} photographs see no points; use more.")
     explicit = {photo.view.name: photo.view.split for photo in photographs}
     views = assign_splits(root, views, explicit, options, warnings)
     return Capture(
         root=root, source=source.source, images=source.images, views=tuple(views), points=points,
-        point_colors=colours, ground=ground, warnings=(*warnings, *ground_warnings),
+        point_colors=colors, ground=ground, warnings=(*warnings, *ground_warnings),
     )  # fmt: skip
 
 
@@ -79,13 +79,13 @@ def _check_options(options: CaptureOptions) -> None:
 def _without_bad_points(source: SourceCapture, warnings: list[str]) -> SourceCapture:
     """Drop points that are not finite or absurdly far from the cameras."""
     poses = np.stack([view.camera_from_world for view in source.views])
-    centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+    centers = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
     finite = np.isfinite(source.points).all(axis=1) & (np.abs(source.points) < 1e12).all(axis=1)
     if not finite.any():
         raise CaptureError(f"{source.source} model: none of its {len(source.points)} points is a finite number.")
-    middle = np.median(centres, axis=0)
+    middle = np.median(centers, axis=0)
     distance = np.linalg.norm(np.where(finite[:, None], source.points, middle) - middle, axis=1)
-    spread = max(float(np.quantile(np.linalg.norm(centres - middle, axis=1), 0.9)), float(np.median(distance[finite])))
+    spread = max(float(np.quantile(np.linalg.norm(centers - middle, axis=1), 0.9)), float(np.median(distance[finite])))
     keep = finite & (distance <= MAX_DISTANCE_RATIO * spread)
     if not keep.all():
         warnings.append(

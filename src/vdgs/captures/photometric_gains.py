@@ -36,11 +36,11 @@ MEDIAN_ITERATIONS = 5
 @dataclass(frozen=True, eq=False)
 class PointColors:
     """Points as photographs show them: s sightings, of point `point[s]` in photograph `image[s]` (in the order of
-    photographs), whose colour has the logarithm `colour[s]` there. Every point is shown by two photographs or more."""
+    photographs), whose colour has the logarithm `color[s]` there. Every point is shown by two photographs or more."""
 
     image: Int64[np.ndarray, " s"]
     point: Int64[np.ndarray, " s"]
-    colour: Float[np.ndarray, "s 3"]
+    color: Float[np.ndarray, "s 3"]
 
     def gains(self) -> dict[int, Float[np.ndarray, " 3"]]:
         """Logarithms of how much brighter than the mean each photograph is, in red, green and blue, by its number."""
@@ -78,7 +78,7 @@ class PointColors:
             gains = gains.reshape(count, -1)
             return much * gains - by_image(mean(gains[image])[self.point])
 
-        departures = self.colour - mean(self.colour)[self.point]
+        departures = self.color - mean(self.color)[self.point]
         # Singular: a gain for all alike says nothing. From 0, conjugate gradients find the least gains of all that fit.
         operator = LinearOperator((count, count), matvec=normal, dtype=np.float64)
         gains = np.stack([cg(operator, wanted)[0] for wanted in by_image(departures).T], axis=1)
@@ -105,8 +105,8 @@ def collect_point_colors(
     for done, index in enumerate(shows):
         on_progress(done, len(shows))
         images.prefetch(shows[done : done + 3], factor)
-        numbers, colours = _seen(images.views[index], images.get(index, factor))
-        found.append((np.full(len(numbers), index), numbers, colours))
+        numbers, colors = _seen(images.views[index], images.get(index, factor))
+        found.append((np.full(len(numbers), index), numbers, colors))
     if not found:
         return None
     return _compared(*(np.concatenate(each) for each in zip(*found, strict=True)))
@@ -148,7 +148,7 @@ def _blurred(image: DecodedImage) -> tuple[Float[np.ndarray, "h w 3"], np.ndarra
     return cv2.GaussianBlur(light * weight[..., None], (0, 0), sigma) / np.maximum(share, 1e-6), counts
 
 
-def _compared(image: np.ndarray, number: np.ndarray, colour: np.ndarray) -> PointColors | None:
+def _compared(image: np.ndarray, number: np.ndarray, color: np.ndarray) -> PointColors | None:
     """The sightings that say something: of points that several photographs show, in photographs that share enough."""
     shared = _shared(number)
     enough = np.bincount(image[shared], minlength=int(image.max(initial=0)) + 1) >= MIN_SHARED_POINTS
@@ -157,7 +157,7 @@ def _compared(image: np.ndarray, number: np.ndarray, colour: np.ndarray) -> Poin
     if not kept.any():
         return None
     _, point = np.unique(number[kept], return_inverse=True)
-    return PointColors(image[kept], point.astype(np.int64), colour[kept])
+    return PointColors(image[kept], point.astype(np.int64), color[kept])
 
 
 def _shared(number: np.ndarray) -> np.ndarray:

@@ -80,9 +80,9 @@ def undistorted_pinhole(intrinsics: Intrinsics) -> Intrinsics:
             f"the camera {intrinsics.model} {intrinsics.params} cannot be undistorted ({error}). "
             "Undistort with colmap image_undistorter and use its output folder."
         ) from error
-    centre = (camera.principal_point_x, camera.principal_point_y)
+    center = (camera.principal_point_x, camera.principal_point_y)
     focal = (camera.focal_length_x, camera.focal_length_y)
-    return Intrinsics("PINHOLE", (*focal, *centre), camera.width, camera.height)
+    return Intrinsics("PINHOLE", (*focal, *center), camera.width, camera.height)
 
 
 def sampling_map(distorted: Intrinsics, pinhole: Intrinsics, strip_px: int = STRIP_PX) -> np.ndarray:

@@ -31,17 +31,17 @@ HINT = "--up x|y|z|-x|-y|-z says it outright."
 
 
 def estimate_up(
-    centres: np.ndarray, rotations: np.ndarray, points: np.ndarray, warnings: list[str]
+    centers: np.ndarray, rotations: np.ndarray, points: np.ndarray, warnings: list[str]
 ) -> tuple[np.ndarray, str]:
     """Unit up vector [3] in the source world, and how it was found; what is doubtful goes to `warnings`.
 
-    `centres` [n, 3], `rotations` [n, 3, 3] (rows: right, down and forward of a camera) and `points` [m, 3] in the
+    `centers` [n, 3], `rotations` [n, 3, 3] (rows: right, down and forward of a camera) and `points` [m, 3] in the
     source world. All of it turns with the world (no per-axis medians).
     """
     rights, image_up, forward = rotations[:, 0], -rotations[:, 1].mean(axis=0), rotations[:, 2].mean(axis=0)
     same_side = float(np.linalg.norm(image_up)) >= MIN_UP_AGREEMENT
     parallel = bool(np.linalg.eigvalsh(rights.T @ rights / len(rights))[1] < MAX_ROLL)
-    up, uncertain = _least_variance(centres, points)
+    up, uncertain = _least_variance(centers, points)
     how = "least variance of cameras and points"
     neither = abs(forward @ up) < MIN_VIEW_COSINE and abs(image_up @ up) < MIN_UPRIGHT_COSINE
     rolled = _roll(rights, up) > (MAX_ROLL_PARALLEL if parallel else MAX_ROLL)
@@ -67,18 +67,18 @@ def estimate_up(
                 f"wall. Taken for down; if it is a wall, {HINT}"
             )
         return (-up if looking > 0 else up), f"{how}, against the view"
-    above = float(np.median(centres @ up) - np.median(points @ up))
+    above = float(np.median(centers @ up) - np.median(points @ up))
     warnings.append("the cameras look level on average; up is taken to be the side of the cameras. --up overrides.")
     return (-up if above < 0 else up), f"{how}, cameras above"
 
 
-def _least_variance(centres: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, bool]:
+def _least_variance(centers: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, bool]:
     """The axis [3], of either sign, of least variance of camera centres and points, and whether it is uncertain.
 
     Both covariances are divided by their trace, so that each counts alike, and added; points beyond the 95 % quantile
     of distance to the median are left out.
     """
-    values, vectors = np.linalg.eigh(_shape(centres) + _shape(points))
+    values, vectors = np.linalg.eigh(_shape(centers) + _shape(points))
     return vectors[:, 0], bool(values[0] > 0.5 * values[1])
 
 

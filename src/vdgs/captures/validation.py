@@ -110,9 +110,9 @@ def _judge_places(capture: Capture, points: np.ndarray, findings: _Findings) -> 
     if len(views) < 2:
         findings.problems.append("There is 1 training photograph; a scene needs at least 2, from different places.")
         return
-    centres = np.array([view.camera.position for view in views])
-    distance = float(np.median(np.linalg.norm(centres - geometric_median(points), axis=1)))
-    spread = 2 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+    centers = np.array([view.camera.position for view in views])
+    distance = float(np.median(np.linalg.norm(centers - geometric_median(points), axis=1)))
+    spread = 2 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
     parallax = float(np.median([view.camera.fx for view in views])) * spread / max(distance, 1e-12)
     unit = capture.ground.unit
     if parallax < MIN_PARALLAX_PX:

@@ -86,7 +86,7 @@ class Lpips:
         total = 0.0
         for number, (layers, head) in enumerate(zip(self._stages, self._heads, strict=True)):
             x, y = (_stage(planes, layers, pool_first=number > 0) for planes in (x, y))
-            difference = (_normalised(x) - _normalised(y)).square_()
+            difference = (_normalized(x) - _normalized(y)).square_()
             total += float(torch.einsum("bchw,c->bhw", difference, head).mean(dtype=torch.float64))
         return total
 
@@ -196,6 +196,6 @@ def _stage(planes: Tensor, layers: list[tuple[Tensor, Tensor]], pool_first: bool
     return planes
 
 
-def _normalised(features: Tensor) -> Tensor:
+def _normalized(features: Tensor) -> Tensor:
     """Unit length over the channels at each place."""
     return features / (features.square().sum(dim=1, keepdim=True).sqrt_() + _EPSILON)

@@ -37,7 +37,7 @@ def make_metrics_table(result: Mapping[str, Any], title: str) -> RenderableType:
     """What `metrics.json` holds: quality raw, colour-corrected, after an affine map of the colours and, where pictures
     are exposed, in neutral colours; quality by visibility, solidity, size and speed."""
     quality = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
-    besides = {"_cc": "colour-corrected", "_affine": "affine fit"}
+    besides = {"_cc": "color-corrected", "_affine": "affine fit"}
     if result["psnr_neutral"] is not None:
         besides["_neutral"] = "neutral colours"
     for column in ("", "raw", *besides.values()):

@@ -51,12 +51,12 @@ class RenderedImage:
             background = red, green, blue
         return RenderedImage(apply_exposure_numpy(self.image, exposure), self.alpha, background)
 
-    def over_background(self, colour: RgbColor) -> UInt8[np.ndarray, "h w 3"] | None:
+    def over_background(self, color: RgbColor) -> UInt8[np.ndarray, "h w 3"] | None:
         """The picture in 8 bits with another background; None where alpha or its own background is not known."""
         if self.alpha is None or self.background is None:
             return None
         # In the precision of the image: where alpha is 1, the bits stay, and with them what is rounded up or down.
-        change = np.subtract(colour, self.background).astype(self.image.dtype)
+        change = np.subtract(color, self.background).astype(self.image.dtype)
         return to_8bit(self.image + (1.0 - self.alpha)[..., None] * change)
 
 
@@ -95,7 +95,7 @@ def count_oversized_splats(splats: Splats, width: int, height: int) -> int:
     may lie anywhere, but the box around it reaches the picture.
     """
     a, b, c = splats.conics.double().unbind(dim=1)
-    opacities, centres = splats.opacities.double(), splats.means_px.double()
+    opacities, centers = splats.opacities.double(), splats.means_px.double()
     determinant = a * c - b * b
     drawn = (a > 0) & (c > 0) & (determinant > 0) & (opacities >= ALPHA_MIN)
     level = 2.0 * torch.log(opacities / ALPHA_MIN)
@@ -104,8 +104,8 @@ def count_oversized_splats(splats: Splats, width: int, height: int) -> int:
     larger = (a + c) / 2 + torch.hypot((a - c) / 2, b)
     diameter = 2.0 * torch.sqrt(level * larger / determinant)
     reach = torch.sqrt(level[:, None] * torch.stack([c, a], dim=1) / determinant[:, None])
-    size = centres.new_tensor([width, height])
-    touching = ((centres + reach > 0) & (centres - reach < size)).all(dim=1)
+    size = centers.new_tensor([width, height])
+    touching = ((centers + reach > 0) & (centers - reach < size)).all(dim=1)
     return int((drawn & touching & (diameter > max(width, height))).sum())
 
 

@@ -114,7 +114,7 @@ def measure_view(index: int, inputs: ViewInputs) -> ViewMetrics:
         corrected = _ImagePair(metrics.to_8bit(correction.image), reference, mask)
         corrected_maps = _maps(corrected, "_cc")
         row |= _metrics(corrected, corrected_maps, "_cc", inputs.lpips)
-        row["colour_fitted"] = correction.fitted
+        row["color_fitted"] = correction.fitted
         affine = _ImagePair(metrics.to_8bit(correct_colors_affine(image, reference, mask).image), reference, mask)
         affine_maps = _maps(affine, "_affine")
         row |= _metrics_without_lpips(affine, affine_maps, "_affine")

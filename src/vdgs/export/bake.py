@@ -143,7 +143,7 @@ class _ViewSamples:
     starts: Int[np.ndarray, " m"]
     pixels: Float[Tensor, " p"]
     directions: Float[Tensor, "p 3"]
-    colours: Float[Tensor, "p 3"]
+    colors: Float[Tensor, "p 3"]
     opacities: Float[Tensor, " p"]
     log_scales: Float[Tensor, "p 3"]
     quaternions: Float[Tensor, "p 4"]
@@ -168,9 +168,9 @@ def _gather_samples(views: BakeViews, wanted: Int[np.ndarray, " m"]) -> _ViewSam
     place, *rest = (torch.cat(column) for column in zip(*columns, strict=True))
     order, counts = sort_segments(place, 0, len(wanted))
     starts = (counts.cumsum(0) - counts).numpy()
-    pixels, directions, colours, opacities, log_scales, quaternions = (each.index_select(0, order) for each in rest)
+    pixels, directions, colors, opacities, log_scales, quaternions = (each.index_select(0, order) for each in rest)
     return _ViewSamples(
-        starts=starts, pixels=pixels, directions=directions, colours=colours, opacities=opacities,
+        starts=starts, pixels=pixels, directions=directions, colors=colors, opacities=opacities,
         log_scales=log_scales, quaternions=quaternions,
     )  # fmt: skip
 
@@ -188,21 +188,21 @@ def _decode_from(model: AnchorModel, gaussians: Tensor, camera: Camera) -> tuple
             pieces.append(decode_world(anchors, rows[low:high], decoder.weights_for_image(None), camera))
     # Rows of all k Gaussians of an anchor, in one column.
     spread = place * k + offset
-    opacities, colours, scales, quaternions = (
+    opacities, colors, scales, quaternions = (
         torch.cat([getattr(piece, name) for piece in pieces]).flatten(0, 1).cpu().index_select(0, spread)
-        for name in ("opacities", "colours", "scales", "quaternions")
+        for name in ("opacities", "colors", "scales", "quaternions")
     )
     means = gaussian_means(anchors.select(rows)).flatten(0, 1).cpu().index_select(0, spread)
     rays = means - torch.from_numpy(camera.position.astype(np.float32))
-    return torch.nn.functional.normalize(rays, dim=1), colours, opacities, scales.log(), quaternions
+    return torch.nn.functional.normalize(rays, dim=1), colors, opacities, scales.log(), quaternions
 
 
 def fit_gaussians(views: BakeViews, wanted: Int[np.ndarray, " m"], degree: int) -> Gaussians:
     """The Gaussians of the given numbers: ascending, close together, each shown by some view."""
     pairs = _gather_samples(views, wanted)
     anchors, k = views.model.anchors, views.model.anchors.offsets.shape[1]
-    kernels, starts = get_backend(pairs.colours.device), torch.from_numpy(pairs.starts)
-    coefficients = kernels.fit_harmonics(pairs.directions, pairs.colours, pairs.pixels, starts, degree, RIDGE_WEIGHT)
+    kernels, starts = get_backend(pairs.colors.device), torch.from_numpy(pairs.starts)
+    coefficients = kernels.fit_harmonics(pairs.directions, pairs.colors, pairs.pixels, starts, degree, RIDGE_WEIGHT)
     log_scales, quaternions = kernels.mean_ellipsoids(pairs.log_scales, pairs.quaternions, pairs.pixels, starts)
     opacities = _weighted_means(pairs.opacities, pairs).clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
     rows = torch.from_numpy(wanted // k)

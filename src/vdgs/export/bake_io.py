@@ -46,7 +46,7 @@ def load_contributions(path: Path) -> ViewContributions:
 
 def save_residual(path: Path, residual: ColorResidual) -> None:
     """Write what a view lacks."""
-    halves = torch.cat([residual.pixels[:, None], residual.colours], 1).contiguous().numpy()
+    halves = torch.cat([residual.pixels[:, None], residual.colors], 1).contiguous().numpy()
     write_array(path, np.concatenate([residual.gaussians.numpy()[None], halves.view(np.int32).reshape(2, -1)]))
 
 
@@ -57,14 +57,14 @@ def load_residual(path: Path) -> ColorResidual:
     return ColorResidual(torch.from_numpy(columns[0]), halves[:, 0], halves[:, 1:])
 
 
-def save_color_updates(path: Path, rows: Int[np.ndarray, " c"], colours: Float[Tensor, "c f 3"]) -> None:
+def save_color_updates(path: Path, rows: Int[np.ndarray, " c"], colors: Float[Tensor, "c f 3"]) -> None:
     """Write what is to be added to the colours of some Gaussians."""
-    numbers = colours.flatten(1).numpy().view(np.int32)
+    numbers = colors.flatten(1).numpy().view(np.int32)
     write_array(path, np.concatenate([rows.astype(np.int32)[:, None], numbers], axis=1))
 
 
 def load_color_updates(path: Path) -> tuple[Int[np.ndarray, " c"], Float[Tensor, "c f 3"]]:
     """The inverse of `save_color_updates`."""
     table = load_array(path, np.int32, 2)
-    colours = np.ascontiguousarray(table[:, 1:]).view(np.float32).reshape(len(table), table.shape[1] // 3, 3)
-    return table[:, 0].astype(np.int64), torch.from_numpy(colours)
+    colors = np.ascontiguousarray(table[:, 1:]).view(np.float32).reshape(len(table), table.shape[1] // 3, 3)
+    return table[:, 0].astype(np.int64), torch.from_numpy(colors)

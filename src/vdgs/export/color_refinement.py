@@ -39,7 +39,7 @@ class ColorResidual:
 
     gaussians: Int32[Tensor, " p"]
     pixels: Float16[Tensor, " p"]
-    colours: Float16[Tensor, "p 3"]
+    colors: Float16[Tensor, "p 3"]
 
 
 class BakedGaussians:
@@ -117,11 +117,11 @@ def view_residual(baked: BakedGaussians, camera: Camera) -> ColorResidual:
 def _splats(spool: GaussianStore, numbers: Int[np.ndarray, " p"], camera: Camera) -> Splats:
     kernels, (means, log_scales, quaternions, logits) = get_backend(torch.device("cpu")), spool.ellipsoids(numbers)
     seen = kernels.project(means, log_scales.exp(), quaternions, camera)
-    colours = kernels.harmonic_colors(
+    colors = kernels.harmonic_colors(
         means, spool.coefficients, torch.from_numpy(numbers), _camera_center(camera), spool.degree
     )
     opacities = torch.where(seen.valid, logits.sigmoid(), 0.0)
-    return Splats(seen.means_px, seen.conics, seen.depths, colours, opacities)
+    return Splats(seen.means_px, seen.conics, seen.depths, colors, opacities)
 
 
 def _camera_center(camera: Camera) -> Float[Tensor, "3"]:
@@ -139,15 +139,15 @@ def color_updates(
             here = view.gaussians[low:high]
             # index_select, not an index: torch is five times as fast at it.
             directions = torch.nn.functional.normalize(means.index_select(0, here) - _camera_center(camera), dim=1)
-            columns.append((here, directions, view.colours[low:high].float(), view.pixels[low:high].float()))
+            columns.append((here, directions, view.colors[low:high].float(), view.pixels[low:high].float()))
     if not columns:
         return np.zeros(0, np.int64), torch.zeros(0, (baked.spool.degree + 1) ** 2, 3)
     numbers, *rest = (torch.cat(column) for column in zip(*columns, strict=True))
     order, counts = sort_segments(numbers, rows.start, len(rows))
-    directions, colours, pixels = (column.index_select(0, order) for column in rest)
+    directions, colors, pixels = (column.index_select(0, order) for column in rest)
     changed = counts.nonzero()[:, 0]
     runs = (counts.cumsum(0) - counts)[changed]
-    found = get_backend(colours.device).fit_harmonics(
-        directions, colours + 0.5, pixels, runs, baked.spool.degree, RIDGE_WEIGHT
+    found = get_backend(colors.device).fit_harmonics(
+        directions, colors + 0.5, pixels, runs, baked.spool.degree, RIDGE_WEIGHT
     )
     return changed.numpy() + rows.start, found

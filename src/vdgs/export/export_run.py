@@ -104,8 +104,8 @@ def export_run(request: ExportRequest, console: Console, execution: ExecutionOpt
         console.print(f"[yellow]warning[/] {run.warning}", highlight=False)
     for path in request.to:
         check_not_among_inputs(path, run.capture)
-    centre = np.median(run.model.anchors.positions.cpu().double().numpy(), axis=0)
-    frames = {path: frame_for_file(path, run, request, centre) for path in request.to}
+    center = np.median(run.model.anchors.positions.cpu().double().numpy(), axis=0)
+    frames = {path: frame_for_file(path, run, request, center) for path in request.to}
     began = time.monotonic()
     with _make_baker(run, request, execution, console) as baker:
         pixels = baker.pixels()

@@ -62,7 +62,7 @@ def _anchors_of_block(run: OpenedRun, block: int) -> np.ndarray:
     return np.repeat(np.arange(len(counts)) == block, counts)
 
 
-def frame_for_file(path: Path, run: OpenedRun, request: ExportRequest, centre: np.ndarray) -> LocalFrame:
+def frame_for_file(path: Path, run: OpenedRun, request: ExportRequest, center: np.ndarray) -> LocalFrame:
     """The coordinates of a file: those that do not reach far have their origin nearby.
 
     3D Tiles stand on the globe wherever it is known how, whatever --crs says of other files: no map lies between.
@@ -70,9 +70,9 @@ def frame_for_file(path: Path, run: OpenedRun, request: ExportRequest, centre: n
     ground, kind = run.capture.ground, registry.format_from_path(path)
     far = min(MAX_LOCAL_COORDINATE, kind.max_coordinate / 2)
     frame = make_local_frame(
-        ground, request.crs or default_crs(ground, path), centre, far
+        ground, request.crs or default_crs(ground, path), center, far
     )  # which refuses what is no system
-    return make_local_frame(ground, "enu", centre, far) if kind.on_globe and ground.origin_geo is not None else frame
+    return make_local_frame(ground, "enu", center, far) if kind.on_globe and ground.origin_geo is not None else frame
 
 
 def select_rows(

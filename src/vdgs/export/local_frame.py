@@ -55,9 +55,9 @@ class LocalFrame(Similarity):
 
 
 def make_local_frame(
-    ground: GroundFrame, crs: str | None, centre: Float[np.ndarray, "3"], max_coordinate: float = MAX_LOCAL_COORDINATE
+    ground: GroundFrame, crs: str | None, center: Float[np.ndarray, "3"], max_coordinate: float = MAX_LOCAL_COORDINATE
 ) -> LocalFrame:
-    """The local coordinates of a system (`Placement.of`) about a scene whose middle is `centre` (ground frame).
+    """The local coordinates of a system (`Placement.of`) about a scene whose middle is `center` (ground frame).
 
     Gaussians take the similarity that is right about the centre: over a kilometre a projection departs from it by
     centimetres, mostly in height (the Earth is round). A middle that is more than `far` from the origin of the system
@@ -66,8 +66,8 @@ def make_local_frame(
     system that cannot be had.
     """
     placement = MapProjection.of(ground, crs)
-    similarity = placement.similarity_at(centre)
-    middle = similarity.apply(centre[None])[0]
+    similarity = placement.similarity_at(center)
+    middle = similarity.apply(center[None])[0]
     origin = np.round(middle / ORIGIN_STEP) * ORIGIN_STEP if np.abs(middle).max() > max_coordinate else np.zeros(3)
     unit = "metre" if placement.unit == "m" else placement.unit
     if placement.crs == "enu" and ground.origin_geo is not None:

@@ -83,19 +83,19 @@ def open_crs(code: str, origin: tuple[float, float, float]) -> CrsTransform:
         )
     _refuse_westward(crs, code, origin)
     axes = crs.axis_info
-    metres = float(axes[0].unit_conversion_factor)
-    if any(abs(axis.unit_conversion_factor - metres) > 1e-12 for axis in axes):
+    meters = float(axes[0].unit_conversion_factor)
+    if any(abs(axis.unit_conversion_factor - meters) > 1e-12 for axis in axes):
         raise VdgsError(f"--crs {code}: {crs.name} counts across and up in different units. Give one with one unit.")
     transformer, notes = _operation(crs, code, origin)
     own_heights = len(axes) == 3
-    unit = "m" if metres == 1.0 else axes[0].unit_name
+    unit = "m" if meters == 1.0 else axes[0].unit_name
     heights = (
         "from the middle of the Earth" if crs.is_geocentric else axes[2].name if own_heights else ELLIPSOIDAL_REFERENCE
     )
     return CrsTransform(
-        code=code, name=crs.name, unit=unit, meters_per_unit=metres, wkt=crs.to_wkt(),
+        code=code, name=crs.name, unit=unit, meters_per_unit=meters, wkt=crs.to_wkt(),
         height_reference=heights if unit == "m" else f"{heights}; in {unit}", notes=notes,
-        _height_factor=1.0 if own_heights else 1 / metres, _transformer=transformer,
+        _height_factor=1.0 if own_heights else 1 / meters, _transformer=transformer,
     )  # fmt: skip
 
 

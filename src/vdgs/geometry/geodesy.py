@@ -67,13 +67,13 @@ def enu_from_geodetic(
 
     `axes_origin` (lat, lon): the place whose east, north and up the axes are, where it is another one.
     """
-    centre = ecef_from_geodetic(np.array([origin]))
-    return (ecef_from_geodetic(geodetic) - centre) @ enu_axes(*(level_at or origin[:2])).T
+    center = ecef_from_geodetic(np.array([origin]))
+    return (ecef_from_geodetic(geodetic) - center) @ enu_axes(*(level_at or origin[:2])).T
 
 
 def geodetic_from_enu(
     enu: np.ndarray, origin: tuple[float, float, float], level_at: tuple[float, float] | None = None
 ) -> np.ndarray:
     """The inverse of `enu_from_geodetic`."""
-    centre = ecef_from_geodetic(np.array([origin]))
-    return geodetic_from_ecef(enu @ enu_axes(*(level_at or origin[:2])) + centre)
+    center = ecef_from_geodetic(np.array([origin]))
+    return geodetic_from_ecef(enu @ enu_axes(*(level_at or origin[:2])) + center)

@@ -82,22 +82,22 @@ class MapProjection:
         """The inverse of `places`."""
         return self._checked(self._backward(np.asarray(points, np.float64)))
 
-    def similarity_at(self, centre: Float[np.ndarray, "3"]) -> Similarity:
-        """The similarity from the ground frame to the target that is right about `centre`, a ground point [3].
+    def similarity_at(self, center: Float[np.ndarray, "3"]) -> Similarity:
+        """The similarity from the ground frame to the target that is right about `center`, a ground point [3].
 
         The rotation holds the meridian convergence and the tilt of the horizon, the scale is that of the horizontal
         plane: over a hundred metres, `places` is met to a millimetre across, and in height to the map's scale
         factor (4 cm on a house of 100 m in the middle of a UTM zone).
         """
-        centre = np.asarray(centre, np.float64)
+        center = np.asarray(center, np.float64)
         steps = _STEP * np.concatenate([np.eye(3), -np.eye(3)])
-        ahead, behind = np.split(self.project(centre + steps), 2)
+        ahead, behind = np.split(self.project(center + steps), 2)
         jacobian = (ahead - behind).T / (2 * _STEP)
         left, _, right = np.linalg.svd(jacobian)
         rotation = left @ right
         # The plane's own scale: a projection scales areas of the ground, heights it passes on.
         scale = float(np.sqrt(np.linalg.norm(np.cross(jacobian[:, 0], jacobian[:, 1]))))
-        return Similarity(scale, rotation, self.project(centre[None])[0] - scale * rotation @ centre)
+        return Similarity(scale, rotation, self.project(center[None])[0] - scale * rotation @ center)
 
     def _checked(self, found: MapPoints) -> MapPoints:
         if not np.isfinite(found).all():
@@ -119,11 +119,11 @@ def _local(ground: GroundFrame) -> MapProjection:
 
 
 def _source(ground: GroundFrame) -> MapProjection:
-    metres = ground.scale if ground.metric else None
-    unit = "m" if metres is not None and abs(metres - 1) < 1e-9 else "units"
+    meters = ground.scale if ground.metric else None
+    unit = "m" if meters is not None and abs(meters - 1) < 1e-9 else "units"
     name, heights = "the capture's own coordinates", "the third coordinate of the capture's own world"
     return MapProjection(
-        crs="source", name=name, unit=unit, meters_per_unit=metres, wkt=None, height_reference=heights, notes=(),
+        crs="source", name=name, unit=unit, meters_per_unit=meters, wkt=None, height_reference=heights, notes=(),
         _forward=ground.apply_inverse, _backward=ground.to_ground,
     )  # fmt: skip
 

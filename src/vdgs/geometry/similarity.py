@@ -42,12 +42,12 @@ def is_collinear(points: np.ndarray) -> bool:
 def fit_similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
     """Least-squares similarity of matched points [n, 3] (Umeyama 1991, eqs. 40-43)."""
     source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
-    centred_source, centred_target = source - source_mean, target - target_mean
-    left, singular, right = np.linalg.svd(centred_target.T @ centred_source)
+    centered_source, centered_target = source - source_mean, target - target_mean
+    left, singular, right = np.linalg.svd(centered_target.T @ centered_source)
     sign = np.ones(3)
     sign[2] = np.sign(np.linalg.det(left) * np.linalg.det(right)) or 1.0
     rotation = (left * sign) @ right
-    scale = float((singular * sign).sum() / (centred_source**2).sum())
+    scale = float((singular * sign).sum() / (centered_source**2).sum())
     return Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)
 
 
@@ -107,12 +107,12 @@ def geometric_median(points: np.ndarray, max_points: int = 20_000) -> np.ndarray
     move it. More than `most` points are thinned evenly.
     """
     sample = points[:: max(1, -(-len(points) // max_points))]
-    centre = np.median(sample, axis=0)
+    center = np.median(sample, axis=0)
     for _ in range(200):
-        distance = np.linalg.norm(sample - centre, axis=1)
+        distance = np.linalg.norm(sample - center, axis=1)
         weight = 1 / np.maximum(distance, 1e-12 * (distance.max() or 1.0))
         moved = weight @ sample / weight.sum()
-        if np.linalg.norm(moved - centre) <= 1e-12 * (distance.max() or 1.0):
+        if np.linalg.norm(moved - center) <= 1e-12 * (distance.max() or 1.0):
             return moved
-        centre = moved
-    return centre
+        center = moved
+    return center

@@ -44,9 +44,9 @@ def vjp_from_autograd(
     """What a function draws that autograd can differentiate, and the way back, with autograd kept in here."""
     inputs = (*splats.tensors, background)
     leaves = [tensor.detach().clone().requires_grad_(True) for tensor in inputs]
-    means_px, conics, colours, opacities, depths, behind = leaves
+    means_px, conics, colors, opacities, depths, behind = leaves
     with torch.enable_grad():
-        drawn = draw(Splats(means_px, conics, depths, colours, opacities), behind)
+        drawn = draw(Splats(means_px, conics, depths, colors, opacities), behind)
 
     def pullback(
         image: Tensor | None,
@@ -61,12 +61,12 @@ def vjp_from_autograd(
             [getattr(drawn, name) for name in received], leaves, list(received.values()),
             allow_unused=True, materialize_grads=True,
         )  # fmt: skip
-        by_means, by_conics, by_colours, by_opacities, by_depths = (each[:count] for each in by_splats)
+        by_means, by_conics, by_colors, by_opacities, by_depths = (each[:count] for each in by_splats)
         for place, gradient in zip(out or (), (by_means, by_conics), strict=False):
             place.copy_(gradient)
         means, conics = out or (by_means, by_conics)
         of_depths = None if drawn.depth is None else by_depths
-        return RasterGradients(means, conics, by_colours, by_opacities, of_depths, by_background)
+        return RasterGradients(means, conics, by_colors, by_opacities, of_depths, by_background)
 
     shown_depth = None if drawn.depth is None else drawn.depth.detach()
     return Raster(drawn.image.detach(), drawn.alpha.detach(), shown_depth, drawn.median_depth), pullback

@@ -180,7 +180,7 @@ class SplatGradients:
 
     means_px: Float[Tensor, "m 2"]
     conics: Float[Tensor, "m 3"]
-    colours: Float[Tensor, "m 3"]
+    colors: Float[Tensor, "m 3"]
     opacities: Float[Tensor, "m"]
     #: By the volume of each: the same number for all.
     volume: float
@@ -234,7 +234,7 @@ class RasterGradients(NamedTuple):
 
     means_px: Float[Tensor, "m 2"]
     conics: Float[Tensor, "m 3"]
-    colours: Float[Tensor, "m 3"]
+    colors: Float[Tensor, "m 3"]
     opacities: Float[Tensor, "m"]
     #: None for a picture drawn without depth.
     depths: Float[Tensor, "m"] | None

@@ -109,7 +109,7 @@ class KernelBackend(Protocol):
     ) -> Tensor: ...
 
     def fit_harmonics(
-        self, directions: Tensor, colours: Tensor, weights: Tensor, starts: Tensor, degree: int, ridge: float
+        self, directions: Tensor, colors: Tensor, weights: Tensor, starts: Tensor, degree: int, ridge: float
     ) -> Tensor: ...
 
     def mean_ellipsoids(

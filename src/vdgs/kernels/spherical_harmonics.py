@@ -56,13 +56,13 @@ def eval_sh_colors(
     used = num_sh_bases(degree) - 1
     if rest.shape[1] < used:
         raise ValueError(f"degree {degree} needs {used} further coefficients, there are {rest.shape[1]}")
-    colours = 0.5 + SH_C0 * dc
+    colors = 0.5 + SH_C0 * dc
     if used:
         weights = eval_sh_bases(directions, degree)[:, 1:]
-        colours = colours + torch.bmm(weights[:, None], rest[:, :used])[:, 0]
-    return colours.clamp_min(0.0)
+        colors = colors + torch.bmm(weights[:, None], rest[:, :used])[:, 0]
+    return colors.clamp_min(0.0)
 
 
-def rgb_to_sh(colours: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
+def rgb_to_sh(colors: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
     """The coefficients of Y_0^0 that show these RGB colours in [0, 1] from everywhere."""
-    return (colours - 0.5) / SH_C0
+    return (colors - 0.5) / SH_C0

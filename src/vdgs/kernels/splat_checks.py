@@ -17,7 +17,7 @@ def check_splats(tensors: tuple[Tensor, ...], width: int, height: int, device_ty
             raise ValueError(f"{name} must be from 1 to {MAX_IMAGE_SIDE_PX} pixels, not {side}")
     n = len(tensors[0]) if tensors[0].dim() else 0
     shapes = ((n, 2), (n, 3), (n, 3), (n,), (n,), (3,))
-    names = ("means_px", "conics", "colours", "opacities", "depths", "background")
+    names = ("means_px", "conics", "colors", "opacities", "depths", "background")
     for name, tensor, shape in zip(names, tensors, shapes, strict=True):
         if tensor.dtype != torch.float32 or device_type not in (None, tensor.device.type):
             where = {None: "", "cpu": " on the CPU"}.get(device_type, f" on {device_type}")

@@ -22,7 +22,7 @@ class DecodedGaussians:
 
     #: tanh of the opacity head: not drawn where it is 0 or less.
     opacities: Float[Tensor, "v k"]
-    colours: Float[Tensor, "v k 3"]
+    colors: Float[Tensor, "v k 3"]
     scales: Float[Tensor, "v k 3"]
     #: wxyz, of any length.
     quaternions: Float[Tensor, "v k 4"]

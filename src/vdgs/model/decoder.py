@@ -17,7 +17,7 @@ from torch import Tensor
 from vdgs.kernels.kernel_types import FEATURE_SIZE, HIDDEN_SIZE, DecoderWeights, MlpWeights
 from vdgs.model.exposure import exposure_matrix
 
-HEADS = {"opacity": 1, "covariance": 7, "colour": 3}  # outputs per offset
+HEADS = {"opacity": 1, "covariance": 7, "color": 3}  # outputs per offset
 HEAD_TENSORS = ("w1", "b1", "w2", "b2")
 
 
@@ -78,8 +78,8 @@ class Decoder:
         if self.appearance_embedding is None or self.appearance_weight is None:
             return self.weights
         embedding = self.appearance_embedding.mean(0) if image is None else self.appearance_embedding[image]
-        colour = self.weights.color
-        return replace(self.weights, color=replace(colour, b1=colour.b1 + self.appearance_weight @ embedding))
+        color = self.weights.color
+        return replace(self.weights, color=replace(color, b1=color.b1 + self.appearance_weight @ embedding))
 
     def exposure_for_image(self, image: int) -> Float[Tensor, "3 4"] | None:
         """The colour model of a training image; None where none is fitted."""

@@ -86,8 +86,8 @@ def render_gaussians(
     kernels = get_backend(gaussians.means.device)
     projected = kernels.project(gaussians.means, gaussians.log_scales.exp(), gaussians.quaternions, camera)
     if camera.model == "pinhole":
-        centre = torch.from_numpy(camera.position.astype(np.float32)).to(gaussians.means)
-        directions = torch.nn.functional.normalize(gaussians.means - centre, dim=-1)
+        center = torch.from_numpy(camera.position.astype(np.float32)).to(gaussians.means)
+        directions = torch.nn.functional.normalize(gaussians.means - center, dim=-1)
     else:
         directions = torch.from_numpy(camera.forward.astype(np.float32)).to(gaussians.means).expand(len(gaussians), 3)
     splats = Splats(

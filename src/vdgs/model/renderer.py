@@ -105,8 +105,8 @@ def render_scalar(
     rows, splats = decode_view(model, camera)
     k = model.anchors.offsets.shape[1]
     of_splat = values.to(rows.device)[rows][splats.source.long() // k].float()
-    grey = replace(splats, colors=of_splat[:, None].expand(-1, 3).contiguous())
-    painted = rasterize_splats(grey, camera, splats.means_px.new_zeros(3))
+    gray = replace(splats, colors=of_splat[:, None].expand(-1, 3).contiguous())
+    painted = rasterize_splats(gray, camera, splats.means_px.new_zeros(3))
     return painted.image[..., 0], painted.alpha
 
 

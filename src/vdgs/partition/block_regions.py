@@ -69,13 +69,13 @@ def lr_ramp(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Tensor
         return None
     block = blocks.items[index]
     low, high = np.array(block.expanded.bounds[:2]), np.array(block.expanded.bounds[2:])
-    centres = (np.indices((RAMP_TABLE_SIZE, RAMP_TABLE_SIZE)).reshape(2, -1).T + 0.5) / RAMP_TABLE_SIZE * (
+    centers = (np.indices((RAMP_TABLE_SIZE, RAMP_TABLE_SIZE)).reshape(2, -1).T + 0.5) / RAMP_TABLE_SIZE * (
         high - low
     ) + low
-    points = shapely.points(centres)
+    points = shapely.points(centers)
     inwards, outwards = shapely.distance(block.core, points), shapely.distance(block.expanded.boundary, points)
     share = np.where(shapely.contains(block.expanded, points), outwards / np.maximum(inwards + outwards, 1e-12), 0.0)
-    share = np.where(blocks.owner(centres) == index, 1.0, share)
+    share = np.where(blocks.owner(centers) == index, 1.0, share)
     made = share.astype(np.float32).reshape(RAMP_TABLE_SIZE, RAMP_TABLE_SIZE), low, (high - low) / RAMP_TABLE_SIZE
 
     @cache

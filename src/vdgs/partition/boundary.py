@@ -240,10 +240,10 @@ def _circumradii(triangles: Float[np.ndarray, "t 3 2"]) -> Float[np.ndarray, " t
     return np.where(flat, np.inf, lengths.prod(axis=1) / np.where(flat, 1.0, 2 * twice_area))
 
 
-def _is_connected(neighbours: np.ndarray, kept: np.ndarray) -> bool:
+def _is_connected(neighbors: np.ndarray, kept: np.ndarray) -> bool:
     """Whether the kept triangles are connected through common edges."""
     start = np.repeat(np.arange(len(kept)), 3)
-    end = neighbours.ravel()
+    end = neighbors.ravel()
     edges = (end >= 0) & kept[start] & kept[end]
     graph = coo_array((np.ones(edges.sum(), bool), (start[edges], end[edges])), shape=(len(kept), len(kept)))
     labels = connected_components(graph, directed=False)[1]

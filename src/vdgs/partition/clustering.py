@@ -55,15 +55,15 @@ def cluster_anchors(
     anchors than clusters.
     """
     check_distinct(count, features)
-    centres = _fit(_subsample(features, MAX_FIT_SAMPLES), count, seed)
+    centers = _fit(_subsample(features, MAX_FIT_SAMPLES), count, seed)
     weights = np.zeros(count)
     if balanced:
         most = min(
             max(BALANCED_MIN_SAMPLES, BALANCED_SAMPLES_PER_CLUSTER * count), max(BALANCED_MAX_DISTANCES // count, count)
         )
         sample = _subsample(features, most)
-        centres, weights = _fit_balanced(sample, centres)
-    return _assign_clusters(features, centres, weights)
+        centers, weights = _fit_balanced(sample, centers)
+    return _assign_clusters(features, centers, weights)
 
 
 def check_distinct(count: int, rows: Float[np.ndarray, "n d"]) -> None:
@@ -95,25 +95,25 @@ def _fit(features: np.ndarray, count: int, seed: int) -> Float[np.ndarray, "coun
 
 
 def _fit_balanced(
-    features: np.ndarray, centres: np.ndarray
+    features: np.ndarray, centers: np.ndarray
 ) -> tuple[Float[np.ndarray, "count 3"], Float[np.ndarray, " count"]]:
     """Lloyd's rounds in which every centre takes the same number of features; centres and weights w of the diagram.
 
     A feature belongs to the centre of least |f - c|² - w.
     """
-    weights = np.zeros(len(centres))
+    weights = np.zeros(len(centers))
     for _ in range(BALANCED_ITERATIONS):
-        squares = _squared_distances(features, centres)
+        squares = _squared_distances(features, centers)
         weights = _balance(squares, weights)
         labels = (squares - weights).argmin(axis=1)
-        sizes = np.bincount(labels, minlength=len(centres))
-        sums = np.column_stack([np.bincount(labels, axis, len(centres)) for axis in features.T])
-        moved = np.where(sizes[:, None] > 0, sums / np.maximum(sizes, 1)[:, None], centres)
-        still = np.abs(moved - centres).max() < 1e-4
-        centres = moved
+        sizes = np.bincount(labels, minlength=len(centers))
+        sums = np.column_stack([np.bincount(labels, axis, len(centers)) for axis in features.T])
+        moved = np.where(sizes[:, None] > 0, sums / np.maximum(sizes, 1)[:, None], centers)
+        still = np.abs(moved - centers).max() < 1e-4
+        centers = moved
         if still:
             break
-    return centres, _balance(_squared_distances(features, centres), weights)
+    return centers, _balance(_squared_distances(features, centers), weights)
 
 
 def _balance(squares: np.ndarray, weights: np.ndarray) -> Float[np.ndarray, " count"]:
@@ -143,16 +143,16 @@ def _balance(squares: np.ndarray, weights: np.ndarray) -> Float[np.ndarray, " co
     return weights - weights.mean()
 
 
-def _squared_distances(features: np.ndarray, centres: np.ndarray) -> Float[np.ndarray, "n count"]:
-    return np.stack([((features - centre) ** 2).sum(axis=1) for centre in centres], axis=1)
+def _squared_distances(features: np.ndarray, centers: np.ndarray) -> Float[np.ndarray, "n count"]:
+    return np.stack([((features - center) ** 2).sum(axis=1) for center in centers], axis=1)
 
 
-def _assign_clusters(features: np.ndarray, centres: np.ndarray, weights: np.ndarray) -> Int64[np.ndarray, " n"]:
+def _assign_clusters(features: np.ndarray, centers: np.ndarray, weights: np.ndarray) -> Int64[np.ndarray, " n"]:
     """The centre of least |f - c|² - w, in chunks that keep memory small."""
-    chunk = max(1, DISTANCES_PER_CHUNK // len(centres))
+    chunk = max(1, DISTANCES_PER_CHUNK // len(centers))
     return np.concatenate(
         [
-            (_squared_distances(features[start : start + chunk], centres) - weights).argmin(axis=1)
+            (_squared_distances(features[start : start + chunk], centers) - weights).argmin(axis=1)
             for start in range(0, len(features), chunk)
         ]
     )

@@ -125,10 +125,10 @@ class BlockCores:
         most = np.linalg.norm(np.maximum(highs - low, high - lows), axis=1)
         return candidates[least <= most.min() * (1 + 1e-9) + RELATIVE_TOLERANCE * np.abs(self._box).max()]
 
-    def _candidates(self, centres: Float[np.ndarray, "c 2"], radius: float, pairs: _CandidatePairs) -> _CandidatePairs:
+    def _candidates(self, centers: Float[np.ndarray, "c 2"], radius: float, pairs: _CandidatePairs) -> _CandidatePairs:
         """Those of the pairs whose core can be the nearest to a place within `radius` of its cell's centre."""
-        distance = self._distances(centres, pairs)
-        slack = 2 * radius + RELATIVE_TOLERANCE * (np.abs(centres).max() + np.abs(self._box).max())
+        distance = self._distances(centers, pairs)
+        slack = 2 * radius + RELATIVE_TOLERANCE * (np.abs(centers).max() + np.abs(self._box).max())
         near = distance <= np.minimum.reduceat(distance, pairs.starts())[pairs.of] + slack
         return _CandidatePairs(pairs.of[near], pairs.core[near])
 

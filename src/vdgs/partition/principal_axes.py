@@ -36,14 +36,14 @@ def fit_principal_plane(ground: Float[np.ndarray, "n 2"]) -> PrincipalPlane:
     which is arbitrary without GPS. Centre and axes turn, move and scale with the places. In a scene that is its own
     mirror image the signs, and so the numbers of the blocks, are decided by rounding.
     """
-    centre = ground.mean(axis=0)
+    center = ground.mean(axis=0)
     kept = ground
     for _ in range(NUM_ITERATIONS):
-        distance = np.linalg.norm(ground - centre, axis=1)
+        distance = np.linalg.norm(ground - center, axis=1)
         kept = ground[distance <= np.quantile(distance, INLIER_SHARE)]
-        centre = kept.mean(axis=0)
-    local = kept - centre
+        center = kept.mean(axis=0)
+    local = kept - center
     _, axes = np.linalg.eigh(local.T @ local)
     axes = axes[:, ::-1]
     skew = ((local @ axes) ** 3).sum(axis=0)
-    return PrincipalPlane(centre, axes * np.where(skew < 0, -1.0, 1.0))
+    return PrincipalPlane(center, axes * np.where(skew < 0, -1.0, 1.0))

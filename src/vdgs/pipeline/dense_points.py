@@ -97,7 +97,7 @@ def fusion_cell(capture: Capture, config: AnchorConfig) -> FusionCell:
 
 
 def _write(file: Path, found: DensePoints) -> None:
-    tensors = {"points": torch.from_numpy(found.points), "colours": torch.from_numpy(found.colors)}
+    tensors = {"points": torch.from_numpy(found.points), "colors": torch.from_numpy(found.colors)}
     write_atomic(
         file, lambda temporary: write_tensors(temporary, tensors, {DENSE_POINTS_FORMAT: str(tensors_crc32(tensors))})
     )
@@ -105,7 +105,7 @@ def _write(file: Path, found: DensePoints) -> None:
 
 def _read(file: Path) -> DensePoints:
     tensors, header = read_tensors(file)
-    points, colours = (tensors.get(name) for name in ("points", "colours"))
-    if points is None or colours is None or header.get(DENSE_POINTS_FORMAT) != str(tensors_crc32(tensors)):
+    points, colors = (tensors.get(name) for name in ("points", "colors"))
+    if points is None or colors is None or header.get(DENSE_POINTS_FORMAT) != str(tensors_crc32(tensors)):
         raise VdgsError(f"{file}: is damaged. Delete it and run the same command again: it is found anew.")
-    return DensePoints(points.numpy(), colours.numpy())
+    return DensePoints(points.numpy(), colors.numpy())

@@ -144,14 +144,14 @@ def _brightness(images: ImageCache, config: TrainConfig, console: Console) -> fl
         wait.update(f"comparing the photographs' brightness, {done / of:.0%}")
 
     with wait:
-        colours = collect_point_colors(images, tell)
-    if colours is None:
+        colors = collect_point_colors(images, tell)
+    if colors is None:
         console.print(
             "exposure: one is fitted to each photograph; whether they differ in brightness is not known, for the "
             "capture does not say which of them show the same points", highlight=False,
         )  # fmt: skip
         return None
-    found, spread = colours.gain_spread(), config.exposure_min_spread
+    found, spread = colors.gain_spread(), config.exposure_min_spread
     said = "one is fitted to each" if found >= spread else f"less than {spread:.2%}, so none is fitted"
     console.print(
         f"exposure: photographs of the same places differ in brightness by {found:.2%}; {said}", highlight=False

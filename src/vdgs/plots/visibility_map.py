@@ -148,10 +148,10 @@ def remove_speckles(covered: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]
 
 def _cameras(axes: Axes, marks: Sequence[CameraMarks]) -> None:
     for mark in marks:
-        centres = np.array([camera.position for camera in mark.cameras]).reshape(-1, 3)
+        centers = np.array([camera.position for camera in mark.cameras]).reshape(-1, 3)
         axes.scatter(
-            centres[:, 0],
-            centres[:, 1],
+            centers[:, 0],
+            centers[:, 1],
             marker="^",
             s=mark.size,
             linewidths=marker_edge_width(mark.size),

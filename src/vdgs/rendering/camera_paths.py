@@ -85,17 +85,17 @@ def orbit(
     a long narrow one is not left sideways: its half axes are two thirds of the 90 % extent of the
     training cameras, but at least a quarter of the height (choices). `template` gives intrinsics and size.
     """
-    centre = np.median(points, axis=0)
+    center = np.median(points, axis=0)
     positions = np.stack([camera.position for camera in cameras])
-    height = max(float(np.median(positions[:, 2]) - centre[2]), 1e-3)
-    offsets = positions[:, :2] - centre[:2]
+    height = max(float(np.median(positions[:, 2]) - center[2]), 1e-3)
+    offsets = positions[:, :2] - center[:2]
     axes = np.linalg.svd(offsets, full_matrices=False)[2] if len(offsets) > 1 else np.eye(2)
     reach = np.quantile(np.abs(offsets @ axes.T), 0.9, axis=0)
     radii = np.maximum(2.0 / 3.0 * reach, 0.25 * height)
     frames = []
     for angle in np.linspace(0.0, 2.0 * np.pi, frame_count(seconds, fps), endpoint=False):
         level = (radii * [np.cos(angle), np.sin(angle)]) @ axes
-        pose = look_at_pose(centre + np.append(level, height), centre)
+        pose = look_at_pose(center + np.append(level, height), center)
         frames.append(replace(template, camera_from_world=pose))
     return CameraPath(tuple(frames), fps)
 
@@ -191,7 +191,7 @@ def _smooth_track(positions: Float[np.ndarray, "n 3"], n_frames: int) -> Float[n
     """The positions as one even, smooth line of `n_frames` points."""
     if len(positions) > _MAX_TRACK_CAMERAS:
         positions = positions[np.linspace(0, len(positions) - 1, _MAX_TRACK_CAMERAS).round().astype(int)]
-    chained = _neighbour_order(positions)
+    chained = _neighbor_order(positions)
     if _length(chained) < 0.6 * _length(positions):
         positions = chained
     if len(positions) == 1 or _length(positions) == 0.0:
@@ -204,7 +204,7 @@ def _smooth_track(positions: Float[np.ndarray, "n 3"], n_frames: int) -> Float[n
     return _resample_line(smooth, n_frames)
 
 
-def _neighbour_order(positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def _neighbor_order(positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """From the first position always to the nearest one not yet visited; O(n²)."""
     left, order = np.ones(len(positions), bool), [0]
     left[0] = False

@@ -148,7 +148,7 @@ def _metadata(request: RenderRequest, run: OpenedModel, drawn: ScalarMap | None)
         "views": str(request.path) if request.path is not None else request.views,
     }  # fmt: skip
     if drawn is not None:
-        facts |= {"numbers": drawn.description, "colours_between": [drawn.scale.low, drawn.scale.high],
+        facts |= {"numbers": drawn.description, "colors_between": [drawn.scale.low, drawn.scale.high],
                   "legend_below": request.colorbar}  # fmt: skip
     return facts
 

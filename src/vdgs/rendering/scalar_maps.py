@@ -109,7 +109,7 @@ def depth_scale(depth_limits: tuple[float, float], unit: str) -> ColorScale:
     if high - low <= 1e-3 * abs(high):  # one plane
         low, high = 0.99 * low, 1.01 * high or 1.0
     numbers = MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high)
-    norm, colours = Normalize(numbers[0], numbers[-1], clip=True), mpl.colormaps["viridis"]
+    norm, colors = Normalize(numbers[0], numbers[-1], clip=True), mpl.colormaps["viridis"]
     words = [f"{number:g}" for number in np.round(numbers, 9)]
     words[0], words[-1] = f"≤ {words[0]}" if numbers[0] > 0 else words[0], f"≥ {words[-1]}"
     return ColorScale(
@@ -117,7 +117,7 @@ def depth_scale(depth_limits: tuple[float, float], unit: str) -> ColorScale:
         low=float(numbers[0]),
         high=float(numbers[-1]),
         ticks=tuple(zip(map(float, numbers), words, strict=True)),
-        colormap=lambda values: np.asarray(colours(norm(values))),
+        colormap=lambda values: np.asarray(colors(norm(values))),
     )
 
 
@@ -160,8 +160,8 @@ def _alpha(run: OpenedModel, run_cameras: RunCameras, cameras: Sequence[Camera])
 def alpha_scale() -> ColorScale:
     """From black, where the scene is transparent, to white."""
     ticks = tuple((number / 4, f"{number / 4:g}") for number in range(5))
-    grey = mpl.colormaps["gray"]
+    gray = mpl.colormaps["gray"]
     titles = ("alpha: 0 nothing, 1 opaque", "alpha")
     return ColorScale(
-        titles=titles, low=0.0, high=1.0, ticks=ticks, colormap=lambda values: np.asarray(grey(values)), has_nodata=False
+        titles=titles, low=0.0, high=1.0, ticks=ticks, colormap=lambda values: np.asarray(gray(values)), has_nodata=False
     )

@@ -105,8 +105,8 @@ def _titles(capture: Capture, report: CaptureReport) -> tuple[str, str, str]:
 
 def _frame(capture: Capture, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The corner points of the map: all cameras and 99 % of the points, with a margin."""
-    centres = np.stack([view.camera.position[:2] for view in capture.views])
-    low = np.minimum(np.quantile(points[:, :2], 0.005, axis=0), centres.min(axis=0))
-    high = np.maximum(np.quantile(points[:, :2], 0.995, axis=0), centres.max(axis=0))
+    centers = np.stack([view.camera.position[:2] for view in capture.views])
+    low = np.minimum(np.quantile(points[:, :2], 0.005, axis=0), centers.min(axis=0))
+    high = np.maximum(np.quantile(points[:, :2], 0.995, axis=0), centers.max(axis=0))
     margin = 0.04 * float((high - low).max())
     return low - margin, high + margin

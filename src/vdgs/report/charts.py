@@ -26,7 +26,7 @@ class Curve:
     """y over x; None in y is a gap. A curve without a name does not stand in the legend."""
 
     name: str
-    colour: str
+    color: str
     x: Sequence[float]
     y: Sequence[float | None]
     dashed: bool = False
@@ -63,9 +63,9 @@ def draw_curves(
         line = "--" if curve.dashed else "-"
         marker = "o" if show_markers else None
         if smoothing_window > 1 and len(x) > smoothing_window:
-            axes.plot(x, y, color=curve.colour, linewidth=0.8, alpha=0.3)
+            axes.plot(x, y, color=curve.color, linewidth=0.8, alpha=0.3)
             y = running_median(y, smoothing_window)
-        axes.plot(x, y, line, color=curve.colour, linewidth=1.6, marker=marker, markersize=3.5, label=curve.name or "_")
+        axes.plot(x, y, line, color=curve.color, linewidth=1.6, marker=marker, markersize=3.5, label=curve.name or "_")
     for mark in marked_iterations:
         axes.axvline(mark, color=MUTED, linewidth=1.0, linestyle=":")
     if from_zero:
@@ -84,9 +84,9 @@ def draw_psnr_bars(
         return None
     figure, axes = _panel("PSNR (dB)")
     at = np.arange(len(names), dtype=float)
-    for shift, values, colour, name in ((-0.2, coarse, COARSE_COLOR, "coarse"), (0.2, merged, MERGED_COLOR, "merged")):
+    for shift, values, color, name in ((-0.2, coarse, COARSE_COLOR, "coarse"), (0.2, merged, MERGED_COLOR, "merged")):
         known = [0.0 if value is None else value for value in values]
-        bars = axes.bar(at + shift, known, 0.38, color=colour, label=name)
+        bars = axes.bar(at + shift, known, 0.38, color=color, label=name)
         axes.bar_label(bars, ["" if v is None else f"{v:.1f}" for v in values], fontsize=7, color=INK, padding=1)
     _name_bars(axes, names)
     axes.set_ylim(0, 1.3 * max(axes.get_ylim()[1], 1e-3))

@@ -93,14 +93,14 @@ def _resolution_changes(records: list[JsonRecord]) -> dict[float, float]:
 def _series(logs: list[NamedLog], key: str, named: bool = True, dashed: bool = False) -> list[Curve]:
     """One curve for each log, of the records that have an iteration and mention the key."""
     curves = []
-    for label, colour, records in logs:
+    for label, color, records in logs:
         points = [
             (at, record.number(key))
             for record in records
             if key in record.values and (at := record.number("iteration")) is not None
         ]
         curves.append(
-            Curve(label if named else "", colour, [at for at, _ in points], [value for _, value in points], dashed)
+            Curve(label if named else "", color, [at for at, _ in points], [value for _, value in points], dashed)
         )
     return curves
 
@@ -121,8 +121,8 @@ def _states(statuses: list[tuple[str, JsonRecord]], report: ReportedRun) -> Html
 def _growth(logs: list[NamedLog]) -> list[Html]:
     """Compensated growth (section IV-C), cycle by cycle."""
     cycles = [
-        (name, colour, found)
-        for name, colour, records in logs
+        (name, color, found)
+        for name, color, records in logs
         if (found := [record for record in records if record.number("low_share") is not None])
     ]
     if not cycles:

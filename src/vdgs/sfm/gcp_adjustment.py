@@ -115,14 +115,14 @@ def _triangulate_all(model: pycolmap.Reconstruction, gcps: GcpList) -> dict[int,
     return {k: seen for k, seen in found if seen is not None}
 
 
-def _intersect_rays(centres: Float[np.ndarray, "n 3"], rays: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"] | None:
+def _intersect_rays(centers: Float[np.ndarray, "n 3"], rays: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"] | None:
     """The point with the least sum of squared distances to lines; None where they are parallel."""
     rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     total = across.sum(axis=0)
     if np.linalg.eigvalsh(total)[0] < 1e-6:
         return None
-    return np.asarray(np.linalg.solve(total, np.einsum("nij,nj->i", across, centres)))
+    return np.asarray(np.linalg.solve(total, np.einsum("nij,nj->i", across, centers)))
 
 
 def _fit_to_gcps(points: Float[np.ndarray, "n 3"], targets: Float[np.ndarray, "n 3"]) -> tuple[Similarity, np.ndarray]:

@@ -56,18 +56,18 @@ def georegister(
     """The similarity that brings the model to its positions, or why they do not tell one: they are too few, or wrong by
     too much of how far they spread. Does not change the model."""
     images = {image.name: image for image in model.images.values() if image.has_pose}
-    rows, centres, targets = _match_positions(images, images_metadata, positions)
+    rows, centers, targets = _match_positions(images, images_metadata, positions)
     if not positions.usable or len(rows) < MIN_POSITIONS:
         few = f"{len(positions)} positions, of placed photographs, are too few"
         return AlignmentFailure(few if len(positions) else "no positions that can be used", ADVICE_WRITE_GPS)
-    if not is_collinear(centres) and not is_nearly_collinear(targets, positions.gps_std[rows]):
-        similarity, inliers = fit_similarity_robust(centres, targets)
+    if not is_collinear(centers) and not is_nearly_collinear(targets, positions.gps_std[rows]):
+        similarity, inliers = fit_similarity_robust(centers, targets)
         how = f"positions of {int(inliers.sum())} photographs ({positions.source})"
     else:
-        rotation, by = _leveling_rotation(model, images, images_metadata, centres, targets)
-        similarity, inliers = _fit_scale(rotation, centres, targets), np.ones(len(rows), bool)
+        rotation, by = _leveling_rotation(model, images, images_metadata, centers, targets)
+        similarity, inliers = _fit_scale(rotation, centers, targets), np.ones(len(rows), bool)
         how = f"positions of {len(rows)} photographs along one line ({positions.source}), up by {by}"
-    residuals = similarity.apply(centres) - targets
+    residuals = similarity.apply(centers) - targets
     how_far = describe_disagreement(residuals, targets[inliers], inliers)
     if how_far:
         why = f"the positions ({positions.source}) and where the photographs were placed disagree: {how_far}"
@@ -80,9 +80,9 @@ def registration_in_place(
 ) -> Georegistration:
     """A model that was brought to its place by other things than positions, and how far those are from it."""
     images = {image.name: image for image in model.images.values() if image.has_pose}
-    rows, centres, targets = _match_positions(images, photographs, positions)
+    rows, centers, targets = _match_positions(images, photographs, positions)
     stays = Similarity(1.0, np.eye(3), np.zeros(3))
-    return Georegistration(stays, method, rows, centres - targets, np.ones(len(rows), bool))
+    return Georegistration(stays, method, rows, centers - targets, np.ones(len(rows), bool))
 
 
 def is_nearly_collinear(points: np.ndarray, std: np.ndarray) -> bool:
@@ -133,8 +133,8 @@ def _match_positions(
     """Rows [m] of the positions whose photographs are placed, where those were placed [m, 3], and the positions."""
     rows = np.array([row for row, i in enumerate(positions.image_indices) if photographs[int(i)].name in images], int)
     names = [photographs[int(positions.image_indices[row])].name for row in rows]
-    centres = np.array([images[name].projection_center() for name in names]).reshape(-1, 3)
-    return rows, centres, positions.enu[rows]
+    centers = np.array([images[name].projection_center() for name in names]).reshape(-1, 3)
+    return rows, centers, positions.enu[rows]
 
 
 def _rotation(image: pycolmap.Image) -> np.ndarray:
@@ -145,7 +145,7 @@ def _leveling_rotation(
     model: pycolmap.Reconstruction,
     images: Mapping[str, pycolmap.Image],
     photographs: Sequence[ImageMetadata],
-    centres: np.ndarray,
+    centers: np.ndarray,
     targets: np.ndarray,
 ) -> tuple[np.ndarray, str]:
     """The rotation into east, north, up where positions along a line leave a turn about it open."""
@@ -157,23 +157,23 @@ def _leveling_rotation(
     if len(found) >= MIN_ATTITUDES:
         left, _, right = np.linalg.svd(np.sum(found, axis=0))
         mean = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
-        return _heading_rotation(mean, centres, targets) @ mean, "the recorded attitudes"
+        return _heading_rotation(mean, centers, targets) @ mean, "the recorded attitudes"
     rotations = np.array([_rotation(image) for image in images.values()])
-    up, _ = estimate_up(centres, rotations, model_points(model), [])
+    up, _ = estimate_up(centers, rotations, model_points(model), [])
     level = rotation_to_z(up)
-    return _heading_rotation(level, centres, targets) @ level, "the views"
+    return _heading_rotation(level, centers, targets) @ level, "the views"
 
 
-def _heading_rotation(rotation: np.ndarray, centres: np.ndarray, targets: np.ndarray) -> np.ndarray:
+def _heading_rotation(rotation: np.ndarray, centers: np.ndarray, targets: np.ndarray) -> np.ndarray:
     """The turn about up that brings the line of the cameras onto that of the positions."""
-    one, other = (centres - centres.mean(axis=0)) @ rotation.T, targets - targets.mean(axis=0)
+    one, other = (centers - centers.mean(axis=0)) @ rotation.T, targets - targets.mean(axis=0)
     angle = np.arctan2((one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]).sum(), (one[:, :2] * other[:, :2]).sum())
     return np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
 
 
-def _fit_scale(rotation: np.ndarray, centres: np.ndarray, targets: np.ndarray) -> Similarity:
+def _fit_scale(rotation: np.ndarray, centers: np.ndarray, targets: np.ndarray) -> Similarity:
     """Scale and translation by least squares, the rotation as it is."""
-    turned = centres @ rotation.T
+    turned = centers @ rotation.T
     one, other = turned - turned.mean(axis=0), targets - targets.mean(axis=0)
     scale = float((one * other).sum() / (one**2).sum())
     return Similarity(scale, rotation, targets.mean(axis=0) - scale * turned.mean(axis=0))

@@ -121,9 +121,9 @@ def retrieval_pairs(descriptors: Sequence[np.ndarray], queries: Sequence[int]) -
 
 
 def _vlad_descriptor(features: np.ndarray, words: MiniBatchKMeans) -> np.ndarray:
-    centres, nearest = words.cluster_centers_, words.predict(features)
-    sums = np.zeros_like(centres, dtype=np.float64)
-    np.add.at(sums, nearest, features - centres[nearest])
+    centers, nearest = words.cluster_centers_, words.predict(features)
+    sums = np.zeros_like(centers, dtype=np.float64)
+    np.add.at(sums, nearest, features - centers[nearest])
     sums = np.sign(sums) * np.sqrt(np.abs(sums))
     flat = sums.ravel()
     return flat / max(float(np.linalg.norm(flat)), 1e-12)

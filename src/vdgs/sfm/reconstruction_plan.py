@@ -78,9 +78,9 @@ def print_plan(reconstruction_plan: ReconstructionPlan, console: Console) -> Non
     held, why = incremental_mapper.should_fix_focal(photographs, reconstruction_plan.gps_priors, options)
     how = "near each other by their positions" if reconstruction_plan.gps_priors.usable else (
         "all with all" if len(photographs) <= options.exhaustive_max else "next in order, and alike")  # fmt: skip
-    metres = "metres east, north, up, " if reconstruction_plan.gps_priors.usable or reconstruction_plan.gcps else ""
+    meters = "metres east, north, up, " if reconstruction_plan.gps_priors.usable or reconstruction_plan.gcps else ""
     plan = [
-        f"features, about {pairs} pairs ({how}), poses and points, {metres}photographs without distortion",
+        f"features, about {pairs} pairs ({how}), poses and points, {meters}photographs without distortion",
         *_gcp_plan_lines(reconstruction_plan.gcps),
         f"the focal length is {'held' if held else 'fitted'}: {why}",
         f"about {rough_duration(reconstruction_plan.estimated_seconds)} on {reconstruction_plan.threads} threads, if they are idle",

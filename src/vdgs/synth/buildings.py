@@ -76,7 +76,7 @@ def pitched_roof(
             down = np.array([0, 0, -0.22])
             face(builder, frame, np.array([start + down, end + down, end, start]), trim)
     cap = Box(x0=r0, x1=r1, y0=middle - 0.16, y1=middle + 0.16, z0=top - 0.12, z1=top + 0.09)
-    box(builder, frame, cap, *(SurfaceMaterial(Material.PAINT, roof.colour * 0.8),) * 2)
+    box(builder, frame, cap, *(SurfaceMaterial(Material.PAINT, roof.color * 0.8),) * 2)
     return rise
 
 
@@ -160,11 +160,11 @@ def flat_block(
     body = Box(x0=-w, x1=w, y0=-d, y1=d, z0=0, z1=height)
     foundation(builder, frame, body)
     box(builder, frame, body, wall, roof)
-    parapet(builder, frame, body, SurfaceMaterial(Material.PAINT, wall.colour * 0.85))
+    parapet(builder, frame, body, SurfaceMaterial(Material.PAINT, wall.color * 0.85))
     metal, dark = SurfaceMaterial(Material.PAINT, palette.METAL), SurfaceMaterial(Material.DARK, palette.DARK)
     hx, hy = rng.uniform(-0.5, 0.5) * w, rng.uniform(-0.1, 0.5) * d
     hut = Box(x0=hx - 1.5, x1=hx + 1.5, y0=hy - 1.3, y1=hy + 1.3, z0=height, z1=height + 2.4)
-    box(builder, frame, hut, SurfaceMaterial(Material.PLASTER, wall.colour, wall.seed), metal)
+    box(builder, frame, hut, SurfaceMaterial(Material.PLASTER, wall.color, wall.seed), metal)
     sunny = rng.random() < 0.45
     if sunny:
         solar_row(builder, frame, -0.8 * w, 0.8 * w, -0.7 * d, height)
@@ -261,11 +261,11 @@ def barn(builder: MeshBuilder, frame: ObjectFrame) -> None:
     frustum(builder, silo, (2.1, 0), (9, 10.4), SurfaceMaterial(Material.PAINT, palette.METAL * 0.8), None, 18)
 
 
-def sawtooth_hall(builder: MeshBuilder, frame: ObjectFrame, size: tuple[float, float], colour: np.ndarray) -> None:
+def sawtooth_hall(builder: MeshBuilder, frame: ObjectFrame, size: tuple[float, float], color: np.ndarray) -> None:
     """A workshop with a saw-tooth roof: glazed steps to the back, sheets to the front."""
     w, d, height = size[0] / 2, size[1] / 2, 5.0
     body = Box(x0=-w, x1=w, y0=-d, y1=d, z0=0, z1=height)
-    wall = SurfaceMaterial(Material.BRICK, colour)
+    wall = SurfaceMaterial(Material.BRICK, color)
     foundation(builder, frame, body)
     box(builder, frame, body, wall)
     teeth = max(2, round(size[1] / 4.5))

@@ -41,7 +41,7 @@ def write_model(folder: Path, cameras: list[Camera], names: list[str], cloud: Sp
         track = pycolmap.Track(
             [pycolmap.TrackElement(int(cloud.observed_image[m]) + 1, int(place_in_image[m])) for m in range(start, end)]
         )
-        point_id = model.add_point3D(cloud.points[k], track, cloud.colours[k])
+        point_id = model.add_point3D(cloud.points[k], track, cloud.colors[k])
         model.point3D(point_id).error = float(cloud.errors[k])
     folder.mkdir(parents=True)
     model.write(folder)

@@ -18,8 +18,8 @@ _SHUTTERS = np.stack([srgb(c) for c in ("#4f7a5a", "#7a3b32", "#47648a", "#8a6a4
 _DOORS = np.stack([srgb(c) for c in ("#7a2f28", "#2f5a48", "#2f4a78", "#6b4a2c")])
 
 
-def _matt(colour: np.ndarray) -> AlbedoAndGloss:
-    return colour.astype(np.float32), np.zeros(len(colour), np.float32)
+def _matt(color: np.ndarray) -> AlbedoAndGloss:
+    return color.astype(np.float32), np.zeros(len(color), np.float32)
 
 
 def _grain_plane(s: Surface) -> tuple[np.ndarray, np.ndarray]:
@@ -32,7 +32,7 @@ def plaster(s: Surface) -> AlbedoAndGloss:
     u, v = _grain_plane(s)
     grain = 1 + 0.05 * smooth(u, v, 0.5, s.footprint) + 0.06 * smooth(u, v, 2.3)
     splash = 1 - 0.2 * np.exp(-np.maximum(s.uv[:, 1], 0) / 0.35)
-    return _matt(scale_color(s.colour, grain * splash))
+    return _matt(scale_color(s.color, grain * splash))
 
 
 def stone(s: Surface) -> AlbedoAndGloss:
@@ -43,7 +43,7 @@ def stone(s: Surface) -> AlbedoAndGloss:
     i = np.floor(u)
     tint = 1 + 0.22 * (cells(i, j) - 0.5) * fade(0.5, s.footprint)
     joint = np.maximum(line((u - i) * 0.9, 0.03, s.footprint), line((v - j) * 0.45, 0.03, s.footprint))
-    return _matt(scale_color(s.colour, (tint + 0.05 * smooth(*_grain_plane(s), 1.3)) * (1 - 0.3 * joint)))
+    return _matt(scale_color(s.color, (tint + 0.05 * smooth(*_grain_plane(s), 1.3)) * (1 - 0.3 * joint)))
 
 
 def brick(s: Surface) -> AlbedoAndGloss:
@@ -54,7 +54,7 @@ def brick(s: Surface) -> AlbedoAndGloss:
     i = np.floor(u)
     tint = 1 + 0.4 * (cells(i, j) - 0.5) * fade(0.3, s.footprint)
     joint = np.maximum(line((u - i) * 0.5, 0.02, s.footprint), line((v - j) * 0.22, 0.02, s.footprint))
-    return _matt(mix_colors(scale_color(s.colour, tint), srgb("#c9bfb0"), 0.5 * joint))
+    return _matt(mix_colors(scale_color(s.color, tint), srgb("#c9bfb0"), 0.5 * joint))
 
 
 def _panes(s: Surface, u: np.ndarray, v: np.ndarray, lit: np.ndarray) -> np.ndarray:
@@ -66,7 +66,7 @@ def _panes(s: Surface, u: np.ndarray, v: np.ndarray, lit: np.ndarray) -> np.ndar
 
 def windows(s: Surface, door: bool = False) -> AlbedoAndGloss:
     """A house wall: evenly spaced windows with frames, sills and shutters; a door in the middle column."""
-    colour, gloss = plaster(s)
+    color, gloss = plaster(s)
     width, height = s.panel.T
     columns = np.maximum(np.round(width / 2.7), 1)
     pitch = width / columns
@@ -81,17 +81,17 @@ def windows(s: Surface, door: bool = False) -> AlbedoAndGloss:
     shutter = glazed & (au > hw + 0.08) & (au < hw + 0.5) & (av < hh + 0.05) & (s.seed < 0.7) & (pitch > 2.2)
     slats = 0.85 + 0.15 * np.cos(v * 50) * fade(0.12, s.footprint)
     tone = _SHUTTERS[(s.seed * 31).astype(int) % 5] * slats[:, None]
-    colour = np.where(shutter[:, None], tone, colour)
+    color = np.where(shutter[:, None], tone, color)
     frame = glazed & (au < hw + 0.1) & (av < hh + 0.1)
     sill = glazed & (au < hw + 0.2) & (v < -hh) & (v > -hh - 0.2)
-    colour = np.where((frame | sill)[:, None], _FRAME, colour)
+    color = np.where((frame | sill)[:, None], _FRAME, color)
     pane = glazed & (au < hw) & (av < hh)
     lit = cells(column + np.floor(s.seed * 4096), storey, 8)
-    colour = np.where(pane[:, None], _panes(s, u, v, lit), colour)
+    color = np.where(pane[:, None], _panes(s, u, v, lit), color)
     leaf, porch = is_door & (au < 0.5) & (v < 0.6), is_door & (au < 0.72) & (v < 0.82)
-    colour = np.where(porch[:, None], _FRAME * 0.9, colour)
-    colour = np.where(leaf[:, None], _DOORS[(s.seed * 57).astype(int) % 4], colour)
-    return colour.astype(np.float32), np.where(pane, np.float32(0.7), gloss)
+    color = np.where(porch[:, None], _FRAME * 0.9, color)
+    color = np.where(leaf[:, None], _DOORS[(s.seed * 57).astype(int) % 4], color)
+    return color.astype(np.float32), np.where(pane, np.float32(0.7), gloss)
 
 
 def front(s: Surface) -> AlbedoAndGloss:
@@ -101,7 +101,7 @@ def front(s: Surface) -> AlbedoAndGloss:
 
 def office(s: Surface) -> AlbedoAndGloss:
     """A town block: shop windows below, storeys of windows above; seeds over 0.95 are churches."""
-    colour, gloss = plaster(s)
+    color, gloss = plaster(s)
     width, height = s.panel.T
     church = s.seed > 0.95
     step = np.where(church, np.float32(2.6), np.where(s.seed < 0.45, np.float32(2.1), np.float32(2.8)))
@@ -119,12 +119,12 @@ def office(s: Surface) -> AlbedoAndGloss:
     rim = inside & (np.abs(u) < hw + 0.12) & (np.abs(v) < hh + 0.12 - arch)
     ledge = (np.abs(s.uv[:, 1] - storey * rise) < 0.16) & ~church
     lit = cells(column + np.floor(s.seed * 4096), storey, 9)
-    colour = np.where((rim | ledge)[:, None], np.minimum(s.colour * 1.25, 0.85), colour)
-    colour = np.where(pane[:, None], _panes(s, u, v, np.maximum(lit, 0.2)), colour)
+    color = np.where((rim | ledge)[:, None], np.minimum(s.color * 1.25, 0.85), color)
+    color = np.where(pane[:, None], _panes(s, u, v, np.maximum(lit, 0.2)), color)
     sign = shop & (s.uv[:, 1] > 2.65) & (s.uv[:, 1] < 3.2)
     signs = _SHUTTERS[(column + np.floor(s.seed * 100)).astype(int) % 5]
-    colour = np.where(sign[:, None], signs, colour)
-    return colour.astype(np.float32), np.where(pane, np.float32(0.8), gloss)
+    color = np.where(sign[:, None], signs, color)
+    return color.astype(np.float32), np.where(pane, np.float32(0.8), gloss)
 
 
 def tiles(s: Surface) -> AlbedoAndGloss:
@@ -137,9 +137,9 @@ def tiles(s: Surface) -> AlbedoAndGloss:
     course = 1 - 0.3 * np.exp(-(v - j) * 5) * alike
     gu, gv = _grain_plane(s)
     weather = 1 + 0.09 * smooth(gu, gv, 2.6) + 0.06 * smooth(gv, gu, 0.9, s.footprint)
-    colour = scale_color(s.colour, tint * roll * course * weather)
+    color = scale_color(s.color, tint * roll * course * weather)
     moss = np.clip(smooth(gu, gv, 1.7) * 0.5 - 0.55, 0, 0.45) * (s.seed > 0.4)
-    return _matt(mix_colors(colour, srgb("#6f7a45"), moss))
+    return _matt(mix_colors(color, srgb("#6f7a45"), moss))
 
 
 def slate(s: Surface) -> AlbedoAndGloss:
@@ -152,7 +152,7 @@ def slate(s: Surface) -> AlbedoAndGloss:
     tint = 1 + 0.36 * (cells(i, j, (s.seed * 512).astype(np.int32)) - 0.5) * alike
     edge = np.maximum(line((v - j) * 0.4, 0.04, s.footprint), line((u - i) * 0.4, 0.02, s.footprint))
     weather = 1 + 0.08 * smooth(*_grain_plane(s), 2.1)
-    return _matt(scale_color(s.colour, tint * weather * (1 - 0.35 * edge)))
+    return _matt(scale_color(s.color, tint * weather * (1 - 0.35 * edge)))
 
 
 def flat_roof(s: Surface) -> AlbedoAndGloss:
@@ -161,7 +161,7 @@ def flat_roof(s: Surface) -> AlbedoAndGloss:
     grain = 1 + 0.09 * smooth(u, v, 0.3, s.footprint) + 0.05 * smooth(u, v, 3.4)
     seam = line((s.uv[:, 0] / 1.4 % 1 - 0.5) * 1.4, 0.05, s.footprint) * (s.seed < 0.6)
     stain = np.clip(smooth(u, v, 4.6) - 0.6, 0, 0.8) * 0.3
-    bare = scale_color(s.colour, grain * (1 - 0.22 * seam) * (1 - stain))
+    bare = scale_color(s.color, grain * (1 - 0.22 * seam) * (1 - stain))
     border = np.minimum(np.minimum(*s.uv.T), np.minimum(*(s.panel - s.uv).T)) < 1.1
     planted = (s.seed > 0.72) & ~border
     sedum = mix_colors(srgb("#7f8f4a"), srgb("#a5764f"), np.clip(0.5 + 0.5 * smooth(u, v, 1.6), 0, 1))
@@ -174,27 +174,27 @@ def timber(s: Surface) -> AlbedoAndGloss:
     i = np.floor(u)
     tint = 1 + 0.3 * (cells(i, i * 0) - 0.5) * fade(0.3, s.footprint)
     gap = line((u - i) * 0.3, 0.025, s.footprint)
-    return _matt(scale_color(s.colour, (tint + 0.06 * smooth(s.uv[:, 0] * 4, s.uv[:, 1], 0.9)) * (1 - 0.4 * gap)))
+    return _matt(scale_color(s.color, (tint + 0.06 * smooth(s.uv[:, 0] * 4, s.uv[:, 1], 0.9)) * (1 - 0.4 * gap)))
 
 
 def paint(s: Surface) -> AlbedoAndGloss:
     """Paint or sheet metal; seeds over 0.8 are polished."""
     u, v = _grain_plane(s)
-    return scale_color(s.colour, 1 + 0.03 * smooth(u, v, 0.6)), np.where(s.seed > 0.8, np.float32(0.35), 0)
+    return scale_color(s.color, 1 + 0.03 * smooth(u, v, 0.6)), np.where(s.seed > 0.8, np.float32(0.35), 0)
 
 
 def glass(s: Surface) -> AlbedoAndGloss:
     """Dark glass."""
     rim = np.minimum(np.minimum(*s.uv.T), np.minimum(*(s.panel - s.uv).T))
-    colour = mix_colors(scale_color(_GLASS * 0.8, np.ones(len(rim))), _FRAME * 0.4, line(rim, 0.05, s.footprint))
-    return colour, np.full(len(rim), 0.8, np.float32)
+    color = mix_colors(scale_color(_GLASS * 0.8, np.ones(len(rim))), _FRAME * 0.4, line(rim, 0.05, s.footprint))
+    return color, np.full(len(rim), 0.8, np.float32)
 
 
 def awning(s: Surface) -> AlbedoAndGloss:
     """Broad stripes of colour and white."""
     stripe = ((s.uv[:, 0] / s.panel[:, 0] * np.float32(3.5)) % 1 < 0.5).astype(np.float32)
     fringe = 1 - 0.15 * np.exp(-s.uv[:, 1] / 0.15)
-    return _matt(mix_colors(s.colour, _FRAME * 0.95, stripe) * fringe[:, None])
+    return _matt(mix_colors(s.color, _FRAME * 0.95, stripe) * fringe[:, None])
 
 
 def solar(s: Surface) -> AlbedoAndGloss:
@@ -202,10 +202,10 @@ def solar(s: Surface) -> AlbedoAndGloss:
     u, v = s.uv[:, 0], s.uv[:, 1]
     panel = np.maximum(line((u % 1.0) - 0.5, 0.05, s.footprint), line((v % 1.05) - 0.52, 0.05, s.footprint))
     cell = np.maximum(line((u % 0.2) - 0.1, 0.01, s.footprint), line((v % 0.2) - 0.1, 0.01, s.footprint))
-    colour = mix_colors(scale_color(srgb("#1f3566"), 1 + 0.2 * smooth(u, v, 1.0)), srgb("#c9d2dc"), 0.85 * panel)
-    return mix_colors(colour, srgb("#7f93b8"), 0.3 * cell), np.full(len(u), 0.5, np.float32)
+    color = mix_colors(scale_color(srgb("#1f3566"), 1 + 0.2 * smooth(u, v, 1.0)), srgb("#c9d2dc"), 0.85 * panel)
+    return mix_colors(color, srgb("#7f93b8"), 0.3 * cell), np.full(len(u), 0.5, np.float32)
 
 
 def plain(s: Surface) -> AlbedoAndGloss:
     """A colour and nothing else."""
-    return _matt(s.colour)
+    return _matt(s.color)

@@ -138,14 +138,14 @@ def _distant(over: FlightArea) -> FlightPlan:
 
 def _orbits(over: FlightArea) -> FlightPlan:
     """Two rings of photographs about each landmark, all looking at its foot."""
-    centres = np.resize(np.arange(len(over.landmarks)), over.count)
+    centers = np.resize(np.arange(len(over.landmarks)), over.count)
     rank = np.arange(over.count) // len(over.landmarks)
     rings = np.where(rank % 2 == 0, 0.75, 1.25) * over.altitude
-    turn = over.phase + centres + 2 * np.pi * rank / max(1, over.count // len(over.landmarks))
+    turn = over.phase + centers + 2 * np.pi * rank / max(1, over.count // len(over.landmarks))
     away = np.stack([np.cos(turn), np.sin(turn)], 1)
     climb = np.where(rank % 2 == 0, 0.95, _OBLIQUE_CLIMB)
     tilt = np.arctan2(rings, climb * over.altitude)
-    place = over.landmarks[centres] + rings[:, None] * away
+    place = over.landmarks[centers] + rings[:, None] * away
     return FlightPlan(place, tilt, np.arctan2(-away[:, 0], -away[:, 1]), climb)
 
 

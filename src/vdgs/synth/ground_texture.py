@@ -46,7 +46,7 @@ def _meadow(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
 
 
 def _slabs(
-    x: np.ndarray, y: np.ndarray, footprint: np.ndarray, size: float, colour: np.ndarray, vary: float
+    x: np.ndarray, y: np.ndarray, footprint: np.ndarray, size: float, color: np.ndarray, vary: float
 ) -> np.ndarray:
     """Square slabs, each a little lighter or darker, with dark joints."""
     u, v = x / np.float32(size), y / np.float32(size)
@@ -54,7 +54,7 @@ def _slabs(
     tint = 1 + vary * (cells(i, j) - 0.5) * fade(size, footprint) + 0.05 * smooth(x, y, 1.9)
     edge = np.maximum(np.abs(u - i - 0.5), np.abs(v - j - 0.5))
     joint = line((0.5 - edge) * size, 0.035, footprint) * 0.4
-    return scale_color(colour, (tint + 0.05 * smooth(x, y, 0.3, footprint)) * (1 - joint))
+    return scale_color(color, (tint + 0.05 * smooth(x, y, 0.3, footprint)) * (1 - joint))
 
 
 def _asphalt(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
@@ -141,10 +141,10 @@ def _rows(
     wander = x + 0.25 * np.sin(y * np.float32(0.21))
     ridge = 0.5 + 0.5 * np.cos(wander * np.float32(2 * np.pi / period)) * fade(period, footprint)
     grown = np.clip(ridge + 0.2 * smooth(x, y, 0.4, footprint), 0, 1)
-    colour = mix_colors(furrow, crop, grown) * (1 + 0.1 * smooth(x, y, 11.0) + 0.07 * smooth(y, x, 2.1))[:, None]
+    color = mix_colors(furrow, crop, grown) * (1 + 0.1 * smooth(x, y, 11.0) + 0.07 * smooth(y, x, 2.1))[:, None]
     tram = np.abs((wander / np.float32(18.0)) % 1 - 0.5) * 18.0
     track = np.maximum(line(tram - 0.8, 0.25, footprint), line(tram + 0.8, 0.25, footprint))
-    return mix_colors(colour, furrow, 0.7 * track).astype(np.float32)
+    return mix_colors(color, furrow, 0.7 * track).astype(np.float32)
 
 
 def _wheat(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
@@ -198,22 +198,22 @@ def _open_land(p: np.ndarray, q: np.ndarray, footprint: np.ndarray) -> np.ndarra
     j = np.floor((b + shift) / 84)
     kind, turned = cells(i, j, 6), cells(i, j, 7) < 0.5
     u, v = np.where(turned, b, a), np.where(turned, a, b)
-    colour = np.empty((len(p), 3), np.float32)
+    color = np.empty((len(p), 3), np.float32)
     crops = (_meadow, _wheat, _greens, _ploughed, _lawn, _lavender)
     bounds = np.array([0.3, 0.52, 0.7, 0.82, 0.95])
     which = np.searchsorted(bounds, kind)
     for k, paint in enumerate(crops):
         at = np.flatnonzero(which == k)
         if len(at):
-            colour[at] = paint(u[at], v[at], footprint[at])
+            color[at] = paint(u[at], v[at], footprint[at])
     edge = np.minimum(31 - np.abs(a / 62 - i - 0.5) * 62, 42 - np.abs((b + shift) / 84 - j - 0.5) * 84)
     verge = np.clip((1.6 + 0.5 * smooth(p, q, 2.0) - edge) * 2, 0, 1)
-    return mix_colors(colour, _woods(p, q, footprint), verge)
+    return mix_colors(color, _woods(p, q, footprint), verge)
 
 
-def _street_colours(
+def _street_colors(
     along: np.ndarray, across: np.ndarray, half: np.ndarray, gap: np.ndarray, footprint: np.ndarray,
-    colour: np.ndarray,
+    color: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
     """Markings on a carriageway: centre dashes, edge lines on main streets, zebras before crossings.
 
@@ -229,11 +229,11 @@ def _street_colours(
     stop = (np.abs(gap - 5.6) < 0.2) & (np.abs(across) < half - 0.3)
     paint = np.maximum(paint, stop * np.float32(0.9))
     wheel = np.exp(-((np.abs(np.abs(across) - 0.5 * half) - 0.75) ** 2) * 6)
-    worn = colour * (1 - 0.1 * wheel)[:, None]
+    worn = color * (1 - 0.1 * wheel)[:, None]
     return mix_colors(worn, _WHITE * 0.9, paint * (0.82 + 0.1 * smooth(along, across, 0.8)))
 
 
-def _streets(plan: StreetPlan, p: np.ndarray, q: np.ndarray, footprint: np.ndarray, colour: np.ndarray) -> np.ndarray:
+def _streets(plan: StreetPlan, p: np.ndarray, q: np.ndarray, footprint: np.ndarray, color: np.ndarray) -> np.ndarray:
     """Draw carriageways, kerbs and pavements over whatever lies below."""
     by_p, by_q = plan.nearest_street(p, q)
     out_p, out_q = by_p.outside, by_q.outside
@@ -245,7 +245,7 @@ def _streets(plan: StreetPlan, p: np.ndarray, q: np.ndarray, footprint: np.ndarr
     beyond = np.where(rounded, np.minimum(corner, nearest), nearest)
     paved = np.flatnonzero(beyond < PAVEMENT)
     if not len(paved):
-        return colour
+        return color
     p, q, fp = p[paved], q[paved], footprint[paved]
     beyond, out_p, out_q = beyond[paved], out_p[paved], out_q[paved]
     surface = _pavement(p, q, fp)
@@ -259,11 +259,11 @@ def _streets(plan: StreetPlan, p: np.ndarray, q: np.ndarray, footprint: np.ndarr
     ):
         on = np.flatnonzero((inside[road] < 0) & (other[road] > 0))
         at = road[on]
-        tar[on] = _street_colours(along[at], across[at], half[at], other[at], fp[at], tar[on])
+        tar[on] = _street_colors(along[at], across[at], half[at], other[at], fp[at], tar[on])
     gutter = np.clip(1 + beyond[road] / 0.5, 0, 1) * 0.16
     surface[road] = tar * (1 - gutter)[:, None]
-    colour[paved] = surface
-    return colour
+    color[paved] = surface
+    return color
 
 
 def ground_albedo(
@@ -277,18 +277,18 @@ def ground_albedo(
     exact = zones.sample(x, y)
     ruled = np.isin(exact, (LandUse.LINE, LandUse.PATIO, LandUse.DRIVE, LandUse.SQUARE, LandUse.ASPHALT, LandUse.COURT))
     zone = np.where(ruled | np.isin(zone, (LandUse.LINE,)), exact, zone)
-    colour = np.empty((len(x), 3), np.float32)
+    color = np.empty((len(x), 3), np.float32)
     for kind in np.unique(zone):
         at = np.flatnonzero(zone == kind)
         if kind == LandUse.OPEN:
-            colour[at] = _open_land(p[at], q[at], footprint[at])
+            color[at] = _open_land(p[at], q[at], footprint[at])
             continue
         u, v = (p, q) if kind in _IN_PLAN else (x, y)
-        colour[at] = _PAINT[LandUse(kind)](u[at], v[at], footprint[at])
-    colour = _streets(plan, p, q, footprint, colour)
+        color[at] = _PAINT[LandUse(kind)](u[at], v[at], footprint[at])
+    color = _streets(plan, p, q, footprint, color)
     for pond in terrain.ponds:
         near = np.flatnonzero(pond.distance(x, y) < 2.0)
         if len(near):
             shore = np.clip((1.4 - pond.distance(x[near], y[near])) / 0.8, 0, 1).astype(np.float32)
-            colour[near] = mix_colors(colour[near], _sand(x[near], y[near], footprint[near]) * 0.75, shore)
-    return colour
+            color[near] = mix_colors(color[near], _sand(x[near], y[near], footprint[near]) * 0.75, shore)
+    return color

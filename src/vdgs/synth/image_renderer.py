@@ -44,7 +44,7 @@ def pixel_rays(camera: Camera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return origins.astype(np.float32), directions.astype(np.float32)
 
 
-def pixel_centres(camera: Camera) -> np.ndarray:
+def pixel_centers(camera: Camera) -> np.ndarray:
     """Image places of all pixel centres, row by row, [height * width, 2]."""
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     return np.stack([x.ravel(), y.ravel()], 1)
@@ -54,11 +54,11 @@ def render_image(
     town: Town, tracer: RayTracer, sky: SkyMap, camera: Camera, samples: int, gain: np.ndarray
 ) -> np.ndarray:
     """The picture that a camera takes, [height, width, 3] uint8; `gain` [3] is its exposure, per channel."""
-    centres, offsets = pixel_centres(camera), pixel_sample_offsets(samples)
+    centers, offsets = pixel_centers(camera), pixel_sample_offsets(samples)
     step = max(1, _CHUNK // samples)
     rows = []
-    for start in range(0, len(centres), step):
-        pixels = centres[start : start + step, None] + offsets
+    for start in range(0, len(centers), step):
+        pixels = centers[start : start + step, None] + offsets
         rays = pixel_rays(camera, pixels.reshape(-1, 2))
         light, _ = radiance(town, tracer, sky, *rays, 1 / camera.fx)
         rows.append(tone_map(light.reshape(-1, samples, 3).mean(1) * gain.astype(np.float32)))

@@ -14,10 +14,10 @@ from vdgs.synth.zones import LandUse, LandUseMap
 
 SUN = np.array([-0.52, -0.44, 0.78], np.float32)
 SUN = SUN / np.linalg.norm(SUN)
-SUN_COLOUR = np.array([2.75, 2.45, 1.98], np.float32)
-SKY_COLOUR = np.array([0.46, 0.62, 0.92], np.float32)
-BOUNCE_COLOUR = np.array([0.26, 0.24, 0.17], np.float32)
-HORIZON_COLOUR = np.array([0.80, 0.88, 0.98], np.float32)
+SUN_COLOR = np.array([2.75, 2.45, 1.98], np.float32)
+SKY_COLOR = np.array([0.46, 0.62, 0.92], np.float32)
+BOUNCE_COLOR = np.array([0.26, 0.24, 0.17], np.float32)
+HORIZON_COLOR = np.array([0.80, 0.88, 0.98], np.float32)
 
 #: Side of a cell (m), twice that on maps larger than `_LARGE` (m from the middle).
 _CELL, _LARGE = 0.5, 300.0
@@ -89,10 +89,10 @@ def _openness(tracer: RayTracer, terrain: Terrain, x: np.ndarray, y: np.ndarray,
     return free / _RAYS
 
 
-def sky_colour(directions: np.ndarray) -> np.ndarray:
+def sky_color(directions: np.ndarray) -> np.ndarray:
     """Radiance of the clear sky along unit directions, [n, 3]."""
     up = np.clip(directions[:, 2:3], 0, 1) ** np.float32(0.6)
-    return HORIZON_COLOUR + (SKY_COLOUR * 0.75 - HORIZON_COLOUR) * up
+    return HORIZON_COLOR + (SKY_COLOR * 0.75 - HORIZON_COLOR) * up
 
 
 def tone_map(radiance: np.ndarray) -> np.ndarray:

@@ -43,7 +43,7 @@ class Mesh:
     vertices: np.ndarray
     faces: np.ndarray
     material: np.ndarray
-    colour: np.ndarray
+    color: np.ndarray
     seed: np.ndarray
     uv: np.ndarray
     panel: np.ndarray
@@ -66,19 +66,19 @@ class _Skins:
     """Materials, colours and seeds of many polygons or parts."""
 
     material: list[int]
-    colour: list[np.ndarray]
+    color: list[np.ndarray]
     seed: list[float]
 
-    def add(self, material: Material, colour: np.ndarray, seed: float) -> None:
+    def add(self, material: Material, color: np.ndarray, seed: float) -> None:
         self.material.append(int(material))
-        self.colour.append(colour)
+        self.color.append(color)
         self.seed.append(seed)
 
     def repeated(self, counts: int | np.ndarray) -> dict[str, np.ndarray]:
         """One row per triangle, where polygon k has counts[k] of them."""
         return {
             "material": np.repeat(np.array(self.material, np.uint8), counts),
-            "colour": np.repeat(np.array(self.colour, np.float32), counts, axis=0),
+            "color": np.repeat(np.array(self.color, np.float32), counts, axis=0),
             "seed": np.repeat(np.array(self.seed, np.float32), counts),
         }
 
@@ -95,21 +95,21 @@ class MeshBuilder:
         self._parts: list[dict[str, np.ndarray]] = []
         self._part_skins = _Skins([], [], [])
 
-    def polygon(self, corners: np.ndarray, material: Material, colour: np.ndarray, seed: float = 0.0) -> None:
+    def polygon(self, corners: np.ndarray, material: Material, color: np.ndarray, seed: float = 0.0) -> None:
         """A planar convex polygon [k, 3], anticlockwise from outside.
 
         Its texture runs from the lowest coordinates, u along the first edge and v across it, in metres.
         """
         rings, skins = self._polygons.setdefault(len(corners), ([], _Skins([], [], [])))
         rings.append(corners)
-        skins.add(material, colour, seed)
+        skins.add(material, color, seed)
 
     def part(
         self,
         vertices: np.ndarray,
         faces: np.ndarray,
         material: Material,
-        colour: np.ndarray,
+        color: np.ndarray,
         seed: float,
         *,
         uv: np.ndarray,
@@ -129,7 +129,7 @@ class MeshBuilder:
                 "normals": np.asarray(normals, np.float32),
             }
         )
-        self._part_skins.add(material, colour, seed)
+        self._part_skins.add(material, color, seed)
 
     def build(self) -> Mesh:
         """Everything collected so far as one mesh."""

@@ -17,10 +17,10 @@ def foliage(s: Surface) -> AlbedoAndGloss:
     height = np.where(crown, 0.7 + 0.38 * s.uv[:, 1], np.clip(0.6 + 0.5 * s.normal[:, 2], 0.5, 1.05))
     leaves = 1 + 0.26 * smooth(u, v, 0.6, s.footprint) + 0.26 * smooth(v, u, 0.27, s.footprint)
     leaves = leaves + 0.1 * smooth(u, v, 1.9)
-    colour = scale_color(s.colour, hollow * height * np.clip(leaves, 0.3, 1.8))
+    color = scale_color(s.color, hollow * height * np.clip(leaves, 0.3, 1.8))
     warm = np.clip(height - 0.85, 0, 0.3) * hollow
-    colour *= 1 + warm[:, None] * np.array([0.9, 0.5, -0.2], np.float32)
-    return colour, np.zeros(len(u), np.float32)
+    color *= 1 + warm[:, None] * np.array([0.9, 0.5, -0.2], np.float32)
+    return color, np.zeros(len(u), np.float32)
 
 
 def _facing_plane(s: Surface) -> tuple[np.ndarray, np.ndarray]:
@@ -33,7 +33,7 @@ def _facing_plane(s: Surface) -> tuple[np.ndarray, np.ndarray]:
 def bark(s: Surface) -> AlbedoAndGloss:
     """Bark with upright ridges."""
     ridges = 1 + 0.25 * smooth(s.uv[:, 0] * 4, s.uv[:, 1], 0.6, s.footprint)
-    return scale_color(s.colour, ridges), np.zeros(len(ridges), np.float32)
+    return scale_color(s.color, ridges), np.zeros(len(ridges), np.float32)
 
 
 def water(s: Surface) -> AlbedoAndGloss:
@@ -41,4 +41,4 @@ def water(s: Surface) -> AlbedoAndGloss:
     x, y = s.position[:, 0], s.position[:, 1]
     ripples = 1 + 0.1 * smooth(x, y * 1.6, 1.1, s.footprint) + 0.16 * smooth(x, y, 6.0)
     ripples = ripples + 0.07 * smooth(y, x, 0.5, s.footprint)
-    return scale_color(s.colour, ripples), np.full(len(x), 1.0, np.float32)
+    return scale_color(s.color, ripples), np.full(len(x), 1.0, np.float32)

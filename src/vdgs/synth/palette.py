@@ -45,6 +45,6 @@ GOLD = srgb("#d9b13a")
 STRAW = srgb("#d8b765")
 
 
-def pick(rng: np.random.Generator, colours: list[np.ndarray], vary: float = 0.08) -> np.ndarray:
+def pick(rng: np.random.Generator, colors: list[np.ndarray], vary: float = 0.08) -> np.ndarray:
     """One of the colours, a little lighter or darker."""
-    return colours[rng.integers(len(colours))] * np.float32(1 + rng.uniform(-vary, vary))
+    return colors[rng.integers(len(colors))] * np.float32(1 + rng.uniform(-vary, vary))

@@ -69,10 +69,10 @@ def _plain_house(site: Site, frame: ObjectFrame) -> None:
     rng = site.rng
     w, d, storeys = rng.uniform(4.0, 6.5), rng.uniform(3.4, 4.2), int(rng.integers(1, 3))
     body = Box(x0=-w, x1=w, y0=-d, y1=d, z0=-1.5, z1=storeys * STOREY_HEIGHT + 0.3)
-    colour, seed, pitch = palette.pick(rng, palette.PLASTER), float(rng.random()), rng.uniform(0.65, 0.95)
+    color, seed, pitch = palette.pick(rng, palette.PLASTER), float(rng.random()), rng.uniform(0.65, 0.95)
     roof = SurfaceMaterial(Material.TILES, palette.pick(rng, palette.ROOF_TILES), seed)
-    box(site.builder, frame, body, SurfaceMaterial(Material.WINDOWS, colour, seed))
-    gables(site.builder, frame, body, pitch, SurfaceMaterial(Material.PLASTER, colour, seed))
+    box(site.builder, frame, body, SurfaceMaterial(Material.WINDOWS, color, seed))
+    gables(site.builder, frame, body, pitch, SurfaceMaterial(Material.PLASTER, color, seed))
     pitched_roof(site.builder, frame, body, pitch, roof)
 
 

@@ -34,8 +34,8 @@ def car(builder: MeshBuilder, frame: ObjectFrame, rng: np.random.Generator) -> N
 
 def bus(builder: MeshBuilder, frame: ObjectFrame, rng: np.random.Generator) -> None:
     """A bus, its nose towards local +x."""
-    colour = palette.pick(rng, palette.CAR[:6])
-    paint, roof = SurfaceMaterial(Material.PAINT, colour, 0.9), SurfaceMaterial(Material.PAINT, palette.TRIM)
+    color = palette.pick(rng, palette.CAR[:6])
+    paint, roof = SurfaceMaterial(Material.PAINT, color, 0.9), SurfaceMaterial(Material.PAINT, palette.TRIM)
     glass = SurfaceMaterial(Material.GLASS, palette.DARK, 0.5)
     box(builder, frame, Box(x0=-5, x1=5, y0=-1.2, y1=1.2, z0=0.35, z1=1.5), paint)
     box(builder, frame, Box(x0=-5, x1=5, y0=-1.2, y1=1.2, z0=1.5, z1=2.5), glass)

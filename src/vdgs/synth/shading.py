@@ -6,7 +6,7 @@ import numpy as np
 
 from vdgs.synth import facades, nature
 from vdgs.synth.ground_texture import ground_albedo
-from vdgs.synth.lighting import BOUNCE_COLOUR, SKY_COLOUR, SUN, SUN_COLOUR, SkyMap, sky_colour
+from vdgs.synth.lighting import BOUNCE_COLOR, SKY_COLOR, SUN, SUN_COLOR, SkyMap, sky_color
 from vdgs.synth.mesh import Material
 from vdgs.synth.ray_tracing import RayHits, RayTracer
 from vdgs.synth.surface import Surface
@@ -56,7 +56,7 @@ def surface_at(
         normal=normal,
         uv=uv,
         panel=mesh.panel[triangle],
-        colour=mesh.colour[triangle],
+        color=mesh.color[triangle],
         seed=mesh.seed[triangle],
         footprint=hits.distance * np.float32(pixel_angle),
         view=directions,
@@ -66,7 +66,7 @@ def surface_at(
 
 def _albedo(town: Town, surface: Surface, material: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Albedo [n, 3] and gloss [n] of every place."""
-    albedo, gloss = np.empty_like(surface.colour), np.zeros(len(material), np.float32)
+    albedo, gloss = np.empty_like(surface.color), np.zeros(len(material), np.float32)
     for kind in np.unique(material):
         at = np.flatnonzero(material == kind)
         if kind == Material.GROUND:
@@ -102,7 +102,7 @@ def radiance(
     `pixel_angle` is the angle between neighbouring pixels in radians.
     """
     hits = tracer.intersect(origins, directions)
-    light = sky_colour(directions)
+    light = sky_color(directions)
     met = np.flatnonzero(hits.triangle >= 0)
     if not len(met):
         return light, hits
@@ -117,8 +117,8 @@ def radiance(
     sun[lit] = facing[lit] * clear
     share = _ambient(town, sky, surface, flat, material).astype(np.float32)
     up = 0.5 + 0.5 * surface.normal[:, 2]
-    arriving = sun[:, None] * SUN_COLOUR + (share * up)[:, None] * SKY_COLOUR
-    arriving += ((0.4 + 0.6 * share) * (1 - 0.75 * up))[:, None] * BOUNCE_COLOUR
+    arriving = sun[:, None] * SUN_COLOR + (share * up)[:, None] * SKY_COLOR
+    arriving += ((0.4 + 0.6 * share) * (1 - 0.75 * up))[:, None] * BOUNCE_COLOR
     light[met] = albedo * arriving + _reflection(surface, gloss, sun)
     return light, hits
 
@@ -134,5 +134,5 @@ def _reflection(surface: Surface, gloss: np.ndarray, sun: np.ndarray) -> np.ndar
     mirrored = view + 2 * cosine[:, None] * normal
     fresnel = gloss[at] * (0.06 + 0.94 * (1 - cosine) ** 5)
     glint = np.clip(mirrored @ SUN, 0, 1) ** 90 * 4.0 * (sun[at] > 0) * gloss[at]
-    out[at] = fresnel[:, None] * sky_colour(mirrored) + (0.2 * glint)[:, None] * SUN_COLOUR
+    out[at] = fresnel[:, None] * sky_color(mirrored) + (0.2 * glint)[:, None] * SUN_COLOR
     return out

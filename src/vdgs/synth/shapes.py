@@ -60,13 +60,13 @@ class SurfaceMaterial:
     """Material, linear colour and seed of a surface."""
 
     material: Material
-    colour: np.ndarray
+    color: np.ndarray
     seed: float = 0.0
 
 
 def face(builder: MeshBuilder, frame: ObjectFrame, corners: np.ndarray, skin: SurfaceMaterial) -> None:
     """One planar polygon given in local coordinates."""
-    builder.polygon(frame.to_world(corners), skin.material, skin.colour, skin.seed)
+    builder.polygon(frame.to_world(corners), skin.material, skin.color, skin.seed)
 
 
 def box(
@@ -81,9 +81,9 @@ def box(
     corners = frame.to_world(shape.corners(*inset))
     skins = sides if isinstance(sides, tuple) else (sides,) * 4
     for ring, skin in zip(corners[SIDES], skins, strict=True):
-        builder.polygon(ring, skin.material, skin.colour, skin.seed)
+        builder.polygon(ring, skin.material, skin.color, skin.seed)
     if top is not None:
-        builder.polygon(corners[4:], top.material, top.colour, top.seed)
+        builder.polygon(corners[4:], top.material, top.color, top.seed)
 
 
 def frustum(
@@ -102,6 +102,6 @@ def frustum(
     high = np.column_stack([ring * max(radii[1], 1e-3), np.full(sides, heights[1])])
     low, high = frame.to_world(low), frame.to_world(high)
     for quad in np.stack([low, np.roll(low, -1, 0), np.roll(high, -1, 0), high], axis=1):
-        builder.polygon(quad, skin.material, skin.colour, skin.seed)
+        builder.polygon(quad, skin.material, skin.color, skin.seed)
     if cap is not None:
-        builder.polygon(high, cap.material, cap.colour, cap.seed)
+        builder.polygon(high, cap.material, cap.color, cap.seed)

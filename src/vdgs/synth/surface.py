@@ -20,7 +20,7 @@ class Surface:
     normal: np.ndarray
     uv: np.ndarray
     panel: np.ndarray
-    colour: np.ndarray
+    color: np.ndarray
     seed: np.ndarray
     footprint: np.ndarray
     view: np.ndarray
@@ -35,6 +35,6 @@ def mix_colors(a: np.ndarray, b: np.ndarray, share: np.ndarray) -> np.ndarray:
     return a + (b - a) * share[:, None]
 
 
-def scale_color(colour: np.ndarray, factor: np.ndarray) -> np.ndarray:
+def scale_color(color: np.ndarray, factor: np.ndarray) -> np.ndarray:
     """A colour [3] or [n, 3] times a factor [n], [n, 3] float32."""
-    return (colour * factor[:, None]).astype(np.float32)
+    return (color * factor[:, None]).astype(np.float32)

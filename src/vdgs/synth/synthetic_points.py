@@ -28,7 +28,7 @@ class SeedPoints:
     """Places [n, 3] (m, float64) picked in one image, and their colours [n, 3] uint8."""
 
     points: np.ndarray
-    colours: np.ndarray
+    colors: np.ndarray
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -40,7 +40,7 @@ class SparseCloud:
 
     true_points: np.ndarray
     points: np.ndarray
-    colours: np.ndarray
+    colors: np.ndarray
     errors: np.ndarray
     observed_point: np.ndarray
     observed_image: np.ndarray
@@ -53,8 +53,8 @@ def sample_seed_points(
     tracer: RayTracer, camera: Camera, image: np.ndarray, count: int, rng: np.random.Generator
 ) -> SeedPoints:
     """About `count` surface places seen in an image [height, width, 3] uint8, denser where it has texture."""
-    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    slope = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
+    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    slope = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1))
     weight = (np.minimum(cv2.GaussianBlur(slope, (0, 0), 1.0), 150) + 4).astype(np.float64).ravel()
     chosen = rng.choice(len(weight), min(count, len(weight)), replace=False, p=weight / weight.sum())
     row, column = np.divmod(chosen, camera.width)
@@ -137,13 +137,13 @@ def make_sparse_cloud(
     """At most `count` points out of the seeds of all images (`seeds[k]` from `cameras[k]`), all seen in
     at least two pictures. O(points x images): a byte of memory for each."""
     places = np.concatenate([seed.points for seed in seeds])
-    colours = np.concatenate([seed.colours for seed in seeds])
+    colors = np.concatenate([seed.colors for seed in seeds])
     home = np.repeat(np.arange(len(seeds)), [len(seed.points) for seed in seeds])
     visible = visibility_matrix(tracer, cameras, places)
     matched = _recognized_views(cameras, places, home, visible, rng)
     good = np.flatnonzero(matched.sum(1) >= 2)
     kept = np.sort(rng.permutation(good)[:count])
-    places, colours, visible, matched = places[kept], colours[kept], visible[kept], matched[kept]
+    places, colors, visible, matched = places[kept], colors[kept], visible[kept], matched[kept]
     point, image = np.nonzero(matched)
     truth = np.empty((len(point), 2))
     of_image = observations_by_image(image, len(cameras))
@@ -158,6 +158,6 @@ def make_sparse_cloud(
     errors = np.bincount(point, residual, len(places)) / np.maximum(np.bincount(point, minlength=len(places)), 1)
     wrong = np.zeros(len(places), bool)
     return SparseCloud(
-        true_points=places, points=points, colours=colours, errors=errors, observed_point=point, observed_image=image,
+        true_points=places, points=points, colors=colors, errors=errors, observed_point=point, observed_image=image,
         observed_px=observed, visibility=visible, outliers=wrong,
     )  # fmt: skip

@@ -109,7 +109,7 @@ def _conifer_crown(variant: int) -> TreeCrown:
 
 
 def _plant(
-    builder: MeshBuilder, crown: TreeCrown, at: ObjectFrame, size: np.ndarray, colour: np.ndarray, seed: float
+    builder: MeshBuilder, crown: TreeCrown, at: ObjectFrame, size: np.ndarray, color: np.ndarray, seed: float
 ) -> None:
     """A crown scaled by `size` [3] and stood at a frame."""
     cos, sin = np.cos(at.angle), np.sin(at.angle)
@@ -117,7 +117,7 @@ def _plant(
     normals = (crown.normals / size) @ turn.T
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     builder.part(
-        at.to_world(crown.vertices * size), crown.faces, Material.FOLIAGE, colour, seed,
+        at.to_world(crown.vertices * size), crown.faces, Material.FOLIAGE, color, seed,
         uv=crown.openness, panel=size[[0, 2]], normals=normals,
     )  # fmt: skip
 
@@ -139,11 +139,11 @@ def tree(
     seed, variant = float(rng.random()), int(rng.integers(6))
     bark = SurfaceMaterial(Material.BARK, palette.BARK)
     if kind == "conifer":
-        colour = palette.pick(rng, palette.NEEDLES)
+        color = palette.pick(rng, palette.NEEDLES)
         frustum(builder, at, (0.25, 0.2), (-0.5, 0.2 * tall), bark, None, 6)
         radius = tall * rng.uniform(0.2, 0.27)
         size = np.array([radius, radius, 0.46 * tall])
-        _plant(builder, _conifer_crown(variant), at.child(0, 0, 0.56 * tall), size, colour, seed)
+        _plant(builder, _conifer_crown(variant), at.child(0, 0, 0.56 * tall), size, color, seed)
         return
     leaves = {"blossom": palette.BLOSSOM}.get(kind, palette.LEAVES)
     if kind == "round" and rng.random() < 0.07:
@@ -153,8 +153,8 @@ def tree(
     if kind != "bush":
         frustum(builder, at, (0.05 * wide + 0.16, 0.12), (-0.5, tall - upright), bark, None, 7)
     size = np.array([wide, wide * rng.uniform(0.88, 1.1), upright])
-    centre = at.child(0, 0, 0.35 * tall if kind == "bush" else tall - upright)
-    _plant(builder, _round_crown(variant, detail), centre, size, palette.pick(rng, leaves, 0.15), seed)
+    center = at.child(0, 0, 0.35 * tall if kind == "bush" else tall - upright)
+    _plant(builder, _round_crown(variant, detail), center, size, palette.pick(rng, leaves, 0.15), seed)
 
 
 def hedge(builder: MeshBuilder, frame: ObjectFrame, length: float, height: float = 1.1) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from vdgs.geometry.camera import Camera
-from vdgs.synth.image_renderer import pixel_centres, pixel_rays
+from vdgs.synth.image_renderer import pixel_centers, pixel_rays
 from vdgs.synth.mesh import Mesh
 from vdgs.synth.ray_tracing import RayTracer
 
@@ -66,7 +66,7 @@ def view_ground_truth(
     """Per pixel centre of a view (every `step`-th pixel): depth along the viewing axis, float32 m, inf for sky; and how
     many training cameras truly see the place met, uint16, 0 for sky. Both [height / step, width / step]."""
     shape = -(-camera.height // step), -(-camera.width // step)
-    pixels = pixel_centres(camera).reshape(camera.height, camera.width, 2)[::step, ::step].reshape(-1, 2)
+    pixels = pixel_centers(camera).reshape(camera.height, camera.width, 2)[::step, ::step].reshape(-1, 2)
     origins, directions = pixel_rays(camera, pixels)
     hits = tracer.intersect(origins, directions)
     met = np.flatnonzero(hits.triangle >= 0)
@@ -82,8 +82,8 @@ def sample_surface_points(mesh: Mesh, half_size: float, count: int, rng: np.rand
     """About `count` places [n, 3] spread evenly by area over all surfaces, inside and out, of a square around the
     origin; a place that nobody can see is among them like any other."""
     corners = mesh.vertices[mesh.faces]
-    centre = corners[..., :2].mean(1)
-    near = np.flatnonzero((np.abs(centre) < half_size).all(1))
+    center = corners[..., :2].mean(1)
+    near = np.flatnonzero((np.abs(center) < half_size).all(1))
     corners = corners[near].astype(np.float64)
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     chosen = corners[rng.choice(len(near), count, p=area / area.sum())]

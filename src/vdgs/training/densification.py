@@ -214,15 +214,15 @@ def _fill_cells(
 
 
 def _anchors_at(
-    centres: Float[Tensor, "c 3"], place: Int64[Tensor, " p"], parents: _Parents, anchors: Anchors, cell: float
+    centers: Float[Tensor, "c 3"], place: Int64[Tensor, " p"], parents: _Parents, anchors: Anchors, cell: float
 ) -> tuple[Anchors, int]:
-    """New anchors at `centres`, the features the maximum of their parents', and how many have a parent in L."""
-    kernels, k, count = get_backend(centres.device), anchors.offsets.shape[1], len(centres)
+    """New anchors at `centers`, the features the maximum of their parents', and how many have a parent in L."""
+    kernels, k, count = get_backend(centers.device), anchors.offsets.shape[1], len(centers)
     new = Anchors(
-        positions=centres,
+        positions=centers,
         features=kernels.group_max(anchors.features[parents.index // k], place, count).reshape(count, FEATURE_SIZE),
-        offsets=centres.new_zeros(count, k, 3),
-        log_scales=centres.new_full((count, 6), math.log(cell)),
+        offsets=centers.new_zeros(count, k, 3),
+        log_scales=centers.new_full((count, 6), math.log(cell)),
     )
     return new, len(place[parents.low].unique())
 

@@ -22,21 +22,21 @@ def mean_image_color(
     total, pixels = np.zeros(3), 0
     for index in np.unique(np.linspace(0, count - 1, min(count, max_images)).astype(int)):
         image, mask = images.get(int(index), downscale)
-        colours = image.numpy().reshape(-1, 3) if mask is None else image.numpy()[mask.numpy() > 0]
-        total += colours.sum(0, dtype=np.float64)
-        pixels += len(colours)
+        colors = image.numpy().reshape(-1, 3) if mask is None else image.numpy()[mask.numpy() > 0]
+        total += colors.sum(0, dtype=np.float64)
+        pixels += len(colors)
     red, green, blue = (float(np.float32(value)) for value in total / (255.0 * max(pixels, 1)))
     return red, green, blue
 
 
 def background_at(stage: TrainingProblem, iteration: int) -> Tensor:
     """Colour [3] behind the scene at this iteration (from 0): from its own to a random one of the RGB cube."""
-    colour, share = torch.tensor(stage.background), stage.config.loss.random_background
+    color, share = torch.tensor(stage.background), stage.config.loss.random_background
     if share:
         generator = torch.Generator().manual_seed(stage.config.seed * 1_000_033 + iteration)
         # Drawn on the CPU: the same colours for any device.
-        colour = torch.lerp(colour, torch.rand(3, generator=generator), share)
-    return colour.to(stage.device, non_blocking=True)
+        color = torch.lerp(color, torch.rand(3, generator=generator), share)
+    return color.to(stage.device, non_blocking=True)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -191,7 +191,7 @@ def initial_state(anchors: Anchors, decoder: Decoder, stage: TrainingProblem) ->
         shared = stage.kind == "block" and name.startswith(("appearance", "exposure"))
         tensor.requires_grad_(not stage.frozen_decoder and not shared)
     compensation = CompensationState.zeros(n, k, device) if stage.config.compensation.enabled else None
-    optimiser = AnchorOptimizer.zeros(anchors, decoder)
+    optimizer = AnchorOptimizer.zeros(anchors, decoder)
     largest = stage.max_log_scale_at(anchors.positions)
     statistics = DensificationStats.zeros(n, k, device)
     return TrainingState(
@@ -199,7 +199,7 @@ def initial_state(anchors: Anchors, decoder: Decoder, stage: TrainingProblem) ->
         anchors=anchors,
         decoder=decoder,
         statistics=statistics,
-        optimizer=optimiser,
+        optimizer=optimizer,
         max_log_scale=largest,
         compensation=compensation,
     )

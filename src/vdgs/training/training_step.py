@@ -36,7 +36,7 @@ class RenderedTrainingView:
 
     image: Float[Tensor, "h w 3"]
     source: SplatSources
-    colours: Float[Tensor, "m 3"]
+    colors: Float[Tensor, "m 3"]
     opacities: Float[Tensor, " m"]
     #: Mean volume of the splats; NaN if there are none.
     volume: Float[Tensor, ""]
@@ -52,8 +52,8 @@ class RenderedTrainingView:
         # In float32, as autograd divides.
         volume = float(torch.tensor(volume_weight) / m) if m else 0.0
         return SplatGradients(
-            means_px=found.means_px, conics=found.conics, colours=found.colours, opacities=found.opacities,
-            volume=volume, source=self.source, color_values=self.colours, opacity_values=self.opacities,
+            means_px=found.means_px, conics=found.conics, colors=found.colors, opacities=found.opacities,
+            volume=volume, source=self.source, color_values=self.colors, opacity_values=self.opacities,
         )  # fmt: skip
 
 
@@ -70,7 +70,7 @@ def render_for_training(
     kernels = get_backend(drawn.means_px.device)
     raster, pullback = kernels.rasterize_vjp(drawn, background, camera.width, camera.height)
     return RenderedTrainingView(
-        image=raster.image, source=splats.source, colours=splats.colors, opacities=splats.opacities,
+        image=raster.image, source=splats.source, colors=splats.colors, opacities=splats.opacities,
         volume=splats.volume, pullback=pullback, scratch=(drawn.means_px[:m], drawn.conics[:m]),
     )  # fmt: skip
 

@@ -25,7 +25,7 @@ from vdgs.viewer.viewer_scene import ViewerScene
 
 #: What layers are called in the panel.
 LAYER_LABELS: dict[str, Layer] = {
-    "Colour": "colour", "Depth": "depth", "V: cameras that see it": "visibility", "Alpha: how opaque": "alpha",
+    "Color": "color", "Depth": "depth", "V: cameras that see it": "visibility", "Alpha: how opaque": "alpha",
     "Blocks": "blocks", "Error against nearest photograph": "error",
 }  # fmt: skip
 MODEL_LABELS = {"Merged": "merged", "Coarse": "coarse", "Side by side": "both"}
@@ -159,7 +159,7 @@ class ClientSession:
             self._show_legend(frame.display)
 
     def _show_legend(self, display: DisplayOptions) -> None:
-        if display.layer in ("colour", "blocks"):
+        if display.layer in ("color", "blocks"):
             self._legend.visible = False
             return
         scale = self.painter.scale(display)
@@ -177,9 +177,9 @@ class ClientSession:
         self.notify("This cannot be drawn", str(error))
         if not isinstance(error, VdgsError):
             self._console.print(f"[yellow]warning[/] a picture could not be drawn: {error!r}", highlight=False)
-        if self._shown.layer != "colour" or self._shown.image_index is not None:
+        if self._shown.layer != "color" or self._shown.image_index is not None:
             self._layer.value = next(iter(LAYER_LABELS))
-            self.change_display(layer="colour", photograph=None)
+            self.change_display(layer="color", photograph=None)
 
     def notify(self, title: str, body: str) -> None:
         self.client.add_notification(title, body, auto_close_seconds=8.0)
@@ -270,9 +270,9 @@ class ClientSession:
         )  # fmt: skip
 
     def _add_points(self) -> Any:
-        points, colours = overlays.sparse_points(self.scene)
+        points, colors = overlays.sparse_points(self.scene)
         size = 2e-3 * camera_height(self.scene.capture)
-        return self.client.scene.add_point_cloud("/points", points, colours, point_size=size, precision="float32")
+        return self.client.scene.add_point_cloud("/points", points, colors, point_size=size, precision="float32")
 
 
 def is_same_view(one: Camera, other: Camera) -> bool:

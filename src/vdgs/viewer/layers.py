@@ -24,7 +24,7 @@ from vdgs.viewer.viewer_scene import ViewerScene
 if TYPE_CHECKING:
     from vdgs.rendering.scalar_maps import ColorScale
 
-Layer = Literal["colour", "depth", "visibility", "alpha", "blocks", "error"]
+Layer = Literal["color", "depth", "visibility", "alpha", "blocks", "error"]
 LAYERS: tuple[Layer, ...] = get_args(Layer)
 #: Errors from here on have the colour of the end, as a share of full brightness (choice).
 _MAX_ERROR = 0.25
@@ -40,7 +40,7 @@ _DIVIDER_COLOR = (255, 255, 255)
 class DisplayOptions:
     """What a visitor has chosen to see."""
 
-    layer: Layer = "colour"
+    layer: Layer = "color"
     #: "merged", "coarse", or "both" beside each other, the coarse one left of `split` (share of the width).
     model: str = "merged"
     split: float = 0.5
@@ -114,7 +114,7 @@ class Painter:
     ) -> UInt8[np.ndarray, "h w 3"]:
         level, count = self._scene.get_level(name, camera, max_anchors)
         self.drawn_anchors += count
-        if display.layer == "colour":
+        if display.layer == "color":
             return to_8bit(render(level.model, camera).image.cpu().numpy())
         if display.layer == "blocks":
             return _render_block_tints(level.model, level.of(self._scene.block_tint(name)), camera)
@@ -183,9 +183,9 @@ def _render_block_tints(model: AnchorModel, tints: Tensor, camera: Camera) -> UI
     rows, splats = decode_view(model, camera)
     k = model.anchors.offsets.shape[1]
     tint = tints[rows][splats.source.long() // k]
-    colours = (1 - _TINT_STRENGTH) * splats.colors.mean(dim=1, keepdim=True) + _TINT_STRENGTH * tint
+    colors = (1 - _TINT_STRENGTH) * splats.colors.mean(dim=1, keepdim=True) + _TINT_STRENGTH * tint
     background = splats.means_px.new_tensor(model.background)
-    raster = rasterize_splats(replace(splats, colors=colours.contiguous()), camera, background)
+    raster = rasterize_splats(replace(splats, colors=colors.contiguous()), camera, background)
     return to_8bit(raster.image.cpu().numpy())
 
 
@@ -195,9 +195,9 @@ def error_scale() -> ColorScale:
 
     from vdgs.rendering.scalar_maps import ColorScale
 
-    colours = mpl.colormaps["inferno"]
+    colors = mpl.colormaps["inferno"]
     numbers = (0.0, 0.05, 0.1, 0.15, 0.2, _MAX_ERROR)
     ticks = tuple((value, f"≥ {value:.0%}" if value == _MAX_ERROR else f"{value:.0%}") for value in numbers)
     titles = ("difference from the nearest photograph", "error of the photograph", "error")
-    paint: Callable[[np.ndarray], np.ndarray] = lambda values: np.asarray(colours(values / _MAX_ERROR))  # noqa: E731
+    paint: Callable[[np.ndarray], np.ndarray] = lambda values: np.asarray(colors(values / _MAX_ERROR))  # noqa: E731
     return ColorScale(titles=titles, low=0.0, high=_MAX_ERROR, ticks=ticks, colormap=paint)

@@ -81,8 +81,8 @@ def _coarse_from_checkpoint(run: RunFolder, device: str) -> OpenedRun:
             f"vdgs status {run.path}"
         )
     capture = open_capture(run)
-    colours = capture.point_colors.mean(axis=0) / 255 if len(capture.points) else np.zeros(3)
-    background = (float(colours[0]), float(colours[1]), float(colours[2]))
+    colors = capture.point_colors.mean(axis=0) / 255 if len(capture.points) else np.zeros(3)
+    background = (float(colors[0]), float(colors[1]), float(colors[2]))
     model = AnchorModel(anchors=saved.anchors, decoder=saved.decoder, voxel_size=1.0, background=background).to(
         torch.device(device)
     )

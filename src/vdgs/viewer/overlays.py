@@ -16,7 +16,7 @@ from vdgs.viewer.viewer_scene import ViewerScene, block_rgb
 _STEP, _SIZE = 0.1, 0.06
 #: Sparse points that a browser is sent at most.
 _MAX_POINTS = 150_000
-_GREY = (150, 150, 150)
+_GRAY = (150, 150, 150)
 
 LineSegments = tuple[Float[np.ndarray, "s 2 3"], UInt8[np.ndarray, "s 2 3"]]
 
@@ -24,15 +24,15 @@ LineSegments = tuple[Float[np.ndarray, "s 2 3"], UInt8[np.ndarray, "s 2 3"]]
 def block_borders(scene: ViewerScene) -> LineSegments:
     """The cores of the blocks as segments that lie on the ground, each in its block's colour."""
     lines: list[np.ndarray] = []
-    colours: list[tuple[int, int, int]] = []
+    colors: list[tuple[int, int, int]] = []
     step = _STEP * camera_height(scene.capture)
     for index, block in enumerate(scene.blocks.items if scene.blocks is not None else ()):
         ring = shapely.get_coordinates(shapely.segmentize(block.core.exterior, max(step, block.core.length / 2000)))
         draped = np.column_stack([ring, _ground_below(scene, ring)])
         segments = np.stack([draped[:-1], draped[1:]], axis=1)
         lines.append(segments)
-        colours += [block_rgb(index)] * len(segments)
-    return _segments(lines, colours)
+        colors += [block_rgb(index)] * len(segments)
+    return _segments(lines, colors)
 
 
 def _ground_below(scene: ViewerScene, points_xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
@@ -50,12 +50,12 @@ def camera_frusta(scene: ViewerScene) -> LineSegments:
     """All cameras as small frusta, in the colour of the block that they stand above."""
     views = scene.capture.views
     size = _SIZE * camera_height(scene.capture)
-    colours = [_GREY] * len(views)
+    colors = [_GRAY] * len(views)
     if scene.blocks is not None:
         owners = scene.blocks.owner(np.stack([view.camera.position[:2] for view in views]))
-        colours = [block_rgb(int(owner)) for owner in owners]
+        colors = [block_rgb(int(owner)) for owner in owners]
     lines = [_frustum(view.camera, size) for view in views]
-    return _segments(lines, [colour for colour in colours for _ in range(8)])
+    return _segments(lines, [color for color in colors for _ in range(8)])
 
 
 def _frustum(camera: Camera, size: float) -> Float[np.ndarray, "8 2 3"]:
@@ -76,8 +76,8 @@ def sparse_points(scene: ViewerScene) -> tuple[Float[np.ndarray, "n 3"], UInt8[n
     return capture.points[::every].astype(np.float32), capture.point_colors[::every]
 
 
-def _segments(lines: Sequence[np.ndarray], colours: Sequence[tuple[int, int, int]]) -> LineSegments:
+def _segments(lines: Sequence[np.ndarray], colors: Sequence[tuple[int, int, int]]) -> LineSegments:
     if not lines:
         return np.zeros((0, 2, 3), np.float32), np.zeros((0, 2, 3), np.uint8)
-    each = np.asarray(colours, np.uint8)
+    each = np.asarray(colors, np.uint8)
     return np.concatenate(lines).astype(np.float32), np.repeat(each[:, None], 2, axis=1)

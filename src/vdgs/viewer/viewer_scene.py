@@ -109,11 +109,11 @@ class ViewerScene:
         if name not in self._tints:
             positions = self.model(name).anchors.positions
             if self.blocks is None:
-                colours = np.full((len(positions), 3), 0.6)
+                colors = np.full((len(positions), 3), 0.6)
             else:
                 palette = np.stack([block_rgb(index) for index in range(len(self.blocks))])
-                colours = palette[self.blocks.owner(xy_positions(positions))] / 255.0
-            self._tints[name] = torch.as_tensor(colours, dtype=torch.float32, device=positions.device)
+                colors = palette[self.blocks.owner(xy_positions(positions))] / 255.0
+            self._tints[name] = torch.as_tensor(colors, dtype=torch.float32, device=positions.device)
         return self._tints[name]
 
     @cached_property
@@ -140,6 +140,6 @@ def block_rgb(block: int) -> tuple[int, int, int]:
     """The colour of a block in all figures, 0 to 255."""
     from vdgs.plots.partition.block_stats import block_color  # brings matplotlib: not before the first picture
 
-    colour = block_color(block).lstrip("#")
-    red, green, blue = (int(colour[place : place + 2], 16) for place in (0, 2, 4))
+    color = block_color(block).lstrip("#")
+    red, green, blue = (int(color[place : place + 2], 16) for place in (0, 2, 4))
     return red, green, blue

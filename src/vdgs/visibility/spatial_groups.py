@@ -24,7 +24,7 @@ class SpatialGroups:
     """Places along a Morton curve in groups of `GROUP_SIZE`, and the ball that holds each group (float64)."""
 
     order: Int64[Tensor, " n"]
-    centres: Float[Tensor, "g 3"]
+    centers: Float[Tensor, "g 3"]
     radii: Float[Tensor, " g"]
 
     @staticmethod
@@ -43,8 +43,8 @@ class SpatialGroups:
 
         O(n / GROUP + what it returns).
         """
-        frustum = Frusta.of([camera], self.centres.device)
-        chosen = _may_hold(self.centres, self.radii, frustum)[0].nonzero()
+        frustum = Frusta.of([camera], self.centers.device)
+        chosen = _may_hold(self.centers, self.radii, frustum)[0].nonzero()
         rows = (chosen * GROUP_SIZE + torch.arange(GROUP_SIZE, device=chosen.device)).reshape(-1)
         return self.order[rows[rows < len(self.order)]].sort().values
 
@@ -52,17 +52,17 @@ class SpatialGroups:
         """The places of each group that any camera may hold, and the numbers of such cameras: all that do, and few
         others. O(c n / GROUP)."""
         for number, rows in enumerate(self.order.split(GROUP_SIZE)):
-            held = _may_hold(self.centres[number, None], self.radii[number, None], frusta)[:, 0]
+            held = _may_hold(self.centers[number, None], self.radii[number, None], frusta)[:, 0]
             if held.any():
                 yield rows, held.nonzero().squeeze(1)
 
 
-def _may_hold(centres: Float[Tensor, "g 3"], radii: Float[Tensor, " g"], frusta: Frusta) -> Bool[Tensor, "c g"]:
+def _may_hold(centers: Float[Tensor, "g 3"], radii: Float[Tensor, " g"], frusta: Frusta) -> Bool[Tensor, "c g"]:
     """Whether frusta may touch balls."""
     turn, shift = frusta.camera_from_world[:, :3, :3], frusta.camera_from_world[:, :3, 3]
-    local = centres @ turn.transpose(1, 2) + shift[:, None]
+    local = centers @ turn.transpose(1, 2) + shift[:, None]
     x, y, z = local.permute(2, 0, 1)
-    reach = radii + ROUNDING * (radii + centres.norm(dim=1) + shift.norm(dim=1)[:, None])
+    reach = radii + ROUNDING * (radii + centers.norm(dim=1) + shift.norm(dim=1)[:, None])
     held = z + reach > NEAR_PLANE
     for focal, side, along in (
         (frusta.fx, frusta.cx, x), (-frusta.fx, frusta.width - frusta.cx, x),

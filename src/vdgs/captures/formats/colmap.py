@@ -75,7 +75,7 @@ def read_colmap(folder: Path) -> ColmapModel:
             points = (read_points3D_binary if binary else read_points3D_text)(points_file)
     except OSError as error:
         raise CaptureError(f"{error.filename or folder}: cannot be read ({error.strerror or error}).") from error
-    return ColmapModel(folder, _views(records, cameras, points, images_file), points.positions, points.colours)
+    return ColmapModel(folder, _views(records, cameras, points, images_file), points.positions, points.colors)
 
 
 def count_images(folder: Path) -> int:

@@ -21,7 +21,7 @@ class ColmapPoints(NamedTuple):
 
     point_ids: np.ndarray
     positions: np.ndarray
-    colours: np.ndarray
+    colors: np.ndarray
 
 
 def empty_points() -> ColmapPoints:

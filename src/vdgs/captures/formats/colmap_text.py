@@ -86,22 +86,22 @@ def _triples(file: Path, number: int, line: str) -> np.ndarray:
 def read_points3D_text(file: Path) -> ColmapPoints:
     numbers: list[float] = []
     positions: list[list[float]] = []
-    colours: list[list[int]] = []
+    colors: list[list[int]] = []
     for number, line in _lines(file):
         words = line.split(maxsplit=8)
         if not words:
             continue
         try:
             identifier, position = float(words[0]), [float(word) for word in words[1:4]]
-            colour = [int(word) for word in words[4:7]]
+            color = [int(word) for word in words[4:7]]
             float(words[7])
         except (ValueError, IndexError):
             raise _bad_line(file, number, "POINT3D_ID X Y Z R G B ERROR TRACK[]") from None
-        if not all(0 <= value <= 255 for value in colour):
+        if not all(0 <= value <= 255 for value in color):
             raise _bad_line(file, number, "POINT3D_ID X Y Z R G B ERROR TRACK[], colours from 0 to 255")
         numbers.append(identifier)
         positions.append(position)
-        colours.append(colour)
+        colors.append(color)
     if not positions:
         return empty_points()
-    return ColmapPoints(np.array(numbers, np.float64), np.array(positions, np.float64), np.array(colours, np.uint8))
+    return ColmapPoints(np.array(numbers, np.float64), np.array(positions, np.float64), np.array(colors, np.uint8))

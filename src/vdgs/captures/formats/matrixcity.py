@@ -78,7 +78,7 @@ def read_matrixcity(root: Path, options: CaptureOptions) -> SourceCapture:
     if len(scales) > 1:
         raise CaptureError(f"{root}: some poses are in metres and some in units of 100 m. Use one kind of pose file.")
     poses = {view.name: view.camera_from_world for view in views}
-    points, colours = find_sparse_points(root, poses, "MatrixCity's layout")
+    points, colors = find_sparse_points(root, poses, "MatrixCity's layout")
     world = WorldPrior(np.eye(3), 1.0, False, "z is up by the format")
     if CITY_PATTERN.search(str(root)) or any(CITY_PATTERN.search(view.name) for view in views):
         unit = scales.pop()
@@ -96,7 +96,7 @@ def read_matrixcity(root: Path, options: CaptureOptions) -> SourceCapture:
             for v in views
         ]
     return SourceCapture(
-        source="matrixcity", images=options.images or "", views=tuple(views), points=points, colors=colours,
+        source="matrixcity", images=options.images or "", views=tuple(views), points=points, colors=colors,
         world=world,
     )  # fmt: skip
 

@@ -58,11 +58,11 @@ def read_mega_nerf(root: Path, options: CaptureOptions) -> SourceCapture:
     for folder, split in SPLIT_FOLDERS:
         views += _read_folder(root, folder, images, split, origin, scale)
     poses = {view.name: view.camera_from_world for view in views}
-    points, colours = find_sparse_points(root, poses, "Mega-NeRF's layout", _aliases(root, views))
+    points, colors = find_sparse_points(root, poses, "Mega-NeRF's layout", _aliases(root, views))
     world = WorldPrior(GROUND_FROM_DRB, 1.0, True, "Mega-NeRF: x is down, metres by pose_scale_factor")
     folders = tuple(root / folder / images for folder, _ in SPLIT_FOLDERS)
     return SourceCapture(
-        source="mega-nerf", images=images, views=tuple(views), points=points, colors=colours, world=world,
+        source="mega-nerf", images=images, views=tuple(views), points=points, colors=colors, world=world,
         image_folders=folders,
     )  # fmt: skip
 

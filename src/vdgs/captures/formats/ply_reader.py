@@ -40,7 +40,7 @@ def read_point_cloud(file: Path) -> tuple[np.ndarray, np.ndarray]:
     header = _header(data, file)
     vertices = (_ascii if header.format == "ascii" else _binary)(data, header, file)
     points = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    return points, _colours(vertices)
+    return points, _colors(vertices)
 
 
 def _header(data: bytes, file: Path) -> _Header:
@@ -100,11 +100,11 @@ def _too_short(header: _Header, file: Path) -> CaptureError:
     )
 
 
-def _colours(vertices: np.ndarray) -> np.ndarray:
+def _colors(vertices: np.ndarray) -> np.ndarray:
     names = vertices.dtype.names or ()
     if not {"red", "green", "blue"} <= set(names):
         return np.full((len(vertices), 3), GRAY, np.uint8)
-    colours = np.stack([vertices[name].astype(np.float64) for name in ("red", "green", "blue")], axis=1)
-    colours = np.nan_to_num(colours, nan=GRAY, posinf=255, neginf=0)
-    unit = vertices["red"].dtype.kind == "f" and len(colours) and 0 < colours.max() <= 1
-    return np.clip(np.round(colours * 255 if unit else colours), 0, 255).astype(np.uint8)
+    colors = np.stack([vertices[name].astype(np.float64) for name in ("red", "green", "blue")], axis=1)
+    colors = np.nan_to_num(colors, nan=GRAY, posinf=255, neginf=0)
+    unit = vertices["red"].dtype.kind == "f" and len(colors) and 0 < colors.max() <= 1
+    return np.clip(np.round(colors * 255 if unit else colors), 0, 255).astype(np.uint8)

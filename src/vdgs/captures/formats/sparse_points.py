@@ -42,8 +42,8 @@ def find_sparse_points(
         )
     folder = max(models, key=count_images)
     model = read_colmap(folder)
-    theirs = {view.name: _centre(view.camera_from_world) for view in model.views}
-    ours = {name: _centre(pose) for name, pose in poses.items()}
+    theirs = {view.name: _center(view.camera_from_world) for view in model.views}
+    ours = {name: _center(pose) for name, pose in poses.items()}
     pairs = _match(list(theirs), list(ours), aliases or {})
     source = np.array([theirs[a] for a, _ in pairs]).reshape(-1, 3)
     target = np.array([ours[b] for _, b in pairs]).reshape(-1, 3)
@@ -65,7 +65,7 @@ def find_sparse_points(
     return similarity.apply(model.points), model.colors
 
 
-def _centre(camera_from_world: np.ndarray) -> np.ndarray:
+def _center(camera_from_world: np.ndarray) -> np.ndarray:
     return -camera_from_world[:3, :3].T @ camera_from_world[:3, 3]
 
 

@@ -94,12 +94,12 @@ def read_transforms(root: Path, options: CaptureOptions) -> SourceCapture:
     twice = find_duplicates(view.name for view in views)
     if twice:
         raise CaptureError(f"{file}: the same image occurs more than once.{format_list(twice)}")
-    points, colours = _points(root, content, file, poses)
+    points, colors = _points(root, content, file, poses)
     homogeneous = np.tile(np.eye(4), (len(points), 1, 1))
     homogeneous[:, :3, 3] = points
     moved = undo(homogeneous)[:, :3, 3]
     return SourceCapture(
-        source="transforms", images=chosen, views=tuple(views), points=moved, colors=colours,
+        source="transforms", images=chosen, views=tuple(views), points=moved, colors=colors,
         image_folders=(root / chosen,) if chosen else (),
     )  # fmt: skip
 

@@ -55,8 +55,8 @@ def _print_table(checks: list[SystemCheck]) -> None:
     for column in ("", "", "found", "what to do"):
         table.add_column(column, overflow="fold")
     for check in checks:
-        sign, colour = signs[check.state] if check.is_ok else ("✗", "bold red")
-        table.add_row(Text(sign, colour), Text(check.name), Text(check.value), Text(check.remedy))
+        sign, color = signs[check.state] if check.is_ok else ("✗", "bold red")
+        table.add_row(Text(sign, color), Text(check.name), Text(check.value), Text(check.remedy))
     console = Console()
     console.print(table)
     broken = [check.name for check in checks if not check.is_ok]

@@ -52,8 +52,8 @@ class VertexAttribute:
         return self.width * (4 if self.component == GL_FLOAT else 1)
 
     def accessor(self, count: int) -> JsonObject:
-        normalised = {"normalized": True} if self.component == GL_UNSIGNED_BYTE else {}
-        return {"componentType": self.component, "count": count, "type": self.accessor_type, **normalised}
+        normalized = {"normalized": True} if self.component == GL_UNSIGNED_BYTE else {}
+        return {"componentType": self.component, "count": count, "type": self.accessor_type, **normalized}
 
 
 def vertex_attributes(degree: int) -> list[VertexAttribute]:

@@ -238,9 +238,9 @@ def _recording(rows: UInt32[np.ndarray, "n 8"], factor: float, page: InitialView
     return base64.b64encode(recording.serialize()).decode("ascii")
 
 
-def _png(colour: tuple[float, float, float]) -> bytes:
+def _png(color: tuple[float, float, float]) -> bytes:
     """A picture of one colour."""
-    pixels = np.broadcast_to(to_uint8(np.array(colour))[::-1], (2, 2, 3))
+    pixels = np.broadcast_to(to_uint8(np.array(color))[::-1], (2, 2, 3))
     done, encoded = cv2.imencode(".png", np.ascontiguousarray(pixels))
     assert done
     return encoded.tobytes()

@@ -73,7 +73,7 @@ class _Images:
         self.count, self.degree = len(scene.means), sample.sh_degree
         self.low, self.high = _signed_log(scene.means.min(0)), _signed_log(scene.means.max(0))
         self.scales = fit_codebook(sample.log_scales.numpy().ravel())
-        self.colours = fit_codebook(sample.sh0.numpy().ravel())
+        self.colors = fit_codebook(sample.sh0.numpy().ravel())
         self.palette: VectorCodebook | None = None
         if self.degree:
             self.palette = VectorCodebook(sample.shN.numpy().reshape(len(sample), -1), MAX_SH_CENTROIDS)
@@ -104,7 +104,7 @@ class _Images:
         span = np.where(self.high > self.low, self.high - self.low, 1.0)
         places = np.rint((_signed_log(piece.means.numpy()) - self.low) / span * MAX_UINT16)
         whole = np.clip(places, 0, MAX_UINT16).astype(np.uint16)
-        shown = quantize(piece.sh0.numpy(), self.colours)
+        shown = quantize(piece.sh0.numpy(), self.colors)
         pixels = {
             "means_l": (whole & 255).astype(np.uint8), "means_u": (whole >> 8).astype(np.uint8),
             "quats": _packed(piece.quaternions.numpy()),
@@ -132,7 +132,7 @@ class _Images:
             "antialias": False,
             "means": {"mins": self.low.tolist(), "maxs": self.high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
             "scales": {"codebook": self.scales.tolist(), "files": ["scales.webp"]}, "quats": {"files": ["quats.webp"]},
-            "sh0": {"codebook": self.colours.tolist(), "files": ["sh0.webp"]},
+            "sh0": {"codebook": self.colors.tolist(), "files": ["sh0.webp"]},
         }  # fmt: skip
         if self.palette:
             meta["shN"] = {

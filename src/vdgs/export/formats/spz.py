@@ -43,15 +43,15 @@ FRACTION_BITS = 12
 MAX_COORDINATE = 2**23 / 2**FRACTION_BITS
 #: For long Niantic's reader opened no more Gaussians than this; programs that have it from then still refuse them.
 MAX_READABLE_POINTS = 10_000_000
-COLOUR_SCALE = 0.15
+COLOR_SCALE = 0.15
 #: Columns in the order of the file.
-COLUMN_NAMES = ("positions", "alphas", "colours", "scales", "rotations", "harmonics")
+COLUMN_NAMES = ("positions", "alphas", "colors", "scales", "rotations", "harmonics")
 READ_BLOCK_BYTES = 1 << 22
 #: What a byte cannot hold, and what became of it.
 CLAMP_NOTES = {
     "large": "Gaussians are larger than 377 units and were cut to that",
     "thin": "Gaussians are thinner than 0.00005 units and became as thick as that, which nobody sees",
-    "colours": "colours lay far outside of 0 .. 1 and were cut off",
+    "colors": "colours lay far outside of 0 .. 1 and were cut off",
 }
 
 
@@ -111,10 +111,10 @@ def encode_columns(piece: Gaussians, version: int, fraction: int = FRACTION_BITS
         piece = canonicalize_quaternions(piece)
     fixed = np.rint(piece.means.double().numpy() * 2**fraction).astype("<i4")
     positions = np.ascontiguousarray(fixed).view(np.uint8).reshape(n, 3, 4)[:, :, :3].reshape(n, 9)
-    colours = to_uint8(piece.sh0.numpy() * COLOUR_SCALE + 0.5)
+    colors = to_uint8(piece.sh0.numpy() * COLOR_SCALE + 0.5)
     scales = np.clip(np.rint((piece.log_scales.numpy() + 10) * 16), 0, 255).astype(np.uint8)
     rotations = (_pack_quaternions_v3 if version >= 3 else _pack_quaternions_v2)(piece.quaternions.numpy())
-    return positions, to_uint8(opacities(piece)[:, None]), colours, scales, rotations, _harmonics(piece.shN.numpy())
+    return positions, to_uint8(opacities(piece)[:, None]), colors, scales, rotations, _harmonics(piece.shN.numpy())
 
 
 def encode_spz(gaussians: Gaussians, version: int) -> bytes:
@@ -140,11 +140,11 @@ def _stream(first: bytes, columns: Mapping[str, IO[bytes]]) -> Iterator[bytes]:
 def _count_clamped(piece: Gaussians) -> dict[str, int]:
     """How many Gaussians have sizes or colours that bytes cannot hold, as in `CLAMP_NOTES`."""
     scales = (piece.log_scales + 10) * 16
-    shown = piece.sh0 * COLOUR_SCALE + 0.5
+    shown = piece.sh0 * COLOR_SCALE + 0.5
     return {
         "large": int((scales > 255.5).any(1).sum()),
         "thin": int((scales < -0.5).any(1).sum()),
-        "colours": int(((shown < -0.002) | (shown > 1.002)).any(1).sum()),
+        "colors": int(((shown < -0.002) | (shown > 1.002)).any(1).sum()),
     }
 
 
@@ -216,7 +216,7 @@ def _decode(data: bytes, path: Path) -> Iterator[Gaussians]:
 
 
 def _gaussians(parts: Sequence[np.ndarray], version: int, fraction: int) -> Gaussians:
-    positions, alphas, colours, scales, rotations, harmonics = parts
+    positions, alphas, colors, scales, rotations, harmonics = parts
     n = len(positions)
     whole = np.zeros((n, 3, 4), np.uint8)
     whole[:, :, 1:] = positions.reshape(n, 3, 3)  # in the upper three bytes, so that the shift back carries the sign
@@ -227,7 +227,7 @@ def _gaussians(parts: Sequence[np.ndarray], version: int, fraction: int) -> Gaus
         log_scales=torch.from_numpy(scales / np.float32(16) - 10),
         quaternions=torch.from_numpy(quaternions.astype(np.float32)),
         opacity_logits=logits_from_opacity(alphas[:, 0] / np.float32(255)),
-        sh0=torch.from_numpy((colours / np.float32(255) - np.float32(0.5)) / np.float32(COLOUR_SCALE)),
+        sh0=torch.from_numpy((colors / np.float32(255) - np.float32(0.5)) / np.float32(COLOR_SCALE)),
         shN=torch.from_numpy((harmonics.reshape(n, harmonics.shape[1] // 3, 3).astype(np.float32) - 128) / 128),
     )
 

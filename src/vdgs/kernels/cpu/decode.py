@@ -85,7 +85,7 @@ class _Decode(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        camera, *inputs, source, colours, opacities = (t.detach() for t in ctx.saved_tensors)
+        camera, *inputs, source, colors, opacities = (t.detach() for t in ctx.saved_tensors)
         wanted = ctx.needs_input_grad[2:]
         out = [torch.empty_like(t) if want else None for t, want in zip(inputs[1:4], wanted[1:4], strict=True)]
         # The gradients of the weights come together or not at all.
@@ -93,6 +93,6 @@ class _Decode(torch.autograd.Function):
         nothing: list[Tensor | None] = [None] * 12
         incoming = [None if g is None else g.contiguous() for g in gradients[:6]]
         extension.get_extension().decode_backward(
-            inputs[:4], inputs[4:], camera, source, colours, opacities, incoming, out, weights
+            inputs[:4], inputs[4:], camera, source, colors, opacities, incoming, out, weights
         )
         return None, None, None, *out, *(weights or nothing)

@@ -48,7 +48,7 @@ def decode_backward_adam(
     _check_splats(gradients)
     steps = [_step(state) for state in moved]
     heads = [contiguous(t.detach()) for t in weights.tensors()]
-    incoming = (gradients.means_px, gradients.conics, gradients.colours, gradients.opacities)
+    incoming = (gradients.means_px, gradients.conics, gradients.colors, gradients.opacities)
     wanted = any(t.requires_grad for t in weights.tensors())
     found = [torch.empty_like(t) for t in heads] if wanted else None
     finite: bool = extension.get_extension().decode_backward_adam(
@@ -77,7 +77,7 @@ def _check_state(state: AdamState) -> None:
 def _check_splats(g: SplatGradients) -> None:
     check_row_shapes(
         len(g.source),
-        means_px=(g.means_px, 2), conics=(g.conics, 3), colours=(g.colours, 3), opacities=(g.opacities[:, None], 1),
-        colour_values=(g.color_values, 3), opacity_values=(g.opacity_values[:, None], 1),
+        means_px=(g.means_px, 2), conics=(g.conics, 3), colors=(g.colors, 3), opacities=(g.opacities[:, None], 1),
+        color_values=(g.color_values, 3), opacity_values=(g.opacity_values[:, None], 1),
         **({} if g.depths is None else {"depths": (g.depths[:, None], 1)}),
     )  # fmt: skip

@@ -19,13 +19,13 @@ def harmonic_colors(
     check_coefficients(coefficients, rows, degree)
     if coefficients.stride(1) != 1:
         coefficients = coefficients.contiguous()
-    colours = torch.empty(len(rows), 3)
-    extension.get_extension().harmonic_colors(means.contiguous(), coefficients, rows, eye.contiguous(), degree, colours)
-    return colours
+    colors = torch.empty(len(rows), 3)
+    extension.get_extension().harmonic_colors(means.contiguous(), coefficients, rows, eye.contiguous(), degree, colors)
+    return colors
 
 
 def fit_harmonics(
-    directions: Float[Tensor, "p 3"], colours: Float[Tensor, "p 3"], weights: Float[Tensor, " p"],
+    directions: Float[Tensor, "p 3"], colors: Float[Tensor, "p 3"], weights: Float[Tensor, " p"],
     starts: Int64[Tensor, " m"], degree: int, ridge: float,
 ) -> Float[Tensor, "m f 3"]:  # fmt: skip
     """As `reference.harmonics.fit_harmonics`. Same bits for any number of threads."""
@@ -33,6 +33,6 @@ def fit_harmonics(
     check_starts(starts, len(weights))
     found = torch.empty(len(starts), 3 * f)
     extension.get_extension().fit_harmonics(
-        directions.contiguous(), colours.contiguous(), weights.contiguous(), starts, degree, ridge, found
+        directions.contiguous(), colors.contiguous(), weights.contiguous(), starts, degree, ridge, found
     )
     return found.view(-1, f, 3)

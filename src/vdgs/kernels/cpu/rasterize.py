@@ -70,7 +70,7 @@ def splat_contributions(
     raster, pullback = _draw((*splats.tensors, background), width, height, False, module)
     lacking = torch.zeros_like(raster.image) if wanted is None else wanted - raster.image
     found = SplatContributions(torch.empty(pullback.count), torch.empty(pullback.count, 3))
-    pullback.module.rasterise_shares(pullback.frame, lacking.contiguous().numpy(), *(t.numpy() for t in found))
+    pullback.module.rasterize_shares(pullback.frame, lacking.contiguous().numpy(), *(t.numpy() for t in found))
     return found
 
 
@@ -81,7 +81,7 @@ def _draw(tensors: tuple[Tensor, ...], width: int, height: int, depth: bool, mod
     depths = (torch.empty(height, width), torch.empty(height, width)) if depth else (None, None)
     raster = Raster(torch.empty(height, width, 3), torch.empty(height, width), *depths)
     behind = tuple(tensors[5].tolist())
-    frame = module.rasterise_forward(
+    frame = module.rasterize_forward(
         *(t.detach().contiguous().numpy() for t in tensors[:5]), behind, width, height,
         *(None if t is None else t.numpy() for t in raster),
     )  # fmt: skip
@@ -110,10 +110,10 @@ class _Pullback:
         means, conics = out or (torch.empty(n, 2), torch.empty(n, 3))
         if not 0 <= n <= self.count or not len(means) == len(conics) == n:
             raise ValueError(f"gradients of {n} splats of {self.count} do not fit into {len(means)} and {len(conics)}")
-        colours, opacities, background = torch.empty(n, 3), torch.empty(n), torch.empty(3)
+        colors, opacities, background = torch.empty(n, 3), torch.empty(n), torch.empty(3)
         depths = torch.empty(n) if self.with_depth else None
-        found = RasterGradients(means, conics, colours, opacities, depths, background)
-        self.module.rasterise_backward(
+        found = RasterGradients(means, conics, colors, opacities, depths, background)
+        self.module.rasterize_backward(
             self.frame, self.background,
             *(None if g is None else g.contiguous().numpy() for g in (image, alpha, depth)),
             *(None if t is None else t.numpy() for t in found),

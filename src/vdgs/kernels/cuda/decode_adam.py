@@ -64,7 +64,7 @@ def decode_backward_adam(
     ]  # fmt: skip
     after: list[KernelArgument] = [
         ctypes.c_int(k), ctypes.c_int(inputs), shown.bits, shown.segments.starts,
-        *(t.contiguous() for t in (gradients.means_px, gradients.conics, gradients.colours, gradients.opacities)),
+        *(t.contiguous() for t in (gradients.means_px, gradients.conics, gradients.colors, gradients.opacities)),
         ctypes.c_float(gradients.volume), updates, lacking, roots, ctypes.c_int(len(roots)), broken,
     ]  # fmt: skip
     wanted = any(t.requires_grad for t in weights.tensors())
@@ -86,9 +86,9 @@ def decode_backward_adam(
 def _weights(weights: DecoderWeights, k: int) -> list[Tensor]:
     """As the kernel takes them: as they are multiplied forwards, then as they are multiplied backwards."""
     heads = weights.opacity, weights.covariance, weights.color
-    opacity, covariance, colour = (pack_head(head, k) for head in heads)
+    opacity, covariance, color = (pack_head(head, k) for head in heads)
     back = (w.detach().contiguous() for head in heads for w in (head.w1, head.w2))
-    return [*opacity, *covariance, *colour, *back]
+    return [*opacity, *covariance, *color, *back]
 
 
 class _DecoderGradientBuffers:

@@ -12,7 +12,7 @@ class PackedCamera(ctypes.Structure):
     """`Camera` of gaussian_math.h, field by field."""
 
     _fields_ = (
-        *((name, 3 * ctypes.c_float) for name in ("right", "down", "forward", "centre")),
+        *((name, 3 * ctypes.c_float) for name in ("right", "down", "forward", "center")),
         *((name, ctypes.c_float) for name in ("fx", "fy", "cx", "cy", "width", "height", "near", "limit_x", "limit_y")),
         ("orthographic", ctypes.c_bool),
     )  # fmt: skip
@@ -22,8 +22,8 @@ class PackedCamera(ctypes.Structure):
         """As `unpack_camera` of gaussian_math.h makes it of the same numbers."""
         numbers = [float(each) for each in camera.packed]
         axes, translation = [numbers[:3], numbers[3:6], numbers[6:9]], numbers[9:12]
-        centre = [-sum(axis[i] * shift for axis, shift in zip(axes, translation, strict=True)) for i in range(3)]
+        center = [-sum(axis[i] * shift for axis, shift in zip(axes, translation, strict=True)) for i in range(3)]
         fx, fy, cx, cy, width, height, orthographic, near, whole_width, whole_height = numbers[12:]
         limits = (FRUSTUM_MARGIN * 0.5 * side / focal for side, focal in ((whole_width, fx), (whole_height, fy)))
-        vectors = (tuple(vector) for vector in (*axes, centre))
+        vectors = (tuple(vector) for vector in (*axes, center))
         return PackedCamera(*vectors, fx, fy, cx, cy, width, height, near, *limits, bool(orthographic))

@@ -18,7 +18,7 @@ from vdgs.kernels.torch_ref.splat_contributions import splat_contributions_from_
 
 #: Side of a tile, threads of a block and sums of an entry: kTile, kThreads and kSums of the source.
 TILE_PX, THREADS, SUMS_PER_ENTRY = 16, 256, 10
-PROGRAM = CudaProgram(name="rasterise.cu", headers=("image_formation.h",))
+PROGRAM = CudaProgram(name="rasterize.cu", headers=("image_formation.h",))
 
 
 def rasterize(
@@ -94,7 +94,7 @@ def _draw(
     last = torch.empty_like(transmittance, dtype=torch.int32)
     depths = (torch.empty_like(transmittance), torch.empty_like(transmittance)) if depth else (None, None)
     program.launch(
-        "rasterise_forward", grid, (THREADS,), *splats, entries.owners, entries.order, entries.bounds, background,
+        "rasterize_forward", grid, (THREADS,), *splats, entries.owners, entries.order, entries.bounds, background,
         ctypes.c_int(width), ctypes.c_int(height), image, transmittance, last, *depths,
     )  # fmt: skip
     raster = Raster(image, 1.0 - transmittance, *depths)
@@ -154,7 +154,7 @@ class _Pullback:
         out: tuple[Tensor, Tensor] | None = None,
         count: int | None = None,
     ) -> RasterGradients:
-        means, conics, colours, opacities, depths = self.splats
+        means, conics, colors, opacities, depths = self.splats
         entries, (height, width) = self.entries, self.transmittance.shape
         wanted = [None if g is None else g.contiguous() for g in (image, alpha, depth)]
         first = slice(count)
@@ -162,23 +162,23 @@ class _Pullback:
         sums = means.new_zeros(len(entries.owners), SUMS_PER_ENTRY)
         picture: list[KernelArgument] = [self.raster.image, self.transmittance, self.last, self.raster.depth]
         self.program.launch(
-            "rasterise_backward", (-(-width // TILE_PX), -(-height // TILE_PX)), (THREADS,), *self.splats,
+            "rasterize_backward", (-(-width // TILE_PX), -(-height // TILE_PX)), (THREADS,), *self.splats,
             entries.owners, entries.order, entries.bounds, ctypes.c_int(width), ctypes.c_int(height), *picture,
             *wanted, kept, sums,
         )  # fmt: skip
         by_means, by_conics = out or (torch.empty_like(means[first]), torch.empty_like(conics[first]))
-        by_colours, by_opacities = torch.empty_like(colours[first]), torch.empty_like(opacities[first])
+        by_colors, by_opacities = torch.empty_like(colors[first]), torch.empty_like(opacities[first])
         by_depths = None if self.raster.depth is None else torch.empty_like(depths[first])
         self.program.launch(
             "gather_gradients", _over(len(means)), (THREADS,), *self.splats, entries.splats,
-            ctypes.c_longlong(len(means)), entries.ends, sums, kept, by_means, by_conics, by_colours, by_opacities,
+            ctypes.c_longlong(len(means)), entries.ends, sums, kept, by_means, by_conics, by_colors, by_opacities,
             by_depths,
         )  # fmt: skip
         if wanted[0] is None:
             by_background = torch.zeros_like(self.background)
         else:
             by_background = (self.transmittance[..., None] * wanted[0]).sum((0, 1))
-        return RasterGradients(by_means, by_conics, by_colours, by_opacities, by_depths, by_background)
+        return RasterGradients(by_means, by_conics, by_colors, by_opacities, by_depths, by_background)
 
 
 def _over(count: int) -> tuple[int]:

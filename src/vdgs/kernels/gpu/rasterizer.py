@@ -16,7 +16,7 @@ from vdgs.kernels.gsplat.rasterize import GsplatUnavailable, load_gsplat
 from vdgs.kernels.kernel_types import Raster, RasterPullback, Splats
 
 #: Environment variable that takes one of them: `gsplat` or `cuda`.
-RASTERIZER_ENV_VAR = "VDGS_RASTERISER"
+RASTERIZER_ENV_VAR = "VDGS_RASTERIZER"
 
 
 def rasterize(

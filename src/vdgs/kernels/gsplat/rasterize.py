@@ -48,7 +48,7 @@ def rasterize(
     """
     engine = engine or load_gsplat()
     check_splats((*splats.tensors, background), width, height)
-    means_px, conics, colours, opacities, depths = splats.tensors
+    means_px, conics, colors, opacities, depths = splats.tensors
     if not len(means_px):
         return _empty(background, width, height, depth)
     reach = splat_radii_px(splats)
@@ -57,9 +57,9 @@ def rasterize(
     means, radii, near = means_px[None], reach[None], depths[None]
     _, keys, order = engine.isect_tiles(means.detach(), radii, near.detach(), TILE_PX, columns, rows)
     offsets = engine.isect_offset_encode(keys, 1, columns, rows).reshape(1, rows, columns)
-    painted, behind = colours, background
+    painted, behind = colors, background
     if depth:
-        painted, behind = torch.cat([colours, depths[:, None]], dim=1), torch.cat([background, background.new_zeros(1)])
+        painted, behind = torch.cat([colors, depths[:, None]], dim=1), torch.cat([background, background.new_zeros(1)])
     picture, alpha = engine.rasterize_to_pixels(
         means, conics[None], painted[None], opacities[None], width, height, TILE_PX, offsets, order,
         backgrounds=behind[None],

@@ -86,7 +86,7 @@ VDGS_FN Mask<T> finite(T a) {
 // A pinhole or orthographic view. `limit` bounds x/z and y/z in the Jacobian of the projection.
 struct Camera {
   Vec3<float> right, down, forward;  // rows of the rotation camera_from_world
-  Vec3<float> centre;
+  Vec3<float> center;
   float fx, fy, cx, cy, width, height, near;
   float limit_x, limit_y;
   bool orthographic;
@@ -100,11 +100,11 @@ VDGS_FN Camera unpack_camera(const float* p) {
   camera.right = {p[0], p[1], p[2]};
   camera.down = {p[3], p[4], p[5]};
   camera.forward = {p[6], p[7], p[8]};
-  float* centre[3] = {&camera.centre.x, &camera.centre.y, &camera.centre.z};
+  float* center[3] = {&camera.center.x, &camera.center.y, &camera.center.z};
   for (int i = 0; i < 3; ++i) {
     double sum = 0.0;
     for (int row = 0; row < 3; ++row) sum -= static_cast<double>(p[3 * row + i]) * p[9 + row];
-    *centre[i] = static_cast<float>(sum);
+    *center[i] = static_cast<float>(sum);
   }
   camera.fx = p[12], camera.fy = p[13], camera.cx = p[14], camera.cy = p[15];
   camera.width = p[16], camera.height = p[17];
@@ -119,11 +119,11 @@ template <class T>
 VDGS_FN Vec3<T> constant(Vec3<float> a) {
   return {constant<T>(a.x), constant<T>(a.y), constant<T>(a.z)};
 }
-// World to camera. Differences to the centre first: far from the origin they keep their precision.
+// World to camera. Differences to the center first: far from the origin they keep their precision.
 template <class T>
 VDGS_FN Vec3<T> into_camera(const Camera& camera, Vec3<T> point) {
-  const Vec3<T> centre = constant<T>(camera.centre);
-  const Vec3<T> ray = {point.x - centre.x, point.y - centre.y, point.z - centre.z};
+  const Vec3<T> center = constant<T>(camera.center);
+  const Vec3<T> ray = {point.x - center.x, point.y - center.y, point.z - center.z};
   return {dot(constant<T>(camera.right), ray), dot(constant<T>(camera.down), ray),
           dot(constant<T>(camera.forward), ray)};
 }
@@ -152,7 +152,7 @@ VDGS_FN Quaternion<T> rotation_gradient(Quaternion<T> q, const Columns<T>& g) {
 
 // ---------------------------------------------------------------------------------------- culling
 
-// Along one side of the image: the squared distance in px of a centre from 0 .. size, and the factor (squared) from
+// Along one side of the image: the squared distance in px of a center from 0 .. size, and the factor (squared) from
 // world to px at its bound.
 template <class T>
 struct Reach {
@@ -160,18 +160,18 @@ struct Reach {
 };
 
 template <class T>
-VDGS_FN Reach<T> reach_of(float focal, float centre, float size, float limit, T position, T inverse_z,
+VDGS_FN Reach<T> reach_of(float focal, float center, float size, float limit, T position, T inverse_z,
                           bool orthographic) {
   const T zero = constant<T>(0.0f);
   const T slope = position * inverse_z;
-  const T pixel = fma(constant<T>(focal), slope, constant<T>(centre));
+  const T pixel = fma(constant<T>(focal), slope, constant<T>(center));
   const T outside = max(max(zero - pixel, pixel - constant<T>(size)), zero);
   const T bounded = orthographic ? zero : min(abs(slope), constant<T>(limit));
   const T scale = constant<T>(focal) * inverse_z;
   return {outside * outside, scale * scale * fma(bounded, bounded, constant<T>(1.0f))};
 }
 
-// Where a centre lies beside the image; the bound is explained in src/vdgs/kernels/torch_ref/cull.py.
+// Where a center lies beside the image; the bound is explained in src/vdgs/kernels/torch_ref/cull.py.
 template <class T>
 struct Sight {
   Reach<T> x, y;
@@ -190,7 +190,7 @@ struct Sight {
   }
 };
 
-// Of a centre in the camera's axes.
+// Of a center in the camera's axes.
 template <class T>
 VDGS_FN Sight<T> sight_of(const Camera& camera, Vec3<T> local) {
   const T inverse_z = camera.orthographic ? constant<T>(1.0f) : constant<T>(1.0f) / local.z;
@@ -402,7 +402,7 @@ VDGS_FN SpawnGradient<T> spawn_backward(const Anchor<T>& anchor, Vec3<T> offset,
   return out;
 }
 
-// Whether any pixel's centre lies in the box around {alpha >= 1/255}: alpha = opacity exp(-q/2) falls
+// Whether any pixel's center lies in the box around {alpha >= 1/255}: alpha = opacity exp(-q/2) falls
 // to 1/255 on the ellipse q = 2 log(255 opacity), which reaches sqrt(q variance) to either side.
 template <class T>
 VDGS_FN Mask<T> on_image(const Camera& camera, const Projection<T>& p, T opacity) {

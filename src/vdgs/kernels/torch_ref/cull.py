@@ -26,17 +26,17 @@ def cull(positions: Float[Tensor, "n 3"], log_scales: Float[Tensor, "n 6"], came
     sigma_squared = torch.exp(2 * log_scales[:, :3].amax(-1))
     z = local[:, 2]
     near_enough = z > NEAR_PLANE
-    for axis, focal, centre, size, whole in (
+    for axis, focal, center, size, whole in (
         (0, camera.fx, camera.cx, camera.width, camera.full_size[0]),
         (1, camera.fy, camera.cy, camera.height, camera.full_size[1]),
     ):
         if camera.model == "orthographic":
-            pixel = focal * local[:, axis] + centre
+            pixel = focal * local[:, axis] + center
             stretch = torch.full_like(z, focal**2)
         else:
             slope = local[:, axis] / z
             limit = FRUSTUM_MARGIN * 0.5 * whole / focal
-            pixel = focal * slope + centre
+            pixel = focal * slope + center
             stretch = (focal / z) ** 2 * (1 + slope.clamp(-limit, limit) ** 2)
         outside = torch.maximum(-pixel, pixel - size).clamp(min=0)
         near_enough = near_enough & (outside**2 <= 9 * (sigma_squared * stretch + DILATION_PX2))

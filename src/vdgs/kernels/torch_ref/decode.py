@@ -43,7 +43,7 @@ def decode(
     projected, variances, drawn = _decode_offsets(anchors, anchor, offset, weights, camera)
     kept = (projected.valid & _on_image(projected.means_px, variances, drawn.opacities, camera)).nonzero()[:, 0]
     return AnchorSplats(
-        **{name: getattr(drawn, name)[kept] for name in ("means_px", "conics", "depths", "colours", "opacities")},
+        **{name: getattr(drawn, name)[kept] for name in ("means_px", "conics", "depths", "colors", "opacities")},
         volumes=drawn.volumes[kept],
         source=(anchor * k + offset)[kept].to(torch.int32),
     )
@@ -122,13 +122,13 @@ def _decode_offsets(
     """What these offsets of these anchors become: projected, their variances along x and y, and all of it as splats."""
     k = anchors.offsets.shape[1]
     covariance = weights.covariance.forward(anchors.inputs).unflatten(1, (k, 7))[anchor, offset]
-    colour = torch.sigmoid(weights.color.forward(anchors.inputs).unflatten(1, (k, 3))[anchor, offset])
+    color = torch.sigmoid(weights.color.forward(anchors.inputs).unflatten(1, (k, 3))[anchor, offset])
     extent = torch.exp(anchors.log_scales)[anchor]
     means = anchors.positions[anchor] + anchors.offsets[anchor, offset] * extent[:, :3]
     scales = extent[:, 3:] * torch.sigmoid(covariance[:, :3])
     projected, variances = project_with_variances(means, scales, covariance[:, 3:], camera)
     splats = AnchorSplats(
-        means_px=projected.means_px, conics=projected.conics, depths=projected.depths, colors=colour,
+        means_px=projected.means_px, conics=projected.conics, depths=projected.depths, colors=color,
         opacities=anchors.opacities[anchor, offset], volumes=scales.prod(-1),
         source=(anchor * k + offset).to(torch.int32),
     )  # fmt: skip

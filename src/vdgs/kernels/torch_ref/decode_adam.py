@@ -38,7 +38,7 @@ def decode_backward_adam(
         source = sources_tensor(gradients.source)
         again = decode_subset(positions[rows], leaves[0], leaves[1], leaves[2], decoder, camera, source)
         outputs = [again.means_px, again.conics, again.colors, again.opacities, again.volumes]
-    received = [gradients.means_px, gradients.conics, gradients.colours, gradients.opacities,
+    received = [gradients.means_px, gradients.conics, gradients.colors, gradients.opacities,
                 torch.full_like(again.volumes, gradients.volume)]  # fmt: skip
     if gradients.depths is not None:
         outputs, received = [*outputs, again.depths], [*received, gradients.depths]

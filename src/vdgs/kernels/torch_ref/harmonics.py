@@ -37,7 +37,7 @@ def harmonic_colors(
 
 
 def fit_harmonics(
-    directions: Float[Tensor, "p 3"], colours: Float[Tensor, "p 3"], weights: Float[Tensor, " p"],
+    directions: Float[Tensor, "p 3"], colors: Float[Tensor, "p 3"], weights: Float[Tensor, " p"],
     starts: Int64[Tensor, " m"], degree: int, ridge: float,
 ) -> Float[Tensor, "m f 3"]:  # fmt: skip
     """Coefficients of each Gaussian, whose pairs begin at `starts`. Directions are unit, from the camera; weights are
@@ -45,7 +45,7 @@ def fit_harmonics(
     check_starts(starts, len(weights))
     functions = eval_sh_bases(directions, degree)
     f = functions.shape[1]
-    known = torch.cat([functions, colours - 0.5], 1)
+    known = torch.cat([functions, colors - 0.5], 1)
     pull = functions.new_full((f,), ridge, dtype=torch.float64)
     pull[0] = 0.0
     found = functions.new_empty(len(starts), f, 3)

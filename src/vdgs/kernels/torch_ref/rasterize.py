@@ -28,7 +28,7 @@ def rasterize(
     rows = torch.cat([*tensors[:3], splats.opacities[:, None], splats.depths[:, None]], dim=1)
     drawn = rows.isfinite().all(dim=1) & (a > 0) & (c > 0) & (a * c - b * b > 0)
     order = torch.argsort(splats.depths[drawn], stable=True)
-    means_px, conics, colours, opacities, depths = (tensor[drawn][order] for tensor in tensors)
+    means_px, conics, colors, opacities, depths = (tensor[drawn][order] for tensor in tensors)
     alpha = _alphas(means_px, conics, opacities, width, height)
     with torch.no_grad():
         # A pixel ends before the splat that would take its transmittance below the minimum.
@@ -38,7 +38,7 @@ def rasterize(
     transmittance = torch.cat([one, torch.cumprod(1 - alpha, dim=0)])
     weights = alpha * transmittance[:-1]
     through = transmittance[-1]
-    image = torch.einsum("mhw,mc->hwc", weights, colours) + through[..., None] * background
+    image = torch.einsum("mhw,mc->hwc", weights, colors) + through[..., None] * background
     if not depth:
         return Raster(image, 1 - through, None)
     expected_depth = torch.einsum("mhw,m->hw", weights, depths)

@@ -41,4 +41,4 @@ def splat_contributions_from_vjp(
     lacking = torch.zeros_like(raster.image) if wanted is None else wanted - raster.image
     found = pullback(lacking, None, torch.ones_like(raster.alpha))
     assert found.depths is not None
-    return SplatContributions(found.depths, found.colours)
+    return SplatContributions(found.depths, found.colors)

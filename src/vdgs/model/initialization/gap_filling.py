@@ -42,8 +42,8 @@ def find_gap_points(
     tree = cKDTree(points[:, :2])
     cell = max(CELL_VOXELS * voxel, float(np.sqrt(np.prod(np.maximum(high - low, voxel)) / MAX_CELLS)))
     while True:
-        centres = _empty_cells(points, low, high, cell)
-        seen = _at_seen_heights(centres, points, tree, cameras)
+        centers = _empty_cells(points, low, high, cell)
+        seen = _at_seen_heights(centers, points, tree, cameras)
         if len(seen) <= MAX_GAP_FRACTION * len(points):
             return seen
         cell *= float(np.sqrt(len(seen) / (MAX_GAP_FRACTION * len(points)))) * 1.05
@@ -61,12 +61,12 @@ def _empty_cells(points: np.ndarray, low: np.ndarray, high: np.ndarray, cell: fl
 
 
 def _at_seen_heights(
-    centres: np.ndarray, points: np.ndarray, tree: cKDTree, cameras: Sequence[Camera]
+    centers: np.ndarray, points: np.ndarray, tree: cKDTree, cameras: Sequence[Camera]
 ) -> Float[np.ndarray, "g 3"]:
     """The centres lifted to the ground about them, where a camera sees them."""
-    if not len(centres):
+    if not len(centers):
         return np.zeros((0, 3))
-    _, nearest = tree.query(centres, k=min(NUM_NEIGHBORS, len(points)), workers=1)
-    heights = np.median(points[np.asarray(nearest).reshape(len(centres), -1), 2], axis=1)
-    lifted = np.column_stack([centres, heights])
+    _, nearest = tree.query(centers, k=min(NUM_NEIGHBORS, len(points)), workers=1)
+    heights = np.median(points[np.asarray(nearest).reshape(len(centers), -1), 2], axis=1)
+    lifted = np.column_stack([centers, heights])
     return lifted[count_visibility(torch.from_numpy(lifted), cameras).numpy() > 0]

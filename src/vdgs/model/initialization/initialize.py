@@ -18,7 +18,7 @@ from vdgs.model.anchors import Anchors
 from vdgs.model.initialization.gap_filling import find_gap_points
 
 #: An outlier is known by its distance to this neighbour: small clusters of false matches are outliers too.
-OUTLIER_NEIGHBOUR = 4
+OUTLIER_NEIGHBOR = 4
 
 
 def auto_voxel_size(points: np.ndarray) -> float:
@@ -38,9 +38,9 @@ def auto_voxel_size(points: np.ndarray) -> float:
 
 def inlier_mask(points: np.ndarray, factor: float) -> np.ndarray:
     """Which points [n, 3] have their fourth nearest neighbour within `factor` times the median such distance."""
-    if factor <= 0 or len(points) <= OUTLIER_NEIGHBOUR:
+    if factor <= 0 or len(points) <= OUTLIER_NEIGHBOR:
         return np.ones(len(points), bool)
-    distances, _ = cKDTree(points).query(points, k=[OUTLIER_NEIGHBOUR + 1], workers=1)
+    distances, _ = cKDTree(points).query(points, k=[OUTLIER_NEIGHBOR + 1], workers=1)
     limit = factor * np.median(distances)
     return distances[:, 0] <= limit if limit > 0 else np.ones(len(points), bool)
 
@@ -52,7 +52,7 @@ def get_voxel_size(points: np.ndarray, config: AnchorConfig) -> float:
 
 def initialize_anchors(
     points: np.ndarray,
-    colours: np.ndarray,
+    colors: np.ndarray,
     cameras: Sequence[Camera],
     config: AnchorConfig,
     dense: tuple[np.ndarray, np.ndarray] | None = None,
@@ -66,13 +66,13 @@ def initialize_anchors(
     """
     voxel = get_voxel_size(points, config)
     kept = inlier_mask(points, config.outlier_distance)
-    points, colours = points[kept], colours[kept]
+    points, colors = points[kept], colors[kept]
     if dense is not None:
-        points, colours = (np.concatenate(pair) for pair in zip((points, colours), dense, strict=True))
+        points, colors = (np.concatenate(pair) for pair in zip((points, colors), dense, strict=True))
     if config.fill_gaps:
         gaps = find_gap_points(points, cameras, voxel)
         nearest = cKDTree(points).query(gaps, workers=1)[1] if len(gaps) else np.zeros(0, np.int64)
-        points, colours = np.concatenate([points, gaps]), np.concatenate([colours, colours[nearest]])
+        points, colors = np.concatenate([points, gaps]), np.concatenate([colors, colors[nearest]])
     cells, owner = np.unique(np.round(points / voxel).astype(np.int64), axis=0, return_inverse=True)
     positions = cells * voxel
     n = len(positions)
@@ -83,7 +83,7 @@ def initialize_anchors(
         spacing = np.full(n, voxel)
     features = np.zeros((n, FEATURE_SIZE))
     if config.from_colors:
-        features[:, :3] = _mean_colours(colours, owner.reshape(-1), n) * 2.0 - 1.0
+        features[:, :3] = _mean_colors(colors, owner.reshape(-1), n) * 2.0 - 1.0
     as_tensor = lambda array: torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))  # noqa: E731
     anchors = Anchors(
         positions=as_tensor(positions),
@@ -94,7 +94,7 @@ def initialize_anchors(
     return anchors, voxel
 
 
-def _mean_colours(colours: np.ndarray, owner: Int64[np.ndarray, " n"], count: int) -> np.ndarray:
+def _mean_colors(colors: np.ndarray, owner: Int64[np.ndarray, " n"], count: int) -> np.ndarray:
     """Mean colour in [0, 1] of the points that share a cell, [count, 3]."""
-    sums = np.stack([np.bincount(owner, colours[:, c] / 255.0, count) for c in range(3)], axis=1)
+    sums = np.stack([np.bincount(owner, colors[:, c] / 255.0, count) for c in range(3)], axis=1)
     return sums / np.bincount(owner, minlength=count)[:, None]

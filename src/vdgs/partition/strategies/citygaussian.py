@@ -43,8 +43,8 @@ class CityGaussian:
     ) -> tuple[Blocks, list[str]]:
         """Equal cells of the contracted square [-2, 2]², as far out as there are anchors."""
         ground = checked_xy(positions)
-        centres = np.array([camera.position[:2] for camera in cameras], np.float64)
-        low, high = np.quantile(centres, FOREGROUND_QUANTILES, axis=0)
+        centers = np.array([camera.position[:2] for camera in cameras], np.float64)
+        low, high = np.quantile(centers, FOREGROUND_QUANTILES, axis=0)
         middle, half = (low + high) / 2, np.maximum((high - low) / 2, 1e-6)
         contracted = contract((ground - middle) / half)
         reach = min(float(np.abs(contracted).max()) + 1e-3, 1.999)

@@ -40,15 +40,15 @@ class VastGaussian:
     ) -> tuple[Blocks, list[str]]:
         """Sections with equally many cameras along the longer side, each cut again across it."""
         ground = checked_xy(positions)
-        centres = np.array([camera.position[:2] for camera in cameras], np.float64)
-        low = np.minimum(np.quantile(ground, EXTENT_QUANTILES[0], axis=0), centres.min(axis=0))
-        high = np.maximum(np.quantile(ground, EXTENT_QUANTILES[1], axis=0), centres.max(axis=0))
+        centers = np.array([camera.position[:2] for camera in cameras], np.float64)
+        low = np.minimum(np.quantile(ground, EXTENT_QUANTILES[0], axis=0), centers.min(axis=0))
+        high = np.maximum(np.quantile(ground, EXTENT_QUANTILES[1], axis=0), centers.max(axis=0))
         margin = 1e-6 * float((high - low).max()) + 1e-9
         low, high = low - margin, high + margin
-        spread = np.ptp(centres, axis=0) + margin
+        spread = np.ptp(centers, axis=0) + margin
         columns, rows = grid_shape(count, spread[0] / spread[1])
         cells = []
-        for x0, x1, section in _equal_camera_splits(centres, 0, columns, low[0], high[0]):
+        for x0, x1, section in _equal_camera_splits(centers, 0, columns, low[0], high[0]):
             for y0, y1, _ in _equal_camera_splits(section, 1, rows, low[1], high[1]):
                 if x1 > x0 and y1 > y0:
                     core = shapely.box(x0, y0, x1, y1)
@@ -65,8 +65,8 @@ class VastGaussian:
         boxes = [_corners(block.core, positions[blocks.owner(checked_xy(positions)) == index, 2])
                  for index, block in enumerate(blocks.items)]  # fmt: skip
         shares = np.array([[box_coverage(box, camera) for box in boxes] for camera in cameras])
-        centres = np.array([camera.position[:2] for camera in cameras], np.float64)
-        inside = [shapely.contains_xy(block.expanded, centres[:, 0], centres[:, 1]) for block in blocks.items]
+        centers = np.array([camera.position[:2] for camera in cameras], np.float64)
+        inside = [shapely.contains_xy(block.expanded, centers[:, 0], centers[:, 1]) for block in blocks.items]
         joined = np.where(np.stack(inside, axis=1), 1.0, shares)
         return replace(scores, scores=joined.astype(scores.scores.dtype))
 
@@ -102,12 +102,12 @@ def _corners(core: shapely.Polygon, heights: Float[np.ndarray, " n"]) -> Float[n
 
 
 def _equal_camera_splits(
-    centres: Float[np.ndarray, "c 2"], axis: int, parts: int, low: float, high: float
+    centers: Float[np.ndarray, "c 2"], axis: int, parts: int, low: float, high: float
 ) -> list[tuple[float, float, Float[np.ndarray, "m 2"]]]:
     """From, to and cameras of each part along an axis; parts meet halfway between neighbouring cameras."""
-    if len(centres) == 0:
-        return [(low, high, centres)]
-    ordered = centres[np.argsort(centres[:, axis], kind="stable")]
+    if len(centers) == 0:
+        return [(low, high, centers)]
+    ordered = centers[np.argsort(centers[:, axis], kind="stable")]
     sections = np.array_split(ordered, min(parts, len(ordered)))
     meets = [(a[-1, axis] + b[0, axis]) / 2 for a, b in itertools.pairwise(sections)]
     edges = [low, *meets, high]

@@ -168,11 +168,11 @@ def _plot_partition(
     style_axes(axes)
 
 
-def _outline_patch(shape: shapely.Polygon, colour: object, width: float, style: object) -> PathPatch:
+def _outline_patch(shape: shapely.Polygon, color: object, width: float, style: object) -> PathPatch:
     """The outline of a polygon, holes included."""
     rings = [Outline(np.asarray(ring.coords), closed=True) for ring in (shape.exterior, *shape.interiors)]
     whole = Outline.make_compound_path(*rings)
-    return PathPatch(whole, facecolor="none", edgecolor=colour, linewidth=width, linestyle=style, zorder=2)
+    return PathPatch(whole, facecolor="none", edgecolor=color, linewidth=width, linestyle=style, zorder=2)
 
 
 def _label_position(core: shapely.Polygon, window: shapely.Polygon) -> tuple[float, float] | None:

@@ -34,9 +34,9 @@ def pluralize(number: int, noun: str) -> str:
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
-def mix_color(colour: str, scale: float, tone: float = 1.0) -> tuple[float, float, float]:
+def mix_color(color: str, scale: float, tone: float = 1.0) -> tuple[float, float, float]:
     """The colour darkened by `scale`, then mixed with white; 1 and 1 leave it."""
-    red, green, blue = (1 - tone * (1 - scale * part) for part in to_rgb(colour))
+    red, green, blue = (1 - tone * (1 - scale * part) for part in to_rgb(color))
     return red, green, blue
 
 
@@ -135,10 +135,10 @@ def _panel(
 ) -> float:
     """One column of the block facts for one cut; returns where its longest bar ends. `step` is the height of a row in
     inches; without it no numbers stand beside the bars."""
-    colours = [mix_color(block_color(block), 1.0, tone) for block in range(len(rows))]
+    colors = [mix_color(block_color(block), 1.0, tone) for block in range(len(rows))]
     if index == 3:
         known = np.isfinite(facts.mean)
-        axes.hlines(rows[known], facts.low[known], facts.high[known], np.array(colours)[known], linewidth=3)
+        axes.hlines(rows[known], facts.low[known], facts.high[known], np.array(colors)[known], linewidth=3)
         axes.scatter(facts.mean[known], rows[known], s=26, color=INK, zorder=3, linewidths=0)
         right = facts.high
         text = [f"{mean:.1f}" for mean in facts.mean]
@@ -156,7 +156,7 @@ def _panel(
             )
             return 0.0
         right = np.nan_to_num(values.astype(np.float64))
-        _bars(axes, rows, right, colours)
+        _bars(axes, rows, right, colors)
         text = [_number(float(value), index) for value in values]
     longest = float(np.nanmax(right, initial=0.0))
     if step is None:
@@ -171,13 +171,13 @@ def _panel(
 
 
 def _bars(
-    axes: Axes, rows: Float[np.ndarray, " b"], ends: Float[np.ndarray, " b"], colours: list[tuple[float, float, float]]
+    axes: Axes, rows: Float[np.ndarray, " b"], ends: Float[np.ndarray, " b"], colors: list[tuple[float, float, float]]
 ) -> None:
     """Bars from 0 as one collection: thousands of patches take matplotlib minutes."""
     low, high = rows - 0.36, rows + 0.36
     corners = [(np.zeros_like(ends), low), (ends, low), (ends, high), (np.zeros_like(ends), high)]
     polygons = np.stack([np.stack(each, -1) for each in corners], 1)
-    axes.add_collection(PolyCollection(list(polygons), facecolors=colours))
+    axes.add_collection(PolyCollection(list(polygons), facecolors=colors))
 
 
 def _rows(axes: Axes, rows: list[Float[np.ndarray, " _"]], named: bool, step: float) -> None:

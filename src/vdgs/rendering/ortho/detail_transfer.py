@@ -72,12 +72,12 @@ class DetailTransfer:
         self._pictures.close()
 
     def detail(
-        self, points: Float[np.ndarray, "n 3"], colours: Float[np.ndarray, "h w 3"], shown: Bool[np.ndarray, "h w"]
+        self, points: Float[np.ndarray, "n 3"], colors: Float[np.ndarray, "h w 3"], shown: Bool[np.ndarray, "h w"]
     ) -> Float[np.ndarray, "h w 3"]:
         """What the photographs add to the colours. `points`: the places of the pixels that are shown."""
         light, weight = np.zeros((len(points), 3), np.float32), np.zeros(len(points), np.float32)
         agreed = np.zeros(len(points), np.float32)
-        drawn = colours[shown]
+        drawn = colors[shown]
         chosen = self._select_views(points)
         least = self._min_trust(chosen, points)
         for index in chosen:
@@ -87,11 +87,11 @@ class DetailTransfer:
             agreed[where] += trust * agreement
             weight[where] += trust
         known = agreed > 0
-        detail = np.zeros_like(colours)
+        detail = np.zeros_like(colors)
         inside = np.zeros(shown.shape, np.float32)
         at = np.flatnonzero(shown.ravel())[known]
         share = agreed[known, None] / weight[known, None]
-        detail.reshape(-1, 3)[at] = share * (light[known] / agreed[known, None] - colours.reshape(-1, 3)[at])
+        detail.reshape(-1, 3)[at] = share * (light[known] / agreed[known, None] - colors.reshape(-1, 3)[at])
         inside.ravel()[at] = 1.0
         return inside[..., None] * (detail - _blurred(detail) / np.maximum(_blurred(inside)[..., None], 1e-6))
 

@@ -72,11 +72,11 @@ class NadirCamera:
 
         Raises VdgsError where the target's z is not up, or no similarity fits the target over the grid.
         """
-        similarity, centre = self._similarity(grid)
+        similarity, center = self._similarity(grid)
         up = similarity.rotation[2]  # the target's, in the ground frame
         radius = 0.75 * max(grid.width, grid.height) * grid.gsd / similarity.scale
-        ceiling = self.clip_height.height_above(centre, max(radius, 1e-6))
-        above = centre + up * (ceiling - centre[2]) / up[2]
+        ceiling = self.clip_height.height_above(center, max(radius, 1e-6))
+        above = center + up * (ceiling - center[2]) / up[2]
         pose = np.eye(4)
         pose[:3, :3] = np.diag([1.0, -1.0, -1.0]) @ similarity.rotation
         pose[:3, 3] = -pose[:3, :3] @ above
@@ -89,8 +89,8 @@ class NadirCamera:
     def _similarity(self, grid: PixelGrid) -> tuple[Similarity, Float[np.ndarray, "3"]]:
         """The similarity about the middle of the grid, and that place on the ground."""
         level = self.placement.project(np.array([[0.0, 0.0, ground_height(self.capture)]]))[0, 2]
-        centre = self.placement.to_ground(np.array([[*grid.centre, level]]))[0]
-        similarity = self.placement.similarity_at(centre)
+        center = self.placement.to_ground(np.array([[*grid.center, level]]))[0]
+        similarity = self.placement.similarity_at(center)
         x0, y0, x1, y1 = grid.bounds
         corners = np.array([[x, y, level] for x in (x0, x1) for y in (y0, y1)])
         if similarity.rotation[2, 2] < 0.98:
@@ -104,4 +104,4 @@ class NadirCamera:
                 f"--crs {self.placement.crs}: {self.placement.name} stretches north and east unlike: over one tile "
                 f"pixels would be {off:.1f} off. Give a conformal system (UTM), and let the map's viewer turn it."
             )
-        return similarity, centre
+        return similarity, center

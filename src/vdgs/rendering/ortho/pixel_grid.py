@@ -45,7 +45,7 @@ class PixelGrid:
         return (self.left, self.top - self.gsd * self.height, self.left + self.gsd * self.width, self.top)
 
     @property
-    def centre(self) -> tuple[float, float]:
+    def center(self) -> tuple[float, float]:
         x0, y0, x1, y1 = self.bounds
         return ((x0 + x1) / 2, (y0 + y1) / 2)
 

@@ -57,8 +57,8 @@ def write_hillshade(dsm: Path, file: Path, grid: PixelGrid) -> None:
     heights, factor = _heights(dsm, MAX_IMAGE_PX)
     light = hillshade(heights, grid.gsd * factor)
     shown = np.isfinite(light)
-    grey = (np.nan_to_num(light) * 255 + 0.5).astype(np.uint8)
-    done, content = cv2.imencode(".png", np.dstack([grey, grey, grey, np.where(shown, 255, 0).astype(np.uint8)]))
+    gray = (np.nan_to_num(light) * 255 + 0.5).astype(np.uint8)
+    done, content = cv2.imencode(".png", np.dstack([gray, gray, gray, np.where(shown, 255, 0).astype(np.uint8)]))
     assert done
     file.write_bytes(content.tobytes())
 
@@ -113,10 +113,10 @@ def _draw_heights(figure: Figure, axes: Axes, heights: np.ndarray, light: np.nda
     there = heights[np.isfinite(heights)]
     low, high = (float(v) for v in np.quantile(there, [0.005, 0.995])) if there.size else (0.0, 1.0)
     norm = Normalize(low, max(high, low + 1e-6))
-    colours = matplotlib.colormaps[HEIGHT_CMAP](0.15 + 0.7 * norm(np.nan_to_num(heights, nan=low)).clip(0, 1))
-    colours[..., :3] *= (0.25 + 0.75 * np.nan_to_num(light) / np.sin(np.radians(ALTITUDE_DEG))).clip(0, 1.2)[..., None]
-    colours[..., 3] = np.isfinite(heights)
-    axes.imshow(colours.clip(0, 1), extent=(x0, x1, y0, y1), interpolation="nearest")
+    colors = matplotlib.colormaps[HEIGHT_CMAP](0.15 + 0.7 * norm(np.nan_to_num(heights, nan=low)).clip(0, 1))
+    colors[..., :3] *= (0.25 + 0.75 * np.nan_to_num(light) / np.sin(np.radians(ALTITUDE_DEG))).clip(0, 1.2)[..., None]
+    colors[..., 3] = np.isfinite(heights)
+    axes.imshow(colors.clip(0, 1), extent=(x0, x1, y0, y1), interpolation="nearest")
     shown = matplotlib.colors.ListedColormap(matplotlib.colormaps[HEIGHT_CMAP](np.linspace(0.15, 0.85, 256)))
     _legend(figure, axes, ScalarMappable(norm, shown), f"height ({sheet.placement.unit})")
 
@@ -130,13 +130,13 @@ def _draw_counts(figure: Figure, axes: Axes, counts: np.ndarray, sheet: PreviewS
     _legend(figure, axes, ScalarMappable(norm, VISIBILITY_CMAP), f"V, to {top}")
 
 
-def _legend(figure: Figure, axes: Axes, colours: ScalarMappable, label: str) -> None:
+def _legend(figure: Figure, axes: Axes, colors: ScalarMappable, label: str) -> None:
     """A bar at the right of a panel."""
     box = axes.get_position()
     bar = figure.add_axes(
         (box.x1 + 0.08 / figure.get_figwidth(), box.y0, 0.1 / figure.get_figwidth(), box.height * 0.6)
     )
-    legend = figure.colorbar(colours, cax=bar)
+    legend = figure.colorbar(colors, cax=bar)
     legend.outline.set_visible(False)  # type: ignore[operator]
     legend.locator = MaxNLocator(5, integer=True)
     legend.update_ticks()
@@ -150,9 +150,9 @@ def _scale_bar(axes: Axes, grid: PixelGrid, placement: MapProjection) -> None:
     x0, y0, x1, y1 = grid.bounds
     length = floor_to_nice_length((x1 - x0) / 4)
     left, low, thick = x0 + 0.05 * (x1 - x0), y0 + 0.05 * (y1 - y0), 0.012 * (y1 - y0)
-    for k, colour in enumerate((INK, "white")):
+    for k, color in enumerate((INK, "white")):
         axes.add_patch(
-            matplotlib.patches.Rectangle((left + k * length / 2, low), length / 2, thick, fc=colour, ec=INK, lw=0.8)
+            matplotlib.patches.Rectangle((left + k * length / 2, low), length / 2, thick, fc=color, ec=INK, lw=0.8)
         )
     axes.text(
         left + length / 2, low + 1.6 * thick, f"{length:g} {placement.unit}", ha="center", va="bottom", fontsize=8,

@@ -229,8 +229,8 @@ def _draw(
 
 
 def _bands(tile: OrthoTile) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    coloured = np.concatenate([tile.colours, tile.alpha[..., None]], axis=-1)
-    return np.moveaxis(coloured, -1, 0), tile.heights[None], tile.visibility[None]
+    colored = np.concatenate([tile.colors, tile.alpha[..., None]], axis=-1)
+    return np.moveaxis(colored, -1, 0), tile.heights[None], tile.visibility[None]
 
 
 def _metadata(plan: OrthoPlan) -> MapMetadata:

@@ -29,7 +29,7 @@ _MAX_SAMPLES = 4
 class OrthoTile:
     """What a tile shows; nothing (0, `NODATA_HEIGHT`, `NODATA_COUNT`) where the scene is open or no camera looks."""
 
-    colours: UInt8[np.ndarray, "h w 3"]
+    colors: UInt8[np.ndarray, "h w 3"]
     alpha: UInt8[np.ndarray, "h w"]
     heights: Float[np.ndarray, "h w"]
     visibility: UInt16[np.ndarray, "h w"]
@@ -38,7 +38,7 @@ class OrthoTile:
 class _PixelSurfaces(NamedTuple):
     """What pixels show, of which some are `shown`: for those, places in the ground frame and how many cameras look."""
 
-    colours: Float[np.ndarray, "h w 3"]
+    colors: Float[np.ndarray, "h w 3"]
     shown: Bool[np.ndarray, "h w"]
     points: Float[np.ndarray, "n 3"]
     counts: Int[np.ndarray, " n"]
@@ -63,17 +63,17 @@ class TileRenderer:
         through = self.nadir_camera.camera(fine)
         camera = self.nadir_camera.camera(grid) if self.samples > 1 else through
         seen = self._seen(through, camera)
-        shown, colours = seen.shown, seen.colours
+        shown, colors = seen.shown, seen.colors
         if self.detail_transfer is not None and shown.any():
             # Drawn once more, with what lies about it; not cut from that, so that heights and V are those without.
             around = self._seen(_pad_camera(through, HALO_PX * self.samples), _pad_camera(camera, HALO_PX))
-            detail = self.detail_transfer.detail(around.points, around.colours, around.shown)
-            colours = colours + detail[HALO_PX:-HALO_PX, HALO_PX:-HALO_PX]
+            detail = self.detail_transfer.detail(around.points, around.colors, around.shown)
+            colors = colors + detail[HALO_PX:-HALO_PX, HALO_PX:-HALO_PX]
         tile = OrthoTile(
             np.zeros((*shown.shape, 3), np.uint8), np.zeros(shown.shape, np.uint8),
             np.full(shown.shape, NODATA_HEIGHT, np.float32), np.full(shown.shape, NODATA_COUNT, np.uint16),
         )  # fmt: skip
-        tile.colours[shown] = (colours[shown].clip(0, 1) * 255 + 0.5).astype(np.uint8)
+        tile.colors[shown] = (colors[shown].clip(0, 1) * 255 + 0.5).astype(np.uint8)
         tile.alpha[shown] = 255
         if shown.any():
             tile.heights[shown] = self.nadir_camera.placement.project(seen.points)[:, 2]

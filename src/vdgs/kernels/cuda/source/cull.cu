@@ -2,7 +2,7 @@
 //
 // A thread an anchor, twice: first a bit for each, 32 of them a word, and how many of a word are set; once these are added
 // up and there is room, the anchor of each set bit goes to its place, so that indices ascend. Scales are read only of
-// anchors whose centre does not already lie on the image. The bound is gaussian_math.h, which the processor uses too.
+// anchors whose center does not already lie on the image. The bound is gaussian_math.h, which the processor uses too.
 #include "gaussian_math.h"
 
 namespace {

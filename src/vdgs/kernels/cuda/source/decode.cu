@@ -20,7 +20,7 @@ constexpr unsigned kAllLanes = 0xffffffffu;
 constexpr int kFeatures = 32;
 constexpr int kHidden = kWarp;
 
-// One MLP, c outputs an offset. Weights lie so that neighbouring lanes read neighbouring numbers: w1 [inputs, 32], w2
+// One MLP, c outputs an offset. Weights lie so that neighboring lanes read neighboring numbers: w1 [inputs, 32], w2
 // [32, c, k], b2 [c, k].
 struct Head {
   const float *w1, *b1, *w2, *b2;
@@ -88,14 +88,14 @@ struct Anchors {
 };
 
 struct Decoder {
-  Head opacity, covariance, colour;
+  Head opacity, covariance, color;
   bool with_distance;
 };
 
 // What the lane's offset looks like, if it shows.
 struct Look {
   vdgs::Footprint<float> drawn;
-  float colour[3];
+  float color[3];
   float opacity, volume;
 };
 
@@ -105,7 +105,7 @@ __device__ unsigned look_at(const Anchors& anchors, const Decoder& decoder, cons
   const int lane = threadIdx.x % kWarp;
   Inputs inputs{anchors.features[row * kFeatures + lane], {}, 0.0f};
   const Vec3<float> position = read(anchors.positions + 3 * row);
-  const Vec3<float> ray = {position.x - camera.centre.x, position.y - camera.centre.y, position.z - camera.centre.z};
+  const Vec3<float> ray = {position.x - camera.center.x, position.y - camera.center.y, position.z - camera.center.z};
   inputs.distance = sqrtf(vdgs::dot(ray, ray));
   inputs.direction = camera.orthographic ? camera.forward : (1.0f / inputs.distance) * ray;
   const float* log_scales = anchors.log_scales + 6 * row;
@@ -130,7 +130,7 @@ __device__ unsigned look_at(const Anchors& anchors, const Decoder& decoder, cons
   if (!all_kept) return 0u;
   look.drawn = p.drawn;
   look.volume = kept ? gaussian.scale.x * gaussian.scale.y * gaussian.scale.z : 0.0f;
-  outputs_of(decoder.colour, hidden_of(decoder.colour, inputs, decoder.with_distance), k, kept, look.colour);
+  outputs_of(decoder.color, hidden_of(decoder.color, inputs, decoder.with_distance), k, kept, look.color);
   return all_kept;
 }
 
@@ -146,7 +146,7 @@ decode_anchors(const float* positions, const float* features, const float* offse
                const float* c_b1, const float* c_w2, const float* c_b2, const float* r_w1, const float* r_b1,
                const float* r_w2, const float* r_b2, vdgs::Camera camera, const long long* rows, long long count,
                int k, int with_distance, int capacity, int* total, unsigned* shown, int* begins, int* lengths,
-               float* volume_sums, float* means_px, float* conics, float* depths, float* colours, float* opacities,
+               float* volume_sums, float* means_px, float* conics, float* depths, float* colors, float* opacities,
                float* volumes, int* source) {
   __shared__ int numbers[kWarps];
   __shared__ float sums[kWarps];
@@ -181,7 +181,7 @@ decode_anchors(const float* positions, const float* features, const float* offse
   means_px[2 * at] = look.drawn.x, means_px[2 * at + 1] = look.drawn.y;
   conics[3 * at] = look.drawn.conic_xx, conics[3 * at + 1] = look.drawn.conic_xy, conics[3 * at + 2] = look.drawn.conic_yy;
   depths[at] = look.drawn.depth;
-  for (int c = 0; c < 3; ++c) colours[3 * at + c] = vdgs::sigmoid(look.colour[c]);
+  for (int c = 0; c < 3; ++c) colors[3 * at + c] = vdgs::sigmoid(look.color[c]);
   opacities[at] = look.opacity;
   if (volumes) volumes[at] = look.volume;
   if (source) source[at] = static_cast<int>(visible * k + lane);
@@ -255,9 +255,9 @@ move_anchors(const float* positions, float* features, float* offsets, float* log
              const float* r_w2t, const float* r_b2, const float* o_w1, const float* o_w2, const float* c_w1,
              const float* c_w2, const float* r_w1, const float* r_w2, vdgs::Camera camera, const long long* rows,
              long long first, long long count, int k, int inputs_wide, const unsigned* shown, const int* begins,
-             const float* by_means_px, const float* by_conics, const float* by_colours, const float* by_opacities,
+             const float* by_means_px, const float* by_conics, const float* by_colors, const float* by_opacities,
              float by_volume, int* updates, const float* lacking, const float* roots, int most_updates, int* broken,
-             float* by_opacity_out, float* by_covariance_out, float* by_colour_out, float* hidden_out,
+             float* by_opacity_out, float* by_covariance_out, float* by_color_out, float* hidden_out,
              float* by_hidden_out, float* inputs_out) {
   const long long place = static_cast<long long>(blockIdx.x) * kWarps + threadIdx.x / kWarp, visible = first + place;
   if (place >= count) return;  // whole warps
@@ -274,32 +274,32 @@ move_anchors(const float* positions, float* features, float* offsets, float* log
   vdgs::Anchor<float> anchor{{}, exp_of(log_extent), exp_of(log_size)};
   if (kept) {
     anchor.position = read(positions + 3 * row);
-    const Vec3<float> x = anchor.position, c = camera.centre, ray = {x.x - c.x, x.y - c.y, x.z - c.z};
+    const Vec3<float> x = anchor.position, c = camera.center, ray = {x.x - c.x, x.y - c.y, x.z - c.z};
     inputs.distance = sqrtf(vdgs::dot(ray, ray));
     inputs.direction = camera.orthographic ? camera.forward : (1.0f / inputs.distance) * ray;
   }
 
-  float by_opacity[1] = {}, by_covariance[7] = {}, by_colour[3] = {}, by_scales[6] = {};
+  float by_opacity[1] = {}, by_covariance[7] = {}, by_color[3] = {}, by_scales[6] = {};
   Vec3<float> by_offset{};
   float hidden[3] = {}, by_hidden[3] = {}, by_feature = 0.0f;
   if (kept) {
     const Head opacity_head{o_w1t, o_b1, o_w2t, o_b2}, covariance_head{c_w1t, c_b1, c_w2t, c_b2};
-    const Head colour_head{r_w1t, r_b1, r_w2t, r_b2};
+    const Head color_head{r_w1t, r_b1, r_w2t, r_b2};
     const bool shows = kept >> lane & 1u;
     const long long splat = first_splat(shown, begins, visible) + lanes_before(kept);  // that of the lane, if it shows
     hidden[0] = hidden_of(opacity_head, inputs, with_distance);
     hidden[1] = hidden_of(covariance_head, inputs, with_distance);
-    hidden[2] = hidden_of(colour_head, inputs, with_distance);
-    float opacity[1], colour[3], covariance[7];
+    hidden[2] = hidden_of(color_head, inputs, with_distance);
+    float opacity[1], color[3], covariance[7];
     outputs_of(opacity_head, hidden[0], k, shows, opacity);
     if (shows) {
       const float value = tanhf(opacity[0]);
       by_opacity[0] = by_opacities[splat] * (1.0f - value * value);
     }
-    outputs_of(colour_head, hidden[2], k, shows, colour);
+    outputs_of(color_head, hidden[2], k, shows, color);
     for (int c = 0; shows && c < 3; ++c) {
-      const float value = vdgs::sigmoid(colour[c]);
-      by_colour[c] = by_colours[3 * splat + c] * value * (1.0f - value);
+      const float value = vdgs::sigmoid(color[c]);
+      by_color[c] = by_colors[3 * splat + c] * value * (1.0f - value);
     }
     outputs_of(covariance_head, hidden[1], k, shows, covariance);
     if (shows) {
@@ -318,7 +318,7 @@ move_anchors(const float* positions, float* features, float* offsets, float* log
     }
     by_hidden[0] = by_hidden_of(o_w2, k, hidden[0], by_opacity);
     by_hidden[1] = by_hidden_of(c_w2, k, hidden[1], by_covariance);
-    by_hidden[2] = by_hidden_of(r_w2, k, hidden[2], by_colour);
+    by_hidden[2] = by_hidden_of(r_w2, k, hidden[2], by_color);
     by_feature = by_feature_of(o_w1, inputs_wide, by_hidden[0]) + by_feature_of(c_w1, inputs_wide, by_hidden[1]) +
                  by_feature_of(r_w1, inputs_wide, by_hidden[2]);
     for (float& each : by_scales) each = add_over_lanes(each);
@@ -328,7 +328,7 @@ move_anchors(const float* positions, float* features, float* offsets, float* log
       const long long at = place * k + lane;
       by_opacity_out[at] = by_opacity[0];
       for (int c = 0; c < 7; ++c) by_covariance_out[7 * at + c] = by_covariance[c];
-      for (int c = 0; c < 3; ++c) by_colour_out[3 * at + c] = by_colour[c];
+      for (int c = 0; c < 3; ++c) by_color_out[3 * at + c] = by_color[c];
     }
     for (int head = 0; head < 3; ++head) {
       hidden_out[(head * count + place) * kHidden + lane] = hidden[head];

@@ -175,13 +175,13 @@ def _view(inputs: StereoInputs, groups: SpatialGroups, camera: Camera, index: in
     """A photograph grey, at the size at which it is matched."""
     picture, _ = inputs.read_image(index)
     small = camera.width < picture.shape[1]
-    grey = cv2.resize(
+    gray = cv2.resize(
         cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), (camera.width, camera.height),
         interpolation=cv2.INTER_AREA if small else cv2.INTER_CUBIC,
     )  # fmt: skip
     _, depth = camera.project(inputs.points[points_in_view(inputs.cameras[index], inputs.points, groups)])
     near, far = np.quantile(depth, DEPTH_QUANTILES) if len(depth) else (1.0, 1.0)
-    return StereoView(camera, grey, float(near) * (1 - DEPTH_MARGIN), float(far) * (1 + DEPTH_MARGIN))
+    return StereoView(camera, gray, float(near) * (1 - DEPTH_MARGIN), float(far) * (1 + DEPTH_MARGIN))
 
 
 def _geometric_consistency(
@@ -211,9 +211,9 @@ def _geometric_consistency(
     size = (camera.width, camera.height)
     if mask is not None:
         confirmed &= cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) > 0
-    colours = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    colors = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
     area = (depth[confirmed].astype(np.float64) ** 2 / (camera.fx * camera.fy))[:, None]
-    values = np.concatenate([places[confirmed], colours[confirmed], np.ones_like(area), area], 1)
+    values = np.concatenate([places[confirmed], colors[confirmed], np.ones_like(area), area], 1)
     sizes = cell.scale_index(depth[confirmed].astype(np.float64) / inputs.cameras[index].fx)
     edge = cell.min_edge * CELL_SCALES[sizes]
     x, y, z = (np.floor(values[:, axis] / edge).astype(np.int64) + MAX_CELL_INDEX for axis in range(3))

@@ -71,8 +71,8 @@ class RectifiedPair:
         matrix = np.array([[self.focal, 0, self.columns[which]], [0, self.focal, self.row], [0, 0, 1.0]])
         turn = camera.camera_from_world[:3, :3] @ self.rotation.T
         homography = _intrinsics(camera) @ turn @ np.linalg.inv(matrix)
-        centre = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # index 0 is the pixel whose centre is at 0.5
-        return np.linalg.inv(centre) @ homography @ centre
+        center = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # index 0 is the pixel whose centre is at 0.5
+        return np.linalg.inv(center) @ homography @ center
 
     def disparity(self, depth: float) -> float:
         """Columns by which a point at this depth lies further left in the second picture."""

@@ -103,9 +103,9 @@ def multi_view_depth(view: StereoView, source_views: Sequence[StereoView]) -> Fl
     return (total / np.maximum(agreeing.sum(0), 1)).astype(np.float32)
 
 
-def _textured(grey: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+def _textured(gray: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Where there is something to match."""
-    values, window = grey.astype(np.float32), (CONTRAST_WINDOW, CONTRAST_WINDOW)
+    values, window = gray.astype(np.float32), (CONTRAST_WINDOW, CONTRAST_WINDOW)
     variance = cv2.blur(values * values, window) - cv2.blur(values, window) ** 2
     textured: np.ndarray = variance > MIN_CONTRAST**2
     return textured

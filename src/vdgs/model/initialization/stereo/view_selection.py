@@ -39,7 +39,7 @@ def select_source_views(
     views = count_visibility(torch.from_numpy(points), cameras).numpy()
     groups = SpatialGroups.of(torch.from_numpy(points))
     shown = [_sample_points(points_in_view(camera, points, groups), views) for camera in cameras]
-    centres = np.stack([camera.position for camera in cameras])
+    centers = np.stack([camera.position for camera in cameras])
     seen = [index for index, mine in enumerate(shown) if len(mine) >= MIN_SAMPLE_POINTS]
     found: list[list[int]] = [[] for _ in cameras]
     if len(seen) < 2:
@@ -51,7 +51,7 @@ def select_source_views(
         mine = points[shown[index]]
         sees = np.stack([cameras[other].in_frustum(mine) for other in asked])
         need = 1.0 / views[shown[index]]
-        worth = _view_score(centres[index], centres[asked], mine) * sees * (need / need.mean())
+        worth = _view_score(centers[index], centers[asked], mine) * sees * (need / need.mean())
         found[index] = [int(asked[k]) for k in _greedily(worth, count)]
     return found
 

@@ -1,7 +1,7 @@
 // Gradients of the entries of every tile, back to front.
 //
 // Per pixel, with T_i before entry i and G = dL/d(image): the derivative with respect to alpha_i is
-//     T_i colour_i . G  -  behind_i / (1 - alpha_i),   behind_i = what lies behind i, times G.
+//     T_i color_i . G  -  behind_i / (1 - alpha_i),   behind_i = what lies behind i, times G.
 // T_i is recovered from T_i+1 by division. Every entry ends up with ten sums over its pixels, from
 // which reduce_gradients makes the gradients of the splat.
 //
@@ -10,7 +10,7 @@
 // those in front of a tile's first wanted entry not even in that.
 #include "cpu/sums.h"
 #include "threads.h"
-#include "cpu/rasterise/tile.h"
+#include "cpu/rasterize/tile.h"
 
 namespace vdgs::raster {
 namespace {
@@ -71,7 +71,7 @@ VDGS_INLINE void entry_gradients(const Record& r, const BlockOrigins& origins, u
     store(alphas[block], alpha);
     store(inverses[block], reciprocal(one - alpha));
   }
-  const F16 red = splat(r.colour[0]), green = splat(r.colour[1]), blue = splat(r.colour[2]);
+  const F16 red = splat(r.color[0]), green = splat(r.color[1]), blue = splat(r.color[2]);
   F16 s0 = zero, su = zero, sv = zero, suu = zero, suv = zero, svv = zero;
   F16 w_red = zero, w_green = zero, w_blue = zero, w_depth = zero;
   for (; touched; touched &= touched - 1) {

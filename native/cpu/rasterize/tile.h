@@ -5,7 +5,7 @@
 // pixel of a block"; both number rows first.
 #pragma once
 
-#include "cpu/rasterise/frame.h"
+#include "cpu/rasterize/frame.h"
 #include "simd/simd.h"
 
 namespace vdgs::raster {
@@ -13,7 +13,7 @@ namespace vdgs::raster {
 alignas(64) constexpr float kLaneX[16] = {0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3};
 alignas(64) constexpr float kLaneY[16] = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3};
 
-// The first pixel centre of each block of a tile.
+// The first pixel center of each block of a tile.
 struct BlockOrigins {
   F16 x, y;
   BlockOrigins(const TileGrid& grid, int tile)
@@ -21,16 +21,16 @@ struct BlockOrigins {
         y(load(kLaneY) * splat(4.0f) + splat(static_cast<float>(tile / grid.columns * kTileSide) + 0.5f)) {}
 };
 
-// First and last tile of the pixels whose centres lie within `reach` of `mean`, along one axis.
+// First and last tile of the pixels whose centers lie within `reach` of `mean`, along one axis.
 struct TileInterval {
   F16 first, last;
   M16 hit;  // there is such a pixel
 };
 VDGS_INLINE TileInterval tile_interval(F16 mean, F16 reach, int n_pixels) {
-  const F16 centre = mean - splat(0.5f);
-  const F16 low = splat(0.0f) - floor(reach - centre);  // ceil(centre - reach)
+  const F16 center = mean - splat(0.5f);
+  const F16 low = splat(0.0f) - floor(reach - center);  // ceil(center - reach)
   const F16 first = max(low, splat(0.0f));
-  const F16 last = min(floor(centre + reach), splat(static_cast<float>(n_pixels - 1)));
+  const F16 last = min(floor(center + reach), splat(static_cast<float>(n_pixels - 1)));
   const F16 per_tile = splat(1.0f / kTileSide);
   return {floor(first * per_tile), floor(last * per_tile), le(first, last)};
 }
@@ -48,9 +48,9 @@ VDGS_INLINE void make_falloff(const Record& r, F16 dx, F16 dy, Falloff& out) {
   store(out.v_pixel, vy * load(kLaneY));
 }
 
-// Which of sixteen squares a splat may reach: those where the largest exponent over the pixel centres'
-// rectangle suffices. dx, dy lead from the mean to the first centre of each, `side` from there to the
-// last. A concave function is largest on the edge that faces its centre, or inside.
+// Which of sixteen squares a splat may reach: those where the largest exponent over the pixel centers'
+// rectangle suffices. dx, dy lead from the mean to the first center of each, `side` from there to the
+// last. A concave function is largest on the edge that faces its center, or inside.
 VDGS_INLINE M16 squares_in_reach(const Record& r, F16 dx, F16 dy, float side) {
   const F16 zero = splat(0.0f);
   const F16 dx_end = dx + splat(side), dy_end = dy + splat(side);

@@ -1,4 +1,4 @@
-// The rasteriser as Python sees it. Shapes and types are checked by vdgs.kernels.cpu.rasterize.
+// The rasterizer as Python sees it. Shapes and types are checked by vdgs.kernels.cpu.rasterize.
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/shared_ptr.h>
 
@@ -6,7 +6,7 @@
 #include <vector>
 
 #include "bindings.h"
-#include "cpu/rasterise/frame.h"
+#include "cpu/rasterize/frame.h"
 
 namespace {
 
@@ -49,7 +49,7 @@ void drop_idle_frames() {
   idle_frames().clear();
 }
 
-std::shared_ptr<Frame> py_forward(Floats means, Floats conics, Floats colours, Floats opacities,
+std::shared_ptr<Frame> py_forward(Floats means, Floats conics, Floats colors, Floats opacities,
                                   Floats depths, const nb::tuple& background, int width, int height,
                                   MutableFloats image, MutableFloats alpha,
                                   std::optional<MutableFloats> depth,
@@ -57,7 +57,7 @@ std::shared_ptr<Frame> py_forward(Floats means, Floats conics, Floats colours, F
   const Splats splats{static_cast<int64_t>(opacities.shape(0)),
                       means.data(),
                       conics.data(),
-                      colours.data(),
+                      colors.data(),
                       opacities.data(),
                       depths.data()};
   const Picture out{image.data(), alpha.data(), depth ? depth->data() : nullptr,
@@ -72,14 +72,14 @@ std::shared_ptr<Frame> py_forward(Floats means, Floats conics, Floats colours, F
 
 void py_backward(std::shared_ptr<Frame> frame, const nb::tuple& background, std::optional<Floats> image,
                  std::optional<Floats> alpha, std::optional<Floats> depth, MutableFloats means,
-                 MutableFloats conics, MutableFloats colours, MutableFloats opacities,
+                 MutableFloats conics, MutableFloats colors, MutableFloats opacities,
                  std::optional<MutableFloats> depths, MutableFloats background_gradient) {
   const auto pointer = [](const std::optional<Floats>& a) { return a ? a->data() : nullptr; };
   const PictureGradients in{pointer(image), pointer(alpha), pointer(depth)};
   const SplatGradients out{static_cast<int64_t>(opacities.shape(0)),
                            means.data(),
                            conics.data(),
-                           colours.data(),
+                           colors.data(),
                            opacities.data(),
                            depths ? depths->data() : nullptr,
                            background_gradient.data()};
@@ -114,7 +114,7 @@ nb::dict statistics(const Frame& frame) {
 
 }  // namespace
 
-VDGS_BIND(rasterise) {
+VDGS_BIND(rasterize) {
   nb::class_<Frame>(m, "Frame", "A drawn picture, as its backward pass needs it.")
       .def_prop_ro("bytes", &Frame::bytes, "Memory that it holds on to.")
       .def_prop_ro("seconds", &seconds, "How long each phase took.")
@@ -123,14 +123,14 @@ VDGS_BIND(rasterise) {
   m.attr("ALPHA_MAX") = vdgs::kAlphaMax;
   m.attr("TRANSMITTANCE_MIN") = vdgs::kTransmittanceMin;
   m.attr("MEDIAN_TRANSMITTANCE") = vdgs::kMedianTransmittance;
-  m.def("rasterise_forward", &py_forward, nb::arg("means"), nb::arg("conics"), nb::arg("colours"),
+  m.def("rasterize_forward", &py_forward, nb::arg("means"), nb::arg("conics"), nb::arg("colors"),
         nb::arg("opacities"), nb::arg("depths"), nb::arg("background"), nb::arg("width"), nb::arg("height"),
         nb::arg("image"), nb::arg("alpha"), nb::arg("depth").none(), nb::arg("median_depth").none(),
         nb::arg("counting") = false);
-  m.def("rasterise_backward", &py_backward, nb::arg("frame"), nb::arg("background"), nb::arg("image").none(),
+  m.def("rasterize_backward", &py_backward, nb::arg("frame"), nb::arg("background"), nb::arg("image").none(),
         nb::arg("alpha").none(), nb::arg("depth").none(), nb::arg("means"), nb::arg("conics"),
-        nb::arg("colours"), nb::arg("opacities"), nb::arg("depths").none(), nb::arg("background_gradient"));
-  m.def("rasterise_shares", &py_shares, nb::arg("frame"), nb::arg("lacking"), nb::arg("pixels"),
+        nb::arg("colors"), nb::arg("opacities"), nb::arg("depths").none(), nb::arg("background_gradient"));
+  m.def("rasterize_shares", &py_shares, nb::arg("frame"), nb::arg("lacking"), nb::arg("pixels"),
         nb::arg("missing"));
   m.def("drop_idle_frames", &drop_idle_frames, "Gives the memory of frames that are not in use back.");
 }

@@ -1,7 +1,7 @@
 // Records of the splats of a slab, made in the order of the input.
 #include <cmath>
 
-#include "cpu/rasterise/tile.h"
+#include "cpu/rasterize/tile.h"
 
 namespace vdgs::raster {
 namespace {
@@ -48,8 +48,8 @@ VDGS_INLINE void derive(Sixteen& s, const TileGrid& grid) {
 }
 
 Record record_of(const Sixteen& s, int k, const Splats& splats, int32_t splat) {
-  const float* colour = splats.colours + 3 * static_cast<int64_t>(splat);
-  const bool finite = std::fabs(colour[0]) + std::fabs(colour[1]) + std::fabs(colour[2]) < __builtin_inff();
+  const float* color = splats.colors + 3 * static_cast<int64_t>(splat);
+  const bool finite = std::fabs(color[0]) + std::fabs(color[1]) + std::fabs(color[2]) < __builtin_inff();
   const uint32_t columns = finite ? static_cast<uint32_t>(s.columns[k]) : kNoTiles;
   return {s.x[k],
           s.y[k],
@@ -57,7 +57,7 @@ Record record_of(const Sixteen& s, int k, const Splats& splats, int32_t splat) {
           s.uy[k],
           s.vy[k],
           s.log2_opacity[k],
-          {colour[0], colour[1], colour[2]},
+          {color[0], color[1], color[2]},
           splats.depths[splat],
           s.best_y[k],
           s.best_x[k],

@@ -1,7 +1,7 @@
 // Gradients and shares of the splats from the sums of their entries, added in a fixed order.
 #include <algorithm>
 
-#include "cpu/rasterise/frame.h"
+#include "cpu/rasterize/frame.h"
 #include "simd/simd.h"
 #include "cpu/sums.h"
 #include "threads.h"
@@ -13,7 +13,7 @@ void clear(const SplatGradients& out, int64_t begin, int64_t end) {
   const size_t n = static_cast<size_t>(end - begin);
   std::memset(out.means + 2 * begin, 0, 8 * n);
   std::memset(out.conics + 3 * begin, 0, 12 * n);
-  std::memset(out.colours + 3 * begin, 0, 12 * n);
+  std::memset(out.colors + 3 * begin, 0, 12 * n);
   std::memset(out.opacities + begin, 0, 4 * n);
   if (out.depths) std::memset(out.depths + begin, 0, 4 * n);
 }
@@ -67,9 +67,9 @@ VDGS_INLINE void write_gradients(const Record& r, const float* sum, int64_t i, c
   out.conics[3 * i + 1] = -(uv - shear * vv) * x_per_u * y_per_v;
   out.conics[3 * i + 2] = -0.5f * vv * y_per_v * y_per_v;
   out.opacities[i] = sum[kSum] / r.opacity;
-  out.colours[3 * i] = sum[kSumRed];
-  out.colours[3 * i + 1] = sum[kSumGreen];
-  out.colours[3 * i + 2] = sum[kSumBlue];
+  out.colors[3 * i] = sum[kSumRed];
+  out.colors[3 * i + 1] = sum[kSumGreen];
+  out.colors[3 * i + 2] = sum[kSumBlue];
   if (out.depths) out.depths[i] = sum[kSumDepth];
 }
 

@@ -1,10 +1,10 @@
-// What the blend loop of the rasteriser could do at best on this core: the same arithmetic on one block
+// What the blend loop of the rasterizer could do at best on this core: the same arithmetic on one block
 // of pixels in registers, with its splats in the first-level cache and nothing around it. Benchmarks
-// report the rasteriser as a share of it.
+// report the rasterizer as a share of it.
 #include <chrono>
 
 #include "bindings.h"
-#include "cpu/rasterise/tile.h"
+#include "cpu/rasterize/tile.h"
 
 namespace {
 

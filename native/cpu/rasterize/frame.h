@@ -1,4 +1,4 @@
-// What lives between the phases of the rasteriser, and between its forward and backward pass.
+// What lives between the phases of the rasterizer, and between its forward and backward pass.
 #pragma once
 
 #include <chrono>
@@ -8,7 +8,7 @@
 
 #include "cpu/buffer.h"
 #include "image_formation.h"
-#include "cpu/rasterise/rasterise.h"
+#include "cpu/rasterize/rasterize.h"
 
 namespace vdgs::raster {
 
@@ -22,14 +22,14 @@ constexpr int kTileBlocks = 16;  // 4 x 4 pixels each
 // Contributing exponents are allowed this much rounding before a block or tile is ruled out.
 constexpr float kExponentSlack = 2e-4f;
 
-// A splat as the tiles read it: one cache line. With dx, dy from the mean to a pixel centre,
+// A splat as the tiles read it: one cache line. With dx, dy from the mean to a pixel center,
 //     u = ux dx + uy dy,   v = vy dy,   log2 alpha = log2_opacity - u^2 - v^2:
 // the Cholesky factor of the conic, which keeps its precision for splats seen edge-on.
 struct alignas(64) Record {
   float mean_x, mean_y;
   float ux, uy, vy;
   float log2_opacity;
-  float colour[3];
+  float color[3];
   float depth;
   float best_y_per_x;  // -b/c: on a vertical line at dx the splat is strongest at dy = this * dx
   float best_x_per_y;  // -b/a
@@ -93,7 +93,7 @@ struct Slab {
 // The pixels of one tile, block by block.
 struct alignas(64) TilePixels {
   float transmittance[kTilePixels];
-  float colour[3][kTilePixels];
+  float color[3][kTilePixels];
   float depth[kTilePixels];
   float stop[kTilePixels];     // order_of() of the entry that finished the pixel
   uint16_t live[kTileBlocks];  // pixels that are not finished

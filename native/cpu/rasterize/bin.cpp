@@ -2,7 +2,7 @@
 #include <stdexcept>
 
 #include "threads.h"
-#include "cpu/rasterise/tile.h"
+#include "cpu/rasterize/tile.h"
 
 namespace vdgs::raster {
 namespace {

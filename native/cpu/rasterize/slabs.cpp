@@ -6,7 +6,7 @@
 #include <limits>
 #include <stdexcept>
 
-#include "cpu/rasterise/frame.h"
+#include "cpu/rasterize/frame.h"
 #include "simd/simd.h"
 #include "threads.h"
 

@@ -1,9 +1,9 @@
-// Differentiable rasteriser of projected Gaussians ("splats") for the CPU.
+// Differentiable rasterizer of projected Gaussians ("splats") for the CPU.
 //
 // The image formation model is that of 3D Gaussian splatting (Kerbl et al. 2023, eqs. 2-3), front to back:
 //
 //     alpha_i = min(0.999, opacity_i exp(-1/2 (a dx^2 + 2 b dx dy + c dy^2)))   skipped below 1/255
-//     colour  = sum_i colour_i alpha_i T_i + T background,   T_i = product of (1 - alpha_j), j before i
+//     color  = sum_i color_i alpha_i T_i + T background,   T_i = product of (1 - alpha_j), j before i
 //
 // where a pixel is finished before T would fall below 1e-4. The median depth of a pixel is that of the
 // splat at which T falls from at least 1/2 to below it; it has no derivative. How it is made fast:
@@ -32,7 +32,7 @@ struct Splats {
   int64_t count;
   const float* means;      // [n, 2] pixels
   const float* conics;     // [n, 3] a, b, c
-  const float* colours;    // [n, 3]
+  const float* colors;    // [n, 3]
   const float* opacities;  // [n]
   const float* depths;     // [n]
 };
@@ -55,7 +55,7 @@ struct SplatGradients {
   int64_t count;
   float* means;
   float* conics;
-  float* colours;
+  float* colors;
   float* opacities;
   float* depths;      // null if the depth was not wanted
   float* background;  // [3]
@@ -70,7 +70,7 @@ void forward(Frame& frame, const Splats& splats, const float background[3], int 
 // May be called more than once for one forward pass, but not at the same time.
 void backward(Frame& frame, const float background[3], const PictureGradients& in, const SplatGradients& out);
 
-// In place of the backward pass, where derivatives by colours suffice. Of each splat the sum of its weights
+// In place of the backward pass, where derivatives by colors suffice. Of each splat the sum of its weights
 // over the pixels [n], and that of weight times `lacking` [h, w, 3] there [n, 3]; zero for splats that were not drawn.
 void shares(Frame& frame, const float* lacking, float* pixels, float* missing);
 

@@ -3,8 +3,8 @@
 //   order_splats        which splat comes when among equal depths, where they do not stand in that order
 //   splat_tiles         in how many tiles of 16x16 pixels each splat reaches a pixel
 //   splat_entries       one entry for each of them: a key (tile, depth) to sort by, and the splat that it is of
-//   rasterise_forward   a block of threads a tile, a thread a pixel: the tile's entries front to back
-//   rasterise_backward  the same entries in the same order once more: ten sums an entry
+//   rasterize_forward   a block of threads a tile, a thread a pixel: the tile's entries front to back
+//   rasterize_backward  the same entries in the same order once more: ten sums an entry
 //   gather_gradients    adds up the entries of each splat: its gradients
 //
 // Entries are made splat after splat and sorted in between (by torch, stable, so that equal depths keep the order of the
@@ -26,14 +26,14 @@ constexpr int kWarps = kThreads / kWarp;
 constexpr unsigned kAllLanes = 0xffffffffu;
 // Entries that the backward pass has in shared memory at a time.
 constexpr int kBatch = 32;
-// Of an entry: by log alpha; by u, v; by dx^2, dx dy, dy^2; by three colours; by depth.
+// Of an entry: by log alpha; by u, v; by dx^2, dx dy, dy^2; by three colors; by depth.
 constexpr int kSums = 10;
 constexpr int kRoom = 16;  // kSums, and zeros up to a power of two
 
 struct Splats {
   const float* means;      // [m, 2]
   const float* conics;     // [m, 3]
-  const float* colours;    // [m, 3]
+  const float* colors;    // [m, 3]
   const float* opacities;  // [m]
   const float* depths;     // [m]
 };
@@ -47,7 +47,7 @@ struct Shape {
 
 struct Entry {
   Shape shape;
-  float colour[3];
+  float color[3];
   float depth;
 };
 
@@ -61,8 +61,8 @@ __device__ bool shape_of(const Splats& splats, long long i, Shape& shape) {
   const float square = b * b;
   const float determinant = fmaf(a, c, -square) + fmaf(-b, b, square);
   const bool finite = is_finite(x) && is_finite(y) && is_finite(a) && is_finite(b) && is_finite(c) &&
-                      is_finite(opacity) && is_finite(splats.depths[i]) && is_finite(splats.colours[3 * i]) &&
-                      is_finite(splats.colours[3 * i + 1]) && is_finite(splats.colours[3 * i + 2]);
+                      is_finite(opacity) && is_finite(splats.depths[i]) && is_finite(splats.colors[3 * i]) &&
+                      is_finite(splats.colors[3 * i + 1]) && is_finite(splats.colors[3 * i + 2]);
   if (!(finite && a > 0.0f && c > 0.0f && determinant > 0.0f && opacity >= kAlphaMin)) return false;
   const float ux = sqrtf(a);
   shape = {x, y, ux, b / ux, sqrtf(determinant / a), opacity, fmaf(2.0002f, logf(opacity / kAlphaMin), 1e-3f)};
@@ -76,7 +76,7 @@ __device__ float clamped(float a, float low, float high) { return fminf(fmaxf(a,
 // Alpha before it is clamped.
 __device__ float alpha_of(const Shape& s, float q) { return s.opacity * expf(-0.5f * q); }
 
-// Whether a splat may reach a pixel's centre of a tile: the least q over the rectangle of centres lies at the mean or on
+// Whether a splat may reach a pixel's center of a tile: the least q over the rectangle of centers lies at the mean or on
 // the border. The rectangle is widened a little, for rounding.
 __device__ bool touches(const Shape& s, int column, int row) {
   const float slack = 0.01f;
@@ -117,7 +117,7 @@ __device__ int pixel_row() { return blockIdx.y * kTile + threadIdx.x / kWarp / 2
 
 __device__ void read_entry(const Splats& splats, long long i, Entry& entry) {
   shape_of(splats, i, entry.shape);  // only splats that are drawn have entries
-  for (int k = 0; k < 3; ++k) entry.colour[k] = splats.colours[3 * i + k];
+  for (int k = 0; k < 3; ++k) entry.color[k] = splats.colors[3 * i + k];
   entry.depth = splats.depths[i];
 }
 
@@ -151,12 +151,12 @@ order_splats(const int* begins, const int* ends, int runs, int* order) {
 // A thread a splat. `order` [m]: the row of the splat that comes first, and so on (null: as the rows are). `tiles` [m], in
 // this order.
 extern "C" __global__ void __launch_bounds__(kThreads)
-splat_tiles(const float* means, const float* conics, const float* colours, const float* opacities, const float* depths,
+splat_tiles(const float* means, const float* conics, const float* colors, const float* opacities, const float* depths,
             const int* order, long long count, int columns, int rows, long long* tiles) {
   const long long place = static_cast<long long>(blockIdx.x) * kThreads + threadIdx.x;
   if (place >= count) return;
   const long long i = order ? order[place] : place;
-  const Splats splats{means, conics, colours, opacities, depths};
+  const Splats splats{means, conics, colors, opacities, depths};
   Shape shape;
   long long found = 0;
   if (shape_of(splats, i, shape)) {
@@ -169,13 +169,13 @@ splat_tiles(const float* means, const float* conics, const float* colours, const
 
 // A thread a splat, in their `order`. `ends` [m]: where the entries of each splat end. `keys` and `owners`: one for each entry.
 extern "C" __global__ void __launch_bounds__(kThreads)
-splat_entries(const float* means, const float* conics, const float* colours, const float* opacities,
+splat_entries(const float* means, const float* conics, const float* colors, const float* opacities,
               const float* depths, const int* order, long long count, int columns, int rows, const long long* ends,
               long long* keys, int* owners) {
   const long long place = static_cast<long long>(blockIdx.x) * kThreads + threadIdx.x;
   if (place >= count) return;
   const long long i = order ? order[place] : place;
-  const Splats splats{means, conics, colours, opacities, depths};
+  const Splats splats{means, conics, colors, opacities, depths};
   Shape shape;
   if (!shape_of(splats, i, shape)) return;
   const Box box = box_of(shape, columns, rows);
@@ -193,12 +193,12 @@ splat_entries(const float* means, const float* conics, const float* colours, con
 // A block a tile. `order`: where each sorted entry was before; `bounds` [tiles + 1]: where those of a tile begin.
 // `last` [h, w]: how many entries of its tile a pixel looks at before it is finished. Depth and median may be null.
 extern "C" __global__ void __launch_bounds__(kThreads)
-rasterise_forward(const float* means, const float* conics, const float* colours, const float* opacities,
+rasterize_forward(const float* means, const float* conics, const float* colors, const float* opacities,
                   const float* depths, const int* owners, const long long* order, const long long* bounds,
                   const float* background, int width, int height, float* image, float* transmittance, int* last,
                   float* depth, float* median) {
   __shared__ Entry batch[kThreads];
-  const Splats splats{means, conics, colours, opacities, depths};
+  const Splats splats{means, conics, colors, opacities, depths};
   const int column = pixel_column(), row = pixel_row();
   const bool inside = column < width && row < height;
   const float x = static_cast<float>(column) + 0.5f, y = static_cast<float>(row) + 0.5f;
@@ -207,7 +207,7 @@ rasterise_forward(const float* means, const float* conics, const float* colours,
   const int count = static_cast<int>(bounds[tile + 1] - first);
   bool finished = !inside;
   int looked_at = count;
-  float through = 1.0f, colour[3] = {0.0f, 0.0f, 0.0f}, mean_depth = 0.0f, half_depth = 0.0f;
+  float through = 1.0f, color[3] = {0.0f, 0.0f, 0.0f}, mean_depth = 0.0f, half_depth = 0.0f;
   for (int begin = 0; begin < count; begin += kThreads) {
     if (__syncthreads_and(finished)) break;  // and before the batch is written anew
     const int size = count - begin < kThreads ? count - begin : kThreads;
@@ -226,7 +226,7 @@ rasterise_forward(const float* means, const float* conics, const float* colours,
         continue;
       }
       const float weight = alpha * through;
-      for (int k = 0; k < 3; ++k) colour[k] = fmaf(weight, batch[i].colour[k], colour[k]);
+      for (int k = 0; k < 3; ++k) color[k] = fmaf(weight, batch[i].color[k], color[k]);
       mean_depth = fmaf(weight, batch[i].depth, mean_depth);
       if (through >= kMedianTransmittance && behind < kMedianTransmittance) half_depth = batch[i].depth;
       through = behind;
@@ -234,7 +234,7 @@ rasterise_forward(const float* means, const float* conics, const float* colours,
   }
   if (!inside) return;
   const long long pixel = static_cast<long long>(row) * width + column;
-  for (int k = 0; k < 3; ++k) image[3 * pixel + k] = fmaf(through, background[k], colour[k]);
+  for (int k = 0; k < 3; ++k) image[3 * pixel + k] = fmaf(through, background[k], color[k]);
   transmittance[pixel] = through;
   last[pixel] = looked_at;
   if (depth) depth[pixel] = mean_depth;
@@ -244,10 +244,10 @@ rasterise_forward(const float* means, const float* conics, const float* colours,
 // A block a tile. Gradients by image, alpha and depth may be null; `sums` [entries, kSums] hold zeros, and go on to do so
 // for all splats but the first `kept`, whose gradients alone are wanted.
 //
-// With `value` = colour . gradient (+ depth): the light behind a splat, as the gradient sees it, is what the whole pixel
+// With `value` = color . gradient (+ depth): the light behind a splat, as the gradient sees it, is what the whole pixel
 // shows without what is in front of it and itself: no transmittance has to be divided out of what was multiplied.
 extern "C" __global__ void __launch_bounds__(kThreads, 4)
-rasterise_backward(const float* means, const float* conics, const float* colours, const float* opacities,
+rasterize_backward(const float* means, const float* conics, const float* colors, const float* opacities,
                    const float* depths, const int* owners, const long long* order, const long long* bounds, int width,
                    int height, const float* image, const float* transmittance, const int* last, const float* depth,
                    const float* by_image, const float* by_alpha, const float* by_depth, long long kept, float* sums) {
@@ -255,7 +255,7 @@ rasterise_backward(const float* means, const float* conics, const float* colours
   __shared__ bool keeps[kBatch];  // whether the sums of an entry are wanted
   __shared__ long long slots[kBatch];
   __shared__ float parts[kWarps][kBatch][kSums];
-  const Splats splats{means, conics, colours, opacities, depths};
+  const Splats splats{means, conics, colors, opacities, depths};
   const int column = pixel_column(), row = pixel_row();
   const bool inside = column < width && row < height;
   const float x = static_cast<float>(column) + 0.5f, y = static_cast<float>(row) + 0.5f;
@@ -299,7 +299,7 @@ rasterise_backward(const float* means, const float* conics, const float* colours
           const float weight = alpha * through;
           float value = wanted_depth * batch[i].depth;
           for (int k = 0; k < 3; ++k) {
-            value = fmaf(wanted[k], batch[i].colour[k], value);
+            value = fmaf(wanted[k], batch[i].color[k], value);
             values[6 + k] = weight * wanted[k];
           }
           values[9] = weight * wanted_depth;
@@ -332,9 +332,9 @@ rasterise_backward(const float* means, const float* conics, const float* colours
 // A thread a splat, in their `order`. Gradients are those of the first `kept` rows; they may overwrite means and conics;
 // `by_depths` may be null.
 extern "C" __global__ void __launch_bounds__(kThreads)
-gather_gradients(const float* means, const float* conics, const float* colours, const float* opacities,
+gather_gradients(const float* means, const float* conics, const float* colors, const float* opacities,
                  const float* depths, const int* order, long long count, const long long* ends, const float* sums,
-                 long long kept, float* by_means, float* by_conics, float* by_colours, float* by_opacities, float* by_depths) {
+                 long long kept, float* by_means, float* by_conics, float* by_colors, float* by_opacities, float* by_depths) {
   const long long place = static_cast<long long>(blockIdx.x) * kThreads + threadIdx.x;
   if (place >= count) return;
   const long long i = order ? order[place] : place;
@@ -343,13 +343,13 @@ gather_gradients(const float* means, const float* conics, const float* colours, 
   for (long long entry = place ? ends[place - 1] : 0; entry < ends[place]; ++entry)
     for (int k = 0; k < kSums; ++k) total[k] += sums[entry * kSums + k];
   Shape s{};
-  const bool drawn = shape_of({means, conics, colours, opacities, depths}, i, s);
+  const bool drawn = shape_of({means, conics, colors, opacities, depths}, i, s);
   by_means[2 * i] = -2.0f * s.ux * total[1];
   by_means[2 * i + 1] = -2.0f * fmaf(s.uy, total[1], s.vy * total[2]);
   by_conics[3 * i] = total[3];
   by_conics[3 * i + 1] = 2.0f * total[4];
   by_conics[3 * i + 2] = total[5];
-  for (int k = 0; k < 3; ++k) by_colours[3 * i + k] = total[6 + k];
+  for (int k = 0; k < 3; ++k) by_colors[3 * i + k] = total[6 + k];
   by_opacities[i] = drawn ? total[0] / s.opacity : 0.0f;
   if (by_depths) by_depths[i] = total[9];
 }

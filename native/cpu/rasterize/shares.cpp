@@ -1,7 +1,7 @@
 // What each splat makes of a picture: the sum of its weights over the pixels, and that of weight times what
-// a picture lacks. Derivatives by colours alone: front to back, four sums per entry in place of ten.
+// a picture lacks. Derivatives by colors alone: front to back, four sums per entry in place of ten.
 #include "threads.h"
-#include "cpu/rasterise/tile.h"
+#include "cpu/rasterize/tile.h"
 
 namespace vdgs::raster {
 namespace {

@@ -1,6 +1,6 @@
-// Which splats can reach a pixel centre, and how many tiles their boxes hold.
+// Which splats can reach a pixel center, and how many tiles their boxes hold.
 #include "threads.h"
-#include "cpu/rasterise/tile.h"
+#include "cpu/rasterize/tile.h"
 
 namespace vdgs::raster {
 namespace {

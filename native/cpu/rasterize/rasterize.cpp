@@ -1,9 +1,9 @@
-// The phases of rasterise.h, one after the other.
-#include "cpu/rasterise/rasterise.h"
+// The phases of rasterize.h, one after the other.
+#include "cpu/rasterize/rasterize.h"
 
 #include <limits>
 
-#include "cpu/rasterise/frame.h"
+#include "cpu/rasterize/frame.h"
 
 namespace vdgs::raster {
 namespace {

@@ -6,7 +6,7 @@
 #include <atomic>
 
 #include "threads.h"
-#include "cpu/rasterise/tile.h"
+#include "cpu/rasterize/tile.h"
 
 namespace vdgs::raster {
 namespace {
@@ -16,7 +16,7 @@ constexpr int kBatch = 64;
 struct alignas(64) Batch {
   Falloff falloff[kBatch];
   struct {
-    float colour[3], depth;
+    float color[3], depth;
   } paint[kBatch];
   float log2_opacity[kBatch];
   alignas(64) uint16_t in_reach[kBatch];
@@ -30,7 +30,7 @@ void prepare_batch(const Record* records, const uint32_t* entries, int n, const 
     const F16 dx = origins.x - splat(r.mean_x), dy = origins.y - splat(r.mean_y);
     batch.in_reach[j] = static_cast<uint16_t>(bits(squares_in_reach(r, dx, dy, 3.0f)));
     make_falloff(r, dx, dy, batch.falloff[j]);
-    batch.paint[j] = {{r.colour[0], r.colour[1], r.colour[2]}, r.depth};
+    batch.paint[j] = {{r.color[0], r.color[1], r.color[2]}, r.depth};
     batch.log2_opacity[j] = r.log2_opacity;
   }
   for (int j = n; j < kBatch; ++j) batch.in_reach[j] = 0;
@@ -44,7 +44,7 @@ VDGS_INLINE uint64_t blend_block(const Batch& batch, uint64_t chosen, int block,
                                  TilePixels& px, float* median_depth, int64_t& pairs) {
   const int at = block * kTileBlocks;
   F16 t = load(px.transmittance + at);
-  F16 c0 = load(px.colour[0] + at), c1 = load(px.colour[1] + at), c2 = load(px.colour[2] + at);
+  F16 c0 = load(px.color[0] + at), c1 = load(px.color[1] + at), c2 = load(px.color[2] + at);
   F16 depth = with_depth ? load(px.depth + at) : splat(0.0f);
   M16 live = mask_of_bits(px.live[block]);
   uint64_t touched = chosen;
@@ -80,14 +80,14 @@ VDGS_INLINE uint64_t blend_block(const Batch& batch, uint64_t chosen, int block,
       }
     }
     t = t_next;
-    c0 = fma(weight, splat(batch.paint[j].colour[0]), c0);
-    c1 = fma(weight, splat(batch.paint[j].colour[1]), c1);
-    c2 = fma(weight, splat(batch.paint[j].colour[2]), c2);
+    c0 = fma(weight, splat(batch.paint[j].color[0]), c0);
+    c1 = fma(weight, splat(batch.paint[j].color[1]), c1);
+    c2 = fma(weight, splat(batch.paint[j].color[2]), c2);
     if (with_depth) depth = fma(weight, splat(batch.paint[j].depth), depth);
     if (counting) pairs += __builtin_popcount(bits(reached & live));
   }
   store(px.transmittance + at, t);
-  store(px.colour[0] + at, c0), store(px.colour[1] + at, c1), store(px.colour[2] + at, c2);
+  store(px.color[0] + at, c0), store(px.color[1] + at, c1), store(px.color[2] + at, c2);
   if (with_depth) store(px.depth + at, depth);
   px.live[block] = static_cast<uint16_t>(bits(live));
   return touched;
@@ -140,7 +140,7 @@ void clear_pixels(const TileGrid& grid, int tile, TilePixels& px) {
   const F16 zero = splat(0.0f);
   for (int i = 0; i < kTilePixels; i += kLanes) {
     store(px.transmittance + i, splat(1.0f));
-    store(px.colour[0] + i, zero), store(px.colour[1] + i, zero), store(px.colour[2] + i, zero);
+    store(px.color[0] + i, zero), store(px.color[1] + i, zero), store(px.color[2] + i, zero);
     store(px.depth + i, zero);
     store(px.stop + i, splat(kNever));
   }
@@ -168,9 +168,9 @@ void finish_tile(Frame& frame, int tile, const TilePixels& px, const float* medi
   for_each_pixel_row(frame.grid, tile, [&](int n, int place, int64_t pixel) {
     const F16 t = load_quads(px.transmittance + place, kLanes);
     write_row(out.alpha + pixel, n, splat(1.0f) - t);
-    write_row3(out.image + 3 * pixel, n, fma(t, b0, load_quads(px.colour[0] + place, kLanes)),
-               fma(t, b1, load_quads(px.colour[1] + place, kLanes)),
-               fma(t, b2, load_quads(px.colour[2] + place, kLanes)));
+    write_row3(out.image + 3 * pixel, n, fma(t, b0, load_quads(px.color[0] + place, kLanes)),
+               fma(t, b1, load_quads(px.color[1] + place, kLanes)),
+               fma(t, b2, load_quads(px.color[2] + place, kLanes)));
     if (!out.depth) return;
     write_row(out.depth + pixel, n, load_quads(px.depth + place, kLanes));
     write_row(out.median_depth + pixel, n, load_quads(median_depth + place, kLanes));
