@@ -42,7 +42,7 @@ demo: setup
 	@echo "test views:  $(DEMO)/run/evaluation/contact_sheet.png"
 	@echo "metrics:     $(DEMO)/run/evaluation/metrics.json"
 	@echo "maps:        $(DEMO)/run/maps/preview.png"
-	@echo "model:       $(DEMO)/run/merged/model.safetensors (vdgs export $(DEMO)/run --to scene.ply for other programs)"
+	@echo "model:       $(DEMO)/run/merged/model.safetensors (vdgs export $(DEMO)/run --output scene.ply for other programs)"
 
 lint: setup
 	$(BIN)/ruff check .

@@ -72,7 +72,7 @@ def run_bench(settings: BenchSettings, console: Console) -> list[BenchResult]:
     written), and at the end if a run failed: the tables then say which and why.
     """
     if settings.jobs < 1 or settings.visibility_bins < 1:
-        raise VdgsError("--jobs and --bins must be at least 1")
+        raise VdgsError("--jobs and --visibility-bins must be at least 1")
     _check_output_outside_inputs(settings.output, plan := make_plan(settings.table, settings.choices))
     known, keys = (
         read_cached_results(settings.reuse_results),
@@ -228,7 +228,7 @@ def _check_same_settings(settings: BenchSettings, run: PlannedRun) -> None:
         raise VdgsError(
             f"{folder.path}: was trained with other settings:\n  "
             + "\n  ".join(changed)
-            + "\nGive the old options to continue, --redo to train again what depends on them, or another --output."
+            + "\nGive the old options to continue, --overwrite to train again what depends on them, or another --output."
         )
 
 
@@ -286,7 +286,9 @@ def _measure(
                         (settings.output / run.folder / file).unlink(missing_ok=True)
                 continue
             by_frusta = (
-                visibility_from_frusta(captures[scene.name], _options(scene, settings)) if seen.source == "truth" else None
+                visibility_from_frusta(captures[scene.name], _options(scene, settings))
+                if seen.source == "truth"
+                else None
             )
             folders = [settings.output / run.folder for run in done]
             keys = {folder: read_json(folder / RECORD_FILE)["key"] for folder in folders}

@@ -66,7 +66,7 @@ def disable_compensation(change: ConfigOverride) -> ConfigOverride:
 def as_in_paper(config: MethodConfig, _budget: Budget) -> MethodConfig:
     """What the paper says of blocks, in place of the preset's own choices: frozen decoder, every photograph used alike
     and at its full size, the coarse stage's rates again, the last model and no mean, cameras above a share of 0.45, its
-    compensation. Where it is silent, as the preset `paper`."""
+    compensation. Where it is silent, as the preset `default`."""
     plain, scene = MethodConfig(), config.block
     return replace(
         config,
@@ -103,14 +103,14 @@ def with_dense_adam(change: ConfigOverride) -> ConfigOverride:
 
     def dense(config: MethodConfig, budget: Budget) -> MethodConfig:
         changed = change(config, budget)
-        return replace(changed, training=replace(changed.training, optimizer="dense"))
+        return replace(changed, training=replace(changed.training, optimizer="adam"))
 
     return dense
 
 
 def with_max_visibility_merge(change: ConfigOverride) -> ConfigOverride:
     """Blocks merged by which of them sees a place most (the paper: "based on visibility coverage")."""
-    return lambda config, budget: replace(change(config, budget), merge=MergeConfig(rule="best_seen"))
+    return lambda config, budget: replace(change(config, budget), merge=MergeConfig(rule="max-visibility"))
 
 
 def with_longer_blocks(factor: int) -> ConfigOverride:
@@ -215,7 +215,7 @@ def with_gamma(value: float) -> ConfigOverride:
 
 def with_paper_gate(config: MethodConfig, _budget: Budget) -> MethodConfig:
     """Offsets of low visibility are judged after as many draws as the others."""
-    return enable_compensation(config, gate="literal")
+    return enable_compensation(config, gate="paper")
 
 
 def with_partition_strategy(strategy: PartitionStrategy) -> ConfigOverride:

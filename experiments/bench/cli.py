@@ -44,7 +44,7 @@ class BenchArguments:
     """What other programs rendered of the test views, a row for each NAME=FOLDER (several after one --renders):
     FOLDER/SCENE/VIEW.png or FOLDER/SCENE/SEED/VIEW.png. Measured as all others (docs/bench.md)."""
     reuse_results: tuple[Path, ...] = ()
-    """results.json of other benches, of this machine or of others (several after one --known): runs with the same
+    """results.json of other benches, of this machine or of others (several after one --reuse-results): runs with the same
     settings, seeds and scenes are taken from there and not trained, and the table says where each is from."""
     data: Path | None = None
     """Folder that holds the scenes with names which are not generated: residence-pixsfm, copr, ..."""

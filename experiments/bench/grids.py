@@ -228,7 +228,9 @@ def _group_columns(results: Sequence[BenchResult], scene: str) -> tuple[list[Tab
     ]
     if of is None:
         return columns, ()
-    return columns, (f"V: {VISIBILITY_SOURCE_NOTES[of.visibility_source]}. Pooled over all these views: {all_group_bounds(of)}.",)
+    return columns, (
+        f"V: {VISIBILITY_SOURCE_NOTES[of.visibility_source]}. Pooled over all these views: {all_group_bounds(of)}.",
+    )
 
 
 def all_group_bounds(result: BenchResult) -> str:

@@ -1,4 +1,4 @@
-"""Figures of runs that another bench trained, perhaps on another machine: its results.json (`--known`).
+"""Figures of runs that another bench trained, perhaps on another machine: its results.json (`--reuse-results`).
 
 A run is the same where its key is: the same settings, seed, scene and way of measuring. Its figures then stand in the
 table as if it had been trained here, and the table says where they are from. So a table of many hours is the work of
@@ -30,7 +30,7 @@ def read_cached_results(files: Iterable[Path]) -> dict[str, BenchResult]:
             results = [_result(each) for each in content["results"]]
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise VdgsError(
-                f"--known {file}: is not what `vdgs bench` writes as results.json, or of an earlier version "
+                f"--reuse-results {file}: is not what `vdgs bench` writes as results.json, or of an earlier version "
                 f"({type(error).__name__}: {error})"
             ) from error
         for each in results:

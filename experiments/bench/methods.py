@@ -117,7 +117,7 @@ _ABLATIONS = [
         citation="VDGS, sections IV-B and IV-C",
         differs="blocks of the paper: frozen decoder, even use of photographs, the coarse stage's rates again, full "
         "size, no mean of models, whole photographs, share of 0.45, its compensation; growth, coarse stage and cut as "
-        "`full_method`; where the paper is silent, the choices of the preset `paper`",
+        "`full_method`; where the paper is silent, the choices of the preset `default`",
     ),
     BenchMethod("whole-photographs", "VDGS (full), whole photographs", with_full_images(full_method)),
     BenchMethod("no-blocking", "w/o blocking", without_blocking, citation="VDGS, Table II (b)"),
@@ -219,7 +219,7 @@ _COARSE_COMPENSATED = [
 _COARSE_PARTS = [
     BenchMethod(
         "coarse-compensated-literal-gate", "coarse stage, compensation of means, gate as for all",
-        coarse_with_compensation(CompensationConfig(min_draws="literal")), COARSE_STAGES,
+        coarse_with_compensation(CompensationConfig(min_draws="paper")), COARSE_STAGES,
         less="iterations of the coarse stage only", differs="to be read against `coarse-compensated-mean`",
     ),
     BenchMethod(
@@ -239,13 +239,13 @@ _LONGER = [
 _CHOICES = [
     BenchMethod("frozen-decoder", "frozen decoder", with_block(decoder="frozen")),
     BenchMethod("even-sampling", "photographs used alike", with_block(sampling="even")),
-    BenchMethod("by-votes", "photographs by votes", with_block(sampling="shares")),
+    BenchMethod("by-votes", "photographs by votes", with_block(sampling="visibility")),
     BenchMethod("share-0.45", "cameras above a share of 0.45", with_assignment(threshold=0.45)),
     BenchMethod(
-        "literal-assignment", "eq. 7 as printed", with_assignment(mode="literal", threshold=0.45),
+        "literal-assignment", "eq. 7 as printed", with_assignment(mode="paper", threshold=0.45),
         differs="eq. 7 with its threshold of 0.45: to be read against `share-0.45`",
     ),
-    BenchMethod("leave-one-out", "cameras by leave-one-out", with_assignment(mode="leave_one_out")),
+    BenchMethod("leave-one-out", "cameras by leave-one-out", with_assignment(mode="leave-one-out")),
     BenchMethod(
         "frustum", "cameras by frusta", with_assignment(mode="frustum"),
         differs="the share is one of the block's anchors, not of pixels",

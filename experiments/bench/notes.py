@@ -63,7 +63,7 @@ def _fairness(plan: BenchPlan) -> str:
         "the sum over all blocks, as if one after the other; it depends on how many runs went at once (--jobs).",
         "LPIPS is VGG with input in [-1, 1]; a dash means that no weights were given (--lpips-weights).",
     ]
-    if any(run.config.block.crop == "pixels" for run in plan.runs if "blocks" in run.stages):
+    if any(run.config.block.crop == "fixed-pixels" for run in plan.runs if "blocks" in run.stages):
         said.append(_PARTS)
     said += [
         f"{scene.title}: {budget.coarse:,} coarse iterations and {budget.blocks} × {budget.per_block:,} for blocks, "

@@ -101,7 +101,12 @@ def _evaluate(at: _JobContext) -> None:
 
     evaluate_stage(
         at.context,
-        EvaluationRequest(path=at.context.run.path, which="best", lpips_weights=at.job.lpips_weights, visibility_bins=at.job.visibility_bins),
+        EvaluationRequest(
+            path=at.context.run.path,
+            which="best",
+            lpips_weights=at.job.lpips_weights,
+            visibility_bins=at.job.visibility_bins,
+        ),
         at.console,
     )
 

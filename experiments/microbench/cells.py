@@ -43,7 +43,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--points", type=int, default=1_000_000)
     parser.add_argument("--threads", type=int, default=extension.get_num_threads())
-    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--color-iterations", type=int, default=7)
     arguments = parser.parse_args()
     extension.set_num_threads(arguments.threads)
     torch.set_num_threads(arguments.threads)

@@ -1,6 +1,6 @@
 """What Ray costs over processes of this machine: the blocks of one run, trained by both, and whether they are the same.
 
-    OMP_WAIT_POLICY=PASSIVE python -m experiments.microbench.executors RUN [--jobs 2] [--rounds 1]
+    OMP_WAIT_POLICY=PASSIVE python -m experiments.microbench.executors RUN [--jobs 2] [--color-iterations 1]
 
 RUN is cut into blocks and not trained yet, or trained: copies are trained, in a folder beside it that is deleted. The
 start of Ray is measured apart, with nothing to do. Rounds take turns (local, Ray, Ray, local, ...).
@@ -54,7 +54,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--jobs", type=int, default=2, help="blocks at once")
-    parser.add_argument("--rounds", type=int, default=1)
+    parser.add_argument("--color-iterations", type=int, default=1)
     asked = parser.parse_args()
     print(describe())
     print(f"{'start and end of Ray':>24} {start_of_ray():7.1f} s", flush=True)

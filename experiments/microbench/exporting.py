@@ -1,8 +1,8 @@
 """How long the export of a large scene takes, and how much memory: a made-up model of many anchors.
 
     export OMP_WAIT_POLICY=PASSIVE
-    python -m experiments.microbench.exporting --anchors 20000 60000 200000 [--to a.ply b.spz]
-    python -m experiments.microbench.exporting --anchors 1000000 --folder /large/disk --no-measure
+    python -m experiments.microbench.exporting --anchors 20000 60000 200000 [--output a.ply b.spz]
+    python -m experiments.microbench.exporting --anchors 1000000 --folder /large/disk --no-evaluate
 
 Each anchor has 10 Gaussians; there are as many photographs to an anchor as in a real flight (one for 1600), 400 x 300
 pixels, and a place is seen by about ten. Every size runs in a process of its own. Seconds are wall clock and processor
@@ -116,7 +116,9 @@ def one(anchors: int, folder: Path, names: list[str], measure: bool) -> None:
     export_run.open_run = lambda *_: run
     set_num_threads(get_num_threads())
     began, before = time.monotonic(), time.process_time()
-    asked = ExportRequest(run=folder / "run", to=tuple(folder / name for name in names), evaluate=measure, device="cpu")
+    asked = ExportRequest(
+        run=folder / "run", output=tuple(folder / name for name in names), evaluate=measure, device="cpu"
+    )
     record = export_run.export_run(asked, Console(quiet=True))
     print(json.dumps({
         "anchors": anchors, "gaussians": record["gaussians"], "views": len(cameras),
@@ -129,9 +131,9 @@ def one(anchors: int, folder: Path, names: list[str], measure: bool) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--anchors", type=int, nargs="+", default=[20_000, 60_000])
-    parser.add_argument("--to", nargs="+", default=["scene.ply"])
+    parser.add_argument("--output", nargs="+", default=["scene.ply"])
     parser.add_argument("--folder", type=Path, default=None, help="where files are written for a while")
-    parser.add_argument("--measure", action=argparse.BooleanOptionalAction, default=True)
+    parser.add_argument("--evaluate", action=argparse.BooleanOptionalAction, default=True)
     parser.add_argument("--one", action="store_true", help=argparse.SUPPRESS)
     asked = parser.parse_args()
     if asked.one:
@@ -150,7 +152,7 @@ def main() -> None:
                 "--folder",
                 folder,
             ]
-            command += ["--to", *asked.to, "--measure" if asked.measure else "--no-measure"]
+            command += ["--output", *asked.to, "--evaluate" if asked.measure else "--no-evaluate"]
             row = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout.splitlines()[-1])
         rows.append(row)
         print(

@@ -1,6 +1,6 @@
 """Photometric loss with its gradient: the native kernel beside torch, in one run.
 
-OMP_WAIT_POLICY=PASSIVE python -m experiments.microbench.loss [--threads 2] [--rounds 5]
+OMP_WAIT_POLICY=PASSIVE python -m experiments.microbench.loss [--threads 2] [--color-iterations 5]
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def main() -> None:
     """Print one line for each size."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--threads", type=int, default=extension.get_num_threads())
-    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--color-iterations", type=int, default=5)
     arguments = parser.parse_args()
     extension.set_num_threads(arguments.threads)
     torch.set_num_threads(arguments.threads)

@@ -257,7 +257,7 @@ def test_points_that_are_remembered_lie_all_over_a_photograph():
     assert (shares > 0.6 * MAX_OBSERVATIONS / 4).all()
 
 
-SETTINGS = ("--preset", "laptop", "--iterations", "20", "--anchors.offsets", "3", "--up", "z")
+SETTINGS = ("--preset", "laptop", "--iterations", "20", "--anchors.num-offsets", "3", "--up", "z")
 
 
 @pytest.mark.parametrize(

@@ -126,7 +126,7 @@ def test_verbs_that_show_a_result_can_be_quiet(verb, does, monkeypatch, capsys):
 
 def test_the_command_that_is_kept_works_in_every_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    typed = ["my place", "--output", "run", "--redo", "--blocks", "2", "--quiet"]
+    typed = ["my place", "--output", "run", "--overwrite", "--blocks", "2", "--quiet"]
     kept = absolute_command_line("run", typed, (Path("my place"), Path("run")))
     assert shlex.split(kept) == ["vdgs", "run", f"{tmp_path}/my place", "--output", f"{tmp_path}/run", "--blocks", "2"]
     assert f"--output={tmp_path}/run" in absolute_command_line(
@@ -163,7 +163,7 @@ def test_another_run_than_the_one_asked_for_is_named(uncut, tmp_path, capsys):
 
 
 def test_a_run_decides_the_defaults_of_its_help(uncut, capsys):
-    for arguments, sampling in (([str(uncut)], "roots"), ([], "even")):
+    for arguments, sampling in (([str(uncut)], "sqrt-visibility"), ([], "uniform")):
         with pytest.raises(SystemExit):
             main(["train", *arguments, "--help"])
         assert f"(default: {sampling})" in capsys.readouterr().out

@@ -61,7 +61,7 @@ def test_numbers_are_found_wherever_they_stand():
     """So the test above can fail."""
     found = {each.flag: each for each in iter_numbers(MethodConfig())}
     assert found["--blocks"].value == 8
-    assert {"--rates.offsets", "--resolutions", "--block.growth.until"} <= found.keys()
+    assert {"--lr.offsets", "--resolution-schedule", "--block.densify.stop-fraction"} <= found.keys()
     assert [each.value for each in iter_numbers(MethodConfig().training.lr)][:2] == [0.01, 1e-4]
     auto = PartitionConfig(blocks="auto")
     assert next(each for each in iter_numbers(auto) if each.path == ("blocks",)) == NumericSetting(
@@ -92,7 +92,7 @@ def test_each_number_out_of_range_is_named_as_the_command_line_names_it():
     )
     assert validate_config(wrong) == [
         "--lambda-vis nan: must be at least 0 and at most 1000",
-        "--block.growth.until 2.0: must be at least 0 and at most 1",
+        "--block.densify.stop-fraction 2.0: must be at least 0 and at most 1",
     ]
     with pytest.raises(VdgsError, match=r"--downscale 0\.5: must be at least 1"):
         check_ranges(CaptureOptions(downscale=0.5))
@@ -109,7 +109,7 @@ def test_each_number_out_of_range_is_named_as_the_command_line_names_it():
         ["inspect", "C", "--output", "R", "--test-every", "0"],
         ["render", "R", "--output", "O", "--seconds", "nan"],
         ["render", "R", "--output", "O", "--width", "10000000"],
-        ["eval", "R", "--bins", "100000"],
+        ["eval", "R", "--visibility-bins", "100000"],
         ["synth", "O", "--noise-px", "inf"],
         ["bench", "toy", "--output", "O", "--seeds", "0"],
     ],
@@ -133,7 +133,7 @@ def test_the_command_line_says_so_at_once(arguments, tmp_path, monkeypatch, caps
         ({"partition": {"blocks": "most"}}, "must be a whole number or auto"),
         ({"partition": {"balanced": 1}}, "must be true or false"),
         ({"block": {"ring": "frozn"}}, "must be frozen or ramp or free"),
-        ({"block": {"sampeling": "even"}}, "block has no 'sampeling'; did you mean 'sampling'"),
+        ({"block": {"sampeling": "uniform"}}, "block has no 'sampeling'; did you mean 'sampling'"),
     ],
 )
 def test_a_value_of_another_kind_is_named(settings, says):

@@ -102,7 +102,9 @@ def test_a_crash_that_comes_back_fails_and_leaves_no_running_status(tmp_path):
 
 
 def test_an_explained_failure_is_not_repeated_and_stops_no_other(tmp_path):
-    failing = 'print("starting"); print("vdgs train: a.jpg: is gone.\\nPut it back.", file=sys.stderr); sys.exit(1)'
+    failing = (
+        'print("starting"); print("vdgs train-blocks: a.jpg: is gone.\\nPut it back.", file=sys.stderr); sys.exit(1)'
+    )
     jobs = [job(tmp_path, 0, FINE), job(tmp_path, 1, failing), job(tmp_path, 2, FINE), job(tmp_path, 3, FINE)]
     outcomes, text = run(jobs, at_once=1)
     assert [o.state for o in outcomes] == ["done", "failed", "done", "done"]
@@ -113,7 +115,7 @@ def test_an_explained_failure_is_not_repeated_and_stops_no_other(tmp_path):
 
 
 def test_a_job_that_someone_else_stopped_is_not_started_again(tmp_path):
-    (outcome,), _ = run([job(tmp_path, 0, 'print("vdgs train: Stopped at iteration 9; saved."); sys.exit(130)')])
+    (outcome,), _ = run([job(tmp_path, 0, 'print("vdgs train-blocks: Stopped at iteration 9; saved."); sys.exit(130)')])
     assert (outcome.state, outcome.attempts) == ("stopped", 1)
     assert "someone else" in outcome.why
     assert "iteration 9" in outcome.why

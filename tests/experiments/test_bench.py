@@ -152,7 +152,9 @@ def test_sky_belongs_to_no_group(benched, tmp_path, monkeypatch):
         below[:10] = np.nan
         return below
 
-    monkeypatch.setattr(bench, "visibility_from_truth", lambda *_: replace(seen, count_map=with_sky, identity="with sky"))
+    monkeypatch.setattr(
+        bench, "visibility_from_truth", lambda *_: replace(seen, count_map=with_sky, identity="with sky")
+    )
     shutil.copytree(benched, tmp_path / "copy")
     pixels = sum(int(np.isfinite(with_sky(view.camera)).sum()) for view in seen.capture.test_views)
     for result in run_bench(settings(tmp_path / "copy"), Console(file=io.StringIO())):

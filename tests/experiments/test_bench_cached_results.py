@@ -1,4 +1,4 @@
-"""`vdgs bench --known`: what other benches measured stands in the table and is not trained again."""
+"""`vdgs bench --reuse-results`: what other benches measured stands in the table and is not trained again."""
 
 import io
 import json

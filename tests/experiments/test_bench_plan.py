@@ -104,9 +104,9 @@ def test_more_anchors_by_plain_growth_differ_from_it_in_the_threshold_alone():
 def test_blocks_as_printed_take_back_what_the_laptop_changes():
     scene = SCENES["lab-uneven"]
     base = scene.base(scene.budget, 0)
-    printed, paper = METHODS["printed"].settings(base, scene.budget), PRESETS["paper"]
+    printed, paper = METHODS["printed"].settings(base, scene.budget), PRESETS["default"]
     assert printed != base
-    assert (printed.block.decoder, printed.block.view_sampling) == ("frozen", "even")
+    assert (printed.block.decoder, printed.block.view_sampling) == ("frozen", "uniform")
     assert (printed.block.decoder, printed.block.view_sampling) == (paper.block.decoder, paper.block.view_sampling)
     assert printed.assignment.threshold == paper.assignment.threshold == 0.45
     # But for what belongs to the scene.
@@ -121,7 +121,7 @@ def test_blocks_as_printed_take_back_what_the_laptop_changes():
         )
     }  # fmt: skip
     assert alone["frozen-decoder"] == replace(base, block=replace(base.block, decoder="frozen"))
-    assert alone["even-sampling"] == replace(base, block=replace(base.block, view_sampling="even"))
+    assert alone["even-sampling"] == replace(base, block=replace(base.block, view_sampling="uniform"))
     again = {name: getattr(paper.block, name) for name in ("offset_rate", "scale_rate", "feature_rate")}
     assert set(again.values()) == {1.0}  # the paper prints no rates for blocks
     assert alone["printed-rates"] == replace(base, block=replace(base.block, **again))
@@ -134,7 +134,7 @@ def test_blocks_as_printed_take_back_what_the_laptop_changes():
 
 
 def test_presets_of_the_paper_restart_the_coarse_stage_and_literal_leaves_our_choices_out():
-    paper, literal = PRESETS["paper"], PRESETS["literal"]
+    paper, literal = PRESETS["default"], PRESETS["paper"]
     for each in (paper, literal):
         loop = block_train_config(each, 100)
         assert (loop.lr, loop.densify) == (each.training.lr, each.training.densify)
@@ -157,11 +157,11 @@ def test_comparators_that_published_dense_adam_have_it():
     scene = SCENES["lab-uneven"]
     base = scene.base(scene.budget, 0)
     scaffold, baseline = (METHODS[name].settings(base, scene.budget) for name in ("scaffold-gs", "baseline"))
-    assert scaffold == replace(baseline, training=replace(baseline.training, optimizer="dense"))
-    assert block_train_config(METHODS["dense-adam"].settings(base, scene.budget), 100).optimizer == "dense"
-    assert baseline.training.optimizer == "visible"
+    assert scaffold == replace(baseline, training=replace(baseline.training, optimizer="adam"))
+    assert block_train_config(METHODS["dense-adam"].settings(base, scene.budget), 100).optimizer == "adam"
+    assert baseline.training.optimizer == "sparse-adam"
     merged = {name: METHODS[name].settings(base, scene.budget).merge.rule for name in METHODS}
-    assert {name for name, rule in merged.items() if rule == "best_seen"} == {"free-best-seen", "ramp-best-seen"}
+    assert {name for name, rule in merged.items() if rule == "max-visibility"} == {"free-best-seen", "ramp-best-seen"}
 
 
 def test_a_sweep_of_t_low_is_not_overruled_by_the_quantile_of_the_laptop():

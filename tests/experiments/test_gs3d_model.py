@@ -38,7 +38,9 @@ def some_gaussians(count: int = 40, seed: int = 0, degree: int = 1) -> Gaussians
 def test_what_is_left_out_of_a_view_would_not_change_it(seed, size):
     everything = some_gaussians(seed=seed)
     everything = replace(
-        everything, log_scales=everything.log_scales + size, opacity_logits=torch.full_like(everything.opacity_logits, 6.0)
+        everything,
+        log_scales=everything.log_scales + size,
+        opacity_logits=torch.full_like(everything.opacity_logits, 6.0),
     )
     camera = Photographs().camera(seed % 8)
     rows = visible_gaussian_rows(everything, camera)

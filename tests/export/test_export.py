@@ -64,7 +64,7 @@ def export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         )
         monkeypatch.setattr(export_module, "open_run", lambda *_: opened)
         request = ExportRequest(
-            run=tmp_path / "run", to=tuple(tmp_path / name for name in names), evaluate=False, device="cpu", **asked
+            run=tmp_path / "run", output=tuple(tmp_path / name for name in names), evaluate=False, device="cpu", **asked
         )
         return export_run(request, QUIET)
 
@@ -198,7 +198,7 @@ def test_boxes_blocks_and_numbers_choose(export, tmp_path: Path):
 @pytest.mark.parametrize(
     ("names", "asked", "said"),
     [
-        ((), {}, "--to FILE"),
+        ((), {}, "--output FILE"),
         (("scene.obj",), {}, "no format is known"),
         (("a.ply", "a.ply"), {}, "given twice"),
         (("run/report.html",), {}, "is the report of the run"),

@@ -58,8 +58,8 @@ def test_what_is_too_large_is_thinned_until_it_fits(tmp_path):
     assert 40_000 // 8 < kept < 40_000
     assert (tmp_path / "a.html").stat().st_size > 0.8 * 1_300_000  # there is little room left
     assert f"{kept:,}" in thinned
-    assert "--html-mb" in thinned
-    with pytest.raises(VdgsError, match="--html-mb"):
+    assert "--html-max-mb" in thinned
+    with pytest.raises(VdgsError, match="--html-max-mb"):
         registry.write_scene(
             tmp_path / "b.html", replace(ExportScene.of(gaussians), page=replace(page, max_bytes=500_000))
         )

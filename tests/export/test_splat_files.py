@@ -96,7 +96,9 @@ def test_an_spz_is_what_niantics_code_reads(tmp_path, version, degree):
         torch.testing.assert_close(read.means, wanted.means, atol=0.5 / 4096 + 1e-6, rtol=0)
         sizes = (each.log_scales.sort(1).values for each in (read, wanted))  # version 2 names the axes anew
         torch.testing.assert_close(*sizes, atol=1 / 32 + 1e-5, rtol=0)
-        torch.testing.assert_close(read.opacity_logits.sigmoid(), wanted.opacity_logits.sigmoid(), atol=0.5 / 255 + 1e-5, rtol=0)
+        torch.testing.assert_close(
+            read.opacity_logits.sigmoid(), wanted.opacity_logits.sigmoid(), atol=0.5 / 255 + 1e-5, rtol=0
+        )
         torch.testing.assert_close(read.sh0, wanted.sh0, atol=0.5 / 255 / 0.15 + 1e-5, rtol=0)
         torch.testing.assert_close(read.shN, wanted.shN, atol=0.5 / 128 + 1e-4, rtol=0)
         error = (gaussian_covariances(read) - gaussian_covariances(wanted)).norm(dim=(1, 2)) / gaussian_covariances(
@@ -137,7 +139,9 @@ def test_chunks_and_their_sizes_make_no_difference(tmp_path, monkeypatch):
         registry.write_scene(tmp_path / f"1{name}", ExportScene.of(whole, PLACED))
     monkeypatch.setattr(export_scene, "CHUNK_SIZE", 16)
     for name in names:
-        registry.write_scene(tmp_path / f"2{name}", ExportScene(chunks=iter(parts), count=100, degree=2, metadata=PLACED))
+        registry.write_scene(
+            tmp_path / f"2{name}", ExportScene(chunks=iter(parts), count=100, degree=2, metadata=PLACED)
+        )
         one, other = (tmp_path / f"{i}{name}" for i in (1, 2))
         if name.endswith((".laz", ".las")):
             continue  # tested by their numbers: headers hold a date

@@ -18,9 +18,14 @@ BERN = (46.95, 7.44, 560.0)
 def frame(origin=BERN, axes=None, metric=True):
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     return GroundFrame(
-        scale=2.0, rotation=turn, translation=np.array([3.0, -4, 5]), metric=metric, description="GPS", origin_geo=origin,
+        scale=2.0,
+        rotation=turn,
+        translation=np.array([3.0, -4, 5]),
+        metric=metric,
+        description="GPS",
+        origin_geo=origin,
         axes_geo=axes,
-    )  # fmt: skip
+    )
 
 
 def scattered(count=50, reach=(900.0, 700.0, 60.0), seed=3):

@@ -25,9 +25,25 @@ from vdgs.system.tensors import read_tensors
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("coarse")]
 
 SETTINGS = (
-    "--preset", "laptop", "--iterations", "200", "--save-every", "10", "--anchors.offsets", "3", "--up", "z",
-    "--growth.start", "40", "--growth.interval", "20", "--growth.statistics-from", "20", "--growth.gate", "0.05",
-)  # fmt: skip
+    "--preset",
+    "laptop",
+    "--iterations",
+    "200",
+    "--save-every",
+    "10",
+    "--anchors.num-offsets",
+    "3",
+    "--up",
+    "z",
+    "--densify.start",
+    "40",
+    "--densify.every",
+    "20",
+    "--densify.stats-start",
+    "20",
+    "--densify.min-draw-fraction",
+    "0.05",
+)
 #: As many as the ten training photographs of a tiny scene can bear beside eighty sparse points; stereo finds more.
 STEREO = f"stereo: {10 * 64 * 48 // PIXELS_PER_POINT - 80} points"
 
@@ -103,7 +119,7 @@ def test_what_stereo_found_is_kept_and_looked_for_once(tmp_path):
 
 def test_stereo_looks_at_photographs_in_full_whatever_size_they_are_trained_at(tmp_path):
     write_colmap(tmp_path / "capture", tiny_scene(points=80))
-    done = finish(tmp_path / "capture", tmp_path / "run", "--iterations", "5", "--resolutions", "0", "2")
+    done = finish(tmp_path / "capture", tmp_path / "run", "--iterations", "5", "--resolution-schedule", "0", "2")
     assert done.returncode == 0, done.stderr
     assert STEREO in done.stdout
 
@@ -258,7 +274,7 @@ def test_a_photograph_deleted_on_the_way_loses_nothing(capture, unbroken, tmp_pa
     other = tmp_path / "capture"
     shutil.copytree(capture, other)
     run = tmp_path / "run"
-    tight = command(other, run, "--image-memory-gb", "1e-6")
+    tight = command(other, run, "--image-cache-gb", "1e-6")
     with begun(*tight, pause_at=("*/checkpoints/00000010.json", 1)) as process:
         process.wait_until_paused()
         photograph = sorted((other / "images").iterdir())[5]
@@ -300,11 +316,11 @@ def test_evaluation_and_renders_of_a_run(unbroken, tmp_path):
     assert training["psnr"] > metrics["psnr"]
     assert {path: path.read_bytes() for path in test_files} == test_files
     for kind in ("image", "depth", "visibility"):
-        assert vdgs("render", run, "--output", tmp_path / kind, "--kind", kind, "--no-legend").returncode == 0
+        assert vdgs("render", run, "--output", tmp_path / kind, "--mode", kind, "--no-colorbar").returncode == 0
         pictures = [cv2.imread(str(path)) for path in sorted((tmp_path / kind).glob("*.png"))]
         assert [picture.shape for picture in pictures] == [(48, 64, 3)] * 2
         assert min(float(picture.std()) for picture in pictures) > 3
-    again = vdgs("render", run, "--output", tmp_path / "depth", "--kind", "depth", "--raw", "--views", "train")
+    again = vdgs("render", run, "--output", tmp_path / "depth", "--mode", "depth", "--raw", "--views", "train")
     assert again.returncode == 0, again.stderr
     assert (
         "10 frames of 64x48 px, each with its numbers as .npy, in place of 2 files of an earlier render" in again.stdout
@@ -313,7 +329,7 @@ def test_evaluation_and_renders_of_a_run(unbroken, tmp_path):
     for numbers in (np.load(file) for file in (tmp_path / "depth").glob("*.npy")):
         assert (numbers.dtype, numbers.shape) == (np.float32, (48, 64))
         assert 7 < np.nanmedian(numbers) < 13  # the flight is 10 above the ground
-    assert vdgs("render", run, "--output", tmp_path / "alpha", "--kind", "alpha").returncode == 0
+    assert vdgs("render", run, "--output", tmp_path / "alpha", "--mode", "alpha").returncode == 0
     tall = cv2.imread(str(next((tmp_path / "alpha").glob("*.png"))))
     assert tall.shape[0] > 48
     assert tall[:48].mean() > 180

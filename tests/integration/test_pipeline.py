@@ -27,12 +27,43 @@ pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("pipeline")]
 
 ITERATIONS, BLOCK_ITERATIONS = 200, 120
 SETTINGS = (
-    "--preset", "laptop", "--iterations", str(ITERATIONS), "--save-every", "20", "--anchors.offsets", "3",
-    "--growth.start", "50", "--growth.interval", "50", "--growth.statistics-from", "25", "--growth.gate", "0.05",
-    "--blocks", "2", "--jobs", "2", "--block.compensation.enabled", "--block.compensation.t-low-quantile", "0",
-    "--assignment.min-cameras", "4", "--block.iterations", str(BLOCK_ITERATIONS), "--block.growth.gate", "0.05",
-    "--block.growth.start", "25", "--block.growth.statistics-from", "0", "--block.growth.interval", "25", "--no-maps",
-)  # fmt: skip
+    "--preset",
+    "laptop",
+    "--iterations",
+    str(ITERATIONS),
+    "--save-every",
+    "20",
+    "--anchors.num-offsets",
+    "3",
+    "--densify.start",
+    "50",
+    "--densify.every",
+    "50",
+    "--densify.stats-start",
+    "25",
+    "--densify.min-draw-fraction",
+    "0.05",
+    "--blocks",
+    "2",
+    "--jobs",
+    "2",
+    "--block.compensation.enabled",
+    "--block.compensation.t-low-quantile",
+    "0",
+    "--assignment.min-cameras",
+    "4",
+    "--block.iterations",
+    str(BLOCK_ITERATIONS),
+    "--block.densify.min-draw-fraction",
+    "0.05",
+    "--block.densify.start",
+    "25",
+    "--block.densify.stats-start",
+    "0",
+    "--block.densify.every",
+    "25",
+    "--no-ortho",
+)
 #: What a block's model is compared by: the whole file.
 MERGED = "merged/model.safetensors"
 
@@ -80,12 +111,12 @@ def moments(run: Path) -> dict[str, int]:
 def train_each(run: Path, *settings: str) -> None:
     """Train every block again, one command each."""
     for index in range(2):
-        done = vdgs("train", run, "--block", index, *settings, "--redo")
+        done = vdgs("train", run, "--block", index, *settings, "--overwrite")
         assert done.returncode == 0, done.stderr
 
 
 def test_a_run_ends_with_maps_and_its_report_shows_them(copied, capture):
-    asked = ("run", capture, "--output", copied, *[each for each in SETTINGS if each != "--no-maps"])
+    asked = ("run", capture, "--output", copied, *[each for each in SETTINGS if each != "--no-ortho"])
     done = vdgs(*asked)
     assert done.returncode == 0, done.stderr
     assert {"orthophoto.tif", "dsm.tif", "visibility.tif"} <= {file.name for file in (copied / "maps").iterdir()}
@@ -95,7 +126,7 @@ def test_a_run_ends_with_maps_and_its_report_shows_them(copied, capture):
 
 def test_a_scene_goes_out_and_says_what_it_loses(copied, tmp_path):
     scene = tmp_path / "out" / "scene.ply"
-    done = vdgs("export", copied, "--to", scene, "--to", tmp_path / "out" / "scene.splat")
+    done = vdgs("export", copied, "--output", scene, "--output", tmp_path / "out" / "scene.splat")
     assert done.returncode == 0, done.stderr
     assert "scene.ply, read back, on" in done.stdout
     assert "scene.splat, read back, on" in done.stdout
@@ -114,7 +145,7 @@ def test_blocks_draw_parts_of_photographs_and_the_pixels_that_were_asked_for(unb
         assert status.iteration > 1.04 * BLOCK_ITERATIONS
         assert status.images_drawn == pytest.approx(BLOCK_ITERATIONS, abs=1)
         assert len(json.loads((folder.path / "crops.json").read_text())["crops"]) == cameras[:, index].sum()
-    train_each(copied, "--block.crop", "steps")
+    train_each(copied, "--block.crop", "fixed-steps")
     for folder in RunFolder(copied).block_folders():
         assert folder.status().iteration == BLOCK_ITERATIONS
         assert folder.status().images_drawn < 0.96 * BLOCK_ITERATIONS
@@ -160,7 +191,7 @@ def bits(decoder: Decoder) -> dict[str, bytes]:
 
 
 def test_blocks_as_printed_leave_one_decoder(unbroken, copied):
-    train_each(copied, "--block.decoder", "frozen", "--block.sampling", "even")
+    train_each(copied, "--block.decoder", "frozen", "--block.view-sampling", "uniform")
     assert vdgs("merge", copied).returncode == 0
     coarse, merged = AnchorModel.load(copied / "coarse/model.safetensors"), AnchorModel.load(copied / MERGED)
     assert merged.decoder_spans == ()
@@ -214,7 +245,7 @@ def test_other_settings_are_refused_where_they_cost_training(capture, copied):
     refused = vdgs("run", capture, "--output", copied, *SETTINGS, "--lambda-vis", "0")
     assert refused.returncode == 1
     assert "--lambda-vis: 1.0 -> 0.0" in refused.stderr
-    assert "--redo" in refused.stderr
+    assert "--overwrite" in refused.stderr
     assert changed_files(copied, before) == set()
 
 
@@ -228,7 +259,7 @@ def test_a_changed_setting_redoes_exactly_what_depends_on_it(capture, copied):
         *SETTINGS,
         "--block.compensation.beta-g",
         "0",
-        "--redo",
+        "--overwrite",
         prepare=do_tasks_here,
     )
     assert redone.returncode == 0, redone.stderr
@@ -333,7 +364,7 @@ def test_a_dry_run_counts_what_stereo_may_add(tmp_path):
 
 def test_another_cut_leaves_no_old_result_standing(copied):
     """What was trained and measured for the cut of before is neither merged nor drawn nor reported as this one's."""
-    assert vdgs("partition", copied, "--lambda-vis", "0.5", "--redo").returncode == 0
+    assert vdgs("partition", copied, "--lambda-vis", "0.5", "--overwrite").returncode == 0
     refused = vdgs("merge", copied)
     assert refused.returncode == 1
     assert "block 0: trained for another cut" in refused.stderr
@@ -365,9 +396,9 @@ def test_a_missing_block_stops_the_merge_unless_the_coarse_model_may_stand_in(co
     refused = vdgs("merge", copied)
     assert refused.returncode == 1
     assert "block 1: not trained yet" in refused.stderr
-    assert "--incomplete" in refused.stderr
+    assert "--allow-missing-blocks" in refused.stderr
     assert not (copied / MERGED).exists()
-    done = vdgs("merge", copied, "--incomplete")
+    done = vdgs("merge", copied, "--allow-missing-blocks")
     assert done.returncode == 0, done.stderr
     blocks, merged = load_blocks(copied / "partition/blocks.geojson"), AnchorModel.load(copied / MERGED)
     coarse = AnchorModel.load(copied / "coarse/model.safetensors").anchors
@@ -377,7 +408,7 @@ def test_a_missing_block_stops_the_merge_unless_the_coarse_model_may_stand_in(co
 
 
 def test_one_block_is_the_whole_scene_and_merging_it_the_identity(copied):
-    for command in (("partition", copied, "--blocks", "1", "--redo"), ("train", copied), ("merge", copied)):
+    for command in (("partition", copied, "--blocks", "1", "--overwrite"), ("train", copied), ("merge", copied)):
         done = vdgs(*command, prepare=do_tasks_here)
         assert done.returncode == 0, done.stderr
     assert sorted(path.name for path in (copied / "blocks").iterdir()) == ["00", "request.json"]
@@ -388,7 +419,7 @@ def test_one_block_is_the_whole_scene_and_merging_it_the_identity(copied):
 def test_stages_need_those_before_them(capture, tmp_path):
     run = tmp_path / "run"
     done = vdgs(
-        "coarse", capture, "--output", run, "--preset", "laptop", "--iterations", "30", "--anchors.offsets", "3"
+        "coarse", capture, "--output", run, "--preset", "laptop", "--iterations", "30", "--anchors.num-offsets", "3"
     )
     assert done.returncode == 0, done.stderr
     for verb, needed in (("train", "vdgs partition"), ("merge", "vdgs partition")):
@@ -428,7 +459,7 @@ OTHER_SEED = (*SETTINGS, "--seed", "7")
 
 def change_cut_off(capture: Path, run: Path, moment: tuple[str, int]) -> None:
     """Ask for another seed, and kill the command before it trains."""
-    with begun("run", capture, "--output", run, *OTHER_SEED, "--redo", pause_at=moment) as process:
+    with begun("run", capture, "--output", run, *OTHER_SEED, "--overwrite", pause_at=moment) as process:
         process.wait_until_paused()
         process.send_signal(signal.SIGKILL)
         process.finished()
@@ -461,7 +492,7 @@ def test_all_that_was_built_on_a_model_of_other_settings_is_made_again(capture, 
 
 
 def test_figures_of_another_model_are_not_taken_for_this_ones(capture, copied):
-    again = vdgs("eval", copied, "--bins", "2")
+    again = vdgs("eval", copied, "--visibility-bins", "2")
     assert again.returncode == 0, again.stderr
     done = vdgs("run", capture, "--output", copied, *SETTINGS)
     assert done.returncode == 0, done.stderr
@@ -471,7 +502,7 @@ def test_figures_of_another_model_are_not_taken_for_this_ones(capture, copied):
 
 def test_a_block_trained_again_is_merged_again(unbroken, copied):
     shutil.rmtree(copied / "blocks/01")
-    assert vdgs("merge", copied, "--incomplete").returncode == 0
+    assert vdgs("merge", copied, "--allow-missing-blocks").returncode == 0
     assert model(copied) != model(unbroken)
     assert vdgs("train", copied, "--block", "1").returncode == 0
     assert vdgs("merge", copied).returncode == 0
@@ -479,11 +510,11 @@ def test_a_block_trained_again_is_merged_again(unbroken, copied):
 
 
 def test_why_a_view_was_assigned(copied):
-    told = vdgs("partition", copied, "--why", "frame_001.png")
+    told = vdgs("partition", copied, "--explain", "frame_001.png")
     assert told.returncode == 0, told.stderr
     assert "frame_001.png" in told.stdout
     assert "threshold" in told.stdout or "best block" in told.stdout or "topped up" in told.stdout
-    unknown = vdgs("partition", copied, "--why", "nobody.png")
+    unknown = vdgs("partition", copied, "--explain", "nobody.png")
     assert unknown.returncode == 1
     assert "no training view 'nobody.png'" in unknown.stderr
 

@@ -185,7 +185,7 @@ def test_nodes_that_join_late_are_avoided_where_they_cannot_work_or_have_no_memo
     for name in cluster.names[1:]:
         cluster.remove(name)
     stranger = another_vdgs(tmp_path / "stranger")
-    with begun(*on_ray(run, cluster), "--memory-gb", "1", pause_at=(MIDDLE, 1), environment=cluster.token) as driver:
+    with begun(*on_ray(run, cluster), "--mem-gb", "1", pause_at=(MIDDLE, 1), environment=cluster.token) as driver:
         driver.wait_until_paused(1)
         (slow,) = driver.paused()
         cluster.add("stranger", {"PYTHONPATH": str(stranger)})

@@ -67,7 +67,7 @@ def test_whatever_is_killed_maps_drawn_in_shards_are_those_of_one_process(uncut,
 
 
 def test_detail_from_photographs_is_the_same_in_shards(uncut, mapped, tmp_path):
-    command = ("map", uncut, *FINE, "--sharp", "--output")
+    command = ("map", uncut, *FINE, "--detail-from-images", "--output")
     for name, more, prepare in (("one", (), None), ("shards", ("--jobs", "2"), do_tasks_here)):
         done = vdgs(*command, tmp_path / name, *more, prepare=prepare)
         assert done.returncode == 0, done.stderr + done.stdout
@@ -94,7 +94,9 @@ def test_a_run_sends_its_maps_where_its_blocks_go_and_stops_when_asked(tmp_path,
     wishes = []
     monkeypatch.setattr(run_pipeline, "render_ortho", lambda context, asked, console, wish: wishes.append(wish))
     for executor in ("local", "slurm"):
-        asked = RunRequest(capture=tmp_path, output=tmp_path, jobs=3, executor_options=ExecutorOptions(executor=executor))
+        asked = RunRequest(
+            capture=tmp_path, output=tmp_path, jobs=3, executor_options=ExecutorOptions(executor=executor)
+        )
         run_pipeline._map(RunContext.from_path(tmp_path), asked, Console(quiet=True))
     assert [(wish.is_distributed, wish.jobs, wish.where.executor) for wish in wishes] == [
         (False, 0, "local"),
@@ -124,7 +126,18 @@ def small_parts_here() -> None:
 def exported(uncut, tmp_path_factory) -> bytes:
     """What one process makes of it, on more threads than a shard has."""
     file = tmp_path_factory.mktemp("exported") / "scene.ply"
-    done = vdgs("export", uncut, "--to", file, "--rounds", "2", "--no-measure", "--threads", "2", prepare=small_parts)
+    done = vdgs(
+        "export",
+        uncut,
+        "--output",
+        file,
+        "--color-iterations",
+        "2",
+        "--no-evaluate",
+        "--threads",
+        "2",
+        prepare=small_parts,
+    )
     assert done.returncode == 0, done.stderr + done.stdout
     return file.read_bytes()
 
@@ -132,7 +145,7 @@ def exported(uncut, tmp_path_factory) -> bytes:
 def test_whenever_its_driver_is_killed_a_scene_baked_in_shards_is_that_of_one_process(uncut, exported, tmp_path):
     """While a second shard surveys; before the first Gaussians, and those with fitted colours, are there whole."""
     run, file = copy_run(uncut, tmp_path / "run"), tmp_path / "scene.ply"
-    command = ("export", run, "--to", file, "--rounds", "2", "--no-measure", "--jobs", "2")
+    command = ("export", run, "--output", file, "--color-iterations", "2", "--no-evaluate", "--jobs", "2")
     for moment in ("*/shards/*/01/000010.npy", "*/shards/*/0.spool", "*/shards/*/1.spool"):
         surveyed = {each: each.stat().st_mtime_ns for each in run.glob("baking/shards/*/0[01]/0000*.npy")}
         with begun(*command, prepare=small_parts_here, pause_at=(moment, 1)) as driver:
@@ -152,14 +165,14 @@ def test_whenever_its_driver_is_killed_a_scene_baked_in_shards_is_that_of_one_pr
 
 
 def test_what_is_chosen_is_baked_alike_in_shards_and_moved_on_by_the_driver(uncut, tmp_path):
-    chosen = ("--max-gaussians", "150", "--sh-degree", "1", "--rounds", "2", "--no-measure")
+    chosen = ("--max-gaussians", "150", "--sh-degree", "1", "--color-iterations", "2", "--no-evaluate")
     for name, more, prepare in (("one", (), small_parts), ("shards", ("--jobs", "2"), small_parts_here)):
-        done = vdgs("export", uncut, "--to", tmp_path / f"{name}.ply", *chosen, *more, prepare=prepare)
+        done = vdgs("export", uncut, "--output", tmp_path / f"{name}.ply", *chosen, *more, prepare=prepare)
         assert done.returncode == 0, done.stderr + done.stdout
     one, shards = ((tmp_path / f"{name}.ply").read_bytes() for name in ("one", "shards"))
     assert shards == one
-    more = ("--refine", "0.01", "--jobs", "2")
-    done = vdgs("export", uncut, "--to", tmp_path / "refined.ply", *chosen, *more, prepare=small_parts_here)
+    more = ("--optimize-seconds", "0.01", "--jobs", "2")
+    done = vdgs("export", uncut, "--output", tmp_path / "refined.ply", *chosen, *more, prepare=small_parts_here)
     assert done.returncode == 0, done.stderr + done.stdout
     refined = (tmp_path / "refined.ply").read_bytes()
     assert len(refined) == len(one)

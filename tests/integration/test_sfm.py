@@ -127,7 +127,9 @@ def test_the_same_command_does_nothing_and_an_option_only_what_depends_on_it(mad
         (incremental_mapper, "find_models"),
     ):
         monkeypatch.setattr(room, name, lambda *_: pytest.fail("was done already"))
-    asked = SfmRequest(image_folders=(flight.folder,), output=output, threads=1, options=SfmOptions(max_output_size=200))
+    asked = SfmRequest(
+        image_folders=(flight.folder,), output=output, threads=1, options=SfmOptions(max_output_size=200)
+    )
     reconstruct(asked, console())
     assert max(load_capture(output).views[0].camera.full_size) <= 200
     assert validate_capture(load_capture(output)).reprojection_px < 1
@@ -257,7 +259,8 @@ def test_positions_that_disagree_leave_the_scale_arbitrary_and_say_why(made, fli
     found = AlignmentFailure("the positions disagree by 2 m", "give better ones")
     monkeypatch.setattr(georegistration, "georegister", lambda *_: found)
     facts = reconstruct(
-        SfmRequest(image_folders=(flight.folder,), output=output, threads=1, options=SfmOptions(max_output_size=200)), said
+        SfmRequest(image_folders=(flight.folder,), output=output, threads=1, options=SfmOptions(max_output_size=200)),
+        said,
     )
     assert (facts.origin, facts.residual_rms_m) == (None, None)
     assert "disagree by 2 m" in facts.georeferenced

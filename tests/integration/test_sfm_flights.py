@@ -120,7 +120,9 @@ def test_portrait_and_landscape_stand_beside_each_other(flight, tmp_path):
 
 def test_more_folders_beside_a_capture_are_refused(flight, tmp_path):
     (tmp_path / "sparse").mkdir()
-    request = RunRequest(capture=tmp_path, output=tmp_path / "run", preset="laptop", extra_image_folders=(flight.folder,))
+    request = RunRequest(
+        capture=tmp_path, output=tmp_path / "run", preset="laptop", extra_image_folders=(flight.folder,)
+    )
     with pytest.raises(VdgsError, match="only folders of photographs alone can be several"):
         reconstruct_if_needed(request, console())
 

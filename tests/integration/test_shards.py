@@ -334,7 +334,16 @@ def test_views_measured_in_shards_are_those_of_one_process(merged, measured, tmp
 
 def test_exposed_views_are_the_same_in_shards_and_where_a_file_is_compared(uncut, tmp_path):
     run, measured = tmp_path / "run", tmp_path / "run" / "coarse" / "evaluation"
-    trained = ("coarse", uncut.parent / "capture", "--output", run, *COARSE, "--test-every", "4", "--exposure")
+    trained = (
+        "coarse",
+        uncut.parent / "capture",
+        "--output",
+        run,
+        *COARSE,
+        "--test-every",
+        "4",
+        "--exposure-compensation",
+    )
     for command in (trained, ("eval", run)):
         done = vdgs(*command)
         assert done.returncode == 0, done.stderr + done.stdout
@@ -352,7 +361,7 @@ def test_exposed_views_are_the_same_in_shards_and_where_a_file_is_compared(uncut
     assert done.returncode == 0, done.stderr + done.stdout
     assert "2 of 2 shards done" in done.stdout
     assert evaluated(measured) == one
-    done = vdgs("export", run, "--to", tmp_path / "scene.ply")
+    done = vdgs("export", run, "--output", tmp_path / "scene.ply")
     assert done.returncode == 0, done.stderr + done.stdout
     (loss,) = json.loads((run / "export.json").read_text())["losses"]
     assert loss["psnr"] == pytest.approx(figures["psnr"], abs=1e-9)

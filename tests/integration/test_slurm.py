@@ -33,7 +33,7 @@ pytestmark = [
     pytest.mark.xdist_group("slurm"),
     pytest.mark.skipif(sys.platform != "linux", reason="who is whose parent is read from /proc"),
 ]
-OWN = ("--processors", "1", "--memory-gb", "1", "--slurm.poll-seconds", "0.2", "--slurm.time", "1:00:00")
+OWN = ("--cpus", "1", "--mem-gb", "1", "--slurm.poll-seconds", "0.2", "--slurm.time", "1:00:00")
 WITHOUT = "SLURM is not installed: apt-get install slurmctld slurmd slurm-client"
 
 
@@ -166,7 +166,7 @@ def test_what_slurm_refuses_is_said_in_its_own_words(cut, tmp_path, monkeypatch)
     with stand_in(tmp_path) as told:
         for name, value in told.items():
             monkeypatch.setenv(name, value)
-        done = vdgs(*by_slurm(run), "--processors", "64", environment=variables())
+        done = vdgs(*by_slurm(run), "--cpus", "64", environment=variables())
     assert done.returncode == 1
     assert "Requested node configuration is not available" in done.stderr
     assert "job.sh" in done.stderr

@@ -73,7 +73,7 @@ class TestWhichRasterizerDraws:
             rasterizer.select_rasterizer("gsplat")
 
     def test_another_word_is_refused(self):
-        with pytest.raises(VdgsError, match="VDGS_RASTERISER must be gsplat, cuda or not set"):
+        with pytest.raises(VdgsError, match="VDGS_RASTERIZER must be gsplat, cuda or not set"):
             rasterizer.select_rasterizer("native")
 
 

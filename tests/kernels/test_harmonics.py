@@ -102,9 +102,7 @@ def test_what_no_fit_can_be_made_of_is_refused(kernels):
     directions, colors, weights, _ = seen([3, 2])
     for starts in ([0, 5], [1, 3], [0, 0], [2, 1], []):
         with pytest.raises(ValueError, match="pair"):
-            kernels.fit_harmonics(
-                directions, colors, weights, torch.tensor(starts, dtype=torch.int64), 1, RIDGE_WEIGHT
-            )
+            kernels.fit_harmonics(directions, colors, weights, torch.tensor(starts, dtype=torch.int64), 1, RIDGE_WEIGHT)
     nothing = torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, dtype=torch.int64)
     assert kernels.fit_harmonics(*nothing, 2, RIDGE_WEIGHT).shape == (0, 9, 3)
     with pytest.raises(ValueError, match="degree"):

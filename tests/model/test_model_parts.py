@@ -106,7 +106,9 @@ def test_the_merged_scene_decodes_each_block_as_it_was_trained():
     blocks, cameras = quadrants(), [VIEWS[:2]] * 4
     trained = trained_apart(coarse, own=True)
     merged, _ = merge_blocks(coarse, trained, blocks, cameras, MergeConfig())
-    assert [part.count for part in merged.decoder_spans] == [len(model.anchors) for model in trained if model is not None]
+    assert [part.count for part in merged.decoder_spans] == [
+        len(model.anchors) for model in trained if model is not None
+    ]
     for part, model in zip(merged.decoder_spans, trained, strict=True):
         assert model is not None
         given, own = part.decoder.tensors(), model.decoder.tensors()

@@ -172,7 +172,10 @@ def test_cells_are_as_large_as_pixels_are(tmp_path):
 
 @given(st.lists(st.floats(1e-6, 1e3), min_size=1, max_size=20), st.floats(0.01, 10), st.floats(0, 10))
 def test_a_cell_is_hardly_larger_or_smaller_than_its_pixels_ask_for(widths, least, pixels):
-    asked, edges = pixels * np.array(widths), least * CELL_SCALES[FusionCell(least, pixels).scale_index(np.array(widths))]
+    asked, edges = (
+        pixels * np.array(widths),
+        least * CELL_SCALES[FusionCell(least, pixels).scale_index(np.array(widths))],
+    )
     assert (edges >= least).all()
     assert (edges <= np.maximum(least, 1.42 * asked)).all()
     assert (edges >= np.minimum(least * CELL_SCALES[-1], 0.7 * asked)).all()

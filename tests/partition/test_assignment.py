@@ -45,12 +45,12 @@ matrices = st.integers(0, 12).flatmap(
 def test_laws_of_assignment(matrix, mode, floor):
     scores = hand_made(*matrix, mode=mode)
     config = replace(CONFIG, mode=mode, min_cameras=floor)
-    threshold = 0.05 if mode == "leave_one_out" else 0.45
+    threshold = 0.05 if mode == "leave-one-out" else 0.45
     result = assign_cameras(scores, config)
     seen = scores.visible_anchors > 0
     assert result.cameras.any(axis=1).all(), "every camera serves a block"
     assert np.array_equal(result.cameras, result.reasons != NOT_ASSIGNED)
-    above = (scores.scores > threshold) & (seen | (mode == "literal"))
+    above = (scores.scores > threshold) & (seen | (mode == "paper"))
     assert np.array_equal(result.reasons == ABOVE_THRESHOLD, above)
     for block in range(seen.shape[1]):
         mine, watching = result.cameras[:, block], seen[:, block]
@@ -67,7 +67,7 @@ def test_laws_of_assignment(matrix, mode, floor):
     assert np.array_equal(assign_cameras(scores, config).reasons, result.reasons)
 
 
-@pytest.mark.parametrize("mode", ["coverage", "literal"])
+@pytest.mark.parametrize("mode", ["coverage", "paper"])
 def test_without_its_best_block_a_camera_may_train_nothing(mode):
     scores = np.array([[0.9, 0.1], [0.3, 0.2], [0.0, 0.5]])
     given = hand_made(scores, np.ones((3, 2), int), mode=mode)
@@ -94,7 +94,9 @@ def test_a_camera_over_the_ring_alone_is_not_taken_for_it():
     """It would draw anchors that do not move, and teach nothing."""
     scores = hand_made([[0.9, 0.6]], [[0, 5]])
     assert assign_cameras(scores, CONFIG).reasons.tolist() == [[NOT_ASSIGNED, ABOVE_THRESHOLD]]
-    assert assign_cameras(replace(scores, mode="literal"), CONFIG).reasons.tolist() == [[ABOVE_THRESHOLD, ABOVE_THRESHOLD]]
+    assert assign_cameras(replace(scores, mode="paper"), CONFIG).reasons.tolist() == [
+        [ABOVE_THRESHOLD, ABOVE_THRESHOLD]
+    ]
 
 
 def test_a_block_without_cameras_complains_and_says_why():

@@ -25,10 +25,10 @@ def test_one_block_is_the_whole_scene(mode):
     scores = compute_score_matrix(scene(), strips(1), [*flight(), skyward()], config)
     assert np.array_equal(scores.coverage[:, 0], [1.0] * 9 + [0.0])
     assert np.array_equal(scores.visible_anchors[:, 0] > 0, [True] * 9 + [False])
-    if mode == "leave_one_out":
+    if mode == "leave-one-out":
         assert (scores.scores[:9, 0] > 0.5).all()
     else:
-        assert np.array_equal(scores.scores[:, 0], [1.0] * 9 + [float(mode == "literal")])
+        assert np.array_equal(scores.scores[:, 0], [1.0] * 9 + [float(mode == "paper")])
 
 
 @every_instruction_set
@@ -62,7 +62,7 @@ def expected_scores(mode: str, model: AnchorModel, blocks: Blocks, view: Camera)
         if mode == "coverage":
             drawn = full.alpha > 0.5
             scores.append(float((alike & drawn & (block.alpha > 0.5)).sum() / drawn.sum()))
-        elif mode == "literal":
+        elif mode == "paper":
             scores.append(float(alike.float().mean()))
         elif mode == "frustum":
             scores.append(float(view.in_frustum(positions.double().numpy()[own]).mean()))
@@ -96,11 +96,11 @@ def test_empty_pixels_count_in_literal_mode_alone():
     assert (literal.scores > 0.8).all()
     assert (coverage.scores < 0.5).all()
     assert np.array_equal(literal.coverage, coverage.scores)
-    empty = compute_score_matrix(scene(), strips(4), [skyward()], replace(CONFIG, mode="literal"))
+    empty = compute_score_matrix(scene(), strips(4), [skyward()], replace(CONFIG, mode="paper"))
     assert (empty.scores == 1).all()
 
 
-@pytest.mark.parametrize("mode", ["coverage", "leave_one_out", "frustum"])
+@pytest.mark.parametrize("mode", ["coverage", "leave-one-out", "frustum"])
 def test_a_block_out_of_view_scores_nothing(mode):
     scores = compute_score_matrix(scene(), strips(4), [camera(2.0)], replace(CONFIG, mode=mode))
     assert scores.scores[0, 0] > 0.05

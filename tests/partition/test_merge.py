@@ -22,7 +22,7 @@ from vdgs.partition.block_records import MergedBlockRecord
 from vdgs.partition.blocks import Block, Blocks
 from vdgs.partition.merging import block_of_points, merge_blocks
 
-OWNER, BEST_SEEN = MergeConfig("owner"), MergeConfig("best_seen")
+OWNER, BEST_SEEN = MergeConfig("owner"), MergeConfig("max-visibility")
 NO_CAMERAS = [[]] * 4
 
 
@@ -157,10 +157,10 @@ def test_a_missing_block_stops_the_merge():
     coarse = scattered()
     some = [scattered(), None, scattered(), None]
     with pytest.raises(
-        VdgsError, match=r"blocks 1, 3 are not trained[^`]*vdgs train RUN --block 1\n.*--block 3"
+        VdgsError, match=r"blocks 1, 3 are not trained[^`]*vdgs train-blocks RUN --block 1\n.*--block 3"
     ) as error:
         merge_blocks(coarse, some, quadrants(), NO_CAMERAS, OWNER)
-    assert "--incomplete" in str(error.value)
+    assert "--allow-missing-blocks" in str(error.value)
     with pytest.raises(VdgsError, match=r"^block 0 is not trained"):
         merge_blocks(coarse, [None, *some[2:3] * 3], quadrants(), NO_CAMERAS, OWNER)
 
@@ -199,7 +199,9 @@ def test_all_blocks_missing_is_the_coarse_scene():
 def test_a_block_of_another_coarse_model_is_refused():
     coarse, own = scattered(), scattered(seed=1)
     stranger = model_at(np.zeros((3, 3)), decoder_seed=1)
-    with pytest.raises(VdgsError, match=r"block 2 was trained from another coarse model.*vdgs train RUN --block 2"):
+    with pytest.raises(
+        VdgsError, match=r"block 2 was trained from another coarse model.*vdgs train-blocks RUN --block 2"
+    ):
         merge_blocks(coarse, [own, own, stranger, own], quadrants(), NO_CAMERAS, OWNER)
     with pytest.raises(VdgsError, match="block 0 was trained from another"):
         merge_blocks(coarse, [replace(own, voxel_size=0.2), own, own, own], quadrants(), NO_CAMERAS, OWNER)

@@ -303,7 +303,7 @@ def test_a_block_by_memory_takes_at_most_that_in_training(
 
 
 def test_more_growth_asks_for_more_blocks_and_limits_of_anchors_for_fewer() -> None:
-    auto, paper = PartitionConfig(blocks="auto"), PRESETS["paper"]
+    auto, paper = PartitionConfig(blocks="auto"), PRESETS["default"]
 
     def count(block: BlockConfig) -> int:
         return choose_block_count(10**6, 50_000, 10**6, MethodConfig(partition=auto, block=block))

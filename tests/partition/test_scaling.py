@@ -184,7 +184,7 @@ def test_the_first_point_of_each_cell(flags: int) -> None:
     assert boundary._first_of_cells(points, 0.7, flags).tolist() == expected
 
 
-@pytest.mark.parametrize("mode", ["coverage", "literal", "leave_one_out"])
+@pytest.mark.parametrize("mode", ["coverage", "paper", "leave-one-out"])
 def test_a_block_that_a_view_does_not_reach_scores_as_if_it_were_drawn(mode: str) -> None:
     model, blocks = small_model(600), stripes(12, 12.0)
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -203,8 +203,8 @@ def test_a_block_that_a_view_does_not_reach_scores_as_if_it_were_drawn(mode: str
         alone = scoring._render_subset(splats, members.reached[index, anchor], full, camera)
         expected = {
             "coverage": lambda alone=alone: scoring.drawn_coverage_ratio(alone, full, config.tau),
-            "literal": lambda alone=alone: scoring.coverage_ratio(alone, full, config.tau),
-            "leave_one_out": lambda: 0.0,
+            "paper": lambda alone=alone: scoring.coverage_ratio(alone, full, config.tau),
+            "leave-one-out": lambda: 0.0,
         }[mode]()
         assert found.scores[0, index] == np.float32(expected)
         assert found.coverage[0, index] == np.float32(scoring.drawn_coverage_ratio(alone, full, config.tau))

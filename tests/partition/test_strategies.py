@@ -86,7 +86,7 @@ def test_citygaussian_cameras_join_the_block_that_they_stand_in():
     strategy, positions = STRATEGIES["citygaussian"], anchors()
     blocks, _ = strategy.partition(positions, CAMERAS, 4)
     config = strategy.assignment(AssignmentConfig(min_cameras=0))
-    assert config.mode == "leave_one_out"
+    assert config.mode == "leave-one-out"
     scores = strategy.adjust_scores(scores_of(blocks, config.mode), positions, blocks, CAMERAS)
     assigned = assign_cameras(scores, config).cameras
     assert np.array_equal(assigned, np.eye(len(blocks), dtype=bool)[scores.nadir_block])

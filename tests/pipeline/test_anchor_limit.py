@@ -51,15 +51,22 @@ def eager(max_anchors: int) -> MethodConfig:
     (planned,) = make_plan("table1", choices).runs
     config, growth = planned.config, planned.config.block.densify
     growth = replace(
-        growth, every=4, stats_start=0, start=1, stop_fraction=1.0, grad_threshold=1e-12, min_draw_fraction=0.0, coarsest_voxels=2.0,
+        growth,
+        every=4,
+        stats_start=0,
+        start=1,
+        stop_fraction=1.0,
+        grad_threshold=1e-12,
+        min_draw_fraction=0.0,
+        coarsest_voxels=2.0,
         prune_view_fraction=1e9,
-    )  # fmt: skip
+    )
     return replace(
         config,
         training=replace(config.training, iterations=1, resolution_schedule=((0.0, 1),)),
         assignment=replace(config.assignment, min_cameras=4, image_size=32),
         block=replace(
-            config.block, iterations=16, densify=growth, swa_fraction=0.0, crop="off", view_sampling="even",
+            config.block, iterations=16, densify=growth, swa_fraction=0.0, crop="off", view_sampling="uniform",
             resolution_schedule=((0.0, 1),),
         ),
     )  # fmt: skip

@@ -36,9 +36,9 @@ DRIVER = (
     "import fcntl, sys; lock = open(sys.argv[1], 'a'); fcntl.flock(lock, fcntl.LOCK_EX); print(flush=True); "
     "sys.stdin.read()"
 )
-#: As `--preset laptop --block.ring free` gives them: blocks may be merged by either rule.
+#: As `--preset laptop --block.margin free` gives them: blocks may be merged by either rule.
 METHOD = replace(PRESETS["laptop"], block=replace(PRESETS["laptop"].block, margin="free"))
-OPTIONS = ("--preset", "laptop", "--block.ring", "free")
+OPTIONS = ("--preset", "laptop", "--block.margin", "free")
 AT_WORK = "another vdgs process works on this run"
 
 
@@ -87,16 +87,16 @@ def command_line(*arguments: object) -> object:
 CHANGES: dict[str, Callable[[Path, Path], list[object]]] = {
     "other blocks": lambda place, run: ["run", place, "--output", run, *OPTIONS, "--blocks", "4"],
     "another coarse model": lambda place, run: [
-        "run", place, "--output", run, *OPTIONS, "--iterations", "50", "--redo",
+        "run", place, "--output", run, *OPTIONS, "--iterations", "50", "--overwrite",
     ],
     "read otherwise": lambda place, run: [
-        "run", place, "--output", run, *OPTIONS, "--downscale", "2", "--redo",
+        "run", place, "--output", run, *OPTIONS, "--downscale", "2", "--overwrite",
     ],
     "the coarse stage": lambda place, run: ["coarse", place, "--output", run, "--preset", "laptop"],
-    "another cut": lambda _, run: ["partition", run, "--blocks", "4", "--redo"],
-    "other training": lambda _, run: ["train", run, "--block.iterations", "7", "--redo"],
-    "another block": lambda _, run: ["train", run, "--block", "0", "--block.iterations", "7", "--redo"],
-    "another merge": lambda _, run: ["merge", run, "--rule", "best_seen"],
+    "another cut": lambda _, run: ["partition", run, "--blocks", "4", "--overwrite"],
+    "other training": lambda _, run: ["train", run, "--block.iterations", "7", "--overwrite"],
+    "another block": lambda _, run: ["train", run, "--block", "0", "--block.iterations", "7", "--overwrite"],
+    "another merge": lambda _, run: ["merge", run, "--rule", "max-visibility"],
     "moved, for visibility": lambda place, run: ["visibility", run, "--capture", moved(place)],
     "moved, for figures": lambda place, run: ["eval", run, "--capture", moved(place)],
     "moved, for a run": lambda place, run: ["run", moved(place), "--output", run, *OPTIONS],

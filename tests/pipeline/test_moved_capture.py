@@ -149,7 +149,7 @@ def test_the_command_that_is_advised_names_the_capture_where_it_lies_now(folder,
     run = RunFolder(folder / "run")
     settings, gone = run.settings(), tmp_path / "gone" / "place"
     for command, moved in (
-        (f"vdgs run {gone} --output 'a run' --redo", f"vdgs run {folder}/place --output 'a run' --redo"),
+        (f"vdgs run {gone} --output 'a run' --overwrite", f"vdgs run {folder}/place --output 'a run' --overwrite"),
         ("vdgs run place --output run", None),
         (None, None),
     ):

@@ -98,7 +98,7 @@ def capture_of(points: np.ndarray, origin: tuple[float, float, float] | None = P
 
 @pytest.fixture
 def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """`vdgs map` of a model and a capture that were never trained; returns the folder of the maps."""
+    """`vdgs ortho` of a model and a capture that were never trained; returns the folder of the maps."""
 
     def run(capture: Capture, model: AnchorModel, **asked) -> Path:
         ortho_folder = SimpleNamespace(path=tmp_path / "run")

@@ -155,7 +155,9 @@ def test_a_file_with_everything(tmp_path: Path):
 
 def test_a_path_in_the_source_frame_shows_the_same(tmp_path: Path):
     rotation = Rotation.from_euler("xyz", [1.2, 0.3, -0.4]).as_matrix()
-    ground = GroundFrame(scale=2.5, rotation=rotation, translation=np.array([10.0, -4, 7]), metric=False, description="test")
+    ground = GroundFrame(
+        scale=2.5, rotation=rotation, translation=np.array([10.0, -4, 7]), metric=False, description="test"
+    )
     entry = {"position": [0, 1, 2], "look_at": [3, 3, 3], "up": [0, 1, 0]}
     plain = load_path(write(tmp_path, [entry]), TEMPLATE).cameras[0]
     file = write(tmp_path, {"frame": "source", "keyframes": [entry]})
@@ -209,7 +211,9 @@ def test_a_path_of_nerfstudio_leads_back_to_the_capture(place: str, tmp_path: Pa
     file = tmp_path / "data/camera_paths/a.json"
     file.write_text(json.dumps(of_nerfstudio(motion, scale, poses)))
     rotation = Rotation.from_euler("xyz", [1.2, 0.3, -0.4]).as_matrix()
-    ground = GroundFrame(scale=2.5, rotation=rotation, translation=np.array([10.0, -4, 7]), metric=False, description="test")
+    ground = GroundFrame(
+        scale=2.5, rotation=rotation, translation=np.array([10.0, -4, 7]), metric=False, description="test"
+    )
     found = load_path(file, TEMPLATE, ground, capture=tmp_path / "capture").cameras
     assert len(found) == 3
     for camera, pose in zip(found, poses, strict=True):
@@ -236,7 +240,9 @@ def test_a_path_of_nerfstudio_without_its_frame_is_refused(tmp_path: Path):
         (tmp_path / "dataparser_transforms.json").write_text(json.dumps(said))
         with pytest.raises(VdgsError, match=rf"dataparser_transforms.json: .*{why}"):
             load_path(file, TEMPLATE)
-    ground = GroundFrame(scale=2.0, rotation=np.eye(3), translation=np.array([1.0, 0, 0]), metric=False, description="test")
+    ground = GroundFrame(
+        scale=2.0, rotation=np.eye(3), translation=np.array([1.0, 0, 0]), metric=False, description="test"
+    )
     for frame, x in (("source", 1.0), ("ground", 0.0)):
         camera = load_path(write(tmp_path, {**content, "frame": frame}), TEMPLATE, ground).cameras[0]
         assert camera.position[0] == pytest.approx(x)

@@ -22,7 +22,7 @@ from vdgs.runs import create_or_resume, open_run
 from vdgs.runs.run_context import RunContext
 
 SETTINGS = (
-    "--preset", "laptop", "--iterations", "12", "--anchors.offsets", "2", "--growth.start", "50", "--no-maps",
+    "--preset", "laptop", "--iterations", "12", "--anchors.num-offsets", "2", "--densify.start", "50", "--no-ortho",
     "--blocks", "2", "--assignment.min-cameras", "4", "--block.iterations", "6", "--quiet",
 )  # fmt: skip
 

@@ -127,7 +127,7 @@ def test_a_change_that_costs_trained_work_needs_redo(tmp_path):
     run.change_settings(other, overwrite=False)  # nothing is trained yet
     run.block(0).reset_unless(run.keys().blocks)
     run.block(0).model.write_bytes(b"a trained block")
-    with pytest.raises(RunError, match=r"--lambda-vis: 0\.7 -> 1\.0(?s:.*)a block useless. Add --redo"):
+    with pytest.raises(RunError, match=r"--lambda-vis: 0\.7 -> 1\.0(?s:.*)a block useless. Add --overwrite"):
         run.change_settings(settings(), overwrite=False)
     assert run.settings() == other
     assert run.change_settings(settings(), overwrite=True) == ["--lambda-vis: 0.7 -> 1.0"]
@@ -173,7 +173,7 @@ def test_each_setting_invalidates_the_stages_that_depend_on_it_and_no_others():
     before = stage_keys(settings())
     changes: list[tuple[str, dict[str, object], int]] = [
         ("capture", {"images": "other"}, 0), ("training", {"seed": 5}, 0), ("partition", {"lambda_vis": 0.7}, 1),
-        ("assignment", {"tau": 0.1}, 2), ("block", {"offset_rate": 0.5}, 3), ("merge", {"rule": "best_seen"}, 4),
+        ("assignment", {"tau": 0.1}, 2), ("block", {"offset_rate": 0.5}, 3), ("merge", {"rule": "max-visibility"}, 4),
     ]  # fmt: skip
     for section, change, first in changes:
         section_changed = replace(getattr(settings(), section), **change)

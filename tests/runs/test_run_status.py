@@ -103,7 +103,7 @@ def test_a_whole_run_is_whole(run, capsys):
 @pytest.mark.parametrize(
     ("section", "setting", "stale", "then"),
     [
-        ("merge", {"rule": "best_seen"}, ["merge", "evaluation"], "merge"),
+        ("merge", {"rule": "max-visibility"}, ["merge", "evaluation"], "merge"),
         ("block", {"iterations": 7}, ["block 0", "block 1", "merge", "evaluation"], "train"),
         ("assignment", {"tau": 0.3}, ["cameras", "block 0", "block 1", "merge", "evaluation"], "partition"),
         ("partition", {"lambda_vis": 0.9}, ["partition", "cameras", "block 0", "block 1", "merge", "evaluation"],
@@ -159,7 +159,9 @@ def test_figures_that_nothing_vouches_for_are_shown_with_a_caution(run):
 
 
 def test_what_fails_and_stops_is_said_with_its_reason(run):
-    run.block(0).set_status(StatusRecord(state="failed", iteration=7, iterations=40, reason="out of memory\nmore of it"))
+    run.block(0).set_status(
+        StatusRecord(state="failed", iteration=7, iterations=40, reason="out of memory\nmore of it")
+    )
     run.block(1).set_status(StatusRecord(state="running", iteration=9, iterations=40))
     standing = get_run_status(run)
     assert (standing.of("block 0").state, standing.of("block 0").reason) == ("failed", "out of memory")
@@ -221,7 +223,7 @@ def test_a_folder_without_a_run_is_an_error(tmp_path, capsys):
 
 
 def test_programs_read_the_same(run, capsys):
-    change(run, "merge", rule="best_seen")
+    change(run, "merge", rule="max-visibility")
     assert command_line("status", run.path, "--json") == EXIT_INCOMPLETE
     facts = json.loads(capsys.readouterr().out)
     assert not facts["whole"]
@@ -283,7 +285,7 @@ def test_a_merged_model_of_other_blocks_is_opened_with_a_caution(run, opened_wit
 def test_the_command_that_began_a_run_is_advised_while_the_settings_are_its_own(run):
     run.merged.model.unlink()
     assert get_run_status(run).next_command() == COMMAND
-    other = replace(run.settings(), merge=MergeConfig("best_seen"))
+    other = replace(run.settings(), merge=MergeConfig("max-visibility"))
     run.change_settings(other, overwrite=True)
     assert run.config.command() is None
     assert get_run_status(run).next_command() == f"vdgs merge {run.path}"

@@ -13,7 +13,7 @@ from vdgs.runs.stage_keys import stage_keys
 
 PLAIN = MethodConfig()
 CHANGED = {
-    "adam": replace(PLAIN, training=replace(PLAIN.training, optimizer="dense")),
+    "adam": replace(PLAIN, training=replace(PLAIN.training, optimizer="adam")),
     "stereo": replace(PLAIN, training=replace(PLAIN.training, anchors=replace(PLAIN.training.anchors, mvs=True))),
     "exposure": replace(PLAIN, training=replace(PLAIN.training, exposure_compensation=True)),
     "spread": replace(PLAIN, training=replace(PLAIN.training, exposure_compensation=True, exposure_min_spread=0.1)),

@@ -234,7 +234,8 @@ def surveyed(made: Path, flight: Flight, tmp_path: Path, file: Path, *held_out: 
     options = SfmOptions(gcp=file, check_points=held_out)
     said = console()
     facts = reconstruct(
-        SfmRequest(image_folders=(flight.folder,), output=output, threads=1, options=options, keep_intermediate=True), said
+        SfmRequest(image_folders=(flight.folder,), output=output, threads=1, options=options, keep_intermediate=True),
+        said,
     )
     return facts, load_capture(output), said.file.getvalue()
 

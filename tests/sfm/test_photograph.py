@@ -327,7 +327,7 @@ def test_the_focal_length_is_held_where_the_flight_cannot_tell_it(tmp_path):
     where = positions_of(seen)
     held = [should_fix_focal(each, where, SfmOptions())[0] for each in (seen, oblique, heights, unknown)]
     assert held == [True, False, False, False]
-    assert should_fix_focal(oblique, where, SfmOptions(focal="hold"))[0]
+    assert should_fix_focal(oblique, where, SfmOptions(focal="fixed"))[0]
 
 
 def circle(radius: float) -> np.ndarray:

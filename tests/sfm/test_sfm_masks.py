@@ -189,7 +189,9 @@ def test_features_lie_where_masks_are_white(masked, tmp_path):
 
 def test_masks_are_written_with_the_capture_and_what_depends_on_them_is_done_again(nine_begun, masked, tmp_path):
     output, keys = tmp_path / "capture", []
-    request = SfmRequest(image_folders=(masked.folder,), output=output, threads=1, options=SfmOptions(max_output_size=200))
+    request = SfmRequest(
+        image_folders=(masked.folder,), output=output, threads=1, options=SfmOptions(max_output_size=200)
+    )
     first = masked.folder / f"masks/{masked.names[0]}.png"
     for change in (lambda: None, lambda: write_mask(first, ~left_half(300, 400)), first.unlink):
         change()

@@ -18,7 +18,7 @@ from vdgs.model.decoder import Decoder
 from vdgs.partition.assignment.score_matrix import ScoreMatrix
 from vdgs.partition.blocks import Block, Blocks
 
-MODES = ("coverage", "literal", "leave_one_out", "frustum")
+MODES = ("coverage", "paper", "leave-one-out", "frustum")
 RENDERED = MODES[:3]
 CONFIG = AssignmentConfig(image_size=48, min_cameras=0)
 WIDTH = 24.0

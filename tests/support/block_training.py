@@ -21,7 +21,13 @@ CONFIG = TrainConfig(
     iterations=40,
     anchors=AnchorConfig(num_offsets=4),
     densify=DensifyConfig(
-        every=10, stats_start=0, start=10, stop_fraction=1.0, grad_threshold=1e-6, coarsest_voxels=4.0, min_draw_fraction=0.05
+        every=10,
+        stats_start=0,
+        start=10,
+        stop_fraction=1.0,
+        grad_threshold=1e-6,
+        coarsest_voxels=4.0,
+        min_draw_fraction=0.05,
     ),
     compensation=CompensationConfig(t_low=0.5),
 )

@@ -18,10 +18,19 @@ from vdgs.runs.run_folder import RunFolder
 
 #: What makes a run of two blocks that is small enough to be trained again and again.
 COARSE = (
-    "--preset", "laptop", "--iterations", "60", "--anchors.offsets", "3", "--growth.levels", "0", "--save-every", "20",
-)  # fmt: skip
+    "--preset",
+    "laptop",
+    "--iterations",
+    "60",
+    "--anchors.num-offsets",
+    "3",
+    "--densify.num-levels",
+    "0",
+    "--save-every",
+    "20",
+)
 CUT = ("--blocks", "2", "--assignment.min-cameras", "4")
-BLOCKS = ("--save-every", "10", "--block.iterations", "30", "--redo")
+BLOCKS = ("--save-every", "10", "--block.iterations", "30", "--overwrite")
 #: Where each block waits once, on its way or when it is continued there.
 MIDDLE = "*/blocks/0?/checkpoints/00000020.json"
 #: Pixels so small that the map of `uncut` has four tiles, two for each shard.

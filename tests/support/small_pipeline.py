@@ -14,9 +14,9 @@ from vdgs.cli.main import main
 
 #: As few and as small as lets anchors grow, blocks train and PSNR say something.
 SETTINGS = (
-    "--preset", "laptop", "--iterations", "40", "--anchors.offsets", "2", "--anchors.voxel", "0.8",
-    "--rates.features", "0.03", "0.03", "--growth.start", "10", "--growth.statistics-from", "0",
-    "--growth.gate", "0.05", "--growth.interval", "10", "--growth.max-anchors", "200",
+    "--preset", "laptop", "--iterations", "40", "--anchors.num-offsets", "2", "--anchors.voxel-size", "0.8",
+    "--lr.features", "0.03", "0.03", "--densify.start", "10", "--densify.stats-start", "0",
+    "--densify.min-draw-fraction", "0.05", "--densify.every", "10", "--densify.max-anchors", "200",
 )  # fmt: skip
 
 
@@ -24,8 +24,8 @@ CUT = ("--blocks", "2", "--assignment.min-cameras", "3")
 
 
 BLOCK = (
-    "--block.iterations", "16", "--block.growth.start", "8", "--block.growth.statistics-from", "0",
-    "--block.growth.interval", "8", "--block.growth.gate", "0.05",
+    "--block.iterations", "16", "--block.densify.start", "8", "--block.densify.stats-start", "0",
+    "--block.densify.every", "8", "--block.densify.min-draw-fraction", "0.05",
 )  # fmt: skip
 
 

@@ -20,7 +20,9 @@ CONFIG = TrainConfig(
     iterations=60,
     resolution_schedule=((0.0, 2), (0.5, 1)),
     anchors=AnchorConfig(num_offsets=4, appearance_dim=3),
-    densify=DensifyConfig(every=10, stats_start=5, start=20, stop_fraction=0.9, grad_threshold=1e-6, min_draw_fraction=0.05),
+    densify=DensifyConfig(
+        every=10, stats_start=5, start=20, stop_fraction=0.9, grad_threshold=1e-6, min_draw_fraction=0.05
+    ),
 )
 
 

@@ -91,9 +91,9 @@ def test_the_picture_of_a_block_counts_in_the_largest_size_that_it_trains_with()
 def test_growth_below_a_fixed_threshold_is_expected_to_be_large():
     """On a real capture nearly all anchors are seen by fewer than a fifth of the cameras."""
     growths = {name: max_growth_factor(preset.block.compensation) for name, preset in PRESETS.items()}
-    assert growths == {"paper": MAX_COMPENSATED_GROWTH, "literal": MAX_COMPENSATED_GROWTH, "laptop": MAX_GROWTH}
+    assert growths == {"paper": MAX_COMPENSATED_GROWTH, "paper": MAX_COMPENSATED_GROWTH, "laptop": MAX_GROWTH}
     lowest = CompensationConfig(t_low_quantile=0.25)
-    assert max_growth_factor(lowest) == max_growth_factor(PRESETS["paper"].training.compensation) == MAX_GROWTH
+    assert max_growth_factor(lowest) == max_growth_factor(PRESETS["default"].training.compensation) == MAX_GROWTH
 
 
 @given(needs)
@@ -104,7 +104,7 @@ def test_a_mean_of_models_takes_one_more_model(need):
     assert more == pytest.approx(4 * (32 + 6 + 3 * need.offsets) * need.grown, abs=1, rel=1e-9)
 
 
-@pytest.mark.parametrize(("kind", "option"), [("coarse", "--average 0"), ("block", "--block.average 0")])
+@pytest.mark.parametrize(("kind", "option"), [("coarse", "--swa-fraction 0"), ("block", "--block.swa-fraction 0")])
 def test_the_mean_may_be_given_up(kind, option):
     need = TrainingWorkload(
         anchors=1_000_000, max_anchors=0, offsets=10, seen=0.4, pixels=10**6, image_cache_bytes=10**8, has_swa=True
@@ -138,7 +138,7 @@ def test_the_limit_of_anchors_makes_it_fit(averaged):
     assert missing <= saved == limit.saved_bytes <= 1.01 * missing
     # Growth that would have to be undone is not promised.
     (least,) = [each for each in memory_advice(need, "coarse", 10**12) if "max-anchors" in each.setting]
-    assert least.setting.startswith("--growth.max-anchors 1000000 ")
+    assert least.setting.startswith("--densify.max-anchors 1000000 ")
 
 
 def test_the_line_for_people_says_what_takes_it_and_what_there_is():
@@ -157,8 +157,8 @@ def test_the_line_for_people_says_what_takes_it_and_what_there_is():
 @pytest.mark.parametrize(
     ("kind", "said"),
     [
-        ("coarse", ". --image-memory-gb may change when a run continues, other settings need a new --output."),
-        ("block", ". --jobs and --image-memory-gb may change when a run continues, other settings need --redo."),
+        ("coarse", ". --image-cache-gb may change when a run continues, other settings need a new --output."),
+        ("block", ". --jobs and --image-cache-gb may change when a run continues, other settings need --overwrite."),
     ],
 )
 def test_a_warning_comes_before_training_where_it_will_not_fit(kind, said, monkeypatch, capsys):
@@ -171,7 +171,7 @@ def test_a_warning_comes_before_training_where_it_will_not_fit(kind, said, monke
     line, warning, *_ = capsys.readouterr().out.splitlines()
     assert line.startswith("memory by estimate")
     assert warning.startswith("warning it may run out of memory: ")
-    assert ("--growth.max-anchors 1000000" in warning) == (kind == "coarse")
+    assert ("--densify.max-anchors 1000000" in warning) == (kind == "coarse")
     assert warning.endswith(said)
     monkeypatch.setattr(memory_advice_module, "available_memory_bytes", lambda: 10**11)
     print_memory_estimate(need, kind, Console(width=2000))
@@ -213,8 +213,8 @@ def test_a_limit_of_the_process_counts():
 
 #: Without stereo, which would leave room behind in which a step fits.
 SETTINGS = (
-    "--preset", "laptop", "--iterations", "40", "--up", "z", "--anchors.offsets", "3", "--threads", "1",
-    "--anchors.no-stereo",
+    "--preset", "laptop", "--iterations", "40", "--up", "z", "--anchors.num-offsets", "3", "--threads", "1",
+    "--anchors.no-mvs",
 )  # fmt: skip
 #: The last iteration with photographs at half their size (preset laptop).
 LAST_HALF = 16

@@ -100,7 +100,9 @@ def test_without_context_only_the_ring_is_drawn():
 def test_a_free_ring_moves_and_a_ramp_moves_it_less():
     moved = {}
     for ring in ("free", "ramp"):
-        stage, state = block_stage(BlockConfig(margin=ring), training=replace(CONFIG, densify=DensifyConfig(num_levels=0)))
+        stage, state = block_stage(
+            BlockConfig(margin=ring), training=replace(CONFIG, densify=DensifyConfig(num_levels=0))
+        )
         before = state.anchors.features.clone()
         ring_rows = state.anchors.positions[:, 0] > 0.5  # beyond the middle of the ring
         finish(stage, state, until=10)

@@ -253,7 +253,7 @@ def test_an_empty_set_of_those_seen_shows_in_the_facts():
 
 @pytest.mark.parametrize(
     ("gate", "interval", "expected"),
-    [("scaled", 100, 8.0), ("literal", 100, 40.0), ("scaled", 10, 2.0), ("scaled", 2, 0.8)],
+    [("scaled", 100, 8.0), ("paper", 100, 40.0), ("scaled", 10, 2.0), ("scaled", 2, 0.8)],
 )
 def test_the_gate_of_low_visibility(gate, interval, expected):
     growth, config = replace(GROWTH, every=interval), replace(PAPER, min_draws=gate)
@@ -261,7 +261,7 @@ def test_the_gate_of_low_visibility(gate, interval, expected):
     assert change.min_draws == pytest.approx(expected)
 
 
-@pytest.mark.parametrize(("gate", "judged"), [("scaled", True), ("literal", False)])
+@pytest.mark.parametrize(("gate", "judged"), [("scaled", True), ("paper", False)])
 def test_an_offset_drawn_nine_times_is_judged_only_by_the_scaled_gate(gate, judged):
     config = replace(PAPER, min_draws=gate)
     n = 30

@@ -124,7 +124,9 @@ def test_faint_anchors_go_once_they_were_seen_often_enough():
 def test_the_budget_serves_the_strongest_first():
     before, stats = anchors(200), statistics(200)
     free = decide_densification(before, statistics(200), 0.1, ALWAYS, torch.Generator().manual_seed(0)).added
-    config = DensifyConfig(min_draw_fraction=0.0, num_levels=1, coarsest_voxels=1.0, grad_threshold=1.0, max_anchors=210)
+    config = DensifyConfig(
+        min_draw_fraction=0.0, num_levels=1, coarsest_voxels=1.0, grad_threshold=1.0, max_anchors=210
+    )
     capped = decide_densification(before, stats, 0.1, config, torch.Generator().manual_seed(0)).added
     assert len(free) > 10
     assert len(capped) == 10
@@ -168,7 +170,9 @@ def test_new_anchors_stay_where_they_may_be_and_no_budget_is_spent_elsewhere():
     held = decide_densification(before, statistics(200), 0.5, config, coins().manual_seed(0), growth_mask=east).added
     assert torch.equal(held.positions, free.positions[east(free.positions)])
     assert 0 < len(held) < len(free)
-    budget = DensifyConfig(min_draw_fraction=0.0, num_levels=2, coarsest_voxels=1.0, grad_threshold=1.0, max_anchors=220)
+    budget = DensifyConfig(
+        min_draw_fraction=0.0, num_levels=2, coarsest_voxels=1.0, grad_threshold=1.0, max_anchors=220
+    )
     few = decide_densification(before, statistics(200), 0.5, budget, coins().manual_seed(0), growth_mask=east).added
     assert len(few) == 20
     assert bool(east(few.positions).all())

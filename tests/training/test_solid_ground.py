@@ -147,7 +147,9 @@ def test_an_anchor_in_the_center_of_a_camera_has_a_size_that_can_be_trained():
 def test_training_leaves_no_gaussian_larger_than_its_bound_nor_far_from_its_anchor():
     """Scales begin too large, of Gaussians and of the unit of their offsets; anchors that grow are bounded too."""
     stage, state = block_stage(BlockConfig())
-    growth = DensifyConfig(every=10, stats_start=0, start=10, stop_fraction=0.8, grad_threshold=1e-6, min_draw_fraction=0.05)
+    growth = DensifyConfig(
+        every=10, stats_start=0, start=10, stop_fraction=0.8, grad_threshold=1e-6, min_draw_fraction=0.05
+    )
     config = replace(stage.config, iterations=47, swa_fraction=0.1, densify=growth)
     cameras = Photographs().cameras
     stage = replace(stage, config=config, max_log_scale=lambda places: max_log_scales(places, cameras) - 3.0)

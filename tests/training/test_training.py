@@ -158,9 +158,7 @@ def test_transparent_anchors_go_where_they_are_seen_and_stay_just_outside_of_all
 @pytest.mark.parametrize("first_seen", [0, 10_000])
 def test_the_first_step_of_an_anchor_is_the_same_whenever_it_is_seen_first(first_seen):
     """An anchor that was never seen keeps everything; seen first, it moves as it would have at once."""
-    config = replace(
-        CONFIG, iterations=20_000, lr=LearningRateConfig(features=(0.01, 0.01), log_scales=(0.01, 0.01))
-    )
+    config = replace(CONFIG, iterations=20_000, lr=LearningRateConfig(features=(0.01, 0.01), log_scales=(0.01, 0.01)))
     state = start(config)
     state.iteration = first_seen
     before = state.anchors.select(torch.arange(len(state.anchors)))
@@ -176,7 +174,9 @@ def test_the_first_step_of_an_anchor_is_the_same_whenever_it_is_seen_first(first
 
 def test_dense_adam_moves_what_a_view_does_not_show_along_its_moments():
     """All anchors, one photograph a step: parameters and moments are those of torch's Adam on whole tensors."""
-    config = replace(CONFIG, optimizer="dense", densify=replace(CONFIG.densify, stop_fraction=0.0), resolution_schedule=((0.0, 1),))
+    config = replace(
+        CONFIG, optimizer="adam", densify=replace(CONFIG.densify, stop_fraction=0.0), resolution_schedule=((0.0, 1),)
+    )
     state, given = start(config), replace(stage(config), frozen_decoder=True)
     far = state.anchors.positions[:, 0] > 2.5  # the last views alone show it
     before = state.anchors.select(far)
@@ -200,8 +200,8 @@ def test_dense_adam_moves_what_a_view_does_not_show_along_its_moments():
 
 def test_visible_and_dense_adam_are_one_where_all_is_seen():
     """The first step moves what it shows, and nothing else has a moment to follow."""
-    states = [start(replace(CONFIG, optimizer=adam)) for adam in ("visible", "dense")]
-    for state, adam in zip(states, ("visible", "dense"), strict=True):
+    states = [start(replace(CONFIG, optimizer=adam)) for adam in ("sparse-adam", "adam")]
+    for state, adam in zip(states, ("sparse-adam", "adam"), strict=True):
         train_step(state, stage(replace(CONFIG, optimizer=adam)))
     visible, dense = (bits(state) for state in states)
     assert {name for name in visible if visible[name] != dense[name]} == {"updates.anchors"}

@@ -131,7 +131,7 @@ def test_photographs_used_alike_are_worth_their_number_and_one_that_outweighs_al
     assert effective_sample_size([weight] * count + [1e9 * weight]) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize(("sampling", "ratio"), [("even", None), ("shares", 9.0), ("roots", 3.0)])
+@pytest.mark.parametrize(("sampling", "ratio"), [("uniform", None), ("visibility", 9.0), ("sqrt-visibility", 3.0)])
 def test_how_often_a_photograph_with_nine_times_the_votes_is_used(sampling: str, ratio: float | None) -> None:
     cameras = [
         Camera(

@@ -113,7 +113,9 @@ def _georeferenced(scene: _Scene, file: Path, warnings: list[str]) -> GroundFram
     shift = np.where(np.abs(middle) > FAR_FROM_ORIGIN_M, -np.round(middle), 0.0)
     if shift.any():
         how = f"{how}, origin moved by {np.abs(shift).max():.0f} m"
-    frame = GroundFrame(scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, description=how, origin_geo=origin)
+    frame = GroundFrame(
+        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, description=how, origin_geo=origin
+    )
     if np.linalg.norm(middle) > MAX_ENU_DISTANCE_M:
         warnings.append(
             f"{file.name}: the cameras are {np.linalg.norm(middle) / 1000:,.0f} km away from the origin, where its "
@@ -129,7 +131,9 @@ def _shifted(frame: GroundFrame, shift: np.ndarray, how: str) -> GroundFrame:
     assert frame.origin_geo is not None
     moved = geodetic_from_enu(-shift[None], frame.origin_geo, frame.axes_origin)[0]
     origin = (float(moved[0]), float(moved[1]), float(moved[2]))
-    return replace(frame, translation=frame.translation + shift, description=how, origin_geo=origin, axes_geo=frame.axes_origin)
+    return replace(
+        frame, translation=frame.translation + shift, description=how, origin_geo=origin, axes_geo=frame.axes_origin
+    )
 
 
 def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | None:
@@ -163,9 +167,13 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
     rms = float(np.sqrt((residuals[inliers] ** 2).sum(axis=1).mean()))
     how = f"GPS of {inliers.sum()} photographs, RMS {rms:.2f} m"
     frame = GroundFrame(
-        scale=similarity.scale, rotation=similarity.rotation, translation=similarity.translation, metric=True, description=how,
+        scale=similarity.scale,
+        rotation=similarity.rotation,
+        translation=similarity.translation,
+        metric=True,
+        description=how,
         origin_geo=origin,
-    )  # fmt: skip
+    )
     frame = _shifted(frame, -_middle(frame.to_ground(scene.points)), how)
     _compare_up(scene, frame, warnings)
     return frame

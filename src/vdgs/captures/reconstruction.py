@@ -183,4 +183,6 @@ def gcp_table(metadata: ReconstructionReport) -> list[tuple[str, str, str, str, 
 
 def excluded_lines(metadata: ReconstructionReport) -> list[str]:
     """Photographs that are not used, each with the reason."""
-    return [f"{photo.name}: {photo.excluded_reason}" for photo in metadata.photographs if photo.excluded_reason is not None]
+    return [
+        f"{photo.name}: {photo.excluded_reason}" for photo in metadata.photographs if photo.excluded_reason is not None
+    ]

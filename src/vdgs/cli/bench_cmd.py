@@ -11,7 +11,7 @@ from vdgs.errors import VdgsError
 CHECKOUT = Path(__file__).parents[3]
 
 
-def bench(arguments: list[str]) -> None:
+def bench_command(arguments: list[str]) -> None:
     """Hand over to the bench. Raises VdgsError where there is no `experiments` to import it from."""
     if (CHECKOUT / "experiments" / "bench" / "cli.py").is_file() and str(CHECKOUT) not in sys.path:
         sys.path.insert(0, str(CHECKOUT))

@@ -5,7 +5,7 @@ Nothing heavy is imported before the options are parsed, so that help and usage 
 
 from __future__ import annotations
 
-from vdgs.cli.bench_cmd import bench
+from vdgs.cli.bench_cmd import bench_command
 from vdgs.cli.capture_cmds import inspect_command, synth_command
 from vdgs.cli.doctor_cmd import doctor_command
 from vdgs.cli.export_cmd import export_command
@@ -17,14 +17,13 @@ from vdgs.cli.stage_cmds import merge_command, partition_command, train_blocks_c
 from vdgs.cli.view_cmd import view_command
 
 __all__ = [
-    "bench",
-    "train_coarse_command",
+    "bench_command",
     "doctor_command",
     "eval_command",
     "export_command",
     "inspect_command",
-    "ortho_command",
     "merge_command",
+    "ortho_command",
     "partition_command",
     "render_command",
     "report_command",
@@ -33,6 +32,7 @@ __all__ = [
     "status_command",
     "synth_command",
     "train_blocks_command",
+    "train_coarse_command",
     "view_command",
     "visibility_command",
 ]

@@ -44,13 +44,13 @@ def parse_arguments(
 
 
 def preset_defaults(arguments: list[str]) -> tuple[PresetName, MethodConfig]:
-    """The preset that the arguments name, and its settings; `paper` without one, or where tyro is to refuse it."""
-    named = "paper"
+    """The preset that the arguments name, and its settings; `default` without one, or where tyro is to refuse it."""
+    named = "default"
     for argument, following in zip(arguments, [*arguments[1:], ""], strict=True):
         option, joined, value = argument.partition("=")
         if option == "--preset":
             named = value if joined else following
-    name: PresetName = named if named in PRESETS else "paper"  # type: ignore[assignment]
+    name: PresetName = named if named in PRESETS else "default"  # type: ignore[assignment]
     return name, PRESETS[name]
 
 
@@ -122,9 +122,9 @@ def make_console(quiet: bool = False) -> Console:
 
 
 def absolute_command_line(verb: str, arguments: list[str], paths: tuple[Path, ...]) -> str:
-    """The command that was given, for every folder to type it in: paths are whole, `--redo` and `--quiet` left out."""
+    """The command that was given, for every folder to type it in: paths are whole, `--overwrite` and `--quiet` left out."""
     whole = {str(path): str(path.resolve()) for path in paths}
-    kept = [each for each in arguments if each not in ("--redo", "--quiet")]
+    kept = [each for each in arguments if each not in ("--overwrite", "--quiet")]
     for name, path in list(whole.items()):
         whole[f"--output={name}"] = f"--output={path}"
     return shlex.join(["vdgs", verb, *(whole.get(each, each) for each in kept)])

@@ -23,7 +23,7 @@ class ExportArguments(ExportRequest):
     """Run folder."""
     to: Annotated[tuple[Path, ...], UseAppendAction] = ()
     """A file to write, by its ending: .ply (3DGS), .spz, .splat, .sog, .glb (glTF), FOLDER/tileset.json (3D Tiles),
-    .points.ply, .laz, .las (point clouds), .html (a page that shows the scene offline). Give --to again for more: the
+    .points.ply, .laz, .las (point clouds), .html (a page that shows the scene offline). Give --output again for more: the
     scene is baked once (docs/export.md)."""
     quiet: bool = False
     """Print nothing but notes, warnings and errors."""
@@ -41,7 +41,9 @@ def export_command(arguments: list[str]) -> None:
     from vdgs.export.export_run import export_run
 
     asked.executor_options.check()
-    export_run(replace(asked, device=device), console, ExecutionOptions(asked.executor_options, asked.jobs, device=device))
+    export_run(
+        replace(asked, device=device), console, ExecutionOptions(asked.executor_options, asked.jobs, device=device)
+    )
     from vdgs.report.write_report import write_report
     from vdgs.runs.run_folder import REPORT_FILE, RunFolder
 

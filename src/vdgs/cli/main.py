@@ -18,10 +18,10 @@ vdgs turns a folder of drone photographs into one 3D Gaussian splatting scene.
 
 its stages, one by one:
   sfm PHOTOGRAPHS --output CAPTURE  photographs to a capture: poses, points, metres and north; the same command goes on
-  coarse CAPTURE --output RUN       train the global model; the same command continues it
+  train-coarse CAPTURE --output RUN train the global model; the same command continues it
   visibility RUN                    how many cameras see each part of the scene
   partition RUN                     cut the scene into blocks and give each its cameras
-  train RUN [--block N]             train the blocks, or one of them; the same command continues
+  train-blocks RUN [--block N]      train the blocks, or one of them; the same command continues
   merge RUN                         the blocks become one scene
   eval RUN                          metrics and pictures of the test views
   report RUN                        one HTML file with figures, metrics, pictures and settings
@@ -29,8 +29,8 @@ its stages, one by one:
 more:
   view RUN                          move through the scene in a browser: layers, places, camera paths
   render RUN                        views or a camera path, as PNG or video
-  map RUN                           orthophoto, surface model and visibility as GeoTIFFs
-  export RUN --to FILE              the scene for other programs: PLY, SPZ, SOG, glTF, 3D Tiles, LAZ
+  ortho RUN                         orthophoto, surface model and visibility as GeoTIFFs
+  export RUN --output FILE          the scene for other programs: PLY, SPZ, SOG, glTF, 3D Tiles, LAZ
   synth OUTPUT                      generate a small aerial town with known truth
   bench TABLE --output FOLDER       methods x scenes x seeds: the paper's tables and a verdict; needs a checkout
   doctor                            what this machine can use, and what to install for the rest
@@ -40,11 +40,27 @@ transforms.json (nerfstudio), train/ and val/ (Mega-NeRF) or the layout of Matri
 """
 
 COMMANDS = (
-    "inspect", "run", "sfm", "status", "coarse", "visibility", "partition", "train", "merge", "eval", "report",
-    "view", "render", "map", "export", "synth", "bench", "doctor",
-)  # fmt: skip
+    "inspect",
+    "run",
+    "sfm",
+    "status",
+    "train-coarse",
+    "visibility",
+    "partition",
+    "train-blocks",
+    "merge",
+    "eval",
+    "report",
+    "view",
+    "render",
+    "ortho",
+    "export",
+    "synth",
+    "bench",
+    "doctor",
+)
 #: Verbs that take up what they left when they were interrupted.
-RESUMABLE_COMMANDS = ("run", "sfm", "coarse", "train", "bench")
+RESUMABLE_COMMANDS = ("run", "sfm", "train-coarse", "train-blocks", "bench")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -80,7 +96,7 @@ def _run_command(command: str, arguments: list[str]) -> int:
     from vdgs.cli import commands
     from vdgs.system.exit_codes import exit_code_of
 
-    action: Callable[[list[str]], Any] = getattr(commands, command)
+    action: Callable[[list[str]], Any] = getattr(commands, f"{command.replace('-', '_')}_command")
     again = "continues: what is finished is kept" if command in RESUMABLE_COMMANDS else "begins it anew"
     return exit_code_of(f"vdgs {command}", lambda: action(arguments), f"The same command {again}.")
 

@@ -33,7 +33,7 @@ class OrthoArguments(OrthoRequest):
 
 
 def ortho_command(arguments: list[str]) -> None:
-    asked = parse_arguments(OrthoArguments, arguments, "vdgs map")
+    asked = parse_arguments(OrthoArguments, arguments, "vdgs ortho")
     device = select_device(asked.device)
     configure_threads(asked.threads)
     from vdgs.distributed.sharded_job import ExecutionOptions

@@ -82,9 +82,13 @@ def eval_command(arguments: list[str]) -> None:
 
     device, console = select_device(asked.device), make_console(asked.quiet)
     measuring = EvaluationRequest(
-        path=asked.run, which=asked.model, lpips_weights=asked.lpips_weights, visibility_bins=asked.visibility_bins, views=asked.views,
+        path=asked.run,
+        which=asked.model,
+        lpips_weights=asked.lpips_weights,
+        visibility_bins=asked.visibility_bins,
+        views=asked.views,
         device=device,
-    )  # fmt: skip
+    )
     configure_threads(asked.threads)
     context = RunContext.from_path(asked.run, asked.capture)
     asked.executor_options.check()

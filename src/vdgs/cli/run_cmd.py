@@ -34,7 +34,7 @@ class TrainCoarseArguments:
     """Folder of the capture."""
     output: Path
     """Run folder; new, or the run to continue."""
-    preset: PresetName = "paper"
+    preset: PresetName = "default"
     """`laptop`: a good result in minutes on a CPU. `paper`: the paper's 100 000 iterations, and our choices where it is
     silent: gaps filled, outliers left out, a background of the mean colour, of random colours in training, bounded
     sizes, only visible anchors moved. `literal`: none of those choices."""
@@ -52,7 +52,7 @@ class TrainCoarseArguments:
 def train_coarse_command(arguments: list[str]) -> None:
     preset, settings = preset_defaults(arguments)
     default = TrainCoarseArguments(capture=tyro.MISSING, output=tyro.MISSING, preset=preset, training=settings.training)
-    asked = parse_arguments(TrainCoarseArguments, arguments, "vdgs coarse", default)
+    asked = parse_arguments(TrainCoarseArguments, arguments, "vdgs train-coarse", default)
     from vdgs.pipeline.train_coarse import train_coarse
     from vdgs.runs.create_or_resume import create_or_resume_run
 

@@ -86,7 +86,9 @@ def partition_command(arguments: list[str]) -> None:
     update_run_settings(
         run, replace(method, partition=asked.partition, assignment=asked.assignment), asked.overwrite, asked.quiet
     )
-    partition_run(context, make_console(asked.quiet), device, ExecutionOptions(asked.executor_options, asked.jobs, device=device))
+    partition_run(
+        context, make_console(asked.quiet), device, ExecutionOptions(asked.executor_options, asked.jobs, device=device)
+    )
     if asked.explain is not None:
         explain_view(run, asked.explain, make_console(asked.quiet))
 
@@ -120,7 +122,7 @@ def train_blocks_command(arguments: list[str]) -> None:
     def defaults(method: MethodConfig) -> TrainBlocksArguments:
         return TrainBlocksArguments(run=tyro.MISSING, block_config=method.block)
 
-    asked, run, method = parse_for_run(TrainBlocksArguments, arguments, "vdgs train", defaults)
+    asked, run, method = parse_for_run(TrainBlocksArguments, arguments, "vdgs train-blocks", defaults)
     device = select_device(asked.device)
     from vdgs.runs.run_context import RunContext
 
@@ -134,7 +136,9 @@ def train_blocks_command(arguments: list[str]) -> None:
     else:
         from vdgs.pipeline.train_blocks import train_blocks
 
-        train_blocks(context, asked.checkpointing, asked.jobs, make_console(asked.quiet), device, asked.executor_options)
+        train_blocks(
+            context, asked.checkpointing, asked.jobs, make_console(asked.quiet), device, asked.executor_options
+        )
 
 
 @dataclass(frozen=True)

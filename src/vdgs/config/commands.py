@@ -40,7 +40,7 @@ class RunRequest:
     """Folder of the capture, or of photographs alone: they become one in RUN/capture first (`vdgs sfm`)."""
     output: Path
     """Run folder; new, or the run to continue."""
-    preset: PresetName = "paper"
+    preset: PresetName = "default"
     """`laptop`: a good result in minutes. `paper`: the paper's numbers (100 000 + 50 000 iterations a block; blocks
     restart the coarse stage's rates), and our choices where it is silent: gaps filled, outliers left out, a background
     of the mean colour, of random colours in training, bounded sizes, cameras by `coverage` and each in its best
@@ -53,7 +53,7 @@ class RunRequest:
     allow_missing_blocks: bool = False
     """Go on if a block fails: the coarse model stands in for it."""
     ortho: bool = True
-    """End with orthophoto, surface model and visibility as GeoTIFFs in RUN/maps, where `vdgs map` can make them."""
+    """End with orthophoto, surface model and visibility as GeoTIFFs in RUN/maps, where `vdgs ortho` can make them."""
     lpips_weights: Path | None = None
     """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
     visibility_bins: Annotated[int, BIN_COUNT_RANGE] = 4
@@ -105,7 +105,7 @@ class RenderRequest:
     """Image width; 0 takes that of the training views."""
     capture: Path | None = None
     """Where the capture lies now; needed only where the run has lost its cameras.json."""
-    mode: Literal["image", "depth", "visibility", "alpha"] = "image"
+    mode: Literal["rgb", "depth", "visibility", "alpha"] = "rgb"
     """What to draw: the picture; the median depth, at which a pixel becomes half opaque (grey where it never does); the
     number of training cameras that see each place, V; or alpha, how opaque the scene is."""
     colorbar: bool = True
@@ -123,7 +123,7 @@ class RenderRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class OrthoRequest:
-    """Maps of a run as GeoTIFFs and pictures (`vdgs map`)."""
+    """Maps of a run as GeoTIFFs and pictures (`vdgs ortho`)."""
 
     run: Path
     """Run folder."""
@@ -153,9 +153,9 @@ class ExportRequest:
 
     run: Path
     """Run folder."""
-    to: tuple[Path, ...] = ()
+    output: tuple[Path, ...] = ()
     """A file to write, by its ending: .ply (3DGS), .spz, .splat, .sog, .glb (glTF), FOLDER/tileset.json (3D Tiles),
-    .points.ply, .laz, .las (point clouds), .html (a page that shows the scene offline). Give --to again for more: the
+    .points.ply, .laz, .las (point clouds), .html (a page that shows the scene offline). Give --output again for more: the
     scene is baked once (docs/export.md)."""
     model: ModelName = "best"
     """Which model; `best` is the merged one where there is one."""
@@ -183,7 +183,7 @@ class ExportRequest:
     evaluate: bool = True
     """Read a file back, draw the test views and say what was lost against the model itself."""
     threads: Annotated[int, WORKER_COUNT] = 0
-    """Threads of the kernels; 0 for all cores. The result does not depend on it, but for --refine."""
+    """Threads of the kernels; 0 for all cores. The result does not depend on it, but for --optimize-seconds."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
 

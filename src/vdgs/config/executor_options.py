@@ -32,7 +32,7 @@ class SlurmOptions:
     setup_command: str = ""
     """A shell command run first in every job, such as `module load cuda`."""
     sbatch_args: tuple[str, ...] = ()
-    """More options for sbatch, each a word (`--slurm.options --qos=long --constraint=avx512`)."""
+    """More options for sbatch, each a word (`--slurm.sbatch-args --qos=long --constraint=avx512`)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +62,7 @@ class ExecutorOptions:
         if self.executor == "slurm" and self.gpus != int(self.gpus):
             raise VdgsError(
                 f"--gpus {self.gpus:g}: SLURM gives whole GPUs. Where it is set up for shares: --gpus 0 and "
-                "--slurm.options --gres=shard:1."
+                "--slurm.sbatch-args --gres=shard:1."
             )
         if self.address is not None and self.executor != "ray":
             raise VdgsError(f"--address {self.address}: is of a Ray cluster; add --executor ray.")

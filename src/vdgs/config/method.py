@@ -1,8 +1,8 @@
 """Every setting of training, with its meaning, its default and where that comes from.
 
 Only the standard library is imported here, so that the command line can show the settings at once.
-The defaults are the preset `paper`: the paper's numbers, and our choices where it is silent and one was needed.
-`presets.py` holds the others, and says which of those choices are left out in `literal`.
+The defaults are the preset `default`: the paper's numbers, and our choices where it is silent and one was needed.
+`presets.py` holds the others, and says which of those choices are left out in `paper`.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ class CompensationConfig:
     """What g is added to when anchors grow; the paper says "the raw gradient statistics". `mean`: to the mean gradient,
     after the division by how often the offset was drawn. `sum`: to the sum before it, so that g is divided too: an
     offset that was drawn eight times gets an eighth of it."""
-    min_draws: Literal["scaled", "literal"] = "scaled"
+    min_draws: Literal["scaled", "paper"] = "scaled"
     """Above how many draws an offset of low visibility is judged: `scaled` takes T_low times the gate of the others, at
     least 2 (choice: within one cycle it can never pass theirs); `literal` the same as the others."""
 
@@ -149,7 +149,7 @@ class TrainConfig:
     iterations: Annotated[int, Range(0, MAX_COUNT)] = 100_000
     """Number of steps, one photograph each; 0 takes sixty for each training photograph, but at least 3000 and at
     most 30 000 (choice: with few photographs a model soon overfits, many need their time)."""
-    view_sampling: Literal["even", "shares", "roots"] = "even"
+    view_sampling: Literal["uniform", "visibility", "sqrt-visibility"] = "uniform"
     """How often each photograph is used. `even`: all alike (the paper). `shares`: every anchor has one vote, divided
     among the cameras that see it, and a photograph is used in proportion to its votes: most where few others look.
     `roots`: in proportion to the square root of its votes, which keeps more photographs in use (choice)."""
@@ -158,7 +158,7 @@ class TrainConfig:
     swa_fraction: Annotated[float, Range(0, 1, exclusive_max=True)] = 0.0
     """The stage ends with the mean of the models of this last share of its iterations, after growth and at full size; 0
     for the very last model (choice)."""
-    optimizer: Literal["visible", "dense"] = "visible"
+    optimizer: Literal["sparse-adam", "adam"] = "sparse-adam"
     """Which anchors a step moves, here and in blocks. `visible`: those that its photograph shows; the others keep
     parameters and moments (choice). `dense`: all of them, as in Scaffold-GS and 3DGS: what is not shown goes on along
     its moments, and the bias correction counts the steps of the stage."""
@@ -218,7 +218,7 @@ class PartitionConfig:
 class AssignmentConfig:
     """Which cameras train which block (eqs. 6-7)."""
 
-    mode: Literal["coverage", "literal", "leave_one_out", "frustum"] = "coverage"
+    mode: Literal["coverage", "paper", "leave-one-out", "frustum"] = "coverage"
     """`coverage`: share of the drawn pixels that the block alone draws alike (choice). `literal`: eq. 7 as printed,
     where pixels empty in both renders count too. `leave_one_out`: 1 - SSIM of the scene without the block.
     `frustum`: share of the block's anchors that the camera holds (needs no renders)."""
@@ -246,14 +246,14 @@ class BlockConfig:
     """Steps for each block; 0 takes fifteen for each of its photographs, at least 500 and at most 15 000 (choice)."""
     steps_scaler: Annotated[float, Range(0, 1000, above=True)] = 1.0
     """Factor on the steps and on the start of statistics and growth, for scenes smaller than the paper's."""
-    view_sampling: Literal["even", "shares", "roots"] = "even"
+    view_sampling: Literal["uniform", "visibility", "sqrt-visibility"] = "uniform"
     """As in the coarse stage, by the votes of the anchors that the block moves: photographs that show little of the
     block are used little."""
     resolution_schedule: ResolutionSchedule = ((0.0, 1),)
     """Resolution schedule, as in the coarse stage."""
     swa_fraction: Annotated[float, Range(0, 1, exclusive_max=True)] = 0.0
     """As in the coarse stage."""
-    crop: Literal["off", "steps", "pixels"] = "off"
+    crop: Literal["off", "fixed-steps", "fixed-pixels"] = "off"
     """Draw only the part of each photograph in which the block has a share, and all of it in every fourth step.
     `steps`: each step costs less; `pixels`: as many pixels are drawn as without, in up to four times more steps, so
     that each place of the scene is drawn more often: `iterations` then counts photographs, whatever their size
@@ -292,9 +292,9 @@ class BlockConfig:
 class MergeConfig:
     """How trained blocks become one scene."""
 
-    rule: Literal["owner", "best_seen"] = "owner"
+    rule: Literal["owner", "max-visibility"] = "owner"
     """Whose anchors stay at a place: `owner`: those of the block whose core it is, or is nearest. `best_seen`: those of
-    the block whose cameras see it most, among the blocks that reach it (needs --block.ring ramp or free)."""
+    the block whose cameras see it most, among the blocks that reach it (needs --block.margin ramp or free)."""
 
 
 @dataclass(frozen=True)
@@ -347,7 +347,10 @@ def block_train_config(config: MethodConfig, num_views: int) -> TrainConfig:
         lr=replace(
             rates,
             offsets=(block.lr_scale_offsets * rates.offsets[0], block.lr_scale_offsets * rates.offsets[1]),
-            log_scales=(block.lr_scale_log_scales * rates.log_scales[0], block.lr_scale_log_scales * rates.log_scales[1]),
+            log_scales=(
+                block.lr_scale_log_scales * rates.log_scales[0],
+                block.lr_scale_log_scales * rates.log_scales[1],
+            ),
             features=(block.lr_scale_features * rates.features[0], block.lr_scale_features * rates.features[1]),
         ),
         densify=replace(

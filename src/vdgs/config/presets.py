@@ -1,12 +1,12 @@
 """Settings by name.
 
-`paper`     the paper's numbers. Where it is silent, or a reading of it leaves a scene that cannot be used, our choices
+`default`   the paper's numbers. Where it is silent, or a reading of it leaves a scene that cannot be used, our choices
             stay: gaps are filled and outliers start no anchor; the background is the mean colour, and in training
             random ones, so that ground becomes opaque; Gaussians are bounded in size and stay about their anchors;
             cameras are assigned by `coverage`, join their best block, and blocks are topped up; what lies around a
             block is drawn; the gate of compensated growth is lower where few cameras look, and g is added to means;
             only anchors that a photograph shows are moved.
-`literal`   none of those. What remains ours has no reading without a choice: the threshold tau, the number of clusters'
+`paper`     none of those. What remains ours has no reading without a choice: the threshold tau, the number of clusters'
             starts, the width of a ring, who owns a place, how volumes are weighted in scenes of another scale.
 `laptop`    a good result in minutes on a CPU; reports/choices.md says what each of its departures brings. Growth in
             blocks is plain: compensated growth (`--block.compensation.enabled`) lost where few cameras look, and places
@@ -30,19 +30,19 @@ from vdgs.config.method import (
     TrainConfig,
 )
 
-PresetName = Literal["paper", "literal", "laptop"]
+PresetName = Literal["default", "paper", "laptop"]
 
 PRESETS: dict[str, MethodConfig] = {
-    "paper": MethodConfig(),
-    "literal": MethodConfig(
+    "default": MethodConfig(),
+    "paper": MethodConfig(
         training=TrainConfig(
-            optimizer="dense",
+            optimizer="adam",
             anchors=AnchorConfig(outlier_distance=0.0, fill_gaps=False, bound_scales=False),
             loss=LossConfig(background="black", random_background=0.0),
         ),
-        assignment=AssignmentConfig(mode="literal", always_best=False, min_cameras=0),
+        assignment=AssignmentConfig(mode="paper", always_best=False, min_cameras=0),
         block=BlockConfig(
-            random_background=0.0, draw_outside=False, compensation=CompensationConfig(min_draws="literal", target="sum")
+            random_background=0.0, draw_outside=False, compensation=CompensationConfig(min_draws="paper", target="sum")
         ),
     ),
     "laptop": MethodConfig(
@@ -60,10 +60,10 @@ PRESETS: dict[str, MethodConfig] = {
         assignment=AssignmentConfig(threshold=0.1),
         block=BlockConfig(
             iterations=0,
-            view_sampling="roots",
+            view_sampling="sqrt-visibility",
             resolution_schedule=((0.0, 1),),
             swa_fraction=0.5,
-            crop="pixels",
+            crop="fixed-pixels",
             lr_scale_offsets=2.0,
             lr_scale_log_scales=2.0,
             lr_scale_features=2.0,

@@ -75,7 +75,7 @@ class NumericSetting:
 
     @property
     def flag(self) -> str:
-        """`--block.growth.max-anchors`."""
+        """`--block.densify.max-anchors`."""
         return to_flag(self.path)
 
 

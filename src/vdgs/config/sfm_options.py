@@ -13,7 +13,7 @@ from vdgs.config.ranges import MAX_COUNT, WORKER_COUNT, FlagName, Range
 class SfmOptions:
     """How photographs become a capture (structure from motion)."""
 
-    focal: Literal["auto", "hold", "refine"] = "auto"
+    focal: Literal["auto", "fixed", "refine"] = "auto"
     """The focal length. hold: that of EXIF and XMP; refine: fitted; auto: held where the flight cannot tell it from the
     height (straight down from one height, by what the drone recorded or by level positions all over an area) and where
     the maker calibrated it; fitted otherwise."""

@@ -11,13 +11,15 @@ def validate_config(config: MethodConfig) -> list[str]:
     found = find_range_errors(config)
     training, block = config.training, config.block
     found += _validate_schedule(training.swa_fraction, training.densify, training.resolution_schedule)
-    found += [f"block.{each}" for each in _validate_schedule(block.swa_fraction, block.densify, block.resolution_schedule)]
+    found += [
+        f"block.{each}" for each in _validate_schedule(block.swa_fraction, block.densify, block.resolution_schedule)
+    ]
     if block.margin == "ramp" and block.decoder == "own":
         found.append(
             "block.ring ramp needs --block.decoder frozen: a decoder that moves changes anchors that should stay"
         )
-    if config.merge.rule == "best_seen" and block.margin == "frozen":
-        found.append("merge.rule best_seen needs --block.ring ramp or free: a frozen ring has nothing to offer")
+    if config.merge.rule == "max-visibility" and block.margin == "frozen":
+        found.append("merge.rule best_seen needs --block.margin ramp or free: a frozen ring has nothing to offer")
     return found
 
 

@@ -33,10 +33,12 @@ BLOCK_LABELS = JobLabels(
     step_unit="iteration",
     rate_unit="it/s",
     shows_training_stats=True,
-    memory_saving_options=("more --blocks", "--block.growth.max-anchors"),
+    memory_saving_options=("more --blocks", "--block.densify.max-anchors"),
 )
 
 
 def shard_kind(work: str, steps: str) -> JobLabels:
     """The words for shards that do something (`measure`) with items (`views`)."""
-    return JobLabels(singular="shard", plural="shards", verb=work, activity="at work", step_unit=steps, rate_unit=f"{steps}/s")
+    return JobLabels(
+        singular="shard", plural="shards", verb=work, activity="at work", step_unit=steps, rate_unit=f"{steps}/s"
+    )

@@ -78,7 +78,16 @@ def build_progress_table(
 ) -> Table:
     """One row for each shard and one with totals; of more than `most`, those that wait or are done are counted."""
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0), caption_justify="left")  # 80 columns
-    columns = (labels.singular, "state", labels.step_unit, *TRAINING_COLUMNS, labels.rate_unit, "left", "memory", "tries")
+    columns = (
+        labels.singular,
+        "state",
+        labels.step_unit,
+        *TRAINING_COLUMNS,
+        labels.rate_unit,
+        "left",
+        "memory",
+        "tries",
+    )
     chosen = [
         place for place, column in enumerate(columns) if labels.shows_training_stats or column not in TRAINING_COLUMNS
     ]

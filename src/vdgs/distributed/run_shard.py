@@ -1,6 +1,6 @@
 """Do one shard of a job, or continue it; nothing if it is done (`executors.sharded_job`). What schedulers start.
 
-    python -m vdgs.distributed.run_shard FOLDER INDEX [--threads N] [--device D] [--image-memory-gb G]
+    python -m vdgs.distributed.run_shard FOLDER INDEX [--threads N] [--device D] [--image-cache-gb G]
 
 FOLDER/request.json says what is to be done. Exit codes: 0 done, 1 an error that was printed, 2 usage, 130 stopped and
 saved.
@@ -24,7 +24,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("index", type=int, help="which shard")
     parser.add_argument("--threads", type=int, default=0, help="threads of the kernels; 0 for all cores")
     parser.add_argument("--device", default="auto", help="where to compute: auto, cpu, cuda or cuda:0")
-    parser.add_argument("--image-memory-gb", type=float, default=0.0, help="memory for photographs; 0: by what is free")
+    parser.add_argument("--image-cache-gb", type=float, default=0.0, help="memory for photographs; 0: by what is free")
     given = parser.parse_args(arguments)
     configure_threads()  # before anything imports torch
 

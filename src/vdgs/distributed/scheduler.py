@@ -53,7 +53,9 @@ class ExecutionPolicy:
 
     def __post_init__(self) -> None:
         if self.max_concurrent < 1 or self.retries < 0:
-            raise ValueError(f"at_once is {self.max_concurrent} and retries is {self.retries}: at least 1 and 0 are needed")
+            raise ValueError(
+                f"at_once is {self.max_concurrent} and retries is {self.retries}: at least 1 and 0 are needed"
+            )
 
 
 def run_tasks(
@@ -99,7 +101,11 @@ class _TaskScheduler:
 
     def __init__(self, works: list[_TaskState], engine: Engine, policy: ExecutionPolicy, listener: TaskListener):
         self.works, self._engine, self._listener = works, engine, listener
-        self._at_once, self._retries, self._patience = policy.max_concurrent, policy.retries, policy.lock_timeout_seconds
+        self._at_once, self._retries, self._patience = (
+            policy.max_concurrent,
+            policy.retries,
+            policy.lock_timeout_seconds,
+        )
         self._by_name = {work.task.name: work for work in works}
         self._waiting = deque(works)
         self._stopping = False

@@ -207,13 +207,15 @@ class ShardedJob:
         device = "auto" if share.resources.gpus and device == "cpu" else device
         return [
             sys.executable, "-m", "vdgs.distributed.run_shard", str(self.folder), str(index), "--threads",
-            str(share.resources.cpus), "--image-memory-gb", f"{share.image_gb:.3f}", "--device", device,
+            str(share.resources.cpus), "--image-cache-gb", f"{share.image_gb:.3f}", "--device", device,
         ]  # fmt: skip
 
     def _raise_unless_done(self, outcomes: Sequence[TaskResult], of: int) -> None:
         kind = self.kind
         if any(outcome.state == "stopped" for outcome in outcomes):
-            raise Stopped(f"Stopped; every {kind.singular} that was {kind.activity} is saved. The same command continues.")
+            raise Stopped(
+                f"Stopped; every {kind.singular} that was {kind.activity} is saved. The same command continues."
+            )
         failed = [outcome for outcome in outcomes if outcome.state != "done"]
         if failed:
             raise RunError(

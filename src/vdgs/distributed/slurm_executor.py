@@ -75,7 +75,9 @@ class SlurmExecutor(ExecutionPolicy):
         assert self.requirements is not None
         # All go into the queue, where they wait without a driver too; SLURM lets so many at a time run.
         everything = replace(self, max_concurrent=max(1, len(tasks)))
-        return run_tasks(tasks, _SlurmEngine(self.requirements, self.options, self.max_concurrent), everything, listener)
+        return run_tasks(
+            tasks, _SlurmEngine(self.requirements, self.options, self.max_concurrent), everything, listener
+        )
 
 
 class _SlurmEngine:

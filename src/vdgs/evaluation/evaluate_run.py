@@ -71,7 +71,7 @@ def evaluate_run(
 
 def check_bins(bins: int) -> None:
     if bins < 1:
-        raise RunError(f"--bins is {bins}; it must be at least 1")
+        raise RunError(f"--visibility-bins is {bins}; it must be at least 1")
 
 
 def make_evaluation_settings(bins: int, views: EvaluationSplit) -> EvaluationSettings:

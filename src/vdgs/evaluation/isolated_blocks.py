@@ -48,7 +48,7 @@ class IsolatedBlocks:
         self._held: OrderedDict[int, AnchorModel] = OrderedDict()
 
     def render(self, index: int, camera: Camera) -> Raster | None:
-        """The block's own picture; None if it was not trained (merged with --incomplete)."""
+        """The block's own picture; None if it was not trained (merged with --allow-missing-blocks)."""
         if not self._done[index]:
             return None
         if index not in self._held:

@@ -64,7 +64,9 @@ class BakePlan:
     def of(run: OpenedRun, request: ExportRequest) -> BakePlan:
         """What baking a run as it is asked for (`drop_unused_sh_degrees`) comes to, and what it depends on."""
         training = [view.camera for view in run.capture.train_views]
-        planned = color_iteration_cameras(training, color_iteration_count(request.color_iterations, gaussian_count(run.model)))
+        planned = color_iteration_cameras(
+            training, color_iteration_count(request.color_iterations, gaussian_count(run.model))
+        )
         steps, spans = _cut(len(training), [len(each) for each in planned], part_count(run.model))
         output = run.folder.path / BAKE_FOLDER
         job = ShardedJob.of("baking", _request(run, request), output, SURVEY, _depends_on(run, request), spans, ".npy")
@@ -102,7 +104,7 @@ class BakePlan:
 
 def drop_unused_sh_degrees(request: ExportRequest) -> ExportRequest:
     """Without colours that change with the direction where no file that is asked for holds them."""
-    if all(registry.format_from_path(path).fixed_colors for path in request.to):
+    if all(registry.format_from_path(path).fixed_colors for path in request.output):
         return replace(request, sh_degree=0)
     return request
 
@@ -122,15 +124,21 @@ def _cut(views: int, rounds: Sequence[int], parts: int) -> tuple[tuple[BakeStep,
 def _request(run: OpenedRun, asked: ExportRequest) -> ExportRequest:
     """What shards must know of what was asked for to find the same work."""
     return ExportRequest(
-        run=Path(os.path.abspath(run.folder.path)), to=asked.to, model=cast(ModelName, run.name), block=asked.block,
-        bbox=asked.bbox, max_gaussians=asked.max_gaussians, sh_degree=asked.sh_degree, color_iterations=asked.color_iterations,
+        run=Path(os.path.abspath(run.folder.path)),
+        output=asked.output,
+        model=cast(ModelName, run.name),
+        block=asked.block,
+        bbox=asked.bbox,
+        max_gaussians=asked.max_gaussians,
+        sh_degree=asked.sh_degree,
+        color_iterations=asked.color_iterations,
         crs=asked.crs,
-    )  # fmt: skip
+    )
 
 
 def _depends_on(run: OpenedRun, request: ExportRequest) -> list[Any]:
     """The model, the degree, how often colours are fitted, and what chooses among its Gaussians."""
-    crs = None if request.bbox is None else request.crs or default_crs(run.capture.ground, request.to[0])
+    crs = None if request.bbox is None else request.crs or default_crs(run.capture.ground, request.output[0])
     box = None if request.bbox is None else list(request.bbox)
     count = color_iteration_count(request.color_iterations, gaussian_count(run.model))
     return [

@@ -39,7 +39,9 @@ def bake_shard(shard: Shard) -> None:
     def results(left: Sequence[int]) -> Results:
         """Views one after the other, for each takes all threads; parts at once."""
         step = work.step_of_shard(shard.index)
-        shard.console.print(f"to {step.kind.verb}: {len(left)} {step.kind.step_unit} of the {run.summary}", highlight=False)
+        shard.console.print(
+            f"to {step.kind.verb}: {len(left)} {step.kind.step_unit} of the {run.summary}", highlight=False
+        )
         do, side_by_side = _doing(run, asked, work, step), step.kind in (FIT, UPDATE_COLORS)
         yield from (parallel_map if side_by_side else map)(do, [item - step.items.start for item in left])
 

@@ -97,15 +97,15 @@ def export_run(request: ExportRequest, console: Console, execution: ExecutionOpt
     capture's inputs, an empty choice, and coordinates that a format or the capture does not have; and what
     `ShardedJob.send` raises.
     """
-    _check_names(request.run, request.to)
+    _check_names(request.run, request.output)
     request = drop_unused_sh_degrees(request)
     run = open_run(request.run, request.model, request.device)
     if run.warning:
         console.print(f"[yellow]warning[/] {run.warning}", highlight=False)
-    for path in request.to:
+    for path in request.output:
         check_not_among_inputs(path, run.capture)
     center = np.median(run.model.anchors.positions.cpu().double().numpy(), axis=0)
-    frames = {path: frame_for_file(path, run, request, center) for path in request.to}
+    frames = {path: frame_for_file(path, run, request, center) for path in request.output}
     began = time.monotonic()
     with _make_baker(run, request, execution, console) as baker:
         pixels = baker.pixels()
@@ -123,7 +123,7 @@ def export_run(request: ExportRequest, console: Console, execution: ExecutionOpt
             seconds = time.monotonic() - began
             rounds = color_iteration_count(request.color_iterations, gaussian_count(run.model))
             console.print(f"baked in {seconds:.1f} s, colours fitted again in {rounds} rounds", highlight=False)
-            files = [_write(path, baked.scene(frames[path], rows[path]), console) for path in request.to]
+            files = [_write(path, baked.scene(frames[path], rows[path]), console) for path in request.output]
             losses = _measure_losses(run, frames, baked, request, console)
     record: ExportMetadata = to_jsonable({
         "model": run.name, "key": run.key, "gaussians": len(kept), "sh_degree": request.sh_degree, "rounds": rounds,
@@ -159,18 +159,18 @@ def _optimize(baked: BakedGaussians, training: Sequence[Camera], seconds: float,
 
 def _check_names(run: Path, paths: tuple[Path, ...]) -> None:
     if not paths:
-        raise VdgsError("Nothing to write: give --to FILE, such as --to scene.ply.")
+        raise VdgsError("Nothing to write: give --output FILE, such as --output scene.ply.")
     for path in paths:
         registry.format_from_path(path)
         check_not_in_capture(path)
         if path.name.lower() == REPORT_FILE and os.path.realpath(path.parent) == os.path.realpath(run):
             raise VdgsError(
-                f"--to {path}: is the report of the run, which would be overwritten, and written again over the page. "
+                f"--output {path}: is the report of the run, which would be overwritten, and written again over the page. "
                 "Choose another name, such as scene.html."
             )
     twice = sorted({str(path) for path in paths if paths.count(path) > 1})
     if twice:
-        raise VdgsError(f"--to {twice[0]}: is given twice.")
+        raise VdgsError(f"--output {twice[0]}: is given twice.")
 
 
 def _write(path: Path, scene: ExportScene, console: Console) -> ExportedFile:
@@ -196,7 +196,7 @@ def _measure_losses(
     """What each file that can be read back loses, or, where none can, the Gaussians that were written."""
     if not request.evaluate:
         return []
-    readable: list[Path | None] = [path for path in request.to if registry.format_from_path(path).read]
+    readable: list[Path | None] = [path for path in request.output if registry.format_from_path(path).read]
     losses = []
     with make_progress_bar(console) as bar:
         task = bar.add_task("comparing with the model", total=len(readable or [None]) * len(views_to_measure(run)))

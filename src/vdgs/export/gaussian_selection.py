@@ -33,7 +33,7 @@ def select_gaussians(pixels: Float[np.ndarray, " g"], run: OpenedRun, request: E
         x0, y0, x1, y1 = request.bbox
         if not (x0 < x1 and y0 < y1):
             raise VdgsError(f"--bbox {x0:g} {y0:g} {x1:g} {y1:g}: is empty. Give X0 Y0 X1 Y1, the lower corner first.")
-        crs = request.crs or default_crs(run.capture.ground, request.to[0])
+        crs = request.crs or default_crs(run.capture.ground, request.output[0])
         inside = MapProjection.of(run.capture.ground, crs).project(
             gaussian_means(run.model.anchors).cpu().double().reshape(-1, 3).numpy()
         )

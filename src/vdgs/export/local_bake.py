@@ -54,7 +54,7 @@ class LocalBake:
     @contextmanager
     def spool(self, kept: Int[np.ndarray, " m"]) -> Iterator[GaussianStore]:
         """These Gaussians in a temporary file beside the first output; `pixels` was asked before."""
-        folder = self._asked.to[0].parent
+        folder = self._asked.output[0].parent
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".baking-") as temporary:
             with make_progress_bar(self._console) as bar:

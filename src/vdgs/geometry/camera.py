@@ -79,7 +79,12 @@ class Camera:
                 f"{self.width}x{self.height}"
             )
         return replace(
-            self, cx=self.cx - left, cy=self.cy - top, width=right - left, height=bottom - top, uncropped_size=self.full_size
+            self,
+            cx=self.cx - left,
+            cy=self.cy - top,
+            width=right - left,
+            height=bottom - top,
+            uncropped_size=self.full_size,
         )
 
     def resized(self, width: int, height: int) -> Camera:

@@ -148,7 +148,9 @@ class OrderedSplats(Splats):
 
     def concat(self, others: OrderedSplats) -> OrderedSplats:
         """These splats followed by others, in the order of each."""
-        runs = SplatSegments.concat(self.segments, len(self.depths), others.segments, len(others.depths), self.depths.device)
+        runs = SplatSegments.concat(
+            self.segments, len(self.depths), others.segments, len(others.depths), self.depths.device
+        )
         both = {
             field.name: torch.cat([getattr(self, field.name), getattr(others, field.name)]) for field in fields(Splats)
         }
@@ -169,9 +171,15 @@ class TrainingSplats(OrderedSplats):
         """The same splats."""
         s = splats
         return TrainingSplats(
-            means_px=s.means_px, conics=s.conics, depths=s.depths, colors=s.colors, opacities=s.opacities, segments=None,
-            source=s.source, volume=s.volumes.mean(),
-        )  # fmt: skip
+            means_px=s.means_px,
+            conics=s.conics,
+            depths=s.depths,
+            colors=s.colors,
+            opacities=s.opacities,
+            segments=None,
+            source=s.source,
+            volume=s.volumes.mean(),
+        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

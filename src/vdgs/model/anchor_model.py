@@ -169,7 +169,9 @@ class AnchorModel:
 
     def _decoders(self) -> list[tuple[str, Decoder]]:
         """Every decoder with what the names of its tensors begin with in a file."""
-        return [("decoder.", self.decoder)] + [(f"part.{i}.", part.decoder) for i, part in enumerate(self.decoder_spans)]
+        return [("decoder.", self.decoder)] + [
+            (f"part.{i}.", part.decoder) for i, part in enumerate(self.decoder_spans)
+        ]
 
 
 def _decoder_of(tensors: Mapping[str, Tensor], prefix: str) -> Decoder:

@@ -141,7 +141,7 @@ def _check_coarse_model(index: int, model: AnchorModel, coarse: AnchorModel) -> 
     ):
         raise VdgsError(
             f"block {index} was trained from another coarse model: its decoder or its grid differs. "
-            f"Train it again: vdgs train RUN --block {index}"
+            f"Train it again: vdgs train-blocks RUN --block {index}"
         )
 
 
@@ -151,8 +151,8 @@ def _decoder_bytes(decoder: Decoder) -> dict[str, tuple[tuple[int, ...], bytes]]
 
 def _missing_message(missing: Sequence[int]) -> str:
     which = f"block {missing[0]} is" if len(missing) == 1 else f"blocks {', '.join(map(str, missing))} are"
-    commands = "".join(f"\n  vdgs train RUN --block {index}" for index in missing)
+    commands = "".join(f"\n  vdgs train-blocks RUN --block {index}" for index in missing)
     return (
         f"{which} not trained to the end. Train what is missing:{commands}\n"
-        "or merge with --incomplete: there the coarse anchors stand in."
+        "or merge with --allow-missing-blocks: there the coarse anchors stand in."
     )

@@ -106,7 +106,10 @@ def _plan_photographs(run_request: RunRequest, console: Console) -> RunEstimate 
     if finished is not None:
         return estimate_run(
             replace(
-                run_request, capture=request.output, extra_image_folders=(), options=replace(run_request.options, gps=None)
+                run_request,
+                capture=request.output,
+                extra_image_folders=(),
+                options=replace(run_request.options, gps=None),
             ),
             console,
         )
@@ -142,13 +145,17 @@ def _plan(capture: Capture, method: MethodConfig, request: RunRequest) -> RunEst
         timed = {}
         for factor in factors:
             at_size = replace(stage, config=replace(config, resolution_schedule=((0.0, factor),)))
-            timed[factor] = _seconds_a_step(initial_coarse_state(anchors, at_size, config.exposure_compensation), at_size)
+            timed[factor] = _seconds_a_step(
+                initial_coarse_state(anchors, at_size, config.exposure_compensation), at_size
+            )
     dense = max_dense_points(capture) if config.anchors.mvs else 0
     need, more = replace(alone, anchors=alone.anchors + dense), MAX_GROWTH * (1 + dense / max(alone.anchors, 1))
     cameras, free = [view.camera for view in capture.train_views], available_memory_bytes()
     pixels = max_image_pixels(cameras, method.block.resolution_schedule)
     blocks = choose_block_count(need.max_grown_anchors, views, pixels, method)
-    each = estimate_memory(block_workload(method, -(-need.max_grown_anchors // blocks), need.max_grown_anchors, pixels)).total
+    each = estimate_memory(
+        block_workload(method, -(-need.max_grown_anchors // blocks), need.max_grown_anchors, pixels)
+    ).total
     whole = estimate_memory(need).total
     photographs = decoded_image_bytes(cameras)
     work = ShardWorkload(
@@ -225,7 +232,7 @@ def _print_estimate(plan: RunEstimate, method: MethodConfig, standing: RunStatus
     console.print("\n".join(lines), highlight=False)
     if plan.may_exceed_memory:
         console.print(
-            "[yellow]warning[/] it may run out of memory. What helps: --downscale 2, --growth.max-anchors, less --jobs",
+            "[yellow]warning[/] it may run out of memory. What helps: --downscale 2, --densify.max-anchors, less --jobs",
             highlight=False,
         )
 

@@ -76,11 +76,14 @@ def _refuse(run: RunFolder, done: list[bool]) -> None:
         if not whole:
             found = standing.of(f"block {index}")
             state = "not trained yet" if found.state in ("missing", "queued") else found.state
-            lines.append(f"block {index}: {found.reason if state == 'stale' else state}" + _because(state, found.reason))
+            lines.append(
+                f"block {index}: {found.reason if state == 'stale' else state}" + _because(state, found.reason)
+            )
     raise RunError(
-        f"{run.path}: not all blocks are trained:\n  " + "\n  ".join(lines)
-        + f"\nTrain them with `vdgs train {run.path}`, or give --incomplete to let the coarse model stand in for them."
-    )  # fmt: skip
+        f"{run.path}: not all blocks are trained:\n  "
+        + "\n  ".join(lines)
+        + f"\nTrain them with `vdgs train-blocks {run.path}`, or give --allow-missing-blocks to let the coarse model stand in for them."
+    )
 
 
 def _because(state: str, why: str) -> str:

@@ -68,7 +68,9 @@ def reconstruct_if_needed(run_request: RunRequest, console: Console) -> RunReque
     _title(console, "photographs")
     request = make_sfm_request(run_request)
     reconstruct(request, console, RunFolder(run_request.output).drive_lock())
-    return replace(run_request, capture=request.output, extra_image_folders=(), options=replace(run_request.options, gps=None))
+    return replace(
+        run_request, capture=request.output, extra_image_folders=(), options=replace(run_request.options, gps=None)
+    )
 
 
 def _stages(context: RunContext, request: RunRequest, console: Console) -> None:
@@ -128,7 +130,11 @@ def _measure(context: RunContext, which: Literal["coarse", "merged"], request: R
         console.print(f"{evaluation_folder(run, which)}: already measured; nothing to do", highlight=False)
         return
     measuring = EvaluationRequest(
-        path=run.path, which=which, lpips_weights=request.lpips_weights, visibility_bins=request.visibility_bins, device=request.device
+        path=run.path,
+        which=which,
+        lpips_weights=request.lpips_weights,
+        visibility_bins=request.visibility_bins,
+        device=request.device,
     )
     evaluate_stage(context, measuring, console, _wish(request))
 
@@ -136,7 +142,9 @@ def _measure(context: RunContext, which: Literal["coarse", "merged"], request: R
 def _wish(request: RunRequest) -> ExecutionOptions:
     """Where shards of stages other than the blocks are done: where blocks are trained, if that is a cluster."""
     return ExecutionOptions(
-        request.executor_options, request.jobs if request.executor_options.executor != "local" else 0, device=request.device
+        request.executor_options,
+        request.jobs if request.executor_options.executor != "local" else 0,
+        device=request.device,
     )
 
 

@@ -67,7 +67,7 @@ def train_block(
 
 
 def train_shard(shard: Shard) -> None:
-    """Train, or continue, a block of RUN/blocks as `vdgs train RUN` asks for it."""
+    """Train, or continue, a block of RUN/blocks as `vdgs train-blocks RUN` asks for it."""
     options = replace(shard.request(CheckpointOptions), image_cache_gb=shard.image_gb)
     train_block(RunContext.from_path(shard.folder.parent), shard.index, options, shard.console, shard.device)
 
@@ -102,7 +102,7 @@ def _train(
             folder.path / "crops.json", len(views), lambda: compute_crops(coarse, own, cameras)
         )
     area = mean_crop_area(crops, shares) if crops else 1.0
-    if method.block.crop == "pixels":
+    if method.block.crop == "fixed-pixels":
         config = replace(config, iterations=steps_for(config.iterations, area))
     prepared = time.monotonic() - began
     warn_without_densification(config, console, "--block.")

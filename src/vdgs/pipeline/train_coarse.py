@@ -176,10 +176,16 @@ def build_coarse_problem(
         smallest = max(factor for _, factor in config.resolution_schedule)
         background = mean_image_color(images, len(cameras), smallest)
     stage = TrainingProblem(
-        config=config, images=images, num_images=len(cameras), voxel_size=voxel, camera_height=camera_height(capture),
-        background=background, view_weights=view_sampling_weights(config, anchors, cameras), device=torch.device(device),
+        config=config,
+        images=images,
+        num_images=len(cameras),
+        voxel_size=voxel,
+        camera_height=camera_height(capture),
+        background=background,
+        view_weights=view_sampling_weights(config, anchors, cameras),
+        device=torch.device(device),
         max_log_scale=(lambda positions: max_log_scales(positions, cameras)) if config.anchors.bound_scales else None,
-    )  # fmt: skip
+    )
     return stage, anchors
 
 
@@ -188,7 +194,11 @@ def initial_coarse_state(anchors: Anchors, stage: TrainingProblem, fit_exposures
     config = stage.config
     generator = torch.Generator().manual_seed(config.seed)
     decoder = Decoder.init_random(
-        config.anchors.num_offsets, config.anchors.view_distance, config.anchors.appearance_dim, stage.num_images, generator
+        config.anchors.num_offsets,
+        config.anchors.view_distance,
+        config.anchors.appearance_dim,
+        stage.num_images,
+        generator,
     )
     if fit_exposures:
         decoder = replace(decoder, exposure=zero_exposures(stage.num_images))

@@ -68,13 +68,15 @@ def render_run(request: RenderRequest, console: Console) -> None:
         said = _write_video(request, run, flight, named, fps, console)
     else:
         said = _write_images(request, run, flight, named, console)
-    console.print(f"{run.summary}: {said}, drawn in {time.monotonic() - began:.1f} s: {request.output}", highlight=False)
+    console.print(
+        f"{run.summary}: {said}, drawn in {time.monotonic() - began:.1f} s: {request.output}", highlight=False
+    )
 
 
 def _check(request: RenderRequest) -> None:
     check_ranges(request)
-    if request.raw and request.mode == "image":
-        raise VdgsError("--raw writes the numbers of a map: it needs --kind depth, visibility or alpha.")
+    if request.raw and request.mode == "rgb":
+        raise VdgsError("--raw writes the numbers of a map: it needs --mode depth, visibility or alpha.")
     if request.raw and request.output.suffix:
         raise VdgsError(f"{request.output}: a film holds no numbers. Give a folder for --output, or leave out --raw.")
 
@@ -137,7 +139,7 @@ def _scalar_map(
 ) -> ScalarMap | None:
     """The map that all views are drawn as; None for plain pictures."""
     return (
-        None if request.mode == "image" else make_scalar_map(request.mode, run, flight, [camera for _, camera in named])
+        None if request.mode == "rgb" else make_scalar_map(request.mode, run, flight, [camera for _, camera in named])
     )
 
 

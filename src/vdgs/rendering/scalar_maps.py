@@ -1,4 +1,4 @@
-"""What `vdgs render --kind` draws of a model, as numbers and in colours that mean the same in every frame."""
+"""What `vdgs render --mode` draws of a model, as numbers and in colours that mean the same in every frame."""
 
 from __future__ import annotations
 
@@ -163,5 +163,10 @@ def alpha_scale() -> ColorScale:
     gray = mpl.colormaps["gray"]
     titles = ("alpha: 0 nothing, 1 opaque", "alpha")
     return ColorScale(
-        titles=titles, low=0.0, high=1.0, ticks=ticks, colormap=lambda values: np.asarray(gray(values)), has_nodata=False
+        titles=titles,
+        low=0.0,
+        high=1.0,
+        ticks=ticks,
+        colormap=lambda values: np.asarray(gray(values)),
+        has_nodata=False,
     )

@@ -80,7 +80,9 @@ class ReportedRun:
         if not unknown:
             return []
         names = ", ".join(stage.name for stage in unknown)
-        return [f"It cannot be told whether these were made with the settings of the run: {names} ({unknown[0].reason})."]
+        return [
+            f"It cannot be told whether these were made with the settings of the run: {names} ({unknown[0].reason})."
+        ]
 
 
 #: States that need more words than their name.

@@ -174,15 +174,15 @@ def _total(rows: list[JsonRecord], key: str) -> str:
 
 
 def ortho_section(report: ReportedRun) -> Html:
-    """The sheet of `vdgs map`, of the merged model that is there."""
+    """The sheet of `vdgs ortho`, of the merged model that is there."""
     source = report.files()
     facts = source.record("maps/map.json")
     parts: list[Html] = []
     if not facts:
-        parts.append(paragraph("No maps were made of this run. `vdgs map RUN` makes them."))
+        parts.append(paragraph("No maps were made of this run. `vdgs ortho RUN` makes them."))
     elif facts.text("model_identity") != report.run.merged.status().model_id:
         parts.append(
-            paragraph("The maps are of another model than the run has now; `vdgs map RUN` draws them anew.", "note")
+            paragraph("The maps are of another model than the run has now; `vdgs ortho RUN` draws them anew.", "note")
         )
     else:
         gsd, unit = facts.number("gsd"), facts.text("unit")

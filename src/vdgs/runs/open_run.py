@@ -86,8 +86,8 @@ def check_has_anchors(folder: RunFolder, anchors: int | None) -> None:
         growth = folder.method().training.densify
         raise RunError(
             f"{folder.coarse.path}: the coarse model holds no anchors: in training all of them were taken for "
-            f"transparent and removed. Give a smaller --growth.prune-opacity (it is {growth.prune_opacity:g}) or a "
-            "larger --growth.start, to `vdgs run` with --redo or in a new --output, and look at the photographs with "
+            f"transparent and removed. Give a smaller --densify.prune-opacity (it is {growth.prune_opacity:g}) or a "
+            "larger --densify.start, to `vdgs run` with --overwrite or in a new --output, and look at the photographs with "
             "`vdgs inspect`: do they show the place, through the right cameras?"
         )
 
@@ -148,7 +148,9 @@ def _caution(folder: RunFolder, name: str) -> str:
         return merged.reason
     again = f"Next: {command}" if (command := standing.next_command()) else "A process works on the run."
     if name == "merged":
-        return f"the merged model is out of date: {merged.reason}. Merge again: vdgs merge {shlex.quote(str(folder.path))}"
+        return (
+            f"the merged model is out of date: {merged.reason}. Merge again: vdgs merge {shlex.quote(str(folder.path))}"
+        )
     state = f"there is one that was {merged.reason}" if merged.state == "stale" else "there is none yet"
     return f"this is the coarse model, not the merged one: {state}. {again}"
 

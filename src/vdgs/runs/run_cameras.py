@@ -86,17 +86,23 @@ def load_run_cameras(run: RunFolder, capture: CaptureMetadata | None) -> RunCame
         frame = record["ground_frame"]
         geo = frame["origin_geo"]
         ground = GroundFrame(
-            scale=float(frame["scale"]), rotation=np.array(frame["rotation"], np.float64),
-            translation=np.array(frame["translation"], np.float64), metric=bool(frame["metric"]), description=str(frame["how"]),
+            scale=float(frame["scale"]),
+            rotation=np.array(frame["rotation"], np.float64),
+            translation=np.array(frame["translation"], np.float64),
+            metric=bool(frame["metric"]),
+            description=str(frame["how"]),
             origin_geo=None if geo is None else tuple(geo),
-        )  # fmt: skip
+        )
         views = [(each["split"], _view(each)) for each in record["views"]]
         return RunCameras(
             train=tuple(view for split, view in views if split == "train"),
-            test=tuple(view for split, view in views if split == "test"), ground=ground,
-            scene_center=np.array(record["middle"], np.float64), camera_height=float(record["camera_height"]), root=root,
+            test=tuple(view for split, view in views if split == "test"),
+            ground=ground,
+            scene_center=np.array(record["middle"], np.float64),
+            camera_height=float(record["camera_height"]),
+            root=root,
             input_folders=tuple(root / str(folder) for folder in record["input_folders"]),
-        )  # fmt: skip
+        )
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise RunError(
             f"{run.cameras_file}: is damaged ({error}). Delete it; the cameras are then read from the capture."

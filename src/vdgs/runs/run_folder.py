@@ -87,7 +87,9 @@ class RunFolder:
     def evaluation(self) -> Path:
         return self.path / "evaluation"
 
-    def create_or_check(self, settings: RunSettings, checked: Sequence[str] = SECTIONS, command: str | None = None) -> None:
+    def create_or_check(
+        self, settings: RunSettings, checked: Sequence[str] = SECTIONS, command: str | None = None
+    ) -> None:
         """Write the settings of a new run, or check that those of the run that is there are the same.
 
         `command` is the one that begins it, kept so that people can be told how to continue.
@@ -144,10 +146,11 @@ class RunFolder:
             lost.append(f"{len(blocks)} blocks" if len(blocks) > 1 else "a block")
         if lost and not overwrite:
             raise RunError(
-                f"{self.config_file}: other settings than this run has:\n  " + "\n  ".join(changed)
-                + f"\nThey make {' and '.join(lost)} useless. Add --redo to train that again, give the old settings to "
+                f"{self.config_file}: other settings than this run has:\n  "
+                + "\n  ".join(changed)
+                + f"\nThey make {' and '.join(lost)} useless. Add --overwrite to train that again, give the old settings to "
                 "continue, or take another --output."
-            )  # fmt: skip
+            )
         self.config.write(settings, command)
         if self.coarse.path.exists():  # at once: nothing must be built on a model of other settings
             self.coarse.reset_unless(after.coarse)

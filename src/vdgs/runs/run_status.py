@@ -107,13 +107,15 @@ class RunStatus:
     def _continues(self) -> bool:
         """The command that began the run takes it to its end: it asked for all stages, and for the settings that the
         run has."""
-        others = any(stage.state == "stale" and stage.reason in (OTHER_SETTINGS, OTHER_PARTITION) for stage in self.stages)
+        others = any(
+            stage.state == "stale" and stage.reason in (OTHER_SETTINGS, OTHER_PARTITION) for stage in self.stages
+        )
         return (self.command or "").startswith("vdgs run ") and not others
 
     def _command_for(self, stage: str) -> str:
         run = shlex.quote(str(self.path))
         if stage == "coarse":
-            return self.command or f"the `vdgs run` or `vdgs coarse` command that began {run}"
+            return self.command or f"the `vdgs run` or `vdgs train-coarse` command that began {run}"
         verbs = {
             "visibility": f"visibility {run}", "partition": f"partition {run}", "cameras": f"partition {run}",
             "merge": f"merge {run}", "coarse evaluation": f"eval {run} --model coarse", "evaluation": f"eval {run}",
@@ -222,7 +224,9 @@ class _StatusScanner:
                 name=name, state="stale", folder=inside, reason=f"model.safetensors is {wrong}", status=status,
                 hint=remedy,
             )  # fmt: skip
-        return StageStatus(name=name, state=state, folder=inside, reason=why, status=status, output_id=status.model_id or "")
+        return StageStatus(
+            name=name, state=state, folder=inside, reason=why, status=status, output_id=status.model_id or ""
+        )
 
     def _state_of(
         self, folder: StageFolder, status: StatusRecord, key: str | None, other: str, locked: Path
@@ -234,7 +238,9 @@ class _StatusScanner:
         if folder.key() != key:
             return "stale", other
         if status.state == "done":
-            return ("done", status.reason or "") if folder.model.exists() else ("missing", f"{folder.model.name} is gone")
+            return (
+                ("done", status.reason or "") if folder.model.exists() else ("missing", f"{folder.model.name} is gone")
+            )
         if status.state == "running" and not is_known_locked(locked):
             return "stopped", "its process ended without a word; it continues from its last checkpoint"
         if status.state in ("running", "queued", "stopped", "failed"):

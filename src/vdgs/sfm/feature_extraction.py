@@ -134,12 +134,7 @@ def extract_features(
     console: Console,
 ) -> dict[str, int]:
     """Features of all photographs into the database; those that are there already are kept. Returns their numbers."""
-    names = [
-        photo.name
-        for kind in camera_groups
-        for photo in kind.images
-        if (workspace.images / photo.name).exists()
-    ]
+    names = [photo.name for kind in camera_groups for photo in kind.images if (workspace.images / photo.name).exists()]
     count, done = len(names), 0
     with report_progress(console, "features, photographs", count) as tell:
         for number, kind in enumerate(camera_groups, 1):

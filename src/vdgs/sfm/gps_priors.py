@@ -96,9 +96,14 @@ def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, st
     if len(kinds) > 1:
         notes.append(f"altitudes are of several kinds ({'; '.join(kinds)}): heights may not fit together.")
     return GpsPriors(
-        image_indices=index, enu=enu, gps_std=deviations, origin=origin, altitude_reference="; ".join(kinds), source=source,
+        image_indices=index,
+        enu=enu,
+        gps_std=deviations,
+        origin=origin,
+        altitude_reference="; ".join(kinds),
+        source=source,
         notes=tuple(notes),
-    )  # fmt: skip
+    )
 
 
 def _read_geodetic(photographs: Sequence[ImageMetadata], table: Path | None) -> tuple[np.ndarray, str, list[str]]:

@@ -39,7 +39,7 @@ def should_fix_focal(
     longer lens and a lower flight look the same. Where nothing says that the flight was one like this it is fitted: a
     wrong focal length that is held bends or tears all other scenes."""
     if options.focal != "auto":
-        return options.focal == "hold", "asked for"
+        return options.focal == "fixed", "asked for"
     if any(photo.lens is None for photo in photographs):
         return False, "nothing says it for some photographs"
     tilts = [photo.attitude.tilt_deg for photo in photographs if photo.attitude]

@@ -97,7 +97,9 @@ def _keys(plan: ReconstructionPlan) -> dict[str, str]:
         for photo in plan.image_list.images
     ]
     lenses = [photo.lens and photo.lens.focal for photo in plan.image_list.images]
-    found = cache_key(__version__, files, lenses, options.max_image_size, options.max_num_features, *_masked_images(plan))
+    found = cache_key(
+        __version__, files, lenses, options.max_image_size, options.max_num_features, *_masked_images(plan)
+    )
     placed = [positions.image_indices.tolist(), positions.enu.tolist(), positions.gps_std.tolist()]
     matched = cache_key(found, placed, options.num_neighbors, options.exhaustive_max)
     mapped = cache_key(matched, options.focal)

@@ -56,9 +56,14 @@ def plan_reconstruction(request: SfmRequest) -> ReconstructionPlan:
     pairs = feature_matching.estimate_pair_count(collection.images, positions, request.options)
     takes = estimate_seconds(collection.images, pairs, request.options, threads)
     return ReconstructionPlan(
-        request=request, image_list=collection, gps_priors=positions, preflight=look, threads=threads, estimated_seconds=takes,
+        request=request,
+        image_list=collection,
+        gps_priors=positions,
+        preflight=look,
+        threads=threads,
+        estimated_seconds=takes,
         gcps=control,
-    )  # fmt: skip
+    )
 
 
 def _read_gcps(options: SfmOptions, collection: ImageList, positions: GpsPriors) -> GcpList | None:
@@ -121,7 +126,7 @@ def check_disk_space(plan: ReconstructionPlan) -> None:
     if free < needed:
         raise VdgsError(
             f"{plan.request.output}: needs about {data_size(needed)}, {data_size(free)} are free there. Free "
-            "some space, choose another --output, or write smaller photographs (--max-size 2000)."
+            "some space, choose another --output, or write smaller photographs (--max-output-size 2000)."
         )
 
 

@@ -57,7 +57,9 @@ class Site:
 
     def level(self, frame: ObjectFrame, width: float, depth: float) -> ObjectFrame:
         """The frame lifted so that no corner of a footprint lies below the ground."""
-        corners = frame.to_world(np.array([(sx * width / 2, sy * depth / 2, 0) for sx in (-1, 0, 1) for sy in (-1, 0, 1)]))
+        corners = frame.to_world(
+            np.array([(sx * width / 2, sy * depth / 2, 0) for sx in (-1, 0, 1) for sy in (-1, 0, 1)])
+        )
         top = float(self.terrain.height(corners[:, 0], corners[:, 1]).max())
         return ObjectFrame(frame.x, frame.y, top + 0.1, frame.angle)
 

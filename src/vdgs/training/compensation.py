@@ -122,7 +122,7 @@ def compensate(
     `threshold` is the T_low that `low_visibility_mask` used.
     """
     plain = growth.min_draw_fraction * growth.every
-    gate = plain if config.min_draws == "literal" else min(plain, max(MIN_SCALED_DRAWS, threshold * plain))
+    gate = plain if config.min_draws == "paper" else min(plain, max(MIN_SCALED_DRAWS, threshold * plain))
     return CompensatedGradient(compensation.cache * low[:, None], low, gate, to_sum=config.target == "sum")
 
 

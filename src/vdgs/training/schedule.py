@@ -62,7 +62,7 @@ def view_sampling_weights(config: TrainConfig, anchors: Anchors, cameras: Sequen
     Roots, because a view with few votes also costs little (`training.crops`): a mean varies least for what it costs
     if strata are drawn in proportion to their weight over the root of their cost (Cochran, 1977, section 5.5).
     """
-    if config.view_sampling == "even":
+    if config.view_sampling == "uniform":
         return None
     votes = visibility_sampling_weights(anchors.positions, cameras)
-    return votes if config.view_sampling == "shares" else tuple(math.sqrt(share) for share in votes)
+    return votes if config.view_sampling == "visibility" else tuple(math.sqrt(share) for share in votes)

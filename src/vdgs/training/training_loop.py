@@ -149,7 +149,7 @@ def _move(
     config, step = stage.config, state.iteration + 1
     rates = learning_rates_at(config.lr, state.iteration / config.iterations)
     states, updates = state.optimizer.anchor_states(state.anchors, rates, config.lr_warm_boost), state.optimizer.updates
-    dense = config.optimizer == "dense"
+    dense = config.optimizer == "adam"
     if dense:
         updates.fill_(state.iteration)
     finite = backward_and_step(state.anchors, rows, gradients, weights, camera, states, updates, stage.lr_mask)

@@ -235,13 +235,17 @@ class RenderScheduler:
         began = self._clock()
         allowed = self._allowed(began)
         anchors = (
-            max(int(allowed / seat.seconds_per_anchor), MIN_PREVIEW_ANCHORS) if seat.seconds_per_anchor else INITIAL_PREVIEW_ANCHORS
+            max(int(allowed / seat.seconds_per_anchor), MIN_PREVIEW_ANCHORS)
+            if seat.seconds_per_anchor
+            else INITIAL_PREVIEW_ANCHORS
         )
         seat.on_frame(RenderedFrame(seat.painter.paint(shown, small, small, anchors), False, whole, shown))
         taken = max(self._clock() - began, 1e-4)
         if seat.painter.drawn_anchors:
             measured = taken / seat.painter.drawn_anchors
-            seat.seconds_per_anchor += (SPEED_SMOOTHING if seat.seconds_per_anchor else 1.0) * (measured - seat.seconds_per_anchor)
+            seat.seconds_per_anchor += (SPEED_SMOOTHING if seat.seconds_per_anchor else 1.0) * (
+                measured - seat.seconds_per_anchor
+            )
         most = max(min(MAX_PREVIEW_PIXELS, whole.width * whole.height), MIN_PREVIEW_PIXELS)
         seat.preview_pixels = float(
             np.clip(seat.preview_pixels * np.clip(allowed / taken, 0.5, 1.5), MIN_PREVIEW_PIXELS, most)

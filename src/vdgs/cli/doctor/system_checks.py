@@ -27,7 +27,7 @@ EXTRAS = {
     "synth": "the generated city, ray-traced (vdgs synth)",
     "lpips": "the linear heads of LPIPS",
     "tensorboard": "curves of the training in TensorBoard",
-    "geo": "maps as GeoTIFFs, any EPSG system (vdgs map)",
+    "geo": "maps as GeoTIFFs, any EPSG system (vdgs ortho)",
     "viewer": "a scene in a browser (vdgs view)",
     "ray": "blocks on many machines (--executor ray)",
     "gsplat": "another rasteriser on an NVIDIA GPU, to compare with",

@@ -44,7 +44,12 @@ def header_comments(metadata: ExportMetadata) -> list[str]:
 def write_ply(path: Path, scene: ExportScene) -> tuple[str, ...]:
     """Write the scene, atomically; loses nothing. Raises VdgsError."""
     names = property_names(scene.degree)
-    lines = ["ply", "format binary_little_endian 1.0", *header_comments(scene.metadata), f"element vertex {scene.count}"]
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        *header_comments(scene.metadata),
+        f"element vertex {scene.count}",
+    ]
     header = "\n".join([*lines, *(f"property float {name}" for name in names), "end_header", ""]).encode("ascii")
 
     def write(temporary: Path) -> None:

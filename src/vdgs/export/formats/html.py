@@ -92,7 +92,7 @@ def write_html(path: Path, scene: ExportScene) -> tuple[str, ...]:
     if len(kept) < len(whole):
         lost.append(
             f"thinned from {len(whole):,} Gaussians to {len(kept):,}, for the page may have "
-            f"{page.max_bytes / 1e6:g} MB (--html-mb)"
+            f"{page.max_bytes / 1e6:g} MB (--html-max-mb)"
         )
     return tuple(lost)
 
@@ -132,7 +132,7 @@ def _thin_to_fit(whole: Gaussians, tried: int, factor: float, page: InitialView)
     if count < MIN_GAUSSIANS:
         raise VdgsError(
             f"A page of {page.max_bytes / 1e6:g} MB has no room for the scene: the client alone takes "
-            f"{frame / 1e6:.1f} MB. Allow more: --html-mb."
+            f"{frame / 1e6:.1f} MB. Allow more: --html-max-mb."
         )
     return simplify(whole, count)[0]
 

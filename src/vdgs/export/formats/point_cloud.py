@@ -28,7 +28,12 @@ LOSS_NOTES = ("sizes, rotations and changing colours are left out: these are poi
 def write_points(path: Path, scene: ExportScene) -> tuple[str, ...]:
     """Write x, y, z (ground frame), red, green, blue and opacity as PLY, atomically. Returns what was lost."""
     names = ["float x", "float y", "float z", "uchar red", "uchar green", "uchar blue", "float opacity"]
-    lines = ["ply", "format binary_little_endian 1.0", *header_comments(scene.metadata), f"element vertex {scene.count}"]
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        *header_comments(scene.metadata),
+        f"element vertex {scene.count}",
+    ]
     header = "\n".join([*lines, *(f"property {name}" for name in names), "end_header", ""]).encode("ascii")
 
     def write(temporary: Path) -> None:
@@ -46,7 +51,11 @@ def write_points(path: Path, scene: ExportScene) -> tuple[str, ...]:
 
 def check_las_dependencies(path: Path, scene: ExportScene) -> None:
     """Raise VdgsError where packages are missing that LAS and LAZ need."""
-    needed = ["laspy", *(["lazrs"] if path.suffix.lower() == ".laz" else []), *(["pyproj"] if scene.metadata.crs else [])]
+    needed = [
+        "laspy",
+        *(["lazrs"] if path.suffix.lower() == ".laz" else []),
+        *(["pyproj"] if scene.metadata.crs else []),
+    ]
     missing = [name for name in needed if importlib.util.find_spec(name) is None]
     if missing:
         raise VdgsError(f"{path}: needs {' and '.join(missing)}, not installed. Install with: pip install 'vdgs[geo]'")

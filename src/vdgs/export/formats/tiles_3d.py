@@ -78,7 +78,9 @@ def write_tiles(path: Path, scene: ExportScene, max_gaussians: int = MAX_GAUSSIA
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{TILESET_FILE}.") as spool:
-            root = _TileQuadtree(write_store(scene, Path(spool) / "rows"), folder, scene.metadata, max_gaussians).build()
+            root = _TileQuadtree(
+                write_store(scene, Path(spool) / "rows"), folder, scene.metadata, max_gaussians
+            ).build()
         write_json(path, _tileset(root, scene.metadata))
     except OSError as error:
         shutil.rmtree(folder, ignore_errors=True)

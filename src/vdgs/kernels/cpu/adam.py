@@ -50,4 +50,6 @@ def adam_rows(
 
 def round_factors(factors: AdamStepFactors) -> AdamStepFactors:
     """The same with the tables in float32."""
-    return factors._replace(step_sizes=factors.step_sizes.astype(np.float32), bias_roots=factors.bias_roots.astype(np.float32))
+    return factors._replace(
+        step_sizes=factors.step_sizes.astype(np.float32), bias_roots=factors.bias_roots.astype(np.float32)
+    )

@@ -92,9 +92,7 @@ def splat_radii_px(splats: Splats) -> Int32[Tensor, "m 2"]:
     a dx² + 2 b dx dy + c dy² = q, dx² reaches q c / (a c - b²).
     """
     opacities = splats.opacities
-    rows = torch.cat(
-        [splats.means_px, splats.conics, splats.colors, opacities[:, None], splats.depths[:, None]], dim=1
-    )
+    rows = torch.cat([splats.means_px, splats.conics, splats.colors, opacities[:, None], splats.depths[:, None]], dim=1)
     a, b, c = splats.conics.unbind(dim=1)
     determinant = a * c - b * b
     drawn = rows.isfinite().all(dim=1) & (a > 0) & (c > 0) & (determinant > 0) & (opacities >= ALPHA_MIN)

@@ -30,7 +30,7 @@ def auto_voxel_size(points: np.ndarray) -> float:
     if len(distinct) < 2:
         raise VdgsError(
             f"The capture has {len(distinct)} distinct sparse point(s); at least 2 are needed to place anchors. "
-            "Run the structure-from-motion again, or give --anchors.voxel."
+            "Run the structure-from-motion again, or give --anchors.voxel-size."
         )
     distances, _ = cKDTree(distinct).query(distinct, k=2, workers=1)
     return float(np.median(distances[:, 1]))

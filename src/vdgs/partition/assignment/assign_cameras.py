@@ -45,9 +45,9 @@ def assign_cameras(scores: ScoreMatrix, config: AssignmentConfig) -> Assignment:
     "Best" is by score, among equals by anchors held, then by index.
     """
     seen = scores.visible_anchors > 0
-    threshold = config.threshold_leave_one_out if scores.mode == "leave_one_out" else config.threshold
+    threshold = config.threshold_leave_one_out if scores.mode == "leave-one-out" else config.threshold
     why = np.zeros(scores.scores.shape, np.int8)
-    why[(scores.scores > threshold) & (seen | (scores.mode == "literal"))] = ABOVE_THRESHOLD
+    why[(scores.scores > threshold) & (seen | (scores.mode == "paper"))] = ABOVE_THRESHOLD
     if config.always_best:
         rows, best = np.arange(len(why)), _best_blocks(scores)
         why[rows, best] = np.where(why[rows, best] == NOT_ASSIGNED, BEST_BLOCK, why[rows, best])

@@ -40,7 +40,9 @@ def explain_assignment(
         raise RunError(f"There is no training view {view!r}. Views are named as in the capture, such as {names[0]!r}.")
     c = names.index(view)
     rows = [
-        AssignmentReason(b, float(scores.scores[c, b]), int(scores.visible_anchors[c, b]), REASONS[assignment.reasons[c, b]])
+        AssignmentReason(
+            b, float(scores.scores[c, b]), int(scores.visible_anchors[c, b]), REASONS[assignment.reasons[c, b]]
+        )
         for b in range(len(scores.anchors))
     ]
     return sorted(rows, key=lambda row: (row.reason == REASONS[0], -row.score))

@@ -194,7 +194,7 @@ def _rendered_scores(
     owner, reached = members.owner[anchor], members.reached[:, anchor]
     scores, covered = [], []
     blank = Raster(torch.zeros_like(full.image), torch.zeros_like(full.alpha), None)
-    alike_to_blank = coverage_ratio(blank, full, config.tau) if config.mode == "literal" else 0.0
+    alike_to_blank = coverage_ratio(blank, full, config.tau) if config.mode == "paper" else 0.0
     # Most of many blocks are nowhere in a view: what they give is known.
     for index, shown in enumerate(reached.any(dim=1).tolist()):
         if not shown:
@@ -203,9 +203,9 @@ def _rendered_scores(
             continue
         block = _render_subset(splats, reached[index], full, camera)
         covered.append(drawn_coverage_ratio(block, full, config.tau))
-        if config.mode == "literal":
+        if config.mode == "paper":
             scores.append(coverage_ratio(block, full, config.tau))
-        elif config.mode == "leave_one_out":
+        elif config.mode == "leave-one-out":
             rest = _render_subset(splats, owner != index, full, camera)
             scores.append(0.0 if rest is full else dissimilarity(rest.image, full.image))
         else:

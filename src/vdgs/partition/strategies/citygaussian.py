@@ -60,7 +60,7 @@ class CityGaussian:
         return nonempty_cells(cells, ground, count)
 
     def assignment(self, config: AssignmentConfig) -> AssignmentConfig:
-        return replace(config, mode="leave_one_out", threshold_leave_one_out=DISSIMILARITY_THRESHOLD)
+        return replace(config, mode="leave-one-out", threshold_leave_one_out=DISSIMILARITY_THRESHOLD)
 
     def adjust_scores(
         self, scores: ScoreMatrix, positions: Float[np.ndarray, "n 3"], blocks: Blocks, cameras: Sequence[Camera]

@@ -37,7 +37,7 @@ from vdgs.plots.visibility_map import (
     plot_visibility_map,
 )
 
-__all__ = ["plot_block_stats", "plot_blocks", "plot_scores", "plot_anchor_visibility"]
+__all__ = ["plot_anchor_visibility", "plot_block_stats", "plot_blocks", "plot_scores"]
 
 #: More anchors than these are thinned: on a map they only cover each other.
 MAX_DRAWN_ANCHORS = 60_000

@@ -1,1 +1,1 @@
-"""`vdgs map`: orthophoto, surface model and visibility of a scene as maps."""
+"""`vdgs ortho`: orthophoto, surface model and visibility of a scene as maps."""

@@ -32,7 +32,7 @@ def check_output_folder(folder: Path) -> None:
     there = [name for name in FILE_NAMES if os.path.lexists(folder / name)]
     if there and not _is_ours(folder):
         raise VdgsError(
-            f"{folder}: holds {', '.join(there)}, and no {METADATA_FILE} says that `vdgs map` wrote them. Nothing was drawn. "
+            f"{folder}: holds {', '.join(there)}, and no {METADATA_FILE} says that `vdgs ortho` wrote them. Nothing was drawn. "
             "Give a new or an empty folder for --output; one with maps of vdgs gets the new ones in their place."
         )
 

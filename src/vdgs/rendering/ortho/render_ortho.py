@@ -1,4 +1,4 @@
-"""`vdgs map`: from a run to GeoTIFFs and pictures of them, written whole or not at all."""
+"""`vdgs ortho`: from a run to GeoTIFFs and pictures of them, written whole or not at all."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def is_ortho_current(run: RunFolder) -> bool:
 
 
 def has_ortho_dependencies() -> bool:
-    """Whether what `vdgs map` needs is installed."""
+    """Whether what `vdgs ortho` needs is installed."""
     return all(find_spec(name) is not None for name in ("rasterio", "pyproj"))
 
 

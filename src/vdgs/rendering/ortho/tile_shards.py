@@ -70,8 +70,13 @@ def distributed_tiles(
 def _job(plan: OrthoPlan, asked: OrthoRequest) -> ShardedJob:
     """The tiles in shards, and what they depend on."""
     depends_on = [
-        plan.model, plan.model_identity, plan.placement.crs, list(astuple(plan.grid)), plan.samples, plan.detail_from_images
-    ]  # fmt: skip
+        plan.model,
+        plan.model_identity,
+        plan.placement.crs,
+        list(astuple(plan.grid)),
+        plan.samples,
+        plan.detail_from_images,
+    ]
     spans = split_ranges(plan.grid.tile_count(), *TILES_OF_SHARD)
     return ShardedJob.of("tiles", asked, plan.folder, TILE_LABELS, depends_on, spans)
 

@@ -27,7 +27,7 @@ METRIC_BYTES_PER_PIXEL, LPIPS_BYTES_PER_PIXEL = 400, 2000
 #: Anchors may grow to so many times their number where nothing limits them (choice; real captures: 1.2 to 3).
 MAX_GROWTH = 3.0
 #: ... where growth is compensated below a fixed T_low, under which nearly all of a real capture is (choice; blocks of
-#: seneca had 6 and 12 times as many after a ninth of the steps of preset `paper`: reports/findings.md).
+#: seneca had 6 and 12 times as many after a ninth of the steps of preset `default`: reports/findings.md).
 MAX_COMPENSATED_GROWTH = 15.0
 #: Share of a block's anchors that one photograph may see, for the estimate before a block is opened (choice).
 MAX_VISIBLE_FRACTION = 0.5
@@ -187,12 +187,14 @@ def memory_advice(need: TrainingWorkload, kind: TrainingKind, to_save: int) -> l
         found.append(MemoryAdvice("vdgs partition with twice the --blocks (smaller blocks)", whole.total - half.total))
         found.append(MemoryAdvice("one less of --jobs (blocks at once)", whole.total))
     if need.has_swa:
-        option = "--average 0" if kind == "coarse" else "--block.average 0"
+        option = "--swa-fraction 0" if kind == "coarse" else "--block.swa-fraction 0"
         last = estimate_memory(replace(need, has_swa=False))
         found.append(MemoryAdvice(f"{option} (the last model instead of a mean)", whole.total - last.total))
     kept = min(need.image_cache_bytes, 50_000_000)
     found.append(
-        MemoryAdvice(f"--image-memory-gb {kept / 1e9:.2f} (fewer photographs kept in memory)", need.image_cache_bytes - kept)
+        MemoryAdvice(
+            f"--image-cache-gb {kept / 1e9:.2f} (fewer photographs kept in memory)", need.image_cache_bytes - kept
+        )
     )
     worth = [each for each in found if each.saved_bytes > whole.total / 100]
     return sorted(worth, key=lambda each: -each.saved_bytes)
@@ -200,7 +202,7 @@ def memory_advice(need: TrainingWorkload, kind: TrainingKind, to_save: int) -> l
 
 def _fewer_anchors(need: TrainingWorkload, kind: TrainingKind, to_save: int) -> MemoryAdvice:
     """A limit of anchors that saves `to_save` bytes, if one does: growth can be forbidden, but no anchor removed."""
-    option = "--growth.max-anchors" if kind == "coarse" else "--block.growth.max-anchors"
+    option = "--densify.max-anchors" if kind == "coarse" else "--block.densify.max-anchors"
     too_many = to_save / _per_grown_anchor(need)
     limit = max(need.anchors, int(need.max_grown_anchors - too_many) // 1000 * 1000, 1)
     saved = estimate_memory(need).total - estimate_memory(replace(need, max_anchors=limit)).total

@@ -85,7 +85,7 @@ def format_memory_advice(found: list[MemoryAdvice], kind: TrainingKind) -> str:
     """The settings in one sentence, the most helpful first, and where each may be changed."""
     if not found:
         return "No setting would save much: this machine needs more memory."
-    free = [option for option in ("--jobs", "--image-memory-gb") if any(option in each.setting for each in found)]
-    others = "a new --output" if kind == "coarse" else "--redo"
+    free = [option for option in ("--jobs", "--image-cache-gb") if any(option in each.setting for each in found)]
+    others = "a new --output" if kind == "coarse" else "--overwrite"
     where = f"{' and '.join(free)} may change when a run continues, other settings need" if free else "They need"
     return f"What helps: {'; '.join(map(str, found))}. {where} {others}."

@@ -42,10 +42,10 @@ def image_cache_bytes(options: CheckpointOptions) -> int:
 
 #: What to do about a diverging loss, in the coarse stage and in a block.
 DIVERGENCE_HINTS = {
-    "coarse": "Lower --rates.* or raise --growth.threshold in a new --output, and look at the photographs with "
+    "coarse": "Lower --lr.* or raise --densify.grad-threshold in a new --output, and look at the photographs with "
     "`vdgs inspect`.",
-    "block": "Lower --block.offset-rate, --block.scale-rate and --block.feature-rate or raise "
-    "--block.growth.threshold (with --redo).",
+    "block": "Lower --block.lr-scale-offsets, --block.lr-scale-log-scales and --block.lr-scale-features or raise "
+    "--block.densify.grad-threshold (with --overwrite).",
 }
 
 

@@ -16,8 +16,8 @@ from vdgs.model.initialization.stereo.sgm import StereoView, pair_depth
 from vdgs.model.initialization.stereo.view_selection import select_source_views
 
 __all__ = [
-    "FusionCell",
     "DensePoints",
+    "FusionCell",
     "StereoInputs",
     "StereoView",
     "compute_dense_points",
