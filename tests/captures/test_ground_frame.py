@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 
 from support.captures import data_folder, moved, tiny_scene, to_source, write_colmap
 from vdgs.captures.formats.source_capture import Intrinsics, SourceCapture, SourceView
-from vdgs.captures.ground_estimation import NOMINAL_CAMERA_HEIGHT, find_ground_frame, rotation_to_z, transform_pose
+from vdgs.captures.ground_estimation import NOMINAL_CAMERA_HEIGHT, find_ground_frame, transform_pose
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import ecef_from_geodetic, enu_from_geodetic, geodetic_from_ecef, geodetic_from_enu
-from vdgs.geometry.similarity import fit_similarity, fit_similarity_robust, geometric_median
+from vdgs.geometry.similarity import fit_similarity, fit_similarity_robust, geometric_median, rotation_to_z
 
 ORIGIN = (46.8426, -91.994, 159.4)
 
@@ -163,8 +163,10 @@ def test_gps_along_one_line_falls_back_to_the_estimate(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("name,lat,lon\na,1,2\n", "columns name,lat,lon,alt"),
-        ("", "columns name,lat,lon,alt"),
+        ("name,lat,lon\na,1,2\n", "gives no altitudes"),
+        ("name,x,y,alt\na,351400,6292300,2\n", "does not say of which coordinate system"),
+        ("a,b,c\n1,x,3\n", "columns name,lat,lon,alt"),
+        ("", "is empty"),
         ("name,lat,lon,alt\n", "names its columns but holds no rows"),
         ("name,lat,lon,alt\nother,1,2,3\n", "none of its 1 rows"),
         ("name,lat,lon,alt\nframe_000,x,2,3\n", "not numbers"),

@@ -13,7 +13,8 @@ import torch
 from support.gaussians import overhead, picture, psnr, random_gaussians
 from vdgs.errors import VdgsError
 from vdgs.export.formats import registry, spz
-from vdgs.export.formats.export_scene import Y_UP, ExportMetadata, ExportScene
+from vdgs.export.formats.axes import Y_UP
+from vdgs.export.formats.export_scene import ExportMetadata, ExportScene
 from vdgs.export.formats.simplify import cell_indices, simplify
 from vdgs.export.formats.tiles_3d import write_tiles
 from vdgs.geometry.geodesy import geodetic_from_ecef
@@ -51,8 +52,11 @@ def tile(path: Path) -> Gaussians:
     assert gltf["accessors"][primitive["attributes"]["POSITION"]]["count"] == len(gaussians)
     # CesiumJS tells the degree of spherical harmonics by how many attributes are named so.
     assert sum("SH_DEGREE" in name for name in primitive["attributes"]) == gaussians.shN.shape[1]
-    moved = transform_gaussians(gaussians, 1.0, np.eye(3), np.array(gltf["nodes"][0]["translation"]))
-    return transform_gaussians(moved, 1.0, Y_UP.T, np.zeros(3))
+    placement = np.array(gltf["nodes"][0]["matrix"], np.float64).reshape(4, 4).T
+    assert "translation" not in gltf["nodes"][0]  # CesiumJS reads nothing but the matrix (CesiumGS/cesium#12682)
+    np.testing.assert_array_equal(placement[:3, :3], np.eye(3))
+    moved = transform_gaussians(gaussians, 1.0, np.eye(3), placement[:3, 3])
+    return transform_gaussians(moved, 1.0, Y_UP.turn.T, np.zeros(3))
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,8 @@ import torch
 from support.gaussians import overhead, picture, psnr, random_gaussians
 from vdgs.errors import VdgsError
 from vdgs.export.formats import export_scene, registry, spz
-from vdgs.export.formats.export_scene import Y_DOWN, Y_UP, ExportMetadata, ExportScene, metadata_path
+from vdgs.export.formats.axes import Y_DOWN, Y_UP
+from vdgs.export.formats.export_scene import ExportMetadata, ExportScene, metadata_path
 from vdgs.export.formats.gaussian_ply import read_ply
 from vdgs.export.formats.parallel_gzip import gzip_blocks
 from vdgs.export.formats.quaternion_canonical import canonicalize_quaternions
@@ -89,9 +90,9 @@ def test_wkt_of_several_lines_stays_one_comment(tmp_path):
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_an_spz_is_what_niantics_code_reads(tmp_path, version, degree):
     written = random_gaussians(400, degree)
-    spz.write_spz(tmp_path / "a.spz", ExportScene.of(written), version)
-    theirs, ours = independent(tmp_path / "a.spz"), turned(registry.read_gaussians(tmp_path / "a.spz"), Y_UP)
-    wanted = turned(written, Y_UP)
+    spz.write_spz(tmp_path / "a.spz", replace(ExportScene.of(written), spz_version=version))
+    theirs, ours = independent(tmp_path / "a.spz"), turned(registry.read_gaussians(tmp_path / "a.spz"), Y_UP.turn)
+    wanted = turned(written, Y_UP.turn)
     for read in (theirs, ours):
         torch.testing.assert_close(read.means, wanted.means, atol=0.5 / 4096 + 1e-6, rtol=0)
         sizes = (each.log_scales.sort(1).values for each in (read, wanted))  # version 2 names the axes anew
@@ -155,7 +156,7 @@ def test_a_splat_is_its_32_bytes(tmp_path):
     assert "colours no longer change with the viewing direction" in lost
     rows = np.frombuffer((tmp_path / "a.splat").read_bytes(), "<f4,<f4,<f4,<f4,<f4,<f4,u4,u4")
     assert len(rows) == 200
-    wanted, theirs = turned(written, Y_DOWN), independent(tmp_path / "a.splat")
+    wanted, theirs = turned(written, Y_DOWN.turn), independent(tmp_path / "a.splat")
     torch.testing.assert_close(theirs.means, wanted.means)
     difference = (gaussian_covariances(theirs) - gaussian_covariances(wanted)).norm(dim=(1, 2)) / gaussian_covariances(
         wanted
@@ -177,7 +178,7 @@ def test_a_sog_is_read_by_others(tmp_path, degree):
     written = random_gaussians(500, degree)
     notes = registry.write_scene(tmp_path / "a.sog", ExportScene.of(written))
     assert "positions are rounded" in notes[0]
-    read, wanted = independent(tmp_path / "a.sog"), turned(written, Y_DOWN)
+    read, wanted = independent(tmp_path / "a.sog"), turned(written, Y_DOWN.turn)
     near = torch.cdist(wanted.means, read.means).argmin(1)  # in Morton order
     assert len(near.unique()) == 500
     read = read.select(near)
@@ -185,7 +186,7 @@ def test_a_sog_is_read_by_others(tmp_path, degree):
     torch.testing.assert_close(read.log_scales, wanted.log_scales, atol=0.05, rtol=0)
     torch.testing.assert_close(read.sh0, wanted.sh0, atol=0.05, rtol=0)
     torch.testing.assert_close(read.shN, wanted.shN, atol=0.02, rtol=0)
-    assert psnr(picture(turned(read, Y_DOWN.T)), picture(written)) > 36
+    assert psnr(picture(turned(read, Y_DOWN.turn.T)), picture(written)) > 36
     with zipfile.ZipFile(tmp_path / "a.sog") as bundle:
         assert json.loads(bundle.read("meta.json"))["count"] == 500
 
@@ -210,7 +211,7 @@ def test_a_glb_holds_the_turned_scene_with_all_its_bits(tmp_path, degree):
     written = random_gaussians(250, degree)
     assert registry.write_scene(tmp_path / "a.glb", ExportScene.of(written, PLACED)) == ()
     gltf, found = glb_arrays(tmp_path / "a.glb")
-    wanted, prefix = turned(written, Y_UP), "KHR_gaussian_splatting:"
+    wanted, prefix = turned(written, Y_UP.turn), "KHR_gaussian_splatting:"
     primitive = gltf.meshes[0].primitives[0]
     assert primitive.mode == 0
     assert primitive.extensions["KHR_gaussian_splatting"]["kernel"] == "ellipse"
@@ -355,5 +356,5 @@ def test_more_than_every_reader_of_spz_opens_is_said(tmp_path, monkeypatch):
 def test_pictures_would_tell_a_wrong_turn(tmp_path):
     """So the tests above can fail."""
     some = random_gaussians(300, 3)
-    assert psnr(picture(turned(some, Y_UP), overhead()), picture(some)) < 25
+    assert psnr(picture(turned(some, Y_UP.turn), overhead()), picture(some)) < 25
     assert psnr(picture(flat(some)), picture(some)) < 30

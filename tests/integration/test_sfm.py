@@ -211,7 +211,7 @@ def test_other_things_are_not_written_over_and_a_full_disk_is_told_before(flight
         reconstruct(SfmRequest(image_folders=(flight.folder,), output=tmp_path / "full"), console())
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1000))
-    with pytest.raises(VdgsError, match="GB are free"):
+    with pytest.raises(VdgsError, match="MB are free"):
         reconstruct(SfmRequest(image_folders=(flight.folder,), output=tmp_path / "new"), console())
     assert not (tmp_path / "new").exists()
 
@@ -240,7 +240,7 @@ def test_one_line_of_photographs_is_placed_by_attitudes_or_views(made, flight, a
 def test_positions_that_are_wrong_by_as_much_as_the_flight_is_wide_tell_no_scale(made, flight, smaller, believed, line):
     """Metres wrong, as a phone is: of the nine photographs 9 m apart, and of as many around an object."""
     photographs = [photo for photo in collect_images([flight.folder]).images if photo.name in flight.names]
-    model = pycolmap.Reconstruction(made / "work" / "models" / "0")
+    model = pycolmap.Reconstruction(made / "sparse" / "0")
     positions = read_gps_priors(photographs, None, (3.0, 3.0) if line else (0.1, 0.1))
     drift = np.random.default_rng(4).normal(0, 0.9, positions.enu.shape)
     placed = georegister(model, photographs, replace(positions, enu=positions.enu / smaller + drift))
@@ -249,15 +249,17 @@ def test_positions_that_are_wrong_by_as_much_as_the_flight_is_wide_tell_no_scale
         assert "disagree" in placed.reason
         assert "over a flight of" in placed.reason
         assert "--gcp" in placed.remedy
+        assert "--georeference anyway" in placed.remedy
     else:
         assert placed.similarity.scale == pytest.approx(1, abs=0.15)
+        assert abs(placed.similarity.scale - 1) < placed.accuracy.scale_percent / 100
 
 
 def test_positions_that_disagree_leave_the_scale_arbitrary_and_say_why(made, flight, tmp_path, monkeypatch):
     output, said = tmp_path / "capture", console()
     shutil.copytree(made, output, symlinks=True)
     found = AlignmentFailure("the positions disagree by 2 m", "give better ones")
-    monkeypatch.setattr(georegistration, "georegister", lambda *_: found)
+    monkeypatch.setattr(georegistration, "georegister", lambda *_, **__: found)
     facts = reconstruct(
         SfmRequest(image_folders=(flight.folder,), output=output, threads=1, options=SfmOptions(max_output_size=200)),
         said,
@@ -267,7 +269,7 @@ def test_positions_that_disagree_leave_the_scale_arbitrary_and_say_why(made, fli
     assert (
         "not georeferenced (the positions disagree by 2 m): the scale of the scene is arbitrary" in said.file.getvalue()
     )
-    assert "next flight: give better ones" in said.file.getvalue()
+    assert "To mend it, give better ones" in said.file.getvalue()
     assert not (output / "georef.json").exists()
     assert not load_capture(output).ground.metric
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
+import os
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,9 +19,10 @@ from scipy.spatial.transform import Rotation
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.ground_frame import GroundFrame
+from vdgs.rendering import video
 from vdgs.rendering.camera_paths import flyover, frame_count, interpolate, look_at_pose, orbit
 from vdgs.rendering.path_io import load_path
-from vdgs.rendering.video import VideoWriter, default_encoder
+from vdgs.rendering.video import Encoder, VideoWriter, caution, check_film, default_encoder
 
 TEMPLATE = Camera(camera_from_world=np.eye(4), fx=400.0, fy=410.0, cx=160.0, cy=90.0, width=320, height=180)
 
@@ -145,9 +149,10 @@ def test_a_file_with_everything(tmp_path: Path):
     path = load_path(file, TEMPLATE)
     first, second = path.cameras
     assert path.fps == 24
-    assert first.fy == pytest.approx(90 / np.tan(np.radians(30)))
-    assert (second.width, second.height) == (320, 180)  # one film, one size
-    assert second.fx == pytest.approx(800 / 3)
+    assert first.fy == pytest.approx(270 / np.tan(np.radians(30)))
+    for camera in path.cameras:  # what leaves its size out takes that of the others: one film, one size
+        assert (camera.width, camera.height) == (960, 540)
+    assert second.fx == pytest.approx(800)
     np.testing.assert_allclose(second.camera_from_world, pose)
     smooth = load_path(write(tmp_path, entries), TEMPLATE, seconds=2.0, fps=10.0)
     assert len(smooth.cameras) == 20
@@ -248,6 +253,23 @@ def test_a_path_of_nerfstudio_without_its_frame_is_refused(tmp_path: Path):
         assert camera.position[0] == pytest.approx(x)
 
 
+#: A key frame.
+VIEW = {"position": [0, 0, 1], "look_at": [0, 0, 0]}
+
+
+def nerfstudio(frame: dict[str, object] | None = None, **more: object) -> dict[str, object]:
+    """A camera path of nerfstudio's viewer with what its editor keeps, and more."""
+    view = {"camera_to_world": np.eye(4).ravel().tolist(), "fov": 60, "aspect": 16 / 9, **(frame or {})}
+    own = {"camera_type": "perspective", "render_width": 1920, "render_height": 1080, "fps": 24, "seconds": 4}
+    kept = {"default_fov": 75, "default_transition_sec": 2.0, "is_cycle": False, "smoothness_value": 0.5, "crop": None}
+    return {**own, **kept, "keyframes": [{"matrix": "[]"}], "camera_path": [view], "frame": "source", **more}
+
+
+def test_what_the_editor_of_nerfstudio_keeps_is_no_fault(tmp_path: Path):
+    (camera,) = load_path(write(tmp_path, nerfstudio({"render_time": 0})), TEMPLATE).cameras
+    assert (camera.width, camera.height) == (1920, 1080)
+
+
 @pytest.mark.parametrize(
     ("content", "says"),
     [
@@ -274,6 +296,15 @@ def test_a_path_of_nerfstudio_without_its_frame_is_refused(tmp_path: Path):
         ({"keyframes": [{"position": [0, 0, 1], "look_at": [0, 0, 0]}], "closed": "no"}, "closed is 'no'; it must be"),
         ({"camera_path": [[1, 2]]}, "frame 0 of camera_path: it must be an object"),
         ({"camera_path": [{"camera_to_world": np.eye(4).tolist(), "fov": 400}]}, "fov is 400"),
+        ([VIEW | {"width": 960}, VIEW, VIEW | {"width": 640}], "key frame 2 asks for 640x180, key frame 0"),
+        (nerfstudio(camera_type="fisheye"), "camera_type is 'fisheye'"),
+        (nerfstudio(camera_type="equirectangular"), "camera_type is 'equirectangular'"),
+        (nerfstudio(camera_type="omnidirectional"), "camera_type is 'omnidirectional'"),
+        (nerfstudio(crop={"crop_center": [0, 0, 0]}), "it has a crop"),
+        (nerfstudio(time_scale=2), "there is no 'time_scale'"),
+        (nerfstudio({"camera_type": "fisheye"}), "frame 0 of camera_path: there is no 'camera_type'"),
+        (nerfstudio({"render_time": 0.5}), "render_time is 0.5"),
+        (nerfstudio({"aspect": 1.0}), "its aspect is 1"),
     ],
 )
 def test_what_is_wrong_is_named(content, says: str, tmp_path: Path):
@@ -398,7 +429,13 @@ def test_a_film_that_fails_leaves_nothing(tmp_path: Path):
 
 def test_a_missing_encoder_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("vdgs.rendering.video.importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("vdgs.rendering.video._ffmpeg_on_path", lambda: None)
+    assert default_encoder() in ("vp9", "mpeg4")
+    monkeypatch.setattr("vdgs.rendering.video._has_vp9", lambda: False)
     assert default_encoder() == "mpeg4"
+    monkeypatch.setattr("vdgs.rendering.video._ffmpeg_on_path", lambda: "ffmpeg")
+    assert default_encoder() == "ffmpeg"
+    monkeypatch.setattr("vdgs.rendering.video._ffmpeg_on_path", lambda: None)
     monkeypatch.setattr("vdgs.rendering.video.cv2.VideoWriter.fourcc", lambda *letters: 0, raising=False)
 
     class Closed:
@@ -415,3 +452,87 @@ def test_a_missing_encoder_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         VideoWriter(tmp_path / "film.mp4", 30.0) as film,
     ):
         film.write(np.zeros((8, 8, 3), np.uint8))
+
+
+@pytest.mark.parametrize("encoder", ["ffmpeg", "av", "vp9", "mpeg4"])
+def test_every_encoder_writes_a_whole_film(tmp_path: Path, encoder: Encoder):
+    needed = {"ffmpeg": ffmpeg_is_there(), "av": importlib.util.find_spec("av"), "vp9": video._has_vp9(), "mpeg4": True}
+    if not needed[encoder]:
+        pytest.skip(f"nothing here encodes with {encoder} (pip install imageio-ffmpeg or av)")
+    file = tmp_path / "film.mp4"
+    with VideoWriter(file, 25.0, encoder=encoder) as film:
+        for level in range(40, 200, 20):
+            film.write(np.full((49, 65, 3), (level, level // 2, 30), np.uint8))
+    check_film(file, 8)
+    reader = cv2.VideoCapture(str(file))
+    assert reader.get(cv2.CAP_PROP_FPS) == pytest.approx(25)
+    done, frame = reader.read()
+    assert done
+    np.testing.assert_allclose(frame[24, 32, ::-1], (40, 20, 30), atol=12)
+    assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
+    assert (caution(encoder) is None) == (encoder in ("ffmpeg", "av"))
+
+
+def ffmpeg_is_there() -> bool:
+    return bool(importlib.util.find_spec("imageio_ffmpeg")) or video._ffmpeg_on_path() is not None
+
+
+def test_a_film_on_a_full_disk_is_an_error_and_the_good_one_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    file, noise = tmp_path / "film.mp4", np.random.default_rng(0)
+    with VideoWriter(file, 30.0) as film:
+        film.write(np.zeros((64, 64, 3), np.uint8))
+    good = file.read_bytes()
+
+    def write_and_lose(encoder: Encoder, lost: float) -> None:
+        """A film of which the disk held only a part: as OpenCV leaves it, which says nothing."""
+        with VideoWriter(file, 30.0, encoder) as film:
+            for _ in range(10):
+                film.write(noise.integers(0, 255, (64, 64, 3), np.uint8))
+            assert film._pen is not None
+            film._pen.close()
+            partial = film._partial
+            with partial.open("r+b") as held:
+                held.truncate(int(partial.stat().st_size * (1 - lost)))
+
+    for lost in (0.02, 0.5, 1.0):
+        with pytest.raises(VdgsError, match="cannot be encoded"):
+            write_and_lose("mpeg4", lost)
+        assert file.read_bytes() == good
+        assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
+    monkeypatch.setattr("vdgs.rendering.video.FULL_BYTES", 1 << 60)
+    with pytest.raises(VdgsError, match="the disk is full"):
+        write_and_lose("mpeg4", 0.5)
+    assert file.read_bytes() == good
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="only root mounts a small disk")
+def test_a_film_on_a_small_disk(tmp_path: Path):
+    """For real: a tmpfs of 160 kB, with each encoder that is here."""
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=160k", "tmpfs", tmp_path], capture_output=True).returncode:
+        pytest.skip("no tmpfs can be mounted here")
+    try:
+        for encoder in dict.fromkeys((default_encoder(), "mpeg4")):
+            film_of_noise(tmp_path / "film.mp4", 1, encoder)
+            good = (tmp_path / "film.mp4").read_bytes()
+            with pytest.raises(VdgsError, match="disk is full"):
+                film_of_noise(tmp_path / "film.mp4", 600, encoder)
+            assert (tmp_path / "film.mp4").read_bytes() == good
+            assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
+    finally:
+        subprocess.run(["umount", tmp_path], check=True)
+
+
+def film_of_noise(file: Path, frames: int, encoder: Encoder) -> None:
+    noise = np.random.default_rng(0)
+    with VideoWriter(file, 30.0, encoder) as film:
+        for _ in range(frames):
+            film.write(noise.integers(0, 255, (128, 128, 3), np.uint8))
+
+
+def test_what_a_killed_film_left_goes(tmp_path: Path):
+    (tmp_path / ".film.mp4.999999999.partial.mp4").write_bytes(b"half")
+    mine = tmp_path / f".film.mp4.{os.getpid()}.partial.png"
+    mine.write_bytes(b"mine")
+    with VideoWriter(tmp_path / "film.mp4", 30.0, "mpeg4") as film:
+        film.write(np.zeros((8, 8, 3), np.uint8))
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["film.mp4", mine.name])

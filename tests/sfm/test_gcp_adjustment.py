@@ -141,7 +141,7 @@ BAD = {
     "a word for a number": ([{"text": "1 2 three 4 5 DJI_0001.JPG"}], "line 2: .* is not `x y z px py photograph"),
     "too few words": ([{"text": "1 2 3 4 5"}], "line 2: .* is not `x y z px py photograph"),
     "not finite": ([{"text": "nan 2 3 4 5 DJI_0001.JPG"}], "line 2: numbers must be finite"),
-    "unknown photograph": ([{"photograph": "DJI_0999.JPG"}], "line 2: there is no photograph 'DJI_0999.JPG'"),
+    "unknown photograph": ([{"photograph": "DJI_0999.JPG"}], r"1 photographs that are not there; .*DJI_0999\.JPG"),
     "outside": ([{"text": "1 2 3 401 5 DJI_0001.JPG"}], "line 2: pixel 401, 5 is outside .* 400 x 300"),
     "two places": ([{}, {"x": 5.0}], "line 3: the point a has another place in line 2"),
     "too few points": ([{"name": "c"}] * 4, "another place"),
@@ -244,7 +244,7 @@ def test_control_points_hold_a_model_where_they_were_surveyed(made, flight, poin
     """GPS is beside the survey by metres, and does not matter; points that were held out come out right."""
     file = write_list(tmp_path / "gcp_list.txt", flight, points)
     facts, capture, said = surveyed(made, flight, tmp_path, file, "well", "fence")
-    assert "5 place the model, 2 are held out" in said
+    assert "placed anew" in said
     assert [each.role for each in facts.survey] == ["control"] * 4 + ["check"] * 2 + ["control"]
     assert max(facts.gcp_rmse_m("check")) < 0.12  # a pixel shows 0.13 m
     assert max(facts.gcp_rmse_m("control")) < 0.12
@@ -287,3 +287,27 @@ def test_a_point_that_does_not_fit_and_marks_that_are_wrong_are_named(made, flig
     off = {each.name: each.residual_m for each in facts.survey}["gate"]
     assert off == pytest.approx((0, -6, 0), abs=0.6)
     assert pytest.approx(facts.height_m, abs=4) == ALTITUDE_M
+
+
+@pytest.mark.parametrize("flip", ["exchanged", "from the lower edge"])
+def test_marks_that_are_read_wrongly_are_refused_and_the_capture_stays(made, flight, points, tmp_path, flip):
+    def wrong(pixel: np.ndarray) -> np.ndarray:
+        return pixel[::-1] if flip == "exchanged" else np.array([pixel[0], HEIGHT - pixel[1]])
+
+    marked = [{k: p if k < 0 else wrong(p) for k, p in seen.items()} for seen in points]
+    marked = [{k: p for k, p in seen.items() if k < 0 or p[1] <= HEIGHT} for seen in marked]
+    with pytest.raises(CaptureError, match=r"px and py change places|py counts from the lower edge"):
+        surveyed(made, flight, tmp_path, write_list(tmp_path / "gcp_list.txt", flight, marked))
+    assert load_capture(tmp_path / "capture").ground.metric
+
+
+def test_control_points_in_feet_or_with_x_and_y_exchanged_are_refused(made, flight, points, tmp_path):
+    text = write_list(tmp_path / "gcp_list.txt", flight, points).read_text().splitlines()
+    rows = [line.split() for line in text[3:]]
+    feet = [[*row[:2], f"{float(row[2]) / 0.3048:.3f}", *row[3:]] for row in rows]
+    (tmp_path / "feet.txt").write_text("\n".join([text[0], *(" ".join(row) for row in feet)]))
+    with pytest.raises(CaptureError, match="feet"):
+        surveyed(made, flight, tmp_path, tmp_path / "feet.txt")
+    mirrored = [{k: (p[[1, 0, 2]] if k < 0 else p) for k, p in seen.items()} for seen in points]
+    with pytest.raises(CaptureError, match=r"x \(east\) and y \(north\) exchanged"):
+        surveyed(made, flight, tmp_path, write_list(tmp_path / "gcp_list.txt", flight, mirrored))

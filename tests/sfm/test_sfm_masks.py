@@ -205,7 +205,7 @@ def test_masks_are_written_with_the_capture_and_what_depends_on_them_is_done_aga
     write_upright_masks(work, prepared.image_list.images, 1)
     model = incremental_mapper.read_models(work)[0]
     write_mask(output / "masks/old.png", left_half())  # of other masks
-    reconstruct._write(prepared, work, model, "key", 1, console())
+    reconstruct._write(prepared, work, model, model, "key", console())
     reconstruct.writing.write_model(output, model, reconstruct._lenses(model, 200))
     capture = load_capture(output)
     names = {view.name: view.mask_path and view.mask_path.name for view in capture.views}

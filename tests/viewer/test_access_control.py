@@ -20,13 +20,29 @@ def test_the_door_knows_its_own_name():
         assert alone.deny_reason("/", {"Host": host}) is not None
     assert alone.deny_reason("/", {"Host": "localhost:8080", "Origin": "http://localhost:8080"}) is None
     assert alone.deny_reason("/", {"Host": "localhost:8080", "Origin": "http://localhost:9999"}) is not None
-    assert alone.deny_reason("/", {"Host": "localhost:8080", "Origin": "null"}) is not None
+    for origin in ("null", "http://[", "", "http://"):
+        assert alone.deny_reason("/", {"Host": "localhost:8080", "Origin": origin}) is not None
     assert AccessControl("0.0.0.0", "abc", 7).local_url() == "http://localhost:7/?token=abc"
     guarded = AccessControl("0.0.0.0", "abc", 7)
     assert guarded.deny_reason("/?token=abc", {"Host": "x"}) is None
     assert guarded.deny_reason("/?token=ab%C3%A9", {"Host": "x"}) is not None
     assert guarded.deny_reason("/", {"Host": "x", "Cookie": "vdgs_view_8=abc"}) is not None
     assert guarded.deny_reason("/", {"Host": "x", "Cookie": 'a=b; vdgs_view_7="abc"'}) is None
+
+
+def test_why_a_visitor_is_refused_is_told_without_what_could_let_in_or_draw():
+    guarded = AccessControl("0.0.0.0", "secret", 7)
+    assert guarded.report("/?token=secret", {"Host": "x"}) is None
+    for path, headers in (
+        ("/?token=secre", {"Host": "x", "Cookie": "vdgs_view_7=secre"}),
+        ("/?token=secret", {"Host": "x", "Origin": "http://y\x1b[31m" + 200 * "z"}),
+        ("/", {}),
+    ):
+        said = guarded.report(path, headers)
+        assert said is not None
+        assert "secre" not in said
+        assert "\x1b" not in said
+        assert len(said) < 400
 
 
 def test_others_are_told_an_address_that_they_can_use(monkeypatch):

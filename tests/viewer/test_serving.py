@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import io
 import json
 import math
 import shutil
@@ -245,7 +246,8 @@ def test_nothing_of_the_machine_is_reached(viewer):
 
 @quiet
 def test_others_need_the_token(run):
-    with serve(open_run(run), "0.0.0.0", None, Console(file=sys.stderr)) as viewer:
+    said = io.StringIO()
+    with serve(open_run(run), "0.0.0.0", None, Console(file=said)) as viewer:
         address, token = viewer.access.local_url(), viewer.access.token
         assert token is not None
         assert len(token) >= 32
@@ -262,6 +264,31 @@ def test_others_need_the_token(run):
         guest.stand(above())
         assert guest.full_picture(above()).shape == (240, 320, 3)
         guest.close()
+        # Why is printed, once for each reason, and never the token.
+        assert said.getvalue().count("The token is missing or wrong") == 1
+        assert ask(address, Cookie=cookie.split(";")[0], Origin="http://lab.example:80")[0] == 403
+        assert ask(address, Cookie=cookie.split(";")[0], Origin="http://lab.example:80")[0] == 403
+        assert said.getvalue().count("proxy_set_header Host $http_host") == 1
+        assert "Origin http://lab.example:80" in said.getvalue()
+        assert token[:-1] not in said.getvalue()
+
+
+@quiet
+def test_a_proxy_that_keeps_its_own_name_is_named(run):
+    """nginx without more settings: the page has loaded, its socket is refused for ever."""
+    said = io.StringIO()
+    with serve(open_run(run), "127.0.0.1", None, Console(file=said)) as viewer:
+        address = viewer.access.local_url()
+        for _ in range(3):
+            with pytest.raises(Exception, match="403"):
+                Guest(address, {"Origin": "http://127.0.0.1:8302"})
+        assert said.getvalue().count("warning") == 1
+        assert "proxy_set_header Host $http_host" in said.getvalue()
+        for host in ("lab.example", "evil.example"):
+            assert ask(address, Host=host)[0] == 403
+        assert said.getvalue().count("warning") == 2
+        assert "--host" in said.getvalue()
+        assert "docs/viewer.md" in said.getvalue()
 
 
 @quiet

@@ -14,8 +14,11 @@ from pathlib import Path
 from vdgs.captures.formats.colmap import count_images, find_models, partial_model, read_colmap
 from vdgs.captures.formats.matrixcity import pose_files, read_matrixcity
 from vdgs.captures.formats.mega_nerf import is_mega_nerf, read_mega_nerf
+from vdgs.captures.formats.ply_reader import read_point_cloud
 from vdgs.captures.formats.source_capture import SourceCapture
+from vdgs.captures.formats.sparse_points import POINT_CLOUDS, find_point_cloud
 from vdgs.captures.formats.transforms import TRANSFORMS_FILE, exclusive_information, read_transforms
+from vdgs.captures.nested_captures import model_below
 from vdgs.captures.reconstruction import is_reconstruction
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -41,6 +44,9 @@ def read_source(root: Path, options: CaptureOptions) -> SourceCapture:
             f"{root}: is not finished: vdgs sfm was stopped. The command that began it goes on "
             f"with it (its photographs, --output {root})."
         )
+    below = model_below(root)
+    if below:
+        raise CaptureError(f"{root}: not a capture itself. {below}")
     raise CaptureError(
         f"{root}: not a capture. {partial_model(root)}Looked for a COLMAP model (sparse/0/cameras.bin and "
         "images.bin, or .txt), transforms.json (nerfstudio), train/metadata/*.pt (Mega-NeRF) and transforms_train.json "
@@ -80,13 +86,19 @@ def _read_colmap(root: Path, options: CaptureOptions) -> SourceCapture:
     model = read_colmap(folder)
     if not model.views:
         raise CaptureError(f"{folder}: the model holds no registered images. Run the reconstruction again.")
-    if not len(model.points):
-        raise CaptureError(
-            f"{folder}: the model holds no 3D points, from which the scene starts. Keep points3D.bin beside "
-            "images.bin, or triangulate: colmap point_triangulator."
-        )
+    points, colors = model.points, model.colors
+    if not len(points):
+        cloud = find_point_cloud(folder, folder.parent, root, lone=True)
+        if cloud is None:
+            raise CaptureError(
+                f"{folder}: the model holds no 3D points, from which the scene starts. Keep points3D.bin beside "
+                f"images.bin, or triangulate (colmap point_triangulator), or put a point cloud in the same world there "
+                f"as {POINT_CLOUDS[0]}."
+            )
+        points, colors = read_point_cloud(cloud)
+        warnings.append(f"the model holds no points; those of {cloud.relative_to(root)} are used.")
     return SourceCapture(
-        source="colmap", images=images, views=model.views, points=model.points, colors=model.colors,
+        source="colmap", images=images, views=model.views, points=points, colors=colors,
         image_folders=(root / images,), warnings=(*warnings, *image_warnings),
     )  # fmt: skip
 

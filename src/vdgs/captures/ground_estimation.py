@@ -23,18 +23,14 @@ import numpy as np
 from vdgs.captures.camera_height import view_distance
 from vdgs.captures.formats.source_capture import SourceCapture, WorldPrior
 from vdgs.captures.georeference import match_gps, read_georef, read_gps
-from vdgs.captures.up_axis import estimate_up
+from vdgs.captures.plane_fit import mirrored
+from vdgs.captures.position_fit import Problem, Up, fit_positions
+from vdgs.captures.up_axis import estimate_up, up_by_views
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu
 from vdgs.geometry.ground_frame import GroundFrame
-from vdgs.geometry.similarity import (
-    Similarity,
-    describe_disagreement,
-    fit_similarity_robust,
-    geometric_median,
-    is_collinear,
-)
+from vdgs.geometry.similarity import geometric_median, is_collinear, rotation_to_z
 
 #: Median camera height above the ground, in units, where the capture has no metres (choice).
 NOMINAL_CAMERA_HEIGHT = 10.0
@@ -108,7 +104,17 @@ def _scene(source: SourceCapture) -> _Scene:
 
 def _georeferenced(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame:
     """Identity rotation in metres; the origin moves (by whole metres) only where float32 needs it."""
-    origin, how = read_georef(file), f"world is ENU metres ({file.name})"
+    georef = read_georef(file)
+    accuracy = f"; {georef.accuracy}" if georef.accuracy else ""
+    if georef.origin is None:
+        return GroundFrame(
+            scale=1.0,
+            rotation=np.eye(3),
+            translation=np.zeros(3),
+            metric=True,
+            description=f"world is metres, z up ({file.name}{accuracy})",
+        )
+    origin, how = georef.origin, f"world is ENU metres ({file.name}{accuracy})"
     middle = np.median(scene.centers, axis=0)
     shift = np.where(np.abs(middle) > FAR_FROM_ORIGIN_M, -np.round(middle), 0.0)
     if shift.any():
@@ -143,29 +149,36 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
     origin = (float(median[0]), float(median[1]), float(median[2]))
     enu = enu_from_geodetic(geodetic, origin)
     centers = scene.centers[indices]
-    similarity, inliers = Similarity(1.0, np.eye(3), np.zeros(3)), np.ones(len(centers), bool)
-    fixed = not is_collinear(centers)
-    if fixed:
-        similarity, inliers = fit_similarity_robust(centers, enu)
-        fixed = not is_collinear(enu[inliers])
-    if not fixed:
+    if is_collinear(centers):
         warnings.append(
             f"{file.name}: {len(indices)} photographs with GPS, all along one line (or fewer than three), "
             "fix no up axis; the frame is estimated from the cameras instead and is not metric."
         )
         return None
-    residuals = similarity.apply(centers) - enu
-    how_far = describe_disagreement(residuals, enu, inliers)
-    if how_far:
-        warnings.append(
-            f"{file.name}: GPS and camera positions disagree ({how_far}); it is ignored and the frame is estimated."
+    direction, deviation, sure = up_by_views(scene.centers, scene.rotations, scene.points)
+    times = np.linspace(0, 1, len(indices))
+    problem = Problem(centers=centers, targets=enu, times=times, up=Up(direction, deviation, "the views", sure))
+    others = {"east and north": enu[:, [1, 0, 2]], "signs": enu * [-1.0, 1.0, 1.0]}
+    if sure and mirrored(centers, enu, direction, others):
+        raise CaptureError(
+            f"{file}: its positions fit the cameras only as their mirror image. Are lat and lon exchanged, or is the "
+            "minus sign of south or west missing? Mend the table, or leave --gps out."
         )
+    fit = fit_positions(problem)
+    refused = fit.why_refused(file.name)
+    if refused:
+        warnings.append(f"{file.name}: {refused}; it is ignored and the frame is estimated.")
         return None
+    similarity, inliers = fit.similarity, fit.inliers
+    if fit.altitude != "used":
+        warnings.append(f"{file.name}: its altitudes drift or are of no use, and were left out; up is by the views.")
     if not inliers.all():
         names = ", ".join(scene.names[i] for i in indices[~inliers][:5])
         warnings.append(f"{file.name}: {(~inliers).sum()} GPS positions left out as outliers ({names}).")
-    rms = float(np.sqrt((residuals[inliers] ** 2).sum(axis=1).mean()))
-    how = f"GPS of {inliers.sum()} photographs, RMS {rms:.2f} m"
+    rms = float(np.sqrt((fit.residuals[inliers] ** 2).sum(axis=1).mean()))
+    place, scale = fit.place_error_m, fit.scale_error
+    how = f"GPS of {inliers.sum()} photographs, RMS {rms:.2f} m; place ±{place[0]:.2g} m across, ±{place[1]:.2g} m up, "
+    how += f"scale ±{scale:.2%} (95 %)"
     frame = GroundFrame(
         scale=similarity.scale,
         rotation=similarity.rotation,
@@ -192,17 +205,6 @@ def _compare_up(scene: _Scene, frame: GroundFrame, warnings: list[str]) -> None:
 
 
 # ------------------------------------------------------------------------------------------------ frames
-
-
-def rotation_to_z(up: np.ndarray) -> np.ndarray:
-    """The smallest rotation [3, 3] that takes the unit vector `up` to z (half a turn about x for -z)."""
-    x, y, z = up / np.linalg.norm(up)
-    across = x * x + y * y
-    if z < 0 and across < 1e-300:
-        return np.diag([1.0, -1.0, -1.0])
-    # 1 / (1 + z) without its cancellation near -z.
-    a = 1 / (1 + z) if z >= 0 else (1 - z) / across
-    return np.array([[1 - a * x * x, -a * x * y, -x], [-a * x * y, 1 - a * y * y, -y], [x, y, z]])
 
 
 def _unscaled(scene: _Scene, rotation: np.ndarray, how: str, warnings: list[str]) -> GroundFrame:

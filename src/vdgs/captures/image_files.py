@@ -16,7 +16,9 @@ import cv2
 import numpy as np
 from PIL import Image
 
+from vdgs.captures.jpeg import JPEGS, has_end, lacks_only_end, with_end
 from vdgs.captures.name_resolution import find_file
+from vdgs.captures.strays import is_hidden
 from vdgs.errors import CaptureError
 from vdgs.system.memory.process_memory import is_out_of_memory
 
@@ -30,6 +32,8 @@ MIN_SIDE_PX = 8
 ROUNDING_PX = 1.0
 #: A mask keeps what is at least so bright, of 255; an alpha channel what is at least so opaque (choice).
 MASK_THRESHOLD = 128
+#: What programs put behind a photograph's name for that of its mask.
+_MASK_TAILS = ("_mask", ".mask", "-mask", "_msk")
 #: Pillow's modes that we know how to bring to 8-bit RGB.
 SUPPORTED_MODES = {"RGB", "RGBA", "L", "LA", "P", "1", "I;16", "I;16B", "I;16L"}
 
@@ -93,14 +97,27 @@ def find_images(folder: Path) -> dict[str, Path]:
     found = {
         path.relative_to(folder).as_posix(): path
         for path in folder.rglob("*")
-        if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
+        if path.suffix.lower() in IMAGE_SUFFIXES and not is_hidden(path.relative_to(folder))
     }
     return dict(sorted(found.items()))
 
 
 def find_mask(folder: Path, name: str) -> Path | None:
-    """The mask of an image: name.jpg.png (COLMAP) or name.png, or the image's own name."""
-    candidates = (name + ".png", str(Path(name).with_suffix(".png")), name)
+    """The mask of an image: name.jpg.png (COLMAP) or name.png, the image's own name, or `name_mask` and its like."""
+    path = Path(name)
+    stems = [str(path.with_name(path.stem + tail)) for tail in _MASK_TAILS]
+    candidates = [name + ".png", str(path.with_suffix(".png")), name, name + ".mask.png"]
+    candidates += [stem + suffix for stem in stems for suffix in (".png", path.suffix, ".jpg", ".tif")]
+    candidates += [str(path.with_suffix(suffix)) for suffix in (".jpg", ".tif", ".PNG")]
+    return next((found for found in (find_file(folder, each) for each in candidates) if found is not None), None)
+
+
+def find_mask_beside(folder: Path, name: str) -> Path | None:
+    """The mask of an image in the image's own folder: name.jpg.png or `name_mask` and its like."""
+    path = Path(name)
+    stems = [str(path.with_name(path.stem + tail)) for tail in _MASK_TAILS]
+    candidates = [name + ".png", name + ".mask.png"]
+    candidates += [stem + suffix for stem in stems for suffix in (".png", path.suffix)]
     return next((found for found in (find_file(folder, each) for each in candidates) if found is not None), None)
 
 
@@ -125,7 +142,7 @@ def decode_image(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 def decode_mask(path: Path, width: int, height: int) -> np.ndarray:
     """What a mask keeps (white), [height, width] bool; a mask of another size is resampled to the image's."""
-    keep = _lightness(path) >= MASK_THRESHOLD
+    keep = _kept(_lightness(path))
     if keep.shape == (height, width):
         return keep
     return cv2.resize(keep.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
@@ -133,7 +150,15 @@ def decode_mask(path: Path, width: int, height: int) -> np.ndarray:
 
 def _lightness(mask: Path) -> np.ndarray:
     """The brightest channel of a mask at its own size, [h, w] uint8."""
+    pixels = _decode(mask)
+    if pixels.dtype == np.uint16 and pixels.size and pixels.max() <= 255:  # 8 bits, written as 16
+        return pixels.reshape(*pixels.shape[:2], -1)[..., :3].max(axis=2).astype(np.uint8)
     return decode_image(mask)[0].max(axis=2)
+
+
+def _kept(light: np.ndarray) -> np.ndarray:
+    """What a mask keeps: the bright; all that is not 0 in a mask of 0 and 1 (COLMAP's)."""
+    return light > 0 if light.size and light.max() == 1 else light >= MASK_THRESHOLD
 
 
 def _decode(path: Path) -> np.ndarray:
@@ -174,7 +199,9 @@ def verify_image(path: Path) -> VerifiedImage:
     """
     try:
         with Image.open(path) as image:
-            if image.format == "JPEG":
+            if image.format in JPEGS and not has_end(path, image):
+                return _verify_without_end(path)
+            if image.format in JPEGS:
                 image.draft(image.mode, (max(1, image.width // 8), max(1, image.height // 8)))
             image.load()
             ranges = [_extremes(image, band) for band in image.getbands() if band != "A"]
@@ -182,6 +209,17 @@ def verify_image(path: Path) -> VerifiedImage:
     except Exception as error:  # any complaint of a decoder is what we came for
         raise CaptureError(f"{path}: {error}") from None
     return VerifiedImage(any(high != low for low, high in ranges), transparent)
+
+
+def _verify_without_end(path: Path) -> VerifiedImage:
+    """Of a JPEG without an end marker: as `verify_image`, where nothing but the marker is missing."""
+    if not lacks_only_end(path):
+        raise CaptureError("it is cut off")
+    with Image.open(with_end(path)) as image:
+        image.draft(image.mode, (max(1, image.width // 8), max(1, image.height // 8)))
+        return VerifiedImage(
+            any(high != low for low, high in (_extremes(image, band) for band in image.getbands())), False
+        )
 
 
 def _extremes(image: Image.Image, band: str) -> tuple[float, float]:
@@ -201,13 +239,14 @@ def kept_fraction(photograph: Path, mask: Path | None, may_be_transparent: bool)
     keep = opaque
     if mask is not None:
         light = _lightness(mask)
-        if not (light >= MASK_THRESHOLD).any():
+        kept = _kept(light)
+        if not kept.any():
             hint = "Scale its values to 0 and 255" if light.any() else "Turn it round if it is inverted"
             raise CaptureError(
                 f"{mask}: leaves nothing of its photograph. White is kept, and the brightest value here is "
                 f"{light.max()} of 255. {hint}, or remove the photograph from the model."
             )
-        keep = light >= MASK_THRESHOLD if opaque is None else decode_mask(mask, *opaque.shape[::-1]) & opaque
+        keep = kept if opaque is None else decode_mask(mask, *opaque.shape[::-1]) & opaque
     if keep is not None and not keep.any():
         raise CaptureError(
             f"{photograph}: is transparent everywhere that it is not masked; nothing of it is left. Remove its "

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from vdgs.captures.formats.source_capture import SINGLE_FOCAL, Intrinsics, SourceCapture, SourceView, format_list
-from vdgs.captures.image_files import find_images, read_header, same_aspect
+from vdgs.captures.formats.source_capture import (
+    SINGLE_FOCAL,
+    Intrinsics,
+    SourceCapture,
+    SourceView,
+    format_list,
+    refuse_many_missing,
+)
+from vdgs.captures.image_files import IMAGE_SUFFIXES, find_images, read_header, same_aspect
 from vdgs.captures.mask_matching import check_mask, find_masks
 from vdgs.captures.name_resolution import ImageNameIndex
+from vdgs.captures.strays import masked_stem
 from vdgs.captures.undistortion import ImageFile
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -28,27 +36,23 @@ class MatchedView:
 
 
 def match_images(root: Path, source: SourceCapture, options: CaptureOptions, warnings: list[str]) -> list[MatchedView]:
-    """Every view with its image file; images without a camera become a warning, the reverse an error."""
+    """Every view with its image file; images without a camera become a warning, and so do some cameras without
+    an image. Raises CaptureError where many are missing."""
     folder = root / source.images
     available = ImageNameIndex(find_images(folder)) if folder.is_dir() else ImageNameIndex({})
-    paths: list[Path] = []
-    missing: list[str] = []
-    for view in source.views:
-        path = view.image_path or folder / (available.find(view.name) or view.name)
-        paths.append(path)
-        if not path.is_file():
-            missing.append(str(path))
-    if missing:
-        raise CaptureError(
-            f"{folder}: {len(missing)} of {len(source.views)} images that have a camera are missing. Copy "
-            f"them there, or choose another folder with --images.{format_list(missing)}"
-        )
+    paths = [view.image_path or folder / (available.find(view.name) or view.name) for view in source.views]
+    there = [path.is_file() for path in paths]
+    missing = [view.name for view, found in zip(source.views, there, strict=True) if not found]
+    warnings += refuse_many_missing(missing, len(paths), folder)
+    views = tuple(view for view, found in zip(source.views, there, strict=True) if found)
+    source, paths = replace(source, views=views), [path for path in paths if path.is_file()]
     named = set(paths)
+    stems = {path.with_suffix("") for path in paths}
     others = {
         name: path
         for spare_folder in source.image_folders
         for name, path in find_images(spare_folder).items()
-        if path not in named
+        if path not in named and not _is_mask(path, stems)
     }
     used = {path.resolve() for path in paths} if others else set()  # asked of the disk only where names differ
     spare = [name for name, path in others.items() if path.resolve() not in used]
@@ -58,12 +62,18 @@ def match_images(root: Path, source: SourceCapture, options: CaptureOptions, war
     return _fitted(root, source, paths, options, warnings)
 
 
+def _is_mask(path: Path, stems: set[Path]) -> bool:
+    """Whether an image is by its name the mask of one of those beside it, which are given without their suffixes."""
+    stem = masked_stem(path.stem) or (path.stem if Path(path.stem).suffix.lower() in IMAGE_SUFFIXES else None)
+    return stem is not None and bool({path.with_name(stem), path.with_name(Path(stem).stem)} & stems)
+
+
 def _fitted(
     root: Path, source: SourceCapture, paths: list[Path], options: CaptureOptions, warnings: list[str]
 ) -> list[MatchedView]:
     """The views with their images, masks and intrinsics at the images' sizes; collects what does not fit."""
     photographs, problems = list[MatchedView](), list[str]()
-    masks = find_masks(root, source.views, options, warnings)
+    masks = find_masks(root, source.images, source.views, options, warnings)
     for view, path in zip(source.views, paths, strict=True):
         mask = masks[view.name]
         try:

@@ -9,6 +9,7 @@ import numpy as np
 
 from vdgs.captures.capture import Capture, Observations, View
 from vdgs.captures.format_dispatch import read_source
+from vdgs.captures.formats.ply_reader import GRAY
 from vdgs.captures.formats.source_capture import SourceCapture, format_list
 from vdgs.captures.ground_estimation import find_ground_frame, transform_pose
 from vdgs.captures.image_checks import detect_rounding
@@ -47,6 +48,8 @@ def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
     ground, ground_warnings = find_ground_frame(source, root, options)
     views = [_view(photo, options, ground) for photo in photographs]
     points, colors = ground.to_ground(source.points), source.colors
+    if (colors == GRAY).all():
+        warnings.append("the points bring no colours under a name that is known; the scene starts from grey.")
     if options.max_images is not None and options.max_images < len(views):
         warnings.append(f"using the {options.max_images} of {len(views)} photographs nearest to the middle.")
         views = select_central_views(views, options.max_images)

@@ -6,13 +6,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from vdgs.captures.formats.source_capture import SourceView
-from vdgs.captures.image_files import find_images, find_mask, read_header, same_aspect
+from vdgs.captures.image_files import find_images, find_mask, find_mask_beside, read_header, same_aspect
+from vdgs.captures.strays import MASK_FOLDERS
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 
 
 def find_masks(
-    root: Path, views: Sequence[SourceView], options: CaptureOptions, warnings: list[str]
+    root: Path, images: str, views: Sequence[SourceView], options: CaptureOptions, warnings: list[str]
 ) -> dict[str, Path | None]:
     """The mask of every photograph by its name, None where it has none; says which masks and photographs have no
     partner.
@@ -20,11 +21,15 @@ def find_masks(
     Raises `CaptureError` for a folder of masks that was asked for and is not there, and where masks are there but none
     of them is of a photograph.
     """
-    folder = root / options.masks
+    names = MASK_FOLDERS if options.masks == CaptureOptions.masks else ()
+    folder = next((root / name for name in names if (root / name).is_dir()), root / options.masks)
     asked_for = options.masks != CaptureOptions.masks
     if asked_for and not folder.is_dir():
         raise CaptureError(f"{folder}: no such folder, though --masks asks for it.")
-    masks = {view.name: view.mask_path or find_mask(folder, view.name) for view in views}
+    masks = {
+        view.name: view.mask_path or find_mask(folder, view.name) or find_mask_beside(root / images, view.name)
+        for view in views
+    }
     with_mask = [name for name, mask in masks.items() if mask is not None]
     if folder.is_dir() and not any(view.mask_path for view in views):
         _compare(folder, masks, asked_for, warnings)

@@ -11,6 +11,8 @@ from vdgs.system.atomic_files import read_json
 from vdgs.system.records import record_from_dict
 
 RECONSTRUCTION_FILE, RECONSTRUCTION_FIGURE = "reconstruction.json", "reconstruction.png"
+#: The model as the photographs alone give it, with their lenses: what positions and control points place.
+MAPPED = "mapped"
 #: The folder of one that is not finished, or whose intermediate files are kept.
 WORK_FOLDER = "work"
 #: What says in it, and in the capture, which steps are done.
@@ -56,6 +58,37 @@ class GcpReport:
 
 
 @dataclass(frozen=True, kw_only=True)
+class AccuracyFacts:
+    """How good a place is; errors are those that 95 % stay below. None: not known, or nothing says it."""
+
+    place_m: tuple[float, ...] | None
+    """Of the whole scene, across and up."""
+    scale_percent: float | None
+    scale_m: float | None
+    """What that makes at the edge of the flight."""
+    north_deg: float | None
+    level_deg: float | None
+    positions_m: tuple[float, ...] | None
+    """Standard deviation of a recorded position east, north and up, as found from the flight itself."""
+    altitude: str = "used"
+    """Recorded altitudes: `used`, `drifts` (with time, left out) or `unused`."""
+    altitude_drift_m: float = 0.0
+
+    @property
+    def summary(self) -> str:
+        """One line for tables."""
+        parts = []
+        if self.place_m is not None:
+            parts.append(f"place ±{self.place_m[0]:.2g} m across, ±{self.place_m[1]:.2g} m up")
+        if self.scale_percent is not None:
+            edge = f" (±{self.scale_m:.2g} m at the edge)" if self.scale_m is not None else ""
+            parts.append(f"scale ±{self.scale_percent:.2g} %{edge}")
+        parts += [f"north ±{self.north_deg:.2g}°"] if self.north_deg is not None else []
+        parts += [f"level ±{self.level_deg:.2g}°"] if self.level_deg is not None else []
+        return f"{', '.join(parts)} (95 %)" if parts else ""
+
+
+@dataclass(frozen=True, kw_only=True)
 class ReconstructionReport:
     """What a person should know about a reconstruction."""
 
@@ -92,6 +125,8 @@ class ReconstructionReport:
     """Of the last part of the work, where it was interrupted."""
     survey: tuple[GcpReport, ...] = ()
     """Surveyed points, those that placed the model and those held out."""
+    accuracy: AccuracyFacts | None = None
+    """Of the place; None where there is none."""
 
     def gcp_rmse_m(self, used_as: str) -> tuple[float, float, float] | None:
         """East, north and up of check points, or of control points; None where there are none."""
@@ -133,6 +168,7 @@ def report_rows(metadata: ReconstructionReport) -> list[tuple[str, str]]:
         ),
         ("Georeference", metadata.georeferenced),
     ]
+    rows += _accuracy_rows(metadata.accuracy) if metadata.accuracy is not None else []
     if metadata.residual_rms_m is not None:
         east, north, up = metadata.residual_rms_m
         left_out = f"; {metadata.positions_rejected} positions not trusted" if metadata.positions_rejected else ""
@@ -154,6 +190,19 @@ def report_rows(metadata: ReconstructionReport) -> list[tuple[str, str]]:
         against = metadata.attitude_difference_deg
         recorded = f"; down is {against:.1f}° from what the drone recorded" if against is not None else ""
         rows.append(("Tilt of the views", f"{metadata.tilt_deg:.1f}° (median){recorded}"))
+    return rows
+
+
+def _accuracy_rows(accuracy: AccuracyFacts) -> list[tuple[str, str]]:
+    rows = [("Accuracy", accuracy.summary)] if accuracy.summary else []
+    if accuracy.positions_m is not None:
+        east, north, up = accuracy.positions_m
+        words = {
+            "drifts": f"; altitudes drift by {accuracy.altitude_drift_m:+.0f} m, left out",
+            "unused": "; altitudes are of no use, left out",
+        }.get(accuracy.altitude, "")
+        found = f"{east:.2g} m east, {north:.2g} m north, {up:.2g} m up (one standard deviation, by the flight itself)"
+        rows.append(("Positions are good to", f"{found}{words}"))
     return rows
 
 

@@ -27,6 +27,10 @@ MAX_ROLL, MAX_ROLL_PARALLEL = float(np.sin(np.radians(10.0))) ** 2, 0.5
 MAX_ROLL_RATIO = 0.25
 #: Roll for which right vectors count as much as the mean image-up does: where they spread by less, that decides.
 ROLL_PRIOR = 0.002
+#: Views whose mean is so long look down alike; it agrees with the shape of the flight within so many degrees (choice).
+LOOKS_DOWN, AGREE_DEG = 0.85, 12.0
+#: Standard deviations of up in degrees: by views that look down, by cameras that are held level, where in doubt.
+VIEWS_DEG, LEVEL_DEG, UNCERTAIN_DEG = 3.0, 5.0, 20.0
 HINT = "--up x|y|z|-x|-y|-z says it outright."
 
 
@@ -109,3 +113,19 @@ def _level(rights: np.ndarray, image_up: np.ndarray) -> np.ndarray:
     mean = image_up / np.linalg.norm(image_up)
     moment = rights.T @ rights / len(rights) + ROLL_PRIOR * (np.eye(3) - np.outer(mean, mean))
     return np.asarray(np.linalg.eigh(moment)[1][:, 0])
+
+
+def up_by_views(centers: np.ndarray, rotations: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, float, bool]:
+    """Up as `estimate_up` has it, joined with the mean view where that looks down; its standard deviation in degrees;
+    and whether up cannot be down."""
+    doubts: list[str] = []
+    up, how = estimate_up(centers, rotations, points, doubts)
+    mean = -rotations[:, 2].mean(axis=0)
+    if np.linalg.norm(mean) < LOOKS_DOWN or how.startswith("level"):
+        return up, (UNCERTAIN_DEG if doubts else LEVEL_DEG), not doubts
+    mean = mean / np.linalg.norm(mean)
+    if up @ mean < np.cos(np.radians(AGREE_DEG)):  # a slope, or a lone oblique look: the views are nearer to the truth
+        return mean, max(VIEWS_DEG, float(np.degrees(np.arccos(np.clip(up @ mean, -1, 1)))) / 2), bool(up @ mean > 0)
+    one_way = np.linalg.norm(rotations[:, 1].mean(axis=0)) > MIN_UP_AGREEMENT  # how the camera hangs does not cancel
+    middle = up + (1 if one_way else 2) * mean
+    return middle / np.linalg.norm(middle), VIEWS_DEG * (2 if one_way else 1), not doubts

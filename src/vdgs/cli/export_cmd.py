@@ -9,7 +9,7 @@ from typing import Annotated
 from tyro.conf import Positional, UseAppendAction, arg
 
 from vdgs.cli.common import make_console, parse_arguments, select_device
-from vdgs.config.commands import ExportRequest
+from vdgs.config.commands import ExportRequest, ProgramName
 from vdgs.config.executor_options import ExecutorOptions
 from vdgs.config.ranges import WORKER_COUNT
 from vdgs.kernels import configure_threads
@@ -22,9 +22,12 @@ class ExportArguments(ExportRequest):
     run: Positional[Path]
     """Run folder."""
     to: Annotated[tuple[Path, ...], UseAppendAction] = ()
-    """A file to write, by its ending: .ply (3DGS), .spz, .splat, .sog, .glb (glTF), FOLDER/tileset.json (3D Tiles),
-    .points.ply, .laz, .las (point clouds), .html (a page that shows the scene offline). Give --output again for more: the
-    scene is baked once (docs/export.md)."""
+    """A file to write, by its ending: .ply (3DGS), .compressed.ply (PlayCanvas), .spz, .splat, .sog, .glb (glTF),
+    FOLDER/tileset.json (3D Tiles), .points.ply, .laz, .las (point clouds), .html (a page that shows the scene offline).
+    Give --output again for more: the scene is baked once (docs/export.md)."""
+    program: Annotated[ProgramName | None, arg(name="for")] = None
+    """Turn the files for this program, so that it shows the scene upright, and refuse files that it does not open.
+    Without --output: write RUN/export/ and the file that suits it best."""
     quiet: bool = False
     """Print nothing but notes, warnings and errors."""
     jobs: Annotated[int, WORKER_COUNT] = 0

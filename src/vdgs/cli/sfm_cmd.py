@@ -20,12 +20,13 @@ class SfmArguments:
 
     images: Positional[tuple[Path, ...]]
     """Folders of photographs, those below them included. A folder masks/ beside photographs has their masks (white =
-    keep), named like them: name.png or name.jpg.png."""
+    keep), named like them: name.png or name.jpg.png; name_mask.jpg beside name.jpg is one too."""
     output: Path
     """Folder of the capture; new, or the one to go on with."""
     gps: Path | None = None
-    """CSV with the header name,lat,lon,alt: positions to use instead of those in the photographs. Names
-    need no folder and no extension where they are told apart without."""
+    """Table of positions to use instead of those in the photographs: columns name,lat,lon,alt as exiftool, Metashape,
+    Pix4D, RealityScan and others name them, ODM's geo.txt or DJI's .MRK. Names need no folder and no extension where
+    they are told apart without."""
     dry_run: bool = False
     """Only look: what the photographs say, what would be done and how long it takes. Writes nothing."""
     threads: Annotated[int, WORKER_COUNT] = 0

@@ -39,8 +39,9 @@ class CaptureOptions:
     up: UpAxis = "auto"
     """Which axis of the capture's own world points up. auto: georeference, GPS, or estimated."""
     gps: Path | None = None
-    """CSV with the header name,lat,lon,alt (further columns allowed): photographs' GPS positions. Names need no
-    folder and no extension where they are told apart without."""
+    """Table of photographs' GPS positions: columns name,lat,lon,alt as exiftool, Metashape, Pix4D, RealityScan and
+    others name them (further ones allowed), or ODM's geo.txt. Names need no folder and no extension where they are told
+    apart without."""
     georef: Path | None = None
     """georef.json saying that the world already is ENU metres. Default: the one in the capture folder."""
     max_images: Annotated[int | None, Range(2, MAX_COUNT)] = None

@@ -32,6 +32,11 @@ MAP_COORDINATE_RANGE = Range(-1e9, 1e9)
 ModelName = Literal["best", "coarse", "merged"]
 
 
+#: Programs that `vdgs export --for` writes for, and names of axes (`export.programs`, `export.formats.axes`).
+ProgramName = Literal["supersplat", "playcanvas", "spark", "gaussiansplats3d", "cesium", "blender", "unity"]
+AxesName = Literal["z-up", "y-up", "y-down", "y-up-left"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class RunRequest:
     """Everything from a capture to a report (`vdgs run`)."""
@@ -154,9 +159,18 @@ class ExportRequest:
     run: Path
     """Run folder."""
     output: tuple[Path, ...] = ()
-    """A file to write, by its ending: .ply (3DGS), .spz, .splat, .sog, .glb (glTF), FOLDER/tileset.json (3D Tiles),
-    .points.ply, .laz, .las (point clouds), .html (a page that shows the scene offline). Give --output again for more: the
-    scene is baked once (docs/export.md)."""
+    """A file to write, by its ending: .ply (3DGS), .compressed.ply (PlayCanvas), .spz, .splat, .sog, .glb (glTF),
+    FOLDER/tileset.json (3D Tiles), .points.ply, .laz, .las (point clouds), .html (a page that shows the scene offline).
+    Give --output again for more: the scene is baked once (docs/export.md)."""
+    program: Annotated[ProgramName | None, FlagName("for")] = None
+    """Turn the files for this program, so that it shows the scene upright, and refuse files that it does not open.
+    Without --output: write RUN/export/ and the file that suits it best."""
+    axes: AxesName | None = None
+    """How the axes of .ply, .spz, .splat and .sog files stand: z-up (x east, y north, z up: the usual ones of .ply),
+    y-up (of .spz: x east, z south), y-down (of .compressed.ply, .splat and .sog: x west, z south), y-up-left
+    (left-handed: x east, z north). Instead of --for."""
+    spz_version: Literal[2, 3, 4] = 3
+    """Version of .spz files: 2 for older programs, 4 (zstd) for those of 2026; 3D Tiles always hold 2."""
     model: ModelName = "best"
     """Which model; `best` is the merged one where there is one."""
     block: Annotated[int | None, Range(0, 10_000)] = None

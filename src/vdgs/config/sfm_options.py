@@ -30,12 +30,21 @@ class SfmOptions:
     max_output_size: Annotated[int, Range(16, 1_000_000, allow_zero=True)] = 0
     """Longer side of the photographs that are written into images/, in pixels; 0: as large as they are."""
     gcp: Path | None = None
-    """gcp_list.txt (as for ODM): surveyed points and where photographs show them. The model is brought to them."""
+    """gcp_list.txt (as for ODM): surveyed points and where photographs show them. The model is brought to them; that of
+    a finished capture in seconds."""
     check_points: tuple[str, ...] = ()
     """Names of points of --gcp that are held out and only measured afterwards; all: every one."""
+    georeference: Literal["auto", "anyway", "off"] = "auto"
+    """Whether positions and control points place the scene. auto: as far as they are good, with their accuracy; not
+    where that is worse than nothing, and an error where they contradict the photographs; anyway: as they are; off: not
+    at all (metres then come from --scale-bar). Changed afterwards, the finished capture is placed anew in seconds."""
+    scale_bar: Path | None = None
+    """Text file of known distances: lines `NAME px py photograph` mark points in two photographs or more, lines
+    `NAME NAME metres` say how far they are apart. Gives the scale without positions, or in place of theirs."""
     gps_std_m: Annotated[tuple[float, float], Range(0, 100_000, above=True)] = (1.0, 2.0)
     """Standard deviation of GPS positions across and upwards, in metres, where the photographs say none themselves (RTK
-    in XMP; GPSHPositioningError in EXIF, with heights as much worse as here)."""
+    in XMP; GPSHPositioningError in EXIF, with heights as much worse as here). Poses do not depend on it; how far off
+    positions are is found from the flight itself, and what is said here of a table counts beside it."""
 
 
 @dataclass(frozen=True, kw_only=True)

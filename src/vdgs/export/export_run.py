@@ -29,15 +29,17 @@ from vdgs.export.formats.gaussian_store import GaussianStore
 from vdgs.export.formats.tiles_3d import TILESET_FILE, tileset_files
 from vdgs.export.gaussian_optimization import optimize_gaussians
 from vdgs.export.gaussian_selection import frame_for_file, local_bounds, select_gaussians, select_rows
-from vdgs.export.local_bake import LocalBake, make_progress_bar
+from vdgs.export.local_bake import BAKING, LocalBake, make_progress_bar
 from vdgs.export.local_frame import LocalFrame
 from vdgs.export.novel_cameras import color_iteration_count, endless_cameras
+from vdgs.export.programs import axes_for, with_files
 from vdgs.geometry.camera import Camera
 from vdgs.model.gaussians import Gaussians
 from vdgs.runs.open_run import OpenedRun, open_run
 from vdgs.runs.run_folder import REPORT_FILE
 from vdgs.system.atomic_files import to_jsonable, write_json
 from vdgs.system.documents import ExportedFile, ExportMetadata, JsonObject
+from vdgs.system.scratch import remove_leftovers
 from vdgs.system.stop_signals import check_stop_requested
 
 #: What was written and lost, beside the run's other results.
@@ -53,12 +55,20 @@ class _BakedScene:
     #: How pages show it first, in the ground frame.
     page: InitialView
 
-    def scene(self, frame: LocalFrame, rows: Int[np.ndarray, " r"]) -> ExportScene:
-        """What a writer is given: the Gaussians of these rows."""
+    def scene(self, frame: LocalFrame, rows: Int[np.ndarray, " r"], path: Path, asked: ExportRequest) -> ExportScene:
+        """What a writer is given for a file: the Gaussians of these rows."""
         chunks = (frame.to_local(piece) for piece in self.pieces(rows))
         bounds, page = local_bounds(frame, self.spool.means[rows]), _view_in_frame(self.page, frame)
+        axes = axes_for(path, asked)
         return ExportScene(
-            chunks=chunks, count=len(rows), degree=self.degree, metadata=frame.facts, bounds=bounds, page=page
+            chunks=chunks,
+            count=len(rows),
+            degree=self.degree,
+            metadata=frame.facts,
+            bounds=bounds,
+            page=page,
+            axes=axes,
+            spz_version=asked.spz_version,
         )
 
     def pieces(self, rows: Int[np.ndarray, " r"]) -> Iterator[Gaussians]:
@@ -97,7 +107,8 @@ def export_run(request: ExportRequest, console: Console, execution: ExecutionOpt
     capture's inputs, an empty choice, and coordinates that a format or the capture does not have; and what
     `ShardedJob.send` raises.
     """
-    _check_names(request.run, request.output)
+    request = with_files(request)
+    _check_names(request)
     request = drop_unused_sh_degrees(request)
     run = open_run(request.run, request.model, request.device)
     if run.warning:
@@ -106,11 +117,12 @@ def export_run(request: ExportRequest, console: Console, execution: ExecutionOpt
         check_not_among_inputs(path, run.capture)
     center = np.median(run.model.anchors.positions.cpu().double().numpy(), axis=0)
     frames = {path: frame_for_file(path, run, request, center) for path in request.output}
+    _tidy(request.output, console)
     began = time.monotonic()
     with _make_baker(run, request, execution, console) as baker:
         pixels = baker.pixels()
         kept = select_gaussians(pixels, run, request)
-        rows = select_rows(frames, run, pixels, kept, request.sh_degree, console)
+        rows = select_rows(frames, run, pixels, kept, request.sh_degree, console, request.spz_version)
         console.print(
             f"{run.summary}: {len(kept):,} Gaussians of {len(pixels):,} are drawn by the training cameras"
             + (" and asked for" if len(kept) < np.count_nonzero(pixels) else ""),
@@ -123,7 +135,9 @@ def export_run(request: ExportRequest, console: Console, execution: ExecutionOpt
             seconds = time.monotonic() - began
             rounds = color_iteration_count(request.color_iterations, gaussian_count(run.model))
             console.print(f"baked in {seconds:.1f} s, colours fitted again in {rounds} rounds", highlight=False)
-            files = [_write(path, baked.scene(frames[path], rows[path]), console) for path in request.output]
+            files = [
+                _write(path, baked.scene(frames[path], rows[path], path, request), console) for path in request.output
+            ]
             losses = _measure_losses(run, frames, baked, request, console)
     record: ExportMetadata = to_jsonable({
         "model": run.name, "key": run.key, "gaussians": len(kept), "sh_degree": request.sh_degree, "rounds": rounds,
@@ -157,11 +171,23 @@ def _optimize(baked: BakedGaussians, training: Sequence[Camera], seconds: float,
         optimize_gaussians(baked, endless_cameras(training), seconds, after_step)
 
 
-def _check_names(run: Path, paths: tuple[Path, ...]) -> None:
-    if not paths:
-        raise VdgsError("Nothing to write: give --output FILE, such as --output scene.ply.")
+def _tidy(paths: tuple[Path, ...], console: Console) -> None:
+    """Remove what killed exports left beside the files that are written now."""
+    found = remove_leftovers(paths[0].parent / BAKING)
     for path in paths:
-        registry.format_from_path(path)
+        found += registry.format_from_path(path).tidy(path)
+    if found:
+        console.print(
+            f"[yellow]note[/] removed what a killed export had left: {', '.join(map(str, found))}", highlight=False
+        )
+
+
+def _check_names(asked: ExportRequest) -> None:
+    run, paths = asked.run, asked.output
+    if not paths:
+        raise VdgsError("Nothing to write: give --output FILE, such as --output scene.ply, or --for PROGRAM.")
+    for path in paths:
+        axes_for(path, asked)
         check_not_in_capture(path)
         if path.name.lower() == REPORT_FILE and os.path.realpath(path.parent) == os.path.realpath(run):
             raise VdgsError(

@@ -77,7 +77,7 @@ def frame_for_file(path: Path, run: OpenedRun, request: ExportRequest, center: n
 
 def select_rows(
     frames: Mapping[Path, LocalFrame], run: OpenedRun, pixels: Float[np.ndarray, " g"], kept: Int[np.ndarray, " m"],
-    degree: int, console: Console,
+    degree: int, console: Console, spz_version: int = 3,
 ) -> dict[Path, Int[np.ndarray, " r"]]:  # fmt: skip
     """Which of the Gaussians each file is given. What a format cannot hold is said before the work.
 
@@ -109,6 +109,7 @@ def select_rows(
                 degree=degree,
                 metadata=frame.facts,
                 bounds=local_bounds(frame, means[rows[path]]),
+                spz_version=spz_version,
             ),
         )
     return rows

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,7 +19,11 @@ from vdgs.export.formats.export_scene import ExportScene
 from vdgs.export.formats.gaussian_store import GaussianStore, write_store
 from vdgs.export.novel_cameras import color_iteration_cameras, color_iteration_count
 from vdgs.runs.open_run import OpenedRun
+from vdgs.system.scratch import scratch_folder
 from vdgs.system.stop_signals import check_stop_requested
+
+#: What scratch folders of the Gaussians are named after.
+BAKING = "baking"
 
 
 def make_progress_bar(console: Console) -> Progress:
@@ -55,11 +58,10 @@ class LocalBake:
     def spool(self, kept: Int[np.ndarray, " m"]) -> Iterator[GaussianStore]:
         """These Gaussians in a temporary file beside the first output; `pixels` was asked before."""
         folder = self._asked.output[0].parent
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder, prefix=".baking-") as temporary:
+        with scratch_folder(folder / BAKING) as temporary:
             with make_progress_bar(self._console) as bar:
                 try:
-                    spool = self._fitted(kept, Path(temporary) / "spool", bar)
+                    spool = self._fitted(kept, temporary / "spool", bar)
                 except OSError as error:
                     raise VdgsError(
                         f"{folder}: cannot hold the scene ({error.strerror or error}). Nothing was written."

@@ -9,9 +9,6 @@ from jaxtyping import Float
 
 #: Points whose second principal spread is below this share of the first lie on one line.
 MAX_COLLINEAR_RATIO = 0.02
-#: Matched points disagree where a fit leaves them farther off (RMS) than this share of their spread, or where fewer
-#: than this share of them trust it: what they say of scale and directions is chance (choice).
-MAX_RELATIVE_RMS, MIN_INLIER_FRACTION = 0.25, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,21 +80,19 @@ def fit_similarity_robust(
     return best, inliers
 
 
-def describe_disagreement(residuals: np.ndarray, targets: np.ndarray, inliers: np.ndarray) -> str:
-    """How far matched points are from agreeing on a similarity, in words; empty where they agree.
-
-    residuals [n, 3] are of all points, `trusted` [n] bool are those that the fit trusts; targets [m, 3] in metres
-    tell the spread.
-    """
-    rms = float(np.sqrt((residuals[inliers] ** 2).sum(axis=1).mean()))
-    spread = float(np.sqrt((targets - targets.mean(axis=0)).var(axis=0).sum()))
-    if inliers.mean() < MIN_INLIER_FRACTION or rms > MAX_RELATIVE_RMS * spread:
-        return f"{inliers.sum()} of {len(inliers)} agree, RMS {rms:.3g} m over a flight of {spread:.3g} m"
-    return ""
-
-
 def _residuals(similarity: Similarity, source: np.ndarray, target: np.ndarray) -> np.ndarray:
     return np.linalg.norm(similarity.apply(source) - target, axis=1)
+
+
+def rotation_to_z(up: np.ndarray) -> np.ndarray:
+    """The smallest rotation [3, 3] that takes the unit vector `up` to z (half a turn about x for -z)."""
+    x, y, z = up / np.linalg.norm(up)
+    across = x * x + y * y
+    if z < 0 and across < 1e-300:
+        return np.diag([1.0, -1.0, -1.0])
+    # 1 / (1 + z) without its cancellation near -z.
+    a = 1 / (1 + z) if z >= 0 else (1 - z) / across
+    return np.array([[1 - a * x * x, -a * x * y, -x], [-a * x * y, 1 - a * y * y, -y], [x, y, z]])
 
 
 def geometric_median(points: np.ndarray, max_points: int = 20_000) -> np.ndarray:

@@ -15,7 +15,9 @@
 or a camera path exported by nerfstudio's viewer (`camera_path`, OpenGL cameras): in nerfstudio's own frame, which
 dataparser_transforms.json leads back from (`films.nerfstudio`), unless it has a `frame` too. `fov_deg` is the vertical
 angle of view. What a key frame leaves out of the intrinsics comes from the camera that the caller gives. What is not
-named here is a mistake, but in a file of nerfstudio's, which holds more than is of use here.
+named here is a mistake. So it is in a file of nerfstudio's, where what its editor keeps for itself (`keyframes`,
+`smoothness_value`, ...) has its part in the frames already; what asks for another camera, a crop or another time is
+refused.
 """
 
 from __future__ import annotations
@@ -53,6 +55,14 @@ _FRAMES = ("ground", "source")
 _INTRINSICS = ("fx", "fy", "cx", "cy")
 _SIZE = ("width", "height")
 _FRAME_KEYS = ("position", "look_at", "up", "camera_from_world", "fov_deg", *_INTRINSICS, *_SIZE)
+#: What a file of nerfstudio's may hold. Its editor's own settings have made the frames of `camera_path`.
+_NERFSTUDIO_KEYS = (
+    "camera_path", "camera_type", "render_width", "render_height", "fps", "seconds", "frame", "crop", "closed",
+    "keyframes", "smoothness_value", "is_cycle", "default_fov", "default_transition_sec",
+)  # fmt: skip
+_NERFSTUDIO_FRAME_KEYS = ("camera_to_world", "fov", "aspect", "render_time")
+#: How far the aspect of a frame may be from the film's: nerfstudio rounds it.
+_SAME_ASPECT = 0.02
 #: Focal lengths and principal points, in pixels.
 _FOCAL, _PIXELS = Range(0, 1e7, exclusive_min=True), Range(-1e7, 1e7)
 _SIDE = Range(1, commands.MAX_RENDER_SIDE_PX)
@@ -94,7 +104,7 @@ def load_path(
         cameras = [_to_ground(camera, ground) for camera in cameras]
     if interpolated or (seconds is not None and len(cameras) > 1):
         cameras = interpolate(cameras, frame_count(length, rate), closed=closed)
-    return CameraPath(tuple(_unify_size(cameras)), rate)
+    return CameraPath(tuple(cameras), rate)
 
 
 def _read(file: Path) -> Mapping[str, Any]:
@@ -118,7 +128,7 @@ def _from_keyframes(content: Mapping[str, Any], default: Camera) -> tuple[list[C
     _check_keys(content, _FILE_KEYS)
     frames, frame = content.get("keyframes"), _frame(content, "ground")
     _require(isinstance(frames, list) and len(frames) > 0, "`keyframes` must be a list of at least one")
-    cameras = []
+    cameras, default = list[Camera](), _common_size(frames or [], default)
     for number, entry in enumerate(frames or []):
         try:
             _require(isinstance(entry, Mapping), "it must be an object")
@@ -126,6 +136,28 @@ def _from_keyframes(content: Mapping[str, Any], default: Camera) -> tuple[list[C
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise ValueError(f"key frame {number}: {error}") from error
     return cameras, _flag(content, "interpolate", True) and len(cameras) > 1, frame
+
+
+def _common_size(frames: Sequence[Any], default: Camera) -> Camera:
+    """The default in the size that key frames ask for. Raises ValueError where they ask for several: a path has one."""
+    first: tuple[int, Camera] | None = None
+    for number, entry in enumerate(frames):
+        if not isinstance(entry, Mapping) or all(entry.get(name) is None for name in _SIZE):
+            continue
+        try:
+            width, height = (_number(entry, name, _SIDE) for name in _SIZE)
+        except ValueError as error:
+            raise ValueError(f"key frame {number}: {error}") from error
+        asked = default.resized(int(width or default.width), int(height or default.height))
+        if first is None:
+            first = number, asked
+        elif (asked.width, asked.height) != (first[1].width, first[1].height):
+            raise ValueError(
+                f"key frame {number} asks for {asked.width}x{asked.height}, key frame {first[0]} for "
+                f"{first[1].width}x{first[1].height}, and a path has one size. Give one width and height, or leave "
+                "them out and use --width"
+            )
+    return default if first is None else first[1]
 
 
 def _frame(content: Mapping[str, Any], default: str) -> str:
@@ -148,9 +180,6 @@ def _keyframe(entry: Mapping[str, Any], default: Camera) -> Camera:
             _vector(entry.get("up", (0, 0, 1)), "up"),
         )
     camera = replace(default, camera_from_world=pose)
-    width, height = (_number(entry, name, _SIDE) for name in _SIZE)
-    if width or height:
-        camera = camera.resized(int(width or camera.width), int(height or camera.height))
     fov = _number(entry, "fov_deg", _FOV_DEG)
     if fov is not None:
         _require("fx" not in entry and "fy" not in entry, "give fov_deg or fx and fy, not both")
@@ -163,6 +192,14 @@ def _keyframe(entry: Mapping[str, Any], default: Camera) -> Camera:
 def _from_nerfstudio(content: Mapping[str, Any], default: Camera) -> tuple[list[Camera], bool, str]:
     """nerfstudio: camera_to_world of OpenGL cameras (+y up, +z backward), 16 numbers, vertical `fov`; every frame is
     there."""
+    _check_keys(content, _NERFSTUDIO_KEYS)
+    kind = content.get("camera_type", "perspective")
+    _require(
+        isinstance(kind, str) and kind.lower() in ("perspective", "persp"),
+        f"camera_type is {kind!r}, and only perspective cameras are drawn. Choose Perspective in nerfstudio and export "
+        "the path again",
+    )
+    _require(content.get("crop") is None, "it has a crop, and no part of a scene is drawn alone. Remove `crop`")
     width, height = (_number(content, f"render_{name}", _SIDE) for name in _SIZE)
     size = int(width or default.width), int(height or default.height)
     entries = content["camera_path"]
@@ -172,12 +209,27 @@ def _from_nerfstudio(content: Mapping[str, Any], default: Camera) -> tuple[list[
         try:
             _require(isinstance(entry, Mapping), "it must be an object")
             _require("camera_to_world" in entry, "camera_to_world is missing")
+            _check_keys(entry, _NERFSTUDIO_FRAME_KEYS)
+            _refuse_other_frames(entry, size if width and height else None)
             world_from_camera = _matrix(entry["camera_to_world"], "camera_to_world") @ np.diag([1.0, -1.0, -1.0, 1.0])
             camera = replace(default.resized(*size), camera_from_world=np.linalg.inv(world_from_camera))
             cameras.append(_with_fov(camera, _number(entry, "fov", _FOV_DEG) or 50.0))
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise ValueError(f"frame {number} of camera_path: {error}") from error
     return cameras, False, _frame(content, "nerfstudio")
+
+
+def _refuse_other_frames(entry: Mapping[str, Any], size: tuple[int, int] | None) -> None:
+    """Raise ValueError for a frame of another shape than the film's, and for one of another time."""
+    aspect = _number(entry, "aspect", Range(0, 1e6, exclusive_min=True))
+    if aspect is not None and size is not None:
+        same = abs(aspect * size[1] / size[0] - 1) <= _SAME_ASPECT
+        _require(
+            same,
+            f"its aspect is {aspect:g}, but render_width and render_height say {size[0]}x{size[1]}: give one shape",
+        )
+    moment = entry.get("render_time")
+    _require(moment in (None, 0, 0.0), f"render_time is {moment!r}, and the scene stands still. Remove `render_time`")
 
 
 def _check_keys(entry: Mapping[str, Any], keys: Sequence[str]) -> None:
@@ -244,8 +296,3 @@ def _to_ground(camera: Camera, ground: GroundFrame) -> Camera:
     return replace(
         camera, camera_from_world=pose_from_rotation(camera.camera_from_world[:3, :3] @ ground.rotation.T, position)
     )
-
-
-def _unify_size(cameras: Sequence[Camera]) -> list[Camera]:
-    """A film has one size: the first camera's."""
-    return [camera.resized(cameras[0].width, cameras[0].height) for camera in cameras]

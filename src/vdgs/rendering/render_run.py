@@ -24,7 +24,7 @@ from vdgs.rendering import camera_paths, render_folder
 from vdgs.rendering.colorbar import add_colorbar, draw_colorbar
 from vdgs.rendering.path_io import load_path
 from vdgs.rendering.scalar_maps import ScalarMap, make_scalar_map
-from vdgs.rendering.video import VideoWriter
+from vdgs.rendering.video import VideoWriter, caution, default_encoder
 from vdgs.runs.open_run import OpenedModel, open_capture, open_model
 from vdgs.runs.run_cameras import RunCameras, load_run_cameras, run_cameras_of_capture
 from vdgs.runs.run_folder import RunFolder
@@ -97,6 +97,8 @@ def _write_video(
         raise VdgsError(
             f"{request.output}: a film needs frames of one size, and these views have {len(sizes)}. Give a folder."
         )
+    if (said := caution(default_encoder())) is not None:
+        console.print(f"[yellow]note[/] {said}", highlight=False)
     with VideoWriter(request.output, fps) as film:
         drawn = _scalar_map(request, run, flight, named)
         for frame in _frames(request, run, named, drawn, console):

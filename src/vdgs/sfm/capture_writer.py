@@ -92,7 +92,7 @@ def _write_one(output: Path, workspace: Workspace, undistortion: Undistortion, n
     targets = [output / folder / jpeg_name(name) for folder, _ in IMAGE_SIZES]
     if all(target.is_file() for target in targets):
         return
-    pixels, _ = decode_image(workspace.images / name)
+    pixels, _ = decode_image((workspace.images / name).resolve())
     straight = cv2.remap(
         pixels, undistortion.grid[..., 0], undistortion.grid[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
     )

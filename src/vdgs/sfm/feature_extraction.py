@@ -12,11 +12,12 @@ from PIL import Image, ImageOps
 from rich.console import Console
 
 from vdgs.captures.image_files import pillow_without_limits
+from vdgs.captures.jpeg import with_end
 from vdgs.errors import CaptureError
 from vdgs.sfm.image_list import ExcludedImage
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.workspace import Workspace, call_cancellable, report_progress
-from vdgs.system.atomic_files import write_atomic
+from vdgs.system.atomic_files import write_atomic, write_bytes
 
 #: A focal length over the longer side where nothing says one: COLMAP's own guess.
 DEFAULT_FOCAL_FACTOR = 1.2
@@ -81,19 +82,22 @@ def write_upright_images(workspace: Workspace, photographs: Sequence[ImageMetada
         if target.exists():
             continue
         target.parent.mkdir(parents=True, exist_ok=True)
+        target.unlink(missing_ok=True)  # a link that leads nowhere
+        if photo.orientation == 1 and not photo.whole:
+            write_bytes(target, with_end(photo.path).read())
+            continue
         if photo.orientation == 1:
-            target.unlink(missing_ok=True)  # a link that leads nowhere
             os.symlink(photo.path.resolve(), target)
             continue
         try:
-            _write_upright(photo.path, target)
+            _write_upright(photo, target)
         except (OSError, SyntaxError, ValueError) as error:
             failed.append(ExcludedImage(photo.name, f"cannot be decoded ({error}): copy it again"))
     return failed
 
 
-def _write_upright(source: Path, target: Path) -> None:
-    with pillow_without_limits(), Image.open(source) as image:
+def _write_upright(photo: ImageMetadata, target: Path) -> None:
+    with pillow_without_limits(), Image.open(photo.path if photo.whole else with_end(photo.path)) as image:
         upright = ImageOps.exif_transpose(image).convert("RGB")
     kind = (
         "PNG" if target.suffix.lower() == ".png" else "TIFF" if target.suffix.lower() in (".tif", ".tiff") else "JPEG"

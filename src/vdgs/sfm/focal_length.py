@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
-from vdgs.sfm.xmp import first_number
+from vdgs.sfm.xmp import first_number, text
 
 #: Width in millimetres of the sensors of cameras that do not say it in EXIF, by EXIF's model.
 SENSOR_WIDTH_MM = {
@@ -22,10 +22,16 @@ MAX_SENSOR_ASPECT = 1.6
 MIN_FOCAL, MAX_FOCAL = 0.2, 20.0
 _INCH, _CENTIMETRE, _MILLIMETRE = 25.4, 10.0, 1.0
 _UNITS = {2: _INCH, 3: _CENTIMETRE, 4: _MILLIMETRE}
-
-
 #: What says a focal length that was measured, lens by lens.
 CALIBRATED_SOURCE = "the maker's calibration in XMP"
+SENSOR, EQUIVALENT = "EXIF's focal length and sensor", "EXIF's 35 mm equivalent"
+#: Two ways to a focal length that differ by more than this factor contradict each other. The 35 mm equivalent is a
+#: whole number, of the diagonal or of the width: up to 15 %.
+AGREE = 1.25
+#: Sides of a picture whose proportions differ by more than this share were cut.
+CUT = 0.02
+#: A digital zoom beyond this is damage.
+LARGEST_ZOOM = 100.0
 
 
 @dataclass(frozen=True)
@@ -34,23 +40,109 @@ class Lens:
 
     focal: float
     source: str
+    doubt: str = ""
+    """What contradicts it; a focal length that is doubted is fitted."""
+    zoom: float = 1.0
+    """The digital zoom that `focal` is multiplied by."""
+    focal_mm: float | None = None
+    """EXIF's FocalLength."""
 
 
 def read_lens(
     tags: Mapping[int, Any], details: Mapping[int, Any], xmp: Mapping[str, str], width: int, height: int
 ) -> Lens | None:
-    """What is best known of: the maker's calibration, EXIF's sensor, a table of sensors, the 35 mm equivalent."""
+    """What is best known of: the maker's calibration, EXIF's sensor, a table of sensors, the 35 mm equivalent.
+
+    Each is held against the others, and what contradicts most of them is not taken.
+    """
     longer = max(width, height)
-    original = max(_number(details.get(0xA002)) or 0.0, _number(details.get(0xA003)) or 0.0) or float(longer)
-    model = _model(tags)
+    original, cut = _original(details, width, height)
+    model, zoom = _model(tags), _zoom(details)
     focal_mm, equivalent_mm = _number(details.get(0x920A)), _number(details.get(0xA405))
-    ways = (
-        (_calibrated(xmp, original), CALIBRATED_SOURCE),
-        (_by_sensor(focal_mm, _sensor(details, original)), "EXIF's focal length and sensor"),
-        (_by_sensor(focal_mm, SENSOR_WIDTH_MM.get(model)), f"EXIF's focal length, the sensor of {model}"),
-        (_by_equivalent(equivalent_mm, width, height), "EXIF's 35 mm equivalent"),
+    kept = zoom * (original / longer if cut else 1.0)  # a picture that was cut has fewer pixels, of the same size
+    measured = [
+        (_times(_calibrated(xmp, original), kept), CALIBRATED_SOURCE),
+        (_times(_by_sensor(focal_mm, _sensor(details, original)), kept), SENSOR),
+        (_times(_by_sensor(focal_mm, SENSOR_WIDTH_MM.get(model)), kept), f"EXIF's focal length, the sensor of {model}"),
+    ]
+    sides = (_number(details.get(0xA002)) or 0.0, _number(details.get(0xA003)) or 0.0) if cut else (width, height)
+    equivalent = _times(_by_equivalent(equivalent_mm, *sides), kept / zoom)
+    equivalent = _zoomed_equivalent(equivalent, [focal for focal, _ in measured], zoom)
+    ways = [*measured, (equivalent, EQUIVALENT)]
+    known = [(focal, source) for focal, source in ways if focal and MIN_FOCAL < focal < MAX_FOCAL]
+    if not known:
+        return None
+    focal, source, doubt = _agreed(known, longer, copied=equivalent_mm == focal_mm)
+    return Lens(focal, source, doubt, 1.0 if source == EQUIVALENT else zoom, focal_mm)
+
+
+def unzoomed(lens: Lens) -> Lens:
+    """The lens where EXIF's focal length has the digital zoom in it already."""
+    return replace(lens, focal=lens.focal / lens.zoom, zoom=1.0)
+
+
+def _agreed(known: list[tuple[float, str]], longer: int, copied: bool) -> tuple[float, str, str]:
+    """The first of the ways that most others agree with, its source, and what contradicts it.
+
+    The calibration and EXIF's sensor are one witness: both count pixels of the original, whose size a program that
+    shrinks a photograph may rewrite. Of witnesses that contradict each other the 35 mm equivalent is the likelier:
+    it stays right then; but not where it merely repeats the focal length. After it comes the table of sensors.
+    """
+    support = [len({_witness(how) for other, how in known if _alike(one, other)}) for one, _ in known]
+    most = [k for k, count in enumerate(support) if count == max(support)]
+    chosen = most[0]
+    if max(support) == 1:
+        trust = {EQUIVALENT: 0 if not copied else 4, CALIBRATED_SOURCE: 2, SENSOR: 3}
+        chosen = min(most, key=lambda k: trust.get(known[k][1], 1))
+    focal, source = known[chosen]
+    others = [f"{other * longer:.0f} px by {how}" for other, how in known if not _alike(other, focal)]
+    if not others:
+        return focal, source, ""
+    return (
+        focal,
+        source,
+        (
+            f"two ways to the focal length contradict each other: {', '.join(others)}, but {focal * longer:.0f} px by "
+            f"{source}, which is taken"
+        ),
     )
-    return next((Lens(focal, source) for focal, source in ways if focal and MIN_FOCAL < focal < MAX_FOCAL), None)
+
+
+def _witness(source: str) -> str:
+    return SENSOR if source == CALIBRATED_SOURCE else source
+
+
+def _alike(one: float, other: float) -> bool:
+    return 1 / AGREE < one / other < AGREE
+
+
+def _zoom(details: Mapping[int, Any]) -> float:
+    """EXIF's DigitalZoomRatio; 0 and nothing mean that none was used."""
+    zoom = _number(details.get(0xA404)) or 1.0
+    return zoom if 1 <= zoom <= LARGEST_ZOOM else 1.0
+
+
+def _zoomed_equivalent(equivalent: float | None, others: Sequence[float | None], zoom: float) -> float | None:
+    """Most cameras count the digital zoom in their 35 mm equivalent; where the others say that this one does not, it is
+    multiplied."""
+    known = next((other for other in others if other), None)
+    if not equivalent or known is None:
+        return equivalent
+    return min((equivalent, equivalent * zoom), key=lambda each: abs(math.log(each / known)))
+
+
+def _original(details: Mapping[int, Any], width: int, height: int) -> tuple[float, bool]:
+    """The longer side in pixels as the camera took it, and whether the picture was cut from it, not shrunk."""
+    sides = sorted(_number(details.get(tag)) or 0.0 for tag in (0xA002, 0xA003))
+    shorter, longer = sorted((width, height))
+    if not sides[1]:
+        return float(longer), False
+    other_shape = sides[0] > 0 and abs(sides[1] / sides[0] * shorter / longer - 1) > CUT
+    return sides[1], other_shape and bool({*sides} & {shorter, longer})
+
+
+def _times(focal: float | None, factor: float) -> float | None:
+    return focal * factor if focal else None
 
 
 def _number(value: Any) -> float | None:
@@ -68,11 +160,14 @@ def _model(tags: Mapping[int, Any]) -> str:
 
 def _calibrated(xmp: Mapping[str, str], original: float) -> float | None:
     """DJI: DewarpData is `date;fx,fy,cx,cy,...` in pixels of the original, CalibratedFocalLength is fx alone."""
-    words = xmp.get("drone-dji:DewarpData", "").partition(";")[2].split(",")
+    words = text(xmp, "DewarpData").partition(";")[2].split(",")
     try:
         focal = float(words[0])
     except ValueError:
-        focal = first_number(xmp, "drone-dji:CalibratedFocalLength") or 0.0
+        focal = first_number(xmp, "CalibratedFocalLength") or 0.0
+    middle = first_number(xmp, "CalibratedOpticalCenterX")
+    if middle and not 1 / AGREE < 2 * middle / original < AGREE:
+        original = 2 * middle  # a program that shrank the photograph wrote its new size into EXIF
     return focal / original if math.isfinite(focal) and focal > 0 else None
 
 
@@ -86,7 +181,7 @@ def _by_sensor(focal_mm: float | None, sensor_mm: float | None) -> float | None:
     return focal_mm / sensor_mm if focal_mm and sensor_mm and 1 < sensor_mm < 100 else None
 
 
-def _by_equivalent(equivalent_mm: float | None, width: int, height: int) -> float | None:
+def _by_equivalent(equivalent_mm: float | None, width: float, height: float) -> float | None:
     longer, shorter = max(width, height), min(width, height)
     if longer > MAX_SENSOR_ASPECT * shorter:
         shorter = round(longer * 3 / 4)

@@ -2,25 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
 from jaxtyping import Float
 from scipy.optimize import least_squares
+from scipy.stats import t as student
 
-from vdgs.captures.reconstruction import GcpReport
+from vdgs.captures.reconstruction import AccuracyFacts, GcpReport
 from vdgs.errors import CaptureError
 from vdgs.geometry.similarity import Similarity, fit_similarity, fit_similarity_robust, is_collinear
-from vdgs.sfm.gcp_list import MIN_CONTROL_POINTS, MIN_OBSERVATIONS, GcpList, GroundControlPoint
+from vdgs.sfm.bending import bend_to_points
+from vdgs.sfm.gcp_list import MIN_CONTROL_POINTS, MIN_OBSERVATIONS, GcpList, GcpObservation, GroundControlPoint
 from vdgs.sfm.georegistration import transform_model
-from vdgs.sfm.workspace import call_cancellable
 
 #: With so many points, one that does not fit the others is found and left out.
 MIN_POINTS_FOR_OUTLIERS = 6
 #: A mark is right to about so many pixels: what is farther off counts less.
 MARK_SIGMA_PX = 2.0
+#: A mark so many pixels from where the model puts a surveyed point is wrong; points whose marks are farther off than
+#: this share of a photograph's longer side are not used (choice).
+MARK_WRONG_PX, MARK_USELESS = 8.0, 0.01
+ANYWAY_GCP = (
+    "Mend the list, place by GPS and only measure the points (--check-points all), or use it as it is "
+    "(--georeference anyway)."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,70 +39,197 @@ class TriangulatedPoint:
     num_images: int
     error_px: float
     """RMS distance between where photographs show it and where the model puts it there."""
+    kept_px: float
+    """The same of the marks that agree."""
+    agreeing: tuple[GcpObservation, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Surveyed:
+    """How a model was brought to surveyed points."""
+
+    model: pycolmap.Reconstruction
+    how: str
+    doubtful: frozenset[str]
+    """Names of points that do not fit the others, or whose marks fit nothing; they were left out."""
+    accuracy: AccuracyFacts
+    notes: tuple[str, ...]
 
 
 def triangulate(model: pycolmap.Reconstruction, point: GroundControlPoint) -> TriangulatedPoint | None:
     """Where the placed photographs see a point; None where fewer than two show it from different places.
 
-    The point nearest to all rays, then the least sum of its errors in the photographs, robustly.
+    The point nearest to all rays, then the least sum of its errors in the photographs, robustly; of many marks a third
+    at most is left out, those farthest off.
     """
     images = {image.name: image for image in model.images.values() if image.has_pose}
     seen = [each for each in point.observations if each.image in images]
+    first = _nearest_to_marks(model, images, seen)
+    if first is None:
+        return None
+    kept, errors = seen, first[1]
+    while len(kept) > max(MIN_OBSERVATIONS + 1, len(seen) - len(seen) // 3) and errors.max() > MARK_WRONG_PX:
+        fewer = [each for each, error in zip(kept, errors, strict=True) if error < errors.max()]
+        found = _nearest_to_marks(model, images, fewer)
+        if found is None:
+            break
+        kept, (place, errors) = fewer, found
+    else:
+        place = first[0] if kept is seen else place
+    all_errors = _errors_px(model, images, seen, place)
+    return TriangulatedPoint(
+        place, len({each.image for each in seen}), _rms(all_errors), _rms(errors), tuple(kept)
+    )  # fmt: skip
+
+
+def _rms(errors: np.ndarray) -> float:
+    return float(np.sqrt((errors**2).mean()))
+
+
+def _nearest_to_marks(
+    model: pycolmap.Reconstruction, images: Mapping[str, pycolmap.Image], seen: Sequence[GcpObservation]
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """The place [3] that marks show, and how far each mark is from it in pixels; None where they show none."""
     if len({each.image for each in seen}) < MIN_OBSERVATIONS:
         return None
     views = [images[each.image] for each in seen]
-    cameras = [model.cameras[view.camera_id] for view in views]
     poses = [np.asarray(view.cam_from_world().matrix()) for view in views]
-    marked = np.array([each.pixel for each in seen])
     rays = [
-        np.append(np.asarray(camera.cam_from_img(pixel)).ravel()[:2], 1) @ pose[:, :3]
-        for camera, pose, pixel in zip(cameras, poses, marked, strict=True)
+        np.append(np.asarray(model.cameras[view.camera_id].cam_from_img(np.array(each.pixel))).ravel()[:2], 1)
+        @ pose[:, :3]
+        for each, view, pose in zip(seen, views, poses, strict=True)
     ]
     start = _intersect_rays(np.array([view.projection_center() for view in views]), np.array(rays))
-    if start is None:
-        return None
-
-    def errors(place: np.ndarray) -> np.ndarray:
-        shown = [
-            np.asarray(camera.img_from_cam((pose @ np.append(place, 1))[None])).ravel()
-            for camera, pose in zip(cameras, poses, strict=True)
-        ]
-        return (np.array(shown) - marked).ravel()
-
-    if any((pose @ np.append(start, 1))[2] <= 0 for pose in poses):
+    if start is None or any((pose @ np.append(start, 1))[2] <= 0 for pose in poses):
         return None  # behind a camera: the marks are of different things
-    found = least_squares(errors, start, loss="soft_l1", f_scale=MARK_SIGMA_PX, x_scale="jac").x
-    return TriangulatedPoint(found, len(views), float(np.sqrt((errors(found).reshape(-1, 2) ** 2).sum(axis=1).mean())))
+    found = least_squares(
+        lambda place: _off_px(model, images, seen, place).ravel(),
+        start,
+        loss="soft_l1",
+        f_scale=MARK_SIGMA_PX,
+        x_scale="jac",
+    ).x
+    return found, _errors_px(model, images, seen, found)
+
+
+def _off_px(
+    model: pycolmap.Reconstruction,
+    images: Mapping[str, pycolmap.Image],
+    seen: Sequence[GcpObservation],
+    place: np.ndarray,
+) -> np.ndarray:
+    shown = []
+    for each in seen:
+        view = images[each.image]
+        there = np.asarray(view.cam_from_world().matrix()) @ np.append(place, 1)
+        shown.append(np.asarray(model.cameras[view.camera_id].img_from_cam(there[None])).ravel() - each.pixel)
+    return np.array(shown)
+
+
+def _errors_px(
+    model: pycolmap.Reconstruction,
+    images: Mapping[str, pycolmap.Image],
+    seen: Sequence[GcpObservation],
+    place: np.ndarray,
+) -> np.ndarray:
+    return np.linalg.norm(_off_px(model, images, seen, place), axis=1)
 
 
 def adjust_to_gcps(
-    model: pycolmap.Reconstruction, gcps: GcpList, origin: tuple[float, float, float], fix_focal: bool, threads: int
-) -> tuple[str, set[str]]:
-    """Move a model to the points that are not held out, then bend it by them: a bundle adjustment in which they stay
-    where they were surveyed. In place, metres east, north, up of `origin`. Returns how that was done, and
-    the names of those that do not fit the others, which were left out.
+    model: pycolmap.Reconstruction,
+    gcps: GcpList,
+    origin: tuple[float, float, float],
+    fix_focal: bool,
+    threads: int,
+    doubts: Callable[[Similarity, np.ndarray, np.ndarray], str] | None,
+) -> Surveyed:
+    """Move a model, in place, to the points that are not held out, metres east, north, up of `origin`; then a copy is
+    bent by them: a bundle adjustment in which they stay where they were surveyed.
 
-    Raises CaptureError where fewer than three of the points are seen by placed photographs, or they lie along a line.
+    `doubts` says of a similarity, of where the model has the points and of where they were surveyed, what speaks
+    against it. Raises CaptureError for what it says, where marks fit nothing, and where fewer than three of the points
+    are seen by placed photographs, or they lie along a line.
     """
-    targets = gcps.enu(origin)
-    used = [(k, seen) for k, seen in _triangulate_all(model, gcps).items() if not gcps.points[k].is_check_point]
+    targets, located = gcps.enu(origin), _triangulate_all(model, gcps)
+    used = [(k, seen) for k, seen in located.items() if not gcps.points[k].is_check_point]
+    wrong = [k for k, seen in used if seen.kept_px > _useless_px(model)]
+    few = 2 * len(wrong) >= len(used) or len(used) - len(wrong) < MIN_CONTROL_POINTS
+    marked = _other_marks(model, gcps) if few and doubts is not None else ""
+    if marked:
+        raise CaptureError(f"{gcps.source}: its marks fit the photographs only if {marked}. {ANYWAY_GCP}")
+    used = [(k, seen) for k, seen in used if k not in wrong]
     rows = np.array([k for k, _ in used], int)
     if len(used) < MIN_CONTROL_POINTS or is_collinear(targets[rows]):
+        bad = f", {len(wrong)} more are marked where they cannot be" if wrong else ""
         raise CaptureError(
             f"{gcps.source}: {len(used)} of its points are shown by two placed photographs or more, not along one "
-            f"line; {MIN_CONTROL_POINTS} are needed. Mark them in more photographs, or hold them out: --check-points all"
+            f"line{bad}; {MIN_CONTROL_POINTS} are needed. Mark them in more photographs, or hold them out: --check-points all"
         )
     places = np.array([seen.position for _, seen in used])
     similarity, trusted = _fit_to_gcps(places, targets[rows])
+    said = doubts(similarity, places[trusted], targets[rows[trusted]]) if doubts is not None else ""
+    if said:
+        raise CaptureError(f"{gcps.source}: {said} {ANYWAY_GCP}")
     transform_model(model, similarity)
-    kept = rows[trusted]
-    _bundle_adjust(model, [(gcps.points[k], targets[k]) for k in kept.tolist()], fix_focal, threads)
-    doubtful = {gcps.points[k].name for k in rows[~trusted].tolist()}
-    return f"{len(kept)} control points ({gcps.source}, {gcps.crs})", doubtful
+    accuracy = _accuracy(similarity.apply(places[trusted]), targets[rows[trusted]])
+    kept = rows[trusted].tolist()
+    model, notes = bend_to_points(model, [(located[k].agreeing, targets[k]) for k in kept], fix_focal, threads)
+    doubtful = frozenset(gcps.points[k].name for k in (*rows[~trusted].tolist(), *wrong))
+    return Surveyed(model, f"{len(kept)} control points ({gcps.source}, {gcps.crs})", doubtful, accuracy, notes)
+
+
+def _useless_px(model: pycolmap.Reconstruction) -> float:
+    longest = max(max(camera.width, camera.height) for camera in model.cameras.values())
+    return max(MARK_WRONG_PX, MARK_USELESS * longest)
+
+
+def _other_marks(model: pycolmap.Reconstruction, control: GcpList) -> str:
+    """How marks must be read so that most points fit, where they do not as they are; empty where no way is known."""
+    sizes = {image.name: model.cameras[image.camera_id] for image in model.images.values() if image.has_pose}
+    limit = _useless_px(model)
+
+    def fitting(change: Callable[[tuple[float, float], pycolmap.Camera], tuple[float, float]]) -> int:
+        count = 0
+        for point in control.points:
+            seen = [each for each in point.observations if each.image in sizes]
+            changed = tuple(replace(each, pixel=change(each.pixel, sizes[each.image])) for each in seen)
+            found = triangulate(model, replace(point, observations=changed))
+            count += found is not None and found.kept_px <= limit
+        return count
+
+    as_they_are = fitting(lambda pixel, _: pixel)
+    for said, change in (
+        ("px and py change places", lambda pixel, _: (pixel[1], pixel[0])),
+        ("py counts from the lower edge", lambda pixel, camera: (pixel[0], camera.height - pixel[1])),
+        ("px counts from the right edge", lambda pixel, camera: (camera.width - pixel[0], pixel[1])),
+    ):
+        if fitting(change) > max(as_they_are, len(control.points) / 2):
+            return said
+    return ""
+
+
+def _accuracy(placed: np.ndarray, targets: np.ndarray) -> AccuracyFacts:
+    """What 95 % stay below, from what a similarity to the points leaves."""
+    off, count = placed - targets, len(targets)
+    times = float(student.ppf(0.975, max(1, 3 * count - 7)))
+    deviation = float(np.sqrt((off**2).sum() / max(1, 3 * count - 7)))
+    spread = np.linalg.svd(targets - targets.mean(axis=0), compute_uv=False)
+    scale = times * deviation / float(np.sqrt((spread**2).sum()))
+    across = float(np.hypot(spread[0], spread[1]))
+    middle = times * deviation / np.sqrt(count)
+    edge = float(np.linalg.norm(targets - targets.mean(axis=0), axis=1).max())
+    return AccuracyFacts(
+        place_m=(float(np.sqrt(2) * middle), float(middle)), scale_percent=100 * scale, scale_m=scale * edge,
+        north_deg=float(np.degrees(times * deviation / across)),
+        level_deg=float(np.degrees(times * deviation / max(float(spread[1]), 1e-9))), positions_m=None,
+    )  # fmt: skip
 
 
 def measure_gcps(
-    model: pycolmap.Reconstruction, gcps: GcpList, origin: tuple[float, float, float], outliers: set[str]
+    model: pycolmap.Reconstruction,
+    gcps: GcpList,
+    origin: tuple[float, float, float],
+    outliers: frozenset[str],
 ) -> tuple[GcpReport, ...]:
     """What a placed model makes of all points: seen minus surveyed, metres east, north, up."""
     targets, located = gcps.enu(origin), _triangulate_all(model, gcps)
@@ -129,43 +264,3 @@ def _fit_to_gcps(points: Float[np.ndarray, "n 3"], targets: Float[np.ndarray, "n
     if len(points) < MIN_POINTS_FOR_OUTLIERS:
         return fit_similarity(points, targets), np.ones(len(points), bool)
     return fit_similarity_robust(points, targets)
-
-
-def _bundle_adjust(
-    model: pycolmap.Reconstruction,
-    points: Sequence[tuple[GroundControlPoint, np.ndarray]],
-    fix_focal: bool,
-    threads: int,
-) -> None:
-    """Bundle adjustment with points that stay where they are, which are taken out of the model again."""
-    config, images = pycolmap.BundleAdjustmentConfig(), {}
-    for image in model.images.values():
-        if image.has_pose:
-            config.add_image(image.image_id)
-            images[image.name] = image
-    fixed = [_add_fixed_point(model, images, point, target) for point, target in points]
-    for number in fixed:
-        config.add_constant_point(number)
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary, options.refine_focal_length = False, not fix_focal
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
-    options.ceres.solver_options.num_threads = threads
-    adjuster = pycolmap.create_default_bundle_adjuster(options, config, model)
-    try:
-        call_cancellable(lambda cancellation_token: adjuster.solve())
-    finally:
-        for number in fixed:
-            model.delete_point3D(number)
-    model.update_point_3d_errors()
-
-
-def _add_fixed_point(
-    model: pycolmap.Reconstruction, images: dict[str, pycolmap.Image], point: GroundControlPoint, target: np.ndarray
-) -> int:
-    track = pycolmap.Track()
-    for sighting in point.observations:
-        image = images.get(sighting.image)
-        if image is not None:
-            image.points2D.append(pycolmap.Point2D(np.array(sighting.pixel)))
-            track.add_element(image.image_id, len(image.points2D) - 1)
-    return int(model.add_point3D(target, track, np.zeros(3, np.uint8)))

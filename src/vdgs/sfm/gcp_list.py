@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from vdgs.captures.coordinate_systems import to_geodetic
 from vdgs.captures.name_resolution import NameLookup, ambiguity_message
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic
@@ -96,9 +97,10 @@ def read_gcp_list(file: Path, collection: ImageList, check_points: Sequence[str]
     are not there, pixels outside them, names that are not there, and points that are too few or along a line.
     """
     header, lines = _lines(file)
-    by_name = _by_name(collection)
-    found = [(line, _observation(line, by_name, file)) for line in lines]
-    transform, system = _crs_transform(header, file)
+    by_name = photographs_by_name(collection)
+    lines, strange = _of_photographs(lines, by_name, file)
+    found = [(line, find_sighting(line.pixel, line.photograph, line.number, by_name, file)) for line in lines]
+    transform, system = to_geodetic(header, file)
     groups: dict[tuple[object, ...], list[tuple[_Line, GcpObservation | None]]] = {}
     for line, sighting in found:
         groups.setdefault((line.name,) if line.name else line.place, []).append((line, sighting))
@@ -109,7 +111,29 @@ def read_gcp_list(file: Path, collection: ImageList, check_points: Sequence[str]
         geodetic = _geodetic([line for line, _ in group], name, transform, system, file)
         seen = tuple(sighting for _, sighting in group if sighting is not None)
         points.append(GroundControlPoint(name, geodetic, seen, ALL_POINTS in check_points or name in check_points))
-    return _checked(points, system, file)
+    return _checked(points, system, file, strange)
+
+
+def _of_photographs(
+    lines: Sequence[_Line], by_name: NameLookup[ImageMetadata | str], file: Path
+) -> tuple[list[_Line], list[str]]:
+    """The lines of photographs that are there, and what to say of the others. CaptureError where none is."""
+    there = [line for line in lines if _photographs_of(line.photograph, by_name)]
+    names = list(dict.fromkeys(line.photograph for line in lines if line not in there))
+    if not names:
+        return there, []
+    shown = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+    if not there:
+        raise CaptureError(
+            f"{file}: none of its {len(lines)} lines is of a photograph that is there ({shown} are not). Is it the "
+            "list of this flight, with the names that the photographs have?"
+        )
+    lost = len(lines) - len(there)
+    return there, [f"{file.name}: {lost} lines are of {len(names)} photographs that are not there; left out ({shown})."]
+
+
+def _photographs_of(name: str, by_name: NameLookup[ImageMetadata | str]) -> list[ImageMetadata | str]:
+    return by_name.find(name)[1] or by_name.find_elsewhere(name)[1]
 
 
 def _geodetic(lines: Sequence[_Line], name: str, transform: Any, system: str, file: Path) -> tuple[float, float, float]:
@@ -141,17 +165,22 @@ def check_gcps_near(gcps: GcpList, positions: np.ndarray, origin: tuple[float, f
         )
 
 
-def _lines(file: Path) -> tuple[str, list[_Line]]:
+def text_lines(file: Path, what: str) -> list[tuple[int, str]]:
+    """The lines of a text file of `what` with their numbers, without empty ones and comments."""
     try:
         if file.stat().st_size > _MAX_FILE_BYTES:
-            raise CaptureError(f"{file}: is far too large for a list of control points.")
+            raise CaptureError(f"{file}: is far too large for a list of {what}.")
         text = file.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise CaptureError(f"{file}: cannot be read ({error.strerror}).") from error
     except UnicodeDecodeError:
-        raise CaptureError(f"{file}: is not a text file. A gcp_list.txt is expected.") from None
+        raise CaptureError(f"{file}: is not a text file. A list of {what} is expected.") from None
     rows = [(k, line.strip()) for k, line in enumerate(text.splitlines(), 1)]
-    rows = [(k, line) for k, line in rows if line and not line.startswith("#")]
+    return [(k, line) for k, line in rows if line and not line.startswith("#")]
+
+
+def _lines(file: Path) -> tuple[str, list[_Line]]:
+    rows = text_lines(file, "control points")
     if not rows:
         raise CaptureError(f"{file}: is empty. The first line names the coordinate system, such as EPSG:32615.")
     return rows[0][1], [_line(line, number, file) for number, line in rows[1:]]
@@ -172,68 +201,34 @@ def _line(text: str, number: int, file: Path) -> _Line:
     return _Line(number, (x, y, z), (across, down), photograph, name)
 
 
-def _crs_transform(header: str, file: Path) -> tuple[Any, str]:
-    """What brings x, y, z [n, 3] to latitude, longitude and height, and the name of their system."""
-    try:
-        import pyproj
-    except ImportError:
-        raise CaptureError(f"{file}: needs pyproj: pip install 'vdgs[geo]'.") from None
-    try:
-        crs = pyproj.CRS.from_user_input(_crs_from_odm(header))
-        flat = len(crs.axis_info) == 2
-        change = pyproj.Transformer.from_crs(crs, "EPSG:4326" if flat else "EPSG:4979", always_xy=True)
-    except pyproj.exceptions.ProjError:
-        raise CaptureError(
-            f"{file}: the first line must name the coordinate system (EPSG:32615, WGS84 UTM 15N, or a PROJ string), "
-            f"and {header[:60]!r} names none."
-        ) from None
-
-    def to_geodetic(places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        x, y, z = places.T
-        if flat:  # heights are metres as they are, whatever they are measured from
-            longitude, latitude = change.transform(x, y)
-        else:
-            longitude, latitude, z = change.transform(x, y, z)
-        return np.stack([latitude, longitude, z], axis=1)
-
-    return to_geodetic, crs.name if crs.name != "unknown" else header
-
-
-def _crs_from_odm(header: str) -> str:
-    """ODM's own words for systems, `WGS84` and `WGS84 UTM 15N`, as codes; others as they are."""
-    words = header.upper().split()
-    if words == ["WGS84"]:
-        return "EPSG:4326"
-    if words[:2] == ["WGS84", "UTM"] and len(words) == 3 and words[2][:-1].isdecimal() and words[2][-1] in "NS":
-        return f"EPSG:{(32600 if words[2][-1] == 'N' else 32700) + int(words[2][:-1])}"
-    return header
-
-
-def _by_name(collection: ImageList) -> NameLookup[ImageMetadata | str]:
+def photographs_by_name(collection: ImageList) -> NameLookup[ImageMetadata | str]:
     """Photographs, and names of those left out."""
     left_out: list[tuple[str, ImageMetadata | str]] = [(each.name, each.name) for each in collection.excluded]
     return NameLookup([*((photo.name, photo) for photo in collection.images), *left_out])
 
 
-def _observation(line: _Line, by_name: NameLookup[ImageMetadata | str], file: Path) -> GcpObservation | None:
-    """None in a photograph that was left out."""
-    found = by_name.find(line.photograph)[1] or by_name.find_elsewhere(line.photograph)[1]
-    where = f"{file}: line {line.number}:"
+def find_sighting(
+    pixel: tuple[float, float], photograph: str, number: int, by_name: NameLookup[ImageMetadata | str], file: Path
+) -> GcpObservation | None:
+    """The mark of a line; None in a photograph that was left out."""
+    found = _photographs_of(photograph, by_name)
+    where = f"{file}: line {number}:"
     if not found:
-        raise CaptureError(f"{where} there is no photograph {line.photograph!r}. Mend the name, or remove the line.")
+        raise CaptureError(f"{where} there is no photograph {photograph!r}. Mend the name, or remove the line.")
     photo = found[0]
     if len(found) > 1:
         one, other = (each if isinstance(each, str) else each.name for each in found[:2])
-        raise CaptureError(f"{where} {ambiguity_message(line.photograph, one, other)}")
+        raise CaptureError(f"{where} {ambiguity_message(photograph, one, other)}")
     if isinstance(photo, str):
         return None
     width, height = photo.stored_size
-    if not (0 <= line.pixel[0] <= width and 0 <= line.pixel[1] <= height):
+    if not (0 <= pixel[0] <= width and 0 <= pixel[1] <= height):
+        exchanged = 0 <= pixel[1] <= width and 0 <= pixel[0] <= height
         raise CaptureError(
-            f"{where} pixel {line.pixel[0]:g}, {line.pixel[1]:g} is outside {photo.name}, which has {width} x {height}."
-            " Was the photograph made smaller since?"
+            f"{where} pixel {pixel[0]:g}, {pixel[1]:g} is outside {photo.name}, which has {width} x {height}. "
+            f"{'Are px and py exchanged, or was' if exchanged else 'Was'} the photograph made smaller since?"
         )
-    return GcpObservation(photo.name, photo.to_upright_pixel(line.pixel))
+    return GcpObservation(photo.name, photo.to_upright_pixel(pixel))
 
 
 def _check_held_out(held_out: Sequence[str], names: Sequence[str], file: Path) -> None:
@@ -242,11 +237,12 @@ def _check_held_out(held_out: Sequence[str], names: Sequence[str], file: Path) -
         raise CaptureError(f"--check-points {unknown[0]}: {file} has {', '.join(names[:20])}; or say {ALL_POINTS}.")
 
 
-def _checked(points: list[GroundControlPoint], system: str, file: Path) -> GcpList:
+def _checked(points: list[GroundControlPoint], system: str, file: Path, notes: Sequence[str]) -> GcpList:
     """Without points that too few photographs show. Raises CaptureError where too few are left to place a model."""
     seen = [point for point in points if len({each.image for each in point.observations}) >= MIN_OBSERVATIONS]
     lonely = [point.name for point in points if point not in seen]
-    notes = [f"{file.name}: only one photograph shows {', '.join(lonely[:5])}; not used."] if lonely else []
+    if lonely:
+        notes = [*notes, f"{file.name}: only one photograph shows {', '.join(lonely[:5])}; not used."]
     used = [point for point in seen if not point.is_check_point]
     if not seen or (used and len(used) < MIN_CONTROL_POINTS):
         raise CaptureError(

@@ -1,4 +1,4 @@
-"""A model brought to metres, east, north and up: by positions, and by recorded attitudes where they do not do."""
+"""A model brought to metres, east, north and up by positions, and how good that is."""
 
 from __future__ import annotations
 
@@ -8,9 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 
-from vdgs.captures.ground_estimation import rotation_to_z
-from vdgs.captures.up_axis import estimate_up
-from vdgs.geometry.similarity import Similarity, describe_disagreement, fit_similarity_robust, is_collinear
+from vdgs.captures.plane_fit import mirrored
+from vdgs.captures.position_fit import PositionFit, Problem, Up, fit_positions
+from vdgs.captures.reconstruction import AccuracyFacts
+from vdgs.captures.up_axis import up_by_views
+from vdgs.errors import CaptureError
+from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu
+from vdgs.geometry.similarity import Similarity, is_collinear, rotation_to_z
 from vdgs.sfm.gps_priors import MIN_POSITIONS, GpsPriors
 from vdgs.sfm.image_metadata import ImageMetadata
 
@@ -18,18 +22,30 @@ from vdgs.sfm.image_metadata import ImageMetadata
 MIN_ATTITUDES = 3
 #: Directions of flight tell a tilt from how a camera hangs if they spread so far: a ratio of singular values.
 MIN_HEADING_SPREAD = 0.3
+#: Recorded attitudes that scatter by more (degrees, median), or that differ so far from what the views say, are no
+#: measurements (choice).
+SCATTER_DEG, CONTRADICT_DEG = 20.0, 45.0
+#: How far a camera may hang beside what is recorded, in degrees: flown in several directions that cancels (choice).
+HANGS_DEG, HANGS_ALIKE_DEG = 1.0, 2.5
+#: Recorded headings count from so many on that agree so well (mean of unit vectors); the other way round is so far.
+ENOUGH_HEADINGS, ALIKE, OTHER_WAY_DEG = 5, 0.95, 150.0
 #: Positions fix a turn about a line if they spread across it this many times their standard deviation.
 MIN_SPREAD_SIGMAS = 3.0
-ADVICE_WRITE_GPS = "let the drone write GPS into the photographs: metres, north, maps."
-ADVICE_BETTER_POSITIONS = (
-    "take photographs over many times more than positions are wrong by, or give better positions: a receiver with RTK, "
-    "a table (--gps) or surveyed points (--gcp)."
+ADVICE_WRITE_GPS = (
+    "let the drone write GPS into the photographs, or give a table of positions (--gps), surveyed points (--gcp) or a "
+    "known distance (--scale-bar) now: the finished capture is placed anew in seconds."
 )
+ADVICE_BETTER_POSITIONS = (
+    "give a known distance (--scale-bar), surveyed points (--gcp) or a table of better positions (--gps) now: the "
+    "finished capture is placed anew in seconds. --georeference anyway uses the positions as they are, off leaves "
+    "them out; next time take photographs over many times more than positions are wrong by."
+)
+ANYWAY = "Mend them, or say --georeference off (without them) or anyway (as they are)."
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Georegistration:
-    """How a model was brought to its place on Earth."""
+    """How a model was brought to metres, and to its place on Earth where that is known."""
 
     similarity: Similarity
     """From the model's own world to metres east, north, up of the positions' origin."""
@@ -40,49 +56,218 @@ class Georegistration:
     """Of them, placed minus recorded, metres [m, 3]."""
     inliers: np.ndarray
     """Which of them the placing trusts, [m] bool."""
+    accuracy: AccuracyFacts | None = None
+    notes: tuple[str, ...] = ()
+    is_georeferenced: bool = True
+    """Whether east, north and the origin are known; metres and up alone where not."""
 
 
 @dataclass(frozen=True)
 class AlignmentFailure:
-    """Why a model was not brought to a place on Earth, and what to do about it."""
+    """Why a model was not brought to metres, and what to do about it."""
 
     reason: str
     remedy: str
 
 
 def georegister(
-    model: pycolmap.Reconstruction, images_metadata: Sequence[ImageMetadata], positions: GpsPriors
+    model: pycolmap.Reconstruction,
+    images_metadata: Sequence[ImageMetadata],
+    positions: GpsPriors,
+    scale: tuple[float, float] | None = None,
+    anyway: bool = False,
+    stated: bool = False,
 ) -> Georegistration | AlignmentFailure:
     """The similarity that brings the model to its positions, or why they do not tell one: they are too few, or wrong by
-    too much of how far they spread. Does not change the model."""
+    too much of how far they spread. `scale` is the factor to metres where it is known otherwise, and its standard
+    deviation as a share; `stated` whether the deviations of the positions are more than a default. Does not change the
+    model.
+
+    Raises CaptureError, unless `anyway`, for positions that fit only once they are mirrored or exchanged.
+    """
     images = {image.name: image for image in model.images.values() if image.has_pose}
     rows, centers, targets = _match_positions(images, images_metadata, positions)
     if not positions.usable or len(rows) < MIN_POSITIONS:
         few = f"{len(positions)} positions, of placed photographs, are too few"
         return AlignmentFailure(few if len(positions) else "no positions that can be used", ADVICE_WRITE_GPS)
-    if not is_collinear(centers) and not is_nearly_collinear(targets, positions.gps_std[rows]):
-        similarity, inliers = fit_similarity_robust(centers, targets)
-        how = f"positions of {int(inliers.sum())} photographs ({positions.source})"
-    else:
-        rotation, by = _leveling_rotation(model, images, images_metadata, centers, targets)
-        similarity, inliers = _fit_scale(rotation, centers, targets), np.ones(len(rows), bool)
-        how = f"positions of {len(rows)} photographs along one line ({positions.source}), up by {by}"
-    residuals = similarity.apply(centers) - targets
-    how_far = describe_disagreement(residuals, targets[inliers], inliers)
-    if how_far:
-        why = f"the positions ({positions.source}) and where the photographs were placed disagree: {how_far}"
-        return AlignmentFailure(why, ADVICE_BETTER_POSITIONS)
-    return Georegistration(similarity, how, rows, residuals, inliers)
+    up, notes = up_of(model, images_metadata)
+    taken = [images_metadata[int(positions.image_indices[row])] for row in rows]
+    stated = stated or (all(photo.gps_std is not None for photo in taken) and positions.source == "EXIF")
+    problem = Problem(
+        centers=centers,
+        targets=targets,
+        times=_moments(taken),
+        up=up,
+        scale=scale,
+        stated=positions.gps_std[rows] if stated else None,
+    )
+    others = _other_readings(targets, positions.origin) if up.sure else {}
+    wrong = mirrored(centers, targets, up.direction, others)
+    if wrong and not anyway:
+        raise CaptureError(
+            f"the positions ({positions.source}) fit the photographs only once {wrong}: as they are, the world would "
+            "be its own mirror image, or upside down. Are latitude and longitude exchanged, or is a hemisphere (S, W, "
+            f"a minus sign) missing? {ANYWAY}"
+        )
+    fit, barometer = _best_fit(problem, taken)
+    refused = fit.why_refused(positions.source)
+    if refused and not anyway:
+        return AlignmentFailure(refused, ADVICE_BETTER_POSITIONS)
+    notes += [f"{refused}; used all the same, as asked for."] if refused else []
+    notes += [f"the positions fit only once {wrong}; used all the same, as asked for."] if wrong else []
+    line = " along one line" if is_nearly_collinear(targets, positions.gps_std[rows]) else ""
+    how = f"positions of {int(fit.inliers.sum())} photographs{line} ({positions.source})"
+    how += f"; up by {up.how}" if line or fit.altitude != "used" else ""
+    how += "; heights by the barometer" if barometer else ""
+    notes += _of_altitudes(fit, barometer) + _of_north(fit.similarity, images, taken)
+    residuals = fit.placed - targets
+    return Georegistration(
+        similarity=fit.similarity,
+        method=how,
+        position_rows=rows,
+        residuals=residuals,
+        inliers=fit.inliers,
+        accuracy=accuracy_of(fit, targets),
+        notes=tuple(notes),
+    )
+
+
+def accuracy_of(fit: PositionFit, targets: np.ndarray) -> AccuracyFacts:
+    """The accuracy of a fit, for people."""
+    away = np.linalg.norm(targets[:, :2] - targets[:, :2].mean(axis=0), axis=1)
+    return AccuracyFacts(
+        place_m=fit.place_error_m, scale_percent=100 * fit.scale_error, scale_m=float(fit.scale_error * away.max()),
+        north_deg=min(180.0, fit.north_error_deg), level_deg=min(180.0, fit.level_error_deg),
+        positions_m=tuple(fit.gps_std.tolist()), altitude=fit.altitude, altitude_drift_m=fit.drift_m,
+    )  # fmt: skip
+
+
+def _best_fit(problem: Problem, taken: Sequence[ImageMetadata]) -> tuple[PositionFit, bool]:
+    """The fit, and whether its heights are the barometer's: over the take-off, where altitudes drift against them."""
+    fit = fit_positions(problem)
+    relative = np.array([np.nan if photo.relative_altitude is None else photo.relative_altitude for photo in taken])
+    if fit.altitude == "used" or not np.isfinite(relative).all() or np.ptp(relative) == 0:
+        return fit, False
+    targets = problem.targets.copy()
+    targets[:, 2] = relative + np.median(targets[:, 2] - relative)
+    steady = fit_positions(
+        Problem(
+            centers=problem.centers,
+            targets=targets,
+            times=problem.times,
+            up=problem.up,
+            scale=problem.scale,
+            stated=problem.stated,
+        )
+    )
+    return (steady, True) if steady.altitude == "used" and steady.score < fit.score else (fit, False)
+
+
+def _of_altitudes(fit: PositionFit, barometer: bool) -> list[str]:
+    if barometer:
+        return ["altitudes drift against the heights over the take-off, which are used in their place."]
+    if fit.altitude == "drifts":
+        return [
+            f"the recorded altitudes drift by {fit.drift_m:+.0f} m from the first photograph to the last: that is left "
+            f"out, and heights above the sea are only good to ±{fit.place_error_m[1]:.0f} m."
+        ]
+    if fit.altitude == "unused":
+        return [
+            f"the recorded altitudes are off by {fit.gps_std[2]:.3g} m from photograph to photograph: scale, north "
+            f"and up are found without them; heights above the sea are only good to ±{fit.place_error_m[1]:.0f} m."
+        ]
+    return []
+
+
+def _of_north(
+    similarity: Similarity, images: Mapping[str, pycolmap.Image], taken: Sequence[ImageMetadata]
+) -> list[str]:
+    """A note where all recorded headings say that the scene lies the other way round: both hemispheres lost."""
+    seen = [photo for photo in taken if photo.attitude is not None]
+    turns = np.array(
+        [
+            similarity.rotation @ _rotation(images[photo.name]).T @ photo.attitude.camera_from_enu
+            for photo in seen
+            if photo.attitude is not None
+        ]
+    ).reshape(-1, 3, 3)
+    if len(turns) < ENOUGH_HEADINGS:
+        return []
+    mean = np.mean(np.exp(1j * np.arctan2(turns[:, 1, 0] - turns[:, 0, 1], turns[:, 0, 0] + turns[:, 1, 1])))
+    away = abs(float(np.degrees(np.angle(mean))))
+    if abs(mean) < ALIKE or away < OTHER_WAY_DEG:
+        return []
+    return [
+        f"north is turned by {away:.0f}° from what the drone recorded. Are both hemispheres (S and W) missing from the "
+        "positions?"
+    ]
+
+
+def _other_readings(targets: np.ndarray, origin: tuple[float, float, float]) -> dict[str, np.ndarray]:
+    """Positions as they would lie if they were written otherwise than they should be."""
+    geodetic = geodetic_from_enu(targets, origin)
+    exchanged = geodetic[:, [1, 0, 2]]
+    found = {"they are mirrored": targets * np.array([-1.0, 1.0, 1.0])}
+    if np.abs(exchanged[:, 0]).max() < 90:
+        latitude, longitude, height = np.median(exchanged, axis=0).tolist()
+        found["latitude and longitude change places"] = enu_from_geodetic(exchanged, (latitude, longitude, height))
+    return found
+
+
+def _moments(taken: Sequence[ImageMetadata]) -> np.ndarray:
+    """The order in which photographs were taken, from 0 to 1 [n]."""
+    order = sorted(range(len(taken)), key=lambda k: (taken[k].datetime, taken[k].name))
+    moments = np.empty(len(taken))
+    moments[order] = np.linspace(0, 1, len(taken))
+    return moments
+
+
+def up_of(model: pycolmap.Reconstruction, photographs: Sequence[ImageMetadata]) -> tuple[Up, list[str]]:
+    """What attitudes that the drone recorded, or else the views, say of up in the model's world; and notes."""
+    images = {image.name: image for image in model.images.values() if image.has_pose}
+    rotations = np.array([_rotation(image) for image in images.values()])
+    centers = np.array([image.projection_center() for image in images.values()])
+    direction, deviation, sure = up_by_views(centers, rotations, model_points(model))
+    views = Up(direction, deviation, "the views", sure)
+    seen = [photo for photo in photographs if photo.attitude is not None and photo.name in images]
+    if len(seen) < max(MIN_ATTITUDES, len(images) / 2):
+        return views, []
+    rotations = np.array([_rotation(images[photo.name]) for photo in seen])
+    down = np.array([photo.attitude.gravity for photo in seen if photo.attitude is not None])
+    ups = -np.einsum("nji,nj->ni", rotations, down)
+    mean = ups.mean(axis=0) / max(float(np.linalg.norm(ups.mean(axis=0))), 1e-12)
+    scatter = float(np.median(np.degrees(np.arccos(np.clip(ups @ mean, -1, 1)))))
+    apart = float(np.degrees(np.arccos(np.clip(mean @ direction, -1, 1))))
+    level = rotation_to_z(mean)
+    tilt, several = _tilt(rotations @ level.T, down)
+    if scatter > SCATTER_DEG or (sure and not several and apart > CONTRADICT_DEG):
+        return views, ["the recorded attitudes contradict the photographs: up is taken from the views instead."]
+    found = level.T @ np.append(-tilt, 1.0)
+    deviation = float(np.hypot(scatter / np.sqrt(len(seen)), HANGS_DEG if several else HANGS_ALIKE_DEG))
+    return Up(found / np.linalg.norm(found), deviation, "the recorded attitudes"), []
 
 
 def registration_in_place(
-    model: pycolmap.Reconstruction, photographs: Sequence[ImageMetadata], positions: GpsPriors, method: str
+    model: pycolmap.Reconstruction,
+    photographs: Sequence[ImageMetadata],
+    positions: GpsPriors,
+    method: str,
+    accuracy: AccuracyFacts | None = None,
+    notes: tuple[str, ...] = (),
 ) -> Georegistration:
     """A model that was brought to its place by other things than positions, and how far those are from it."""
     images = {image.name: image for image in model.images.values() if image.has_pose}
     rows, centers, targets = _match_positions(images, photographs, positions)
     stays = Similarity(1.0, np.eye(3), np.zeros(3))
-    return Georegistration(stays, method, rows, centers - targets, np.ones(len(rows), bool))
+    return Georegistration(
+        similarity=stays,
+        method=method,
+        position_rows=rows,
+        residuals=centers - targets,
+        inliers=np.ones(len(rows), bool),
+        accuracy=accuracy,
+        notes=notes,
+    )
 
 
 def is_nearly_collinear(points: np.ndarray, std: np.ndarray) -> bool:
@@ -116,15 +301,23 @@ def tilt_from_attitudes(model: pycolmap.Reconstruction, photographs: Sequence[Im
     if len(images) < MIN_ATTITUDES:
         return None
     rotations = np.array([_rotation(image) for image in images])
-    off = np.array([gravity[image.name] for image in images]) + rotations[:, :, 2]
-    hangs = np.broadcast_to(np.eye(3)[:, :2], (len(images), 3, 2))
+    tilt, _ = _tilt(rotations, np.array([gravity[image.name] for image in images]))
+    return float(np.degrees(np.linalg.norm(tilt)))
+
+
+def _tilt(rotations: np.ndarray, gravity: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Tilt of a world whose up is about z, [2] in radians, and whether it was told from how the camera hangs:
+    camera_from_world [n, 3, 3] and recorded down in the cameras [n, 3]."""
+    off = gravity + rotations[:, :, 2]
+    hangs = np.broadcast_to(np.eye(3)[:, :2], (len(rotations), 3, 2))
+    several = False
     for unknown in (np.concatenate([rotations[:, :, :2], hangs], axis=2), rotations[:, :, :2]):
         flat = unknown.reshape(-1, unknown.shape[2])
         singular = np.linalg.svd(flat, compute_uv=False)
         if singular[-1] > MIN_HEADING_SPREAD * singular[0]:
+            several = unknown.shape[2] == 4
             break
-    tilt = np.linalg.lstsq(flat, off.ravel(), rcond=None)[0][:2]
-    return float(np.degrees(np.linalg.norm(tilt)))
+    return np.linalg.lstsq(flat, off.ravel(), rcond=None)[0][:2], several
 
 
 def _match_positions(
@@ -139,41 +332,3 @@ def _match_positions(
 
 def _rotation(image: pycolmap.Image) -> np.ndarray:
     return np.asarray(image.cam_from_world().rotation.matrix())
-
-
-def _leveling_rotation(
-    model: pycolmap.Reconstruction,
-    images: Mapping[str, pycolmap.Image],
-    photographs: Sequence[ImageMetadata],
-    centers: np.ndarray,
-    targets: np.ndarray,
-) -> tuple[np.ndarray, str]:
-    """The rotation into east, north, up where positions along a line leave a turn about it open."""
-    found = [
-        photo.attitude.camera_from_enu.T @ _rotation(images[photo.name])
-        for photo in photographs
-        if photo.attitude is not None and photo.name in images
-    ]
-    if len(found) >= MIN_ATTITUDES:
-        left, _, right = np.linalg.svd(np.sum(found, axis=0))
-        mean = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
-        return _heading_rotation(mean, centers, targets) @ mean, "the recorded attitudes"
-    rotations = np.array([_rotation(image) for image in images.values()])
-    up, _ = estimate_up(centers, rotations, model_points(model), [])
-    level = rotation_to_z(up)
-    return _heading_rotation(level, centers, targets) @ level, "the views"
-
-
-def _heading_rotation(rotation: np.ndarray, centers: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """The turn about up that brings the line of the cameras onto that of the positions."""
-    one, other = (centers - centers.mean(axis=0)) @ rotation.T, targets - targets.mean(axis=0)
-    angle = np.arctan2((one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]).sum(), (one[:, :2] * other[:, :2]).sum())
-    return np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
-
-
-def _fit_scale(rotation: np.ndarray, centers: np.ndarray, targets: np.ndarray) -> Similarity:
-    """Scale and translation by least squares, the rotation as it is."""
-    turned = centers @ rotation.T
-    one, other = turned - turned.mean(axis=0), targets - targets.mean(axis=0)
-    scale = float((one * other).sum() / (one**2).sum())
-    return Similarity(scale, rotation, targets.mean(axis=0) - scale * turned.mean(axis=0))

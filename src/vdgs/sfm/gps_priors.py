@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from vdgs.captures.georeference import match_gps, read_gps
+from vdgs.captures.georeference import match_rows
+from vdgs.captures.gps_tables import GpsRow, read_gps_table
+from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic
 from vdgs.sfm.image_metadata import ImageMetadata
 
@@ -16,6 +18,8 @@ from vdgs.sfm.image_metadata import ImageMetadata
 NULL_POSITION_DEG = 0.01
 #: A position so many times farther from the middle than the median one, and so many metres, is another flight's.
 OUTLIER_FACTOR, OUTLIER_DISTANCE_M = 10.0, 1000.0
+#: A table whose positions are this near to those in the photographs is of the same flight (degrees).
+SAME_FLIGHT_DEG = 0.05
 #: Positions that spread less than this (metres) say nothing: the receiver kept the first, or nobody moved.
 MIN_SPREAD_M = 2.0
 #: Fewer positions fix no scale and no directions.
@@ -56,13 +60,28 @@ class GpsPriors:
         return rows
 
 
+@dataclass(frozen=True, eq=False)
+class _Recorded:
+    """What the photographs or a table say of all places."""
+
+    geodetic: np.ndarray
+    """Latitude, longitude, altitude [n, 3], NaN where unknown."""
+    kinds: list[str]
+    """What each altitude is measured from."""
+    source: str
+    notes: list[str]
+    rows: Mapping[int, GpsRow]
+    """Rows of a table by the photographs that they are of."""
+
+
 def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, std_m: tuple[float, float]) -> GpsPriors:
-    """Positions from a table (name, lat, lon, alt), or from the photographs themselves.
+    """Positions from a table, or from the photographs themselves.
 
     Those at 0, 0 and those kilometres away from all others are left out with a note; all of them where they do not
     spread. Raises CaptureError for a table that cannot be read or is another flight's.
     """
-    geodetic, source, notes = _read_geodetic(photographs, table)
+    recorded = _read_geodetic(photographs, table)
+    geodetic, notes = recorded.geodetic, recorded.notes
     names = [photo.name for photo in photographs]
     known = np.isfinite(geodetic[:, :2]).all(axis=1)
     nowhere = known & (np.abs(geodetic[:, :2]) < NULL_POSITION_DEG).all(axis=1)
@@ -87,12 +106,10 @@ def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, st
             "north; not used."
         )
         index, enu = index[:0], enu[:0]
-    deviations = np.array([_position_std(photographs[i], table, std_m) for i in index.tolist()]).reshape(-1, 3)
-    kinds = (
-        list(dict.fromkeys(photographs[i].altitude_type for i in index.tolist()))
-        if table is None
-        else [f"as in {table.name}"]
-    )
+    deviations = np.array(
+        [_position_std(photographs[i], recorded.rows.get(i), table, std_m) for i in index.tolist()]
+    ).reshape(-1, 3)
+    kinds = list(dict.fromkeys(recorded.kinds[i] for i in index.tolist()))
     if len(kinds) > 1:
         notes.append(f"altitudes are of several kinds ({'; '.join(kinds)}): heights may not fit together.")
     return GpsPriors(
@@ -101,22 +118,91 @@ def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, st
         gps_std=deviations,
         origin=origin,
         altitude_reference="; ".join(kinds),
-        source=source,
+        source=recorded.source,
         notes=tuple(notes),
     )
 
 
-def _read_geodetic(photographs: Sequence[ImageMetadata], table: Path | None) -> tuple[np.ndarray, str, list[str]]:
-    """Latitude, longitude, altitude [n, 3], NaN where unknown."""
-    geodetic = np.full((len(photographs), 3), np.nan)
+def _read_geodetic(photographs: Sequence[ImageMetadata], table: Path | None) -> _Recorded:
     if table is None:
-        for row, photo in zip(geodetic, photographs, strict=True):
-            row[:2] = photo.lat_lon if photo.lat_lon is not None else np.nan
-            row[2] = photo.altitude if photo.altitude is not None else np.nan
-        return geodetic, "EXIF", []
-    index, given = match_gps([photo.name for photo in photographs], read_gps(table), table)
-    geodetic[index] = given
-    return geodetic, table.name, []
+        geodetic = np.array([(*(photo.lat_lon or (np.nan, np.nan)), _or_nan(photo.altitude)) for photo in photographs])
+        kinds = [photo.altitude_type for photo in photographs]
+        return _without_default_altitudes(_Recorded(geodetic.reshape(-1, 3), kinds, "EXIF", [], {}), photographs)
+    read = read_gps_table(table)
+    names = [photo.name for photo in photographs]
+    rows = match_rows(names, read.rows, table, read.numbered)
+    geodetic, kinds = np.full((len(photographs), 3), np.nan), [""] * len(photographs)
+    for index, row in rows.items():
+        geodetic[index], kinds[index] = row.position, f"as in {table.name}"
+        if not np.isfinite(row.position[2]):
+            geodetic[index, 2], kinds[index] = _altitude_beside(photographs[index])
+    notes = [*read.notes, *_unmatched(read.rows, rows, table)]
+    _refuse_exchanged(geodetic, photographs, table)
+    without = [index for index, row in rows.items() if not np.isfinite(row.position[2])]
+    if without:
+        chosen = np.isin(np.arange(len(names)), without)
+        notes.append(f"{table.name} gives no altitude for {_some(names, chosen)}; as the photographs say it.")
+    return _Recorded(geodetic, kinds, table.name, notes, rows)
+
+
+def _without_default_altitudes(recorded: _Recorded, photographs: Sequence[ImageMetadata]) -> _Recorded:
+    """Where no altitude is known (all exactly 0 are those of a program that knew none), heights over the take-off."""
+    known = np.isfinite(recorded.geodetic[:, :2]).all(axis=1)
+    heights = np.array([_or_nan(photo.relative_altitude) for photo in photographs])
+    altitudes = np.nan_to_num(recorded.geodetic[known, 2])
+    if known.sum() < MIN_POSITIONS or altitudes.any() or not np.isfinite(heights[known]).all():
+        return recorded
+    geodetic = recorded.geodetic.copy()
+    geodetic[known, 2] = heights[known]
+    kinds = ["above the take-off, by XMP" if known[k] else kind for k, kind in enumerate(recorded.kinds)]
+    notes = ["EXIF has no altitudes, or exactly 0 (a default); heights over the take-off are used."]
+    return _Recorded(geodetic, kinds, recorded.source, notes, {})
+
+
+def _refuse_exchanged(geodetic: np.ndarray, photographs: Sequence[ImageMetadata], table: Path) -> None:
+    """Raise CaptureError where a table's positions become those of the photographs once exchanged or mirrored."""
+    own = np.array([photo.lat_lon or (np.nan, np.nan) for photo in photographs])
+    both = np.isfinite(own).all(axis=1) & np.isfinite(geodetic[:, :2]).all(axis=1)
+    if both.sum() < MIN_POSITIONS:
+        return
+    given, own = geodetic[both, :2], own[both]
+
+    def fits(places: np.ndarray) -> bool:
+        return bool(np.abs(np.median(places - own, axis=0)).max() < SAME_FLIGHT_DEG)
+
+    if fits(given):
+        return
+    ways = {
+        "latitude and longitude are exchanged": given[:, ::-1],
+        "south is north": given * [-1, 1], "west is east": given * [1, -1],
+        "south and west are north and east": -given,
+    }  # fmt: skip
+    wrong = next((what for what, places in ways.items() if fits(places)), None)
+    if wrong is not None:
+        raise CaptureError(
+            f"{table}: {wrong}, as the positions in the photographs tell ({own[0][0]:.5f}, {own[0][1]:.5f}; here "
+            f"{given[0][0]:.5f}, {given[0][1]:.5f}). Mend its columns or their names."
+        )
+
+
+def _altitude_beside(photo: ImageMetadata) -> tuple[float, str]:
+    """What a photograph itself says of its altitude, and what it is measured from."""
+    if photo.altitude is not None:
+        return photo.altitude, photo.altitude_type
+    return _or_nan(photo.relative_altitude), "above the take-off, by XMP"
+
+
+def _or_nan(value: float | None) -> float:
+    return np.nan if value is None else value
+
+
+def _unmatched(rows: Sequence[GpsRow], found: Mapping[int, GpsRow], table: Path) -> list[str]:
+    """What to say of rows that are of no photograph."""
+    used = {row.line for row in found.values()}
+    spare = list(dict.fromkeys(row.name for row in rows if row.line not in used))
+    if not spare:
+        return []
+    return [f"{table.name}: {len(spare)} rows are of photographs that are not there; left out ({_first(spare)})."]
 
 
 def _outliers(geodetic: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -141,10 +227,14 @@ def _origin(geodetic: np.ndarray) -> tuple[float, float, float]:
     return latitude, longitude, altitude
 
 
-def _position_std(photo: ImageMetadata, table: Path | None, std_m: tuple[float, float]) -> tuple[float, float, float]:
-    """A table has `deviation_m` across and upwards; photographs have what a receiver with RTK says, or what EXIF says
-    across and as much worse upwards as `deviation_m` is."""
+def _position_std(
+    photo: ImageMetadata, row: GpsRow | None, table: Path | None, std_m: tuple[float, float]
+) -> tuple[float, float, float]:
+    """A table has its own columns of accuracy, else `deviation_m` across and upwards; photographs have what a
+    receiver with RTK says, or what EXIF says across and as much worse upwards as `deviation_m` is."""
     across, up = std_m
+    if row is not None and row.gps_std is not None:
+        across, up = (max(value, MIN_STD_M) for value in row.gps_std)
     if table is None and photo.gps_std is not None:
         east, north, height = (max(value, MIN_STD_M) for value in photo.gps_std)
         return east, north, height
@@ -155,6 +245,9 @@ def _position_std(photo: ImageMetadata, table: Path | None, std_m: tuple[float, 
 
 
 def _some(names: Sequence[str], which: np.ndarray) -> str:
-    chosen = [name for name, take in zip(names, which, strict=True) if take]
+    return _first([name for name, take in zip(names, which, strict=True) if take])
+
+
+def _first(chosen: Sequence[str]) -> str:
     more = len(chosen) - 3
     return ", ".join(chosen[:3]) + (f" and {more} more" if more > 0 else "")

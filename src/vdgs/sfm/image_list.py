@@ -11,11 +11,14 @@ from pathlib import Path
 
 from vdgs.captures.formats.colmap import partial_model
 from vdgs.captures.formats.source_capture import format_list
-from vdgs.captures.image_files import IMAGE_SUFFIXES
-from vdgs.captures.name_resolution import match_key, to_colmap_name
+from vdgs.captures.name_resolution import match_key
+from vdgs.captures.nested_captures import foreign_poses, model_below
 from vdgs.captures.output_guard import is_capture
 from vdgs.captures.reconstruction import is_reconstruction
+from vdgs.captures.strays import walk
 from vdgs.errors import CaptureError
+from vdgs.sfm.cross_checks import cross_checked, strays
+from vdgs.sfm.find_images import find_files, is_photograph, nothing_found
 from vdgs.sfm.image_metadata import ImageMetadata, UnusableImage, read_image_metadata
 from vdgs.sfm.mask_files import check_mask, find_masks
 
@@ -23,8 +26,6 @@ from vdgs.sfm.mask_files import check_mask, find_masks
 MIN_IMAGES = 3
 #: So many bytes at both ends of files of one size tell whether they are copies.
 _DIGEST_BYTES = 1 << 16
-#: Two files beside a photograph that are no news.
-_IGNORED_FILES = {".ds_store", "thumbs.db"}
 
 
 @dataclass(frozen=True)
@@ -63,21 +64,26 @@ def collect_images(folders: Sequence[Path]) -> ImageList:
             )
         if is_capture(folder):
             raise CaptureError(f"{folder}: is a capture already. Use it as it is: vdgs run {folder} --output RUN")
-    named, others = _named(folders)
-    if not named:
-        raise CaptureError(
-            f"{', '.join(map(str, folders))}: holds no photographs ({', '.join(sorted(IMAGE_SUFFIXES))})"
-            + (f", but {others} other files" if others else "")
-            + ". Raw files (.dng) must be developed first."
-        )
-    masks, notes = find_masks(folders, named.values())
-    named = {name: path for name, path in named.items() if path in masks}
+        below = model_below(folder)
+        if below:
+            raise CaptureError(
+                f"{below}\nTo make new poses of photographs instead, give their own folder, without a model below it."
+            )
+    found = find_files(folders)
+    if not found.named:
+        raise nothing_found(folders, found)
+    masks, notes = find_masks(folders, found.named.values())
+    named = {name: path for name, path in found.named.items() if path in masks}
     with ThreadPoolExecutor(4) as pool:
         read = list(pool.map(_read, named.values(), named.keys(), masks.values()))
     photographs = [each for each in read if isinstance(each, ImageMetadata)]
-    left_out = [each for each in read if isinstance(each, ExcludedImage)]
+    left_out = [ExcludedImage(name, why) for name, why in found.left_out.items()]
+    left_out += [each for each in read if isinstance(each, ExcludedImage)]
     photographs, doubled = _drop_duplicates(photographs)
-    left_out += doubled
+    photographs, strange = _of_the_flight(photographs)
+    left_out += [*doubled, *strange]
+    notes = [*found.notes(), *notes]
+    notes += [f"not read: {poses}. Poses are made anew." for folder in folders for poses in foreign_poses(folder)]
     if len(photographs) < MIN_IMAGES:
         reasons = format_list(f"{each.name}: {each.reason}" for each in left_out)
         raise CaptureError(
@@ -85,7 +91,7 @@ def collect_images(folders: Sequence[Path]) -> ImageList:
             f"can be used; a scene needs {MIN_IMAGES} at the very least, and each place two or three that show "
             f"it from different positions.{reasons}"
         )
-    return ImageList(tuple(folders), tuple(photographs), tuple(left_out), others, tuple(notes))
+    return ImageList(tuple(folders), tuple(photographs), tuple(left_out), found.others, tuple(notes))
 
 
 def is_image_folder(folder: Path) -> bool:
@@ -98,44 +104,14 @@ def is_image_folder(folder: Path) -> bool:
         or (folder / "sparse").exists()
     ):
         return False
-    return any(_is_image(path) for path in folder.rglob("*"))
+    return any(is_photograph(path) for _, files, _ in walk(folder) for path in files)
 
 
-def _is_image(path: Path) -> bool:
-    return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and path.is_file()
-
-
-def _named(folders: Sequence[Path]) -> tuple[dict[str, Path], int]:
-    """Photographs by their names in the capture, sorted, and the number of other files. Raises CaptureError for two of
-    one name."""
-    prefixes = _prefixes(folders)
-    found, others = dict[str, Path](), 0
-    seen = set[Path]()
-    for folder, prefix in zip(folders, prefixes, strict=True):
-        for path in sorted(folder.rglob("*")):
-            if not _is_image(path):
-                others += path.is_file() and path.name.lower() not in _IGNORED_FILES
-                continue
-            real = path.resolve()
-            if real not in seen:  # a folder and one inside it may both be named
-                seen.add(real)
-                name = to_colmap_name(prefix + path.relative_to(folder).as_posix())
-                if name in found:
-                    raise CaptureError(
-                        f"{path}: would be called {name} in the capture, whose names have _ for blanks, as would "
-                        f"{found[name]}. Rename one of the two, or remove it if it is a copy."
-                    )
-                found[name] = path
-    return dict(sorted(found.items())), others
-
-
-def _prefixes(folders: Sequence[Path]) -> list[str]:
-    """What tells photographs of several folders apart: the folders' own names, numbered where they are alike."""
-    if len(folders) == 1:
-        return [""]
-    names = [to_colmap_name(folder.resolve().name) or "photographs" for folder in folders]
-    counts = Counter(names)
-    return [f"{name}_{k + 1}/" if counts[name] > 1 else f"{name}/" for k, name in enumerate(names)]
+def _of_the_flight(photographs: Sequence[ImageMetadata]) -> tuple[list[ImageMetadata], list[ExcludedImage]]:
+    """Without the pictures that are none of the flight, and with tags held against each other's."""
+    reasons, lent = strays(photographs)
+    kept = [lent.get(photo.name, photo) for photo in photographs if photo.name not in reasons]
+    return cross_checked(kept), [ExcludedImage(name, why) for name, why in sorted(reasons.items())]
 
 
 def _read(path: Path, name: str, mask: Path | None) -> ImageMetadata | ExcludedImage:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,11 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from vdgs.captures.image_files import MAX_IMAGE_PX, SUPPORTED_MODES, pillow_without_limits
+from vdgs.captures.jpeg import JPEGS, has_end, lacks_only_end
+from vdgs.sfm.exif_gps import finite, plain_text, read_altitude, read_place
 from vdgs.sfm.focal_length import Lens, read_lens
-from vdgs.sfm.xmp import first_number, read_xmp
+from vdgs.sfm.xmp import first_number, read_xmp, text
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +57,53 @@ def attitude_from_aircraft(heading_deg: float, pitch_deg: float, roll_deg: float
     return Attitude(np.stack([wing, -nose, belly]) @ enu)
 
 
+#: What `read_attitude` says of angles that are no measurement.
+DEFAULT_ANGLES = "all angles of the camera are exactly 0: a default, no measurement; not used"
+#: Without its heading a view is believed only where it looks so nearly down that the heading hardly matters (degrees).
+NEARLY_DOWN_DEG = 20.0
+#: In Pix4D's XMP a pitch of 0 looks down and 90 ahead. Below this (degrees) the gimbal's own angle was written there:
+#: cameras do not look backwards.
+_BACKWARDS_DEG = -30.0
+
+
+def read_attitude(xmp: Mapping[str, str]) -> tuple[Attitude | None, str]:
+    """Where the camera looked, or None, and what people should know of it.
+
+    By the gimbal (DJI and those who write as it does, Parrot, Skydio), by Pix4D's names, or by the aircraft that the
+    camera is fixed to, which looks down when level (senseFly). Angles that are all exactly 0 are those of a program
+    that knew none.
+    """
+    for names, from_gimbal in _WAYS:
+        yaw, pitch, roll = (first_number(xmp, *each) for each in names)
+        if pitch is None:
+            continue
+        if not yaw and not pitch and not roll:
+            return None, DEFAULT_ANGLES
+        if max(abs(yaw or 0.0), abs(pitch), abs(roll or 0.0)) > 360:
+            continue
+        if yaw is None:
+            yaw = first_number(xmp, "FlightYawDegree", "DroneYawDegree", "GPSImgDirection")
+        attitude = from_gimbal(yaw or 0.0, pitch, roll or 0.0)
+        return (attitude, "") if yaw is not None or attitude.tilt_deg < NEARLY_DOWN_DEG else (None, "")
+    return None, ""
+
+
+def _by_pix4d(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Attitude:
+    return attitude_from_gimbal(yaw_deg, pitch_deg if pitch_deg < _BACKWARDS_DEG else pitch_deg - 90, roll_deg)
+
+
+_WAYS = (
+    ((("GimbalYawDegree",), ("GimbalPitchDegree",), ("GimbalRollDegree",)), attitude_from_gimbal),
+    ((("CameraYawDegree",), ("CameraPitchDegree",), ("CameraRollDegree",)), attitude_from_gimbal),
+    (
+        (("CameraOrientationNED:Yaw",), ("CameraOrientationNED:Pitch",), ("CameraOrientationNED:Roll",)),
+        attitude_from_gimbal,
+    ),
+    ((("sensefly:Heading",), ("sensefly:PitchAngle",), ("sensefly:RollAngle",)), attitude_from_aircraft),
+    ((("Camera:Yaw",), ("Camera:Pitch",), ("Camera:Roll",)), _by_pix4d),
+)  # fmt: skip
+
+
 #: A shorter side below this shows too little to be matched: a thumbnail.
 MIN_SIDE_PX = 100
 #: EXIF orientations that turn a photograph by a quarter: width and height change places.
@@ -64,8 +112,8 @@ TRANSPOSED_ORIENTATIONS = (5, 6, 7, 8)
 MAX_GPS_ERROR_M = 1000.0
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
 _XMP_HEADER = b"http://ns.adobe.com/xap/1.0/\x00"
-#: The ends of a JPEG that may have been cut off are looked for in so many bytes at its end.
-_TAIL_BYTES = 1 << 16
+#: What cameras are called that do not say what they are.
+UNKNOWN_CAMERA = "unknown camera"
 
 
 class UnusableImage(Exception):
@@ -97,6 +145,7 @@ class ImageMetadata:
     gps_error_m: float | None
     """How far the place may be off across, in metres, where EXIF says it (GPSHPositioningError)."""
     relative_altitude: float | None
+    """In metres; 0 is what drones write that do not know it."""
     attitude: Attitude | None
     """Of the picture as the sensor has it; None for pictures that lay on their side."""
     file_bytes: int
@@ -104,6 +153,10 @@ class ImageMetadata:
     """Its file has an alpha channel, whatever that says."""
     mask: Path | None = None
     """White where it counts."""
+    doubts: tuple[str, ...] = ()
+    """What its tags say that is not believed, and why."""
+    whole: bool = True
+    """False where its file lacks the end marker, but nothing of the picture."""
 
     @property
     def may_be_masked(self) -> bool:
@@ -143,11 +196,14 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
             exif = image.getexif()
             tags, details, gps = dict(exif), dict(exif.get_ifd(_EXIF_IFD)), dict(exif.get_ifd(_GPS_IFD))
             xmp = read_xmp(_xmp_packet(image))
+            if text(xmp, "GPano:ProjectionType"):
+                raise UnusableImage(f"is a panorama ({text(xmp, 'GPano:ProjectionType')}), no photograph of one view")
             transparent = "A" in image.getbands() or "transparency" in image.info
-            if image.format == "JPEG" and not _has_end(path, size):
-                image.load()
+            whole = image.format not in JPEGS or has_end(path, image)
     except UnusableImage:
         raise
+    except UnidentifiedImageError:
+        raise UnusableImage(_not_an_image(path)) from None
     except OSError as error:
         why = "it is cut off" if "truncated" in str(error) else str(getattr(error, "strerror", None) or error)
         raise UnusableImage(f"cannot be read ({why}): copy it again") from None
@@ -155,11 +211,14 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
         raise UnusableImage(f"is damaged ({error}): copy it again") from None
     orientation = tags.get(0x0112, 1)
     orientation = orientation if orientation in range(1, 9) else 1
+    if not whole:
+        _check_pixels(path)
     lens = read_lens(tags, details, xmp, width, height)
     if orientation in TRANSPOSED_ORIENTATIONS:
         width, height = height, width
-    altitude, altitude_type = _altitude(gps, xmp)
-    attitude = _attitude(xmp) if orientation == 1 else None
+    place, unclear = read_place(gps, xmp)
+    altitude, altitude_type = read_altitude(gps, xmp)
+    attitude, default = read_attitude(xmp)
     return ImageMetadata(
         name=name,
         path=path,
@@ -168,17 +227,28 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
         orientation=orientation,
         camera=_camera(tags, details, xmp),
         lens=lens,
-        datetime=_text(details.get(0x9003)) or _text(tags.get(0x0132)),
-        lat_lon=_lat_lon(gps),
+        datetime=plain_text(details.get(0x9003)) or plain_text(tags.get(0x0132)),
+        lat_lon=place,
         altitude=altitude,
         altitude_type=altitude_type,
         gps_std=_rtk_std(xmp),
         gps_error_m=_gps_error(gps),
-        relative_altitude=first_number(xmp, "drone-dji:RelativeAltitude", "sensefly:Height"),
-        attitude=attitude,
+        relative_altitude=first_number(xmp, "RelativeAltitude", "sensefly:Height") or None,
+        attitude=attitude if orientation == 1 else None,
         file_bytes=size,
         has_alpha_channel=transparent,
+        doubts=tuple(filter(None, (unclear, default, lens.doubt if lens else ""))),
+        whole=whole,
     )
+
+
+def _not_an_image(path: Path) -> str:
+    """Why Pillow knows no format for a file: HEIC by another name, most often."""
+    with path.open("rb") as file:
+        head = file.read(12)
+    if head[4:8] == b"ftyp":
+        return f"is no {path.suffix.lower().lstrip('.')} but HEIC, HEIF or AVIF inside: convert it to JPEG"
+    return "cannot be read (no image format that is known): copy it again"
 
 
 def _check(image: Image.Image) -> None:
@@ -190,11 +260,14 @@ def _check(image: Image.Image) -> None:
         raise UnusableImage(f"has the colour mode {image.mode}: convert it to 8-bit RGB")
 
 
-def _has_end(path: Path, size: int) -> bool:
-    """Whether a JPEG's end marker is near its end, where only trailing data of makers may follow it."""
-    with path.open("rb") as file:
-        file.seek(max(0, size - _TAIL_BYTES))
-        return b"\xff\xd9" in file.read()
+def _check_pixels(path: Path) -> None:
+    """Raise Unusable unless all pixels of a JPEG without its end are there."""
+    try:
+        complete = lacks_only_end(path)
+    except (OSError, SyntaxError, ValueError, MemoryError):
+        complete = False
+    if not complete:
+        raise UnusableImage("cannot be read (it is cut off): copy it again")
 
 
 def _xmp_packet(image: Image.Image) -> bytes:
@@ -205,83 +278,20 @@ def _xmp_packet(image: Image.Image) -> bytes:
     return packet if isinstance(packet, bytes) else str(packet).encode("utf-8", errors="replace")
 
 
-def _text(value: Any) -> str:
-    """EXIF text without the zeros and control characters that it may be padded with."""
-    if isinstance(value, bytes):
-        value = value.decode("ascii", errors="replace")
-    kept = "".join(letter for letter in value if letter.isprintable()) if isinstance(value, str) else ""
-    return kept.strip()[:80]
-
-
 def _camera(tags: Mapping[int, Any], details: Mapping[int, Any], xmp: Mapping[str, str]) -> str:
-    maker, model = _text(tags.get(0x010F)), _text(tags.get(0x0110))
-    serial = _text(details.get(0xA431)) or xmp.get("drone-dji:CameraSerialNumber", "")
+    maker, model = plain_text(tags.get(0x010F)), plain_text(tags.get(0x0110))
+    serial = plain_text(details.get(0xA431)) or text(xmp, "CameraSerialNumber")
     named = model if maker and model.lower().startswith(maker.lower()) else f"{maker} {model}".strip()
-    return f"{named or 'unknown camera'}{f' no. {serial}' if serial else ''}"
-
-
-def finite_float(value: Any) -> float | None:
-    """A number of EXIF (a rational, mostly) as a float; None for what is none, infinite or NaN."""
-    try:
-        result = float(value)
-    except (TypeError, ValueError, ZeroDivisionError):
-        return None
-    return result if math.isfinite(result) else None
-
-
-def _lat_lon(gps: Mapping[int, Any]) -> tuple[float, float] | None:
-    latitude = _degrees(gps.get(2), _text(gps.get(1)).upper() == "S")
-    longitude = _degrees(gps.get(4), _text(gps.get(3)).upper() == "W")
-    if latitude is None or longitude is None or abs(latitude) > 90 or abs(longitude) > 180:
-        return None
-    return latitude, longitude
-
-
-def _degrees(value: Any, negative: bool) -> float | None:
-    if not isinstance(value, (tuple, list)) or len(value) != 3:
-        return None
-    parts = [finite_float(each) for each in value]
-    if any(part is None for part in parts):
-        return None
-    degrees = sum(part / 60**power for power, part in enumerate(parts) if part is not None)
-    return -degrees if negative else degrees
-
-
-def _altitude(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[float | None, str]:
-    """Altitude in metres and what it is measured from, as far as the file says."""
-    below = gps.get(5) in (b"\x01", 1)
-    value = finite_float(gps.get(6))
-    if value is None:
-        value = first_number(xmp, "drone-dji:AbsoluteAltitude", "sensefly:AltitudeWGS84")
-    elif below:
-        value = -value
-    if value is None or abs(value) > 20_000:
-        return None, ""
-    ellipsoidal = first_number(xmp, "sensefly:AltitudeWGS84")
-    if ellipsoidal is not None and abs(ellipsoidal - value) < 0.01:
-        return value, "above the WGS 84 ellipsoid (AltitudeWGS84)"
-    named = xmp.get("drone-dji:AltitudeType", "")
-    return value, f"{named} as recorded" if named else "EXIF GPSAltitude as recorded, datum not stated"
+    return f"{named or UNKNOWN_CAMERA}{f' no. {serial}' if serial else ''}"
 
 
 def _rtk_std(xmp: Mapping[str, str]) -> tuple[float, float, float] | None:
-    found = [first_number(xmp, f"drone-dji:RtkStd{which}") for which in ("Lon", "Lat", "Hgt")]
+    found = [first_number(xmp, f"RtkStd{which}") for which in ("Lon", "Lat", "Hgt")]
     east, north, up = (value if value is not None and 0 < value < 100 else None for value in found)
     return None if east is None or north is None or up is None else (east, north, up)
 
 
 def _gps_error(gps: Mapping[int, Any]) -> float | None:
     """EXIF's GPSHPositioningError in metres; 0 and kilometres say nothing."""
-    value = finite_float(gps.get(0x1F))
+    value = finite(gps.get(0x1F))
     return value if value is not None and 0 < value < MAX_GPS_ERROR_M else None
-
-
-def _attitude(xmp: Mapping[str, str]) -> Attitude | None:
-    """From the gimbal (DJI), or the aircraft that the camera is fixed to, which looks down when level (senseFly)."""
-    yaw, pitch, roll = (first_number(xmp, f"drone-dji:Gimbal{which}Degree") for which in ("Yaw", "Pitch", "Roll"))
-    if yaw is not None and pitch is not None and roll is not None:
-        return attitude_from_gimbal(yaw, pitch, roll)
-    yaw, pitch, roll = (first_number(xmp, f"sensefly:{which}") for which in ("Heading", "PitchAngle", "RollAngle"))
-    if yaw is not None and pitch is not None and roll is not None:
-        return attitude_from_aircraft(yaw, pitch, roll)
-    return None

@@ -1,4 +1,4 @@
-"""Poses and points from matches: COLMAP's incremental mapper, with positions as priors."""
+"""Poses and points from matches alone: COLMAP's incremental mapper."""
 
 from __future__ import annotations
 
@@ -26,6 +26,8 @@ MIN_OBLIQUE_SHARE, MIN_HEIGHT_SPREAD = 0.15, 0.2
 #: Of a way around something no tenth of the positions is nearer to the middle than this share of how far all are (RMS,
 #: both axes alike); of strips over an area it is (choice).
 ORBIT_RADIUS_SHARE = 0.8
+#: So small a share of photographs that are unlike the others changes no rule for all (choice).
+FEW = 0.1
 #: Parts of fewer photographs than this are no model.
 MIN_MODEL_SIZE = 3
 #: What the mapper has is kept so many times on the way, each time by so many photographs more at least.
@@ -40,8 +42,11 @@ def should_fix_focal(
     wrong focal length that is held bends or tears all other scenes."""
     if options.focal != "auto":
         return options.focal == "fixed", "asked for"
-    if any(photo.lens is None for photo in photographs):
+    few = max(1, FEW * len(photographs))
+    if sum(photo.lens is None for photo in photographs) > few:
         return False, "nothing says it for some photographs"
+    if sum(bool(photo.lens and photo.lens.doubt) for photo in photographs) > few:
+        return False, "what the photographs say of it contradicts itself"
     tilts = [photo.attitude.tilt_deg for photo in photographs if photo.attitude]
     if tilts and np.mean(np.array(tilts) > OBLIQUE_ANGLE_DEG) >= MIN_OBLIQUE_SHARE:
         return False, f"{np.mean(np.array(tilts) > OBLIQUE_ANGLE_DEG):.0%} oblique views tell it"
@@ -65,7 +70,9 @@ def _is_survey_grid(positions: GpsPriors) -> bool:
     axes, spread, _ = np.linalg.svd(plane, full_matrices=False)
     spread, alike = spread / np.sqrt(len(plane)), np.linalg.norm(axes, axis=1) * np.sqrt(len(plane))
     around = np.quantile(alike, 0.1) > ORBIT_RADIUS_SHARE * np.sqrt(2)
-    return not around and _range(positions.enu[:, 2]) <= MIN_HEIGHT_SPREAD * spread[1]
+    heights, moments = positions.enu[:, 2], np.arange(len(positions))
+    steady = heights - np.polyval(np.polyfit(moments, heights, 1), moments)  # altitudes of receivers drift
+    return not around and min(_range(heights), _range(steady)) <= MIN_HEIGHT_SPREAD * spread[1]
 
 
 def _range(heights: np.ndarray) -> float:
@@ -73,31 +80,8 @@ def _range(heights: np.ndarray) -> float:
     return float(np.ptp(np.quantile(heights, [0.05, 0.95])))
 
 
-def write_pose_priors(workspace: Workspace, photographs: Sequence[ImageMetadata], positions: GpsPriors) -> None:
-    """Positions with their covariances and, where the drone says it, which way is down."""
-    row_of = {int(i): row for row, i in enumerate(positions.image_indices)} if positions.usable else {}
-    database = pycolmap.Database.open(workspace.database)
-    try:
-        database.clear_pose_priors()
-        images = {image.name: image for image in database.read_all_images()}
-        for i, photo in enumerate(photographs):
-            if i not in row_of or photo.name not in images:
-                continue
-            prior = pycolmap.PosePrior(
-                corr_data_id=images[photo.name].data_id,
-                position=positions.enu[row_of[i]],
-                position_covariance=np.diag(positions.gps_std[row_of[i]] ** 2),
-                coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
-            )
-            if photo.attitude is not None:
-                prior.gravity = photo.attitude.gravity
-            database.write_pose_prior(prior)
-    finally:
-        database.close()
-
-
 def run_mapper(
-    workspace: Workspace, count: int, fix_focal: bool, use_gps_priors: bool, threads: int, console: Console
+    workspace: Workspace, count: int, fix_focal: bool, threads: int, console: Console
 ) -> list[pycolmap.Reconstruction]:
     """All models that the mapper makes of the matches, that of most photographs first.
 
@@ -107,7 +91,7 @@ def run_mapper(
     for folder in (workspace.models, workspace.snapshots):
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-    options = _options(fix_focal, use_gps_priors, threads)
+    options = _options(fix_focal, threads)
     options.snapshot_path, options.snapshot_frames_freq = (
         workspace.snapshots,
         max(MIN_SNAPSHOT_INTERVAL, count // MAX_SNAPSHOTS),
@@ -183,12 +167,12 @@ def _sorted(models: list[pycolmap.Reconstruction]) -> list[pycolmap.Reconstructi
     return sorted(models, key=lambda model: -model.num_reg_images())
 
 
-def _options(fix_focal: bool, use_gps_priors: bool, threads: int) -> pycolmap.IncrementalPipelineOptions:
+def _options(fix_focal: bool, threads: int) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = threads, 0
     options.min_model_size = MIN_MODEL_SIZE
     options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not fix_focal
-    options.use_prior_position = options.use_robust_loss_on_prior_position = use_gps_priors
+    options.use_prior_position = False  # poses come without trust in positions, which may be off by any amount
     # Its solver takes minutes for each photograph that does not fit, and finds none in overlapping flights.
     options.structure_less_registration_fallback = False
     # Points that two photographs see are where the edges of a flight, and few photographs, have any.

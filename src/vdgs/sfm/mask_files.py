@@ -12,6 +12,7 @@ import numpy as np
 
 from vdgs.captures.image_files import decode_image, decode_mask, find_images, find_mask, read_header, same_aspect
 from vdgs.captures.mask_matching import mask_name
+from vdgs.captures.strays import MASK_FOLDERS, is_mask_folder, masked_stem
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.sfm.image_metadata import ImageMetadata
@@ -19,15 +20,16 @@ from vdgs.sfm.workspace import Workspace
 from vdgs.system.atomic_files import write_bytes
 from vdgs.system.stop_signals import check_stop_requested
 
-#: What folders of masks are called, and one of the photographs that they may lie beside, as in captures.
+#: What a folder of masks is called, and one of the photographs that it may lie beside, as in captures.
 MASK_FOLDER, IMAGE_FOLDER = CaptureOptions.masks, "images"
 
 
 def find_masks(folders: Sequence[Path], files: Collection[Path]) -> tuple[dict[Path, Path | None], list[str]]:
     """The photographs among the images below the folders, each with its mask or None; and what people should know.
 
-    A folder `masks` holds masks of what lies beside it, named like that, or like what lies in `images` beside it. Where
-    there is nothing but such folders, their images are photographs.
+    A folder `masks` (`mask`, `_masks`, ...) holds masks of what lies beside it, named like that, or like what lies in
+    `images` beside it. Where there is nothing but such folders, their images are photographs. An image beside a
+    photograph that is called `x_mask`, `mask_x` or `x.jpg.png` is its mask too.
 
     Raises CaptureError for a folder of masks none of which is of a photograph.
     """
@@ -35,17 +37,38 @@ def find_masks(folders: Sequence[Path], files: Collection[Path]) -> tuple[dict[P
     photographs = [file for file in files if file not in places]
     if not photographs:
         return dict.fromkeys(files), []
+    adjacent = _beside_photographs(photographs)
     beside = {place.parent: place for place in places.values()}
     is_folder = cache(Path.is_dir)
     found = dict[Path, Path | None]()
     for file in photographs:
+        if file in adjacent:
+            continue
         found[file] = None
         for parent, name in _mask_candidates(file, folders):
-            place = beside.get(parent, parent / MASK_FOLDER)
-            if found[file] is None and is_folder(place):
-                beside[parent] = place
-                found[file] = find_mask(place, name)
-    return found, _mask_notes(sorted(beside.values()), found)
+            if parent not in beside:
+                beside[parent] = next(
+                    (parent / each for each in MASK_FOLDERS if is_folder(parent / each)), parent / MASK_FOLDER
+                )
+            if found[file] is None and is_folder(beside[parent]):
+                found[file] = find_mask(beside[parent], name)
+    for mask, photograph in adjacent.items():
+        found[photograph] = found[photograph] or mask
+    there = sorted(place for place in beside.values() if is_folder(place))
+    return found, _mask_notes(there, found)
+
+
+def _beside_photographs(files: Sequence[Path]) -> dict[Path, Path]:
+    """Images that are by their names masks of others in their folder, each with its photograph."""
+    by_stem = {(file.parent, file.stem.lower()): file for file in files}
+    by_name = {(file.parent, file.name.lower()): file for file in files}
+    found = {}
+    for file in files:
+        stem = (masked_stem(file.stem) or "").lower()
+        photograph = by_name.get((file.parent, stem or file.stem.lower())) or by_stem.get((file.parent, stem))
+        if photograph is not None and photograph != file:
+            found[file] = photograph
+    return {mask: photograph for mask, photograph in found.items() if photograph not in found}
 
 
 def check_mask(photo: ImageMetadata) -> None:
@@ -66,7 +89,7 @@ def _masks_above(file: Path, folders: Sequence[Path]) -> Iterator[Path]:
     folder = next(folder for folder in folders if folder in file.parents)
     parts = file.relative_to(folder).parts[:-1]
     for k, part in enumerate(parts):
-        if part.lower() == MASK_FOLDER:
+        if is_mask_folder(part):
             yield folder.joinpath(*parts[: k + 1])
             return
 
@@ -103,7 +126,7 @@ def _mask_notes(mask_folders: Sequence[Path], found: dict[Path, Path | None]) ->
     without = [file for file, mask in found.items() if mask is None]
     if used and without:
         remarks.append(
-            f"{len(found) - len(without)} of {len(found)} photographs have a mask in {MASK_FOLDER}/; the others, such as "
+            f"{len(found) - len(without)} of {len(found)} photographs have a mask; the others, such as "
             f"{without[0].name}, count whole."
         )
     return remarks

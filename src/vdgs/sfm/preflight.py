@@ -157,6 +157,10 @@ def _warnings(collection: ImageList, overlap: float | None, views: float | None,
     without = [photo.name for photo in photographs if photo.lens is None]
     if without:
         found.append(f"{_first(without)}: nothing says the focal length; it is fitted from a guess.")
+    found += _doubts(photographs)
+    endless = [photo.name for photo in photographs if not photo.whole]
+    if endless:
+        found.append(f"{_first(endless)}: the file lacks its end marker, but nothing of the picture; used.")
     small = _small_files(photographs)
     if small:
         found.append(f"{_first(small)}: far smaller files than the others: blurred, dark, or showing little?")
@@ -170,6 +174,17 @@ def _warnings(collection: ImageList, overlap: float | None, views: float | None,
     if moments and max(moments) - min(moments) > timedelta(days=1):
         found.append(f"taken on {len(days)} days, {days[0]} to {days[-1]}: light, shadows and plants may differ.")
     return found
+
+
+def _doubts(photographs: Sequence[ImageMetadata]) -> list[str]:
+    """What tags say that is not believed, each with the photographs that it is about; values are those of the first."""
+    names, texts = dict[str, list[str]](), dict[str, str]()
+    for photo in photographs:
+        for doubt in photo.doubts:
+            kind = doubt.partition(" (")[0]
+            names.setdefault(kind, []).append(photo.name)
+            texts.setdefault(kind, doubt)
+    return [f"{_first(names[kind])}: {text.rstrip('.')}." for kind, text in texts.items()]
 
 
 def _small_files(photographs: Sequence[ImageMetadata]) -> list[str]:

@@ -14,11 +14,13 @@ import pycolmap
 from rich.console import Console
 
 from vdgs import __version__
+from vdgs.captures.georeference import ENU_FRAME, LOCAL_FRAME, ORIGIN_KEYS
 from vdgs.captures.reconstruction import (
+    MAPPED,
     RECONSTRUCTION_FIGURE,
     RECONSTRUCTION_FILE,
     WORK_FOLDER,
-    GcpReport,
+    CameraReport,
     ReconstructionReport,
     is_reconstruction,
     read_reconstruction,
@@ -26,17 +28,16 @@ from vdgs.captures.reconstruction import (
 from vdgs.config.serialization import to_dict
 from vdgs.config.sfm_options import SfmRequest
 from vdgs.errors import VdgsError
-from vdgs.geometry.similarity import Similarity
 from vdgs.sfm import (
     capture_writer,
     feature_extraction,
     feature_matching,
-    gcp_adjustment,
     georegistration,
     incremental_mapper,
     mask_files,
 )
 from vdgs.sfm.console_report import print_reconstruction_report
+from vdgs.sfm.georeferencing import georeference
 from vdgs.sfm.image_list import ExcludedImage
 from vdgs.sfm.position_plots import plot_positions, plot_residuals
 from vdgs.sfm.reconstruction_plan import (
@@ -46,13 +47,19 @@ from vdgs.sfm.reconstruction_plan import (
     print_plan,
     time_order,
 )
-from vdgs.sfm.reconstruction_report import ReconstructionResult, exclusion_reasons, make_reconstruction_report
+from vdgs.sfm.reconstruction_report import (
+    ReconstructionResult,
+    cameras_of,
+    exclusion_reasons,
+    make_reconstruction_report,
+)
 from vdgs.sfm.workspace import Workspace, cache_key, silence_colmap
 from vdgs.system.atomic_files import to_jsonable, write_json
-from vdgs.system.documents import JsonObject
 from vdgs.system.file_locks import lock_folder
 from vdgs.system.records import record_to_dict
 
+#: A lens that moves pixels in the corners by no more leaves the photographs without distortion as they are.
+LENS_PX = 0.05
 #: Where the positions are shown before the work, inside the output.
 POSITIONS_FIGURE = "photographs.png"
 
@@ -70,11 +77,18 @@ def reconstruct(
     prepared = plan_reconstruction(request)
     output = request.output
     work, keys = Workspace(output / WORK_FOLDER), _keys(prepared)
-    facts = read_reconstruction(output) if _is_finished(output, keys["capture"]) else None
+    facts = read_reconstruction(output) if _is_finished(output, keys["placed"]) else None
     if facts is not None:
         console.print(f"{output}: made of these photographs already; nothing to do", highlight=False)
         return facts
     _check_output_folder(output)
+    before = _placed_before(output, keys["capture"])
+    if before is not None:
+        with lock or nullcontext(), lock_folder(output):
+            facts = _place_anew(prepared, before, keys["placed"], console)
+        console.print(f"{output}: placed anew; its photographs and poses stay", highlight=False)
+        print_reconstruction_report(facts, console)
+        return facts
     print_plan(prepared, console)
     check_disk_space(prepared)
     with lock or nullcontext(), lock_folder(output):
@@ -90,7 +104,7 @@ def reconstruct(
 
 
 def _keys(plan: ReconstructionPlan) -> dict[str, str]:
-    """What each step depends on, each on those before it."""
+    """What each step depends on, each on those before it. All but the last do not depend on what places the scene."""
     options, positions = plan.request.options, plan.gps_priors
     files = [
         (photo.name, photo.file_bytes, photo.path.stat().st_mtime_ns, photo.width, photo.height, photo.orientation)
@@ -100,12 +114,14 @@ def _keys(plan: ReconstructionPlan) -> dict[str, str]:
     found = cache_key(
         __version__, files, lenses, options.max_image_size, options.max_num_features, *_masked_images(plan)
     )
-    placed = [positions.image_indices.tolist(), positions.enu.tolist(), positions.gps_std.tolist()]
-    matched = cache_key(found, placed, options.num_neighbors, options.exhaustive_max)
+    matched = cache_key(found, options.num_neighbors, options.exhaustive_max)
     mapped = cache_key(matched, options.focal)
-    points = plan.gcps.points if plan.gcps else ()
-    capture = cache_key(mapped, options.max_output_size, [record_to_dict(point) for point in points])
-    return {"features": found, "matches": matched, "model": mapped, "capture": capture}
+    capture = cache_key(mapped, options.max_output_size)
+    points, bars = plan.gcps.points if plan.gcps else (), plan.scale_bars
+    told = [positions.image_indices.tolist(), positions.enu.tolist(), positions.gps_std.tolist(), positions.origin]
+    known = [record_to_dict(point) for point in points], bars and record_to_dict(bars)
+    placed = cache_key(capture, told, known, options.georeference)
+    return {"features": found, "matches": matched, "model": mapped, "capture": capture, "placed": placed}
 
 
 def _masked_images(plan: ReconstructionPlan) -> list[tuple[Any, ...]]:
@@ -119,7 +135,68 @@ def _masked_images(plan: ReconstructionPlan) -> list[tuple[Any, ...]]:
 
 
 def _is_finished(output: Path, key: str) -> bool:
-    return (output / RECONSTRUCTION_FILE).is_file() and Workspace(output).is_done("capture", key)
+    return (output / RECONSTRUCTION_FILE).is_file() and Workspace(output).is_done("placed", key)
+
+
+def _placed_before(output: Path, key: str) -> ReconstructionReport | None:
+    """The facts of a finished capture of the same photographs that is to be placed otherwise."""
+    if not (
+        (output / RECONSTRUCTION_FILE).is_file()
+        and (output / MAPPED).is_dir()
+        and Workspace(output).is_done("capture", key)
+    ):
+        return None
+    return read_reconstruction(output)
+
+
+def _place_anew(
+    prepared: ReconstructionPlan, before: ReconstructionReport, key: str, console: Console
+) -> ReconstructionReport:
+    """Place the model of a finished capture again; it stays as it is where that is refused. Photographs are written
+    again only where what places it tells another lens."""
+    began, collection = time.monotonic(), prepared.image_list
+    output, photographs = prepared.request.output, collection.images
+    kinds = feature_extraction.group_by_camera(photographs)
+    found = georeference(pycolmap.Reconstruction(output / MAPPED), prepared, before.focal_fixed)
+    if _lens_moved(before.cameras, cameras_of(found.model, kinds)) > LENS_PX:
+        work = Workspace(output / WORK_FOLDER)
+        feature_extraction.write_upright_images(work, photographs)
+        mask_files.write_upright_masks(work, photographs, prepared.threads)
+        for name in (*(folder for folder, _ in capture_writer.IMAGE_SIZES), capture_writer.MASK_FOLDER):
+            shutil.rmtree(output / name, ignore_errors=True)
+        _write_images(prepared, work, found.model, console)
+        work.remove()
+    known = {each.name for each in collection.excluded}
+    left_out = [
+        ExcludedImage(photo.name, photo.excluded_reason)
+        for photo in before.photographs
+        if photo.excluded_reason is not None and photo.name not in known
+    ]
+    held = before.focal_fixed, before.focal_reason
+    seconds = time.monotonic() - began
+    outcome = ReconstructionResult(
+        camera_groups=kinds,
+        found=found,
+        excluded=left_out,
+        components=before.components,
+        pairs=before.pairs,
+        focal_fixed=held,
+        seconds=seconds,
+    )
+    return _finish(prepared, outcome, key)
+
+
+def _lens_moved(before: Sequence[CameraReport], after: Sequence[CameraReport]) -> float:
+    """By how many pixels of a photograph the picture without distortion changes in the corners, at most."""
+    if len(before) != len(after):
+        return float("inf")
+    moved = [0.0]
+    for one, other in zip(before, after, strict=True):
+        corner = float(np.hypot(one.width, one.height)) / 2
+        away = corner / one.focal_after_px
+        bent = (other.radial_distortion - one.radial_distortion) * away**2
+        moved.append(corner * abs(bent + other.focal_after_px / one.focal_after_px - 1))
+    return max(moved)
 
 
 def _check_output_folder(output: Path) -> None:
@@ -139,8 +216,8 @@ def _steps(
     plan: ReconstructionPlan, workspace: Workspace, keys: dict[str, str], console: Console
 ) -> ReconstructionReport:
     began = time.monotonic()
-    request, output = plan.request, plan.request.output
-    photographs, threads = plan.image_list.images, plan.threads
+    request = plan.request
+    photographs = plan.image_list.images
     kinds = feature_extraction.group_by_camera(photographs)
     lost = _features(plan, workspace, kinds, keys["features"], console)
     usable = [photo for photo in photographs if photo.name not in {each.name for each in lost}]
@@ -154,25 +231,40 @@ def _steps(
         feature_matching.count_verified_matches(workspace),
         lost,
     )
-    placed, origin, surveyed = _georegister(models[0], plan, held[0])
-    _write(plan, workspace, models[0], keys["capture"], threads, console)
+    mapped = pycolmap.Reconstruction(models[0])
+    found = georeference(models[0], plan, held[0])
+    _write(plan, workspace, mapped, found.model, keys["capture"], console)
     outcome = ReconstructionResult(
-        camera_groups=kinds, registration=placed, origin=origin, survey=surveyed, excluded=left_out,
-        components=[model.num_reg_images() for model in models], pairs=pairs, focal_fixed=held,
+        camera_groups=kinds,
+        found=found,
+        excluded=left_out,
+        components=[model.num_reg_images() for model in models],
+        pairs=pairs,
+        focal_fixed=held,
         seconds=time.monotonic() - began,
-    )  # fmt: skip
-    facts = make_reconstruction_report(models[0], plan, outcome)
-    points = georegistration.model_points(models[0])
-    marks = dict(zip((each.name for each in surveyed), _gcp_positions(plan), strict=False))
-    plot_residuals(points, plan.gps_priors, outcome.georegistration, marks, output / RECONSTRUCTION_FIGURE)
-    if origin is not None:
-        write_json(output / "georef.json", _georef(facts, origin))
-    capture_writer.write_model(output, models[0], _lenses(models[0], request.options.max_output_size))
+    )
+    return _finish(plan, outcome, keys["placed"])
+
+
+def _finish(prepared: ReconstructionPlan, outcome: ReconstructionResult, key: str) -> ReconstructionReport:
+    """Write what depends on where the scene lies; the facts come last."""
+    request, output, model = prepared.request, prepared.request.output, outcome.found.model
+    facts = make_reconstruction_report(prepared, outcome)
+    Workspace(output).begin("placed", key)
+    shutil.rmtree(output / "sparse", ignore_errors=True)
+    (output / "georef.json").unlink(missing_ok=True)
+    marks = dict(zip((each.name for each in outcome.found.survey), _gcp_positions(prepared), strict=False))
+    plot_residuals(
+        georegistration.model_points(model), prepared.gps_priors, outcome.metric, marks, output / RECONSTRUCTION_FIGURE
+    )
+    if outcome.metric is not None:
+        write_json(output / "georef.json", _georef(facts, outcome.found.origin))
+    capture_writer.write_model(output, model, _lenses(model, request.options.max_output_size))
     write_json(
         output / RECONSTRUCTION_FILE,
         to_jsonable(record_to_dict(facts)) | {"options": to_jsonable(to_dict(request.options))},
     )
-    Workspace(output).finish("capture", keys["capture"])
+    Workspace(output).finish("placed", key)
     return facts
 
 
@@ -225,39 +317,9 @@ def _models(
     if not workspace.is_begun("model", key):
         incremental_mapper.delete_models(workspace)
         workspace.begin("model", key)
-    incremental_mapper.write_pose_priors(workspace, plan.image_list.images, plan.gps_priors)
-    models = incremental_mapper.run_mapper(workspace, count, fix_focal, plan.gps_priors.usable, plan.threads, console)
+    models = incremental_mapper.run_mapper(workspace, count, fix_focal, plan.threads, console)
     workspace.finish("model", key)
     return models
-
-
-def _georegister(
-    model: pycolmap.Reconstruction, plan: ReconstructionPlan, fix_focal: bool
-) -> tuple[
-    georegistration.Georegistration | georegistration.AlignmentFailure,
-    tuple[float, float, float] | None,
-    tuple[GcpReport, ...],
-]:
-    """Bring the model to metres east, north, up, its median point to height 0; the origin that this has on Earth, and
-    what it makes of surveyed points."""
-    photographs, positions, control = plan.image_list.images, plan.gps_priors, plan.gcps
-    doubtful = set[str]()
-    if control is not None and control.has_control_points:
-        how, doubtful = gcp_adjustment.adjust_to_gcps(model, control, plan.origin, fix_focal, plan.threads)
-        placed: georegistration.Georegistration | georegistration.AlignmentFailure = (
-            georegistration.registration_in_place(model, photographs, positions, how)
-        )
-    else:
-        placed = georegistration.georegister(model, photographs, positions)
-        if isinstance(placed, georegistration.Georegistration):
-            georegistration.transform_model(model, placed.similarity)
-    if isinstance(placed, georegistration.AlignmentFailure):
-        return placed, None, ()
-    surveyed = gcp_adjustment.measure_gcps(model, control, plan.origin, doubtful) if control is not None else ()
-    ground = float(np.median(georegistration.model_points(model)[:, 2]))
-    georegistration.transform_model(model, Similarity(1.0, np.eye(3), np.array([0.0, 0.0, -ground])))
-    latitude, longitude, altitude = plan.origin
-    return placed, (latitude, longitude, altitude + ground), surveyed
 
 
 def _gcp_positions(plan: ReconstructionPlan) -> np.ndarray:
@@ -273,35 +335,51 @@ def _lenses(model: pycolmap.Reconstruction, max_size: int) -> dict[int, capture_
 def _write(
     plan: ReconstructionPlan,
     workspace: Workspace,
+    mapped: pycolmap.Reconstruction,
     model: pycolmap.Reconstruction,
     key: str,
-    threads: int,
     console: Console,
 ) -> None:
+    """Photographs without distortion, by the lenses of the placed model, and the model as it was mapped."""
     output = plan.request.output
     if not Workspace(output).is_begun("capture", key):
-        for name in (*(folder for folder, _ in capture_writer.IMAGE_SIZES), capture_writer.MASK_FOLDER, "sparse"):
+        for name in (
+            *(folder for folder, _ in capture_writer.IMAGE_SIZES),
+            capture_writer.MASK_FOLDER,
+            "sparse",
+            MAPPED,
+        ):
             shutil.rmtree(output / name, ignore_errors=True)
         for name in (RECONSTRUCTION_FILE, "georef.json", RECONSTRUCTION_FIGURE):
             (output / name).unlink(missing_ok=True)
         Workspace(output).begin("capture", key)
     shutil.rmtree(output / "sparse", ignore_errors=True)
+    _write_images(plan, workspace, model, console)
+    (output / MAPPED).mkdir(exist_ok=True)
+    mapped.write(output / MAPPED)
+    Workspace(output).finish("capture", key)
+
+
+def _write_images(
+    prepared: ReconstructionPlan, work: Workspace, model: pycolmap.Reconstruction, console: Console
+) -> None:
+    output, max_size = prepared.request.output, prepared.request.options.max_output_size
     names: dict[int, list[str]] = {}
     for image in sorted(model.images.values(), key=lambda image: image.name):
         if image.has_pose:
             names.setdefault(image.camera_id, []).append(image.name)
-    capture_writer.write_images(
-        output, workspace, names, _lenses(model, plan.request.options.max_output_size), threads, console
-    )
+    capture_writer.write_images(output, work, names, _lenses(model, max_size), prepared.threads, console)
 
 
-def _georef(report: ReconstructionReport, origin: tuple[float, float, float]) -> JsonObject:
-    latitude, longitude, altitude = origin
+def _georef(report: ReconstructionReport, origin: tuple[float, float, float] | None) -> dict[str, Any]:
+    place = {} if origin is None else dict(zip(ORIGIN_KEYS, origin, strict=True))
     return {
-        "frame": "ENU, metres, x east y north z up",
-        "origin_lat_deg": latitude, "origin_lon_deg": longitude, "origin_alt_m": altitude,
+        "frame": ENU_FRAME if origin is not None else LOCAL_FRAME,
+        **place,
         "alt_reference": report.altitude_reference,
-        "method": f"bundle adjustment with positions as priors, then a similarity to the {report.georeferenced}",
+        "method": f"poses from the photographs alone, then a similarity: {report.georeferenced}",
+        "accuracy": report.accuracy and report.accuracy.summary,
+        "accuracy_95": report.accuracy and record_to_dict(report.accuracy),
         "gps_outliers_left_out": report.positions_rejected,
         "gps_residual_rms_m_xyz": list(report.residual_rms_m or ()),
         "z0": "median height of the 3D points",

@@ -19,6 +19,7 @@ from vdgs.sfm.gcp_list import GcpList, check_gcps_near, read_gcp_list
 from vdgs.sfm.gps_priors import GpsPriors, read_gps_priors
 from vdgs.sfm.image_list import ImageList, collect_images
 from vdgs.sfm.preflight import PreflightReport, estimate_seconds, make_preflight_report
+from vdgs.sfm.scale_bars import ScaleBars, read_scale_bars
 from vdgs.system.units import data_size, rough_duration
 
 #: Bytes of disk for a feature, with its descriptor and its matches; and for a pixel of a written photograph.
@@ -36,6 +37,7 @@ class ReconstructionPlan:
     threads: int
     estimated_seconds: float
     gcps: GcpList | None = None
+    scale_bars: ScaleBars | None = None
 
     @property
     def origin(self) -> tuple[float, float, float]:
@@ -50,6 +52,7 @@ def plan_reconstruction(request: SfmRequest) -> ReconstructionPlan:
     check_output_outside_images(request.output, collection)
     positions = read_gps_priors(collection.images, request.gps, request.options.gps_std_m)
     control = _read_gcps(request.options, collection, positions)
+    bars = read_scale_bars(request.options.scale_bar, collection) if request.options.scale_bar is not None else None
     look = make_preflight_report(collection, positions)
     look = replace(look, warnings=[*look.warnings, *(control.notes if control else ())])
     threads = request.threads or default_num_threads()
@@ -63,6 +66,7 @@ def plan_reconstruction(request: SfmRequest) -> ReconstructionPlan:
         threads=threads,
         estimated_seconds=takes,
         gcps=control,
+        scale_bars=bars,
     )
 
 
@@ -72,6 +76,10 @@ def _read_gcps(options: SfmOptions, collection: ImageList, positions: GpsPriors)
             raise VdgsError("--check-points names points of a list: give it with --gcp")
         return None
     control = read_gcp_list(options.gcp, collection, options.check_points)
+    if options.georeference == "off":
+        raise VdgsError("--georeference off leaves control points out: give --gcp without it")
+    if options.georeference == "anyway":
+        return control
     check_gcps_near(control, positions.enu, positions.origin, options.gcp)
     return control
 

@@ -10,6 +10,8 @@ import pycolmap
 
 from vdgs.captures.reconstruction import CameraReport, GcpReport, ImageReport, ReconstructionReport
 from vdgs.sfm.feature_extraction import CameraGroup
+from vdgs.sfm.gcp_adjustment import MARK_WRONG_PX
+from vdgs.sfm.georeferencing import Georeferenced
 from vdgs.sfm.georegistration import AlignmentFailure, Georegistration, model_points, tilt_from_attitudes
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_list import ExcludedImage, ImageList
@@ -21,8 +23,6 @@ from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 MAX_FOCAL_DRIFT, MAX_HEIGHT_DRIFT = 0.05, 0.15
 #: Degrees between down as the model has it and as the drone recorded it that are worth a word.
 MAX_TILT_DEG = 3.0
-#: A mark so many pixels from where the model puts a surveyed point is wrong (choice).
-MAX_MARK_ERROR_PX = 8.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -31,11 +31,8 @@ class ReconstructionResult:
 
     #: Kinds of camera, as the features were found with.
     camera_groups: Sequence[CameraGroup]
-    #: How the model was placed by positions, or why not, and where its origin is (latitude, longitude, altitude).
-    registration: Georegistration | AlignmentFailure
-    origin: tuple[float, float, float] | None
-    #: Surveyed points and how far off the model has them.
-    survey: tuple[GcpReport, ...]
+    #: The model where it belongs, how it was placed or why not, and surveyed points.
+    found: Georeferenced
     excluded: Sequence[ExcludedImage]
     #: Photographs of each part that came out, the largest first.
     components: Sequence[int]
@@ -46,45 +43,47 @@ class ReconstructionResult:
     seconds: float
 
     @property
-    def georegistration(self) -> Georegistration | None:
-        return self.registration if isinstance(self.registration, Georegistration) else None
+    def metric(self) -> Georegistration | None:
+        """How the model was brought to metres; None where it was not."""
+        return self.found.placed if isinstance(self.found.placed, Georegistration) else None
 
 
-def make_reconstruction_report(
-    model: pycolmap.Reconstruction, plan: ReconstructionPlan, result: ReconstructionResult
-) -> ReconstructionReport:
+def make_reconstruction_report(plan: ReconstructionPlan, result: ReconstructionResult) -> ReconstructionReport:
     """The facts of a model that lies where it belongs."""
-    placed, held = result.georegistration, result.focal_fixed
+    model, placed, held = result.found.model, result.metric, result.focal_fixed
     collection, positions, look = plan.image_list, plan.gps_priors, plan.preflight
     images = [image for image in model.images.values() if image.has_pose]
     metric = placed is not None
     height = _height(model, images) if metric else None
     forwards = np.array([image.cam_from_world().rotation.matrix()[2] for image in images])
     tilt = float(np.median(np.degrees(np.arccos(np.clip(-forwards[:, 2], -1, 1))))) if metric else None
-    cameras = _cameras(model, result.camera_groups)
+    cameras = cameras_of(model, result.camera_groups)
     turned = tilt_from_attitudes(model, collection.images) if metric else None
     warnings = [*look.warnings, *_warnings(cameras, held[0], height, look.height_m, turned)]
-    warnings += _survey_warnings(result.survey)
+    warnings += _survey_warnings(result.found.survey)
     advice = _advice(look, held[0], len(images), len(collection.images))
-    if isinstance(result.registration, AlignmentFailure):
-        georeferenced = f"none: {result.registration.reason}; scale, north and up are not known"
-        warnings.append(f"not georeferenced ({result.registration.reason}): the scale of the scene is arbitrary.")
-        advice.append(result.registration.remedy)
+    if isinstance(result.found.placed, AlignmentFailure):
+        unplaced = result.found.placed
+        georeferenced = f"none: {unplaced.reason}; scale, north and up are not known"
+        warnings.append(
+            f"not georeferenced ({unplaced.reason}): the scale of the scene is arbitrary. To mend it, {unplaced.remedy}"
+        )
     else:
-        georeferenced = result.registration.method
+        georeferenced = result.found.placed.method
+        warnings += result.found.placed.notes
     return ReconstructionReport(
         found=len(collection.images) + len(collection.excluded), registered=len(images),
         components=tuple(result.components), pairs=result.pairs, points=model.num_points3D(),
         track_length=float(model.compute_mean_track_length()),
         reprojection_px=float(model.compute_mean_reprojection_error()), georeferenced=georeferenced,
-        altitude_reference=_altitudes(plan) if metric else "", origin=result.origin,
+        altitude_reference=_altitudes(plan) if placed and placed.is_georeferenced else "", origin=result.found.origin,
         residual_rms_m=_rms(placed), positions_rejected=int((~placed.inliers).sum()) if placed else 0,
         focal_fixed=held[0], focal_reason=held[1], height_m=height, recorded_height_m=look.height_m, tilt_deg=tilt,
         attitude_difference_deg=turned, cameras=cameras,
         photographs=_photographs(collection, positions, placed, result.excluded), warnings=tuple(warnings),
         advice=tuple(advice),
         seconds=result.seconds,
-        survey=result.survey,
+        survey=result.found.survey, accuracy=placed.accuracy if placed else None,
     )  # fmt: skip
 
 
@@ -138,7 +137,8 @@ def _height(model: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]) ->
     return float(np.median(heights) - np.median(model_points(model)[:, 2]))
 
 
-def _cameras(model: pycolmap.Reconstruction, kinds: Sequence[CameraGroup]) -> tuple[CameraReport, ...]:
+def cameras_of(model: pycolmap.Reconstruction, kinds: Sequence[CameraGroup]) -> tuple[CameraReport, ...]:
+    """Each kind's camera before and after."""
     return tuple(
         CameraReport(
             name=kind.camera,
@@ -194,8 +194,8 @@ def _survey_warnings(survey: Sequence[GcpReport]) -> list[str]:
         if each.residual_m is None:
             found.append(f"the surveyed point {each.name} is shown by too few placed photographs; not used.")
         elif each.role == "not used":
-            found.append(f"the control point {each.name} does not fit the others; not used. Is its place right?")
-        if each.error_px is not None and each.error_px > MAX_MARK_ERROR_PX:
+            found.append(f"the control point {each.name} does not fit the others; not used. Right place, right marks?")
+        if each.error_px is not None and each.error_px > MARK_WRONG_PX:
             away = f"{each.error_px:.0f} px from where it must be seen"
             found.append(f"the surveyed point {each.name} is marked {away}. Look at its marks again.")
     return found

@@ -7,7 +7,7 @@ pattern is bounded, and so is what is looked at.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 #: So much of a packet is looked at; those of drones take a few kB.
 MAX_PACKET_BYTES = 1 << 18
@@ -17,29 +17,61 @@ _NAME = r"[A-Za-z_][\w.-]{0,63}"
 _ATTRIBUTE = re.compile(
     rf"({_NAME}):({_NAME})[ \t\r\n]{{0,16}}=[ \t\r\n]{{0,16}}(?:\"([^\"<]{{0,400}})\"|'([^'<]{{0,400}})')"
 )
-_ELEMENT = re.compile(rf"<({_NAME}):({_NAME})>([^<]{{0,400}})</")
+_ELEMENT = re.compile(rf"<({_NAME}):({_NAME})(?:[ \t\r\n][^<>]{{0,200}})?>([^<]{{0,400}})</")
+#: The one structure whose fields have names that others have too (Skydio): how the camera lies, north, east, down.
+_CAMERA = re.compile(r"CameraOrientationNED\b")
+_CAMERA_BYTES = 600
 
 
 def read_xmp(packet: bytes) -> dict[str, str]:
     """Attributes and elements without children by `prefix:Name`, prefixes as they are in the file; {} for nonsense."""
     text = packet[:MAX_PACKET_BYTES].decode("utf-8", errors="replace")
     found: dict[str, str] = {}
-    for pattern in (_ATTRIBUTE, _ELEMENT):
-        for match in pattern.finditer(text):
-            prefix, name, *values = match.groups()
-            value = next((each for each in values if each is not None), "").strip()
-            if prefix != "xmlns" and len(found) < MAX_VALUES:
-                found.setdefault(f"{prefix}:{name}", value)
+    for prefix, name, value in _values(text):
+        if prefix != "xmlns" and len(found) < MAX_VALUES:
+            found.setdefault(f"{prefix}:{name}", value)
+    camera = _CAMERA.search(text)
+    if camera:
+        body = text[camera.end() : camera.end() + _CAMERA_BYTES].partition("CameraOrientationNED")[0]
+        for _, name, value in _values(body):
+            found.setdefault(f"CameraOrientationNED:{name}", value)
     return found
 
 
+def _values(text: str) -> Iterator[tuple[str, str, str]]:
+    for pattern in (_ATTRIBUTE, _ELEMENT):
+        for match in pattern.finditer(text):
+            prefix, name, *values = match.groups()
+            yield prefix, name, next((each for each in values if each is not None), "").strip()
+
+
+def text(values: Mapping[str, str], *names: str) -> str:
+    """The first of these values; a name without a prefix is that of any maker (`drone-dji:`, `drone-parrot:`, ...)."""
+    return next(_found(values, names), "")
+
+
 def first_number(values: Mapping[str, str], *names: str) -> float | None:
-    """The first of these values that is a finite number, such as "+39.80"."""
-    for name in names:
-        try:
-            value = float(values[name])
-        except (KeyError, ValueError):
-            continue
-        if abs(value) < 1e12:  # false for NaN too
+    """The first of these values that is a finite number, such as "+39.80", with a unit behind it or as a fraction."""
+    for written in _found(values, names):
+        value = _number(written)
+        if value is not None and abs(value) < 1e12:  # false for NaN too
             return value
     return None
+
+
+def _found(values: Mapping[str, str], names: tuple[str, ...]) -> Iterator[str]:
+    for name in names:
+        if ":" in name:
+            if name in values:
+                yield values[name]
+        else:
+            yield from (value for key, value in values.items() if key.partition(":")[2].lower() == name.lower())
+
+
+def _number(written: str) -> float | None:
+    words = written.replace("\u2212", "-").split()
+    numerator, slash, denominator = (words[0] if words else "").rstrip("m°").partition("/")
+    try:
+        return float(numerator) / float(denominator) if slash else float(numerator)
+    except (ValueError, ZeroDivisionError):
+        return None

@@ -54,13 +54,27 @@ class AccessControl:
         """Why a request may not come in; None if it may."""
         host = headers.get("Host", "")
         if self.token is None and hostname_from_header(host) not in (*LOOPBACK_HOSTS, self.host):
-            return "This server answers only to the name of this machine. Start it with --host to open it to others."
+            return (
+                "This server answers only to the name of this machine. Start it with --host to open it to others, or "
+                "let the proxy in front of it send Host: localhost and the same name as Origin."
+            )
         origin = headers.get("Origin")
-        if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
-            return "Pages of other sites may not use this server."
+        if origin is not None and (_place_of(origin) or None) != host.lower():
+            return (
+                "Pages of other sites may not use this server. If a proxy stands in front of it, let it pass on the "
+                "Host of the visitor (nginx: proxy_set_header Host $http_host;)."
+            )
         if self.token is not None and not (self.has_token(path) or self._has_cookie(headers.get("Cookie", ""))):
             return "The token is missing or wrong. Open the whole address that `vdgs view` printed."
         return None
+
+    def report(self, path: str, headers: Mapping[str, str]) -> str | None:
+        """What to tell who runs the server of a visitor who may not come in; None if he may. Never holds a token."""
+        why = self.deny_reason(path, headers)
+        if why is None:
+            return None
+        names = (f"{name} {_short(headers[name])}" for name in ("Host", "Origin") if name in headers)
+        return f"a visitor was refused ({', '.join(names) or 'no Host'}): {why} See docs/viewer.md."
 
     def has_token(self, path: str) -> bool:
         """Whether the address itself holds the token."""
@@ -78,6 +92,19 @@ class AccessControl:
             return False
         assert self.token is not None
         return found is not None and hmac.compare_digest(found.value.encode(), self.token.encode())
+
+
+def _short(value: str) -> str:
+    """What a visitor sent, for a terminal: printable, in a few characters."""
+    return "".join(letter if letter.isprintable() else "?" for letter in value)[:80]
+
+
+def _place_of(origin: str) -> str:
+    """Name and port in an Origin header; nothing where it is no address."""
+    try:
+        return urlsplit(origin).netloc.lower()
+    except ValueError:
+        return ""
 
 
 def hostname_from_header(host: str) -> str:

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 
 from vdgs.captures.camera_height import FOV_DEG, camera_height
 from vdgs.config.commands import ViewRequest
@@ -108,7 +109,7 @@ class ViewerServer:
 def serve(run: OpenedRun, host: str, port: int | None, console: Console) -> Iterator[ViewerServer]:
     """A viewer of an opened run on a port (None: the first that is free), while the context lasts."""
     scene, studio = ViewerScene(run), RenderScheduler()
-    door, server = _start_listening(host, port)
+    door, server = _start_listening(host, port, console)
     viewer = ViewerServer(server=server, access=door, scene=scene, scheduler=studio, sessions={})
     _set_initial_camera(server, run)
 
@@ -205,13 +206,13 @@ def find_free_port(host: str, port: int | None) -> int:
     raise VdgsError(f"--port {port}: cannot be used on {host} ({why}). Give another one.")
 
 
-def _start_listening(host: str, port: int | None) -> tuple[AccessControl, Any]:
+def _start_listening(host: str, port: int | None, console: Console) -> tuple[AccessControl, Any]:
     """A server that listens, and its door. A port that another program takes between the look and the start is passed
     over, unless it was asked for: VdgsError then."""
     token = None if is_loopback(host) else secrets.token_urlsafe(24)
     for _ in range(MAX_PORT_TRIES):
         door = AccessControl(host, token, find_free_port(host, port))
-        server = _start(door)
+        server = _start(door, console)
         if server is not None:
             return door, server
         if port is not None:
@@ -219,7 +220,7 @@ def _start_listening(host: str, port: int | None) -> tuple[AccessControl, Any]:
     raise VdgsError(f"--port {door.port}: was taken meanwhile. Give the command again.")
 
 
-def _start(access: AccessControl) -> Any:
+def _start(access: AccessControl, console: Console) -> Any:
     """A viser server behind a door; None if its port was taken meanwhile."""
     import viser
     import websockets.asyncio.server as sockets
@@ -235,7 +236,7 @@ def _start(access: AccessControl) -> Any:
     def serve_guarded(*args: Any, process_request: Any, **options: Any) -> Any:
         nonlocal guarded
         guarded = True
-        return unguarded(*args, process_request=_guard_requests(access, process_request), **options)
+        return unguarded(*args, process_request=_guard_requests(access, process_request, console), **options)
 
     # viser has no hook before its own answers. What it calls to listen is ours while it starts.
     sockets.serve = serve_guarded  # type: ignore[misc, assignment]
@@ -261,14 +262,22 @@ def _limit_send_buffer(connection: Any) -> None:
             wire.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, MAX_UNSENT_BYTES)
 
 
-def _guard_requests(access: AccessControl, handler: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    """What answers a request: a refusal, or what viser answers."""
+def _guard_requests(
+    access: AccessControl, handler: Callable[[Any, Any], Any], console: Console
+) -> Callable[[Any, Any], Any]:  # fmt: skip
+    """What answers a request: a refusal, or what viser answers. Each reason of a refusal is printed once."""
     from websockets.datastructures import Headers
     from websockets.http11 import Response
+
+    told = set[str]()
 
     def answer(connection: Any, request: Any) -> Any:
         refusal = access.deny_reason(request.path, request.headers)
         if refusal is not None:
+            if refusal not in told:
+                told.add(refusal)
+                said = escape(str(access.report(request.path, request.headers)))
+                console.print(f"[yellow]warning[/] {said}", highlight=False, soft_wrap=True)
             body = (refusal + "\n").encode()
             headers = Headers({"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))})
             return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", headers, body)

@@ -33,6 +33,14 @@ def _bad_line(file: Path, number: int, expected: str) -> CaptureError:
     return CaptureError(f"{file}: line {number} should read '{expected}'. The file is damaged; export it again.")
 
 
+def _whole(word: str) -> int:
+    """A whole number, such as `240` or, as some programs write sizes, `240.0`. ValueError for anything else."""
+    number = float(word)
+    if not number.is_integer():
+        raise ValueError(word)
+    return int(number)
+
+
 def read_cameras_text(file: Path) -> dict[int, Intrinsics]:
     expected = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"
     cameras: dict[int, Intrinsics] = {}
@@ -41,7 +49,7 @@ def read_cameras_text(file: Path) -> dict[int, Intrinsics]:
         if not words:
             continue
         try:
-            identifier, model, width, height = int(words[0]), words[1], int(words[2]), int(words[3])
+            identifier, model, width, height = int(words[0]), words[1], _whole(words[2]), _whole(words[3])
             params = tuple(float(word) for word in words[4:])
         except (ValueError, IndexError):
             raise _bad_line(file, number, expected) from None
@@ -93,7 +101,7 @@ def read_points3D_text(file: Path) -> ColmapPoints:
             continue
         try:
             identifier, position = float(words[0]), [float(word) for word in words[1:4]]
-            color = [int(word) for word in words[4:7]]
+            color = [_whole(word) for word in words[4:7]]
             float(words[7])
         except (ValueError, IndexError):
             raise _bad_line(file, number, "POINT3D_ID X Y Z R G B ERROR TRACK[]") from None

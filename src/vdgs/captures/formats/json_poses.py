@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -56,6 +57,9 @@ def parse_number(source: JsonObject, key: str, file: Path) -> float | None:
     value = source.get(key)
     if value is None:
         return None
+    if isinstance(value, str):
+        with suppress(ValueError):
+            value = float(value)
     if isinstance(value, bool) or not isinstance(value, int | float) or not _finite(value):
         raise CaptureError(f"{file}: {key!r} must be a finite number, not {str(value)[:40]!r}.")
     return float(value)

@@ -28,6 +28,7 @@ from vdgs.captures.formats.source_capture import (
     WorldPrior,
     find_duplicates,
     format_list,
+    refuse_many_missing,
     to_rigid,
 )
 from vdgs.captures.formats.sparse_points import find_sparse_points
@@ -41,7 +42,10 @@ POSE_UNIT_M = 100.0
 BLOCK_ROTATION = 0.01
 #: Where a block keeps its images.
 IMAGE_FOLDERS = ("", "rgb", "input", "images")
-CITY_PATTERN = re.compile(r"block|_city|matrix", re.IGNORECASE)
+#: What the folders of its blocks are called in the paths of its images.
+CITY_PATTERN = re.compile(
+    r"block_?(all|fusion|\d+|[a-z])(_test|_train)?|(small|big)_city.*|matrix_?city.*", re.IGNORECASE
+)
 
 
 def pose_files(root: Path) -> list[tuple[Path, Split]]:
@@ -66,12 +70,20 @@ def read_matrixcity(root: Path, options: CaptureOptions) -> SourceCapture:
     files = pose_files(root)
     views: list[SourceView] = []
     scales: set[float] = set()
+    missing: list[str] = []
+    count, is_city = 0, False
     for file, split in files:
         content = read_capture_json(file)
         for frame in get_frames(content, file):
-            view, scale = _read_frame(root, frame, content, file, split)
+            count, is_city = count + 1, is_city or _of_a_city(frame)
+            image = _find_image(root, frame, file, split)
+            if isinstance(image, str):
+                missing.append(image)
+                continue
+            view, scale = _read_frame(image, frame, content, file, split)
             views.append(view)
             scales.add(scale)
+    warnings = _missing(missing, count, root)
     twice = find_duplicates(view.name for view in views)
     if twice:
         raise CaptureError(f"{root}: the same image occurs more than once in the pose files.{format_list(twice)}")
@@ -80,7 +92,7 @@ def read_matrixcity(root: Path, options: CaptureOptions) -> SourceCapture:
     poses = {view.name: view.camera_from_world for view in views}
     points, colors = find_sparse_points(root, poses, "MatrixCity's layout")
     world = WorldPrior(np.eye(3), 1.0, False, "z is up by the format")
-    if CITY_PATTERN.search(str(root)) or any(CITY_PATTERN.search(view.name) for view in views):
+    if is_city:
         unit = scales.pop()
         world = WorldPrior(np.eye(3), unit, True, f"MatrixCity: z is up, unit {unit:.0f} m")
     one_split = {view.split for view in views} == {"train"}
@@ -96,13 +108,32 @@ def read_matrixcity(root: Path, options: CaptureOptions) -> SourceCapture:
             for v in views
         ]
     return SourceCapture(
-        source="matrixcity", images=options.images or "", views=tuple(views), points=points, colors=colors,
+        source="matrixcity",
+        images=options.images or "",
+        views=tuple(views),
+        points=points,
+        colors=colors,
         world=world,
-    )  # fmt: skip
+        warnings=warnings,
+    )
+
+
+def _of_a_city(frame: JsonObject) -> bool:
+    """Whether a frame says that it is of MatrixCity: by its keys, or a path through one of the city's blocks."""
+    if "rot_mat" in frame or "frame_index" in frame:
+        return True
+    return any(CITY_PATTERN.fullmatch(part) for part in PurePosixPath(str(frame.get("file_path", ""))).parts)
+
+
+def _missing(missing: list[str], count: int, root: Path) -> tuple[str, ...]:
+    try:
+        return tuple(refuse_many_missing(missing, count, root))
+    except CaptureError as error:
+        raise CaptureError(f"{error}\n(Unpack the .tar of each block into the block's folder.)") from None
 
 
 def _read_frame(
-    root: Path, frame: JsonObject, content: JsonObject, file: Path, split: Split
+    found: tuple[str, Path], frame: JsonObject, content: JsonObject, file: Path, split: Split
 ) -> tuple[SourceView, float]:
     """A view, and the unit of its world in metres if the file is MatrixCity's."""
     label = str(frame.get("file_path", frame.get("frame_index", "?")))
@@ -111,7 +142,7 @@ def _read_frame(
     scaled = abs(norm / BLOCK_ROTATION - 1) < 0.01
     if scaled:
         matrix[:3, :3] /= BLOCK_ROTATION
-    name, image = _find_image(root, frame, file, split)
+    name, image = found
     pose = np.linalg.inv(to_rigid(matrix @ OPENGL_FROM_OPENCV, file, f"frame {label}"))
     common = {key: value for key, value in content.items() if key != "frames"}
     intrinsics = parse_intrinsics(frame, common, image, file)
@@ -120,8 +151,8 @@ def _read_frame(
     ), 1.0 if scaled else POSE_UNIT_M
 
 
-def _find_image(root: Path, frame: JsonObject, file: Path, split: Split) -> tuple[str, Path]:
-    """Name (as from the dataset's root) and file of a frame's image.
+def _find_image(root: Path, frame: JsonObject, file: Path, split: Split) -> tuple[str, Path] | str:
+    """Name (as from the dataset's root) and file of a frame's image; what it is called where it is gone.
 
     Published file_paths climb ("../../train/block_1/0000.png"); the climbing is dropped and the rest is
     looked for beside the pose file, in the capture, and up to three folders above a pose/ folder.
@@ -147,11 +178,7 @@ def _find_image(root: Path, frame: JsonObject, file: Path, split: Split) -> tupl
                 for image in (candidate, candidate.with_name(candidate.name + ".png")):
                     if image.is_file():
                         return _name(root, image, split), image
-    raise CaptureError(
-        f"{file}: its image {'/'.join(parts)!r} is not found below {bases[-1]}. Unpack the .tar of each "
-        "block into the "
-        "block's folder."
-    )
+    return "/".join(parts)
 
 
 def _name(root: Path, image: Path, split: Split) -> str:

@@ -20,7 +20,7 @@ from vdgs.captures.formats.source_capture import (
     SourceView,
     WorldPrior,
     check_intrinsics,
-    format_list,
+    refuse_many_missing,
     to_rigid,
 )
 from vdgs.captures.formats.sparse_points import find_sparse_points
@@ -54,32 +54,40 @@ def read_mega_nerf(root: Path, options: CaptureOptions) -> SourceCapture:
     if not scale > 0:
         raise CaptureError(f"{file}: pose_scale_factor {scale} must be positive.")
     images = options.images or "rgbs"
-    views: list[SourceView] = []
+    views, missing = list[SourceView](), list[str]()
     for folder, split in SPLIT_FOLDERS:
-        views += _read_folder(root, folder, images, split, origin, scale)
+        views += _read_folder(root, folder, images, split, origin, scale, missing)
+    try:
+        warnings = refuse_many_missing(missing, len(views) + len(missing), root)
+    except CaptureError as error:
+        raise CaptureError(
+            f"{error}\n(For UrbanScene3D, copy the raw photographs as Mega-NeRF's README says.)"
+        ) from None
     poses = {view.name: view.camera_from_world for view in views}
     points, colors = find_sparse_points(root, poses, "Mega-NeRF's layout", _aliases(root, views))
     world = WorldPrior(GROUND_FROM_DRB, 1.0, True, "Mega-NeRF: x is down, metres by pose_scale_factor")
     folders = tuple(root / folder / images for folder, _ in SPLIT_FOLDERS)
     return SourceCapture(
-        source="mega-nerf", images=images, views=tuple(views), points=points, colors=colors, world=world,
+        source="mega-nerf",
+        images=images,
+        views=tuple(views),
+        points=points,
+        colors=colors,
+        world=world,
         image_folders=folders,
-    )  # fmt: skip
+        warnings=tuple(warnings),
+    )
 
 
 def _read_folder(
-    root: Path, folder: str, images: str, split: Split, origin: np.ndarray, scale: float
+    root: Path, folder: str, images: str, split: Split, origin: np.ndarray, scale: float, missing: list[str]
 ) -> list[SourceView]:
+    """The views of a folder; those whose image is gone are added to `missing`."""
     metadata = sorted((root / folder / "metadata").glob("*.pt"))
     present = {to_nfc(Path(name).stem): path for name, path in find_images(root / folder / images).items()}
-    missing = [str(file) for file in metadata if to_nfc(file.stem) not in present]
-    if missing:
-        raise CaptureError(
-            f"{root / folder / images}: {len(missing)} images named by metadata are missing. For "
-            "UrbanScene3D, copy "
-            f"the raw photographs as Mega-NeRF's README says.{format_list(missing)}"
-        )
-    return [_read_view(file, present[to_nfc(file.stem)], folder, split, origin, scale) for file in metadata]
+    missing += [f"{folder}/{images}/{file.stem}" for file in metadata if to_nfc(file.stem) not in present]
+    there = [file for file in metadata if to_nfc(file.stem) in present]
+    return [_read_view(file, present[to_nfc(file.stem)], folder, split, origin, scale) for file in there]
 
 
 def _read_view(file: Path, image: Path, folder: str, split: Split, origin: np.ndarray, scale: float) -> SourceView:

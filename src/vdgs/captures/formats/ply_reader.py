@@ -1,7 +1,8 @@
-"""Point clouds from PLY files: vertices with x, y, z and, where present, red, green, blue."""
+"""Point clouds from PLY files: vertices with x, y, z and, where present, colours."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +12,13 @@ from vdgs.errors import CaptureError
 
 MAX_HEADER_BYTES = 1 << 16
 GRAY = 128
+#: What red, green and blue are called; 3DGS has the zeroth coefficient of spherical harmonics.
+HARMONICS = ("f_dc_0", "f_dc_1", "f_dc_2")
+COLORS = (
+    ("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"),
+    ("color_red", "color_green", "color_blue"), ("scalar_red", "scalar_green", "scalar_blue"), HARMONICS,
+)  # fmt: skip
+SH_0 = 0.28209479177387814
 PLY_DTYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
     "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4",
@@ -24,14 +32,16 @@ class _Header:
     count: int
     layout: np.dtype
     size: int
+    types: Mapping[str, str]
+    """What kind of number each property is, `u1` to `<f8`."""
 
 
 def read_point_cloud(file: Path) -> tuple[np.ndarray, np.ndarray]:
     """Points [n, 3] float64 and colours [n, 3] uint8 (mid-grey where the file has none).
 
-    Reads `ascii` and `binary_little_endian`, vertices first; floating-point colours are taken to run from
-    0 to 1. Raises `CaptureError` naming the file if it is missing, of another kind, or shorter than it
-    announces.
+    Reads `ascii` and `binary_little_endian`, vertices first; floating-point colours may run from 0 to 1,
+    those of 16 bits to 65535. Raises `CaptureError` naming the file if it is missing, of another kind, or shorter than
+    it announces.
     """
     try:
         data = file.read_bytes()
@@ -40,7 +50,7 @@ def read_point_cloud(file: Path) -> tuple[np.ndarray, np.ndarray]:
     header = _header(data, file)
     vertices = (_ascii if header.format == "ascii" else _binary)(data, header, file)
     points = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    return points, _colors(vertices)
+    return points, _colors(vertices, header.types)
 
 
 def _header(data: bytes, file: Path) -> _Header:
@@ -71,7 +81,7 @@ def _header(data: bytes, file: Path) -> _Header:
         raise fail(f"is of format {form!r}")
     if count < 0 or not {"x", "y", "z"} <= set(dict(fields)):
         raise fail("announces no vertices with x, y, z")
-    return _Header(form, count, np.dtype(fields), start)
+    return _Header(form, count, np.dtype(fields), start, dict(fields))
 
 
 def _binary(data: bytes, header: _Header, file: Path) -> np.ndarray:
@@ -100,11 +110,23 @@ def _too_short(header: _Header, file: Path) -> CaptureError:
     )
 
 
-def _colors(vertices: np.ndarray) -> np.ndarray:
-    names = vertices.dtype.names or ()
-    if not {"red", "green", "blue"} <= set(names):
+def _colors(vertices: np.ndarray, types: Mapping[str, str]) -> np.ndarray:
+    names = {name.lower(): name for name in vertices.dtype.names or ()}
+    triple = next((triple for triple in COLORS if set(triple) <= set(names)), None)
+    if triple is None:
         return np.full((len(vertices), 3), GRAY, np.uint8)
-    colors = np.stack([vertices[name].astype(np.float64) for name in ("red", "green", "blue")], axis=1)
-    colors = np.nan_to_num(colors, nan=GRAY, posinf=255, neginf=0)
-    unit = vertices["red"].dtype.kind == "f" and len(colors) and 0 < colors.max() <= 1
-    return np.clip(np.round(colors * 255 if unit else colors), 0, 255).astype(np.uint8)
+    colors = np.stack([vertices[names[name]].astype(np.float64) for name in triple], axis=1)
+    if triple == HARMONICS:
+        colors = 255 * (0.5 + SH_0 * np.nan_to_num(colors, posinf=2, neginf=-2))
+    else:
+        colors = colors * _factor(colors, types[names[triple[0]]])
+    return np.clip(np.round(np.nan_to_num(colors, nan=GRAY, posinf=255, neginf=0)), 0, 255).astype(np.uint8)
+
+
+def _factor(colors: np.ndarray, kind: str) -> float:
+    """What brings colours to 0 to 255: numbers with a point may run to 1, and 16 bits to 65535, where they do."""
+    finite = colors[np.isfinite(colors)]
+    largest = float(finite.max()) if len(finite) else 0.0
+    if "f" in kind and 0 < largest <= 1:
+        return 255.0
+    return 1 / 257 if largest > 255 and "1" not in kind else 1.0

@@ -7,7 +7,7 @@ already in OpenCV camera axes. `loading` turns it into a checked `Capture` in th
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -39,6 +39,8 @@ PINHOLE_WHEN_ZERO = {
 }  # fmt: skip
 MAX_SIDE_PX = 100_000
 MAX_LISTED = 10
+#: A capture is used without the photographs that are gone where at least this share is there (choice).
+LEAST_THERE = 0.5
 
 
 @dataclass(frozen=True)
@@ -108,6 +110,20 @@ class SourceCapture:
     #: Folders in which every image should have a camera.
     image_folders: tuple[Path, ...] = ()
     warnings: tuple[str, ...] = field(default=())
+
+
+def refuse_many_missing(missing: Sequence[str], count: int, where: Path) -> list[str]:
+    """A warning about photographs that have a camera but are not there; CaptureError where too few are left."""
+    if not missing:
+        return []
+    if count - len(missing) < max(1, LEAST_THERE * count):
+        raise CaptureError(
+            f"{where}: {len(missing)} of {count} images that have a camera are missing; at least "
+            f"{LEAST_THERE:.0%} must be there. Copy them there, or choose another folder with --images."
+            f"{format_list(missing)}"
+        )
+    shown = ", ".join(missing[:MAX_LISTED]) + (", ..." if len(missing) > MAX_LISTED else "")
+    return [f"{len(missing)} of {count} images that have a camera are missing; the others are used ({shown})."]
 
 
 def format_list(names: Iterable[str]) -> str:

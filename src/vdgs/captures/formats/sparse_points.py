@@ -14,7 +14,10 @@ from vdgs.errors import CaptureError
 from vdgs.geometry.similarity import fit_similarity_robust, is_collinear
 
 #: Names under which a point cloud in the capture's own world is looked for.
-POINT_CLOUDS = ("points3D.ply", "sparse_pc.ply", "point_cloud.ply", "points.ply")
+POINT_CLOUDS = (
+    "points3D.ply", "points3d.ply", "sparse_pc.ply", "point_cloud.ply", "points.ply", "sparse.ply", "pointcloud.ply",
+    "input.ply", "fused.ply",
+)  # fmt: skip
 #: A COLMAP model fits the poses if camera centres agree to this share of their spread (RMS).
 MAX_RELATIVE_RMS = 0.02
 
@@ -30,10 +33,13 @@ def find_sparse_points(
     maps names in the COLMAP model to names in `poses`; `option` is what the command line needs beside a model, so
     that its cameras do not replace `poses`. Raises `CaptureError` if there is nothing, or nothing that fits.
     """
-    for name in POINT_CLOUDS:
-        if (root / name).is_file():
-            return read_point_cloud(root / name)
+    cloud = find_point_cloud(root)
+    if cloud is not None:
+        return read_point_cloud(cloud)
     models = find_models(root)
+    cloud = None if models else find_point_cloud(root, lone=True)
+    if cloud is not None:
+        return read_point_cloud(cloud)
     if not models:
         raise CaptureError(
             f"{root}: {what} brings no 3D points, from which the scene starts. Put a point cloud in the "
@@ -63,6 +69,14 @@ def find_sparse_points(
             f"{spread:.3g}, {inliers.sum()} of {len(pairs)} agree); it is another reconstruction or naming."
         )
     return similarity.apply(model.points), model.colors
+
+
+def find_point_cloud(*folders: Path, lone: bool = False) -> Path | None:
+    """The point cloud in the first of these folders that has one under a usual name; with `lone`, else the only PLY in
+    one of them, whatever it is called."""
+    usual = [folder / name for folder in folders for name in POINT_CLOUDS]
+    single = [files[0] for files in ([*folder.glob("*.ply")] for folder in folders) if len(files) == 1]
+    return next((file for file in (*usual, *(single if lone else ())) if file.is_file()), None)
 
 
 def _center(camera_from_world: np.ndarray) -> np.ndarray:

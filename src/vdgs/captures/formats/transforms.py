@@ -27,6 +27,7 @@ from vdgs.captures.formats.source_capture import (
     SourceView,
     find_duplicates,
     format_list,
+    refuse_many_missing,
     safe_name,
     to_rigid,
 )
@@ -70,10 +71,13 @@ def read_transforms(root: Path, options: CaptureOptions) -> SourceCapture:
     chosen = options.images or folder
     splits = _splits(content, names, file, root, options)
     undo = _undo_applied(content, file)
-    views, poses = list[SourceView](), dict[str, np.ndarray]()
+    views, poses, missing = list[SourceView](), dict[str, np.ndarray](), list[str]()
     for frame, name in zip(frames, names, strict=True):
         short = name.removeprefix(folder + "/") if folder else name
         image = _image(root, f"{chosen}/{short}" if chosen else short)
+        if image is None:
+            missing.append(short)
+            continue
         world_from_camera = parse_matrix(frame.get("transform_matrix"), file, f"frame {name!r}") @ OPENGL_FROM_OPENCV
         in_file = to_rigid(world_from_camera, file, f"frame {name!r}")
         pose, poses[short] = np.linalg.inv(undo(in_file)), np.linalg.inv(in_file)
@@ -91,6 +95,7 @@ def read_transforms(root: Path, options: CaptureOptions) -> SourceCapture:
                 mask_path=mask_file,
             )
         )
+    warnings = refuse_many_missing(missing, len(frames), root / chosen)
     twice = find_duplicates(view.name for view in views)
     if twice:
         raise CaptureError(f"{file}: the same image occurs more than once.{format_list(twice)}")
@@ -99,9 +104,14 @@ def read_transforms(root: Path, options: CaptureOptions) -> SourceCapture:
     homogeneous[:, :3, 3] = points
     moved = undo(homogeneous)[:, :3, 3]
     return SourceCapture(
-        source="transforms", images=chosen, views=tuple(views), points=moved, colors=colors,
+        source="transforms",
+        images=chosen,
+        views=tuple(views),
+        points=moved,
+        colors=colors,
         image_folders=(root / chosen,) if chosen else (),
-    )  # fmt: skip
+        warnings=tuple(warnings),
+    )
 
 
 def _name(frame: JsonObject, file: Path, root: Path) -> str:
@@ -118,19 +128,17 @@ def _common_folder(names: list[str]) -> str:
     return first.pop() if len(first) == 1 and not flat else ""
 
 
-def _image(root: Path, name: str) -> Path:
-    """The image itself; file_path may come without its extension, and shrunk folders may hold another."""
+def _image(root: Path, name: str) -> Path | None:
+    """The image itself; file_path may come without its extension, and shrunk folders may hold another.
+
+    None where it is gone.
+    """
     suffixes = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
     path = PurePosixPath(name)
     others = (
         str(other) for suffix in suffixes for other in (path.with_name(path.name + suffix), path.with_suffix(suffix))
     )
-    found = next((found for found in (find_file(root, each) for each in (name, *others)) if found is not None), None)
-    if found is None:
-        raise CaptureError(
-            f"{root / name}: no such image, though transforms.json names it. Copy it there, or see --images."
-        )
-    return found
+    return next((found for found in (find_file(root, each) for each in (name, *others)) if found is not None), None)
 
 
 def _splits(content: JsonObject, names: list[str], file: Path, root: Path, options: CaptureOptions) -> dict[str, Split]:

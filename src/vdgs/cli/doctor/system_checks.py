@@ -198,9 +198,11 @@ def _video_encoding() -> list[SystemCheck]:
                 film.write(np.full((64, 96, 3), level, np.uint8))
     except Exception as error:
         return [SystemCheck("film", "missing", f"{encoder}: {error}", "pip install imageio-ffmpeg")]
-    if encoder == "mpeg4":
-        return [SystemCheck("film", "ok", "MPEG-4", "pip install imageio-ffmpeg for H.264, which browsers play too.")]
-    return [SystemCheck("film", "ok", "H.264")]
+    if video.warning(encoder) is not None:
+        return [
+            SystemCheck("film", "ok", video.CODECS[encoder], "pip install imageio-ffmpeg for H.264, which all play.")
+        ]
+    return [SystemCheck("film", "ok", video.CODECS[encoder])]
 
 
 def _disk() -> list[SystemCheck]:

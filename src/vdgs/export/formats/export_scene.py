@@ -1,17 +1,16 @@
 """What every writer is given: chunks of Gaussians, how many there are, and where on Earth they stand.
 
 Coordinates of a `ExportScene` are those of the ground frame: local, z up, float32. A format that has an up axis of its own
-turns them (`Y_UP`, `Y_DOWN`); its reader turns them back, so that what is read from disk can be drawn with the run's
+turns them (`formats.axes`); its reader turns them back, so that what is read from disk can be drawn with the run's
 own cameras.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -21,17 +20,13 @@ from torch import Tensor
 
 from vdgs import __version__
 from vdgs.errors import VdgsError
+from vdgs.export.formats.axes import Z_UP, Axes
 from vdgs.kernels.spherical_harmonics import SH_C0
-from vdgs.model.gaussian_transform import transform_gaussians
 from vdgs.model.gaussians import Gaussians
 from vdgs.system.atomic_files import write_json
 
 #: Writers work on so many Gaussians at a time, however large the chunks are that they are given: about 100 MB.
 CHUNK_SIZE = 1 << 17
-#: x east, y up, z south: glTF and SPZ.
-Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-#: x west, y down, z south: what viewers of .splat and .sog turn by half a turn about z, so that it stands upright.
-Y_DOWN = np.array([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]])
 
 
 @dataclass(frozen=True)
@@ -81,6 +76,10 @@ class ExportScene:
     bounds: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
     #: For those formats that show the scene themselves; they find a view of their own where it is not given.
     page: InitialView | None = None
+    #: How the axes of the file shall stand; None: as readers of its format expect them.
+    axes: Axes | None = None
+    #: Version of an SPZ.
+    spz_version: int = 3
 
     @staticmethod
     def of(gaussians: Gaussians, metadata: ExportMetadata | None = None) -> ExportScene:
@@ -94,8 +93,8 @@ class ExportScene:
             bounds=(tuple(low), tuple(high)),
         )
 
-    def pieces(self, turn: Float[np.ndarray, "3 3"] | None = None) -> Iterator[Gaussians]:
-        """At most `CHUNK_SIZE` Gaussians at a time, on the CPU, unit quaternions, turned where asked.
+    def pieces(self, axes: Axes = Z_UP) -> Iterator[Gaussians]:
+        """At most `CHUNK_SIZE` Gaussians at a time, on the CPU, unit quaternions, along these axes.
 
         Raises VdgsError for numbers that are not finite, ValueError where chunks are not what was announced.
         """
@@ -105,7 +104,7 @@ class ExportScene:
                 raise ValueError(f"a chunk has degree {chunk.sh_degree}, announced was {self.degree}")
             for start in range(0, len(chunk), CHUNK_SIZE):
                 piece = _clean(chunk.select(torch.arange(start, min(start + CHUNK_SIZE, len(chunk)))), done)
-                yield piece if turn is None else transform_gaussians(piece, 1.0, turn, np.zeros(3))
+                yield axes.of_ground(piece)
                 done += len(piece)
         if done != self.count:
             raise ValueError(f"{self.count} Gaussians were announced, {done} came")
@@ -128,11 +127,6 @@ def concatenate(pieces: Iterable[Gaussians]) -> Gaussians:
     """Pieces of a scene, at least one, as one."""
     tensors = [piece.tensors() for piece in pieces]
     return Gaussians(**{name: torch.cat([each[name] for each in tensors]) for name in tensors[0]})
-
-
-def rotate_back(gaussians: Gaussians, rotation: Float[np.ndarray, "3 3"]) -> Gaussians:
-    """Gaussians of a file back in the ground frame."""
-    return transform_gaussians(gaussians, 1.0, rotation.T, np.zeros(3))
 
 
 def opacities(gaussians: Gaussians) -> Float[np.ndarray, " n"]:
@@ -166,9 +160,9 @@ def metadata_path(path: Path) -> Path:
     return path.with_name(path.name + ".json")
 
 
-def write_metadata_file(path: Path, metadata: ExportMetadata, frame: Mapping[str, Any]) -> None:
+def write_metadata_file(path: Path, metadata: ExportMetadata, axes: Axes) -> None:
     """Write the facts beside a file, with what its axes mean."""
-    write_json(metadata_path(path), {"file": path.name, **metadata.to_dict(), **frame})
+    write_json(metadata_path(path), {"file": path.name, **metadata.to_dict(), "axes": axes.description})
 
 
 def ascii_line(text: str) -> str:

@@ -1,11 +1,14 @@
 """The PLY of 3DGS: every number as it was trained, in the layout of INRIA's program that all others read.
 
-Coordinates are those of the ground frame, z up. Header comments say where they stand.
+Coordinates are those of the ground frame, z up, unless others are asked for. Header comments say where they stand: all
+of them short lines, for some readers have room for 1024 characters and do not check (RPly, in Open3D and older
+CloudCompare). The whole coordinate reference system stands beside the PLY, in FILE.prj.
 """
 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,12 +16,15 @@ import numpy as np
 import torch
 
 from vdgs.errors import VdgsError
+from vdgs.export.formats.axes import Z_UP, Axes, axes_named
 from vdgs.export.formats.export_scene import CHUNK_SIZE, ExportMetadata, ExportScene, ascii_line, concatenate
 from vdgs.kernels.spherical_harmonics import MAX_SH_DEGREE, num_sh_bases
 from vdgs.model.gaussians import Gaussians
-from vdgs.system.atomic_files import write_atomic
+from vdgs.system.atomic_files import write_atomic, write_text
 
 MAX_HEADER_BYTES = 1 << 16
+#: Characters of a fact in a comment.
+LONGEST_COMMENT = 200
 PLY_TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
     "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4",
@@ -35,19 +41,44 @@ def property_names(degree: int) -> tuple[str, ...]:
     return ("x", "y", "z", "nx", "ny", "nz", *DC_NAMES, *rest, "opacity", *SCALE_NAMES, *ROTATION_NAMES)
 
 
-def header_comments(metadata: ExportMetadata) -> list[str]:
-    """Header lines that say where local coordinates stand, one fact each, as JSON."""
-    return [f"comment {name} {ascii_line(json.dumps(value))}" if not isinstance(value, str)
-            else f"comment {name} {ascii_line(value)}" for name, value in metadata.to_dict().items()]  # fmt: skip
+def header_comments(metadata: ExportMetadata, axes: Axes) -> list[str]:
+    """Header lines that say where local coordinates stand, one fact each, as JSON, none of them long."""
+    known = {**metadata.to_dict(), "axes": axes.description}
+    if metadata.crs is not None:
+        known["crs"] = short_name(metadata.crs)
+    return [f"comment {name} {ascii_line(value if isinstance(value, str) else json.dumps(value))[:LONGEST_COMMENT]}"
+            for name, value in known.items()]  # fmt: skip
+
+
+def short_name(crs: str) -> str:
+    """A coordinate reference system in a few words: its code where its WKT ends in one, else its name."""
+    code = re.search(r'(?:ID|AUTHORITY)\["(\w+)",\s*"?(\w+)"?\]\s*\]\s*$', crs)
+    name = re.match(r'\s*\w+\["([^"]*)"', crs)
+    if code is not None:
+        return f"{code[1]}:{code[2]}"
+    return name[1] if name is not None else crs
+
+
+def beside_ply(path: Path) -> Path:
+    """Where the whole coordinate reference system of a PLY stands: FILE.prj."""
+    return path.with_name(path.name + ".prj")
+
+
+def write_crs_beside(path: Path, facts: ExportMetadata) -> None:
+    """Write FILE.prj where there is a system; one of an earlier export that has none now goes."""
+    if facts.crs is not None:
+        write_text(beside_ply(path), facts.crs.rstrip() + "\n")
+    else:
+        beside_ply(path).unlink(missing_ok=True)
 
 
 def write_ply(path: Path, scene: ExportScene) -> tuple[str, ...]:
     """Write the scene, atomically; loses nothing. Raises VdgsError."""
-    names = property_names(scene.degree)
+    names, axes = property_names(scene.degree), scene.axes or Z_UP
     lines = [
         "ply",
         "format binary_little_endian 1.0",
-        *header_comments(scene.metadata),
+        *header_comments(scene.metadata, axes),
         f"element vertex {scene.count}",
     ]
     header = "\n".join([*lines, *(f"property float {name}" for name in names), "end_header", ""]).encode("ascii")
@@ -55,10 +86,11 @@ def write_ply(path: Path, scene: ExportScene) -> tuple[str, ...]:
     def write(temporary: Path) -> None:
         with temporary.open("wb") as file:
             file.write(header)
-            for piece in scene.pieces():
+            for piece in scene.pieces(axes):
                 _rows(piece, len(names)).tofile(file)
 
     write_atomic(path, write)
+    write_crs_beside(path, scene.metadata)
     return ()
 
 
@@ -84,7 +116,7 @@ def read_ply_chunks(path: Path) -> Iterator[Gaussians]:
 
     Raises VdgsError for a file that is missing, of another kind, or shorter than it announces.
     """
-    layout, count, start = _header(path)
+    layout, count, start, axes = _header(path)
     names = layout.names or ()
     rest = sum(name.startswith("f_rest_") for name in names)
     missing = [name for name in property_names(0) if name not in names and not name.startswith("n")]
@@ -99,7 +131,7 @@ def read_ply_chunks(path: Path) -> Iterator[Gaussians]:
             table = np.fromfile(path, layout, min(CHUNK_SIZE, count - first), offset=start + first * layout.itemsize)
         except OSError as error:
             raise VdgsError(f"{path}: cannot be read ({error.strerror or error}).") from error
-        yield _gaussians(table, rest)
+        yield axes.to_ground(_gaussians(table, rest))
 
 
 def _gaussians(table: np.ndarray, rest: int) -> Gaussians:
@@ -115,8 +147,8 @@ def _gaussians(table: np.ndarray, rest: int) -> Gaussians:
     )  # fmt: skip
 
 
-def _header(path: Path) -> tuple[np.dtype, int, int]:
-    """Layout of a vertex, their number, and where they begin."""
+def _header(path: Path) -> tuple[np.dtype, int, int, Axes]:
+    """Layout of a vertex, their number, where they begin, and the axes that a comment names."""
     try:
         with path.open("rb") as file:
             data = file.read(MAX_HEADER_BYTES)
@@ -127,10 +159,12 @@ def _header(path: Path) -> tuple[np.dtype, int, int]:
     if not data.startswith(b"ply") or end < 0 or not start:
         raise VdgsError(f"{path}: is no PLY file.")
     fields: list[tuple[str, str]] = []
-    form, count, elements = "", -1, 0
+    form, count, elements, axes = "", -1, 0, Z_UP
     for words in (line.split() for line in data[:end].decode("latin-1").splitlines()):
         if words[:1] == ["format"] and len(words) > 1:
             form = words[1]
+        elif words[:2] == ["comment", "axes"]:
+            axes = axes_named(" ".join(words[2:]), Z_UP)
         elif words[:1] == ["element"] and len(words) == 3:
             elements += 1
             count = int(words[2]) if elements == 1 and words[1] == "vertex" and words[2].isdecimal() else count
@@ -140,4 +174,4 @@ def _header(path: Path) -> tuple[np.dtype, int, int]:
             fields.append((words[2], PLY_TYPES[words[1]]))
     if form != "binary_little_endian" or count < 0:
         raise VdgsError(f"{path}: is no binary PLY of vertices (format {form!r}). Write it as binary_little_endian.")
-    return np.dtype(fields), count, start
+    return np.dtype(fields), count, start, axes

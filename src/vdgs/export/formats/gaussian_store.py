@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from vdgs.errors import RunError
+from vdgs.export.formats.axes import Z_UP, Axes
 from vdgs.export.formats.export_scene import CHUNK_SIZE, ExportScene
 from vdgs.model.gaussians import Gaussians
 
@@ -74,12 +75,12 @@ class GaussianStore:
         return self.rows(np.unique(np.linspace(0, count - 1, min(max_count, count)).astype(np.int64)))
 
 
-def write_store(scene: ExportScene, file: Path, rotation: np.ndarray | None = None) -> GaussianStore:
-    """Write all numbers of a scene to a temporary file, turned where asked. The caller removes the file."""
+def write_store(scene: ExportScene, file: Path, axes: Axes = Z_UP) -> GaussianStore:
+    """Write all numbers of a scene to a temporary file, along these axes. The caller removes the file."""
     means, done = np.empty((scene.count, 3), np.float32), 0
     shapes: dict[str, tuple[int, ...]] = {}
     with file.open("wb") as handle:
-        for piece in scene.pieces(rotation):
+        for piece in scene.pieces(axes):
             shapes = shapes or {name: tuple(tensor.shape[1:]) for name, tensor in piece.tensors().items()}
             flatten(piece).tofile(handle)
             means[done : done + len(piece)] = piece.means.numpy()

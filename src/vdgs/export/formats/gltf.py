@@ -16,8 +16,8 @@ from typing import IO
 import numpy as np
 
 from vdgs.errors import VdgsError
+from vdgs.export.formats.axes import Y_UP
 from vdgs.export.formats.export_scene import (
-    Y_UP,
     ExportMetadata,
     ExportScene,
     base_colors,
@@ -142,18 +142,15 @@ def _document(
 
 def asset_json(metadata: ExportMetadata) -> JsonObject:
     """glTF's and 3D Tiles' word on where a file comes from."""
-    return {
-        "version": "2.0",
-        "generator": metadata.program,
-        "extras": {**metadata.to_dict(), "axes": "x east, y up, z south"},
-    }
+    return {"version": "2.0", "generator": metadata.program, "extras": {**metadata.to_dict(), "axes": Y_UP.description}}
 
 
 def spz_glb(gaussians: Gaussians, spz: bytes, translation: np.ndarray, metadata: ExportMetadata) -> bytes:
     """A GLB around an SPZ of the same Gaussians (y up), moved by `translation` [3] (y up) to their place.
 
-    The attributes name what the SPZ yields, without data of their own. Degree 0 and opacity are not among them: they
-    are COLOR_0, and CesiumJS tells the degree by the number of attributes.
+    The node says so by a `matrix`: CesiumJS (1.140 to 1.145) reads nothing else of the node of a splat, and stops at a
+    `translation` (CesiumGS/cesium#12682). The attributes name what the SPZ yields, without data of their own. Degree 0
+    and opacity are not among them: they are COLOR_0, and CesiumJS tells the degree by the number of attributes.
     """
     count = len(gaussians)
     columns = [
@@ -176,7 +173,7 @@ def spz_glb(gaussians: Gaussians, spz: bytes, translation: np.ndarray, metadata:
         "asset": {"version": "2.0", "generator": metadata.program},
         "extensionsUsed": [EXTENSION, SPZ_EXTENSION], "extensionsRequired": [EXTENSION, SPZ_EXTENSION],
         "scene": 0, "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "translation": [float(x) for x in translation]}],
+        "nodes": [{"mesh": 0, "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, *(float(x) for x in translation), 1]}],
         "meshes": [{"primitives": [{"mode": 0, "attributes": names, "extensions": {EXTENSION: splatting}}]}],
         "accessors": accessors, "bufferViews": [{"buffer": 0, "byteOffset": 0, "byteLength": len(spz)}],
         "buffers": [{"byteLength": len(spz)}],

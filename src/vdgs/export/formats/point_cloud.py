@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vdgs.errors import VdgsError
+from vdgs.export.formats.axes import Z_UP
 from vdgs.export.formats.export_scene import ExportMetadata, ExportScene, base_colors, opacities, to_uint8
-from vdgs.export.formats.gaussian_ply import header_comments
+from vdgs.export.formats.gaussian_ply import header_comments, write_crs_beside
 from vdgs.system.atomic_files import write_atomic
 
 if TYPE_CHECKING:
@@ -26,12 +27,14 @@ LOSS_NOTES = ("sizes, rotations and changing colours are left out: these are poi
 
 
 def write_points(path: Path, scene: ExportScene) -> tuple[str, ...]:
-    """Write x, y, z (ground frame), red, green, blue and opacity as PLY, atomically. Returns what was lost."""
+    """Write x, y, z (ground frame, or along the axes that are asked for), red, green, blue and opacity as PLY,
+    atomically. Returns what was lost."""
     names = ["float x", "float y", "float z", "uchar red", "uchar green", "uchar blue", "float opacity"]
+    axes = scene.axes or Z_UP
     lines = [
         "ply",
         "format binary_little_endian 1.0",
-        *header_comments(scene.metadata),
+        *header_comments(scene.metadata, axes),
         f"element vertex {scene.count}",
     ]
     header = "\n".join([*lines, *(f"property {name}" for name in names), "end_header", ""]).encode("ascii")
@@ -39,13 +42,14 @@ def write_points(path: Path, scene: ExportScene) -> tuple[str, ...]:
     def write(temporary: Path) -> None:
         with temporary.open("wb") as file:
             file.write(header)
-            for piece in scene.pieces():
+            for piece in scene.pieces(axes):
                 rows = np.empty(len(piece), POINT_DTYPE)
                 rows["xyz"], rows["rgb"] = piece.means.numpy(), to_uint8(base_colors(piece))
                 rows["opacity"] = opacities(piece)
                 rows.tofile(file)
 
     write_atomic(path, write)
+    write_crs_beside(path, scene.metadata)
     return LOSS_NOTES
 
 

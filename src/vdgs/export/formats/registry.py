@@ -8,16 +8,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vdgs.errors import VdgsError
+from vdgs.export.formats.compressed_ply import compressed_ply_pieces, write_compressed_ply
 from vdgs.export.formats.export_scene import ExportScene, concatenate, metadata_path
-from vdgs.export.formats.gaussian_ply import read_ply_chunks, write_ply
+from vdgs.export.formats.gaussian_ply import beside_ply, read_ply_chunks, write_ply
 from vdgs.export.formats.gltf import check_glb_size, write_glb
 from vdgs.export.formats.html import check_viser, read_html_chunks, write_html
 from vdgs.export.formats.point_cloud import check_las_dependencies, write_laz, write_points
 from vdgs.export.formats.sog import write_sog
 from vdgs.export.formats.splat import read_splat_chunks, write_splat
 from vdgs.export.formats.spz import MAX_COORDINATE, check_range, read_spz_chunks, write_spz
-from vdgs.export.formats.tiles_3d import TILESET_FILE, check_tileset_folder, write_tiles
+from vdgs.export.formats.tiles_3d import TILESET_FILE, check_tileset_folder, remove_killed, write_tiles
 from vdgs.model.gaussians import Gaussians
+from vdgs.system.scratch import remove_leftovers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,11 +43,19 @@ class ExportFormat:
     fixed_colors: bool = False
     #: Whether it stands on the globe, in no map's coordinates.
     on_globe: bool = False
+    #: Removes what killed exports left beside a file, and returns it.
+    tidy: Callable[[Path], list[Path]] = remove_leftovers
 
 
-#: The longer endings first: `.points.ply` is a `.ply` too.
+#: The longer endings first: `.points.ply` and `.compressed.ply` are `.ply` too.
 FORMATS: tuple[ExportFormat, ...] = (
     ExportFormat(suffix=".points.ply", description="point cloud, local coordinates", write=write_points),
+    ExportFormat(
+        suffix=".compressed.ply",
+        description="PlayCanvas' compressed PLY, a quarter",
+        write=write_compressed_ply,
+        read=compressed_ply_pieces,
+    ),
     ExportFormat(suffix=".ply", description="3DGS PLY, nothing lost", write=write_ply, read=read_ply_chunks),
     ExportFormat(
         suffix=".spz",
@@ -81,6 +91,7 @@ FORMATS: tuple[ExportFormat, ...] = (
         write=write_tiles,
         check=check_tileset_folder,
         on_globe=True,
+        tidy=remove_killed,
     ),
     ExportFormat(
         suffix=".html",
@@ -146,4 +157,7 @@ def read_chunks(path: Path) -> Iterator[Gaussians]:
 
 def files_written(path: Path) -> tuple[Path, ...]:
     """The files that writing `path` replaces, beside the tiles of a tileset."""
-    return (path, metadata_path(path)) if format_from_path(path).writes_metadata_file else (path,)
+    chosen = format_from_path(path)
+    if chosen.suffix.endswith(".ply"):
+        return (path, beside_ply(path))
+    return (path, metadata_path(path)) if chosen.writes_metadata_file else (path,)

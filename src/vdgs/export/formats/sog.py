@@ -10,7 +10,6 @@ from __future__ import annotations
 import io
 import json
 import math
-import tempfile
 import zipfile
 from pathlib import Path
 
@@ -18,10 +17,10 @@ import numpy as np
 import torch
 from PIL import Image
 
+from vdgs.export.formats.axes import Y_DOWN
 from vdgs.export.formats.codebooks import SAMPLE_ROWS, VectorCodebook, fit_codebook, quantize
 from vdgs.export.formats.export_scene import (
     CHUNK_SIZE,
-    Y_DOWN,
     ExportMetadata,
     ExportScene,
     opacities,
@@ -33,6 +32,7 @@ from vdgs.kernels import get_backend
 from vdgs.model.gaussians import Gaussians
 from vdgs.system.atomic_files import write_atomic
 from vdgs.system.documents import JsonObject
+from vdgs.system.scratch import scratch_folder
 
 #: Sets of spherical harmonics at most. The format would take 65536; their gain is small and their search long.
 MAX_SH_CENTROIDS = 4096
@@ -44,12 +44,12 @@ MAX_UINT16 = 65535
 
 def write_sog(path: Path, scene: ExportScene) -> tuple[str, ...]:
     """Write the bundled kind, atomically, and the scene's facts beside it. Returns what was lost. Raises VdgsError."""
-    coarsest = 0.0
+    coarsest, axes = 0.0, scene.axes or Y_DOWN
 
     def write(temporary: Path) -> None:
         nonlocal coarsest
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
-            images = _Images(write_store(scene, Path(folder) / "rows", Y_DOWN))
+        with scratch_folder(path) as folder:
+            images = _Images(write_store(scene, folder / "rows", axes))
             coarsest = images.max_step()
             with zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as bundle:
                 for name, picture in images.encode().items():
@@ -57,7 +57,7 @@ def write_sog(path: Path, scene: ExportScene) -> tuple[str, ...]:
                 bundle.writestr("meta.json", json.dumps(images.meta(scene.metadata), allow_nan=False))
 
     write_atomic(path, write)
-    write_metadata_file(path, scene.metadata, {"axes": "x west, y down, z south"})
+    write_metadata_file(path, scene.metadata, axes)
     notes = [f"positions are rounded, farthest from the origin to {100 * coarsest:.1f} cm (if units are metres)"]
     if scene.degree:
         notes.append(f"changing colours are taken from a palette of at most {MAX_SH_CENTROIDS}")

@@ -12,15 +12,14 @@ import numpy as np
 import torch
 
 from vdgs.errors import VdgsError
+from vdgs.export.formats.axes import Y_DOWN, axes_beside, in_ground
 from vdgs.export.formats.export_scene import (
     CHUNK_SIZE,
-    Y_DOWN,
     ExportScene,
     base_colors,
     gaussian_scales,
     logits_from_opacity,
     opacities,
-    rotate_back,
     to_uint8,
     write_metadata_file,
 )
@@ -33,12 +32,12 @@ SPLAT_DTYPE = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 
 
 def write_splat(path: Path, scene: ExportScene) -> tuple[str, ...]:
     """Write the scene, atomically, and its facts beside it. Returns what was lost. Raises VdgsError."""
-    clipped = 0
+    clipped, axes = 0, scene.axes or Y_DOWN
 
     def write(temporary: Path) -> None:
         nonlocal clipped
         with temporary.open("wb") as file:
-            for piece in scene.pieces(Y_DOWN):
+            for piece in scene.pieces(axes):
                 rows = np.empty(len(piece), SPLAT_DTYPE)
                 shown = base_colors(piece)
                 clipped += int(((shown < 0) | (shown > 1)).any(1).sum())
@@ -48,7 +47,7 @@ def write_splat(path: Path, scene: ExportScene) -> tuple[str, ...]:
                 rows.tofile(file)
 
     write_atomic(path, write)
-    write_metadata_file(path, scene.metadata, {"axes": "x west, y down, z south"})
+    write_metadata_file(path, scene.metadata, axes)
     lost = ["colours no longer change with the viewing direction"] if scene.degree else []
     if clipped:
         lost.append(f"{clipped} of {scene.count} colours lay outside of 0 .. 1 and were cut off")
@@ -65,8 +64,8 @@ def read_splat_chunks(path: Path) -> Iterator[Gaussians]:
     if not len(rows) or len(rows) % SPLAT_DTYPE.itemsize:
         raise VdgsError(f"{path}: holds {len(rows)} bytes, which are no whole Gaussians of 32. Write it again.")
     whole = rows.view(SPLAT_DTYPE)
-    for first in range(0, len(whole), CHUNK_SIZE):
-        yield rotate_back(_gaussians(whole[first : first + CHUNK_SIZE]), Y_DOWN)
+    pieces = (_gaussians(whole[first : first + CHUNK_SIZE]) for first in range(0, len(whole), CHUNK_SIZE))
+    yield from in_ground(pieces, axes_beside(path, Y_DOWN))
 
 
 def _gaussians(table: np.ndarray) -> Gaussians:

@@ -1,15 +1,16 @@
-"""SPZ: a sixth of a PLY and less, in fixed point, gzipped (Niantic's format, versions 2 and 3).
+"""SPZ: a sixth of a PLY and less, in fixed point, compressed (Niantic's format, versions 2, 3 and 4).
 
 Positions have 24 bits, 12 of them after the point: steps of 0.24 mm, within ±2048 m, beyond which other programs wrap
 around silently; here it is an error. y is up (right, up, back). Version 3 keeps rotations finer than version 2, which
-the extension of glTF asks for. Version 4 (zstd) is not written: few programs read it yet.
+the extension of glTF asks for. Both are one gzip stream. Version 4 holds what version 3 does in a zstd frame for each
+quantity, behind 32 bytes of head and a table of their sizes; few programs read it yet (Niantic's own code from 2026).
 """
 
 from __future__ import annotations
 
+import importlib.util
 import math
 import struct
-import tempfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -19,14 +20,13 @@ import numpy as np
 import torch
 
 from vdgs.errors import VdgsError
+from vdgs.export.formats.axes import Y_UP, axes_beside, in_ground
 from vdgs.export.formats.export_scene import (
     CHUNK_SIZE,
-    Y_UP,
     ExportScene,
     concatenate,
     logits_from_opacity,
     opacities,
-    rotate_back,
     to_uint8,
     write_metadata_file,
 )
@@ -35,9 +35,14 @@ from vdgs.export.formats.quaternion_canonical import canonicalize_quaternions
 from vdgs.kernels.spherical_harmonics import MAX_SH_DEGREE, num_sh_bases
 from vdgs.model.gaussians import Gaussians
 from vdgs.system.atomic_files import write_atomic
+from vdgs.system.scratch import scratch_folder
 
 MAGIC = 0x5053474E
 HEADER_STRUCT = struct.Struct("<IIIBBBB")
+#: Version 4: the same, then flags, the number of streams, where the table of their sizes begins, and twelve zeros.
+HEADER_4, SIZES = struct.Struct("<IIIBBBBI12x"), struct.Struct("<QQ")
+#: What is quantised deflates hardly better at higher levels of zstd (1 .. 22).
+ZSTD_LEVEL = 9
 FRACTION_BITS = 12
 #: Positions lie below this many units from the origin.
 MAX_COORDINATE = 2**23 / 2**FRACTION_BITS
@@ -56,24 +61,26 @@ CLAMP_NOTES = {
 
 
 def check_range(path: Path, scene: ExportScene) -> None:
-    """Raise VdgsError where it is known beforehand that positions do not fit."""
+    """Raise VdgsError where it is known beforehand that positions do not fit, or a package is missing."""
+    if scene.spz_version == 4 and importlib.util.find_spec("zstandard") is None:
+        raise VdgsError(f"{path}: version 4 needs zstandard, not installed. Install it: pip install zstandard")
     if scene.bounds is not None and (far := float(np.abs(np.array(scene.bounds)).max())) >= MAX_COORDINATE:
         raise _too_far(path, far)
 
 
-def write_spz(path: Path, scene: ExportScene, version: int = 3) -> tuple[str, ...]:
+def write_spz(path: Path, scene: ExportScene) -> tuple[str, ...]:
     """Write the scene, atomically, and its facts beside it. Returns what was lost. Raises VdgsError.
 
     The file holds one quantity after the other: they wait in temporary files beside it, so memory stays small.
     """
     check_range(path, scene)
-    cut = dict.fromkeys(CLAMP_NOTES, 0)
+    cut, axes, version = dict.fromkeys(CLAMP_NOTES, 0), scene.axes or Y_UP, scene.spz_version
 
     def write(temporary: Path) -> None:
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
-            spools = {name: (Path(folder) / name).open("w+b") for name in COLUMN_NAMES}
+        with scratch_folder(path) as folder:
+            spools = {name: (folder / name).open("w+b") for name in COLUMN_NAMES}
             try:
-                for piece in scene.pieces(Y_UP):
+                for piece in scene.pieces(axes):
                     far = float(piece.means.abs().max())
                     if far >= MAX_COORDINATE - 1 / 2**FRACTION_BITS:
                         raise _too_far(path, far)
@@ -82,6 +89,9 @@ def write_spz(path: Path, scene: ExportScene, version: int = 3) -> tuple[str, ..
                     for name, column in zip(COLUMN_NAMES, encode_columns(piece, version), strict=True):
                         column.tofile(spools[name])
                 with temporary.open("wb") as file:
+                    if version == 4:
+                        _write_streams(file, scene, spools)
+                        return
                     for part in gzip_blocks(_stream(encode_header(scene.count, scene.degree, version), spools)):
                         file.write(part)
             finally:
@@ -89,7 +99,7 @@ def write_spz(path: Path, scene: ExportScene, version: int = 3) -> tuple[str, ..
                     spool.close()
 
     write_atomic(path, write)
-    write_metadata_file(path, scene.metadata, {"axes": "x east, y up, z south"})
+    write_metadata_file(path, scene.metadata, axes)
     notes = [f"{cut[name]} of {scene.count} {what}" for name, what in CLAMP_NOTES.items() if cut[name]]
     if scene.count > MAX_READABLE_POINTS:
         notes.append(
@@ -127,6 +137,23 @@ def encode_spz(gaussians: Gaussians, version: int) -> bytes:
     parts = [encode_header(len(gaussians), gaussians.sh_degree, version, fraction)]
     parts += [column.tobytes() for column in encode_columns(gaussians, version, fraction)]
     return b"".join(gzip_blocks(parts))
+
+
+def _write_streams(file: IO[bytes], scene: ExportScene, spools: Mapping[str, IO[bytes]]) -> None:
+    """Version 4: head, sizes of the streams before and after compression, streams. What is empty is no stream."""
+    import zstandard
+
+    filled = [spool for spool in spools.values() if spool.seek(0, 2)]
+    head = HEADER_4.pack(MAGIC, 4, scene.count, scene.degree, FRACTION_BITS, 0, len(filled), HEADER_4.size)
+    file.write(head + bytes(SIZES.size * len(filled)))
+    sizes = b""
+    for spool in filled:
+        whole = spool.tell()
+        spool.seek(0)
+        _, packed = zstandard.ZstdCompressor(level=ZSTD_LEVEL).copy_stream(spool, file, size=whole)
+        sizes += SIZES.pack(packed, whole)
+    file.seek(HEADER_4.size)
+    file.write(sizes)
 
 
 def _stream(first: bytes, columns: Mapping[str, IO[bytes]]) -> Iterator[bytes]:
@@ -178,16 +205,35 @@ def _pack_quaternions_v3(quaternions: np.ndarray) -> np.ndarray:
 
 
 def read_spz_chunks(path: Path) -> Iterator[Gaussians]:
-    """The Gaussians of a file of version 2 or 3, in the ground frame, at most `CHUNK_SIZE` at a time, but all of its
+    """The Gaussians of a file of version 2, 3 or 4, in the ground frame, at most `CHUNK_SIZE` at a time, but all of its
     bytes in memory, 64 for each. Raises VdgsError if it is damaged or another."""
     try:
-        data = zlib.decompress(path.read_bytes(), 31)
+        packed = path.read_bytes()
+        data = _of_streams(packed, path) if packed[:4] == struct.pack("<I", MAGIC) else zlib.decompress(packed, 31)
     except OSError as error:
         raise VdgsError(f"{path}: cannot be read ({error.strerror or error}).") from error
     except zlib.error as error:
-        raise VdgsError(f"{path}: is no SPZ of versions 2 and 3, or damaged ({error}). Write it again.") from None
-    for piece in _decode(data, path):
-        yield rotate_back(piece, Y_UP)
+        raise VdgsError(f"{path}: is no SPZ of versions 2 to 4, or damaged ({error}). Write it again.") from None
+    yield from in_ground(_decode(data, path), axes_beside(path, Y_UP))
+
+
+def _of_streams(packed: bytes, path: Path) -> bytes:
+    """A file of version 4 as one of version 3, inflated. Raises VdgsError if it is damaged or another."""
+    import zstandard
+
+    try:
+        _, version, count, degree, fraction, flags, streams, table = HEADER_4.unpack_from(packed)
+        if version != 4:
+            raise ValueError(f"its version is {version}")
+        parts = [HEADER_STRUCT.pack(MAGIC, 3, count, degree, fraction, flags, 0)]
+        start = table + streams * SIZES.size
+        for index in range(streams):
+            size, whole = SIZES.unpack_from(packed, table + index * SIZES.size)
+            parts.append(zstandard.ZstdDecompressor().decompress(packed[start : start + size], whole))
+            start += size
+    except (struct.error, ValueError, zstandard.ZstdError) as error:
+        raise VdgsError(f"{path}: is no SPZ of versions 2 to 4, or damaged ({error}). Write it again.") from None
+    return b"".join(parts)
 
 
 def decode_spz(data: bytes, path: Path) -> Gaussians:
@@ -201,7 +247,7 @@ def _decode(data: bytes, path: Path) -> Iterator[Gaussians]:
         or (fields := HEADER_STRUCT.unpack_from(data))[0] != MAGIC
         or fields[1] not in (2, 3)
     ):
-        raise VdgsError(f"{path}: is no SPZ of versions 2 and 3.")
+        raise VdgsError(f"{path}: is no SPZ of versions 2 to 4.")
     _, version, n, degree, fraction, _, _ = fields
     rest = num_sh_bases(degree) - 1 if degree <= MAX_SH_DEGREE else 0
     widths = (9, 1, 3, 3, 4 if version == 3 else 3, 3 * rest)

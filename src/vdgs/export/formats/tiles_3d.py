@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import tempfile
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +20,8 @@ import torch
 
 from vdgs.errors import VdgsError
 from vdgs.export.formats import spz
-from vdgs.export.formats.export_scene import Y_UP, ExportMetadata, ExportScene
+from vdgs.export.formats.axes import Y_UP
+from vdgs.export.formats.export_scene import ExportMetadata, ExportScene
 from vdgs.export.formats.gaussian_store import GaussianStore, write_store
 from vdgs.export.formats.gltf import EXTENSION, SPZ_EXTENSION, spz_glb
 from vdgs.export.formats.simplify import simplify
@@ -31,11 +31,16 @@ from vdgs.model.gaussian_transform import gaussian_covariances, transform_gaussi
 from vdgs.model.gaussians import MAX_SIGMA, Gaussians
 from vdgs.system.atomic_files import write_bytes, write_json
 from vdgs.system.documents import JsonObject
+from vdgs.system.scratch import leftovers, remove_leftovers, scratch_folder
 
 TILESET_FILE = "tileset.json"
 #: How tiles are named beside their tileset: the folder's number is one that nothing there has yet, the file says where
 #: in the quadtree it stands.
 _TILE = re.compile(r"tiles-[0-9]+/[0-3]+\.glb")
+#: What a killed export may leave there.
+_UNFINISHED = re.compile(r"tiles-[0-9]+/([0-3]+\.glb|\.[0-3]+\.glb\.[0-9]+\.tmp)")
+#: The file of a scratch folder that names the folder of tiles which is being filled.
+_WRITES = "tiles"
 #: Gaussians of a tile: about a megabyte with spherical harmonics of degree 3.
 MAX_GAUSSIANS_PER_TILE = 50_000
 #: The extension of glTF asks for version 2.
@@ -76,11 +81,9 @@ def write_tiles(path: Path, scene: ExportScene, max_gaussians: int = MAX_GAUSSIA
     taken = [int(each.name[6:]) for each in path.parent.glob("tiles-*") if each.name[6:].isdecimal()]
     folder = path.parent / f"tiles-{1 + max(taken, default=0)}"
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{TILESET_FILE}.") as spool:
-            root = _TileQuadtree(
-                write_store(scene, Path(spool) / "rows"), folder, scene.metadata, max_gaussians
-            ).build()
+        with scratch_folder(path) as scratch:
+            (scratch / _WRITES).write_text(folder.name)
+            root = _TileQuadtree(write_store(scene, scratch / "rows"), folder, scene.metadata, max_gaussians).build()
         write_json(path, _tileset(root, scene.metadata))
     except OSError as error:
         shutil.rmtree(folder, ignore_errors=True)
@@ -114,6 +117,19 @@ def tileset_files(path: Path) -> list[Path]:
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return []
     return [path.parent / uri for uri in sorted(set(found)) if _TILE.fullmatch(uri)]
+
+
+def remove_killed(path: Path) -> list[Path]:
+    """Remove what killed exports of the tileset at `path` left: scratch folders, and the tiles that they had begun.
+    Returns what was there. Raises nothing for what cannot be removed."""
+    named, begun = set(tileset_files(path)), list[Path]()
+    for each in leftovers(path):
+        with suppress(OSError, UnicodeDecodeError):
+            begun += sorted(path.parent.joinpath((each / _WRITES).read_text()).glob("*"))
+    inside = {each: str(each.relative_to(path.parent)) for each in begun if each.parent.parent == path.parent}
+    tiles = [each for each, name in inside.items() if _UNFINISHED.fullmatch(name) and each not in named]
+    _remove(tiles)
+    return [*remove_leftovers(path), *sorted({each.parent for each in tiles})]
 
 
 def _remove(tiles: list[Path]) -> None:
@@ -163,8 +179,8 @@ class _TileQuadtree:
             low, high = np.minimum(low, child.low), np.maximum(high, child.high)
         middle = np.rint((gaussians.means.double().amin(0) + gaussians.means.double().amax(0)).numpy() / 2)
         file = self.folder / f"{name}.glb"
-        here = transform_gaussians(gaussians, 1.0, Y_UP, -(Y_UP @ middle))
-        write_bytes(file, spz_glb(here, spz.encode_spz(here, SPZ_VERSION), Y_UP @ middle, self.facts))
+        here = transform_gaussians(gaussians, 1.0, Y_UP.turn, -(Y_UP.turn @ middle))
+        write_bytes(file, spz_glb(here, spz.encode_spz(here, SPZ_VERSION), Y_UP.turn @ middle, self.facts))
         entry: JsonObject = {
             "boundingVolume": {"box": _box_of(low, high)}, "geometricError": error,
             "content": {"uri": f"{self.folder.name}/{file.name}"},

@@ -201,6 +201,7 @@ def _draw(
     """Put all tiles into files beside the final ones; what came out. One tile is in memory at a time."""
     grid = plan.grid
     tags = {"CRS_NAME": facts["crs_name"], "HEIGHTS": facts["heights"], "MODEL": facts["model"],
+            "GEOREFERENCE": facts["georeference"],
             "SOFTWARE": facts["software"]}  # fmt: skip
     mapped, poorly, low, high = 0, 0, np.inf, -np.inf
     with ExitStack() as open_files:

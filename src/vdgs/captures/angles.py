@@ -1,0 +1,60 @@
+"""Latitudes and longitudes as people and programs write them: decimal, degrees and minutes, with words for the side."""
+
+from __future__ import annotations
+
+import math
+import re
+import unicodedata
+from collections.abc import Sequence
+
+_NUMBER = re.compile(r"\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?")
+#: Words that degrees, minutes and seconds may be written with.
+_UNITS = re.compile(r"degrees?|deg|minutes?|min|seconds?|sec", re.IGNORECASE)
+#: First letters of the words for south and west, north and east, in the axis that they belong to.
+SIDES = {"latitude": ("S", "N"), "longitude": ("W", "E")}
+#: The largest value of each, in degrees.
+LIMITS = {"latitude": 90.0, "longitude": 180.0}
+
+
+def side_of(word: str, axis: str) -> float | None:
+    """-1 for south or west, 1 for north or east, by the first letter of a word; None for anything else."""
+    letter = word.strip().upper()[:1]
+    south, north = SIDES[axis]
+    return -1.0 if letter == south else 1.0 if letter == north else None
+
+
+def degrees_of_parts(parts: Sequence[float | None]) -> float | None:
+    """Degrees from up to three numbers: degrees, minutes, seconds. Minutes and seconds that are none count as 0."""
+    if not 1 <= len(parts) <= 3 or parts[0] is None:
+        return None
+    whole, *rest = (value or 0.0 for value in parts)
+    if any(not 0 <= value < 60.0001 for value in rest):
+        return None
+    degrees = sum(value / 60**power for power, value in enumerate((abs(whole), *rest)))
+    return math.copysign(degrees, whole)
+
+
+def degrees_of_text(text: str, axis: str) -> tuple[float, bool] | None:
+    """Degrees from text such as `-33.5`, `33.5 S`, `33°30'1.5" South` or `33,30.02S`, and whether it says the side.
+
+    None for what is no such angle. A comma stands for the decimal point where it is the only one of its text.
+    """
+    plain = _UNITS.sub(" ", unicodedata.normalize("NFKC", text.replace("\u00ba", " "))).strip()
+    letters = re.findall(r"[A-Za-z]+", re.sub(r"\d[eE][+-]?\d", "00", plain))
+    if len(letters) > 1:
+        return None
+    side = side_of(letters[0], axis) if letters else None
+    if letters and side is None:
+        return None
+    plain = re.sub(r"[A-Za-z]+$|^[A-Za-z]+", " ", plain).strip()
+    # In XMP `33,30.02` has degrees and minutes; in a table `33,5` is decimal.
+    if plain.count(",") and ("." in plain or plain.count(",") > 1 or side is not None):
+        plain = plain.replace(",", " ")
+    words = _NUMBER.findall(plain)
+    value = degrees_of_parts([float(word.replace(",", ".")) for word in words])
+    if value is None or not math.isfinite(value):
+        return None
+    negative = plain.lstrip().startswith(("-", "\u2212"))
+    if side is not None:
+        return side * value, True
+    return (-value if negative else value), negative

@@ -1,0 +1,62 @@
+"""Coordinate systems by the names that lists and tables give them: codes, ODM's words, PROJ strings, WKT."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from vdgs.errors import CaptureError
+
+ToGeodetic = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n 3"]]
+_STARTS = re.compile(
+    r"(EPSG:\s*\d+|WGS\s?84\b|\+proj=|\+init=|(GEOG|PROJ|GEO|PROJC|COMPD|COMPOUND)[A-Z]*CRS?\[|\w*CS\[)", re.I
+)
+
+
+def names_a_system(line: str) -> bool:
+    """Whether a line is the name of a coordinate system, as far as its beginning tells."""
+    return bool(_STARTS.match(line.strip()))
+
+
+def to_geodetic(header: str, file: Path) -> tuple[ToGeodetic, str]:
+    """What brings x, y, z [n, 3] (x east or longitude) to latitude, longitude and height, and the name of their system.
+
+    Raises CaptureError for a system that is unknown, and without pyproj.
+    """
+    try:
+        import pyproj
+    except ImportError:
+        raise CaptureError(f"{file}: needs pyproj: pip install 'vdgs[geo]'.") from None
+    try:
+        crs = pyproj.CRS.from_user_input(_named(header))
+        flat = len(crs.axis_info) == 2
+        change = pyproj.Transformer.from_crs(crs, "EPSG:4326" if flat else "EPSG:4979", always_xy=True)
+    except pyproj.exceptions.ProjError:
+        raise CaptureError(
+            f"{file}: the first line must name the coordinate system (EPSG:32615, WGS84 UTM 15N, or a PROJ string), "
+            f"and {header[:60]!r} names none."
+        ) from None
+
+    def changed(places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        x, y, z = places.T
+        if flat:  # heights are metres as they are, whatever they are measured from
+            longitude, latitude = change.transform(x, y)
+        else:
+            longitude, latitude, z = change.transform(x, y, z)
+        return np.stack([latitude, longitude, z], axis=1)
+
+    return changed, crs.name if crs.name != "unknown" else header
+
+
+def _named(header: str) -> str:
+    """ODM's own words for systems, `WGS84` and `WGS84 UTM 15N`, as codes; others as they are."""
+    words = header.upper().replace("WGS 84", "WGS84").split()
+    if words == ["WGS84"]:
+        return "EPSG:4326"
+    if words[:2] == ["WGS84", "UTM"] and len(words) == 3 and words[2][:-1].isdecimal() and words[2][-1] in "NS":
+        return f"EPSG:{(32600 if words[2][-1] == 'N' else 32700) + int(words[2][:-1])}"
+    return header

@@ -1,0 +1,88 @@
+"""Captures and models below a folder of photographs, before anyone makes their poses anew."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from vdgs.captures.formats.colmap import count_images, find_models
+from vdgs.captures.formats.matrixcity import pose_files
+from vdgs.captures.formats.mega_nerf import is_mega_nerf
+from vdgs.captures.image_files import IMAGE_SUFFIXES
+from vdgs.captures.output_guard import is_capture
+
+#: So many folders deep a model is looked for: WORKSPACE/dense/0 with sparse in it, and one above.
+DEEPEST = 3
+#: Poses of programs that are not read, by the file that has them, and what turns them into what is.
+_OTHERS = {
+    "reconstruction.json": "poses of OpenSfM or ODM; `opensfm export_colmap` makes a COLMAP model of them",
+    "shots.geojson": "poses of ODM; `opensfm export_colmap` on its opensfm folder makes a COLMAP model of them",
+    "cameras.xml": "poses of Metashape; it exports COLMAP",
+    "bundle.out": "poses of Bundler; COLMAP imports them",
+    "project.opf": "poses of Pix4D; pyopf makes a COLMAP model of them",
+}
+#: A file of poses with fewer bytes has none ("[]").
+_LEAST_BYTES = 20
+
+
+def model_below(root: Path) -> str | None:
+    """What to say of a capture, or a model, in a folder below `root`; None where there is none."""
+    for folder in _folders(root):
+        if not is_capture(folder):
+            continue
+        if _has_photographs(folder):
+            return f"{folder} is a capture: vdgs run {_quoted(folder)} --output RUN"
+        models = find_models(folder)
+        if models:
+            biggest = max(models, key=count_images)
+            photographs = _photographs_beside(root, folder)
+            link = f"ln -s {_quoted(photographs.resolve())} {_quoted(folder / 'images')}; " if photographs else ""
+            return (
+                f"{biggest} is a COLMAP model of {count_images(biggest)} photographs. To "
+                f"use it, put them beside it as images: {link}vdgs run {_quoted(folder)} --output RUN"
+            )
+    return None
+
+
+def foreign_poses(root: Path) -> list[str]:
+    """Poses below `root` that other programs made and that are not read, and what makes a capture of them."""
+    found = []
+    for folder in (root, *_folders(root)):
+        for name, what in _OTHERS.items():
+            file = folder / name
+            if file.is_file() and file.stat().st_size > _LEAST_BYTES:
+                found.append(f"{file.relative_to(root).as_posix()}: {what}")
+    return found
+
+
+def _folders(root: Path) -> Iterator[Path]:
+    """Folders below `root`, those that lie higher first, without hidden ones."""
+    level = [root]
+    for _ in range(DEEPEST):
+        level = [
+            Path(entry.path)
+            for folder in level
+            for entry in sorted(os.scandir(folder), key=lambda entry: entry.name)
+            if entry.is_dir(follow_symlinks=False) and not entry.name.startswith(".")
+        ]
+        yield from level
+
+
+def _has_photographs(folder: Path) -> bool:
+    if (folder / "transforms.json").is_file() or is_mega_nerf(folder) or pose_files(folder):
+        return True
+    return any(entry.is_dir() and entry.name.startswith("images") for entry in folder.iterdir())
+
+
+def _photographs_beside(root: Path, model: Path) -> Path | None:
+    """The folder with most images in or right below `root`, but not in the model's own."""
+    folders = [root, *(entry for entry in root.iterdir() if entry.is_dir() and entry not in (model, *model.parents))]
+    counts = {folder: sum(entry.suffix.lower() in IMAGE_SUFFIXES for entry in folder.iterdir()) for folder in folders}
+    best = max(counts, key=lambda folder: counts[folder])
+    return best if counts[best] else None
+
+
+def _quoted(path: Path) -> str:
+    text = str(path)
+    return f'"{text}"' if " " in text else text

@@ -1,0 +1,89 @@
+"""What lies among photographs and is none: folders of programs, products, previews, masks by their names."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path, PurePath
+
+#: Folders that systems and programs keep for themselves; so are all whose names begin with a dot.
+_HIDDEN = re.compile(
+    r"\..*|@.*|#recycle|\$recycle\.bin|__macosx|system volume information|lost\+found|_?thumb(nail)?s?|_?previews?"
+    r"|thumbs?_.*|proxies|cache|__pycache__",
+    re.IGNORECASE,
+)
+#: Folders of what programs made of photographs: ODM, OpenSfM, COLMAP, Pix4D, Metashape, and their maps.
+_PRODUCTS = re.compile(
+    r"odm_\w+|opensfm|entwine_pointcloud|3d_tiles|dsm|dtm|dem|chm|ndvi|ortho(photos?|mosaics?)|dsm_ortho|mosaics?"
+    r"|1_initial|2_densification|3_dsm_ortho|4_index|.+\.files|.+\.rcproj|stereo|depth_?maps?|normal_maps?|depths?"
+    r"|normals?|contact_?sheets?|renders?|reports?|textures?|texturing|\d+_orthophoto|undistorted_depths|semantics?",
+    re.IGNORECASE,
+)
+#: Files by which programs mark a folder of their results (ours: maps, renders, runs).
+_MARKS = ("map.json", "render.json", "capture.json", "partition.json", "export.json", "steps.json")
+#: What a folder of maps holds that is no photograph, where `map.json` lies beside it.
+_OF_MAPS = {"orthophoto.tif", "dsm.tif", "visibility.tif", "hillshade.png", "preview.png"}
+#: Pictures of ours, and what screens leave on a disk.
+_PICTURES = re.compile(
+    r"(photographs|reconstruction|contact[_ -]?sheet)\.(png|jpe?g)|screen[ _-]?shots?\b.*|bildschirmfoto.*"
+    r"|capture d.écran.*"
+    r"|(odm_)?(orthophoto|orthomosaic|ortho|dsm|dtm|dem|hillshade|mosaic)([_-].*)?\.(tiff?|png|jpe?g)"
+    r"|.+[_-](orthophoto|orthomosaic|transparent_mosaic[_-]?\w*|mosaic_\w+|dsm|dtm|ortho)\.(tiff?|png|jpe?g)",
+    re.IGNORECASE,
+)
+#: What folders of masks are called, the usual name first.
+MASK_FOLDERS = ("masks", "mask", "_masks", "images_masks", "image_masks", "Masks")
+_MASK_FOLDER = re.compile(r"_?(images?_?)?(masks?|msk)(_?images?)?|.+_masks", re.IGNORECASE)
+_MASK_STEM = re.compile(r"(?P<before>.+?)[ ._-](mask|msk)|(mask|msk)[ ._-](?P<after>.+)", re.IGNORECASE)
+_PREVIEW_STEM = re.compile(
+    r"(?P<before>.+?)[ ._-](thumb|thumbnail|preview|small|proxy|tn)|(thumb|tn)[ ._-](?P<after>.+)", re.I
+)
+
+
+def why_not_read(folder: Path) -> str | None:
+    """Why pictures in a folder below photographs are none, by its name or what marks it; None where they may be."""
+    if _HIDDEN.fullmatch(folder.name):
+        return "hidden, or of a system's or a program's own"
+    if _PRODUCTS.fullmatch(folder.name) or any((folder / mark).is_file() for mark in _MARKS):
+        return "results of a program"
+    return None
+
+
+def is_result(file: Path) -> bool:
+    """Whether a picture is by its name a map, an overview or a picture of a screen, not a photograph."""
+    of_map = file.name.lower() in _OF_MAPS and (file.parent / "map.json").is_file()
+    return of_map or bool(_PICTURES.fullmatch(file.name))
+
+
+def walk(folder: Path) -> Iterator[tuple[Path, list[Path], dict[Path, str]]]:
+    """Each folder with its files, sorted, and the folders in it that are not entered, with the reason."""
+    for at, folders, files in os.walk(folder):
+        here = Path(at)
+        reasons = {here / name: why_not_read(here / name) for name in sorted(folders)}
+        folders[:] = [path.name for path, why in reasons.items() if why is None]
+        yield here, [here / name for name in sorted(files)], {path: why for path, why in reasons.items() if why}
+
+
+def is_hidden(name: PurePath) -> bool:
+    """Whether a file lies in a folder that a system keeps for itself (`.thumbnails`, `@eaDir`, `__MACOSX`)."""
+    return any(part.startswith((".", "@", "__MACOSX")) for part in name.parts)
+
+
+def is_mask_folder(name: str) -> bool:
+    """Whether a folder is called as folders of masks are."""
+    return bool(_MASK_FOLDER.fullmatch(name))
+
+
+def masked_stem(stem: str) -> str | None:
+    """The stem of the photograph that a mask is of by its name (`x_mask`, `mask_x`, `x.jpg.mask`); None for others."""
+    return _stem(_MASK_STEM.fullmatch(stem))
+
+
+def previewed_stem(stem: str) -> str | None:
+    """The stem of the photograph that a preview is of by its name (`x_thumb`, `x.preview`); None for others."""
+    return _stem(_PREVIEW_STEM.fullmatch(stem))
+
+
+def _stem(match: re.Match[str] | None) -> str | None:
+    return (match["before"] or match["after"]) if match else None

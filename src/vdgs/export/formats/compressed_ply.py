@@ -1,0 +1,201 @@
+"""PlayCanvas' compressed PLY: 16 bytes a Gaussian, and a byte for each coefficient of colours that change.
+
+Chunks of 256 neighbours (in Morton order) have bounds as float32; within them a Gaussian has positions and logarithms
+of sizes in 11, 10 and 11 bits, the three smaller parts of its rotation in 10 bits each, colour and opacity in 8. The
+coefficients of spherical harmonics are bytes between -4 and 4. The frame is that of `.sog`, y down.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt32
+
+from vdgs.errors import VdgsError
+from vdgs.export.formats.axes import Y_DOWN, Axes, axes_named
+from vdgs.export.formats.export_scene import CHUNK_SIZE, ExportScene, base_colors, logits_from_opacity, opacities
+from vdgs.export.formats.gaussian_ply import MAX_HEADER_BYTES, header_comments, write_crs_beside
+from vdgs.export.formats.gaussian_store import write_store
+from vdgs.kernels import get_backend
+from vdgs.kernels.spherical_harmonics import num_sh_bases, rgb_to_sh
+from vdgs.model.gaussians import Gaussians
+from vdgs.system.atomic_files import write_atomic
+from vdgs.system.scratch import scratch_folder
+
+CHUNK = 256
+#: What the float32 of a chunk are: lowest and highest position, logarithm of the size, colour.
+BOUNDS = tuple(
+    f"{end}_{what}"
+    for names in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
+    for end in ("min", "max")
+    for what in names
+)
+PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+#: Readers take no larger or smaller logarithm of a size.
+LARGEST_LOG = 20.0
+#: Coefficients of spherical harmonics lie between minus and plus half of this.
+SPAN = 8.0
+LOST = (
+    "positions and sizes are rounded to 1/2047 of what their chunk of 256 neighbours spans, colours to bytes, changing "
+    f"colours to {SPAN / 256:.3f}"
+)
+
+
+def write_compressed_ply(path: Path, scene: ExportScene) -> tuple[str, ...]:
+    """Write the scene, atomically. Returns what was lost. Raises VdgsError."""
+    axes, count = scene.axes or Y_DOWN, scene.count
+    coefficients = 3 * (num_sh_bases(scene.degree) - 1)
+    header = _header(scene, axes, coefficients)
+    chunks = -(-count // CHUNK)
+    vertices = len(header) + chunks * 4 * len(BOUNDS)
+    harmonics = vertices + count * 4 * len(PACKED)
+
+    def write(temporary: Path) -> None:
+        with scratch_folder(path) as folder:
+            held = write_store(scene, folder / "rows", axes)
+            order = get_backend(torch.device("cpu")).morton_order(torch.from_numpy(held.means)).numpy()
+            with temporary.open("wb") as file:
+                file.write(header)
+                for first in range(0, count, CHUNK_SIZE):  # whole chunks: ROWS is a multiple of them
+                    piece = held.rows(order[first : first + CHUNK_SIZE])
+                    bounds, packed = _packed(piece)
+                    _put(file, len(header) + first // CHUNK * 4 * len(BOUNDS), bounds)
+                    _put(file, vertices + first * 4 * len(PACKED), packed)
+                    _put(file, harmonics + first * coefficients, _bytes_of_harmonics(piece))
+
+    write_atomic(path, write)
+    write_crs_beside(path, scene.metadata)
+    return (LOST,)
+
+
+def _header(scene: ExportScene, axes: Axes, coefficients: int) -> bytes:
+    lines = ["ply", "format binary_little_endian 1.0", *header_comments(scene.metadata, axes)]
+    lines += [f"element chunk {-(-scene.count // CHUNK)}", *(f"property float {name}" for name in BOUNDS)]
+    lines += [f"element vertex {scene.count}", *(f"property uint {name}" for name in PACKED)]
+    if coefficients:
+        lines += [f"element sh {scene.count}", *(f"property uchar f_rest_{i}" for i in range(coefficients))]
+    return "\n".join([*lines, "end_header", ""]).encode("ascii")
+
+
+def _put(file: IO[bytes], place: int, values: np.ndarray) -> None:
+    file.seek(place)
+    file.write(values.tobytes())
+
+
+def _packed(piece: Gaussians) -> tuple[Float[np.ndarray, "c 18"], UInt32[np.ndarray, "n 4"]]:
+    """The bounds of the chunks, and the four words of each Gaussian."""
+    logs = piece.log_scales.numpy().clip(-LARGEST_LOG, LARGEST_LOG)
+    bounds, units = [], []
+    for values in (piece.means.numpy(), logs, base_colors(piece)):
+        low, high, unit = _within_chunks(values)
+        bounds += [low, high]
+        units.append(unit)
+    words = np.empty((len(piece), 4), "<u4")
+    words[:, 0], words[:, 2] = _join(units[0], (11, 10, 11)), _join(units[1], (11, 10, 11))
+    words[:, 1] = _rotation(piece.quaternions.numpy())
+    words[:, 3] = _join(np.concatenate([units[2], opacities(piece)[:, None]], 1), (8, 8, 8, 8))
+    return np.concatenate(bounds, 1).astype("<f4"), words
+
+
+def _within_chunks(values: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Lowest and highest of each chunk [c, 3], and where between them each value lies, 0 .. 1."""
+    starts = np.arange(0, len(values), CHUNK)
+    low, high = np.minimum.reduceat(values, starts, 0), np.maximum.reduceat(values, starts, 0)
+    chunk = np.arange(len(values)) // CHUNK
+    span = (high - low).astype(np.float64)
+    return low, high, (values - low[chunk]) / np.where(span > 0, span, 1.0)[chunk]
+
+
+def _join(units: np.ndarray, widths: tuple[int, ...]) -> UInt32[np.ndarray, " n"]:
+    """Columns of 0 .. 1, each in so many bits, the first in the highest."""
+    word = np.zeros(len(units), np.uint32)
+    for column, width in enumerate(widths):
+        most = (1 << width) - 1
+        word = (word << np.uint32(width)) | np.clip(np.rint(units[:, column] * most), 0, most).astype(np.uint32)
+    return word
+
+
+def _rotation(quaternions: Float[np.ndarray, "n 4"]) -> UInt32[np.ndarray, " n"]:
+    """Which of w, x, y, z is largest, then the others in their order, 10 bits each."""
+    largest = np.abs(quaternions).argmax(1)
+    signed = np.where(quaternions[np.arange(len(quaternions)), largest][:, None] < 0, -quaternions, quaternions)
+    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
+    small = np.take_along_axis(signed, others, 1) * np.sqrt(0.5) + 0.5
+    return (largest.astype(np.uint32) << np.uint32(30)) | _join(small, (10, 10, 10))
+
+
+def _bytes_of_harmonics(piece: Gaussians) -> np.ndarray:
+    """Channel by channel, as in a plain PLY; a byte stands for the middle of what it covers."""
+    coded = np.floor((piece.shN.numpy().transpose(0, 2, 1) / SPAN + 0.5) * 256)
+    return np.clip(coded, 0, 255).astype(np.uint8)
+
+
+def is_compressed(head: bytes) -> bool:
+    """Whether a header is one of these."""
+    return re.search(rb"^property \w+ packed_position\s*$", head, re.MULTILINE) is not None
+
+
+def compressed_ply_pieces(path: Path) -> Iterator[Gaussians]:
+    """The Gaussians of a file, in the ground frame, at most `CHUNK_SIZE` at a time. Raises VdgsError for another or a damaged
+    one."""
+    try:
+        data = np.memmap(path, np.uint8, "r")
+    except (OSError, ValueError) as error:
+        raise VdgsError(f"{path}: cannot be read ({error}).") from error
+    head, end, _ = bytes(data[:MAX_HEADER_BYTES]).partition(b"end_header\n")
+    if not end or not is_compressed(head):
+        raise VdgsError(f"{path}: is no compressed PLY of PlayCanvas.")
+    text = head.decode("latin-1")
+    counts = {name: int(number) for name, number in re.findall(r"^element (\w+) (\d+)\s*$", text, re.MULTILINE)}
+    coefficients = len(re.findall(r"^property uchar f_rest_", text, re.MULTILINE))
+    described = re.search(r"^comment axes (.*)$", text, re.MULTILINE)
+    axes = axes_named(described[1].strip() if described else None, Y_DOWN)
+    chunks, count = counts.get("chunk", 0), counts.get("vertex", 0)
+    sizes = (chunks * 4 * len(BOUNDS), count * 4 * len(PACKED), count * coefficients)
+    start = len(head) + len(end)
+    if count < 1 or chunks != -(-count // CHUNK) or len(data) < start + sum(sizes):
+        raise VdgsError(f"{path}: holds fewer Gaussians than it announces. It is truncated; write it again.")
+    edges = np.cumsum([start, *sizes])
+    bounds = data[edges[0] : edges[1]].view("<f4").reshape(chunks, 6, 3)
+    words = data[edges[1] : edges[2]].view("<u4").reshape(count, 4)
+    harmonics = data[edges[2] : edges[3]].reshape(count, 3, coefficients // 3)
+    for first in range(0, count, CHUNK_SIZE):
+        rows = slice(first, first + CHUNK_SIZE)
+        chunk = np.arange(first, min(first + CHUNK_SIZE, count)) // CHUNK
+        yield axes.to_ground(_unpacked(bounds[chunk], np.array(words[rows]), np.array(harmonics[rows])))
+
+
+def _unpacked(bounds: np.ndarray, words: np.ndarray, harmonics: np.ndarray) -> Gaussians:
+    def between(units: np.ndarray, low: int) -> torch.Tensor:
+        values = bounds[:, low] + units * (bounds[:, low + 1] - bounds[:, low])
+        return torch.from_numpy(values.astype(np.float32))
+
+    shown = _part(words[:, 3], (8, 8, 8, 8))
+    rest = (harmonics.transpose(0, 2, 1).astype(np.float32) + np.float32(0.5)) / 256 - np.float32(0.5)
+    return Gaussians(
+        means=between(_part(words[:, 0], (11, 10, 11)), 0), log_scales=between(_part(words[:, 2], (11, 10, 11)), 2),
+        quaternions=_quaternions(words[:, 1]), opacity_logits=logits_from_opacity(shown[:, 3]),
+        sh0=rgb_to_sh(between(shown[:, :3], 4)), shN=torch.from_numpy(np.ascontiguousarray(rest * SPAN)),
+    )  # fmt: skip
+
+
+def _part(words: np.ndarray, widths: tuple[int, ...]) -> np.ndarray:
+    """The inverse of `_join`."""
+    shifts = np.cumsum([0, *widths[:0:-1]])[::-1]
+    pairs = zip(shifts, widths, strict=True)
+    return np.stack([(words >> np.uint32(shift)) % (1 << width) / ((1 << width) - 1) for shift, width in pairs], 1)
+
+
+def _quaternions(words: np.ndarray) -> torch.Tensor:
+    small = (_part(words, (10, 10, 10)) - 0.5) * np.sqrt(2)
+    largest = words >> np.uint32(30)
+    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
+    found = np.empty((len(words), 4))
+    np.put_along_axis(found, others, small, 1)
+    found[np.arange(len(words)), largest] = np.sqrt(np.maximum(0, 1 - (small**2).sum(1)))
+    return torch.from_numpy(found.astype(np.float32))

@@ -1,0 +1,127 @@
+"""A model bent, after it was moved to where it belongs, by what is known better than a similarity of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pycolmap
+
+from vdgs.sfm.gcp_list import GcpObservation
+from vdgs.sfm.georegistration import Georegistration, model_points
+from vdgs.sfm.gps_priors import GpsPriors
+from vdgs.sfm.image_metadata import ImageMetadata
+from vdgs.sfm.workspace import call_cancellable
+
+#: A model that is bent by more than this share of the flying height is torn (choice).
+MOST_BENT = 0.1
+#: Positions tell how a model is bent where they are good to this share of the flying height (choice), and so many.
+GOOD_SHARE, ENOUGH_POSITIONS = 0.01, 6
+
+
+def bend_to_positions(
+    model: pycolmap.Reconstruction,
+    photographs: Sequence[ImageMetadata],
+    positions: GpsPriors,
+    placed: Georegistration,
+    hold_focal: bool,
+    threads: int,
+) -> pycolmap.Reconstruction:
+    """A bundle adjustment with positions that were found to be good as priors; the model as it is where they are not,
+    and where that would tear it."""
+    accuracy = placed.accuracy
+    if accuracy is None or accuracy.positions_m is None or accuracy.altitude != "used":
+        return model
+    deviations = np.array(accuracy.positions_m)
+    if placed.inliers.sum() < ENOUGH_POSITIONS or deviations.max() > GOOD_SHARE * _height(model):
+        return model
+    bent = pycolmap.Reconstruction(model)
+    images = {image.name: image for image in bent.images.values() if image.has_pose}
+    priors: list[pycolmap.PosePrior] = []
+    for row in placed.position_rows[placed.inliers].tolist():
+        image = images[photographs[int(positions.image_indices[row])].name]
+        priors.append(
+            pycolmap.PosePrior(
+                pose_prior_id=len(priors) + 1,
+                corr_data_id=image.data_id,
+                position=positions.enu[row],
+                position_covariance=np.diag(deviations**2),
+                coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
+            )
+        )
+    config = pycolmap.BundleAdjustmentConfig()
+    for image in images.values():
+        config.add_image(image.image_id)
+    known = pycolmap.PosePriorBundleAdjustmentOptions()
+    known.ceres.prior_position_loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    adjuster = pycolmap.create_pose_prior_bundle_adjuster(_options(hold_focal, threads), known, config, priors, bent)
+    call_cancellable(lambda cancellation_token: adjuster.solve())
+    bent.update_point_3d_errors()
+    return bent if _tears(model, bent) is None else model
+
+
+def bend_to_points(
+    model: pycolmap.Reconstruction,
+    points: Sequence[tuple[Sequence[GcpObservation], np.ndarray]],
+    hold_focal: bool,
+    threads: int,
+) -> tuple[pycolmap.Reconstruction, tuple[str, ...]]:
+    """A bundle adjustment with points that stay where they were surveyed, which are taken out of the model again; the
+    model as it is, and a note, where that would tear it."""
+    bent = pycolmap.Reconstruction(model)
+    images = {image.name: image for image in bent.images.values() if image.has_pose}
+    config = pycolmap.BundleAdjustmentConfig()
+    for image in images.values():
+        config.add_image(image.image_id)
+    fixed = [_add_fixed(bent, images, sightings, target) for sightings, target in points]
+    for number in fixed:
+        config.add_constant_point(number)
+    adjuster = pycolmap.create_default_bundle_adjuster(_options(hold_focal, threads), config, bent)
+    try:
+        call_cancellable(lambda cancellation_token: adjuster.solve())
+    finally:
+        for number in fixed:
+            bent.delete_point3D(number)
+    bent.update_point_3d_errors()
+    moved = _tears(model, bent)
+    if moved is not None:
+        note = f"the model was moved to the control points but not bent: that would move cameras by {moved:.3g} m."
+        return model, (note,)
+    return bent, ()
+
+
+def _options(hold_focal: bool, threads: int) -> pycolmap.BundleAdjustmentOptions:
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary, options.refine_focal_length = False, not hold_focal
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.solver_options.num_threads = threads
+    return options
+
+
+def _height(model: pycolmap.Reconstruction) -> float:
+    """Median distance of the cameras to the median point."""
+    centers = np.array([image.projection_center() for image in model.images.values() if image.has_pose])
+    return float(np.median(np.linalg.norm(centers - np.median(model_points(model), axis=0), axis=1)))
+
+
+def _tears(model: pycolmap.Reconstruction, bent: pycolmap.Reconstruction) -> float | None:
+    """How far cameras moved, metres, where that is more than a bent model allows; None where it is not."""
+    numbers = [image.image_id for image in model.images.values() if image.has_pose]
+    before, after = (np.array([each.image(k).projection_center() for k in numbers]) for each in (model, bent))
+    moved = float(np.sqrt(((after - before) ** 2).sum(axis=1).mean()))
+    worse = bent.compute_mean_reprojection_error() > 1 + 2 * model.compute_mean_reprojection_error()
+    return moved if worse or moved > MOST_BENT * _height(model) else None
+
+
+def _add_fixed(
+    model: pycolmap.Reconstruction,
+    images: Mapping[str, pycolmap.Image],
+    sightings: Sequence[GcpObservation],
+    target: np.ndarray,
+) -> int:
+    track = pycolmap.Track()
+    for sighting in sightings:
+        image = images[sighting.image]
+        image.points2D.append(pycolmap.Point2D(np.array(sighting.pixel)))
+        track.add_element(image.image_id, len(image.points2D) - 1)
+    return int(model.add_point3D(target, track, np.zeros(3, np.uint8)))

@@ -1,0 +1,129 @@
+"""What the photographs of a flight tell of each other's tags: digital zoom, default angles, pictures without tags."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import PurePosixPath
+
+import numpy as np
+from PIL import Image
+
+from vdgs.captures.image_files import same_aspect
+from vdgs.sfm.focal_length import unzoomed
+from vdgs.sfm.image_metadata import UNKNOWN_CAMERA, ImageMetadata
+
+#: Focal lengths within this share of each other are one.
+ONE_FOCAL = 0.02
+#: Views whose tilt is this near to level may be those of a drone that records no angle (degrees).
+LEVEL_DEG = 1.0
+#: Fewer photographs do not tell a default from a measurement.
+LEAST_ALIKE = 3
+#: A smaller copy has at most this share of the longer side of the photograph of its name.
+SMALLER = 0.7
+#: A mask by another name is black and white: this share of it lies within so many grey values of the two.
+BLACK_AND_WHITE, NEAR_GRAY = 0.97, 24
+#: Sides of the small picture that tells it.
+_LOOKED_AT = (128, 128)
+
+
+def cross_checked(photographs: Sequence[ImageMetadata]) -> list[ImageMetadata]:
+    """The photographs with what their tags say in the light of the others'."""
+    groups: dict[str, list[ImageMetadata]] = {}
+    for photo in photographs:
+        groups.setdefault(photo.camera, []).append(photo)
+    changed = {photo.name: photo for group in groups.values() for photo in _without_defaults(_zoom_once(group))}
+    return [changed[photo.name] for photo in photographs]
+
+
+def _zoom_once(group: list[ImageMetadata]) -> list[ImageMetadata]:
+    """Lenses whose EXIF focal length has the digital zoom in it, as the others of the camera tell, without a second."""
+    whole = {photo.lens.focal_mm for photo in group if photo.lens and photo.lens.focal_mm and photo.lens.zoom == 1}
+    found = []
+    for photo in group:
+        lens = photo.lens
+        if lens is not None and lens.zoom > 1 and lens.focal_mm:
+            already = any(_near(lens.focal_mm / lens.zoom, focal) for focal in whole)
+            if already and not any(_near(lens.focal_mm, focal) for focal in whole):
+                photo = replace(photo, lens=unzoomed(lens))
+        found.append(photo)
+    return found
+
+
+def _near(one: float, other: float) -> bool:
+    return abs(one / other - 1) < ONE_FOCAL
+
+
+def _without_defaults(group: list[ImageMetadata]) -> list[ImageMetadata]:
+    """Without attitudes that are one and the same level view in all photographs of a camera: nobody flies so."""
+    attitudes = [photo.attitude for photo in group if photo.attitude is not None]
+    if len(attitudes) < LEAST_ALIKE or abs(attitudes[0].tilt_deg - 90) > LEVEL_DEG:
+        return group
+    if any(not np.array_equal(each.camera_from_enu, attitudes[0].camera_from_enu) for each in attitudes):
+        return group
+    doubt = "all angles of the camera are the same level view in every photograph: a default; not used"
+    return [
+        replace(photo, attitude=None, doubts=(*photo.doubts, doubt)) if photo.attitude else photo for photo in group
+    ]
+
+
+def strays(photographs: Sequence[ImageMetadata]) -> tuple[dict[str, str], dict[str, ImageMetadata]]:
+    """Pictures among the photographs that are none of the flight, with the reason; and photographs whose tags were
+    lost, with the camera of the others of their size.
+
+    A picture without any tags is a stray only where most others have them.
+    """
+    reasons = _smaller_copies(photographs)
+    tagged = [photo for photo in photographs if not is_bare(photo)]
+    bare = [photo for photo in photographs if is_bare(photo) and photo.name not in reasons]
+    lent = dict[str, ImageMetadata]()
+    if len(bare) >= len(tagged):
+        return reasons, lent
+    kinds = Counter((photo.size, photo.camera, photo.lens) for photo in tagged)
+    for photo in bare:
+        alike = [(camera, lens) for size, camera, lens in kinds if size == photo.size]
+        if not alike:
+            reasons[photo.name] = (
+                f"has no tags of a camera, and {photo.width} x {photo.height} pixels, unlike the photographs: no "
+                "photograph of this flight? (Give it their tags if it is one.)"
+            )
+        elif is_black_and_white(photo):
+            reasons[photo.name] = "is black and white and has no tags of a camera: a mask? Name it like its photograph"
+        elif len(alike) == 1:
+            camera, lens = alike[0]
+            doubt = f"no tags of a camera; taken as by {camera}, as the others of its size"
+            lent[photo.name] = replace(photo, camera=camera, lens=lens, doubts=(*photo.doubts, doubt))
+    return reasons, lent
+
+
+def is_bare(photo: ImageMetadata) -> bool:
+    """Whether nothing says which camera took a picture, through what, and where."""
+    return photo.camera == UNKNOWN_CAMERA and photo.lens is None and photo.lat_lon is None
+
+
+def _smaller_copies(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
+    """Previews and thumbnails: of the name and shape of a larger photograph, in another folder."""
+    stems: dict[str, list[ImageMetadata]] = {}
+    for photo in photographs:
+        stems.setdefault(PurePosixPath(photo.name).stem.lower(), []).append(photo)
+    usual = Counter(photo.size for photo in photographs).most_common(1)[0][0] if photographs else (0, 0)
+    reasons = {}
+    for alike in stems.values():
+        largest = max(alike, key=lambda photo: photo.width * photo.height)
+        for photo in alike:
+            small = max(photo.size) <= SMALLER * max(largest.size) and photo.size != usual
+            if small and same_aspect(photo.size, largest.size):
+                reasons[photo.name] = f"is a smaller copy of {largest.name}"
+    return reasons
+
+
+def is_black_and_white(photo: ImageMetadata) -> bool:
+    """Whether a picture shows black and white alone, as masks do."""
+    try:
+        with Image.open(photo.path) as image:
+            image.draft("L", _LOOKED_AT)
+            gray = np.asarray(image.convert("L").resize(_LOOKED_AT, Image.Resampling.NEAREST)).astype(int)
+    except (OSError, SyntaxError, ValueError):
+        return False
+    return float(np.minimum(gray, 255 - gray).__le__(NEAR_GRAY).mean()) >= BLACK_AND_WHITE

@@ -1,0 +1,153 @@
+"""Where a photograph says that it was taken: EXIF's GPS block, held against the positions in XMP."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from vdgs.captures.angles import LIMITS, SIDES, degrees_of_parts, degrees_of_text, side_of
+from vdgs.sfm.xmp import first_number, text
+
+#: Places in EXIF and XMP that are farther apart than this (degrees, some 100 m) contradict each other.
+SAME_PLACE_DEG = 1e-3
+#: Altitudes beyond this (metres) are damage.
+HIGHEST_M = 20_000.0
+#: EXIF's tags: latitude and longitude, each behind its reference.
+_TAGS = {"latitude": (1, 2), "longitude": (3, 4)}
+#: XMP's names for them, the makers' (with their misspelling) before Adobe's.
+_XMP = {
+    "latitude": ("GpsLatitude", "GPSLatitude", "Latitude"),
+    "longitude": ("GpsLongitude", "GpsLongtitude", "GPSLongitude", "Longitude"),
+}  # fmt: skip
+
+Place = tuple[float, float]
+
+
+def finite(value: Any) -> float | None:
+    """A number of EXIF (a rational, mostly) as a float; None for what is none, infinite or NaN."""
+    try:
+        result = float(value)
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return None
+    return result if math.isfinite(result) else None
+
+
+def plain_text(value: Any) -> str:
+    """EXIF text without the zeros and control characters that it may be padded with."""
+    if isinstance(value, bytes):
+        value = value.decode("ascii", errors="replace")
+    kept = "".join(letter for letter in value if letter.isprintable()) if isinstance(value, str) else ""
+    return kept.strip()[:80]
+
+
+def read_place(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[Place | None, str]:
+    """Latitude and longitude in degrees, or None; and what people should know of it.
+
+    EXIF's block comes first. XMP fills what the block lacks, a place or its side of the Earth. Where the two are
+    different places neither is believed.
+    """
+    in_xmp = _place_in_xmp(xmp)
+    if gps.get(2) is None and gps.get(4) is None:
+        return in_xmp, ""
+    found = {axis: _angle(gps, axis) for axis in _TAGS}
+    unclear = [axis for axis, angle in found.items() if angle is None]
+    if unclear:
+        shown = ", ".join(f"{axis} {_shown(gps.get(_TAGS[axis][1]))}" for axis in unclear)
+        return in_xmp, "" if in_xmp else f"the position in EXIF is not understood ({shown})"
+    latitude, longitude = (angle for angle in found.values() if angle is not None)
+    if in_xmp is not None and _same((abs(latitude[0]), abs(longitude[0])), (abs(in_xmp[0]), abs(in_xmp[1]))):
+        if latitude[1] and longitude[1] and not _same((latitude[0], longitude[0]), in_xmp):
+            return None, f"EXIF and XMP name different hemispheres ({_degrees(latitude, longitude)}, {_pair(in_xmp)})"
+        return (in_xmp if not (latitude[1] and longitude[1]) else (latitude[0], longitude[0])), ""
+    if latitude[0] == longitude[0] == 0:
+        return in_xmp or (0.0, 0.0), ""
+    if not (latitude[1] and longitude[1]):
+        sides = [f"{axis} {south} or {north}" for axis, (south, north) in SIDES.items() if not found[axis][1]]  # type: ignore[index]
+        return None, (
+            f"the position in EXIF ({_degrees(latitude, longitude)}) names no hemisphere ({', '.join(sides)}): say it "
+            "in a table (--gps)"
+        )
+    place = latitude[0], longitude[0]
+    if in_xmp is not None and not _same(place, in_xmp):
+        return None, f"EXIF and XMP name different places ({_pair(place)}; {_pair(in_xmp)})"
+    return place, ""
+
+
+def read_altitude(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[float | None, str]:
+    """Altitude in metres and what it is measured from, as far as the file says."""
+    reference = gps.get(5)
+    reference = reference[0] if isinstance(reference, bytes) and len(reference) == 1 else reference
+    value = finite(gps.get(6))
+    if value is None:
+        value = first_number(xmp, "AbsoluteAltitude", "sensefly:AltitudeWGS84", "AltitudeWGS84", "exif:GPSAltitude")
+    elif str(reference).strip("\x00 ") in ("1", "3") or reference in (1, 3):
+        value = -abs(value)
+    if value is None or abs(value) > HIGHEST_M:
+        return None, ""
+    ellipsoidal = first_number(xmp, "AltitudeWGS84")
+    if ellipsoidal is not None and abs(ellipsoidal - value) < 0.01:
+        return value, "above the WGS 84 ellipsoid (AltitudeWGS84)"
+    named = text(xmp, "AltitudeType")
+    return value, f"{named} as recorded" if named else "EXIF GPSAltitude as recorded, datum not stated"
+
+
+def _angle(gps: Mapping[int, Any], axis: str) -> tuple[float, bool] | None:
+    """Degrees, and whether the block says on which side of the equator or Greenwich they are."""
+    reference, tag = _TAGS[axis]
+    value, word = gps.get(tag), plain_text(gps.get(reference))
+    written = plain_text(value) if isinstance(value, str | bytes) else ""
+    if written:
+        read = degrees_of_text(written, axis)
+        if read is None:
+            return None
+        degrees, sided = read
+    else:
+        parts = list(value) if isinstance(value, tuple | list) else [value]
+        known = degrees_of_parts([_part(part) for part in parts])
+        if known is None or any(_is_infinite(part) for part in parts):
+            return None
+        degrees, sided = known, known < 0
+    if word:
+        side = side_of(word, axis)
+        if side is None:
+            return None
+        degrees, sided = side * abs(degrees), True
+    return (degrees, sided) if abs(degrees) <= LIMITS[axis] else None
+
+
+def _part(value: Any) -> float | None:
+    return finite(value)
+
+
+def _is_infinite(value: Any) -> bool:
+    """Whether a rational has a numerator but a denominator of 0: damage, where 0/0 says nothing."""
+    numerator = getattr(value, "numerator", 0)
+    return getattr(value, "denominator", 1) == 0 and numerator not in (0, None) and not math.isnan(numerator)
+
+
+def _place_in_xmp(xmp: Mapping[str, str]) -> Place | None:
+    read = []
+    for axis, names in _XMP.items():
+        angle = degrees_of_text(text(xmp, *names), axis)
+        if angle is None or abs(angle[0]) > LIMITS[axis]:
+            return None
+        read.append(angle[0])
+    return (read[0], read[1]) if any(read) else None
+
+
+def _same(one: Place, other: Place) -> bool:
+    return all(abs(a - b) < SAME_PLACE_DEG for a, b in zip(one, other, strict=True))
+
+
+def _degrees(latitude: tuple[float, bool], longitude: tuple[float, bool]) -> str:
+    return _pair((latitude[0], longitude[0]))
+
+
+def _pair(place: Place) -> str:
+    return f"{place[0]:.5f}, {place[1]:.5f}"
+
+
+def _shown(value: Any) -> str:
+    parts = value if isinstance(value, tuple | list) else [value]
+    return " ".join(str(part)[:20] for part in parts[:4]) if value is not None else "missing"

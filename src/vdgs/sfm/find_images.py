@@ -1,0 +1,127 @@
+"""Which files of folders are photographs, by their names: what lies beside them, and what is not even looked into."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from vdgs.captures.image_files import IMAGE_SUFFIXES
+from vdgs.captures.name_resolution import to_colmap_name
+from vdgs.captures.strays import is_result, previewed_stem, walk
+from vdgs.errors import CaptureError
+
+#: Photographs that are not read, and what to do with them.
+_APPLE = {".heic", ".heif", ".hif", ".avif", ".jxl"}
+_RAW = {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw", ".raw", ".gpr", ".3fr", ".iiq"}
+#: Files beside a photograph that are no news.
+_SILENT = {".ds_store", "thumbs.db", "desktop.ini"}
+
+
+@dataclass
+class Found:
+    """The photographs of folders by their names in the capture, sorted, and what is none."""
+
+    named: dict[str, Path] = field(default_factory=dict)
+    others: int = 0
+    """Files that are no images."""
+    left_out: dict[str, str] = field(default_factory=dict)
+    """Images that are no photographs by their names, with the reason."""
+    skipped: dict[str, str] = field(default_factory=dict)
+    """Folders that are not looked into, with the reason."""
+    unread: Counter[str] = field(default_factory=Counter)
+    """Photographs of kinds that are not read, by their suffix."""
+
+    def notes(self) -> list[str]:
+        """What people should know of what is not used."""
+        notes = [f"{_count(number, suffix)} not read: {_remedy(suffix)}." for suffix, number in self.unread.items()]
+        for why in dict.fromkeys(self.skipped.values()):
+            names = [name for name, reason in self.skipped.items() if reason == why]
+            shown = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+            notes.append(f"not read: {shown} ({why}).")
+        return notes
+
+
+def is_photograph(path: Path) -> bool:
+    """Whether a file is an image by its name."""
+    return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and path.is_file()
+
+
+def find_files(folders: Sequence[Path]) -> Found:
+    """The photographs in the folders and those below them. Raises CaptureError for two of one name."""
+    found, seen = Found(), set[Path]()
+    for folder, prefix in zip(folders, _prefixes(folders), strict=True):
+        for _, files, skipped in walk(folder):
+            found.skipped |= {prefix + path.relative_to(folder).as_posix(): why for path, why in skipped.items()}
+            stems = {path.stem.lower() for path in files if is_photograph(path)}
+            for path in files:
+                if is_photograph(path):
+                    real = path.resolve()
+                    if real not in seen:  # a folder and one inside it may both be named
+                        seen.add(real)
+                        _add(found, path, prefix + path.relative_to(folder).as_posix(), stems)
+                else:
+                    _count_other(found, path, stems)
+    found.named = dict(sorted(found.named.items()))
+    return found
+
+
+def _add(found: Found, path: Path, written: str, stems: set[str]) -> None:
+    name = to_colmap_name(written)
+    preview = previewed_stem(path.stem)
+    if preview is not None and preview.lower() in stems:
+        found.left_out[name] = "is a preview, by its name"
+    elif is_result(path):
+        found.left_out[name] = "is a map or another result, by its name"
+    elif name in found.named:
+        raise CaptureError(
+            f"{path}: would be called {name} in the capture, whose names have _ for blanks, as would "
+            f"{found.named[name]}. Rename one of the two, or remove it if it is a copy."
+        )
+    else:
+        found.named[name] = path
+
+
+def _count_other(found: Found, path: Path, stems: set[str]) -> None:
+    """A file that is no image that is read. Raw files beside their JPEG are no news."""
+    suffix = path.suffix.lower()
+    if path.name.startswith("._") or path.name.lower() in _SILENT:
+        return
+    found.others += path.is_file()
+    if suffix in _APPLE | _RAW and path.stem.lower() not in stems:
+        found.unread[suffix] += 1
+
+
+def nothing_found(folders: Sequence[Path], found: Found) -> CaptureError:
+    """What to tell of folders without photographs that can be read."""
+    said = f"{', '.join(map(str, folders))}: holds no photographs ({', '.join(sorted(IMAGE_SUFFIXES))})"
+    if found.unread:
+        kinds = "; ".join(
+            f"{_count(number, suffix)} not read: {_remedy(suffix)}" for suffix, number in found.unread.items()
+        )
+        return CaptureError(f"{said}. {kinds}.")
+    left = len(found.left_out)
+    others = f", but {found.others} other files" if found.others else ""
+    others += f", and {left} images that are no photographs ({next(iter(found.left_out))}, ...)" if left else ""
+    skipped = f" Not looked into: {', '.join(list(found.skipped)[:5])}." if found.skipped else ""
+    return CaptureError(f"{said}{others}.{skipped} Raw files (.dng) must be developed first, HEIC converted to JPEG.")
+
+
+def _count(number: int, suffix: str) -> str:
+    return f"{number} {suffix} file{'s are' if number > 1 else ' is'}"
+
+
+def _remedy(suffix: str) -> str:
+    if suffix in _RAW:
+        return "develop them to JPEG or TIFF first, with their tags"
+    return "convert them to JPEG, with their tags (phones and macOS export them so)"
+
+
+def _prefixes(folders: Sequence[Path]) -> list[str]:
+    """What tells photographs of several folders apart: the folders' own names, numbered where they are alike."""
+    if len(folders) == 1:
+        return [""]
+    names = [to_colmap_name(folder.resolve().name) or "photographs" for folder in folders]
+    counts = Counter(names)
+    return [f"{name}_{k + 1}/" if counts[name] > 1 else f"{name}/" for k, name in enumerate(names)]

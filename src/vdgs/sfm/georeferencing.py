@@ -1,0 +1,310 @@
+"""Where a model lies: by surveyed points, positions, a known distance, or none of them; and what speaks against it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pycolmap
+
+from vdgs.captures.plane_fit import mirrored
+from vdgs.captures.position_fit import Up
+from vdgs.captures.reconstruction import AccuracyFacts, GcpReport
+from vdgs.config.sfm_options import SfmOptions
+from vdgs.errors import CaptureError
+from vdgs.geometry.similarity import Similarity, rotation_to_z
+from vdgs.sfm import gcp_adjustment, georegistration
+from vdgs.sfm.bending import bend_to_positions
+from vdgs.sfm.georegistration import AlignmentFailure, Georegistration
+from vdgs.sfm.reconstruction_plan import ReconstructionPlan
+from vdgs.sfm.scale_bars import known_scale
+
+WITHOUT = (
+    "give a known distance (--scale-bar), or the same command without --georeference off: the finished capture is "
+    "placed anew in seconds."
+)
+#: Metres in a foot.
+FOOT_M = 0.3048
+#: Control points and scene disagree if a fit leaves them farther off (RMS) than this share of their spread (choice).
+MOST_OFF = 0.1
+#: Up by control points and by the photographs may differ by so many degrees (choice).
+MOST_TILTED_DEG = 60.0
+#: GPS is wrong by no more than this many metres across and, geoids among it, up; no heights by more than the last.
+GPS_ACROSS_M, GPS_UP_M, HEIGHTS_M = 100.0, 150.0, 1000.0
+#: Scales that differ by so much (share) beside what they may be wrong by contradict each other (choice).
+SCALES_APART = 0.1
+#: A ratio so near to that of feet and metres is one (share).
+ABOUT = 0.12
+
+
+@dataclass(frozen=True, eq=False)
+class Georeferenced:
+    """A model where it belongs, its median point at height 0."""
+
+    model: pycolmap.Reconstruction
+    placed: Georegistration | AlignmentFailure
+    origin: tuple[float, float, float] | None
+    """Latitude and longitude in degrees, altitude in metres; None where they are not known."""
+    survey: tuple[GcpReport, ...]
+
+
+def georeference(model: pycolmap.Reconstruction, prepared: ReconstructionPlan, hold_focal: bool) -> Georeferenced:
+    """Bring a model, which may change, to metres east, north, up.
+
+    Raises CaptureError for what contradicts itself or the photographs: then nothing should be written.
+    """
+    control = prepared.gcps
+    doubtful = frozenset[str]()
+    placed: Georegistration | AlignmentFailure
+    if control is not None and control.has_control_points:
+        model, placed, doubtful = _by_control(model, prepared, hold_focal)
+    else:
+        placed = _by_positions(model, prepared)
+        if isinstance(placed, Georegistration):
+            georegistration.transform_model(model, placed.similarity)
+            model, placed = _bent(model, placed, prepared, hold_focal)
+    if isinstance(placed, AlignmentFailure):
+        return Georeferenced(model, placed, None, ())
+    survey: tuple[GcpReport, ...] = ()
+    if control is not None and placed.is_georeferenced:
+        survey = gcp_adjustment.measure_gcps(model, control, prepared.origin, doubtful)
+    ground = float(np.median(georegistration.model_points(model)[:, 2]))
+    _refuse_upside_down(model, ground, placed, prepared)
+    georegistration.transform_model(model, Similarity(1.0, np.eye(3), np.array([0.0, 0.0, -ground])))
+    latitude, longitude, altitude = prepared.origin
+    origin = (latitude, longitude, altitude + ground) if placed.is_georeferenced else None
+    return Georeferenced(model, placed, origin, survey)
+
+
+def _by_positions(model: pycolmap.Reconstruction, prepared: ReconstructionPlan) -> Georegistration | AlignmentFailure:
+    photographs, positions, options = prepared.image_list.images, prepared.gps_priors, prepared.request.options
+    scale = known_scale(model, prepared.scale_bars) if prepared.scale_bars is not None else None
+    anyway = options.georeference == "anyway"
+    if options.georeference == "off":
+        placed: Georegistration | AlignmentFailure = AlignmentFailure("asked for: --georeference off", WITHOUT)
+    else:
+        stated = prepared.request.gps is not None and options.gps_std_m != SfmOptions.gps_std_m
+        alone = georegistration.georegister(model, photographs, positions, None, anyway, stated)
+        placed = (
+            alone
+            if scale is None
+            else georegistration.georegister(model, photographs, positions, scale, anyway, stated)
+        )
+        if scale is not None and isinstance(alone, Georegistration) and not anyway:
+            _refuse_another_scale(scale, alone, prepared)
+    if scale is None or prepared.scale_bars is None:
+        return placed
+    if isinstance(placed, Georegistration):
+        return replace(placed, method=f"{placed.method}; scale by a known distance ({prepared.scale_bars.source})")
+    return _by_distance(model, scale, placed, prepared)
+
+
+def _by_distance(
+    model: pycolmap.Reconstruction, scale: tuple[float, float], why: AlignmentFailure, prepared: ReconstructionPlan
+) -> Georegistration:
+    """Metres and up alone."""
+    assert prepared.scale_bars is not None
+    up, notes = georegistration.up_of(model, prepared.image_list.images)
+    factor, share = scale
+    rotation = rotation_to_z(up.direction)
+    centers = np.array([image.projection_center() for image in model.images.values() if image.has_pose])
+    middle = np.append(np.median(centers @ rotation.T, axis=0)[:2], 0.0)
+    edge = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+    accuracy = AccuracyFacts(
+        place_m=None, scale_percent=200 * share, scale_m=2 * share * factor * edge, north_deg=None,
+        level_deg=2 * up.deviation_deg, positions_m=None, altitude="unused",
+    )  # fmt: skip
+    how = f"a known distance ({prepared.scale_bars.source}): metres, up by {up.how}; no place on Earth ({why.reason})"
+    none = np.zeros((0, 3))
+    return Georegistration(
+        similarity=Similarity(factor, rotation, -factor * middle),
+        method=how,
+        position_rows=np.zeros(0, int),
+        residuals=none,
+        inliers=np.zeros(0, bool),
+        accuracy=accuracy,
+        notes=tuple(notes),
+        is_georeferenced=False,
+    )
+
+
+def _refuse_another_scale(scale: tuple[float, float], alone: Georegistration, prepared: ReconstructionPlan) -> None:
+    assert prepared.scale_bars is not None
+    assert alone.accuracy is not None
+    ratio = scale[0] / alone.similarity.scale
+    known = (alone.accuracy.scale_percent or 0.0) / 100 + 3 * scale[1]
+    if abs(math.log(ratio)) > SCALES_APART + known:
+        raise CaptureError(
+            f"{prepared.scale_bars.source}: its distances make the scene {ratio:.3g} times as large as the positions "
+            f"({prepared.gps_priors.source}) do, which are good to ±{alone.accuracy.scale_percent:.2g} %."
+            f"{_in_feet(ratio)} Mend it, or leave the positions out: --georeference off"
+        )
+
+
+def _in_feet(ratio: float) -> str:
+    for feet in (FOOT_M, 1 / FOOT_M):
+        if abs(ratio / feet - 1) < ABOUT:
+            return " Are they in feet, where metres are expected?"
+    return ""
+
+
+def _bent(
+    model: pycolmap.Reconstruction, placed: Georegistration, prepared: ReconstructionPlan, hold_focal: bool
+) -> tuple[pycolmap.Reconstruction, Georegistration]:
+    """The model bent by positions that are good for that, and how far they are from it then."""
+    photographs, positions = prepared.image_list.images, prepared.gps_priors
+    bent = bend_to_positions(model, photographs, positions, placed, hold_focal, prepared.threads)
+    if bent is model:
+        return model, placed
+    lies = georegistration.registration_in_place(bent, photographs, positions, placed.method)
+    return bent, replace(placed, residuals=lies.residuals)
+
+
+def _by_control(
+    model: pycolmap.Reconstruction, prepared: ReconstructionPlan, hold_focal: bool
+) -> tuple[pycolmap.Reconstruction, Georegistration, frozenset[str]]:
+    photographs, control = prepared.image_list.images, prepared.gcps
+    assert control is not None
+    anyway = prepared.request.options.georeference == "anyway"
+    doubts = None if anyway else Doubts.of(model, prepared)
+    found = gcp_adjustment.adjust_to_gcps(model, control, prepared.origin, hold_focal, prepared.threads, doubts)
+    notes = found.notes
+    if prepared.scale_bars is not None:
+        factor, _ = known_scale(found.model, prepared.scale_bars)
+        notes += (f"the distances of {prepared.scale_bars.source} are {1 / factor:.2%} of what they should be.",)
+    placed = georegistration.registration_in_place(
+        found.model, photographs, prepared.gps_priors, found.how, found.accuracy, notes
+    )
+    return found.model, placed, found.doubtful
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Doubts:
+    """What photographs and positions say against a similarity to control points."""
+
+    up: Up
+    centers: np.ndarray
+    """Of the cameras, in the model's world."""
+    ground: np.ndarray
+    """Points of the model."""
+    by_gps: Georegistration | None
+    gps: str
+    recorded_height_m: float | None
+    altitude: float
+    """Of the origin that metres up count from."""
+
+    @classmethod
+    def of(cls, model: pycolmap.Reconstruction, prepared: ReconstructionPlan) -> Doubts:
+        photographs, positions = prepared.image_list.images, prepared.gps_priors
+        try:
+            by_gps = georegistration.georegister(model, photographs, positions)
+        except CaptureError:  # positions that are mirrored say nothing of control points
+            by_gps = AlignmentFailure("", "")
+        centers = np.array([image.projection_center() for image in model.images.values() if image.has_pose])
+        return cls(
+            up=georegistration.up_of(model, photographs)[0],
+            centers=centers,
+            ground=georegistration.model_points(model),
+            by_gps=by_gps if isinstance(by_gps, Georegistration) else None,
+            gps=positions.source,
+            recorded_height_m=prepared.preflight.height_m,
+            altitude=prepared.origin[2],
+        )
+
+    def __call__(self, similarity: Similarity, places: np.ndarray, targets: np.ndarray) -> str:
+        """What speaks against a similarity from places [n, 3] to surveyed ones, in words; empty where nothing does."""
+        return (
+            self._of_hands(similarity, places, targets)
+            or self._of_fit(similarity, places, targets)
+            or self._of_gps(similarity, targets)
+            or self._of_height(similarity)
+        )
+
+    def _of_hands(self, similarity: Similarity, places: np.ndarray, targets: np.ndarray) -> str:
+        up = similarity.rotation @ self.up.direction
+        tilted = float(np.degrees(np.arccos(np.clip(up[2], -1, 1))))
+        others = {"x": targets[:, [1, 0, 2]]} if self.up.sure else {}
+        exchanged = mirrored(places, targets, self.up.direction, others)
+        if exchanged or (self.up.sure and tilted > MOST_TILTED_DEG):
+            return (
+                f"placed by it the world would be turned by {tilted:.0f}° from what the photographs say of up"
+                f"{', its own mirror image' if exchanged or tilted > 90 else ''}. Are x (east) and y (north) exchanged?"
+            )
+        return ""
+
+    def _of_fit(self, similarity: Similarity, places: np.ndarray, targets: np.ndarray) -> str:
+        off = float(np.sqrt(((similarity.apply(places) - targets) ** 2).sum(axis=1).mean()))
+        spread = float(np.sqrt(np.var(targets, axis=0).sum()))
+        if off <= MOST_OFF * spread:
+            return ""
+        return (
+            f"its points and where the photographs show them disagree by {off:.3g} m over {spread:.3g} m. Are names, "
+            "marks and the system right, and x, y and z in the same unit?"
+        )
+
+    def _of_gps(self, similarity: Similarity, targets: np.ndarray) -> str:
+        if self.by_gps is None or self.by_gps.accuracy is None or self.by_gps.accuracy.place_m is None:
+            return ""
+        accuracy, gps = self.by_gps.accuracy, self.by_gps.similarity
+        error_across, error_up = self.by_gps.accuracy.place_m
+        ratio = similarity.scale / gps.scale
+        if abs(math.log(ratio)) > SCALES_APART + (accuracy.scale_percent or 0.0) / 100:
+            return (
+                f"its points make the scene {ratio:.3g} times as large as GPS ({self.gps}) does, which is good to "
+                f"±{accuracy.scale_percent:.2g} %.{_in_feet(ratio)}"
+            )
+        off = np.median(similarity.apply(self.centers) - gps.apply(self.centers), axis=0)
+        across = float(np.hypot(off[0], off[1]))
+        if across > GPS_ACROSS_M + error_across:
+            return (
+                f"its points lie {_distance(across)} from where GPS ({self.gps}) has them, which is good to "
+                f"±{error_across:.2g} m. Is it the right system and zone, x (east) before y (north)?"
+            )
+        height = float(np.median(targets[:, 2]))
+        level = float(np.median(targets[:, 2]) - off[2])
+        if abs(off[2]) > GPS_UP_M + error_up:
+            feet = abs(self._altitude_off_in_feet(height, level)) < 0.5 * abs(off[2])
+            if feet or abs(off[2]) > HEIGHTS_M:
+                return (
+                    f"its heights are {_distance(abs(float(off[2])))} {'over' if off[2] > 0 else 'under'} those of GPS "
+                    f"({self.gps}).{' Are they in feet, where metres are expected?' if feet else ' Are they metres?'}"
+                )
+        return ""
+
+    def _altitude_off_in_feet(self, height: float, level: float) -> float:
+        """How far heights would be from those of GPS if they were in feet; heights here count from the origin."""
+        return FOOT_M * (height + self.altitude) - (level + self.altitude)
+
+    def _of_height(self, similarity: Similarity) -> str:
+        if self.by_gps is not None or not self.recorded_height_m:
+            return ""
+        height = float(np.median(similarity.apply(self.centers)[:, 2]) - np.median(similarity.apply(self.ground)[:, 2]))
+        ratio = height / self.recorded_height_m
+        if _in_feet(ratio):
+            return (
+                f"placed by it the cameras are {height:.0f} m over the ground, the drone recorded "
+                f"{self.recorded_height_m:.0f} m over its take-off.{_in_feet(ratio)}"
+            )
+        return ""
+
+
+def _distance(meters: float) -> str:
+    return f"{meters / 1000:.3g} km" if meters >= 1000 else f"{meters:.3g} m"
+
+
+def _refuse_upside_down(
+    model: pycolmap.Reconstruction, ground: float, placed: Georegistration, prepared: ReconstructionPlan
+) -> None:
+    """Raise CaptureError for a placed world whose cameras look at the sky from under the ground, though none did."""
+    if prepared.request.options.georeference == "anyway":
+        return
+    images = [image for image in model.images.values() if image.has_pose]
+    height = float(np.median([image.projection_center()[2] for image in images])) - ground
+    up, _ = georegistration.up_of(model, prepared.image_list.images)
+    if up.sure and up.direction[2] < 0:
+        raise CaptureError(
+            f"placed by {placed.method}, the cameras would be {abs(height):.3g} m {'under' if height < 0 else 'over'} the "
+            f"ground and look up, against what the photographs show. Are east and north (x and y, latitude and "
+            f"longitude) exchanged, or is a hemisphere missing? {georegistration.ANYWAY}"
+        )

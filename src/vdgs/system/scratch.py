@@ -1,0 +1,82 @@
+"""Folders and files that stand beside an output while it is written, and what killed processes leave of them.
+
+A scratch folder holds a locked file as long as its process lives, on whichever machine. Temporary files carry the
+number of their process (`write_atomically`).
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import psutil
+
+#: How the names of scratch folders end, and their file that is locked.
+ENDING, LOCK = ".scratch", ".lock"
+#: Temporary files of `write_atomically` and of films.
+_TEMPORARY = re.compile(r"(?:^|\.)([0-9]+)\.(?:tmp|partial\.mp4)$")
+#: A scratch folder without its file may just be made, for so many seconds.
+_YOUNG_SECONDS = 60.0
+
+
+@contextmanager
+def scratch_folder(path: Path) -> Iterator[Path]:
+    """A folder beside `path` for what waits while it is written; it goes when the context ends."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    folder = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.", suffix=ENDING))
+    try:
+        with (folder / LOCK).open("a+b") as handle:
+            with suppress(OSError):  # a file system without locks: what is left there stays
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def leftovers(path: Path) -> list[Path]:
+    """Scratch folders and temporary files of `path` whose processes are gone."""
+    try:
+        entries = sorted(path.parent.iterdir())
+    except OSError:
+        return []
+    start = f".{path.name}."
+    return [each for each in entries if each.name.startswith(start) and _is_left(each, each.name[len(start) :])]
+
+
+def _is_left(entry: Path, rest: str) -> bool:
+    if rest.endswith(ENDING) and entry.is_dir() and not entry.is_symlink():
+        return not _is_held(entry)
+    found = _TEMPORARY.search(rest)
+    return found is not None and entry.is_file() and not psutil.pid_exists(int(found[1]))
+
+
+def _is_held(folder: Path) -> bool:
+    try:
+        with (folder / LOCK).open("rb") as handle:
+            fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except FileNotFoundError:
+        with suppress(OSError):
+            return time.time() - folder.stat().st_mtime < _YOUNG_SECONDS
+        return True
+    except OSError:  # held, or where no files can be locked
+        return True
+    return False
+
+
+def remove_leftovers(path: Path) -> list[Path]:
+    """Remove what killed processes left of `path`; returns what was there. Nothing else is touched."""
+    found = leftovers(path)
+    for each in found:
+        if each.is_dir():
+            shutil.rmtree(each, ignore_errors=True)
+        else:
+            with suppress(OSError):
+                os.unlink(each)
+    return found

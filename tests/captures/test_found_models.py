@@ -1,0 +1,266 @@
+"""What lies in a folder is used: photographs that are left, models below it, points beside a model, any colours."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from support.captures import TinyScene, tiny_scene, write_colmap, write_images, write_ply
+from support.dataset_layouts import DRB, OPENGL, halves, write_matrixcity, write_mega_nerf
+from vdgs.captures.formats.ply_reader import GRAY, read_point_cloud
+from vdgs.captures.loading import load_capture
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.errors import CaptureError
+from vdgs.sfm.image_list import collect_images, is_image_folder
+
+
+@pytest.fixture(scope="module")
+def scene() -> TinyScene:
+    return tiny_scene()
+
+
+def write_transforms(root: Path, scene: TinyScene, **changes) -> None:
+    first = next(iter(scene.cameras.values()))
+    frames = [
+        {"file_path": f"images/{name}", "transform_matrix": (np.linalg.inv(each.camera_from_world) @ OPENGL).tolist()}
+        for name, each in scene.cameras.items()
+    ]
+    content = {"fl_x": first.fx, "cx": first.cx, "cy": first.cy, "w": first.width, "h": first.height, "frames": frames}
+    root.mkdir(parents=True, exist_ok=True)
+    (root / "transforms.json").write_text(json.dumps(content | changes))
+    write_images(root / "images", scene)
+    write_ply(root / "sparse_pc.ply", scene.points, scene.colors)
+
+
+# ------------------------------------------------------------------------------- photographs that are gone
+
+
+def write_kind(kind: str, root: Path, scene: TinyScene) -> tuple[Path, list[Path]]:
+    """A capture of twelve photographs, and their files."""
+    if kind == "colmap":
+        write_colmap(root, scene)
+    elif kind == "transforms":
+        write_transforms(root, scene)
+    elif kind == "mega-nerf":
+        write_mega_nerf(root, scene)
+        write_ply(root / "points3D.ply", scene.points @ DRB.T, scene.colors)
+    else:
+        root = root / "aerial/pose/block_A"
+        write_matrixcity(root, *halves(scene))
+        return root, sorted((root.parent.parent).rglob("*.png"))
+    return root, sorted(root.rglob("*.png"))
+
+
+@pytest.mark.parametrize("kind", ["colmap", "transforms", "mega-nerf", "matrixcity"])
+def test_a_capture_is_used_without_the_photographs_that_are_gone(tmp_path, scene, kind):
+    root, images = write_kind(kind, tmp_path, scene)
+    assert len(images) == 12
+    for image in images[1:4]:
+        image.unlink()
+    capture = load_capture(root)
+    assert len(capture.views) == 9
+    (said,) = [warning for warning in capture.warnings if "are missing; the others are used" in warning]
+    assert said.startswith("3 of 12 images that have a camera are missing")
+    assert all(image.stem in said for image in images[1:4])
+    for image in images[4:8]:
+        image.unlink()
+    with pytest.raises(CaptureError, match=r"7 of 12 images that have a camera are missing") as refused:
+        load_capture(root)
+    assert all(image.stem in str(refused.value) for image in images[1:8])
+
+
+# --------------------------------------------------------------------------------------------- models below
+
+PLACES = [
+    ("dense/0", "images", "sparse"), ("dense/0", "images", "sparse/0"), ("undistorted", "images", "sparse"),
+    ("a/b/c", "images", "sparse/0"), ("project", "images", "colmap/sparse/0"), ("out/capture", "images_2", "sparse/0"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("below", "images", "sparse"), PLACES)
+def test_captures_below_are_named_before_poses_are_made_anew(tmp_path, scene, below, images, sparse):
+    write_colmap(tmp_path / below, scene, images=images, sparse=sparse)
+    write_images(tmp_path / "input", scene)
+    assert is_image_folder(tmp_path)
+    said = re.escape(f"{below} is a capture: vdgs run {tmp_path / below}")
+    for refuses in (lambda: collect_images([tmp_path]), lambda: load_capture(tmp_path)):
+        with pytest.raises(CaptureError, match=said):
+            refuses()
+    assert len(load_capture(tmp_path / below).views) == 12  # as the message says
+    assert is_image_folder(tmp_path / "input")
+
+
+def test_a_capture_of_nerfstudio_below_is_named(tmp_path, scene):
+    write_transforms(tmp_path / "processed", scene)
+    with pytest.raises(CaptureError, match=r"processed is a capture: vdgs run"):
+        collect_images([tmp_path])
+
+
+@pytest.mark.parametrize("sparse", ["distorted/sparse/0", "distorted/sparse", "work/0", "model"])
+def test_a_model_apart_from_its_photographs_is_named_with_what_joins_them(tmp_path, scene, sparse):
+    write_images(tmp_path / "input", scene)
+    write_colmap(tmp_path, scene, images=None, sparse=sparse)
+    with pytest.raises(CaptureError, match=r"is a COLMAP model of 12 photographs") as refused:
+        collect_images([tmp_path])
+    link = re.search(r"ln -s (\S+) (\S+); vdgs run (\S+) --output RUN", str(refused.value))
+    assert link is not None
+    Path(link[2]).symlink_to(link[1])
+    assert len(load_capture(Path(link[3])).views) == 12
+
+
+@pytest.mark.parametrize("name", ["opensfm/reconstruction.json", "cameras.xml", "odm_report/shots.geojson"])
+def test_poses_of_formats_that_are_not_read_are_said(tmp_path, name):
+    large = tiny_scene(width=160, height=120)
+    write_images(tmp_path, large)
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text("[]")
+    assert not any("Poses are made anew" in note for note in collect_images([tmp_path]).notes)
+    (tmp_path / name).write_text('[{"shots": {"a": {"rotation": [0, 0, 0]}}}]')
+    assert any(name in note and "Poses are made anew" in note for note in collect_images([tmp_path]).notes)
+
+
+# --------------------------------------------------------------------------------------- points and sizes
+
+
+@pytest.mark.parametrize("cloud", ["sparse/0/points3D.ply", "sparse/0/cloud.ply", "sparse/points.ply", "my_points.ply"])
+@pytest.mark.parametrize("text", [True, False])
+def test_points_come_from_a_cloud_beside_the_model(tmp_path, scene, cloud, text):
+    folder = write_colmap(tmp_path, scene, text=text)
+    (points,) = folder.glob("points3D.*")
+    points.unlink()
+    with pytest.raises(CaptureError, match=r"no 3D points.*points3D\.ply"):
+        load_capture(tmp_path)
+    write_ply(tmp_path / cloud, scene.points, scene.colors)
+    capture = load_capture(tmp_path)
+    assert len(capture.points) == len(scene.points)
+    assert np.array_equal(capture.point_colors, scene.colors)
+    assert any(cloud in warning for warning in capture.warnings)
+
+
+def test_numbers_that_are_whole_may_be_written_with_a_point(tmp_path, scene):
+    folder = write_colmap(tmp_path / "colmap", scene, text=True)
+    cameras = (folder / "cameras.txt").read_text()
+    (folder / "cameras.txt").write_text(re.sub(r"PINHOLE (\d+) (\d+) ", r"PINHOLE \1.0 \2.000 ", cameras))
+    assert load_capture(tmp_path / "colmap").views[0].camera.width == 64
+    (folder / "cameras.txt").write_text(re.sub(r"PINHOLE (\d+) ", r"PINHOLE \1.5 ", cameras))
+    with pytest.raises(CaptureError, match="CAMERA_ID MODEL WIDTH HEIGHT"):
+        load_capture(tmp_path / "colmap")
+    write_transforms(tmp_path / "nerf", scene, w=64.0, h="48", fl_x="57.6")
+    assert load_capture(tmp_path / "nerf").views[0].camera.height == 48
+
+
+# ---------------------------------------------------------------------------------------------- colours
+
+COLORS = np.random.default_rng(5).integers(0, 256, (50, 3))
+
+
+def cloud(file: Path, names: tuple[str, ...], kind: str, values: np.ndarray, text: bool) -> Path:
+    codes = {"uchar": "B", "ushort": "H", "int": "i", "float": "f", "double": "d"}
+    header = f"ply\nformat {'ascii' if text else 'binary_little_endian'} 1.0\nelement vertex {len(values)}\n"
+    header += "".join(f"property float {axis}\n" for axis in "xyz")
+    header += "".join(f"property {kind} {name}\n" for name in names) + "end_header\n"
+    cast = float if kind in ("float", "double") else int
+    if text:
+        body = "".join(f"1 2 3 {' '.join(str(cast(v)) for v in row)}\n" for row in values).encode()
+    else:
+        body = b"".join(struct.pack(f"<3f{len(row)}{codes[kind]}", 1, 2, 3, *map(cast, row)) for row in values)
+    file.write_bytes(header.encode() + body)
+    return file
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"),
+        ("Red", "Green", "Blue"), ("alpha", "R", "G", "B"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize(
+    ("kind", "factor"),
+    [
+        ("uchar", 1), ("ushort", 257), ("ushort", 1), ("int", 257), ("int", 1), ("float", 1 / 255), ("float", 1),
+        ("double", 257),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("text", [True, False])
+def test_colors_of_clouds_are_read_by_every_name_and_scale(tmp_path, names, kind, factor, text):
+    values = COLORS * factor
+    if len(names) == 4:
+        values = np.c_[values[:, :1], values]
+    found = read_point_cloud(cloud(tmp_path / "a.ply", names, kind, values, text))[1]
+    assert np.abs(found.astype(int) - COLORS).max() <= 1
+
+
+def test_colors_of_splats_and_none_at_all(tmp_path):
+    coefficients = (COLORS / 255 - 0.5) / 0.28209479177387814
+    file = cloud(tmp_path / "a.ply", ("f_dc_0", "f_dc_1", "f_dc_2"), "float", coefficients, False)
+    assert np.abs(read_point_cloud(file)[1].astype(int) - COLORS).max() <= 1
+    gray = cloud(tmp_path / "b.ply", ("u", "v"), "float", COLORS[:, :2], False)
+    assert (read_point_cloud(gray)[1] == GRAY).all()
+
+
+def test_points_without_colors_are_remarked(tmp_path, scene):
+    write_transforms(tmp_path, scene)
+    assert load_capture(tmp_path).warnings == ()
+    cloud(tmp_path / "sparse_pc.ply", ("u",), "float", COLORS[:, :1], True)
+    text = (tmp_path / "sparse_pc.ply").read_text()
+    for k in range(len(COLORS)):
+        text = text.replace("\n1 2 3 ", f"\n{k % 7} {k % 5} {k / 100} ", 1)
+    (tmp_path / "sparse_pc.ply").write_text(text)
+    assert any("bring no colours" in warning for warning in load_capture(tmp_path).warnings)
+
+
+# ------------------------------------------------------------------------------------------------- units
+
+
+@pytest.mark.parametrize("place", ["lego", "blocks/lego", "small_city/lego", "matrix/lego", "pose/lego", "block_1"])
+def test_units_are_never_told_by_where_a_set_lies(tmp_path, scene, place):
+    root = tmp_path / place
+    root.mkdir(parents=True)
+    for part, half in zip(("train", "test"), halves(scene), strict=True):
+        write_images(root / part, half)
+        frames = [
+            {"file_path": f"./{part}/{name.removesuffix('.png')}",
+             "transform_matrix": (np.linalg.inv(each.camera_from_world) @ OPENGL).tolist()}
+            for name, each in half.cameras.items()
+        ]  # fmt: skip
+        (root / f"transforms_{part}.json").write_text(json.dumps({"camera_angle_x": 1.0, "frames": frames}))
+    write_ply(root / "points3D.ply", scene.points, scene.colors)
+    ground = load_capture(root).ground
+    assert not ground.metric
+    assert ground.scale == pytest.approx(1, abs=0.1)  # the median camera height is 10 units
+
+
+# ------------------------------------------------------------------------------------------------- masks
+
+
+@pytest.mark.parametrize(
+    "named", ["masks/{}.png", "mask/{}.png", "_masks/{}_mask.png", "images/{}_mask.png", "images/{}.png.png"]
+)
+def test_masks_of_a_capture_have_any_usual_name(tmp_path, scene, named):
+    write_colmap(tmp_path, scene)
+    for name, camera in scene.cameras.items():
+        keep = np.ones((camera.height, camera.width), np.uint8)
+        keep[:10] = 0
+        file = tmp_path / named.format(name.removesuffix(".png"))
+        file.parent.mkdir(exist_ok=True)
+        assert cv2.imwrite(str(file), keep)
+    capture = load_capture(tmp_path)
+    assert all(view.mask_path is not None for view in capture.views)
+    assert not any("no camera" in warning for warning in capture.warnings)
+
+
+def test_thumbnails_of_a_system_are_no_images_of_a_capture(tmp_path, scene):
+    write_colmap(tmp_path, scene)
+    shutil.copytree(tmp_path / "images", tmp_path / "images/@eaDir")
+    shutil.copytree(tmp_path / "images/@eaDir", tmp_path / "images/.thumbs")
+    capture = load_capture(tmp_path, CaptureOptions())
+    assert len(capture.views) == 12
+    assert not any("no camera" in warning for warning in capture.warnings)

@@ -1,0 +1,162 @@
+"""Tables of positions as other programs write them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from support.flights import write_photograph
+from vdgs.captures.gps_tables import read_gps_table
+from vdgs.errors import CaptureError
+from vdgs.sfm.gps_priors import read_gps_priors
+from vdgs.sfm.image_metadata import read_image_metadata
+
+NOISE = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
+PLACE = (-33.5, -70.6, 500.0)
+EASTING, NORTHING = 351375.7913, 6292135.2282  # of zone 19 south
+
+TABLES = {
+    "upper case": "Name,Lat,Lon,Alt\na.jpg,-33.5,-70.6,500\n",
+    "blanks": "name, lat, lon, alt\na.jpg, -33.5, -70.6, 500\n",
+    "semicolons": "name;lat;lon;alt\na.jpg;-33.5;-70.6;500\n",
+    "decimal commas": "name;lat;lon;alt\na.jpg;-33,5;-70,6;500,0\n",
+    "tabs": "name\tlatitude\tlongitude\taltitude\na.jpg\t-33.5\t-70.6\t500\n",
+    "columns of blanks": "name   lat     lon   alt\na.jpg  -33.5  -70.6  500\n",
+    "another order": "alt,lon,lat,File Name\n500,-70.6,-33.5,a.jpg\n",
+    "odm": "EPSG:4326\na.jpg -70.6 -33.5 500\n",
+    "odm, words": "WGS84\na.jpg -70.6 -33.5 500 10 20 30 0.5 1\n",
+    "odm, proj": "+proj=longlat +datum=WGS84\na.jpg\t-70.6\t-33.5\t500\n",
+    "odm, utm": f"WGS84 UTM 19S\na.jpg {EASTING} {NORTHING} 500\n",
+    "utm with names": f"EPSG:32719\nLabel,Easting,Northing,Elevation\na.jpg,{EASTING},{NORTHING},500\n",
+    "utm in a column": f"image,epsg,x,y,z\na.jpg,32719,{EASTING},{NORTHING},500\n",
+    "exiftool": 'SourceFile,GPSLatitude,GPSLongitude,GPSAltitude\n./a.jpg,-33.5,-70.6,500\n',
+    "exiftool, words": "SourceFile,GPSLatitude,GPSLongitude,GPSAltitude\n"
+    "./a.jpg,\"33 deg 30' 0.00\"\" S\",\"70 deg 36' 0.00\"\" W\",500 m Above Sea Level\n",
+    "references": "file,latitude,GPSLatitudeRef,longitude,GPSLongitudeRef,altitude\na.jpg,33.5,South,70.6,W,500\n",
+    "metashape": "# Cameras (1)\n#Label,X/Longitude,Y/Latitude,Z/Altitude,Error_(m)\na.jpg,-70.6,-33.5,500,\n# end\n",
+    "metashape, system": '# CoordinateSystem: GEOGCS["WGS 84",AUTHORITY["EPSG","4326"]]\n'
+    "#Label,X/Longitude,Y/Latitude,Z/Altitude\na,-70.6,-33.5,500\n",
+    "pix4d": "imagename,latitude [decimal degrees],longitude [decimal degrees],altitude [meter],accuracy horizontal "
+    "[meter],accuracy vertical [meter]\na.jpg,-33.5,-70.6,500,5,10\n",
+    "pix4d without names": "a.jpg,-33.5,-70.6,500,5,10\n",
+    "longitude first": "a.jpg,-120.6,-33.5,500\n",
+    "quotes": '"name","lat","lon","alt"\n"a.jpg","-33.5","-70.6","500"\n',
+    "windows": "name,lat,lon,alt\r\n\r\na.jpg,-33.5,-70.6,500\r\n",
+    "comments": "# by hand\nname,lat,lon,alt\n# the first\na.jpg,-33.5,-70.6,500\n",
+    "dji moments": "1\t280234.1\t[2145]\t  12,N\t 34,E\t -20,V\t-33.5,Lat\t-70.6,Lon\t500,Ellh\t"
+    "0.01, 0.02, 0.03\t50,Q\n",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("text", TABLES.values(), ids=TABLES)
+def test_tables_are_read_as_programs_write_them(tmp_path, text):
+    if "UTM" in text or "EPSG" in text or "epsg" in text or "+proj" in text:
+        pytest.importorskip("pyproj")
+    file = tmp_path / "table.txt"
+    for encoding in ("utf-8", "utf-8-sig", "utf-16"):
+        file.write_bytes(text.encode(encoding))
+        (row,) = read_gps_table(file).rows
+        expected = (PLACE[0], -120.6, 500.0) if "-120.6" in text else PLACE
+        assert row.position == pytest.approx(expected, abs=2e-6)
+        assert row.name.endswith(("a.jpg", "a", "1"))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "is empty"),
+        ("name,lat,lon,alt\n", "holds no rows"),
+        ("a,b,c\n1,x,3\n", r"names the columns name,lat,lon,alt \(found: a, b, c\)"),
+        ("name,x,y,z\na.jpg,351400,6292300,5\n", "'x' and 'y' but does not say of which coordinate system"),
+        ("a.jpg,351400,6292300,5\n", "names neither its columns nor the coordinate system"),
+        ("name,lat,lon,alt\na.jpg,1,2,high\n", "line 2: the altitude 'high' is not a number"),
+        ("name,lat,lon,alt\na.jpg,one,2,3\n", "line 2: .* are not numbers"),
+        ("name,lat,lon,alt\na.jpg,-70.6,233.5,1e9\n", "line 2: .* no place on Earth"),
+        ("name,lat,lon,alt\na.jpg,-97.6,33.5,10\n", "line 2: .* no place on Earth"),
+        ("EPSG:32719\na.jpg 1e12 1e12 5\n", "line 2: .* is no place in"),
+        ("\0\1\2\3\0\0\0\0", "is not a CSV table"),
+    ],
+)
+def test_tables_that_are_none_are_refused_with_the_line(tmp_path, text, said):
+    file = tmp_path / "table.csv"
+    file.write_text(text)
+    with pytest.raises(CaptureError, match=said):
+        read_gps_table(file)
+
+
+NAMES = [f"{k}.jpg" for k in range(4)]
+
+
+def photographs(folder, names):
+    for k, name in enumerate(names):
+        pixels = np.roll(NOISE, k, axis=0)
+        write_photograph(folder / name, pixels, k, None, xmp=f'drone-dji:RelativeAltitude="+{40 + k}.0"')
+    return [read_image_metadata(folder / name, name) for name in names]
+
+
+def test_altitudes_that_a_table_lacks_are_those_of_the_photographs(tmp_path):
+    seen = photographs(tmp_path, [f"{k}.jpg" for k in range(4)])
+    file = tmp_path / "gps.csv"
+    file.write_text("name,lat,lon,alt\n" + "".join(f"{k}.jpg,-33.5{k},-70.6,\n" for k in range(4)))
+    assert all(math.isnan(row.position[2]) for row in read_gps_table(file).rows)
+    found = read_gps_priors(seen, file, (1.0, 2.0))
+    assert len(found) == 4
+    assert np.ptp(found.enu[:, 2]) == pytest.approx(3, abs=0.6)
+    assert any("gives no altitude for 0.jpg" in note for note in found.notes)
+
+
+def test_rows_of_photographs_that_are_gone_are_left_out_and_said(tmp_path):
+    seen = photographs(tmp_path, [f"{k}.jpg" for k in range(4)])
+    file = tmp_path / "gps.csv"
+    rows = [f"{k}.jpg,-33.5{k},-70.6,500,0.5,1.5\n" for k in range(7)]
+    file.write_text("name,lat,lon,alt,accuracy_horizontal,accuracy_vertical\n" + "".join(rows) + "9.jpg,,,\n")
+    found = read_gps_priors(seen, file, (1.0, 2.0))
+    assert found.gps_std[0] == pytest.approx([0.5, 0.5, 1.5])
+    assert any("3 rows are of photographs that are not there; left out (4.jpg, 5.jpg, 6.jpg)" in n for n in found.notes)
+    assert any("1 of 8 rows have no position" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("row", "said"),
+    [
+        ("{1},{0}", "exchanged"),
+        ("{2},{1}", "south is north"),
+        ("{0},{3}", "west is east"),
+        ("{2},{3}", "south and west"),
+    ],
+)
+def test_a_table_that_contradicts_the_photographs_is_refused_with_what_is_exchanged(tmp_path, row, said):
+    file = tmp_path / "gps.csv"
+    seen = [replace(photo, place=(-33.5 - k / 1000, -70.6)) for k, photo in enumerate(photographs(tmp_path, NAMES))]
+    for written, refused in (("{0},{1}", False), (row, True)):
+        lines = [written.format(-33.5 - k / 1000, -70.6, 33.5 + k / 1000, 70.6) for k in range(4)]
+        file.write_text("name,lat,lon,alt\n" + "".join(f"{k}.jpg,{line},500\n" for k, line in enumerate(lines)))
+        if refused:
+            with pytest.raises(CaptureError, match=said):
+                read_gps_priors(seen, file, (1.0, 2.0))
+        else:
+            assert len(read_gps_priors(seen, file, (1.0, 2.0))) == 4
+
+
+@pytest.mark.parametrize("altitude", [0.0, None])
+def test_altitudes_that_are_all_zero_are_a_default(tmp_path, altitude):
+    seen = photographs(tmp_path, NAMES)
+    seen = [replace(photo, place=(-33.5 - k / 1000, -70.6), altitude=altitude) for k, photo in enumerate(seen)]
+    found = read_gps_priors(seen, None, (1.0, 2.0))
+    assert np.ptp(found.enu[:, 2]) == pytest.approx(3, abs=0.1)
+    assert found.altitude_reference == "above the take-off, by XMP"
+    assert any("exactly 0" in note for note in found.notes)
+
+
+def test_moments_of_a_drone_are_matched_by_number(tmp_path):
+    seen = photographs(tmp_path, [f"DJI_2026_{k:04d}_V.jpg" for k in range(1, 5)])
+    file = tmp_path / "flight.MRK"
+    line = "{}\t280234.1\t[2145]\t  12,N\t 34,E\t -20,V\t-33.5{},Lat\t-70.6,Lon\t500,Ellh\t0.01, 0.02, 0.03\t50,Q\n"
+    file.write_text("".join(line.format(k, k) for k in range(1, 5)))
+    found = read_gps_priors(seen, file, (1.0, 2.0))
+    assert found.image_indices.tolist() == [0, 1, 2, 3]
+    assert np.all(np.diff(found.enu[:, 1]) < -100)
+    assert found.gps_std[0] == pytest.approx([0.02, 0.02, 0.03])

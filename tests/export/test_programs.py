@@ -1,0 +1,322 @@
+"""Files for single programs: how their axes stand, compressed PLYs, versions of SPZ, what killed exports leave."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from support.gaussians import overhead, picture, psnr, random_gaussians
+from vdgs.config.commands import ExportRequest
+from vdgs.errors import VdgsError
+from vdgs.export.formats import registry, spz
+from vdgs.export.formats.axes import ALL, Y_UP_LEFT, Axes, reoriented
+from vdgs.export.formats.export_scene import ExportMetadata, ExportScene
+from vdgs.export.formats.gaussian_ply import short_name
+from vdgs.export.programs import FREE, PROGRAMS, axes_for, with_files
+from vdgs.geometry.camera import Camera
+from vdgs.model.gaussians import Gaussians
+from vdgs.system.scratch import remove_leftovers, scratch_folder
+
+MODULES = Path(os.environ.get("VDGS_NODE") or "none") / "node_modules"
+CONVERTER = MODULES / "@playcanvas/splat-transform/bin/cli.mjs"
+
+
+def turned_camera(camera: Camera, turn: np.ndarray) -> Camera:
+    """The camera that sees a turned scene as this one sees the scene."""
+    pose = camera.camera_from_world.copy()
+    pose[:3, :3] = pose[:3, :3] @ turn.T
+    return replace(camera, camera_from_world=pose)
+
+
+# Axes
+
+
+@pytest.mark.parametrize("axes", ALL, ids=lambda axes: axes.name)
+def test_a_scene_along_other_axes_is_the_same_scene(axes: Axes):
+    some = random_gaussians(200, 3)
+    there = axes.of_ground(some)
+    back = axes.to_ground(there)
+    np.testing.assert_allclose(there.means, some.means.numpy() @ axes.turn.T, atol=1e-6)
+    for name in ("means", "log_scales", "logits", "dc", "rest"):
+        torch.testing.assert_close(back.tensors()[name], some.tensors()[name], atol=1e-5, rtol=1e-4)
+    if np.linalg.det(axes.turn) > 0:
+        shown = picture(there, turned_camera(overhead(), axes.turn))
+        assert psnr(shown, picture(some)) > 60
+
+
+def test_a_mirrored_scene_shows_the_mirrored_picture():
+    """In a mirrored scene a mirrored camera sees what the camera sees, its right for its left."""
+    some, camera = random_gaussians(200, 3), overhead()
+    mirror = np.diag([1.0, 1.0, -1.0])
+    pose = np.eye(4)
+    flip = np.diag([-1.0, 1.0, 1.0])  # of the picture's own x, so that the camera stays right-handed
+    pose[:3, :3] = flip @ camera.camera_from_world[:3, :3] @ mirror
+    pose[:3, 3] = flip @ camera.camera_from_world[:3, 3]
+    shown = picture(reoriented(some, mirror), replace(camera, camera_from_world=pose))
+    assert psnr(shown[:, ::-1], picture(some)) > 60
+    assert psnr(shown, picture(some)) < 30
+
+
+@pytest.mark.parametrize("axes", ALL, ids=lambda axes: axes.name)
+@pytest.mark.parametrize("name", ["a.ply", "a.compressed.ply", "a.spz", "a.splat"])
+def test_files_along_any_axes_are_read_back_into_the_ground_frame(tmp_path, axes: Axes, name: str):
+    some = random_gaussians(300, 0 if name.endswith("splat") else 2)
+    registry.write_scene(tmp_path / name, replace(ExportScene.of(some), axes=axes))
+    back = registry.read_gaussians(tmp_path / name)
+    assert psnr(picture(back), picture(some)) > 28
+    assert axes.to_markdown.encode() in b"".join(each.read_bytes()[:2000] for each in sorted(tmp_path.iterdir()))
+
+
+def test_each_program_gets_its_axes_and_no_other_files(tmp_path):
+    for name, program in PROGRAMS.items():
+        asked = with_files(ExportRequest(run=tmp_path, program=name))
+        (path,) = asked.output
+        assert path == tmp_path / "export" / program.file
+        assert axes_for(path, asked) is program.axes[registry.format_from_path(path).suffix]
+        assert set(program.axes) <= {each.suffix for each in registry.FORMATS}
+    with pytest.raises(VdgsError, match=r"a\.spz is no file for SuperSplat"):
+        axes_for(Path("a.spz"), ExportRequest(run=tmp_path, program="supersplat"))
+    with pytest.raises(VdgsError, match=r"Write tileset\.json"):
+        axes_for(Path("a.ply"), ExportRequest(run=tmp_path, program="cesium"))
+    with pytest.raises(VdgsError, match="Leave out one of them"):
+        axes_for(Path("a.ply"), ExportRequest(run=tmp_path, program="spark", axes="y-up"))
+    with pytest.raises(VdgsError, match="has axes of its own"):
+        axes_for(Path("a.glb"), ExportRequest(run=tmp_path, axes="y-down"))
+    assert {registry.format_from_path(Path("a" + ending)).suffix for ending in FREE} == set(FREE)
+    assert axes_for(Path("a.ply"), ExportRequest(run=tmp_path, axes="y-up-left")) is Y_UP_LEFT
+    assert axes_for(Path("a.ply"), ExportRequest(run=tmp_path)) is None
+
+
+# The compressed PLY of PlayCanvas
+
+
+@pytest.mark.parametrize(("count", "degree"), [(1, 0), (256, 1), (300, 2), (1000, 3)])
+def test_a_compressed_ply_holds_the_scene(tmp_path, count: int, degree: int):
+    some = random_gaussians(count, degree)
+    (lost,) = registry.write_scene(tmp_path / "a.compressed.ply", ExportScene.of(some))
+    assert "rounded" in lost
+    data = (tmp_path / "a.compressed.ply").read_bytes()
+    head, _, body = data.partition(b"end_header\n")
+    assert b"element chunk %d\n" % math.ceil(count / 256) in head
+    assert len(body) == math.ceil(count / 256) * 72 + count * (16 + 3 * ((degree + 1) ** 2 - 1))
+    back = registry.read_gaussians(tmp_path / "a.compressed.ply")
+    assert back.sh_degree == degree
+    assert psnr(picture(back), picture(some)) > (30 if degree else 34)
+
+
+def test_the_independent_reader_of_playcanvas_reads_it(tmp_path):
+    """splat-transform (MIT, npm) makes a plain PLY of it, with what it reads from it."""
+    node = shutil.which("node")
+    if node is None or not CONVERTER.is_file():
+        pytest.skip("VDGS_NODE names no folder with it: npm install --prefix FOLDER @playcanvas/splat-transform")
+    some = random_gaussians(700, 3)
+    registry.write_scene(tmp_path / "a.compressed.ply", ExportScene.of(some))
+    subprocess.run([node, CONVERTER, "-w", "a.compressed.ply", "b.ply"], cwd=tmp_path, check=True, capture_output=True)
+    theirs = registry.read_gaussians(tmp_path / "b.ply")
+    ours = replace(ExportScene.of(registry.read_gaussians(tmp_path / "a.compressed.ply")))
+    turned = next(axes for axes in ALL if axes.name == "y-down").of_ground(next(iter(ours.pieces())))
+    theirs, mine = by_place(theirs), by_place(turned)
+    torch.testing.assert_close(theirs.means, mine.means, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(theirs.log_scales, mine.log_scales, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(theirs.sh0, mine.sh0, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(theirs.shN, mine.shN, atol=0.04, rtol=1e-3)  # turned, bytes of 1/32 apart
+    assert ((theirs.quaternions * mine.quaternions).sum(1).abs() > 0.9999).all()
+
+
+def test_gaussforge_reads_it(tmp_path):
+    gaussforge = pytest.importorskip("gaussforge")
+    some = random_gaussians(700, 1)
+    registry.write_scene(tmp_path / "a.compressed.ply", ExportScene.of(some))
+    answer = gaussforge.GaussForge().convert((tmp_path / "a.compressed.ply").read_bytes(), "compressed.ply", "ply")
+    assert "data" in answer, answer
+    (tmp_path / "b.ply").write_bytes(answer["data"])
+    theirs = by_place(registry.read_gaussians(tmp_path / "b.ply"))
+    down = next(axes for axes in ALL if axes.name == "y-down")
+    mine = by_place(down.of_ground(registry.read_gaussians(tmp_path / "a.compressed.ply")))
+    torch.testing.assert_close(theirs.means, mine.means, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(theirs.sh0, mine.sh0, atol=1e-3, rtol=1e-3)
+
+
+def by_place(gaussians: Gaussians) -> Gaussians:
+    """In the order of their places."""
+    places = np.round(gaussians.means.double().numpy(), 3)
+    return gaussians.select(torch.from_numpy(np.lexsort(places.T)))
+
+
+@pytest.mark.parametrize("cut", [10, 2000, 16500])
+def test_a_damaged_compressed_ply_is_refused(tmp_path, cut: int):
+    registry.write_scene(tmp_path / "a.compressed.ply", ExportScene.of(random_gaussians(1000, 0)))
+    whole = (tmp_path / "a.compressed.ply").read_bytes()
+    (tmp_path / "a.compressed.ply").write_bytes(whole[:-cut])
+    with pytest.raises(VdgsError, match=r"truncated|no compressed PLY"):
+        registry.read_gaussians(tmp_path / "a.compressed.ply")
+
+
+# Versions of SPZ
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_version_4_holds_what_version_3_holds(tmp_path, degree: int):
+    pytest.importorskip("zstandard", reason="zstandard is not installed (pip install zstandard)")
+    some = random_gaussians(500, degree)
+    for version in (3, 4):
+        registry.write_scene(tmp_path / f"{version}.spz", replace(ExportScene.of(some), spz_version=version))
+    data = (tmp_path / "4.spz").read_bytes()
+    assert data[:8] == b"NGSP" + (4).to_bytes(4, "little")
+    assert data[15] == (6 if degree else 5)
+    three, four = (registry.read_gaussians(tmp_path / f"{version}.spz") for version in (3, 4))
+    for name, tensor in three.tensors().items():
+        torch.testing.assert_close(four.tensors()[name], tensor, atol=1e-6, rtol=1e-6)
+    (tmp_path / "4.spz").write_bytes(data[:-50])
+    with pytest.raises(VdgsError, match="damaged"):
+        registry.read_gaussians(tmp_path / "4.spz")
+
+
+@pytest.mark.parametrize("version", [2, 3, 4])
+def test_niantics_own_code_reads_every_version(tmp_path, version: int):
+    """In splat-transform, as WebAssembly."""
+    node = shutil.which("node")
+    if node is None or not CONVERTER.is_file():
+        pytest.skip("VDGS_NODE names no folder with it: npm install --prefix FOLDER @playcanvas/splat-transform")
+    some = random_gaussians(300, 2)
+    registry.write_scene(tmp_path / "a.spz", replace(ExportScene.of(some), spz_version=version))
+    subprocess.run([node, CONVERTER, "-w", "a.spz", "b.ply"], cwd=tmp_path, check=True, capture_output=True)
+    theirs, mine = registry.read_gaussians(tmp_path / "b.ply"), registry.read_gaussians(tmp_path / "a.spz")
+    down = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])  # Niantic's code gives y down, z ahead, for a PLY
+    up = next(axes for axes in ALL if axes.name == "y-up")
+    theirs, mine = by_place(theirs), by_place(reoriented(up.of_ground(mine), down))
+    torch.testing.assert_close(theirs.means, mine.means, atol=1e-3, rtol=1e-4)
+    torch.testing.assert_close(theirs.shN, mine.shN, atol=0.01, rtol=1e-3)
+
+
+def test_version_4_without_its_package_is_said(tmp_path, monkeypatch):
+    monkeypatch.setattr(spz.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(VdgsError, match="pip install zstandard"):
+        registry.write_scene(tmp_path / "a.spz", replace(ExportScene.of(random_gaussians(5, 0)), spz_version=4))
+
+
+# Headers that other readers have room for
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.points.ply", "a.compressed.ply"])
+def test_no_line_of_a_header_is_long(tmp_path, name: str):
+    pyproj = pytest.importorskip("pyproj")
+    wkt = pyproj.CRS.from_epsg(32611).to_wkt()
+    assert len(wkt) > 1024
+    facts = ExportMetadata((500000.0, 3800000.0, 0.0), wkt)
+    registry.write_scene(tmp_path / name, ExportScene.of(random_gaussians(20, 3), facts))
+    head = (tmp_path / name).read_bytes().partition(b"end_header")[0].decode()
+    assert max(map(len, head.splitlines())) < 256
+    assert "comment crs EPSG:32611\n" in head
+    assert pyproj.CRS.from_wkt((tmp_path / f"{name}.prj").read_text()).to_epsg() == 32611
+    assert (tmp_path / f"{name}.prj") in registry.files_written(tmp_path / name)
+    registry.write_scene(
+        tmp_path / name, ExportScene.of(random_gaussians(20, 3))
+    )  # no system now: none stays beside it
+    assert [each.name for each in tmp_path.iterdir()] == [name]
+
+
+def test_a_system_has_a_short_name():
+    pyproj = pytest.importorskip("pyproj")
+    for code in ("EPSG:25832", "EPSG:4978", "EPSG:2056", "ESRI:54009"):
+        crs = pyproj.CRS.from_user_input(code)
+        assert short_name(crs.to_wkt()) == code
+        assert short_name(crs.to_wkt("WKT1_GDAL")) == code
+    both = pyproj.CRS.from_user_input("EPSG:32633+5773")
+    assert short_name(both.to_wkt()) == both.name
+    assert short_name("EPSG:32633+5773") == "EPSG:32633+5773"
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.points.ply"])
+def test_open3d_reads_the_points(tmp_path, name: str):
+    open3d = pytest.importorskip("open3d", reason="Open3D is not installed (pip install open3d)")
+    pyproj = pytest.importorskip("pyproj")
+    some = random_gaussians(200, 3)
+    registry.write_scene(
+        tmp_path / name, ExportScene.of(some, ExportMetadata((5e5, 3.8e6, 0.0), pyproj.CRS.from_epsg(32611).to_wkt()))
+    )
+    points = np.asarray(open3d.io.read_point_cloud(str(tmp_path / name)).points)
+    np.testing.assert_allclose(points, some.means.numpy(), atol=1e-6)
+
+
+# What killed exports leave
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+import torch
+from dataclasses import replace
+from support.gaussians import random_gaussians
+from vdgs.export.formats import registry
+from vdgs.export.formats.export_scene import Scene
+
+def chunks():
+    yield random_gaussians(3000, 0)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+path = Path(sys.argv[1])
+if path.name == "tileset.json":
+    from vdgs.export.formats import tiles
+    written = tiles.write_bytes
+    def write(file, content):
+        written(file, content)
+        os.kill(os.getpid(), signal.SIGKILL)
+    tiles.write_bytes = write
+    tiles.write_tiles(path, Scene.of(random_gaussians(3000, 0)), most=500)
+registry.write(path, Scene(chunks(), 6000, 0))
+"""
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.compressed.ply", "a.spz", "a.sog", "a.glb", "tileset.json"])
+def test_what_a_killed_export_left_goes_with_the_next(tmp_path, name: str):
+    (tmp_path / ".a.ply.notes.scratch.txt").write_text("mine")
+    (tmp_path / "tiles-7").mkdir()
+    (tmp_path / "tiles-7" / "0.glb").write_text("mine")
+    mine = listed(tmp_path)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
+    done = subprocess.run([sys.executable, "-c", KILLED, tmp_path / name], env=environment, capture_output=True)
+    assert done.returncode == -9, done.stderr.decode()
+    left = listed(tmp_path)
+    assert left > mine
+    found = registry.format_from_path(tmp_path / name).tidy(tmp_path / name)
+    assert found
+    assert listed(tmp_path) == mine
+
+
+def listed(folder: Path) -> set[str]:
+    return {str(each.relative_to(folder)) for each in folder.rglob("*")}
+
+
+def test_what_a_living_process_needs_stays(tmp_path):
+    path = tmp_path / "a.ply"
+    alive = tmp_path / f".a.ply.{os.getpid()}.tmp"
+    alive.write_text("half")
+    with scratch_folder(path) as folder:
+        assert remove_leftovers(path) == []
+        assert folder.is_dir()
+        young = tmp_path / ".a.ply.abc.scratch"
+        young.mkdir()  # as another process has just made it
+        assert remove_leftovers(path) == []
+        os.utime(young, (time.time() - 1000,) * 2)
+        assert remove_leftovers(path) == [young]
+    assert listed(tmp_path) == {alive.name}
+    other = tmp_path / ".b.ply.999999999.tmp"
+    other.write_text("of another file")
+    assert remove_leftovers(path) == []
+    assert remove_leftovers(tmp_path / "b.ply") == [other]
+
+
+def test_the_facts_beside_a_file_say_how_it_stands(tmp_path):
+    registry.write_scene(tmp_path / "a.spz", replace(ExportScene.of(random_gaussians(20, 0)), axes=Y_UP_LEFT))
+    assert json.loads((tmp_path / "a.spz.json").read_text())["axes"] == "x east, y up, z north"

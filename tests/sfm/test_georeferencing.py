@@ -1,0 +1,299 @@
+"""Places found from positions of unknown accuracy: how good they are is said, and what is mirrored is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from vdgs.captures.plane_fit import mirrored
+from vdgs.captures.position_fit import PositionFit, Problem, Up, fit_positions
+from vdgs.captures.reconstruction import AccuracyFacts
+from vdgs.captures.up_axis import up_by_views
+from vdgs.geometry.similarity import Similarity, fit_similarity
+from vdgs.sfm.georeferencing import FOOT_M, Doubts
+from vdgs.sfm.georegistration import Georegistration
+
+#: Metres of the flight for one unit of the cameras' world.
+SCALE = 13.0
+HEIGHT_M = 75.0
+
+
+def strips(count: int, each: int, step: float, rng: np.random.Generator) -> np.ndarray:
+    """Strips flown back and forth, heights that differ by a few metres, about the origin."""
+    along = [k if strip % 2 == 0 else each - 1 - k for strip in range(count) for k in range(each)]
+    across = np.repeat(np.arange(count), each)
+    places = np.stack([step * np.array(along), 1.2 * step * across, HEIGHT_M + rng.normal(0, 2, len(across))], axis=1)
+    return places - [*places.mean(axis=0)[:2], 0]
+
+
+def own_world(places: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    return places @ turn / SCALE + [1.0, -2, 3]
+
+
+def problem_of(
+    places: np.ndarray, recorded: np.ndarray, seed: int, up_deg: float = 2.0, stated: np.ndarray | None = None
+) -> tuple[Problem, np.ndarray]:
+    """Cameras in a world of their own, what is known of up (off by about `up_deg`), and the turn that was taken."""
+    turn = Rotation.random(random_state=seed).as_matrix()
+    askew = Rotation.from_rotvec([*np.random.default_rng(seed).normal(0, np.radians(up_deg / 1.5), 2), 0]).as_matrix()
+    up = Up(turn.T @ askew @ [0.0, 0, 1], max(up_deg, 1.0), "the views")
+    return Problem(
+        centers=own_world(places, turn),
+        targets=recorded,
+        times=np.linspace(0, 1, len(places)),
+        up=up,
+        scale=None,
+        stated=stated,
+    ), turn
+
+
+def tilt_deg(fit: PositionFit, turn: np.ndarray) -> float:
+    return float(np.degrees(np.arccos(np.clip((fit.similarity.rotation @ turn.T)[2, 2], -1, 1))))
+
+
+def north_off_deg(fit: PositionFit, turn: np.ndarray) -> float:
+    against = fit.similarity.rotation @ turn.T
+    return float(np.degrees(np.arctan2(against[1, 0] - against[0, 1], against[0, 0] + against[1, 1])))
+
+
+@pytest.mark.parametrize("wrong_m", [0.0, 1.0, 3.0, 5.0, 10.0, 20.0])
+@pytest.mark.parametrize(("count", "each", "step"), [(3, 4, 17.0), (6, 12, 25.0)])
+def test_flights_lie_within_their_stated_accuracy(wrong_m, count, each, step):
+    """Positions wrong by 0 to 20 m, heights by half as much again: nineteen of twenty within what is stated."""
+    within, stated = [], []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        places = strips(count, each, step, rng)
+        recorded = places + rng.normal(0, wrong_m, places.shape) * [1, 1, 1.5]
+        problem, turn = problem_of(places, recorded, seed)
+        fit = fit_positions(problem)
+        off = fit.placed.mean(axis=0) - places.mean(axis=0)
+        within += [
+            abs(fit.similarity.scale / SCALE - 1) <= fit.scale_error + 1e-9,
+            abs(north_off_deg(fit, turn)) <= fit.north_error_deg + 1e-6,
+            tilt_deg(fit, turn) <= fit.level_error_deg + 1e-6,
+            np.hypot(off[0], off[1]) <= fit.place_error_m[0],
+            abs(off[2]) <= fit.place_error_m[1],
+        ]
+        stated.append(fit.scale_error)
+        if wrong_m <= 5 or count == 6:
+            assert not fit.why_refused("EXIF")
+    assert np.mean(within) >= 0.9
+    spread = step * np.hypot(each, 1.2 * count) / np.sqrt(12)
+    assert np.median(stated) < 0.01 + 4 * wrong_m / spread / np.sqrt(count * each)
+
+
+@pytest.mark.parametrize("drift_m", [10.0, 30.0, 60.0, 114.0])
+@pytest.mark.parametrize("shape", ["line", "there and back"])
+@pytest.mark.parametrize("wrong_m", [0.0, 3.0])
+def test_altitudes_that_drift_tilt_nothing_and_are_said(drift_m, shape, wrong_m):
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        places = strips(3, 4, 17.0, rng)
+        time = np.linspace(0, 1, len(places))
+        recorded = places + rng.normal(0, wrong_m, places.shape) * [1, 1, 0.3]
+        recorded[:, 2] += drift_m * (time if shape == "line" else np.sin(np.pi * time))
+        problem, turn = problem_of(places, recorded, seed)
+        fit = fit_positions(problem)
+        assert tilt_deg(fit, turn) < 6.0
+        assert fit.similarity.scale == pytest.approx(SCALE, rel=1.5 * fit.scale_error + 0.01)
+        assert not fit.why_refused("EXIF")
+        assert abs(fit.placed.mean(axis=0)[2] - places[:, 2].mean()) <= fit.place_error_m[1]
+        if drift_m >= 30:
+            assert fit.altitude != "used"
+            assert fit.place_error_m[1] > 0.3 * drift_m
+        if shape == "line" and drift_m >= 30:
+            assert fit.drift_m == pytest.approx(drift_m, rel=0.25)
+
+
+@pytest.mark.parametrize("count", [3, 4, 5])
+def test_few_positions_are_not_judged_as_strictly_as_many(count):
+    """An exact fit of three says little: their errors are as large as few make them, and altitudes do not tilt them."""
+    corners = np.array([[0.0, 0, 75], [60, 5, 77], [55, 50, 74], [2, 48, 76], [30, 25, 75]])[:count]
+    recorded = corners + np.random.default_rng(3).normal(0, 3, corners.shape)
+    problem, turn = problem_of(corners, recorded, 3)
+    fit = fit_positions(problem)
+    assert not fit.why_refused("EXIF")
+    assert abs(fit.similarity.scale / SCALE - 1) < fit.scale_error
+    assert fit.scale_error > 0.02
+    drifting = recorded + np.outer(np.linspace(0, 1, count), [0, 0, 40])
+    problem, turn = problem_of(corners, drifting, 3)
+    assert tilt_deg(fit_positions(problem), turn) < 6
+
+
+def test_positions_worse_than_nothing_are_refused_in_words_that_agree_with_each_other():
+    rng = np.random.default_rng(2)
+    places = strips(3, 4, 0.4, rng) * [1, 1, 0.01]
+    problem, _ = problem_of(places, places + rng.normal(0, 2.0, places.shape), 2)
+    said = fit_positions(problem).why_refused("EXIF")
+    assert "disagree by about" in said
+    assert "over a flight of" in said
+    assert " agree" not in said.replace("disagree", "")
+
+
+@pytest.mark.parametrize(("radius", "believed"), [(1.5, 0.1), (10.0, 0.8), (20.0, 1.0)])
+def test_positions_that_wander_as_a_phone_does_tell_no_scale_of_a_small_orbit(radius, believed):
+    """Errors that follow each other look like a smaller or larger orbit: they count for more than random ones."""
+    taken, within = [], []
+    for seed in range(20):
+        rng, angle = np.random.default_rng(seed), np.linspace(0, 2 * np.pi, 30, endpoint=False)
+        places = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(30, 1.5)], axis=1)
+        walk = np.cumsum(rng.normal(0, 1, places.shape), axis=0)
+        walk -= walk.mean(axis=0)
+        walk *= rng.uniform(1, 2.5) / np.sqrt((walk[:, :2] ** 2).sum(axis=1).mean())
+        problem, _ = problem_of(places, places + walk, seed, 4.0)
+        fit = fit_positions(problem)
+        taken.append(not fit.why_refused("EXIF"))
+        within += [abs(fit.similarity.scale / SCALE - 1) <= fit.scale_error] if taken[-1] else []
+    assert np.mean(taken) <= believed if believed < 0.5 else np.mean(taken) >= believed
+    assert not within or np.mean(within) >= 0.75
+
+
+def test_stated_accuracy_wins_over_what_views_say_of_up():
+    """A receiver with RTK over a slope of 10 degrees that a drone follows: its heights are right, the views are not."""
+    rng = np.random.default_rng(1)
+    places = strips(5, 8, 20.0, rng)
+    places[:, 2] += np.tan(np.radians(10)) * places[:, 0]
+    problem, turn = problem_of(places, places + rng.normal(0, 0.02, places.shape), 1, 4.0, np.full(places.shape, 0.02))
+    fit = fit_positions(problem)
+    assert fit.altitude == "used"
+    assert tilt_deg(fit, turn) < 0.1
+    assert fit.place_error_m[0] < 0.1
+
+
+def test_positions_that_are_another_flights_are_left_out():
+    rng = np.random.default_rng(7)
+    places = strips(4, 8, 20.0, rng)
+    recorded = places + rng.normal(0, 1, places.shape)
+    recorded[[3, 17, 20]] += [150.0, -90, 30]
+    problem, _ = problem_of(places, recorded, 7)
+    fit = fit_positions(problem)
+    assert not fit.inliers[[3, 17, 20]].any()
+    assert fit.inliers.sum() >= 27
+    assert fit.similarity.scale == pytest.approx(SCALE, rel=0.02)
+
+
+def test_along_a_line_up_is_what_is_known_without_positions():
+    rng = np.random.default_rng(9)
+    places = strips(1, 8, 20.0, rng)
+    problem, turn = problem_of(places, places + rng.normal(0, 1, places.shape), 9)
+    fit = fit_positions(problem)
+    assert tilt_deg(fit, turn) < 5
+    assert abs(north_off_deg(fit, turn)) < 3
+    assert not fit.why_refused("EXIF")
+
+
+def test_a_facade_gets_its_scale_from_heights_too():
+    rng = np.random.default_rng(4)
+    places = np.stack([np.tile([0.0, 1, 2], 8), np.zeros(24), 3.0 * np.repeat(np.arange(8), 3)], axis=1) * 3
+    problem, _ = problem_of(places, places + rng.normal(0, 0.5, places.shape), 4)
+    fit = fit_positions(problem)
+    assert fit.altitude == "used"
+    assert fit.similarity.scale == pytest.approx(SCALE, rel=0.05)
+
+
+@pytest.mark.parametrize("wrong_m", [0.0, 1.0, 5.0])
+@pytest.mark.parametrize("change", ["exchanged", "latitudes", "longitudes"])
+@pytest.mark.parametrize("each", [3, 4, 8])
+def test_mirrored_positions_are_named_and_sound_ones_never(wrong_m, change, each):
+    mirror = {"exchanged": [[0, 1, 0], [1, 0, 0], [0, 0, 1]], "latitudes": np.diag([1, -1, 1]),
+              "longitudes": np.diag([-1, 1, 1])}[change]  # fmt: skip
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        places = strips(3, each, 17.0, rng)
+        recorded = places + rng.normal(0, wrong_m, places.shape)
+        for read, said in ((recorded @ np.array(mirror, float), "mirrored"), (recorded, "")):
+            problem, _ = problem_of(places, read, seed)
+            others = {"mirrored": read * np.array([1.0, -1, 1])}
+            assert mirrored(problem.centers, read, problem.up.direction, others) == said
+
+
+def test_views_that_look_down_tell_up_over_a_slope():
+    rng = np.random.default_rng(0)
+    places = strips(4, 6, 20.0, rng)
+    slope = np.tan(np.radians(18)) * places[:, 0]
+    ground = rng.uniform(-80, 80, (500, 3)) * [1, 1, 0.02]
+    ground[:, 2] += np.tan(np.radians(18)) * ground[:, 0]
+    rotations = np.array(
+        [np.diag([1.0, -1, -1]) @ Rotation.from_euler("xyz", [*rng.normal(0, 3, 2), 180.0 * (k % 2)], True).as_matrix()
+         for k in range(len(places))]
+    )  # fmt: skip
+    up, deviation, sure = up_by_views(places + slope[:, None] * [0, 0, 1], rotations, ground)
+    assert np.degrees(np.arccos(up[2])) < 6
+    assert sure
+    assert deviation >= 3
+
+
+# ---------------------------------------------------------------------------------------------- control points
+
+
+def doubts(gps: bool = True, recorded: float | None = HEIGHT_M, altitude: float = 500.0) -> tuple[Doubts, np.ndarray]:
+    """A model that is in metres already, placed by GPS to 3 m, its points on the ground."""
+    rng = np.random.default_rng(0)
+    centers = strips(3, 4, 17.0, rng)
+    ground = rng.uniform(-40, 40, (200, 3)) * [1, 1, 0.01]
+    accuracy = AccuracyFacts(
+        place_m=(6.0, 12.0), scale_percent=5, scale_m=1, north_deg=1, level_deg=1, positions_m=(3.0, 3, 5)
+    )
+    here = Similarity(1.0, np.eye(3), np.zeros(3))
+    rows = np.arange(len(centers))
+    placed = Georegistration(
+        similarity=here,
+        method="GPS",
+        position_rows=rows,
+        residuals=np.zeros_like(centers),
+        inliers=np.ones(len(centers), bool),
+        accuracy=accuracy,
+    )
+    up = Up(np.array([0.0, 0, 1]), 2.0, "the views")
+    marks = np.array([[-20.0, -20, 0], [20, -20, 1], [20, 20, 0.5], [-20, 20, 0], [0, 5, 2]])
+    return Doubts(
+        up=up,
+        centers=centers,
+        ground=ground,
+        by_gps=placed if gps else None,
+        gps="EXIF",
+        recorded_height_m=recorded,
+        altitude=altitude,
+    ), marks
+
+
+def said_of(doubt: Doubts, marks: np.ndarray, targets: np.ndarray) -> str:
+    return doubt(fit_similarity(marks, targets), marks, targets)
+
+
+def test_sound_control_points_raise_no_doubts():
+    doubt, marks = doubts()
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        assert said_of(doubt, marks, marks + np.array([5, -4, 40]) + rng.normal(0, 0.05, marks.shape)) == ""
+
+
+@pytest.mark.parametrize("gps", [True, False])
+def test_control_points_with_x_and_y_exchanged_are_refused(gps):
+    doubt, marks = doubts(gps)
+    for count in (3, 5):
+        assert "x (east) and y (north)" in said_of(doubt, marks[:count], marks[:count, [1, 0, 2]])
+
+
+@pytest.mark.parametrize(("recorded", "gps"), [(HEIGHT_M, False), (None, True)])
+@pytest.mark.parametrize("feet", [FOOT_M, 1 / FOOT_M])
+def test_control_points_in_feet_are_refused(recorded, gps, feet):
+    doubt, marks = doubts(gps, recorded)
+    assert "in feet" in said_of(doubt, marks, feet * marks)
+
+
+def test_heights_in_feet_and_points_kilometers_off_are_refused():
+    doubt, marks = doubts()
+    heights = marks + np.array([0, 0, 500 / FOOT_M - 500])
+    assert "Are they in feet" in said_of(doubt, marks, heights)
+    assert "3.2 km from where GPS" in said_of(doubt, marks, marks + np.array([3200.0, 0, 0]))
+    assert "2 km over those of GPS" in said_of(doubt, marks, marks + np.array([0, 0, 2000.0]))
+
+
+def test_points_that_fit_nothing_are_refused():
+    doubt, marks = doubts()
+    assert "disagree by" in said_of(
+        doubt, marks, marks + np.array([[9.0, 0, 0], [-9, 4, 0], [0, 9, 0], [0, -8, 9], [5, 0, 0]])
+    )

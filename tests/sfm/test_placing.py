@@ -1,0 +1,167 @@
+"""A finished capture is placed anew by other positions, known distances or none; contradictions leave it as it is."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+pytest.importorskip("embreex")
+
+from support.flights import ORIGIN, Flight, copy_folder, sightings
+from vdgs.captures.loading import load_capture
+from vdgs.captures.reconstruction import read_reconstruction, report_rows
+from vdgs.captures.validation import validate_capture
+from vdgs.config.sfm_options import SfmOptions, SfmRequest
+from vdgs.errors import CaptureError
+from vdgs.geometry.geodesy import geodetic_from_enu
+from vdgs.sfm import feature_extraction, feature_matching, incremental_mapper
+from vdgs.sfm.reconstruct import reconstruct
+
+pytestmark = pytest.mark.xdist_group("sfm")
+
+
+def console() -> Console:
+    return Console(file=io.StringIO(), width=500)
+
+
+@pytest.fixture(scope="module")
+def finished(nine, nine_begun, tmp_path_factory) -> Path:
+    """Placed by GPS; nothing but the capture is kept."""
+    output = tmp_path_factory.mktemp("finished") / "capture"
+    copy_folder(nine_begun["writing"], output)
+    reconstruct(SfmRequest(image_folders=(nine.folder,), output=output, threads=1), console())
+    return output
+
+
+@pytest.fixture
+def capture(finished, tmp_path, monkeypatch) -> Path:
+    """A copy whose features, matches and poses must not be made again."""
+    shutil.copytree(finished, tmp_path / "capture")
+    for room, name in (
+        (feature_extraction, "find_features"),
+        (feature_matching, "match"),
+        (incremental_mapper, "find_models"),
+    ):
+        monkeypatch.setattr(room, name, lambda *_: pytest.fail("was done already"))
+    return tmp_path / "capture"
+
+
+def again(flight: Flight, capture: Path, gps: Path | None = None, **options):
+    said = console()
+    request = SfmRequest(
+        image_folders=(flight.folder,), output=capture, gps=gps, threads=1, options=SfmOptions(**options)
+    )
+    return reconstruct(request, said), said.file.getvalue()
+
+
+def table(file: Path, flight: Flight, change=lambda enu: enu, columns=(0, 1, 2)) -> Path:
+    enu = change(np.array([camera.position for camera in flight.cameras]))
+    geodetic = geodetic_from_enu(enu, ORIGIN)[:, columns]
+    rows = [f"{name},{a:.9f},{b:.9f},{c:.3f}" for name, (a, b, c) in zip(flight.names, geodetic, strict=True)]
+    file.write_text("\n".join(["name,lat,lon,alt", *rows]))
+    return file
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    found = (path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != ".lock")
+    return {str(path.relative_to(folder)): path.read_bytes() for path in found if path.suffix != ".JPG"}
+
+
+def test_a_table_given_afterwards_moves_the_finished_capture(nine, capture, tmp_path):
+    shift = np.array([30.0, -20, 15])
+    before = read_reconstruction(capture)
+    facts, said = again(nine, capture, table(tmp_path / "gps.csv", nine, lambda enu: enu + shift))
+    assert "placed anew" in said
+    assert max(facts.residual_rms_m) < 0.3
+    assert (facts.registered, facts.pairs, facts.found) == (before.registered, before.pairs, before.library_info)
+    scene = load_capture(capture)
+    assert validate_capture(scene).problems == ()
+    assert "scale ±" in scene.ground.description  # what maps and reports say of their place
+    origin = np.array(facts.origin) - before.origin
+    assert origin[2] == pytest.approx(15, abs=1)
+    for label in ("Accuracy", "Positions are good to"):
+        assert label in dict(report_rows(facts))
+    written = json.loads((capture / "reconstruction.json").read_text())["accuracy"]
+    assert written["scale_percent"] > 0
+    assert "nothing to do" in again(nine, capture, tmp_path / "gps.csv")[1]
+
+
+def test_altitudes_that_drift_afterwards_tilt_nothing(nine, capture, tmp_path):
+    drift = np.outer(np.linspace(0, 30, 9), [0, 0, 1])
+    facts, said = again(nine, capture, table(tmp_path / "gps.csv", nine, lambda enu: enu + drift))
+    assert facts.tilt_deg < 5
+    assert facts.accuracy.altitude == "drifts" or "barometer" in facts.georeferenced
+    assert "drift" in said
+    assert facts.height_m == pytest.approx(45, abs=4)
+
+
+def test_mirrored_tables_are_refused_and_leave_the_capture_as_it_was(nine, capture, tmp_path):
+    before = files(capture)
+    mirrored = table(tmp_path / "north.csv", nine, lambda enu: enu * [1, -1, 1])
+    exchanged = table(tmp_path / "exchanged.csv", nine, columns=(1, 0, 2))
+    for file in (mirrored, exchanged):
+        with pytest.raises(CaptureError, match=r"latitude and longitude (are )?exchanged"):
+            again(nine, capture, file)
+    assert files(capture) == before
+    assert "used all the same" in again(nine, capture, mirrored, georeference="anyway")[1]
+
+
+@pytest.fixture(scope="module")
+def marks(nine) -> list[dict[int, np.ndarray]]:
+    return sightings(nine.cameras, np.array([[-8.0, -8], [9, -7], [8, 9]]))
+
+
+def bars(file: Path, flight: Flight, marks, factor: float = 1.0) -> Path:
+    lines = ["# measured with a tape"]
+    for name, seen in zip("ABC", marks, strict=True):
+        lines += [f"{name} {seen[k][0]:.2f} {seen[k][1]:.2f} {flight.names[k]}" for k in seen if k >= 0]
+    for i, j in ((0, 1), (1, 2)):
+        lines.append(f"{'ABC'[i]} {'ABC'[j]} {factor * np.linalg.norm(marks[i][-1] - marks[j][-1]):.3f}")
+    file.write_text("\n".join(lines))
+    return file
+
+
+def test_a_known_distance_gives_meters_without_positions(nine, capture, marks, tmp_path):
+    off, said = again(nine, capture, georeference="off")
+    assert off.origin is None
+    assert "--scale-bar" in said
+    assert not load_capture(capture).ground.metric
+    facts, _ = again(nine, capture, georeference="off", scale_bar=bars(tmp_path / "bars.txt", nine, marks))
+    scene = load_capture(capture)
+    assert scene.ground.metric
+    assert scene.ground.origin_geo is None
+    assert facts.height_m == pytest.approx(45, abs=1.5)
+    assert facts.accuracy.scale_percent < 5
+    assert facts.accuracy.place_m is None
+    assert "a known distance (bars.txt)" in facts.georeferenced
+
+
+def test_a_known_distance_and_positions_agree_or_are_refused(nine, capture, marks, tmp_path):
+    facts, _ = again(nine, capture, scale_bar=bars(tmp_path / "bars.txt", nine, marks))
+    assert "scale by a known distance" in facts.georeferenced
+    assert facts.origin is not None
+    with pytest.raises(CaptureError, match=r"3\.[12]\d* times as large.*in feet.*--georeference off"):
+        again(nine, capture, scale_bar=bars(tmp_path / "feet.txt", nine, marks, 1 / 0.3048))
+
+
+BAD_BARS = {
+    "nothing": ("", "names no distance"),
+    "one photograph": ("A 10 10 DJI_0001.JPG\nB 20 20 DJI_0001.JPG\nA B 3", "A is marked in fewer than two"),
+    "no mark": ("A B 3", "A is marked in fewer than two photographs"),
+    "no number": ("A B three", "line 1: 'A B three' is not"),
+    "no distance": ("A B -3", "line 1: 'A B -3' is not"),
+    "unknown": ("A 10 10 DJI_0999.JPG", "line 1: there is no photograph"),
+}
+
+
+@pytest.mark.parametrize(("text", "said"), BAD_BARS.values(), ids=BAD_BARS)
+def test_bad_lists_of_distances_are_refused_with_the_line(nine, capture, tmp_path, text, said):
+    (tmp_path / "bars.txt").write_text(text)
+    with pytest.raises(CaptureError, match=said):
+        again(nine, capture, scale_bar=tmp_path / "bars.txt")

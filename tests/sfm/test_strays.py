@@ -1,0 +1,299 @@
+"""What lies among the photographs of a flight and is none of them; files that are whole but for their end."""
+
+from __future__ import annotations
+
+import io
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from support.flights import add_xmp, write_photograph
+from vdgs.captures.image_files import decode_mask, verify_image
+from vdgs.captures.jpeg import lacks_only_end
+from vdgs.config.sfm_options import SfmOptions
+from vdgs.errors import CaptureError
+from vdgs.sfm.feature_extraction import write_upright_images
+from vdgs.sfm.gps_priors import read_gps_priors
+from vdgs.sfm.image_list import ImageList, collect_images, is_image_folder
+from vdgs.sfm.image_metadata import UnusableImage, read_image_metadata
+from vdgs.sfm.incremental_mapper import should_fix_focal
+from vdgs.sfm.preflight import make_preflight_report
+from vdgs.sfm.workspace import Workspace
+
+COUNT = 6
+
+
+def pixels(number: int, width: int = 160, height: int = 120) -> np.ndarray:
+    rough = np.random.default_rng(number).integers(0, 255, (height // 4, width // 4, 3), np.uint8)
+    return cv2.resize(rough, (width, height), interpolation=cv2.INTER_CUBIC)
+
+
+def flight(folder: Path, count: int = COUNT, orientation: int = 1) -> list[str]:
+    folder.mkdir(parents=True, exist_ok=True)
+    names = [f"DJI_{k + 1:04d}.JPG" for k in range(count)]
+    for k, name in enumerate(names):
+        place = np.array((10.0 * (k % 3), 12.0 * (k // 3), 40.0))
+        write_photograph(folder / name, pixels(k), k, place, orientation)
+    return names
+
+
+def picture(file: Path, shown: np.ndarray, **more) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(shown).save(file, **more)
+
+
+def half(height: int = 120, width: int = 160) -> np.ndarray:
+    keep = np.full((height, width), 255, np.uint8)
+    keep[: height // 2] = 0
+    return keep
+
+
+def said(found: ImageList) -> list[str]:
+    return make_preflight_report(found, read_gps_priors(found.images, None, (1.0, 2.0))).warnings
+
+
+# --------------------------------------------------------------------------------------------------- masks
+
+
+@pytest.mark.parametrize(
+    "named",
+    [
+        "{stem}_mask.JPG", "{stem}_mask.png", "{stem}-mask.png", "{stem}.mask.png", "{stem}_Mask.PNG",
+        "mask_{stem}.png",
+        "{stem}.JPG.png", "{stem}.JPG.mask.png", "masks/{stem}.png", "mask/{stem}.png", "_masks/{stem}.JPG",
+        "masks/{stem}_mask.png", "images_masks/{stem}.JPG.png", "Mask/{stem}_mask.jpg", "my_masks/{stem}.tif",
+    ],
+)  # fmt: skip
+def test_masks_by_any_usual_name_are_masks(tmp_path, named):
+    names = flight(tmp_path)
+    for name in names:
+        picture(tmp_path / named.format(stem=name.removesuffix(".JPG")), half())
+    found = collect_images([tmp_path])
+    assert [photo.name for photo in found.images] == names
+    assert all(photo.mask is not None for photo in found.images)
+    assert should_fix_focal(found.images, read_gps_priors(found.images, None, (1, 2)), SfmOptions())[0]
+
+
+@pytest.mark.parametrize(
+    "kind", ["0 and 1", "0 and 255", "16 bits", "16 bits of 255", "16 bits of 1", "one bit", "gray"]
+)
+def test_masks_of_every_scale_keep_the_same(tmp_path, kind):
+    keep = half() > 0
+    file = tmp_path / "mask.png"
+    if kind == "one bit":
+        Image.fromarray(keep).save(file)
+    elif "16" in kind:
+        top = 65535 if kind == "16 bits" else int(kind.split()[-1])
+        cv2.imwrite(str(file), keep.astype(np.uint16) * top)
+    else:
+        picture(file, keep.astype(np.uint8) * (1 if kind == "0 and 1" else 200 if kind == "gray" else 255))
+    assert np.array_equal(decode_mask(file, 160, 120), keep)
+    assert np.array_equal(decode_mask(file, 80, 60), keep[::2, ::2])
+
+
+# -------------------------------------------------------------------------------------------------- strays
+
+
+@pytest.mark.parametrize(
+    "folder",
+    [
+        ".Trashes/501", ".thumbnails", "@eaDir", "__MACOSX", "$RECYCLE.BIN", "System Volume Information", "thumbnails",
+        "Thumbs", "odm_orthophoto", "odm_texturing/x", "opensfm/undistorted/images", "dsm", "orthophoto", "3_dsm_ortho",
+        "project.files/0/0", "depth_maps", "renders", ".git/x",
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("tagged", [True, False])
+def test_folders_of_systems_and_programs_are_not_read(tmp_path, folder, tagged):
+    names = flight(tmp_path)
+    for k, name in enumerate(names):
+        (tmp_path / folder).mkdir(parents=True, exist_ok=True)
+        if tagged:
+            write_photograph(tmp_path / folder / name, pixels(50 + k), k, np.zeros(3))
+        else:
+            picture(tmp_path / folder / name, pixels(50 + k))
+    found = collect_images([tmp_path])
+    assert [photo.name for photo in found.images] == names
+    assert any(f"not read: {folder.partition('/')[0]}" in note for note in found.notes)
+    assert not is_image_folder(tmp_path / folder.partition("/")[0] / "none")
+    deepest = tmp_path / folder
+    if "/" not in folder:  # given by itself it is what was asked for
+        assert len(collect_images([deepest]).images) == COUNT
+
+
+@pytest.mark.parametrize(
+    ("name", "size"),
+    [
+        ("odm_orthophoto.tif", (300, 300)), ("site_orthomosaic.png", (160, 120)), ("dsm.tif", (160, 120)),
+        ("plan_DSM.tif", (200, 200)), ("photographs.png", (300, 200)), ("contact sheet.jpg", (160, 120)),
+        ("Screenshot 2026-06-01.png", (160, 120)), ("DJI_0001_thumb.JPG", (160, 120)),
+        ("DJI_0001_preview.jpg", (160, 120)),
+        ("anything.jpg", (300, 100)), ("logo.png", (200, 200)),
+    ],
+)  # fmt: skip
+def test_pictures_that_are_none_of_the_flight_are_left_out_and_change_no_rule(tmp_path, name, size):
+    names = flight(tmp_path)
+    picture(tmp_path / name, pixels(99, *size))
+    found = collect_images([tmp_path])
+    assert [photo.name for photo in found.images] == names
+    assert [each.name for each in found.excluded] == [name.replace(" ", "_")]
+    assert should_fix_focal(found.images, read_gps_priors(found.images, None, (1, 2)), SfmOptions())[0]
+
+
+def test_maps_of_ours_among_photographs_are_left_out(tmp_path):
+    names = flight(tmp_path)
+    (tmp_path / "maps").mkdir()
+    for folder in (tmp_path, tmp_path / "maps"):
+        (folder / "map.json").write_text("{}")
+        for name in ("hillshade.png", "preview.png", "visibility.tif", "orthophoto.tif"):
+            picture(folder / name, pixels(7))
+    found = collect_images([tmp_path])
+    assert [photo.name for photo in found.images] == names
+    assert any("maps" in note for note in found.notes)
+
+
+def test_smaller_copies_in_another_folder_are_left_out(tmp_path):
+    names = flight(tmp_path / "full")
+    for name in names:
+        with Image.open(tmp_path / "full" / name) as image:
+            exif, shown = image.getexif(), np.asarray(image.resize((320, 240)))
+        picture(tmp_path / "full" / name, shown, exif=exif)
+        picture(tmp_path / "web" / name, shown[::2, ::2], exif=exif)
+    found = collect_images([tmp_path])
+    assert [photo.name for photo in found.images] == [f"full/{name}" for name in names]
+    assert all("smaller copy of full/" in each.reason for each in found.excluded)
+
+
+def test_a_photograph_that_lost_its_tags_is_used_as_the_others_of_its_size(tmp_path):
+    names = flight(tmp_path)
+    picture(tmp_path / names[2], pixels(2), quality=95)
+    picture(tmp_path / "DJI_0099.JPG", np.repeat(half()[..., None], 3, 2), quality=95)  # a mask by another name
+    found = collect_images([tmp_path])
+    assert [photo.name for photo in found.images] == names
+    assert found.images[2].lens == found.images[1].lens
+    assert "black and white" in found.excluded[0].reason
+    assert any(f"{names[2]}: no tags of a camera; taken as by Maker Drone" in each for each in said(found))
+
+
+def test_photographs_without_any_tags_are_photographs(tmp_path):
+    for k in range(COUNT):
+        picture(tmp_path / f"{k}.png", pixels(k, 160 + 8 * (k % 2)))
+    assert len(collect_images([tmp_path]).images) == COUNT
+
+
+def test_panoramas_are_named(tmp_path):
+    names = flight(tmp_path)
+    write_photograph(tmp_path / "PANO_0001.JPG", pixels(77, 240, 120), 77, np.zeros(3))
+    add_xmp(tmp_path / "PANO_0001.JPG", b'<rdf:Description GPano:ProjectionType="equirectangular"/>')
+    found = collect_images([tmp_path])
+    assert [photo.name for photo in found.images] == names
+    assert "is a panorama (equirectangular)" in found.excluded[0].reason
+
+
+# -------------------------------------------------------------------------------------- kinds that are not read
+
+
+@pytest.mark.parametrize(
+    ("suffix", "remedy"),
+    [(".HEIC", "convert"), (".heif", "convert"), (".avif", "convert"), (".DNG", "develop"), (".cr3", "develop")],
+)
+def test_photographs_of_kinds_that_are_not_read_are_named_with_the_remedy(tmp_path, suffix, remedy):
+    flight(tmp_path)
+    for k in range(3):
+        (tmp_path / f"IMG_{k}{suffix}").write_bytes(b"\0" * 40)
+    (tmp_path / f"DJI_0001{suffix}").write_bytes(b"\0" * 40)  # beside its JPEG: no news
+    found = collect_images([tmp_path])
+    assert any(f"3 {suffix.lower()} files are not read: {remedy}" in note for note in found.notes)
+    for file in tmp_path.glob("*.JPG"):
+        file.unlink()
+    with pytest.raises(CaptureError, match=f"4 {suffix.lower()} files are not read: {remedy}"):
+        collect_images([tmp_path])
+
+
+def test_heic_by_the_name_of_a_jpeg_is_named(tmp_path):
+    file = tmp_path / "IMG_0001.JPG"
+    file.write_bytes(b"\0\0\0\x24ftypheic" + b"\0" * 100)
+    with pytest.raises(UnusableImage, match="is no jpg but HEIC"):
+        read_image_metadata(file, file.name)
+
+
+# ---------------------------------------------------------------------------------------------- ends of JPEGs
+
+
+def jpeg(kind: str) -> bytes:
+    shown = Image.fromarray(pixels(3, 320, 240))
+    more = {
+        "plain": {"format": "JPEG"}, "progressive": {"format": "JPEG", "progressive": True},
+        "restarts": {"format": "JPEG", "restart_marker_rows": 1}, "gray": {"format": "JPEG"},
+        "several": {"format": "MPO", "save_all": True, "append_images": [shown.resize((160, 120))]},
+        "with a preview": {"format": "JPEG"},
+    }[kind]  # fmt: skip
+    if kind == "gray":
+        shown = shown.convert("L")
+    file = io.BytesIO()
+    shown.save(file, quality=90, **more)
+    content = file.getvalue()
+    if kind == "with a preview":  # whose own end is in the tags
+        small = io.BytesIO()
+        shown.resize((80, 60)).save(small, "JPEG")
+        tag = b"Preview\0" + small.getvalue()
+        content = content[:2] + b"\xff\xe5" + struct.pack(">H", len(tag) + 2) + tag + content[2:]
+    return content
+
+
+KINDS = ["plain", "progressive", "restarts", "gray", "several", "with a preview"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
+def test_what_is_cut_off_is_named_in_every_kind_of_jpeg(tmp_path, kind, share):
+    content, file = jpeg(kind), tmp_path / "a.jpg"
+    first = content.index(b"\xff\xd9\xff\xd8") if kind == "several" else len(content)
+    file.write_bytes(content[: int(share * first)])
+    with pytest.raises(UnusableImage, match=r"cut off|damaged"):
+        read_image_metadata(file, file.name)
+    with pytest.raises(CaptureError):
+        verify_image(file)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "several"])
+@pytest.mark.parametrize("missing", [1, 2])
+def test_what_lacks_its_end_alone_is_used_with_a_note(tmp_path, kind, missing):
+    content, file = jpeg(kind), tmp_path / "a.jpg"
+    file.write_bytes(content[:-missing])
+    assert lacks_only_end(file)
+    assert not read_image_metadata(file, file.name).whole
+    assert verify_image(file).has_content
+    file.write_bytes(content)
+    assert read_image_metadata(file, file.name).whole
+    file.write_bytes(content + b"\0" * 500)  # what makers put behind it
+    assert read_image_metadata(file, file.name).whole
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "several"])
+def test_zeros_that_a_rescued_file_is_filled_up_with_are_no_pixels(tmp_path, kind):
+    content, file = jpeg(kind), tmp_path / "a.jpg"
+    file.write_bytes(content[: int(0.7 * len(content))] + bytes(len(content)))
+    with pytest.raises(UnusableImage, match="cut off"):
+        read_image_metadata(file, file.name)
+
+
+@pytest.mark.parametrize("orientation", [1, 6])
+def test_photographs_without_an_end_go_on_whole(tmp_path, orientation):
+    names = flight(tmp_path / "card", orientation=orientation)
+    whole = cv2.imread(str(tmp_path / "card" / names[0]), cv2.IMREAD_UNCHANGED)
+    for name in names:
+        file = tmp_path / "card" / name
+        file.write_bytes(file.read_bytes()[:-2])
+    found = collect_images([tmp_path / "card"])
+    assert any("lacks its end marker, but nothing of the picture; used" in each for each in said(found))
+    work = Workspace(tmp_path / "work")
+    assert write_upright_images(work, found.images) == []
+    with Image.open(work.images / names[0]) as image:
+        image.load()
+        assert image.size == ((160, 120) if orientation == 1 else (120, 160))
+    if orientation == 1:
+        assert np.array_equal(cv2.imread(str(work.images / names[0]), cv2.IMREAD_UNCHANGED), whole)

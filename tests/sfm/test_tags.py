@@ -1,0 +1,314 @@
+"""Tags of photographs that contradict each other, are defaults, or are written as few programs write them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
+
+from support.flights import add_xmp, write_photograph
+from vdgs.captures.angles import degrees_of_text
+from vdgs.config.sfm_options import SfmOptions
+from vdgs.sfm.exif_gps import read_altitude, read_place
+from vdgs.sfm.feature_extraction import group_by_camera
+from vdgs.sfm.focal_length import AGREE, EQUIVALENT, SENSOR, read_lens
+from vdgs.sfm.gps_priors import read_gps_priors
+from vdgs.sfm.image_list import collect_images
+from vdgs.sfm.image_metadata import (
+    DEFAULT_ANGLES,
+    ImageMetadata,
+    attitude_from_gimbal,
+    read_attitude,
+    read_image_metadata,
+)
+from vdgs.sfm.incremental_mapper import should_fix_focal
+from vdgs.sfm.preflight import make_preflight_report
+from vdgs.sfm.xmp import read_xmp
+
+NOISE = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
+R = IFDRational
+SOUTH, WEST = -33.5, -70.6
+
+
+def photograph(folder: Path, number: int, **more) -> ImageMetadata:
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / f"p{number:02d}.jpg"
+    write_photograph(file, np.roll(NOISE, number, axis=0), number, np.array((10.0 * number, 0, 40)), **more)
+    return read_image_metadata(file, file.name)
+
+
+def packet(attributes: str) -> dict[str, str]:
+    return read_xmp(f"<rdf:Description {attributes}/>".encode())
+
+
+# ------------------------------------------------------------------------------------------------------ places
+
+
+@pytest.mark.parametrize(
+    ("latitude", "side", "longitude", "other_side"),
+    [
+        pytest.param((R(33, 1), R(30, 1), R(0, 1)), "S", (R(70, 1), R(36, 1), R(0, 1)), "W", id="as it should be"),
+        pytest.param((R(33, 1), R(30, 1)), "S", (R(70, 1), R(36, 1)), "W", id="degrees and minutes"),
+        pytest.param((R(33, 1), R(30, 1), R(0, 0)), "S", (R(70, 1), R(36, 1), R(0, 0)), "W", id="seconds 0/0"),
+        pytest.param(R(335, 10), "S", R(706, 10), "W", id="one rational"),
+        pytest.param((R(335, 10),), "s\0", (R(706, 10),), "w\0", id="one in a list, small letters"),
+        pytest.param((R(335, 10), R(0, 1), R(0, 1)), "South", (R(706, 10), R(0, 1), R(0, 1)), "West", id="words"),
+        pytest.param((-33.5, 0.0, 0.0), "", (-70.6, 0.0, 0.0), "", id="signs"),
+        pytest.param((-33.0, 30.0, 0.0), "S", (-70.0, 36.0, 0.0), "W", id="signs and references"),
+        pytest.param("33.5", "S", "70.6", "W", id="text"),
+        pytest.param("33,30,0S", "", "70,36.0W", "", id="text as in XMP"),
+        pytest.param(b"33 30 0\0", b"S", b"70 36 0\0", b"W", id="bytes"),
+        pytest.param("33\u00b030'0\" South", "", "70 deg 36' 0.00\" W", "", id="text as of exiftool"),
+    ],
+)
+def test_places_are_read_in_every_way_that_programs_write_them(latitude, side, longitude, other_side):
+    place, said = read_place({1: side, 2: latitude, 3: other_side, 4: longitude}, {})
+    assert place == pytest.approx((SOUTH, WEST), abs=1e-9)
+    assert said == ""
+
+
+@pytest.mark.parametrize(
+    ("gps", "said"),
+    [
+        ({1: "S", 2: (R(0, 0), R(0, 0), R(0, 0)), 3: "W", 4: (70.0, 36.0, 0.0)}, "not understood (latitude"),
+        ({1: "S", 2: (33.0, R(5, 0), 0.0), 3: "W", 4: (70.0, 36.0, 0.0)}, "not understood (latitude"),
+        ({1: "S", 2: (33.0, 30.0, 0.0)}, "not understood (longitude missing)"),
+        ({1: "S", 2: (133.0, 30.0, 0.0), 3: "W", 4: (70.0, 36.0, 0.0)}, "not understood (latitude"),
+        ({1: "O", 2: (33.0, 30.0, 0.0), 3: "O", 4: (70.0, 36.0, 0.0)}, "not understood (latitude"),
+        ({2: (33.0, 30.0, 0.0), 4: (70.0, 36.0, 0.0)}, "no hemisphere (latitude S or N, longitude W or E)"),
+        ({1: "S", 2: (33.0, 30.0, 0.0), 4: (70.0, 36.0, 0.0)}, "no hemisphere (longitude W or E)"),
+    ],
+)
+def test_what_is_there_but_not_understood_is_said(gps, said):
+    place, why = read_place(gps, {})
+    assert place is None
+    assert said in why
+
+
+@pytest.mark.parametrize(
+    "attributes",
+    [
+        'drone-dji:GpsLatitude="-33.5" drone-dji:GpsLongtitude="-70.6"',
+        'drone-dji:GpsLatitude="-33.5" drone-dji:GpsLongitude="-70.6"',
+        'drone-skydio:Latitude="-33.5" drone-skydio:Longitude="-70.6"',
+        'exif:GPSLatitude="33,30.0S" exif:GPSLongitude="70,36.0W"',
+        'exif:GPSLatitude="33,30,0S" exif:GPSLongitude="70,36,0W"',
+    ],
+)
+def test_xmp_fills_what_exif_lacks_and_its_contradiction_is_no_knowledge(attributes):
+    xmp = packet(attributes)
+    assert read_place({}, xmp) == (pytest.approx((SOUTH, WEST)), "")
+    assert read_place({2: (33.0, 30.0, 0.0), 4: (70.0, 36.0, 0.0)}, xmp) == (pytest.approx((SOUTH, WEST)), "")
+    assert read_place({1: "S", 2: (33.0, 30.0, 0.0), 3: "W", 4: (70.0, 36.0, 0.1)}, xmp)[1] == ""
+    for sides, minutes, said in ((("N", "W"), 30.0, "hemispheres"), (("S", "W"), 31.0, "places")):
+        place, why = read_place({1: sides[0], 2: (33.0, minutes, 0.0), 3: sides[1], 4: (70.0, 36.0, 0.0)}, xmp)
+        assert place is None
+        assert f"different {said}" in why
+
+
+@pytest.mark.parametrize(
+    ("gps", "altitude"),
+    [
+        ({5: b"\0", 6: R(120, 1)}, 120),
+        ({5: b"\1", 6: R(120, 1)}, -120),
+        ({5: 1, 6: R(-120, 1)}, -120),
+        ({5: "1", 6: 120.0}, -120),
+        ({5: 2, 6: 120.0}, 120),  # Exif 3: above the sea
+        ({5: 3, 6: 120.0}, -120),
+        ({6: R(0, 0)}, None),
+        ({5: 0, 6: 1e9}, None),
+    ],
+)
+def test_altitudes_and_their_references(gps, altitude):
+    assert read_altitude(gps, {})[0] == altitude
+    if altitude is None and 5 not in gps:
+        assert read_altitude(gps, packet('drone-dji:AbsoluteAltitude="+41.5"'))[0] == 41.5
+
+
+@pytest.mark.parametrize(
+    ("text", "degrees"),
+    [("-33.5", -33.5), ("33,5", 33.5), ("+0.1", 0.1), ("N 33 30 0", 33.5), ("33 minutes", 33), ("x", None), ("", None)],
+)
+def test_angles_are_read_from_text(text, degrees):
+    read = degrees_of_text(text, "latitude")
+    assert (read and read[0]) == (degrees if degrees is None else pytest.approx(degrees))
+
+
+def test_a_flight_without_a_hemisphere_is_told(tmp_path):
+    for k in range(4):
+        photograph(tmp_path, k)
+        file = tmp_path / f"p{k:02d}.jpg"
+        with Image.open(file) as image:
+            exif = image.getexif()
+        for tag in (1, 3):
+            del exif.get_ifd(0x8825)[tag]
+        Image.fromarray(np.roll(NOISE, k, axis=0)).save(file, quality=95, exif=exif)
+    kept = collect_images([tmp_path])
+    found = make_preflight_report(kept, read_gps_priors(kept.images, None, (1.0, 2.0)))
+    assert any("p00.jpg, p01.jpg, p02.jpg and 1 more: " in each and "no hemisphere" in each for each in found.warnings)
+
+
+# -------------------------------------------------------------------------------------------------------- lens
+
+#: 8.5 mm and 40 pixels a millimetre: 340 px of 400, or 30 mm of 35 mm film.
+DETAILS = {0x920A: 8.5, 0xA002: 400, 0xA003: 300, 0xA20E: 40.0, 0xA210: 4}
+
+
+@pytest.mark.parametrize(
+    ("changes", "size", "focal", "source", "doubted"),
+    [
+        pytest.param({}, (400, 300), 0.85, SENSOR, False, id="plain"),
+        pytest.param({0xA405: 30}, (400, 300), 0.85, SENSOR, False, id="two that agree"),
+        pytest.param({0xA405: 30}, (200, 150), 0.85, SENSOR, False, id="shrunk"),
+        pytest.param({0xA20E: 160.0, 0xA405: 30}, (400, 300), 0.867, EQUIVALENT, True, id="shrunk, size rewritten"),
+        pytest.param({0xA210: 2, 0xA405: 30}, (400, 300), 0.867, EQUIVALENT, False, id="called inches"),
+        pytest.param({0xA405: 8.5}, (400, 300), 0.85, SENSOR, True, id="an equivalent that repeats the focal length"),
+        pytest.param({0xA405: 0}, (400, 300), 0.85, SENSOR, False, id="no equivalent"),
+        pytest.param({0xA404: 2.0}, (400, 300), 1.7, SENSOR, False, id="digital zoom"),
+        pytest.param({0xA404: 2.0, 0xA405: 60}, (400, 300), 1.7, SENSOR, False, id="zoom that the equivalent knows"),
+        pytest.param({0xA404: 2.0, 0xA405: 30}, (400, 300), 1.7, SENSOR, False, id="zoom that it does not"),
+        pytest.param({0xA404: 0.0}, (400, 300), 0.85, SENSOR, False, id="zoom 0: none"),
+        pytest.param({0xA404: R(0, 0)}, (400, 300), 0.85, SENSOR, False, id="zoom 0/0"),
+        pytest.param({0xA404: 1.0}, (400, 300), 0.85, SENSOR, False, id="zoom 1"),
+        pytest.param({0x920A: 0, 0xA404: 2.0, 0xA405: 60}, (400, 300), 1.733, EQUIVALENT, False, id="phone, zoomed"),
+        pytest.param({0xA405: 30}, (400, 225), 0.85, SENSOR, False, id="cut above and below"),
+        pytest.param({0xA405: 30}, (200, 300), 340 / 300, SENSOR, False, id="cut at the sides"),
+    ],
+)
+def test_ways_to_the_focal_length_are_held_against_each_other(changes, size, focal, source, doubted):
+    lens = read_lens({}, DETAILS | changes, {}, *size)
+    assert lens is not None
+    assert (lens.focal, lens.source) == (pytest.approx(focal, abs=2e-3), source)
+    assert bool(lens.doubt) is doubted
+
+
+def test_a_contradiction_names_both_and_is_not_held(tmp_path):
+    lens = read_lens({}, DETAILS | {0xA20E: 160.0, 0xA405: 30}, {}, 400, 300)
+    assert lens is not None
+    assert "1360 px by EXIF's focal length and sensor" in lens.doubt
+    assert "347 px by EXIF's 35 mm equivalent" in lens.doubt
+    seen = [replace(photograph(tmp_path, k), lens=lens) for k in range(4)]
+    where = read_gps_priors(seen, None, (1.0, 2.0))
+    assert should_fix_focal(seen, where, SfmOptions()) == (False, "what the photographs say of it contradicts itself")
+
+
+def test_what_three_ways_say_is_by_majority():
+    tags = {0x0110: "FC6310"}  # a sensor 13.2 mm wide
+    details = {0x920A: 8.8, 0xA405: 24, 0xA002: 1368, 0xA20E: 2 * 5472 / 13.2, 0xA210: 4}
+    lens = read_lens(tags, details, {}, 1368, 912)
+    assert lens is not None
+    assert lens.focal == pytest.approx(8.8 / 13.2)
+    assert "FC6310" in lens.source
+    assert "px by EXIF's focal length and sensor" in lens.doubt
+
+
+def test_a_size_that_was_rewritten_does_not_vote_twice():
+    """The calibration and the sensor are both of the original's pixels, four times too long here."""
+    xmp = packet('drone-dji:CalibratedFocalLength="3648.0"')
+    details = {0x920A: 8.8, 0xA405: 24, 0xA002: 1368, 0xA003: 912, 0xA20E: 5472 / 13.2, 0xA210: 4}
+    lens = read_lens({}, details, xmp, 1368, 912)
+    assert lens is not None
+    assert (lens.source, lens.focal) == (EQUIVALENT, pytest.approx(0.667, abs=2e-3))
+    without = read_lens({0x0110: "FC6310"}, {**details, 0xA405: 0}, {}, 1368, 912)
+    assert without is not None
+    assert without.focal == pytest.approx(8.8 / 13.2)  # the table of sensors
+
+
+def test_the_makers_calibration_survives_a_rewritten_size():
+    xmp = packet('drone-dji:CalibratedFocalLength="3666.6" drone-dji:CalibratedOpticalCenterX="2736.0"')
+    lens = read_lens({}, {0xA002: 1368, 0xA003: 912}, xmp, 1368, 912)
+    assert lens is not None
+    assert lens.focal == pytest.approx(3666.6 / 5472)
+    assert 1 / AGREE < lens.focal / 0.667 < AGREE
+
+
+@pytest.mark.parametrize("in_focal_length", [False, True])
+def test_digital_zoom_is_a_camera_of_its_own_and_counts_once(tmp_path, in_focal_length):
+    for k in range(6):
+        photograph(tmp_path, k)
+        if k % 3 == 2:
+            file = tmp_path / f"p{k:02d}.jpg"
+            with Image.open(file) as image:
+                exif, xmp = image.getexif(), image.info["xmp"]
+            details = exif.get_ifd(0x8769)
+            details[0xA404] = 2.0
+            details[0x920A] = details[0x920A] * (2 if in_focal_length else 1)
+            Image.fromarray(np.roll(NOISE, k, axis=0)).save(file, quality=95, exif=exif)
+            add_xmp(file, xmp)
+    kinds = group_by_camera(collect_images([tmp_path]).images)
+    assert [(len(kind.images), kind.focal_px) for kind in kinds] == [
+        (4, pytest.approx(136)), (2, pytest.approx(272)),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("unknown", [1, 5])
+def test_one_stray_does_not_change_the_rule_for_all(tmp_path, unknown):
+    seen = [photograph(tmp_path, k) for k in range(6)]
+    seen = [replace(photo, lens=None) if k < unknown else photo for k, photo in enumerate(seen)]
+    assert should_fix_focal(seen, read_gps_priors(seen, None, (1.0, 2.0)), SfmOptions())[0] is (unknown == 1)
+
+
+# --------------------------------------------------------------------------------------------------- attitudes
+
+
+@pytest.mark.parametrize(
+    ("attributes", "angles"),
+    [
+        ('dji:GimbalYawDegree="+30.0" dji:GimbalPitchDegree="-60.0" dji:GimbalRollDegree="+0.0"', (30, -60, 0)),
+        ('drone:GimbalYawDegree="30" drone:GimbalPitchDegree="-60" drone:GimbalRollDegree="0"', (30, -60, 0)),
+        ('parrot:CameraYawDegree="30" parrot:CameraPitchDegree="-60" parrot:CameraRollDegree="0"', (30, -60, 0)),
+        ('Camera:Yaw="30" Camera:Pitch="30" Camera:Roll="0"', (30, -60, 0)),  # Pix4D: 0 looks down
+        ('Camera:Yaw="30/1" Camera:Pitch="-60" Camera:Roll="0"', (30, -60, 0)),
+        ('drone-dji:GimbalPitchDegree="-60" drone-dji:FlightYawDegree="+30.0"', (30, -60, 0)),
+        ('drone-dji:GimbalPitchDegree="-90"', (0, -90, 0)),
+    ],
+)  # fmt: skip
+def test_attitudes_are_read_under_every_makers_names(attributes, angles):
+    xmp = packet(attributes)
+    elements = "".join(f"<{name}>{value}</{name}>" for name, value in xmp.items())
+    for values in (xmp, read_xmp(elements.encode())):
+        attitude, said = read_attitude(values)
+        assert attitude is not None
+        assert said == ""
+        assert attitude.camera_from_enu == pytest.approx(attitude_from_gimbal(*angles).camera_from_enu, abs=1e-9)
+
+
+def test_a_camera_inside_a_structure_is_not_mistaken_for_the_vehicle():
+    structure = (
+        "<d:VehicleOrientationNED rdf:parseType='Resource'><d:Yaw>1</d:Yaw><d:Pitch>2</d:Pitch><d:Roll>3</d:Roll>"
+        "</d:VehicleOrientationNED><d:CameraOrientationNED rdf:parseType='Resource'><d:Yaw>30</d:Yaw>"
+        "<d:Pitch>-60</d:Pitch><d:Roll>0</d:Roll></d:CameraOrientationNED>"
+    )
+    attitude, _ = read_attitude(read_xmp(structure.encode()))
+    assert attitude is not None
+    assert attitude.camera_from_enu == pytest.approx(attitude_from_gimbal(30, -60, 0).camera_from_enu)
+
+
+@pytest.mark.parametrize(
+    ("attributes", "said"),
+    [
+        ('drone-dji:GimbalYawDegree="+0.00" drone-dji:GimbalPitchDegree="+0.00" drone-dji:GimbalRollDegree="+0.00"',
+         DEFAULT_ANGLES),
+        ('drone-dji:GimbalPitchDegree="0"', DEFAULT_ANGLES),
+        ('drone-parrot:CameraYawDegree="0" drone-parrot:CameraPitchDegree="-0.0"', DEFAULT_ANGLES),
+        ('drone-dji:GimbalPitchDegree="-45"', ""),  # oblique, and nothing says where to
+        ('drone-dji:GimbalYawDegree="30"', ""),
+        ("", ""),
+    ],
+)  # fmt: skip
+def test_defaults_and_halves_of_attitudes_are_none(attributes, said):
+    assert read_attitude(packet(attributes)) == (None, said)
+
+
+def test_the_same_level_view_in_all_photographs_is_a_default(tmp_path):
+    level = 'drone-dji:GimbalYawDegree="90.0" drone-dji:GimbalPitchDegree="0.1" drone-dji:GimbalRollDegree="0"'
+    for k in range(4):
+        photograph(tmp_path / "same", k, xmp=level)
+        photograph(tmp_path / "other", k, xmp=level.replace("90.0", f"9{k}.0"))
+    same, other = (collect_images([tmp_path / name]).images for name in ("same", "other"))
+    assert all(photo.attitude is None and "default" in photo.doubts[0] for photo in same)
+    assert all(photo.attitude is not None and not photo.doubts for photo in other)
