@@ -48,7 +48,7 @@ class BenchArguments:
     settings, seeds and scenes are taken from there and not trained, and the table says where each is from."""
     data: Path | None = None
     """Folder that holds the scenes with names which are not generated: residence-pixsfm, copr, ..."""
-    scale_iterations: Annotated[float, Range(0, 1000, above=True)] = 1.0
+    scale_iterations: Annotated[float, Range(0, 1000, exclusive_min=True)] = 1.0
     """Factor on the iterations of every scene."""
     iterations_total: Annotated[int | None, Range(1, MAX_COUNT)] = None
     """Iterations that every method may spend on a scene, shared out as the scene's own; overrides the factor."""

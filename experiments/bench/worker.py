@@ -67,7 +67,7 @@ class _JobContext:
 
 
 def _coarse(at: _JobContext) -> None:
-    from vdgs.config.checkpointing import CheckpointOptions
+    from vdgs.config.executor_options import CheckpointOptions
     from vdgs.pipeline.train_coarse import train_coarse
 
     if at.job.coarse_from is not None:
@@ -84,7 +84,7 @@ def _partition(at: _JobContext) -> None:
 
 
 def _blocks(at: _JobContext) -> None:
-    from vdgs.config.checkpointing import CheckpointOptions
+    from vdgs.config.executor_options import CheckpointOptions
     from vdgs.pipeline.train_blocks import train_blocks
 
     train_blocks(at.context, CheckpointOptions(), at.job.block_jobs, at.console)

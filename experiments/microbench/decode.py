@@ -93,7 +93,7 @@ def use(isa: str, threads: int) -> None:
     """Run the kernels of one instruction set on so many threads."""
     chosen = extension.load_extension(isa)
     chosen.set_threads(threads)
-    mock.patch.object(extension, "native", return_value=chosen).start()
+    mock.patch.object(extension, "get_extension", return_value=chosen).start()
 
 
 def report_cull(n: int, isas: list[str]) -> None:

@@ -34,7 +34,7 @@ from vdgs.cli.main import main as vdgs
 from vdgs.kernels.cuda.driver import CudaUnavailable, get_cuda_driver
 from vdgs.kernels.cuda.nvrtc import CompileTarget, get_nvrtc
 from vdgs.kernels.gpu import rasterizer
-from vdgs.kernels.gsplat.rasterize import GsplatUnavailable
+from vdgs.kernels.gsplat import GsplatUnavailable
 
 #: Sources and the headers that they include.
 SOURCES = {

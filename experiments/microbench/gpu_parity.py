@@ -17,7 +17,7 @@ from torch import Tensor
 
 from experiments.microbench.step import scene
 from vdgs.kernels import cuda, gsplat
-from vdgs.kernels.gsplat.rasterize import GsplatUnavailable
+from vdgs.kernels.gsplat import GsplatUnavailable
 from vdgs.kernels.kernel_types import (
     AdamState,
     AnchorSplats,

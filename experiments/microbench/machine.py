@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from vdgs.kernels import cpu_count
 from vdgs.kernels.cpu.extension import active_isa, supported_isas
-from vdgs.kernels.thread_count import cpu_count
 
 
 def describe() -> str:

@@ -105,7 +105,7 @@ def test_each_number_out_of_range_is_named_as_the_command_line_names_it():
     [
         ["run", "C", "--output", "R", "--expansion", "nan"],
         ["run", "C", "--output", "R", "--threads", "-3"],
-        ["coarse", "C", "--output", "R", "--downscale", "1e9"],
+        ["train-coarse", "C", "--output", "R", "--downscale", "1e9"],
         ["inspect", "C", "--output", "R", "--test-every", "0"],
         ["render", "R", "--output", "O", "--seconds", "nan"],
         ["render", "R", "--output", "O", "--width", "10000000"],
@@ -128,12 +128,12 @@ def test_the_command_line_says_so_at_once(arguments, tmp_path, monkeypatch, caps
     [
         ({"training": {"iterations": "many"}}, r"training\.iterations is 'many'; it must be a whole number"),
         ({"training": {"iterations": 1.5}}, "must be a whole number"),
-        ({"training": {"rates": {"offsets": [1]}}}, "must be a list of 2: a number, a number"),
+        ({"training": {"lr": {"offsets": [1]}}}, "must be a list of 2: a number, a number"),
         ({"training": {"anchors": 3}}, "not a group of settings"),
         ({"partition": {"blocks": "most"}}, "must be a whole number or auto"),
         ({"partition": {"balanced": 1}}, "must be true or false"),
-        ({"block": {"ring": "frozn"}}, "must be frozen or ramp or free"),
-        ({"block": {"sampeling": "uniform"}}, "block has no 'sampeling'; did you mean 'sampling'"),
+        ({"block": {"margin": "frozn"}}, "must be frozen or ramp or free"),
+        ({"block": {"view_sampeling": "uniform"}}, "block has no 'view_sampeling'; did you mean 'view_sampling'"),
     ],
 )
 def test_a_value_of_another_kind_is_named(settings, says):
@@ -142,5 +142,6 @@ def test_a_value_of_another_kind_is_named(settings, says):
 
 
 def test_a_number_that_yaml_takes_for_text_is_still_one():
-    assert from_dict(MethodConfig, {"block": {"growth": {"threshold": "1e-4"}}}).block.growth.threshold == 1e-4
+    densify = from_dict(MethodConfig, {"block": {"densify": {"grad_threshold": "1e-4"}}}).block.densify
+    assert densify.grad_threshold == 1e-4
     assert to_dict(from_dict(CaptureOptions, {"gps": "/a.csv"}))["gps"] == "/a.csv"

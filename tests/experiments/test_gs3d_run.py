@@ -22,7 +22,7 @@ from experiments.baselines.gs3d.training import (
 from support.captures import tiny_scene, write_colmap
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
-from vdgs.config.checkpointing import CheckpointOptions
+from vdgs.config.executor_options import CheckpointOptions
 from vdgs.errors import RunError, Stopped, VdgsError
 from vdgs.evaluation.renderable_model import EvaluationSettings
 from vdgs.geometry.camera import Camera

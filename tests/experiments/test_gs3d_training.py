@@ -31,7 +31,7 @@ from experiments.baselines.gs3d.training import (
     train,
 )
 from support.checkerboard import Photographs
-from vdgs.config.checkpointing import CheckpointOptions
+from vdgs.config.executor_options import CheckpointOptions
 from vdgs.errors import TrainingDiverged, VdgsError
 from vdgs.kernels import cpu, get_num_threads, set_num_threads
 from vdgs.runs.stage_folder import StageFolder

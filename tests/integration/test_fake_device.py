@@ -88,7 +88,7 @@ def rasterizer(request, drivers, compiled_code, monkeypatch) -> str:
 def test_a_step_on_another_device_makes_the_numbers_of_the_processor(monkeypatch, rasterizer):
     with pretended_card():
         found = to_checkpoint(trained_on(CARD, 1)).tensors
-    monkeypatch.setenv(kernels.KERNELS_ENV_VAR, "reference")
+    monkeypatch.setenv(kernels.KERNELS_ENV_VAR, "torch_ref")
     expected = to_checkpoint(trained_on(CPU, 1)).tensors
     assert found.keys() == expected.keys()
     for name, tensor in expected.items():
@@ -148,6 +148,6 @@ def test_mixed_devices_are_found(monkeypatch, rasterizer):
 def test_cards_take_the_composed_set_and_the_processor_its_own(monkeypatch):
     assert kernels.get_backend(CARD).__name__ == "vdgs.kernels.gpu"
     assert kernels.get_backend(CPU).__name__ == "vdgs.kernels.cpu"
-    for name in ("reference", "composed"):
+    for name in ("torch_ref", "gpu"):
         monkeypatch.setenv(kernels.KERNELS_ENV_VAR, name)
         assert kernels.get_backend(CPU).__name__ == f"vdgs.kernels.{name}"

@@ -29,7 +29,7 @@ def runs(native_small, tmp_path_factory) -> tuple[Path, Path, Path]:
     twin, shared = folder / "twin", folder / "shared"
     shutil.copytree(native_small.coarse, shared)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(kernels.KERNELS_ENV_VAR, "reference")
+        patch.setenv(kernels.KERNELS_ENV_VAR, "torch_ref")
         assert kernels.get_backend(torch.device("cpu")) is torch_ref
         train_coarse(native_small.capture, twin)
         after_the_coarse_stage(twin)

@@ -222,8 +222,9 @@ class TestCache:
         assert compile_cache.load_or_compile("k", PARTS, lambda: b"code") == b"code"
 
     def test_processes_at_once(self):
-        code = "from vdgs.kernels.cuda.compile_cache import cached\n"
-        code += "for _ in range(3): assert cached('k', {'source': 'same'}, lambda: b'x' * 100_000) == b'x' * 100_000"
+        code = "from vdgs.kernels.cuda.compile_cache import load_or_compile\n"
+        code += "code = b'x' * 100_000\n"
+        code += "for _ in range(3): assert load_or_compile('k', {'source': 'same'}, lambda: code) == code"
         environment = {compile_cache.CUDA_CACHE_ENV_VAR: str(compile_cache.cache_folder())}
         with python_begun(code, **environment) as one, python_begun(code, **environment) as other:
             assert [each.finished().returncode for each in (one, other)] == [0, 0]

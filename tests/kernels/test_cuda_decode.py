@@ -12,12 +12,10 @@ import torch
 from support.cuda_on_host import ORDERS, HostDriver, build_on_host, needs_a_compiler, needs_nvrtc
 from support.decode_scenes import Scene, looking_down, moved_by, turned
 from vdgs.geometry.camera import Camera
-from vdgs.kernels.cuda.decode import PROGRAM, decode, decode_for_training, expand_sources
+from vdgs.kernels.cuda.decode import PROGRAM, SplatCapacity, decode, decode_for_training, expand_sources
 from vdgs.kernels.cuda.decode_adam import decode_backward_adam
 from vdgs.kernels.cuda.driver import get_cuda_driver
-from vdgs.kernels.cuda.launch import CudaProgram, read_header, read_source
-from vdgs.kernels.cuda.packed_camera import PackedCamera
-from vdgs.kernels.cuda.splat_capacity import SplatCapacity
+from vdgs.kernels.cuda.launch import CudaProgram, PackedCamera, read_header, read_source
 from vdgs.kernels.kernel_types import AdamState, AnchorSplats, SplatGradients, Splats, TrainingSplats
 from vdgs.kernels.splat_segments import SplatMask
 from vdgs.kernels.torch_ref.decode import decode as reference
@@ -147,7 +145,7 @@ def test_nothing_to_show_has_no_mean_volume(library):
 class Narrow(SplatCapacity):
     """As if a view had needed less than the next one."""
 
-    def for_anchors(self, count, offsets, device):
+    def estimate(self, count, offsets, device):
         return 11
 
 
@@ -300,7 +298,7 @@ class TestMoving:
         whole = moved_by(moving, scene, turned(), rows)
         program = moving.keywords["program"]
         program.driver.launched.clear()
-        pieces = moved_by(partial(moving, piece=16), scene, turned(), rows)
+        pieces = moved_by(partial(moving, chunk=16), scene, turned(), rows)
         assert [grid for _, grid, _ in program.driver.launched] == [(2, 1, 1), (1, 1, 1)]
         assert all(torch.equal(one, other) for one, other in zip(whole[1], pieces[1], strict=True))
         for one, other in zip(whole[3], pieces[3], strict=True):

@@ -18,14 +18,14 @@ from vdgs.kernels.cuda import nvrtc as nvrtc_module
 from vdgs.kernels.cuda.driver import CudaUnavailable, GpuInfo
 from vdgs.kernels.device_selection import DeviceUnavailable, SelectedDevice, select_device
 from vdgs.kernels.gpu import rasterizer
-from vdgs.kernels.gsplat.rasterize import GsplatUnavailable
+from vdgs.kernels.gsplat import GsplatUnavailable
 
 
 @pytest.fixture
 def _two_cards(monkeypatch: pytest.MonkeyPatch):
     """As if this were a machine with two cards."""
     cards = [GpuInfo(index, "Card", 8 * 10**9, (8, 6)) for index in (0, 1)]
-    monkeypatch.setattr(driver, "get_cuda_driver", lambda: SimpleNamespace(cards=lambda: cards))
+    monkeypatch.setattr(driver, "get_cuda_driver", lambda: SimpleNamespace(list_gpus=lambda: cards))
     monkeypatch.setattr(nvrtc_module, "get_nvrtc", lambda: None)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
 
@@ -46,8 +46,8 @@ def test_the_table_says_who_does_what(operation):
         assert found is getattr(ways[0], operation)
     else:
         assert found.__module__ == "vdgs.kernels.gpu.rasterizer"
-    assert operations.backends_for(operation, "cpu") == ("native",)
-    assert operations.backends_for(operation, "mps") == ("reference",)
+    assert operations.backends_for(operation, "cpu") == ("cpu",)
+    assert operations.backends_for(operation, "mps") == ("torch_ref",)
 
 
 class TestWhichRasterizerDraws:
@@ -129,14 +129,14 @@ class TestWithCards:
 
 
 def test_deciding_needs_no_torch():
-    code = "import sys, vdgs.kernels.device_selection as d; d.choose('auto'); print('torch' in sys.modules)"
+    code = "import sys, vdgs.kernels.device_selection as d; d.select_device('auto'); print('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "False"
 
 
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["coarse", "nowhere", "--output", "run"],
+        ["train-coarse", "nowhere", "--output", "run"],
         ["run", "nowhere", "--output", "run"],
         ["render", "nowhere", "--output", "pictures"],
         ["eval", "nowhere"],
@@ -171,21 +171,22 @@ def test_doctor_says_what_there_is(monkeypatch: pytest.MonkeyPatch, tmp_path):
     (tmp_path / "loss.cu-sm_86-0.bin").touch()
     cards = [GpuInfo(0, "A card", 24 * 10**9, (8, 6))]
     monkeypatch.setattr(
-        doctor_cuda, "get_cuda_driver", lambda: SimpleNamespace(cards=lambda: cards, version=lambda: (12, 8))
+        doctor_cuda, "get_cuda_driver", lambda: SimpleNamespace(list_gpus=lambda: cards, version=lambda: (12, 8))
     )
     found = nvrtc_module.NvrtcLibrary("/somewhere/libnvrtc.so.13", "the wheel nvidia-cuda-nvrtc")
-    monkeypatch.setattr(doctor_cuda, "get_nvrtc", lambda: SimpleNamespace(version=(13, 0), found=found))
+    monkeypatch.setattr(doctor_cuda, "get_nvrtc", lambda: SimpleNamespace(version=(13, 0), library_info=found))
     lines = {check.name: check for check in doctor_cuda.cuda_checks()}
     assert lines["CUDA card 0"].value == "A card, 24.0 GB, compute capability 8.6; driver for CUDA 12.8"
     assert lines["NVRTC"].value == "13.0, from the wheel nvidia-cuda-nvrtc: /somewhere/libnvrtc.so.13"
     assert lines["CUDA kernels"].value.startswith("compiled code in")
     assert lines["CUDA kernels"].value.endswith("1 entries")
-    assert lines["on cpu: native"].value == f"all {len(operations.OPERATION_NAMES)} operations"
+    assert lines["on cpu: cpu"].value == f"all {len(operations.OPERATION_NAMES)} operations"
     assert lines["on cuda: cuda"].value == (
-        "add_view_statistics, cull, decode, decode_backward_adam, decode_to_train, photometric_loss, shares"
+        "add_view_statistics, cull, decode, decode_backward_adam, decode_for_training, photometric_loss, "
+        "splat_contributions"
     )
-    assert lines["on cuda: gsplat or cuda"].value == "rasterise, rasterise_vjp"
-    assert "adam_rows" in lines["on cuda: reference"].value
+    assert lines["on cuda: gsplat or cuda"].value == "rasterize, rasterize_vjp"
+    assert "adam_rows" in lines["on cuda: torch_ref"].value
     assert lines["--device auto"].value.startswith("cpu: vdgs has not been run on a GPU")
     assert all(check.is_ok for check in lines.values())
 

@@ -18,8 +18,7 @@ from support.rasterize_scenes import (
     splats_of,
 )
 from vdgs.errors import VdgsError
-from vdgs.kernels.gsplat import rasterize, rasterize_vjp
-from vdgs.kernels.gsplat.rasterize import GsplatUnavailable, load_gsplat, splat_radii_px
+from vdgs.kernels.gsplat import GsplatUnavailable, load_gsplat, rasterize, rasterize_vjp, splat_radii_px
 from vdgs.kernels.torch_ref.rasterize import rasterize as reference
 from vdgs.kernels.torch_ref.rasterize import rasterize_vjp as reference_vjp
 

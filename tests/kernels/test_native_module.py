@@ -37,7 +37,7 @@ def test_unknown_instruction_set_is_refused_by_name() -> None:
 
 
 def test_environment_chooses_instruction_set_and_threads() -> None:
-    code = "from vdgs.kernels.cpu import module as m; print(m.isa(), m.threads())"
+    code = "from vdgs.kernels.cpu import extension as m; print(m.active_isa(), m.get_num_threads())"
     done = python(code, VDGS_ISA="portable", VDGS_THREADS="3")
     assert done.stdout.split() == ["portable", "3"]
 
@@ -50,7 +50,7 @@ def test_environment_chooses_instruction_set_and_threads() -> None:
     ],
 )
 def test_environment_errors_say_what_is_wrong(variable: str, value: str, message: str) -> None:
-    done = python("from vdgs.kernels.cpu import module as m; m.native()", **{variable: value})
+    done = python("from vdgs.kernels.cpu import extension as m; m.get_extension()", **{variable: value})
     assert done.returncode != 0
     assert message in done.stderr
 
@@ -151,8 +151,8 @@ def test_an_exception_in_a_task_reaches_the_caller(isa: str) -> None:
 
 FORK = """
 import os, sys
-from vdgs.kernels.cpu.extension import load, supported
-modules = [load(name) for name in supported()]
+from vdgs.kernels.cpu.extension import load_extension, supported_isas
+modules = [load_extension(name) for name in supported_isas()]
 for m in modules:
     m.set_threads(4)
     assert m.check.sum_of_tasks(1000, -1) == 499500

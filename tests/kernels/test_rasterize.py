@@ -31,7 +31,7 @@ from vdgs.kernels.cpu.extension import load_extension, supported_isas
 from vdgs.kernels.cpu.rasterize import rasterize, rasterize_vjp, splat_contributions
 from vdgs.kernels.kernel_types import Raster, Splats
 from vdgs.kernels.torch_ref.rasterize import rasterize as reference
-from vdgs.kernels.torch_ref.splat_contributions import splat_contributions as twin
+from vdgs.kernels.torch_ref.rasterize import splat_contributions as twin
 
 ISAS = supported_isas()
 NAMES = ("means_px", "conics", "colors", "opacities", "depths", "background")

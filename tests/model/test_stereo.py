@@ -22,7 +22,7 @@ from vdgs.model.initialization.stereo import (
     compute_dense_points,
     fusion,
     pair_depth,
-    view_selection,
+    select_source_views,
 )
 from vdgs.model.initialization.stereo.fusion import CELL_SCALES, MIN_SPACING
 from vdgs.model.initialization.stereo.rectification import RectifiedPair
@@ -246,7 +246,7 @@ def test_a_full_disk_is_said_before_anything_is_matched(tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "posix_fallocate", full)
-    with pytest.raises(VdgsError, match=r"need .* GB there for a while \(No space left on device\). Free some space"):
+    with pytest.raises(VdgsError, match=r"need 1 MB there for a while \(No space left on device\). Free some space"):
         points_of(flight(), tmp_path)
     assert not list(tmp_path.iterdir())
 
@@ -255,10 +255,10 @@ def test_partners_stand_on_all_sides_and_see_the_same_ground():
     grid = [camera(x, y) for y in (-4.0, 0.0, 4.0) for x in (-4.0, 0.0, 4.0)]
     elsewhere = [camera(100.0 + x, 0.0) for x in (-2.0, 2.0)]
     points = np.concatenate([sparse(), sparse() + np.array([100.0, 0, 5.0])])
-    found = view_selection([*grid, *elsewhere], points, count=4)
+    found = select_source_views([*grid, *elsewhere], points, count=4)
     middle = np.array([grid[other].position[:2] for other in found[4]])
     assert (middle.min(0) < 0).all()
     assert (middle.max(0) > 0).all()
     assert all(other < 9 for mine in found[:9] for other in mine)
     assert (found[9], found[10]) == ([10], [9])
-    assert view_selection(grid, np.zeros((0, 3))) == [[]] * 9
+    assert select_source_views(grid, np.zeros((0, 3))) == [[]] * 9

@@ -12,7 +12,7 @@ from rich.console import Console
 from experiments.bench.plan import PlanOptions, make_plan
 from support.captures import tiny_scene, write_colmap
 from vdgs.config.capture_options import CaptureOptions
-from vdgs.config.checkpointing import CheckpointOptions
+from vdgs.config.executor_options import CheckpointOptions
 from vdgs.config.method import BlockConfig, DensifyConfig, MethodConfig, max_block_anchors
 from vdgs.config.validation_rules import validate_config
 from vdgs.pipeline.count_visibility import count_run_visibility

@@ -15,7 +15,7 @@ from support.hand_made_models import model_at
 from vdgs.captures.capture import Capture
 from vdgs.captures.capture_metadata import capture_metadata
 from vdgs.config.capture_options import CaptureOptions
-from vdgs.config.checkpointing import CheckpointOptions
+from vdgs.config.executor_options import CheckpointOptions
 from vdgs.config.method import AnchorConfig, DensifyConfig, MethodConfig, TrainConfig
 from vdgs.errors import RunError
 from vdgs.model.anchor_model import AnchorModel, ModelMetadata

@@ -12,8 +12,8 @@ from rich.console import Console
 from support.captures import tiny_scene, write_colmap
 from vdgs.cli.main import main
 from vdgs.config.capture_options import CaptureOptions
-from vdgs.config.checkpointing import CheckpointOptions
 from vdgs.config.commands import RenderRequest
+from vdgs.config.executor_options import CheckpointOptions
 from vdgs.config.method import AnchorConfig, MethodConfig, TrainConfig
 from vdgs.errors import CaptureError, RunError, VdgsError
 from vdgs.pipeline.train_coarse import train_coarse

@@ -16,7 +16,7 @@ from rich.console import Console
 from support.captures import TinyScene, data_folder, tiny_scene, write_colmap
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
-from vdgs.geometry.row_sampling import sample_points
+from vdgs.geometry.similarity import sample_points
 from vdgs.report.capture_report import inspect_capture, print_report
 from vdgs.report.capture_stats import format_length
 from vdgs.visibility.visibility_counts import count_visibility, visibility_stats

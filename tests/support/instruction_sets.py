@@ -17,7 +17,7 @@ every_instruction_set = pytest.mark.parametrize("instructions", extension.suppor
 @contextmanager
 def using(instructions: str) -> Iterator[None]:
     """Run the kernels built for one instruction set."""
-    with patch.object(extension, "native", lambda: extension.load_extension(instructions)):
+    with patch.object(extension, "get_extension", lambda: extension.load_extension(instructions)):
         yield
 
 

@@ -49,9 +49,9 @@ needs = st.builds(
     offsets=st.integers(1, 20),
     seen=st.floats(0, 1),
     pixels=st.integers(1, 10**8),
-    images_bytes=st.integers(0, 10**11),
+    image_cache_bytes=st.integers(0, 10**11),
     surroundings=st.integers(0, 10**7),
-    averaged=st.booleans(),
+    has_swa=st.booleans(),
     growth=st.floats(1, 20),
 )
 
@@ -66,7 +66,7 @@ def test_an_anchor_takes_what_was_measured():
 def test_what_is_more_takes_more(need):
     found = estimate_memory(need)
     assert found.start <= found.total
-    for name in ("anchors", "offsets", "pixels", "images_bytes", "surroundings"):
+    for name in ("anchors", "offsets", "pixels", "image_cache_bytes", "surroundings"):
         assert estimate_memory(replace(need, **{name: 2 * getattr(need, name)})).total >= found.total
     assert (
         estimate_memory(replace(need, max_anchors=need.anchors)).total
@@ -81,27 +81,27 @@ def test_the_picture_of_a_block_counts_in_the_largest_size_that_it_trains_with()
     ]
     assert max_image_pixels(cameras, ((0.0, 4), (0.1, 2), (0.4, 1))) == 5472 * 3648
     assert max_image_pixels(cameras, ((0.0, 4), (0.5, 2))) == 2736 * 1824
-    paper, laptop = (block_workload(PRESETS[name], 50_000, 400_000, 5472 * 3648) for name in ("paper", "laptop"))
+    default, laptop = (block_workload(PRESETS[name], 50_000, 400_000, 5472 * 3648) for name in ("default", "laptop"))
     assert estimate_memory(laptop).image == 150 * 5472 * 3648
-    assert (laptop.has_swa, paper.has_swa) == (True, False)
-    assert (laptop.max_grown_anchors, paper.max_grown_anchors) == (150_000, 750_000)
+    assert (laptop.has_swa, default.has_swa) == (True, False)
+    assert (laptop.max_grown_anchors, default.max_grown_anchors) == (150_000, 750_000)
     assert laptop.surroundings == 350_000
 
 
 def test_growth_below_a_fixed_threshold_is_expected_to_be_large():
     """On a real capture nearly all anchors are seen by fewer than a fifth of the cameras."""
     growths = {name: max_growth_factor(preset.block.compensation) for name, preset in PRESETS.items()}
-    assert growths == {"paper": MAX_COMPENSATED_GROWTH, "paper": MAX_COMPENSATED_GROWTH, "laptop": MAX_GROWTH}
+    assert growths == {"default": MAX_COMPENSATED_GROWTH, "paper": MAX_COMPENSATED_GROWTH, "laptop": MAX_GROWTH}
     lowest = CompensationConfig(t_low_quantile=0.25)
     assert max_growth_factor(lowest) == max_growth_factor(PRESETS["default"].training.compensation) == MAX_GROWTH
 
 
 @given(needs)
 def test_a_mean_of_models_takes_one_more_model(need):
-    plain, averaged = (estimate_memory(replace(need, averaged=each)) for each in (False, True))
+    plain, averaged = (estimate_memory(replace(need, has_swa=each)) for each in (False, True))
     assert averaged.start == plain.start
     more = averaged.total - plain.total
-    assert more == pytest.approx(4 * (32 + 6 + 3 * need.offsets) * need.grown, abs=1, rel=1e-9)
+    assert more == pytest.approx(4 * (32 + 6 + 3 * need.offsets) * need.max_grown_anchors, abs=1, rel=1e-9)
 
 
 @pytest.mark.parametrize(("kind", "option"), [("coarse", "--swa-fraction 0"), ("block", "--block.swa-fraction 0")])
@@ -201,9 +201,9 @@ def test_other_errors_are_not_taken_for_it():
 @pytest.mark.skipif(sys.platform != "linux", reason="limits of address space")
 def test_a_limit_of_the_process_counts():
     code = (
-        "import resource, psutil; from vdgs.system.memory.process_memory import available_bytes\n"
+        "import resource, psutil; from vdgs.system.memory.process_memory import available_memory_bytes\n"
         "vms = psutil.Process().memory_info().vms\n"
-        "resource.setrlimit(resource.RLIMIT_AS, (vms + 10**8,) * 2); print(available_bytes())"
+        "resource.setrlimit(resource.RLIMIT_AS, (vms + 10**8,) * 2); print(available_memory_bytes())"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert 0 < int(done.stdout) <= 10**8 < available_memory_bytes()
@@ -246,7 +246,7 @@ def limit_memory_before_full_size() -> None:
 def test_training_that_runs_out_of_memory_saves_says_what_helps_and_continues(tmp_path):
     capture = tmp_path / "capture"
     write_colmap(capture, tiny_scene(columns=3, rows=2, width=1000, height=750))
-    command = ("coarse", capture, "--output", tmp_path / "run", *SETTINGS)
+    command = ("train-coarse", capture, "--output", tmp_path / "run", *SETTINGS)
     broken = vdgs(*command, prepare=limit_memory_before_full_size)
     assert broken.returncode == 1, broken.stdout + broken.stderr
     assert "Traceback" not in broken.stderr
@@ -259,7 +259,7 @@ def test_training_that_runs_out_of_memory_saves_says_what_helps_and_continues(tm
 
     continued = vdgs(*command)
     assert f"continuing at iteration {LAST_HALF}" in continued.stdout
-    unbroken = entry_point("coarse", capture, "--output", tmp_path / "unbroken", *SETTINGS)
+    unbroken = entry_point("train-coarse", capture, "--output", tmp_path / "unbroken", *SETTINGS)
     assert continued.returncode == unbroken.returncode == 0
     models = [(tmp_path / run / "coarse" / "model.safetensors").read_bytes() for run in ("run", "unbroken")]
     assert models[0] == models[1]

@@ -81,7 +81,7 @@ TRANSIENT = """
 import sys
 from pathlib import Path
 import torch
-from vdgs.system.checkpoints import SavedState, load_newest, save_state
+from vdgs.system.checkpoints import Checkpoint, load_latest_checkpoint, save_checkpoint
 
 def memory(key):
     with open("/proc/self/status") as status:
@@ -96,10 +96,10 @@ def rise(work):
     return result
 
 folder = Path(sys.argv[1])
-save_state(folder, SavedState(1, {}, {"a": torch.zeros(9)}))
+save_checkpoint(folder, Checkpoint(1, {}, {"a": torch.zeros(9)}))
 tensors = {f"{i}": torch.full((5_000_000,), float(i)) for i in range(4)}
-rise(lambda: save_state(folder, SavedState(2, {}, tensors)))
-state, _ = rise(lambda: load_newest(folder))
+rise(lambda: save_checkpoint(folder, Checkpoint(2, {}, tensors)))
+state, _ = rise(lambda: load_latest_checkpoint(folder))
 assert all(torch.equal(state.tensors[name], tensor) for name, tensor in tensors.items())
 """
 

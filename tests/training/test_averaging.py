@@ -53,8 +53,8 @@ def test_it_is_the_mean_of_the_models_and_changes_none_of_them(monkeypatch):
         if iteration > 36:
             models.append(tensors_of(plain.anchors, plain.decoder))
     last, result = tensors_of(averaged.anchors, averaged.decoder), tensors_of(*averaged.result())
-    assert averaged.average is not None
-    assert averaged.average.count == len(models) == 24
+    assert averaged.model_average is not None
+    assert averaged.model_average.count == len(models) == 24
     for name, value in result.items():
         assert np.array_equal(last[name], models[-1][name])
         assert np.allclose(value, np.mean([each[name] for each in models], axis=0), atol=1e-6), name
@@ -63,7 +63,7 @@ def test_it_is_the_mean_of_the_models_and_changes_none_of_them(monkeypatch):
 
 def test_without_it_the_result_is_the_last_model():
     state = run(start(), stage())
-    assert state.average is None
+    assert state.model_average is None
     assert state.result() == (state.anchors, state.decoder)
 
 

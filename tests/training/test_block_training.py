@@ -121,8 +121,8 @@ def test_the_ramp_falls_from_core_to_boundary():
 def test_the_ramp_falls_into_a_hole_as_it_does_outwards():
     """Outskirts lie around a dense centre."""
     middle = shapely.Point(0, 0)
-    outskirts = Block(middle.buffer(20, 64).gain_spread(middle.buffer(12, 64)),
-                      middle.buffer(25, 64).gain_spread(middle.buffer(7, 64)))  # fmt: skip
+    outskirts = Block(middle.buffer(20, 64).difference(middle.buffer(12, 64)),
+                      middle.buffer(25, 64).difference(middle.buffer(7, 64)))  # fmt: skip
     mobility = lr_ramp(
         Blocks((outskirts, Block(middle.buffer(12, 64), middle.buffer(14, 64)))), 0, BlockConfig(margin="ramp")
     )

@@ -191,7 +191,7 @@ def test_single_pixels_far_away_do_not_open_a_part_wide():
 
 
 def in_parts(stage, crop: Crop):
-    return replace(stage, crops=(crop,) * stage.image_count)
+    return replace(stage, crops=(crop,) * stage.num_images)
 
 
 def trained_bits(stage, state, until: int = 1000) -> dict[str, bytes]:

@@ -34,7 +34,7 @@ from vdgs.captures.capture import Capture
 from vdgs.captures.capture_metadata import capture_metadata, check_same_capture
 from vdgs.captures.image_cache import ImageCache
 from vdgs.captures.validation import require_trainable
-from vdgs.config.checkpointing import CheckpointOptions
+from vdgs.config.executor_options import CheckpointOptions
 from vdgs.config.serialization import diff_settings, to_dict
 from vdgs.errors import RunError, VdgsError
 from vdgs.evaluation.coverage import coverage_map

@@ -26,7 +26,7 @@ from experiments.baselines.gs3d.training import (
     train,
 )
 from vdgs.captures.capture import Capture
-from vdgs.config.checkpointing import CheckpointOptions
+from vdgs.config.executor_options import CheckpointOptions
 from vdgs.runs.stage_folder import StageFolder, StatusRecord
 from vdgs.system.checkpoints import save_checkpoint
 from vdgs.training.session.training_progress import LINE_INTERVAL_SECONDS, LOG_INTERVAL

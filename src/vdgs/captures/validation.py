@@ -18,8 +18,7 @@ from rich.markup import escape
 from vdgs.captures.capture import Capture, View
 from vdgs.captures.image_checks import check_images
 from vdgs.errors import CaptureError
-from vdgs.geometry.row_sampling import sample_points
-from vdgs.geometry.similarity import geometric_median
+from vdgs.geometry.similarity import geometric_median, sample_points
 from vdgs.visibility.visibility_counts import count_visibility
 
 #: Sparse points looked at when there are more.

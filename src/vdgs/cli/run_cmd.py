@@ -17,9 +17,8 @@ from vdgs.cli.common import (
     select_device,
 )
 from vdgs.config.capture_options import CaptureOptions
-from vdgs.config.checkpointing import CheckpointOptions
 from vdgs.config.commands import RunRequest
-from vdgs.config.executor_options import ExecutorOptions
+from vdgs.config.executor_options import CheckpointOptions, ExecutorOptions
 from vdgs.config.method import PartitionConfig, TrainConfig
 from vdgs.config.presets import PresetName
 from vdgs.config.ranges import WORKER_COUNT

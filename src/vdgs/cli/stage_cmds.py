@@ -16,8 +16,7 @@ from vdgs.cli.common import (
     select_device,
     update_run_settings,
 )
-from vdgs.config.checkpointing import CheckpointOptions
-from vdgs.config.executor_options import ExecutorOptions
+from vdgs.config.executor_options import CheckpointOptions, ExecutorOptions
 from vdgs.config.method import AssignmentConfig, BlockConfig, MergeConfig, MethodConfig, PartitionConfig
 from vdgs.config.ranges import WORKER_COUNT, Range
 from vdgs.kernels import configure_threads

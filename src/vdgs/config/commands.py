@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from vdgs.config.capture_options import CaptureOptions
-from vdgs.config.checkpointing import CheckpointOptions
-from vdgs.config.executor_options import ExecutorOptions
+from vdgs.config.executor_options import CheckpointOptions, ExecutorOptions
 from vdgs.config.method import AssignmentConfig, BlockConfig, MergeConfig, MethodConfig, PartitionConfig, TrainConfig
 from vdgs.config.presets import PresetName
 from vdgs.config.ranges import MAX_COUNT, MAX_FLOAT, WORKER_COUNT, FlagName, Range
@@ -46,11 +45,11 @@ class RunRequest:
     output: Path
     """Run folder; new, or the run to continue."""
     preset: PresetName = "default"
-    """`laptop`: a good result in minutes. `paper`: the paper's numbers (100 000 + 50 000 iterations a block; blocks
-    restart the coarse stage's rates), and our choices where it is silent: gaps filled, outliers left out, a background
-    of the mean colour, of random colours in training, bounded sizes, cameras by `coverage` and each in its best
-    block, blocks topped up and drawn in their surroundings, a lower gate of compensated growth, g added to means, only
-    visible anchors moved. `literal`: the paper's numbers and none of those choices."""
+    """`laptop`: a good result in minutes. `default`: the paper's numbers (100 000 + 50 000 iterations a block), and our
+    choices where it is silent: gaps filled, outliers left out, a background of the mean colour, of random colours in
+    training, bounded sizes, cameras by `coverage` and each in its best block, a minimum of cameras a block, blocks
+    drawn in their surroundings, a lower gate of compensated growth, g added to means, only visible anchors moved.
+    `paper`: the paper's numbers and none of those choices."""
     overwrite: bool = False
     """Allow other settings than the run has to discard what was trained with the old ones."""
     jobs: Annotated[int, WORKER_COUNT] = 0
@@ -134,7 +133,7 @@ class OrthoRequest:
     """Run folder."""
     output: Path | None = None
     """Folder for the maps, not among photographs nor with such files of others; by default RUN/maps."""
-    gsd: Annotated[float | None, Range(0, MAX_FLOAT, above=True)] = None
+    gsd: Annotated[float | None, Range(0, MAX_FLOAT, exclusive_min=True)] = None
     """Side of a pixel in units of the map (metres, mostly); by default the median that a pixel of the training
     photographs shows of the ground, at the size at which they were used."""
     bbox: Annotated[tuple[float, float, float, float] | None, MAP_COORDINATE_RANGE] = None
@@ -180,16 +179,15 @@ class ExportRequest:
     max_gaussians: Annotated[int, Range(0, MAX_COUNT)] = 0
     """Only so many Gaussians, those that make most of the training photographs; 0 for all."""
     sh_degree: Literal[0, 1, 2, 3] = 3
-    """How colours change with the direction: spherical harmonics up to this degree. 0: not at all, and a fifth of the
-    size."""
+    """Degree of the spherical harmonics of colours. 0: the same from everywhere, and a fifth of the size."""
     html_max_mb: Annotated[float, Range(1, 2000)] = 30.0
     """A .html file has at most so many MB: the scene is thinned until it fits."""
     color_iterations: Annotated[int | None, Range(0, 100)] = None
-    """How often colours are fitted again to what the file's pictures lack of the model's. By default 8 times, or once
-    where the anchors spawn more than four million Gaussians: more come nearer and take longer (docs/export.md)."""
+    """How often colours are fitted again to the difference from the model's images. By default 8 times, or once where
+    the anchors spawn more than four million Gaussians (docs/export.md)."""
     optimize_seconds: Annotated[float, SECONDS_RANGE] = 0.0
-    """Seconds for which all that is baked is moved towards the model's own pictures, after what is fitted in closed
-    form; 0: not at all. Needs 0.7 kB of memory for each Gaussian of degree 3."""
+    """Seconds of optimization of all baked parameters towards the model's images, after the fit in closed form; 0:
+    none. Needs 0.7 kB of memory for each Gaussian of degree 3."""
     crs: str | None = None
     """Coordinates of the files: EPSG:n (EPSG:25832), `enu` (metres east and north of the scene's origin), `source`
     (those of the capture) or `local` (the ground frame). By default `enu` where the capture is georeferenced, and UTM

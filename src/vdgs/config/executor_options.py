@@ -1,14 +1,12 @@
-"""Where blocks are trained and shards of other stages done: on this machine, a Ray cluster or by SLURM.
-
-Never changes the result.
-"""
+"""Options that never change the result: where blocks and shards run , and how training is saved."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from vdgs.config.ranges import MAX_FLOAT, WORKER_COUNT, Range, check_ranges
+from vdgs.config.ranges import MAX_COUNT, MAX_FLOAT, WORKER_COUNT, Range, check_ranges
+from vdgs.errors import VdgsError
 
 #: What can run them.
 ExecutorName = Literal["local", "ray", "slurm"]
@@ -27,7 +25,7 @@ class SlurmOptions:
     is asked to save in time, put back into the queue and continued."""
     grace_seconds: Annotated[int, Range(1, 86_400)] = 120
     """How long before the time limit a block is asked to save."""
-    poll_seconds: Annotated[float, Range(0, 3600, above=True)] = 5.0
+    poll_seconds: Annotated[float, Range(0, 3600, exclusive_min=True)] = 5.0
     """How often SLURM is asked what became of the jobs."""
     setup_command: str = ""
     """A shell command run first in every job, such as `module load cuda`."""
@@ -56,8 +54,6 @@ class ExecutorOptions:
 
     def check(self) -> None:
         """Raise VdgsError for values that do not work, alone or together."""
-        from vdgs.errors import VdgsError
-
         check_ranges(self)
         if self.executor == "slurm" and self.gpus != int(self.gpus):
             raise VdgsError(
@@ -71,3 +67,19 @@ class ExecutorOptions:
                 f"--address {self.address}: is for clients outside a cluster. Run vdgs on one of its machines, with "
                 "--address auto (`ray job submit` does so)."
             )
+
+
+@dataclass(frozen=True)
+class CheckpointOptions:
+    """How training is saved and logged, which never changes the result."""
+
+    save_every: Annotated[int, Range(1, MAX_COUNT)] = 1000
+    """Iterations between two checkpoints."""
+    image_cache_gb: Annotated[float, Range(0, MAX_FLOAT)] = 0.0
+    """Memory for decoded images; 0 takes a quarter of what is free. On a cluster: of one block."""
+    tensorboard: bool = False
+    """Also write TensorBoard events into the stage's folder (needs the extra `tensorboard`)."""
+
+    def check(self) -> None:
+        """Raise VdgsError for values that do not work."""
+        check_ranges(self)

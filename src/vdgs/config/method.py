@@ -30,17 +30,16 @@ class AnchorConfig:
     """Edge of the initial voxel grid in units of the ground frame; 0 takes the median nearest-neighbour distance of the
     sparse points."""
     outlier_distance: Annotated[float, Range(2, MAX_FLOAT, allow_zero=True)] = 30.0
-    """Sparse points start no anchor where their fourth neighbour is this many times farther than the median one's; 0
-    keeps all (choice: a few points deep below the ground become a backdrop that every camera sees through it)."""
+    """Sparse points whose fourth neighbour is this many times farther than the median start no anchor; 0 keeps all
+    (choice: points deep below the ground become a backdrop)."""
     fill_gaps: bool = True
     """Also start anchors on ground that cameras see but that holds no sparse points: woods, water, fields (choice)."""
     mvs: bool = False
-    """Also start anchors where pairs of photographs agree how far the ground is (semi-global matching, before
-    training): where few photographs look, sparse points are few, and what starts at a wrong height stays there
-    (choice)."""
+    """Also start anchors at dense stereo points (semi-global matching): where few photographs look, sparse points are
+    few, and anchors that start at a wrong height stay there (choice)."""
     bound_scales: bool = True
-    """No Gaussian may be longer than a quarter of the pictures that train it: none can hang as a veil before a whole
-    view. The unit of an anchor's offsets is bounded with them: its Gaussians stay about it (choice)."""
+    """No Gaussian may be longer than a quarter of the images that train it, and the unit of an anchor's offsets is
+    bounded likewise: fewer floaters (choice)."""
     view_distance: bool = False
     """Feed the distance between camera and anchor to the decoder too."""
     appearance_dim: Annotated[int, Range(0, 1024)] = 0
@@ -87,7 +86,7 @@ class DensifyConfig:
     """Mean norm of dL/d(mean) in NDC units above which an offset asks for a new anchor."""
     num_levels: Annotated[int, Range(0, 16)] = 3
     """Number of cell sizes tried; level i has threshold 2^i times and cells 4^i times finer."""
-    coarsest_voxels: Annotated[float, Range(0, MAX_FLOAT, above=True)] = 16.0
+    coarsest_voxels: Annotated[float, Range(0, MAX_FLOAT, exclusive_min=True)] = 16.0
     """Edge of the coarsest cell, in voxels."""
     min_draw_fraction: Annotated[float, Range(0, MAX_COUNT)] = 0.4
     """An offset is judged once it was rendered more often than this share of the interval."""
@@ -106,24 +105,21 @@ class CompensationConfig:
     enabled: bool = True
     """Off: plain growth (the paper's "w/o Anchor Generation")."""
     t_low: Annotated[float, FRACTION] = 0.20
-    """T_low: an anchor is of low visibility (the set L) when fewer than this share of the cameras of a growth cycle
-    hold it in their frustum."""
+    """T_low: an anchor is in the set L when fewer than this share of the cameras of a growth cycle see it."""
     t_low_quantile: Annotated[float, Range(0, 1, exclusive_max=True)] = 0.0
-    """Above 0: T_low is instead this quantile of the shares of the anchors that a camera of the cycle sees (choice: on
-    a large scene nearly every anchor is below a fixed share). Anchors that tie there are in L all or none, whichever
-    comes nearer to the quantile."""
+    """Above 0: T_low is this quantile of the shares of the anchors that a camera of the cycle sees (choice: on a large
+    scene nearly every anchor is below a fixed share). Ties are in L all or none, whichever is nearer the quantile."""
     beta_g: Annotated[float, Range(0, MAX_FLOAT)] = 2.0
-    """beta_g: weight of a cycle's mean gradient in the cache g. With the paper's 2, g is a sum that grows to twenty
-    times the gradients it is made of; with 1 - gamma (the preset `laptop`) it is a mean over cycles."""
+    """beta_g: weight of a cycle's mean gradient in the cache g. With the paper's 2, g grows to twenty times its
+    gradients; with 1 - gamma (the preset `laptop`) it is a mean over cycles."""
     gamma: Annotated[float, FRACTION] = 0.9
     """gamma: decay of the cache g from cycle to cycle."""
     target: Literal["mean", "sum"] = "mean"
-    """What g is added to when anchors grow; the paper says "the raw gradient statistics". `mean`: to the mean gradient,
-    after the division by how often the offset was drawn. `sum`: to the sum before it, so that g is divided too: an
-    offset that was drawn eight times gets an eighth of it."""
+    """What g is added to; the paper says "the raw gradient statistics". `mean`: the mean gradient over the draws of an
+    offset. `sum`: the sum before the division, so that g is divided by the draws too."""
     min_draws: Literal["scaled", "paper"] = "scaled"
-    """Above how many draws an offset of low visibility is judged: `scaled` takes T_low times the gate of the others, at
-    least 2 (choice: within one cycle it can never pass theirs); `literal` the same as the others."""
+    """Above how many draws an offset of L is judged: `scaled` takes T_low times the gate of the others, at least 2
+    (choice: within one cycle it can never pass theirs); `paper` the same as the others."""
 
 
 @dataclass(frozen=True)
@@ -135,11 +131,10 @@ class LossConfig:
     volume_reg: Annotated[float, Range(0, MAX_FLOAT)] = 0.01
     """Weight of the mean product of the three scales of the Gaussians that are drawn."""
     background: Literal["mean", "black"] = "mean"
-    """Colour behind the scene: the mean of the training photographs (choice: what no photograph shows is then drawn
-    in a colour of the place), or black."""
+    """Colour behind the scene: the mean of the training photographs (choice), or black."""
     random_background: Annotated[float, FRACTION] = 1.0
-    """So much of the background's colour is drawn anew for every step of training, from the whole RGB cube: ground that
-    were left transparent could not borrow a colour from it (choice; the paper is silent on its background)."""
+    """Share of the background's colour that is drawn at random in every step, from the RGB cube: transparent ground
+    cannot borrow its colour (choice; the paper does not name its background)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,21 +142,21 @@ class TrainConfig:
     """Training of the coarse stage."""
 
     iterations: Annotated[int, Range(0, MAX_COUNT)] = 100_000
-    """Number of steps, one photograph each; 0 takes sixty for each training photograph, but at least 3000 and at
-    most 30 000 (choice: with few photographs a model soon overfits, many need their time)."""
+    """Number of steps, one photograph each; 0 takes sixty for each training photograph, at least 3000 and at most
+    30 000 (choice: with few photographs a model overfits soon)."""
     view_sampling: Literal["uniform", "visibility", "sqrt-visibility"] = "uniform"
-    """How often each photograph is used. `even`: all alike (the paper). `shares`: every anchor has one vote, divided
-    among the cameras that see it, and a photograph is used in proportion to its votes: most where few others look.
-    `roots`: in proportion to the square root of its votes, which keeps more photographs in use (choice)."""
+    """How often each photograph is used. `uniform`: all alike (the paper). `visibility`: every anchor divides one vote
+    among the cameras that see it, and photographs are used in proportion to their votes. `sqrt-visibility`: in
+    proportion to the square root of their votes, which keeps more photographs in use (choice)."""
     resolution_schedule: ResolutionSchedule = ((0.0, 1),)
     """Resolution schedule: from this share of the iterations on, images are shrunk by this factor."""
     swa_fraction: Annotated[float, Range(0, 1, exclusive_max=True)] = 0.0
     """The stage ends with the mean of the models of this last share of its iterations, after growth and at full size; 0
     for the very last model (choice)."""
     optimizer: Literal["sparse-adam", "adam"] = "sparse-adam"
-    """Which anchors a step moves, here and in blocks. `visible`: those that its photograph shows; the others keep
-    parameters and moments (choice). `dense`: all of them, as in Scaffold-GS and 3DGS: what is not shown goes on along
-    its moments, and the bias correction counts the steps of the stage."""
+    """Which anchors a step moves, here and in blocks. `sparse-adam`: those that its photograph shows; the others keep
+    parameters and moments (choice). `adam`: all, as in Scaffold-GS and 3DGS: others continue along their moments, and
+    the bias correction counts the steps of the stage."""
     seed: Annotated[int, Range(0, 2**32 - 1)] = 0
     """Everything random follows from it: on the CPU the same seed gives the same bits."""
     anchors: AnchorConfig = field(default_factory=AnchorConfig)
@@ -170,22 +165,18 @@ class TrainConfig:
     """Learning rates."""
     lr_warm_boost: Annotated[float, Range(1, 1000)] = 1.0
     """Up to how many times faster an anchor moves while it has had few updates: after u of them, by the least of this
-    and 1 / sqrt(1 - 0.999^u), which is 3 after 118 updates and 1.3 after 900 (choice: in short trainings an anchor is
-    seen a few hundred times; 1 is Adam as it is)."""
+    and 1 / sqrt(1 - 0.999^u), which is 3 after 118 updates and 1.3 after 900 (choice, for short trainings; 1: Adam)."""
     densify: DensifyConfig = field(default_factory=DensifyConfig)
     """Growth and pruning of anchors."""
     loss: LossConfig = field(default_factory=LossConfig)
     """The loss."""
     exposure_compensation: bool = False
-    """Fit a small colour model to each photograph: an affine map whose mean over all photographs is neutral. The scene
-    is drawn in neutral colours, and compared with a test photograph in the exposure that the training photographs
-    taken before and after it and what its camera meters foretell (no pixel of it is used). Blocks take it over as the
-    coarse stage leaves it (choice)."""
+    """Fit an affine colour model to each photograph, whose mean over all photographs is neutral. The scene is drawn in
+    neutral colours, and compared with a test photograph in the exposure predicted from the training photographs taken
+    before and after it and from its metadata (no pixel of it is used). Blocks keep the coarse stage's models (choice)."""
     exposure_min_spread: Annotated[float, Range(0, 1)] = 0.0
-    """Fit exposures only where photographs of the same places differ in brightness by at least this share of it, by the
-    colours of the sparse points that several show: where photographs have one exposure, fitting some gains nothing and
-    may cost (choice). At 0, and in a capture that does not say which photograph shows which point, they are always
-    fitted."""
+    """Fit exposures only where photographs of the same sparse points differ in brightness by at least this share
+    (choice: with one exposure, fitting gains nothing). At 0, and in a capture without tracks, they are always fitted."""
     compensation: CompensationConfig = field(default_factory=lambda: CompensationConfig(enabled=False))
     """Compensated growth already in this stage (choice: only blocks have it; the ablation without blocks needs it)."""
 
@@ -195,23 +186,21 @@ class PartitionConfig:
     """How the scene is cut into blocks (eq. 5 and what follows it)."""
 
     strategy: PartitionStrategy = "visibility"
-    """`visibility`: by place and visibility (the paper). The others are the partitions of published methods, to compare
-    with; each cuts and chooses cameras in its own way, whatever the settings of the assignment say."""
+    """`visibility`: by position and visibility (the paper). The others are published methods for comparison, which also
+    assign cameras in their own way, whatever the settings of the assignment."""
     blocks: Annotated[int | Literal["auto"], Range(1, 10_000)] = 8
     """K, the number of blocks; 1 is the whole scene (the paper's "w/o Blocking"); `auto` takes as few as
-    --block-memory-gb allows: give more to train them at once on several machines."""
+    --block-memory-gb allows."""
     lambda_vis: Annotated[float, Range(0, 1000)] = 1.0
     """lambda_vis: weight of visibility beside place in the clustering (paper: 0.7 to 1.3); 0 is purely spatial."""
     balanced: bool = False
     """Blocks of about equally many anchors (choice; plain k-means leaves them several times apart)."""
     expansion: Annotated[float, Range(0, 1000)] = 0.4
-    """A block is widened by this share of the radius of a disc of its area. While ring and context are frozen (the
-    default) that decides what is drawn when cameras are assigned and nothing else: no anchor beyond the core is
-    trained, however wide the ring is."""
-    block_memory_gb: Annotated[float, Range(0, MAX_FLOAT, above=True)] = 4.0
-    """Memory that an average block may take in training, by estimate and beside the photographs that are kept; only
-    `--blocks auto` looks at it. Larger blocks take more, and so do all where more blocks would have too few photographs
-    (fifty) each."""
+    """A block is widened by this share of the radius of a disc of its area. With a frozen margin (the default) that
+    only decides what is drawn when cameras are assigned."""
+    block_memory_gb: Annotated[float, Range(0, MAX_FLOAT, exclusive_min=True)] = 4.0
+    """Memory that an average block may take in training, by estimate and beside cached photographs, for `--blocks
+    auto`. All take more where more blocks would have too few photographs (fifty) each."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,21 +208,19 @@ class AssignmentConfig:
     """Which cameras train which block (eqs. 6-7)."""
 
     mode: Literal["coverage", "paper", "leave-one-out", "frustum"] = "coverage"
-    """`coverage`: share of the drawn pixels that the block alone draws alike (choice). `literal`: eq. 7 as printed,
-    where pixels empty in both renders count too. `leave_one_out`: 1 - SSIM of the scene without the block.
+    """`coverage`: share of the drawn pixels that the block alone draws alike (choice). `paper`: eq. 7 as printed,
+    where pixels empty in both renders count too. `leave-one-out`: 1 - SSIM of the scene without the block.
     `frustum`: share of the block's anchors that the camera holds (needs no renders)."""
-    tau: Annotated[float, Range(0, 1, above=True)] = 0.05
-    """tau: pixels differ when the mean absolute difference of their channels is above this (choice; not in the
-    paper)."""
+    tau: Annotated[float, Range(0, 1, exclusive_min=True)] = 0.05
+    """tau: pixels differ when the mean absolute difference of their channels is above this (choice)."""
     threshold: Annotated[float, FRACTION] = 0.45
     """Share of pixels (or, for `frustum`, of anchors) above which a camera is assigned."""
     threshold_leave_one_out: Annotated[float, FRACTION] = 0.05
-    """The same for `leave_one_out` (peers: 0.05 to 0.12)."""
+    """The same for `leave-one-out` (peers: 0.05 to 0.12)."""
     always_best: bool = True
     """Every camera also joins its best block (choice: else one that is above the threshold nowhere trains nothing)."""
     min_cameras: Annotated[int, Range(0, MAX_COUNT)] = 100
-    """Each block is topped up with the cameras that show it best to at least this many, as far as any show it (choice);
-    0 leaves it as it is."""
+    """Each block gets at least this many cameras, as far as any show it (choice); 0: no minimum."""
     image_size: Annotated[int, Range(16, 16_384)] = 320
     """Size at which the renders are compared."""
 
@@ -244,34 +231,31 @@ class BlockConfig:
 
     iterations: Annotated[int, Range(0, MAX_COUNT)] = 50_000
     """Steps for each block; 0 takes fifteen for each of its photographs, at least 500 and at most 15 000 (choice)."""
-    steps_scaler: Annotated[float, Range(0, 1000, above=True)] = 1.0
+    steps_scaler: Annotated[float, Range(0, 1000, exclusive_min=True)] = 1.0
     """Factor on the steps and on the start of statistics and growth, for scenes smaller than the paper's."""
     view_sampling: Literal["uniform", "visibility", "sqrt-visibility"] = "uniform"
-    """As in the coarse stage, by the votes of the anchors that the block moves: photographs that show little of the
-    block are used little."""
+    """As in the coarse stage, by the votes of the anchors that the block moves."""
     resolution_schedule: ResolutionSchedule = ((0.0, 1),)
     """Resolution schedule, as in the coarse stage."""
     swa_fraction: Annotated[float, Range(0, 1, exclusive_max=True)] = 0.0
     """As in the coarse stage."""
     crop: Literal["off", "fixed-steps", "fixed-pixels"] = "off"
-    """Draw only the part of each photograph in which the block has a share, and all of it in every fourth step.
-    `steps`: each step costs less; `pixels`: as many pixels are drawn as without, in up to four times more steps, so
-    that each place of the scene is drawn more often: `iterations` then counts photographs, whatever their size
-    (choice)."""
+    """Draw only the part of each photograph that shows the block, and all of it in every fourth step. `fixed-steps`:
+    each step costs less; `fixed-pixels`: as many pixels are drawn as without, in up to four times more steps;
+    `iterations` then counts whole photographs (choice)."""
     lr_scale_offsets: Annotated[float, FACTOR_RANGE] = 1.0
-    """The rates of the coarse stage start again, those of offsets times this (the paper prints no rates for blocks;
-    CityGaussian fine-tunes with 0.4)."""
+    """The rates of the coarse stage start again, those of offsets times this (CityGaussian: 0.4)."""
     lr_scale_log_scales: Annotated[float, FACTOR_RANGE] = 1.0
     """... and those of log-scales times this (CityGaussian: 0.8)."""
     lr_scale_features: Annotated[float, FACTOR_RANGE] = 1.0
     """... and those of features times this."""
     lr_warm_boost: Annotated[float, Range(1, 1000)] = 1.0
-    """As `early` of the coarse stage, for the block's own updates: its anchors begin trained."""
+    """As in the coarse stage, for the block's own updates: its anchors begin trained."""
     random_background: Annotated[float, FRACTION] = 1.0
-    """As in the loss of the coarse stage: without, blocks make ground transparent that was opaque (choice)."""
+    """As in the loss of the coarse stage (choice: at 0 blocks make opaque ground transparent)."""
     decoder: Literal["frozen", "own"] = "frozen"
-    """`frozen`: as the coarse stage left it (the paper). `own`: each block trains its copy, which its anchors keep in
-    the merged scene (choice: with a frozen decoder blocks overfit sooner where few cameras see them)."""
+    """`frozen`: that of the coarse stage (the paper). `own`: each block trains a copy, which its anchors keep in the
+    merged scene (choice: with a frozen decoder blocks overfit sooner where few cameras see them)."""
     margin: Literal["frozen", "ramp", "free"] = "frozen"
     """Anchors between core and widened boundary: `frozen` are drawn and never move (choice for "gradients at the
     boundary are suppressed"); `ramp`: their learning rate falls linearly to zero at the widened boundary; `free`
@@ -282,8 +266,7 @@ class BlockConfig:
     """Growth and pruning of anchors, by default as in the coarse stage: the paper says nothing else."""
     max_anchors_total: Annotated[int, Range(0, MAX_COUNT)] = 0
     """No growth beyond this many anchors of all blocks together; 0 for no limit. Each block has a share in proportion
-    to the coarse anchors it owns. A block that starts with more grows none, and none of its anchors is removed for
-    it: the merged scene has at most this many, or as many as the coarse model."""
+    to the coarse anchors it owns. No anchor is removed: a block that starts with more grows none."""
     compensation: CompensationConfig = field(default_factory=CompensationConfig)
     """Compensated growth (eqs. 8-10)."""
 
@@ -293,8 +276,8 @@ class MergeConfig:
     """How trained blocks become one scene."""
 
     rule: Literal["owner", "max-visibility"] = "owner"
-    """Whose anchors stay at a place: `owner`: those of the block whose core it is, or is nearest. `best_seen`: those of
-    the block whose cameras see it most, among the blocks that reach it (needs --block.margin ramp or free)."""
+    """Whose anchors stay at a position: `owner`: those of the block with the nearest core. `max-visibility`: those of
+    the block whose cameras see it most, among those that reach it (needs --block.margin ramp or free)."""
 
 
 @dataclass(frozen=True)
@@ -323,11 +306,8 @@ def resolve_iterations(config: TrainConfig, num_views: int) -> TrainConfig:
 
 
 def max_block_anchors(config: BlockConfig, num_anchors: int, total_anchors: int) -> int:
-    """Up to how many anchors a block may grow that owns so many of all (`of`) coarse anchors; 0 for no limit.
-
-    Shares are rounded down, so that together they are never more than the total. At least 1: no anchor of its own and
-    no limit are different things.
-    """
+    """Up to how many anchors a block may grow that owns `num_anchors` of all coarse anchors; 0 for no limit. Shares are
+    rounded down, so that their sum is at most the total, but at least 1, since 0 means no limit."""
     share = max(1, config.max_anchors_total * num_anchors // total_anchors) if config.max_anchors_total else 0
     limits = [limit for limit in (config.densify.max_anchors, share) if limit]
     return min(limits, default=0)
@@ -337,6 +317,8 @@ def block_train_config(config: MethodConfig, num_views: int) -> TrainConfig:
     """The settings of the training loop for one block with so many photographs."""
     block, scale = config.block, config.block.steps_scaler
     rates = config.training.lr
+    factors = {name: getattr(block, f"lr_scale_{name}") for name in ("offsets", "log_scales", "features")}
+    scaled = {name: (f * getattr(rates, name)[0], f * getattr(rates, name)[1]) for name, f in factors.items()}
     return replace(
         config.training,
         iterations=max(1, round(scale * (block.iterations or _steps(num_views, *AUTO_BLOCK_ITERATIONS)))),
@@ -344,15 +326,7 @@ def block_train_config(config: MethodConfig, num_views: int) -> TrainConfig:
         swa_fraction=block.swa_fraction,
         lr_warm_boost=block.lr_warm_boost,
         resolution_schedule=block.resolution_schedule,
-        lr=replace(
-            rates,
-            offsets=(block.lr_scale_offsets * rates.offsets[0], block.lr_scale_offsets * rates.offsets[1]),
-            log_scales=(
-                block.lr_scale_log_scales * rates.log_scales[0],
-                block.lr_scale_log_scales * rates.log_scales[1],
-            ),
-            features=(block.lr_scale_features * rates.features[0], block.lr_scale_features * rates.features[1]),
-        ),
+        lr=replace(rates, **scaled),
         densify=replace(
             block.densify,
             stats_start=round(scale * block.densify.stats_start),

@@ -41,7 +41,7 @@ class SfmOptions:
     scale_bar: Path | None = None
     """Text file of known distances: lines `NAME px py photograph` mark points in two photographs or more, lines
     `NAME NAME metres` say how far they are apart. Gives the scale without positions, or in place of theirs."""
-    gps_std_m: Annotated[tuple[float, float], Range(0, 100_000, above=True)] = (1.0, 2.0)
+    gps_std_m: Annotated[tuple[float, float], Range(0, 100_000, exclusive_min=True)] = (1.0, 2.0)
     """Standard deviation of GPS positions across and upwards, in metres, where the photographs say none themselves (RTK
     in XMP; GPSHPositioningError in EXIF, with heights as much worse as here). Poses do not depend on it; how far off
     positions are is found from the flight itself, and what is said here of a table counts beside it."""

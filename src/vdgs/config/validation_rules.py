@@ -11,37 +11,28 @@ def validate_config(config: MethodConfig) -> list[str]:
     found = find_range_errors(config)
     training, block = config.training, config.block
     found += _validate_schedule(training.swa_fraction, training.densify, training.resolution_schedule)
-    found += [
-        f"block.{each}" for each in _validate_schedule(block.swa_fraction, block.densify, block.resolution_schedule)
-    ]
+    of_block = _validate_schedule(block.swa_fraction, block.densify, block.resolution_schedule)
+    found += [f"block.{each}" for each in of_block]
     if block.margin == "ramp" and block.decoder == "own":
         found.append(
-            "block.ring ramp needs --block.decoder frozen: a decoder that moves changes anchors that should stay"
+            "block.margin ramp needs --block.decoder frozen: a decoder that moves changes anchors that should stay"
         )
     if config.merge.rule == "max-visibility" and block.margin == "frozen":
-        found.append("merge.rule best_seen needs --block.margin ramp or free: a frozen ring has nothing to offer")
+        found.append(
+            "merge.rule max-visibility needs --block.margin ramp or free: a frozen margin has nothing to offer"
+        )
     return found
 
 
-def _validate_schedule(average: float, growth: DensifyConfig, resolutions: ResolutionSchedule) -> list[str]:
+def _validate_schedule(swa_fraction: float, densify: DensifyConfig, resolutions: ResolutionSchedule) -> list[str]:
     """What does not fit together in the course of a training."""
-    return _validate_resolutions(resolutions) + _validate_average(average, growth, resolutions)
-
-
-def _validate_resolutions(resolutions: ResolutionSchedule) -> list[str]:
-    found = []
-    if not resolutions or resolutions[0][0] != 0.0:
-        found.append("resolutions must begin at share 0.0")
-    if [share for share, _ in resolutions] != sorted({share for share, _ in resolutions}):
-        found.append("resolutions: shares must ascend")
+    found, starts = [], [start for start, _ in resolutions]
+    if starts[:1] != [0.0]:
+        found.append("resolution_schedule must begin at share 0.0")
+    if starts != sorted(set(starts)):
+        found.append("resolution_schedule: shares must ascend")
+    if 0 < swa_fraction < 1 and densify.stop_fraction >= 1:
+        found.append("swa_fraction needs growth and pruning to end: densify.stop_fraction must be below 1")
+    elif 0 < swa_fraction < 1 and starts and starts[-1] > max(1 - swa_fraction, densify.stop_fraction):
+        found.append("swa_fraction would mix models of several image sizes: let resolution_schedule end before it")
     return found
-
-
-def _validate_average(average: float, growth: DensifyConfig, resolutions: ResolutionSchedule) -> list[str]:
-    if not 0 < average < 1:
-        return []
-    if growth.stop_fraction >= 1:
-        return ["average needs growth and pruning to end: growth.until must be below 1"]
-    if resolutions and resolutions[-1][0] > max(1 - average, growth.stop_fraction):
-        return ["average would mix models of several image sizes: let the last of resolutions begin before it"]
-    return []

@@ -52,10 +52,7 @@ class Camera:
     def packed(self) -> np.ndarray:
         """What the kernels read, [22] float32: rotation (9, row-major), translation (3),
         fx, fy, cx, cy, width, height, orthographic (0 or 1), near, width and height of the whole picture."""
-        rigid = self.camera_from_world
-        tail = [self.fx, self.fy, self.cx, self.cy, self.width, self.height,
-                float(self.model == "orthographic"), NEAR_PLANE, *self.full_size]  # fmt: skip
-        return np.concatenate([rigid[:3, :3].ravel(), rigid[:3, 3], tail]).astype(np.float32)
+        return np.concatenate([self.packed_float64, self.full_size]).astype(np.float32)
 
     @cached_property
     def packed_float64(self) -> np.ndarray:
@@ -74,18 +71,10 @@ class Camera:
         """The part of this picture with columns `left` to `right` and rows `top` to `bottom`, both without the last:
         what it draws is what the whole picture shows there. Raises ValueError where that is no part of it."""
         if not (0 <= left < right <= self.width and 0 <= top < bottom <= self.height):
-            raise ValueError(
-                f"columns {left} to {right} and rows {top} to {bottom} are no part of a picture of "
-                f"{self.width}x{self.height}"
-            )
-        return replace(
-            self,
-            cx=self.cx - left,
-            cy=self.cy - top,
-            width=right - left,
-            height=bottom - top,
-            uncropped_size=self.full_size,
-        )
+            box = f"columns {left} to {right} and rows {top} to {bottom}"
+            raise ValueError(f"{box} are no part of a picture of {self.width}x{self.height}")
+        cx, cy, width, height = self.cx - left, self.cy - top, right - left, bottom - top
+        return replace(self, cx=cx, cy=cy, width=width, height=height, uncropped_size=self.full_size)
 
     def resized(self, width: int, height: int) -> Camera:
         """The same view on an image of another size. Raises ValueError for a part of a picture."""
@@ -93,13 +82,7 @@ class Camera:
             raise ValueError("resize the whole picture, then take a part of it")
         sx, sy = width / self.width, height / self.height
         return replace(
-            self,
-            fx=self.fx * sx,
-            fy=self.fy * sy,
-            cx=self.cx * sx,
-            cy=self.cy * sy,
-            width=width,
-            height=height,
+            self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
         )
 
     def limit_size(self, max_side_px: int) -> Camera:

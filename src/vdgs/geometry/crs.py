@@ -68,9 +68,7 @@ def open_crs(code: str, origin: tuple[float, float, float]) -> CrsTransform:
     try:
         import pyproj
     except ImportError:
-        raise VdgsError(
-            f"--crs {code}: needs pyproj: pip install 'vdgs[geo]'. Without it: --crs enu or local."
-        ) from None
+        raise VdgsError(f"--crs {code}: needs pyproj: pip install 'vdgs[geo]', or --crs enu or local.") from None
     code = code.upper()
     try:
         crs = pyproj.CRS.from_user_input(code)
@@ -81,7 +79,7 @@ def open_crs(code: str, origin: tuple[float, float, float]) -> CrsTransform:
             f"--crs {code}: {crs.name} is not in metres across (degrees, or heights alone). Give a projected system, "
             f"such as {utm_epsg(*origin[:2])}, or leave --crs out."
         )
-    _refuse_westward(crs, code, origin)
+    _check_axes(crs, code, origin)
     axes = crs.axis_info
     meters = float(axes[0].unit_conversion_factor)
     if any(abs(axis.unit_conversion_factor - meters) > 1e-12 for axis in axes):
@@ -89,9 +87,8 @@ def open_crs(code: str, origin: tuple[float, float, float]) -> CrsTransform:
     transformer, notes = _operation(crs, code, origin)
     own_heights = len(axes) == 3
     unit = "m" if meters == 1.0 else axes[0].unit_name
-    heights = (
-        "from the middle of the Earth" if crs.is_geocentric else axes[2].name if own_heights else ELLIPSOIDAL_REFERENCE
-    )
+    heights = axes[2].name if own_heights else ELLIPSOIDAL_REFERENCE
+    heights = "from the middle of the Earth" if crs.is_geocentric else heights
     return CrsTransform(
         code=code, name=crs.name, unit=unit, meters_per_unit=meters, wkt=crs.to_wkt(),
         height_reference=heights if unit == "m" else f"{heights}; in {unit}", notes=notes,
@@ -103,7 +100,7 @@ def _horizontal(crs: Any) -> Any:
     return crs.sub_crs_list[0] if crs.is_compound else crs
 
 
-def _refuse_westward(crs: Any, code: str, origin: tuple[float, float, float]) -> None:
+def _check_axes(crs: Any, code: str, origin: tuple[float, float, float]) -> None:
     """Raise VdgsError for coordinates that grow to the west: maps and scenes would be turned about, or as in a mirror.
 
     Both axes of a polar system lead south, or both north: they lie to each other as east and north do.
@@ -112,12 +109,10 @@ def _refuse_westward(crs: Any, code: str, origin: tuple[float, float, float]) ->
     if "west" not in towards:
         return
     twin = _of_name(f"{_horizontal(crs).name} East North")
-    instead = (
-        f"Give its twin to the east and north, {twin}" if twin else f"Give another, such as {utm_epsg(*origin[:2])}"
-    )
+    other = f"its twin to the east and north, {twin}" if twin else f"another, such as {utm_epsg(*origin[:2])}"
     raise VdgsError(
         f"--crs {code}: {crs.name} counts to the {towards[0]} and {towards[1]}; maps and scenes need east and north. "
-        f"{instead}, or leave --crs out."
+        f"Give {other}, or leave --crs out."
     )
 
 

@@ -16,14 +16,8 @@ def ecef_from_geodetic(geodetic: np.ndarray) -> np.ndarray:
     altitude = geodetic[:, 2]
     normal = SEMI_MAJOR_M / np.sqrt(1 - ECCENTRICITY2 * np.sin(latitude) ** 2)
     horizontal = (normal + altitude) * np.cos(latitude)
-    return np.stack(
-        [
-            horizontal * np.cos(longitude),
-            horizontal * np.sin(longitude),
-            (normal * (1 - ECCENTRICITY2) + altitude) * np.sin(latitude),
-        ],
-        axis=1,
-    )
+    z = (normal * (1 - ECCENTRICITY2) + altitude) * np.sin(latitude)
+    return np.stack([horizontal * np.cos(longitude), horizontal * np.sin(longitude), z], axis=1)
 
 
 def geodetic_from_ecef(ecef: np.ndarray) -> np.ndarray:
@@ -45,19 +39,9 @@ def geodetic_from_ecef(ecef: np.ndarray) -> np.ndarray:
 def enu_axes(latitude_deg: float, longitude_deg: float) -> np.ndarray:
     """Rows: east, north, up as Earth-centred unit vectors, [3, 3]."""
     latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
-    sin_lat, cos_lat, sin_lon, cos_lon = (
-        np.sin(latitude),
-        np.cos(latitude),
-        np.sin(longitude),
-        np.cos(longitude),
-    )
-    return np.array(
-        [
-            [-sin_lon, cos_lon, 0.0],
-            [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat],
-            [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat],
-        ]
-    )
+    sin_lat, cos_lat, sin_lon, cos_lon = np.sin(latitude), np.cos(latitude), np.sin(longitude), np.cos(longitude)
+    north = [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]
+    return np.array([[-sin_lon, cos_lon, 0.0], north, [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat]])
 
 
 def enu_from_geodetic(
@@ -65,7 +49,7 @@ def enu_from_geodetic(
 ) -> np.ndarray:
     """(lat, lon, alt) [n, 3] to east-north-up metres [n, 3] about `origin` (lat, lon, alt).
 
-    `axes_origin` (lat, lon): the place whose east, north and up the axes are, where it is another one.
+    `level_at` (lat, lon): the point whose east, north and up the axes are, where it is another one.
     """
     center = ecef_from_geodetic(np.array([origin]))
     return (ecef_from_geodetic(geodetic) - center) @ enu_axes(*(level_at or origin[:2])).T

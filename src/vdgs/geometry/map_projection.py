@@ -1,9 +1,9 @@
 """From the ground frame to the coordinates of a map, and back, in float64.
 
-A georeferenced ground frame is a plane that touches the Earth (ENU). A map projection is not: over a kilometre the two
-part by centimetres in height, their norths by the meridian convergence, their metres by the scale factor. So places go
-the long way: ground → Earth-centred → latitude, longitude, ellipsoidal height → projection (pyproj). What moves many
-things at once (a tile of a map, the shapes of Gaussians) takes the similarity that is right about one place.
+A georeferenced ground frame is a plane tangent to the Earth (ENU), which differs from a map projection by centimetres
+in height over a kilometre, by the meridian convergence and by the scale factor. Points therefore pass through
+Earth-centred and geodetic coordinates (pyproj); tiles and shapes of Gaussians take the similarity that is exact at one
+point.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _STEP = 20.0
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MapProjection:
-    """Coordinates of a target system for points of a ground frame. Made by `Placement.of`."""
+    """Coordinates of a target system for points of a ground frame. Made by `MapProjection.of`."""
 
     #: What `--crs` would say: "EPSG:32611", "enu", "source" or "local".
     crs: str
@@ -57,19 +57,19 @@ class MapProjection:
         Raises VdgsError for a system that is unknown, in degrees, not to the east and north, or needs a georeference
         that is not there, and where pyproj is not installed.
         """
-        asked = (crs or ("local" if ground.origin_geo is None else utm_epsg(*ground.origin_geo[:2]))).strip()
-        if asked.lower() == "local":
+        name = (crs or ("local" if ground.origin_geo is None else utm_epsg(*ground.origin_geo[:2]))).strip()
+        if name.lower() == "local":
             return _local(ground)
-        if asked.lower() == "source":
+        if name.lower() == "source":
             return _source(ground)
-        if asked.lower() != "enu" and not asked.upper().startswith("EPSG:"):
-            raise VdgsError(f"--crs {asked}: is no coordinate system known here. Give {CRS_CHOICES}.")
+        if name.lower() != "enu" and not name.upper().startswith("EPSG:"):
+            raise VdgsError(f"--crs {name}: is no coordinate system known here. Give {CRS_CHOICES}.")
         if ground.origin_geo is None:
             raise VdgsError(
-                f"--crs {asked}: the capture is not georeferenced ({ground.description}), so nobody knows where on Earth it "
-                "lies. Give positions when the run is started (--gps TABLE.csv or --georef FILE.json), or --crs local."
+                f"--crs {name}: the capture is not georeferenced ({ground.description}). Give positions when the run "
+                "is started (--gps TABLE.csv or --georef FILE.json), or --crs local."
             )
-        return _enu(ground) if asked.lower() == "enu" else _projected(ground, open_crs(asked, ground.origin_geo))
+        return _enu(ground) if name.lower() == "enu" else _projected(ground, open_crs(name, ground.origin_geo))
 
     def project(self, points: MapPoints) -> MapPoints:
         """Points of the ground frame [n, 3] to coordinates of the target (east or x, north or y, height), exactly.
@@ -79,14 +79,14 @@ class MapProjection:
         return self._checked(self._forward(np.asarray(points, np.float64)))
 
     def to_ground(self, points: MapPoints) -> MapPoints:
-        """The inverse of `places`."""
+        """The inverse of `project`."""
         return self._checked(self._backward(np.asarray(points, np.float64)))
 
     def similarity_at(self, center: Float[np.ndarray, "3"]) -> Similarity:
         """The similarity from the ground frame to the target that is right about `center`, a ground point [3].
 
         The rotation holds the meridian convergence and the tilt of the horizon, the scale is that of the horizontal
-        plane: over a hundred metres, `places` is met to a millimetre across, and in height to the map's scale
+        plane: over a hundred metres, `project` is met to a millimetre across, and in height to the map's scale
         factor (4 cm on a house of 100 m in the middle of a UTM zone).
         """
         center = np.asarray(center, np.float64)
@@ -114,7 +114,7 @@ def _local(ground: GroundFrame) -> MapProjection:
         axes = ""
     return MapProjection(
         crs="local", name=name + axes, unit=ground.unit, meters_per_unit=1.0 if ground.metric else None, wkt=None,
-        height_reference=heights, notes=(), _forward=_same, _backward=_same,
+        height_reference=heights, notes=(), _forward=np.copy, _backward=np.copy,
     )  # fmt: skip
 
 
@@ -151,18 +151,6 @@ def _projected(ground: GroundFrame, projection: CrsTransform) -> MapProjection:
     def backward(places: MapPoints) -> MapPoints:
         return enu_from_geodetic(projection.to_geodetic(places), origin, level_at)
 
-    return MapProjection(
-        crs=projection.code,
-        name=f"{projection.name} ({projection.code})",
-        unit=projection.unit,
-        meters_per_unit=projection.meters_per_unit,
-        wkt=projection.wkt,
-        height_reference=projection.height_reference,
-        notes=projection.notes,
-        _forward=forward,
-        _backward=backward,
-    )
-
-
-def _same(points: MapPoints) -> MapPoints:
-    return points.copy()
+    shared = {n: getattr(projection, n) for n in ("unit", "meters_per_unit", "wkt", "height_reference", "notes")}
+    name = f"{projection.name} ({projection.code})"
+    return MapProjection(crs=projection.code, name=name, _forward=forward, _backward=backward, **shared)

@@ -99,7 +99,7 @@ def geometric_median(points: np.ndarray, max_points: int = 20_000) -> np.ndarray
     """The place [3] with the least summed distance to the points [n, 3] (Weiszfeld's iteration).
 
     Unlike a median per axis it turns and scales with the points, and unlike the mean a few strays do not
-    move it. More than `most` points are thinned evenly.
+    move it. More than `max_points` points are thinned evenly.
     """
     sample = points[:: max(1, -(-len(points) // max_points))]
     center = np.median(sample, axis=0)
@@ -111,3 +111,10 @@ def geometric_median(points: np.ndarray, max_points: int = 20_000) -> np.ndarray
             return moved
         center = moved
     return center
+
+
+def sample_points(points: np.ndarray, max_points: int) -> np.ndarray:
+    """At most `max_points` of the points [n, 3], drawn without replacement with a fixed seed."""
+    if len(points) <= max_points:
+        return points
+    return points[np.sort(np.random.default_rng(0).choice(len(points), max_points, replace=False))]

@@ -1,81 +1,44 @@
-"""The numerical operations, in interchangeable implementations, behind one door: `get_backend(device)`.
+"""The numerical operations, in interchangeable implementations: `get_backend(device)` returns one.
 
-`native` is C++ for the CPU, `reference` readable torch for any device (and the oracle of the tests). `KernelBackend` in
-`operations.py` is the typed set that both offer; "d" marks those that torch can differentiate. `composed` is the set
-for NVIDIA GPUs, of `reference`, own kernels (`cuda`) and `gsplat`; a table in `operations.py` says which is which.
-Code outside this folder names no implementation.
+`cpu` is C++ for the CPU, `torch_ref` readable torch for any device (and the oracle of the tests), `gpu` the set for
+NVIDIA GPUs, made of `torch_ref`, own kernels (`cuda`) and `gsplat` (`operations.GPU_BACKENDS`). All offer
+`operations.KernelBackend`. Code outside this folder names no implementation.
 
-Names and dimensions, fixed once for all files in this folder:
-
-    n  anchors of the model          v  anchors visible in the view
-    k  offsets per anchor            m  splats: Gaussians that survive decoding
-    h, w  image height and width in pixels
-
-       cull(positions [n,3], log_scales [n,6], camera) -> int64 [v], ascending
-    d  decode(positions [n,3], features [n,32], offsets [n,k,3], log_scales [n,6], weights, camera,
-              rows [v]) -> Splats
-       decode_to_train(the same) -> Splats, in an order that goes with them, and their mean volume
-       decode_backward_adam(positions [n,3], moved, weights, camera, rows [v], gradients, updates [n])
-                 -> finite, gradients of the weights; anchors move and their updates are counted, in place
-    d  project(means [m,3], scales [m,3], quaternions [m,4], camera) -> Projected
-    d  rasterise(means_px [m,2], conics [m,3], colours [m,3], opacities [m], depths [m],
-                 background [3], width, height) -> Raster(image [h,w,3], alpha [h,w], depth [h,w], median_depth [h,w])
-       rasterise_vjp(the same) -> Raster, and the function that takes gradients of it back to the splats
-       shares(the same, wanted [h,w,3]) -> Shares(pixels [m], missing [m,3])
-    d  photometric_loss(image [h,w,3], target uint8 [h,w,3], mask) -> Photometric(loss, l1, ssim)
-       adam_rows(parameter [n,...], rows [v], gradient [v,...], moments, ...) -> finite; in place
-       add_view_statistics(visible [v], inside [v], source [m], opacities [m], gradient_px [m,2], ..., sums)
-                 in place
-       harmonic_colours(means [m,3], coefficients [n,c], rows [m], eye [3], degree) -> colours [m,3]
-       fit_harmonics(directions [p,3], colours [p,3], weights [p], starts [m], degree, ridge) -> coefficients [m,f,3]
-       mean_ellipsoids(log_scales [p,3], quaternions [p,4], weights [p], starts [m]) -> the same of the means [m,...]
-       count_visibility(points [n,3], cameras) -> int32 [n];  mark_visible(points [n,3], camera) -> bool [n]
-       cell_keys, cell_centres, group_cells, group_max, contains, morton_order: the lattice of growth
-
-Constants shared by all implementations live in `constants.py`. Nothing heavy is imported before it is asked for.
+Dimensions in this folder: n anchors of the model, v anchors visible in the view, k offsets per anchor, m splats
+(Gaussians that survive decoding), h and w image height and width in pixels. Importing this module loads nothing heavy.
 """
 
 from __future__ import annotations
 
 import os
 from functools import cache
+from importlib import import_module
 from typing import TYPE_CHECKING
+
+from vdgs.errors import VdgsError
 
 if TYPE_CHECKING:
     import torch
 
     from vdgs.kernels.operations import KernelBackend
 
-#: Environment variable that takes another set than the device's own: `reference` or `composed`, for tests and doubts.
+#: Environment variable that selects another implementation than the device's own, for tests and comparisons.
 KERNELS_ENV_VAR = "VDGS_KERNELS"
 
 
 def get_backend(device: torch.device) -> KernelBackend:
-    """The operations for tensors on `device`: C++ on the CPU, the composed set on NVIDIA GPUs, torch elsewhere; on any
-    device those that VDGS_KERNELS names, if it does.
-
-    Raises VdgsError for another value of that variable.
-    """
+    """The operations for tensors on `device`: `cpu`, `gpu` on NVIDIA GPUs, `torch_ref` elsewhere, or the implementation
+    that VDGS_KERNELS names. Raises VdgsError for another value of that variable."""
     return _implementation(device.type, os.environ.get(KERNELS_ENV_VAR, ""))
 
 
 @cache
-def _implementation(device_type: str, wanted: str) -> KernelBackend:
-    if wanted not in ("", "native", "reference", "composed"):
-        from vdgs.errors import VdgsError
-
-        raise VdgsError(f"{KERNELS_ENV_VAR} must be native, reference, composed or not set, not {wanted!r}.")
-    if wanted == "reference" or (wanted != "composed" and device_type not in ("cpu", "cuda")):
-        from vdgs.kernels import torch_ref
-
-        return torch_ref
-    if wanted == "composed" or device_type == "cuda":
-        from vdgs.kernels import gpu
-
-        return gpu
-    from vdgs.kernels import cpu
-
-    return cpu
+def _implementation(device_type: str, name: str) -> KernelBackend:
+    if name not in ("", "cpu", "torch_ref", "gpu"):
+        raise VdgsError(f"{KERNELS_ENV_VAR} must be cpu, torch_ref, gpu or not set, not {name!r}.")
+    name = name if name in ("torch_ref", "gpu") else {"cpu": "cpu", "cuda": "gpu"}.get(device_type, "torch_ref")
+    backend: KernelBackend = import_module(f"vdgs.kernels.{name}")  # type: ignore[assignment]
+    return backend
 
 
 def get_num_threads() -> int:
@@ -85,22 +48,27 @@ def get_num_threads() -> int:
     return extension.get_num_threads()
 
 
+def cpu_count() -> int:
+    """The number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def default_num_threads() -> int:
-    """`VDGS_THREADS`, or the number of cores that this process may use; the kernels themselves are not loaded.
-
-    Raises VdgsError for another value of that variable.
-    """
-    from vdgs.kernels import thread_count
-
-    return thread_count.default_num_threads()
+    """`VDGS_THREADS`, or the number of cores that this process may use. VdgsError for another value of the variable."""
+    text = os.environ.get("VDGS_THREADS")
+    if not text:
+        return cpu_count()
+    if not text.isdecimal() or int(text) < 1:
+        raise VdgsError(f"VDGS_THREADS must be a whole number from 1, not {text!r}.")
+    return int(text)
 
 
 def configure_threads(count: int | None = None) -> None:
-    """Set up the threads of this process and, by its environment, of those that it starts.
+    """Set up the threads of this process and, through its environment, of its child processes.
 
     Call it before torch is imported: torch's OpenMP threads must block, not spin, beside the kernels' own pool, and
-    OMP_WAIT_POLICY is read once, when torch is loaded. A value that is set already stays. Without a count nothing heavy
-    is imported; with one, kernels and torch use so many threads, with 0 as many as `default_num_threads` says.
+    torch reads OMP_WAIT_POLICY once. A value that is set already stays. `count` 0 means `default_num_threads()`; None
+    leaves the number of threads and imports nothing heavy.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     if count is not None:

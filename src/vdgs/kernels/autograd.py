@@ -1,4 +1,4 @@
-"""Between rasterisers and autograd: what knows its own way back is made known to autograd, and the other way round."""
+"""Shared by the rasterizers: checks of their arguments, and the bridge to autograd and back."""
 
 from __future__ import annotations
 
@@ -12,13 +12,15 @@ from torch.autograd.function import once_differentiable
 
 from vdgs.kernels.kernel_types import Raster, RasterGradients, RasterPullback, Splats
 
-#: From the tensors of splats (`Splats.tensors`) and the background to the picture and the way back from it.
+#: The largest picture side: tiles are numbered with 16 bits.
+MAX_IMAGE_SIDE_PX = 16 * 32767
+#: From the tensors of splats (`Splats.tensors`) and the background to the image and its pullback.
 RasterizeFn = Callable[[tuple[Tensor, ...]], tuple[Raster, RasterPullback]]
 
 
 def rasterize_with_autograd(draw: RasterizeFn, splats: Splats, background: Tensor) -> Raster:
-    """The picture before a background [3]. Gradients of image, alpha and expected depth find back to splats and
-    background, once: the second derivative is not defined, and asking for it raises RuntimeError."""
+    """The image over a background [3], differentiable once by splats and background; a second derivative raises
+    RuntimeError."""
     return Raster(*_Drawn.apply(draw, *splats.tensors, background))
 
 
@@ -41,7 +43,7 @@ class _Drawn(torch.autograd.Function):
 def vjp_from_autograd(
     draw: Callable[[Splats, Tensor], Raster], splats: Splats, background: Float[Tensor, "3"]
 ) -> tuple[Raster, RasterPullback]:
-    """What a function draws that autograd can differentiate, and the way back, with autograd kept in here."""
+    """The image of a function that autograd differentiates, and its pullback, with autograd kept inside."""
     inputs = (*splats.tensors, background)
     leaves = [tensor.detach().clone().requires_grad_(True) for tensor in inputs]
     means_px, conics, colors, opacities, depths, behind = leaves
@@ -55,8 +57,7 @@ def vjp_from_autograd(
         out: tuple[Tensor, Tensor] | None = None,
         count: int | None = None,
     ) -> RasterGradients:
-        made = {"image": image, "alpha": alpha, "depth": depth}
-        received = {name: gradient for name, gradient in made.items() if gradient is not None}
+        received = {name: g for name, g in (("image", image), ("alpha", alpha), ("depth", depth)) if g is not None}
         *by_splats, by_background = torch.autograd.grad(
             [getattr(drawn, name) for name in received], leaves, list(received.values()),
             allow_unused=True, materialize_grads=True,
@@ -70,3 +71,20 @@ def vjp_from_autograd(
 
     shown_depth = None if drawn.depth is None else drawn.depth.detach()
     return Raster(drawn.image.detach(), drawn.alpha.detach(), shown_depth, drawn.median_depth), pullback
+
+
+def check_splats(tensors: tuple[Tensor, ...], width: int, height: int, device_type: str | None = None) -> None:
+    """Raise TypeError or ValueError unless these are means_px, conics, colours, opacities, depths and a background,
+    float32 (on `device_type`, if given), and the image has a size that can be drawn."""
+    for name, side in (("width", width), ("height", height)):
+        if not 1 <= side <= MAX_IMAGE_SIDE_PX:
+            raise ValueError(f"{name} must be from 1 to {MAX_IMAGE_SIDE_PX} pixels, not {side}")
+    n = len(tensors[0]) if tensors[0].dim() else 0
+    shapes = ((n, 2), (n, 3), (n, 3), (n,), (n,), (3,))
+    names = ("means_px", "conics", "colors", "opacities", "depths", "background")
+    for name, tensor, shape in zip(names, tensors, shapes, strict=True):
+        if tensor.dtype != torch.float32 or device_type not in (None, tensor.device.type):
+            where = {None: "", "cpu": " on the CPU"}.get(device_type, f" on {device_type}")
+            raise TypeError(f"{name} must be float32{where}, not {tensor.dtype} on {tensor.device}")
+        if tuple(tensor.shape) != shape:
+            raise ValueError(f"{name} must have shape {list(shape)}, not {list(tensor.shape)}")

@@ -15,10 +15,10 @@ from torch import Tensor
 
 from vdgs.kernels.splat_segments import SplatMask, SplatSegments
 
-#: Whether all was finite: a bool, or on a card, which nobody has asked yet, a tensor that holds one.
+#: Whether all numbers were finite: a bool, or a tensor that holds one on a GPU (reading it would wait for the GPU).
 IsFinite = bool | Bool[Tensor, ""]
 
-#: What each of m splats is of: see `TrainingSplats`.
+#: The anchor and offset of each of m splats: see `TrainingSplats`.
 SplatSources = Int32[Tensor, "m"] | SplatMask
 
 #: Numbers in an anchor's feature, and units in the hidden layer of every head.
@@ -43,10 +43,8 @@ class MlpWeights:
         return self.w1, self.b1, self.w2, self.b2
 
     def forward(self, inputs: Float[Tensor, "v 36"]) -> Float[Tensor, "v output"]:
-        """What the head makes of features, viewing directions and distances, the last of which it may not look at.
-
-        Raises ValueError if its first layer is neither 35 nor 36 wide.
-        """
+        """Outputs for features, directions and distances (ignored by a first layer of width 35). Raises ValueError if
+        the first layer is neither 35 nor 36 wide."""
         width = self.w1.shape[1]
         if width not in (FEATURE_SIZE + 3, FEATURE_SIZE + 4):
             raise ValueError(f"a head's first layer must be 35 or 36 wide, not {width}")
@@ -85,13 +83,9 @@ class DecoderWeights:
 
         def head(outputs: int) -> MlpWeights:
             inputs = FEATURE_SIZE + 3 + int(with_distance)
-            shapes = [(HIDDEN_SIZE, inputs), (HIDDEN_SIZE,), (outputs, HIDDEN_SIZE), (outputs,)]
-            bounds = [inputs**-0.5] * 2 + [HIDDEN_SIZE**-0.5] * 2
-            draws = (
-                (2 * torch.rand(shape, generator=generator) - 1) * bound
-                for shape, bound in zip(shapes, bounds, strict=True)
-            )
-            return MlpWeights(*draws)
+            layers = ((HIDDEN_SIZE, inputs), (outputs, HIDDEN_SIZE))
+            shapes = [(shape, columns**-0.5) for rows, columns in layers for shape in ((rows, columns), (rows,))]
+            return MlpWeights(*((2 * torch.rand(shape, generator=generator) - 1) * bound for shape, bound in shapes))
 
         return DecoderWeights(head(k), head(7 * k), head(3 * k))
 
@@ -127,15 +121,17 @@ class Splats:
         return self.means_px, self.conics, self.colors, self.opacities, self.depths
 
 
+#: The tensors of `Splats` in the order of its fields.
+SPLAT_TENSORS = ("means_px", "conics", "depths", "colors", "opacities")
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AnchorSplats(Splats):
-    """What an anchor model looks like from one camera.
+    """What an anchor model looks like from one camera."""
 
-    `source` is (index among the visible anchors)·k + offset, ascending; `volumes` are the products
-    of the three scales (world units cubed), which the loss keeps small.
-    """
-
+    #: Products of the three scales (world units cubed), which the loss keeps small.
     volumes: Float[Tensor, "m"]
+    #: (Index among the visible anchors)·k + offset, ascending.
     source: Int32[Tensor, "m"]
 
 
@@ -148,20 +144,16 @@ class OrderedSplats(Splats):
 
     def concat(self, others: OrderedSplats) -> OrderedSplats:
         """These splats followed by others, in the order of each."""
-        runs = SplatSegments.concat(
-            self.segments, len(self.depths), others.segments, len(others.depths), self.depths.device
-        )
-        both = {
-            field.name: torch.cat([getattr(self, field.name), getattr(others, field.name)]) for field in fields(Splats)
-        }
-        return OrderedSplats(**both, segments=runs)
+        m, n, device = len(self.depths), len(others.depths), self.depths.device
+        both = {name: torch.cat([getattr(self, name), getattr(others, name)]) for name in SPLAT_TENSORS}
+        return OrderedSplats(**both, segments=SplatSegments.concat(self.segments, m, others.segments, n, device))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrainingSplats(OrderedSplats):
-    """What a training step needs to know of an anchor model as one camera sees it: no more than that."""
+    """What a training step needs of an anchor model as one camera sees it."""
 
-    #: As in `AnchorSplats`; a card may only know which offsets show.
+    #: As in `AnchorSplats`; a GPU may only know which offsets show.
     source: SplatSources
     #: Mean volume of the splats; NaN if there are none.
     volume: Float[Tensor, ""]
@@ -169,17 +161,8 @@ class TrainingSplats(OrderedSplats):
     @staticmethod
     def of(splats: AnchorSplats) -> TrainingSplats:
         """The same splats."""
-        s = splats
-        return TrainingSplats(
-            means_px=s.means_px,
-            conics=s.conics,
-            depths=s.depths,
-            colors=s.colors,
-            opacities=s.opacities,
-            segments=None,
-            source=s.source,
-            volume=s.volumes.mean(),
-        )
+        named = {name: getattr(splats, name) for name in SPLAT_TENSORS}
+        return TrainingSplats(**named, segments=None, source=splats.source, volume=splats.volumes.mean())
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -261,12 +244,8 @@ class RasterPullback(Protocol):
         out: tuple[Tensor, Tensor] | None = None,
         count: int | None = None,
     ) -> RasterGradients:
-        """Gradients by image [h,w,3], alpha [h,w] and depth [h,w]; None is zero. To be called once.
-
-        Those of the first `count` splats (None: of all m). Those of means_px and conics overwrite the contiguous
-        tensors `over` [count,2] and [count,3], if given.
-        """
-        ...
+        """Gradients by image [h,w,3], alpha [h,w] and depth [h,w]; None is zero. Call once. Returns those of the
+        first `count` splats (None: all m). Those of means_px and conics are written to `out` [count,2], [count,3]."""
 
 
 class PhotometricLoss(NamedTuple):

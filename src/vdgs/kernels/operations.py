@@ -137,9 +137,9 @@ class KernelBackend(Protocol):
 OPERATION_NAMES = tuple(sorted(name for name in vars(KernelBackend) if not name.startswith("_")))
 
 #: By which implementation (a folder of `vdgs.kernels`) each operation is done on an NVIDIA card: torch's own arithmetic
-#: (`reference`), own kernels (`cuda`) or gsplat's. Of several the first that can be used; gsplat cannot tell median
+#: (`torch_ref`), own kernels (`cuda`) or gsplat's. Of several the first that can be used; gsplat cannot tell median
 #: depth, so that pictures with depth are always drawn by the own kernels.
-GPU_BACKENDS: dict[str, tuple[str, ...]] = dict.fromkeys(OPERATION_NAMES, ("reference",)) | {
+GPU_BACKENDS: dict[str, tuple[str, ...]] = dict.fromkeys(OPERATION_NAMES, ("torch_ref",)) | {
     "add_view_statistics": ("cuda",),
     "cull": ("cuda",),
     "decode": ("cuda",),
@@ -157,4 +157,4 @@ GPU_VERIFIED = False
 
 def backends_for(operation: str, device_type: str) -> tuple[str, ...]:
     """The implementations of an operation on a kind of device, the preferred one first."""
-    return ("native",) if device_type == "cpu" else GPU_BACKENDS[operation] if device_type == "cuda" else ("reference",)
+    return ("cpu",) if device_type == "cpu" else GPU_BACKENDS[operation] if device_type == "cuda" else ("torch_ref",)

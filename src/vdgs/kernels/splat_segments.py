@@ -1,8 +1,5 @@
-"""Splats that do not stand in the order of their anchors, and what tells where they are.
-
-On a card, blocks of threads write the splats of some anchors each, and which block comes first is left to the card.
-Within a block's run they are in order, so that a number or two for each run say all.
-"""
+"""The order of splats that a GPU wrote in segments: each block of threads writes the splats of its anchors in order,
+and the blocks finish in any order."""
 
 from __future__ import annotations
 
@@ -18,14 +15,14 @@ ANCHORS_PER_SEGMENT = 8
 
 @dataclass(frozen=True, eq=False)
 class SplatSegments:
-    """Where m splats stand that are ordered within runs, and the runs in any way: r of them, which may be empty."""
+    """r segments of m splats, in the order that is meant; a segment may be empty."""
 
-    #: The row at which each run begins, and how many rows it has; runs are named in the order that is meant.
+    #: The first row of each segment, and its number of rows.
     starts: Int32[Tensor, " r"]
     lengths: Int32[Tensor, " r"]
 
     def order(self, m: int) -> Int32[Tensor, " m"]:
-        """The rows of the m splats in the order that is meant. Nothing waits for a card."""
+        """The rows of the m splats in the order that is meant. Does not wait for a GPU."""
         ends = self.lengths.cumsum(0, dtype=torch.int32)
         place = torch.arange(m, dtype=torch.int32, device=ends.device)
         shift = self.starts - ends + self.lengths
@@ -35,7 +32,7 @@ class SplatSegments:
     def concat(
         first: SplatSegments | None, m: int, second: SplatSegments | None, n: int, device: torch.device
     ) -> SplatSegments | None:
-        """Those of m splats followed by n others; None is one run, as the rows are."""
+        """The segments of m splats followed by n others; None is one segment."""
         if first is None and second is None:
             return None
         first, second = first or SplatSegments.single(m, device), second or SplatSegments.single(n, device)
@@ -43,14 +40,14 @@ class SplatSegments:
 
     @staticmethod
     def single(m: int, device: torch.device) -> SplatSegments:
-        """m splats as the rows are."""
+        """m splats in the order of the rows."""
         return SplatSegments(*(torch.full((1,), number, dtype=torch.int32, device=device) for number in (0, m)))
 
 
 @dataclass(frozen=True, eq=False)
 class SplatMask:
-    """Which offsets each of v visible anchors shows, and where their m splats stand: in place of `source`
-    (`AnchorSplats`), of which it has an eighth of the bytes."""
+    """Which offsets of each of v visible anchors have a splat, and the segments of their m splats:
+    `AnchorSplats.source` in an eighth of the bytes."""
 
     #: Bit o is set where offset o has a splat; splats of an anchor are in the order of offsets.
     bits: Int32[Tensor, " v"]
@@ -64,14 +61,12 @@ class SplatMask:
 
     @staticmethod
     def of(source: Int32[Tensor, " m"], v: int, offsets: int) -> SplatMask:
-        """From ascending sources. Nothing waits for a card."""
+        """From ascending sources. Does not wait for a GPU."""
         anchor, offset = source // offsets, source % offsets
         bits = torch.zeros(v, dtype=torch.int32, device=source.device)
         bits.index_add_(0, anchor, torch.ones_like(source) << offset)
-        firsts = (
-            torch.arange(0, v + ANCHORS_PER_SEGMENT, ANCHORS_PER_SEGMENT, device=source.device).clamp(max=v) * offsets
-        )
-        bounds = torch.searchsorted(source, firsts.to(torch.int32), out_int32=True)
+        anchors = torch.arange(0, v + ANCHORS_PER_SEGMENT, ANCHORS_PER_SEGMENT, device=source.device).clamp(max=v)
+        bounds = torch.searchsorted(source, (anchors * offsets).to(torch.int32), out_int32=True)
         return SplatMask(bits, SplatSegments(bounds[:-1].contiguous(), bounds.diff()), len(source), offsets)
 
 

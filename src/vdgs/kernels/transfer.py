@@ -1,8 +1,5 @@
-"""Numbers on their way from main memory to a card, without waiting for it.
-
-A plain `tensor.to(card)`, `torch.tensor(…, device=card)` or `new_tensor` first waits until the card has done all that
-was queued. On the processor nothing of this makes a difference.
-"""
+"""Copies from main memory to a GPU that do not wait for it, as `tensor.to`, `torch.tensor(…, device=…)` and
+`new_tensor` do. On the CPU they make no difference."""
 
 from __future__ import annotations
 
@@ -14,8 +11,8 @@ from torch import Tensor
 
 def to_like(values: Any, like: Tensor) -> Tensor:
     """A few numbers (an array, or a sequence of floats) on the device of a tensor and in its type."""
-    given = values if isinstance(values, Tensor) else torch.as_tensor(values, dtype=torch.float64)
-    return given.to(like.device, like.dtype, non_blocking=True)
+    tensor = values if isinstance(values, Tensor) else torch.as_tensor(values, dtype=torch.float64)
+    return tensor.to(like.device, like.dtype, non_blocking=True)
 
 
 def upload(tensor: Tensor, device: torch.device) -> Tensor:
@@ -26,6 +23,5 @@ def upload(tensor: Tensor, device: torch.device) -> Tensor:
 
 
 def is_host(tensor: Tensor) -> bool:
-    """Whether looking at its numbers costs nothing: to ask a card means to wait for it, so that what is only checked to
-    say clearly what is wrong is not checked there."""
+    """Whether reading its numbers is free. Reading from a GPU waits for it, so arguments there are not validated."""
     return tensor.device.type == "cpu"

@@ -149,12 +149,7 @@ class AnchorModel:
     def check(self) -> None:
         """Raise ValueError unless shapes and types agree with each other and all numbers are finite."""
         n, k = len(self.anchors), self.anchors.offsets.shape[1] if self.anchors.offsets.ndim == 3 else 0
-        shapes = {
-            "positions": (n, 3),
-            "features": (n, FEATURE_SIZE),
-            "offsets": (n, k, 3),
-            "log_scales": (n, 6),
-        }
+        shapes = {"positions": (n, 3), "features": (n, FEATURE_SIZE), "offsets": (n, k, 3), "log_scales": (n, 6)}
         for name, shape in shapes.items():
             tensor = getattr(self.anchors, name)
             if tuple(tensor.shape) != shape or tensor.dtype != torch.float32:

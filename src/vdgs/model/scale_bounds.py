@@ -5,9 +5,9 @@ photographs, and seen from between the cameras it hangs as a veil in front of ev
 of any training camera that holds the anchor's place, the ellipse within which one of its Gaussians is drawn at all
 (alpha of at least 1/255, at full opacity) is no longer than `MAX_IMAGE_FRACTION` of the longer side.
 
-The three scales that are the unit of an anchor's offsets may be `MAX_OFFSET_FACTOR` times that. Nothing else keeps Gaussians about
-their anchor, where visibility, blocks, culling and growth take them to be. Unbounded, a few anchors of every real scene
-strew theirs over all of it, where they hang as patches in the colours of somewhere else.
+The three scales that are the unit of an anchor's offsets may be `MAX_OFFSET_FACTOR` times that. Nothing else keeps
+Gaussians about their anchor, where visibility, blocks, culling and growth take them to be. Unbounded, a few anchors of
+every real scene strew theirs over all of it, where they hang as patches in the colours of somewhere else.
 """
 
 from __future__ import annotations

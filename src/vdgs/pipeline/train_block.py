@@ -18,7 +18,7 @@ from vdgs import __version__
 from vdgs.captures.camera_height import camera_height
 from vdgs.captures.capture_metadata import capture_metadata
 from vdgs.captures.image_cache import ImageCache
-from vdgs.config.checkpointing import CheckpointOptions
+from vdgs.config.executor_options import CheckpointOptions
 from vdgs.config.method import block_train_config, max_block_anchors
 from vdgs.distributed.shard import Shard
 from vdgs.errors import RunError

@@ -11,8 +11,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from vdgs.config.checkpointing import CheckpointOptions
-from vdgs.config.executor_options import ExecutorOptions
+from vdgs.config.executor_options import CheckpointOptions, ExecutorOptions
 from vdgs.distributed.job_labels import BLOCK_LABELS
 from vdgs.distributed.node_check import NodeRequirements, image_and_mask_files
 from vdgs.distributed.sharded_job import ExecutionOptions, ShardedJob, ShardNeeds

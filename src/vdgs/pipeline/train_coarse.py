@@ -15,7 +15,7 @@ from vdgs.captures.capture_metadata import capture_metadata
 from vdgs.captures.image_cache import ImageCache
 from vdgs.captures.photometric_gains import collect_point_colors
 from vdgs.captures.validation import require_trainable
-from vdgs.config.checkpointing import CheckpointOptions
+from vdgs.config.executor_options import CheckpointOptions
 from vdgs.config.method import TrainConfig
 from vdgs.model.anchor_model import ModelMetadata
 from vdgs.model.anchors import Anchors

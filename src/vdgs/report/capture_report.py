@@ -18,7 +18,7 @@ from vdgs.captures.output_guard import check_not_among_inputs
 from vdgs.captures.reconstruction import ReconstructionReport, excluded_lines, report_rows
 from vdgs.captures.validation import format_reprojection, validate_capture
 from vdgs.geometry.camera import Camera
-from vdgs.geometry.row_sampling import sample_points
+from vdgs.geometry.similarity import sample_points
 from vdgs.report.capture_figures import draw_capture_map, draw_visibility_histogram
 from vdgs.report.capture_stats import CaptureReport, format_length, measure_capture
 from vdgs.system.atomic_files import to_jsonable, write_json

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from vdgs.captures.capture import Capture
 from vdgs.captures.image_checks import ImageCheckReport
 from vdgs.captures.validation import ValidationReport
-from vdgs.geometry.row_sampling import sample_points
+from vdgs.geometry.similarity import sample_points
 from vdgs.visibility.visibility_counts import LOW_VISIBILITY_LIMITS, count_visibility, visibility_stats
 
 

@@ -1,8 +1,8 @@
 """Signals that ask this process to stop: noted, so that work ends where it is whole, instead of breaking it off.
 
 A request is noted by every context that lasts when it comes, so that one which the innermost had no time to serve (it
-came with the last step of a training) is served by those around it: `check_stop_requested`, which all that works long calls
-where it is whole. An exception alone would not do: raised in a callback of a library, it may be swallowed there.
+came with the last step of a training) is served by those around it: `check_stop_requested`, which all that works long
+calls where it is whole. An exception alone would not do: raised in a callback of a library, it may be swallowed there.
 """
 
 from __future__ import annotations

@@ -96,8 +96,8 @@ def _crop(share: Float[np.ndarray, "h w"]) -> Crop:
 
 
 def _span(counts: Int[np.ndarray, " s"], margin: float) -> tuple[float, float]:
-    """First and last place of a row of pixels, as shares of its length, between which all but `TAIL_FRACTION` on each side
-    of the counts lie, widened by `margin` pixels."""
+    """First and last place of a row of pixels, as shares of its length, between which all but `TAIL_FRACTION` on each
+    side of the counts lie, widened by `margin` pixels."""
     reached = np.cumsum(counts) / counts.sum()
     first = int(np.searchsorted(reached, TAIL_FRACTION, side="right"))
     last = int(np.searchsorted(reached, 1 - TAIL_FRACTION)) + 1

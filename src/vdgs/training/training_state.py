@@ -1,4 +1,5 @@
-"""What training works on (`TrainingProblem`, the same for all iterations) and what changes (`TrainingState`, explicit and whole).
+"""What training works on (`TrainingProblem`, the same for all iterations) and what changes (`TrainingState`, explicit
+and whole).
 
 A state that is saved and loaded continues with the same bits.
 """

@@ -59,10 +59,7 @@ class RenderedTrainingView:
 
 @torch.no_grad()
 def render_for_training(
-    splats: TrainingSplats,
-    camera: Camera,
-    background: Float[Tensor, "3"],
-    frozen_splats: OrderedSplats | None = None,
+    splats: TrainingSplats, camera: Camera, background: Float[Tensor, "3"], frozen_splats: OrderedSplats | None = None
 ) -> RenderedTrainingView:
     """Draw the splats of trained anchors with those `around` them. The tensors of `splats` are the view's from now on:
     their memory is used again."""
@@ -87,8 +84,8 @@ def backward_and_step(
 ) -> IsFinite:
     """Move the anchors of the given rows in place, and leave the decoder's gradients in its `.grad`.
 
-    `weights` are the decoder's as the view saw them, `states` those of `TRAINED_TENSORS`; `updates` counts how often each
-    anchor has moved; `lr_mask` is the learning-rate mask of `training.Stage`. False: a gradient is not finite, and
+    `weights` are the decoder's as the view saw them, `states` those of `TRAINED_TENSORS`; `updates` counts how often
+    each anchor has moved; `lr_mask` is the learning-rate mask of `training.Stage`. False: a gradient is not finite, and
     some anchors may have moved while others have not.
     """
     slow = None if lr_mask is None else _SlowAnchors.of(anchors, rows, lr_mask)

@@ -48,8 +48,9 @@ class ModelAverage:
 
 
 def is_averaged_step(iteration: int, config: TrainConfig) -> bool:
-    """Whether the model after `iteration` steps is one of those averaged: about `NUM_AVERAGED_MODELS`, evenly spread over the last
-    share `config.average` of the iterations, none of them before growth has ended; the very last one is."""
+    """Whether the model after `iteration` steps is one of those averaged: about `NUM_AVERAGED_MODELS`, evenly spread
+    over the last share `config.average` of the iterations, none of them before growth has ended; the very last one
+    is."""
     begin = max(1 - config.swa_fraction, config.densify.stop_fraction) * config.iterations
     every = max(1, round((config.iterations - begin) / NUM_AVERAGED_MODELS))
     return config.swa_fraction > 0 and iteration > begin and (config.iterations - iteration) % every == 0

@@ -54,7 +54,7 @@ def _operations() -> list[SystemCheck]:
     for name in OPERATION_NAMES:
         ways.setdefault(backends_for(name, "cuda"), []).append(name)
     by_card = [SystemCheck(f"on cuda: {' or '.join(way)}", "note", ", ".join(names)) for way, names in ways.items()]
-    return [SystemCheck("on cpu: native", "note", f"all {len(OPERATION_NAMES)} operations"), *by_card]
+    return [SystemCheck("on cpu: cpu", "note", f"all {len(OPERATION_NAMES)} operations"), *by_card]
 
 
 def _device() -> SystemCheck:

@@ -22,7 +22,7 @@ def adam_rows(
     beta2: float = 0.999,
     epsilon: float = 1e-15,
 ) -> bool:
-    """As `reference.adam.adam_rows`, for contiguous float32 parameters and moments.
+    """As `torch_ref.adam_rows`, for contiguous float32 parameters and moments.
 
     Raises ValueError also where one of those is not contiguous. Same bits for any number of threads.
     """

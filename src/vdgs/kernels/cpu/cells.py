@@ -14,7 +14,7 @@ __all__ = ["cell_centers", "cell_keys", "contains", "group_cells", "group_max", 
 
 
 def cell_keys(positions: Float[Tensor, "n 3"], cell_size: float, origin: Float[Tensor, "3"]) -> Int64[Tensor, "n"]:
-    """As `reference.cells.cell_keys`."""
+    """As `torch_ref.cell_keys`."""
     reference.check_lattice(positions, cell_size, origin)
     keys = torch.empty(positions.shape[0], dtype=torch.int64)
     exact = origin.detach().to(torch.float64).contiguous()
@@ -24,7 +24,7 @@ def cell_keys(positions: Float[Tensor, "n 3"], cell_size: float, origin: Float[T
 
 
 def group_cells(keys: Int64[Tensor, "n"]) -> tuple[Int64[Tensor, "c"], Int64[Tensor, "n"]]:
-    """As `reference.cells.group_cells`, by radix sort."""
+    """As `torch_ref.group_cells`, by radix sort."""
     reference.check_keys(keys)
     keys = keys.contiguous()
     unique, group = torch.empty_like(keys), torch.empty_like(keys)
@@ -33,7 +33,7 @@ def group_cells(keys: Int64[Tensor, "n"]) -> tuple[Int64[Tensor, "c"], Int64[Ten
 
 
 def contains(table: Int64[Tensor, "a"], query: Int64[Tensor, "b"]) -> Bool[Tensor, "b"]:
-    """As `reference.cells.contains`, by open addressing."""
+    """As `torch_ref.contains`, by open addressing."""
     reference.check_keys(table)
     reference.check_keys(query)
     result = torch.empty(query.shape[0], dtype=torch.bool)
@@ -42,7 +42,7 @@ def contains(table: Int64[Tensor, "a"], query: Int64[Tensor, "b"]) -> Bool[Tenso
 
 
 def group_max(values: Float[Tensor, "n d"], group: Int64[Tensor, "n"], count: int) -> Float[Tensor, "c d"]:
-    """As `reference.cells.group_max`."""
+    """As `torch_ref.group_max`."""
     reference.check_groups(values, group, count)
     result = values.new_empty(count, values.shape[1])
     extension.get_extension().group_max(values.detach().contiguous(), group.contiguous(), result)
@@ -50,7 +50,7 @@ def group_max(values: Float[Tensor, "n d"], group: Int64[Tensor, "n"], count: in
 
 
 def morton_order(positions: Float[Tensor, "n 3"]) -> Int64[Tensor, "n"]:
-    """As `reference.cells.morton_order`, by radix sort."""
+    """As `torch_ref.morton_order`, by radix sort."""
     reference.check_positions(positions)
     order = torch.empty(positions.shape[0], dtype=torch.int64)
     if positions.shape[0]:

@@ -12,12 +12,8 @@ from vdgs.kernels.cpu.arguments import check_row_shapes, contiguous, packed_came
 
 
 def cull(positions: Float[Tensor, "n 3"], log_scales: Float[Tensor, "n 6"], camera: Camera) -> Int64[Tensor, "v"]:
-    """Indices, ascending, of the anchors that may touch the image: the bound of
-    `vdgs.kernels.torch_ref.cull.cull`, of which this is the float32 twin.
-
-    The scales are read only where the centre does not already lie on the image. Raises ValueError
-    where the shapes do not belong together.
-    """
+    """As `torch_ref.cull`, in float32; scales are read only where the centre lies outside the image. Raises ValueError
+    for shapes that do not match."""
     check_row_shapes(positions.shape[0], positions=(positions, 3), log_scales=(log_scales, 6))
     visible = extension.get_extension().cull(
         contiguous(positions.detach()), contiguous(log_scales.detach()), packed_camera(camera)

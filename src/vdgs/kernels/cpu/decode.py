@@ -24,13 +24,11 @@ def decode(
     camera: Camera,
     rows: Int64[Tensor, "v"] | None = None,
 ) -> AnchorSplats:
-    """Decode and project visible anchors: see `vdgs.kernels.torch_ref.decode.decode`, of which this is
-    the float32 twin.
+    """As `torch_ref.decode`, in float32.
 
-    Between forward and backward only the arguments and the splats are kept; hidden layers are computed
-    again. Gradients are the same bits for any number of threads; those that nobody wants are not
-    computed. `rows` ascend without repetition and are read where they stand; they are gathered only if autograd
-    follows. Raises ValueError where shapes do not belong together or k > 32, IndexError for a row that is not there.
+    Backward computes hidden layers again, and only the gradients that are needed; same bits for any number of threads.
+    `rows` ascend without repetition; anchors are gathered only if autograd follows. Raises ValueError for shapes that
+    do not match or k > 32, IndexError for a row outside the anchors.
     """
     check_anchors(positions, features, offsets, log_scales)
     tensors: tuple[Tensor, ...] = (positions.detach(), features, offsets, log_scales)
@@ -55,7 +53,7 @@ def decode_for_training(
     camera: Camera,
     rows: Int64[Tensor, "v"] | None = None,
 ) -> TrainingSplats:
-    """As `reference.decode.decode_for_training`, by `decode`."""
+    """As `torch_ref.decode_for_training`, by `decode`."""
     return TrainingSplats.of(decode(positions, features, offsets, log_scales, weights, camera, rows))
 
 

@@ -29,11 +29,10 @@ def decode_backward_adam(
     gradients: SplatGradients,
     updates: Int32[Tensor, "n"],
 ) -> tuple[bool, tuple[Tensor, ...] | None]:
-    """As `reference.decode_adam.decode_backward_adam`, for contiguous float32 parameters and moments.
+    """As `torch_ref.decode_backward_adam`, for contiguous float32 parameters and moments.
 
-    An anchor moves as soon as its gradient is known: that of all anchors is never held. The bits are those of
-    `decode` with autograd and `adam_rows`, for any number of threads. Raises ValueError or TypeError where the
-    arguments do not belong together, IndexError for a row that is not there: before any change.
+    An anchor moves as soon as its gradient is known. The bits are those of `decode` with autograd and `adam_rows`, for
+    any number of threads. Raises ValueError, TypeError or IndexError for unsuitable arguments, before any change.
     """
     features, offsets, log_scales = (state.parameter for state in moved)
     check_anchors(positions, features, offsets, log_scales)
@@ -42,7 +41,9 @@ def decode_backward_adam(
     if not updates.is_contiguous():
         raise ValueError("updates must be contiguous")
     for state in moved:
-        _check_state(state)
+        for tensor in state[:3]:
+            if tensor.dtype != torch.float32 or not tensor.is_contiguous() or tensor.shape != state.parameter.shape:
+                raise ValueError("parameter and moments must be contiguous float32 of one shape")
     source = sources_tensor(gradients.source)
     check_sources(source, rows, offsets.shape[1])
     _check_splats(gradients)
@@ -66,12 +67,6 @@ def _step(state: AdamState) -> tuple[Any, ...]:
     """A parameter and its moments, the tables of its step, and the betas with epsilon."""
     rates, roots, *rest = round_factors(step_factors(state.learning_rate, None, lr_boost=state.lr_boost))
     return (*(t.detach() for t in state[:3]), rates, roots, rest)
-
-
-def _check_state(state: AdamState) -> None:
-    for tensor in state[:3]:
-        if tensor.dtype != torch.float32 or not tensor.is_contiguous() or tensor.shape != state.parameter.shape:
-            raise ValueError("parameter and moments must be contiguous float32 of one shape")
 
 
 def _check_splats(g: SplatGradients) -> None:

@@ -14,7 +14,7 @@ def mean_ellipsoids(
     log_scales: Float[Tensor, "p 3"], quaternions: Float[Tensor, "p 4"], weights: Float[Tensor, " p"],
     starts: Int64[Tensor, " m"],
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 4"]]:  # fmt: skip
-    """As `reference.ellipsoids.mean_ellipsoids`. Same bits for any number of threads."""
+    """As `torch_ref.mean_ellipsoids`. Same bits for any number of threads."""
     check_starts(starts, len(weights))
     found = torch.empty(len(starts), 3), torch.empty(len(starts), 4)
     given = (each.contiguous() for each in (log_scales, quaternions, weights))

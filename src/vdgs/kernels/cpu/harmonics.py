@@ -15,7 +15,7 @@ def harmonic_colors(
     means: Float[Tensor, "m 3"], coefficients: Float[Tensor, "n c"], rows: Int64[Tensor, " m"],
     eye: Float[Tensor, "3"], degree: int,
 ) -> Float[Tensor, "m 3"]:  # fmt: skip
-    """As `reference.harmonics.harmonic_colors`. Same bits for any number of threads."""
+    """As `torch_ref.harmonic_colors`. Same bits for any number of threads."""
     check_coefficients(coefficients, rows, degree)
     if coefficients.stride(1) != 1:
         coefficients = coefficients.contiguous()
@@ -28,7 +28,7 @@ def fit_harmonics(
     directions: Float[Tensor, "p 3"], colors: Float[Tensor, "p 3"], weights: Float[Tensor, " p"],
     starts: Int64[Tensor, " m"], degree: int, ridge: float,
 ) -> Float[Tensor, "m f 3"]:  # fmt: skip
-    """As `reference.harmonics.fit_harmonics`. Same bits for any number of threads."""
+    """As `torch_ref.fit_harmonics`. Same bits for any number of threads."""
     f = num_sh_bases(degree)
     check_starts(starts, len(weights))
     found = torch.empty(len(starts), 3 * f)

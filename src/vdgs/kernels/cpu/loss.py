@@ -20,11 +20,8 @@ def photometric_loss(
     *,
     ssim_weight: float = 0.2,
 ) -> PhotometricLoss:
-    """As `reference.loss.photometric_loss`, for float32 images. Differentiable once.
-
-    The gradient is computed together with the loss where the image asks for one. Same bits for any number
-    of threads. Memory beyond the gradient is some 0.5 MB a thread.
-    """
+    """As `torch_ref.photometric_loss`, for float32 images. Differentiable once; the gradient is computed with the loss.
+    Same bits for any number of threads. Takes some 0.5 MB a thread beside the gradient."""
     check_images(image, target, mask)
     if image.dtype != torch.float32:
         raise TypeError(f"image must be float32, not {image.dtype}")

@@ -15,15 +15,9 @@ from vdgs.kernels.kernel_types import ProjectedGaussians
 
 
 def project(
-    means: Float[Tensor, "m 3"],
-    scales: Float[Tensor, "m 3"],
-    quaternions: Float[Tensor, "m 4"],
-    camera: Camera,
+    means: Float[Tensor, "m 3"], scales: Float[Tensor, "m 3"], quaternions: Float[Tensor, "m 4"], camera: Camera
 ) -> ProjectedGaussians:
-    """Project Gaussians: see `vdgs.kernels.torch_ref.project.project`, of which this is the float32 twin.
-
-    Raises ValueError where the shapes do not belong together.
-    """
+    """As `torch_ref.project`, in float32. Raises ValueError for shapes that do not match."""
     check_row_shapes(means.shape[0], means=(means, 3), scales=(scales, 3), quaternions=(quaternions, 4))
     arguments = (contiguous(t) for t in (means, scales, quaternions))
     return ProjectedGaussians(*_Project.apply(*arguments, packed_camera(camera)))

@@ -1,4 +1,4 @@
-"""Splats to a picture, in C++ on the CPU (native/cpu/rasterise/rasterise.h)."""
+"""Splats to a picture, in C++ on the CPU (native/cpu/rasterize/rasterize.h)."""
 
 from __future__ import annotations
 
@@ -9,50 +9,31 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vdgs.kernels.autograd import rasterize_with_autograd
+from vdgs.kernels.autograd import check_splats, rasterize_with_autograd
 from vdgs.kernels.cpu import extension as native_module
 from vdgs.kernels.kernel_types import Raster, RasterGradients, RasterPullback, SplatContributions, Splats
-from vdgs.kernels.splat_checks import check_splats
 
 
 def rasterize(
-    splats: Splats,
-    background: Float[Tensor, "3"],
-    width: int,
-    height: int,
-    *,
-    depth: bool = False,
-    module: Any = None,
+    splats: Splats, background: Float[Tensor, "3"], width: int, height: int, *, depth: bool = False, module: Any = None
 ) -> Raster:
     """Blend splats front to back (3DGS, eqs. 2-3), differentiable in their five tensors and the background.
 
-    All are float32 on the CPU. `depth` asks for the expected depth, the sum of w_i depth_i, neither
-    divided by alpha nor given a background, and for the median depth, which is not differentiable; without
-    it the picture costs nothing extra. Thresholds as in vdgs.kernels.constants. `module` is the build of the
-    kernels to use (default: the one of this process).
-
-    A splat whose row holds NaN or infinity, or whose conic is not positive definite, is not drawn and
-    its gradient is zero. The result has the same bits for any number of threads.
-
-    Raises TypeError or ValueError for tensors of another type, device or shape, or a picture side
-    outside 1 .. 524272. The second derivative is not defined: asking for it raises RuntimeError.
+    All are float32 on the CPU. `depth` adds the expected depth, the sum of w_i depth_i (neither divided by alpha nor
+    given a background), and the median depth, which is not differentiable. `module` is the build of the kernels to use
+    (default: that of this process). A splat whose row holds NaN or infinity, or whose conic is not positive definite,
+    is not drawn and its gradient is zero. Same bits for any number of threads. Raises TypeError or ValueError for
+    tensors of another dtype, device or shape, or a side outside 1 .. 524272 pixels; RuntimeError for second
+    derivatives.
     """
     return rasterize_with_autograd(lambda tensors: _draw(tensors, width, height, depth, module), splats, background)
 
 
 def rasterize_vjp(
-    splats: Splats,
-    background: Float[Tensor, "3"],
-    width: int,
-    height: int,
-    *,
-    depth: bool = False,
-    module: Any = None,
+    splats: Splats, background: Float[Tensor, "3"], width: int, height: int, *, depth: bool = False, module: Any = None
 ) -> tuple[Raster, RasterPullback]:
-    """`rasterize` without autograd: the picture, and the way back from it. Raises what `rasterize` raises.
-
-    Of the arguments nothing is kept: their memory may be used again before the way back.
-    """
+    """`rasterize` without autograd: the image and its pullback, which keeps none of the arguments (their memory may be
+    reused). Raises what `rasterize` raises."""
     return _draw((*splats.tensors, background), width, height, depth, module)
 
 
@@ -65,8 +46,8 @@ def splat_contributions(
     *,
     module: Any = None,
 ) -> SplatContributions:
-    """As `reference.shares.shares`: front to back a second time, four sums for each splat of a tile where the way back
-    of `rasterize` makes ten. The same bits for any number of threads."""
+    """As `torch_ref.splat_contributions`, by a second pass with four sums for each splat of a tile, where backward has
+    ten. Same bits for any number of threads."""
     raster, pullback = _draw((*splats.tensors, background), width, height, False, module)
     lacking = torch.zeros_like(raster.image) if wanted is None else wanted - raster.image
     found = SplatContributions(torch.empty(pullback.count), torch.empty(pullback.count, 3))
@@ -76,7 +57,9 @@ def splat_contributions(
 
 def _draw(tensors: tuple[Tensor, ...], width: int, height: int, depth: bool, module: Any) -> tuple[Raster, _Pullback]:
     """The picture of means_px, conics, colours, opacities, depths before a background, and the way back."""
-    _check(tensors, width, height)
+    check_splats(tensors, width, height, "cpu")
+    if len(tensors[0]) >= 2**31:
+        raise ValueError(f"at most 2^31 - 1 splats can be drawn at once, not {len(tensors[0])}")
     module = module or native_module.get_extension()
     depths = (torch.empty(height, width), torch.empty(height, width)) if depth else (None, None)
     raster = Raster(torch.empty(height, width, 3), torch.empty(height, width), *depths)
@@ -90,7 +73,7 @@ def _draw(tensors: tuple[Tensor, ...], width: int, height: int, depth: bool, mod
 
 @dataclass(frozen=True)
 class _Pullback:
-    """What is kept of a picture for its backward pass: see `RasterPullback`."""
+    """A `RasterPullback` and what it keeps of an image."""
 
     frame: Any
     module: Any
@@ -119,10 +102,3 @@ class _Pullback:
             *(None if t is None else t.numpy() for t in found),
         )  # fmt: skip
         return found
-
-
-def _check(tensors: tuple[Tensor, ...], width: int, height: int) -> None:
-    check_splats(tensors, width, height, "cpu")
-    n = len(tensors[0])
-    if n >= 2**31:
-        raise ValueError(f"at most 2^31 - 1 splats can be drawn at once, not {n}")

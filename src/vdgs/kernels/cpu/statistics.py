@@ -22,7 +22,7 @@ def add_view_statistics(
     width: int,
     height: int,
 ) -> None:
-    """As `reference.statistics.add_view_statistics`, for contiguous float32. Same bits for any number of threads."""
+    """As `torch_ref.add_view_statistics`, for contiguous float32. Same bits for any number of threads."""
     gradient = statistics.gradient
     sources = sources_tensor(source)
     check_sources(sources, visible, gradient.shape[1])

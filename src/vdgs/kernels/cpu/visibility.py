@@ -19,11 +19,8 @@ SORT_FROM_CAMERAS = 8
 
 
 def count_visibility(points: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Int32[Tensor, "n"]:
-    """As `reference.visibility.count_visibility`, to the last point: what float32 cannot decide, float64 does.
-
-    O(n) memory. Fast where cameras see small parts of the scene: a block of 512 neighbours that lies inside
-    or outside a frustum costs one test.
-    """
+    """As `torch_ref.count_visibility`, exactly: float64 decides what float32 cannot. O(n) memory; a block of 512
+    neighbours inside or outside a frustum costs one test."""
     check_points(points)
     count = torch.zeros(points.shape[0], dtype=torch.int32)
     if len(cameras) == 0 or points.shape[0] == 0:
@@ -32,11 +29,11 @@ def count_visibility(points: Float[Tensor, "n 3"], cameras: Sequence[Camera]) ->
     points = points.detach().contiguous()
     if len(cameras) < SORT_FROM_CAMERAS:
         extension.get_extension().count_visibility(points, packed, count)
-        return count
-    order = morton_order(torch.nan_to_num(points, posinf=0.0, neginf=0.0))
-    sorted_count = torch.empty_like(count)
-    extension.get_extension().count_visibility(points[order], packed, sorted_count)
-    count[order] = sorted_count
+    else:
+        order = morton_order(torch.nan_to_num(points, posinf=0.0, neginf=0.0))
+        sorted_count = torch.empty_like(count)
+        extension.get_extension().count_visibility(points[order], packed, sorted_count)
+        count[order] = sorted_count
     return count
 
 

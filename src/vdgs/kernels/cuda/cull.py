@@ -9,8 +9,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from vdgs.geometry.camera import Camera
-from vdgs.kernels.cuda.launch import CudaProgram
-from vdgs.kernels.cuda.packed_camera import PackedCamera
+from vdgs.kernels.cuda.launch import CudaProgram, PackedCamera
 
 #: Threads of a block, and anchors of a word: kThreads and kWarp of the source.
 THREADS, WARP_SIZE = 256, 32
@@ -21,12 +20,9 @@ PROGRAM = CudaProgram(name="cull.cu", headers=("gaussian_math.h", "image_formati
 def cull(
     positions: Float[Tensor, "n 3"], log_scales: Float[Tensor, "n 6"], camera: Camera, *, program: CudaProgram = PROGRAM
 ) -> Int64[Tensor, "v"]:
-    """As `native.cull`, for float32 tensors on a CUDA device: indices, ascending, of the anchors that may touch the
-    image.
-
-    Waits for the device once: for how many they are. Besides them, a quarter of a byte an anchor is taken. Raises
-    ValueError where the shapes do not belong together, TypeError for other types of elements, CudaUnavailable where the
-    kernels cannot be run.
+    """As `cpu.cull`, for float32 tensors on a CUDA device. Waits for the device once, for the number of indices. Raises
+    ValueError for shapes that do not match, TypeError for other dtypes, CudaUnavailable where the kernels cannot be
+    run.
     """
     n = len(positions)
     if positions.shape != (n, 3) or log_scales.shape != (n, 6):
@@ -36,10 +32,10 @@ def cull(
     if positions.dtype != torch.float32 or log_scales.dtype != torch.float32:
         raise TypeError(f"positions and log_scales must be float32, not {positions.dtype} and {log_scales.dtype}")
     count, grid, block = ctypes.c_longlong(n), (-(-n // THREADS),), (THREADS,)
-    marks, found = (positions.new_empty(-(-n // WARP_SIZE), dtype=torch.int32) for _ in range(2))
+    marks, counts = (positions.new_empty(-(-n // WARP_SIZE), dtype=torch.int32) for _ in range(2))
     anchors = positions.detach().contiguous(), log_scales.detach().contiguous()
-    program.launch("mark_anchors", grid, block, *anchors, PackedCamera.of(camera), count, marks, found)
-    ends = found.cumsum(0, dtype=torch.int32)
+    program.launch("mark_anchors", grid, block, *anchors, PackedCamera.of(camera), count, marks, counts)
+    ends = counts.cumsum(0, dtype=torch.int32)
     rows = positions.new_empty(int(ends[-1]) if n else 0, dtype=torch.int64)
     program.launch("write_rows", grid, block, marks, ends, count, rows)
     return rows

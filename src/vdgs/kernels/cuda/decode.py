@@ -4,31 +4,53 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 from vdgs.geometry.camera import Camera
-from vdgs.kernels.cuda.launch import CudaProgram, KernelArgument
-from vdgs.kernels.cuda.packed_camera import PackedCamera
-from vdgs.kernels.cuda.splat_capacity import SplatCapacity
+from vdgs.kernels.cuda.launch import CudaProgram, KernelArgument, PackedCamera
 from vdgs.kernels.kernel_types import (
     FEATURE_SIZE,
     HIDDEN_SIZE,
+    SPLAT_TENSORS,
     AnchorSplats,
     DecoderWeights,
     MlpWeights,
-    Splats,
     TrainingSplats,
 )
 from vdgs.kernels.splat_segments import ANCHORS_PER_SEGMENT, SplatMask, SplatSegments
-from vdgs.kernels.torch_ref.decode import decode as by_torch
+from vdgs.kernels.torch_ref.decode import decode as torch_decode
 
 #: Warps of a block, each with an anchor: kWarps of the source. A lane an offset.
 ANCHORS_PER_BLOCK, MAX_OFFSETS = ANCHORS_PER_SEGMENT, 32
 PROGRAM = CudaProgram(name="decode.cu", headers=("gaussian_math.h", "image_formation.h"))
+#: Memory beyond what earlier views needed, as a factor and in splats.
+MARGIN_FACTOR, MARGIN_SPLATS = 1.125, 256
+#: The need of a view counts this much less with each later one.
+DECAY = 0.98
+
+
+class SplatCapacity:
+    """How many splats to allocate before their number is known: per anchor in view and device, the most that recent
+    views needed. An estimate costs memory or a second pass, never a bit of the result."""
+
+    def __init__(self) -> None:
+        self._shares: dict[tuple[str, int], float] = {}
+
+    def estimate(self, count: int, offsets: int, device: torch.device) -> int:
+        """Splats to allocate for `count` anchors of `offsets` each: half of them before the first view."""
+        share = self._shares.get((str(device), offsets), offsets / 2)
+        return min(int(MARGIN_FACTOR * share * count) + MARGIN_SPLATS, count * offsets)
+
+    def update(self, count: int, offsets: int, device: torch.device, splats: int) -> None:
+        """Record the number of splats of a view."""
+        if count:
+            key = str(device), offsets
+            self._shares[key] = max(splats / count, DECAY * self._shares.get(key, 0.0))
+
+
 CAPACITY = SplatCapacity()
 
 
@@ -44,15 +66,14 @@ def decode(
     program: CudaProgram = PROGRAM,
     capacity: SplatCapacity = CAPACITY,
 ) -> AnchorSplats:
-    """As `reference.decode.decode`, for float32 tensors on a CUDA device. Same bits every time.
+    """As `torch_ref.decode`, for float32 tensors on a CUDA device; `torch_ref` itself where autograd follows.
 
-    Where autograd follows it is the reference that decodes: this has no derivative. Waits for the device once: for how
-    many splats there are. They are put into order afterwards (`decode_for_training` does without). Raises ValueError for
-    more than 32 offsets, TypeError for other types of elements, CudaUnavailable where the kernel cannot be run.
+    Deterministic. Waits for the device once, for the number of splats, which are then sorted. Raises ValueError for
+    more than 32 offsets, TypeError for other dtypes, CudaUnavailable where the kernel cannot be run.
     """
     anchors = (positions, features, offsets, log_scales)
     if torch.is_grad_enabled() and any(t.requires_grad for t in (*anchors, *weights.tensors())):
-        return by_torch(*anchors, weights, camera, rows)
+        return torch_decode(*anchors, weights, camera, rows)
     named, shown, _ = _decoded(anchors, weights, camera, rows, True, program, capacity)
     order = shown.segments.order(len(shown))
     return AnchorSplats(**{name: tensor.index_select(0, order) for name, tensor in named.items()})
@@ -71,39 +92,20 @@ def decode_for_training(
     program: CudaProgram = PROGRAM,
     capacity: SplatCapacity = CAPACITY,
 ) -> TrainingSplats:
-    """As `reference.decode.decode_for_training`, as `decode` in what it asks, waits for and raises.
+    """As `torch_ref.decode_for_training`; requirements, waits and errors are those of `decode`.
 
-    Splats are those of `decode` to the bit, but where each block's stand is left to the card: `runs` tells. Sources are
-    not written, nor volumes, which are added up in a fixed order. Nothing is kept between anchors and splats.
+    The splats equal those of `decode` to the bit, in the order of `segments`. Volumes are summed in a fixed order.
     """
     anchors = (positions, features, offsets, log_scales)
     named, shown, sums = _decoded(anchors, weights, camera, rows, False, program, capacity)
     return TrainingSplats(**named, segments=shown.segments, source=shown, volume=sums.sum() / len(shown))
 
 
-@dataclass(frozen=True)
-class _DecodeBuffers:
-    """Room for m splats, as the kernel takes it; volumes and sources where they are asked for."""
-
-    drawn: Splats
-    volumes: Float[Tensor, " m"] | None
-    source: Int32[Tensor, " m"] | None
-
-    @staticmethod
-    def empty(m: int, whole: bool, like: Tensor) -> _DecodeBuffers:
-        new = like.new_empty
-        rest = (new(m), new(m, dtype=torch.int32)) if whole else (None, None)
-        return _DecodeBuffers(Splats(new(m, 2), new(m, 3), new(m), new(m, 3), new(m)), *rest)
-
-    def tensors(self) -> list[Tensor | None]:
-        """In the order of the kernel's arguments."""
-        return [*self.named().values(), *([None] * 2 if self.source is None else [])]
-
-    def named(self) -> dict[str, Tensor]:
-        """By the names of `AnchorSplats`, as far as they are there."""
-        drawn = {field.name: getattr(self.drawn, field.name) for field in fields(Splats)}
-        rest = {"volumes": self.volumes, "source": self.source}
-        return drawn | {name: tensor for name, tensor in rest.items() if tensor is not None}
+def _decode_buffers(m: int, whole: bool, like: Tensor) -> dict[str, Tensor]:
+    """Memory for m splats by field of `AnchorSplats`, in the kernel's order; volumes and sources only if `whole`."""
+    shapes = dict(zip(SPLAT_TENSORS, ((m, 2), (m, 3), (m,), (m, 3), (m,)), strict=True))
+    made = {name: like.new_empty(shape) for name, shape in (shapes | ({"volumes": (m,)} if whole else {})).items()}
+    return made | ({"source": like.new_empty(m, dtype=torch.int32)} if whole else {})
 
 
 def _decoded(
@@ -113,10 +115,10 @@ def _decoded(
     rows: Tensor | None,
     whole: bool,
     program: CudaProgram,
-    room: SplatCapacity,
+    splat_capacity: SplatCapacity,
 ) -> tuple[dict[str, Tensor], SplatMask, Float[Tensor, " r"]]:
-    """Splats as the card happens to place them (`whole`: with volumes and sources), where they are, and unless `whole`
-    the volumes of each run added up."""
+    """Splats as the GPU happens to place them (`whole`: with volumes and sources), their mask and segments, and unless
+    `whole` the sum of volumes of each segment."""
     positions, _, offsets, _ = anchors
     k, inputs = offsets.shape[1], weights.opacity.w1.shape[1]
     check_decoder(k, weights, anchors)
@@ -131,26 +133,26 @@ def _decoded(
         ctypes.c_int(inputs == FEATURE_SIZE + 4),
     ]  # fmt: skip
 
-    def write(capacity: int) -> tuple[_DecodeBuffers, Tensor]:
-        made, total = _DecodeBuffers.empty(capacity, whole, positions), positions.new_zeros(1, dtype=torch.int32)
+    def write(capacity: int) -> tuple[dict[str, Tensor], Tensor]:
+        made, total = _decode_buffers(capacity, whole, positions), positions.new_zeros(1, dtype=torch.int32)
         program.launch(
             "decode_anchors", (blocks,), (32 * ANCHORS_PER_BLOCK,), *given, ctypes.c_int(capacity), total, bits,
-            begins, lengths, None if whole else sums, *made.tensors(),
+            begins, lengths, None if whole else sums, *made.values(), *([] if whole else [None, None]),
         )  # fmt: skip
         return made, total
 
-    capacity = room.estimate(count, k, positions.device)
+    capacity = splat_capacity.estimate(count, k, positions.device)
     made, total = write(capacity)
     m = int(total) if count else 0
-    room.update(count, k, positions.device, m)
+    splat_capacity.update(count, k, positions.device, m)
     if m > capacity:  # what there was no room for was not written
         made, _ = write(m)
-    found = {name: tensor[:m] for name, tensor in made.named().items()}
-    return found, SplatMask(bits, SplatSegments(begins, lengths), m, k), sums
+    splats = {name: tensor[:m] for name, tensor in made.items()}
+    return splats, SplatMask(bits, SplatSegments(begins, lengths), m, k), sums
 
 
 def expand_sources(source: Tensor | SplatMask, *, program: CudaProgram = PROGRAM) -> Int32[Tensor, " m"]:
-    """What each splat is of, written out if only what shows is known."""
+    """The source of each splat, expanded from a `SplatMask`."""
     if isinstance(source, Tensor):
         return source
     made = source.bits.new_empty(len(source))
@@ -163,8 +165,8 @@ def expand_sources(source: Tensor | SplatMask, *, program: CudaProgram = PROGRAM
 
 
 def pack_head(head: MlpWeights, k: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """A head as the kernels take it forwards, so that neighbouring lanes read neighbouring numbers: w1 [inputs, 32],
-    b1 [32], w2 [32, c, k], b2 [c, k], with c outputs an offset."""
+    """A head for the forward kernels, coalesced: w1 [inputs, 32], b1 [32], w2 [32, c, k], b2 [c, k] for c outputs an
+    offset."""
     w1, b1, w2, b2 = (tensor.detach() for tensor in head.tensors())
     by_offset = w2.reshape(k, -1, HIDDEN_SIZE).permute(2, 1, 0), b2.reshape(k, -1).t()
     return w1.t().contiguous(), b1.contiguous(), by_offset[0].contiguous(), by_offset[1].contiguous()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int32, Int64
@@ -12,14 +13,13 @@ from torch import Tensor
 
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.cuda.decode import ANCHORS_PER_BLOCK, PROGRAM, check_decoder, expand_sources, pack_head
-from vdgs.kernels.cuda.launch import CudaProgram, KernelArgument
-from vdgs.kernels.cuda.packed_camera import PackedCamera
-from vdgs.kernels.kernel_types import AdamState, DecoderWeights, IsFinite, MlpWeights, SplatGradients
+from vdgs.kernels.cuda.launch import CudaProgram, KernelArgument, PackedCamera
+from vdgs.kernels.kernel_types import AdamState, DecoderWeights, IsFinite, SplatGradients
 from vdgs.kernels.splat_segments import SplatMask
 from vdgs.kernels.torch_ref.adam import bias_correction_tables, check_updates
-from vdgs.kernels.torch_ref.decode_adam import decode_backward_adam as by_torch
+from vdgs.kernels.torch_ref.decode_adam import decode_backward_adam as torch_decode_backward_adam
 
-#: Anchors whose parts of the decoder's gradients are held at once: whole blocks.
+#: Anchors whose contributions to the decoder's gradients are stored at once: whole blocks.
 ANCHORS_PER_CHUNK = 2**14
 
 
@@ -33,20 +33,18 @@ def decode_backward_adam(
     updates: Int32[Tensor, "n"],
     *,
     program: CudaProgram = PROGRAM,
-    piece: int = ANCHORS_PER_CHUNK,
+    chunk: int = ANCHORS_PER_CHUNK,
 ) -> tuple[IsFinite, tuple[Tensor, ...] | None]:
-    """As `reference.decode_adam.decode_backward_adam`, for float32 tensors on a CUDA device.
+    """As `torch_ref.decode_backward_adam`, for float32 tensors on a CUDA device, without waiting for it.
 
-    Gradients of anchors are never held: a warp takes an anchor from its splats to its new place. Those of the decoder
-    are matrix products (by torch) of what each anchor adds, some 1.4 kB, for `piece` anchors at a time: 22 MB, which
-    the caches of large cards hold; where nobody wants them, nothing. Nothing waits for the device, and whether all was
-    finite stays there: an anchor for which it is not does not move. Of gradients by depth the kernel knows nothing:
-    with them, torch does it all. All of `moved` anneal alike (`AdamState.early`). Raises ValueError or TypeError for
-    unsuitable tensors, CudaUnavailable where the kernel cannot be run.
+    A warp moves an anchor; its gradients are never stored. Gradients of the decoder are matrix products (by torch) over
+    `chunk` anchors at a time, 1.4 kB each (22 MB fit the caches of large GPUs). An anchor whose gradient is not finite
+    does not move. With gradients by depth, torch computes everything. `lr_boost` is the same for all of `moved`. Raises
+    ValueError or TypeError for unsuitable tensors, CudaUnavailable where the kernel cannot be run.
     """
     if gradients.depths is not None:
         named = replace(gradients, source=expand_sources(gradients.source, program=program))
-        return by_torch(positions, moved, weights, camera, rows, named, updates)
+        return torch_decode_backward_adam(positions, moved, weights, camera, rows, named, updates)
     check_updates(updates, len(positions))
     features, offsets, _ = moved
     k, inputs = offsets.parameter.shape[1], weights.opacity.w1.shape[1]
@@ -69,7 +67,7 @@ def decode_backward_adam(
     ]  # fmt: skip
     wanted = any(t.requires_grad for t in weights.tensors())
     of_weights = [torch.zeros_like(t) for t in weights.tensors()] if wanted else None
-    at_once = piece if wanted else max(v, 1)
+    at_once = chunk if wanted else max(v, 1)
     for first in range(0, v, at_once):
         count = min(at_once, v - first)
         made = _DecoderGradientBuffers.empty(count, k, inputs, positions) if wanted else None
@@ -84,18 +82,20 @@ def decode_backward_adam(
 
 
 def _weights(weights: DecoderWeights, k: int) -> list[Tensor]:
-    """As the kernel takes them: as they are multiplied forwards, then as they are multiplied backwards."""
+    """The kernel's layout: first for the forward products, then for the backward ones."""
     heads = weights.opacity, weights.covariance, weights.color
     opacity, covariance, color = (pack_head(head, k) for head in heads)
     back = (w.detach().contiguous() for head in heads for w in (head.w1, head.w2))
     return [*opacity, *covariance, *color, *back]
 
 
-class _DecoderGradientBuffers:
+class _DecoderGradientBuffers(NamedTuple):
     """What each of some visible anchors adds to the gradients of the decoder."""
 
-    def __init__(self, by_outputs: tuple[Tensor, ...], hidden: Tensor, by_hidden: Tensor, inputs: Tensor):
-        self.by_outputs, self.hidden, self.by_hidden, self.inputs = by_outputs, hidden, by_hidden, inputs
+    by_outputs: tuple[Tensor, ...]
+    hidden: Tensor
+    by_hidden: Tensor
+    inputs: Tensor
 
     @staticmethod
     def empty(count: int, k: int, inputs: int, like: Tensor) -> _DecoderGradientBuffers:
@@ -109,9 +109,7 @@ class _DecoderGradientBuffers:
     def gradients(self) -> tuple[Tensor, ...]:
         """Of the twelve tensors of the decoder."""
         heads = zip(self.by_outputs, self.hidden, self.by_hidden, strict=True)
-        return DecoderWeights(
-            *(
-                MlpWeights(by_hidden.t() @ self.inputs, by_hidden.sum(0), by_output.t() @ hidden, by_output.sum(0))
-                for by_output, hidden, by_hidden in heads
-            )
-        ).tensors()
+        by_head = (
+            (b.t() @ self.inputs, b.sum(0), outputs.t() @ hidden, outputs.sum(0)) for outputs, hidden, b in heads
+        )
+        return tuple(gradient for gradients in by_head for gradient in gradients)

@@ -26,12 +26,9 @@ def photometric_loss(
     ssim_weight: float = 0.2,
     program: CudaProgram = PROGRAM,
 ) -> PhotometricLoss:
-    """As `reference.loss.photometric_loss`, for float32 images on a CUDA device. Differentiable once.
-
-    Everything stays on the device and nothing waits for it. The gradient is computed together with the loss where the
-    image asks for one; until then 36 bytes a pixel are taken for it. Same bits every time. Raises TypeError for
-    tensors elsewhere, ValueError for tensors on several devices, CudaUnavailable where the kernel cannot be run.
-    """
+    """As `torch_ref.photometric_loss`, for float32 images on a CUDA device, without waiting for it. Differentiable
+    once, deterministic. The gradient is computed with the loss and takes 36 bytes a pixel until then. Raises TypeError
+    for tensors elsewhere, ValueError for several devices, CudaUnavailable where the kernel cannot be run."""
     check_images(image, target, mask)
     if image.dtype != torch.float32:
         raise TypeError(f"image must be float32, not {image.dtype}")

@@ -1,4 +1,4 @@
-"""Splats to a picture on a GPU (source/rasterise.cu): `vdgs.kernels.torch_ref.rasterize`, tile by tile."""
+"""Splats to a picture on a GPU (source/rasterize.cu): `torch_ref.rasterize`, tile by tile."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ import torch
 from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
-from vdgs.kernels.autograd import rasterize_with_autograd
+from vdgs.kernels.autograd import check_splats, rasterize_with_autograd
 from vdgs.kernels.cuda.launch import CudaProgram, KernelArgument
 from vdgs.kernels.kernel_types import OrderedSplats, Raster, RasterGradients, RasterPullback, SplatContributions, Splats
-from vdgs.kernels.splat_checks import check_splats
 from vdgs.kernels.splat_segments import SplatSegments
-from vdgs.kernels.torch_ref.splat_contributions import splat_contributions_from_vjp
+from vdgs.kernels.torch_ref.rasterize import splat_contributions_from_vjp
 
 #: Side of a tile, threads of a block and sums of an entry: kTile, kThreads and kSums of the source.
 TILE_PX, THREADS, SUMS_PER_ENTRY = 16, 256, 10
@@ -30,16 +29,13 @@ def rasterize(
     depth: bool = False,
     program: CudaProgram = PROGRAM,
 ) -> Raster:
-    """As `native.rasterize`, for float32 tensors on a CUDA device; median depth included. Same bits every time.
+    """As `cpu.rasterize`, for float32 tensors on a CUDA device, median depth included. Deterministic.
 
-    Waits for the device once: how many entries (splats times the tiles that they reach) there is room to be made for.
-    Backward takes 52 bytes an entry. Raises TypeError or ValueError for unsuitable tensors, CudaUnavailable where the
-    kernels cannot be run.
+    Waits for the device once, for the number of entries (splats times the tiles that they reach). Backward takes 52
+    bytes an entry. Raises TypeError or ValueError for unsuitable tensors, CudaUnavailable where kernels cannot be run.
     """
     runs = _runs_of(splats)
-    return rasterize_with_autograd(
-        lambda tensors: _draw(tensors, runs, width, height, depth, program), splats, background
-    )
+    return rasterize_with_autograd(lambda t: _draw(t, runs, width, height, depth, program), splats, background)
 
 
 def rasterize_vjp(
@@ -51,7 +47,7 @@ def rasterize_vjp(
     depth: bool = False,
     program: CudaProgram = PROGRAM,
 ) -> tuple[Raster, RasterPullback]:
-    """`rasterize` without autograd: the picture, and the way back from it, which reads the splats again."""
+    """`rasterize` without autograd: the image, and its pullback, which reads the splats again."""
     return _draw((*splats.tensors, background), _runs_of(splats), width, height, depth, program)
 
 
@@ -62,7 +58,7 @@ def splat_contributions(
     height: int,
     wanted: Float[Tensor, "h w 3"] | None = None,
 ) -> SplatContributions:
-    """As `reference.shares.shares`, by the whole way back."""
+    """As `torch_ref.splat_contributions`, by the whole backward pass."""
     return splat_contributions_from_vjp(rasterize_vjp, splats, background, width, height, wanted)
 
 
@@ -72,8 +68,8 @@ def _runs_of(splats: Splats) -> SplatSegments | None:
 
 @dataclass(frozen=True)
 class _Entries:
-    """What each tile shows, front to back: n entries, one for each splat and tile that it reaches. Before they are
-    sorted they stand in the order of the splats: that of the rows, or `splats`."""
+    """What each tile shows, front to back: an entry for each pair of a splat and a tile that it reaches. Before sorting
+    they are in the order of the splats: that of the rows, or `splats`."""
 
     owners: Int32[Tensor, " n"]  # the splat of each entry, before sorting
     order: Int64[Tensor, " n"]  # where each entry was before sorting
@@ -136,7 +132,7 @@ def _entries(splats: list[Tensor], runs: SplatSegments | None, grid: tuple[int, 
 
 @dataclass(frozen=True, kw_only=True)
 class _Pullback:
-    """What is kept of a picture for its backward pass: see `RasterPullback`."""
+    """A `RasterPullback` and what it keeps of an image."""
 
     program: CudaProgram
     splats: list[Tensor]
@@ -174,9 +170,8 @@ class _Pullback:
             ctypes.c_longlong(len(means)), entries.ends, sums, kept, by_means, by_conics, by_colors, by_opacities,
             by_depths,
         )  # fmt: skip
-        if wanted[0] is None:
-            by_background = torch.zeros_like(self.background)
-        else:
+        by_background = torch.zeros_like(self.background)
+        if wanted[0] is not None:
             by_background = (self.transmittance[..., None] * wanted[0]).sum((0, 1))
         return RasterGradients(by_means, by_conics, by_colors, by_opacities, by_depths, by_background)
 

@@ -31,18 +31,21 @@ def add_view_statistics(
     *,
     program: CudaProgram = PROGRAM,
 ) -> None:
-    """As `reference.statistics.add_view_statistics`, for tensors on a CUDA device; float32, and sums contiguous.
+    """As `torch_ref.add_view_statistics`, for tensors on a CUDA device; float32, and sums contiguous.
 
-    One pass, same bits every time, nothing waits for the device, which does not look whether sources belong to the
-    visible anchors. Raises ValueError or TypeError for unsuitable tensors, CudaUnavailable where the kernel cannot be
-    run. Anchors may come in any order; splats of one must stand together. Where only what shows is known (`SplatMask`), the
-    sources are written out first.
+    Deterministic, in one pass, without waiting for the device or checking the sources. Anchors may come in any order;
+    splats of one anchor are consecutive. Raises ValueError or TypeError for unsuitable tensors, CudaUnavailable where
+    the kernel cannot be run.
     """
     sums, k = statistics.tensors(), statistics.gradient.shape[1]
     sources = expand_sources(source)
     check_sources(sources, visible, k)
     check_inside(inside, visible)
-    _check_types(sums | {"opacities": opacities, "gradient_px": gradient_px}, sources)
+    for name, tensor in (sums | {"opacities": opacities, "gradient_px": gradient_px}).items():
+        if tensor.dtype != torch.float32:
+            raise TypeError(f"{name} must be float32, not {tensor.dtype}")
+    if sources.dtype != torch.int32:
+        raise TypeError(f"source must be int32, not {sources.dtype}")
     m, v = len(sources), len(visible)
     if opacities.shape != (m,) or gradient_px.shape != (m, 2):
         raise ValueError(
@@ -53,11 +56,3 @@ def add_view_statistics(
         ctypes.c_longlong(v), sources.contiguous(), opacities.detach().contiguous(), gradient_px.contiguous(),
         ctypes.c_longlong(m), ctypes.c_int(k), ctypes.c_float(width / 2), ctypes.c_float(height / 2), *sums.values(),
     )  # fmt: skip
-
-
-def _check_types(floats: dict[str, Tensor], source: Tensor) -> None:
-    for name, tensor in floats.items():
-        if tensor.dtype != torch.float32:
-            raise TypeError(f"{name} must be float32, not {tensor.dtype}")
-    if source.dtype != torch.int32:
-        raise TypeError(f"source must be int32, not {source.dtype}")

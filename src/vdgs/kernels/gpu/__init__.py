@@ -1,6 +1,6 @@
 """What a GPU computes with: torch, own CUDA kernels and gsplat, put together to the whole set of operations.
 
-`vdgs.kernels.operations.ON_A_CARD` says which operation is which.
+`vdgs.kernels.operations.GPU_BACKENDS` says which operation is which.
 """
 
 from vdgs.kernels.cuda import add_view_statistics as add_view_statistics

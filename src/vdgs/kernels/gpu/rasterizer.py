@@ -12,7 +12,7 @@ from torch import Tensor
 
 from vdgs.errors import VdgsError
 from vdgs.kernels import cuda, gsplat
-from vdgs.kernels.gsplat.rasterize import GsplatUnavailable, load_gsplat
+from vdgs.kernels.gsplat import GsplatUnavailable, load_gsplat
 from vdgs.kernels.kernel_types import Raster, RasterPullback, Splats
 
 #: Environment variable that takes one of them: `gsplat` or `cuda`.
@@ -22,7 +22,7 @@ RASTERIZER_ENV_VAR = "VDGS_RASTERIZER"
 def rasterize(
     splats: Splats, background: Float[Tensor, "3"], width: int, height: int, *, depth: bool = False
 ) -> Raster:
-    """As `native.rasterize`, for float32 tensors on a GPU."""
+    """As `cpu.rasterize`, for float32 tensors on a GPU."""
     return _drawing(depth).rasterize(splats, background, width, height, depth=depth)
 
 

@@ -5,7 +5,7 @@ does not drift on old momentum. Its moments are then means over its own updates,
 count those: with the global step, a row that is first seen late would make its first step
 (1 - beta1) / sqrt(1 - beta2) times too large, which is 3.2, and up to 6 times its rate soon after.
 
-Short trainings want longer steps of rows that have had few, and shorter ones later (`AdamState.early`): every row
+Short trainings want longer steps of rows that have had few, and shorter ones later (`AdamState.lr_boost`): every row
 anneals over its own updates, whenever they come.
 """
 

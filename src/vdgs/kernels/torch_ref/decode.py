@@ -60,7 +60,7 @@ def decode_for_training(
     rows: Int64[Tensor, "v"] | None = None,
 ) -> TrainingSplats:
     """`decode` without autograd, and only what a training step asks for. Splats of an anchor stand together, in the
-    order of its offsets; anchors stand in the order that `TrainingSplats.runs` tells."""
+    order of its offsets; anchors stand in the order that `TrainingSplats.segments` tells."""
     return TrainingSplats.of(decode(positions, features, offsets, log_scales, weights, camera, rows))
 
 

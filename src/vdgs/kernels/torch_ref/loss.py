@@ -55,8 +55,7 @@ def photometric_loss(
 
 
 def ssim_map(
-    image: Float[Tensor, "h w c"] | UInt8[Tensor, "h w c"],
-    target: Float[Tensor, "h w c"] | UInt8[Tensor, "h w c"],
+    image: Float[Tensor, "h w c"] | UInt8[Tensor, "h w c"], target: Float[Tensor, "h w c"] | UInt8[Tensor, "h w c"]
 ) -> Float[Tensor, "h w c"]:
     """SSIM of every pixel and channel in float64, for evaluation. uint8 images are divided by 255."""
     if image.shape != target.shape or image.ndim != 3:

@@ -18,29 +18,22 @@ from vdgs.kernels.transfer import to_like
 
 
 def project(
-    means: Float[Tensor, "m 3"],
-    scales: Float[Tensor, "m 3"],
-    quaternions: Float[Tensor, "m 4"],
-    camera: Camera,
+    means: Float[Tensor, "m 3"], scales: Float[Tensor, "m 3"], quaternions: Float[Tensor, "m 4"], camera: Camera
 ) -> ProjectedGaussians:
     """Project Gaussians (world means, standard deviations along their axes, wxyz rotations).
 
-    Quaternions are normalised here. Works in the precision of its arguments and is differentiable in
-    all three. Not valid, thus all zero and without gradient: z <= near, and whatever does not come
-    out as finite numbers.
+    Quaternions are normalised here. Works in the precision of its arguments and is differentiable in all three. Not
+    valid, thus all zero and without gradient: z <= near, and whatever does not come out as finite numbers.
 
-    In J, x/z and y/z are clamped to 1.3 times the half-angle of the frustum on either side, as 3DGS
-    does: the linearisation explodes far outside the image. The derivative is that of the clamped
-    function: J's u = clamp(x/z) stands still beyond the bound, whether x or z moves.
+    In J, x/z and y/z are clamped to 1.3 times the half-angle of the frustum on either side, as 3DGS does: the
+    linearisation explodes far outside the image. The derivative is that of the clamped function: J's u = clamp(x/z)
+    stands still beyond the bound, whether x or z moves.
     """
     return project_with_variances(means, scales, quaternions, camera)[0]
 
 
 def project_with_variances(
-    means: Float[Tensor, "m 3"],
-    scales: Float[Tensor, "m 3"],
-    quaternions: Float[Tensor, "m 4"],
-    camera: Camera,
+    means: Float[Tensor, "m 3"], scales: Float[Tensor, "m 3"], quaternions: Float[Tensor, "m 4"], camera: Camera
 ) -> tuple[ProjectedGaussians, Float[Tensor, "m 2"]]:
     """`project`, and the dilated variances along x and y in px² (one where not valid)."""
     rigid = to_like(camera.camera_from_world, means)

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from vdgs.kernels.autograd import vjp_from_autograd
 from vdgs.kernels.constants import ALPHA_MAX, ALPHA_MIN, MEDIAN_TRANSMITTANCE, TRANSMITTANCE_MIN
-from vdgs.kernels.kernel_types import Raster, RasterPullback, Splats
+from vdgs.kernels.kernel_types import Raster, RasterPullback, SplatContributions, Splats
 
 
 def rasterize(
-    splats: Splats,
-    background: Float[Tensor, "3"],
-    width: int,
-    height: int,
-    *,
-    depth: bool = False,
+    splats: Splats, background: Float[Tensor, "3"], width: int, height: int, *, depth: bool = False
 ) -> Raster:
     """Blend splats front to back (3DGS, eqs. 2-3); see vdgs.kernels.cpu.rasterize, whose twin this is.
 
@@ -46,12 +43,7 @@ def rasterize(
 
 
 def rasterize_vjp(
-    splats: Splats,
-    background: Float[Tensor, "3"],
-    width: int,
-    height: int,
-    *,
-    depth: bool = False,
+    splats: Splats, background: Float[Tensor, "3"], width: int, height: int, *, depth: bool = False
 ) -> tuple[Raster, RasterPullback]:
     """`rasterize` without autograd for the caller: the picture, and the way back from it (by autograd in here)."""
 
@@ -59,6 +51,38 @@ def rasterize_vjp(
         return rasterize(splats, background, width, height, depth=depth)
 
     return vjp_from_autograd(draw, splats, background)
+
+
+def splat_contributions(
+    splats: Splats,
+    background: Float[Tensor, "3"],
+    width: int,
+    height: int,
+    wanted: Float[Tensor, "h w 3"] | None = None,
+) -> SplatContributions:
+    """How many pixels each splat makes, the sum of its weights w = alpha T over them (3DGS, eq. 3), and the sum of w
+    times what the picture lacks there of the wanted one (zero without).
+
+    These are the derivatives of the sum of the expected depth by the depth of the splat, and, by its colour, of half of
+    the squared error of the picture, negated. Raises what `rasterize` raises.
+    """
+    return splat_contributions_from_vjp(rasterize_vjp, splats, background, width, height, wanted)
+
+
+def splat_contributions_from_vjp(
+    draw: Callable[..., tuple[Raster, RasterPullback]],
+    splats: Splats,
+    background: Float[Tensor, "3"],
+    width: int,
+    height: int,
+    wanted: Float[Tensor, "h w 3"] | None,
+) -> SplatContributions:
+    """The same by any `rasterize_vjp`."""
+    raster, pullback = draw(splats, background, width, height, depth=True)
+    lacking = torch.zeros_like(raster.image) if wanted is None else wanted - raster.image
+    found = pullback(lacking, None, torch.ones_like(raster.alpha))
+    assert found.depths is not None
+    return SplatContributions(found.depths, found.colors)
 
 
 @torch.no_grad()
@@ -72,11 +96,7 @@ def _median_depth(transmittance: Float[Tensor, "m_and_one h w"], depths: Float[T
 
 
 def _alphas(
-    means_px: Float[Tensor, "m 2"],
-    conics: Float[Tensor, "m 3"],
-    opacities: Float[Tensor, "m"],
-    width: int,
-    height: int,
+    means_px: Float[Tensor, "m 2"], conics: Float[Tensor, "m 3"], opacities: Float[Tensor, "m"], width: int, height: int
 ) -> Float[Tensor, "m h w"]:
     """Opacity of every splat at every pixel centre, zero where it is too small to count."""
     x = torch.arange(width, dtype=means_px.dtype, device=means_px.device) + 0.5

@@ -17,7 +17,7 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 
 from vdgs.geometry.camera import Camera
-from vdgs.geometry.row_sampling import sample_points
+from vdgs.geometry.similarity import sample_points
 from vdgs.partition.blocks import Blocks
 from vdgs.plots.partition.block_stats import (
     block_color,

@@ -10,7 +10,7 @@ from typing import Any
 
 from rich.console import Console
 
-from vdgs.config.checkpointing import CheckpointOptions
+from vdgs.config.executor_options import CheckpointOptions
 from vdgs.config.method import TrainConfig
 from vdgs.errors import VdgsError
 from vdgs.model.anchor_model import AnchorModel

@@ -1,9 +1,10 @@
-"""Splats to a picture by gsplat: `isect_tiles`, `isect_offset_encode`, `rasterize_to_pixels`.
+"""The rasterizer of gsplat 1.5.3 (Apache-2.0, the extra `gsplat`) behind the operations of `vdgs.kernels`, on a GPU.
 
-Both sides mean the same by means (the first pixel's centre is (0.5, 0.5)), conics, alpha (from 1/255 to 0.999), the end
-of a pixel (transmittance 1e-4) and equal depths (the order of the rows: `OrderedSplats.runs` are not looked at). gsplat
-asks in addition how far each splat reaches, and knows no depth: here it is a fourth colour over a background of zero.
-Median depth it cannot tell: that is None.
+It calls `isect_tiles`, `isect_offset_encode` and `rasterize_to_pixels`; `vdgs.kernels.gpu` uses it where it is
+installed (docs/cuda.md). Both sides agree on means (the first pixel's centre is (0.5, 0.5)), conics, alpha (1/255 to
+0.999), the end of a pixel (transmittance 1e-4) and equal depths (the order of the rows: `OrderedSplats.segments` is
+ignored). gsplat needs the extent of each splat, and has no depth: here depth is a fourth colour over a background of
+zero. It cannot compute the median depth, which is None.
 """
 
 from __future__ import annotations
@@ -18,10 +19,9 @@ from jaxtyping import Float, Int32
 from torch import Tensor
 
 from vdgs.errors import VdgsError
-from vdgs.kernels.autograd import vjp_from_autograd
+from vdgs.kernels.autograd import check_splats, vjp_from_autograd
 from vdgs.kernels.constants import ALPHA_MIN
 from vdgs.kernels.kernel_types import Raster, RasterPullback, Splats
-from vdgs.kernels.splat_checks import check_splats
 
 #: Side of gsplat's tiles, in pixels (its default).
 TILE_PX = 16
@@ -32,15 +32,9 @@ class GsplatUnavailable(VdgsError):
 
 
 def rasterize(
-    splats: Splats,
-    background: Float[Tensor, "3"],
-    width: int,
-    height: int,
-    *,
-    depth: bool = False,
-    engine: Any = None,
+    splats: Splats, background: Float[Tensor, "3"], width: int, height: int, *, depth: bool = False, engine: Any = None
 ) -> Raster:
-    """As `native.rasterize`, for tensors on a GPU; depths must be positive (gsplat sorts by their bits).
+    """As `cpu.rasterize`, for tensors on a GPU; depths must be positive (gsplat sorts by their bits).
 
     Waits for the device once, in `isect_tiles`: for how many tiles the splats reach. `engine` offers gsplat's three
     functions (default: gsplat, which compiles its kernels when first used; that takes minutes and a CUDA toolkit).
@@ -68,13 +62,7 @@ def rasterize(
 
 
 def rasterize_vjp(
-    splats: Splats,
-    background: Float[Tensor, "3"],
-    width: int,
-    height: int,
-    *,
-    depth: bool = False,
-    engine: Any = None,
+    splats: Splats, background: Float[Tensor, "3"], width: int, height: int, *, depth: bool = False, engine: Any = None
 ) -> tuple[Raster, RasterPullback]:
     """`rasterize`, and the way back from it: gsplat's own derivative, those of the means in pixels among it."""
 
