@@ -65,7 +65,7 @@ CORRECTED_COLUMNS = (
     TableColumn("SSIM ↑", "ssim_cc", 3),
     TableColumn("LPIPS ↓", "lpips_vgg_cc", 3, -1),
 )
-REFERENCE_EXPOSURE_COLUMNS = TableColumn("PSNR ↑", "psnr_neutral"), TableColumn("SSIM ↑", "ssim_neutral", 3)
+REFERENCE_EXPOSURE_COLUMNS = TableColumn("PSNR ↑", "psnr_reference_exposure"), TableColumn("SSIM ↑", "ssim_reference_exposure", 3)
 COST_COLUMNS = (
     TableColumn("iterations", "iterations", 0, 0),
     TableColumn("photographs drawn", "photographs", 0, 0),
@@ -80,15 +80,15 @@ COST_COLUMNS = (
     TableColumn("frames/s", "fps", 0, 0),
 )
 COVERAGE_COLUMNS = (
-    TableColumn("opaque % ↑", "solid_share", factor=100.0),
-    TableColumn("PSNR, own background ↑", "psnr_seen_own"),
-    TableColumn("PSNR, black ↑", "psnr_seen_black"),
-    TableColumn("PSNR, white ↑", "psnr_seen_white"),
+    TableColumn("opaque % ↑", "opacity_coverage", factor=100.0),
+    TableColumn("PSNR, own background ↑", "psnr_covered_own_background"),
+    TableColumn("PSNR, black ↑", "psnr_covered_black"),
+    TableColumn("PSNR, white ↑", "psnr_covered_white"),
     TableColumn("error of expected depth % ↓", "depth_error_median_expected", 2, -1, 100.0),
     TableColumn("error of median depth % ↓", "depth_error_median_median", 2, -1, 100.0),
     TableColumn("expected depth within 1 %, % ↑", "depth_within_1_percent_expected", 1, 1, 100.0),
     TableColumn("median depth within 1 %, % ↑", "depth_within_1_percent_median", 1, 1, 100.0),
-    TableColumn("large splats ↓", "splats_larger_than_picture", 0, -1),
+    TableColumn("large splats ↓", "oversized_splats", 0, -1),
 )
 #: What makes rows comparable that are exposed and rows that are not.
 REFERENCE_EXPOSURE_NOTE = (
@@ -158,7 +158,7 @@ def make_result_tables(plan: BenchPlan, results: Sequence[BenchResult]) -> list[
 
 def _neutral(plan: BenchPlan, results: Sequence[BenchResult], title: str) -> list[ResultTable]:
     """Quality in neutral colours, of all methods; nothing where no method is measured in others."""
-    if all(result.figures.get("psnr_neutral") is None for result in results):
+    if all(result.figures.get("psnr_reference_exposure") is None for result in results):
         return []
     alike = [replace(result, figures=_in_neutral_colors(result.figures)) for result in results]
     return [
@@ -170,9 +170,9 @@ def _neutral(plan: BenchPlan, results: Sequence[BenchResult], title: str) -> lis
 
 def _in_neutral_colors(figures: Mapping[str, float | None]) -> Mapping[str, float | None]:
     """The figures with those in neutral colours, which are the raw ones where nothing else is said."""
-    if figures.get("psnr_neutral") is not None:
+    if figures.get("psnr_reference_exposure") is not None:
         return figures
-    return {**figures, "psnr_neutral": figures.get("psnr"), "ssim_neutral": figures.get("ssim")}
+    return {**figures, "psnr_reference_exposure": figures.get("psnr"), "ssim_reference_exposure": figures.get("ssim")}
 
 
 def _for_scene(column: TableColumn, scene: str) -> TableColumn:

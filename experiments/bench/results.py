@@ -21,12 +21,12 @@ from vdgs.system.atomic_files import read_json
 #: What evaluations report, raw and after colour correction.
 QUALITY_KEYS = ("psnr", "ssim", "lpips_vgg", "lpips_vgg_01", "psnr_cc", "ssim_cc", "lpips_vgg_cc", "lpips_vgg_01_cc")
 #: The same in neutral colours, of views that are drawn exposed as their neighbours in the flight.
-REFERENCE_EXPOSURE_KEYS = ("psnr_neutral", "ssim_neutral")
+REFERENCE_EXPOSURE_KEYS = ("psnr_reference_exposure", "ssim_reference_exposure")
 #: Over the pixels that training cameras see: how opaque they are, PSNR by background, errors of depth; and veils.
 COVERAGE_KEYS = (
-    "solid_share", "psnr_seen_own", "psnr_seen_black", "psnr_seen_white", "depth_error_median_expected",
+    "opacity_coverage", "psnr_covered_own_background", "psnr_covered_black", "psnr_covered_white", "depth_error_median_expected",
     "depth_error_median_median", "depth_within_1_percent_expected", "depth_within_1_percent_median",
-    "splats_larger_than_picture",
+    "oversized_splats",
 )  # fmt: skip
 
 

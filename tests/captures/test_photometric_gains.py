@@ -276,7 +276,7 @@ def test_exposures_are_fitted_where_photographs_differ(
     for index, name in enumerate(SCENE.cameras):
         picture = 0.8 * gains[index % len(gains)] * render_plane(CAMERAS[index])[:, :, ::-1]
         assert cv2.imwrite(str(capture / "images" / name), picture.astype(np.uint8))
-    done = vdgs("coarse", capture, "--output", run, *SETTINGS)
+    done = vdgs("train-coarse", capture, "--output", run, *SETTINGS)
     assert done.returncode == 0, done.stderr
     assert said in " ".join(done.stdout.split())
     model = AnchorModel.load(run / "coarse/model.safetensors")

@@ -143,10 +143,10 @@ def test_inspect_says_how_cameras_and_points_were_compared(tmp_path, scene):
     assert "of the points lie in front of and inside a training camera (the capture has no tracks" in said
     report = json.loads((tmp_path / "b" / "report.json").read_text(encoding="utf-8"))
     assert report["reprojection_px"] is None
-    assert report["share_seen"] > 0.9
+    assert report["seen_fraction"] > 0.9
 
 
-@pytest.mark.parametrize("verb", ["inspect", "coarse", "run"])
+@pytest.mark.parametrize("verb", ["inspect", "train-coarse", "run"])
 def test_every_verb_that_begins_refuses_it(tmp_path, scene, verb):
     write_colmap(tmp_path / "capture", below(scene), shown=scene)
     done = vdgs(verb, tmp_path / "capture", "--output", tmp_path / "out")

@@ -174,10 +174,10 @@ def test_slivers_of_a_block_are_left_out():
     labels = halves()
     labels[0, :36], labels[1, :35] = 2, 3  # 0.5 % of 7200 pixels are 36
     assert visible_blocks(labels, 5) == [0, 1, 2]
-    pooled = BlockMetrics(5, ["alone"])
-    pooled.add(labels, {"alone": np.where(labels == 3, np.nan, 0.01)})
+    pooled = BlockMetrics(5, ["isolated"])
+    pooled.add(labels, {"isolated": np.where(labels == 3, np.nan, 0.01)})
     assert [row["pixels"] for row in pooled.rows()] == [3600 - 71, 3600, 36, 0, 0]
-    assert pooled.overall()["psnr_alone"] == pytest.approx(20.0)
+    assert pooled.overall()["psnr_isolated"] == pytest.approx(20.0)
 
 
 def seams_of(coarse: np.ndarray, merged: np.ndarray, labels: np.ndarray, mask: np.ndarray | None = None) -> dict:
@@ -196,12 +196,12 @@ def test_uniform_noise_leaves_no_seam():
     coarse, merged = np.abs(rng.normal(0, 0.1, (2, 400, 600)))
     figures = seams_of(coarse, 0.5 * merged, halves(400, 600))
     assert figures["border_pixels"] == 2 * 400 * 22
-    assert figures["other_pixels"] == 2 * 400 * 578
+    assert figures["interior_pixels"] == 2 * 400 * 578
     for key in ("mae_coarse", "mae_merged"):
         assert figures[key]["ratio"] == pytest.approx(1, abs=0.03)
-    assert figures["seam_mae"] == pytest.approx(1, abs=0.03)
-    assert figures["seam_mse"] == pytest.approx(1, abs=0.06)
-    assert figures["mae_merged"]["elsewhere"] == pytest.approx(0.5 * figures["mae_coarse"]["elsewhere"], rel=0.01)
+    assert figures["seam_mae_ratio"] == pytest.approx(1, abs=0.03)
+    assert figures["seam_mse_ratio"] == pytest.approx(1, abs=0.06)
+    assert figures["mae_merged"]["interior"] == pytest.approx(0.5 * figures["mae_coarse"]["interior"], rel=0.01)
 
 
 def test_an_error_along_the_border_is_a_seam():
@@ -210,8 +210,8 @@ def test_an_error_along_the_border_is_a_seam():
     figures = seams_of(noise, torn, labels)
     assert figures["mae_merged"]["ratio"] == pytest.approx(3)
     assert figures["mse_merged"]["ratio"] == pytest.approx(9)
-    assert figures["seam_mae"] == pytest.approx(3)
-    assert figures["seam_mse"] == pytest.approx(9)
+    assert figures["seam_mae_ratio"] == pytest.approx(3)
+    assert figures["seam_mse_ratio"] == pytest.approx(9)
 
 
 def test_a_border_in_a_hard_place_is_no_seam():
@@ -219,7 +219,7 @@ def test_a_border_in_a_hard_place_is_no_seam():
     hard = np.where(border_pixels(labels), 0.3, 0.1)
     figures = seams_of(hard, hard / 2, labels)
     assert figures["mae_merged"]["ratio"] == pytest.approx(3)
-    assert figures["seam_mae"] == pytest.approx(1)
+    assert figures["seam_mae_ratio"] == pytest.approx(1)
 
 
 def test_pixels_that_do_not_count():
@@ -229,14 +229,14 @@ def test_pixels_that_do_not_count():
     mask[-10:], errors[-10:] = False, np.nan
     figures = seams_of(errors, errors, labels, mask)
     assert figures["border_pixels"] == 2 * 30 * 22
-    assert figures["mae_merged"]["elsewhere"] == pytest.approx(0.1)
+    assert figures["mae_merged"]["interior"] == pytest.approx(0.1)
 
 
 def test_no_border_no_figure():
     figures = seams_of(np.ones((4, 4)), np.ones((4, 4)), np.zeros((4, 4), np.int16))
     assert figures["border_pixels"] == 0
-    assert np.isnan(figures["seam_mae"])
-    assert figures["mae_coarse"]["elsewhere"] == 1.0
+    assert np.isnan(figures["seam_mae_ratio"])
+    assert figures["mae_coarse"]["interior"] == 1.0
 
 
 class Plane:
@@ -287,10 +287,10 @@ def test_an_evaluation_of_blocks(tmp_path: Path):
     assert result == json.loads((tmp_path / "by_block.json").read_text())
     assert [row["block"] for row in result["blocks"]] == [0, 1, 2, 3]
     for row in result["blocks"][:3]:
-        assert row["psnr_alone"] > row["psnr_merged"] > row["psnr_coarse"] - 10
-    assert result["blocks"][3]["psnr_alone"] is None
-    assert result["all"]["psnr_alone"] is None
-    assert result["seams"]["seam_mae"] > 1.5
+        assert row["psnr_isolated"] > row["psnr_merged"] > row["psnr_coarse"] - 10
+    assert result["blocks"][3]["psnr_isolated"] is None
+    assert result["all"]["psnr_isolated"] is None
+    assert result["seams"]["seam_mae_ratio"] > 1.5
     assert result["seams"]["mae_coarse"]["ratio"] == pytest.approx(1, abs=0.1)
     assert plane.asked[-1] == 0
     assert plane.asked.count(3) <= 2  # not for the view that shows block 0 alone
@@ -308,7 +308,7 @@ def test_blocks_are_measured_in_the_exposure_of_the_view(tmp_path: Path):
     exposed = Darker(CAMERAS[:2]).evaluate(tmp_path / "exposed", exposure=lambda _: 0.8 * torch.eye(3, 4))
     for name in ("psnr_coarse", "psnr_merged"):
         assert exposed["all"][name] == pytest.approx(neutral[name] - 20 * np.log10(0.8), abs=0.2)
-    alone = [row["psnr_alone"] for row in exposed["blocks"][:3]]
+    alone = [row["psnr_isolated"] for row in exposed["blocks"][:3]]
     assert min(alone) > exposed["all"]["psnr_merged"]
     assert Darker(CAMERAS[:2]).evaluate(tmp_path / "as it is")["all"]["psnr_coarse"] < neutral["psnr_coarse"]
 
@@ -345,7 +345,7 @@ def test_the_block_alone_is_measured_where_it_is_shown(tmp_path: Path):
 
     plane.block = own_place_only  # type: ignore[method-assign,assignment]
     result = plane.evaluate(tmp_path)
-    assert [row["psnr_alone"] for row in result["blocks"]] == pytest.approx([-20 * np.log10(0.02)] * 4, abs=0.6)
+    assert [row["psnr_isolated"] for row in result["blocks"]] == pytest.approx([-20 * np.log10(0.02)] * 4, abs=0.6)
 
 
 def test_the_table_says_what_was_found(tmp_path: Path):
@@ -353,7 +353,7 @@ def test_the_table_says_what_was_found(tmp_path: Path):
     text = StringIO()
     Console(file=text, width=200).print(make_block_table(result))
     assert f"{result['blocks'][1]['psnr_merged']:.2f}" in text.getvalue()
-    assert f"merged over coarse {result['seams']['seam_mae']:.3f}" in text.getvalue()
+    assert f"merged over coarse {result['seams']['seam_mae_ratio']:.3f}" in text.getvalue()
     lonely = StringIO()
     Console(file=lonely, width=200).print(make_block_table(Plane([ONE_BLOCK]).evaluate(tmp_path)))
     assert "no border" in lonely.getvalue()

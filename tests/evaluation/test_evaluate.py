@@ -120,7 +120,7 @@ def test_masks_are_respected(city: City, tmp_path: Path):
     result = evaluate_model(replace(city.taken, views=[masked]), RenderableModel(render=city.render), tmp_path / "out")
     left = psnr(city.renders[0][:, :32], city.photographs[0][:, :32])
     assert result["psnr"] == pytest.approx(left, abs=1e-9)
-    assert read(tmp_path / "out" / "per_view.json")[0]["kept_pixels"] == 48 * 32
+    assert read(tmp_path / "out" / "per_view.json")[0]["unmasked_pixels"] == 48 * 32
 
 
 def test_a_view_that_is_masked_entirely_leaves_the_means_alone(city: City, tmp_path: Path):
@@ -187,9 +187,9 @@ def test_pictures_are_measured_in_the_exposure_that_the_model_knows_beside_neutr
     model = replace(neutral, exposure=lambda v: gains[v.name])
     evaluate_model(photographs, model, tmp_path / "exposed", settings=settings, console=Console(file=out, width=120))
     plain, result = (read(tmp_path / folder / "metrics.json") for folder in ("plain", "exposed"))
-    assert plain["psnr_neutral"] is plain["ssim_neutral"] is None
+    assert plain["psnr_reference_exposure"] is plain["ssim_reference_exposure"] is None
     assert plain["notes"] == []
-    assert (result["psnr_neutral"], result["ssim_neutral"]) == (plain["psnr"], plain["ssim"])
+    assert (result["psnr_reference_exposure"], result["ssim_reference_exposure"]) == (plain["psnr"], plain["ssim"])
     assert result["psnr"] > plain["psnr"] + 1
     assert result["notes"] == [
         "views are drawn and measured in the exposure of its neighbours; 1 of them neutral, for want of training "
@@ -200,14 +200,14 @@ def test_pictures_are_measured_in_the_exposure_that_the_model_knows_beside_neutr
         saved = cv2.imread(str(tmp_path / "exposed" / row["render"]))[..., ::-1]
         assert np.abs(saved - (drawn * float(gains[shown.name][0, 0])).clip(0, 255)).max() < 0.51
         assert row["psnr"] == psnr(saved, photographs.load_image(shown))
-        assert row["psnr_neutral"] == psnr(drawn, photographs.load_image(shown))
+        assert row["psnr_reference_exposure"] == psnr(drawn, photographs.load_image(shown))
         assert row["exposure"] == gains[shown.name].tolist()
     assert sum(10 ** (-each["psnr"] / 10) * each["pixels"] for each in result["by_visibility"]) == pytest.approx(
-        sum(10 ** (-row["psnr"] / 10) * row["kept_pixels"] for row in rows)
+        sum(10 ** (-row["psnr"] / 10) * row["unmasked_pixels"] for row in rows)
     )
     text = " ".join(out.getvalue().split())
     assert "neutral colours" in text
-    assert f"{result['psnr_neutral']:.2f}" in text
+    assert f"{result['psnr_reference_exposure']:.2f}" in text
     assert "in the exposure of its neighbours" in text
 
 

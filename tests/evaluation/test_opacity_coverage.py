@@ -65,28 +65,28 @@ def read(path: Path):
 def test_what_is_opaque_everywhere_is_solid_before_any_background(tmp_path: Path):
     model = RenderableModel(render=veil(1.0), coverage_map=seen_from(40), background=BACKGROUND)
     result = evaluate_model(TAKEN, model, tmp_path)
-    assert (result["solid_share"], result["seen_pixels"]) == (1.0, 2 * 40 * HEIGHT)
-    assert result["psnr_seen_own"] == result["psnr_seen_black"] == result["psnr_seen_white"]
+    assert (result["opacity_coverage"], result["covered_pixels"]) == (1.0, 2 * 40 * HEIGHT)
+    assert result["psnr_covered_own_background"] == result["psnr_covered_black"] == result["psnr_covered_white"]
     rows = read(tmp_path / "per_view.json")
     for row, taken in zip(rows, PHOTOGRAPHS, strict=True):
         left = np.s_[:, :40]
         saved = cv2.imread(str(tmp_path / row["render"]))[..., ::-1]
-        assert row["psnr_seen_own"] == pytest.approx(psnr(saved[left], taken[left]))
+        assert row["psnr_covered_own_background"] == pytest.approx(psnr(saved[left], taken[left]))
         assert (cv2.imread(str(tmp_path / row["alpha"])) == 255).all()
-    assert result["psnr_seen_own"] == pytest.approx(np.mean([row["psnr_seen_own"] for row in rows]))
+    assert result["psnr_covered_own_background"] == pytest.approx(np.mean([row["psnr_covered_own_background"] for row in rows]))
 
 
 def test_a_veil_is_not_solid_and_shows_what_is_behind_it(tmp_path: Path):
     result = evaluate_model(
         TAKEN, RenderableModel(render=veil(0.5), coverage_map=seen_from(40), background=BACKGROUND), tmp_path
     )
-    assert result["solid_share"] == 0.0
+    assert result["opacity_coverage"] == 0.0
     expected = []
     for taken in PHOTOGRAPHS:
         before_white = metrics.to_8bit(0.5 * 0.9 * taken.astype(np.float32) / 255 + 0.5)
         expected.append(psnr(before_white[:, :40], taken[:, :40]))
-    assert result["psnr_seen_white"] == pytest.approx(np.mean(expected), abs=0.02)
-    assert result["psnr_seen_own"] > result["psnr_seen_white"]
+    assert result["psnr_covered_white"] == pytest.approx(np.mean(expected), abs=0.02)
+    assert result["psnr_covered_own_background"] > result["psnr_covered_white"]
     assert (cv2.imread(str(tmp_path / "alpha" / "one.png")) == 128).all()
 
 
@@ -163,28 +163,28 @@ def test_masks_in_an_evaluation(tmp_path: Path):
         return veil(1.0)(camera)._replace(alpha=alpha)
 
     everywhere = RenderableModel(render=half_open, coverage_map=seen_from(WIDTH), background=BACKGROUND)
-    assert evaluate_model(TAKEN, everywhere, tmp_path / "whole")["solid_share"] == 0.5
+    assert evaluate_model(TAKEN, everywhere, tmp_path / "whole")["opacity_coverage"] == 0.5
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[:, 32:] = 255
     cv2.imwrite(str(tmp_path / "mask.png"), mask)
     masked = replace(TAKEN, views=[view("one.jpg", mask=tmp_path / "mask.png")], load_image=lambda _: PHOTOGRAPHS[0])
-    assert evaluate_model(masked, everywhere, tmp_path / "masked")["solid_share"] == 0.0
+    assert evaluate_model(masked, everywhere, tmp_path / "masked")["opacity_coverage"] == 0.0
 
 
 def test_what_is_not_known_is_null(tmp_path: Path):
     opaque = veil(1.0)
-    names = ("solid_share", *COVERED_PSNR_KEYS, *METRIC_NAMES, "splats_larger_than_picture", "largest_splats")
+    names = ("opacity_coverage", *COVERED_PSNR_KEYS, *METRIC_NAMES, "oversized_splats", "max_oversized_splats")
     result = evaluate_model(TAKEN, RenderableModel(render=opaque, background=BACKGROUND), tmp_path / "no V")
     assert {result[name] for name in names} == {None}
     image_only = RenderableModel(
         render=lambda camera: SimpleNamespace(image=opaque(camera).image), coverage_map=seen_from(40)
     )
     result = evaluate_model(TAKEN, image_only, tmp_path / "no alpha")
-    assert result["psnr_seen_own"] > 10
-    assert {result[name] for name in names if name != "psnr_seen_own"} == {None}
+    assert result["psnr_covered_own_background"] > 10
+    assert {result[name] for name in names if name != "psnr_covered_own_background"} == {None}
     row = read(tmp_path / "no alpha" / "per_view.json")[0]
     assert row["alpha"] is None
-    assert row["seen_pixels"] == 40 * HEIGHT
+    assert row["covered_pixels"] == 40 * HEIGHT
     assert not (tmp_path / "no alpha" / "alpha").exists()
     result = evaluate_model(
         TAKEN, RenderableModel(render=opaque, coverage_map=seen_from(0), background=BACKGROUND), tmp_path / "none seen"
@@ -288,14 +288,14 @@ def test_large_splats_of_all_views_and_where_most_are(tmp_path: Path):
         render=veil(1.0), coverage_map=seen_from(40), background=BACKGROUND, decode_splats=splats_of
     )
     result = evaluate_model(TAKEN, model, tmp_path, console=Console(file=out, width=100))
-    assert result["splats_larger_than_picture"] == 4
-    assert (result["largest_splats"], result["largest_splats_view"]) == (3, "two.jpg")
-    assert [row["largest_splats"] for row in read(tmp_path / "per_view.json")] == [1, 3]
+    assert result["oversized_splats"] == 4
+    assert (result["max_oversized_splats"], result["max_oversized_splats_view"]) == (3, "two.jpg")
+    assert [row["oversized_splats"] for row in read(tmp_path / "per_view.json")] == [1, 3]
     assert "larger than the picture: 4" in out.getvalue()
     assert "100.00%" in out.getvalue()
     none = replace(model, decode_splats=lambda camera: splats(splat(1.0, 0.9)))
     result = evaluate_model(TAKEN, none, tmp_path / "none")
-    assert (result["splats_larger_than_picture"], result["largest_splats_view"]) == (0, None)
+    assert (result["oversized_splats"], result["max_oversized_splats_view"]) == (0, None)
 
 
 @pytest.mark.parametrize("model", ["pinhole", "orthographic"])

@@ -66,7 +66,7 @@ def test_renders_of_our_own_measure_as_our_own(data, output, theirs):
     for of_colors in REFERENCE_EXPOSURE_KEYS:  # nor what it would be in another exposure
         assert ours.figures[of_colors] is not None, of_colors
         assert foreign.figures[of_colors] is None, of_colors
-    assert ours.figures["solid_share"] is not None
+    assert ours.figures["opacity_coverage"] is not None
     for cost in ("anchors", "gaussians", "iterations", "seconds", "peak_memory_bytes", "fps"):
         assert foreign.figures.get(cost) is None, cost
     text = (output / "table1" / "table.md").read_text()

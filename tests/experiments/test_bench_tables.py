@@ -141,7 +141,7 @@ def test_solidity_is_a_table_where_it_is_known():
     results = made({"baseline": (0, 0), "full": (1, 0)})
     assert not [grid for grid in make_result_tables(plan, results) if grid.name == "solidity-lab-uneven"]
     for result, share in zip(results, (0.5, 0.5, 0.5, 0.9, 0.9, 0.9), strict=True):
-        result.figures.update({"solid_share": share, "splats_larger_than_picture": None})
+        result.figures.update({"opacity_coverage": share, "oversized_splats": None})
     (grid,) = [grid for grid in make_result_tables(plan, results) if grid.name == "solidity-lab-uneven"]
     assert grid.columns == ("opaque % ↑",)
     assert "| VDGS (full) | **90.00 ± 0.00** |" in to_markdown([grid], "T", [])
@@ -154,7 +154,7 @@ def test_methods_that_fit_exposures_are_compared_with_others_in_neutral_colors()
     for result in results[:3]:
         result.figures.update({"psnr": 20.5, "ssim": 0.61})
     for result in results[3:]:
-        result.figures.update({"psnr": 30.0, "ssim": 0.9, "psnr_neutral": 20.25, "ssim_neutral": 0.6})
+        result.figures.update({"psnr": 30.0, "ssim": 0.9, "psnr_reference_exposure": 20.25, "ssim_reference_exposure": 0.6})
     (grid,) = [grid for grid in make_result_tables(plan, results) if grid.name == "neutral"]
     text = to_markdown([grid], "T", [])
     assert "| VDGS (full) | <u>20.25 ± 0.00</u> | <u>0.600 ± 0.000</u> |" in text

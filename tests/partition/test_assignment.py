@@ -129,12 +129,12 @@ def test_what_is_saved_is_loaded(saved):
     names, loaded, decided = load_scores(path)
     assert names == ["a.jpg", "b/ö.jpg", "c.jpg"]
     assert loaded.mode == "coverage"
-    for name in ("scores", "held", "covered", "anchors", "beneath"):
+    for name in ("scores", "visible_anchors", "coverage", "anchors", "nadir_block"):
         assert np.array_equal(getattr(loaded, name), getattr(scores, name))
-    assert np.array_equal(decided.reasons, result.why)
+    assert np.array_equal(decided.reasons, result.reasons)
     assert np.array_equal(decided.cameras, result.cameras)
-    assert decided.warnings == result.complaints
-    assert len(result.complaints) == 2
+    assert decided.warnings == result.warnings
+    assert len(result.warnings) == 2
     before = path.read_bytes()
     save_scores(path, names, loaded, decided)
     assert path.read_bytes() == before
@@ -164,7 +164,7 @@ def test_missing_and_damaged_files_say_so(saved, tmp_path):
         except RunError:
             continue
         assert np.array_equal(loaded.scores.scores, scores.scores)
-        assert np.array_equal(loaded.assignment.reasons, result.why)
+        assert np.array_equal(loaded.assignment.reasons, result.reasons)
 
 
 def test_a_file_whose_arrays_disagree_is_refused(saved):
@@ -172,7 +172,7 @@ def test_a_file_whose_arrays_disagree_is_refused(saved):
     with np.load(path, allow_pickle=False) as file:
         arrays = dict(file)
     for name, value in (
-        ("held", arrays["held"][:1]), ("why", arrays["why"] + 9), ("scores", arrays["scores"].astype(float)),
+        ("visible_anchors", arrays["visible_anchors"][:1]), ("reasons", arrays["reasons"] + 9), ("scores", arrays["scores"].astype(float)),
         ("names", np.arange(3)), ("format", np.array("other")),
     ):  # fmt: skip
         np.savez(path, **{**arrays, name: value})

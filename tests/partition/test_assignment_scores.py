@@ -118,8 +118,8 @@ def test_scores_depend_on_no_other_camera_and_on_no_number_of_threads(mode):
         shuffled = compute_score_matrix(
             scene(), blocks, [views[i] for i in order], config, lambda *done: told.append(done)
         )
-    for name in ("scores", "held", "covered", "beneath"):
-        assert np.array_equal(getattr(alone, name)[order], getattr(shuffled, name), equal_nan=name == "covered")
+    for name in ("scores", "visible_anchors", "coverage", "nadir_block"):
+        assert np.array_equal(getattr(alone, name)[order], getattr(shuffled, name), equal_nan=name == "coverage")
     assert told == [(i + 1, 9) for i in range(9)]
 
 

@@ -105,7 +105,7 @@ def test_every_place_has_one_owner_and_cores_are_disjoint_within_their_boundarie
     for block in blocks.items:
         assert block.core.is_valid
         assert block.expanded.is_valid
-        assert block.core.gain_spread(block.expanded).area == 0
+        assert block.core.difference(block.expanded).area == 0
         assert block.expanded.area > 1.2 * block.core.area
     generator = np.random.default_rng(4)
     places = np.concatenate(
@@ -375,7 +375,7 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("origin", [(47.3, 8.5, 440.0), (-17.0, 179.9999, 20.0), (-33.9, -70.6, 900.0)])
 def test_blocks_on_the_map(tmp_path: Path, origin: tuple[float, float, float]) -> None:
-    ring = shapely.box(-400, -300, 500, 300).gain_spread(shapely.box(-50, -50, 60, 50))
+    ring = shapely.box(-400, -300, 500, 300).difference(shapely.box(-50, -50, 60, 50))
     hole = shapely.box(-50, -50, 60, 50)
     blocks = Blocks((Block(ring, ring.buffer(40)), Block(hole, hole.buffer(10))))
     ground = GroundFrame(

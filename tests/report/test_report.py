@@ -156,10 +156,10 @@ def whole_run(root: Path, name: str = "meadow", noise: bool = False) -> RunFolde
         {
             "lambda_vis": 1.0,
             "blocks": rows,
-            "spatial": spatial,
+            "spatial_only_blocks": spatial,
             "seconds": 4.5,
             "warnings": ["Block 1 is thin."],
-            "complaints": ["Block 0 is blind."],
+            "assignment_warnings": ["Block 0 is blind."],
         },
     )
     for block in (0, 1):
@@ -172,10 +172,10 @@ def whole_run(root: Path, name: str = "meadow", noise: bool = False) -> RunFolde
     write(root / "evaluation/metrics.json", metrics(28.375, "merged"))
     write(root / "evaluation/per_view.json", views(28.0))
     write(root / "evaluation/status.json", {"seconds": 3.5, "peak_memory_bytes": 6e8})
-    figures = {"pixels": 99, "psnr_coarse": 27.0, "psnr_alone": 27.5, "psnr_merged": 27.75}
+    figures = {"pixels": 99, "psnr_coarse": 27.0, "psnr_isolated": 27.5, "psnr_merged": 27.75}
     write(root / "evaluation/by_block.json", {
         "blocks": [{"block": 0, **figures}, {"block": 1, **figures}], "all": figures,
-        "seams": {"border_px": 10.0, "border_pixels": 77, "seam_mae": 1.0625, "seam_mse": 1.125},
+        "seams": {"border_px": 10.0, "border_pixels": 77, "seam_mae_ratio": 1.0625, "seam_mse_ratio": 1.125},
         "views": [{"name": "first.jpg", "border_pixels": 40}]})  # fmt: skip
     size = (1000, 700) if noise else (60, 40)
     names = [f"evaluation/comparisons/{name}.png" for name in ("first", "second", "third")]
@@ -236,14 +236,14 @@ def test_the_report_leads_to_a_page_of_the_scene_that_it_shows(tmp_path):
 def test_the_least_solid_view_is_shown_and_solidity_compared(tmp_path):
     run = whole_run(tmp_path)
     known = metrics(28.375, "merged") | {
-        "solid_share": 0.8765,
-        "psnr_seen_black": 27.5,
-        "splats_larger_than_picture": 12,
+        "opacity_coverage": 0.8765,
+        "psnr_covered_black": 27.5,
+        "oversized_splats": 12,
     }
     write(tmp_path / "evaluation/metrics.json", known)
     rows = views(28.0)
     for row, share in zip(rows, (0.9, 0.25, 0.8), strict=True):
-        row |= {"solid_share": share, "alpha": str(row["render"]).replace("renders", "alpha"), "largest_splats": 4}
+        row |= {"opacity_coverage": share, "alpha": str(row["render"]).replace("renders", "alpha"), "oversized_splats": 4}
         picture(tmp_path / "evaluation" / str(row["alpha"]))
     write(tmp_path / "evaluation/per_view.json", rows)
     page = Page(write_report(run))
@@ -358,7 +358,7 @@ def test_hostile_names_stay_text(tmp_path):
     write(run.path / "evaluation/per_view.json", views(28.0, names=(evil + "1", "../../../x.jpg", "n" * 900)))
     write(run.path / "evaluation/by_block.json", {"views": [{"name": evil, "border_pixels": 3}]})
     write(run.path / "partition/partition.json", {"warnings": [evil], "blocks": [{"block": evil}]})
-    write(run.path / "blocks/00/status.json", {"state": "failed", "why": evil})
+    write(run.path / "blocks/00/status.json", {"state": "failed", "reason": evil})
     page = Page(write_report(run))
     assert "script" not in page.tags
     assert "alert('x')" in page.text()

@@ -44,7 +44,7 @@ CUT = PartitionRecord(
             area=2.5,
         ),
     ),
-    spatial=(BlockRecord(0, 5, 2.5, 1.5, 0.5),),
+    spatial_only_blocks=(BlockRecord(0, 5, 2.5, 1.5, 0.5),),
     seconds=3.0,
     peak_memory_bytes=4,
 )

@@ -226,8 +226,8 @@ def test_programs_read_the_same(run, capsys):
     change(run, "merge", rule="max-visibility")
     assert command_line("status", run.path, "--json") == EXIT_INCOMPLETE
     facts = json.loads(capsys.readouterr().out)
-    assert not facts["whole"]
-    assert facts["next"] == f"vdgs merge {shlex.quote(str(run.path))}"
+    assert not facts["complete"]
+    assert facts["next_command"] == f"vdgs merge {shlex.quote(str(run.path))}"
     assert {row["stage"]: row["state"] for row in facts["stages"]}["merge"] == "stale"
 
 

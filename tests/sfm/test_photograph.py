@@ -220,7 +220,7 @@ def test_positions_that_cannot_be_are_left_out_and_named(tmp_path):
     seen[2] = replace(seen[2], lat_lon=(ORIGIN[0] + 1, ORIGIN[1]))
     seen[3] = replace(seen[3], altitude=None)
     found = positions_of(seen)
-    assert found.index.tolist() == [0, 4, 5]
+    assert found.image_indices.tolist() == [0, 4, 5]
     for name, said in (("p01", "0, 0"), ("p02", "far from all others"), ("p03", "no altitude")):
         assert any(name in note and said in note for note in found.notes), found.notes
 
@@ -364,7 +364,7 @@ def test_without_attitudes_the_focal_length_is_held_where_positions_are_those_of
     where = positions_of(photographs)
     if places is not None:
         enu = places + np.random.default_rng(3).normal(0, wrong_m, places.shape)
-        where = replace(where, index=np.arange(len(enu)), enu=enu, gps_std=np.tile([1.0, 1, 2], (len(enu), 1)))
+        where = replace(where, image_indices=np.arange(len(enu)), enu=enu, gps_std=np.tile([1.0, 1, 2], (len(enu), 1)))
     assert should_fix_focal(photographs, where, SfmOptions())[0] is held
     calibrated = [replace(photo, lens=Lens(0.7, CALIBRATED_SOURCE)) for photo in photographs]
     assert should_fix_focal(calibrated, where, SfmOptions())[0]

@@ -51,7 +51,7 @@ def camera_of(image: pycolmap.Image) -> Camera:
     rigid[:3] = image.cam_from_world().matrix()
     fx, fy, cx, cy = image.camera.params
     return Camera(
-        camera_from_world=rigid, fx=fx, fy=fy, cx=cx, cy=cy, width=image.camera.width, height=image.camera.camera_height
+        camera_from_world=rigid, fx=fx, fy=fy, cx=cx, cy=cy, width=image.camera.width, height=image.camera.height
     )
 
 

@@ -100,7 +100,7 @@ def collect_point_colors(
     `tell(done, of)` is called before each photograph is looked at, and may raise. Raises what reading them does.
     """
     chosen = np.unique(np.linspace(0, len(images.views) - 1, min(len(images.views), most_images)).astype(int)).tolist()
-    shows = [index for index in chosen if images.views[index].sightings is not None]
+    shows = [index for index in chosen if images.views[index].observations is not None]
     factor, found = _factor(images), []
     for done, index in enumerate(shows):
         on_progress(done, len(shows))

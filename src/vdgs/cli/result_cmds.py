@@ -41,7 +41,7 @@ def status_command(arguments: list[str]) -> int:
 
     facts = status_json(RunFolder(asked.run))
     print(json.dumps(facts, indent=1, ensure_ascii=False))
-    return 0 if facts["whole"] else EXIT_INCOMPLETE
+    return 0 if facts["complete"] else EXIT_INCOMPLETE
 
 
 @dataclass(frozen=True, kw_only=True)

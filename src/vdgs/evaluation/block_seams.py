@@ -1,6 +1,6 @@
 """Evaluate what the cut into blocks gained and what its seams cost, with pictures of the worst places to look.
 
-OUTPUT/by_block.json    PSNR of each block: coarse, trained alone, merged; errors at borders against elsewhere
+OUTPUT/by_block.json    PSNR of each block: coarse, isolated (as trained), merged; errors at borders against the interior
 OUTPUT/seams/NAME.png   coarse | merged | merged with the borders of blocks | error, where borders show most
 """
 
@@ -45,7 +45,7 @@ from vdgs.system.documents import BlockMetricsDocument, JsonObject
 from vdgs.system.stop_signals import check_stop_requested
 
 #: Renders that are measured by block: without blocks, the block as it was trained, all blocks together.
-RENDER_NAMES = ("coarse", "alone", "merged")
+RENDER_NAMES = ("coarse", "isolated", "merged")
 #: Pictures drawn at most: the views with the most border pixels.
 MAX_SEAM_VIEWS = 6
 #: Borders of blocks and their numbers: bright on a dark rim, so that they show on any ground.
@@ -157,8 +157,8 @@ def measure_block_view(view: View, stem: str, inputs: BlockInputs) -> tuple[Bloc
     labels = block_label_map(drawn, view.camera, inputs.blocks)
     coarse, merged = inputs.to_image(inputs.render_coarse(view.camera), view), inputs.to_image(drawn, view)
     squared = {"coarse": squared_error(coarse, reference), "merged": squared_error(merged, reference)}
-    alone = _isolated_errors(view, labels, reference, inputs)
-    by_block.add(labels, squared | {"alone": alone}, mask)
+    isolated = _isolated_errors(view, labels, reference, inputs)
+    by_block.add(labels, squared | {"isolated": isolated}, mask)
     errors = {f"mse_{name}": values for name, values in squared.items()}
     errors["mae_coarse"] = comparison_images.absolute_error(coarse, reference)
     errors["mae_merged"] = comparison_images.absolute_error(merged, reference)
@@ -257,11 +257,11 @@ def make_block_table(result: Mapping[str, Any]) -> RenderableType:
 
 
 def _cells(row: Mapping[str, Any]) -> list[str]:
-    coarse, alone, merged = (row[f"psnr_{name}"] for name in RENDER_NAMES)
+    coarse, isolated, merged = (row[f"psnr_{name}"] for name in RENDER_NAMES)
     gain = None if coarse is None or merged is None else merged - coarse
     return [
         f"{row['pixels']:,}",
-        *(format_value(each, "{:.2f}") for each in (coarse, alone, merged)),
+        *(format_value(each, "{:.2f}") for each in (coarse, isolated, merged)),
         format_value(gain, "{:+.2f}"),
     ]
 
@@ -272,5 +272,5 @@ def _seam_line(seams: Mapping[str, Any]) -> str:
     coarse, merged = (format_value(seams[f"mae_{name}"]["ratio"], "{:.3f}") for name in SeamMetrics.RENDER_NAMES)
     return (
         f"error within {seams['border_px']:.0f} px of a border over error elsewhere: merged {merged}, coarse {coarse} "
-        f"(which has no seams); merged over coarse {format_value(seams['seam_mae'], '{:.3f}')}"
+        f"(which has no seams); merged over coarse {format_value(seams['seam_mae_ratio'], '{:.3f}')}"
     )

@@ -178,15 +178,15 @@ class SeamMetrics(_PooledErrors):
                 sums[place] += errors[name][where].sum()
 
     def figures(self) -> JsonObject:
-        """Means at the border and elsewhere, their ratio for each render, and `seam_mae`, `seam_mse`: the ratio of the
+        """Means at the border and elsewhere, their ratio for each render, and `seam_mae_ratio`, `seam_mse_ratio`: the ratio of the
         merged render over that of the coarse one. Above 1, merging left seams; NaN where there are no borders."""
-        result: JsonObject = {"border_pixels": int(self._pixels[0]), "other_pixels": int(self._pixels[1])}
+        result: JsonObject = {"border_pixels": int(self._pixels[0]), "interior_pixels": int(self._pixels[1])}
         for name, sums in self._sums.items():
             border, elsewhere = (_ratio(float(sums[place]), float(self._pixels[place])) for place in (0, 1))
-            result[name] = {"border": border, "elsewhere": elsewhere, "ratio": _ratio(border, elsewhere)}
+            result[name] = {"border": border, "interior": elsewhere, "ratio": _ratio(border, elsewhere)}
         for kind in ("mae", "mse"):
             coarse, merged = (result[f"{kind}_{name}"]["ratio"] for name in self.RENDER_NAMES)
-            result[f"seam_{kind}"] = _ratio(merged, coarse)
+            result[f"seam_{kind}_ratio"] = _ratio(merged, coarse)
         return result
 
 

@@ -72,10 +72,7 @@ class DepthErrors:
 
 
 def compute_depth_errors(
-    raster: Raster,
-    true_depth: Float[np.ndarray, "h w"],
-    covered: Bool[np.ndarray, "h w"],
-    camera_height: float,
+    raster: Raster, true_depth: Float[np.ndarray, "h w"], covered: Bool[np.ndarray, "h w"], camera_height: float
 ) -> dict[str, Float[np.ndarray, " n"]]:
     """|depth - truth| / camera height at the seen pixels of which the truth is known (not of the sky), by kind.
 

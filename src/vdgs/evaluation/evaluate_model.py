@@ -135,7 +135,7 @@ def _summary(
     pixel_bins = gathered.histogram.bins(settings.visibility_bins) if gathered.histogram else None
     visible = [np.nan if row["mean_visibility"] is None else row["mean_visibility"] for row in rows]
     figures = [{name: row[name] for name in RAW_KEYS + CORRECTED_KEYS + AFFINE_KEYS} for row in rows]
-    unfitted = sum(row.get("color_fitted") is False for row in rows)
+    unfitted = sum(row.get("color_correction_fitted") is False for row in rows)
     notes = [note for note in (lpips_note, _exposure_note(rows, settings)) if note]
     if unfitted:
         notes.append(f"colour correction: too few unsaturated pixels in {unfitted} views, left as they are")

@@ -91,7 +91,7 @@ def make_renderable_model(run: OpenedRun, coarse: OpenedRun, views: EvaluationSp
         model_bytes=run.model_path.stat().st_size,
         train_seconds=run.status.seconds,
         peak_memory_bytes=run.status.peak_memory_bytes,
-        model_identity=run.status.model_id,
+        model_digest=run.status.model_id,
         key=run.key,
     )
     return RenderableModel(

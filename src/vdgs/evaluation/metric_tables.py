@@ -22,10 +22,10 @@ QUALITY_METRICS = (
 )
 #: Of solidity: what is measured over the pixels that training cameras see; those that are null are not shown.
 COVERAGE_METRICS = (
-    ("solid_share", "opaque (alpha ≥ 0.95) ↑", "{:.2%}"),
-    ("psnr_seen_own", "PSNR before its own background (dB) ↑", "{:.2f}"),
-    ("psnr_seen_black", "PSNR before black (dB) ↑", "{:.2f}"),
-    ("psnr_seen_white", "PSNR before white (dB) ↑", "{:.2f}"),
+    ("opacity_coverage", "opaque (alpha ≥ 0.95) ↑", "{:.2%}"),
+    ("psnr_covered_own_background", "PSNR before its own background (dB) ↑", "{:.2f}"),
+    ("psnr_covered_black", "PSNR before black (dB) ↑", "{:.2f}"),
+    ("psnr_covered_white", "PSNR before white (dB) ↑", "{:.2f}"),
     ("depth_error_median_expected", "median error of expected depth (camera heights) ↓", "{:.2%}"),
     ("depth_error_median_median", "median error of median depth (camera heights) ↓", "{:.2%}"),
     ("depth_within_1_percent_expected", "expected depth within 1 % of the camera height ↑", "{:.2%}"),
@@ -38,8 +38,8 @@ def make_metrics_table(result: Mapping[str, Any], title: str) -> RenderableType:
     are exposed, in neutral colours; quality by visibility, solidity, size and speed."""
     quality = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
     besides = {"_cc": "color-corrected", "_affine": "affine fit"}
-    if result["psnr_neutral"] is not None:
-        besides["_neutral"] = "neutral colours"
+    if result["psnr_reference_exposure"] is not None:
+        besides["_reference_exposure"] = "neutral colours"
     for column in ("", "raw", *besides.values()):
         quality.add_column(column, justify="left" if not column else "right")
     for key, label, form in QUALITY_METRICS:
@@ -48,9 +48,9 @@ def make_metrics_table(result: Mapping[str, Any], title: str) -> RenderableType:
     parts: list[RenderableType] = [quality]
     if result["by_visibility"]:
         parts.append(_visibility_table(result["by_visibility"]))
-    if result["psnr_seen_own"] is not None:
+    if result["psnr_covered_own_background"] is not None:
         parts.append(_solidity_table(result))
-    if result["largest_splats"]:
+    if result["max_oversized_splats"]:
         parts.append(Text(_splats_line(result)))
     parts.append(Text(_model_line(result), style="dim"))
     parts += [Text(note, style="yellow") for note in result["notes"]]
@@ -90,8 +90,8 @@ def _solidity_table(result: Mapping[str, Any]) -> Table:
 
 def _splats_line(result: Mapping[str, Any]) -> str:
     return (
-        f"splats larger than the picture: {result['splats_larger_than_picture']:,}, most of them "
-        f"({result['largest_splats']:,}) in {result['largest_splats_view']}"
+        f"splats larger than the picture: {result['oversized_splats']:,}, most of them "
+        f"({result['max_oversized_splats']:,}) in {result['max_oversized_splats_view']}"
     )
 
 

@@ -60,9 +60,7 @@ def ssim_map(
 
 
 def replace_masked(
-    image: UInt8[np.ndarray, "h w 3"],
-    reference: UInt8[np.ndarray, "h w 3"],
-    mask: Bool[np.ndarray, "h w"] | None,
+    image: UInt8[np.ndarray, "h w 3"], reference: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"] | None
 ) -> UInt8[np.ndarray, "h w 3"]:
     """The image where the mask keeps it, the reference elsewhere."""
     return image if mask is None else np.where(mask[..., None], image, reference)

@@ -26,7 +26,7 @@ from vdgs.kernels.kernel_types import Splats
 #: At least this opaque, a pixel counts as solid.
 OPAQUE_ALPHA = 0.95
 #: PSNR over seen pixels before the model's own background, a black and a white one.
-COVERED_PSNR_KEYS = ("psnr_seen_own", "psnr_seen_black", "psnr_seen_white")
+COVERED_PSNR_KEYS = ("psnr_covered_own_background", "psnr_covered_black", "psnr_covered_white")
 
 RgbColor = tuple[float, float, float]
 _BLACK: RgbColor = (0.0, 0.0, 0.0)
@@ -64,14 +64,14 @@ def measure_opacity_coverage(
     rendered: RenderedImage, reference: UInt8[np.ndarray, "h w 3"], covered: Bool[np.ndarray, "h w"] | None
 ) -> dict[str, float | None]:
     """The figures of one view; None where alpha, the background or the seen pixels are not known, or there are none."""
-    row: dict[str, float | None] = {"seen_pixels": None, "solid_pixels": None, "solid_share": None}
+    row: dict[str, float | None] = {"covered_pixels": None, "opaque_pixels": None, "opacity_coverage": None}
     row |= dict.fromkeys(COVERED_PSNR_KEYS)
     if covered is None:
         return row
-    count = row["seen_pixels"] = int(np.count_nonzero(covered))
+    count = row["covered_pixels"] = int(np.count_nonzero(covered))
     if rendered.alpha is not None:
-        solid = row["solid_pixels"] = int(np.count_nonzero(rendered.alpha[covered] >= OPAQUE_ALPHA))
-        row["solid_share"] = solid / count if count else None
+        solid = row["opaque_pixels"] = int(np.count_nonzero(rendered.alpha[covered] >= OPAQUE_ALPHA))
+        row["opacity_coverage"] = solid / count if count else None
     pictures = to_8bit(rendered.image), rendered.over_background(_BLACK), rendered.over_background(_WHITE)
     for name, picture in zip(COVERED_PSNR_KEYS, pictures, strict=True):
         if picture is not None and count:
@@ -81,10 +81,14 @@ def measure_opacity_coverage(
 
 def summarize_opacity_coverage(rows: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
     """The figures of all views, from the rows of each: shares of all seen pixels, means of PSNR over the views."""
-    known = [row for row in rows if row["solid_pixels"] is not None]
-    seen = sum(row["seen_pixels"] for row in known)
-    solid = sum(row["solid_pixels"] for row in known)
-    result = {"seen_pixels": seen, "solid_share": solid / seen} if seen else {"seen_pixels": None, "solid_share": None}
+    known = [row for row in rows if row["opaque_pixels"] is not None]
+    seen = sum(row["covered_pixels"] for row in known)
+    solid = sum(row["opaque_pixels"] for row in known)
+    result = (
+        {"covered_pixels": seen, "opacity_coverage": solid / seen}
+        if seen
+        else {"covered_pixels": None, "opacity_coverage": None}
+    )
     return result | {name: mean_or_none([row[name] for row in rows]) for name in COVERED_PSNR_KEYS}
 
 
@@ -110,11 +114,11 @@ def count_oversized_splats(splats: Splats, width: int, height: int) -> int:
 
 
 def summarize_oversized_splats(rows: Sequence[Mapping[str, Any]]) -> dict[str, int | str | None]:
-    """Splats larger than the picture over all views, and the view with most of them, from `largest_splats` of each."""
-    known = [row for row in rows if row["largest_splats"] is not None]
-    worst = max(known, key=lambda row: row["largest_splats"], default=None)
+    """Splats larger than the picture over all views, and the view with most of them, from `oversized_splats` of each."""
+    known = [row for row in rows if row["oversized_splats"] is not None]
+    worst = max(known, key=lambda row: row["oversized_splats"], default=None)
     return {
-        "splats_larger_than_picture": sum(row["largest_splats"] for row in known) if known else None,
-        "largest_splats": worst["largest_splats"] if worst else None,
-        "largest_splats_view": worst["name"] if worst and worst["largest_splats"] else None,
+        "oversized_splats": sum(row["oversized_splats"] for row in known) if known else None,
+        "max_oversized_splats": worst["oversized_splats"] if worst else None,
+        "max_oversized_splats_view": worst["name"] if worst and worst["oversized_splats"] else None,
     }

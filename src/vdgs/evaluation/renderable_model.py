@@ -35,7 +35,7 @@ class ModelMetadata:
     train_seconds: float | None = None
     peak_memory_bytes: int | None = None
     #: What tells the model from any other, and the settings that it was made with (`runs.keys`).
-    model_identity: str | None = None
+    model_digest: str | None = None
     key: str | None = None
 
 

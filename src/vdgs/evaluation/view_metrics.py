@@ -34,7 +34,7 @@ CORRECTED_KEYS = tuple(f"{name}_cc" for name in RAW_KEYS)
 #: After one affine map of the colours, which is fitted on the view too.
 AFFINE_KEYS = ("psnr_affine", "ssim_affine")
 #: In neutral colours, where the other figures are of an exposed picture.
-REFERENCE_EXPOSURE_KEYS = ("psnr_neutral", "ssim_neutral")
+REFERENCE_EXPOSURE_KEYS = ("psnr_reference_exposure", "ssim_reference_exposure")
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +114,7 @@ def measure_view(index: int, inputs: ViewInputs) -> ViewMetrics:
         corrected = _ImagePair(metrics.to_8bit(correction.image), reference, mask)
         corrected_maps = _maps(corrected, "_cc")
         row |= _metrics(corrected, corrected_maps, "_cc", inputs.lpips)
-        row["color_fitted"] = correction.fitted
+        row["color_correction_fitted"] = correction.fitted
         affine = _ImagePair(metrics.to_8bit(correct_colors_affine(image, reference, mask).image), reference, mask)
         affine_maps = _maps(affine, "_affine")
         row |= _metrics_without_lpips(affine, affine_maps, "_affine")
@@ -127,8 +127,8 @@ def measure_view(index: int, inputs: ViewInputs) -> ViewMetrics:
     row |= measure_opacity_coverage(rendered, reference, seen)
     depth_errors = _depth_errors(view, inputs.model, seen)
     row |= summarize_depth_errors(depth_errors)
-    row["largest_splats"] = _oversized_splats(view, inputs.model)
-    row["kept_pixels"] = image.shape[0] * image.shape[1] if mask is None else int(mask.sum())
+    row["oversized_splats"] = _oversized_splats(view, inputs.model)
+    row["unmasked_pixels"] = image.shape[0] * image.shape[1] if mask is None else int(mask.sum())
     row["render_seconds"] = seconds
     _draw_comparison(view, stem, raw, row, inputs)
     cell = None
@@ -143,10 +143,7 @@ def _load_reference(
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"] | None]:
     reference, mask = photographs.load_image(view), photographs.load_mask(view)
     wanted = (view.camera.height, view.camera.width)
-    for what, shape in (
-        ("photograph", reference.shape[:2]),
-        ("mask", wanted if mask is None else mask.shape),
-    ):
+    for what, shape in (("photograph", reference.shape[:2]), ("mask", wanted if mask is None else mask.shape)):
         if shape != wanted:
             raise CaptureError(
                 f"{view.image_path}: the {what} of {view.name} is {shape[1]} x {shape[0]} pixels, its camera "
@@ -214,10 +211,7 @@ def _metrics(
     nothing_kept = pair.mask is not None and not pair.mask.any()
     if lpips is not None and not nothing_kept and min(pair.image.shape[:2]) >= MIN_SIDE_PX:
         scores = lpips(metrics.replace_masked(pair.image, pair.reference, pair.mask), pair.reference)
-        figures[f"lpips_vgg{suffix}"], figures[f"lpips_vgg_01{suffix}"] = (
-            scores.lpips_vgg,
-            scores.lpips_vgg_01,
-        )
+        figures[f"lpips_vgg{suffix}"], figures[f"lpips_vgg_01{suffix}"] = (scores.lpips_vgg, scores.lpips_vgg_01)
     return figures
 
 
@@ -231,13 +225,11 @@ def _reference_exposure_metrics(neutral: _ImagePair | None) -> dict[str, float |
     """What the picture in neutral colours comes to; None where that is the picture which is measured anyway."""
     if neutral is None:
         return dict.fromkeys(REFERENCE_EXPOSURE_KEYS)
-    return _metrics_without_lpips(neutral, _maps(neutral, "_neutral"), "_neutral")
+    return _metrics_without_lpips(neutral, _maps(neutral, "_reference_exposure"), "_reference_exposure")
 
 
 def _count_visibility(
-    visibility: Float[np.ndarray, "h w"] | None,
-    maps: Mapping[str, np.ndarray],
-    mask: Bool[np.ndarray, "h w"] | None,
+    visibility: Float[np.ndarray, "h w"] | None, maps: Mapping[str, np.ndarray], mask: Bool[np.ndarray, "h w"] | None
 ) -> tuple[VisibilityHistogram | None, float | None]:
     """The pixels pooled by V, and the mean V of what the view sees; None where nothing is known."""
     if visibility is None:

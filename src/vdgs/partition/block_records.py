@@ -53,7 +53,7 @@ class PartitionRecord:
     warnings: tuple[str, ...] = ()
     assignment_warnings: tuple[str, ...] = ()
     blocks: tuple[BlockCamerasRecord, ...] = ()
-    spatial: tuple[BlockRecord, ...] = ()
+    spatial_only_blocks: tuple[BlockRecord, ...] = ()
     """The cut that place alone would give, to compare with."""
     seconds: float | None = None
     peak_memory_bytes: int | None = None

@@ -42,7 +42,7 @@ def block_cores(
     cores: list[shapely.Polygon | None] = [None] * count
     taken = _TakenArea(list(shapes.values()))
     for place, label in sorted(enumerate(shapes), key=lambda each: (shapes[each[1]].area, each[1])):
-        core = _remove_slivers(largest_part(shapes[label].gain_spread(taken.about(place))), cell / 2)
+        core = _remove_slivers(largest_part(shapes[label].difference(taken.about(place))), cell / 2)
         if not core.is_empty:
             cores[label] = core
             taken.take(place, core)

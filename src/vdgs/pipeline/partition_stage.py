@@ -131,7 +131,7 @@ def partition_run(
             key=keys.partition, assignment_key=keys.assignment, strategy=method.partition.strategy,
             lambda_vis=method.partition.lambda_vis if method.partition.strategy == "visibility" else None,
             warnings=tuple(warnings), assignment_warnings=tuple(assignment.warnings), blocks=tuple(rows),
-            spatial=block_rows(spatial, scene.positions, scene.visibility),
+            spatial_only_blocks=block_rows(spatial, scene.positions, scene.visibility),
             seconds=time.monotonic() - began, peak_memory_bytes=peak_memory_bytes(),
         )  # fmt: skip
         write_json(

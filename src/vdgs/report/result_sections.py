@@ -19,23 +19,23 @@ MAX_VIEW_ROWS, MAX_SEAM_IMAGES = 400, 3
 METRICS = (
     ("psnr", "PSNR (dB) ↑", "{:.2f}", "{:+.2f}"),
     ("psnr_cc", "PSNR, colour-corrected (dB) ↑", "{:.2f}", "{:+.2f}"),
-    ("psnr_neutral", "PSNR in neutral colours (dB) ↑", "{:.2f}", "{:+.2f}"),
+    ("psnr_reference_exposure", "PSNR in neutral colours (dB) ↑", "{:.2f}", "{:+.2f}"),
     ("ssim", "SSIM ↑", "{:.4f}", "{:+.4f}"),
     ("ssim_cc", "SSIM, colour-corrected ↑", "{:.4f}", "{:+.4f}"),
-    ("ssim_neutral", "SSIM in neutral colours ↑", "{:.4f}", "{:+.4f}"),
+    ("ssim_reference_exposure", "SSIM in neutral colours ↑", "{:.4f}", "{:+.4f}"),
     ("lpips_vgg", "LPIPS vgg ↓", "{:.4f}", "{:+.4f}"),
     ("lpips_vgg_cc", "LPIPS vgg, colour-corrected ↓", "{:.4f}", "{:+.4f}"),
     ("lpips_vgg_01", "LPIPS vgg, [0, 1] input ↓", "{:.4f}", "{:+.4f}"),
     ("lpips_vgg_01_cc", "LPIPS vgg, [0, 1] input, colour-corrected ↓", "{:.4f}", "{:+.4f}"),
-    ("solid_share", "share of seen pixels that is opaque ↑", "{:.4f}", "{:+.4f}"),
-    ("psnr_seen_own", "PSNR of seen pixels before its own background (dB) ↑", "{:.2f}", "{:+.2f}"),
-    ("psnr_seen_black", "PSNR of seen pixels before black (dB) ↑", "{:.2f}", "{:+.2f}"),
-    ("psnr_seen_white", "PSNR of seen pixels before white (dB) ↑", "{:.2f}", "{:+.2f}"),
+    ("opacity_coverage", "share of seen pixels that is opaque ↑", "{:.4f}", "{:+.4f}"),
+    ("psnr_covered_own_background", "PSNR of seen pixels before its own background (dB) ↑", "{:.2f}", "{:+.2f}"),
+    ("psnr_covered_black", "PSNR of seen pixels before black (dB) ↑", "{:.2f}", "{:+.2f}"),
+    ("psnr_covered_white", "PSNR of seen pixels before white (dB) ↑", "{:.2f}", "{:+.2f}"),
     ("depth_error_median_expected", "median error of expected depth (camera heights) ↓", "{:.4f}", "{:+.4f}"),
     ("depth_error_median_median", "median error of median depth (camera heights) ↓", "{:.4f}", "{:+.4f}"),
     ("depth_within_1_percent_expected", "share with expected depth within 1 % ↑", "{:.4f}", "{:+.4f}"),
     ("depth_within_1_percent_median", "share with median depth within 1 % ↑", "{:.4f}", "{:+.4f}"),
-    ("splats_larger_than_picture", "splats larger than the picture, all test views ↓", "{:,.0f}", "{:+,.0f}"),
+    ("oversized_splats", "splats larger than the picture, all test views ↓", "{:,.0f}", "{:+,.0f}"),
 )
 
 
@@ -140,7 +140,7 @@ def _comparison(source: RunFiles, folder: str, kind: str, row: JsonRecord, coars
 
 def _least_opaque_view(source: RunFiles, folder: str, rows: list[JsonRecord]) -> Html:
     """Alpha of the view with the lowest share of opaque pixels: where ground is half transparent, it is grey."""
-    known = [(solid, row) for row in rows if (solid := row.number("solid_share")) is not None and row.text("alpha")]
+    known = [(solid, row) for row in rows if (solid := row.number("opacity_coverage")) is not None and row.text("alpha")]
     if not known:
         return Html("")
     solid, row = min(known, key=lambda each: each[0])
@@ -166,8 +166,8 @@ def _views_table(rows: list[JsonRecord], other: dict[str | None, JsonRecord]) ->
                 format_db(row.number("psnr_cc")),
                 format_similarity(row.number("ssim")),
                 format_similarity(row.number("lpips_vgg")),
-                format_percent(row.number("solid_share")),
-                count(row.number("largest_splats")),
+                format_percent(row.number("opacity_coverage")),
+                count(row.number("oversized_splats")),
             ]
         )
     head = ["view", "mean V", "PSNR coarse", "PSNR", "Δ", "PSNR cc", "SSIM", "LPIPS vgg", "solid", "large splats"]
@@ -225,7 +225,7 @@ def seams_section(report: ReportedRun) -> Html:
     rows = [_block_row(count(row.number("block")), row) for row in facts.rows("blocks")]
     if rows and facts.child("all"):
         rows.append(_block_row("all", facts.child("all")))
-    head = ["block", "pixels", "PSNR coarse", "PSNR alone", "PSNR merged", "merged − coarse"]
+    head = ["block", "pixels", "PSNR coarse", "PSNR isolated", "PSNR merged", "merged − coarse"]
     parts.append(
         table(
             head,
@@ -240,26 +240,26 @@ def seams_section(report: ReportedRun) -> Html:
 
 
 def _block_row(name: str, row: JsonRecord) -> list[str]:
-    before, alone, after = (row.number(f"psnr_{key}") for key in ("coarse", "alone", "merged"))
+    before, isolated, after = (row.number(f"psnr_{key}") for key in ("coarse", "isolated", "merged"))
     return [
         name,
         count(row.number("pixels")),
         format_db(before),
-        format_db(alone),
+        format_db(isolated),
         format_db(after),
         format_difference(after, before),
     ]
 
 
 def _seam_sentence(seams: JsonRecord) -> str:
-    ratio = seams.number("seam_mae")
+    ratio = seams.number("seam_mae_ratio")
     if ratio is None:
         return ""
     near, pixels = seams.number("border_px"), seams.number("border_pixels")
     return (
         f"Within {format_value(near, '{:g}')} px of a border between blocks ({count(pixels)} pixels), the error relative "
         f"to elsewhere is {ratio:.2f} times what it is in the coarse model, which has no seams (mean absolute error; "
-        f"squared error {format_value(seams.number('seam_mse'), '{:.2f}')}). 1 is no seam; above 1, borders got worse."
+        f"squared error {format_value(seams.number('seam_mse_ratio'), '{:.2f}')}). 1 is no seam; above 1, borders got worse."
     )
 
 

@@ -68,9 +68,9 @@ def blocks_section(report: ReportedRun) -> Html:
                 + " The core belongs to one block; the widened block reaches over its borders."
             )
         )
-    parts += [paragraph(note, "note") for note in facts.texts("warnings") + facts.texts("complaints")]
+    parts += [paragraph(note, "note") for note in facts.texts("warnings") + facts.texts("assignment_warnings")]
     parts.append(figure(source.image("partition/blocks.png"), "The blocks from above.", "map of the blocks", True))
-    parts.append(_blocks_table(rows, facts.rows("spatial")))
+    parts.append(_blocks_table(rows, facts.rows("spatial_only_blocks")))
     parts.append(
         figure(source.image("partition/block_facts.png"), "What each block holds.", "sizes of the blocks", True)
     )
@@ -180,7 +180,7 @@ def ortho_section(report: ReportedRun) -> Html:
     parts: list[Html] = []
     if not facts:
         parts.append(paragraph("No maps were made of this run. `vdgs ortho RUN` makes them."))
-    elif facts.text("model_identity") != report.run.merged.status().model_id:
+    elif facts.text("model_digest") != report.run.merged.status().model_id:
         parts.append(
             paragraph("The maps are of another model than the run has now; `vdgs ortho RUN` draws them anew.", "note")
         )

@@ -48,8 +48,8 @@ def status_json(run: RunFolder) -> RunStatusDocument:
     """The same for programs."""
     standing = full_run_status(run)
     return {
-        "run": str(run.path), "whole": standing.is_complete, "at_work": standing.is_running,
-        "next": standing.next_command() or None, "stages": [_stage_json(stage) for stage in standing.stages],
+        "run": str(run.path), "complete": standing.is_complete, "running": standing.is_running,
+        "next_command": standing.next_command() or None, "stages": [_stage_json(stage) for stage in standing.stages],
     }  # fmt: skip
 
 
@@ -86,6 +86,6 @@ def progress_text(status: StatusRecord | None) -> str:
 def _stage_json(stage: StageStatus) -> StageStatusDocument:
     status = stage.status or StatusRecord()
     return {
-        "stage": stage.name, "state": stage.state, "why": stage.reason or None, "folder": stage.folder,
+        "stage": stage.name, "state": stage.state, "reason": stage.reason or None, "folder": stage.folder,
         "iteration": status.iteration, "iterations": status.iterations, "seconds_left": status.seconds_left,
     }  # fmt: skip

@@ -40,7 +40,7 @@ SECTION_LINKS = (
     ("costs", "time and memory"), ("settings", "settings"),
 )  # fmt: skip
 #: Name of the line of the page that says which standing of the run it shows, and where it is to be found at the latest.
-STATUS_META_NAME, MAX_HEAD_CHARS = "vdgs-standing", 2000
+STATUS_META_NAME, MAX_HEAD_CHARS = "vdgs-status", 2000
 
 
 def write_report(run: RunFolder) -> Path:

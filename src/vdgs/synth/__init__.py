@@ -18,9 +18,7 @@ __all__ = ["SynthOptions", "generate"]
 
 
 def generate(
-    output: Path,
-    options: SynthOptions | None = None,
-    on_progress: Callable[[str, int, int], None] | None = None,
+    output: Path, options: SynthOptions | None = None, on_progress: Callable[[str, int, int], None] | None = None
 ) -> FlightStats:
     """Build a town, fly over it and write a COLMAP capture to `output` (which must not hold anything yet).
 

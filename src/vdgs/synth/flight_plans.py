@@ -52,7 +52,7 @@ def _down(place: np.ndarray, heading: np.ndarray) -> FlightPlan:
 
 def _joined(parts: list[FlightPlan]) -> FlightPlan:
     """One mission after the other."""
-    names = ("place", "tilt", "heading", "climb")
+    names = ("position_xy", "tilt", "heading", "altitude_factor")
     return FlightPlan(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 

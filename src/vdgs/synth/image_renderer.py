@@ -31,12 +31,7 @@ def pixel_rays(camera: Camera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarr
     """Origins and unit directions [n, 3] float32 of the rays through image places [n, 2] (pixels)."""
     rotation = camera.camera_from_world[:3, :3]
     local = np.stack(
-        [
-            (pixels[:, 0] - camera.cx) / camera.fx,
-            (pixels[:, 1] - camera.cy) / camera.fy,
-            np.ones(len(pixels)),
-        ],
-        1,
+        [(pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy, np.ones(len(pixels))], 1
     )
     directions = local @ rotation
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

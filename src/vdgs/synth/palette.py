@@ -12,18 +12,7 @@ SLATE = [srgb(c) for c in ("#5b6472", "#4c525c", "#6b6a70")]
 OFFICE = [srgb(c) for c in ("#d6cdbd", "#c2a184", "#b5b9bd", "#a85f48", "#dfe0dc", "#cdb68d")]
 FLAT_ROOF = [srgb(c) for c in ("#9a9a96", "#b3ada1", "#7f7c78", "#a9a59b")]
 CAR = [
-    srgb(c)
-    for c in (
-        "#c8281e",
-        "#1f4fa8",
-        "#e8e8e6",
-        "#2b2d31",
-        "#8d949c",
-        "#e3b01c",
-        "#2f7a4d",
-        "#d8dde2",
-        "#66232b",
-    )
+    srgb(c) for c in ("#c8281e", "#1f4fa8", "#e8e8e6", "#2b2d31", "#8d949c", "#e3b01c", "#2f7a4d", "#d8dde2", "#66232b")
 ]
 AWNING = [srgb(c) for c in ("#d6342a", "#1f7fb8", "#e8a51d", "#2f9a57", "#b14ba0")]
 LEAVES = [srgb(c) for c in ("#5f8a34", "#4f7a30", "#6f9a3c", "#7fa046", "#467038")]

@@ -90,12 +90,7 @@ def _ambient(town: Town, sky: SkyMap, surface: Surface, flat: np.ndarray, materi
 
 
 def radiance(
-    town: Town,
-    tracer: RayTracer,
-    sky: SkyMap,
-    origins: np.ndarray,
-    directions: np.ndarray,
-    pixel_angle: float,
+    town: Town, tracer: RayTracer, sky: SkyMap, origins: np.ndarray, directions: np.ndarray, pixel_angle: float
 ) -> tuple[np.ndarray, RayHits]:
     """Linear light that comes along rays [n, 3] float32, [n, 3], and what they met.
 

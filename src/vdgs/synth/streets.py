@@ -54,10 +54,7 @@ class StreetPlan:
         p, q = np.asarray(p, np.float64), np.asarray(q, np.float64)
         u, v = p, q
         for _ in range(12):
-            u, v = (
-                p - self.bend * np.sin(v / 46 + self.phases[0]),
-                q - self.bend * np.sin(u / 46 + self.phases[1]),
-            )
+            u, v = (p - self.bend * np.sin(v / 46 + self.phases[0]), q - self.bend * np.sin(u / 46 + self.phases[1]))
         cos, sin = np.cos(self.angle), np.sin(self.angle)
         return cos * u - sin * v, sin * u + cos * v
 

@@ -67,11 +67,7 @@ def sample_seed_points(
 
 
 def _recognized_views(
-    cameras: list[Camera],
-    places: np.ndarray,
-    home: np.ndarray,
-    visible: np.ndarray,
-    rng: np.random.Generator,
+    cameras: list[Camera], places: np.ndarray, home: np.ndarray, visible: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
     """In which of the pictures that see it a place is also recognised: the likelier, the nearer to the
     direction of the picture it was found in (`home`), [n, cameras] bool."""

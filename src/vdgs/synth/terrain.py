@@ -98,11 +98,6 @@ def _add_water(builder: MeshBuilder, pond: Pond) -> None:
     """A flat sheet at the pond's level; the ground around it hides its rim."""
     angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     ring = np.stack(
-        [
-            pond.x + 1.4 * pond.rx * np.cos(angle),
-            pond.y + 1.4 * pond.ry * np.sin(angle),
-            np.full(24, pond.level),
-        ],
-        1,
+        [pond.x + 1.4 * pond.rx * np.cos(angle), pond.y + 1.4 * pond.ry * np.sin(angle), np.full(24, pond.level)], 1
     )
     builder.polygon(ring, Material.WATER, np.array([0.05, 0.13, 0.15]))

@@ -138,10 +138,7 @@ def _blocks(site: Site, grand: bool) -> np.ndarray:
 def _traffic(site: Site) -> None:
     """Cars that drive on the right and cars parked at the kerb, street trees and lamps on the pavements."""
     plan = site.plan
-    for streets, halves, others, along_q in (
-        (plan.p, plan.p_half, plan.q, True),
-        (plan.q, plan.q_half, plan.p, False),
-    ):
+    for streets, halves, others, along_q in ((plan.p, plan.p_half, plan.q, True), (plan.q, plan.q_half, plan.p, False)):
         for position, half in zip(streets, halves, strict=True):
             for start, end in pairwise(others):
                 _stretch(site, position, half, (start + 13, end - 13), along_q)

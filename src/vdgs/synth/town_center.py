@@ -71,10 +71,7 @@ def park(site: Site, block: Plot) -> None:
     rng, w, d = site.rng, block.width / 2, block.depth / 2
     site.paint_all(block, LandUse.LAWN)
     t = np.linspace(-1, 1, 30)
-    for curve in (
-        [(w * s, 0.45 * d * np.sin(2.4 * s)) for s in t],
-        [(0.4 * w * np.cos(2.2 * s), d * s) for s in t],
-    ):
+    for curve in ([(w * s, 0.45 * d * np.sin(2.4 * s)) for s in t], [(0.4 * w * np.cos(2.2 * s), d * s) for s in t]):
         site.stroke(block, curve, 1.8, LandUse.PATH)
     angle = np.linspace(0, 2 * np.pi, 40)
     site.stroke(block, [(0.2 * w + 5.4 * np.cos(k), 5.4 * np.sin(k)) for k in angle], 1.8, LandUse.PATH)
@@ -90,12 +87,7 @@ def park(site: Site, block: Plot) -> None:
         if any(np.hypot(a - x, b - y) < r for x, y, r in kept):
             continue
         kept.append((a, b, 4.2))
-        tree(
-            site.builder,
-            site.frame(block, a, b),
-            rng,
-            str(rng.choice(["round", "round", "round", "conifer"])),
-        )
+        tree(site.builder, site.frame(block, a, b), rng, str(rng.choice(["round", "round", "round", "conifer"])))
     for b in (-d + 0.5, d - 0.5):
         for a in (-0.55 * w, 0.5 * w):
             hedge(site.builder, site.frame(block, a, b), 0.7 * w, 1.0)

@@ -37,19 +37,19 @@ class CaptureMetadata(TypedDict, total=False):
 
 class EvaluationMetrics(TypedDict, total=False):
     """metrics.json: means over the views; None where there is no such figure. The figures that are not named here have
-    the suffixes of `evaluation.view` (`_cc`, `_affine`, `_neutral`)."""
+    the suffixes of `evaluation.view` (`_cc`, `_affine`, `_reference_exposure`)."""
 
     psnr: float | None
     ssim: float | None
     lpips: float | None
     by_visibility: list[JsonObject] | None
     views_by_visibility: list[JsonObject] | None
-    seen_pixels: int | None
-    solid_share: float | None
-    largest_splats: int | None
-    largest_splats_view: str | None
+    covered_pixels: int | None
+    opacity_coverage: float | None
+    max_oversized_splats: int | None
+    max_oversized_splats_view: str | None
     model: str | None
-    model_identity: str | None
+    model_digest: str | None
     key: str | None
     n_anchors: int | None
     model_bytes: int | None
@@ -84,7 +84,7 @@ class StageStatusDocument(TypedDict):
 
     stage: str
     state: str
-    why: str | None
+    reason: str | None
     folder: str
     iteration: int | None
     iterations: int | None
@@ -95,9 +95,9 @@ class RunStatusDocument(TypedDict):
     """What `vdgs status --json` prints."""
 
     run: str
-    whole: bool
-    at_work: bool
-    next: str | None
+    complete: bool
+    running: bool
+    next_command: str | None
     stages: list[StageStatusDocument]
 
 
@@ -130,7 +130,7 @@ class MapMetadata(TypedDict, total=False):
 
     software: str
     model: str
-    model_identity: str | None
+    model_digest: str | None
     crs: str | None
     crs_name: str
     unit: str

@@ -93,7 +93,7 @@ def assignment_rows(
 TABLE_COLUMNS = (
     ("block", "block", "{}"),
     ("cameras", "cameras", "{:,}"),
-    ("added", "added", "{:,}"),
+    ("extra_cameras", "added", "{:,}"),
     ("anchors_core", "anchors", "{:,}"),
     ("anchors_expanded", "widened", "{:,}"),
     ("mean_v", "mean V", "{:.1f}"),

@@ -19,7 +19,7 @@ from vdgs.system.atomic_files import write_bytes
 
 FILE_FORMAT = "vdgs-scores-1"
 #: The arrays of the file over cameras and blocks, with their types.
-MATRICES = {"scores": np.float32, "held": np.int32, "covered": np.float32, "why": np.int8}
+MATRICES = {"scores": np.float32, "visible_anchors": np.int32, "coverage": np.float32, "reasons": np.int8}
 
 #: What zipfile and numpy raise on damaged bytes has no common base.
 DAMAGED_FILE_ERRORS = (
@@ -43,9 +43,9 @@ def save_scores(path: Path, names: Sequence[str], scores: ScoreMatrix, assignmen
     buffer = io.BytesIO()
     np.savez(
         buffer, format=np.array(FILE_FORMAT), mode=np.array(scores.mode),
-        names=np.array(names, np.str_), complaints=np.array(assignment.warnings, np.str_),
-        scores=scores.scores, held=scores.visible_anchors, covered=scores.coverage, anchors=scores.anchors,
-        beneath=scores.nadir_block, why=assignment.reasons,
+        names=np.array(names, np.str_), warnings=np.array(assignment.warnings, np.str_),
+        scores=scores.scores, visible_anchors=scores.visible_anchors, coverage=scores.coverage, anchors=scores.anchors,
+        nadir_block=scores.nadir_block, reasons=assignment.reasons,
     )  # fmt: skip
     write_bytes(path, buffer.getvalue())
 
@@ -79,10 +79,10 @@ def load_scores(path: Path) -> ScoreFile:
         raise RunError(f"{path}: is not there. Assign the cameras first: vdgs partition RUN") from error
     except DAMAGED_FILE_ERRORS as error:
         raise RunError(f"{path}: is damaged ({error}). Assign the cameras again: vdgs partition RUN") from error
-    scored = {name: arrays[name] for name in ("scores", "held", "covered", "anchors", "beneath")}
+    scored = {name: arrays[name] for name in ("scores", "visible_anchors", "coverage", "anchors", "nadir_block")}
     scores = ScoreMatrix(mode=str(arrays["mode"]), **scored)
-    complaints = [str(line) for line in arrays["complaints"]]
-    assignment = Assignment(arrays["why"] != 0, arrays["why"], complaints)
+    warnings = [str(line) for line in arrays["warnings"]]
+    assignment = Assignment(arrays["reasons"] != 0, arrays["reasons"], warnings)
     return ScoreFile([str(name) for name in arrays["names"]], scores, assignment)
 
 
@@ -94,12 +94,12 @@ def _check(arrays: dict[str, np.ndarray]) -> None:
     expected: dict[str, tuple[tuple[int, ...], type]] = {
         name: ((cameras, blocks), kind) for name, kind in MATRICES.items()
     }
-    expected |= {"anchors": ((blocks,), np.int64), "beneath": ((cameras,), np.int64)}
+    expected |= {"anchors": ((blocks,), np.int64), "nadir_block": ((cameras,), np.int64)}
     for name, (shape, kind) in expected.items():
         if arrays[name].shape != shape or arrays[name].dtype != kind:
             raise ValueError(f"{name} is {arrays[name].dtype} {arrays[name].shape}, not {np.dtype(kind)} {shape}")
-    for name in ("names", "complaints", "mode"):
+    for name in ("names", "warnings", "mode"):
         if arrays[name].dtype.kind != "U":
             raise ValueError(f"{name} is not text")
-    if arrays["why"].size and not (arrays["why"].min() >= 0 and arrays["why"].max() < len(REASONS)):
-        raise ValueError("why holds unknown reasons")
+    if arrays["reasons"].size and not (arrays["reasons"].min() >= 0 and arrays["reasons"].max() < len(REASONS)):
+        raise ValueError("reasons holds unknown numbers")

@@ -103,7 +103,10 @@ class CameraScorer:
 
 def concatenate_scores(parts: Sequence[ScoreMatrix]) -> ScoreMatrix:
     """The rows of several parts, one below the other; at least one part, all for the same blocks."""
-    over = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ("scores", "held", "covered")}
+    over = {
+        name: np.concatenate([getattr(part, name) for part in parts])
+        for name in ("scores", "visible_anchors", "coverage")
+    }
     beneath = np.concatenate([part.nadir_block for part in parts])
     return ScoreMatrix(mode=parts[0].mode, **over, anchors=parts[0].anchors, nadir_block=beneath)
 

@@ -38,8 +38,8 @@ class OrthoPlan:
     """Where its files go."""
     run_name: str
     model: str
-    """Which model, in a word; `model_identity` tells it from every other."""
-    model_identity: str | None
+    """Which model, in a word; `model_digest` tells it from every other."""
+    model_digest: str | None
     nadir_camera: NadirCamera
     grid: PixelGrid
     samples: int
@@ -48,7 +48,7 @@ class OrthoPlan:
     """Whether detail is taken from the photographs."""
 
     @staticmethod
-    def of(request: OrthoRequest, run: Path, model: str, model_identity: str | None, capture: Capture) -> OrthoPlan:
+    def of(request: OrthoRequest, run: Path, model: str, model_digest: str | None, capture: Capture) -> OrthoPlan:
         """The map that is asked for of a run folder. Raises VdgsError for a system, pixel size or extent that makes
         none, and for an output among inputs of the capture."""
         folder = output_folder(request, run)
@@ -61,7 +61,7 @@ class OrthoPlan:
         above = NadirCamera.of(capture, placement)
         above.camera(grid.subgrid(0, 0, 1, 1))  # a system that makes no map is refused here
         return OrthoPlan(
-            folder=folder, run_name=run.name, model=model, model_identity=model_identity, nadir_camera=above, grid=grid,
+            folder=folder, run_name=run.name, model=model, model_digest=model_digest, nadir_camera=above, grid=grid,
             samples=samples_per_side(grid.gsd, finest), detail_from_images=request.detail_from_images,
         )  # fmt: skip
 

@@ -129,7 +129,7 @@ def _write(plan: OrthoPlan, tiles: Iterable[OrthoTile], console: Console) -> Map
 
 def is_ortho_current(run: RunFolder) -> bool:
     """Whether RUN/maps shows the merged model that is there."""
-    drawn = read_json_or_empty(run.path / "maps" / METADATA_FILE).get("model_identity")
+    drawn = read_json_or_empty(run.path / "maps" / METADATA_FILE).get("model_digest")
     return drawn is not None and drawn == run.merged.status().model_id
 
 
@@ -237,7 +237,7 @@ def _bands(tile: OrthoTile) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _metadata(plan: OrthoPlan) -> MapMetadata:
     grid, placement, capture = plan.grid, plan.placement, plan.nadir_camera.capture
     return {
-        "software": software_name(), "model": plan.model, "model_identity": plan.model_identity,
+        "software": software_name(), "model": plan.model, "model_digest": plan.model_digest,
         "crs": placement.crs, "crs_name": placement.name,
         "unit": placement.unit, "heights": placement.height_reference, "georeference": capture.ground.description,
         "gsd": grid.gsd, "width": grid.width, "height": grid.height, "bounds": list(grid.bounds),

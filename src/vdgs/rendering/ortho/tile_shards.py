@@ -71,7 +71,7 @@ def _job(plan: OrthoPlan, asked: OrthoRequest) -> ShardedJob:
     """The tiles in shards, and what they depend on."""
     depends_on = [
         plan.model,
-        plan.model_identity,
+        plan.model_digest,
         plan.placement.crs,
         list(astuple(plan.grid)),
         plan.samples,
