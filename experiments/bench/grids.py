@@ -65,7 +65,10 @@ CORRECTED_COLUMNS = (
     TableColumn("SSIM ↑", "ssim_cc", 3),
     TableColumn("LPIPS ↓", "lpips_vgg_cc", 3, -1),
 )
-REFERENCE_EXPOSURE_COLUMNS = TableColumn("PSNR ↑", "psnr_reference_exposure"), TableColumn("SSIM ↑", "ssim_reference_exposure", 3)
+REFERENCE_EXPOSURE_COLUMNS = (
+    TableColumn("PSNR ↑", "psnr_reference_exposure"),
+    TableColumn("SSIM ↑", "ssim_reference_exposure", 3),
+)
 COST_COLUMNS = (
     TableColumn("iterations", "iterations", 0, 0),
     TableColumn("photographs drawn", "photographs", 0, 0),

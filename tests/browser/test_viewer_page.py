@@ -57,7 +57,7 @@ def beside_the_panel(picture: np.ndarray) -> np.ndarray:
 @quiet
 def test_a_browser_shows_the_scene(viewer):
     wait_until(lambda: not viewer.sessions)
-    with open_page(viewer.door.address(), *WINDOW) as page:
+    with open_page(viewer.access.local_url(), *WINDOW) as page:
         wait_until(lambda: viewer.sessions)
         (visitor,) = viewer.sessions.values()
         wait_until(lambda: in_window(visitor))
@@ -83,7 +83,7 @@ def test_a_browser_shows_the_scene(viewer):
 @quiet
 def test_a_browser_shows_every_layer_and_goes_where_buttons_lead(viewer):
     wait_until(lambda: not viewer.sessions)
-    with open_page(viewer.door.address(), *WINDOW) as page:
+    with open_page(viewer.access.local_url(), *WINDOW) as page:
         wait_until(lambda: viewer.sessions)
         (visitor,) = viewer.sessions.values()
         wait_until(lambda: in_window(visitor))
@@ -91,7 +91,7 @@ def test_a_browser_shows_every_layer_and_goes_where_buttons_lead(viewer):
         def painted() -> np.ndarray:
             """What the visitor should see now."""
             camera = in_window(visitor)
-            return beside_the_panel(visitor.submit(lambda: visitor.painter.paint(visitor.shown, camera, camera)))
+            return beside_the_panel(visitor.submit(lambda: visitor.painter.paint(visitor.display, camera, camera)))
 
         def seen() -> np.ndarray:
             return beside_the_panel(page.screenshot())
@@ -99,7 +99,7 @@ def test_a_browser_shows_every_layer_and_goes_where_buttons_lead(viewer):
         shown = {}
         for name in LAYER_LABELS:
             visitor._layer.value = name
-            wait_until(lambda name=name: visitor.shown.layer == LAYER_LABELS[name])
+            wait_until(lambda name=name: visitor.display.layer == LAYER_LABELS[name])
             wait_until(lambda: np.abs(seen() - painted()).mean() < 6)
             shown[name] = seen()
         for one, other in combinations(shown, 2):

@@ -73,7 +73,9 @@ def test_what_is_opaque_everywhere_is_solid_before_any_background(tmp_path: Path
         saved = cv2.imread(str(tmp_path / row["render"]))[..., ::-1]
         assert row["psnr_covered_own_background"] == pytest.approx(psnr(saved[left], taken[left]))
         assert (cv2.imread(str(tmp_path / row["alpha"])) == 255).all()
-    assert result["psnr_covered_own_background"] == pytest.approx(np.mean([row["psnr_covered_own_background"] for row in rows]))
+    assert result["psnr_covered_own_background"] == pytest.approx(
+        np.mean([row["psnr_covered_own_background"] for row in rows])
+    )
 
 
 def test_a_veil_is_not_solid_and_shows_what_is_behind_it(tmp_path: Path):

@@ -154,7 +154,9 @@ def test_methods_that_fit_exposures_are_compared_with_others_in_neutral_colors()
     for result in results[:3]:
         result.figures.update({"psnr": 20.5, "ssim": 0.61})
     for result in results[3:]:
-        result.figures.update({"psnr": 30.0, "ssim": 0.9, "psnr_reference_exposure": 20.25, "ssim_reference_exposure": 0.6})
+        result.figures.update(
+            {"psnr": 30.0, "ssim": 0.9, "psnr_reference_exposure": 20.25, "ssim_reference_exposure": 0.6}
+        )
     (grid,) = [grid for grid in make_result_tables(plan, results) if grid.name == "neutral"]
     text = to_markdown([grid], "T", [])
     assert "| VDGS (full) | <u>20.25 ± 0.00</u> | <u>0.600 ± 0.000</u> |" in text

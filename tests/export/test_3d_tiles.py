@@ -132,7 +132,7 @@ def test_older_tiles_go_when_new_ones_are_there(tmp_path, town):
         notes = registry.write_scene(path, ExportScene.of(some))
     assert any("centre of the Earth" in note for note in notes)
     assert sorted(each.name for each in tmp_path.iterdir()) == ["mine.txt", "tiles-2", "tileset.json"]
-    broken = replace(some, dc=some.dc * float("inf"))
+    broken = replace(some, sh0=some.sh0 * float("inf"))
     with pytest.raises(VdgsError, match="not finite"):
         registry.write_scene(path, ExportScene(chunks=[broken], count=50, degree=1))
     assert sorted(each.name for each in tmp_path.iterdir()) == ["mine.txt", "tiles-2", "tileset.json"]

@@ -62,7 +62,7 @@ def export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
             name="merged",
             status=StatusRecord(),
             key="k",
-            caution="",
+            warning="",
             capture=capture_at(origin),
         )
         monkeypatch.setattr(export_module, "open_run", lambda *_: opened)
@@ -210,7 +210,7 @@ def test_a_frame_and_back_is_where_it_was():
     for crs in ("EPSG:32632", "enu", "local"):
         frame = make_local_frame(ground(PLACE), crs, np.zeros(3))
         back = frame.to_ground(frame.to_local(gaussians))
-        for name in ("means", "log_scales", "rest"):
+        for name in ("means", "log_scales", "shN"):
             assert torch.allclose(getattr(back, name), getattr(gaussians, name), atol=1e-3), (crs, name)
     frame = make_local_frame(ground(PLACE), "enu", np.array([5000.0, -3000.0, 20.0]), max_coordinate=1000.0)
     back = frame.to_ground(frame.to_local(gaussians))

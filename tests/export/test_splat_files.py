@@ -61,7 +61,7 @@ def test_a_ply_keeps_every_bit(tmp_path, degree):
     written = random_gaussians(300, degree)
     assert registry.write_scene(tmp_path / "a.ply", ExportScene.of(written, PLACED)) == ()
     for read in (registry.read_gaussians(tmp_path / "a.ply"), independent(tmp_path / "a.ply")):
-        for name in ("means", "log_scales", "logits", "dc", "rest"):
+        for name in ("means", "log_scales", "opacity_logits", "sh0", "shN"):
             assert torch.equal(getattr(read, name), getattr(written, name)), name
         torch.testing.assert_close(gaussian_covariances(read), gaussian_covariances(written))
 
@@ -280,7 +280,7 @@ def test_numbers_that_are_none_leave_no_file(tmp_path, ending):
     (tmp_path / name).write_text("before")
     broken = random_gaussians(20, 1)
     broken.opacity_logits[13] = float("nan")
-    with pytest.raises(VdgsError, match="Gaussian 13: its logits are not finite"):
+    with pytest.raises(VdgsError, match="Gaussian 13: its opacity logits are not finite"):
         registry.write_scene(tmp_path / name, ExportScene(chunks=iter([broken]), count=20, degree=1))
     assert [each.name for each in tmp_path.iterdir()] == [name]
     assert (tmp_path / name).read_text() == "before"

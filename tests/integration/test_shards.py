@@ -350,7 +350,9 @@ def test_exposed_views_are_the_same_in_shards_and_where_a_file_is_compared(uncut
     assert "in the exposure interpolated from the training photographs" in " ".join(done.stdout.split())
     figures, rows = (json.loads((measured / f"{name}.json").read_text()) for name in ("metrics", "per_view"))
     assert all(row["psnr"] != row["psnr_reference_exposure"] for row in rows)
-    assert figures["psnr_reference_exposure"] == pytest.approx(np.mean([row["psnr_reference_exposure"] for row in rows]))
+    assert figures["psnr_reference_exposure"] == pytest.approx(
+        np.mean([row["psnr_reference_exposure"] for row in rows])
+    )
     one = evaluated(measured)
     assert is_evaluated(RunFolder(run), "coarse", None, 4)
     status = json.loads((measured / "status.json").read_text())

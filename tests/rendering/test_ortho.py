@@ -26,7 +26,7 @@ from vdgs.geometry.map_projection import MapProjection
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.decoder import Decoder
 from vdgs.model.renderer import render
-from vdgs.rendering.ortho import detail_transfer, ortho_folder, render_ortho, tile_renderer
+from vdgs.rendering.ortho import detail_transfer, ortho_plan, render_ortho, tile_renderer
 from vdgs.rendering.ortho.detail_transfer import DetailTransfer
 from vdgs.rendering.ortho.geotiff import GDAL_CACHE_BYTES, limit_gdal_cache
 from vdgs.rendering.ortho.nadir_camera import NadirCamera
@@ -102,7 +102,7 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
     def run(capture: Capture, model: AnchorModel, **asked) -> Path:
         ortho_folder = SimpleNamespace(path=tmp_path / "run")
-        status = SimpleNamespace(model="1-2")
+        status = SimpleNamespace(model_id="1-2")
         opened = SimpleNamespace(folder=ortho_folder, capture=capture, model=model, name="coarse", status=status)
         monkeypatch.setattr(RunContext, "open_model", lambda *_: opened)
         request = OrthoRequest(run=tmp_path / "run", device="cpu", **asked)
@@ -372,10 +372,10 @@ def test_a_map_killed_while_its_files_take_their_places_is_known_as_ours_and_as_
 
     capture, model = house
     with monkeypatch.context() as patch:
-        patch.setattr(ortho_folder.os, "replace", kill)
+        patch.setattr(ortho_plan.os, "replace", kill)
         with pytest.raises(Killed):
             make(capture, model, gsd=0.5)
-    run = SimpleNamespace(path=make.path, merged=SimpleNamespace(status=lambda: SimpleNamespace(model="1-2")))
+    run = SimpleNamespace(path=make.path, merged=SimpleNamespace(status=lambda: SimpleNamespace(model_id="1-2")))
     assert (make.path / "maps" / "dsm.tif").exists()
     assert not render_ortho.is_ortho_current(run)
     make(capture, model, gsd=0.4)
@@ -385,7 +385,7 @@ def test_a_map_killed_while_its_files_take_their_places_is_known_as_ours_and_as_
 def test_a_disk_without_room_is_named_before_anything_is_drawn(house, make, monkeypatch):
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(10, 9, 1))
-    monkeypatch.setattr(tile_renderer.TileRenderer, "tile", lambda *_: pytest.fail("drawn"))
+    monkeypatch.setattr(tile_renderer.TileRenderer, "render_tile", lambda *_: pytest.fail("drawn"))
     with pytest.raises(VdgsError, match=r"0 MB are free\. Give a larger --gsd"):
         make(*house, gsd=0.2)
 
@@ -446,8 +446,8 @@ def photographed(capture: Capture, model: AnchorModel, folder: Path, woven: floa
         places = sharp.unproject(drawn.median_depth.numpy())
         low = (places[..., 2] < 1.0)[..., None]
         image = (drawn.image.numpy() + woven * low * pattern(places)[..., None]).clip(0, 1)
-        Image.fromarray((image * 255 + 0.5).astype(np.uint8)).save(ortho_folder / view.name)
-        views.append(replace(view, camera=sharp, image_path=ortho_folder / view.name))
+        Image.fromarray((image * 255 + 0.5).astype(np.uint8)).save(folder / view.name)
+        views.append(replace(view, camera=sharp, image_path=folder / view.name))
     return replace(capture, views=tuple(views))
 
 
@@ -458,7 +458,7 @@ def test_detail_comes_from_the_photographs_where_they_see_the_place(house, tmp_p
     grid = PixelGrid(-3.0, 5.0, 0.08, 120, 100)
     placement, sharpener = MapProjection.of(capture.ground, "local"), DetailTransfer(model, capture)
     plain = surveyor_of(model, capture, placement).render_tile(grid)
-    sharp = surveyor_of(model, capture, placement, sharpener=sharpener).render_tile(grid)
+    sharp = surveyor_of(model, capture, placement, detail_transfer=sharpener).render_tile(grid)
     sharpener.close()
     np.testing.assert_array_equal(sharp.heights, plain.heights)
     gained = (sharp.colors.astype(float) - plain.colors).mean(axis=-1) / 255
@@ -489,10 +489,8 @@ def misted(capture: Capture, folder: Path) -> Capture:
         sharp = view.camera.resized(320, 240)
         x, y, _ = np.moveaxis(sharp.unproject(np.full((240, 320), sharp.position[2])), -1, 0)
         light = 0.5 + 0.1 * np.sin(2 * np.pi * (x + 0.3 * number) / 4.1) * np.cos(2 * np.pi * y / 5.3)
-        Image.fromarray((light[..., None].repeat(3, axis=2) * 255 + 0.5).astype(np.uint8)).save(
-            ortho_folder / view.name
-        )
-        views.append(replace(view, camera=sharp, image_path=ortho_folder / view.name))
+        Image.fromarray((light[..., None].repeat(3, axis=2) * 255 + 0.5).astype(np.uint8)).save(folder / view.name)
+        views.append(replace(view, camera=sharp, image_path=folder / view.name))
     return replace(capture, views=tuple(views))
 
 
@@ -503,7 +501,7 @@ def test_detail_knows_no_borders_of_tiles(house, tmp_path, monkeypatch, most):
     capture, _ = house
     capture, model = misted(capture, tmp_path), gray(GROUND)
     sharpener = DetailTransfer(model, capture)
-    surveyor = surveyor_of(model, capture, MapProjection.of(capture.ground, "local"), sharpener=sharpener)
+    surveyor = surveyor_of(model, capture, MapProjection.of(capture.ground, "local"), detail_transfer=sharpener)
     grid = PixelGrid(-8.0, 4.0, 0.08, 200, 100)
     whole = surveyor.render_tile(grid).colors
     joined = np.zeros_like(whole)

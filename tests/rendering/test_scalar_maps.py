@@ -13,9 +13,16 @@ from matplotlib.colors import to_rgb
 from vdgs.config.commands import RenderRequest
 from vdgs.errors import VdgsError
 from vdgs.plots.style import VISIBILITY_CMAP
-from vdgs.rendering import colorbar, render_folder
+from vdgs.rendering import render_folder
 from vdgs.rendering.render_run import _check
-from vdgs.rendering.scalar_maps import NO_DATA_COLOR, alpha_scale, depth_range, depth_scale, visibility_scale
+from vdgs.rendering.scalar_maps import (
+    NO_DATA_COLOR,
+    add_colorbar,
+    alpha_scale,
+    depth_range,
+    depth_scale,
+    visibility_scale,
+)
 
 SCALES = {
     "depth": depth_scale((31.7, 48.2), "m"),
@@ -131,7 +138,7 @@ def test_v_has_the_colors_of_all_other_figures_and_whole_steps() -> None:
 def test_legends_fit_below_every_picture(name: str, size: tuple[int, int]) -> None:
     scale, (height, width) = SCALES[name], size
     picture = np.full((height, width, 3), 7, np.uint8)
-    whole = colorbar.add_colorbar(picture, scale)
+    whole = add_colorbar(picture, scale)
     assert whole.shape[1] == width
     assert whole.shape[0] % 2 == 0
     np.testing.assert_array_equal(whole[:height], picture)

@@ -59,7 +59,7 @@ def test_the_report_says_what_is_there(capture, tmp_path):
     assert not report.metric
     stored = json.loads((tmp_path / "out" / "report.json").read_text(encoding="utf-8"))
     assert stored["points"] == report.points
-    assert stored["share_below"]["3"] == report.fraction_below[3]
+    assert stored["fraction_below"]["3"] == report.fraction_below[3]
     for name in report.figures:
         pixels = cv2.imread(str(tmp_path / "out" / name))
         assert pixels.shape[1] > 900

@@ -16,8 +16,8 @@ from vdgs.errors import RunError
 from vdgs.report import write_report
 from vdgs.report.charts import running_median
 from vdgs.report.embedded_images import MAX_BYTES, reduce_image
-from vdgs.report.formatting import format_difference
 from vdgs.report.html_page import escape_html
+from vdgs.report.run_reader import format_difference
 from vdgs.runs.run_folder import RunFolder
 
 pytestmark = pytest.mark.xdist_group("report")
@@ -133,7 +133,7 @@ def whole_run(root: Path, name: str = "meadow", noise: bool = False) -> RunFolde
             "mean": 4.5,
             "gini": 0.25,
             "quantiles": {"5": 1, "50": 4},
-            "share_below": {"3": 0.125},
+            "fraction_below": {"3": 0.125},
         },
     )
     rows = [
@@ -243,7 +243,11 @@ def test_the_least_solid_view_is_shown_and_solidity_compared(tmp_path):
     write(tmp_path / "evaluation/metrics.json", known)
     rows = views(28.0)
     for row, share in zip(rows, (0.9, 0.25, 0.8), strict=True):
-        row |= {"opacity_coverage": share, "alpha": str(row["render"]).replace("renders", "alpha"), "oversized_splats": 4}
+        row |= {
+            "opacity_coverage": share,
+            "alpha": str(row["render"]).replace("renders", "alpha"),
+            "oversized_splats": 4,
+        }
         picture(tmp_path / "evaluation" / str(row["alpha"]))
     write(tmp_path / "evaluation/per_view.json", rows)
     page = Page(write_report(run))

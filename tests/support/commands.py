@@ -1,7 +1,7 @@
 """Commands of vdgs as processes of their own: real ones, to be signalled and killed, without the seconds of importing.
 
     done = vdgs("merge", run)                      # waits; done.returncode, done.stdout, done.stderr
-    with begun("coarse", capture, "--output", run, pause_at=("*/00000040.json", 1)) as command:
+    with begun("train-coarse", capture, "--output", run, pause_at=("*/00000040.json", 1)) as command:
         command.wait_until_paused()
         command.send_signal(signal.SIGKILL)
 

@@ -37,14 +37,14 @@ def vdgs(*arguments: object) -> None:
 
 
 def train_coarse(capture: Path, run: Path, *device: str) -> None:
-    vdgs("coarse", capture, "--output", run, "--up", "z", *SETTINGS, *device)
+    vdgs("train-coarse", capture, "--output", run, "--up", "z", *SETTINGS, *device)
 
 
 def after_the_coarse_stage(run: Path, *device: str) -> None:
     vdgs("visibility", run)
     vdgs("partition", run, *CUT)
     for block in (0, 1):
-        vdgs("train", run, "--block", block, *BLOCK, *device)
+        vdgs("train-blocks", run, "--block", block, *BLOCK, *device)
     vdgs("merge", run)
     vdgs("eval", run, "--model", "coarse", *device)
     vdgs("eval", run, "--model", "merged", *device)

@@ -45,7 +45,7 @@ def trained(folder: Path) -> Path:
     """A run of a textured plane whose coarse stage is done."""
     write_colmap(folder / "capture", tiny_scene())
     done = vdgs(
-        "coarse", folder / "capture", "--output", folder / "run", "--preset", "laptop", "--iterations", "60",
+        "train-coarse", folder / "capture", "--output", folder / "run", "--preset", "laptop", "--iterations", "60",
         "--save-every", "20", "--up", "z",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

@@ -10,6 +10,7 @@ import pytest
 from support.captures import camera_at
 from vdgs.geometry.camera import Camera
 from vdgs.viewer.layers import DisplayOptions
+from vdgs.viewer.navigation import limit_resolution
 from vdgs.viewer.render_scheduler import (
     ANCHORS_PER_TURN,
     MIN_PREVIEW_PIXELS,
@@ -17,7 +18,6 @@ from vdgs.viewer.render_scheduler import (
     ROUND_SECONDS,
     RenderedFrame,
     RenderScheduler,
-    limit_pixels,
 )
 
 
@@ -34,18 +34,20 @@ class Slow:
     """A painter that takes so long for each pixel."""
 
     def __init__(self, clock: Clock, per_px: float = 0.0) -> None:
-        self.clock, self.per_px, self.settled, self.drawn = clock, per_px, 0, 0
+        self.clock, self.per_px, self.settled, self.drawn_anchors = clock, per_px, 0, 0
 
-    def key(self, shown: DisplayOptions) -> object:
+    def cache_key(self, display: DisplayOptions) -> object:
         return id(self)
 
-    def in_view(self, shown: DisplayOptions, camera: Camera) -> int:
+    def count_visible_anchors(self, display: DisplayOptions, camera: Camera) -> int:
         return 0
 
-    def settle(self, shown: DisplayOptions, whole: Camera) -> None:
+    def update_depth_range(self, display: DisplayOptions, full_camera: Camera) -> None:
         self.settled += 1
 
-    def paint(self, shown: DisplayOptions, camera: Camera, whole: Camera, most: int | None = None) -> np.ndarray:
+    def paint(
+        self, display: DisplayOptions, camera: Camera, full_camera: Camera, max_anchors: int | None = None
+    ) -> np.ndarray:
         self.clock.now += self.per_px * camera.width * camera.height
         return np.zeros((camera.height, camera.width, 3), np.uint8)
 
@@ -90,7 +92,7 @@ def test_a_camera_that_moves_on_leaves_nothing_to_be_finished(studio):
         clock.now += REST_SECONDS
         studio.step()
     count = len(frames)
-    assert seat.work is not None
+    assert seat.job is not None
     studio.request_frame(seat, camera_at(9, 0, width=1280), DisplayOptions())
     studio.step()
     assert not frames[-1].is_full
@@ -114,7 +116,7 @@ def test_quick_pictures_are_as_large_as_time_allows(studio):
             studio.step()
         height, width = frames[-1].image.shape[:2]
         assert least <= width * height <= most
-        studio.leave(seat)
+        studio.remove_session(seat)
 
 
 class Decoding(Slow):
@@ -124,11 +126,15 @@ class Decoding(Slow):
         super().__init__(clock)
         self.per_anchor, self.times = per_anchor, [1, 5, 15, 45]
 
-    def paint(self, shown: DisplayOptions, camera: Camera, whole: Camera, most: int | None = None) -> np.ndarray:
+    def paint(
+        self, display: DisplayOptions, camera: Camera, full_camera: Camera, max_anchors: int | None = None
+    ) -> np.ndarray:
         counts = [100_000 // times for times in self.times]
-        self.drawn = counts[0] if most is None else next((c for c in counts if c <= most), counts[-1])
-        self.clock.now += self.per_anchor * self.drawn
-        return super().paint(shown, camera, whole, most)
+        self.drawn_anchors = (
+            counts[0] if max_anchors is None else next((c for c in counts if c <= max_anchors), counts[-1])
+        )
+        self.clock.now += self.per_anchor * self.drawn_anchors
+        return super().paint(display, camera, full_camera, max_anchors)
 
 
 @pytest.mark.parametrize(("moving", "drawn"), [(1, 20_000), (2, 20_000), (8, 6_666)])
@@ -143,7 +149,7 @@ def test_a_round_of_all_who_move_stays_short(studio, moving, drawn):
         for _ in seats:
             assert studio.step() == 0
         taken = clock.now - began
-    assert [painter.drawn for painter in painters] == [drawn] * moving
+    assert [painter.drawn_anchors for painter in painters] == [drawn] * moving
     assert taken <= ROUND_SECONDS * 1.05
 
 
@@ -154,14 +160,14 @@ def test_who_is_alone_on_a_fast_machine_sees_the_model_itself_while_moving(studi
     for x in range(3):
         studio.request_frame(seat, camera_at(x, 0, width=1280), DisplayOptions())
         studio.step()
-    assert painter.drawn == 100_000
+    assert painter.drawn_anchors == 100_000
 
 
 def test_two_who_rest_at_the_same_place_share_a_picture(studio):
     studio, clock = studio
 
     class Alike(Slow):
-        def key(self, shown: DisplayOptions) -> object:
+        def cache_key(self, display: DisplayOptions) -> object:
             return "one scene"
 
     one, other, elsewhere = (sit(studio, Alike(clock, 1e-7)) for _ in range(3))
@@ -181,7 +187,7 @@ def test_two_who_rest_at_the_same_place_share_a_picture(studio):
 def test_a_full_picture_of_much_is_drawn_in_parts(studio):
     studio, clock = studio
     painter = Slow(clock)
-    painter.in_view = lambda shown, camera: 5 * ANCHORS_PER_TURN  # type: ignore[method-assign]
+    painter.count_visible_anchors = lambda display, camera: 5 * ANCHORS_PER_TURN  # type: ignore[method-assign]
     seat, frames, _ = sit(studio, painter)
     studio.request_frame(seat, camera_at(0, 0, width=1280), DisplayOptions())
     studio.step()
@@ -219,7 +225,7 @@ def test_who_left_is_drawn_for_no_more(studio):
     studio, clock = studio
     seat, frames, _ = sit(studio, Slow(clock))
     studio.request_frame(seat, camera_at(0, 0), DisplayOptions())
-    studio.leave(seat)
+    studio.remove_session(seat)
     assert studio.step() is None
     assert not frames
 
@@ -228,7 +234,7 @@ def test_one_visitors_trouble_is_theirs_alone(studio):
     studio, clock = studio
 
     class Broken(Slow):
-        def paint(self, shown, camera, whole, most=None):
+        def paint(self, display, camera, full_camera, max_anchors=None):
             raise RuntimeError("no picture")
 
     broken, _, errors = sit(studio, Broken(clock))
@@ -260,7 +266,7 @@ def test_a_small_canvas_is_drawn_once(studio):
     studio, clock = studio
     seat, frames, _ = sit(studio, Slow(clock))
     camera = camera_at(0, 0, width=160)
-    assert limit_pixels(camera, 1e6) is camera
+    assert limit_resolution(camera, 1e6) is camera
     studio.request_frame(seat, camera, DisplayOptions())
     studio.step()
     clock.now += REST_SECONDS

@@ -57,7 +57,7 @@ def viewer(run):
 
 @pytest.fixture
 def guest(viewer):
-    guest = Guest(viewer.door.address())
+    guest = Guest(viewer.access.local_url())
     yield guest
     guest.close()
 
@@ -121,11 +121,11 @@ def test_a_double_click_turns_about_the_place(viewer, guest):
     assert visitor.camera.position == pytest.approx(camera.position)
     guest.click(x / 640, y / 480)
     guest.click(x / 640, y / 480)
-    wait_until(lambda: np.linalg.norm(visitor.stand.look_at[:2] - [0.8, -0.6]) < 0.15)
+    wait_until(lambda: np.linalg.norm(visitor.pose.look_at[:2] - [0.8, -0.6]) < 0.15)
     assert visitor.camera.position == pytest.approx(camera.position, abs=1e-6)
 
     def in_the_middle() -> bool:
-        seen, _ = visitor.camera.project(visitor.stand.look_at[None])
+        seen, _ = visitor.camera.project(visitor.pose.look_at[None])
         return bool(np.abs(seen[0] - (320.0, 240.0)).max() < 0.5)
 
     wait_until(in_the_middle)  # the browser says where it looks once it has been led there
@@ -156,7 +156,7 @@ def test_a_path_is_set_and_saved(viewer, guest, tmp_path):
 @quiet
 def test_visitors_that_vanish_are_forgotten(viewer):
     wait_until(lambda: not viewer.sessions)
-    guests = [Guest(viewer.door.address()) for _ in range(4)]
+    guests = [Guest(viewer.access.local_url()) for _ in range(4)]
     for number, guest in enumerate(guests):
         guest.stand(above(0.1 * number))
     wait_until(lambda: len(viewer.sessions) == 4)
@@ -168,7 +168,7 @@ def test_visitors_that_vanish_are_forgotten(viewer):
     guests[3].assert_sees(expected(viewer, camera))
     guests[3].close()
     wait_until(lambda: not viewer.sessions)
-    assert not viewer.scheduler._seats
+    assert not viewer.scheduler._sessions
 
 
 @quiet
@@ -182,14 +182,14 @@ def test_many_visits_leave_nothing_behind(viewer):
 
     wait_until(lambda: not viewer.sessions)
     for number in range(6):
-        guest = Guest(viewer.door.address())
+        guest = Guest(viewer.access.local_url())
         guest.stand(above(0.1 * number))
         guest.full_picture(above(0.1 * number))
         guest.choose("Layer", "Depth")
         (guest.vanish if number % 2 else guest.close)()
     wait_until(lambda: not viewer.sessions)
     wait_until(lambda: not any(there().values()))
-    assert len(viewer.scheduler._full_pictures) <= MAX_CACHED_IMAGES
+    assert len(viewer.scheduler._full_images) <= MAX_CACHED_IMAGES
 
 
 @quiet
@@ -200,15 +200,15 @@ def test_a_photograph_lies_over_the_model_until_one_leaves(viewer, guest):
     (visitor,) = viewer.sessions.values()
     taken = viewer.scene.capture.views[0].camera
     visitor.view_image(0)
-    assert visitor.shown.photograph == 0
+    assert visitor.display.image_index == 0
     guest.stand(above(0.2))  # was on its way when the browser was told to go
     wait_until(lambda: visitor.camera.position[0] == pytest.approx(0.2))
-    assert visitor.shown.photograph == 0
+    assert visitor.display.image_index == 0
     guest.stand(taken)
     wait_until(lambda: np.allclose(visitor.camera.position, taken.position))
-    guest.assert_sees(visitor.painter.paint(visitor.shown, visitor.camera, visitor.camera))
+    guest.assert_sees(visitor.painter.paint(visitor.display, visitor.camera, visitor.camera))
     guest.stand(above(0.3))
-    wait_until(lambda: visitor.shown.photograph is None)
+    wait_until(lambda: visitor.display.image_index is None)
 
 
 # ------------------------------------------------------------------------------------- the door
@@ -225,7 +225,7 @@ def ask(address: str, path: str = "/", **headers: str) -> tuple[int, bytes, str]
 
 @quiet
 def test_nothing_of_the_machine_is_reached(viewer):
-    address = viewer.door.address()
+    address = viewer.access.local_url()
     assert ask(address)[0] == 200
     for path in (
         "/../../../../etc/passwd",
@@ -294,7 +294,7 @@ def test_a_proxy_that_keeps_its_own_name_is_named(run):
 @quiet
 def test_a_canvas_that_is_too_large_is_drawn_smaller(viewer, monkeypatch):
     monkeypatch.setattr(navigation, "MAX_CANVAS_PIXELS", 320 * 240)
-    guest = Guest(viewer.door.address())
+    guest = Guest(viewer.access.local_url())
     guest.stand(above(width=200_000, height=150_000))
     guest.assert_sees(expected(viewer, above()))
     guest.close()
@@ -369,11 +369,11 @@ def test_a_run_that_trains_is_shown_as_it_was_saved_last(run, viewer, guest, tmp
     camera = above()
     guest.stand(camera)
     guest.full_picture(camera)
-    viewer.tell(run_status_markdown(RunFolder(run)))
+    viewer.set_progress(run_status_markdown(RunFolder(run)))
     shown = viewer.scene.run
-    viewer.show(last)
+    viewer.replace_run(last)
     guest.assert_sees(expected(viewer, camera))
-    viewer.show(shown)
+    viewer.replace_run(shown)
     for _ in guest.messages():  # words and pictures take turns
         if "**coarse** done" in guest.text():
             break
@@ -387,7 +387,7 @@ def test_blocks_that_train_are_shown_with_what_they_have(run, tmp_path):
         done = vdgs(*command)
         assert done.returncode == 0, done.stderr
     assert open_run_or_checkpoint(cut).name == "coarse"
-    done = vdgs("train", cut, "--block", "1", "--block.iterations", "20", "--save-every", "10")
+    done = vdgs("train-blocks", cut, "--block", "1", "--block.iterations", "20", "--save-every", "10")
     assert done.returncode == 0, done.stderr
     folder = cut / "blocks/01"
     status = json.loads((folder / "status.json").read_text())

@@ -85,7 +85,7 @@ def photographed(folder: Path, model: AnchorModel, change: Callable[[int, np.nda
         name="merged",
         status=StatusRecord(),
         key="key",
-        caution="",
+        warning="",
         capture=capture,
     )
     coarse = replace(run, model=opaque_plane(), name="coarse")

@@ -21,7 +21,7 @@ class ExportArguments(ExportRequest):
 
     run: Positional[Path]
     """Run folder."""
-    to: Annotated[tuple[Path, ...], UseAppendAction] = ()
+    output: Annotated[tuple[Path, ...], UseAppendAction] = ()
     """A file to write, by its ending: .ply (3DGS), .compressed.ply (PlayCanvas), .spz, .splat, .sog, .glb (glTF),
     FOLDER/tileset.json (3D Tiles), .points.ply, .laz, .las (point clouds), .html (a page that shows the scene offline).
     Give --output again for more: the scene is baked once (docs/export.md)."""
@@ -50,5 +50,5 @@ def export_command(arguments: list[str]) -> None:
     from vdgs.report.write_report import write_report
     from vdgs.runs.run_folder import REPORT_FILE, RunFolder
 
-    if any(path.suffix.lower() == ".html" for path in asked.to) and (asked.run / REPORT_FILE).exists():
+    if any(path.suffix.lower() == ".html" for path in asked.output) and (asked.run / REPORT_FILE).exists():
         write_report(RunFolder(asked.run))  # it leads to the page

@@ -19,7 +19,7 @@ from vdgs.kernels.kernel_types import AdamState
 from vdgs.model.gaussians import Gaussians, render_gaussians
 
 #: Learning rates: half of what trains Gaussians from nothing (3DGS), for these start near the end.
-LEARNING_RATES = {"dc": 1.25e-3, "rest": 6e-5, "logits": 0.025, "log_scales": 2.5e-3, "quaternions": 5e-4}
+LEARNING_RATES = {"sh0": 1.25e-3, "shN": 6e-5, "opacity_logits": 0.025, "log_scales": 2.5e-3, "quaternions": 5e-4}
 
 
 def optimize_gaussians(

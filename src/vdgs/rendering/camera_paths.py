@@ -1,7 +1,4 @@
-"""Camera paths for films: through key frames, around a scene, along a flight. `path_files` reads them.
-
-All in the ground frame (z up).
-"""
+"""Camera paths in the ground frame (z up): through key frames, around a scene, along a flight. See `path_io`."""
 
 from __future__ import annotations
 
@@ -25,14 +22,14 @@ _MAX_TRACK_CAMERAS = 400
 
 @dataclass(frozen=True, eq=False)
 class CameraPath:
-    """The cameras of a film, one a frame, all of one size."""
+    """The cameras of a video, one a frame, all of one size."""
 
     cameras: tuple[Camera, ...]
     fps: float
 
 
 def frame_count(seconds: float, fps: float) -> int:
-    """Frames of a film, at least one. Raises VdgsError for more than can be drawn."""
+    """Frames of a video, at least one. Raises VdgsError for more than can be drawn."""
     if not seconds * fps <= MAX_FRAMES:
         raise VdgsError(
             f"a film of {seconds:g} seconds at {fps:g} frames a second has {seconds * fps:,.0f} frames, more than "
@@ -92,12 +89,10 @@ def orbit(
     axes = np.linalg.svd(offsets, full_matrices=False)[2] if len(offsets) > 1 else np.eye(2)
     reach = np.quantile(np.abs(offsets @ axes.T), 0.9, axis=0)
     radii = np.maximum(2.0 / 3.0 * reach, 0.25 * height)
-    frames = []
-    for angle in np.linspace(0.0, 2.0 * np.pi, frame_count(seconds, fps), endpoint=False):
-        level = (radii * [np.cos(angle), np.sin(angle)]) @ axes
-        pose = look_at_pose(center + np.append(level, height), center)
-        frames.append(replace(template, camera_from_world=pose))
-    return CameraPath(tuple(frames), fps)
+    angles = np.linspace(0.0, 2.0 * np.pi, frame_count(seconds, fps), endpoint=False)
+    offsets = ((radii * [np.cos(angle), np.sin(angle)]) @ axes for angle in angles)
+    poses = (look_at_pose(center + np.append(offset, height), center) for offset in offsets)
+    return CameraPath(tuple(replace(template, camera_from_world=pose) for pose in poses), fps)
 
 
 def flyover(
@@ -145,24 +140,22 @@ def look_at_pose(position: np.ndarray, target: np.ndarray, up: Sequence[float] |
     forward = np.asarray(target, dtype=np.float64) - position
     length = np.linalg.norm(forward)
     if length <= 1e-12:
-        raise ValueError("`position` and `look_at_pose` are the same point")
+        raise ValueError("`position` and `look_at` are the same point")
     forward = forward / length
     right = np.cross(forward, np.asarray(up, dtype=np.float64))
     if np.linalg.norm(right) < 1e-6:
         right = np.cross(forward, [0.0, 1.0, 0.0] if abs(forward[1]) < 0.9 else [1.0, 0.0, 0.0])
     right /= np.linalg.norm(right)
-    return pose_from_rotation(
-        np.stack([right, np.cross(forward, right), forward]), np.asarray(position, dtype=np.float64)
-    )
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return pose_from_rotation(rotation, np.asarray(position, dtype=np.float64))
 
 
 def pose_from_rotation(
     rotation: Float[np.ndarray, "3 3"], position: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 4"]:
-    """`camera_from_world` of a camera with this rotation standing at this place."""
+    """`camera_from_world` of a camera with this rotation at this position."""
     matrix = np.eye(4)
-    matrix[:3, :3] = rotation
-    matrix[:3, 3] = -rotation @ position
+    matrix[:3, :3], matrix[:3, 3] = rotation, -rotation @ position
     return matrix
 
 
@@ -179,11 +172,10 @@ def _tangents(
     """Catmull-Rom: the slope between the neighbours; at the ends of an open path, to the one neighbour."""
     if closed:
         before, after = positions[-2] - positions[-1], positions[1] - positions[0]
-        wrapped = np.concatenate([[positions[0] + before], positions, [positions[-1] + after]])
-        span = knots[-1]
-        times = np.concatenate([[knots[-2] - span], knots, [span + knots[1]]])
-        return (wrapped[2:] - wrapped[:-2]) / (times[2:] - times[:-2])[:, None]
-    padded, times = positions[[0, *range(len(positions)), -1]], knots[[0, *range(len(knots)), -1]]
+        padded = np.concatenate([[positions[0] + before], positions, [positions[-1] + after]])
+        times = np.concatenate([[knots[-2] - knots[-1]], knots, [knots[-1] + knots[1]]])
+    else:
+        padded, times = positions[[0, *range(len(positions)), -1]], knots[[0, *range(len(knots)), -1]]
     return (padded[2:] - padded[:-2]) / (times[2:] - times[:-2])[:, None]
 
 

@@ -1,8 +1,8 @@
 """The frame that nerfstudio trains in, and the way back from it.
 
-Before it trains, nerfstudio turns a scene upright, moves it to the middle of its cameras and scales it into a unit box;
-the camera paths of its viewer are in that frame. What it did stands in the folder of the training, outputs/NAME/METHOD/
-DATE/dataparser_transforms.json: `transform`, a rigid motion [3, 4], and `scale`, with
+Before it trains, nerfstudio turns a scene upright, centres it on its cameras and scales it into a unit box; the camera
+paths of its viewer are in that frame. The folder of the training, outputs/NAME/METHOD/DATE, has the transformation in
+dataparser_transforms.json: `transform`, a rigid motion [3, 4], and `scale`, with
 
     x_nerfstudio = scale * (transform @ x_source)
 
@@ -30,10 +30,10 @@ _MIN_SCALE, _MAX_SCALE = 1e-9, 1e9
 
 
 def pose_in_source(camera_from_world: Float[np.ndarray, "4 4"], nerfstudio: Similarity) -> Float[np.ndarray, "4 4"]:
-    """The pose in the source frame of a camera that stands in nerfstudio's."""
-    turned = camera_from_world[:3, :3]
-    position = -turned.T @ camera_from_world[:3, 3]
-    return pose_from_rotation(turned @ nerfstudio.rotation, nerfstudio.apply_inverse(position[None])[0])
+    """The pose in the source frame of a camera in nerfstudio's frame."""
+    rotation = camera_from_world[:3, :3]
+    position = -rotation.T @ camera_from_world[:3, 3]
+    return pose_from_rotation(rotation @ nerfstudio.rotation, nerfstudio.apply_inverse(position[None])[0])
 
 
 def find_nerfstudio_frame(path: Path, capture: Path | None) -> Similarity:
@@ -42,16 +42,15 @@ def find_nerfstudio_frame(path: Path, capture: Path | None) -> Similarity:
 
     Raises VdgsError where there is none, and CaptureError for one that is damaged.
     """
-    beside = path.absolute().parent
-    folders = [beside, beside.parent, *([] if capture is None else [capture])]
-    found = next((folder / TRANSFORMS_FILE for folder in folders if (folder / TRANSFORMS_FILE).is_file()), None)
-    if found is None:
+    folders = [*path.absolute().parents[:2], *([] if capture is None else [capture])]
+    file = next((folder / TRANSFORMS_FILE for folder in folders if (folder / TRANSFORMS_FILE).is_file()), None)
+    if file is None:
         raise VdgsError(_missing_message(path, folders))
-    content = read_capture_json(found)
-    motion = to_rigid(parse_matrix(content.get("transform"), found, "transform"), found, "transform")
-    scale = parse_number(content, "scale", found)
+    content = read_capture_json(file)
+    motion = to_rigid(parse_matrix(content.get("transform"), file, "transform"), file, "transform")
+    scale = parse_number(content, "scale", file)
     if scale is None or not _MIN_SCALE < scale < _MAX_SCALE:
-        raise VdgsError(f"{found}: scale is {scale}; it must be a positive factor. Copy the file again.")
+        raise VdgsError(f"{file}: scale is {scale}; it must be a positive factor. Copy the file again.")
     return Similarity(scale, motion[:3, :3], scale * motion[:3, 3])
 
 

@@ -19,9 +19,9 @@ _WRITER = "vdgs render"
 def begin_render(folder: Path, names: Sequence[str]) -> list[str]:
     """Make a folder ready for files of these names; returns those that an earlier render left in it.
 
-    They stay until `finish_render`. What is listed from here on are both, so that a render that was cut off is known again.
-    Raises VdgsError, before anything is written, for a folder that holds anything but an earlier render; hidden files
-    count for nothing.
+    They stay until `finish_render`. The manifest lists both from here on, so that a render that was cut off is known
+    again. Raises VdgsError, before anything is written, for a folder that holds anything but an earlier render; hidden
+    files count for nothing.
     """
     if folder.exists() and not folder.is_dir():
         raise VdgsError(f"{folder}: is a file. Give a folder for pictures, or a name that ends in .mp4 for a film.")
@@ -34,9 +34,8 @@ def begin_render(folder: Path, names: Sequence[str]) -> list[str]:
             f"{folder}: holds {len(foreign)} files or folders that no render wrote ({shown}). Give a new or an empty "
             f"folder for --output; one that `vdgs render` filled is replaced."
         )
-    write_json(
-        folder / MANIFEST_FILE, {"written_by": _WRITER, "finished": False, "files": sorted(earlier | set(names))}
-    )
+    files = sorted(earlier | set(names))
+    write_json(folder / MANIFEST_FILE, {"written_by": _WRITER, "finished": False, "files": files})
     return sorted(earlier)
 
 

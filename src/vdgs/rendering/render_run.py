@@ -20,10 +20,10 @@ from vdgs.evaluation.image_io import unique_file_stems, write_png
 from vdgs.evaluation.metrics import to_8bit
 from vdgs.geometry.camera import Camera
 from vdgs.model.renderer import render
-from vdgs.rendering import camera_paths, render_folder
-from vdgs.rendering.colorbar import add_colorbar, draw_colorbar
+from vdgs.rendering import camera_paths
 from vdgs.rendering.path_io import load_path
-from vdgs.rendering.scalar_maps import ScalarMap, make_scalar_map
+from vdgs.rendering.render_folder import begin_render, finish_render
+from vdgs.rendering.scalar_maps import ScalarMap, add_colorbar, draw_colorbar, make_scalar_map
 from vdgs.rendering.video import VideoWriter, caution, default_encoder
 from vdgs.runs.open_run import OpenedModel, open_capture, open_model
 from vdgs.runs.run_cameras import RunCameras, load_run_cameras, run_cameras_of_capture
@@ -33,21 +33,43 @@ from vdgs.system.memory.process_memory import available_memory_bytes
 from vdgs.system.stop_signals import check_stop_requested
 from vdgs.system.units import data_size
 
-#: Pace of a film of separate views.
+#: Frames a second of a video of separate views.
 STILLS_FPS = 2.0
 
+#: The name of a frame, its image with the colorbar or without, and the values that it shows.
+_Frame = tuple[str, UInt8[np.ndarray, "_ w 3"], Float[np.ndarray, "h w"] | None]
 
-@dataclass(frozen=True, eq=False)
-class _NamedImage:
-    """One picture, with its legend or without, its name, and the numbers that it shows."""
 
-    name: str
-    picture: UInt8[np.ndarray, "_ w 3"]
-    values: Float[np.ndarray, "h w"] | None
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Render:
+    """What is drawn: the named cameras, of a model of a run."""
+
+    request: RenderRequest
+    run: OpenedModel
+    run_cameras: RunCameras
+    named: list[tuple[str, Camera]]
+    console: Console
+
+    def scalar_map(self) -> ScalarMap | None:
+        """The map that all views are drawn as; None for color images."""
+        mode, cameras = self.request.mode, [camera for _, camera in self.named]
+        return None if mode == "rgb" else make_scalar_map(mode, self.run, self.run_cameras, cameras)
+
+    def frames(self, scalar_map: ScalarMap | None) -> Iterator[_Frame]:
+        """One frame per camera, in order."""
+        no_bar = not self.console.is_terminal
+        for name, camera in track(self.named, "rendering", console=self.console, disable=no_bar):
+            check_stop_requested()
+            if scalar_map is None:
+                yield name, to_8bit(render(self.run.model, camera).image.cpu().numpy()), None
+                continue
+            values = scalar_map.values(camera)
+            image = scalar_map.scale.colorize(values)
+            yield name, add_colorbar(image, scalar_map.scale) if self.request.colorbar else image, values
 
 
 def render_run(request: RenderRequest, console: Console) -> None:
-    """Render what was asked for, on a device that is chosen already (`vdgs.kernels.device_selection`).
+    """Render the views of a request on a device that is chosen already (`vdgs.kernels.device_selection`).
 
     Raises VdgsError for options that do not go together, an unusable path, codec or output, and for an output among the
     capture's inputs or in a folder that holds anything but an earlier render.
@@ -56,21 +78,18 @@ def render_run(request: RenderRequest, console: Console) -> None:
     _check(request)
     check_not_in_capture(request.output)
     run = open_model(RunFolder(request.run), request.model, request.device)
-    flight = _load_cameras(request, run)
-    check_not_among_folders(request.output, flight.root, flight.input_folders)
+    run_cameras = _load_cameras(request, run)
+    check_not_among_folders(request.output, run_cameras.root, run_cameras.input_folders)
     if run.warning:
         console.print(f"[yellow]warning[/] {run.warning}", highlight=False)
-    named, fps = _cameras(request, flight)
+    named, fps = _named_cameras(request, run_cameras)
     if request.width:
         named = [(name, camera.resized(request.width, _height(camera, request.width))) for name, camera in named]
     _check_size(request, [camera for _, camera in named])
-    if request.output.suffix:
-        said = _write_video(request, run, flight, named, fps, console)
-    else:
-        said = _write_images(request, run, flight, named, console)
-    console.print(
-        f"{run.summary}: {said}, drawn in {time.monotonic() - began:.1f} s: {request.output}", highlight=False
-    )
+    job = _Render(request=request, run=run, run_cameras=run_cameras, named=named, console=console)
+    summary = _write_video(job, fps) if request.output.suffix else _write_images(job)
+    seconds = time.monotonic() - began
+    console.print(f"{run.summary}: {summary}, drawn in {seconds:.1f} s: {request.output}", highlight=False)
 
 
 def _check(request: RenderRequest) -> None:
@@ -81,108 +100,86 @@ def _check(request: RenderRequest) -> None:
         raise VdgsError(f"{request.output}: a film holds no numbers. Give a folder for --output, or leave out --raw.")
 
 
-def _write_video(
-    request: RenderRequest,
-    run: OpenedModel,
-    flight: RunCameras,
-    named: list[tuple[str, Camera]],
-    fps: float,
-    console: Console,
-) -> str:
-    """Draw the frames of a film; returns what to say of it."""
-    if request.output.is_dir():
-        raise VdgsError(f"{request.output}: is a folder. Give another name for the film.")
-    sizes = {(camera.width, camera.height) for _, camera in named}
+def _write_video(job: _Render, fps: float) -> str:
+    """Draw the frames of a video; returns a summary."""
+    output, count = job.request.output, len(job.named)
+    if output.is_dir():
+        raise VdgsError(f"{output}: is a folder. Give another name for the film.")
+    sizes = {(camera.width, camera.height) for _, camera in job.named}
     if len(sizes) > 1:
-        raise VdgsError(
-            f"{request.output}: a film needs frames of one size, and these views have {len(sizes)}. Give a folder."
-        )
+        raise VdgsError(f"{output}: a film needs frames of one size, and these views have {len(sizes)}. Give a folder.")
     if (said := caution(default_encoder())) is not None:
-        console.print(f"[yellow]note[/] {said}", highlight=False)
-    with VideoWriter(request.output, fps) as film:
-        drawn = _scalar_map(request, run, flight, named)
-        for frame in _frames(request, run, named, drawn, console):
-            film.write(frame.picture)
-    (width, height), strip = sizes.pop(), ""
-    if drawn is not None and request.colorbar:
-        rows = len(draw_colorbar(drawn.scale, width, height))
-        height, strip = height + rows, f", the lowest {rows} rows of them the legend"
-    return (
-        f"{_frame_count_text(len(named))} of {width // 2 * 2}x{height // 2 * 2} px{strip}, a film of {len(named) / fps:.1f} s "
-        f"at {fps:g} frames a second"
-    )
+        job.console.print(f"[yellow]note[/] {said}", highlight=False)
+    with VideoWriter(output, fps) as video:
+        scalar_map = job.scalar_map()
+        for _, image, _ in job.frames(scalar_map):
+            video.write(image)
+    (width, height), colorbar = sizes.pop(), ""
+    if scalar_map is not None and job.request.colorbar:
+        rows = len(draw_colorbar(scalar_map.scale, width, height))
+        height, colorbar = height + rows, f", the lowest {rows} rows of them the legend"
+    size = f"{width // 2 * 2}x{height // 2 * 2} px{colorbar}"
+    return f"{_frame_count_text(count)} of {size}, a film of {count / fps:.1f} s at {fps:g} frames a second"
 
 
-def _write_images(
-    request: RenderRequest, run: OpenedModel, flight: RunCameras, named: list[tuple[str, Camera]], console: Console
-) -> str:
-    """Draw pictures into a folder; returns what to say of them."""
-    kinds = (".png", ".npy") if request.raw else (".png",)
-    names = [name + kind for name, _ in named for kind in kinds]
-    earlier = render_folder.begin_render(request.output, names)
-    drawn = _scalar_map(request, run, flight, named)
-    for frame in _frames(request, run, named, drawn, console):
-        write_png(request.output / f"{frame.name}.png", frame.picture)
-        if request.raw and frame.values is not None:
-            write_array(request.output / f"{frame.name}.npy", frame.values)
-    render_folder.finish_render(request.output, earlier, names, _metadata(request, run, drawn))
-    sizes = list(dict.fromkeys(f"{camera.width}x{camera.height} px" for _, camera in named))
-    said = f"{_frame_count_text(len(named))} of {sizes[0] if len(sizes) == 1 else f'{len(sizes)} sizes'}"
-    said += ", each with its numbers as .npy" if request.raw else ""
-    return said + (f", in place of {len(earlier)} files of an earlier render" if earlier else "")
+def _write_images(job: _Render) -> str:
+    """Draw images into a folder; returns a summary."""
+    output, raw = job.request.output, job.request.raw
+    names = [name + suffix for name, _ in job.named for suffix in ((".png", ".npy") if raw else (".png",))]
+    earlier = begin_render(output, names)
+    scalar_map = job.scalar_map()
+    for name, image, values in job.frames(scalar_map):
+        write_png(output / f"{name}.png", image)
+        if raw and values is not None:
+            write_array(output / f"{name}.npy", values)
+    finish_render(output, earlier, names, _metadata(job.request, job.run.name, scalar_map))
+    sizes = list(dict.fromkeys(f"{camera.width}x{camera.height} px" for _, camera in job.named))
+    summary = f"{_frame_count_text(len(job.named))} of {sizes[0] if len(sizes) == 1 else f'{len(sizes)} sizes'}"
+    summary += ", each with its numbers as .npy" if raw else ""
+    return summary + (f", in place of {len(earlier)} files of an earlier render" if earlier else "")
 
 
 def _frame_count_text(count: int) -> str:
     return f"{count:,} frame{'' if count == 1 else 's'}"
 
 
-def _scalar_map(
-    request: RenderRequest, run: OpenedModel, flight: RunCameras, named: list[tuple[str, Camera]]
-) -> ScalarMap | None:
-    """The map that all views are drawn as; None for plain pictures."""
-    return (
-        None if request.mode == "rgb" else make_scalar_map(request.mode, run, flight, [camera for _, camera in named])
-    )
-
-
-def _metadata(request: RenderRequest, run: OpenedModel, drawn: ScalarMap | None) -> dict[str, object]:
-    """What render.json says of the pictures beside it."""
-    facts: dict[str, object] = {
-        "run": str(request.run.resolve()), "model": run.name, "kind": request.mode,
-        "views": str(request.path) if request.path is not None else request.views,
-    }  # fmt: skip
-    if drawn is not None:
-        facts |= {"numbers": drawn.description, "colors_between": [drawn.scale.low, drawn.scale.high],
-                  "legend_below": request.colorbar}  # fmt: skip
-    return facts
+def _metadata(request: RenderRequest, model: str, scalar_map: ScalarMap | None) -> dict[str, object]:
+    """What render.json says of the images beside it."""
+    views = request.views if request.path is None else str(request.path)
+    run = str(request.run.resolve())
+    metadata: dict[str, object] = {"run": run, "model": model, "mode": request.mode, "views": views}
+    if scalar_map is not None:
+        limits = [scalar_map.scale.low, scalar_map.scale.high]
+        metadata |= {"numbers": scalar_map.description, "colors_between": limits, "legend_below": request.colorbar}
+    return metadata
 
 
 def _load_cameras(request: RenderRequest, run: OpenedModel) -> RunCameras:
     """The cameras of the run: as it keeps them, else of its capture, which is asked too where it is named."""
-    described = run.model.metadata.capture
-    kept = load_run_cameras(run.folder, described) if request.capture is None else None
-    if kept is not None:
-        return kept
+    expected = run.model.metadata.capture
+    saved = load_run_cameras(run.folder, expected) if request.capture is None else None
+    if saved is not None:
+        return saved
     capture = open_capture(run.folder, request.capture)
-    check_same_capture(run.model_path, described, capture)
+    check_same_capture(run.model_path, expected, capture)
     return run_cameras_of_capture(capture)
 
 
-def _cameras(request: RenderRequest, flight: RunCameras) -> tuple[list[tuple[str, Camera]], float]:
-    """The cameras with their names, and the frames per second for a film of them."""
+def _named_cameras(request: RenderRequest, run_cameras: RunCameras) -> tuple[list[tuple[str, Camera]], float]:
+    """The cameras with their names, and the frames per second for a video of them."""
     if request.path is None and request.views in ("test", "train"):
-        names, cameras = zip(*(flight.test if request.views == "test" else flight.train), strict=True)
-        return list(zip(unique_file_stems(list(names)), cameras, strict=True)), request.fps or STILLS_FPS
-    template = flight.cameras[0]
-    length, rate = request.seconds or camera_paths.DEFAULT_SECONDS, request.fps or camera_paths.DEFAULT_FPS
+        views = run_cameras.test if request.views == "test" else run_cameras.train
+        names = unique_file_stems([name for name, _ in views])
+        return [(name, camera) for name, (_, camera) in zip(names, views, strict=True)], request.fps or STILLS_FPS
+    cameras, ground = run_cameras.cameras, run_cameras.ground
+    seconds, fps = request.seconds or camera_paths.DEFAULT_SECONDS, request.fps or camera_paths.DEFAULT_FPS
     if request.path is not None:
-        path = load_path(
-            request.path, template, flight.ground, request.seconds or None, request.fps or None, flight.root
-        )
+        given = request.seconds or None, request.fps or None
+        path = load_path(request.path, cameras[0], ground, *given, run_cameras.root)
     elif request.views == "orbit":
-        path = camera_paths.orbit(flight.scene_center[None], flight.cameras, template, length, rate)
+        path = camera_paths.orbit(run_cameras.scene_center[None], cameras, cameras[0], seconds, fps)
     else:
-        path = camera_paths.flyover(flight.cameras, template, length, rate)
+        path = camera_paths.flyover(cameras, cameras[0], seconds, fps)
     return [(f"{i:05d}", camera) for i, camera in enumerate(path.cameras)], path.fps
 
 
@@ -191,32 +188,15 @@ def _check_size(request: RenderRequest, cameras: list[Camera]) -> None:
     largest = max(cameras, key=lambda camera: camera.width * camera.height)
     size = f"{largest.width}x{largest.height}"
     where = f"{request.path}: " if request.path is not None and not request.width else ""
-    if max(largest.width, largest.height) > MAX_RENDER_SIDE_PX:
-        raise VdgsError(
-            f"{where}pictures of {size} are too large: at most {MAX_RENDER_SIDE_PX} pixels a side can be drawn. "
-            "Give a smaller --width."
-        )
     need, free = largest.width * largest.height * RENDER_BYTES_PER_PIXEL, available_memory_bytes()
-    if need > free:
-        raise VdgsError(
-            f"{where}a picture of {size} takes about {data_size(need)} to draw, and {data_size(free)} are free. "
-            "Give a smaller --width."
-        )
+    if max(largest.width, largest.height) > MAX_RENDER_SIDE_PX:
+        problem = f"pictures of {size} are too large: at most {MAX_RENDER_SIDE_PX} pixels a side can be drawn"
+    elif need > free:
+        problem = f"a picture of {size} takes about {data_size(need)} to draw, and {data_size(free)} are free"
+    else:
+        return
+    raise VdgsError(f"{where}{problem}. Give a smaller --width.")
 
 
 def _height(camera: Camera, width: int) -> int:
     return max(2, 2 * round(camera.height * width / camera.width / 2))
-
-
-def _frames(
-    request: RenderRequest, run: OpenedModel, named: list[tuple[str, Camera]], drawn: ScalarMap | None, console: Console
-) -> Iterator[_NamedImage]:
-    """One picture per camera, in order."""
-    for name, camera in track(named, "rendering", console=console, disable=not console.is_terminal):
-        check_stop_requested()
-        if drawn is None:
-            yield _NamedImage(name, to_8bit(render(run.model, camera).image.cpu().numpy()), None)
-            continue
-        values = drawn.values(camera)
-        picture = drawn.scale.colorize(values)
-        yield _NamedImage(name, add_colorbar(picture, drawn.scale) if request.colorbar else picture, values)

@@ -1,4 +1,4 @@
-"""What `vdgs render --mode` draws of a model, as numbers and in colours that mean the same in every frame."""
+"""What `vdgs render --mode` draws of a model: values, colours that mean the same in every frame, and the colorbar."""
 
 from __future__ import annotations
 
@@ -11,8 +11,11 @@ import numpy as np
 from jaxtyping import Float, Shaped, UInt8
 from matplotlib.colors import Normalize
 from matplotlib.ticker import MaxNLocator
+from PIL import Image, ImageDraw
 
+from vdgs.evaluation.comparison_images import FAINT, INK, PAPER, load_font
 from vdgs.geometry.camera import Camera
+from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.renderer import render, render_scalar_map
 from vdgs.plots.style import VISIBILITY_CMAP
 from vdgs.plots.visibility_map import visibility_color_norm
@@ -27,6 +30,9 @@ NO_DATA_COLOR = (208, 211, 215)
 #: The range of depths is that of so many views at most, spread over all, drawn so small (longer side): one for the
 #: whole film, found before its first frame.
 _MAX_PREVIEWS, _PREVIEW_PX = 24, 160
+#: Type in pixels: a share of the picture's width between these.
+_MIN_FONT_PX, _MAX_FONT_PX, _FONT_SHARE = 11, 26, 1 / 46
+_NO_DATA_LABEL = "nothing drawn"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -48,9 +54,9 @@ class ColorScale:
     def colorize(self, values: Shaped[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
         """A map in colours, `NO_DATA_COLOR` where it is NaN."""
         known = np.isfinite(values)
-        picture = (self.colormap(np.where(known, values, self.low))[..., :3] * 255 + 0.5).astype(np.uint8)
-        picture[~known] = NO_DATA_COLOR
-        return picture
+        image = (self.colormap(np.where(known, values, self.low))[..., :3] * 255 + 0.5).astype(np.uint8)
+        image[~known] = NO_DATA_COLOR
+        return image
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,38 +72,34 @@ class ScalarMap:
 def make_scalar_map(
     mode: ScalarMapMode, run: OpenedModel, run_cameras: RunCameras, cameras: Sequence[Camera]
 ) -> ScalarMap:
-    """The map of a model to be drawn in all of `cameras`; `flight` is that of its run."""
+    """The map of a model to be drawn in all of `cameras`; `run_cameras` are those of its run."""
     return {"depth": _depth, "visibility": _visibility, "alpha": _alpha}[mode](run, run_cameras, cameras)
 
 
-def _depth(run: OpenedModel, run_cameras: RunCameras, cameras: Sequence[Camera]) -> ScalarMap:
-    def values(camera: Camera) -> Float[np.ndarray, "h w"]:
-        raster = render(run.model, camera, depth=True)
-        assert raster.median_depth is not None
-        depth, alpha = raster.median_depth.cpu().numpy(), raster.alpha.cpu().numpy()
-        return np.where(alpha > 0.5, depth, np.nan).astype(np.float32)
+def render_depth(model: AnchorModel, camera: Camera) -> Float[np.ndarray, "h w"]:
+    """Median depth of a view; NaN where a pixel is at most half opaque."""
+    raster = render(model, camera, depth=True)
+    assert raster.median_depth is not None
+    depth, alpha = raster.median_depth.cpu().numpy(), raster.alpha.cpu().numpy()
+    return np.where(alpha > 0.5, depth, np.nan).astype(np.float32)
 
+
+def _depth(run: OpenedModel, run_cameras: RunCameras, cameras: Sequence[Camera]) -> ScalarMap:
     unit = run_cameras.ground.unit
     meaning = (
         f"Median depth: z along the view, in {unit} of the ground frame, at which a pixel becomes half opaque; NaN "
         "where it never does."
     )
-    span = depth_range(
-        (values(camera.limit_size(_PREVIEW_PX)) for camera in _sample_cameras(cameras)), run_cameras.camera_height
-    )
-    return ScalarMap(values, depth_scale(span, unit), meaning)
-
-
-def _sample_cameras(cameras: Sequence[Camera]) -> list[Camera]:
-    """At most `_MAX_PREVIEWS` of the cameras, evenly, the first and the last among them."""
-    places = np.linspace(0, len(cameras) - 1, min(len(cameras), _MAX_PREVIEWS)).round().astype(int)
-    return [cameras[index] for index in places]
+    sampled = np.linspace(0, len(cameras) - 1, min(len(cameras), _MAX_PREVIEWS)).round().astype(int)
+    previews = (render_depth(run.model, cameras[index].limit_size(_PREVIEW_PX)) for index in sampled)
+    scale = depth_scale(depth_range(previews, run_cameras.camera_height), unit)
+    return ScalarMap(lambda camera: render_depth(run.model, camera), scale, meaning)
 
 
 def depth_range(depths: Iterable[Float[np.ndarray, "_ _"]], fallback: float) -> tuple[float, float]:
     """Least and greatest depth in these maps, without the outermost 1 % of each: no view may fall out of the colours.
 
-    From 0 to twice `otherwise` where nothing is drawn in any.
+    From 0 to twice `fallback` where nothing is drawn in any.
     """
     ends = [np.nanquantile(depth, (0.01, 0.99)) for depth in depths if np.isfinite(depth).any()]
     return (float(np.min(ends)), float(np.max(ends))) if ends else (0.0, 2.0 * fallback)
@@ -108,15 +110,15 @@ def depth_scale(depth_limits: tuple[float, float], unit: str) -> ColorScale:
     low, high = depth_limits
     if high - low <= 1e-3 * abs(high):  # one plane
         low, high = 0.99 * low, 1.01 * high or 1.0
-    numbers = MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high)
-    norm, colors = Normalize(numbers[0], numbers[-1], clip=True), mpl.colormaps["viridis"]
-    words = [f"{number:g}" for number in np.round(numbers, 9)]
-    words[0], words[-1] = f"≤ {words[0]}" if numbers[0] > 0 else words[0], f"≥ {words[-1]}"
+    ticks = np.asarray(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high)).tolist()
+    norm, colors = Normalize(ticks[0], ticks[-1], clip=True), mpl.colormaps["viridis"]
+    labels = [f"{number:g}" for number in np.round(ticks, 9)]
+    labels[0], labels[-1] = f"≤ {labels[0]}" if ticks[0] > 0 else labels[0], f"≥ {labels[-1]}"
     return ColorScale(
         titles=(f"depth along the view ({unit})", f"depth ({unit})", unit),
-        low=float(numbers[0]),
-        high=float(numbers[-1]),
-        ticks=tuple(zip(map(float, numbers), words, strict=True)),
+        low=ticks[0],
+        high=ticks[-1],
+        ticks=tuple(zip(ticks, labels, strict=True)),
         colormap=lambda values: np.asarray(colors(norm(values))),
     )
 
@@ -170,3 +172,55 @@ def alpha_scale() -> ColorScale:
         colormap=lambda values: np.asarray(gray(values)),
         has_nodata=False,
     )
+
+
+def add_colorbar(image: UInt8[np.ndarray, "h w 3"], scale: ColorScale) -> UInt8[np.ndarray, "tall w 3"]:
+    """The picture with the legend of its colours below it; both together have an even number of rows."""
+    return np.concatenate([image, draw_colorbar(scale, image.shape[1], image.shape[0])])
+
+
+def draw_colorbar(scale: ColorScale, width: int, above: int) -> UInt8[np.ndarray, "rows w 3"]:
+    """The strip for a picture of `width` and `above` rows: what is measured, a bar of colours, numbers."""
+    size = int(np.clip(round(width * _FONT_SHARE), _MIN_FONT_PX, _MAX_FONT_PX))
+    margin, bar = size // 2, size
+    top = margin + round(1.35 * size)
+    rows = top + bar + round(1.75 * size)
+    strip = Image.new("RGB", (width, rows + (above + rows) % 2), PAPER)
+    draw = ImageDraw.Draw(strip)
+    _heading(draw, scale, width, margin, size)
+    draw.line((0, 0, width, 0), FAINT)  # alpha is white where all is well
+    left, right = margin, max(width - margin, margin + 1)
+    across = np.linspace(scale.low, scale.high, right - left)
+    strip.paste(Image.fromarray(scale.colorize(np.broadcast_to(across, (bar, right - left)))), (left, top))
+    draw.rectangle((left - 1, top - 1, right, top + bar), outline=FAINT)
+    _numbers(draw, scale, (left, right), top + bar, size)
+    return np.asarray(strip)
+
+
+def _heading(draw: ImageDraw.ImageDraw, scale: ColorScale, width: int, margin: int, size: int) -> None:
+    """What is measured at the left; at the right, where there is room for it, what no colour stands for."""
+    face = load_font(size)
+    room = float(width - 2 * margin)
+    title = next((each for each in scale.titles if face.getlength(each) <= room), "")
+    draw.text((margin, margin), title, INK, face)
+    patch = size + size // 2
+    needed = face.getlength(_NO_DATA_LABEL) + patch
+    if scale.has_nodata and room - face.getlength(title) - 2 * size >= needed:
+        start = round(width - margin - needed)
+        draw.rectangle((start, margin, start + size, margin + size), fill=NO_DATA_COLOR, outline=FAINT)
+        draw.text((start + patch, margin), _NO_DATA_LABEL, INK, face)
+
+
+def _numbers(draw: ImageDraw.ImageDraw, scale: ColorScale, bar: tuple[int, int], top: int, size: int) -> None:
+    """The numbers below the bar, (left, right) in pixels: both ends first, then those that overlap no other."""
+    face, (left, right) = load_font(size), bar
+    taken: list[tuple[float, float]] = []
+    for value, words in (scale.ticks[0], scale.ticks[-1], *scale.ticks[1:-1]):
+        x = left + (value - scale.low) / (scale.high - scale.low) * (right - 1 - left)
+        length = face.getlength(words)
+        start = min(max(x - length / 2, left), right - length)
+        if start < left or any(start < other[1] + size / 2 and other[0] < start + length + size / 2 for other in taken):
+            continue
+        taken.append((start, start + length))
+        draw.line((round(x), top, round(x), top + size // 4), FAINT)
+        draw.text((start, top + size // 3), words, INK, face)

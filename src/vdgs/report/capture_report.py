@@ -88,10 +88,7 @@ def _rows(report: CaptureReport) -> list[tuple[str, str]]:
     low, middle, high = report.camera_height
     rows = [
         ("Photographs", f"{report.num_images} ({report.train} train, {report.test} test), {report.source}"),
-        (
-            "Images",
-            f"{report.images or '.'}/: {sizes}" + (f" and {more} more sizes" if more > 0 else "") + " px",
-        ),
+        ("Images", f"{report.images or '.'}/: {sizes}" + (f" and {more} more sizes" if more > 0 else "") + " px"),
         ("Focal length", f"{report.focal_px:.1f} px ({report.field_of_view_deg:.0f}° across)"),
         ("Sparse points", f"{report.points}, median spacing {format_length(report.point_spacing, unit)}"),
         ("Ground frame", report.ground + ("" if report.metric else " (not metric)")),

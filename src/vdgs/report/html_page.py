@@ -77,7 +77,7 @@ def join_html(parts: Iterable[Html]) -> Html:
 
 
 def paragraph(text: str, css_class: str = "") -> Html:
-    """`kind` is "", facts, verdict, note or absent."""
+    """`css_class` is "", facts, verdict, note or absent. Nothing if there is no text."""
     return Html(f"<p{_class_attribute(css_class)}>{escape_html(text)}</p>") if text else Html("")
 
 
@@ -93,32 +93,28 @@ def heading(text: str) -> Html:
 def table(
     head: Sequence[str], rows: Sequence[Sequence[str]], caption: str = "", wrap_last_column: bool = False
 ) -> Html:
-    """Numbers stand to the right, but in the first column and, if `wordy`, the last. Nothing if there is no row."""
+    """Cells are right-aligned but in the first column and, with `wrap_last_column`, the last. Nothing without rows."""
     if not rows:
         return Html("")
     cells = "".join(f'<th scope="col">{escape_html(cell)}</th>' for cell in head)
     lines = "\n".join("<tr>" + "".join(f"<td>{escape_html(cell)}</td>" for cell in row) + "</tr>" for row in rows)
     # The caption stands outside, so that it does not scroll with a wide table.
+    attribute = _class_attribute("wordy" if wrap_last_column else "")
     return Html(
-        f"{paragraph(caption, 'facts')}\n"
-        f'<div class="scroll"><table{_class_attribute("wordy" if wrap_last_column else "")}>\n<thead><tr>{cells}</tr></thead>\n'
+        f'{paragraph(caption, "facts")}\n<div class="scroll"><table{attribute}>\n<thead><tr>{cells}</tr></thead>\n'
         f"<tbody>\n{lines}\n</tbody></table></div>"
     )
 
 
-def figure(image_data: EmbeddedImage | None, caption: str, alt: str, wide: bool = False, tall: bool = False) -> Html:
-    """A picture that is `wide` is not squeezed to the width of a phone but scrolls; one that is
-    `tall` does not fill a desk.
-
-    Nothing if there is no picture.
-    """
-    if image_data is None:
+def figure(image: EmbeddedImage | None, caption: str, alt: str, wide: bool = False, tall: bool = False) -> Html:
+    """A `wide` image scrolls on a phone; a `tall` one does not fill a desktop screen. Nothing without an image."""
+    if image is None:
         return Html("")
-    image = f'<img src="{image_data.data_uri()}" width="{image_data.width}" height="{image_data.height}" alt="{escape_html(alt)}">'
-    words = f"<figcaption>{escape_html(caption)}</figcaption>" if caption else ""
-    return Html(
-        f'<figure{_class_attribute("wide" if wide else "tall" if tall else "")}><div class="scroll">{image}</div>{words}</figure>'
-    )
+    size = f'width="{image.width}" height="{image.height}"'
+    tag = f'<img src="{image.data_uri()}" {size} alt="{escape_html(alt)}">'
+    text = f"<figcaption>{escape_html(caption)}</figcaption>" if caption else ""
+    attribute = _class_attribute("wide" if wide else "tall" if tall else "")
+    return Html(f'<figure{attribute}><div class="scroll">{tag}</div>{text}</figure>')
 
 
 def gallery(figures: Iterable[Html]) -> Html:
@@ -149,13 +145,13 @@ def table_of_contents(entries: Iterable[tuple[str, str]]) -> Html:
 
 
 def document(title: str, parts: Iterable[Html], metadata: Mapping[str, str] | None = None) -> str:
-    """A whole page; `facts` stand in its head, for programs."""
-    told = "".join(f'<meta name="{escape_html(k)}" content="{escape_html(v)}">\n' for k, v in (metadata or {}).items())
+    """A whole page; `metadata` is written into its head, for programs."""
+    meta = "".join(f'<meta name="{escape_html(k)}" content="{escape_html(v)}">\n' for k, v in (metadata or {}).items())
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{escape_html(SECURITY_POLICY)}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"{told}<title>{escape_html(title)}</title>\n<style>{PAGE_STYLE}</style>\n</head>\n<body>\n<main>\n"
+        f"{meta}<title>{escape_html(title)}</title>\n<style>{PAGE_STYLE}</style>\n</head>\n<body>\n<main>\n"
         f"{join_html(parts)}\n</main>\n</body>\n</html>\n"
     )
 

@@ -12,11 +12,33 @@ from typing import Any
 from vdgs.report.embedded_images import EmbeddedImage, ImageReadError, load_embedded_image
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_status import RunStatus, StageStatus
+from vdgs.system.units import ABSENT, count
 
 #: Characters of one text, and entries of one list of texts, that a report shows.
 MAX_TEXT_CHARS, MAX_TEXTS = 600, 40
 #: Numbers beyond are damage.
 MAX_ABS_VALUE = 1e30
+#: States that need more words than their name.
+STATE_LABELS = {"stale": "out of date", "unknown": "not known"}
+#: How decibels and similarities (SSIM, LPIPS) are written.
+DB, SIMILARITY = "{:.2f}", "{:.4f}"
+
+
+def format_value(value: float | None, form: str) -> str:
+    """A number for people; a dash where there is none."""
+    return ABSENT if value is None else form.format(value)
+
+
+def format_percent(value: float | None) -> str:
+    return ABSENT if value is None else f"{100 * value:.1f} %"
+
+
+def format_difference(after: float | None, before: float | None, form: str = DB) -> str:
+    """The difference with its sign: a minus as in print, and never one before a zero."""
+    if after is None or before is None:
+        return ABSENT
+    signed = form.replace("{:", "{:+").format(after - before)
+    return signed.replace("-", "−" if float(signed.replace(",", "")) else "+")
 
 
 @dataclass(frozen=True)
@@ -35,6 +57,12 @@ class JsonRecord:
             return None
         return float(value) if abs(value) <= MAX_ABS_VALUE else None
 
+    def format(self, key: str, form: str = DB) -> str:
+        return format_value(self.number(key), form)
+
+    def count(self, key: str) -> str:
+        return count(self.number(key))
+
     def text(self, key: str) -> str | None:
         value = self.values.get(key)
         return _shortened(value) if isinstance(value, str) else None
@@ -43,9 +71,9 @@ class JsonRecord:
         values = self.values.get(key)
         if not isinstance(values, list):
             return []
-        found = [_shortened(value) for value in values if isinstance(value, str)]
-        more = len(found) - MAX_TEXTS
-        return found[:MAX_TEXTS] + ([f"… and {more} more"] if more > 0 else [])
+        texts = [_shortened(value) for value in values if isinstance(value, str)]
+        more = len(texts) - MAX_TEXTS
+        return texts[:MAX_TEXTS] + ([f"… and {more} more"] if more > 0 else [])
 
     def child(self, key: str) -> JsonRecord:
         return _record(self.values.get(key))
@@ -80,19 +108,13 @@ class ReportedRun:
         if not unknown:
             return []
         names = ", ".join(stage.name for stage in unknown)
-        return [
-            f"It cannot be told whether these were made with the settings of the run: {names} ({unknown[0].reason})."
-        ]
-
-
-#: States that need more words than their name.
-STATE_LABELS = {"stale": "out of date", "unknown": "not known"}
+        reason = unknown[0].reason
+        return [f"It cannot be told whether these were made with the settings of the run: {names} ({reason})."]
 
 
 def _stale_note(stage: StageStatus) -> str:
     """Why a stage is left out, in a sentence."""
-    folder, why = stage.folder, stage.reason
-    return f"{folder}: {why}; it is left out. `vdgs status` says which command makes it anew."
+    return f"{stage.folder}: {stage.reason}; it is left out. `vdgs status` says which command makes it anew."
 
 
 class RunFiles:
@@ -106,18 +128,17 @@ class RunFiles:
         self.notes: list[str] = []
 
     def has(self, name: str) -> bool:
-        if self._is_stale(name):
-            return False
-        return os.path.exists(self._root / name)  # unlike Path.exists, no error for names that no file can have
+        return not self._is_stale(name) and self.exists(name)
 
     def exists(self, *names: str) -> bool:
         """Whether one of these files is there, in date or not."""
+        # Unlike Path.exists, os.path.exists raises no error for names that no file can have.
         return any(os.path.exists(self._root / name) for name in names)
 
     def _is_stale(self, name: str) -> bool:
         """Whether a file that is there does not fit the run; the notes then say why, once."""
         why = next((why for folder, why in self._stale.items() if name.startswith(f"{folder}/")), None)
-        if why is None or name.endswith("/status.json") or not os.path.exists(self._root / name):
+        if why is None or name.endswith("/status.json") or not self.exists(name):
             return False
         if why not in self.notes:
             self.notes.append(why)
@@ -133,37 +154,24 @@ class RunFiles:
 
     def lines(self, name: str) -> list[JsonRecord]:
         """The JSON objects of a file with one on each line."""
-        text = self.text(name)
-        found, bad = [], 0
-        for line in (text or "").splitlines():
-            try:
-                record = _record(json.loads(line))
-            except (ValueError, RecursionError):
-                record = JsonRecord({})
-            if record:
-                found.append(record)
-            else:
-                bad += 1
-        if bad:
-            self.notes.append(f"{name}: {bad} line{'s' if bad > 1 else ''} could not be read and {_are(bad)} left out.")
-        return found
+        records = [_record(_parse_or_none(line)) for line in (self.text(name) or "").splitlines()]
+        if bad := sum(not record for record in records):
+            lines = "1 line could not be read and is" if bad == 1 else f"{bad} lines could not be read and are"
+            self.notes.append(f"{name}: {lines} left out.")
+        return [record for record in records if record]
 
     def text(self, name: str) -> str | None:
         """The text of a file; None if there is none."""
-        path = self._root / name
         try:
-            return path.read_text(encoding="utf-8", errors="replace") if self.has(name) else None
+            return (self._root / name).read_text(encoding="utf-8", errors="replace") if self.has(name) else None
         except OSError as error:
             self.notes.append(f"{name} cannot be read ({error.strerror or error}).")
             return None
 
     def image(self, name: str) -> EmbeddedImage | None:
         """A PNG of the run, ready to embed; None if there is none."""
-        path = self._root / name
-        if not self.has(name):
-            return None
         try:
-            return load_embedded_image(path)
+            return load_embedded_image(self._root / name) if self.has(name) else None
         except ImageReadError as error:
             self.notes.append(f"{name} is damaged or not a PNG ({error}); it is left out.")
             return None
@@ -184,8 +192,11 @@ class RunFiles:
         return value
 
 
-def _are(count: int) -> str:
-    return "is" if count == 1 else "are"
+def _parse_or_none(line: str) -> Any:
+    try:
+        return json.loads(line)
+    except (ValueError, RecursionError):
+        return None
 
 
 def _shortened(text: str) -> str:

@@ -1,4 +1,4 @@
-"""The place: who sees what, how it was cut into blocks, which photographs each block was given."""
+"""The place: how it was photographed, who sees what, how it was cut into blocks, which photographs each block has."""
 
 from __future__ import annotations
 
@@ -6,10 +6,22 @@ import os
 from pathlib import Path
 from urllib.parse import quote
 
-from vdgs.report.formatting import format_percent, format_value
-from vdgs.report.html_page import Html, figure, heading, link, paragraph, section, table
-from vdgs.report.run_reader import JsonRecord, ReportedRun, RunFiles
+from vdgs.captures.reconstruction import (
+    RECONSTRUCTION_FIGURE,
+    RECONSTRUCTION_FILE,
+    ReconstructionReport,
+    excluded_lines,
+    gcp_table,
+    report_rows,
+)
+from vdgs.report.html_page import Html, details, figure, heading, join_html, link, paragraph, section, table
+from vdgs.report.run_reader import JsonRecord, ReportedRun, RunFiles, format_percent
+from vdgs.system.records import record_from_dict
 from vdgs.system.units import ABSENT, count
+
+#: Photographs left out that are named.
+MAX_LISTED = 500
+VISIBILITY_FILE, PARTITION_FILE = "visibility/visibility.json", "partition/partition.json"
 
 
 def html_export_link(report: ReportedRun) -> Html:
@@ -24,143 +36,147 @@ def html_export_link(report: ReportedRun) -> Html:
         if path.lower().endswith(".html") and os.path.isfile(path):
             address = quote(Path(os.path.relpath(path, run.path.resolve())).as_posix())
             size = (file.number("bytes") or 0) / 1e6
-            return link(
-                address, "Move through the scene", f" ({os.path.basename(path)}, {size:,.1f} MB; opens offline)"
-            )
+            note = f" ({os.path.basename(path)}, {size:,.1f} MB; opens offline)"
+            return link(address, "Move through the scene", note)
     return Html("")
 
 
+def sfm_section(report: ReportedRun) -> Html:
+    """How the capture was made of photographs; nothing where the capture came from elsewhere."""
+    source, title = report.files(), "From photographs to cameras"
+    written = source.record(RECONSTRUCTION_FILE)
+    if not written and not source.notes:
+        return Html("")
+    try:
+        reconstruction = record_from_dict(ReconstructionReport, written.values)
+    except ValueError as error:
+        source.notes.append(f"{RECONSTRUCTION_FILE} is damaged ({error}); what it says is left out.")
+        return section("photographs", title, [], source.notes)
+    parts = [table(["what", "how much"], report_rows(reconstruction), wrap_last_column=True)]
+    parts += [paragraph(warning, "note") for warning in reconstruction.warnings]
+    if reconstruction.survey:
+        names = ["point", "used as", "photographs", "east [m]", "north [m]", "up [m]", "error [px]"]
+        parts += [heading("Surveyed points: seen minus surveyed"), table(names, gcp_table(reconstruction))]
+    caption = "The points from above; arrows lead from the recorded position of a photograph to where it was placed."
+    parts.append(figure(source.image(RECONSTRUCTION_FIGURE), caption, "residuals of the positions from above", True))
+    parts.append(_excluded_images(excluded_lines(reconstruction)))
+    if reconstruction.advice:
+        parts += [heading("For the next flight"), *map(paragraph, reconstruction.advice)]
+    return section("photographs", title, parts, source.notes)
+
+
+def _excluded_images(lines: list[str]) -> Html:
+    more = len(lines) - MAX_LISTED
+    shown = [*lines[:MAX_LISTED], *([f"and {more} more"] if more > 0 else [])]
+    title = f"{len(lines)} photograph{'s' if len(lines) != 1 else ''} left out, and why"
+    return details(title, join_html(map(paragraph, shown)))
+
+
 def visibility_section(report: ReportedRun) -> Html:
-    source = report.files()
-    facts = source.record("visibility/visibility.json")
+    source, map_file = report.files(), "visibility/map.png"
+    stats = source.record(VISIBILITY_FILE)
+    is_absent = not stats and not source.exists(VISIBILITY_FILE)
     parts = [
         paragraph(
             "V is the number of training photographs that see a place. Where it is low, a model has little to go by; "
             "the blocks are cut and trained with V in mind."
-        )
+        ),
+        *((paragraph(_visibility_sentence(stats)), _distribution(stats)) if stats else ()),
+        paragraph("Visibility is not measured yet." if is_absent else "", "absent"),
+        figure(source.image(map_file), "The place from above, coloured by V.", "map of visibility", True),
     ]
-    if facts:
-        parts.append(paragraph(_visibility_sentence(facts)))
-        parts.append(_distribution(facts))
-    elif not source.exists("visibility/visibility.json"):
-        parts.append(paragraph("Visibility is not measured yet.", "absent"))
-    parts.append(
-        figure(source.image("visibility/map.png"), "The place from above, coloured by V.", "map of visibility", True)
-    )
-    if facts and not source.has("visibility/map.png"):
-        parts.append(paragraph("There is no map of it (visibility/map.png).", "absent"))
+    if stats and not source.has(map_file):
+        parts.append(paragraph(f"There is no map of it ({map_file}).", "absent"))
     return section("visibility", "The place and its visibility", parts, source.notes)
 
 
 def blocks_section(report: ReportedRun) -> Html:
     source = report.files()
-    facts = source.record("partition/partition.json")
-    parts: list[Html] = []
-    if not facts and not source.exists("partition/partition.json"):
-        parts.append(paragraph("The scene is not cut into blocks yet.", "absent"))
-    rows = facts.rows("blocks")
+    partition = source.record(PARTITION_FILE)
+    is_absent = not partition and not source.exists(PARTITION_FILE)
+    parts = [paragraph("The scene is not cut into blocks yet." if is_absent else "", "absent")]
+    rows = partition.rows("blocks")
     if rows:
-        how = facts.number("lambda_vis")
-        parts.append(
-            paragraph(
-                f"{len(rows)} block{'s' if len(rows) > 1 else ''}"
-                + (f", cut by place and visibility (λ_vis = {how:g})." if how is not None else ".")
-                + " The core belongs to one block; the widened block reaches over its borders."
-            )
-        )
-    parts += [paragraph(note, "note") for note in facts.texts("warnings") + facts.texts("assignment_warnings")]
-    parts.append(figure(source.image("partition/blocks.png"), "The blocks from above.", "map of the blocks", True))
-    parts.append(_blocks_table(rows, facts.rows("spatial_only_blocks")))
-    parts.append(
-        figure(source.image("partition/block_facts.png"), "What each block holds.", "sizes of the blocks", True)
-    )
-    missing = [name for name in ("blocks.png", "block_facts.png") if facts and not source.has(f"partition/{name}")]
-    if missing:
-        parts.append(paragraph(f"Figures that are not there: {', '.join(missing)}.", "absent"))
+        how = partition.number("lambda_vis")
+        cut = f", cut by place and visibility (λ_vis = {how:g})" if how is not None else ""
+        reach = "The core belongs to one block; the widened block reaches over its borders."
+        parts.append(paragraph(f"{len(rows)} block{'s' if len(rows) > 1 else ''}{cut}. {reach}"))
+    warnings = partition.texts("warnings") + partition.texts("assignment_warnings")
+    missing = [name for name in ("blocks.png", "block_facts.png") if partition and not source.has(f"partition/{name}")]
+    parts += [
+        *(paragraph(warning, "note") for warning in warnings),
+        figure(source.image("partition/blocks.png"), "The blocks from above.", "map of the blocks", True),
+        _blocks_table(rows, partition.rows("spatial_only_blocks")),
+        figure(source.image("partition/block_facts.png"), "What each block holds.", "sizes of the blocks", True),
+        paragraph(f"Figures that are not there: {', '.join(missing)}." if missing else "", "absent"),
+    ]
     return section("blocks", "Blocks", parts, source.notes)
 
 
 def assignment_section(report: ReportedRun) -> Html:
-    source = report.files()
-    facts = source.record("partition/partition.json")
-    rows = facts.rows("blocks")
-    parts: list[Html] = []
-    if rows:
-        parts.append(
-            paragraph(
-                "A photograph trains every block to whose image it contributes more than the threshold; each trains at "
-                "least the block it serves best, and blocks with too few photographs are topped up with the next best."
-            )
-        )
-        parts.append(_cameras_table(rows))
-    else:
-        parts.append(paragraph("No photographs are assigned to blocks yet.", "absent"))
-    scores = source.image("partition/scores.png")
-    parts.append(
-        figure(scores, "Score of every photograph (row) for every block (column).", "matrix of scores", tall=True)
+    source, score_file = report.files(), "partition/scores.png"
+    rows = source.record(PARTITION_FILE).rows("blocks")
+    rule = (
+        "A photograph trains every block to whose image it contributes more than the threshold; each trains at "
+        "least the block it serves best, and blocks with too few photographs are topped up with the next best."
     )
-    if rows and not source.has("partition/scores.png"):
-        parts.append(paragraph("There is no figure of the scores (partition/scores.png).", "absent"))
+    absent = f"There is no figure of the scores ({score_file})." if rows and not source.has(score_file) else ""
+    caption = "Score of every photograph (row) for every block (column)."
+    parts = [
+        paragraph(rule) if rows else paragraph("No photographs are assigned to blocks yet.", "absent"),
+        _cameras_table(rows),
+        figure(source.image(score_file), caption, "matrix of scores", tall=True),
+        paragraph(absent, "absent"),
+    ]
     return section("cameras", "Camera assignment", parts, source.notes)
 
 
 def _visibility_sentence(record: JsonRecord) -> str:
-    quantiles, below = record.child("quantiles"), record.child("share_below")
+    quantiles, below = record.child("quantiles"), record.child("fraction_below")
     parts = []
     if record.number("anchors") is not None:
-        parts.append(f"{count(record.number('anchors'))} anchors, {count(record.number('training_views'))} photographs")
+        parts.append(f"{record.count('anchors')} anchors, {record.count('training_views')} photographs")
     if quantiles.number("50") is not None:
-        parts.append(f"the median anchor is seen by {quantiles.number('50'):g}")
+        parts.append(f"the median anchor is seen by {quantiles.format('50', '{:g}')}")
     if below.number("3") is not None:
         parts.append(f"{format_percent(below.number('3'))} of the anchors by fewer than 3")
     return "; ".join(parts) + "." if parts else ""
 
 
 def _distribution(record: JsonRecord) -> Html:
-    quantiles, below = record.child("quantiles"), record.child("share_below")
-    head = ["mean V", "Gini"]
-    row = [format_value(record.number("mean"), "{:.2f}"), format_value(record.number("gini"), "{:.3f}")]
-    for percent in [key for key in quantiles.values if key.isdecimal()][:9]:
-        head.append(f"{percent} %")
-        row.append(format_value(quantiles.number(percent), "{:g}"))
-    for limit in [key for key in below.values if key.isdecimal()][:9]:
-        head.append(f"V < {limit}")
-        row.append(format_percent(below.number(limit)))
+    quantiles, below = record.child("quantiles"), record.child("fraction_below")
+    percents, limits = ([key for key in each.values if key.isdecimal()][:9] for each in (quantiles, below))
+    head = ["mean V", "Gini", *(f"{percent} %" for percent in percents), *(f"V < {limit}" for limit in limits)]
+    row = [record.format("mean"), record.format("gini", "{:.3f}")]
+    row += [quantiles.format(percent, "{:g}") for percent in percents]
+    row += [format_percent(below.number(limit)) for limit in limits]
     return table(head, [row], "V over all anchors: mean, inequality, quantiles, share below a limit")
 
 
 def _blocks_table(rows: list[JsonRecord], spatial: list[JsonRecord]) -> Html:
-    spread = {row.number("block"): row.number("std_v") for row in rows}
     head = ["block", "anchors of the core", "widened", "area of the core", "mean V", "cameras"]
-    if any(value is not None for value in spread.values()):
-        head.append("std V")
+    has_std = any(row.number("std_v") is not None for row in rows)
     lines = []
     for row in rows:
-        line = [
-            count(row.number("block")), count(row.number("anchors_core")), count(row.number("anchors_expanded")),
-            format_value(row.number("area"), "{:,.0f}"), format_value(row.number("mean_v"), "{:.2f}"),
-            count(row.number("cameras")),
-        ]  # fmt: skip
-        if "std V" in head:
-            line.append(format_value(row.number("std_v"), "{:.2f}"))
-        lines.append(line)
-    ours = table(head, lines, "Areas are in square units of the ground frame (m² where the capture is metric)")
+        anchors = [row.count("anchors_core"), row.count("anchors_expanded")]
+        line = [row.count("block"), *anchors, row.format("area", "{:,.0f}"), row.format("mean_v"), row.count("cameras")]
+        lines.append([*line, *([row.format("std_v")] if has_std else [])])
+    caption = "Areas are in square units of the ground frame (m² where the capture is metric)"
+    blocks_table = table([*head, *(["std V"] if has_std else [])], lines, caption)
     if not spatial:
-        return ours
-    theirs = [
-        [
-            count(row.number("block")), count(row.number("anchors_core")), format_value(row.number("area"), "{:,.0f}"),
-            format_value(row.number("mean_v"), "{:.2f}"), format_value(row.number("std_v"), "{:.2f}"),
-        ]
+        return blocks_table
+    spatial_lines = [
+        [row.count("block"), row.count("anchors_core"), row.format("area", "{:,.0f}"), row.format("mean_v"),
+         row.format("std_v")]
         for row in spatial
     ]  # fmt: skip
-    compared = table(["block", "anchors of the core", "area of the core", "mean V", "std V"], theirs)
-    return Html(ours + "\n" + heading("For comparison: cut by place alone (λ_vis = 0)") + "\n" + compared)
+    compared = table(["block", "anchors of the core", "area of the core", "mean V", "std V"], spatial_lines)
+    return Html(f"{blocks_table}\n{heading('For comparison: cut by place alone (λ_vis = 0)')}\n{compared}")
 
 
 def _cameras_table(rows: list[JsonRecord]) -> Html:
     keys = ("cameras", "above_threshold", "best_block", "topped_up")
-    lines = [[count(row.number("block")), *(count(row.number(key)) for key in keys)] for row in rows]
+    lines = [[row.count("block"), *map(row.count, keys)] for row in rows]
     totals = [_total(rows, key) for key in keys]
     if len(rows) > 1 and ABSENT not in totals:
         lines.append(["all", *totals])
@@ -168,30 +184,27 @@ def _cameras_table(rows: list[JsonRecord]) -> Html:
 
 
 def _total(rows: list[JsonRecord], key: str) -> str:
-    values = [row.number(key) for row in rows]
-    known = [value for value in values if value is not None]
-    return count(sum(known)) if len(known) == len(values) else ABSENT
+    known = [value for row in rows if (value := row.number(key)) is not None]
+    return count(sum(known)) if len(known) == len(rows) else ABSENT
 
 
 def ortho_section(report: ReportedRun) -> Html:
     """The sheet of `vdgs ortho`, of the merged model that is there."""
     source = report.files()
-    facts = source.record("maps/map.json")
-    parts: list[Html] = []
-    if not facts:
-        parts.append(paragraph("No maps were made of this run. `vdgs ortho RUN` makes them."))
-    elif facts.text("model_digest") != report.run.merged.status().model_id:
-        parts.append(
-            paragraph("The maps are of another model than the run has now; `vdgs ortho RUN` draws them anew.", "note")
-        )
+    metadata = source.record("maps/map.json")
+    if not metadata:
+        parts = [paragraph("No maps were made of this run. `vdgs ortho RUN` makes them.")]
+    elif metadata.text("model_digest") != report.run.merged.status().model_id:
+        stale = "The maps are of another model than the run has now; `vdgs ortho RUN` draws them anew."
+        parts = [paragraph(stale, "note")]
     else:
-        gsd, unit = facts.number("gsd"), facts.text("unit")
-        parts.append(
+        gsd, unit = metadata.number("gsd"), metadata.text("unit")
+        parts = [
             paragraph(
-                f"Orthophoto, surface model and visibility in {facts.text('crs_name')}"
+                f"Orthophoto, surface model and visibility in {metadata.text('crs_name')}"
                 + (f", pixels of {gsd:.3g} {unit}" if gsd else "")
                 + ": GeoTIFFs in maps/. Blank is what is not solid, or what no training photograph shows."
-            )
-        )
-        parts.append(figure(source.image("maps/preview.png"), "The scene as maps.", "maps of the scene", True))
+            ),
+            figure(source.image("maps/preview.png"), "The scene as maps.", "maps of the scene", True),
+        ]
     return section("maps", "Maps", parts, source.notes)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
 import yaml
 
 from vdgs.errors import RunError
-from vdgs.report.cost_sections import costs_section, settings_section
 from vdgs.report.html_page import Html, document, escape_html, join_html, paragraph, table_of_contents
 from vdgs.report.result_sections import (
     by_visibility_section,
@@ -25,21 +25,29 @@ from vdgs.report.scene_sections import (
     blocks_section,
     html_export_link,
     ortho_section,
+    sfm_section,
     visibility_section,
 )
-from vdgs.report.sfm_section import sfm_section
-from vdgs.report.training_section import training_section
+from vdgs.report.training_section import costs_section, settings_section, training_section
 from vdgs.runs.run_folder import REPORT_FILE, RunFolder
 from vdgs.runs.run_status import RunStatus, StageStatus, get_run_status
 from vdgs.system.atomic_files import write_text
 
-#: name and title of the sections, for the links at the top
-SECTION_LINKS = (
-    ("visibility", "visibility"), ("blocks", "blocks"), ("cameras", "cameras"), ("training", "training"),
-    ("views", "test views"), ("maps", "maps"), ("by-visibility", "quality by visibility"), ("seams", "per block"),
-    ("costs", "time and memory"), ("settings", "settings"),
-)  # fmt: skip
-#: Name of the line of the page that says which standing of the run it shows, and where it is to be found at the latest.
+#: The sections, each with its name and title for the links at the top.
+SECTIONS: tuple[tuple[Callable[[ReportedRun], Html], str, str], ...] = (
+    (sfm_section, "photographs", "photographs"),
+    (visibility_section, "visibility", "visibility"),
+    (blocks_section, "blocks", "blocks"),
+    (assignment_section, "cameras", "cameras"),
+    (training_section, "training", "training"),
+    (views_section, "views", "test views"),
+    (ortho_section, "maps", "maps"),
+    (by_visibility_section, "by-visibility", "quality by visibility"),
+    (seams_section, "seams", "per block"),
+    (costs_section, "costs", "time and memory"),
+    (settings_section, "settings", "settings"),
+)
+#: Name of the meta element with the status of the run that the page shows; it stands within so many characters.
 STATUS_META_NAME, MAX_HEAD_CHARS = "vdgs-status", 2000
 
 
@@ -51,35 +59,23 @@ def write_report(run: RunFolder) -> Path:
     """
     if not run.path.is_dir():
         raise RunError(f"{run.path}: is not a run folder. Train first: vdgs run CAPTURE --output RUN")
-    shown = ReportedRun(run, get_run_status(run))
-    photographs = sfm_section(shown)
-    sections = [
-        *([photographs] if photographs else []),
-        visibility_section(shown),
-        blocks_section(shown),
-        assignment_section(shown),
-        training_section(shown),
-        views_section(shown),
-        ortho_section(shown),
-        by_visibility_section(shown),
-        seams_section(shown),
-        costs_section(shown),
-        settings_section(shown),
-    ]
-    links = [*([("photographs", "photographs")] if photographs else []), *SECTION_LINKS]
-    header, title = _header(shown)
-    path = run.path / REPORT_FILE
-    write_text(
-        path, document(title, [header, table_of_contents(links), *sections], {STATUS_META_NAME: shown.status.digest})
+    report = ReportedRun(run, get_run_status(run))
+    sections = [(make_section(report), name, title) for make_section, name, title in SECTIONS]
+    links = [(name, title) for content, name, title in sections if content]
+    header, title = _header(report)
+    page = document(
+        title,
+        [header, table_of_contents(links), *(content for content, _, _ in sections)],
+        {STATUS_META_NAME: report.status.digest},
     )
-    return path
+    write_text(run.path / REPORT_FILE, page)
+    return run.path / REPORT_FILE
 
 
 def report_status(run: RunFolder, status: RunStatus) -> StageStatus:
     """Whether the report is there and shows the run as it stands."""
-    path = run.path / REPORT_FILE
     try:
-        with path.open(encoding="utf-8", errors="replace") as file:
+        with (run.path / REPORT_FILE).open(encoding="utf-8", errors="replace") as file:
             head = file.read(MAX_HEAD_CHARS)
     except OSError:
         return StageStatus(name="report", state="missing", folder=REPORT_FILE)
@@ -90,17 +86,14 @@ def report_status(run: RunFolder, status: RunStatus) -> StageStatus:
 
 def _header(report: ReportedRun) -> tuple[Html, str]:
     source = report.files()
-    config = _config(source)
-    version = config.child("vdgs")
-    made_of = source.record("capture.json")
-    name = _capture_name(config, made_of)
+    config, capture = _config(source), source.record("capture.json")
+    name = _capture_name(config, capture)
     coarse, merged = read_metrics(source)
-    title = f"{name} – vdgs report"
+    version, commit = (config.child("vdgs").text(key) for key in ("version", "commit"))
     facts = [
         f"Report of {datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
-        f"run begun with vdgs {version.text('version') or 'of unknown version'}"
-        + (f", commit {commit[:12]}" if (commit := version.text("commit")) else ""),
-        _image_counts(made_of),
+        f"run begun with vdgs {version or 'of unknown version'}{f', commit {commit[:12]}' if commit else ''}",
+        _image_counts(capture),
     ]
     parts = [
         Html(f"<h1>{escape_html(name)}</h1>"),
@@ -109,9 +102,9 @@ def _header(report: ReportedRun) -> tuple[Html, str]:
         paragraph(result_summary(coarse, merged), "verdict"),
         result_table(coarse, merged),
         html_export_link(report),
-        *(paragraph(warning, "note") for warning in made_of.texts("warnings")),
+        *(paragraph(warning, "note") for warning in capture.texts("warnings")),
     ]
-    return Html(f"<header>\n{join_html(parts)}\n</header>"), title
+    return Html(f"<header>\n{join_html(parts)}\n</header>"), f"{name} – vdgs report"
 
 
 def _config(source: RunFiles) -> JsonRecord:

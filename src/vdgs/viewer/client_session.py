@@ -166,7 +166,7 @@ class ClientSession:
         if scale is None:
             return
         if self._legend_of != (display.layer, display.model, scale.low, scale.high):
-            from vdgs.rendering.colorbar import draw_colorbar
+            from vdgs.rendering.scalar_maps import draw_colorbar
 
             self._legend.image = np.ascontiguousarray(draw_colorbar(scale, _LEGEND_PX, 0))
             self._legend_of = (display.layer, display.model, scale.low, scale.high)
@@ -179,7 +179,7 @@ class ClientSession:
             self._console.print(f"[yellow]warning[/] a picture could not be drawn: {error!r}", highlight=False)
         if self._shown.layer != "color" or self._shown.image_index is not None:
             self._layer.value = next(iter(LAYER_LABELS))
-            self.change_display(layer="color", photograph=None)
+            self.change_display(layer="color", image_index=None)
 
     def notify(self, title: str, body: str) -> None:
         self.client.add_notification(title, body, auto_close_seconds=8.0)
@@ -207,7 +207,7 @@ class ClientSession:
         self._split = gui.add_slider("Coarse | merged", 0.0, 1.0, 0.01, 0.5, visible=False)
         self._split.on_update(lambda _: self.change_display(split=float(self._split.value)))
         self._photograph = gui.add_slider("Photograph | model", 0.0, 1.0, 0.01, 0.5, visible=False)
-        self._photograph.on_update(lambda _: self.change_display(photograph_split=float(self._photograph.value)))
+        self._photograph.on_update(lambda _: self.change_display(image_split=float(self._photograph.value)))
         self._build_views()
         self._build_overlays()
         self.place = PointPanel(self)

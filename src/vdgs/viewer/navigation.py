@@ -1,4 +1,4 @@
-"""Where a visitor stands: the browser's camera as ours and back, and the places that buttons lead to."""
+"""Camera poses of a client: the browser's camera as a `Camera` and back, and the poses that buttons lead to."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from vdgs.captures.camera_height import default_view
 from vdgs.captures.capture import Capture
 from vdgs.config.commands import MAX_RENDER_SIDE_PX, RENDER_BYTES_PER_PIXEL
 from vdgs.geometry.camera import Camera
+from vdgs.rendering.camera_paths import pose_from_rotation
 
-#: Nearer to straight down than this, the direction on the map no longer follows from where one looks.
+#: With a steeper view than this, the heading no longer follows from the direction of the view.
 _NADIR_COSINE = 0.995
 #: How far a view from straight above is tilted, so that it knows which way is north.
 _NADIR_TILT = 1e-3
@@ -23,14 +24,14 @@ MAX_CANVAS_PIXELS = 7680 * 4320
 
 @dataclass(frozen=True, eq=False)
 class CameraPose:
-    """Where a visitor stands and what they look at, ground frame; z is up."""
+    """Position and look-at point of a client's camera, ground frame; z is up."""
 
     position: Float[np.ndarray, "3"]
     look_at: Float[np.ndarray, "3"]
 
     @property
     def distance(self) -> float:
-        """From the visitor to what they look at."""
+        """From the position to the look-at point."""
         return float(np.linalg.norm(self.look_at - self.position))
 
 
@@ -39,25 +40,23 @@ def camera_from_browser(wxyz: np.ndarray, position: np.ndarray, fov: float, widt
 
     Raises ValueError for what is no camera: numbers that are not finite, an empty canvas, an impossible angle.
     """
-    turn, place = np.asarray(wxyz, np.float64), np.asarray(position, np.float64)
-    usable = np.isfinite(turn).all() and np.isfinite(place).all() and np.linalg.norm(turn) > 1e-6
+    quaternion, position = np.asarray(wxyz, np.float64), np.asarray(position, np.float64)
+    usable = np.isfinite(quaternion).all() and np.isfinite(position).all() and np.linalg.norm(quaternion) > 1e-6
     if not (usable and width > 0 and height > 0 and 1e-3 < fov < math.pi - 1e-3):
         raise ValueError("this is no camera")
-    rotation = _rotation_matrix(turn / np.linalg.norm(turn)).T
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ place
+    pose = pose_from_rotation(_rotation_matrix(quaternion / np.linalg.norm(quaternion)).T, position)
     focal = 0.5 * height / math.tan(0.5 * fov)
     return Camera(camera_from_world=pose, fx=focal, fy=focal, cx=width / 2, cy=height / 2, width=width, height=height)
 
 
 def max_render_pixels(free_bytes: int) -> int:
-    """How many pixels a visitor's picture may have where so many bytes of memory are free."""
+    """How many pixels an image may have where so many bytes of memory are free."""
     return max(1, min(MAX_CANVAS_PIXELS, free_bytes // RENDER_BYTES_PER_PIXEL))
 
 
-def limit_resolution(camera: Camera, max_pixels: int) -> Camera:
-    """The same view no larger than can be drawn, `most` pixels and `MAX_RENDER_SIDE_PX` a side: the browser enlarges what
-    comes. The very camera where it is no larger."""
+def limit_resolution(camera: Camera, max_pixels: float) -> Camera:
+    """The same view with at most `max_pixels` pixels and `MAX_RENDER_SIDE_PX` a side: the browser enlarges what comes.
+    The same object where it is no larger."""
     pixels, longest = camera.width * camera.height, max(camera.width, camera.height)
     scale = min((max_pixels / pixels) ** 0.5, MAX_RENDER_SIDE_PX / longest)
     if scale >= 1.0:
@@ -90,9 +89,8 @@ def north_up_pose(pose: CameraPose) -> CameraPose:
 
 def zoom_to(pose: CameraPose, target: Float[np.ndarray, "3"], factor: float = 0.35) -> CameraPose:
     """Looking at a place in the same direction, from a share of the present distance to it."""
-    away = pose.position - pose.look_at
-    towards = away / max(float(np.linalg.norm(away)), 1e-9)
-    return CameraPose(target + towards * factor * float(np.linalg.norm(pose.position - target)), target)
+    direction = (pose.position - pose.look_at) / max(pose.distance, 1e-9)
+    return CameraPose(target + direction * factor * float(np.linalg.norm(pose.position - target)), target)
 
 
 def pose_from_camera(camera: Camera, distance: float) -> CameraPose:
@@ -107,6 +105,4 @@ def pose_from_camera(camera: Camera, distance: float) -> CameraPose:
 
 def fov_to_fit(camera: Camera, aspect: float) -> float:
     """The vertical angle, in radians, at which a canvas (width over height) holds all of a photograph's."""
-    vertical = 0.5 * camera.height / camera.fy
-    across = 0.5 * camera.width / camera.fx / aspect
-    return 2.0 * math.atan(max(vertical, across))
+    return 2.0 * math.atan(max(0.5 * camera.height / camera.fy, 0.5 * camera.width / camera.fx / aspect))

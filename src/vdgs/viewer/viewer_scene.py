@@ -132,7 +132,7 @@ class ViewerScene:
             return ()
 
     def close(self) -> None:
-        if "photographs" in self.__dict__:
+        if "images" in self.__dict__:
             self.images.close()
 
 

@@ -49,7 +49,7 @@ class GaussianStore:
     @property
     def degree(self) -> int:
         """Of the spherical harmonics."""
-        return math.isqrt(self.shapes["rest"][0] + 1) - 1
+        return math.isqrt(self.shapes["shN"][0] + 1) - 1
 
     def add_sh(self, rows: np.ndarray, added: Float[Tensor, "n f 3"]) -> None:
         """Add to the coefficients of the Gaussians of the given rows, each named once: of the constant function first.
@@ -106,8 +106,14 @@ def open_store(file: Path, degree: int, writable: bool = False) -> GaussianStore
 
 def value_shapes(degree: int) -> dict[str, tuple[int, ...]]:
     """The numbers of a Gaussian, in their order."""
-    rest = (degree + 1) ** 2 - 1
-    return {"means": (3,), "log_scales": (3,), "quaternions": (4,), "logits": (), "dc": (3,), "rest": (rest, 3)}
+    num_rest = (degree + 1) ** 2 - 1
+    geometry: dict[str, tuple[int, ...]] = {
+        "means": (3,),
+        "log_scales": (3,),
+        "quaternions": (4,),
+        "opacity_logits": (),
+    }
+    return geometry | {"sh0": (3,), "shN": (num_rest, 3)}
 
 
 def unflatten(rows: Float[Tensor, "n w"], degree: int) -> Gaussians:

@@ -44,32 +44,31 @@ HALO_PX = round(4 * _BLUR_PX)
 
 
 class CacheSizes(NamedTuple):
-    """What a sharpener keeps between tiles, at most (bytes)."""
+    """What a `DetailTransfer` keeps between tiles, at most (bytes)."""
 
     images: int = 0
     depths: int = 0
 
 
-def cache_sizes(sharp: bool, capture: Capture) -> CacheSizes:
+def cache_sizes(detail_from_images: bool, capture: Capture) -> CacheSizes:
     """What drawing keeps of photographs, where detail is taken from them."""
-    if not sharp:
+    if not detail_from_images:
         return CacheSizes()
     pixels = max(view.camera.width * view.camera.height for view in capture.train_views)
     return CacheSizes(_IMAGE_CACHE_BYTES, 4 * _MAX_CACHED_DEPTHS * pixels)
 
 
 class DetailTransfer:
-    """Takes detail from the training photographs of a capture; remembers pictures and depths between tiles."""
+    """Takes detail from the training photographs of a capture; caches images and depths between tiles."""
 
     def __init__(self, model: AnchorModel, capture: Capture) -> None:
         self._model = model
         self._views = capture.train_views
-        self._pictures = ImageCache(self._views, _IMAGE_CACHE_BYTES)
+        self._images = ImageCache(self._views, _IMAGE_CACHE_BYTES)
         self._depths: OrderedDict[int, Float[np.ndarray, "h w"]] = OrderedDict()
 
     def close(self) -> None:
-        """End the cache's threads."""
-        self._pictures.close()
+        self._images.close()
 
     def detail(
         self, points: Float[np.ndarray, "n 3"], colors: Float[np.ndarray, "h w 3"], shown: Bool[np.ndarray, "h w"]
@@ -79,13 +78,13 @@ class DetailTransfer:
         agreed = np.zeros(len(points), np.float32)
         drawn = colors[shown]
         chosen = self._select_views(points)
-        least = self._min_trust(chosen, points)
+        min_trust = self._min_trust(chosen, points)
         for index in chosen:
-            where, found, trust = self._sample_view(index, points, least)
-            agreement = np.exp(-0.5 * (np.abs(found - drawn[where]).mean(axis=1) / _COLOR_SIGMA) ** 2)
-            light[where] += (trust * agreement)[:, None] * found
-            agreed[where] += trust * agreement
-            weight[where] += trust
+            rows, sampled, trust = self._sample_view(index, points, min_trust)
+            agreement = np.exp(-0.5 * (np.abs(sampled - drawn[rows]).mean(axis=1) / _COLOR_SIGMA) ** 2)
+            light[rows] += (trust * agreement)[:, None] * sampled
+            agreed[rows] += trust * agreement
+            weight[rows] += trust
         known = agreed > 0
         detail = np.zeros_like(colors)
         inside = np.zeros(shown.shape, np.float32)
@@ -108,29 +107,27 @@ class DetailTransfer:
             return np.zeros(len(points), np.float32)
         cameras = [self._views[index].camera for index in chosen]
         parts = (points[first : first + _POINTS_PER_CHUNK] for first in range(0, len(points), _POINTS_PER_CHUNK))
-        return np.concatenate(
-            [_trust_threshold(np.stack([_trust(camera, part) for camera in cameras])) for part in parts]
-        )
+        trusts = (np.stack([_trust(camera, part) for camera in cameras]) for part in parts)
+        return np.concatenate([_trust_threshold(trust) for trust in trusts])
 
     def _sample_view(
-        self, index: int, points: Float[np.ndarray, "n 3"], least: Float[np.ndarray, " n"]
+        self, index: int, points: Float[np.ndarray, "n 3"], min_trust: Float[np.ndarray, " n"]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Rows of the places that a photograph truly sees, and is trusted at more than at least, their colours [m, 3]
-        in [0, 1], and by how much it is [m]."""
+        """Rows of the points that a photograph truly sees and is trusted at more than `min_trust`, their colours [m, 3]
+        in [0, 1], and the trust above it [m]."""
         camera = self._views[index].camera
-        trust = _trust(camera, points) - least
+        trust = _trust(camera, points) - min_trust
         rows = np.flatnonzero(trust > 0)
         if not len(rows):
             return rows, np.zeros((0, 3), np.float32), trust[rows]
-        picture = self._pictures.get(index)
+        cached = self._images.get(index)
         pixels, depth = camera.project(points[rows])
         column, row = pixels.astype(np.int64).T
         clear = depth <= (1 + _DEPTH_TOLERANCE) * self._depth(index)[row, column]
-        if picture.mask is not None:
-            clear &= picture.mask.numpy()[row, column] > 0
+        if cached.mask is not None:
+            clear &= cached.mask.numpy()[row, column] > 0
         rows = rows[clear]
-        found = _sample_image(picture.image.numpy(), (pixels[clear] - 0.5).astype(np.float32))
-        return rows, found, trust[rows]
+        return rows, _sample_image(cached.image.numpy(), (pixels[clear] - 0.5).astype(np.float32)), trust[rows]
 
     def _depth(self, index: int) -> Float[np.ndarray, "h w"]:
         """Median depth of the scene in a photograph; infinite where it shows nothing solid."""
@@ -138,19 +135,13 @@ class DetailTransfer:
             self._depths.move_to_end(index)
             return self._depths[index]
         with torch.inference_mode():
-            found = render(self._model, self._views[index].camera, depth=True).median_depth
-        assert found is not None
-        depth = found.cpu().numpy()
+            median_depth = render(self._model, self._views[index].camera, depth=True).median_depth
+        assert median_depth is not None
+        depth = median_depth.cpu().numpy()
         self._depths[index] = np.where(depth > 0, depth, np.inf)
         if len(self._depths) > _MAX_CACHED_DEPTHS:
             self._depths.popitem(last=False)
         return self._depths[index]
-
-
-def _nadir_cosine(camera: Camera, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """How straight from above a camera sees places: the cosine to the vertical, 0 from below."""
-    rays = camera.position - points
-    return (rays[:, 2] / np.linalg.norm(rays, axis=1)).clip(min=0.0)
 
 
 def _trust(camera: Camera, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
@@ -159,7 +150,9 @@ def _trust(camera: Camera, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray
     border = np.minimum.reduce([pixels[:, 0], pixels[:, 1], camera.width - pixels[:, 0], camera.height - pixels[:, 1]])
     held = (depth > 0) & (border > 1.0)
     trust = np.zeros(len(points), np.float32)
-    trust[held] = _nadir_cosine(camera, points[held]) ** _NADIR_POWER * np.minimum(border[held] / _BORDER_PX, 1.0)
+    rays = camera.position - points[held]
+    cosine = (rays[:, 2] / np.linalg.norm(rays, axis=1)).clip(min=0.0)  # to the vertical; 0 from below
+    trust[held] = cosine**_NADIR_POWER * np.minimum(border[held] / _BORDER_PX, 1.0)
     return trust
 
 
@@ -180,5 +173,5 @@ def _sample_image(image: np.ndarray, at: Float[np.ndarray, "n 2"]) -> Float[np.n
     padded = np.zeros((-(-max(len(at), 1) // side) * side, 2), np.float32)
     padded[: len(at)] = at
     grid = padded.reshape(-1, side, 2)
-    found = cv2.remap(image, grid[..., 0], grid[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    return found.reshape(-1, 3)[: len(at)].astype(np.float32) / 255
+    sampled = cv2.remap(image, grid[..., 0], grid[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return sampled.reshape(-1, 3)[: len(at)].astype(np.float32) / 255

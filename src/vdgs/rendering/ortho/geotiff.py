@@ -26,10 +26,10 @@ class RasterLayer:
     title: str
     bands: tuple[str, ...]
     dtype: str
-    nodata: float | None
-    #: How overviews are made: "average" for pictures, "nearest" for heights and counts: the mean of a roof and a street
-    #: is a height that nothing has.
-    overviews: str
+    nodata: float | None = None
+    #: Resampling of overviews: "average" for images; "nearest" for heights and counts, for the mean of a roof and a
+    #: street is a height that nothing has.
+    overviews: str = "nearest"
     unit: str = ""
 
     @property
@@ -49,7 +49,7 @@ def require_rasterio() -> Any:
 
 
 def limit_gdal_cache() -> Any:
-    """A context in which GDAL keeps no more than `GDAL_CACHE_BYTES` of files in memory, whatever the size of the machine."""
+    """A context in which GDAL keeps at most `GDAL_CACHE_BYTES` of files in memory, on any machine."""
     return require_rasterio().Env(GDAL_CACHEMAX=GDAL_CACHE_BYTES)
 
 
@@ -69,8 +69,7 @@ def open_geotiff(
 ) -> Iterator[Any]:
     """A tiled GeoTIFF open for `write_tile`; its name must end in .tif."""
     rasterio = require_rasterio()
-    alpha = "alpha" in layer.bands
-    options = {"photometric": "RGB", "alpha": "YES"} if alpha else {}
+    options = {"photometric": "RGB", "alpha": "YES"} if "alpha" in layer.bands else {}
     with rasterio.open(
         file, "w", driver="GTiff", width=grid.width, height=grid.height, count=len(layer.bands), dtype=layer.dtype,
         crs=rasterio_crs(placement), transform=rasterio.Affine(grid.gsd, 0.0, grid.left, 0.0, -grid.gsd, grid.top),

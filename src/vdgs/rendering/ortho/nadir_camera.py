@@ -36,7 +36,7 @@ class ClipHeight:
         return ClipHeight(cameras, capture.points, flown)
 
     def height_above(self, point: Float[np.ndarray, "3"], radius: float) -> float:
-        """z under which everything solid about `place` stands (choice).
+        """z under which everything solid about `point` stands (choice).
 
         Where a drone flew there is air: what a model has as high as the cameras nearby hangs in front of them, unless
         the sparse points say that something stands there. Cameras that do not fly above the scene say nothing: then
@@ -44,9 +44,8 @@ class ClipHeight:
         """
         if not self.cameras_above_scene:
             return max(float(self.points[:, 2].max()), float(self.cameras[:, 2].max())) + radius
-        away = np.hypot(*(self.cameras[:, :2] - point[:2]).T)
-        near = self.cameras[np.argsort(away)[:_NUM_NEIGHBORS]]
-        flying = float(np.median(near[:, 2]))
+        distances = np.hypot(*(self.cameras[:, :2] - point[:2]).T)
+        flying = float(np.median(self.cameras[np.argsort(distances)[:_NUM_NEIGHBORS], 2]))
         about = self.points[(np.abs(self.points[:, :2] - point[:2]) <= radius).all(axis=1), 2]
         if not len(about):
             return flying

@@ -1,28 +1,30 @@
-"""What is to be drawn before anything is: the pixels of a map, the cameras above them, and of which model."""
+"""What a map is made of (pixels, cameras above them, a model), and the folder that its files come to stand in."""
 
 from __future__ import annotations
 
+import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from vdgs.captures.capture import Capture
-from vdgs.captures.output_guard import check_not_among_inputs
+from vdgs.captures.output_guard import check_not_among_inputs, check_not_in_capture
 from vdgs.config.commands import OrthoRequest
+from vdgs.errors import VdgsError
 from vdgs.geometry.map_projection import MapProjection
 from vdgs.model.anchor_model import AnchorModel
+from vdgs.rendering.ortho import pixel_grid
 from vdgs.rendering.ortho.detail_transfer import DetailTransfer
 from vdgs.rendering.ortho.nadir_camera import NadirCamera
-from vdgs.rendering.ortho.pixel_grid import (
-    PixelGrid,
-    capture_extent,
-    check_grid_overlap,
-    grid_from_bbox,
-    ground_sampling_distance,
-    median_point,
-)
+from vdgs.rendering.ortho.pixel_grid import PixelGrid
 from vdgs.rendering.ortho.tile_renderer import TileRenderer, samples_per_side
+from vdgs.system.atomic_files import read_json_or_empty, write_json
+
+ORTHOPHOTO_FILE, DSM_FILE, VISIBILITY_FILE = "orthophoto.tif", "dsm.tif", "visibility.tif"
+HILLSHADE_FILE, PREVIEW_FILE, METADATA_FILE = "hillshade.png", "preview.png", "map.json"
+FILE_NAMES = (ORTHOPHOTO_FILE, DSM_FILE, VISIBILITY_FILE, HILLSHADE_FILE, PREVIEW_FILE, METADATA_FILE)
 
 
 def output_folder(request: OrthoRequest, run: Path) -> Path:
@@ -54,10 +56,11 @@ class OrthoPlan:
         folder = output_folder(request, run)
         check_not_among_inputs(folder, capture)
         placement = MapProjection.of(capture.ground, request.crs)
-        finest = ground_sampling_distance(capture, placement.similarity_at(median_point(capture)).scale)
-        shown = capture_extent(capture, placement)
-        grid = grid_from_bbox(request.bbox or shown, finest if request.gsd is None else request.gsd)
-        check_grid_overlap(grid, shown, placement)
+        scale = placement.similarity_at(pixel_grid.median_point(capture)).scale
+        finest = pixel_grid.ground_sampling_distance(capture, scale)
+        extent = pixel_grid.capture_extent(capture, placement)
+        grid = pixel_grid.grid_from_bbox(request.bbox or extent, finest if request.gsd is None else request.gsd)
+        pixel_grid.check_grid_overlap(grid, extent, placement)
         above = NadirCamera.of(capture, placement)
         above.camera(grid.subgrid(0, 0, 1, 1))  # a system that makes no map is refused here
         return OrthoPlan(
@@ -72,9 +75,56 @@ class OrthoPlan:
     @contextmanager
     def tile_renderer(self, model: AnchorModel) -> Iterator[TileRenderer]:
         """What draws its tiles."""
-        sharpener = DetailTransfer(model, self.nadir_camera.capture) if self.detail_from_images else None
+        details = DetailTransfer(model, self.nadir_camera.capture) if self.detail_from_images else None
         try:
-            yield TileRenderer(model, self.nadir_camera, self.samples, sharpener)
+            yield TileRenderer(model, self.nadir_camera, self.samples, details)
         finally:
-            if sharpener is not None:
-                sharpener.close()
+            if details is not None:
+                details.close()
+
+
+def software_name() -> str:
+    """What map.json calls the program that drew the files beside it."""
+    from vdgs import __version__
+
+    return f"vdgs {__version__}"
+
+
+def check_output_folder(folder: Path) -> None:
+    """Raise VdgsError where maps may not go: among inputs of a capture, or where files of their names are not ours."""
+    check_not_in_capture(folder)
+    if folder.exists() and not folder.is_dir():
+        raise VdgsError(f"{folder}: is a file. Give a folder for the maps.")
+    present = [name for name in FILE_NAMES if os.path.lexists(folder / name)]
+    is_ours = str(read_json_or_empty(folder / METADATA_FILE).get("software")).startswith("vdgs ")
+    if present and not is_ours:
+        raise VdgsError(
+            f"{folder}: holds {', '.join(present)}, and no {METADATA_FILE} says that `vdgs ortho` wrote them. Nothing "
+            "was drawn. Give a new or an empty folder for --output; one with maps of vdgs gets the new ones in their "
+            "place."
+        )
+
+
+@contextmanager
+def staging_folder(folder: Path) -> Iterator[Path]:
+    """A folder inside `folder` whose files come to stand in it when all are there; nothing is left if not.
+
+    map.json comes last: while files take their places it says only whose they are. Raises VdgsError, with the remedy,
+    where the disk refuses.
+    """
+    staging = folder / f".maps-{os.getpid()}"
+    try:
+        staging.mkdir(parents=True, exist_ok=True)
+        yield staging
+        write_json(folder / METADATA_FILE, {"software": software_name(), "finished": False})
+        for file in sorted(staging.iterdir(), key=lambda file: (file.name == METADATA_FILE, file.name)):
+            os.replace(file, folder / file.name)
+    except OSError as error:  # rasterio's errors are such too
+        raise VdgsError(
+            f"{folder}: the maps cannot be written ({error.strerror or error}). Free some space or give another "
+            "--output; maps that were there are kept."
+        ) from error
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+        if folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()

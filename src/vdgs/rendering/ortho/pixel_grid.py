@@ -59,7 +59,7 @@ class PixelGrid:
 
     def tile(self, number: int, side: int = TILE_PX) -> tuple[int, int, PixelGrid]:
         """The tile of this number among `tiles`, from 0."""
-        row, column = (side * place for place in divmod(number, -(-self.width // side)))
+        row, column = (side * index for index in divmod(number, -(-self.width // side)))
         size = min(side, self.width - column), min(side, self.height - row)
         return column, row, self.subgrid(column, row, *size)
 
@@ -95,16 +95,16 @@ def capture_extent(capture: Capture, placement: MapProjection) -> tuple[float, f
 
     Raises VdgsError where there are too few points to tell.
     """
-    seen = count_visibility(torch.from_numpy(capture.points), [view.camera for view in capture.train_views]).numpy()
-    shown = capture.points[seen >= min(MIN_SEEN_BY, len(capture.train_views))]
-    shown = shown[_not_in_background(shown, np.array([view.camera.position for view in capture.train_views]))]
+    cameras = [view.camera for view in capture.train_views]
+    seen = count_visibility(torch.from_numpy(capture.points), cameras).numpy()
+    shown = capture.points[seen >= min(MIN_SEEN_BY, len(cameras))]
+    shown = shown[_not_in_background(shown, np.array([camera.position for camera in cameras]))]
     if len(shown) < 10:
         raise VdgsError(
-            f"{capture.root}: has {len(shown)} sparse points in {MIN_SEEN_BY} pictures or more, too few to tell what a map "
-            "should show. Give --bbox X0 Y0 X1 Y1."
+            f"{capture.root}: has {len(shown)} sparse points in {MIN_SEEN_BY} pictures or more, too few to tell what a "
+            "map should show. Give --bbox X0 Y0 X1 Y1."
         )
-    places = placement.project(shown)[:, :2]
-    low, high = np.quantile(places, [_TRIM_QUANTILE, 1 - _TRIM_QUANTILE], axis=0)
+    low, high = np.quantile(placement.project(shown)[:, :2], [_TRIM_QUANTILE, 1 - _TRIM_QUANTILE], axis=0)
     beyond = _MARGIN_SHARE * (high - low)
     return (*(low - beyond).tolist(), *(high + beyond).tolist())
 
@@ -119,8 +119,8 @@ def check_grid_overlap(grid: PixelGrid, extent: tuple[float, float, float, float
     """Raise VdgsError where a grid lies wholly beside what the photographs show, by more than that is wide."""
     x0, y0, x1, y1 = extent
     left, bottom, right, top = grid.bounds
-    across, along = x1 - x0, y1 - y0
-    if left > x1 + across or right < x0 - across or bottom > y1 + along or top < y0 - along:
+    width, height = x1 - x0, y1 - y0
+    if left > x1 + width or right < x0 - width or bottom > y1 + height or top < y0 - height:
         raise VdgsError(
             f"--bbox {' '.join(f'{v:g}' for v in grid.bounds)}: lies beside the scene, which spans "
             f"{' '.join(f'{v:.1f}' for v in extent)} in {placement.name}."
@@ -133,17 +133,14 @@ def ground_sampling_distance(capture: Capture, scale: float) -> float:
     `scale`: target units in one of the ground frame. Raises VdgsError where no photograph holds a sparse point.
     """
     views = capture.train_views
-    chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, _MAX_GSD_CAMERAS).round().astype(int))]
     sizes = []
-    for view in chosen:
-        held = view.camera.in_frustum(capture.points)
+    for index in np.unique(np.linspace(0, len(views) - 1, _MAX_GSD_CAMERAS).round().astype(int)):
+        camera = views[index].camera
+        held = camera.in_frustum(capture.points)
         if held.any():
-            depth = view.camera.project(capture.points[held])[1]
-            sizes.append(float(np.median(depth)) / view.camera.fx)
+            sizes.append(float(np.median(camera.project(capture.points[held])[1])) / camera.fx)
     if not sizes:
-        raise VdgsError(
-            f"{capture.root}: no photograph holds a sparse point, so none has a ground sampling. Give --gsd."
-        )
+        raise VdgsError(f"{capture.root}: no photograph holds a sparse point to measure its pixels by. Give --gsd.")
     return float(f"{scale * float(np.median(sizes)):.2g}")
 
 

@@ -39,7 +39,7 @@ class PreviewSheet:
     name: str
     grid: PixelGrid
     placement: MapProjection
-    facts: MapMetadata
+    metadata: MapMetadata
 
 
 def hillshade(heights: Float[np.ndarray, "h w"], pixel_size: float) -> Float[np.ndarray, "h w"]:
@@ -93,11 +93,11 @@ def write_preview(orthophoto: Path, dsm: Path, visibility: Path, file: Path, she
     panels[0].set(xlabel=f"{east} ({sheet.placement.unit})", ylabel=f"{north} ({sheet.placement.unit})")
     _scale_bar(panels[0], grid, sheet.placement)
     _north(panels[0], "N" if east == "easting" else "y")
-    facts = sheet.facts
+    metadata = sheet.metadata
     draw_titles(
         figure, sheet.name,
         f"{sheet.placement.name}; {grid.width} x {grid.height} pixels of {grid.gsd:g} {sheet.placement.unit}; "
-        f"{facts['model']} model, {facts['training_cameras']} training photographs",
+        f"{metadata['model']} model, {metadata['training_cameras']} training photographs",
         f"Heights: {sheet.placement.height_reference}. Blank: nothing solid, or no photograph looks there.",
     )  # fmt: skip
     canvas.print_png(file)  # type: ignore[arg-type]
@@ -110,8 +110,8 @@ def _heights(dsm: Path, longest_px: int) -> tuple[Float[np.ndarray, "h w"], floa
 
 def _draw_heights(figure: Figure, axes: Axes, heights: np.ndarray, light: np.ndarray, sheet: PreviewSheet) -> None:
     x0, y0, x1, y1 = sheet.grid.bounds
-    there = heights[np.isfinite(heights)]
-    low, high = (float(v) for v in np.quantile(there, [0.005, 0.995])) if there.size else (0.0, 1.0)
+    known = heights[np.isfinite(heights)]
+    low, high = np.quantile(known, [0.005, 0.995]).tolist() if known.size else (0.0, 1.0)
     norm = Normalize(low, max(high, low + 1e-6))
     colors = matplotlib.colormaps[HEIGHT_CMAP](0.15 + 0.7 * norm(np.nan_to_num(heights, nan=low)).clip(0, 1))
     colors[..., :3] *= (0.25 + 0.75 * np.nan_to_num(light) / np.sin(np.radians(ALTITUDE_DEG))).clip(0, 1.2)[..., None]
@@ -123,9 +123,9 @@ def _draw_heights(figure: Figure, axes: Axes, heights: np.ndarray, light: np.nda
 
 def _draw_counts(figure: Figure, axes: Axes, counts: np.ndarray, sheet: PreviewSheet) -> None:
     x0, y0, x1, y1 = sheet.grid.bounds
-    there = counts != NODATA_COUNT
-    top, norm = visibility_color_norm(counts[there]) if there.any() else (10, Normalize(0, 10))
-    shown = np.ma.masked_array(np.minimum(counts, top), ~there)
+    known = counts != NODATA_COUNT
+    top, norm = visibility_color_norm(counts[known]) if known.any() else (10, Normalize(0, 10))
+    shown = np.ma.masked_array(np.minimum(counts, top), ~known)
     axes.imshow(shown, extent=(x0, x1, y0, y1), cmap=VISIBILITY_CMAP, norm=norm, interpolation="nearest")
     _legend(figure, axes, ScalarMappable(norm, VISIBILITY_CMAP), f"V, to {top}")
 
@@ -133,9 +133,8 @@ def _draw_counts(figure: Figure, axes: Axes, counts: np.ndarray, sheet: PreviewS
 def _legend(figure: Figure, axes: Axes, colors: ScalarMappable, label: str) -> None:
     """A bar at the right of a panel."""
     box = axes.get_position()
-    bar = figure.add_axes(
-        (box.x1 + 0.08 / figure.get_figwidth(), box.y0, 0.1 / figure.get_figwidth(), box.height * 0.6)
-    )
+    width = figure.get_figwidth()
+    bar = figure.add_axes((box.x1 + 0.08 / width, box.y0, 0.1 / width, box.height * 0.6))
     legend = figure.colorbar(colors, cax=bar)
     legend.outline.set_visible(False)  # type: ignore[operator]
     legend.locator = MaxNLocator(5, integer=True)
@@ -151,9 +150,8 @@ def _scale_bar(axes: Axes, grid: PixelGrid, placement: MapProjection) -> None:
     length = floor_to_nice_length((x1 - x0) / 4)
     left, low, thick = x0 + 0.05 * (x1 - x0), y0 + 0.05 * (y1 - y0), 0.012 * (y1 - y0)
     for k, color in enumerate((INK, "white")):
-        axes.add_patch(
-            matplotlib.patches.Rectangle((left + k * length / 2, low), length / 2, thick, fc=color, ec=INK, lw=0.8)
-        )
+        corner = (left + k * length / 2, low)
+        axes.add_patch(matplotlib.patches.Rectangle(corner, length / 2, thick, fc=color, ec=INK, lw=0.8))
     axes.text(
         left + length / 2, low + 1.6 * thick, f"{length:g} {placement.unit}", ha="center", va="bottom", fontsize=8,
         color=INK, bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.5},
@@ -170,6 +168,6 @@ def _north(axes: Axes, name: str) -> None:
 
 
 def floor_to_nice_length(limit: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is not above `about`."""
+    """The largest of 1, 2, 5 times a power of ten that is not above `limit`."""
     power = 10.0 ** np.floor(np.log10(limit))
     return float(max(step * power for step in (1, 2, 5) if step * power <= limit * (1 + 1e-9)))

@@ -19,26 +19,9 @@ from vdgs.distributed.job_folders import clear
 from vdgs.distributed.sharded_job import ExecutionOptions
 from vdgs.errors import VdgsError
 from vdgs.geometry.map_projection import MapProjection
-from vdgs.rendering.ortho.geotiff import (
-    RasterLayer,
-    limit_gdal_cache,
-    open_geotiff,
-    require_rasterio,
-    write_cog,
-    write_tile,
-)
-from vdgs.rendering.ortho.ortho_folder import (
-    DSM_FILE,
-    HILLSHADE_FILE,
-    METADATA_FILE,
-    ORTHOPHOTO_FILE,
-    PREVIEW_FILE,
-    VISIBILITY_FILE,
-    check_output_folder,
-    software_name,
-    staging_folder,
-)
-from vdgs.rendering.ortho.ortho_plan import OrthoPlan, output_folder
+from vdgs.rendering.ortho import geotiff, ortho_plan
+from vdgs.rendering.ortho.geotiff import RasterLayer
+from vdgs.rendering.ortho.ortho_plan import DSM_FILE, METADATA_FILE, ORTHOPHOTO_FILE, VISIBILITY_FILE, OrthoPlan
 from vdgs.rendering.ortho.previews import PreviewSheet, write_hillshade, write_preview
 from vdgs.rendering.ortho.tile_renderer import NODATA_COUNT, NODATA_HEIGHT, OrthoTile
 from vdgs.rendering.ortho.tile_shards import distributed_tiles
@@ -59,72 +42,67 @@ def render_ortho(
 ) -> Path:
     """Write the maps of a run, on a device that is chosen already; returns their folder.
 
-    Tiles are drawn in this process, or in shards where a `wish` sends them: the files are the same. Raises VdgsError,
-    before anything is drawn, for a system, pixel size or extent that makes no map, a folder among a capture's inputs or
-    with such files of others, a disk without room, and where rasterio or pyproj is missing; and what
-    `ShardedJob.send` raises.
+    Tiles are drawn in this process, or in shards where `execution` sends them: the files are the same. Raises
+    VdgsError, before anything is drawn, for a system, pixel size or extent that makes no map, a folder among a
+    capture's inputs or with such files of others, a disk without room, and where rasterio or pyproj is missing; and
+    what `ShardedJob.send` raises.
     """
-    require_rasterio()
-    check_output_folder(output_folder(request, request.run))
+    geotiff.require_rasterio()
+    ortho_plan.check_output_folder(ortho_plan.output_folder(request, request.run))
     began = time.monotonic()
     if execution is not None and execution.is_distributed:
-        facts, folder = _render_sharded(context, request, execution, console)
+        share, folder = _render_sharded(context, request, execution, console)
     else:
-        facts, folder = _render_locally(context, request, console)
-    console.print(
-        f"maps: {folder} ({facts['mapped_share']:.0%} of the pixels, {time.monotonic() - began:.0f} s)",
-        highlight=False,
-    )
+        share, folder = _render_locally(context, request, console)
+    console.print(f"maps: {folder} ({share:.0%} of the pixels, {time.monotonic() - began:.0f} s)", highlight=False)
     return folder
 
 
-def _render_locally(context: RunContext, request: OrthoRequest, console: Console) -> tuple[MapMetadata, Path]:
-    """Draw in this process; what came out, and where."""
+def _render_locally(context: RunContext, request: OrthoRequest, console: Console) -> tuple[float, Path]:
+    """Draw in this process; returns the share of the pixels that are mapped, and the folder."""
     run = context.open_model(request.model, request.device)
     plan = OrthoPlan.of(request, run.folder.path, run.name, run.status.model_id, run.capture)
     _print_plan(plan, console)
     clear(plan.folder)
-    with plan.tile_renderer(run.model) as surveyor:
-        return _write(plan, (surveyor.render_tile(part) for _, _, part in plan.grid.tiles()), console), plan.folder
+    with plan.tile_renderer(run.model) as renderer:
+        return _write(plan, (renderer.render_tile(part) for _, _, part in plan.grid.tiles()), console), plan.folder
 
 
 def _render_sharded(
     context: RunContext, request: OrthoRequest, execution: ExecutionOptions, console: Console
-) -> tuple[MapMetadata, Path]:
-    """Let shards of the tiles be drawn elsewhere, and gather them one at a time. No model is in the memory of this
-    process."""
+) -> tuple[float, Path]:
+    """Let shards of the tiles be drawn elsewhere, and gather them one at a time. This process holds no model."""
     context.release_models()
     run = RunFolder(Path(os.path.abspath(request.run)))  # as in `stages.train`: other machines may mount it so
-    found, capture = locate_model(run, request.model), context.capture
-    plan = OrthoPlan.of(request, run.path, found.name, found.stage.status().model_id, capture)
+    model = locate_model(run, request.model)
+    plan = OrthoPlan.of(request, run.path, model.name, model.stage.status().model_id, context.capture)
     _print_plan(plan, console, sharded=True)
-    with distributed_tiles(plan, request, run, found, execution, console) as tiles:
+    with distributed_tiles(plan, request, run, model, execution, console) as tiles:
         return _write(plan, tiles, console), plan.folder
 
 
-def _write(plan: OrthoPlan, tiles: Iterable[OrthoTile], console: Console) -> MapMetadata:
+def _write(plan: OrthoPlan, tiles: Iterable[OrthoTile], console: Console) -> float:
     """Make maps of all tiles, which come in their order: files that come to stand in the folder together. Returns
-    what map.json says."""
+    the share of the pixels that are mapped."""
     layers = raster_layers(plan.placement)
-    with staging_folder(plan.folder) as staging, limit_gdal_cache():
-        facts = _metadata(plan)
-        facts |= _draw(plan, tiles, layers, staging, facts, console)
-        if not facts["mapped_share"]:
+    with ortho_plan.staging_folder(plan.folder) as staging, geotiff.limit_gdal_cache():
+        metadata = _metadata(plan)
+        metadata |= _draw(plan, tiles, layers, staging, metadata, console)
+        if not metadata["mapped_share"]:
             raise VdgsError(
                 f"{plan.folder}: the {plan.model} model shows nothing solid there, or no training photograph looks "
                 "there. Give another --bbox or leave it out."
             )
         for layer in layers:
             rough = staging / f"rough-{layer.name}"
-            write_cog(rough, staging / layer.name, layer)
+            geotiff.write_cog(rough, staging / layer.name, layer)
             rough.unlink()
-        sheet = PreviewSheet(plan.run_name, plan.grid, plan.placement, facts)
-        write_hillshade(staging / DSM_FILE, staging / HILLSHADE_FILE, plan.grid)
-        write_preview(
-            staging / ORTHOPHOTO_FILE, staging / DSM_FILE, staging / VISIBILITY_FILE, staging / PREVIEW_FILE, sheet
-        )
-        write_json(staging / METADATA_FILE, to_jsonable(facts))
-    return facts
+        sheet = PreviewSheet(plan.run_name, plan.grid, plan.placement, metadata)
+        orthophoto, dsm, visibility = (staging / layer.name for layer in layers)
+        write_hillshade(dsm, staging / ortho_plan.HILLSHADE_FILE, plan.grid)
+        write_preview(orthophoto, dsm, visibility, staging / ortho_plan.PREVIEW_FILE, sheet)
+        write_json(staging / METADATA_FILE, to_jsonable(metadata))
+    return metadata["mapped_share"]
 
 
 def is_ortho_current(run: RunFolder) -> bool:
@@ -146,7 +124,6 @@ def raster_layers(placement: MapProjection) -> tuple[RasterLayer, RasterLayer, R
             title="orthophoto: colours seen from straight above",
             bands=("red", "green", "blue", "alpha"),
             dtype="uint8",
-            nodata=None,
             overviews="average",
         ),
         RasterLayer(
@@ -155,7 +132,6 @@ def raster_layers(placement: MapProjection) -> tuple[RasterLayer, RasterLayer, R
             bands=(f"height, {placement.height_reference}",),
             dtype="float32",
             nodata=NODATA_HEIGHT,
-            overviews="nearest",
             unit=placement.unit,
         ),
         RasterLayer(
@@ -164,27 +140,25 @@ def raster_layers(placement: MapProjection) -> tuple[RasterLayer, RasterLayer, R
             bands=("training cameras",),
             dtype="uint16",
             nodata=NODATA_COUNT,
-            overviews="nearest",
             unit="cameras",
         ),
     )
 
 
 def _print_plan(plan: OrthoPlan, console: Console, sharded: bool = False) -> None:
-    """Say how large the map will be; raise VdgsError where the disk has no room for it."""
+    """Print how large the map will be; raise VdgsError where the disk has no room for it."""
     grid, placement, folder = plan.grid, plan.placement, plan.folder
     for note in placement.notes:
         console.print(f"[yellow]note[/] {note}", highlight=False)
-    # What shards have drawn lies beside it until all is gathered.
-    share = _DISK_SHARE + 1 if sharded else _DISK_SHARE
-    needed = int(share * grid.width * grid.height * sum(layer.bytes_per_pixel for layer in raster_layers(placement)))
-    needed += 5_000_000
+    share = _DISK_SHARE + sharded  # tiles of shards lie beside it until all are gathered
+    bytes_per_pixel = sum(layer.bytes_per_pixel for layer in raster_layers(placement))
+    needed = int(share * grid.width * grid.height * bytes_per_pixel) + 5_000_000
     existing = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.exists())
     free = shutil.disk_usage(existing).free
-    across, along = grid.width * grid.gsd, grid.height * grid.gsd
+    size = f"{grid.width * grid.gsd:.1f} x {grid.height * grid.gsd:.1f} {placement.unit}"
     console.print(
-        f"map: {grid.width} x {grid.height} pixels of {grid.gsd:g} {placement.unit}, {across:.1f} x {along:.1f} "
-        f"{placement.unit}, {placement.name}; heights {placement.height_reference}; at most {data_size(needed)} on the disk",
+        f"map: {grid.width} x {grid.height} pixels of {grid.gsd:g} {placement.unit}, {size}, {placement.name}; heights "
+        f"{placement.height_reference}; at most {data_size(needed)} on the disk",
         highlight=False,
     )
     if needed > free:
@@ -195,25 +169,23 @@ def _print_plan(plan: OrthoPlan, console: Console, sharded: bool = False) -> Non
 
 
 def _draw(
-    plan: OrthoPlan, tiles: Iterable[OrthoTile], layers: tuple[RasterLayer, ...], staging: Path, facts: MapMetadata,
+    plan: OrthoPlan, tiles: Iterable[OrthoTile], layers: tuple[RasterLayer, ...], staging: Path, metadata: MapMetadata,
     console: Console,
 ) -> MapMetadata:  # fmt: skip
-    """Put all tiles into files beside the final ones; what came out. One tile is in memory at a time."""
+    """Write all tiles into files beside the final ones; returns what they show. One tile is in memory at a time."""
     grid = plan.grid
-    tags = {"CRS_NAME": facts["crs_name"], "HEIGHTS": facts["heights"], "MODEL": facts["model"],
-            "GEOREFERENCE": facts["georeference"],
-            "SOFTWARE": facts["software"]}  # fmt: skip
+    keys = ("crs_name", "heights", "model", "georeference", "software")
+    tags = {key.upper(): str(metadata[key]) for key in keys}  # type: ignore[literal-required]
     mapped, poorly, low, high = 0, 0, np.inf, -np.inf
     with ExitStack() as open_files:
         files = [
-            open_files.enter_context(open_geotiff(staging / f"rough-{layer.name}", layer, grid, plan.placement, tags))
+            open_files.enter_context(
+                geotiff.open_geotiff(staging / f"rough-{layer.name}", layer, grid, plan.placement, tags)
+            )
             for layer in layers
         ]
-        shown_tiles = track(
-            zip(grid.tiles(), tiles, strict=True), "drawing", total=grid.tile_count(), console=console,
-            disable=not console.is_terminal,
-        )  # fmt: skip
-        for (column, row, _), tile in shown_tiles:
+        placed, no_bar = zip(grid.tiles(), tiles, strict=True), not console.is_terminal
+        for (column, row, _), tile in track(placed, "drawing", grid.tile_count(), console=console, disable=no_bar):
             check_stop_requested()
             shown = tile.alpha > 0
             if shown.any():
@@ -221,7 +193,7 @@ def _draw(
                 poorly += int((tile.visibility[shown] < 5).sum())
                 low, high = min(low, float(tile.heights[shown].min())), max(high, float(tile.heights[shown].max()))
             for file, bands in zip(files, _bands(tile), strict=True):
-                write_tile(file, column, row, bands)
+                geotiff.write_tile(file, column, row, bands)
     return {
         "mapped_share": mapped / (grid.width * grid.height),
         "seen_by_fewer_than_5_share": poorly / mapped if mapped else None,
@@ -237,11 +209,10 @@ def _bands(tile: OrthoTile) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _metadata(plan: OrthoPlan) -> MapMetadata:
     grid, placement, capture = plan.grid, plan.placement, plan.nadir_camera.capture
     return {
-        "software": software_name(), "model": plan.model, "model_digest": plan.model_digest,
-        "crs": placement.crs, "crs_name": placement.name,
-        "unit": placement.unit, "heights": placement.height_reference, "georeference": capture.ground.description,
+        "software": ortho_plan.software_name(), "model": plan.model, "model_digest": plan.model_digest,
+        "crs": placement.crs, "crs_name": placement.name, "unit": placement.unit,
+        "heights": placement.height_reference, "georeference": capture.ground.description,
         "gsd": grid.gsd, "width": grid.width, "height": grid.height, "bounds": list(grid.bounds),
         "samples_per_pixel": plan.samples**2, "sharpened": plan.detail_from_images,
-        "training_cameras": len(capture.train_views),
-        "notes": list(placement.notes),
+        "training_cameras": len(capture.train_views), "notes": list(placement.notes),
     }  # fmt: skip

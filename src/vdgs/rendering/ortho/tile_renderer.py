@@ -57,16 +57,14 @@ class TileRenderer:
 
     def render_tile(self, grid: PixelGrid) -> OrthoTile:
         """Draw the pixels of a grid, each from `samples`² of its own."""
-        fine = PixelGrid(
-            grid.left, grid.top, grid.gsd / self.samples, grid.width * self.samples, grid.height * self.samples
-        )
-        through = self.nadir_camera.camera(fine)
-        camera = self.nadir_camera.camera(grid) if self.samples > 1 else through
-        seen = self._seen(through, camera)
-        shown, colors = seen.shown, seen.colors
+        n = self.samples
+        fine = self.nadir_camera.camera(PixelGrid(grid.left, grid.top, grid.gsd / n, grid.width * n, grid.height * n))
+        camera = self.nadir_camera.camera(grid) if n > 1 else fine
+        surfaces = self._surfaces(fine, camera)
+        shown, colors = surfaces.shown, surfaces.colors
         if self.detail_transfer is not None and shown.any():
             # Drawn once more, with what lies about it; not cut from that, so that heights and V are those without.
-            around = self._seen(_pad_camera(through, HALO_PX * self.samples), _pad_camera(camera, HALO_PX))
+            around = self._surfaces(_pad_camera(fine, HALO_PX * n), _pad_camera(camera, HALO_PX))
             detail = self.detail_transfer.detail(around.points, around.colors, around.shown)
             colors = colors + detail[HALO_PX:-HALO_PX, HALO_PX:-HALO_PX]
         tile = OrthoTile(
@@ -76,39 +74,37 @@ class TileRenderer:
         tile.colors[shown] = (colors[shown].clip(0, 1) * 255 + 0.5).astype(np.uint8)
         tile.alpha[shown] = 255
         if shown.any():
-            tile.heights[shown] = self.nadir_camera.placement.project(seen.points)[:, 2]
-        tile.visibility[shown] = seen.counts.clip(max=NODATA_COUNT - 1)
+            tile.heights[shown] = self.nadir_camera.placement.project(surfaces.points)[:, 2]
+        tile.visibility[shown] = surfaces.counts.clip(max=NODATA_COUNT - 1)
         return tile
 
-    def _seen(self, through: Camera, camera: Camera) -> _PixelSurfaces:
-        """What the pixels of a camera show, each from `samples`² of those of the camera `through` which it is drawn."""
+    def _surfaces(self, fine: Camera, camera: Camera) -> _PixelSurfaces:
+        """What the pixels of a camera show, each from `samples`² pixels of the `fine` camera, which is drawn."""
         with torch.inference_mode():
-            raster = render(self.model, through, background=(0.0, 0.0, 0.0), depth=True)
+            raster = render(self.model, fine, background=(0.0, 0.0, 0.0), depth=True)
         assert raster.median_depth is not None
-        opacity = _blocks(raster.alpha.cpu().numpy(), self.samples).mean(axis=-1)
+        alpha = raster.alpha.cpu().numpy()
+        opacity = _blocks(alpha, self.samples).mean(axis=-1)
         image = raster.image.cpu().numpy()
         light = np.stack([_blocks(image[..., c], self.samples).mean(axis=-1) for c in range(3)], axis=-1)
         depth = raster.median_depth.cpu().numpy().astype(np.float64)
-        depth[raster.alpha.cpu().numpy() < MIN_ALPHA] = np.nan
+        depth[alpha < MIN_ALPHA] = np.nan
         # One of the samples, not their mean: at a wall the mean is a height that nothing has.
         depth = _lower_median(_blocks(depth, self.samples))
         shown = (opacity >= MIN_ALPHA) & np.isfinite(depth)
         points = camera.unproject(np.where(shown, depth, 0.0))[shown]
-        counts = count_visibility(
-            torch.from_numpy(points), [view.camera for view in self.nadir_camera.capture.train_views]
-        ).numpy()
-        looked_at = counts > 0  # what no photograph shows, the model invents
-        shown[shown] = looked_at
-        return _PixelSurfaces(
-            light / np.maximum(opacity, MIN_ALPHA)[..., None], shown, points[looked_at], counts[looked_at]
-        )
+        cameras = [view.camera for view in self.nadir_camera.capture.train_views]
+        counts = count_visibility(torch.from_numpy(points), cameras).numpy()
+        visible = counts > 0  # what no photograph shows, the model invents
+        shown[shown] = visible
+        colors = light / np.maximum(opacity, MIN_ALPHA)[..., None]
+        return _PixelSurfaces(colors, shown, points[visible], counts[visible])
 
 
 def _pad_camera(camera: Camera, by: int) -> Camera:
     """The same camera with so many pixels more on every side."""
-    return replace(
-        camera, cx=camera.cx + by, cy=camera.cy + by, width=camera.width + 2 * by, height=camera.height + 2 * by
-    )
+    width, height = camera.width + 2 * by, camera.height + 2 * by
+    return replace(camera, cx=camera.cx + by, cy=camera.cy + by, width=width, height=height)
 
 
 def samples_per_side(gsd: float, finest: float) -> int:
@@ -126,6 +122,6 @@ def _blocks(values: np.ndarray, side: int) -> np.ndarray:
 def _lower_median(values: Float[np.ndarray, "h w k"]) -> Float[np.ndarray, "h w"]:
     """The median of the values that are there, one of them; NaN where fewer than half are."""
     ordered = np.sort(values, axis=-1)  # NaN last
-    there = np.isfinite(values).sum(axis=-1)
-    chosen = np.take_along_axis(ordered, np.maximum(there - 1, 0)[..., None] // 2, axis=-1)[..., 0]
-    return np.where(2 * there >= values.shape[-1], chosen, np.nan)
+    known = np.isfinite(values).sum(axis=-1)
+    chosen = np.take_along_axis(ordered, np.maximum(known - 1, 0)[..., None] // 2, axis=-1)[..., 0]
+    return np.where(2 * known >= values.shape[-1], chosen, np.nan)

@@ -1,6 +1,6 @@
 """The tiles of a map drawn in shards, elsewhere or by several processes, and gathered one at a time.
 
-FOLDER/shards/KEY/NN/   of shard NN: a file for each of its tiles (`executors.sharded_job`), the arrays that it shows
+FOLDER/shards/KEY/NN/   of shard NN: a file for each of its tiles (`distributed.sharded_job`), the arrays that it shows
 """
 
 from __future__ import annotations
@@ -67,33 +67,27 @@ def distributed_tiles(
         yield job.gather(load_tile)
 
 
-def _job(plan: OrthoPlan, asked: OrthoRequest) -> ShardedJob:
+def _job(plan: OrthoPlan, request: OrthoRequest) -> ShardedJob:
     """The tiles in shards, and what they depend on."""
-    depends_on = [
-        plan.model,
-        plan.model_digest,
-        plan.placement.crs,
-        list(astuple(plan.grid)),
-        plan.samples,
-        plan.detail_from_images,
-    ]
+    grid, how = list(astuple(plan.grid)), [plan.samples, plan.detail_from_images]
+    depends_on = [plan.model, plan.model_digest, plan.placement.crs, grid, *how]
     spans = split_ranges(plan.grid.tile_count(), *TILES_OF_SHARD)
-    return ShardedJob.of("tiles", asked, plan.folder, TILE_LABELS, depends_on, spans)
+    return ShardedJob.of("tiles", request, plan.folder, TILE_LABELS, depends_on, spans)
 
 
 def draw_shard(shard: Shard) -> None:
     """Draw a shard of the tiles. They stay beside its status until all are gathered."""
-    asked = shard.request(OrthoRequest)
-    opened = open_run(asked.run, asked.model, shard.device)
-    plan = OrthoPlan.of(asked, asked.run, opened.name, opened.status.model_id, opened.capture)
+    request = shard.request(OrthoRequest)
+    run = open_run(request.run, request.model, shard.device)
+    plan = OrthoPlan.of(request, request.run, run.name, run.status.model_id, run.capture)
 
     def results(left: Sequence[int]) -> Results:
-        shard.console.print(f"drawing {len(left)} tiles of the {opened.summary}", highlight=False)
-        with plan.tile_renderer(opened.model) as surveyor:
+        shard.console.print(f"drawing {len(left)} tiles of the {run.summary}", highlight=False)
+        with plan.tile_renderer(run.model) as renderer:
             for item in left:
-                yield partial(save_tile, tile=surveyor.render_tile(plan.grid.tile(item)[2]))
+                yield partial(save_tile, tile=renderer.render_tile(plan.grid.tile(item)[2]))
 
-    shard.do(_job(plan, asked), results)
+    shard.do(_job(plan, request), results)
 
 
 def save_tile(path: Path, tile: OrthoTile) -> None:
@@ -110,6 +104,5 @@ def load_tile(path: Path) -> OrthoTile:
             return OrthoTile(**{each.name: file[each.name] for each in fields(OrthoTile)})
     # What zipfile and numpy raise on damaged bytes has no common base.
     except (OSError, ValueError, KeyError, TypeError, IndexError, EOFError, zipfile.BadZipFile) as error:
-        raise RunError(
-            f"{path}: is missing or damaged ({error}). Delete {path.parent} and run the same command again."
-        ) from error
+        remedy = f"Delete {path.parent} and run the same command again."
+        raise RunError(f"{path}: is missing or damaged ({error}). {remedy}") from error
