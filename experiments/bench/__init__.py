@@ -1,1 +1,1 @@
-"""The evidence: methods × scenes × seeds turned into tables, figures and a verdict (`python -m experiments.bench`)."""
+"""Methods × scenes × seeds to tables, figures and a check of the paper's claims: `python -m experiments.bench`."""

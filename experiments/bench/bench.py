@@ -1,10 +1,10 @@
-"""`vdgs bench`: the runs of a table, several at once, then its tables, figure and verdict.
+"""`vdgs bench`: the runs of a table, several at once, then its tables, figure and check of the claims.
 
 OUTPUT/
   captures/SCENE/             what was generated
   runs/SCENE/METHOD/SEED/     ordinary run folders; shared-coarse-…: coarse stages of several runs
-  jobs/                       what each process was told, and what it said
-  TABLE/                      results.json table.md table.tex table.csv verdict.txt groups.png
+  jobs/                       what each process is to do, and its log
+  TABLE/                      results.json table.md table.tex table.csv claims.txt groups.png
 """
 
 from __future__ import annotations
@@ -22,19 +22,24 @@ from pathlib import Path
 import psutil
 from rich.console import Console
 
+from experiments.bench.cached_results import drop_cached_runs, match_pixel_groups, read_cached_results
+from experiments.bench.claim_check import check_claims
 from experiments.bench.definitions import BenchScene
 from experiments.bench.figure import plot_visibility_groups
-from experiments.bench.grids import make_result_tables
-from experiments.bench.known import drop_cached_runs, match_pixel_groups, read_cached_results
 from experiments.bench.measure import FRUSTA_FILE, GROUPS_FILE, measure_groups
 from experiments.bench.notes import make_notes
+from experiments.bench.pixel_visibility import (
+    PixelVisibility,
+    visibility_from_frusta,
+    visibility_from_model,
+    visibility_from_truth,
+)
 from experiments.bench.plan import BenchPlan, PlannedRun, PlanOptions, make_plan
 from experiments.bench.renders import check_renders
+from experiments.bench.result_tables import make_result_tables
 from experiments.bench.results import BenchResult, collect_results, results_to_json
-from experiments.bench.seen import PixelVisibility, visibility_from_frusta, visibility_from_model, visibility_from_truth
-from experiments.bench.verdict import check_claims
+from experiments.bench.table_writers import to_latex, to_markdown, to_tidy_csv
 from experiments.bench.worker import RECORD_FILE, BenchJob
-from experiments.bench.writing import to_latex, to_markdown, to_tidy_csv
 from vdgs.captures.loading import load_capture
 from vdgs.captures.output_guard import check_not_among_files, check_not_in_capture
 from vdgs.config.capture_options import CaptureOptions
@@ -55,7 +60,7 @@ class BenchSettings:
 
     table: str
     output: Path
-    choices: PlanOptions
+    plan_options: PlanOptions
     data: Path | None = None
     jobs: int = 1
     visibility_bins: int = 4
@@ -73,30 +78,28 @@ def run_bench(settings: BenchSettings, console: Console) -> list[BenchResult]:
     """
     if settings.jobs < 1 or settings.visibility_bins < 1:
         raise VdgsError("--jobs and --visibility-bins must be at least 1")
-    _check_output_outside_inputs(settings.output, plan := make_plan(settings.table, settings.choices))
-    known, keys = (
-        read_cached_results(settings.reuse_results),
-        {run.name: _key(run, plan, settings) for run in plan.coarse + plan.runs},
-    )
-    left = drop_cached_runs(plan, keys, known)
+    _check_output_outside_inputs(settings.output, plan := make_plan(settings.table, settings.plan_options))
+    cached = read_cached_results(settings.reuse_results)
+    keys = {run.name: _key(run, plan, settings) for run in plan.coarse + plan.runs}
+    remaining = drop_cached_runs(plan, keys, cached)
     if settings.reuse_results:
-        taken = len(plan.runs) - len(left.runs)
-        console.print(f"{taken} of {len(plan.runs)} runs are known and not trained here", highlight=False)
+        num_cached = len(plan.runs) - len(remaining.runs)
+        console.print(f"{num_cached} of {len(plan.runs)} runs are known and not trained here", highlight=False)
     began = time.monotonic()
     with _locked(settings.output):
-        captures, lost = _captures(left, settings, console)
-        ended = lost | _train(left, captures, keys, settings, console)
-        ended |= _measure(left, captures, ended, settings, console)
-        results = match_pixel_groups(collect_results(plan, settings.output, ended, keys, known), known)
+        captures, failed = _captures(remaining, settings, console)
+        outcomes = failed | _train(remaining, captures, keys, settings, console)
+        outcomes |= _measure(remaining, captures, outcomes, settings, console)
+        results = match_pixel_groups(collect_results(plan, settings.output, outcomes, keys, cached), cached)
         _write(plan, results, settings, console)
     console.print(f"{(time.monotonic() - began) / 60:.1f} min", highlight=False)
-    if any(each.state == "stopped" for each in ended.values()):
+    if any(each.state == "stopped" for each in outcomes.values()):
         raise Stopped("Stopped; every run is saved. The same command continues.")
-    failed = [each for each in ended.values() if each.state == "failed"]
-    if failed:
+    errors = [each for each in outcomes.values() if each.state == "failed"]
+    if errors:
         raise VdgsError(
-            f"{len(failed)} of {len(ended)} runs failed; the tables leave them out:\n  "
-            + "\n  ".join(f"{each.name}: {each.reason}" for each in failed)
+            f"{len(errors)} of {len(outcomes)} runs failed; the tables leave them out:\n  "
+            + "\n  ".join(f"{each.name}: {each.reason}" for each in errors)
         )
     return results
 
@@ -114,16 +117,16 @@ def _captures(
     plan: BenchPlan, settings: BenchSettings, console: Console
 ) -> tuple[dict[str, Path], dict[str, TaskResult]]:
     """The folder of every scene, generated where there is none yet; the runs of those that cannot be had, failed."""
-    found, lost = {}, dict[str, TaskResult]()
+    folders, failed = {}, dict[str, TaskResult]()
     for scene in plan.scenes:
         try:
-            found[scene.name] = _capture(scene, settings, console)
+            folders[scene.name] = _capture(scene, settings, console)
         except VdgsError as error:
             names = [run.name for run in plan.coarse + plan.runs if run.scene == scene.name]
-            lost |= {name: TaskResult(name=name, state="failed", reason=str(error)) for name in names}
-    if lost and not found:
-        raise VdgsError(next(iter(lost.values())).reason)
-    return found, lost
+            failed |= {name: TaskResult(name=name, state="failed", reason=str(error)) for name in names}
+    if failed and not folders:
+        raise VdgsError(next(iter(failed.values())).reason)
+    return folders, failed
 
 
 def _capture(scene: BenchScene, settings: BenchSettings, console: Console) -> Path:
@@ -139,8 +142,8 @@ def _capture(scene: BenchScene, settings: BenchSettings, console: Console) -> Pa
     folder = settings.output / "captures" / scene.name
     if not folder.exists():
         for name in ("size", "flight"):
-            known = typing.get_args(typing.get_type_hints(SynthOptions)[name])
-            if name in scene.synth and scene.synth[name] not in known:
+            choices = typing.get_args(typing.get_type_hints(SynthOptions)[name])
+            if name in scene.synth and scene.synth[name] not in choices:
                 raise VdgsError(f"{scene.name}: this version generates no {name} {scene.synth[name]!r}")
         console.print(f"generating {scene.name}", highlight=False)
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -228,7 +231,8 @@ def _check_same_settings(settings: BenchSettings, run: PlannedRun) -> None:
         raise VdgsError(
             f"{folder.path}: was trained with other settings:\n  "
             + "\n  ".join(changed)
-            + "\nGive the old options to continue, --overwrite to train again what depends on them, or another --output."
+            + "\nGive the old options to continue, --overwrite to train again what depends on them, or another "
+            "--output."
         )
 
 
@@ -253,7 +257,7 @@ def _job(run: PlannedRun, plan: BenchPlan, capture: Path, key: str, settings: Be
 
 
 def _options(scene: BenchScene, settings: BenchSettings) -> CaptureOptions:
-    return CaptureOptions(**scene.options, validation=settings.choices.validation)
+    return CaptureOptions(**scene.options, validation=settings.plan_options.validation)
 
 
 def _is_done(output: Path, run: PlannedRun, key: str) -> bool:
@@ -320,28 +324,25 @@ def _pixel_visibility(
 
 
 def _write(plan: BenchPlan, results: list[BenchResult], settings: BenchSettings, console: Console) -> None:
-    output, grids, lines = (
-        settings.output / plan.table.name,
-        make_result_tables(plan, results),
-        check_claims(plan, results),
-    )
+    output = settings.output / plan.table.name
+    result_tables, claims = make_result_tables(plan, results), check_claims(plan, results)
     output.mkdir(exist_ok=True)
     write_json(
         output / "results.json",
         to_jsonable({
             "table": plan.table.name, "title": plan.table.title, "seeds": plan.seeds,
             "budgets": {name: vars(budget) | {"total": budget.total} for name, budget in plan.budgets.items()},
-            "choices": to_dict(settings.choices), "results": results_to_json(results),
-            "verdict": [vars(line) for line in lines],
+            "plan_options": to_dict(settings.plan_options), "results": results_to_json(results),
+            "claims": [vars(line) for line in claims],
         }),
     )  # fmt: skip
-    text = "\n".join(map(str, lines)) or "This table asks no question."
+    text = "\n".join(map(str, claims)) or "This table asks no question."
     drawn = plot_visibility_groups(output / "groups.png", plan, results)
-    paragraphs = make_notes(plan, results, lines, drawn)
-    write_text(output / "table.md", to_markdown(grids, plan.table.title, paragraphs))
-    write_text(output / "table.tex", to_latex(grids))
-    write_text(output / "table.csv", to_tidy_csv(grids))
-    write_text(output / "verdict.txt", text + "\n")
+    paragraphs = make_notes(plan, results, claims, drawn)
+    write_text(output / "table.md", to_markdown(result_tables, plan.table.title, paragraphs))
+    write_text(output / "table.tex", to_latex(result_tables))
+    write_text(output / "table.csv", to_tidy_csv(result_tables))
+    write_text(output / "claims.txt", text + "\n")
     console.print(text, highlight=False, markup=False)
     console.print(f"tables: {output / 'table.md'} and beside it", highlight=False)
 

@@ -21,7 +21,7 @@ TableName = Literal[
 
 @dataclass(frozen=True, kw_only=True)
 class BenchArguments:
-    """Train methods on scenes with several seeds and write tables, a figure and a verdict.
+    """Train methods on scenes with several seeds and write tables, a figure and a check of the claims.
 
     The same command continues what was stopped; finished runs are kept.
     """
@@ -44,8 +44,8 @@ class BenchArguments:
     """What other programs rendered of the test views, a row for each NAME=FOLDER (several after one --renders):
     FOLDER/SCENE/VIEW.png or FOLDER/SCENE/SEED/VIEW.png. Measured as all others (docs/bench.md)."""
     reuse_results: tuple[Path, ...] = ()
-    """results.json of other benches, of this machine or of others (several after one --reuse-results): runs with the same
-    settings, seeds and scenes are taken from there and not trained, and the table says where each is from."""
+    """results.json of other benches, of this machine or of others (several after one --reuse-results): runs with the
+    same settings, seeds and scenes are taken from there and not trained, and the table says where each is from."""
     data: Path | None = None
     """Folder that holds the scenes with names which are not generated: residence-pixsfm, copr, ..."""
     scale_iterations: Annotated[float, Range(0, 1000, exclusive_min=True)] = 1.0
@@ -69,25 +69,25 @@ class BenchArguments:
 
 
 def bench_command(arguments: list[str]) -> None:
-    asked = parse_arguments(BenchArguments, arguments, "vdgs bench")
+    args = parse_arguments(BenchArguments, arguments, "vdgs bench")
     from experiments.bench.bench import BenchSettings, run_bench
     from experiments.bench.plan import PlanOptions
 
-    choices = PlanOptions(
-        asked.seeds, asked.scenes, asked.methods, asked.scale_iterations, asked.iterations_total, asked.max_anchors,
-        asked.options.validation, asked.renders, replace(asked.options, validation=False),
+    options = PlanOptions(
+        args.seeds, args.scenes, args.methods, args.scale_iterations, args.iterations_total, args.max_anchors,
+        args.options.validation, args.renders, replace(args.options, validation=False),
     )  # fmt: skip
     run_bench(
         BenchSettings(
-            asked.table,
-            asked.output,
-            choices,
-            asked.data,
-            asked.jobs,
-            asked.visibility_bins,
-            asked.lpips_weights,
-            asked.overwrite,
-            asked.reuse_results,
+            args.table,
+            args.output,
+            options,
+            args.data,
+            args.jobs,
+            args.visibility_bins,
+            args.lpips_weights,
+            args.overwrite,
+            args.reuse_results,
         ),
-        make_console(asked.quiet),
+        make_console(args.quiet),
     )

@@ -80,7 +80,8 @@ class BenchScene:
     preset: PresetName = "laptop"
     #: Path below --data; None for a generated scene.
     capture: str | None = None
-    #: Where it lies, if it was given as a folder, and its fingerprint (`captures.facts`): folders may share a name.
+    #: Where it lies, if it was given as a folder, and its fingerprint (`captures.capture_metadata`): folders may share
+    #: a name.
     folder: Path | None = None
     contents: Mapping[str, int] = field(default_factory=dict)
     #: SynthOptions by name.
@@ -97,7 +98,7 @@ class BenchScene:
     def base(self, budget: Budget, seed: int, scale: float = 1.0) -> MethodConfig:
         """The full method on this scene with so many iterations: the scene's preset, with compensated growth, which the
         paper's method has and the preset `laptop` leaves out. `scale` is that of the budget to the scene's own: growth
-        begins that much earlier or later, as in `block.scale_iterations`."""
+        begins that much earlier or later, as in `block.steps_scaler`."""
         config = self.override(PRESETS[self.preset])
         growth = config.training.densify
         early = replace(growth, stats_start=round(scale * growth.stats_start), start=round(scale * growth.start))

@@ -10,9 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from experiments.bench.grids import group_bounds
 from experiments.bench.measure import group_names
 from experiments.bench.plan import BenchPlan
+from experiments.bench.result_tables import group_bounds
 from experiments.bench.results import BenchResult
 from experiments.bench.statistics import Summary, summarize
 from vdgs.plots.style import ACCENT, DPI, INK, MUTED, draw_titles, style_axes
@@ -62,19 +62,19 @@ def _columns(labels: Sequence[str], width: float) -> int:
 
 def _panel(axes: Axes, plan: BenchPlan, results: Sequence[BenchResult], title: str, first: bool) -> None:
     groups = max((result.groups for result in results), key=len)
-    places = np.arange(len(groups), dtype=float)
+    positions = np.arange(len(groups), dtype=float)
     others = 0
     for index, method in enumerate(plan.methods):
         ours = method.name == plan.table.ours
-        round_, place_in_round = (0, 0) if ours else divmod(others, len(METHOD_COLORS))
-        color, marker = (ACCENT, "o") if ours else (METHOD_COLORS[place_in_round], MARKERS[place_in_round])
+        round_, style = (0, 0) if ours else divmod(others, len(METHOD_COLORS))
+        color, marker = (ACCENT, "o") if ours else (METHOD_COLORS[style], MARKERS[style])
         others += not ours
         summaries = [_of(results, method.name, group) for group in range(len(groups))]
-        known = [(place, each) for place, each in zip(places, summaries, strict=True) if each is not None]
+        measured = [(x, each) for x, each in zip(positions, summaries, strict=True) if each is not None]
         shift = 0.05 * (index - (len(plan.methods) - 1) / 2) if len(plan.seeds) > 1 else 0.0
         axes.errorbar(
-            [place + shift for place, _ in known], [each.mean for _, each in known],
-            yerr=[each.spread or 0.0 for _, each in known] if len(plan.seeds) > 1 else None,
+            [x + shift for x, _ in measured], [each.mean for _, each in measured],
+            yerr=[each.spread or 0.0 for _, each in measured] if len(plan.seeds) > 1 else None,
             color=color, marker=marker, markersize=5.5, markerfacecolor="white" if round_ else color,
             linestyle=LINES[round_ % len(LINES)], linewidth=2.2 if ours else 1.3, elinewidth=1.0, capsize=2.5,
             label=method.title, zorder=3 if ours else 2,
@@ -83,9 +83,9 @@ def _panel(axes: Axes, plan: BenchPlan, results: Sequence[BenchResult], title: s
         f"{name}\nV {group_bounds(group)}"
         for name, group in zip(group_names(len(groups)), groups, strict=True)
     ]  # fmt: skip
-    axes.set_xticks(places, [name.replace(" seen ", "\nseen ") for name in names])
-    seen_by = next(result.visibility_source for result in results if result.groups)
-    axes.set_title(f"{title}, {VISIBILITY_LABELS[seen_by]}", fontsize=10.5, color=INK, loc="left")
+    axes.set_xticks(positions, [name.replace(" seen ", "\nseen ") for name in names])
+    source = next(result.visibility_source for result in results if result.groups)
+    axes.set_title(f"{title}, {VISIBILITY_LABELS[source]}", fontsize=10.5, color=INK, loc="left")
     axes.grid(axis="y", color=MUTED, alpha=0.18, linewidth=0.7)
     if first:
         axes.set_ylabel("PSNR, dB")

@@ -1,8 +1,8 @@
 """Every method measured on the same pixels by visibility.
 
 A run's own evaluation groups pixels by V as its own coarse model draws it; methods with other coarse models would then
-be compared on other pixels. Here one V of the scene (`seen.py`) says for every pixel of the test views how many
-training cameras see the place, and the pictures that each run left are measured against that.
+be compared on other pixels. Here one V of the scene (`pixel_visibility.py`) says for every pixel of the test views how
+many training cameras see the place, and the renders that each run left are measured against that.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from experiments.bench.seen import PixelVisibility
+from experiments.bench.pixel_visibility import PixelVisibility
 from experiments.bench.worker import RECORD_FILE
 from vdgs.captures.image_cache import ImageCache
 from vdgs.errors import VdgsError
@@ -30,7 +30,7 @@ from vdgs.system.atomic_files import read_json, to_jsonable, write_json
 GROUPS_FILE = "by_visibility.json"
 #: The same by the frusta that hold the true surface, of generated scenes.
 FRUSTA_FILE = "by_frusta.json"
-NAMES = ("squared_error", "ssim", "squared_error_cc", "ssim_cc")
+FIGURES = ("squared_error", "ssim", "squared_error_cc", "ssim_cc")
 
 
 def final_evaluation_folder(run: Path) -> Path:
@@ -47,44 +47,38 @@ def measure_groups(
     `runs`: folder -> key. The test views are read once for all. Raises VdgsError where a picture is missing.
     """
     file = FRUSTA_FILE if visibility.source == "frusta" else GROUPS_FILE
-    of = {
-        "seen_by": visibility.source,
-        "seen": visibility.identity,
-        "bins": bins,
-        "whole_cameras": True,
-        "tells_unseen": True,
-    }
-    wanted = {folder: of | {"run": key} for folder, key in runs.items()}
-    left = [folder for folder, record in wanted.items() if not _is_measured(folder / file, record)]
-    if not left:
+    record = {"visibility_source": visibility.source, "visibility_identity": visibility.identity, "bins": bins}
+    records = {folder: record | {"run": key} for folder, key in runs.items()}
+    to_measure = [folder for folder, record in records.items() if not _is_measured(folder / file, record)]
+    if not to_measure:
         return
     views = visibility.capture.test_views
     stems = unique_file_stems([view.name for view in views])
-    histograms = {folder: VisibilityHistogram(NAMES) for folder in left}
+    histograms = {folder: VisibilityHistogram(FIGURES) for folder in to_measure}
     unseen, pixels = 0, 0
     with ImageCache(views, IMAGE_CACHE_BYTES) as images:
         for index, view in enumerate(views):
             on_progress(f"test view {index + 1} of {len(views)}")
             photograph, views_of_pixels = images.get(index), visibility.visibility_map(view.camera)
             mask = None if photograph.mask is None else photograph.mask.numpy() > 0
-            kept = np.ones(views_of_pixels.shape, bool) if mask is None else mask
-            unseen, pixels = unseen + int((visibility.unseen(view.camera) & kept).sum()), pixels + int(kept.sum())
-            for folder in left:
-                picture = _read_picture(final_evaluation_folder(folder) / "renders" / f"{stems[index]}.png", folder)
-                histograms[folder].add(views_of_pixels, pixel_values(picture, photograph.image.numpy(), mask), mask)
-    for folder in left:
-        found = {"groups": histograms[folder].bins(bins), "unseen_share": unseen / max(pixels, 1)}
-        write_json(folder / file, to_jsonable(wanted[folder] | found))
+            valid = np.ones(views_of_pixels.shape, bool) if mask is None else mask
+            unseen, pixels = unseen + int((visibility.unseen(view.camera) & valid).sum()), pixels + int(valid.sum())
+            for folder in to_measure:
+                render = _read_render(final_evaluation_folder(folder) / "renders" / f"{stems[index]}.png", folder)
+                histograms[folder].add(views_of_pixels, pixel_values(render, photograph.image.numpy(), mask), mask)
+    for folder in to_measure:
+        groups = {"groups": histograms[folder].bins(bins), "unseen_share": unseen / max(pixels, 1)}
+        write_json(folder / file, to_jsonable(records[folder] | groups))
 
 
 def pixel_values(
-    picture: UInt8[np.ndarray, "h w 3"], photograph: UInt8[np.ndarray, "h w 3"], mask: np.ndarray | None
+    render: UInt8[np.ndarray, "h w 3"], photograph: UInt8[np.ndarray, "h w 3"], mask: np.ndarray | None
 ) -> dict[str, np.ndarray]:
     """Squared error and SSIM at every pixel [h, w], raw and after the colour correction."""
-    corrected = metrics.to_8bit(correct_colors(picture, photograph, mask).image)
+    corrected = metrics.to_8bit(correct_colors(render, photograph, mask).image)
     return {
-        "squared_error": metrics.squared_error(picture, photograph),
-        "ssim": metrics.ssim_map(picture, photograph, mask),
+        "squared_error": metrics.squared_error(render, photograph),
+        "ssim": metrics.ssim_map(render, photograph, mask),
         "squared_error_cc": metrics.squared_error(corrected, photograph),
         "ssim_cc": metrics.ssim_map(corrected, photograph, mask),
     }
@@ -101,17 +95,17 @@ def group_names(count: int) -> list[str]:
 
 def _is_measured(file: Path, record: Mapping[str, Any]) -> bool:
     try:
-        held = read_json(file)
+        saved = read_json(file)
     except (VdgsError, FileNotFoundError):
         return False
-    return isinstance(held, dict) and all(held.get(name) == value for name, value in record.items())
+    return isinstance(saved, dict) and all(saved.get(name) == value for name, value in record.items())
 
 
-def _read_picture(path: Path, run: Path) -> UInt8[np.ndarray, "h w 3"]:
-    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if picture is None:
+def _read_render(path: Path, run: Path) -> UInt8[np.ndarray, "h w 3"]:
+    render = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if render is None:
         raise VdgsError(
-            f"{path}: the rendered test view is missing or damaged. Delete {run / RECORD_FILE} and give the same command: "
-            "the run is then only measured again."
+            f"{path}: the rendered test view is missing or damaged. Delete {run / RECORD_FILE} and give the same "
+            "command: the run is then only measured again."
         )
-    return np.ascontiguousarray(picture[..., ::-1])
+    return np.ascontiguousarray(render[..., ::-1])

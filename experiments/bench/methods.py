@@ -10,7 +10,8 @@ from collections.abc import Callable
 from typing import Literal
 
 from experiments.baselines.gs3d.schedule import MIN_INTERVAL, PUBLISHED_ITERATIONS
-from experiments.bench.changes import (
+from experiments.bench.definitions import COARSE_STAGES, GS3D_STAGES, BenchMethod, ConfigOverride
+from experiments.bench.overrides import (
     FACTORIAL_CAMERAS,
     as_in_paper,
     coarse_only,
@@ -43,7 +44,6 @@ from experiments.bench.changes import (
     without_blocking_same_time,
     without_compensation,
 )
-from experiments.bench.definitions import COARSE_STAGES, GS3D_STAGES, BenchMethod, ConfigOverride
 from vdgs.config.method import CompensationConfig
 
 LAMBDA_VIS = (0.0, 0.5, 1.0, 1.3)
@@ -54,7 +54,7 @@ GAMMA = (0.80, 0.90, 0.95)
 BLOCKS = (1, 2, 4, 8, 16)
 #: Of the factorial: a cut by place alone, or by place and visibility; what g is added to (None: plain growth); T_low.
 FACTORIAL_VIS, FACTORIAL_T_LOW = (0.0, 1.0), (0.2, 0.3)
-FACTORIAL_ADDED: tuple[Literal["mean", "sum"] | None, ...] = (None, "mean", "sum")
+FACTORIAL_TARGETS: tuple[Literal["mean", "sum"] | None, ...] = (None, "mean", "sum")
 
 
 def _sweep(
@@ -176,7 +176,8 @@ _OTHERS = [
         "citygaussian",
         "CityGaussian partition",
         with_partition_strategy("citygaussian"),
-        citation="Liu et al., CityGaussian: Real-time High-quality Large-Scale Scene Rendering with Gaussians, ECCV 2024",
+        citation="Liu et al., CityGaussian: Real-time High-quality Large-Scale Scene Rendering with Gaussians, "
+        "ECCV 2024",
         omissions=_COMMON,
     ),
     BenchMethod(
@@ -206,14 +207,14 @@ _EACH_AS_LONG = [
 ]  # fmt: skip
 _COARSE_COMPENSATED = [
     BenchMethod(
-        f"coarse-compensated-{added_to}",
-        f"coarse stage, compensation as printed, {added_to}s",
-        coarse_with_compensation(CompensationConfig(target=added_to)),
+        f"coarse-compensated-{target}",
+        f"coarse stage, compensation as printed, {target}s",
+        coarse_with_compensation(CompensationConfig(target=target)),
         COARSE_STAGES,
         less="iterations of the coarse stage only",
         differs=f"to be read against `coarse`; {_GATE}",
     )
-    for added_to in ("mean", "sum")
+    for target in ("mean", "sum")
 ]
 #: What compensation is made of: g, and the lower gate for what few cameras see, which is our choice.
 _COARSE_PARTS = [
@@ -238,8 +239,8 @@ _LONGER = [
 ]  # fmt: skip
 _CHOICES = [
     BenchMethod("frozen-decoder", "frozen decoder", with_block(decoder="frozen")),
-    BenchMethod("even-sampling", "photographs used alike", with_block(sampling="even")),
-    BenchMethod("by-votes", "photographs by votes", with_block(sampling="visibility")),
+    BenchMethod("even-sampling", "photographs used alike", with_block(view_sampling="uniform")),
+    BenchMethod("by-votes", "photographs by votes", with_block(view_sampling="visibility")),
     BenchMethod("share-0.45", "cameras above a share of 0.45", with_assignment(threshold=0.45)),
     BenchMethod(
         "literal-assignment", "eq. 7 as printed", with_assignment(mode="paper", threshold=0.45),
@@ -252,15 +253,18 @@ _CHOICES = [
     ),
     BenchMethod(
         "printed-rates", "the coarse stage's rates again",
-        with_block(offset_rate=1.0, scale_rate=1.0, feature_rate=1.0),
+        with_block(lr_scale_offsets=1.0, lr_scale_log_scales=1.0, lr_scale_features=1.0),
     ),
     BenchMethod(
-        "damped-rates", "damped rates", with_block(offset_rate=0.4, scale_rate=0.8, feature_rate=1.0),
+        "damped-rates", "damped rates",
+        with_block(lr_scale_offsets=0.4, lr_scale_log_scales=0.8, lr_scale_features=1.0),
         differs="0.4 and 0.8 times the coarse stage's rates of offsets and scales, with which CityGaussian fine-tunes",
     ),
     BenchMethod(
         "printed-damped", "blocks as printed, damped rates",
-        lambda config, budget: with_block(offset_rate=0.4, scale_rate=0.8)(as_in_paper(config, budget), budget),
+        lambda config, budget: with_block(lr_scale_offsets=0.4, lr_scale_log_scales=0.8)(
+            as_in_paper(config, budget), budget
+        ),
         differs="`printed` with the rates of `damped-rates`: what earlier versions took for printed",
     ),
     BenchMethod("dense-adam", "dense Adam", with_dense_adam(full_method), differs="in the coarse stage and in blocks"),
@@ -268,25 +272,25 @@ _CHOICES = [
         "compensation-of-sums", "compensation as printed, of sums", with_summed_compensation,
         differs=f"T_low = 0.20, β_g = 2, γ = 0.9; {_GATE}; g is added to the sums of gradients",
     ),
-    BenchMethod("half-size", "photographs halved at first", with_block(resolutions=((0.0, 2), (0.3, 1)))),
-    BenchMethod("last-model", "the last model, no mean", with_block(average=0.0)),
+    BenchMethod("half-size", "photographs halved at first", with_block(resolution_schedule=((0.0, 2), (0.3, 1)))),
+    BenchMethod("last-model", "the last model, no mean", with_block(swa_fraction=0.0)),
     BenchMethod(
         "printed-compensation", "compensation as printed", lambda config, _: with_paper_compensation(config),
         differs=f"T_low = 0.20, β_g = 2, γ = 0.9; {_GATE}",
     ),
-    BenchMethod("no-context", "without context", with_block(context=False)),
-    BenchMethod("free-ring", "free ring", with_block(ring="free")),
+    BenchMethod("no-context", "without context", with_block(draw_outside=False)),
+    BenchMethod("free-ring", "free ring", with_block(margin="free")),
     BenchMethod(
-        "free-best-seen", "free ring, merged by best seen", with_max_visibility_merge(with_block(ring="free")),
+        "free-best-seen", "free ring, merged by best seen", with_max_visibility_merge(with_block(margin="free")),
         differs="to be read against `free-ring`",
     ),
     BenchMethod(
-        "ramp", "ramp ring, frozen decoder", with_block(ring="ramp", decoder="frozen"),
+        "ramp", "ramp ring, frozen decoder", with_block(margin="ramp", decoder="frozen"),
         differs="to be read against `frozen-decoder`: a ramp needs one",
     ),
     BenchMethod(
         "ramp-best-seen", "ramp ring, frozen decoder, merged by best seen",
-        with_max_visibility_merge(with_block(ring="ramp", decoder="frozen")), differs="to be read against `ramp`",
+        with_max_visibility_merge(with_block(margin="ramp", decoder="frozen")), differs="to be read against `ramp`",
     ),
     BenchMethod("literal-gate", "literal gate", with_paper_gate),
 ]  # fmt: skip
@@ -301,21 +305,21 @@ _SWEEPS = [
 ]
 
 
-def _cell(lambda_vis: float, added_to: Literal["mean", "sum"] | None, t_low: float) -> BenchMethod:
-    name = f"cell-{lambda_vis:g}-" + ("off" if added_to is None else f"{added_to}-{t_low:g}")
-    grown = "plain growth" if added_to is None else f"compensation of {added_to}s, T_low = {t_low:g}"
+def _cell(lambda_vis: float, target: Literal["mean", "sum"] | None, t_low: float) -> BenchMethod:
+    name = f"cell-{lambda_vis:g}-" + ("off" if target is None else f"{target}-{t_low:g}")
+    grown = "plain growth" if target is None else f"compensation of {target}s, T_low = {t_low:g}"
     return BenchMethod(
-        name, f"λ_vis = {lambda_vis:g}, {grown}", factorial_cell(lambda_vis, added_to, t_low),
+        name, f"λ_vis = {lambda_vis:g}, {grown}", factorial_cell(lambda_vis, target, t_low),
         differs=f"each block has {FACTORIAL_CAMERAS} cameras: those whose best block it is, and those that show it "
         f"best besides; β_g = 2, γ = 0.9; {_GATE}",
     )  # fmt: skip
 
 
 _FACTORIAL = [
-    _cell(lambda_vis, added_to, t_low)
+    _cell(lambda_vis, target, t_low)
     for lambda_vis in FACTORIAL_VIS
-    for added_to in FACTORIAL_ADDED
-    for t_low in (FACTORIAL_T_LOW if added_to else FACTORIAL_T_LOW[:1])
+    for target in FACTORIAL_TARGETS
+    for t_low in (FACTORIAL_T_LOW if target else FACTORIAL_T_LOW[:1])
 ]
 
 #: Of the threshold of growth: whether compensated growth is more than that.

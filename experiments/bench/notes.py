@@ -4,28 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from experiments.bench.claim_check import ClaimCheck
 from experiments.bench.definitions import BenchMethod
-from experiments.bench.grids import VISIBILITY_SOURCE_NOTES, all_group_bounds
+from experiments.bench.paper_numbers import PAPER_CONTRADICTIONS, PAPER_EFFICIENCY, PAPER_NUMBERS
 from experiments.bench.plan import BenchPlan
-from experiments.bench.quoted import PAPER_CONTRADICTIONS, PAPER_EFFICIENCY, PAPER_NUMBERS
+from experiments.bench.result_tables import VISIBILITY_SOURCE_NOTES, all_group_bounds
 from experiments.bench.results import BenchResult
-from experiments.bench.verdict import ClaimCheck
-from experiments.bench.writing import escape_markdown as plain
+from experiments.bench.table_writers import escape_markdown as plain
 from vdgs.partition.strategies import STRATEGIES
 
 
-def make_notes(plan: BenchPlan, results: Sequence[BenchResult], lines: Sequence[ClaimCheck], figure: bool) -> list[str]:
-    """Verdict, figure, fairness, failures, sources, scenes, and the paper's contradictions."""
+def make_notes(
+    plan: BenchPlan, results: Sequence[BenchResult], claims: Sequence[ClaimCheck], figure: bool
+) -> list[str]:
+    """Claims, figure, fairness, failures, sources, scenes, and the paper's contradictions."""
     parts = []
-    if lines:
-        parts.append(_list("Verdict", map(str, lines)))
+    if claims:
+        parts.append(_list("Claims", map(str, claims)))
     if figure:
         parts.append("![PSNR by visibility](groups.png)")
     parts.append(_fairness(plan))
     parts.append(_list("Groups by visibility", _groups(plan, results)))
-    lost = [each for each in results if each.state != "done" or each.reason]
-    said = [f"{each.method} on {each.scene}, seed {each.seed}: {each.state}. {each.reason}" for each in lost]
-    parts.append(_list("Missing", [*said, *_not_rendered(plan)]))
+    missing = [each for each in results if each.state != "done" or each.reason]
+    failures = [f"{each.method} on {each.scene}, seed {each.seed}: {each.state}. {each.reason}" for each in missing]
+    parts.append(_list("Missing", [*failures, *_not_rendered(plan)]))
     parts.append(_list("Where the figures are from", _provenance_notes(results)))
     parts.append(_list("Methods", map(_method, plan.methods)))
     parts.append(_list("Scenes", [f"{scene.title}: {scene.note}" for scene in plan.scenes if scene.note]))
@@ -36,10 +38,10 @@ def make_notes(plan: BenchPlan, results: Sequence[BenchResult], lines: Sequence[
     return [part for part in parts if part]
 
 
-_PARTS = (
-    "Where blocks draw only the part of each photograph that shows them (--block.crop pixels), their share of the "
-    "total counts photographs, whatever their size: they make more iterations, of smaller pictures (and so decide more "
-    "often about growth). The columns have both; in rows where these are the same, blocks draw whole photographs."
+_CROP_NOTE = (
+    "Where blocks draw only the part of each photograph that shows them (--block.crop fixed-pixels), their share of "
+    "the total counts photographs, whatever their size: they make more iterations, of smaller pictures (and so decide "
+    "more often about growth). The columns have both; in rows where these are the same, blocks draw whole photographs."
 )
 
 
@@ -55,28 +57,28 @@ def _not_rendered(plan: BenchPlan) -> list[str]:
 
 
 def _fairness(plan: BenchPlan) -> str:
-    said = [
+    notes = [
         "Same photographs, sparse points, split and total of iterations for all methods of a scene, but for rows of "
-        "which it is said below that they get less or more; where a cut gives fewer blocks than asked for, a method "
+        "which it is notes below that they get less or more; where a cut gives fewer blocks than asked for, a method "
         "gets fewer iterations, as its row says.",
         "A coarse stage that several methods share is trained once; its time counts for each of them. Training time is "
         "the sum over all blocks, as if one after the other; it depends on how many runs went at once (--jobs).",
         "LPIPS is VGG with input in [-1, 1]; a dash means that no weights were given (--lpips-weights).",
     ]
     if any(run.config.block.crop == "fixed-pixels" for run in plan.runs if "blocks" in run.stages):
-        said.append(_PARTS)
-    said += [
+        notes.append(_CROP_NOTE)
+    notes += [
         f"{scene.title}: {budget.coarse:,} coarse iterations and {budget.blocks} × {budget.per_block:,} for blocks, "
         f"{budget.total:,} in all."
         for scene in plan.scenes
         for budget in [plan.budgets[scene.name]]
     ]
     if plan.max_anchors:
-        said.append(_limit(plan))
-    foreign = [method.title for method in plan.methods if method.renders is not None]
-    if foreign:
-        said.append(f"None of this is known of {', '.join(foreign)}: rendered by another program.")
-    return _list("What each method got", said)
+        notes.append(_limit(plan))
+    external = [method.title for method in plan.methods if method.renders is not None]
+    if external:
+        notes.append(f"None of this is known of {', '.join(external)}: rendered by another program.")
+    return _list("What each method got", notes)
 
 
 def _limit(plan: BenchPlan) -> str:
@@ -91,33 +93,35 @@ def _limit(plan: BenchPlan) -> str:
 
 def _groups(plan: BenchPlan, results: Sequence[BenchResult]) -> list[str]:
     """What V of each scene is, and the V of each group."""
-    said = ["The same pixels for all methods and seeds; equal V is never split, so groups may differ in size."]
+    notes = ["The same pixels for all methods and seeds; equal V is never split, so groups may differ in size."]
     for scene in plan.scenes:
-        of = next((each for each in results if each.scene == scene.name and each.groups), None)
-        if of is not None:
-            said.append(f"{scene.title}: {VISIBILITY_SOURCE_NOTES[of.visibility_source]}. {all_group_bounds(of)}")
-    return said if len(said) > 1 else []
+        result = next((each for each in results if each.scene == scene.name and each.groups), None)
+        if result is not None:
+            notes.append(
+                f"{scene.title}: {VISIBILITY_SOURCE_NOTES[result.visibility_source]}. {all_group_bounds(result)}"
+            )
+    return notes if len(notes) > 1 else []
 
 
 def _provenance_notes(results: Sequence[BenchResult]) -> list[str]:
     """When and on what which runs were trained: of several machines only figures of the same one compare in seconds."""
     runs: dict[str, dict[int, list[str]]] = {}
     for each in results:
-        if each.origin:
-            runs.setdefault(each.origin, {}).setdefault(each.seed, []).append(f"{each.method} on {each.scene}")
+        if each.provenance:
+            runs.setdefault(each.provenance, {}).setdefault(each.seed, []).append(f"{each.method} on {each.scene}")
     if len(runs) == 1:
         return [f"{next(iter(runs))}: all."]
     return [
-        f"{origin}: " + "; ".join(f"seed {seed}: {', '.join(names)}" for seed, names in seeds.items()) + "."
-        for origin, seeds in runs.items()
+        f"{provenance}: " + "; ".join(f"seed {seed}: {', '.join(names)}" for seed, names in seeds.items()) + "."
+        for provenance, seeds in runs.items()
     ]
 
 
 def _method(method: BenchMethod) -> str:
-    left = list(method.omissions)
+    omissions = list(method.omissions)
     strategy = STRATEGIES.get(method.name)
     if strategy is not None:
-        left = [*strategy.omissions, *left]
+        omissions = [*strategy.omissions, *omissions]
     text = f"{method.title} (`{method.name}`)" if not method.citation else f"{method.title} ({method.citation})"
     if method.differs:
         text += f": {method.differs}"
@@ -125,7 +129,7 @@ def _method(method: BenchMethod) -> str:
         text += f". Gets less: {method.less}"
     if method.more:
         text += f". Gets more: {method.more}"
-    return text + (f". Left out: {'; '.join(left)}" if left else "")
+    return text + (f". Left out: {'; '.join(omissions)}" if omissions else "")
 
 
 def _list(title: str, lines: object) -> str:

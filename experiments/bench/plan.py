@@ -9,9 +9,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from experiments.bench.custom_scenes import resolve_scenes
 from experiments.bench.definitions import GS3D_STAGES, BenchMethod, BenchScene, BenchTable, Budget
-from experiments.bench.explicit import gs3d_config
-from experiments.bench.folders import resolve_scenes
+from experiments.bench.gs3d_stage import gs3d_config
 from experiments.bench.methods import METHODS
 from experiments.bench.renders import method_from_renders, renders_digest, renders_folder
 from experiments.bench.tables import TABLES
@@ -87,7 +87,7 @@ class BenchPlan:
     #: Coarse stages that several runs share, to be trained first.
     coarse: tuple[PlannedRun, ...]
     runs: tuple[PlannedRun, ...]
-    #: (scene, method, seed) -> the run that answers for it: methods with the same settings share one.
+    #: (scene, method, seed) -> the run that it is measured on: methods with the same settings share one.
     run_of: Mapping[tuple[str, str, int], PlannedRun]
     #: Most anchors of a scene; 0 for no limit.
     max_anchors: int = 0
@@ -109,25 +109,24 @@ def make_plan(name: str, options: PlanOptions) -> BenchPlan:
     seeds = table.seeds if options.seeds is None else tuple(range(options.seeds))
     if not seeds:
         raise VdgsError("--seeds must be at least 1")
-    foreign = _render_methods(options, scenes, seeds)
+    external = _render_methods(options, scenes, seeds)
     budgets: dict[str, Budget] = {}
-    answers: dict[tuple[str, str, int], PlannedRun] = {}
+    run_of: dict[tuple[str, str, int], PlannedRun] = {}
     coarse, runs = list[PlannedRun](), list[PlannedRun]()
     for scene in scenes:
         budgets[scene.name] = budget = _budget(scene, options)
         for seed in seeds:
             base = _limit_anchors(scene.base(budget, seed, budget.total / scene.budget.total), options)
             planned = [_planned(scene, method, budget, base, seed) for method in methods]
-            planned += _render_runs(scene, foreign, base, seed)
+            planned += _render_runs(scene, external, base, seed)
             shared, planned = _share_coarse(planned)
             coarse += shared
-            taken: dict[str, PlannedRun] = {}
+            distinct: dict[str, PlannedRun] = {}
             for run in planned:
-                same = taken.setdefault(run.key({}, {}), run)
-                answers[scene.name, run.method, seed] = same
-            runs += taken.values()
+                run_of[scene.name, run.method, seed] = distinct.setdefault(run.key({}, {}), run)
+            runs += distinct.values()
     return BenchPlan(
-        table, scenes, methods + foreign, seeds, budgets, tuple(coarse), tuple(runs), answers, options.max_anchors,
+        table, scenes, methods + external, seeds, budgets, tuple(coarse), tuple(runs), run_of, options.max_anchors,
         options.validation,
     )  # fmt: skip
 
@@ -136,26 +135,26 @@ def _render_methods(
     options: PlanOptions, scenes: Sequence[BenchScene], seeds: Sequence[int]
 ) -> tuple[BenchMethod, ...]:
     """The methods whose renders are given. Raises VdgsError for a name that is taken or a folder without renders."""
-    found = list[BenchMethod]()
+    methods = list[BenchMethod]()
     for text in options.renders:
-        method = method_from_renders(text, [*METHODS.values(), *found])
+        method = method_from_renders(text, [*METHODS.values(), *methods])
         if not any(renders_folder(method, scene.name, seed) for scene in scenes for seed in seeds):
             names = ", ".join(scene.name for scene in scenes)
             raise VdgsError(
                 f"--renders {text!r}: {method.renders} holds no renders. They are looked for in folders named after "
                 f"the scenes ({names}): SCENE/*.png, or SCENE/0/*.png, SCENE/1/*.png, ... for several seeds."
             )
-        found.append(method)
-    return tuple(found)
+        methods.append(method)
+    return tuple(methods)
 
 
 def _render_runs(scene: BenchScene, methods: Sequence[BenchMethod], base: MethodConfig, seed: int) -> list[PlannedRun]:
     """The runs that measure what others rendered of a scene, where they did."""
-    found = [(method, renders_folder(method, scene.name, seed)) for method in methods]
+    renders = [(method, renders_folder(method, scene.name, seed)) for method in methods]
     return [
         PlannedRun(scene.name, method.name, seed, Path("runs", scene.name, f"renders-{method.name}", str(seed)),
                    method.stages, base, renders=folder, identity=renders_digest(folder))
-        for method, folder in found if folder is not None
+        for method, folder in renders if folder is not None
     ]  # fmt: skip
 
 

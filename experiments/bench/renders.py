@@ -62,8 +62,8 @@ def renders_folder(method: BenchMethod, scene: str, seed: int) -> Path | None:
     """Where the renders of a scene and seed are; None where there are none."""
     if method.renders is None:
         return None
-    of_scene = method.renders / scene
-    folders = [of_scene / str(seed)] + [of_scene] * (seed == 0)
+    scene_folder = method.renders / scene
+    folders = [scene_folder / str(seed)] + [scene_folder] * (seed == 0)
     return next((folder for folder in folders if any(folder.glob("*.png"))), None)
 
 
@@ -83,8 +83,8 @@ def check_renders(folder: Path, views: Sequence[View]) -> list[Path]:
     if missing:
         more = f" and {len(missing) - MAX_LISTED} more" if len(missing) > MAX_LISTED else ""
         raise VdgsError(
-            f"{folder}: lacks {len(missing)} of {len(files)} views: {', '.join(missing[:MAX_LISTED])}{more}. Each is needed "
-            "under that name, as PNG in the size of the photograph."
+            f"{folder}: lacks {len(missing)} of {len(files)} views: {', '.join(missing[:MAX_LISTED])}{more}. Each is "
+            "needed under that name, as PNG in the size of the photograph."
         )
     for file, view in zip(files, views, strict=True):
         _read(file, view)
@@ -98,9 +98,9 @@ def measure_renders(capture: Capture, folder: Path, output: Path, lpips_weights:
     """
     views = capture.test_views
     files = check_renders(folder, views)
-    of_camera = {id(view.camera): (file, view) for file, view in zip(files, views, strict=True)}
+    by_camera = {id(view.camera): (file, view) for file, view in zip(files, views, strict=True)}
     lpips, note = load_lpips(lpips_weights)
-    model = RenderableModel(render=lambda camera: _LoadedRender(_read(*of_camera[id(camera)])), is_timed=False)
+    model = RenderableModel(render=lambda camera: _LoadedRender(_read(*by_camera[id(camera)])), is_timed=False)
     with cached_reference_views(views) as photographs:
         evaluate_model(photographs, model, output, lpips=lpips, lpips_note=note, console=console)
 
@@ -112,13 +112,13 @@ class _LoadedRender:
 
 def _read(file: Path, view: View) -> Float[Tensor, "h w 3"]:
     """RGB in [0, 1]; transparency is not looked at."""
-    picture = cv2.imread(str(file), cv2.IMREAD_COLOR)
-    if picture is None:
+    image = cv2.imread(str(file), cv2.IMREAD_COLOR)
+    if image is None:
         raise VdgsError(f"{file}: cannot be read as a picture")
-    height, width = picture.shape[:2]
+    height, width = image.shape[:2]
     if (width, height) != (view.camera.width, view.camera.height):
         raise VdgsError(
             f"{file}: is {width} x {height} pixels, the photograph as it is used here {view.camera.width} x "
             f"{view.camera.height}. Render it in that size."
         )
-    return torch.from_numpy(np.ascontiguousarray(picture[..., ::-1])).float() / 255.0
+    return torch.from_numpy(np.ascontiguousarray(image[..., ::-1])).float() / 255.0

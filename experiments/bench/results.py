@@ -24,9 +24,9 @@ QUALITY_KEYS = ("psnr", "ssim", "lpips_vgg", "lpips_vgg_01", "psnr_cc", "ssim_cc
 REFERENCE_EXPOSURE_KEYS = ("psnr_reference_exposure", "ssim_reference_exposure")
 #: Over the pixels that training cameras see: how opaque they are, PSNR by background, errors of depth; and veils.
 COVERAGE_KEYS = (
-    "opacity_coverage", "psnr_covered_own_background", "psnr_covered_black", "psnr_covered_white", "depth_error_median_expected",
-    "depth_error_median_median", "depth_within_1_percent_expected", "depth_within_1_percent_median",
-    "oversized_splats",
+    "opacity_coverage", "psnr_covered_own_background", "psnr_covered_black", "psnr_covered_white",
+    "depth_error_median_expected", "depth_error_median_median", "depth_within_1_percent_expected",
+    "depth_within_1_percent_median", "oversized_splats",
 )  # fmt: skip
 
 
@@ -46,14 +46,14 @@ class BenchResult:
     figures: Mapping[str, float | None] = field(default_factory=dict)
     #: By visibility, least seen first: lower, upper, pixels.
     groups: tuple[Mapping[str, Any], ...] = ()
-    #: What V of the groups is (`seen.SeenBy`); empty without groups.
+    #: What V of the groups is (`pixel_visibility.VisibilitySource`); empty without groups.
     visibility_source: str = ""
     #: The same by V as the paper counts it, of generated scenes: figures as `psnr@frusta0`.
     frusta: tuple[Mapping[str, Any], ...] = ()
     #: Changes with everything that the result depends on, but for the version and the machine.
     key: str = ""
-    #: When, on what and with which version it was trained (`origin.py`).
-    origin: str = ""
+    #: When, on what and with which version it was trained (`provenance.py`).
+    provenance: str = ""
 
 
 def collect_results(
@@ -70,8 +70,8 @@ def collect_results(
             results.append(replace(cached[keys[run.name]], scene=scene, method=method, seed=seed))
             continue
         end = ended.get(run.name)
-        state, why = (end.state, end.reason) if end else ("missing", "")
-        result = BenchResult(scene, method, seed, state, why, str(run.folder), key=keys[run.name])
+        state, reason = (end.state, end.reason) if end else ("missing", "")
+        result = BenchResult(scene, method, seed, state, reason, str(run.folder), key=keys[run.name])
         if state == "done":
             try:
                 result = _read(output, run, result)
@@ -100,9 +100,11 @@ def _read(output: Path, planned: PlannedRun, result: BenchResult) -> BenchResult
     bounds, measured = _groups(run.path / GROUPS_FILE, "@", figures)
     by_frusta, _ = _groups(run.path / FRUSTA_FILE, "@frusta", figures)
     figures["unseen_share"] = measured.get("unseen_share")
-    seen_by = measured["seen_by"] if bounds else ""
-    origin = record.get("origin", "")
-    return replace(result, figures=figures, groups=bounds, visibility_source=seen_by, frusta=by_frusta, origin=origin)
+    source = measured["visibility_source"] if bounds else ""
+    provenance = record.get("provenance", "")
+    return replace(
+        result, figures=figures, groups=bounds, visibility_source=source, frusta=by_frusta, provenance=provenance
+    )
 
 
 def _groups(file: Path, at: str, figures: dict[str, float | None]) -> tuple[tuple[dict[str, Any], ...], dict[str, Any]]:

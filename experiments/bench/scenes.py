@@ -120,7 +120,7 @@ def _real(name: str) -> BenchScene:
 def _mega_nerf(name: str, title: str, uneven: bool) -> BenchScene:
     folder = f"{name}-pixsfm"
     return BenchScene(
-        name, title, PAPER_BUDGET, "paper", capture=folder, options={"downscale": 4.0}, uneven=uneven,
+        name, title, PAPER_BUDGET, "default", capture=folder, options={"downscale": 4.0}, uneven=uneven,
         note=_MEGA_NERF.replace("NAME", name),
     )  # fmt: skip
 
@@ -143,7 +143,7 @@ _SCENES = [
     _mega_nerf("rubble", "Rubble", uneven=False),
     _mega_nerf("building", "Building", uneven=False),
     BenchScene(
-        "block-all", "Block-All", PAPER_BUDGET, "paper", capture="small_city/aerial/pose/block_all",
+        "block-all", "Block-All", PAPER_BUDGET, "default", capture="small_city/aerial/pose/block_all",
         options={"downscale": 1.2}, uneven=False,
         note="MatrixCity, small city, aerial: pose/block_all; 1920 pixels wide, read at 1600.",
     ),

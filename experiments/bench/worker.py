@@ -1,6 +1,6 @@
 """One run of a table, in a process of its own: `python -m experiments.bench.worker JOB.json`.
 
-Its folder is an ordinary run: the verbs `partition`, `train`, `merge`, `eval`, `render` and `report` work on it.
+Its folder is an ordinary run: the verbs `partition`, `train-blocks`, `merge`, `eval`, `render` and `report` work on it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from vdgs.system.atomic_files import read_json, write_json
 if TYPE_CHECKING:
     from vdgs.runs.run_context import RunContext
 
-#: In the run folder: state, key, why, seconds of each stage.
+#: In the run folder: state, key, provenance, seconds of each stage.
 RECORD_FILE = "bench.json"
 
 
@@ -112,7 +112,7 @@ def _evaluate(at: _JobContext) -> None:
 
 
 def _gaussians(at: _JobContext) -> None:
-    from experiments.bench.explicit import train_gs3d
+    from experiments.bench.gs3d_stage import train_gs3d
 
     train_gs3d(at.context.run, at.context.capture, at.job.lpips_weights, at.console)
 
@@ -164,7 +164,7 @@ def run_job(job: BenchJob) -> None:
     """All stages of a job, noting how long each took; the record says done only at the end."""
     from rich.console import Console
 
-    from experiments.bench.origin import describe_provenance
+    from experiments.bench.provenance import describe_provenance
     from vdgs.kernels import configure_threads
 
     configure_threads(job.threads)
@@ -177,7 +177,7 @@ def run_job(job: BenchJob) -> None:
             STAGES[name](working)
             record["seconds"][name] = record["seconds"].get(name, 0.0) + time.monotonic() - began
             write_json(job.output / RECORD_FILE, record)
-        write_json(job.output / RECORD_FILE, record | {"state": "done", "origin": describe_provenance(job.threads)})
+        write_json(job.output / RECORD_FILE, record | {"state": "done", "provenance": describe_provenance(job.threads)})
 
 
 @contextmanager

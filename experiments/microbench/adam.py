@@ -11,8 +11,8 @@ from types import ModuleType
 
 import torch
 
-from experiments.microbench.machine import describe
-from experiments.microbench.stopwatch import medians_ms
+from experiments.microbench.hardware_info import describe
+from experiments.microbench.timing import medians_ms
 from vdgs.kernels.cpu import adam as native
 from vdgs.kernels.cpu import extension
 from vdgs.kernels.kernel_types import AdamState
@@ -48,7 +48,7 @@ def main() -> None:
     parser.add_argument("--anchors", type=int, default=100_000)
     parser.add_argument("--visible", type=int, default=20_000)
     parser.add_argument("--threads", type=int, default=extension.get_num_threads())
-    parser.add_argument("--color-iterations", type=int, default=15)
+    parser.add_argument("--rounds", type=int, default=15)
     arguments = parser.parse_args()
     extension.set_num_threads(arguments.threads)
     torch.set_num_threads(arguments.threads)

@@ -25,8 +25,8 @@ import numpy as np
 import shapely
 import torch
 
-from experiments.microbench.machine import describe
-from experiments.microbench.stopwatch import medians_ms
+from experiments.microbench.hardware_info import describe
+from experiments.microbench.timing import medians_ms
 from vdgs.config.method import AssignmentConfig
 from vdgs.geometry.camera import Camera
 from vdgs.kernels import cpu as kernels
@@ -81,11 +81,11 @@ def strip(visible: int, blocks: int, cameras: int) -> tuple[AnchorModel, list[Ca
     ), views
 
 
-def slices(model: AnchorModel, count: int) -> Blocks:
+def strip_blocks(model: AnchorModel, count: int) -> Blocks:
     """Blocks side by side along x, with about equally many anchors, widened as by --partition.expansion 0.4."""
-    places = model.anchors.positions[:, :2].double().numpy()
-    edges = np.quantile(places[:, 0], np.linspace(0, 1, count + 1))
-    low, high = places[:, 1].min(), places[:, 1].max()
+    points = model.anchors.positions[:, :2].double().numpy()
+    edges = np.quantile(points[:, 0], np.linspace(0, 1, count + 1))
+    low, high = points[:, 1].min(), points[:, 1].max()
     cores = [shapely.box(a, low, b, high) for a, b in pairwise(edges)]
     return Blocks(tuple(Block(core, core.buffer(0.4 * np.sqrt(core.area / np.pi))) for core in cores))
 
@@ -109,7 +109,7 @@ def main() -> None:
         model, cameras = run.model, [view.camera for view in run.capture.train_views]
     else:
         model, cameras = strip(arguments.visible, arguments.blocks, arguments.cameras)
-    blocks = slices(model, arguments.blocks)
+    blocks = strip_blocks(model, arguments.blocks)
     seen = [int((kernels.count_visibility(model.anchors.positions, [camera]) > 0).sum()) for camera in cameras]
     print(
         f"{len(cameras)} cameras, {len(blocks)} blocks, {len(model.anchors):,} anchors, "

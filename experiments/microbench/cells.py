@@ -11,8 +11,8 @@ from types import ModuleType
 
 import torch
 
-from experiments.microbench.machine import describe
-from experiments.microbench.stopwatch import medians_ms
+from experiments.microbench.hardware_info import describe
+from experiments.microbench.timing import medians_ms
 from vdgs.kernels.cpu import cells as native
 from vdgs.kernels.cpu import extension
 from vdgs.kernels.torch_ref import cells as reference
@@ -43,7 +43,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--points", type=int, default=1_000_000)
     parser.add_argument("--threads", type=int, default=extension.get_num_threads())
-    parser.add_argument("--color-iterations", type=int, default=7)
+    parser.add_argument("--rounds", type=int, default=7)
     arguments = parser.parse_args()
     extension.set_num_threads(arguments.threads)
     torch.set_num_threads(arguments.threads)

@@ -1,4 +1,4 @@
-"""What a card does, within a few minutes: whether it computes what the processor computes, and how long that takes.
+"""Check a GPU in a few minutes: whether it computes what the processor computes, and how long that takes.
 
     python -m experiments.microbench.gpu [--minutes 8] [--capture PLACE] [--small]
 
@@ -29,7 +29,7 @@ import torch
 
 from experiments.microbench import gpu_parity, step
 from experiments.microbench.cuda_resources import resources_of
-from experiments.microbench.machine import describe
+from experiments.microbench.hardware_info import describe
 from vdgs.cli.main import main as vdgs
 from vdgs.kernels.cuda.driver import CudaUnavailable, get_cuda_driver
 from vdgs.kernels.cuda.nvrtc import CompileTarget, get_nvrtc
@@ -46,12 +46,12 @@ TOWN_DB = 0.5
 
 
 @dataclass(frozen=True)
-class Machine:
-    """A device, and what is asked of it besides tensors. Tests put another in the place of the card."""
+class GpuDevice:
+    """A device, and and the functions that the measurements need of it. Tests replace the card by another."""
 
     device: torch.device
-    synchronise: Callable[[], None]
-    forget_peak: Callable[[], None]
+    synchronize: Callable[[], None]
+    reset_peak: Callable[[], None]
     peak_bytes: Callable[[], int]
     capability: tuple[int, int]
 
@@ -81,18 +81,18 @@ SMALL = Sizes(
 
 @dataclass
 class Report:
-    """What was found wrong, and what there was no time for."""
+    """Errors, and sections that were skipped for want of time."""
 
     seconds: float
     began: float = field(default_factory=time.monotonic)
-    wrong: list[str] = field(default_factory=list)
-    left_out: list[str] = field(default_factory=list)
+    errors: list[str] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)
 
     @contextmanager
     def section(self, title: str) -> Iterator[bool]:
-        """Gives whether there is time for it; an error in one section is told, and the next one goes on."""
+        """Gives whether there is time for it; an error in one section is printed, and the next one follows."""
         if time.monotonic() - self.began > self.seconds:
-            self.left_out.append(title)
+            self.skipped.append(title)
             yield False
             return
         print(f"\n{title}", flush=True)
@@ -100,10 +100,10 @@ class Report:
             yield True
         except Exception as error:
             traceback.print_exc()
-            self.wrong.append(f"{title}: {type(error).__name__}: {error}")
+            self.errors.append(f"{title}: {type(error).__name__}: {error}")
 
 
-def find_card() -> Machine | str:
+def find_card() -> GpuDevice | str:
     """The first card, or why none can be used."""
     try:
         driver = get_cuda_driver()
@@ -117,62 +117,63 @@ def find_card() -> Machine | str:
         major, minor = card.capability
         print(f"card         {card.name}, {card.memory_bytes / 1e9:.1f} GB, compute capability {major}.{minor}")
     print(f"NVRTC        {compiler.version[0]}.{compiler.version[1]}, from {compiler.library_info.origin}")
-    return Machine(
+    return GpuDevice(
         torch.device("cuda"), torch.cuda.synchronize, torch.cuda.reset_peak_memory_stats,
         torch.cuda.max_memory_allocated, cards[0].capability,
     )  # fmt: skip
 
 
-def print_resources(machine: Machine) -> None:
-    target: CompileTarget = get_nvrtc().target_for(machine.capability)
+def print_resources(gpu: GpuDevice) -> None:
+    target: CompileTarget = get_nvrtc().target_for(gpu.capability)
     if target.is_ptx:
         print(f"this NVRTC is older than the card: {target.name}, which the driver compiles on")
         return
     for source, headers in SOURCES.items():
-        for found in resources_of(source, target, headers):
+        for kernel in resources_of(source, target, headers):
             print(
-                f"{found.kernel:22} {found.registers:4} registers {found.shared_bytes:6} B shared "
-                f"{found.spilled_bytes:4} B spilled"
+                f"{kernel.kernel:22} {kernel.registers:4} registers {kernel.shared_bytes:6} B shared "
+                f"{kernel.spilled_bytes:4} B spilled"
             )
 
 
-def print_parity(machine: Machine, sizes: Sizes, report: Report) -> None:
-    for found in gpu_parity.differences(machine.device, *sizes.parity):
-        name = f"{found.operation}{f' by {found.by}' if found.by else ''}: {found.result}"
-        print(f"{name:56} {found.size:9.1e} {'' if found.agrees else 'TOO FAR'}", flush=True)
-        if not found.agrees:
-            report.wrong.append(f"{name} differs by {found.size:.1e}")
+def print_parity(gpu: GpuDevice, sizes: Sizes, report: Report) -> None:
+    for difference in gpu_parity.differences(gpu.device, *sizes.parity):
+        name = f"{difference.operation}{f' by {difference.backend}' if difference.backend else ''}: {difference.result}"
+        print(f"{name:56} {difference.size:9.1e} {'' if difference.agrees else 'TOO FAR'}", flush=True)
+        if not difference.agrees:
+            report.errors.append(f"{name} differs by {difference.size:.1e}")
 
 
 def train_town(sizes: Sizes, report: Report) -> None:
     with tempfile.TemporaryDirectory() as folder:
         capture = Path(folder) / "capture"
-        command("synth", str(capture), *sizes.town)
-        found = {
-            device: trained(capture, Path(folder) / device, device, sizes.iterations, "--seed", "1")
+        run_command("synth", str(capture), *sizes.town)
+        results = {
+            device: train_and_measure(capture, Path(folder) / device, device, sizes.iterations, "--seed", "1")
             for device in ("cpu", "cuda")
         }
-    for device, (psnr, seconds) in found.items():
+    for device, (psnr, seconds) in results.items():
         print(
             f"{device:6} {psnr:6.2f} dB after {sizes.iterations} iterations, {seconds:6.1f} s with all that is around"
         )
-    off = abs(found["cpu"][0] - found["cuda"][0])
-    if not off <= TOWN_DB:
-        report.wrong.append(f"the town differs by {off:.2f} dB")
+    difference = abs(results["cpu"][0] - results["cuda"][0])
+    if not difference <= TOWN_DB:
+        report.errors.append(f"the town differs by {difference:.2f} dB")
 
 
-def trained(capture: Path, run: Path, device: str, iterations: int, *options: str) -> tuple[float, float]:
+def train_and_measure(capture: Path, run: Path, device: str, iterations: int, *options: str) -> tuple[float, float]:
     """PSNR of the test views after a coarse stage, and its seconds."""
     begin = time.monotonic()
-    command(
-        "coarse", str(capture), "--output", str(run), "--iterations", str(iterations), "--device", device, *options
+    run_command(
+        "train-coarse", str(capture), "--output", str(run), "--iterations", str(iterations), "--device", device,
+        *options,
     )  # fmt: skip
     seconds = time.monotonic() - begin
-    command("eval", str(run), "--model", "coarse", "--device", device)
+    run_command("eval", str(run), "--model", "coarse", "--device", device)
     return json.loads((run / "coarse" / "evaluation" / "metrics.json").read_text())["psnr"], seconds
 
 
-def command(*arguments: str) -> None:
+def run_command(*arguments: str) -> None:
     """A verb of vdgs in this process. Raises RuntimeError where it fails."""
     try:
         vdgs(list(arguments))
@@ -181,14 +182,14 @@ def command(*arguments: str) -> None:
             raise RuntimeError(f"vdgs {' '.join(arguments)} ended with {ended.code}") from ended
 
 
-def time_steps(machine: Machine, sizes: Sizes) -> None:
+def time_steps(gpu: GpuDevice, sizes: Sizes) -> None:
     for name in rasterizers():
         os.environ[rasterizer.RASTERIZER_ENV_VAR] = name
         for visible, width, height in sizes.steps:
-            state, camera, target = step.prepare(visible, width, height, device=machine.device)
+            state, camera, target = step.prepare(visible, width, height, device=gpu.device)
             times: dict[str, list[float]] = {phase: [] for phase in step.PHASES}
             for number in range(1, sizes.rounds + 4):
-                seen, splats = step.one_step(state, camera, target, number, times, machine.synchronise)
+                seen, splats = step.one_step(state, camera, target, number, times, gpu.synchronize)
             medians = {phase: statistics.median(values[3:]) for phase, values in times.items()}
             parts = "  ".join(f"{phase} {value:.2f}" for phase, value in medians.items())
             print(
@@ -208,16 +209,16 @@ def rasterizers() -> list[str]:
     return ["gsplat", "cuda"]
 
 
-def print_memory(machine: Machine, sizes: Sizes) -> None:
+def print_memory(gpu: GpuDevice, sizes: Sizes) -> None:
     """Slopes of the peak over the number of anchors, in view and out of view, with the smallest pictures."""
     _, width, height = sizes.steps[0]
 
     def peak(visible: int, hidden: int) -> int:
-        machine.forget_peak()
-        state, camera, target = step.prepare(visible, width, height, hidden, device=machine.device)
+        gpu.reset_peak()
+        state, camera, target = step.prepare(visible, width, height, hidden, device=gpu.device)
         for number in range(1, 4):
-            step.one_step(state, camera, target, number, {phase: [] for phase in step.PHASES}, machine.synchronise)
-        return machine.peak_bytes()
+            step.one_step(state, camera, target, number, {phase: [] for phase in step.PHASES}, gpu.synchronize)
+        return gpu.peak_bytes()
 
     count = sizes.memory
     base = peak(count, 0)
@@ -227,41 +228,41 @@ def print_memory(machine: Machine, sizes: Sizes) -> None:
 
 def train_capture(capture: Path, iterations: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        psnr, seconds = trained(capture, Path(folder) / "run", "cuda", iterations)
+        psnr, seconds = train_and_measure(capture, Path(folder) / "run", "cuda", iterations)
     print(f"{capture.name}: {psnr:.2f} dB after {iterations} iterations, {seconds:.1f} s, reading included")
 
 
-def main(arguments: list[str] | None = None, machine: Machine | None = None) -> int:
+def main(arguments: list[str] | None = None, gpu: GpuDevice | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=8.0, help="no section begins after so long (default 8)")
     parser.add_argument("--capture", type=Path, help="also train on this capture")
     parser.add_argument("--iterations", type=int, default=1500, help="of that training (default 1500)")
     parser.add_argument("--small", action="store_true", help="as little of everything as tries all of it")
-    asked = parser.parse_args(arguments)
-    found = machine or find_card()
-    if isinstance(found, str):
-        print(f"No GPU to measure: {found}", file=sys.stderr)
+    args = parser.parse_args(arguments)
+    device = gpu or find_card()
+    if isinstance(device, str):
+        print(f"No GPU to measure: {device}", file=sys.stderr)
         return 2
     print(describe())
-    sizes, report = SMALL if asked.small else FULL, Report(60 * asked.minutes)
+    sizes, report = SMALL if args.small else FULL, Report(60 * args.minutes)
     sections: dict[str, Callable[[], None]] = {
-        "what the kernels take": lambda: print_resources(found),
-        "parity with the processor": lambda: print_parity(found, sizes, report),
+        "what the kernels take": lambda: print_resources(device),
+        "parity with the processor": lambda: print_parity(device, sizes, report),
         "a generated town": lambda: train_town(sizes, report),
-        "a training step": lambda: time_steps(found, sizes),
-        "memory": lambda: print_memory(found, sizes),
+        "a training step": lambda: time_steps(device, sizes),
+        "memory": lambda: print_memory(device, sizes),
     }
-    if asked.capture is not None:
-        sections["a capture"] = lambda: train_capture(asked.capture, asked.iterations)
+    if args.capture is not None:
+        sections["a capture"] = lambda: train_capture(args.capture, args.iterations)
     for title, work in sections.items():
         with report.section(title) as has_time:
             if has_time:
                 work()
-    for title in report.left_out:
+    for title in report.skipped:
         print(f"no time was left for: {title}")
-    for line in report.wrong:
+    for line in report.errors:
         print(line, file=sys.stderr)
-    return 1 if report.wrong else 0
+    return 1 if report.errors else 0
 
 
 if __name__ == "__main__":

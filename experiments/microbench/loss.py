@@ -1,6 +1,6 @@
 """Photometric loss with its gradient: the native kernel beside torch, in one run.
 
-OMP_WAIT_POLICY=PASSIVE python -m experiments.microbench.loss [--threads 2] [--color-iterations 5]
+OMP_WAIT_POLICY=PASSIVE python -m experiments.microbench.loss [--threads 2] [--rounds 5]
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from types import ModuleType
 
 import torch
 
-from experiments.microbench.machine import describe
-from experiments.microbench.stopwatch import medians_ms
+from experiments.microbench.hardware_info import describe
+from experiments.microbench.timing import medians_ms
 from vdgs.kernels.cpu import extension
 from vdgs.kernels.cpu import loss as native
 from vdgs.kernels.torch_ref import loss as reference
@@ -37,7 +37,7 @@ def main() -> None:
     """Print one line for each size."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--threads", type=int, default=extension.get_num_threads())
-    parser.add_argument("--color-iterations", type=int, default=5)
+    parser.add_argument("--rounds", type=int, default=5)
     arguments = parser.parse_args()
     extension.set_num_threads(arguments.threads)
     torch.set_num_threads(arguments.threads)

@@ -18,7 +18,7 @@ import numpy as np
 import shapely
 import torch
 
-from experiments.microbench.machine import describe
+from experiments.microbench.hardware_info import describe
 from experiments.microbench.visibility import flight
 from vdgs.config.method import PartitionConfig
 from vdgs.kernels.cpu import extension
@@ -49,11 +49,11 @@ def town(n: int) -> np.ndarray:
     return np.column_stack([flat, generator.uniform(0, 60, n)])
 
 
-def look_up(blocks: Blocks, places: np.ndarray, where: str) -> None:
+def time_lookup(blocks: Blocks, points: np.ndarray, where: str) -> None:
     """Time the owners of places and compare a part of them with brute force."""
-    owner = timed(f"owners of {len(places)} places {where}, {len(blocks)} cores", lambda: blocks.owner(places))
-    points = shapely.points(places[:COMPARED])
-    distance = np.stack([shapely.distance(block.core, points) for block in blocks.items], axis=1)
+    owner = timed(f"owners of {len(points)} points {where}, {len(blocks)} cores", lambda: blocks.owner(points))
+    compared = shapely.points(points[:COMPARED])
+    distance = np.stack([shapely.distance(block.core, compared) for block in blocks.items], axis=1)
     print(
         f"{'':>52} {100 * (distance.min(axis=1) > 0).mean():6.0f} % outside every core, "
         f"{(distance.argmin(axis=1) != owner[:COMPARED]).sum()} of {COMPARED} differ from brute force"
@@ -80,8 +80,8 @@ def main() -> None:
         blocks = timed(title, lambda config=config: partition_scene(positions, views, config, seed=0)[0])  # type: ignore[misc]
     corners = [len(shapely.get_coordinates(block.core)) for block in blocks.items]
     print(f"{'corners of the cores':>52} {min(corners)} to {max(corners)}")
-    look_up(blocks, generator.uniform(0, EXTENT_M, (1_000_000, 2)), "in the box")
-    look_up(blocks, generator.uniform(-1.5 * EXTENT_M, 2.5 * EXTENT_M, (1_000_000, 2)), "about it")
+    time_lookup(blocks, generator.uniform(0, EXTENT_M, (1_000_000, 2)), "in the box")
+    time_lookup(blocks, generator.uniform(-1.5 * EXTENT_M, 2.5 * EXTENT_M, (1_000_000, 2)), "about it")
     print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MiB")
 
 

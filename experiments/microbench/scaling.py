@@ -4,15 +4,15 @@
       [--stages cut ...] [--anchors 100000 1000000] [--photographs 100 1000]
     python -m experiments.microbench.scaling table RESULTS
 
-Every case runs in a process of its own, one after the other, and is a line of the file RESULTS. What is there is not
-measured again: stopped, the same command goes on; to measure a stage anew, delete its lines. Seconds are of the wall
-clock, with those of the processors beside them: on a machine that does other things too, believe those. Memory is what
-the process takes at most, its libraries and its input included, and beside it what the input took.
+Every case runs in a process of its own, one after the other, and is a line of the file RESULTS. Cases that the file
+has are not measured again: the same command continues after a stop; to measure a stage anew, delete its lines. Seconds
+are of the wall clock, with those of the processors beside them: on a machine that does other things too, believe those.
+Memory is what the process takes at most, its libraries and its input included, and beside it what the input took.
 
 The exponent of growth is log(t2 / t1) / log(n2 / n1) over the last two sizes: 1 is in proportion to the input.
-Stages of anchors: visibility, cut, owners, rows (facts of the blocks), figures, assignment (of SCORED cameras), save,
+Stages of anchors: visibility, cut, owners, rows (records of the blocks), figures, assignment (of SCORED cameras), save,
 load, merge (opened, merged and saved), start (bounds of sizes and ground of the pictures, before a step can be made).
-Stages of photographs: open, facts (fingerprint and soundness), inspect, plan (vdgs run --dry-run).
+Stages of photographs: open, metadata (fingerprint and validation), inspect, plan (vdgs run --dry-run).
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from experiments.microbench import made_up
-from experiments.microbench.machine import describe
+from experiments.microbench import synthetic_scene
+from experiments.microbench.hardware_info import describe
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.partition.blocks import Blocks
 from vdgs.system.memory.process_memory import peak_memory_bytes, reset_peak_memory
@@ -78,24 +78,27 @@ class Measured:
 def _visibility(case: Case, folder: Path) -> Work:
     from vdgs.visibility.visibility_counts import count_visibility
 
-    extent = made_up.extent_of(case.photographs)
-    positions, cameras = torch.from_numpy(made_up.places(case.anchors, extent)), made_up.flight(case.photographs)
+    extent = synthetic_scene.extent_for(case.photographs)
+    positions, cameras = (
+        torch.from_numpy(synthetic_scene.random_positions(case.anchors, extent)),
+        synthetic_scene.flight(case.photographs),
+    )
     return lambda: count_visibility(positions, cameras)
 
 
-def _seen_places(case: Case) -> tuple[np.ndarray, np.ndarray]:
+def _positions_and_visibility(case: Case) -> tuple[np.ndarray, np.ndarray]:
     """Anchors and how many photographs hold each."""
     from vdgs.visibility.visibility_counts import count_visibility
 
-    positions = made_up.places(case.anchors, made_up.extent_of(case.photographs))
-    return positions, count_visibility(torch.from_numpy(positions), made_up.flight(case.photographs)).numpy()
+    positions = synthetic_scene.random_positions(case.anchors, synthetic_scene.extent_for(case.photographs))
+    return positions, count_visibility(torch.from_numpy(positions), synthetic_scene.flight(case.photographs)).numpy()
 
 
 def _cut(case: Case, folder: Path) -> Work:
     from vdgs.config.method import PartitionConfig
     from vdgs.partition.partition_scene import partition_scene
 
-    positions, views = _seen_places(case)
+    positions, views = _positions_and_visibility(case)
     return lambda: partition_scene(positions, views, PartitionConfig(blocks=BLOCKS), seed=0)
 
 
@@ -111,9 +114,13 @@ def _cut_site(case: Case) -> tuple[Blocks, np.ndarray, np.ndarray]:
     from vdgs.config.method import PartitionConfig
     from vdgs.partition.partition_scene import partition_scene
 
-    positions, views = _seen_places(case)
-    some = slice(None, None, max(1, case.anchors // 200_000))
-    return partition_scene(positions[some], views[some], PartitionConfig(blocks=BLOCKS), seed=0)[0], positions, views
+    positions, views = _positions_and_visibility(case)
+    sample = slice(None, None, max(1, case.anchors // 200_000))
+    return (
+        partition_scene(positions[sample], views[sample], PartitionConfig(blocks=BLOCKS), seed=0)[0],
+        positions,
+        views,
+    )
 
 
 def _rows(case: Case, folder: Path) -> Work:
@@ -121,45 +128,52 @@ def _rows(case: Case, folder: Path) -> Work:
     from vdgs.partition.assignment.assignment_tables import assignment_rows
 
     blocks, positions, views = _cut_site(case)
-    why = np.ones((case.photographs, len(blocks)), np.int8)
-    return lambda: assignment_rows(blocks, positions, views, Assignment(why > 0, why, []))
+    reasons = np.ones((case.photographs, len(blocks)), np.int8)
+    return lambda: assignment_rows(blocks, positions, views, Assignment(reasons > 0, reasons, []))
 
 
 def _figures(case: Case, folder: Path) -> Work:
-    from vdgs.plots.partition import block_maps
+    from vdgs.plots.partition.block_maps import plot_anchor_visibility, plot_blocks
+    from vdgs.plots.partition.block_stats import plot_block_stats
+    from vdgs.plots.partition.score_heatmap import plot_scores
 
     blocks, positions, views = _cut_site(case)
-    cameras, used = made_up.flight(case.photographs), np.ones((case.photographs, len(blocks)), bool)
+    cameras, used = synthetic_scene.flight(case.photographs), np.ones((case.photographs, len(blocks)), bool)
 
     def draw() -> None:
         names = ("x (m)", "y (m)")
-        block_maps.plot_anchor_visibility(folder / "map.png", positions, views, cameras, names)
-        block_maps.plot_blocks(folder / "blocks.png", positions, views, cameras, used, [("cut", blocks)], names)
-        block_maps.plot_block_stats(folder / "facts.png", positions, views, blocks, used, "m", blocks)
-        block_maps.plot_scores(folder / "scores.png", np.random.default_rng(0).random(used.shape), used)
+        plot_anchor_visibility(folder / "map.png", positions, views, cameras, names)
+        plot_blocks(folder / "blocks.png", positions, views, cameras, used, [("cut", blocks)], names)
+        plot_block_stats(folder / "stats.png", positions, views, blocks, used, "m", blocks)
+        plot_scores(folder / "scores.png", np.random.default_rng(0).random(used.shape), used)
 
     return draw
 
 
 def _site_model(case: Case) -> AnchorModel:
-    extent = made_up.extent_of(case.photographs)
-    return made_up.model(made_up.places(case.anchors, extent), extent)
+    extent = synthetic_scene.extent_for(case.photographs)
+    return synthetic_scene.random_model(synthetic_scene.random_positions(case.anchors, extent), extent)
 
 
 def _assignment(case: Case, folder: Path) -> Work:
     from vdgs.config.method import AssignmentConfig
     from vdgs.partition.assignment.score_matrix import compute_score_matrix
 
-    model, blocks = _site_model(case), made_up.slices(made_up.extent_of(case.photographs), BLOCKS)
-    cameras = made_up.flight(case.photographs)[:: max(1, case.photographs // SCORED)][:SCORED]
+    model, blocks = (
+        _site_model(case),
+        synthetic_scene.strip_blocks(synthetic_scene.extent_for(case.photographs), BLOCKS),
+    )
+    cameras = synthetic_scene.flight(case.photographs)[:: max(1, case.photographs // SCORED)][:SCORED]
     return lambda: compute_score_matrix(model, blocks, cameras, AssignmentConfig())
 
 
 def _start(case: Case, folder: Path) -> Work:
     from vdgs.model.scale_bounds import max_log_scales
 
-    positions = torch.from_numpy(made_up.places(case.anchors, made_up.extent_of(case.photographs)))
-    cameras = made_up.flight(case.photographs)
+    positions = torch.from_numpy(
+        synthetic_scene.random_positions(case.anchors, synthetic_scene.extent_for(case.photographs))
+    )
+    cameras = synthetic_scene.flight(case.photographs)
     return lambda: max_log_scales(positions, cameras)
 
 
@@ -169,7 +183,7 @@ def _save(case: Case, folder: Path) -> Work:
 
 
 def _load(case: Case, folder: Path) -> Work:
-    _elsewhere(lambda: _site_model(case).save(folder / "model.safetensors"))
+    _run_in_child(lambda: _site_model(case).save(folder / "model.safetensors"))
     return lambda: AnchorModel.load(folder / "model.safetensors")
 
 
@@ -178,7 +192,10 @@ def _merge(case: Case, folder: Path) -> Work:
     from vdgs.partition.blocks import xy_positions
     from vdgs.partition.merging import merge_blocks
 
-    blocks, cameras = made_up.slices(made_up.extent_of(case.photographs), BLOCKS), made_up.flight(case.photographs)
+    blocks, cameras = (
+        synthetic_scene.strip_blocks(synthetic_scene.extent_for(case.photographs), BLOCKS),
+        synthetic_scene.flight(case.photographs),
+    )
     files = [folder / f"block_{index}.safetensors" for index in range(len(blocks))]
 
     def write() -> None:
@@ -193,20 +210,20 @@ def _merge(case: Case, folder: Path) -> Work:
             ).save(file)
         whole.save(folder / "coarse.safetensors")
 
-    _elsewhere(write)
-    of_block = [cameras[index :: len(blocks)] for index in range(len(blocks))]
+    _run_in_child(write)
+    cameras_of_blocks = [cameras[index :: len(blocks)] for index in range(len(blocks))]
 
     def work() -> None:
         coarse = AnchorModel.load(folder / "coarse.safetensors")
         trained = [partial(AnchorModel.load, file) for file in files]
-        merged, _ = merge_blocks(coarse, trained, blocks, of_block, MergeConfig())
+        merged, _ = merge_blocks(coarse, trained, blocks, cameras_of_blocks, MergeConfig())
         merged.save(folder / "merged.safetensors")
 
     return work
 
 
 def _capture(case: Case, folder: Path) -> Path:
-    _elsewhere(lambda: made_up.capture(folder / "capture", case.photographs))
+    _run_in_child(lambda: synthetic_scene.write_capture(folder / "capture", case.photographs))
     return folder / "capture"
 
 
@@ -217,7 +234,7 @@ def _open(case: Case, folder: Path) -> Work:
     return lambda: load_capture(path)
 
 
-def _facts(case: Case, folder: Path) -> Work:
+def _metadata(case: Case, folder: Path) -> Work:
     from vdgs.captures.capture_metadata import capture_metadata
     from vdgs.captures.loading import load_capture
     from vdgs.captures.validation import require_valid
@@ -228,11 +245,18 @@ def _facts(case: Case, folder: Path) -> Work:
 
 def _command(case: Case, folder: Path, *words: str) -> Work:
     """A verb of the command line and its arguments, in this process."""
-    from vdgs import cli
+    from vdgs.cli.main import main
 
     path = _capture(case, folder)
-    verb = getattr(cli, words[0])
-    return lambda: verb([word.format(capture=path, folder=folder) for word in words[1:]])
+
+    def work() -> None:
+        try:
+            main([word.format(capture=path, folder=folder) for word in words])
+        except SystemExit as ended:
+            if ended.code:
+                raise
+
+    return work
 
 
 def _inspect(case: Case, folder: Path) -> Work:
@@ -247,11 +271,11 @@ OF_ANCHORS = {
     "visibility": _visibility, "cut": _cut, "owners": _owners, "rows": _rows, "figures": _figures,
     "assignment": _assignment, "save": _save, "load": _load, "merge": _merge, "start": _start,
 }  # fmt: skip
-OF_PHOTOGRAPHS = {"open": _open, "facts": _facts, "inspect": _inspect, "plan": _plan}
+OF_PHOTOGRAPHS = {"open": _open, "metadata": _metadata, "inspect": _inspect, "plan": _plan}
 STAGES = OF_ANCHORS | OF_PHOTOGRAPHS
 
 
-def _elsewhere(work: Work) -> None:
+def _run_in_child(work: Work) -> None:
     """Do something in a child, so that its memory is not ours."""
     child = os.fork()
     if child == 0:
@@ -263,7 +287,7 @@ def _elsewhere(work: Work) -> None:
         finally:
             os._exit(code)
     if os.waitpid(child, 0)[1] != 0:
-        raise SystemExit("what the stage needs could not be made")
+        raise SystemExit("the input of the stage could not be made")
 
 
 # -------------------------------------------------------------------------------------------- measuring
@@ -282,7 +306,7 @@ def measure_here(case: Case) -> Measured:
                     peak_bytes=peak_memory_bytes(), load=load)  # fmt: skip
 
 
-def cases(stages: list[str], anchors: list[int], photographs: list[int], flight: int) -> list[Case]:
+def list_cases(stages: list[str], anchors: list[int], photographs: list[int], flight: int) -> list[Case]:
     """Stages of anchors over a flight of one size, those of photographs at each size."""
     return [
         case
@@ -295,11 +319,11 @@ def cases(stages: list[str], anchors: list[int], photographs: list[int], flight:
     ]
 
 
-def measure(results: Path, wanted: list[Case]) -> None:
+def measure(results: Path, cases: list[Case]) -> None:
     """Add to the file what is not there yet."""
-    known = {(each.stage, each.anchors, each.photographs) for each in read(results)}
-    for case in wanted:
-        if (case.stage, case.anchors, case.photographs) in known:
+    measured = {(each.stage, each.anchors, each.photographs) for each in read(results)}
+    for case in cases:
+        if (case.stage, case.anchors, case.photographs) in measured:
             continue
         words = [case.stage, str(case.anchors), str(case.photographs)]
         command = [sys.executable, "-m", "experiments.microbench.scaling", "one", *words]
@@ -322,11 +346,11 @@ def read(results: Path) -> list[Measured]:
 # ------------------------------------------------------------------------------------------------ table
 
 
-def table(found: list[Measured]) -> str:
+def table(results: list[Measured]) -> str:
     """Markdown: a row for each stage and size, by stage and ascending."""
     rows = ["| stage | anchors | photographs | seconds | processor s | GB | of it input | exponent |", "|---" * 8 + "|"]
     for stage in STAGES:
-        of_stage = sorted((e for e in found if e.stage == stage), key=lambda e: (e.photographs, e.anchors))
+        of_stage = sorted((e for e in results if e.stage == stage), key=lambda e: (e.photographs, e.anchors))
         before: Measured | None = None
         for each in of_stage:
             anchors = f"{each.anchors:,}" if each.anchors else ""
@@ -364,15 +388,15 @@ def main() -> None:
     one.add_argument("stage", choices=STAGES)
     one.add_argument("anchors", type=int)
     one.add_argument("photographs", type=int)
-    asked = parser.parse_args()
-    if asked.verb == "one":
-        measured = measure_here(Case(asked.stage, asked.anchors, asked.photographs))
+    args = parser.parse_args()
+    if args.verb == "one":
+        measured = measure_here(Case(args.stage, args.anchors, args.photographs))
         print(json.dumps(asdict(measured)), flush=True)
-    elif asked.verb == "measure":
+    elif args.verb == "measure":
         print(describe())
-        measure(asked.results, cases(asked.stages, asked.anchors, asked.photographs, asked.flight))
+        measure(args.results, list_cases(args.stages, args.anchors, args.photographs, args.flight))
     else:
-        print(table(read(asked.results)))
+        print(table(read(args.results)))
 
 
 if __name__ == "__main__":

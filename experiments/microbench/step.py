@@ -1,4 +1,4 @@
-"""Where the time of one whole training step goes: cull, decode, rasterise, loss, its way back to the
+"""Where the time of one whole training step goes: cull, decode, rasterize, loss, its way back to the
 splats, from them to anchors that move, statistics.
 
     python -m experiments.microbench.step [--threads 2] [--visible 20000] [--own 0.125]
@@ -29,7 +29,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 import numpy as np
 import torch
 
-from experiments.microbench.machine import describe
+from experiments.microbench.hardware_info import describe
 from vdgs.config.method import TrainConfig
 from vdgs.geometry.camera import Camera
 from vdgs.kernels import get_backend, set_num_threads
@@ -43,7 +43,7 @@ from vdgs.training import FrozenAnchors, TrainingProblem, initial_state, to_chec
 from vdgs.training.optimizer import learning_rates_at
 from vdgs.training.training_step import backward_and_step, render_for_training
 
-PHASES = ("cull", "decode", "around", "rasterize", "loss", "solid", "backward", "move", "statistics")
+PHASES = ("cull", "decode", "around", "rasterize", "loss", "backward", "move", "statistics")
 
 
 def scene(visible: int, width: int, height: int, hidden: int = 0) -> tuple[Anchors, Camera]:
@@ -73,26 +73,26 @@ def scene(visible: int, width: int, height: int, hidden: int = 0) -> tuple[Ancho
 
 
 def timed_phase(
-    times: dict[str, list[float]], phase: str, work: Callable[[], Any], synchronise: Callable[[], None] | None
+    times: dict[str, list[float]], phase: str, work: Callable[[], Any], synchronize: Callable[[], None] | None
 ) -> Any:
     begin = time.perf_counter()
     result = work()
-    if synchronise is not None:
-        synchronise()
+    if synchronize is not None:
+        synchronize()
     times[phase].append(1e3 * (time.perf_counter() - begin))
     return result
 
 
 def one_step(
     state: Any, camera: Camera, target: torch.Tensor, step: int, times: dict[str, list[float]],
-    synchronise: Callable[[], None] | None = None, surroundings: FrozenAnchors | None = None,
+    synchronize: Callable[[], None] | None = None, surroundings: FrozenAnchors | None = None,
 ) -> tuple[int, int]:  # fmt: skip
-    """The work of vdgs.training.train_step, phase by phase, where the anchors are; `synchronise` waits for it."""
+    """The work of vdgs.training.training_step, phase by phase, where the anchors are; `synchronize` waits for it."""
     device = state.anchors.positions.device
     kernels, rates = get_backend(device), learning_rates_at(TrainConfig().lr, 0.1)
 
     def timed(phase: str, work: Callable[[], Any]) -> Any:
-        return timed_phase(times, phase, work, synchronise)
+        return timed_phase(times, phase, work, synchronize)
 
     weights = state.decoder.weights_for_image(0)
     with torch.no_grad():
@@ -176,8 +176,8 @@ def measure(visible: int, width: int, height: int, repeats: int, own: float) -> 
 
 def peaks(visible: int, hidden: int) -> tuple[int, int, int]:
     """Bytes of a fresh process: once all is imported, at most during three steps, and what saving adds after them."""
-    asked = [sys.executable, "-m", "experiments.microbench.step", "--peak", str(visible), str(hidden)]
-    imported, steps, saving = subprocess.run(asked, check=True, capture_output=True, text=True).stdout.split()
+    args = [sys.executable, "-m", "experiments.microbench.step", "--peak", str(visible), str(hidden)]
+    imported, steps, saving = subprocess.run(args, check=True, capture_output=True, text=True).stdout.split()
     return int(imported), int(steps), int(saving)
 
 

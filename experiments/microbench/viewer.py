@@ -40,14 +40,14 @@ SERVER = "import sys\nfrom vdgs.cli.main import main\nmain(sys.argv[1:])"
 MOVES = 30.0
 
 
-def around(run: Path, width: int, height: int):
+def orbit_camera(run: Path, width: int, height: int):
     """A camera on a circle about the scene, by its angle in radians."""
-    stand = overview_pose(open_run(run).capture)
-    away, focal = stand.position - stand.look_at, 0.5 * height / math.tan(math.radians(FOV_DEG / 2))
+    overview = overview_pose(open_run(run).capture)
+    away, focal = overview.position - overview.look_at, 0.5 * height / math.tan(math.radians(FOV_DEG / 2))
 
     def camera(angle: float) -> Camera:
         turn = np.array([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1.0]])
-        pose = look_at_pose(stand.look_at + turn @ away, stand.look_at)
+        pose = look_at_pose(overview.look_at + turn @ away, overview.look_at)
         return Camera(
             camera_from_world=pose, fx=focal, fy=focal, cx=width / 2, cy=height / 2, width=width, height=height
         )
@@ -80,11 +80,11 @@ def start(run: Path, camera) -> Started:
     return Started(process, address, taken, used.user + used.system)
 
 
-def moving(address: str, camera, seconds: float, start: float = 0.0) -> dict[str, float]:
+def visit_moving(address: str, camera, seconds: float, start: float = 0.0) -> dict[str, float]:
     """A visitor whose camera turns for so long and then rests: pictures a second, their size, gaps, age, time to full.
 
     The age of what a visitor sees is greatest just before the next picture comes: the time since the camera stood where
-    the last picture was asked for is at most the gap and the time that one picture takes.
+    the last picture was args for is at most the gap and the time that one picture takes.
     """
     guest, arrivals, sizes, stopped = Guest(address), list[float](), list[int](), threading.Event()
     ended = [math.inf]
@@ -118,7 +118,7 @@ def moving(address: str, camera, seconds: float, start: float = 0.0) -> dict[str
     }  # fmt: skip
 
 
-def coming_and_going(address: str, camera, seconds: float, number: int) -> int:
+def visit_repeatedly(address: str, camera, seconds: float, number: int) -> int:
     """One after another visits for a while, each looks about for some seconds and vanishes or leaves; how many."""
     until, visits = time.perf_counter() + seconds, 0
     while time.perf_counter() < until:
@@ -131,7 +131,7 @@ def coming_and_going(address: str, camera, seconds: float, number: int) -> int:
     return visits
 
 
-def together(jobs: list[Callable[[], Any]]) -> list[Any]:
+def run_together(jobs: list[Callable[[], Any]]) -> list[Any]:
     """Do jobs at the same time."""
     with ThreadPoolExecutor(len(jobs)) as pool:
         return [each.result() for each in [pool.submit(job) for job in jobs]]
@@ -139,25 +139,25 @@ def together(jobs: list[Callable[[], Any]]) -> list[Any]:
 
 def load(address: str, camera, visitors: int, seconds: float, server: psutil.Process) -> None:
     """Visitors for a long time, half of whom vanish in the middle and come again; memory every tenth of it."""
-    weights: list[int] = []
+    memory_mb: list[int] = []
     ended = threading.Event()
 
-    def weigh() -> None:
+    def sample_memory() -> None:
         while not ended.wait(seconds / 10):
-            weights.append(round(server.memory_info().rss / 1e6))
+            memory_mb.append(round(server.memory_info().rss / 1e6))
 
-    scales = threading.Thread(target=weigh)
-    scales.start()
-    stay = [lambda n=n: moving(address, camera, seconds, 0.7 * n) for n in range(visitors // 2)]
-    change = [lambda n=n: coming_and_going(address, camera, seconds, n) for n in range(visitors - visitors // 2)]
-    found = together([*stay, *change])
+    sampler = threading.Thread(target=sample_memory)
+    sampler.start()
+    stay = [lambda n=n: visit_moving(address, camera, seconds, 0.7 * n) for n in range(visitors // 2)]
+    change = [lambda n=n: visit_repeatedly(address, camera, seconds, n) for n in range(visitors - visitors // 2)]
+    results = run_together([*stay, *change])
     ended.set()
-    scales.join()
-    rates = [each["rate"] for each in found[: len(stay)]]
+    sampler.join()
+    rates = [each["rate"] for each in results[: len(stay)]]
     print(
-        f"load: {visitors} visitors for {seconds:g} s, of whom {len(change)} came {sum(found[len(stay) :])} times and "
-        f"vanished half of them: those who stayed got {min(rates):.1f} to {max(rates):.1f} pictures a second; "
-        "memory, MB: " + " ".join(str(weight) for weight in weights)
+        f"load: {visitors} visitors for {seconds:g} s, of whom {len(change)} came {sum(results[len(stay) :])} times "
+        f"and vanished half of them: those who stayed got {min(rates):.1f} to {max(rates):.1f} pictures a second; "
+        "memory, MB: " + " ".join(str(megabytes) for megabytes in memory_mb)
     )
     assert server.is_running()
 
@@ -169,31 +169,33 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--load", type=float, default=0.0, help="Seconds of the load test; 300 is a good while")
     parser.add_argument("--size", type=int, nargs=2, default=(1280, 800))
-    asked = parser.parse_args()
-    camera = around(asked.run, *asked.size)
+    args = parser.parse_args()
+    camera = orbit_camera(args.run, *args.size)
     print(f"load of the machine before: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
-    started = start(asked.run, camera)
+    started = start(args.run, camera)
     address = started.address
     try:
         print(f"first picture after {started.seconds:.2f} s, of which the server computed {started.cpu_seconds:.2f} s")
         server = psutil.Process(started.process.pid)
         print(f"memory with the first picture: {server.memory_info().rss / 1e6:.0f} MB")
-        one = moving(address, camera, min(asked.seconds, 10.0))
+        one = visit_moving(address, camera, min(args.seconds, 10.0))
         print(
             f"one visitor: {one['rate']:.1f} pictures a second while moving, {one['width']:.0f} px wide, 95 % of gaps "
             f"below {1e3 * one['gap']:.0f} ms, the longest {1e3 * one['longest']:.0f} ms, full picture "
             f"{1e3 * one['rest']:.0f} ms after the camera came to rest"
         )
         before = server.memory_info().rss
-        found = together([lambda n=n: moving(address, camera, asked.seconds, 0.7 * n) for n in range(asked.sessions)])
-        rates, gaps = [each["rate"] for each in found], [each["gap"] for each in found]
+        results = run_together(
+            [lambda n=n: visit_moving(address, camera, args.seconds, 0.7 * n) for n in range(args.visitors)]
+        )
+        rates, gaps = [each["rate"] for each in results], [each["gap"] for each in results]
         print(
-            f"{len(found)} visitors for {asked.seconds:g} s: {min(rates):.1f} to {max(rates):.1f} pictures a second "
-            f"each, {np.median([each['width'] for each in found]):.0f} px wide, 95 % of gaps below "
+            f"{len(results)} visitors for {args.seconds:g} s: {min(rates):.1f} to {max(rates):.1f} pictures a second "
+            f"each, {np.median([each['width'] for each in results]):.0f} px wide, 95 % of gaps below "
             f"{1e3 * max(gaps):.0f} ms; memory {before / 1e6:.0f} -> {server.memory_info().rss / 1e6:.0f} MB"
         )
-        if asked.load:
-            load(address, camera, asked.sessions, asked.load, server)
+        if args.load:
+            load(address, camera, args.visitors, args.load, server)
     finally:
         started.process.send_signal(signal.SIGINT)
         started.process.wait()

@@ -14,7 +14,7 @@ import time
 import numpy as np
 import torch
 
-from experiments.microbench.machine import describe
+from experiments.microbench.hardware_info import describe
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.cpu import extension
 from vdgs.kernels.cpu import visibility as native

@@ -14,9 +14,9 @@ from rich.console import Console
 
 from experiments.bench import bench
 from experiments.bench.bench import BenchSettings, run_bench
-from experiments.bench.grids import group_bounds
+from experiments.bench.pixel_visibility import visibility_from_frusta, visibility_from_truth
 from experiments.bench.plan import PlanOptions
-from experiments.bench.seen import visibility_from_frusta, visibility_from_truth
+from experiments.bench.result_tables import group_bounds
 from support.commands import begun, is_free, vdgs, wait_until
 from support.forking import start_tasks
 from vdgs.config.capture_options import CaptureOptions
@@ -66,9 +66,9 @@ def test_a_bench_that_was_killed_continues_to_its_tables(benched):
     groups = [each["groups"] for each in results["results"]]
     assert groups[0] == groups[1]  # the same pixels
     assert "**" in (benched / "toy" / "table.md").read_text()
-    for name in ("table.tex", "table.csv", "verdict.txt", "groups.png"):
+    for name in ("table.tex", "table.csv", "claims.txt", "groups.png"):
         assert (benched / "toy" / name).stat().st_size
-    assert len(results["verdict"]) == 2
+    assert len(results["claims"]) == 2
 
 
 def test_a_finished_bench_trains_nothing_again(benched):
@@ -95,7 +95,7 @@ def test_other_settings_do_not_discard_what_is_trained(benched):
 
 def test_generated_scenes_are_grouped_by_the_true_visibility(benched):
     results = json.loads((benched / "toy" / "results.json").read_text())["results"]
-    assert {each["seen_by"] for each in results} == {"truth"}
+    assert {each["visibility_source"] for each in results} == {"truth"}
     root = benched / "captures" / "tiny"
     seen = visibility_from_truth(root, CaptureOptions())
     assert seen is not None
@@ -106,7 +106,7 @@ def test_generated_scenes_are_grouped_by_the_true_visibility(benched):
     for group in groups:
         assert ((counted >= group["lower"]) & (counted <= group["upper"])).sum() == group["pixels"]
     assert "truly see the surface" in (benched / "toy" / "table.md").read_text()
-    assert f"(V {group_bounds(groups[0])})" in (benched / "toy" / "verdict.txt").read_text()
+    assert f"(V {group_bounds(groups[0])})" in (benched / "toy" / "claims.txt").read_text()
 
 
 def test_frusta_hold_at_least_what_is_truly_seen(benched):

@@ -9,13 +9,13 @@ import pytest
 from rich.console import Console
 
 from experiments.bench.bench import BenchSettings, run_bench
-from experiments.bench.known import drop_cached_runs, match_pixel_groups, read_cached_results
+from experiments.bench.cached_results import drop_cached_runs, match_pixel_groups, read_cached_results
 from experiments.bench.plan import PlanOptions, make_plan
 from experiments.bench.results import BenchResult
 from support.bench import InThisProcess, write_data
 from vdgs.errors import VdgsError
 
-pytestmark = pytest.mark.xdist_group("bench known")
+pytestmark = pytest.mark.xdist_group("bench_cached_results")
 
 
 def asked(data: Path, output: Path, seeds: int = 1, known: tuple[Path, ...] = (), total: int = 40) -> BenchSettings:
@@ -41,7 +41,7 @@ def there(data, tmp_path_factory) -> Path:
     output = tmp_path_factory.mktemp("known") / "there"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("experiments.bench.bench.LocalExecutor", InThisProcess)
-        patch.setattr("experiments.bench.origin.origin", lambda threads: "1999-12-31, another machine")
+        patch.setattr("experiments.bench.provenance.describe_provenance", lambda threads: "1999-12-31, another machine")
         bench(asked(data, output))
     return output / "table2" / "results.json"
 
@@ -55,14 +55,14 @@ def here(monkeypatch) -> None:
     monkeypatch.setattr("experiments.bench.bench.LocalExecutor", InThisProcess)
 
 
-def test_what_is_known_is_not_trained(data, there, tmp_path):
+def test_cached_results_are_not_trained_again(data, there, tmp_path):
     results, said = bench(asked(data, tmp_path / "out", known=(there,)))
     assert "2 of 2 runs are known" in said
     assert not (tmp_path / "out" / "runs").exists()
     before = json.loads(there.read_text())["results"]
     after = json.loads((tmp_path / "out" / "table2" / "results.json").read_text())["results"]
     assert after == before
-    assert {each.origin for each in results.values()} == {"1999-12-31, another machine"}
+    assert {each.provenance for each in results.values()} == {"1999-12-31, another machine"}
     assert "1999-12-31, another machine: all." in (tmp_path / "out" / "table2" / "table.md").read_text()
     # A table that was written from a file can be the file of another one.
     again, _ = bench(asked(data, tmp_path / "again", known=(tmp_path / "out" / "table2" / "results.json",)))
@@ -85,12 +85,12 @@ def test_another_seed_is_trained_beside_it(data, there, tmp_path):
 
 
 def test_other_settings_are_another_run(data, there, tmp_path):
-    plan = make_plan("table2", asked(data, tmp_path, total=60).choices)
+    plan = make_plan("table2", asked(data, tmp_path, total=60).plan_options)
     known = read_cached_results([there])
     assert all(run.key({}, {}) not in known for run in plan.runs)
 
 
-def test_a_coarse_stage_that_only_known_runs_share_is_not_trained():
+def test_a_coarse_stage_that_only_cached_runs_share_is_not_trained():
     plan = make_plan("toy", PlanOptions(methods=("baseline", "full", "no-blocking")))
     keys = {run.name: run.name for run in plan.coarse + plan.runs}
     full, other = (next(run for run in plan.runs if run.method == name) for name in ("full", "no-blocking"))

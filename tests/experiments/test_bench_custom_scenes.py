@@ -13,8 +13,8 @@ from rich.console import Console
 
 from experiments.bench import bench
 from experiments.bench.bench import BenchSettings, run_bench
+from experiments.bench.custom_scenes import budget_for, resolve_scenes
 from experiments.bench.definitions import Budget
-from experiments.bench.folders import budget_for, resolve_scenes
 from experiments.bench.plan import PlanOptions, make_plan
 from experiments.bench.results import BenchResult
 from experiments.bench.scenes import LAPTOP_BUDGET, SCENES
@@ -25,7 +25,7 @@ from vdgs.config.method import resolve_iterations
 from vdgs.config.presets import PRESETS
 from vdgs.errors import CaptureError, VdgsError
 
-pytestmark = pytest.mark.xdist_group("bench_folders")
+pytestmark = pytest.mark.xdist_group("bench_custom_scenes")
 
 PLAIN = CaptureOptions()
 
@@ -132,7 +132,7 @@ def test_a_folder_becomes_a_table_and_keeps_its_results_where_it_goes(captures, 
     assert "A capture given as a folder: 10 training and 2 test photographs of 32 x 24" in table
     assert str(captures) not in table
     said = json.loads((output / "table2" / "results.json").read_text())
-    assert said["choices"]["options"]["downscale"] == 2
+    assert said["plan_options"]["options"]["downscale"] == 2
     trained = (output / result.folder / "coarse" / "model.safetensors").stat().st_mtime_ns
     moved = Path(shutil.copytree(captures / "My place (2024)", tmp_path / "elsewhere" / "My place (2024)"))
     (again,) = benched(moved, output)

@@ -16,7 +16,7 @@ from vdgs.captures.loading import load_capture
 from vdgs.runs.run_folder import RunFolder
 from vdgs.synth import SynthOptions, generate
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("bench_layouts")]
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("bench_datasets")]
 
 WIDTH, HEIGHT = 160, 120
 
@@ -65,7 +65,7 @@ def test_the_published_data_sets_are_benched(data, tmp_path):
     for each in results:
         assert 5 < each["figures"]["psnr"] < 40
         assert each["figures"]["psnr@0"] is not None
-        assert each["seen_by"] == "model"  # nobody knows the truth about a photograph
+        assert each["visibility_source"] == "model"  # nobody knows the truth about a photograph
         run, scene = RunFolder(tmp_path / each["folder"]), SCENES[each["scene"]]
         assert run.method().block.densify.grad_threshold == scene.base(scene.budget, 0).block.densify.grad_threshold
         renders = sorted((run.evaluation / "renders").iterdir())

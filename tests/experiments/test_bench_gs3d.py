@@ -13,7 +13,7 @@ from experiments.baselines.gs3d.run import gaussians_folder
 from experiments.baselines.gs3d.schedule import MIN_INTERVAL, PUBLISHED_ITERATIONS, scale_schedule
 from experiments.baselines.gs3d.training import Gs3dConfig
 from experiments.bench import bench
-from experiments.bench.explicit import gs3d_config
+from experiments.bench.gs3d_stage import gs3d_config
 from experiments.bench.measure import GROUPS_FILE
 from experiments.bench.notes import make_notes
 from experiments.bench.plan import PlanOptions, make_plan
@@ -24,7 +24,7 @@ from vdgs.errors import RunError, Stopped
 from vdgs.runs.open_run import open_run
 from vdgs.runs.run_folder import RunFolder
 
-pytestmark = pytest.mark.xdist_group("bench_explicit")
+pytestmark = pytest.mark.xdist_group("bench_gs3d")
 
 
 def test_the_published_length_has_the_published_schedule():
@@ -34,10 +34,10 @@ def test_the_published_length_has_the_published_schedule():
 @given(st.integers(1, 2_000_000))
 def test_a_schedule_is_one_whatever_its_length(iterations):
     config, published = scale_schedule(iterations), Gs3dConfig()
-    starts = [start for start, _ in config.resolutions]
+    starts = [start for start, _ in config.resolution_schedule]
     assert starts == sorted(starts)
     assert starts[0] == 0
-    assert [factor for _, factor in config.resolutions] == [4, 2, 1]
+    assert [factor for _, factor in config.resolution_schedule] == [4, 2, 1]
     assert config.degree_interval >= 1
     assert config.density.interval >= MIN_INTERVAL
     assert config.density.reset_interval >= MIN_INTERVAL
@@ -51,7 +51,7 @@ def test_long_and_short_schedules_move_in_proportion():
     long, short = scale_schedule(300_000), scale_schedule(6_000)
     assert (long.density.start, long.density.interval, long.density.reset_interval) == (5_000, 1_000, 30_000)
     assert (short.density.start, short.density.interval, short.density.reset_interval) == (100, 100, 600)
-    assert (short.degree_interval, short.resolutions) == (200, ((0, 4), (50, 2), (100, 1)))
+    assert (short.degree_interval, short.resolution_schedule) == (200, ((0, 4), (50, 2), (100, 1)))
 
 
 def test_its_settings_are_those_of_the_table():
@@ -110,7 +110,7 @@ def test_alone_it_has_no_groups_and_other_settings_train_it_again(data, tmp_path
     (run.path / "bench.json").unlink()  # measured again, not trained
     assert benched(data, tmp_path, "3dgs")["3dgs"].figures["psnr"] == alone.figures["psnr"]
     assert model.stat().st_mtime_ns == before
-    assert benched(data, tmp_path, "3dgs", total=80, redo=True)["3dgs"].figures["iterations"] == 80
+    assert benched(data, tmp_path, "3dgs", total=80, overwrite=True)["3dgs"].figures["iterations"] == 80
     assert model.stat().st_mtime_ns != before
 
 

@@ -8,8 +8,8 @@ import pytest
 from experiments.bench.cli import BenchArguments
 from experiments.bench.definitions import BenchMethod, BenchScene, Budget
 from experiments.bench.methods import METHODS
+from experiments.bench.paper_numbers import PAPER_NUMBERS
 from experiments.bench.plan import PlanOptions, make_plan
-from experiments.bench.quoted import PAPER_NUMBERS
 from experiments.bench.scenes import PUBLISHED, SCENES
 from experiments.bench.tables import TABLES
 from experiments.bench.worker import STAGES
@@ -94,7 +94,7 @@ def test_more_anchors_by_plain_growth_differ_from_it_in_the_threshold_alone():
     threshold = base.training.densify.grad_threshold
     assert base.block.densify.grad_threshold == threshold
     for factor in (0.5, 0.25):
-        line = f"growth.threshold: {threshold} -> {factor * threshold}"
+        line = f"densify.grad_threshold: {threshold} -> {factor * threshold}"
         eager = f"threshold-{factor:g}"
         assert diff_settings(settings["cell-1-off"], settings[f"cell-1-{eager}"]) == [f"block.{line}"]
         assert diff_settings(settings["coarse"], settings[f"coarse-{eager}"]) == [f"training.{line}"]
@@ -104,13 +104,13 @@ def test_more_anchors_by_plain_growth_differ_from_it_in_the_threshold_alone():
 def test_blocks_as_printed_take_back_what_the_laptop_changes():
     scene = SCENES["lab-uneven"]
     base = scene.base(scene.budget, 0)
-    printed, paper = METHODS["printed"].settings(base, scene.budget), PRESETS["default"]
+    printed, default = METHODS["printed"].settings(base, scene.budget), PRESETS["default"]
     assert printed != base
     assert (printed.block.decoder, printed.block.view_sampling) == ("frozen", "uniform")
-    assert (printed.block.decoder, printed.block.view_sampling) == (paper.block.decoder, paper.block.view_sampling)
-    assert printed.assignment.threshold == paper.assignment.threshold == 0.45
+    assert (printed.block.decoder, printed.block.view_sampling) == (default.block.decoder, default.block.view_sampling)
+    assert printed.assignment.threshold == default.assignment.threshold == 0.45
     # But for what belongs to the scene.
-    block = replace(paper.block, iterations=base.block.iterations, densify=base.block.densify)
+    block = replace(default.block, iterations=base.block.iterations, densify=base.block.densify)
     assert printed.block == block
     assert printed.training == base.training
     alone = {
@@ -122,35 +122,36 @@ def test_blocks_as_printed_take_back_what_the_laptop_changes():
     }  # fmt: skip
     assert alone["frozen-decoder"] == replace(base, block=replace(base.block, decoder="frozen"))
     assert alone["even-sampling"] == replace(base, block=replace(base.block, view_sampling="uniform"))
-    again = {name: getattr(paper.block, name) for name in ("offset_rate", "scale_rate", "feature_rate")}
+    again = {
+        name: getattr(default.block, name) for name in ("lr_scale_offsets", "lr_scale_log_scales", "lr_scale_features")
+    }
     assert set(again.values()) == {1.0}  # the paper prints no rates for blocks
     assert alone["printed-rates"] == replace(base, block=replace(base.block, **again))
     assert alone["half-size"] == replace(base, block=replace(base.block, resolution_schedule=((0.0, 2), (0.3, 1))))
-    assert alone["last-model"] == replace(base, block=replace(base.block, swa_fraction=paper.block.swa_fraction))
-    compensation = paper.block.compensation
+    assert alone["last-model"] == replace(base, block=replace(base.block, swa_fraction=default.block.swa_fraction))
+    compensation = default.block.compensation
     assert alone["printed-compensation"] == replace(base, block=replace(base.block, compensation=compensation))
     assert all(each != base for each in alone.values())
     assert alone["share-0.45"] == replace(base, assignment=replace(base.assignment, threshold=0.45))
 
 
-def test_presets_of_the_paper_restart_the_coarse_stage_and_literal_leaves_our_choices_out():
-    paper, literal = PRESETS["default"], PRESETS["paper"]
-    for each in (paper, literal):
+def test_default_and_paper_restart_the_coarse_stage_and_paper_leaves_our_choices_out():
+    default, paper = PRESETS["default"], PRESETS["paper"]
+    for each in (default, paper):
         loop = block_train_config(each, 100)
         assert (loop.lr, loop.densify) == (each.training.lr, each.training.densify)
         assert (loop.iterations, loop.lr_warm_boost, loop.swa_fraction) == (50_000, 1.0, 0.0)
         assert (each.partition.blocks, each.partition.expansion, each.assignment.threshold) == (8, 0.4, 0.45)
-    own = {
-        line.split(":")[0] for line in diff_settings(to_dict(paper), to_dict(literal))
+    ours = {
+        line.split(":")[0] for line in diff_settings(to_dict(default), to_dict(paper))
     }  # fmt: skip
-    assert own == {
-        "assignment.best_block", "assignment.min_cameras", "assignment.mode", "block.background_noise",
-        "block.compensation.added_to",
-        "block.compensation.gate", "block.context", "training.adam", "training.anchors.bound_sizes",
-        "training.anchors.fill_gaps", "training.anchors.outlier_distance", "training.loss.background",
-        "training.loss.background_noise",
+    assert ours == {
+        "assignment.always_best", "assignment.min_cameras", "assignment.mode", "block.random_background",
+        "block.compensation.target", "block.compensation.min_draws", "block.draw_outside", "training.optimizer",
+        "training.anchors.bound_scales", "training.anchors.fill_gaps", "training.anchors.outlier_distance",
+        "training.loss.background", "training.loss.random_background",
     }  # fmt: skip
-    assert not validate_config(literal)
+    assert not validate_config(paper)
 
 
 def test_comparators_that_published_dense_adam_have_it():

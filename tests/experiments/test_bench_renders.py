@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from experiments.bench import bench
+from experiments.bench.claim_check import check_claims
 from experiments.bench.measure import final_evaluation_folder
 from experiments.bench.notes import make_notes
 from experiments.bench.plan import PlanOptions, make_plan
 from experiments.bench.results import COVERAGE_KEYS, REFERENCE_EXPOSURE_KEYS
-from experiments.bench.verdict import check_claims
 from support.bench import InThisProcess, benched, write_data
 from vdgs.errors import VdgsError
 from vdgs.evaluation import image_io

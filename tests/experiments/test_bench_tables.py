@@ -1,4 +1,4 @@
-"""From results to tables: statistics, marks, the verdict, and what is written."""
+"""From results to tables: statistics, marks, claim checks, and what is written."""
 
 import csv
 import io
@@ -9,15 +9,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from experiments.bench.claim_check import check_claims
 from experiments.bench.figure import plot_visibility_groups
-from experiments.bench.grids import ResultTable, TableCell, TableRow, make_result_tables
 from experiments.bench.measure import group_names
 from experiments.bench.notes import make_notes
 from experiments.bench.plan import PlanOptions, make_plan
+from experiments.bench.result_tables import ResultTable, TableCell, TableRow, make_result_tables
 from experiments.bench.results import BenchResult
 from experiments.bench.statistics import Summary, paired_difference, rank_marks, summarize
-from experiments.bench.verdict import check_claims
-from experiments.bench.writing import escape_latex, escape_markdown, to_latex, to_markdown, to_tidy_csv
+from experiments.bench.table_writers import escape_latex, escape_markdown, to_latex, to_markdown, to_tidy_csv
 
 
 def test_mean_and_spread():
@@ -53,7 +53,7 @@ def test_no_value_without_mark_is_above_one_with_it(values, digits):
     assert all(a > b for a in second for b in rest)
 
 
-def made(gains: dict[str, tuple[float, float]], seeds: int = 3, method_failed: str = "") -> list[BenchResult]:
+def results_with(gains: dict[str, tuple[float, float]], seeds: int = 3, method_failed: str = "") -> list[BenchResult]:
     """Results on `lab-uneven` with PSNR 20 in all four groups, plus `gains` in the least and the best seen."""
     bounds = tuple({"lower": float(i), "upper": float(i + 1), "pixels": 10} for i in range(4))
     results = []
@@ -77,14 +77,14 @@ def answers(results: list[BenchResult], **choices) -> list[bool | None]:
     return [line.answer for line in check_claims(plan, results)]
 
 
-def test_the_verdict_asks_for_more_than_the_spread_and_allows_a_tenth():
+def test_a_claim_check_asks_for_more_than_the_spread_and_allows_a_tenth():
     nothing = {"baseline": (0.0, 0.0)}
-    assert answers(made(nothing | {"full": (0.5, -0.05)})) == [True, True]
-    assert answers(made(nothing | {"full": (0.09, -0.11)})) == [False, False]  # the spread of seeds is 0.1
-    assert answers(made(nothing | {"full": (0.5, 0.0)}, seeds=1), seeds=1) == [None, True]
-    assert answers(made(nothing | {"full": (0.5, 0.0)}, method_failed="full")) == [None]
+    assert answers(results_with(nothing | {"full": (0.5, -0.05)})) == [True, True]
+    assert answers(results_with(nothing | {"full": (0.09, -0.11)})) == [False, False]  # the spread of seeds is 0.1
+    assert answers(results_with(nothing | {"full": (0.5, 0.0)}, seeds=1), seeds=1) == [None, True]
+    assert answers(results_with(nothing | {"full": (0.5, 0.0)}, method_failed="full")) == [None]
     plan = make_plan("table2", PlanOptions(scenes=("lab-uneven",), methods=("baseline", "full")))
-    least, _ = check_claims(plan, made(nothing | {"full": (0.5, 0.0)}))
+    least, _ = check_claims(plan, results_with(nothing | {"full": (0.5, 0.0)}))
     assert least.numbers == "+0.50 dB, spread 0.10, 3 seeds: +0.50, +0.50, +0.50"  # each against the same seed
 
 
@@ -138,7 +138,7 @@ def test_grids_are_written_in_every_form():
 
 def test_solidity_is_a_table_where_it_is_known():
     plan = make_plan("table2", PlanOptions(scenes=("lab-uneven",), methods=("baseline", "full")))
-    results = made({"baseline": (0, 0), "full": (1, 0)})
+    results = results_with({"baseline": (0, 0), "full": (1, 0)})
     assert not [grid for grid in make_result_tables(plan, results) if grid.name == "solidity-lab-uneven"]
     for result, share in zip(results, (0.5, 0.5, 0.5, 0.9, 0.9, 0.9), strict=True):
         result.figures.update({"opacity_coverage": share, "oversized_splats": None})
@@ -149,14 +149,13 @@ def test_solidity_is_a_table_where_it_is_known():
 
 def test_methods_that_fit_exposures_are_compared_with_others_in_neutral_colors():
     plan = make_plan("table2", PlanOptions(scenes=("lab-uneven",), methods=("baseline", "full")))
-    results = made({"baseline": (0, 0), "full": (1, 0)})
+    results = results_with({"baseline": (0, 0), "full": (1, 0)})
     assert not [grid for grid in make_result_tables(plan, results) if grid.name == "neutral"]
     for result in results[:3]:
         result.figures.update({"psnr": 20.5, "ssim": 0.61})
     for result in results[3:]:
-        result.figures.update(
-            {"psnr": 30.0, "ssim": 0.9, "psnr_reference_exposure": 20.25, "ssim_reference_exposure": 0.6}
-        )
+        result.figures.update({"psnr": 30.0, "ssim": 0.9})
+        result.figures.update({"psnr_reference_exposure": 20.25, "ssim_reference_exposure": 0.6})
     (grid,) = [grid for grid in make_result_tables(plan, results) if grid.name == "neutral"]
     text = to_markdown([grid], "T", [])
     assert "| VDGS (full) | <u>20.25 ± 0.00</u> | <u>0.600 ± 0.000</u> |" in text
@@ -165,7 +164,7 @@ def test_methods_that_fit_exposures_are_compared_with_others_in_neutral_colors()
 
 def test_failures_are_shown_and_leave_a_gap(tmp_path):
     plan = make_plan("table2", PlanOptions(scenes=("lab-uneven",), methods=("baseline", "full")))
-    results = made({"baseline": (0, 0), "full": (1, 0)}, method_failed="full")
+    results = results_with({"baseline": (0, 0), "full": (1, 0)}, method_failed="full")
     text = to_markdown(
         make_result_tables(plan, results), "T", make_notes(plan, results, check_claims(plan, results), False)
     )
@@ -183,7 +182,7 @@ def test_groups_have_names():
 
 @pytest.mark.parametrize(("validation", "views"), [(False, "Test views"), (True, "Validation views")])
 def test_a_table_says_which_views_it_is_measured_on(validation, views):
-    results = made({}, seeds=1)
+    results = results_with({}, seeds=1)
     plan = make_plan("table2", PlanOptions(scenes=("lab-uneven",), methods=("baseline", "full"), validation=validation))
     titles = [grid.title for grid in make_result_tables(plan, results)]
     assert titles[0].startswith(f"{views}, raw")

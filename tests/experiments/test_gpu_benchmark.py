@@ -32,16 +32,16 @@ def test_all_of_it_runs_and_agrees(drivers, compiled_code, tmp_path, monkeypatch
     monkeypatch.setattr(device_selection, "_no_card", lambda index: "")
     monkeypatch.setattr(gpu, "TOWN_DB", 3.0)  # after eight iterations, less says nothing
     write_colmap(tmp_path / "capture", tiny_scene(columns=3, rows=2, width=32, height=24, points=80))
-    machine = gpu.Machine(CARD, lambda: None, lambda: None, lambda: 0, (8, 6))
+    device = gpu.GpuDevice(CARD, lambda: None, lambda: None, lambda: 0, (8, 6))
     with pretended_card():
-        code = gpu.main(["--small", "--capture", str(tmp_path / "capture"), "--iterations", "4"], machine)
+        code = gpu.main(["--small", "--capture", str(tmp_path / "capture"), "--iterations", "4"], device)
     said = capsys.readouterr()
     assert code == 0, said.err
     for operation in OPERATION_NAMES:
         assert f"{operation}: " in said.out or f"{operation} by cuda: " in said.out
     for kernel in ("rasterize_backward", "mark_anchors", "write_rows", "add_view", "move_anchors"):
         assert f"{kernel:22}" in said.out
-    for line in ("rasterise_vjp by gsplat: gradient means_px", "a generated town", "cuda   "):
+    for line in ("rasterize_vjp by gsplat: gradient means_px", "a generated town", "cuda   "):
         assert line in said.out
     assert "gsplat  40x32" in said.out
     assert "cuda    40x32" in said.out
@@ -50,7 +50,7 @@ def test_all_of_it_runs_and_agrees(drivers, compiled_code, tmp_path, monkeypatch
 
 
 def test_what_differs_or_fails_is_told_and_the_rest_goes_on(monkeypatch, capsys):
-    machine = gpu.Machine(torch.device("cpu"), lambda: None, lambda: None, lambda: 0, (8, 6))
+    device = gpu.GpuDevice(torch.device("cpu"), lambda: None, lambda: None, lambda: 0, (8, 6))
     for name in ("print_resources", "train_town", "print_memory"):
         monkeypatch.setattr(gpu, name, lambda *_: None)
 
@@ -60,7 +60,7 @@ def test_what_differs_or_fails_is_told_and_the_rest_goes_on(monkeypatch, capsys)
     far = [gpu.gpu_parity.Difference("decode", "", "conics", "value", 0.5)]
     monkeypatch.setattr(gpu.gpu_parity, "differences", lambda *_: far)
     monkeypatch.setattr(gpu, "time_steps", fails)
-    assert gpu.main(["--small"], machine) == 1
+    assert gpu.main(["--small"], device) == 1
     said = capsys.readouterr()
     assert "decode: conics differs by 5.0e-01" in said.err
     assert "a training step: RuntimeError: the card fell out" in said.err
@@ -68,8 +68,8 @@ def test_what_differs_or_fails_is_told_and_the_rest_goes_on(monkeypatch, capsys)
 
 
 def test_what_there_is_no_time_for_is_named(capsys):
-    machine = gpu.Machine(torch.device("cpu"), lambda: None, lambda: None, lambda: 0, (8, 6))
-    assert gpu.main(["--small", "--minutes", "-1"], machine) == 0
+    device = gpu.GpuDevice(torch.device("cpu"), lambda: None, lambda: None, lambda: 0, (8, 6))
+    assert gpu.main(["--small", "--minutes", "-1"], device) == 0
     assert "no time was left for: parity with the processor" in capsys.readouterr().out
 
 

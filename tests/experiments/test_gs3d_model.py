@@ -115,7 +115,7 @@ def test_small_gaussians_are_cloned_and_large_ones_split():
     for name, tensor in change.added.tensors().items():
         assert torch.equal(tensor[0], before.tensors()[name][0])  # the clone
     torch.testing.assert_close(change.added.log_scales[1:].exp(), torch.full((2, 3), 0.5 / 1.6))
-    assert torch.equal(change.added.rest[1], before.shN[2])
+    assert torch.equal(change.added.shN[1], before.shN[2])
 
 
 def test_where_nothing_asks_nothing_changes():

@@ -32,7 +32,7 @@ from vdgs.runs.stage_folder import StageFolder
 pytestmark = pytest.mark.xdist_group("gaussians")
 
 DENSITY = DensityConfig(start=15, interval=10, until=0.5, dense=0.08, reset_interval=40)
-SHORT = Gs3dConfig(iterations=60, resolutions=((0, 2), (30, 1)), density=DENSITY)
+SHORT = Gs3dConfig(iterations=60, resolution_schedule=((0, 2), (30, 1)), density=DENSITY)
 QUIET = Console(quiet=True)
 
 
@@ -111,8 +111,8 @@ def test_the_background_is_black_or_that_of_the_photographs(trained, capture, tm
 
 
 def test_settings_that_do_not_work_are_named(capture, tmp_path):
-    wrong = replace(SHORT, iterations=0, resolutions=((5, 1),), degree=4)
-    with pytest.raises(VdgsError, match=r"(?s)iterations.*degree.*resolutions"):
+    wrong = replace(SHORT, iterations=0, resolution_schedule=((5, 1),), degree=4)
+    with pytest.raises(VdgsError, match=r"(?s)iterations.*degree.*resolution_schedule"):
         comparator.train_gs3d(capture, wrong, tmp_path / "run", QUIET)
     assert not (tmp_path / "run").exists()
 

@@ -21,13 +21,13 @@ from experiments.baselines.gs3d.training import (
     Gs3dLearningRates,
     Gs3dProblem,
     downscale_at,
-    from_saved,
+    from_checkpoint,
     gs3d_train_step,
     initial_state,
     learning_rates_at,
     scene_extent,
     sh_degree_at,
-    to_saved,
+    to_checkpoint,
     train,
 )
 from support.checkerboard import Photographs
@@ -41,7 +41,7 @@ pytestmark = pytest.mark.xdist_group("gaussian_training")
 
 CONFIG = Gs3dConfig(
     iterations=80,
-    resolutions=((0, 2), (20, 1)),
+    resolution_schedule=((0, 2), (20, 1)),
     degree_interval=25,
     density=DensityConfig(start=15, interval=10, until=0.75, dense=0.08, reset_interval=40),
 )
@@ -67,7 +67,7 @@ def run(state, stage_, until: int | None = None):
 
 
 def bits(state) -> dict[str, bytes]:
-    return {name: tensor.numpy().tobytes() for name, tensor in to_saved(state).tensors.items()}
+    return {name: tensor.numpy().tobytes() for name, tensor in to_checkpoint(state).tensors.items()}
 
 
 @pytest.fixture(scope="module")
@@ -94,10 +94,10 @@ def test_a_stopped_and_continued_run_has_the_same_bits(unbroken, tmp_path):
     for stop_at in (1, 19, 20, 27, 40, 79):
         run(state, stage(), until=stop_at)
         assert state.iteration == stop_at
-        save_checkpoint(tmp_path, to_saved(state))
+        save_checkpoint(tmp_path, to_checkpoint(state))
         saved, _ = load_latest_checkpoint(tmp_path)
         assert saved is not None
-        state = from_saved(saved)
+        state = from_checkpoint(saved)
     assert bits(run(state, stage())) == bits(unbroken)
 
 
@@ -110,42 +110,42 @@ def test_the_number_of_threads_changes_no_bit(unbroken):
         set_num_threads(before)
 
 
-def memory_runs_out(monkeypatch, where: str, at_call: int, room=gaussian_training) -> None:
+def memory_runs_out(monkeypatch, where: str, at_call: int, module=gaussian_training) -> None:
     """The given function of a module, by name, finds no memory in its call of that number."""
-    function, calls = getattr(room, where), itertools.count(1)
+    function, calls = getattr(module, where), itertools.count(1)
 
     def scarce(*values, **named):
         if next(calls) == at_call:
             raise MemoryError("std::bad_alloc")
         return function(*values, **named)
 
-    monkeypatch.setattr(room, where, scarce)
+    monkeypatch.setattr(module, where, scarce)
 
 
-def watched(folder: StageFolder):
+def train_in(folder: StageFolder):
     folder.path.mkdir(exist_ok=True)
     console = Console(file=io.StringIO())
     saved, _ = load_latest_checkpoint(folder.checkpoints)
-    state = start() if saved is None else from_saved(saved)
+    state = start() if saved is None else from_checkpoint(saved)
     train_with_checkpoints(folder, state, stage(), CheckpointOptions(), console)
     return state
 
 
-@pytest.mark.parametrize("where", ["draw_gaussians", "_make_room"])
+@pytest.mark.parametrize("where", ["render_gaussians", "_allocate_gradients"])
 def test_where_memory_runs_out_before_anything_moves_no_step_is_lost(where, unbroken, tmp_path, monkeypatch):
     folder = StageFolder(tmp_path / "gaussians")
     with monkeypatch.context() as scarcity:
         memory_runs_out(scarcity, where, 38)
         with pytest.raises(VdgsError, match=r"out of memory with .* The checkpoint of iteration 37 is saved in"):
-            watched(folder)
-    assert bits(watched(folder)) == bits(unbroken)
+            train_in(folder)
+    assert bits(train_in(folder)) == bits(unbroken)
 
 
 def test_where_memory_runs_out_within_a_step_nothing_half_moved_is_saved(tmp_path, monkeypatch):
     folder = StageFolder(tmp_path / "gaussians")
-    memory_runs_out(monkeypatch, "adam_rows", 38 * 5, room=cpu)  # four of the tensors have moved, or three
+    memory_runs_out(monkeypatch, "adam_rows", 38 * 5, module=cpu)  # four of the tensors have moved, or three
     with pytest.raises(VdgsError, match="There is no checkpoint yet"):
-        watched(folder)
+        train_in(folder)
 
 
 def test_another_seed_is_another_run():
@@ -155,7 +155,7 @@ def test_another_seed_is_another_run():
 
 
 def test_growth_keeps_everything_aligned_and_resets_opacities(unbroken):
-    assert len({tensor.shape[0] for tensor in to_saved(unbroken).tensors.values()}) == 1
+    assert len({tensor.shape[0] for tensor in to_checkpoint(unbroken).tensors.values()}) == 1
     state, counts = start(), {}
     train(
         state, stage(), stop=lambda: False, after_step=lambda s, r: counts.update({s.iteration: (r, len(s.gaussians))})
@@ -172,20 +172,20 @@ def test_growth_keeps_everything_aligned_and_resets_opacities(unbroken):
 
 def test_opacities_are_reset_with_their_moments():
     state = run(start(), stage(), until=39)
-    assert float(state.gaussians.logits.sigmoid().max()) > 0.05
+    assert float(state.gaussians.opacity_logits.sigmoid().max()) > 0.05
     gs3d_train_step(state, stage())
-    assert float(state.gaussians.logits.sigmoid().max()) <= 0.01 + 1e-6
-    assert not state.moments.first["logits"].any()
+    assert float(state.gaussians.opacity_logits.sigmoid().max()) <= 0.01 + 1e-6
+    assert not state.moments.first["opacity_logits"].any()
     assert state.moments.first["means"].any()
 
 
 def test_bands_of_color_are_released_one_after_the_other():
     assert [sh_degree_at(i, CONFIG) for i in (0, 24, 25, 50, 75, 79)] == [0, 0, 1, 2, 3, 3]
     state = run(start(), stage(), until=25)
-    assert not state.gaussians.rest.any()
+    assert not state.gaussians.shN.any()
     run(state, stage(), until=50)
-    assert state.gaussians.rest[:, :3].any()
-    assert not state.gaussians.rest[:, 3:].any()
+    assert state.gaussians.shN[:, :3].any()
+    assert not state.gaussians.shN[:, 3:].any()
 
 
 def test_the_schedules():
@@ -194,7 +194,7 @@ def test_the_schedules():
     assert learning_rates_at(config, 3.0, 0)["means"] == pytest.approx(3 * 1.6e-4)
     assert learning_rates_at(config, 3.0, 50)["means"] == pytest.approx(3 * 1.6e-5)
     assert learning_rates_at(config, 3.0, 100)["means"] == pytest.approx(3 * 1.6e-6)
-    assert learning_rates_at(config, 3.0, 100)["dc"] == pytest.approx(20 * learning_rates_at(config, 9.0, 0)["rest"])
+    assert learning_rates_at(config, 3.0, 100)["sh0"] == pytest.approx(20 * learning_rates_at(config, 9.0, 0)["shN"])
 
 
 def test_a_loss_that_is_not_a_number_stops_training():

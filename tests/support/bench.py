@@ -38,11 +38,11 @@ def write_data(folder: Path) -> None:
 
 
 def benched(
-    data: Path, output: Path, *methods: str, total: int = 40, redo: bool = False, renders: tuple[str, ...] = ()
+    data: Path, output: Path, *methods: str, total: int = 40, overwrite: bool = False, renders: tuple[str, ...] = ()
 ) -> dict[str, BenchResult]:
     """Table I of that scene with these methods, one seed."""
-    choices = PlanOptions(
+    options = PlanOptions(
         seeds=1, scenes=("copr",), methods=methods, iterations_total=total, max_anchors=300, renders=renders
     )
-    asked = BenchSettings("table1", output, choices, data, overwrite=redo)
-    return {each.method: each for each in run_bench(asked, Console(file=io.StringIO()))}
+    settings = BenchSettings("table1", output, options, data, overwrite=overwrite)
+    return {each.method: each for each in run_bench(settings, Console(file=io.StringIO()))}

@@ -21,6 +21,7 @@ def files_with_shapes() -> list[Path]:
 
 
 def module_name(file: Path) -> str:
-    """`vdgs.model.initialization.gap_filling` for src/vdgs/model/initialization/gap_filling.py, `experiments.bench.seen` for experiments/bench/seen.py."""
+    """A module's name by its file: `vdgs.captures.splits` for src/vdgs/captures/splits.py, `experiments.bench.plan` for
+    experiments/bench/plan.py."""
     parts = file.relative_to(PACKAGE.parent if file.is_relative_to(PACKAGE) else ROOT).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)

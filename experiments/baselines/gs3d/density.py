@@ -88,7 +88,7 @@ def adaptive_density_control(
 
 
 def split_gaussians(parents: Gaussians, shrink: float, generator: torch.Generator) -> Gaussians:
-    """PARTS for each of p parents, [p PARTS], all first parts before all second ones: their means are drawn from the
+    """SPLIT_COUNT parts for each of p parents, all first parts before all second ones: their means are drawn from the
     parent's own distribution, their scales divided by `shrink`, everything else is the parent's."""
     parts = parents.select(torch.arange(len(parents)).repeat(SPLIT_COUNT))
     along_axes = torch.randn(len(parts), 3, generator=generator) * parts.log_scales.exp()

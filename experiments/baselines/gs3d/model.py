@@ -61,7 +61,7 @@ class GaussianModel:
     gaussians: Gaussians
     #: Colour drawn where nothing is, RGB in [0, 1].
     background: tuple[float, float, float]
-    #: JSON-able facts that travel with the file: ground frame, capture, version.
+    #: JSON values that travel with the file: ground frame, capture, version.
     metadata: Mapping[str, Any]
 
     @torch.no_grad()
@@ -73,8 +73,8 @@ class GaussianModel:
     def save(self, path: Path) -> None:
         """Write one safetensors file, atomically."""
         tensors = self.gaussians.tensors()
-        facts = {"background": self.background, "facts": dict(self.metadata), "crc32": tensors_crc32(tensors)}
-        header = {FILE_FORMAT: json.dumps(facts)}
+        values = {"background": self.background, "metadata": dict(self.metadata), "crc32": tensors_crc32(tensors)}
+        header = {FILE_FORMAT: json.dumps(values)}
         write_atomic(path, lambda temporary: write_tensors(temporary, tensors, header))
 
     @staticmethod
@@ -84,13 +84,13 @@ class GaussianModel:
         if FILE_FORMAT not in header:
             raise VdgsError(f"{path}: is not a vdgs model of explicit Gaussians (its header has no {FILE_FORMAT!r})")
         try:
-            known = json.loads(header[FILE_FORMAT])
-            if known["crc32"] != tensors_crc32(tensors):
+            values = json.loads(header[FILE_FORMAT])
+            if values["crc32"] != tensors_crc32(tensors):
                 raise ValueError("its checksum does not agree")
             gaussians = Gaussians(**tensors)
             _check(gaussians)
-            red, green, blue = (float(value) for value in known["background"])
-            return GaussianModel(gaussians, (red, green, blue), known["facts"])
+            red, green, blue = (float(value) for value in values["background"])
+            return GaussianModel(gaussians, (red, green, blue), values["metadata"])
         except (KeyError, ValueError, TypeError) as error:
             raise VdgsError(
                 f"{path}: is damaged or incomplete ({error}). Delete it and train again: it is rebuilt from the last "
@@ -105,8 +105,8 @@ def _check(gaussians: Gaussians) -> None:
     rest = gaussians.shN.shape[1] if gaussians.shN.ndim == 3 else -1
     if rest not in counts:
         raise ValueError(f"{rest} further coefficients of colour belong to no degree")
-    shapes = {"means": (n, 3), "log_scales": (n, 3), "quaternions": (n, 4), "logits": (n,), "dc": (n, 3),
-              "rest": (n, rest, 3)}  # fmt: skip
+    shapes = {"means": (n, 3), "log_scales": (n, 3), "quaternions": (n, 4), "opacity_logits": (n,), "sh0": (n, 3),
+              "shN": (n, rest, 3)}  # fmt: skip
     for name, tensor in gaussians.tensors().items():
         if tuple(tensor.shape) != shapes[name] or tensor.dtype != torch.float32:
             raise ValueError(f"{name} is {tensor.dtype} {tuple(tensor.shape)}, not float32 {shapes[name]}")

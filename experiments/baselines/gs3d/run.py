@@ -6,7 +6,7 @@ or different:
 
 - pruning by footprint in the image (section 5.2); the prune by size in the world is there;
 - training stops at the iteration given: rates decay over that length; intervals (degree, decisions, resets) are
-  those of the settings, which `schedule.scheduled` gives for another length than the published one;
+  those of the settings, which `schedule.scale_schedule` gives for another length than the published one;
 - views come in a new random order every epoch that is drawn from the seed, not from a running generator;
 - image formation is that of this project (docs/conventions.md): alpha at most 0.999, near plane at 0.01, extent by
   opacity, exact gradients;
@@ -110,7 +110,7 @@ def train_gs3d(
             return GaussianModel.load(folder.model)
         require_trainable(capture, console)
         views = capture.train_views
-        factors = tuple(sorted({factor for _, factor in config.resolutions}))
+        factors = tuple(sorted({factor for _, factor in config.resolution_schedule}))
         with ImageCache(views, image_cache_bytes(options), downscales=factors) as images:
             extent, background = scene_extent([view.camera for view in views]), (0.0, 0.0, 0.0)
             if config.background == "mean":
@@ -118,8 +118,8 @@ def train_gs3d(
             stage = Gs3dProblem(config, images, len(views), extent, background)
             state = resume_or_start(folder, capture, config, console)
             train_with_checkpoints(folder, state, stage, options, console)
-        facts = {"capture": capture_metadata(capture), "version": __version__, "iterations": state.iteration}
-        model = GaussianModel(state.gaussians, stage.background, facts)
+        metadata = {"capture": capture_metadata(capture), "version": __version__, "iterations": state.iteration}
+        model = GaussianModel(state.gaussians, stage.background, metadata)
         finish_training(folder, state, model, console)
         return model
 
@@ -174,7 +174,7 @@ def _model_metadata(trained: StageFolder | None) -> ModelMetadata:
 
 def _check(config: Gs3dConfig) -> None:
     """Raise VdgsError for settings that do not work."""
-    starts = [start for start, _ in config.resolutions]
+    starts = [start for start, _ in config.resolution_schedule]
     problems = {
         "iterations must be at least 1": config.iterations >= 1,
         f"degree must be from 0 to {MAX_SH_DEGREE}": 0 <= config.degree <= MAX_SH_DEGREE,
@@ -185,11 +185,13 @@ def _check(config: Gs3dConfig) -> None:
         "initial_opacity and density.reset_opacity must lie between 0 and 1": all(
             0 < value < 1 for value in (config.initial_opacity, config.density.reset_opacity)
         ),
-        "resolutions must begin at iteration 0 and ascend": bool(starts)
+        "resolution_schedule must begin at iteration 0 and ascend": bool(starts)
         and starts[0] == 0
         and starts == sorted(starts),
         "background must be black or mean": config.background in ("black", "mean"),
-        "factors of resolutions must be at least 1": all(factor >= 1 for _, factor in config.resolutions),
+        "factors of resolution_schedule must be at least 1": all(
+            factor >= 1 for _, factor in config.resolution_schedule
+        ),
     }
     wrong = [problem for problem, holds in problems.items() if not holds]
     if wrong:

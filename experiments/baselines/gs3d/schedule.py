@@ -24,7 +24,7 @@ def scale_schedule(iterations: int, config: Gs3dConfig | None = None, max_gaussi
     return replace(
         config,
         iterations=iterations,
-        resolutions=tuple((round(scale * start), factor) for start, factor in config.resolutions),
+        resolution_schedule=tuple((round(scale * start), factor) for start, factor in config.resolution_schedule),
         degree_interval=max(1, round(scale * config.degree_interval)),
         density=replace(
             density,

@@ -19,10 +19,10 @@ from experiments.baselines.gs3d.training import (
     Gs3dState,
     Gs3dStepReport,
     downscale_at,
-    from_saved,
+    from_checkpoint,
     initial_state,
     sh_degree_at,
-    to_saved,
+    to_checkpoint,
     train,
 )
 from vdgs.captures.capture import Capture
@@ -43,7 +43,7 @@ def resume_or_start(folder: StageFolder, capture: Capture, config: Gs3dConfig, c
         points, colors = capture.points, capture.point_colors
         return initial_state(initialize_gaussians(points, colors, config.initial_opacity, config.degree))
 
-    return restore_or_start(folder, config.iterations, start, from_saved, "Choose another output folder.", console)
+    return restore_or_start(folder, config.iterations, start, from_checkpoint, "Choose another output folder.", console)
 
 
 def train_with_checkpoints(
@@ -53,7 +53,7 @@ def train_with_checkpoints(
     journal = _TrainingLog(folder, stage.config, console)
     training = TrainingSession(
         folder=folder, state=state,
-        to_checkpoint=lambda: to_saved(state),
+        to_checkpoint=lambda: to_checkpoint(state),
         status=lambda: journal.status(state),
         size=lambda: f"{len(state.gaussians):,} Gaussians",
         divergence_hint="",
@@ -62,12 +62,12 @@ def train_with_checkpoints(
     )  # fmt: skip
 
     def loop(stop: Callable[[], bool]) -> bool:
-        keeper = Checkpointer(training, options.save_every)
+        checkpointer = Checkpointer(training, options.save_every)
 
         def after_step(state: Gs3dState, report: Gs3dStepReport) -> None:
-            keeper.update_timers()
+            checkpointer.update_timers()
             journal.step(state, report)
-            keeper.save_if_due(training.status)
+            checkpointer.save_if_due(training.status)
 
         return train(state, stage, stop=stop, after_step=after_step)
 
@@ -116,7 +116,7 @@ class _TrainingLog:
 
 def finish_training(folder: StageFolder, state: Gs3dState, model: GaussianModel, console: Console) -> None:
     """Save the model of a run that is complete, mark it done and say so."""
-    save_checkpoint(folder.checkpoints, to_saved(state))
+    save_checkpoint(folder.checkpoints, to_checkpoint(state))
     model.save(folder.model)
     status = StatusRecord(
         state="done", iteration=state.iteration, iterations=state.iteration,

@@ -33,11 +33,11 @@ class Gs3dLearningRates:
 
     means: tuple[float, float] = (1.6e-4, 1.6e-6)
     """Means, times the extent of the scene; decays exponentially from the first to the second value (section 5.1)."""
-    dc: float = 0.0025
+    sh0: float = 0.0025
     """Constant colour."""
-    rest: float = 0.0025 / 20
+    shN: float = 0.0025 / 20
     """The other coefficients of colour."""
-    logits: float = 0.05
+    opacity_logits: float = 0.05
     """Opacities before the sigmoid."""
     log_scales: float = 0.005
     """Logarithms of the scales."""
@@ -53,7 +53,7 @@ class Gs3dConfig:
     """Number of steps, one photograph each (section 7.1)."""
     seed: int = 0
     """Everything random follows from it: on the CPU the same seed gives the same bits."""
-    resolutions: tuple[tuple[int, int], ...] = ((0, 4), (250, 2), (500, 1))
+    resolution_schedule: tuple[tuple[int, int], ...] = ((0, 4), (250, 2), (500, 1))
     """From this iteration on, images are shrunk by this factor (section 7.1, "warm-up")."""
     degree: int = 3
     """Degree of the spherical harmonics (section 7.1: four bands)."""
@@ -105,7 +105,8 @@ class Gs3dState:
     scratch: dict[str, Tensor] = field(default_factory=dict)
 
     def take_groups(self) -> dict[str, TensorGroup]:
-        """What is kept per Gaussian and outlives a decision, no longer held here: see `per_anchor.remap`."""
+        """What is kept per Gaussian and outlives a decision, no longer held here: see
+        `per_anchor_tensors.index_anchors`."""
         groups = {"gaussians": self.gaussians.tensors(), "first": self.moments.first, "second": self.moments.second}
         self.put_groups({name: {key: t[:0] for key, t in group.items()} for name, group in groups.items()})
         return groups
@@ -148,7 +149,7 @@ def sh_degree_at(iteration: int, config: Gs3dConfig) -> int:
 
 def downscale_at(iteration: int, config: Gs3dConfig) -> int:
     """Factor by which images are shrunk at this iteration (from 0)."""
-    return [factor for start, factor in config.resolutions if iteration >= start][-1]
+    return [factor for start, factor in config.resolution_schedule if iteration >= start][-1]
 
 
 def learning_rates_at(config: Gs3dConfig, extent: float, iteration: int) -> dict[str, float]:
@@ -174,11 +175,11 @@ def gs3d_train_step(state: Gs3dState, stage: Gs3dProblem) -> Gs3dStepReport:
     behind = state.gaussians.means.new_tensor(stage.background)
     raster, means_px = render_gaussians(Gaussians(**seen), camera, behind, degree)
     kernels = get_backend(raster.image.device)
-    found = kernels.photometric_loss(raster.image, target, mask, ssim_weight=config.ssim_weight)
-    value = float(found.loss.detach())
+    photometric = kernels.photometric_loss(raster.image, target, mask, ssim_weight=config.ssim_weight)
+    value = float(photometric.loss.detach())
     if not math.isfinite(value):
         raise TrainingDiverged(f"The loss is {value} at iteration {iteration + 1}.")
-    *gradients, of_means_px = torch.autograd.grad(found.loss, [*seen.values(), means_px], materialize_grads=True)
+    *gradients, of_means_px = torch.autograd.grad(photometric.loss, [*seen.values(), means_px], materialize_grads=True)
     psnr = training_psnr(raster.image.detach(), target, mask) if (iteration + 1) % PSNR_LOG_INTERVAL == 0 else None
     _allocate_gradients(state)
     state.is_consistent = False
@@ -187,7 +188,7 @@ def gs3d_train_step(state: Gs3dState, stage: Gs3dProblem) -> Gs3dStepReport:
     )
     state.iteration += 1
 
-    report = Gs3dStepReport(value, float(found.l1), float(found.ssim), len(rows))
+    report = Gs3dStepReport(value, float(photometric.l1), float(photometric.ssim), len(rows))
     if state.iteration <= config.density.until * config.iterations:
         _accumulate_gradients(state, rows, of_means_px, camera)
         report = replace(report, **_densify(state, stage))
@@ -209,7 +210,7 @@ def _adam_step(
     """One step of Adam for all Gaussians: those that the view does not show move on by their moments (program)."""
     finite: IsFinite = True
     for name, tensor in state.gaussians.tensors().items():
-        if name == "rest" and not degree:
+        if name == "shN" and not degree:
             continue  # gradients and moments are zero: nothing moves
         everywhere = state.scratch[name].index_copy_(0, rows, gradients[name])
         moved = AdamState(tensor, state.moments.first[name], state.moments.second[name], rates[name])
@@ -228,9 +229,9 @@ def _accumulate_gradients(
 
 
 def _densify(state: Gs3dState, stage: Gs3dProblem) -> dict[str, Any]:
-    """Clone, split and prune, and reset opacities, where it is time. Returns what GaussiansReport says of it."""
+    """Clone, split and prune, and reset opacities, where it is time. Returns what Gs3dStepReport says of it."""
     config, done = stage.config.density, state.iteration
-    facts: dict[str, Any] = {}
+    counts: dict[str, Any] = {}
     if done > config.start and done % config.interval == 0:
         generator = torch.Generator().manual_seed(stage.config.seed * 1_000_003 + done)
         change = adaptive_density_control(
@@ -238,12 +239,12 @@ def _densify(state: Gs3dState, stage: Gs3dProblem) -> dict[str, Any]:
             prune_large=done > config.reset_interval,
         )  # fmt: skip
         _apply(state, change.added, change.kept)
-        facts = {"cloned": change.cloned, "split": change.split, "pruned": change.pruned}
+        counts = {"cloned": change.cloned, "split": change.split, "pruned": change.pruned}
     if done % config.reset_interval == 0:
         state.gaussians.opacity_logits.copy_(cap_opacity_logits(state.gaussians.opacity_logits, config.reset_opacity))
-        state.moments.first["logits"].zero_()
-        state.moments.second["logits"].zero_()
-    return facts
+        state.moments.first["opacity_logits"].zero_()
+        state.moments.second["opacity_logits"].zero_()
+    return counts
 
 
 def _apply(state: Gs3dState, added: Gaussians, kept: Tensor) -> None:
@@ -279,18 +280,18 @@ def train(
     return True
 
 
-def to_saved(state: Gs3dState) -> Checkpoint:
-    """The whole state as tensors and facts."""
+def to_checkpoint(state: Gs3dState) -> Checkpoint:
+    """The whole state as tensors and metadata."""
     tensors = {f"gaussians.{name}": tensor for name, tensor in state.gaussians.tensors().items()}
     tensors |= {f"first.{name}": tensor for name, tensor in state.moments.first.items()}
     tensors |= {f"second.{name}": tensor for name, tensor in state.moments.second.items()}
     tensors |= {"gradient": state.gradient, "views": state.views}
-    facts = {"loss": repr(state.loss), "psnr": repr(state.psnr), "seconds": state.seconds,
-             "peak_memory_bytes": state.peak_memory_bytes}  # fmt: skip
-    return Checkpoint(state.iteration, facts, tensors)
+    metadata = {"loss": repr(state.loss), "psnr": repr(state.psnr), "seconds": state.seconds,
+                "peak_memory_bytes": state.peak_memory_bytes}  # fmt: skip
+    return Checkpoint(state.iteration, metadata, tensors)
 
 
-def from_saved(saved: Checkpoint) -> Gs3dState:
+def from_checkpoint(saved: Checkpoint) -> Gs3dState:
     """The inverse of `to_checkpoint`, bit for bit. Raises KeyError or TypeError if something is missing."""
 
     def part(prefix: str) -> dict[str, Tensor]:

@@ -1,4 +1,4 @@
-"""Grids as Markdown, LaTeX and CSV."""
+"""Result tables as Markdown, LaTeX and CSV."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import io
 import re
 from collections.abc import Sequence
 
-from experiments.bench.grids import ResultTable, TableCell
+from experiments.bench.result_tables import ResultTable, TableCell
 
 _LATEX = {
     "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "$": r"\$",
@@ -41,45 +41,45 @@ def format_cell(cell: TableCell) -> str:
     return text if spread is None else f"{text} ± {spread:.{cell.digits}f}"
 
 
-def to_markdown(grids: Sequence[ResultTable], heading: str, paragraphs: Sequence[str]) -> str:
-    """A document: heading, the grids, and paragraphs (already Markdown)."""
-    parts = [f"# {escape_markdown(heading)}", *(_markdown_grid(grid) for grid in grids), *paragraphs]
+def to_markdown(tables: Sequence[ResultTable], heading: str, paragraphs: Sequence[str]) -> str:
+    """A document: heading, the tables, and paragraphs (already Markdown)."""
+    parts = [f"# {escape_markdown(heading)}", *(_markdown_table(table) for table in tables), *paragraphs]
     return "\n\n".join(parts) + "\n"
 
 
-def to_latex(grids: Sequence[ResultTable]) -> str:
-    """One `table` for each grid; they need the package booktabs."""
-    return "% Made by `vdgs bench`. Needs \\usepackage{booktabs}.\n\n" + "\n\n".join(map(_latex_grid, grids)) + "\n"
+def to_latex(tables: Sequence[ResultTable]) -> str:
+    """One `table` for each table; they need the package booktabs."""
+    return "% Made by `vdgs bench`. Needs \\usepackage{booktabs}.\n\n" + "\n\n".join(map(_latex_table, tables)) + "\n"
 
 
-def to_tidy_csv(grids: Sequence[ResultTable]) -> str:
-    """One line for each number: grid, group, row, column, mean, spread, seeds, mark."""
+def to_tidy_csv(tables: Sequence[ResultTable]) -> str:
+    """One line for each number: table, group, row, column, mean, spread, seeds, mark."""
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(["grid", "group", "row", "column", "mean", "spread", "seeds", "mark"])
-    for grid in grids:
+    writer.writerow(["table", "group", "row", "column", "mean", "spread", "seeds", "mark"])
+    for table in tables:
         group = ""
-        for row in grid.rows:
+        for row in table.rows:
             if not row.cells:
                 group = row.label
-            for column, cell in zip(grid.columns, row.cells, strict=bool(row.cells)):
+            for column, cell in zip(table.columns, row.cells, strict=bool(row.cells)):
                 if cell.summary is not None:
                     spread = "" if cell.summary.spread is None else repr(cell.summary.spread)
-                    writer.writerow([grid.name, group, row.label, column, repr(cell.summary.mean), spread,
+                    writer.writerow([table.name, group, row.label, column, repr(cell.summary.mean), spread,
                                      cell.summary.count, cell.mark])  # fmt: skip
     return file.getvalue()
 
 
-def _markdown_grid(grid: ResultTable) -> str:
-    lines = [f"## {escape_markdown(grid.title)}", ""]
-    lines.append("| method | " + " | ".join(map(escape_markdown, grid.columns)) + " |")
-    lines.append("|---|" + "---:|" * len(grid.columns))
-    for row in grid.rows:
+def _markdown_table(table: ResultTable) -> str:
+    lines = [f"## {escape_markdown(table.title)}", ""]
+    lines.append("| method | " + " | ".join(map(escape_markdown, table.columns)) + " |")
+    lines.append("|---|" + "---:|" * len(table.columns))
+    for row in table.rows:
         if row.cells:
             lines.append(f"| {escape_markdown(row.label)} | " + " | ".join(map(_markdown_cell, row.cells)) + " |")
         else:
-            lines.append(f"| *{escape_markdown(row.label)}* |" + " |" * len(grid.columns))
-    for note in grid.notes:
+            lines.append(f"| *{escape_markdown(row.label)}* |" + " |" * len(table.columns))
+    for note in table.notes:
         lines += ["", escape_markdown(note)]
     return "\n".join(lines)
 
@@ -89,18 +89,18 @@ def _markdown_cell(cell: TableCell) -> str:
     return {"best": f"**{text}**", "second": f"<u>{text}</u>", "": text}[cell.mark]
 
 
-def _latex_grid(grid: ResultTable) -> str:
-    lines = [r"\begin{table}[htbp]", r"\centering", rf"\caption{{{escape_latex(grid.title)}}}"]
-    lines.append(rf"\label{{tab:{re.sub('[^a-z0-9-]', '-', grid.name.lower())}}}")
-    lines += [r"\begin{tabular}{l" + "r" * len(grid.columns) + "}", r"\toprule"]
-    lines += [" & ".join(["method", *map(escape_latex, grid.columns)]) + r" \\", r"\midrule"]
-    for row in grid.rows:
+def _latex_table(table: ResultTable) -> str:
+    lines = [r"\begin{table}[htbp]", r"\centering", rf"\caption{{{escape_latex(table.title)}}}"]
+    lines.append(rf"\label{{tab:{re.sub('[^a-z0-9-]', '-', table.name.lower())}}}")
+    lines += [r"\begin{tabular}{l" + "r" * len(table.columns) + "}", r"\toprule"]
+    lines += [" & ".join(["method", *map(escape_latex, table.columns)]) + r" \\", r"\midrule"]
+    for row in table.rows:
         if row.cells:
             lines.append(" & ".join([escape_latex(row.label), *map(_latex_cell, row.cells)]) + r" \\")
         else:
-            lines.append(rf"\multicolumn{{{len(grid.columns) + 1}}}{{l}}{{\textit{{{escape_latex(row.label)}}}}} \\")
+            lines.append(rf"\multicolumn{{{len(table.columns) + 1}}}{{l}}{{\textit{{{escape_latex(row.label)}}}}} \\")
     lines += [r"\bottomrule", r"\end{tabular}"]
-    lines += [rf"\par\smallskip {escape_latex(note)}" for note in grid.notes]
+    lines += [rf"\par\smallskip {escape_latex(note)}" for note in table.notes]
     return "\n".join([*lines, r"\end{table}"])
 
 

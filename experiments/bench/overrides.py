@@ -95,7 +95,7 @@ def with_full_images(change: ConfigOverride) -> ConfigOverride:
 def with_summed_compensation(config: MethodConfig, _budget: Budget) -> MethodConfig:
     """The paper's compensation, added to the sums of gradients and not to their means."""
     printed = with_paper_compensation(config)
-    return enable_compensation(printed, added_to="sum")
+    return enable_compensation(printed, target="sum")
 
 
 def with_dense_adam(change: ConfigOverride) -> ConfigOverride:
@@ -159,17 +159,17 @@ def coarse_with_compensation(compensation: CompensationConfig) -> ConfigOverride
     return change
 
 
-def factorial_cell(lambda_vis: float, added_to: Literal["mean", "sum"] | None, t_low: float) -> ConfigOverride:
-    """One cell of the factorial: all blocks have equally many cameras, and all of compensation but `added_to` and T_low
+def factorial_cell(lambda_vis: float, target: Literal["mean", "sum"] | None, t_low: float) -> ConfigOverride:
+    """One cell of the factorial: all blocks have equally many cameras, and all of compensation but `target` and T_low
     is the paper's."""
 
     def change(config: MethodConfig, budget: Budget) -> MethodConfig:
         printed = with_paper_compensation(with_lambda_vis(lambda_vis)(config, budget), t_low=t_low)
         equal = replace(printed.assignment, threshold=1.0, min_cameras=FACTORIAL_CAMERAS)
         changed = replace(printed, assignment=equal)
-        if added_to is None:
+        if target is None:
             return enable_compensation(changed, enabled=False)
-        return enable_compensation(changed, added_to=added_to)
+        return enable_compensation(changed, target=target)
 
     return change
 
@@ -215,7 +215,7 @@ def with_gamma(value: float) -> ConfigOverride:
 
 def with_paper_gate(config: MethodConfig, _budget: Budget) -> MethodConfig:
     """Offsets of low visibility are judged after as many draws as the others."""
-    return enable_compensation(config, gate="paper")
+    return enable_compensation(config, min_draws="paper")
 
 
 def with_partition_strategy(strategy: PartitionStrategy) -> ConfigOverride:
@@ -229,8 +229,8 @@ def with_partition_strategy(strategy: PartitionStrategy) -> ConfigOverride:
 
 
 def explicit_gaussians(background: Literal["mean", "black"]) -> ConfigOverride:
-    """3DGS, told by what it has in common with our coarse stage: iterations, seed, background and the limit of anchors
-    (`explicit.gaussians_config` makes its settings of these)."""
+    """3DGS, by what it has in common with our coarse stage: iterations, seed, background and the limit of anchors
+    (`gs3d_stage.gs3d_config` makes its settings of these)."""
 
     def change(config: MethodConfig, budget: Budget) -> MethodConfig:
         alone = coarse_only(config, budget)

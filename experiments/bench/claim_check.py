@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from experiments.bench.grids import group_bounds
 from experiments.bench.plan import BenchPlan
+from experiments.bench.result_tables import group_bounds
 from experiments.bench.results import BenchResult
 from experiments.bench.statistics import SeedDifference, paired_difference, summarize
 
@@ -30,12 +30,14 @@ class ClaimCheck:
 
 def check_claims(plan: BenchPlan, results: Sequence[BenchResult]) -> list[ClaimCheck]:
     """For each scene with the full method: uneven ones by group, even ones against the best."""
-    lines = []
+    claims = []
     ours = plan.table.ours
-    foreign = {method.name for method in plan.methods if method.renders is not None}
-    titles = {method.name: method.title + " (by another program)" * (method.name in foreign) for method in plan.methods}
+    external = {method.name for method in plan.methods if method.renders is not None}
+    titles = {
+        method.name: method.title + " (by another program)" * (method.name in external) for method in plan.methods
+    }
     for scene in plan.scenes:
-        mine = [result for result in results if result.scene == scene.name]
+        in_scene = [result for result in results if result.scene == scene.name]
         fair = [
             method.name for method in plan.methods
             if method.name != ours and not method.more and _has_answer(plan, scene.name, method.name)
@@ -44,12 +46,12 @@ def check_claims(plan: BenchPlan, results: Sequence[BenchResult]) -> list[ClaimC
         if ours not in titles or not others:
             continue
         if scene.uneven:
-            lines += [line for other in others for line in _uneven(scene.title, mine, ours, other, titles)]
+            claims += [claim for other in others for claim in _uneven(scene.title, in_scene, ours, other, titles)]
         else:
             # The best of those that had the same means.
-            equal = [name for name in fair if name not in foreign]
-            lines.append(_even(scene.title, mine, ours, {name: titles[name] for name in (ours, *equal)}))
-    return lines
+            equal = [name for name in fair if name not in external]
+            claims.append(_even(scene.title, in_scene, ours, {name: titles[name] for name in (ours, *equal)}))
+    return claims
 
 
 def _has_answer(plan: BenchPlan, scene: str, method: str) -> bool:
@@ -82,14 +84,14 @@ def _uneven(
 
 def _even(scene: str, results: Sequence[BenchResult], ours: str, titles: dict[str, str]) -> ClaimCheck:
     means = {name: summarize(_by_seed(results, name, "psnr").values()) for name in titles}
-    known = {name: each.mean for name, each in means.items() if each is not None}
+    measured = {name: each.mean for name, each in means.items() if each is not None}
     question = f"{titles[ours]} within {TOLERANCE_DB} dB of the best (even coverage)"
-    if ours not in known or len(known) < 2:
+    if ours not in measured or len(measured) < 2:
         return ClaimCheck(scene, question, None, "no results to compare")
-    best = max(known, key=lambda name: known[name])
-    behind = known[best] - known[ours]
+    best = max(measured, key=lambda name: measured[name])
+    behind = measured[best] - measured[ours]
     return ClaimCheck(
-        scene, question, behind <= TOLERANCE_DB, f"{known[ours]:.2f} dB, best {titles[best]} {known[best]:.2f} dB"
+        scene, question, behind <= TOLERANCE_DB, f"{measured[ours]:.2f} dB, best {titles[best]} {measured[best]:.2f} dB"
     )
 
 

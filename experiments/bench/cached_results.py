@@ -19,11 +19,11 @@ from vdgs.system.atomic_files import read_json
 
 
 def read_cached_results(files: Iterable[Path]) -> dict[str, BenchResult]:
-    """Key -> result of every finished run that the files tell of; of several with one key the first.
+    """Key -> result of every finished run in the files; of several with one key the first.
 
     Raises VdgsError for a file that cannot be read or is no results.json of a bench.
     """
-    found: dict[str, BenchResult] = {}
+    results_by_key: dict[str, BenchResult] = {}
     for file in files:
         content = read_json(file)
         try:
@@ -35,8 +35,8 @@ def read_cached_results(files: Iterable[Path]) -> dict[str, BenchResult]:
             ) from error
         for each in results:
             if each.state == "done":
-                found.setdefault(each.key, each)
-    return found
+                results_by_key.setdefault(each.key, each)
+    return results_by_key
 
 
 def _result(plain: Mapping[str, Any]) -> BenchResult:
@@ -76,5 +76,5 @@ def _grouped_alike(result: BenchResult, reference: BenchResult | None) -> bool:
 
 def _ungrouped(result: BenchResult) -> BenchResult:
     figures = {name: value for name, value in result.figures.items() if "@" not in name}
-    why = "Its groups by visibility are of other pixels than those of the runs here: it has none in this table."
-    return replace(result, figures=figures, groups=(), frusta=(), reason=why)
+    reason = "Its groups by visibility are of other pixels than those of the runs here: it has none in this table."
+    return replace(result, figures=figures, groups=(), frusta=(), reason=reason)

@@ -1,4 +1,4 @@
-"""Results as grids of numbers: rows are methods, columns figures. How they are written is `writing.py`'s business."""
+"""Results as tables of numbers: rows are methods, columns figures. `table_writers.py` writes them."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from typing import Any
 
 from experiments.bench.definitions import MethodGroup
 from experiments.bench.measure import group_names
+from experiments.bench.paper_numbers import METRIC_COLUMNS, PAPER_NUMBERS
 from experiments.bench.plan import BenchPlan
-from experiments.bench.quoted import METRIC_COLUMNS, PAPER_NUMBERS
 from experiments.bench.results import BenchResult
 from experiments.bench.statistics import Mark, Summary, rank_marks, summarize
-from vdgs.evaluation.by_visibility import format_bounds as named_bounds
+from vdgs.evaluation.by_visibility import format_bounds
 
 
 @dataclass(frozen=True)
 class TableColumn:
-    """A figure: `key` of `Result.figures`, shown times `factor`; `better`: +1 higher, -1 lower, 0 neither."""
+    """A figure: `key` of `BenchResult.figures`, shown times `factor`; `better`: +1 higher, -1 lower, 0 neither."""
 
     title: str
     key: str
@@ -124,7 +124,7 @@ def make_result_tables(plan: BenchPlan, results: Sequence[BenchResult]) -> list[
     across = "mean ± standard deviation over seeds" if len(plan.seeds) > 1 else "one seed"
     views = "Validation views" if plan.validation else "Test views"
     unseen = _unseen(plan, results)
-    grids = [
+    tables = [
         _measured(plan, results, "raw", f"{views}, raw ({across})", _for_scenes(plan, QUALITY_COLUMNS), unseen),
         _measured(
             plan,
@@ -137,36 +137,43 @@ def make_result_tables(plan: BenchPlan, results: Sequence[BenchResult]) -> list[
         *_neutral(plan, results, f"{views}, neutral colours ({across})"),
     ]
     for scene in plan.scenes:
-        mine = [result for result in results if result.scene == scene.name]
-        columns, notes = _group_columns(mine, scene.name)
+        in_scene = [result for result in results if result.scene == scene.name]
+        columns, notes = _group_columns(in_scene, scene.name)
         if columns:
             title = f"{scene.title}: PSNR by visibility"
-            grids.append(_measured(plan, mine, f"visibility-{scene.name}", title, columns, notes))
-        columns, notes = _frusta_columns(mine, scene.name)
+            tables.append(_measured(plan, in_scene, f"visibility-{scene.name}", title, columns, notes))
+        columns, notes = _frusta_columns(in_scene, scene.name)
         if columns:
             title = f"{scene.title}: PSNR by visibility as the paper counts it"
-            grids.append(_measured(plan, mine, f"frusta-{scene.name}", title, columns, notes))
+            tables.append(_measured(plan, in_scene, f"frusta-{scene.name}", title, columns, notes))
         columns = [
-            _for_scene(c, scene.name) for c in COVERAGE_COLUMNS if any(r.figures.get(c.key) is not None for r in mine)
+            _for_scene(c, scene.name)
+            for c in COVERAGE_COLUMNS
+            if any(r.figures.get(c.key) is not None for r in in_scene)
         ]
         if columns:
             title = f"{scene.title}: solidity"
-            grids.append(_measured(plan, mine, f"solidity-{scene.name}", title, columns, (COVERAGE_NOTE,)))
+            tables.append(_measured(plan, in_scene, f"solidity-{scene.name}", title, columns, (COVERAGE_NOTE,)))
         columns = [_for_scene(c, scene.name) for c in COST_COLUMNS]
         title = f"{scene.title}: what each method got"
-        grids.append(_measured(plan, mine, f"costs-{scene.name}", title, columns, (SIZE_NOTE,)))
-    quoted = _paper_table(plan)
-    return grids + ([quoted] if quoted else [])
+        tables.append(_measured(plan, in_scene, f"costs-{scene.name}", title, columns, (SIZE_NOTE,)))
+    from_paper = _paper_table(plan)
+    return tables + ([from_paper] if from_paper else [])
 
 
 def _neutral(plan: BenchPlan, results: Sequence[BenchResult], title: str) -> list[ResultTable]:
     """Quality in neutral colours, of all methods; nothing where no method is measured in others."""
     if all(result.figures.get("psnr_reference_exposure") is None for result in results):
         return []
-    alike = [replace(result, figures=_in_neutral_colors(result.figures)) for result in results]
+    in_neutral = [replace(result, figures=_in_neutral_colors(result.figures)) for result in results]
     return [
         _measured(
-            plan, alike, "neutral", title, _for_scenes(plan, REFERENCE_EXPOSURE_COLUMNS), (REFERENCE_EXPOSURE_NOTE,)
+            plan,
+            in_neutral,
+            "neutral",
+            title,
+            _for_scenes(plan, REFERENCE_EXPOSURE_COLUMNS),
+            (REFERENCE_EXPOSURE_NOTE,),
         )
     ]
 
@@ -203,8 +210,8 @@ def _unseen(plan: BenchPlan, results: Sequence[BenchResult]) -> tuple[str, ...]:
             shares[scene.title] = share
     if not shares:
         return ()
-    said = "; ".join(f"{title}: {share:.1%}" for title, share in shares.items())
-    return (f"Over all pixels, of which no training camera sees: {said}. There every method only guesses.",)
+    listed = "; ".join(f"{title}: {share:.1%}" for title, share in shares.items())
+    return (f"Over all pixels, of which no training camera sees: {listed}. There every method only guesses.",)
 
 
 def _frusta_columns(results: Sequence[BenchResult], scene: str) -> tuple[list[TableColumn], tuple[str, ...]]:
@@ -220,8 +227,8 @@ def _frusta_columns(results: Sequence[BenchResult], scene: str) -> tuple[list[Ta
 
 def _group_columns(results: Sequence[BenchResult], scene: str) -> tuple[list[TableColumn], tuple[str, ...]]:
     """PSNR of each group, least seen first, raw and corrected for the ends; how the groups are bounded."""
-    of = next((result for result in results if result.groups), None)
-    groups = of.groups if of else ()
+    first = next((result for result in results if result.groups), None)
+    groups = first.groups if first else ()
     names = group_names(len(groups)) if groups else []
     columns = [TableColumn(f"{name} ↑", f"psnr@{index}", scene=scene) for index, name in enumerate(names)]
     columns += [
@@ -229,11 +236,10 @@ def _group_columns(results: Sequence[BenchResult], scene: str) -> tuple[list[Tab
         for index in sorted({0, len(names) - 1})
         if names
     ]
-    if of is None:
+    if first is None:
         return columns, ()
-    return columns, (
-        f"V: {VISIBILITY_SOURCE_NOTES[of.visibility_source]}. Pooled over all these views: {all_group_bounds(of)}.",
-    )
+    source = VISIBILITY_SOURCE_NOTES[first.visibility_source]
+    return columns, (f"V: {source}. Pooled over all these views: {all_group_bounds(first)}.",)
 
 
 def all_group_bounds(result: BenchResult) -> str:
@@ -244,7 +250,7 @@ def all_group_bounds(result: BenchResult) -> str:
 
 def group_bounds(group: Mapping[str, Any]) -> str:
     """Least and greatest V of a group."""
-    return named_bounds(group["lower"], group["upper"])
+    return format_bounds(group["lower"], group["upper"])
 
 
 def _measured(
@@ -281,9 +287,9 @@ def _rows_of_group(
         for i, column in enumerate(columns)
     ]
     rows = [TableRow(title)] if title and methods else []
-    for place, method in enumerate(methods):
+    for index, method in enumerate(methods):
         cells = tuple(
-            TableCell(table[place][i], column.digits, marked[i][place])  # type: ignore[arg-type]
+            TableCell(table[index][i], column.digits, marked[i][index])  # type: ignore[arg-type]
             for i, column in enumerate(columns)
         )  # fmt: skip
         rows.append(TableRow(titles[method], cells))
@@ -303,14 +309,14 @@ def _paper_table(plan: BenchPlan) -> ResultTable | None:
         return None
     scenes = list(dict.fromkeys(scene for row in rows.values() for scene in row))
     columns = tuple(f"{scene}: {name}" for scene in scenes for name in METRIC_COLUMNS)
-    made = []
+    table_rows = []
     for label, row in rows.items():
         cells = [
             TableCell(Summary(row[scene][i], None, 1), 4 if digits == 4 and i else (2 if i == 0 else 3))
             if scene in row else TableCell(None, 2)
             for scene in scenes for i, digits in enumerate([2, 4, 4] if plan.table.name == "table4" else [2, 3, 3])
         ]  # fmt: skip
-        made.append(TableRow(label, tuple(cells)))
+        table_rows.append(TableRow(label, tuple(cells)))
     return ResultTable(
-        "quoted", "Quoted from the paper (its data, its hardware; not measured here)", columns, tuple(made)
+        "quoted", "Quoted from the paper (its data, its hardware; not measured here)", columns, tuple(table_rows)
     )

@@ -1,4 +1,4 @@
-"""A made-up site of any size: anchors, cameras over them, blocks side by side, and a COLMAP capture of them.
+"""A synthetic site of any size: anchors, cameras over them, blocks side by side, and a COLMAP capture of them.
 
 The site grows with the photographs, so that a place is seen by about as many however large the site is: a flight of
 5000 photographs covers two kilometres by two. Half of the anchors lie evenly on the plane, half in dense quarters, as a
@@ -33,7 +33,7 @@ SIZE, FOCAL = (96, 72), 0.75
 POINTS_EACH, SEEN_EACH = 200, 2000
 
 
-def extent_of(cameras: int) -> float:
+def extent_for(cameras: int) -> float:
     """The side in metres of the site that so many photographs cover."""
     return EXTENT_A_ROOT * cameras**0.5
 
@@ -42,15 +42,15 @@ def flight(count: int, width: int = 1200, height: int = 800) -> list[Camera]:
     """Photographs from 120 m in serpentines, every third an oblique of 45 degrees in a random direction."""
     generator = np.random.default_rng(0)
     across = int(np.ceil(count**0.5))
-    step = extent_of(count) / across
+    step = extent_for(count) / across
     return [
-        _looking((index % across + 0.5) * step, (index // across + 0.5) * step,
+        _tilted_camera((index % across + 0.5) * step, (index // across + 0.5) * step,
                  generator.uniform(0, 2 * np.pi), TILTS_DEG[index % len(TILTS_DEG)], width, height)
         for index in range(count)
     ]  # fmt: skip
 
 
-def _looking(x: float, y: float, heading: float, tilt_deg: float, width: int, height: int) -> Camera:
+def _tilted_camera(x: float, y: float, heading: float, tilt_deg: float, width: int, height: int) -> Camera:
     c, s = np.cos(heading), np.sin(heading)
     turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
     c, s = np.cos(np.deg2rad(tilt_deg)), np.sin(np.deg2rad(tilt_deg))
@@ -64,21 +64,21 @@ def _looking(x: float, y: float, heading: float, tilt_deg: float, width: int, he
     )  # fmt: skip
 
 
-def places(count: int, extent_m: float, seed: int = 1) -> np.ndarray:
+def random_positions(count: int, extent_m: float, seed: int = 1) -> np.ndarray:
     """Where anchors are, [n, 3] float32, in no order: half evenly, half in quarters, up to 60 m high; a few strays."""
     generator = np.random.default_rng(seed)
     quarters = generator.uniform(0, extent_m, (QUARTERS, 2))
-    found = np.empty((count, 3), np.float32)
-    found[:, :2] = generator.uniform(0, extent_m, (count, 2))
+    positions = np.empty((count, 3), np.float32)
+    positions[:, :2] = generator.uniform(0, extent_m, (count, 2))
     dense = count // 2
-    found[:dense, :2] = quarters[generator.integers(0, QUARTERS, dense)]
-    found[:dense, :2] += generator.normal(0, extent_m / QUARTERS, (dense, 2))
-    found[:, 2] = 60 * generator.random(count) ** 3
-    found[: count // 2000, :2] *= 1.5
-    return found
+    positions[:dense, :2] = quarters[generator.integers(0, QUARTERS, dense)]
+    positions[:dense, :2] += generator.normal(0, extent_m / QUARTERS, (dense, 2))
+    positions[:, 2] = 60 * generator.random(count) ** 3
+    positions[: count // 2000, :2] *= 1.5
+    return positions
 
 
-def model(positions: np.ndarray, extent_m: float) -> AnchorModel:
+def random_model(positions: np.ndarray, extent_m: float) -> AnchorModel:
     """Anchors that are as large as they lie apart, with a decoder that nothing trained."""
     n, g = len(positions), torch.Generator().manual_seed(0)
     spacing = extent_m / n**0.5
@@ -96,17 +96,17 @@ def model(positions: np.ndarray, extent_m: float) -> AnchorModel:
     )
 
 
-def slices(extent_m: float, count: int) -> Blocks:
+def strip_blocks(extent_m: float, count: int) -> Blocks:
     """Blocks side by side along x, widened as by --partition.expansion 0.4."""
     cores = [shapely.box(a, 0, b, extent_m) for a, b in pairwise(np.linspace(0, extent_m, count + 1))]
     return Blocks(tuple(Block(core, core.buffer(0.4 * np.sqrt(core.area / np.pi))) for core in cores))
 
 
-def capture(folder: Path, photographs: int) -> None:
+def write_capture(folder: Path, photographs: int) -> None:
     """A binary COLMAP model with tracks, and small photographs: one file with many names."""
     width, height = SIZE
-    cameras, extent = flight(photographs, width, height), extent_of(photographs)
-    points = places(POINTS_EACH * photographs, extent, seed=2).astype(np.float64)
+    cameras, extent = flight(photographs, width, height), extent_for(photographs)
+    points = random_positions(POINTS_EACH * photographs, extent, seed=2).astype(np.float64)
     names = [f"flight/drone_{index:05d}.jpg" for index in range(photographs)]
     _write_photographs(folder / "images", names)
     sparse = folder / "sparse" / "0"
@@ -114,12 +114,12 @@ def capture(folder: Path, photographs: int) -> None:
     first = cameras[0]
     numbers = struct.pack("<QIiQQ4d", 1, 1, 1, width, height, first.fx, first.fy, first.cx, first.cy)
     (sparse / "cameras.bin").write_bytes(numbers)
-    by_cell = _Cells(points, extent, cells=max(1, int(extent / HEIGHT_M)))
+    grid = _PointGrid(points, extent, cells=max(1, int(extent / HEIGHT_M)))
     observed = []
     with (sparse / "images.bin").open("wb") as file:
         file.write(struct.pack("<Q", photographs))
         for index, camera in enumerate(cameras):
-            shown = by_cell.seen_by(camera, index)
+            shown = grid.seen_by(camera, index)
             record = np.zeros(len(shown), [("pixel", "<f8", 2), ("point", "<i8")])
             record["pixel"], record["point"] = camera.project(points[shown])[0], shown + 1
             pose = struct.pack("<I7dI", index + 1, *_quaternion(camera), *camera.camera_from_world[:3, 3], 1)
@@ -143,7 +143,7 @@ def _write_points(file: Path, points: np.ndarray, observed: np.ndarray) -> None:
             stream.write(head.tobytes() + tracks[begin:end].tobytes())
 
 
-class _Cells:
+class _PointGrid:
     """Points by cells of the plane, so that a photograph asks only those about it."""
 
     def __init__(self, points: np.ndarray, extent: float, cells: int) -> None:
@@ -161,14 +161,13 @@ class _Cells:
             for x in range(max(0, column - 2), min(self.cells, column + 3))
             for y in range(max(0, row - 2), min(self.cells, row + 3))
         ]
-        found = np.concatenate(near)
-        found = found[camera.in_frustum(self.points[found])]
-        chosen = np.random.default_rng(seed).permutation(found)[:SEEN_EACH]
-        return np.sort(chosen)
+        candidates = np.concatenate(near)
+        candidates = candidates[camera.in_frustum(self.points[candidates])]
+        return np.sort(np.random.default_rng(seed).permutation(candidates)[:SEEN_EACH])
 
 
 def _write_photographs(folder: Path, names: list[str]) -> None:
-    """One photograph with grain, under all names (hard links: a disk of pictures is not what is measured)."""
+    """One photograph with grain, under all names (hard links: disk space is not what is measured)."""
     generator = np.random.default_rng(3)
     pixels = generator.integers(0, 256, (*SIZE[::-1], 3), np.uint8)
     first = folder / names[0]

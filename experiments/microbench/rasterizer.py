@@ -1,8 +1,8 @@
 """How fast the rasteriser draws and differentiates: nine scenes, one and two threads, every instruction set.
 
-    python -m experiments.microbench.rasteriser
-    python -m experiments.microbench.rasteriser --prototype DIR     beside the feasibility study in DIR, interleaved
-    python -m experiments.microbench.rasteriser --run RUN           test views of a trained run instead
+    python -m experiments.microbench.rasterizer
+    python -m experiments.microbench.rasterizer --prototype DIR     beside the feasibility study in DIR, interleaved
+    python -m experiments.microbench.rasterizer --run RUN           test views of a trained run instead
 
 Times are medians in milliseconds of the public function, autograd included, from tensors to gradients;
 the study is timed from arrays to arrays. Repetitions alternate, so that a busy machine slows both alike:
@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from experiments.microbench.machine import describe
+from experiments.microbench.hardware_info import describe
 from vdgs.kernels.cpu.extension import load_extension, supported_isas
 from vdgs.kernels.cpu.rasterize import rasterize
 from vdgs.kernels.kernel_types import Splats

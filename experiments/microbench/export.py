@@ -1,8 +1,8 @@
-"""How long the export of a large scene takes, and how much memory: a made-up model of many anchors.
+"""How long the export of a large scene takes, and how much memory: a synthetic model of many anchors.
 
     export OMP_WAIT_POLICY=PASSIVE
-    python -m experiments.microbench.exporting --anchors 20000 60000 200000 [--output a.ply b.spz]
-    python -m experiments.microbench.exporting --anchors 1000000 --folder /large/disk --no-evaluate
+    python -m experiments.microbench.export --anchors 20000 60000 200000 [--output a.ply b.spz]
+    python -m experiments.microbench.export --anchors 1000000 --folder /large/disk --no-evaluate
 
 Each anchor has 10 Gaussians; there are as many photographs to an anchor as in a real flight (one for 1600), 400 x 300
 pixels, and a place is seen by about ten. Every size runs in a process of its own. Seconds are wall clock and processor
@@ -47,7 +47,7 @@ WIDTH, HEIGHT = 400, 300
 TESTED = 40
 
 
-def made_up(anchors: int) -> tuple[AnchorModel, list[Camera]]:
+def synthetic_flight(anchors: int) -> tuple[AnchorModel, list[Camera]]:
     """Anchors on a square of ground, one in each unit, in the order in which training leaves them, and a flight above
     that looks straight down."""
     side = math.ceil(math.sqrt(anchors))
@@ -86,7 +86,7 @@ def made_up(anchors: int) -> tuple[AnchorModel, list[Camera]]:
 
 def one(anchors: int, folder: Path, names: list[str], measure: bool) -> None:
     """Export one size and print what it took, as JSON."""
-    model, cameras = made_up(anchors)
+    model, cameras = synthetic_flight(anchors)
     photograph = folder / "gray.png"
     Image.new("RGB", (WIDTH, HEIGHT), (128, 128, 128)).save(photograph)
     every = max(4, len(cameras) // TESTED)
@@ -101,25 +101,25 @@ def one(anchors: int, folder: Path, names: list[str], measure: bool) -> None:
         for i, camera in enumerate(cameras)
     )
     ground = GroundFrame(
-        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, description="made up", origin_geo=None
+        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, description="synthetic", origin_geo=None
     )
     capture = Capture(
-        root=folder, source="made up", images=".", views=views, points=np.zeros((1, 3)),
+        root=folder, source="synthetic", images=".", views=views, points=np.zeros((1, 3)),
         point_colors=np.zeros((1, 3), np.uint8), ground=ground,
     )  # fmt: skip
     file = folder / "run" / "coarse" / "model.safetensors"
     model.save(file)
     run = OpenedRun(
         folder=RunFolder(folder / "run"), model=model, model_path=file, name="coarse", status=StatusRecord(), key="key",
-        caution="", capture=capture,
+        warning="", capture=capture,
     )  # fmt: skip
     export_run.open_run = lambda *_: run
     set_num_threads(get_num_threads())
     began, before = time.monotonic(), time.process_time()
-    asked = ExportRequest(
+    args = ExportRequest(
         run=folder / "run", output=tuple(folder / name for name in names), evaluate=measure, device="cpu"
     )
-    record = export_run.export_run(asked, Console(quiet=True))
+    record = export_run.export_run(args, Console(quiet=True))
     print(json.dumps({
         "anchors": anchors, "gaussians": record["gaussians"], "views": len(cameras),
         "seconds": time.monotonic() - began, "processor": time.process_time() - before,
@@ -135,24 +135,24 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=None, help="where files are written for a while")
     parser.add_argument("--evaluate", action=argparse.BooleanOptionalAction, default=True)
     parser.add_argument("--one", action="store_true", help=argparse.SUPPRESS)
-    asked = parser.parse_args()
-    if asked.one:
-        one(asked.anchors[0], asked.folder, asked.to, asked.measure)
+    args = parser.parse_args()
+    if args.one:
+        one(args.anchors[0], args.folder, args.output, args.evaluate)
         return
     rows = []
-    for anchors in asked.anchors:
-        with tempfile.TemporaryDirectory(dir=asked.folder) as folder:
+    for anchors in args.anchors:
+        with tempfile.TemporaryDirectory(dir=args.folder) as folder:
             command = [
                 sys.executable,
                 "-m",
-                "experiments.microbench.exporting",
+                "experiments.microbench.export",
                 "--one",
                 "--anchors",
                 str(anchors),
                 "--folder",
                 folder,
             ]
-            command += ["--output", *asked.to, "--evaluate" if asked.measure else "--no-evaluate"]
+            command += ["--output", *args.output, "--evaluate" if args.evaluate else "--no-evaluate"]
             row = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout.splitlines()[-1])
         rows.append(row)
         print(

@@ -53,32 +53,32 @@ class PixelVisibility:
 def visibility_from_truth(root: Path, options: CaptureOptions) -> PixelVisibility | None:
     """V by the truth beside a generated capture, read with `options`; None where there is none, or where it counts
     other training views than those that are used or does not know a test view."""
-    known = _load_truth(root, options)
-    if known is None:
+    loaded = _load_truth(root, options)
+    if loaded is None:
         return None
-    truth, capture, parts = known
+    truth, capture, parts = loaded
     views = _by_pose(capture.test_views)
 
-    def counted(camera: Camera) -> Float[np.ndarray, "h w"]:
+    def count_map(camera: Camera) -> Float[np.ndarray, "h w"]:
         return truth.visibility_map(views[camera.camera_from_world.tobytes()])
 
-    return PixelVisibility(capture, counted, "truth", f"seen at all: {parts}")
+    return PixelVisibility(capture, count_map, "truth", f"seen at all: {parts}")
 
 
 def visibility_from_frusta(root: Path, options: CaptureOptions) -> PixelVisibility | None:
     """How many training cameras hold the true surface at each pixel in their frustum, whatever hides it; None where
     `visibility_from_truth` is."""
-    known = _load_truth(root, options)
-    if known is None:
+    loaded = _load_truth(root, options)
+    if loaded is None:
         return None
-    truth, capture, parts = known
+    truth, capture, parts = loaded
     views, unit = _by_pose(capture.test_views), capture.ground.scale
     cameras = [view.camera for view in capture.train_views]
 
-    def counted(camera: Camera) -> Float[np.ndarray, "h w"]:
+    def count_map(camera: Camera) -> Float[np.ndarray, "h w"]:
         return count_frusta(truth, views[camera.camera_from_world.tobytes()], unit, cameras)
 
-    return PixelVisibility(capture, counted, "frusta", f"by frusta: {parts}")
+    return PixelVisibility(capture, count_map, "frusta", f"by frusta: {parts}")
 
 
 def _by_pose(views: Sequence[View]) -> dict[bytes, View]:
@@ -90,19 +90,19 @@ def count_frusta(truth: GroundTruth, view: View, unit: float, cameras: Sequence[
     in a metre."""
     depth = unit * truth.depth_map(view)
     sky = ~np.isfinite(depth)
-    places = view.camera.unproject(np.where(sky, 1.0, depth)).reshape(-1, 3)
-    held = count_visibility(torch.from_numpy(places), cameras).numpy().reshape(depth.shape)
-    return np.where(sky, np.nan, held)
+    points = view.camera.unproject(np.where(sky, 1.0, depth)).reshape(-1, 3)
+    counts = count_visibility(torch.from_numpy(points), cameras).numpy().reshape(depth.shape)
+    return np.where(sky, np.nan, counts)
 
 
 def _load_truth(root: Path, options: CaptureOptions) -> tuple[GroundTruth, Capture, str] | None:
-    """The truth of a generated capture, the capture, and what tells it from others; None as in `visibility_from_truth`."""
+    """The truth of a generated capture, the capture, and its identity; None as in `visibility_from_truth`."""
     if not has_ground_truth(root):
         return None
     truth, capture = load_ground_truth(root), load_capture(root, options)
-    known = {kind: {file.stem for file in (truth.folder / kind).glob("*.npz")} for kind in ("depth", "views")}
-    counted = known["depth"] == {Path(view.name).stem for view in capture.train_views}
-    if not counted or not known["views"] >= {Path(view.name).stem for view in capture.test_views}:
+    stems = {kind: {file.stem for file in (truth.folder / kind).glob("*.npz")} for kind in ("depth", "views")}
+    same_views = stems["depth"] == {Path(view.name).stem for view in capture.train_views}
+    if not same_views or not stems["views"] >= {Path(view.name).stem for view in capture.test_views}:
         return None
     parts = ", ".join(f"{name} {crc:08x}" for name, crc in capture_fingerprint(capture).items())
     return truth, capture, parts

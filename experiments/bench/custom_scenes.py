@@ -39,10 +39,10 @@ def resolve_scenes(texts: Sequence[str], options: CaptureOptions, validation: bo
         taken = {*SCENES, *(scene.name for scene in scenes.values())}
         scenes[key] = SCENES[text] if folder is None else _scene_from_folder(folder, options, validation, taken)
     if not any(scene.folder for scene in scenes.values()):
-        changed = [f"--{name.replace('_', '-')}" for name in _non_default_options(options)]
-        if changed:
+        flags = [f"--{name.replace('_', '-')}" for name in _non_default_options(options)]
+        if flags:
             raise VdgsError(
-                f"{', '.join(changed)}: say how a capture is read that is given as a folder (--scenes ./my-place); "
+                f"{', '.join(flags)}: say how a capture is read that is given as a folder (--scenes ./my-place); "
                 "scenes with names have options of their own. Leave them out."
             )
     return tuple(scenes.values())
@@ -73,7 +73,7 @@ def _scene_from_folder(folder: Path, options: CaptureOptions, validation: bool, 
         load_capture(folder, replace(options, validation=True))  # what cannot be held out is said now
     name, training = _name(folder, taken), len(capture.train_views)
     return BenchScene(
-        name, name, budget_for(training), options=_non_default_options(options), override=_for_photographs(training),
+        name, name, budget_for(training), options=_non_default_options(options), override=_limit_min_cameras(training),
         folder=folder.resolve(), contents=capture_fingerprint(capture), note=_note(capture),
     )  # fmt: skip
 
@@ -88,15 +88,15 @@ def _name(folder: Path, taken: Collection[str]) -> str:
 def _non_default_options(options: CaptureOptions) -> dict[str, Any]:
     """What is not as it is by default; files by their full paths, since processes read them."""
     values = {each.name: getattr(options, each.name) for each in fields(options) if each.name != "validation"}
-    plain = CaptureOptions()
+    defaults = CaptureOptions()
     return {
         name: value.resolve() if isinstance(value, Path) else value
         for name, value in values.items()
-        if value != getattr(plain, name)
+        if value != getattr(defaults, name)
     }
 
 
-def _for_photographs(training: int) -> Callable[[MethodConfig], MethodConfig]:
+def _limit_min_cameras(training: int) -> Callable[[MethodConfig], MethodConfig]:
     cameras = min(max(round(MIN_CAMERA_SHARE * training), MIN_CAMERAS), MAX_CAMERAS)
     return lambda config: replace(config, assignment=replace(config.assignment, min_cameras=cameras))
 
