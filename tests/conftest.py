@@ -88,7 +88,7 @@ def uncut(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     folder = tmp_path_factory.mktemp("uncut")
     write_colmap(folder / "capture", tiny_scene(columns=5, rows=4))
-    done = vdgs("coarse", folder / "capture", "--output", folder / "coarse", *COARSE, "--test-every", "4")
+    done = vdgs("train-coarse", folder / "capture", "--output", folder / "coarse", *COARSE, "--test-every", "4")
     assert done.returncode == 0, done.stderr + done.stdout
     return folder / "coarse"
 

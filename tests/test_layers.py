@@ -37,7 +37,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
 #: The folders of the experiments, lowest first, as the rooms of a package of its own.
 EXPERIMENT_LAYERS: tuple[tuple[str, ...], ...] = (("baselines", "microbench"), ("bench",), ("reports",))
 #: The only module of the package that may import the experiments.
-HANDS_OVER = "vdgs.cli.bench_cmd"
+HANDS_OVER = "vdgs.cli.tool_cmds"
 #: What other rooms may import of a room, beside the room itself.
 DOORS: Mapping[str, tuple[str, ...]] = {
     "kernels": (

@@ -245,18 +245,11 @@ def _metadata(case: Case, folder: Path) -> Work:
 
 def _command(case: Case, folder: Path, *words: str) -> Work:
     """A verb of the command line and its arguments, in this process."""
-    from vdgs.cli.main import main
+    from vdgs.cli.main import get_command
 
     path = _capture(case, folder)
-
-    def work() -> None:
-        try:
-            main([word.format(capture=path, folder=folder) for word in words])
-        except SystemExit as ended:
-            if ended.code:
-                raise
-
-    return work
+    verb = get_command(words[0])
+    return lambda: verb([word.format(capture=path, folder=folder) for word in words[1:]])
 
 
 def _inspect(case: Case, folder: Path) -> Work:

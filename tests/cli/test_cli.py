@@ -14,12 +14,12 @@ from support.clusters import copy_run
 from support.commands import PATIENCE_SECONDS, entry_point, vdgs
 from vdgs import cli
 from vdgs.cli.common import absolute_command_line, make_console
-from vdgs.cli.main import COMMANDS, HELP, main
+from vdgs.cli.main import COMMANDS, HELP, get_command, main
 
 HEAVY = ("torch", "numpy", "matplotlib", "pycolmap", "cv2", "scipy")
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["coarse", "--help"], ["eval", "--help"]])
+@pytest.mark.parametrize("arguments", [["--help"], ["train-coarse", "--help"], ["eval", "--help"]])
 def test_help_imports_nothing_heavy(arguments):
     code = (
         "import sys\nfrom vdgs.cli.main import main\n"
@@ -34,7 +34,7 @@ def test_help_imports_nothing_heavy(arguments):
 def test_every_verb_is_in_the_help_and_has_an_action():
     for verb in COMMANDS:
         assert f"  {verb} " in HELP
-        assert callable(getattr(cli, verb))
+        assert callable(get_command(verb))
 
 
 @pytest.mark.parametrize("verb", COMMANDS)
@@ -47,19 +47,19 @@ def test_every_verb_explains_itself(verb, capsys):
 
 def test_the_preset_decides_the_defaults(capsys):
     with pytest.raises(SystemExit):
-        main(["coarse", "--preset", "laptop", "--help"])
+        main(["train-coarse", "--preset", "laptop", "--help"])
     laptop = capsys.readouterr().out
     with pytest.raises(SystemExit):
-        main(["coarse", "--help"])
+        main(["train-coarse", "--help"])
     assert "100000" in capsys.readouterr().out
     assert "100000" not in laptop
 
 
 def test_an_unknown_verb_is_a_usage_error(capsys):
     with pytest.raises(SystemExit) as ended:
-        main(["trian"])
+        main(["mrege"])
     assert ended.value.code == 2
-    assert "there is no verb 'trian'; did you mean 'train'?" in capsys.readouterr().err
+    assert "there is no verb 'mrege'; did you mean 'merge'?" in capsys.readouterr().err
 
 
 def test_the_bench_is_named_where_there_is_only_the_package(monkeypatch, capsys):
@@ -81,7 +81,7 @@ def test_the_bench_is_found_from_any_folder(tmp_path):
 
 
 def test_a_missing_capture_is_one_line_and_no_traceback(tmp_path):
-    done = entry_point("coarse", tmp_path / "nowhere", "--output", tmp_path / "run")
+    done = entry_point("train-coarse", tmp_path / "nowhere", "--output", tmp_path / "run")
     assert done.returncode == 1
     assert "nowhere" in done.stderr
     assert "Traceback" not in done.stderr
@@ -89,7 +89,7 @@ def test_a_missing_capture_is_one_line_and_no_traceback(tmp_path):
 
 
 def test_settings_that_do_not_work_are_named(tmp_path):
-    done = vdgs("coarse", str(tmp_path), "--output", str(tmp_path / "run"), "--iterations", "-1")
+    done = vdgs("train-coarse", str(tmp_path), "--output", str(tmp_path / "run"), "--iterations", "-1")
     assert done.returncode == 1
     assert "--iterations -1: must be at least 0" in done.stderr
 
@@ -106,7 +106,7 @@ def test_quiet_leaves_what_a_person_must_know(capsys):
 
 @pytest.mark.parametrize(
     ("verb", "does"),
-    [("report", "vdgs.report.write_report"), ("map", "vdgs.rendering.ortho.render_ortho.render_ortho")],
+    [("report", "vdgs.report.write_report"), ("ortho", "vdgs.rendering.ortho.render_ortho.render_ortho")],
 )
 def test_verbs_that_show_a_result_can_be_quiet(verb, does, monkeypatch, capsys):
     def done(*given: object) -> Path:
@@ -116,9 +116,9 @@ def test_verbs_that_show_a_result_can_be_quiet(verb, does, monkeypatch, capsys):
         return Path("result")
 
     monkeypatch.setattr(does, done)
-    getattr(cli, verb)(["run"])
-    assert capsys.readouterr().out.startswith({"report": "report: result", "map": "how it goes"}[verb])
-    getattr(cli, verb)(["run", "--quiet"])
+    get_command(verb)(["run"])
+    assert capsys.readouterr().out.startswith({"report": "report: result", "ortho": "how it goes"}[verb])
+    get_command(verb)(["run", "--quiet"])
     said = capsys.readouterr()
     assert said.out == ""
     assert said.err in ("", "note what a person must know\n")
@@ -143,27 +143,27 @@ def test_the_arguments_are_parsed_once(uncut, monkeypatch, tmp_path, capsys):
 
     monkeypatch.setattr(tyro, "cli", count)
     for arguments in (
-        ("coarse", tmp_path / "nowhere", "--output", tmp_path / "run", "--preset=laptop"),
-        ("train", uncut),
+        ("train-coarse", tmp_path / "nowhere", "--output", tmp_path / "run", "--preset=laptop"),
+        ("train-blocks", uncut),
         ("merge", uncut, "--rule", "owner"),
         ("partition", "--capture", uncut, tmp_path),
     ):
         with pytest.raises(SystemExit) as ended:
             main([str(each) for each in arguments])
         assert ended.value.code == 1
-    assert parsed == ["CoarseArguments", "TrainArguments", "MergeArguments", "PartitionArguments"]
+    assert parsed == ["TrainCoarseArguments", "TrainBlocksArguments", "MergeArguments", "PartitionArguments"]
     assert f"{tmp_path}: is not a run folder" in capsys.readouterr().err
 
 
 def test_another_run_than_the_one_asked_for_is_named(uncut, tmp_path, capsys):
     other = copy_run(uncut, tmp_path / "other")
     with pytest.raises(SystemExit):
-        main(["train", "--capture", str(other), str(uncut)])
+        main(["train-blocks", "--capture", str(other), str(uncut)])
     assert f"{other}: is a run, and so is {uncut}" in capsys.readouterr().err
 
 
 def test_a_run_decides_the_defaults_of_its_help(uncut, capsys):
     for arguments, sampling in (([str(uncut)], "sqrt-visibility"), ([], "uniform")):
         with pytest.raises(SystemExit):
-            main(["train", *arguments, "--help"])
+            main(["train-blocks", *arguments, "--help"])
         assert f"(default: {sampling})" in capsys.readouterr().out

@@ -9,9 +9,9 @@ from types import SimpleNamespace
 
 import pytest
 
+from vdgs.cli.doctor import SystemCheck
 from vdgs.cli.doctor import doctor_report as doctor_report
 from vdgs.cli.doctor import system_checks as doctor
-from vdgs.cli.doctor.check import SystemCheck
 from vdgs.cli.doctor.doctor_report import is_healthy, print_report, run_checks
 
 pytestmark = pytest.mark.xdist_group("doctor")

@@ -11,15 +11,12 @@ from typing import Any
 import pytest
 
 from experiments.bench.cli import BenchArguments
-from vdgs.cli.capture_cmds import InspectArguments, SynthArguments
+from vdgs.cli.capture_cmds import InspectArguments, SfmArguments, SynthArguments
 from vdgs.cli.export_cmd import ExportArguments
 from vdgs.cli.main import main
-from vdgs.cli.ortho_cmd import OrthoArguments
-from vdgs.cli.result_cmds import EvalArguments, RenderArguments
+from vdgs.cli.result_cmds import EvalArguments, OrthoArguments, RenderArguments, ViewArguments
 from vdgs.cli.run_cmd import RunArguments, TrainCoarseArguments
-from vdgs.cli.sfm_cmd import SfmArguments
 from vdgs.cli.stage_cmds import MergeArguments, PartitionArguments, TrainBlocksArguments
-from vdgs.cli.view_cmd import ViewArguments
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.method import MethodConfig, PartitionConfig
 from vdgs.config.presets import PRESETS
@@ -38,7 +35,7 @@ ARGUMENTS: tuple[Any, ...] = (
     RenderArguments(run=HERE, output=HERE),
     PartitionArguments(run=HERE),
     TrainBlocksArguments(run=HERE),
-    MergeArguments(HERE),
+    MergeArguments(run=HERE),
     OrthoArguments(run=HERE),
     ExportArguments(run=HERE),
     SfmArguments(images=(HERE,), output=HERE),

@@ -15,7 +15,7 @@ from support.shard_scripts import job, run
 from vdgs.distributed import local_executor
 from vdgs.distributed.executor import LogListener, Task, TaskListener, TaskResult
 from vdgs.distributed.local_executor import LocalExecutor
-from vdgs.distributed.shard_runner import Shard
+from vdgs.distributed.shard_runner import ShardCommand
 from vdgs.distributed.task_process import PARENT_PID_VARIABLE, stop_when_parent_dies
 from vdgs.runs.stage_folder import StageFolder
 
@@ -37,17 +37,17 @@ class Told(TaskListener):
     def __init__(self):
         self.news: list[tuple[str, str | int]] = []
 
-    def started(self, task: Task, attempt: int) -> None:
+    def on_started(self, task: Task, attempt: int) -> None:
         self.news.append((task.name, attempt))
 
-    def ended(self, task: Task, outcome: TaskResult) -> None:
+    def on_ended(self, task: Task, outcome: TaskResult) -> None:
         self.news.append((task.name, outcome.state))
 
 
 @pytest.mark.parametrize("terminal", [False, True])
 def test_all_are_done_and_shown(tmp_path, terminal):
     outcomes, text = run([job(tmp_path, i, FINE) for i in (0, 3, 5)], terminal=terminal)
-    assert [(o.name, o.state, o.attempts, o.why) for o in outcomes] == [
+    assert [(o.name, o.state, o.attempts, o.reason) for o in outcomes] == [
         (f"block {i:02d}", "done", 1, "") for i in (0, 3, 5)
     ]
     assert "3 of 3 blocks done" in text
@@ -94,8 +94,8 @@ def test_a_crash_that_comes_back_fails_and_leaves_no_running_status(tmp_path):
     script = 'tell("running", iteration=7); print("last words", flush=True); os._exit(77)'
     (outcome,), text = run([job(tmp_path, 0, script)], retries=1)
     assert (outcome.state, outcome.attempts) == ("failed", 2)
-    assert "crashed 2 times" in outcome.why
-    assert "exit code 77" in outcome.why
+    assert "crashed 2 times" in outcome.reason
+    assert "exit code 77" in outcome.reason
     assert "last words" in text
     status = StageFolder(tmp_path / "00").status()
     assert (status.state, status.iteration) == ("failed", 7)
@@ -108,7 +108,7 @@ def test_an_explained_failure_is_not_repeated_and_stops_no_other(tmp_path):
     jobs = [job(tmp_path, 0, FINE), job(tmp_path, 1, failing), job(tmp_path, 2, FINE), job(tmp_path, 3, FINE)]
     outcomes, text = run(jobs, at_once=1)
     assert [o.state for o in outcomes] == ["done", "failed", "done", "done"]
-    assert (outcomes[1].attempts, outcomes[1].why) == (1, "a.jpg: is gone.\nPut it back.")
+    assert (outcomes[1].attempts, outcomes[1].reason) == (1, "a.jpg: is gone.\nPut it back.")
     assert "block 01 failed: a.jpg: is gone." in text
     assert "3 of 4 blocks done" in text
     assert str(jobs[1].output) in text.replace("\n", "")
@@ -117,8 +117,8 @@ def test_an_explained_failure_is_not_repeated_and_stops_no_other(tmp_path):
 def test_a_job_that_someone_else_stopped_is_not_started_again(tmp_path):
     (outcome,), _ = run([job(tmp_path, 0, 'print("vdgs train-blocks: Stopped at iteration 9; saved."); sys.exit(130)')])
     assert (outcome.state, outcome.attempts) == ("stopped", 1)
-    assert "someone else" in outcome.why
-    assert "iteration 9" in outcome.why
+    assert "someone else" in outcome.reason
+    assert "iteration 9" in outcome.reason
 
 
 def test_memory_that_ran_out_lowers_the_number_at_once(tmp_path, monkeypatch):
@@ -142,16 +142,16 @@ def test_a_damaged_status_file_is_no_reason_to_fall(tmp_path, content):
     made.folder.status_file.write_bytes(content)
     (outcome,), _ = run([made], retries=0, terminal=True)
     assert outcome.state == "failed"
-    assert "exit code 9" in outcome.why
+    assert "exit code 9" in outcome.reason
 
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / "blocks").write_text("a file where a folder should be")
     outcomes, _ = run([job(tmp_path / "blocks", 0, FINE), job(tmp_path, 1, FINE)])
     assert [o.state for o in outcomes] == ["failed", "done"]
-    assert str(tmp_path / "blocks/00") in outcomes[0].why
-    assert "Not a directory" in outcomes[0].why
-    assert "run the same command again" in outcomes[0].why
+    assert str(tmp_path / "blocks/00") in outcomes[0].reason
+    assert "Not a directory" in outcomes[0].reason
+    assert "run the same command again" in outcomes[0].reason
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
@@ -161,14 +161,14 @@ def test_a_full_disk_is_named(tmp_path):
     made.output.symlink_to("/dev/full")
     (outcome,), _ = run([made])
     assert outcome.state == "failed"
-    assert "No space left on device" in outcome.why
-    assert str(made.output) in outcome.why
+    assert "No space left on device" in outcome.reason
+    assert str(made.output) in outcome.reason
 
 
 def test_a_command_that_is_not_there_is_named(tmp_path):
-    (outcome,), _ = run([Shard(0, StageFolder(tmp_path), ["/nowhere/python"])])
+    (outcome,), _ = run([ShardCommand(0, StageFolder(tmp_path), ["/nowhere/python"])])
     assert outcome.state == "failed"
-    assert "/nowhere/python" in outcome.why
+    assert "/nowhere/python" in outcome.reason
 
 
 def test_a_folder_that_another_process_holds_is_waited_for(tmp_path):
@@ -177,8 +177,8 @@ def test_a_folder_that_another_process_holds_is_waited_for(tmp_path):
     class Holding(LogListener):
         """Lets go of the folder once it hears that it is waited for."""
 
-        def waits(self, task: Task) -> None:
-            super().waits(task)
+        def on_waiting(self, task: Task) -> None:
+            super().on_waiting(task)
             lock.close()
 
     with ExitStack() as lock:
@@ -237,31 +237,31 @@ DRIVER = """
 import json, sys
 from pathlib import Path
 from rich.console import Console
-from vdgs.distributed.shard_runner import Piece, run_pieces
+from vdgs.distributed.shard_runner import ShardCommand, run_shards
 from vdgs.distributed.local_executor import LocalExecutor
 from vdgs.runs.stage_folder import StageFolder
 
 class Counted(LocalExecutor):
     def run(self, tasks, listener):
-        tick = listener.tick
+        on_tick = listener.on_tick
         def counted():
-            tick()
+            on_tick()
             with open(sys.argv[2], "a") as looks: looks.write(".")
-        listener.tick = counted
+        listener.on_tick = counted
         return super().run(tasks, listener)
 
 jobs = [
-    Piece(index, StageFolder(Path(folder)), command) for index, folder, command in json.loads(sys.argv[1])
+    ShardCommand(index, StageFolder(Path(folder)), command) for index, folder, command in json.loads(sys.argv[1])
 ]
-outcomes = run_pieces(jobs, Counted(2, poll_seconds=0.02), Console())
-print("OUTCOMES", json.dumps([[o.state, o.attempts, o.why] for o in outcomes]))
+outcomes = run_shards(jobs, Counted(2, poll_seconds=0.02), Console())
+print("OUTCOMES", json.dumps([[o.state, o.attempts, o.reason] for o in outcomes]))
 """
 
 
 class Driver:
     """A process that runs jobs; begins once the first two say that they are ready."""
 
-    def __init__(self, jobs: list[Shard], root: Path):
+    def __init__(self, jobs: list[ShardCommand], root: Path):
         self._looks, self._root = root / "looks", root
         argument = json.dumps([[made.index, str(made.folder.path), made.command] for made in jobs])
         command = [sys.executable, "-c", DRIVER, argument, str(self._looks)]

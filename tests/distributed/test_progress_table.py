@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from vdgs.distributed.progress_table import build_progress_table, progress_line
+from vdgs.distributed.resource_allocation import default_jobs
 from vdgs.distributed.shard_progress import ProgressStats, ShardProgress, read_progress_stats, seconds_left_overall
-from vdgs.distributed.shard_runner import default_jobs
 from vdgs.distributed.task_process import error_message
 
 
@@ -89,7 +89,7 @@ def test_the_table_fits_the_screen_and_keeps_what_matters():
 def test_the_message_is_found_among_the_output(tmp_path):
     output = tmp_path / "output.log"
     output.write_bytes(
-        b"vdgs train-blocks: old\n--- again\nnoise\r\x1b[31m 50 %\x1b[0m\nvdgs train: a.jpg: gone\nPut it back\n\n"
+        b"vdgs train-blocks: old\n--- again\nnoise\r\x1b[31m 50 %\x1b[0m\nvdgs train-blocks: a.jpg: gone\nPut it back\n\n"
     )
     assert error_message(output) == "a.jpg: gone\nPut it back"
     output.write_bytes(b"Traceback\n  somewhere\nValueError: \xff\x07no\n")

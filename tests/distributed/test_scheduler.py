@@ -37,16 +37,16 @@ class Scripted:
     """An engine whose attempts end as a list says, one after the other; it remembers what they asked for."""
 
     def __init__(
-        self, ends: list[AttemptResult | OSError], most_memory: int | None = None, there: tuple[str, ...] = ()
+        self, ends: list[AttemptResult | OSError], max_memory_bytes: int | None = None, there: tuple[str, ...] = ()
     ):
-        self.most_memory, self._ends, self._there = most_memory, list(ends), there
+        self.max_memory_bytes, self._ends, self._there = max_memory_bytes, list(ends), there
         self.asked: list[tuple[str, int, TaskResources]] = []
 
     def start(self, tasks):
         self.asked += [(task.name, attempt, task.resources) for task, attempt in tasks]
         return [self._next() for _ in tasks]
 
-    def find(self, task):
+    def find_running(self, task):
         return self._next() if task.name in self._there else None
 
     def refresh(self):
@@ -68,7 +68,7 @@ class Attempt:
     def request_stop(self) -> None:
         raise AssertionError("nobody asked")
 
-    kill = ask_to_stop
+    kill = request_stop
 
 
 class Heard(LogListener):
@@ -78,8 +78,8 @@ class Heard(LogListener):
         self.lines: list[str] = []
         super().__init__(lambda text, _: self.lines.append(text))
 
-    def placed(self, task: Task, where: str, found: bool) -> None:
-        self.lines.append(f"{task.name} on {where}" + (" again" if found else ""))
+    def on_placed(self, task: Task, where: str, resumed: bool) -> None:
+        self.lines.append(f"{task.name} on {where}" + (" again" if resumed else ""))
 
 
 def run(folder: Path, engine: Scripted, task: Task | None = None, retries: int = 2):
@@ -93,12 +93,12 @@ def run(folder: Path, engine: Scripted, task: Task | None = None, retries: int =
 
 def test_memory_that_ran_out_is_asked_for_up_to_what_the_largest_node_has(tmp_path):
     killed = AttemptResult(-9, out_of_memory=True)
-    engine = Scripted([killed, killed, killed], most_memory=7 * GB)
+    engine = Scripted([killed, killed, killed], max_memory_bytes=7 * GB)
     outcome, lines = run(tmp_path, engine)
     assert [needs.memory_bytes for _, _, needs in engine.asked] == [4 * GB, 6 * GB, 7 * GB]
     assert (outcome.state, outcome.attempts) == ("failed", 3)
     assert "crashed by SIGKILL (out of memory; it asks for 6.00 GB now)" in lines[1]
-    assert "no node has more than the 7.00 GB" in outcome.why
+    assert "no node has more than the 7.00 GB" in outcome.reason
 
 
 def test_a_lost_place_is_worded_and_the_task_tried_a_bounded_number_of_times(tmp_path):
@@ -108,7 +108,7 @@ def test_a_lost_place_is_worded_and_the_task_tried_a_bounded_number_of_times(tmp
     assert lines[1].startswith("block 00: crashed by the loss of its node node-7; continues from its last checkpoint")
     outcome, _ = run(tmp_path, Scripted([lost] * 3))
     assert (outcome.state, outcome.attempts) == ("failed", 3)
-    assert outcome.why.startswith("crashed 3 times, at last by the loss of its node node-7")
+    assert outcome.reason.startswith("crashed 3 times, at last by the loss of its node node-7")
 
 
 def test_a_time_limit_costs_no_attempt_as_long_as_the_task_gets_further(tmp_path):
@@ -127,7 +127,7 @@ def test_a_time_limit_costs_no_attempt_as_long_as_the_task_gets_further(tmp_path
     assert sum("saved and waits for another turn" in line for line in lines) == 5
     outcome, _ = run(tmp_path, Further([SAVED] * 9), task, retries=1)
     assert outcome.state == "failed"
-    assert "its time limit, before it got any further" in outcome.why
+    assert "its time limit, before it got any further" in outcome.reason
 
 
 def test_what_an_earlier_driver_began_is_watched_and_not_begun_again(tmp_path):
@@ -140,41 +140,41 @@ def test_what_an_earlier_driver_began_is_watched_and_not_begun_again(tmp_path):
 def test_what_the_system_refuses_is_named(tmp_path):
     outcome, _ = run(tmp_path, Scripted([OSError(28, "No space left on device", "/runs/00/output.log")]))
     assert outcome.state == "failed"
-    assert outcome.why.startswith("/runs/00/output.log: No space left on device. Free some space")
+    assert outcome.reason.startswith("/runs/00/output.log: No space left on device. Free some space")
 
 
 @dataclass(frozen=True)
-class Place:
-    processors: int
+class Node:
+    cpus: int
     memory_bytes: int
 
 
-places = st.lists(st.builds(Place, st.integers(1, 64), st.integers(GB, 10**12)), min_size=1, max_size=5)
+node_lists = st.lists(st.builds(Node, st.integers(1, 64), st.integers(GB, 10**12)), min_size=1, max_size=5)
 
 
-@given(places, st.integers(1, 40), st.integers(0, 8), st.integers(10**8, 10**11))
-def test_blocks_find_room_on_a_cluster(places, blocks, jobs, each):
+@given(node_lists, st.integers(1, 40), st.integers(0, 8), st.integers(10**8, 10**11))
+def test_blocks_find_room_on_a_cluster(nodes, blocks, jobs, each):
     share = allocate_cluster(
-        ShardWorkload(pieces=blocks, shard_bytes=each, jobs=jobs), places, ExecutorOptions(executor="ray")
+        ShardWorkload(shards=blocks, shard_bytes=each, jobs=jobs), nodes, ExecutorOptions(executor="ray")
     )
-    needs, most = share.resources, max(place.memory_bytes for place in places)
+    needs, most = share.resources, max(node.memory_bytes for node in nodes)
     assert share.max_concurrent == min(blocks, jobs or blocks)
-    assert 1 <= needs.cpus <= max(place.processors for place in places)
-    room = sum(place.processors // needs.cpus for place in places)
+    assert 1 <= needs.cpus <= max(node.cpus for node in nodes)
+    room = sum(node.cpus // needs.cpus for node in nodes)
     assert needs.cpus == 1 or room >= share.max_concurrent
     assert min(each, most) <= needs.memory_bytes <= most
 
 
 works = st.builds(
-    ShardWorkload, st.integers(1, 60), st.integers(10**8, 10**11), st.just(0), st.sampled_from([0.0, 0.5, 20.0]),
-    photographs_bytes=st.integers(0, 10**12),
+    ShardWorkload, shards=st.integers(1, 60), shard_bytes=st.integers(10**8, 10**11), jobs=st.just(0),
+    image_gb=st.sampled_from([0.0, 0.5, 20.0]), images_bytes=st.integers(0, 10**12),
 )  # fmt: skip
 
 
 @given(works, st.integers(1, 128), st.integers(0, 10**12))
 def test_blocks_at_once_and_their_photographs_fit_into_one_machine(work, cores, free):
     share = allocate_local(work, cores, free)
-    photographs = min(work.photographs_bytes, 1e9 * share.image_gb)
+    photographs = min(work.images_bytes, 1e9 * share.image_gb)
     assert share.max_concurrent == 1 or share.max_concurrent * (work.shard_bytes + photographs) <= free + 1
     assert share.max_concurrent == 1 or not exceeds_memory(work, share.max_concurrent, free)
     assert (
@@ -185,12 +185,12 @@ def test_blocks_at_once_and_their_photographs_fit_into_one_machine(work, cores, 
 
 def test_large_photographs_leave_room_for_fewer_blocks():
     """Photographs of 20 MP: 3 GB for the picture of a block and 16 GB for those that are kept."""
-    large = ShardWorkload(pieces=32, shard_bytes=3_800_000_000, images_bytes=10**11)
+    large = ShardWorkload(shards=32, shard_bytes=3_800_000_000, images_bytes=10**11)
     share = allocate_local(large, 32, 64 * GB)
     assert (share.max_concurrent, share.image_gb) == (12, 16 / 12)
     assert allocate_local(replace(large, image_gb=40), 32, 64 * GB).max_concurrent == 6
     # Small ones need no quarter of the memory.
-    small = ShardWorkload(pieces=32, shard_bytes=2 * GB, images_bytes=10**7)
+    small = ShardWorkload(shards=32, shard_bytes=2 * GB, images_bytes=10**7)
     assert allocate_local(small, 32, 64 * GB).max_concurrent == 31
 
 
@@ -199,14 +199,14 @@ def test_two_small_blocks_fit_into_a_laptop_with_4_gb_free():
     cameras = [Camera(camera_from_world=np.eye(4), fx=1, fy=1, cx=0, cy=0, width=400, height=300)] * 56
     largest = block_workload(PRESETS["laptop"], 100_000, 200_000, 400 * 300)
     work = ShardWorkload(
-        pieces=4, shard_bytes=estimate_memory(largest).total, images_bytes=decoded_image_bytes(cameras)
+        shards=4, shard_bytes=estimate_memory(largest).total, images_bytes=decoded_image_bytes(cameras)
     )
     assert allocate_local(work, 2, 4 * GB).max_concurrent == 2
     assert not exceeds_memory(work, 2, 4 * GB)
 
 
 def test_photographs_give_way_to_blocks_that_a_person_asked_for():
-    work = ShardWorkload(pieces=4, shard_bytes=3 * GB, jobs=2, images_bytes=10**11)
+    work = ShardWorkload(shards=4, shard_bytes=3 * GB, jobs=2, images_bytes=10**11)
     assert allocate_local(work, 4, 7 * GB).image_gb == 0.5
     assert allocate_local(work, 4, 6 * GB).image_gb == 0.1
     assert [exceeds_memory(work, 2, free) for free in (6 * GB, 7 * GB)] == [True, False]
@@ -214,7 +214,7 @@ def test_photographs_give_way_to_blocks_that_a_person_asked_for():
 
 
 def test_people_are_told_what_blocks_and_their_photographs_take(question):
-    work = ShardWorkload(pieces=4, shard_bytes=2 * GB, images_bytes=10**11)
+    work = ShardWorkload(shards=4, shard_bytes=2 * GB, images_bytes=10**11)
     with select_backend(ExecutorOptions(), work, MachineResources(4, 8 * GB), lambda: question) as chosen:
         assert "a block takes at most 2.00 GB and 667 MB for photographs, of 8.00 GB free" in chosen.description
         assert chosen.description.startswith("3 at once")
@@ -228,17 +228,17 @@ def test_people_are_told_what_blocks_and_their_photographs_take(question):
 def test_what_a_person_asks_for_is_asked_of_the_cluster():
     asked = ExecutorOptions(executor="ray", cpus=3, mem_gb=5, gpus=0.5)
     for share in (
-        allocate_cluster(ShardWorkload(pieces=4, shard_bytes=GB), [Place(8, 64 * GB)], asked),
-        allocate_queue(ShardWorkload(pieces=4, shard_bytes=GB), asked),
+        allocate_cluster(ShardWorkload(shards=4, shard_bytes=GB), [Node(8, 64 * GB)], asked),
+        allocate_queue(ShardWorkload(shards=4, shard_bytes=GB), asked),
     ):
         assert share.resources == TaskResources(3, 5 * GB, 0.5)
     assert (
         allocate_cluster(
-            ShardWorkload(pieces=4, shard_bytes=GB, image_gb=2), [Place(8, 64 * GB)], ExecutorOptions(executor="ray")
+            ShardWorkload(shards=4, shard_bytes=GB, image_gb=2), [Node(8, 64 * GB)], ExecutorOptions(executor="ray")
         ).image_gb
         == 2
     )
-    assert allocate_local(ShardWorkload(pieces=8, shard_bytes=2 * GB, image_gb=4), 2, 8 * GB).image_gb == 2
+    assert allocate_local(ShardWorkload(shards=8, shard_bytes=2 * GB, image_gb=4), 2, 8 * GB).image_gb == 2
 
 
 @pytest.mark.parametrize(
@@ -280,14 +280,14 @@ def question(tmp_path) -> NodeRequirements:
 
 
 def test_a_machine_that_sees_the_same_can_work_on_a_run(question):
-    with question.asked() as plain:
+    with question.with_lock_probe() as plain:
         assert check_node(plain)["problems"] == []
     assert check_node(question.to_dict())["problems"] == []  # nobody waits for the answer
     assert list(question.folder.iterdir()) == []
 
 
 def test_what_a_machine_does_not_see_is_named(question, monkeypatch):
-    with question.asked() as plain:
+    with question.with_lock_probe() as plain:
 
         def said(**other) -> str:
             (problem,) = check_node(plain | other)["problems"]

@@ -70,6 +70,6 @@ def test_who_keeps_a_command_on_a_node_says_so_too(tmp_path, greedy):
         requirements=NodeRequirements(tmp_path, ()).to_dict(),
     )  # fmt: skip
     for expected in (AttemptResult(-signal.SIGKILL, out_of_memory=True), AttemptResult(0)):
-        keeper = RayTaskActor(order, collect_seconds=1e6)  # when nobody collects, it would end this process
+        keeper = RayTaskActor(order, result_timeout_seconds=1e6)  # when nobody collects, it would end this process
         keeper.begin()
         assert keeper.end() == expected

@@ -111,7 +111,7 @@ def moments(run: Path) -> dict[str, int]:
 def train_each(run: Path, *settings: str) -> None:
     """Train every block again, one command each."""
     for index in range(2):
-        done = vdgs("train", run, "--block", index, *settings, "--overwrite")
+        done = vdgs("train-blocks", run, "--block", index, *settings, "--overwrite")
         assert done.returncode == 0, done.stderr
 
 
@@ -289,7 +289,9 @@ def test_a_run_that_is_cut_off_while_blocks_train_continues_to_the_same_bits(cap
 
 def test_a_block_that_is_killed_is_started_again(unbroken, copied):
     shutil.rmtree(copied / "blocks/01")
-    with begun("train", copied, "--save-every", "20", pause_at=("*/blocks/*/checkpoints/00000040.json", 1)) as process:
+    with begun(
+        "train-blocks", copied, "--save-every", "20", pause_at=("*/blocks/*/checkpoints/00000040.json", 1)
+    ) as process:
         process.wait_until_paused()
         process.kill_paused()
         done = process.finished()
@@ -375,17 +377,17 @@ def test_another_cut_leaves_no_old_result_standing(copied):
     assert "of 32x" in drawn.stdout
     assert vdgs("report", copied).returncode == 0
     assert "Coarse model: PSNR" in (copied / "report.html").read_text()
-    again = vdgs("train", copied, prepare=do_tasks_here)
+    again = vdgs("train-blocks", copied, prepare=do_tasks_here)
     assert again.returncode == 0, again.stderr
     assert "trained again: blocks 0, 1" in again.stdout
 
 
 def test_one_block_alone_is_the_same_block(unbroken, copied):
     shutil.rmtree(copied / "blocks/00")
-    done = vdgs("train", copied, "--block", "0", "--threads", "2")
+    done = vdgs("train-blocks", copied, "--block", "0", "--threads", "2")
     assert done.returncode == 0, done.stderr
     assert model(copied, "blocks/00/model.safetensors") == model(unbroken, "blocks/00/model.safetensors")
-    absent = vdgs("train", copied, "--block", "7")
+    absent = vdgs("train-blocks", copied, "--block", "7")
     assert absent.returncode == 1
     assert "has blocks 0 to 1; there is no block 7" in absent.stderr
 
@@ -408,7 +410,7 @@ def test_a_missing_block_stops_the_merge_unless_the_coarse_model_may_stand_in(co
 
 
 def test_one_block_is_the_whole_scene_and_merging_it_the_identity(copied):
-    for command in (("partition", copied, "--blocks", "1", "--overwrite"), ("train", copied), ("merge", copied)):
+    for command in (("partition", copied, "--blocks", "1", "--overwrite"), ("train-blocks", copied), ("merge", copied)):
         done = vdgs(*command, prepare=do_tasks_here)
         assert done.returncode == 0, done.stderr
     assert sorted(path.name for path in (copied / "blocks").iterdir()) == ["00", "request.json"]
@@ -419,18 +421,27 @@ def test_one_block_is_the_whole_scene_and_merging_it_the_identity(copied):
 def test_stages_need_those_before_them(capture, tmp_path):
     run = tmp_path / "run"
     done = vdgs(
-        "coarse", capture, "--output", run, "--preset", "laptop", "--iterations", "30", "--anchors.num-offsets", "3"
+        "train-coarse",
+        capture,
+        "--output",
+        run,
+        "--preset",
+        "laptop",
+        "--iterations",
+        "30",
+        "--anchors.num-offsets",
+        "3",
     )
     assert done.returncode == 0, done.stderr
-    for verb, needed in (("train", "vdgs partition"), ("merge", "vdgs partition")):
+    for verb, needed in (("train-blocks", "vdgs partition"), ("merge", "vdgs partition")):
         refused = vdgs(verb, run)
         assert refused.returncode == 1
         assert needed in refused.stderr
         assert "Traceback" not in refused.stderr
     short = ("--block.iterations", "30")
     commands = (
-        ("visibility", run), ("partition", run, "--blocks", "2"), ("train", run, "--block", "0", *short),
-        ("train", run, "--block", "1"), ("train", run), ("merge", run), ("eval", run), ("report", run),
+        ("visibility", run), ("partition", run, "--blocks", "2"), ("train-blocks", run, "--block", "0", *short),
+        ("train-blocks", run, "--block", "1"), ("train-blocks", run), ("merge", run), ("eval", run), ("report", run),
     )  # fmt: skip
     for command in commands:
         done = vdgs(*command)
@@ -442,14 +453,14 @@ def test_stages_need_those_before_them(capture, tmp_path):
 def test_damaged_files_of_a_partition_are_named(copied, file):
     shutil.rmtree(copied / "blocks/00")
     (copied / file).write_bytes((copied / file).read_bytes()[:50])
-    done = vdgs("train", copied, "--block", "0")
+    done = vdgs("train-blocks", copied, "--block", "0")
     assert done.returncode == 1
     assert Path(file).name in done.stderr
     assert "Traceback" not in done.stderr
     assert "vdgs partition" in done.stderr
     mended = vdgs("partition", copied)  # what the message advises helps
     assert mended.returncode == 0, mended.stderr
-    assert vdgs("train", copied, "--block", "0").returncode == 0
+    assert vdgs("train-blocks", copied, "--block", "0").returncode == 0
 
 
 #: Of a change of the coarse stage's settings: they are written, the old model is deleted, it is gone.
@@ -479,8 +490,8 @@ def test_all_that_was_built_on_a_model_of_other_settings_is_made_again(capture, 
     change_cut_off(capture, copied, MOMENTS_OF_A_CHANGE[0])
     coarse_settings = OTHER_SEED[: OTHER_SEED.index("--blocks")]
     commands = (
-        ("coarse", capture, "--output", copied, *coarse_settings, "--seed", "7"),
-        ("visibility", copied), ("partition", copied), ("train", copied, "--block", "0"),
+        ("train-coarse", capture, "--output", copied, *coarse_settings, "--seed", "7"),
+        ("visibility", copied), ("partition", copied), ("train-blocks", copied, "--block", "0"),
     )  # fmt: skip
     for command in commands:
         done = vdgs(*command)
@@ -504,7 +515,7 @@ def test_a_block_trained_again_is_merged_again(unbroken, copied):
     shutil.rmtree(copied / "blocks/01")
     assert vdgs("merge", copied, "--allow-missing-blocks").returncode == 0
     assert model(copied) != model(unbroken)
-    assert vdgs("train", copied, "--block", "1").returncode == 0
+    assert vdgs("train-blocks", copied, "--block", "1").returncode == 0
     assert vdgs("merge", copied).returncode == 0
     assert model(copied) == model(unbroken)
 

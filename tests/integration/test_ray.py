@@ -54,7 +54,7 @@ def cluster():
 
 
 def on_ray(run: Path, cluster: Cluster) -> tuple[object, ...]:
-    return ("train", run, *BLOCKS, "--executor", "ray", "--address", cluster.address)
+    return ("train-blocks", run, *BLOCKS, "--executor", "ray", "--address", cluster.address)
 
 
 def another_code() -> None:
@@ -68,10 +68,10 @@ def test_a_run_starts_a_ray_of_its_own_for_each_job():
     """One after the other, in one process, as `vdgs run --executor ray` does without an address."""
     done = python(
         """
-from vdgs.distributed.ray_executor import connected, nodes
+from vdgs.distributed.ray_executor import connect, list_nodes
 for _ in range(2):
-    with connected(None):
-        print(len(nodes()), "node")
+    with connect(None):
+        print(len(list_nodes()), "node")
 """
     )
     assert done.stdout.splitlines() == ["1 node", "1 node"], done.stderr
@@ -134,7 +134,7 @@ def test_a_driver_that_was_killed_finds_its_blocks_again_and_stops_them_when_ask
         assert done.returncode == 130, done.stderr + done.stdout
         assert "every block that was training is saved" in done.stderr
         assert not any(alive(process) for process in first.paused())
-    done = vdgs("train", run, *BLOCKS, prepare=do_tasks_here)  # what was saved leads to the same models anywhere
+    done = vdgs("train-blocks", run, *BLOCKS, prepare=do_tasks_here)  # what was saved leads to the same models anywhere
     assert done.returncode == 0, done.stderr + done.stdout
     assert models(run) == models(local)
     for block in (0, 1):
@@ -167,9 +167,9 @@ def test_tiles_of_several_nodes_are_joined_to_the_maps_of_one_process(uncut, clu
     """Two shards, two nodes."""
     pytest.importorskip("rasterio")
     here, there = (copy_run(uncut, tmp_path / name / "run") for name in ("here", "there"))
-    one = vdgs("map", here, *FINE)
+    one = vdgs("ortho", here, *FINE)
     shards = vdgs(
-        "map", there, *FINE, "--executor", "ray", "--address", cluster.address, environment=cluster.token
+        "ortho", there, *FINE, "--executor", "ray", "--address", cluster.address, environment=cluster.token
     )  # fmt: skip
     assert one.returncode == shards.returncode == 0, one.stderr + shards.stderr + shards.stdout
     assert "2 of 2 shards done" in shards.stdout

@@ -38,7 +38,7 @@ def mapped(uncut, tmp_path_factory) -> dict[str, object]:
     """What one process makes of it."""
     pytest.importorskip("rasterio")
     folder = tmp_path_factory.mktemp("mapped") / "maps"
-    done = vdgs("map", uncut, *FINE, "--output", folder)
+    done = vdgs("ortho", uncut, *FINE, "--output", folder)
     assert done.returncode == 0, done.stderr + done.stdout
     files = evaluated(folder)
     assert files.keys() == {"dsm.tif", "hillshade.png", "map.json", "orthophoto.tif", "preview.png", "visibility.tif"}
@@ -48,7 +48,7 @@ def mapped(uncut, tmp_path_factory) -> dict[str, object]:
 def test_whatever_is_killed_maps_drawn_in_shards_are_those_of_one_process(uncut, mapped, tmp_path):
     """The driver while both shards are at work, then a shard."""
     run = copy_run(uncut, tmp_path / uncut.name)  # whose name is on the sheet
-    command = ("map", run, *FINE, "--jobs", "2")
+    command = ("ortho", run, *FINE, "--jobs", "2")
     with begun(*command, pause_at=("*/shards/*/00000[13].npz", 1)) as first:
         first.wait_until_paused(2)
         first.send_signal(signal.SIGKILL)
@@ -67,7 +67,7 @@ def test_whatever_is_killed_maps_drawn_in_shards_are_those_of_one_process(uncut,
 
 
 def test_detail_from_photographs_is_the_same_in_shards(uncut, mapped, tmp_path):
-    command = ("map", uncut, *FINE, "--detail-from-images", "--output")
+    command = ("ortho", uncut, *FINE, "--detail-from-images", "--output")
     for name, more, prepare in (("one", (), None), ("shards", ("--jobs", "2"), do_tasks_here)):
         done = vdgs(*command, tmp_path / name, *more, prepare=prepare)
         assert done.returncode == 0, done.stderr + done.stdout

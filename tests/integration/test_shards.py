@@ -170,7 +170,7 @@ class Halving:
 def job_of(output: Path, name: str, number: float = 0.1) -> ShardedJob:
     """A job whose items are halved again and again."""
     request = Halving(output, number, name, (1e-17, 1 / 3), device="of the driver")
-    return ShardedJob.of("halves", request, output, shard_kind("halve", "numbers"), name, [range(2), range(2, 5)])
+    return ShardedJob.create("halves", request, output, shard_kind("halve", "numbers"), name, [range(2), range(2, 5)])
 
 
 def halve_shard(shard: Shard) -> None:
@@ -209,13 +209,13 @@ def test_a_job_keeps_what_is_done_and_is_gathered_in_the_order_of_its_items(tmp_
         ShardNeeds(1, lambda: pytest.fail("asked of this machine")),
         ExecutionOptions(ExecutorOptions(), jobs=2),
     )
-    with pytest.raises(AssertionError, match="exit code 1"), job.held():
+    with pytest.raises(AssertionError, match="exit code 1"), job.exclusive():
         job.run(needs, wish, console)
     assert job.pending == [1]
     assert "3: has no half" in (job.shard(1).path / "output.log").read_text()
     (tmp_path / "go").touch()
     kept = job.file(2).stat().st_mtime_ns
-    with job.held():
+    with job.exclusive():
         job.run(needs, wish, console)
         assert "1 of 2 shards to halve" in console.file.getvalue()
         assert job.file(2).stat().st_mtime_ns == kept
@@ -251,7 +251,7 @@ def test_shards_of_other_jobs_go_unless_they_are_at_work(tmp_path):
     assert wanted.key != other.key
     for job in (wanted, other):
         job.mark_queued()
-    with wanted.held(), pytest.raises(RunError, match="another vdgs process"), wanted.held():
+    with wanted.exclusive(), pytest.raises(RunError, match="another vdgs process"), wanted.exclusive():
         pass
     assert not list(tmp_path.iterdir())
     for job in (wanted, other):

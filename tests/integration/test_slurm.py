@@ -62,7 +62,7 @@ def slurm(request, tmp_path, monkeypatch) -> str:
 
 
 def by_slurm(run: Path) -> tuple[object, ...]:
-    return ("train", run, *BLOCKS, "--executor", "slurm", *OWN)
+    return ("train-blocks", run, *BLOCKS, "--executor", "slurm", *OWN)
 
 
 def variables() -> dict[str, str]:
@@ -131,7 +131,7 @@ def test_a_driver_that_was_killed_finds_its_jobs_again_and_stops_them_when_asked
             done = second.finished()
         assert done.returncode == 130, done.stderr + done.stdout
         assert not any(alive(process) for process in first.paused())
-    done = vdgs("train", run, *BLOCKS, prepare=do_tasks_here)  # what was saved leads to the same models anywhere
+    done = vdgs("train-blocks", run, *BLOCKS, prepare=do_tasks_here)  # what was saved leads to the same models anywhere
     assert done.returncode == 0, done.stderr + done.stdout
     assert models(run) == models(local)
 

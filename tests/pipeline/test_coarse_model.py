@@ -66,7 +66,7 @@ def test_training_that_leaves_no_anchors_is_not_done_and_says_what_to_change(tmp
     write_colmap(tmp_path / "place", replace(scene, points=scene.points[below], colors=scene.colors[below]))
     run, capture = begin(tmp_path, METHOD)
     for _ in range(2):  # the same command says the same
-        with pytest.raises(RunError, match=r"coarse: .*no anchors(?s:.*)--growth\.prune-opacity(?s:.*)--overwrite"):
+        with pytest.raises(RunError, match=r"coarse: .*no anchors(?s:.*)--densify\.prune-opacity(?s:.*)--overwrite"):
             train(run, capture)
         assert not run.coarse.model.exists()
         assert get_run_status(run).of("coarse").state == "failed"

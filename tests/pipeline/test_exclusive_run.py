@@ -92,10 +92,10 @@ CHANGES: dict[str, Callable[[Path, Path], list[object]]] = {
     "read otherwise": lambda place, run: [
         "run", place, "--output", run, *OPTIONS, "--downscale", "2", "--overwrite",
     ],
-    "the coarse stage": lambda place, run: ["coarse", place, "--output", run, "--preset", "laptop"],
+    "the coarse stage": lambda place, run: ["train-coarse", place, "--output", run, "--preset", "laptop"],
     "another cut": lambda _, run: ["partition", run, "--blocks", "4", "--overwrite"],
-    "other training": lambda _, run: ["train", run, "--block.iterations", "7", "--overwrite"],
-    "another block": lambda _, run: ["train", run, "--block", "0", "--block.iterations", "7", "--overwrite"],
+    "other training": lambda _, run: ["train-blocks", run, "--block.iterations", "7", "--overwrite"],
+    "another block": lambda _, run: ["train-blocks", run, "--block", "0", "--block.iterations", "7", "--overwrite"],
     "another merge": lambda _, run: ["merge", run, "--rule", "max-visibility"],
     "moved, for visibility": lambda place, run: ["visibility", run, "--capture", moved(place)],
     "moved, for figures": lambda place, run: ["eval", run, "--capture", moved(place)],
@@ -120,7 +120,7 @@ def test_what_another_process_drives_is_not_touched(run, place, capsys, change):
 def test_a_block_is_trained_beside_who_drives_the_run(run, capsys):
     """Commands that change nothing are those that executors begin, on whatever machine."""
     with driven_elsewhere(run):
-        assert command_line("train", run.path, "--block", "0") == 1
+        assert command_line("train-blocks", run.path, "--block", "0") == 1
     assert "vdgs partition" in capsys.readouterr().err  # it is not refused for its driver
 
 

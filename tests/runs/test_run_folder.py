@@ -69,8 +69,10 @@ def test_a_damaged_config_is_named(tmp_path, text):
         ({"capture": {"path": "/data/a", "imagse": "x"}}, r"capture has no 'imagse'; did you mean 'images'\?"),
         ({"capture": {"path": "/data/a", "images": 5}}, r"capture\.images is 5; it must be text"),
         ({"capture": {"images": None}}, "`capture` must be a group of settings with a path"),
-        ({"merge": {"rule": "mine"}}, r"merge\.rule is 'mine'; it must be owner or best_seen"),
+        ({"merge": {"rule": "mine"}}, r"merge\.rule is 'mine'; it must be owner or max-visibility"),
         ({"blocks": 4}, "this file has no 'blocks'"),
+        ({"training": {"average": 0.3}}, r"config\.yaml: training has no 'average'.* or start a new --output"),
+        ({"block": {"ring": "ramp"}}, r"config\.yaml: block has no 'ring'; did you mean .* or start a new --output"),
     ],
 )
 def test_a_setting_that_is_none_is_named(tmp_path, change, complaint):
@@ -173,7 +175,7 @@ def test_each_setting_invalidates_the_stages_that_depend_on_it_and_no_others():
     before = stage_keys(settings())
     changes: list[tuple[str, dict[str, object], int]] = [
         ("capture", {"images": "other"}, 0), ("training", {"seed": 5}, 0), ("partition", {"lambda_vis": 0.7}, 1),
-        ("assignment", {"tau": 0.1}, 2), ("block", {"offset_rate": 0.5}, 3), ("merge", {"rule": "max-visibility"}, 4),
+        ("assignment", {"tau": 0.1}, 2), ("block", {"lr_scale_offsets": 0.5}, 3), ("merge", {"rule": "max-visibility"}, 4),
     ]  # fmt: skip
     for section, change, first in changes:
         section_changed = replace(getattr(settings(), section), **change)
@@ -243,12 +245,19 @@ def test_a_mean_needs_an_end_of_growth(average, until, problems):
     coarse = MethodConfig(training=TrainConfig(swa_fraction=average, densify=growth))
     block = MethodConfig(block=BlockConfig(swa_fraction=average, densify=growth))
     assert [len(validate_config(each)) for each in (coarse, block)] == [problems, problems]
-    assert all("growth.until" in each or "average" in each for each in validate_config(coarse) + validate_config(block))
+    assert all(
+        "densify.stop_fraction" in each or "swa-fraction" in each
+        for each in validate_config(coarse) + validate_config(block)
+    )
 
 
 @pytest.mark.parametrize(("begins", "problems"), [(0.5, 0), (0.51, 1)])
 def test_a_mean_is_of_models_of_one_image_size(begins, problems):
-    settings = {"average": 0.5, "growth": DensifyConfig(stop_fraction=0.4), "resolutions": ((0.0, 2), (begins, 1))}
+    settings = {
+        "swa_fraction": 0.5,
+        "densify": DensifyConfig(stop_fraction=0.4),
+        "resolution_schedule": ((0.0, 2), (begins, 1)),
+    }
     assert len(validate_config(MethodConfig(training=TrainConfig(**settings)))) == problems
     assert len(validate_config(MethodConfig(block=BlockConfig(**settings)))) == problems
 

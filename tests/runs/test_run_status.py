@@ -9,12 +9,13 @@ import shlex
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 import yaml
 
 from support.hand_made_models import model_at
+from vdgs.captures.capture import Capture
 from vdgs.cli.main import main
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.method import MergeConfig, MethodConfig
@@ -67,7 +68,7 @@ def run(tmp_path) -> RunFolder:
     write_json(run.partition / "partition.json", record)
     models = [trained(run.block(index), keys.blocks, 1 + index, block=index) for index in (0, 1)]
     merged = trained(run.merged, keys.merge, 5)
-    write_json(run.merged.status_file, {"state": "done", "model": merged, "block_models": models, "anchors": 2})
+    write_json(run.merged.status_file, {"state": "done", "model_id": merged, "block_models": models, "anchors": 2})
     measured(run.evaluation, merged, 24.75, "merged")
     write_report(run)
     return run
@@ -104,7 +105,7 @@ def test_a_whole_run_is_whole(run, capsys):
     ("section", "setting", "stale", "then"),
     [
         ("merge", {"rule": "max-visibility"}, ["merge", "evaluation"], "merge"),
-        ("block", {"iterations": 7}, ["block 0", "block 1", "merge", "evaluation"], "train"),
+        ("block", {"iterations": 7}, ["block 0", "block 1", "merge", "evaluation"], "train-blocks"),
         ("assignment", {"tau": 0.3}, ["cameras", "block 0", "block 1", "merge", "evaluation"], "partition"),
         ("partition", {"lambda_vis": 0.9}, ["partition", "cameras", "block 0", "block 1", "merge", "evaluation"],
          "partition"),
@@ -177,9 +178,9 @@ def test_what_fails_and_stops_is_said_with_its_reason(run):
 
 def test_a_run_is_at_work_between_two_stages_too(run):
     run.merged.model.unlink()
-    with run.driven():
+    with run.drive_lock():
         assert next_step(full_run_status(run)) == "nothing to type: it is at work"
-        with pytest.raises(RunError, match="another vdgs process"), run.driven():
+        with pytest.raises(RunError, match="another vdgs process"), run.drive_lock():
             pass
 
 
@@ -211,7 +212,7 @@ def test_a_run_is_read_where_no_file_can_be_locked(run, monkeypatch, capsys, num
     assert open_model(run, "coarse").name == "coarse"
     with pytest.raises(OSError, match="not implemented"):
         is_locked(run.path / ".run")
-    for held in (run.driven(), run.locked()):
+    for held in (run.drive_lock(), run.locked()):
         with pytest.raises(RunError, match=r"file system locks no files \(Function not implemented\)\. Mount"), held:
             pass
 
@@ -253,14 +254,14 @@ def test_models_that_were_copied_to_where_they_do_not_belong_are_refused(run):
 
 @pytest.fixture
 def opened_without_photographs(monkeypatch):
-    monkeypatch.setattr("vdgs.runs.open_run.open_capture", lambda run: SimpleNamespace(test_views=(), train_views=()))
+    monkeypatch.setattr("vdgs.runs.open_run.open_capture", lambda run: Mock(Capture, test_views=(), train_views=()))
     monkeypatch.setattr("vdgs.runs.open_run.check_same_capture", lambda *_: None)
 
 
 def test_the_model_that_is_opened_says_what_it_is(run, opened_without_photographs):
     opened = open_run(run.path)
     assert (opened.name, opened.warning) == ("merged", "")
-    assert opened.line.startswith("merged model (2 anchors, ")
+    assert opened.summary.startswith("merged model (2 anchors, ")
     change(run, "partition", lambda_vis=0.9)
     opened = open_run(run.path)
     assert opened.name == "coarse"

@@ -22,7 +22,7 @@ from vdgs.distributed.executor import Task, TaskListener, TaskResult
 class InThisProcess:
     """An executor without processes: starting them would take most of the time."""
 
-    at_once: int
+    max_concurrent: int
 
     def run(self, tasks: Sequence[Task], _listener: TaskListener) -> list[TaskResult]:
         with threads_as_before():

@@ -148,7 +148,7 @@ def make_run(folder: Path) -> Path:
     """A run that is cut into two blocks."""
     capture, run = folder / "capture", folder / "cut"
     write_colmap(capture, tiny_scene())
-    for command in (("coarse", capture, "--output", run, *COARSE), ("partition", run, *CUT)):
+    for command in (("train-coarse", capture, "--output", run, *COARSE), ("partition", run, *CUT)):
         done = vdgs(*command)
         assert done.returncode == 0, done.stderr + done.stdout
     return run
@@ -157,7 +157,7 @@ def make_run(folder: Path) -> Path:
 def train_here(run: Path, to: Path) -> Path:
     """A copy of a run, its blocks trained by this machine alone."""
     local = copy_run(run, to)
-    done = vdgs("train", local, *BLOCKS, prepare=do_tasks_here)
+    done = vdgs("train-blocks", local, *BLOCKS, prepare=do_tasks_here)
     assert done.returncode == 0, done.stderr + done.stdout
     return local
 

@@ -68,7 +68,7 @@ if sys.platform == "linux":
 class CommandsHere:
     """An executor that runs modules of vdgs in this process, one after the other: processes without their start."""
 
-    at_once: int
+    max_concurrent: int
 
     def run(self, tasks: Sequence[Task], _listener: TaskListener) -> list[TaskResult]:
         from vdgs.distributed.executor import TaskResult

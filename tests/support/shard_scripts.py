@@ -11,7 +11,7 @@ from rich.console import Console
 
 from support.commands import PATIENCE_SECONDS
 from vdgs.distributed.local_executor import LocalExecutor
-from vdgs.distributed.shard_runner import Shard, run_shards
+from vdgs.distributed.shard_runner import ShardCommand, run_shards
 from vdgs.runs.stage_folder import StageFolder
 
 #: What every fake block begins with: it knows its folder, can say how far it is, and lists the SIGTERMs it gets.
@@ -31,10 +31,12 @@ def wait_for(condition):
 """
 
 
-def job(root: Path, index: int, script: str) -> Shard:
+def job(root: Path, index: int, script: str) -> ShardCommand:
     folder = StageFolder(root / f"{index:02d}")
     who = f"block = {index}\n"
-    return Shard(index, folder, [sys.executable, "-S", "-c", PRELUDE + who + textwrap.dedent(script), str(folder.path)])
+    return ShardCommand(
+        index, folder, [sys.executable, "-S", "-c", PRELUDE + who + textwrap.dedent(script), str(folder.path)]
+    )
 
 
 def run(jobs, *, at_once=2, retries=2, terminal=False):

@@ -1,1 +1,1 @@
-"""The command line: `main` chooses the verb, `commands` lists them, a module `..._cmd` holds each."""
+"""The command line: `main` chooses the verb, a module `..._cmds` or `..._cmd` holds each."""

@@ -1,4 +1,4 @@
-"""Verbs about captures: look at one (`inspect_command`), generate one (`synth_command`)."""
+"""Verbs about captures: look at one (`inspect`), generate one (`synth`), make one of photographs (`sfm`)."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from vdgs.cli.common import make_console, parse_arguments
+from vdgs.cli.common import QuietArguments, make_console, parse_arguments
 from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.ranges import WORKER_COUNT, FlagName
+from vdgs.config.sfm_options import SfmOptions, SfmRequest
+from vdgs.errors import CaptureError, VdgsError
 from vdgs.synth.options import SynthOptions
 
 
@@ -28,49 +31,89 @@ class InspectArguments:
 
 
 def inspect_command(arguments: list[str]) -> None:
-    asked = parse_arguments(InspectArguments, arguments, "vdgs inspect")
+    args = parse_arguments(InspectArguments, arguments, "vdgs inspect")
     from vdgs.captures.image_checks import check_images
     from vdgs.captures.loading import load_capture
     from vdgs.captures.output_guard import check_not_among_inputs, check_not_in_capture
     from vdgs.captures.reconstruction import read_reconstruction
-    from vdgs.errors import CaptureError
     from vdgs.report.capture_report import inspect_capture, print_report
 
-    check_not_in_capture(asked.output)
-    capture = load_capture(asked.capture, asked.options)
-    check_not_among_inputs(asked.output, capture)
-    checked = check_images(capture) if asked.check else None
-    report = inspect_capture(capture, asked.output, checked)
+    check_not_in_capture(args.output)
+    capture = load_capture(args.capture, args.options)
+    check_not_among_inputs(args.output, capture)
+    report = inspect_capture(capture, args.output, check_images(capture) if args.check else None)
     print_report(report, reconstruction_report=read_reconstruction(capture.root))
     if report.problems:
         raise CaptureError(f"{capture.root}: cannot become a scene; see the problems above.")
 
 
 @dataclass(frozen=True)
-class SynthArguments:
+class SynthArguments(QuietArguments):
     """Generate an aerial place and a drone flight over it, as a COLMAP capture."""
 
     output: Positional[Path]
     """Folder for the capture; it must not exist or be empty."""
-    quiet: bool = False
-    """Print nothing but notes, warnings and errors."""
     options: Annotated[SynthOptions, arg(name="")] = field(default_factory=SynthOptions)
 
 
 def synth_command(arguments: list[str]) -> None:
-    asked = parse_arguments(SynthArguments, arguments, "vdgs synth")
+    args = parse_arguments(SynthArguments, arguments, "vdgs synth")
     from rich.progress import Progress, TaskID
 
     from vdgs.synth import generate
 
-    console = make_console(asked.quiet)
+    console = make_console(args.quiet)
     with Progress(console=console, disable=not console.is_terminal) as bar:
         tasks: dict[str, TaskID] = {}
 
-        def show(stage: str, done: int, total: int) -> None:
+        def on_progress(stage: str, done: int, total: int) -> None:
             if stage not in tasks:
                 tasks[stage] = bar.add_task(stage, total=total)
             bar.update(tasks[stage], completed=done)
 
-        found = generate(asked.output, asked.options, show)
-    console.print(f"{found.summary}\ncapture: {asked.output}", highlight=False)
+        result = generate(args.output, args.options, on_progress)
+    console.print(f"{result.summary}\ncapture: {args.output}", highlight=False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SfmArguments(QuietArguments):
+    """Photographs to a capture: features, matches, poses and points, metres and north from their positions, photographs
+    without lens distortion in three sizes. The same command goes on where it was stopped. Photographs are only read."""
+
+    images: Positional[tuple[Path, ...]]
+    """Folders of photographs, those below them included. A folder masks/ beside photographs has their masks (white =
+    keep), named like them: name.png or name.jpg.png; name_mask.jpg beside name.jpg is one too."""
+    output: Path
+    """Folder of the capture; new, or the one to go on with."""
+    gps: Path | None = None
+    """Table of positions to use instead of those in the photographs: columns name,lat,lon,alt as exiftool, Metashape,
+    Pix4D, RealityScan and others name them, ODM's geo.txt or DJI's .MRK. Names need no folder and no extension where
+    they are told apart without."""
+    dry_run: bool = False
+    """Only look: what the photographs say, what would be done and how long it takes. Writes nothing."""
+    threads: Annotated[int, WORKER_COUNT] = 0
+    """Threads to use; 0 for all cores."""
+    keep_intermediate: bool = False
+    """Keep COLMAP's database and models in OUTPUT/work once all is done."""
+    options: Annotated[SfmOptions, arg(name=""), FlagName("")] = field(default_factory=SfmOptions)
+
+
+def sfm_command(arguments: list[str]) -> None:
+    args = parse_arguments(SfmArguments, arguments, "vdgs sfm")
+    from vdgs.sfm.reconstruction_plan import plan_reconstruction, print_plan
+
+    if not args.images:
+        raise VdgsError("name the folder of the photographs: vdgs sfm PHOTOGRAPHS --output CAPTURE")
+    request = SfmRequest(
+        image_folders=args.images, output=args.output, gps=args.gps, threads=args.threads,
+        keep_intermediate=args.keep_intermediate, options=args.options,
+    )  # fmt: skip
+    console = make_console(args.quiet)
+    if args.dry_run:
+        print_plan(plan_reconstruction(request), console)
+        console.print("Nothing was written.", highlight=False)
+        return
+    from vdgs.sfm.reconstruct import reconstruct
+
+    reconstruct(request, console)
+    console.print(f"capture: {args.output}\nnext: vdgs run {args.output} --output RUN", highlight=False)

@@ -8,11 +8,10 @@ from typing import Annotated
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from vdgs.cli.common import make_console, parse_arguments, select_device
+from vdgs.cli.common import make_console, parse_arguments, set_up_compute
 from vdgs.config.commands import ExportRequest, ProgramName
 from vdgs.config.executor_options import ExecutorOptions
 from vdgs.config.ranges import WORKER_COUNT
-from vdgs.kernels import configure_threads
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,8 +37,7 @@ class ExportArguments(ExportRequest):
 
 def export_command(arguments: list[str]) -> None:
     asked = parse_arguments(ExportArguments, arguments, "vdgs export")
-    device, console = select_device(asked.device), make_console(asked.quiet)
-    configure_threads(asked.threads)
+    device, console = set_up_compute(asked.device, asked.threads), make_console(asked.quiet)
     from vdgs.distributed.sharded_job import ExecutionOptions
     from vdgs.export.export_run import export_run
 

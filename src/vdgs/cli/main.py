@@ -39,7 +39,7 @@ vdgs VERB --help explains the options of a verb. A capture is a folder with imag
 transforms.json (nerfstudio), train/ and val/ (Mega-NeRF) or the layout of MatrixCity; `sfm` makes one of photographs.
 """
 
-COMMANDS = (
+COMMANDS = [
     "inspect",
     "run",
     "sfm",
@@ -58,7 +58,7 @@ COMMANDS = (
     "synth",
     "bench",
     "doctor",
-)
+]
 #: Verbs that take up what they left when they were interrupted.
 RESUMABLE_COMMANDS = ("run", "sfm", "train-coarse", "train-blocks", "bench")
 
@@ -85,20 +85,28 @@ def _suggestion(word: str) -> str:
     """A question about the verb that may be meant."""
     import difflib
 
-    like = difflib.get_close_matches(word.lower().lstrip("-"), [*COMMANDS, "help"], n=1)
-    return f"; did you mean {like[0]!r}?" if like else ""
+    similar = difflib.get_close_matches(word.lower().lstrip("-"), [*COMMANDS, "help"], n=1)
+    return f"; did you mean {similar[0]!r}?" if similar else ""
 
 
 def _run_command(command: str, arguments: list[str]) -> int:
     from vdgs.kernels import configure_threads
 
     configure_threads()  # before anything imports torch
-    from vdgs.cli import commands
     from vdgs.system.exit_codes import exit_code_of
 
-    action: Callable[[list[str]], Any] = getattr(commands, f"{command.replace('-', '_')}_command")
+    action = get_command(command)
     again = "continues: what is finished is kept" if command in RESUMABLE_COMMANDS else "begins it anew"
     return exit_code_of(f"vdgs {command}", lambda: action(arguments), f"The same command {again}.")
+
+
+def get_command(name: str) -> Callable[[list[str]], Any]:
+    """The function of a verb, which takes its arguments."""
+    from vdgs.cli import capture_cmds, export_cmd, result_cmds, run_cmd, stage_cmds, tool_cmds
+
+    function = f"{name.replace('-', '_')}_command"
+    modules = (capture_cmds, export_cmd, result_cmds, run_cmd, stage_cmds, tool_cmds)
+    return next(getattr(module, function) for module in modules if hasattr(module, function))
 
 
 if __name__ == "__main__":

@@ -10,23 +10,23 @@ import tyro
 from tyro.conf import Positional, arg
 
 from vdgs.cli.common import (
+    ComputeArguments,
+    QuietArguments,
     absolute_command_line,
     make_console,
     parse_arguments,
     preset_defaults,
-    select_device,
+    set_up_compute,
 )
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RunRequest
 from vdgs.config.executor_options import CheckpointOptions, ExecutorOptions
 from vdgs.config.method import PartitionConfig, TrainConfig
 from vdgs.config.presets import PresetName
-from vdgs.config.ranges import WORKER_COUNT
-from vdgs.kernels import configure_threads
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainCoarseArguments:
+class TrainCoarseArguments(ComputeArguments):
     """Train the global anchor model of a capture. The same command continues a run that was stopped."""
 
     capture: Positional[Path]
@@ -34,15 +34,9 @@ class TrainCoarseArguments:
     output: Path
     """Run folder; new, or the run to continue."""
     preset: PresetName = "default"
-    """`laptop`: a good result in minutes on a CPU. `paper`: the paper's 100 000 iterations, and our choices where it is
-    silent: gaps filled, outliers left out, a background of the mean colour, of random colours in training, bounded
-    sizes, only visible anchors moved. `literal`: none of those choices."""
-    threads: Annotated[int, WORKER_COUNT] = 0
-    """Threads of the kernels; 0 for all cores. The result does not depend on it."""
-    device: str = "auto"
-    """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
-    quiet: bool = False
-    """Print nothing but notes, warnings and errors."""
+    """`laptop`: a good result in minutes on a CPU. `default`: the paper's 100 000 iterations, and our choices where it
+    is silent: gaps filled, outliers left out, a background of the mean color, of random colors in training, bounded
+    sizes, only visible anchors moved. `paper`: none of those choices."""
     options: Annotated[CaptureOptions, arg(name="")] = field(default_factory=CaptureOptions)
     training: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
     checkpointing: Annotated[CheckpointOptions, arg(name="")] = field(default_factory=CheckpointOptions)
@@ -51,20 +45,19 @@ class TrainCoarseArguments:
 def train_coarse_command(arguments: list[str]) -> None:
     preset, settings = preset_defaults(arguments)
     default = TrainCoarseArguments(capture=tyro.MISSING, output=tyro.MISSING, preset=preset, training=settings.training)
-    asked = parse_arguments(TrainCoarseArguments, arguments, "vdgs train-coarse", default)
+    args = parse_arguments(TrainCoarseArguments, arguments, "vdgs train-coarse", default)
     from vdgs.pipeline.train_coarse import train_coarse
     from vdgs.runs.create_or_resume import create_or_resume_run
 
-    device = select_device(asked.device)
-    configure_threads(asked.threads)
-    method = replace(settings, training=asked.training)
-    command = absolute_command_line("coarse", arguments, (asked.capture, asked.output))
-    context = create_or_resume_run(asked.capture, asked.output, asked.options, method, command=command)
-    train_coarse(context, asked.checkpointing, make_console(asked.quiet), device)
+    device = set_up_compute(args.device, args.threads)
+    method = replace(settings, training=args.training)
+    command = absolute_command_line("train-coarse", arguments, (args.capture, args.output))
+    context = create_or_resume_run(args.capture, args.output, args.options, method, command=command)
+    train_coarse(context, args.checkpointing, make_console(args.quiet), device)
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunArguments(RunRequest):
+class RunArguments(RunRequest, QuietArguments):
     """Do everything: coarse model, visibility, blocks, cameras, block training, merge, metrics, report.
 
     The same command continues a run that was stopped; finished stages are skipped.
@@ -76,8 +69,6 @@ class RunArguments(RunRequest):
     """More folders of photographs, where the first is one of photographs alone."""
     dry_run: bool = False
     """Only say what it would take: blocks, memory, time, by estimate and a few steps that are timed. Writes nothing."""
-    quiet: bool = False
-    """Print nothing but notes, warnings and errors."""
     options: Annotated[CaptureOptions, arg(name="")] = field(default_factory=CaptureOptions)
     training: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
     partition: Annotated[PartitionConfig, arg(name="")] = field(default_factory=PartitionConfig)
@@ -91,15 +82,14 @@ def run_command(arguments: list[str]) -> None:
         capture=tyro.MISSING, output=tyro.MISSING, preset=preset, training=settings.training,
         partition=settings.partition, assignment=settings.assignment, block=settings.block, merge=settings.merge,
     )  # fmt: skip
-    asked = parse_arguments(RunArguments, arguments, "vdgs run", default)
-    device = select_device(asked.device)
-    configure_threads(asked.threads)
-    if asked.dry_run:
+    args = parse_arguments(RunArguments, arguments, "vdgs run", default)
+    request = replace(args, device=set_up_compute(args.device, args.threads))
+    if args.dry_run:
         from vdgs.pipeline.dry_run import estimate_run
 
-        estimate_run(replace(asked, device=device), make_console())
+        estimate_run(request, make_console())
         return
     from vdgs.pipeline.run_pipeline import run_pipeline
 
-    command = absolute_command_line("run", arguments, (asked.capture, *asked.images, asked.output))
-    run_pipeline(replace(asked, device=device), make_console(asked.quiet), command)
+    command = absolute_command_line("run", arguments, (args.capture, *args.images, args.output))
+    run_pipeline(request, make_console(args.quiet), command)

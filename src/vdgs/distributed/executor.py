@@ -1,14 +1,15 @@
-"""What runs commands: the interface that every engine stands behind (processes of this machine: `local`; Ray:
-`on_ray`; SLURM: `on_slurm`).
+"""The interface of what runs tasks: processes of this machine (`local_executor`), Ray (`ray_executor`), SLURM
+(`slurm_executor`).
 
 A task is a command that can be repeated: it continues after an interruption and does nothing once it is done. So an
-engine keeps no state of its own, and may die. A task that ends with 0 is done; with 1 or 2 (usage) it failed for a
+executor keeps no state of its own, and may die. A task that ends with 0 is done; with 1 or 2 (usage) it failed for a
 reason that it printed, which another attempt would not mend; with 130 it was asked to stop. Everything else is a crash:
 the task is started again.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,17 +17,21 @@ from typing import Literal, Protocol
 
 #: How a task can end.
 EndState = Literal["done", "failed", "stopped"]
+#: Exit codes of the command line (`system.exit_codes`).
+EXIT_DONE, EXIT_EXPLAINED, EXIT_STOPPED = 0, (1, 2), 130
+#: Environment variable with the process id of the driver; set for each task that a driver starts.
+PARENT_PID_VARIABLE = "VDGS_PARENT"
 
 
 @dataclass(frozen=True)
 class TaskResources:
-    """What a task asks of the place where it runs. Processes of this machine take what there is."""
+    """What a task asks of the machine where it runs. Processes of this machine take what there is."""
 
     cpus: int = 1
     memory_bytes: int = 0
-    """0: says nothing."""
+    """0: not stated."""
     gpus: float = 0.0
-    """Shares of one are possible where the engine knows them."""
+    """Fractions are possible where the executor knows them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +49,12 @@ class Task:
     after: str | None = None
     """The name of the task, among those run with it, that must be done before this one starts."""
     resources: TaskResources = field(default_factory=TaskResources)
+
+    def remote_environment(self) -> dict[str, str]:
+        """Its variables on another machine: those of this process that decide how vdgs computes, and its own."""
+        inherited = {key: value for key, value in os.environ.items() if key.startswith("VDGS_")}
+        inherited.pop(PARENT_PID_VARIABLE, None)
+        return inherited | dict(self.environment)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,10 +74,10 @@ class TaskResult:
 
 
 class TaskListener:
-    """Is told what becomes of the tasks while they run; does nothing with it. Called in the thread that runs them."""
+    """Receives what becomes of the tasks while they run, in the thread that runs them; ignores it."""
 
-    def on_placed(self, task: Task, where: str, found: bool) -> None:
-        """It runs on the machine `where`; `found` there, begun by a driver that died. Before `started`."""
+    def on_placed(self, task: Task, where: str, resumed: bool) -> None:
+        """It runs on the machine `where`; `resumed`: a driver that died had begun it there. Before `on_started`."""
 
     def on_started(self, task: Task, attempt: int) -> None:
         """An attempt, counted from 1, begins."""
@@ -83,7 +94,7 @@ class TaskListener:
     def on_stopping(self, tasks: Sequence[Task]) -> None:
         """These run and were asked to save and end; no more are started."""
 
-    def on_ended(self, task: Task, outcome: TaskResult) -> None:
+    def on_ended(self, task: Task, result: TaskResult) -> None:
         """It will not be started again, or never was."""
 
     def on_tick(self) -> None:
@@ -91,14 +102,14 @@ class TaskListener:
 
 
 class Executor(Protocol):
-    """An engine that runs tasks."""
+    """Runs tasks."""
 
     @property
     def max_concurrent(self) -> int:
         """How many tasks run side by side, at most."""
 
     def run(self, tasks: Sequence[Task], listener: TaskListener) -> list[TaskResult]:
-        """Run every task, in their order where there is a choice; the outcomes in the order of the tasks.
+        """Run every task, in their order where there is a choice; the results in the order of the tasks.
 
         One that fails stops no other but those that come `after` it. When this process is asked to stop (Ctrl-C,
         SIGTERM, SIGHUP), it asks the running tasks once to save and end, and starts no more.
@@ -110,28 +121,24 @@ PrintLine = Callable[[str, str], None]
 
 
 class LogListener(TaskListener):
-    """Says what a person must know in any case: who waits, who crashed, who was asked to stop."""
+    """Prints what a person must know in any case: which task waits, crashed or was asked to stop."""
 
     def __init__(self, print_line: PrintLine):
         self.print_line = print_line
 
-    def waits(self, task: Task) -> None:
+    def on_waiting(self, task: Task) -> None:
         self.print_line(f"{task.name}: waiting for another process that works on it", "yellow")
 
-    def paused(self, task: Task, why: str) -> None:
+    def on_paused(self, task: Task, why: str) -> None:
         self.print_line(f"{task.name}: saved and waits for another turn" + (f" ({why})" if why else ""), "yellow")
 
-    def crashed(self, task: Task, how: str, attempts_left: int) -> None:
+    def on_crashed(self, task: Task, how: str, attempts_left: int) -> None:
         text = f"{task.name}: crashed by {how}; continues from its last checkpoint, attempts left: {attempts_left}"
         self.print_line(text, "yellow")
 
-    def stopping(self, tasks: Sequence[Task]) -> None:
+    def on_stopping(self, tasks: Sequence[Task]) -> None:
         names = ", ".join(task.name for task in tasks)
         self.print_line(f"stopping: {names} will save and end (Ctrl-C again kills)", "yellow")
-
-
-#: Exit codes of the command line (cli.py).
-EXIT_DONE, EXIT_EXPLAINED, EXIT_STOPPED = 0, (1, 2), 130
 
 
 @dataclass(frozen=True)
@@ -148,9 +155,9 @@ class AttemptResult:
     """How an attempt ended."""
 
     code: int | None
-    """The exit code as `subprocess` counts (negative: a signal); None of one that was lost with its place."""
+    """The exit code as `subprocess` counts (negative: a signal); None of one that was lost with its machine."""
     reason: str = ""
-    """Of a lost one: by what, in words."""
+    """Why an attempt was lost, in words."""
     out_of_memory: bool = False
     """The system, or the cluster, ended it for want of memory."""
     out_of_time: bool = False
@@ -165,7 +172,7 @@ class Attempt(Protocol):
         """None while it waits for a place, or waits for one again."""
 
     def poll(self) -> AttemptResult | None:
-        """How it ended; None while it goes on. Brings `begun` up to date."""
+        """How it ended; None while it goes on. Brings `start_info` up to date."""
 
     def request_stop(self) -> None:
         """Ask it to save and end; one that waits for a place ends at once. Called once."""
@@ -179,13 +186,13 @@ class Engine(Protocol):
 
     @property
     def max_memory_bytes(self) -> int | None:
-        """Bytes that a task can ask for at most; None of an engine that finds no place by needs."""
+        """Bytes that a task can ask for at most; None of an engine that places no task by its resources."""
 
     def start(self, tasks: Sequence[tuple[Task, int]]) -> Sequence[Attempt | OSError]:
-        """Begin an attempt (of that number) at each task, or say what the system refuses."""
+        """Begin an attempt (of that number) at each task, or return what the system refuses."""
 
     def find_running(self, task: Task) -> Attempt | None:
-        """An attempt that a driver began which died since, and that goes on without it."""
+        """An attempt that goes on without the driver which began it and died."""
 
     def refresh(self) -> None:
-        """Learn the news that `look` tells; once before all looks."""
+        """Read the news that `Attempt.poll` returns; once before all polls."""

@@ -1,4 +1,4 @@
-"""The folders of jobs for a folder: who works there, and what is removed (`sharded_job` says what lies where).
+"""The folders of jobs: who works there, and what is removed (`sharded_job` says what lies where).
 
 OUTPUT may be any folder of a person's, with `shards` of its own in it: only what is known to be a job is ever removed.
 """
@@ -15,16 +15,24 @@ from vdgs.system.file_locks import is_locked
 
 #: The name of the folder of all jobs in the folder that they are for.
 SHARDS = "shards"
-#: What the names of the folders of jobs look like (`ShardedJob.of`).
+#: The names of the folders of jobs (`ShardedJob.create`).
 _KEY = re.compile(r"[0-9a-f]{12}")
 
 
 def clear(output: Path, key: str | None = None) -> None:
     """Remove what shards of other jobs than that with this `key` have left. Raises RunError where they are at work."""
     for job in (output / SHARDS).glob("*"):
-        if job.name != key and _is_job(job):
-            _refuse_at_work(job)
-            remove(job)
+        if job.name == key or not _is_job(job):
+            continue
+        if is_locked(job):
+            raise RunError(f"{job}: another vdgs process gathers shards there. Wait for it or stop it.")
+        for folder in job.iterdir():
+            if is_locked(folder):
+                raise RunError(
+                    f"{folder}: a shard that an earlier command sent out is still at work there. Wait for it, or watch "
+                    "it again with that command (it stops with Ctrl-C)."
+                )
+        remove(job)
 
 
 def remove(job: Path) -> None:
@@ -35,20 +43,9 @@ def remove(job: Path) -> None:
 
 
 def _is_job(folder: Path) -> bool:
-    """Whether a folder holds shards, whoever put what else beside it: it is named by a key, and it or a shard in it was
-    locked once. One with nothing in it was made by a driver that ended at once, or is no loss."""
+    """Whether a folder is a job's, whoever put what else beside it: its name is a key, and it or a shard in it was
+    locked once. An empty one was made by a driver that ended at once, or is no loss."""
     if folder.is_symlink() or not folder.is_dir() or not _KEY.fullmatch(folder.name):
         return False
     locked = (folder / ".lock").exists() or any(folder.glob("*/.lock"))
     return locked or not any(folder.iterdir())
-
-
-def _refuse_at_work(job: Path) -> None:
-    if is_locked(job):
-        raise RunError(f"{job}: another vdgs process gathers shards there. Wait for it or stop it.")
-    for folder in job.iterdir():
-        if is_locked(folder):
-            raise RunError(
-                f"{folder}: a shard that an earlier command sent out is still at work there. Wait for it, or watch it "
-                "again with that command (it stops with Ctrl-C)."
-            )

@@ -1,4 +1,4 @@
-"""What stages send out: how their shards are called, and what of them is worth showing."""
+"""How the shards of a stage are called, and what of them is worth showing."""
 
 from __future__ import annotations
 
@@ -16,13 +16,11 @@ class JobLabels:
     activity: str
     """What it is at work with: "training"."""
     step_unit: str
-    """What the numbers of `iteration` and `iterations` in its status file count, as the head of a column."""
+    """The unit of `iteration` and `iterations` in its status file, as the head of a column."""
     rate_unit: str
-    """So many of them a second."""
     shows_training_stats: bool = False
-    """Whether it tells of anchors and PSNR while it runs."""
+    """Whether its status file has anchors and PSNR."""
     memory_saving_options: tuple[str, ...] = ()
-    """Options that let one take less memory."""
 
 
 BLOCK_LABELS = JobLabels(
@@ -37,8 +35,8 @@ BLOCK_LABELS = JobLabels(
 )
 
 
-def shard_kind(work: str, steps: str) -> JobLabels:
+def shard_kind(verb: str, unit: str) -> JobLabels:
     """The words for shards that do something (`measure`) with items (`views`)."""
     return JobLabels(
-        singular="shard", plural="shards", verb=work, activity="at work", step_unit=steps, rate_unit=f"{steps}/s"
+        singular="shard", plural="shards", verb=verb, activity="at work", step_unit=unit, rate_unit=f"{unit}/s"
     )

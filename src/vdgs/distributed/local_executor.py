@@ -21,12 +21,12 @@ class LocalExecutor(ExecutionPolicy):
 
 
 class _LocalEngine:
-    """The engine: attempts that end with this process."""
+    """Its attempts end with this process: none is found running (`task_process.stop_when_parent_dies`)."""
 
     max_memory_bytes = None
 
     def __init__(self) -> None:
-        self._memory_kills = oom_kill_count()
+        self._oom_kills = oom_kill_count()
 
     def start(self, tasks: Sequence[tuple[Task, int]]) -> list[_LocalAttempt | OSError]:
         return [self._start(task, attempt) for task, attempt in tasks]
@@ -38,31 +38,25 @@ class _LocalEngine:
             return error
 
     def find_running(self, _task: Task) -> None:
-        """What a driver that died has left ends by itself (`parent`)."""
+        return None
 
     def refresh(self) -> None:
-        """`look` asks the system itself."""
+        """`poll` asks the system itself."""
 
     def memory_ran_out(self) -> bool:
-        """Whether the system has ended processes for want of memory since this was last asked."""
-        kills, before = oom_kill_count(), self._memory_kills
-        self._memory_kills = kills
-        return kills > before
+        """Whether the system has ended processes for want of memory since the last call."""
+        before, self._oom_kills = self._oom_kills, oom_kill_count()
+        return self._oom_kills > before
 
 
 class _LocalAttempt:
     def __init__(self, process: TaskProcess, engine: _LocalEngine):
         self._process, self._engine = process, engine
         self.start_info = AttemptStarted(process.output_offset)
+        self.request_stop, self.kill = process.terminate, process.kill
 
     def poll(self) -> AttemptResult | None:
         code = self._process.poll()
         if code is None:
             return None
         return AttemptResult(code, out_of_memory=code == -signal.SIGKILL and self._engine.memory_ran_out())
-
-    def request_stop(self) -> None:
-        self._process.terminate()
-
-    def kill(self) -> None:
-        self._process.kill()

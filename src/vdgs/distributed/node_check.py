@@ -1,6 +1,6 @@
 """Whether a machine can work on a run: it sees the same files, runs the same vdgs, and its locks hold for the others.
 
-What is asked and answered are plain values, so that a machine without vdgs can be asked too.
+Questions and answers are plain values, so that a machine without vdgs can be asked too.
 """
 
 from __future__ import annotations
@@ -22,10 +22,14 @@ from vdgs.system.atomic_files import write_text
 from vdgs.system.documents import FitnessAnswer, FitnessQuestion
 from vdgs.system.file_locks import is_locked, lock_folder
 
-#: Files that are looked for by their size, at most (the first, the last and some between).
+#: How many files are compared by their size, at most (the first, the last and some between).
 MAX_CHECKED_FILES = 8
-#: Where Linux says what its processors can do, and what decides which kernels run, the best first.
+#: Where Linux lists the instruction sets of its processors, and those that decide which kernels run, the best first.
 CPUINFO_FILE, INSTRUCTION_SETS = Path("/proc/cpuinfo"), ("avx512f", "avx2")
+_NO_LOCKS = (
+    "{}: locks of files (flock) {}. Mount that file system with them (NFS 4; Lustre: -o flock), or two machines may "
+    "write the same files"
+)
 
 
 @dataclass(frozen=True)
@@ -35,10 +39,10 @@ class NodeRequirements:
     folder: Path
     """The run folder: must be the same one, and writable."""
     files: Sequence[Path]
-    """Photographs and models that must be there, of the size that they have here."""
+    """Images and models that must be there, of the size that they have here."""
 
     def to_dict(self, held: Path | None = None) -> FitnessQuestion:
-        """The question as plain values; `held` is a folder that this process holds."""
+        """The question as plain values; `held` is a folder that this process has locked."""
         step = max(1, -(-len(self.files) // MAX_CHECKED_FILES))
         chosen = [*self.files[::step], *self.files[-1:]]
         return {
@@ -48,7 +52,7 @@ class NodeRequirements:
 
     @contextmanager
     def with_lock_probe(self) -> Iterator[FitnessQuestion]:
-        """The question while this process holds a folder in the run folder, so that others can be asked to see that."""
+        """The question while this process locks a folder in the run folder, so that others can be asked to see that."""
         held = self.folder / f".fitness-{uuid4().hex}"
         try:
             with lock_folder(held):
@@ -61,19 +65,19 @@ class NodeRequirements:
 
 
 def image_and_mask_files(views: Sequence[View]) -> list[Path]:
-    """The files of photographs, and of masks where they have any."""
+    """The image files of views, and their masks where they have any."""
     return [path for view in views for path in (view.image_path, view.mask_path) if path is not None]
 
 
-def check_node(requirements: FitnessQuestion) -> FitnessAnswer:
+def check_node(question: FitnessQuestion) -> FitnessAnswer:
     """This machine's answer: its `node`, the `processor`'s instructions, and the `problems` that it sees, in words."""
-    problems = [*_folder(requirements), *_files(requirements["files"]), *_code(requirements)]
+    problems = [*_folder_problems(question), *_file_problems(question["files"]), *_code_problems(question)]
     return {"node": socket.gethostname(), "processor": cpu_instruction_set(), "problems": problems}
 
 
 @cache
 def code_digest() -> str:
-    """What tells this vdgs from every other: a digest of its Python files."""
+    """A digest of the Python files of this vdgs."""
     package, digest = Path(__file__).parents[1], hashlib.sha256()
     for file in sorted(package.rglob("*.py")):
         digest.update(file.relative_to(package).as_posix().encode())
@@ -81,41 +85,34 @@ def code_digest() -> str:
     return digest.hexdigest()[:16]
 
 
-def _folder(requirements: FitnessQuestion) -> list[str]:
-    folder, held = Path(requirements["folder"]), requirements["held"]
+def _folder_problems(question: FitnessQuestion) -> list[str]:
+    folder, held = Path(question["folder"]), None if question["held"] is None else Path(question["held"])
+    remedy = "All nodes must share the file system that it lies on"
     if not folder.is_dir():
-        return [f"there is no {folder}. All nodes must share the file system that it lies on"]
-    if held is not None and not (Path(held) / "here").is_file():
-        return [
-            f"{folder} is another folder there, of the same name. All nodes must share the file system that it lies on"
-        ]
+        return [f"there is no {folder}. {remedy}"]
+    if held is not None and not (held / "here").is_file():
+        return [f"{folder} is another folder there, of the same name. {remedy}"]
     if not os.access(folder, os.W_OK):
         return [f"{folder} cannot be written there"]
     try:
-        return [] if held is None or is_locked(Path(held)) else [_WITHOUT_LOCKS.format(folder, "reach no other node")]
+        return [] if held is None or is_locked(held) else [_NO_LOCKS.format(folder, "reach no other node")]
     except OSError as error:
-        return [_WITHOUT_LOCKS.format(folder, f"do not work there ({error.strerror})")]
+        return [_NO_LOCKS.format(folder, f"do not work there ({error.strerror})")]
 
 
-_WITHOUT_LOCKS = (
-    "{}: locks of files (flock) {}. Mount that file system with them (NFS 4; Lustre: -o flock), or two machines may "
-    "write the same files"
-)
-
-
-def _files(files: Sequence[tuple[str, int]]) -> list[str]:
+def _file_problems(files: Sequence[tuple[str, int]]) -> list[str]:
     for name, size in files:
-        if _size(Path(name)) < 0:
+        if (size_there := _size(Path(name))) < 0:
             return [f"there is no {name}, or it cannot be read. Photographs must lie where all nodes see them"]
-        if _size(Path(name)) != size:
-            return [f"{name} has {_size(Path(name)):,} bytes there and {size:,} here: it is another file"]
+        if size_there != size:
+            return [f"{name} has {size_there:,} bytes there and {size:,} here: it is another file"]
     return []
 
 
-def _code(requirements: FitnessQuestion) -> list[str]:
-    if requirements["version"] != __version__:
-        return [f"it has vdgs {__version__}, this machine {requirements['version']}. Install the same on all"]
-    if requirements["code"] != code_digest():
+def _code_problems(question: FitnessQuestion) -> list[str]:
+    if question["version"] != __version__:
+        return [f"it has vdgs {__version__}, this machine {question['version']}. Install the same on all"]
+    if question["code"] != code_digest():
         return [f"its vdgs {__version__} is not the same code as this machine's. Install the same on all"]
     return []
 

@@ -19,8 +19,9 @@ from vdgs.system.units import ABSENT, clock, data_size
 LOG_INTERVAL_SECONDS = 15.0
 #: Lines of the table that are not rows of shards: head, rules, totals, and one to spare for the prompt.
 TABLE_FRAME_LINES = 7
-#: Columns of what trains.
+#: Columns that only training has.
 TRAINING_COLUMNS = ("PSNR", "anchors")
+#: The styles of states, in the order in which states are counted, and the order in which rows are shown if not all fit.
 STATE_STYLES: dict[ShardState, str] = {
     "queued": "dim",
     "running": "cyan",
@@ -28,13 +29,14 @@ STATE_STYLES: dict[ShardState, str] = {
     "failed": "red",
     "stopped": "yellow",
 }
+URGENCY: tuple[ShardState, ...] = ("running", "failed", "stopped", "queued", "done")
 
 
 class ProgressTable:
     """Shows rows until it is closed. Everything printed meanwhile goes through it, above the table."""
 
     def __init__(self, console: Console, rows: list[ShardProgress], at_once: int, labels: JobLabels = BLOCK_LABELS):
-        self._console, self._rows, self._at_once, self._kind = console, rows, at_once, labels
+        self._console, self._rows, self._at_once, self._labels = console, rows, at_once, labels
         self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
         self._last_line = time.monotonic()
 
@@ -49,83 +51,60 @@ class ProgressTable:
             self._live.stop()
 
     def print_line(self, text: str, style: str = "") -> None:
-        """A line that stays."""
+        """Print a line that stays."""
         self._console.print(text, style=style, highlight=False, markup=False)
 
     def note(self, text: str) -> None:
-        """A line about what the live table shows anyway: only where there is none."""
+        """Print what the live table shows anyway: only where there is none."""
         if self._live is None:
             self.print_line(text)
 
     def show(self) -> None:
         """Redraw the table, or print the summary line if it is time."""
         if self._live is not None:
-            table = build_progress_table(
-                self._rows, self._at_once, self._console.height - TABLE_FRAME_LINES, self._kind
-            )
-            self._live.update(table, refresh=True)
-        elif self._open and time.monotonic() - self._last_line >= LOG_INTERVAL_SECONDS:
+            room = self._console.height - TABLE_FRAME_LINES
+            self._live.update(build_progress_table(self._rows, self._at_once, room, self._labels), refresh=True)
+            return
+        is_open = any(row.state in ("queued", "running") for row in self._rows)
+        if is_open and time.monotonic() - self._last_line >= LOG_INTERVAL_SECONDS:
             self._last_line = time.monotonic()
-            self.print_line(progress_line(self._rows, self._at_once, self._kind))
-
-    @property
-    def _open(self) -> bool:
-        return any(row.state in ("queued", "running") for row in self._rows)
+            self.print_line(progress_line(self._rows, self._at_once, self._labels))
 
 
 def build_progress_table(
     rows: list[ShardProgress], at_once: int, max_rows: int, labels: JobLabels = BLOCK_LABELS
 ) -> Table:
-    """One row for each shard and one with totals; of more than `most`, those that wait or are done are counted."""
+    """One row for each shard and one with totals; of more than `max_rows`, those that wait or are done are counted."""
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0), caption_justify="left")  # 80 columns
-    columns = (
-        labels.singular,
-        "state",
-        labels.step_unit,
-        *TRAINING_COLUMNS,
-        labels.rate_unit,
-        "left",
-        "memory",
-        "tries",
-    )
+    unit, rate = labels.step_unit, labels.rate_unit
+    columns = (labels.singular, "state", unit, *TRAINING_COLUMNS, rate, "left", "memory", "tries")
     chosen = [
-        place for place, column in enumerate(columns) if labels.shows_training_stats or column not in TRAINING_COLUMNS
+        index for index, column in enumerate(columns) if labels.shows_training_stats or column not in TRAINING_COLUMNS
     ]
-    for column in (columns[place] for place in chosen):
-        table.add_column(column, justify="left" if column == "state" else "right", no_wrap=True)
-    shown = _visible_rows(rows, max(max_rows, 1))
-    for row in shown:
-        cells = _cells(row)
-        table.add_row(*(cells[place] for place in chosen), style=STATE_STYLES[row.state])
+    for index in chosen:
+        table.add_column(columns[index], justify="left" if columns[index] == "state" else "right", no_wrap=True)
+    shown = sorted(rows, key=lambda row: URGENCY.index(row.state))[: max(max_rows, 1)]
+    for row in rows:
+        if row in shown:
+            cells = _cells(row)
+            table.add_row(*(cells[index] for index in chosen), style=STATE_STYLES[row.state])
     if len(shown) < len(rows):
-        hidden = [row for row in rows if row not in shown]
-        table.caption = f"and {_states(hidden)}"
+        table.caption = f"and {_states([row for row in rows if row not in shown])}"
     table.add_section()
     totals = _totals(rows, at_once)
-    table.add_row(*(totals[place] for place in chosen), style="bold")
+    table.add_row(*(totals[index] for index in chosen), style="bold")
     return table
 
 
 def progress_line(rows: list[ShardProgress], at_once: int, labels: JobLabels = BLOCK_LABELS) -> str:
     """The table in one line: counts, the shards that run, the time left."""
-    running = [
-        f"{row.index:02d}: {_iteration(row)}" + (f" {row.stats.psnr:.2f} dB" if row.stats.psnr is not None else "")
-        for row in rows
-        if row.state == "running"
-    ]
+    parts = [f"{labels.plural}: {_states(rows)}"]
+    for row in rows:
+        if row.state == "running":
+            psnr = f" {row.stats.psnr:.2f} dB" if row.stats.psnr is not None else ""
+            parts.append(f"{row.index:02d}: {_iteration(row)}{psnr}")
     left = seconds_left_overall(rows, at_once)
-    parts = [f"{labels.plural}: {_states(rows)}", *running] + (
-        [f"about {clock(left)} left"] if left is not None else []
-    )
-    return " · ".join(parts)
-
-
-def _visible_rows(rows: list[ShardProgress], max_rows: int) -> list[ShardProgress]:
-    if len(rows) <= max_rows:
-        return rows
-    urgency = {"running": 0, "failed": 1, "stopped": 2, "queued": 3, "done": 4}
-    urgent = sorted(rows, key=lambda row: urgency[row.state])[:max_rows]
-    return [row for row in rows if row in urgent]
+    return " · ".join(parts if left is None else [*parts, f"about {clock(left)} left"])
 
 
 def _states(rows: Sequence[ShardProgress]) -> str:
@@ -134,23 +113,23 @@ def _states(rows: Sequence[ShardProgress]) -> str:
 
 
 def _iteration(row: ShardProgress) -> str:
-    figures = row.stats
-    if figures.iteration is None:
+    stats = row.stats
+    if stats.iteration is None:
         return "starting" if row.state == "running" else ABSENT
-    return f"{figures.iteration:,}" + (f"/{figures.iterations:,}" if figures.iterations is not None else "")
+    return f"{stats.iteration:,}" + (f"/{stats.iterations:,}" if stats.iterations is not None else "")
 
 
 def _cells(row: ShardProgress) -> list[str]:
-    figures, running = row.stats, row.state == "running"
+    stats, running = row.stats, row.state == "running"
     return [
         f"{row.index:02d}",
         row.state,
         _iteration(row),
-        _shown(figures.psnr, "{:.2f}"),
-        _shown(figures.anchors, "{:,}"),
-        _shown(row.speed if running else None, "{:.1f}"),
-        _shown(row.seconds_left if running else None),
-        data_size(figures.memory_bytes, decimals=1),
+        _number_text(stats.psnr, "{:.2f}"),
+        _number_text(stats.anchors, "{:,}"),
+        _number_text(row.speed if running else None, "{:.1f}"),
+        _clock_text(row.seconds_left if running else None),
+        data_size(stats.memory_bytes, decimals=1),
         str(row.attempts) if row.attempts else ABSENT,
     ]
 
@@ -164,27 +143,25 @@ def _totals(rows: list[ShardProgress], at_once: int) -> list[str]:
     return [
         "all",
         f"{done}/{len(rows)} done",
-        _percent(rows),
+        f"{100 * sum(map(_done_share, rows)) / len(rows):.0f} %" if rows else ABSENT,
         "",
-        _shown(sum(anchors) if anchors else None, "{:,}"),
-        _shown(sum(speeds) if speeds else None, "{:.1f}"),
-        _shown(seconds_left_overall(rows, at_once)),
+        _number_text(sum(anchors) if anchors else None, "{:,}"),
+        _number_text(sum(speeds) if speeds else None, "{:.1f}"),
+        _clock_text(seconds_left_overall(rows, at_once)),
         data_size(sum(memory) if memory else None, decimals=1),
         "",
     ]
 
 
-def _percent(rows: list[ShardProgress]) -> str:
-    """Share of the work done, a shard that says nothing counting as one that has not begun."""
-    shares = []
-    for row in rows:
-        iteration, iterations = row.stats.iteration, row.stats.iterations
-        share = min((iteration or 0) / iterations, 1.0) if iterations else 0.0
-        shares.append(1.0 if row.state == "done" else share)
-    return f"{100 * sum(shares) / len(shares):.0f} %" if shares else ABSENT
+def _done_share(row: ShardProgress) -> float:
+    """Share of its work that is done; 0 where it does not say."""
+    iteration, iterations = row.stats.iteration, row.stats.iterations
+    return 1.0 if row.state == "done" else min((iteration or 0) / iterations, 1.0) if iterations else 0.0
 
 
-def _shown(value: float | None, form: str | None = None) -> str:
-    if value is None:
-        return ABSENT
-    return form.format(value) if form else clock(value)
+def _number_text(value: float | None, form: str) -> str:
+    return ABSENT if value is None else form.format(value)
+
+
+def _clock_text(seconds: float | None) -> str:
+    return ABSENT if seconds is None else clock(seconds)

@@ -1,7 +1,7 @@
-"""Tasks on a Ray cluster: Ray finds each a node with room for what it needs, a keeper there runs it (`keeper`).
+"""Tasks on a Ray cluster: Ray finds each a node with room for what it needs, an actor there runs it (`ray_actor`).
 
-Only paths travel: state is in files that all nodes see. What Ray loses is begun again by the crew, not by Ray, so that
-attempts are counted and worded as everywhere.
+Only paths travel: state is in files that all nodes see. What Ray loses is started again by the scheduler, not by Ray,
+so that attempts are counted and worded as everywhere.
 """
 
 from __future__ import annotations
@@ -31,12 +31,11 @@ from vdgs.distributed.executor import (
 from vdgs.distributed.node_check import NodeRequirements
 from vdgs.distributed.ray_actor import NodeRejected, RayTaskActor, RayTaskSpec
 from vdgs.distributed.scheduler import ExecutionPolicy, run_tasks
-from vdgs.distributed.task_process import PARENT_PID_VARIABLE
 from vdgs.errors import VdgsError
 from vdgs.system.documents import FitnessAnswer, FitnessQuestion
 
 NAMESPACE = "vdgs"
-#: Memory for Ray's own objects, of which there are none: the least that it takes.
+#: Memory for Ray's object store, which holds nothing: the least that Ray takes.
 OBJECT_STORE_BYTES = 80 << 20
 #: Seconds that a node gets to answer before anything starts.
 NODE_CHECK_TIMEOUT_SECONDS = 300.0
@@ -57,21 +56,21 @@ class RayNode:
 
 @contextmanager
 def connect(address: str | None) -> Iterator[None]:
-    """Be a driver of a cluster: of the one at `address`, else that of RAY_ADDRESS, else a Ray of this machine alone.
+    """Be a driver of the cluster at `address`, else of that in RAY_ADDRESS, else of a Ray of this machine alone.
 
     Raises VdgsError where there is no Ray, or none that answers.
     """
     where = _resolve_address(address)
-    variables, own = {"RAY_USAGE_STATS_ENABLED": "0"}, dict[str, Any]()
+    variables, options = {"RAY_USAGE_STATS_ENABLED": "0"}, dict[str, Any]()
     if where == "local":
-        own = {"include_dashboard": False, "object_store_memory": OBJECT_STORE_BYTES}
+        options = {"include_dashboard": False, "object_store_memory": OBJECT_STORE_BYTES}
         variables["RAY_worker_niceness"] = "0"  # as tasks have it that are processes of this machine
-        # Ray listens on all addresses: let in who has the token, which is nobody else.
+        # Ray listens on all addresses: admit only who has the token, which is nobody else.
         variables |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": _token()}
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:
-        with _ray_driver(where, own):
+        with _ray_driver(where, options):
             yield
     finally:
         for name, value in before.items():
@@ -83,7 +82,7 @@ def connect(address: str | None) -> Iterator[None]:
 
 @cache
 def _token() -> str:
-    """What opens the Rays of this process: the same for all, for Ray reads it once in the life of a process."""
+    """The token of every Ray that this process starts: Ray reads it once in the life of a process."""
     return secrets.token_hex(32)
 
 
@@ -106,18 +105,18 @@ def _require_ray() -> None:
 
 
 @contextmanager
-def _ray_driver(where: str, own: Mapping[str, Any]) -> Iterator[None]:
+def _ray_driver(where: str, options: Mapping[str, Any]) -> Iterator[None]:
     _require_ray()
     import ray
 
     with _preserve_signal_handlers():
         try:
-            ray.init(address=where, namespace=NAMESPACE, log_to_driver=False, logging_level="error", **own)
+            ray.init(address=where, namespace=NAMESPACE, log_to_driver=False, logging_level="error", **options)
         except (ConnectionError, RuntimeError, ValueError, OSError, ray.exceptions.RayError) as error:
-            said = str(error).strip().splitlines() or [type(error).__name__]
+            message = str(error).strip().splitlines() or [type(error).__name__]
             raise VdgsError(
-                f"{where}: no Ray cluster that can be used ({said[0]}). See `ray status` there; --address auto on one "
-                "of its machines, the same versions of Ray and Python on all."
+                f"{where}: no Ray cluster that can be used ({message[0]}). See `ray status` there; --address auto on "
+                "one of its machines, the same versions of Ray and Python on all."
             ) from error
     try:
         yield
@@ -129,10 +128,8 @@ def _ray_driver(where: str, own: Mapping[str, Any]) -> Iterator[None]:
 @contextmanager
 def _preserve_signal_handlers() -> Iterator[None]:
     """Ray sets handlers of signals; ours are put back."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
+    before = {number: signal.getsignal(number) for number in numbers}
     try:
         yield
     finally:
@@ -144,32 +141,28 @@ def list_nodes() -> list[RayNode]:
     """The nodes that are there now and have processors."""
     import ray
 
-    found = []
-    for each in ray.nodes():
-        has = each["Resources"]
-        if each["Alive"] and has.get("CPU", 0) >= 1:
-            found.append(
-                RayNode(
-                    each["NodeID"], each["NodeManagerHostname"], int(has["CPU"]), int(has.get("memory", 0)),
-                    float(has.get("GPU", 0)),
-                )
-            )  # fmt: skip
-    return found
+    alive = ((each, each["Resources"]) for each in ray.nodes() if each["Alive"])
+    return [
+        RayNode(
+            each["NodeID"], each["NodeManagerHostname"], int(has["CPU"]), int(has.get("memory", 0)),
+            float(has.get("GPU", 0)),
+        )
+        for each, has in alive
+        if has.get("CPU", 0) >= 1
+    ]  # fmt: skip
 
 
 def check_nodes(requirements: NodeRequirements, ray_nodes: Sequence[RayNode]) -> list[FitnessAnswer]:
-    """Every node's answer (`fitness.examine`), but for nodes that are gone meanwhile.
-
-    Raises VdgsError, naming nodes and what is wrong, if one is unfit.
-    """
+    """The answers of all nodes that are still there (`node_check.check_node`). Raises VdgsError, naming nodes and
+    problems, if one cannot work on the run."""
     import ray
 
-    with requirements.with_lock_probe() as plain:
-        asked = {node: _check_node_remotely(node.node_id, plain) for node in ray_nodes}
+    with requirements.with_lock_probe() as question:
+        pending = [(node, _check_node_remotely(node.node_id, question)) for node in ray_nodes]
         answers, problems = list[FitnessAnswer](), list[str]()
-        for node, answer in asked.items():
+        for node, future in pending:
             try:
-                answers.append(ray.get(answer, timeout=NODE_CHECK_TIMEOUT_SECONDS))
+                answers.append(ray.get(future, timeout=NODE_CHECK_TIMEOUT_SECONDS))
             except ray.exceptions.RayError as error:
                 if node.node_id in {each.node_id for each in list_nodes()}:
                     problems.append(f"node {node.name}: does not answer ({_last_line(error)})")
@@ -185,7 +178,7 @@ def _check_node_remotely(node: str, requirements: FitnessQuestion) -> Any:
     import ray
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-    def look() -> FitnessAnswer:
+    def check() -> FitnessAnswer:
         import socket
 
         try:
@@ -194,8 +187,8 @@ def _check_node_remotely(node: str, requirements: FitnessQuestion) -> Any:
             return {"node": socket.gethostname(), "processor": "", "problems": [f"vdgs is not installed ({error})"]}
         return check_node(requirements)
 
-    there = NodeAffinitySchedulingStrategy(node, soft=False)
-    return ray.remote(look).options(num_cpus=0, max_retries=0, scheduling_strategy=there).remote()
+    on_node = NodeAffinitySchedulingStrategy(node, soft=False)
+    return ray.remote(check).options(num_cpus=0, max_retries=0, scheduling_strategy=on_node).remote()
 
 
 @dataclass(frozen=True)
@@ -203,7 +196,7 @@ class RayExecutor(ExecutionPolicy):
     """Runs tasks on the cluster that this process is connected to."""
 
     requirements: NodeRequirements | None = None
-    """What a node must see; asked again where each task starts, for nodes may join late."""
+    """What a node must see; checked again where each task starts, for nodes may join late."""
 
     def run(self, tasks: Sequence[Task], listener: TaskListener) -> list[TaskResult]:
         """As `Executor.run`."""
@@ -212,14 +205,16 @@ class RayExecutor(ExecutionPolicy):
 
 
 class _RayEngine:
-    """The engine."""
-
     def __init__(self, requirements: NodeRequirements):
-        self._question = requirements.to_dict()
-        self._run = hashlib.sha256(str(requirements.folder).encode()).hexdigest()[:12]
-        #: Nodes that were found to be unfit.
-        self.unfit = set[str]()
-        self._keepers = _list_actors()
+        self._requirements = requirements.to_dict()
+        self._run_id = hashlib.sha256(str(requirements.folder).encode()).hexdigest()[:12]
+        #: Identifiers of nodes that cannot work on the run.
+        self.rejected_nodes = set[str]()
+        import ray
+
+        named = ray.util.list_named_actors(all_namespaces=True)
+        #: Names of the actors of vdgs on the cluster that live.
+        self._actors = sorted(each["name"] for each in named if each["namespace"] == NAMESPACE)
 
     @property
     def max_memory_bytes(self) -> int:
@@ -231,126 +226,108 @@ class _RayEngine:
     def _start(self, task: Task, attempt: int) -> Attempt:
         import ray
 
-        order = RayTaskSpec(
-            command=tuple(task.command), output=str(task.output), environment=_environment() | dict(task.environment),
-            attempt=attempt, python=sys.executable, requirements=self._question,
+        spec = RayTaskSpec(
+            command=tuple(task.command), output=str(task.output), environment=task.remote_environment(),
+            attempt=attempt, python=sys.executable, requirements=self._requirements,
         )  # fmt: skip
-        needs = task.resources
-        options: dict[str, Any] = {"num_cpus": needs.cpus, "num_gpus": needs.gpus}
-        if needs.memory_bytes:
-            options["memory"] = needs.memory_bytes
-        if self.unfit and any(node.node_id not in self.unfit for node in list_nodes()):
-            options["label_selector"] = {"ray.io/node-id": f"!in({','.join(sorted(self.unfit))})"}
+        resources = task.resources
+        options: dict[str, Any] = {"num_cpus": resources.cpus, "num_gpus": resources.gpus}
+        if resources.memory_bytes:
+            options["memory"] = resources.memory_bytes
+        if self.rejected_nodes and any(node.node_id not in self.rejected_nodes for node in list_nodes()):
+            options["label_selector"] = {"ray.io/node-id": f"!in({','.join(sorted(self.rejected_nodes))})"}
         actor = ray.remote(RayTaskActor).options(
-            name=self._name(task, attempt), namespace=NAMESPACE, lifetime="detached", max_restarts=0, max_concurrency=8,
-            **options,
+            name=self._actor_name(task, attempt), namespace=NAMESPACE, lifetime="detached", max_restarts=0,
+            max_concurrency=8, **options,
         )  # fmt: skip
-        return _RayAttempt(actor.remote(order), self)
+        return _RayAttempt(actor.remote(spec), self)
 
     def find_running(self, task: Task) -> Attempt | None:
         import ray
 
-        mine = [name for name in self._keepers if name.startswith(self._name(task, ""))]
-        with suppress(ValueError, IndexError):  # it may go just now
-            return _RayAttempt(ray.get_actor(mine[-1], NAMESPACE), self)
+        names = [name for name in self._actors if name.startswith(self._actor_name(task, ""))]
+        with suppress(ValueError, IndexError):  # it may exit just now
+            return _RayAttempt(ray.get_actor(names[-1], NAMESPACE), self)
         return None
 
     def refresh(self) -> None:
-        """`look` asks Ray itself."""
+        """`poll` asks Ray itself."""
 
-    def _name(self, task: Task, attempt: int | str) -> str:
-        """Of a keeper; another for each attempt, for the name of a dead one is free only after a while."""
+    def _actor_name(self, task: Task, attempt: int | str) -> str:
+        """Another name for each attempt: that of a dead actor is free only after a while."""
         unique = f"{attempt}-{secrets.token_hex(4)}" if attempt else ""
-        return f"{self._run}/{task.name}/{unique}"
+        return f"{self._run_id}/{task.name}/{unique}"
 
 
 class _RayAttempt:
-    def __init__(self, actor: Any, cluster: _RayEngine):
-        self._keeper, self._cluster = actor, cluster
+    def __init__(self, actor: Any, engine: _RayEngine):
+        self._actor, self._engine = actor, engine
         self._begin = actor.begin.remote()
         self._end: Any = None
-        self._over: AttemptResult | None = None
+        self._result: AttemptResult | None = None
         self._unavailable = 0
         self.start_info: AttemptStarted | None = None
 
     def poll(self) -> AttemptResult | None:
         import ray
 
-        if self._over is None:
+        if self._result is None:
             try:
                 if self._end is None and _is_ready(self._begin):
-                    self._began(ray.get(self._begin))
+                    self._started(ray.get(self._begin))
                 if self._end is not None and _is_ready(self._end):
-                    self._over = ray.get(self._end)
+                    self._result = ray.get(self._end)
             except ray.exceptions.ActorUnavailableError as error:
                 self._ask_again(error)
             except ray.exceptions.RayTaskError as error:  # there is no such command there, or no space
-                self._over = AttemptResult(None, f"an error before its first line: {_last_line(error.cause or error)}")
+                self._result = AttemptResult(None, _early_error_text(error.cause or error))
             except ray.exceptions.RayError as error:
-                self._over = AttemptResult(None, self._how(error), out_of_memory=_out_of_memory(error))
-            if self._over is not None:
-                self._dismiss()
-        return self._over
+                self._result = AttemptResult(None, self._loss_text(error), out_of_memory=_is_out_of_memory(error))
+            if self._result is not None:
+                self._kill_actor()
+        return self._result
 
     def request_stop(self) -> None:
         if self.poll() is None and self.start_info is None and not _is_ready(self._begin):
-            self._over = AttemptResult(EXIT_STOPPED)
-            self._dismiss()
-        elif self._over is None:
-            self._keeper.stop.remote()
+            self._result = AttemptResult(EXIT_STOPPED)
+            self._kill_actor()
+        elif self._result is None:
+            self._actor.stop.remote()
 
     def kill(self) -> None:
-        if self._over is None:
-            self._keeper.kill.remote()
+        if self._result is None:
+            self._actor.kill.remote()
 
-    def _began(self, answer: AttemptStarted | NodeRejected) -> None:
+    def _started(self, answer: AttemptStarted | NodeRejected) -> None:
         if isinstance(answer, NodeRejected):
-            self._cluster.unfit.add(answer.node_id)
-            self._over = AttemptResult(None, f"a node that cannot work on the run, {answer.node}: {answer.reason}")
+            self._engine.rejected_nodes.add(answer.node_id)
+            self._result = AttemptResult(None, f"a node that cannot work on the run, {answer.node}: {answer.reason}")
             return
-        self.start_info, self._end = answer, self._keeper.end.remote()
+        self.start_info, self._end = answer, self._actor.end.remote()
 
     def _ask_again(self, error: Exception) -> None:
-        """The network to the keeper's node failed, and may work again."""
+        """The network to the actor's node failed, and may work again."""
         self._unavailable += 1
         if self._unavailable > MAX_UNAVAILABLE_POLLS:
-            self._over = AttemptResult(None, self._how(error))
+            self._result = AttemptResult(None, self._loss_text(error))
         elif self._end is None:
-            self._begin = self._keeper.begin.remote()
+            self._begin = self._actor.begin.remote()
         else:
-            self._end = self._keeper.end.remote()
+            self._end = self._actor.end.remote()
 
-    def _how(self, error: Exception) -> str:
-        text = str(error)
+    def _loss_text(self, error: Exception) -> str:
         where = f" {self.start_info.where}" if self.start_info is not None else ""
-        if _out_of_memory(error):
+        if _is_out_of_memory(error):
             return f"Ray, to free memory on its node{where}"
-        if "node has died" in text or "node was terminated" in text or "node died" in text:
+        if any(words in str(error) for words in ("node has died", "node was terminated", "node died")):
             return f"the loss of its node{where}"
-        if self.start_info is None:
-            return f"an error before its first line: {_last_line(error)}"
-        return f"the loss of its worker on node{where}"
+        return _early_error_text(error) if self.start_info is None else f"the loss of its worker on node{where}"
 
-    def _dismiss(self) -> None:
+    def _kill_actor(self) -> None:
         import ray
 
         with suppress(ray.exceptions.RayError, ValueError):
-            ray.kill(self._keeper)
-
-
-def _list_actors() -> list[str]:
-    """Names of all keepers on the cluster that live."""
-    import ray
-
-    named = ray.util.list_named_actors(all_namespaces=True)
-    return sorted(each["name"] for each in named if each["namespace"] == NAMESPACE)
-
-
-def _environment() -> dict[str, str]:
-    """Variables of this process that decide how vdgs computes."""
-    return {
-        name: value for name, value in os.environ.items() if name.startswith("VDGS_") and name != PARENT_PID_VARIABLE
-    }
+            ray.kill(self._actor)
 
 
 def _is_ready(answer: Any) -> bool:
@@ -359,10 +336,14 @@ def _is_ready(answer: Any) -> bool:
     return bool(ray.wait([answer], timeout=0)[0])
 
 
-def _out_of_memory(error: Exception) -> bool:
+def _is_out_of_memory(error: Exception) -> bool:
     import ray
 
     return isinstance(error, ray.exceptions.OutOfMemoryError) or "running low on memory" in str(error)
+
+
+def _early_error_text(error: BaseException) -> str:
+    return f"an error before its first line: {_last_line(error)}"
 
 
 def _last_line(error: BaseException) -> str:

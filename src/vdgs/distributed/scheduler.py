@@ -1,6 +1,5 @@
-"""The tasks of one call, whatever engine begins them: which wait, which run, which are tried again, how each ended.
-
-All that a person sees of a failure is worded here, so that every engine says it in the same words.
+"""Schedules the tasks of one call, whatever engine begins them: which wait, which run, which are tried again, how each
+ended. All messages about failures are worded here, so that every engine uses the same words.
 """
 
 from __future__ import annotations
@@ -32,9 +31,9 @@ from vdgs.runs.stage_folder import StageFolder
 from vdgs.system.stop_signals import catch_stop_signals
 from vdgs.system.units import data_size
 
-#: Seconds that tasks get to save when this process fails itself, and between two looks at them meanwhile.
+#: Seconds that tasks get to save when this process fails itself, and between two polls meanwhile.
 GRACE_SECONDS, GRACE_POLL_SECONDS = 120.0, 0.05
-#: Free bytes below which a silent failure is put down to a full disk.
+#: Free bytes below which a failure without a message is put down to a full disk.
 DISK_FULL_BYTES = 1 << 20
 #: What a task asks for after it was ended for want of memory, times what it asked for before (choice).
 MEMORY_RETRY_FACTOR = 1.5
@@ -42,19 +41,18 @@ MEMORY_RETRY_FACTOR = 1.5
 
 @dataclass(frozen=True)
 class ExecutionPolicy:
-    """How many tasks run side by side, how often one that crashes is started again, and how often all are looked at."""
+    """How many tasks run side by side, how often one that crashes is started again, and how often all are polled."""
 
     max_concurrent: int
     retries: int = 2
     poll_seconds: float = 0.5
     lock_timeout_seconds: float = 60.0
-    """How long to wait for a process that still holds a task's folder, such as one whose driver was killed and that
-    saves."""
+    """How long to wait for a process that still holds a task's folder: one whose driver was killed, and that saves."""
 
     def __post_init__(self) -> None:
         if self.max_concurrent < 1 or self.retries < 0:
             raise ValueError(
-                f"at_once is {self.max_concurrent} and retries is {self.retries}: at least 1 and 0 are needed"
+                f"max_concurrent is {self.max_concurrent}, retries is {self.retries}; at least 1 and 0 are needed"
             )
 
 
@@ -62,66 +60,64 @@ def run_tasks(
     tasks: Sequence[Task], engine: Engine, policy: ExecutionPolicy, listener: TaskListener
 ) -> list[TaskResult]:
     """As `Executor.run`, with the attempts of an engine. A second Ctrl-C kills those that still run."""
-    with catch_stop_signals(hangup=True) as asked:
-        crew = _TaskScheduler([_TaskState(task) for task in tasks], engine, policy, listener)
+    with catch_stop_signals(hangup=True) as signals:
+        scheduler = _TaskScheduler([_TaskState(task) for task in tasks], engine, policy, listener)
         try:
-            while not crew.step(asked):
+            while not scheduler.step(signals):
                 time.sleep(policy.poll_seconds)
         finally:
-            crew.abandon()
-    return [work.outcome for work in crew.works if work.outcome is not None]
+            scheduler.abandon()
+    return [state.result for state in scheduler.states if state.result is not None]
 
 
 class _TaskState:
-    """A task and the attempt that is made at it."""
+    """A task and its present attempt."""
 
     def __init__(self, task: Task):
         self.task = task
         self.attempt: Attempt | None = None
-        self.outcome: TaskResult | None = None
+        self.result: TaskResult | None = None
         self.attempts = 0
-        self.asked_to_stop = False
-        #: Whether it was told that this attempt began, when it did, and where its output begins.
-        self.told, self.began, self.output_from = False, 0.0, 0
+        self.stop_requested = False
+        #: Whether the start of this attempt was reported, its time, and where its output begins.
+        self.started, self.start_time, self.output_from = False, 0.0, 0
         #: Whether an earlier driver began it.
-        self.found = False
+        self.resumed = False
         #: Since when another process is seen to work on it.
-        self.held_since: float | None = None
-        #: How far it was when its time was last up.
+        self.locked_since: float | None = None
+        #: How many iterations it had when its time was last up.
         self.progress = -1
 
-    def ask_to_stop(self) -> None:
-        if self.attempt is not None and not self.asked_to_stop:
-            self.asked_to_stop = True
+    def request_stop(self) -> None:
+        if self.attempt is not None and not self.stop_requested:
+            self.stop_requested = True
             self.attempt.request_stop()
 
 
 class _TaskScheduler:
     """The tasks of one call."""
 
-    def __init__(self, works: list[_TaskState], engine: Engine, policy: ExecutionPolicy, listener: TaskListener):
-        self.works, self._engine, self._listener = works, engine, listener
-        self._at_once, self._retries, self._patience = (
-            policy.max_concurrent,
-            policy.retries,
-            policy.lock_timeout_seconds,
-        )
-        self._by_name = {work.task.name: work for work in works}
-        self._waiting = deque(works)
+    def __init__(self, states: list[_TaskState], engine: Engine, policy: ExecutionPolicy, listener: TaskListener):
+        self.states, self._engine, self._policy, self._listener = states, engine, policy, listener
+        self._max_concurrent = policy.max_concurrent
+        self._by_name = {state.task.name: state for state in states}
+        self._waiting = deque(states)
         self._stopping = False
-        for work in works:
-            self._adopt(work)
+        for state in states:
+            if (attempt := engine.find_running(state.task)) is not None:
+                self._waiting.remove(state)
+                state.attempt, state.resumed, state.attempts = attempt, True, 1
 
     @property
     def _running(self) -> list[_TaskState]:
-        return [work for work in self.works if work.attempt is not None]
+        return [state for state in self.states if state.attempt is not None]
 
     def step(self, signals: Sequence[int]) -> bool:
-        """Judge what ended, pass on what was `asked` (signals), start what there is room for. True when all ended."""
+        """Judge what ended, pass on the signals that came, start what there is room for. True when all ended."""
         if self._running:
             self._engine.refresh()
-        for work in self._running:
-            self._poll(work)
+        for state in self._running:
+            self._poll(state)
         if signals:
             self._stop(kill=signal.SIGINT in signals[1:])
         self._start_ready()
@@ -130,179 +126,171 @@ class _TaskScheduler:
 
     def abandon(self) -> None:
         """Leave no process behind when this one fails itself."""
-        for work in self._running:
-            work.ask_to_stop()
-        end = time.monotonic() + GRACE_SECONDS
         left = self._running
+        for state in left:
+            state.request_stop()
+        end = time.monotonic() + GRACE_SECONDS
         while left and time.monotonic() < end:
             self._engine.refresh()
-            left = [work for work in left if work.attempt is not None and work.attempt.poll() is None]
+            left = [state for state in left if state.attempt is not None and state.attempt.poll() is None]
             time.sleep(GRACE_POLL_SECONDS if left else 0)
-        for work in left:
-            assert work.attempt is not None
-            work.attempt.kill()
+        for state in left:
+            assert state.attempt is not None
+            state.attempt.kill()
 
-    def _adopt(self, work: _TaskState) -> None:
-        """Watch what an earlier driver began, if it still goes on."""
-        attempt = self._engine.find_running(work.task)
-        if attempt is not None:
-            self._waiting.remove(work)
-            work.attempt, work.found, work.attempts = attempt, True, 1
-
-    def _poll(self, work: _TaskState) -> None:
-        assert work.attempt is not None
-        end = work.attempt.poll()
-        self._report_start(work)
+    def _poll(self, state: _TaskState) -> None:
+        assert state.attempt is not None
+        end = state.attempt.poll()
+        self._report_start(state)
         if end is not None:
-            work.attempt = None
-            self._judge(work, end)
+            state.attempt = None
+            self._judge(state, end)
 
-    def _report_start(self, work: _TaskState) -> None:
-        """Pass on that an attempt has found a place, or lost it again."""
-        assert work.attempt is not None
-        begun = work.attempt.start_info
-        if begun is not None and not work.told:
-            work.told, work.began, work.output_from = True, time.monotonic(), begun.output_from
-            if begun.where:
-                self._listener.on_placed(work.task, begun.where, work.found)
-            self._listener.on_started(work.task, work.attempts)
-        elif begun is None and work.told:
-            work.told = False
-            self._listener.on_paused(work.task, "")
+    def _report_start(self, state: _TaskState) -> None:
+        """Report that an attempt has found a place, or lost it again."""
+        assert state.attempt is not None
+        info = state.attempt.start_info
+        if info is not None and not state.started:
+            state.started, state.start_time, state.output_from = True, time.monotonic(), info.output_from
+            if info.where:
+                self._listener.on_placed(state.task, info.where, state.resumed)
+            self._listener.on_started(state.task, state.attempts)
+        elif info is None and state.started:
+            state.started = False
+            self._listener.on_paused(state.task, "")
 
     def _start_ready(self) -> None:
         ready = list[_TaskState]()
-        for work in list(self._waiting):
-            before = self._by_name.get(work.task.after) if work.task.after is not None else None
-            end = before.outcome if before is not None else None
-            room = len(self._running) + len(ready) < self._at_once
+        for state in list(self._waiting):
+            before = self._by_name.get(state.task.after) if state.task.after is not None else None
+            end = before.result if before is not None else None
+            has_room = len(self._running) + len(ready) < self._max_concurrent
             if end is not None and end.state != "done":
-                self._waiting.remove(work)
+                self._waiting.remove(state)
                 self._start(ready)
-                self._end(work, end.state, f"{end.name} {end.state}: {end.reason}")
-            elif room and (before is None or end is not None) and not self._is_locked_elsewhere(work):
-                self._waiting.remove(work)
-                ready.append(work)
+                self._end(state, end.state, f"{end.name} {end.state}: {end.reason}")
+            elif has_room and (before is None or end is not None) and not self._is_locked_elsewhere(state):
+                self._waiting.remove(state)
+                ready.append(state)
         self._start(ready)
 
     def _start(self, ready: list[_TaskState]) -> None:
         """Begin an attempt at each; the list is empty then."""
-        works = list(ready)
+        states = list(ready)
         ready.clear()
-        for work in works:
-            work.attempts += 1
-            work.told = work.found = work.asked_to_stop = False
-        attempts = self._engine.start([(work.task, work.attempts) for work in works]) if works else ()
-        for work, attempt in zip(works, attempts, strict=True):
+        for state in states:
+            state.attempts += 1
+            state.started = state.resumed = state.stop_requested = False
+        attempts = self._engine.start([(state.task, state.attempts) for state in states]) if states else ()
+        for state, attempt in zip(states, attempts, strict=True):
             if isinstance(attempt, OSError):
-                self._end(work, "failed", _start_error_text(work.task, attempt))
+                self._end(state, "failed", _start_error_text(state.task, attempt))
             else:
-                work.attempt = attempt
-                self._report_start(work)
+                state.attempt = attempt
+                self._report_start(state)
 
-    def _is_locked_elsewhere(self, work: _TaskState) -> bool:
-        """Another process still works on the task, and patience is not at an end (then the task says so itself)."""
-        if work.task.folder is None or not StageFolder(work.task.folder).is_locked_elsewhere():
+    def _is_locked_elsewhere(self, state: _TaskState) -> bool:
+        """Another process works on the task, and the time to wait for it is not over (then the task itself fails)."""
+        if state.task.folder is None or not StageFolder(state.task.folder).is_locked_elsewhere():
             return False
-        if work.held_since is None:
-            work.held_since = time.monotonic()
-            self._listener.on_waiting(work.task)
-        return time.monotonic() - work.held_since < self._patience
+        if state.locked_since is None:
+            state.locked_since = time.monotonic()
+            self._listener.on_waiting(state.task)
+        return time.monotonic() - state.locked_since < self._policy.lock_timeout_seconds
 
     def _stop(self, kill: bool) -> None:
         if not self._stopping:
             self._stopping = True
             while self._waiting:
                 self._end(self._waiting.popleft(), "stopped", "not started")
-            if begun := [work.task for work in self._running if work.told]:
-                self._listener.on_stopping(begun)
-        for work in self._running:
-            work.ask_to_stop()
-            if kill and work.attempt is not None:
-                work.attempt.kill()
+            if started := [state.task for state in self._running if state.started]:
+                self._listener.on_stopping(started)
+        for state in self._running:
+            state.request_stop()
+            if kill and state.attempt is not None:
+                state.attempt.kill()
 
-    def _judge(self, work: _TaskState, end: AttemptResult) -> None:
-        code, why = end.code, error_message(work.task.output, work.output_from) if work.told else ""
+    def _judge(self, state: _TaskState, end: AttemptResult) -> None:
+        code, why = end.code, error_message(state.task.output, state.output_from) if state.started else ""
         if code == EXIT_DONE:
-            self._end(work, "done")
-        elif self._stopping and not work.told:
-            work.attempts -= 1
-            self._end(work, "stopped", "not started")
+            self._end(state, "done")
+        elif self._stopping and not state.started:
+            state.attempts -= 1
+            self._end(state, "stopped", "not started")
         elif end.out_of_time and not self._stopping:
-            self._out_of_time(work, why)
+            self._out_of_time(state, why)
         elif code == EXIT_STOPPED:
-            self._end(work, "stopped", why if work.asked_to_stop else f"stopped by someone else. {why}".strip())
+            self._end(state, "stopped", why if state.stop_requested else f"stopped by someone else. {why}".strip())
         elif code in EXIT_EXPLAINED:
-            self._end(work, "failed", why or _silent_failure_text(work.task, _end_text(end)))
+            self._end(state, "failed", why or _silent_failure_text(state.task, _end_text(end)))
         elif self._stopping:
-            self._end(work, "stopped", f"ended by {_end_text(end)}; continues from its last checkpoint")
+            self._end(state, "stopped", f"ended by {_end_text(end)}; continues from its last checkpoint")
         else:
-            self._crashed(work, end, why)
+            self._crashed(state, end, why)
 
-    def _out_of_time(self, work: _TaskState, why: str) -> None:
-        """It saved and goes on in its next turn; no attempt is lost as long as it gets further from turn to turn."""
-        progress = stage_iteration(work.task.folder)
-        if progress > work.progress:
-            work.progress, work.attempts = progress, work.attempts - 1
-            self._listener.on_paused(work.task, why)
-            self._waiting.append(work)
+    def _out_of_time(self, state: _TaskState, why: str) -> None:
+        """It saved and goes on in its next turn; no attempt is lost as long as each turn gets further."""
+        progress = stage_iteration(state.task.folder)
+        if progress > state.progress:
+            state.progress, state.attempts = progress, state.attempts - 1
+            self._listener.on_paused(state.task, why)
+            self._waiting.append(state)
         else:
-            self._crashed(work, AttemptResult(None, "its time limit, before it got any further"), why)
+            self._crashed(state, AttemptResult(None, "its time limit, before it got any further"), why)
 
-    def _crashed(self, work: _TaskState, end: AttemptResult, why: str) -> None:
-        how = _end_text(end)
+    def _crashed(self, state: _TaskState, end: AttemptResult, why: str) -> None:
+        how, retries = _end_text(end), self._policy.retries
         if end.out_of_memory:
-            how += f" (out of memory; {self._after_memory_kill(work)})"
-        work.held_since = None
-        if work.attempts > self._retries:
-            times = f"crashed {work.attempts} times, at last by {how}" if self._retries else f"crashed by {how}"
-            self._end(work, "failed", f"{times}. {why}".strip())
+            how += f" (out of memory; {self._after_memory_kill(state)})"
+        state.locked_since = None
+        if state.attempts > retries:
+            times = f"crashed {state.attempts} times, at last by {how}" if retries else f"crashed by {how}"
+            self._end(state, "failed", f"{times}. {why}".strip())
             return
-        self._listener.on_crashed(work.task, how, self._retries + 1 - work.attempts)
-        self._waiting.append(work)
+        self._listener.on_crashed(state.task, how, retries + 1 - state.attempts)
+        self._waiting.append(state)
 
-    def _after_memory_kill(self, work: _TaskState) -> str:
-        """Ask for more memory, where places are found by needs, else run fewer at once; what to say of it."""
-        most = self._engine.max_memory_bytes
-        if most is None:
-            self._at_once = max(1, self._at_once - 1)
-            return f"from now on at most {self._at_once} at once"
-        needs = work.task.resources
-        more = min(round(MEMORY_RETRY_FACTOR * needs.memory_bytes), max(most, needs.memory_bytes))
-        if more <= needs.memory_bytes:
-            return f"no node has more than the {data_size(needs.memory_bytes)} that it asked for"
-        work.task = replace(work.task, resources=replace(needs, memory_bytes=more))
-        return f"it asks for {data_size(more)} now"
+    def _after_memory_kill(self, state: _TaskState) -> str:
+        """Ask for more memory where tasks are placed by their resources, else run fewer at once; returns which."""
+        available = self._engine.max_memory_bytes
+        if available is None:
+            self._max_concurrent = max(1, self._max_concurrent - 1)
+            return f"from now on at most {self._max_concurrent} at once"
+        resources = state.task.resources
+        requested = resources.memory_bytes
+        increased = min(round(MEMORY_RETRY_FACTOR * requested), max(available, requested))
+        if increased <= requested:
+            return f"no node has more than the {data_size(requested)} that it asked for"
+        state.task = replace(state.task, resources=replace(resources, memory_bytes=increased))
+        return f"it asks for {data_size(increased)} now"
 
-    def _end(self, work: _TaskState, state: EndState, why: str = "") -> None:
-        seconds = time.monotonic() - work.began if work.attempts and work.began else 0.0
-        lines = tuple(tail_lines(work.task.output, work.output_from)) if state == "failed" and work.told else ()
-        work.outcome = TaskResult(
-            name=work.task.name, state=state, attempts=work.attempts, seconds=seconds, reason=why, last_lines=lines
+    def _end(self, state: _TaskState, end: EndState, reason: str = "") -> None:
+        task = state.task
+        seconds = time.monotonic() - state.start_time if state.attempts and state.start_time else 0.0
+        lines = tuple(tail_lines(task.output, state.output_from)) if end == "failed" and state.started else ()
+        state.result = TaskResult(
+            name=task.name, state=end, attempts=state.attempts, seconds=seconds, reason=reason, last_lines=lines
         )
-        self._listener.on_ended(work.task, work.outcome)
+        self._listener.on_ended(task, state.result)
 
 
 def stage_iteration(folder: Path | None) -> int:
-    """How many iterations the stage in a folder has told; 0 where it tells nothing."""
-    if folder is None:
-        return 0
+    """The iteration in the status file of a stage folder; 0 where there is none."""
     try:
-        return StageFolder(folder).status().iteration or 0
+        return 0 if folder is None else StageFolder(folder).status().iteration or 0
     except (VdgsError, OSError):
         return 0
 
 
 def _end_text(end: AttemptResult) -> str:
-    code = end.code
-    if code is None:
+    if end.code is None:
         return end.reason
-    if code >= 0:
-        return f"exit code {code}"
+    if end.code >= 0:
+        return f"exit code {end.code}"
     try:
-        return signal.Signals(-code).name
+        return signal.Signals(-end.code).name
     except ValueError:
-        return f"signal {-code}"
+        return f"signal {-end.code}"
 
 
 def _start_error_text(task: Task, error: OSError) -> str:
@@ -313,7 +301,7 @@ def _start_error_text(task: Task, error: OSError) -> str:
 
 
 def _silent_failure_text(task: Task, end: str) -> str:
-    """What to say of a task that failed and printed nothing."""
+    """The reason of a failure without a message."""
     folder = task.output.parent
     with suppress(OSError):
         if shutil.disk_usage(folder).free < DISK_FULL_BYTES:

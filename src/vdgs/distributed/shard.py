@@ -1,4 +1,4 @@
-"""One shard of a job, done by this process (`run_shard` is its entry point)."""
+"""One shard of a job, done by this process (`python -m vdgs.distributed.run_shard`)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from vdgs.system.atomic_files import read_json
 from vdgs.system.memory.process_memory import peak_memory_bytes
 from vdgs.system.stop_signals import check_stop_requested
 
-#: What does a shard, by the word that stands in the request: nothing that a file names is called but these.
+#: The workers that a request may name: nothing else that a file names is called.
 WORKERS = {
     "block": "vdgs.pipeline.train_block:train_shard",
     "scores": "vdgs.pipeline.partition_stage:score_shard",
@@ -28,7 +28,7 @@ WORKERS = {
     "tiles": "vdgs.rendering.ortho.tile_shards:draw_shard",
     "baking": "vdgs.export.bake_shard:bake_shard",
 }
-#: Seconds between two notes of how far a shard is.
+#: Seconds between two updates of the status of a shard.
 STATUS_SECONDS = 1.0
 
 Request = TypeVar("Request")
@@ -38,18 +38,18 @@ Results = Generator[Callable[[Path], None], None, None]
 
 @dataclass(frozen=True)
 class Shard:
-    """A shard that this process is to do, and what it is given for that."""
+    """A shard that this process is to do, and its resources."""
 
     folder: Path
     """Of the job."""
     index: int
     device: str
     image_gb: float
-    """Memory for photographs."""
+    """Memory for images."""
     console: Console
 
     def request(self, kind: type[Request]) -> Request:
-        """What is asked for. Raises RunError where that is missing or damaged."""
+        """The request of the job. Raises RunError where it is missing or damaged."""
         file = self.folder / REQUEST
         try:
             return from_dict(kind, read_json(file)["request"], "")  # type: ignore[no-any-return]
@@ -57,9 +57,9 @@ class Shard:
             raise RunError(f"{file}: is damaged ({error}). Run the command that sends out the shards again.") from error
 
     def do(self, job: ShardedJob, results: Callable[[Sequence[int]], Results]) -> None:
-        """Do the items that are left of this shard; nothing if it is done. `results` computes those that it is given.
+        """Do the items that are left of this shard; nothing if it is done. `results` computes the items it is given.
 
-        Raises RunError where the run has changed, so that its job is another now, and for a shard that there is not.
+        Raises RunError where the run has changed, so that its job is another now, and for an index out of range.
         """
         if job.folder != self.folder:
             raise RunError(
@@ -74,19 +74,18 @@ class Shard:
             return
         left = [item for item in span if not job.file(item).exists()]
         done = len(span) - len(left)
-        with shard_session(folder, done, len(span)) as tell, closing(results(left)) as writers:
-            for item in left:
+        with shard_session(folder, done, len(span)) as on_progress, closing(results(left)) as writers:
+            for count, item in enumerate(left, done + 1):
                 check_stop_requested()
                 next(writers)(job.file(item))
-                done += 1
-                tell(done)
+                on_progress(count)
 
 
 def run_shard(shard: Shard) -> None:
-    """Let its worker do a shard. Raises RunError where nothing says what to do, and what the worker raises."""
+    """Let its worker do a shard. Raises RunError where the request names none, and what the worker raises."""
     file = shard.folder / REQUEST
-    written = read_json(file)
-    worker = WORKERS.get(str(written.get("worker"))) if isinstance(written, dict) else None
+    request = read_json(file)
+    worker = WORKERS.get(str(request.get("worker"))) if isinstance(request, dict) else None
     if worker is None:
         raise RunError(f"{file}: names no worker of this vdgs ({', '.join(WORKERS)}). Is it of another version?")
     module, _, name = worker.partition(":")
@@ -95,38 +94,38 @@ def run_shard(shard: Shard) -> None:
 
 @contextmanager
 def shard_session(folder: StageFolder, done: int, total: int) -> Iterator[Callable[[int], None]]:
-    """Hold the folder of a shard and note there how far it is: to be told how many of its items are done.
+    """Lock the folder of a shard and keep its status file there; yields a function that takes the number of items done.
 
-    Raises Stopped after Ctrl-C or SIGTERM, and whatever is raised within; both are noted.
+    Raises Stopped after Ctrl-C or SIGTERM, and whatever is raised within; both are written to the status file.
     """
-    began, noted = time.monotonic(), 0.0
-    before = done
+    start, done_before, last_update = time.monotonic(), done, 0.0
 
-    def status(state: str, why: str | None = None) -> StatusRecord:
-        taken = time.monotonic() - began
-        left = round((total - done) * taken / (done - before)) if done > before else None
-        return StatusRecord(
-            state=state, reason=why, iteration=done, iterations=total, seconds=taken, seconds_left=left,
+    def set_status(state: str, reason: str | None = None) -> None:
+        seconds = time.monotonic() - start
+        left = round((total - done) * seconds / (done - done_before)) if done > done_before else None
+        status = StatusRecord(
+            state=state, reason=reason, iteration=done, iterations=total, seconds=seconds, seconds_left=left,
             peak_memory_bytes=peak_memory_bytes(),
         )  # fmt: skip
+        folder.set_status(status)
 
-    def tell(now: int) -> None:
-        nonlocal done, noted
+    def on_progress(now: int) -> None:
+        nonlocal done, last_update
         done = now
-        if time.monotonic() - noted > STATUS_SECONDS:
-            noted = time.monotonic()
-            folder.set_status(status("running"))
+        if time.monotonic() - last_update > STATUS_SECONDS:
+            last_update = time.monotonic()
+            set_status("running")
 
     with folder.locked():
-        tell(done)
+        on_progress(done)
         try:
-            yield tell
+            yield on_progress
         except (KeyboardInterrupt, Interrupted) as error:
-            folder.set_status(status("stopped"))
+            set_status("stopped")
             raise Stopped(
                 f"Stopped after {done} of {total}; what is done is saved. The same command continues."
             ) from error
         except VdgsError as error:
-            folder.set_status(status("failed", str(error)))
+            set_status("failed", str(error))
             raise
-        folder.set_status(status("done"))
+        set_status("done")

@@ -17,7 +17,7 @@ MAX_VALUE = 1e12
 
 @dataclass(frozen=True, kw_only=True)
 class ProgressStats:
-    """What a status file says; None where it says nothing that can be used."""
+    """The figures of a status file; None where one is missing or damaged."""
 
     iteration: int | None = None
     iterations: int | None = None
@@ -51,11 +51,7 @@ def read_progress_stats(status_file: Path) -> ProgressStats | None:
 def _number(value: Any) -> float | None:
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
-    try:
-        number = float(value)
-    except OverflowError:
-        return None
-    return number if 0 <= number <= MAX_VALUE else None
+    return float(value) if 0 <= value <= MAX_VALUE else None
 
 
 def _count(value: Any) -> int | None:
@@ -64,7 +60,7 @@ def _count(value: Any) -> int | None:
 
 
 class ShardProgress:
-    """What is known of a shard while the others run."""
+    """How far a shard is while the others run."""
 
     def __init__(self, index: int):
         self.index = index
@@ -86,7 +82,7 @@ class ShardProgress:
             self._readings.append((now, stats.iteration))
 
     def restart(self) -> None:
-        """A new attempt begins: earlier readings say nothing of its speed."""
+        """A new attempt begins, with a speed of its own."""
         self.state, self.attempts = "running", self.attempts + 1
         self._readings.clear()
 
@@ -101,18 +97,18 @@ class ShardProgress:
     @property
     def seconds_left(self) -> float | None:
         """What the shard says itself, else what follows from its speed; None where neither is known."""
-        if self.stats.seconds_left is not None:
-            return self.stats.seconds_left
-        iteration, iterations, speed = self.stats.iteration, self.stats.iterations, self.speed
-        if iteration is None or iterations is None or not speed:
+        stats, speed = self.stats, self.speed
+        if stats.seconds_left is not None:
+            return stats.seconds_left
+        if stats.iteration is None or stats.iterations is None or not speed:
             return None
-        return max(iterations - iteration, 0) / speed
+        return max(stats.iterations - stats.iteration, 0) / speed
 
 
 def seconds_left_overall(rows: list[ShardProgress], at_once: int) -> float | None:
     """Estimated time until all shards are done; None before anything is known (complexity: one pass).
 
-    Those that wait are taken to be as fast, and where they say nothing as long, as those that ran.
+    Those that wait are taken to be as fast as those that ran, and as long where they do not say it.
     """
     speeds = [row.speed for row in rows if row.speed]
     lengths = [row.stats.iterations for row in rows if row.stats.iterations]

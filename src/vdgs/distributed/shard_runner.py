@@ -1,4 +1,4 @@
-"""Pieces of work as tasks of an executor: what their status files say while they run, shown live; how they ended."""
+"""The shards of a job as tasks of an executor: their status files are shown live, and how they ended."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from vdgs.system.units import clock
 
 
 @dataclass(frozen=True)
-class Shard:
-    """A command that does one piece of work, such as training a block: it continues after an interruption, and does
-    nothing once it is done."""
+class ShardCommand:
+    """A command that does one shard, such as training a block: it continues after an interruption, and does nothing
+    once it is done."""
 
     index: int
     folder: StageFolder
@@ -45,110 +45,101 @@ class Shard:
         )
 
 
-def default_jobs(shards: int, cores: int, memory_available: int, memory_each: int) -> tuple[int, int]:
-    """How many pieces to do at once on the CPU, and with how many threads each (choice).
-
-    As many as there are cores and memory (bytes) for, at least one: separate ones use cores better than the threads of
-    one. The cores left over are shared out.
-    """
-    fit = memory_available // memory_each if memory_each > 0 else shards
-    jobs = max(1, min(shards, cores, fit))
-    return jobs, max(1, cores // jobs)
-
-
-def run_shards(shards: Sequence[Shard], executor: Executor, console: Console) -> list[TaskResult]:
-    """Run the command of every piece, with a live table; the outcomes in their order. One that fails stops no other."""
-    rows = [ShardProgress(piece.index) for piece in shards]
-    for piece, row in zip(shards, rows, strict=True):
-        row.observe(read_progress_stats(piece.folder.status_file), time.monotonic())
-    kind = shards[0].labels if shards else BLOCK_LABELS
-    with ProgressTable(console, rows, executor.max_concurrent, kind) as board:
-        outcomes = executor.run([piece.task() for piece in shards], _ProgressListener(shards, rows, board))
-    _print_summary(shards, kind, outcomes, console)
-    return outcomes
+def run_shards(shards: Sequence[ShardCommand], executor: Executor, console: Console) -> list[TaskResult]:
+    """Run every shard, with a live table; the results in their order. One that fails stops no other."""
+    rows = [ShardProgress(shard.index) for shard in shards]
+    for shard, row in zip(shards, rows, strict=True):
+        row.observe(read_progress_stats(shard.folder.status_file), time.monotonic())
+    labels = shards[0].labels if shards else BLOCK_LABELS
+    with ProgressTable(console, rows, executor.max_concurrent, labels) as table:
+        results = executor.run([shard.task() for shard in shards], _ProgressListener(shards, rows, table))
+    _print_summary(shards, labels, results, console)
+    return results
 
 
 class _ProgressListener(LogListener):
     """Keeps the rows of the table as status files say."""
 
-    def __init__(self, pieces: Sequence[Shard], rows: Sequence[ShardProgress], board: ProgressTable):
-        super().__init__(board.print_line)
-        self._board = board
-        self._pairs = {piece.name: (piece, row) for piece, row in zip(pieces, rows, strict=True)}
-        #: On which machine, in words, where it is not this one.
+    def __init__(self, shards: Sequence[ShardCommand], rows: Sequence[ShardProgress], table: ProgressTable):
+        super().__init__(table.print_line)
+        self._table = table
+        self._shards = {shard.name: (shard, row) for shard, row in zip(shards, rows, strict=True)}
+        #: On which machine each runs, in words, where it is not this one.
         self._where = dict[str, str]()
 
-    def placed(self, task: Task, where: str, found: bool) -> None:
+    def on_placed(self, task: Task, where: str, resumed: bool) -> None:
         self._where[task.name] = f" on {where}"
-        if found:
+        if resumed:
             self.print_line(f"{task.name}: is still at work on {where}, and is watched again", "")
 
-    def started(self, task: Task, attempt: int) -> None:
-        self._pairs[task.name][1].restart()
-        self._board.note(f"{task.name}: started{self._where.get(task.name, '')}{_attempt_text(attempt)}")
+    def on_started(self, task: Task, attempt: int) -> None:
+        self._shards[task.name][1].restart()
+        self._table.note(f"{task.name}: started{self._where.get(task.name, '')}{_attempt_text(attempt)}")
 
-    def paused(self, task: Task, why: str) -> None:
-        super().paused(task, why)
+    def on_paused(self, task: Task, why: str) -> None:
+        super().on_paused(task, why)
+        self._requeue(task)
+
+    def on_crashed(self, task: Task, how: str, attempts_left: int) -> None:
+        super().on_crashed(task, how, attempts_left)
+        self._requeue(task)
+
+    def on_ended(self, task: Task, result: TaskResult) -> None:
+        shard, row = self._shards[task.name]
         self._observe(task.name)
-        self._pairs[task.name][1].state = "queued"
+        row.state, row.attempts = result.state, result.attempts
+        if result.state == "failed":
+            self.print_line(f"{task.name}: failed", STATE_STYLES[result.state])
+            self.print_line("\n".join(f"  {line}" for line in result.last_lines or result.reason.splitlines()), "")
+        elif result.attempts:
+            took = f"{clock(result.seconds)}{_attempt_text(result.attempts)}"
+            self._table.note(f"{task.name}: {result.state} after {took}")
+        if result.attempts and result.state != "done":
+            _record_end(shard.folder, result)
 
-    def crashed(self, task: Task, how: str, attempts_left: int) -> None:
-        super().crashed(task, how, attempts_left)
-        self._observe(task.name)
-        self._pairs[task.name][1].state = "queued"
-
-    def ended(self, task: Task, outcome: TaskResult) -> None:
-        piece, row = self._pairs[task.name]
-        self._observe(task.name)
-        row.state, row.attempts = outcome.state, outcome.attempts
-        if outcome.state == "failed":
-            self.print_line(f"{task.name}: failed", STATE_STYLES[outcome.state])
-            self.print_line("\n".join(f"  {line}" for line in outcome.last_lines or outcome.reason.splitlines()), "")
-        elif outcome.attempts:
-            took = f"{clock(outcome.seconds)}{_attempt_text(outcome.attempts)}"
-            self._board.note(f"{task.name}: {outcome.state} after {took}")
-        if outcome.attempts and outcome.state != "done":
-            _record_end(piece.folder, outcome)
-
-    def tick(self) -> None:
-        for name in self._pairs:
+    def on_tick(self) -> None:
+        for name in self._shards:
             self._observe(name)
-        self._board.show()
+        self._table.show()
+
+    def _requeue(self, task: Task) -> None:
+        self._observe(task.name)
+        self._shards[task.name][1].state = "queued"
 
     def _observe(self, name: str) -> None:
-        piece, row = self._pairs[name]
+        shard, row = self._shards[name]
         if row.state == "running":
-            row.observe(read_progress_stats(piece.folder.status_file), time.monotonic())
+            row.observe(read_progress_stats(shard.folder.status_file), time.monotonic())
 
 
 def _attempt_text(number: int) -> str:
     return f" (attempt {number})" if number > 1 else ""
 
 
-def _record_end(folder: StageFolder, outcome: TaskResult) -> None:
-    """Let no status file say "running" of a piece that is not: a process that was killed could not write it itself."""
+def _record_end(folder: StageFolder, result: TaskResult) -> None:
+    """Let no status file say "running" of a shard that is not: a process that was killed could not write it itself."""
     # Not if another process has taken over, nor if the file is damaged.
     with suppress(VdgsError, OSError, ValueError), folder.locked():
         status = folder.status()
-        if status.state not in (outcome.state, "done"):
-            folder.set_status(replace(status, state=outcome.state, reason=outcome.reason))
+        if status.state not in (result.state, "done"):
+            folder.set_status(replace(status, state=result.state, reason=result.reason))
 
 
-def _print_summary(shards: Sequence[Shard], labels: JobLabels, outcomes: list[TaskResult], console: Console) -> None:
-    def say(text: str, style: str = "") -> None:
+def _print_summary(
+    shards: Sequence[ShardCommand], labels: JobLabels, results: list[TaskResult], console: Console
+) -> None:
+    def print_line(text: str, style: str = "") -> None:
         console.print(text, style=style, highlight=False, markup=False)
 
-    unfinished = [(piece, outcome) for piece, outcome in zip(shards, outcomes, strict=True) if outcome.state != "done"]
-    say(f"{len(shards) - len(unfinished)} of {len(shards)} {labels.plural} done")
-    for piece, outcome in unfinished:
-        if outcome.attempts:
-            say(
-                f"{piece.name} {outcome.state}" + (f": {outcome.reason}" if outcome.reason else ""),
-                STATE_STYLES[outcome.state],
-            )
-        if outcome.state == "failed" and piece.output.is_file():
-            say(f"  all of its output: {piece.output}")
-    if waited := [piece.name for piece, outcome in unfinished if not outcome.attempts]:
-        say(f"not started: {', '.join(waited)}", STATE_STYLES["stopped"])
+    unfinished = [(shard, result) for shard, result in zip(shards, results, strict=True) if result.state != "done"]
+    print_line(f"{len(shards) - len(unfinished)} of {len(shards)} {labels.plural} done")
+    for shard, result in unfinished:
+        if result.attempts:
+            reason = f": {result.reason}" if result.reason else ""
+            print_line(f"{shard.name} {result.state}{reason}", STATE_STYLES[result.state])
+        if result.state == "failed" and shard.output.is_file():
+            print_line(f"  all of its output: {shard.output}")
+    if not_started := [shard.name for shard, result in unfinished if not result.attempts]:
+        print_line(f"not started: {', '.join(not_started)}", STATE_STYLES["stopped"])
     if unfinished:
-        say(f"The same command continues these {labels.plural} and leaves those that are done.")
+        print_line(f"The same command continues these {labels.plural} and leaves those that are done.")

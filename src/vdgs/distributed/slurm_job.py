@@ -1,8 +1,8 @@
 """What a job of SLURM runs: one task of those that a driver submitted together, watched in the driver's place.
 
-    python -m vdgs.distributed.slurm_job FOLDER     (with SLURM's variables of the element)
+    python -m vdgs.distributed.slurm_job FOLDER     (with SLURM's variables of the job)
 
-FOLDER/tasks.json says what element n is to do; FOLDER/n.json says how that went. SIGUSR1, which SLURM sends some time
+FOLDER/tasks.json holds the task of job n of the array, FOLDER/n.json how it went. SIGUSR1, which SLURM sends some time
 before the limit, lets the task save; the job is then put back into the queue, so that it goes on without a driver.
 """
 
@@ -12,7 +12,7 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from vdgs.system.documents import JsonObject
 
 @dataclass(frozen=True, kw_only=True)
 class SlurmTaskRecord:
-    """How far an element is, in FOLDER/n.json."""
+    """How far a job is, in FOLDER/n.json."""
 
     node: str
     output_from: int
@@ -44,14 +44,10 @@ class SlurmTaskRecord:
     """How far the task was when its time was up: see `requeue`."""
 
 
-def record_file(folder: Path, index: int) -> Path:
-    return folder / f"{index}.json"
-
-
 def read_task_record(folder: Path, index: int) -> SlurmTaskRecord | None:
-    """What an element says of itself; None before it began, or while it is written."""
+    """The record of a job; None before it began, or while it is written."""
     try:
-        return SlurmTaskRecord(**read_json(record_file(folder, index)))
+        return SlurmTaskRecord(**read_json(folder / f"{index}.json"))
     except Exception:  # no such file, or not a whole one yet: asked again soon
         return None
 
@@ -59,62 +55,56 @@ def read_task_record(folder: Path, index: int) -> SlurmTaskRecord | None:
 def main(arguments: list[str]) -> int:
     """Do the task; its exit code."""
     folder, variables = Path(arguments[0]), os.environ
-    element = ArrayTaskId(variables["SLURM_ARRAY_JOB_ID"], int(variables["SLURM_ARRAY_TASK_ID"]))
+    task_id = ArrayTaskId(variables["SLURM_ARRAY_JOB_ID"], int(variables["SLURM_ARRAY_TASK_ID"]))
     turn = int(variables.get("SLURM_RESTART_COUNT", 0))
-    written = read_json(folder / "tasks.json")
-    task, before = written["tasks"][str(element.index)], read_task_record(folder, element.index)
-    answer = check_node(written["question"])
-    tell = _record_updater(
-        record_file(folder, element.index),
-        SlurmTaskRecord(node=socket.gethostname(), output_from=_size(task["output"]), turn=turn),
-    )
+    content = read_json(folder / "tasks.json")
+    task, before = content["tasks"][str(task_id.index)], read_task_record(folder, task_id.index)
+    answer = check_node(content["question"])
+    record = SlurmTaskRecord(node=socket.gethostname(), output_from=_size(task["output"]), turn=turn)
+    update = _record_updater(folder / f"{task_id.index}.json", record)
     if answer["problems"]:
-        tell(code=EXIT_EXPLAINED[0], unfit=answer["problems"][0])
+        update(code=EXIT_EXPLAINED[0], unfit=answer["problems"][0])
         return EXIT_EXPLAINED[0]
-    kills = oom_kill_count()
+    oom_kills = oom_kill_count()
     process = TaskProcess(task["command"], Path(task["output"]), task["environment"], task["attempt"] + turn)
-    asked = _forward_signals(process)
-    tell(output_from=process.output_offset)
+    signals = _forward_signals(process)
+    update(output_from=process.output_offset)
     code = process.wait()
-    if code != EXIT_STOPPED or asked != [signal.SIGUSR1]:
-        tell(code=code, out_of_memory=code == -signal.SIGKILL and oom_kill_count() > kills)
+    if code != EXIT_STOPPED or signals != [signal.SIGUSR1]:
+        update(code=code, out_of_memory=code == -signal.SIGKILL and oom_kill_count() > oom_kills)
         return code if code >= 0 else 128 - code
-    progress = _task_progress(task)
-    tell(code=code, out_of_time=True, progress=progress)
+    from vdgs.distributed.scheduler import stage_iteration
+
+    progress = stage_iteration(None if task["folder"] is None else Path(task["folder"]))
+    update(code=code, out_of_time=True, progress=progress)
     if before is None or before.progress is None or progress > before.progress:
-        requeue(element)  # ends this process if it works; else the driver submits it again
+        requeue(task_id)  # ends this process if it works; else the driver submits it again
     return code
 
 
 def _forward_signals(process: TaskProcess) -> list[int]:
-    """Ask the process to save when this one is asked to; the signals that came, each once."""
-    asked = list[int]()
+    """Ask the process to save when this one is asked to; returns a list that fills with the signals, each once."""
+    received = list[int]()
 
-    def ask(number: int, _frame: object) -> None:
-        if number not in asked:
-            asked.append(number)
+    def forward(number: int, _frame: object) -> None:
+        if number not in received:
+            received.append(number)
         process.terminate()
 
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1):
-        signal.signal(number, ask)
-    return asked
+        signal.signal(number, forward)
+    return received
 
 
 def _record_updater(file: Path, record: SlurmTaskRecord) -> Callable[..., None]:
-    """A function that adds to the record of this element."""
-    known: JsonObject = asdict(record)
+    """A function that adds values to the record of this job."""
+    content: JsonObject = asdict(record)
 
-    def tell(**facts: Any) -> None:
-        known.update(facts)
-        write_json(file, known)
+    def update(**values: Any) -> None:
+        content.update(values)
+        write_json(file, content)
 
-    return tell
-
-
-def _task_progress(task: Mapping[str, Any]) -> int:
-    from vdgs.distributed.scheduler import stage_iteration
-
-    return stage_iteration(None if task["folder"] is None else Path(task["folder"]))
+    return update
 
 
 def _size(output: str) -> int:

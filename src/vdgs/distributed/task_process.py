@@ -13,16 +13,22 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-#: Environment variable with the process id of the driver; set for each task that a driver starts.
-PARENT_PID_VARIABLE = "VDGS_PARENT"
+from vdgs.distributed.executor import PARENT_PID_VARIABLE
+
+#: Bytes of output that are read, and lines that are shown.
+TAIL_BYTES, TAIL_LINES = 1 << 16, 12
+#: How the command line begins the message of an error (`system.exit_codes`).
+ERROR_PREFIX = re.compile(r"vdgs [\w-]+: ")
+#: Colors and cursor movements; other control characters.
+ANSI_ESCAPES = re.compile(r"\x1b\[[0-9;?]*[ -/]*[@-~]")
+CONTROL_CHARACTERS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 
 
 def stop_when_parent_dies(poll_seconds: float = 1.0) -> threading.Thread | None:
     """Send this process SIGTERM, once, when the driver that started it is gone. Returns the watching thread.
 
-    Does nothing (None) where no driver did. The variable is removed, so that processes which this one starts do not
-    take its parent for theirs. Polling is enough and, unlike PR_SET_PDEATHSIG, works on every POSIX system, needs no
-    code between fork and exec, and does not end the task with the driver's thread.
+    None where no driver did. The variable is removed: processes that this one starts have another parent. Polling,
+    unlike PR_SET_PDEATHSIG, works on every POSIX system and does not end the task with the driver's thread.
     """
     try:
         parent = int(os.environ.pop(PARENT_PID_VARIABLE, ""))
@@ -37,17 +43,6 @@ def _watch_parent(parent: int, poll_seconds: float) -> None:
     while os.getppid() == parent:  # an orphan is adopted by another process
         time.sleep(poll_seconds)
     os.kill(os.getpid(), signal.SIGTERM)
-
-
-#: Bytes of output that are looked at, and lines that are shown.
-TAIL_BYTES, TAIL_LINES = 1 << 16, 12
-#: How the command line begins the message of an error (cli.py).
-ERROR_PREFIX = re.compile(r"vdgs \w+: ")
-#: Colours and cursor movements; other control characters.
-ANSI_ESCAPES, CONTROL_CHARACTERS = (
-    re.compile(r"\x1b\[[0-9;?]*[ -/]*[@-~]"),
-    re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]"),
-)
 
 
 def tail_lines(output: Path, start: int = 0) -> list[str]:
@@ -68,9 +63,9 @@ def tail_lines(output: Path, start: int = 0) -> list[str]:
 def error_message(output: Path, start: int = 0) -> str:
     """The message that the command line ended with, else the last line; empty if there is no output."""
     lines = tail_lines(output, start)
-    for place in reversed(range(len(lines))):
-        if ERROR_PREFIX.match(lines[place]):
-            return "\n".join([ERROR_PREFIX.sub("", lines[place]), *lines[place + 1 :]])
+    for index in reversed(range(len(lines))):
+        if ERROR_PREFIX.match(lines[index]):
+            return "\n".join([ERROR_PREFIX.sub("", lines[index]), *lines[index + 1 :]])
     return lines[-1] if lines else ""
 
 
@@ -87,22 +82,13 @@ class TaskProcess:
             file.flush()
             #: Where the output of this attempt begins.
             self.output_offset = file.tell()
-            self._process = subprocess.Popen(
+            process = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT,
                 env={**os.environ, **variables}, start_new_session=True,
             )  # fmt: skip
-
-    def poll(self) -> int | None:
-        """The exit code; None while it runs."""
-        return self._process.poll()
-
-    def wait(self) -> int:
-        """Wait for the end; the exit code."""
-        return self._process.wait()
-
-    def terminate(self) -> None:
-        """Ask it to save and end."""
-        self._process.terminate()
+        self._process = process
+        #: The exit code, None while it runs; wait for the end; ask it to save and end.
+        self.poll, self.wait, self.terminate = process.poll, process.wait, process.terminate
 
     def kill(self) -> None:
         """End the process and whatever it started (its session's group)."""

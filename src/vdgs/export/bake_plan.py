@@ -69,7 +69,9 @@ class BakePlan:
         )
         steps, spans = _cut(len(training), [len(each) for each in planned], part_count(run.model))
         output = run.folder.path / BAKE_FOLDER
-        job = ShardedJob.of("baking", _request(run, request), output, SURVEY, _depends_on(run, request), spans, ".npy")
+        job = ShardedJob.create(
+            "baking", _request(run, request), output, SURVEY, _depends_on(run, request), spans, ".npy"
+        )
         return BakePlan(job, steps, training, planned)
 
     def steps_of_round(self, round_: int) -> list[BakeStep]:

@@ -49,7 +49,7 @@ def distributed_bake(
     Raises RunError where another process bakes the same, or shards of an earlier command are at work.
     """
     work = BakePlan.of(run, request)
-    with work.job.held():
+    with work.job.exclusive():
         yield DistributedBake(run, request, work, execution, console)
     _remove_if_empty(work.job.output)
 

@@ -159,7 +159,7 @@ def _plan(capture: Capture, method: MethodConfig, request: RunRequest) -> RunEst
     whole = estimate_memory(need).total
     photographs = decoded_image_bytes(cameras)
     work = ShardWorkload(
-        pieces=blocks,
+        shards=blocks,
         shard_bytes=each,
         jobs=request.jobs,
         image_gb=request.checkpointing.image_cache_gb,

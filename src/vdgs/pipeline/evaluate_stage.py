@@ -137,7 +137,7 @@ def _measure_in_shards(
     weights = None if asked.lpips_weights is None else Path(os.path.abspath(asked.lpips_weights))
     job = _job(run, found, replace(asked, path=run.path, which=found.name, lpips_weights=weights), len(views))
     files = [run.config_file, run.coarse.model, found.stage.model, *image_and_mask_files(views)]
-    with lock_folder(output), job.held():
+    with lock_folder(output), job.exclusive():
         _announce(found, len(views), asked.views, console)
         _delete_results(output)
         needs = ShardNeeds(_shard_bytes(run, found, asked, capture), lambda: NodeRequirements(job.folder, files))
@@ -155,7 +155,7 @@ def _job(run: RunFolder, found: ModelLocation, asked: EvaluationRequest, count: 
     if exposed := _exposed(run):
         depends_on.append(exposed)
     output = evaluation_folder(run, found.name, asked.views)
-    return ShardedJob.of("views", asked, output, VIEW_LABELS, depends_on, split_ranges(count, *VIEWS_OF_SHARD))
+    return ShardedJob.create("views", asked, output, VIEW_LABELS, depends_on, split_ranges(count, *VIEWS_OF_SHARD))
 
 
 def _shard_bytes(run: RunFolder, found: ModelLocation, asked: EvaluationRequest, capture: Capture) -> int:

@@ -215,7 +215,7 @@ def _job(run: RunFolder, cameras: int) -> ShardedJob:
     request = ScoreRequest(Path(os.path.abspath(run.path)))
     depends_on = [run.keys().assignment, run.coarse_model_id(), cameras]
     spans = split_ranges(-(-cameras // CAMERAS_PER_ITEM), *ITEMS_OF_SHARD)
-    return ShardedJob.of("scores", request, run.partition, CAMERA_LABELS, depends_on, spans)
+    return ShardedJob.create("scores", request, run.partition, CAMERA_LABELS, depends_on, spans)
 
 
 def _begun_cut(job: ShardedJob) -> tuple[Blocks, list[str]] | None:

@@ -85,7 +85,7 @@ def _settings(path: Path, text: str) -> RunSettings:
         return RunSettings.from_dict(settings)
     except (ValueError, TypeError) as error:
         raise RunError(
-            f"{path}: {error}. Write it as it was, or start a new --output: runs of another version do not go on."
+            f"{path}: {error}. Correct the file, or start a new --output: a run of another version cannot be continued."
         ) from error
 
 

@@ -8,14 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from vdgs.config.capture_options import CaptureOptions
-from vdgs.config.method import (
-    AssignmentConfig,
-    BlockConfig,
-    MergeConfig,
-    MethodConfig,
-    PartitionConfig,
-    TrainConfig,
-)
+from vdgs.config.method import AssignmentConfig, BlockConfig, MergeConfig, MethodConfig, PartitionConfig, TrainConfig
 from vdgs.config.ranges import iter_out_of_range
 from vdgs.config.serialization import from_dict, to_dict
 

@@ -121,7 +121,7 @@ class RunStatus:
             "merge": f"merge {run}", "coarse evaluation": f"eval {run} --model coarse", "evaluation": f"eval {run}",
             "report": f"report {run}",
         }  # fmt: skip
-        return f"vdgs {verbs.get(stage, f'train {run}')}"
+        return f"vdgs {verbs.get(stage, f'train-blocks {run}')}"
 
 
 def get_run_status(run: RunFolder, settings: RunSettings | None = None) -> RunStatus:

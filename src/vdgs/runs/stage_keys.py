@@ -23,7 +23,7 @@ STAGE_DEPENDENCIES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "merge": (("merge",), ("blocks",)),
 }
 #: Settings that do nothing without another.
-REQUIRED_SETTINGS: dict[tuple[str, ...], str] = {("training", "exposure_spread"): "exposure"}
+REQUIRED_SETTINGS: dict[tuple[str, ...], str] = {("training", "exposure_min_spread"): "exposure_compensation"}
 
 
 @dataclass(frozen=True, kw_only=True)

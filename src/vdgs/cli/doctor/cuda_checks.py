@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vdgs.cli.doctor.check import SystemCheck
+from vdgs.cli.doctor import SystemCheck
 from vdgs.kernels.cuda.compile_cache import CUDA_CACHE_ENV_VAR, cache_folder
 from vdgs.kernels.cuda.driver import CudaDriver, get_cuda_driver
 from vdgs.kernels.cuda.nvrtc import CudaUnavailable, Nvrtc, get_nvrtc

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 
-from vdgs.cli.doctor.check import SystemCheck
+from vdgs.cli.doctor import SystemCheck
 from vdgs.cli.doctor.system_checks import CHECKS
 
 

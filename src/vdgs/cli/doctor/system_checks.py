@@ -18,7 +18,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from vdgs.cli.doctor.check import SystemCheck
+from vdgs.cli.doctor import SystemCheck
 from vdgs.system.memory.cgroups import cgroup_limits
 from vdgs.system.units import data_size
 
@@ -146,7 +146,7 @@ def _torch() -> list[SystemCheck]:
 
 
 def _cuda() -> list[SystemCheck]:
-    checks: list[SystemCheck] = importlib.import_module("vdgs.cli.doctor.cuda_checks").looks()
+    checks: list[SystemCheck] = importlib.import_module("vdgs.cli.doctor.cuda_checks").cuda_checks()
     return checks
 
 
@@ -172,7 +172,7 @@ def _extras() -> list[SystemCheck]:
 def _lpips() -> list[SystemCheck]:
     """Both files of LPIPS, without reading half a gigabyte."""
     lpips = importlib.import_module("vdgs.evaluation.lpips")
-    heads, weights = lpips.find_heads(), lpips.cached_weights()
+    heads, weights = lpips.find_heads(), lpips.default_weights_path()
     if heads and weights.is_file():
         return [SystemCheck("LPIPS", "ok", f"VGG16 weights in {weights.parent}")]
     if heads:
@@ -188,21 +188,15 @@ def _video_encoding() -> list[SystemCheck]:
     import numpy as np
 
     video = importlib.import_module("vdgs.rendering.video")
-    encoder = video.best_encoder()
+    encoder = video.default_encoder()
     try:
-        with (
-            tempfile.TemporaryDirectory() as folder,
-            video.VideoWriter(Path(folder) / "test.mp4", 30.0) as film,
-        ):
+        with tempfile.TemporaryDirectory() as folder, video.VideoWriter(Path(folder) / "test.mp4", 30.0) as film:
             for level in (0, 128, 255):
                 film.write(np.full((64, 96, 3), level, np.uint8))
     except Exception as error:
         return [SystemCheck("film", "missing", f"{encoder}: {error}", "pip install imageio-ffmpeg")]
-    if video.warning(encoder) is not None:
-        return [
-            SystemCheck("film", "ok", video.CODECS[encoder], "pip install imageio-ffmpeg for H.264, which all play.")
-        ]
-    return [SystemCheck("film", "ok", video.CODECS[encoder])]
+    remedy = "" if video.caution(encoder) is None else "pip install imageio-ffmpeg for H.264, which all play."
+    return [SystemCheck("film", "ok", video.CODECS[encoder], remedy)]
 
 
 def _disk() -> list[SystemCheck]:
@@ -233,7 +227,7 @@ def _required() -> dict[str, list[str]]:
 def _checkout_requirements() -> list[str]:
     import tomllib
 
-    file = Path(__file__).parents[3] / "pyproject.toml"
+    file = Path(__file__).parents[4] / "pyproject.toml"
     if not file.is_file():
         return []
     project: dict[str, Any] = tomllib.loads(file.read_text(encoding="utf-8"))["project"]

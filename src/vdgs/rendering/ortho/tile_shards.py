@@ -62,7 +62,7 @@ def distributed_tiles(
         render_bytes(model.stage.model.stat().st_size, images.depths, side * side),
         lambda: NodeRequirements(job.folder, files),
     )
-    with job.held():
+    with job.exclusive():
         job.run(needs, replace(execution, image_gb=max(images.images, 1) / 1e9), console)
         yield job.gather(load_tile)
 
@@ -72,7 +72,7 @@ def _job(plan: OrthoPlan, request: OrthoRequest) -> ShardedJob:
     grid, how = list(astuple(plan.grid)), [plan.samples, plan.detail_from_images]
     depends_on = [plan.model, plan.model_digest, plan.placement.crs, grid, *how]
     spans = split_ranges(plan.grid.tile_count(), *TILES_OF_SHARD)
-    return ShardedJob.of("tiles", request, plan.folder, TILE_LABELS, depends_on, spans)
+    return ShardedJob.create("tiles", request, plan.folder, TILE_LABELS, depends_on, spans)
 
 
 def draw_shard(shard: Shard) -> None:

@@ -1,14 +1,31 @@
-"""The verb whose code is not in the package: `bench` lies in `experiments/` of a checkout."""
+"""The verbs about this machine (`doctor`) and about the experiments of a checkout (`bench`)."""
 
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
+from vdgs.cli.common import parse_arguments
 from vdgs.errors import VdgsError
 
 #: The root of the checkout, where the package is used from one.
 CHECKOUT = Path(__file__).parents[3]
+
+
+@dataclass(frozen=True)
+class DoctorArguments:
+    """Say what this machine can use, and what to install for the rest."""
+
+    json: bool = False
+    """Print JSON instead of a table."""
+
+
+def doctor_command(arguments: list[str]) -> int:
+    args = parse_arguments(DoctorArguments, arguments, "vdgs doctor")
+    from vdgs.cli.doctor.doctor_report import print_report
+
+    return print_report(as_json=args.json)
 
 
 def bench_command(arguments: list[str]) -> None:
