@@ -123,7 +123,7 @@ def problems(package: Path, layers: tuple[tuple[str, ...], ...] = LAYERS) -> lis
 
 def unlisted(package: Path, layers: tuple[tuple[str, ...], ...]) -> list[str]:
     """Rooms without a layer, and layers' rooms that are not there."""
-    there = {room_of(module) for module in modules_of(package)} - {"", "__main__"}
+    there = {room_of(module) for module in modules_of(package)} - {""}
     listed = [room for layer in layers for room in layer]
     return [
         *(f"{package.name}/{room}: belongs to no layer; add it to LAYERS" for room in sorted(there - {*listed})),

@@ -16,6 +16,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 from vdgs.errors import VdgsError
+from vdgs.kernels.thread_count import cpu_count as cpu_count
+from vdgs.kernels.thread_count import default_num_threads as default_num_threads
 
 if TYPE_CHECKING:
     import torch
@@ -46,21 +48,6 @@ def get_num_threads() -> int:
     from vdgs.kernels.cpu import extension
 
     return extension.get_num_threads()
-
-
-def cpu_count() -> int:
-    """The number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def default_num_threads() -> int:
-    """`VDGS_THREADS`, or the number of cores that this process may use. VdgsError for another value of the variable."""
-    text = os.environ.get("VDGS_THREADS")
-    if not text:
-        return cpu_count()
-    if not text.isdecimal() or int(text) < 1:
-        raise VdgsError(f"VDGS_THREADS must be a whole number from 1, not {text!r}.")
-    return int(text)
 
 
 def configure_threads(count: int | None = None) -> None:

@@ -13,7 +13,7 @@ from types import ModuleType
 from typing import Any
 
 from vdgs.errors import VdgsError
-from vdgs.kernels import default_num_threads
+from vdgs.kernels.thread_count import default_num_threads
 
 #: Every instruction set that the kernels are built for, best first.
 INSTRUCTION_SETS = ("avx512", "avx2", "portable")
