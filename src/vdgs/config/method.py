@@ -173,10 +173,10 @@ class TrainConfig:
     exposure_compensation: bool = False
     """Fit an affine colour model to each photograph, whose mean over all photographs is neutral. The scene is drawn in
     neutral colours, and compared with a test photograph in the exposure predicted from the training photographs taken
-    before and after it and from its metadata (no pixel of it is used). Blocks keep the coarse stage's models (choice)."""
+    before and after it and from its metadata (no pixel of it is used). Blocks keep the models (choice)."""
     exposure_min_spread: Annotated[float, Range(0, 1)] = 0.0
     """Fit exposures only where photographs of the same sparse points differ in brightness by at least this share
-    (choice: with one exposure, fitting gains nothing). At 0, and in a capture without tracks, they are always fitted."""
+    (choice: with one exposure, fitting gains nothing). At 0, and in a capture without tracks, always fitted."""
     compensation: CompensationConfig = field(default_factory=lambda: CompensationConfig(enabled=False))
     """Compensated growth already in this stage (choice: only blocks have it; the ablation without blocks needs it)."""
 

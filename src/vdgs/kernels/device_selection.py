@@ -1,7 +1,4 @@
-"""Which device computes: what `--device` asks for, and what there is.
-
-Decided before any work begins, and without torch: a device that cannot do all of it is refused at once.
-"""
+"""Which device computes, from `--device` and the hardware; decided before any work begins, without loading torch."""
 
 from __future__ import annotations
 
@@ -25,11 +22,8 @@ class SelectedDevice:
 
 
 def select_device(device: str) -> SelectedDevice:
-    """The device to use for `auto`, `cpu`, `cuda` or `cuda:i`.
-
-    `auto` takes a card only once everything has been run on one. Raises DeviceUnavailable for a card that is not there
-    or cannot be used, VdgsError for another word.
-    """
+    """The device for `auto`, `cpu`, `cuda` or `cuda:i`; `auto` takes a GPU only if GPU_VERIFIED. Raises
+    DeviceUnavailable for a GPU that is absent or cannot be used, VdgsError for another value."""
     named = re.fullmatch(r"auto|cpu|cuda(?::(\d+))?", device)
     if named is None:
         raise VdgsError(f"--device {device}: choose auto, cpu, cuda or cuda:0 (the number is that of the card)")
@@ -40,9 +34,8 @@ def select_device(device: str) -> SelectedDevice:
     index = int(named.group(1) or 0)
     reason = _no_card(index)
     if not reason:
-        return SelectedDevice(
-            f"cuda:{index}", "as asked for" if device != "auto" else "there is a card that can be used"
-        )
+        why = "there is a card that can be used" if device == "auto" else "as asked for"
+        return SelectedDevice(f"cuda:{index}", why)
     if device == "auto":
         return SelectedDevice("cpu", reason)
     raise DeviceUnavailable(f"--device {device}: {reason}. Use --device cpu, which does everything, or leave it out.")

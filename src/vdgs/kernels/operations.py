@@ -1,8 +1,4 @@
-"""The typed set of operations that every implementation offers, and who does which on which device.
-
-What each does is said where it is written most readably: in `vdgs.kernels.torch_ref`. Names and dimensions as in
-`vdgs.kernels`.
-"""
+"""The operations of every implementation, documented in `vdgs.kernels.torch_ref`, and their choice by device."""
 
 from __future__ import annotations
 
@@ -136,9 +132,8 @@ class KernelBackend(Protocol):
 #: The names of the operations: each implementation's `__init__` imports them under these.
 OPERATION_NAMES = tuple(sorted(name for name in vars(KernelBackend) if not name.startswith("_")))
 
-#: By which implementation (a folder of `vdgs.kernels`) each operation is done on an NVIDIA card: torch's own arithmetic
-#: (`torch_ref`), own kernels (`cuda`) or gsplat's. Of several the first that can be used; gsplat cannot tell median
-#: depth, so that pictures with depth are always drawn by the own kernels.
+#: The implementations (modules of `vdgs.kernels`) of each operation on an NVIDIA GPU; of several the first that can be
+#: used. gsplat has no median depth: images with depth are always drawn by `cuda`.
 GPU_BACKENDS: dict[str, tuple[str, ...]] = dict.fromkeys(OPERATION_NAMES, ("torch_ref",)) | {
     "add_view_statistics": ("cuda",),
     "cull": ("cuda",),

@@ -26,9 +26,9 @@ from vdgs.system.documents import CaptureMetadata
 from vdgs.system.tensors import REBUILD_HINT, read_tensors, tensors_crc32, write_tensors
 
 ANCHOR_MODEL_FORMAT = "vdgs-anchors-1"
-#: Of a model whose blocks have decoders of their own: a reader that knows of one decoder must not take it.
+#: Of a model whose blocks have decoders of their own, which readers of one decoder must refuse.
 MULTI_DECODER_FORMAT = "vdgs-anchors-2"
-#: Anchors whose numbers are looked at together.
+#: Anchors checked at once.
 CHECK_CHUNK = 1 << 16
 
 
@@ -42,7 +42,7 @@ class DecoderSpan:
 
 @dataclass(frozen=True, kw_only=True)
 class ModelMetadata:
-    """What travels with a model: where it comes from. None: not known, or nothing of this kind of model."""
+    """Where a model comes from; None: not known, or not of this kind of model."""
 
     capture: CaptureMetadata | None = None
     #: The version of vdgs that wrote it.
@@ -147,26 +147,25 @@ class AnchorModel:
         return model
 
     def check(self) -> None:
-        """Raise ValueError unless shapes and types agree with each other and all numbers are finite."""
+        """Raise ValueError unless shapes and dtypes agree and all numbers are finite."""
         n, k = len(self.anchors), self.anchors.offsets.shape[1] if self.anchors.offsets.ndim == 3 else 0
         shapes = {"positions": (n, 3), "features": (n, FEATURE_SIZE), "offsets": (n, k, 3), "log_scales": (n, 6)}
         for name, shape in shapes.items():
             tensor = getattr(self.anchors, name)
             if tuple(tensor.shape) != shape or tensor.dtype != torch.float32:
                 raise ValueError(f"{name} is {tensor.dtype} {tuple(tensor.shape)}, not float32 {shape}")
-            # Piece by piece: what is finite takes more memory to say than the numbers do.
-            if not all(bool(torch.isfinite(piece).all()) for piece in tensor.split(CHECK_CHUNK)):
+            # In chunks: `isfinite` of all takes more memory than the tensor.
+            if not all(bool(torch.isfinite(chunk).all()) for chunk in tensor.split(CHECK_CHUNK)):
                 raise ValueError(f"{name} holds numbers that are not finite")
         for _, decoder in self._decoders():
             decoder.check(k)
-        if self.decoder_spans and sum(part.count for part in self.decoder_spans) != n:
-            raise ValueError(f"its parts hold {sum(part.count for part in self.decoder_spans)} anchors, not {n}")
+        total = sum(span.count for span in self.decoder_spans)
+        if self.decoder_spans and total != n:
+            raise ValueError(f"its parts hold {total} anchors, not {n}")
 
     def _decoders(self) -> list[tuple[str, Decoder]]:
-        """Every decoder with what the names of its tensors begin with in a file."""
-        return [("decoder.", self.decoder)] + [
-            (f"part.{i}.", part.decoder) for i, part in enumerate(self.decoder_spans)
-        ]
+        """Every decoder with the prefix of its tensors in a file."""
+        return [("decoder.", self.decoder), *((f"part.{i}.", s.decoder) for i, s in enumerate(self.decoder_spans))]
 
 
 def _decoder_of(tensors: Mapping[str, Tensor], prefix: str) -> Decoder:

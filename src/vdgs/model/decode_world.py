@@ -1,6 +1,7 @@
-"""What anchors spawn in the world, as one camera sees them: the Gaussians that `kernels.decode` projects.
+"""The Gaussians of anchors in the world, as seen by one camera (Scaffold-GS eqs. 3-8, as in
+`kernels.torch_ref.decode`).
 
-Dimensions: v anchors, k offsets of each. Scaffold-GS eqs. 3-8, as in `kernels.reference.decode`.
+Dimensions: v anchors, k offsets of each.
 """
 
 from __future__ import annotations
@@ -41,10 +42,8 @@ def decode_world(
     k = anchors.offsets.shape[1]
     ray = anchors.positions[rows] - torch.as_tensor(camera.position).to(anchors.positions)
     distance = ray.norm(dim=1, keepdim=True)
-    if camera.model == "orthographic":
-        direction = torch.as_tensor(camera.forward).to(ray).expand_as(ray)
-    else:
-        direction = ray / distance
+    level = camera.model == "orthographic"
+    direction = torch.as_tensor(camera.forward).to(ray).expand_as(ray) if level else ray / distance
     inputs = torch.cat([anchors.features[rows], direction, distance], 1)
     covariance = weights.covariance.forward(inputs).unflatten(1, (k, 7))
     return DecodedGaussians(

@@ -29,7 +29,7 @@ class Decoder:
     #: One row per training image, and its map to the colour head's hidden layer; None without appearance.
     appearance_embedding: Float[Tensor, "images a"] | None = None
     appearance_weight: Float[Tensor, "32 a"] | None = None
-    #: What each training image's colours depart from the mean (`model.exposure`); None: all are taken as they are.
+    #: Departures of each training image's colours from the mean (`model.exposure`); None: no exposure is fitted.
     exposure: Float[Tensor, "images 3 4"] | None = None
 
     @staticmethod
@@ -92,16 +92,11 @@ class Decoder:
             raise ValueError(f"the decoder takes {inputs} inputs, not 35 or 36")
         for head, per_offset in HEADS.items():
             outputs = offsets * per_offset
-            expected = {
-                "w1": (HIDDEN_SIZE, inputs),
-                "b1": (HIDDEN_SIZE,),
-                "w2": (outputs, HIDDEN_SIZE),
-                "b2": (outputs,),
-            }
-            for part, shape in expected.items():
-                found = tuple(getattr(getattr(self.weights, head), part).shape)
-                if found != shape:
-                    raise ValueError(f"decoder {head}_{part} has shape {found}, not {shape}")
+            shapes = ((HIDDEN_SIZE, inputs), (HIDDEN_SIZE,), (outputs, HIDDEN_SIZE), (outputs,))
+            for part, expected in zip(HEAD_TENSORS, shapes, strict=True):
+                shape = tuple(getattr(getattr(self.weights, head), part).shape)
+                if shape != expected:
+                    raise ValueError(f"decoder {head}_{part} has shape {shape}, not {expected}")
         for name, tensor in self.tensors().items():
             if not bool(torch.isfinite(tensor).all()):
                 raise ValueError(f"decoder {name} holds numbers that are not finite")

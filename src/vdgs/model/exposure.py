@@ -1,11 +1,8 @@
-"""The exposure of each photograph: a small affine model of its colours, fitted while the scene is trained.
+"""The exposure of each photograph: an affine model of its colours, trained with the scene.
 
-Photographs of one flight differ in brightness and white balance. Without a model of that, the scene takes the mean
-where many look, and the exposure of the one or two photographs that show it where few do. A photograph's model departs
-from the mean of all: the mean itself is neutral by construction, and it is neutral colours that a scene is drawn in.
-
-Exposure drifts along a flight, so that of a photograph without a model follows from those taken just before and after
-it (`interpolate_exposure`). It is what test photographs are compared in.
+Photographs of one flight differ in brightness and white balance. A photograph's model is its departure from the mean of
+all, so that the mean is neutral, and the scene is drawn in neutral colours. Exposure drifts along a flight: that of a
+test photograph is interpolated from those taken just before and after it (`interpolate_exposure`).
 """
 
 from __future__ import annotations
@@ -22,7 +19,7 @@ MAX_FLIGHT_GAP = 8
 
 
 def zero_exposures(images: int) -> Float[Tensor, "images 3 4"]:
-    """Departures of so many photographs, none of which departs yet."""
+    """Departures of `images` photographs, all zero."""
     return torch.zeros(images, 3, 4)
 
 
@@ -32,8 +29,8 @@ def exposure_matrix(departures: Float[Tensor, "images 3 4"], image: int) -> Floa
 
 
 class FlightNeighbors(NamedTuple):
-    """The nearest photographs before and after a place of a flight, as rows (twice the same one at an end of the
-    flight), and how far from the first to the last the place lies, 0 to 1."""
+    """Rows of the nearest photographs before and after a position in a flight (the same one twice at an end), and the
+    position between them, 0 to 1."""
 
     first: int
     last: int
@@ -45,8 +42,8 @@ class FlightNeighbors(NamedTuple):
 
 
 def find_flight_neighbors(images: Mapping[int, int], place: int, include_self: bool = True) -> FlightNeighbors | None:
-    """Those of a place among the photographs of a flight: `images` are rows by their places in it. A photograph that
-    stands there is its own unless not `itself`. None if even the nearest is more than `MAX_FLIGHT_GAP` places away."""
+    """The neighbors of a position in a flight: `images` maps positions to rows. A photograph at `place` counts only
+    with `include_self`. None if the nearest is more than `MAX_FLIGHT_GAP` positions away."""
     others = images.keys() if include_self else images.keys() - {place}
     before = max((other for other in others if other <= place), default=None)
     after = min((other for other in others if other >= place), default=None)
@@ -60,12 +57,9 @@ def find_flight_neighbors(images: Mapping[int, int], place: int, include_self: b
 def interpolate_exposure(
     departures: Float[Tensor, "images 3 4"], images: Mapping[int, int], place: int
 ) -> Float[Tensor, "3 4"]:
-    """The colour model [A | b] of a photograph at a place of a flight, from those that have one: `images` are the rows
-    of `departures` that belong to the flight, by their places in it.
-
-    Linear between the nearest before and the nearest after it; at an end of the flight, that of the nearest; the own
-    one of a photograph that has one; neutral if even the nearest is more than `MAX_FLIGHT_GAP` places away.
-    """
+    """The colour model [A | b] at a position in a flight, linear between its neighbors; `images` maps positions to
+    rows of `departures`. That of the nearest at an end of the flight; neutral if none is within `MAX_FLIGHT_GAP`
+    positions."""
     near = find_flight_neighbors(images, place)
     if near is None:
         return _neutral(departures)

@@ -18,12 +18,9 @@ from torch import Tensor
 
 from vdgs.geometry.camera import Camera
 from vdgs.kernels import get_backend
-from vdgs.kernels.constants import ALPHA_MIN
 from vdgs.kernels.kernel_types import Raster, Splats
 from vdgs.kernels.spherical_harmonics import eval_sh_colors
-
-#: Beyond so many standard deviations not even an opaque Gaussian reaches the least alpha that is drawn.
-MAX_SIGMA = math.sqrt(-2 * math.log(ALPHA_MIN))
+from vdgs.model.scale_bounds import MAX_SIGMA
 
 
 @dataclass(frozen=True, kw_only=True)

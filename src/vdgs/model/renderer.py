@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import torch
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from vdgs.geometry.camera import Camera
 from vdgs.kernels import get_backend
-from vdgs.kernels.kernel_types import AnchorSplats, DecoderWeights, Raster, Splats, TrainingSplats
+from vdgs.kernels.kernel_types import SPLAT_TENSORS, AnchorSplats, DecoderWeights, Raster, Splats, TrainingSplats
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 
@@ -42,10 +42,8 @@ def cull_anchors(anchors: Anchors, camera: Camera) -> Int64[Tensor, " v"]:
 def decode_view(
     model: AnchorModel, camera: Camera, image_index: int | None = None
 ) -> tuple[Int64[Tensor, " v"], AnchorSplats]:
-    """The rows that may touch a view and what they look like, each anchor by its own decoder; `source` counts rows.
-
-    `image`: as in `render`.
-    """
+    """The rows that may touch a view and their splats, each anchor by its own decoder; `source` counts rows.
+    `image_index` as in `render`."""
     rows = cull_anchors(model.anchors, camera)
     spans = model.decoder_ranges()
     starts = rows.new_tensor([first for first, _, _ in spans] + [len(model.anchors)])
@@ -54,22 +52,15 @@ def decode_view(
         (first, last, decoder)
         for (first, last), (_, _, decoder) in zip(pairwise(bounds), spans, strict=True) if first < last
     ] or [(0, 0, model.decoder)]  # fmt: skip
-    pieces = [
+    parts = [
         (first, decode_anchors(model.anchors, rows[first:last], decoder.weights_for_image(image_index), camera))
         for first, last, decoder in shown
     ]
-    return rows, _joined(pieces, model.anchors.offsets.shape[1])
-
-
-def _joined(pieces: list[tuple[int, AnchorSplats]], k: int) -> AnchorSplats:
-    """Splats of consecutive rows as one, in order; each piece with the place of its first row."""
-    if len(pieces) == 1:
-        return pieces[0][1]
-    named = {
-        field.name: torch.cat([getattr(splats, field.name) for _, splats in pieces])
-        for field in fields(AnchorSplats) if field.name != "source"
-    }  # fmt: skip
-    return AnchorSplats(**named, source=torch.cat([splats.source + first * k for first, splats in pieces]))
+    if len(parts) == 1:
+        return rows, parts[0][1]
+    k, names = model.anchors.offsets.shape[1], (*SPLAT_TENSORS, "volumes")
+    named = {name: torch.cat([getattr(splats, name) for _, splats in parts]) for name in names}
+    return rows, AnchorSplats(**named, source=torch.cat([splats.source + first * k for first, splats in parts]))
 
 
 def rasterize_splats(splats: Splats, camera: Camera, background: Float[Tensor, "3"], depth: bool = False) -> Raster:
@@ -89,8 +80,7 @@ def render(
 ) -> Raster:
     """One view of a model: image [h, w, 3] (not clamped), alpha [h, w], expected and median depth [h, w] or None.
 
-    `background` replaces the model's own. `image` is the index of a training image whose appearance to use;
-    None takes the mean appearance.
+    `background` replaces the model's own. `image_index` selects the appearance of a training image; None: the mean.
     """
     _, splats = decode_view(model, camera, image_index)
     return rasterize_splats(splats, camera, splats.means_px.new_tensor(background or model.background), depth)
@@ -100,8 +90,7 @@ def render(
 def render_scalar(
     model: AnchorModel, values: Float[Tensor, " n"], camera: Camera
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-    """A value per anchor in place of its colour, on black: the sum of the values that a pixel shows, each by its part
-    of the pixel, and alpha, the sum of the parts."""
+    """A value per anchor blended in place of its colour, over 0, and alpha."""
     rows, splats = decode_view(model, camera)
     k = model.anchors.offsets.shape[1]
     of_splat = values.to(rows.device)[rows][splats.source.long() // k].float()
@@ -111,10 +100,7 @@ def render_scalar(
 
 
 def render_scalar_map(model: AnchorModel, values: Float[Tensor, " n"], camera: Camera) -> Float[Tensor, "h w"]:
-    """A value per anchor drawn as a map: the alpha-weighted mean at each pixel, NaN where nothing is drawn.
-
-    Used for visibility maps (V at each pixel).
-    """
+    """A value per anchor as a map: the alpha-weighted mean at each pixel, NaN where alpha is at most one half."""
     scale = float(values.max().clamp(min=1)) if len(values) else 1.0
     painted, alpha = render_scalar(model, values / scale, camera)
     value = painted / alpha.clamp(min=1e-6) * scale

@@ -20,12 +20,9 @@ if TYPE_CHECKING:
     import numpy as np
 
 
-def write_atomic(path: Path, write: Callable[[Path], None]) -> None:
-    """Let `write` fill a temporary file beside `path`, then rename it over `path`.
-
-    Raises VdgsError, with the file and the remedy, when the disk refuses (full, read-only, ...);
-    what stood at `path` before is then untouched.
-    """
+def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
+    """Let `write` fill a temporary file beside `path`, then rename it over `path`. Raises VdgsError, with file and
+    remedy, when the disk refuses (full, read-only, ...); `path` is then untouched."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -38,8 +35,8 @@ def write_atomic(path: Path, write: Callable[[Path], None]) -> None:
             temporary.unlink(missing_ok=True)
         why = getattr(error, "strerror", None) or error
         raise VdgsError(
-            f"{path}: cannot be written ({why}). {disk_hint(error)}, then run the same command again: it continues from "
-            "the last good state."
+            f"{path}: cannot be written ({why}). {disk_hint(error)}, then run the same command again: it continues "
+            "from the last good state."
         ) from error
     except BaseException:
         temporary.unlink(missing_ok=True)
@@ -47,11 +44,10 @@ def write_atomic(path: Path, write: Callable[[Path], None]) -> None:
 
 
 def disk_hint(error: BaseException) -> str:
-    """What to do about a file or folder that the system does not let us write: the beginning of a sentence."""
+    """What to do about a file or folder that cannot be written: the beginning of a sentence."""
     number = getattr(error, "errno", None)
-    if number is None:  # of safetensors: "I/O error: No space left on device (os error 28)"
-        found = re.search(r"os error (\d+)", str(error))
-        number = int(found[1]) if found else None
+    if number is None and (match := re.search(r"os error (\d+)", str(error))):  # of safetensors
+        number = int(match[1])
     if number in (errno.EACCES, errno.EPERM, errno.EROFS):
         return "Allow writing there (chmod u+w, or another mount) or choose another folder"
     if number in (errno.ENOTDIR, errno.EISDIR, errno.EEXIST):
@@ -65,11 +61,7 @@ def disk_hint(error: BaseException) -> str:
 
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file atomically."""
-
-    def write(temporary: Path) -> None:
-        temporary.write_bytes(content)
-
-    write_atomic(path, write)
+    write_atomic(path, lambda temporary: temporary.write_bytes(content))
 
 
 def write_array(path: Path, values: np.ndarray) -> None:
@@ -94,7 +86,7 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def to_jsonable(value: Any) -> Any:
-    """The value with numpy scalars as Python numbers and NaN or infinity as None: measurements that there are not."""
+    """The value with numpy scalars as Python numbers, and NaN or infinity as None."""
     if isinstance(value, Mapping):
         return {str(key): to_jsonable(each) for key, each in value.items()}
     if isinstance(value, (list, tuple)):
@@ -107,7 +99,7 @@ def to_jsonable(value: Any) -> Any:
 
 
 def read_json_or_empty(path: Path) -> dict[str, Any]:
-    """What a stage noted of itself in a JSON file; nothing if it is missing or damaged: it is then done again."""
+    """The object in a JSON file; empty if the file is missing or damaged (the stage then runs again)."""
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):

@@ -1,8 +1,7 @@
 """Checkpoints of a stage: whole or absent, checked when read, the last two kept.
 
-A state is `NNNNNNNN.safetensors` (tensors) and, written after it, `NNNNNNNN.json` (iteration, facts, size and
-CRC-32 of the tensors' file). A state counts only if its JSON is there and the CRC agrees, so that a cut-off or
-damaged write is noticed and the state before it is used.
+A checkpoint is `NNNNNNNN.safetensors` and, written after it, `NNNNNNNN.json` (iteration, metadata, size and CRC-32 of
+the tensors' file). One without its JSON, or with another CRC, is skipped for the one before it.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ def save_checkpoint(folder: Path, state: Checkpoint) -> None:
     """Write a state and remove all but the newest two. Raises VdgsError if the disk refuses."""
     path = state_file(folder, state.iteration)
     write_atomic(path, lambda temporary: write_tensors(temporary, state.tensors))
-    # Of what the disk has, not of what was meant: read again, from the system's cache.
+    # Of the file as read back, not of the tensors in memory.
     size, crc = file_size_and_crc32(path)
     sidecar = {"iteration": state.iteration, "bytes": size, "crc32": crc, "facts": dict(state.metadata)}
     write_json(path.with_suffix(".json"), sidecar)
@@ -74,14 +73,14 @@ def delete_checkpoints_after(folder: Path, iteration: int) -> None:
 
 
 def _read(sidecar: Path) -> Checkpoint:
-    facts = json.loads(sidecar.read_text(encoding="utf-8"))
+    record = json.loads(sidecar.read_text(encoding="utf-8"))
     path = sidecar.with_suffix(".safetensors")
     size, crc = file_size_and_crc32(path)
-    if size != facts["bytes"]:
-        raise ValueError(f"{size} bytes instead of {facts['bytes']}")
-    if crc != facts["crc32"]:
+    if size != record["bytes"]:
+        raise ValueError(f"{size} bytes instead of {record['bytes']}")
+    if crc != record["crc32"]:
         raise ValueError("its checksum does not agree")
-    return Checkpoint(int(facts["iteration"]), facts["facts"], read_tensors_unchecked(path))
+    return Checkpoint(int(record["iteration"]), record["facts"], read_tensors_unchecked(path))
 
 
 def remove_partial_files(folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""The JSON documents that several rooms read and write, as types: keys of older files may be missing."""
+"""Types of the JSON documents that several packages read and write; keys of older files may be missing."""
 
 from __future__ import annotations
 

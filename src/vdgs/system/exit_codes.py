@@ -9,10 +9,8 @@ from typing import Any
 
 
 def exit_code_of(name: str, action: Callable[[], Any], when_interrupted: str) -> int:
-    """Run an action to its end: 0 done (or what the action returns), 1 an error that was printed, 130 stopped.
-
-    `name` begins what is printed. What is no trouble of a person's is raised.
-    """
+    """Run an action: 0 (or its result) when done, 1 after a printed error, 130 when stopped. `name` begins the message.
+    Errors that a user cannot cause are raised."""
     from vdgs.errors import Interrupted, Stopped, VdgsError
     from vdgs.system.stop_signals import catch_stop_signals
 

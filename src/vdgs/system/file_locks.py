@@ -11,16 +11,13 @@ from pathlib import Path
 from vdgs.errors import RunError
 from vdgs.system.atomic_files import disk_hint
 
-#: A lock that is taken is tried so often, with so many seconds between: one who only looks (`is_locked`) holds it too,
-#: for a moment.
+#: Attempts to take a lock, and seconds between them: `is_locked` holds it too, for a moment.
 LOCK_ATTEMPTS, LOCK_SECONDS = 3, 0.02
 
 
 def is_locked(folder: Path) -> bool:
-    """Whether a process works on what is in a folder alone. Only looks: nothing is created.
-
-    OSError where the file system of the folder locks no files: for those who must know.
-    """
+    """Whether a process holds the exclusive lock of a folder. Creates nothing. Raises OSError where the file system has
+    no locks."""
     try:
         handle = (folder / ".lock").open("rb")
     except OSError:
@@ -34,23 +31,21 @@ def is_locked(folder: Path) -> bool:
 
 
 def is_known_locked(folder: Path) -> bool:
-    """As `is_locked`, for those who only show or read what is there: where no file can be locked, none is."""
+    """As `is_locked`, but False where the file system has no locks: for readers."""
     try:
         return is_locked(folder)
-    except OSError:  # Lustre without -o flock, some of FUSE: a finished run can be looked at there all the same
+    except OSError:  # Lustre without -o flock, some FUSE file systems
         return False
 
 
 @contextmanager
 def lock_folder(folder: Path, shared: bool = False) -> Iterator[None]:
-    """Hold a folder for this process, alone or `shared`; it is made if it is not there.
-
-    RunError if another process stands in the way, or the folder cannot be written.
-    """
+    """Hold the lock of a folder, exclusive or `shared`; the folder is created if missing. Raises RunError if another
+    process holds it, or the folder cannot be written."""
     kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        # For reading and writing: NFS wants the one for a shared lock and the other for one that is not.
+        # For reading and writing: NFS needs the one for shared locks and the other for exclusive ones.
         handle = (folder / ".lock").open("a+b")
     except OSError as error:
         raise RunError(f"{folder}: cannot be written ({error.strerror}). {disk_hint(error)}.") from error
@@ -61,9 +56,8 @@ def lock_folder(folder: Path, shared: bool = False) -> Iterator[None]:
                 break
             except BlockingIOError as error:
                 if attempt + 1 == LOCK_ATTEMPTS:
-                    raise RunError(
-                        f"{folder}: another vdgs process works on this run. Wait for it or stop it."
-                    ) from error
+                    problem = "another vdgs process works on this run. Wait for it or stop it."
+                    raise RunError(f"{folder}: {problem}") from error
                 time.sleep(LOCK_SECONDS)
             except OSError as error:
                 raise RunError(

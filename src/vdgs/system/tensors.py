@@ -1,11 +1,7 @@
-"""Tensors in and out of safetensors files without a second copy of them in memory.
+"""Safetensors files without a second copy of the tensors in memory, which the safetensors library makes.
 
-The library serialises all tensors into one piece of bytes first, and parses files from one: as much memory again as
-training holds for its anchors. Here one tensor at a time goes between its own memory and the file. The bytes written
-are those that `safetensors.torch.save_file` writes.
-
-The format: length of the header (8 bytes, little endian), the header (JSON, padded with spaces to a multiple of 8
-bytes), then the tensors, one behind the other.
+The bytes are those that `safetensors.torch.save_file` writes: length of the header (8 bytes, little endian), the header
+(JSON, padded with spaces to a multiple of 8 bytes), then the tensors one after the other.
 """
 
 from __future__ import annotations
@@ -28,7 +24,7 @@ DTYPES = {
     "BOOL": torch.bool,
 }  # fmt: skip
 _NAMES = {dtype: name for name, dtype in DTYPES.items()}
-_PIECE = 1 << 20
+_CHUNK = 1 << 20
 #: What to do about a model that cannot be used.
 REBUILD_HINT = "Delete it and run the command that trained it again: it is rebuilt from the last checkpoint."
 
@@ -36,7 +32,7 @@ REBUILD_HINT = "Delete it and run the command that trained it again: it is rebui
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> None:
     """Write tensors, with at most one extra copy of a tensor that is not contiguous.
 
-    Raises OSError if the disk refuses (what was written so far stays: see `files.write_atomically`), TypeError for a
+    Raises OSError if the disk refuses (what was written so far stays: see `write_atomic`), TypeError for a
     type outside DTYPES.
     """
     for name, tensor in tensors.items():
@@ -71,10 +67,8 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 
 def read_tensors_unchecked(path: Path) -> dict[str, Tensor]:
-    """All tensors of a file that `write_tensors` wrote, each read into memory of its own.
-
-    Meant for files whose checksum is known to agree: raises OSError, ValueError or KeyError for others.
-    """
+    """All tensors of a file that `write_tensors` wrote and whose checksum is known to agree; raises OSError, ValueError
+    or KeyError for others."""
     with path.open("rb") as file:
         entries = json.loads(file.read(int.from_bytes(file.read(8), "little")))
         entries.pop("__metadata__", None)
@@ -92,8 +86,8 @@ def file_size_and_crc32(path: Path) -> tuple[int, int]:
     """Bytes and CRC-32 of a file, read piece by piece: states are large."""
     size = crc = 0
     with path.open("rb") as file:
-        while piece := file.read(_PIECE):
-            size, crc = size + len(piece), zlib.crc32(piece, crc)
+        while chunk := file.read(_CHUNK):
+            size, crc = size + len(chunk), zlib.crc32(chunk, crc)
     return size, crc
 
 

@@ -1,12 +1,11 @@
-"""Compensated anchor growth: gradients of places that few cameras see are remembered and added (VDGS section IV-C).
+"""Compensated anchor growth: gradients of positions that few cameras see are cached and added (VDGS section IV-C).
 
-Dimensions: n anchors, k offsets. A growth cycle is what lies between two growth decisions. At its end, in this order:
+Dimensions: n anchors, k offsets. At the end of a growth cycle (between two growth decisions), `densify` calls:
 
-    low, threshold = low_visibility(share, config)                           # eq. 8's c_k -> the set L, eq. 9
+    low, threshold = low_visibility_mask(ratio, config)                      # eq. 8's c_k -> the set L, eq. 9
     update_cache(compensation, statistics, low, config)                      # g_k, eq. 10
-    change = compensate(compensation, low, threshold, growth, config)
-    decision = decide(..., compensated=change)                               # grows; resets what was judged
-    remap(state, ...)                                                        # with all that is kept per anchor
+    compensated = compensate(compensation, low, threshold, growth, config)
+    decide_densification(..., compensated=compensated)                       # grows; resets what was judged
     begin_cycle(compensation, statistics)                                    # the next cycle counts from here
 
 c_k belongs to the source anchor, hence L is a set of anchors; g_k belongs to the offset.
@@ -31,11 +30,8 @@ MIN_SCALED_DRAWS = 2.0
 
 @dataclass
 class CompensationState:
-    """What is remembered of each offset from cycle to cycle (float32).
-
-    Growth statistics carry over from cycle to cycle until they are judged. What they were when the cycle began is
-    kept beside them: the sums of the cycle alone are then a difference, and no step has more to count.
-    """
+    """The state of each offset that lasts over cycles (float32). The statistics at the begin of a cycle are kept, since
+    the statistics carry over until they are judged: the sums of a cycle are a difference."""
 
     #: The cache g_k, a gradient norm in NDC units.
     cache: Float[Tensor, "n k"]
@@ -54,11 +50,9 @@ class CompensationState:
 def low_visibility_mask(ratio: Float[Tensor, " n"], config: CompensationConfig) -> tuple[Bool[Tensor, " n"], float]:
     """The set L = {c_k < T_low} of anchors, and the T_low used.
 
-    `share` is c_k: the share in [0, 1] of the cycle's cameras whose frustum holds the anchor. With `t_low_quantile`
-    above 0, T_low is that quantile of the shares above 0. Cycles of few cameras have few different shares, and many
-    anchors may have just T_low: L then takes in all anchors up to that share at which it comes nearest to the quantile
-    of those seen (choice; the larger of two that are as near). It is empty where no anchor is seen, and where nearly
-    all that are seen have the least share.
+    `ratio` is c_k: the share in [0, 1] of the cycle's cameras whose frustum holds the anchor. With `t_low_quantile`
+    above 0, T_low is that quantile of the shares above 0. Where many anchors have a share of exactly T_low, L takes all
+    anchors up to the share at which its size is nearest to the quantile (choice; of two as near the larger).
     """
     if config.t_low_quantile <= 0:
         return ratio < config.t_low, config.t_low
@@ -133,12 +127,11 @@ def cycle_log(
     decision: DensificationDecision,
     config: CompensationConfig,
 ) -> dict[str, float | None]:
-    """JSON-able facts of one cycle for the log.
+    """Numbers of one cycle for the log.
 
-    `low_share`: share of the anchors that are of low visibility; `low_share_of_seen`: the same of those that a camera
-    of the cycle sees, 0 where ties leave nothing near the wished quantile; `t_low`: the threshold used; `mean_cache`,
-    `max_cache`: g over the offsets of L (null where L is empty); `grown_low`, `grown_other`: new anchors in cells with
-    a parent in L, and the others; `pruned`: anchors removed.
+    `low_share`: share of the anchors in L; `low_share_of_seen`: the same of those that a camera of the cycle sees;
+    `t_low`: the threshold used; `mean_cache`, `max_cache`: g over the offsets of L (null where L is empty);
+    `grown_low`, `grown_other`: new anchors in cells with a parent in L, and the others; `pruned`: anchors removed.
     """
     low, offsets = int(compensated.low.sum()), compensated.added.shape[1]
     seen = ratio > 0

@@ -1,7 +1,6 @@
-"""The part of each photograph that shows a block: what lies outside teaches the block little, so it is not drawn.
+"""The part of each photograph that shows a block, the only part that its training draws.
 
-The coarse model says what shows it: the block's anchors are painted white, all others black, and where the picture is
-not black they have a share in its pixels.
+The coarse model is rendered with the block's anchors white and all others black: pixels that are not black show it.
 """
 
 from __future__ import annotations
@@ -25,16 +24,14 @@ from vdgs.system.atomic_files import read_json, write_json
 CROP_RENDER_SIDE_PX = 320
 #: A pixel shows a block where the block's anchors have at least this share in it (choice).
 MIN_CONTRIBUTION = 0.1
-#: So much of what a photograph shows of a block may lie outside of each side of its part: single pixels seen through
-#: gaps would else open it wide (choice).
+#: Share of a block's pixels that may lie outside each side of a crop, so that single pixels do not widen it (choice).
 TAIL_FRACTION = 0.005
-#: The part is widened by this share of the photograph's longest side, on each side (choice). It also keeps off the
-#: block what SSIM sees at the border of a picture, where its windows of 11 pixels find nothing.
+#: A crop is widened by this share of the photograph's longest side, on each side (choice), which also keeps the border
+#: effects of SSIM's windows off the block.
 MARGIN = 0.04
 #: A part as large as this is the whole photograph: nothing would be saved.
 FULL_AREA_FRACTION = 0.9
-#: Every so many steps draw the whole photograph (choice): what a block lets stand beyond the parts no step would else
-#: see, and it would stand in the pictures of other blocks once all are merged.
+#: Every so many steps draw the whole photograph (choice): floaters outside the crops would otherwise remain.
 FULL_IMAGE_EVERY = 4
 #: Smaller parts make at most so many times more steps: a step costs something however little it draws (choice).
 MAX_STEP_FACTOR = 4.0
@@ -70,17 +67,10 @@ FULL_IMAGE = Crop(0.0, 0.0, 1.0, 1.0)
 
 
 def compute_crops(model: AnchorModel, own: Bool[Tensor, " n"], cameras: Sequence[Camera]) -> tuple[Crop, ...]:
-    """For each camera the part of its picture in which anchors `own` of the model have a share.
-
-    The whole picture where that is nearly all of it, and where it is nothing: what a camera was given for is then not
-    on the coarse model's surface.
-    """
-    return tuple(_crop(_own_share(model, own, camera)) for camera in cameras)
-
-
-def _own_share(model: AnchorModel, own: Bool[Tensor, " n"], camera: Camera) -> Float[np.ndarray, "h w"]:
-    """What share the anchors have in each pixel of a small picture."""
-    return render_scalar(model, own.float(), camera.limit_size(CROP_RENDER_SIDE_PX))[0].cpu().numpy()
+    """For each camera the part of its image that shows anchors `own` of the model; all of it where that is nearly all,
+    or nothing (the block then lies behind the coarse model's surface)."""
+    small = (camera.limit_size(CROP_RENDER_SIDE_PX) for camera in cameras)
+    return tuple(_crop(render_scalar(model, own.float(), camera)[0].cpu().numpy()) for camera in small)
 
 
 def _crop(share: Float[np.ndarray, "h w"]) -> Crop:

@@ -49,7 +49,7 @@ class CompensatedGradient:
 
 @dataclass(frozen=True)
 class DensificationDecision:
-    """What one growth step does to the anchors: first append `added`, then keep `kept` of all."""
+    """What one growth step does to the anchors: first append `added`, then keep `keep_mask` of the old ones."""
 
     added: Anchors
     keep_mask: Bool[Tensor, " n"]
@@ -93,9 +93,9 @@ def decide_densification(
 ) -> DensificationDecision:
     """One growth decision (Scaffold-GS eqs. 9-10 and its pruning; with `compensated`, VDGS section IV-C).
 
-    `surroundings` are positions of further anchors, which occupy cells but neither grow nor go; `may_hold` says which
-    cell centres may get an anchor (all, if not given). Random numbers belong to offsets, not to policies: the same
-    generator keeps the same offsets with compensation and without.
+    `frozen_positions` are further anchors that occupy cells; `growth_mask` says which cell centres may get an anchor.
+    Random numbers belong to offsets, not to policies: the same generator keeps the same offsets with compensation and
+    without.
 
     Resets, in place, the gradient statistics of the offsets that were judged and the opacity statistics of the
     anchors that were, as upstream does; the others keep counting.
@@ -186,11 +186,8 @@ def _fill_cells(
     max_new: int | None,
     growth_mask: GrowthMask | None,
 ) -> tuple[Anchors, int]:
-    """One anchor at the centre of each cell that holds a parent's Gaussian, no anchor yet, and may hold one.
-
-    Where `room` is short, the cells with the largest gradients are served first. Also says how many of the cells
-    have a parent in L.
-    """
+    """An anchor at the centre of each allowed cell that holds a parent's Gaussian and no anchor, at most `max_new` of
+    the largest gradients; and how many of the cells have a parent in L."""
     kernels, k = get_backend(anchors.positions.device), anchors.offsets.shape[1]
     rows = parents.index // k
     means = anchors.positions[rows] + anchors.offsets[rows, parents.index % k] * anchors.log_scales[rows, :3].exp()
@@ -205,12 +202,11 @@ def _fill_cells(
     if max_new is not None and int(chosen.sum()) > max_new:
         strongest = kernels.group_max(parents.gradient[:, None], group, len(cells))[:, 0]
         strongest[~chosen] = -1.0
-        chosen = torch.zeros_like(chosen).index_fill_(
-            0, strongest.argsort(descending=True, stable=True)[:max_new], True
-        )
+        best = strongest.argsort(descending=True, stable=True)[:max_new]
+        chosen = torch.zeros_like(chosen).index_fill_(0, best, True)
     served = chosen[group]
-    place = (chosen.cumsum(0) - 1)[group[served]]
-    return _anchors_at(kernels.cell_centers(cells[chosen], cell, origin), place, parents.select(served), anchors, cell)
+    index = (chosen.cumsum(0) - 1)[group[served]]
+    return _anchors_at(kernels.cell_centers(cells[chosen], cell, origin), index, parents.select(served), anchors, cell)
 
 
 def _anchors_at(
@@ -240,7 +236,5 @@ def _hold_any(
 
 
 def _within_lattice(points: Float[Tensor, "p 3"], cell: float) -> Bool[Tensor, " p"]:
-    """Which points have a cell: finite and within 2^20 cells of the origin (a key has 21 bits an axis).
-
-    What lies farther away than a million of the finest cells does not grow (choice)."""
+    """Which points have a cell: finite and within 2^20 cells of the origin (21 bits an axis); others do not grow."""
     return (points.abs() < (LATTICE_REACH - 2) * cell).all(1)

@@ -1,4 +1,4 @@
-"""Anchors that come and go between steps, with their moments, statistics and remembered gradients."""
+"""Adding, removing and sorting anchors between steps, with their moments, statistics and cached gradients."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from vdgs.visibility.visibility_counts import visibility_ratio
 
 
 class Growth(TypedDict):
-    """What a growth decision did, as `StepReport` says it."""
+    """Fields of `StepReport`: what a growth decision did."""
 
     grown: int
     pruned: int

@@ -19,13 +19,11 @@ SLACK_PX = 1.0
 
 
 def crop_to_gradient_support(stage: TrainingProblem, splats: Splats, camera: Camera, box: PixelBox) -> PixelBox:
-    """What is to be drawn of a box of a view, which `camera` shows, so that gradients of a stage's splats in it are the
-    same but for rounding. The means of the splats, in pixels of the box, become pixels of that, in place.
-
-    On a card the whole box is drawn: the host would wait for the card's answer.
-    """
-    around = stage.frozen_anchors
-    if around is None or not len(around.anchors) or stage.device.type != "cpu":
+    """The part of a box of a view, which `camera` shows, that gives the same gradients of a block's splats but for
+    rounding. The means of the splats are shifted to pixels of the part, in place. On a GPU the whole box: computing the
+    part would wait for the GPU."""
+    frozen = stage.frozen_anchors
+    if frozen is None or not len(frozen.anchors) or stage.device.type != "cpu":
         return box
     part = splat_roi(splats, camera)
     if part is None:
@@ -36,8 +34,7 @@ def crop_to_gradient_support(stage: TrainingProblem, splats: Splats, camera: Cam
 
 
 def splat_roi(splats: Splats, camera: Camera) -> PixelBox | None:
-    """The part of a picture that splats reach, with what the loss looks at beside it; None: all of it, nearly all, or
-    none."""
+    """The part of an image that splats reach, with the margin of the loss; None: all, nearly all, or nothing."""
     reached = splat_bounds(splats, camera.width, camera.height)
     if reached is None:
         return None

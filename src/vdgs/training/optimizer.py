@@ -24,10 +24,7 @@ class AdamMoments:
 
     @staticmethod
     def zeros(parameters: dict[str, Tensor]) -> AdamMoments:
-        return AdamMoments(
-            {name: torch.zeros_like(p) for name, p in parameters.items()},
-            {name: torch.zeros_like(p) for name, p in parameters.items()},
-        )
+        return AdamMoments(*({name: torch.zeros_like(p) for name, p in parameters.items()} for _ in range(2)))
 
 
 @dataclass
@@ -48,19 +45,15 @@ class AnchorOptimizer:
         return AnchorOptimizer(AdamMoments.zeros(trained), AdamMoments.zeros(decoder.tensors()), updates)
 
     def anchor_states(self, anchors: Anchors, rates: dict[str, float], lr_boost: float) -> list[AdamState]:
-        """What moves of the anchors, in the order of `TRAINED_TENSORS`; `early` as in `AdamState`."""
+        """The states of `TRAINED_TENSORS`, in that order; `lr_boost` as in `AdamState`."""
+        first, second = self.anchors.first, self.anchors.second
         return [
-            AdamState(
-                getattr(anchors, name), self.anchors.first[name], self.anchors.second[name], rates[name], lr_boost
-            )
+            AdamState(getattr(anchors, name), first[name], second[name], rates[name], lr_boost)
             for name in TRAINED_TENSORS
         ]
 
     def update_decoder(self, decoder: Decoder, rates: dict[str, float], step: int) -> IsFinite:
-        """Move the decoder's tensors by their `.grad`, in place; `step` counts from 1.
-
-        False: a gradient is not finite.
-        """
+        """Step the decoder's tensors by their `.grad`, in place; `step` counts from 1. False: one is not finite."""
         finite: IsFinite = True
         for name, tensor in decoder.tensors().items():
             if tensor.grad is not None:

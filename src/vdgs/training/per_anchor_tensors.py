@@ -1,8 +1,5 @@
-"""All that is kept per anchor comes, goes and changes places by one rule.
-
-Parameters, moments, statistics, remembered gradients and the mean of models have one row for each anchor. They are
-held in groups of named tensors; a group's new rows are given (parameters) or zero: an anchor without history.
-"""
+"""Adding, removing and permuting the rows of all tensors with one row per anchor: parameters, moments, statistics,
+cached gradients, mean of models. New rows of a group are given (parameters) or zero."""
 
 from __future__ import annotations
 
@@ -17,22 +14,20 @@ TensorGroup = dict[str, Tensor]
 
 
 class PerAnchorTensors(Protocol):
-    """What holds groups of tensors with one row for each anchor."""
+    """A state with groups of tensors that have one row per anchor."""
 
     def take_groups(self) -> dict[str, TensorGroup]:
-        """All groups by name, no longer held elsewhere: each tensor can be let go as it is replaced."""
-        ...
+        """All groups by name, no longer referenced by the state."""
 
     def put_groups(self, groups: dict[str, TensorGroup]) -> None:
         """The inverse of `take_groups`."""
-        ...
 
 
 def index_anchors(state: PerAnchorTensors, added: Mapping[str, TensorGroup], count: int, kept: Tensor) -> None:
     """Append `count` rows to everything that the state keeps per anchor, then keep the rows `kept` (mask or order).
 
-    `added` has the new rows of the groups that it names; those of the others are zero. Tensor by tensor: no more than
-    one is there twice.
+    `added` has the new rows of the groups that it names; those of the others are zero. At most one tensor at a time
+    exists twice.
     """
     groups = state.take_groups()
     for name, group in groups.items():

@@ -22,16 +22,25 @@ from vdgs.model.renderer import cull_anchors, decode_anchors_for_training
 from vdgs.model.scale_bounds import MAX_OFFSET_FACTOR
 from vdgs.training.densification_step import densify, sort_morton
 from vdgs.training.gradient_roi import crop_to_gradient_support
-from vdgs.training.objective import compute_loss
 from vdgs.training.optimizer import learning_rates_at
 from vdgs.training.schedule import downscale_at, view_at
 from vdgs.training.target import background_at, crop_box, crop_camera, make_target
 from vdgs.training.training_state import StepReport, TrainingProblem, TrainingState
-from vdgs.training.training_step import backward_and_step, render_for_training, step_unseen_anchors
+from vdgs.training.training_step import backward_and_step, compute_loss, render_for_training, step_unseen_anchors
 from vdgs.training.weight_averaging import ModelAverage, is_averaged_step
 
 #: How much of the value before is kept at each step.
 LOSS_DECAY, PSNR_DECAY = 0.98, 0.9
+
+
+#: Camera height above the ground to which volumes are referred, so that the volume term means the same in any unit.
+REFERENCE_HEIGHT = 10.0
+#: Every so many iterations anchors are put into Morton order, so that neighbours in space are neighbours in memory.
+SORT_INTERVAL = 1000
+#: Every so many iterations sizes are clamped to their bounds, and whenever a model is averaged or complete.
+BOUND_INTERVAL = 10
+#: Every so many iterations the PSNR of the training view is computed, for the log.
+PSNR_LOG_INTERVAL = 10
 
 
 def exponential_mean(before: float, value: float, decay: float) -> float:
@@ -46,16 +55,6 @@ def training_psnr(
     squared = (image.clamp(0, 1) - target.float() / 255.0) ** 2
     counted = squared if mask is None else squared[mask > 0]
     return -10.0 * math.log10(max(float(counted.mean()), 1e-10)) if counted.numel() else None
-
-
-#: Camera height above the ground to which volumes are referred, so that the volume term means the same in any unit.
-REFERENCE_HEIGHT = 10.0
-#: Every so many iterations anchors are put into Morton order, so that neighbours in space are neighbours in memory.
-SORT_INTERVAL = 1000
-#: Every so many iterations sizes are brought back below their bounds, and whenever a model is averaged or complete.
-BOUND_INTERVAL = 10
-#: Every so many iterations the PSNR of the training view is taken, for people.
-PSNR_LOG_INTERVAL = 10
 
 
 def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
@@ -75,26 +74,25 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
     with torch.no_grad():
         splats = decode_anchors_for_training(state.anchors, rows, weights, camera)
         target = make_target(stage, view, downscale, crop_to_gradient_support(stage, splats, camera, box))
-        around = _surroundings(stage, view, camera, target.camera)
-        drawn = render_for_training(splats, target.camera, background, around)
+        frozen = _frozen_splats(stage, view, camera, target.camera)
+        drawn = render_for_training(splats, target.camera, background, frozen)
     compared = compute_loss(drawn, target, state.decoder, image_index_at(stage, view), config)
     volume_weight, loss = _volume_weight(stage), compared.loss
     if volume_weight and len(drawn.source):
         loss = loss + volume_weight * drawn.volume
-    # Read at once: on a card, each number that is asked for waits for everything before it.
+    # Read at once: on a GPU each read waits for everything before it.
     value, l1, ssim = torch.stack([loss, compared.l1, compared.ssim]).tolist()
     if not math.isfinite(value):
         raise TrainingDiverged(f"The loss is {value} at iteration {iteration + 1}.")
     gradients = drawn.backward(compared.image, volume_weight)
-    psnr = (
-        training_psnr(compared.shown, target.image, target.mask) if (iteration + 1) % PSNR_LOG_INTERVAL == 0 else None
-    )
+    measured = (iteration + 1) % PSNR_LOG_INTERVAL == 0
+    psnr = training_psnr(compared.shown, target.image, target.mask) if measured else None
     state.is_consistent = False
     _move(state, stage, rows, gradients, weights, camera)
 
     growing = iteration + 1 <= config.densify.stop_fraction * config.iterations
     if growing and iteration + 1 > config.densify.stats_start:
-        # Seen is what V counts too: an anchor beside the picture may touch it, but is not to blame for showing nothing.
+        # Seen as V counts it: an anchor whose centre lies outside the image is not pruned for showing nothing there.
         kernels = get_backend(stage.device)
         inside = kernels.mark_visible(state.anchors.positions[rows], camera)
         kernels.add_view_statistics(
@@ -109,22 +107,24 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
     last, averaged = state.iteration == config.iterations, is_averaged_step(state.iteration, config)
     if state.iteration % BOUND_INTERVAL == 0 or averaged or last:
         _bound_sizes(state)
-    if averaged:
-        _average(state)
+    if averaged and state.model_average is not None:
+        state.model_average.add(state.anchors, state.decoder)
+    elif averaged:
+        state.model_average = ModelAverage.of(state.anchors, state.decoder)
     _smooth(state, value, psnr)
     state.is_consistent = True
     return report
 
 
 @torch.no_grad()
-def _surroundings(stage: TrainingProblem, view: int, camera: Camera, part: Camera) -> OrderedSplats | None:
-    """The splats in a part of a view of the frozen anchors around a block: drawn, but out of autograd's sight."""
-    around = stage.frozen_anchors
-    if around is None or not len(around.anchors):
+def _frozen_splats(stage: TrainingProblem, view: int, camera: Camera, part: Camera) -> OrderedSplats | None:
+    """The splats of the frozen anchors around a block in a part of a view, without autograd."""
+    frozen = stage.frozen_anchors
+    if frozen is None or not len(frozen.anchors):
         return None
-    weights = around.decoder.weights_for_image(image_index_at(stage, view))
-    # Of anchors that the whole view shows: one that strews its Gaussians may stand beside the part that they cover.
-    return decode_anchors_for_training(around.anchors, cull_anchors(around.anchors, camera), weights, part)
+    weights = frozen.decoder.weights_for_image(image_index_at(stage, view))
+    # Culled by the whole view: an anchor outside the part may have Gaussians in it.
+    return decode_anchors_for_training(frozen.anchors, cull_anchors(frozen.anchors, camera), weights, part)
 
 
 def image_index_at(stage: TrainingProblem, view: int) -> int:
@@ -163,23 +163,14 @@ def _move(
 
 @torch.no_grad()
 def _bound_sizes(state: TrainingState) -> None:
-    """Let no Gaussian be larger than pictures can show (the decoder only makes an anchor's scales smaller), nor an
-    anchor strew them: the unit of its offsets is bounded too."""
+    """Clamp the scales of Gaussians (the decoder only makes them smaller) and the unit of their offsets."""
     offsets, sizes = state.anchors.log_scales[:, :3], state.anchors.log_scales[:, 3:]
     torch.minimum(sizes, state.max_log_scale[:, None], out=sizes)
     torch.minimum(offsets, state.max_log_scale[:, None] + math.log(MAX_OFFSET_FACTOR), out=offsets)
 
 
-def _average(state: TrainingState) -> None:
-    """Count the model in the mean that the stage ends with."""
-    if state.model_average is None:
-        state.model_average = ModelAverage.of(state.anchors, state.decoder)
-    else:
-        state.model_average.add(state.anchors, state.decoder)
-
-
 def _smooth(state: TrainingState, loss: float, psnr: float | None) -> None:
-    """Update the smoothed loss and, where it was taken, PSNR (for people and for the divergence check)."""
+    """Update the smoothed loss and PSNR. Raises TrainingDiverged where the loss rose far above its minimum."""
     state.loss = exponential_mean(state.loss, loss, LOSS_DECAY)
     if psnr is not None:
         state.psnr = exponential_mean(state.psnr, psnr, PSNR_DECAY)
@@ -199,10 +190,7 @@ def train(
     after_step: Callable[[TrainingState, StepReport], None],
     prefetch: int = 4,
 ) -> bool:
-    """Steps until the stage is complete or `stop()` is true. True if complete.
-
-    `after_step` sees every step (progress, log, saving).
-    """
+    """Step until the stage is complete (True) or `stop()` is true; `after_step` is called after every step."""
     config = stage.config
     while state.iteration < config.iterations:
         if stop():
@@ -211,6 +199,5 @@ def train(
         for iteration in ahead:
             view = view_at(iteration, stage.num_images, config.seed, stage.view_weights)
             stage.images.prefetch([view], downscale_at(iteration, config))
-        report = train_step(state, stage)
-        after_step(state, report)
+        after_step(state, train_step(state, stage))
     return True

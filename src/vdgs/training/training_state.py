@@ -1,8 +1,5 @@
-"""What training works on (`TrainingProblem`, the same for all iterations) and what changes (`TrainingState`, explicit
-and whole).
-
-A state that is saved and loaded continues with the same bits.
-"""
+"""What training works on (`TrainingProblem`) and what changes (`TrainingState`, which is saved and loaded bit for
+bit)."""
 
 from __future__ import annotations
 
@@ -49,20 +46,20 @@ class TrainingState:
     decoder: Decoder
     statistics: DensificationStats
     optimizer: AnchorOptimizer
-    #: Largest log-scale that Gaussians of each anchor may have, [n] (`model.sizes`): anchors never move.
+    #: Largest log-scale that Gaussians of each anchor may have, [n] (`model.scale_bounds`): anchors never move.
     max_log_scale: Tensor
     #: Remembered gradients of compensated growth; None where growth is plain.
     compensation: CompensationState | None = None
-    #: Mean of the last models, once it has begun (`averaging.counts_in_mean`).
+    #: Mean of the last models, once it has begun (`is_averaged_step`).
     model_average: ModelAverage | None = None
-    #: Smoothed loss, the smallest it has been, smoothed PSNR: of what is drawn of training views.
+    #: Smoothed loss, its minimum, and smoothed PSNR of training views.
     loss: float = math.nan
     best_loss: float = math.inf
     psnr: float = math.nan
-    #: Time spent and largest memory used so far, over all processes that worked on this state.
+    #: Time spent and peak memory so far, over all processes that worked on this state.
     seconds: float = 0.0
     peak_memory_bytes: int = 0
-    #: False while a step changes tensors: one that is broken off there leaves no state that may be saved.
+    #: False while a step changes tensors: an interrupted step leaves no state that may be saved.
     is_consistent: bool = True
 
     def groups(self) -> dict[str, TensorGroup]:
@@ -80,7 +77,7 @@ class TrainingState:
         return groups
 
     def take_groups(self) -> dict[str, TensorGroup]:
-        """`groups`, which the state no longer holds: see `per_anchor.remap`."""
+        """`groups`, which the state no longer holds: see `index_anchors`."""
         groups = {name: dict(group) for name, group in self.groups().items()}
         self.put_groups({name: {key: t[:0] for key, t in group.items()} for name, group in groups.items()})
         return groups
@@ -100,28 +97,20 @@ class TrainingState:
         """What training has arrived at: the mean of the last models where there is one, else the last one."""
         if self.model_average is None:
             return self.anchors, self.decoder
-        return (
-            Anchors(self.anchors.positions, **self.model_average.anchors),
-            Decoder.from_tensors(self.model_average.decoder),
-        )
+        anchors = Anchors(self.anchors.positions, **self.model_average.anchors)
+        return anchors, Decoder.from_tensors(self.model_average.decoder)
 
     def model(
         self, voxel: float, background: tuple[float, float, float], metadata: ModelMetadata | None = None
     ) -> AnchorModel:
         """The model of `result`."""
-        anchors, decoder = self.result()
-        return AnchorModel(
-            anchors=anchors,
-            decoder=decoder,
-            voxel_size=voxel,
-            background=background,
-            metadata=metadata or ModelMetadata(),
-        )
+        (anchors, decoder), metadata = self.result(), metadata or ModelMetadata()
+        return AnchorModel(anchors=anchors, decoder=decoder, voxel_size=voxel, background=background, metadata=metadata)
 
 
 @dataclass(frozen=True)
 class FrozenAnchors:
-    """Anchors that stay as they are, with the decoder that they were trained with."""
+    """Anchors that do not train, with their decoder."""
 
     anchors: Anchors
     decoder: Decoder
@@ -135,7 +124,7 @@ class TrainingProblem:
     images: TrainingImages
     num_images: int
     voxel_size: float
-    #: How high the cameras fly above the ground, or how far they are from the scene (`captures.heights`), in units of
+    #: Height of the cameras above the ground, or their distance from the scene (`captures.camera_height`), in units of
     #: the ground frame.
     camera_height: float
     #: Whether the whole scene is trained or one block of it.
@@ -152,20 +141,20 @@ class TrainingProblem:
     growth_mask: Callable[[Tensor], Tensor] | None = None
     #: How far the anchors at places [p, 3] move, from 0 to 1 of a full step; None: all of it.
     lr_mask: Callable[[Tensor], Tensor] | None = None
-    #: Which training image of the whole capture each view is (for its appearance); None: the same number.
+    #: The training image of the whole capture that each view is (for its appearance); None: the same number.
     image_indices: Sequence[int] | None = None
     #: How often each view is used, in proportion; None: all alike.
     view_weights: tuple[float, ...] | None = None
-    #: The part of each view to be drawn, or of that what a block's splats reach (`training.reach`); None: all of all.
+    #: The part of each view that is drawn, further limited by `gradient_roi`; None: all of it.
     crops: tuple[Crop, ...] | None = None
     #: Where the arithmetic is done. Photographs and places come to it.
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
 
     def max_log_scale_at(self, positions: Tensor) -> Tensor:
         """The largest log-scale [p] of Gaussians of anchors at places [p, 3]."""
-        return (
-            torch.full_like(positions[:, 0], math.inf) if self.max_log_scale is None else self.max_log_scale(positions)
-        )
+        if self.max_log_scale is None:
+            return torch.full_like(positions[:, 0], math.inf)
+        return self.max_log_scale(positions)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,27 +176,23 @@ def initial_state(anchors: Anchors, decoder: Decoder, stage: TrainingProblem) ->
     """A state before the first step. The anchors' tensors are moved in place: give copies of what must stay."""
     n, k, device = len(anchors), anchors.offsets.shape[1], anchors.positions.device
     for name, tensor in decoder.tensors().items():
-        # A block sees some of the photographs: the mean appearance and exposure, in which others are drawn, must not
-        # drift apart.
+        # The mean appearance and exposure, in which other photographs are drawn, must stay the same in all blocks.
         shared = stage.kind == "block" and name.startswith(("appearance", "exposure"))
         tensor.requires_grad_(not stage.frozen_decoder and not shared)
     compensation = CompensationState.zeros(n, k, device) if stage.config.compensation.enabled else None
-    optimizer = AnchorOptimizer.zeros(anchors, decoder)
-    largest = stage.max_log_scale_at(anchors.positions)
-    statistics = DensificationStats.zeros(n, k, device)
     return TrainingState(
         iteration=0,
         anchors=anchors,
         decoder=decoder,
-        statistics=statistics,
-        optimizer=optimizer,
-        max_log_scale=largest,
+        statistics=DensificationStats.zeros(n, k, device),
+        optimizer=AnchorOptimizer.zeros(anchors, decoder),
+        max_log_scale=stage.max_log_scale_at(anchors.positions),
         compensation=compensation,
     )
 
 
 def to_checkpoint(state: TrainingState) -> Checkpoint:
-    """The whole state as tensors and facts."""
+    """The whole state as tensors and metadata."""
     groups: dict[str, Mapping[str, Tensor]] = {**state.groups()}
     groups["decoder"] = {name: tensor.detach() for name, tensor in state.decoder.tensors().items()}
     groups["first.decoder"] = state.optimizer.decoder.first
@@ -215,10 +200,10 @@ def to_checkpoint(state: TrainingState) -> Checkpoint:
     if state.model_average is not None:
         groups["average.decoder"] = state.model_average.decoder
     tensors = {f"{name}.{key}": tensor for name, group in groups.items() for key, tensor in group.items()}
-    facts = {"loss": repr(state.loss), "best_loss": repr(state.best_loss), "psnr": repr(state.psnr),
+    metadata = {"loss": repr(state.loss), "best_loss": repr(state.best_loss), "psnr": repr(state.psnr),
              "seconds": state.seconds, "peak_memory_bytes": state.peak_memory_bytes,
              "averaged": 0 if state.model_average is None else state.model_average.count}  # fmt: skip
-    return Checkpoint(state.iteration, facts, tensors)
+    return Checkpoint(state.iteration, metadata, tensors)
 
 
 def result_from_saved(saved: Checkpoint) -> tuple[Anchors, Decoder]:

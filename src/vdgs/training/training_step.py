@@ -1,8 +1,7 @@
-"""A training step by hand: a view drawn, and the backward pass from its image to the anchors.
+"""A training step without autograd between image and anchors: render a view, compute the loss, step backward.
 
-Autograd would hold a copy of the anchors in view and gradients beside all that they belong to. By hand, anchors are
-read where they stand, gradients of splats take the place of what is no longer needed, and an anchor moves as soon as
-its gradient is known. The bits are those of autograd through `decode` and `rasterize`, with Adam after it.
+Autograd would copy the anchors in view and hold their gradients. Here anchors are read in place, gradients of splats
+reuse memory, and an anchor moves as soon as its gradient is known. The bits are those of autograd followed by Adam.
 """
 
 from __future__ import annotations
@@ -15,6 +14,7 @@ import torch
 from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
+from vdgs.config.method import TrainConfig
 from vdgs.geometry.camera import Camera
 from vdgs.kernels import get_backend
 from vdgs.kernels.kernel_types import (
@@ -28,11 +28,14 @@ from vdgs.kernels.kernel_types import (
     TrainingSplats,
 )
 from vdgs.model.anchors import TRAINED_TENSORS, Anchors
+from vdgs.model.decoder import Decoder
+from vdgs.model.exposure import apply_exposure
+from vdgs.training.target import TrainingTarget
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RenderedTrainingView:
-    """A picture for training, and what the backward pass needs of the m splats of the anchors that are trained."""
+    """A rendered image, and what backward needs of the m splats of the trained anchors."""
 
     image: Float[Tensor, "h w 3"]
     source: SplatSources
@@ -46,13 +49,13 @@ class RenderedTrainingView:
 
     @torch.no_grad()
     def backward(self, image: Float[Tensor, "h w 3"], volume_weight: float) -> SplatGradients:
-        """Gradients of a loss: `image` by the picture, `volume_reg` by the mean volume. Call it once."""
+        """Gradients of a loss: `image` by the image, `volume_weight` by the mean volume. Call it once."""
         m = len(self.source)
-        found = self.pullback(image, None, None, out=self.scratch, count=m)
+        g = self.pullback(image, None, None, out=self.scratch, count=m)
         # In float32, as autograd divides.
         volume = float(torch.tensor(volume_weight) / m) if m else 0.0
         return SplatGradients(
-            means_px=found.means_px, conics=found.conics, colors=found.colors, opacities=found.opacities,
+            means_px=g.means_px, conics=g.conics, colors=g.colors, opacities=g.opacities,
             volume=volume, source=self.source, color_values=self.colors, opacity_values=self.opacities,
         )  # fmt: skip
 
@@ -61,8 +64,7 @@ class RenderedTrainingView:
 def render_for_training(
     splats: TrainingSplats, camera: Camera, background: Float[Tensor, "3"], frozen_splats: OrderedSplats | None = None
 ) -> RenderedTrainingView:
-    """Draw the splats of trained anchors with those `around` them. The tensors of `splats` are the view's from now on:
-    their memory is used again."""
+    """Draw the splats of trained anchors with `frozen_splats`. The returned view reuses the memory of `splats`."""
     m, drawn = len(splats.source), splats if frozen_splats is None else splats.concat(frozen_splats)
     kernels = get_backend(drawn.means_px.device)
     raster, pullback = kernels.rasterize_vjp(drawn, background, camera.width, camera.height)
@@ -70,6 +72,39 @@ def render_for_training(
         image=raster.image, source=splats.source, colors=splats.colors, opacities=splats.opacities,
         volume=splats.volume, pullback=pullback, scratch=(drawn.means_px[:m], drawn.conics[:m]),
     )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LossGradients:
+    """The loss of an image without the volume term, and its gradient by the image."""
+
+    loss: Float[Tensor, ""]
+    l1: Float[Tensor, ""]
+    ssim: Float[Tensor, ""]
+    #: The rendered image in the exposure of the photograph, where one is fitted.
+    shown: Float[Tensor, "h w 3"]
+    image: Float[Tensor, "h w 3"]
+
+
+def compute_loss(
+    rendered: RenderedTrainingView, target: TrainingTarget, decoder: Decoder, image_index: int, config: TrainConfig
+) -> LossGradients:
+    """Compare an image with its photograph, training image `image_index` of the capture. The gradient of a fitted
+    exposure is left in the decoder's `.grad`. Gradients are scaled to the whole photograph (`valid_fraction`)."""
+    image = rendered.image.requires_grad_(True)
+    exposure = decoder.exposure_for_image(image_index)
+    shown = image if exposure is None else apply_exposure(image, exposure)
+    kernels = get_backend(image.device)
+    photometric = kernels.photometric_loss(shown, target.image, target.mask, ssim_weight=config.loss.ssim_lambda)
+    loss = photometric.loss.detach()
+    fitted = [decoder.exposure] if decoder.exposure is not None and decoder.exposure.requires_grad else []
+    found = torch.autograd.grad(photometric.loss, [image, *fitted])
+    for tensor, gradient in zip(fitted, found[1:], strict=True):
+        tensor.grad = gradient
+    if target.valid_fraction != 1.0:
+        for each in found:
+            each.mul_(target.valid_fraction)
+    return LossGradients(loss=loss, l1=photometric.l1, ssim=photometric.ssim, shown=shown.detach(), image=found[0])
 
 
 def backward_and_step(
@@ -84,9 +119,8 @@ def backward_and_step(
 ) -> IsFinite:
     """Move the anchors of the given rows in place, and leave the decoder's gradients in its `.grad`.
 
-    `weights` are the decoder's as the view saw them, `states` those of `TRAINED_TENSORS`; `updates` counts how often
-    each anchor has moved; `lr_mask` is the learning-rate mask of `training.Stage`. False: a gradient is not finite, and
-    some anchors may have moved while others have not.
+    `weights` are the decoder's as the view saw them, `states` those of `TRAINED_TENSORS`, `updates` the count of steps
+    of each anchor, `lr_mask` that of `TrainingProblem`. False: a gradient is not finite; some anchors may have moved.
     """
     slow = None if lr_mask is None else _SlowAnchors.of(anchors, rows, lr_mask)
     finite, of_weights = get_backend(anchors.positions.device).decode_backward_adam(
@@ -113,7 +147,7 @@ class _Given(torch.autograd.Function):
         return None, *ctx.gradients
 
 
-#: Rows that coast at a time: so many gradients of zero are held.
+#: Rows stepped at once: bounds the memory for zero gradients.
 UNSEEN_CHUNK = 2**14
 
 
@@ -125,11 +159,8 @@ def step_unseen_anchors(
     step: int,
     lr_mask: Callable[[Tensor], Tensor] | None = None,
 ) -> None:
-    """Let every anchor but those of the given rows go on along its moments, in place: the step of Adam with no gradient
-    that anchors make where a view does not show them and Adam is dense (Scaffold-GS, 3DGS).
-
-    `states` and `lr_mask` as in `backward_and_step`; `step` counts from 1.
-    """
+    """Step every anchor outside `rows` with a zero gradient, in place, as dense Adam does (Scaffold-GS, 3DGS). `states`
+    and `lr_mask` as in `backward_and_step`; `step` counts from 1."""
     unseen = torch.ones_like(anchors.positions[:, 0], dtype=torch.bool).index_fill_(0, rows, False)
     rest = unseen.nonzero()[:, 0]
     slow = None if lr_mask is None else _SlowAnchors.of(anchors, rest, lr_mask)
@@ -143,7 +174,7 @@ def step_unseen_anchors(
 
 @dataclass(frozen=True)
 class _SlowAnchors:
-    """Those of the anchors that move that make less than a full step, as they were before it."""
+    """The moving anchors that make less than a full step, as they were before it."""
 
     rows: Int64[Tensor, " s"]
     share: Float[Tensor, " s"]

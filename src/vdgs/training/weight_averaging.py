@@ -1,7 +1,7 @@
-"""The mean of the last models that training passes through (Polyak and Juditsky, 1992), in place of the very last one.
+"""The mean of the last models of training (Polyak and Juditsky, 1992), in place of the very last one.
 
-Where rates do not fade (features, log-scales), Adam ends about the optimum: where the last few photographs pulled it.
-What few photographs show is pulled farthest. The mean over many of those places is nearer (choice; reports/choices.md).
+Where learning rates do not decay (features, log-scales), Adam ends near the optimum, displaced by the last photographs.
+The mean over many iterations is nearer, most of all for what few photographs show (choice).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from vdgs.config.method import TrainConfig
 from vdgs.model.anchors import TRAINED_TENSORS, Anchors
 from vdgs.model.decoder import Decoder
 
-#: The mean is one of about so many models: enough for it, and few enough to cost no time.
+#: About how many models are averaged.
 NUM_AVERAGED_MODELS = 100
 
 
@@ -31,11 +31,8 @@ class ModelAverage:
     @staticmethod
     def of(anchors: Anchors, decoder: Decoder) -> ModelAverage:
         """The mean of one model, in tensors of its own."""
-        return ModelAverage(
-            1,
-            {name: getattr(anchors, name).clone() for name in TRAINED_TENSORS},
-            {name: tensor.detach().clone() for name, tensor in decoder.tensors().items()},
-        )
+        trained = {name: getattr(anchors, name).clone() for name in TRAINED_TENSORS}
+        return ModelAverage(1, trained, decoder.copy().tensors())
 
     @torch.no_grad()
     def add(self, anchors: Anchors, decoder: Decoder) -> None:
@@ -48,9 +45,8 @@ class ModelAverage:
 
 
 def is_averaged_step(iteration: int, config: TrainConfig) -> bool:
-    """Whether the model after `iteration` steps is one of those averaged: about `NUM_AVERAGED_MODELS`, evenly spread
-    over the last share `config.average` of the iterations, none of them before growth has ended; the very last one
-    is."""
+    """Whether the model after `iteration` steps is averaged: about `NUM_AVERAGED_MODELS`, evenly spread over the last
+    `config.swa_fraction` of the iterations and after the end of growth, the last one included."""
     begin = max(1 - config.swa_fraction, config.densify.stop_fraction) * config.iterations
     every = max(1, round((config.iterations - begin) / NUM_AVERAGED_MODELS))
     return config.swa_fraction > 0 and iteration > begin and (config.iterations - iteration) % every == 0

@@ -22,14 +22,13 @@ class PointProjection(NamedTuple):
     #: Along the viewing direction, and straight from the camera, in world units.
     depth: Float[Tensor, "*c n"]
     distance: Float[Tensor, "*c n"]
-    #: Whether the frustum holds the point: as `Camera.sees`, but for rounding.
+    #: Whether the frustum holds the point: as `Camera.in_frustum`, but for rounding.
     inside: Bool[Tensor, "*c n"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Frusta:
-    """c pinhole cameras side by side, all asked at once: what one asks of thousands, one after the other, costs more
-    than what they answer."""
+    """c pinhole cameras as batched tensors."""
 
     camera_from_world: Float64[Tensor, "c 4 4"]
     fx: Float64[Tensor, " c"]
@@ -49,7 +48,7 @@ class Frusta:
         return Frusta(camera_from_world=rigid_there, fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
 
     def select(self, chosen: Int64[Tensor, " some"]) -> Frusta:
-        """Those of these numbers."""
+        """The frusta at these indices."""
         return Frusta(**{field.name: getattr(self, field.name)[chosen] for field in fields(self)})
 
     @property

@@ -1,4 +1,4 @@
-"""Places in groups of neighbours, so that a camera looks at those about its frustum and not at all there are."""
+"""Points in groups of neighbours, so that a query tests groups near a frustum instead of all points."""
 
 from __future__ import annotations
 
@@ -39,10 +39,8 @@ class SpatialGroups:
         return SpatialGroups(order, (low + high) / 2, (high - low).norm(dim=1) / 2)
 
     def query_frustum(self, camera: Camera) -> Int64[Tensor, " some"]:
-        """The places, ascending, that may fall into the picture of a pinhole camera: all that do, and few others.
-
-        O(n / GROUP + what it returns).
-        """
+        """The points, ascending, that may fall into the image of a pinhole camera: all that do, and few others. O(n /
+        GROUP_SIZE + result)."""
         frustum = Frusta.of([camera], self.centers.device)
         chosen = _may_hold(self.centers, self.radii, frustum)[0].nonzero()
         rows = (chosen * GROUP_SIZE + torch.arange(GROUP_SIZE, device=chosen.device)).reshape(-1)

@@ -46,19 +46,15 @@ def count_visibility(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera])
 
 
 def visibility_sampling_weights(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> tuple[float, ...]:
-    """How much of the training each camera deserves (choice): every anchor has one vote and divides it among the
-    cameras that hold it, so that w_j = sum of 1 / V_i over the anchors i that camera j holds.
-
-    The shares add up to the number of anchors that any camera holds; where that is none, all are 1.
-    """
+    """Sampling weights of cameras (choice): w_j = sum of 1 / V_i over the anchors i that camera j holds, so that each
+    anchor divides one vote among its cameras. All are 1 if no anchor is held."""
     votes = 1.0 / count_visibility(positions, cameras).double().clamp(min=1)
     shares = tuple(float(votes[count_visibility(positions, [camera]) > 0].sum()) for camera in cameras)
     return shares if any(shares) else (1.0,) * len(cameras)
 
 
 def effective_sample_size(shares: Sequence[float]) -> float:
-    """How many things used alike vary as much in the mean as these used in proportion to `shares`: (Σ w)² / Σ w²
-    (Kish, Survey Sampling, 1965, section 11.7). At least one share is above 0."""
+    """(Σ w)² / Σ w² (Kish, Survey Sampling, 1965, section 11.7) for `shares`, of which at least one is above 0."""
     return sum(shares) ** 2 / sum(share * share for share in shares)
 
 
@@ -72,10 +68,7 @@ def normalize_visibility(visibility: Int[np.ndarray, " n"]) -> Float[np.ndarray,
 
 def visibility_ratio(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Float[Tensor, " n"]:
     """c_k of every anchor (eq. 8): the share of the distinct cameras of a growth cycle whose frustum holds it, float32.
-
-    A view that was drawn twice in the cycle, or at two resolutions, counts once. All offsets of an anchor share its
-    c_k. Raises ValueError without any camera.
-    """
+    A view at two resolutions counts once. Raises ValueError without cameras."""
     if not cameras:
         raise ValueError("a growth cycle without cameras has no shares")
     distinct = list({_frustum(camera): camera for camera in cameras}.values())

@@ -1,8 +1,7 @@
-"""Compiled code on disk, found again by everything that it was made from.
+"""A disk cache of compiled code.
 
-An entry is whole or absent (it is renamed into place), carries the digest of its code, and its name is a digest of
-sources, headers, options, compiler and target: nothing is ever stale, and processes that compile the same thing at
-once write the same entry. A damaged one is compiled again.
+An entry is written atomically, carries the digest of its code, and is named by a digest of sources, headers, options,
+compiler and target. A damaged entry is compiled again.
 """
 
 from __future__ import annotations
@@ -38,17 +37,14 @@ def cache_folder() -> Path:
 def digest_parts(parts: Mapping[str, str]) -> str:
     """A digest of named texts: of the names, of the texts and of where one ends and the next begins."""
     digest = hashlib.sha256()
-    for name, text in sorted(parts.items()):
-        for piece in (name.encode(), text.encode()):
-            digest.update(len(piece).to_bytes(8, "little") + piece)
+    for part in (part.encode() for pair in sorted(parts.items()) for part in pair):
+        digest.update(len(part).to_bytes(8, "little") + part)
     return digest.hexdigest()
 
 
 def load_or_compile(name: str, parts: Mapping[str, str], make: Callable[[], bytes]) -> bytes:
-    """The code made from these parts: as it was kept, or made now and kept.
-
-    `name` (for people) begins the file's name. A folder that cannot be read or written costs time, not the work.
-    """
+    """The code made from these parts, from the cache or by `make`. `name` begins the file's name. A folder that cannot
+    be read or written is ignored."""
     path = cache_folder() / f"{name}-{digest_parts(parts)[:40]}.bin"
     if (code := _read(path)) is not None:
         return code

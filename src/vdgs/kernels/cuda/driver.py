@@ -1,8 +1,5 @@
-"""The CUDA driver through ctypes: which cards there are, loading compiled code, launching it.
-
-`Driver` is what the rest of this folder asks for. `CudaDriver` is the real one; tests put a stand-in in its place, so
-that everything up to the call into libcuda runs on a machine without a GPU.
-"""
+"""The CUDA driver through ctypes: GPUs, loading of compiled code, launches. Tests replace `CudaDriver` by a `Driver`
+that needs no GPU."""
 
 from __future__ import annotations
 
@@ -93,7 +90,7 @@ class CudaDriver:
         """Every visible GPU."""
         count = ctypes.c_int()
         self._call("cuDeviceGetCount", ctypes.byref(count))
-        return [self._card(index) for index in range(count.value)]
+        return [self._gpu(index) for index in range(count.value)]
 
     def capability(self, device: torch.device) -> tuple[int, int]:
         handle = self._device(_index(device))
@@ -132,7 +129,7 @@ class CudaDriver:
         finally:
             self._call("cuCtxPopCurrent_v2", ctypes.byref(ctypes.c_void_p()))
 
-    def _card(self, index: int) -> GpuInfo:
+    def _gpu(self, index: int) -> GpuInfo:
         device = self._device(index)
         name, memory = ctypes.create_string_buffer(256), ctypes.c_size_t()
         self._call("cuDeviceGetName", name, len(name), device)

@@ -1,7 +1,5 @@
-"""NVRTC, NVIDIA's compiler as a library: found, loaded and called through ctypes.
-
-Neither nvcc nor a compiler of the host nor CUDA_HOME is needed: NVRTC compiles device code out of memory. It comes
-with torch's CUDA builds, as the wheel `nvidia-cuda-nvrtc`, or with a CUDA toolkit.
+"""NVRTC, NVIDIA's compiler as a library, through ctypes; it needs neither nvcc nor a host compiler nor CUDA_HOME. It
+comes with torch's CUDA builds, as the wheel `nvidia-cuda-nvrtc`, or with a CUDA toolkit.
 """
 
 from __future__ import annotations
@@ -60,7 +58,10 @@ def find_nvrtc() -> Iterator[NvrtcLibrary]:
     major = _torch_cuda_major()
     if major is not None:
         own = [found for folder in folders for found in _in_folder(folder) if _major(found) == major]
-        yield from (NvrtcLibrary(str(path), "torch's CUDA build") for path in own + _in_folder(_torch_folder()))
+        import torch
+
+        own += _in_folder(Path(torch.__file__).parent / "lib")
+        yield from (NvrtcLibrary(str(path), "torch's CUDA build") for path in own)
     wheels = [found for folder in folders for found in _in_folder(folder)]
     for path in sorted(wheels, key=lambda path: _major(path) or 0, reverse=True):
         yield NvrtcLibrary(str(path), "the wheel nvidia-cuda-nvrtc")
@@ -165,9 +166,9 @@ class Nvrtc:
             )
 
     def _explain(self, code: int) -> str:
-        say = self._library.nvrtcGetErrorString
-        say.restype = ctypes.c_char_p
-        text = say(code)
+        error_string = self._library.nvrtcGetErrorString
+        error_string.restype = ctypes.c_char_p
+        text = error_string(code)
         return text.decode() if text else f"error {code}"
 
 
@@ -194,9 +195,3 @@ def _torch_cuda_major() -> int | None:
     import torch
 
     return int(torch.version.cuda.split(".")[0]) if torch.version.cuda else None
-
-
-def _torch_folder() -> Path:
-    import torch
-
-    return Path(torch.__file__).parent / "lib"

@@ -1,12 +1,7 @@
-"""Adam for the rows that a view has touched (visible-only Adam, as in Taming-3DGS).
+"""Sparse Adam (as in Taming-3DGS): only the rows that a view has touched move, others keep parameters and moments.
 
-A row that is not given keeps its parameters *and* its moments: an anchor that no camera of the step saw
-does not drift on old momentum. Its moments are then means over its own updates, and so the bias correction must
-count those: with the global step, a row that is first seen late would make its first step
-(1 - beta1) / sqrt(1 - beta2) times too large, which is 3.2, and up to 6 times its rate soon after.
-
-Short trainings want longer steps of rows that have had few, and shorter ones later (`AdamState.lr_boost`): every row
-anneals over its own updates, whenever they come.
+The bias correction counts the updates of each row: with the global step, a row first seen late would make its first
+step (1 - beta1) / sqrt(1 - beta2) = 3.2 times too large. `AdamState.lr_boost` lengthens the first steps of each row.
 """
 
 from __future__ import annotations
@@ -25,10 +20,8 @@ from vdgs.kernels.transfer import is_host
 
 
 class AdamStepFactors(NamedTuple):
-    """What a step needs of its settings: parameter -= rate · m / (sqrt(v) · root + epsilon).
-
-    `rates` and `roots` hold what follows from 1, 2, ... updates of a row, the last one also from all that are more.
-    """
+    """Factors of parameter -= step_size · m / (sqrt(v) · bias_root + epsilon), for 1, 2, ... updates of a row; the last
+    also for more."""
 
     step_sizes: Float[np.ndarray, " t"]
     bias_roots: Float[np.ndarray, " t"]
@@ -52,11 +45,10 @@ def adam_rows(
 
     `gradient` holds one row for each of `rows`, which ascend without repetition; None means all rows.
     `step` counts from 1: for all rows, or for each of them the updates that it has had, this one included.
-    Returns whether every gradient was finite; if not, nothing is changed. On a card the answer stays there.
+    Returns whether every gradient was finite (a tensor on a GPU); if not, nothing is changed.
 
-    Raises IndexError for a row outside the parameter, ValueError for rows that do not ascend, shapes that
-    do not match or settings out of range, TypeError for other types of elements: before any change. Numbers that are
-    on a card are not looked at.
+    Raises IndexError for a row outside the parameter, ValueError for rows that do not ascend, shapes that do not match
+    or settings out of range, TypeError for other dtypes: before any change. Values on a GPU are not checked.
     """
     check_rows(state, rows, gradient)
     factors = check_step(state, step, len(gradient), beta1, beta2, epsilon)
@@ -86,9 +78,9 @@ def _of_rows(
         return float(factors.step_sizes[0]), float(factors.bias_roots[0])
     # The rate changes with every step, these tables never: so they are on the card but once.
     lacking, roots = bias_correction_tables(factors.beta1, factors.beta2, gradient.device)
-    place = (step.long() - 1).clamp(max=len(roots) - 1)
-    root = roots[place]
-    rate = root.clamp(max=state.lr_boost) * state.learning_rate / lacking[place]
+    index = (step.long() - 1).clamp(max=len(roots) - 1)
+    root = roots[index]
+    rate = root.clamp(max=state.lr_boost) * state.learning_rate / lacking[index]
     shape = (-1, *[1] * (gradient.ndim - 1))
     return rate.to(gradient.dtype).reshape(shape), root.to(gradient.dtype).reshape(shape)
 
@@ -103,10 +95,8 @@ def bias_correction_tables(beta1: float, beta2: float, device: torch.device) -> 
 def check_step(
     state: AdamState, step: int | Tensor, count: int, beta1: float, beta2: float, epsilon: float
 ) -> AdamStepFactors:
-    """The factors of a step of `count` rows: of one number of updates, or where a tensor has that of each row, of any.
-
-    Raises ValueError or TypeError for settings out of range, and unless a tensor counts the updates of each row.
-    """
+    """The factors of a step of `count` rows, for one number of updates, or a tensor with that of each row. Raises
+    ValueError or TypeError for settings out of range or an unsuitable tensor."""
     if isinstance(step, int):
         return step_factors(state.learning_rate, step, beta1, beta2, epsilon, state.lr_boost)
     check_updates(step, count, min_updates=1)
@@ -121,10 +111,7 @@ def step_factors(
     epsilon: float = 1e-15,
     lr_boost: float = 1.0,
 ) -> AdamStepFactors:
-    """The factors after so many updates, or after any number of them (None), with both bias corrections folded in.
-
-    Raises ValueError for settings out of range.
-    """
+    """The factors after `updates`, or after any number of them (None). Raises ValueError for settings out of range."""
     if not (0 <= beta1 < 1 and 0 <= beta2 < 1):
         raise ValueError(f"beta1 and beta2 must lie in [0, 1), got {beta1} and {beta2}")
     if not (math.isfinite(learning_rate) and learning_rate >= 0 and epsilon > 0):
@@ -136,7 +123,7 @@ def step_factors(
     else:
         first, second = np.array([1 - beta1**updates]), np.array([1 - beta2**updates])
     if not (math.isfinite(lr_boost) and lr_boost >= 1):
-        raise ValueError(f"early must be finite and at least 1, got {lr_boost}")
+        raise ValueError(f"lr_boost must be finite and at least 1, got {lr_boost}")
     roots = 1 / np.sqrt(second)
     return AdamStepFactors(np.minimum(lr_boost, roots) * learning_rate / first, roots, beta1, beta2, epsilon)
 
@@ -173,7 +160,7 @@ def check_rows(state: AdamState, rows: Tensor | None, gradient: Tensor) -> None:
 
 
 def check_updates(updates: Tensor, count: int, min_updates: int = 0) -> None:
-    """Raise a clear error unless these are `count` numbers of updates, none below `least`."""
+    """Raise a clear error unless these are `count` numbers of updates, none below `min_updates`."""
     if updates.dtype != torch.int32:
         raise TypeError(f"updates must be int32, not {updates.dtype}")
     if updates.shape != (count,):

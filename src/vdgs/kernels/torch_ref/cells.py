@@ -67,9 +67,8 @@ def group_max(values: Float[Tensor, "n d"], group: Int64[Tensor, "n"], count: in
 def morton_order(positions: Float[Tensor, "n 3"]) -> Int64[Tensor, "n"]:
     """The permutation that sorts positions along a Morton curve, stable. O(n).
 
-    Positions are quantised to 21 bits an axis over a cube on the lower corner of their bounding box (choice:
-    a cube and not the box itself, so that neighbours on the curve are near in metres in a flat scene).
-    Raises ValueError where a position is not finite.
+    Positions are quantised to 21 bits an axis over a cube at the lower corner of their bounding box (choice: a cube, so
+    that neighbours on the curve are near in a flat scene). Raises ValueError where a position is not finite.
     """
     check_positions(positions)
     if positions.shape[0] == 0:

@@ -37,7 +37,7 @@ def decode(
     k = offsets.shape[1]
     if rows is not None:
         positions, features, offsets, log_scales = (t[rows] for t in (positions, features, offsets, log_scales))
-    anchors = _Anchors.of(positions, features, offsets, log_scales, weights, camera)
+    anchors = _Anchors.of((positions, features, offsets, log_scales), weights, camera)
     usable = (anchors.opacities > 0) & anchors.finite[:, None] & torch.isfinite(offsets).all(-1)
     anchor, offset = usable.nonzero(as_tuple=True)
     projected, variances, drawn = _decode_offsets(anchors, anchor, offset, weights, camera)
@@ -59,8 +59,8 @@ def decode_for_training(
     camera: Camera,
     rows: Int64[Tensor, "v"] | None = None,
 ) -> TrainingSplats:
-    """`decode` without autograd, and only what a training step asks for. Splats of an anchor stand together, in the
-    order of its offsets; anchors stand in the order that `TrainingSplats.segments` tells."""
+    """`decode` without autograd, and only what a training step needs. Splats of an anchor are consecutive, in the order
+    of its offsets; `TrainingSplats.segments` gives the order of anchors."""
     return TrainingSplats.of(decode(positions, features, offsets, log_scales, weights, camera, rows))
 
 
@@ -73,9 +73,9 @@ def decode_subset(
     camera: Camera,
     source: Int32[Tensor, "m"],
 ) -> AnchorSplats:
-    """`decode` once more for those splats that it has kept: as their number is known, nothing waits for a card."""
+    """`decode` for a known subset of splats, without waiting for a GPU."""
     k = offsets.shape[1]
-    anchors = _Anchors.of(positions, features, offsets, log_scales, weights, camera)
+    anchors = _Anchors.of((positions, features, offsets, log_scales), weights, camera)
     chosen = source.long()
     _, _, drawn = _decode_offsets(anchors, chosen // k, chosen % k, weights, camera)
     return replace(drawn, source=source)
@@ -83,8 +83,7 @@ def decode_subset(
 
 @dataclass(frozen=True, kw_only=True)
 class _Anchors:
-    """Anchors as a camera sees them. What is not finite is replaced by zeros before the arithmetic: 0 · NaN would enter
-    the gradients of the weights."""
+    """Anchors as a camera sees them, with zeros for what is not finite (0 · NaN would enter gradients of weights)."""
 
     positions: Float[Tensor, "v 3"]
     offsets: Float[Tensor, "v k 3"]
@@ -94,14 +93,8 @@ class _Anchors:
     finite: Bool[Tensor, "v"]
 
     @staticmethod
-    def of(
-        positions: Tensor,
-        features: Tensor,
-        offsets: Tensor,
-        log_scales: Tensor,
-        weights: DecoderWeights,
-        camera: Camera,
-    ) -> _Anchors:
+    def of(anchors: tuple[Tensor, Tensor, Tensor, Tensor], weights: DecoderWeights, camera: Camera) -> _Anchors:
+        positions, features, offsets, log_scales = anchors
         positions = positions.detach()
         viewing = _viewing(positions, camera)
         finite = _finite_rows(positions, viewing, features, log_scales.exp())
@@ -110,10 +103,8 @@ class _Anchors:
         )
         inputs = torch.cat([features, viewing], -1)
         opacities = torch.tanh(weights.opacity.forward(inputs))
-        return _Anchors(
-            positions=positions, offsets=offsets, log_scales=log_scales, inputs=inputs, opacities=opacities,
-            finite=finite,
-        )  # fmt: skip
+        named = {"positions": positions, "offsets": offsets, "log_scales": log_scales, "inputs": inputs}
+        return _Anchors(**named, opacities=opacities, finite=finite)
 
 
 def _decode_offsets(

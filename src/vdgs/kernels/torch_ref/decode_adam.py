@@ -26,10 +26,9 @@ def decode_backward_adam(
 ) -> tuple[IsFinite, tuple[Tensor, ...] | None]:
     """Differentiate `decode(positions, *parameters, weights, camera, rows)`, and move these rows, in place.
 
-    `moved` are features, offsets and log-scales; `gradients` are those of the splats that decoding gave. `updates` says
-    how often each anchor has moved, for the bias correction, and is counted up in place. Returns whether every gradient
-    of an anchor was finite (if not, some may have moved while others have not) and the gradients of the decoder's
-    twelve tensors (None where none of them requires one).
+    `moved` are features, offsets and log-scales; `gradients` those of the decoded splats; `updates` counts the steps of
+    each anchor and is incremented in place. Returns whether every gradient of an anchor was finite (if not, some
+    anchors may have moved) and the gradients of the decoder's twelve tensors (None where none requires one).
     """
     check_updates(updates, len(positions))
     leaves = [state.parameter[rows].detach().requires_grad_(True) for state in moved]

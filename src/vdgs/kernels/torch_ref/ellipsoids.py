@@ -1,9 +1,8 @@
-"""The mean of ellipsoids: that of the logarithms of their covariances (Arsigny, Fillard, Pennec and Ayache,
-"Log-Euclidean metrics for fast and simple calculus on diffusion tensors", 2006).
+"""The mean of ellipsoids by the logarithms of their covariances (Arsigny, Fillard, Pennec and Ayache, "Log-Euclidean
+metrics for fast and simple calculus on diffusion tensors", 2006).
 
-Half of the logarithm of R diag(s²) Rᵀ is R diag(ln s) Rᵀ: symmetric, whatever the order and the signs of the axes, of
-which a mean of quaternions would depend; and its trace is the logarithm of the volume, which a mean of covariances
-would blow up. Dimensions: p ellipsoids, m means.
+Half the logarithm of R diag(s²) Rᵀ is R diag(ln s) Rᵀ, which does not depend on order and signs of the axes, and whose
+trace is the logarithm of the volume. Dimensions: p ellipsoids, m means.
 """
 
 from __future__ import annotations

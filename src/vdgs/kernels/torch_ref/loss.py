@@ -31,12 +31,9 @@ def photometric_loss(
 ) -> PhotometricLoss:
     """(1 - ssim_weight) · L1 + ssim_weight · (1 - SSIM) between `image` (in [0, 1]) and `target` / 255.
 
-    Pixels where `mask` is zero do not count: there the image is replaced by the target, so that the
-    windows of their neighbours see no difference either, and the means run over the kept pixels only
-    (choice: nothing that is drawn under the mask can change the loss). With no pixel kept, loss and L1
-    are 0, SSIM is 1 and the gradient is zero. A NaN in a kept pixel makes the loss NaN.
-
-    Raises TypeError for other types of elements, ValueError for shapes that do not match.
+    Pixels where `mask` is zero do not count: the image is replaced by the target there, and means run over the other
+    pixels (choice: what is drawn under the mask cannot change the loss). With no pixel left, loss and L1 are 0, SSIM is
+    1 and the gradient is zero. Raises TypeError for other dtypes, ValueError for shapes that do not match.
     """
     check_images(image, target, mask)
     goal = target.to(image.dtype) / 255

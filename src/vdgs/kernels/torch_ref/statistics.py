@@ -23,12 +23,11 @@ def add_view_statistics(
 ) -> None:
     """Add one view to the sums that growth decides by (Scaffold-GS section 4.2), in place.
 
-    `source` is (index in `visible`) k + offset, ascending without repetition; `gradient_px` is the loss by the
-    splats' means in pixels, whose norm is taken in NDC: these run over [-1, 1] across the image, hence the factors
-    width/2 and height/2. Each drawn offset gains its norm and a count, each visible anchor the opacity of its
-    splats, and a count if it is `inside`: visible are also anchors just outside of the picture, which may touch it but
-    mostly do not. Raises IndexError for a source beyond the visible anchors, ValueError unless `inside` says something
-    of each of them, before any change.
+    `source` is (index in `visible`) k + offset, ascending without repetition; `gradient_px` is the gradient by the
+    means in pixels, whose norm is taken in NDC ([-1, 1] across the image, hence width/2 and height/2). Each drawn
+    offset gains its norm and a count, each visible anchor the opacity of its splats, and a count if its centre is
+    `inside` the image. Raises IndexError for a source beyond the visible anchors, ValueError for an unsuitable
+    `inside`, before any change.
     """
     k = statistics.gradient.shape[1]
     sources = sources_tensor(source)

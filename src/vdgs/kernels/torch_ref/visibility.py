@@ -30,7 +30,7 @@ def count_visibility(points: Float[Tensor, "n 3"], cameras: Sequence[Camera]) ->
 
 
 def mark_visible(points: Float[Tensor, "n 3"], camera: Camera) -> Bool[Tensor, "n"]:
-    """Which points one camera sees: as `Camera.sees`, on the device of the points."""
+    """Which points one camera sees: as `Camera.in_frustum`, on the device of the points."""
     check_points(points)
     exact = points.detach().to(torch.float64)
     finite = torch.isfinite(exact).all(dim=1)

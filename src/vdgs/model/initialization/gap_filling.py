@@ -1,9 +1,7 @@
-"""Ground that photographs show but structure-from-motion left empty: where anchors must start all the same.
+"""Points on ground that photographs show but structure-from-motion left empty (canopies, water, fields).
 
-Feature matching fails on canopies, water and fields, so that whole strips which several cameras fly over hold no
-sparse point. No anchor would start there, and growth cannot cross a wide gap: the render would have a hole where
-photographs overlap. Choice (the paper is silent): the empty cells of a grid on the ground plane that at least one
-training camera sees each get a point, at the height of the nearest sparse points.
+No anchor would start there, and growth cannot cross a wide gap. Choice (the paper is silent): each empty cell of a grid
+on the ground plane that a training camera sees gets a point, at the height of the nearest sparse points.
 """
 
 from __future__ import annotations

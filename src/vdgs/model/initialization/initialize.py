@@ -65,8 +65,8 @@ def initialize_anchors(
     colours. Raises VdgsError with fewer than two distinct points.
     """
     voxel = get_voxel_size(points, config)
-    kept = inlier_mask(points, config.outlier_distance)
-    points, colors = points[kept], colors[kept]
+    inliers = inlier_mask(points, config.outlier_distance)
+    points, colors = points[inliers], colors[inliers]
     if dense is not None:
         points, colors = (np.concatenate(pair) for pair in zip((points, colors), dense, strict=True))
     if config.fill_gaps:
@@ -76,22 +76,16 @@ def initialize_anchors(
     cells, owner = np.unique(np.round(points / voxel).astype(np.int64), axis=0, return_inverse=True)
     positions = cells * voxel
     n = len(positions)
+    spacing = np.full(n, voxel)
     if n > 1:
         distances, _ = cKDTree(positions).query(positions, k=min(4, n), workers=1)
         spacing = np.clip(distances[:, 1:].mean(axis=1), 0.5 * voxel, None)
-    else:
-        spacing = np.full(n, voxel)
     features = np.zeros((n, FEATURE_SIZE))
     if config.from_colors:
         features[:, :3] = _mean_colors(colors, owner.reshape(-1), n) * 2.0 - 1.0
     as_tensor = lambda array: torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))  # noqa: E731
-    anchors = Anchors(
-        positions=as_tensor(positions),
-        features=as_tensor(features),
-        offsets=torch.zeros(n, config.num_offsets, 3),
-        log_scales=as_tensor(np.repeat(np.log(spacing)[:, None], 6, axis=1)),
-    )
-    return anchors, voxel
+    offsets, log_scales = torch.zeros(n, config.num_offsets, 3), np.repeat(np.log(spacing)[:, None], 6, axis=1)
+    return Anchors(as_tensor(positions), as_tensor(features), offsets, as_tensor(log_scales)), voxel
 
 
 def _mean_colors(colors: np.ndarray, owner: Int64[np.ndarray, " n"], count: int) -> np.ndarray:

@@ -1,7 +1,5 @@
-"""What Linux control groups let this process take: those of containers, of SLURM's jobs, of systemd's units.
-
-Only the standard library is imported: `vdgs doctor` looks here where other things are broken.
-"""
+"""Memory limits of Linux control groups (containers, SLURM jobs, systemd units). Standard library only, for `vdgs
+doctor`."""
 
 from __future__ import annotations
 
@@ -29,11 +27,8 @@ class CgroupLimit:
 
 
 def cgroup_limits(process: Path = PROC_SELF) -> list[CgroupLimit]:
-    """The limits on this process: of its own control group and of all above it, for each binds; [] where none is set.
-
-    Version 2 and version 1, whose limit is close to 2^63 where there is none. What Linux does not let us see (groups
-    above a container's root, a folder that is not mounted) is left out.
-    """
+    """The limits of this process's control group and of all above it (versions 1 and 2); [] where none is set. Groups
+    that are not visible (above a container's root, not mounted) are left out."""
     with suppress(OSError, ValueError):  # no Linux
         groups = _groups(_own_groups((process / "cgroup").read_text()), (process / "mountinfo").read_text())
         return [limit for folder, version in groups if (limit := _limit(folder, version)) is not None]
@@ -41,10 +36,8 @@ def cgroup_limits(process: Path = PROC_SELF) -> list[CgroupLimit]:
 
 
 def slurm_memory_limit(environment: Mapping[str, str] = os.environ) -> int | None:
-    """Bytes that the SLURM job asked for on this node; None outside of jobs, and where it asked for nothing.
-
-    For clusters where SLURM sets no control group a limit: it may then count what the job takes and end it.
-    """
+    """Bytes that the SLURM job requested on this node; None outside of jobs and without a request. SLURM may enforce it
+    without a control group."""
     if "SLURM_JOB_ID" not in environment:
         return None
 

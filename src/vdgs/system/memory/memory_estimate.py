@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 from vdgs.config.method import CompensationConfig, MethodConfig, ResolutionSchedule, max_block_anchors
 from vdgs.geometry.camera import Camera
@@ -21,8 +21,7 @@ PROCESS_BYTES = 350_000_000
 TRAIN_BYTES_PER_PIXEL = 150
 #: What a step makes of an anchor in view, for each of its Gaussians (measured with ten: 1.55 kB an anchor).
 STEP_BYTES_PER_OFFSET = 155
-#: A picture that is measured: maps of errors and of V, each in double precision; the features of both pictures that
-#: LPIPS compares, its widest layer (choice: not measured).
+#: An image that is evaluated: maps of errors and of V in double precision; LPIPS's widest layer (choice: not measured).
 METRIC_BYTES_PER_PIXEL, LPIPS_BYTES_PER_PIXEL = 400, 2000
 #: Anchors may grow to so many times their number where nothing limits them (choice; real captures: 1.2 to 3).
 MAX_GROWTH = 3.0
@@ -33,8 +32,6 @@ MAX_COMPENSATED_GROWTH = 15.0
 MAX_VISIBLE_FRACTION = 0.5
 #: Numbers of an anchor apart from its offsets: place, feature, log-scales.
 FLOATS_PER_ANCHOR = 3 + 32 + 6
-#: ... of which a mean of models holds all but the place, which never moves.
-POSITION_FLOATS = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,8 +111,8 @@ def decoded_image_bytes(cameras: Iterable[Camera]) -> int:
 
 
 def block_workload(method: MethodConfig, anchors: int, total_anchors: int, pixels: int) -> TrainingWorkload:
-    """What training a block works on that has so many of all (`of`) coarse anchors and photographs of up to `pixels`;
-    before it is opened, and beside what photographs take. A part of a photograph may be all of it."""
+    """The workload of a block with `anchors` of all coarse anchors and photographs of up to `pixels`, before it is
+    opened and without cached photographs. A crop may be a whole photograph."""
     block = method.block
     return TrainingWorkload(
         anchors=anchors,
@@ -131,10 +128,10 @@ def block_workload(method: MethodConfig, anchors: int, total_anchors: int, pixel
 
 
 def bytes_per_anchor(offsets: int, seen: float) -> float:
-    """Parameters, two moments, a count of updates, a bound on size and statistics of an anchor, and what steps make of
-    the share that is in view."""
-    kept = 3 * model_bytes_per_anchor(offsets) + 4 * (2 + 2 * offsets + 2)
-    return kept + seen * STEP_BYTES_PER_OFFSET * offsets
+    """Parameters, two moments, a count of updates, a bound on size and statistics of an anchor, and its share of what a
+    step allocates for anchors in view."""
+    state = 3 * model_bytes_per_anchor(offsets) + 4 * (2 + 2 * offsets + 2)
+    return state + seen * STEP_BYTES_PER_OFFSET * offsets
 
 
 def model_bytes_per_anchor(offsets: int) -> int:
@@ -142,13 +139,9 @@ def model_bytes_per_anchor(offsets: int) -> int:
     return 4 * (FLOATS_PER_ANCHOR + 3 * offsets)
 
 
-def swa_bytes_per_anchor(offsets: int) -> int:
-    """What a mean of models holds of an anchor."""
-    return model_bytes_per_anchor(offsets) - 4 * POSITION_FLOATS
-
-
 def _per_grown_anchor(need: TrainingWorkload) -> float:
-    mean = swa_bytes_per_anchor(need.offsets) if need.has_swa else 0
+    # A mean of models holds no positions, which never move.
+    mean = model_bytes_per_anchor(need.offsets) - 4 * 3 if need.has_swa else 0
     return bytes_per_anchor(need.offsets, need.seen) + mean
 
 
@@ -164,8 +157,8 @@ def estimate_memory(need: TrainingWorkload) -> MemoryEstimate:
 
 
 def render_bytes(model_bytes: int, cached_bytes: int, pixels: int, lpips: bool = False) -> int:
-    """What measuring pictures of `pixels` takes at most; `models` have so many bytes on the disk. They are held as
-    they are there, and what drawing makes of their anchors is about as much again. `held`: other models beside them."""
+    """What evaluating images of `pixels` takes at most, for models of `model_bytes` on disk, which rendering doubles,
+    and `cached_bytes` of other models."""
     features = LPIPS_BYTES_PER_PIXEL if lpips else 0
     return PROCESS_BYTES + 2 * model_bytes + cached_bytes + (METRIC_BYTES_PER_PIXEL + features) * pixels
 
@@ -175,29 +168,26 @@ def memory_advice(need: TrainingWorkload, kind: TrainingKind, to_save: int) -> l
 
     What would save less than a hundredth of the whole is left out.
     """
-    whole = estimate_memory(need)
+    total, cached = estimate_memory(need).total, need.image_cache_bytes
+
+    def saved(**changes: Any) -> int:
+        return total - estimate_memory(replace(need, **changes)).total
+
     found = [_fewer_anchors(need, kind, to_save)]
     if kind == "coarse":
-        smaller = estimate_memory(replace(need, pixels=need.pixels // 4, image_cache_bytes=need.image_cache_bytes // 4))
-        found.append(
-            MemoryAdvice("photographs of half the size (--downscale or --images images_N)", whole.total - smaller.total)
-        )
+        bytes_saved = saved(pixels=need.pixels // 4, image_cache_bytes=cached // 4)
+        found.append(MemoryAdvice("photographs of half the size (--downscale or --images images_N)", bytes_saved))
     else:
-        half = estimate_memory(replace(need, anchors=need.anchors // 2))
-        found.append(MemoryAdvice("vdgs partition with twice the --blocks (smaller blocks)", whole.total - half.total))
-        found.append(MemoryAdvice("one less of --jobs (blocks at once)", whole.total))
+        half = saved(anchors=need.anchors // 2)
+        found.append(MemoryAdvice("vdgs partition with twice the --blocks (smaller blocks)", half))
+        found.append(MemoryAdvice("one less of --jobs (blocks at once)", total))
     if need.has_swa:
         option = "--swa-fraction 0" if kind == "coarse" else "--block.swa-fraction 0"
-        last = estimate_memory(replace(need, has_swa=False))
-        found.append(MemoryAdvice(f"{option} (the last model instead of a mean)", whole.total - last.total))
-    kept = min(need.image_cache_bytes, 50_000_000)
-    found.append(
-        MemoryAdvice(
-            f"--image-cache-gb {kept / 1e9:.2f} (fewer photographs kept in memory)", need.image_cache_bytes - kept
-        )
-    )
-    worth = [each for each in found if each.saved_bytes > whole.total / 100]
-    return sorted(worth, key=lambda each: -each.saved_bytes)
+        found.append(MemoryAdvice(f"{option} (the last model instead of a mean)", saved(has_swa=False)))
+    least = min(cached, 50_000_000)
+    option = f"--image-cache-gb {least / 1e9:.2f} (fewer photographs kept in memory)"
+    found.append(MemoryAdvice(option, cached - least))
+    return sorted((each for each in found if each.saved_bytes > total / 100), key=lambda each: -each.saved_bytes)
 
 
 def _fewer_anchors(need: TrainingWorkload, kind: TrainingKind, to_save: int) -> MemoryAdvice:
@@ -211,13 +201,10 @@ def _fewer_anchors(need: TrainingWorkload, kind: TrainingKind, to_save: int) -> 
 
 def describe_memory(estimate: MemoryEstimate, available_bytes: int) -> str:
     """One line: what is needed, what for, and what there is."""
-    grown = (
-        f", {data_size(estimate.grown_anchors)} once they have grown"
-        if estimate.grown_anchors > estimate.anchors
-        else ""
-    )
+    more = estimate.grown_anchors > estimate.anchors
+    grown = f", {data_size(estimate.grown_anchors)} once they have grown" if more else ""
     return (
-        f"memory by estimate: {data_size(estimate.start)} at the start, {data_size(estimate.total)} at most (photographs "
-        f"{data_size(estimate.images)}, one picture {data_size(estimate.image)}, anchors "
+        f"memory by estimate: {data_size(estimate.start)} at the start, {data_size(estimate.total)} at most "
+        f"(photographs {data_size(estimate.images)}, one picture {data_size(estimate.image)}, anchors "
         f"{data_size(estimate.anchors)}{grown}); this process may take {data_size(available_bytes)}"
     )

@@ -32,31 +32,30 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 def available_memory_bytes() -> int:
-    """What this process may still take: of the machine's free memory, of its control groups' (a container's, a SLURM
-    job's, a systemd unit's), of its own limit. Where no group limits a SLURM job, of what the job asked for."""
+    """What this process may still take: the least of the machine's free memory, that of its control groups (container,
+    SLURM job, systemd unit), its own limit and, where no group limits a SLURM job, the job's request."""
     memory, groups = psutil.virtual_memory(), cgroup_limits()
     free = [memory.available, *(group.free for group in groups)]
     job = slurm_memory_limit()
     if job is not None and all(group.limit >= memory.total for group in groups):
-        free.append(job - _taken_with_children())
+        free.append(job - _resident_with_children())
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     if limit != resource.RLIM_INFINITY:
         free.append(limit - psutil.Process().memory_info().vms)
     return max(0, min(free))
 
 
-def _taken_with_children() -> int:
-    """Resident bytes of this process and of those that it started; what they share counts for each."""
-    process = psutil.Process()
-    taken = process.memory_info().rss
-    for child in process.children(recursive=True):
+def _resident_with_children() -> int:
+    """Resident bytes of this process and its children; shared memory counts for each."""
+    total = 0
+    for process in (psutil.Process(), *psutil.Process().children(recursive=True)):
         with suppress(psutil.Error):  # it has just ended
-            taken += child.memory_info().rss
-    return int(taken)
+            total += process.memory_info().rss
+    return int(total)
 
 
 def peak_memory_bytes() -> int:
-    """Largest resident size of this process since it began, or since `reset_peak_memory` where the system can forget."""
+    """Largest resident size of this process since it began, or since `reset_peak_memory`."""
     with suppress(OSError, ValueError, StopIteration):
         lines = Path("/proc/self/status").read_text().splitlines()
         return 1024 * int(next(line for line in lines if line.startswith("VmHWM")).split()[1])
@@ -65,7 +64,7 @@ def peak_memory_bytes() -> int:
 
 
 def reset_peak_memory() -> None:
-    """Let the peak begin again at today's size, so that each stage of a run is measured apart (Linux)."""
+    """Restart the peak at the current size, so that each stage of a run is measured alone (Linux)."""
     gc.collect()
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")

@@ -1,4 +1,4 @@
-"""What people are told about memory: before training how much it will take, after a failure what takes less."""
+"""Messages about memory: the estimate before training, and advice after a failure."""
 
 from __future__ import annotations
 
@@ -54,16 +54,12 @@ def training_workload(state: TrainingState, stage: TrainingProblem) -> TrainingW
 
 def print_memory_estimate(need: TrainingWorkload, kind: TrainingKind, console: Console) -> None:
     """Say what training will take beside what there is; where that is too little, what helps."""
-    found = estimate_memory(need)
-    room = available_memory_bytes() + psutil.Process().memory_info().rss
-    console.print(describe_memory(found, room), highlight=False)
-    if found.total > room:
-        helpful = memory_advice(need, kind, found.total - room)
-        console.print(
-            f"[yellow]warning[/] it may run out of memory: {data_size(found.total - room)} are missing by estimate. "
-            + format_memory_advice(helpful, kind),
-            highlight=False,
-        )
+    estimate, available = estimate_memory(need), available_memory_bytes() + psutil.Process().memory_info().rss
+    console.print(describe_memory(estimate, available), highlight=False)
+    if (missing := estimate.total - available) > 0:
+        advice = format_memory_advice(memory_advice(need, kind, missing), kind)
+        warning = f"it may run out of memory: {data_size(missing)} are missing by estimate. {advice}"
+        console.print(f"[yellow]warning[/] {warning}", highlight=False)
 
 
 def out_of_memory_hint(need: TrainingWorkload, state: TrainingState, stage: TrainingProblem) -> str:
@@ -76,9 +72,8 @@ def out_of_memory_hint(need: TrainingWorkload, state: TrainingState, stage: Trai
     # Growth cannot be undone where it led, so a limit is one for training that begins anew.
     before = replace(now, anchors=min(need.anchors, len(state.anchors)))
     whole = estimate_memory(now).total
-    return f"It took about {data_size(whole)}. " + format_memory_advice(
-        memory_advice(before, kind, round(MIN_SAVED_FRACTION * whole)), kind
-    )
+    advice = memory_advice(before, kind, round(MIN_SAVED_FRACTION * whole))
+    return f"It took about {data_size(whole)}. " + format_memory_advice(advice, kind)
 
 
 def format_memory_advice(found: list[MemoryAdvice], kind: TrainingKind) -> str:

@@ -1,4 +1,4 @@
-"""Training of anchors, watched: what the coarse stage and a block show, log and advise."""
+"""Training of anchors with progress, log, checkpoints and advice, for the coarse stage and for blocks."""
 
 from __future__ import annotations
 
@@ -75,14 +75,8 @@ def resume_or_start(
 
     Raises RunError for a state that this version cannot read or that is beyond the last iteration.
     """
-    return restore_or_start(
-        folder,
-        stage.config.iterations,
-        start,
-        lambda saved: from_checkpoint(saved, stage),
-        "Start a new --output.",
-        console,
-    )
+    advice, restore = "Start a new --output.", lambda saved: from_checkpoint(saved, stage)
+    return restore_or_start(folder, stage.config.iterations, start, restore, advice, console)
 
 
 def train_with_checkpoints(
@@ -105,13 +99,13 @@ def train_with_checkpoints(
     )  # fmt: skip
 
     def loop(stop: Callable[[], bool]) -> bool:
-        keeper, board = Checkpointer(training, options.save_every), _board(folder, options, state.iteration)
+        checkpointer, board = Checkpointer(training, options.save_every), _board(folder, options, state.iteration)
         with TrainingProgress(console, folder, stage.config, state.iteration, board) as progress:
 
             def after_step(state: TrainingState, report: StepReport) -> None:
-                keeper.update_timers()
+                checkpointer.update_timers()
                 progress.step(state, report)
-                keeper.save_if_due(lambda: progress.status(state), progress.flush)
+                checkpointer.save_if_due(lambda: progress.status(state), progress.flush)
 
             return train(state, stage, stop=stop, after_step=after_step)
 
@@ -142,12 +136,12 @@ def finish_stage(
 
 
 def warn_without_densification(config: TrainConfig, console: Console, prefix: str = "--") -> None:
-    """Say so where growth would begin after it has ended; `prefix` is that of the stage's options."""
+    """Print a note if growth would start after its end; `prefix` is that of the stage's options."""
     if config.densify.num_levels and config.densify.stop_fraction * config.iterations < config.densify.start:
         console.print(
             f"[yellow]note[/] no anchor will grow: growth starts at iteration {config.densify.start} and ends at "
             f"{config.densify.stop_fraction * config.iterations:.0f}. Give more {prefix}iterations or a smaller "
-            f"{prefix}growth.start.",
+            f"{prefix}densify.start.",
             highlight=False,
         )
 

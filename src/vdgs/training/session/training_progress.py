@@ -1,4 +1,4 @@
-"""What a person sees while training runs, and what is logged."""
+"""Progress bar, console lines, log.jsonl and TensorBoard of a training."""
 
 from __future__ import annotations
 

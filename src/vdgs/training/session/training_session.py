@@ -1,4 +1,4 @@
-"""Training that is watched: logged, checkpointed, stopped and continued. The same for every kind of state."""
+"""Training that is logged, checkpointed, stopped and continued, for every kind of state."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ STATUS_SECONDS = 2.0
 
 
 class ResumableState(Protocol):
-    """What every state of a training says of itself."""
+    """The part of a training state that a session needs."""
 
     iteration: int
     seconds: float
@@ -38,7 +38,7 @@ S = TypeVar("S", bound=ResumableState)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrainingSession:
-    """A training as the one who watches it sees it."""
+    """A training with the functions that save it and report on it."""
 
     folder: StageFolder
     state: ResumableState
@@ -99,12 +99,12 @@ def run_session(training: TrainingSession, loop: Callable[[Callable[[], bool]], 
     """
     folder, state = training.folder, training.state
     try:
-        with catch_stop_signals(second_interrupts=True) as asked:
+        with catch_stop_signals(second_interrupts=True) as requests:
             folder.set_status(training.status())
-            complete = loop(lambda: bool(asked))
+            complete = loop(lambda: bool(requests))
     except TrainingDiverged as error:
         folder.set_status(StatusRecord(state="failed", iteration=state.iteration, reason=str(error)))
-        raise TrainingDiverged(f"{error} {_kept(folder)} {training.divergence_hint}".rstrip()) from error
+        raise TrainingDiverged(f"{error} {_last_checkpoint(folder)} {training.divergence_hint}".rstrip()) from error
     except MEMORY_ERRORS as error:
         if not is_out_of_memory(error):
             raise
@@ -112,7 +112,8 @@ def run_session(training: TrainingSession, loop: Callable[[Callable[[], bool]], 
         kept = _rescue(training)
         folder.set_status(StatusRecord(state="failed", iteration=state.iteration, reason="out of memory"))
         raise VdgsError(
-            f"{folder.path}: out of memory with {training.size()}{_wanted(error)}. {kept} {training.memory_hint()}"
+            f"{folder.path}: out of memory with {training.size()}{_requested_bytes(error)}. {kept} "
+            f"{training.memory_hint()}"
         ) from error
     except VdgsError as error:  # a photograph that is gone, a full disk: every step so far is whole
         folder.set_status(StatusRecord(state="failed", iteration=state.iteration, reason=str(error)))
@@ -125,7 +126,7 @@ def run_session(training: TrainingSession, loop: Callable[[Callable[[], bool]], 
 
 
 class Checkpointer:
-    """After every step: the state's account of time and memory (across interruptions), checkpoints, status.json."""
+    """After every step: time and peak memory of the state (across interruptions), checkpoints, status.json."""
 
     def __init__(self, training: TrainingSession, save_every: int):
         self._training, self._save_every = training, save_every
@@ -154,11 +155,11 @@ class Checkpointer:
             training.folder.set_status(status())
 
 
-def _kept(folder: StageFolder) -> str:
-    kept, _ = load_latest_checkpoint(folder.checkpoints)
-    if kept is None:
+def _last_checkpoint(folder: StageFolder) -> str:
+    saved, _ = load_latest_checkpoint(folder.checkpoints)
+    if saved is None:
         return "There is no checkpoint yet."
-    return f"The checkpoint of iteration {kept.iteration} is kept in {folder.checkpoints}."
+    return f"The checkpoint of iteration {saved.iteration} is kept in {folder.checkpoints}."
 
 
 def _rescue(training: TrainingSession) -> str:
@@ -173,12 +174,12 @@ def _rescue(training: TrainingSession) -> str:
         else:
             return f"The checkpoint of iteration {training.state.iteration} is saved in {folder.checkpoints}."
     try:
-        return _kept(folder)
+        return _last_checkpoint(folder)
     except MEMORY_ERRORS:
         return f"Earlier checkpoints are kept in {folder.checkpoints}."
 
 
-def _wanted(error: BaseException) -> str:
-    """How much was asked for in vain, where the error says so."""
-    asked = re.search(r"allocate ([\d.]+) (bytes|[KMG]iB)", str(error))
-    return f" ({asked.group(1)} {asked.group(2)} more could not be had)" if asked else ""
+def _requested_bytes(error: BaseException) -> str:
+    """How much could not be allocated, where the error names it."""
+    size = re.search(r"allocate ([\d.]+) (bytes|[KMG]iB)", str(error))
+    return f" ({size.group(1)} {size.group(2)} more could not be had)" if size else ""

@@ -1,26 +1,18 @@
-"""Dense stereo before training: where photographs agree how far the ground is, anchors may start.
+"""Dense stereo before training: anchors may start where photographs agree on the depth of the ground.
 
-Structure-from-motion leaves few points where few photographs look, and what starts at a wrong height there stays there:
-two or three photographs are learnt by heart with any surface. Classical stereo needs no more than two photographs, and
-knows what training does not: that neighbouring pixels mostly lie on one surface.
+Structure-from-motion leaves few points where few photographs look, and two or three photographs fit any surface, so
+that anchors which start at a wrong height stay there. Stereo needs two photographs, and assumes that neighbouring
+pixels mostly lie on one surface. No GPU or network is needed; the result is the same for any number of threads.
 
-    partners(cameras, points)          which photographs each one is compared with
-    depth_of_pair(first, second, ...)  a pair, rectified and matched: the depth of the first one's pixels
-    dense_points(...)                  the depths of all photographs, those that others confirm, as points
-
-Nothing of it needs a GPU or a network; it is deterministic, for any number of threads.
+    select_source_views(cameras, points)  the photographs that each one is compared with
+    pair_depth(first, second)             a pair, rectified and matched: the depth of the first one's pixels
+    compute_dense_points(...)             the depths of all photographs that others confirm, as points
 """
 
-from vdgs.model.initialization.stereo.fusion import DensePoints, FusionCell, StereoInputs, compute_dense_points
-from vdgs.model.initialization.stereo.sgm import StereoView, pair_depth
-from vdgs.model.initialization.stereo.view_selection import select_source_views
-
-__all__ = [
-    "DensePoints",
-    "FusionCell",
-    "StereoInputs",
-    "StereoView",
-    "compute_dense_points",
-    "pair_depth",
-    "select_source_views",
-]
+from vdgs.model.initialization.stereo.fusion import DensePoints as DensePoints
+from vdgs.model.initialization.stereo.fusion import FusionCell as FusionCell
+from vdgs.model.initialization.stereo.fusion import StereoInputs as StereoInputs
+from vdgs.model.initialization.stereo.fusion import compute_dense_points as compute_dense_points
+from vdgs.model.initialization.stereo.sgm import StereoView as StereoView
+from vdgs.model.initialization.stereo.sgm import pair_depth as pair_depth
+from vdgs.model.initialization.stereo.view_selection import select_source_views as select_source_views

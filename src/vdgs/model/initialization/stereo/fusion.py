@@ -55,9 +55,8 @@ MAX_CELL_INDEX = 2**19
 
 @dataclass(frozen=True, eq=False)
 class StereoInputs:
-    """A flight as stereo sees it: cameras at the size of their photographs, sparse points [n, 3] of the same world,
-    places [p, 3] for which partners are chosen (the points, and ground without any), and what reads photograph i: RGB
-    [h, w, 3] and the mask [h, w] of what counts (None: all)."""
+    """Cameras at the size of their photographs, sparse points [n, 3], positions [p, 3] for which source views are
+    chosen, and a function that reads photograph i: RGB [h, w, 3] and the mask [h, w] of what counts (None: all)."""
 
     cameras: Sequence[Camera]
     points: Float[np.ndarray, "n 3"]
@@ -108,21 +107,17 @@ class _Cells:
 def compute_dense_points(
     inputs: StereoInputs, cell: FusionCell, scratch_dir: Path, on_progress: Callable[[int, int], None], threads: int = 1
 ) -> DensePoints:
-    """Match every photograph with its partners, and give each cell that enough pixels lie in the mean of them. A pixel
-    counts where the depths of partners confirm it.
+    """Match every photograph with its source views; each cell with enough confirmed pixels gets their mean.
 
-    `scratch` is a folder for a file of depths, gone afterwards: memory grows with the place, not with how many
-    photographs show it. `tell(done, of)` is called in this thread after each photograph, once for matching and once for
-    confirming. Deterministic, whatever `threads`; raises what `read` raises, and VdgsError where the disk has no room.
+    `scratch_dir` holds a temporary file of depths. `on_progress(done, total)` is called in this thread after each
+    photograph, once for matching and once for confirming. Deterministic for any `threads`; raises what `read_image`
+    raises, and VdgsError where the disk has no room.
     """
     cameras = [_matched_size(camera) for camera in inputs.cameras]
-    others, groups = (
-        select_source_views(inputs.cameras, inputs.sample_points),
-        SpatialGroups.of(torch.from_numpy(inputs.points)),
-    )
+    others = select_source_views(inputs.cameras, inputs.sample_points)
+    groups = SpatialGroups.of(torch.from_numpy(inputs.points))
     views = lru_cache(MAX_CACHED_VIEWS)(lambda index: _view(inputs, groups, cameras[index], index))
     width, height = max(each.width for each in cameras), max(each.height for each in cameras)
-    steps, of = iter(range(1, 2 * len(cameras) + 1)), 2 * len(cameras)
     with tempfile.TemporaryFile(dir=scratch_dir) as file, ThreadPoolExecutor(max(1, threads)) as pool:
         shape = (len(cameras), height, width)
         _reserve(file, 2 * math.prod(shape), scratch_dir)
@@ -136,11 +131,16 @@ def compute_dense_points(
         def confirm(index: int) -> _Cells:
             return _geometric_consistency(inputs, cameras, depths, index, others[index], cell)
 
-        for _ in pool.map(match, range(len(cameras))):
-            on_progress(next(steps), of)
-        found = _summed(_report_progress(pool.map(confirm, range(len(cameras))), steps, of, on_progress))
+        def confirmed() -> Iterator[_Cells]:
+            for done, cells in enumerate(pool.map(confirm, range(len(cameras))), len(cameras) + 1):
+                on_progress(done, 2 * len(cameras))
+                yield cells
+
+        for done, _ in enumerate(pool.map(match, range(len(cameras))), 1):
+            on_progress(done, 2 * len(cameras))
+        total = _summed(confirmed())
         del depths
-    return _fused(found, cell)
+    return _fused(total, cell)
 
 
 def _reserve(file: IO[bytes], size: int, folder: Path) -> None:
@@ -155,14 +155,6 @@ def _reserve(file: IO[bytes], size: int, folder: Path) -> None:
             f"{folder}: depths of stereo need {data_size(size)} there for a while ({error.strerror}). "
             f"{disk_hint(error)}, then run the same command again."
         ) from error
-
-
-def _report_progress(
-    cells: Iterator[_Cells], steps: Iterator[int], of: int, on_progress: Callable[[int, int], None]
-) -> Iterator[_Cells]:
-    for each in cells:
-        on_progress(next(steps), of)
-        yield each
 
 
 def _matched_size(camera: Camera) -> Camera:
@@ -201,12 +193,8 @@ def _geometric_consistency(
     for other in others:
         inside, agrees = _told_by(places, cameras[other], depths[other])
         held, agreed = held + inside, agreed + agrees
-    confirmed = (
-        known
-        & (agreed >= 1)
-        & (agreed >= MIN_AGREEING_FRACTION * held)
-        & (np.abs(places) < MAX_CELL_INDEX * cell.min_edge).all(-1)
-    )
+    confirmed = known & (agreed >= 1) & (agreed >= MIN_AGREEING_FRACTION * held)
+    confirmed &= (np.abs(places) < MAX_CELL_INDEX * cell.min_edge).all(-1)
     picture, mask = inputs.read_image(index)
     size = (camera.width, camera.height)
     if mask is not None:

@@ -78,10 +78,8 @@ def _as_seen_by(camera: Camera, common: RectifiedPair, along: Float[np.ndarray, 
     column, row = (there[..., axis].astype(np.float32) for axis in (0, 1))
     depth = cv2.remap(along, column, row, cv2.INTER_NEAREST, borderValue=0)
     axis = camera.forward @ common.rotation.T
-    across = np.stack(
-        [(column + 0.5 - common.columns[0]) / common.focal, (row + 0.5 - common.row) / common.focal, np.ones_like(row)],
-        -1,
-    )
+    x, y = (column + 0.5 - common.columns[0]) / common.focal, (row + 0.5 - common.row) / common.focal
+    across = np.stack([x, y, np.ones_like(row)], -1)
     return np.maximum(depth * (across @ axis), 0.0).astype(np.float32)
 
 

@@ -1,8 +1,7 @@
-"""Which photographs each one is compared with: near enough to be alike, far enough apart to tell depth.
+"""Source views of each photograph: near enough to look alike, far enough apart to measure depth.
 
-A few neighbours that all lie to one side would leave the far side of a photograph alone, and what most photographs show
-needs no help. So places count for less the more cameras see them, and partners are chosen greedily: each next one for
-what those before it serve worst.
+Points count for less the more cameras see them, and views are chosen greedily, each for the points that the earlier
+ones cover worst, so that they do not all lie to one side.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ NUM_SOURCE_VIEWS = 8
 BEST_ANGLE_DEG, SIGMA_BELOW_DEG, SIGMA_ABOVE_DEG = 12.0, 4.0, 12.0
 #: So many of the places that a photograph shows speak for it, and fewer than so many do not.
 NUM_SAMPLE_POINTS, MIN_SAMPLE_POINTS = 300, 8
-#: Photographs that look at places nearest to one's own are asked: pairs of a large flight are too many to look at.
+#: Photographs that look at places nearest to one's own are candidates: pairs of a large flight are too many to look at.
 MAX_CANDIDATES = 64
 #: A partner must serve at least this share of what a photograph shows.
 MIN_COVERAGE_GAIN = 0.01
@@ -47,12 +46,12 @@ def select_source_views(
     middles = np.stack([points[shown[index]].mean(0) for index in seen])
     _, near = cKDTree(middles).query(middles, k=min(MAX_CANDIDATES, len(seen)), workers=1)
     for index, others in zip(seen, near, strict=True):
-        asked = np.array([seen[other] for other in np.sort(others) if seen[other] != index], np.int64)
+        candidates = np.array([seen[other] for other in np.sort(others) if seen[other] != index], np.int64)
         mine = points[shown[index]]
-        sees = np.stack([cameras[other].in_frustum(mine) for other in asked])
+        sees = np.stack([cameras[other].in_frustum(mine) for other in candidates])
         need = 1.0 / views[shown[index]]
-        worth = _view_score(centers[index], centers[asked], mine) * sees * (need / need.mean())
-        found[index] = [int(asked[k]) for k in _greedily(worth, count)]
+        worth = _view_score(centers[index], centers[candidates], mine) * sees * (need / need.mean())
+        found[index] = [int(candidates[k]) for k in _greedily(worth, count)]
     return found
 
 
