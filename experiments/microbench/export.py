@@ -29,7 +29,7 @@ from rich.console import Console
 
 from vdgs.captures.capture import Capture, View
 from vdgs.config.commands import ExportRequest
-from vdgs.export import export_run
+from vdgs.export.export_run import export_run, resolve_request
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.kernels import get_backend, get_num_threads, set_num_threads
@@ -113,13 +113,12 @@ def one(anchors: int, folder: Path, names: list[str], measure: bool) -> None:
         folder=RunFolder(folder / "run"), model=model, model_path=file, name="coarse", status=StatusRecord(), key="key",
         warning="", capture=capture,
     )  # fmt: skip
-    export_run.open_run = lambda *_: run
     set_num_threads(get_num_threads())
     began, before = time.monotonic(), time.process_time()
     args = ExportRequest(
         run=folder / "run", output=tuple(folder / name for name in names), evaluate=measure, device="cpu"
     )
-    record = export_run.export_run(args, Console(quiet=True))
+    record = export_run(run, resolve_request(args), Console(quiet=True))
     print(json.dumps({
         "anchors": anchors, "gaussians": record["gaussians"], "views": len(cameras),
         "seconds": time.monotonic() - began, "processor": time.process_time() - before,

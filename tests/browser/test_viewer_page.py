@@ -71,8 +71,8 @@ def test_a_browser_shows_the_scene(viewer):
         camera = in_window(visitor)
         assert camera is not None
         page.click(340.0, 440.0)
-        wait_until(lambda: "ground frame" in visitor.place._words.content)
-        place = visitor.place._place
+        wait_until(lambda: "ground frame" in visitor.point_panel._label.content)
+        place = visitor.point_panel._point
         assert place is not None
         assert camera.project(place.position[None])[0][0] == pytest.approx((340.0, 440.0), abs=1.0)
         page.drag((340.0, 440.0), (430.0, 400.0))
@@ -98,13 +98,13 @@ def test_a_browser_shows_every_layer_and_goes_where_buttons_lead(viewer):
 
         shown = {}
         for name in LAYER_LABELS:
-            visitor._layer.value = name
+            visitor._layer_choice.value = name
             wait_until(lambda name=name: visitor.display.layer == LAYER_LABELS[name])
             wait_until(lambda: np.abs(seen() - painted()).mean() < 6)
             shown[name] = seen()
         for one, other in combinations(shown, 2):
             assert np.abs(shown[one] - shown[other]).mean() > 3, (one, other)
-        visitor._layer.value = "Color"
+        visitor._layer_choice.value = "Color"
         for name, looks in (("From above", (0, 0, -1)), ("All", (0, 0.71, -0.71))):
             wait_until(lambda name=name: page.press(name))
             wait_until(lambda looks=looks: visitor.camera.forward == pytest.approx(looks, abs=0.02))

@@ -18,10 +18,9 @@ from support.gaussians import random_gaussians
 from support.hand_made_models import capture_at, ground, model_at
 from vdgs.config.commands import ExportRequest
 from vdgs.errors import VdgsError
-from vdgs.export import export_run as export_module
 from vdgs.export import local_bake
 from vdgs.export.bake import collect_contributions
-from vdgs.export.export_run import RECORD_FILE, export_run
+from vdgs.export.export_run import RECORD_FILE, export_run, resolve_request
 from vdgs.export.formats import registry
 from vdgs.export.local_frame import MAX_LOCAL_COORDINATE, make_local_frame
 from vdgs.export.programs import PROGRAMS
@@ -47,7 +46,7 @@ def scattered(parts: tuple[int, ...] = ()) -> AnchorModel:
 
 
 @pytest.fixture
-def export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def export(tmp_path: Path):
     """`vdgs export` of a model that was never trained, into files of these names."""
 
     def run(
@@ -65,11 +64,10 @@ def export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
             warning="",
             capture=capture_at(origin),
         )
-        monkeypatch.setattr(export_module, "open_run", lambda *_: opened)
         request = ExportRequest(
             run=tmp_path / "run", output=tuple(tmp_path / name for name in names), evaluate=False, device="cpu", **asked
         )
-        return export_run(request, QUIET)
+        return export_run(opened, resolve_request(request), QUIET)
 
     return run
 

@@ -113,11 +113,11 @@ def test_a_double_click_turns_about_the_place(viewer, guest):
     guest.stand(camera)
     guest.full_picture(camera)
     (visitor,) = viewer.sessions.values()
-    visitor.place.clock = lambda: 0.0  # all at the same time
+    visitor.point_panel.clock = lambda: 0.0  # all at the same time
     x, y = camera.project(np.array([[0.8, -0.6, 0.0]]))[0][0]
     guest.click(x / 640, y / 480)
     guest.click(x / 640 + 0.1, y / 480)  # elsewhere
-    wait_until(lambda: visitor.place._place is not None)
+    wait_until(lambda: visitor.point_panel._point is not None)
     assert visitor.camera.position == pytest.approx(camera.position)
     guest.click(x / 640, y / 480)
     guest.click(x / 640, y / 480)
@@ -139,7 +139,7 @@ def test_a_path_is_set_and_saved(viewer, guest, tmp_path):
         guest.full_picture(camera)
         guest.choose("Key frame", "Add")
         visitor = list(viewer.sessions.values())[-1]
-        wait_until(lambda visitor=visitor, count=count: len(visitor.path.keyframes) == count)
+        wait_until(lambda visitor=visitor, count=count: len(visitor.path_panel.keyframes) == count)
     guest.choose("Path", "Save")
     parts = b""
     for message in guest.messages():

@@ -33,10 +33,10 @@ from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.stage_folder import StatusRecord
 from vdgs.viewer import navigation, overlays
 from vdgs.viewer.image_comparison import nearest_view_index, warp_image
-from vdgs.viewer.keyframes import camera_at_time, path_json
 from vdgs.viewer.layers import LAYERS, DisplayOptions, Painter
 from vdgs.viewer.lod import LodPyramid
 from vdgs.viewer.measurement import Ruler
+from vdgs.viewer.path_panel import camera_at_time, path_json
 from vdgs.viewer.picking import pick_point, pick_position, thumbnail
 from vdgs.viewer.viewer_scene import ViewerScene
 

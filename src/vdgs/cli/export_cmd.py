@@ -39,14 +39,15 @@ def export_command(arguments: list[str]) -> None:
     asked = parse_arguments(ExportArguments, arguments, "vdgs export")
     device, console = set_up_compute(asked.device, asked.threads), make_console(asked.quiet)
     from vdgs.distributed.sharded_job import ExecutionOptions
-    from vdgs.export.export_run import export_run
+    from vdgs.export.export_run import export_run, resolve_request
+    from vdgs.runs.open_run import open_run
 
     asked.executor_options.check()
-    export_run(
-        replace(asked, device=device), console, ExecutionOptions(asked.executor_options, asked.jobs, device=device)
-    )
+    request = resolve_request(replace(asked, device=device))
+    run = open_run(request.run, request.model, device)
+    export_run(run, request, console, ExecutionOptions(asked.executor_options, asked.jobs, device=device))
     from vdgs.report.write_report import write_report
-    from vdgs.runs.run_folder import REPORT_FILE, RunFolder
+    from vdgs.runs.run_folder import REPORT_FILE
 
-    if any(path.suffix.lower() == ".html" for path in asked.output) and (asked.run / REPORT_FILE).exists():
-        write_report(RunFolder(asked.run))  # it leads to the page
+    if any(path.suffix.lower() == ".html" for path in request.output) and (asked.run / REPORT_FILE).exists():
+        write_report(run.folder)  # it leads to the page

@@ -35,7 +35,7 @@ from vdgs.export.novel_cameras import color_iteration_count, endless_cameras
 from vdgs.export.programs import axes_for, with_files
 from vdgs.geometry.camera import Camera
 from vdgs.model.gaussians import Gaussians
-from vdgs.runs.open_run import OpenedRun, open_run
+from vdgs.runs.open_run import OpenedRun
 from vdgs.runs.run_folder import REPORT_FILE
 from vdgs.system.atomic_files import to_jsonable, write_json
 from vdgs.system.documents import ExportedFile, ExportMetadata, JsonObject
@@ -99,18 +99,25 @@ def _point(place: np.ndarray) -> tuple[float, float, float]:
     return x, y, z
 
 
-def export_run(request: ExportRequest, console: Console, execution: ExecutionOptions | None = None) -> ExportMetadata:
-    """Write what was asked for, on a device that is chosen already; returns what RUN/export.json holds.
+def resolve_request(request: ExportRequest) -> ExportRequest:
+    """The request with its files named, checked before the run is opened, and the degree that they need.
 
-    The scene is baked in this process, or in shards where a `wish` sends them: the files are the same. Raises
-    VdgsError, before any Gaussian is baked, for file names of no format, outputs that are the run's report or among a
-    capture's inputs, an empty choice, and coordinates that a format or the capture does not have; and what
-    `ShardedJob.send` raises.
+    Raises VdgsError for file names of no format and for outputs that are the run's report.
     """
     request = with_files(request)
     _check_names(request)
-    request = drop_unused_sh_degrees(request)
-    run = open_run(request.run, request.model, request.device)
+    return drop_unused_sh_degrees(request)
+
+
+def export_run(
+    run: OpenedRun, request: ExportRequest, console: Console, execution: ExecutionOptions | None = None
+) -> ExportMetadata:
+    """Write the files of a resolved request from an opened run; returns what RUN/export.json holds.
+
+    The scene is baked in this process, or in shards where `execution` sends them: the files are the same. Raises
+    VdgsError, before any Gaussian is baked, for outputs among a capture's inputs, an empty choice, and coordinates
+    that a format or the capture does not have; and what `ShardedJob.send` raises.
+    """
     if run.warning:
         console.print(f"[yellow]warning[/] {run.warning}", highlight=False)
     for path in request.output:
@@ -191,8 +198,8 @@ def _check_names(asked: ExportRequest) -> None:
         check_not_in_capture(path)
         if path.name.lower() == REPORT_FILE and os.path.realpath(path.parent) == os.path.realpath(run):
             raise VdgsError(
-                f"--output {path}: is the report of the run, which would be overwritten, and written again over the page. "
-                "Choose another name, such as scene.html."
+                f"--output {path}: is the report of the run, which would be overwritten, and written again over the "
+                "page. Choose another name, such as scene.html."
             )
     twice = sorted({str(path) for path in paths if paths.count(path) > 1})
     if twice:

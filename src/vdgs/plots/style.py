@@ -1,10 +1,12 @@
-"""How all figures look: ink, thin axes, titles, the colours of visibility."""
+"""The look of all figures: ink, thin axes, titles, the colours of visibility."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
@@ -14,12 +16,33 @@ VISIBILITY_CMAP = LinearSegmentedColormap.from_list(
     "seen", ["#9d0208", "#dc2f02", "#f48c06", "#e9c46a", "#8ab17d", "#2a9d8f", "#1f6f8b", "#14395b"]
 )
 DPI = 120
-
-
-#: Type in points: what is smaller cannot be read where a figure of a page's width is shown at a screen's.
+#: Type in points: smaller type cannot be read where a figure of a page's width is shown at a screen's.
 TEXT_SIZE, NOTE_SIZE = 11.0, 10.0
-#: What a title that is too long shrinks to at most.
+#: Smallest size of a title that is too long.
 MIN_TITLE_SIZE = 4.0
+
+#: Places axes in a figure by left, bottom, width, height in inches.
+PlaceAxes = Callable[[float, float, float, float], Axes]
+
+
+def new_figure(width: float, height: float) -> tuple[Figure, PlaceAxes]:
+    """A figure of so many inches, and what places axes in it."""
+    figure = Figure(figsize=(width, height), dpi=DPI)
+    FigureCanvasAgg(figure)
+
+    def place(left: float, bottom: float, across: float, up: float) -> Axes:
+        width, height = figure.get_size_inches()
+        return figure.add_axes((left / width, bottom / height, across / width, up / height))
+
+    return figure, place
+
+
+def write_png(figure: Figure, file: Path) -> None:
+    figure.canvas.print_png(file)  # type: ignore[attr-defined]
+
+
+def pluralize(number: int, noun: str) -> str:
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
 def draw_titles(figure: Figure, name: str, subtitle: str, note: str) -> None:
@@ -34,22 +57,10 @@ def draw_titles(figure: Figure, name: str, subtitle: str, note: str) -> None:
             line.set_fontsize(size)
 
 
-def axes_placer(figure: Figure) -> Callable[[float, float, float, float], Axes]:
-    """Places axes by left, bottom, width, height in inches."""
-    width, height = figure.get_size_inches()
-
-    def place(left: float, bottom: float, across: float, up: float) -> Axes:
-        return figure.add_axes((left / width, bottom / height, across / width, up / height))
-
-    return place
-
-
 def style_axes(axes: Axes) -> None:
     """Thin ink: no box, faint ticks."""
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    for side in ("left", "bottom"):
-        axes.spines[side].set_color(MUTED)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(MUTED)
     axes.tick_params(colors=MUTED, labelcolor=INK, labelsize=NOTE_SIZE)
     for label in (axes.xaxis.label, axes.yaxis.label):
         label.set(color=INK, fontsize=TEXT_SIZE)

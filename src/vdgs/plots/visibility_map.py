@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import BoundaryNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -18,17 +18,8 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 from scipy.ndimage import binary_closing, binary_opening, gaussian_filter, label
 
 from vdgs.geometry.camera import Camera
-from vdgs.plots.style import (
-    ACCENT,
-    DPI,
-    INK,
-    NOTE_SIZE,
-    TEXT_SIZE,
-    VISIBILITY_CMAP,
-    axes_placer,
-    draw_titles,
-    style_axes,
-)
+from vdgs.plots import style
+from vdgs.plots.style import ACCENT, INK, NOTE_SIZE, TEXT_SIZE, VISIBILITY_CMAP, style_axes
 from vdgs.visibility.visibility_counts import LOW_VISIBILITY_LIMITS, count_visibility
 
 GRID_CELLS = 240
@@ -76,53 +67,37 @@ class VisibilityMapData:
 def plot_visibility_map(file: Path, data: VisibilityMapData) -> None:
     """Points and cameras from above, points coloured by V; beside it the histogram of V. Writes a PNG."""
     width, height = map_size_inches(data.low, data.high)
-    figure = Figure(figsize=(width + 4.7, height + 2.05), dpi=DPI)
-    canvas = FigureCanvasAgg(figure)
-    place = axes_placer(figure)
+    figure, place = style.new_figure(width + 4.7, height + 2.05)
     axes = place(0.85, 0.65, width, height)
     top, norm = visibility_color_norm(data.visibility)
-    lined = _ground(axes, data, norm)
+    bordered = _ground(axes, data, norm)
     order = np.argsort(-data.visibility, kind="stable")  # the poorly seen on top, so that none is hidden
     order = order[:: -(-len(order) // MAX_DRAWN_POINTS) or 1]
-    size = float(np.clip(6e4 / max(len(order), 1), 0.5, 7.0))
-    axes.scatter(
-        data.points[order, 0],
-        data.points[order, 1],
-        c=np.minimum(data.visibility[order], top),
-        s=size,
-        cmap=VISIBILITY_CMAP,
-        norm=norm,
-        linewidths=0,
-    )
+    size, (x, y) = float(np.clip(6e4 / max(len(order), 1), 0.5, 7.0)), data.points[order, :2].T
+    colors = np.minimum(data.visibility[order], top)
+    axes.scatter(x, y, size, colors, cmap=VISIBILITY_CMAP, norm=norm, linewidths=0)
     _cameras(axes, data.marks)
-    _legend(figure, axes, lined)
-    axes.set(xlim=(data.low[0], data.high[0]), ylim=(data.low[1], data.high[1]), aspect="equal")
-    axes.set(xlabel=data.x_label, ylabel=data.y_label)
+    _legend(figure, axes, bordered)
+    (x0, y0), (x1, y1) = data.low, data.high
+    axes.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", xlabel=data.x_label, ylabel=data.y_label)
     start = 0.85 + width + 0.75
     bar, histogram = place(start, 0.65, 0.2, height), place(start + 0.24, 0.65, 2.3, height)
     _histogram(bar, histogram, data.visibility, top, norm, data.noun)
     style_axes(axes)
-    draw_titles(figure, *data.titles)
-    canvas.print_png(file)  # type: ignore[arg-type]
+    style.draw_titles(figure, *data.titles)
+    style.write_png(figure, file)
 
 
 def _ground(axes: Axes, data: VisibilityMapData, norm: Normalize) -> bool:
-    """V on the level ground pale, and the border of where it is at least 3: also where there are no points. Returns
+    """Pale V on the level ground, and the border of where it is at least 3, also where there are no points. Returns
     whether there is such a border."""
-    low, high, cameras = data.low, data.high, data.marks[0].cameras
-    x = np.linspace(low[0], high[0], GRID_CELLS)
-    y = np.linspace(low[1], high[1], GRID_CELLS)
+    (x0, y0), (x1, y1), cameras = data.low, data.high, data.marks[0].cameras
+    x, y = np.linspace(x0, x1, GRID_CELLS), np.linspace(y0, y1, GRID_CELLS)
     grid = np.stack([*np.meshgrid(x, y), np.full((GRID_CELLS, GRID_CELLS), data.ground)], axis=-1)
     field = count_visibility(torch.from_numpy(grid.reshape(-1, 3)), cameras).numpy().reshape(GRID_CELLS, GRID_CELLS)
+    ground, colors = np.ma.masked_equal(field, 0), VISIBILITY_CMAP
     axes.imshow(
-        np.ma.masked_equal(field, 0),
-        origin="lower",
-        extent=(low[0], high[0], low[1], high[1]),
-        cmap=VISIBILITY_CMAP,
-        norm=norm,
-        alpha=0.22,
-        interpolation="nearest",
-        zorder=0,
+        ground, colors, norm, alpha=0.22, origin="lower", extent=(x0, x1, y0, y1), interpolation="nearest", zorder=0
     )
     covered = remove_speckles(field >= LOW_VISIBILITY_LIMITS[0])
     if covered.all() or not covered.any():
@@ -149,53 +124,32 @@ def remove_speckles(covered: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]
 def _cameras(axes: Axes, marks: Sequence[CameraMarks]) -> None:
     for mark in marks:
         centers = np.array([camera.position for camera in mark.cameras]).reshape(-1, 3)
-        axes.scatter(
-            centers[:, 0],
-            centers[:, 1],
-            marker="^",
-            s=mark.size,
-            linewidths=marker_edge_width(mark.size),
-            label=mark.label,
-            zorder=3,
-            facecolors=mark.face,
-            edgecolors=mark.edge,
-        )
+        draw_triangles(axes, centers[:, :2], mark.size, mark.face, mark.edge, zorder=3, label=mark.label)
 
 
-def _legend(figure: Figure, axes: Axes, lined: bool) -> None:
+def draw_triangles(axes: Axes, xy: np.ndarray, size: float, face: str, edge: str, **options: Any) -> None:
+    """Marks of `size` points², whose edge does not cover them."""
+    width, (x, y) = min(0.8, 0.15 * size**0.5), xy.T
+    axes.scatter(x, y, size, marker="^", linewidths=width, facecolors=face, edgecolors=edge, **options)
+
+
+def _legend(figure: Figure, axes: Axes, bordered: bool) -> None:
     """One line between the titles and the map."""
     handles, _ = axes.get_legend_handles_labels()
-    border = Line2D(
-        [],
-        [],
-        color=INK,
-        linewidth=BORDER_LINE_WIDTH,
-        label=f"border of V ≥ {LOW_VISIBILITY_LIMITS[0]} on level ground",
-    )
+    label = f"border of V ≥ {LOW_VISIBILITY_LIMITS[0]} on level ground"
+    border = Line2D([], [], color=INK, linewidth=BORDER_LINE_WIDTH, label=label)
     width, height = figure.get_size_inches()
     figure.legend(
-        handles=[*handles, border] if lined else handles, loc="upper left", ncols=3, fontsize=NOTE_SIZE, frameon=False,
+        handles=[*handles, border] if bordered else handles, loc="upper left", ncols=3, fontsize=NOTE_SIZE,
         bbox_to_anchor=(0.85 / width, 1 - 1.13 / height), handletextpad=0.4, columnspacing=1.2, borderaxespad=0,
-        borderpad=0.1,
+        borderpad=0.1, frameon=False,
     )  # fmt: skip
-
-
-def marker_edge_width(size: float) -> float:
-    """Width in points of the edge of a mark of `size` points²: the edge of a small mark must not cover it."""
-    return min(0.8, 0.15 * size**0.5)
-
-
-def _decimals(ticks: np.ndarray) -> int:
-    """How many decimals tell the ticks apart, at most 2."""
-    return next((digits for digits in (0, 1) if np.allclose(ticks, np.round(ticks, digits))), 2)
 
 
 def _histogram(bar: Axes, axes: Axes, visibility: np.ndarray, top: int, norm: Normalize, noun: str) -> None:
     """The colour scale, and growing out of it the histogram of V; the last step holds all above it."""
-    levels = np.arange(top + 1)
-    bar.imshow(
-        levels[:, None], origin="lower", extent=(0, 1, -0.5, top + 0.5), aspect="auto", cmap=VISIBILITY_CMAP, norm=norm
-    )
+    levels, limit, extent = np.arange(top + 1), LOW_VISIBILITY_LIMITS[0], (0, 1, -0.5, top + 0.5)
+    bar.imshow(levels[:, None], VISIBILITY_CMAP, norm, origin="lower", extent=extent, aspect="auto")
     bar.set_xticks([])
     step = max(1, round(top / 10))
     ticks = [level for level in levels[::step] if level < top - step / 2] + [top]
@@ -207,23 +161,17 @@ def _histogram(bar: Axes, axes: Axes, visibility: np.ndarray, top: int, norm: No
     median = min(float(np.median(visibility)), top)
     axes.plot([0, 1.12 * shares.max()], [median, median], color=INK, linewidth=0.8, linestyle=(0, (4, 3)))
     axes.text(1.12 * shares.max(), median, " median", va="center", fontsize=NOTE_SIZE, color=INK)
-    below = float((visibility < LOW_VISIBILITY_LIMITS[0]).mean())
-    note = axes.text(
-        shares[: LOW_VISIBILITY_LIMITS[0]].max() + 0.03 * shares.max(),
-        1,
-        f" {below:.1%} below {LOW_VISIBILITY_LIMITS[0]}",
-        va="center",
-        fontsize=TEXT_SIZE,
-        fontweight="bold",
-        color=ACCENT,
-    )
-    axes.set(
-        ylim=(-0.5, top + 0.5), xlim=(0, 1.4 * shares.max()), yticks=[], xlabel=f"share of the {noun.split()[-1]}s"
-    )
+    below, start = float((visibility < limit).mean()), shares[:limit].max() + 0.03 * shares.max()
+    text = f" {below:.1%} below {limit}"
+    note = axes.text(start, 1, text, va="center", fontsize=TEXT_SIZE, fontweight="bold", color=ACCENT)
+    x_label = f"share of the {noun.split()[-1]}s"
+    axes.set(ylim=(-0.5, top + 0.5), xlim=(0, 1.4 * shares.max()), yticks=[], xlabel=x_label)
     if note.get_window_extent().x1 > axes.figure.bbox.x1:  # too long beside the longest bar
-        note.set_text(f" {below:.1%}\n below {LOW_VISIBILITY_LIMITS[0]}")
+        note.set_text(f" {below:.1%}\n below {limit}")
     axes.xaxis.set_major_locator(MaxNLocator(4))
-    axes.xaxis.set_major_formatter(PercentFormatter(1, decimals=_decimals(100 * axes.get_xticks())))
+    percents = 100 * axes.get_xticks()
+    decimals = next((digits for digits in (0, 1) if np.allclose(percents, np.round(percents, digits))), 2)
+    axes.xaxis.set_major_formatter(PercentFormatter(1, decimals=decimals))
     for part in (bar, axes):
         style_axes(part)
         part.spines[:].set_visible(False)
@@ -236,9 +184,8 @@ def visibility_color_norm(visibility: np.ndarray) -> tuple[int, Normalize]:
     The 99 % quantile: a few points that very many cameras see must not flatten the rest.
     """
     top = max(int(np.quantile(visibility, 0.99)), LOW_VISIBILITY_LIMITS[-1])
-    return top, BoundaryNorm(np.arange(-0.5, top + 1), VISIBILITY_CMAP.N) if top < VISIBILITY_CMAP.N else Normalize(
-        0, top
-    )
+    n_colors = VISIBILITY_CMAP.N
+    return top, BoundaryNorm(np.arange(-0.5, top + 1), n_colors) if top < n_colors else Normalize(0, top)
 
 
 def map_size_inches(low: np.ndarray, high: np.ndarray, max_width: float = 8.0) -> tuple[float, float]:

@@ -110,7 +110,7 @@ def depth_scale(depth_limits: tuple[float, float], unit: str) -> ColorScale:
     low, high = depth_limits
     if high - low <= 1e-3 * abs(high):  # one plane
         low, high = 0.99 * low, 1.01 * high or 1.0
-    ticks = np.asarray(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high)).tolist()
+    ticks = [float(tick) for tick in MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high)]
     norm, colors = Normalize(ticks[0], ticks[-1], clip=True), mpl.colormaps["viridis"]
     labels = [f"{number:g}" for number in np.round(ticks, 9)]
     labels[0], labels[-1] = f"≤ {labels[0]}" if ticks[0] > 0 else labels[0], f"≥ {labels[-1]}"

@@ -244,9 +244,9 @@ def _seam_sentence(seams: JsonRecord) -> str:
         return ""
     return (
         f"Within {seams.format('border_px', '{:g}')} px of a border between blocks ({seams.count('border_pixels')} "
-        f"pixels), the error relative to elsewhere is {seams.format('seam_mae_ratio')} times what it is in the coarse model, "
-        f"which has no seams (mean absolute error; squared error {seams.format('seam_mse_ratio')}). 1 is no seam; above 1, "
-        "borders got worse."
+        f"pixels), the error relative to elsewhere is {seams.format('seam_mae_ratio')} times what it is in the coarse "
+        f"model, which has no seams (mean absolute error; squared error {seams.format('seam_mse_ratio')}). 1 is no "
+        "seam; above 1, borders got worse."
     )
 
 

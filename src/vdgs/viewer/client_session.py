@@ -1,4 +1,4 @@
-"""One visitor: their camera, what they chose to see, and the panel that they choose with."""
+"""One client: its camera, what it shows, and its panel."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from vdgs.viewer.point_panel import PointPanel
 from vdgs.viewer.render_scheduler import RenderedFrame, RenderScheduler
 from vdgs.viewer.viewer_scene import ViewerScene
 
-#: What layers are called in the panel.
+#: Labels of the layers in the panel.
 LAYER_LABELS: dict[str, Layer] = {
     "Color": "color", "Depth": "depth", "V: cameras that see it": "visibility", "Alpha: how opaque": "alpha",
     "Blocks": "blocks", "Error against nearest photograph": "error",
 }  # fmt: skip
 MODEL_LABELS = {"Merged": "merged", "Coarse": "coarse", "Side by side": "both"}
-#: JPEG quality of quick pictures and of full ones.
+#: JPEG quality of previews and of full images.
 _PREVIEW_QUALITY, _FULL_QUALITY = 70, 92
 _LEGEND_PX = 300
 #: Farther from where a photograph was taken than this share of the camera height, it no longer lies over the model.
@@ -37,92 +37,82 @@ _IMAGE_POSE_TOLERANCE = 2e-3
 
 
 class ClientSession:
-    """Between one browser and the studio. Callbacks of the browser come in any thread."""
+    """Connects one browser to the scheduler. Callbacks of the browser come in any thread."""
 
     def __init__(self, client: Any, scene: ViewerScene, scheduler: RenderScheduler, console: Console) -> None:
         self.client, self.scene, self.scheduler, self._console = client, scene, scheduler, console
         self._lock = threading.RLock()
-        self._shown = DisplayOptions(model=scene.names[0])
+        self._display = DisplayOptions(model=scene.names[0])
         self._camera: Camera | None = None
-        # Found once: with another limit at every move, a camera that rests would seem to be another one.
-        self._most_px = navigation.max_render_pixels(available_memory_bytes())
+        # Fixed for the session: with another limit at every move, a camera at rest would seem to move.
+        self._max_pixels = navigation.max_render_pixels(available_memory_bytes())
         self._arrived = False
-        self._legend_of: object = None
+        self._legend_key: object = None
         self.painter = Painter(scene)
-        self._seat = scheduler.add_session(self.painter, self._send_frame, self._on_render_error)
+        self._render_session = scheduler.add_session(self.painter, self._send_frame, self._on_render_error)
         self._build()
         client.camera.on_update(lambda _: self._on_camera_moved())
-        client.scene.on_click()(lambda event: self.place.on_click(event.screen_pos))
+        client.scene.on_click()(lambda event: self.point_panel.on_click(event.screen_pos))
         height = camera_height(scene.capture)
         client.camera.min_orbit_distance, client.camera.max_orbit_distance = 1e-3 * height, 200 * height
         self._on_camera_moved()
 
-    # ------------------------------------------------------------------------------------- what they see
-
     @property
     def camera(self) -> Camera | None:
-        """Where they are, at the size of their canvas, or the largest that is drawn."""
+        """The camera at the size of the canvas, or the largest that is drawn."""
         return self._camera
 
     @property
     def display(self) -> DisplayOptions:
-        return self._shown
+        return self._display
 
     @property
     def pose(self) -> CameraPose:
-        """Where they are and what they look at."""
         return CameraPose(np.array(self.client.camera.position), np.array(self.client.camera.look_at))
 
     def change_display(self, **changes: Any) -> None:
-        """See something else from the same place."""
+        """Show something else from the same camera."""
         with self._lock:
-            self._shown = replace(self._shown, **changes)
+            self._display = replace(self._display, **changes)
             if self._camera is not None:
-                self.scheduler.request_frame(self._seat, self._camera, self._shown)
+                self.scheduler.request_frame(self._render_session, self._camera, self._display)
 
     def move_to(self, pose: CameraPose, fov: float | None = None) -> None:
-        """Stand elsewhere."""
         camera = self.client.camera
         with self.client.atomic():
-            camera.up_direction = (0.0, 0.0, 1.0)
-            camera.position = tuple(pose.position)
+            camera.up_direction, camera.position = (0.0, 0.0, 1.0), tuple(pose.position)
             camera.look_at = tuple(pose.look_at)
             if fov is not None:
                 camera.fov = float(fov)
         self._on_camera_moved(from_browser=False)
 
     def view_image(self, index: int) -> None:
-        """Stand where a photograph was taken, with the photograph over the model."""
-        taken = self.scene.capture.views[index].camera
+        """Move to the camera of a photograph, with the photograph over the model."""
+        camera, height = self.scene.capture.views[index].camera, camera_height(self.scene.capture)
         with self._lock:
             self._arrived = False
-            self._shown = replace(self._shown, image_index=index)
-            self._photograph.visible = True
-        self.move_to(
-            navigation.pose_from_camera(taken, camera_height(self.scene.capture)),
-            navigation.fov_to_fit(taken, self.client.camera.aspect),
-        )
+            self._display = replace(self._display, image_index=index)
+            self._image_split.visible = True
+        fov = navigation.fov_to_fit(camera, self.client.camera.aspect)
+        self.move_to(navigation.pose_from_camera(camera, height), fov)
 
     def on_model_changed(self) -> None:
         """The run has a newer model."""
-        names = ["both", *self.scene.names] if len(self.scene.names) > 1 else [*self.scene.names]
-        model = self._shown.model if self._shown.model in names else self.scene.names[0]
-        self._models.visible = len(self.scene.names) > 1
-        self._legend_of = None
-        self.change_display(model=model)
+        model, several = self._display.model, len(self.scene.names) > 1
+        self._model_choice.visible = several
+        self._legend_key = None
+        self.change_display(model=model if several and model == "both" else self.scene.shown_name(model))
 
     def set_progress(self, progress: str) -> None:
-        """How far training is."""
         self._progress.content = progress
         self._training.visible = bool(progress)
 
     def close(self) -> None:
-        self.path.stop()
-        self.scheduler.remove_session(self._seat)
+        self.path_panel.stop()
+        self.scheduler.remove_session(self._render_session)
 
     def _on_camera_moved(self, from_browser: bool = True) -> None:
-        """Draw for where the camera is now: by the browser (`theirs`), which may still send older news after we told it
-        to go elsewhere, or by us."""
+        """Draw for the camera that the browser has now; after `move_to` it may still send older ones for a while."""
         state = self.client.camera
         try:
             camera = navigation.camera_from_browser(
@@ -130,28 +120,28 @@ class ClientSession:
             )
         except (ValueError, AssertionError):  # a canvas that is just being laid out
             return
-        camera = navigation.limit_resolution(camera, self._most_px)
+        camera = navigation.limit_resolution(camera, self._max_pixels)
         with self._lock:
             if self._camera is not None and is_same_view(camera, self._camera):
-                return  # the browser tells again what we know: the camera rests
+                return  # the camera rests
             self._camera = camera
             if from_browser:
-                self._leave_photograph(camera)
-            self.scheduler.request_frame(self._seat, camera, self._shown)
+                self._hide_image_if_left(camera)
+            self.scheduler.request_frame(self._render_session, camera, self._display)
 
-    def _leave_photograph(self, camera: Camera) -> None:
-        index = self._shown.image_index
+    def _hide_image_if_left(self, camera: Camera) -> None:
+        index = self._display.image_index
         if index is None:
             return
-        away = float(np.linalg.norm(self.scene.capture.views[index].camera.position - camera.position))
-        if away <= _IMAGE_POSE_TOLERANCE * camera_height(self.scene.capture):
+        distance = float(np.linalg.norm(self.scene.capture.views[index].camera.position - camera.position))
+        if distance <= _IMAGE_POSE_TOLERANCE * camera_height(self.scene.capture):
             self._arrived = True
         elif self._arrived:
-            self._shown = replace(self._shown, image_index=None)
-            self._photograph.visible = False
+            self._display = replace(self._display, image_index=None)
+            self._image_split.visible = False
 
     def _send_frame(self, frame: RenderedFrame) -> None:
-        """Send a picture, and its legend once the camera rests. In the studio's thread."""
+        """Send an image, and its legend once the camera rests. Runs in the thread of the scheduler."""
         quality = _FULL_QUALITY if frame.is_full else _PREVIEW_QUALITY
         self.client.scene.set_background_image(frame.image, format="jpeg", jpeg_quality=quality)
         self.client.flush()
@@ -165,60 +155,60 @@ class ClientSession:
         scale = self.painter.scale(display)
         if scale is None:
             return
-        if self._legend_of != (display.layer, display.model, scale.low, scale.high):
+        key = (display.layer, display.model, scale.low, scale.high)
+        if self._legend_key != key:
             from vdgs.rendering.scalar_maps import draw_colorbar
 
-            self._legend.image = np.ascontiguousarray(draw_colorbar(scale, _LEGEND_PX, 0))
-            self._legend_of = (display.layer, display.model, scale.low, scale.high)
+            self._legend.image, self._legend_key = np.ascontiguousarray(draw_colorbar(scale, _LEGEND_PX, 0)), key
         self._legend.visible = True
 
     def _on_render_error(self, error: Exception) -> None:
-        """What they asked for cannot be drawn: say why, and show colours again."""
+        """Report why a view cannot be drawn, and show colors again."""
         self.notify("This cannot be drawn", str(error))
         if not isinstance(error, VdgsError):
             self._console.print(f"[yellow]warning[/] a picture could not be drawn: {error!r}", highlight=False)
-        if self._shown.layer != "color" or self._shown.image_index is not None:
-            self._layer.value = next(iter(LAYER_LABELS))
+        if self._display.layer != "color" or self._display.image_index is not None:
+            self._layer_choice.value = next(iter(LAYER_LABELS))
             self.change_display(layer="color", image_index=None)
 
     def notify(self, title: str, body: str) -> None:
         self.client.add_notification(title, body, auto_close_seconds=8.0)
 
     def submit(self, function: Callable[[], Any]) -> Any:
-        """Have something done by the studio; None, and the visitor told, where it fails for a reason to be told."""
+        """Run a function in the thread of the scheduler; None, with a notification, where it raises VdgsError."""
         try:
             return self.scheduler.submit(function).result()
         except VdgsError as error:
             self.notify("This cannot be shown", str(error))
         except CancelledError:
-            pass  # the studio closes: nobody is there to be told
+            pass  # the scheduler closes
         return None
-
-    # ------------------------------------------------------------------------------------- the panel
 
     def _build(self) -> None:
         gui = self.client.gui
-        self._layer = gui.add_dropdown("Layer", tuple(LAYER_LABELS), hint=f"What is drawn: one of {len(LAYERS)} layers")
-        self._layer.on_update(lambda _: self.change_display(layer=LAYER_LABELS[self._layer.value]))
+        self._layer_choice = gui.add_dropdown(
+            "Layer", tuple(LAYER_LABELS), hint=f"What is drawn: one of {len(LAYERS)} layers"
+        )
+        self._layer_choice.on_update(lambda _: self.change_display(layer=LAYER_LABELS[self._layer_choice.value]))
         self._legend = gui.add_image(np.full((2, _LEGEND_PX, 3), 255, np.uint8), format="png", visible=False)
         several = len(self.scene.names) > 1
-        self._models = gui.add_dropdown("Model", tuple(MODEL_LABELS), visible=several)
-        self._models.on_update(lambda _: self._choose_model())
-        self._split = gui.add_slider("Coarse | merged", 0.0, 1.0, 0.01, 0.5, visible=False)
-        self._split.on_update(lambda _: self.change_display(split=float(self._split.value)))
-        self._photograph = gui.add_slider("Photograph | model", 0.0, 1.0, 0.01, 0.5, visible=False)
-        self._photograph.on_update(lambda _: self.change_display(image_split=float(self._photograph.value)))
+        self._model_choice = gui.add_dropdown("Model", tuple(MODEL_LABELS), visible=several)
+        self._model_choice.on_update(lambda _: self._choose_model())
+        self._model_split = gui.add_slider("Coarse | merged", 0.0, 1.0, 0.01, 0.5, visible=False)
+        self._model_split.on_update(lambda _: self.change_display(split=float(self._model_split.value)))
+        self._image_split = gui.add_slider("Photograph | model", 0.0, 1.0, 0.01, 0.5, visible=False)
+        self._image_split.on_update(lambda _: self.change_display(image_split=float(self._image_split.value)))
         self._build_views()
         self._build_overlays()
-        self.place = PointPanel(self)
-        self.path = PathPanel(self)
+        self.point_panel = PointPanel(self)
+        self.path_panel = PathPanel(self)
         self._training = gui.add_folder("Training", visible=False)
         with self._training:
             self._progress = gui.add_markdown("")
 
     def _choose_model(self) -> None:
-        model = MODEL_LABELS[self._models.value]
-        self._split.visible = model == "both"
+        model = MODEL_LABELS[self._model_choice.value]
+        self._model_split.visible = model == "both"
         self.change_display(model=model)
 
     def _build_views(self) -> None:
@@ -227,47 +217,42 @@ class ClientSession:
 
         @buttons.on_click
         def _(_: Any) -> None:
-            change: dict[str, Callable[[], CameraPose]] = {
+            poses: dict[str, Callable[[], CameraPose]] = {
                 "All": lambda: navigation.overview_pose(self.scene.capture),
                 "From above": lambda: navigation.top_down_pose(self.pose),
                 "North up": lambda: navigation.north_up_pose(self.pose),
             }
-            self.move_to(change[buttons.value](), np.radians(FOV_DEG))
+            self.move_to(poses[buttons.value](), np.radians(FOV_DEG))
 
     def _build_overlays(self) -> None:
         gui = self.client.gui
         with gui.add_folder("Over it"):
             self._checkbox("Block borders", self._add_borders)
-            self._checkbox("Cameras", self._add_cameras)
+            self._checkbox("Cameras", lambda: self._add_lines("cameras", overlays.camera_frusta, 1.5))
             self._checkbox("Sparse points", self._add_points)
 
     def _checkbox(self, name: str, add: Callable[[], Any]) -> None:
         box = self.client.gui.add_checkbox(name, False)
-        drawn: list[Any] = []
+        handles: list[Any] = []
 
         @box.on_update
         def _(_: Any) -> None:
-            while drawn:
-                drawn.pop().remove()
+            while handles:
+                handles.pop().remove()
             if box.value and (handle := add()) is not None:
-                drawn.append(handle)
+                handles.append(handle)
 
     def _add_borders(self) -> Any:
-        lines = self._lines("borders", overlays.block_borders, 3.0)
+        lines = self._add_lines("borders", overlays.block_borders, 3.0)
         if lines is None:
             self.notify("No borders", "The scene is not cut into blocks.")
         return lines
 
-    def _add_cameras(self) -> Any:
-        return self._lines("cameras", overlays.camera_frusta, 1.5)
-
-    def _lines(self, name: str, of: Callable[[ViewerScene], overlays.LineSegments], thickness: float) -> Any:
-        found = self.submit(lambda: of(self.scene))
-        if found is None or not len(found[0]):
+    def _add_lines(self, name: str, make: Callable[[ViewerScene], overlays.LineSegments], width: float) -> Any:
+        lines = self.submit(lambda: make(self.scene))
+        if lines is None or not len(lines[0]):
             return None
-        return self.client.scene.add_line_segments(
-            f"/{name}", *found, thickness=thickness, thickness_units="screen"
-        )  # fmt: skip
+        return self.client.scene.add_line_segments(f"/{name}", *lines, thickness=width, thickness_units="screen")
 
     def _add_points(self) -> Any:
         points, colors = overlays.sparse_points(self.scene)

@@ -18,9 +18,9 @@ from vdgs.viewer.viewer_scene import ViewerScene
 
 #: Photographs are compared at most so large (longer side): an error map is for looking at.
 _MAX_COMPARE_PX = 800
-#: A place is what a photograph shows if the depths agree so well (share).
+#: A point is what a photograph shows if the depths agree so well (share).
 _DEPTH_TOLERANCE = 0.03
-#: Maps of errors that are kept.
+#: Error maps in the cache.
 _MAX_CACHED = 6
 
 
@@ -42,37 +42,37 @@ def nearest_view_index(scene: ViewerScene, camera: Camera) -> int:
     """
     height = camera_height(scene.capture)
 
-    def away(each: Camera) -> float:
-        turn = np.arccos(np.clip(float(each.forward @ camera.forward), -1.0, 1.0))
-        return float(np.linalg.norm(each.position - camera.position)) / height + float(turn)
+    def distance(index: int) -> float:
+        view = scene.capture.views[index].camera
+        turn = np.arccos(np.clip(float(view.forward @ camera.forward), -1.0, 1.0))
+        return float(np.linalg.norm(view.position - camera.position)) / height + float(turn)
 
-    return min(range(len(scene.capture.views)), key=lambda index: away(scene.capture.views[index].camera))
+    return min(range(len(scene.capture.views)), key=distance)
 
 
 class ImageComparison:
-    """Errors against photographs, each found once and kept a while. Used from the thread that draws."""
+    """Errors against photographs, cached. Used from the thread that draws."""
 
     def __init__(self, scene: ViewerScene) -> None:
         self._scene = scene
-        self._kept: OrderedDict[tuple[int, str, int], ImageErrorMap] = OrderedDict()
+        self._cache: OrderedDict[tuple[int, str, int], ImageErrorMap] = OrderedDict()
 
-    def error_map(self, name: str, camera: Camera, whole: Camera) -> Float[np.ndarray, "h w"]:
-        """The error against the photograph nearest to the `whole` view, as its part `camera` sees it; NaN where that
-        photograph does not show the place, or is masked."""
-        misses = self._cached_error_map(name, nearest_view_index(self._scene, whole))
-        model = self._scene.model(name)
-        depth = render(model, camera, depth=True).median_depth
+    def error_map(self, name: str, camera: Camera, full_camera: Camera) -> Float[np.ndarray, "h w"]:
+        """The error against the photograph nearest to `full_camera`, as its part `camera` sees it; NaN where that
+        photograph does not show the point, or is masked."""
+        error_map = self._cached_error_map(name, nearest_view_index(self._scene, full_camera))
+        depth = render(self._scene.model(name), camera, depth=True).median_depth
         assert depth is not None
-        return _reproject_error(misses, camera, depth.cpu().numpy())
+        return _reproject_error(error_map, camera, depth.cpu().numpy())
 
     def _cached_error_map(self, name: str, index: int) -> ImageErrorMap:
         key = (self._scene.generation, name, index)
-        if key not in self._kept:
-            self._kept[key] = self._compute_error_map(name, index)
-            while len(self._kept) > _MAX_CACHED:
-                self._kept.popitem(last=False)
-        self._kept.move_to_end(key)
-        return self._kept[key]
+        if key not in self._cache:
+            self._cache[key] = self._compute_error_map(name, index)
+            while len(self._cache) > _MAX_CACHED:
+                self._cache.popitem(last=False)
+        self._cache.move_to_end(key)
+        return self._cache[key]
 
     def _compute_error_map(self, name: str, index: int) -> ImageErrorMap:
         view = self._scene.capture.views[index]
@@ -93,14 +93,13 @@ def _reproject_error(
     error_map: ImageErrorMap, camera: Camera, depth: Float[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "h w"]:
     """Errors where `camera` sees them, from where the photograph does."""
-    places = camera.unproject(depth).reshape(-1, 3)
-    pixels, away = error_map.camera.project(places)
+    pixels, distance = error_map.camera.project(camera.unproject(depth).reshape(-1, 3))
     x, y = ((pixels[:, axis] - 0.5).reshape(depth.shape).astype(np.float32) for axis in (0, 1))
-    there = cv2.remap(error_map.depth, x, y, cv2.INTER_NEAREST, borderValue=0.0)
+    shown_depth = cv2.remap(error_map.depth, x, y, cv2.INTER_NEAREST, borderValue=0.0)
     error = cv2.remap(error_map.error, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    away = away.reshape(depth.shape)
-    shown = (depth > 0) & (away > 0) & (there > 0) & (np.abs(there - away) <= _DEPTH_TOLERANCE * np.abs(away))
-    return np.where(shown, error, np.nan).astype(np.float32)
+    distance = distance.reshape(depth.shape)
+    agrees = np.abs(shown_depth - distance) <= _DEPTH_TOLERANCE * np.abs(distance)
+    return np.where((depth > 0) & (distance > 0) & (shown_depth > 0) & agrees, error, np.nan).astype(np.float32)
 
 
 def load_resized_image(scene: ViewerScene, index: int, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
@@ -112,20 +111,20 @@ def load_resized_image(scene: ViewerScene, index: int, width: int, height: int) 
 def warp_image(
     scene: ViewerScene, index: int, camera: Camera
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """A photograph as a camera at the same place sees it, however it is turned and however wide it looks, and where
-    there is any: from one place, turning is a mapping of pixels to pixels."""
+    """A photograph as another camera at the same position sees it, and where it covers that view: without a change of
+    position, pixels map to pixels."""
     taken = scene.capture.views[index].camera
     scale = min(1.0, camera.fx / taken.fx)
     taken = taken.resized(max(1, round(taken.width * scale)), max(1, round(taken.height * scale)))
-    picture = load_resized_image(scene, index, taken.width, taken.height)
+    image = load_resized_image(scene, index, taken.width, taken.height)
     turn = camera.camera_from_world[:3, :3] @ taken.camera_from_world[:3, :3].T
     mapping = _intrinsics(camera) @ turn @ np.linalg.inv(_intrinsics(taken))
     size = (camera.width, camera.height)
-    warped = cv2.warpPerspective(picture, mapping, size, flags=cv2.INTER_LINEAR)
-    inside = cv2.warpPerspective(np.ones(picture.shape[:2], np.uint8), mapping, size, flags=cv2.INTER_NEAREST)
+    warped = cv2.warpPerspective(image, mapping, size, flags=cv2.INTER_LINEAR)
+    inside = cv2.warpPerspective(np.ones(image.shape[:2], np.uint8), mapping, size, flags=cv2.INTER_NEAREST)
     x, y = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    behind = np.linalg.inv(mapping)[2] @ np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
-    return np.asarray(warped), (inside > 0) & (behind.reshape(inside.shape) > 0)
+    in_front = np.linalg.inv(mapping)[2] @ np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
+    return np.asarray(warped), (inside > 0) & (in_front.reshape(inside.shape) > 0)
 
 
 def _intrinsics(camera: Camera) -> Float[np.ndarray, "3 3"]:

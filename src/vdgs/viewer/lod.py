@@ -1,7 +1,7 @@
-"""Fewer, larger Gaussians for quick pictures: what takes time is how many there are, not how many pixels they fill.
+"""Levels of detail: fewer, larger Gaussians for previews, whose time follows from their number, not from pixels.
 
-Only pictures of a moving camera are drawn with them, and only where so much is in view that single Gaussians are small.
-At rest the model itself is drawn.
+Only previews of a moving camera use them, where so much is in view that single Gaussians are small. At rest the model
+itself is drawn.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class LodLevel:
     mask: Bool[Tensor, " n"] | None = None
 
     def of(self, values: Tensor) -> Tensor:
-        """What is known of all anchors, of those that it holds."""
+        """Of values of all anchors, those of the anchors that it holds."""
         return values if self.mask is None else values[self.mask]
 
 
@@ -42,17 +42,15 @@ class LodPyramid:
         self._levels = [LodLevel(model)]
 
     def of(self, camera: Camera, max_anchors: int | None = None) -> tuple[LodLevel, int]:
-        """The model itself, or the finest level of which the camera sees at most so many anchors; and how many it
-        sees of it, about."""
-        whole = self._levels[0]
-        shown, number = len(cull_anchors(whole.model.anchors, camera)), 0
-        if max_anchors is None:
-            return whole, shown
-        while shown // decimation_factor(number) > max(max_anchors, 1):
+        """The model itself, or the finest level of which the camera sees at most so many anchors; and about how many
+        of them it sees."""
+        model = self._levels[0].model
+        visible, number = len(cull_anchors(model.anchors, camera)), 0
+        while max_anchors is not None and visible // decimation_factor(number) > max(max_anchors, 1):
             number += 1
         while len(self._levels) <= number:
-            self._levels.append(decimate(whole.model, decimation_factor(len(self._levels))))
-        return self._levels[number], shown // decimation_factor(number)
+            self._levels.append(decimate(model, decimation_factor(len(self._levels))))
+        return self._levels[number], visible // decimation_factor(number)
 
 
 def decimation_factor(level: int) -> int:

@@ -36,11 +36,11 @@ def block_borders(scene: ViewerScene) -> LineSegments:
 
 
 def _ground_below(scene: ViewerScene, points_xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-    """Heights of the sparse points about places: the median of the nearest eight."""
+    """Height of the ground at positions: the median of the nearest eight sparse points."""
     points = scene.capture.points
     if not len(points):
         return np.zeros(len(points_xy))
-    from scipy.spatial import cKDTree  # not before the first picture
+    from scipy.spatial import cKDTree  # slow to import
 
     _, nearest = cKDTree(points[:, :2]).query(points_xy, k=min(8, len(points)))
     return np.asarray(np.median(points[:, 2][np.reshape(nearest, (len(points_xy), -1))], axis=1))

@@ -1,44 +1,47 @@
-"""The part of the panel for a camera path: set key frames, play it, save it for `vdgs render --path`."""
+"""The part of the panel for a camera path: set key frames, play the path, save it for `vdgs render --path`."""
 
 from __future__ import annotations
 
+import json
 import threading
 import time
+from collections.abc import Sequence
 
 import numpy as np
 
 from vdgs.geometry.camera import Camera
-from vdgs.rendering.camera_paths import DEFAULT_SECONDS
-from vdgs.viewer.keyframes import camera_at_time, path_json
+from vdgs.rendering.camera_paths import DEFAULT_FPS, DEFAULT_SECONDS, interpolate
 from vdgs.viewer.navigation import CameraPose
 from vdgs.viewer.session_protocol import SessionProtocol
 
-#: Pictures a second while a path is played.
+#: Frames a second while a path is played.
 _PLAYBACK_FPS = 15.0
+#: Width of a video at most (choice).
+_MAX_WIDTH = 1920
 _FILE_NAME = "path.json"
 
 
 class PathPanel:
-    """The key frames of one visitor."""
+    """The key frames of one client."""
 
     def __init__(self, session: SessionProtocol) -> None:
-        self._visitor = session
+        self._session = session
         self.keyframes: list[Camera] = []
         self._stopping: threading.Event | None = None
         gui = session.client.gui
         with gui.add_folder("Camera path", expand_by_default=False):
-            self._words = gui.add_markdown("No key frames yet.")
+            self._label = gui.add_markdown("No key frames yet.")
             frames = gui.add_button_group("Key frame", ("Add", "Remove last"))
             self._seconds = gui.add_number("Seconds", DEFAULT_SECONDS, min=0.5, max=600.0, step=0.5)
             self._closed = gui.add_checkbox("Closed", False, hint="Come back to the first key frame")
-            acts = gui.add_button_group("Path", ("Play", "Stop", "Save"))
+            actions = gui.add_button_group("Path", ("Play", "Stop", "Save"))
         frames.on_click(lambda _: self.add() if frames.value == "Add" else self.remove_last())
-        acts.on_click(lambda _: {"Play": self.play, "Stop": self.stop, "Save": self.save}[acts.value]())
+        actions.on_click(lambda _: {"Play": self.play, "Stop": self.stop, "Save": self.save}[actions.value]())
 
     def add(self) -> None:
-        """The present view becomes the next key frame."""
-        if self._visitor.camera is not None:
-            self.keyframes.append(self._visitor.camera)
+        """Make the present view the next key frame."""
+        if self._session.camera is not None:
+            self.keyframes.append(self._session.camera)
         self._update_label()
 
     def remove_last(self) -> None:
@@ -47,29 +50,26 @@ class PathPanel:
 
     def _update_label(self) -> None:
         count = len(self.keyframes)
-        self._words.content = f"{count} key frame{'' if count == 1 else 's'}." if count else "No key frames yet."
-
-    def to_json(self) -> str:
-        """The file. Raises ValueError without key frames."""
-        return path_json(self.keyframes, float(self._seconds.value), bool(self._closed.value))
+        self._label.content = f"{count} key frame{'' if count == 1 else 's'}." if count else "No key frames yet."
 
     def save(self) -> None:
         """Let the browser download the path."""
         if not self.keyframes:
-            self._visitor.notify("No key frames", "Add key frames first.")
+            self._session.notify("No key frames", "Add key frames first.")
             return
-        self._visitor.client.send_file_download(_FILE_NAME, self.to_json().encode())
+        text = path_json(self.keyframes, float(self._seconds.value), bool(self._closed.value))
+        self._session.client.send_file_download(_FILE_NAME, text.encode())
 
     def play(self) -> None:
-        """Move along the path, as fast as the film will."""
+        """Move along the path, as fast as the video will."""
         if len(self.keyframes) < 2:
-            self._visitor.notify("Too few key frames", "A path is played between two key frames or more.")
+            self._session.notify("Too few key frames", "A path is played between two key frames or more.")
             return
         self.stop()
         stopping = self._stopping = threading.Event()
         frames, seconds, closed = list(self.keyframes), float(self._seconds.value), bool(self._closed.value)
 
-        def along() -> None:
+        def follow() -> None:
             began = time.monotonic()
             while not stopping.wait(1.0 / _PLAYBACK_FPS):
                 now = time.monotonic() - began
@@ -77,13 +77,42 @@ class PathPanel:
                 if now >= seconds:
                     return
 
-        threading.Thread(target=along, name="path", daemon=True).start()
+        threading.Thread(target=follow, name="path", daemon=True).start()
 
     def stop(self) -> None:
         if self._stopping is not None:
             self._stopping.set()
 
     def _move_camera(self, camera: Camera) -> None:
-        distance = self._visitor.pose.distance
+        distance = self._session.pose.distance
         fov = 2.0 * float(np.arctan(0.5 * camera.height / camera.fy))
-        self._visitor.move_to(CameraPose(camera.position.copy(), camera.position + distance * camera.forward), fov)
+        self._session.move_to(CameraPose(camera.position.copy(), camera.position + distance * camera.forward), fov)
+
+
+def path_json(keyframes: Sequence[Camera], seconds: float, closed: bool = False, fps: float = DEFAULT_FPS) -> str:
+    """The text of a camera path in the ground frame, of the size of its first key frame. Numbers keep all digits.
+
+    Raises ValueError without key frames.
+    """
+    if not keyframes:
+        raise ValueError("a camera path needs at least one key frame")
+    first = keyframes[0].limit_size(_MAX_WIDTH)
+    width, height = (max(2, size // 2 * 2) for size in (first.width, first.height))
+    content = {
+        "frame": "ground", "seconds": seconds, "fps": fps, "closed": closed, "interpolate": True,
+        "keyframes": [_keyframe_json(camera.resized(width, height)) for camera in keyframes],
+    }  # fmt: skip
+    return json.dumps(content, indent=1) + "\n"
+
+
+def _keyframe_json(camera: Camera) -> dict[str, object]:
+    return {
+        "camera_from_world": camera.camera_from_world.tolist(), "fx": camera.fx, "fy": camera.fy, "cx": camera.cx,
+        "cy": camera.cy, "width": camera.width, "height": camera.height,
+    }  # fmt: skip
+
+
+def camera_at_time(keyframes: Sequence[Camera], seconds: float, time: float, closed: bool = False) -> Camera:
+    """The camera of a path after so many seconds, as the video will have it."""
+    frames = interpolate(keyframes, max(1, round(seconds * DEFAULT_FPS)), closed)
+    return frames[min(max(int(time * DEFAULT_FPS), 0), len(frames) - 1)]

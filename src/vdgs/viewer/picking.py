@@ -1,4 +1,4 @@
-"""A place that was clicked: where it is, how many cameras see it, which, and whether something stands between."""
+"""A clicked point: its position, how many cameras see it, which, and whether something stands between."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vdgs.model.renderer import render
 from vdgs.viewer.image_comparison import load_resized_image
 from vdgs.viewer.viewer_scene import ViewerScene
 
-#: A camera sees a place freely if what it draws there is so near to it (share of the depth; choice).
+#: A camera sees a point unoccluded if the drawn depth is so near to its depth (share; choice).
 _OCCLUSION_TOLERANCE = 0.02
 #: Thumbnails: how large (longer side), and how large the part of the photograph about the place is (share).
 _THUMBNAIL_PX, _THUMBNAIL_CROP = 320, 0.5
@@ -24,7 +24,7 @@ _MARKER_COLOR = (255, 60, 40)
 
 @dataclass(frozen=True, eq=False)
 class ImageHit:
-    """A photograph that a place lies in."""
+    """A photograph that a point lies in."""
 
     #: In `capture.views`.
     index: int
@@ -39,14 +39,14 @@ class ImageHit:
 
 @dataclass(frozen=True, eq=False)
 class PickedPoint:
-    """What is known of a place on the surface of the model."""
+    """A point on the surface of the model."""
 
     position: Float[np.ndarray, "3"]
     #: V: training cameras whose pictures it lies in.
     visibility: int
     #: The block that owns it; None where the scene is not cut.
     block: int | None
-    #: All photographs that it lies in, the test views too: those that see it freely first, then the nearest.
+    #: All photographs that it lies in, the test views too: unoccluded ones first, then the nearest.
     hits: tuple[ImageHit, ...]
     #: Coordinates for people, a line each.
     coordinates: tuple[str, ...]
@@ -60,11 +60,8 @@ def pick_position(model: AnchorModel, camera: Camera, x: float, y: float) -> Flo
     column, row = int(np.floor(x)), int(np.floor(y))
     if not (0 <= column < camera.width and 0 <= row < camera.height):
         return None
-    pixel = camera.cropped(column, row, column + 1, row + 1)
-    raster = render(model, pixel, depth=True)
-    assert raster.median_depth is not None
-    depth = float(raster.median_depth[0, 0])
-    if depth <= 0 or float(raster.alpha[0, 0]) <= 0.5:
+    depth, alpha = _render_pixel(model, camera, column, row)
+    if depth <= 0 or alpha <= 0.5:
         return None
     local = np.array([(x - camera.cx) / camera.fx * depth, (y - camera.cy) / camera.fy * depth, depth])
     rotation, translation = camera.camera_from_world[:3, :3], camera.camera_from_world[:3, 3]
@@ -72,31 +69,36 @@ def pick_position(model: AnchorModel, camera: Camera, x: float, y: float) -> Flo
 
 
 def pick_point(scene: ViewerScene, name: str, position: Float[np.ndarray, "3"]) -> PickedPoint:
-    """All that is known of a place."""
     model, views = scene.model(name), scene.capture.views
-    sights = []
-    for index, view in enumerate(views):
-        if view.camera.in_frustum(position[None])[0]:
-            sights.append(_image_hit(model, view.camera, index, view.name, position))
-    seen_by = sum(views[sight.index].split == "train" for sight in sights)
-    owner = None if scene.blocks is None else int(scene.blocks.owner(position[None, :2])[0])
-    ordered = tuple(sorted(sights, key=lambda sight: (not sight.unoccluded, sight.ground_sampling)))
-    return PickedPoint(position, seen_by, owner, ordered, coordinate_lines(scene, position))
+    hits = [
+        _image_hit(model, view.camera, index, view.name, position)
+        for index, view in enumerate(views)
+        if view.camera.in_frustum(position[None])[0]
+    ]
+    visibility = sum(views[hit.index].split == "train" for hit in hits)
+    block = None if scene.blocks is None else int(scene.blocks.owner(position[None, :2])[0])
+    hits.sort(key=lambda hit: (not hit.unoccluded, hit.ground_sampling))
+    return PickedPoint(position, visibility, block, tuple(hits), coordinate_lines(scene, position))
 
 
 def _image_hit(model: AnchorModel, camera: Camera, index: int, name: str, position: np.ndarray) -> ImageHit:
     pixels, depth = camera.project(position[None])
     x, y = float(pixels[0, 0]), float(pixels[0, 1])
     column, row = min(int(x), camera.width - 1), min(int(y), camera.height - 1)
+    drawn, _ = _render_pixel(model, camera, column, row)
+    unoccluded = drawn == 0 or drawn >= float(depth[0]) * (1 - _OCCLUSION_TOLERANCE)
+    return ImageHit(index, name, (x, y), float(depth[0]) / camera.fx, unoccluded)
+
+
+def _render_pixel(model: AnchorModel, camera: Camera, column: int, row: int) -> tuple[float, float]:
+    """Median depth and alpha of one pixel."""
     raster = render(model, camera.cropped(column, row, column + 1, row + 1), depth=True)
     assert raster.median_depth is not None
-    drawn = float(raster.median_depth[0, 0])
-    free = drawn == 0 or drawn >= float(depth[0]) * (1 - _OCCLUSION_TOLERANCE)
-    return ImageHit(index, name, (x, y), float(depth[0]) / camera.fx, free)
+    return float(raster.median_depth[0, 0]), float(raster.alpha[0, 0])
 
 
 def coordinate_lines(scene: ViewerScene, position: Float[np.ndarray, "3"]) -> tuple[str, ...]:
-    """A place in the ground frame, on Earth, and on the map, as far as they are known."""
+    """A point in the ground frame, on Earth and on the map, as far as these are known."""
     ground = scene.capture.ground
     x, y = ("east", "north") if ground.origin_geo else ("x", "y")
     lines = [f"{x} {position[0]:.2f}, {y} {position[1]:.2f}, up {position[2]:.2f} {ground.unit} (ground frame)"]
@@ -110,13 +112,13 @@ def coordinate_lines(scene: ViewerScene, position: Float[np.ndarray, "3"]) -> tu
 
 
 def thumbnail(scene: ViewerScene, hit: ImageHit) -> UInt8[np.ndarray, "h w 3"]:
-    """The part of a photograph about a place, which is marked. Raises CaptureError if it cannot be read."""
+    """The part of a photograph about a point, which is marked. Raises CaptureError if it cannot be read."""
     camera = scene.capture.views[hit.index].camera
-    picture = load_resized_image(scene, hit.index, camera.width, camera.height)
+    image = load_resized_image(scene, hit.index, camera.width, camera.height)
     width, height = max(1, round(_THUMBNAIL_CROP * camera.width)), max(1, round(_THUMBNAIL_CROP * camera.height))
     left = int(np.clip(hit.pixel[0] - width / 2, 0, camera.width - width))
     top = int(np.clip(hit.pixel[1] - height / 2, 0, camera.height - height))
-    part = picture[top : top + height, left : left + width]
+    part = image[top : top + height, left : left + width]
     scale = _THUMBNAIL_PX / max(width, height)
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
     small = cv2.resize(part, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)

@@ -1,4 +1,4 @@
-"""What the parts of a visitor's panel ask of the visitor."""
+"""What the parts of a client's panel need of its session."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from vdgs.viewer.viewer_scene import ViewerScene
 
 
 class SessionProtocol(Protocol):
-    """A visitor (`visitor.Visitor`)."""
+    """`client_session.ClientSession`."""
 
-    #: Their browser, as viser knows it.
+    #: The browser, as viser knows it.
     client: Any
     scene: ViewerScene
 

@@ -1,7 +1,8 @@
-"""What visitors look at: the models of a run and what is known of it, each opened when it is first asked for."""
+"""What clients look at: the models of a run and what belongs to them, each loaded when it is first needed."""
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -17,6 +18,7 @@ from vdgs.errors import VdgsError
 from vdgs.evaluation.view_exposures import ViewExposures, make_exposures
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.map_projection import MapProjection
+from vdgs.kernels.kernel_types import Raster
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.renderer import render
 from vdgs.partition.blocks import Blocks, xy_positions
@@ -27,21 +29,21 @@ from vdgs.viewer.lod import LodLevel, LodPyramid
 ModelChoice = Literal["coarse", "merged"]
 #: Photographs kept in memory, decoded (choice).
 _IMAGE_CACHE_BYTES = 128 << 20
-#: What a camera meters is drawn from at most about so many anchors (choice): the law of it takes up to two hundred
-#: pictures, and all visitors wait meanwhile.
+#: What a camera meters is drawn from at most about so many anchors (choice): fitting its law takes up to two hundred
+#: images, and all clients wait meanwhile.
 _METERING_MAX_ANCHORS = 10_000
 
 
 class ViewerScene:
-    """One run, opened for visitors. Used from one thread, the one that draws."""
+    """One run, opened for viewing. Used from one thread, the one that draws."""
 
     def __init__(self, run: OpenedRun, open_other: Callable[[str], OpenedRun] | None = None) -> None:
         self.run = run
         self.capture = run.capture
         self._open = open_other or (lambda name: open_run(run.folder.path, name, run.device))  # type: ignore[arg-type]
         self._runs: dict[str, OpenedRun] = {run.name: run}
-        self._seen: dict[str, Tensor] = {}
-        self._tints: dict[str, Tensor] = {}
+        self._visibility: dict[str, Tensor] = {}
+        self._block_tints: dict[str, Tensor] = {}
         self._levels: dict[str, LodPyramid] = {}
         self._exposures: dict[str, ViewExposures | None] = {}
         #: Grows with every newer model.
@@ -52,20 +54,23 @@ class ViewerScene:
         """The models that can be shown, the best first."""
         return ("merged", "coarse") if self.run.name == "merged" else (self.run.name,)
 
+    def shown_name(self, name: str) -> str:
+        """The name itself where the run has such a model, else that of the best one."""
+        return name if name in self.names else self.names[0]
+
     def get_run(self, name: str) -> OpenedRun:
         """A model of the run; the one opened first where that has no such model."""
         if name not in self.names:
             name = self.run.name
         if name not in self._runs:
-            # The capture is the same: kept once.
-            self._runs[name] = replace(self._open(name), capture=self.capture)
+            self._runs[name] = replace(self._open(name), capture=self.capture)  # one capture in memory
         return self._runs[name]
 
     def model(self, name: str) -> AnchorModel:
         return self.get_run(name).model
 
     def get_level(self, name: str, camera: Camera, max_anchors: int | None = None) -> tuple[LodLevel, int]:
-        """What to draw of a model: itself, or one with at most so many anchors in view; and how many those are."""
+        """The level of detail to draw, with at most so many anchors in view, and how many those are."""
         if name not in self._levels:
             self._levels[name] = LodPyramid(self.model(name))
         return self._levels[name].of(camera, max_anchors)
@@ -74,26 +79,26 @@ class ViewerScene:
         """Put a newer model in place of the one of its name."""
         self.run = run
         self._runs = {run.name: run}
-        self._seen, self._tints, self._levels, self._exposures = {}, {}, {}, {}
+        self._visibility, self._block_tints, self._levels, self._exposures = {}, {}, {}, {}
         self.generation += 1
         self.__dict__.pop("blocks", None)
 
     def visibility(self, name: str) -> Float[Tensor, " n"]:
         """V of every anchor of a model."""
-        if name not in self._seen:
+        if name not in self._visibility:
             cameras = [view.camera for view in self.capture.train_views]
-            self._seen[name] = get_run_visibility(self.get_run(name), cameras).float()
-        return self._seen[name]
+            self._visibility[name] = get_run_visibility(self.get_run(name), cameras).float()
+        return self._visibility[name]
 
     def exposures(self, name: str) -> ViewExposures | None:
         """The exposures that views are compared in with a model, as `vdgs eval` has them but for what is metered of
-        thinner models; None where training fitted none."""
+        decimated models; None where training fitted none."""
+
+        def render_decimated(camera: Camera) -> Raster:
+            return render(self.get_level(name, camera, _METERING_MAX_ANCHORS)[0].model, camera)
+
         if name not in self._exposures:
-            self._exposures[name] = make_exposures(
-                self.model(name),
-                self.capture,
-                lambda camera: render(self.get_level(name, camera, _METERING_MAX_ANCHORS)[0].model, camera),
-            )
+            self._exposures[name] = make_exposures(self.model(name), self.capture, render_decimated)
         return self._exposures[name]
 
     @cached_property
@@ -105,16 +110,16 @@ class ViewerScene:
             return None
 
     def block_tint(self, name: str) -> Float[Tensor, "n 3"]:
-        """The colour of the block that owns each anchor, RGB in 0 to 1; grey where the scene is not cut."""
-        if name not in self._tints:
+        """The color of the block that owns each anchor, RGB in 0 to 1; gray where the scene is not cut."""
+        if name not in self._block_tints:
             positions = self.model(name).anchors.positions
             if self.blocks is None:
                 colors = np.full((len(positions), 3), 0.6)
             else:
                 palette = np.stack([block_rgb(index) for index in range(len(self.blocks))])
                 colors = palette[self.blocks.owner(xy_positions(positions))] / 255.0
-            self._tints[name] = torch.as_tensor(colors, dtype=torch.float32, device=positions.device)
-        return self._tints[name]
+            self._block_tints[name] = torch.as_tensor(colors, dtype=torch.float32, device=positions.device)
+        return self._block_tints[name]
 
     @cached_property
     def images(self) -> ImageCache:
@@ -123,13 +128,11 @@ class ViewerScene:
 
     @cached_property
     def map_projections(self) -> tuple[MapProjection, ...]:
-        """The coordinates that a place is given in beside those of the ground frame: those of the map, if any."""
-        if self.capture.ground.origin_geo is None:
-            return ()
-        try:
-            return (MapProjection.of(self.capture.ground),)
-        except VdgsError:  # pyproj is not installed
-            return ()
+        """The map coordinates that a point is given in beside those of the ground frame, if any."""
+        with contextlib.suppress(VdgsError):  # pyproj is not installed
+            if self.capture.ground.origin_geo is not None:
+                return (MapProjection.of(self.capture.ground),)
+        return ()
 
     def close(self) -> None:
         if "images" in self.__dict__:
@@ -140,6 +143,5 @@ def block_rgb(block: int) -> tuple[int, int, int]:
     """The colour of a block in all figures, 0 to 255."""
     from vdgs.plots.partition.block_stats import block_color  # brings matplotlib: not before the first picture
 
-    color = block_color(block).lstrip("#")
-    red, green, blue = (int(color[place : place + 2], 16) for place in (0, 2, 4))
+    red, green, blue = bytes.fromhex(block_color(block).lstrip("#"))
     return red, green, blue

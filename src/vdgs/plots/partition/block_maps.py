@@ -9,7 +9,6 @@ import numpy as np
 import shapely
 from jaxtyping import Bool, Float, Int
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -19,23 +18,10 @@ from matplotlib.path import Path as Outline
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.similarity import sample_points
 from vdgs.partition.blocks import Blocks
-from vdgs.plots.partition.block_stats import (
-    block_color,
-    compute_block_stats,
-    mix_color,
-    plot_block_stats,
-    pluralize,
-    std_note,
-)
+from vdgs.plots import visibility_map
+from vdgs.plots.partition.block_stats import block_color, compute_block_stats, mix_color, plot_block_stats, std_note
 from vdgs.plots.partition.score_heatmap import plot_scores
-from vdgs.plots.style import DPI, INK, MUTED, NOTE_SIZE, TEXT_SIZE, axes_placer, draw_titles, style_axes
-from vdgs.plots.visibility_map import (
-    CameraMarks,
-    VisibilityMapData,
-    map_size_inches,
-    marker_edge_width,
-    plot_visibility_map,
-)
+from vdgs.plots.style import INK, MUTED, NOTE_SIZE, TEXT_SIZE, draw_titles, new_figure, pluralize, style_axes, write_png
 
 __all__ = ["plot_anchor_visibility", "plot_block_stats", "plot_blocks", "plot_scores"]
 
@@ -61,15 +47,15 @@ def plot_anchor_visibility(
     """Anchors from above coloured by V_i, cameras, and the histogram of V. Writes a PNG; `axes` are the names of x
     and y with their unit (`GroundFrame.axis_names`)."""
     low, high = _map_corners(np.concatenate([_inner_quantiles(positions[:, :2]), _camera_xy(cameras)]))
-    marks = CameraMarks("training camera", cameras, INK, "white", _mark_size(len(cameras)))
+    marks = visibility_map.CameraMarks("training camera", cameras, INK, "white", _mark_size(len(cameras)))
     facts = f"an anchor is seen by {np.median(visibility):g} training cameras (median)"
     heading = (f"{pluralize(len(visibility), 'anchor')} and {pluralize(len(cameras), 'training camera')}", facts)
-    seen = VisibilityMapData(
+    data = visibility_map.VisibilityMapData(
         points=positions, visibility=visibility, low=low, high=high, ground=float(np.median(positions[:, 2])),
         marks=(marks,), x_label=axes[0], y_label=axes[1], noun="an anchor",
         titles=(*heading, "anchors coloured by V; pale: V on level ground"),
     )  # fmt: skip
-    plot_visibility_map(file, seen)
+    visibility_map.plot_visibility_map(file, data)
 
 
 def plot_blocks(
@@ -88,11 +74,10 @@ def plot_blocks(
     of x and y with their unit (`GroundFrame.axis_names`).
     """
     low, high, whole = _frame_of_blocks(_inner_quantiles(positions[:, :2]), [cut for _, cut in cuts])
-    width, height = map_size_inches(low, high, MAP_WIDTH_INCHES)
+    width, height = visibility_map.map_size_inches(low, high, MAP_WIDTH_INCHES)
     (_, blocks), count = cuts[0], len(cuts)
     columns, rows = (count, 1) if width < 1.7 * height else (1, count)
-    figure = Figure(figsize=(max(0.85 + columns * (width + 0.75), 7.5), 1.15 + rows * (height + 1.1)), dpi=DPI)
-    canvas, place = FigureCanvasAgg(figure), axes_placer(figure)
+    figure, place = new_figure(max(0.85 + columns * (width + 0.75), 7.5), 1.15 + rows * (height + 1.1))
     shown = sample_points(positions[:, :2].astype(np.float64), MAX_DRAWN_ANCHORS)
     for index, (name, cut) in enumerate(cuts):
         row, column = index // columns, index % columns
@@ -106,7 +91,7 @@ def plot_blocks(
         axes.set(xlabel=names[0], ylabel=names[1])
     _heading(figure, blocks, (len(positions), len(shown)), _camera_xy(cameras), (low, high), whole)
     _legend(figure, bool(assigned.any(axis=1).all()))
-    canvas.print_png(file)  # type: ignore[arg-type]
+    write_png(figure, file)
 
 
 def _camera_xy(cameras: Sequence[Camera]) -> Float[np.ndarray, "c 2"]:
@@ -118,9 +103,9 @@ def _mark_size(cameras: int) -> float:
     return float(np.clip(9000 / max(cameras, 1), 8, 30))
 
 
-def _inner_quantiles(places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "2 2"]:
+def _inner_quantiles(positions: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "2 2"]:
     """The 0.5 % and 99.5 % quantiles in x and in y."""
-    return np.quantile(np.asarray(places, np.float64), (0.005, 0.995), axis=0)
+    return np.quantile(np.asarray(positions, np.float64), (0.005, 0.995), axis=0)
 
 
 def _map_corners(corners: Float[np.ndarray, "n 2"], margin: float = 0.08) -> tuple[np.ndarray, np.ndarray]:
@@ -157,10 +142,10 @@ def _plot_partition(
         dark = mix_color(block_color(index), 0.65)
         axes.add_patch(_outline_patch(block.expanded, dark, 1.0, (0, (4, 3))))
         axes.add_patch(_outline_patch(block.core, INK, 1.1, "solid"))
-        place = _label_position(block.core, window)
-        if place is not None:
+        position = _label_position(block.core, window)
+        if position is not None:
             axes.text(
-                *place, str(index), ha="center", va="center", fontsize=12 if len(blocks) <= 40 else 8,
+                *position, str(index), ha="center", va="center", fontsize=12 if len(blocks) <= 40 else 8,
                 fontweight="bold", color=dark, zorder=5,
                 bbox={"boxstyle": "round,pad=0.25", "facecolor": "white", "edgecolor": dark, "linewidth": 0.8},
             )  # fmt: skip
@@ -177,22 +162,18 @@ def _outline_patch(shape: shapely.Polygon, color: object, width: float, style: o
 
 def _label_position(core: shapely.Polygon, window: shapely.Polygon) -> tuple[float, float] | None:
     """Where in the visible part of a core there is most room for its number; None where nothing of it is visible."""
-    visible = [part for part in shapely.get_parts(core.intersection(window)) if part.area > 0]
-    if not visible:
+    largest = max(shapely.get_parts(core.intersection(window)), key=lambda part: part.area, default=None)
+    if largest is None or largest.area == 0:
         return None
-    largest = max(visible, key=lambda part: part.area)
     x, y = shapely.maximum_inscribed_circle(largest).coords[0]
     return x, y
 
 
-def _cameras(axes: Axes, places: Float[np.ndarray, "c 2"], used: Bool[np.ndarray, " c"]) -> None:
+def _cameras(axes: Axes, positions: Float[np.ndarray, "c 2"], used: Bool[np.ndarray, " c"]) -> None:
     """Cameras as small triangles; white those that are not `used`."""
-    size = 0.7 * _mark_size(len(places))
+    size = 0.7 * _mark_size(len(positions))
     for chosen, face, edge in ((used, INK, "white"), (~used, "white", INK)):
-        axes.scatter(
-            places[chosen, 0], places[chosen, 1], marker="^", s=size, linewidths=marker_edge_width(size),
-            facecolors=face, edgecolors=edge, zorder=4,
-        )  # fmt: skip
+        visibility_map.draw_triangles(axes, positions[chosen], size, face, edge, zorder=4)
 
 
 def _heading(

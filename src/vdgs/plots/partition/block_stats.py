@@ -9,14 +9,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb
-from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
 from vdgs.partition.blocks import Blocks, xy_positions
-from vdgs.plots.style import DPI, INK, MUTED, axes_placer, draw_titles, style_axes
+from vdgs.plots.style import INK, MUTED, draw_titles, new_figure, pluralize, style_axes, write_png
 
 #: Colours of blocks 0 to 15; block 16 begins anew. Neighbours in the list differ most.
 BLOCK_PALETTE = (
@@ -28,10 +26,6 @@ BLOCK_PALETTE = (
 def block_color(index: int) -> str:
     """The colour of a block in all figures."""
     return BLOCK_PALETTE[index % len(BLOCK_PALETTE)]
-
-
-def pluralize(number: int, noun: str) -> str:
-    return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
 def mix_color(color: str, scale: float, tone: float = 1.0) -> tuple[float, float, float]:
@@ -55,7 +49,7 @@ def plot_block_stats(
 ) -> None:
     """Per block: anchors, cameras, area of the core, V and its standard deviation, which eq. 5 is meant to lower.
 
-    The blocks of `compare` (λ_vis = 0) stand below in lighter tones. Writes a PNG; `unit` is that of places.
+    The blocks of `comparison` (λ_vis = 0) stand below in lighter tones. Writes a PNG; `unit` is that of places.
     """
     ours = compute_block_stats(positions, visibility, blocks)._replace(cameras=assigned.sum(axis=0))
     groups = [ours] if comparison is None else [ours, compute_block_stats(positions, visibility, comparison)]
@@ -66,8 +60,7 @@ def plot_block_stats(
     # Inches; thousands of blocks make a picture that can still be opened, in which numbers are too small to be set.
     step = min(float(np.clip(14 / count, 0.13, 0.3)), MAX_HEIGHT_INCHES / count)
     set_numbers = step > MIN_ROW_INCHES
-    figure = Figure(figsize=(14.5, 2.15 + step * count), dpi=DPI)
-    canvas, place = FigureCanvasAgg(figure), axes_placer(figure)
+    figure, place = new_figure(14.5, 2.15 + step * count)
     panels = [place(1.15 + 2.65 * index, 0.65, 2.3, step * count) for index in range(5)]
     names = (
         "anchors of the core", "cameras assigned", f"area of the core ({unit}²)",
@@ -75,8 +68,8 @@ def plot_block_stats(
     )  # fmt: skip
     for index, (axes, name) in enumerate(zip(panels, names, strict=True)):
         ends = [
-            _panel(axes, index, group, places, tone, step if set_numbers else None)
-            for group, places, tone in zip(groups, rows, (1.0, 0.45), strict=False)
+            _panel(axes, index, group, group_rows, tone, step if set_numbers else None)
+            for group, group_rows, tone in zip(groups, rows, (1.0, 0.45), strict=False)
         ]
         # From 0, with room for the number right of the longest bar.
         axes.set_xlim(0, 1.38 * max(ends) or 1.0)
@@ -86,19 +79,12 @@ def plot_block_stats(
         axes.xaxis.set_major_locator(MaxNLocator(3, integer=index < 2, min_n_ticks=1))
     note = "mean over the blocks of the standard deviation of V within each: " + _both(groups)
     captions = ("",) if comparison is None else ("this cut", "cut by place alone, λ_vis = 0 (numbers of its own)")
-    for places, caption in zip(rows, captions, strict=True):
-        panels[0].text(
-            0,
-            places[0] - 0.95,
-            caption,
-            va="center",
-            fontsize=_font(step) if set_numbers else 8.0,
-            fontweight="bold",
-            color=INK,
-        )
-    lower = "colours and numbers are those of the map of blocks"
-    draw_titles(figure, pluralize(len(blocks), "block"), note, lower)
-    canvas.print_png(file)  # type: ignore[arg-type]
+    size = _font(step) if set_numbers else 8.0
+    for group_rows, caption in zip(rows, captions, strict=True):
+        y = group_rows[0] - 0.95
+        panels[0].text(0, y, caption, va="center", fontsize=size, fontweight="bold", color=INK)
+    draw_titles(figure, pluralize(len(blocks), "block"), note, "colours and numbers are those of the map of blocks")
+    write_png(figure, file)
 
 
 class BlockStats(NamedTuple):
@@ -131,37 +117,30 @@ def compute_block_stats(
 
 
 def _panel(
-    axes: Axes, index: int, facts: BlockStats, rows: Float[np.ndarray, " b"], tone: float, step: float | None
+    axes: Axes, index: int, stats: BlockStats, rows: Float[np.ndarray, " b"], tone: float, step: float | None
 ) -> float:
-    """One column of the block facts for one cut; returns where its longest bar ends. `step` is the height of a row in
+    """One column of the figure for one cut; returns where its longest bar ends. `step` is the height of a row in
     inches; without it no numbers stand beside the bars."""
     colors = [mix_color(block_color(block), 1.0, tone) for block in range(len(rows))]
     if index == 3:
-        known = np.isfinite(facts.mean)
-        axes.hlines(rows[known], facts.low[known], facts.high[known], np.array(colors)[known], linewidth=3)
-        axes.scatter(facts.mean[known], rows[known], s=26, color=INK, zorder=3, linewidths=0)
-        right = facts.high
-        text = [f"{mean:.1f}" for mean in facts.mean]
+        known = np.isfinite(stats.mean)
+        axes.hlines(rows[known], stats.low[known], stats.high[known], np.array(colors)[known], linewidth=3)
+        axes.scatter(stats.mean[known], rows[known], s=26, color=INK, zorder=3, linewidths=0)
+        right = stats.high
+        labels = [f"{mean:.1f}" for mean in stats.mean]
     else:
-        values = (facts.anchors, facts.cameras, facts.area, None, facts.spread)[index]
+        values = (stats.anchors, stats.cameras, stats.area, None, stats.spread)[index]
         if values is None:
-            axes.text(
-                0.02,
-                float(rows.mean()),
-                "no cameras are assigned\nto this cut",
-                transform=axes.get_yaxis_transform(),
-                va="center",
-                fontsize=8,
-                color=MUTED,
-            )
+            text, transform = "no cameras are assigned\nto this cut", axes.get_yaxis_transform()
+            axes.text(0.02, float(rows.mean()), text, transform=transform, va="center", fontsize=8, color=MUTED)
             return 0.0
         right = np.nan_to_num(values.astype(np.float64))
         _bars(axes, rows, right, colors)
-        text = [_number(float(value), index) for value in values]
+        labels = [_number(float(value), index) for value in values]
     longest = float(np.nanmax(right, initial=0.0))
     if step is None:
         return longest
-    for row, end, label in zip(rows, right, text, strict=True):
+    for row, end, label in zip(rows, right, labels, strict=True):
         missing = label == "nan"
         axes.annotate(
             "no anchors" if missing else label, (0 if missing else end, row), (6, 0), textcoords="offset points",

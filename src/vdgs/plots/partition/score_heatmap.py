@@ -7,13 +7,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgb
-from matplotlib.figure import Figure
 
-from vdgs.plots.partition.block_stats import pluralize
-from vdgs.plots.style import ACCENT, DPI, INK, MUTED, NOTE_SIZE, TEXT_SIZE, axes_placer, draw_titles, style_axes
+from vdgs.plots import style
+from vdgs.plots.style import ACCENT, INK, MUTED, NOTE_SIZE, TEXT_SIZE, pluralize
 
 #: From no score to the highest; nothing in it resembles the mark of an assigned camera.
 SCORE_CMAP = LinearSegmentedColormap.from_list("score", ["#f1f3f5", "#a9c7d6", "#1f6f8b", "#14395b"])
@@ -34,16 +32,15 @@ def plot_scores(file: Path, scores: Float[np.ndarray, "c b"], assigned: Bool[np.
     order, best = sort_cameras(scores)
     width = float(np.clip(0.55 * blocks, 4.5, 14.0))
     height = float(np.clip(0.2 * cameras, 2.0, 9.0))
-    figure = Figure(figsize=(1.75 + width + 1.3, height + 1.9), dpi=DPI)
-    canvas, place = FigureCanvasAgg(figure), axes_placer(figure)
+    figure, place = style.new_figure(1.75 + width + 1.3, height + 1.9)
     axes = place(1.75, 0.65, width, height)
     norm = Normalize(min(0.0, float(scores.min(initial=0))), max(float(scores.max(initial=0)), 1e-6))
     if cameras:
         extent = (-0.5, blocks - 0.5, cameras - 0.5, -0.5)
-        picture = _cells(scores[order], assigned[order], norm, width / blocks)
+        image = _cells(scores[order], assigned[order], norm, width / blocks)
         # Sharp where every camera has a row of pixels, else averaged so that none is dropped.
-        smooth = "nearest" if cameras <= height * DPI else "antialiased"
-        axes.imshow(picture, aspect="auto", extent=extent, interpolation=smooth)
+        smooth = "nearest" if cameras <= height * style.DPI else "antialiased"
+        axes.imshow(image, aspect="auto", extent=extent, interpolation=smooth)
         bar = figure.colorbar(ScalarMappable(norm, SCORE_CMAP), cax=place(1.75 + width + 0.3, 0.65, 0.18, height))
         bar.set_label("score", color=INK, fontsize=TEXT_SIZE)
         bar.outline.set_visible(False)  # type: ignore[operator]
@@ -52,15 +49,14 @@ def plot_scores(file: Path, scores: Float[np.ndarray, "c b"], assigned: Bool[np.
         axes.text(0.5, 0.5, "no cameras", ha="center", va="center", transform=axes.transAxes, color=MUTED)
         axes.set_xlim(-0.5, blocks - 0.5)
     step = max(1, int(np.ceil(0.3 * blocks / width)))
-    axes.set_xticks(np.arange(0, blocks, step))
-    axes.set_xlabel("block")
-    style_axes(axes)
+    axes.set(xticks=np.arange(0, blocks, step), xlabel="block")
+    style.style_axes(axes)
     _groups(axes, best, height)
-    each = assigned.sum(axis=1)
-    facts = f"a camera serves {each.mean():.2f} blocks on average, at most {each.max()}" if cameras else ""
+    counts = assigned.sum(axis=1)
+    serves = f"a camera serves {counts.mean():.2f} blocks on average, at most {counts.max()}" if cameras else ""
     note = "cameras by best block, then by score; red: assigned"
-    draw_titles(figure, f"{pluralize(cameras, 'camera')}, {pluralize(blocks, 'block')}", facts, note)
-    canvas.print_png(file)  # type: ignore[arg-type]
+    style.draw_titles(figure, f"{pluralize(cameras, 'camera')}, {pluralize(blocks, 'block')}", serves, note)
+    style.write_png(figure, file)
 
 
 def sort_cameras(scores: Float[np.ndarray, "c b"]) -> tuple[Int[np.ndarray, " c"], Int[np.ndarray, " c"]]:
@@ -77,7 +73,7 @@ def sort_cameras(scores: Float[np.ndarray, "c b"]) -> tuple[Int[np.ndarray, " c"
 def _cells(
     scores: Float[np.ndarray, "c b"], assigned: Bool[np.ndarray, "c b"], norm: Normalize, inches: float
 ) -> np.ndarray:
-    """The picture [c, cell * b, 3] of the matrix, whose cells are so many `inches` wide."""
+    """The image [c, cell * b, 3] of the matrix, whose cells are so many `inches` wide."""
     cell = max(MIN_CELL_PX, min(CELL_PX, MAX_ROW_PX // scores.shape[1]))
     gap = max(1, GAP_PX * cell // CELL_PX)
     mark = int(np.clip(cell * MARK_INCHES / inches, 2, cell // 4))

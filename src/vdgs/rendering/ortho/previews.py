@@ -10,14 +10,13 @@ import matplotlib
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from vdgs.geometry.map_projection import MapProjection
-from vdgs.plots.style import DPI, INK, MUTED, VISIBILITY_CMAP, axes_placer, draw_titles, style_axes
+from vdgs.plots.style import INK, MUTED, VISIBILITY_CMAP, draw_titles, new_figure, style_axes, write_png
 from vdgs.plots.visibility_map import visibility_color_norm
 from vdgs.rendering.ortho.geotiff import read_overview
 from vdgs.rendering.ortho.pixel_grid import PixelGrid
@@ -70,8 +69,7 @@ def write_preview(orthophoto: Path, dsm: Path, visibility: Path, file: Path, she
     across, along = x1 - x0, y1 - y0
     scale = min(5.2 / across, 6.4 / along)
     width, height = max(across * scale, 2.6), max(along * scale, 2.2)
-    figure = Figure(figsize=(3 * width + 4.9, height + 2.3), dpi=DPI)
-    canvas, place = FigureCanvasAgg(figure), axes_placer(figure)
+    figure, place = new_figure(3 * width + 4.9, height + 2.3)
     rgba = np.moveaxis(read_overview(orthophoto, _PANEL_PX)[0], 0, -1)
     heights, factor = _heights(dsm, _PANEL_PX)
     counts = read_overview(visibility, _PANEL_PX)[0][0]
@@ -100,7 +98,7 @@ def write_preview(orthophoto: Path, dsm: Path, visibility: Path, file: Path, she
         f"{metadata['model']} model, {metadata['training_cameras']} training photographs",
         f"Heights: {sheet.placement.height_reference}. Blank: nothing solid, or no photograph looks there.",
     )  # fmt: skip
-    canvas.print_png(file)  # type: ignore[arg-type]
+    write_png(figure, file)
 
 
 def _heights(dsm: Path, longest_px: int) -> tuple[Float[np.ndarray, "h w"], float]:
