@@ -255,7 +255,7 @@ def test_training_that_runs_out_of_memory_saves_says_what_helps_and_continues(tm
     folder = tmp_path / "run" / "coarse"
     assert [path.stem for path in (folder / "checkpoints").glob("*.json")] == [f"{LAST_HALF:08d}"]
     assert f"The checkpoint of iteration {LAST_HALF} is saved in {folder / 'checkpoints'}." in broken.stderr
-    assert json.loads((folder / "status.json").read_text())["why"] == "out of memory"
+    assert json.loads((folder / "status.json").read_text())["reason"] == "out of memory"
 
     continued = vdgs(*command)
     assert f"continuing at iteration {LAST_HALF}" in continued.stdout
