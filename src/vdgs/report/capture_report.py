@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -17,7 +16,6 @@ from vdgs.captures.image_checks import ImageCheckReport
 from vdgs.captures.output_guard import check_not_among_inputs
 from vdgs.captures.reconstruction import ReconstructionReport, excluded_lines, report_rows
 from vdgs.captures.validation import format_reprojection, validate_capture
-from vdgs.geometry.camera import Camera
 from vdgs.geometry.similarity import sample_points
 from vdgs.report.capture_figures import draw_capture_map, draw_visibility_histogram
 from vdgs.report.capture_stats import CaptureReport, format_length, measure_capture
@@ -33,14 +31,15 @@ MAX_PROJECTIONS = 2e8
 def inspect_capture(capture: Capture, output: Path, image_check: ImageCheckReport | None = None) -> CaptureReport:
     """Measure the capture; write report.json and two figures into the folder `output` (made if absent).
 
-    `checked` is what decoding its photographs told, where they were decoded. Raises VdgsError for an output among the
-    capture's inputs.
+    `image_check` is the result of decoding its photographs, where they were decoded. Raises VdgsError for an output
+    among the capture's inputs.
     """
     check_not_among_inputs(output, capture)
     output.mkdir(parents=True, exist_ok=True)
     few_enough = int(np.clip(MAX_PROJECTIONS / len(capture.train_views), MIN_POINTS, MAX_POINTS))
     points = sample_points(capture.points, few_enough)
-    visibility = _visibility(points, [view.camera for view in capture.train_views])
+    cameras = [view.camera for view in capture.train_views]
+    visibility = count_visibility(torch.from_numpy(np.ascontiguousarray(points)), cameras).numpy().astype(np.int64)
     report = measure_capture(capture, points, visibility, validate_capture(capture), image_check)
     figures = [output / "visibility_map.png", output / "visibility.png"]
     draw_capture_map(capture, report, points, visibility, figures[0])
@@ -48,11 +47,6 @@ def inspect_capture(capture: Capture, output: Path, image_check: ImageCheckRepor
     report = replace(report, figures=[file.name for file in figures])
     write_json(output / "report.json", to_jsonable(asdict(report)))
     return report
-
-
-def _visibility(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
-    """V of points [n, 3], int64 [n]."""
-    return count_visibility(torch.from_numpy(np.ascontiguousarray(points)), cameras).numpy().astype(np.int64)
 
 
 def print_report(

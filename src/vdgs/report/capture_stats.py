@@ -79,7 +79,7 @@ def measure_capture(
     validation: ValidationReport,
     image_check: ImageCheckReport | None,
 ) -> CaptureReport:
-    """The report on a capture, given (a sample of) its points and their V; `checked` None: nothing was decoded."""
+    """The report on a capture, given (a sample of) its points and their V; `image_check` None: nothing was decoded."""
     cameras = [view.camera for view in capture.views]
     ground_height = float(np.median(points[:, 2]))
     heights = np.array([camera.position[2] for camera in cameras]) - ground_height
@@ -91,7 +91,7 @@ def measure_capture(
     tilts = [np.degrees(np.arccos(np.clip(-camera.forward[2], -1, 1))) for camera in cameras]
     masked = sum(view.camera.width * view.camera.height for view in capture.views if view.mask_path)
     origin = capture.ground.origin_geo
-    seen = visibility_stats(visibility)
+    seen, image_warnings = visibility_stats(visibility), image_check.warnings if image_check else ()
     return CaptureReport(
         source=capture.source,
         images=capture.images,
@@ -122,21 +122,16 @@ def measure_capture(
         num_observations=validation.num_observations,
         seen_fraction=float((visibility > 0).mean()),
         problems=list(validation.problems),
-        warnings=[
-            *capture.warnings,
-            *(image_check.warnings if image_check else ()),
-            *validation.warnings,
-            *_findings(visibility),
-        ],
+        warnings=[*capture.warnings, *image_warnings, *validation.warnings, *_findings(visibility)],
         figures=[],
     )
 
 
 def _ground_sample_distance(capture: Capture, points: np.ndarray) -> float | None:
     few = np.ascontiguousarray(sample_points(points, 20_000))
-    places, distances = torch.from_numpy(few), []
+    positions, distances = torch.from_numpy(few), []
     for view in capture.views:
-        seen = np.flatnonzero(count_visibility(places, [view.camera]).numpy())
+        seen = np.flatnonzero(count_visibility(positions, [view.camera]).numpy())
         if len(seen):
             distances.append(float(np.median(view.camera.project(few[seen])[1])) / view.camera.fx)
     return float(np.median(distances)) if distances else None

@@ -15,10 +15,12 @@ from PIL import Image
 MAX_SIDE_PX, MAX_BYTES = 1600, 400_000
 #: What is tried, in turn, on a picture that comes out too large: its share of the longest side, JPEG quality.
 REDUCTIONS = ((1.0, 85), (1.0, 72), (0.75, 72), (0.5, 72), (0.3, 60))
+#: What Pillow raises for a damaged file.
+_READ_ERRORS = (OSError, ValueError, SyntaxError, EOFError, struct.error, zlib.error, Image.DecompressionBombError)
 
 
 class ImageReadError(Exception):
-    """A picture that cannot be read."""
+    """An image that cannot be read."""
 
 
 @dataclass(frozen=True)
@@ -35,19 +37,11 @@ class EmbeddedImage:
 
 
 def load_embedded_image(path: Path) -> EmbeddedImage:
-    """A PNG file, reduced; drawings stay PNG (sharp lines), photographs become JPEG. Raises PictureError."""
+    """A PNG file, reduced; drawings stay PNG (sharp lines), photographs become JPEG. Raises ImageReadError."""
     try:
         with Image.open(path, formats=["PNG"]) as image:
             return reduce_image(image)
-    except (
-        OSError,
-        ValueError,
-        SyntaxError,
-        EOFError,
-        struct.error,
-        zlib.error,
-        Image.DecompressionBombError,
-    ) as error:
+    except _READ_ERRORS as error:
         raise ImageReadError(str(error).replace(str(path), path.name)) from error
 
 

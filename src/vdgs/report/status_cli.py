@@ -26,30 +26,30 @@ STATE_STYLES = {
 def full_run_status(run: RunFolder) -> RunStatus:
     """How far a run is, its report included. Raises RunError for a folder that holds no run."""
     run.config_file.exists() or run.settings()  # which says that there is none
-    standing = get_run_status(run)
-    return replace(standing, stages=(*standing.stages, report_status(run, standing)))
+    status = get_run_status(run)
+    return replace(status, stages=(*status.stages, report_status(run, status)))
 
 
 def print_status(run: RunFolder, console: Console) -> int:
     """Say how far every stage and block is and what to type next; 0 if the run is whole, else `EXIT_INCOMPLETE`."""
-    standing = full_run_status(run)
-    width = max(len(stage.name) for stage in standing.stages)
-    for stage in standing.stages:
-        said = "; ".join(part for part in (progress_text(stage.status), stage.reason) if part)
+    status = full_run_status(run)
+    width = max(len(stage.name) for stage in status.stages)
+    for stage in status.stages:
+        note = "; ".join(part for part in (progress_text(stage.status), stage.reason) if part)
         state = f"[{STATE_STYLES[stage.state]}]{stage.state:<8}[/]"
-        console.print(f"{stage.name:<{width}}  {state}  {escape(said)}".rstrip(), highlight=False)
-    counted = Counter(stage.state for stage in standing.stages)
+        console.print(f"{stage.name:<{width}}  {state}  {escape(note)}".rstrip(), highlight=False)
+    counted = Counter(stage.state for stage in status.stages)
     console.print(", ".join(f"{count} {state}" for state, count in counted.items()), highlight=False)
-    console.print(escape(f"next: {next_step(standing)}"), highlight=False)
-    return 0 if standing.is_complete else EXIT_INCOMPLETE
+    console.print(escape(f"next: {next_step(status)}"), highlight=False)
+    return 0 if status.is_complete else EXIT_INCOMPLETE
 
 
 def status_json(run: RunFolder) -> RunStatusDocument:
     """The same for programs."""
-    standing = full_run_status(run)
+    status = full_run_status(run)
     return {
-        "run": str(run.path), "complete": standing.is_complete, "running": standing.is_running,
-        "next_command": standing.next_command() or None, "stages": [_stage_json(stage) for stage in standing.stages],
+        "run": str(run.path), "complete": status.is_complete, "running": status.is_running,
+        "next_command": status.next_command() or None, "stages": [_stage_json(stage) for stage in status.stages],
     }  # fmt: skip
 
 

@@ -36,7 +36,7 @@ from vdgs.viewer.viewer_scene import ViewerScene
 
 #: Where the search for a free port begins, and how many are tried.
 FIRST_PORT, MAX_PORT_TRIES = 8080, 50
-#: So many bytes may wait in the system for a visitor's network before newer pictures take the place of older ones here.
+#: So many bytes may wait in the system for a session's network before newer pictures take the place of older ones here.
 MAX_UNSENT_BYTES = 64 << 10
 #: How often a run that trains is looked at, seconds.
 REFRESH_SECONDS = 2.0
@@ -92,55 +92,55 @@ class ViewerServer:
     progress: str = ""
 
     def replace_run(self, run: OpenedRun) -> None:
-        """Let every visitor see a newer model."""
+        """Show a newer model to every client."""
         self.scheduler.submit(lambda: self.scene.replace_run(run)).result()
-        for visitor in list(self.sessions.values()):
-            visitor.on_model_changed()
+        for session in list(self.sessions.values()):
+            session.on_model_changed()
 
     def set_progress(self, progress: str) -> None:
-        """How far training is, to every visitor who does not know it yet."""
+        """How far training is, to every session who does not know it yet."""
         if progress != self.progress:
             self.progress = progress
-            for visitor in list(self.sessions.values()):
-                visitor.set_progress(progress)
+            for session in list(self.sessions.values()):
+                session.set_progress(progress)
 
 
 @contextlib.contextmanager
 def serve(run: OpenedRun, host: str, port: int | None, console: Console) -> Iterator[ViewerServer]:
     """A viewer of an opened run on a port (None: the first that is free), while the context lasts."""
-    scene, studio = ViewerScene(run), RenderScheduler()
-    door, server = _start_listening(host, port, console)
-    viewer = ViewerServer(server=server, access=door, scene=scene, scheduler=studio, sessions={})
+    scene, scheduler = ViewerScene(run), RenderScheduler()
+    access, server = _start_listening(host, port, console)
+    viewer = ViewerServer(server=server, access=access, scene=scene, scheduler=scheduler, sessions={})
     _set_initial_camera(server, run)
 
-    def comes(client: Any) -> None:
+    def on_connect(client: Any) -> None:
         generation = scene.generation
-        visitor = ClientSession(client, scene, studio, console)
-        viewer.sessions[client.client_id] = visitor
-        visitor.set_progress(viewer.progress)
+        session = ClientSession(client, scene, scheduler, console)
+        viewer.sessions[client.client_id] = session
+        session.set_progress(viewer.progress)
         if scene.generation != generation:  # a newer model came while the panel was made
-            visitor.on_model_changed()
+            session.on_model_changed()
         if client.client_id not in server.get_clients():  # gone while the panel was made
-            goes(client)
+            on_disconnect(client)
 
-    def goes(client: Any) -> None:
-        visitor = viewer.sessions.pop(client.client_id, None)
-        if visitor is not None:
-            visitor.close()
+    def on_disconnect(client: Any) -> None:
+        session = viewer.sessions.pop(client.client_id, None)
+        if session is not None:
+            session.close()
 
     # What is there by now stays. Left out of all later searches for garbage, it lets them be quick and frequent:
     # visitors who left are held by circles of viser's until one finds them.
     gc.collect()
     gc.freeze()
     trim_heap()  # what opening the run took beside what it left
-    worker = threading.Thread(target=studio.run, name="studio", daemon=True)
+    worker = threading.Thread(target=scheduler.run, name="render scheduler", daemon=True)
     worker.start()
-    server.on_client_connect(comes)
-    server.on_client_disconnect(goes)
+    server.on_client_connect(on_connect)
+    server.on_client_disconnect(on_disconnect)
     try:
         yield viewer
     finally:
-        studio.close()
+        scheduler.close()
         with contextlib.redirect_stdout(io.StringIO()):  # it says that it stopped
             server.stop()
         worker.join(timeout=5.0)
@@ -207,27 +207,27 @@ def find_free_port(host: str, port: int | None) -> int:
 
 
 def _start_listening(host: str, port: int | None, console: Console) -> tuple[AccessControl, Any]:
-    """A server that listens, and its door. A port that another program takes between the look and the start is passed
+    """A server that listens, and its access. A port that another program takes between the look and the start is passed
     over, unless it was asked for: VdgsError then."""
     token = None if is_loopback(host) else secrets.token_urlsafe(24)
     for _ in range(MAX_PORT_TRIES):
-        door = AccessControl(host, token, find_free_port(host, port))
-        server = _start(door, console)
+        access = AccessControl(host, token, find_free_port(host, port))
+        server = _start(access, console)
         if server is not None:
-            return door, server
+            return access, server
         if port is not None:
             break
-    raise VdgsError(f"--port {door.port}: was taken meanwhile. Give the command again.")
+    raise VdgsError(f"--port {access.port}: was taken meanwhile. Give the command again.")
 
 
 def _start(access: AccessControl, console: Console) -> Any:
-    """A viser server behind a door; None if its port was taken meanwhile."""
+    """A viser server behind a access; None if its port was taken meanwhile."""
     import viser
     import websockets.asyncio.server as sockets
 
     class Server(viser.ViserServer):
         def request_share_url(self, verbose: bool = True) -> str | None:
-            """No visitor may open a tunnel to elsewhere."""
+            """No session may open a tunnel to elsewhere."""
             return None
 
     guarded = False
