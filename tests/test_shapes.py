@@ -18,7 +18,7 @@ from vdgs.evaluation.metrics import squared_error
 from vdgs.kernels import cpu, rotations, torch_ref
 from vdgs.kernels.spherical_harmonics import eval_sh_bases
 from vdgs.model.initialization.gap_filling import find_gap_points
-from vdgs.partition.principal_axes import fit_principal_plane
+from vdgs.partition.clustering import fit_principal_plane
 from vdgs.training.compensation import low_visibility_mask
 from vdgs.visibility.visibility_counts import count_visibility
 

@@ -22,8 +22,8 @@ from vdgs.errors import VdgsError
 from vdgs.evaluation import metrics
 from vdgs.evaluation.by_visibility import VisibilityHistogram
 from vdgs.evaluation.color_correction import correct_colors
+from vdgs.evaluation.comparison_images import unique_file_stems
 from vdgs.evaluation.evaluate_run import IMAGE_CACHE_BYTES
-from vdgs.evaluation.image_io import unique_file_stems
 from vdgs.system.atomic_files import read_json, to_jsonable, write_json
 
 #: In a run folder: its figures by visibility, and the V and the key of the run that they hold for.

@@ -24,9 +24,9 @@ from torch import Tensor
 from experiments.bench.definitions import RENDER_STAGES, BenchMethod
 from vdgs.captures.capture import Capture, View
 from vdgs.errors import VdgsError
+from vdgs.evaluation.comparison_images import unique_file_stems
 from vdgs.evaluation.evaluate_model import evaluate_model
 from vdgs.evaluation.evaluate_run import cached_reference_views
-from vdgs.evaluation.image_io import unique_file_stems
 from vdgs.evaluation.lpips import load_lpips
 from vdgs.evaluation.renderable_model import RenderableModel
 from vdgs.system.tensors import file_size_and_crc32

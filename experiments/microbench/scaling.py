@@ -124,8 +124,7 @@ def _cut_site(case: Case) -> tuple[Blocks, np.ndarray, np.ndarray]:
 
 
 def _rows(case: Case, folder: Path) -> Work:
-    from vdgs.partition.assignment.assign_cameras import Assignment
-    from vdgs.partition.assignment.assignment_tables import assignment_rows
+    from vdgs.partition.assignment.assign_cameras import Assignment, assignment_rows
 
     blocks, positions, views = _cut_site(case)
     reasons = np.ones((case.photographs, len(blocks)), np.int8)

@@ -272,7 +272,7 @@ class Plane:
     def evaluate(self, output: Path, mask: np.ndarray | None = None, **more) -> dict:
         photographs = ReferenceViews(self.views, self.load_image, lambda _: mask)
         inputs = BlockInputs(
-            photographs=photographs, render_coarse=self.coarse, render_merged=self.merged, render_block=self.block,
+            reference_views=photographs, render_coarse=self.coarse, render_merged=self.merged, render_block=self.block,
             blocks=quadrants(), **more,
         )  # fmt: skip
         return evaluate_blocks(inputs, output)

@@ -18,7 +18,7 @@ from rich.console import Console
 
 from support.photographs import as_render, load_mask, noisy, photograph, psnr, real_photographs, ssim, view
 from vdgs.errors import CaptureError, RunError, TrainingDiverged
-from vdgs.evaluation import comparison_images, image_io, metrics
+from vdgs.evaluation import comparison_images, metrics
 from vdgs.evaluation.evaluate_model import evaluate_model
 from vdgs.evaluation.lpips import Lpips, LpipsScores
 from vdgs.evaluation.renderable_model import EvaluationSettings, ModelMetadata, ReferenceViews, RenderableModel
@@ -65,7 +65,7 @@ def read(path: Path):
 
 def test_what_is_written_is_what_was_measured(city: City, tmp_path: Path):
     facts = ModelMetadata(n_anchors=1234, model_bytes=10**6)
-    model = RenderableModel(render=city.render, visibility_map=city.visibility, facts=facts)
+    model = RenderableModel(render=city.render, visibility_map=city.visibility, metadata=facts)
     result = evaluate_model(city.taken, model, tmp_path, lpips_note="LPIPS is null: no weights.")
     assert result == read(tmp_path / "metrics.json")
     rows = read(tmp_path / "per_view.json")
@@ -228,7 +228,7 @@ def test_what_cannot_be_evaluated_is_said(city: City, tmp_path: Path):
 
 @given(st.lists(st.text("ab/.\\_: é", min_size=1, max_size=8), min_size=1, max_size=8))
 def test_every_view_has_its_own_plain_file_name(names: list[str]):
-    stems = image_io.unique_file_stems(names)
+    stems = comparison_images.unique_file_stems(names)
     assert len({stem.casefold() for stem in stems}) == len(names)
     for stem in stems:
         assert not set(stem) & set('/\\:*?"<>|')
@@ -237,7 +237,7 @@ def test_every_view_has_its_own_plain_file_name(names: list[str]):
 
 def test_readable_file_names():
     names = ["a/b.jpg", "c/b.jpg", "a/b.png", "A/B.JPG", "DJI_0018.JPG"]
-    assert image_io.unique_file_stems(names) == ["a__b", "c__b", "a__b_png", "A__B_JPG", "DJI_0018"]
+    assert comparison_images.unique_file_stems(names) == ["a__b", "c__b", "a__b_png", "A__B_JPG", "DJI_0018"]
 
 
 def test_json_has_no_nan(tmp_path):

@@ -19,10 +19,9 @@ from rich.console import Console
 
 from support.photographs import load_mask, photograph, psnr, view
 from vdgs.evaluation import metrics
-from vdgs.evaluation.coverage import coverage_map
 from vdgs.evaluation.depth_errors import METRIC_NAMES, DepthErrors, compute_depth_errors
 from vdgs.evaluation.evaluate_model import evaluate_model
-from vdgs.evaluation.opacity_coverage import COVERED_PSNR_KEYS, RenderedImage, count_oversized_splats
+from vdgs.evaluation.opacity_coverage import COVERED_PSNR_KEYS, RenderedImage, count_oversized_splats, coverage_map
 from vdgs.evaluation.renderable_model import ReferenceViews, RenderableModel
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import Raster, Splats
@@ -73,9 +72,8 @@ def test_what_is_opaque_everywhere_is_solid_before_any_background(tmp_path: Path
         saved = cv2.imread(str(tmp_path / row["render"]))[..., ::-1]
         assert row["psnr_covered_own_background"] == pytest.approx(psnr(saved[left], taken[left]))
         assert (cv2.imread(str(tmp_path / row["alpha"])) == 255).all()
-    assert result["psnr_covered_own_background"] == pytest.approx(
-        np.mean([row["psnr_covered_own_background"] for row in rows])
-    )
+    figures = [row["psnr_covered_own_background"] for row in rows]
+    assert result["psnr_covered_own_background"] == pytest.approx(np.mean(figures))
 
 
 def test_a_veil_is_not_solid_and_shows_what_is_behind_it(tmp_path: Path):

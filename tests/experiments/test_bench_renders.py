@@ -15,7 +15,7 @@ from experiments.bench.plan import PlanOptions, make_plan
 from experiments.bench.results import COVERAGE_KEYS, REFERENCE_EXPOSURE_KEYS
 from support.bench import InThisProcess, benched, write_data
 from vdgs.errors import VdgsError
-from vdgs.evaluation import image_io
+from vdgs.evaluation import comparison_images
 
 pytestmark = pytest.mark.xdist_group("bench_renders")
 
@@ -107,7 +107,7 @@ def test_what_was_broken_off_is_measured_again(data, output, theirs, monkeypatch
     pictures = [file.read_bytes() for file in files]
     for file in files:
         cv2.imwrite(str(file), 255 - cv2.imread(str(file)))
-    write, written = image_io.write_png, []
+    write, written = comparison_images.write_png, []
 
     def interrupted(path, picture):
         if path.parent.name == "renders" and written:
@@ -116,7 +116,7 @@ def test_what_was_broken_off_is_measured_again(data, output, theirs, monkeypatch
         write(path, picture)
 
     with monkeypatch.context() as patched:
-        patched.setattr(image_io, "write_png", interrupted)
+        patched.setattr(comparison_images, "write_png", interrupted)
         with pytest.raises(KeyboardInterrupt):
             benched(data, output, "baseline", **asked)
     for file, picture in zip(files, pictures, strict=True):

@@ -13,7 +13,7 @@ import torch
 
 from support.captures import tiny_scene, write_colmap
 from support.commands import begun, do_tasks_here, entry_point, is_free, vdgs, wait_until
-from vdgs.evaluation.isolated_blocks import IsolatedBlocks
+from vdgs.evaluation.evaluate_run import IsolatedBlocks
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.decoder import Decoder
 from vdgs.partition.assignment.score_file import load_scores

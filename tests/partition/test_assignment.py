@@ -21,8 +21,10 @@ from vdgs.partition.assignment.assign_cameras import (
     NOT_ASSIGNED,
     TOPPED_UP,
     assign_cameras,
+    assignment_rows,
+    explain_assignment,
+    make_assignment_table,
 )
-from vdgs.partition.assignment.assignment_tables import assignment_rows, explain_assignment, make_assignment_table
 from vdgs.partition.assignment.score_file import load_scores, save_scores
 from vdgs.partition.assignment.score_matrix import compute_score_matrix
 from vdgs.partition.block_records import BlockCamerasRecord
@@ -172,7 +174,8 @@ def test_a_file_whose_arrays_disagree_is_refused(saved):
     with np.load(path, allow_pickle=False) as file:
         arrays = dict(file)
     for name, value in (
-        ("visible_anchors", arrays["visible_anchors"][:1]), ("reasons", arrays["reasons"] + 9), ("scores", arrays["scores"].astype(float)),
+        ("visible_anchors", arrays["visible_anchors"][:1]), ("reasons", arrays["reasons"] + 9),
+        ("scores", arrays["scores"].astype(float)),
         ("names", np.arange(3)), ("format", np.array("other")),
     ):  # fmt: skip
         np.savez(path, **{**arrays, name: value})

@@ -11,10 +11,7 @@ from vdgs.config.method import AssignmentConfig
 from vdgs.partition.assignment.assign_cameras import assign_cameras
 from vdgs.partition.assignment.score_file import load_scores, save_scores
 from vdgs.partition.assignment.score_matrix import ScoreMatrix
-from vdgs.partition.strategies import STRATEGIES
-from vdgs.partition.strategies.citygaussian import contract, expand
-from vdgs.partition.strategies.strategy import grid_shape
-from vdgs.partition.strategies.vastgaussian import box_coverage
+from vdgs.partition.strategies import STRATEGIES, box_coverage, contract, expand, grid_shape
 
 SCENE = tiny_scene(6, 4)
 CAMERAS = list(SCENE.cameras.values())

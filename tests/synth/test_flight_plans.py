@@ -16,16 +16,20 @@ from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import VdgsError
 from vdgs.synth import SynthOptions, generate
-from vdgs.synth.flight_cameras import make_camera, make_flight_cameras
-from vdgs.synth.flight_stats import compute_flight_stats, sample_visible_points
+from vdgs.synth.flight_cameras import make_camera, make_flight_cameras, make_test_cameras
 from vdgs.synth.mesh import Material, MeshBuilder
 from vdgs.synth.options import ResolvedOptions
 from vdgs.synth.perturbations import add_outliers, exposure_gains, perturb_cameras
 from vdgs.synth.ray_tracing import RayTracer
 from vdgs.synth.synthetic_points import SparseCloud
-from vdgs.synth.test_cameras import make_test_cameras
 from vdgs.synth.town import Town, build_town
-from vdgs.synth.true_visibility import count_visibility, sample_surface_points, view_ground_truth
+from vdgs.synth.true_visibility import (
+    compute_flight_stats,
+    count_visibility,
+    sample_surface_points,
+    sample_visible_points,
+    view_ground_truth,
+)
 
 pytestmark = pytest.mark.xdist_group("synth_flights")
 

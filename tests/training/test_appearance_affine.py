@@ -18,9 +18,15 @@ from support.hand_made_models import capture_at
 from support.small_training import CONFIG, bits, run, stage, start
 from vdgs.captures.capture import Capture, View
 from vdgs.captures.capture_order import flight_positions
-from vdgs.evaluation.auto_exposure import AutoExposure, fit_auto_exposure, log_luminance
 from vdgs.evaluation.opacity_coverage import RenderedImage
-from vdgs.evaluation.view_exposures import ViewExposures, apply_exposure_numpy, make_exposures
+from vdgs.evaluation.view_exposures import (
+    AutoExposure,
+    ViewExposures,
+    apply_exposure_numpy,
+    fit_auto_exposure,
+    log_luminance,
+    make_exposures,
+)
 from vdgs.geometry.camera import Camera
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors

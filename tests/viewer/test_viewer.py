@@ -17,9 +17,8 @@ from scipy.spatial.transform import Rotation
 from support.captures import camera_at, look_down
 from support.hand_made_models import opaque_plane, quadrants
 from vdgs.captures.capture import Capture, View
-from vdgs.evaluation.auto_exposure import log_luminance
 from vdgs.evaluation.metrics import to_8bit
-from vdgs.evaluation.view_exposures import apply_exposure_numpy
+from vdgs.evaluation.view_exposures import apply_exposure_numpy, log_luminance
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.model.anchor_model import AnchorModel, DecoderSpan

@@ -37,10 +37,10 @@ from vdgs.captures.validation import require_trainable
 from vdgs.config.executor_options import CheckpointOptions
 from vdgs.config.serialization import diff_settings, to_dict
 from vdgs.errors import RunError, VdgsError
-from vdgs.evaluation.coverage import coverage_map
 from vdgs.evaluation.evaluate_model import evaluate_model
 from vdgs.evaluation.evaluate_run import cached_reference_views, make_true_depth
 from vdgs.evaluation.lpips import load_lpips
+from vdgs.evaluation.opacity_coverage import coverage_map
 from vdgs.evaluation.renderable_model import EvaluationSettings, ModelMetadata, RenderableModel
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import Raster
@@ -148,7 +148,7 @@ def evaluate_gs3d(
         return model.render(camera, depth=True)
 
     measured = RenderableModel(
-        render=model.render, visibility_map=visibility_map, facts=_model_metadata(trained), background=model.background,
+        render=model.render, visibility_map=visibility_map, metadata=_model_metadata(trained), background=model.background,
         coverage_map=coverage_map(render_depth, [view.camera for view in capture.train_views]),
         true_depth=make_true_depth(capture, capture.test_views), render_depth=render_depth,
         camera_height=camera_height(capture),

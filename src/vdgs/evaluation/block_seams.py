@@ -1,6 +1,6 @@
-"""Evaluate what the cut into blocks gained and what its seams cost, with pictures of the worst places to look.
+"""Evaluates what the cut into blocks gained and what its seams cost, with images of the worst seams.
 
-OUTPUT/by_block.json    PSNR of each block: coarse, isolated (as trained), merged; errors at borders against the interior
+OUTPUT/by_block.json    PSNR of each block: coarse, isolated (as trained), merged; errors at borders, interior
 OUTPUT/seams/NAME.png   coarse | merged | merged with the borders of blocks | error, where borders show most
 """
 
@@ -23,7 +23,7 @@ from torch import Tensor
 
 from vdgs.captures.capture import View
 from vdgs.errors import RunError
-from vdgs.evaluation import comparison_images, image_io
+from vdgs.evaluation import comparison_images
 from vdgs.evaluation.by_block import (
     BORDER_PX,
     BlockMetrics,
@@ -77,7 +77,7 @@ class BlockInputs:
     `render_block(index, camera)` is the image of a block as it was trained, among its frozen surroundings; None where
     it was not trained. All are measured in the exposure of the view, as in `MeasuredModel`."""
 
-    photographs: ReferenceViews
+    reference_views: ReferenceViews
     render_coarse: Callable[[Camera], Raster]
     render_merged: Callable[[Camera], Raster]
     render_block: Callable[[int, Camera], Raster | None]
@@ -105,11 +105,11 @@ def evaluate_blocks(inputs: BlockInputs, output: Path) -> BlockMetricsDocument:
 
     The figure of a block that was not trained is null. Raises RunError without views.
     """
-    views = inputs.photographs.views
+    views = inputs.reference_views.views
     if not views:
         raise RunError(f"{output}: there are no test views. Hold some out when the capture is read.")
     measured, seen = list[BlockViewMetrics](), list[SeamView]()
-    for view, stem in zip(views, image_io.unique_file_stems([view.name for view in views]), strict=True):
+    for view, stem in zip(views, comparison_images.unique_file_stems([view.name for view in views]), strict=True):
         check_stop_requested()
         figures, picture = measure_block_view(view, stem, inputs)
         measured.append(figures)
@@ -127,7 +127,7 @@ def select_seam_views(border_pixels: Sequence[int]) -> list[int]:
 
 
 def save_seam_image(path: Path, view: SeamView) -> None:
-    image_io.write_png(path, np.asarray(draw_seam_image(view)))
+    comparison_images.write_png(path, np.asarray(draw_seam_image(view)))
 
 
 def summarize_blocks(per_view_metrics: Iterable[BlockViewMetrics], blocks: int, output: Path) -> BlockMetricsDocument:
@@ -152,7 +152,7 @@ def summarize_blocks(per_view_metrics: Iterable[BlockViewMetrics], blocks: int, 
 def measure_block_view(view: View, stem: str, inputs: BlockInputs) -> tuple[BlockViewMetrics, SeamView]:
     """Measure a view; what it comes to, and what a picture of it shows."""
     by_block, seams = BlockMetrics(len(inputs.blocks), RENDER_NAMES), SeamMetrics()
-    reference, mask = inputs.photographs.load_image(view), inputs.photographs.load_mask(view)
+    reference, mask = inputs.reference_views.load_image(view), inputs.reference_views.load_mask(view)
     drawn = inputs.render_merged(view.camera)
     labels = block_label_map(drawn, view.camera, inputs.blocks)
     coarse, merged = inputs.to_image(inputs.render_coarse(view.camera), view), inputs.to_image(drawn, view)

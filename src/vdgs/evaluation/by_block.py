@@ -1,9 +1,8 @@
 """Quality by block, and what the seams between blocks cost.
 
-Every pixel of a test view is labelled with the block that owns the place it shows. PSNR is then pooled by block, and
-the error near the borders of the labels is held against the error elsewhere. Borders may happen to lie in places that
-are hard anyway, so the coarse model, which has no seams, is measured on the same pixels. Nothing is kept but sums: one
-pass, memory bounded whatever the number of test views.
+Every pixel of a test view is labelled with the block that owns the point it shows. PSNR is pooled by block, and the
+error near the borders of the labels is compared with the error in the interior. The coarse model, which has no seams,
+is measured on the same pixels: borders may lie where images are hard to match anyway. Only sums stay in memory.
 """
 
 from __future__ import annotations
@@ -32,10 +31,9 @@ NO_BLOCK = -1
 
 
 def block_label_map(raster: Raster, camera: Camera, blocks: Blocks) -> Int16[np.ndarray, "h w"]:
-    """The block that owns what each pixel shows, NOTHING where alpha is at most one half.
-
-    The place is the centre of the pixel at the median depth: where a surface is, unlike the expected depth, which
-    at the edge of a roof lies between roof and ground. Raises ValueError if the view was drawn without depth.
+    """The block that owns the point that each pixel shows (its centre at the median depth); NO_BLOCK where alpha is at
+    most one half. The expected depth would lie between roof and ground at the edge of a roof.
+    Raises ValueError if the view was rendered without depth.
     """
     if raster.median_depth is None:
         raise ValueError("labels need a render with depth")
@@ -79,7 +77,7 @@ def border_pixels(labels: Int16[np.ndarray, "h w"], width_px: float = BORDER_PX)
 
 
 def visible_blocks(labels: Int16[np.ndarray, "h w"], blocks: int) -> list[int]:
-    """The blocks that own at least LEAST_SHARE of the view."""
+    """The blocks that own at least MIN_VIEW_SHARE of the view."""
     counts = np.bincount(labels[labels >= 0].astype(np.int64), minlength=blocks)
     return np.flatnonzero(counts >= max(1.0, MIN_VIEW_SHARE * labels.size)).tolist()
 
@@ -95,34 +93,27 @@ class _PooledErrors:
         self._sums = {name: np.zeros(groups) for name in names}
 
     def merge(self: _AnyPooled, other: _AnyPooled) -> None:
-        """Count what another one counted; view by view, in their order, with the bits of one that counted all."""
+        """Add another's sums. Merged view by view, in order, sums have the bits of one object that counted all."""
         self._pixels += other._pixels
         for name, total in self._sums.items():
             total += other._sums[name]
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """What was counted: for files."""
-        return {
-            "pixels": self._pixels, "names": np.array([*self._sums], np.str_), "sums": np.stack([*self._sums.values()]),
-        }  # fmt: skip
+        """The counts as arrays, for files."""
+        names, sums = np.array([*self._sums], np.str_), np.stack([*self._sums.values()])
+        return {"pixels": self._pixels, "names": names, "sums": sums}
 
     @classmethod
     def of(cls: type[_AnyPooled], arrays: Mapping[str, np.ndarray]) -> _AnyPooled:
-        """The inverse of `arrays`."""
-        found = cls.__new__(cls)
-        names = [str(name) for name in arrays["names"]]
-        _PooledErrors.__init__(found, len(arrays["pixels"]), names)
-        found._pixels += arrays["pixels"]
-        for name, sums in zip(names, arrays["sums"], strict=True):
-            found._sums[name] += sums
-        return found
+        """The inverse of `to_arrays`."""
+        result = cls.__new__(cls)
+        result._pixels = arrays["pixels"].copy()
+        result._sums = {str(name): sums.copy() for name, sums in zip(arrays["names"], arrays["sums"], strict=True)}
+        return result
 
 
 class BlockMetrics(_PooledErrors):
     """Squared errors of named renders, pooled by block; `add` each test view, then read `rows`."""
-
-    def __init__(self, blocks: int, names: Sequence[str]) -> None:
-        super().__init__(blocks, names)
 
     def add(
         self,
@@ -130,8 +121,8 @@ class BlockMetrics(_PooledErrors):
         squared_errors: Mapping[str, Float[np.ndarray, "h w"]],
         mask: Bool[np.ndarray, "h w"] | None = None,
     ) -> None:
-        """Count one view. Only blocks of `visible_blocks` take part, so that all renders are measured on the same pixels;
-        a name whose errors are NaN there has no figure for that block."""
+        """Count one view: the pixels of `visible_blocks` alone, the same for all renders. A name whose errors are NaN
+        there has no figure for that block."""
         counted = np.isin(labels, visible_blocks(labels, len(self._pixels)))
         if mask is not None:
             counted &= mask
@@ -155,7 +146,7 @@ class BlockMetrics(_PooledErrors):
 
 
 class SeamMetrics(_PooledErrors):
-    """Errors at the borders of blocks against errors elsewhere; `add` each test view, then read `figures`."""
+    """Errors at the borders of blocks against errors in their interior; `add` each test view, then read `figures`."""
 
     #: The renders that are compared. The coarse one has no seams: it says how hard the places at the borders are.
     RENDER_NAMES = ("coarse", "merged")
@@ -178,12 +169,12 @@ class SeamMetrics(_PooledErrors):
                 sums[place] += errors[name][where].sum()
 
     def figures(self) -> JsonObject:
-        """Means at the border and elsewhere, their ratio for each render, and `seam_mae_ratio`, `seam_mse_ratio`: the ratio of the
-        merged render over that of the coarse one. Above 1, merging left seams; NaN where there are no borders."""
+        """Means at the border and in the interior, their ratio for each render, and `seam_mae_ratio`, `seam_mse_ratio`:
+        the ratio of the merged render over that of the coarse one. Above 1, merging left seams; NaN without borders."""
         result: JsonObject = {"border_pixels": int(self._pixels[0]), "interior_pixels": int(self._pixels[1])}
         for name, sums in self._sums.items():
-            border, elsewhere = (_ratio(float(sums[place]), float(self._pixels[place])) for place in (0, 1))
-            result[name] = {"border": border, "interior": elsewhere, "ratio": _ratio(border, elsewhere)}
+            border, interior = (_ratio(float(sums[place]), float(self._pixels[place])) for place in (0, 1))
+            result[name] = {"border": border, "interior": interior, "ratio": _ratio(border, interior)}
         for kind in ("mae", "mse"):
             coarse, merged = (result[f"{kind}_{name}"]["ratio"] for name in self.RENDER_NAMES)
             result[f"seam_{kind}_ratio"] = _ratio(merged, coarse)

@@ -1,9 +1,8 @@
 """Quality by visibility: the claim is about poorly seen places, so it is measured there.
 
-V is the number of training cameras that see a place (section IV-B); rendered per pixel it is a map
-[h, w], NaN where the model shows nothing, and is rounded to whole cameras. Pixels of all test views are
-pooled and cut into quantiles of V. Nothing is kept but a histogram: one pass, memory bounded whatever
-the number of test views.
+V is the number of training cameras that see a point (section IV-B); rendered per pixel it is a map [h, w], NaN where
+the model shows nothing, rounded to whole cameras. Pixels of all test views are pooled in a histogram and cut into
+quantiles of V.
 """
 
 from __future__ import annotations
@@ -58,8 +57,7 @@ class VisibilityHistogram:
             self._empty_sums[name] += float(values[name][empty].sum())
 
     def merge(self, other: VisibilityHistogram) -> None:
-        """Count what another one counted. Merged view by view, in their order, sums have the bits of one histogram to
-        which the views were added."""
+        """Add another's sums. Merged view by view, in their order, sums have the bits of one histogram of all views."""
         keys = np.flatnonzero(other._counts)
         self._counts[keys] += other._counts[keys]
         self._empty_count += other._empty_count
@@ -72,7 +70,7 @@ class VisibilityHistogram:
         return [*self._sums]
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """What was counted, without the places where nothing was: for files."""
+        """The counts that are not zero, for files."""
         keys = np.flatnonzero(self._counts)
         return {
             "names": np.array(self.names, np.str_), "keys": keys, "counts": self._counts[keys],
@@ -82,7 +80,7 @@ class VisibilityHistogram:
 
     @classmethod
     def of(cls, arrays: Mapping[str, np.ndarray]) -> VisibilityHistogram:
-        """The inverse of `arrays`."""
+        """The inverse of `to_arrays`."""
         found = cls([str(name) for name in arrays["names"]])
         found._counts[arrays["keys"]] = arrays["counts"]
         found._empty_count = int(arrays["empty_count"])
@@ -112,11 +110,9 @@ class VisibilityHistogram:
     def _bin(lower: float | None, upper: float | None, pixels: int, sums: Mapping[str, float]) -> VisibilityBin:
         figures: VisibilityBin = {"lower": lower, "upper": upper, "pixels": pixels}
         for name, total in sums.items():
-            mean = total / pixels
-            if name.startswith("squared_error"):
-                figures[name.replace("squared_error", "psnr", 1)] = psnr_from_mse(mean)
-            else:
-                figures[name] = mean
+            is_error = name.startswith("squared_error")
+            key = name.replace("squared_error", "psnr", 1)
+            figures[key] = psnr_from_mse(total / pixels) if is_error else total / pixels
         return figures
 
 
@@ -135,14 +131,9 @@ def view_bins(
     result: list[VisibilityBin] = []
     for group in quantile_groups(counts, n_bins):
         members = order[ends[group[0]] : ends[group[-1] + 1]]
-        entry: VisibilityBin = {
-            "lower": float(values[group[0]]),
-            "upper": float(values[group[-1]]),
-            "views": len(members),
-        }
-        for name in figures[members[0]]:
-            entry[name] = mean_or_none([figures[i][name] for i in members])
-        result.append(entry)
+        bounds = {"lower": float(values[group[0]]), "upper": float(values[group[-1]]), "views": len(members)}
+        means = {name: mean_or_none([figures[i][name] for i in members]) for name in figures[members[0]]}
+        result.append({**bounds, **means})
     return result
 
 
@@ -170,12 +161,12 @@ def quantile_groups(counts: np.ndarray, n_bins: int) -> list[np.ndarray]:
 
 
 def histogram_keys(values: np.ndarray) -> np.ndarray:
-    """Where non-negative numbers (infinity too) are counted in a histogram of KEYS places, in their order."""
+    """The bin of each non-negative number (infinity too) in a histogram of NUM_KEYS bins, in ascending order."""
     # Adding zero turns a negative zero, whose bits would be a huge key, into a positive one.
     positive = np.maximum(values, 0.0).astype(np.float32) + np.float32(0.0)
     return (positive.view(np.uint32) >> _DROPPED_BITS).astype(np.int64)
 
 
 def histogram_values(keys: np.ndarray) -> np.ndarray:
-    """The least number, float32, that is counted at each place."""
+    """The least number, float32, of each bin."""
     return (keys.astype(np.uint32) << _DROPPED_BITS).view(np.float32)

@@ -6,15 +6,20 @@ the same on every machine.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
+import cv2
 import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
+
+from vdgs.errors import VdgsError
+from vdgs.system.atomic_files import write_bytes
 
 #: Mean absolute error per channel at the bright end of the colour map: one scale for all views of all
 #: runs, so that two pictures can be held side by side.
@@ -26,6 +31,7 @@ INK, FAINT, PAPER = (28, 30, 34), (120, 124, 130), (255, 255, 255)
 #: Panels are shown between these widths; the renders themselves are saved untouched.
 PANEL_MIN_PX, PANEL_MAX_PX = 320, 960
 THUMBNAIL_PX = 300
+_MAX_NAME_LENGTH = 120
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,3 +195,37 @@ def _ellipsize(text: str, face: ImageFont.FreeTypeFont, room_px: float) -> str:
         if face.getlength(short) <= room_px:
             return short
     return "…"
+
+
+def write_png(path: Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
+    """Lossless RGB, atomically."""
+    done, content = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))
+    if not done:
+        raise VdgsError(f"{path} cannot be encoded as PNG from an image of size {list(image.shape)}.")
+    write_bytes(path, content.tobytes())
+
+
+def unique_file_stems(names: Sequence[str]) -> list[str]:
+    """One file name (without suffix) for each view name, in order, unique even where case is ignored.
+
+    `a/b.jpg` becomes `a__b`; where that name is taken the suffix joins it (`a__b_jpg`), then a number.
+    """
+    taken: set[str] = set()
+    stems = []
+    for name in names:
+        path = PurePosixPath(name.replace("\\", "/"))
+        parts = [*path.parent.parts, path.stem]
+        plain = "__".join(_safe(part) for part in parts if part.strip("/."))[-_MAX_NAME_LENGTH:] or "view"
+        stem, number = plain, 2
+        if stem.casefold() in taken and path.suffix:
+            plain = stem = f"{plain}_{_safe(path.suffix[1:])}"
+        while stem.casefold() in taken:
+            stem, number = f"{plain}_{number}", number + 1
+        taken.add(stem.casefold())
+        stems.append(stem)
+    return stems
+
+
+def _safe(part: str) -> str:
+    """Letters, digits and a few marks: no separators, drive letters or hidden files."""
+    return re.sub(r"[^\w.\- ]", "_", part).strip(". ") or "_"

@@ -38,18 +38,18 @@ class DepthErrors:
         self._near += int(np.count_nonzero(errors <= NEAR_THRESHOLD))
 
     def merge(self, other: DepthErrors) -> None:
-        """Count what another one counted."""
+        """Add another's counts."""
         self._counts += other._counts
         self._near += other._near
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """What was counted, without the places where nothing was: for files."""
+        """The counts that are not zero, for files."""
         keys = np.flatnonzero(self._counts)
         return {"keys": keys, "counts": self._counts[keys], "near": np.array(self._near)}
 
     @classmethod
     def of(cls, arrays: Mapping[str, np.ndarray]) -> DepthErrors:
-        """The inverse of `arrays`."""
+        """The inverse of `to_arrays`."""
         found = cls()
         found._counts[arrays["keys"]] = arrays["counts"]
         found._near = int(arrays["near"])
@@ -67,34 +67,34 @@ class DepthErrors:
         return float(histogram_values(np.array([middle]))[0])
 
     def near_share(self) -> float | None:
-        """Of the errors, how many are at most NEAR; exact."""
+        """Of the errors, how many are at most NEAR_THRESHOLD; exact."""
         return self._near / self.count if self.count else None
 
 
 def compute_depth_errors(
     raster: Raster, true_depth: Float[np.ndarray, "h w"], covered: Bool[np.ndarray, "h w"], camera_height: float
 ) -> dict[str, Float[np.ndarray, " n"]]:
-    """|depth - truth| / camera height at the seen pixels of which the truth is known (not of the sky), by kind.
+    """|depth - truth| / camera height at the covered pixels whose truth is known (not sky), by kind.
 
-    `truth` is the depth along the camera's axis, in the units of the model like `camera_height` (> 0), infinite for
-    sky. `drawn` comes with depth; a kind that the renderer does not know is left out.
+    `true_depth` is along the camera's axis, in the units of the model like `camera_height` (> 0), infinite for sky.
+    A kind that the renderer does not know is left out.
     """
     counted = covered & np.isfinite(true_depth)
     alpha = raster.alpha.double().cpu().numpy()[counted]
     shown = alpha > MIN_ALPHA
-    found = {}
+    result = {}
     for kind, depth in zip(DEPTH_KINDS, (raster.depth, raster.median_depth), strict=True):
         if depth is None:
             continue
         depths = depth.double().cpu().numpy()[counted]
         if kind == "expected":
             depths = depths / np.where(shown, alpha, 1.0)
-        found[kind] = np.where(shown, np.abs(depths - true_depth[counted]) / camera_height, np.inf)
-    return found
+        result[kind] = np.where(shown, np.abs(depths - true_depth[counted]) / camera_height, np.inf)
+    return result
 
 
 def summarize_depth_errors(errors: Mapping[str, DepthErrors]) -> dict[str, float | None]:
-    """What is reported, under NAMES; None of a kind that is not there."""
+    """The figures of METRIC_NAMES; None for a kind that is missing."""
     figures: dict[str, float | None] = dict.fromkeys(METRIC_NAMES)
     for kind, each in errors.items():
         figures[f"depth_error_median_{kind}"] = each.median()

@@ -1,6 +1,5 @@
-"""Evaluate a model on views, mostly its test views: every figure that papers report, raw and colour-corrected, and by
-visibility; whether it is opaque where photographs show ground; the pictures behind that. One view is in memory at a
-time.
+"""Evaluates a model on views: every figure that papers report, raw, colour-corrected, by visibility; opacity; images.
+One view is in memory at a time.
 
     OUTPUT/
       metrics.json        means over the views, bins by visibility, size and speed of the model
@@ -24,7 +23,7 @@ from rich.console import Console
 
 from vdgs.captures.capture import View
 from vdgs.errors import RunError
-from vdgs.evaluation import comparison_images, image_io
+from vdgs.evaluation import comparison_images
 from vdgs.evaluation.by_visibility import VisibilityHistogram, mean_or_none, view_bins
 from vdgs.evaluation.depth_errors import DepthErrors, summarize_depth_errors
 from vdgs.evaluation.lpips import Lpips
@@ -85,9 +84,13 @@ def evaluate_model(
     """
     require_views(reference_views.views, output)
     inputs = ViewInputs(reference_views, model, lpips, settings or EvaluationSettings(), output)
-    measured = (_unless_stopped(index, inputs) for index in range(len(reference_views.views)))
+
+    def measure(index: int) -> ViewMetrics:
+        check_stop_requested()
+        return measure_view(index, inputs)
+
     return summarize_views(
-        measured, model.facts, output,
+        map(measure, range(len(reference_views.views))), model.metadata, output,
         lpips_note=lpips_note, settings=inputs.settings, timed=model.is_timed, console=console,
     )  # fmt: skip
 
@@ -101,11 +104,6 @@ def require_views(views: Sequence[View], output: Path) -> None:
         )
 
 
-def _unless_stopped(index: int, inputs: ViewInputs) -> ViewMetrics:
-    check_stop_requested()
-    return measure_view(index, inputs)
-
-
 def summarize_views(
     per_view_metrics: Iterable[ViewMetrics],
     metadata: ModelMetadata,
@@ -116,7 +114,7 @@ def summarize_views(
     timed: bool,
     console: Console | None,
 ) -> EvaluationMetrics:
-    """Gather views, in their order, into the figures of all of them; otherwise as `evaluate_model`. One is held at a time."""
+    """Gather views, in their order, into the figures of all; otherwise as `evaluate_model`. One view is in memory."""
     gathered = _MetricTotals()
     for figures in per_view_metrics:
         gathered.add(figures)
@@ -128,26 +126,24 @@ def summarize_views(
 
 
 def _summary(
-    gathered: _MetricTotals, facts: ModelMetadata, lpips_note: str, settings: EvaluationSettings, timed: bool
+    gathered: _MetricTotals, metadata: ModelMetadata, lpips_note: str, settings: EvaluationSettings, timed: bool
 ) -> EvaluationMetrics:
-    rows = gathered.rows
-    means = {name: mean_or_none([row[name] for row in rows]) for name in RAW_KEYS + CORRECTED_KEYS + AFFINE_KEYS}
+    rows, keys = gathered.rows, RAW_KEYS + CORRECTED_KEYS + AFFINE_KEYS
     pixel_bins = gathered.histogram.bins(settings.visibility_bins) if gathered.histogram else None
     visible = [np.nan if row["mean_visibility"] is None else row["mean_visibility"] for row in rows]
-    figures = [{name: row[name] for name in RAW_KEYS + CORRECTED_KEYS + AFFINE_KEYS} for row in rows]
+    figures = [{name: row[name] for name in keys} for row in rows]
     unfitted = sum(row.get("color_correction_fitted") is False for row in rows)
     notes = [note for note in (lpips_note, _exposure_note(rows, settings)) if note]
     if unfitted:
         notes.append(f"colour correction: too few unsaturated pixels in {unfitted} views, left as they are")
     result = {
-        **means,
-        **{name: mean_or_none([row.get(name) for row in rows]) for name in REFERENCE_EXPOSURE_KEYS},
+        **{name: mean_or_none([row[name] for row in rows]) for name in keys + REFERENCE_EXPOSURE_KEYS},
         "by_visibility": pixel_bins,
         "views_by_visibility": view_bins(visible, figures, settings.visibility_bins) if pixel_bins else None,
         **summarize_opacity_coverage(rows),
         **summarize_depth_errors(gathered.depth_errors),
         **summarize_oversized_splats(rows),
-        **asdict(facts),
+        **asdict(metadata),
         "fps": 1.0 / max(statistics.median(row["render_seconds"] for row in rows), 1e-9) if timed else None,
         settings.title.replace(" ", "_"): len(rows),
         "notes": notes,
@@ -173,6 +169,6 @@ def _write(output: Path, result: Mapping[str, Any], gathered: _MetricTotals, tit
         psnr = "PSNR –" if result["psnr"] is None else f"PSNR {result['psnr']:.2f} dB"
         ssim = "SSIM –" if result["ssim"] is None else f"SSIM {result['ssim']:.3f}"
         sheet = comparison_images.draw_contact_sheet(gathered.cells, f"{shown} {title} · {psnr} · {ssim}")
-        image_io.write_png(output / "contact_sheet.png", np.asarray(sheet))
+        comparison_images.write_png(output / "contact_sheet.png", np.asarray(sheet))
     write_json(output / "per_view.json", to_jsonable(gathered.rows))
     write_json(output / "metrics.json", result)  # last: where it stands, the rest is complete

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -17,22 +18,26 @@ from vdgs.captures.capture import Capture, View
 from vdgs.captures.ground_truth import has_ground_truth, load_ground_truth
 from vdgs.captures.image_cache import ImageCache
 from vdgs.errors import RunError
-from vdgs.evaluation.coverage import coverage_map
+from vdgs.evaluation.block_seams import BlockInputs
 from vdgs.evaluation.evaluate_model import evaluate_model
 from vdgs.evaluation.lpips import load_lpips
+from vdgs.evaluation.opacity_coverage import coverage_map
 from vdgs.evaluation.renderable_model import EvaluationSettings, ModelMetadata, ReferenceViews, RenderableModel
 from vdgs.evaluation.view_exposures import make_exposures
 from vdgs.geometry.camera import Camera
-from vdgs.model.anchor_model import AnchorModel
+from vdgs.kernels.kernel_types import Raster
+from vdgs.model.anchor_model import AnchorModel, DecoderSpan
 from vdgs.model.renderer import decode_view, render, render_scalar_map
-from vdgs.runs.open_run import OpenedRun
+from vdgs.partition.block_regions import split_trainable_anchors
+from vdgs.runs.model_integrity import load_verified
+from vdgs.runs.open_run import OpenedRun, load_run_blocks
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.visibility_store import get_run_visibility
 
 #: Photographs kept decoded during an evaluation, which needs one at a time.
 IMAGE_CACHE_BYTES = 256_000_000
 
-#: How views are exposed, where exposures were fitted (`evaluation.exposures`).
+#: How views are exposed, where exposures were fitted (`evaluation.view_exposures`).
 EXPOSURE_NOTES = {
     "test": "in the exposure interpolated from the training photographs before and after, corrected for what is "
     "metered where that foretells these (no pixel of a test view is used)",
@@ -41,6 +46,8 @@ EXPOSURE_NOTES = {
 
 #: What to measure on. A model that is good on training views and not on test views overfits.
 EvaluationSplit = Literal["test", "training"]
+#: Blocks are held assembled among their surroundings up to so many bytes (at least one): views show them in turn.
+CACHE_BYTES = 2_000_000_000
 
 
 def evaluate_run(
@@ -55,18 +62,10 @@ def evaluate_run(
     check_bins(bins)
     output = evaluation_folder(run.folder, run.name, views)
     lpips, note = load_lpips(lpips_weights)
-    model, chosen = make_renderable_model(run, coarse, views), select_views(run.capture, views)
-    with cached_reference_views(chosen) as photographs:
-        evaluate_model(
-            photographs,
-            model,
-            output,
-            lpips=lpips,
-            lpips_note=note,
-            console=console,
-            settings=make_evaluation_settings(bins, views),
-        )
-    console.print(f"pictures and figures: {output}", highlight=False)
+    model, settings = make_renderable_model(run, coarse, views), make_evaluation_settings(bins, views)
+    with cached_reference_views(select_views(run.capture, views)) as images:
+        evaluate_model(images, model, output, lpips=lpips, lpips_note=note, console=console, settings=settings)
+    console.print(f"images and metrics: {output}", highlight=False)
 
 
 def check_bins(bins: int) -> None:
@@ -85,7 +84,7 @@ def select_views(capture: Capture, views: EvaluationSplit) -> list[View]:
 
 def make_renderable_model(run: OpenedRun, coarse: OpenedRun, views: EvaluationSplit) -> RenderableModel:
     """The opened model as the evaluation sees it, beside the coarse model of its run."""
-    facts = ModelMetadata(
+    metadata = ModelMetadata(
         model=run.name,
         n_anchors=len(run.model.anchors),
         model_bytes=run.model_path.stat().st_size,
@@ -95,7 +94,7 @@ def make_renderable_model(run: OpenedRun, coarse: OpenedRun, views: EvaluationSp
         key=run.key,
     )
     return RenderableModel(
-        render=lambda camera: render(run.model, camera), visibility_map=make_visibility_map(coarse), facts=facts,
+        render=lambda camera: render(run.model, camera), visibility_map=make_visibility_map(coarse), metadata=metadata,
         background=run.model.background, coverage_map=make_coverage_map(coarse),
         true_depth=make_true_depth(run.capture, select_views(run.capture, views)),
         render_depth=lambda camera: render(run.model, camera, depth=True), camera_height=camera_height(run.capture),
@@ -133,7 +132,7 @@ def make_visibility_map(coarse: OpenedRun) -> Callable[[Camera], np.ndarray]:
 
 
 def make_coverage_map(coarse: OpenedRun) -> Callable[[Camera], Bool[np.ndarray, "h w"]]:
-    """Which pixels of a view show what enough training cameras see (`evaluation.seen`), by the coarse model's depth
+    """Which pixels of a view show what enough training cameras see , by the coarse model's depth
     whatever model is measured."""
     cameras = [view.camera for view in coarse.capture.train_views]
     return coverage_map(lambda camera: render(coarse.model, camera, depth=True), cameras)
@@ -156,3 +155,52 @@ def make_true_depth(capture: Capture, views: Sequence[View]) -> Callable[[View],
         return None
     # The world of a generated capture is in metres, and the ground frame is a similarity of it.
     return lambda view: units_per_metre * truth.depth_map(view)
+
+
+def make_block_inputs(opened: OpenedRun, coarse: OpenedRun, images: ReferenceViews) -> BlockInputs:
+    """Where the pictures of a run's blocks come from; the merged model is the one that was opened."""
+    run = opened.folder
+    return BlockInputs(
+        reference_views=images,
+        render_coarse=lambda camera: render(coarse.model, camera, depth=True),
+        render_merged=lambda camera: render(opened.model, camera, depth=True),
+        render_block=IsolatedBlocks(run, coarse.model).render,
+        blocks=load_run_blocks(run),
+        exposure=make_exposures(opened.model, opened.capture),
+    )  # fmt: skip
+
+
+class IsolatedBlocks:
+    """Blocks as they were trained, before the merge: their own anchors among frozen coarse ones."""
+
+    def __init__(self, run: RunFolder, coarse: AnchorModel):
+        self._run, self._coarse = run, coarse
+        blocks, config, key = load_run_blocks(run), run.method().block, run.keys().blocks
+        self._key = key
+        self._around = [
+            split_trainable_anchors(coarse.anchors, blocks, index, config)[1] for index in range(len(blocks))
+        ]
+        self._done = [run.block(index).is_done(key) for index in range(len(blocks))]
+        self._held: OrderedDict[int, AnchorModel] = OrderedDict()
+
+    def render(self, index: int, camera: Camera) -> Raster | None:
+        """The block's own picture; None if it was not trained (merged with --allow-missing-blocks)."""
+        if not self._done[index]:
+            return None
+        if index not in self._held:
+            self._held[index] = self.assemble(index)
+            while len(self._held) > 1 and sum(_bytes(model) for model in self._held.values()) > CACHE_BYTES:
+                self._held.popitem(last=False)
+        self._held.move_to_end(index)
+        return render(self._held[index], camera)
+
+    def assemble(self, index: int) -> AnchorModel:
+        """A block's own anchors and what stood around them in its training, each with its decoder."""
+        own = load_verified(self._run.block(index), self._key, index).to(self._coarse.anchors.positions.device)
+        around = self._coarse.anchors.select(self._around[index])
+        parts = DecoderSpan(len(own.anchors), own.decoder), DecoderSpan(len(around), self._coarse.decoder)
+        return replace(own, anchors=own.anchors.concat(around), decoder_spans=parts)
+
+
+def _bytes(model: AnchorModel) -> int:
+    return sum(tensor.numel() * tensor.element_size() for tensor in model.anchors.tensors().values())

@@ -105,15 +105,15 @@ def load_lpips(weights: Path | None = None, heads: Path | None = None) -> tuple[
             f"LPIPS is null: no VGG16 weights. Download {VGG16_URL} and give --lpips-weights PATH, "
             f"or put it at {cached}."
         )
-    found = heads or find_heads()
-    if found is None:
+    head_file = heads or find_heads()
+    if head_file is None:
         return None, "LPIPS is null: no linear heads. They ship with torchmetrics: pip install 'vdgs[lpips]'."
-    backbone, linear = _read(source, "VGG16 weights"), _read(found, "LPIPS heads")
+    backbone, linear = _read(source, "VGG16 weights"), _read(head_file, "LPIPS heads")
     try:
         metric = Lpips(backbone, linear)
     except ValueError as error:
         raise VdgsError(
-            f"{source} and {found} do not make LPIPS: {error}. The weights must be torchvision's VGG16 "
+            f"{source} and {head_file} do not make LPIPS: {error}. The weights must be torchvision's VGG16 "
             f"({VGG16_URL}), the heads vgg.pth of torchmetrics or lpips."
         ) from error
     return metric, f"LPIPS from {source.name} ({_weights_origin(source)})"
@@ -151,29 +151,24 @@ def _weights_origin(weights: Path) -> str:
 
 
 def _read(path: Path, what: str) -> dict[str, Tensor]:
-    try:
-        if path.suffix == ".safetensors":
-            tensors = load_file(path)
-        else:
-            tensors = torch.load(path, map_location="cpu", weights_only=True)
-    except FileNotFoundError as error:
-        raise VdgsError(f"{path}: no such file; it should hold the {what}.") from error
-    except (SafetensorError, OSError, EOFError, RuntimeError, ValueError, KeyError) as error:
-        raise VdgsError(_unreadable(path, what)) from error
-    except Exception as error:  # weights_only raises pickle's own error, and pickle is not imported here
-        if type(error).__name__ != "UnpicklingError":
-            raise
-        raise VdgsError(_unreadable(path, what)) from error
-    if not isinstance(tensors, Mapping):
-        raise VdgsError(_unreadable(path, what))
-    return {name: value for name, value in tensors.items() if isinstance(value, Tensor)}
-
-
-def _unreadable(path: Path, what: str) -> str:
-    return (
+    unreadable = (
         f"{path} cannot be read as {what}: it must be a state dict of tensors, saved by torch or as "
         f".safetensors. Perhaps the download was cut off; download it again."
     )
+    try:
+        is_safetensors = path.suffix == ".safetensors"
+        tensors = load_file(path) if is_safetensors else torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError as error:
+        raise VdgsError(f"{path}: no such file; it should hold the {what}.") from error
+    except Exception as error:
+        # weights_only raises pickle's own error, and pickle is not imported here
+        expected = SafetensorError, OSError, EOFError, RuntimeError, ValueError, KeyError
+        if not isinstance(error, expected) and type(error).__name__ != "UnpicklingError":
+            raise
+        raise VdgsError(unreadable) from error
+    if not isinstance(tensors, Mapping):
+        raise VdgsError(unreadable)
+    return {name: value for name, value in tensors.items() if isinstance(value, Tensor)}
 
 
 def _take(tensors: Mapping[str, Tensor], name: str, shape: tuple[int, ...]) -> Tensor:

@@ -20,7 +20,7 @@ QUALITY_METRICS = (
     ("lpips_vgg", "LPIPS vgg ↓", "{:.4f}"),
     ("lpips_vgg_01", "LPIPS vgg, [0,1] input ↓", "{:.4f}"),
 )
-#: Of solidity: what is measured over the pixels that training cameras see; those that are null are not shown.
+#: Figures over the pixels that training cameras cover; those that are null are not shown.
 COVERAGE_METRICS = (
     ("opacity_coverage", "opaque (alpha ≥ 0.95) ↑", "{:.2%}"),
     ("psnr_covered_own_background", "PSNR before its own background (dB) ↑", "{:.2f}"),
@@ -35,7 +35,7 @@ COVERAGE_METRICS = (
 
 def make_metrics_table(result: Mapping[str, Any], title: str) -> RenderableType:
     """What `metrics.json` holds: quality raw, colour-corrected, after an affine map of the colours and, where pictures
-    are exposed, in neutral colours; quality by visibility, solidity, size and speed."""
+    are exposed, in neutral colours; quality by visibility, opacity, size and speed."""
     quality = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
     besides = {"_cc": "color-corrected", "_affine": "affine fit"}
     if result["psnr_reference_exposure"] is not None:
@@ -49,7 +49,7 @@ def make_metrics_table(result: Mapping[str, Any], title: str) -> RenderableType:
     if result["by_visibility"]:
         parts.append(_visibility_table(result["by_visibility"]))
     if result["psnr_covered_own_background"] is not None:
-        parts.append(_solidity_table(result))
+        parts.append(_opacity_table(result))
     if result["max_oversized_splats"]:
         parts.append(Text(_splats_line(result)))
     parts.append(Text(_model_line(result), style="dim"))
@@ -75,7 +75,7 @@ def _visibility_table(bins: list[Mapping[str, Any]]) -> Table:
     return table
 
 
-def _solidity_table(result: Mapping[str, Any]) -> Table:
+def _opacity_table(result: Mapping[str, Any]) -> Table:
     table = Table(
         box=box.SIMPLE_HEAD, show_header=False, title="of the pixels that at least 3 training cameras see",
         title_justify="left",

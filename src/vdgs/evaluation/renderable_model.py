@@ -47,7 +47,7 @@ class RenderableModel:
     render: Callable[[Camera], RenderedView]
     #: V per pixel [h, w], NaN where the model shows nothing; without it there are no figures by visibility.
     visibility_map: Callable[[Camera], Float[np.ndarray, "h w"]] | None = None
-    facts: ModelMetadata = ModelMetadata()
+    metadata: ModelMetadata = ModelMetadata()
     #: Whether the time that `render` takes says anything.
     is_timed: bool = True
     #: What is behind the model in a render, RGB in [0, 1].

@@ -12,9 +12,8 @@ from vdgs.config.method import MethodConfig, PartitionConfig
 from vdgs.errors import VdgsError
 from vdgs.partition.blocks import Block, Blocks
 from vdgs.partition.boundary import MIN_CELLS, block_cores, cell_size, expand_core, scene_extent
-from vdgs.partition.clustering import check_distinct, cluster_anchors, clustering_features
+from vdgs.partition.clustering import check_distinct, cluster_anchors, clustering_features, fit_principal_plane
 from vdgs.partition.polygon_lookup import BlockCores
-from vdgs.partition.principal_axes import fit_principal_plane
 from vdgs.system.memory.memory_estimate import block_workload, estimate_memory
 
 #: A block that would own less than this share of the anchors of an average block is not worth training.

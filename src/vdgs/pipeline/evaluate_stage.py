@@ -22,20 +22,21 @@ from vdgs.distributed.sharded_job import ExecutionOptions, ShardedJob, ShardNeed
 from vdgs.evaluation.block_seams import SeamView, evaluate_blocks, make_block_table, save_seam_image, select_seam_views
 from vdgs.evaluation.block_seams import measure_block_view as measure_view_of_blocks
 from vdgs.evaluation.block_seams import summarize_blocks as conclude_blocks
+from vdgs.evaluation.comparison_images import unique_file_stems
 from vdgs.evaluation.evaluate_model import require_views, summarize_views
 from vdgs.evaluation.evaluate_run import (
+    CACHE_BYTES,
     IMAGE_CACHE_BYTES,
     EvaluationSplit,
     cached_reference_views,
     check_bins,
     evaluate_run,
     evaluation_folder,
+    make_block_inputs,
     make_evaluation_settings,
     make_renderable_model,
     select_views,
 )
-from vdgs.evaluation.image_io import unique_file_stems
-from vdgs.evaluation.isolated_blocks import CACHE_BYTES, make_block_inputs
 from vdgs.evaluation.lpips import load_lpips
 from vdgs.evaluation.renderable_model import ModelMetadata
 from vdgs.evaluation.view_metrics import ViewInputs, measure_view
@@ -186,7 +187,7 @@ def measure_shard(shard: Shard) -> None:
             seams = (
                 make_block_inputs(opened, coarse, photographs) if _has_seams(run, opened.name, asked.views) else None
             )
-            facts = {"model": record_to_dict(model.facts), "lpips_note": note}
+            facts = {"model": record_to_dict(model.metadata), "lpips_note": note}
             write_json(job.shard(shard.index).path / "facts.json", facts)
             shard.console.print(f"measuring the {opened.summary} on {len(left)} views", highlight=False)
             pictures = _SeamPictures(job, job.spans[shard.index]) if seams is not None else None

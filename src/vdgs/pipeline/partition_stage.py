@@ -28,8 +28,9 @@ from vdgs.distributed.shard import Results, Shard
 from vdgs.distributed.sharded_job import ExecutionOptions, ShardedJob, ShardNeeds, split_ranges
 from vdgs.errors import RunError
 from vdgs.geometry.camera import Camera
-from vdgs.partition.assignment.assign_cameras import Assignment, assign_cameras
-from vdgs.partition.assignment.assignment_tables import (
+from vdgs.partition.assignment.assign_cameras import (
+    Assignment,
+    assign_cameras,
     assignment_rows,
     block_rows,
     explain_assignment,

@@ -16,7 +16,7 @@ from vdgs.captures.output_guard import check_not_among_folders, check_not_in_cap
 from vdgs.config.commands import MAX_RENDER_SIDE_PX, RENDER_BYTES_PER_PIXEL, RenderRequest
 from vdgs.config.ranges import check_ranges
 from vdgs.errors import VdgsError
-from vdgs.evaluation.image_io import unique_file_stems, write_png
+from vdgs.evaluation.comparison_images import unique_file_stems, write_png
 from vdgs.evaluation.metrics import to_8bit
 from vdgs.geometry.camera import Camera
 from vdgs.model.renderer import render

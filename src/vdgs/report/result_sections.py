@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import PurePosixPath
 
 from vdgs.evaluation.by_visibility import format_bounds
-from vdgs.evaluation.image_io import unique_file_stems
+from vdgs.evaluation.comparison_images import unique_file_stems
 from vdgs.report.charts import draw_gain_bars, draw_psnr_bars
 from vdgs.report.html_page import Html, details, figure, gallery, paragraph, section, table
 from vdgs.report.run_reader import (

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from vdgs.synth.options import SynthOptions
 
 if TYPE_CHECKING:
-    from vdgs.synth.flight_stats import FlightStats
+    from vdgs.synth.true_visibility import FlightStats
 
 __all__ = ["SynthOptions", "generate"]
 
@@ -22,11 +22,10 @@ def generate(
 ) -> FlightStats:
     """Build a town, fly over it and write a COLMAP capture to `output` (which must not hold anything yet).
 
-    Returns how unevenly the flight sees the place.
-    `progress(stage, done, total)` is called as the work goes on. The same options give the same bytes.
-    Raises VdgsError where the extra `synth` is not installed, an option makes no capture, or `output`
+    Returns how unevenly the flight sees the town; calls `on_progress(stage, done, total)`. The same options give the
+    same bytes. Raises VdgsError where the extra `synth` is not installed, an option makes no capture, or `output`
     holds something already.
     """
     from vdgs.synth.generation import generate as run
 
-    return run(Path(output), options or SynthOptions(), on_progress)
+    return run(Path(output), options or SynthOptions(), on_progress or (lambda stage, done, total: None))

@@ -8,8 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from vdgs.synth.mesh import srgb
-from vdgs.synth.noise import cells, fade, line, smooth
-from vdgs.synth.surface import Surface, mix_colors, scale_color
+from vdgs.synth.surface import Surface, cells, fade, line, mix_colors, scale_color, smooth
 
 AlbedoAndGloss = tuple[np.ndarray, np.ndarray]
 _GLASS = srgb("#2c3a48")
@@ -27,6 +26,14 @@ def _grain_plane(s: Surface) -> tuple[np.ndarray, np.ndarray]:
     return s.uv[:, 0] + s.seed * 97, s.uv[:, 1] + s.seed * 53
 
 
+def _half_bond(s: Surface, width: float, height: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Coordinates u, v in courses of stones (m) laid in half bond, and the column and row of the stone."""
+    u, v = s.uv[:, 0] / np.float32(width), s.uv[:, 1] / np.float32(height)
+    j = np.floor(v)
+    u = u + 0.5 * (j % 2)
+    return u, v, np.floor(u), j
+
+
 def plaster(s: Surface) -> AlbedoAndGloss:
     """Rendered wall: blotches, and dirt where rain splashes up."""
     u, v = _grain_plane(s)
@@ -37,10 +44,7 @@ def plaster(s: Surface) -> AlbedoAndGloss:
 
 def stone(s: Surface) -> AlbedoAndGloss:
     """Ashlar: blocks of 0.9 by 0.45 m in half bond."""
-    u, v = s.uv[:, 0] / np.float32(0.9), s.uv[:, 1] / np.float32(0.45)
-    j = np.floor(v)
-    u = u + 0.5 * (j % 2)
-    i = np.floor(u)
+    u, v, i, j = _half_bond(s, 0.9, 0.45)
     tint = 1 + 0.22 * (cells(i, j) - 0.5) * fade(0.5, s.footprint)
     joint = np.maximum(line((u - i) * 0.9, 0.03, s.footprint), line((v - j) * 0.45, 0.03, s.footprint))
     return _matt(scale_color(s.color, (tint + 0.05 * smooth(*_grain_plane(s), 1.3)) * (1 - 0.3 * joint)))
@@ -48,10 +52,7 @@ def stone(s: Surface) -> AlbedoAndGloss:
 
 def brick(s: Surface) -> AlbedoAndGloss:
     """Courses of large bricks with pale joints."""
-    u, v = s.uv[:, 0] / np.float32(0.5), s.uv[:, 1] / np.float32(0.22)
-    j = np.floor(v)
-    u = u + 0.5 * (j % 2)
-    i = np.floor(u)
+    u, v, i, j = _half_bond(s, 0.5, 0.22)
     tint = 1 + 0.4 * (cells(i, j) - 0.5) * fade(0.3, s.footprint)
     joint = np.maximum(line((u - i) * 0.5, 0.02, s.footprint), line((v - j) * 0.22, 0.02, s.footprint))
     return _matt(mix_colors(scale_color(s.color, tint), srgb("#c9bfb0"), 0.5 * joint))
@@ -64,7 +65,7 @@ def _panes(s: Surface, u: np.ndarray, v: np.ndarray, lit: np.ndarray) -> np.ndar
     return mix_colors(curtain, _FRAME, 0.8 * bars)
 
 
-def windows(s: Surface, door: bool = False) -> AlbedoAndGloss:
+def windows(s: Surface, has_door: bool = False) -> AlbedoAndGloss:
     """A house wall: evenly spaced windows with frames, sills and shutters; a door in the middle column."""
     color, gloss = plaster(s)
     width, height = s.panel.T
@@ -74,7 +75,7 @@ def windows(s: Surface, door: bool = False) -> AlbedoAndGloss:
     u = s.uv[:, 0] - (column + 0.5) * pitch
     v = s.uv[:, 1] - storey * np.float32(2.7) - 1.55
     room = (storey + 1) * 2.7 <= height + 0.2
-    is_door = (column == np.floor(columns / 2)) & (storey == 0) & door
+    is_door = (column == np.floor(columns / 2)) & (storey == 0) & has_door
     glazed = room & ~is_door
     hw, hh = np.float32(0.52), np.float32(0.68)
     au, av = np.abs(u), np.abs(v)
@@ -94,9 +95,9 @@ def windows(s: Surface, door: bool = False) -> AlbedoAndGloss:
     return color.astype(np.float32), np.where(pane, np.float32(0.7), gloss)
 
 
-def front(s: Surface) -> AlbedoAndGloss:
+def door(s: Surface) -> AlbedoAndGloss:
     """A house wall with its door."""
-    return windows(s, door=True)
+    return windows(s, has_door=True)
 
 
 def office(s: Surface) -> AlbedoAndGloss:
@@ -144,10 +145,7 @@ def tiles(s: Surface) -> AlbedoAndGloss:
 
 def slate(s: Surface) -> AlbedoAndGloss:
     """Flat slates in half bond."""
-    v = s.uv[:, 1] / np.float32(0.4)
-    j = np.floor(v)
-    u = s.uv[:, 0] / np.float32(0.4) + 0.5 * (j % 2)
-    i = np.floor(u)
+    u, v, i, j = _half_bond(s, 0.4, 0.4)
     alike = fade(0.4, s.footprint)
     tint = 1 + 0.36 * (cells(i, j, (s.seed * 512).astype(np.int32)) - 0.5) * alike
     edge = np.maximum(line((v - j) * 0.4, 0.04, s.footprint), line((u - i) * 0.4, 0.02, s.footprint))
@@ -206,6 +204,41 @@ def solar(s: Surface) -> AlbedoAndGloss:
     return mix_colors(color, srgb("#7f93b8"), 0.3 * cell), np.full(len(u), 0.5, np.float32)
 
 
-def plain(s: Surface) -> AlbedoAndGloss:
+def dark(s: Surface) -> AlbedoAndGloss:
     """A colour and nothing else."""
     return _matt(s.color)
+
+
+def foliage(s: Surface) -> AlbedoAndGloss:
+    """Leaves: dark in the hollows between clumps, light and yellowish on top, speckled all over."""
+    u, v = _facing_plane(s)
+    crown = s.seed >= 0  # hedges carry no crown coordinates
+    hollow = np.where(crown, 0.5 + 0.62 * s.uv[:, 0], 0.95)
+    height = np.where(crown, 0.7 + 0.38 * s.uv[:, 1], np.clip(0.6 + 0.5 * s.normal[:, 2], 0.5, 1.05))
+    leaves = 1 + 0.26 * smooth(u, v, 0.6, s.footprint) + 0.26 * smooth(v, u, 0.27, s.footprint)
+    leaves = leaves + 0.1 * smooth(u, v, 1.9)
+    color = scale_color(s.color, hollow * height * np.clip(leaves, 0.3, 1.8))
+    warm = np.clip(height - 0.85, 0, 0.3) * hollow
+    color *= 1 + warm[:, None] * np.array([0.9, 0.5, -0.2], np.float32)
+    return color, np.zeros(len(u), np.float32)
+
+
+def _facing_plane(s: Surface) -> tuple[np.ndarray, np.ndarray]:
+    """World coordinates in whichever of the three axis planes a place faces most (m, [n] each)."""
+    x, y, z = s.position.T
+    axis = np.abs(s.normal * np.array([1, 1, 1.2], np.float32)).argmax(1)
+    return np.where(axis == 0, y + 11, x), np.where(axis == 2, y, z + 37)
+
+
+def bark(s: Surface) -> AlbedoAndGloss:
+    """Bark with upright ridges."""
+    ridges = 1 + 0.25 * smooth(s.uv[:, 0] * 4, s.uv[:, 1], 0.6, s.footprint)
+    return scale_color(s.color, ridges), np.zeros(len(ridges), np.float32)
+
+
+def water(s: Surface) -> AlbedoAndGloss:
+    """Still water: its own colour below, the sky on top, faint ripples."""
+    x, y = s.position[:, 0], s.position[:, 1]
+    ripples = 1 + 0.1 * smooth(x, y * 1.6, 1.1, s.footprint) + 0.16 * smooth(x, y, 6.0)
+    ripples = ripples + 0.07 * smooth(y, x, 0.5, s.footprint)
+    return scale_color(s.color, ripples), np.full(len(x), 1.0, np.float32)

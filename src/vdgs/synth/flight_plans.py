@@ -1,6 +1,6 @@
-"""Missions: where a drone takes its photographs, and where it looks, before wind and GPS disturb it.
+"""Missions: where a drone takes its images, and where it looks, before wind and GPS disturb it.
 
-Each mission sees the place unevenly in its own way; `imbalance` measures how. A *climb* is a height above ground as a
+Each mission sees the town unevenly in its own way; `imbalance` measures how. A *climb* is a height above ground as a
 share of the flight's altitude.
 """
 
@@ -15,16 +15,17 @@ from vdgs.synth.streets import StreetPlan
 
 #: A photograph's height over its width.
 _ASPECT = 0.75
-#: Climb of photographs that look aslant: they are taken lower than those that look straight down.
-_OBLIQUE_CLIMB = 0.86
-#: A place is wide if half its side is more than so many altitudes.
+#: Altitude factor of oblique photographs: they are taken lower than those that look straight down.
+_OBLIQUE_FACTOR = 0.86
+#: An area is wide if half its side is more than so many altitudes.
 _WIDE = 2.0
 _GOLDEN = np.pi * (3 - 5**0.5)
 
 
 @dataclass(frozen=True, eq=False)
 class FlightPlan:
-    """place [n, 2] m; tilt from straight down and heading clockwise from north [n] rad; climb [n]."""
+    """Position [n, 2] m; tilt from straight down and heading clockwise from north [n] rad; altitude_factor [n]: height
+    above ground over the altitude of the flight."""
 
     position_xy: np.ndarray
     tilt: np.ndarray
@@ -45,15 +46,16 @@ class FlightArea:
     landmarks: np.ndarray
 
 
-def _down(place: np.ndarray, heading: np.ndarray) -> FlightPlan:
+def _down(position: np.ndarray, heading: np.ndarray) -> FlightPlan:
     """Photographs that look straight down."""
-    return FlightPlan(place, np.zeros(len(place)), heading, np.ones(len(place)))
+    return FlightPlan(position, np.zeros(len(position)), heading, np.ones(len(position)))
 
 
 def _joined(parts: list[FlightPlan]) -> FlightPlan:
     """One mission after the other."""
-    names = ("position_xy", "tilt", "heading", "altitude_factor")
-    return FlightPlan(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+    return FlightPlan(
+        *(np.concatenate(values) for values in zip(*(vars(part).values() for part in parts), strict=True))
+    )
 
 
 def _spaced(path: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -89,9 +91,9 @@ def _obliques(half: float, count: int, phase: float) -> FlightPlan:
     """An orbit on two radii that looks inwards, 28 to 45 degrees from straight down."""
     turn = phase + 2 * np.pi * np.arange(count) / max(count, 1)
     radius = half * np.where(np.arange(count) % 2 == 0, 0.58, 0.9)
-    place = np.stack([radius * np.cos(turn), radius * np.sin(turn)], 1)
+    position = np.stack([radius * np.cos(turn), radius * np.sin(turn)], 1)
     tilt = np.radians(np.where(np.arange(count) % 3 == 0, 42, 31))
-    return FlightPlan(place, tilt, np.arctan2(-place[:, 0], -place[:, 1]), np.full(count, _OBLIQUE_CLIMB))
+    return FlightPlan(position, tilt, np.arctan2(-position[:, 0], -position[:, 1]), np.full(count, _OBLIQUE_FACTOR))
 
 
 def _even(over: FlightArea) -> FlightPlan:
@@ -100,26 +102,15 @@ def _even(over: FlightArea) -> FlightPlan:
 
 
 def _uneven(over: FlightArea) -> FlightPlan:
-    if over.half > _WIDE * over.altitude:
-        return _uneven_wide(over)
-    oblique, outskirts = round(0.27 * over.count), round(0.36 * over.count)
+    """Dense over the centre, sparse circuits around it, obliques; over a wide area the centre is a small part of it."""
+    wide = over.half > _WIDE * over.altitude
+    center, outer, spacing, orbit = (0.25, 0.8, 1.0, 0.5) if wide else (0.4, 0.78, 0.75, 1.0)
+    oblique, outskirts = (round(share * over.count) for share in ((0.2, 0.22) if wide else (0.27, 0.36)))
     return _joined(
         [
-            _grid(0.4 * over.half, over.count - oblique - outskirts),
-            _circuits(0.4 * over.half, 0.78 * over.half, 0.75 * over.altitude, outskirts),
-            _obliques(over.half, oblique, over.phase),
-        ]
-    )
-
-
-def _uneven_wide(over: FlightArea) -> FlightPlan:
-    """The same over a wide place: most photographs over a centre that is a small part of it."""
-    oblique, outskirts = round(0.2 * over.count), round(0.22 * over.count)
-    return _joined(
-        [
-            _grid(0.25 * over.half, over.count - oblique - outskirts),
-            _circuits(0.25 * over.half, 0.8 * over.half, 1.0 * over.altitude, outskirts),
-            _obliques(0.5 * over.half, oblique, over.phase),
+            _grid(center * over.half, over.count - oblique - outskirts),
+            _circuits(center * over.half, outer * over.half, spacing * over.altitude, outskirts),
+            _obliques(orbit * over.half, oblique, over.phase),
         ]
     )
 
@@ -129,10 +120,10 @@ def _distant(over: FlightArea) -> FlightPlan:
     far = round(0.3 * over.count)
     turn = over.phase + _GOLDEN * np.arange(far)
     radius = over.half * (0.25 + 0.35 * ((np.arange(far) * 0.618) % 1))
-    place = np.stack([radius * np.cos(turn), radius * np.sin(turn)], 1)
+    position = np.stack([radius * np.cos(turn), radius * np.sin(turn)], 1)
     outwards = np.arange(far) % 3 != 0
-    heading = np.arctan2(place[:, 0], place[:, 1]) + np.where(outwards, 0, np.pi)
-    looking = FlightPlan(place, np.radians(np.where(outwards, 60.0, 54.0)), heading, np.full(far, _OBLIQUE_CLIMB))
+    heading = np.arctan2(position[:, 0], position[:, 1]) + np.where(outwards, 0, np.pi)
+    looking = FlightPlan(position, np.radians(np.where(outwards, 60.0, 54.0)), heading, np.full(far, _OBLIQUE_FACTOR))
     return _joined([_grid(0.3 * over.half, over.count - far), looking])
 
 
@@ -143,10 +134,10 @@ def _orbits(over: FlightArea) -> FlightPlan:
     rings = np.where(rank % 2 == 0, 0.75, 1.25) * over.altitude
     turn = over.phase + centers + 2 * np.pi * rank / max(1, over.count // len(over.landmarks))
     away = np.stack([np.cos(turn), np.sin(turn)], 1)
-    climb = np.where(rank % 2 == 0, 0.95, _OBLIQUE_CLIMB)
+    climb = np.where(rank % 2 == 0, 0.95, _OBLIQUE_FACTOR)
     tilt = np.arctan2(rings, climb * over.altitude)
-    place = over.landmarks[centers] + rings[:, None] * away
-    return FlightPlan(place, tilt, np.arctan2(-away[:, 0], -away[:, 1]), climb)
+    position = over.landmarks[centers] + rings[:, None] * away
+    return FlightPlan(position, tilt, np.arctan2(-away[:, 0], -away[:, 1]), climb)
 
 
 def _corridor(over: FlightArea) -> FlightPlan:
@@ -154,11 +145,11 @@ def _corridor(over: FlightArea) -> FlightPlan:
     lane = np.arange(over.count) % 3 - 1
     q = np.linspace(-1.25, 1.25, over.count) * over.half
     p = over.plan.p[over.plan.p_main] + 0.3 * over.altitude * lane
-    place = np.stack(over.plan.to_world(p, q), 1)
-    ahead = np.stack(over.plan.to_world(p, q + 2.0), 1) - place
+    position = np.stack(over.plan.to_world(p, q), 1)
+    ahead = np.stack(over.plan.to_world(p, q + 2.0), 1) - position
     heading = np.arctan2(ahead[:, 0], ahead[:, 1]) + np.where(lane > 0, np.pi, 0)
     tilt = np.radians(np.where(lane == 0, 0.0, 35.0))
-    return FlightPlan(place, tilt, heading, np.where(lane == 0, 1.0, _OBLIQUE_CLIMB))
+    return FlightPlan(position, tilt, heading, np.where(lane == 0, 1.0, _OBLIQUE_FACTOR))
 
 
 #: The missions by the name of the option `--flight`.
@@ -174,6 +165,4 @@ FLIGHT_PLANS: dict[str, Callable[[FlightArea], FlightPlan]] = {
 def altitude_for_overlap(extent: float, count: int, overlap: float, focal: float) -> float:
     """The altitude (m) at which `count` photographs, were they an even grid over `extent` metres a side, would each
     share `overlap` of their side with the next (mean of the two sides of the picture; `focal` in image widths)."""
-    spacing = extent / np.sqrt(count)
-    side_per_altitude = np.sqrt(_ASPECT) / focal
-    return float(spacing / (1 - overlap) / side_per_altitude)
+    return float(extent / np.sqrt(count) / (1 - overlap) / (np.sqrt(_ASPECT) / focal))

@@ -17,18 +17,16 @@ from vdgs.captures.output_guard import check_not_in_capture
 from vdgs.captures.splits import TEST_LIST, VALIDATION_LIST
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
-from vdgs.synth.colmap_writer import write_model
-from vdgs.synth.flight_cameras import flight_altitude, make_flight_cameras
-from vdgs.synth.flight_stats import FlightStats, compute_flight_stats, sample_visible_points
-from vdgs.synth.ground_truth_writer import write_cameras, write_flight, write_points, write_views
+from vdgs.synth.dataset_writer import write_cameras, write_flight, write_model, write_points, write_views
+from vdgs.synth.flight_cameras import flight_altitude, make_flight_cameras, make_test_cameras
 from vdgs.synth.image_renderer import render_image
 from vdgs.synth.lighting import SkyMap, make_sky_map
 from vdgs.synth.options import ResolvedOptions, SynthOptions
 from vdgs.synth.perturbations import add_outliers, exposure_gains, perturb_cameras
 from vdgs.synth.ray_tracing import RayTracer, require_embree
 from vdgs.synth.synthetic_points import SeedPoints, SparseCloud, make_sparse_cloud, sample_seed_points
-from vdgs.synth.test_cameras import make_test_cameras
 from vdgs.synth.town import Town, build_town
+from vdgs.synth.true_visibility import FlightStats, compute_flight_stats, sample_visible_points
 from vdgs.system.atomic_files import write_text
 
 ProgressCallback = Callable[[str, int, int], None]
@@ -52,13 +50,13 @@ The flight, {imbalance}.
 {options}
 """
 _TRUTH_NOTE = """- `truth/`: depth and true visibility (with occlusion) per pixel, true poses, true places of points.
-  Read it with `vdgs.captures.ground_truth.load_truth`; the module says what is where.
+  Read it with `vdgs.captures.ground_truth.load_ground_truth`; the module says what is where.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class _ViewPlan:
-    """Names and true cameras of all photographs, the first `training` of which train; gains [n, 3]."""
+    """Names and true cameras of all images, the first `training` of which train; gains [n, 3]."""
 
     names: list[str]
     cameras: list[Camera]
@@ -66,9 +64,9 @@ class _ViewPlan:
     training: int
 
 
-def generate(output: Path, options: SynthOptions, on_progress: ProgressCallback | None = None) -> FlightStats:
+def generate(output: Path, options: SynthOptions, on_progress: ProgressCallback) -> FlightStats:
     """See `vdgs.synth.generate`."""
-    chosen, tell = options.resolved(), on_progress or _silent
+    resolved = options.resolved()
     check_not_in_capture(output)
     require_embree()
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
@@ -76,145 +74,100 @@ def generate(output: Path, options: SynthOptions, on_progress: ProgressCallback 
     partial = output.with_name(f".{output.name}.partial-{os.getpid()}")
     partial.mkdir(parents=True)
     try:
-        found = _write_capture(partial, chosen, tell)
+        stats = _write_capture(partial, resolved, on_progress)
         if output.exists():
             output.rmdir()
         partial.rename(output)
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
         raise
-    return found
+    return stats
 
 
-def _silent(stage: str, done: int, total: int) -> None:
-    pass
-
-
-def _write_capture(folder: Path, options: ResolvedOptions, tell: ProgressCallback) -> FlightStats:
+def _write_capture(folder: Path, options: ResolvedOptions, on_progress: ProgressCallback) -> FlightStats:
     """Write a complete capture into an empty folder."""
-    tell("town", 0, 1)
+    on_progress("town", 0, 1)
     town = build_town(options.seed, options.extent_m)
     tracer = RayTracer(town.mesh)
-    tell("town", 1, 1)
+    on_progress("town", 1, 1)
     with ThreadPoolExecutor(options.workers or os.cpu_count() or 1) as pool:
         sky = make_sky_map(tracer, town.terrain, town.zones, options.extent_m / 2 + 40, pool)
-        photographs, found = _plan_views(town, tracer, options)
-        _write_lists(folder, photographs, options)
-        seeds = _render_images(folder / "images", town, tracer, sky, photographs, options, pool, tell)
-        cloud = _write_model(folder, town, tracer, photographs, seeds, options, tell)
-        _write_truth(folder / "truth", tracer, photographs, cloud, found, options, pool, tell)
+        views, stats = _plan_views(town, tracer, options)
+        first_validation = views.training + options.test_images
+        write_text(folder / TEST_LIST, "\n".join(views.names[views.training : first_validation]) + "\n")
+        if validation := views.names[first_validation:]:
+            write_text(folder / VALIDATION_LIST, "\n".join(validation) + "\n")
+        seeds = _render_images(folder / "images", town, tracer, sky, views, options, pool, on_progress)
+        on_progress("points", 0, 1)
+        cloud = _write_model(folder / "sparse" / "0", town, tracer, views, seeds, options)
+        on_progress("points", 1, 1)
+        truth = folder / "truth"
+        write_flight(truth, options.flight, stats)
+        if options.truth:
+            total = len(views.names)
+            on_progress("truth", 0, total)
+            write_cameras(truth, views.names, views.cameras, views.gains)
+            write_points(truth, cloud)
+            named = list(zip(views.names, views.cameras, strict=True))
+            write_views(truth, tracer, named, views.training, pool, lambda done: on_progress("truth", done, total))
     note = _NOTE.format(
-        version=__version__,
-        training=photographs.training,
-        test=options.test_images,
-        validation=options.validation_images,
-        poses="noisy" if options.pose_noise_px else "true",
-        points=len(cloud.points),
-        noise_px=options.noise_px,
-        truth=_TRUTH_NOTE if options.truth else "",
-        imbalance=found.summary,
+        version=__version__, training=views.training, test=options.test_images, validation=options.validation_images,
+        poses="noisy" if options.pose_noise_px else "true", points=len(cloud.points), noise_px=options.noise_px,
+        truth=_TRUTH_NOTE if options.truth else "", imbalance=stats.summary,
         options="\n".join(f"- {line}" for line in options.to_lines),
-    )
+    )  # fmt: skip
     (folder / "capture.md").write_text(note, encoding="utf-8")
-    return found
+    return stats
 
 
 def _plan_views(town: Town, tracer: RayTracer, options: ResolvedOptions) -> tuple[_ViewPlan, FlightStats]:
-    """The flight, the test and validation photographs, and how unevenly the flight sees the place."""
+    """The flight, the test and validation images, and how unevenly the flight sees the town."""
     training = make_flight_cameras(options, town)
     half = options.extent_m / 2
-    places, views = sample_visible_points(tracer, town.mesh, training, half, np.random.default_rng([options.seed, 8]))
+    points, counts = sample_visible_points(tracer, town.mesh, training, half, np.random.default_rng([options.seed, 8]))
     names = [f"drone_{k + 1:04d}.jpg" for k in range(len(training))]
     cameras = list(training)
     for stream, kind, count in ((9, "test", options.test_images), (10, "validation", options.validation_images)):
         rng = np.random.default_rng([options.seed, stream])
-        cameras += make_test_cameras(tracer, town.terrain, training, places, count, options, rng)
+        cameras += make_test_cameras(tracer, town.terrain, training, points, count, options, rng)
         names += [f"{kind}_{k + 1:04d}.jpg" for k in range(count)]
     gains = exposure_gains(len(cameras), options.exposure_stops, np.random.default_rng([options.seed, 5]))
-    return _ViewPlan(names, cameras, gains, len(training)), compute_flight_stats(views, len(training))
-
-
-def _write_lists(folder: Path, photographs: _ViewPlan, options: ResolvedOptions) -> None:
-    """`test.txt` and `validation.txt`, which loading a capture keeps to."""
-    first = photographs.training
-    test = photographs.names[first : first + options.test_images]
-    write_text(folder / TEST_LIST, "\n".join(test) + "\n")
-    validation = photographs.names[first + options.test_images :]
-    if validation:
-        write_text(folder / VALIDATION_LIST, "\n".join(validation) + "\n")
+    return _ViewPlan(names, cameras, gains, len(training)), compute_flight_stats(counts, len(training))
 
 
 def _render_images(
-    folder: Path,
-    town: Town,
-    tracer: RayTracer,
-    sky: SkyMap,
-    photographs: _ViewPlan,
-    options: ResolvedOptions,
-    pool: Executor,
-    tell: ProgressCallback,
-) -> list[SeedPoints]:
-    """Render and save every picture; returns the places picked in each training picture."""
+    folder: Path, town: Town, tracer: RayTracer, sky: SkyMap, views: _ViewPlan, options: ResolvedOptions,
+    pool: Executor, on_progress: ProgressCallback,
+) -> list[SeedPoints]:  # fmt: skip
+    """Render and save every image; returns the points picked in each training image."""
     folder.mkdir()
-    wanted = int(np.ceil(1.5 * options.points / photographs.training)) + 4
-    total = len(photographs.names)
+    per_image = int(np.ceil(1.5 * options.points / views.training)) + 4
+    total = len(views.names)
 
-    def take(k: int) -> SeedPoints | None:
-        camera = photographs.cameras[k]
-        image = render_image(town, tracer, sky, camera, options.samples_per_pixel, photographs.gains[k])
-        Image.fromarray(image).save(folder / photographs.names[k], quality=95, subsampling=0)
-        if k >= photographs.training:
+    def render(k: int) -> SeedPoints | None:
+        camera = views.cameras[k]
+        image = render_image(town, tracer, sky, camera, options.samples_per_pixel, views.gains[k])
+        Image.fromarray(image).save(folder / views.names[k], quality=95, subsampling=0)
+        if k >= views.training:
             return None
-        return sample_seed_points(tracer, camera, image, wanted, np.random.default_rng([options.seed, 3, k]))
+        return sample_seed_points(tracer, camera, image, per_image, np.random.default_rng([options.seed, 3, k]))
 
+    on_progress("images", 0, total)
     seeds = []
-    tell("images", 0, total)
-    for done, found in enumerate(pool.map(take, range(total)), start=1):
-        if found is not None:
-            seeds.append(found)
-        tell("images", done, total)
-    return seeds
+    for done, points in enumerate(pool.map(render, range(total)), start=1):
+        seeds.append(points)
+        on_progress("images", done, total)
+    return [points for points in seeds if points is not None]
 
 
 def _write_model(
-    folder: Path,
-    town: Town,
-    tracer: RayTracer,
-    photographs: _ViewPlan,
-    seeds: list[SeedPoints],
-    options: ResolvedOptions,
-    tell: ProgressCallback,
+    folder: Path, town: Town, tracer: RayTracer, views: _ViewPlan, seeds: list[SeedPoints], options: ResolvedOptions
 ) -> SparseCloud:
-    """The COLMAP model: points from training photographs only, poses of all."""
-    tell("points", 0, 1)
-    cameras, training = photographs.cameras, photographs.cameras[: photographs.training]
-    rng = np.random.default_rng([options.seed, 4])
-    cloud = make_sparse_cloud(tracer, training, seeds, options.points, options.noise_px, rng)
-    cloud = add_outliers(cloud, training, options.outliers, np.random.default_rng([options.seed, 7]))
+    """The COLMAP model: points from training images only, poses of all."""
+    training = views.cameras[: views.training]
+    rng = {stream: np.random.default_rng([options.seed, stream]) for stream in (4, 6, 7)}
+    cloud = make_sparse_cloud(tracer, training, seeds, options.points, options.noise_px, rng[4])
+    cloud = add_outliers(cloud, training, options.outliers, rng[7])
     altitude = flight_altitude(options, town.tallest)
-    poses = perturb_cameras(cameras, options.pose_noise_px, altitude, np.random.default_rng([options.seed, 6]))
-    write_model(folder / "sparse" / "0", poses, photographs.names, cloud)
-    tell("points", 1, 1)
+    write_model(folder, perturb_cameras(views.cameras, options.pose_noise_px, altitude, rng[6]), views.names, cloud)
     return cloud
-
-
-def _write_truth(
-    folder: Path,
-    tracer: RayTracer,
-    photographs: _ViewPlan,
-    cloud: SparseCloud,
-    found: FlightStats,
-    options: ResolvedOptions,
-    pool: Executor,
-    tell: ProgressCallback,
-) -> None:
-    """How uneven the flight is, always; everything else that is known if it was asked for."""
-    write_flight(folder, options.flight, found)
-    if not options.truth:
-        return
-    total = len(photographs.names)
-    tell("truth", 0, total)
-    write_cameras(folder, photographs.names, photographs.cameras, photographs.gains)
-    write_points(folder, cloud)
-    named = list(zip(photographs.names, photographs.cameras, strict=True))
-    write_views(folder, tracer, named, photographs.training, pool, lambda done: tell("truth", done, total))

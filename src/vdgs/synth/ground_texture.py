@@ -7,13 +7,13 @@ and returns linear albedo [n, 3].
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
 from vdgs.synth.mesh import srgb
-from vdgs.synth.noise import cells, fade, line, smooth
 from vdgs.synth.streets import KERB_RADIUS, PAVEMENT, StreetPlan
-from vdgs.synth.surface import mix_colors, scale_color
+from vdgs.synth.surface import cells, fade, line, mix_colors, scale_color, smooth
 from vdgs.synth.terrain import Terrain
 from vdgs.synth.zones import LandUse, LandUseMap
 
@@ -30,10 +30,6 @@ def grass(x: np.ndarray, y: np.ndarray, footprint: np.ndarray, dry: float = 0.3)
     return scale_color(mix_colors(green, _GRASS[2], yellow), tufts)
 
 
-def _lawn(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
-    return grass(x, y, footprint, dry=0.12)
-
-
 def _meadow(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
     """Tall grass with flowers in drifts."""
     base = grass(x, y, footprint, dry=0.55) * np.float32(0.92)
@@ -45,16 +41,14 @@ def _meadow(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
     return mix_colors(base, petals, bloom * 0.85)
 
 
-def _slabs(
-    x: np.ndarray, y: np.ndarray, footprint: np.ndarray, size: float, color: np.ndarray, vary: float
-) -> np.ndarray:
+def _slabs(x: np.ndarray, y: np.ndarray, footprint: np.ndarray, size: float, color: str, vary: float) -> np.ndarray:
     """Square slabs, each a little lighter or darker, with dark joints."""
     u, v = x / np.float32(size), y / np.float32(size)
     i, j = np.floor(u), np.floor(v)
     tint = 1 + vary * (cells(i, j) - 0.5) * fade(size, footprint) + 0.05 * smooth(x, y, 1.9)
     edge = np.maximum(np.abs(u - i - 0.5), np.abs(v - j - 0.5))
     joint = line((0.5 - edge) * size, 0.035, footprint) * 0.4
-    return scale_color(color, (tint + 0.05 * smooth(x, y, 0.3, footprint)) * (1 - joint))
+    return scale_color(srgb(color), (tint + 0.05 * smooth(x, y, 0.3, footprint)) * (1 - joint))
 
 
 def _asphalt(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
@@ -70,21 +64,9 @@ def _gravel(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
     return scale_color(srgb("#cdbb97"), 1 + grain)
 
 
-def _drive(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
-    return _slabs(x, y, footprint, 0.8, srgb("#b9ada0"), 0.16)
-
-
-def _patio(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
-    return _slabs(x, y, footprint, 0.65, srgb("#cfb295"), 0.3)
-
-
-def _pavement(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
-    return _slabs(x, y, footprint, 0.6, srgb("#c2beb6"), 0.14)
-
-
 def _square(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
     """Cobbles in two colours, laid in a large chequer with pale bands."""
-    base = _slabs(x, y, footprint, 0.42, srgb("#c9b08c"), 0.3)
+    base = _slabs(x, y, footprint, 0.42, "#c9b08c", 0.3)
     i, j = np.floor(x / 4.2), np.floor(y / 4.2)
     dark = ((i + j).astype(np.int32) & 1).astype(np.float32)
     edge = np.maximum(np.abs(x / 4.2 - i - 0.5), np.abs(y / 4.2 - j - 0.5))
@@ -134,59 +116,37 @@ def _sand(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
     return scale_color(srgb("#e0cb98"), 1 + 0.07 * smooth(x, y, 0.4, footprint) + 0.05 * smooth(x, y, 1.8))
 
 
-def _rows(
-    x: np.ndarray, y: np.ndarray, footprint: np.ndarray, period: float, furrow: np.ndarray, crop: np.ndarray
-) -> np.ndarray:
+def _rows(x: np.ndarray, y: np.ndarray, footprint: np.ndarray, period: float, furrow: str, crop: str) -> np.ndarray:
     """A crop in rows along y, with tramlines of a tractor every eighteen metres or so."""
     wander = x + 0.25 * np.sin(y * np.float32(0.21))
     ridge = 0.5 + 0.5 * np.cos(wander * np.float32(2 * np.pi / period)) * fade(period, footprint)
     grown = np.clip(ridge + 0.2 * smooth(x, y, 0.4, footprint), 0, 1)
-    color = mix_colors(furrow, crop, grown) * (1 + 0.1 * smooth(x, y, 11.0) + 0.07 * smooth(y, x, 2.1))[:, None]
+    soil, plants = srgb(furrow), srgb(crop)
+    color = mix_colors(soil, plants, grown) * (1 + 0.1 * smooth(x, y, 11.0) + 0.07 * smooth(y, x, 2.1))[:, None]
     tram = np.abs((wander / np.float32(18.0)) % 1 - 0.5) * 18.0
     track = np.maximum(line(tram - 0.8, 0.25, footprint), line(tram + 0.8, 0.25, footprint))
-    return mix_colors(color, furrow, 0.7 * track).astype(np.float32)
+    return mix_colors(color, soil, 0.7 * track).astype(np.float32)
 
 
-def _wheat(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
-    return _rows(x, y, footprint, 0.9, srgb("#b59a55"), srgb("#e0c578"))
-
-
-def _lavender(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
-    return _rows(x, y, footprint, 1.5, srgb("#a58f68"), srgb("#8265b5"))
-
-
-def _ploughed(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
-    return _rows(x, y, footprint, 0.8, srgb("#6d4f38"), srgb("#967152"))
-
-
-def _greens(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
-    return _rows(x, y, footprint, 1.1, srgb("#7d6444"), srgb("#6fa045"))
-
-
-_IN_PLAN = (LandUse.LAWN, LandUse.SOIL, LandUse.PATIO, LandUse.DRIVE, LandUse.SQUARE, LandUse.WHEAT, LandUse.LAVENDER,
-            LandUse.PLOUGHED, LandUse.GREENS)  # fmt: skip
-_PAINT: dict[LandUse, Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]] = {
-    LandUse.LAWN: _lawn,
-    LandUse.PATH: _gravel,
-    LandUse.PATIO: _patio,
-    LandUse.DRIVE: _drive,
-    LandUse.SOIL: _soil,
-    LandUse.SQUARE: _square,
-    LandUse.ASPHALT: _asphalt,
-    LandUse.GRAVEL: _gravel,
-    LandUse.PITCH: _pitch,
-    LandUse.LINE: _white,
-    LandUse.FLOWERS: _flowers,
-    LandUse.MEADOW: _meadow,
-    LandUse.WOODS: _woods,
-    LandUse.SAND: _sand,
-    LandUse.WHEAT: _wheat,
-    LandUse.LAVENDER: _lavender,
-    LandUse.PLOUGHED: _ploughed,
-    LandUse.GREENS: _greens,
-    LandUse.BUILDING: _drive,
-    LandUse.COURT: _court,
-}
+_Shader = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+_lawn: _Shader = partial(grass, dry=0.12)
+_wheat: _Shader = partial(_rows, period=0.9, furrow="#b59a55", crop="#e0c578")
+_lavender: _Shader = partial(_rows, period=1.5, furrow="#a58f68", crop="#8265b5")
+_ploughed: _Shader = partial(_rows, period=0.8, furrow="#6d4f38", crop="#967152")
+_greens: _Shader = partial(_rows, period=1.1, furrow="#7d6444", crop="#6fa045")
+_drive: _Shader = partial(_slabs, size=0.8, color="#b9ada0", vary=0.16)
+_pavement: _Shader = partial(_slabs, size=0.6, color="#c2beb6", vary=0.14)
+#: Shaders of zones in coordinates of the street plan, and of zones in coordinates of the world.
+_PLAN_SHADERS: dict[LandUse, _Shader] = {
+    LandUse.LAWN: _lawn, LandUse.PATIO: partial(_slabs, size=0.65, color="#cfb295", vary=0.3), LandUse.DRIVE: _drive,
+    LandUse.SOIL: _soil, LandUse.SQUARE: _square, LandUse.WHEAT: _wheat, LandUse.LAVENDER: _lavender,
+    LandUse.PLOUGHED: _ploughed, LandUse.GREENS: _greens,
+}  # fmt: skip
+_WORLD_SHADERS: dict[LandUse, _Shader] = {
+    LandUse.PATH: _gravel, LandUse.ASPHALT: _asphalt, LandUse.GRAVEL: _gravel, LandUse.PITCH: _pitch,
+    LandUse.LINE: _white, LandUse.FLOWERS: _flowers, LandUse.MEADOW: _meadow, LandUse.WOODS: _woods,
+    LandUse.SAND: _sand, LandUse.BUILDING: _drive, LandUse.COURT: _court,
+}  # fmt: skip
 
 
 def _open_land(p: np.ndarray, q: np.ndarray, footprint: np.ndarray) -> np.ndarray:
@@ -202,10 +162,9 @@ def _open_land(p: np.ndarray, q: np.ndarray, footprint: np.ndarray) -> np.ndarra
     crops = (_meadow, _wheat, _greens, _ploughed, _lawn, _lavender)
     bounds = np.array([0.3, 0.52, 0.7, 0.82, 0.95])
     which = np.searchsorted(bounds, kind)
-    for k, paint in enumerate(crops):
+    for k in np.unique(which):
         at = np.flatnonzero(which == k)
-        if len(at):
-            color[at] = paint(u[at], v[at], footprint[at])
+        color[at] = crops[k](u[at], v[at], footprint[at])
     edge = np.minimum(31 - np.abs(a / 62 - i - 0.5) * 62, 42 - np.abs((b + shift) / 84 - j - 0.5) * 84)
     verge = np.clip((1.6 + 0.5 * smooth(p, q, 2.0) - edge) * 2, 0, 1)
     return mix_colors(color, _woods(p, q, footprint), verge)
@@ -248,9 +207,7 @@ def _streets(plan: StreetPlan, p: np.ndarray, q: np.ndarray, footprint: np.ndarr
         return color
     p, q, fp = p[paved], q[paved], footprint[paved]
     beyond, out_p, out_q = beyond[paved], out_p[paved], out_q[paved]
-    surface = _pavement(p, q, fp)
-    kerb = line(beyond - 0.1, 0.12, fp)
-    surface = mix_colors(surface, srgb("#dcdad4"), kerb)
+    surface = mix_colors(_pavement(p, q, fp), srgb("#dcdad4"), line(beyond - 0.1, 0.12, fp))
     road = np.flatnonzero(beyond < 0)
     tar = _asphalt(p[road], q[road], fp[road])
     for inside, other, along, across, half in (
@@ -260,8 +217,7 @@ def _streets(plan: StreetPlan, p: np.ndarray, q: np.ndarray, footprint: np.ndarr
         on = np.flatnonzero((inside[road] < 0) & (other[road] > 0))
         at = road[on]
         tar[on] = _street_colors(along[at], across[at], half[at], other[at], fp[at], tar[on])
-    gutter = np.clip(1 + beyond[road] / 0.5, 0, 1) * 0.16
-    surface[road] = tar * (1 - gutter)[:, None]
+    surface[road] = tar * (1 - np.clip(1 + beyond[road] / 0.5, 0, 1) * 0.16)[:, None]
     color[paved] = surface
     return color
 
@@ -273,18 +229,18 @@ def ground_albedo(
     p, q = plan.to_plan(x, y)
     # ragged edges: nothing that grows ends in a line drawn with a ruler
     jx, jy = x + 0.12 * smooth(x, y, 0.8), y + 0.12 * smooth(y, x, 0.8)
-    zone = zones.sample(jx, jy)
-    exact = zones.sample(x, y)
+    zone, exact = zones.sample(jx, jy), zones.sample(x, y)
     ruled = np.isin(exact, (LandUse.LINE, LandUse.PATIO, LandUse.DRIVE, LandUse.SQUARE, LandUse.ASPHALT, LandUse.COURT))
-    zone = np.where(ruled | np.isin(zone, (LandUse.LINE,)), exact, zone)
+    zone = np.where(ruled | (zone == LandUse.LINE), exact, zone)
     color = np.empty((len(x), 3), np.float32)
     for kind in np.unique(zone):
         at = np.flatnonzero(zone == kind)
         if kind == LandUse.OPEN:
             color[at] = _open_land(p[at], q[at], footprint[at])
-            continue
-        u, v = (p, q) if kind in _IN_PLAN else (x, y)
-        color[at] = _PAINT[LandUse(kind)](u[at], v[at], footprint[at])
+        elif kind in _PLAN_SHADERS:
+            color[at] = _PLAN_SHADERS[LandUse(kind)](p[at], q[at], footprint[at])
+        else:
+            color[at] = _WORLD_SHADERS[LandUse(kind)](x[at], y[at], footprint[at])
     color = _streets(plan, p, q, footprint, color)
     for pond in terrain.ponds:
         near = np.flatnonzero(pond.distance(x, y) < 2.0)

@@ -22,7 +22,8 @@ HORIZON_COLOR = np.array([0.80, 0.88, 0.98], np.float32)
 #: Side of a cell (m), twice that on maps larger than `_LARGE` (m from the middle).
 _CELL, _LARGE = 0.5, 300.0
 _RAYS = 32
-#: Places worked on at a time.
+#: Points in a row of a lookup, and points whose rays are cast at a time.
+_ROW = 16384
 _AT_ONCE = 1 << 15
 
 
@@ -35,23 +36,14 @@ class SkyMap:
     cell: float
 
     def sample(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Openness at world places by bilinear interpolation, [n] float32."""
+        """Openness at world points by bilinear interpolation, [n] float32."""
         u = ((x + self.half_size) / self.cell - 0.5).astype(np.float32)
         v = ((y + self.half_size) / self.cell - 0.5).astype(np.float32)
-        mapped = cv2.remap(
-            self.openness, u[:, None], v[:, None], cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_CONSTANT, borderValue=1.0,
-        ) if len(u) < 32000 else _remap_long(self.openness, u, v)  # fmt: skip
-        return mapped.ravel()
-
-
-def _remap_long(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """cv2.remap takes no side over 32767: fold a long list into rows."""
-    width = 16384
-    padded = -len(u) % width
-    u, v = (np.pad(c, (0, padded)).reshape(-1, width) for c in (u, v))
-    mapped = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=1.0)
-    return mapped.ravel()[: mapped.size - padded]
+        # cv2.remap takes no side over 32767: fold the list into rows
+        padded = -len(u) % _ROW
+        u, v = (np.pad(c, (0, padded)).reshape(-1, _ROW) for c in (u, v))
+        mapped = cv2.remap(self.openness, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=1.0)
+        return mapped.ravel()[: mapped.size - padded]
 
 
 def make_sky_map(tracer: RayTracer, terrain: Terrain, zones: LandUseMap, half_size: float, pool: Executor) -> SkyMap:

@@ -2,34 +2,20 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
 
-
-class Material(IntEnum):
-    """What a triangle is made of; each has its shader in `facades`, `ground` or `nature`."""
-
-    GROUND = 0
-    PLASTER = 1
-    WINDOWS = 2
-    DOOR = 3
-    OFFICE = 4
-    TILES = 5
-    SLATE = 6
-    FLAT_ROOF = 7
-    STONE = 8
-    BRICK = 9
-    TIMBER = 10
-    PAINT = 11
-    GLASS = 12
-    AWNING = 13
-    FOLIAGE = 14
-    BARK = 15
-    WATER = 16
-    SOLAR = 17
-    DARK = 18
+#: What a triangle is made of; each has its shader in `facades` or `ground_texture`.
+Material = IntEnum(
+    "Material",
+    "GROUND PLASTER WINDOWS DOOR OFFICE TILES SLATE FLAT_ROOF STONE BRICK TIMBER PAINT "
+    "GLASS AWNING FOLIAGE BARK WATER SOLAR DARK",
+    start=0,
+)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -61,87 +47,58 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / (np.linalg.norm(vectors, axis=-1, keepdims=True) + 1e-12)
 
 
-@dataclass(frozen=True)
-class _Skins:
-    """Materials, colours and seeds of many polygons or parts."""
-
-    material: list[int]
-    color: list[np.ndarray]
-    seed: list[float]
-
-    def add(self, material: Material, color: np.ndarray, seed: float) -> None:
-        self.material.append(int(material))
-        self.color.append(color)
-        self.seed.append(seed)
-
-    def repeated(self, counts: int | np.ndarray) -> dict[str, np.ndarray]:
-        """One row per triangle, where polygon k has counts[k] of them."""
-        return {
-            "material": np.repeat(np.array(self.material, np.uint8), counts),
-            "color": np.repeat(np.array(self.color, np.float32), counts, axis=0),
-            "seed": np.repeat(np.array(self.seed, np.float32), counts),
-        }
+#: Material, colour and seed of a polygon or part.
+_Skin = tuple[Material, np.ndarray, float]
 
 
 class MeshBuilder:
     """Collects polygons and ready-made parts, then joins them into one `Mesh`.
 
-    Polygons are only noted when they are added and turned into triangles all at once: a town has tens
-    of thousands of them.
+    Polygons become triangles all at once in `build`: a town has tens of thousands of them.
     """
 
     def __init__(self) -> None:
-        self._polygons: dict[int, tuple[list[np.ndarray], _Skins]] = {}
-        self._parts: list[dict[str, np.ndarray]] = []
-        self._part_skins = _Skins([], [], [])
+        self._polygons: dict[int, list[tuple[np.ndarray, _Skin]]] = defaultdict(list)
+        self._parts: list[tuple[dict[str, np.ndarray], _Skin]] = []
 
     def polygon(self, corners: np.ndarray, material: Material, color: np.ndarray, seed: float = 0.0) -> None:
         """A planar convex polygon [k, 3], anticlockwise from outside.
 
         Its texture runs from the lowest coordinates, u along the first edge and v across it, in metres.
         """
-        rings, skins = self._polygons.setdefault(len(corners), ([], _Skins([], [], [])))
-        rings.append(corners)
-        skins.add(material, color, seed)
+        self._polygons[len(corners)].append((corners, (material, color, seed)))
 
     def part(
-        self,
-        vertices: np.ndarray,
-        faces: np.ndarray,
-        material: Material,
-        color: np.ndarray,
-        seed: float,
-        *,
-        uv: np.ndarray,
-        panel: np.ndarray,
-        normals: np.ndarray,
-    ) -> None:
-        """A ready-made piece of one material.
-
-        vertices [v, 3], faces [f, 3], uv [f, 3, 2], panel [2] or [f, 2], normals [f, 3, 3].
-        """
-        self._parts.append(
-            {
-                "vertices": np.asarray(vertices, np.float32),
-                "faces": np.asarray(faces, np.int32),
-                "uv": np.asarray(uv, np.float32),
-                "panel": np.broadcast_to(np.asarray(panel, np.float32), (len(faces), 2)),
-                "normals": np.asarray(normals, np.float32),
-            }
-        )
-        self._part_skins.add(material, color, seed)
+        self, vertices: np.ndarray, faces: np.ndarray, material: Material, color: np.ndarray, seed: float, *,
+        uv: np.ndarray, panel: np.ndarray, normals: np.ndarray,
+    ) -> None:  # fmt: skip
+        """Triangles: vertices [v, 3], faces [f, 3], uv [f, 3, 2], panel [2] or [f, 2], normals [f, 3, 3]."""
+        arrays = {"vertices": vertices, "uv": uv, "panel": np.broadcast_to(panel, (len(faces), 2)), "normals": normals}
+        arrays = {name: np.asarray(value, np.float32) for name, value in arrays.items()}
+        self._parts.append((arrays | {"faces": np.asarray(faces, np.int32)}, (material, color, seed)))
 
     def build(self) -> Mesh:
         """Everything collected so far as one mesh."""
-        pieces = [_triangulated(np.array(rings), skins) for rings, skins in self._polygons.values()]
+        meshes = [_triangulate(*zip(*polygons, strict=True)) for polygons in self._polygons.values()]
         if self._parts:
-            joined = _joined(self._parts)
-            pieces.append(joined | self._part_skins.repeated(np.array([len(p["faces"]) for p in self._parts])))
-        return Mesh(**_joined(pieces))
+            parts, skins = zip(*self._parts, strict=True)
+            meshes.append(_join(parts) | _repeat_skins(skins, np.array([len(part["faces"]) for part in parts])))
+        return Mesh(**_join(meshes))
 
 
-def _triangulated(corners: np.ndarray, skins: _Skins) -> dict[str, np.ndarray]:
+def _repeat_skins(skins: Sequence[_Skin], counts: int | np.ndarray) -> dict[str, np.ndarray]:
+    """One row per triangle, where polygon or part k has counts[k] triangles."""
+    material, color, seed = zip(*skins, strict=True)
+    return {
+        "material": np.repeat(np.array(material, np.uint8), counts),
+        "color": np.repeat(np.array(color, np.float32), counts, axis=0),
+        "seed": np.repeat(np.array(seed, np.float32), counts),
+    }
+
+
+def _triangulate(polygons: Sequence[np.ndarray], skins: Sequence[_Skin]) -> dict[str, np.ndarray]:
     """Polygons of equally many corners [n, k, 3] as fans of triangles (Newell's method for their normals)."""
+    corners = np.array(polygons)
     count, sides = corners.shape[:2]
     normal = _unit(np.cross(corners, np.roll(corners, -1, axis=1)).sum(1))
     along = _unit(corners[:, 1] - corners[:, 0])
@@ -158,12 +115,12 @@ def _triangulated(corners: np.ndarray, skins: _Skins) -> dict[str, np.ndarray]:
         "uv": local[:, fan].reshape(-1, 3, 2).astype(np.float32),
         "panel": np.repeat(local.max(1), triangles, axis=0).astype(np.float32),
         "normals": np.repeat(np.repeat(normal, triangles, axis=0)[:, None], 3, axis=1).astype(np.float32),
-        **skins.repeated(triangles),
+        **_repeat_skins(skins, triangles),
     }
 
 
-def _joined(pieces: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Pieces one after the other, the corners of their faces renumbered."""
-    first = np.cumsum([0, *(len(piece["vertices"]) for piece in pieces)], dtype=np.int32)
-    moved = [piece | {"faces": piece["faces"] + start} for piece, start in zip(pieces, first, strict=False)]
-    return {name: np.ascontiguousarray(np.concatenate([p[name] for p in moved])) for name in moved[0]}
+def _join(meshes: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Meshes one after the other, the corners of their faces renumbered."""
+    first = np.cumsum([0, *(len(mesh["vertices"]) for mesh in meshes)], dtype=np.int32)
+    moved = [mesh | {"faces": mesh["faces"] + start} for mesh, start in zip(meshes, first, strict=False)]
+    return {name: np.ascontiguousarray(np.concatenate([mesh[name] for mesh in moved])) for name in moved[0]}

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import Annotated, Literal
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, get_args
 
 from vdgs.config.commands import MAX_RENDER_SIDE_PX
 from vdgs.config.ranges import WORKER_COUNT, Range, check_ranges
@@ -12,14 +12,13 @@ from vdgs.errors import VdgsError
 SizeName = Literal["toy", "village", "town", "district", "city"]
 FlightName = Literal["uneven", "even", "distant", "orbits", "corridor"]
 
-_SIZES: dict[str, dict[str, float]] = {
+_SIZES: dict[str, dict[str, Any]] = {
     "toy": {"images": 24, "width": 96, "height": 72, "extent_m": 60.0, "points": 1500},
     "village": {"images": 56, "width": 400, "height": 300, "extent_m": 120.0, "points": 5000},
     "town": {"images": 120, "width": 800, "height": 600, "extent_m": 320.0, "points": 40000},
     "district": {"images": 150, "width": 400, "height": 300, "extent_m": 420.0, "points": 30000},
     "city": {"images": 600, "width": 400, "height": 300, "extent_m": 900.0, "points": 120000},
 }
-_FLIGHTS = ("uneven", "even", "distant", "orbits", "corridor")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,51 +71,37 @@ class SynthOptions:
     """Threads that render; 0 takes one per core. The result does not depend on it."""
 
     def resolved(self) -> ResolvedOptions:
-        """These options with every None replaced by the value of `size`.
+        """These options with every None but `overlap` replaced by the value of `size`.
 
         Raises VdgsError where a value makes no capture.
         """
-        defaults = _SIZES.get(self.size)
-        if defaults is None:
+        if self.size not in _SIZES:
             raise VdgsError(f"--size {self.size}: there are only {', '.join(_SIZES)}.")
-        if self.flight not in _FLIGHTS:
-            raise VdgsError(f"--flight {self.flight}: there are only {', '.join(_FLIGHTS)}.")
+        if self.flight not in get_args(FlightName):
+            raise VdgsError(f"--flight {self.flight}: there are only {', '.join(get_args(FlightName))}.")
         check_ranges(self)
-        own = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "size"}
-        chosen = own | {name: value if own[name] is None else own[name] for name, value in defaults.items()}
-        for name in ("images", "width", "height", "points"):
-            chosen[name] = int(chosen[name])
-        if chosen["test_images"] is None:
-            chosen["test_images"] = max(2, chosen["images"] // 8)
-        if chosen["validation_images"] is None:
-            chosen["validation_images"] = chosen["test_images"]
-        return ResolvedOptions(**(chosen | {"extent_m": float(chosen["extent_m"])}))
+        defaults = _SIZES[self.size]
+        values = vars(self) | {name: value for name, value in defaults.items() if getattr(self, name) is None}
+        if values["test_images"] is None:
+            values["test_images"] = max(2, values["images"] // 8)
+        if values["validation_images"] is None:
+            values["validation_images"] = values["test_images"]
+        return ResolvedOptions(**(values | {"extent_m": float(values["extent_m"])}))
 
 
 @dataclass(frozen=True, kw_only=True)
-class ResolvedOptions:
-    """`SynthOptions` with every value known (`overlap` may stay open); the fields mean the same."""
+class ResolvedOptions(SynthOptions):
+    """`SynthOptions` with every value known; `overlap` alone may stay open."""
 
-    seed: int
     images: int
     test_images: int
     validation_images: int
     width: int
     height: int
-    samples_per_pixel: int
-    flight: FlightName
-    overlap: float | None
     points: int
-    noise_px: float
-    outliers: float
-    pose_noise_px: float
-    exposure_stops: float
     extent_m: float
-    truth: bool
-    workers: int
 
     @property
     def to_lines(self) -> list[str]:
         """One `name: value` a line, for people; without what does not change the result."""
-        stated = replace(self, workers=0)
-        return [f"{name}: {value}" for name, value in vars(stated).items() if name != "workers"]
+        return [f"{name}: {value}" for name, value in vars(self).items() if name not in ("size", "workers")]

@@ -57,9 +57,8 @@ class Site:
 
     def level(self, frame: ObjectFrame, width: float, depth: float) -> ObjectFrame:
         """The frame lifted so that no corner of a footprint lies below the ground."""
-        corners = frame.to_world(
-            np.array([(sx * width / 2, sy * depth / 2, 0) for sx in (-1, 0, 1) for sy in (-1, 0, 1)])
-        )
+        grid = [(sx * width / 2, sy * depth / 2, 0) for sx in (-1, 0, 1) for sy in (-1, 0, 1)]
+        corners = frame.to_world(np.array(grid))
         top = float(self.terrain.height(corners[:, 0], corners[:, 1]).max())
         return ObjectFrame(frame.x, frame.y, top + 0.1, frame.angle)
 
@@ -112,10 +111,5 @@ class Site:
 def rotate_plot(plot: Plot, turns: int) -> Plot:
     """The same rectangle seen from another side: its front is where local b is least."""
     swap = turns % 2 == 1
-    return Plot(
-        plot.p,
-        plot.q,
-        plot.depth if swap else plot.width,
-        plot.width if swap else plot.depth,
-        plot.quarter_turns + turns,
-    )
+    width, depth = (plot.depth, plot.width) if swap else (plot.width, plot.depth)
+    return Plot(plot.p, plot.q, width, depth, plot.quarter_turns + turns)

@@ -106,16 +106,9 @@ def _refine_points(
         local = places[point[at]] @ rotation.T + camera.camera_from_world[:3, 3]
         x, y, z = local.T
         zero = np.zeros_like(z)
-        jacobian = (
-            np.stack(
-                [
-                    np.stack([camera.fx / z, zero, -camera.fx * x / z**2], 1),
-                    np.stack([zero, camera.fy / z, -camera.fy * y / z**2], 1),
-                ],
-                1,
-            )
-            @ rotation
-        )
+        du = np.stack([camera.fx / z, zero, -camera.fx * x / z**2], 1)
+        dv = np.stack([zero, camera.fy / z, -camera.fy * y / z**2], 1)
+        jacobian = np.stack([du, dv], 1) @ rotation
         np.add.at(normal, point[at], np.einsum("nij,nik->njk", jacobian, jacobian))
         np.add.at(right, point[at], np.einsum("nij,ni->nj", jacobian, noise[at]))
     damping = 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
@@ -152,8 +145,7 @@ def make_sparse_cloud(
     for camera, at in zip(cameras, of_image, strict=True):
         residual[at] = np.linalg.norm(camera.project(points[point[at]])[0] - observed[at], axis=1)
     errors = np.bincount(point, residual, len(places)) / np.maximum(np.bincount(point, minlength=len(places)), 1)
-    wrong = np.zeros(len(places), bool)
     return SparseCloud(
         true_points=places, points=points, colors=colors, errors=errors, observed_point=point, observed_image=image,
-        observed_px=observed, visibility=visible, outliers=wrong,
+        observed_px=observed, visibility=visible, outliers=np.zeros(len(places), bool),
     )  # fmt: skip

@@ -68,23 +68,14 @@ class Terrain:
         x, y = np.meshgrid(axis, axis)
         z = self.height(x, y)
         step = 0.4
-        normal = np.stack(
-            [
-                (self.height(x - step, y) - self.height(x + step, y)) / (2 * step),
-                (self.height(x, y - step) - self.height(x, y + step)) / (2 * step),
-                np.ones_like(x),
-            ],
-            -1,
-        )
+        slope_x = (self.height(x - step, y) - self.height(x + step, y)) / (2 * step)
+        slope_y = (self.height(x, y - step) - self.height(x, y + step)) / (2 * step)
+        normal = np.stack([slope_x, slope_y, np.ones_like(x)], -1)
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
         side = len(axis)
         corner = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()
-        faces = np.concatenate(
-            [
-                np.stack([corner, corner + 1, corner + side + 1], 1),
-                np.stack([corner, corner + side + 1, corner + side], 1),
-            ]
-        )
+        far = corner + side + 1
+        faces = np.concatenate([np.stack([corner, corner + 1, far], 1), np.stack([corner, far, corner + side], 1)])
         vertices = np.stack([x, y, z], -1).reshape(-1, 3)
         builder.part(
             vertices, faces, Material.GROUND, np.zeros(3), 0.0,
@@ -97,7 +88,6 @@ class Terrain:
 def _add_water(builder: MeshBuilder, pond: Pond) -> None:
     """A flat sheet at the pond's level; the ground around it hides its rim."""
     angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    ring = np.stack(
-        [pond.x + 1.4 * pond.rx * np.cos(angle), pond.y + 1.4 * pond.ry * np.sin(angle), np.full(24, pond.level)], 1
-    )
+    x, y = pond.x + 1.4 * pond.rx * np.cos(angle), pond.y + 1.4 * pond.ry * np.sin(angle)
+    ring = np.stack([x, y, np.full(24, pond.level)], 1)
     builder.polygon(ring, Material.WATER, np.array([0.05, 0.13, 0.15]))

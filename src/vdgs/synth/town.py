@@ -9,13 +9,12 @@ import numpy as np
 
 from vdgs.synth import props, town_center
 from vdgs.synth.mesh import Mesh, MeshBuilder
-from vdgs.synth.outskirts import build_outskirts, edge_plots, scatter_trees
-from vdgs.synth.periphery import build_periphery
+from vdgs.synth.outskirts import build_outskirts, build_periphery, edge_plots, scatter_trees
 from vdgs.synth.residential import residential_block
 from vdgs.synth.site import Plot, Site
 from vdgs.synth.streets import PAVEMENT, StreetPlan, make_street_plan
 from vdgs.synth.terrain import Pond, Terrain
-from vdgs.synth.towers import MAX_HEIGHT, towers
+from vdgs.synth.town_center import MAX_HEIGHT, towers
 from vdgs.synth.trees import tree
 from vdgs.synth.zones import LandUseMap
 
@@ -66,12 +65,15 @@ def build_town(seed: int, extent_m: float) -> Town:
 
 def _pond(site: Site, plot: Plot) -> Pond:
     """The pond behind an edge of the town, level with the lowest ground of its shore."""
-    p, q = plot.plan(np.array(0.0), np.array(14.0))
-    x, y = (float(v) for v in site.plan.to_world(p, q))
-    rx, ry = 15.0, 13.0
-    angle = np.linspace(0, 2 * np.pi, 32)
-    shore = site.terrain.height(x + 1.25 * rx * np.cos(angle), y + 1.25 * ry * np.sin(angle))
-    return Pond(x, y, rx, ry, float(shore.min()) - 0.35)
+    return _water(site, plot, 14.0, (15.0, 13.0), 32)
+
+
+def _water(site: Site, plot: Plot, b: float, radii: tuple[float, float], samples: int, shore_ry: float = 0.0) -> Pond:
+    """Water at local (0, b) of a plot, level with the lowest of `samples` points around its shore."""
+    x, y = (float(v) for v in site.plan.to_world(*plot.plan(np.array(0.0), np.array(b))))
+    angle = np.linspace(0, 2 * np.pi, samples)
+    around = x + 1.25 * radii[0] * np.cos(angle), y + 1.25 * (shore_ry or radii[1]) * np.sin(angle)
+    return Pond(x, y, *radii, float(site.terrain.height(*around).min()) - 0.35)
 
 
 def _lake(site: Site, plots: list[Plot], pond_plot: int, extent: float) -> Pond:
@@ -84,11 +86,7 @@ def _lake(site: Site, plots: list[Plot], pond_plot: int, extent: float) -> Pond:
         along = abs((plot.p - main[0], plot.q - main[1])[plot.quarter_turns % 2])
         return float(min(other, 2 * along))
 
-    plot = max(plots, key=room)
-    x, y = (float(v) for v in plan.to_world(*plot.plan(np.array(0.0), np.array(50 + 1.15 * radius))))
-    angle = np.linspace(0, 2 * np.pi, 64)
-    shore = site.terrain.height(x + 1.25 * radius * np.cos(angle), y + 1.25 * radius * np.sin(angle))
-    return Pond(x, y, radius, 0.9 * radius, float(shore.min()) - 0.35)
+    return _water(site, max(plots, key=room), 50 + 1.15 * radius, (radius, 0.9 * radius), 64, shore_ry=radius)
 
 
 def _tower_blocks(cells: list[tuple[int, int]], middle: tuple[int, int]) -> list[tuple[int, int]]:

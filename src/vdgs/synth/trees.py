@@ -89,9 +89,7 @@ def _round_crown(variant: int, detail: int) -> TreeCrown:
 def _conifer_crown(variant: int) -> TreeCrown:
     """Skirts of branches, one above the other, with ragged rims."""
     rng = np.random.default_rng([22, variant])
-    vertices: list[np.ndarray] = []
-    faces: list[np.ndarray] = []
-    openness: list[np.ndarray] = []
+    vertices, faces = list[np.ndarray](), list[np.ndarray]()
     around, skirts = 22, 6
     for k in range(skirts):
         share = k / skirts
@@ -104,8 +102,8 @@ def _conifer_crown(variant: int) -> TreeCrown:
         vertices.append(np.vstack([ring, [0, 0, min(high, 1.0)]]))
         following = (np.arange(around) + 1) % around
         faces.append(np.stack([np.arange(around), following, np.full(around, around)], 1) + start)
-        openness.append(np.append(np.full(around, 1.0), 0.15))
-    return _finish(np.vstack(vertices), np.vstack(faces), np.concatenate(openness), 0.25)
+    openness = np.tile(np.append(np.full(around, 1.0), 0.15), skirts)
+    return _finish(np.vstack(vertices), np.vstack(faces), openness, 0.25)
 
 
 def _plant(

@@ -7,31 +7,13 @@ from enum import IntEnum
 import cv2
 import numpy as np
 
-
-class LandUse(IntEnum):
-    """What covers the ground. OPEN is farmland, painted by formula; streets are drawn over every zone."""
-
-    OPEN = 0
-    LAWN = 1
-    PATH = 2
-    PATIO = 3
-    DRIVE = 4
-    SOIL = 5
-    SQUARE = 6
-    ASPHALT = 7
-    GRAVEL = 8
-    PITCH = 9
-    LINE = 10
-    FLOWERS = 11
-    MEADOW = 12
-    WOODS = 13
-    SAND = 14
-    WHEAT = 15
-    LAVENDER = 16
-    PLOUGHED = 17
-    GREENS = 18
-    BUILDING = 19
-    COURT = 20
+#: What covers the ground. OPEN is farmland, painted by formula; streets are drawn over every zone.
+LandUse = IntEnum(
+    "LandUse",
+    "OPEN LAWN PATH PATIO DRIVE SOIL SQUARE ASPHALT GRAVEL PITCH LINE FLOWERS "
+    "MEADOW WOODS SAND WHEAT LAVENDER PLOUGHED GREENS BUILDING COURT",
+    start=0,
+)
 
 
 class LandUseMap:
