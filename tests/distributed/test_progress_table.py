@@ -89,7 +89,8 @@ def test_the_table_fits_the_screen_and_keeps_what_matters():
 def test_the_message_is_found_among_the_output(tmp_path):
     output = tmp_path / "output.log"
     output.write_bytes(
-        b"vdgs train-blocks: old\n--- again\nnoise\r\x1b[31m 50 %\x1b[0m\nvdgs train-blocks: a.jpg: gone\nPut it back\n\n"
+        b"vdgs train-blocks: old\n--- again\nnoise\r\x1b[31m 50 %\x1b[0m\n"
+        b"vdgs train-blocks: a.jpg: gone\nPut it back\n\n"
     )
     assert error_message(output) == "a.jpg: gone\nPut it back"
     output.write_bytes(b"Traceback\n  somewhere\nValueError: \xff\x07no\n")

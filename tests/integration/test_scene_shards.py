@@ -97,7 +97,7 @@ def test_a_run_sends_its_maps_where_its_blocks_go_and_stops_when_asked(tmp_path,
         asked = RunRequest(
             capture=tmp_path, output=tmp_path, jobs=3, executor_options=ExecutorOptions(executor=executor)
         )
-        run_pipeline._map(RunContext.from_path(tmp_path), asked, Console(quiet=True))
+        run_pipeline._ortho(RunContext.from_path(tmp_path), asked, Console(quiet=True))
     assert [(wish.is_distributed, wish.jobs, wish.where.executor) for wish in wishes] == [
         (False, 0, "local"),
         (True, 3, "slurm"),
@@ -108,7 +108,7 @@ def test_a_run_sends_its_maps_where_its_blocks_go_and_stops_when_asked(tmp_path,
 
     monkeypatch.setattr(run_pipeline, "render_ortho", stopped)
     with pytest.raises(Stopped):
-        run_pipeline._map(RunContext.from_path(tmp_path), asked, Console(quiet=True))
+        run_pipeline._ortho(RunContext.from_path(tmp_path), asked, Console(quiet=True))
 
 
 def small_parts() -> None:

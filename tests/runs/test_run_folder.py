@@ -24,7 +24,9 @@ from vdgs.system.atomic_files import write_json, write_text
 
 def settings(**changes) -> RunSettings:
     laptop = PRESETS["laptop"]
-    return RunSettings.of("/data/a", CaptureOptions(), replace(laptop, training=replace(laptop.training, **changes)))
+    return RunSettings.create(
+        "/data/a", CaptureOptions(), replace(laptop, training=replace(laptop.training, **changes))
+    )
 
 
 def test_the_same_settings_continue(tmp_path):
@@ -175,7 +177,8 @@ def test_each_setting_invalidates_the_stages_that_depend_on_it_and_no_others():
     before = stage_keys(settings())
     changes: list[tuple[str, dict[str, object], int]] = [
         ("capture", {"images": "other"}, 0), ("training", {"seed": 5}, 0), ("partition", {"lambda_vis": 0.7}, 1),
-        ("assignment", {"tau": 0.1}, 2), ("block", {"lr_scale_offsets": 0.5}, 3), ("merge", {"rule": "max-visibility"}, 4),
+        ("assignment", {"tau": 0.1}, 2), ("block", {"lr_scale_offsets": 0.5}, 3),
+        ("merge", {"rule": "max-visibility"}, 4),
     ]  # fmt: skip
     for section, change, first in changes:
         section_changed = replace(getattr(settings(), section), **change)

@@ -24,7 +24,7 @@ CHANGED = {
 
 
 def keys(method: MethodConfig):
-    return stage_keys(RunSettings.of("/somewhere", CaptureOptions(), method))
+    return stage_keys(RunSettings.create("/somewhere", CaptureOptions(), method))
 
 
 @pytest.mark.parametrize("name", CHANGED)

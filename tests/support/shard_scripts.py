@@ -18,8 +18,9 @@ from vdgs.runs.stage_folder import StageFolder
 PRELUDE = f"""
 import json, os, pathlib, signal, sys, time
 folder = pathlib.Path(sys.argv[1])
-def tell(state, **facts):
-    (folder / "status.json").write_text(json.dumps({{"state": state, **facts}}))
+def tell(state, **values):
+    (folder / "status.tmp").write_text(json.dumps({{"state": state, **values}}))
+    (folder / "status.tmp").rename(folder / "status.json")
 def stop(*_):
     with (folder / "terms").open("a") as terms:
         terms.write("TERM ")

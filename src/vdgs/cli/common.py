@@ -173,7 +173,7 @@ def make_console(quiet: bool = False) -> Console:
 
 
 def absolute_command_line(verb: str, arguments: list[str], paths: tuple[Path, ...]) -> str:
-    """The command that was given, for every folder to type it in: paths are whole, `--overwrite` and `--quiet` left out."""
+    """The command as it can be typed in any folder: with absolute paths, without `--overwrite` and `--quiet`."""
     whole = {str(path): str(path.resolve()) for path in paths}
     whole |= {f"--output={name}": f"--output={path}" for name, path in whole.items()}
     words = [whole.get(each, each) for each in arguments if each not in ("--overwrite", "--quiet")]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -39,26 +40,8 @@ vdgs VERB --help explains the options of a verb. A capture is a folder with imag
 transforms.json (nerfstudio), train/ and val/ (Mega-NeRF) or the layout of MatrixCity; `sfm` makes one of photographs.
 """
 
-COMMANDS = [
-    "inspect",
-    "run",
-    "sfm",
-    "status",
-    "train-coarse",
-    "visibility",
-    "partition",
-    "train-blocks",
-    "merge",
-    "eval",
-    "report",
-    "view",
-    "render",
-    "ortho",
-    "export",
-    "synth",
-    "bench",
-    "doctor",
-]
+#: The verbs, which begin the lines of the help.
+COMMANDS = tuple(re.findall(r"^  ([a-z][a-z-]*) ", HELP, re.MULTILINE))
 #: Verbs that take up what they left when they were interrupted.
 RESUMABLE_COMMANDS = ("run", "sfm", "train-coarse", "train-blocks", "bench")
 

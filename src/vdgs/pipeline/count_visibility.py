@@ -32,15 +32,15 @@ def count_run_visibility(context: RunContext, console: Console) -> None:
         check_has_anchors(run, len(opened.model.anchors))
         visibility = load_or_count_visibility(opened).numpy()
         cameras = [view.camera for view in opened.capture.train_views]
-        facts = asdict(visibility_stats(visibility))
+        stats = asdict(visibility_stats(visibility))
         figures.plot_anchor_visibility(
             run.visibility / "map.png", opened.model.anchors.positions.numpy(), visibility, cameras,
             opened.capture.ground.axis_names,
         )  # fmt: skip
-        write_json(file, {"key": key, "anchors": len(visibility), "training_views": len(cameras), **facts})
-    quantiles = ", ".join(f"{share} %: {value:g}" for share, value in facts["quantiles"].items())
+        write_json(file, {"key": key, "anchors": len(visibility), "training_views": len(cameras), **stats})
+    quantiles = ", ".join(f"{share} %: {value:g}" for share, value in stats["quantiles"].items())
     console.print(
-        f"cameras that see an anchor (V), by quantile: {quantiles}; Gini {facts['gini']:.2f}\n"
+        f"cameras that see an anchor (V), by quantile: {quantiles}; Gini {stats['gini']:.2f}\n"
         f"map: {run.visibility / 'map.png'}",
         highlight=False,
     )

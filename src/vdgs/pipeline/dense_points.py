@@ -1,4 +1,4 @@
-"""What dense stereo adds to the sparse points of a run: found once, before the coarse stage, and kept beside it.
+"""The points that dense stereo adds to the sparse points of a run: computed once, before the coarse stage, and saved.
 
 RUN/coarse/stereo.safetensors goes with the coarse stage: `StageFolder.reset_unless` removes it with all that was made
 for other settings.
@@ -32,14 +32,14 @@ DENSE_POINTS_FILE = "stereo.safetensors"
 #: the two, and two, four or eight times that where pixels are so much larger than below the flight (choice). An anchor
 #: has ten Gaussians; growth makes more where that is too few.
 CELL_VOXELS, CELL_PX = 1.2, 3.0
-#: Photographs are to have so many pixels for each point that anchors start from, sparse and dense together: more
-#: anchors than that cost time and are learnt by heart (choice; reports/few-cameras.md). Seldom seen places come first.
+#: So many pixels of the images for each point that anchors start from, sparse and dense together: more anchors than
+#: that cost time and overfit (choice). Points that few cameras see come first.
 PIXELS_PER_POINT = 180
 
 
 def load_dense_points(run: RunFolder, config: AnchorConfig) -> DensePoints | None:
-    """What the coarse stage of the run found; None where its settings ask for none. VdgsError where the file is missing
-    or damaged."""
+    """The dense points of the coarse stage; None where its settings ask for none. VdgsError for a missing or damaged
+    file."""
     return _read(run.coarse.path / DENSE_POINTS_FILE) if config.mvs else None
 
 
@@ -51,39 +51,36 @@ def find_dense_points(
     on_progress: Callable[[int, int], None],
     threads: int,
 ) -> DensePoints | None:
-    """As `load_dense_points`, found and kept where they are not yet: dense points that lie away from the sparse ones, none
-    where those are as many as the photographs can bear.
+    """As `load_dense_points`, computed and saved where they are not yet: points away from the sparse ones, none where
+    those are as many as the images can bear.
 
-    `images` are the training photographs; `tell(done, of)` is called after each step, and may raise.
+    `images` are the training images; `on_progress(done, total)` is called after each step, and may raise.
     """
     file = run.coarse.path / DENSE_POINTS_FILE
     if not config.mvs or file.exists():
         return load_dense_points(run, config)
     cameras, room = [view.camera for view in capture.train_views], max_dense_points(capture)
     if not room:
-        nothing = DensePoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-        _write(file, nothing)
-        return nothing
+        return _write(file, DensePoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8)))
     cell = fusion_cell(capture, config)
 
     def read(index: int) -> tuple[np.ndarray, np.ndarray | None]:
-        picture = images.get(index)
-        return picture.image.numpy(), None if picture.mask is None else picture.mask.numpy()
+        cached = images.get(index)
+        return cached.image.numpy(), None if cached.mask is None else cached.mask.numpy()
 
     gaps = find_gap_points(capture.points, cameras, get_voxel_size(capture.points, config))
     inputs = StereoInputs(cameras, capture.points, np.concatenate([capture.points, gaps]), read)
-    found = compute_dense_points(inputs, cell, run.coarse.path, on_progress, threads)
-    if len(found.points):
-        away = np.flatnonzero(cKDTree(capture.points).query(found.points, workers=1)[0] > cell.min_edge / 2)
-        views = count_visibility(torch.from_numpy(found.points[away]), cameras).numpy()
-        kept = np.sort(away[np.argsort(views, kind="stable")[:room]])
-        found = DensePoints(found.points[kept], found.colors[kept])
-    _write(file, found)
-    return found
+    dense = compute_dense_points(inputs, cell, run.coarse.path, on_progress, threads)
+    if len(dense.points):
+        away = np.flatnonzero(cKDTree(capture.points).query(dense.points, workers=1)[0] > cell.min_edge / 2)
+        views = count_visibility(torch.from_numpy(dense.points[away]), cameras).numpy()
+        chosen = np.sort(away[np.argsort(views, kind="stable")[:room]])
+        dense = DensePoints(dense.points[chosen], dense.colors[chosen])
+    return _write(file, dense)
 
 
 def max_dense_points(capture: Capture) -> int:
-    """At most so many points are added to the sparse ones: photographs are to bear them all."""
+    """The most points that are added to the sparse ones (`PIXELS_PER_POINT`)."""
     pixels = sum(view.camera.width * view.camera.height for view in capture.train_views)
     return max(0, pixels // PIXELS_PER_POINT - len(capture.points))
 
@@ -96,11 +93,11 @@ def fusion_cell(capture: Capture, config: AnchorConfig) -> FusionCell:
     )
 
 
-def _write(file: Path, found: DensePoints) -> None:
-    tensors = {"points": torch.from_numpy(found.points), "colors": torch.from_numpy(found.colors)}
-    write_atomic(
-        file, lambda temporary: write_tensors(temporary, tensors, {DENSE_POINTS_FORMAT: str(tensors_crc32(tensors))})
-    )
+def _write(file: Path, dense: DensePoints) -> DensePoints:
+    tensors = {"points": torch.from_numpy(dense.points), "colors": torch.from_numpy(dense.colors)}
+    header = {DENSE_POINTS_FORMAT: str(tensors_crc32(tensors))}
+    write_atomic(file, lambda temporary: write_tensors(temporary, tensors, header))
+    return dense
 
 
 def _read(file: Path) -> DensePoints:

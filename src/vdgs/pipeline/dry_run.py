@@ -23,7 +23,7 @@ from vdgs.config.ranges import check_ranges
 from vdgs.config.validation_rules import validate_config
 from vdgs.distributed.resource_allocation import ShardWorkload, allocate_local, exceeds_memory
 from vdgs.errors import VdgsError
-from vdgs.kernels import get_num_threads as threads_available
+from vdgs.kernels import get_num_threads
 from vdgs.partition.partition_scene import choose_block_count
 from vdgs.pipeline.dense_points import max_dense_points
 from vdgs.pipeline.train_coarse import build_coarse_problem, initial_coarse_state
@@ -44,7 +44,7 @@ from vdgs.system.memory.memory_estimate import (
 from vdgs.system.memory.process_memory import available_memory_bytes
 from vdgs.system.stop_signals import check_stop_requested
 from vdgs.system.units import data_size, rough_duration
-from vdgs.training import TrainingState, train
+from vdgs.training import TrainingProblem, TrainingState, train
 from vdgs.training.session.memory_advice import training_workload
 from vdgs.training.session.trainer import image_cache_bytes
 
@@ -54,16 +54,16 @@ MIN_TIMED_STEPS, MAX_TIMED_SECONDS = 4, 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class RunEstimate:
-    """What a run takes by estimate. Seconds are pairs: anchors as many as at the start, and, with all that stereo may
-    add, grown all the while."""
+    """What a run takes by estimate. Seconds are pairs: with as many anchors as at the start, and with all that stereo
+    may add, grown all the while."""
 
     anchors: int
     dense_points: int
-    """What stereo may add to the sparse points at most; an anchor starts at each."""
+    """The most that stereo may add to the sparse points; an anchor starts at each."""
     blocks: int
     coarse_iterations: int
     block_iterations: int
-    """Of one block, where all have equally many photographs and no step draws a part."""
+    """Of one block, where all have equally many images and no step draws a crop."""
     jobs: int
     free_bytes: int
     coarse_bytes: int
@@ -71,13 +71,12 @@ class RunEstimate:
     images_bytes: int
     """Of one block, beside `block_bytes`."""
     may_exceed_memory: bool
-    """Whether it may take more than is free."""
     coarse_seconds: tuple[float, float]
     blocks_seconds: tuple[float, float]
 
 
 def estimate_run(request: RunRequest, console: Console) -> RunEstimate | None:
-    """Say what `vdgs run` would do and take; None of photographs alone, whose training nobody knows.
+    """Print what `vdgs run` would do and take; None of photographs alone, whose training cannot be estimated.
 
     Raises what reading the capture raises, VdgsError for bad settings.
     """
@@ -88,31 +87,24 @@ def estimate_run(request: RunRequest, console: Console) -> RunEstimate | None:
     if request.options.undistort:
         raise VdgsError("--dry-run writes nothing, and --undistort writes photographs: leave one of the two out.")
     if is_image_input(request):
-        return _plan_photographs(request, console)
+        return _estimate_reconstruction(request, console)
     capture = load_capture(request.capture, request.options)
     for warning in capture.warnings:
         console.print(f"[yellow]note[/] {warning}", highlight=False)
     method = replace(method, training=resolve_iterations(method.training, len(capture.train_views)))
-    standing = _standing(request, capture, method, console)
-    plan = _plan(capture, method, request)
-    _print_estimate(plan, method, standing, console)
-    return plan
+    status = _run_status(request, capture, method, console)
+    estimate = _estimate(capture, method, request)
+    _print_estimate(estimate, method, status, console)
+    return estimate
 
 
-def _plan_photographs(run_request: RunRequest, console: Console) -> RunEstimate | None:
-    """The look at photographs; training can be estimated once they are a capture, which a run makes first."""
+def _estimate_reconstruction(run_request: RunRequest, console: Console) -> RunEstimate | None:
+    """The plan of the reconstruction; training can be estimated once there is a capture, which a run makes first."""
     request = make_sfm_request(run_request)
-    finished = read_reconstruction(request.output)
-    if finished is not None:
-        return estimate_run(
-            replace(
-                run_request,
-                capture=request.output,
-                extra_image_folders=(),
-                options=replace(run_request.options, gps=None),
-            ),
-            console,
-        )
+    if read_reconstruction(request.output) is not None:
+        options = replace(run_request.options, gps=None)
+        with_capture = replace(run_request, capture=request.output, extra_image_folders=(), options=options)
+        return estimate_run(with_capture, console)
     print_plan(plan_reconstruction(request), console)
     folders = " ".join(map(str, (run_request.capture, *run_request.extra_image_folders)))
     console.print(
@@ -123,8 +115,8 @@ def _plan_photographs(run_request: RunRequest, console: Console) -> RunEstimate 
     return None
 
 
-def _standing(request: RunRequest, capture: Capture, method: MethodConfig, console: Console) -> RunStatus | None:
-    """How far the run is that is there already, with the settings that are asked for; None where there is none."""
+def _run_status(request: RunRequest, capture: Capture, method: MethodConfig, console: Console) -> RunStatus | None:
+    """How far the run is that is there already, with the settings of the request; None where there is none."""
     run = RunFolder(request.output)
     if not run.config_file.exists():
         return None
@@ -136,38 +128,31 @@ def _standing(request: RunRequest, capture: Capture, method: MethodConfig, conso
     return get_run_status(run, settings)
 
 
-def _plan(capture: Capture, method: MethodConfig, request: RunRequest) -> RunEstimate:
+def _estimate(capture: Capture, method: MethodConfig, request: RunRequest) -> RunEstimate:
     config, views = method.training, len(capture.train_views)
     factors = sorted({factor for _, factor in (*config.resolution_schedule, *method.block.resolution_schedule)})
     with ImageCache(capture.train_views, image_cache_bytes(request.checkpointing), downscales=tuple(factors)) as images:
         stage, anchors = build_coarse_problem(capture, config, images, request.device)
-        alone = training_workload(initial_coarse_state(anchors, stage, config.exposure_compensation), stage)
+        fit_exposures = config.exposure_compensation
+        sparse = training_workload(initial_coarse_state(anchors, stage, fit_exposures), stage)
         timed = {}
         for factor in factors:
             at_size = replace(stage, config=replace(config, resolution_schedule=((0.0, factor),)))
-            timed[factor] = _seconds_a_step(
-                initial_coarse_state(anchors, at_size, config.exposure_compensation), at_size
-            )
+            timed[factor] = _seconds_per_step(initial_coarse_state(anchors, at_size, fit_exposures), at_size)
     dense = max_dense_points(capture) if config.anchors.mvs else 0
-    need, more = replace(alone, anchors=alone.anchors + dense), MAX_GROWTH * (1 + dense / max(alone.anchors, 1))
+    need, growth = replace(sparse, anchors=sparse.anchors + dense), MAX_GROWTH * (1 + dense / max(sparse.anchors, 1))
     cameras, free = [view.camera for view in capture.train_views], available_memory_bytes()
     pixels = max_image_pixels(cameras, method.block.resolution_schedule)
     blocks = choose_block_count(need.max_grown_anchors, views, pixels, method)
-    each = estimate_memory(
-        block_workload(method, -(-need.max_grown_anchors // blocks), need.max_grown_anchors, pixels)
-    ).total
-    whole = estimate_memory(need).total
-    photographs = decoded_image_bytes(cameras)
+    largest = block_workload(method, -(-need.max_grown_anchors // blocks), need.max_grown_anchors, pixels)
+    block_bytes, coarse_bytes = estimate_memory(largest).total, estimate_memory(need).total
+    image_bytes, image_gb = decoded_image_bytes(cameras), request.checkpointing.image_cache_gb
     work = ShardWorkload(
-        shards=blocks,
-        shard_bytes=each,
-        jobs=request.jobs,
-        image_gb=request.checkpointing.image_cache_gb,
-        images_bytes=photographs,
+        shards=blocks, shard_bytes=block_bytes, jobs=request.jobs, image_gb=image_gb, images_bytes=image_bytes
     )
-    share = allocate_local(work, threads_available(), free)
+    share = allocate_local(work, get_num_threads(), free)
     block = block_train_config(method, max(1, round(views * min(1.0, 1.5 / blocks))))
-    coarse = _seconds(config, timed)
+    coarse_seconds, blocks_seconds = _seconds(config, timed), blocks * _seconds(block, timed)
     return RunEstimate(
         anchors=len(anchors),
         dense_points=dense,
@@ -176,25 +161,25 @@ def _plan(capture: Capture, method: MethodConfig, request: RunRequest) -> RunEst
         block_iterations=block.iterations,
         jobs=share.max_concurrent,
         free_bytes=free,
-        coarse_bytes=whole,
-        block_bytes=each,
-        images_bytes=min(photographs, round(1e9 * share.image_gb)),
-        may_exceed_memory=whole > free or exceeds_memory(work, share.max_concurrent, free),
-        coarse_seconds=(coarse, coarse * (1 + more) / 2),
-        blocks_seconds=(blocks * _seconds(block, timed), blocks * _seconds(block, timed) * more),
+        coarse_bytes=coarse_bytes,
+        block_bytes=block_bytes,
+        images_bytes=min(image_bytes, round(1e9 * share.image_gb)),
+        may_exceed_memory=coarse_bytes > free or exceeds_memory(work, share.max_concurrent, free),
+        coarse_seconds=(coarse_seconds, coarse_seconds * (1 + growth) / 2),
+        blocks_seconds=(blocks_seconds, blocks_seconds * growth),
     )
 
 
-def _seconds_a_step(state: TrainingState, stage: object) -> float:
-    """Mean time of the steps that are tried; the first is left out, which opens files and compiles nothing twice."""
-    began = [time.monotonic()]
+def _seconds_per_step(state: TrainingState, stage: TrainingProblem) -> float:
+    """Mean time of the steps that are tried, without the first, which opens files."""
+    times = [time.monotonic()]
 
     def enough() -> bool:
         check_stop_requested()
-        return len(began) > MIN_TIMED_STEPS and began[-1] - began[1] > MAX_TIMED_SECONDS
+        return len(times) > MIN_TIMED_STEPS and times[-1] - times[1] > MAX_TIMED_SECONDS
 
-    train(state, stage, stop=enough, after_step=lambda *_: began.append(time.monotonic()))  # type: ignore[arg-type]
-    return (began[-1] - began[1]) / (len(began) - 2) if len(began) > 2 else began[-1] - began[0]
+    train(state, stage, stop=enough, after_step=lambda *_: times.append(time.monotonic()))
+    return (times[-1] - times[1]) / (len(times) - 2) if len(times) > 2 else times[-1] - times[0]
 
 
 def _seconds(config: TrainConfig, timed: dict[int, float]) -> float:
@@ -206,24 +191,22 @@ def _seconds(config: TrainConfig, timed: dict[int, float]) -> float:
     )
 
 
-def _print_estimate(plan: RunEstimate, method: MethodConfig, standing: RunStatus | None, console: Console) -> None:
+def _print_estimate(plan: RunEstimate, method: MethodConfig, status: RunStatus | None, console: Console) -> None:
     def done(*names: str) -> str:
-        found = [stage for stage in standing.stages if stage.name in names] if standing is not None else []
-        whole = bool(found) and all(stage.state == "done" for stage in found)
-        return "; done already" if whole else ""
+        stages = [stage for stage in status.stages if stage.name in names] if status is not None else []
+        return "; done already" if stages and all(stage.state == "done" for stage in stages) else ""
 
     blocks = f"{plan.blocks} block{'' if plan.blocks == 1 else 's'}"
     auto = method.partition.blocks == "auto"
     chosen = " by estimate: --blocks auto counts again when anchors have grown" if auto else ""
-    per_block = _times(plan.blocks_seconds)
     stereo = f" (and at most {plan.dense_points:,} where stereo finds ground)" if plan.dense_points else ""
-    names = [stage.name for stage in standing.blocks] if standing is not None else []
+    names = [stage.name for stage in status.blocks] if status is not None else []
     lines = [
         f"coarse model: {plan.anchors:,} anchors at the start{stereo}, {plan.coarse_iterations:,} iterations, at most "
         f"{data_size(plan.coarse_bytes)}, {_times(plan.coarse_seconds)}{done('coarse')}",
         f"{blocks}{chosen}: about {plan.block_iterations:,} iterations each, {plan.jobs} at once, at most "
         f"{data_size(plan.block_bytes)} each and {data_size(plan.images_bytes)} for photographs, "
-        f"{per_block}{done(*names)}",
+        f"{_times(plan.blocks_seconds)}{done(*names)}",
         f"memory that is free: {data_size(plan.free_bytes)}",
         "Times are of training alone, from steps timed now on this machine; the larger one is with "
         f"{MAX_GROWTH:g} times as many anchors{', and with those of stereo' if plan.dense_points else ''}. Nothing was "
@@ -232,7 +215,8 @@ def _print_estimate(plan: RunEstimate, method: MethodConfig, standing: RunStatus
     console.print("\n".join(lines), highlight=False)
     if plan.may_exceed_memory:
         console.print(
-            "[yellow]warning[/] it may run out of memory. What helps: --downscale 2, --densify.max-anchors, less --jobs",
+            "[yellow]warning[/] it may run out of memory. What helps: --downscale 2, --densify.max-anchors, less "
+            "--jobs",
             highlight=False,
         )
 

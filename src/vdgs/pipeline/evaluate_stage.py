@@ -1,4 +1,4 @@
-"""Measuring a run: its test views, and for a merged scene also its blocks and their seams."""
+"""Evaluation of a run: its test views, and for a merged scene also its blocks and their seams."""
 
 from __future__ import annotations
 
@@ -12,16 +12,22 @@ from pathlib import Path
 
 from rich.console import Console
 
-from vdgs.captures.capture import Capture
+from vdgs.captures.capture import View
 from vdgs.config.commands import ModelName
 from vdgs.distributed.job_folders import clear
 from vdgs.distributed.job_labels import shard_kind
 from vdgs.distributed.node_check import NodeRequirements, image_and_mask_files
 from vdgs.distributed.shard import Results, Shard
 from vdgs.distributed.sharded_job import ExecutionOptions, ShardedJob, ShardNeeds, split_ranges
-from vdgs.evaluation.block_seams import SeamView, evaluate_blocks, make_block_table, save_seam_image, select_seam_views
-from vdgs.evaluation.block_seams import measure_block_view as measure_view_of_blocks
-from vdgs.evaluation.block_seams import summarize_blocks as conclude_blocks
+from vdgs.evaluation.block_seams import (
+    SeamView,
+    evaluate_blocks,
+    make_block_table,
+    measure_block_view,
+    save_seam_image,
+    select_seam_views,
+    summarize_blocks,
+)
 from vdgs.evaluation.comparison_images import unique_file_stems
 from vdgs.evaluation.evaluate_model import require_views, summarize_views
 from vdgs.evaluation.evaluate_run import (
@@ -38,7 +44,7 @@ from vdgs.evaluation.evaluate_run import (
     select_views,
 )
 from vdgs.evaluation.lpips import load_lpips
-from vdgs.evaluation.renderable_model import ModelMetadata
+from vdgs.evaluation.renderable_model import EvaluationSettings, ModelMetadata
 from vdgs.evaluation.view_metrics import ViewInputs, measure_view
 from vdgs.evaluation.view_metrics_io import load_view_metrics, save_view_metrics
 from vdgs.runs.open_run import ModelLocation, load_run_blocks, locate_model
@@ -52,14 +58,14 @@ from vdgs.system.memory.process_memory import peak_memory_bytes, reset_peak_memo
 from vdgs.system.records import record_from_dict, record_to_dict
 
 #: Views of a shard, least and most, and how many shards there are in between (choice): a process of its own is worth
-#: some views, and what is lost with one is little.
-VIEWS_OF_SHARD = 3, 25, 16
+#: some views, and little is lost with one.
+SHARD_VIEWS = 3, 25, 16
 VIEW_LABELS = shard_kind("measure", "views")
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationRequest:
-    """Which figures are wanted."""
+    """Which model is measured on which views, and how."""
 
     path: Path
     """The run folder."""
@@ -70,201 +76,210 @@ class EvaluationRequest:
     device: str = "cpu"
 
 
+@dataclass(frozen=True)
+class _Evaluation:
+    """A request and the model of the run that it means."""
+
+    run: RunFolder
+    model: ModelLocation
+    request: EvaluationRequest
+
+    @staticmethod
+    def create(request: EvaluationRequest) -> _Evaluation:
+        """Raises RunError where the model is not trained."""
+        run = RunFolder(Path(os.path.abspath(request.path)))  # not resolved: other machines may mount it so
+        return _Evaluation(run, locate_model(run, request.which), request)
+
+    @property
+    def output(self) -> Path:
+        return evaluation_folder(self.run, self.model.name, self.request.views)
+
+    @property
+    def has_seams(self) -> bool:
+        """Whether blocks and the seams between them are measured too."""
+        is_merged = self.request.views == "test" and self.model.name == "merged"
+        return is_merged and len(load_run_blocks(self.run)) > 1
+
+    @property
+    def settings(self) -> EvaluationSettings:
+        return make_evaluation_settings(self.request.visibility_bins, self.request.views)
+
+    def begin(self, view_count: int, console: Console) -> None:
+        """Announce the evaluation, and delete what vouches for figures that are about to change, and what blocks of
+        another partition may have left."""
+        summary = f"measuring the {self.model.summary} on {view_count} {self.request.views} views"
+        console.print(summary, highlight=False)
+        for stale in ("status.json", "metrics.json", "by_block.json"):
+            (self.output / stale).unlink(missing_ok=True)
+        shutil.rmtree(self.output / "seams", ignore_errors=True)
+
+    def job(self, view_count: int) -> ShardedJob:
+        """The views in shards, and what their figures depend on."""
+        run, model, request = self.run, self.model, self.request
+        weights = None if request.lpips_weights is None else Path(os.path.abspath(request.lpips_weights))
+        request = replace(request, path=run.path, which=model.name, lpips_weights=weights)
+        blocks = [folder.status().model_id for folder in run.block_folders()] if model.name == "merged" else []
+        depends_on = [
+            model.stage.status().model_id, model.key, run.coarse_model_id(), blocks, str(weights), request.views
+        ]  # fmt: skip
+        if exposure := _exposure_mode(run):
+            depends_on.append(exposure)
+        spans = split_ranges(view_count, *SHARD_VIEWS)
+        return ShardedJob.create("views", request, self.output, VIEW_LABELS, depends_on, spans)
+
+    def shard_bytes(self, views: Sequence[View]) -> int:
+        """Memory by estimate: the models that are drawn, cached blocks among them, and one image."""
+        coarse, model = self.run.coarse.model, self.model.stage.model
+        files = [coarse, model] + ([coarse] if self.model.name == "merged" else [])
+        size = sum(file.stat().st_size for file in files)
+        cached = CACHE_BYTES if self.has_seams else 0
+        pixels = max(view.camera.width * view.camera.height for view in views)
+        return render_bytes(size, min(cached, size), pixels, self.request.lpips_weights is not None)
+
+
 def evaluate_stage(
     context: RunContext, request: EvaluationRequest, console: Console, execution: ExecutionOptions | None = None
 ) -> None:
     """Measure a model of a run; of the merged one, on test views, also block by block and at the seams.
 
-    In this process, or in shards where a `wish` sends them: the figures are the same, but for times.
+    In this process, or in shards where `execution` is distributed: the figures are the same, but for times.
 
     Raises what `ShardedJob.send` raises, and RunError where another process measures the same.
     """
     check_bins(request.visibility_bins)
-    run = RunFolder(Path(os.path.abspath(request.path)))  # as in `stages.train`: other machines may mount it so
-    found = locate_model(run, request.which)
-    output = evaluation_folder(run, found.name, request.views)
-    if found.warning:
-        console.print(f"[yellow]warning[/] {found.warning}", highlight=False)
-    began = time.monotonic()
+    evaluation = _Evaluation.create(request)
+    run, model = evaluation.run, evaluation.model
+    if model.warning:
+        console.print(f"[yellow]warning[/] {model.warning}", highlight=False)
+    start = time.monotonic()
     if execution is not None and execution.is_distributed:
-        peak = _measure_in_shards(context, run, found, request, execution, console)
+        peak = _evaluate_in_shards(context, evaluation, execution, console)
     else:
-        peak = _measure_here(context, found, request, console)
-    record = _record_of(run, found.name, request.lpips_weights, request.visibility_bins)
-    write_json(output / "status.json", record | {"seconds": time.monotonic() - began, "peak_memory_bytes": peak})
+        peak = _evaluate_here(context, evaluation, console)
+    record = _record(run, model.name, request.lpips_weights, request.visibility_bins)
+    status = record | {"seconds": time.monotonic() - start, "peak_memory_bytes": peak}
+    write_json(evaluation.output / "status.json", status)
 
 
-def _measure_here(context: RunContext, found: ModelLocation, request: EvaluationRequest, console: Console) -> int:
+def _evaluate_here(context: RunContext, evaluation: _Evaluation, console: Console) -> int:
     """Measure in this process; the most memory that it took (bytes)."""
-    run = context.run
-    output = evaluation_folder(run, found.name, request.views)
+    request, output = evaluation.request, evaluation.output
     with lock_folder(output):
         clear(output)
-        opened = context.open_model(request.which, request.device)
-        coarse = context.open_model("coarse", request.device)
-        _announce(found, len(select_views(opened.capture, request.views)), request.views, console)
-        _delete_results(output)
+        opened, coarse = (context.open_model(which, request.device) for which in (request.which, "coarse"))
+        evaluation.begin(len(select_views(opened.capture, request.views)), console)
         reset_peak_memory()
         evaluate_run(opened, coarse, request.lpips_weights, request.visibility_bins, console, request.views)
-        if _has_seams(run, found.name, request.views):
-            with cached_reference_views(opened.capture.test_views) as photographs:
-                console.print(make_block_table(evaluate_blocks(make_block_inputs(opened, coarse, photographs), output)))
+        if evaluation.has_seams:
+            with cached_reference_views(opened.capture.test_views) as images:
+                console.print(make_block_table(evaluate_blocks(make_block_inputs(opened, coarse, images), output)))
     return peak_memory_bytes()
 
 
-def _announce(found: ModelLocation, count: int, views: EvaluationSplit, console: Console) -> None:
-    console.print(f"measuring the {found.summary} on {count} {views} views", highlight=False)
-
-
-def _has_seams(run: RunFolder, name: str, views: EvaluationSplit) -> bool:
-    """Whether blocks and the seams between them are measured too."""
-    return views == "test" and name == "merged" and len(load_run_blocks(run)) > 1
-
-
-def _measure_in_shards(
-    context: RunContext,
-    run: RunFolder,
-    found: ModelLocation,
-    asked: EvaluationRequest,
-    wish: ExecutionOptions,
-    console: Console,
+def _evaluate_in_shards(
+    context: RunContext, evaluation: _Evaluation, execution: ExecutionOptions, console: Console
 ) -> int:
-    """Let shards of the views be measured elsewhere, and join them; the most memory that one took (bytes). No model is
-    in the memory of this process."""
+    """Let shards of the views be measured elsewhere, and join them; the most memory that one took (bytes). This process
+    holds no model in memory."""
     context.release_models()
-    output, capture = evaluation_folder(run, found.name, asked.views), context.capture
-    views = select_views(capture, asked.views)
-    require_views(views, output)
-    weights = None if asked.lpips_weights is None else Path(os.path.abspath(asked.lpips_weights))
-    job = _job(run, found, replace(asked, path=run.path, which=found.name, lpips_weights=weights), len(views))
-    files = [run.config_file, run.coarse.model, found.stage.model, *image_and_mask_files(views)]
-    with lock_folder(output), job.exclusive():
-        _announce(found, len(views), asked.views, console)
-        _delete_results(output)
-        needs = ShardNeeds(_shard_bytes(run, found, asked, capture), lambda: NodeRequirements(job.folder, files))
-        job.run(needs, replace(wish, image_gb=IMAGE_CACHE_BYTES / 1e9), console)
-        _join(run, found, asked, job, console)
+    run, views = evaluation.run, select_views(context.capture, evaluation.request.views)
+    require_views(views, evaluation.output)
+    job = evaluation.job(len(views))
+    files = [run.config_file, run.coarse.model, evaluation.model.stage.model, *image_and_mask_files(views)]
+    with lock_folder(evaluation.output), job.exclusive():
+        evaluation.begin(len(views), console)
+        needs = ShardNeeds(evaluation.shard_bytes(views), lambda: NodeRequirements(job.folder, files))
+        job.run(needs, replace(execution, image_gb=IMAGE_CACHE_BYTES / 1e9), console)
+        _join(evaluation, job, console)
         return job.peak_memory_bytes
 
 
-def _job(run: RunFolder, found: ModelLocation, asked: EvaluationRequest, count: int) -> ShardedJob:
-    """The views in shards, and what their figures depend on."""
-    blocks = [folder.status().model_id for folder in run.block_folders()] if found.name == "merged" else []
-    depends_on = [
-        found.stage.status().model_id, found.key, run.coarse_model_id(), blocks, str(asked.lpips_weights), asked.views
-    ]  # fmt: skip
-    if exposed := _exposed(run):
-        depends_on.append(exposed)
-    output = evaluation_folder(run, found.name, asked.views)
-    return ShardedJob.create("views", asked, output, VIEW_LABELS, depends_on, split_ranges(count, *VIEWS_OF_SHARD))
-
-
-def _shard_bytes(run: RunFolder, found: ModelLocation, asked: EvaluationRequest, capture: Capture) -> int:
-    """Memory by estimate: the models that are drawn, blocks among them as far as they are held, and one picture."""
-    models = [run.coarse.model, found.stage.model] + ([run.coarse.model] if found.name == "merged" else [])
-    held = CACHE_BYTES if _has_seams(run, found.name, asked.views) else 0
-    pixels = max(view.camera.width * view.camera.height for view in select_views(capture, asked.views))
-    files = sum(model.stat().st_size for model in models)
-    return render_bytes(files, min(held, files), pixels, asked.lpips_weights is not None)
-
-
 def measure_shard(shard: Shard) -> None:
-    """Measure a shard of the views. What they come to stays beside its status until all are joined; pictures go where
-    they belong."""
-    asked = shard.request(EvaluationRequest)
-    run, context = RunFolder(asked.path), RunContext.from_path(asked.path)
-    opened, coarse = (context.open_model(which, shard.device) for which in (asked.which, "coarse"))
-    views = select_views(opened.capture, asked.views)
-    job = _job(run, locate_model(run, asked.which), asked, len(views))
+    """Measure a shard of the views. The figures stay beside its status until all are joined; images go where they
+    belong."""
+    evaluation = _Evaluation.create(shard.request(EvaluationRequest))
+    request, context = evaluation.request, RunContext.from_path(evaluation.request.path)
+    opened, coarse = (context.open_model(which, shard.device) for which in (request.which, "coarse"))
+    views = select_views(opened.capture, request.views)
+    job = evaluation.job(len(views))
 
     def results(left: Sequence[int]) -> Results:
-        with cached_reference_views(views) as photographs:
-            lpips, note = load_lpips(asked.lpips_weights)
-            model = make_renderable_model(opened, coarse, asked.views)
-            inputs = ViewInputs(
-                photographs, model, lpips, make_evaluation_settings(asked.visibility_bins, asked.views), job.output
-            )
-            seams = (
-                make_block_inputs(opened, coarse, photographs) if _has_seams(run, opened.name, asked.views) else None
-            )
-            facts = {"model": record_to_dict(model.metadata), "lpips_note": note}
-            write_json(job.shard(shard.index).path / "facts.json", facts)
+        with cached_reference_views(views) as images:
+            lpips, note = load_lpips(request.lpips_weights)
+            model = make_renderable_model(opened, coarse, request.views)
+            inputs = ViewInputs(images, model, lpips, evaluation.settings, job.output)
+            blocks = make_block_inputs(opened, coarse, images) if evaluation.has_seams else None
+            metadata = {"model": record_to_dict(model.metadata), "lpips_note": note}
+            write_json(job.shard(shard.index).path / "facts.json", metadata)
             shard.console.print(f"measuring the {opened.summary} on {len(left)} views", highlight=False)
-            pictures = _SeamPictures(job, job.spans[shard.index]) if seams is not None else None
+            seams = _SeamImages(job, job.spans[shard.index]) if blocks is not None else None
             for item in left:
                 metrics, block_metrics = measure_view(item, inputs), None
-                if seams is not None and pictures is not None:
-                    block_metrics, seen = measure_view_of_blocks(views[item], inputs.stems[item], seams)
-                    pictures.keep(item, seen)
+                if blocks is not None and seams is not None:
+                    block_metrics, seam_view = measure_block_view(views[item], inputs.stems[item], blocks)
+                    seams.update(item, seam_view)
                 yield partial(save_view_metrics, metrics=metrics, block_metrics=block_metrics)
 
     shard.do(job, results)
 
 
-class _SeamPictures:
-    """Pictures of the views of a shard that are worth seeing, of those that are measured so far."""
+class _SeamImages:
+    """Images of the seams in the views of a shard that show most of them, of those measured so far."""
 
     def __init__(self, job: ShardedJob, span: range):
         self._job = job
         measured = {item: load_view_metrics(job.file(item))[1] for item in span if job.file(item).exists()}
-        self._borders = {item: figures.row["border_pixels"] for item, figures in measured.items() if figures}
+        self._border_pixels = {item: figures.row["border_pixels"] for item, figures in measured.items() if figures}
 
-    def keep(self, item: int, seen: SeamView) -> None:
-        """Draw a view if it is worth seeing, and remove the picture of one that no longer is."""
-        self._borders[item] = seen.border_pixel_count
-        items = sorted(self._borders)
-        best = {items[place] for place in select_seam_views([self._borders[each] for each in items])}
+    def update(self, item: int, view: SeamView) -> None:
+        """Draw a view if it is among the best, and remove the image of one that no longer is."""
+        self._border_pixels[item] = view.border_pixel_count
+        items = sorted(self._border_pixels)
+        best = {items[index] for index in select_seam_views([self._border_pixels[each] for each in items])}
         if item in best:
-            save_seam_image(self._job.file(item, ".png"), seen)
+            save_seam_image(self._job.file(item, ".png"), view)
         for other in set(items) - best:
             self._job.file(other, ".png").unlink(missing_ok=True)
 
 
-def _join(run: RunFolder, found: ModelLocation, request: EvaluationRequest, job: ShardedJob, console: Console) -> None:
-    """Gather what the views came to, in their order, a view at a time."""
-    facts = read_json(job.shard(0).path / "facts.json")
+def _join(evaluation: _Evaluation, job: ShardedJob, console: Console) -> None:
+    """Gather the figures of the views, in their order, a view at a time."""
+    metadata = read_json(job.shard(0).path / "facts.json")
     summarize_views(
-        (figures for figures, _ in job.gather(load_view_metrics)),
-        record_from_dict(ModelMetadata, facts["model"]),
+        (metrics for metrics, _ in job.gather(load_view_metrics)),
+        record_from_dict(ModelMetadata, metadata["model"]),
         job.output,
-        lpips_note=facts["lpips_note"],
-        settings=make_evaluation_settings(request.visibility_bins, request.views),
+        lpips_note=metadata["lpips_note"],
+        settings=evaluation.settings,
         timed=False,
         console=console,
     )
-    if _has_seams(run, found.name, request.views):
+    if evaluation.has_seams:
         figures = [each for _, each in job.gather(load_view_metrics) if each is not None]
         stems = unique_file_stems([each.row["name"] for each in figures])
         for item in select_seam_views([each.row["border_pixels"] for each in figures]):
             write_bytes(job.output / "seams" / f"{stems[item]}.png", job.file(item, ".png").read_bytes())
-        console.print(make_block_table(conclude_blocks(figures, len(load_run_blocks(run)), job.output)))
+        block_count = len(load_run_blocks(evaluation.run))
+        console.print(make_block_table(summarize_blocks(figures, block_count, job.output)))
     console.print(f"pictures and figures: {job.output}", highlight=False)
 
 
 def is_evaluated(run: RunFolder, name: str, lpips_weights: Path | None, bins: int) -> bool:
-    """Whether the figures that are there are those of the model that is there, measured in this way."""
-    wanted = _record_of(run, name, lpips_weights, bins)
+    """Whether the figures on disk are of the present model, measured in this way."""
+    expected = _record(run, name, lpips_weights, bins)
     record = read_json_or_empty(evaluation_folder(run, name) / "status.json")
-    return {key: record.get(key) for key in wanted} == wanted
+    return {key: record.get(key) for key in expected} == expected
 
 
-def _record_of(run: RunFolder, name: str, lpips_weights: Path | None, bins: int) -> MeasuredAs:
-    stage = run.merged if name == "merged" else run.coarse
+def _record(run: RunFolder, name: str, lpips_weights: Path | None, bins: int) -> MeasuredAs:
     keys = run.keys()
-    key = keys.merge if name == "merged" else keys.coarse
+    stage, key = (run.merged, keys.merge) if name == "merged" else (run.coarse, keys.coarse)
     return {
         "key": key, "model": stage.status().model_id, "lpips_weights": str(lpips_weights), "bins": bins,
-        "exposed": _exposed(run),
+        "exposed": _exposure_mode(run),
     }  # fmt: skip
 
 
-def _exposed(run: RunFolder) -> str | None:
-    """How views are exposed, if training fitted exposures; None in neutral colours."""
+def _exposure_mode(run: RunFolder) -> str | None:
+    """How views are exposed, if training fitted exposures; None in neutral colors."""
     return "interpolated and metered" if run.method().training.exposure_compensation else None
-
-
-def _delete_results(output: Path) -> None:
-    """Delete what vouches for figures that are about to change, and what another cut may have left."""
-    for stale in ("status.json", "metrics.json", "by_block.json"):
-        (output / stale).unlink(missing_ok=True)
-    shutil.rmtree(output / "seams", ignore_errors=True)

@@ -23,43 +23,43 @@ from vdgs.system.tensors import file_id
 def merge_run_blocks(context: RunContext, allow_missing_blocks: bool, console: Console) -> None:
     """Merge the blocks of a run into RUN/merged; nothing if they are merged already.
 
-    Raises RunError if a block is missing or failed, unless `incomplete`: the coarse anchors then stand in for it.
+    Raises RunError if a block is missing or failed, unless `allow_missing_blocks`: the coarse anchors then stand in.
     """
     run = context.run
     with run.locked():
-        key, keys = run.keys().merge, run.keys()
-        blocks = load_run_blocks(run)
-        done = [run.block(index).is_done(keys.blocks) for index in range(len(blocks))]
-        models = [run.block(i).status().model_id if whole else None for i, whole in enumerate(done)]
-        if run.merged.is_done(key) and run.merged.status().block_models == tuple(models):
+        keys, blocks = run.keys(), load_run_blocks(run)
+        folders = [run.block(index) for index in range(len(blocks))]
+        done = [folder.is_done(keys.blocks) for folder in folders]
+        models = [folder.status().model_id if is_done else None for folder, is_done in zip(folders, done, strict=True)]
+        if run.merged.is_done(keys.merge) and run.merged.status().block_models == tuple(models):
             console.print(f"{run.merged.model}: already merged; nothing to do", highlight=False)
             return
         if not all(done) and not allow_missing_blocks:
-            _refuse(run, done)
+            raise RunError(_missing_blocks_text(run, done))
         reset_peak_memory()
-        began = time.monotonic()
+        start = time.monotonic()
         opened = context.open_model("coarse")
         capture, coarse = opened.capture, opened.model
         views = capture.train_views
-        cameras = [[views[i].camera for i in of_block] for of_block in all_block_view_indices(run, capture)]
+        cameras = [[views[i].camera for i in indices] for indices in all_block_view_indices(run, capture)]
         trained = [
-            partial(load_verified, run.block(i), keys.blocks, i) if whole else None for i, whole in enumerate(done)
+            partial(load_verified, folder, keys.blocks, index) if done[index] else None
+            for index, folder in enumerate(folders)
         ]
-        merged, became = merge_blocks(
+        merged, merged_blocks = merge_blocks(
             coarse, trained, blocks, cameras, run.method().merge, allow_missing=allow_missing_blocks
         )
-        run.merged.reset_unless(key)
-        merged = replace(merged, metadata=replace(merged.metadata, key=key))
+        run.merged.reset_unless(keys.merge)
+        merged = replace(merged, metadata=replace(merged.metadata, key=keys.merge))
         merged.save(run.merged.model)
-        trained_in = [run.block(i).status() for i, whole in enumerate(done) if whole]
-        stages = [opened.status, *trained_in]
+        stages = [opened.status, *(folder.status() for folder, is_done in zip(folders, done, strict=True) if is_done)]
         status = StatusRecord(
-            state="done", anchors=len(merged.anchors), blocks_trained=sum(done), blocks=tuple(became),
+            state="done", anchors=len(merged.anchors), blocks_trained=sum(done), blocks=tuple(merged_blocks),
             block_models=tuple(models), model_id=file_id(run.merged.model),
             seconds=sum(each.seconds or 0.0 for each in stages),
             iterations=sum(each.iteration or 0 for each in stages),
             peak_memory_bytes=max(each.peak_memory_bytes or 0 for each in stages),
-            merge_seconds=time.monotonic() - began, merge_peak_memory_bytes=peak_memory_bytes(),
+            merge_seconds=time.monotonic() - start, merge_peak_memory_bytes=peak_memory_bytes(),
         )  # fmt: skip
         run.merged.set_status(status)
     console.print(
@@ -69,22 +69,16 @@ def merge_run_blocks(context: RunContext, allow_missing_blocks: bool, console: C
     )
 
 
-def _refuse(run: RunFolder, done: list[bool]) -> None:
-    lines = []
-    standing = get_run_status(run)
-    for index, whole in enumerate(done):
-        if not whole:
-            found = standing.of(f"block {index}")
-            state = "not trained yet" if found.state in ("missing", "queued") else found.state
-            lines.append(
-                f"block {index}: {found.reason if state == 'stale' else state}" + _because(state, found.reason)
-            )
-    raise RunError(
+def _missing_blocks_text(run: RunFolder, done: list[bool]) -> str:
+    lines, run_status = [], get_run_status(run)
+    for index in (index for index, is_done in enumerate(done) if not is_done):
+        block = run_status.of(f"block {index}")
+        state = "not trained yet" if block.state in ("missing", "queued") else block.state
+        text = state + (f" ({block.reason})" if block.reason else "")
+        lines.append(f"block {index}: {block.reason if state == 'stale' else text}")
+    return (
         f"{run.path}: not all blocks are trained:\n  "
         + "\n  ".join(lines)
-        + f"\nTrain them with `vdgs train-blocks {run.path}`, or give --allow-missing-blocks to let the coarse model stand in for them."
+        + f"\nTrain them with `vdgs train-blocks {run.path}`, or give --allow-missing-blocks to let the coarse model "
+        "stand in for them."
     )
-
-
-def _because(state: str, why: str) -> str:
-    return f" ({why})" if why and state != "stale" else ""

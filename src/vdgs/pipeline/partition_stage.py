@@ -1,4 +1,4 @@
-"""The scene cut into blocks, and cameras for each: partition and assignment (section IV-B).
+"""The scene in blocks, and cameras for each: partition and assignment (section IV-B).
 
 RUN/partition/   blocks.geojson (ground frame), blocks_wgs84.geojson (if georeferenced), scores.npz,
                  partition.json, blocks.png, block_facts.png, scores.png
@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -20,6 +21,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from vdgs.captures.capture import Capture
 from vdgs.config.method import AssignmentConfig, MethodConfig, PartitionConfig
 from vdgs.distributed.job_folders import clear, remove
 from vdgs.distributed.job_labels import shard_kind
@@ -54,26 +56,27 @@ from vdgs.system.memory.process_memory import peak_memory_bytes, reset_peak_memo
 from vdgs.system.records import record_to_dict
 from vdgs.system.stop_signals import check_stop_requested
 
-#: Cameras that are scored and saved together; how many such groups a shard has, least and most, and how many shards
-#: there are in between (choice).
+#: Cameras that are scored and saved together; such groups of a shard, least and most, and how many shards there are in
+#: between (choice).
 CAMERAS_PER_ITEM = 8
-ITEMS_OF_SHARD = 1, 8, 16
+SHARD_ITEMS = 1, 8, 16
 CAMERA_LABELS = shard_kind("score cameras", "groups")
-#: The blocks that shards score cameras for, in the folder of the job.
-SHARD_BLOCKS_FILE = "blocks.geojson"
+#: The blocks, in the folder of the partition and in that of a job that scores cameras for them; the scores.
+BLOCKS_FILE, SCORES_FILE = "blocks.geojson", "scores.npz"
+
+Loaded = TypeVar("Loaded")
 
 
 @dataclass(frozen=True)
 class ScoreRequest:
-    """What shards that score cameras are asked for."""
+    """The request of shards that score cameras: the run folder."""
 
     run: Path
-    """Run folder."""
 
 
 @dataclass(frozen=True)
 class _Scene:
-    """What is cut: the coarse anchors and who sees them."""
+    """What is partitioned: the coarse anchors and the cameras that see them."""
 
     opened: OpenedRun
     positions: Float[np.ndarray, "n 3"]
@@ -81,7 +84,7 @@ class _Scene:
     cameras: list[Camera]
 
     @staticmethod
-    def of(context: RunContext, device: str) -> _Scene:
+    def open(context: RunContext, device: str) -> _Scene:
         opened = context.open_model("coarse", device)
         cameras = [view.camera for view in opened.capture.train_views]
         positions = opened.model.anchors.positions.cpu().numpy()
@@ -91,32 +94,36 @@ class _Scene:
 def partition_run(
     context: RunContext, console: Console, device: str = "cpu", execution: ExecutionOptions | None = None
 ) -> None:
-    """Cut the scene of a run and assign its cameras, drawing on a device; what is there for the same settings is kept.
+    """Partition the scene of a run and assign its cameras, drawing on a device; what is there for the same settings is
+    kept.
 
-    Cameras are scored in this process, or in shards where a `wish` sends them: the scores are the same. Raises RunError
-    without a coarse model, and what `ShardedJob.send` raises.
+    Cameras are scored in this process, or in shards where `execution` is distributed: the scores are the same. Raises
+    RunError without a coarse model, and what `ShardedJob.send` raises.
     """
     run = context.run
-    keys, before = run.keys(), _record_before(run)
-    kept = _kept_blocks(run) if before.key == keys.partition else None
-    if kept is not None and before.assignment_key == keys.assignment and _scores_are_whole(run):
+    keys, before = run.keys(), _or_none(run.partition_record) or PartitionRecord()
+    saved = _or_none(lambda: load_blocks(run.partition / BLOCKS_FILE)) if before.key == keys.partition else None
+    has_assignment = saved is not None and before.assignment_key == keys.assignment
+    if has_assignment and _or_none(lambda: load_scores(run.partition / SCORES_FILE)) is not None:
         console.print(f"{run.partition}: already cut; nothing to do", highlight=False)
         return
     with run.locked():
         reset_peak_memory()
-        began, method, scene = time.monotonic(), run.method(), _Scene.of(context, device)
+        start, method, scene = time.monotonic(), run.method(), _Scene.open(context, device)
         job, config = _job(run, len(scene.cameras)), _assignment(method)
-        begun = _begun_cut(job)
-        if begun is not None:
-            blocks, warnings = begun
-        elif kept is not None:
-            blocks, warnings = kept, list(before.warnings)
+        shard_blocks = job.folder / BLOCKS_FILE
+        if shard_blocks.exists():  # shards of an earlier command score cameras for these blocks
+            blocks, warnings = load_blocks(shard_blocks), list(read_json(shard_blocks)["warnings"])
+        elif saved is not None:
+            blocks, warnings = saved, list(before.warnings)
         else:
-            blocks, warnings = _cut(scene, method)
-        sends = execution is not None and execution.is_distributed
-        clear(run.partition, job.key if sends else None)
-        if execution is not None and sends:
-            scores = _score_in_shards(run, scene, job, (blocks, warnings), execution, console)
+            blocks, warnings = _partition(scene, method)
+        is_distributed = execution is not None and execution.is_distributed
+        clear(run.partition, job.key if is_distributed else None)
+        if execution is not None and is_distributed:
+            with lock_folder(job.folder):  # from here on `job_folders` knows it as a job, whenever this process ends
+                save_blocks(shard_blocks, blocks, [{} for _ in blocks.items], {"warnings": warnings})
+            scores = _score_in_shards(run, scene, job, len(blocks), execution, console)
         else:
             scores = _score(scene, blocks, config, console)
         if method.partition.strategy != "visibility":
@@ -125,7 +132,7 @@ def partition_run(
         for note in warnings + assignment.warnings:
             console.print(f"[yellow]note[/] {note}", highlight=False)
         rows = assignment_rows(blocks, scene.positions, scene.visibility, assignment)
-        _save(run.partition, scene, blocks, scores, assignment, rows)
+        _save(run.partition, scene.opened.capture, blocks, scores, assignment, rows)
         spatial = _spatial(scene, method.partition, method.training.seed, blocks)
         _draw(run.partition, scene, blocks, scores, assignment, method.partition, spatial)
         record = PartitionRecord(
@@ -133,12 +140,10 @@ def partition_run(
             lambda_vis=method.partition.lambda_vis if method.partition.strategy == "visibility" else None,
             warnings=tuple(warnings), assignment_warnings=tuple(assignment.warnings), blocks=tuple(rows),
             spatial_only_blocks=block_rows(spatial, scene.positions, scene.visibility),
-            seconds=time.monotonic() - began, peak_memory_bytes=peak_memory_bytes(),
+            seconds=time.monotonic() - start, peak_memory_bytes=peak_memory_bytes(),
         )  # fmt: skip
-        write_json(
-            run.partition / "partition.json", record_to_dict(record)
-        )  # last: where it stands, the rest is complete
-        if sends:
+        write_json(run.partition / "partition.json", record_to_dict(record))  # last: the rest is complete
+        if is_distributed:
             remove(job.folder)
     console.print(make_assignment_table(rows))
     console.print(f"figures: {run.partition / 'blocks.png'} and beside it", highlight=False)
@@ -146,7 +151,7 @@ def partition_run(
 
 def explain_view(run: RunFolder, view: str, console: Console) -> None:
     """How well a training view shows each block, and why it was assigned to it or not. RunError for another name."""
-    names, scores, assignment = load_scores(run.partition / "scores.npz")
+    names, scores, assignment = load_scores(run.partition / SCORES_FILE)
     table = Table(box=box.SIMPLE_HEAD, title=view, title_justify="left")
     for heading in ("block", "score", "anchors held", "why"):
         table.add_column(heading, justify="left" if heading == "why" else "right")
@@ -155,7 +160,7 @@ def explain_view(run: RunFolder, view: str, console: Console) -> None:
     console.print(table)
 
 
-def _cut(scene: _Scene, method: MethodConfig) -> tuple[Blocks, list[str]]:
+def _partition(scene: _Scene, method: MethodConfig) -> tuple[Blocks, list[str]]:
     config, pixels = method.partition, max_image_pixels(scene.cameras, method.block.resolution_schedule)
     count = choose_block_count(len(scene.visibility), len(scene.cameras), pixels, method)
     if config.strategy != "visibility":
@@ -163,39 +168,24 @@ def _cut(scene: _Scene, method: MethodConfig) -> tuple[Blocks, list[str]]:
     return partition_scene(scene.positions, scene.visibility, replace(config, blocks=count), method.training.seed)
 
 
-def _spatial(scene: _Scene, config: PartitionConfig, seed: int, cut: Blocks) -> Blocks:
-    """The cut that place alone would give, to compare with."""
-    if config.lambda_vis == 0 or len(cut) == 1:
-        return cut
-    return partition_scene(scene.positions, scene.visibility, replace(config, blocks=len(cut), lambda_vis=0.0), seed)[0]
+def _spatial(scene: _Scene, config: PartitionConfig, seed: int, blocks: Blocks) -> Blocks:
+    """The blocks that positions alone would give, to compare with."""
+    if config.lambda_vis == 0 or len(blocks) == 1:
+        return blocks
+    config = replace(config, blocks=len(blocks), lambda_vis=0.0)
+    return partition_scene(scene.positions, scene.visibility, config, seed)[0]
 
 
-def _record_before(run: RunFolder) -> PartitionRecord:
-    """How the scene was cut before; nothing if the file is damaged: the scene is then cut again."""
+def _or_none(load: Callable[[], Loaded]) -> Loaded | None:
+    """What an earlier command left; None where its file is missing or damaged: it is then made again."""
     try:
-        return run.partition_record()
-    except RunError:
-        return PartitionRecord()
-
-
-def _kept_blocks(run: RunFolder) -> Blocks | None:
-    """The blocks that were cut before; None if their file is missing or damaged: the scene is then cut again."""
-    try:
-        return load_blocks(run.partition / "blocks.geojson")
+        return load()
     except RunError:
         return None
 
 
-def _scores_are_whole(run: RunFolder) -> bool:
-    try:
-        load_scores(run.partition / "scores.npz")
-    except RunError:
-        return False
-    return True
-
-
 def _assignment(method: MethodConfig) -> AssignmentConfig:
-    """The settings of the assignment, as the strategy that cuts wants them."""
+    """The settings of the assignment, as the strategy of the partition needs them."""
     strategy = method.partition.strategy
     return method.assignment if strategy == "visibility" else STRATEGIES[strategy].assignment(method.assignment)
 
@@ -204,60 +194,43 @@ def _score(scene: _Scene, blocks: Blocks, config: AssignmentConfig, console: Con
     with Progress(console=console, disable=not console.is_terminal, transient=True) as bar:
         task = bar.add_task("assigning cameras")
 
-        def show(done: int, total: int) -> None:
+        def on_progress(done: int, total: int) -> None:
             check_stop_requested()
             bar.update(task, completed=done, total=total)
 
-        return compute_score_matrix(scene.opened.model, blocks, scene.cameras, config, show)
+        return compute_score_matrix(scene.opened.model, blocks, scene.cameras, config, on_progress)
 
 
 def _job(run: RunFolder, cameras: int) -> ShardedJob:
-    """Groups of training cameras in shards; what their scores depend on."""
+    """Groups of training cameras in shards, and what their scores depend on."""
     request = ScoreRequest(Path(os.path.abspath(run.path)))
     depends_on = [run.keys().assignment, run.coarse_model_id(), cameras]
-    spans = split_ranges(-(-cameras // CAMERAS_PER_ITEM), *ITEMS_OF_SHARD)
+    spans = split_ranges(-(-cameras // CAMERAS_PER_ITEM), *SHARD_ITEMS)
     return ShardedJob.create("scores", request, run.partition, CAMERA_LABELS, depends_on, spans)
 
 
-def _begun_cut(job: ShardedJob) -> tuple[Blocks, list[str]] | None:
-    """The blocks for which shards of an earlier command score cameras, and the warnings of their cut, if there are."""
-    file = job.folder / SHARD_BLOCKS_FILE
-    if not file.exists():
-        return None
-    return load_blocks(file), list(read_json(file)["warnings"])
-
-
 def _score_in_shards(
-    run: RunFolder,
-    scene: _Scene,
-    job: ShardedJob,
-    cut: tuple[Blocks, list[str]],
-    wish: ExecutionOptions,
-    console: Console,
+    run: RunFolder, scene: _Scene, job: ShardedJob, block_count: int, execution: ExecutionOptions, console: Console
 ) -> ScoreMatrix:
     """Let shards of the cameras be scored elsewhere, and join their rows."""
-    blocks, warnings = cut
-    with lock_folder(job.folder):  # from here on `job_folders` knows it as a job, whenever this process ends
-        save_blocks(job.folder / SHARD_BLOCKS_FILE, blocks, [{} for _ in blocks.items], {"warnings": warnings})
     pixels = max(camera.width * camera.height for camera in scene.cameras)
-    model, photographs = run.coarse.model, image_and_mask_files(scene.opened.capture.train_views)
+    model, images = run.coarse.model, image_and_mask_files(scene.opened.capture.train_views)
     needs = ShardNeeds(
-        render_bytes(model.stat().st_size, len(scene.positions) * len(blocks), pixels),
-        lambda: NodeRequirements(job.folder, [run.config_file, model, *photographs]),
+        render_bytes(model.stat().st_size, len(scene.positions) * block_count, pixels),
+        lambda: NodeRequirements(job.folder, [run.config_file, model, *images]),
     )
-    job.run(needs, wish, console)
+    job.run(needs, execution, console)
     return concatenate_scores(list(job.gather(load_score_rows)))
 
 
 def score_shard(shard: Shard) -> None:
-    """Score a shard of the cameras for the blocks that a command has cut; scores stay beside its status until all are
-    joined."""
+    """Score a shard of the cameras for the blocks of the job; scores stay beside its status until all are joined."""
     context = RunContext.from_path(shard.request(ScoreRequest).run)
     run, opened = context.run, context.open_model("coarse", shard.device)
     cameras = [view.camera for view in opened.capture.train_views]
 
     def results(left: Sequence[int]) -> Results:
-        scorer = CameraScorer(opened.model, load_blocks(shard.folder / SHARD_BLOCKS_FILE), _assignment(run.method()))
+        scorer = CameraScorer(opened.model, load_blocks(shard.folder / BLOCKS_FILE), _assignment(run.method()))
         for item in left:
             scores = scorer.scores(cameras[item * CAMERAS_PER_ITEM : (item + 1) * CAMERAS_PER_ITEM])
             yield partial(save_score_rows, scores=scores)
@@ -266,23 +239,21 @@ def score_shard(shard: Shard) -> None:
 
 
 def _save(
-    folder: Path, scene: _Scene, blocks: Blocks, scores: ScoreMatrix, assignment: Assignment, rows: Sequence[BlockCamerasRecord]
+    folder: Path, capture: Capture, blocks: Blocks, scores: ScoreMatrix, assignment: Assignment,
+    rows: Sequence[BlockCamerasRecord],
 ) -> None:  # fmt: skip
-    """The files that later stages read, and the place of the blocks on Earth where it is known."""
+    """Write the files that later stages read, and the blocks in WGS 84 where the capture is georeferenced."""
     for stale in ("partition.json", "blocks_wgs84.geojson"):
         (folder / stale).unlink(missing_ok=True)
-    facts = [record_to_dict(row) for row in rows]
-    save_blocks(folder / "blocks.geojson", blocks, facts)
-    ground = scene.opened.capture.ground
-    if ground.origin_geo is not None:
-        save_blocks_wgs84(folder / "blocks_wgs84.geojson", blocks, facts, ground)
-    save_scores(
-        folder / "scores.npz", [view.name for view in scene.opened.capture.train_views], scores, assignment
-    )  # fmt: skip
+    properties = [record_to_dict(row) for row in rows]
+    save_blocks(folder / BLOCKS_FILE, blocks, properties)
+    if capture.ground.origin_geo is not None:
+        save_blocks_wgs84(folder / "blocks_wgs84.geojson", blocks, properties, capture.ground)
+    save_scores(folder / SCORES_FILE, [view.name for view in capture.train_views], scores, assignment)
 
 
 def describe_partition(config: PartitionConfig) -> str:
-    """How a scene is cut, in a few words: λ_vis says nothing of the partitions of others, nor of one block."""
+    """How a scene is partitioned, in a few words: λ_vis means nothing for other strategies, nor for one block."""
     if config.strategy != "visibility":
         return STRATEGIES[config.strategy].citation.split(", ")[-2] + " partition"
     return f"λ_vis = {config.lambda_vis:g}" if config.blocks != 1 else "not cut"
@@ -292,11 +263,12 @@ def _draw(
     folder: Path, scene: _Scene, blocks: Blocks, scores: ScoreMatrix, assignment: Assignment, config: PartitionConfig,
     spatial: Blocks,
 ) -> None:  # fmt: skip
-    ours = config.strategy == "visibility" and config.lambda_vis > 0
-    compare = spatial if ours and len(blocks) > 1 else None
-    cuts = [(describe_partition(config), blocks)] + ([] if compare is None else [(figures.SPATIAL_ONLY_LABEL, compare)])
+    uses_visibility = config.strategy == "visibility" and config.lambda_vis > 0
+    compare = spatial if uses_visibility and len(blocks) > 1 else None
+    partitions = [(describe_partition(config), blocks)]
+    partitions += [] if compare is None else [(figures.SPATIAL_ONLY_LABEL, compare)]
     figures.plot_blocks(
-        folder / "blocks.png", scene.positions, scene.visibility, scene.cameras, assignment.cameras, cuts,
+        folder / "blocks.png", scene.positions, scene.visibility, scene.cameras, assignment.cameras, partitions,
         scene.opened.capture.ground.axis_names,
     )  # fmt: skip
     figures.plot_block_stats(

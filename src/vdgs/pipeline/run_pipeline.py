@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
-from typing import Literal
+from typing import Literal, cast
 
 from rich.console import Console
 from rich.markup import escape
@@ -37,29 +36,27 @@ from vdgs.system.stop_signals import check_stop_requested
 
 
 def run_pipeline(request: RunRequest, console: Console, command: str | None = None) -> None:
-    """Everything from a capture to a report, on a device that is chosen already (`vdgs.kernels.device_selection`).
+    """Everything from a capture to a report, on a device that is selected already (`vdgs.kernels.device_selection`).
 
-    `command` is what asks for it, kept in the run for people who want to continue it.
-
-    Raises what the stages raise; all that was finished before stays, and the same command continues.
+    `command` is the command line, saved in the run for people who want to continue it. Raises what the stages raise;
+    what was finished before stays, and the same command continues.
     """
     check_backend_reachable(request.executor_options)
     check_ranges(request)
     check_weights_file(request.lpips_weights)
     request = reconstruct_if_needed(request, console)
-    begun = exclusive_run(
+    with exclusive_run(
         request.capture, request.output, request.options, request.method(), overwrite=request.overwrite, command=command
-    )
-    with begun as context:
+    ) as context:
         _stages(context, request, console)
     console.print(escape(f"next: {next_step(full_run_status(context.run))}"), highlight=False)
 
 
 def reconstruct_if_needed(run_request: RunRequest, console: Console) -> RunRequest:
-    """The request about a capture: where it is about photographs alone, they become one in RUN/capture first.
+    """The request with a capture: photographs alone become one in RUN/capture first.
 
-    Raises what `reconstruct` raises, RunError where another process drives the run whose capture it would be, and
-    VdgsError for settings that do not work, before the long work.
+    Raises what `reconstruct` raises, RunError where another process drives the run, and VdgsError for settings that do
+    not work, before the long work.
     """
     if not is_image_input(run_request):
         return run_request
@@ -80,7 +77,7 @@ def _stages(context: RunContext, request: RunRequest, console: Console) -> None:
     count_run_visibility(context, console)
     _measure(context, "coarse", request, console)
     _title(console, "blocks")
-    partition_run(context, console, request.device, _wish(request))
+    partition_run(context, console, request.device, _execution(request))
     _title(console, "block training")
     try:
         train_blocks(context, request.checkpointing, request.jobs, console, request.device, request.executor_options)
@@ -92,15 +89,15 @@ def _stages(context: RunContext, request: RunRequest, console: Console) -> None:
     merge_run_blocks(context, request.allow_missing_blocks, console)
     _measure(context, "merged", request, console)
     context.release_models("coarse")
-    _verdict(context.run, console)
+    _print_improvement(context.run, console)
     if request.ortho:
-        _map(context, request, console)
+        _ortho(context, request, console)
     check_stop_requested()
     console.print(f"report: {write_report(context.run)}", highlight=False)
 
 
-def _map(context: RunContext, request: RunRequest, console: Console) -> None:
-    """Orthophoto, surface model and visibility. What hinders a map does not spoil a run: it is said."""
+def _ortho(context: RunContext, request: RunRequest, console: Console) -> None:
+    """Orthophoto, surface model and visibility. An error of a map does not fail the run: it is printed."""
     _title(console, "maps")
     run = context.run
     if not has_ortho_dependencies():
@@ -109,7 +106,7 @@ def _map(context: RunContext, request: RunRequest, console: Console) -> None:
         console.print(f"{run.path / 'maps'}: already drawn; nothing to do", highlight=False)
     else:
         try:
-            render_ortho(context, OrthoRequest(run=run.path, device=request.device), console, _wish(request))
+            render_ortho(context, OrthoRequest(run=run.path, device=request.device), console, _execution(request))
         except Stopped:
             raise
         except VdgsError as error:
@@ -126,31 +123,26 @@ def _measure(context: RunContext, which: Literal["coarse", "merged"], request: R
     """Evaluate a model unless that was done already, for this very model and in the same way."""
     check_stop_requested()
     run = context.run
-    if is_evaluated(run, which, request.lpips_weights, request.visibility_bins):
+    weights, bins = request.lpips_weights, request.visibility_bins
+    if is_evaluated(run, which, weights, bins):
         console.print(f"{evaluation_folder(run, which)}: already measured; nothing to do", highlight=False)
         return
-    measuring = EvaluationRequest(
-        path=run.path,
-        which=which,
-        lpips_weights=request.lpips_weights,
-        visibility_bins=request.visibility_bins,
-        device=request.device,
+    evaluation = EvaluationRequest(
+        path=run.path, which=which, lpips_weights=weights, visibility_bins=bins, device=request.device
     )
-    evaluate_stage(context, measuring, console, _wish(request))
+    evaluate_stage(context, evaluation, console, _execution(request))
 
 
-def _wish(request: RunRequest) -> ExecutionOptions:
+def _execution(request: RunRequest) -> ExecutionOptions:
     """Where shards of stages other than the blocks are done: where blocks are trained, if that is a cluster."""
-    return ExecutionOptions(
-        request.executor_options,
-        request.jobs if request.executor_options.executor != "local" else 0,
-        device=request.device,
-    )
+    options = request.executor_options
+    return ExecutionOptions(options, request.jobs if options.executor != "local" else 0, device=request.device)
 
 
-def _verdict(run: RunFolder, console: Console) -> None:
-    """One line: what the blocks brought."""
-    coarse, merged = (_metrics(folder) for folder in (run.coarse.path / "evaluation", run.evaluation))
+def _print_improvement(run: RunFolder, console: Console) -> None:
+    """Print how the merged model compares with the coarse one."""
+    folders = (run.coarse.path / "evaluation", run.evaluation)
+    coarse, merged = (cast(EvaluationMetrics, read_json(folder / "metrics.json")) for folder in folders)
     before, after = coarse.get("psnr"), merged.get("psnr")
     if before is None or after is None:
         return
@@ -159,8 +151,3 @@ def _verdict(run: RunFolder, console: Console) -> None:
         f"SSIM {coarse['ssim']:.3f} → {merged['ssim']:.3f}",
         style="bold", highlight=False,
     )  # fmt: skip
-
-
-def _metrics(folder: Path) -> EvaluationMetrics:
-    metrics: EvaluationMetrics = read_json(folder / "metrics.json")
-    return metrics

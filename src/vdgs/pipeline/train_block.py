@@ -1,14 +1,13 @@
 """Block training (section IV-B): one block, from the coarse anchors of its place, with its own cameras.
 
 The decoder is frozen, or each block trains a copy of its own. What lies around the block's core is drawn and never
-moves: the ring out to its widened boundary and, as context, all else that its cameras see (choice: else every pixel
+moves: the margin out to its widened boundary and, as context, all else that its cameras see (choice: else every pixel
 that no anchor covers would push the anchors at the boundary to fill the hole).
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -67,7 +66,7 @@ def train_block(
 
 
 def train_shard(shard: Shard) -> None:
-    """Train, or continue, a block of RUN/blocks as `vdgs train-blocks RUN` asks for it."""
+    """Train, or continue, a block of RUN/blocks for `vdgs train-blocks RUN`."""
     options = replace(shard.request(CheckpointOptions), image_cache_gb=shard.image_gb)
     train_block(RunContext.from_path(shard.folder.parent), shard.index, options, shard.console, shard.device)
 
@@ -78,62 +77,57 @@ def _train(
     run, opened = context.run, context.open_model("coarse", device)
     folder, method = run.block(index), run.method()
     capture, coarse = opened.capture, opened.model
-    chosen = block_view_indices(run, capture, index)
-    views = [capture.train_views[i] for i in chosen]
+    indices = block_view_indices(run, capture, index)
+    views = [capture.train_views[i] for i in indices]
+    cameras = [view.camera for view in views]
     metadata = ModelMetadata(
         capture=capture_metadata(capture), version=__version__, block=index, views=len(views), key=run.keys().blocks
     )
     own, around = split_trainable_anchors(coarse.anchors, blocks, index, method.block)
-    around &= visible_anchors(coarse.anchors, [view.camera for view in views])
+    around &= visible_anchors(coarse.anchors, cameras)
     anchors, surroundings = coarse.anchors.select(own), coarse.anchors.select(around)
     if not views or not len(anchors):
         _keep_coarse(folder, replace(coarse, anchors=anchors, metadata=metadata), len(views), console)
         return
-    owned = [each.anchors_core for each in run.partition_record().blocks]
+    core_anchors = [block.anchors_core for block in run.partition_record().blocks]
     config = block_train_config(method, len(views))
-    limit = max_block_anchors(method.block, owned[index], sum(owned))
+    limit = max_block_anchors(method.block, core_anchors[index], sum(core_anchors))
     config = replace(config, densify=replace(config.densify, max_anchors=limit))
-    shares = view_sampling_weights(config, anchors, [view.camera for view in views])
-    began = time.monotonic()
-    crops = None
+    weights = view_sampling_weights(config, anchors, cameras)
+    start, crops = time.monotonic(), None
     if method.block.crop != "off":
-        cameras = [view.camera for view in views]
-        crops = load_or_compute_crops(
-            folder.path / "crops.json", len(views), lambda: compute_crops(coarse, own, cameras)
-        )
-    area = mean_crop_area(crops, shares) if crops else 1.0
+        crops_file = folder.path / "crops.json"
+        crops = load_or_compute_crops(crops_file, len(views), lambda: compute_crops(coarse, own, cameras))
+    area = mean_crop_area(crops, weights) if crops else 1.0
     if method.block.crop == "fixed-pixels":
         config = replace(config, iterations=steps_for(config.iterations, area))
-    prepared = time.monotonic() - began
+    preparation_seconds = time.monotonic() - start
     warn_without_densification(config, console, "--block.")
     factors = tuple(sorted({factor for _, factor in config.resolution_schedule}))
-    flown = [view.camera for view in capture.train_views]
+    all_cameras = [view.camera for view in capture.train_views]
     with ImageCache(views, image_cache_bytes(options), downscales=factors) as images:
         stage = TrainingProblem(
             config=config, images=images, num_images=len(views), voxel_size=coarse.voxel_size,
             camera_height=camera_height(capture), kind="block", background=coarse.background, device=device,
             frozen_decoder=method.block.decoder == "frozen", frozen_anchors=FrozenAnchors(surroundings, coarse.decoder),
             growth_mask=growth_mask(blocks, index, method.block), lr_mask=lr_ramp(blocks, index, method.block),
-            image_indices=chosen, view_weights=shares, crops=crops,
-            max_log_scale=(lambda positions: max_log_scales(positions, flown)) if config.anchors.bound_scales else None,
+            image_indices=indices, view_weights=weights, crops=crops,
+            max_log_scale=(
+                (lambda positions: max_log_scales(positions, all_cameras)) if config.anchors.bound_scales else None
+            ),
         )  # fmt: skip
         state = resume_or_start(folder, stage, lambda: initial_state(anchors, coarse.decoder.copy(), stage), console)
-        state.seconds += prepared
+        state.seconds += preparation_seconds
+        worth = f" (worth {effective_sample_size(weights):.0f} used alike)" if weights else ""
         parts = f", {area:.0%} of a photograph each" if crops else ""
         console.print(
-            f"block {index}: {_views_served(len(views), len(capture.train_views), shares)}, {int(own.sum()):,} anchors "
-            f"of its own, {len(surroundings):,} around it, {config.iterations:,} iterations{parts}",
+            f"block {index}: {len(views)} of {len(capture.train_views)} training views{worth}, {int(own.sum()):,} "
+            f"anchors of its own, {len(surroundings):,} around it, {config.iterations:,} iterations{parts}",
             highlight=False,
         )
         train_with_checkpoints(folder, state, stage, options, console)
     metadata = replace(metadata, iterations=state.iteration, decoder=method.block.decoder)
     finish_stage(folder, state, state.model(coarse.voxel_size, coarse.background, metadata), console, area)
-
-
-def _views_served(count: int, of: int, shares: Sequence[float] | None) -> str:
-    """How many views a block has, in words, and how many they are worth where some are used more than others."""
-    worth = f" (worth {effective_sample_size(shares):.0f} used alike)" if shares else ""
-    return f"{count} of {of} training views{worth}"
 
 
 def _keep_coarse(folder: StageFolder, model: AnchorModel, views: int, console: Console) -> None:

@@ -32,7 +32,7 @@ def train_blocks(
     device: str = "cpu",
     executor_options: ExecutorOptions | None = None,
 ) -> None:
-    """Train, or continue, all blocks of a run that are not finished, on this machine or `where` was asked for.
+    """Train, or continue, all blocks of a run that are not finished, on this machine or by another executor.
 
     `jobs` at once, each on `device`; 0 takes as many as there is room for. Raises RunError if a block failed (the
     others are trained first), Stopped after Ctrl-C or SIGTERM (every block saved), and VdgsError where a machine of a
@@ -43,20 +43,18 @@ def train_blocks(
         raise VdgsError(f"--jobs is {jobs}; it must be at least 1, or 0 for what cores and memory allow")
     # Not resolved: other machines may mount what links point to elsewhere.
     run = RunFolder(Path(os.path.abspath(context.run.path)))
-    began = time.monotonic()
+    start = time.monotonic()
     with run.locked(shared=True):
         blocks, key = load_run_blocks(run), run.keys().blocks
         _remove_beyond(run, len(blocks), console)
-        left = [index for index in range(len(blocks)) if not run.block(index).is_done(key)]
-        if not left:
+        pending = [index for index in range(len(blocks)) if not run.block(index).is_done(key)]
+        if not pending:
             console.print(f"{context.run.path}/blocks: all {len(blocks)} trained; nothing to do", highlight=False)
             return
         context.release_models()  # the memory is for the blocks
         views = context.capture.train_views
-        cameras, files = (
-            [view.camera for view in views],
-            [run.config_file, run.coarse.model, *image_and_mask_files(views)],
-        )
+        cameras = [view.camera for view in views]
+        files = [run.config_file, run.coarse.model, *image_and_mask_files(views)]
         job = ShardedJob(
             worker="block", request=options, folder=run.path / "blocks", kind=BLOCK_LABELS,
             spans=tuple(range(index, index + 1) for index in range(len(blocks))),
@@ -65,19 +63,19 @@ def train_blocks(
             _block_bytes(run, cameras), lambda: NodeRequirements(run.path, files), decoded_image_bytes(cameras)
         )
 
-        def ready() -> None:
-            _note_discarded(run, left, key, console)
-            for index in left:
+        def on_ready() -> None:
+            _note_discarded(run, pending, key, console)
+            for index in pending:
                 _mark_queued(run.block(index), key)
 
-        wish = ExecutionOptions(executor_options or ExecutorOptions(), jobs, options.image_cache_gb, device)
-        job.send(left, len(blocks), needs, wish, console, ready)
-    console.print(f"blocks trained in {(time.monotonic() - began) / 60:.1f} min", highlight=False)
+        execution = ExecutionOptions(executor_options or ExecutorOptions(), jobs, options.image_cache_gb, device)
+        job.send(pending, len(blocks), needs, execution, console, on_ready)
+    console.print(f"blocks trained in {(time.monotonic() - start) / 60:.1f} min", highlight=False)
 
 
-def _note_discarded(run: RunFolder, left: list[int], key: str, console: Console) -> None:
-    """Say which blocks were trained for another cut or with other settings: what they hold is about to go."""
-    old = [index for index in left if run.block(index).has_output() and run.block(index).key() != key]
+def _note_discarded(run: RunFolder, pending: list[int], key: str, console: Console) -> None:
+    """Name the blocks that were trained for another partition or with other settings: their models are deleted."""
+    old = [index for index in pending if run.block(index).has_output() and run.block(index).key() != key]
     if old:
         console.print(
             f"[yellow]note[/] trained for another cut or with other settings, and trained again: block"
@@ -87,10 +85,7 @@ def _note_discarded(run: RunFolder, left: list[int], key: str, console: Console)
 
 
 def _mark_queued(folder: StageFolder, key: str) -> None:
-    """Let a block say that it waits for its turn, and hold no work of other settings.
-
-    Not if another process trains it already: its status is then its own.
-    """
+    """Set the status of a block to queued, and delete work of other settings; not if another process trains it."""
     with suppress(RunError), folder.locked():
         folder.reset_unless(key)
         if not folder.is_done(key):
@@ -98,7 +93,7 @@ def _mark_queued(folder: StageFolder, key: str) -> None:
 
 
 def _remove_beyond(run: RunFolder, count: int, console: Console) -> None:
-    """Delete blocks of an earlier cut into more of them."""
+    """Delete blocks of an earlier partition into more of them."""
     for folder in run.block_folders():
         if int(folder.path.name) >= count:
             console.print(f"[yellow]note[/] {folder.path} is of an earlier cut and is deleted", highlight=False)
@@ -106,8 +101,8 @@ def _remove_beyond(run: RunFolder, count: int, console: Console) -> None:
 
 
 def _block_bytes(run: RunFolder, cameras: Sequence[Camera]) -> int:
-    """Memory by estimate that the largest block needs for the program, its picture, its anchors once they have grown,
-    and those around it. Photographs that are kept have a budget of their own."""
+    """Memory by estimate that the largest block needs for the program, its image, its anchors once they have grown, and
+    those around it. Cached images have a budget of their own."""
     method, anchors = run.method(), [each.anchors_core for each in run.partition_record().blocks]
     pixels = max_image_pixels(cameras, method.block.resolution_schedule)
     return estimate_memory(block_workload(method, max(anchors), sum(anchors), pixels)).total

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 import torch
@@ -82,49 +84,45 @@ def _train(
         dense = _dense_points(run, capture, images, config, console)
         stage, anchors = build_coarse_problem(capture, config, images, device, dense)
 
-        def begun() -> TrainingState:
-            differ = _brightness(images, config, console)
-            fitted = config.exposure_compensation and (differ is None or differ >= config.exposure_min_spread)
-            found = {"sparse_points": len(capture.points), "dense_points": None if dense is None else len(dense.points)}
-            write_json(folder.initialization_file, {**found, "brightness_differs": differ, "exposures": fitted})
+        def start() -> TrainingState:
+            spread = _brightness_spread(images, config, console)
+            fitted = config.exposure_compensation and (spread is None or spread >= config.exposure_min_spread)
+            counts = {
+                "sparse_points": len(capture.points),
+                "dense_points": None if dense is None else len(dense.points),
+            }
+            write_json(folder.initialization_file, {**counts, "brightness_differs": spread, "exposures": fitted})
             return initial_coarse_state(anchors, stage, fitted)
 
-        state = resume_or_start(folder, stage, begun, console)
-        _announce(capture, state, config, console)
+        state = resume_or_start(folder, stage, start, console)
+        camera = capture.train_views[0].camera
+        console.print(
+            f"{capture.root} ({capture.images}): {len(capture.train_views)} training and {len(capture.test_views)} "
+            f"test views of {camera.width}x{camera.height}, {len(capture.points):,} points, {len(state.anchors):,} "
+            f"anchors, {config.iterations:,} iterations",
+            highlight=False,
+        )
         train_with_checkpoints(folder, state, stage, options, console)
-    _refuse_empty(run, state)
+    if not len(state.anchors):  # not done, but kept: to come this far again would not help
+        save_checkpoint(folder.checkpoints, to_checkpoint(state))
+        reason = "training has removed all anchors"
+        folder.set_status(StatusRecord(state="failed", iteration=state.iteration, reason=reason))
+    check_has_anchors(run, len(state.anchors))
     metadata = ModelMetadata(
         capture=capture_metadata(capture), version=__version__, iterations=state.iteration, key=run.keys().coarse
     )
     finish_stage(folder, state, state.model(stage.voxel_size, stage.background, metadata), console)
 
 
-def _refuse_empty(run: RunFolder, state: TrainingState) -> None:
-    """Raise RunError for a state without anchors, before its stage counts as done. It is kept: to come this far again
-    would not help."""
-    if not len(state.anchors):
-        save_checkpoint(run.coarse.checkpoints, to_checkpoint(state))
-        run.coarse.set_status(
-            StatusRecord(state="failed", iteration=state.iteration, reason="training has removed all anchors")
-        )
-    check_has_anchors(run, len(state.anchors))
-
-
 def _dense_points(
     run: RunFolder, capture: Capture, images: ImageCache, config: TrainConfig, console: Console
 ) -> DensePoints | None:
-    """What stereo adds to the sparse points, found now or before; what it found is said."""
-    began = time.monotonic()
-    wait = console.status("looking for ground by stereo")
-
-    def tell(done: int, of: int) -> None:
-        check_stop_requested()
-        wait.update(f"looking for ground by stereo, {done / of:.0%}")
-
-    with wait:
-        dense = find_dense_points(run, capture, images, config.anchors, tell, torch.get_num_threads())
+    """The points that stereo adds to the sparse ones, computed now or before; prints how many."""
+    start = time.monotonic()
+    with _progress("looking for ground by stereo", console) as on_progress:
+        dense = find_dense_points(run, capture, images, config.anchors, on_progress, torch.get_num_threads())
     if dense is not None:
-        added = f"{len(dense.points):,} points beside the sparse ones, {time.monotonic() - began:.0f} s"
+        added = f"{len(dense.points):,} points beside the sparse ones, {time.monotonic() - start:.0f} s"
         console.print(
             f"stereo: {added if len(dense.points) else 'no points added: the sparse ones suffice, or nothing matches'}",
             highlight=False,
@@ -132,31 +130,37 @@ def _dense_points(
     return dense
 
 
-def _brightness(images: ImageCache, config: TrainConfig, console: Console) -> float | None:
-    """By what share photographs of the same places differ in brightness; None where nothing depends on it, or the
-    capture does not tell. Says what follows."""
+@contextmanager
+def _progress(label: str, console: Console) -> Iterator[Callable[[int, int], None]]:
+    """Show how far something is while the context lasts; yields a function that takes the steps done and all steps."""
+    with console.status(label) as status:
+
+        def on_progress(done: int, total: int) -> None:
+            check_stop_requested()
+            status.update(f"{label}, {done / total:.0%}")
+
+        yield on_progress
+
+
+def _brightness_spread(images: ImageCache, config: TrainConfig, console: Console) -> float | None:
+    """By what share images of the same places differ in brightness; None where nothing depends on it, or the capture
+    does not tell. Prints what follows."""
     if not (config.exposure_compensation and config.exposure_min_spread):
         return None
-    wait = console.status("comparing the photographs' brightness")
-
-    def tell(done: int, of: int) -> None:
-        check_stop_requested()
-        wait.update(f"comparing the photographs' brightness, {done / of:.0%}")
-
-    with wait:
-        colors = collect_point_colors(images, tell)
+    with _progress("comparing the photographs' brightness", console) as on_progress:
+        colors = collect_point_colors(images, on_progress)
     if colors is None:
         console.print(
             "exposure: one is fitted to each photograph; whether they differ in brightness is not known, for the "
             "capture does not say which of them show the same points", highlight=False,
         )  # fmt: skip
         return None
-    found, spread = colors.gain_spread(), config.exposure_min_spread
-    said = "one is fitted to each" if found >= spread else f"less than {spread:.2%}, so none is fitted"
+    spread, limit = colors.gain_spread(), config.exposure_min_spread
+    result = "one is fitted to each" if spread >= limit else f"less than {limit:.2%}, so none is fitted"
     console.print(
-        f"exposure: photographs of the same places differ in brightness by {found:.2%}; {said}", highlight=False
+        f"exposure: photographs of the same places differ in brightness by {spread:.2%}; {result}", highlight=False
     )
-    return found
+    return spread
 
 
 def build_coarse_problem(
@@ -166,8 +170,7 @@ def build_coarse_problem(
     device: torch.device | str,
     dense: DensePoints | None = None,
 ) -> tuple[TrainingProblem, Anchors]:
-    """What the coarse stage works with, and the anchors that it starts from: at the sparse points, and the `dense`
-    ones."""
+    """The problem of the coarse stage, and the anchors that it starts from: at the sparse and the `dense` points."""
     cameras = [view.camera for view in capture.train_views]
     # The voxel follows from the capture: recomputed when a run continues.
     anchors, voxel = initialize_anchors(capture.points, capture.point_colors, cameras, config.anchors, dense)
@@ -190,26 +193,11 @@ def build_coarse_problem(
 
 
 def initial_coarse_state(anchors: Anchors, stage: TrainingProblem, fit_exposures: bool) -> TrainingState:
-    """The state before the first step, in which photographs have exposures to be fitted or have none."""
-    config = stage.config
-    generator = torch.Generator().manual_seed(config.seed)
+    """The state before the first step, with or without exposures that are fitted."""
+    config, generator = stage.config.anchors, torch.Generator().manual_seed(stage.config.seed)
     decoder = Decoder.init_random(
-        config.anchors.num_offsets,
-        config.anchors.view_distance,
-        config.anchors.appearance_dim,
-        stage.num_images,
-        generator,
+        config.num_offsets, config.view_distance, config.appearance_dim, stage.num_images, generator
     )
     if fit_exposures:
         decoder = replace(decoder, exposure=zero_exposures(stage.num_images))
     return initial_state(anchors.to(stage.device), decoder.to(stage.device), stage)
-
-
-def _announce(capture: Capture, state: TrainingState, config: TrainConfig, console: Console) -> None:
-    camera = capture.train_views[0].camera
-    console.print(
-        f"{capture.root} ({capture.images}): {len(capture.train_views)} training and {len(capture.test_views)} test "
-        f"views of {camera.width}x{camera.height}, {len(capture.points):,} points, {len(state.anchors):,} anchors, "
-        f"{config.iterations:,} iterations",
-        highlight=False,
-    )

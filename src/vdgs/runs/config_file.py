@@ -20,21 +20,21 @@ from vdgs.errors import RunError
 from vdgs.runs.run_settings import SECTIONS, RunSettings
 from vdgs.system.atomic_files import write_text
 
-#: Those whose options have no prefix on the command line.
+#: Sections whose options have no prefix on the command line.
 UNPREFIXED_SECTIONS = ("capture", "training", "partition")
 
 
 def setting_flag(setting: str) -> str:
-    """`--lambda-vis` for partition.lambda_vis: how `vdgs run` calls a setting of config.yaml."""
+    """The option of `vdgs run` for a setting of config.yaml: `--lambda-vis` for partition.lambda_vis."""
     section, _, name = setting.partition(".")
     return to_flag((name,) if section in UNPREFIXED_SECTIONS else (section, name))
 
 
 def changed_flags(old: RunSettings, new: RunSettings, sections: Sequence[str] = SECTIONS) -> list[str]:
-    """Lines that say which options differ between the settings of two runs; where the capture lies is none."""
+    """The options that differ between the settings of two runs, a line each; the path of the capture is none."""
     before, after = ({name: each.to_dict()[name] for name in sections} for each in (old, new))
-    paths = [line.partition(": ") for line in diff_settings(before, after) if not line.startswith("capture.path: ")]
-    return [f"{setting_flag(path)}: {values}" for path, _, values in paths]
+    lines = [line.partition(": ") for line in diff_settings(before, after) if not line.startswith("capture.path: ")]
+    return [f"{setting_flag(path)}: {values}" for path, _, values in lines]
 
 
 @dataclass(frozen=True)
@@ -48,14 +48,14 @@ class ConfigFile:
         write_text(self.path, yaml.safe_dump(header | settings.to_dict(), sort_keys=False, allow_unicode=True))
 
     def command(self) -> str | None:
-        """The command that gave the run the settings that it has; None where several did, nothing says it, or the
-        folder is a copy of the one that the command works on."""
+        """The command that gave the run its settings; None where several did, none is recorded, or the folder is a copy
+        of the one that the command works on."""
         try:
             header = yaml.safe_load(self.path.read_text(encoding="utf-8-sig"))["vdgs"]
         except (OSError, yaml.YAMLError, RecursionError, ValueError, KeyError, TypeError):
             return None
         command = header.get("command") if isinstance(header, dict) else None
-        return command if isinstance(command, str) and not _makes_another(command, self.path.parent) else None
+        return command if isinstance(command, str) and not _is_of_another_run(command, self.path.parent) else None
 
     def settings(self) -> RunSettings:
         """The settings of the run."""
@@ -64,16 +64,15 @@ class ConfigFile:
                 f"{self.path.parent}: is not a run folder (no config.yaml). Train first: vdgs run CAPTURE --output RUN"
             )
         try:
-            text = self.path.read_text(encoding="utf-8-sig")
+            return _parse_settings(self.path, self.path.read_text(encoding="utf-8-sig"))
         except UnicodeDecodeError as error:
             raise RunError(f"{self.path}: is damaged, not valid YAML ({error})") from error
-        return _settings(self.path, text)
 
 
 @lru_cache(maxsize=4)
-def _settings(path: Path, text: str) -> RunSettings:
-    """What the text of a file means. A command asks for its settings many times, and PyYAML takes tens of milliseconds
-    for each (its quick parser, in C, is no way out: brackets that are nested deeply end the process)."""
+def _parse_settings(path: Path, text: str) -> RunSettings:
+    """The settings in the text of a file. Cached: a command reads its settings many times, and PyYAML takes tens of
+    milliseconds for each (its parser in C crashes on deeply nested brackets)."""
     try:
         settings = yaml.safe_load(text)
     except (yaml.YAMLError, RecursionError, ValueError) as error:
@@ -89,8 +88,8 @@ def _settings(path: Path, text: str) -> RunSettings:
         ) from error
 
 
-def _makes_another(command: str, folder: Path) -> bool:
-    """Whether a command names the whole path of another folder as its output: this one is a copy."""
+def _is_of_another_run(command: str, folder: Path) -> bool:
+    """Whether a command names the absolute path of another folder as its output: this folder is a copy."""
     try:
         words = shlex.split(command)
     except ValueError:
@@ -107,7 +106,6 @@ def git_commit() -> str | None:
         return None
     command = ["git", "-C", str(root), "rev-parse", "HEAD"]
     try:
-        found = subprocess.run(command, capture_output=True, text=True, check=False)
+        return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip() or None
     except OSError:  # no git on this machine
         return None
-    return found.stdout.strip() or None

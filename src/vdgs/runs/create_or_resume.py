@@ -1,4 +1,4 @@
-"""A run begun, or taken up again: the capture opened, its settings checked and written down."""
+"""A new run, or a run that continues: its capture opened, its settings checked and saved."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ def create_or_resume_run(
 ) -> RunContext:
     """Open the capture and a new run of it, or the run that is there if it was started with the same settings.
 
-    `redo` None compares the settings of the coarse stage only and refuses others; True or False is about changing
-    them (`RunFolder.change_settings`). `command` is the one that asks, kept in the run. Raises CaptureError for a
+    `overwrite` None compares the settings of the coarse stage only and refuses others; True or False is about changing
+    them (`RunFolder.change_settings`). `command` is the command line, saved in the run. Raises CaptureError for a
     capture that cannot be used, RunError for other settings than the run's and for a run that another process drives,
     VdgsError for settings that do not work and for an output among inputs.
     """
-    with exclusive_run(capture_path, output, capture_options, method, overwrite=overwrite, command=command) as begun:
-        return begun
+    with exclusive_run(capture_path, output, capture_options, method, overwrite=overwrite, command=command) as context:
+        return context
 
 
 @contextmanager
@@ -55,14 +55,13 @@ def exclusive_run(
     overwrite: bool | None = None,
     command: str | None = None,
 ) -> Iterator[RunContext]:
-    """As `create_or_resume_run`, for who takes the run from stage to stage: it is driven (`RunFolder.driven`) from before anything
-    of it is written or removed to the end of the `with`."""
-    problems = validate_config(method)
-    if problems:
+    """As `create_or_resume_run`, with the lock of a driver (`RunFolder.drive_lock`) from before anything is written or
+    removed to the end of the `with`."""
+    if problems := validate_config(method):
         raise VdgsError("These settings do not work:\n  " + "\n  ".join(problems))
     check_not_in_capture(output)
-    # Whole paths, as config.yaml holds them: stages hand the capture on, also to other machines.
-    capture_path, capture_options = capture_path.resolve(), _with_whole_paths(capture_options)
+    # Absolute paths, as config.yaml holds them: stages hand the capture on, also to other machines.
+    capture_path, capture_options = capture_path.resolve(), _with_absolute_paths(capture_options)
     capture = load_capture(capture_path, capture_options)
     check_not_among_inputs(output, capture)
     method = replace(method, training=resolve_iterations(method.training, len(capture.train_views)))
@@ -79,34 +78,30 @@ def _resume(
     run: RunFolder, capture: Capture, capture_path: Path, settings: RunSettings, overwrite: bool | None,
     command: str | None,
 ) -> None:  # fmt: skip
-    """Write down the settings of a run that this process drives, new ones or others; what they make useless goes."""
-    with run.locked(shared=_goes_on(run, settings)):
-        read_anew = run.config_file.exists() and capture_options_changed(run, settings)
-        if run.capture_file.exists() and not read_anew:
+    """Save the settings of a run that this process drives, new ones or others; what they make useless is deleted."""
+    # Where nothing changes its blocks may be at work, begun by a driver that died.
+    continues = run.config_file.exists() and run.capture_file.exists() and run.settings() == settings
+    with run.locked(shared=continues):
+        is_read_anew = run.config_file.exists() and capture_options_changed(run, settings)
+        if run.capture_file.exists() and not is_read_anew:
             check_same_capture(run.capture_file, read_json(run.capture_file), capture)
         if overwrite is None or not run.config_file.exists():
             run.create_or_check(settings, ("capture", "training"), command)
             run.move_capture(capture_path)
         else:
             run.change_settings(settings, overwrite, command)
-            if read_anew:  # nothing is left that was made of it; what the coarse stage writes takes its place
+            if is_read_anew:  # nothing is left that was made of it; the coarse stage writes the new one
                 run.capture_file.unlink(missing_ok=True)
-        _keep_reconstruction(capture.root, run.path)
-
-
-def _goes_on(run: RunFolder, settings: RunSettings) -> bool:
-    """Whether the run that is there has the very settings: nothing of it changes, and its blocks may be at work, begun
-    by a driver that died."""
-    return run.config_file.exists() and run.capture_file.exists() and run.settings() == settings
+        _copy_reconstruction(capture.root, run.path)
 
 
 def capture_options_changed(run: RunFolder, settings: RunSettings) -> bool:
-    """Whether the run reads its capture with other options: it is their change then that has to be spoken of."""
+    """Whether the run reads its capture with other options: a difference of captures is due to these then."""
     return run.settings().capture != settings.capture
 
 
-def _keep_reconstruction(root: Path, run: Path) -> None:
-    """How the capture was made of photographs, where it was made here: for the report, which reads the run alone."""
+def _copy_reconstruction(root: Path, run: Path) -> None:
+    """Copy how the capture was made of photographs, if it was made here: the report reads the run alone."""
     for name in (RECONSTRUCTION, RECONSTRUCTION_FIGURE):
         if (root / name).is_file():
             content = (root / name).read_bytes()
@@ -115,11 +110,10 @@ def _keep_reconstruction(root: Path, run: Path) -> None:
 
 
 def run_settings(capture_path: Path, capture_options: CaptureOptions, method: MethodConfig) -> RunSettings:
-    """What config.yaml holds: everything that the result depends on."""
-    return RunSettings.of(capture_path.resolve(), _with_whole_paths(capture_options), method)
+    """The settings in config.yaml: everything that the result depends on."""
+    return RunSettings.create(capture_path.resolve(), _with_absolute_paths(capture_options), method)
 
 
-def _with_whole_paths(options: CaptureOptions) -> CaptureOptions:
-    """Options whose files are named from the root of the disk: they mean the same in every folder."""
-    whole: dict[str, Any] = {name: path.resolve() for name, path in vars(options).items() if isinstance(path, Path)}
-    return replace(options, **whole)
+def _with_absolute_paths(options: CaptureOptions) -> CaptureOptions:
+    paths: dict[str, Any] = {name: path.resolve() for name, path in vars(options).items() if isinstance(path, Path)}
+    return replace(options, **paths)

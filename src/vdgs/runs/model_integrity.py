@@ -1,5 +1,4 @@
-"""Whether the model in a stage's folder is the one that the stage made: people copy files, also to where they do not
-belong."""
+"""Whether the model in a stage's folder is the one that the stage made, and not a file that a person copied there."""
 
 from __future__ import annotations
 
@@ -24,14 +23,13 @@ def integrity_error(stage: StageFolder, key: str, block: int | None = None) -> s
     try:
         with safe_open(stage.model, framework="pt") as file:
             header = dict(file.metadata() or {})
-        told = ModelMetadata.from_dict(
-            json.loads(header.get(ANCHOR_MODEL_FORMAT) or header[MULTI_DECODER_FORMAT])["facts"]
-        )
+        content = json.loads(header.get(ANCHOR_MODEL_FORMAT) or header[MULTI_DECODER_FORMAT])
+        metadata = ModelMetadata.from_dict(content["facts"])
     except (OSError, SafetensorError, ValueError, KeyError, TypeError, AttributeError):
         return "not a model that can be read"
-    if told.block != block:
-        return "a model of the whole scene" if told.block is None else f"the model of block {told.block}"
-    if told.key != key:
+    if metadata.block != block:
+        return "a model of the whole scene" if metadata.block is None else f"the model of block {metadata.block}"
+    if metadata.key != key:
         return "a model of other settings or of another run"
     return "" if _size_agrees(stage) else MODEL_MISMATCH
 
@@ -43,8 +41,8 @@ def path_to_delete(stage: StageFolder) -> Path:
 
 
 def _size_agrees(stage: StageFolder) -> bool:
-    vouched = stage.status().model_id
-    return vouched is None or vouched.startswith(f"{stage.model.stat().st_size}-")
+    model_id = stage.status().model_id
+    return model_id is None or model_id.startswith(f"{stage.model.stat().st_size}-")
 
 
 def load_verified(stage: StageFolder, key: str, block: int | None = None) -> AnchorModel:
@@ -53,12 +51,12 @@ def load_verified(stage: StageFolder, key: str, block: int | None = None) -> Anc
     Raises RunError for a file that the stage did not make, however it came there; VdgsError for one that is damaged.
     """
     model = AnchorModel.load(stage.model)
-    wrong = integrity_error(stage, key, block)
-    if not wrong and stage.status().model_id not in (None, file_id(stage.model)):
-        wrong = MODEL_MISMATCH
-    if wrong:
+    error = integrity_error(stage, key, block)
+    if not error and stage.status().model_id not in (None, file_id(stage.model)):
+        error = MODEL_MISMATCH
+    if error:
         raise RunError(
-            f"{stage.model}: is {wrong}. Put back the one that was trained here, or delete {path_to_delete(stage)} and give "
-            "the command that made it again."
+            f"{stage.model}: is {error}. Put back the one that was trained here, or delete {path_to_delete(stage)} and "
+            "give the command that made it again."
         )
     return model

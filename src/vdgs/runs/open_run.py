@@ -1,4 +1,4 @@
-"""A run opened for looking at it or for building on it: its capture, and one of its models."""
+"""A run opened to look at it or to build on it: its capture, and one of its models."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool
 
 from vdgs.captures.capture import Capture
 from vdgs.captures.capture_metadata import check_same_capture
@@ -43,7 +42,7 @@ class OpenedModel:
     @property
     def summary(self) -> str:
         """Which model it is, in a few words."""
-        return _model_line(self.name, len(self.model.anchors), self.model_path)
+        return _model_summary(self.name, len(self.model.anchors), self.model_path)
 
     @property
     def device(self) -> torch.device:
@@ -53,7 +52,7 @@ class OpenedModel:
 
 @dataclass(frozen=True, kw_only=True)
 class OpenedRun(OpenedModel):
-    """A run opened for looking at it: one of its models, and its capture as it was trained on."""
+    """An opened model and the capture as it was trained on."""
 
     capture: Capture
 
@@ -76,8 +75,8 @@ def with_capture(opened: OpenedModel, capture: Capture) -> OpenedRun:
 
 def open_model(folder: RunFolder, which: ModelName = "best", device: torch.device | str = "cpu") -> OpenedModel:
     """Open a model of a run on a device, without the capture. Raises RunError if it is not trained."""
-    found = locate_model(folder, which)
-    return found.opened(folder, load_verified(found.stage, found.key).to(torch.device(device)))
+    location = locate_model(folder, which)
+    return location.opened(folder, load_verified(location.stage, location.key).to(torch.device(device)))
 
 
 def check_has_anchors(folder: RunFolder, anchors: int | None) -> None:
@@ -87,8 +86,8 @@ def check_has_anchors(folder: RunFolder, anchors: int | None) -> None:
         raise RunError(
             f"{folder.coarse.path}: the coarse model holds no anchors: in training all of them were taken for "
             f"transparent and removed. Give a smaller --densify.prune-opacity (it is {growth.prune_opacity:g}) or a "
-            "larger --densify.start, to `vdgs run` with --overwrite or in a new --output, and look at the photographs with "
-            "`vdgs inspect`: do they show the place, through the right cameras?"
+            "larger --densify.start, to `vdgs run` with --overwrite or in a new --output, and look at the photographs "
+            "with `vdgs inspect`: do they show the place, through the right cameras?"
         )
 
 
@@ -104,7 +103,7 @@ class ModelLocation:
     @property
     def summary(self) -> str:
         """Which model it is, in a few words."""
-        return _model_line(self.name, self.stage.status().anchors or 0, self.stage.model)
+        return _model_summary(self.name, self.stage.status().anchors or 0, self.stage.model)
 
     def opened(self, folder: RunFolder, model: AnchorModel) -> OpenedModel:
         """The same with the model that was read of it."""
@@ -114,7 +113,7 @@ class ModelLocation:
         )  # fmt: skip
 
 
-def _model_line(name: str, anchors: int, file: Path) -> str:
+def _model_summary(name: str, anchors: int, file: Path) -> str:
     return f"{name} model ({anchors:,} anchors, {file.stat().st_size / 1e6:,.1f} MB)"
 
 
@@ -125,34 +124,32 @@ def locate_model(folder: RunFolder, which: ModelName = "best") -> ModelLocation:
         name = "merged" if folder.merged.is_done(keys.merge) else "coarse"
     stage, key = (folder.merged, keys.merge) if name == "merged" else (folder.coarse, keys.coarse)
     if not stage.is_done(key):
-        raise RunError(_not_there(folder, name))
-    return ModelLocation(stage, name, key, _caution(folder, name) if which != "coarse" else "")
+        raise RunError(_missing_model_text(folder, name))
+    return ModelLocation(stage, name, key, _warning(folder, name) if which != "coarse" else "")
 
 
-def _not_there(folder: RunFolder, name: str) -> str:
+def _missing_model_text(folder: RunFolder, name: str) -> str:
     """Why a model cannot be opened, and what to do."""
-    standing = get_run_status(folder)
-    found = standing.of("merge" if name == "merged" else "coarse")
-    why = f"state: {found.state}" + (f", {found.reason}" if found.reason else "")
-    command = standing.next_command()
-    return f"{folder.path}: has no {name} model of its settings yet ({why})." + (
-        f" Next: {command}" if command else " A process works on it: wait for it."
-    )
+    run_status = get_run_status(folder)
+    stage, command = run_status.of("merge" if name == "merged" else "coarse"), run_status.next_command()
+    why = f"state: {stage.state}" + (f", {stage.reason}" if stage.reason else "")
+    remedy = f"Next: {command}" if command else "A process works on it: wait for it."
+    return f"{folder.path}: has no {name} model of its settings yet ({why}). {remedy}"
 
 
-def _caution(folder: RunFolder, name: str) -> str:
-    """What to say of a model that is not the merged one, or of a merged one that is out of date."""
-    standing = get_run_status(folder)
-    merged = standing.of("merge")
+def _warning(folder: RunFolder, name: str) -> str:
+    """The warning for a model that is not the merged one, or for a merged one that is out of date."""
+    run_status = get_run_status(folder)
+    merged = run_status.of("merge")
     if merged.state == "done":
         return merged.reason
-    again = f"Next: {command}" if (command := standing.next_command()) else "A process works on the run."
+    remedy = f"Next: {command}" if (command := run_status.next_command()) else "A process works on the run."
     if name == "merged":
         return (
             f"the merged model is out of date: {merged.reason}. Merge again: vdgs merge {shlex.quote(str(folder.path))}"
         )
     state = f"there is one that was {merged.reason}" if merged.state == "stale" else "there is none yet"
-    return f"this is the coarse model, not the merged one: {state}. {again}"
+    return f"this is the coarse model, not the merged one: {state}. {remedy}"
 
 
 def open_capture(folder: RunFolder, at: Path | None = None) -> Capture:
@@ -161,13 +158,12 @@ def open_capture(folder: RunFolder, at: Path | None = None) -> Capture:
     Raises CaptureError if it is gone or changed its form.
     """
     settings = folder.settings()
-    written = Path(settings.capture_path)
-    if at is None and not written.is_dir():
+    path = at or Path(settings.capture_path)
+    if at is None and not path.is_dir():
         raise CaptureError(
-            f"{written}: the capture of {folder.path} is not there. If it was moved, say where it lies now: "
-            "--capture PATH."
+            f"{path}: the capture of {folder.path} is not there. If it was moved, give its folder: --capture PATH."
         )
-    return load_capture(at or written, settings.capture)
+    return load_capture(path, settings.capture)
 
 
 def relocate_capture(folder: RunFolder, at: Path) -> Capture:
@@ -192,22 +188,14 @@ def load_run_blocks(run: RunFolder) -> Blocks:
 
 
 def block_view_indices(run: RunFolder, capture: Capture, index: int) -> list[int]:
-    """Which training views, by number, serve a block."""
-    return _views(_assigned(run, capture)[:, index])
+    """The indices of the training views that serve a block."""
+    return all_block_view_indices(run, capture)[index]
 
 
 def all_block_view_indices(run: RunFolder, capture: Capture) -> list[list[int]]:
-    """The same of every block, read once."""
-    return [_views(of_block) for of_block in _assigned(run, capture).T]
-
-
-def _views(assigned: Bool[np.ndarray, " c"]) -> list[int]:
-    return [int(view) for view in np.flatnonzero(assigned)]
-
-
-def _assigned(run: RunFolder, capture: Capture) -> Bool[np.ndarray, "c b"]:
-    """Which training view serves which block. Raises RunError where that is of other views."""
-    _, _, assignment = load_scores(run.partition / "scores.npz")
+    """The same of every block. Raises RunError where the assignment is of another capture."""
+    file = run.partition / "scores.npz"
+    _, _, assignment = load_scores(file)
     if len(assignment.cameras) != len(capture.train_views):
-        raise RunError(f"{run.partition / 'scores.npz'}: is of another capture. Run: vdgs partition {run.path}")
-    return assignment.cameras
+        raise RunError(f"{file}: is of another capture. Run: vdgs partition {run.path}")
+    return [np.flatnonzero(of_block).tolist() for of_block in assignment.cameras.T]

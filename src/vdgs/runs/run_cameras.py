@@ -1,4 +1,4 @@
-"""What a run keeps of its flight: every camera, so that it can be drawn where the capture is not.
+"""The cameras of a run, saved so that they can be drawn where the capture is not.
 
 RUN/cameras.json is written when the coarse stage begins, and belongs to the capture that capture.json describes.
 """
@@ -32,7 +32,7 @@ class RunCameras:
     ground: GroundFrame
     #: The median of the sparse points: what a film turns about.
     scene_center: Float[np.ndarray, "3"]
-    #: How high the training cameras fly (`captures.heights`).
+    #: How high the training cameras fly (`captures.camera_height`).
     camera_height: float
     #: Where the capture lies, and the folders that hold its photographs and masks: nothing is written there.
     root: Path
@@ -45,7 +45,7 @@ class RunCameras:
 
 
 def run_cameras_of_capture(capture: Capture) -> RunCameras:
-    """The flight of a capture that is there."""
+    """The cameras of a capture that is there."""
     return RunCameras(
         train=tuple((view.name, view.camera) for view in capture.train_views),
         test=tuple((view.name, view.camera) for view in capture.test_views), ground=capture.ground,
@@ -55,7 +55,7 @@ def run_cameras_of_capture(capture: Capture) -> RunCameras:
 
 
 def save_run_cameras(run: RunFolder, capture: Capture) -> None:
-    """Write the flight of a capture into its run."""
+    """Save the cameras of a capture in its run."""
     ground, root = capture.ground, capture.root.resolve()
     write_json(
         run.cameras_file,
@@ -67,15 +67,15 @@ def save_run_cameras(run: RunFolder, capture: Capture) -> None:
             },
             "middle": np.median(capture.points, axis=0).tolist(),
             "camera_height": camera_height(capture),
-            "input_folders": [_within(root, folder) for folder in input_folders(capture)],
-            "views": [_plain(view) for view in capture.views],
+            "input_folders": [_relative_to(root, folder) for folder in input_folders(capture)],
+            "views": [_view_to_dict(view) for view in capture.views],
         },
     )  # fmt: skip
 
 
 def load_run_cameras(run: RunFolder, capture: CaptureMetadata | None) -> RunCameras | None:
-    """The flight that the run keeps, if it is that of the capture that a model describes; None for a run of a version
-    that kept none. RunError if the file is damaged."""
+    """The saved cameras, if they are of the capture that a model describes; None where there are none. RunError if the
+    file is damaged."""
     if not run.cameras_file.exists():
         return None
     record = read_json(run.cameras_file)
@@ -83,21 +83,11 @@ def load_run_cameras(run: RunFolder, capture: CaptureMetadata | None) -> RunCame
     try:
         if record["fingerprint"] != (capture or {}).get("fingerprint"):
             return None
-        frame = record["ground_frame"]
-        geo = frame["origin_geo"]
-        ground = GroundFrame(
-            scale=float(frame["scale"]),
-            rotation=np.array(frame["rotation"], np.float64),
-            translation=np.array(frame["translation"], np.float64),
-            metric=bool(frame["metric"]),
-            description=str(frame["how"]),
-            origin_geo=None if geo is None else tuple(geo),
-        )
-        views = [(each["split"], _view(each)) for each in record["views"]]
+        views = [(each["split"], _view_from_dict(each)) for each in record["views"]]
         return RunCameras(
             train=tuple(view for split, view in views if split == "train"),
             test=tuple(view for split, view in views if split == "test"),
-            ground=ground,
+            ground=_ground_from_dict(record["ground_frame"]),
             scene_center=np.array(record["middle"], np.float64),
             camera_height=float(record["camera_height"]),
             root=root,
@@ -109,17 +99,27 @@ def load_run_cameras(run: RunFolder, capture: CaptureMetadata | None) -> RunCame
         ) from error
 
 
-def _within(root: Path, folder: Path) -> str:
-    """A folder as the root of the capture knows it, so that it is found where the capture was moved to; whole where it
-    lies elsewhere."""
-    whole = folder.absolute()
-    for path in (whole, whole.resolve()):
+def _relative_to(root: Path, folder: Path) -> str:
+    """A folder relative to the root of the capture, so that it is found where the capture was moved to; absolute where
+    it lies elsewhere."""
+    absolute = folder.absolute()
+    for path in (absolute, absolute.resolve()):
         if path.is_relative_to(root):
             return path.relative_to(root).as_posix()
-    return str(whole)
+    return str(absolute)
 
 
-def _plain(view: View) -> JsonObject:
+def _ground_from_dict(frame: JsonObject) -> GroundFrame:
+    rotation, translation = (np.array(frame[name], np.float64) for name in ("rotation", "translation"))
+    scale, metric, geo = float(frame["scale"]), bool(frame["metric"]), frame["origin_geo"]
+    geo = None if geo is None else tuple(geo)
+    description = str(frame["how"])
+    return GroundFrame(
+        scale=scale, rotation=rotation, translation=translation, metric=metric, description=description, origin_geo=geo
+    )
+
+
+def _view_to_dict(view: View) -> JsonObject:
     camera = view.camera
     return {
         "name": view.name, "split": view.split, "camera_from_world": camera.camera_from_world.tolist(),
@@ -128,7 +128,7 @@ def _plain(view: View) -> JsonObject:
     }  # fmt: skip
 
 
-def _view(record: JsonObject) -> tuple[str, Camera]:
+def _view_from_dict(record: JsonObject) -> tuple[str, Camera]:
     pose = np.array(record["camera_from_world"], np.float64).reshape(4, 4)
     fx, fy, cx, cy = (float(record[key]) for key in ("fx", "fy", "cx", "cy"))
     return str(record["name"]), Camera(

@@ -1,8 +1,7 @@
-"""A run that a command works on, and what the command has read of it: stages hand it on instead of reading it again."""
+"""A run that a command works on, with its capture and models in memory: each stage passes it on to the next."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -15,25 +14,18 @@ from vdgs.runs.open_run import ModelLocation, OpenedRun, locate_model, open_capt
 from vdgs.runs.run_folder import RunFolder
 
 
-@dataclass(frozen=True)
-class _CachedModel:
-    """A model in memory, and the very file that it was read from."""
-
-    identity: tuple[object, ...]
-    model: AnchorModel
-
-
 class RunContext:
     """A run folder with its capture, read once, and its models, each read once until it is released.
 
-    Photographs stay on the disk. The state of stages is read from the disk at every call: other processes may have
+    Images stay on the disk. The state of stages is read from the disk at every call: other processes may have
     trained blocks meanwhile, and a model whose file or key has changed is read again.
     """
 
     def __init__(self, run: RunFolder, capture: Capture | None = None) -> None:
         self.run = run
         self._capture = capture
-        self._models: dict[str, _CachedModel] = {}
+        #: By their names, each with the identity of the file that it was read from.
+        self._models: dict[str, tuple[tuple[object, ...], AnchorModel]] = {}
 
     @staticmethod
     def from_path(path: Path, capture: Path | None = None) -> RunContext:
@@ -56,20 +48,21 @@ class RunContext:
 
         Raises RunError if it is not trained or was made from another capture, CaptureError as `capture` does.
         """
-        capture, found = self.capture, locate_model(self.run, which)
-        return with_capture(found.opened(self.run, self._model(found, torch.device(device))), capture)
+        capture, location = self.capture, locate_model(self.run, which)
+        return with_capture(location.opened(self.run, self._model(location, torch.device(device))), capture)
 
     def release_models(self, *names: str) -> None:
         """Forget models ("coarse", "merged"), without names all: before work that needs the memory."""
         for name in names or tuple(self._models):
             self._models.pop(name, None)
 
-    def _model(self, found: ModelLocation, device: torch.device) -> AnchorModel:
+    def _model(self, location: ModelLocation, device: torch.device) -> AnchorModel:
         """The model of a finished stage. Moved to another device, it leaves the one where it was."""
-        cached, file = self._models.pop(found.name, None), found.stage.model.stat()
-        identity = (found.key, found.stage.status().model_id, file.st_ino, file.st_size, file.st_mtime_ns)
-        model = cached.model if cached is not None and cached.identity == identity else None
+        stage, file = location.stage, location.stage.model.stat()
+        identity = (location.key, stage.status().model_id, file.st_ino, file.st_size, file.st_mtime_ns)
+        cached = self._models.pop(location.name, ((), None))
+        model = cached[1] if cached[0] == identity else None
         del cached  # before another file is read: two models may not fit into the memory
-        model = (load_verified(found.stage, found.key) if model is None else model).to(device)
-        self._models[found.name] = _CachedModel(identity, model)
+        model = (load_verified(stage, location.key) if model is None else model).to(device)
+        self._models[location.name] = (identity, model)
         return model

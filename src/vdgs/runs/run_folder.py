@@ -59,7 +59,7 @@ class RunFolder:
         return StageFolder(self.path / "blocks" / f"{index:02d}")
 
     def block_folders(self) -> list[StageFolder]:
-        """Those that are there, in order; a folder whose name is no number is not ours."""
+        """The folders of blocks that are there, in order; a folder whose name is no number is none."""
         paths = [path for path in (self.path / "blocks").glob("[0-9]*") if path.name.isdecimal()]
         return [StageFolder(path) for path in sorted(paths, key=lambda path: int(path.name))]
 
@@ -72,7 +72,7 @@ class RunFolder:
         return self.path / "partition"
 
     def partition_record(self) -> PartitionRecord:
-        """What partition.json says; nothing if the scene is not cut yet. RunError if the file is damaged."""
+        """The content of partition.json; empty if the scene is not partitioned yet. RunError for a damaged file."""
         file = self.partition / "partition.json"
         try:
             return record_from_dict(PartitionRecord, read_json(file)) if file.exists() else PartitionRecord()
@@ -92,10 +92,8 @@ class RunFolder:
     ) -> None:
         """Write the settings of a new run, or check that those of the run that is there are the same.
 
-        `command` is the one that begins it, kept so that people can be told how to continue.
-
-        Only the sections named in `checked` are compared. Raises RunError with the differences if they are not the
-        same, and if the folder holds something else.
+        `command` is the command line, saved so that people can be told how to continue. Only the sections named in
+        `checked` are compared. Raises RunError with the differences, and if the folder holds something else.
         """
         if self.config_file.exists():
             changed = changed_flags(self.settings(), settings, checked)
@@ -116,22 +114,18 @@ class RunFolder:
         known = {".lock", self._driver.name, *([self.own_capture.name] if is_reconstruction(self.own_capture) else [])}
         if self.path.exists() and not self.path.is_dir():
             raise RunError(f"{self.path}: is a file. Choose a folder for --output.")
-        strangers = (
-            [p.name for p in self.path.iterdir() if p.name not in known and p.suffix != ".tmp"]
-            if self.path.exists()
-            else []
-        )
-        if strangers:
+        files = self.path.iterdir() if self.path.exists() else ()
+        if unknown := sorted(file.name for file in files if file.name not in known and file.suffix != ".tmp"):
             raise RunError(
-                f"{self.path}: holds other files ({', '.join(sorted(strangers)[:3])}) and no config.yaml. "
+                f"{self.path}: holds other files ({', '.join(unknown[:3])}) and no config.yaml. "
                 "Choose an empty or a new folder for --output."
             )
 
     def change_settings(self, settings: RunSettings, overwrite: bool, command: str | None = None) -> list[str]:
-        """Give a run other settings; returns what changed, one line each. `command` as in `begin`.
+        """Give a run other settings; returns what changed, one line each. `command` as in `create_or_check`.
 
-        Raises RunError, with the differences, if trained work depends on what changed, unless `redo` allows to
-        lose it. Stages delete what was made for other settings when they next run (`StageFolder.reset_unless`).
+        Raises RunError, with the differences, if trained work depends on what changed, unless `overwrite`. Stages
+        delete what was made for other settings when they next run (`StageFolder.reset_unless`).
         """
         old = self.settings()
         if old == settings:
@@ -148,8 +142,8 @@ class RunFolder:
             raise RunError(
                 f"{self.config_file}: other settings than this run has:\n  "
                 + "\n  ".join(changed)
-                + f"\nThey make {' and '.join(lost)} useless. Add --overwrite to train that again, give the old settings to "
-                "continue, or take another --output."
+                + f"\nThey make {' and '.join(lost)} useless. Add --overwrite to train that again, give the old "
+                "settings to continue, or take another --output."
             )
         self.config.write(settings, command)
         if self.coarse.path.exists():  # at once: nothing must be built on a model of other settings
@@ -157,7 +151,7 @@ class RunFolder:
         return changed
 
     def move_capture(self, to: Path) -> None:
-        """Remember that the capture of the run lies elsewhere now. That it is the same one is for the caller to see."""
+        """Save that the capture of the run lies elsewhere now; the caller checks that it is the same one."""
         settings, command = self.settings(), self.config.command()
         before, now = settings.capture_path, str(to.resolve())
         if before == now:
@@ -179,24 +173,22 @@ class RunFolder:
         return stage_keys(self.settings(), self.coarse_model_id())
 
     def coarse_model_id(self) -> str | None:
-        """What tells the coarse model from any other; None while there is none."""
+        """The identity of the coarse model; None while there is none."""
         return self.coarse.status().model_id
 
     @contextmanager
     def locked(self, shared: bool = False) -> Iterator[None]:
-        """Hold the run for this process, or share it with others that do (blocks are trained side by side).
+        """Lock the run for this process, or share it with others that do (blocks are trained side by side).
 
-        RunError if another process stands in the way.
+        RunError if another process holds it.
         """
         with lock_folder(self.path, shared):
             yield
 
     @contextmanager
     def drive_lock(self) -> Iterator[None]:
-        """Take this run from stage to stage, so that others can see it between two stages too (`is_running`).
-
-        Whoever changes its settings holds it meanwhile: between two stages, and while a model is measured or drawn, a
-        driver holds nothing else. RunError if another process drives the run.
+        """The lock of a process that takes the run from stage to stage or changes its settings (`is_running`): between
+        two stages, and while a model is measured or drawn, it holds nothing else. RunError if another process has it.
         """
         with lock_folder(self._driver):
             yield

@@ -29,7 +29,7 @@ class RunSettings:
     merge: MergeConfig
 
     @staticmethod
-    def of(capture_path: Path | str, capture: CaptureOptions, method: MethodConfig) -> RunSettings:
+    def create(capture_path: Path | str, capture: CaptureOptions, method: MethodConfig) -> RunSettings:
         """From the settings of a command."""
         return RunSettings(capture_path=str(capture_path), capture=capture, **vars(method))
 
@@ -44,8 +44,8 @@ class RunSettings:
 
     @staticmethod
     def from_dict(content: Mapping[str, Any]) -> RunSettings:
-        """The inverse; what is not named keeps its default. Raises ValueError, naming the setting, for one that there
-        is not, of another kind or out of its range."""
+        """The inverse; what is not named keeps its default. Raises ValueError, naming the setting, for one that is
+        unknown, of another type or out of its range."""
         sections = dict(content)
         capture = sections.pop("capture", None)
         if not isinstance(capture, Mapping) or not isinstance(capture.get("path"), str):
@@ -55,4 +55,4 @@ class RunSettings:
         for section in SECTIONS[1:]:
             for each in iter_out_of_range(getattr(method, section), (section,)):
                 raise ValueError(f"{'.'.join(each.path)} is {each.value}; it must be {each.range}")
-        return RunSettings.of(capture["path"], options, method)
+        return RunSettings.create(capture["path"], options, method)

@@ -1,6 +1,6 @@
-"""How far a run is: what every stage and block came to, and whether that was made with the settings it has now.
+"""How far a run is: the state of every stage and block, and whether it was made with the settings the run has now.
 
-All that shows results of a run, builds on them or advises what to do next asks here, so that they say the same.
+Everything that shows results of a run, builds on them or advises what to do next uses this module.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import hashlib
 import json
 import shlex
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -41,13 +41,13 @@ class StageStatus:
     name: str
     state: StageState
     folder: str
-    """What it made, inside the run."""
+    """Its output, relative to the run."""
     reason: str = ""
-    """One line; empty where there is nothing to say."""
+    """One line, or empty."""
     status: StatusRecord | None = None
-    """What the stage notes of itself, where it trains or merges."""
+    """Its status file, where it trains or merges."""
     output_id: str = ""
-    """What tells what it made from any other."""
+    """The identity of its output."""
     hint: str = ""
     """What to do before its command is of use."""
 
@@ -86,7 +86,7 @@ class RunStatus:
 
     @property
     def digest(self) -> str:
-        """What tells this standing from any other: a report of it is out of date once it differs."""
+        """A digest of this status: a report of it is out of date once it differs."""
         content = [[stage.name, stage.state, stage.output_id] for stage in self.stages]
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
@@ -105,12 +105,9 @@ class RunStatus:
 
     @property
     def _continues(self) -> bool:
-        """The command that began the run takes it to its end: it asked for all stages, and for the settings that the
-        run has."""
-        others = any(
-            stage.state == "stale" and stage.reason in (OTHER_SETTINGS, OTHER_PARTITION) for stage in self.stages
-        )
-        return (self.command or "").startswith("vdgs run ") and not others
+        """The command that began the run takes it to its end: it is for all stages, and for the settings of the run."""
+        reasons = {stage.reason for stage in self.stages if stage.state == "stale"}
+        return (self.command or "").startswith("vdgs run ") and not reasons & {OTHER_SETTINGS, OTHER_PARTITION}
 
     def _command_for(self, stage: str) -> str:
         run = shlex.quote(str(self.path))
@@ -125,8 +122,8 @@ class RunStatus:
 
 
 def get_run_status(run: RunFolder, settings: RunSettings | None = None) -> RunStatus:
-    """How far a run is, for its settings or for others. Reads only, and never fails on what it reads: what is damaged
-    is `unknown`, and says why."""
+    """How far a run is, for its settings or for others. Reads only and never fails: what is damaged is `unknown`, with
+    the reason."""
     try:
         keys, why = run.keys() if settings is None else stage_keys(settings, run.coarse_model_id()), ""
     except VdgsError as error:
@@ -136,7 +133,7 @@ def get_run_status(run: RunFolder, settings: RunSettings | None = None) -> RunSt
 
 @dataclass(frozen=True)
 class _StatusScanner:
-    """One look at a run, whose keys are None where they cannot be known."""
+    """Reads the status of a run; `keys` is None where the settings cannot be read."""
 
     run: RunFolder
     keys: StageKeys | None
@@ -164,7 +161,7 @@ class _StatusScanner:
     def _judged(
         self, name: str, folder: Path, there: bool, found: object, wanted: object, made: str, why: str = OTHER_SETTINGS
     ) -> StageStatus:
-        """A stage whose record says with which settings it was made (`found`); None where it does not."""
+        """A stage by the key in its record (`found`, None where there is none) and the key that it should have."""
         state: StageState
         if not there:
             state, why = "missing", ""
@@ -196,15 +193,12 @@ class _StatusScanner:
     def _cut(self) -> Iterator[StageStatus]:
         folder, record = self.run.partition, self._record()
         there = (folder / "partition.json").exists()
-        cut = self._judged("partition", folder, there, record.key, self._key("partition"), str(record.key))
-        cameras = self._judged(
-            "cameras", folder, there, record.assignment_key, self._key("assignment"), str(record.assignment_key)
-        )
-        yield cut
-        yield cameras
+        key, assignment_key = record.key, record.assignment_key
+        yield self._judged("partition", folder, there, key, self._key("partition"), str(key))
+        yield self._judged("cameras", folder, there, assignment_key, self._key("assignment"), str(assignment_key))
 
     def _block_folders(self) -> list[StageFolder]:
-        """Those of the present cut, begun or not, and those that are there."""
+        """The folders of the blocks of the present partition, begun or not, and those that are there."""
         count, keys, record = 0, self.keys, self._record()
         if keys is not None and (record.key, record.assignment_key) == (keys.partition, keys.assignment):
             count = len(record.blocks)
@@ -219,14 +213,10 @@ class _StatusScanner:
             return StageStatus(name=name, state="unknown", folder=inside, reason=_first_line(str(error)))
         state, why = self._state_of(folder, status, key, other, locked)
         if state == "done" and (wrong := integrity_error(folder, key or "", _number(name))):
-            remedy = f"delete {path_to_delete(folder)}, then "
-            return StageStatus(
-                name=name, state="stale", folder=inside, reason=f"model.safetensors is {wrong}", status=status,
-                hint=remedy,
-            )  # fmt: skip
-        return StageStatus(
-            name=name, state=state, folder=inside, reason=why, status=status, output_id=status.model_id or ""
-        )
+            reason, hint = f"model.safetensors is {wrong}", f"delete {path_to_delete(folder)}, then "
+            return StageStatus(name=name, state="stale", folder=inside, reason=reason, status=status, hint=hint)
+        output_id = status.model_id or ""
+        return StageStatus(name=name, state=state, folder=inside, reason=why, status=status, output_id=output_id)
 
     def _state_of(
         self, folder: StageFolder, status: StatusRecord, key: str | None, other: str, locked: Path
@@ -237,10 +227,10 @@ class _StatusScanner:
             return "unknown", self.why_unknown
         if folder.key() != key:
             return "stale", other
+        if status.state == "done" and not folder.model.exists():
+            return "missing", f"{folder.model.name} is gone"
         if status.state == "done":
-            return (
-                ("done", status.reason or "") if folder.model.exists() else ("missing", f"{folder.model.name} is gone")
-            )
+            return "done", status.reason or ""
         if status.state == "running" and not is_known_locked(locked):
             return "stopped", "its process ended without a word; it continues from its last checkpoint"
         if status.state in ("running", "queued", "stopped", "failed"):
@@ -255,21 +245,11 @@ class _StatusScanner:
         models = tuple((b.status.model_id if b.status else None) if b.state == "done" else None for b in blocks)
         stands_in = [block.name for block, model in zip(blocks, models, strict=True) if model is None]
         if found.status.block_models != models:
-            return StageStatus(
-                name="merge",
-                state="stale",
-                folder=found.folder,
-                reason=OTHER_BLOCKS,
-                status=found.status,
-                output_id=found.output_id,
-            )
-        why = f"the coarse model stands in for {', '.join(stands_in)}" if stands_in else ""
-        return StageStatus(
-            name="merge", state="done", folder=found.folder, reason=why, status=found.status, output_id=found.output_id
-        )
+            return replace(found, state="stale", reason=OTHER_BLOCKS)
+        return replace(found, reason=f"the coarse model stands in for {', '.join(stands_in)}" if stands_in else "")
 
     def _measured(self, name: str, folder: Path, model: StageStatus) -> StageStatus:
-        """Figures of a model: they are worth what the model is."""
+        """The figures of a model: they are out of date where the model is."""
         there = (folder / "metrics.json").exists()
         record = read_json_or_empty(folder / "status.json")
         made = json.dumps([record.get(each) for each in ("model", "lpips_weights", "bins")])
@@ -279,7 +259,7 @@ class _StatusScanner:
 
 
 def _number(name: str) -> int | None:
-    """Of a block, from the name of its standing."""
+    """The index of a block, from the name of its stage."""
     return int(name.split()[1]) if name.startswith("block ") else None
 
 

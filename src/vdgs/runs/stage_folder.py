@@ -18,7 +18,7 @@ from vdgs.system.records import record_from_dict, record_to_compact_dict
 
 @dataclass(frozen=True, kw_only=True)
 class StatusRecord:
-    """status.json; None for what a stage does not say."""
+    """status.json; None for what a stage does not record."""
 
     state: str = "new"
     """new (nothing is written yet), queued, running, stopped, done or failed."""
@@ -27,20 +27,20 @@ class StatusRecord:
     iteration: int | None = None
     iterations: int | None = None
     images_drawn: float | None = None
-    """How many photographs' worth of pixels were drawn; None where every iteration draws a whole one."""
+    """How many images' worth of pixels were drawn; None where every iteration draws a whole one."""
     anchors: int | None = None
     psnr_training: float | None = None
     seconds: float | None = None
     seconds_left: int | None = None
     peak_memory_bytes: int | None = None
     model_id: str | None = None
-    """What tells the finished model from any other (`storage.tensors.identity`)."""
+    """The identity of the finished model (`system.tensors.file_id`)."""
 
     # Of a merged scene:
     blocks_trained: int | None = None
     blocks: tuple[MergedBlockRecord, ...] | None = None
     block_models: tuple[str | None, ...] | None = None
-    """`model` of each block; None for one that is missing."""
+    """`model_id` of each block; None for one that is missing."""
     merge_seconds: float | None = None
     merge_peak_memory_bytes: int | None = None
 
@@ -61,7 +61,7 @@ class StageFolder:
 
     @property
     def initialization_file(self) -> Path:
-        """What was found before the first step of the coarse stage."""
+        """What the coarse stage started from."""
         return self.path / "start.json"
 
     @property
@@ -94,17 +94,16 @@ class StageFolder:
         return self.path / "key"
 
     def key(self) -> str | None:
-        """For which settings (`stages/keys.py`) this folder works; None if it says nothing of it."""
+        """The key (`stage_keys`) that this folder works for; None if it has none."""
         try:
             return self.key_file.read_text(encoding="ascii", errors="replace").strip()
         except OSError:
             return None
 
     def reset_unless(self, key: str) -> None:
-        """Delete what is here unless it was made for these settings, and let the folder work for them from now on.
+        """Delete what is here unless it was made for this key, and write the key.
 
-        What was made for other or unknown settings goes first and the key is written last: a folder never holds what
-        its key does not say.
+        The key is written last: a folder never holds work of other settings than those of its key.
         """
         if self.key() == key:
             return
@@ -117,7 +116,7 @@ class StageFolder:
         write_text(self.key_file, key + "\n")
 
     def has_output(self) -> bool:
-        """Something was trained here."""
+        """Whether something was trained here."""
         return self.model.exists() or any(self.checkpoints.glob("*.json"))
 
     def is_done(self, key: str | None = None) -> bool:
@@ -126,12 +125,12 @@ class StageFolder:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Hold this stage for this process; RunError if another one works on it."""
+        """Lock this stage for this process; RunError if another one works on it."""
         with lock_folder(self.path):
             yield
 
     def is_locked_elsewhere(self) -> bool:
-        """Another process works on this stage. A folder that cannot be written is held by none."""
+        """Whether another process works on this stage. A folder that cannot be written is locked by none."""
         try:
             with self.locked():
                 return False
@@ -142,11 +141,11 @@ class StageFolder:
         """Drop log lines after `iteration` (and a half-written last one), so that a continued run repeats none."""
         if not self.log.exists():
             return
-        kept = []
+        lines = []
         for line in self.log.read_text(encoding="utf-8", errors="replace").splitlines():
             try:
                 if json.loads(line)["iteration"] <= iteration:
-                    kept.append(line)
+                    lines.append(line)
             except (ValueError, KeyError, TypeError):
                 break
-        write_text(self.log, "".join(line + "\n" for line in kept))
+        write_text(self.log, "".join(line + "\n" for line in lines))

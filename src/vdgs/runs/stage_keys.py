@@ -52,5 +52,5 @@ def stage_keys(settings: RunSettings, coarse_model: str | None = None) -> StageK
 
 def hashable_settings(section: str, settings: dict[str, Any]) -> dict[str, Any]:
     """The settings of a section that keys are made of: one that needs another counts only beside it."""
-    idle = {("capture", "path"), *(each for each, needed in REQUIRED_SETTINGS.items() if not settings.get(needed))}
-    return {name: value for name, value in settings.items() if (section, name) not in idle}
+    ignored = {("capture", "path"), *(each for each, needed in REQUIRED_SETTINGS.items() if not settings.get(needed))}
+    return {name: value for name, value in settings.items() if (section, name) not in ignored}
