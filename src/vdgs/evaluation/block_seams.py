@@ -33,6 +33,20 @@ from vdgs.evaluation.by_block import (
     border_pixels,
     visible_blocks,
 )
+from vdgs.evaluation.comparison_images import (
+    ERROR_LABEL,
+    ERROR_LIMIT,
+    PANEL_MAX_PX,
+    PANEL_MIN_PX,
+    Panel,
+    absolute_error,
+    colorize,
+    draw_panels,
+    load_font,
+    panel_size,
+    resize,
+    unique_file_stems,
+)
 from vdgs.evaluation.metric_tables import format_value
 from vdgs.evaluation.metrics import masked_mean, psnr_from_mse, squared_error, to_8bit
 from vdgs.evaluation.renderable_model import ReferenceViews
@@ -75,7 +89,7 @@ class SeamView:
 class BlockInputs:
     """Where the images of a view come from. `render_merged` draws depth; the labels follow from the median one.
     `render_block(index, camera)` is the image of a block as it was trained, among its frozen surroundings; None where
-    it was not trained. All are measured in the exposure of the view, as in `MeasuredModel`."""
+    it was not trained. All are measured in the exposure of the view, as in `RenderableModel`."""
 
     reference_views: ReferenceViews
     render_coarse: Callable[[Camera], Raster]
@@ -101,29 +115,26 @@ class BlockViewMetrics:
 
 def evaluate_blocks(inputs: BlockInputs, output: Path) -> BlockMetricsDocument:
     """Measure every test view, write `output`, and return what `by_block.json` holds. One view is in memory at a time,
-    and those that are drawn.
-
-    The figure of a block that was not trained is null. Raises RunError without views.
-    """
+    and the seam images. The figure of a block that was not trained is null. Raises RunError without views."""
     views = inputs.reference_views.views
     if not views:
         raise RunError(f"{output}: there are no test views. Hold some out when the capture is read.")
-    measured, seen = list[BlockViewMetrics](), list[SeamView]()
-    for view, stem in zip(views, comparison_images.unique_file_stems([view.name for view in views]), strict=True):
+    measured, shown = list[BlockViewMetrics](), list[SeamView]()
+    for view, stem in zip(views, unique_file_stems([view.name for view in views]), strict=True):
         check_stop_requested()
-        figures, picture = measure_block_view(view, stem, inputs)
+        figures, seam_view = measure_block_view(view, stem, inputs)
         measured.append(figures)
-        seen.append(picture)
-        seen = [seen[place] for place in select_seam_views([each.border_pixel_count for each in seen])]
-    for each in seen:
+        shown.append(seam_view)
+        shown = [shown[index] for index in select_seam_views([each.border_pixel_count for each in shown])]
+    for each in shown:
         save_seam_image(output / "seams" / f"{each.stem}.png", each)
     return summarize_blocks(measured, len(inputs.blocks), output)
 
 
 def select_seam_views(border_pixels: Sequence[int]) -> list[int]:
     """Which of the views are drawn, by the number of border pixels of each: those with most, the first of equals."""
-    best = sorted(range(len(border_pixels)), key=lambda place: -border_pixels[place])[:MAX_SEAM_VIEWS]
-    return [place for place in best if border_pixels[place]]
+    best = sorted(range(len(border_pixels)), key=lambda index: -border_pixels[index])[:MAX_SEAM_VIEWS]
+    return [index for index in best if border_pixels[index]]
 
 
 def save_seam_image(path: Path, view: SeamView) -> None:
@@ -137,20 +148,16 @@ def summarize_blocks(per_view_metrics: Iterable[BlockViewMetrics], blocks: int, 
         by_block.merge(figures.by_block)
         seams.merge(figures.seams)
         rows.append(figures.row)
+    seam_figures = {"border_px": BORDER_PX, **seams.figures()}
     result: BlockMetricsDocument = to_jsonable(
-        {
-            "blocks": by_block.rows(),
-            "all": by_block.overall(),
-            "seams": {"border_px": BORDER_PX, **seams.figures()},
-            "views": rows,
-        }
+        {"blocks": by_block.rows(), "all": by_block.overall(), "seams": seam_figures, "views": rows}
     )
     write_json(output / "by_block.json", result)
     return result
 
 
 def measure_block_view(view: View, stem: str, inputs: BlockInputs) -> tuple[BlockViewMetrics, SeamView]:
-    """Measure a view; what it comes to, and what a picture of it shows."""
+    """Measure a view: its figures, and what a seam image of it shows."""
     by_block, seams = BlockMetrics(len(inputs.blocks), RENDER_NAMES), SeamMetrics()
     reference, mask = inputs.reference_views.load_image(view), inputs.reference_views.load_mask(view)
     drawn = inputs.render_merged(view.camera)
@@ -160,21 +167,20 @@ def measure_block_view(view: View, stem: str, inputs: BlockInputs) -> tuple[Bloc
     isolated = _isolated_errors(view, labels, reference, inputs)
     by_block.add(labels, squared | {"isolated": isolated}, mask)
     errors = {f"mse_{name}": values for name, values in squared.items()}
-    errors["mae_coarse"] = comparison_images.absolute_error(coarse, reference)
-    errors["mae_merged"] = comparison_images.absolute_error(merged, reference)
+    errors |= {"mae_coarse": absolute_error(coarse, reference), "mae_merged": absolute_error(merged, reference)}
     seams.add(labels, errors, mask)
-    kept = border_pixels(labels) if mask is None else border_pixels(labels) & mask
-    seen = SeamView(
+    border = border_pixels(labels) if mask is None else border_pixels(labels) & mask
+    seam_view = SeamView(
         name=view.name, stem=stem, coarse=coarse, merged=merged, reference=reference, mask=mask, labels=labels,
-        border=kept,
+        border=border,
     )  # fmt: skip
     row = {
         "name": view.name,
-        "border_pixels": seen.border_pixel_count,
+        "border_pixels": seam_view.border_pixel_count,
         **{f"psnr_{name}": psnr_from_mse(masked_mean(values, mask)) for name, values in squared.items()},
-        **{f"psnr_{name}_border": _psnr_within(values, kept) for name, values in squared.items()},
+        **{f"psnr_{name}_border": _psnr_within(values, border) for name, values in squared.items()},
     }
-    return BlockViewMetrics(row, by_block, seams), seen
+    return BlockViewMetrics(row, by_block, seams), seam_view
 
 
 def _psnr_within(values: Float[np.ndarray, "h w"], where: Bool[np.ndarray, "h w"]) -> float | None:
@@ -197,20 +203,17 @@ def _isolated_errors(
 def draw_seam_image(view: SeamView) -> Image.Image:
     """Coarse | merged | merged with the borders of blocks | error of the merged render, labelled."""
     height, width = view.labels.shape
-    size = comparison_images.panel_size(width, height, comparison_images.PANEL_MIN_PX, comparison_images.PANEL_MAX_PX)
-    error = comparison_images.absolute_error(view.merged, view.reference)
+    size = panel_size(width, height, PANEL_MIN_PX, PANEL_MAX_PX)
+    error = absolute_error(view.merged, view.reference)
     if view.mask is not None:
         error = np.where(view.mask, error, np.nan)
     panels = [
-        comparison_images.Panel(comparison_images.resize(view.coarse, size), "coarse", _caption(view.coarse, view)),
-        comparison_images.Panel(comparison_images.resize(view.merged, size), "merged", _caption(view.merged, view)),
-        comparison_images.Panel(draw_block_borders(view.merged, view.labels, size), "borders of blocks"),
-        comparison_images.Panel(
-            comparison_images.resize(comparison_images.colorize(error, comparison_images.ERROR_LIMIT), size),
-            f"merged: {comparison_images.ERROR_LABEL}",
-        ),
+        Panel(resize(view.coarse, size), "coarse", _caption(view.coarse, view)),
+        Panel(resize(view.merged, size), "merged", _caption(view.merged, view)),
+        Panel(draw_block_borders(view.merged, view.labels, size), "borders of blocks"),
+        Panel(resize(colorize(error, ERROR_LIMIT), size), f"merged: {ERROR_LABEL}"),
     ]
-    return comparison_images.draw_panels(panels, view.name, comparison_images.ERROR_LIMIT)
+    return draw_panels(panels, view.name, ERROR_LIMIT)
 
 
 def _caption(image: UInt8[np.ndarray, "h w 3"], view: SeamView) -> str:
@@ -226,14 +229,14 @@ def draw_block_borders(
     shown_labels = cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST)
     lines = border_lines(shown_labels)
     rim = cv2.dilate(lines.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    pixels = np.asarray(comparison_images.resize(image, size)).copy()
+    pixels = np.asarray(resize(image, size)).copy()
     pixels[rim], pixels[lines] = OUTLINE_COLOR, LINE_COLOR
-    picture = Image.fromarray(pixels)
-    draw, face = ImageDraw.Draw(picture), comparison_images.load_font(max(12, size[0] // 34), bold=True)
+    drawn = Image.fromarray(pixels)
+    draw, face = ImageDraw.Draw(drawn), load_font(max(12, size[0] // 34), bold=True)
     for index in visible_blocks(shown_labels, int(shown_labels.max(initial=-1)) + 1):
-        place = _label_position(shown_labels == index)
-        draw.text(place, str(index), LINE_COLOR, face, anchor="mm", stroke_width=2, stroke_fill=OUTLINE_COLOR)
-    return picture
+        position = _label_position(shown_labels == index)
+        draw.text(position, str(index), LINE_COLOR, face, anchor="mm", stroke_width=2, stroke_fill=OUTLINE_COLOR)
+    return drawn
 
 
 def _label_position(region: Bool[np.ndarray, "h w"]) -> tuple[int, int]:
@@ -259,11 +262,8 @@ def make_block_table(result: Mapping[str, Any]) -> RenderableType:
 def _cells(row: Mapping[str, Any]) -> list[str]:
     coarse, isolated, merged = (row[f"psnr_{name}"] for name in RENDER_NAMES)
     gain = None if coarse is None or merged is None else merged - coarse
-    return [
-        f"{row['pixels']:,}",
-        *(format_value(each, "{:.2f}") for each in (coarse, isolated, merged)),
-        format_value(gain, "{:+.2f}"),
-    ]
+    values = [format_value(each, "{:.2f}") for each in (coarse, isolated, merged)]
+    return [f"{row['pixels']:,}", *values, format_value(gain, "{:+.2f}")]
 
 
 def _seam_line(seams: Mapping[str, Any]) -> str:
@@ -271,6 +271,6 @@ def _seam_line(seams: Mapping[str, Any]) -> str:
         return "no border between blocks is in sight"
     coarse, merged = (format_value(seams[f"mae_{name}"]["ratio"], "{:.3f}") for name in SeamMetrics.RENDER_NAMES)
     return (
-        f"error within {seams['border_px']:.0f} px of a border over error elsewhere: merged {merged}, coarse {coarse} "
-        f"(which has no seams); merged over coarse {format_value(seams['seam_mae_ratio'], '{:.3f}')}"
+        f"error within {seams['border_px']:.0f} px of a border over error in the interior: merged {merged}, "
+        f"coarse {coarse} (which has no seams); merged over coarse {format_value(seams['seam_mae_ratio'], '{:.3f}')}"
     )

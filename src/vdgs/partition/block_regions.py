@@ -28,12 +28,12 @@ RAMP_TABLE_SIZE = 512
 def split_trainable_anchors(anchors: Anchors, blocks: Blocks, index: int, config: BlockConfig) -> tuple[Tensor, Tensor]:
     """What a block moves and what it only draws, as two masks [n].
 
-    Own are the anchors that the block owns (with a ring that is not frozen: that it reaches). Around it are the ring
-    and, with `config.context`, everything else.
+    Own are the anchors of the core (with a ring that is not frozen: of the widened block). Around are the ring and,
+    with `config.draw_outside`, everything else.
     """
-    place = xy_positions(anchors.positions)
-    owner = blocks.owner(place)
-    core, reached = owner == index, blocks.in_expanded(index, place, owner)
+    points = xy_positions(anchors.positions)
+    owner = blocks.owner(points)
+    core, reached = owner == index, blocks.in_expanded(index, points, owner)
     own = core if config.margin == "frozen" else reached
     around = ~own if config.draw_outside else reached & ~own
     device = anchors.positions.device
@@ -49,38 +49,34 @@ def visible_anchors(anchors: Anchors, cameras: Sequence[Camera]) -> Bool[Tensor,
 
 
 def growth_mask(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Tensor], Tensor]:
-    """Which places may get new anchors: those of which the merge keeps what stands there."""
+    """Which points may get new anchors: those whose anchors the merge takes from the block."""
 
     def inside(positions: Float[Tensor, "p 3"]) -> Bool[Tensor, " p"]:
-        place = xy_positions(positions)
-        kept = blocks.owner(place) == index if config.margin == "frozen" else blocks.in_expanded(index, place)
-        return torch.from_numpy(kept).to(positions.device)
+        points = xy_positions(positions)
+        grows = blocks.owner(points) == index if config.margin == "frozen" else blocks.in_expanded(index, points)
+        return torch.from_numpy(grows).to(positions.device)
 
     return inside
 
 
 def lr_ramp(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Tensor], Tensor] | None:
-    """The learning-rate mask of a ring that is a ramp: 1 wherever the block owns the place, and where another does,
-    falling linearly from the core to 0 at the widened boundary.
-
-    Read from a table over the block, since it is asked in every step.
-    """
+    """The learning-rate mask of a ramp: 1 where the block owns the point, elsewhere falling linearly from the core to 0
+    at the widened boundary. It reads a table, because every step calls it."""
     if config.margin != "ramp":
         return None
     block = blocks.items[index]
     low, high = np.array(block.expanded.bounds[:2]), np.array(block.expanded.bounds[2:])
-    centers = (np.indices((RAMP_TABLE_SIZE, RAMP_TABLE_SIZE)).reshape(2, -1).T + 0.5) / RAMP_TABLE_SIZE * (
-        high - low
-    ) + low
+    cells = np.indices((RAMP_TABLE_SIZE, RAMP_TABLE_SIZE)).reshape(2, -1).T
+    centers = (cells + 0.5) / RAMP_TABLE_SIZE * (high - low) + low
     points = shapely.points(centers)
     inwards, outwards = shapely.distance(block.core, points), shapely.distance(block.expanded.boundary, points)
     share = np.where(shapely.contains(block.expanded, points), outwards / np.maximum(inwards + outwards, 1e-12), 0.0)
     share = np.where(blocks.owner(centers) == index, 1.0, share)
-    made = share.astype(np.float32).reshape(RAMP_TABLE_SIZE, RAMP_TABLE_SIZE), low, (high - low) / RAMP_TABLE_SIZE
+    arrays = share.astype(np.float32).reshape(RAMP_TABLE_SIZE, RAMP_TABLE_SIZE), low, (high - low) / RAMP_TABLE_SIZE
 
     @cache
     def on(device: torch.device) -> list[Tensor]:
-        return [torch.from_numpy(each).to(device) for each in made]
+        return [torch.from_numpy(each).to(device) for each in arrays]
 
     def rate_mask(positions: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:
         table, origin, cell = on(positions.device)

@@ -27,7 +27,7 @@ from vdgs.system.documents import JsonObject
 
 
 def xy_positions(positions: Float[Tensor, "n 3"] | Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
-    """x and y of anchors as all who ask for owners give them, in float64: the same bits have the same owner."""
+    """x and y of anchors in float64, the form in which owners are looked up: the same bits have the same owner."""
     return torch.as_tensor(positions)[:, :2].double().cpu().numpy()
 
 
@@ -49,9 +49,9 @@ class Blocks:
         return len(self.items)
 
     def owner(self, points: Float[np.ndarray, "n 2"]) -> Int64[np.ndarray, " n"]:
-        """The block of every place: whose core holds it, else whose core is nearest (the first of equals).
+        """The block of every point: whose core holds it, else whose core is nearest (the first of equals).
 
-        A million places among sixteen cores take about a second. Raises ValueError if a place is not finite.
+        Raises ValueError if a point is not finite.
         """
         return self._cores.nearest(points)
 
@@ -62,8 +62,7 @@ class Blocks:
     def in_expanded(
         self, index: int, points: Float[np.ndarray, "n 2"], owner: Int64[np.ndarray, " n"] | None = None
     ) -> Bool[np.ndarray, " n"]:
-        """Which places belong to the widened block: inside its boundary, or owned by it. `owner` of the places saves
-        asking for it, where several blocks are looked at."""
+        """Which points belong to the widened block: inside its boundary, or owned by it (`owner`, if already known)."""
         boundary = self.items[index].expanded
         reached = (self.owner(points) if owner is None else owner) == index
         (west, south), (east, north) = np.array(boundary.bounds).reshape(2, 2)
@@ -79,9 +78,9 @@ def save_blocks(
     properties: Sequence[Mapping[str, object]],
     scene_properties: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write cores and widened boundaries as a FeatureCollection, atomically, with `facts` of each block and `of_all`.
+    """Write cores and widened boundaries with `properties` of each block as a FeatureCollection, atomically.
 
-    Coordinates keep all digits: what is read owns exactly what was written.
+    Coordinates keep all digits: blocks that are read own exactly what they owned before.
     """
     write_json(path, _feature_collection(blocks, properties) | dict(scene_properties or {}))
 
@@ -99,19 +98,20 @@ def save_blocks_wgs84(
     origin, level_at = ground.origin_geo, ground.axes_origin
 
     def on_earth(shape: shapely.Polygon) -> shapely.Polygon:
-        turned = shapely.transform(shape, lambda places: _longitude_latitude(places, origin, level_at))
-        return shapely.orient_polygons(turned)
+        return shapely.orient_polygons(
+            shapely.transform(shape, lambda points: _longitude_latitude(points, origin, level_at))
+        )
 
-    turned = Blocks(tuple(Block(on_earth(block.core), on_earth(block.expanded)) for block in blocks.items))
-    write_json(path, _feature_collection(turned, properties))
+    geographic = Blocks(tuple(Block(on_earth(block.core), on_earth(block.expanded)) for block in blocks.items))
+    write_json(path, _feature_collection(geographic, properties))
 
 
 def _longitude_latitude(
-    places: Float[np.ndarray, "n 2"], origin: tuple[float, float, float], level_at: tuple[float, float]
+    points: Float[np.ndarray, "n 2"], origin: tuple[float, float, float], level_at: tuple[float, float]
 ) -> Float[np.ndarray, "n 2"]:
-    """Degrees of places east and north of `origin` (lat deg, lon deg, alt m), at its height; the axes are east and
+    """Degrees of points east and north of `origin` (lat deg, lon deg, alt m), at its height; the axes are east and
     north at `axes_origin` (lat deg, lon deg)."""
-    geodetic = geodetic_from_enu(np.column_stack([places, np.zeros(len(places))]), origin, level_at)
+    geodetic = geodetic_from_enu(np.column_stack([points, np.zeros(len(points))]), origin, level_at)
     longitude = geodetic[:, 1]
     return np.column_stack([longitude + 360 * np.round((origin[1] - longitude) / 360), geodetic[:, 0]])
 
@@ -139,19 +139,13 @@ def load_blocks(path: Path) -> Blocks:
         return Blocks(tuple(Block(shapes[index, "core"], shapes[index, "expanded"]) for index in range(count)))
     except FileNotFoundError as error:
         raise RunError(f"{path}: is not there. Cut the scene first: vdgs partition RUN") from error
-    except KeyError as error:
-        raise RunError(f"{path}: is damaged ({error} is missing). Cut the scene again: vdgs partition RUN") from error
-    except (OSError, ValueError, TypeError, AttributeError, IndexError, shapely.errors.ShapelyError) as error:
+    except (OSError, ValueError, TypeError, AttributeError, LookupError, shapely.errors.ShapelyError) as error:
         raise RunError(f"{path}: is damaged ({error}). Cut the scene again: vdgs partition RUN") from error
 
 
 def _polygon(feature: JsonObject) -> shapely.Polygon:
     """The polygon of a feature. Raises ValueError if it is another shape, empty, or holds numbers that are none."""
     shape = shapely.geometry.shape(feature["geometry"])
-    if (
-        not isinstance(shape, shapely.Polygon)
-        or shape.is_empty
-        or not np.isfinite(shapely.get_coordinates(shape)).all()
-    ):
-        raise ValueError("a boundary is not a polygon")
-    return shape
+    if isinstance(shape, shapely.Polygon) and not shape.is_empty and np.isfinite(shapely.get_coordinates(shape)).all():
+        return shape
+    raise ValueError("a boundary is not a polygon")

@@ -39,34 +39,18 @@ def block_cores(
     """
     cell = cell_size(points, count)
     shapes = {label: _outline(members, cell) for label, members in _components(points, labels, count, cell).items()}
-    cores: list[shapely.Polygon | None] = [None] * count
-    taken = _TakenArea(list(shapes.values()))
-    for place, label in sorted(enumerate(shapes), key=lambda each: (shapes[each[1]].area, each[1])):
-        core = _remove_slivers(largest_part(shapes[label].difference(taken.about(place))), cell / 2)
-        if not core.is_empty:
-            cores[label] = core
-            taken.take(place, core)
-    return cores
-
-
-class _TakenArea:
-    """What the cores of smaller shapes take of the plane; asked about one shape at a time, of all that there are."""
-
-    def __init__(self, shapes: list[shapely.Polygon]) -> None:
-        self._shapes, self._tree = shapes, shapely.STRtree(shapes)
-        self._cores: dict[int, shapely.Polygon] = {}
-
-    def about(self, place: int) -> shapely.Geometry:
-        """The union of the cores whose shapes may touch this one, in the order in which they were taken."""
-        near = set(self._tree.query(self._shapes[place]).tolist())
+    labels_of = list(shapes)
+    tree, cores = shapely.STRtree(list(shapes.values())), dict[int, shapely.Polygon]()
+    for label in sorted(shapes, key=lambda each: (shapes[each].area, each)):
+        near = {labels_of[index] for index in tree.query(shapes[label]).tolist()}
         taken: shapely.Geometry = shapely.Polygon()
-        for other, core in self._cores.items():
+        for other, core in cores.items():
             if other in near:
                 taken = taken.union(core)
-        return taken
-
-    def take(self, place: int, core: shapely.Polygon) -> None:
-        self._cores[place] = core
+        core = _remove_slivers(largest_part(shapes[label].difference(taken)), cell / 2)
+        if not core.is_empty:
+            cores[label] = core
+    return [cores.get(label) for label in range(count)]
 
 
 def expand_core(core: shapely.Polygon, expansion: float) -> shapely.Polygon:
@@ -121,19 +105,19 @@ def _components(points: np.ndarray, labels: np.ndarray, count: int, cell: float)
     members = np.split(
         own[np.argsort(labels[own], kind="stable")], np.cumsum(np.bincount(labels[own], minlength=count))
     )
-    found = {}
+    result = {}
     for label, window in enumerate(ndimage.find_objects(strongest + 1, count)):
-        at_home = members[label]
-        if window is None or len(at_home) == 0:
+        home = members[label]
+        if window is None or len(home) == 0:
             continue
         window = _grow_window(window, CLOSING_CELLS, strongest.shape)
         components = ndimage.label(
             ndimage.binary_closing(strongest[window] == label, EIGHT_NEIGHBORS), EIGHT_NEIGHBORS
         )[0]
-        row, column = np.divmod(flat[at_home], columns)
+        row, column = np.divmod(flat[home], columns)
         component = components[row - window[0].start, column - window[1].start]
-        found[label] = points[at_home[component == np.bincount(component).argmax()]]
-    return found
+        result[label] = points[home[component == np.bincount(component).argmax()]]
+    return result
 
 
 def _dominant_cluster(
@@ -178,11 +162,7 @@ def _grow_window(window: tuple[slice, slice], cells: int, shape: tuple[int, ...]
 def _outline(points: Float[np.ndarray, "m 2"], cell: float) -> shapely.Polygon:
     """The α-shape of a component, simplified to what a cell can tell. One or two points, or a line, get a buffer."""
     spacing = cell / 4
-    thinned = points
-    while True:
-        thinned = points[_first_of_cells(points, spacing)]
-        if len(thinned) <= MAX_OUTLINE_POINTS:
-            break
+    while len(thinned := points[_first_of_cells(points, spacing)]) > MAX_OUTLINE_POINTS:
         spacing *= np.sqrt(2)
     shape = alpha_shape(thinned, ALPHA_CELLS * cell)
     if shape is None or shape.area < (cell / 4) ** 2:

@@ -1,7 +1,6 @@
-"""Anchors clustered by place and visibility (eq. 5), plainly or into clusters of about equal size.
+"""Clusters anchors by position and visibility (eq. 5), plainly or into clusters of about equal size.
 
-All functions expect anchors in a canonical order (`cut.py`), which makes their results independent of the order in
-which the model holds them.
+Anchors come in a canonical order (`partition_scene`): results do not depend on the order of the model.
 """
 
 from __future__ import annotations
@@ -156,12 +155,8 @@ def _squared_distances(features: np.ndarray, centers: np.ndarray) -> Float[np.nd
 def _assign_clusters(features: np.ndarray, centers: np.ndarray, weights: np.ndarray) -> Int64[np.ndarray, " n"]:
     """The centre of least |f - c|² - w, in chunks that keep memory small."""
     chunk = max(1, DISTANCES_PER_CHUNK // len(centers))
-    return np.concatenate(
-        [
-            (_squared_distances(features[start : start + chunk], centers) - weights).argmin(axis=1)
-            for start in range(0, len(features), chunk)
-        ]
-    )
+    parts = (features[start : start + chunk] for start in range(0, len(features), chunk))
+    return np.concatenate([(_squared_distances(part, centers) - weights).argmin(axis=1) for part in parts])
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,6 @@
-"""Trained blocks become one scene: every place takes its anchors from exactly one block.
+"""Merges trained blocks into one scene: every point of the plane takes its anchors from exactly one block.
 
-Merging is a selection by place: no anchor is changed, averaged or added. A block's training moves, grows and prunes
-only what its cameras see; where they see nothing, its anchors are the coarse ones still, and so is the merged scene.
+No anchor is changed, averaged or added. Where the cameras of a block see nothing, its anchors stay the coarse ones.
 
 Symbols: V_i, the number of cameras that hold anchor i in their frustum (section IV-B of the paper).
 """
@@ -38,11 +37,10 @@ def merge_blocks(
 ) -> tuple[AnchorModel, list[MergedBlockRecord]]:
     """One model from the trained blocks, and what became of the anchors of each block.
 
-    A trained model holds the anchors that its block was free to move: those that it owns, and those of its ring unless
-    that was frozen. The result keeps, block after block and in their order, the anchors of each block at the places
-    that the rule gives to it. With `allow_missing` the coarse anchors stand in at places whose owner is None.
-    Memory: the coarse anchors, the merged ones, and half of those again while they are put together. Trained ones may
-    be given by what opens them: one block at a time is then open.
+    A trained model holds the anchors that its block was free to move: its own, and those of its ring unless frozen. The
+    result holds, block after block, the anchors of each block at the points that the rule gives to it. With
+    `allow_missing` the coarse anchors stand in for a block that is None. A model may be given by a function that loads
+    it: then one block at a time is in memory. Memory: coarse and merged anchors, and half of the merged ones again.
 
     Raises VdgsError for a missing block (unless allowed), and for a block that shows that it was not trained from
     `coarse`: by its grid, or by other bits of a frozen decoder.
@@ -55,34 +53,30 @@ def merge_blocks(
     if missing and not allow_missing:
         raise VdgsError(_missing_message(missing))
     coarse_owner = blocks.owner(xy_positions(coarse.anchors.positions)) if missing else None
-    selected, pieces, became, own = [], [], [], False
+    selected, spans, records, own_decoder = [], [], [], False
     for index, given in enumerate(block_models):
         model = given() if callable(given) else given
         if model is None:
             assert coarse_owner is not None
-            piece = coarse.anchors.select(torch.from_numpy(coarse_owner == index))
-            trained_here, kept, from_coarse = 0, 0, len(piece)
+            anchors = coarse.anchors.select(torch.from_numpy(coarse_owner == index))
+            trained, kept = 0, 0
         else:
             _check_coarse_model(index, model, coarse)
-            givers = block_of_points(model.anchors.positions, blocks, cameras_of_block, config, missing)
-            piece = model.anchors.select(torch.from_numpy(givers == index))
-            trained_here, kept, from_coarse = len(model.anchors), len(piece), 0
-            own = own or has_own_decoder(model)
-        unseen = int((count_visibility(piece.positions, cameras_of_block[index]) == 0).sum())
+            sources = block_of_points(model.anchors.positions, blocks, cameras_of_block, config, missing)
+            anchors = model.anchors.select(torch.from_numpy(sources == index))
+            trained, kept = len(model.anchors), len(anchors)
+            own_decoder = own_decoder or has_own_decoder(model)
+        unseen = int((count_visibility(anchors.positions, cameras_of_block[index]) == 0).sum())
         # A copy: a tensor of a file keeps all of the file in memory.
-        pieces.append(DecoderSpan(len(piece), coarse.decoder if model is None else model.decoder.copy()))
-        selected.append(piece.tensors())
-        became.append(
+        spans.append(DecoderSpan(len(anchors), coarse.decoder if model is None else model.decoder.copy()))
+        selected.append(anchors.tensors())
+        records.append(
             MergedBlockRecord(
-                block=index,
-                trained=trained_here,
-                kept=kept,
-                dropped=trained_here - kept,
-                coarse_fallback=from_coarse,
-                unseen=unseen,
+                block=index, trained=trained, kept=kept, dropped=trained - kept,
+                coarse_fallback=len(anchors) if model is None else 0, unseen=unseen,
             )
-        )
-    return replace(coarse, anchors=_concatenate(selected), decoder_spans=tuple(pieces) if own else ()), became
+        )  # fmt: skip
+    return replace(coarse, anchors=_concatenate(selected), decoder_spans=tuple(spans) if own_decoder else ()), records
 
 
 def has_own_decoder(model: AnchorModel) -> bool:
@@ -97,28 +91,27 @@ def block_of_points(
     config: MergeConfig,
     missing: Sequence[int] = (),
 ) -> Int64[np.ndarray, " n"]:
-    """The block whose anchors stay at each place: a function of the place alone, so that blocks never overlap.
+    """The block whose anchors stay at each point: a function of the point alone, so that blocks never overlap.
 
-    `owner`: the owner. `best_seen`: among the blocks that reach the place, the one whose cameras see it most; of equals
-    the owner, else the first. What a `missing` block owns stays with it, and it is given nothing more.
-    O(n) memory; `best_seen` costs a count of visibility for each block.
+    `owner`: the owner. `max-visibility`: among the blocks that reach the point, the one whose cameras see it most; of
+    equals the owner, else the first. A `missing` block keeps what it owns, and gets nothing more. O(n) memory.
     """
-    places = xy_positions(positions)
-    owner = blocks.owner(places)
+    points = xy_positions(positions)
+    owner = blocks.owner(points)
     if config.rule == "owner":
         return owner
-    giver = owner.copy()
-    most = np.full(len(places), -1, np.int64)
+    source = owner.copy()
+    most = np.full(len(points), -1, np.int64)
     # The owner is counted first and others must see strictly more: of equals it keeps the place.
     for index in range(len(blocks)):
         rows = np.flatnonzero(owner == index)
         most[rows] = _visibility(positions, rows, cameras_of_block[index])
     for index in (each for each in range(len(blocks)) if each not in missing):
-        rows = np.flatnonzero(blocks.in_expanded(index, places, owner) & (owner != index) & ~np.isin(owner, missing))
+        rows = np.flatnonzero(blocks.in_expanded(index, points, owner) & (owner != index) & ~np.isin(owner, missing))
         visibility = _visibility(positions, rows, cameras_of_block[index])
         better = visibility > most[rows]
-        giver[rows[better]], most[rows[better]] = index, visibility[better]
-    return giver
+        source[rows[better]], most[rows[better]] = index, visibility[better]
+    return source
 
 
 def _visibility(positions: Float[Tensor, "n 3"], rows: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
@@ -126,19 +119,16 @@ def _visibility(positions: Float[Tensor, "n 3"], rows: np.ndarray, cameras: Sequ
     return count_visibility(positions[torch.from_numpy(rows)], cameras).numpy()
 
 
-def _concatenate(pieces: Sequence[dict[str, Tensor]]) -> Anchors:
-    """One behind the other. Takes the tensors out of the pieces: only those of one name are in memory twice."""
-    return Anchors(**{name: torch.cat([piece.pop(name) for piece in pieces]) for name in list(pieces[0])})
+def _concatenate(parts: Sequence[dict[str, Tensor]]) -> Anchors:
+    """All anchors in one. Takes the tensors out of the parts: only those of one name are in memory twice."""
+    return Anchors(**{name: torch.cat([part.pop(name) for part in parts]) for name in list(parts[0])})
 
 
 def _check_coarse_model(index: int, model: AnchorModel, coarse: AnchorModel) -> None:
     """Where blocks leave the decoder as it is, other bits are another coarse model."""
-    same = has_own_decoder(model) or _decoder_bytes(model.decoder) == _decoder_bytes(coarse.decoder)
-    if (
-        not same
-        or model.anchors.offsets.shape[1] != coarse.anchors.offsets.shape[1]
-        or model.voxel_size != coarse.voxel_size
-    ):
+    same_decoder = has_own_decoder(model) or _decoder_bytes(model.decoder) == _decoder_bytes(coarse.decoder)
+    same_offsets = model.anchors.offsets.shape[1] == coarse.anchors.offsets.shape[1]
+    if not (same_decoder and same_offsets and model.voxel_size == coarse.voxel_size):
         raise VdgsError(
             f"block {index} was trained from another coarse model: its decoder or its grid differs. "
             f"Train it again: vdgs train-blocks RUN --block {index}"

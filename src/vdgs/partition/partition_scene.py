@@ -19,20 +19,19 @@ from vdgs.system.memory.memory_estimate import block_workload, estimate_memory
 #: A block that would own less than this share of the anchors of an average block is not worth training.
 MIN_BLOCK_SHARE = 0.05
 
-#: What `--blocks auto` reckons with (choice): photographs that an average block needs.
+#: `--blocks auto` (choice): images that an average block needs.
 CAMERAS_PER_BLOCK = 50
 
 
 def partition_scene(
     positions: Float[np.ndarray, "n 3"], visibility: Int[np.ndarray, " n"], config: PartitionConfig, seed: int
 ) -> tuple[Blocks, list[str]]:
-    """Cut a scene into blocks by the places of its anchors and their visibility V; and warnings for people.
+    """Cut a scene into blocks by the positions of its anchors and their visibility V; also returns warnings.
 
-    Every place has exactly one owner (`Blocks.owner`). The cut turns, moves and scales with the scene and does not
+    Every point has exactly one owner (`Blocks.owner`). The cut turns, moves and scales with the scene and does not
     depend on the order of the anchors. Blocks are numbered along the longer axis of the scene. There are fewer blocks
-    than asked for, and a warning, where a cluster is the strongest nowhere on the plane (choice: its anchors join the
-    blocks about them). Raises VdgsError if the anchors cannot be cut; ValueError if the number of blocks is still
-    "auto" (`choose_block_count`).
+    than requested, and a warning, where a cluster is the strongest nowhere on the plane (choice: its anchors join the
+    blocks around them). Raises VdgsError if the anchors cannot be cut.
     """
     ground = _checked_positions(positions, visibility)
     if config.blocks == "auto":
@@ -45,17 +44,18 @@ def partition_scene(
     check_distinct(count, ground)
     ground, visibility = _sorted(ground, np.asarray(visibility, np.int64))
     plane = fit_principal_plane(ground)
-    places, visibility = _sorted(plane.to_plane(ground), visibility)
-    features = clustering_features(places, visibility, config.lambda_vis)
+    points, visibility = _sorted(plane.to_plane(ground), visibility)
+    features = clustering_features(points, visibility, config.lambda_vis)
     labels = cluster_anchors(features, count, seed, config.balanced)
-    found = block_cores(places, labels, count)
-    there = [core for core in found if core is not None]
-    cores = _drop_tiny_blocks(sorted(there, key=lambda core: (core.centroid.x, core.centroid.y)), places, count)
-    warnings = []
+    candidates = block_cores(points, labels, count)
+    ordered = sorted(
+        (core for core in candidates if core is not None), key=lambda core: (core.centroid.x, core.centroid.y)
+    )
+    cores, warnings = _drop_tiny_blocks(ordered, points, count), []
     if len(cores) < count:
-        lost = [label for label, core in enumerate(found) if not any(core is kept for kept in cores)]
-        why = _fewer_blocks_reason(places, labels, lost, count, config.lambda_vis)
-        warnings.append(f"the scene is cut into {len(cores)} blocks instead of {count}: {why}")
+        lost = [label for label, core in enumerate(candidates) if not any(core is each for each in cores)]
+        reason = _fewer_blocks_reason(points, labels, lost, count, config.lambda_vis)
+        warnings.append(f"the scene is cut into {len(cores)} blocks instead of {count}: {reason}")
     if len(cores) == 1:
         return _single_block(ground, config.expansion), warnings
     grounded = [plane.to_ground(core) for core in cores]
@@ -71,8 +71,8 @@ def _fewer_blocks_reason(
         len(each) >= MIN_BLOCK_SHARE * len(points) / count and scene_extent(each) < MIN_CELLS * cell for each in members
     ):
         return (
-            f"blocks are told apart on cells of 1/{scene_extent(points) / cell:.0f} of the scene's extent, and the other "
-            f"clusters are less than {MIN_CELLS} such cells across. Fewer blocks avoid this; of places that lie "
+            f"blocks are told apart on cells of 1/{scene_extent(points) / cell:.0f} of the scene's extent, and the "
+            f"other clusters are less than {MIN_CELLS} such cells across. Fewer blocks avoid this; of places that lie "
             "far apart, each is better a run of its own."
         )
     if lambda_vis > 0:
@@ -80,18 +80,15 @@ def _fewer_blocks_reason(
             "the anchors of the other clusters are scattered among those of their neighbours. A smaller --lambda-vis "
             "or fewer blocks avoid this."
         )
-    return (
-        "the other clusters hold hardly any anchors, or lie scattered among their neighbours. Fewer blocks avoid this."
-    )
+    return "the other clusters hold hardly any anchors, or lie scattered among their neighbours. Use fewer blocks."
 
 
 def choose_block_count(n_anchors: int, n_cameras: int, image_pixels: int, method: MethodConfig) -> int:
     """The number of blocks that the settings ask for; for "auto" it follows from the scene and the memory.
 
-    Choice: as few as keep an average block within `block_memory_gb` in training by `memory.estimate`, with photographs
-    of up to `image_pixels`, the rest of the scene about it and half of all anchors in view; photographs that are kept
-    aside. But never fewer than 50 photographs for an average block: where that allows too few blocks, as many as it
-    allows. Few, because blocks cost steps: of one total, a place gets fewer the more there are (reports/findings.md).
+    Choice: the fewest that keep an average block within `block_memory_gb` in training (`estimate_memory`), with images
+    of up to `image_pixels`, the rest of the scene around it and half of all anchors in view, cached images aside; but
+    never fewer than 50 images for an average block. Few, because of one total of steps each block gets fewer.
     """
     config = method.partition
     if config.blocks != "auto":
@@ -132,12 +129,10 @@ def _single_block(ground: np.ndarray, expansion: float) -> Blocks:
 
 
 def _drop_tiny_blocks(cores: list[shapely.Polygon], points: np.ndarray, count: int) -> list[shapely.Polygon]:
-    """The cores that own more than a trifle of the anchors; at least one.
-
-    The least goes first. What it owned goes to others of those that are left; nothing else changes its owner.
-    """
-    found, left = BlockCores(cores), np.arange(len(cores))
-    owner = found.nearest(points)
+    """The cores that own at least MIN_BLOCK_SHARE of an average block; at least one. The smallest goes first, and only
+    what it owned changes its owner."""
+    lookup, left = BlockCores(cores), np.arange(len(cores))
+    owner = lookup.nearest(points)
     while len(left) > 1:
         owned = np.bincount(owner, minlength=len(cores))[left]
         least = int(owned.argmin())
@@ -145,5 +140,5 @@ def _drop_tiny_blocks(cores: list[shapely.Polygon], points: np.ndarray, count: i
             break
         orphans = np.flatnonzero(owner == left[least])
         left = np.delete(left, least)
-        owner[orphans] = found.nearest(points[orphans], among=left)
+        owner[orphans] = lookup.nearest(points[orphans], among=left)
     return [cores[index] for index in left]

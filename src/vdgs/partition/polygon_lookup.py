@@ -1,11 +1,8 @@
-"""The core nearest to each of many places: whole cells of places are decided at once, only places near borders one by
-one.
+"""Finds the core nearest to each of many points: whole cells of points at once, only points near borders one by one.
 
-A cell of half-diagonal r about its centre c belongs to core k as a whole where every other core is farther from c than
-k by more than 2 r. What is left is divided into smaller cells, until looking at the places themselves is cheaper.
-
-Which cores a cell or a place may belong to is kept as pairs, sorted by the first and then by the core: few cores are
-near one place, however many there are.
+A cell of half-diagonal r around its centre c belongs to core k as a whole where every other core is farther from c than
+k by more than 2 r. The other cells are divided, until testing their points is cheaper. The candidate cores of cells and
+points are pairs, sorted by cell or point and then by core: few cores are near one point, however many there are.
 """
 
 from __future__ import annotations
@@ -56,22 +53,20 @@ class BlockCores:
     def nearest(
         self, points: Float[np.ndarray, "n 2"], among: Int64[np.ndarray, " k"] | None = None
     ) -> Int64[np.ndarray, " n"]:
-        """The core of every place: which holds it, else which is nearest; the first of equals. `among`: the cores, at
-        least one and ascending, that are asked; by default all.
-
-        Raises ValueError if a place is not finite.
+        """The core of every point: which holds it, else which is nearest; the first of equals. `among`: the cores to
+        consider, ascending; by default all. Raises ValueError if a point is not finite.
         """
         if not np.isfinite(points).all():
             raise ValueError("places that are not finite numbers have no owner")
-        asked = np.arange(len(self.shapes)) if among is None else among
-        owner = np.full(len(points), asked[0], np.int64)
-        if len(asked) == 1:
+        candidates = np.arange(len(self.shapes)) if among is None else among
+        owner = np.full(len(points), candidates[0], np.int64)
+        if len(candidates) == 1:
             return owner
         # Far places apart from the others: a box that holds them all would have to be divided many times.
         far = ((points < self._box[0]) | (points > self._box[1])).any(axis=1)
         for some in (np.flatnonzero(~far), np.flatnonzero(far)):
             if len(some):
-                owner[some] = self._nearest(points[some], asked)
+                owner[some] = self._nearest(points[some], candidates)
         return owner
 
     def _nearest(

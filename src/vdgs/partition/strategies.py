@@ -47,7 +47,7 @@ MIN_ANCHOR_SHARE = 0.25
 
 
 class PartitionStrategy(Protocol):
-    """A published partition. Blocks own every place, by core or nearest core, as ours do."""
+    """A published partition. Blocks own every point, by core or nearest core, as in `Blocks`."""
 
     @property
     def citation(self) -> str: ...

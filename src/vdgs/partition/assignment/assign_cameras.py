@@ -8,7 +8,7 @@ best views.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int8
@@ -21,7 +21,7 @@ from vdgs.partition.assignment.score_matrix import ScoreMatrix
 from vdgs.partition.block_records import BlockCamerasRecord, BlockRecord
 from vdgs.partition.blocks import Blocks, xy_positions
 
-#: What the numbers in `Assignment.why` mean.
+#: What the numbers in `Assignment.reasons` mean.
 NOT_ASSIGNED, ABOVE_THRESHOLD, BEST_BLOCK, TOPPED_UP = range(4)
 REASONS = ("not assigned", "above the threshold", "the view's best block", "topped up")
 #: field of a row, heading, format
@@ -51,10 +51,10 @@ def assign_cameras(scores: ScoreMatrix, config: AssignmentConfig) -> Assignment:
     """Decide from the scores; the threshold is that of the mode in which they were made.
 
     1. A camera whose score is above the threshold joins, if its frustum holds any anchor of the block's core: without
-       one it has nothing to teach. Mode `literal` asks the score alone, as printed.
+       one it has nothing to teach. Mode `paper` asks the score alone, as printed.
     2. Every camera joins its best block among those of which it holds an anchor. One that holds none joins the block
        with the best score, or where all are 0 the one beneath it: every camera serves at least one block. Not so
-       without `config.best_block`.
+       without `config.always_best`.
     3. Every block with fewer than `config.min_cameras` is topped up with the best of the cameras that hold an anchor of
        it, until it has so many or all of them.
 
@@ -62,17 +62,17 @@ def assign_cameras(scores: ScoreMatrix, config: AssignmentConfig) -> Assignment:
     """
     seen = scores.visible_anchors > 0
     threshold = config.threshold_leave_one_out if scores.mode == "leave-one-out" else config.threshold
-    why = np.zeros(scores.scores.shape, np.int8)
-    why[(scores.scores > threshold) & (seen | (scores.mode == "paper"))] = ABOVE_THRESHOLD
+    reasons = np.zeros(scores.scores.shape, np.int8)
+    reasons[(scores.scores > threshold) & (seen | (scores.mode == "paper"))] = ABOVE_THRESHOLD
     if config.always_best:
-        rows, best = np.arange(len(why)), _best_blocks(scores)
-        why[rows, best] = np.where(why[rows, best] == NOT_ASSIGNED, BEST_BLOCK, why[rows, best])
+        rows, best = np.arange(len(reasons)), _best_blocks(scores)
+        reasons[rows, best] = np.where(reasons[rows, best] == NOT_ASSIGNED, BEST_BLOCK, reasons[rows, best])
     for block in range(len(scores.anchors)):
-        missing = max(config.min_cameras - np.count_nonzero(why[:, block]), 0)
+        missing = max(config.min_cameras - np.count_nonzero(reasons[:, block]), 0)
         order = np.lexsort((-scores.visible_anchors[:, block], -scores.scores[:, block]))
-        candidates = order[seen[order, block] & (why[order, block] == NOT_ASSIGNED)]
-        why[candidates[:missing], block] = TOPPED_UP
-    return Assignment(why != NOT_ASSIGNED, why, _warnings(scores, why, threshold))
+        candidates = order[seen[order, block] & (reasons[order, block] == NOT_ASSIGNED)]
+        reasons[candidates[:missing], block] = TOPPED_UP
+    return Assignment(reasons != NOT_ASSIGNED, reasons, _warnings(scores, reasons, threshold))
 
 
 def _best_blocks(scores: ScoreMatrix) -> np.ndarray:
@@ -85,24 +85,24 @@ def _best_blocks(scores: ScoreMatrix) -> np.ndarray:
     return np.where(blank, scores.nadir_block, best)
 
 
-def _warnings(scores: ScoreMatrix, why: np.ndarray, threshold: float) -> list[str]:
-    complaints = []
+def _warnings(scores: ScoreMatrix, reasons: np.ndarray, threshold: float) -> list[str]:
+    warnings = []
     for block, anchors in enumerate(scores.anchors):
         watching = int(np.count_nonzero(scores.visible_anchors[:, block]))
         if anchors == 0:
-            complaints.append(f"Block {block} holds no anchors. Cut the scene into fewer blocks: --blocks.")
+            warnings.append(f"Block {block} holds no anchors. Cut the scene into fewer blocks: --blocks.")
         elif watching == 0:
-            complaints.append(
+            warnings.append(
                 f"Block {block}: no training camera sees any of its {anchors:,} anchors. It cannot be trained; the "
                 "coarse anchors stay. Fewer blocks (--blocks) would join it to one that is seen."
             )
-        elif not why[:, block].any():
-            complaints.append(
+        elif not reasons[:, block].any():
+            warnings.append(
                 f"Block {block}: {watching} training camera(s) see some of its {anchors:,} anchors, but none scores "
                 f"above {threshold:g} (best: {scores.scores[:, block].max():.3g}). Lower --assignment.threshold or "
                 "raise --assignment.min-cameras."
             )
-    return complaints
+    return warnings
 
 
 @dataclass(frozen=True)
@@ -155,26 +155,18 @@ def assignment_rows(
     blocks: Blocks, positions: Float[np.ndarray, "n 3"], visibility: Int[np.ndarray, " n"], assignment: Assignment
 ) -> list[BlockCamerasRecord]:
     """What was decided for each block."""
-    places = xy_positions(positions)
-    owner = blocks.owner(places)
-    rows = []
-    for index, block in enumerate(blocks.items):
-        own, why = owner == index, assignment.reasons[:, index]
-        rows.append(
-            BlockCamerasRecord(
-                block=index,
-                cameras=int(np.count_nonzero(why)),
-                above_threshold=int(np.count_nonzero(why == ABOVE_THRESHOLD)),
-                best_block=int(np.count_nonzero(why == BEST_BLOCK)),
-                topped_up=int(np.count_nonzero(why == TOPPED_UP)),
-                anchors_core=int(np.count_nonzero(own)),
-                anchors_expanded=int(np.count_nonzero(blocks.in_expanded(index, places, owner))),
-                mean_v=float(visibility[own].mean()) if own.any() else None,
-                std_v=float(visibility[own].std()) if own.any() else None,
-                area=float(block.core.area),
-            )
+    points = xy_positions(positions)
+    owner = blocks.owner(points)
+    return [
+        BlockCamerasRecord(
+            **asdict(row), cameras=int(np.count_nonzero(reasons)),
+            above_threshold=int(np.count_nonzero(reasons == ABOVE_THRESHOLD)),
+            best_block=int(np.count_nonzero(reasons == BEST_BLOCK)),
+            topped_up=int(np.count_nonzero(reasons == TOPPED_UP)),
+            anchors_expanded=int(np.count_nonzero(blocks.in_expanded(row.block, points, owner))),
         )
-    return rows
+        for row, reasons in zip(block_rows(blocks, positions, visibility), assignment.reasons.T, strict=True)
+    ]  # fmt: skip
 
 
 def make_assignment_table(rows: Sequence[BlockCamerasRecord]) -> Table:

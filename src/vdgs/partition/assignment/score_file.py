@@ -1,4 +1,4 @@
-"""The score matrix and what was decided from it, as one file: anyone can ask why a view was chosen."""
+"""The score matrix and the assignment as one file, from which `--explain` reads why a view was chosen."""
 
 from __future__ import annotations
 
@@ -91,10 +91,9 @@ def _check(arrays: dict[str, np.ndarray]) -> None:
     if str(arrays["format"]) != FILE_FORMAT:
         raise ValueError(f"it is not a {FILE_FORMAT} file")
     (cameras,), (blocks,) = arrays["names"].shape, arrays["anchors"].shape
-    expected: dict[str, tuple[tuple[int, ...], type]] = {
-        name: ((cameras, blocks), kind) for name, kind in MATRICES.items()
-    }
-    expected |= {"anchors": ((blocks,), np.int64), "nadir_block": ((cameras,), np.int64)}
+    expected: dict[str, tuple[tuple[int, ...], type]]
+    expected = {"anchors": ((blocks,), np.int64), "nadir_block": ((cameras,), np.int64)}
+    expected |= {name: ((cameras, blocks), kind) for name, kind in MATRICES.items()}
     for name, (shape, kind) in expected.items():
         if arrays[name].shape != shape or arrays[name].dtype != kind:
             raise ValueError(f"{name} is {arrays[name].dtype} {arrays[name].shape}, not {np.dtype(kind)} {shape}")

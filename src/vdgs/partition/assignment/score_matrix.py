@@ -2,10 +2,9 @@
 
 Names and dimensions: c cameras, b blocks, n anchors, m splats of one view.
 
-The anchors of a view are decoded once. Because decoding works anchor by anchor, the splats of a block's anchors are
-exactly those that the block alone would give: each block is drawn from its share of the splats of the whole view.
-Everything is drawn over black (choice; as the methods do that the paper builds on), with the mean appearance: over the
-model's own background, a colour of the place, missing ground would too often pass for a match.
+The anchors of a view are decoded once: each block is rendered from its share of the splats of the whole view, which are
+exactly those that the block alone would give. Everything is rendered over black (choice; as the methods do that the
+paper builds on), with the mean appearance: missing ground over the model's own background would pass for a match.
 """
 
 from __future__ import annotations
@@ -58,12 +57,12 @@ def compute_score_matrix(
     config: AssignmentConfig,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> ScoreMatrix:
-    """Score every camera for every block. `progress` is told (cameras done, all cameras) after each, in this thread.
+    """Score every camera for every block; calls `on_progress(done, total)` after each camera, in this thread.
 
     - `coverage` (choice): |{Δ < τ and alpha of the block > 0.5}| / |{alpha of the scene > 0.5}|; Δ (eq. 6) compares
       the scene with the widened block drawn alone. Pixels empty in both do not count; 0 where the scene is empty.
-    - `literal`: the share of *all* pixels with Δ < τ (eq. 7).
-    - `leave_one_out`: 1 - SSIM of the scene without the anchors that the block owns against the whole scene, 8 bits.
+    - `paper`: the share of *all* pixels with Δ < τ (eq. 7).
+    - `leave-one-out`: 1 - SSIM of the scene without the anchors that the block owns against the whole scene, 8 bits.
     - `frustum`: the share of the anchors that the block owns whose centre the camera holds; nothing is drawn.
 
     Pictures are at most `config.image_size` wide and high. The scores of a camera depend on no other camera and on
@@ -73,7 +72,7 @@ def compute_score_matrix(
 
 
 class CameraScorer:
-    """Scores cameras, as many at a time as one likes (`compute_score_matrix`)."""
+    """Scores cameras in any number of calls (`compute_score_matrix`)."""
 
     def __init__(self, model: AnchorModel, blocks: Blocks, config: AssignmentConfig):
         self._model, self._blocks, self._config = model, blocks, config
@@ -82,33 +81,30 @@ class CameraScorer:
     def scores(self, cameras: Sequence[Camera], on_progress: Callable[[int, int], None] | None = None) -> ScoreMatrix:
         """The rows of some cameras."""
         shape, members, config = (len(cameras), len(self._blocks)), self._members, self._config
-        scores, covered = np.zeros(shape, np.float32), np.full(shape, np.nan, np.float32)
-        held = np.zeros(shape, np.int32)
-        # Small pictures keep the threads of one kernel waiting for each other; those of several cameras do not.
+        scores, coverage = np.zeros(shape, np.float32), np.full(shape, np.nan, np.float32)
+        visible_anchors = np.zeros(shape, np.int32)
+        # Small images keep the threads of one kernel waiting for each other; those of several cameras do not.
         workers = ThreadPoolExecutor(get_num_threads())
         try:
             rows = workers.map(lambda camera: _score_camera(self._model, members, camera, config), cameras)
             for index, row in enumerate(rows):
-                held[index], scores[index], covered[index] = row
+                visible_anchors[index], scores[index], coverage[index] = row
                 if on_progress is not None:
                     on_progress(index + 1, len(cameras))
         finally:
             workers.shutdown(cancel_futures=True)
         positions = np.array([camera.position[:2] for camera in cameras], np.float64).reshape(-1, 2)
         return ScoreMatrix(
-            mode=config.mode, scores=scores, visible_anchors=held, coverage=covered, anchors=members.counts(),
-            nadir_block=self._blocks.owner(positions),
+            mode=config.mode, scores=scores, visible_anchors=visible_anchors, coverage=coverage,
+            anchors=members.counts(), nadir_block=self._blocks.owner(positions),
         )  # fmt: skip
 
 
 def concatenate_scores(parts: Sequence[ScoreMatrix]) -> ScoreMatrix:
     """The rows of several parts, one below the other; at least one part, all for the same blocks."""
-    over = {
-        name: np.concatenate([getattr(part, name) for part in parts])
-        for name in ("scores", "visible_anchors", "coverage")
-    }
-    beneath = np.concatenate([part.nadir_block for part in parts])
-    return ScoreMatrix(mode=parts[0].mode, **over, anchors=parts[0].anchors, nadir_block=beneath)
+    names = ("scores", "visible_anchors", "coverage", "nadir_block")
+    rows = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    return ScoreMatrix(**(vars(parts[0]) | rows))
 
 
 def color_difference(block: Raster, full: Raster) -> Float[np.ndarray, "h w"]:
@@ -142,7 +138,7 @@ class _BlockMembers:
     """Which anchors belong to which block, and the anchors sorted for counting."""
 
     owner: Int64[Tensor, " n"]
-    #: As `Blocks.reaches`, for all blocks at once.
+    #: As `Blocks.in_expanded`, for all blocks at once.
     reached: Bool[Tensor, "b n"]
     #: Anchor positions by owner, neighbours together: whole groups are then decided by one test each.
     points: Float[Tensor, "n 3"]
@@ -152,11 +148,11 @@ class _BlockMembers:
     @staticmethod
     def of(model: AnchorModel, blocks: Blocks) -> _BlockMembers:
         positions = model.anchors.positions
-        places = xy_positions(positions)
-        owner = blocks.owner(places)
-        reached = np.empty((len(blocks), len(places)), bool)
+        points = xy_positions(positions)
+        owner = blocks.owner(points)
+        reached = np.empty((len(blocks), len(points)), bool)
         for index in range(len(blocks)):
-            reached[index] = blocks.in_expanded(index, places, owner)
+            reached[index] = blocks.in_expanded(index, points, owner)
         near = get_backend(positions.device).morton_order(positions).cpu().numpy()
         order = near[np.argsort(owner[near], kind="stable")]
         bounds = [0, *np.cumsum(np.bincount(owner, minlength=len(blocks))).tolist()]
@@ -169,28 +165,28 @@ class _BlockMembers:
         """How many anchors every block owns."""
         return np.diff(self.bounds).astype(np.int64)
 
-    def held(self, camera: Camera) -> list[int]:
-        """How many anchors of every block the frustum holds."""
-        seen = count_visibility(self.points, [camera])
-        return [int(seen[a:b].sum()) for a, b in pairwise(self.bounds)]
+    def visible(self, camera: Camera) -> np.ndarray:
+        """How many anchors of every block are in the frustum, [b] int32."""
+        in_frustum = count_visibility(self.points, [camera])
+        return np.array([int(in_frustum[a:b].sum()) for a, b in pairwise(self.bounds)], np.int32)
 
 
 @torch.no_grad()  # holds for the thread that it is entered in
 def _score_camera(
     model: AnchorModel, members: _BlockMembers, camera: Camera, config: AssignmentConfig
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Held anchors, scores and covered shares of one camera for every block, [b] each."""
-    held = np.array(members.held(camera), np.int32)
+    """Visible anchors, scores and coverage of one camera for every block, [b] each."""
+    visible = members.visible(camera)
     if config.mode == "frustum":
-        return held, held / np.maximum(members.counts(), 1), np.full(len(held), np.nan)
-    scores, covered = _rendered_scores(model, members, camera.limit_size(config.image_size), config)
-    return held, np.array(scores), np.array(covered)
+        return visible, visible / np.maximum(members.counts(), 1), np.full(len(visible), np.nan)
+    scores, coverage = _rendered_scores(model, members, camera.limit_size(config.image_size), config)
+    return visible, np.array(scores), np.array(coverage)
 
 
 def _rendered_scores(
     model: AnchorModel, members: _BlockMembers, camera: Camera, config: AssignmentConfig
 ) -> tuple[list[float], list[float]]:
-    """The scores of one camera for every block in a mode that draws, and its covered shares."""
+    """The scores of one camera for every block in a mode that renders, and its coverage."""
     rows, splats = decode_view(model, camera)
     anchor = rows[splats.source.long() // model.anchors.offsets.shape[1]]
     full = rasterize_splats(splats, camera, splats.means_px.new_zeros(3))
