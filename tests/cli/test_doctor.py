@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from types import SimpleNamespace
 
 import pytest
 
@@ -13,6 +12,7 @@ from vdgs.cli.doctor import SystemCheck
 from vdgs.cli.doctor import doctor_report as doctor_report
 from vdgs.cli.doctor import system_checks as doctor
 from vdgs.cli.doctor.doctor_report import is_healthy, print_report, run_checks
+from vdgs.kernels.cpu import extension
 
 pytestmark = pytest.mark.xdist_group("doctor")
 
@@ -35,6 +35,7 @@ def test_every_subject_is_reported(checks: list[SystemCheck]):
     assert names["python"].state == "ok"
     assert names["dependencies"].is_ok
     for check in checks:
+        assert check.state != "broken", check
         assert check.state in ("ok", "note") or check.remedy
 
 
@@ -71,29 +72,29 @@ def test_as_json(checks: list[SystemCheck], capsys: pytest.CaptureFixture):
     assert [each["name"] for each in content["checks"]] == [check.name for check in checks]
 
 
-def native(**loads) -> SimpleNamespace:
-    """A stand-in for the choice of kernels: a build loads, or raises what is given."""
+def set_builds(monkeypatch: pytest.MonkeyPatch, **builds: object) -> None:
+    """Let these builds of the kernels be there: each loads, or raises what is given."""
 
-    def load(name: str) -> str:
-        if isinstance(loads[name], Exception):
-            raise loads[name]
+    def load(name: str) -> object:
+        if isinstance(builds[name], Exception):
+            raise builds[name]
         return name
 
-    return SimpleNamespace(
-        INSTRUCTION_SETS=tuple(loads), load=load, isa=lambda: "avx2", threads=lambda: 2,
-        supported=lambda: ("avx512", "avx2", "portable"),
-    )  # fmt: skip
+    monkeypatch.setattr(extension, "INSTRUCTION_SETS", tuple(builds))
+    monkeypatch.setattr(extension, "load_extension", load)
+    monkeypatch.setattr(extension, "active_isa", lambda: "avx2")
+    monkeypatch.setattr(extension, "supported_isas", lambda: ("avx512", "avx2", "portable"))
 
 
 def test_kernels_in_use_and_missing(monkeypatch: pytest.MonkeyPatch):
     unbuilt = ImportError("not built: pip install -e .")
-    monkeypatch.setattr(doctor, "_native_module", lambda: native(avx512=unbuilt, avx2=1, portable=1))
+    set_builds(monkeypatch, avx512=unbuilt, avx2=1, portable=1)
     (check,) = doctor._kernels()
     assert check.state == "note"
     assert check.is_ok
     assert check.value == "avx2 in use; available: avx2, portable"
     assert "avx512" in check.remedy
-    monkeypatch.setattr(doctor, "_native_module", lambda: native(avx2=unbuilt, portable=unbuilt))
+    set_builds(monkeypatch, avx2=unbuilt, portable=unbuilt)
     (check,) = doctor._kernels()
     assert not check.is_ok
     assert "pip install -e ." in check.remedy

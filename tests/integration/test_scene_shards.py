@@ -91,14 +91,14 @@ def test_a_tile_that_is_damaged_is_named(tmp_path):
 
 def test_a_run_sends_its_maps_where_its_blocks_go_and_stops_when_asked(tmp_path, monkeypatch):
     monkeypatch.setattr(run_pipeline, "has_ortho_dependencies", lambda: True)
-    wishes = []
-    monkeypatch.setattr(run_pipeline, "render_ortho", lambda context, asked, console, wish: wishes.append(wish))
+    sent = []
+    monkeypatch.setattr(run_pipeline, "render_ortho", lambda context, asked, console, execution: sent.append(execution))
     for executor in ("local", "slurm"):
         asked = RunRequest(
             capture=tmp_path, output=tmp_path, jobs=3, executor_options=ExecutorOptions(executor=executor)
         )
         run_pipeline._ortho(RunContext.from_path(tmp_path), asked, Console(quiet=True))
-    assert [(wish.is_distributed, wish.jobs, wish.where.executor) for wish in wishes] == [
+    assert [(each.is_distributed, each.jobs, each.executor_options.executor) for each in sent] == [
         (False, 0, "local"),
         (True, 3, "slurm"),
     ]

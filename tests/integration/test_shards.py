@@ -261,7 +261,7 @@ def test_shards_of_other_jobs_go_unless_they_are_at_work(tmp_path):
     with (
         lock_folder(wanted.folder),
         pytest.raises(RunError, match="another vdgs process gathers shards there"),
-        other.held(),
+        other.exclusive(),
     ):
         pass
     assert wanted.folder.exists()
@@ -335,7 +335,7 @@ def test_views_measured_in_shards_are_those_of_one_process(merged, measured, tmp
 def test_exposed_views_are_the_same_in_shards_and_where_a_file_is_compared(uncut, tmp_path):
     run, measured = tmp_path / "run", tmp_path / "run" / "coarse" / "evaluation"
     trained = (
-        "coarse",
+        "train-coarse",
         uncut.parent / "capture",
         "--output",
         run,

@@ -131,10 +131,9 @@ def parse_for_run(
 
 def update_run_settings(run: RunFolder, method: MethodConfig, overwrite: bool, console: Console) -> None:
     """Give the run other settings for later stages, if they are other. RunError where another process drives it."""
-    from vdgs.config.validation_rules import validate_config
+    from vdgs.config.validation_rules import check_config
 
-    if problems := validate_config(method):
-        raise VdgsError("These settings do not work:\n  " + "\n  ".join(problems))
+    check_config(method)
     settings = replace(run.settings(), **vars(method))
     if settings != run.settings():
         with run.drive_lock(), run.locked():

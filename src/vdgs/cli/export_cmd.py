@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from vdgs.cli.common import make_console, parse_arguments, set_up_compute
+from vdgs.cli.common import QuietArguments, ShardArguments, make_console, parse_arguments, set_up_compute
 from vdgs.config.commands import ExportRequest, ProgramName
-from vdgs.config.executor_options import ExecutorOptions
-from vdgs.config.ranges import WORKER_COUNT
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportArguments(ExportRequest):
+class ExportArguments(ExportRequest, ShardArguments, QuietArguments):
     """Write the scene of a run as standard files of Gaussians or points, and say what is lost by it."""
 
     run: Positional[Path]
@@ -27,27 +25,19 @@ class ExportArguments(ExportRequest):
     program: Annotated[ProgramName | None, arg(name="for")] = None
     """Turn the files for this program, so that it shows the scene upright, and refuse files that it does not open.
     Without --output: write RUN/export/ and the file that suits it best."""
-    quiet: bool = False
-    """Print nothing but notes, warnings and errors."""
-    jobs: Annotated[int, WORKER_COUNT] = 0
-    """Shards of the baking done at once, each in a process of its own; 0: on this machine one process bakes all, a
-    cluster as many as it has room for."""
-    executor_options: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
 
 
 def export_command(arguments: list[str]) -> None:
-    asked = parse_arguments(ExportArguments, arguments, "vdgs export")
-    device, console = set_up_compute(asked.device, asked.threads), make_console(asked.quiet)
-    from vdgs.distributed.sharded_job import ExecutionOptions
+    args = parse_arguments(ExportArguments, arguments, "vdgs export")
+    device, console = set_up_compute(args.device, args.threads), make_console(args.quiet)
     from vdgs.export.export_run import export_run, resolve_request
     from vdgs.runs.open_run import open_run
 
-    asked.executor_options.check()
-    request = resolve_request(replace(asked, device=device))
+    execution, request = args.execution(device), resolve_request(replace(args, device=device))
     run = open_run(request.run, request.model, device)
-    export_run(run, request, console, ExecutionOptions(asked.executor_options, asked.jobs, device=device))
+    export_run(run, request, console, execution)
     from vdgs.report.write_report import write_report
     from vdgs.runs.run_folder import REPORT_FILE
 
-    if any(path.suffix.lower() == ".html" for path in request.output) and (asked.run / REPORT_FILE).exists():
-        write_report(run.folder)  # it leads to the page
+    if any(path.suffix.lower() == ".html" for path in request.output) and (args.run / REPORT_FILE).exists():
+        write_report(run.folder)  # it links to the page

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from vdgs.config.method import DensifyConfig, MethodConfig, ResolutionSchedule
 from vdgs.config.ranges import find_range_errors
+from vdgs.errors import VdgsError
 
 
 def validate_config(config: MethodConfig) -> list[str]:
@@ -22,6 +23,12 @@ def validate_config(config: MethodConfig) -> list[str]:
             "merge.rule max-visibility needs --block.margin ramp or free: a frozen margin has nothing to offer"
         )
     return found
+
+
+def check_config(config: MethodConfig) -> None:
+    """Raise VdgsError with all that is wrong with the settings."""
+    if problems := validate_config(config):
+        raise VdgsError("These settings do not work:\n  " + "\n  ".join(problems))
 
 
 def _validate_schedule(swa_fraction: float, densify: DensifyConfig, resolutions: ResolutionSchedule) -> list[str]:

@@ -20,7 +20,7 @@ from vdgs.captures.reconstruction import read_reconstruction
 from vdgs.config.commands import RunRequest
 from vdgs.config.method import MethodConfig, TrainConfig, block_train_config, resolve_iterations
 from vdgs.config.ranges import check_ranges
-from vdgs.config.validation_rules import validate_config
+from vdgs.config.validation_rules import check_config
 from vdgs.distributed.resource_allocation import ShardWorkload, allocate_local, exceeds_memory
 from vdgs.errors import VdgsError
 from vdgs.kernels import get_num_threads
@@ -82,8 +82,7 @@ def estimate_run(request: RunRequest, console: Console) -> RunEstimate | None:
     """
     check_ranges(request)
     method = request.method()
-    if problems := validate_config(method):
-        raise VdgsError("These settings do not work:\n  " + "\n  ".join(problems))
+    check_config(method)
     if request.options.undistort:
         raise VdgsError("--dry-run writes nothing, and --undistort writes photographs: leave one of the two out.")
     if is_image_input(request):

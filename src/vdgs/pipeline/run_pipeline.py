@@ -10,7 +10,7 @@ from rich.markup import escape
 
 from vdgs.config.commands import OrthoRequest, RunRequest
 from vdgs.config.ranges import check_ranges
-from vdgs.config.validation_rules import validate_config
+from vdgs.config.validation_rules import check_config
 from vdgs.distributed.backend_selection import check_backend_reachable
 from vdgs.distributed.sharded_job import ExecutionOptions
 from vdgs.errors import RunError, Stopped, VdgsError
@@ -60,8 +60,7 @@ def reconstruct_if_needed(run_request: RunRequest, console: Console) -> RunReque
     """
     if not is_image_input(run_request):
         return run_request
-    if problems := validate_config(run_request.method()):
-        raise VdgsError("These settings do not work:\n  " + "\n  ".join(problems))
+    check_config(run_request.method())
     _title(console, "photographs")
     request = make_sfm_request(run_request)
     reconstruct(request, console, RunFolder(run_request.output).drive_lock())

@@ -17,8 +17,7 @@ from vdgs.captures.reconstruction import RECONSTRUCTION_FILE as RECONSTRUCTION
 from vdgs.captures.validation import require_valid
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.method import MethodConfig, resolve_iterations
-from vdgs.config.validation_rules import validate_config
-from vdgs.errors import VdgsError
+from vdgs.config.validation_rules import check_config
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
@@ -57,8 +56,7 @@ def exclusive_run(
 ) -> Iterator[RunContext]:
     """As `create_or_resume_run`, with the lock of a driver (`RunFolder.drive_lock`) from before anything is written or
     removed to the end of the `with`."""
-    if problems := validate_config(method):
-        raise VdgsError("These settings do not work:\n  " + "\n  ".join(problems))
+    check_config(method)
     check_not_in_capture(output)
     # Absolute paths, as config.yaml holds them: stages hand the capture on, also to other machines.
     capture_path, capture_options = capture_path.resolve(), _with_absolute_paths(capture_options)

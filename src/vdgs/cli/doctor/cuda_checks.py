@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from vdgs.cli.doctor import SystemCheck
 from vdgs.kernels.cuda.compile_cache import CUDA_CACHE_ENV_VAR, cache_folder
-from vdgs.kernels.cuda.driver import CudaDriver, get_cuda_driver
-from vdgs.kernels.cuda.nvrtc import CudaUnavailable, Nvrtc, get_nvrtc
+from vdgs.kernels.cuda.driver import get_cuda_driver
+from vdgs.kernels.cuda.nvrtc import CudaUnavailable, get_nvrtc
 from vdgs.kernels.device_selection import select_device
 from vdgs.kernels.operations import OPERATION_NAMES, backends_for
 from vdgs.system.units import data_size
@@ -18,7 +18,7 @@ def cuda_checks() -> list[SystemCheck]:
 
 def _gpus() -> list[SystemCheck]:
     try:
-        driver: CudaDriver = get_cuda_driver()
+        driver = get_cuda_driver()
         cards = driver.list_gpus()
         major, minor = driver.version()
     except CudaUnavailable as error:
@@ -35,17 +35,17 @@ def _gpus() -> list[SystemCheck]:
 
 def _compiler() -> SystemCheck:
     try:
-        found: Nvrtc = get_nvrtc()
+        nvrtc = get_nvrtc()
     except CudaUnavailable as error:
         return SystemCheck("NVRTC", "note", "not found: CUDA kernels cannot be compiled", str(error))
-    version = f"{found.version[0]}.{found.version[1]}"
-    return SystemCheck("NVRTC", "ok", f"{version}, from {found.library_info.origin}: {found.library_info.path}")
+    (major, minor), library = nvrtc.version, nvrtc.library_info
+    return SystemCheck("NVRTC", "ok", f"{major}.{minor}, from {library.origin}: {library.path}")
 
 
 def _kernels() -> SystemCheck:
     folder = cache_folder()
-    kept = len(list(folder.glob("*.bin"))) if folder.is_dir() else 0
-    return SystemCheck("CUDA kernels", "note", f"compiled code in {folder} ({CUDA_CACHE_ENV_VAR}), {kept} entries")
+    count = len(list(folder.glob("*.bin"))) if folder.is_dir() else 0
+    return SystemCheck("CUDA kernels", "note", f"compiled code in {folder} ({CUDA_CACHE_ENV_VAR}), {count} entries")
 
 
 def _operations() -> list[SystemCheck]:

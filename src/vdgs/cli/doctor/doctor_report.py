@@ -1,7 +1,6 @@
 """The report of `vdgs doctor`, as a table or as JSON.
 
-Nothing outside the standard library is imported at the top, so that the report also appears where a
-dependency is broken: that is when it is needed.
+Nothing outside the standard library is imported at the top: the report also appears where a dependency is broken.
 """
 
 from __future__ import annotations
@@ -16,11 +15,11 @@ from vdgs.cli.doctor.system_checks import CHECKS
 def run_checks() -> list[SystemCheck]:
     """Look at the machine; takes a few seconds (torch is imported), changes nothing and never raises."""
     checks: list[SystemCheck] = []
-    for look in CHECKS:
+    for check in CHECKS:
         try:
-            checks += look()
+            checks += check()
         except Exception as error:  # the report must stand on a machine where anything may be broken
-            name = getattr(look, "__name__", "check").strip("_")
+            name = getattr(check, "__name__", "check").strip("_")
             checks.append(SystemCheck(name, "broken", f"{type(error).__name__}: {error}", "Reinstall vdgs.", True))
     return checks
 

@@ -1,7 +1,7 @@
-"""What `vdgs doctor` looks at.
+"""The checks of `vdgs doctor`.
 
-Nothing outside the standard library is imported at the top, so that the report also appears where a
-dependency is broken: that is when it is needed.
+Nothing outside the standard library is imported at the top, so that the report also appears where a dependency is
+broken: that is when it is needed.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import re
 import shutil
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from vdgs.cli.doctor import SystemCheck
@@ -60,53 +60,42 @@ def _dependencies() -> list[SystemCheck]:
 
 
 def _processor() -> list[SystemCheck]:
-    return [SystemCheck("processor", "ok", f"{_processor_name()}, {_usable_cores()} of {os.cpu_count()} cores usable")]
-
-
-def _processor_name() -> str:
-    info = Path("/proc/cpuinfo")
-    if info.is_file():
-        names = re.findall(r"^model name\s*:\s*(.+)$", info.read_text(), re.MULTILINE)
-        if names:
-            return str(names[0])
-    return platform.processor() or platform.machine()
-
-
-def _usable_cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    info = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").is_file() else ""
+    model = re.search(r"^model name\s*:\s*(.+)$", info, re.MULTILINE)
+    name = model.group(1) if model else platform.processor() or platform.machine()
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return [SystemCheck("processor", "ok", f"{name}, {cores} of {os.cpu_count()} cores usable")]
 
 
 def _kernels() -> list[SystemCheck]:
     """The C++ kernels: which builds load here, which one is in use."""
-    module = _native_module()
-    built, refused = [], []
-    for name in module.INSTRUCTION_SETS:
+    from vdgs.kernels.cpu import extension
+
+    built, errors = [], {}
+    for name in extension.INSTRUCTION_SETS:
         try:
-            module.load(name)
+            extension.load_extension(name)
             built.append(name)
         except Exception as error:
-            refused.append((name, error))
+            errors[name] = str(error)
     if not built:
-        return [SystemCheck("native kernels", "missing", "not built", str(refused[-1][1]), True)]
-    supported = module.supported()
-    unbuilt = [name for name, _ in refused if name in supported]
-    value = f"{module.isa()} in use; available: {', '.join(built)}"
+        return [SystemCheck("native kernels", "missing", "not built", errors[extension.INSTRUCTION_SETS[-1]], True)]
+    unbuilt = [name for name in errors if name in extension.supported_isas()]
+    value = f"{extension.active_isa()} in use; available: {', '.join(built)}"
     if unbuilt:
         faster = f"The processor also runs {', '.join(unbuilt)}, which this installation lacks: reinstall vdgs."
         return [SystemCheck("native kernels", "note", value, faster, True)]
     return [SystemCheck("native kernels", "ok", value, essential=True)]
 
 
-def _native_module() -> ModuleType:
-    return importlib.import_module("vdgs.kernels.cpu.extension")
-
-
 def _threads() -> list[SystemCheck]:
     import torch
 
-    native = _run_check(lambda: str(_native_module().threads())) or "none"
+    from vdgs.kernels import get_num_threads
+
+    native = "none"
+    with suppress(ImportError):  # not built, as another check says
+        native = str(get_num_threads())
     policy = os.environ.get("OMP_WAIT_POLICY", "")
     checks = [SystemCheck("threads", "ok", f"kernels {native} (VDGS_THREADS), torch {torch.get_num_threads()}")]
     if policy.upper() == "PASSIVE":
@@ -146,8 +135,9 @@ def _torch() -> list[SystemCheck]:
 
 
 def _cuda() -> list[SystemCheck]:
-    checks: list[SystemCheck] = importlib.import_module("vdgs.cli.doctor.cuda_checks").cuda_checks()
-    return checks
+    from vdgs.cli.doctor.cuda_checks import cuda_checks
+
+    return cuda_checks()
 
 
 def _extras() -> list[SystemCheck]:
@@ -171,7 +161,8 @@ def _extras() -> list[SystemCheck]:
 
 def _lpips() -> list[SystemCheck]:
     """Both files of LPIPS, without reading half a gigabyte."""
-    lpips = importlib.import_module("vdgs.evaluation.lpips")
+    from vdgs.evaluation import lpips
+
     heads, weights = lpips.find_heads(), lpips.default_weights_path()
     if heads and weights.is_file():
         return [SystemCheck("LPIPS", "ok", f"VGG16 weights in {weights.parent}")]
@@ -187,7 +178,8 @@ def _video_encoding() -> list[SystemCheck]:
 
     import numpy as np
 
-    video = importlib.import_module("vdgs.rendering.video")
+    from vdgs.rendering import video
+
     encoder = video.default_encoder()
     try:
         with tempfile.TemporaryDirectory() as folder, video.VideoWriter(Path(folder) / "test.mp4", 30.0) as film:
@@ -208,15 +200,14 @@ def _disk() -> list[SystemCheck]:
 
 
 def _required() -> dict[str, list[str]]:
-    """Packages by extra ("" holds what vdgs always requires), from the installed metadata, else from
-    the checkout's pyproject.toml. The other extras of vdgs
-    that an extra includes are left out: they have lines of their own."""
+    """Packages by extra ("" holds what vdgs always requires), from the installed metadata, else from the checkout's
+    pyproject.toml. The extras of vdgs that an extra includes are left out: they have lines of their own."""
     try:
-        stated = importlib.metadata.requires("vdgs") or []
+        requirements = importlib.metadata.requires("vdgs") or []
     except importlib.metadata.PackageNotFoundError:
-        stated = _checkout_requirements()
+        requirements = _checkout_requirements()
     groups: dict[str, list[str]] = {"": []}
-    for requirement in stated:
+    for requirement in requirements:
         marker = re.search(r"""extra\s*==\s*['"]([^'"]+)['"]""", requirement)
         name = re.match(r"[A-Za-z0-9._-]+", requirement)
         if name and name.group() != "vdgs":
@@ -231,10 +222,9 @@ def _checkout_requirements() -> list[str]:
     if not file.is_file():
         return []
     project: dict[str, Any] = tomllib.loads(file.read_text(encoding="utf-8"))["project"]
-    stated = list(project["dependencies"])
-    for extra, packages in project.get("optional-dependencies", {}).items():
-        stated += [f"{package}; extra == '{extra}'" for package in packages]
-    return stated
+    extras = project.get("optional-dependencies", {}).items()
+    optional = (f"{package}; extra == '{extra}'" for extra, packages in extras for package in packages)
+    return [*project["dependencies"], *optional]
 
 
 def _version(package: str) -> str | None:
@@ -252,24 +242,5 @@ def _import_error(module: str) -> str:
     return ""
 
 
-def _run_check(check: Callable[[], str]) -> str | None:
-    try:
-        return check()
-    except Exception:  # a missing figure is shown as missing
-        return None
-
-
-CHECKS: tuple[Callable[[], list[SystemCheck]], ...] = (
-    _versions,
-    _dependencies,
-    _processor,
-    _kernels,
-    _threads,
-    _memory,
-    _torch,
-    _cuda,
-    _extras,
-    _lpips,
-    _video_encoding,
-    _disk,
-)
+_BASIC_CHECKS = (_versions, _dependencies, _processor, _kernels, _threads, _memory, _torch)
+CHECKS: tuple[Callable[[], list[SystemCheck]], ...] = (*_BASIC_CHECKS, _cuda, _extras, _lpips, _video_encoding, _disk)
