@@ -58,7 +58,7 @@ class Photographed(ImageCache):
 
     def __init__(
         self, gains: np.ndarray, views: Sequence[View] = VIEWS, downscales: Sequence[float] = (1,),
-        change: Callable[[int, np.ndarray], DecodedImage] = lambda _, picture: DecodedImage(torch.from_numpy(picture), None),
+        change: Callable[[int, np.ndarray], DecodedImage] = lambda _, each: DecodedImage(torch.from_numpy(each), None),
     ) -> None:  # fmt: skip
         super().__init__(views, 0, downscales)
         self.gains, self.change, self.asked = gains, change, set[tuple[int, float]]()

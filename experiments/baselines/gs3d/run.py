@@ -148,7 +148,8 @@ def evaluate_gs3d(
         return model.render(camera, depth=True)
 
     measured = RenderableModel(
-        render=model.render, visibility_map=visibility_map, metadata=_model_metadata(trained), background=model.background,
+        render=model.render, visibility_map=visibility_map, metadata=_model_metadata(trained),
+        background=model.background,
         coverage_map=coverage_map(render_depth, [view.camera for view in capture.train_views]),
         true_depth=make_true_depth(capture, capture.test_views), render_depth=render_depth,
         camera_height=camera_height(capture),

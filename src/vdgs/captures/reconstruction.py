@@ -180,7 +180,8 @@ def report_rows(metadata: ReconstructionReport) -> list[tuple[str, str]]:
             (
                 "Lens",
                 f"{camera.name}: focal length {camera.focal_before_px:.0f} px by {camera.focal_source}, "
-                f"{camera.focal_after_px:.0f} px now ({held}: {metadata.focal_reason}), k {camera.radial_distortion:+.4f}",
+                f"{camera.focal_after_px:.0f} px now ({held}: {metadata.focal_reason}), k "
+                f"{camera.radial_distortion:+.4f}",
             )
         )
     if metadata.height_m is not None:

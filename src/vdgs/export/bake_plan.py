@@ -4,7 +4,8 @@ Each step needs all of the one before. Shards are numbered through all steps, so
 
     survey              training views      what each shows
     fit                 parts of anchors    their Gaussians
-    compare, then mend  views, then parts   what pictures lack; what is added to colours. For each of the `color_iteration_cameras`
+    compare, then mend  views, then parts   what pictures lack; what is added to colours. For each of the
+                                            `color_iteration_cameras`
 
     RUN/baking/shards/KEY/   of all shards together (`executors.sharded_job`): pixels.npy and kept.npy, from the survey;
                              N.spool, the Gaussians after N rounds of fitting colours, the last of them alone

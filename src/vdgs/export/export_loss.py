@@ -56,9 +56,9 @@ def views_to_measure(run: OpenedRun) -> list[View]:
 def measure_loss(
     run: OpenedRun, chunks: Iterable[Gaussians], after_view: Callable[[], None] = lambda: None
 ) -> ExportLoss:
-    """Draw `views_to_measure` with the model and with Gaussians, which are in the ground frame, and compare both with the
-    photographs, in 8 bits as all metrics, and as `vdgs eval` in the exposure of each view where exposures were fitted:
-    files hold neutral colours. Of the pieces only what those views show is kept in memory."""
+    """Draw `views_to_measure` with the model and with Gaussians, which are in the ground frame, and compare both with
+    the photographs, in 8 bits as all metrics, and as `vdgs eval` in the exposure of each view where exposures were
+    fitted: files hold neutral colours. Of the pieces only what those views show is kept in memory."""
     views, exposure = views_to_measure(run), make_exposures(run.model, run.capture)
     gaussians = _seen(chunks, [view.camera for view in views])
     visibility = make_visibility_map(with_coarse_model(run))

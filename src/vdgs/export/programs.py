@@ -51,7 +51,7 @@ PROGRAMS: Mapping[str, Program] = {
         {".ply": Y_UP, ".splat": Y_UP},
         "it opens no others upright",
     ),
-    "cesium": Program("CesiumJS", f"tiles/{TILESET_FILE}", {TILESET_FILE: None}, "CesiumJS draws Gaussians of 3D Tiles alone"),
+    "cesium": Program("CesiumJS", f"tiles/{TILESET_FILE}", {TILESET_FILE: None}, "Gaussians come as 3D Tiles only"),
     "blender": Program(
         "Blender", "blender.ply", {".ply": Z_UP, ".points.ply": Z_UP, ".glb": None}, "Blender's add-ons read PLY"
     ),

@@ -33,8 +33,10 @@ def print_preflight(preflight: PreflightReport, collection: ImageList, plan: lis
     if preflight.gsd_m is not None:
         rows.append(("A pixel shows", f"about {100 * preflight.gsd_m:.1f} cm of the ground"))
     if preflight.forward_overlap is not None and preflight.views_per_point is not None:
-        seen = f"{preflight.forward_overlap:.0%} along the flight; a place is seen by about {preflight.views_per_point:.0f}"
-        rows.append(("Overlap", f"about {seen}, were the ground level"))
+        seen = f"a place is seen by about {preflight.views_per_point:.0f}"
+        rows.append(
+            ("Overlap", f"about {preflight.forward_overlap:.0%} along the flight; {seen}, were the ground level")
+        )
     if preflight.oblique is not None:
         rows.append(("Oblique views", f"{preflight.oblique} of {preflight.num_images}"))
     rows += [("Plan" if k == 0 else "", line) for k, line in enumerate(plan)]

@@ -163,7 +163,8 @@ def adjust_to_gcps(
         bad = f", {len(wrong)} more are marked where they cannot be" if wrong else ""
         raise CaptureError(
             f"{gcps.source}: {len(used)} of its points are shown by two placed photographs or more, not along one "
-            f"line{bad}; {MIN_CONTROL_POINTS} are needed. Mark them in more photographs, or hold them out: --check-points all"
+            f"line{bad}; {MIN_CONTROL_POINTS} are needed. Mark them in more photographs, or hold them "
+            "out: --check-points all"
         )
     places = np.array([seen.position for _, seen in used])
     similarity, trusted = _fit_to_gcps(places, targets[rows])

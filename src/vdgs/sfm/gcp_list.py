@@ -90,8 +90,8 @@ class _Line:
 def read_gcp_list(file: Path, collection: ImageList, check_points: Sequence[str]) -> GcpList:
     """The points of a gcp_list.txt: a first line with the coordinate system, then x y z px py photograph [name].
 
-    Pixels are those of the file as it is, before EXIF's orientation, as ODM counts them. Points named in `is_check_point`
-    (`all`: every one) are check points. What photographs show that were left out is not used.
+    Pixels are those of the file as it is, before EXIF's orientation, as ODM counts them. Points named in
+    `is_check_point` (`all`: every one) are check points. What photographs show that were left out is not used.
 
     Raises CaptureError for a file that cannot be read, a system that is unknown, lines that are none, photographs that
     are not there, pixels outside them, names that are not there, and points that are too few or along a line.
@@ -246,7 +246,8 @@ def _checked(points: list[GroundControlPoint], system: str, file: Path, notes: S
     used = [point for point in seen if not point.is_check_point]
     if not seen or (used and len(used) < MIN_CONTROL_POINTS):
         raise CaptureError(
-            f"{file}: {len(used)} points that {MIN_OBSERVATIONS} photographs show, and {MIN_CONTROL_POINTS} are needed to "
+            f"{file}: {len(used)} points that {MIN_OBSERVATIONS} photographs show, and "
+            f"{MIN_CONTROL_POINTS} are needed to "
             f"place a scene{' (' + '; '.join(notes) + ')' if notes else ''}. With fewer: --check-points {ALL_POINTS}"
         )
     control = GcpList(tuple(seen), system, file.name, tuple(notes))

@@ -304,7 +304,8 @@ def _refuse_upside_down(
     up, _ = georegistration.up_of(model, prepared.image_list.images)
     if up.sure and up.direction[2] < 0:
         raise CaptureError(
-            f"placed by {placed.method}, the cameras would be {abs(height):.3g} m {'under' if height < 0 else 'over'} the "
+            f"placed by {placed.method}, the cameras would be {abs(height):.3g} m "
+            f"{'under' if height < 0 else 'over'} the "
             f"ground and look up, against what the photographs show. Are east and north (x and y, latitude and "
             f"longitude) exchanged, or is a hemisphere missing? {georegistration.ANYWAY}"
         )

@@ -96,7 +96,8 @@ def print_plan(reconstruction_plan: ReconstructionPlan, console: Console) -> Non
         f"features, about {pairs} pairs ({how}), poses and points, {meters}photographs without distortion",
         *_gcp_plan_lines(reconstruction_plan.gcps),
         f"the focal length is {'held' if held else 'fitted'}: {why}",
-        f"about {rough_duration(reconstruction_plan.estimated_seconds)} on {reconstruction_plan.threads} threads, if they are idle",
+        f"about {rough_duration(reconstruction_plan.estimated_seconds)} on "
+        f"{reconstruction_plan.threads} threads, if they are idle",
     ]
     print_preflight(reconstruction_plan.preflight, reconstruction_plan.image_list, plan, console)
 

@@ -210,7 +210,8 @@ def _advice(look: PreflightReport, held: bool, registered: int, found: int) -> l
         advice.append("fly the strips closer together, or a second grid across the first: every place in 8 or more.")
     if held and look.oblique is not None and look.oblique == 0:
         advice.append(
-            f"add oblique views (camera {OBLIQUE_ANGLE_DEG + 10:.0f}° or more from straight down) or a second height: walls "
+            f"add oblique views (camera {OBLIQUE_ANGLE_DEG + 10:.0f}° or more from straight down) or "
+            "a second height: walls "
             "come out, and the focal length is fixed by the flight itself."
         )
     if registered < 0.9 * found:

@@ -39,8 +39,8 @@ class ColmapImage:
 
 
 def sample_observations(numbers: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """At most `MAX_OBSERVATIONS` of an image's points that are points of the model, at random; copies. A point that one image
-    remembers is likely to be remembered by others that show it: chance depends on its number alone."""
+    """At most `MAX_OBSERVATIONS` of an image's points that are points of the model, at random; copies. A point that one
+    image remembers is likely to be remembered by others that show it: chance depends on its number alone."""
     matched = np.flatnonzero((numbers >= 0) & (numbers < 2**63) & np.isfinite(pixels).all(axis=1))
     few = np.sort(matched[np.argsort(_chance(numbers[matched].astype(np.int64)), kind="stable")[:MAX_OBSERVATIONS]])
     return numbers[few].astype(np.int64), pixels[few]

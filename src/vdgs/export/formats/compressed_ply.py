@@ -141,8 +141,8 @@ def is_compressed(head: bytes) -> bool:
 
 
 def compressed_ply_pieces(path: Path) -> Iterator[Gaussians]:
-    """The Gaussians of a file, in the ground frame, at most `CHUNK_SIZE` at a time. Raises VdgsError for another or a damaged
-    one."""
+    """The Gaussians of a file, in the ground frame, at most `CHUNK_SIZE` at a time. Raises VdgsError for another or a
+    damaged one."""
     try:
         data = np.memmap(path, np.uint8, "r")
     except (OSError, ValueError) as error:

@@ -1,7 +1,7 @@
 """What every writer is given: chunks of Gaussians, how many there are, and where on Earth they stand.
 
-Coordinates of a `ExportScene` are those of the ground frame: local, z up, float32. A format that has an up axis of its own
-turns them (`formats.axes`); its reader turns them back, so that what is read from disk can be drawn with the run's
+Coordinates of a `ExportScene` are those of the ground frame: local, z up, float32. A format that has an up axis of its
+own turns them (`formats.axes`); its reader turns them back, so that what is read from disk can be drawn with the run's
 own cameras.
 """
 

@@ -91,8 +91,8 @@ def write_store(scene: ExportScene, file: Path, axes: Axes = Z_UP) -> GaussianSt
 
 
 def open_store(file: Path, degree: int, writable: bool = False) -> GaussianStore:
-    """The Gaussians of this degree that `write_store` has written, on the disk, their means too. Raises RunError for a file
-    that is missing or damaged."""
+    """The Gaussians of this degree that `write_store` has written, on the disk, their means too. Raises RunError for a
+    file that is missing or damaged."""
     shapes = value_shapes(degree)
     width = sum(int(np.prod(shape)) for shape in shapes.values())
     try:

@@ -78,7 +78,8 @@ def check_glb_size(path: Path, scene: ExportScene) -> None:
     """Raise VdgsError where a GLB cannot hold so many Gaussians."""
     if gaussian_bytes(scene) + (1 << 16) > MAX_LENGTH:
         raise VdgsError(
-            f"{path}: {scene.count} Gaussians take {gaussian_bytes(scene) / 2**30:.1f} GiB as glTF, and a GLB holds 4 GiB. "
+            f"{path}: {scene.count} Gaussians take {gaussian_bytes(scene) / 2**30:.1f} GiB as glTF, "
+            "and a GLB holds 4 GiB. "
             "Write 3D Tiles (a file named tileset.json) or .spz, or fewer Gaussians."
         )
 

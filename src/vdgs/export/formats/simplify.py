@@ -2,8 +2,8 @@
 
 Each cell of a grid becomes one Gaussian with the mean, spread and colour of those in it, weighted by what they cover.
 Two things differ from the moments alone, so that a surface stays closed. The spread of the centres within a cell counts
-`SPREAD_FACTOR` times: neighbours that only share an edge would leave gaps between them. And optical depth times area is kept,
-not opacity: many small opaque Gaussians make one large opaque one, few make a faint one.
+`SPREAD_FACTOR` times: neighbours that only share an edge would leave gaps between them. And optical depth times area is
+kept, not opacity: many small opaque Gaussians make one large opaque one, few make a faint one.
 """
 
 from __future__ import annotations

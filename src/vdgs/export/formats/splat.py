@@ -55,8 +55,8 @@ def write_splat(path: Path, scene: ExportScene) -> tuple[str, ...]:
 
 
 def read_splat_chunks(path: Path) -> Iterator[Gaussians]:
-    """The Gaussians of a file, in the ground frame, at most `CHUNK_SIZE` at a time. Raises VdgsError if it is missing or
-    damaged."""
+    """The Gaussians of a file, in the ground frame, at most `CHUNK_SIZE` at a time. Raises VdgsError if it is missing
+    or damaged."""
     try:
         rows = np.fromfile(path, np.uint8)
     except OSError as error:

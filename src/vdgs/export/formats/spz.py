@@ -299,7 +299,8 @@ def _quaternions_v3(coded: np.ndarray) -> np.ndarray:
 
 def _too_far(path: Path, far: float) -> VdgsError:
     return VdgsError(
-        f"{path}: a Gaussian lies {far:.0f} m from the origin, and SPZ holds positions only within {MAX_COORDINATE:.0f} m. "
+        f"{path}: a Gaussian lies {far:.0f} m from the origin, and SPZ holds positions only within "
+        f"{MAX_COORDINATE:.0f} m. "
         "Write a part of the scene or move its origin into its middle; or choose tileset.json, .glb or .ply, which "
         "hold any extent."
     )
