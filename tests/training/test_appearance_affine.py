@@ -153,7 +153,7 @@ class Lit(ViewExposures):
         )
         self._light = light
 
-    def _drawn(self, view: View) -> np.ndarray:
+    def _render_small(self, view: View) -> np.ndarray:
         return np.full((4, 6, 3), self._light(view))
 
 
