@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 
 from vdgs.cli.common import parse_arguments
@@ -33,7 +34,7 @@ def bench_command(arguments: list[str]) -> None:
     if (CHECKOUT / "experiments" / "bench" / "cli.py").is_file() and str(CHECKOUT) not in sys.path:
         sys.path.insert(0, str(CHECKOUT))
     try:
-        from experiments.bench import cli
+        bench = import_module("experiments.bench.cli")
     except ImportError as error:
         if error.name not in ("experiments", "experiments.bench", "experiments.bench.cli"):
             raise
@@ -41,4 +42,4 @@ def bench_command(arguments: list[str]) -> None:
             "the package `experiments` is missing, which an installation does not hold: clone the repository of vdgs, "
             "and run `python -m experiments.bench` in its root."
         ) from error
-    cli.bench_command(arguments)
+    bench.bench_command(arguments)
