@@ -12,6 +12,8 @@ from vdgs.errors import VdgsError
 
 #: The root of the checkout, where the package is used from one.
 CHECKOUT = Path(__file__).parents[3]
+#: Loaded by name where it is: an installation holds no experiments.
+BENCH_MODULE = "experiments.bench.cli"
 
 
 @dataclass(frozen=True)
@@ -34,9 +36,9 @@ def bench_command(arguments: list[str]) -> None:
     if (CHECKOUT / "experiments" / "bench" / "cli.py").is_file() and str(CHECKOUT) not in sys.path:
         sys.path.insert(0, str(CHECKOUT))
     try:
-        bench = import_module("experiments.bench.cli")
+        bench = import_module(BENCH_MODULE)
     except ImportError as error:
-        if error.name not in ("experiments", "experiments.bench", "experiments.bench.cli"):
+        if error.name not in ("experiments", "experiments.bench", BENCH_MODULE):
             raise
         raise VdgsError(
             "the package `experiments` is missing, which an installation does not hold: clone the repository of vdgs, "
