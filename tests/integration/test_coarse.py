@@ -56,7 +56,7 @@ def capture(tmp_path_factory) -> Path:
 
 
 def command(capture: Path, run: Path, *more: str) -> list[str]:
-    return ["coarse", str(capture), "--output", str(run), *SETTINGS, *more]
+    return ["train-coarse", str(capture), "--output", str(run), *SETTINGS, *more]
 
 
 def finish(capture: Path, run: Path, *more: str) -> CompletedProcess[str]:
@@ -315,7 +315,7 @@ def test_evaluation_and_renders_of_a_run(unbroken, tmp_path):
     assert (metrics["test_views"], training["training_views"]) == (2, 10)
     assert training["psnr"] > metrics["psnr"]
     assert {path: path.read_bytes() for path in test_files} == test_files
-    for kind in ("image", "depth", "visibility"):
+    for kind in ("rgb", "depth", "visibility"):
         assert vdgs("render", run, "--output", tmp_path / kind, "--mode", kind, "--no-colorbar").returncode == 0
         pictures = [cv2.imread(str(path)) for path in sorted((tmp_path / kind).glob("*.png"))]
         assert [picture.shape for picture in pictures] == [(48, 64, 3)] * 2

@@ -34,12 +34,12 @@ pytestmark = [
 CPU = torch.device("cpu")
 #: Growth, compensation, a new order and the mean of models all happen within few steps.
 BUSY = {
-    "growth": DensifyConfig(
+    "densify": DensifyConfig(
         every=2, stats_start=0, start=2, grad_threshold=1e-6, min_draw_fraction=0.1, stop_fraction=0.5
     ),
     "compensation": CompensationConfig(enabled=True, t_low=1.0),
     "iterations": 8,
-    "average": 0.4,
+    "swa_fraction": 0.4,
 }
 
 

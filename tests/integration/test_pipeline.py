@@ -327,9 +327,9 @@ def test_ctrl_c_between_stages_stops_the_run_and_the_same_command_continues(capt
 
 def time_few_steps() -> None:
     """Let a plan be made of fewer steps than take seconds."""
-    from vdgs.pipeline.run_pipeline import dry_run
+    from vdgs.pipeline import dry_run
 
-    dry_run.TIMED_SECONDS = 0.0
+    dry_run.MAX_TIMED_SECONDS = 0.0
 
 
 def test_a_dry_run_says_what_it_takes_and_writes_nothing(capture, copied, tmp_path):

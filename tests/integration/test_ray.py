@@ -24,7 +24,7 @@ from support.clusters import (
     train_here,
 )  # fmt: skip
 from support.commands import begun, do_tasks_here, python, vdgs, wait_until
-from vdgs.cli.main import main
+from vdgs import cli
 
 pytestmark = [
     pytest.mark.slow,
@@ -209,7 +209,7 @@ def test_nodes_that_join_late_are_avoided_where_they_cannot_work_or_have_no_memo
 
 def another_vdgs(folder: Path) -> Path:
     """A folder to import a vdgs from that differs by one file."""
-    source = Path(main.__file__).parent
+    source = Path(cli.__file__).parents[1]
     shutil.copytree(source, folder / "vdgs", ignore=shutil.ignore_patterns("*.so", "__pycache__"))
     (folder / "vdgs/of_another_version.py").touch()
     # An installation that leads to its sources by a hook would lead there from that node too.

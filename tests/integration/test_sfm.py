@@ -122,9 +122,9 @@ def test_the_same_command_does_nothing_and_an_option_only_what_depends_on_it(mad
     reconstruct(SfmRequest(image_folders=(flight.folder,), output=output, threads=1, keep_intermediate=True), console())
     assert files(output) == before
     for room, name in (
-        (feature_extraction, "find_features"),
-        (feature_matching, "match"),
-        (incremental_mapper, "find_models"),
+        (feature_extraction, "extract_features"),
+        (feature_matching, "match_pairs"),
+        (incremental_mapper, "run_mapper"),
     ):
         monkeypatch.setattr(room, name, lambda *_: pytest.fail("was done already"))
     asked = SfmRequest(

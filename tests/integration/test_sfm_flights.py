@@ -179,8 +179,8 @@ class Stopper:
 
 STEPS = {
     "features": (feature_extraction, "_extract", 3),
-    "matching": (feature_matching, "call", 2),
-    "mapping": (incremental_mapper, "keep_snapshots", 5),
+    "matching": (feature_matching, "call_cancellable", 2),
+    "mapping": (incremental_mapper, "save_snapshots", 5),
     "writing": (capture_writer, "write_bytes", 8),
 }
 
@@ -220,7 +220,7 @@ def test_ctrl_c_at_each_step_keeps_what_is_done_and_the_same_command_goes_on(
         return call_cancellable(called, *arguments, **named)
 
     for each in (feature_extraction, feature_matching, incremental_mapper):
-        monkeypatch.setattr(each, "call", counted)
+        monkeypatch.setattr(each, "call_cancellable", counted)
     written = {path: path.stat().st_mtime_ns for path in output.glob("images*/*.JPG")}
     facts = reconstruct(request, console())
     whole_capture(output, flight, facts)
@@ -264,7 +264,9 @@ def test_another_focal_length_begins_mapping_anew(flight, begun, tmp_path, monke
             reconstruct(SfmRequest(image_folders=(flight.folder,), output=output, threads=1), console())
     assert any((output / "work" / "kept").iterdir())
     monkeypatch.setattr(
-        incremental_mapper, "run_mapper", lambda work, *_: pytest.fail("kept") if work.kept.exists() else done()
+        incremental_mapper,
+        "run_mapper",
+        lambda work, *_: pytest.fail("kept") if work.saved_snapshots.exists() else done(),
     )
 
     def done():
@@ -301,7 +303,7 @@ def test_a_disk_that_fills_while_photographs_are_written_is_said_and_nothing_is_
             reconstruct(request, console())
     assert len(list(output.glob("images*/*.JPG"))) == 7
     for room in (feature_extraction, feature_matching, incremental_mapper):
-        monkeypatch.setattr(room, "call", lambda *_, **__: pytest.fail("was done already"))
+        monkeypatch.setattr(room, "call_cancellable", lambda *_, **__: pytest.fail("was done already"))
     whole_capture(output, flight, reconstruct(request, console()))
 
 
@@ -324,11 +326,11 @@ def test_a_disk_that_is_full_for_the_database_is_said_and_nothing_is_lost(flight
 
     full.calls = 0
     with monkeypatch.context() as patch:
-        patch.setattr(room, "call", full)
+        patch.setattr(room, "call_cancellable", full)
         with pytest.raises(VdgsError, match=r"the disk is full .* the same command then goes on"):
             reconstruct(request, console())
     calls = []
-    monkeypatch.setattr(room, "call", lambda *a, **n: (calls.append(a[0]), call_cancellable(*a, **n))[1])
+    monkeypatch.setattr(room, "call_cancellable", lambda *a, **n: (calls.append(a[0]), call_cancellable(*a, **n))[1])
     whole_capture(output, flight, reconstruct(request, console()))
     assert len(calls) < (5 if room is feature_extraction else 9)  # of five, and nine with the four pairs of each
     shutil.rmtree(output)

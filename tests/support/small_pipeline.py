@@ -32,7 +32,7 @@ BLOCK = (
 def vdgs(*arguments: object) -> None:
     """A verb in this process; its exit code must be 0."""
     with pytest.raises(SystemExit) as ended:
-        main.main([str(each) for each in arguments])
+        main([str(each) for each in arguments])
     assert not ended.value.code
 
 
