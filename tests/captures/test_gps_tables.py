@@ -130,7 +130,7 @@ def test_rows_of_photographs_that_are_gone_are_left_out_and_said(tmp_path):
 )
 def test_a_table_that_contradicts_the_photographs_is_refused_with_what_is_exchanged(tmp_path, row, said):
     file = tmp_path / "gps.csv"
-    seen = [replace(photo, place=(-33.5 - k / 1000, -70.6)) for k, photo in enumerate(photographs(tmp_path, NAMES))]
+    seen = [replace(photo, lat_lon=(-33.5 - k / 1000, -70.6)) for k, photo in enumerate(photographs(tmp_path, NAMES))]
     for written, refused in (("{0},{1}", False), (row, True)):
         lines = [written.format(-33.5 - k / 1000, -70.6, 33.5 + k / 1000, 70.6) for k in range(4)]
         file.write_text("name,lat,lon,alt\n" + "".join(f"{k}.jpg,{line},500\n" for k, line in enumerate(lines)))
@@ -144,7 +144,7 @@ def test_a_table_that_contradicts_the_photographs_is_refused_with_what_is_exchan
 @pytest.mark.parametrize("altitude", [0.0, None])
 def test_altitudes_that_are_all_zero_are_a_default(tmp_path, altitude):
     seen = photographs(tmp_path, NAMES)
-    seen = [replace(photo, place=(-33.5 - k / 1000, -70.6), altitude=altitude) for k, photo in enumerate(seen)]
+    seen = [replace(photo, lat_lon=(-33.5 - k / 1000, -70.6), altitude=altitude) for k, photo in enumerate(seen)]
     found = read_gps_priors(seen, None, (1.0, 2.0))
     assert np.ptp(found.enu[:, 2]) == pytest.approx(3, abs=0.1)
     assert found.altitude_reference == "above the take-off, by XMP"

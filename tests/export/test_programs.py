@@ -48,7 +48,7 @@ def test_a_scene_along_other_axes_is_the_same_scene(axes: Axes):
     there = axes.of_ground(some)
     back = axes.to_ground(there)
     np.testing.assert_allclose(there.means, some.means.numpy() @ axes.turn.T, atol=1e-6)
-    for name in ("means", "log_scales", "logits", "dc", "rest"):
+    for name in ("means", "log_scales", "opacity_logits", "sh0", "shN"):
         torch.testing.assert_close(back.tensors()[name], some.tensors()[name], atol=1e-5, rtol=1e-4)
     if np.linalg.det(axes.turn) > 0:
         shown = picture(there, turned_camera(overhead(), axes.turn))
@@ -75,7 +75,7 @@ def test_files_along_any_axes_are_read_back_into_the_ground_frame(tmp_path, axes
     registry.write_scene(tmp_path / name, replace(ExportScene.of(some), axes=axes))
     back = registry.read_gaussians(tmp_path / name)
     assert psnr(picture(back), picture(some)) > 28
-    assert axes.to_markdown.encode() in b"".join(each.read_bytes()[:2000] for each in sorted(tmp_path.iterdir()))
+    assert axes.description.encode() in b"".join(each.read_bytes()[:2000] for each in sorted(tmp_path.iterdir()))
 
 
 def test_each_program_gets_its_axes_and_no_other_files(tmp_path):
@@ -259,7 +259,7 @@ import torch
 from dataclasses import replace
 from support.gaussians import random_gaussians
 from vdgs.export.formats import registry
-from vdgs.export.formats.export_scene import Scene
+from vdgs.export.formats.export_scene import ExportScene
 
 def chunks():
     yield random_gaussians(3000, 0)
@@ -267,14 +267,14 @@ def chunks():
 
 path = Path(sys.argv[1])
 if path.name == "tileset.json":
-    from vdgs.export.formats import tiles
+    from vdgs.export.formats import tiles_3d as tiles
     written = tiles.write_bytes
     def write(file, content):
         written(file, content)
         os.kill(os.getpid(), signal.SIGKILL)
     tiles.write_bytes = write
-    tiles.write_tiles(path, Scene.of(random_gaussians(3000, 0)), most=500)
-registry.write(path, Scene(chunks(), 6000, 0))
+    tiles.write_tiles(path, ExportScene.of(random_gaussians(3000, 0)), max_gaussians=500)
+registry.write_scene(path, ExportScene(chunks=chunks(), count=6000, degree=0))
 """
 
 
@@ -284,7 +284,7 @@ def test_what_a_killed_export_left_goes_with_the_next(tmp_path, name: str):
     (tmp_path / "tiles-7").mkdir()
     (tmp_path / "tiles-7" / "0.glb").write_text("mine")
     mine = listed(tmp_path)
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])}
     done = subprocess.run([sys.executable, "-c", KILLED, tmp_path / name], env=environment, capture_output=True)
     assert done.returncode == -9, done.stderr.decode()
     left = listed(tmp_path)

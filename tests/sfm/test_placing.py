@@ -44,9 +44,9 @@ def capture(finished, tmp_path, monkeypatch) -> Path:
     """A copy whose features, matches and poses must not be made again."""
     shutil.copytree(finished, tmp_path / "capture")
     for room, name in (
-        (feature_extraction, "find_features"),
-        (feature_matching, "match"),
-        (incremental_mapper, "find_models"),
+        (feature_extraction, "extract_features"),
+        (feature_matching, "match_pairs"),
+        (incremental_mapper, "run_mapper"),
     ):
         monkeypatch.setattr(room, name, lambda *_: pytest.fail("was done already"))
     return tmp_path / "capture"
@@ -79,7 +79,7 @@ def test_a_table_given_afterwards_moves_the_finished_capture(nine, capture, tmp_
     facts, said = again(nine, capture, table(tmp_path / "gps.csv", nine, lambda enu: enu + shift))
     assert "placed anew" in said
     assert max(facts.residual_rms_m) < 0.3
-    assert (facts.registered, facts.pairs, facts.found) == (before.registered, before.pairs, before.library_info)
+    assert (facts.registered, facts.pairs, facts.found) == (before.registered, before.pairs, before.found)
     scene = load_capture(capture)
     assert validate_capture(scene).problems == ()
     assert "scale ±" in scene.ground.description  # what maps and reports say of their place
