@@ -252,7 +252,7 @@ def test_masks_of_other_names_or_shapes_are_refused(folder, scene):
 
 def test_masks_that_leave_nothing_are_refused_and_masks_of_ones_keep_all(folder, scene):
     write_masks(folder, scene.cameras, keep=0)
-    with pytest.raises(CaptureError, match="0 of 255. Turn it round"):
+    with pytest.raises(CaptureError, match=r"0 of 255\. Turn it round"):
         check_images(load_capture(folder))
     write_masks(folder, scene.cameras, keep=1)
     check_images(load_capture(folder))

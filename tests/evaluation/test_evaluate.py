@@ -21,7 +21,7 @@ from vdgs.errors import CaptureError, RunError, TrainingDiverged
 from vdgs.evaluation import comparison_images, metrics
 from vdgs.evaluation.evaluate_model import evaluate_model
 from vdgs.evaluation.lpips import Lpips, LpipsScores
-from vdgs.evaluation.renderable_model import EvaluationSettings, ModelMetadata, ReferenceViews, RenderableModel
+from vdgs.evaluation.renderable_model import EvaluatedModel, EvaluationSettings, ReferenceViews, RenderableModel
 from vdgs.system.atomic_files import to_jsonable, write_json
 
 pytestmark = pytest.mark.xdist_group("evaluate")
@@ -64,7 +64,7 @@ def read(path: Path):
 
 
 def test_what_is_written_is_what_was_measured(city: City, tmp_path: Path):
-    facts = ModelMetadata(n_anchors=1234, model_bytes=10**6)
+    facts = EvaluatedModel(n_anchors=1234, model_bytes=10**6)
     model = RenderableModel(render=city.render, visibility_map=city.visibility, metadata=facts)
     result = evaluate_model(city.taken, model, tmp_path, lpips_note="LPIPS is null: no weights.")
     assert result == read(tmp_path / "metrics.json")

@@ -41,7 +41,7 @@ from vdgs.evaluation.evaluate_model import evaluate_model
 from vdgs.evaluation.evaluate_run import cached_reference_views, make_true_depth
 from vdgs.evaluation.lpips import load_lpips
 from vdgs.evaluation.opacity_coverage import coverage_map
-from vdgs.evaluation.renderable_model import EvaluationSettings, ModelMetadata, RenderableModel
+from vdgs.evaluation.renderable_model import EvaluatedModel, EvaluationSettings, RenderableModel
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import Raster
 from vdgs.kernels.spherical_harmonics import MAX_SH_DEGREE
@@ -163,11 +163,11 @@ def evaluate_gs3d(
     return of_gaussians
 
 
-def _model_metadata(trained: StageFolder | None) -> ModelMetadata:
+def _model_metadata(trained: StageFolder | None) -> EvaluatedModel:
     if trained is None:
-        return ModelMetadata(model=METHOD_NAME)
+        return EvaluatedModel(model=METHOD_NAME)
     status = trained.status()
-    return ModelMetadata(
+    return EvaluatedModel(
         model=METHOD_NAME, model_bytes=trained.model.stat().st_size,
         train_seconds=status.seconds, peak_memory_bytes=status.peak_memory_bytes,
     )  # fmt: skip

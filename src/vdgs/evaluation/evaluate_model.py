@@ -29,7 +29,7 @@ from vdgs.evaluation.depth_errors import DepthErrors, summarize_depth_errors
 from vdgs.evaluation.lpips import Lpips
 from vdgs.evaluation.metric_tables import make_metrics_table
 from vdgs.evaluation.opacity_coverage import summarize_opacity_coverage, summarize_oversized_splats
-from vdgs.evaluation.renderable_model import EvaluationSettings, ModelMetadata, ReferenceViews, RenderableModel
+from vdgs.evaluation.renderable_model import EvaluatedModel, EvaluationSettings, ReferenceViews, RenderableModel
 from vdgs.evaluation.view_metrics import (
     AFFINE_KEYS,
     CORRECTED_KEYS,
@@ -106,7 +106,7 @@ def require_views(views: Sequence[View], output: Path) -> None:
 
 def summarize_views(
     per_view_metrics: Iterable[ViewMetrics],
-    metadata: ModelMetadata,
+    metadata: EvaluatedModel,
     output: Path,
     *,
     lpips_note: str,
@@ -126,7 +126,7 @@ def summarize_views(
 
 
 def _summary(
-    gathered: _MetricTotals, metadata: ModelMetadata, lpips_note: str, settings: EvaluationSettings, timed: bool
+    gathered: _MetricTotals, metadata: EvaluatedModel, lpips_note: str, settings: EvaluationSettings, timed: bool
 ) -> EvaluationMetrics:
     rows, keys = gathered.rows, RAW_KEYS + CORRECTED_KEYS + AFFINE_KEYS
     pixel_bins = gathered.histogram.bins(settings.visibility_bins) if gathered.histogram else None

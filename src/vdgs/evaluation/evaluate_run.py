@@ -22,7 +22,7 @@ from vdgs.evaluation.block_seams import BlockInputs
 from vdgs.evaluation.evaluate_model import evaluate_model
 from vdgs.evaluation.lpips import load_lpips
 from vdgs.evaluation.opacity_coverage import coverage_map
-from vdgs.evaluation.renderable_model import EvaluationSettings, ModelMetadata, ReferenceViews, RenderableModel
+from vdgs.evaluation.renderable_model import EvaluatedModel, EvaluationSettings, ReferenceViews, RenderableModel
 from vdgs.evaluation.view_exposures import make_exposures
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import Raster
@@ -84,7 +84,7 @@ def select_views(capture: Capture, views: EvaluationSplit) -> list[View]:
 
 def make_renderable_model(run: OpenedRun, coarse: OpenedRun, views: EvaluationSplit) -> RenderableModel:
     """The opened model as the evaluation sees it, beside the coarse model of its run."""
-    metadata = ModelMetadata(
+    metadata = EvaluatedModel(
         model=run.name,
         n_anchors=len(run.model.anchors),
         model_bytes=run.model_path.stat().st_size,

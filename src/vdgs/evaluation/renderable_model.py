@@ -25,7 +25,7 @@ class RenderedView(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ModelMetadata:
+class EvaluatedModel:
     """What the evaluation reports of the model but cannot measure itself; None is unknown."""
 
     #: "coarse" or "merged".
@@ -47,7 +47,7 @@ class RenderableModel:
     render: Callable[[Camera], RenderedView]
     #: V per pixel [h, w], NaN where the model shows nothing; without it there are no figures by visibility.
     visibility_map: Callable[[Camera], Float[np.ndarray, "h w"]] | None = None
-    metadata: ModelMetadata = ModelMetadata()
+    metadata: EvaluatedModel = EvaluatedModel()
     #: Whether the time that `render` takes says anything.
     is_timed: bool = True
     #: What is behind the model in a render, RGB in [0, 1].

@@ -38,7 +38,7 @@ from vdgs.model.gaussians import Gaussians
 from vdgs.runs.open_run import OpenedRun
 from vdgs.runs.run_folder import REPORT_FILE
 from vdgs.system.atomic_files import to_jsonable, write_json
-from vdgs.system.documents import ExportedFile, ExportMetadata, JsonObject
+from vdgs.system.documents import ExportDocument, ExportedFile, JsonObject
 from vdgs.system.scratch import remove_leftovers
 from vdgs.system.stop_signals import check_stop_requested
 
@@ -111,7 +111,7 @@ def resolve_request(request: ExportRequest) -> ExportRequest:
 
 def export_run(
     run: OpenedRun, request: ExportRequest, console: Console, execution: ExecutionOptions | None = None
-) -> ExportMetadata:
+) -> ExportDocument:
     """Write the files of a resolved request from an opened run; returns what RUN/export.json holds.
 
     The scene is baked in this process, or in shards where `execution` sends them: the files are the same. Raises
@@ -146,7 +146,7 @@ def export_run(
                 _write(path, baked.scene(frames[path], rows[path], path, request), console) for path in request.output
             ]
             losses = _measure_losses(run, frames, baked, request, console)
-    record: ExportMetadata = to_jsonable({
+    record: ExportDocument = to_jsonable({
         "model": run.name, "key": run.key, "gaussians": len(kept), "sh_degree": request.sh_degree, "rounds": rounds,
         "seconds_to_bake": seconds, "seconds_to_refine": request.optimize_seconds, "files": files, "losses": losses,
     })  # fmt: skip

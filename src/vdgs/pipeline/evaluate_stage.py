@@ -44,7 +44,7 @@ from vdgs.evaluation.evaluate_run import (
     select_views,
 )
 from vdgs.evaluation.lpips import load_lpips
-from vdgs.evaluation.renderable_model import EvaluationSettings, ModelMetadata
+from vdgs.evaluation.renderable_model import EvaluatedModel, EvaluationSettings
 from vdgs.evaluation.view_metrics import ViewInputs, measure_view
 from vdgs.evaluation.view_metrics_io import load_view_metrics, save_view_metrics
 from vdgs.runs.open_run import ModelLocation, load_run_blocks, locate_model
@@ -247,7 +247,7 @@ def _join(evaluation: _Evaluation, job: ShardedJob, console: Console) -> None:
     metadata = read_json(job.shard(0).path / "facts.json")
     summarize_views(
         (metrics for metrics, _ in job.gather(load_view_metrics)),
-        record_from_dict(ModelMetadata, metadata["model"]),
+        record_from_dict(EvaluatedModel, metadata["model"]),
         job.output,
         lpips_note=metadata["lpips_note"],
         settings=evaluation.settings,

@@ -111,7 +111,7 @@ class ExportedFile(TypedDict):
     notes: list[str]
 
 
-class ExportMetadata(TypedDict):
+class ExportDocument(TypedDict):
     """export.json of a run."""
 
     model: str
