@@ -14,7 +14,7 @@ class SfmOptions:
     """How photographs become a capture (structure from motion)."""
 
     focal: Literal["auto", "fixed", "refine"] = "auto"
-    """The focal length. hold: that of EXIF and XMP; refine: fitted; auto: held where the flight cannot tell it from the
+    """The focal length. fixed: that of EXIF and XMP; refine: fitted; auto: held where the flight cannot tell it from the
     height (straight down from one height, by what the drone recorded or by level positions all over an area) and where
     the maker calibrated it; fitted otherwise."""
     num_neighbors: Annotated[int, Range(2, 1000)] = 16
