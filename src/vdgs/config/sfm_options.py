@@ -14,9 +14,9 @@ class SfmOptions:
     """How photographs become a capture (structure from motion)."""
 
     focal: Literal["auto", "fixed", "refine"] = "auto"
-    """The focal length. fixed: that of EXIF and XMP; refine: fitted; auto: held where the flight cannot tell it from the
-    height (straight down from one height, by what the drone recorded or by level positions all over an area) and where
-    the maker calibrated it; fitted otherwise."""
+    """The focal length. fixed: that of EXIF and XMP; refine: fitted; auto: held where the flight cannot tell it from
+    the height (straight down from one height, by what the drone recorded or by level positions all over an area) and
+    where the maker calibrated it; fitted otherwise."""
     num_neighbors: Annotated[int, Range(2, 1000)] = 16
     """Each photograph is matched with so many that were taken near it, where positions are known; with more where those
     show little of the same: facades, oblique views, several cameras at one place."""
