@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -315,7 +316,14 @@ def test_real_gps_agrees_with_the_georeference():
     capture = load_capture(folder, CaptureOptions(images="images_4"))
     by_gps = load_capture(folder, CaptureOptions(images="images_4", gps=folder / "gps.csv"))
     assert by_gps.ground.scale == pytest.approx(1, abs=1e-3)
-    assert by_gps.ground.rotation[2, 2] > 0.99999
+    # georef.json comes of the same positions, which are good to some metres, by another fit: the two may lean against
+    # each other by no more than the height error that the frame itself states makes at the edge of the flight.
+    (stated,) = re.findall(r"±([\d.]+) m up", by_gps.ground.description)
+    centers = np.array([view.camera.position for view in by_gps.views])
+    edge = np.linalg.norm(centers[:, :2] - np.median(centers[:, :2], axis=0), axis=1).max()
+    lean = np.arccos(by_gps.ground.rotation[2, 2])
+    assert np.degrees(lean) < 0.5
+    assert edge * np.sin(lean) < float(stated)
     assert by_gps.ground.origin_geo is not None
     assert capture.ground.origin_geo is not None
     assert by_gps.ground.origin_geo[:2] == pytest.approx(capture.ground.origin_geo[:2], abs=1e-3)
