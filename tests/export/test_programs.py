@@ -28,6 +28,8 @@ from vdgs.geometry.camera import Camera
 from vdgs.model.gaussians import Gaussians
 from vdgs.system.scratch import remove_leftovers, scratch_folder
 
+pytestmark = pytest.mark.slow
+
 MODULES = Path(os.environ.get("VDGS_NODE") or "none") / "node_modules"
 CONVERTER = MODULES / "@playcanvas/splat-transform/bin/cli.mjs"
 

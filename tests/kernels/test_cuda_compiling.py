@@ -16,6 +16,8 @@ from vdgs.errors import VdgsError
 from vdgs.kernels.cuda import compile_cache, launch, nvrtc
 from vdgs.kernels.cuda.nvrtc import CompileError, CompileTarget, CudaUnavailable, Nvrtc, NvrtcLibrary
 
+pytestmark = pytest.mark.slow
+
 ARCHITECTURES = (75, 80, 86, 89, 90, 100, 120)
 
 

@@ -26,6 +26,8 @@ from vdgs.plots.partition.score_heatmap import sort_cameras
 from vdgs.plots.style import DPI, draw_titles
 from vdgs.plots.visibility_map import remove_speckles
 
+pytestmark = pytest.mark.slow
+
 #: Names of x and y.
 METERS = ("east (m)", "north (m)")
 

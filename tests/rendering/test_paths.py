@@ -24,6 +24,8 @@ from vdgs.rendering.camera_paths import flyover, frame_count, interpolate, look_
 from vdgs.rendering.path_io import load_path
 from vdgs.rendering.video import Encoder, VideoWriter, caution, check_film, default_encoder
 
+pytestmark = pytest.mark.slow
+
 TEMPLATE = Camera(camera_from_world=np.eye(4), fx=400.0, fy=410.0, cx=160.0, cy=90.0, width=320, height=180)
 
 

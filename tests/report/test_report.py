@@ -20,7 +20,7 @@ from vdgs.report.html_page import escape_html
 from vdgs.report.run_reader import format_difference
 from vdgs.runs.run_folder import RunFolder
 
-pytestmark = pytest.mark.xdist_group("report")
+pytestmark = [pytest.mark.xdist_group("report"), pytest.mark.slow]
 
 VOID = {"meta", "img", "br", "link", "hr", "input"}
 FILES = ("coarse/start.json",

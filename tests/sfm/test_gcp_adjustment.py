@@ -27,7 +27,7 @@ from vdgs.sfm.image_list import ExcludedImage, ImageList, collect_images
 from vdgs.sfm.reconstruct import reconstruct
 from vdgs.sfm.reconstruction_plan import plan_reconstruction
 
-pytestmark = pytest.mark.xdist_group("sfm")
+pytestmark = [pytest.mark.xdist_group("sfm"), pytest.mark.slow]
 
 PLACES = np.array([[-8.0, -8], [9, -7], [8, 9], [-9, 8], [0, 0], [-4, 5], [5, -2]])
 NAMES = ("north_west", "north_east", "gate", "barn", "well", "fence", "stone")

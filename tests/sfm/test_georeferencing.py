@@ -14,6 +14,8 @@ from vdgs.geometry.similarity import Similarity, fit_similarity
 from vdgs.sfm.georeferencing import FOOT_M, Doubts
 from vdgs.sfm.georegistration import Georegistration
 
+pytestmark = pytest.mark.slow
+
 #: Metres of the flight for one unit of the cameras' world.
 SCALE = 13.0
 HEIGHT_M = 75.0

@@ -31,7 +31,7 @@ from vdgs.synth.true_visibility import (
     view_ground_truth,
 )
 
-pytestmark = pytest.mark.xdist_group("synth_flights")
+pytestmark = [pytest.mark.xdist_group("synth_flights"), pytest.mark.slow]
 
 FLIGHTS = ("uneven", "even", "distant", "orbits", "corridor")
 TOY = SynthOptions(size="toy", width=64, height=48, samples_per_pixel=1, points=300, seed=1, truth=True)

@@ -42,6 +42,8 @@ from vdgs.training.session import memory_advice as memory_advice_module
 from vdgs.training.session import trainer as watching
 from vdgs.training.session.memory_advice import print_memory_estimate
 
+pytestmark = pytest.mark.slow
+
 needs = st.builds(
     TrainingWorkload,
     anchors=st.integers(1, 10**7),

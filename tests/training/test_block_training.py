@@ -30,6 +30,8 @@ from vdgs.training import (
     views_in_cycle,
 )
 
+pytestmark = pytest.mark.slow
+
 
 def finish(stage: TrainingProblem, state: TrainingState, until: int = 1000) -> TrainingState:
     train(state, stage, stop=lambda: state.iteration >= until, after_step=lambda *_: None)

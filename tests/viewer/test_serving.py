@@ -40,7 +40,7 @@ from vdgs.viewer.point_panel import PointPanel
 from vdgs.viewer.render_scheduler import MAX_CACHED_IMAGES, RenderSession
 from vdgs.viewer.server import find_free_port, serve
 
-pytestmark = pytest.mark.xdist_group("viewer")
+pytestmark = [pytest.mark.xdist_group("viewer"), pytest.mark.slow]
 
 
 @pytest.fixture(scope="module")
