@@ -23,6 +23,8 @@ from vdgs.captures.photometric_gains import LOG_OFFSET, PointColors, collect_poi
 from vdgs.config.presets import PRESETS
 from vdgs.model.anchor_model import AnchorModel
 
+pytestmark = pytest.mark.slow
+
 SCENE = tiny_scene(columns=5, rows=4)
 CAMERAS = list(SCENE.cameras.values())
 SPREAD = PRESETS["laptop"].training.exposure_min_spread

@@ -37,7 +37,7 @@ GCC = (compiler := host_compiler()) and "Free Software" in subprocess.run(
     [compiler, "--version"], capture_output=True, text=True, check=False
 ).stdout  # fmt: skip
 pytestmark = [
-    needs_nvrtc, pytest.mark.xdist_group("cuda_traffic"),
+    needs_nvrtc, pytest.mark.xdist_group("cuda_traffic"), pytest.mark.slow,
     pytest.mark.skipif(not GCC, reason="no GCC, whose thread sanitizer calls what counts"),
 ]  # fmt: skip
 #: Anchors in view and offsets of the scene that is decoded; pixels of the pictures.
