@@ -11,89 +11,36 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
-from PIL import Image
 from rich.console import Console
 
 from support.captures import look_down
-from support.hand_made_models import model_at, opaque_plane
-from vdgs.captures.capture import Capture, View
+from support.mapped_house import (
+    GROUND,
+    HOUSE,
+    ROOF,
+    TOP,
+    capture_of,
+    model_of,
+    surface,
+    surveyor_of,
+)  # fmt: skip
+from vdgs.captures.capture import Capture
 from vdgs.config.commands import OrthoRequest
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
-from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.geometry.map_projection import MapProjection
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.model.decoder import Decoder
 from vdgs.model.renderer import render
-from vdgs.rendering.ortho import detail_transfer, ortho_plan, render_ortho, tile_renderer
-from vdgs.rendering.ortho.detail_transfer import DetailTransfer
+from vdgs.rendering.ortho import ortho_plan, render_ortho, tile_renderer
 from vdgs.rendering.ortho.geotiff import GDAL_CACHE_BYTES, limit_gdal_cache
 from vdgs.rendering.ortho.nadir_camera import NadirCamera
 from vdgs.rendering.ortho.pixel_grid import TILE_PX, PixelGrid, capture_extent, grid_from_bbox, ground_sampling_distance
 from vdgs.rendering.ortho.previews import floor_to_nice_length, hillshade
-from vdgs.rendering.ortho.tile_renderer import NODATA_COUNT, NODATA_HEIGHT, TileRenderer, samples_per_side
+from vdgs.rendering.ortho.tile_renderer import NODATA_COUNT, NODATA_HEIGHT, samples_per_side
 from vdgs.runs.run_context import RunContext
 
 rasterio = pytest.importorskip("rasterio")
 pytest.importorskip("pyproj")
-
-#: Far from the middle of its zone: grid north is 1.1 degrees off.
-PLACE = (46.95, 7.44, 560.0)
-SPACING, ROOF = 0.25, 5.0
-#: Where the house stands, in the ground frame: x0, y0, x1, y1.
-HOUSE = (2.0, -3.0, 6.0, 1.0)
-
-
-def surface(x0: float, y0: float, x1: float, y1: float, z: float) -> np.ndarray:
-    x, y = np.meshgrid(np.arange(x0 + SPACING / 2, x1, SPACING), np.arange(y0 + SPACING / 2, y1, SPACING))
-    # Not quite level: which of two splats at one depth comes first is a matter of rounding.
-    return np.column_stack([x.ravel(), y.ravel(), z + np.random.default_rng(0).uniform(-0.02, 0.02, x.size)])
-
-
-def model_of(places: np.ndarray) -> AnchorModel:
-    """Opaque splats at these places, each of its own colour, flat enough that roofs stay roofs."""
-    plane = opaque_plane(spacing=SPACING)
-    anchors = model_at(places).anchors
-    anchors = replace(
-        anchors,
-        offsets=torch.zeros_like(anchors.offsets),
-        log_scales=torch.full_like(anchors.log_scales, float(np.log(SPACING))),
-    )
-    return replace(plane, anchors=anchors)
-
-
-def surveyor_of(model: AnchorModel, capture: Capture, placement: MapProjection, *given, **named) -> TileRenderer:
-    return TileRenderer(model, NadirCamera.of(capture, placement), *given, **named)
-
-
-GROUND, TOP = surface(-10, -10, 10, 10, 0.0), surface(*HOUSE, ROOF)
-
-
-def capture_of(points: np.ndarray, origin: tuple[float, float, float] | None = PLACE, flying: float = 20.0) -> Capture:
-    """Cameras in a row over the scene, looking down; the sparse points as given."""
-    views = []
-    for number, x in enumerate((-6.0, -2.0, 2.0, 6.0)):
-        camera = Camera(
-            camera_from_world=look_down(np.array([x, 0.0, flying]), 5.0, 90.0), fx=80.0, fy=80.0, cx=32.0, cy=24.0,
-            width=64, height=48,
-        )  # fmt: skip
-        views.append(
-            View(
-                name=f"{number}.png",
-                camera=camera,
-                image_path=Path("images") / f"{number}.png",
-                mask_path=None,
-                split="train",
-            )
-        )
-    ground = GroundFrame(
-        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, description="hand-made", origin_geo=origin
-    )
-    return Capture(
-        root=Path("place"), source="colmap", images="images", views=tuple(views), points=points,
-        point_colors=np.zeros((len(points), 3), np.uint8), ground=ground,
-    )  # fmt: skip
 
 
 @pytest.fixture
@@ -430,88 +377,6 @@ def test_light_of_a_hillshade():
 @pytest.mark.parametrize(("about", "length"), [(10.0, 10.0), (9.9, 5.0), (0.23, 0.2), (499.0, 200.0)])
 def test_scale_bars_are_round(about, length):
     assert floor_to_nice_length(about) == pytest.approx(length)
-
-
-def pattern(places: np.ndarray) -> np.ndarray:
-    """A fine weave of the ground, -1 or 1, by x and y."""
-    return np.sign(np.sin(places[..., 0] * 2 * np.pi / 0.9) * np.sin(places[..., 1] * 2 * np.pi / 0.9))
-
-
-def photographed(capture: Capture, model: AnchorModel, folder: Path, woven: float) -> Capture:
-    """Photographs of the model on disk, the ground (not the roof) woven with detail that the model does not have."""
-    views = []
-    for view in capture.views:
-        sharp = view.camera.resized(320, 240)
-        drawn = render(model, sharp, depth=True)
-        places = sharp.unproject(drawn.median_depth.numpy())
-        low = (places[..., 2] < 1.0)[..., None]
-        image = (drawn.image.numpy() + woven * low * pattern(places)[..., None]).clip(0, 1)
-        Image.fromarray((image * 255 + 0.5).astype(np.uint8)).save(folder / view.name)
-        views.append(replace(view, camera=sharp, image_path=folder / view.name))
-    return replace(capture, views=tuple(views))
-
-
-@pytest.mark.parametrize("woven", [0.0, 0.06])
-def test_detail_comes_from_the_photographs_where_they_see_the_place(house, tmp_path, woven):
-    capture, model = house
-    capture = photographed(capture, model, tmp_path, woven)
-    grid = PixelGrid(-3.0, 5.0, 0.08, 120, 100)
-    placement, sharpener = MapProjection.of(capture.ground, "local"), DetailTransfer(model, capture)
-    plain = surveyor_of(model, capture, placement).render_tile(grid)
-    sharp = surveyor_of(model, capture, placement, detail_transfer=sharpener).render_tile(grid)
-    sharpener.close()
-    np.testing.assert_array_equal(sharp.heights, plain.heights)
-    gained = (sharp.colors.astype(float) - plain.colors).mean(axis=-1) / 255
-    x = grid.left + (np.arange(120) + 0.5) * 0.08
-    y = grid.top - (np.arange(100) + 0.5) * 0.08
-    ground = plain.heights < 1.0
-    if not woven:
-        assert np.abs(gained).mean() < 0.01
-        return
-    detail = pattern(np.stack(np.meshgrid(x, y), axis=-1))
-    assert np.corrcoef(gained[ground], detail[ground])[0, 1] > 0.7
-    assert np.abs(gained[~ground]).mean() < 0.35 * np.abs(gained[ground]).mean()
-
-
-def gray(places: np.ndarray) -> AnchorModel:
-    """The same splats, all of one grey."""
-    model = model_of(places)
-    tensors = {name: tensor.clone() for name, tensor in model.decoder.tensors().items()}
-    tensors["color_w2"].zero_()
-    tensors["color_b2"].zero_()
-    return replace(model, decoder=Decoder.from_tensors(tensors))
-
-
-def misted(capture: Capture, folder: Path) -> Capture:
-    """Photographs, whose own brightness waves smoothly with the place and is another in each."""
-    views = []
-    for number, view in enumerate(capture.views):
-        sharp = view.camera.resized(320, 240)
-        x, y, _ = np.moveaxis(sharp.unproject(np.full((240, 320), sharp.position[2])), -1, 0)
-        light = 0.5 + 0.1 * np.sin(2 * np.pi * (x + 0.3 * number) / 4.1) * np.cos(2 * np.pi * y / 5.3)
-        Image.fromarray((light[..., None].repeat(3, axis=2) * 255 + 0.5).astype(np.uint8)).save(folder / view.name)
-        views.append(replace(view, camera=sharp, image_path=folder / view.name))
-    return replace(capture, views=tuple(views))
-
-
-@pytest.mark.parametrize("most", [12, 2])
-def test_detail_knows_no_borders_of_tiles(house, tmp_path, monkeypatch, most):
-    """Also where only some of the photographs are looked up."""
-    monkeypatch.setattr(detail_transfer, "_MAX_VIEWS", most)
-    capture, _ = house
-    capture, model = misted(capture, tmp_path), gray(GROUND)
-    sharpener = DetailTransfer(model, capture)
-    surveyor = surveyor_of(model, capture, MapProjection.of(capture.ground, "local"), detail_transfer=sharpener)
-    grid = PixelGrid(-8.0, 4.0, 0.08, 200, 100)
-    whole = surveyor.render_tile(grid).colors
-    joined = np.zeros_like(whole)
-    for column, row, part in grid.tiles(50):
-        joined[row : row + part.height, column : column + part.width] = surveyor.render_tile(part).colors
-    sharpener.close()
-    assert np.ptp(whole[..., 0].astype(int)) > 10
-    off = np.abs(joined.astype(int) - whole)
-    assert off.max() <= 1
-    assert (off > 0).mean() < 0.01
 
 
 def test_gdal_may_keep_megabytes_of_a_map_and_not_bytes():

@@ -1,15 +1,11 @@
-"""Camera paths: what the file says, what a smooth path promises, what a film holds."""
+"""Camera paths: what the file says, what a smooth path promises."""
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import os
-import subprocess
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -19,12 +15,8 @@ from scipy.spatial.transform import Rotation
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.ground_frame import GroundFrame
-from vdgs.rendering import video
 from vdgs.rendering.camera_paths import flyover, frame_count, interpolate, look_at_pose, orbit
 from vdgs.rendering.path_io import load_path
-from vdgs.rendering.video import Encoder, VideoWriter, caution, check_film, default_encoder
-
-pytestmark = pytest.mark.slow
 
 TEMPLATE = Camera(camera_from_world=np.eye(4), fx=400.0, fy=410.0, cx=160.0, cy=90.0, width=320, height=180)
 
@@ -386,155 +378,3 @@ def test_a_flyover_of_one_camera_stands_still():
     path = flyover(strips(1, 1), TEMPLATE, seconds=0.2, fps=25.0)
     assert len(path.cameras) == 5
     assert all(is_rigid(camera) for camera in path.cameras)
-
-
-def test_a_film_holds_its_frames(tmp_path: Path):
-    file = tmp_path / "films" / "film.mp4"
-    levels = (40, 120, 200)
-    with VideoWriter(file, 30.0, encoder="mpeg4") as film:
-        for level in levels:
-            film.write(np.full((49, 65, 3), (level, level // 2, 30), np.uint8))
-        assert not file.exists()
-    assert [path.name for path in file.parent.iterdir()] == ["film.mp4"]
-    reader = cv2.VideoCapture(str(file))
-    for level in levels:
-        done, frame = reader.read()
-        assert done
-        assert frame.shape == (48, 64, 3)
-        np.testing.assert_allclose(frame[24, 32, ::-1], (level, level // 2, 30), atol=12)
-    assert not reader.read()[0]
-    reader.release()
-
-
-def interrupted() -> np.ndarray:
-    raise KeyboardInterrupt
-
-
-def test_a_film_that_fails_leaves_nothing(tmp_path: Path):
-    file = tmp_path / "film.mp4"
-    frame = np.zeros((32, 32, 3), np.uint8)
-    with VideoWriter(tmp_path / "good.mp4", 30.0, encoder="mpeg4") as film:
-        film.write(frame)
-        with pytest.raises(ValueError, match="in a film of"):
-            film.write(frame[:16])
-    with (
-        pytest.raises(KeyboardInterrupt),
-        VideoWriter(file, 30.0, encoder="mpeg4") as film,
-    ):
-        film.write(frame + interrupted())
-    with pytest.raises(VdgsError, match="no frames"), VideoWriter(file, 30.0):
-        pass
-    with pytest.raises(VdgsError, match=r"\.mp4"):
-        VideoWriter(tmp_path / "film.avi", 30.0)
-    assert [path.name for path in tmp_path.iterdir()] == ["good.mp4"]
-
-
-def test_a_missing_encoder_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("vdgs.rendering.video.importlib.util.find_spec", lambda name: None)
-    monkeypatch.setattr("vdgs.rendering.video._ffmpeg_on_path", lambda: None)
-    assert default_encoder() in ("vp9", "mpeg4")
-    monkeypatch.setattr("vdgs.rendering.video._has_vp9", lambda: False)
-    assert default_encoder() == "mpeg4"
-    monkeypatch.setattr("vdgs.rendering.video._ffmpeg_on_path", lambda: "ffmpeg")
-    assert default_encoder() == "ffmpeg"
-    monkeypatch.setattr("vdgs.rendering.video._ffmpeg_on_path", lambda: None)
-    monkeypatch.setattr("vdgs.rendering.video.cv2.VideoWriter.fourcc", lambda *letters: 0, raising=False)
-
-    class Closed:
-        fourcc = staticmethod(lambda *letters: 0)
-
-        def __init__(self, *arguments) -> None: ...
-
-        def isOpened(self) -> bool:
-            return False
-
-    monkeypatch.setattr("vdgs.rendering.video.cv2.VideoWriter", Closed)
-    with (
-        pytest.raises(VdgsError, match="pip install imageio-ffmpeg"),
-        VideoWriter(tmp_path / "film.mp4", 30.0) as film,
-    ):
-        film.write(np.zeros((8, 8, 3), np.uint8))
-
-
-@pytest.mark.parametrize("encoder", ["ffmpeg", "av", "vp9", "mpeg4"])
-def test_every_encoder_writes_a_whole_film(tmp_path: Path, encoder: Encoder):
-    needed = {"ffmpeg": ffmpeg_is_there(), "av": importlib.util.find_spec("av"), "vp9": video._has_vp9(), "mpeg4": True}
-    if not needed[encoder]:
-        pytest.skip(f"nothing here encodes with {encoder} (pip install imageio-ffmpeg or av)")
-    file = tmp_path / "film.mp4"
-    with VideoWriter(file, 25.0, encoder=encoder) as film:
-        for level in range(40, 200, 20):
-            film.write(np.full((49, 65, 3), (level, level // 2, 30), np.uint8))
-    check_film(file, 8)
-    reader = cv2.VideoCapture(str(file))
-    assert reader.get(cv2.CAP_PROP_FPS) == pytest.approx(25)
-    done, frame = reader.read()
-    assert done
-    np.testing.assert_allclose(frame[24, 32, ::-1], (40, 20, 30), atol=12)
-    assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
-    assert (caution(encoder) is None) == (encoder in ("ffmpeg", "av"))
-
-
-def ffmpeg_is_there() -> bool:
-    return bool(importlib.util.find_spec("imageio_ffmpeg")) or video._ffmpeg_on_path() is not None
-
-
-def test_a_film_on_a_full_disk_is_an_error_and_the_good_one_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    file, noise = tmp_path / "film.mp4", np.random.default_rng(0)
-    with VideoWriter(file, 30.0) as film:
-        film.write(np.zeros((64, 64, 3), np.uint8))
-    good = file.read_bytes()
-
-    def write_and_lose(encoder: Encoder, lost: float) -> None:
-        """A film of which the disk held only a part: as OpenCV leaves it, which says nothing."""
-        with VideoWriter(file, 30.0, encoder) as film:
-            for _ in range(10):
-                film.write(noise.integers(0, 255, (64, 64, 3), np.uint8))
-            assert film._pen is not None
-            film._pen.close()
-            partial = film._partial
-            with partial.open("r+b") as held:
-                held.truncate(int(partial.stat().st_size * (1 - lost)))
-
-    for lost in (0.02, 0.5, 1.0):
-        with pytest.raises(VdgsError, match="cannot be encoded"):
-            write_and_lose("mpeg4", lost)
-        assert file.read_bytes() == good
-        assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
-    monkeypatch.setattr("vdgs.rendering.video.FULL_BYTES", 1 << 60)
-    with pytest.raises(VdgsError, match="the disk is full"):
-        write_and_lose("mpeg4", 0.5)
-    assert file.read_bytes() == good
-
-
-@pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="only root mounts a small disk")
-def test_a_film_on_a_small_disk(tmp_path: Path):
-    """For real: a tmpfs of 160 kB, with each encoder that is here."""
-    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=160k", "tmpfs", tmp_path], capture_output=True).returncode:
-        pytest.skip("no tmpfs can be mounted here")
-    try:
-        for encoder in dict.fromkeys((default_encoder(), "mpeg4")):
-            film_of_noise(tmp_path / "film.mp4", 1, encoder)
-            good = (tmp_path / "film.mp4").read_bytes()
-            with pytest.raises(VdgsError, match="disk is full"):
-                film_of_noise(tmp_path / "film.mp4", 600, encoder)
-            assert (tmp_path / "film.mp4").read_bytes() == good
-            assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
-    finally:
-        subprocess.run(["umount", tmp_path], check=True)
-
-
-def film_of_noise(file: Path, frames: int, encoder: Encoder) -> None:
-    noise = np.random.default_rng(0)
-    with VideoWriter(file, 30.0, encoder) as film:
-        for _ in range(frames):
-            film.write(noise.integers(0, 255, (128, 128, 3), np.uint8))
-
-
-def test_what_a_killed_film_left_goes(tmp_path: Path):
-    (tmp_path / ".film.mp4.999999999.partial.mp4").write_bytes(b"half")
-    mine = tmp_path / f".film.mp4.{os.getpid()}.partial.png"
-    mine.write_bytes(b"mine")
-    with VideoWriter(tmp_path / "film.mp4", 30.0, "mpeg4") as film:
-        film.write(np.zeros((8, 8, 3), np.uint8))
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["film.mp4", mine.name])
