@@ -1,5 +1,6 @@
 """The command line: help comes without heavy imports, errors come without tracebacks."""
 
+import importlib.util
 import os
 import shlex
 import subprocess
@@ -11,7 +12,7 @@ import tyro
 from rich.console import Console
 
 from support.clusters import copy_run
-from support.commands import PATIENCE_SECONDS, entry_point, vdgs
+from support.commands import PATIENCE_SECONDS, vdgs
 from vdgs import cli
 from vdgs.cli.common import absolute_command_line, make_console
 from vdgs.cli.main import COMMANDS, HELP, get_command, main
@@ -29,6 +30,26 @@ def test_help_imports_nothing_heavy(arguments):
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE_SECONDS)
     assert done.returncode == 0, done.stderr
     assert "usage" in done.stdout.lower()
+
+
+#: A module of those that take long to import, and what it imports only when it is needed.
+IMPORTED_LATE = {"vdgs.export.export_run": "viser", "vdgs.viewer.server": "matplotlib"}
+#: Each in a process that has imported torch alone.
+EACH = f"""
+import importlib, os, sys, torch
+def imports(module, late):
+    if (process := os.fork()) == 0:
+        importlib.import_module(module)
+        os._exit(late in sys.modules)
+    return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) != 0
+print([each for each in {IMPORTED_LATE!r}.items() if imports(*each)])
+"""
+
+
+@pytest.mark.skipif(importlib.util.find_spec("viser") is None or not hasattr(os, "fork"), reason="no viser, or no fork")
+def test_what_only_some_work_needs_is_not_waited_for():
+    done = subprocess.run([sys.executable, "-c", EACH], capture_output=True, text=True, timeout=PATIENCE_SECONDS)
+    assert (done.returncode, done.stdout) == (0, "[]\n"), done.stderr
 
 
 def test_every_verb_is_in_the_help_and_has_an_action():
@@ -81,7 +102,7 @@ def test_the_bench_is_found_from_any_folder(tmp_path):
 
 
 def test_a_missing_capture_is_one_line_and_no_traceback(tmp_path):
-    done = entry_point("train-coarse", tmp_path / "nowhere", "--output", tmp_path / "run")
+    done = vdgs("train-coarse", tmp_path / "nowhere", "--output", tmp_path / "run")
     assert done.returncode == 1
     assert "nowhere" in done.stderr
     assert "Traceback" not in done.stderr

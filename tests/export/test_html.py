@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
 import sys
 from dataclasses import replace
 
@@ -93,8 +92,3 @@ def test_without_viser_it_is_said_before_the_work(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(VdgsError, match=r"vdgs\[viewer\]"):
         registry.check_export(tmp_path / "a.html", ExportScene(chunks=(), count=5, degree=0))
-
-
-def test_writing_other_formats_does_not_wait_for_viser():
-    code = "import sys, vdgs.export.export_run; sys.exit('viser' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code]).returncode == 0

@@ -7,7 +7,6 @@ import math
 import os
 import shutil
 import subprocess
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 
+from support.commands import python
 from support.gaussians import overhead, picture, psnr, random_gaussians
 from vdgs.config.commands import ExportRequest
 from vdgs.errors import VdgsError
@@ -255,9 +255,8 @@ def test_open3d_reads_the_points(tmp_path, name: str):
 # What killed exports leave
 
 KILLED = """
-import os, signal, sys
+import os, signal
 from pathlib import Path
-import torch
 from dataclasses import replace
 from support.gaussians import random_gaussians
 from vdgs.export.formats import registry
@@ -267,7 +266,7 @@ def chunks():
     yield random_gaussians(3000, 0)
     os.kill(os.getpid(), signal.SIGKILL)
 
-path = Path(sys.argv[1])
+path = Path(os.environ["WRITTEN"])
 if path.name == "tileset.json":
     from vdgs.export.formats import tiles_3d as tiles
     written = tiles.write_bytes
@@ -286,9 +285,8 @@ def test_what_a_killed_export_left_goes_with_the_next(tmp_path, name: str):
     (tmp_path / "tiles-7").mkdir()
     (tmp_path / "tiles-7" / "0.glb").write_text("mine")
     mine = listed(tmp_path)
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])}
-    done = subprocess.run([sys.executable, "-c", KILLED, tmp_path / name], env=environment, capture_output=True)
-    assert done.returncode == -9, done.stderr.decode()
+    done = python(KILLED, WRITTEN=str(tmp_path / name))
+    assert done.returncode == -9, done.stderr
     left = listed(tmp_path)
     assert left > mine
     found = registry.format_from_path(tmp_path / name).tidy(tmp_path / name)

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import ctypes
-import subprocess
-import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
 from torch._subclasses import FakeTensorMode
 
+from support.commands import python
 from vdgs.errors import VdgsError
 from vdgs.kernels.cuda import driver as driver_module
 from vdgs.kernels.cuda.driver import CudaDriver, CudaUnavailable, DriverError, get_cuda_driver
@@ -144,8 +142,9 @@ def test_no_card_and_no_driver(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_the_benchmark_says_that_there_is_no_gpu():
-    command = [sys.executable, "-m", "experiments.microbench.gpu"]
-    done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True, timeout=120)
+    done = python(
+        "import runpy, sys; sys.argv[1:] = []; runpy.run_module('experiments.microbench.gpu', run_name='__main__')"
+    )
     assert done.returncode == 2
     assert done.stderr.startswith("No GPU to measure: ")
     assert "Traceback" not in done.stderr

@@ -9,7 +9,6 @@ import math
 import shutil
 import signal
 import socket
-import subprocess
 import sys
 from pathlib import Path
 from urllib.error import HTTPError
@@ -23,7 +22,7 @@ pytest.importorskip("viser", reason="viser is not installed (pip install 'vdgs[v
 
 import viser
 
-from support.commands import vdgs, wait_until
+from support.commands import begun, vdgs, wait_until
 from support.viewer import Guest, expected, quiet, trained
 from vdgs.errors import RunError, VdgsError
 from vdgs.geometry.camera import Camera
@@ -317,21 +316,13 @@ def test_ports_and_hosts_that_cannot_be_used_are_said_before_any_work(run):
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
 def test_it_ends_when_asked_to(run, how):
-    command = [sys.executable, "-c", "from vdgs.cli.main import main; main()", "view", str(run)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        assert process.stderr is not None
-        line = next((line for line in process.stdout if "http://127.0.0.1:" in line), "")
-        assert line.startswith("coarse model ("), process.stderr.read()
-        process.stdout.readline()
+    with begun("view", run) as process:
+        wait_until(lambda: "http://127.0.0.1:" in process.printed() or not process.runs())
         process.send_signal(how)
-        assert process.wait(timeout=60) == 0
-        assert "Traceback" not in process.stderr.read()
-
-
-def test_what_draws_charts_is_not_waited_for():
-    code = "import sys, vdgs.viewer.server; sys.exit('matplotlib' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+        done = process.finished()
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("coarse model ("), done.stdout
+    assert "Traceback" not in done.stderr
 
 
 def test_a_folder_without_a_run_is_said(tmp_path):
