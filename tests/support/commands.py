@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 
 #: What nothing takes that still goes on, however busy the machine is. The limit of a whole test is larger still.
 PATIENCE_SECONDS = 900.0
+#: Resolution of the figures that commands draw.
+SMALL_DPI = 30
 #: Seconds between two looks at what is waited for.
 GLANCE_SECONDS = 0.01
 
@@ -44,6 +46,15 @@ GLANCE_SECONDS = 0.01
 IMPORTED = [
     "vdgs.cli.main",
     "vdgs.cli",
+    "vdgs.cli.capture_cmds",
+    "vdgs.cli.export_cmd",
+    "vdgs.cli.result_cmds",
+    "vdgs.cli.run_cmd",
+    "vdgs.cli.stage_cmds",
+    "vdgs.cli.tool_cmds",
+    "vdgs.kernels.device_selection",
+    "vdgs.pipeline.dry_run",
+    "vdgs.system.exit_codes",
     "vdgs.pipeline.run_pipeline",
     "vdgs.rendering.render_run",
     "experiments.bench.bench",
@@ -53,7 +64,12 @@ IMPORTED = [
     "vdgs.kernels.torch_ref",
     "vdgs.kernels.autograd",
     "typeguard",
+    "tyro._backends._tyro_backend",
+    "tyro.constructors._struct_spec_dataclass",
+    "rich._emoji_codes",
     "contourpy",
+    "PIL.GifImagePlugin",
+    "PIL.JpegImagePlugin",
     "PIL.PngImagePlugin",
     "sklearn.cluster",
     "rasterio",
@@ -267,11 +283,20 @@ def _run(main: Callable[[], None], stdout: str, stderr: str, environment: dict[s
 
 def _vdgs(arguments: list[str], prepare: Callable[[], None] | None) -> None:
     fork_tasks()
+    draw_small_figures()
     if prepare is not None:
         prepare()
     from vdgs.cli.main import main
 
     main(arguments)
+
+
+def draw_small_figures() -> None:
+    """Let this process draw figures of so few pixels as still makes files of them: what they show, others test."""
+    from vdgs.plots import style
+    from vdgs.report import charts
+
+    style.DPI = charts.DPI = SMALL_DPI
 
 
 def _execute(code: str) -> None:
