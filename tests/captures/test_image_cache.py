@@ -11,6 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
+from support.commands import PATIENCE_SECONDS
 from vdgs.captures.capture import View
 from vdgs.captures.image_cache import ImageCache, load_image
 from vdgs.captures.image_files import decode_image, decode_mask, read_header
@@ -138,7 +139,7 @@ def test_many_threads_get_the_right_pictures(views):
         for thread in threads:
             thread.start()
         for thread in threads:
-            thread.join(60)
+            thread.join(PATIENCE_SECONDS)
         assert not any(thread.is_alive() for thread in threads)
         assert cache.nbytes <= 3 * BYTES
     assert not wrong

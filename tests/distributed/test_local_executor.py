@@ -272,6 +272,7 @@ class Driver:
 
     def send_signal(self, number: signal.Signals) -> None:
         """Returns when the driver has looked at its jobs since."""
+        wait_until(lambda: self._looks.exists() or self.process.poll() is not None)
         self.process.send_signal(number)
         before = self._looks.stat().st_size
         wait_until(lambda: self._looks.stat().st_size >= before + 2 or self.process.poll() is not None)

@@ -1,6 +1,7 @@
 """Work as jobs of SLURM: a real one of this machine where it is installed, and always a stand-in for its commands."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -10,6 +11,7 @@ import pytest
 
 from support.clusters import (
     BLOCKS,
+    KILLED,
     MIDDLE,
     alive,
     copy_run,
@@ -19,8 +21,9 @@ from support.clusters import (
     parent_of,
     shard_of,
     train_here,
+    waiting_shards,
 )  # fmt: skip
-from support.commands import Command, begun, do_tasks_here, vdgs, wait_until
+from support.commands import begun, do_tasks_here, vdgs, wait_until
 from support.slurm import is_installed, real, stand_in
 from vdgs.config.executor_options import SlurmOptions
 from vdgs.distributed import slurm_commands
@@ -78,12 +81,6 @@ def element_of(process: int) -> str:
     return f"{told['SLURM_ARRAY_JOB_ID']}_{told['SLURM_ARRAY_TASK_ID']}"
 
 
-def processes(driver: Command, count: int) -> dict[int, int]:
-    """The process of each block that waits now, once so many have waited in all."""
-    driver.wait_until_paused(count)
-    return {shard_of(process): process for process in driver.paused() if alive(process)}
-
-
 def let_go_on_at_once(element: str) -> None:
     """Spare a job that was put back into the queue the two minutes that SLURM lets it wait."""
     if is_real():
@@ -101,19 +98,19 @@ def is_real() -> bool:
 def test_time_limits_kills_and_lost_jobs_end_in_the_models_of_the_local_run(slurm, cut, local, tmp_path):
     run = copy_run(cut, tmp_path / "run")
     with begun(*by_slurm(run), pause_at=(MIDDLE, 1), environment=variables()) as driver:
-        waiting = processes(driver, 2)
+        waiting = waiting_shards(driver, 2)
         # What SLURM sends some time before the limit: the block saves, and its job has a second turn.
         subprocess.run(["scancel", "--batch", "--signal=USR1", element_of(waiting[0])], check=True)
         let_go_on_at_once(element_of(waiting[0]))
         os.kill(waiting[1], signal.SIGKILL)
-        waiting = processes(driver, 4)
+        waiting = waiting_shards(driver, 4)
         os.kill(parent_of(waiting[1]), signal.SIGKILL)  # the job's own process
-        processes(driver, 5)
+        driver.wait_until_paused(5)
         driver.go_on()
         done = driver.finished()
     assert done.returncode == 0, done.stderr + done.stdout
     assert models(run) == models(local)
-    assert "block 01: crashed by SIGKILL; continues from its last checkpoint, attempts left: 2" in done.stdout
+    assert re.search(f"block 01: {KILLED}; continues from its last checkpoint, attempts left: 2", done.stdout)
     assert "block 01: crashed by SLURM (FAILED)" in done.stdout
     assert "block 00: saved and waits for another turn" in done.stdout
     assert "block 00: crashed" not in done.stdout

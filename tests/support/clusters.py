@@ -9,11 +9,12 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from support.captures import tiny_scene, write_colmap
-from support.commands import PATIENCE_SECONDS, do_tasks_here, vdgs
+from support.commands import PATIENCE_SECONDS, Command, do_tasks_here, vdgs
 from vdgs.runs.run_folder import RunFolder
 
 #: What makes a run of two blocks that is small enough to be trained again and again.
@@ -38,6 +39,12 @@ FINE = ("--gsd", "0.022")
 
 #: Figures that depend on the machine and on what else it does.
 TIMES = ("fps", "render_seconds", "seconds", "peak_memory_bytes")
+
+#: How the end of a command is told that was killed. Where the machine, whose count is that of all its processes, has
+#: meanwhile killed any for want of memory, this one may be taken for one of them.
+KILLED = r"crashed by SIGKILL( \(out of memory; [^)]*\))?"
+#: How the loss of a node is told, by what Ray says first: that the node has died, or that its worker does not answer.
+NODE_LOST = r"crashed by the loss of its (node|worker on node)"
 
 #: Serves commands, one line each: starts and removes nodes. Nodes have one processor; the head has none.
 SERVER = """
@@ -80,7 +87,10 @@ class Cluster:
         environment = os.environ | {
             "PYTHONPATH": os.pathsep.join(paths), "RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0",
             "RAY_enable_worker_prestart": "0", "RAY_prestart_worker_first_driver": "0", "PYTHONWARNINGS": "ignore",
+            # A node that is gone refuses to be asked, at once; one that is slow to answer is not taken for dead.
             "RAY_health_check_initial_delay_ms": "0", "RAY_health_check_period_ms": "1000",
+            "RAY_health_check_failure_threshold": "2", "RAY_health_check_timeout_ms": "600000",
+            "RAY_gcs_rpc_server_reconnect_timeout_s": "600",
             "RAY_memory_monitor_refresh_ms": "0",  # what other tests take is not for Ray to free
             "VDGS_THREADS": "1", "OMP_NUM_THREADS": "1", **self.token,
         }  # fmt: skip
@@ -142,6 +152,17 @@ def shard_of(process: int) -> int:
     """Which shard, or block, a process does."""
     words = Path(f"/proc/{process}/cmdline").read_bytes().decode().split("\0")
     return int(words[words.index("vdgs.distributed.run_shard") + 2])
+
+
+def waiting_shards(driver: Command, count: int) -> dict[int, int]:
+    """The process of each shard, or block, that waits now, once so many have waited in all."""
+    driver.wait_until_paused(count)
+    found = dict[int, int]()
+    for process in driver.paused():
+        with suppress(OSError, ValueError):  # it has just ended
+            if alive(process):
+                found[shard_of(process)] = process
+    return found
 
 
 def make_run(folder: Path) -> Path:

@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 from websockets.sync.client import ClientConnection, connect
 
 from support.captures import tiny_scene, write_colmap
-from support.commands import vdgs
+from support.commands import PATIENCE_SECONDS, vdgs
 from vdgs.evaluation.metrics import to_8bit
 from vdgs.geometry.camera import Camera
 from vdgs.model.renderer import render
@@ -36,7 +36,7 @@ from vdgs.viewer.server import ViewerServer
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 #: A busy machine may need long; nothing waits so long where all is well.
-PATIENCE = 60.0
+PATIENCE = PATIENCE_SECONDS
 #: Viser's threads end after its sockets.
 quiet = pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning", "ignore::ResourceWarning")
 
