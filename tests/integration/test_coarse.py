@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from support.captures import tiny_scene, write_colmap
-from support.commands import begun, entry_point, limit_files, vdgs
+from support.commands import begun, limit_files, vdgs
 from vdgs.errors import VdgsError
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.pipeline.dense_points import PIXELS_PER_POINT
@@ -70,7 +70,7 @@ def model_bytes(run: Path) -> bytes:
 @pytest.fixture(scope="module")
 def unbroken(capture, tmp_path_factory) -> Path:
     run = tmp_path_factory.mktemp("unbroken") / "run"
-    done = entry_point(*command(capture, run))
+    done = vdgs(*command(capture, run))
     assert done.returncode == 0, done.stderr
     return run
 

@@ -215,11 +215,11 @@ def test_a_limit_of_the_process_counts():
 
 #: Without stereo, which would leave room behind in which a step fits.
 SETTINGS = (
-    "--preset", "laptop", "--iterations", "40", "--up", "z", "--anchors.num-offsets", "3", "--threads", "1",
+    "--preset", "laptop", "--iterations", "20", "--up", "z", "--anchors.num-offsets", "3", "--threads", "1",
     "--anchors.no-mvs",
 )  # fmt: skip
 #: The last iteration with photographs at half their size (preset laptop).
-LAST_HALF = 16
+LAST_HALF = 8
 
 
 def limit_memory_before_full_size() -> None:
