@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.method import MethodConfig
 from vdgs.config.serialization import from_dict
-from vdgs.errors import Stopped, VdgsError
+from vdgs.errors import VdgsError
 from vdgs.system.atomic_files import read_json, write_json
 
 if TYPE_CHECKING:
@@ -215,18 +215,10 @@ def main(arguments: list[str]) -> int:
 
     configure_threads()  # before anything imports torch
     from vdgs.distributed.task_process import stop_when_parent_dies
-    from vdgs.system.stop_signals import catch_stop_signals
+    from vdgs.system.exit_codes import exit_code_of
 
     stop_when_parent_dies()
-    try:
-        with catch_stop_signals(interrupts=True):
-            run_job(BenchJob.read(Path(arguments[0])))
-    except VdgsError as error:
-        print(f"vdgs bench: {error}", file=sys.stderr)
-        return 130 if isinstance(error, Stopped) else 1
-    except KeyboardInterrupt:
-        return 130
-    return 0
+    return exit_code_of("vdgs bench", lambda: run_job(BenchJob.read(Path(arguments[0]))), "The same command continues.")
 
 
 if __name__ == "__main__":

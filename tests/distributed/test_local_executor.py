@@ -18,6 +18,7 @@ from vdgs.distributed.local_executor import LocalExecutor
 from vdgs.distributed.shard_runner import ShardCommand
 from vdgs.distributed.task_process import PARENT_PID_VARIABLE, stop_when_parent_dies
 from vdgs.runs.stage_folder import StageFolder
+from vdgs.system.stop_signals import STOP_SIGNALS
 
 FINE = 'tell("done", iteration=10, iterations=10, psnr_training=25.5, anchors=1234)'
 #: Runs until asked to stop, then saves until it may end; a second SIGTERM would be noticed.
@@ -287,12 +288,12 @@ class Driver:
         return json.loads(line.removeprefix("OUTCOMES"))
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", STOP_SIGNALS)
 def test_a_request_to_stop_reaches_each_job_once(tmp_path, number):
     jobs = [job(tmp_path, i, LONG) for i in range(3)]
     driver = Driver(jobs, tmp_path)
     driver.send_signal(number)
-    if number == signal.SIGTERM:
+    if number != signal.SIGINT:
         driver.send_signal(number)  # a scheduler that asks twice: still once, and no kill
     driver.let_jobs_end()
     assert [o[:2] for o in driver.outcomes()] == [["stopped", 1], ["stopped", 1], ["stopped", 0]]

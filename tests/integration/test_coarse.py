@@ -20,6 +20,7 @@ from vdgs.errors import VdgsError
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.pipeline.dense_points import PIXELS_PER_POINT
 from vdgs.runs.open_run import open_run
+from vdgs.system.stop_signals import STOP_SIGNALS
 from vdgs.system.tensors import read_tensors
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("coarse")]
@@ -150,15 +151,25 @@ def test_ten_kills_change_no_bit(capture, unbroken, tmp_path):
     assert model_bytes(run) == model_bytes(unbroken)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_stopped_run_saves_and_continues(capture, unbroken, tmp_path, number):
-    run = tmp_path / "run"
-    with begun(*command(capture, run), pause_at=("*/checkpoints/00000020.json", 1)) as process:
+def take_terminal(name: str) -> None:
+    """Let this process begin a session at a terminal, where its errors go."""
+    os.setsid()
+    os.dup2(os.open(name, os.O_RDWR), 2)
+
+
+@pytest.mark.parametrize("how", [*STOP_SIGNALS, "terminal closes"])
+def test_a_stopped_run_saves_and_continues(capture, unbroken, tmp_path, how):
+    run, (inside, outside) = tmp_path / "run", os.openpty()
+    prepare = None if isinstance(how, signal.Signals) else partial(take_terminal, os.ttyname(outside))
+    with begun(*command(capture, run), pause_at=("*/checkpoints/00000020.json", 1), prepare=prepare) as process:
         process.wait_until_paused()
-        process.send_signal(number)
+        if isinstance(how, signal.Signals):
+            process.send_signal(how)
+        os.close(outside)
+        os.close(inside)
         stopped = process.finished()
     assert stopped.returncode == 130
-    assert "The same command continues" in stopped.stderr
+    assert ("The same command continues" in stopped.stderr) == isinstance(how, signal.Signals)
     assert json.loads((run / "coarse/status.json").read_text())["state"] == "stopped"
     done = finish(capture, run)
     assert "continuing at iteration 20" in done.stdout

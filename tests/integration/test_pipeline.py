@@ -267,7 +267,10 @@ def test_a_changed_setting_redoes_exactly_what_depends_on_it(capture, copied):
     assert changed == {"config.yaml", "blocks", "merged", "evaluation", "report.html"}
 
 
-@pytest.mark.parametrize(("number", "blocks"), [(signal.SIGINT, ["00", "01"]), (signal.SIGKILL, ["01"])])
+@pytest.mark.parametrize(
+    ("number", "blocks"),
+    [(signal.SIGINT, ["00", "01"]), (signal.SIGTERM, ["01"]), (signal.SIGHUP, ["01"]), (signal.SIGKILL, ["01"])],
+)
 def test_a_run_that_is_cut_off_while_blocks_train_continues_to_the_same_bits(capture, unbroken, copied, number, blocks):
     for name in ("merged", "evaluation", *(f"blocks/{block}" for block in blocks)):
         shutil.rmtree(copied / name)
@@ -277,8 +280,8 @@ def test_a_run_that_is_cut_off_while_blocks_train_continues_to_the_same_bits(cap
         process.send_signal(number)
         cut_off = process.finished()
     wait_until(lambda: is_free(copied))  # blocks notice that their driver is gone, save and end
-    assert cut_off.returncode == (130 if number == signal.SIGINT else -number)
-    assert ("The same command continues" in cut_off.stderr) == (number == signal.SIGINT)
+    assert cut_off.returncode == (-number if number == signal.SIGKILL else 130)
+    assert ("The same command continues" in cut_off.stderr) == (number != signal.SIGKILL)
     for block in blocks:
         status = json.loads((copied / "blocks" / block / "status.json").read_text())
         assert (status["state"], status["iteration"]) == ("stopped", 40)

@@ -166,33 +166,33 @@ def test_of_two_parts_the_larger_is_kept_and_the_other_named(tmp_path):
 
 
 class Stopper:
-    """Sends Ctrl-C once a function was called so many times."""
+    """Sends a signal once a function was called so many times."""
 
-    def __init__(self, after: int) -> None:
-        self.left = after
+    def __init__(self, after: int, number: signal.Signals = signal.SIGINT) -> None:
+        self.left, self.number = after, number
 
     def __call__(self) -> None:
         self.left -= 1
         if self.left == 0:
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), self.number)
 
 
 STEPS = {
-    "features": (feature_extraction, "_extract", 3),
-    "matching": (feature_matching, "call_cancellable", 2),
-    "mapping": (incremental_mapper, "save_snapshots", 5),
-    "writing": (capture_writer, "write_bytes", 8),
+    "features": (feature_extraction, "_extract", 3, signal.SIGTERM),
+    "matching": (feature_matching, "call_cancellable", 2, signal.SIGHUP),
+    "mapping": (incremental_mapper, "save_snapshots", 5, signal.SIGTERM),
+    "writing": (capture_writer, "write_bytes", 8, signal.SIGINT),
 }
 
 
 @pytest.mark.parametrize("step", STEPS)
-def test_ctrl_c_at_each_step_keeps_what_is_done_and_the_same_command_goes_on(
+def test_a_signal_at_each_step_keeps_what_is_done_and_the_same_command_goes_on(
     flight, begun, tmp_path, monkeypatch, step
 ):
     monkeypatch.setattr(feature_matching, "PAIRS_PER_THREAD", 4)
     monkeypatch.setattr(incremental_mapper, "MIN_SNAPSHOT_INTERVAL", 2)
-    room, name, after = STEPS[step]
-    output, stop, function = tmp_path / "capture", Stopper(after), getattr(room, name)
+    room, name, after, number = STEPS[step]
+    output, stop, function = tmp_path / "capture", Stopper(after, number), getattr(room, name)
     if step in begun:
         copy_folder(begun[step], output)
     request = SfmRequest(image_folders=(flight.folder,), output=output, threads=1)
@@ -235,16 +235,21 @@ def test_ctrl_c_at_each_step_keeps_what_is_done_and_the_same_command_goes_on(
         assert len(written) >= 8
 
 
-def test_only_whole_snapshots_are_gone_on_from_and_the_largest_of_them(tmp_path):
+def test_only_whole_snapshots_are_gone_on_from_and_the_largest_of_them(tmp_path, monkeypatch):
     work = Workspace(tmp_path)
 
     def snapshot(name: str, placed: int) -> None:
         (work.snapshots / name).mkdir(parents=True)
         (work.snapshots / name / "images.bin").write_bytes(placed.to_bytes(8, "little"))
 
+    def check(folder: Path) -> None:
+        if folder.name == "half":
+            raise OSError("COLMAP could write a part only")
+
+    monkeypatch.setattr(incremental_mapper, "check_whole_model", check)
     incremental_mapper.save_snapshots(work)
     assert incremental_mapper._largest_snapshot(work) is None
-    for name, placed, kept in (("1", 7, 7), ("2", 12, 12), ("3", 5, 12), ("4", 110, 110)):
+    for name, placed, kept in (("1", 7, 7), ("2", 12, 12), ("3", 5, 12), ("half", 50, 12), ("4", 110, 110)):
         snapshot(name, placed)
         incremental_mapper.save_snapshots(work)
         assert [path.name for path in work.saved_snapshots.iterdir()] == [str(kept)]
@@ -318,7 +323,7 @@ def test_a_disk_that_is_full_for_the_database_is_said_and_nothing_is_lost(flight
     def full(function, *arguments, **named):
         full.calls += 1
         if full.calls == 3:
-            return call_cancellable(lambda cancellation_token: fail("SQLite error: database or disk is full"))
+            return call_cancellable(lambda _, cancellation_token: fail("SQLite error: disk is full"), arguments[0])
         return call_cancellable(function, *arguments, **named)
 
     def fail(why: str):

@@ -129,7 +129,7 @@ def test_a_film_on_a_full_disk_is_an_error_and_the_good_one_stays(tmp_path: Path
             write_and_lose("mpeg4", lost)
         assert file.read_bytes() == good
         assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
-    monkeypatch.setattr("vdgs.rendering.video.FULL_BYTES", 1 << 60)
+    monkeypatch.setattr("vdgs.system.atomic_files.FULL_DISK_BYTES", 1 << 60)
     with pytest.raises(VdgsError, match="the disk is full"):
         write_and_lose("mpeg4", 0.5)
     assert file.read_bytes() == good

@@ -1,37 +1,57 @@
 """Requests to stop are noted as they should be, and handlers are put back."""
 
+import re
 import signal
+import subprocess
+import sys
 import threading
 from contextlib import suppress
+from pathlib import Path
 
 import pytest
 
+import vdgs
 from vdgs.errors import Interrupted
-from vdgs.system.stop_signals import catch_stop_signals, check_stop_requested
+from vdgs.system.stop_signals import STOP_SIGNALS, catch_stop_signals, check_stop_requested
 
-NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+#: Loads pycolmap, with or without a handler of ours, then says what SIGTERM does.
+LOADED = """
+import importlib, signal, sys, threading
+from vdgs.system.stop_signals import catch_stop_signals
+with catch_stop_signals() as requests:
+    load = lambda: importlib.import_module("vdgs.system.colmap")
+    if sys.argv[1] == "thread":
+        thread = threading.Thread(target=load)
+        thread.start()
+        thread.join()
+    else:
+        load()
+    signal.raise_signal(signal.SIGTERM)
+    print("asked", *requests)
+signal.raise_signal(signal.SIGTERM)
+"""
 
 
 @pytest.fixture(autouse=True)
 def handlers_as_before():
     """Those of a terminal, whatever the tests were started with: under nohup they inherit an ignored SIGHUP."""
     inherited = signal.signal(signal.SIGHUP, signal.SIG_DFL)
-    before = [signal.getsignal(number) for number in NUMBERS]
+    before = [signal.getsignal(number) for number in STOP_SIGNALS]
     yield
-    after = [signal.getsignal(number) for number in NUMBERS]
+    after = [signal.getsignal(number) for number in STOP_SIGNALS]
     signal.signal(signal.SIGHUP, inherited)
     assert after == before
 
 
 def test_requests_are_noted_in_their_order():
-    with catch_stop_signals(hangup=True) as asked:
+    with catch_stop_signals() as asked:
         assert not asked
         for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM, signal.SIGINT):
             signal.raise_signal(number)
         assert list(asked) == [signal.SIGHUP, signal.SIGINT, signal.SIGTERM, signal.SIGINT]
 
 
-@pytest.mark.parametrize("first", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("first", STOP_SIGNALS)
 def test_the_second_ctrl_c_interrupts_where_asked_for(first):
     with catch_stop_signals(second_interrupts=True) as asked:
         signal.raise_signal(first)
@@ -41,16 +61,41 @@ def test_the_second_ctrl_c_interrupts_where_asked_for(first):
         assert list(asked) == [first, signal.SIGTERM]
 
 
-def test_hangup_stays_ignored_under_nohup_and_is_left_alone_where_not_asked_for():
+def test_hangup_stays_ignored_under_nohup():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with catch_stop_signals(hangup=True) as asked:
+        with catch_stop_signals() as asked:
             signal.raise_signal(signal.SIGHUP)
             assert not asked
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)
-    with catch_stop_signals():
-        assert signal.getsignal(signal.SIGHUP) == before
+
+
+def test_only_ctrl_c_breaks_off_the_saving():
+    """A terminal that closes sends SIGHUP twice, schedulers SIGTERM to all processes of a job and to their parent."""
+    with catch_stop_signals(interrupts=True) as asked:
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGHUP)
+        for number in (signal.SIGHUP, signal.SIGTERM):
+            signal.raise_signal(number)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        assert list(asked) == [signal.SIGHUP, signal.SIGHUP, signal.SIGTERM, signal.SIGINT]
+
+
+@pytest.mark.parametrize("where", ["main", "thread"])
+def test_pycolmap_leaves_sigterm_to_us(where):
+    done = subprocess.run([sys.executable, "-c", LOADED, where], capture_output=True, text=True, timeout=300)
+    assert done.stdout == f"asked {int(signal.SIGTERM)}\n", done.stderr
+    assert (done.returncode, done.stderr) == (-signal.SIGTERM, "")  # no trace of C++ outside of our contexts either
+
+
+def test_pycolmap_is_imported_in_one_place():
+    package = Path(vdgs.__file__).parent
+    direct = re.compile(r"^\s*(import|from) pycolmap", re.MULTILINE)
+    found = [str(file.relative_to(package)) for file in package.rglob("*.py") if direct.search(file.read_text())]
+    assert found == ["system/colmap.py"]
 
 
 def test_a_request_that_the_inner_work_had_no_time_for_stops_the_outer():
@@ -64,7 +109,7 @@ def test_a_request_that_the_inner_work_had_no_time_for_stops_the_outer():
     check_stop_requested()  # another command in this process was not asked
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", STOP_SIGNALS)
 def test_an_interrupt_that_was_swallowed_is_not_forgotten(number):
     with catch_stop_signals(interrupts=True):
         check_stop_requested()
@@ -78,7 +123,7 @@ def test_outside_the_main_thread_nothing_is_noted():
     seen = []
 
     def work() -> None:
-        with catch_stop_signals(hangup=True) as asked:
+        with catch_stop_signals() as asked:
             seen.append((list(asked), signal.getsignal(signal.SIGINT)))
 
     before = signal.getsignal(signal.SIGINT)

@@ -7,7 +7,6 @@ import io
 import json
 import math
 import shutil
-import signal
 import socket
 import sys
 from pathlib import Path
@@ -30,6 +29,7 @@ from vdgs.rendering.camera_paths import look_at_pose
 from vdgs.rendering.path_io import load_path
 from vdgs.runs.open_run import open_run
 from vdgs.runs.run_folder import RunFolder
+from vdgs.system.stop_signals import STOP_SIGNALS
 from vdgs.viewer import navigation
 from vdgs.viewer.client_session import ClientSession
 from vdgs.viewer.layers import Painter
@@ -314,7 +314,7 @@ def test_ports_and_hosts_that_cannot_be_used_are_said_before_any_work(run):
     assert "--port 70000" in vdgs("view", run, "--port", "70000").stderr
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("how", STOP_SIGNALS)
 def test_it_ends_when_asked_to(run, how):
     with begun("view", run) as process:
         wait_until(lambda: "http://127.0.0.1:" in process.printed() or not process.runs())

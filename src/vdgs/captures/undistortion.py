@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -18,6 +17,7 @@ import numpy as np
 from vdgs.captures.formats.source_capture import Intrinsics
 from vdgs.captures.image_files import decode_image, decode_mask
 from vdgs.errors import CaptureError
+from vdgs.system.atomic_files import write_bytes
 
 JPEG_QUALITY = 95
 NUM_THREADS = 2
@@ -71,7 +71,7 @@ def undistort(folder: Path, photographs: list[ImageFile]) -> list[ImageFile]:
 
 def undistorted_pinhole(intrinsics: Intrinsics) -> Intrinsics:
     """The pinhole camera whose picture holds no blank pixels (COLMAP's own choice of size and centre)."""
-    import pycolmap  # 60 MB of memory: only for lenses that need it
+    from vdgs.system.colmap import pycolmap  # 60 MB of memory: only for lenses that need it
 
     try:
         camera = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), _colmap(intrinsics))
@@ -118,7 +118,7 @@ def _undistort_one(
     known = _read_json(stamp_file)
     if not (target.is_file() and isinstance(known, dict) and known.get("made_from") == stamp):
         keep = _write_straight(photo, map_of(lens), target, mask_target)
-        _write(stamp_file, json.dumps({"made_from": stamp, "mask": keep}).encode())
+        write_bytes(stamp_file, json.dumps({"made_from": stamp, "mask": keep}).encode())
         known = {"mask": keep}
     mask = mask_target if known.get("mask") and mask_target.is_file() else None
     return ImageFile(photo.name, target, mask, pinhole)
@@ -134,12 +134,11 @@ def _write_straight(photo: ImageFile, grid: np.ndarray, target: Path, mask_targe
     x, y = grid[..., 0], grid[..., 1]
     straight = cv2.remap(pixels, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     settings = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111]
-    target.parent.mkdir(parents=True, exist_ok=True)
-    _write(target, cv2.imencode(".jpg", cv2.cvtColor(straight, cv2.COLOR_RGB2BGR), settings)[1].tobytes())
+    write_bytes(target, cv2.imencode(".jpg", cv2.cvtColor(straight, cv2.COLOR_RGB2BGR), settings)[1].tobytes())
     if keep is None:
         return False
     mask = cv2.remap(keep.astype(np.uint8) * 255, x, y, cv2.INTER_NEAREST, borderValue=(0.0,))
-    _write(mask_target, cv2.imencode(".png", mask)[1].tobytes())
+    write_bytes(mask_target, cv2.imencode(".png", mask)[1].tobytes())
     return True
 
 
@@ -150,15 +149,8 @@ def _read_json(file: Path) -> object:
         return None
 
 
-def _write(file: Path, data: bytes) -> None:
-    """Write under a temporary name, then rename: a run that is cut off leaves no half image."""
-    part = file.with_name(file.name + ".part")
-    part.write_bytes(data)
-    os.replace(part, file)
-
-
 def _colmap(intrinsics: Intrinsics) -> Any:
-    import pycolmap
+    from vdgs.system.colmap import pycolmap
 
     return pycolmap.Camera(
         model=intrinsics.model,

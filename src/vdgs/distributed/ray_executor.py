@@ -10,9 +10,7 @@ import hashlib
 import importlib.util
 import os
 import secrets
-import signal
 import sys
-import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -33,6 +31,7 @@ from vdgs.distributed.ray_actor import NodeRejected, RayTaskActor, RayTaskSpec
 from vdgs.distributed.scheduler import ExecutionPolicy, run_tasks
 from vdgs.errors import VdgsError
 from vdgs.system.documents import FitnessAnswer, FitnessQuestion
+from vdgs.system.stop_signals import preserve_signal_handlers
 
 NAMESPACE = "vdgs"
 #: Memory for Ray's object store, which holds nothing: the least that Ray takes.
@@ -109,7 +108,7 @@ def _ray_driver(where: str, options: Mapping[str, Any]) -> Iterator[None]:
     _require_ray()
     import ray
 
-    with _preserve_signal_handlers():
+    with preserve_signal_handlers():
         try:
             ray.init(address=where, namespace=NAMESPACE, log_to_driver=False, logging_level="error", **options)
         except (ConnectionError, RuntimeError, ValueError, OSError, ray.exceptions.RayError) as error:
@@ -121,20 +120,8 @@ def _ray_driver(where: str, options: Mapping[str, Any]) -> Iterator[None]:
     try:
         yield
     finally:
-        with _preserve_signal_handlers():
+        with preserve_signal_handlers():
             ray.shutdown()
-
-
-@contextmanager
-def _preserve_signal_handlers() -> Iterator[None]:
-    """Ray sets handlers of signals; ours are put back."""
-    numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
-    before = {number: signal.getsignal(number) for number in numbers}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def list_nodes() -> list[RayNode]:

@@ -4,12 +4,10 @@ ended. All messages about failures are worded here, so that every engine uses th
 
 from __future__ import annotations
 
-import shutil
 import signal
 import time
 from collections import deque
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,13 +26,12 @@ from vdgs.distributed.executor import (
 from vdgs.distributed.task_process import error_message, tail_lines
 from vdgs.errors import VdgsError
 from vdgs.runs.stage_folder import StageFolder
+from vdgs.system.atomic_files import is_disk_full
 from vdgs.system.stop_signals import catch_stop_signals
 from vdgs.system.units import data_size
 
 #: Seconds that tasks get to save when this process fails itself, and between two polls meanwhile.
 GRACE_SECONDS, GRACE_POLL_SECONDS = 120.0, 0.05
-#: Free bytes below which a failure without a message is put down to a full disk.
-DISK_FULL_BYTES = 1 << 20
 #: What a task asks for after it was ended for want of memory, times what it asked for before (choice).
 MEMORY_RETRY_FACTOR = 1.5
 
@@ -60,7 +57,7 @@ def run_tasks(
     tasks: Sequence[Task], engine: Engine, policy: ExecutionPolicy, listener: TaskListener
 ) -> list[TaskResult]:
     """As `Executor.run`, with the attempts of an engine. A second Ctrl-C kills those that still run."""
-    with catch_stop_signals(hangup=True) as signals:
+    with catch_stop_signals() as signals:
         scheduler = _TaskScheduler([_TaskState(task) for task in tasks], engine, policy, listener)
         try:
             while not scheduler.step(signals):
@@ -303,7 +300,6 @@ def _start_error_text(task: Task, error: OSError) -> str:
 def _silent_failure_text(task: Task, end: str) -> str:
     """The reason of a failure without a message."""
     folder = task.output.parent
-    with suppress(OSError):
-        if shutil.disk_usage(folder).free < DISK_FULL_BYTES:
-            return f"{folder}: the disk is full. Free some space, then run the same command again."
+    if is_disk_full(folder):
+        return f"{folder}: the disk is full. Free some space, then run the same command again."
     return f"{end}, without a message"

@@ -23,6 +23,7 @@ from vdgs.distributed.slurm_commands import ArrayTaskId, requeue
 from vdgs.distributed.task_process import TaskProcess, oom_kill_count
 from vdgs.system.atomic_files import read_json, write_json
 from vdgs.system.documents import JsonObject
+from vdgs.system.stop_signals import STOP_SIGNALS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,7 +92,7 @@ def _forward_signals(process: TaskProcess) -> list[int]:
             received.append(number)
         process.terminate()
 
-    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1):
+    for number in (*STOP_SIGNALS, signal.SIGUSR1):
         signal.signal(number, forward)
     return received
 

@@ -12,13 +12,13 @@ from rich.console import Console
 from rich.progress import Progress
 
 from vdgs.config.commands import ExportRequest
-from vdgs.errors import VdgsError
 from vdgs.export.bake import BakeContributions, bake, collect_contributions, gaussian_count
 from vdgs.export.color_refinement import BakedGaussians, refine_colors
 from vdgs.export.formats.export_scene import ExportScene
 from vdgs.export.formats.gaussian_store import GaussianStore, write_store
 from vdgs.export.novel_cameras import color_iteration_cameras, color_iteration_count
 from vdgs.runs.open_run import OpenedRun
+from vdgs.system.atomic_files import explain_disk_errors
 from vdgs.system.scratch import scratch_folder
 from vdgs.system.stop_signals import check_stop_requested
 
@@ -60,12 +60,8 @@ class LocalBake:
         folder = self._asked.output[0].parent
         with scratch_folder(folder / BAKING) as temporary:
             with make_progress_bar(self._console) as bar:
-                try:
+                with explain_disk_errors(temporary / "spool"):
                     spool = self._fitted(kept, temporary / "spool", bar)
-                except OSError as error:
-                    raise VdgsError(
-                        f"{folder}: cannot hold the scene ({error.strerror or error}). Nothing was written."
-                    ) from error
                 self._improve(BakedGaussians(self._run.model, kept, spool), bar)
             yield spool
 

@@ -10,6 +10,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
+from vdgs.system.atomic_files import write_atomic
+
 INK, MUTED, ACCENT = "#22262b", "#6c757d", "#c1121f"
 #: From hardly seen (alarming) to seen often (calm); dark enough everywhere to stand on white.
 VISIBILITY_CMAP = LinearSegmentedColormap.from_list(
@@ -38,7 +40,7 @@ def new_figure(width: float, height: float) -> tuple[Figure, PlaceAxes]:
 
 
 def write_png(figure: Figure, file: Path) -> None:
-    figure.canvas.print_png(file)  # type: ignore[attr-defined]
+    write_atomic(file, figure.canvas.print_png)  # type: ignore[attr-defined]
 
 
 def pluralize(number: int, noun: str) -> str:

@@ -28,6 +28,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from vdgs.errors import VdgsError
+from vdgs.system.atomic_files import is_disk_full
 from vdgs.system.scratch import remove_leftovers
 
 Encoder = Literal["ffmpeg", "av", "vp9", "mpeg4"]
@@ -35,8 +36,6 @@ Encoder = Literal["ffmpeg", "av", "vp9", "mpeg4"]
 CODECS = {"ffmpeg": "H.264", "av": "H.264", "vp9": "VP9", "mpeg4": "MPEG-4"}
 #: Quality of H.264: 18 is hardly told from the original, 23 is ffmpeg's own.
 CRF = "20"
-#: A disk with less room than this is why a film is broken.
-FULL_BYTES = 1 << 20
 _FOURCC = {"vp9": "vp09", "mpeg4": "mp4v"}
 _REMEDY = "Install an encoder with `pip install imageio-ffmpeg`, or render single images instead."
 
@@ -282,12 +281,11 @@ class VideoWriter:
         self._shape = shape
 
     def _failure(self, why: str) -> VdgsError:
-        with suppress(OSError):
-            if shutil.disk_usage(self.path.parent).free < FULL_BYTES or "No space left" in why:
-                return VdgsError(
-                    f"{self.path} cannot be written: the disk is full ({why}). Free some space or choose another "
-                    "folder, then run the same command again."
-                )
+        if is_disk_full(self.path.parent) or "No space left" in why:
+            return VdgsError(
+                f"{self.path} cannot be written: the disk is full ({why}). Free some space or choose another "
+                "folder, then run the same command again."
+            )
         return VdgsError(f"{self.path} cannot be encoded ({why}). {_REMEDY}")
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import pycolmap
 
 from vdgs.sfm.gcp_list import GcpObservation
 from vdgs.sfm.georegistration import Georegistration, model_points
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.workspace import call_cancellable
+from vdgs.system.colmap import pycolmap
 
 #: A model that is bent by more than this share of the flying height is torn (choice).
 MOST_BENT = 0.1

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pycolmap
 from rich.console import Console
 
+from vdgs.captures.formats.colmap_writing import write_model_files
 from vdgs.captures.formats.source_capture import Intrinsics
 from vdgs.captures.image_files import decode_image
 from vdgs.captures.undistortion import sampling_map, undistorted_pinhole
@@ -22,6 +22,7 @@ from vdgs.errors import CaptureError
 from vdgs.sfm.mask_files import encode_mask, undistort_mask
 from vdgs.sfm.workspace import Workspace, report_progress
 from vdgs.system.atomic_files import write_bytes
+from vdgs.system.colmap import pycolmap
 from vdgs.system.stop_signals import check_stop_requested
 
 #: Sides are multiples of this, so that the smaller sizes are exactly a half and a quarter.
@@ -150,8 +151,7 @@ def write_model(output: Path, model: pycolmap.Reconstruction, undistortions: Map
         straight.point3D(number).error = point.error
     # The model makes the folder a capture: it comes last and as a whole.
     part, whole = output / "sparse" / ".part", output / "sparse" / "0"
-    part.mkdir(parents=True, exist_ok=True)
-    straight.write(part)
+    write_model_files(straight, part)
     os.replace(part, whole)
 
 

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import pycolmap
 from PIL import Image, ImageOps
 from rich.console import Console
 
@@ -18,6 +17,7 @@ from vdgs.sfm.image_list import ExcludedImage
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.workspace import Workspace, call_cancellable, report_progress
 from vdgs.system.atomic_files import write_atomic, write_bytes
+from vdgs.system.colmap import pycolmap
 
 #: A focal length over the longer side where nothing says one: COLMAP's own guess.
 DEFAULT_FOCAL_FACTOR = 1.2
@@ -112,8 +112,7 @@ def _write_upright(photo: ImageMetadata, target: Path) -> None:
 def create_database(workspace: Workspace, camera_groups: Sequence[CameraGroup]) -> None:
     """The database with one camera for each kind of photographs, unless it is there."""
     workspace.path.mkdir(parents=True, exist_ok=True)
-    database = pycolmap.Database.open(workspace.database)
-    try:
+    with workspace.open_database() as database:
         if database.num_cameras() == len(camera_groups):
             return
         database.clear_all_tables()
@@ -125,8 +124,6 @@ def create_database(workspace: Workspace, camera_groups: Sequence[CameraGroup]) 
             rig = pycolmap.Rig()
             rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, number))
             database.write_rig(rig)
-    finally:
-        database.close()
 
 
 def extract_features(
@@ -186,15 +183,12 @@ def _extract(
 
 def count_features(workspace: Workspace) -> dict[str, int]:
     """Numbers of features by the names of photographs in the database."""
-    database = pycolmap.Database.open(workspace.database)
-    try:
+    with workspace.open_database() as database:
         return {
             image.name: database.num_keypoints_for_image(image.image_id)
             for image in database.read_all_images()
             if database.exists_keypoints(image.image_id)
         }
-    finally:
-        database.close()
 
 
 def images_without_features(photographs: Sequence[ImageMetadata], counts: dict[str, int]) -> list[ExcludedImage]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import pycolmap
 from rich.console import Console
 
 from vdgs.config.sfm_options import SfmOptions
@@ -14,6 +13,7 @@ from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.workspace import Workspace, call_cancellable, report_progress
 from vdgs.system.atomic_files import write_text
+from vdgs.system.colmap import pycolmap
 
 #: Pairs that one call compares, for each thread.
 PAIRS_PER_THREAD = 12
@@ -111,8 +111,7 @@ def match_pairs(
 
 def count_verified_matches(workspace: Workspace, min_inliers: int = 15) -> dict[str, int]:
     """With how many others each photograph was matched for good, by its name."""
-    database = pycolmap.Database.open(workspace.database)
-    try:
+    with workspace.open_database() as database:
         counts = {image.image_id: 0 for image in database.read_all_images()}
         names = {image.image_id: image.name for image in database.read_all_images()}
         for number, inliers in zip(*database.read_two_view_geometry_num_inliers(), strict=True):
@@ -120,34 +119,25 @@ def count_verified_matches(workspace: Workspace, min_inliers: int = 15) -> dict[
                 for image in pycolmap.pair_id_to_image_pair(number):
                     counts[image] += 1
         return {names[image]: count for image, count in counts.items()}
-    finally:
-        database.close()
 
 
 def _matched(workspace: Workspace) -> set[frozenset[str]]:
     """Pairs that were compared and verified."""
-    database = pycolmap.Database.open(workspace.database)
-    try:
+    with workspace.open_database() as database:
         names = {image.image_id: image.name for image in database.read_all_images()}
         numbers, _ = database.read_two_view_geometry_num_inliers()
         return {frozenset(names[image] for image in pycolmap.pair_id_to_image_pair(number)) for number in numbers}
-    finally:
-        database.close()
 
 
 def delete_matches(workspace: Workspace) -> None:
-    database = pycolmap.Database.open(workspace.database)
-    try:
+    with workspace.open_database() as database:
         database.clear_matches()
         database.clear_two_view_geometries()
-    finally:
-        database.close()
 
 
 def _descriptors(workspace: Workspace, photographs: Sequence[ImageMetadata]) -> list[np.ndarray]:
     """Some descriptors [m, 128] of each photograph, the same in every run."""
-    database = pycolmap.Database.open(workspace.database)
-    try:
+    with workspace.open_database() as database:
         numbers = {image.name: image.image_id for image in database.read_all_images()}
         found = []
         for photo in photographs:
@@ -158,5 +148,3 @@ def _descriptors(workspace: Workspace, photographs: Sequence[ImageMetadata]) -> 
             rows = np.asarray(database.read_descriptors(number).data)
             found.append(rows[:: max(1, len(rows) // _MAX_DESCRIPTORS)].copy())
         return found
-    finally:
-        database.close()

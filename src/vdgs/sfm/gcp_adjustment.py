@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float
 from scipy.optimize import least_squares
 from scipy.stats import t as student
@@ -17,6 +16,7 @@ from vdgs.geometry.similarity import Similarity, fit_similarity, fit_similarity_
 from vdgs.sfm.bending import bend_to_points
 from vdgs.sfm.gcp_list import MIN_CONTROL_POINTS, MIN_OBSERVATIONS, GcpList, GcpObservation, GroundControlPoint
 from vdgs.sfm.georegistration import transform_model
+from vdgs.system.colmap import pycolmap
 
 #: With so many points, one that does not fit the others is found and left out.
 MIN_POINTS_FOR_OUTLIERS = 6

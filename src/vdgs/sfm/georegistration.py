@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import pycolmap
 
 from vdgs.captures.plane_fit import mirrored
 from vdgs.captures.position_fit import PositionFit, Problem, Up, fit_positions
@@ -17,6 +16,7 @@ from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu
 from vdgs.geometry.similarity import Similarity, is_collinear, rotation_to_z
 from vdgs.sfm.gps_priors import MIN_POSITIONS, GpsPriors
 from vdgs.sfm.image_metadata import ImageMetadata
+from vdgs.system.colmap import pycolmap
 
 #: Attitudes that agree on which way a world lies, at least.
 MIN_ATTITUDES = 3

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from rich.console import Console
 
+from vdgs.captures.formats.colmap_writing import check_whole_model
 from vdgs.config.sfm_options import SfmOptions
 from vdgs.errors import CaptureError
 from vdgs.sfm.feature_extraction import CameraGroup
@@ -20,6 +20,8 @@ from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.preflight import OBLIQUE_ANGLE_DEG
 from vdgs.sfm.workspace import Workspace, call_cancellable, report_progress
+from vdgs.system.atomic_files import explain_disk_errors
+from vdgs.system.colmap import pycolmap
 
 #: Oblique views, or heights that differ by so much of the flying height, let a flight tell the focal length (choice).
 MIN_OBLIQUE_SHARE, MIN_HEIGHT_SPREAD = 0.15, 0.2
@@ -80,13 +82,11 @@ def _range(heights: np.ndarray) -> float:
     return float(np.ptp(np.quantile(heights, [0.05, 0.95])))
 
 
-def run_mapper(
-    workspace: Workspace, count: int, fix_focal: bool, threads: int, console: Console
-) -> list[pycolmap.Reconstruction]:
-    """All models that the mapper makes of the matches, that of most photographs first.
+def run_mapper(workspace: Workspace, count: int, fix_focal: bool, threads: int, console: Console) -> None:
+    """Write all models that the mapper makes of the matches (`read_models`).
 
     What it has is kept on the way, and goes on where it was stopped (`delete_models` first to begin anew). Raises
-    CaptureError where it makes none.
+    CaptureError where it makes none, VdgsError where the disk does not hold them.
     """
     for folder in (workspace.models, workspace.snapshots):
         shutil.rmtree(folder, ignore_errors=True)
@@ -115,13 +115,15 @@ def run_mapper(
             save_snapshots(workspace)  # the mapper ended by itself: they are whole
             raise
         tell(count)
+    for number in models:
+        with explain_disk_errors(workspace.models / str(number)):
+            check_whole_model(workspace.models / str(number))
     if not models:
         raise CaptureError(
             "no two photographs could be joined. Either they do not overlap, or they were all taken at one place "
             "(turning alone shows no depth), or they show nothing to hold on to: water, snow, blurred pictures. Fly "
             "with 70 to 80 % overlap, the camera moving between photographs."
         )
-    return _sorted(list(models.values()))
 
 
 def save_snapshots(workspace: Workspace) -> None:
@@ -130,6 +132,11 @@ def save_snapshots(workspace: Workspace) -> None:
     To be called where the mapper does not write: then what is there is whole.
     """
     for folder in sorted(workspace.snapshots.iterdir()) if workspace.snapshots.is_dir() else []:
+        try:
+            check_whole_model(folder)
+        except OSError:  # a full disk: what was saved before stays
+            shutil.rmtree(folder)
+            continue
         before, count = _largest_snapshot(workspace), _registered_count(folder)
         if before is None or count > int(before.name):
             workspace.saved_snapshots.mkdir(exist_ok=True)
@@ -157,13 +164,8 @@ def _registered_count(folder: Path) -> int:
 
 
 def read_models(workspace: Workspace) -> list[pycolmap.Reconstruction]:
-    """What `run_mapper` found before."""
-    return _sorted(
-        [pycolmap.Reconstruction(folder) for folder in sorted(workspace.models.iterdir()) if folder.is_dir()]
-    )
-
-
-def _sorted(models: list[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
+    """What `run_mapper` found, the model of most photographs first."""
+    models = [pycolmap.Reconstruction(folder) for folder in sorted(workspace.models.iterdir()) if folder.is_dir()]
     return sorted(models, key=lambda model: -model.num_reg_images())
 
 

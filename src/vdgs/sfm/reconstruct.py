@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 from rich.console import Console
 
 from vdgs import __version__
+from vdgs.captures.formats.colmap_writing import write_model_files
 from vdgs.captures.georeference import ENU_FRAME, LOCAL_FRAME, ORIGIN_KEYS
 from vdgs.captures.reconstruction import (
     MAPPED,
@@ -55,6 +55,7 @@ from vdgs.sfm.reconstruction_report import (
 )
 from vdgs.sfm.workspace import Workspace, cache_key, silence_colmap
 from vdgs.system.atomic_files import to_jsonable, write_json
+from vdgs.system.colmap import pycolmap
 from vdgs.system.file_locks import lock_folder
 from vdgs.system.records import record_to_dict
 
@@ -209,7 +210,10 @@ def _check_output_folder(output: Path) -> None:
 
 def _has_foreign_files(output: Path) -> bool:
     """Whether a folder holds anything but what a reconstruction begins with."""
-    return any(each.name not in (".lock", POSITIONS_FIGURE) and each.suffix != ".tmp" for each in output.iterdir())
+    work = output / WORK_FOLDER
+    begun = work.is_dir() and all(each.suffix == ".tmp" for each in work.iterdir())  # ended before its first record
+    known = (".lock", POSITIONS_FIGURE, *([WORK_FOLDER] if begun else []))
+    return any(each.name not in known and each.suffix != ".tmp" for each in output.iterdir())
 
 
 def _steps(
@@ -312,14 +316,14 @@ def _matches(plan: ReconstructionPlan, workspace: Workspace, key: str, console: 
 def _models(
     plan: ReconstructionPlan, workspace: Workspace, key: str, count: int, fix_focal: bool, console: Console
 ) -> list[pycolmap.Reconstruction]:
-    if workspace.is_done("model", key):
-        return incremental_mapper.read_models(workspace)
-    if not workspace.is_begun("model", key):
-        incremental_mapper.delete_models(workspace)
-        workspace.begin("model", key)
-    models = incremental_mapper.run_mapper(workspace, count, fix_focal, plan.threads, console)
-    workspace.finish("model", key)
-    return models
+    if not workspace.is_done("model", key):
+        if not workspace.is_begun("model", key):
+            incremental_mapper.delete_models(workspace)
+            workspace.begin("model", key)
+        incremental_mapper.run_mapper(workspace, count, fix_focal, plan.threads, console)
+        workspace.finish("model", key)
+    # Read even if they are in memory: the order of their points decides the last bits of what follows.
+    return incremental_mapper.read_models(workspace)
 
 
 def _gcp_positions(plan: ReconstructionPlan) -> np.ndarray:
@@ -355,8 +359,7 @@ def _write(
         Workspace(output).begin("capture", key)
     shutil.rmtree(output / "sparse", ignore_errors=True)
     _write_images(plan, workspace, model, console)
-    (output / MAPPED).mkdir(exist_ok=True)
-    mapped.write(output / MAPPED)
+    write_model_files(mapped, output / MAPPED)
     Workspace(output).finish("capture", key)
 
 

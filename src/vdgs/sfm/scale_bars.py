@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
 from vdgs.errors import CaptureError
 from vdgs.sfm.gcp_adjustment import triangulate
@@ -20,6 +19,7 @@ from vdgs.sfm.gcp_list import (
     text_lines,
 )
 from vdgs.sfm.image_list import ImageList
+from vdgs.system.colmap import pycolmap
 
 #: What a mark is off by in pixels at least, and what a measured distance is good to as a share (choice).
 LEAST_PX, LEAST_SHARE = 0.5, 0.002

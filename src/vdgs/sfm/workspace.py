@@ -13,13 +13,13 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any, TypeVar
 
-import pycolmap
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from vdgs.captures.reconstruction import STEPS_FILE
 from vdgs.errors import CaptureError, VdgsError
-from vdgs.system.atomic_files import read_json_or_empty, write_json
+from vdgs.system.atomic_files import is_disk_full, read_json_or_empty, write_json
+from vdgs.system.colmap import pycolmap
 from vdgs.system.stop_signals import check_stop_requested
 from vdgs.system.units import rough_duration
 
@@ -81,6 +81,16 @@ class Workspace:
     def finish(self, step: str, key: str) -> None:
         self._note("done", step, key)
 
+    @contextmanager
+    def open_database(self) -> Iterator[pycolmap.Database]:
+        """COLMAP's database. Raises VdgsError where the disk refuses."""
+        with explain_colmap_errors(self.path):
+            database = pycolmap.Database.open(self.database)
+            try:
+                yield database
+            finally:
+                database.close()
+
     def remove(self) -> None:
         shutil.rmtree(self.path, ignore_errors=True)
 
@@ -129,15 +139,25 @@ def call_cancellable(function: Callable[..., Result], *arguments: Any, **named: 
             pass
         raise
     thread.join()
-    error = ended.get("error")
-    if isinstance(error, (MemoryError, KeyboardInterrupt)):
-        raise error
-    if error is not None:
-        said = " ".join(str(error).split())
-        if "full" in said or "disk I/O" in said:
-            raise VdgsError(f"the disk is full ({said}). Free some space; the same command then goes on.") from error
-        raise CaptureError(f"COLMAP could not go on ({said}). What was done is kept.") from error
+    if "error" in ended:
+        with explain_colmap_errors(Path(arguments[0]).parent):
+            raise ended["error"]
     return ended["result"]
+
+
+@contextmanager
+def explain_colmap_errors(folder: Path) -> Iterator[None]:
+    """A context that lets COLMAP work in a folder: its errors become VdgsErrors, with the remedy where the disk is full
+    (SQLite says so, or that it cannot open its database)."""
+    try:
+        yield
+    except (RuntimeError, ValueError, IndexError) as error:
+        said = " ".join(str(error).split())
+        if is_disk_full(folder) or "full" in said or "disk I/O" in said:
+            raise VdgsError(
+                f"{folder}: the disk is full ({said}). Free some space; the same command then goes on."
+            ) from error
+        raise CaptureError(f"{folder}: COLMAP could not go on ({said}). What was done is kept.") from error
 
 
 @contextmanager

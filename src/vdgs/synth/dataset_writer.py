@@ -9,14 +9,15 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
+from vdgs.captures.formats.colmap_writing import write_model_files
 from vdgs.captures.ground_truth import pack_depth
 from vdgs.geometry.camera import Camera
 from vdgs.synth.ray_tracing import RayTracer
 from vdgs.synth.synthetic_points import SparseCloud, observations_by_image
 from vdgs.synth.true_visibility import FlightStats, view_ground_truth
 from vdgs.system.atomic_files import write_json
+from vdgs.system.colmap import pycolmap
 
 
 def write_flight(folder: Path, flight: str, found: FlightStats) -> None:
@@ -96,5 +97,4 @@ def write_model(folder: Path, cameras: list[Camera], names: list[str], cloud: Sp
         )
         point_id = model.add_point3D(cloud.points[k], track, cloud.colors[k])
         model.point3D(point_id).error = float(cloud.errors[k])
-    folder.mkdir(parents=True)
-    model.write(folder)
+    write_model_files(model, folder)

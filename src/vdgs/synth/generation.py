@@ -27,7 +27,7 @@ from vdgs.synth.ray_tracing import RayTracer, require_embree
 from vdgs.synth.synthetic_points import SeedPoints, SparseCloud, make_sparse_cloud, sample_seed_points
 from vdgs.synth.town import Town, build_town
 from vdgs.synth.true_visibility import FlightStats, compute_flight_stats, sample_visible_points
-from vdgs.system.atomic_files import write_text
+from vdgs.system.atomic_files import explain_disk_errors, write_text
 
 ProgressCallback = Callable[[str, int, int], None]
 
@@ -72,12 +72,13 @@ def generate(output: Path, options: SynthOptions, on_progress: ProgressCallback)
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise VdgsError(f"{output} already exists and is not empty: name another folder, or remove it first.")
     partial = output.with_name(f".{output.name}.partial-{os.getpid()}")
-    partial.mkdir(parents=True)
     try:
-        stats = _write_capture(partial, resolved, on_progress)
-        if output.exists():
-            output.rmdir()
-        partial.rename(output)
+        with explain_disk_errors(output):
+            partial.mkdir(parents=True)
+            stats = _write_capture(partial, resolved, on_progress)
+            if output.exists():
+                output.rmdir()
+            partial.rename(output)
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
         raise

@@ -7,8 +7,9 @@ import json
 import math
 import os
 import re
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,28 +20,44 @@ from vdgs.errors import VdgsError
 if TYPE_CHECKING:
     import numpy as np
 
+#: Free bytes of a full disk.
+FULL_DISK_BYTES = 1 << 20
+
 
 def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write` fill a temporary file beside `path`, then rename it over `path`. Raises VdgsError, with file and
     remedy, when the disk refuses (full, read-only, ...); `path` is then untouched."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write(temporary)
-        with temporary.open("rb") as handle:
-            os.fsync(handle.fileno())
-        os.replace(temporary, path)
-    except (OSError, SafetensorError) as error:  # safetensors hides the system's error in one of its own
+        with explain_disk_errors(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write(temporary)
+            with temporary.open("rb") as handle:
+                os.fsync(handle.fileno())
+            os.replace(temporary, path)
+    except BaseException:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
-        why = getattr(error, "strerror", None) or error
-        raise VdgsError(
-            f"{path}: cannot be written ({why}). {disk_hint(error)}, then run the same command again: it continues "
-            "from the last good state."
-        ) from error
-    except BaseException:
-        temporary.unlink(missing_ok=True)
         raise
+
+
+@contextmanager
+def explain_disk_errors(path: Path) -> Iterator[None]:
+    """A context that writes to a file or folder: what the disk refuses becomes a VdgsError with name and remedy."""
+    try:
+        yield
+    except (OSError, SafetensorError) as error:  # safetensors hides the system's error in one of its own
+        why = reason_of(error, path.parent)
+        raise VdgsError(
+            f"{path}: cannot be written ({getattr(why, 'strerror', None) or why}). {disk_hint(why)}, then run the same "
+            "command again: it continues from the last good state."
+        ) from error
+
+
+def reason_of(error: BaseException, folder: Path) -> BaseException:
+    """Why a folder could not be written to: libraries with files of their own hide that the disk is full."""
+    hidden = getattr(error, "errno", None) is None and is_disk_full(folder)
+    return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) if hidden else error
 
 
 def disk_hint(error: BaseException) -> str:
@@ -57,6 +74,13 @@ def disk_hint(error: BaseException) -> str:
     if number in (errno.ENOSPC, errno.EDQUOT):
         return "Free some space or choose another folder"
     return "Free some space, see that the folder can be written, or choose another"
+
+
+def is_disk_full(folder: Path) -> bool:
+    """Whether so little room is left that a failure without a reason is put down to it."""
+    with suppress(OSError):
+        return shutil.disk_usage(folder).free < FULL_DISK_BYTES
+    return False
 
 
 def write_bytes(path: Path, content: bytes) -> None:

@@ -6,6 +6,9 @@ Every active context records a request: if the innermost one ends before it reac
 
 from __future__ import annotations
 
+import ctypes
+import os
+import select
 import signal
 import threading
 from collections.abc import Iterator, Sequence
@@ -13,18 +16,19 @@ from contextlib import contextmanager
 
 from vdgs.errors import Interrupted
 
+#: Ctrl-C, what schedulers and `kill` send, and the end of a terminal or connection.
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 #: The requests recorded by each active context, the outermost first.
 _recorded: list[list[int]] = []
 
 
 @contextmanager
-def catch_stop_signals(
-    *, hangup: bool = False, second_interrupts: bool = False, interrupts: bool = False
-) -> Iterator[Sequence[int]]:
-    """The stop signals received while the context is active, in order: Ctrl-C (SIGINT) and SIGTERM.
+def catch_stop_signals(*, second_interrupts: bool = False, interrupts: bool = False) -> Iterator[Sequence[int]]:
+    """The stop signals received while the context is active, in order; SIGHUP is none where it is ignored (nohup).
 
-    With `hangup` also SIGHUP, unless it is ignored (nohup). With `second_interrupts`, Ctrl-C after any other request
-    raises KeyboardInterrupt at once; with `interrupts` every request does. Outside the main thread nothing is recorded.
+    With `second_interrupts`, Ctrl-C after any other request raises KeyboardInterrupt at once; with `interrupts` the
+    first request does too. Other signals never interrupt twice: a terminal that closes sends several, and what they
+    would break off is the saving. Outside the main thread nothing is recorded.
     """
     requests: list[int] = []
     if threading.current_thread() is not threading.main_thread():
@@ -32,16 +36,17 @@ def catch_stop_signals(
         return
 
     def ask(number: int, _frame: object) -> None:
+        _discard_output_without_reader()
         if second_interrupts and requests and number == signal.SIGINT:
             raise KeyboardInterrupt
+        first = not requests
         for recorded in _recorded:
             recorded.append(number)
-        if interrupts:
+        if interrupts and (first or number == signal.SIGINT):
             raise KeyboardInterrupt
 
-    numbers = [signal.SIGINT, signal.SIGTERM]
-    if hangup and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
-        numbers.append(signal.SIGHUP)
+    hangs_up = signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN
+    numbers = [number for number in STOP_SIGNALS if hangs_up or number != signal.SIGHUP]
     _recorded.append(requests)
     before = {number: signal.signal(number, ask) for number in numbers}
     try:
@@ -56,3 +61,41 @@ def check_stop_requested() -> None:
     """Raise Interrupted if an active context has recorded a request, even if its exception was swallowed."""
     if any(_recorded):
         raise Interrupted("interrupted. The same command continues.")
+
+
+@contextmanager
+def preserve_signal_handlers() -> Iterator[None]:
+    """Put back the handlers of stop signals that a library replaces when it is imported or started.
+
+    Outside the main thread those of the C library are put back, which is what a library in C++ replaces.
+    """
+    if threading.current_thread() is threading.main_thread():
+        handlers = {number: signal.getsignal(number) for number in STOP_SIGNALS}
+        try:
+            yield
+        finally:
+            for number, handler in handlers.items():
+                if handler is not None:  # one that Python did not set
+                    signal.signal(number, handler)
+        return
+    get, put = ctypes.pythonapi.PyOS_getsig, ctypes.pythonapi.PyOS_setsig
+    get.argtypes, put.argtypes = [ctypes.c_int], [ctypes.c_int, ctypes.c_void_p]
+    get.restype = put.restype = ctypes.c_void_p
+    addresses = {number: get(number) for number in STOP_SIGNALS}
+    try:
+        yield
+    finally:
+        for number, address in addresses.items():
+            put(number, address)
+
+
+def _discard_output_without_reader() -> None:
+    """Send output nowhere that has lost its terminal or reader: its error would break off the saving."""
+    poll = select.poll()
+    for descriptor in (1, 2):
+        poll.register(descriptor, 0)
+    for descriptor, events in poll.poll(0):
+        if events & (select.POLLERR | select.POLLHUP):
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, descriptor)
+            os.close(nowhere)

@@ -20,6 +20,7 @@ from typing import Any
 
 from vdgs.cli.doctor import SystemCheck
 from vdgs.system.memory.cgroups import cgroup_limits
+from vdgs.system.stop_signals import preserve_signal_handlers
 from vdgs.system.units import data_size
 
 #: What each extra adds, for people; an extra that is not listed is reported without a sentence.
@@ -236,7 +237,8 @@ def _version(package: str) -> str | None:
 
 def _import_error(module: str) -> str:
     try:
-        importlib.import_module(module)
+        with preserve_signal_handlers():
+            importlib.import_module(module)
     except Exception as error:
         return f"{type(error).__name__}: {error}"
     return ""

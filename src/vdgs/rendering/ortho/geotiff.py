@@ -48,9 +48,18 @@ def require_rasterio() -> Any:
     return rasterio
 
 
-def limit_gdal_cache() -> Any:
-    """A context in which GDAL keeps at most `GDAL_CACHE_BYTES` of files in memory, on any machine."""
-    return require_rasterio().Env(GDAL_CACHEMAX=GDAL_CACHE_BYTES)
+@contextmanager
+def limit_gdal_cache() -> Iterator[None]:
+    """A context in which GDAL keeps at most `GDAL_CACHE_BYTES` of files in memory, on any machine, and raises OSError
+    whatever the disk refuses."""
+    rasterio = require_rasterio()
+    from rasterio._err import CPLE_BaseError  # what GDAL says when it closes a file; `rasterio.errors` lacks it
+
+    try:
+        with rasterio.Env(GDAL_CACHEMAX=GDAL_CACHE_BYTES):
+            yield
+    except CPLE_BaseError as error:
+        raise OSError(str(error)) from error
 
 
 def rasterio_crs(placement: MapProjection) -> Any:

@@ -20,7 +20,7 @@ from vdgs.rendering.ortho.detail_transfer import DetailTransfer
 from vdgs.rendering.ortho.nadir_camera import NadirCamera
 from vdgs.rendering.ortho.pixel_grid import PixelGrid
 from vdgs.rendering.ortho.tile_renderer import TileRenderer, samples_per_side
-from vdgs.system.atomic_files import read_json_or_empty, write_json
+from vdgs.system.atomic_files import read_json_or_empty, reason_of, write_json
 
 ORTHOPHOTO_FILE, DSM_FILE, VISIBILITY_FILE = "orthophoto.tif", "dsm.tif", "visibility.tif"
 HILLSHADE_FILE, PREVIEW_FILE, METADATA_FILE = "hillshade.png", "preview.png", "map.json"
@@ -120,9 +120,10 @@ def staging_folder(folder: Path) -> Iterator[Path]:
         for file in sorted(staging.iterdir(), key=lambda file: (file.name == METADATA_FILE, file.name)):
             os.replace(file, folder / file.name)
     except OSError as error:  # rasterio's errors are such too
+        why = reason_of(error, staging)  # GDAL's own words mislead
         raise VdgsError(
-            f"{folder}: the maps cannot be written ({error.strerror or error}). Free some space or give another "
-            "--output; maps that were there are kept."
+            f"{folder}: the maps cannot be written ({getattr(why, 'strerror', None) or why}). Free some space or give "
+            "another --output; maps that were there are kept."
         ) from error
     finally:
         shutil.rmtree(staging, ignore_errors=True)

@@ -14,6 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from vdgs.config.method import TrainConfig
 from vdgs.runs.stage_folder import StageFolder, StatusRecord
+from vdgs.system.atomic_files import explain_disk_errors
 from vdgs.system.units import clock
 from vdgs.training import StepReport, TrainingState, downscale_at
 
@@ -30,7 +31,9 @@ class TrainingProgress:
 
     def __init__(self, console: Console, folder: StageFolder, config: TrainConfig, start: int, board: Any = None):
         self._console, self._config, self._board = console, config, board
-        self._log: TextIO = folder.log.open("a", encoding="utf-8")
+        self._file = folder.log
+        with explain_disk_errors(self._file):
+            self._log: TextIO = self._file.open("a", encoding="utf-8")
         self._recent: deque[tuple[float, int]] = deque([(time.monotonic(), start)], maxlen=200)
         self._last_line = time.monotonic()
         self._process = psutil.Process()
@@ -46,7 +49,8 @@ class TrainingProgress:
 
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
-        self._log.close()
+        with explain_disk_errors(self._file):
+            self._log.close()
         if self._board is not None:
             self._board.close()
 
@@ -76,7 +80,8 @@ class TrainingProgress:
         )  # fmt: skip
 
     def flush(self) -> None:
-        self._log.flush()
+        with explain_disk_errors(self._file):
+            self._log.flush()
 
     def _line(self, state: TrainingState) -> str:
         memory = self._process.memory_info().rss / 1e9
@@ -98,7 +103,8 @@ class TrainingProgress:
             "iterations_per_second": round(self.speed(), 3), "memory_bytes": self._process.memory_info().rss,
             **report.cycle,
         }  # fmt: skip
-        self._log.write(json.dumps(record) + "\n")
+        with explain_disk_errors(self._file):
+            self._log.write(json.dumps(record) + "\n")
         if self._board is not None:
             for name in (name for name in TENSORBOARD_SCALARS if record[name] is not None):
                 self._board.add_scalar(name, record[name], state.iteration)

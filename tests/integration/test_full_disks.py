@@ -1,0 +1,158 @@
+"""Stages whose disk is full in their middle: a file system in memory that has little room, then more."""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+import subprocess
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from support.commands import vdgs
+from support.flights import copy_folder
+from support.small_pipeline import BLOCK, CUT, SETTINGS
+from vdgs.config.sfm_options import SfmRequest
+from vdgs.errors import VdgsError
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("full_disks")]
+
+SIZE_MB = 64
+
+
+@dataclass(frozen=True)
+class SmallDisk:
+    """A file system that a file of no use fills up."""
+
+    folder: Path
+
+    def leave(self, free_bytes: int) -> None:
+        """Let so much room be left."""
+        state = os.statvfs(self.folder)
+        with (self.folder / "ballast").open("wb") as file:
+            os.posix_fallocate(file.fileno(), 0, state.f_bavail * state.f_frsize - free_bytes)
+
+    def empty(self) -> None:
+        (self.folder / "ballast").unlink()
+
+    def results(self) -> dict[str, bytes]:
+        """All files but those that say how work goes on, and folders of work."""
+        return {
+            str(path.relative_to(self.folder)): path.read_bytes()
+            for path in self.folder.rglob("*")
+            if path.is_file() and path.suffix in (".safetensors", ".npz", ".bin", ".geojson", ".png", ".JPG", ".db")
+        }
+
+    def leftovers(self) -> list[str]:
+        ends = (".tmp", ".part", ".scratch", ".partial.mp4")
+        return [path.name for path in self.folder.rglob("*") if path.name.endswith(ends) or ".maps-" in path.name]
+
+
+@pytest.fixture
+def disk(tmp_path) -> Iterator[SmallDisk]:
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", f"size={SIZE_MB}m", "tmpfs", str(folder)]
+    if shutil.which("mount") is None or subprocess.run(command, capture_output=True).returncode:
+        pytest.skip("a file system in memory cannot be mounted here: that needs root")
+    try:
+        yield SmallDisk(folder)
+    finally:
+        subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+def fails_then_works(disk: SmallDisk, free_bytes: int, *command: object) -> None:
+    """The law: words instead of traces, exit code 1, what was there stays whole, no leftovers, then the same command
+    works."""
+    before = disk.results()
+    disk.leave(free_bytes)
+    failed = vdgs(*command)
+    assert failed.returncode == 1, f"{command}: {failed.stdout}{failed.stderr}"
+    assert str(disk.folder) in failed.stderr
+    assert "Free some space" in failed.stderr
+    assert not [each for each in ("Traceback", "***", "terminate called") if each in failed.stderr], failed.stderr
+    after = disk.results()
+    assert {name: after.get(name) for name in before} == before, command
+    assert disk.leftovers() == []
+    disk.empty()
+    done = vdgs(*command)
+    assert done.returncode == 0, f"{command}: {done.stderr}"
+    kept = {name: content for name, content in disk.results().items() if name in after and name not in before}
+    assert kept == {name: after[name] for name in kept}, "a half file stood under its final name"
+
+
+def test_every_stage_of_a_run_says_that_the_disk_is_full_and_continues_to_the_same_bits(disk, native_small):
+    run, free = disk.folder / "run", 24 << 10
+    for command in (
+        ("train-coarse", native_small.capture, "--output", run, "--up", "z", *SETTINGS, "--save-every", "10"),
+        ("visibility", run),
+        ("partition", run, *CUT),
+        ("train-blocks", run, *BLOCK, "--jobs", "1"),
+        ("merge", run),
+        ("eval", run),
+        ("report", run),
+    ):
+        fails_then_works(disk, free, *command)
+    for model in ("coarse/model.safetensors", "merged/model.safetensors"):
+        assert (run / model).read_bytes() == (native_small.whole / model).read_bytes()
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        *(("export", "RUN", "--output", f"DISK/{name}") for name in ("a.ply", "a.spz", "a.glb", "a.html", "tiles")),
+        ("render", "RUN", "--output", "DISK/views"),
+        ("render", "RUN", "--views", "flyover", "--output", "DISK/film.mp4"),
+        ("inspect", "CAPTURE", "--output", "DISK/looks"),
+        ("synth", "DISK/town", "--size", "toy"),
+    ],
+    ids=lambda command: f"{command[0]} {Path(command[-1]).name}",
+)
+def test_files_for_others_are_whole_or_absent(disk, native_small, command):
+    places = {"RUN": native_small.whole, "CAPTURE": native_small.capture, "DISK": disk.folder}
+
+    def place(word: str) -> str:
+        for name, path in places.items():
+            word = word.replace(name, str(path))
+        return word
+
+    fails_then_works(disk, 4 << 10, *map(place, command))
+
+
+@pytest.mark.parametrize("free_bytes", [0, 24 << 10, 5_100_000])
+def test_maps_are_whole_or_absent(disk, native_small, free_bytes):
+    pytest.importorskip("rasterio")
+    fails_then_works(disk, free_bytes, "ortho", native_small.whole, "--output", disk.folder / "maps", "--gsd", "0.02")
+
+
+@pytest.mark.parametrize(
+    ("step", "free_bytes"),
+    [("features", 0), ("features", 64 << 10), ("features", 400 << 10), ("matching", 24 << 10), ("mapping", 100 << 10)],
+)
+def test_a_reconstruction_continues_to_the_same_model(disk, nine, nine_begun, tmp_path, monkeypatch, step, free_bytes):
+    """COLMAP's own files among them: its database, and models, which it writes without a look whether they fit."""
+    from vdgs.sfm.reconstruct import reconstruct
+
+    output, unbroken = disk.folder / "capture", tmp_path / "capture"
+    copy_folder(nine_begun["writing"], unbroken)
+    if step in nine_begun:
+        copy_folder(nine_begun[step], output)
+
+    def goes_on(folder: Path) -> None:
+        reconstruct(SfmRequest(image_folders=(nine.folder,), output=folder, threads=1), Console(file=io.StringIO()))
+
+    goes_on(unbroken)
+    disk.leave(free_bytes)
+    with monkeypatch.context() as patch:
+        patch.setattr("vdgs.sfm.reconstruct.check_disk_space", lambda _: None)  # others fill it later
+        with pytest.raises(VdgsError, match=f"{disk.folder}.*Free some space"):
+            goes_on(output)
+    disk.empty()
+    goes_on(output)
+    for name in ("cameras", "images", "points3D", "rigs", "frames"):
+        file = f"sparse/0/{name}.bin"
+        assert (output / file).read_bytes() == (unbroken / file).read_bytes()
