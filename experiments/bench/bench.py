@@ -41,7 +41,7 @@ from experiments.bench.results import BenchResult, collect_results, results_to_j
 from experiments.bench.table_writers import to_latex, to_markdown, to_tidy_csv
 from experiments.bench.worker import RECORD_FILE, BenchJob
 from vdgs.captures.loading import load_capture
-from vdgs.captures.output_guard import check_not_among_files, check_not_in_capture
+from vdgs.captures.output_guard import check_not_among_files, check_output
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.serialization import diff_settings, to_dict
 from vdgs.distributed.executor import LogListener, Task, TaskResult
@@ -106,7 +106,7 @@ def run_bench(settings: BenchSettings, console: Console) -> list[BenchResult]:
 
 def _check_output_outside_inputs(output: Path, plan: BenchPlan) -> None:
     """Raise VdgsError before anything is written where the output lies among photographs or masks of a scene."""
-    check_not_in_capture(output)
+    check_output(output)
     for scene in plan.scenes:
         if scene.folder is not None:
             names = [scene.options.get("images"), scene.options.get("masks")]

@@ -11,6 +11,7 @@ from tyro.conf import Positional, arg
 from vdgs.cli.common import make_console, parse_arguments
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import BIN_COUNT_RANGE
+from vdgs.config.output_paths import Output
 from vdgs.config.ranges import MAX_COUNT, Range
 
 TableName = Literal[
@@ -31,7 +32,7 @@ class BenchArguments:
     premise holds, each block trained as long, its choices crossed, its compensation without blocks, and its parts
     against plain growth at lower thresholds; efficiency: its paragraph; longer: blocks that train two and four times
     as long; choices: one choice of ours changed at a time; toy: a small one in a minute or two."""
-    output: Path
+    output: Annotated[Path, Output()]
     """Folder for runs and results; new, or the one to continue."""
     seeds: Annotated[int | None, Range(1, 1000)] = None
     """How many seeds (0, 1, ...); by default as many as the table has."""

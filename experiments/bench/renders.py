@@ -29,6 +29,7 @@ from vdgs.evaluation.evaluate_model import evaluate_model
 from vdgs.evaluation.evaluate_run import cached_reference_views
 from vdgs.evaluation.lpips import load_lpips
 from vdgs.evaluation.renderable_model import RenderableModel
+from vdgs.system.native_messages import without_decoder_messages
 from vdgs.system.tensors import file_size_and_crc32
 
 #: What a row may be called: it also names a folder, and stands in tables of three languages and in a figure.
@@ -112,7 +113,8 @@ class _LoadedRender:
 
 def _read(file: Path, view: View) -> Float[Tensor, "h w 3"]:
     """RGB in [0, 1]; transparency is not looked at."""
-    image = cv2.imread(str(file), cv2.IMREAD_COLOR)
+    with without_decoder_messages():
+        image = cv2.imread(str(file), cv2.IMREAD_COLOR)
     if image is None:
         raise VdgsError(f"{file}: cannot be read as a picture")
     height, width = image.shape[:2]

@@ -242,6 +242,24 @@ def test_fisheyes_are_read_as_such(says):
     assert found == Intrinsics("OPENCV_FISHEYE", (50.0, 51.0, 32.0, 24.0, 0.04, 0.03, 0.02, 0.01), 64, 48)
 
 
+def test_distortion_is_read_from_keys_and_lists_alike():
+    lens = {
+        "fl_x": 50.0,
+        "fl_y": 51.0,
+        "cx": 32.0,
+        "cy": 24.0,
+        "w": 64,
+        "h": 48,
+        "k5": 0.0,
+        "rolling_shutter": [0, 0.0],
+    }
+    by_keys = lens | {"k1": 0.04, "k2": 0.03, "p1": 0.02, "p2": 0.01}
+    by_list = lens | {"distortion_params": [0.04, 0.03, 0, 0, 0.02, 0.01]}
+    one, other = (parse_intrinsics({}, each, Path("a.png"), Path("transforms.json")) for each in (by_keys, by_list))
+    assert one == other
+    assert one.model == "OPENCV"
+
+
 def frame(pose: np.ndarray, path: str = "images/frame_000.png") -> dict:
     return {"file_path": path, "transform_matrix": pose.tolist()}
 
@@ -263,6 +281,10 @@ def frame(pose: np.ndarray, path: str = "images/frame_000.png") -> dict:
         ({"camera_model": "THIN_PRISM_FISHEYE"}, "'THIN_PRISM_FISHEYE' is not supported; undistort"),
         ({"camera_model": "OPENCV", "is_fisheye": True}, "is_fisheye contradicts the camera model OPENCV"),
         ({"camera_model": "OPENCV_FISHEYE", "p1": 0.01}, "p1, p2 of a fisheye"),
+        ({"k6": 0.01}, "lens parameter k6 is not supported"),
+        ({"rolling_shutter": [0, 0, 0.1, 0]}, "rolling_shutter is not supported"),
+        ({"distortion_params": [0.1, 0, 0, 0, 0, 0]}, "lens distortion"),
+        ({"distortion_params": [0.1]}, "must be a list of k1"),
         ({"ftheta_p0": 0.0}, "'ftheta_p0' describes is not supported"),
         ({"ply_file_path": "../../cloud.ply"}, "inside the capture"),
         ({"ply_file_path": None}, None),

@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from PIL import Image
 from rich.console import Console
 
 from experiments.bench.bench import BenchSettings, run_bench
@@ -14,7 +15,7 @@ from experiments.bench.plan import PlanOptions
 from support.captures import tiny_scene, write_colmap
 from support.dataset_layouts import write_mega_nerf
 from vdgs.captures.loading import load_capture
-from vdgs.captures.output_guard import check_not_among_inputs, check_not_in_capture
+from vdgs.captures.output_guard import check_not_among_inputs, check_output
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import OrthoRequest
 from vdgs.config.presets import PRESETS
@@ -45,13 +46,13 @@ INSIDE = ("images_4", "images_4/run", "images_4/film.mp4", "masks", "masks/new/r
 @pytest.mark.parametrize("inside", INSIDE)
 def test_inputs_of_any_capture_are_known_without_reading_it(root: Path, inside: str) -> None:
     with pytest.raises(VdgsError, match="is for inputs of the capture"):
-        check_not_in_capture(root / inside)
+        check_output(root / inside)
 
 
 @pytest.mark.parametrize("beside", ["", "run", "renders/images", "images_by_me", "undistorted/images", "film.mp4"])
 def test_other_places_in_a_capture_are_free(root: Path, beside: str) -> None:
     before, capture = contents(root), load_capture(root)
-    check_not_in_capture(root / beside)  # raises nothing
+    check_output(root / beside)  # raises nothing
     check_not_among_inputs(root / beside, capture)
     assert contents(root) == before  # nor makes what it was asked about
 
@@ -62,7 +63,7 @@ def test_relative_names_and_links_lead_to_the_same_folder(root: Path, monkeypatc
     monkeypatch.chdir(root / "sparse")
     for name in ("../images_4", "../../link/run", "../../film.mp4", "../../link/../images_4"):
         with pytest.raises(VdgsError, match="images_4"):
-            check_not_in_capture(Path(name))
+            check_output(Path(name))
 
 
 def test_photographs_elsewhere_and_under_other_names_are_known(root: Path, tmp_path: Path) -> None:
@@ -99,7 +100,7 @@ def test_the_layout_of_mega_nerf_is_known(tmp_path: Path) -> None:
     write_mega_nerf(tmp_path / "mill", tiny_scene())
     for inside in ("train/rgbs", "val/rgbs/run", "train/metadata"):
         with pytest.raises(VdgsError, match="is for inputs"):
-            check_not_in_capture(tmp_path / "mill" / inside)
+            check_output(tmp_path / "mill" / inside)
 
 
 def begin(root: Path, output: Path) -> None:
@@ -147,5 +148,74 @@ def test_a_folder_that_cannot_be_read_is_no_capture(tmp_path: Path, monkeypatch:
         raise PermissionError(13, os.strerror(13), str(path))
 
     monkeypatch.setattr("vdgs.captures.output_guard.find_models", refuse)
-    check_not_in_capture(tmp_path / "images" / "run")
+    check_output(tmp_path / "images" / "run")
     assert not list(tmp_path.iterdir())
+
+
+def photographs(folder: Path, count: int, maker: str = "") -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    exif = Image.Exif()
+    if maker:
+        exif[0x010F] = maker
+    for k in range(count):
+        Image.new("RGB", (16, 16), (k, 0, 0)).save(folder / f"P{k:04d}.jpg", exif=exif)
+    return folder
+
+
+def is_refused(output: Path) -> bool:
+    try:
+        check_output(output)
+    except VdgsError:
+        return True
+    return False
+
+
+def test_folders_of_photographs_are_known_without_a_capture(tmp_path: Path) -> None:
+    many = photographs(tmp_path / "flight", 5)
+    one = photographs(tmp_path / "one", 1, "DJI")
+    raw = tmp_path / "raw"
+    raw.mkdir()
+    (raw / "A.DNG").touch()
+    for inside in (many, many / "run", many / "film.mp4", many / "new" / "run", one, one / "film.mp4", raw):
+        assert is_refused(inside), inside
+    assert not is_refused(tmp_path / "run")  # beside folders of photographs
+    assert not is_refused(one / "run")  # a folder with a picture in it, such as a home
+
+
+def test_a_few_pictures_are_no_photographs(tmp_path: Path) -> None:
+    figures = photographs(tmp_path / "figures", 2)
+    assert not is_refused(figures)
+    home = photographs(tmp_path / "home", 4)
+    for name in "abcdefgh":
+        (home / name).mkdir()
+    assert is_refused(home)
+    assert not is_refused(home / "a" / "run")
+
+
+def test_all_that_a_camera_took_is_one_tree(tmp_path: Path) -> None:
+    photographs(tmp_path / "DCIM" / "100MEDIA", 1)
+    for inside in ("DCIM", "DCIM/run", "DCIM/100MEDIA/x", "DCIM/101MEDIA"):
+        with pytest.raises(VdgsError, match=str(tmp_path / "(DCIM-results|run|x|101MEDIA)$")):
+            check_output(tmp_path / inside)
+    assert not is_refused(tmp_path / "other" / "DCIM")  # not there yet
+
+
+def test_results_of_ours_are_no_photographs(tmp_path: Path) -> None:
+    renders = photographs(tmp_path / "views", 9)
+    (renders / "render.json").write_text("{}")
+    run = photographs(tmp_path / "run", 9)
+    (run / "config.yaml").write_text("vdgs:\n  version: 0\n")
+    straight = photographs(tmp_path / "straight", 9)
+    for picture in list(straight.iterdir()):
+        picture.with_name(picture.name + ".json").write_text('{"made_from": {}}')
+        shutil.copy(picture, picture.with_name(picture.name + ".mask.png"))
+    for output in (renders, run / "maps", run / "film.mp4", straight):
+        assert not is_refused(output), output
+
+
+def test_a_capture_with_photographs_in_its_root_takes_folders_but_no_files(tmp_path: Path) -> None:
+    write_colmap(tmp_path / "flat", tiny_scene())
+    for photograph in (tmp_path / "flat" / "images").iterdir():
+        shutil.move(photograph, tmp_path / "flat")
+    assert not is_refused(tmp_path / "flat" / "run" / "maps")
+    assert is_refused(tmp_path / "flat" / "film.mp4")

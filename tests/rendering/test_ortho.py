@@ -234,12 +234,20 @@ def test_a_capture_without_georeference_has_a_map_that_says_so(house, make, caps
     ortho_folder = make(replace(capture, ground=replace(capture.ground, origin_geo=None, metric=False)), model, gsd=0.2)
     assert "units without known size" in capsys.readouterr().err
     with rasterio.open(ortho_folder / "dsm.tif") as file:
-        assert file.crs.to_epsg() is None
-        assert "local units" in file.crs.to_wkt()
+        assert file.crs is None  # GDAL has no unit without a size: it would write metres
         assert file.units == ("units",)
         assert "units without known size" in file.tags()["CRS_NAME"]
         assert file.read(1).max() == pytest.approx(ROOF, abs=0.05)
         assert file.bounds.left < -6
+
+
+def test_units_of_known_size_keep_it(house, make):
+    capture, model = house
+    scaled = replace(capture.ground, origin_geo=None, scale=0.5)
+    ortho_folder = make(replace(capture, ground=scaled), model, gsd=0.2, crs="source")
+    with rasterio.open(ortho_folder / "dsm.tif") as file:
+        assert 'UNIT["unknown",0.5]' in file.crs.to_wkt()
+        assert file.units == ("units",)
 
 
 def test_without_options_pixels_are_those_of_the_photographs(house, make):
@@ -327,6 +335,16 @@ def test_a_map_killed_while_its_files_take_their_places_is_known_as_ours_and_as_
     assert not render_ortho.is_ortho_current(run)
     make(capture, model, gsd=0.4)
     assert render_ortho.is_ortho_current(run)
+
+
+def test_what_a_killed_command_left_goes_before_the_work_and_is_said(house, make, capsys):
+    left = make.path / "maps" / ".maps.abc.scratch"
+    (left / "maps").mkdir(parents=True)
+    (left / ".lock").touch()
+    (left / "maps" / "rough-dsm.tif").write_bytes(bytes(100))
+    ortho_folder = make(*house, gsd=0.5)
+    assert {file.name for file in ortho_folder.iterdir()} == set(ortho_plan.FILE_NAMES)
+    assert "removed what a killed command had left" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_disk_without_room_is_named_before_anything_is_drawn(house, make, monkeypatch):

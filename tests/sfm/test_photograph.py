@@ -307,7 +307,7 @@ def test_the_look_says_what_the_flight_is(tmp_path):
     assert found.forward_overlap == pytest.approx(1 - 10 / (found.height_m / 0.85 * 0.75), abs=0.02)
     assert found.spread_m == pytest.approx((20, 24), abs=0.1)
     assert found.oblique == 0
-    assert found.days == ["2026:06:01"]
+    assert found.days == ["2026-06-01"]
 
 
 def test_other_days_and_small_files_are_remarked(tmp_path):

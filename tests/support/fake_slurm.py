@@ -12,6 +12,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -19,7 +20,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-STATE = Path(os.environ["VDGS_TEST_SLURM"])
+STATE = Path(os.environ.get("VDGS_TEST_SLURM", ""))
 PLACES = 2
 NODE = "stand-in"
 GLANCE_SECONDS = 0.02
@@ -34,8 +35,8 @@ def main(verb: str, words: list[str]) -> int:
 def sbatch(words: list[str]) -> int:
     """Submit an array; every element gets a process that goes with it."""
     script = Path(words[-1]).read_text()
-    lines = [line.removeprefix("#SBATCH --") for line in script.splitlines() if line.startswith("#SBATCH --")]
-    asked = dict(line.partition("=")[::2] for line in lines)
+    words = [word for line in script.splitlines() if line.startswith("#SBATCH ") for word in directive_words(line[8:])]
+    asked = dict(word.removeprefix("--").partition("=")[::2] for word in words)
     if int(asked["cpus-per-task"]) > PLACES:
         print(
             "sbatch: error: Batch job submission failed: Requested node configuration is not available", file=sys.stderr
@@ -51,11 +52,41 @@ def sbatch(words: list[str]) -> int:
         folder = STATE / f"{number}_{index}"
         folder.mkdir()
         (folder / "script").write_text(script)
-        tell(folder, state="PENDING", name=asked["job-name"], turn=0, output=asked["output"].replace("%a", str(index)))
+        tell(folder, state="PENDING", name=asked["job-name"], turn=0, output=file_name(asked["output"], index))
         quiet = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         subprocess.Popen([sys.executable, "-S", __file__, "go", str(folder)], start_new_session=True, **quiet)  # type: ignore[call-overload]
     print(number)
     return 0
+
+
+def directive_words(line: str) -> list[str]:
+    """The words of a line as sbatch takes them apart: quotes group, a backslash escapes (inside quotes too), `#`
+    begins a comment."""
+    words, word, quote, escaped = [], None, "", False
+    for letter in line:
+        if escaped:
+            word, escaped = (word or "") + letter, False
+        elif letter == "\\":
+            escaped = True
+        elif quote:
+            word, quote = (word, "") if letter == quote else (word + letter, quote)
+        elif letter in "\"'":
+            word, quote = word or "", letter
+        elif letter == "#":
+            break
+        elif letter.isspace():
+            words, word = ([*words, word], None) if word is not None else (words, None)
+        else:
+            word = (word or "") + letter
+    assert not quote, line
+    return words if word is None else [*words, word]
+
+
+def file_name(pattern: str, index: int) -> str:
+    """What SLURM makes of the name of a file: `%a` and `%%`, unless it has a backslash."""
+    if "\\" in pattern:
+        return pattern.replace("\\", "")
+    return re.sub("%([a%])", lambda found: "%" if found[1] == "%" else str(index), pattern)
 
 
 def go(folder: Path) -> None:

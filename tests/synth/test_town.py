@@ -182,6 +182,14 @@ def test_a_failure_leaves_nothing_behind(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_what_a_killed_command_left_goes(tmp_path: Path) -> None:
+    left = tmp_path / ".capture.abc.scratch"
+    left.mkdir()
+    (left / ".lock").touch()
+    generate(tmp_path / "capture", TINY)
+    assert [path.name for path in tmp_path.iterdir()] == ["capture"]
+
+
 def test_a_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(VdgsError, match=r"vdgs\[synth\]"):

@@ -22,6 +22,7 @@ from vdgs.captures.nested_captures import model_below
 from vdgs.captures.reconstruction import is_reconstruction
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
+from vdgs.system.quoting import shell_word
 
 
 def read_source(root: Path, options: CaptureOptions) -> SourceCapture:
@@ -42,7 +43,7 @@ def read_source(root: Path, options: CaptureOptions) -> SourceCapture:
     if is_reconstruction(root):
         raise CaptureError(
             f"{root}: is not finished: vdgs sfm was stopped. The command that began it goes on "
-            f"with it (its photographs, --output {root})."
+            f"with it (its photographs, --output {shell_word(root)})."
         )
     below = model_below(root)
     if below:
@@ -50,7 +51,7 @@ def read_source(root: Path, options: CaptureOptions) -> SourceCapture:
     raise CaptureError(
         f"{root}: not a capture. {partial_model(root)}Looked for a COLMAP model (sparse/0/cameras.bin and "
         "images.bin, or .txt), transforms.json (nerfstudio), train/metadata/*.pt (Mega-NeRF) and transforms_train.json "
-        f"(MatrixCity). Photographs alone become one first: vdgs sfm {root} --output CAPTURE"
+        f"(MatrixCity). Photographs alone become one first: vdgs sfm {shell_word(root)} --output CAPTURE"
     )
 
 

@@ -5,6 +5,7 @@ Pixels are taken as COLMAP takes them: RGB, 8 bits, EXIF orientation not applied
 
 from __future__ import annotations
 
+import os
 import warnings as python_warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,8 +22,22 @@ from vdgs.captures.name_resolution import find_file
 from vdgs.captures.strays import is_hidden
 from vdgs.errors import CaptureError
 from vdgs.system.memory.process_memory import is_out_of_memory
+from vdgs.system.native_messages import without_decoder_messages
+
+# What libraries say of files on their own is for their makers: what cannot be read is said in our words.
+python_warnings.filterwarnings("ignore", module=r"PIL\.")
+if "OPENCV_LOG_LEVEL" not in os.environ:
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"}
+#: Photographs that are not read: of Apple and others (to be converted), and raw ones (to be developed).
+APPLE_SUFFIXES = {".heic", ".heif", ".hif", ".avif", ".jxl"}
+RAW_SUFFIXES = {
+    ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw", ".raw", ".gpr", ".3fr", ".iiq",
+}  # fmt: skip
+UNREAD_IMAGE_SUFFIXES = APPLE_SUFFIXES | RAW_SUFFIXES
+#: Maker and model of a camera in EXIF.
+_CAMERA_TAGS = {0x010F, 0x0110}
 #: Headers that announce more pixels than this are refused rather than decoded.
 MAX_IMAGE_PX = 1_000_000_000
 #: A photograph or mask with a shorter side than this (pixels) shows nothing: a thumbnail, what is left of a file, or
@@ -83,6 +98,17 @@ def read_header(path: Path) -> ImageHeader:
     if header.mode not in SUPPORTED_MODES:
         raise CaptureError(f"{path}: has the colour mode {header.mode}; convert it to 8-bit RGB.")
     return header
+
+
+def has_camera(path: Path) -> bool:
+    """Whether an image says of itself that a camera took it. Raw files and those of phones are of cameras."""
+    if path.suffix.lower() in UNREAD_IMAGE_SUFFIXES:
+        return True
+    try:
+        with pillow_without_limits(), Image.open(path) as image:
+            return not _CAMERA_TAGS.isdisjoint(image.getexif())
+    except Exception:  # Pillow's parsers raise many kinds on damaged headers
+        return False
 
 
 def same_aspect(one: tuple[int, int], other: tuple[int, int]) -> bool:
@@ -168,7 +194,8 @@ def _decode(path: Path) -> np.ndarray:
     except OSError as error:
         raise CaptureError(f"{path}: cannot be read ({error.strerror or error}).") from error
     try:
-        pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+        with without_decoder_messages():
+            pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
     except cv2.error as error:
         if is_out_of_memory(error):
             raise

@@ -11,6 +11,7 @@ from vdgs.captures.formats.matrixcity import pose_files
 from vdgs.captures.formats.mega_nerf import is_mega_nerf
 from vdgs.captures.image_files import IMAGE_SUFFIXES
 from vdgs.captures.output_guard import is_capture
+from vdgs.system.quoting import shell_word
 
 #: So many folders deep a model is looked for: WORKSPACE/dense/0 with sparse in it, and one above.
 DEEPEST = 3
@@ -32,15 +33,15 @@ def model_below(root: Path) -> str | None:
         if not is_capture(folder):
             continue
         if _has_photographs(folder):
-            return f"{folder} is a capture: vdgs run {_quoted(folder)} --output RUN"
+            return f"{folder} is a capture: vdgs run {shell_word(folder)} --output RUN"
         models = find_models(folder)
         if models:
             biggest = max(models, key=count_images)
             photographs = _photographs_beside(root, folder)
-            link = f"ln -s {_quoted(photographs.resolve())} {_quoted(folder / 'images')}; " if photographs else ""
+            link = f"ln -s {shell_word(photographs.resolve())} {shell_word(folder / 'images')}; " if photographs else ""
             return (
                 f"{biggest} is a COLMAP model of {count_images(biggest)} photographs. To "
-                f"use it, put them beside it as images: {link}vdgs run {_quoted(folder)} --output RUN"
+                f"use it, put them beside it as images: {link}vdgs run {shell_word(folder)} --output RUN"
             )
     return None
 
@@ -81,8 +82,3 @@ def _photographs_beside(root: Path, model: Path) -> Path | None:
     counts = {folder: sum(entry.suffix.lower() in IMAGE_SUFFIXES for entry in folder.iterdir()) for folder in folders}
     best = max(counts, key=lambda folder: counts[folder])
     return best if counts[best] else None
-
-
-def _quoted(path: Path) -> str:
-    text = str(path)
-    return f'"{text}"' if " " in text else text

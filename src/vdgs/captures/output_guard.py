@@ -1,31 +1,64 @@
-"""Where nothing may be written: among photographs, masks and sparse models, which cannot be made again."""
+"""Where nothing may be written: among photographs, masks and sparse models, which cannot be made again, and among which
+a picture of ours would be taken for one more photograph.
+
+`check_output` is asked by every verb, for every option that is marked `Output` (`config.output_paths`), and by what
+does the work, for those who call it from Python. What is allowed:
+
+- a folder beside the photographs, also in a capture whose photographs lie in `images/`, and in a project's folder whose
+  photographs lie in folders of their own (`project/DCIM`, `project/run`);
+- anything in a run or a capture but its inputs, wherever the run or capture lies;
+- a new folder in a capture whose photographs lie in its root (no file there);
+- a folder of results (a render, maps): they are no photographs (`strays.why_not_read`).
+"""
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from vdgs.captures.capture import Capture
 from vdgs.captures.formats.colmap import find_models
 from vdgs.captures.formats.matrixcity import pose_files
 from vdgs.captures.formats.mega_nerf import is_mega_nerf
+from vdgs.captures.image_files import IMAGE_SUFFIXES, UNREAD_IMAGE_SUFFIXES, has_camera
+from vdgs.captures.reconstruction import is_reconstruction
+from vdgs.captures.strays import is_result, is_run, why_not_read
 from vdgs.errors import VdgsError
+from vdgs.system.atomic_files import read_json_or_empty
+
+if TYPE_CHECKING:
+    from vdgs.captures.capture import Capture
 
 #: What the folders of a capture that hold its inputs are usually called, in its root.
 _USUAL = re.compile(r"images(_\d+)?|masks|sparse|colmap", re.IGNORECASE)
 #: The same in the parts `train` and `val` of a capture in Mega-NeRF's layout.
 _MEGA_NERF = ("rgbs", "metadata")
+#: What cameras call the folder of all that they took.
+_CAMERA_FOLDER = "dcim"
+#: So many pictures are photographs, whatever they say of themselves: with fewer there is no scene (`sfm.image_list`).
+_MANY_PICTURES = 3
 
 
-def check_not_in_capture(output: Path) -> None:
-    """Raise VdgsError where `output` lies in a folder of inputs of some capture, known by its name and its neighbours.
+def check_output(output: Path) -> None:
+    """Raise VdgsError where `output` lies in a folder of inputs of some capture, known by its name and its neighbours,
+    or in a folder of photographs.
 
     `output` is a file or folder that need not be there yet; links and `..` are followed. Reads no capture, so that it
     can be asked before anything else; `check_not_among_inputs` knows folders of other names too.
     """
     real = Path(os.path.realpath(output))
+    _check_not_in_capture(output, real)
+    found = [folder for folder in _folders_around(real) if _holds_photographs(folder, real)]
+    if found:
+        raise VdgsError(
+            f"{output}: lies among the photographs in {found[0]}, where it would be taken for more of them. Nothing "
+            f"was written. Choose a folder outside of it, such as {_place_beside(found[-1], real)}"
+        )
+
+
+def _check_not_in_capture(output: Path, real: Path) -> None:
     for folder in (real, *real.parents):
         parent = folder.parent
         if _USUAL.fullmatch(folder.name) and is_capture(parent):
@@ -34,9 +67,65 @@ def check_not_in_capture(output: Path) -> None:
             raise _error(output, folder, parent.parent)
 
 
+def _folders_around(real: Path) -> list[Path]:
+    """The output and the folders around it, up to the first run or capture, in which results are at home: a capture's
+    root is among them where a file would be written into it."""
+    around: list[Path] = []
+    for folder in (real, *real.parents):
+        if is_run(folder):
+            break
+        if is_capture(folder) or is_reconstruction(folder):
+            return [*around, folder] if _is_written_into(folder, real) else around
+        around.append(folder)
+    return around
+
+
+def _is_written_into(folder: Path, output: Path) -> bool:
+    """Whether the output is the folder, or a file (by its ending, where it is not there yet) in it."""
+    is_file = bool(output.suffix) and not output.is_dir()
+    return output == folder or (is_file and output.parent == folder)
+
+
+def _holds_photographs(folder: Path, output: Path) -> bool:
+    """Whether an output in a folder would lie among photographs.
+
+    Where it is written right into the folder, or is the folder, few photographs are enough; further up most of what is
+    there must be photographs: a home folder with some pictures is none of them.
+    """
+    try:
+        names = {entry.name: entry.is_file() for entry in os.scandir(folder) if not entry.name.startswith(".")}
+    except OSError:  # is not there yet, is a file, or cannot be read
+        return False
+    if folder.name.lower() == _CAMERA_FOLDER:
+        return True
+    if why_not_read(folder) is not None:
+        return False
+    suffixes = IMAGE_SUFFIXES | UNREAD_IMAGE_SUFFIXES
+    pictures = [folder / name for name, is_file in names.items() if is_file and Path(name).suffix.lower() in suffixes]
+    pictures = [picture for picture in _without_undistorted(pictures, names) if not is_result(picture)]
+    if _is_written_into(folder, output):
+        return len(pictures) >= _MANY_PICTURES or any(map(has_camera, pictures))
+    return len(pictures) >= max(_MANY_PICTURES, len(names) / 2)
+
+
+def _without_undistorted(pictures: list[Path], names: Collection[str]) -> list[Path]:
+    """The pictures but those of `undistort`, each of which has its record beside it, and their masks."""
+    recorded = [picture.name for picture in pictures if f"{picture.name}.json" in names]
+    if not recorded or "made_from" not in read_json_or_empty(pictures[0].parent / f"{recorded[0]}.json"):
+        return pictures
+    ours = set(recorded)
+    return [picture for picture in pictures if picture.name.removesuffix(".mask.png") not in ours]
+
+
+def _place_beside(photographs: Path, output: Path) -> Path:
+    """A folder or file that may be written instead: beside the outermost folder of photographs."""
+    name = output.name if output != photographs else f"{photographs.name}-results"
+    return photographs.parent / name
+
+
 def check_not_among_inputs(output: Path, capture: Capture) -> None:
     """Raise VdgsError where `output` lies among the photographs or masks of this capture, wherever they are, or among
-    the inputs of any other (`check_not_in_capture`)."""
+    the inputs of any other, or other photographs (`check_output`)."""
     check_not_among_folders(output, capture.root, input_folders(capture))
 
 
@@ -62,7 +151,6 @@ def check_not_among_folders(output: Path, root: Path, folders: Sequence[Path]) -
 
     Where inputs lie in the root itself, folders beside them are free.
     """
-    check_not_in_capture(output)
     real = Path(os.path.realpath(output))
     around = {_identity(folder) for folder in (real, *real.parents)} - {None}
     whole_capture = Path(os.path.realpath(root))
@@ -71,6 +159,7 @@ def check_not_among_folders(output: Path, root: Path, folders: Sequence[Path]) -
         known = _identity(folder)
         if known in around and (known not in above_root or known == _identity(real)):
             raise _error(output, folder, root)
+    check_output(output)
 
 
 def _folders_of(files: Sequence[Path]) -> list[Path]:

@@ -45,9 +45,18 @@ def why_not_read(folder: Path) -> str | None:
     """Why pictures in a folder below photographs are none, by its name or what marks it; None where they may be."""
     if _HIDDEN.fullmatch(folder.name):
         return "hidden, or of a system's or a program's own"
-    if _PRODUCTS.fullmatch(folder.name) or any((folder / mark).is_file() for mark in _MARKS):
+    if _PRODUCTS.fullmatch(folder.name) or is_run(folder) or any((folder / mark).is_file() for mark in _MARKS):
         return "results of a program"
     return None
+
+
+def is_run(folder: Path) -> bool:
+    """Whether a folder is a run of ours, by the first line of its config.yaml."""
+    try:
+        with (folder / "config.yaml").open("rb") as handle:
+            return handle.readline().rstrip() == b"vdgs:"
+    except OSError:
+        return False
 
 
 def is_result(file: Path) -> bool:

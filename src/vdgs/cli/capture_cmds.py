@@ -10,10 +10,12 @@ from tyro.conf import Positional, arg
 
 from vdgs.cli.common import QuietArguments, make_console, parse_arguments
 from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.output_paths import Output
 from vdgs.config.ranges import WORKER_COUNT, FlagName
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.synth.options import SynthOptions
+from vdgs.system.quoting import shell_word
 
 
 @dataclass(frozen=True)
@@ -23,7 +25,7 @@ class InspectArguments:
 
     capture: Positional[Path]
     """Folder of the capture."""
-    output: Path
+    output: Annotated[Path, Output()]
     """Folder for report.json and the figures."""
     check: bool = True
     """Decode every photograph once, to find damaged ones."""
@@ -34,11 +36,10 @@ def inspect_command(arguments: list[str]) -> None:
     args = parse_arguments(InspectArguments, arguments, "vdgs inspect")
     from vdgs.captures.image_checks import check_images
     from vdgs.captures.loading import load_capture
-    from vdgs.captures.output_guard import check_not_among_inputs, check_not_in_capture
+    from vdgs.captures.output_guard import check_not_among_inputs
     from vdgs.captures.reconstruction import read_reconstruction
     from vdgs.report.capture_report import inspect_capture, print_report
 
-    check_not_in_capture(args.output)
     capture = load_capture(args.capture, args.options)
     check_not_among_inputs(args.output, capture)
     report = inspect_capture(capture, args.output, check_images(capture) if args.check else None)
@@ -51,19 +52,20 @@ def inspect_command(arguments: list[str]) -> None:
 class SynthArguments(QuietArguments):
     """Generate an aerial place and a drone flight over it, as a COLMAP capture."""
 
-    output: Positional[Path]
+    output: Annotated[Positional[Path], Output()]
     """Folder for the capture; it must not exist or be empty."""
     options: Annotated[SynthOptions, arg(name="")] = field(default_factory=SynthOptions)
 
 
 def synth_command(arguments: list[str]) -> None:
     args = parse_arguments(SynthArguments, arguments, "vdgs synth")
-    from rich.progress import Progress, TaskID
+    from rich.progress import TaskID
 
     from vdgs.synth import generate
+    from vdgs.system.console import make_progress_bar
 
     console = make_console(args.quiet)
-    with Progress(console=console, disable=not console.is_terminal) as bar:
+    with make_progress_bar(console, transient=False) as bar:
         tasks: dict[str, TaskID] = {}
 
         def on_progress(stage: str, done: int, total: int) -> None:
@@ -83,7 +85,7 @@ class SfmArguments(QuietArguments):
     images: Positional[tuple[Path, ...]]
     """Folders of photographs, those below them included. A folder masks/ beside photographs has their masks (white =
     keep), named like them: name.png or name.jpg.png; name_mask.jpg beside name.jpg is one too."""
-    output: Path
+    output: Annotated[Path, Output()]
     """Folder of the capture; new, or the one to go on with."""
     gps: Path | None = None
     """Table of positions to use instead of those in the photographs: columns name,lat,lon,alt as exiftool, Metashape,
@@ -116,4 +118,4 @@ def sfm_command(arguments: list[str]) -> None:
     from vdgs.sfm.reconstruct import reconstruct
 
     reconstruct(request, console)
-    console.print(f"capture: {args.output}\nnext: vdgs run {args.output} --output RUN", highlight=False)
+    console.print(f"capture: {args.output}\nnext: vdgs run {shell_word(args.output)} --output RUN", highlight=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,9 +12,11 @@ from tyro.conf import Positional, arg
 
 from vdgs.config.executor_options import ExecutorOptions
 from vdgs.config.method import MethodConfig
+from vdgs.config.output_paths import output_paths
 from vdgs.config.presets import PRESETS, PresetName
 from vdgs.config.ranges import WORKER_COUNT, check_ranges
 from vdgs.errors import VdgsError
+from vdgs.system.quoting import shell_line
 
 #: What lines begin with that are printed even where a person asked for quiet.
 ALWAYS_PRINTED_PREFIXES = ("[yellow]", "[red]")
@@ -83,10 +84,16 @@ class ShardArguments:
 def parse_arguments(
     arguments_type: type[Parsed], arguments: list[str], prog: str, default: Parsed | None = None
 ) -> Parsed:
-    """The arguments of a verb. Raises VdgsError for a number that is outside its range (`config.ranges`)."""
+    """The arguments of a verb. Raises VdgsError for a number that is outside its range (`config.ranges`), and
+    for an output among photographs or in a capture's inputs (`captures.output_guard`)."""
     options: dict[str, Any] = {} if default is None else {"default": default}
     parsed: Parsed = tyro.cli(arguments_type, args=arguments, prog=prog, **options)
     check_ranges(parsed)
+    if outputs := list(output_paths(parsed)):
+        from vdgs.captures.output_guard import check_output
+
+        for path in outputs:
+            check_output(path)
     return parsed
 
 
@@ -155,10 +162,20 @@ def make_console(quiet: bool = False) -> Console:
     """Where verbs print to; with `quiet` only notes and warnings are, on standard error."""
     from rich.console import Console
 
-    if not quiet:
-        return Console(soft_wrap=True)
+    from vdgs.system.console import escape_names
 
-    class Warnings(Console):
+    class Names(Console):
+        """Prints names with brackets as they are."""
+
+        def print(self, *objects: Any, **options: Any) -> None:
+            if options.get("markup", True):
+                objects = tuple(escape_names(each) if isinstance(each, str) else each for each in objects)
+            super().print(*objects, **options)
+
+    if not quiet:
+        return Names(soft_wrap=True)
+
+    class Warnings(Names):
         """Prints what a person must know, and leaves out how work goes."""
 
         def print(self, *objects: Any, **options: Any) -> None:
@@ -176,4 +193,4 @@ def absolute_command_line(verb: str, arguments: list[str], paths: tuple[Path, ..
     whole = {str(path): str(path.resolve()) for path in paths}
     whole |= {f"--output={name}": f"--output={path}" for name, path in whole.items()}
     words = [whole.get(each, each) for each in arguments if each not in ("--overwrite", "--quiet")]
-    return shlex.join(["vdgs", verb, *words])
+    return shell_line(["vdgs", verb, *words])

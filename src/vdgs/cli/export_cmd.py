@@ -10,6 +10,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from vdgs.cli.common import QuietArguments, ShardArguments, make_console, parse_arguments, set_up_compute
 from vdgs.config.commands import ExportRequest, ProgramName
+from vdgs.config.output_paths import Output
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,7 +19,7 @@ class ExportArguments(ExportRequest, ShardArguments, QuietArguments):
 
     run: Positional[Path]
     """Run folder."""
-    output: Annotated[tuple[Path, ...], UseAppendAction] = ()
+    output: Annotated[tuple[Path, ...], UseAppendAction, Output()] = ()
     """A file to write, by its ending: .ply (3DGS), .compressed.ply (PlayCanvas), .spz, .splat, .sog, .glb (glTF),
     FOLDER/tileset.json (3D Tiles), .points.ply, .laz, .las (point clouds), .html (a page that shows the scene offline).
     Give --output again for more: the scene is baked once (docs/export.md)."""

@@ -22,6 +22,7 @@ from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RunRequest
 from vdgs.config.executor_options import CheckpointOptions, ExecutorOptions
 from vdgs.config.method import PartitionConfig, TrainConfig
+from vdgs.config.output_paths import Output
 from vdgs.config.presets import PresetName
 
 
@@ -31,7 +32,7 @@ class TrainCoarseArguments(ComputeArguments):
 
     capture: Positional[Path]
     """Folder of the capture."""
-    output: Path
+    output: Annotated[Path, Output()]
     """Run folder; new, or the run to continue."""
     preset: PresetName = "default"
     """`laptop`: a good result in minutes on a CPU. `default`: the paper's 100 000 iterations, and our choices where it

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
+from vdgs.config.output_paths import Output
 from vdgs.config.ranges import MAX_COUNT, Range
 
 UpAxis = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
@@ -48,7 +49,7 @@ class CaptureOptions:
     """Use only this many photographs: those nearest to the middle of the flight."""
     undistort: bool = False
     """Undistort photographs whose camera model has lens distortion (written once, then reused)."""
-    undistorted_folder: Path | None = None
+    undistorted_folder: Annotated[Path | None, Output()] = None
     """Where undistorted photographs are kept. Default: undistorted/ inside the capture folder."""
     masks: str = "masks"
     """Folder of masks (white = keep), named like the photographs: name.png or name.jpg.png."""

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.executor_options import CheckpointOptions, ExecutorOptions
 from vdgs.config.method import AssignmentConfig, BlockConfig, MergeConfig, MethodConfig, PartitionConfig, TrainConfig
+from vdgs.config.output_paths import Output
 from vdgs.config.presets import PresetName
 from vdgs.config.ranges import MAX_COUNT, MAX_FLOAT, WORKER_COUNT, FlagName, Range
 from vdgs.config.sfm_options import SfmOptions
@@ -42,7 +43,7 @@ class RunRequest:
 
     capture: Path
     """Folder of the capture, or of photographs alone: they become one in RUN/capture first (`vdgs sfm`)."""
-    output: Path
+    output: Annotated[Path, Output()]
     """Run folder; new, or the run to continue."""
     preset: PresetName = "default"
     """`laptop`: a good result in minutes. `default`: the paper's numbers (100 000 + 50 000 iterations a block), and our
@@ -89,7 +90,7 @@ class RenderRequest:
 
     run: Path
     """Run folder."""
-    output: Path
+    output: Annotated[Path, Output()]
     """Folder for PNG files: new, empty, or filled by an earlier render, which is replaced. Or a file that ends in
     .mp4."""
     views: Literal["test", "train", "orbit", "flyover"] = "test"
@@ -131,7 +132,7 @@ class OrthoRequest:
 
     run: Path
     """Run folder."""
-    output: Path | None = None
+    output: Annotated[Path | None, Output()] = None
     """Folder for the maps, not among photographs nor with such files of others; by default RUN/maps."""
     gsd: Annotated[float | None, Range(0, MAX_FLOAT, exclusive_min=True)] = None
     """Side of a pixel in units of the map (metres, mostly); by default the median that a pixel of the training
@@ -157,7 +158,7 @@ class ExportRequest:
 
     run: Path
     """Run folder."""
-    output: tuple[Path, ...] = ()
+    output: Annotated[tuple[Path, ...], Output()] = ()
     """A file to write, by its ending: .ply (3DGS), .compressed.ply (PlayCanvas), .spz, .splat, .sog, .glb (glTF),
     FOLDER/tileset.json (3D Tiles), .points.ply, .laz, .las (point clouds), .html (a page that shows the scene offline).
     Give --output again for more: the scene is baked once (docs/export.md)."""

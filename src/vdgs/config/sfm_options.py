@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
+from vdgs.config.output_paths import Output
 from vdgs.config.ranges import MAX_COUNT, WORKER_COUNT, FlagName, Range
 
 
@@ -52,7 +53,7 @@ class SfmRequest:
     """Photographs to a capture (`vdgs sfm`)."""
 
     image_folders: tuple[Path, ...]
-    output: Path
+    output: Annotated[Path, Output()]
     gps: Path | None = None
     threads: Annotated[int, WORKER_COUNT] = 0
     keep_intermediate: bool = False

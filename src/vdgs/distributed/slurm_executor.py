@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import secrets
-import shlex
 import sys
 import time
 from collections import defaultdict
@@ -35,6 +34,7 @@ from vdgs.distributed.slurm_job import SlurmTaskRecord, read_task_record
 from vdgs.errors import VdgsError
 from vdgs.system.atomic_files import read_json_or_empty, write_json, write_text
 from vdgs.system.documents import JsonObject
+from vdgs.system.quoting import sbatch_directive, shell_line, slurm_file_pattern
 
 #: How often a job that squeue no longer lists is looked for in vain before it counts as lost: shared file systems show
 #: a file some seconds after it was written.
@@ -150,11 +150,11 @@ def make_batch_script(folder: Path, count: int, resources: TaskResources, option
         "time": options.time,
         "signal": f"B:USR1@{options.grace_seconds}",
         "open-mode": "append",
-        "output": str(folder / "%a.out"),
+        "output": slurm_file_pattern(folder, "%a.out"),
     }
-    lines = [f"#SBATCH --{name}={value}" for name, value in directives.items() if value]
-    lines += ["#SBATCH --requeue", *(f"#SBATCH {word}" for word in options.sbatch_args)]
-    job = shlex.join([sys.executable, "-m", "vdgs.distributed.slurm_job", str(folder)])
+    words = [f"--{name}={value}" for name, value in directives.items() if value]
+    lines = [sbatch_directive(word) for word in (*words, "--requeue", *options.sbatch_args)]
+    job = shell_line([sys.executable, "-m", "vdgs.distributed.slurm_job", str(folder)])
     setup = [options.setup_command] if options.setup_command else []
     return "\n".join(["#!/bin/bash", *lines, "", *setup, f"exec {job}", ""])
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import shlex
 import signal
 import subprocess
 import threading
@@ -14,6 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from vdgs.distributed.executor import PARENT_PID_VARIABLE
+from vdgs.system.quoting import shell_line
 
 #: Bytes of output that are read, and lines that are shown.
 TAIL_BYTES, TAIL_LINES = 1 << 16, 12
@@ -75,7 +75,7 @@ class TaskProcess:
     def __init__(self, command: Sequence[str], output: Path, environment: Mapping[str, str], attempt: int):
         """Start the command. Raises OSError if its output cannot be written or there is no such command."""
         output.parent.mkdir(parents=True, exist_ok=True)
-        heading = f"--- {time.strftime('%Y-%m-%d %H:%M:%S')} attempt {attempt}: {shlex.join(command)}"
+        heading = f"--- {time.strftime('%Y-%m-%d %H:%M:%S')} attempt {attempt}: {shell_line(command)}"
         variables = {"PYTHONUNBUFFERED": "1", **environment, PARENT_PID_VARIABLE: str(os.getpid())}
         with output.open("ab") as file:
             file.write(f"{heading}\n".encode())

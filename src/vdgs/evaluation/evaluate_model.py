@@ -40,6 +40,7 @@ from vdgs.evaluation.view_metrics import (
     measure_view,
 )
 from vdgs.system.atomic_files import to_jsonable, write_json
+from vdgs.system.console import print_once
 from vdgs.system.documents import EvaluationMetrics, JsonObject
 from vdgs.system.stop_signals import check_stop_requested
 
@@ -122,6 +123,8 @@ def summarize_views(
     _write(output, result, gathered, settings.title)
     if console is not None:
         console.print(make_metrics_table(result, f"{len(gathered.rows)} {settings.title}"))
+        for note in result["notes"]:
+            print_once(console, note, "yellow")
     return result
 
 

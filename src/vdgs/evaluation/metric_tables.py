@@ -53,7 +53,6 @@ def make_metrics_table(result: Mapping[str, Any], title: str) -> RenderableType:
     if result["max_oversized_splats"]:
         parts.append(Text(_splats_line(result)))
     parts.append(Text(_model_line(result), style="dim"))
-    parts += [Text(note, style="yellow") for note in result["notes"]]
     return Group(*parts)
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Int
 from rich.console import Console
 
 from vdgs.captures.camera_height import default_view
-from vdgs.captures.output_guard import check_not_among_inputs, check_not_in_capture
+from vdgs.captures.output_guard import check_not_among_inputs, check_output
 from vdgs.config.commands import ExportRequest
 from vdgs.distributed.sharded_job import ExecutionOptions
 from vdgs.errors import VdgsError
@@ -29,7 +29,7 @@ from vdgs.export.formats.gaussian_store import GaussianStore
 from vdgs.export.formats.tiles_3d import TILESET_FILE, tileset_files
 from vdgs.export.gaussian_optimization import optimize_gaussians
 from vdgs.export.gaussian_selection import frame_for_file, local_bounds, select_gaussians, select_rows
-from vdgs.export.local_bake import BAKING, LocalBake, make_progress_bar
+from vdgs.export.local_bake import BAKING, LocalBake
 from vdgs.export.local_frame import LocalFrame
 from vdgs.export.novel_cameras import color_iteration_count, endless_cameras
 from vdgs.export.programs import axes_for, with_files
@@ -38,6 +38,7 @@ from vdgs.model.gaussians import Gaussians
 from vdgs.runs.open_run import OpenedRun
 from vdgs.runs.run_folder import REPORT_FILE
 from vdgs.system.atomic_files import to_jsonable, write_json
+from vdgs.system.console import make_progress_bar
 from vdgs.system.documents import ExportDocument, ExportedFile, JsonObject
 from vdgs.system.scratch import remove_leftovers
 from vdgs.system.stop_signals import check_stop_requested
@@ -195,7 +196,7 @@ def _check_names(asked: ExportRequest) -> None:
         raise VdgsError("Nothing to write: give --output FILE, such as --output scene.ply, or --for PROGRAM.")
     for path in paths:
         axes_for(path, asked)
-        check_not_in_capture(path)
+        check_output(path)
         if path.name.lower() == REPORT_FILE and os.path.realpath(path.parent) == os.path.realpath(run):
             raise VdgsError(
                 f"--output {path}: is the report of the run, which would be overwritten, and written again over the "

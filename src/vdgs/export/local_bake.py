@@ -19,16 +19,12 @@ from vdgs.export.formats.gaussian_store import GaussianStore, write_store
 from vdgs.export.novel_cameras import color_iteration_cameras, color_iteration_count
 from vdgs.runs.open_run import OpenedRun
 from vdgs.system.atomic_files import explain_disk_errors
+from vdgs.system.console import make_progress_bar
 from vdgs.system.scratch import scratch_folder
 from vdgs.system.stop_signals import check_stop_requested
 
 #: What scratch folders of the Gaussians are named after.
 BAKING = "baking"
-
-
-def make_progress_bar(console: Console) -> Progress:
-    """A bar that shows how far work is, to be used as a context."""
-    return Progress(console=console, disable=not console.is_terminal, transient=True)
 
 
 class LocalBake:

@@ -42,6 +42,7 @@ from vdgs.system.memory.memory_estimate import (
     max_image_pixels,
 )
 from vdgs.system.memory.process_memory import available_memory_bytes
+from vdgs.system.quoting import shell_word
 from vdgs.system.stop_signals import check_stop_requested
 from vdgs.system.units import data_size, rough_duration
 from vdgs.training import TrainingProblem, TrainingState, train
@@ -105,7 +106,7 @@ def _estimate_reconstruction(run_request: RunRequest, console: Console) -> RunEs
         with_capture = replace(run_request, capture=request.output, extra_image_folders=(), options=options)
         return estimate_run(with_capture, console)
     print_plan(plan_reconstruction(request), console)
-    folders = " ".join(map(str, (run_request.capture, *run_request.extra_image_folders)))
+    folders = " ".join(map(shell_word, (run_request.capture, *run_request.extra_image_folders)))
     console.print(
         f"Training can be estimated once they are a capture: vdgs sfm {folders} --output CAPTURE, then the same "
         "with CAPTURE. Nothing was written.",

@@ -17,6 +17,7 @@ from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_status import get_run_status
 from vdgs.runs.stage_folder import StatusRecord
 from vdgs.system.memory.process_memory import peak_memory_bytes, reset_peak_memory
+from vdgs.system.quoting import shell_word
 from vdgs.system.tensors import file_id
 
 
@@ -79,6 +80,6 @@ def _missing_blocks_text(run: RunFolder, done: list[bool]) -> str:
     return (
         f"{run.path}: not all blocks are trained:\n  "
         + "\n  ".join(lines)
-        + f"\nTrain them with `vdgs train-blocks {run.path}`, or give --allow-missing-blocks to let the coarse model "
-        "stand in for them."
+        + f"\nTrain them with: vdgs train-blocks {shell_word(run.path)}\nor give --allow-missing-blocks to let the "
+        "coarse model stand in for them."
     )

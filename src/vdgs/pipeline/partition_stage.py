@@ -18,7 +18,6 @@ import numpy as np
 from jaxtyping import Float, Int
 from rich import box
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
 from vdgs.captures.capture import Capture
@@ -50,6 +49,7 @@ from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.visibility_store import load_or_count_visibility
 from vdgs.system.atomic_files import read_json, write_json
+from vdgs.system.console import make_progress_bar
 from vdgs.system.file_locks import lock_folder
 from vdgs.system.memory.memory_estimate import max_image_pixels, render_bytes
 from vdgs.system.memory.process_memory import peak_memory_bytes, reset_peak_memory
@@ -191,8 +191,8 @@ def _assignment(method: MethodConfig) -> AssignmentConfig:
 
 
 def _score(scene: _Scene, blocks: Blocks, config: AssignmentConfig, console: Console) -> ScoreMatrix:
-    with Progress(console=console, disable=not console.is_terminal, transient=True) as bar:
-        task = bar.add_task("assigning cameras")
+    with make_progress_bar(console) as bar:
+        task = bar.add_task("assigning cameras", total=None)
 
         def on_progress(done: int, total: int) -> None:
             check_stop_requested()

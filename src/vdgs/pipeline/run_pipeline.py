@@ -8,6 +8,7 @@ from typing import Literal, cast
 from rich.console import Console
 from rich.markup import escape
 
+from vdgs.captures.output_guard import check_output
 from vdgs.config.commands import OrthoRequest, RunRequest
 from vdgs.config.ranges import check_ranges
 from vdgs.config.validation_rules import check_config
@@ -44,6 +45,7 @@ def run_pipeline(request: RunRequest, console: Console, command: str | None = No
     check_backend_reachable(request.executor_options)
     check_ranges(request)
     check_weights_file(request.lpips_weights)
+    check_output(request.output)
     request = reconstruct_if_needed(request, console)
     with exclusive_run(
         request.capture, request.output, request.options, request.method(), overwrite=request.overwrite, command=command

@@ -9,10 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt8
 from rich.console import Console
-from rich.progress import track
 
 from vdgs.captures.capture_metadata import check_same_capture
-from vdgs.captures.output_guard import check_not_among_folders, check_not_in_capture
+from vdgs.captures.output_guard import check_not_among_folders, check_output
 from vdgs.config.commands import MAX_RENDER_SIDE_PX, RENDER_BYTES_PER_PIXEL, RenderRequest
 from vdgs.config.ranges import check_ranges
 from vdgs.errors import VdgsError
@@ -29,6 +28,7 @@ from vdgs.runs.open_run import OpenedModel, open_capture, open_model
 from vdgs.runs.run_cameras import RunCameras, load_run_cameras, run_cameras_of_capture
 from vdgs.runs.run_folder import RunFolder
 from vdgs.system.atomic_files import write_array
+from vdgs.system.console import track
 from vdgs.system.memory.process_memory import available_memory_bytes
 from vdgs.system.stop_signals import check_stop_requested
 from vdgs.system.units import data_size
@@ -57,8 +57,7 @@ class _Render:
 
     def frames(self, scalar_map: ScalarMap | None) -> Iterator[_Frame]:
         """One frame per camera, in order."""
-        no_bar = not self.console.is_terminal
-        for name, camera in track(self.named, "rendering", console=self.console, disable=no_bar):
+        for name, camera in track(self.named, "rendering", len(self.named), self.console):
             check_stop_requested()
             if scalar_map is None:
                 yield name, to_8bit(render(self.run.model, camera).image.cpu().numpy()), None
@@ -76,7 +75,7 @@ def render_run(request: RenderRequest, console: Console) -> None:
     """
     began = time.monotonic()
     _check(request)
-    check_not_in_capture(request.output)
+    check_output(request.output)
     run = open_model(RunFolder(request.run), request.model, request.device)
     run_cameras = _load_cameras(request, run)
     check_not_among_folders(request.output, run_cameras.root, run_cameras.input_folders)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections import Counter
 from dataclasses import replace
 
@@ -14,6 +13,8 @@ from vdgs.runs.run_folder import REPORT_FILE, RunFolder
 from vdgs.runs.run_status import RunStatus, StageStatus, get_run_status
 from vdgs.runs.stage_folder import StatusRecord
 from vdgs.system.documents import RunStatusDocument, StageStatusDocument
+from vdgs.system.quoting import shell_word
+from vdgs.system.units import rough_duration
 
 #: Exit code of `vdgs status` for a run that is not whole: something of it is missing, runs, failed or is out of date.
 EXIT_INCOMPLETE = 3
@@ -59,8 +60,9 @@ def next_step(status: RunStatus) -> str:
         return command
     if status.is_running:
         return "nothing to type: it is at work"
-    run = shlex.quote(str(status.path))
-    return f"open {status.path / REPORT_FILE}, or film it: vdgs render {run} --views flyover --output flyover.mp4"
+    run = shell_word(status.path)
+    report = shell_word(status.path / REPORT_FILE)
+    return f"open {report}, or film it: vdgs render {run} --views flyover --output flyover.mp4"
 
 
 def progress_text(status: StatusRecord | None) -> str:
@@ -77,7 +79,7 @@ def progress_text(status: StatusRecord | None) -> str:
     if status.psnr_training is not None:
         parts.append(f"{status.psnr_training:.2f} dB while training")
     if status.state == "running" and status.seconds_left is not None:
-        parts.append(f"about {status.seconds_left:,} s left")
+        parts.append(f"about {rough_duration(status.seconds_left)} left")
     elif status.seconds is not None:
         parts.append(f"{status.seconds:,.0f} s")
     return ", ".join(parts)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import yaml
 
+from vdgs.captures.output_guard import check_output
 from vdgs.errors import RunError
 from vdgs.report.html_page import Html, document, escape_html, join_html, paragraph, table_of_contents
 from vdgs.report.result_sections import (
@@ -55,10 +56,11 @@ def write_report(run: RunFolder) -> Path:
     """Write RUN/report.html and return its path: one file that needs no other, of whatever is there so far.
 
     What is missing or damaged is left out, and a sentence says so. Raises RunError if there is no such folder,
-    VdgsError if the file cannot be written.
+    VdgsError if the file cannot be written, or the folder is one of photographs.
     """
     if not run.path.is_dir():
         raise RunError(f"{run.path}: is not a run folder. Train first: vdgs run CAPTURE --output RUN")
+    check_output(run.path / REPORT_FILE)
     report = ReportedRun(run, get_run_status(run))
     sections = [(make_section(report), name, title) for make_section, name, title in SECTIONS]
     links = [(name, title) for content, name, title in sections if content]

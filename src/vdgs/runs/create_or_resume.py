@@ -11,7 +11,7 @@ from typing import Any
 from vdgs.captures.capture import Capture
 from vdgs.captures.capture_metadata import check_same_capture
 from vdgs.captures.loading import load_capture
-from vdgs.captures.output_guard import check_not_among_inputs, check_not_in_capture
+from vdgs.captures.output_guard import check_not_among_inputs, check_output
 from vdgs.captures.reconstruction import RECONSTRUCTION_FIGURE as RECONSTRUCTION_FIGURE
 from vdgs.captures.reconstruction import RECONSTRUCTION_FILE as RECONSTRUCTION
 from vdgs.captures.validation import require_valid
@@ -57,7 +57,7 @@ def exclusive_run(
     """As `create_or_resume_run`, with the lock of a driver (`RunFolder.drive_lock`) from before anything is written or
     removed to the end of the `with`."""
     check_config(method)
-    check_not_in_capture(output)
+    check_output(output)
     # Absolute paths, as config.yaml holds them: stages hand the capture on, also to other machines.
     capture_path, capture_options = capture_path.resolve(), _with_absolute_paths(capture_options)
     capture = load_capture(capture_path, capture_options)

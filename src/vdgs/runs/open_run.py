@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_status import get_run_status
 from vdgs.runs.stage_folder import StageFolder, StatusRecord
 from vdgs.system.atomic_files import read_json
+from vdgs.system.quoting import shell_word
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,9 +145,7 @@ def _warning(folder: RunFolder, name: str) -> str:
         return merged.reason
     remedy = f"Next: {command}" if (command := run_status.next_command()) else "A process works on the run."
     if name == "merged":
-        return (
-            f"the merged model is out of date: {merged.reason}. Merge again: vdgs merge {shlex.quote(str(folder.path))}"
-        )
+        return f"the merged model is out of date: {merged.reason}. Merge again: vdgs merge {shell_word(folder.path)}"
     state = f"there is one that was {merged.reason}" if merged.state == "stale" else "there is none yet"
     return f"this is the coarse model, not the merged one: {state}. {remedy}"
 
@@ -182,7 +180,8 @@ def load_run_blocks(run: RunFolder) -> Blocks:
     record, keys = run.partition_record(), run.keys()
     if (record.key, record.assignment_key) != (keys.partition, keys.assignment):
         raise RunError(
-            f"{run.path}: is not cut into blocks yet, or with other settings. Run: vdgs partition {run.path}"
+            f"{run.path}: is not cut into blocks yet, or with other settings. Run: "
+            f"vdgs partition {shell_word(run.path)}"
         )
     return load_blocks(run.partition / "blocks.geojson")
 
@@ -197,5 +196,5 @@ def all_block_view_indices(run: RunFolder, capture: Capture) -> list[list[int]]:
     file = run.partition / "scores.npz"
     _, _, assignment = load_scores(file)
     if len(assignment.cameras) != len(capture.train_views):
-        raise RunError(f"{file}: is of another capture. Run: vdgs partition {run.path}")
+        raise RunError(f"{file}: is of another capture. Run: vdgs partition {shell_word(run.path)}")
     return [np.flatnonzero(of_block).tolist() for of_block in assignment.cameras.T]

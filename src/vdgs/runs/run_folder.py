@@ -18,6 +18,7 @@ from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.stage_keys import StageKeys, stage_keys
 from vdgs.system.atomic_files import read_json
 from vdgs.system.file_locks import is_known_locked, lock_folder
+from vdgs.system.quoting import shell_line, shell_word
 from vdgs.system.records import record_from_dict
 
 #: The page about a run, in its folder (`vdgs report`).
@@ -77,7 +78,9 @@ class RunFolder:
         try:
             return record_from_dict(PartitionRecord, read_json(file)) if file.exists() else PartitionRecord()
         except (VdgsError, ValueError) as error:
-            raise RunError(f"{file}: is damaged. Cut the scene again: vdgs partition {self.path}") from error
+            raise RunError(
+                f"{file}: is damaged. Cut the scene again: vdgs partition {shell_word(self.path)}"
+            ) from error
 
     @property
     def merged(self) -> StageFolder:
@@ -157,7 +160,7 @@ class RunFolder:
         if before == now:
             return
         words = shlex.split(command) if command else []
-        moved = shlex.join([now if word == before else word for word in words]) if before in words else None
+        moved = shell_line(now if word == before else word for word in words) if before in words else None
         self.config.write(replace(settings, capture_path=now), moved)
 
     def settings(self) -> RunSettings:

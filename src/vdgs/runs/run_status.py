@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +21,7 @@ from vdgs.runs.stage_folder import StageFolder, StatusRecord
 from vdgs.runs.stage_keys import StageKeys, stage_keys
 from vdgs.system.atomic_files import read_json_or_empty
 from vdgs.system.file_locks import is_known_locked
+from vdgs.system.quoting import shell_word
 
 #: `stale`: made with other settings, for another cut or from another model than the run has now. `unknown`: something
 #: is there, and no record says with which settings it was made.
@@ -96,7 +96,7 @@ class RunStatus:
             return ""
         for stage in self.stages:
             if stage.state == "unknown":
-                return f"mend {shlex.quote(str(self.path / 'config.yaml'))}"
+                return f"mend {shell_word(self.path / 'config.yaml')}"
             if stage.state != "done":
                 if self._continues and not stage.hint:
                     return self.command or ""
@@ -110,7 +110,7 @@ class RunStatus:
         return (self.command or "").startswith("vdgs run ") and not reasons & {OTHER_SETTINGS, OTHER_PARTITION}
 
     def _command_for(self, stage: str) -> str:
-        run = shlex.quote(str(self.path))
+        run = shell_word(self.path)
         if stage == "coarse":
             return self.command or f"the `vdgs run` or `vdgs train-coarse` command that began {run}"
         verbs = {

@@ -7,14 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from vdgs.captures.image_files import IMAGE_SUFFIXES
+from vdgs.captures.image_files import IMAGE_SUFFIXES, RAW_SUFFIXES, UNREAD_IMAGE_SUFFIXES
 from vdgs.captures.name_resolution import to_colmap_name
 from vdgs.captures.strays import is_result, previewed_stem, walk
 from vdgs.errors import CaptureError
 
-#: Photographs that are not read, and what to do with them.
-_APPLE = {".heic", ".heif", ".hif", ".avif", ".jxl"}
-_RAW = {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw", ".raw", ".gpr", ".3fr", ".iiq"}
 #: Files beside a photograph that are no news.
 _SILENT = {".ds_store", "thumbs.db", "desktop.ini"}
 
@@ -89,7 +86,7 @@ def _count_other(found: Found, path: Path, stems: set[str]) -> None:
     if path.name.startswith("._") or path.name.lower() in _SILENT:
         return
     found.others += path.is_file()
-    if suffix in _APPLE | _RAW and path.stem.lower() not in stems:
+    if suffix in UNREAD_IMAGE_SUFFIXES and path.stem.lower() not in stems:
         found.unread[suffix] += 1
 
 
@@ -113,7 +110,7 @@ def _count(number: int, suffix: str) -> str:
 
 
 def _remedy(suffix: str) -> str:
-    if suffix in _RAW:
+    if suffix in RAW_SUFFIXES:
         return "develop them to JPEG or TIFF first, with their tags"
     return "convert them to JPEG, with their tags (phones and macOS export them so)"
 

@@ -21,6 +21,7 @@ from vdgs.sfm.cross_checks import cross_checked, strays
 from vdgs.sfm.find_images import find_files, is_photograph, nothing_found
 from vdgs.sfm.image_metadata import ImageMetadata, UnusableImage, read_image_metadata
 from vdgs.sfm.mask_files import check_mask, find_masks
+from vdgs.system.quoting import shell_word
 
 #: Fewer photographs are no scene.
 MIN_IMAGES = 3
@@ -60,10 +61,12 @@ def collect_images(folders: Sequence[Path]) -> ImageList:
             raise CaptureError(f"{folder}: no such folder. Give the folder that the photographs are in.")
         if is_reconstruction(folder) and not is_capture(folder):
             raise CaptureError(
-                f"{folder}: is a capture that is not finished. Give its photographs and --output {folder}"
+                f"{folder}: is a capture that is not finished. Give its photographs and --output {shell_word(folder)}"
             )
         if is_capture(folder):
-            raise CaptureError(f"{folder}: is a capture already. Use it as it is: vdgs run {folder} --output RUN")
+            raise CaptureError(
+                f"{folder}: is a capture already. Use it as it is: vdgs run {shell_word(folder)} --output RUN"
+            )
         below = model_below(folder)
         if below:
             raise CaptureError(

@@ -70,7 +70,7 @@ def make_preflight_report(collection: ImageList, positions: GpsPriors) -> Prefli
     footprint = _footprint(photographs, height)
     spread = np.ptp(positions.enu[:, :2], axis=0) if len(positions) else None
     tilts = [photo.attitude.tilt_deg for photo in photographs if photo.attitude]
-    days = sorted({photo.datetime[:10] for photo in photographs if photo.datetime})
+    days = sorted({f"{when:%Y-%m-%d}" for when in (_time(photo.datetime) for photo in photographs) if when is not None})
     overlap, views = _overlap(photographs, positions, footprint), _views_per_place(positions, footprint)
     focal = _median(photo.lens.focal * max(photo.width, photo.height) for photo in photographs if photo.lens)
     return PreflightReport(

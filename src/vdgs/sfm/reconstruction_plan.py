@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from vdgs.captures.output_guard import check_not_in_capture
+from vdgs.captures.output_guard import check_output
 from vdgs.config.ranges import check_ranges
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import VdgsError
@@ -114,7 +114,7 @@ def _gcp_plan_lines(control: GcpList | None) -> list[str]:
 
 def check_output_outside_images(output: Path, collection: ImageList) -> None:
     """Raise VdgsError where the output would lie among the photographs, or in a capture."""
-    check_not_in_capture(output)
+    check_output(output)
     real = output.resolve()
     for folder in collection.folders:
         if real == folder.resolve() or folder.resolve() in real.parents:

@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from vdgs.captures.reconstruction import STEPS_FILE
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.system.atomic_files import is_disk_full, read_json_or_empty, write_json
 from vdgs.system.colmap import pycolmap
+from vdgs.system.console import make_progress_bar
 from vdgs.system.stop_signals import check_stop_requested
 from vdgs.system.units import rough_duration
 
@@ -168,11 +168,7 @@ def report_progress(console: Console, title: str, total: int) -> Iterator[Callab
         console.print(f"{title}: {total}", highlight=False)
         yield _ProgressLines(title, total, console)
         return
-    columns = (
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"),
-        TimeRemainingColumn(),
-    )  # fmt: skip
-    with Progress(*columns, console=console) as bar:
+    with make_progress_bar(console, counts=True, transient=False) as bar:
         task = bar.add_task(title, total=total)
         yield lambda done: bar.update(task, completed=done)
 

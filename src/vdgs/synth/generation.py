@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from vdgs import __version__
-from vdgs.captures.output_guard import check_not_in_capture
+from vdgs.captures.output_guard import check_output
 from vdgs.captures.splits import TEST_LIST, VALIDATION_LIST
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
@@ -28,6 +27,7 @@ from vdgs.synth.synthetic_points import SeedPoints, SparseCloud, make_sparse_clo
 from vdgs.synth.town import Town, build_town
 from vdgs.synth.true_visibility import FlightStats, compute_flight_stats, sample_visible_points
 from vdgs.system.atomic_files import explain_disk_errors, write_text
+from vdgs.system.scratch import remove_leftovers, scratch_folder
 
 ProgressCallback = Callable[[str, int, int], None]
 
@@ -67,21 +67,18 @@ class _ViewPlan:
 def generate(output: Path, options: SynthOptions, on_progress: ProgressCallback) -> FlightStats:
     """See `vdgs.synth.generate`."""
     resolved = options.resolved()
-    check_not_in_capture(output)
+    check_output(output)
     require_embree()
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise VdgsError(f"{output} already exists and is not empty: name another folder, or remove it first.")
-    partial = output.with_name(f".{output.name}.partial-{os.getpid()}")
-    try:
-        with explain_disk_errors(output):
-            partial.mkdir(parents=True)
-            stats = _write_capture(partial, resolved, on_progress)
-            if output.exists():
-                output.rmdir()
-            partial.rename(output)
-    except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
+    remove_leftovers(output)
+    with explain_disk_errors(output), scratch_folder(output) as scratch:
+        partial = scratch / "capture"
+        partial.mkdir()
+        stats = _write_capture(partial, resolved, on_progress)
+        if output.exists():
+            output.rmdir()
+        partial.rename(output)
     return stats
 
 

@@ -18,6 +18,7 @@ from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_status import get_run_status
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.system.checkpoints import sidecars
+from vdgs.system.quoting import shell_word
 from vdgs.training.session.trainer import model_from_checkpoint
 
 #: What a model is called that no stage has finished yet.
@@ -78,7 +79,7 @@ def _coarse_from_checkpoint(run: RunFolder, device: str) -> OpenedRun:
     if saved is None:
         raise RunError(
             f"{run.path}: has no model and no checkpoint yet. Wait for the first one, or look how far it is: "
-            f"vdgs status {run.path}"
+            f"vdgs status {shell_word(run.path)}"
         )
     capture = open_capture(run)
     colors = capture.point_colors.mean(axis=0) / 255 if len(capture.points) else np.zeros(3)

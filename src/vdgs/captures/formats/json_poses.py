@@ -94,7 +94,7 @@ def parse_intrinsics(frame: JsonObject, common: JsonObject, image: Path, file: P
     if fx is None or fy is None:
         raise CaptureError(f"{file}: no focal length for {image.name} (fl_x or camera_angle_x).")
     head = (fx, fy, get("cx", width / 2) or 0.0, get("cy", height / 2) or 0.0)
-    model, tail = _lens(_camera_model(values, file), {k: get(k, 0.0) or 0.0 for k in _LENS}, file)
+    model, tail = _lens(_camera_model(values, file), _distortion(values, file), file)
     if not (0 < width < 1e6 and 0 < height < 1e6):
         raise CaptureError(f"{file}: {image.name} has an image size of {width}x{height}. Mend w and h.")
     return check_intrinsics(Intrinsics(model, (*head, *tail), int(width), int(height)), file, image.name)
@@ -104,8 +104,24 @@ _LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
 #: Camera models that bend by radial and tangential polynomials, if at all, and fisheyes that k1...k4 describe.
 _PERSPECTIVE = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL"}
 _FISHEYE = {"OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE"}
+#: Parameters of lenses and shutters that other programs write beside those; zero means none.
+_OTHER_PARAMETERS = ("k5", "k6", "s1", "s2", "s3", "s4", "b1", "b2", "skew", "rolling_shutter")
 #: Keys by which instant-ngp names lenses that are no camera model here.
 _OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular")
+
+
+def _distortion(values: JsonObject, file: Path) -> dict[str, float]:
+    """k1 ... p2, zero where absent, from keys of their own or as nerfstudio's list `distortion_params`."""
+    for key in _OTHER_PARAMETERS:
+        value = values.get(key)
+        if any(each not in (None, 0) for each in (value if isinstance(value, list) else [value])):
+            raise CaptureError(f"{file}: the lens parameter {key} is not supported; undistort the images first.")
+    given = values.get("distortion_params")
+    if given is None:
+        return {key: parse_number(values, key, file) or 0.0 for key in _LENS}
+    if not isinstance(given, list) or len(given) != len(_LENS):
+        raise CaptureError(f"{file}: distortion_params must be a list of {', '.join(_LENS)}. Export the file again.")
+    return {key: parse_number({key: value}, key, file) or 0.0 for key, value in zip(_LENS, given, strict=True)}
 
 
 def _focal(side: float, angle: float | None) -> float | None:

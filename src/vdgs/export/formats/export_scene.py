@@ -7,7 +7,6 @@ own cameras.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -163,8 +162,3 @@ def metadata_path(path: Path) -> Path:
 def write_metadata_file(path: Path, metadata: ExportMetadata, axes: Axes) -> None:
     """Write the facts beside a file, with what its axes mean."""
     write_json(metadata_path(path), {"file": path.name, **metadata.to_dict(), "axes": axes.description})
-
-
-def ascii_line(text: str) -> str:
-    """Text as one line of a header, in ASCII."""
-    return json.dumps(" ".join(text.split()))[1:-1]

@@ -17,10 +17,11 @@ import torch
 
 from vdgs.errors import VdgsError
 from vdgs.export.formats.axes import Z_UP, Axes, axes_named
-from vdgs.export.formats.export_scene import CHUNK_SIZE, ExportMetadata, ExportScene, ascii_line, concatenate
+from vdgs.export.formats.export_scene import CHUNK_SIZE, ExportMetadata, ExportScene, concatenate
 from vdgs.kernels.spherical_harmonics import MAX_SH_DEGREE, num_sh_bases
 from vdgs.model.gaussians import Gaussians
 from vdgs.system.atomic_files import write_atomic, write_text
+from vdgs.system.quoting import header_line
 
 MAX_HEADER_BYTES = 1 << 16
 #: Characters of a fact in a comment.
@@ -46,7 +47,7 @@ def header_comments(metadata: ExportMetadata, axes: Axes) -> list[str]:
     known = {**metadata.to_dict(), "axes": axes.description}
     if metadata.crs is not None:
         known["crs"] = short_name(metadata.crs)
-    return [f"comment {name} {ascii_line(value if isinstance(value, str) else json.dumps(value))[:LONGEST_COMMENT]}"
+    return [f"comment {name} {header_line(value if isinstance(value, str) else json.dumps(value))[:LONGEST_COMMENT]}"
             for name, value in known.items()]  # fmt: skip
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from vdgs.errors import VdgsError
 from vdgs.geometry.map_projection import MapProjection
 from vdgs.rendering.ortho.pixel_grid import TILE_PX, PixelGrid
+from vdgs.system.quoting import wkt_string
 
 #: What GDAL may keep of files in memory: in bytes, as rasterio takes it; GDAL itself would take 128 for megabytes.
 GDAL_CACHE_BYTES = 128 << 20
@@ -63,13 +64,19 @@ def limit_gdal_cache() -> Iterator[None]:
 
 
 def rasterio_crs(placement: MapProjection) -> Any:
-    """The system as rasterio knows it: that of the catalogue, or a local one with name and unit."""
+    """The system as rasterio knows it: that of the catalogue, or a local one with name and unit.
+
+    None where nobody knows the unit: GDAL writes metres for a local system whose unit has no size. The tags say then
+    what the coordinates are (`crs_name`).
+    """
     crs = require_rasterio().crs.CRS
     if placement.wkt is not None:
         return crs.from_user_input(placement.crs)
-    unit = f'"metre",{placement.meters_per_unit:g}' if placement.unit == "m" else '"unit of unknown size",1'
-    name = placement.name.replace('"', "'")
-    return crs.from_wkt(f'LOCAL_CS["{name}",UNIT[{unit}],AXIS["x",EAST],AXIS["y",NORTH]]')
+    if placement.meters_per_unit is None:
+        return None
+    unit = wkt_string("metre" if placement.meters_per_unit == 1 else placement.unit)
+    local = f"LOCAL_CS[{wkt_string(placement.name)},UNIT[{unit},{placement.meters_per_unit!r}]"
+    return crs.from_wkt(f'{local},AXIS["x",EAST],AXIS["y",NORTH]]')
 
 
 @contextmanager

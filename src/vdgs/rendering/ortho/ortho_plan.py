@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from rich.console import Console
+
 from vdgs.captures.capture import Capture
-from vdgs.captures.output_guard import check_not_among_inputs, check_not_in_capture
+from vdgs.captures.output_guard import check_not_among_inputs, check_output
 from vdgs.config.commands import OrthoRequest
 from vdgs.errors import VdgsError
 from vdgs.geometry.map_projection import MapProjection
@@ -21,10 +22,13 @@ from vdgs.rendering.ortho.nadir_camera import NadirCamera
 from vdgs.rendering.ortho.pixel_grid import PixelGrid
 from vdgs.rendering.ortho.tile_renderer import TileRenderer, samples_per_side
 from vdgs.system.atomic_files import read_json_or_empty, reason_of, write_json
+from vdgs.system.scratch import remove_leftovers, scratch_folder
 
 ORTHOPHOTO_FILE, DSM_FILE, VISIBILITY_FILE = "orthophoto.tif", "dsm.tif", "visibility.tif"
 HILLSHADE_FILE, PREVIEW_FILE, METADATA_FILE = "hillshade.png", "preview.png", "map.json"
 FILE_NAMES = (ORTHOPHOTO_FILE, DSM_FILE, VISIBILITY_FILE, HILLSHADE_FILE, PREVIEW_FILE, METADATA_FILE)
+#: The folder in a folder of maps where new ones are drawn, by the name that `scratch_folder` takes.
+STAGING = "maps"
 
 
 def output_folder(request: OrthoRequest, run: Path) -> Path:
@@ -83,6 +87,13 @@ class OrthoPlan:
                 details.close()
 
 
+def remove_killed(folder: Path, console: Console) -> None:
+    """Remove what a killed `vdgs ortho` left in a folder of maps."""
+    if found := remove_leftovers(folder / STAGING):
+        said = f"[yellow]note[/] removed what a killed command had left: {', '.join(map(str, found))}"
+        console.print(said, highlight=False)
+
+
 def software_name() -> str:
     """What map.json calls the program that drew the files beside it."""
     from vdgs import __version__
@@ -92,7 +103,7 @@ def software_name() -> str:
 
 def check_output_folder(folder: Path) -> None:
     """Raise VdgsError where maps may not go: among inputs of a capture, or where files of their names are not ours."""
-    check_not_in_capture(folder)
+    check_output(folder)
     if folder.exists() and not folder.is_dir():
         raise VdgsError(f"{folder}: is a file. Give a folder for the maps.")
     present = [name for name in FILE_NAMES if os.path.lexists(folder / name)]
@@ -112,20 +123,22 @@ def staging_folder(folder: Path) -> Iterator[Path]:
     map.json comes last: while files take their places it says only whose they are. Raises VdgsError, with the remedy,
     where the disk refuses.
     """
-    staging = folder / f".maps-{os.getpid()}"
     try:
-        staging.mkdir(parents=True, exist_ok=True)
-        yield staging
-        write_json(folder / METADATA_FILE, {"software": software_name(), "finished": False})
-        for file in sorted(staging.iterdir(), key=lambda file: (file.name == METADATA_FILE, file.name)):
-            os.replace(file, folder / file.name)
-    except OSError as error:  # rasterio's errors are such too
-        why = reason_of(error, staging)  # GDAL's own words mislead
+        with scratch_folder(folder / STAGING) as scratch:
+            staging = scratch / "maps"
+            staging.mkdir()
+            try:
+                yield staging
+                write_json(folder / METADATA_FILE, {"software": software_name(), "finished": False})
+                for file in sorted(staging.iterdir(), key=lambda file: (file.name == METADATA_FILE, file.name)):
+                    os.replace(file, folder / file.name)
+            except OSError as error:  # rasterio's errors are such too, and GDAL's own words mislead
+                raise reason_of(error, staging) from error
+    except OSError as error:
         raise VdgsError(
-            f"{folder}: the maps cannot be written ({getattr(why, 'strerror', None) or why}). Free some space or give "
-            "another --output; maps that were there are kept."
+            f"{folder}: the maps cannot be written ({error.strerror or error}). Free some space or give another "
+            "--output; maps that were there are kept."
         ) from error
     finally:
-        shutil.rmtree(staging, ignore_errors=True)
         if folder.is_dir() and not any(folder.iterdir()):
             folder.rmdir()

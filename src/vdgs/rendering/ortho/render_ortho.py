@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from rich.progress import track
 
 from vdgs.config.commands import OrthoRequest
 from vdgs.distributed.job_folders import clear
@@ -29,6 +28,7 @@ from vdgs.runs.open_run import locate_model
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
 from vdgs.system.atomic_files import read_json_or_empty, to_jsonable, write_json
+from vdgs.system.console import track
 from vdgs.system.documents import MapMetadata
 from vdgs.system.stop_signals import check_stop_requested
 from vdgs.system.units import data_size
@@ -48,7 +48,8 @@ def render_ortho(
     what `ShardedJob.send` raises.
     """
     geotiff.require_rasterio()
-    ortho_plan.check_output_folder(ortho_plan.output_folder(request, request.run))
+    ortho_plan.check_output_folder(output := ortho_plan.output_folder(request, request.run))
+    ortho_plan.remove_killed(output, console)
     began = time.monotonic()
     if execution is not None and execution.is_distributed:
         share, folder = _render_sharded(context, request, execution, console)
@@ -184,8 +185,8 @@ def _draw(
             )
             for layer in layers
         ]
-        placed, no_bar = zip(grid.tiles(), tiles, strict=True), not console.is_terminal
-        for (column, row, _), tile in track(placed, "drawing", grid.tile_count(), console=console, disable=no_bar):
+        placed = zip(grid.tiles(), tiles, strict=True)
+        for (column, row, _), tile in track(placed, "drawing", grid.tile_count(), console):
             check_stop_requested()
             shown = tile.alpha > 0
             if shown.any():

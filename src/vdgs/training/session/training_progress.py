@@ -10,11 +10,11 @@ from typing import Any, TextIO
 
 import psutil
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from vdgs.config.method import TrainConfig
 from vdgs.runs.stage_folder import StageFolder, StatusRecord
 from vdgs.system.atomic_files import explain_disk_errors
+from vdgs.system.console import make_progress_bar
 from vdgs.system.units import clock
 from vdgs.training import StepReport, TrainingState, downscale_at
 
@@ -37,10 +37,7 @@ class TrainingProgress:
         self._recent: deque[tuple[float, int]] = deque([(time.monotonic(), start)], maxlen=200)
         self._last_line = time.monotonic()
         self._process = psutil.Process()
-        self._bar = Progress(
-            TextColumn("{task.description}"), BarColumn(bar_width=None), TextColumn("{task.percentage:>3.0f}%"),
-            TimeRemainingColumn(), console=console, disable=not console.is_terminal,
-        )  # fmt: skip
+        self._bar = make_progress_bar(console, transient=False)
         self._task = self._bar.add_task("starting", total=config.iterations, completed=start)
 
     def __enter__(self) -> TrainingProgress:
@@ -62,7 +59,9 @@ class TrainingProgress:
             self._bar.update(self._task, completed=state.iteration, description=self._line(state))
         if not self._console.is_terminal and now - self._last_line > LINE_INTERVAL_SECONDS:
             self._last_line = now
-            self._console.print(self._line(state) + f"  {clock(self._seconds_left(state))} left", highlight=False)
+            left = self._seconds_left(state)
+            said = self._line(state) + ("" if left is None else f"  {clock(left)} left")
+            self._console.print(said, highlight=False)
         if state.iteration % LOG_INTERVAL == 0 or report.grown is not None:
             self._write(state, report)
 
@@ -73,10 +72,11 @@ class TrainingProgress:
 
     def status(self, state: TrainingState) -> StatusRecord:
         """Where training stands."""
+        left = self._seconds_left(state)
         return StatusRecord(
             state="running", iteration=state.iteration, iterations=self._config.iterations, anchors=len(state.anchors),
             psnr_training=None if math.isnan(state.psnr) else state.psnr, seconds=round(state.seconds, 1),
-            seconds_left=round(self._seconds_left(state)), peak_memory_bytes=state.peak_memory_bytes,
+            seconds_left=None if left is None else round(left), peak_memory_bytes=state.peak_memory_bytes,
         )  # fmt: skip
 
     def flush(self) -> None:
@@ -90,8 +90,10 @@ class TrainingProgress:
             f"{len(state.anchors):,} anchors  {self.speed():.1f} it/s  {memory:.1f} GB"
         )
 
-    def _seconds_left(self, state: TrainingState) -> float:
-        return (self._config.iterations - state.iteration) / max(self.speed(), 1e-3)
+    def _seconds_left(self, state: TrainingState) -> float | None:
+        """None before a pace is known."""
+        speed = self.speed()
+        return (self._config.iterations - state.iteration) / speed if speed else None
 
     def _write(self, state: TrainingState, report: StepReport) -> None:
         record = {

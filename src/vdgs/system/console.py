@@ -1,0 +1,60 @@
+"""What long work shows on a console: bars with the time left, and notes that are printed once."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from typing import TypeVar
+from weakref import WeakKeyDictionary
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TaskProgressColumn, TextColumn
+from rich.text import Text
+
+from vdgs.system.units import clock
+
+Item = TypeVar("Item")
+
+#: Brackets that rich would take for styles, but for those that lines of ours have.
+_NOT_OURS = re.compile(
+    r"(?<!\\)\[(?!/?(yellow|red|green|cyan|magenta|blue|bold|dim)( \w+)?\]|/\])(?=[a-z#/@])", re.IGNORECASE
+)
+#: What each console has printed already.
+_PRINTED = WeakKeyDictionary[Console, set[str]]()
+
+
+class TimeLeftColumn(ProgressColumn):
+    """`0:01:11 left`; nothing before a pace is known and once all is done."""
+
+    max_refresh = 0.5
+
+    def render(self, task: Task) -> Text:
+        left = None if task.finished or task.total is None else task.time_remaining
+        return Text("" if left is None else f"{clock(left)} left", style="progress.remaining")
+
+
+def make_progress_bar(console: Console, counts: bool = False, transient: bool = True) -> Progress:
+    """A bar that shows how far work is, to be used as a context; none where the console is no terminal. With `counts`
+    it says how many are done, else what share."""
+    done = MofNCompleteColumn() if counts else TaskProgressColumn()
+    columns = (TextColumn("{task.description}"), BarColumn(), done, TimeLeftColumn())
+    return Progress(*columns, console=console, disable=not console.is_terminal, transient=transient)
+
+
+def track(items: Iterable[Item], description: str, total: int, console: Console) -> Iterator[Item]:
+    """The items, with a bar for them."""
+    with make_progress_bar(console, transient=False) as bar:
+        yield from bar.track(items, total, description=description)
+
+
+def escape_names(text: str) -> str:
+    """The text of a line with styles, in which brackets that are none of ours are names: `run[2][new]`."""
+    return _NOT_OURS.sub(r"\\\g<0>", text)
+
+
+def print_once(console: Console, text: str, style: str) -> None:
+    """Print a line, unless this console has it already."""
+    printed = _PRINTED.setdefault(console, set())
+    if text not in printed:
+        printed.add(text)
+        console.print(Text(text, style=style))

@@ -1,0 +1,116 @@
+"""No verb writes among photographs, whichever of its options names the place: laws over all verbs and options."""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tyro
+from PIL import Image
+
+from vdgs.cli.main import COMMANDS, get_command, main
+from vdgs.config.output_paths import Output, is_output
+from vdgs.config.ranges import FlagName, to_flag
+from vdgs.config.serialization import field_hints
+
+#: Options that name what is only read.
+READ = {
+    "capture", "run", "images", "gps", "gcp", "scale_bar", "test_list", "georef", "lpips_weights", "path", "data",
+    "reuse_results", "image_folders", "extra_image_folders",
+}  # fmt: skip
+
+
+class _Parsed(Exception):
+    pass
+
+
+def arguments_type(verb: str) -> type:
+    """The class of a verb's arguments."""
+
+    def catch(kind: type, **_: Any) -> None:
+        raise _Parsed(kind)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tyro, "cli", catch)
+        with pytest.raises(_Parsed) as parsed:
+            get_command(verb)(["run"])
+    return parsed.value.args[0]
+
+
+def path_options(kind: type, within: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Every option that holds a path, by its names, with its type."""
+    for field in dataclasses.fields(kind):
+        hint = field_hints(kind)[field.name]
+        inner = typing.get_args(hint)[0] if typing.get_origin(hint) is typing.Annotated else hint
+        if dataclasses.is_dataclass(inner):
+            names = [each.name for each in getattr(hint, "__metadata__", ()) if hasattr(each, "name")]
+            yield from path_options(inner, (*within, *filter(None, names[:1] or [field.name])))
+        elif "Path" in str(hint):
+            yield (*within, field.name), hint
+
+
+WRITTEN = [(verb, names) for verb in COMMANDS for names, hint in path_options(arguments_type(verb)) if is_output(hint)]
+
+
+@pytest.fixture
+def card(tmp_path: Path) -> Path:
+    """A memory card: DCIM/100MEDIA with photographs."""
+    folder = tmp_path / "card" / "DCIM" / "100MEDIA"
+    folder.mkdir(parents=True)
+    exif = Image.Exif()
+    exif[0x010F] = "DJI"
+    for k in range(4):
+        Image.fromarray(np.full((48, 64, 3), 50 * k, np.uint8)).save(folder / f"DJI_000{k}.JPG", exif=exif)
+    return folder
+
+
+def contents(folder: Path) -> dict[Path, bytes | None]:
+    return {path: path.read_bytes() if path.is_file() else None for path in sorted(folder.rglob("*"))}
+
+
+@pytest.mark.parametrize("verb", COMMANDS)
+def test_every_path_is_known_as_read_or_written(verb: str) -> None:
+    for names, hint in path_options(arguments_type(verb)):
+        read = names[-1] in READ
+        assert read != is_output(hint), f"vdgs {verb} {to_flag(names)}: mark it with Output(), or list it as read"
+
+
+def test_the_known_outputs_are_found() -> None:
+    verbs = {verb for verb, _ in WRITTEN}
+    assert verbs >= {"run", "sfm", "train-coarse", "inspect", "render", "ortho", "export", "synth", "bench"}
+    assert ("inspect", ("undistorted_folder",)) in WRITTEN
+    assert is_output(typing.Annotated[Path | None, FlagName("x"), Output()])
+    assert not is_output(Path)
+
+
+@pytest.mark.parametrize("inside", ["", "new", "new/deep", "film.mp4", "scene.ply", "../ortho.tif", ".."])
+@pytest.mark.parametrize(("verb", "names"), WRITTEN, ids=[f"{verb} {names[-1]}" for verb, names in WRITTEN])
+def test_no_verb_writes_among_photographs(verb: str, names: tuple[str, ...], inside: str, card: Path, capsys) -> None:
+    before, root = contents(card.parents[1]), card.parents[1].parent
+    arguments = [str(root / "is-not-there")] if verb not in ("synth", "bench") else ["toy"] if verb == "bench" else []
+    if names != ("output",):
+        arguments += [] if verb in ("render", "ortho", "export") else ["--output", str(root / "free")]
+    place = str(card / inside)
+    with pytest.raises(SystemExit) as ended:
+        main([verb, *arguments, *([place] if verb == "synth" else [to_flag(names), place])])
+    assert ended.value.code == 1
+    said = capsys.readouterr().err
+    assert "lies among the photographs" in said
+    assert str(card.parents[1] / "") in said.split("such as")[1]
+    assert contents(card.parents[1]) == before
+    assert sorted(root.iterdir()) == [root / "card"]
+
+
+@pytest.mark.parametrize("verb", sorted({*COMMANDS} - {verb for verb, _ in WRITTEN} - {"doctor"}))
+def test_photographs_are_no_run(verb: str, card: Path, capsys) -> None:
+    before = contents(card.parents[1])
+    with pytest.raises(SystemExit) as ended:
+        main([verb, str(card)])
+    assert ended.value.code == 1
+    assert str(card) in capsys.readouterr().err
+    assert contents(card.parents[1]) == before
