@@ -473,6 +473,16 @@ def test_absolute_paths_inside_the_capture_are_those_of_its_files(tmp_path, scen
         assert_sees_the_scene(capture, scene)
 
 
+@pytest.mark.parametrize("top", ["/home/other/place/", "C:\\data\\place\\", "../place/", "../../"])
+def test_paths_of_another_machine_are_those_of_the_captures_files(tmp_path, scene, top):
+    content = write_transforms(tmp_path, scene)
+    for each in content["frames"]:
+        each["file_path"] = top + each["file_path"].replace("/", "\\" if "\\" in top else "/")
+    content["ply_file_path"] = top + "sparse_pc.ply"
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    assert_sees_the_scene(load_capture(tmp_path), scene)
+
+
 def test_a_path_outside_the_capture_is_called_what_it_is(tmp_path, scene):
     write_transforms(tmp_path, scene, ply_file_path="/elsewhere/cloud.ply")
     with pytest.raises(CaptureError, match=r"the ply_file_path '/elsewhere/cloud\.ply' is not a path inside"):

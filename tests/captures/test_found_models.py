@@ -161,16 +161,17 @@ def test_numbers_that_are_whole_may_be_written_with_a_point(tmp_path, scene):
 COLORS = np.random.default_rng(5).integers(0, 256, (50, 3))
 
 
-def cloud(file: Path, names: tuple[str, ...], kind: str, values: np.ndarray, text: bool) -> Path:
+def cloud(file: Path, names: tuple[str, ...], kind: str, values: np.ndarray, form: str) -> Path:
     codes = {"uchar": "B", "ushort": "H", "int": "i", "float": "f", "double": "d"}
-    header = f"ply\nformat {'ascii' if text else 'binary_little_endian'} 1.0\nelement vertex {len(values)}\n"
+    header = f"ply\nformat {form} 1.0\nelement vertex {len(values)}\n"
     header += "".join(f"property float {axis}\n" for axis in "xyz")
     header += "".join(f"property {kind} {name}\n" for name in names) + "end_header\n"
     cast = float if kind in ("float", "double") else int
-    if text:
+    if form == "ascii":
         body = "".join(f"1 2 3 {' '.join(str(cast(v)) for v in row)}\n" for row in values).encode()
     else:
-        body = b"".join(struct.pack(f"<3f{len(row)}{codes[kind]}", 1, 2, 3, *map(cast, row)) for row in values)
+        code = f"{'<' if 'little' in form else '>'}3f{values.shape[1]}{codes[kind]}"
+        body = b"".join(struct.pack(code, 1, 2, 3, *map(cast, row)) for row in values)
     file.write_bytes(header.encode() + body)
     return file
 
@@ -189,27 +190,69 @@ def cloud(file: Path, names: tuple[str, ...], kind: str, values: np.ndarray, tex
         ("double", 257),
     ],
 )  # fmt: skip
-@pytest.mark.parametrize("text", [True, False])
-def test_colors_of_clouds_are_read_by_every_name_and_scale(tmp_path, names, kind, factor, text):
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_colors_of_clouds_are_read_by_every_name_and_scale(tmp_path, names, kind, factor, form):
     values = COLORS * factor
     if len(names) == 4:
         values = np.c_[values[:, :1], values]
-    found = read_point_cloud(cloud(tmp_path / "a.ply", names, kind, values, text))[1]
+    points, found = read_point_cloud(cloud(tmp_path / "a.ply", names, kind, values, form))
+    assert (points == [1, 2, 3]).all()
     assert np.abs(found.astype(int) - COLORS).max() <= 1
 
 
 def test_colors_of_splats_and_none_at_all(tmp_path):
     coefficients = (COLORS / 255 - 0.5) / 0.28209479177387814
-    file = cloud(tmp_path / "a.ply", ("f_dc_0", "f_dc_1", "f_dc_2"), "float", coefficients, False)
+    file = cloud(tmp_path / "a.ply", ("f_dc_0", "f_dc_1", "f_dc_2"), "float", coefficients, "binary_big_endian")
     assert np.abs(read_point_cloud(file)[1].astype(int) - COLORS).max() <= 1
-    gray = cloud(tmp_path / "b.ply", ("u", "v"), "float", COLORS[:, :2], False)
+    gray = cloud(tmp_path / "b.ply", ("u", "v"), "float", COLORS[:, :2], "binary_little_endian")
     assert (read_point_cloud(gray)[1] == GRAY).all()
+
+
+def test_a_comment_ends_no_header(tmp_path):
+    file = cloud(tmp_path / "a.ply", ("red", "green", "blue"), "uchar", COLORS, "binary_big_endian")
+    file.write_bytes(file.read_bytes().replace(b"1.0\n", b"1.0\ncomment end_header is below\nobj_info 1\n", 1))
+    assert (read_point_cloud(file)[1] == COLORS).all()
+
+
+@pytest.mark.parametrize("last", [True, False])
+def test_images_of_a_text_model_may_lack_the_lines_of_their_points(tmp_path, scene, last):
+    write_colmap(tmp_path, scene, text=True)
+    file = tmp_path / "sparse/0/images.txt"
+    lines = [line for line in file.read_text().splitlines() if line.endswith(".png")]
+    file.write_text("\n".join(lines if last else [*lines, ""]).replace("\n", "\n\n", 1))
+    capture = load_capture(tmp_path)
+    assert len(capture.views) == len(lines) == 12
+
+
+@pytest.mark.parametrize(("model", "disk"), [("images/", ""), ("DCIM/100/", ""), ("", "flight/"), ("a/", "b/a/")])
+def test_images_may_lie_in_other_folders_than_the_model_says(tmp_path, scene, model, disk):
+    write_colmap(tmp_path, scene, text=True)
+    file = tmp_path / "sparse/0/images.txt"
+    file.write_text(re.sub(r" (\S+\.png)", rf" {model}\1", file.read_text()))
+    (tmp_path / "images").rename(tmp_path / "old")
+    (tmp_path / "images" / disk).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / "old").rename(tmp_path / "images" / disk)
+    capture = load_capture(tmp_path)
+    assert len({view.image_path for view in capture.views}) == 12
+    assert any("by other folders" in warning for warning in capture.warnings)
+
+
+def test_images_of_one_name_in_two_folders_are_not_guessed(tmp_path, scene):
+    write_colmap(tmp_path, scene, text=True)
+    file = tmp_path / "sparse/0/images.txt"
+    names = [line.split()[-1] for line in file.read_text().splitlines() if line.endswith(".png")]
+    text = file.read_text()
+    for k, name in enumerate(names):
+        text = text.replace(f" {name}", f" {'ab'[k % 2]}/{names[k - k % 2]}")
+    file.write_text(text)
+    with pytest.raises(CaptureError, match="12 of 12 images"):
+        load_capture(tmp_path)
 
 
 def test_points_without_colors_are_remarked(tmp_path, scene):
     write_transforms(tmp_path, scene)
     assert load_capture(tmp_path).warnings == ()
-    cloud(tmp_path / "sparse_pc.ply", ("u",), "float", COLORS[:, :1], True)
+    cloud(tmp_path / "sparse_pc.ply", ("u",), "float", COLORS[:, :1], "ascii")
     text = (tmp_path / "sparse_pc.ply").read_text()
     for k in range(len(COLORS)):
         text = text.replace("\n1 2 3 ", f"\n{k % 7} {k % 5} {k / 100} ", 1)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from support.flights import write_photograph
+from vdgs.captures.coordinate_systems import to_geodetic
 from vdgs.captures.gps_tables import read_gps_table
 from vdgs.errors import CaptureError
 from vdgs.sfm.gps_priors import read_gps_priors
@@ -46,6 +47,16 @@ TABLES = {
     "quotes": '"name","lat","lon","alt"\n"a.jpg","-33.5","-70.6","500"\n',
     "windows": "name,lat,lon,alt\r\n\r\na.jpg,-33.5,-70.6,500\r\n",
     "comments": "# by hand\nname,lat,lon,alt\n# the first\na.jpg,-33.5,-70.6,500\n",
+    "mission planner": "#name latitude/Y longitude/X height/Z yaw pitch roll SAlt\na.jpg -33.5 -70.6 500 1 2 3 10\n",
+    "header of blanks behind a sign": "# photo latitude longitude ellh\na.jpg -33.5 -70.6 500\n",
+    "propeller": "image_name,lat_dd,lon_dd,ellipsoidal_height_m\na.jpg,-33.5,-70.6,500\n",
+    "bentley": "Photo Name;Longitude;Latitude;Height\na.jpg;-70.6;-33.5;500\n",
+    "feet": "name,lat,lon,Altitude (ft)\na.jpg,-33.5,-70.6,1640.41995\n",
+    "survey feet": "name,lat,lon,alt [us survey ft]\na.jpg,-33.5,-70.6,1640.416667\n",
+    "feet in rows": "name,lat,lon,alt_ft\na.jpg,-33.5,-70.6,1640.41995 ft\n",
+    "pix4d, external": "imageName longitude latitude altitude omega phi kappa\na.jpg -70.6 -33.5 500 0.1 0.2 0.3\n",
+    "moments without a fix": "1\t2.1\t[2]\t 0,N\t 0,E\t 0,V\t0.0,Lat\t0.0,Lon\t0.0,Ellh\t0, 0, 0\t0,Q\n"
+    "1\t280.1\t[2145]\t 12,N\t 34,E\t -20,V\t-33.5,Lat\t-70.6,Lon\t500,Ellh\t0.01, 0.02, 0.03\t50,Q\n2\t280.2\n",
     "dji moments": "1\t280234.1\t[2145]\t  12,N\t 34,E\t -20,V\t-33.5,Lat\t-70.6,Lon\t500,Ellh\t"
     "0.01, 0.02, 0.03\t50,Q\n",
 }  # fmt: skip
@@ -77,7 +88,17 @@ def test_tables_are_read_as_programs_write_them(tmp_path, text):
         ("name,lat,lon,alt\na.jpg,-70.6,233.5,1e9\n", "line 2: .* no place on Earth"),
         ("name,lat,lon,alt\na.jpg,-97.6,33.5,10\n", "line 2: .* no place on Earth"),
         ("EPSG:32719\na.jpg 1e12 1e12 5\n", "line 2: .* is no place in"),
-        ("\0\1\2\3\0\0\0\0", "is not a CSV table"),
+        ("\0\1\2\3\0\0\0\0", "is not a CSV table.*Save a spreadsheet as CSV"),
+        ("EPSG:4326\n-70.6 -33.5 500 100 200 a.jpg P1\n", "control points is given as --gcp"),
+        ("time,latitude,longitude,altitude\n1,-33.5,-70.6,5\n", "no column of photographs' names.*exiftool -geotag"),
+        ('<?xml version="1.0"?>\n<gpx><trkpt lat="1" lon="2"/></gpx>', "is a track.*exiftool -geotag"),
+        ("<?xml version='1.0'?><kml><coordinates>-70.6,-33.5,500</coordinates></kml>", "is a track"),
+        ("$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\n", "is a track"),
+        ("% program : RTKLIB\n%  GPST latitude(deg) longitude(deg) height(m)\n2023/05/01 10:00:00 1 2 3", "of RTKLIB"),
+        ('<?xml version="1.0"?>\n<document version="1.2.0"><camera label="a"/></document>', "Metashape's XML"),
+        ('<?xml version="1.0"?><BlocksExchange version="2.1"/>', "BlocksExchange"),
+        ('[{\n"SourceFile": "a.jpg"}]', "is JSON"),
+        ('{"type":"FeatureCollection","features":[]}', "is JSON"),
     ],
 )
 def test_tables_that_are_none_are_refused_with_the_line(tmp_path, text, said):
@@ -106,6 +127,22 @@ def test_altitudes_that_a_table_lacks_are_those_of_the_photographs(tmp_path):
     assert len(found) == 4
     assert np.ptp(found.enu[:, 2]) == pytest.approx(3, abs=0.6)
     assert any("gives no altitude for 0.jpg" in note for note in found.notes)
+
+
+def test_positions_without_any_altitude_count_in_the_plane(tmp_path):
+    seen = [replace(photo, relative_altitude=None) for photo in photographs(tmp_path, NAMES)]
+    (tmp_path / "gps.csv").write_text("name,lat,lon\n" + "".join(f"{k}.jpg,-33.5{k},-70.6\n" for k in range(4)))
+    tagged = [replace(photo, lat_lon=(-33.5 - k / 100, -70.6), altitude=None) for k, photo in enumerate(seen)]
+    for found in (read_gps_priors(seen, tmp_path / "gps.csv", (1, 2)), read_gps_priors(tagged, None, (1, 2))):
+        assert len(found) == 4
+        assert not found.has_altitudes
+        assert found.origin == pytest.approx((-33.515, -70.6, 0))
+        assert np.abs(found.enu[:, 2]).max() < 1  # the Earth is round
+        assert any("no altitudes" in note for note in found.notes)
+    some = [replace(photo, altitude=2500.0 + k if k else None) for k, photo in enumerate(tagged)]
+    found = read_gps_priors(some, None, (1, 2))
+    assert found.image_indices.tolist() == [1, 2, 3]
+    assert found.has_altitudes
 
 
 def test_rows_of_photographs_that_are_gone_are_left_out_and_said(tmp_path):
@@ -141,6 +178,38 @@ def test_a_table_that_contradicts_the_photographs_is_refused_with_what_is_exchan
             assert len(read_gps_priors(seen, file, (1.0, 2.0))) == 4
 
 
+def test_a_flight_across_the_antimeridian_holds_together(tmp_path):
+    seen = photographs(tmp_path, NAMES)
+    places = [(-17 - k / 10000, (179.9999 + k / 15000 + 180) % 360 - 180) for k in range(4)]
+    (tmp_path / "gps.csv").write_text(
+        "name,lat,lon,alt\n" + "".join(f"{k}.jpg,{lat},{lon % 360},5\n" for k, (lat, lon) in enumerate(places))
+    )
+    tagged = [replace(photo, lat_lon=place, altitude=5.0) for photo, place in zip(seen, places, strict=True)]
+    for found in (read_gps_priors(tagged, None, (1, 2)), read_gps_priors(tagged, tmp_path / "gps.csv", (1, 2))):
+        assert len(found) == 4
+        assert np.ptp(found.enu, axis=0) == pytest.approx([21.3, 33.2, 0], abs=0.2)
+        assert (np.diff(found.enu[:, 0]) > 0).all()
+        assert abs(found.origin[1]) == pytest.approx(180, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("header", "code"),
+    [
+        ("WGS84 UTM 19S", 32719), ("WGS 84 UTM 19 S", 32719), ("UTM zone 19S", 32719), ("EPSG 32719", 32719),
+        ("32719", 32719), ("crs: epsg:32719", 32719), ("WGS 84 / UTM zone 19S", 32719), ("utm 19s", 32719),
+        ("urn:ogc:def:crs:EPSG::32719", 32719),
+    ],
+)  # fmt: skip
+def test_systems_are_known_by_all_their_names(tmp_path, header, code):
+    pytest.importorskip("pyproj")
+    (tmp_path / "geo.txt").write_text(f"{header}\na.jpg {EASTING} {NORTHING} 500\n")
+    (row,) = read_gps_table(tmp_path / "geo.txt").rows
+    assert row.position == pytest.approx(PLACE, abs=2e-6)
+    change, name = to_geodetic("EPSG:2225", tmp_path / "geo.txt")
+    assert "heights are taken as metres" in name
+    assert change(np.array([[6_000_000.0, 2_000_000, 5]]))[0, 2] == 5
+
+
 @pytest.mark.parametrize("altitude", [0.0, None])
 def test_altitudes_that_are_all_zero_are_a_default(tmp_path, altitude):
     seen = photographs(tmp_path, NAMES)
@@ -149,6 +218,20 @@ def test_altitudes_that_are_all_zero_are_a_default(tmp_path, altitude):
     assert np.ptp(found.enu[:, 2]) == pytest.approx(3, abs=0.1)
     assert found.altitude_reference == "above the take-off, by XMP"
     assert any("exactly 0" in note for note in found.notes)
+
+
+def test_altitudes_of_exactly_zero_among_others_are_none(tmp_path):
+    seen = photographs(tmp_path, [f"{k}.jpg" for k in range(8)])
+    heights = [0.0, 501, 502, 503, 504, 505, 506, 507]
+    seen = [
+        replace(photo, lat_lon=(-33.5 - k / 1000, -70.6), altitude=height)
+        for k, (photo, height) in enumerate(zip(seen, heights, strict=True))
+    ]
+    found = read_gps_priors(seen, None, (1.0, 2.0))
+    assert found.image_indices.tolist() == list(range(1, 8))
+    assert any("0.jpg: the position has no altitude; not used" in note for note in found.notes)
+    beach = [replace(photo, altitude=float(k)) for k, photo in enumerate(seen)]
+    assert len(read_gps_priors(beach, None, (1.0, 2.0))) == 8
 
 
 def test_moments_of_a_drone_are_matched_by_number(tmp_path):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from support.captures import data_folder, moved, tiny_scene, to_source, write_colmap
 from vdgs.captures.formats.source_capture import Intrinsics, SourceCapture, SourceView
@@ -161,10 +162,35 @@ def test_gps_along_one_line_falls_back_to_the_estimate(tmp_path):
     assert frame.rotation[2, 2] > 0.99
 
 
+def test_gps_without_altitudes_places_in_the_plane(tmp_path):
+    truth = tiny_scene()
+    rows = [line.rpartition(",")[0] for line in write_gps(tmp_path / "gps.csv", truth).read_text().splitlines()]
+    (tmp_path / "gps.csv").write_text("\n".join(rows))
+    world = moved(truth, 0.013, Rotation.from_rotvec([0.3, -2, 1]).as_matrix(), np.array([1.0, 2, 3]))
+    frame, warnings = ground_of(world, tmp_path, gps=tmp_path / "gps.csv")
+    assert frame.metric
+    assert frame.scale == pytest.approx(1 / 0.013, rel=0.05)
+    assert frame.origin_geo == pytest.approx((*ORIGIN[:2], 0), abs=1e-4)
+    assert any("has no altitudes" in warning for warning in warnings)
+    offset = truth.points - frame.to_ground(world.points)
+    assert np.ptp(offset, axis=0).max() < 1  # turned by less than what the views are off by
+
+
+def test_moments_of_a_drone_place_a_finished_capture(tmp_path):
+    truth = tiny_scene()
+    geodetic = geodetic_from_enu(np.array([camera.position for camera in truth.cameras.values()]), ORIGIN)
+    line = "{}\t280.1\t[2145]\t 12,N\t 34,E\t -20,V\t{:.9f},Lat\t{:.9f},Lon\t{:.3f},Ellh\t0.01, 0.02, 0.03\t50,Q"
+    (tmp_path / "a.MRK").write_text("\n".join(line.format(k, *row) for k, row in enumerate(geodetic.tolist(), 1)))
+    renamed = replace(truth, cameras={f"DJI_{k:04d}.png": c for k, c in enumerate(truth.cameras.values(), 1)})
+    frame, warnings = ground_of(renamed, tmp_path, gps=tmp_path / "a.MRK")
+    assert (frame.metric, warnings) == (True, [])
+    assert frame.scale == pytest.approx(1, rel=1e-3)
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("name,lat,lon\na,1,2\n", "gives no altitudes"),
+        ("name,lat,lon\na,1,2\n", "none of its 1 rows"),
         ("name,x,y,alt\na,351400,6292300,2\n", "does not say of which coordinate system"),
         ("a,b,c\n1,x,3\n", "columns name,lat,lon,alt"),
         ("", "is empty"),

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from support.captures import tiny_scene, write_colmap
 from support.flights import write_photograph
-from vdgs.captures.georeference import match_gps, read_gps
+from vdgs.captures.georeference import match_gps
 from vdgs.captures.loading import load_capture
 from vdgs.captures.name_resolution import ImageNameIndex, NameLookup, match_key, to_colmap_name
 from vdgs.config.capture_options import CaptureOptions
@@ -36,7 +36,7 @@ def matched(tmp_path: Path, names: list[str], *rows: str) -> dict[str, float]:
     """Latitudes that a table of rows `name` and `latitude` gives photographs."""
     file = tmp_path / "gps.csv"
     file.write_text("name,lat,lon,alt\n" + "".join(f"{row},20,5\n" for row in rows), encoding="utf-8")
-    indices, positions = match_gps(names, read_gps(file), file)
+    indices, positions, _ = match_gps(names, file)
     return {names[index]: float(position[0]) for index, position in zip(indices, positions, strict=True)}
 
 
@@ -45,6 +45,12 @@ def card(folder: Path, *names: str) -> Path:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         write_photograph(folder / name, np.roll(NOISE, k, axis=0), k, None)
     return folder
+
+
+def test_no_name_in_a_capture_is_a_comment_of_colmaps_lists(tmp_path):
+    assert [to_colmap_name(name) for name in ("#1.jpg", "a#1.jpg", "# 2.jpg")] == ["_1.jpg", "a#1.jpg", "__2.jpg"]
+    found = collect_images([card(tmp_path, "#1.JPG", "b#2.JPG", "c.JPG")])
+    assert [photo.name for photo in found.images] == ["_1.JPG", "b#2.JPG", "c.JPG"]
 
 
 # ------------------------------------------------------------------------------------ tables of positions

@@ -66,6 +66,25 @@ def test_a_ply_keeps_every_bit(tmp_path, degree):
         torch.testing.assert_close(gaussian_covariances(read), gaussian_covariances(written))
 
 
+@pytest.mark.parametrize("form", ["ascii", "binary_big_endian"])
+def test_splats_of_other_programs_are_read_in_every_form_of_a_ply(tmp_path, form):
+    written = random_gaussians(300, 1)
+    registry.write_scene(tmp_path / "a.ply", ExportScene.of(written, PLACED))
+    data = (tmp_path / "a.ply").read_bytes()
+    header, mark, body = data.partition(b"end_header\n")
+    rows = np.frombuffer(body, "<f4").reshape(300, -1)
+    text = "\n".join(" ".join(repr(float(value)) for value in row) for row in rows).encode()
+    body = text if form == "ascii" else rows.astype(">f4").tobytes()
+    header = header.replace(b"binary_little_endian", form.encode()) + mark
+    (tmp_path / "b.ply").write_bytes(header + body)
+    read = registry.read_gaussians(tmp_path / "b.ply")
+    for name in ("means", "log_scales", "opacity_logits", "sh0", "shN"):
+        assert torch.equal(getattr(read, name), getattr(written, name)), name
+    (tmp_path / "b.ply").write_bytes(header + body[: len(body) // 2])
+    with pytest.raises(VdgsError, match="truncated"):
+        registry.read_gaussians(tmp_path / "b.ply")
+
+
 def test_a_ply_says_where_it_stands_and_has_the_layout_that_all_read(tmp_path):
     registry.write_scene(tmp_path / "a.ply", ExportScene.of(random_gaussians(3, 3), PLACED))
     data = (tmp_path / "a.ply").read_bytes()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -107,6 +109,22 @@ def test_altitudes_that_drift_tilt_nothing_and_are_said(drift_m, shape, wrong_m)
             assert fit.place_error_m[1] > 0.3 * drift_m
         if shape == "line" and drift_m >= 30:
             assert fit.drift_m == pytest.approx(drift_m, rel=0.25)
+
+
+@pytest.mark.parametrize("wrong_m", [0.0, 3.0])
+@pytest.mark.parametrize("count", [6, 12])
+def test_positions_without_altitudes_tell_scale_and_north(wrong_m, count):
+    """Of all photographs, or of every other one."""
+    rng = np.random.default_rng(4)
+    places = strips(3, 4, 17.0, rng)[:: 12 // count]
+    recorded = (places + rng.normal(0, wrong_m, places.shape)) * [1, 1, 0]
+    problem, turn = problem_of(places, recorded, 4)
+    fit = fit_positions(replace(problem, has_altitudes=False))
+    assert fit.altitude == "none"
+    assert fit.why_refused("EXIF") == ""
+    assert abs(fit.similarity.scale / SCALE - 1) <= fit.scale_error < 0.3
+    assert abs(north_off_deg(fit, turn)) <= fit.north_error_deg < 15
+    assert tilt_deg(fit, turn) <= fit.level_error_deg
 
 
 @pytest.mark.parametrize("count", [3, 4, 5])

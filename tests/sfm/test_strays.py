@@ -184,6 +184,36 @@ def test_photographs_without_any_tags_are_photographs(tmp_path):
     assert len(collect_images([tmp_path]).images) == COUNT
 
 
+def test_linked_folders_are_read_and_loops_are_not(tmp_path):
+    flight(tmp_path / "card")
+    (tmp_path / "place").mkdir()
+    (tmp_path / "place/sub").symlink_to(tmp_path / "card")
+    (tmp_path / "card/loop").symlink_to(tmp_path / "card")
+    (tmp_path / "card/up").symlink_to(tmp_path)
+    (tmp_path / "card/gone.jpg").symlink_to(tmp_path / "nothing")
+    for folder in (tmp_path / "card", tmp_path / "place"):
+        assert len(collect_images([folder]).images) == COUNT
+
+
+def test_thermal_pictures_beside_visible_ones_are_left_out(tmp_path):
+    for name in flight(tmp_path):
+        stem = name.removesuffix(".JPG")
+        (tmp_path / name).rename(tmp_path / f"{stem}_V.JPG")
+        write_photograph(tmp_path / f"{stem}_T.JPG", pixels(int(stem[-1]), 128, 104), 3, np.zeros(3))
+    found = collect_images([tmp_path])
+    assert [photo.name[-5] for photo in found.images] == ["V"] * COUNT
+    assert all("thermal picture beside" in each.reason for each in found.excluded)
+    for file in tmp_path.glob("*_V.JPG"):
+        file.unlink()
+    assert len(collect_images([tmp_path]).images) == COUNT
+
+
+def test_pictures_twice_as_wide_as_high_without_a_lens_are_remarked(tmp_path):
+    for k in range(COUNT):
+        picture(tmp_path / f"{k}.png", pixels(k, 240, 120))
+    assert any("Panoramas of 360° cannot be used" in each for each in said(collect_images([tmp_path])))
+
+
 def test_panoramas_are_named(tmp_path):
     names = flight(tmp_path)
     write_photograph(tmp_path / "PANO_0001.JPG", pixels(77, 240, 120), 77, np.zeros(3))
@@ -198,7 +228,15 @@ def test_panoramas_are_named(tmp_path):
 
 @pytest.mark.parametrize(
     ("suffix", "remedy"),
-    [(".HEIC", "convert"), (".heif", "convert"), (".avif", "convert"), (".DNG", "develop"), (".cr3", "develop")],
+    [
+        (".HEIC", "convert"),
+        (".heif", "convert"),
+        (".avif", "convert"),
+        (".DNG", "develop"),
+        (".cr3", "develop"),
+        (".jp2", "convert"),
+        (".jfif", "they are JPEG; rename"),
+    ],
 )
 def test_photographs_of_kinds_that_are_not_read_are_named_with_the_remedy(tmp_path, suffix, remedy):
     flight(tmp_path)
@@ -211,6 +249,14 @@ def test_photographs_of_kinds_that_are_not_read_are_named_with_the_remedy(tmp_pa
         file.unlink()
     with pytest.raises(CaptureError, match=f"4 {suffix.lower()} files are not read: {remedy}"):
         collect_images([tmp_path])
+
+
+def test_films_are_named_where_there_is_nothing_else(tmp_path):
+    (tmp_path / "DJI_0001.MP4").write_bytes(b"x")
+    with pytest.raises(CaptureError, match="1 .mp4 file is not read: take single frames out of them"):
+        collect_images([tmp_path])
+    flight(tmp_path)
+    assert not any("mp4" in note for note in collect_images([tmp_path]).notes)
 
 
 def test_heic_by_the_name_of_a_jpeg_is_named(tmp_path):

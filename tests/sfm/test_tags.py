@@ -138,6 +138,12 @@ def test_angles_are_read_from_text(text, degrees):
     assert (read and read[0]) == (degrees if degrees is None else pytest.approx(degrees))
 
 
+@pytest.mark.parametrize(("absolute", "altitude"), [("+96.20", 96.2), ("-96.20", -96), ("+300", -96), (None, -96)])
+def test_the_wrong_reference_of_an_altitude_gives_way_to_the_sign_in_xmp(absolute, altitude):
+    xmp = {"drone-dji:AbsoluteAltitude": absolute} if absolute else {}
+    assert read_altitude({5: b"\x01", 6: 96.0}, xmp)[0] == altitude
+
+
 def test_a_flight_without_a_hemisphere_is_told(tmp_path):
     for k in range(4):
         photograph(tmp_path, k)
@@ -243,6 +249,24 @@ def test_digital_zoom_is_a_camera_of_its_own_and_counts_once(tmp_path, in_focal_
     assert [(len(kind.images), kind.focal_px) for kind in kinds] == [
         (4, pytest.approx(136)), (2, pytest.approx(272)),
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize("equivalent", [None, 59])
+def test_digital_zoom_of_all_photographs_is_doubted_unless_the_equivalent_has_it(tmp_path, equivalent):
+    for k in range(4):
+        photograph(tmp_path, k)
+        file = tmp_path / f"p{k:02d}.jpg"
+        with Image.open(file) as image:
+            exif = image.getexif()
+        details = exif.get_ifd(0x8769)
+        details[0xA404] = 2.0
+        if equivalent:
+            details[0xA405] = equivalent
+        Image.fromarray(np.roll(NOISE, k, axis=0)).save(file, quality=95, exif=exif)
+    seen = collect_images([tmp_path]).images
+    assert all(bool(photo.lens.doubt) == (equivalent is None) for photo in seen)
+    said = make_preflight_report(collect_images([tmp_path]), read_gps_priors(seen, None, (1.0, 2.0))).warnings
+    assert any("272 px if not, as taken, 136 px if so" in each for each in said) == (equivalent is None)
 
 
 @pytest.mark.parametrize("unknown", [1, 5])

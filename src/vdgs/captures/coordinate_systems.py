@@ -13,8 +13,11 @@ from vdgs.errors import CaptureError
 
 ToGeodetic = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n 3"]]
 _STARTS = re.compile(
-    r"(EPSG:\s*\d+|WGS\s?84\b|\+proj=|\+init=|(GEOG|PROJ|GEO|PROJC|COMPD|COMPOUND)[A-Z]*CRS?\[|\w*CS\[)", re.I
-)
+    r"(\d{4,6}$|(EPSG|ESRI)[\s:]+\d+|urn:ogc:def:crs:|https?://www\.opengis\.net/def/crs/|WGS\s?84\b|UTM\b|\w[\w() +-]* / \w|\+proj="
+    r"|\+init=|(GEOG|PROJ|GEO|PROJC|COMPD|COMPOUND)[A-Z]*CRS?\[|\w*CS\[)", re.I
+)  # fmt: skip
+#: ODM's words for the zones of UTM, and those that people write in their place.
+_UTM = re.compile(r"(?:WGS ?84)?[ /]*UTM(?: ZONE)? *(\d{1,2}) *([NS])", re.I)
 
 
 def names_a_system(line: str) -> bool:
@@ -49,14 +52,17 @@ def to_geodetic(header: str, file: Path) -> tuple[ToGeodetic, str]:
             longitude, latitude, z = change.transform(x, y, z)
         return np.stack([latitude, longitude, z], axis=1)
 
-    return changed, crs.name if crs.name != "unknown" else header
+    name = crs.name if crs.name != "unknown" else header
+    feet = flat and crs.is_projected and "foot" in (crs.axis_info[0].unit_name or "")
+    return changed, f"{name}; x and y in feet, heights are taken as metres" if feet else name
 
 
 def _named(header: str) -> str:
     """ODM's own words for systems, `WGS84` and `WGS84 UTM 15N`, as codes; others as they are."""
-    words = header.upper().replace("WGS 84", "WGS84").split()
-    if words == ["WGS84"]:
+    header = re.sub(r"(?i)^(crs|srs)\s*:", "", header.strip()).strip()
+    if header.upper() in ("WGS84", "WGS 84"):
         return "EPSG:4326"
-    if words[:2] == ["WGS84", "UTM"] and len(words) == 3 and words[2][:-1].isdecimal() and words[2][-1] in "NS":
-        return f"EPSG:{(32600 if words[2][-1] == 'N' else 32700) + int(words[2][:-1])}"
-    return header
+    zone = _UTM.fullmatch(header)
+    if zone is not None:
+        return f"EPSG:{(32600 if zone[2] in 'Nn' else 32700) + int(zone[1])}"
+    return re.sub(r"(?i)^(EPSG|ESRI)[\s:]+", r"\1:", header)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from vdgs.captures.gps_tables import GpsRow, by_number, check_geodetic, read_gps_table
+from vdgs.captures.gps_tables import GpsRow, by_number, check_geodetic, read_gps_table, with_altitudes
 from vdgs.captures.name_resolution import NameLookup, ambiguity_message
 from vdgs.errors import CaptureError
 
@@ -57,24 +56,18 @@ def read_georef(file: Path) -> Georef:
     return Georef(origin, accuracy)  # type: ignore[arg-type]
 
 
-def read_gps(file: Path) -> list[GpsRow]:
-    """The rows of a table of positions that have all three coordinates.
+def match_gps(names: Sequence[str], file: Path) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Indices [m] of the images that a table has a position of, the positions [m, 3] (latitude, longitude, altitude),
+    and whether their altitudes are known (0 where not).
 
-    Raises `CaptureError` for a missing file or column, a value that is no position, and where no row has an altitude.
+    Raises `CaptureError` as `read_gps_table` and `match_rows` do.
     """
     table = read_gps_table(file)
-    rows = [row for row in table.rows if math.isfinite(row.position[2])]
-    if table.rows and not rows:
-        raise CaptureError(
-            f"{file}: gives no altitudes, without which it places no scene. Add them as a column alt, in metres."
-        )
-    return rows
-
-
-def match_gps(names: Sequence[str], rows: Sequence[GpsRow], file: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Indices [m] of the images with a GPS position, and the positions [m, 3] (lat, lon, alt), as `match_rows`."""
-    found = match_rows(names, rows, file)
-    return np.array(list(found)), np.array([row.position for row in found.values()])
+    found = match_rows(names, table.rows, file, table.numbered)
+    positions = np.array([row.position for row in found.values()]).reshape(-1, 3)
+    kept, has_altitudes = with_altitudes(positions[:, 2], np.ones(len(positions), bool))
+    positions = np.where([True, True, has_altitudes], positions, 0.0)
+    return np.array(list(found), int)[kept], positions[kept], has_altitudes
 
 
 def match_rows(names: Sequence[str], rows: Sequence[GpsRow], file: Path, numbered: bool = False) -> dict[int, GpsRow]:

@@ -17,9 +17,25 @@ import numpy as np
 
 from vdgs.captures.angles import degrees_of_text
 from vdgs.captures.coordinate_systems import names_a_system, to_geodetic
-from vdgs.captures.text_tables import Line, Row, read_lines, rows_of
+from vdgs.captures.text_tables import LOOKED_AT, Line, Row, read_lines, rows_of
 from vdgs.errors import CaptureError
 
+_BY_TIME = (
+    "by time and not by photograph. Let `exiftool -geotag TRACK PHOTOGRAPHS`, or the receiver's own program, write the "
+    "positions into the photographs."
+)
+#: How files begin that have positions but are no tables of them, and what to do.
+_OTHERS = (
+    (r"<gpx|<kml|<trainingcenter|^\$g[pnlab][a-z]{3},", f"is a track, {_BY_TIME}"),
+    (r"^% *(program|gpst|utc|jst)\b|^%.*latitude\(deg\)", f"is a solution of RTKLIB or Emlid, {_BY_TIME}"),
+    (r"<blocksexchange", "is BlocksExchange XML (DJI Terra, ContextCapture). Export the positions as text instead."),
+    (r"<document\b", "is Metashape's XML. Export the reference as text instead (.txt, .csv), with a line of columns."),
+    (r"^<", "is XML. Export the positions as text instead, with the columns name,lat,lon,alt."),
+    (
+        r"^[{[]\s*[{\"\]]|^[{[]$",
+        "is JSON. Export a table instead: `exiftool -csv -n -GPS* PHOTOGRAPHS`, or ODM's geo.txt.",
+    ),
+)
 #: What each column is called, once blanks, signs, units and the case of letters are taken away.
 _COLUMNS: dict[str, frozenset[str]] = {
     what: frozenset(names.split())
@@ -27,12 +43,12 @@ _COLUMNS: dict[str, frozenset[str]] = {
         "name": "name label image imagename imagefile imagefilename filename file sourcefile photo photoname "
         "photograph picture picturename img imgname path filepath imagepath cameraname photolabel",
         "lat": "lat latitude gpslatitude gpslat ylatitude latitudey latitudedeg latdeg wgs84lat wgs84latitude "
-        "latitudewgs84 latitudedecimaldegrees ylat cameralatitude originallatitude latitudedd",
+        "latitudewgs84 ylat cameralatitude originallatitude",
         "lon": "lon long lng longitude gpslongitude gpslon gpslong gpslng xlongitude longitudex longitudedeg londeg "
-        "wgs84lon wgs84longitude longitudewgs84 longitudedecimaldegrees xlon cameralongitude longitudedd",
+        "wgs84lon wgs84longitude longitudewgs84 xlon cameralongitude originallongitude",
         "alt": "alt altitude gpsaltitude gpsalt zaltitude altitudez altitudem height ellipsoidheight ellipsoidalheight "
-        "heightm ele elev elevation z h up absolutealtitude altitudemeter altm cameraaltitude gpsheight zh altitudemsl "
-        "heightellipsoid ellh elevationm",
+        "heightm heightz ele elev elevation z h up absolutealtitude altm cameraaltitude gpsheight zh altitudemsl "
+        "heightellipsoid ellh elevationm altft altitudeft altitudefeet heightft",
         "x": "x easting east e utmeasting utmx xeasting xe eastingx coordx xm eastingm xeast",
         "y": "y northing north n utmnorthing utmy ynorthing yn northingy coordy ym northingm ynorth",
         "latref": "latref latituderef gpslatituderef",
@@ -45,7 +61,12 @@ _COLUMNS: dict[str, frozenset[str]] = {
         "system": "epsg crs srs epsgcode",
     }.items()
 }  # fmt: skip
-_UNIT = re.compile(r"[\[(][^\])]*[\])]|_?\bdecimal degrees\b")
+_UNIT = re.compile(
+    r"[\[(][^\])]*[\])]|[_ ](?:decimal degrees|dd|deg|degrees|m|met(?:er|re)s?|(?:us[ _]?)?f(?:oo|ee)?t)$"
+)
+#: How the names of columns, and values, say that they are feet.
+_FEET = re.compile(r"(?:[\[( _\d]|^alt|^altitude|^height)(us[ _]?(?:survey[ _]?)?)?(?:ft|feet|foot)\b", re.IGNORECASE)
+FOOT_M, SURVEY_FOOT_M = 0.3048, 1200 / 3937
 #: Words of exiftool behind altitudes below the sea.
 _BELOW = re.compile(r"below|^1$", re.IGNORECASE)
 _LEADING_NUMBER = re.compile(r"\s*([+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)\s*(?:m|metres|meters)?\b", re.IGNORECASE)
@@ -82,6 +103,8 @@ class _Columns(NamedTuple):
     """Which word of a row is what."""
     system: str | None
     """The coordinate system that the table names."""
+    altitude_unit: float = 1.0
+    """Metres in one of its altitudes."""
     assumed: bool = False
     """The order is that of programs that write no header."""
 
@@ -90,8 +113,12 @@ def read_gps_table(file: Path) -> GpsTable:
     """The positions in a table. Raises CaptureError for a file that is none, that lacks a column, whose coordinates are
     of an unknown system, or that holds a value that is no position."""
     lines = read_lines(file)
-    if lines and all(_MRK.search(line.text) for line in lines):
+    if any(_MRK.search(line.text) for line in lines):
         return _moments(lines, file)
+    head = "\n".join(line.text for line in lines[:LOOKED_AT]).lower()
+    for begins, what in _OTHERS:
+        if re.search(begins, head[:1] if begins == "^<" else head, re.MULTILINE):
+            raise CaptureError(f"{file}: {what}")
     system, body = None, list[Line]()
     for line in lines:
         if system is None and not body and names_a_system(_after_colon(line.text)):
@@ -99,6 +126,7 @@ def read_gps_table(file: Path) -> GpsTable:
         else:
             body.append(line)
     body = [line for line in body if not line.text.startswith("#") or _is_header(line)]
+    body = [Line(line.number, line.text.lstrip("# ") if k == 0 else line.text) for k, line in enumerate(body)]
     if not body:
         raise CaptureError(f"{file}: is empty. Write a first line `name,lat,lon,alt` and one for each photograph.")
     rows = rows_of(body)
@@ -129,7 +157,7 @@ def _after_colon(text: str) -> str:
 
 def _is_header(line: Line) -> bool:
     """Whether a line that begins like a comment names the columns (Metashape, RealityScan)."""
-    words = rows_of([line])[0].words
+    words = rows_of([Line(line.number, line.text.lstrip("# "))])[0].words
     return {"name"} < set(_known(words))
 
 
@@ -147,8 +175,11 @@ def _known(words: Sequence[str]) -> dict[str, int]:
 def _columns(rows: list[Row], system: str | None, file: Path) -> tuple[_Columns, list[Row]]:
     """The columns and the rows below their names. Raises CaptureError."""
     known = _known(rows[0].words)
+    unit = _meters(rows[0].words[known["alt"]]) if "alt" in known else 1.0
     if {"name", "lat", "lon"} <= set(known):
-        return _Columns(known, None), rows[1:]
+        return _Columns(known, None, unit), rows[1:]
+    if {"lat", "lon"} <= set(known):
+        raise CaptureError(f"{file}: has positions but no column of photographs' names: it is {_BY_TIME}")
     if {"name", "x", "y"} <= set(known):
         if system is None and "system" in known and len(rows) > 1:
             code = rows[1].words[known["system"]]
@@ -159,10 +190,13 @@ def _columns(rows: list[Row], system: str | None, file: Path) -> tuple[_Columns,
                 "say of which coordinate system. Write its code as a first line of its own, such as EPSG:32633, or "
                 "give name,lat,lon,alt."
             )
-        return _Columns(known, system), rows[1:]
+        return _Columns(known, system, unit), rows[1:]
     if not _has_numbers(rows[0]):
         found = ", ".join(sorted(word for word in rows[0].words if word)) or "nothing"
-        raise CaptureError(f"{file}: needs a first line that names the columns name,lat,lon,alt (found: {found}).")
+        marks = "" if system is None else " A list of control points is given as --gcp."
+        raise CaptureError(
+            f"{file}: needs a first line that names the columns name,lat,lon,alt (found: {found}).{marks}"
+        )
     order = {"name": 0, "alt": 3} if len(rows[0].words) > 3 else {"name": 0}
     if system is not None:
         if len(rows[0].words) > 8:  # ODM: name x y z yaw pitch roll and two accuracies
@@ -176,7 +210,14 @@ def _columns(rows: list[Row], system: str | None, file: Path) -> tuple[_Columns,
             f"{rows[0].words[2]}. Write its code as a first line of its own, such as EPSG:32633."
         )
     swapped = firsts.max(initial=0) > 90
-    return _Columns({**order, "lat": 2 if swapped else 1, "lon": 1 if swapped else 2}, None, not swapped), rows
+    places = {"lat": 2 if swapped else 1, "lon": 1 if swapped else 2}
+    return _Columns({**order, **places}, None, assumed=not swapped), rows
+
+
+def _meters(word: str) -> float:
+    """Metres in what a word says that it is in: feet, those of the United States' survey, or metres."""
+    feet = _FEET.search(word)
+    return 1.0 if feet is None else SURVEY_FOOT_M if feet[1] else FOOT_M
 
 
 def _has_numbers(row: Row) -> bool:
@@ -233,11 +274,12 @@ def _altitude(row: Row, columns: _Columns, file: Path) -> float:
     if not word:
         return math.nan
     number = _LEADING_NUMBER.match(word)
-    if number is None or (word[number.end() :].strip() and "sea" not in word.lower()):
+    unit = _meters(word)
+    if number is None or (word[number.end() :].strip() and "sea" not in word.lower() and unit == 1):
         if word.lower() in ("nan", "none", "null", "-", "n/a", "na"):
             return math.nan
         raise CaptureError(f"{file}: line {row.number}: the altitude {word!r} is not a number. Mend the row.")
-    value = float(number[1].replace(",", "."))
+    value = float(number[1].replace(",", ".")) * (unit if unit != 1 else columns.altitude_unit)
     below = _BELOW.search(word[number.end() :]) or _BELOW.search(_word(row, columns, "altref"))
     return -abs(value) if below else value
 
@@ -274,10 +316,10 @@ def _deviations(row: Row, columns: _Columns) -> tuple[float, float] | None:
 def _moments(lines: Sequence[Line], file: Path) -> GpsTable:
     """DJI's .MRK: the number of each photograph, its place, and its deviations north, east and up."""
     rows = []
-    for line in lines:
-        number, text = line
+    for number, text in lines:
         match = _MRK.search(text)
-        assert match is not None
+        if match is None or float(match[1]) == float(match[2]) == 0:
+            continue
         words = text.split()
         position = (float(match[1]), float(match[2]), float(match[3]))
         check_geodetic(position, file, f"line {number}: ")
@@ -285,7 +327,17 @@ def _moments(lines: Sequence[Line], file: Path) -> GpsTable:
         known = len(spread) == 3 and all(0 < value < 100 for value in spread)
         deviations = (max(spread[:2]), spread[2]) if known else None
         rows.append(GpsRow(number, words[0], position, deviations))
-    return GpsTable(tuple(rows), numbered=True)
+    without = len(lines) - len(rows)
+    notes = (f"{file.name}: {without} of {len(lines)} rows have no position; not used.",) if without else ()
+    return GpsTable(tuple(rows), numbered=True, notes=notes)
+
+
+def with_altitudes(altitudes: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Which of the `known` positions [n] bool are used, and whether with their altitudes [n]: those that have one; all
+    of them, in the plane alone, where most have none."""
+    finite = known & np.isfinite(altitudes)
+    enough = finite.sum() >= min(3, known.sum()) and 2 * finite.sum() >= known.sum()
+    return (finite, True) if enough else (known, False)
 
 
 def by_number(names: Sequence[str]) -> Callable[[str], tuple[tuple[int, int], list[int]]]:

@@ -22,13 +22,14 @@ import numpy as np
 
 from vdgs.captures.camera_height import view_distance
 from vdgs.captures.formats.source_capture import SourceCapture, WorldPrior
-from vdgs.captures.georeference import match_gps, read_georef, read_gps
+from vdgs.captures.georeference import match_gps, read_georef
 from vdgs.captures.plane_fit import mirrored
 from vdgs.captures.position_fit import Problem, Up, fit_positions
+from vdgs.captures.reconstruction import by_axis
 from vdgs.captures.up_axis import estimate_up, up_by_views
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
-from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu
+from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu, median_place
 from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.geometry.similarity import geometric_median, is_collinear, rotation_to_z
 
@@ -144,9 +145,8 @@ def _shifted(frame: GroundFrame, shift: np.ndarray, how: str) -> GroundFrame:
 
 def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | None:
     """Similarity from camera centres to ENU, or None (with a warning) where the flight does not fix one."""
-    indices, geodetic = match_gps(scene.names, read_gps(file), file)
-    median = np.median(geodetic, axis=0)
-    origin = (float(median[0]), float(median[1]), float(median[2]))
+    indices, geodetic, has_altitudes = match_gps(scene.names, file)
+    origin = median_place(geodetic)
     enu = enu_from_geodetic(geodetic, origin)
     centers = scene.centers[indices]
     if is_collinear(centers):
@@ -157,7 +157,8 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
         return None
     direction, deviation, sure = up_by_views(scene.centers, scene.rotations, scene.points)
     times = np.linspace(0, 1, len(indices))
-    problem = Problem(centers=centers, targets=enu, times=times, up=Up(direction, deviation, "the views", sure))
+    up = Up(direction, deviation, "the views", sure)
+    problem = Problem(centers=centers, targets=enu, times=times, up=up, has_altitudes=has_altitudes)
     others = {"east and north": enu[:, [1, 0, 2]], "signs": enu * [-1.0, 1.0, 1.0]}
     if sure and mirrored(centers, enu, direction, others):
         raise CaptureError(
@@ -170,15 +171,17 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
         warnings.append(f"{file.name}: {refused}; it is ignored and the frame is estimated.")
         return None
     similarity, inliers = fit.similarity, fit.inliers
-    if fit.altitude != "used":
+    if fit.altitude == "none":
+        warnings.append(f"{file.name}: it has no altitudes; up is by the views, heights count from the median point.")
+    elif fit.altitude != "used":
         warnings.append(f"{file.name}: its altitudes drift or are of no use, and were left out; up is by the views.")
     if not inliers.all():
         names = ", ".join(scene.names[i] for i in indices[~inliers][:5])
         warnings.append(f"{file.name}: {(~inliers).sum()} GPS positions left out as outliers ({names}).")
-    rms = float(np.sqrt((fit.residuals[inliers] ** 2).sum(axis=1).mean()))
-    place, scale = fit.place_error_m, fit.scale_error
-    how = f"GPS of {inliers.sum()} photographs, RMS {rms:.2f} m; place ±{place[0]:.2g} m across, ±{place[1]:.2g} m up, "
-    how += f"scale ±{scale:.2%} (95 %)"
+    axes = slice(3 if has_altitudes else 2)
+    rms = float(np.sqrt((fit.residuals[inliers, axes] ** 2).sum(axis=1).mean()))
+    place = by_axis(fit.place_error_m if has_altitudes else fit.place_error_m[:1], ("across", "up"), "±{:.2g}")
+    how = f"GPS of {inliers.sum()} photographs, RMS {rms:.2f} m; place {place}, scale ±{fit.scale_error:.2%} (95 %)"
     frame = GroundFrame(
         scale=similarity.scale,
         rotation=similarity.rotation,
@@ -188,6 +191,8 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
         origin_geo=origin,
     )
     frame = _shifted(frame, -_middle(frame.to_ground(scene.points)), how)
+    if not has_altitudes and frame.origin_geo is not None:
+        frame = replace(frame, origin_geo=(*frame.origin_geo[:2], 0.0))
     _compare_up(scene, frame, warnings)
     return frame
 

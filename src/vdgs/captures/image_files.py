@@ -35,7 +35,10 @@ APPLE_SUFFIXES = {".heic", ".heif", ".hif", ".avif", ".jxl"}
 RAW_SUFFIXES = {
     ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw", ".raw", ".gpr", ".3fr", ".iiq",
 }  # fmt: skip
-UNREAD_IMAGE_SUFFIXES = APPLE_SUFFIXES | RAW_SUFFIXES
+JPEG_SUFFIXES = {".jfif", ".jpe", ".jif", ".mpo"}
+VIDEO_SUFFIXES = {".mp4", ".mov", ".avi", ".mkv", ".mts", ".m2ts", ".m4v", ".insv", ".360", ".wmv"}
+OTHER_SUFFIXES = {".jp2", ".j2k", ".gif", ".psd", ".exr", ".hdr", ".tga", ".rjpeg", ".insp"}
+UNREAD_IMAGE_SUFFIXES = APPLE_SUFFIXES | RAW_SUFFIXES | JPEG_SUFFIXES | OTHER_SUFFIXES
 #: Maker and model of a camera in EXIF.
 _CAMERA_TAGS = {0x010F, 0x0110}
 #: Headers that announce more pixels than this are refused rather than decoded.

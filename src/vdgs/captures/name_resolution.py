@@ -20,8 +20,10 @@ def to_nfc(name: str) -> str:
 
 
 def to_colmap_name(name: str) -> str:
-    """The name as COLMAP's lists, which part words at blanks, can hold it: `_` for each blank, letters composed."""
-    return "".join("_" if letter.isspace() else letter for letter in to_nfc(name))
+    """The name as COLMAP's lists, which part words at blanks and skip lines that begin with `#`, can hold it: `_` for
+    each blank and for a `#` that it begins with, letters composed."""
+    plain = "".join("_" if letter.isspace() else letter for letter in to_nfc(name))
+    return f"_{plain[1:]}" if plain.startswith("#") else plain
 
 
 def match_key(name: str) -> str:

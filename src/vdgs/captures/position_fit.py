@@ -67,7 +67,7 @@ class PositionFit:
     gps_std: np.ndarray
     """Standard deviation of a position east, north and up [3], metres."""
     altitude: str
-    """`used`, `drifts` or `unused`."""
+    """`used`, `drifts`, `unused`, or `none` where there are none."""
     drift_m: float
     """By which altitudes drift from the first photograph to the last."""
     scale_error: float
@@ -106,15 +106,17 @@ class Problem:
     """The factor from the cameras' world to metres, and its standard deviation as a share."""
     stated: np.ndarray | None = None
     """Standard gps_std [n, 3] that the receiver itself states."""
+    has_altitudes: bool = True
+    """Whether the targets have heights; where not, these are anything, and the fit is one in the plane."""
 
 
 def fit_positions(problem: Problem) -> PositionFit:
     """The likeliest similarity of cameras that are not mirrored; needs three positions."""
     starts = [_upright_start(problem)]
-    if not is_collinear(problem.centers):
+    if problem.has_altitudes and not is_collinear(problem.centers):
         starts.append(fit_similarity_robust(problem.centers, problem.targets, 100)[0])
-    models = ["used", "unused"]
-    if len(problem.centers) >= ENOUGH_TO_DOUBT:
+    models = ["used", "unused"] if problem.has_altitudes else ["unused"]
+    if problem.has_altitudes and len(problem.centers) >= ENOUGH_TO_DOUBT:
         models.append("drifts")
     found = [_settle(problem, start, model) for start in starts for model in models]
     best = min(found, key=lambda fit: fit.score)
@@ -186,7 +188,7 @@ def _settle(problem: Problem, start: Similarity, model: str) -> PositionFit:
     )
     return PositionFit(
         similarity=similarity, inliers=inliers, residuals=placed - problem.targets, placed=placed,
-        gps_std=gps_std, altitude=model, drift_m=state.drift if model == "drifts" else 0.0,
+        gps_std=gps_std, altitude=model if problem.has_altitudes else "none", drift_m=state.drift if model == "drifts" else 0.0,
         scale_error=scale, wandering_error=2 * math.sqrt(wandering[0]), north_error_deg=north,
         level_error_deg=level, place_error_m=place,
         score=_score(problem, state, inliers, gps_std, model),
@@ -196,6 +198,8 @@ def _settle(problem: Problem, start: Similarity, model: str) -> PositionFit:
 def _residuals(problem: Problem, state: _State, middle: np.ndarray, times: np.ndarray) -> np.ndarray:
     off = state.scale * (problem.centers - middle) @ state.rotation.T + state.middle - problem.targets
     off[:, 2] += state.drift * times
+    if not problem.has_altitudes:
+        off[:, 2] = 0.0
     return off
 
 

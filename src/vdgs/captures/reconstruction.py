@@ -62,16 +62,16 @@ class AccuracyFacts:
     """How good a place is; errors are those that 95 % stay below. None: not known, or nothing says it."""
 
     place_m: tuple[float, ...] | None
-    """Of the whole scene, across and up."""
+    """Of the whole scene, across and up; across alone where no altitudes are known."""
     scale_percent: float | None
     scale_m: float | None
     """What that makes at the edge of the flight."""
     north_deg: float | None
     level_deg: float | None
     positions_m: tuple[float, ...] | None
-    """Standard deviation of a recorded position east, north and up, as found from the flight itself."""
+    """Standard deviation of a recorded position east, north and (where it has one) up, as found from the flight."""
     altitude: str = "used"
-    """Recorded altitudes: `used`, `drifts` (with time, left out) or `unused`."""
+    """Recorded altitudes: `used`, `drifts` (with time, left out), `unused`, or `none` where there are none."""
     altitude_drift_m: float = 0.0
 
     @property
@@ -79,7 +79,7 @@ class AccuracyFacts:
         """One line for tables."""
         parts = []
         if self.place_m is not None:
-            parts.append(f"place ±{self.place_m[0]:.2g} m across, ±{self.place_m[1]:.2g} m up")
+            parts.append(f"place {by_axis(self.place_m, ('across', 'up'), '±{:.2g}')}")
         if self.scale_percent is not None:
             edge = f" (±{self.scale_m:.2g} m at the edge)" if self.scale_m is not None else ""
             parts.append(f"scale ±{self.scale_percent:.2g} %{edge}")
@@ -106,7 +106,7 @@ class ReconstructionReport:
     altitude_reference: str
     origin: tuple[float, ...] | None
     residual_rms_m: tuple[float, ...] | None
-    """East, north, up."""
+    """East, north, up; without the last where no altitudes are known."""
     positions_rejected: int
     focal_fixed: bool
     focal_reason: str
@@ -170,9 +170,8 @@ def report_rows(metadata: ReconstructionReport) -> list[tuple[str, str]]:
     ]
     rows += _accuracy_rows(metadata.accuracy) if metadata.accuracy is not None else []
     if metadata.residual_rms_m is not None:
-        east, north, up = metadata.residual_rms_m
         left_out = f"; {metadata.positions_rejected} positions not trusted" if metadata.positions_rejected else ""
-        rows.append(("Position residuals", f"RMS {east:.2f} m east, {north:.2f} m north, {up:.2f} m up{left_out}"))
+        rows.append(("Position residuals", f"RMS {by_axis(metadata.residual_rms_m)}{left_out}"))
     rows += _survey_rows(metadata)
     held = "held" if metadata.focal_fixed else "fitted"
     for camera in metadata.cameras:
@@ -194,15 +193,20 @@ def report_rows(metadata: ReconstructionReport) -> list[tuple[str, str]]:
     return rows
 
 
+def by_axis(values: tuple[float, ...], axes: tuple[str, ...] = ("east", "north", "up"), number: str = "{:.2f}") -> str:
+    """Metres with the axes that they are along; the last is missing where no altitudes are known."""
+    return ", ".join(f"{number.format(value)} m {axis}" for value, axis in zip(values, axes, strict=False))
+
+
 def _accuracy_rows(accuracy: AccuracyFacts) -> list[tuple[str, str]]:
     rows = [("Accuracy", accuracy.summary)] if accuracy.summary else []
     if accuracy.positions_m is not None:
-        east, north, up = accuracy.positions_m
         words = {
+            "none": "; no altitudes",
             "drifts": f"; altitudes drift by {accuracy.altitude_drift_m:+.0f} m, left out",
             "unused": "; altitudes are of no use, left out",
         }.get(accuracy.altitude, "")
-        found = f"{east:.2g} m east, {north:.2g} m north, {up:.2g} m up (one standard deviation, by the flight itself)"
+        found = f"{by_axis(accuracy.positions_m, number='{:.2g}')} (one standard deviation, by the flight itself)"
         rows.append(("Positions are good to", f"{found}{words}"))
     return rows
 

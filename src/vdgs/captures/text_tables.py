@@ -18,7 +18,7 @@ _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
 #: A photograph's name in front of a line whose words are parted by blanks, which may be in the name too.
 _NAME_WITH_BLANKS = re.compile(r"\s*([^\"#][^\"]*?\.(?:jpe?g|png|tiff?|webp|dng|heic))\s+(?=\S)", re.IGNORECASE)
 #: Lines that are looked at for the separator.
-_LOOKED_AT = 20
+LOOKED_AT = 20
 
 
 class Line(NamedTuple):
@@ -45,7 +45,7 @@ def read_lines(file: Path) -> list[Line]:
         raise CaptureError(f"{file}: cannot be read ({error.strerror}).") from error
     text = _decoded(data)
     if "\x00" in text:
-        raise CaptureError(f"{file}: is not a CSV table (it holds bytes that are no text).")
+        raise CaptureError(f"{file}: is not a CSV table (it holds bytes that are no text). Save a spreadsheet as CSV.")
     return [Line(k, line.strip(" \r")) for k, line in enumerate(text.splitlines(), 1) if line.strip()]
 
 
@@ -63,7 +63,7 @@ def _decoded(data: bytes) -> str:
 
 def rows_of(lines: Sequence[Line]) -> list[Row]:
     """The lines as words, without quotes; decimal commas are points where the separator is another."""
-    separator = _separator([line.text for line in lines[:_LOOKED_AT]])
+    separator = _separator([line.text for line in lines[:LOOKED_AT]])
     rows = []
     for line in lines:
         if separator is None:

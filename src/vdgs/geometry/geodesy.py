@@ -36,6 +36,19 @@ def geodetic_from_ecef(ecef: np.ndarray) -> np.ndarray:
     return np.stack([np.degrees(latitude), np.degrees(np.arctan2(y, x)), altitude], axis=1)
 
 
+def median_place(geodetic: np.ndarray) -> tuple[float, float, float]:
+    """The median latitude, longitude (-180 to 180) and altitude of places [n, 3], n > 0, on both sides of the
+    antimeridian too."""
+    latitude, _, altitude = np.median(geodetic, axis=0).tolist()
+    away = np.median(wrap_degrees(geodetic[:, 1] - geodetic[0, 1]))
+    return latitude, float(wrap_degrees(geodetic[0, 1] + away)), altitude
+
+
+def wrap_degrees(angles: np.ndarray) -> np.ndarray:
+    """Angles [n] as they are from -180 to below 180."""
+    return (angles + 180.0) % 360.0 - 180.0
+
+
 def enu_axes(latitude_deg: float, longitude_deg: float) -> np.ndarray:
     """Rows: east, north, up as Earth-centred unit vectors, [3, 3]."""
     latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)

@@ -163,6 +163,6 @@ def _intrinsics(camera: pycolmap.Camera) -> Intrinsics:
     if not camera.verify_params() or camera.has_bogus_params(0.1, 10.0, 1.0):
         raise CaptureError(
             f"the fitted lens of a camera ({camera.params_to_string()}) is none that there is: the photographs do not "
-            "tell it. Hold the focal length: --focal hold"
+            "tell it. Hold the focal length: --focal fixed"
         )
     return Intrinsics(camera.model_name, tuple(float(value) for value in camera.params), camera.width, camera.height)

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from vdgs.captures.image_files import same_aspect
-from vdgs.sfm.focal_length import unzoomed
+from vdgs.sfm.focal_length import Lens, unzoomed
 from vdgs.sfm.image_metadata import UNKNOWN_CAMERA, ImageMetadata
 
 #: Focal lengths within this share of each other are one.
@@ -38,7 +38,8 @@ def cross_checked(photographs: Sequence[ImageMetadata]) -> list[ImageMetadata]:
 
 
 def _zoom_once(group: list[ImageMetadata]) -> list[ImageMetadata]:
-    """Lenses whose EXIF focal length has the digital zoom in it, as the others of the camera tell, without a second."""
+    """Lenses whose EXIF focal length has the digital zoom in it, as the others of the camera tell, without a second;
+    doubted where nothing tells, because all are zoomed."""
     whole = {photo.lens.focal_mm for photo in group if photo.lens and photo.lens.focal_mm and photo.lens.zoom == 1}
     found = []
     for photo in group:
@@ -47,8 +48,21 @@ def _zoom_once(group: list[ImageMetadata]) -> list[ImageMetadata]:
             already = any(_near(lens.focal_mm / lens.zoom, focal) for focal in whole)
             if already and not any(_near(lens.focal_mm, focal) for focal in whole):
                 photo = replace(photo, lens=unzoomed(lens))
+            elif not whole and not lens.zoom_confirmed and lens.zoom > 1 + ONE_FOCAL:
+                photo = _doubted(photo, lens)
         found.append(photo)
     return found
+
+
+def _doubted(photo: ImageMetadata, lens: Lens) -> ImageMetadata:
+    """With a focal length that is fitted, because it may have the digital zoom in it twice."""
+    pixels = lens.focal * max(photo.size)
+    doubt = (
+        f"all photographs of this camera are zoomed digitally, and nothing tells whether EXIF's focal length has that "
+        f"in it already ({lens.zoom:g} times: {pixels:.0f} px if not, as taken, {pixels / lens.zoom:.0f} px if so); it "
+        "is fitted. If heights look wrong, add a photograph without zoom, or mend DigitalZoomRatio"
+    )
+    return replace(photo, lens=replace(lens, doubt=doubt), doubts=(*photo.doubts, doubt))
 
 
 def _near(one: float, other: float) -> bool:
@@ -74,7 +88,7 @@ def strays(photographs: Sequence[ImageMetadata]) -> tuple[dict[str, str], dict[s
 
     A picture without any tags is a stray only where most others have them.
     """
-    reasons = _smaller_copies(photographs)
+    reasons = _smaller_copies(photographs) | _thermal(photographs)
     tagged = [photo for photo in photographs if not is_bare(photo)]
     bare = [photo for photo in photographs if is_bare(photo) and photo.name not in reasons]
     lent = dict[str, ImageMetadata]()
@@ -100,6 +114,19 @@ def strays(photographs: Sequence[ImageMetadata]) -> tuple[dict[str, str], dict[s
 def is_bare(photo: ImageMetadata) -> bool:
     """Whether nothing says which camera took a picture, through what, and where."""
     return photo.camera == UNKNOWN_CAMERA and photo.lens is None and photo.lat_lon is None
+
+
+def _thermal(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
+    """Pictures of a thermal camera beside those that the same drone took of the same (DJI: `_T` and `_V`, `_W`, `_Z`)."""
+    stems = {str(PurePosixPath(photo.name).with_suffix("")).upper(): photo for photo in photographs}
+    found = {}
+    for stem, photo in stems.items():
+        beside = [stems[stem[:-1] + other] for other in "VWZ" if stem.endswith("_T") and stem[:-1] + other in stems]
+        if any(photo.width * photo.height < each.width * each.height for each in beside):
+            found[photo.name] = (
+                f"is the thermal picture beside {beside[0].name}: give a folder of those alone to use them"
+            )
+    return found
 
 
 def _smaller_copies(photographs: Sequence[ImageMetadata]) -> dict[str, str]:

@@ -83,6 +83,9 @@ def read_altitude(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[float
         value = first_number(xmp, "AbsoluteAltitude", "sensefly:AltitudeWGS84", "AltitudeWGS84", "exif:GPSAltitude")
     elif str(reference).strip("\x00 ") in ("1", "3") or reference in (1, 3):
         value = -abs(value)
+    absolute = first_number(xmp, "AbsoluteAltitude")
+    if value is not None and absolute is not None and value * absolute < 0 and abs(value + absolute) < 1:
+        value = absolute  # drones and programs write the wrong reference; the sign in XMP is written out
     if value is None or abs(value) > HIGHEST_M:
         return None, ""
     ellipsoidal = first_number(xmp, "AltitudeWGS84")

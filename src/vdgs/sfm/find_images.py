@@ -7,7 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from vdgs.captures.image_files import IMAGE_SUFFIXES, RAW_SUFFIXES, UNREAD_IMAGE_SUFFIXES
+from vdgs.captures.image_files import (
+    IMAGE_SUFFIXES,
+    JPEG_SUFFIXES,
+    OTHER_SUFFIXES,
+    RAW_SUFFIXES,
+    UNREAD_IMAGE_SUFFIXES,
+    VIDEO_SUFFIXES,
+)
 from vdgs.captures.name_resolution import to_colmap_name
 from vdgs.captures.strays import is_result, previewed_stem, walk
 from vdgs.errors import CaptureError
@@ -32,7 +39,8 @@ class Found:
 
     def notes(self) -> list[str]:
         """What people should know of what is not used."""
-        notes = [f"{_count(number, suffix)} not read: {_remedy(suffix)}." for suffix, number in self.unread.items()]
+        kinds = [kind for kind in self.unread if kind not in _VIDEO]  # films lie on most cards
+        notes = [f"{_count(self.unread[kind], kind)} not read: {_remedy(kind)}." for kind in kinds]
         for why in dict.fromkeys(self.skipped.values()):
             names = [name for name, reason in self.skipped.items() if reason == why]
             shown = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
@@ -86,7 +94,7 @@ def _count_other(found: Found, path: Path, stems: set[str]) -> None:
     if path.name.startswith("._") or path.name.lower() in _SILENT:
         return
     found.others += path.is_file()
-    if suffix in UNREAD_IMAGE_SUFFIXES and path.stem.lower() not in stems:
+    if suffix in UNREAD_IMAGE_SUFFIXES | VIDEO_SUFFIXES and path.stem.lower() not in stems:
         found.unread[suffix] += 1
 
 
@@ -112,6 +120,12 @@ def _count(number: int, suffix: str) -> str:
 def _remedy(suffix: str) -> str:
     if suffix in RAW_SUFFIXES:
         return "develop them to JPEG or TIFF first, with their tags"
+    if suffix in JPEG_SUFFIXES:
+        return "they are JPEG; rename them to .jpg"
+    if suffix in VIDEO_SUFFIXES:
+        return "take single frames out of them first (ffmpeg -i VIDEO -vf fps=1 -qscale:v 2 frame_%05d.jpg)"
+    if suffix in OTHER_SUFFIXES:
+        return "convert them to JPEG, PNG or TIFF, with their tags"
     return "convert them to JPEG, with their tags (phones and macOS export them so)"
 
 

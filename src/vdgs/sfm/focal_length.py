@@ -46,6 +46,8 @@ class Lens:
     """The digital zoom that `focal` is multiplied by."""
     focal_mm: float | None = None
     """EXIF's FocalLength."""
+    zoom_confirmed: bool = False
+    """Whether the 35 mm equivalent has the zoom in it, where EXIF's FocalLength has not."""
 
 
 def read_lens(
@@ -66,14 +68,15 @@ def read_lens(
         (_times(_by_sensor(focal_mm, SENSOR_WIDTH_MM.get(model)), kept), f"EXIF's focal length, the sensor of {model}"),
     ]
     sides = (_number(details.get(0xA002)) or 0.0, _number(details.get(0xA003)) or 0.0) if cut else (width, height)
-    equivalent = _times(_by_equivalent(equivalent_mm, *sides), kept / zoom)
+    equivalent = as_written = _times(_by_equivalent(equivalent_mm, *sides), kept / zoom)
     equivalent = _zoomed_equivalent(equivalent, [focal for focal, _ in measured], zoom)
     ways = [*measured, (equivalent, EQUIVALENT)]
     known = [(focal, source) for focal, source in ways if focal and MIN_FOCAL < focal < MAX_FOCAL]
     if not known:
         return None
     focal, source, doubt = _agreed(known, longer, copied=equivalent_mm == focal_mm)
-    return Lens(focal, source, doubt, 1.0 if source == EQUIVALENT else zoom, focal_mm)
+    confirmed = as_written is not None and _alike(as_written, focal) and not _alike(as_written, focal / zoom)
+    return Lens(focal, source, doubt, 1.0 if source == EQUIVALENT else zoom, focal_mm, confirmed)
 
 
 def unzoomed(lens: Lens) -> Lens:

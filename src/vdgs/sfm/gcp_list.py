@@ -14,7 +14,7 @@ from jaxtyping import Float
 from vdgs.captures.coordinate_systems import to_geodetic
 from vdgs.captures.name_resolution import NameLookup, ambiguity_message
 from vdgs.errors import CaptureError
-from vdgs.geometry.geodesy import enu_from_geodetic
+from vdgs.geometry.geodesy import enu_from_geodetic, median_place
 from vdgs.geometry.similarity import is_collinear
 from vdgs.sfm.image_list import ImageList
 from vdgs.sfm.image_metadata import ImageMetadata
@@ -74,8 +74,7 @@ class GcpList:
     @property
     def median_origin(self) -> tuple[float, float, float]:
         """An origin, where positions give none."""
-        latitude, longitude, height = np.median([point.geodetic for point in self.points], axis=0).tolist()
-        return latitude, longitude, height
+        return median_place(np.array([point.geodetic for point in self.points]))
 
 
 @dataclass(frozen=True)

@@ -73,8 +73,15 @@ def georeference(model: pycolmap.Reconstruction, prepared: ReconstructionPlan, h
     _refuse_upside_down(model, ground, placed, prepared)
     georegistration.transform_model(model, Similarity(1.0, np.eye(3), np.array([0.0, 0.0, -ground])))
     latitude, longitude, altitude = prepared.origin
-    origin = (latitude, longitude, altitude + ground) if placed.is_georeferenced else None
+    altitude = altitude + ground if _knows_altitude(prepared) else 0.0
+    origin = (latitude, longitude, altitude) if placed.is_georeferenced else None
     return Georeferenced(model, placed, origin, survey)
+
+
+def _knows_altitude(prepared: ReconstructionPlan) -> bool:
+    """Whether control points or positions say how high the place is."""
+    control = prepared.gcps
+    return prepared.gps_priors.has_altitudes or (control is not None and control.has_control_points)
 
 
 def _by_positions(model: pycolmap.Reconstruction, prepared: ReconstructionPlan) -> Georegistration | AlignmentFailure:
@@ -247,7 +254,7 @@ class Doubts:
         if self.by_gps is None or self.by_gps.accuracy is None or self.by_gps.accuracy.place_m is None:
             return ""
         accuracy, gps = self.by_gps.accuracy, self.by_gps.similarity
-        error_across, error_up = self.by_gps.accuracy.place_m
+        error_across, *error_up = self.by_gps.accuracy.place_m
         ratio = similarity.scale / gps.scale
         if abs(math.log(ratio)) > SCALES_APART + (accuracy.scale_percent or 0.0) / 100:
             return (
@@ -263,7 +270,7 @@ class Doubts:
             )
         height = float(np.median(targets[:, 2]))
         level = float(np.median(targets[:, 2]) - off[2])
-        if abs(off[2]) > GPS_UP_M + error_up:
+        if error_up and abs(off[2]) > GPS_UP_M + error_up[0]:
             feet = abs(self._altitude_off_in_feet(height, level)) < 0.5 * abs(off[2])
             if feet or abs(off[2]) > HEIGHTS_M:
                 return (

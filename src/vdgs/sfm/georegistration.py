@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from vdgs.captures.position_fit import PositionFit, Problem, Up, fit_positions
 from vdgs.captures.reconstruction import AccuracyFacts
 from vdgs.captures.up_axis import up_by_views
 from vdgs.errors import CaptureError
-from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu
+from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu, median_place
 from vdgs.geometry.similarity import Similarity, is_collinear, rotation_to_z
 from vdgs.sfm.gps_priors import MIN_POSITIONS, GpsPriors
 from vdgs.sfm.image_metadata import ImageMetadata
@@ -53,7 +53,7 @@ class Georegistration:
     position_rows: np.ndarray
     """Which positions have a placed photograph, [m] rows of `GpsPriors`."""
     residuals: np.ndarray
-    """Of them, placed minus recorded, metres [m, 3]."""
+    """Of them, placed minus recorded, metres [m, 3]; [m, 2] where no altitudes are recorded."""
     inliers: np.ndarray
     """Which of them the placing trusts, [m] bool."""
     accuracy: AccuracyFacts | None = None
@@ -100,6 +100,7 @@ def georegister(
         up=up,
         scale=scale,
         stated=positions.gps_std[rows] if stated else None,
+        has_altitudes=positions.has_altitudes,
     )
     others = _other_readings(targets, positions.origin) if up.sure else {}
     wrong = mirrored(centers, targets, up.direction, others)
@@ -120,25 +121,31 @@ def georegister(
     how += f"; up by {up.how}" if line or fit.altitude != "used" else ""
     how += "; heights by the barometer" if barometer else ""
     notes += _of_altitudes(fit, barometer) + _of_north(fit.similarity, images, taken)
-    residuals = fit.placed - targets
     return Georegistration(
         similarity=fit.similarity,
         method=how,
         position_rows=rows,
-        residuals=residuals,
+        residuals=_recorded(fit.placed - targets, positions),
         inliers=fit.inliers,
-        accuracy=accuracy_of(fit, targets),
+        accuracy=accuracy_of(fit, targets, positions),
         notes=tuple(notes),
     )
 
 
-def accuracy_of(fit: PositionFit, targets: np.ndarray) -> AccuracyFacts:
+def _recorded(values: np.ndarray, positions: GpsPriors) -> np.ndarray:
+    """Of values [n, 3] along each axis those that positions say something about: without up where none has an
+    altitude."""
+    return values if positions.has_altitudes else values[..., :2]
+
+
+def accuracy_of(fit: PositionFit, targets: np.ndarray, positions: GpsPriors) -> AccuracyFacts:
     """The accuracy of a fit, for people."""
+    place = fit.place_error_m if positions.has_altitudes else fit.place_error_m[:1]
     away = np.linalg.norm(targets[:, :2] - targets[:, :2].mean(axis=0), axis=1)
     return AccuracyFacts(
-        place_m=fit.place_error_m, scale_percent=100 * fit.scale_error, scale_m=float(fit.scale_error * away.max()),
+        place_m=place, scale_percent=100 * fit.scale_error, scale_m=float(fit.scale_error * away.max()),
         north_deg=min(180.0, fit.north_error_deg), level_deg=min(180.0, fit.level_error_deg),
-        positions_m=tuple(fit.gps_std.tolist()), altitude=fit.altitude, altitude_drift_m=fit.drift_m,
+        positions_m=tuple(_recorded(fit.gps_std, positions).tolist()), altitude=fit.altitude, altitude_drift_m=fit.drift_m,
     )  # fmt: skip
 
 
@@ -150,16 +157,9 @@ def _best_fit(problem: Problem, taken: Sequence[ImageMetadata]) -> tuple[Positio
         return fit, False
     targets = problem.targets.copy()
     targets[:, 2] = relative + np.median(targets[:, 2] - relative)
-    steady = fit_positions(
-        Problem(
-            centers=problem.centers,
-            targets=targets,
-            times=problem.times,
-            up=problem.up,
-            scale=problem.scale,
-            stated=problem.stated,
-        )
-    )
+    steady = fit_positions(replace(problem, targets=targets, has_altitudes=True))
+    if not problem.has_altitudes:
+        return (steady, True) if steady.altitude == "used" else (fit, False)
     return (steady, True) if steady.altitude == "used" and steady.score < fit.score else (fit, False)
 
 
@@ -209,8 +209,7 @@ def _other_readings(targets: np.ndarray, origin: tuple[float, float, float]) -> 
     exchanged = geodetic[:, [1, 0, 2]]
     found = {"they are mirrored": targets * np.array([-1.0, 1.0, 1.0])}
     if np.abs(exchanged[:, 0]).max() < 90:
-        latitude, longitude, height = np.median(exchanged, axis=0).tolist()
-        found["latitude and longitude change places"] = enu_from_geodetic(exchanged, (latitude, longitude, height))
+        found["latitude and longitude change places"] = enu_from_geodetic(exchanged, median_place(exchanged))
     return found
 
 
@@ -263,7 +262,7 @@ def registration_in_place(
         similarity=stays,
         method=method,
         position_rows=rows,
-        residuals=centers - targets,
+        residuals=_recorded(centers - targets, positions),
         inliers=np.ones(len(rows), bool),
         accuracy=accuracy,
         notes=notes,

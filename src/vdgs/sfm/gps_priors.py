@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from vdgs.captures.georeference import match_rows
-from vdgs.captures.gps_tables import GpsRow, read_gps_table
+from vdgs.captures.gps_tables import GpsRow, read_gps_table, with_altitudes
 from vdgs.errors import CaptureError
-from vdgs.geometry.geodesy import enu_from_geodetic
+from vdgs.geometry.geodesy import enu_from_geodetic, median_place, wrap_degrees
 from vdgs.sfm.image_metadata import ImageMetadata
 
 #: Positions nearer than this to 0, 0 (degrees) are a receiver without satellites.
@@ -22,6 +22,8 @@ OUTLIER_FACTOR, OUTLIER_DISTANCE_M = 10.0, 1000.0
 SAME_FLIGHT_DEG = 0.05
 #: Positions that spread less than this (metres) say nothing: the receiver kept the first, or nobody moved.
 MIN_SPREAD_M = 2.0
+#: An altitude of exactly 0 among others that are farther from it (metres) is a default (choice).
+FAR_FROM_ZERO_M = 30.0
 #: Fewer positions fix no scale and no directions.
 MIN_POSITIONS = 3
 #: No receiver is better than this, whatever it writes (metres).
@@ -44,6 +46,8 @@ class GpsPriors:
     source: str
     notes: tuple[str, ...]
     """What people should know: positions left out, and why."""
+    has_altitudes: bool = True
+    """False where most positions have none: then heights here are 0, and positions count in the plane alone."""
 
     def __len__(self) -> int:
         return len(self.image_indices)
@@ -93,11 +97,17 @@ def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, st
         if far.any():
             notes.append(f"{_some(names, far)}: the position is far from all others; not used.")
         known &= ~far
-    flat = known & ~np.isfinite(geodetic[:, 2])
-    if flat.any():
-        notes.append(f"{_some(names, flat)}: the position has no altitude; not used.")
-    known &= ~flat
-    index = np.flatnonzero(known)
+    geodetic = _without_single_zeros(geodetic, known)
+    kept, has_altitudes = with_altitudes(geodetic[:, 2], known)
+    if not has_altitudes:
+        geodetic = np.where([True, True, False], geodetic, 0.0)
+        notes.append(
+            f"{_some(names, known)}: the positions have no altitudes: they tell scale and north, the views or attitudes "
+            "up; heights above the sea are not known."
+        )
+    elif (kept != known).any():
+        notes.append(f"{_some(names, known & ~kept)}: the position has no altitude; not used.")
+    index = np.flatnonzero(kept)
     origin = _origin(geodetic[index])
     enu = enu_from_geodetic(geodetic[index], origin) if len(index) else np.zeros((0, 3))
     if len(index) >= MIN_POSITIONS and np.ptp(enu[:, :2], axis=0).max() < MIN_SPREAD_M:
@@ -109,7 +119,11 @@ def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, st
     deviations = np.array(
         [_position_std(photographs[i], recorded.rows.get(i), table, std_m) for i in index.tolist()]
     ).reshape(-1, 3)
-    kinds = list(dict.fromkeys(recorded.kinds[i] for i in index.tolist()))
+    kinds = (
+        list(dict.fromkeys(recorded.kinds[i] for i in index.tolist()))
+        if has_altitudes
+        else ["not recorded; 0 is that of the median point"]
+    )
     if len(kinds) > 1:
         notes.append(f"altitudes are of several kinds ({'; '.join(kinds)}): heights may not fit together.")
     return GpsPriors(
@@ -120,6 +134,7 @@ def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, st
         altitude_reference="; ".join(kinds),
         source=recorded.source,
         notes=tuple(notes),
+        has_altitudes=has_altitudes,
     )
 
 
@@ -159,6 +174,14 @@ def _without_default_altitudes(recorded: _Recorded, photographs: Sequence[ImageM
     return _Recorded(geodetic, kinds, recorded.source, notes, {})
 
 
+def _without_single_zeros(geodetic: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Without altitudes of exactly 0 where the others are far from it: those of a receiver that had none."""
+    zero, others = geodetic[:, 2] == 0, known & (np.nan_to_num(geodetic[:, 2]) != 0)
+    if not zero.any() or not others.any() or abs(np.median(geodetic[others, 2])) < FAR_FROM_ZERO_M:
+        return geodetic
+    return np.where(zero[:, None] & [False, False, True], np.nan, geodetic)
+
+
 def _refuse_exchanged(geodetic: np.ndarray, photographs: Sequence[ImageMetadata], table: Path) -> None:
     """Raise CaptureError where a table's positions become those of the photographs once exchanged or mirrored."""
     own = np.array([photo.lat_lon or (np.nan, np.nan) for photo in photographs])
@@ -168,7 +191,7 @@ def _refuse_exchanged(geodetic: np.ndarray, photographs: Sequence[ImageMetadata]
     given, own = geodetic[both, :2], own[both]
 
     def fits(places: np.ndarray) -> bool:
-        return bool(np.abs(np.median(places - own, axis=0)).max() < SAME_FLIGHT_DEG)
+        return bool(np.abs(np.median(wrap_degrees(places - own), axis=0)).max() < SAME_FLIGHT_DEG)
 
     if fits(given):
         return
@@ -207,11 +230,11 @@ def _unmatched(rows: Sequence[GpsRow], found: Mapping[int, GpsRow], table: Path)
 
 def _outliers(geodetic: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Positions that cannot be of this flight, [n] bool."""
-    middle = np.median(geodetic[known], axis=0)
     level = geodetic.copy()
-    level[:, 2] = np.where(np.isfinite(geodetic[:, 2]), geodetic[:, 2], 0.0)
+    heights = geodetic[known & np.isfinite(geodetic[:, 2]), 2]
+    level[:, 2] = np.where(np.isfinite(geodetic[:, 2]), geodetic[:, 2], np.median(heights) if len(heights) else 0.0)
     altitudes = level[known, 2]
-    enu = enu_from_geodetic(level, (float(middle[0]), float(middle[1]), float(np.median(altitudes))))
+    enu = enu_from_geodetic(level, median_place(level[known]))
     across = np.linalg.norm(enu[:, :2], axis=1)
     up = np.abs(level[:, 2] - np.median(altitudes))
     with np.errstate(invalid="ignore"):
@@ -223,8 +246,7 @@ def _outliers(geodetic: np.ndarray, known: np.ndarray) -> np.ndarray:
 def _origin(geodetic: np.ndarray) -> tuple[float, float, float]:
     if not len(geodetic):
         return 0.0, 0.0, 0.0
-    latitude, longitude, altitude = (float(value) for value in np.median(geodetic, axis=0))
-    return latitude, longitude, altitude
+    return median_place(geodetic)
 
 
 def _position_std(

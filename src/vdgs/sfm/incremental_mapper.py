@@ -66,7 +66,7 @@ def should_fix_focal(
 
 def _is_survey_grid(positions: GpsPriors) -> bool:
     """Whether photographs were taken from one height all over an area, as a survey is, and not around something."""
-    if not positions.usable or is_nearly_collinear(positions.enu, positions.gps_std):
+    if not positions.usable or not positions.has_altitudes or is_nearly_collinear(positions.enu, positions.gps_std):
         return False
     plane = positions.enu[:, :2] - positions.enu[:, :2].mean(axis=0)
     axes, spread, _ = np.linalg.svd(plane, full_matrices=False)

@@ -158,6 +158,12 @@ def _warnings(collection: ImageList, overlap: float | None, views: float | None,
     if without:
         found.append(f"{_first(without)}: nothing says the focal length; it is fitted from a guess.")
     found += _doubts(photographs)
+    round_ = [photo.name for photo in photographs if photo.width == 2 * photo.height and photo.lens is None]
+    if round_:
+        found.append(
+            f"{_first(round_)}: exactly twice as wide as high, of an unknown lens. Panoramas of 360° cannot be used: cut "
+            "views with a lens out of them first."
+        )
     endless = [photo.name for photo in photographs if not photo.whole]
     if endless:
         found.append(f"{_first(endless)}: the file lacks its end marker, but nothing of the picture; used.")

@@ -176,7 +176,7 @@ def _warnings(
         if not held and camera.focal_source != "a guess" and abs(drift) > MAX_FOCAL_DRIFT:
             found.append(
                 f"{camera.name}: the fitted focal length is {drift:+.0%} of what {camera.focal_source} says; if "
-                "heights look wrong, hold it: --focal hold"
+                "heights look wrong, hold it: --focal fixed"
             )
     if height is not None and recorded is not None and abs(height / recorded - 1) > MAX_HEIGHT_DRIFT:
         found.append(

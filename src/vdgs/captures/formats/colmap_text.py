@@ -64,9 +64,11 @@ def read_cameras_text(file: Path) -> dict[int, Intrinsics]:
 
 
 def read_images_text(file: Path, with_points: bool = True) -> Iterator[ColmapImage]:
-    """Two lines an image: the pose, then its points (which may be an empty line)."""
+    """Two lines an image: the pose, then its points (which may be an empty line, or missing)."""
     lines = _lines(file)
-    for number, line in lines:
+    following: tuple[int, str] | None = None
+    while (each := following or next(lines, None)) is not None:
+        (number, line), following = each, None
         if not line.strip():
             continue
         words = line.split(maxsplit=9)
@@ -77,10 +79,25 @@ def read_images_text(file: Path, with_points: bool = True) -> Iterator[ColmapIma
         except (ValueError, IndexError):
             raise _bad_line(file, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME") from None
         shown = next(lines, (number + 1, ""))
+        if _is_pose(shown[1]):
+            following, shown = shown, (number, "")
         triples = _triples(file, *shown) if with_points else np.zeros((0, 3))
         yield ColmapImage(
             tuple(pose[:4]), tuple(pose[4:]), camera, name, sample_observations(triples[:, 2], triples[:, :2])
         )
+
+
+def _is_pose(line: str) -> bool:
+    """Whether a line begins another image, by its name, where the points of the one before should be."""
+    words = line.split(maxsplit=9)
+    try:
+        _ = int(words[0]), int(words[8]), [float(word) for word in words[1:8]]
+        float(words[9].split()[0])
+    except IndexError:
+        return False
+    except ValueError:
+        return len(words) == 10 and words[0].isdecimal() and words[8].isdecimal()
+    return False
 
 
 def _triples(file: Path, number: int, line: str) -> np.ndarray:

@@ -12,6 +12,8 @@ from vdgs.errors import CaptureError
 
 MAX_HEADER_BYTES = 1 << 16
 GRAY = 128
+#: Formats of a PLY file, and the order of its bytes.
+BYTE_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 #: What red, green and blue are called; 3DGS has the zeroth coefficient of spherical harmonics.
 HARMONICS = ("f_dc_0", "f_dc_1", "f_dc_2")
 COLORS = (
@@ -20,9 +22,9 @@ COLORS = (
 )  # fmt: skip
 SH_0 = 0.28209479177387814
 PLY_DTYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
-    "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4",
-    "float32": "<f4", "double": "<f8", "float64": "<f8",
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
+    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
 }  # fmt: skip
 
 
@@ -33,13 +35,13 @@ class _Header:
     layout: np.dtype
     size: int
     types: Mapping[str, str]
-    """What kind of number each property is, `u1` to `<f8`."""
+    """What kind of number each property is, `u1` to `f8`."""
 
 
 def read_point_cloud(file: Path) -> tuple[np.ndarray, np.ndarray]:
     """Points [n, 3] float64 and colours [n, 3] uint8 (mid-grey where the file has none).
 
-    Reads `ascii` and `binary_little_endian`, vertices first; floating-point colours may run from 0 to 1,
+    Reads `ascii` and both binary formats, vertices first; floating-point colours may run from 0 to 1,
     those of 16 bits to 65535. Raises `CaptureError` naming the file if it is missing, of another kind, or shorter than
     it announces.
     """
@@ -55,10 +57,10 @@ def read_point_cloud(file: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def _header(data: bytes, file: Path) -> _Header:
     def fail(what: str) -> CaptureError:
-        return CaptureError(f"{file}: {what}. A PLY point cloud with x, y, z (ascii or little-endian) is needed.")
+        return CaptureError(f"{file}: {what}. A PLY point cloud with x, y, z is needed.")
 
-    end = data.find(b"end_header", 0, MAX_HEADER_BYTES)
-    start = data.find(b"\n", end) + 1
+    end = data.find(b"\nend_header", 0, MAX_HEADER_BYTES)
+    start = data.find(b"\n", end + 1) + 1
     if not data.startswith(b"ply") or end < 0 or start == 0:
         raise fail("has no PLY header")
     form, element, count = "", "", -1
@@ -77,11 +79,12 @@ def _header(data: bytes, file: Path) -> _Header:
             if len(words) != 3 or words[1] not in PLY_DTYPES or words[2] in dict(fields):
                 raise fail(f"has a vertex property that is not understood ({line.strip()!r})")
             fields.append((words[2], PLY_DTYPES[words[1]]))
-    if form not in ("ascii", "binary_little_endian"):
+    if form not in BYTE_ORDERS:
         raise fail(f"is of format {form!r}")
     if count < 0 or not {"x", "y", "z"} <= set(dict(fields)):
         raise fail("announces no vertices with x, y, z")
-    return _Header(form, count, np.dtype(fields), start, dict(fields))
+    layout = np.dtype([(name, BYTE_ORDERS[form] + kind) for name, kind in fields])
+    return _Header(form, count, layout, start, dict(fields))
 
 
 def _binary(data: bytes, header: _Header, file: Path) -> np.ndarray:

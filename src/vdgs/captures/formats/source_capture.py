@@ -40,7 +40,7 @@ PINHOLE_WHEN_ZERO = {
 MAX_SIDE_PX = 100_000
 MAX_LISTED = 10
 #: A capture is used without the photographs that are gone where at least this share is there (choice).
-LEAST_THERE = 0.5
+LEAST_THERE = 2 / 3
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,8 @@ def find_duplicates(names: Iterable[str]) -> list[str]:
 def safe_name(name: str, file: Path, what: str = "image name", root: Path | None = None) -> str:
     """A name in posix form. Raises `CaptureError`, saying `what` it is, if it leaves its folder.
 
-    An absolute one may be meant too, if it lies in `root`: it is then relative to that.
+    An absolute one may be meant too, if it lies in `root`: it is then relative to that; so may one of another machine
+    or folder, if its end is a file in `root`.
     """
     if root is not None and Path(name).is_absolute():
         with suppress(ValueError):
@@ -152,6 +153,11 @@ def safe_name(name: str, file: Path, what: str = "image name", root: Path | None
     posix = name.replace("\\", "/")
     parts = PurePosixPath(posix).parts
     climbs = ".." in parts or posix.startswith("/") or bool(PureWindowsPath(name).drive)
+    if climbs and root is not None:
+        ends = ["/".join(parts[k:]) for k in range(1, len(parts)) if ".." not in parts[k:]]
+        inside = next((end for end in ends if "\0" not in end and (root / end).is_file()), None)
+        if inside is not None:
+            return inside
     if not parts or climbs or any(ord(letter) < 32 for letter in name):
         raise CaptureError(
             f"{file}: the {what} {name!r} is not a path inside the {'image folder' if root is None else 'capture'}. "

@@ -10,11 +10,14 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import torch
 
+from vdgs.captures.formats.ply_reader import BYTE_ORDERS, PLY_DTYPES
 from vdgs.errors import VdgsError
 from vdgs.export.formats.axes import Z_UP, Axes, axes_named
 from vdgs.export.formats.export_scene import CHUNK_SIZE, ExportMetadata, ExportScene, concatenate
@@ -26,11 +29,6 @@ from vdgs.system.quoting import header_line
 MAX_HEADER_BYTES = 1 << 16
 #: Characters of a fact in a comment.
 LONGEST_COMMENT = 200
-PLY_TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
-    "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4",
-    "float32": "<f4", "double": "<f8", "float64": "<f8",
-}  # fmt: skip
 SCALE_NAMES = tuple(f"scale_{axis}" for axis in range(3))
 ROTATION_NAMES = tuple(f"rot_{part}" for part in range(4))
 DC_NAMES = tuple(f"f_dc_{channel}" for channel in range(3))
@@ -113,11 +111,11 @@ def read_ply(path: Path) -> Gaussians:
 
 
 def read_ply_chunks(path: Path) -> Iterator[Gaussians]:
-    """The Gaussians of a binary PLY file of 3DGS, properties in any order, at most `CHUNK_SIZE` at a time.
+    """The Gaussians of a PLY file of 3DGS, binary or ASCII, properties in any order, at most `CHUNK_SIZE` at a time.
 
     Raises VdgsError for a file that is missing, of another kind, or shorter than it announces.
     """
-    layout, count, start, axes = _header(path)
+    form, layout, count, start, axes = _header(path)
     names = layout.names or ()
     rest = sum(name.startswith("f_rest_") for name in names)
     missing = [name for name in property_names(0) if name not in names and not name.startswith("n")]
@@ -125,14 +123,25 @@ def read_ply_chunks(path: Path) -> Iterator[Gaussians]:
         what = f"has no {missing[0]}" if missing else f"has {rest} f_rest properties"
         raise VdgsError(f"{path}: {what}; this is no PLY of 3DGS. Point clouds have other layouts.")
     held = (path.stat().st_size - start) // layout.itemsize
-    if held < count:
+    if form != "ascii" and held < count:
         raise VdgsError(f"{path}: announces {count} Gaussians but holds {held}. It is truncated; write it again.")
-    for first in range(0, max(count, 1), CHUNK_SIZE):
-        try:
-            table = np.fromfile(path, layout, min(CHUNK_SIZE, count - first), offset=start + first * layout.itemsize)
-        except OSError as error:
-            raise VdgsError(f"{path}: cannot be read ({error.strerror or error}).") from error
-        yield axes.to_ground(_gaussians(table, rest))
+    try:
+        with path.open("rb") as file:
+            file.seek(start)
+            for first in range(0, max(count, 1), CHUNK_SIZE):
+                yield axes.to_ground(_gaussians(_table(file, form, layout, min(CHUNK_SIZE, count - first)), rest))
+    except OSError as error:
+        raise VdgsError(f"{path}: cannot be read ({error.strerror or error}).") from error
+    except ValueError as error:
+        raise VdgsError(f"{path}: is damaged or truncated ({error}). Write it again.") from error
+
+
+def _table(file: BinaryIO, form: str, layout: np.dtype, count: int) -> np.ndarray:
+    """The next so many vertices. Raises ValueError where there are fewer."""
+    if form != "ascii" or not count:
+        return np.frombuffer(file.read(count * layout.itemsize), layout)
+    rows = [tuple(line.split()) for line in islice(file, count)]
+    return np.array(rows, [(name, "f4") for name in layout.names or ()]).reshape(count)
 
 
 def _gaussians(table: np.ndarray, rest: int) -> Gaussians:
@@ -148,8 +157,8 @@ def _gaussians(table: np.ndarray, rest: int) -> Gaussians:
     )  # fmt: skip
 
 
-def _header(path: Path) -> tuple[np.dtype, int, int, Axes]:
-    """Layout of a vertex, their number, where they begin, and the axes that a comment names."""
+def _header(path: Path) -> tuple[str, np.dtype, int, int, Axes]:
+    """The file's format, layout of a vertex, their number, where they begin, and the axes that a comment names."""
     try:
         with path.open("rb") as file:
             data = file.read(MAX_HEADER_BYTES)
@@ -170,9 +179,9 @@ def _header(path: Path) -> tuple[np.dtype, int, int, Axes]:
             elements += 1
             count = int(words[2]) if elements == 1 and words[1] == "vertex" and words[2].isdecimal() else count
         elif words[:1] == ["property"] and elements == 1:
-            if len(words) != 3 or words[1] not in PLY_TYPES:
+            if len(words) != 3 or words[1] not in PLY_DTYPES:
                 raise VdgsError(f"{path}: has a property that is not understood ({' '.join(words)}).")
-            fields.append((words[2], PLY_TYPES[words[1]]))
-    if form != "binary_little_endian" or count < 0:
-        raise VdgsError(f"{path}: is no binary PLY of vertices (format {form!r}). Write it as binary_little_endian.")
-    return np.dtype(fields), count, start, axes
+            fields.append((words[2], PLY_DTYPES[words[1]]))
+    if form not in BYTE_ORDERS or count < 0:
+        raise VdgsError(f"{path}: is no PLY of vertices (format {form!r}). Write it as binary_little_endian.")
+    return form, np.dtype([(name, BYTE_ORDERS[form] + kind) for name, kind in fields]), count, start, axes
