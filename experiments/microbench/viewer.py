@@ -29,7 +29,7 @@ import psutil
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 
 from support.viewer import Guest
-from vdgs.captures.camera_height import FOV_DEG
+from vdgs.captures.first_view import FOV_DEG
 from vdgs.geometry.camera import Camera
 from vdgs.rendering.camera_paths import look_at_pose
 from vdgs.runs.open_run import open_run

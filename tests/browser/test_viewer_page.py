@@ -16,9 +16,13 @@ pytest.importorskip("viser", reason="viser is not installed (pip install 'vdgs[v
 
 from support.commands import wait_until
 from support.viewer import expected, needs_browser, open_page, quiet, trained
+from vdgs.captures.loading import load_capture
+from vdgs.config.capture_options import CaptureOptions
 from vdgs.geometry.camera import Camera
 from vdgs.runs.open_run import open_run
+from vdgs.viewer import navigation
 from vdgs.viewer.client_session import LAYER_LABELS, ClientSession
+from vdgs.viewer.measurement import SCALE_BAR_FILE
 from vdgs.viewer.server import serve
 
 pytestmark = [pytest.mark.browser, needs_browser, pytest.mark.xdist_group("viewer")]
@@ -105,10 +109,37 @@ def test_a_browser_shows_every_layer_and_goes_where_buttons_lead(viewer):
         for one, other in combinations(shown, 2):
             assert np.abs(shown[one] - shown[other]).mean() > 3, (one, other)
         visitor._layer_choice.value = "Color"
-        for name, looks in (("From above", (0, 0, -1)), ("All", (0, 0.71, -0.71))):
+        pose = navigation.overview_pose(viewer.scene.capture)
+        overview = (pose.look_at - pose.position) / pose.distance
+        for name, looks in (("From above", (0, 0, -1)), ("All", overview)):
             wait_until(lambda name=name: page.press(name))
             wait_until(lambda looks=looks: visitor.camera.forward == pytest.approx(looks, abs=0.02))
             up = -visitor.camera.camera_from_world[1, :3]
-            assert up[1] > 0.7  # north is up
-            assert abs(up[0]) < 0.01
+            assert up[1] > 0.7 if name == "From above" else up[2] > 0
             wait_until(lambda: np.abs(seen() - painted()).mean() < 6)
+
+
+@quiet
+def test_a_distance_measured_in_a_browser_gives_the_capture_its_metres(viewer, run, tmp_path):
+    wait_until(lambda: not viewer.sessions)
+    with open_page(viewer.access.local_url(), *WINDOW) as page:
+        page.call("Page.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
+        wait_until(lambda: viewer.sessions)
+        (visitor,) = viewer.sessions.values()
+        wait_until(lambda: in_window(visitor))
+        panel = visitor.point_panel.measure_panel
+        panel._switch.value, panel._meters.value = True, 25.0
+        for count, place in enumerate(((300.0, 380.0), (420.0, 460.0)), 1):
+            page.click(*place)
+            wait_until(lambda count=count: len(panel.ruler.clicked) == count)
+        wait_until(lambda: "units** ±" in panel._measured.content)
+        wait_until(lambda: page.press("Save known distance"))
+        file = tmp_path / SCALE_BAR_FILE
+        wait_until(file.is_file)
+        wait_until(lambda: f"--scale-bar {SCALE_BAR_FILE}" in panel._command.content)
+        before = viewer.scene.capture.ground
+        ground = load_capture(viewer.scene.capture.root, CaptureOptions(up="z", scale_bar=file)).ground
+        ends = ground.to_ground(before.apply_inverse(panel.ruler.points()))
+        assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(25.0, rel=1e-3)
+        assert ground.metric
+        assert not list(run.rglob(SCALE_BAR_FILE))  # nothing is written where the server is

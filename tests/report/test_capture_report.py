@@ -18,7 +18,7 @@ from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.geometry.similarity import sample_points
 from vdgs.report.capture_report import inspect_capture, print_report
-from vdgs.report.capture_stats import format_length
+from vdgs.system.units import format_length
 from vdgs.visibility.visibility_counts import count_visibility, visibility_stats
 
 
@@ -55,7 +55,7 @@ def test_the_report_says_what_is_there(capture, tmp_path):
     assert report.fraction_below[5] == pytest.approx((visibility < 5).mean())
     assert report.visibility_quantiles[50] == np.median(visibility)
     assert report.camera_height[1] == pytest.approx(10, abs=0.1)
-    assert report.ground_sample_distance == pytest.approx(10 / (0.9 * 64), rel=0.2)
+    assert report.place.ground_sampling_distance == pytest.approx(10 / (0.9 * 64), rel=0.2)
     assert not report.metric
     stored = json.loads((tmp_path / "out" / "report.json").read_text(encoding="utf-8"))
     assert stored["points"] == report.points
@@ -75,7 +75,7 @@ def test_the_table_is_printed_with_its_warnings(tmp_path):
     stream = io.StringIO()
     print_report(report, Console(file=stream, width=120))
     printed = stream.getvalue()
-    assert "3 (2 train, 1 test), colmap" in printed
+    assert "3 of 3 used (2 for training, 1 for tests)" in printed
     assert "Warning: " in printed
     assert "fewer than 3 training cameras" in " ".join(printed.split())
 
@@ -108,6 +108,6 @@ def test_samples_are_repeatable_and_lengths_are_for_people():
 def test_a_real_capture_is_as_its_readme_says(tmp_path):
     """copr: 21.1 m to the surface and 0.99 cm per pixel at full size, so 3.96 at a quarter."""
     report = inspect_capture(load_capture(data_folder("copr"), CaptureOptions(images="images_4")), tmp_path)
-    assert report.ground_sample_distance == pytest.approx(0.0396, rel=0.05)
+    assert report.place.ground_sampling_distance == pytest.approx(0.0396, rel=0.05)
     assert report.tilt_deg == pytest.approx(8.2, abs=0.1)
     assert report.warnings == []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -34,9 +35,10 @@ from vdgs.viewer import navigation, overlays
 from vdgs.viewer.image_comparison import nearest_view_index, warp_image
 from vdgs.viewer.layers import LAYERS, DisplayOptions, Painter
 from vdgs.viewer.lod import LodPyramid
-from vdgs.viewer.measurement import Ruler
+from vdgs.viewer.measure_panel import scale_markdown
+from vdgs.viewer.measurement import KnownDistance, MeasuredPoint, Ruler
 from vdgs.viewer.path_panel import camera_at_time, path_json
-from vdgs.viewer.picking import pick_point, pick_position, thumbnail
+from vdgs.viewer.picking import measured_point, pick_point, pick_position, thumbnail
 from vdgs.viewer.viewer_scene import ViewerScene
 
 pytestmark = pytest.mark.xdist_group("viewer_scene")
@@ -329,13 +331,45 @@ def test_a_thumbnail_marks_the_place(scene):
 def test_a_ruler_measures(scene):
     ruler = Ruler("m")
     for corner in ((0, 0, 0), (3, 4, 0), (3, 4, 2)):
-        ruler.add(np.array(corner, float))
+        ruler.add(MeasuredPoint(np.array(corner, float), 0.1))
     assert (ruler.distance(), ruler.height_difference()) == (7.0, 2.0)
+    assert ruler.distance_deviation() == pytest.approx(0.1 * 6**0.5)  # the point in the middle moves both segments
+    assert "± 0.24" in ruler.to_markdown()
     ruler.clear()
     for corner in ((0, 0, 5), (2, 0, 1), (2, 3, 0), (0, 3, 0)):
-        ruler.add(np.array(corner, float))
+        ruler.add(MeasuredPoint(np.array(corner, float)))
     assert ruler.area() == 6.0
     assert "area **6.00 m²**" in ruler.to_markdown()
+
+
+def test_no_metres_are_said_of_a_scene_without_a_scale():
+    ruler = Ruler("units")
+    for corner in ((0, 0, 0), (2, 0, 0), (2, 3, 0)):
+        ruler.add(MeasuredPoint(np.array(corner, float)))
+    assert "3.00 square units" in ruler.to_markdown()
+    assert re.search(r"\bm\b|m²", ruler.to_markdown()) is None
+
+
+def test_a_measured_point_lies_where_its_photographs_show_it(scene):
+    camera = camera_at(0.4, 0.3)
+    point = measured_point(scene, "merged", camera, 30.0, 20.0)
+    assert point is not None
+    assert 0 < point.deviation < 0.5
+    views = {view.name: view.camera for view in scene.capture.views}
+    assert 2 <= len(point.rays) <= 8
+    for name, x, y in point.rays:
+        there = views[name].camera_from_world @ [*point.position, 1.0]
+        assert (there[0] / there[2], there[1] / there[2]) == pytest.approx((x, y), abs=1e-9)
+
+
+def test_known_distances_say_how_large_a_unit_is_and_what_contradicts_itself():
+    one, other = MeasuredPoint(np.zeros(3)), MeasuredPoint(np.array([0.0, 0.0, 4.0]))
+    known = [KnownDistance(one, other, 10.0), KnownDistance(one, other, 10.2)]
+    said = scale_markdown(known, "my place")
+    assert "**2.525 m**" in said
+    assert "vdgs run 'my place' --scale-bar known-distances.txt" in said
+    assert "contradict" not in said
+    assert "contradict" in scale_markdown([*known, KnownDistance(one, other, 20.0)], "my place")
 
 
 def test_lines_lie_where_cameras_and_borders_are(scene):

@@ -61,6 +61,8 @@ class Capture:
     ground: GroundFrame
     #: What a person should know but need not mend.
     warnings: tuple[str, ...] = field(default=())
+    #: Photographs that are there and not used: without a camera, or left out by an option.
+    num_unused_images: int = 0
 
     @property
     def train_views(self) -> tuple[View, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,6 +27,8 @@ class Georef:
     """Latitude and longitude in degrees, altitude in metres; None where it has no place on Earth."""
     accuracy: str
     """In words; empty where it says none."""
+    method: str = ""
+    """How the place was found, in words; empty where it says none."""
 
 
 def read_georef(file: Path) -> Georef:
@@ -40,9 +42,9 @@ def read_georef(file: Path) -> Georef:
         raise CaptureError(f"{file}: cannot be read ({error.strerror}).") from error
     except (ValueError, RecursionError) as error:
         raise CaptureError(f"{file}: is not JSON ({error}). Mend it, or remove it to do without.") from None
-    accuracy = str(content.get("accuracy") or "") if isinstance(content, dict) else ""
+    accuracy, method = ("", "") if not isinstance(content, dict) else (_accuracy(content), _words(content, "method"))
     if isinstance(content, dict) and content.get("frame") == LOCAL_FRAME:
-        return Georef(None, accuracy)
+        return Georef(None, accuracy, method)
     if not isinstance(content, dict) or "ENU" not in str(content.get("frame", "ENU")):
         raise CaptureError(
             f"{file}: describes no ENU frame (x east, y north, z up, metres). Only ENU worlds are "
@@ -53,7 +55,24 @@ def read_georef(file: Path) -> Georef:
     except (KeyError, TypeError, ValueError):
         raise CaptureError(f"{file}: must give numbers for {', '.join(ORIGIN_KEYS)}.") from None
     check_geodetic(origin, file)
-    return Georef(origin, accuracy)  # type: ignore[arg-type]
+    return Georef(origin, accuracy, method)  # type: ignore[arg-type]
+
+
+def _words(content: Mapping[str, object], key: str) -> str:
+    value = content.get(key)
+    return value if isinstance(value, str) else ""
+
+
+def _accuracy(content: Mapping[str, object]) -> str:
+    """What a georef.json says of its accuracy; of a file that gives residuals alone, these."""
+    if stated := _words(content, "accuracy"):
+        return stated
+    for key, of in (("gcp", "control points"), ("gps", "positions")):
+        values = content.get(f"{key}_residual_rms_m_xyz")
+        if isinstance(values, list) and len(values) == 3 and all(isinstance(each, (int, float)) for each in values):
+            east, north, up = values
+            return f"residuals of {of}: RMS {east:.2g} m east, {north:.2g} m north, {up:.2g} m up"
+    return ""
 
 
 def match_gps(names: Sequence[str], file: Path) -> tuple[np.ndarray, np.ndarray, bool]:

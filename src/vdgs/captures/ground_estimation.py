@@ -8,6 +8,8 @@ Where the up axis and the scale come from, in this order:
 4. What the format promises about its world (Mega-NeRF, MatrixCity).
 5. Estimate (`up`): drones look down on what is flat, others hold their cameras level.
 
+Known distances (`--scale-bar`) give any of them its metres.
+
 All arithmetic is float64. Choice: in a frame that is not georeferenced the origin is the median sparse point,
 so z = 0 is the median height of the ground; where metres are unknown the median camera flies at
 `NOMINAL_CAMERA_HEIGHT`, or is so far from the points where it is not above them (`heights`).
@@ -23,6 +25,7 @@ import numpy as np
 from vdgs.captures.camera_height import view_distance
 from vdgs.captures.formats.source_capture import SourceCapture, WorldPrior
 from vdgs.captures.georeference import match_gps, read_georef
+from vdgs.captures.known_distances import MOST_APART, known_scale_of_views
 from vdgs.captures.plane_fit import mirrored
 from vdgs.captures.position_fit import Problem, Up, fit_positions
 from vdgs.captures.reconstruction import by_axis
@@ -61,8 +64,37 @@ class _Scene:
 def find_ground_frame(source: SourceCapture, root: Path, options: CaptureOptions) -> tuple[GroundFrame, list[str]]:
     """The ground frame of a capture, and warnings for people.
 
-    Raises `CaptureError` for georeferences that cannot be used.
+    Raises `CaptureError` for georeferences and known distances that cannot be used.
     """
+    frame, warnings = _frame_without_distances(source, root, options)
+    if options.scale_bar is not None:
+        frame = _scaled(frame, source, options.scale_bar)
+    return frame, warnings
+
+
+def _scaled(frame: GroundFrame, source: SourceCapture, file: Path) -> GroundFrame:
+    """The frame in the metres of known distances; where it has a place on Earth, its middle stays."""
+    factor, share = known_scale_of_views(file, source.views, source.points)
+    ratio = factor / frame.scale
+    if frame.metric and abs(ratio - 1) > MOST_APART:
+        raise CaptureError(
+            f"{file}: its distances make the scene {ratio:.3g} times as large as {frame.description} does. Are they in "
+            "feet, where metres are expected? Mend them, or leave the georeference out (--up)."
+        )
+    middle = _middle(frame.to_ground(source.points)) if frame.origin_geo else np.zeros(3)
+    scale = f"scale ±{200 * share:.2g} % (95 %)"
+    return replace(
+        frame, scale=factor, translation=ratio * frame.translation + (1 - ratio) * middle, metric=True,
+        description=f"{frame.description.partition('; median camera height')[0]}; metres by known distances "
+        f"({file.name}), {scale}",
+        accuracy=f"{frame.accuracy}; {scale}" if frame.accuracy else scale,
+        method=f"{frame.method}; scale by known distances ({file.name})".removeprefix("; "),
+    )  # fmt: skip
+
+
+def _frame_without_distances(
+    source: SourceCapture, root: Path, options: CaptureOptions
+) -> tuple[GroundFrame, list[str]]:
     scene = _scene(source)
     warnings: list[str] = []
     if options.up != "auto":
@@ -114,6 +146,8 @@ def _georeferenced(scene: _Scene, file: Path, warnings: list[str]) -> GroundFram
             translation=np.zeros(3),
             metric=True,
             description=f"world is metres, z up ({file.name}{accuracy})",
+            accuracy=georef.accuracy,
+            method=georef.method or f"{file.name}, which does not say how",
         )
     origin, how = georef.origin, f"world is ENU metres ({file.name}{accuracy})"
     middle = np.median(scene.centers, axis=0)
@@ -121,8 +155,9 @@ def _georeferenced(scene: _Scene, file: Path, warnings: list[str]) -> GroundFram
     if shift.any():
         how = f"{how}, origin moved by {np.abs(shift).max():.0f} m"
     frame = GroundFrame(
-        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, description=how, origin_geo=origin
-    )
+        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, description=how, origin_geo=origin,
+        accuracy=georef.accuracy, method=georef.method or f"{file.name}, which does not say how",
+    )  # fmt: skip
     if np.linalg.norm(middle) > MAX_ENU_DISTANCE_M:
         warnings.append(
             f"{file.name}: the cameras are {np.linalg.norm(middle) / 1000:,.0f} km away from the origin, where its "
@@ -181,7 +216,9 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
     axes = slice(3 if has_altitudes else 2)
     rms = float(np.sqrt((fit.residuals[inliers, axes] ** 2).sum(axis=1).mean()))
     place = by_axis(fit.place_error_m if has_altitudes else fit.place_error_m[:1], ("across", "up"), "±{:.2g}")
-    how = f"GPS of {inliers.sum()} photographs, RMS {rms:.2f} m; place {place}, scale ±{fit.scale_error:.2%} (95 %)"
+    method = f"GPS of {inliers.sum()} photographs, RMS {rms:.2f} m"
+    accuracy = f"place {place}, scale ±{fit.scale_error:.2%} (95 %)"
+    how = f"{method}; {accuracy}"
     frame = GroundFrame(
         scale=similarity.scale,
         rotation=similarity.rotation,
@@ -189,6 +226,8 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
         metric=True,
         description=how,
         origin_geo=origin,
+        accuracy=accuracy,
+        method=f"{method} ({file.name})",
     )
     frame = _shifted(frame, -_middle(frame.to_ground(scene.points)), how)
     if not has_altitudes and frame.origin_geo is not None:

@@ -36,9 +36,11 @@ class MatchedView:
     file: ImageFile
 
 
-def match_images(root: Path, source: SourceCapture, options: CaptureOptions, warnings: list[str]) -> list[MatchedView]:
-    """Every view with its image file; images without a camera become a warning, and so do some cameras without
-    an image. Raises CaptureError where many are missing."""
+def match_images(
+    root: Path, source: SourceCapture, options: CaptureOptions, warnings: list[str]
+) -> tuple[list[MatchedView], int]:
+    """Every view with its image file, and how many images have no camera: these become a warning, and so do some
+    cameras without an image. Raises CaptureError where many are missing."""
     folder = root / source.images
     available = ImageNameIndex(find_images(folder)) if folder.is_dir() else ImageNameIndex({})
     found_as = [available.find(view.name) for view in source.views]
@@ -63,7 +65,7 @@ def match_images(root: Path, source: SourceCapture, options: CaptureOptions, war
     if spare:
         shown = ", ".join(spare[:5]) + (", ..." if len(spare) > 5 else "")
         warnings.append(f"{len(spare)} images have no camera and are not used ({shown}).")
-    return _fitted(root, source, paths, options, warnings)
+    return _fitted(root, source, paths, options, warnings), len(spare)
 
 
 def _elsewhere(names: list[str], available: ImageNameIndex, folder: Path, warnings: list[str]) -> Sequence[str | None]:

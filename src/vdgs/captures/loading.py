@@ -42,7 +42,7 @@ def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
     source = read_source(root, options)
     warnings = list(source.warnings)
     source = _without_bad_points(source, warnings)
-    photographs = match_images(root, source, options, warnings)
+    photographs, unused = match_images(root, source, options, warnings)
     photographs = _undistorted(root, photographs, options, warnings)
     _refuse_tiny(photographs, options)
     ground, ground_warnings = find_ground_frame(source, root, options)
@@ -64,6 +64,7 @@ def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
     return Capture(
         root=root, source=source.source, images=source.images, views=tuple(views), points=points,
         point_colors=colors, ground=ground, warnings=(*warnings, *ground_warnings),
+        num_unused_images=unused + len(photographs) - len(views),
     )  # fmt: skip
 
 

@@ -127,6 +127,8 @@ class ReconstructionReport:
     """Surveyed points, those that placed the model and those held out."""
     accuracy: AccuracyFacts | None = None
     """Of the place; None where there is none."""
+    flown: tuple[str, ...] = ()
+    """When the first and the last photograph were taken, as EXIF has it; empty where it says nothing."""
 
     def gcp_rmse_m(self, used_as: str) -> tuple[float, float, float] | None:
         """East, north and up of check points, or of control points; None where there are none."""

@@ -45,6 +45,10 @@ class CaptureOptions:
     apart without."""
     georef: Path | None = None
     """georef.json saying that the world already is ENU metres. Default: the one in the capture folder."""
+    scale_bar: Path | None = None
+    """Text file of known distances, which give the scale in metres: lines `NAME px py photograph` (pixels) or `NAME ray
+    x y photograph` mark points in two photographs or more, lines `NAME NAME metres` say how far they are apart. `vdgs
+    view` writes such a file."""
     max_images: Annotated[int | None, Range(2, MAX_COUNT)] = None
     """Use only this many photographs: those nearest to the middle of the flight."""
     undistort: bool = False

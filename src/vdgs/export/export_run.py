@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Int
 from rich.console import Console
 
-from vdgs.captures.camera_height import default_view
+from vdgs.captures.first_view import default_view
 from vdgs.captures.output_guard import check_not_among_inputs, check_output
 from vdgs.config.commands import ExportRequest
 from vdgs.distributed.sharded_job import ExecutionOptions

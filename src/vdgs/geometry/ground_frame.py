@@ -23,6 +23,10 @@ class GroundFrame(Similarity):
     #: frame that is moved keeps its axes.
     axes_geo: tuple[float, float] | None = None
 
+    #: How good place and scale are, and by what they were found, where that is known; for people.
+    accuracy: str = ""
+    method: str = ""
+
     @property
     def axes_origin(self) -> tuple[float, float]:
         """Latitude and longitude (deg) of the place whose east, north and up are the axes (georeferenced frames)."""

@@ -67,7 +67,10 @@ def reconstruct_if_needed(run_request: RunRequest, console: Console) -> RunReque
     request = make_sfm_request(run_request)
     reconstruct(request, console, RunFolder(run_request.output).drive_lock())
     return replace(
-        run_request, capture=request.output, extra_image_folders=(), options=replace(run_request.options, gps=None)
+        run_request,
+        capture=request.output,
+        extra_image_folders=(),
+        options=replace(run_request.options, gps=None, scale_bar=None),
     )
 
 

@@ -13,7 +13,8 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 from vdgs.captures.capture import Capture
 from vdgs.plots.style import DPI, INK, NOTE_SIZE, TEXT_SIZE, VISIBILITY_CMAP, style_axes, write_png
 from vdgs.plots.visibility_map import CameraMarks, VisibilityMapData, plot_visibility_map, visibility_color_norm
-from vdgs.report.capture_stats import CaptureReport, format_length
+from vdgs.report.capture_stats import CaptureReport
+from vdgs.system.units import format_length
 from vdgs.visibility.visibility_counts import LOW_VISIBILITY_LIMITS
 
 
@@ -76,7 +77,7 @@ def _titles(capture: Capture, report: CaptureReport) -> tuple[str, str, str]:
     lines = [
         f"{report.points:,} points",
         f"camera height {report.camera_height[1]:.3g} {report.unit}",
-        f"{format_length(report.ground_sample_distance, report.unit)} per pixel",
+        f"{format_length(report.place.ground_sampling_distance, report.unit)} per pixel",
         f"a point is seen by {report.visibility_quantiles[50]:g} training cameras (median)",
     ]
     return name, "  ·  ".join(lines), "points coloured by V; pale: V on level ground"

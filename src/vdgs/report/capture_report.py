@@ -14,12 +14,14 @@ from rich.table import Table
 from vdgs.captures.capture import Capture
 from vdgs.captures.image_checks import ImageCheckReport
 from vdgs.captures.output_guard import check_not_among_inputs
+from vdgs.captures.place_facts import place_rows
 from vdgs.captures.reconstruction import ReconstructionReport, excluded_lines, report_rows
 from vdgs.captures.validation import format_reprojection, validate_capture
 from vdgs.geometry.similarity import sample_points
 from vdgs.report.capture_figures import draw_capture_map, draw_visibility_histogram
-from vdgs.report.capture_stats import CaptureReport, format_length, measure_capture
+from vdgs.report.capture_stats import CaptureReport, measure_capture
 from vdgs.system.atomic_files import to_jsonable, write_json
+from vdgs.system.units import format_length
 from vdgs.visibility.visibility_counts import count_visibility
 
 #: Points looked at when there are more, and fewer where there are many cameras.
@@ -81,14 +83,13 @@ def _rows(report: CaptureReport) -> list[tuple[str, str]]:
     below = ", ".join(f"{share:.1%} by < {limit}" for limit, share in report.fraction_below.items())
     low, middle, high = report.camera_height
     rows = [
-        ("Photographs", f"{report.num_images} ({report.train} train, {report.test} test), {report.source}"),
+        *place_rows(report.place),
+        ("Source", report.source),
         ("Images", f"{report.images or '.'}/: {sizes}" + (f" and {more} more sizes" if more > 0 else "") + " px"),
         ("Focal length", f"{report.focal_px:.1f} px ({report.field_of_view_deg:.0f}° across)"),
         ("Sparse points", f"{report.points}, median spacing {format_length(report.point_spacing, unit)}"),
         ("Ground frame", report.ground + ("" if report.metric else " (not metric)")),
-        ("Extent", " x ".join(f"{value:.4g}" for value in report.extent) + f" {unit} (1-99 % of the points)"),
         ("Camera height", f"{middle:.4g} {unit} (from {low:.4g} to {high:.4g}), tilt {report.tilt_deg:.1f}°"),
-        ("Ground sample distance", f"{format_length(report.ground_sample_distance, unit)} per pixel"),
         ("Cameras per point V", quantiles),
         ("Poorly seen points", f"{below} cameras; Gini {report.visibility_gini:.2f}"),
         ("Masks", _masks(report)),
@@ -97,7 +98,7 @@ def _rows(report: CaptureReport) -> list[tuple[str, str]]:
     ]
     if report.origin_geo is not None:
         latitude, longitude, altitude = report.origin_geo
-        rows.insert(5, ("Origin", f"{latitude:.7f}, {longitude:.7f}, {altitude:.1f} m"))
+        rows.append(("Origin", f"{latitude:.7f}, {longitude:.7f}, {altitude:.1f} m"))
     return rows
 
 

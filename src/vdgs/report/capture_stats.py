@@ -10,20 +10,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from scipy.spatial import cKDTree
 
 from vdgs.captures.capture import Capture
 from vdgs.captures.image_checks import ImageCheckReport
+from vdgs.captures.place_facts import PlaceFacts, measure_place
 from vdgs.captures.validation import ValidationReport
-from vdgs.geometry.similarity import sample_points
-from vdgs.visibility.visibility_counts import LOW_VISIBILITY_LIMITS, count_visibility, visibility_stats
+from vdgs.visibility.visibility_counts import LOW_VISIBILITY_LIMITS, visibility_stats
 
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureReport:
     """Numbers about a capture; lengths are in `unit` of the ground frame."""
 
+    #: What the report of a run and `vdgs status` begin with.
+    place: PlaceFacts
     source: str
     images: str
     unit: str
@@ -42,13 +43,9 @@ class CaptureReport:
     metric: bool
     #: Latitude, longitude (deg) and altitude (m) of the origin, where known.
     origin_geo: tuple[float, float, float] | None
-    #: x, y, z between the 1 % and 99 % quantiles of the sparse points.
-    extent: tuple[float, float, float]
     #: Minimum, median, maximum height of the cameras above the median sparse point.
     camera_height: tuple[float, float, float]
     tilt_deg: float
-    #: Ground sample distance: median of depth / focal length over the views, per pixel.
-    ground_sample_distance: float | None
     #: V of the points: quantiles by percent, mean, and Gini coefficient (0 = all seen alike).
     visibility_quantiles: dict[int, float]
     visibility_mean: float
@@ -84,7 +81,6 @@ def measure_capture(
     ground_height = float(np.median(points[:, 2]))
     heights = np.array([camera.position[2] for camera in cameras]) - ground_height
     sizes, counts = np.unique([(c.width, c.height) for c in cameras], axis=0, return_counts=True)
-    low, high = np.quantile(points, [0.01, 0.99], axis=0)
     spacing = cKDTree(points).query(points, k=2)[0][:, 1] if len(points) > 1 else np.zeros(1)
     focal = float(np.median([camera.fx for camera in cameras]))
     fields = [2 * np.degrees(np.arctan(camera.width / 2 / camera.fx)) for camera in cameras]
@@ -93,6 +89,7 @@ def measure_capture(
     origin = capture.ground.origin_geo
     seen, image_warnings = visibility_stats(visibility), image_check.warnings if image_check else ()
     return CaptureReport(
+        place=measure_place(capture),
         source=capture.source,
         images=capture.images,
         unit=capture.ground.unit,
@@ -107,10 +104,8 @@ def measure_capture(
         ground=capture.ground.description,
         metric=capture.ground.metric,
         origin_geo=None if origin is None else (float(origin[0]), float(origin[1]), float(origin[2])),
-        extent=tuple(float(value) for value in high - low),  # type: ignore[arg-type]
         camera_height=(float(heights.min()), float(np.median(heights)), float(heights.max())),
         tilt_deg=float(np.median(tilts)),
-        ground_sample_distance=_ground_sample_distance(capture, points),
         visibility_quantiles=seen.quantiles,
         visibility_mean=seen.mean,
         visibility_gini=seen.gini,
@@ -127,16 +122,6 @@ def measure_capture(
     )
 
 
-def _ground_sample_distance(capture: Capture, points: np.ndarray) -> float | None:
-    few = np.ascontiguousarray(sample_points(points, 20_000))
-    positions, distances = torch.from_numpy(few), []
-    for view in capture.views:
-        seen = np.flatnonzero(count_visibility(positions, [view.camera]).numpy())
-        if len(seen):
-            distances.append(float(np.median(view.camera.project(few[seen])[1])) / view.camera.fx)
-    return float(np.median(distances)) if distances else None
-
-
 def _findings(visibility: np.ndarray) -> list[str]:
     """What the visibility says that a person should know."""
     thin = float((visibility < LOW_VISIBILITY_LIMITS[0]).mean())
@@ -146,10 +131,3 @@ def _findings(visibility: np.ndarray) -> list[str]:
         f"{thin:.0%} of the points are seen by fewer than {LOW_VISIBILITY_LIMITS[0]} training cameras; "
         "expect these parts to come out poorly (see the map)."
     ]
-
-
-def format_length(value: float | None, unit: str) -> str:
-    """A length for people: centimetres where metres would be small."""
-    if value is None:
-        return "unknown"
-    return f"{value * 100:.3g} cm" if unit == "m" and value < 1 else f"{value:.3g} {unit}"

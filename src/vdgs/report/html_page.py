@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import NewType
 
 from vdgs.report.embedded_images import EmbeddedImage
@@ -15,37 +16,62 @@ Html = NewType("Html", str)
 #: The browser may load nothing: all is in the file.
 SECURITY_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 PAGE_STYLE = """
-:root { color-scheme: light; }
+:root {
+  color-scheme: light dark;
+  --page: #fff; --ink: #22262b; --muted: #59626b; --line: #d5d9dd; --faint: #eceff1; --link: #1f5f8b; --code: #f5f7f8;
+  --note: #fff8e6;
+}
+@media (prefers-color-scheme: dark) {
+  :root {
+    --page: #16191c; --ink: #e4e7ea; --muted: #a3adb6; --line: #3b434a; --faint: #2a3036; --link: #7db8e8;
+    --code: #20252a; --note: #33290f;
+  }
+  figure img { background: #fff; border-radius: 4px; }
+}
 * { box-sizing: border-box; }
-body { margin: 0; background: #fff; color: #22262b; font: 16px/1.5 system-ui, -apple-system, "Segoe UI", sans-serif; }
+body { margin: 0; background: var(--page); color: var(--ink); }
+body { font: 16px/1.5 system-ui, -apple-system, "Segoe UI", sans-serif; }
 main { max-width: 68rem; margin: 0 auto; padding: 1.5rem 1rem 4rem; overflow-wrap: anywhere; }
 h1 { font-size: 1.7rem; line-height: 1.2; margin: 0.5rem 0; }
-h2 { font-size: 1.25rem; margin: 2.5rem 0 0.5rem; padding-top: 0.75rem; border-top: 1px solid #d5d9dd; }
+h2 { font-size: 1.25rem; margin: 2.5rem 0 0.5rem; padding-top: 0.75rem; border-top: 1px solid var(--line); }
 h3 { font-size: 1rem; margin: 1.5rem 0 0.25rem; }
 p { margin: 0.5rem 0; max-width: 46rem; }
-.facts, figcaption { color: #59626b; font-size: 0.875rem; }
+.facts, figcaption { color: var(--muted); font-size: 0.875rem; }
 .verdict { font-size: 1.15rem; font-weight: 600; margin: 1rem 0; }
-.note { border-left: 4px solid #d08700; padding: 0.3rem 0.8rem; background: #fff8e6; }
-.absent { color: #59626b; font-style: italic; }
+.note { border-left: 4px solid #d08700; padding: 0.3rem 0.8rem; background: var(--note); }
+.absent { color: var(--muted); font-style: italic; }
 nav { font-size: 0.875rem; margin: 1rem 0; }
 nav a { margin-right: 1rem; white-space: nowrap; }
-a { color: #1f5f8b; }
+a { color: var(--link); }
 .scroll { overflow-x: auto; margin: 0.75rem 0; }
 table { border-collapse: collapse; font-size: 0.9rem; font-variant-numeric: tabular-nums; overflow-wrap: normal; }
 th, td { padding: 0.25rem 0.9rem 0.25rem 0; text-align: right; vertical-align: top; white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; }
 table.wordy td:last-child, table.wordy th:last-child { text-align: left; white-space: normal; min-width: 12rem; }
 thead th { border-bottom: 1px solid #8a939b; font-weight: 600; }
-tbody tr + tr td { border-top: 1px solid #eceff1; }
+tbody tr + tr td { border-top: 1px solid var(--faint); }
 figure { margin: 1rem 0; break-inside: avoid; }
 figcaption { margin-top: 0.25rem; }
 img { display: block; max-width: 100%; height: auto; }
 .tall img { width: 34rem; }
 .gallery { display: flex; flex-wrap: wrap; gap: 0.5rem 1.25rem; }
 .gallery figure { flex: 1 1 17rem; max-width: 30rem; margin: 0.5rem 0; }
+.beside { display: flex; flex-wrap: wrap; gap: 0.5rem 1.75rem; align-items: flex-start; margin: 0.75rem 0; }
+.beside > * { flex: 1 1 22rem; min-width: 0; margin: 0; }
+.sheet { position: relative; display: table; margin: 0 auto; line-height: 1.2; }
+.sheet img { max-height: 30rem; width: auto; }
+.bar, .north { position: absolute; background: #ffffffd9; color: #16191c; font-size: 0.8rem; font-weight: 600; }
+.bar { left: 3%; bottom: 3%; padding-top: 2px; text-align: center; white-space: nowrap; border: solid #16191c; }
+.bar { border-width: 0 2px 3px; overflow-wrap: normal; }
+.north { right: 3%; top: 3%; padding: 2px 7px; text-align: center; }
+.north::before { content: "\\2191"; display: block; font-size: 1.3rem; line-height: 1; }
+table.known { width: 100%; font-size: 0.9rem; }
+table.known th { font-weight: 600; width: 9.5rem; white-space: normal; padding-right: 1rem; }
+table.known td { text-align: left; white-space: normal; }
+table.known th, table.known td { border-top: 1px solid var(--faint); }
 details { margin: 0.75rem 0; }
-summary { cursor: pointer; color: #1f5f8b; }
-pre { overflow-x: auto; background: #f5f7f8; padding: 0.75rem; font-size: 0.8rem; line-height: 1.4; }
+summary { cursor: pointer; color: var(--link); }
+pre { overflow-x: auto; background: var(--code); padding: 0.75rem; font-size: 0.8rem; line-height: 1.4; }
 @media (max-width: 44rem) { .wide img { max-width: none; width: 44rem; } }
 @media print {
   body { font-size: 10pt; }
@@ -115,6 +141,41 @@ def figure(image: EmbeddedImage | None, caption: str, alt: str, wide: bool = Fal
     text = f"<figcaption>{escape_html(caption)}</figcaption>" if caption else ""
     attribute = _class_attribute("wide" if wide else "tall" if tall else "")
     return Html(f'<figure{attribute}><div class="scroll">{tag}</div>{text}</figure>')
+
+
+@dataclass(frozen=True)
+class Overlay:
+    """A scale bar over a map."""
+
+    text: str
+    width_percent: float
+    """Of the width of the map."""
+
+
+def map_figure(image: EmbeddedImage, caption: str, alt: str, bar: Overlay | None, north: str | None) -> Html:
+    """A map with a scale bar and an arrow to its upper side, both as text: they stay legible at any width."""
+    size = f'width="{image.width}" height="{image.height}"'
+    parts = [f'<img src="{image.data_uri()}" {size} alt="{escape_html(alt)}">']
+    if bar is not None:
+        parts.append(f'<div class="bar" style="width:{bar.width_percent:.3f}%">{escape_html(bar.text)}</div>')
+    if north is not None:
+        parts.append(f'<div class="north">{escape_html(north)}</div>')
+    shown = "".join(parts)
+    return Html(f'<figure><div class="sheet">{shown}</div><figcaption>{escape_html(caption)}</figcaption></figure>')
+
+
+def facts_table(rows: Sequence[tuple[str, str]]) -> Html:
+    """Pairs of what and how much, without a head; texts wrap. Nothing without rows."""
+    if not rows:
+        return Html("")
+    lines = "".join(f'<tr><th scope="row">{escape_html(a)}</th><td>{escape_html(b)}</td></tr>\n' for a, b in rows)
+    return Html(f'<table class="known"><tbody>\n{lines}</tbody></table>')
+
+
+def side_by_side(*parts: Html) -> Html:
+    """Beside each other where the screen is wide enough."""
+    shown = "".join(f"<div>{part}</div>" for part in parts if part)
+    return Html(f'<div class="beside">{shown}</div>') if shown else Html("")
 
 
 def gallery(figures: Iterable[Html]) -> Html:

@@ -55,7 +55,7 @@ def read_metrics(source: RunFiles) -> tuple[JsonRecord, JsonRecord]:
     return coarse, merged
 
 
-def result_summary(coarse: JsonRecord, merged: JsonRecord) -> str:
+def _result_summary(coarse: JsonRecord, merged: JsonRecord) -> str:
     """The result in one line."""
     before, after = coarse.number("psnr"), merged.number("psnr")
     if after is None and before is None:
@@ -84,8 +84,10 @@ def _compared(coarse: JsonRecord, merged: JsonRecord, key: str, form: str) -> li
     return [coarse.format(key, form), merged.format(key, form), difference]
 
 
-def result_table(coarse: JsonRecord, merged: JsonRecord) -> Html:
+def metrics_section(report: ReportedRun) -> Html:
     """Every measure of both models and the difference; measures that neither has are left out."""
+    source = report.files()
+    coarse, merged = read_metrics(source)
 
     def is_known(key: str) -> bool:
         return (coarse.number(key), merged.number(key)) != (None, None)
@@ -100,8 +102,9 @@ def result_table(coarse: JsonRecord, merged: JsonRecord) -> Html:
         if is_known(key):
             rows.append([label, to_text(coarse.number(key)), to_text(merged.number(key)), ""])
     notes = dict.fromkeys(merged.texts("notes") + coarse.texts("notes"))
-    lines = [table(["", "coarse", "merged", "Δ"], rows), *(paragraph(note, "facts") for note in notes)]
-    return Html("\n".join(lines))
+    summary = paragraph(_result_summary(coarse, merged), "verdict")
+    parts = [summary, table(["", "coarse", "merged", "Δ"], rows), *(paragraph(note, "facts") for note in notes)]
+    return section("metrics", "Metrics", parts, source.notes)
 
 
 def views_section(report: ReportedRun) -> Html:
@@ -216,6 +219,8 @@ def seams_section(report: ReportedRun) -> Html:
     source, file = report.files(), f"{MERGED_EVALUATION}/by_block.json"
     metrics = source.record(file)
     is_absent = not metrics and not source.exists(file)
+    if report.is_one_block:
+        return Html("")
     rows = [_block_row(row.count("block"), row) for row in metrics.rows("blocks")]
     if rows and metrics.child("all"):
         rows.append(_block_row("all", metrics.child("all")))

@@ -94,6 +94,11 @@ class ReportedRun:
         stale = {stage.folder: _stale_note(stage) for stage in self.status.stages if stage.state == "stale"}
         return RunFiles(self.run.path, stale)
 
+    @property
+    def is_one_block(self) -> bool:
+        """Whether the scene is cut into a single block: then nothing is divided among blocks, and nothing merged."""
+        return len(RunFiles(self.run.path).record("partition/partition.json").rows("blocks")) == 1
+
     def stage_state(self, name: str) -> str:
         """How far a stage is, in words."""
         stage = self.status.of(name)

@@ -15,9 +15,10 @@ from vdgs.captures.reconstruction import (
     report_rows,
 )
 from vdgs.report.html_page import Html, details, figure, heading, join_html, link, paragraph, section, table
+from vdgs.report.place_section import MAP_FILE, current_map
 from vdgs.report.run_reader import JsonRecord, ReportedRun, RunFiles, format_percent
 from vdgs.system.records import record_from_dict
-from vdgs.system.units import ABSENT, count
+from vdgs.system.units import ABSENT, count, format_length
 
 #: Photographs left out that are named.
 MAX_LISTED = 500
@@ -78,8 +79,8 @@ def visibility_section(report: ReportedRun) -> Html:
     is_absent = not stats and not source.exists(VISIBILITY_FILE)
     parts = [
         paragraph(
-            "V is the number of training photographs that see a place. Where it is low, a model has little to go by; "
-            "the blocks are cut and trained with V in mind."
+            "V is the number of training photographs that see a place. Where it is low, a model has little to go by"
+            + ("." if report.is_one_block else "; the blocks are cut and trained with V in mind.")
         ),
         *((paragraph(_visibility_sentence(stats)), _distribution(stats)) if stats else ()),
         paragraph("Visibility is not measured yet." if is_absent else "", "absent"),
@@ -91,6 +92,9 @@ def visibility_section(report: ReportedRun) -> Html:
 
 
 def blocks_section(report: ReportedRun) -> Html:
+    """How the scene was cut; nothing of a single block."""
+    if report.is_one_block:
+        return Html("")
     source = report.files()
     partition = source.record(PARTITION_FILE)
     is_absent = not partition and not source.exists(PARTITION_FILE)
@@ -100,13 +104,15 @@ def blocks_section(report: ReportedRun) -> Html:
         how = partition.number("lambda_vis")
         cut = f", cut by place and visibility (λ_vis = {how:g})" if how is not None else ""
         reach = "The core belongs to one block; the widened block reaches over its borders."
-        parts.append(paragraph(f"{len(rows)} block{'s' if len(rows) > 1 else ''}{cut}. {reach}"))
+        parts.append(paragraph(f"{len(rows)} blocks{cut}. {reach}"))
+    is_metric = source.record("capture.json").child("ground_frame").values.get("metric") is True
+    area_unit = "m²" if is_metric else "square units of the scene, whose size is not known"
     warnings = partition.texts("warnings") + partition.texts("assignment_warnings")
     missing = [name for name in ("blocks.png", "block_facts.png") if partition and not source.has(f"partition/{name}")]
     parts += [
         *(paragraph(warning, "note") for warning in warnings),
         figure(source.image("partition/blocks.png"), "The blocks from above.", "map of the blocks", True),
-        _blocks_table(rows, partition.rows("spatial_only_blocks")),
+        _blocks_table(rows, partition.rows("spatial_only_blocks"), area_unit),
         figure(source.image("partition/block_facts.png"), "What each block holds.", "sizes of the blocks", True),
         paragraph(f"Figures that are not there: {', '.join(missing)}." if missing else "", "absent"),
     ]
@@ -114,6 +120,9 @@ def blocks_section(report: ReportedRun) -> Html:
 
 
 def assignment_section(report: ReportedRun) -> Html:
+    """Which photographs each block has; nothing of a single block."""
+    if report.is_one_block:
+        return Html("")
     source, score_file = report.files(), "partition/scores.png"
     rows = source.record(PARTITION_FILE).rows("blocks")
     rule = (
@@ -153,7 +162,7 @@ def _distribution(record: JsonRecord) -> Html:
     return table(head, [row], "V over all anchors: mean, inequality, quantiles, share below a limit")
 
 
-def _blocks_table(rows: list[JsonRecord], spatial: list[JsonRecord]) -> Html:
+def _blocks_table(rows: list[JsonRecord], spatial: list[JsonRecord], area_unit: str) -> Html:
     head = ["block", "anchors of the core", "widened", "area of the core", "mean V", "cameras"]
     has_std = any(row.number("std_v") is not None for row in rows)
     lines = []
@@ -161,7 +170,7 @@ def _blocks_table(rows: list[JsonRecord], spatial: list[JsonRecord]) -> Html:
         anchors = [row.count("anchors_core"), row.count("anchors_expanded")]
         line = [row.count("block"), *anchors, row.format("area", "{:,.0f}"), row.format("mean_v"), row.count("cameras")]
         lines.append([*line, *([row.format("std_v")] if has_std else [])])
-    caption = "Areas are in square units of the ground frame (m² where the capture is metric)"
+    caption = f"Areas are in {area_unit}"
     blocks_table = table([*head, *(["std V"] if has_std else [])], lines, caption)
     if not spatial:
         return blocks_table
@@ -191,18 +200,18 @@ def _total(rows: list[JsonRecord], key: str) -> str:
 def ortho_section(report: ReportedRun) -> Html:
     """The sheet of `vdgs ortho`, of the merged model that is there."""
     source = report.files()
-    metadata = source.record("maps/map.json")
+    metadata = current_map(report, source)
     if not metadata:
-        parts = [paragraph("No maps were made of this run. `vdgs ortho RUN` makes them.")]
-    elif metadata.text("model_digest") != report.run.merged.status().model_id:
         stale = "The maps are of another model than the run has now; `vdgs ortho RUN` draws them anew."
-        parts = [paragraph(stale, "note")]
+        none = "No maps were made of this run. `vdgs ortho RUN` makes them."
+        is_stale = source.exists(MAP_FILE) and not source.notes
+        parts = [paragraph(stale, "note") if is_stale else paragraph(none)]
     else:
-        gsd, unit = metadata.number("gsd"), metadata.text("unit")
+        gsd, unit = metadata.number("gsd"), metadata.text("unit") or "units"
         parts = [
             paragraph(
                 f"Orthophoto, surface model and visibility in {metadata.text('crs_name')}"
-                + (f", pixels of {gsd:.3g} {unit}" if gsd else "")
+                + (f", pixels of {format_length(gsd, unit)}" if gsd else "")
                 + ": GeoTIFFs in maps/. Blank is what is not solid, or what no training photograph shows."
             ),
             figure(source.image("maps/preview.png"), "The scene as maps.", "maps of the scene", True),

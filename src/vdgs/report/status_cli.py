@@ -8,12 +8,17 @@ from dataclasses import replace
 from rich.console import Console
 from rich.markup import escape
 
+from vdgs.captures.place_facts import PlaceFacts, place_summary
+from vdgs.report.place_section import read_place
+from vdgs.report.run_reader import RunFiles
 from vdgs.report.write_report import report_status
 from vdgs.runs.run_folder import REPORT_FILE, RunFolder
 from vdgs.runs.run_status import RunStatus, StageStatus, get_run_status
 from vdgs.runs.stage_folder import StatusRecord
+from vdgs.system.atomic_files import to_jsonable
 from vdgs.system.documents import RunStatusDocument, StageStatusDocument
 from vdgs.system.quoting import shell_word
+from vdgs.system.records import record_to_dict
 from vdgs.system.units import rough_duration
 
 #: Exit code of `vdgs status` for a run that is not whole: something of it is missing, runs, failed or is out of date.
@@ -33,7 +38,9 @@ def full_run_status(run: RunFolder) -> RunStatus:
 
 def print_status(run: RunFolder, console: Console) -> int:
     """Say how far every stage and block is and what to type next; 0 if the run is whole, else `EXIT_INCOMPLETE`."""
-    status = full_run_status(run)
+    status, place = full_run_status(run), _place(run)
+    if place is not None:
+        console.print(escape(place_summary(place)), highlight=False)
     width = max(len(stage.name) for stage in status.stages)
     for stage in status.stages:
         note = "; ".join(part for part in (progress_text(stage.status), stage.reason) if part)
@@ -47,11 +54,17 @@ def print_status(run: RunFolder, console: Console) -> int:
 
 def status_json(run: RunFolder) -> RunStatusDocument:
     """The same for programs."""
-    status = full_run_status(run)
+    status, place = full_run_status(run), _place(run)
     return {
-        "run": str(run.path), "complete": status.is_complete, "running": status.is_running,
+        "run": str(run.path), "place": None if place is None else to_jsonable(record_to_dict(place)),
+        "complete": status.is_complete, "running": status.is_running,
         "next_command": status.next_command() or None, "stages": [_stage_json(stage) for stage in status.stages],
     }  # fmt: skip
+
+
+def _place(run: RunFolder) -> PlaceFacts | None:
+    """The facts of the place, as the report begins with them; None where the run has none."""
+    return read_place(RunFiles(run.path))
 
 
 def next_step(status: RunStatus) -> str:

@@ -12,11 +12,10 @@ import yaml
 from vdgs.captures.output_guard import check_output
 from vdgs.errors import RunError
 from vdgs.report.html_page import Html, document, escape_html, join_html, paragraph, table_of_contents
+from vdgs.report.place_section import place_panel, read_place
 from vdgs.report.result_sections import (
     by_visibility_section,
-    read_metrics,
-    result_summary,
-    result_table,
+    metrics_section,
     seams_section,
     views_section,
 )
@@ -34,17 +33,18 @@ from vdgs.runs.run_folder import REPORT_FILE, RunFolder
 from vdgs.runs.run_status import RunStatus, StageStatus, get_run_status
 from vdgs.system.atomic_files import write_text
 
-#: The sections, each with its name and title for the links at the top.
+#: The sections, each with its name and title for the links at the top; those that say nothing of a run are empty.
 SECTIONS: tuple[tuple[Callable[[ReportedRun], Html], str, str], ...] = (
+    (views_section, "views", "test views"),
+    (metrics_section, "metrics", "metrics"),
+    (by_visibility_section, "by-visibility", "quality by visibility"),
+    (ortho_section, "maps", "maps"),
     (sfm_section, "photographs", "photographs"),
     (visibility_section, "visibility", "visibility"),
     (blocks_section, "blocks", "blocks"),
     (assignment_section, "cameras", "cameras"),
-    (training_section, "training", "training"),
-    (views_section, "views", "test views"),
-    (ortho_section, "maps", "maps"),
-    (by_visibility_section, "by-visibility", "quality by visibility"),
     (seams_section, "seams", "per block"),
+    (training_section, "training", "training"),
     (costs_section, "costs", "time and memory"),
     (settings_section, "settings", "settings"),
 )
@@ -90,21 +90,21 @@ def _header(report: ReportedRun) -> tuple[Html, str]:
     source = report.files()
     config, capture = _config(source), source.record("capture.json")
     name = _capture_name(config, capture)
-    coarse, merged = read_metrics(source)
     version, commit = (config.child("vdgs").text(key) for key in ("version", "commit"))
+    place = read_place(report.files())
     facts = [
         f"Report of {datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
         f"run begun with vdgs {version or 'of unknown version'}{f', commit {commit[:12]}' if commit else ''}",
-        _image_counts(capture),
+        _image_counts(capture) if place is None else "",
     ]
+    name = place.name if place is not None and place.name else name
+    panel = place_panel(report, source)
     parts = [
         Html(f"<h1>{escape_html(name)}</h1>"),
-        paragraph(" · ".join(fact for fact in facts if fact), "facts"),
-        *(paragraph(note, "note") for note in [*source.notes, *report.warnings()]),
-        paragraph(result_summary(coarse, merged), "verdict"),
-        result_table(coarse, merged),
+        panel,
         html_export_link(report),
-        *(paragraph(warning, "note") for warning in capture.texts("warnings")),
+        *(paragraph(note, "note") for note in [*source.notes, *report.warnings(), *capture.texts("warnings")]),
+        paragraph(" · ".join(fact for fact in facts if fact), "facts"),
     ]
     return Html(f"<header>\n{join_html(parts)}\n</header>"), f"{name} – vdgs report"
 

@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from vdgs.captures.capture import Capture
-from vdgs.captures.capture_metadata import check_same_capture
+from vdgs.captures.capture_metadata import capture_fingerprint, check_same_capture
 from vdgs.captures.loading import load_capture
 from vdgs.captures.output_guard import check_not_among_inputs, check_output
+from vdgs.captures.place_facts import measure_place
 from vdgs.captures.reconstruction import RECONSTRUCTION_FIGURE as RECONSTRUCTION_FIGURE
 from vdgs.captures.reconstruction import RECONSTRUCTION_FILE as RECONSTRUCTION
 from vdgs.captures.validation import require_valid
@@ -21,7 +22,8 @@ from vdgs.config.validation_rules import check_config
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
-from vdgs.system.atomic_files import read_json, write_bytes
+from vdgs.system.atomic_files import read_json, read_json_or_empty, to_jsonable, write_bytes, write_json
+from vdgs.system.records import record_to_dict
 
 
 def create_or_resume_run(
@@ -91,6 +93,7 @@ def _resume(
             if is_read_anew:  # nothing is left that was made of it; the coarse stage writes the new one
                 run.capture_file.unlink(missing_ok=True)
         _copy_reconstruction(capture.root, run.path)
+        _write_place(capture, run)
 
 
 def capture_options_changed(run: RunFolder, settings: RunSettings) -> bool:
@@ -105,6 +108,13 @@ def _copy_reconstruction(root: Path, run: Path) -> None:
             content = (root / name).read_bytes()
             if not (run / name).is_file() or (run / name).read_bytes() != content:
                 write_bytes(run / name, content)
+
+
+def _write_place(capture: Capture, run: RunFolder) -> None:
+    """Save the facts of the place that the report and `vdgs status` begin with, unless they are there."""
+    fingerprint = capture_fingerprint(capture)
+    if read_json_or_empty(run.place_file).get("fingerprint") != fingerprint:
+        write_json(run.place_file, to_jsonable(record_to_dict(measure_place(capture)) | {"fingerprint": fingerprint}))
 
 
 def run_settings(capture_path: Path, capture_options: CaptureOptions, method: MethodConfig) -> RunSettings:

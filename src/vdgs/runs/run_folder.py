@@ -49,6 +49,10 @@ class RunFolder:
         return self.path / "capture.json"
 
     @property
+    def place_file(self) -> Path:
+        return self.path / "place.json"
+
+    @property
     def cameras_file(self) -> Path:
         return self.path / "cameras.json"
 

@@ -10,11 +10,12 @@ from jaxtyping import Float
 from scipy.optimize import least_squares
 from scipy.stats import t as student
 
+from vdgs.captures.known_distances import MIN_OBSERVATIONS, intersect_rays
 from vdgs.captures.reconstruction import AccuracyFacts, GcpReport
 from vdgs.errors import CaptureError
 from vdgs.geometry.similarity import Similarity, fit_similarity, fit_similarity_robust, is_collinear
 from vdgs.sfm.bending import bend_to_points
-from vdgs.sfm.gcp_list import MIN_CONTROL_POINTS, MIN_OBSERVATIONS, GcpList, GcpObservation, GroundControlPoint
+from vdgs.sfm.gcp_list import MIN_CONTROL_POINTS, GcpList, GcpObservation, GroundControlPoint
 from vdgs.sfm.georegistration import transform_model
 from vdgs.system.colmap import pycolmap
 
@@ -99,7 +100,7 @@ def _nearest_to_marks(
         @ pose[:, :3]
         for each, view, pose in zip(seen, views, poses, strict=True)
     ]
-    start = _intersect_rays(np.array([view.projection_center() for view in views]), np.array(rays))
+    start = intersect_rays(np.array([view.projection_center() for view in views]), np.array(rays))
     if start is None or any((pose @ np.append(start, 1))[2] <= 0 for pose in poses):
         return None  # behind a camera: the marks are of different things
     found = least_squares(
@@ -249,16 +250,6 @@ def measure_gcps(
 def _triangulate_all(model: pycolmap.Reconstruction, gcps: GcpList) -> dict[int, TriangulatedPoint]:
     found = ((k, triangulate(model, point)) for k, point in enumerate(gcps.points))
     return {k: seen for k, seen in found if seen is not None}
-
-
-def _intersect_rays(centers: Float[np.ndarray, "n 3"], rays: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"] | None:
-    """The point with the least sum of squared distances to lines; None where they are parallel."""
-    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-    total = across.sum(axis=0)
-    if np.linalg.eigvalsh(total)[0] < 1e-6:
-        return None
-    return np.asarray(np.linalg.solve(total, np.einsum("nij,nj->i", across, centers)))
 
 
 def _fit_to_gcps(points: Float[np.ndarray, "n 3"], targets: Float[np.ndarray, "n 3"]) -> tuple[Similarity, np.ndarray]:

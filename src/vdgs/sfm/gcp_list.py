@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vdgs.captures.coordinate_systems import to_geodetic
+from vdgs.captures.known_distances import MIN_OBSERVATIONS, text_lines
 from vdgs.captures.name_resolution import NameLookup, ambiguity_message
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, median_place
@@ -21,14 +22,12 @@ from vdgs.sfm.image_metadata import ImageMetadata
 
 #: Fewer points fix no place, scale and directions.
 MIN_CONTROL_POINTS = 3
-#: Photographs that must show a point: one view tells a line, no place.
-MIN_OBSERVATIONS = 2
 #: Points farther from the photographs than this are in another zone, or east and north have changed places (metres).
 MAX_DISTANCE_M = 20_000.0
 #: A word for all points of the file, where some are named to be held out.
 ALL_POINTS = "all"
-#: Larger files, and points higher above or below the sea, are none (bytes, metres).
-_MAX_FILE_BYTES, _MAX_HEIGHT_M = 1 << 24, 20_000.0
+#: Points higher above or below the sea are none (metres).
+_MAX_HEIGHT_M = 20_000.0
 
 
 @dataclass(frozen=True)
@@ -164,20 +163,6 @@ def check_gcps_near(gcps: GcpList, positions: np.ndarray, origin: tuple[float, f
         )
 
 
-def text_lines(file: Path, what: str) -> list[tuple[int, str]]:
-    """The lines of a text file of `what` with their numbers, without empty ones and comments."""
-    try:
-        if file.stat().st_size > _MAX_FILE_BYTES:
-            raise CaptureError(f"{file}: is far too large for a list of {what}.")
-        text = file.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise CaptureError(f"{file}: cannot be read ({error.strerror}).") from error
-    except UnicodeDecodeError:
-        raise CaptureError(f"{file}: is not a text file. A list of {what} is expected.") from None
-    rows = [(k, line.strip()) for k, line in enumerate(text.splitlines(), 1)]
-    return [(k, line) for k, line in rows if line and not line.startswith("#")]
-
-
 def _lines(file: Path) -> tuple[str, list[_Line]]:
     rows = text_lines(file, "control points")
     if not rows:
@@ -206,10 +191,10 @@ def photographs_by_name(collection: ImageList) -> NameLookup[ImageMetadata | str
     return NameLookup([*((photo.name, photo) for photo in collection.images), *left_out])
 
 
-def find_sighting(
-    pixel: tuple[float, float], photograph: str, number: int, by_name: NameLookup[ImageMetadata | str], file: Path
-) -> GcpObservation | None:
-    """The mark of a line; None in a photograph that was left out."""
+def find_photograph(
+    photograph: str, number: int, by_name: NameLookup[ImageMetadata | str], file: Path
+) -> ImageMetadata | None:
+    """The photograph that a line names; None for one that was left out."""
     found = _photographs_of(photograph, by_name)
     where = f"{file}: line {number}:"
     if not found:
@@ -218,8 +203,17 @@ def find_sighting(
     if len(found) > 1:
         one, other = (each if isinstance(each, str) else each.name for each in found[:2])
         raise CaptureError(f"{where} {ambiguity_message(photograph, one, other)}")
-    if isinstance(photo, str):
+    return None if isinstance(photo, str) else photo
+
+
+def find_sighting(
+    pixel: tuple[float, float], photograph: str, number: int, by_name: NameLookup[ImageMetadata | str], file: Path
+) -> GcpObservation | None:
+    """The mark of a line; None in a photograph that was left out."""
+    photo = find_photograph(photograph, number, by_name, file)
+    if photo is None:
         return None
+    where = f"{file}: line {number}:"
     width, height = photo.stored_size
     if not (0 <= pixel[0] <= width and 0 <= pixel[1] <= height):
         exchanged = 0 <= pixel[1] <= width and 0 <= pixel[0] <= height

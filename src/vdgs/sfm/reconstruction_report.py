@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vdgs.captures.capture_dates import first_and_last
 from vdgs.captures.reconstruction import CameraReport, GcpReport, ImageReport, ReconstructionReport
 from vdgs.sfm.feature_extraction import CameraGroup
 from vdgs.sfm.gcp_adjustment import MARK_WRONG_PX
@@ -84,6 +85,7 @@ def make_reconstruction_report(plan: ReconstructionPlan, result: ReconstructionR
         advice=tuple(advice),
         seconds=result.seconds,
         survey=result.found.survey, accuracy=placed.accuracy if placed else None,
+        flown=first_and_last(photo.datetime for photo in collection.images),
     )  # fmt: skip
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RunRequest
 from vdgs.config.sfm_options import SfmRequest
@@ -40,5 +42,5 @@ def make_sfm_request(request: RunRequest) -> SfmRequest:
         output=run.own_capture,
         gps=options.gps,
         threads=request.threads,
-        options=request.sfm,
+        options=request.sfm if options.scale_bar is None else replace(request.sfm, scale_bar=options.scale_bar),
     )

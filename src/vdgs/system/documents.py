@@ -92,9 +92,10 @@ class StageStatusDocument(TypedDict):
 
 
 class RunStatusDocument(TypedDict):
-    """What `vdgs status --json` prints."""
+    """What `vdgs status --json` prints; `place` is RUN/place.json."""
 
     run: str
+    place: JsonObject | None
     complete: bool
     running: bool
     next_command: str | None

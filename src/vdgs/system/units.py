@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 ABSENT = "–"
 
 
@@ -45,3 +47,16 @@ def clock(seconds: float) -> str:
     """1:01:11, of the same width while it counts down."""
     whole = round(seconds)
     return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
+
+
+def floor_to_nice_length(limit: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten that is not above `limit`: what a scale bar shows."""
+    power = 10.0 ** math.floor(math.log10(limit))
+    return float(max(step * power for step in (1, 2, 5) if step * power <= limit * (1 + 1e-9)))
+
+
+def format_length(value: float | None, unit: str) -> str:
+    """A length for people: centimetres where metres would be small."""
+    if value is None:
+        return "unknown"
+    return f"{value * 100:.3g} cm" if unit == "m" and value < 1 else f"{value:.3g} {unit}"

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from vdgs.captures.camera_height import FOV_DEG, camera_height
+from vdgs.captures.camera_height import camera_height
+from vdgs.captures.first_view import FOV_DEG
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
 from vdgs.system.memory.process_memory import available_memory_bytes

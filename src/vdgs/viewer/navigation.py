@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from vdgs.captures.camera_height import default_view
 from vdgs.captures.capture import Capture
+from vdgs.captures.first_view import default_view
 from vdgs.config.commands import MAX_RENDER_SIDE_PX, RENDER_BYTES_PER_PIXEL
 from vdgs.geometry.camera import Camera
 from vdgs.rendering.camera_paths import pose_from_rotation

@@ -13,12 +13,15 @@ from vdgs.geometry.geodesy import geodetic_from_enu
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.renderer import render
 from vdgs.viewer.image_comparison import load_resized_image
+from vdgs.viewer.measurement import MeasuredPoint
 from vdgs.viewer.viewer_scene import ViewerScene
 
 #: A camera sees a point unoccluded if the drawn depth is so near to its depth (share; choice).
 _OCCLUSION_TOLERANCE = 0.02
 #: Thumbnails: how large (longer side), and how large the part of the photograph about the place is (share).
 _THUMBNAIL_PX, _THUMBNAIL_CROP = 320, 0.5
+#: Photographs that a measured point is marked in, at most, and by which its depth is judged.
+_MARKED_IMAGES = 8
 _MARKER_COLOR = (255, 60, 40)
 
 
@@ -35,6 +38,8 @@ class ImageHit:
     ground_sampling: float
     #: Nothing stands between.
     unoccluded: bool
+    #: The depth that is drawn there less the depth of the point; 0 where nothing is drawn.
+    depth_error: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +92,28 @@ def _image_hit(model: AnchorModel, camera: Camera, index: int, name: str, positi
     column, row = min(int(x), camera.width - 1), min(int(y), camera.height - 1)
     drawn, _ = _render_pixel(model, camera, column, row)
     unoccluded = drawn == 0 or drawn >= float(depth[0]) * (1 - _OCCLUSION_TOLERANCE)
-    return ImageHit(index, name, (x, y), float(depth[0]) / camera.fx, unoccluded)
+    error = drawn - float(depth[0]) if drawn > 0 else 0.0
+    return ImageHit(index, name, (x, y), float(depth[0]) / camera.fx, unoccluded, error)
+
+
+def measured_point(scene: ViewerScene, name: str, camera: Camera, x: float, y: float) -> MeasuredPoint | None:
+    """The point that the pixel at `x`, `y` shows, for the ruler; None where nothing is drawn.
+
+    It is off across the view by half a pixel of the clicked picture, or of the photograph that shows it best where that
+    is coarser, and along it by what the depths disagree that the nearest photographs see.
+    """
+    position = pick_position(scene.model(name), camera, x, y)
+    if position is None:
+        return None
+    hits = [hit for hit in pick_point(scene, name, position).hits if hit.unoccluded][:_MARKED_IMAGES]
+    pixel = float(np.linalg.norm(position - camera.position)) / camera.fx
+    across = 0.5 * max([pixel, *(hit.ground_sampling for hit in hits[:1])])
+    along = float(np.median([abs(hit.depth_error) for hit in hits])) if hits else 0.0
+    rays = []
+    for hit in hits:
+        seen = scene.capture.views[hit.index].camera
+        rays.append((hit.name, (hit.pixel[0] - seen.cx) / seen.fx, (hit.pixel[1] - seen.cy) / seen.fy))
+    return MeasuredPoint(position, float(np.hypot(across, 1.48 * along)), tuple(rays))
 
 
 def _render_pixel(model: AnchorModel, camera: Camera, column: int, row: int) -> tuple[float, float]:

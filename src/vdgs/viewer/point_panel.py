@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from vdgs.captures.camera_height import camera_height
 from vdgs.viewer import navigation
-from vdgs.viewer.measurement import Ruler
-from vdgs.viewer.picking import PickedPoint, pick_point, pick_position, thumbnail
+from vdgs.viewer.measure_panel import MeasurePanel
+from vdgs.viewer.picking import PickedPoint, measured_point, pick_point, pick_position, thumbnail
 from vdgs.viewer.session_protocol import SessionProtocol
 
 _HINT = "Click a place to see what is known of it; double click to turn about it."
+_NOTHING = "Nothing is drawn there."
 #: Two clicks within so many seconds, so near to each other (share of the canvas), are a double click.
 _DOUBLE_CLICK_SECONDS, _DOUBLE_CLICK_DISTANCE = 0.45, 0.01
 #: Images shown of a point.
@@ -29,17 +29,15 @@ class PointPanel:
         self._session = session
         self._folder = session.client.gui.add_folder("Place")
         self._handles: list[Any] = []
-        self._ruler = Ruler(session.scene.capture.ground.unit)
         self._point: PickedPoint | None = None
         with self._folder:
             self._label = session.client.gui.add_markdown(_HINT)
-        self._measuring = False
         self.clock = time.monotonic
         self._lock = threading.Lock()
         #: Held while a point is shown: clicks come on several threads, and a folder takes one of them at a time.
         self._showing = threading.Lock()
         self._last: tuple[float, float, float] | None = None
-        self._build_measuring()
+        self.measure_panel = MeasurePanel(session)
 
     def on_click(self, screen: tuple[float, float]) -> None:
         """A click at a share of the canvas' width and height. A double click turns about the point from then on."""
@@ -49,12 +47,16 @@ class PointPanel:
         is_double = self._is_double(screen)
         name = session.scene.shown_name(session.display.model)
         x, y = screen[0] * camera.width, screen[1] * camera.height
+        if self.measure_panel.is_on:
+            measured = session.submit(lambda: measured_point(session.scene, name, camera, x, y))
+            if measured is not None:
+                self.measure_panel.add(measured)
+            else:
+                self._label.content = _NOTHING
+            return
         position = session.submit(lambda: pick_position(session.scene.model(name), camera, x, y))
         if position is None:
-            self._label.content = "Nothing is drawn there."
-        elif self._measuring:
-            self._ruler.add(position)
-            self._show_measure()
+            self._label.content = _NOTHING
         elif is_double:
             session.move_to(navigation.CameraPose(session.pose.position, position))
         elif (point := session.submit(lambda: pick_point(session.scene, name, position))) is not None:
@@ -104,38 +106,6 @@ class PointPanel:
             pose, target = self._session.pose, self._point.position
             orbit = navigation.CameraPose(pose.position, target)
             self._session.move_to(orbit if how == "Orbit" else navigation.zoom_to(pose, target))
-
-    # ------------------------------------------------------------------------------------- measuring
-
-    def _build_measuring(self) -> None:
-        gui = self._session.client.gui
-        with gui.add_folder("Measure", expand_by_default=False):
-            switch = gui.add_checkbox("Clicks measure", False, hint="Distance, height and area between clicked places")
-            self._measured = gui.add_markdown("")
-            again = gui.add_button("Begin again")
-        self._line: Any = None
-
-        @switch.on_update
-        def _(_: Any) -> None:
-            self._measuring = bool(switch.value)
-
-        @again.on_click
-        def _(_: Any) -> None:
-            self._ruler.clear()
-            self._show_measure()
-
-    def _show_measure(self) -> None:
-        if self._line is not None:
-            self._line.remove()
-            self._line = None
-        self._measured.content = self._ruler.to_markdown()
-        points, scene, color = self._ruler.points(), self._session.client.scene, (255, 220, 0)
-        if len(points) == 1:
-            radius = 4e-3 * camera_height(self._session.scene.capture)
-            self._line = scene.add_icosphere("/measure", radius, color=color, position=tuple(points[0]))
-        elif len(points) > 1:
-            line = np.stack([points[:-1], points[1:]], axis=1).astype(np.float32)
-            self._line = scene.add_line_segments("/measure", line, color, thickness=3.0, thickness_units="screen")
 
 
 def point_markdown(point: PickedPoint) -> str:

@@ -19,7 +19,8 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from vdgs.captures.camera_height import FOV_DEG, camera_height
+from vdgs.captures.camera_height import camera_height
+from vdgs.captures.first_view import FOV_DEG
 from vdgs.config.commands import ViewRequest
 from vdgs.errors import Interrupted, VdgsError
 from vdgs.kernels.idle_memory import trim_heap

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt32
 
-from vdgs.captures.camera_height import FOV_DEG
+from vdgs.captures.first_view import FOV_DEG
 from vdgs.errors import VdgsError
 from vdgs.export.formats.export_scene import (
     ExportScene,

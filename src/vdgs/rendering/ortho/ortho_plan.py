@@ -25,8 +25,11 @@ from vdgs.system.atomic_files import read_json_or_empty, reason_of, write_json
 from vdgs.system.scratch import remove_leftovers, scratch_folder
 
 ORTHOPHOTO_FILE, DSM_FILE, VISIBILITY_FILE = "orthophoto.tif", "dsm.tif", "visibility.tif"
-HILLSHADE_FILE, PREVIEW_FILE, METADATA_FILE = "hillshade.png", "preview.png", "map.json"
-FILE_NAMES = (ORTHOPHOTO_FILE, DSM_FILE, VISIBILITY_FILE, HILLSHADE_FILE, PREVIEW_FILE, METADATA_FILE)
+HILLSHADE_FILE, PICTURE_FILE, PREVIEW_FILE = "hillshade.png", "orthophoto.png", "preview.png"
+METADATA_FILE = "map.json"
+FILE_NAMES = (
+    ORTHOPHOTO_FILE, DSM_FILE, VISIBILITY_FILE, HILLSHADE_FILE, PICTURE_FILE, PREVIEW_FILE, METADATA_FILE
+)  # fmt: skip
 #: The folder in a folder of maps where new ones are drawn, by the name that `scratch_folder` takes.
 STAGING = "maps"
 

@@ -7,26 +7,20 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from jaxtyping import Bool, Float
-from scipy.spatial import cKDTree
+from jaxtyping import Float
 
 from vdgs.captures.capture import Capture
+from vdgs.captures.scene_points import MIN_SEEN_BY, scene_points
+from vdgs.captures.scene_points import ground_sampling_distance as scene_gsd
 from vdgs.errors import VdgsError
 from vdgs.geometry.map_projection import MapProjection
-from vdgs.visibility.visibility_counts import count_visibility
 
 #: Side of a tile in pixels: that of the blocks of the files, so that a tile is written as one.
 TILE_PX = 512
-#: A map ends beyond the sparse points that so many training cameras see, but for a share of them on every side, by a
-#: share of its size. What lies so many times farther from every camera than the median point is what they see behind
-#: the scene, with pixels as many times larger (choice).
-MIN_SEEN_BY, MAX_DISTANCE_RATIO = 2, 4.0
+#: A map ends beyond the points of the scene, but for a share of them on every side, by a share of its size (choice).
 _TRIM_QUANTILE, _MARGIN_SHARE = 0.002, 0.03
 #: No map has more pixels: a hundred thousand each way.
 MAX_PIXELS = 10_000_000_000
-#: Cameras by which the ground sampling is found.
-_MAX_GSD_CAMERAS = 60
 
 
 @dataclass(frozen=True)
@@ -95,10 +89,7 @@ def capture_extent(capture: Capture, placement: MapProjection) -> tuple[float, f
 
     Raises VdgsError where there are too few points to tell.
     """
-    cameras = [view.camera for view in capture.train_views]
-    seen = count_visibility(torch.from_numpy(capture.points), cameras).numpy()
-    shown = capture.points[seen >= min(MIN_SEEN_BY, len(cameras))]
-    shown = shown[_not_in_background(shown, np.array([camera.position for camera in cameras]))]
+    shown = scene_points(capture)
     if len(shown) < 10:
         raise VdgsError(
             f"{capture.root}: has {len(shown)} sparse points in {MIN_SEEN_BY} pictures or more, too few to tell what a "
@@ -107,12 +98,6 @@ def capture_extent(capture: Capture, placement: MapProjection) -> tuple[float, f
     low, high = np.quantile(placement.project(shown)[:, :2], [_TRIM_QUANTILE, 1 - _TRIM_QUANTILE], axis=0)
     beyond = _MARGIN_SHARE * (high - low)
     return (*(low - beyond).tolist(), *(high + beyond).tolist())
-
-
-def _not_in_background(points: Float[np.ndarray, "n 3"], cameras: Float[np.ndarray, "c 3"]) -> Bool[np.ndarray, " n"]:
-    """Which points are of the scene, and not of what cameras see behind it."""
-    distance = cKDTree(cameras).query(points, workers=1)[0]
-    return np.asarray(distance <= MAX_DISTANCE_RATIO * np.median(distance)) if len(points) else np.ones(0, bool)
 
 
 def check_grid_overlap(grid: PixelGrid, extent: tuple[float, float, float, float], placement: MapProjection) -> None:
@@ -132,16 +117,10 @@ def ground_sampling_distance(capture: Capture, scale: float) -> float:
 
     `scale`: target units in one of the ground frame. Raises VdgsError where no photograph holds a sparse point.
     """
-    views = capture.train_views
-    sizes = []
-    for index in np.unique(np.linspace(0, len(views) - 1, _MAX_GSD_CAMERAS).round().astype(int)):
-        camera = views[index].camera
-        held = camera.in_frustum(capture.points)
-        if held.any():
-            sizes.append(float(np.median(camera.project(capture.points[held])[1])) / camera.fx)
-    if not sizes:
+    size = scene_gsd(capture)
+    if size is None:
         raise VdgsError(f"{capture.root}: no photograph holds a sparse point to measure its pixels by. Give --gsd.")
-    return float(f"{scale * float(np.median(sizes)):.2g}")
+    return float(f"{scale * size:.2g}")
 
 
 def ground_height(capture: Capture) -> float:

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import matplotlib
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
@@ -22,6 +22,7 @@ from vdgs.rendering.ortho.geotiff import read_overview
 from vdgs.rendering.ortho.pixel_grid import PixelGrid
 from vdgs.rendering.ortho.tile_renderer import NODATA_COUNT, NODATA_HEIGHT
 from vdgs.system.documents import MapMetadata
+from vdgs.system.units import floor_to_nice_length
 
 #: The sun of a hillshade: from the north-west, half way up, as on printed maps.
 AZIMUTH_DEG, ALTITUDE_DEG = 315.0, 45.0
@@ -57,7 +58,17 @@ def write_hillshade(dsm: Path, file: Path, grid: PixelGrid) -> None:
     light = hillshade(heights, grid.gsd * factor)
     shown = np.isfinite(light)
     gray = (np.nan_to_num(light) * 255 + 0.5).astype(np.uint8)
-    done, content = cv2.imencode(".png", np.dstack([gray, gray, gray, np.where(shown, 255, 0).astype(np.uint8)]))
+    _write_bgra(np.dstack([gray, gray, gray, np.where(shown, 255, 0).astype(np.uint8)]), file)
+
+
+def write_picture(orthophoto: Path, file: Path) -> None:
+    """The orthophoto alone with transparent holes, at most `MAX_IMAGE_PX` long: what the report begins with."""
+    red, green, blue, alpha = read_overview(orthophoto, MAX_IMAGE_PX)[0]
+    _write_bgra(np.dstack([blue, green, red, alpha]), file)
+
+
+def _write_bgra(picture: UInt8[np.ndarray, "h w 4"], file: Path) -> None:
+    done, content = cv2.imencode(".png", np.ascontiguousarray(picture))
     assert done
     file.write_bytes(content.tobytes())
 
@@ -163,9 +174,3 @@ def _north(axes: Axes, name: str) -> None:
         fontweight="bold", color=INK, arrowprops={"arrowstyle": "-|>", "color": INK, "lw": 1.2},
         bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.5},
     )  # fmt: skip
-
-
-def floor_to_nice_length(limit: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is not above `limit`."""
-    power = 10.0 ** np.floor(np.log10(limit))
-    return float(max(step * power for step in (1, 2, 5) if step * power <= limit * (1 + 1e-9)))

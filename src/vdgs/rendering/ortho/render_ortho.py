@@ -21,7 +21,7 @@ from vdgs.geometry.map_projection import MapProjection
 from vdgs.rendering.ortho import geotiff, ortho_plan
 from vdgs.rendering.ortho.geotiff import RasterLayer
 from vdgs.rendering.ortho.ortho_plan import DSM_FILE, METADATA_FILE, ORTHOPHOTO_FILE, VISIBILITY_FILE, OrthoPlan
-from vdgs.rendering.ortho.previews import PreviewSheet, write_hillshade, write_preview
+from vdgs.rendering.ortho.previews import PreviewSheet, write_hillshade, write_picture, write_preview
 from vdgs.rendering.ortho.tile_renderer import NODATA_COUNT, NODATA_HEIGHT, OrthoTile
 from vdgs.rendering.ortho.tile_shards import distributed_tiles
 from vdgs.runs.open_run import locate_model
@@ -101,6 +101,7 @@ def _write(plan: OrthoPlan, tiles: Iterable[OrthoTile], console: Console) -> flo
         sheet = PreviewSheet(plan.run_name, plan.grid, plan.placement, metadata)
         orthophoto, dsm, visibility = (staging / layer.name for layer in layers)
         write_hillshade(dsm, staging / ortho_plan.HILLSHADE_FILE, plan.grid)
+        write_picture(orthophoto, staging / ortho_plan.PICTURE_FILE)
         write_preview(orthophoto, dsm, visibility, staging / ortho_plan.PREVIEW_FILE, sheet)
         write_json(staging / METADATA_FILE, to_jsonable(metadata))
     return metadata["mapped_share"]

@@ -1,0 +1,224 @@
+"""Known distances between points that photographs show: a text file, and the scale that it gives a world.
+
+Lines are `NAME px py photograph`, a mark in pixels, `NAME ray x y photograph`, a mark as x/z and y/z of the camera's
+ray (which `vdgs view` writes: it holds for any size of the photograph), or `NAME NAME metres`, a distance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from vdgs.captures.formats.source_capture import SourceView
+from vdgs.captures.name_resolution import NameLookup, ambiguity_message
+from vdgs.errors import CaptureError
+
+#: Photographs that must show a point: one view tells a line, no place.
+MIN_OBSERVATIONS = 2
+#: What a mark is off by in pixels at least, and what a measured distance is good to as a share (choice).
+LEAST_PX, LEAST_SHARE = 0.5, 0.002
+#: Distances that make scales differ by more than this share contradict each other (choice).
+MOST_APART = 0.1
+FORM = "`NAME px py photograph` or `NAME ray x y photograph` for a mark, or `NAME NAME metres` for a distance"
+_RAY = "ray"
+#: Larger files are none (bytes).
+_MAX_FILE_BYTES = 1 << 24
+
+
+@dataclass(frozen=True)
+class DistanceMark:
+    """Where a photograph shows a point."""
+
+    name: str
+    photograph: str
+    number: int
+    """Of its line in the file."""
+    at: tuple[float, float]
+    """Pixels from the upper left corner, or x/z and y/z of the camera's ray."""
+    is_ray: bool
+
+
+@dataclass(frozen=True)
+class KnownDistances:
+    """Marks of points, and how far points are apart: two names, and metres."""
+
+    marks: tuple[DistanceMark, ...]
+    distances: tuple[tuple[str, str, float], ...]
+
+
+def read_known_distances(file: Path) -> KnownDistances:
+    """The marks and distances of a text file; `#` for comments. Raises CaptureError, naming the line, for a file that
+    cannot be read, lines that are neither, and distances that are none."""
+    marks: list[DistanceMark] = []
+    distances: list[tuple[str, str, float]] = []
+    for number, line in text_lines(file, "known distances"):
+        words = line.split("\t") if "\t" in line else line.split()
+        try:
+            if len(words) == 3:
+                distances.append((words[0], words[1], _meters(words[2])))
+            else:
+                marks.append(_mark(words, number))
+        except (ValueError, IndexError):
+            raise CaptureError(f"{file}: line {number}: {line[:80]!r} is not {FORM}. Mend the line.") from None
+    if not distances:
+        raise CaptureError(f"{file}: names no distance. Lines are {FORM}.")
+    return KnownDistances(tuple(marks), tuple(distances))
+
+
+def _mark(words: Sequence[str], number: int) -> DistanceMark:
+    is_ray = words[1] == _RAY
+    x, y, photograph = words[1 + is_ray : 4 + is_ray]
+    if not (math.isfinite(float(x)) and math.isfinite(float(y))):
+        raise ValueError(x)
+    return DistanceMark(words[0], photograph.strip(), number, (float(x), float(y)), is_ray)
+
+
+def _meters(word: str) -> float:
+    value = float(word)
+    if not (math.isfinite(value) and 0 < value < 1e6):
+        raise ValueError(word)
+    return value
+
+
+def text_lines(file: Path, what: str) -> list[tuple[int, str]]:
+    """The lines of a text file of `what` with their numbers, without empty ones and comments."""
+    try:
+        if file.stat().st_size > _MAX_FILE_BYTES:
+            raise CaptureError(f"{file}: is far too large for a list of {what}.")
+        text = file.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise CaptureError(f"{file}: cannot be read ({error.strerror}).") from error
+    except UnicodeDecodeError:
+        raise CaptureError(f"{file}: is not a text file. A list of {what} is expected.") from None
+    rows = [(k, line.strip()) for k, line in enumerate(text.splitlines(), 1)]
+    return [(k, line) for k, line in rows if line and not line.startswith("#")]
+
+
+def check_marked(known: KnownDistances, images_of: Mapping[str, set[str]], file: Path) -> None:
+    """Raise CaptureError for a point of a distance that fewer than two photographs show."""
+    for name in dict.fromkeys(name for one, other, _ in known.distances for name in (one, other)):
+        if len(images_of.get(name, set())) < MIN_OBSERVATIONS:
+            raise CaptureError(f"{file}: the point {name} is marked in fewer than two photographs. Mark it in more.")
+
+
+@dataclass(frozen=True, eq=False)
+class LocatedPoint:
+    """A point in a world, and by how many pixels its marks are off."""
+
+    position: Float[np.ndarray, "3"]
+    error_px: float
+
+
+def scale_of_distances(
+    distances: Sequence[tuple[str, str, float]], located: Mapping[str, LocatedPoint], pixel: float, source: str
+) -> tuple[float, float]:
+    """The factor from a world to metres, and its standard deviation as a share; `pixel` is what one shows, in the
+    world. Raises CaptureError for points that are not located, marks that are wrong, and distances that contradict
+    each other."""
+    factors, shares = [], []
+    for one, other, meters in distances:
+        for name in (one, other):
+            if name not in located:
+                raise CaptureError(
+                    f"{source}: the point {name} is not shown by two placed photographs that agree on it. Mark it "
+                    "in more of them."
+                )
+        length = float(np.linalg.norm(located[one].position - located[other].position))
+        off = max(LEAST_PX, math.hypot(located[one].error_px, located[other].error_px)) * pixel
+        if not length > 2 * off:
+            raise CaptureError(
+                f"{source}: {one} and {other} are {length / pixel:.0f} pixels apart and their marks are off by "
+                f"{off / pixel:.0f}. Look at the marks again, or measure a longer distance."
+            )
+        factors.append(meters / length)
+        shares.append(math.hypot(LEAST_SHARE, off / length))
+    weights = 1 / np.square(shares)
+    mean = float(np.exp((weights * np.log(factors)).sum() / weights.sum()))
+    apart = max(abs(factor / mean - 1) for factor in factors)
+    if apart > MOST_APART:
+        raise CaptureError(
+            f"{source}: its distances contradict each other by {apart:.0%}. Look at marks and metres again."
+        )
+    return mean, max(float(1 / np.sqrt(weights.sum())), apart / 2)
+
+
+def intersect_rays(centers: Float[np.ndarray, "n 3"], rays: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"] | None:
+    """The point with the least sum of squared distances to lines; None where they are parallel."""
+    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    total = across.sum(axis=0)
+    if np.linalg.eigvalsh(total)[0] < 1e-6:
+        return None
+    return np.asarray(np.linalg.solve(total, np.einsum("nij,nj->i", across, centers)))
+
+
+def known_scale_of_views(
+    file: Path, views: Sequence[SourceView], points: Float[np.ndarray, "n 3"]
+) -> tuple[float, float]:
+    """The factor from a capture's world to metres, and its standard deviation as a share.
+
+    Pixels are those of the photographs at the size that the cameras are given for. Raises CaptureError as
+    `read_known_distances` and `scale_of_distances`, and for photographs that are not there.
+    """
+    known = read_known_distances(file)
+    lookup = NameLookup([(view.name, view) for view in views])
+    seen: dict[str, list[tuple[SourceView, np.ndarray]]] = {}
+    for mark in known.marks:
+        view = _view(mark, lookup, file)
+        seen.setdefault(mark.name, []).append((view, _ray(mark, view, file)))
+    check_marked(known, {name: {view.name for view, _ in marks} for name, marks in seen.items()}, file)
+    located = {name: place for name, marks in seen.items() if (place := _locate(marks)) is not None}
+    centers = np.array([-view.camera_from_world[:3, :3].T @ view.camera_from_world[:3, 3] for view in views])
+    middle = np.median(points, axis=0)
+    focal = np.array([view.intrinsics.focal[0] for view in views])
+    pixel = float(np.median(np.linalg.norm(centers - middle, axis=1) / focal))
+    return scale_of_distances(known.distances, located, pixel, file.name)
+
+
+def _view(mark: DistanceMark, lookup: NameLookup[SourceView], file: Path) -> SourceView:
+    where = f"{file}: line {mark.number}:"
+    _, found = lookup.find(mark.photograph)
+    if not found:
+        raise CaptureError(f"{where} there is no photograph {mark.photograph!r}. Mend the name, or remove the line.")
+    if len(found) > 1:
+        raise CaptureError(f"{where} {ambiguity_message(mark.photograph, found[0].name, found[1].name)}")
+    return found[0]
+
+
+def _ray(mark: DistanceMark, view: SourceView, file: Path) -> np.ndarray:
+    """x/z, y/z and 1 in the camera."""
+    lens = view.intrinsics
+    if mark.is_ray:
+        return np.array([*mark.at, 1.0])
+    if lens.is_distorted:
+        raise CaptureError(
+            f"{file}: line {mark.number}: {view.name} has a lens with distortion, where a mark in pixels says too "
+            "little. Undistort the capture, or measure in `vdgs view` (lines with `ray`)."
+        )
+    if not (0 <= mark.at[0] <= lens.width and 0 <= mark.at[1] <= lens.height):
+        raise CaptureError(
+            f"{file}: line {mark.number}: pixel {mark.at[0]:g}, {mark.at[1]:g} is outside {view.name}, whose camera is "
+            f"given for {lens.width} x {lens.height}. Mark it in a photograph of that size."
+        )
+    return np.array([*((mark.at[k] - lens.principal_point[k]) / lens.focal[k] for k in (0, 1)), 1.0])
+
+
+def _locate(marks: Sequence[tuple[SourceView, np.ndarray]]) -> LocatedPoint | None:
+    """The point nearest to all rays; None where they are parallel, or it lies behind a camera."""
+    poses = np.array([view.camera_from_world[:3] for view, _ in marks])
+    rays = np.array([ray for _, ray in marks])
+    centers = -np.einsum("nji,nj->ni", poses[:, :, :3], poses[:, :, 3])
+    place = intersect_rays(centers, np.einsum("nji,nj->ni", poses[:, :, :3], rays))
+    if place is None:
+        return None
+    there = poses @ np.append(place, 1.0)
+    if (there[:, 2] <= 0).any():
+        return None
+    focal = np.array([view.intrinsics.focal for view, _ in marks])
+    off = (there[:, :2] / there[:, 2:] - rays[:, :2]) * focal
+    return LocatedPoint(place, float(np.sqrt((off**2).sum(axis=1).mean())))

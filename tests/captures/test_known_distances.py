@@ -1,0 +1,96 @@
+"""Metres by known distances: a capture without a scale gets one, one with a scale is held against them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from support.captures import tiny_scene, write_colmap
+from vdgs.captures.loading import load_capture
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.errors import CaptureError
+from vdgs.geometry.camera import Camera
+
+#: Two places of the scene, and how many of its units make a metre in these tests.
+ONE, OTHER, UNITS_PER_METER = np.array([-1.0, -0.5, 0.0]), np.array([1.5, 0.8, 0.0]), 0.25
+METERS = float(np.linalg.norm(ONE - OTHER)) / UNITS_PER_METER
+
+
+def mark(kind: str, name: str, place: np.ndarray, photograph: str, camera: Camera) -> str:
+    x, y = camera.project(place[None])[0][0]
+    if kind == "ray":
+        return f"{name} ray {(x - camera.cx) / camera.fx} {(y - camera.cy) / camera.fy} {photograph}"
+    return f"{name} {x} {y} {photograph}"
+
+
+def bars(file: Path, meters: float = METERS, kind: str = "ray", most: int = 4) -> Path:
+    lines = ["# a comment"]
+    for name, place in (("A", ONE), ("B", OTHER)):
+        seen = [each for each in tiny_scene().cameras.items() if each[1].in_frustum(place[None])[0]]
+        lines += [mark(kind, name, place, *each) for each in seen[:most]]
+    file.write_text("\n".join([*lines, f"A B {meters}", ""]))
+    return file
+
+
+@pytest.fixture
+def capture(tmp_path) -> Path:
+    write_colmap(tmp_path / "capture", tiny_scene())
+    return tmp_path / "capture"
+
+
+@pytest.mark.parametrize("kind", ["ray", "pixel"])
+def test_a_capture_without_scale_gets_metres(capture, tmp_path, kind):
+    options = CaptureOptions(up="z", scale_bar=bars(tmp_path / "bars.txt", kind=kind))
+    ground = load_capture(capture, options).ground
+    assert ground.metric
+    assert ground.scale == pytest.approx(1 / UNITS_PER_METER, rel=1e-4)
+    apart = np.linalg.norm(np.diff(ground.to_ground(np.stack([ONE, OTHER])), axis=0))
+    assert apart == pytest.approx(METERS, rel=1e-4)
+    assert ground.accuracy.startswith("scale ±")
+    assert "10 units" not in ground.description
+
+
+def test_marks_in_pixels_are_those_of_the_cameras_whatever_size_is_used(capture, tmp_path):
+    options = CaptureOptions(up="z", downscale=2.0, scale_bar=bars(tmp_path / "bars.txt", kind="pixel"))
+    assert load_capture(capture, options).ground.scale == pytest.approx(1 / UNITS_PER_METER, rel=1e-4)
+
+
+def test_a_georeference_keeps_its_place_and_takes_the_scale_unless_that_contradicts_it(capture, tmp_path):
+    place = {"frame": "ENU", "origin_lat_deg": 48.0, "origin_lon_deg": 11.0, "origin_alt_m": 500.0}
+    (capture / "georef.json").write_text(json.dumps(place))
+    length = METERS * UNITS_PER_METER
+    before = load_capture(capture)
+    after = load_capture(capture, CaptureOptions(scale_bar=bars(tmp_path / "bars.txt", 1.03 * length)))
+    assert after.ground.scale == pytest.approx(1.03, rel=1e-4)
+    assert after.ground.origin_geo == before.ground.origin_geo
+    assert np.median(after.points, axis=0) == pytest.approx(np.median(before.points, axis=0), abs=0.02)
+    with pytest.raises(CaptureError, match=r"times as large.*feet"):
+        load_capture(capture, CaptureOptions(scale_bar=bars(tmp_path / "bars.txt", length / 0.3048)))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("A B\n", r"line 1: 'A B' is not"), ("A B nan\n", "line 1"), ("A B -2\n", "line 1"),
+        ("A ray 0.1 x 0.png\nA B 2\n", "line 1"), ("A 1 2 no.png\nA B 2\n", "no photograph 'no.png'"),
+        ("# nothing\n", "names no distance"), ("A B 2\n", "A is marked in fewer than two"),
+        ("A 1e9 2 00.png\nA B 2\n", "outside"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_with_a_file_is_said(capture, tmp_path, text, said):
+    first = next(iter(tiny_scene().cameras))
+    (tmp_path / "bars.txt").write_text(text.replace("00.png", first))
+    with pytest.raises(CaptureError, match=said):
+        load_capture(capture, CaptureOptions(up="z", scale_bar=tmp_path / "bars.txt"))
+
+
+def test_a_file_that_is_not_there_and_distances_that_contradict_each_other_are_refused(capture, tmp_path):
+    with pytest.raises(CaptureError, match="cannot be read"):
+        load_capture(capture, CaptureOptions(up="z", scale_bar=tmp_path / "none.txt"))
+    file = bars(tmp_path / "bars.txt")
+    file.write_text(file.read_text() + f"B A {1.4 * METERS}\n")
+    with pytest.raises(CaptureError, match="contradict each other"):
+        load_capture(capture, CaptureOptions(up="z", scale_bar=file))
