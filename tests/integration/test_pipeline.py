@@ -325,14 +325,14 @@ def test_ctrl_c_between_stages_stops_the_run_and_the_same_command_continues(capt
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     status = vdgs("status", copied)
     assert status.returncode == 0, status.stdout
-    assert "next: open" in status.stdout
+    assert f"report: {copied / 'report.html'}" in status.stdout
 
 
 def time_few_steps() -> None:
     """Let a plan be made of fewer steps than take seconds."""
-    from vdgs.pipeline import dry_run
+    from vdgs.pipeline import time_estimate
 
-    dry_run.MAX_TIMED_SECONDS = 0.0
+    time_estimate.MAX_TIMED_SECONDS = 0.0
 
 
 def test_a_dry_run_says_what_it_takes_and_writes_nothing(capture, copied, tmp_path):
@@ -364,7 +364,7 @@ def test_a_dry_run_counts_what_stereo_may_add(tmp_path):
         "run", tmp_path / "capture", "--output", tmp_path / "run", *SETTINGS, "--dry-run", prepare=time_few_steps
     )
     assert f"and at most {10 * 64 * 48 // PIXELS_PER_POINT - 80} where stereo finds ground" in planned.stdout
-    assert "and with those of stereo" in " ".join(planned.stdout.split())
+    assert "training steps at each size, stereo." in " ".join(planned.stdout.split())
 
 
 def test_another_cut_leaves_no_old_result_standing(copied):

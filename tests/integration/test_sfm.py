@@ -303,7 +303,11 @@ def test_a_run_of_photographs_makes_them_a_capture_first_and_reports_how(made, f
 
 def test_a_dry_run_of_photographs_looks_and_writes_nothing(flight, tmp_path):
     said = console()
-    assert estimate_run(asked(flight, tmp_path / "run"), said) is None
+    estimate = estimate_run(asked(flight, tmp_path / "run"), said)
+    assert {"photographs", "coarse", "blocks", "measuring"} <= {
+        name for name, cost in estimate.times.items() if cost.seconds > 0
+    }
+    assert "the whole job: about" in said.file.getvalue()
     assert "10 of 10" in said.file.getvalue()
     assert list(tmp_path.iterdir()) == []
 

@@ -13,16 +13,21 @@ from unittest.mock import Mock
 
 import pytest
 import yaml
+from tyro import MISSING
 
 from support.hand_made_models import model_at
+from support.next_commands import next_commands
 from vdgs.captures.capture import Capture
+from vdgs.cli.common import parse_arguments, preset_defaults
 from vdgs.cli.main import main
+from vdgs.cli.run_cmd import RunArguments
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.method import MergeConfig, MethodConfig
+from vdgs.config.presets import PRESETS
 from vdgs.errors import RunError
 from vdgs.model.anchor_model import ModelMetadata
 from vdgs.report import write_report
-from vdgs.report.status_cli import EXIT_INCOMPLETE, full_run_status, next_step
+from vdgs.report.status_cli import EXIT_INCOMPLETE, full_run_status, next_line
 from vdgs.runs.model_integrity import load_verified
 from vdgs.runs.open_run import open_model, open_run
 from vdgs.runs.run_folder import RunFolder
@@ -97,8 +102,8 @@ def test_a_whole_run_is_whole(run, capsys):
     assert command_line("status", run.path) == 0
     said = capsys.readouterr().out
     assert "10 done" in said
-    assert "next: open" in said
-    assert "vdgs render" in said
+    assert f"report: {run.path / 'report.html'}" in said
+    assert next_commands(said) == [f"vdgs render {run.path} --views flyover --output flyover.mp4"]
 
 
 @pytest.mark.parametrize(
@@ -173,13 +178,13 @@ def test_what_fails_and_stops_is_said_with_its_reason(run):
         standing = get_run_status(run)
         assert standing.of("block 1").state == "running"
         assert standing.next_command() == ""
-        assert "at work" in next_step(standing)
+        assert "at work" in next_line(standing)
 
 
 def test_a_run_is_at_work_between_two_stages_too(run):
     run.merged.model.unlink()
     with run.drive_lock():
-        assert next_step(full_run_status(run)) == "nothing to type: it is at work"
+        assert next_line(full_run_status(run)) == "at work: nothing to type"
         with pytest.raises(RunError, match="another vdgs process"), run.drive_lock():
             pass
 
@@ -240,7 +245,7 @@ def test_models_that_were_copied_to_where_they_do_not_belong_are_refused(run):
     with pytest.raises(RunError, match=r"is the model of block 1\. Put back .* or delete"):
         load_verified(zero, key, 0)
     assert get_run_status(run).of("block 0").state == "stale"
-    assert get_run_status(run).next_command().startswith("delete ")
+    assert next_commands(next_line(get_run_status(run))) == [f"rm -r {zero.path}", f"vdgs train-blocks {run.path}"]
     zero.model.write_bytes(own)
     model = model_at(PLACES, seed=8)  # of the right block, but not what was trained here
     replace(model, metadata=ModelMetadata(key=key, block=0)).save(zero.model)
@@ -304,4 +309,44 @@ def test_a_copy_of_a_run_is_not_continued_where_the_run_lies(run, tmp_path):
 
 def test_settings_that_cannot_be_read_are_to_be_mended(run):
     run.config_file.write_text(run.config_file.read_text().replace("iterations: ", "iterations: many #", 1))
-    assert get_run_status(run).next_command() == f"mend {run.config_file}"
+    assert get_run_status(run).next_command() == ""
+    assert next_line(get_run_status(run)).startswith(f"to mend: correct {run.config_file}")
+
+
+@pytest.mark.parametrize(
+    "changed", [{}, {"partition": {"lambda_vis": 0.3, "blocks": 3}}, {"block": {"draw_outside": False}}]
+)
+def test_a_run_without_its_command_is_continued_with_its_settings(tmp_path, changed):
+    """The options name the settings, whatever shell characters the folders have."""
+    run = RunFolder(tmp_path / "it's a run; $HOME")
+    method = PRESETS["laptop"]
+    method = replace(method, **{name: replace(getattr(method, name), **new) for name, new in changed.items()})
+    options = CaptureOptions(images="images_4", test_every=5)
+    run.create_or_check(RunSettings.create(tmp_path / "a capture", options, method))
+    line = next_line(get_run_status(run))
+    (command,) = next_commands(line)
+    words = shlex.split(command)
+    assert words[:5] == ["vdgs", "run", str(tmp_path / "a capture"), "--output", str(run.path)]
+    preset, settings = preset_defaults(words[2:])
+    asked = RunArguments(
+        capture=MISSING, output=MISSING, preset=preset, training=settings.training, partition=settings.partition,
+        assignment=settings.assignment, block=settings.block, merge=settings.merge,
+    )  # fmt: skip
+    parsed = parse_arguments(RunArguments, words[2:], "vdgs run", asked)
+    assert (parsed.method(), parsed.options) == (method, options)
+
+
+def test_what_the_driver_works_on_is_shown_as_running(run, capsys):
+    (run.evaluation / "metrics.json").unlink()
+    write_json(run.progress_file, {"stage": "evaluation", "step": "test views", "done": 3, "total": 12})
+    assert states(run)["evaluation"] == "missing"  # nobody works on it
+    with run.drive_lock():
+        assert states(run)["evaluation"] == "running"
+        assert command_line("status", run.path) == EXIT_INCOMPLETE
+    assert "test views: 3 of 12" in capsys.readouterr().out
+
+
+def test_a_status_file_that_is_damaged_is_deleted_first(run):
+    run.block(1).status_file.write_text("{}")
+    commands = next_commands(next_line(get_run_status(run)))
+    assert commands == [f"rm {run.block(1).status_file}", f"vdgs train-blocks {run.path}"]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vdgs.errors import CaptureError
-from vdgs.system.atomic_files import read_json
+from vdgs.system.atomic_files import read_json, read_json_or_empty
 from vdgs.system.records import record_from_dict
 
 RECONSTRUCTION_FILE, RECONSTRUCTION_FIGURE = "reconstruction.json", "reconstruction.png"
@@ -17,6 +17,12 @@ MAPPED = "mapped"
 WORK_FOLDER = "work"
 #: What says in it, and in the capture, which steps are done.
 STEPS_FILE = "steps.json"
+#: How far the present step is, in the work folder.
+PROGRESS_FILE = "progress.json"
+#: The photographs that it is made of, in the capture.
+SOURCE_IMAGES_FILE = "photographs.json"
+#: The stage of a run that makes a capture of photographs, as `vdgs status` names it.
+SFM_STAGE = "photographs"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,6 +148,12 @@ class ReconstructionReport:
 def is_reconstruction(root: Path) -> bool:
     """Whether a folder is a capture made of photographs here, finished or not."""
     return (root / RECONSTRUCTION_FILE).is_file() or (root / WORK_FOLDER / STEPS_FILE).is_file()
+
+
+def is_finished(root: Path) -> bool:
+    """Whether a capture that was begun here is placed, its last step."""
+    done = read_json_or_empty(root / STEPS_FILE).get("done")
+    return (root / RECONSTRUCTION_FILE).is_file() and isinstance(done, dict) and "placed" in done
 
 
 def read_reconstruction(root: Path) -> ReconstructionReport | None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
+from rich.markup import escape
 from tyro.conf import Positional, arg
 
 from vdgs.cli.common import QuietArguments, make_console, parse_arguments
@@ -15,7 +16,7 @@ from vdgs.config.ranges import WORKER_COUNT, FlagName
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.synth.options import SynthOptions
-from vdgs.system.quoting import shell_word
+from vdgs.system.quoting import shell_line
 
 
 @dataclass(frozen=True)
@@ -97,6 +98,8 @@ class SfmArguments(QuietArguments):
     """Threads to use; 0 for all cores."""
     keep_intermediate: bool = False
     """Keep COLMAP's database and models in OUTPUT/work once all is done."""
+    overwrite: bool = False
+    """Make the capture anew where photographs were added, removed or changed since it was begun."""
     options: Annotated[SfmOptions, arg(name=""), FlagName("")] = field(default_factory=SfmOptions)
 
 
@@ -108,14 +111,19 @@ def sfm_command(arguments: list[str]) -> None:
         raise VdgsError("name the folder of the photographs: vdgs sfm PHOTOGRAPHS --output CAPTURE")
     request = SfmRequest(
         image_folders=args.images, output=args.output, gps=args.gps, threads=args.threads,
-        keep_intermediate=args.keep_intermediate, options=args.options,
+        keep_intermediate=args.keep_intermediate, overwrite=args.overwrite, options=args.options,
     )  # fmt: skip
     console = make_console(args.quiet)
     if args.dry_run:
-        print_plan(plan_reconstruction(request), console)
+        from vdgs.sfm.sfm_estimate import estimate_sfm
+
+        plan = plan_reconstruction(request)
+        print_plan(plan, estimate_sfm(plan).text(plan.threads), console)
         console.print("Nothing was written.", highlight=False)
         return
     from vdgs.sfm.reconstruct import reconstruct
 
     reconstruct(request, console)
-    console.print(f"capture: {args.output}\nnext: vdgs run {shell_word(args.output)} --output RUN", highlight=False)
+    capture = args.output.resolve()
+    run = shell_line(["vdgs", "run", capture, "--output", f"{capture}-run", "--preset", "laptop"])
+    console.print(escape(f"capture: {args.output}\nnext: {run}"), highlight=False)

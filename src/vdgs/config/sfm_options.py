@@ -57,4 +57,6 @@ class SfmRequest:
     gps: Path | None = None
     threads: Annotated[int, WORKER_COUNT] = 0
     keep_intermediate: bool = False
+    overwrite: bool = False
+    """Make a capture anew whose photographs were added, removed or changed."""
     options: Annotated[SfmOptions, FlagName("")] = field(default_factory=SfmOptions)

@@ -13,7 +13,7 @@ One view is in memory at a time.
 from __future__ import annotations
 
 import statistics
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -74,6 +74,7 @@ def evaluate_model(
     lpips_note: str = "",
     settings: EvaluationSettings | None = None,
     console: Console | None = None,
+    on_view: Callable[[int], object] = lambda _done: None,
 ) -> EvaluationMetrics:
     """Render and measure every view, write `output`, and return what `metrics.json` holds.
 
@@ -88,7 +89,9 @@ def evaluate_model(
 
     def measure(index: int) -> ViewMetrics:
         check_stop_requested()
-        return measure_view(index, inputs)
+        measured = measure_view(index, inputs)
+        on_view(index + 1)
+        return measured
 
     return summarize_views(
         map(measure, range(len(reference_views.views))), model.metadata, output,

@@ -64,7 +64,11 @@ def evaluate_run(
     lpips, note = load_lpips(lpips_weights)
     model, settings = make_renderable_model(run, coarse, views), make_evaluation_settings(bins, views)
     with cached_reference_views(select_views(run.capture, views)) as images:
-        evaluate_model(images, model, output, lpips=lpips, lpips_note=note, console=console, settings=settings)
+        stage = "evaluation" if run.name == "merged" else "coarse evaluation"
+        evaluate_model(
+            images, model, output, lpips=lpips, lpips_note=note, console=console, settings=settings,
+            on_view=run.folder.begin_step(stage, f"{views} views", "", len(images.views)),
+        )  # fmt: skip
     console.print(f"images and metrics: {output}", highlight=False)
 
 

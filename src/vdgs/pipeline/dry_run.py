@@ -1,14 +1,15 @@
 """`vdgs run --dry-run`: what a run would take, by estimate, before it begins. Nothing is written.
 
-Time is measured, not guessed: a few steps at each size of the photographs, on this machine and with these settings.
-What cannot be known before is how far anchors grow, so times are given as two ends.
+Time is measured, not guessed: a few steps at each size of the photographs, on this machine and with these settings. Of
+photographs alone two are searched and matched, and the steps are those of a scene like theirs (`assumed_scene`).
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from rich.console import Console
 
@@ -18,45 +19,49 @@ from vdgs.captures.image_cache import ImageCache
 from vdgs.captures.loading import load_capture
 from vdgs.captures.reconstruction import read_reconstruction
 from vdgs.config.commands import RunRequest
-from vdgs.config.method import MethodConfig, TrainConfig, block_train_config, resolve_iterations
+from vdgs.config.method import MethodConfig, block_train_config, resolve_iterations
 from vdgs.config.ranges import check_ranges
 from vdgs.config.validation_rules import check_config
-from vdgs.distributed.resource_allocation import ShardWorkload, allocate_local, exceeds_memory
+from vdgs.distributed.resource_allocation import Allocation, ShardWorkload, allocate_local, exceeds_memory
 from vdgs.errors import VdgsError
 from vdgs.kernels import get_num_threads
 from vdgs.partition.partition_scene import choose_block_count
+from vdgs.pipeline.assumed_scene import as_many, assumed_capture
 from vdgs.pipeline.dense_points import max_dense_points
+from vdgs.pipeline.time_estimate import (
+    COARSE_VIEW_STEPS,
+    MAP_STEPS,
+    MERGED_VIEW_STEPS,
+    OTHER_SECONDS,
+    START_SECONDS,
+    StepTimes,
+    expected_growth,
+    time_steps,
+    time_stereo,
+)
 from vdgs.pipeline.train_coarse import build_coarse_problem, initial_coarse_state
+from vdgs.rendering.ortho.render_ortho import has_ortho_dependencies
 from vdgs.runs.config_file import changed_flags
 from vdgs.runs.create_or_resume import capture_options_changed, run_settings
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_status import RunStatus, get_run_status
 from vdgs.sfm.reconstruction_plan import plan_reconstruction, print_plan
 from vdgs.sfm.run_request import is_image_input, make_sfm_request
+from vdgs.sfm.sfm_estimate import estimate_sfm
 from vdgs.system.atomic_files import read_json
-from vdgs.system.memory.memory_estimate import (
-    MAX_GROWTH,
-    block_workload,
-    decoded_image_bytes,
-    estimate_memory,
-    max_image_pixels,
-)
+from vdgs.system.memory.memory_estimate import block_workload, decoded_image_bytes, estimate_memory, max_image_pixels
 from vdgs.system.memory.process_memory import available_memory_bytes
-from vdgs.system.quoting import shell_word
-from vdgs.system.stop_signals import check_stop_requested
+from vdgs.system.processor_time import NO_COST, Cost, describe_cost
 from vdgs.system.units import data_size, rough_duration
-from vdgs.training import TrainingProblem, TrainingState, train
 from vdgs.training.session.memory_advice import training_workload
 from vdgs.training.session.trainer import image_cache_bytes
 
-#: Steps at each size that are timed at least, the first of them not; then as many as fit into so many seconds.
-MIN_TIMED_STEPS, MAX_TIMED_SECONDS = 4, 2.0
+START = Cost(START_SECONDS, START_SECONDS)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunEstimate:
-    """What a run takes by estimate. Seconds are pairs: with as many anchors as at the start, and with all that stereo
-    may add, grown all the while."""
+    """What a run takes by estimate."""
 
     anchors: int
     dense_points: int
@@ -72,14 +77,36 @@ class RunEstimate:
     images_bytes: int
     """Of one block, beside `block_bytes`."""
     may_exceed_memory: bool
-    coarse_seconds: tuple[float, float]
-    blocks_seconds: tuple[float, float]
+    growth: tuple[float, float]
+    """How many times their number anchors become in the coarse stage, and in a block."""
+    times: Mapping[str, Cost]
+    """What each stage takes: photographs, stereo, coarse, blocks, measuring, maps, other."""
+    slowdown: float
+    """How many times as long it takes as busy as the machine is now."""
+
+    @property
+    def total(self) -> Cost:
+        return sum(self.times.values(), NO_COST)
 
 
-def estimate_run(request: RunRequest, console: Console) -> RunEstimate | None:
-    """Print what `vdgs run` would do and take; None of photographs alone, whose training cannot be estimated.
+@dataclass(frozen=True)
+class _Scene:
+    """What is to be trained: a capture, or one that stands for the photographs of which one will be made."""
 
-    Raises what reading the capture raises, VdgsError for bad settings.
+    timed: Capture
+    """Whose steps are timed."""
+    counted: Capture
+    """Whose photographs are counted."""
+    test_views: int
+    points: int
+    views_per_point: float = 8.0
+    """By how many photographs a place is seen."""
+
+
+def estimate_run(request: RunRequest, console: Console) -> RunEstimate:
+    """Print what `vdgs run` would do and take.
+
+    Raises what reading the capture or the photographs raises, VdgsError for bad settings.
     """
     check_ranges(request)
     method = request.method()
@@ -87,32 +114,41 @@ def estimate_run(request: RunRequest, console: Console) -> RunEstimate | None:
     if request.options.undistort:
         raise VdgsError("--dry-run writes nothing, and --undistort writes photographs: leave one of the two out.")
     if is_image_input(request):
-        return _estimate_reconstruction(request, console)
+        return _estimate_from_images(request, console)
     capture = load_capture(request.capture, request.options)
     for warning in capture.warnings:
         console.print(f"[yellow]note[/] {warning}", highlight=False)
     method = replace(method, training=resolve_iterations(method.training, len(capture.train_views)))
     status = _run_status(request, capture, method, console)
-    estimate = _estimate(capture, method, request)
+    estimate = _estimate(_Scene(capture, capture, len(capture.test_views), len(capture.points)), method, request)
     _print_estimate(estimate, method, status, console)
     return estimate
 
 
-def _estimate_reconstruction(run_request: RunRequest, console: Console) -> RunEstimate | None:
-    """The plan of the reconstruction; training can be estimated once there is a capture, which a run makes first."""
+def _estimate_from_images(run_request: RunRequest, console: Console) -> RunEstimate:
+    """The whole job of photographs alone; of a capture that was made of them before, what remains."""
     request = make_sfm_request(run_request)
     if read_reconstruction(request.output) is not None:
         options = replace(run_request.options, gps=None)
         with_capture = replace(run_request, capture=request.output, extra_image_folders=(), options=options)
         return estimate_run(with_capture, console)
-    print_plan(plan_reconstruction(request), console)
-    folders = " ".join(map(shell_word, (run_request.capture, *run_request.extra_image_folders)))
-    console.print(
-        f"Training can be estimated once they are a capture: vdgs sfm {folders} --output CAPTURE, then the same "
-        "with CAPTURE. Nothing was written.",
-        highlight=False,
-    )
-    return None
+    plan = plan_reconstruction(request)
+    sfm = estimate_sfm(plan)
+    print_plan(plan, sfm.text(plan.threads), console)
+    count = len(plan.image_list.images)
+    tested = -(-count // run_request.options.test_every)
+    method = run_request.method()
+    method = replace(method, training=resolve_iterations(method.training, count - tested))
+    with tempfile.TemporaryDirectory(prefix="vdgs-") as folder:
+        timed = assumed_capture(plan, run_request.options, sfm.points, Path(folder))
+        scene = _Scene(timed, as_many(timed, count - tested), tested, sfm.points)
+        if plan.preflight.views_per_point:
+            scene = replace(scene, views_per_point=plan.preflight.views_per_point)
+        estimate = _estimate(scene, method, run_request)
+    slowdown = max(sfm.slowdown, estimate.slowdown)
+    estimate = replace(estimate, times={"photographs": sfm.total, **estimate.times}, slowdown=slowdown)
+    _print_estimate(estimate, method, None, console)
+    return estimate
 
 
 def _run_status(request: RunRequest, capture: Capture, method: MethodConfig, console: Console) -> RunStatus | None:
@@ -128,20 +164,20 @@ def _run_status(request: RunRequest, capture: Capture, method: MethodConfig, con
     return get_run_status(run, settings)
 
 
-def _estimate(capture: Capture, method: MethodConfig, request: RunRequest) -> RunEstimate:
-    config, views = method.training, len(capture.train_views)
+def _estimate(scene: _Scene, method: MethodConfig, request: RunRequest) -> RunEstimate:
+    config, views = method.training, len(scene.counted.train_views)
     factors = sorted({factor for _, factor in (*config.resolution_schedule, *method.block.resolution_schedule)})
-    with ImageCache(capture.train_views, image_cache_bytes(request.checkpointing), downscales=tuple(factors)) as images:
-        stage, anchors = build_coarse_problem(capture, config, images, request.device)
-        fit_exposures = config.exposure_compensation
-        sparse = training_workload(initial_coarse_state(anchors, stage, fit_exposures), stage)
-        timed = {}
-        for factor in factors:
-            at_size = replace(stage, config=replace(config, resolution_schedule=((0.0, factor),)))
-            timed[factor] = _seconds_per_step(initial_coarse_state(anchors, at_size, fit_exposures), at_size)
-    dense = max_dense_points(capture) if config.anchors.mvs else 0
-    need, growth = replace(sparse, anchors=sparse.anchors + dense), MAX_GROWTH * (1 + dense / max(sparse.anchors, 1))
-    cameras, free = [view.camera for view in capture.train_views], available_memory_bytes()
+    budget = image_cache_bytes(request.checkpointing)
+    with ImageCache(scene.timed.train_views, budget, downscales=tuple({1, *factors})) as images:
+        stage, anchors = build_coarse_problem(scene.timed, config, images, request.device)
+        sparse = training_workload(initial_coarse_state(anchors, stage, config.exposure_compensation), stage)
+        steps = time_steps(stage, anchors, factors, config.exposure_compensation)
+        dense = _dense_room(scene) if config.anchors.mvs else 0
+        stereo = views * time_stereo(scene.timed, images, config.anchors) if dense else 0.0
+    share = scene.points / max(1, len(scene.timed.points))
+    sparse = replace(sparse, anchors=round(share * sparse.anchors))
+    need = replace(sparse, anchors=sparse.anchors + dense)
+    cameras, free = [view.camera for view in scene.counted.train_views], available_memory_bytes()
     pixels = max_image_pixels(cameras, method.block.resolution_schedule)
     blocks = choose_block_count(need.max_grown_anchors, views, pixels, method)
     largest = block_workload(method, -(-need.max_grown_anchors // blocks), need.max_grown_anchors, pixels)
@@ -150,45 +186,55 @@ def _estimate(capture: Capture, method: MethodConfig, request: RunRequest) -> Ru
     work = ShardWorkload(
         shards=blocks, shard_bytes=block_bytes, jobs=request.jobs, image_gb=image_gb, images_bytes=image_bytes
     )
-    share = allocate_local(work, get_num_threads(), free)
+    local = allocate_local(work, get_num_threads(), free)
     block = block_train_config(method, max(1, round(views * min(1.0, 1.5 / blocks))))
-    coarse_seconds, blocks_seconds = _seconds(config, timed), blocks * _seconds(block, timed)
+    more = 1 + dense / max(sparse.anchors, 1) / 2  # stereo fills half of what it may, where it fills any
+    start = more * expected_growth(config)
+    times = {
+        "stereo": Cost(stereo / get_num_threads(), stereo),
+        "coarse": steps.stage(config, more),
+        "blocks": _side_by_side((steps.stage(block, start) + START) * blocks, local),
+        **_other_times(scene, steps, bool(request.ortho)),
+    }
     return RunEstimate(
-        anchors=len(anchors),
+        anchors=sparse.anchors,
         dense_points=dense,
         blocks=blocks,
         coarse_iterations=config.iterations,
         block_iterations=block.iterations,
-        jobs=share.max_concurrent,
+        jobs=local.max_concurrent,
         free_bytes=free,
         coarse_bytes=coarse_bytes,
         block_bytes=block_bytes,
-        images_bytes=min(image_bytes, round(1e9 * share.image_gb)),
-        may_exceed_memory=coarse_bytes > free or exceeds_memory(work, share.max_concurrent, free),
-        coarse_seconds=(coarse_seconds, coarse_seconds * (1 + growth) / 2),
-        blocks_seconds=(blocks_seconds, blocks_seconds * growth),
+        images_bytes=min(image_bytes, round(1e9 * local.image_gb)),
+        may_exceed_memory=coarse_bytes > free or exceeds_memory(work, local.max_concurrent, free),
+        growth=(expected_growth(config), expected_growth(block)),
+        times=times,
+        slowdown=steps.slowdown,
     )
 
 
-def _seconds_per_step(state: TrainingState, stage: TrainingProblem) -> float:
-    """Mean time of the steps that are tried, without the first, which opens files."""
-    times = [time.monotonic()]
-
-    def enough() -> bool:
-        check_stop_requested()
-        return len(times) > MIN_TIMED_STEPS and times[-1] - times[1] > MAX_TIMED_SECONDS
-
-    train(state, stage, stop=enough, after_step=lambda *_: times.append(time.monotonic()))
-    return (times[-1] - times[1]) / (len(times) - 2) if len(times) > 2 else times[-1] - times[0]
+def _dense_room(scene: _Scene) -> int:
+    """The most points that stereo may add to those that there are, or will be."""
+    return max(0, max_dense_points(scene.counted) + len(scene.counted.points) - scene.points)
 
 
-def _seconds(config: TrainConfig, timed: dict[int, float]) -> float:
-    """Of all steps of a stage, each at the size that the schedule gives it."""
-    ends = [begin for begin, _ in config.resolution_schedule[1:]] + [1.0]
-    return sum(
-        config.iterations * max(0.0, end - begin) * timed[factor]
-        for (begin, factor), end in zip(config.resolution_schedule, ends, strict=True)
-    )
+def _side_by_side(cost: Cost, allocation: Allocation) -> Cost:
+    """Blocks that are trained at once share the processors better than the threads of one do."""
+    if allocation.max_concurrent == 1:
+        return cost
+    return Cost(cost.processor_seconds / get_num_threads(), cost.processor_seconds)
+
+
+def _other_times(scene: _Scene, steps: StepTimes, ortho: bool) -> dict[str, Cost]:
+    """What is drawn and measured, by what steps take, and the rest."""
+    step, views = steps.at_full_size, len(scene.counted.train_views) + scene.test_views
+    maps = MAP_STEPS * views / scene.views_per_point if ortho and has_ortho_dependencies() else 0.0
+    return {
+        "measuring": step * (scene.test_views * (COARSE_VIEW_STEPS + MERGED_VIEW_STEPS)),
+        "maps": step * maps,
+        "other": Cost(OTHER_SECONDS, OTHER_SECONDS),
+    }
 
 
 def _print_estimate(plan: RunEstimate, method: MethodConfig, status: RunStatus | None, console: Console) -> None:
@@ -196,20 +242,27 @@ def _print_estimate(plan: RunEstimate, method: MethodConfig, status: RunStatus |
         stages = [stage for stage in status.stages if stage.name in names] if status is not None else []
         return "; done already" if stages and all(stage.state == "done" for stage in stages) else ""
 
+    def takes(*names: str) -> str:
+        return rough_duration(sum(plan.times[name].seconds for name in names))
+
     blocks = f"{plan.blocks} block{'' if plan.blocks == 1 else 's'}"
     auto = method.partition.blocks == "auto"
     chosen = " by estimate: --blocks auto counts again when anchors have grown" if auto else ""
     stereo = f" (and at most {plan.dense_points:,} where stereo finds ground)" if plan.dense_points else ""
     names = [stage.name for stage in status.blocks] if status is not None else []
+    coarse_growth, block_growth = plan.growth
     lines = [
         f"coarse model: {plan.anchors:,} anchors at the start{stereo}, {plan.coarse_iterations:,} iterations, at most "
-        f"{data_size(plan.coarse_bytes)}, {_times(plan.coarse_seconds)}{done('coarse')}",
+        f"{data_size(plan.coarse_bytes)}, about {takes('stereo', 'coarse')}{done('coarse')}",
         f"{blocks}{chosen}: about {plan.block_iterations:,} iterations each, {plan.jobs} at once, at most "
-        f"{data_size(plan.block_bytes)} each and {data_size(plan.images_bytes)} for photographs, "
-        f"{_times(plan.blocks_seconds)}{done(*names)}",
+        f"{data_size(plan.block_bytes)} each and {data_size(plan.images_bytes)} for photographs, about "
+        f"{takes('blocks')}{done(*names)}",
+        f"measuring, maps, report: about {takes('measuring', 'maps', 'other')}",
         f"memory that is free: {data_size(plan.free_bytes)}",
-        "Times are of training alone, from steps timed now on this machine; the larger one is with "
-        f"{MAX_GROWTH:g} times as many anchors{', and with those of stereo' if plan.dense_points else ''}. Nothing was "
+        f"the whole job: {describe_cost(plan.total, get_num_threads(), plan.slowdown)}",
+        f"Measured now on this machine: training steps at each size{', stereo' if plan.dense_points else ''}"
+        f"{', features and matches of two photographs' if 'photographs' in plan.times else ''}. Anchors are taken to "
+        f"grow {coarse_growth:.2g} times in the coarse model and {block_growth:.2g} times in blocks. Nothing was "
         "written.",
     ]
     console.print("\n".join(lines), highlight=False)
@@ -219,8 +272,3 @@ def _print_estimate(plan: RunEstimate, method: MethodConfig, status: RunStatus |
             "--jobs",
             highlight=False,
         )
-
-
-def _times(seconds: Sequence[float]) -> str:
-    low, high = (rough_duration(each) for each in seconds)
-    return f"{low} to {high}" if low != high else f"about {low}"

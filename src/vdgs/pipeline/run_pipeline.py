@@ -25,7 +25,7 @@ from vdgs.pipeline.train_blocks import train_blocks
 from vdgs.pipeline.train_coarse import train_coarse
 from vdgs.rendering.ortho.render_ortho import has_ortho_dependencies, is_ortho_current, render_ortho
 from vdgs.report import write_report
-from vdgs.report.status_cli import full_run_status, next_step
+from vdgs.report.status_cli import full_run_status, next_line
 from vdgs.runs.create_or_resume import exclusive_run
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
@@ -46,15 +46,15 @@ def run_pipeline(request: RunRequest, console: Console, command: str | None = No
     check_ranges(request)
     check_weights_file(request.lpips_weights)
     check_output(request.output)
-    request = reconstruct_if_needed(request, console)
+    request = reconstruct_if_needed(request, console, command)
     with exclusive_run(
         request.capture, request.output, request.options, request.method(), overwrite=request.overwrite, command=command
     ) as context:
         _stages(context, request, console)
-    console.print(escape(f"next: {next_step(full_run_status(context.run))}"), highlight=False)
+    console.print(escape(next_line(full_run_status(context.run))), highlight=False)
 
 
-def reconstruct_if_needed(run_request: RunRequest, console: Console) -> RunRequest:
+def reconstruct_if_needed(run_request: RunRequest, console: Console, command: str | None = None) -> RunRequest:
     """The request with a capture: photographs alone become one in RUN/capture first.
 
     Raises what `reconstruct` raises, RunError where another process drives the run, and VdgsError for settings that do
@@ -65,7 +65,7 @@ def reconstruct_if_needed(run_request: RunRequest, console: Console) -> RunReque
     check_config(run_request.method())
     _title(console, "photographs")
     request = make_sfm_request(run_request)
-    reconstruct(request, console, RunFolder(run_request.output).drive_lock())
+    reconstruct(request, console, RunFolder(run_request.output), command)
     return replace(
         run_request,
         capture=request.output,
@@ -75,12 +75,16 @@ def reconstruct_if_needed(run_request: RunRequest, console: Console) -> RunReque
 
 
 def _stages(context: RunContext, request: RunRequest, console: Console) -> None:
+    run = context.run
     _title(console, "coarse model")
+    run.begin_step("coarse")
     train_coarse(context, request.checkpointing, console, request.device)
     check_stop_requested()
+    run.begin_step("visibility")
     count_run_visibility(context, console)
     _measure(context, "coarse", request, console)
     _title(console, "blocks")
+    run.begin_step("partition")
     partition_run(context, console, request.device, _execution(request))
     _title(console, "block training")
     try:
@@ -90,14 +94,16 @@ def _stages(context: RunContext, request: RunRequest, console: Console) -> None:
             raise
         console.print(f"[yellow]note[/] {error}", highlight=False)
     _title(console, "merge and evaluation")
+    run.begin_step("merge")
     merge_run_blocks(context, request.allow_missing_blocks, console)
     _measure(context, "merged", request, console)
     context.release_models("coarse")
-    _print_improvement(context.run, console)
+    _print_improvement(run, console)
     if request.ortho:
         _ortho(context, request, console)
     check_stop_requested()
-    console.print(f"report: {write_report(context.run)}", highlight=False)
+    run.begin_step("report")
+    console.print(f"report: {write_report(run)}", highlight=False)
 
 
 def _ortho(context: RunContext, request: RunRequest, console: Console) -> None:

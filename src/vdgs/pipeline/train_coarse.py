@@ -34,6 +34,7 @@ from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.stage_folder import StatusRecord
 from vdgs.system.atomic_files import write_json
 from vdgs.system.checkpoints import save_checkpoint
+from vdgs.system.step_progress import StepProgress
 from vdgs.system.stop_signals import check_stop_requested
 from vdgs.training import TrainingProblem, TrainingState, initial_state, mean_image_color, to_checkpoint
 from vdgs.training.schedule import view_sampling_weights
@@ -85,7 +86,7 @@ def _train(
         stage, anchors = build_coarse_problem(capture, config, images, device, dense)
 
         def start() -> TrainingState:
-            spread = _brightness_spread(images, config, console)
+            spread = _brightness_spread(run, images, config, console)
             fitted = config.exposure_compensation and (spread is None or spread >= config.exposure_min_spread)
             counts = {
                 "sparse_points": len(capture.points),
@@ -119,7 +120,7 @@ def _dense_points(
 ) -> DensePoints | None:
     """The points that stereo adds to the sparse ones, computed now or before; prints how many."""
     start = time.monotonic()
-    with _progress("looking for ground by stereo", console) as on_progress:
+    with _progress("looking for ground by stereo", run, console) as on_progress:
         dense = find_dense_points(run, capture, images, config.anchors, on_progress, torch.get_num_threads())
     if dense is not None:
         added = f"{len(dense.points):,} points beside the sparse ones, {time.monotonic() - start:.0f} s"
@@ -131,23 +132,27 @@ def _dense_points(
 
 
 @contextmanager
-def _progress(label: str, console: Console) -> Iterator[Callable[[int, int], None]]:
+def _progress(label: str, run: RunFolder, console: Console) -> Iterator[Callable[[int, int], None]]:
     """Show how far something is while the context lasts; yields a function that takes the steps done and all steps."""
+    progress: StepProgress | None = None
     with console.status(label) as status:
 
         def on_progress(done: int, total: int) -> None:
+            nonlocal progress
             check_stop_requested()
+            progress = progress or run.begin_step("coarse", label, "steps", total)
+            progress(done)
             status.update(f"{label}, {done / total:.0%}")
 
         yield on_progress
 
 
-def _brightness_spread(images: ImageCache, config: TrainConfig, console: Console) -> float | None:
+def _brightness_spread(run: RunFolder, images: ImageCache, config: TrainConfig, console: Console) -> float | None:
     """By what share images of the same places differ in brightness; None where nothing depends on it, or the capture
     does not tell. Prints what follows."""
     if not (config.exposure_compensation and config.exposure_min_spread):
         return None
-    with _progress("comparing the photographs' brightness", console) as on_progress:
+    with _progress("comparing the photographs' brightness", run, console) as on_progress:
         colors = collect_point_colors(images, on_progress)
     if colors is None:
         console.print(

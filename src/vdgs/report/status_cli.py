@@ -4,21 +4,26 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
+from pathlib import Path
 
 from rich.console import Console
 from rich.markup import escape
 
 from vdgs.captures.place_facts import PlaceFacts, place_summary
+from vdgs.captures.reconstruction import PROGRESS_FILE, SFM_STAGE, WORK_FOLDER, is_finished
+from vdgs.errors import VdgsError
 from vdgs.report.place_section import read_place
 from vdgs.report.run_reader import RunFiles
 from vdgs.report.write_report import report_status
 from vdgs.runs.run_folder import REPORT_FILE, RunFolder
-from vdgs.runs.run_status import RunStatus, StageStatus, get_run_status
+from vdgs.runs.run_status import RunStatus, StageState, StageStatus, get_run_status
 from vdgs.runs.stage_folder import StatusRecord
+from vdgs.sfm.source_images import SourceImages, source_changes
 from vdgs.system.atomic_files import to_jsonable
 from vdgs.system.documents import RunStatusDocument, StageStatusDocument
-from vdgs.system.quoting import shell_word
+from vdgs.system.quoting import shell_line
 from vdgs.system.records import record_to_dict
+from vdgs.system.step_progress import read_step
 from vdgs.system.units import rough_duration
 
 #: Exit code of `vdgs status` for a run that is not whole: something of it is missing, runs, failed or is out of date.
@@ -30,10 +35,40 @@ STATE_STYLES = {
 
 
 def full_run_status(run: RunFolder) -> RunStatus:
-    """How far a run is, its report included. Raises RunError for a folder that holds no run."""
-    run.config_file.exists() or run.settings()  # which says that there is none
+    """How far a run is, its photographs and its report included. Raises RunError for a folder that holds no run."""
+    photographs = _photographs_status(run)
+    if not run.config_file.exists() and photographs is None:
+        run.settings()  # which says that there is none
     status = get_run_status(run)
-    return replace(status, stages=(*status.stages, report_status(run, status)))
+    if photographs is not None and not run.config_file.exists():  # it is written once there is a capture
+        status = replace(status, problem="", command=photographs.command)
+    before = () if photographs is None else (photographs,)
+    return replace(status, stages=(*before, *status.stages, report_status(run, status)))
+
+
+def _photographs_status(run: RunFolder) -> StageStatus | None:
+    """How far the capture is that a run makes of its photographs; None for a run of another capture."""
+    root = run.own_capture
+    sources = SourceImages.read(root)
+    if sources is None or (run.config_file.exists() and not _is_capture_of(run, root)):
+        return None
+    alone = shell_line(["vdgs", "sfm", *sources.folders, "--output", str(root.resolve())])
+    command, changes = sources.command or alone, source_changes(root)
+    stage = StageStatus(name=SFM_STAGE, state="done", folder=root.name, command=command)
+    if not is_finished(root):
+        step = read_step(root / WORK_FOLDER / PROGRESS_FILE)
+        state: StageState = "running" if run.is_running() else "stopped"
+        stage = replace(stage, state=state, step=step)
+    if changes and stage.state != "running":
+        stage = replace(stage, state="stale", reason=changes, command=f"{command} --overwrite")
+    return stage
+
+
+def _is_capture_of(run: RunFolder, root: Path) -> bool:
+    try:
+        return Path(run.settings().capture_path).resolve() == root.resolve()
+    except VdgsError:  # then nothing says that it is another one
+        return True
 
 
 def print_status(run: RunFolder, console: Console) -> int:
@@ -43,12 +78,13 @@ def print_status(run: RunFolder, console: Console) -> int:
         console.print(escape(place_summary(place)), highlight=False)
     width = max(len(stage.name) for stage in status.stages)
     for stage in status.stages:
-        note = "; ".join(part for part in (progress_text(stage.status), stage.reason) if part)
+        step = stage.step.text(stage.state == "running") if stage.step is not None else ""
+        note = "; ".join(part for part in (progress_text(stage.status), step, stage.reason) if part)
         state = f"[{STATE_STYLES[stage.state]}]{stage.state:<8}[/]"
         console.print(f"{stage.name:<{width}}  {state}  {escape(note)}".rstrip(), highlight=False)
     counted = Counter(stage.state for stage in status.stages)
     console.print(", ".join(f"{count} {state}" for state, count in counted.items()), highlight=False)
-    console.print(escape(f"next: {next_step(status)}"), highlight=False)
+    console.print(escape(next_line(status)), highlight=False)
     return 0 if status.is_complete else EXIT_INCOMPLETE
 
 
@@ -67,15 +103,16 @@ def _place(run: RunFolder) -> PlaceFacts | None:
     return read_place(RunFiles(run.path))
 
 
-def next_step(status: RunStatus) -> str:
-    """What a person does next, in a line."""
+def next_line(status: RunStatus) -> str:
+    """What a person does next. What follows `next: ` is a command that a shell takes as it stands."""
     if command := status.next_command():
-        return command
+        return f"next: {command}"
     if status.is_running:
-        return "nothing to type: it is at work"
-    run = shell_word(status.path)
-    report = shell_word(status.path / REPORT_FILE)
-    return f"open {report}, or film it: vdgs render {run} --views flyover --output flyover.mp4"
+        return "at work: nothing to type"
+    if status.problem or not status.is_complete:
+        return f"to mend: {status.problem or 'see above'}"
+    film = shell_line(["vdgs", "render", status.path, "--views", "flyover", "--output", "flyover.mp4"])
+    return f"report: {status.path / REPORT_FILE}\nnext: {film}"
 
 
 def progress_text(status: StatusRecord | None) -> str:
@@ -99,8 +136,12 @@ def progress_text(status: StatusRecord | None) -> str:
 
 
 def _stage_json(stage: StageStatus) -> StageStatusDocument:
-    status = stage.status or StatusRecord()
+    status, step = stage.status or StatusRecord(), stage.step
+    if step is not None:
+        status = StatusRecord(iteration=step.done, iterations=step.total or None)
+    left = step.seconds_left if step is not None and stage.state == "running" else status.seconds_left
     return {
         "stage": stage.name, "state": stage.state, "reason": stage.reason or None, "folder": stage.folder,
-        "iteration": status.iteration, "iterations": status.iterations, "seconds_left": status.seconds_left,
+        "step": step.step if step is not None else None, "iteration": status.iteration,
+        "iterations": status.iterations, "seconds_left": left,
     }  # fmt: skip

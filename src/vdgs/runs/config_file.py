@@ -5,15 +5,18 @@ from __future__ import annotations
 import os
 import shlex
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import yaml
 
 from vdgs import __version__
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.presets import PRESETS
 from vdgs.config.ranges import to_flag
 from vdgs.config.serialization import diff_settings
 from vdgs.errors import RunError
@@ -35,6 +38,38 @@ def changed_flags(old: RunSettings, new: RunSettings, sections: Sequence[str] = 
     before, after = ({name: each.to_dict()[name] for name in sections} for each in (old, new))
     lines = [line.partition(": ") for line in diff_settings(before, after) if not line.startswith("capture.path: ")]
     return [f"{setting_flag(path)}: {values}" for path, _, values in lines]
+
+
+def run_command(settings: RunSettings, output: Path) -> str:
+    """A command that asks for these settings: those of the nearest preset, and the options that differ."""
+    candidates: list[list[str]] = []
+    for preset, method in PRESETS.items():
+        before = RunSettings.create(settings.capture_path, CaptureOptions(), method).to_dict()
+        options = [word for name, value in _differences(before, settings.to_dict()) for word in _words(name, value)]
+        candidates.append(["vdgs", "run", settings.capture_path, "--output", str(output.resolve())])
+        candidates[-1] += ["--preset", preset, *options]
+    return shlex.join(min(candidates, key=len))
+
+
+def _differences(old: Mapping[str, Any], new: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Settings that differ, by their paths, with their new values."""
+    for name, value in new.items():
+        if isinstance(value, Mapping):
+            yield from _differences(old[name], value, f"{prefix}{name}.")
+        elif value != old[name]:
+            yield prefix + name, value
+
+
+def _words(setting: str, value: Any) -> list[str]:
+    """An option and its values as a command line has them."""
+    flag = setting_flag(setting)
+    if isinstance(value, bool):
+        head, _, name = flag.rpartition(".")
+        return [flag if value else f"{head}.no-{name}" if head else f"--no-{flag.removeprefix('--')}"]
+    words = [flag]
+    for item in value if isinstance(value, list) else [value]:
+        words += map(str, item if isinstance(item, list) else [item])
+    return words
 
 
 @dataclass(frozen=True)

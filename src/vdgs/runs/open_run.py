@@ -133,7 +133,7 @@ def _missing_model_text(folder: RunFolder, name: str) -> str:
     run_status = get_run_status(folder)
     stage, command = run_status.of("merge" if name == "merged" else "coarse"), run_status.next_command()
     why = f"state: {stage.state}" + (f", {stage.reason}" if stage.reason else "")
-    remedy = f"Next: {command}" if command else "A process works on it: wait for it."
+    remedy = f"Next: {command}" if command else run_status.problem or "A process works on it: wait for it."
     return f"{folder.path}: has no {name} model of its settings yet ({why}). {remedy}"
 
 

@@ -20,6 +20,7 @@ from vdgs.system.atomic_files import read_json
 from vdgs.system.file_locks import is_known_locked, lock_folder
 from vdgs.system.quoting import shell_line, shell_word
 from vdgs.system.records import record_from_dict
+from vdgs.system.step_progress import StepProgress, StepRecord
 
 #: The page about a run, in its folder (`vdgs report`).
 REPORT_FILE = "report.html"
@@ -157,6 +158,18 @@ class RunFolder:
             self.coarse.reset_unless(after.coarse)
         return changed
 
+    @property
+    def is_trained(self) -> bool:
+        """Whether training on the capture has begun."""
+        return self.capture_file.exists()
+
+    def discard_training(self) -> None:
+        """Delete what was trained: the capture of the run is about to be made anew."""
+        for folder in (self.coarse, *self.block_folders(), self.merged):
+            if folder.path.exists():
+                folder.reset_unless("")
+        self.capture_file.unlink(missing_ok=True)
+
     def move_capture(self, to: Path) -> None:
         """Save that the capture of the run lies elsewhere now; the caller checks that it is the same one."""
         settings, command = self.settings(), self.config.command()
@@ -202,6 +215,17 @@ class RunFolder:
 
     def is_running(self) -> bool:
         return is_known_locked(self._driver)
+
+    @property
+    def progress_file(self) -> Path:
+        """How far the process that drives the run is."""
+        return self._driver / "progress.json"
+
+    def begin_step(self, stage: str, step: str = "", unit: str = "", total: int = 0) -> StepProgress:
+        """Say what the process that drives the run works on; what is returned takes how many are done."""
+        progress = StepProgress(self.progress_file, StepRecord(stage=stage, step=step, unit=unit, total=total))
+        progress(0)
+        return progress
 
     @property
     def _driver(self) -> Path:

@@ -14,6 +14,7 @@ from typing import Literal
 
 from vdgs.errors import VdgsError
 from vdgs.partition.block_records import PartitionRecord
+from vdgs.runs.config_file import run_command
 from vdgs.runs.model_integrity import integrity_error, path_to_delete
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
@@ -22,6 +23,7 @@ from vdgs.runs.stage_keys import StageKeys, stage_keys
 from vdgs.system.atomic_files import read_json_or_empty
 from vdgs.system.file_locks import is_known_locked
 from vdgs.system.quoting import shell_word
+from vdgs.system.step_progress import StepRecord, read_step
 
 #: `stale`: made with other settings, for another cut or from another model than the run has now. `unknown`: something
 #: is there, and no record says with which settings it was made.
@@ -49,7 +51,11 @@ class StageStatus:
     output_id: str = ""
     """The identity of its output."""
     hint: str = ""
-    """What to do before its command is of use."""
+    """What to do before its command is of use, as the beginning of a shell command."""
+    command: str = ""
+    """What makes it, where that is no verb for this stage alone."""
+    step: StepRecord | None = None
+    """How far the step is that it is in, or was stopped in."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +67,12 @@ class RunStatus:
     """In the order in which they are made."""
     command: str | None = None
     """The command that began the run, where its settings are still those that it asked for."""
+    written_command: str = ""
+    """One with the settings of the run in full."""
     is_driven: bool = False
     """A command takes it from stage to stage."""
+    problem: str = ""
+    """What to mend by hand before any command is of use."""
 
     def of(self, name: str) -> StageStatus:
         """A stage by its name: coarse, coarse evaluation, visibility, partition, cameras, block N, merge, evaluation.
@@ -91,16 +101,15 @@ class RunStatus:
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
     def next_command(self) -> str:
-        """What to type next; empty while something runs, and where all is done."""
-        if self.is_running:
+        """What to type next, as a shell takes it; empty while something runs, where all is done, and where something is
+        to be mended by hand."""
+        if self.is_running or self.problem:
             return ""
         for stage in self.stages:
-            if stage.state == "unknown":
-                return f"mend {shell_word(self.path / 'config.yaml')}"
             if stage.state != "done":
                 if self._continues and not stage.hint:
-                    return self.command or ""
-                return stage.hint + self._command_for(stage.name)
+                    return stage.command or self.command or ""
+                return stage.hint + (stage.command or self._command_for(stage.name))
         return ""
 
     @property
@@ -112,7 +121,7 @@ class RunStatus:
     def _command_for(self, stage: str) -> str:
         run = shell_word(self.path)
         if stage == "coarse":
-            return self.command or f"the `vdgs run` or `vdgs train-coarse` command that began {run}"
+            return self.command or self.written_command
         verbs = {
             "visibility": f"visibility {run}", "partition": f"partition {run}", "cameras": f"partition {run}",
             "merge": f"merge {run}", "coarse evaluation": f"eval {run} --model coarse", "evaluation": f"eval {run}",
@@ -128,7 +137,20 @@ def get_run_status(run: RunFolder, settings: RunSettings | None = None) -> RunSt
         keys, why = run.keys() if settings is None else stage_keys(settings, run.coarse_model_id()), ""
     except VdgsError as error:
         keys, why = None, _first_line(str(error))
-    return RunStatus(run.path, tuple(_StatusScanner(run, keys, why).stages()), run.config.command(), run.is_running())
+    command, driven = run.config.command(), run.is_running()
+    stages = tuple(_StatusScanner(run, keys, why).stages())
+    if driven and (step := read_step(run.progress_file)) is not None:
+        stages = tuple(_at_work(stage, step) if stage.name == step.stage else stage for stage in stages)
+    problem = f"correct {run.config_file}, or put back the one that was there: {why}" if why else ""
+    written = "" if why or command else run_command(run.settings(), run.path)
+    return RunStatus(run.path, stages, command, written, driven, problem)
+
+
+def _at_work(stage: StageStatus, step: StepRecord) -> StageStatus:
+    """A stage that the process which drives the run says it works on."""
+    if stage.state in ("running", "done"):  # it says more itself
+        return stage
+    return replace(stage, state="running", reason="", step=step)
 
 
 @dataclass(frozen=True)
@@ -210,10 +232,12 @@ class _StatusScanner:
         try:
             status = folder.status()
         except VdgsError as error:
-            return StageStatus(name=name, state="unknown", folder=inside, reason=_first_line(str(error)))
+            hint = f"rm {shell_word(str(folder.status_file))} && "
+            return StageStatus(name=name, state="unknown", folder=inside, reason=_first_line(str(error)), hint=hint)
         state, why = self._state_of(folder, status, key, other, locked)
         if state == "done" and (wrong := integrity_error(folder, key or "", _number(name))):
-            reason, hint = f"model.safetensors is {wrong}", f"delete {path_to_delete(folder)}, then "
+            reason = f"model.safetensors is {wrong}"
+            hint = f"rm -r {shell_word(str(path_to_delete(folder)))} && "
             return StageStatus(name=name, state="stale", folder=inside, reason=reason, status=status, hint=hint)
         output_id = status.model_id or ""
         return StageStatus(name=name, state=state, folder=inside, reason=why, status=status, output_id=output_id)

@@ -73,7 +73,9 @@ def write_images(
     Raises CaptureError for photographs that cannot be decoded, VdgsError where the disk is full.
     """
     total, done = sum(len(each) for each in names.values()), 0
-    with report_progress(console, "photographs without distortion", total) as tell, ThreadPoolExecutor(threads) as pool:
+    note = "without distortion, "
+    with report_progress(workspace, console, "writing", total, note) as tell, ThreadPoolExecutor(threads) as pool:
+        tell(done)
         for camera, members in names.items():
             for _ in pool.map(partial(_write_one, output, workspace, undistortions[camera]), members):
                 check_stop_requested()

@@ -12,6 +12,7 @@ from rich.console import Console
 
 from vdgs.captures.image_files import pillow_without_limits
 from vdgs.captures.jpeg import with_end
+from vdgs.config.sfm_options import SfmOptions
 from vdgs.errors import CaptureError
 from vdgs.sfm.image_list import ExcludedImage
 from vdgs.sfm.image_metadata import ImageMetadata
@@ -136,14 +137,14 @@ def extract_features(
 ) -> dict[str, int]:
     """Features of all photographs into the database; those that are there already are kept. Returns their numbers."""
     names = [photo.name for kind in camera_groups for photo in kind.images if (workspace.images / photo.name).exists()]
-    count, done = len(names), 0
-    with report_progress(console, "features, photographs", count) as tell:
+    there = count_features(workspace)
+    count, done = len(names), sum(name in there for name in names)
+    with report_progress(workspace, console, "features", count) as tell:
+        tell(done)
         for number, kind in enumerate(camera_groups, 1):
             missing = [photo.name for photo in kind.images if (workspace.images / photo.name).exists()]
-            there = count_features(workspace)
-            done += sum(name in there for name in missing)
             missing = [name for name in missing if name not in there]
-            octave = -1 if is_upsampled(max(kind.width, kind.height), max_image_size, count) else 0
+            octave = first_octave(kind, max_image_size, count)
             for masked in (False, True):  # COLMAP takes masks for all photographs of a call, or for none
                 names = [name for name in missing if workspace.mask(name).exists() == masked]
                 for start in range(0, len(names), IMAGES_PER_THREAD * threads):
@@ -152,6 +153,35 @@ def extract_features(
                     done += len(chunk)
                     tell(done)
     return count_features(workspace)
+
+
+def extract_groups(
+    workspace: Workspace, camera_groups: Sequence[CameraGroup], options: SfmOptions, count: int, threads: int
+) -> None:
+    """Features of some of `count` photographs at once, searched as all are."""
+    for number, group in enumerate(camera_groups, 1):
+        octave = first_octave(group, options.max_image_size, count)
+        for masked in (False, True):
+            names = [photo.name for photo in group.images if workspace.mask(photo.name).exists() == masked]
+            if names:
+                _extract(
+                    workspace, names, masked, number, octave, options.max_image_size, options.max_num_features, threads
+                )  # fmt: skip
+
+
+def searched_megapixels(photographs: Sequence[ImageMetadata], options: SfmOptions) -> float:
+    """Megapixels of all photographs as they are searched, three times as many where that is done finely."""
+    total = 0.0
+    for photo in photographs:
+        longer = max(photo.width, photo.height)
+        fine = 3 if is_upsampled(longer, options.max_image_size, len(photographs)) else 1
+        total += fine * photo.width * photo.height * min(1.0, options.max_image_size / longer) ** 2
+    return total / 1e6
+
+
+def first_octave(group: CameraGroup, max_image_size: int, count: int) -> int:
+    """-1 where photographs are searched at twice their size."""
+    return -1 if is_upsampled(max(group.width, group.height), max_image_size, count) else 0
 
 
 def is_upsampled(longer_side: int, max_image_size: int, count: int) -> bool:

@@ -35,7 +35,8 @@ def estimate_pair_count(photographs: Sequence[ImageMetadata], positions: GpsPrio
     if count <= pair_selection.SEQUENTIAL_OVERLAP:
         return count * (count - 1) // 2
     return (
-        len(_spatial_pairs(photographs, positions, options)) + (count - len(positions)) * pair_selection.NUM_RETRIEVED
+        len(spatial_candidates(photographs, positions, options))
+        + (count - len(positions)) * pair_selection.NUM_RETRIEVED
     )
 
 
@@ -44,7 +45,7 @@ def select_pairs(
 ) -> list[tuple[str, str]]:
     """Names of the pairs to match, sorted."""
     count = len(photographs)
-    order = _time_order(photographs)
+    order = time_order(photographs)
     if count <= pair_selection.SEQUENTIAL_OVERLAP or (not positions.usable and count <= options.exhaustive_max):
         chosen = pair_selection.exhaustive_pairs(count)
     elif not positions.usable:
@@ -53,7 +54,7 @@ def select_pairs(
         )
         chosen |= pair_selection.retrieval_pairs(_descriptors(workspace, photographs), range(count))
     else:
-        chosen = _spatial_pairs(photographs, positions, options)
+        chosen = spatial_candidates(photographs, positions, options)
         lost = np.flatnonzero(~np.isfinite(positions.all_positions(count)).all(axis=1))
         if len(lost):
             chosen |= pair_selection.retrieval_pairs(_descriptors(workspace, photographs), lost.tolist())
@@ -72,17 +73,17 @@ def select_pairs(
     return [(names[i], names[j]) for i, j in sorted(chosen)]
 
 
-def _spatial_pairs(
+def spatial_candidates(
     photographs: Sequence[ImageMetadata], positions: GpsPriors, options: SfmOptions
 ) -> set[tuple[int, int]]:
     """Pairs of those near each other, and of those next to each other in time, where a position is wrong."""
     unknown = np.full(3, np.nan)
     views = np.array([photo.attitude.camera_from_enu[2] if photo.attitude else unknown for photo in photographs])
     near = pair_selection.spatial_pairs(positions.all_positions(len(photographs)), options.num_neighbors, views)
-    return near | pair_selection.sequential_pairs(_time_order(photographs), pair_selection.SEQUENTIAL_OVERLAP_WITH_GPS)
+    return near | pair_selection.sequential_pairs(time_order(photographs), pair_selection.SEQUENTIAL_OVERLAP_WITH_GPS)
 
 
-def _time_order(photographs: Sequence[ImageMetadata]) -> list[int]:
+def time_order(photographs: Sequence[ImageMetadata]) -> list[int]:
     return sorted(range(len(photographs)), key=lambda i: (photographs[i].datetime, photographs[i].name))
 
 
@@ -92,21 +93,39 @@ def match_pairs(
     """Match and verify pairs; those that are in the database already are kept."""
     done = _matched(workspace)
     missing = [pair for pair in pairs_to_match if frozenset(pair) not in done]
+    before = len(pairs_to_match) - len(missing)
+    with report_progress(workspace, console, "matching", len(pairs_to_match)) as tell:
+        tell(before)
+        for start in range(0, len(missing), PAIRS_PER_THREAD * threads):
+            chunk = missing[start : start + PAIRS_PER_THREAD * threads]
+            match_chunk(workspace, chunk, threads)
+            tell(before + start + len(chunk))
+
+
+def match_chunk(workspace: Workspace, pairs: Sequence[tuple[str, str]], threads: int) -> None:
+    """Match and verify some pairs in one call."""
     options, pairing = pycolmap.FeatureMatchingOptions(), pycolmap.ImportedPairingOptions()
     options.num_threads, options.use_gpu = threads, False
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = 0
     pairing.match_list_path = workspace.path / "pairs.txt"
-    before = len(pairs_to_match) - len(missing)
-    with report_progress(console, "matching, pairs", len(pairs_to_match)) as tell:
-        for start in range(0, len(missing), PAIRS_PER_THREAD * threads):
-            chunk = missing[start : start + PAIRS_PER_THREAD * threads]
-            write_text(workspace.path / "pairs.txt", "".join(f"{one} {other}\n" for one, other in chunk))
-            call_cancellable(
-                pycolmap.match_image_pairs, workspace.database, matching_options=options, pairing_options=pairing,
-                verification_options=verification, device=pycolmap.Device.cpu,
-            )  # fmt: skip
-            tell(before + start + len(chunk))
+    write_text(workspace.path / "pairs.txt", "".join(f"{one} {other}\n" for one, other in pairs))
+    call_cancellable(
+        pycolmap.match_image_pairs, workspace.database, matching_options=options, pairing_options=pairing,
+        verification_options=verification, device=pycolmap.Device.cpu,
+    )  # fmt: skip
+
+
+def copy_features(workspace: Workspace, name: str, copy: str) -> None:
+    """Give the features of a photograph to another one, which need not be there."""
+    database = pycolmap.Database.open(workspace.database)
+    try:
+        image = next(each for each in database.read_all_images() if each.name == name)
+        number = database.write_image(pycolmap.Image(name=copy, camera_id=image.camera_id))
+        database.write_keypoints(number, database.read_keypoints(image.image_id))
+        database.write_descriptors(number, database.read_descriptors(image.image_id))
+    finally:
+        database.close()
 
 
 def count_verified_matches(workspace: Workspace, min_inliers: int = 15) -> dict[str, int]:

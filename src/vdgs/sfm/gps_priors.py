@@ -13,6 +13,7 @@ from vdgs.captures.gps_tables import GpsRow, read_gps_table, with_altitudes
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, median_place, wrap_degrees
 from vdgs.sfm.image_metadata import ImageMetadata
+from vdgs.system.units import first_names
 
 #: Positions nearer than this to 0, 0 (degrees) are a receiver without satellites.
 NULL_POSITION_DEG = 0.01
@@ -225,7 +226,7 @@ def _unmatched(rows: Sequence[GpsRow], found: Mapping[int, GpsRow], table: Path)
     spare = list(dict.fromkeys(row.name for row in rows if row.line not in used))
     if not spare:
         return []
-    return [f"{table.name}: {len(spare)} rows are of photographs that are not there; left out ({_first(spare)})."]
+    return [f"{table.name}: {len(spare)} rows are of photographs that are not there; left out ({first_names(spare)})."]
 
 
 def _outliers(geodetic: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -267,9 +268,4 @@ def _position_std(
 
 
 def _some(names: Sequence[str], which: np.ndarray) -> str:
-    return _first([name for name, take in zip(names, which, strict=True) if take])
-
-
-def _first(chosen: Sequence[str]) -> str:
-    more = len(chosen) - 3
-    return ", ".join(chosen[:3]) + (f" and {more} more" if more > 0 else "")
+    return first_names([name for name, take in zip(names, which, strict=True) if take])

@@ -98,7 +98,9 @@ def run_mapper(workspace: Workspace, count: int, fix_focal: bool, threads: int, 
     )
     begun = _largest_snapshot(workspace)
     placed = int(begun.name) if begun else 2  # a model begins with two
-    with report_progress(console, f"mapping, {f'{placed} placed before, ' if begun else ''}photographs", count) as tell:
+    note = f"{placed} placed before, " if begun else ""
+    with report_progress(workspace, console, "mapping", count, note) as tell:
+        tell(placed)
 
         def one_more() -> None:
             nonlocal placed

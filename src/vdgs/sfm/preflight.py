@@ -11,11 +11,10 @@ from datetime import datetime, timedelta
 import numpy as np
 from shapely import MultiPoint
 
-from vdgs.config.sfm_options import SfmOptions
-from vdgs.sfm.feature_extraction import is_upsampled
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_list import ImageList
 from vdgs.sfm.image_metadata import ImageMetadata
+from vdgs.system.units import first_names
 
 #: A file so much smaller than the median of its camera shows little: blurred, dark, water (choice).
 SMALL_FILE_RATIO = 0.4
@@ -25,12 +24,6 @@ MIN_OVERLAP = 0.6
 MIN_VIEWS_PER_POINT = 4.0
 #: Views farther from straight down than this are oblique (degrees).
 OBLIQUE_ANGLE_DEG = 20.0
-#: Seconds of one core, measured on a Xeon without GPU (docs/sfm.md): a megapixel searched for features, a pair of
-#: photographs with 1000 features each compared (it goes with the square), a photograph placed, a megapixel written.
-#: Another machine may take half or twice as long.
-FEATURE_SECONDS, PAIR_SECONDS, MAPPING_SECONDS, WRITING_SECONDS = 0.25, 0.0055, 1.5, 0.05
-#: Features of a megapixel, about; searched finely three times as many, and it takes three times as long.
-FEATURES_PER_MEGAPIXEL = 2500
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,15 +85,6 @@ def make_preflight_report(collection: ImageList, positions: GpsPriors) -> Prefli
     )  # fmt: skip
 
 
-def estimate_seconds(photographs: Sequence[ImageMetadata], pairs: int, options: SfmOptions, threads: int) -> float:
-    """About how long the work takes, from what one core was measured to take."""
-    pixels = sum(_searched_pixels(photo, options.max_image_size, len(photographs)) for photo in photographs) / 1e6
-    features = min(options.max_num_features, FEATURES_PER_MEGAPIXEL * pixels / len(photographs))
-    written = sum(photo.width * photo.height for photo in photographs) / 1e6
-    shared = FEATURE_SECONDS * pixels + PAIR_SECONDS * (features / 1000) ** 2 * pairs + WRITING_SECONDS * written
-    return shared / max(1, threads) + MAPPING_SECONDS * len(photographs)
-
-
 def flying_height(photographs: Sequence[ImageMetadata]) -> tuple[float | None, str]:
     """Median height above the take-off in metres, and what says so."""
     heights = [
@@ -109,13 +93,6 @@ def flying_height(photographs: Sequence[ImageMetadata]) -> tuple[float | None, s
     if 2 * len(heights) < len(photographs):
         return None, "the photographs do not say it"
     return statistics.median(heights), "above the take-off, by XMP"
-
-
-def _searched_pixels(photo: ImageMetadata, feature_size: int, count: int) -> float:
-    """Pixels to search, three times as many where that is done finely."""
-    longer = max(photo.width, photo.height)
-    times = 3 if is_upsampled(longer, feature_size, count) else 1
-    return times * photo.width * photo.height * min(1.0, feature_size / longer) ** 2
 
 
 def _median(values: object) -> float | None:
@@ -156,7 +133,7 @@ def _warnings(collection: ImageList, overlap: float | None, views: float | None,
     photographs, found = collection.images, list[str]()
     without = [photo.name for photo in photographs if photo.lens is None]
     if without:
-        found.append(f"{_first(without)}: nothing says the focal length; it is fitted from a guess.")
+        found.append(f"{first_names(without)}: nothing says the focal length; it is fitted from a guess.")
     found += _doubts(photographs)
     round_ = [photo.name for photo in photographs if photo.width == 2 * photo.height and photo.lens is None]
     if round_:
@@ -166,10 +143,10 @@ def _warnings(collection: ImageList, overlap: float | None, views: float | None,
         )
     endless = [photo.name for photo in photographs if not photo.whole]
     if endless:
-        found.append(f"{_first(endless)}: the file lacks its end marker, but nothing of the picture; used.")
+        found.append(f"{first_names(endless)}: the file lacks its end marker, but nothing of the picture; used.")
     small = _small_files(photographs)
     if small:
-        found.append(f"{_first(small)}: far smaller files than the others: blurred, dark, or showing little?")
+        found.append(f"{first_names(small)}: far smaller files than the others: blurred, dark, or showing little?")
     if overlap is not None and overlap < MIN_OVERLAP:
         found.append(f"they overlap by about {overlap:.0%} along the flight; below {MIN_OVERLAP:.0%} gaps come.")
     if views is not None and views < MIN_VIEWS_PER_POINT:
@@ -190,7 +167,7 @@ def _doubts(photographs: Sequence[ImageMetadata]) -> list[str]:
             kind = doubt.partition(" (")[0]
             names.setdefault(kind, []).append(photo.name)
             texts.setdefault(kind, doubt)
-    return [f"{_first(names[kind])}: {text.rstrip('.')}." for kind, text in texts.items()]
+    return [f"{first_names(names[kind])}: {text.rstrip('.')}." for kind, text in texts.items()]
 
 
 def _small_files(photographs: Sequence[ImageMetadata]) -> list[str]:
@@ -211,8 +188,3 @@ def _time(text: str) -> datetime | None:
         return datetime.strptime(text, "%Y:%m:%d %H:%M:%S")
     except ValueError:
         return None
-
-
-def _first(names: Sequence[str]) -> str:
-    more = len(names) - 3
-    return ", ".join(names[:3]) + (f" and {more} more" if more > 0 else "")

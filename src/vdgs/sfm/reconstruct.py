@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.console import Console
 
-from vdgs import __version__
 from vdgs.captures.formats.colmap_writing import write_model_files
 from vdgs.captures.georeference import ENU_FRAME, LOCAL_FRAME, ORIGIN_KEYS
 from vdgs.captures.reconstruction import (
     MAPPED,
     RECONSTRUCTION_FIGURE,
     RECONSTRUCTION_FILE,
+    SOURCE_IMAGES_FILE,
     WORK_FOLDER,
     CameraReport,
     ReconstructionReport,
@@ -27,7 +27,8 @@ from vdgs.captures.reconstruction import (
 )
 from vdgs.config.serialization import to_dict
 from vdgs.config.sfm_options import SfmRequest
-from vdgs.errors import VdgsError
+from vdgs.errors import RunError, VdgsError
+from vdgs.runs.run_folder import RunFolder
 from vdgs.sfm import (
     capture_writer,
     feature_extraction,
@@ -53,7 +54,10 @@ from vdgs.sfm.reconstruction_report import (
     exclusion_reasons,
     make_reconstruction_report,
 )
-from vdgs.sfm.workspace import Workspace, cache_key, silence_colmap
+from vdgs.sfm.sfm_estimate import estimate_sfm
+from vdgs.sfm.source_images import SourceImages, check_unchanged
+from vdgs.sfm.step_keys import step_keys
+from vdgs.sfm.workspace import Workspace, silence_colmap
 from vdgs.system.atomic_files import to_jsonable, write_json
 from vdgs.system.colmap import pycolmap
 from vdgs.system.file_locks import lock_folder
@@ -66,73 +70,76 @@ POSITIONS_FIGURE = "photographs.png"
 
 
 def reconstruct(
-    request: SfmRequest, console: Console, lock: AbstractContextManager[None] | None = None
+    request: SfmRequest, console: Console, run: RunFolder | None = None, command: str | None = None
 ) -> ReconstructionReport:
     """Make a capture of photographs in `request.output`, or go on with one that was begun.
 
-    `alone` is held while anything is written; not where all is done already. Raises what it raises, CaptureError for
-    photographs that cannot become one, VdgsError for an output that is something else and a disk that is full. What was
-    done is kept.
+    `run` is the run that the capture is for: this process drives it while anything is written, and what was trained on
+    another capture is deleted (`request.overwrite`). `command` is the command line, recorded for `vdgs status`. Raises
+    CaptureError for photographs that cannot become a capture, RunError for a run that another process drives, VdgsError
+    for an output that is something else, other photographs than before and a disk that is full. What was done is kept.
     """
     silence_colmap()
     prepared = plan_reconstruction(request)
     output = request.output
-    work, keys = Workspace(output / WORK_FOLDER), _keys(prepared)
+    work, keys = Workspace(output / WORK_FOLDER), step_keys(prepared)
+    sources = SourceImages.of(request.image_folders, command)
     facts = read_reconstruction(output) if _is_finished(output, keys["placed"]) else None
     if facts is not None:
         console.print(f"{output}: made of these photographs already; nothing to do", highlight=False)
+        if SourceImages.read(output) != sources:  # of files that are not used
+            sources.write(output)
+        if not request.keep_intermediate:
+            work.remove()
         return facts
     _check_output_folder(output)
+    check_unchanged(output, sources, request.overwrite)
+    _check_nothing_trained(request, run)
     before = _placed_before(output, keys["capture"])
     if before is not None:
-        with lock or nullcontext(), lock_folder(output):
+        with _writing(request, run):
+            sources.write(output)
             facts = _place_anew(prepared, before, keys["placed"], console)
         console.print(f"{output}: placed anew; its photographs and poses stay", highlight=False)
         print_reconstruction_report(facts, console)
         return facts
-    print_plan(prepared, console)
     check_disk_space(prepared)
-    with lock or nullcontext(), lock_folder(output):
-        work.path.mkdir(exist_ok=True)
+    goes_on = work.is_begun("features", keys["features"])
+    estimate = None if goes_on else estimate_sfm(prepared)
+    print_plan(prepared, "" if estimate is None else estimate.text(prepared.threads), console)
+    with _writing(request, run):
+        sources.write(output)
+        if estimate is not None:
+            work.remove()
+            work.begin("features", keys["features"])
+            write_json(work.expected_file, estimate.expected_seconds)
         plot_positions(
             prepared.gps_priors, time_order(prepared), "Where the photographs were taken", output / POSITIONS_FIGURE
         )
         facts = _steps(prepared, work, keys, console)
-        if not request.keep_intermediate:
-            work.remove()
     print_reconstruction_report(facts, console)
     return facts
 
 
-def _keys(plan: ReconstructionPlan) -> dict[str, str]:
-    """What each step depends on, each on those before it. All but the last do not depend on what places the scene."""
-    options, positions = plan.request.options, plan.gps_priors
-    files = [
-        (photo.name, photo.file_bytes, photo.path.stat().st_mtime_ns, photo.width, photo.height, photo.orientation)
-        for photo in plan.image_list.images
-    ]
-    lenses = [photo.lens and photo.lens.focal for photo in plan.image_list.images]
-    found = cache_key(
-        __version__, files, lenses, options.max_image_size, options.max_num_features, *_masked_images(plan)
-    )
-    matched = cache_key(found, options.num_neighbors, options.exhaustive_max)
-    mapped = cache_key(matched, options.focal)
-    capture = cache_key(mapped, options.max_output_size)
-    points, bars = plan.gcps.points if plan.gcps else (), plan.scale_bars
-    told = [positions.image_indices.tolist(), positions.enu.tolist(), positions.gps_std.tolist(), positions.origin]
-    known = [record_to_dict(point) for point in points], bars and record_to_dict(bars)
-    placed = cache_key(capture, told, known, options.georeference)
-    return {"features": found, "matches": matched, "model": mapped, "capture": capture, "placed": placed}
+@contextmanager
+def _writing(request: SfmRequest, run: RunFolder | None) -> Iterator[None]:
+    """Locks while the capture is written. At the end its work folder goes; it stays where the work was interrupted."""
+    with run.drive_lock() if run is not None else nullcontext(), lock_folder(request.output):
+        if run is not None:
+            run.discard_training()
+        yield
+        if not request.keep_intermediate:
+            Workspace(request.output / WORK_FOLDER).remove()
 
 
-def _masked_images(plan: ReconstructionPlan) -> list[tuple[Any, ...]]:
-    """Photographs of which something may be left out, and what says so."""
-    masked = [photo for photo in plan.image_list.images if photo.may_be_masked]
-    files = [photo.mask.stat() if photo.mask is not None else None for photo in masked]
-    return [
-        (photo.name, photo.has_alpha_channel, file and (file.st_size, file.st_mtime_ns))
-        for photo, file in zip(masked, files, strict=True)
-    ]
+def _check_nothing_trained(request: SfmRequest, run: RunFolder | None) -> None:
+    """Raise RunError where a capture is about to change that a run was trained on."""
+    if run is not None and run.is_trained and not request.overwrite:
+        raise RunError(
+            f"{run.path}: its capture was made with other positions or other settings of the reconstruction (--sfm, "
+            "--gps), and the run was trained on it. Add --overwrite to do both again, give the old settings to "
+            "continue, or take another --output."
+        )
 
 
 def _is_finished(output: Path, key: str) -> bool:
@@ -212,7 +219,7 @@ def _has_foreign_files(output: Path) -> bool:
     """Whether a folder holds anything but what a reconstruction begins with."""
     work = output / WORK_FOLDER
     begun = work.is_dir() and all(each.suffix == ".tmp" for each in work.iterdir())  # ended before its first record
-    known = (".lock", POSITIONS_FIGURE, *([WORK_FOLDER] if begun else []))
+    known = (".lock", POSITIONS_FIGURE, SOURCE_IMAGES_FILE, *([WORK_FOLDER] if begun else []))
     return any(each.name not in known and each.suffix != ".tmp" for each in output.iterdir())
 
 
@@ -280,9 +287,6 @@ def _features(
     console: Console,
 ) -> list[ExcludedImage]:
     options, photographs = plan.request.options, plan.image_list.images
-    if not workspace.is_begun("features", key):
-        workspace.remove()
-        workspace.begin("features", key)
     feature_extraction.create_database(workspace, camera_groups)
     failed = feature_extraction.write_upright_images(workspace, photographs)
     counts = feature_extraction.count_features(workspace)

@@ -18,9 +18,9 @@ from vdgs.sfm.console_report import print_preflight
 from vdgs.sfm.gcp_list import GcpList, check_gcps_near, read_gcp_list
 from vdgs.sfm.gps_priors import GpsPriors, read_gps_priors
 from vdgs.sfm.image_list import ImageList, collect_images
-from vdgs.sfm.preflight import PreflightReport, estimate_seconds, make_preflight_report
+from vdgs.sfm.preflight import PreflightReport, make_preflight_report
 from vdgs.sfm.scale_bars import ScaleBars, read_scale_bars
-from vdgs.system.units import data_size, rough_duration
+from vdgs.system.units import data_size
 
 #: Bytes of disk for a feature, with its descriptor and its matches; and for a pixel of a written photograph.
 BYTES_PER_FEATURE, BYTES_PER_PIXEL = 250, 0.9
@@ -35,7 +35,8 @@ class ReconstructionPlan:
     gps_priors: GpsPriors
     preflight: PreflightReport
     threads: int
-    estimated_seconds: float
+    pairs: int
+    """About how many pairs will be matched."""
     gcps: GcpList | None = None
     scale_bars: ScaleBars | None = None
 
@@ -57,14 +58,13 @@ def plan_reconstruction(request: SfmRequest) -> ReconstructionPlan:
     look = replace(look, warnings=[*look.warnings, *(control.notes if control else ())])
     threads = request.threads or default_num_threads()
     pairs = feature_matching.estimate_pair_count(collection.images, positions, request.options)
-    takes = estimate_seconds(collection.images, pairs, request.options, threads)
     return ReconstructionPlan(
         request=request,
         image_list=collection,
         gps_priors=positions,
         preflight=look,
         threads=threads,
-        estimated_seconds=takes,
+        pairs=pairs,
         gcps=control,
         scale_bars=bars,
     )
@@ -84,20 +84,19 @@ def _read_gcps(options: SfmOptions, collection: ImageList, positions: GpsPriors)
     return control
 
 
-def print_plan(reconstruction_plan: ReconstructionPlan, console: Console) -> None:
-    """Print the look, and what will be done."""
+def print_plan(reconstruction_plan: ReconstructionPlan, takes: str, console: Console) -> None:
+    """Print the look, what will be done, and how long that `takes`."""
     photographs, options = reconstruction_plan.image_list.images, reconstruction_plan.request.options
-    pairs = feature_matching.estimate_pair_count(photographs, reconstruction_plan.gps_priors, options)
     held, why = incremental_mapper.should_fix_focal(photographs, reconstruction_plan.gps_priors, options)
     how = "near each other by their positions" if reconstruction_plan.gps_priors.usable else (
         "all with all" if len(photographs) <= options.exhaustive_max else "next in order, and alike")  # fmt: skip
     meters = "metres east, north, up, " if reconstruction_plan.gps_priors.usable or reconstruction_plan.gcps else ""
     plan = [
-        f"features, about {pairs} pairs ({how}), poses and points, {meters}photographs without distortion",
+        f"features, about {reconstruction_plan.pairs} pairs ({how}), poses and points, {meters}photographs without "
+        "distortion",
         *_gcp_plan_lines(reconstruction_plan.gcps),
         f"the focal length is {'held' if held else 'fitted'}: {why}",
-        f"about {rough_duration(reconstruction_plan.estimated_seconds)} on "
-        f"{reconstruction_plan.threads} threads, if they are idle",
+        *([takes] if takes else []),
     ]
     print_preflight(reconstruction_plan.preflight, reconstruction_plan.image_list, plan, console)
 

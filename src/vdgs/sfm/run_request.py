@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RunRequest
 from vdgs.config.sfm_options import SfmRequest
 from vdgs.errors import VdgsError
 from vdgs.runs.run_folder import RunFolder
+from vdgs.sfm.capture_writer import IMAGE_SIZES
 from vdgs.sfm.image_list import is_image_folder
 
 
@@ -24,6 +26,22 @@ def is_image_input(request: RunRequest) -> bool:
     return False
 
 
+def _check_capture_options(options: CaptureOptions) -> None:
+    """Raise VdgsError for what the capture that is made of photographs will not have, before it is made."""
+    made = [name for name, _ in IMAGE_SIZES]
+    if options.images is not None and Path(options.images).as_posix() not in made:
+        raise VdgsError(
+            f"--images {options.images}: the capture made of photographs has {', '.join(made)}. Choose one of these, "
+            "or a size of your own: --sfm.max-output-size (pixels of the longer side), --downscale."
+        )
+    if options.format not in ("auto", "colmap"):
+        raise VdgsError(f"--format {options.format}: the capture made of photographs is a COLMAP model. Leave it out.")
+    if options.test_list is not None and not options.test_list.is_file():
+        raise VdgsError(f"--test-list {options.test_list}: no such file. Give a text file with a name in each line.")
+    if options.split == "explicit" and options.test_list is None:
+        raise VdgsError("--split explicit: photographs have no split of their own. Add --test-list, or leave it out.")
+
+
 def make_sfm_request(request: RunRequest) -> SfmRequest:
     """Photographs into RUN/capture. Raises VdgsError for options that speak of a capture that is not there yet."""
     options = request.options
@@ -35,6 +53,7 @@ def make_sfm_request(request: RunRequest) -> SfmRequest:
             f"--masks {options.masks}: names a folder of a capture. Masks of photographs alone are those in "
             f"{CaptureOptions.masks}/ beside them: rename the folder."
         )
+    _check_capture_options(options)
     run = RunFolder(request.output)
     run.check_output_empty()
     return SfmRequest(
@@ -42,5 +61,6 @@ def make_sfm_request(request: RunRequest) -> SfmRequest:
         output=run.own_capture,
         gps=options.gps,
         threads=request.threads,
+        overwrite=request.overwrite,
         options=request.sfm if options.scale_bar is None else replace(request.sfm, scale_bar=options.scale_bar),
     )

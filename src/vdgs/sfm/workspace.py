@@ -11,19 +11,23 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar, get_args
 
 from rich.console import Console
 
-from vdgs.captures.reconstruction import STEPS_FILE
+from vdgs.captures.reconstruction import PROGRESS_FILE, SFM_STAGE, STEPS_FILE
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.system.atomic_files import is_disk_full, read_json_or_empty, write_json
 from vdgs.system.colmap import pycolmap
 from vdgs.system.console import make_progress_bar
+from vdgs.system.step_progress import StepProgress, StepRecord
 from vdgs.system.stop_signals import check_stop_requested
 from vdgs.system.units import rough_duration
 
 Result = TypeVar("Result")
+#: The steps that are counted, in their order.
+SfmStep = Literal["features", "matching", "mapping", "writing"]
+SFM_STEPS: tuple[SfmStep, ...] = get_args(SfmStep)
 #: Seconds between two looks whether a person asked to stop.
 _POLL_SECONDS = 0.2
 #: Work that takes fewer seconds needs no lines about how far it is.
@@ -53,6 +57,16 @@ class Workspace:
     @property
     def database(self) -> Path:
         return self.path / "database.db"
+
+    @property
+    def progress_file(self) -> Path:
+        """How far the present step is."""
+        return self.path / PROGRESS_FILE
+
+    @property
+    def expected_file(self) -> Path:
+        """The seconds that each step takes, by estimate."""
+        return self.path / "expected.json"
 
     @property
     def models(self) -> Path:
@@ -161,34 +175,52 @@ def explain_colmap_errors(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def report_progress(console: Console, title: str, total: int) -> Iterator[Callable[[int], None]]:
+def report_progress(
+    workspace: Workspace, console: Console, step: SfmStep, total: int, note: str = ""
+) -> Iterator[Callable[[int], None]]:
     """A bar with the time left where the console is a terminal, else a line for every tenth; yields what tells how many
-    are done."""
+    are done. `vdgs status` reads the same from the work folder."""
+    later = SFM_STEPS[SFM_STEPS.index(step) + 1 :]
+    expected = read_json_or_empty(workspace.expected_file)
+    record = StepRecord(
+        stage=SFM_STAGE,
+        step=step,
+        unit="pairs" if step == "matching" else "photographs",
+        total=total,
+        later_seconds=sum(float(expected.get(name, 0)) for name in later),
+    )
+    title = f"{step}, {note}{record.unit}"
+    progress = StepProgress(workspace.progress_file, record)
     if not console.is_terminal:
         console.print(f"{title}: {total}", highlight=False)
-        yield _ProgressLines(title, total, console)
+        yield _ProgressLines(title, progress, console)
         return
     with make_progress_bar(console, counts=True, transient=False) as bar:
         task = bar.add_task(title, total=total)
-        yield lambda done: bar.update(task, completed=done)
+
+        def tell(done: int) -> None:
+            bar.update(task, completed=done)
+            progress(done)
+
+        yield tell
 
 
 class _ProgressLines:
     """How far work is, for logs: a line for every tenth, with the time left, and none in the first half minute."""
 
-    def __init__(self, title: str, total: int, console: Console) -> None:
-        self.title, self.total, self.console = title, total, console
-        self.began, self.first, self.told = time.monotonic(), -1, 0
+    def __init__(self, title: str, progress: StepProgress, console: Console) -> None:
+        self.title, self.progress, self.console = title, progress, console
+        self.began, self.told = time.monotonic(), 0
 
     def __call__(self, done: int) -> None:
-        if self.first < 0:
-            self.first = done  # what was done before tells nothing of the pace
-        seconds, tenth = time.monotonic() - self.began, 10 * done // max(1, self.total)
-        if seconds < _MIN_LOG_SECONDS or tenth <= self.told or done <= self.first or done >= self.total:
+        record = self.progress(done)
+        tenth, left = 10 * done // max(1, record.total), record.seconds_left
+        if time.monotonic() - self.began < _MIN_LOG_SECONDS or tenth <= self.told or left is None:
             return
-        self.told = tenth
-        left = seconds / (done - self.first) * (self.total - done)
-        self.console.print(f"{self.title}: {done} of {self.total}, about {rough_duration(left)} left", highlight=False)
+        if done < record.total:
+            self.told = tenth
+            line = f"{self.title}: {done} of {record.total}, about {rough_duration(left)} left"
+            self.console.print(line, highlight=False)
 
 
 def silence_colmap() -> None:

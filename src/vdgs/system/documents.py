@@ -86,7 +86,9 @@ class StageStatusDocument(TypedDict):
     state: str
     reason: str | None
     folder: str
+    step: str | None
     iteration: int | None
+    """Or how many of the step are done, `iterations` of how many: photographs, pairs, tiles."""
     iterations: int | None
     seconds_left: float | None
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 ABSENT = "–"
 
@@ -60,3 +61,9 @@ def format_length(value: float | None, unit: str) -> str:
     if value is None:
         return "unknown"
     return f"{value * 100:.3g} cm" if unit == "m" and value < 1 else f"{value:.3g} {unit}"
+
+
+def first_names(names: Sequence[str]) -> str:
+    """a.jpg, b.jpg, c.jpg and 12 more."""
+    more = len(names) - 3
+    return ", ".join(names[:3]) + (f" and {more} more" if more > 0 else "")

@@ -45,7 +45,7 @@ def open_run_or_checkpoint(path: Path, which: ModelName = "best", device: str = 
 def run_status_markdown(run: RunFolder) -> str:
     """How far every stage and block is, in Markdown."""
     from vdgs.report.status_cli import (  # brings what draws charts: not before the first picture
-        next_step,
+        next_line,
         progress_text,
     )
 
@@ -54,7 +54,7 @@ def run_status_markdown(run: RunFolder) -> str:
         f"**{stage.name}** {stage.state}" + (f": {progress_text(stage.status)}" if progress_text(stage.status) else "")
         for stage in standing.stages
     ]
-    return "\n\n".join([*lines, f"next: {next_step(standing)}"])
+    return "\n\n".join([*lines, next_line(standing)])
 
 
 def run_file_times(run: RunFolder) -> tuple[tuple[str, int], ...]:

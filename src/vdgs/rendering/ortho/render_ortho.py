@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from importlib.util import find_spec
 from pathlib import Path
@@ -66,7 +66,8 @@ def _render_locally(context: RunContext, request: OrthoRequest, console: Console
     _print_plan(plan, console)
     clear(plan.folder)
     with plan.tile_renderer(run.model) as renderer:
-        return _write(plan, (renderer.render_tile(part) for _, _, part in plan.grid.tiles()), console), plan.folder
+        tiles = (renderer.render_tile(part) for _, _, part in plan.grid.tiles())
+        return _write(plan, _counted(context.run, plan, tiles), console), plan.folder
 
 
 def _render_sharded(
@@ -79,7 +80,15 @@ def _render_sharded(
     plan = OrthoPlan.of(request, run.path, model.name, model.stage.status().model_id, context.capture)
     _print_plan(plan, console, sharded=True)
     with distributed_tiles(plan, request, run, model, execution, console) as tiles:
-        return _write(plan, tiles, console), plan.folder
+        return _write(plan, _counted(run, plan, tiles), console), plan.folder
+
+
+def _counted(run: RunFolder, plan: OrthoPlan, tiles: Iterable[OrthoTile]) -> Iterator[OrthoTile]:
+    """The tiles, counted for `vdgs status`: maps are what comes before the report."""
+    progress = run.begin_step("report", "maps", "tiles", plan.grid.tile_count())
+    for done, tile in enumerate(tiles, 1):
+        yield tile
+        progress(done)
 
 
 def _write(plan: OrthoPlan, tiles: Iterable[OrthoTile], console: Console) -> float:

@@ -1,0 +1,80 @@
+"""Which photographs a capture is made of, and what changed in their folders since: OUTPUT/photographs.json."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from vdgs.captures.reconstruction import SOURCE_IMAGES_FILE
+from vdgs.errors import VdgsError
+from vdgs.sfm.find_images import find_files
+from vdgs.system.atomic_files import read_json_or_empty, write_json
+from vdgs.system.records import record_from_dict, record_to_dict
+from vdgs.system.units import first_names
+
+
+@dataclass(frozen=True)
+class SourceFile:
+    """A photograph: its name in the capture, and what tells that its file was changed."""
+
+    name: str
+    file_bytes: int
+    mtime_ns: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceImages:
+    """The photographs of a capture, used or not, and the command that makes it of them."""
+
+    folders: tuple[str, ...]
+    files: tuple[SourceFile, ...]
+    command: str | None = None
+
+    @staticmethod
+    def of(folders: Sequence[Path], command: str | None = None) -> SourceImages:
+        """Those that lie in the folders now. Raises VdgsError where they cannot be told."""
+        stats = {name: path.stat() for name, path in find_files(folders).named.items()}
+        files = tuple(SourceFile(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats.items())
+        return SourceImages(folders=tuple(str(each.resolve()) for each in folders), files=files, command=command)
+
+    @staticmethod
+    def read(output: Path) -> SourceImages | None:
+        """Those that a capture was begun with; None where it does not say it."""
+        try:
+            return record_from_dict(SourceImages, read_json_or_empty(output / SOURCE_IMAGES_FILE))
+        except ValueError:
+            return None
+
+    def write(self, output: Path) -> None:
+        write_json(output / SOURCE_IMAGES_FILE, record_to_dict(self))
+
+    def changes_since(self, before: SourceImages) -> str:
+        """2 photographs added (a.jpg, b.jpg), 1 removed (c.jpg); empty where nothing changed."""
+        old, new = ({each.name: each for each in files} for files in (before.files, self.files))
+        changed = [name for name in old.keys() & new.keys() if old[name] != new[name]]
+        kinds = (("added", new.keys() - old.keys()), ("removed", old.keys() - new.keys()), ("changed", changed))
+        parts = [f"{len(names)} {kind} ({first_names(sorted(names))})" for kind, names in kinds if names]
+        return f"photographs: {', '.join(parts)}" if parts else ""
+
+
+def source_changes(output: Path) -> str:
+    """What changed in the folders of photographs since a capture was begun with them; empty where nothing did, and
+    where they are not there any more (a card that was taken out)."""
+    before = SourceImages.read(output)
+    if before is None or not all(Path(folder).is_dir() for folder in before.folders):
+        return ""
+    try:
+        return SourceImages.of([Path(folder) for folder in before.folders]).changes_since(before)
+    except (VdgsError, OSError) as error:
+        return f"photographs: cannot be compared ({error})"
+
+
+def check_unchanged(output: Path, now: SourceImages, overwrite: bool) -> None:
+    """Raise VdgsError, naming them, where photographs are others than those a capture was begun with."""
+    before = SourceImages.read(output)
+    if before is not None and not overwrite and (changes := now.changes_since(before)):
+        raise VdgsError(
+            f"{output}: was begun with other photographs than there are now. {changes[0].upper()}{changes[1:]}. Add "
+            "--overwrite to make it anew of those that are there, with all that was trained on it; or restore them."
+        )

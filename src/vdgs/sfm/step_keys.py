@@ -1,0 +1,41 @@
+"""What each step of a reconstruction depends on: a step whose key is another is done again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from vdgs import __version__
+from vdgs.sfm.reconstruction_plan import ReconstructionPlan
+from vdgs.sfm.workspace import cache_key
+from vdgs.system.records import record_to_dict
+
+
+def step_keys(plan: ReconstructionPlan) -> dict[str, str]:
+    """What each step depends on, each on those before it. All but the last do not depend on what places the scene."""
+    options, positions = plan.request.options, plan.gps_priors
+    files = [
+        (photo.name, photo.file_bytes, photo.path.stat().st_mtime_ns, photo.width, photo.height, photo.orientation)
+        for photo in plan.image_list.images
+    ]
+    lenses = [photo.lens and photo.lens.focal for photo in plan.image_list.images]
+    found = cache_key(
+        __version__, files, lenses, options.max_image_size, options.max_num_features, *_masked_images(plan)
+    )
+    matched = cache_key(found, options.num_neighbors, options.exhaustive_max)
+    mapped = cache_key(matched, options.focal)
+    capture = cache_key(mapped, options.max_output_size)
+    points, bars = plan.gcps.points if plan.gcps else (), plan.scale_bars
+    told = [positions.image_indices.tolist(), positions.enu.tolist(), positions.gps_std.tolist(), positions.origin]
+    known = [record_to_dict(point) for point in points], bars and record_to_dict(bars)
+    placed = cache_key(capture, told, known, options.georeference)
+    return {"features": found, "matches": matched, "model": mapped, "capture": capture, "placed": placed}
+
+
+def _masked_images(plan: ReconstructionPlan) -> list[tuple[Any, ...]]:
+    """Photographs of which something may be left out, and what says so."""
+    masked = [photo for photo in plan.image_list.images if photo.may_be_masked]
+    files = [photo.mask.stat() if photo.mask is not None else None for photo in masked]
+    return [
+        (photo.name, photo.has_alpha_channel, file and (file.st_size, file.st_mtime_ns))
+        for photo, file in zip(masked, files, strict=True)
+    ]
