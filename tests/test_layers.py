@@ -27,12 +27,13 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("kernels",),
     ("visibility",),
     ("captures", "model"),
-    ("partition", "synth"),
+    ("ops", "partition", "synth"),
     ("plots", "runs"),
     ("distributed", "evaluation", "sfm", "training"),
     ("export", "rendering", "report"),
     ("pipeline", "viewer"),
     ("cli",),
+    ("api",),
 )
 #: The folders of the experiments, lowest first, as the rooms of a package of its own.
 EXPERIMENT_LAYERS: tuple[tuple[str, ...], ...] = (("baselines", "microbench"), ("bench",), ("reports",))
@@ -41,6 +42,7 @@ DOORS: Mapping[str, tuple[str, ...]] = {
     "kernels": (
         "kernel_types",
         "constants",
+        "gaussian_projection",
         "operations",
         "device_selection",
         "transfer",
@@ -242,8 +244,8 @@ CLEAN = {
     "high.py": "from vdgs.pipeline import train_coarse", "cli/doctor/cards.py": "from vdgs.kernels import cpu",
 }  # fmt: skip
 DOOR = (
-    "kernels, kernels.kernel_types, kernels.constants, kernels.operations, kernels.device_selection, "
-    "kernels.transfer, kernels.idle_memory, kernels.rotations, kernels.spherical_harmonics"
+    "kernels, kernels.kernel_types, kernels.constants, kernels.gaussian_projection, kernels.operations, "
+    "kernels.device_selection, kernels.transfer, kernels.idle_memory, kernels.rotations, kernels.spherical_harmonics"
 )
 
 

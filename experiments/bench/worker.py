@@ -211,9 +211,6 @@ def _plain(value: Any) -> Any:
 
 def main(arguments: list[str]) -> int:
     """Exit codes as those of the command line: 0 done, 1 explained, 130 stopped."""
-    from vdgs.kernels import configure_threads
-
-    configure_threads()  # before anything imports torch
     from vdgs.distributed.task_process import stop_when_parent_dies
     from vdgs.system.exit_codes import exit_code_of
 

@@ -29,3 +29,7 @@ class Stopped(VdgsError):
 
 class Interrupted(Stopped):
     """Work was asked to stop between two steps of it: nothing had to be saved."""
+
+
+class UnsupportedOption(VdgsError, NotImplementedError):
+    """A function of the Python API was asked for what it does not have; the message says what to do instead."""

@@ -73,9 +73,6 @@ def _suggestion(word: str) -> str:
 
 
 def _run_command(command: str, arguments: list[str]) -> int:
-    from vdgs.kernels import configure_threads
-
-    configure_threads()  # before anything imports torch
     from vdgs.system.exit_codes import exit_code_of
 
     action = get_command(command)

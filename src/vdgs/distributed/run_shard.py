@@ -25,7 +25,6 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--device", default="auto", help="where to compute: auto, cpu, cuda or cuda:0")
     parser.add_argument("--image-cache-gb", type=float, default=0.0, help="memory for photographs; 0: by what is free")
     args = parser.parse_args(arguments)
-    configure_threads()  # before anything imports torch
 
     from vdgs.system.exit_codes import exit_code_of
 

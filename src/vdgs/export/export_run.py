@@ -113,7 +113,18 @@ def resolve_request(request: ExportRequest) -> ExportRequest:
 def export_run(
     run: OpenedRun, request: ExportRequest, console: Console, execution: ExecutionOptions | None = None
 ) -> ExportDocument:
-    """Write the files of a resolved request from an opened run; returns what RUN/export.json holds.
+    """`write_files`, in this process or in shards where `execution` sends them, noted in RUN/export.json."""
+    if execution is None or not execution.is_distributed:
+        forget_shards(run)
+    record = write_files(run, request, console, execution)
+    write_json(run.folder.path / RECORD_FILE, record)
+    return record
+
+
+def write_files(
+    run: OpenedRun, request: ExportRequest, console: Console, execution: ExecutionOptions | None = None
+) -> ExportDocument:
+    """Write the files of a resolved request from an opened run, or a scene in memory; returns what was done.
 
     The scene is baked in this process, or in shards where `execution` sends them: the files are the same. Raises
     VdgsError, before any Gaussian is baked, for outputs among a capture's inputs, an empty choice, and coordinates
@@ -151,7 +162,6 @@ def export_run(
         "model": run.name, "key": run.key, "gaussians": len(kept), "sh_degree": request.sh_degree, "rounds": rounds,
         "seconds_to_bake": seconds, "seconds_to_refine": request.optimize_seconds, "files": files, "losses": losses,
     })  # fmt: skip
-    write_json(run.folder.path / RECORD_FILE, record)
     return record
 
 
@@ -161,7 +171,6 @@ def _make_baker(
     """What bakes the scene: this process, or shards."""
     if execution is not None and execution.is_distributed:
         return distributed_bake(run, request, execution, console)
-    forget_shards(run)
     return nullcontext(LocalBake(run, request, console))
 
 

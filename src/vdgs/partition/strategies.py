@@ -18,14 +18,16 @@ from typing import Protocol
 import numpy as np
 import shapely
 import shapely.affinity
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from vdgs.config.method import AssignmentConfig
+from vdgs.config.method import AssignmentConfig, MethodConfig
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
 from vdgs.partition.assignment.score_matrix import ScoreMatrix
 from vdgs.partition.blocks import Block, Blocks
 from vdgs.partition.clustering import fit_principal_plane
+from vdgs.partition.partition_scene import choose_block_count, partition_scene
+from vdgs.system.memory.memory_estimate import max_image_pixels
 
 #: Outliers beyond these quantiles of the anchors do not decide how large the scene is.
 EXTENT_QUANTILES = (0.01, 0.99)
@@ -301,3 +303,30 @@ STRATEGIES: dict[str, PartitionStrategy] = {
     "citygaussian": CityGaussian(),
     "dogs": Dogs(),
 }
+
+
+def cut_scene(
+    positions: Float[np.ndarray, "n 3"], visibility: Int[np.ndarray, " n"], cameras: Sequence[Camera],
+    method: MethodConfig,
+) -> tuple[Blocks, list[str]]:  # fmt: skip
+    """The blocks that the settings ask for, by their strategy, and warnings."""
+    config, pixels = method.partition, max_image_pixels(cameras, method.block.resolution_schedule)
+    count = choose_block_count(len(visibility), len(cameras), pixels, method)
+    if config.strategy != "visibility":
+        return STRATEGIES[config.strategy].partition(positions, cameras, count)
+    return partition_scene(positions, visibility, replace(config, blocks=count), method.training.seed)
+
+
+def assignment_config(method: MethodConfig) -> AssignmentConfig:
+    """The settings of the assignment, as the strategy of the partition needs them."""
+    strategy = method.partition.strategy
+    return method.assignment if strategy == "visibility" else STRATEGIES[strategy].assignment(method.assignment)
+
+
+def adjust_scores(
+    scores: ScoreMatrix, positions: Float[np.ndarray, "n 3"], blocks: Blocks, cameras: Sequence[Camera], strategy: str
+) -> ScoreMatrix:
+    """The scores as the strategy of the partition decides by them."""
+    return (
+        scores if strategy == "visibility" else STRATEGIES[strategy].adjust_scores(scores, positions, blocks, cameras)
+    )

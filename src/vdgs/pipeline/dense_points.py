@@ -51,17 +51,28 @@ def find_dense_points(
     on_progress: Callable[[int, int], None],
     threads: int,
 ) -> DensePoints | None:
-    """As `load_dense_points`, computed and saved where they are not yet: points away from the sparse ones, none where
-    those are as many as the images can bear.
-
-    `images` are the training images; `on_progress(done, total)` is called after each step, and may raise.
-    """
+    """As `load_dense_points`, computed (`match_dense_points`) and saved where they are not yet."""
     file = run.coarse.path / DENSE_POINTS_FILE
     if not config.mvs or file.exists():
         return load_dense_points(run, config)
+    return _write(file, match_dense_points(capture, images, config, run.coarse.path, on_progress, threads))
+
+
+def match_dense_points(
+    capture: Capture,
+    images: ImageCache,
+    config: AnchorConfig,
+    scratch_dir: Path,
+    on_progress: Callable[[int, int], None],
+    threads: int,
+) -> DensePoints:
+    """Points away from the sparse ones, none where those are as many as the images can bear.
+
+    `images` are the training images; `on_progress(done, total)` is called after each step, and may raise.
+    """
     cameras, room = [view.camera for view in capture.train_views], max_dense_points(capture)
     if not room:
-        return _write(file, DensePoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8)))
+        return DensePoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     cell = fusion_cell(capture, config)
 
     def read(index: int) -> tuple[np.ndarray, np.ndarray | None]:
@@ -70,13 +81,13 @@ def find_dense_points(
 
     gaps = find_gap_points(capture.points, cameras, get_voxel_size(capture.points, config))
     inputs = StereoInputs(cameras, capture.points, np.concatenate([capture.points, gaps]), read)
-    dense = compute_dense_points(inputs, cell, run.coarse.path, on_progress, threads)
+    dense = compute_dense_points(inputs, cell, scratch_dir, on_progress, threads)
     if len(dense.points):
         away = np.flatnonzero(cKDTree(capture.points).query(dense.points, workers=1)[0] > cell.min_edge / 2)
         views = count_visibility(torch.from_numpy(dense.points[away]), cameras).numpy()
         chosen = np.sort(away[np.argsort(views, kind="stable")[:room]])
         dense = DensePoints(dense.points[chosen], dense.colors[chosen])
-    return _write(file, dense)
+    return dense
 
 
 def max_dense_points(capture: Capture) -> int:

@@ -41,8 +41,8 @@ from vdgs.partition.assignment.score_file import load_score_rows, load_scores, s
 from vdgs.partition.assignment.score_matrix import CameraScorer, ScoreMatrix, compute_score_matrix, concatenate_scores
 from vdgs.partition.block_records import BlockCamerasRecord, PartitionRecord
 from vdgs.partition.blocks import Blocks, load_blocks, save_blocks, save_blocks_wgs84
-from vdgs.partition.partition_scene import choose_block_count, partition_scene
-from vdgs.partition.strategies import STRATEGIES
+from vdgs.partition.partition_scene import partition_scene
+from vdgs.partition.strategies import STRATEGIES, adjust_scores, assignment_config, cut_scene
 from vdgs.plots.partition import block_maps as figures
 from vdgs.runs.open_run import OpenedRun
 from vdgs.runs.run_context import RunContext
@@ -51,7 +51,7 @@ from vdgs.runs.visibility_store import load_or_count_visibility
 from vdgs.system.atomic_files import read_json, write_json
 from vdgs.system.console import make_progress_bar
 from vdgs.system.file_locks import lock_folder
-from vdgs.system.memory.memory_estimate import max_image_pixels, render_bytes
+from vdgs.system.memory.memory_estimate import render_bytes
 from vdgs.system.memory.process_memory import peak_memory_bytes, reset_peak_memory
 from vdgs.system.records import record_to_dict
 from vdgs.system.stop_signals import check_stop_requested
@@ -110,7 +110,7 @@ def partition_run(
     with run.locked():
         reset_peak_memory()
         start, method, scene = time.monotonic(), run.method(), _Scene.open(context, device)
-        job, config = _job(run, len(scene.cameras)), _assignment(method)
+        job, config = _job(run, len(scene.cameras)), assignment_config(method)
         shard_blocks = job.folder / BLOCKS_FILE
         if shard_blocks.exists():  # shards of an earlier command score cameras for these blocks
             blocks, warnings = load_blocks(shard_blocks), list(read_json(shard_blocks)["warnings"])
@@ -126,8 +126,7 @@ def partition_run(
             scores = _score_in_shards(run, scene, job, len(blocks), execution, console)
         else:
             scores = _score(scene, blocks, config, console)
-        if method.partition.strategy != "visibility":
-            scores = STRATEGIES[method.partition.strategy].adjust_scores(scores, scene.positions, blocks, scene.cameras)
+        scores = adjust_scores(scores, scene.positions, blocks, scene.cameras, method.partition.strategy)
         assignment = assign_cameras(scores, config)
         for note in warnings + assignment.warnings:
             console.print(f"[yellow]note[/] {note}", highlight=False)
@@ -161,11 +160,7 @@ def explain_view(run: RunFolder, view: str, console: Console) -> None:
 
 
 def _partition(scene: _Scene, method: MethodConfig) -> tuple[Blocks, list[str]]:
-    config, pixels = method.partition, max_image_pixels(scene.cameras, method.block.resolution_schedule)
-    count = choose_block_count(len(scene.visibility), len(scene.cameras), pixels, method)
-    if config.strategy != "visibility":
-        return STRATEGIES[config.strategy].partition(scene.positions, scene.cameras, count)
-    return partition_scene(scene.positions, scene.visibility, replace(config, blocks=count), method.training.seed)
+    return cut_scene(scene.positions, scene.visibility, scene.cameras, method)
 
 
 def _spatial(scene: _Scene, config: PartitionConfig, seed: int, blocks: Blocks) -> Blocks:
@@ -182,12 +177,6 @@ def _or_none(load: Callable[[], Loaded]) -> Loaded | None:
         return load()
     except RunError:
         return None
-
-
-def _assignment(method: MethodConfig) -> AssignmentConfig:
-    """The settings of the assignment, as the strategy of the partition needs them."""
-    strategy = method.partition.strategy
-    return method.assignment if strategy == "visibility" else STRATEGIES[strategy].assignment(method.assignment)
 
 
 def _score(scene: _Scene, blocks: Blocks, config: AssignmentConfig, console: Console) -> ScoreMatrix:
@@ -230,7 +219,7 @@ def score_shard(shard: Shard) -> None:
     cameras = [view.camera for view in opened.capture.train_views]
 
     def results(left: Sequence[int]) -> Results:
-        scorer = CameraScorer(opened.model, load_blocks(shard.folder / BLOCKS_FILE), _assignment(run.method()))
+        scorer = CameraScorer(opened.model, load_blocks(shard.folder / BLOCKS_FILE), assignment_config(run.method()))
         for item in left:
             scores = scorer.scores(cameras[item * CAMERAS_PER_ITEM : (item + 1) * CAMERAS_PER_ITEM])
             yield partial(save_score_rows, scores=scores)

@@ -8,29 +8,33 @@ that no anchor covers would push the anchors at the boundary to fill the hole).
 from __future__ import annotations
 
 import time
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from rich.console import Console
 
 from vdgs import __version__
 from vdgs.captures.camera_height import camera_height
+from vdgs.captures.capture import Capture, View
 from vdgs.captures.capture_metadata import capture_metadata
 from vdgs.captures.image_cache import ImageCache
 from vdgs.config.executor_options import CheckpointOptions
-from vdgs.config.method import block_train_config, max_block_anchors
+from vdgs.config.method import MethodConfig, TrainConfig, block_train_config, max_block_anchors
 from vdgs.distributed.shard import Shard
 from vdgs.errors import RunError
 from vdgs.model.anchor_model import AnchorModel, ModelMetadata
+from vdgs.model.anchors import Anchors
 from vdgs.model.scale_bounds import max_log_scales
 from vdgs.partition.block_regions import growth_mask, lr_ramp, split_trainable_anchors, visible_anchors
-from vdgs.partition.blocks import Blocks
+from vdgs.partition.blocks import Blocks, xy_positions
 from vdgs.runs.open_run import block_view_indices, load_run_blocks
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.stage_folder import StageFolder, StatusRecord
 from vdgs.system.tensors import file_id
 from vdgs.training import FrozenAnchors, TrainingProblem, initial_state
-from vdgs.training.crops import compute_crops, load_or_compute_crops, mean_crop_area, steps_for
+from vdgs.training.crops import Crop, compute_crops, load_or_compute_crops, mean_crop_area, steps_for
 from vdgs.training.schedule import view_sampling_weights
 from vdgs.training.session.trainer import (
     finish_stage,
@@ -71,63 +75,125 @@ def train_shard(shard: Shard) -> None:
     train_block(RunContext.from_path(shard.folder.parent), shard.index, options, shard.console, shard.device)
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BlockPlan:
+    """What a block trains with."""
+
+    index: int
+    coarse: AnchorModel
+    #: The training views of the capture that serve the block.
+    indices: list[int]
+    views: list[View]
+    #: What it moves, and what it only draws.
+    anchors: Anchors
+    surroundings: Anchors
+    config: TrainConfig
+    weights: tuple[float, ...] | None
+    crops: tuple[Crop, ...] | None
+
+    @property
+    def mean_area(self) -> float:
+        """Mean share of a photograph that a step draws."""
+        return mean_crop_area(self.crops, self.weights) if self.crops else 1.0
+
+    @property
+    def can_train(self) -> bool:
+        """Whether there is anything to move, and a photograph of it."""
+        return bool(self.views) and len(self.anchors) > 0
+
+    def open_images(self, budget_bytes: int) -> ImageCache:
+        """Its photographs in the sizes that it needs."""
+        factors = tuple(sorted({factor for _, factor in self.config.resolution_schedule}))
+        return ImageCache(self.views, budget_bytes, downscales=factors)
+
+    def problem(
+        self, capture: Capture, blocks: Blocks, method: MethodConfig, images: ImageCache, device: torch.device
+    ) -> TrainingProblem:
+        """What training works on."""
+        cameras, coarse, config = [view.camera for view in capture.train_views], self.coarse, self.config
+        return TrainingProblem(
+            config=config, images=images, num_images=len(self.views), voxel_size=coarse.voxel_size,
+            camera_height=camera_height(capture), kind="block", background=coarse.background, device=device,
+            frozen_decoder=method.block.decoder == "frozen",
+            frozen_anchors=FrozenAnchors(self.surroundings, coarse.decoder),
+            growth_mask=growth_mask(blocks, self.index, method.block),
+            lr_mask=lr_ramp(blocks, self.index, method.block),
+            image_indices=self.indices, view_weights=self.weights, crops=self.crops,
+            max_log_scale=(
+                (lambda positions: max_log_scales(positions, cameras)) if config.anchors.bound_scales else None
+            ),
+        )  # fmt: skip
+
+
+def plan_block(
+    coarse: AnchorModel,
+    capture: Capture,
+    blocks: Blocks,
+    index: int,
+    indices: list[int],
+    method: MethodConfig,
+    keep_crops: Callable[[int, Callable[[], tuple[Crop, ...]]], tuple[Crop, ...]] = lambda count, find: find(),
+) -> BlockPlan:
+    """What a block trains with, which the training views of these `indices` serve. `keep_crops` is given the number of
+    crops and what finds them."""
+    views = [capture.train_views[i] for i in indices]
+    cameras = [view.camera for view in views]
+    own, around = split_trainable_anchors(coarse.anchors, blocks, index, method.block)
+    around &= visible_anchors(coarse.anchors, cameras)
+    anchors, surroundings = coarse.anchors.select(own), coarse.anchors.select(around)
+    config, weights, crops = block_train_config(method, len(views)), None, None
+    if views and len(anchors):
+        owned = np.bincount(blocks.owner(xy_positions(coarse.anchors.positions)), minlength=len(blocks))
+        limit = max_block_anchors(method.block, int(owned[index]), int(owned.sum()))
+        config = replace(config, densify=replace(config.densify, max_anchors=limit))
+        weights = view_sampling_weights(config, anchors, cameras)
+        if method.block.crop != "off":
+            crops = keep_crops(len(views), lambda: compute_crops(coarse, own, cameras))
+    plan = BlockPlan(
+        index=index, coarse=coarse, indices=indices, views=views, anchors=anchors, surroundings=surroundings,
+        config=config, weights=weights, crops=crops,
+    )  # fmt: skip
+    if method.block.crop != "fixed-pixels" or not crops:
+        return plan
+    return replace(plan, config=replace(config, iterations=steps_for(config.iterations, plan.mean_area)))
+
+
 def _train(
     context: RunContext, index: int, blocks: Blocks, options: CheckpointOptions, console: Console, device: torch.device
 ) -> None:
     run, opened = context.run, context.open_model("coarse", device)
     folder, method = run.block(index), run.method()
     capture, coarse = opened.capture, opened.model
-    indices = block_view_indices(run, capture, index)
-    views = [capture.train_views[i] for i in indices]
-    cameras = [view.camera for view in views]
+    start = time.monotonic()
+    plan = plan_block(
+        coarse, capture, blocks, index, block_view_indices(run, capture, index), method,
+        lambda count, find: load_or_compute_crops(folder.path / "crops.json", count, find),
+    )  # fmt: skip
+    preparation_seconds, views = time.monotonic() - start, plan.views
     metadata = ModelMetadata(
         capture=capture_metadata(capture), version=__version__, block=index, views=len(views), key=run.keys().blocks
     )
-    own, around = split_trainable_anchors(coarse.anchors, blocks, index, method.block)
-    around &= visible_anchors(coarse.anchors, cameras)
-    anchors, surroundings = coarse.anchors.select(own), coarse.anchors.select(around)
-    if not views or not len(anchors):
-        _keep_coarse(folder, replace(coarse, anchors=anchors, metadata=metadata), len(views), console)
+    if not plan.can_train:
+        _keep_coarse(folder, replace(coarse, anchors=plan.anchors, metadata=metadata), len(views), console)
         return
-    core_anchors = [block.anchors_core for block in run.partition_record().blocks]
-    config = block_train_config(method, len(views))
-    limit = max_block_anchors(method.block, core_anchors[index], sum(core_anchors))
-    config = replace(config, densify=replace(config.densify, max_anchors=limit))
-    weights = view_sampling_weights(config, anchors, cameras)
-    start, crops = time.monotonic(), None
-    if method.block.crop != "off":
-        crops_file = folder.path / "crops.json"
-        crops = load_or_compute_crops(crops_file, len(views), lambda: compute_crops(coarse, own, cameras))
-    area = mean_crop_area(crops, weights) if crops else 1.0
-    if method.block.crop == "fixed-pixels":
-        config = replace(config, iterations=steps_for(config.iterations, area))
-    preparation_seconds = time.monotonic() - start
-    warn_without_densification(config, console, "--block.")
-    factors = tuple(sorted({factor for _, factor in config.resolution_schedule}))
-    all_cameras = [view.camera for view in capture.train_views]
-    with ImageCache(views, image_cache_bytes(options), downscales=factors) as images:
-        stage = TrainingProblem(
-            config=config, images=images, num_images=len(views), voxel_size=coarse.voxel_size,
-            camera_height=camera_height(capture), kind="block", background=coarse.background, device=device,
-            frozen_decoder=method.block.decoder == "frozen", frozen_anchors=FrozenAnchors(surroundings, coarse.decoder),
-            growth_mask=growth_mask(blocks, index, method.block), lr_mask=lr_ramp(blocks, index, method.block),
-            image_indices=indices, view_weights=weights, crops=crops,
-            max_log_scale=(
-                (lambda positions: max_log_scales(positions, all_cameras)) if config.anchors.bound_scales else None
-            ),
-        )  # fmt: skip
-        state = resume_or_start(folder, stage, lambda: initial_state(anchors, coarse.decoder.copy(), stage), console)
+    warn_without_densification(plan.config, console, "--block.")
+    with plan.open_images(image_cache_bytes(options)) as images:
+        stage = plan.problem(capture, blocks, method, images, device)
+        state = resume_or_start(
+            folder, stage, lambda: initial_state(plan.anchors, coarse.decoder.copy(), stage), console
+        )
         state.seconds += preparation_seconds
-        worth = f" (worth {effective_sample_size(weights):.0f} used alike)" if weights else ""
-        parts = f", {area:.0%} of a photograph each" if crops else ""
+        worth = f" (worth {effective_sample_size(plan.weights):.0f} used alike)" if plan.weights else ""
+        parts = f", {plan.mean_area:.0%} of a photograph each" if plan.crops else ""
         console.print(
-            f"block {index}: {len(views)} of {len(capture.train_views)} training views{worth}, {int(own.sum()):,} "
-            f"anchors of its own, {len(surroundings):,} around it, {config.iterations:,} iterations{parts}",
+            f"block {index}: {len(views)} of {len(capture.train_views)} training views{worth}, {len(plan.anchors):,} "
+            f"anchors of its own, {len(plan.surroundings):,} around it, {plan.config.iterations:,} iterations{parts}",
             highlight=False,
         )
         train_with_checkpoints(folder, state, stage, options, console)
     metadata = replace(metadata, iterations=state.iteration, decoder=method.block.decoder)
-    finish_stage(folder, state, state.model(coarse.voxel_size, coarse.background, metadata), console, area)
+    model = state.model(coarse.voxel_size, coarse.background, metadata)
+    finish_stage(folder, state, model, console, plan.mean_area)
 
 
 def _keep_coarse(folder: StageFolder, model: AnchorModel, views: int, console: Console) -> None:

@@ -80,14 +80,12 @@ def _train(
     device: torch.device,
 ) -> None:
     folder = run.coarse
-    factors = tuple(sorted({1, *(factor for _, factor in config.resolution_schedule)}))  # 1: stereo sees them in full
-    with ImageCache(capture.train_views, image_cache_bytes(options), downscales=factors) as images:
+    with open_training_images(capture, config, image_cache_bytes(options)) as images:
         dense = _dense_points(run, capture, images, config, console)
         stage, anchors = build_coarse_problem(capture, config, images, device, dense)
 
         def start() -> TrainingState:
-            spread = _brightness_spread(run, images, config, console)
-            fitted = config.exposure_compensation and (spread is None or spread >= config.exposure_min_spread)
+            spread, fitted = fits_exposures(images, config, console, run)
             counts = {
                 "sparse_points": len(capture.points),
                 "dense_points": None if dense is None else len(dense.points),
@@ -115,12 +113,18 @@ def _train(
     finish_stage(folder, state, state.model(stage.voxel_size, stage.background, metadata), console)
 
 
+def open_training_images(capture: Capture, config: TrainConfig, budget_bytes: int) -> ImageCache:
+    """The training photographs in the sizes that the coarse stage needs; in full for stereo."""
+    factors = tuple(sorted({1, *(factor for _, factor in config.resolution_schedule)}))
+    return ImageCache(capture.train_views, budget_bytes, downscales=factors)
+
+
 def _dense_points(
     run: RunFolder, capture: Capture, images: ImageCache, config: TrainConfig, console: Console
 ) -> DensePoints | None:
     """The points that stereo adds to the sparse ones, computed now or before; prints how many."""
     start = time.monotonic()
-    with _progress("looking for ground by stereo", run, console) as on_progress:
+    with show_progress("looking for ground by stereo", console, run) as on_progress:
         dense = find_dense_points(run, capture, images, config.anchors, on_progress, torch.get_num_threads())
     if dense is not None:
         added = f"{len(dense.points):,} points beside the sparse ones, {time.monotonic() - start:.0f} s"
@@ -132,27 +136,38 @@ def _dense_points(
 
 
 @contextmanager
-def _progress(label: str, run: RunFolder, console: Console) -> Iterator[Callable[[int, int], None]]:
-    """Show how far something is while the context lasts; yields a function that takes the steps done and all steps."""
+def show_progress(label: str, console: Console, run: RunFolder | None = None) -> Iterator[Callable[[int, int], None]]:
+    """Show how far something is while the context lasts, and record it for `vdgs status` in a run's folder; yields a
+    function that takes the steps done and all steps."""
     progress: StepProgress | None = None
     with console.status(label) as status:
 
         def on_progress(done: int, total: int) -> None:
             nonlocal progress
             check_stop_requested()
-            progress = progress or run.begin_step("coarse", label, "steps", total)
-            progress(done)
+            if run is not None:
+                progress = progress or run.begin_step("coarse", label, "steps", total)
+                progress(done)
             status.update(f"{label}, {done / total:.0%}")
 
         yield on_progress
 
 
-def _brightness_spread(run: RunFolder, images: ImageCache, config: TrainConfig, console: Console) -> float | None:
-    """By what share images of the same places differ in brightness; None where nothing depends on it, or the capture
-    does not tell. Prints what follows."""
+def fits_exposures(
+    images: ImageCache, config: TrainConfig, console: Console, run: RunFolder | None = None
+) -> tuple[float | None, bool]:
+    """By what share images of the same places differ in brightness (None where nothing depends on it, or the capture
+    does not tell), and whether an exposure is fitted to each. Prints what follows."""
+    spread = _brightness_spread(run, images, config, console)
+    return spread, config.exposure_compensation and (spread is None or spread >= config.exposure_min_spread)
+
+
+def _brightness_spread(
+    run: RunFolder | None, images: ImageCache, config: TrainConfig, console: Console
+) -> float | None:
     if not (config.exposure_compensation and config.exposure_min_spread):
         return None
-    with _progress("comparing the photographs' brightness", run, console) as on_progress:
+    with show_progress("comparing the photographs' brightness", console, run) as on_progress:
         colors = collect_point_colors(images, on_progress)
     if colors is None:
         console.print(

@@ -14,6 +14,7 @@ from vdgs.captures.loading import load_capture
 from vdgs.config.commands import ModelName
 from vdgs.errors import CaptureError, RunError
 from vdgs.model.anchor_model import AnchorModel
+from vdgs.partition.assignment.assign_cameras import Assignment
 from vdgs.partition.assignment.score_file import load_scores
 from vdgs.partition.blocks import Blocks, load_blocks
 from vdgs.runs.model_integrity import load_verified
@@ -114,7 +115,8 @@ class ModelLocation:
 
 
 def _model_summary(name: str, anchors: int, file: Path) -> str:
-    return f"{name} model ({anchors:,} anchors, {file.stat().st_size / 1e6:,.1f} MB)"
+    size = f", {file.stat().st_size / 1e6:,.1f} MB" if file.is_file() else ""  # a scene in memory has none
+    return f"{name} model ({anchors:,} anchors{size})"
 
 
 def locate_model(folder: RunFolder, which: ModelName = "best") -> ModelLocation:
@@ -184,6 +186,12 @@ def load_run_blocks(run: RunFolder) -> Blocks:
             f"vdgs partition {shell_word(run.path)}"
         )
     return load_blocks(run.partition / "blocks.geojson")
+
+
+def load_run_assignment(run: RunFolder) -> Assignment:
+    """Which training views serve which block, and why. Raises what `load_run_blocks` raises."""
+    load_run_blocks(run)
+    return load_scores(run.partition / "scores.npz")[2]
 
 
 def block_view_indices(run: RunFolder, capture: Capture, index: int) -> list[int]:

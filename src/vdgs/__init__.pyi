@@ -1,0 +1,30 @@
+from vdgs import ops as ops
+from vdgs.api import Camera as Camera
+from vdgs.api import Capture as Capture
+from vdgs.api import CaptureOptions as CaptureOptions
+from vdgs.api import Render as Render
+from vdgs.api import Run as Run
+from vdgs.api import Scene as Scene
+from vdgs.api import assign_cameras as assign_cameras
+from vdgs.api import cameras_from as cameras_from
+from vdgs.api import count_visibility as count_visibility
+from vdgs.api import export as export
+from vdgs.api import load_capture as load_capture
+from vdgs.api import merge as merge
+from vdgs.api import open_run as open_run
+from vdgs.api import partition as partition
+from vdgs.api import preset as preset
+from vdgs.api import render as render
+from vdgs.api import train as train
+from vdgs.api import view as view
+from vdgs.api import visibility_ratio as visibility_ratio
+from vdgs.config.method import AssignmentConfig as AssignmentConfig
+from vdgs.config.method import CompensationConfig as CompensationConfig
+from vdgs.config.method import MethodConfig as MethodConfig
+from vdgs.config.method import TrainConfig as TrainConfig
+from vdgs.errors import UnsupportedOption as UnsupportedOption
+from vdgs.errors import VdgsError as VdgsError
+from vdgs.kernels import configure_threads as configure_threads
+from vdgs.training.compensated_growth import CompensatedGrowth as CompensatedGrowth
+
+__version__: str

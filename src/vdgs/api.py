@@ -1,0 +1,397 @@
+"""The Python API: what the verbs of the command line do, as functions. docs/python.md is its guide.
+
+Lengths are in units of the ground frame (metres where the capture says so), z up; pixel centres are at 0.5; cameras
+look along +z (OpenCV). Torch tensors or numpy arrays go in, and the same comes out. What a caller can mend is raised as
+`VdgsError`, which says how. Everything here is loaded when `vdgs.NAME` is first used.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+from rich.console import Console
+from torch import Tensor
+
+from vdgs.captures.capture import Capture as Capture
+from vdgs.config.capture_options import CaptureOptions as CaptureOptions
+from vdgs.config.commands import ExportRequest, ModelName, ViewRequest
+from vdgs.config.executor_options import CheckpointOptions
+from vdgs.config.method import AssignmentConfig, MergeConfig, MethodConfig, PartitionConfig, TrainConfig
+from vdgs.config.presets import PRESETS, PresetName
+from vdgs.errors import CaptureError, VdgsError
+from vdgs.geometry.camera import Camera as Camera
+from vdgs.geometry.camera import CameraModel
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.ops.arrays import Array, like, to_torch
+from vdgs.partition.assignment.assign_cameras import Assignment
+from vdgs.partition.blocks import Blocks
+from vdgs.runs import open_run as runs
+from vdgs.runs.model_integrity import load_verified
+from vdgs.runs.run_context import RunContext
+from vdgs.runs.run_folder import RunFolder
+from vdgs.runs.stage_folder import StatusRecord
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A trained scene: anchors with their decoder, and the capture that it was trained from."""
+
+    model: AnchorModel
+    #: None where it is not known (`Scene.load`) or gone: such a scene is drawn, but not exported.
+    capture: Capture | None = None
+
+    def __len__(self) -> int:
+        return len(self.model.anchors)
+
+    @property
+    def positions(self) -> Tensor:
+        """Of the anchors, [n, 3] float32, ground frame."""
+        return self.model.anchors.positions
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """The training cameras. Raises VdgsError where the capture is not known."""
+        if self.capture is None:
+            raise VdgsError("the scene does not know its capture: give it, as in Scene(model, capture)")
+        return [view.camera for view in self.capture.train_views]
+
+    def save(self, path: str | Path) -> None:
+        """Write the model as one safetensors file, atomically."""
+        self.model.save(Path(path))
+
+    @staticmethod
+    def load(path: str | Path, capture: Capture | None = None) -> Scene:
+        """Read a model that `save` or a run wrote. Raises VdgsError for a missing, damaged or other file."""
+        return Scene(AnchorModel.load(Path(path)), capture)
+
+
+class Run:
+    """A run folder opened to look at; each part is read when first asked for. See `open_run`."""
+
+    def __init__(self, folder: RunFolder, model: ModelName, device: str, capture: Path | None) -> None:
+        self.folder, self.model, self.device = folder, model, device
+        self._context = RunContext.from_path(folder.path, capture)
+
+    @property
+    def path(self) -> Path:
+        return self.folder.path
+
+    @property
+    def settings(self) -> MethodConfig:
+        """What it was trained with."""
+        return self.folder.method()
+
+    @cached_property
+    def capture(self) -> Capture:
+        """Cameras, sparse points, ground frame, split. Raises CaptureError where it is gone."""
+        return self._context.capture
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The model, with its capture where that is there. Raises RunError where it is not trained."""
+        try:
+            opened = self._context.open_model(self.model, self.device)
+        except CaptureError:
+            return Scene(runs.open_model(self.folder, self.model, self.device).model)
+        return Scene(opened.model, opened.capture)
+
+    @cached_property
+    def blocks(self) -> Blocks:
+        """The cut of the scene. Raises RunError where it is not cut with the run's settings."""
+        return runs.load_run_blocks(self.folder)
+
+    @cached_property
+    def assignment(self) -> Assignment:
+        """Which training cameras serve which block, and why: `cameras` [c, k] bool, `reasons`."""
+        return runs.load_run_assignment(self.folder)
+
+    @cached_property
+    def block_scenes(self) -> list[Scene]:
+        """The trained blocks, each with the anchors that it moves. Raises RunError where one is not trained."""
+        key, capture = self.folder.keys().blocks, self.scene.capture
+        stages = [self.folder.block(index) for index in range(len(self.blocks))]
+        return [Scene(load_verified(stage, key, index), capture) for index, stage in enumerate(stages)]
+
+
+def open_run(
+    path: str | Path, *, model: ModelName = "best", device: str = "cpu", capture: str | Path | None = None
+) -> Run:
+    """Open a run folder: `.scene`, `.capture`, `.blocks`, `.assignment`, `.block_scenes`, `.settings`.
+
+    `model` is "coarse", "merged" or "best" (the merged one where there is one); `capture` is where the capture lies now
+    if it was moved (the run remembers it). Raises RunError for a folder that is no run.
+    """
+    folder = RunFolder(Path(path))
+    folder.settings()
+    return Run(folder, model, device, None if capture is None else Path(capture))
+
+
+def load_capture(path: str | Path, **options: Any) -> Capture:
+    """Read and check a capture: a folder with COLMAP, nerfstudio, Mega-NeRF or MatrixCity files.
+
+    `options` are those of `CaptureOptions`, as in `vdgs run --help`: images="images_4", downscale=2, test_every=8, ...
+    Raises CaptureError naming the file, the fault and the remedy.
+    """
+    return _load_capture(Path(path), CaptureOptions(**options))
+
+
+def _load_capture(path: Path, options: CaptureOptions | None) -> Capture:
+    from vdgs.captures.loading import load_capture as load
+
+    return load(path, options)
+
+
+def preset(name: PresetName = "laptop") -> MethodConfig:
+    """The settings of a preset; change them with `dataclasses.replace`. Raises VdgsError for another name."""
+    if name not in PRESETS:
+        raise VdgsError(f"there is no preset {name!r}: choose one of {', '.join(PRESETS)}")
+    return PRESETS[name]
+
+
+def cameras_from(
+    viewmats: Array, Ks: Array, width: int, height: int, *, model: CameraModel = "pinhole"
+) -> list[Camera]:
+    """Cameras from camera-from-world matrices [c, 4, 4] (OpenCV axes) and intrinsics [c, 3, 3] or [3, 3] in pixels.
+
+    Raises ValueError for other shapes.
+    """
+    poses, intrinsics = (to_torch(each).detach().cpu().double().numpy() for each in (viewmats, Ks))
+    if poses.ndim != 3 or poses.shape[1:] != (4, 4) or intrinsics.shape[-2:] != (3, 3):
+        raise ValueError(f"viewmats must be [c, 4, 4] and Ks [c, 3, 3], not {poses.shape} and {intrinsics.shape}")
+    return [
+        Camera(
+            camera_from_world=pose, fx=K[0, 0].item(), fy=K[1, 1].item(), cx=K[0, 2].item(), cy=K[1, 2].item(),
+            width=width, height=height, model=model,
+        )
+        for pose, K in zip(poses, np.broadcast_to(intrinsics, (len(poses), 3, 3)), strict=True)
+    ]  # fmt: skip
+
+
+class Render(NamedTuple):
+    """A drawn view."""
+
+    #: [h, w, 3] float32, not clamped, and how opaque the scene is, [h, w].
+    rgb: Tensor
+    alpha: Tensor
+    #: z along the view in units of the ground frame, [h, w]: where a pixel becomes half opaque (NaN where it never
+    #: does), and the mean over what is drawn (NaN where nothing is). None without depth.
+    depth: Tensor | None
+    expected_depth: Tensor | None
+
+
+def render(
+    scene: Scene,
+    camera: Camera,
+    *,
+    mode: Literal["rgb", "rgb+depth"] = "rgb",
+    background: tuple[float, float, float] | None = None,
+    image_index: int | None = None,
+) -> Render:
+    """Draw one view of a scene, without gradients.
+
+    `background` replaces the scene's own; `image_index` selects the appearance of a training photograph, where one was
+    trained. Source: Scaffold-GS eqs. 3-8, 3DGS eqs. 2-3.
+    """
+    from vdgs.model.renderer import render as draw
+
+    if mode not in ("rgb", "rgb+depth"):
+        raise VdgsError(f"mode={mode!r}: choose rgb or rgb+depth")
+    raster = draw(scene.model, camera, background=background, depth=mode != "rgb", image_index=image_index)
+    if raster.depth is None or raster.median_depth is None:
+        return Render(raster.image, raster.alpha, None, None)
+    median = raster.median_depth.masked_fill(raster.median_depth == 0, torch.nan)
+    return Render(raster.image, raster.alpha, median, raster.depth / raster.alpha)
+
+
+def count_visibility(points: Array, cameras: Sequence[Camera]) -> Array:
+    """V_i [n] int32: how many cameras hold each point [n, 3] (float32 or float64) in their frustum. Nothing hides.
+
+    Raises TypeError or ValueError for other points. Source: VDGS section IV-B.
+    """
+    from vdgs.visibility import visibility_counts
+
+    return like(points, visibility_counts.count_visibility(_points(points), cameras))
+
+
+def visibility_ratio(points: Array, cameras: Sequence[Camera]) -> Array:
+    """c_k [n] float32: the share of the distinct cameras whose frustum holds each point [n, 3].
+
+    Raises ValueError without cameras. Source: VDGS eq. 8.
+    """
+    from vdgs.visibility import visibility_counts
+
+    return like(points, visibility_counts.visibility_ratio(_points(points), cameras))
+
+
+def _points(points: Any) -> Tensor:
+    """As a tensor in the precision that it came in."""
+    return torch.from_numpy(np.array(points)) if isinstance(points, np.ndarray) else points
+
+
+def partition(
+    points: Array,
+    visibility: Array,
+    *,
+    num_blocks: int = 4,
+    lambda_vis: float = 1.0,
+    seed: int = 0,
+    balanced: bool = False,
+    expansion: float = 0.4,
+) -> Blocks:
+    """Cut points [n, 3] into blocks on the ground plane, by place and by their visibility V [n].
+
+    `lambda_vis` weighs visibility beside place (0: place alone); a block is widened by `expansion` of its radius.
+    Warns (UserWarning) where there are fewer blocks than asked for; raises VdgsError where nothing can be cut. `Blocks`
+    has `items` (polygons `core` and `expanded`) and `owner(xy)`. Source: VDGS eq. 5.
+    """
+    from vdgs.partition.partition_scene import partition_scene
+
+    config = PartitionConfig(blocks=num_blocks, lambda_vis=lambda_vis, balanced=balanced, expansion=expansion)
+    places, counts = (_points(each).detach().cpu().numpy() for each in (points, visibility))
+    blocks, notes = partition_scene(places, counts.astype(np.int64), config, seed)
+    _warn(notes)
+    return blocks
+
+
+def assign_cameras(
+    scene: Scene, blocks: Blocks, cameras: Sequence[Camera], config: AssignmentConfig | None = None
+) -> Assignment:
+    """Which cameras train which block: `.cameras` [c, k] bool, `.reasons` [c, k] int8 (indices of
+    `vdgs.partition.assignment.assign_cameras.REASONS`), `.warnings`, which are also warned of.
+
+    The scene is drawn once for each camera and block; `config.mode` says how the pictures are compared. Source: VDGS
+    eqs. 6-7.
+    """
+    from vdgs.partition.assignment import assign_cameras as assignment
+    from vdgs.partition.assignment.score_matrix import compute_score_matrix
+
+    config = config or AssignmentConfig()
+    decided = assignment.assign_cameras(compute_score_matrix(scene.model, blocks, cameras, config), config)
+    _warn(decided.warnings)
+    return decided
+
+
+def merge(
+    scene: Scene,
+    block_scenes: Sequence[Scene],
+    blocks: Blocks,
+    assignment: Assignment,
+    *,
+    rule: Literal["owner", "max-visibility"] = "owner",
+) -> Scene:
+    """One scene from trained blocks: every place takes its anchors from exactly one block.
+
+    `scene` is the coarse scene that the blocks were trained from; the rows of `assignment` are its training cameras.
+    Raises VdgsError for blocks of another coarse scene, ValueError where the numbers do not fit.
+    """
+    from vdgs.partition.merging import merge_blocks
+
+    cameras = scene.cameras
+    if assignment.cameras.shape != (len(cameras), len(blocks)):
+        raise ValueError(
+            f"the assignment is {list(assignment.cameras.shape)}, not [{len(cameras)} training cameras, "
+            f"{len(blocks)} blocks]"
+        )
+    served = [[cameras[i] for i in np.flatnonzero(of_block)] for of_block in assignment.cameras.T]
+    models = [each.model for each in block_scenes]
+    return Scene(merge_blocks(scene.model, models, blocks, served, MergeConfig(rule))[0], scene.capture)
+
+
+def export(scene: Scene | Run, path: str | Path, **options: Any) -> None:
+    """Write a scene as Gaussians or points; the ending of `path` says how (.ply, .spz, .splat, .sog, .glb, .html, ...).
+
+    `options` are those of `vdgs export`: sh_degree=3, max_gaussians=0, crs="EPSG:25832", program="supersplat", ... The
+    file is that of `vdgs export`. Needs no screen. Raises VdgsError, before any Gaussian is baked, for a name or an
+    option that does not work and for a scene without its capture.
+    """
+    from vdgs.export.export_run import resolve_request, write_files
+
+    scene = scene.scene if isinstance(scene, Run) else scene
+    if scene.capture is None:
+        raise VdgsError(f"{path}: baking needs the training cameras: give the capture, as in Scene(model, capture)")
+    request = resolve_request(ExportRequest(run=Path(path).parent, output=(Path(path),), evaluate=False, **options))
+    opened = runs.OpenedRun(
+        folder=RunFolder(request.run), model=scene.model, model_path=Path(path), capture=scene.capture, key="",
+        name="merged" if scene.model.decoder_spans else "coarse", status=StatusRecord(state="done"), warning="",
+    )  # fmt: skip
+    write_files(opened, request, _warning_console())
+
+
+def train(
+    capture: str | Path | Capture,
+    config: PresetName | MethodConfig | TrainConfig = "laptop",
+    *,
+    run_dir: str | Path | None = None,
+    callbacks: Sequence[Callable[[Any], object]] = (),
+    device: str = "cpu",
+    capture_options: CaptureOptions | None = None,
+) -> Scene:
+    """Train a scene as `vdgs run` does: global model, V, blocks, cameras, block training, merge; the same bits.
+
+    A `TrainConfig` trains the global model alone. Without `run_dir` all is done in this process and in memory, and
+    after every step each callback is given a `TrainingEvent` (stage, iteration, iterations, loss, psnr in dB, anchors);
+    one that returns True ends the stage early. With `run_dir` it is a run folder, which the same call continues after a
+    crash; its blocks train in processes of their own, so it takes the capture's folder and no callbacks.
+    `capture_options` say how a folder is read. Raises CaptureError for a capture that cannot become a scene, VdgsError
+    for settings, TrainingDiverged.
+    """
+    from vdgs.pipeline.train_in_memory import train_in_memory
+
+    config = preset(config) if isinstance(config, str) else config
+    if run_dir is None:
+        opened = capture if isinstance(capture, Capture) else _load_capture(Path(capture), capture_options)
+        return Scene(train_in_memory(opened, config, tuple(callbacks), _warning_console(), device), opened)
+    if callbacks or isinstance(capture, Capture):
+        given = "callbacks" if callbacks else "Capture"
+        raise VdgsError(f"run_dir={str(run_dir)!r} takes no {given}: processes of their own read the capture's folder")
+    _train_run(Path(capture), capture_options, config, Path(run_dir), device)
+    return open_run(run_dir, model="coarse" if isinstance(config, TrainConfig) else "best", device=device).scene
+
+
+def _train_run(
+    capture: Path, options: CaptureOptions | None, config: MethodConfig | TrainConfig, run_dir: Path, device: str
+) -> None:
+    """The stages of `vdgs run` that make the scene."""
+    from vdgs.pipeline import count_visibility as visibility
+    from vdgs.pipeline import merge_blocks, partition_stage, train_blocks, train_coarse
+    from vdgs.runs.create_or_resume import exclusive_run
+
+    method = config if isinstance(config, MethodConfig) else MethodConfig(training=config)
+    console, saving = _warning_console(), CheckpointOptions()
+    with exclusive_run(capture, run_dir, options or CaptureOptions(), method, overwrite=False) as context:
+        train_coarse.train_coarse(context, saving, console, device)
+        if isinstance(config, MethodConfig):
+            visibility.count_run_visibility(context, console)
+            partition_stage.partition_run(context, console, device)
+            train_blocks.train_blocks(context, saving, 0, console, device)
+            merge_blocks.merge_run_blocks(context, False, console)
+
+
+def view(run: Run | str | Path, *, host: str = "127.0.0.1", port: int | None = None) -> None:
+    """Show a run in a browser until Ctrl-C, as `vdgs view` does: prints the address. Needs viser (extra `viewer`).
+
+    Raises VdgsError for a run without a model, and for an address that cannot be used.
+    """
+    from vdgs.viewer.server import view_run
+
+    opened = run if isinstance(run, Run) else open_run(run)
+    view_run(ViewRequest(run=opened.path, model=opened.model, host=host, port=port, device=opened.device), Console())
+
+
+def _warn(notes: Sequence[str]) -> None:
+    for note in notes:
+        warnings.warn(note, stacklevel=3)
+
+
+def _warning_console() -> Console:
+    """Where notes of the stages go that nobody must miss: nothing else is printed."""
+    from vdgs.cli.common import make_console
+
+    return make_console(quiet=True)

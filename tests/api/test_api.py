@@ -1,0 +1,238 @@
+"""The functions of `vdgs`: what the command line makes of the same things, bit for bit; lazy; said when it fails."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import vdgs
+from support.small_pipeline import vdgs as verb
+from vdgs.errors import CaptureError, RunError, VdgsError
+
+STUB = Path(vdgs.__file__).with_suffix(".pyi")
+
+
+@pytest.fixture(scope="module")
+def run(native_small):
+    return vdgs.open_run(native_small.whole)
+
+
+@pytest.fixture(scope="module")
+def coarse(native_small):
+    return vdgs.open_run(native_small.whole, model="coarse").scene
+
+
+@pytest.fixture(scope="module")
+def capture(native_small):
+    return vdgs.load_capture(native_small.capture, up="z")
+
+
+def test_the_import_loads_nothing_heavy():
+    code = "import sys, vdgs; print(*sorted(sys.modules)); dir(vdgs); print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded, torch_too = done.stdout.strip().splitlines()
+    own = {name for name in loaded.split() if name.startswith("vdgs")}
+    assert own == {"vdgs", "vdgs.errors", "vdgs.kernels", "vdgs.kernels.thread_count"}
+    assert not {"torch", "numpy", "inspect", "dataclasses", "scipy"} & set(loaded.split())
+    assert torch_too == "False"
+
+
+def test_threads_are_set_up_before_callers_load_torch():
+    code = "import os; os.environ.pop('OMP_WAIT_POLICY', None); import vdgs; print(os.environ['OMP_WAIT_POLICY'])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "PASSIVE"
+
+
+def test_the_stub_names_what_is_there():
+    tree = ast.parse(STUB.read_text(encoding="utf-8"))
+    stubbed = {alias.asname for node in tree.body if isinstance(node, ast.ImportFrom) for alias in node.names}
+    assert stubbed == {*vdgs._HOMES, "ops", "configure_threads"}
+    assert stubbed <= set(dir(vdgs))
+    for name in stubbed:
+        value = getattr(vdgs, name)
+        assert inspect.getdoc(value), name
+        assert value is getattr(vdgs, name)
+    with pytest.raises(AttributeError, match="no attribute 'rendr'"):
+        vdgs.rendr  # noqa: B018
+
+
+def test_the_reference_names_all_of_it():
+    page = (Path(__file__).parents[2] / "docs" / "python.md").read_text(encoding="utf-8")
+    operations = {name for name, value in vars(vdgs.ops).items() if inspect.isfunction(value)}
+    assert len(operations) == 6
+    for name in {*vdgs._HOMES, *(f"ops.{name}" for name in operations)}:
+        assert f"`{name}`" in page, name
+
+
+def test_functions_that_are_folders_too_are_both():
+    import vdgs.export.bake
+    import vdgs.partition.blocks
+
+    assert vdgs.export.bake.bake is not None
+    for name in ("export", "partition"):
+        assert callable(getattr(vdgs, name))
+        assert inspect.signature(getattr(vdgs, name)) == inspect.signature(getattr(vdgs.api, name))
+
+
+def test_a_run_is_opened_and_drawn(run, native_small):
+    assert len(run.scene) == len(run.scene.positions)
+    assert (len(run.blocks), run.assignment.cameras.shape) == (2, (5, 2))
+    camera = run.scene.cameras[0]
+    out = vdgs.render(run.scene, camera, mode="rgb+depth")
+    assert out.rgb.shape == (camera.height, camera.width, 3)
+    assert bool((out.alpha >= 0).all())
+    assert float(out.depth.nanmean()) == pytest.approx(10, abs=1.5)  # so high is the flight
+    assert float(out.expected_depth.nanmean()) == pytest.approx(10, abs=1.5)
+    assert vdgs.render(run.scene, camera).depth is None
+    loaded = vdgs.Scene.load(native_small.whole / "merged" / "model.safetensors")
+    assert torch.equal(vdgs.render(loaded, camera).rgb, out.rgb)
+    with pytest.raises(VdgsError, match="choose rgb"):
+        vdgs.render(run.scene, camera, mode="depths")
+
+
+def test_cameras_are_made_of_matrices(run):
+    camera = run.scene.cameras[1]
+    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    made = vdgs.cameras_from(camera.camera_from_world[None], K, camera.width, camera.height)
+    torch.testing.assert_close(vdgs.render(run.scene, made[0]).rgb, vdgs.render(run.scene, camera).rgb)
+    with pytest.raises(ValueError, match="viewmats must be"):
+        vdgs.cameras_from(camera.camera_from_world, K, 4, 3)
+
+
+def test_visibility_is_counted_in_the_kind_that_is_given(coarse, native_small):
+    counts = vdgs.count_visibility(coarse.positions, coarse.cameras)
+    ratios = vdgs.visibility_ratio(coarse.positions, coarse.cameras)
+    torch.testing.assert_close(ratios, counts.float() / len(coarse.cameras))
+    points = coarse.positions.numpy()
+    for given in (points, points.astype(np.float64)):
+        found = vdgs.count_visibility(given, coarse.cameras)
+        assert isinstance(found, np.ndarray)
+        assert found.dtype == np.int32
+        assert found.tolist() == counts.tolist()
+    assert isinstance(vdgs.visibility_ratio(points, coarse.cameras), np.ndarray)
+
+
+def test_the_stages_are_those_of_the_run(run, coarse):
+    settings = run.settings
+    counts = vdgs.count_visibility(coarse.positions, coarse.cameras)
+    blocks = vdgs.partition(coarse.positions.numpy(), counts.numpy(), num_blocks=2, seed=settings.training.seed)
+    assert [each.core for each in blocks.items] == [each.core for each in run.blocks.items]
+    assignment = vdgs.assign_cameras(coarse, blocks, coarse.cameras, settings.assignment)
+    assert np.array_equal(assignment.reasons, run.assignment.reasons)
+    merged = vdgs.merge(coarse, run.block_scenes, blocks, assignment)
+    assert same(merged, run.scene)
+    with pytest.raises(ValueError, match=r"not \[5 training cameras, 2 blocks\]"):
+        vdgs.merge(coarse, run.block_scenes, blocks, vdgs.assign_cameras(coarse, blocks, coarse.cameras[:2]))
+
+
+def same(one: vdgs.Scene, other: vdgs.Scene) -> bool:
+    ours, theirs = one.model, other.model
+    decoders = [(part.decoder.tensors(), of.decoder.tensors()) for part, of in zip(
+        ours.decoder_spans, theirs.decoder_spans, strict=True)]  # fmt: skip
+    return all(
+        torch.equal(tensor, kept[name])
+        for own, kept in [(ours.anchors.tensors(), theirs.anchors.tensors()), *decoders]
+        for name, tensor in own.items()
+    )
+
+
+def test_training_in_memory_makes_the_scene_of_the_run(run, capture):
+    events = []
+    scene = vdgs.train(capture, run.settings, callbacks=[events.append])
+    assert same(scene, run.scene)
+    assert {event.stage for event in events} == {"coarse", "block 0", "block 1"}
+    last = events[-1]
+    assert (last.iteration, last.loss > 0, last.anchors > 0) == (last.iterations, True, True)
+
+
+def test_a_callback_ends_a_stage(run, capture):
+    seen = []
+
+    def stop(event):
+        seen.append(event.iteration)
+        return event.iteration == 3
+
+    scene = vdgs.train(capture, run.settings.training, callbacks=[stop])
+    assert seen == [1, 2, 3]
+    assert scene.model.metadata.iterations == 3
+
+
+@pytest.mark.slow
+def test_training_in_a_folder_leaves_a_run(run, native_small, tmp_path):
+    options = vdgs.CaptureOptions(up="z")
+    scene = vdgs.train(native_small.capture, run.settings, run_dir=tmp_path / "run", capture_options=options)
+    assert same(scene, run.scene)
+    assert len(vdgs.open_run(tmp_path / "run").blocks) == 2
+    again = vdgs.train(native_small.capture, run.settings, run_dir=tmp_path / "run", capture_options=options)
+    assert same(again, scene)
+
+
+def test_the_file_is_that_of_the_command_line(run, coarse, native_small, tmp_path):
+    verb("export", native_small.whole, "--output", tmp_path / "verb.ply", "--sh-degree", "1", "--no-evaluate")
+    vdgs.export(run, tmp_path / "run.ply", sh_degree=1)
+    vdgs.export(vdgs.merge(coarse, run.block_scenes, run.blocks, run.assignment), tmp_path / "m.ply", sh_degree=1)
+    written = (tmp_path / "verb.ply").read_bytes()
+    assert written.startswith(b"ply")
+    assert (tmp_path / "run.ply").read_bytes() == written == (tmp_path / "m.ply").read_bytes()
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["m.ply", "run.ply", "verb.ply"]
+
+
+def test_a_scene_is_saved_and_read(run, tmp_path):
+    run.scene.save(tmp_path / "scene.safetensors")
+    loaded = vdgs.Scene.load(tmp_path / "scene.safetensors")
+    assert same(loaded, run.scene)
+    with pytest.raises(VdgsError, match="needs the training cameras"):
+        vdgs.export(loaded, tmp_path / "scene.ply")
+    with pytest.raises(VdgsError, match="does not know its capture"):
+        loaded.cameras  # noqa: B018
+
+
+def test_a_run_whose_capture_is_gone_is_still_drawn(run, native_small, tmp_path, monkeypatch):
+    import shutil
+
+    shutil.copytree(native_small.whole, tmp_path / "run")
+    config = (tmp_path / "run" / "config.yaml").read_text()
+    (tmp_path / "run" / "config.yaml").write_text(config.replace(str(native_small.capture), str(tmp_path / "gone")))
+    moved = vdgs.open_run(tmp_path / "run")
+    assert moved.scene.capture is None
+    assert len(moved.scene) > 0
+    with pytest.raises(CaptureError):
+        moved.capture  # noqa: B018
+
+
+def test_what_does_not_work_is_said_before_any_work(capture, tmp_path):
+    with pytest.raises(RunError):
+        vdgs.open_run(tmp_path)
+    with pytest.raises(CaptureError, match="no such folder"):
+        vdgs.train(tmp_path / "none")
+    with pytest.raises(VdgsError, match="no preset 'fast'"):
+        vdgs.train(capture, "fast")
+    with pytest.raises(VdgsError, match="takes no Capture"):
+        vdgs.train(capture, run_dir=tmp_path / "run")
+    with pytest.raises(VdgsError, match="takes no callbacks"):
+        vdgs.train(capture.root, run_dir=tmp_path / "run", callbacks=[print])
+    site = np.random.default_rng(8).uniform(0, 200, (500, 3))
+    far_apart = np.concatenate([site, site + np.array([50_000.0, 0, 0])])
+    with pytest.warns(UserWarning, match="instead of 8"):
+        vdgs.partition(far_apart, np.full(1000, 5), num_blocks=8, lambda_vis=0.0)
+    bad = replace(vdgs.preset(), training=replace(vdgs.preset().training, iterations=-1))
+    with pytest.raises(VdgsError):
+        vdgs.train(capture, bad)
+
+
+def test_a_run_is_shown_in_a_browser_as_the_verb_does(run, monkeypatch):
+    from vdgs.viewer import server
+
+    asked = []
+    monkeypatch.setattr(server, "view_run", lambda request, console: asked.append(request))
+    vdgs.view(run, port=8123)
+    vdgs.view(str(run.path))
+    assert [(each.run, each.port, each.model) for each in asked] == [(run.path, 8123, "best"), (run.path, None, "best")]
