@@ -5,6 +5,8 @@ VENV   ?= .venv
 DEMO    = demo
 BIN     = $(VENV)/bin
 STAMP   = $(VENV)/.installed
+TEST_STAMP = $(VENV)/.installed-test
+INSTALL = PIP_CONSTRAINT=constraints.txt $(BIN)/python -m pip install --quiet --disable-pip-version-check
 SOURCES = $(shell find native src/vdgs/kernels/shared -name "*.h" -o -name "*.cpp") CMakeLists.txt pyproject.toml constraints.txt
 
 # torch's threads block instead of spinning beside the kernels' own.
@@ -12,13 +14,13 @@ export OMP_WAIT_POLICY = PASSIVE
 # What one process of the tests has compiled, the others find.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup demo test test-fast lint types clean
+.PHONY: help setup setup-test demo test test-fast lint types clean
 
 help:
 	@echo "make demo    generate a small town, run the whole method on it, report (a few minutes, no GPU)"
 	@echo "make test    lint, types and the whole test suite"
 	@echo "make test-fast  the tests that are marked neither slow nor browser (two minutes)"
-	@echo "make setup   only install into $(VENV)"
+	@echo "make setup   only install into $(VENV); make setup-test: with what the tests need"
 	@echo "make clean   remove $(VENV), build/ and $(DEMO)/"
 
 setup: $(STAMP)
@@ -29,8 +31,15 @@ $(BIN)/python:
 
 # PIP_CONSTRAINT also pins the tools that pip installs only for building.
 $(STAMP): $(BIN)/python $(SOURCES)
-	PIP_CONSTRAINT=constraints.txt $(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[test]'
+	$(INSTALL) -e '.[demo,viewer]'
 	@touch $(STAMP)
+
+# The tests need more: linters, Ray, readers of what is exported.
+$(TEST_STAMP): $(STAMP)
+	$(INSTALL) -e '.[test]'
+	@touch $(TEST_STAMP)
+
+setup-test: $(TEST_STAMP)
 
 demo: setup
 	rm -rf $(DEMO)
@@ -44,17 +53,17 @@ demo: setup
 	@echo "maps:        $(DEMO)/run/maps/preview.png"
 	@echo "model:       $(DEMO)/run/merged/model.safetensors (vdgs export $(DEMO)/run --output scene.ply for other programs)"
 
-lint: setup
+lint: setup-test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-types: setup
+types: setup-test
 	$(BIN)/mypy
 
 test: lint types
 	$(BIN)/python -m pytest
 
-test-fast: setup
+test-fast: setup-test
 	$(BIN)/python -m pytest -m "not slow and not browser"
 
 clean:

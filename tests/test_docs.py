@@ -15,6 +15,7 @@ PACKAGE = ROOT / "src" / "vdgs"
 PAGES = [
     ROOT / "README.md",
     ROOT / "CONTRIBUTING.md",
+    ROOT / "CHANGELOG.md",
     *(page for page in sorted((ROOT / "docs").rglob("*.md")) if page.name != "glossary.md"),
 ]
 #: Endings of files of the repository; others that pages name belong to a run or to a capture.
@@ -31,12 +32,23 @@ def is_there(name: str) -> bool:
     )
 
 
+def headings(page: Path) -> set[str]:
+    """The names by which links reach the headings of a page, as GitHub forms them."""
+    lines = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), re.M)
+    return {re.sub(r"[^\w\- ]", "", line.lower()).replace(" ", "-") for line in lines}
+
+
 def mistakes(page: Path) -> list[str]:
     text = page.read_text(encoding="utf-8")
     wrong = [f"file {name}" for name in SOURCE_FILE.findall(text) if not is_there(name)]
-    for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", text):
-        if not target.startswith("http") and not (page.parent / target).exists():
+    for target, _, heading in re.findall(r"\]\(([^)#\s]*)(#([^)\s]*))?[^)]*\)", text):
+        file = page.parent / target if target else page
+        if target.startswith("http"):
+            continue
+        if not file.exists():
             wrong.append(f"link {target}")
+        elif heading and heading not in headings(file):
+            wrong.append(f"link {target}#{heading}")
     for module in re.findall(r"-m ((?:vdgs|experiments)[\w.]*)", text):
         path = (ROOT if module.startswith("experiments") else ROOT / "src") / module.replace(".", "/")
         if not (path.is_dir() or path.with_suffix(".py").exists()):
@@ -51,7 +63,21 @@ def test_what_a_page_names_exists(page):
     assert mistakes(page) == []
 
 
+@pytest.mark.parametrize("page", ["README.md", "CHANGELOG.md", "docs/benchmarks.md"])
+def test_a_page_that_is_read_first_is_short(page):
+    assert len((ROOT / page).read_text(encoding="utf-8").splitlines()) <= 70
+
+
 def test_a_mistake_is_found(tmp_path):
     page = tmp_path / "page.md"
-    page.write_text("`runs/keys.py`, [there](gone.md), `python -m vdgs.executors.work`:\n\n    vdgs coarse CAPTURE\n")
-    assert mistakes(page) == ["file runs/keys.py", "link gone.md", "module vdgs.executors.work", "verb coarse"]
+    page.write_text(
+        "## A heading\n`runs/keys.py`, [there](gone.md), [here](#a-heading), [no](#other), "
+        "`python -m vdgs.executors.work`:\n\n    vdgs coarse CAPTURE\n"
+    )
+    assert mistakes(page) == [
+        "file runs/keys.py",
+        "link gone.md",
+        "link #other",
+        "module vdgs.executors.work",
+        "verb coarse",
+    ]

@@ -43,7 +43,7 @@ def match_images(
     cameras without an image. Raises CaptureError where many are missing."""
     folder = root / source.images
     available = ImageNameIndex(find_images(folder)) if folder.is_dir() else ImageNameIndex({})
-    found_as = [available.find(view.name) for view in source.views]
+    found_as: Sequence[str | None] = [available.find(view.name) for view in source.views]
     if not any(found_as):
         found_as = _elsewhere([view.name for view in source.views], available, folder, warnings)
     paths = [view.image_path or folder / (name or view.name) for view, name in zip(source.views, found_as, strict=True)]

@@ -29,7 +29,6 @@ from vdgs.report.status_cli import full_run_status, next_line
 from vdgs.runs.create_or_resume import exclusive_run
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
-from vdgs.sfm.reconstruct import reconstruct
 from vdgs.sfm.run_request import is_image_input, make_sfm_request
 from vdgs.system.atomic_files import read_json
 from vdgs.system.documents import EvaluationMetrics
@@ -62,6 +61,8 @@ def reconstruct_if_needed(run_request: RunRequest, console: Console, command: st
     """
     if not is_image_input(run_request):
         return run_request
+    from vdgs.sfm.reconstruct import reconstruct  # needs pycolmap, which a run of a capture does not
+
     check_config(run_request.method())
     _title(console, "photographs")
     request = make_sfm_request(run_request)

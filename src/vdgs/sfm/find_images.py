@@ -39,7 +39,7 @@ class Found:
 
     def notes(self) -> list[str]:
         """What people should know of what is not used."""
-        kinds = [kind for kind in self.unread if kind not in _VIDEO]  # films lie on most cards
+        kinds = [kind for kind in self.unread if kind not in VIDEO_SUFFIXES]  # films lie on most cards
         notes = [f"{_count(self.unread[kind], kind)} not read: {_remedy(kind)}." for kind in kinds]
         for why in dict.fromkeys(self.skipped.values()):
             names = [name for name, reason in self.skipped.items() if reason == why]

@@ -7,6 +7,12 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
+#: Required packages that an installation may leave out (`docs/third-party.md`), and what then does not work.
+REMOVABLE_PACKAGES = {
+    "pycolmap": "photographs cannot become a capture, lenses cannot be undistorted, and vdgs synth cannot write its "
+    "model. Run pip install pycolmap, or bring a capture of undistorted photographs, which works without it."
+}
+
 
 def exit_code_of(name: str, action: Callable[[], Any], when_interrupted: str) -> int:
     """Run an action: 0 (or its result) when done, 1 after a printed error, 130 when stopped. `name` begins the message.
@@ -24,6 +30,11 @@ def exit_code_of(name: str, action: Callable[[], Any], when_interrupted: str) ->
         print(f"{name}: {error}", file=sys.stderr)
         return 130 if isinstance(error, Stopped) else 1
     except BrokenPipeError:
+        return 1
+    except ModuleNotFoundError as error:
+        if error.name not in REMOVABLE_PACKAGES:
+            raise
+        print(f"{name}: {error.name} is not installed: {REMOVABLE_PACKAGES[error.name]}", file=sys.stderr)
         return 1
     except OSError as error:  # a disk that is full, a folder that cannot be written: no news from a traceback
         print(f"{name}: {error.filename or 'a file'}: {error.strerror or error}{_remedy(error)}", file=sys.stderr)

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from vdgs.cli.doctor import SystemCheck
+from vdgs.system.exit_codes import REMOVABLE_PACKAGES
 from vdgs.system.memory.cgroups import cgroup_limits
 from vdgs.system.stop_signals import preserve_signal_handlers
 from vdgs.system.units import data_size
@@ -35,7 +36,7 @@ EXTRAS = {
     "test": "the test suite",
 }
 #: Imported for real, since these are the ones whose binary parts break.
-BINARY_MODULES = ("torch", "numpy", "scipy", "cv2", "PIL", "pycolmap", "safetensors", "matplotlib")
+BINARY_MODULES = ("torch", "numpy", "scipy", "cv2", "PIL", "safetensors", "matplotlib")
 MIN_FREE_DISK_BYTES = 5 * 10**9
 
 
@@ -51,13 +52,24 @@ def _versions() -> list[SystemCheck]:
 
 def _dependencies() -> list[SystemCheck]:
     """The packages that vdgs requires are installed, and the binary ones can be imported."""
-    absent = [name for name in _required().get("", []) if _version(name) is None]
+    required = [name for name in _required().get("", []) if name not in REMOVABLE_PACKAGES]
+    absent = [name for name in required if _version(name) is None]
     broken = [f"{name} ({error})" for name in BINARY_MODULES if (error := _import_error(name))]
     if absent or broken:
         packages = " ".join(absent) or "--force-reinstall vdgs"
         found = ", ".join([*(f"{name} is not installed" for name in absent), *broken])
         return [SystemCheck("dependencies", "broken", found, f"pip install {packages}", True)]
     return [SystemCheck("dependencies", "ok", "all installed, all can be imported", essential=True)]
+
+
+def _removable_packages() -> list[SystemCheck]:
+    """Packages that an installation may leave out: what does not work without each."""
+    checks = []
+    for name, loss in REMOVABLE_PACKAGES.items():
+        error = _import_error(name)
+        value = f"{error}: {loss.split('.')[0]}" if error else _version(name) or "installed"
+        checks.append(SystemCheck(name, "missing" if error else "ok", value, f"pip install {name}" if error else ""))
+    return checks
 
 
 def _processor() -> list[SystemCheck]:
@@ -244,5 +256,5 @@ def _import_error(module: str) -> str:
     return ""
 
 
-_BASIC_CHECKS = (_versions, _dependencies, _processor, _kernels, _threads, _memory, _torch)
+_BASIC_CHECKS = (_versions, _dependencies, _removable_packages, _processor, _kernels, _threads, _memory, _torch)
 CHECKS: tuple[Callable[[], list[SystemCheck]], ...] = (*_BASIC_CHECKS, _cuda, _extras, _lpips, _video_encoding, _disk)
