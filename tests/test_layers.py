@@ -33,7 +33,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("export", "rendering", "report"),
     ("pipeline", "viewer"),
     ("cli",),
-    ("api",),
+    ("__main__", "api"),
 )
 #: The folders of the experiments, lowest first, as the rooms of a package of its own.
 EXPERIMENT_LAYERS: tuple[tuple[str, ...], ...] = (("baselines", "microbench"), ("bench",), ("reports",))

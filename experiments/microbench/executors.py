@@ -32,7 +32,7 @@ def copy(run: Path, to: Path) -> Path:
 
 def train(run: Path, engine: str, jobs: int) -> float:
     """Seconds that the blocks of a run take, from the command to its end."""
-    command = [sys.executable, "-m", "vdgs.cli", "train-blocks", str(run), "--jobs", str(jobs), "--executor", engine]
+    command = [sys.executable, "-m", "vdgs", "train-blocks", str(run), "--jobs", str(jobs), "--executor", engine]
     began = time.perf_counter()
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     return time.perf_counter() - began

@@ -94,7 +94,7 @@ def test_the_bench_is_named_where_there_is_only_the_package(monkeypatch, capsys)
 def test_the_bench_is_found_from_any_folder(tmp_path):
     environment = os.environ | {"PYTHONPATH": str(Path(cli.__file__).parents[2])}
     done = subprocess.run(
-        [sys.executable, "-m", "vdgs.cli", "bench", "--help"], cwd=tmp_path, env=environment,
+        [sys.executable, "-m", "vdgs", "bench", "--help"], cwd=tmp_path, env=environment,
         capture_output=True, text=True, timeout=PATIENCE_SECONDS,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

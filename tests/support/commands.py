@@ -7,7 +7,7 @@
 
 One server for each worker of the tests imports the package once; every command is forked from it, and so are the
 processes that it starts itself, such as those of blocks (`forking`), unless it is asked to start them as people's do
-(`start_tasks`) or to do in its own what they would (`do_tasks_here`). `entry_point` is a whole `python -m vdgs.cli`,
+(`start_tasks`) or to do in its own what they would (`do_tasks_here`). `entry_point` is a whole `python -m vdgs`,
 `python` any code in such a process.
 """
 
@@ -231,8 +231,8 @@ def limit_files(most_bytes: int) -> None:
 
 
 def entry_point(*arguments: object) -> subprocess.CompletedProcess[str]:
-    """The same as a person starts it: `python -m vdgs.cli`, with all that it imports."""
-    command = [sys.executable, "-m", "vdgs.cli", *map(str, arguments)]
+    """The same as a person starts it: `python -m vdgs`, with all that it imports."""
+    command = [sys.executable, "-m", "vdgs", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_SECONDS)
 
 

@@ -61,7 +61,7 @@ def reconstruct_if_needed(run_request: RunRequest, console: Console, command: st
     """
     if not is_image_input(run_request):
         return run_request
-    from vdgs.sfm.reconstruct import reconstruct  # needs pycolmap, which a run of a capture does not
+    from vdgs.sfm.reconstruct import reconstruct  # imports much that a run of a capture does not need
 
     check_config(run_request.method())
     _title(console, "photographs")

@@ -130,8 +130,6 @@ def call_cancellable(function: Callable[..., Result], *arguments: Any, **named: 
 
     Raises VdgsError for what COLMAP cannot do, and what asked to stop.
     """
-    import pycolmap
-
     token, ended, over = pycolmap.CancellationToken(), dict[str, Any](), threading.Event()
 
     def work() -> None:
@@ -227,7 +225,5 @@ class _ProgressLines:
 
 def silence_colmap() -> None:
     """COLMAP's own log is for its makers: errors come as exceptions, progress is shown here."""
-    import pycolmap
-
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     pycolmap.set_random_seed(0)

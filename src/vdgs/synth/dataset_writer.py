@@ -71,8 +71,6 @@ def write_model(folder: Path, cameras: list[Camera], names: list[str], cloud: Sp
 
     All images share one pinhole camera. Point k of the cloud gets the id k + 1, image k the id k + 1.
     """
-    import pycolmap
-
     model = pycolmap.Reconstruction()
     first = cameras[0]
     model.add_camera_with_trivial_rig(
