@@ -48,7 +48,8 @@ def run_command(settings: RunSettings, output: Path) -> str:
         options = [word for name, value in _differences(before, settings.to_dict()) for word in _words(name, value)]
         candidates.append(["vdgs", "run", settings.capture_path, "--output", str(output.resolve())])
         candidates[-1] += ["--preset", preset, *options]
-    return shlex.join(min(candidates, key=lambda words: len(words)))
+    shortest = min(candidates, key=len)
+    return shlex.join(shortest)
 
 
 def _differences(old: Mapping[str, Any], new: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

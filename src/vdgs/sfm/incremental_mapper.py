@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from vdgs.captures.formats.colmap_writing import check_whole_model
+from vdgs.captures.formats.colmap_writing import check_whole_model, write_model_files
 from vdgs.config.sfm_options import SfmOptions
 from vdgs.errors import CaptureError
 from vdgs.sfm.feature_extraction import CameraGroup
@@ -20,7 +20,6 @@ from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.preflight import OBLIQUE_ANGLE_DEG
 from vdgs.sfm.workspace import Workspace, call_cancellable, report_progress
-from vdgs.system.atomic_files import explain_disk_errors
 from vdgs.system.colmap import pycolmap
 
 #: Oblique views, or heights that differ by so much of the flying height, let a flight tell the focal length (choice).
@@ -117,9 +116,8 @@ def run_mapper(workspace: Workspace, count: int, fix_focal: bool, threads: int, 
             save_snapshots(workspace)  # the mapper ended by itself: they are whole
             raise
         tell(count)
-    for number in models:
-        with explain_disk_errors(workspace.models / str(number)):
-            check_whole_model(workspace.models / str(number))
+    for number, model in models.items():  # COLMAP writes no folder for a model that goes on from a snapshot
+        write_model_files(model, workspace.models / str(number))
     if not models:
         raise CaptureError(
             "no two photographs could be joined. Either they do not overlap, or they were all taken at one place "

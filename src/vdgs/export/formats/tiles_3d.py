@@ -29,7 +29,7 @@ from vdgs.geometry.geodesy import ecef_from_geodetic, enu_axes
 from vdgs.kernels import get_backend
 from vdgs.model.gaussian_transform import gaussian_covariances, transform_gaussians
 from vdgs.model.gaussians import MAX_SIGMA, Gaussians
-from vdgs.system.atomic_files import write_bytes, write_json
+from vdgs.system.atomic_files import explain_disk_errors, write_bytes, write_json
 from vdgs.system.documents import JsonObject
 from vdgs.system.scratch import leftovers, remove_leftovers, scratch_folder
 
@@ -81,15 +81,10 @@ def write_tiles(path: Path, scene: ExportScene, max_gaussians: int = MAX_GAUSSIA
     taken = [int(each.name[6:]) for each in path.parent.glob("tiles-*") if each.name[6:].isdecimal()]
     folder = path.parent / f"tiles-{1 + max(taken, default=0)}"
     try:
-        with scratch_folder(path) as scratch:
+        with explain_disk_errors(path), scratch_folder(path) as scratch:
             (scratch / _WRITES).write_text(folder.name)
             root = _TileQuadtree(write_store(scene, scratch / "rows"), folder, scene.metadata, max_gaussians).build()
         write_json(path, _tileset(root, scene.metadata))
-    except OSError as error:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise VdgsError(
-            f"{path}: cannot be written ({error.strerror or error}). Free some space or choose another folder."
-        ) from error
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise

@@ -174,8 +174,8 @@ def _print_plan(plan: OrthoPlan, console: Console, sharded: bool = False) -> Non
     )
     if needed > free:
         raise VdgsError(
-            f"{folder}: the map may take {data_size(needed)} while it is written, and {data_size(free)} are free. Give "
-            f"a larger --gsd than {grid.gsd:g}, a smaller --bbox, or an --output on another disk."
+            f"{folder}: the map may take {data_size(needed)} while it is written, and {data_size(free)} are free. Free "
+            f"some space, or give a larger --gsd than {grid.gsd:g}, a smaller --bbox, or an --output on another disk."
         )
 
 
