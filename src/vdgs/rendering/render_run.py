@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 from rich.console import Console
 
 from vdgs.captures.capture_metadata import check_same_capture
-from vdgs.captures.output_guard import check_not_among_folders, check_output
+from vdgs.captures.output_guard import check_not_among_folders
 from vdgs.config.commands import MAX_RENDER_SIDE_PX, RENDER_BYTES_PER_PIXEL, RenderRequest
 from vdgs.config.ranges import check_ranges
 from vdgs.errors import VdgsError
@@ -75,7 +75,6 @@ def render_run(request: RenderRequest, console: Console) -> None:
     """
     began = time.monotonic()
     _check(request)
-    check_output(request.output)
     run = open_model(RunFolder(request.run), request.model, request.device)
     run_cameras = _load_cameras(request, run)
     check_not_among_folders(request.output, run_cameras.root, run_cameras.input_folders)
