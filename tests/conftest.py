@@ -29,6 +29,7 @@ from support.package_files import files_with_shapes, module_name
 
 if TYPE_CHECKING:
     from support.flights import Flight
+    from support.pipeline_run import TwoBlocks
     from support.small_pipeline import NativeRun
 
 #: Memory is what limits their number on machines of many cores (about 1 GB each).
@@ -91,6 +92,14 @@ def uncut(tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = vdgs("train-coarse", folder / "capture", "--output", folder / "coarse", *COARSE, "--test-every", "4")
     assert done.returncode == 0, done.stderr + done.stdout
     return folder / "coarse"
+
+
+@pytest.fixture(scope="session")
+def two_blocks(tmp_path_factory: pytest.TempPathFactory) -> TwoBlocks:
+    """A whole run of two blocks, which train at once. Not to be changed: `clusters.copy_run`."""
+    from support.pipeline_run import run_two_blocks
+
+    return run_two_blocks(tmp_path_factory.mktemp("place"))
 
 
 @pytest.fixture(scope="session")

@@ -1,9 +1,7 @@
-"""`vdgs run` as people run it: real processes, stopped, killed, damaged, given other settings and continued."""
+"""`vdgs run` by real processes: what it leaves, what the same command does again, and what other settings change."""
 
 import json
 import shutil
-import signal
-from contextlib import suppress
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -12,7 +10,9 @@ import pytest
 import torch
 
 from support.captures import tiny_scene, write_colmap
-from support.commands import begun, do_tasks_here, entry_point, is_free, vdgs, wait_until
+from support.clusters import copy_run
+from support.commands import do_tasks_here, vdgs
+from support.pipeline_run import BLOCK_ITERATIONS, ITERATIONS, MERGED, SETTINGS, changed_files, model, moments
 from vdgs.evaluation.evaluate_run import IsolatedBlocks
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.decoder import Decoder
@@ -25,87 +25,20 @@ from vdgs.visibility.visibility_counts import count_visibility
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("pipeline")]
 
-ITERATIONS, BLOCK_ITERATIONS = 200, 120
-SETTINGS = (
-    "--preset",
-    "laptop",
-    "--iterations",
-    str(ITERATIONS),
-    "--save-every",
-    "20",
-    "--anchors.num-offsets",
-    "3",
-    "--densify.start",
-    "50",
-    "--densify.every",
-    "50",
-    "--densify.stats-start",
-    "25",
-    "--densify.min-draw-fraction",
-    "0.05",
-    "--blocks",
-    "2",
-    "--jobs",
-    "2",
-    "--block.compensation.enabled",
-    "--block.compensation.t-low-quantile",
-    "0",
-    "--assignment.min-cameras",
-    "4",
-    "--block.iterations",
-    str(BLOCK_ITERATIONS),
-    "--block.densify.min-draw-fraction",
-    "0.05",
-    "--block.densify.start",
-    "25",
-    "--block.densify.stats-start",
-    "0",
-    "--block.densify.every",
-    "25",
-    "--no-ortho",
-)
-#: What a block's model is compared by: the whole file.
-MERGED = "merged/model.safetensors"
+
+@pytest.fixture(scope="module")
+def capture(two_blocks) -> Path:
+    return two_blocks.capture
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("place") / "capture"
-    write_colmap(folder, tiny_scene())
-    origin = {"frame": "ENU", "origin_lat_deg": 47.0, "origin_lon_deg": 8.5, "origin_alt_m": 400.0}
-    (folder / "georef.json").write_text(json.dumps(origin))
-    return folder
-
-
-@pytest.fixture(scope="module")
-def unbroken(capture, tmp_path_factory) -> Path:
-    run = tmp_path_factory.mktemp("unbroken") / "run"
-    done = entry_point("run", capture, "--output", run, *SETTINGS)
-    assert done.returncode == 0, done.stderr + done.stdout
-    assert "2 at once" in done.stdout
-    assert "→ merged" in done.stdout
-    return run
+def unbroken(two_blocks) -> Path:
+    return two_blocks.run
 
 
 @pytest.fixture
 def copied(unbroken, tmp_path) -> Path:
-    return Path(shutil.copytree(unbroken, tmp_path / "run", ignore=shutil.ignore_patterns(".lock")))
-
-
-def model(run: Path, name: str = MERGED) -> bytes:
-    return (run / name).read_bytes()
-
-
-def changed_files(run: Path, before: dict[str, int]) -> set[str]:
-    return {name for name, moment in moments(run).items() if before.get(name) != moment}
-
-
-def moments(run: Path) -> dict[str, int]:
-    return {
-        str(path.relative_to(run)): path.stat().st_mtime_ns
-        for path in run.rglob("*")
-        if path.is_file() and path.name != ".lock"
-    }
+    return copy_run(unbroken, tmp_path / "run")
 
 
 def train_each(run: Path, *settings: str) -> None:
@@ -267,67 +200,6 @@ def test_a_changed_setting_redoes_exactly_what_depends_on_it(capture, copied):
     assert changed == {"config.yaml", "blocks", "merged", "evaluation", "report.html"}
 
 
-@pytest.mark.parametrize(
-    ("number", "blocks"),
-    [(signal.SIGINT, ["00", "01"]), (signal.SIGTERM, ["01"]), (signal.SIGHUP, ["01"]), (signal.SIGKILL, ["01"])],
-)
-def test_a_run_that_is_cut_off_while_blocks_train_continues_to_the_same_bits(capture, unbroken, copied, number, blocks):
-    for name in ("merged", "evaluation", *(f"blocks/{block}" for block in blocks)):
-        shutil.rmtree(copied / name)
-    command = ("run", capture, "--output", copied, *SETTINGS)
-    with begun(*command, pause_at=("*/blocks/*/checkpoints/00000040.json", 1)) as process:
-        process.wait_until_paused(processes=len(blocks))
-        process.send_signal(number)
-        cut_off = process.finished()
-    wait_until(lambda: is_free(copied))  # blocks notice that their driver is gone, save and end
-    assert cut_off.returncode == (-number if number == signal.SIGKILL else 130)
-    assert ("The same command continues" in cut_off.stderr) == (number != signal.SIGKILL)
-    for block in blocks:
-        status = json.loads((copied / "blocks" / block / "status.json").read_text())
-        assert (status["state"], status["iteration"]) == ("stopped", 40)
-    done = vdgs(*command)
-    assert done.returncode == 0, done.stderr + done.stdout
-    assert model(copied) == model(unbroken)
-
-
-def test_a_block_that_is_killed_is_started_again(unbroken, copied):
-    shutil.rmtree(copied / "blocks/01")
-    with begun(
-        "train-blocks", copied, "--save-every", "20", pause_at=("*/blocks/*/checkpoints/00000040.json", 1)
-    ) as process:
-        process.wait_until_paused()
-        process.kill_paused()
-        done = process.finished()
-    assert done.returncode == 0, done.stderr
-    assert "crashed by SIGKILL" in done.stdout
-    assert "continuing at iteration 20" in (copied / "blocks/01/output.log").read_text()
-    assert model(copied, "blocks/01/model.safetensors") == model(unbroken, "blocks/01/model.safetensors")
-
-
-def swallow_ctrl_c() -> None:
-    """Let Ctrl-C come between two stages, inside something that swallows it."""
-    from vdgs.pipeline import run_pipeline
-
-    def measure_visibility(*_: object) -> None:
-        with suppress(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
-
-    run_pipeline.count_run_visibility = measure_visibility  # type: ignore[assignment]
-
-
-def test_ctrl_c_between_stages_stops_the_run_and_the_same_command_continues(capture, copied):
-    shutil.rmtree(copied / "merged")
-    stopped = vdgs("run", capture, "--output", copied, *SETTINGS, prepare=swallow_ctrl_c)
-    assert stopped.returncode == 130
-    assert "interrupted. The same command continues" in stopped.stderr
-    assert not (copied / "merged").exists()
-    done = vdgs("run", capture, "--output", copied, *SETTINGS, "--quiet")
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
-    status = vdgs("status", copied)
-    assert status.returncode == 0, status.stdout
-    assert f"report: {copied / 'report.html'}" in status.stdout
-
-
 def time_few_steps() -> None:
     """Let a plan be made of fewer steps than take seconds."""
     from vdgs.pipeline import time_estimate
@@ -452,59 +324,6 @@ def test_stages_need_those_before_them(capture, tmp_path):
     assert json.loads((run / "evaluation/metrics.json").read_text())["model"] == "merged"
 
 
-@pytest.mark.parametrize("file", ["partition/blocks.geojson", "partition/scores.npz", "partition/partition.json"])
-def test_damaged_files_of_a_partition_are_named(copied, file):
-    shutil.rmtree(copied / "blocks/00")
-    (copied / file).write_bytes((copied / file).read_bytes()[:50])
-    done = vdgs("train-blocks", copied, "--block", "0")
-    assert done.returncode == 1
-    assert Path(file).name in done.stderr
-    assert "Traceback" not in done.stderr
-    assert "vdgs partition" in done.stderr
-    mended = vdgs("partition", copied)  # what the message advises helps
-    assert mended.returncode == 0, mended.stderr
-    assert vdgs("train-blocks", copied, "--block", "0").returncode == 0
-
-
-#: Of a change of the coarse stage's settings: they are written, the old model is deleted, it is gone.
-MOMENTS_OF_A_CHANGE = [("*/coarse/key", 2), ("*/coarse/model.safetensors", 1), ("*/coarse/.key.*", 1)]
-OTHER_SEED = (*SETTINGS, "--seed", "7")
-
-
-def change_cut_off(capture: Path, run: Path, moment: tuple[str, int]) -> None:
-    """Ask for another seed, and kill the command before it trains."""
-    with begun("run", capture, "--output", run, *OTHER_SEED, "--overwrite", pause_at=moment) as process:
-        process.wait_until_paused()
-        process.send_signal(signal.SIGKILL)
-        process.finished()
-    assert "seed: 7" in (run / "config.yaml").read_text()
-
-
-@pytest.mark.parametrize("moment", MOMENTS_OF_A_CHANGE)
-def test_nothing_is_built_on_a_model_of_other_settings(capture, copied, moment):
-    """A change of the coarse stage's settings counts at once, even if training it again never began."""
-    change_cut_off(capture, copied, moment)
-    refused = vdgs("partition", copied)
-    assert refused.returncode == 1
-    assert "no coarse model of its settings" in refused.stderr
-
-
-def test_all_that_was_built_on_a_model_of_other_settings_is_made_again(capture, copied):
-    change_cut_off(capture, copied, MOMENTS_OF_A_CHANGE[0])
-    coarse_settings = OTHER_SEED[: OTHER_SEED.index("--blocks")]
-    commands = (
-        ("train-coarse", capture, "--output", copied, *coarse_settings, "--seed", "7"),
-        ("visibility", copied), ("partition", copied), ("train-blocks", copied, "--block", "0"),
-    )  # fmt: skip
-    for command in commands:
-        done = vdgs(*command)
-        assert done.returncode == 0, done.stderr
-        assert "nothing to do" not in done.stdout
-    stale = vdgs("merge", copied)
-    assert stale.returncode == 1
-    assert "not all blocks are trained:\n  block 1" in stale.stderr
-
-
 def test_figures_of_another_model_are_not_taken_for_this_ones(capture, copied):
     again = vdgs("eval", copied, "--visibility-bins", "2")
     assert again.returncode == 0, again.stderr
@@ -512,15 +331,6 @@ def test_figures_of_another_model_are_not_taken_for_this_ones(capture, copied):
     assert done.returncode == 0, done.stderr
     assert len(json.loads((copied / "evaluation/metrics.json").read_text())["views_by_visibility"]) > 0
     assert done.stdout.count("already measured") == 1  # the coarse one
-
-
-def test_a_block_trained_again_is_merged_again(unbroken, copied):
-    shutil.rmtree(copied / "blocks/01")
-    assert vdgs("merge", copied, "--allow-missing-blocks").returncode == 0
-    assert model(copied) != model(unbroken)
-    assert vdgs("train-blocks", copied, "--block", "1").returncode == 0
-    assert vdgs("merge", copied).returncode == 0
-    assert model(copied) == model(unbroken)
 
 
 def test_why_a_view_was_assigned(copied):

@@ -308,7 +308,11 @@ def test_the_report_tells_what_training_began_with(tmp_path):
     assert "It starts from" not in Page(write_report(run)).text()
 
 
-@pytest.mark.parametrize("damage", ["[[1, {", '{"blocks": 3}', "\x00\xff" + "[" * 100_000])
+@pytest.mark.parametrize(
+    "damage",
+    ["[[1, {", '{"blocks": 3}', "\x00\xff" + "[" * 100_000],
+    ids=["cut off", "of another kind", "nested deeply"],
+)
 def test_damaged_files_are_named_and_the_rest_stands(tmp_path, damage):
     run = whole_run(tmp_path / "run")
     for file in FILES:

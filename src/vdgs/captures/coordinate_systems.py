@@ -13,8 +13,8 @@ from vdgs.errors import CaptureError
 
 ToGeodetic = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n 3"]]
 _STARTS = re.compile(
-    r"(\d{4,6}$|(EPSG|ESRI)[\s:]+\d+|urn:ogc:def:crs:|https?://www\.opengis\.net/def/crs/|WGS\s?84\b|UTM\b|\w[\w() +-]* / \w|\+proj="
-    r"|\+init=|(GEOG|PROJ|GEO|PROJC|COMPD|COMPOUND)[A-Z]*CRS?\[|\w*CS\[)", re.I
+    r"(\d{4,6}$|(EPSG|ESRI)[\s:]+\d+|urn:ogc:def:crs:|https?://www\.opengis\.net/def/crs/|WGS\s?84\b|UTM\b"
+    r"|\w[\w() +-]* / \w|\+proj=|\+init=|(GEOG|PROJ|GEO|PROJC|COMPD|COMPOUND)[A-Z]*CRS?\[|\w*CS\[)", re.I
 )  # fmt: skip
 #: ODM's words for the zones of UTM, and those that people write in their place.
 _UTM = re.compile(r"(?:WGS ?84)?[ /]*UTM(?: ZONE)? *(\d{1,2}) *([NS])", re.I)

@@ -188,7 +188,8 @@ def _settle(problem: Problem, start: Similarity, model: str) -> PositionFit:
     )
     return PositionFit(
         similarity=similarity, inliers=inliers, residuals=placed - problem.targets, placed=placed,
-        gps_std=gps_std, altitude=model if problem.has_altitudes else "none", drift_m=state.drift if model == "drifts" else 0.0,
+        gps_std=gps_std, altitude=model if problem.has_altitudes else "none",
+        drift_m=state.drift if model == "drifts" else 0.0,
         scale_error=scale, wandering_error=2 * math.sqrt(wandering[0]), north_error_deg=north,
         level_error_deg=level, place_error_m=place,
         score=_score(problem, state, inliers, gps_std, model),

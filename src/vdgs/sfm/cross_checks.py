@@ -117,7 +117,7 @@ def is_bare(photo: ImageMetadata) -> bool:
 
 
 def _thermal(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
-    """Pictures of a thermal camera beside those that the same drone took of the same (DJI: `_T` and `_V`, `_W`, `_Z`)."""
+    """Pictures of a thermal camera beside those that the same drone took (DJI: `_T` beside `_V`, `_W` or `_Z`)."""
     stems = {str(PurePosixPath(photo.name).with_suffix("")).upper(): photo for photo in photographs}
     found = {}
     for stem, photo in stems.items():

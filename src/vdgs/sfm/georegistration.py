@@ -145,7 +145,8 @@ def accuracy_of(fit: PositionFit, targets: np.ndarray, positions: GpsPriors) -> 
     return AccuracyFacts(
         place_m=place, scale_percent=100 * fit.scale_error, scale_m=float(fit.scale_error * away.max()),
         north_deg=min(180.0, fit.north_error_deg), level_deg=min(180.0, fit.level_error_deg),
-        positions_m=tuple(_recorded(fit.gps_std, positions).tolist()), altitude=fit.altitude, altitude_drift_m=fit.drift_m,
+        positions_m=tuple(_recorded(fit.gps_std, positions).tolist()),
+        altitude=fit.altitude if positions.has_altitudes else "none", altitude_drift_m=fit.drift_m,
     )  # fmt: skip
 
 

@@ -25,6 +25,8 @@ SAME_FLIGHT_DEG = 0.05
 MIN_SPREAD_M = 2.0
 #: An altitude of exactly 0 among others that are farther from it (metres) is a default (choice).
 FAR_FROM_ZERO_M = 30.0
+#: What altitudes are measured from where none is known.
+ALTITUDE_UNKNOWN = "not recorded; 0 is that of the median point"
 #: Fewer positions fix no scale and no directions.
 MIN_POSITIONS = 3
 #: No receiver is better than this, whatever it writes (metres).
@@ -98,16 +100,7 @@ def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, st
         if far.any():
             notes.append(f"{_some(names, far)}: the position is far from all others; not used.")
         known &= ~far
-    geodetic = _without_single_zeros(geodetic, known)
-    kept, has_altitudes = with_altitudes(geodetic[:, 2], known)
-    if not has_altitudes:
-        geodetic = np.where([True, True, False], geodetic, 0.0)
-        notes.append(
-            f"{_some(names, known)}: the positions have no altitudes: they tell scale and north, the views or attitudes "
-            "up; heights above the sea are not known."
-        )
-    elif (kept != known).any():
-        notes.append(f"{_some(names, known & ~kept)}: the position has no altitude; not used.")
+    geodetic, kept, has_altitudes = _in_space_or_plane(geodetic, known, names, notes)
     index = np.flatnonzero(kept)
     origin = _origin(geodetic[index])
     enu = enu_from_geodetic(geodetic[index], origin) if len(index) else np.zeros((0, 3))
@@ -120,11 +113,9 @@ def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, st
     deviations = np.array(
         [_position_std(photographs[i], recorded.rows.get(i), table, std_m) for i in index.tolist()]
     ).reshape(-1, 3)
-    kinds = (
-        list(dict.fromkeys(recorded.kinds[i] for i in index.tolist()))
-        if has_altitudes
-        else ["not recorded; 0 is that of the median point"]
-    )
+    kinds = [ALTITUDE_UNKNOWN]
+    if has_altitudes:
+        kinds = list(dict.fromkeys(recorded.kinds[i] for i in index.tolist()))
     if len(kinds) > 1:
         notes.append(f"altitudes are of several kinds ({'; '.join(kinds)}): heights may not fit together.")
     return GpsPriors(
@@ -137,6 +128,23 @@ def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, st
         notes=tuple(notes),
         has_altitudes=has_altitudes,
     )
+
+
+def _in_space_or_plane(
+    geodetic: np.ndarray, known: np.ndarray, names: Sequence[str], notes: list[str]
+) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Positions [n, 3], which are used [n] bool, and whether with their altitudes (0 where not); says so in notes."""
+    geodetic = _without_single_zeros(geodetic, known)
+    kept, has_altitudes = with_altitudes(geodetic[:, 2], known)
+    if not has_altitudes:
+        notes.append(
+            f"{_some(names, known)}: the positions have no altitudes: they tell scale and north, the views or "
+            "attitudes up; heights above the sea are not known."
+        )
+        return np.where([True, True, False], geodetic, 0.0), kept, False
+    if (kept != known).any():
+        notes.append(f"{_some(names, known & ~kept)}: the position has no altitude; not used.")
+    return geodetic, kept, True
 
 
 def _read_geodetic(photographs: Sequence[ImageMetadata], table: Path | None) -> _Recorded:
