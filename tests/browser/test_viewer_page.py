@@ -127,6 +127,11 @@ def test_a_distance_measured_in_a_browser_gives_the_capture_its_metres(viewer, r
         wait_until(lambda: viewer.sessions)
         (visitor,) = viewer.sessions.values()
         wait_until(lambda: in_window(visitor))
+        wait_until(  # a page that shows no picture yet takes no clicks
+            lambda: np.abs(
+                beside_the_panel(page.screenshot()) - beside_the_panel(expected(viewer, in_window(visitor)))
+            ).mean() < 6
+        )  # fmt: skip
         panel = visitor.point_panel.measure_panel
         panel._switch.value, panel._meters.value = True, 25.0
         for count, place in enumerate(((300.0, 380.0), (420.0, 460.0)), 1):

@@ -187,7 +187,8 @@ def format_area(area: float | None, unit: str) -> str:
         return f"{area / _SQUARE_KILOMETER:.3g} km²"
     if unit == "m" and area >= _HECTARE:
         return f"{area / _HECTARE:.3g} ha"
-    return f"{area:,.0f} m²" if unit == "m" else f"{area:,.4g} square {unit}"
+    amount = f"{area:,.0f}" if area >= 100 else f"{area:.3g}"
+    return f"{amount} m²" if unit == "m" else f"{amount} square {unit}"
 
 
 def place_summary(facts: PlaceFacts) -> str:

@@ -58,8 +58,8 @@ img { display: block; max-width: 100%; height: auto; }
 .gallery figure { flex: 1 1 17rem; max-width: 30rem; margin: 0.5rem 0; }
 .beside { display: flex; flex-wrap: wrap; gap: 0.5rem 1.75rem; align-items: flex-start; margin: 0.75rem 0; }
 .beside > * { flex: 1 1 22rem; min-width: 0; margin: 0; }
-.sheet { position: relative; display: table; margin: 0 auto; line-height: 1.2; }
-.sheet img { max-height: 30rem; width: auto; }
+.sheet { position: relative; margin: 0 auto; line-height: 1.2; }
+.sheet img { width: 100%; }
 .bar, .north { position: absolute; background: #ffffffd9; color: #16191c; font-size: 0.8rem; font-weight: 600; }
 .bar { left: 3%; bottom: 3%; padding-top: 2px; text-align: center; white-space: nowrap; border: solid #16191c; }
 .bar { border-width: 0 2px 3px; overflow-wrap: normal; }
@@ -89,6 +89,8 @@ pre { overflow-x: auto; background: var(--code); padding: 0.75rem; font-size: 0.
   pre { white-space: pre-wrap; }
 }
 """
+#: How high a map is on a wide screen: with what stands beside it, it fills the first screen of a laptop.
+_MAP_HEIGHT_REM = 30
 #: Control characters but tab and line feed, and halves of surrogate pairs: no page may hold them.
 _FORBIDDEN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 
@@ -160,8 +162,9 @@ def map_figure(image: EmbeddedImage, caption: str, alt: str, bar: Overlay | None
         parts.append(f'<div class="bar" style="width:{bar.width_percent:.3f}%">{escape_html(bar.text)}</div>')
     if north is not None:
         parts.append(f'<div class="north">{escape_html(north)}</div>')
-    shown = "".join(parts)
-    return Html(f'<figure><div class="sheet">{shown}</div><figcaption>{escape_html(caption)}</figcaption></figure>')
+    shown, width = "".join(parts), f"min(100%, {_MAP_HEIGHT_REM * image.width / image.height:.2f}rem)"
+    note = f"<figcaption>{escape_html(caption)}</figcaption>"
+    return Html(f'<figure><div class="sheet" style="width:{width}">{shown}</div>{note}</figure>')
 
 
 def facts_table(rows: Sequence[tuple[str, str]]) -> Html:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
+import threading
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,8 @@ class MeasurePanel:
         self._session, self._line = session, None
         self.ruler = Ruler(session.scene.capture.ground.unit)
         self.known: list[KnownDistance] = []
+        #: Held while measures change: clicks come on several threads.
+        self._showing = threading.Lock()
         gui = session.client.gui
         with gui.add_folder("Measure", expand_by_default=False):
             self._switch = gui.add_checkbox("Clicks measure", False, hint="Distance, height and area between places")
@@ -40,12 +43,14 @@ class MeasurePanel:
         return bool(self._switch.value)
 
     def add(self, point: MeasuredPoint) -> None:
-        self.ruler.add(point)
-        self._show()
+        with self._showing:
+            self.ruler.add(point)
+            self._show()
 
     def clear(self) -> None:
-        self.ruler.clear()
-        self._show()
+        with self._showing:
+            self.ruler.clear()
+            self._show()
 
     def save(self) -> None:
         """Let the browser download all distances that were said to be known, with the one between the clicked places;
