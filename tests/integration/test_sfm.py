@@ -35,12 +35,15 @@ from vdgs.pipeline.dry_run import estimate_run
 from vdgs.pipeline.run_pipeline import reconstruct_if_needed
 from vdgs.report import write_report
 from vdgs.runs.create_or_resume import create_or_resume_run
+from vdgs.runs.run_folder import RunFolder
 from vdgs.sfm import feature_extraction, feature_matching, georegistration, incremental_mapper
 from vdgs.sfm.georegistration import AlignmentFailure, Georegistration, georegister, transform_model
 from vdgs.sfm.gps_priors import read_gps_priors
 from vdgs.sfm.image_list import collect_images
 from vdgs.sfm.reconstruct import reconstruct
 from vdgs.sfm.workspace import call_cancellable
+from vdgs.system.atomic_files import write_json
+from vdgs.system.step_progress import read_step
 from vdgs.system.stop_signals import catch_stop_signals
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("sfm")]
@@ -144,7 +147,7 @@ def test_what_was_interrupted_goes_on(flight, tmp_path, monkeypatch):
 
         def stopped(function, *arguments, **named):
             calls.append(function.__name__)
-            if len(calls) == 3:
+            if len(calls) == 4:  # the first is of the estimate
                 raise KeyboardInterrupt
             return call_cancellable(function, *arguments, **named)
 
@@ -153,6 +156,9 @@ def test_what_was_interrupted_goes_on(flight, tmp_path, monkeypatch):
             reconstruct(request, console())
     with pytest.raises(CaptureError, match="is not finished"):
         load_capture(output)
+    step = read_step(output / "work" / "progress.json")
+    assert step is not None
+    assert (step.step, step.total) == ("features", 10)
     extracted = []
 
     def counted(function, *arguments, **named):
@@ -163,6 +169,26 @@ def test_what_was_interrupted_goes_on(flight, tmp_path, monkeypatch):
     facts = reconstruct(request, console())
     assert facts.registered == 9
     assert len(extracted) == 10 - 4  # four were searched before, in two calls
+    assert not (output / "work").exists()
+
+
+def test_photographs_that_came_later_are_refused_or_make_the_capture_anew(flight, tmp_path):
+    output, card, late = tmp_path / "capture", tmp_path / "card", flight.names[-1]
+    shutil.copytree(flight.folder, card)
+    (card / late).rename(tmp_path / "later.jpg")
+    run = RunFolder(tmp_path / "run")
+    first = SfmRequest(image_folders=(card,), output=output, threads=1, options=SfmOptions(num_neighbors=3))
+    assert reconstruct(first, console(), run).registered == 8
+    write_json(run.capture_file, {})  # as training leaves it
+    before = files(output)
+    with pytest.raises(RunError, match="other positions or other settings"):
+        reconstruct(replace(first, options=SfmOptions(max_output_size=200)), console(), run)
+    (tmp_path / "later.jpg").rename(card / late)
+    with pytest.raises(VdgsError, match=rf"1 added \({late}\).*--overwrite"):
+        reconstruct(first, console(), run)
+    assert files(output) == before
+    assert reconstruct(replace(first, overwrite=True), console(), run).registered == 9
+    assert not run.is_trained
 
 
 def test_without_positions_the_scale_is_arbitrary_and_said_so(flight, tmp_path):
@@ -303,7 +329,7 @@ def test_a_run_of_photographs_makes_them_a_capture_first_and_reports_how(made, f
 
 def test_a_dry_run_of_photographs_looks_and_writes_nothing(flight, tmp_path):
     said = console()
-    estimate = estimate_run(asked(flight, tmp_path / "run"), said)
+    estimate = estimate_run(replace(asked(flight, tmp_path / "run"), device="cpu"), said)
     assert {"photographs", "coarse", "blocks", "measuring"} <= {
         name for name, cost in estimate.times.items() if cost.seconds > 0
     }

@@ -178,7 +178,7 @@ class Stopper:
 
 
 STEPS = {
-    "features": (feature_extraction, "_extract", 3, signal.SIGTERM),
+    "features": (feature_extraction, "_extract", 4, signal.SIGTERM),  # the first call is of the estimate
     "matching": (feature_matching, "call_cancellable", 2, signal.SIGHUP),
     "mapping": (incremental_mapper, "save_snapshots", 5, signal.SIGTERM),
     "writing": (capture_writer, "write_bytes", 8, signal.SIGINT),

@@ -171,7 +171,7 @@ def _estimate(scene: _Scene, method: MethodConfig, request: RunRequest) -> RunEs
     with ImageCache(scene.timed.train_views, budget, downscales=tuple({1, *factors})) as images:
         stage, anchors = build_coarse_problem(scene.timed, config, images, request.device)
         sparse = training_workload(initial_coarse_state(anchors, stage, config.exposure_compensation), stage)
-        steps = time_steps(stage, anchors, factors, config.exposure_compensation)
+        steps = time_steps(stage, anchors, images, factors, config.exposure_compensation)
         dense = _dense_room(scene) if config.anchors.mvs else 0
         stereo = views * time_stereo(scene.timed, images, config.anchors) if dense else 0.0
     share = scene.points / max(1, len(scene.timed.points))
@@ -189,7 +189,7 @@ def _estimate(scene: _Scene, method: MethodConfig, request: RunRequest) -> RunEs
     local = allocate_local(work, get_num_threads(), free)
     block = block_train_config(method, max(1, round(views * min(1.0, 1.5 / blocks))))
     more = 1 + dense / max(sparse.anchors, 1) / 2  # stereo fills half of what it may, where it fills any
-    start = more * expected_growth(config)
+    start = more * expected_growth(config, steps.texture)
     times = {
         "stereo": Cost(stereo / get_num_threads(), stereo),
         "coarse": steps.stage(config, more),
@@ -208,7 +208,7 @@ def _estimate(scene: _Scene, method: MethodConfig, request: RunRequest) -> RunEs
         block_bytes=block_bytes,
         images_bytes=min(image_bytes, round(1e9 * local.image_gb)),
         may_exceed_memory=coarse_bytes > free or exceeds_memory(work, local.max_concurrent, free),
-        growth=(expected_growth(config), expected_growth(block)),
+        growth=(expected_growth(config, steps.texture), expected_growth(block, steps.texture)),
         times=times,
         slowdown=steps.slowdown,
     )

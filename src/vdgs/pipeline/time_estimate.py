@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 
@@ -25,10 +26,15 @@ from vdgs.training import TrainingProblem, train
 
 #: Steps at each size that are timed at least, the first of them not; then as many as fit into so many seconds.
 MIN_TIMED_STEPS, MAX_TIMED_SECONDS = 4, 1.5
-#: How many times their number anchors become where growth decides often, and after how many decisions half of that is
-#: reached. Measured: 1.3 to 4.6 times (four captures), `laptop`; 1.8 and 2.3 times, 100 000 iterations; blocks whose
-#: growth is compensated below a fixed T_low 6 and 12 times (reports/findings.md).
-EXPECTED_GROWTH, EXPECTED_COMPENSATED_GROWTH, HALF_GROWTH_DECISIONS = 2.0, 9.0, 4
+#: What anchors gain where growth decides often, as a share of their number, in photographs of `USUAL_TEXTURE`, with the
+#: square of the texture; how many times as many they become in blocks whose growth is compensated below a fixed T_low;
+#: and after how many decisions half of that is reached. Measured (`laptop`, texture): 1.4 times at 13, 1.7 and 1.9 at
+#: 17 and 16, 4.6 at 34; 1.8 and 2.3 times at 17 with 100 000 iterations; compensated blocks 6 and 12 times.
+PLAIN_GAIN, USUAL_TEXTURE, COMPENSATED_GROWTH, HALF_GROWTH_DECISIONS = 1.05, 17.0, 9.0, 4
+#: Photographs whose texture is measured, about.
+TEXTURE_VIEWS = 6
+#: Textures beyond these tell no more.
+TEXTURE_RANGE = (8.0, 36.0)
 #: Share of a photograph's stereo that confirming its depths adds to finding them.
 CONFIRMING = 0.15
 #: What measuring a view takes, in training steps of its size: of the coarse model, and of the merged one with its
@@ -45,6 +51,8 @@ class StepTimes:
     anchor_share: float
     """Of the time of a step at the largest size, what goes with the number of anchors."""
     slowdown: float
+    texture: float
+    """Of the photographs (`measure_texture`)."""
 
     @property
     def at_full_size(self) -> Cost:
@@ -57,28 +65,40 @@ class StepTimes:
         total = NO_COST
         for (begin, factor), end in zip(config.resolution_schedule, ends, strict=True):
             total += self.by_downscale[factor] * (config.iterations * max(0.0, end - begin))
-        return total * (1 + self.anchor_share * (start * mean_growth(config) - 1))
+        return total * (1 + self.anchor_share * (start * mean_growth(config, self.texture) - 1))
 
 
-def expected_growth(config: TrainConfig) -> float:
+def expected_growth(config: TrainConfig, texture: float) -> float:
     """How many times their number anchors become in a stage, by estimate."""
     densify = config.densify
     decisions = max(0.0, (densify.stop_fraction * config.iterations - densify.start) / densify.every)
     if not densify.num_levels:
         return 1.0
-    plain = max_growth_factor(config.compensation) == MAX_GROWTH
-    most = EXPECTED_GROWTH if plain else EXPECTED_COMPENSATED_GROWTH
-    return 1 + (most - 1) * decisions / (decisions + HALF_GROWTH_DECISIONS)
+    gain = PLAIN_GAIN * (float(np.clip(texture, *TEXTURE_RANGE)) / USUAL_TEXTURE) ** 2
+    if max_growth_factor(config.compensation) != MAX_GROWTH:
+        gain = COMPENSATED_GROWTH - 1
+    return 1 + gain * decisions / (decisions + HALF_GROWTH_DECISIONS)
 
 
-def mean_growth(config: TrainConfig) -> float:
+def measure_texture(images: ImageCache) -> float:
+    """Mean absolute Laplacian of photographs at the size that is trained on, in grey levels."""
+    found = []
+    for index in range(0, len(images.views), max(1, len(images.views) // TEXTURE_VIEWS)):
+        gray = cv2.cvtColor(images.get(index).image.numpy(), cv2.COLOR_RGB2GRAY).astype(np.float32)
+        found.append(float(np.abs(cv2.Laplacian(gray, cv2.CV_32F)).mean()))
+    return float(np.mean(found))
+
+
+def mean_growth(config: TrainConfig, texture: float) -> float:
     """The mean over the steps of a stage: anchors grow from the first decision to the last."""
     first = min(1.0, config.densify.start / max(1, config.iterations))
     middle = (first + max(first, config.densify.stop_fraction)) / 2
-    return 1 + (expected_growth(config) - 1) * (1 - middle)
+    return 1 + (expected_growth(config, texture) - 1) * (1 - middle)
 
 
-def time_steps(stage: TrainingProblem, anchors: Anchors, factors: list[int], fit_exposures: bool) -> StepTimes:
+def time_steps(
+    stage: TrainingProblem, anchors: Anchors, images: ImageCache, factors: list[int], fit_exposures: bool
+) -> StepTimes:
     """Train a few steps at each size, and with half of the anchors at the largest."""
     timed, slowdowns = {}, []
     for factor in factors:
@@ -89,7 +109,10 @@ def time_steps(stage: TrainingProblem, anchors: Anchors, factors: list[int], fit
     fewer, _ = _step_cost(stage, half, largest, fit_exposures) if len(half) else (timed[largest], 1.0)
     share = 2 * (1 - fewer.processor_seconds / max(timed[largest].processor_seconds, 1e-9))
     return StepTimes(
-        by_downscale=timed, anchor_share=float(np.clip(share, 0.2, 1.0)), slowdown=float(np.median(slowdowns))
+        by_downscale=timed,
+        anchor_share=float(np.clip(share, 0.2, 1.0)),
+        slowdown=float(np.median(slowdowns)),
+        texture=measure_texture(images),
     )
 
 

@@ -84,6 +84,8 @@ def print_status(run: RunFolder, console: Console) -> int:
         console.print(f"{stage.name:<{width}}  {state}  {escape(note)}".rstrip(), highlight=False)
     counted = Counter(stage.state for stage in status.stages)
     console.print(", ".join(f"{count} {state}" for state, count in counted.items()), highlight=False)
+    if status.is_complete:
+        console.print(escape(f"report: {status.path / REPORT_FILE}"), highlight=False)
     console.print(escape(next_line(status)), highlight=False)
     return 0 if status.is_complete else EXIT_INCOMPLETE
 
@@ -112,7 +114,7 @@ def next_line(status: RunStatus) -> str:
     if status.problem or not status.is_complete:
         return f"to mend: {status.problem or 'see above'}"
     film = shell_line(["vdgs", "render", status.path, "--views", "flyover", "--output", "flyover.mp4"])
-    return f"report: {status.path / REPORT_FILE}\nnext: {film}"
+    return f"next: {film}"
 
 
 def progress_text(status: StatusRecord | None) -> str:

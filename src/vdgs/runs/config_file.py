@@ -48,7 +48,7 @@ def run_command(settings: RunSettings, output: Path) -> str:
         options = [word for name, value in _differences(before, settings.to_dict()) for word in _words(name, value)]
         candidates.append(["vdgs", "run", settings.capture_path, "--output", str(output.resolve())])
         candidates[-1] += ["--preset", preset, *options]
-    shortest = min(candidates, key=len)
+    shortest: list[str] = min(candidates, key=len)
     return shlex.join(shortest)
 
 
