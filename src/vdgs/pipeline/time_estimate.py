@@ -30,7 +30,7 @@ MIN_TIMED_STEPS, MAX_TIMED_SECONDS = 4, 1.5
 #: square of the texture; how many times as many they become in blocks whose growth is compensated below a fixed T_low;
 #: and after how many decisions half of that is reached. Measured (`laptop`, texture): 1.4 times at 13, 1.7 and 1.9 at
 #: 17 and 16, 4.6 at 34; 1.8 and 2.3 times at 17 with 100 000 iterations; compensated blocks 6 and 12 times.
-PLAIN_GAIN, USUAL_TEXTURE, COMPENSATED_GROWTH, HALF_GROWTH_DECISIONS = 1.05, 17.0, 9.0, 4
+PLAIN_GAIN, USUAL_TEXTURE, COMPENSATED_GROWTH, HALF_GROWTH_DECISIONS = 1.3, 17.0, 9.0, 8
 #: Photographs whose texture is measured, about.
 TEXTURE_VIEWS = 6
 #: Textures beyond these tell no more.

@@ -138,8 +138,8 @@ def _warnings(collection: ImageList, overlap: float | None, views: float | None,
     round_ = [photo.name for photo in photographs if photo.width == 2 * photo.height and photo.lens is None]
     if round_:
         found.append(
-            f"{first_names(round_)}: exactly twice as wide as high, of an unknown lens. Panoramas of 360° cannot be used: "
-            "cut views with a lens out of them first."
+            f"{first_names(round_)}: exactly twice as wide as high, of an unknown lens. Panoramas of 360° cannot be "
+            "used: cut views with a lens out of them first."
         )
     endless = [photo.name for photo in photographs if not photo.whole]
     if endless:
