@@ -123,9 +123,9 @@ def test_a_browser_shows_every_layer_and_goes_where_buttons_lead(viewer):
 def test_a_distance_measured_in_a_browser_gives_the_capture_its_metres(viewer, run, tmp_path):
     wait_until(lambda: not viewer.sessions)
     with open_page(viewer.access.local_url(), *WINDOW) as page:
-        page.call("Page.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
         wait_until(lambda: viewer.sessions)
         (visitor,) = viewer.sessions.values()
+        visitor.client.send_file_download = lambda name, content: (tmp_path / name).write_bytes(content)
         wait_until(lambda: in_window(visitor))
         wait_until(  # a page that shows no picture yet takes no clicks
             lambda: np.abs(
