@@ -17,6 +17,7 @@ import vdgs
 from support.small_pipeline import vdgs as verb
 from vdgs.errors import CaptureError, RunError, VdgsError
 
+pytestmark = pytest.mark.xdist_group("api")
 STUB = Path(vdgs.__file__).with_suffix(".pyi")
 
 

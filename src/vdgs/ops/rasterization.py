@@ -103,14 +103,7 @@ def rasterization(
     `with_eval3d`. Source: Kerbl et al. 2023 (eqs. 2-6); Ye et al. 2025 for the interface.
     """
     given = locals()
-    shutter = getattr(rolling_shutter, "name", rolling_shutter)
-    if shutter not in (None, "GLOBAL"):
-        raise UnsupportedOption(f"rolling_shutter={shutter}: cameras have a global shutter")
-    for name, (allowed, remedy) in UNSUPPORTED.items():
-        value = given[name]
-        if not any(value is each or (isinstance(value, (str, bool)) and value == each) for each in allowed):
-            choices = " or ".join(repr(each) for each in allowed)
-            raise UnsupportedOption(f"{name}={value!r}: vdgs.ops.rasterization has only {choices}; {remedy}")
+    _refuse_unsupported(given)
     tensors = {name: to_torch(given[name]) for name in _Gaussians.names() if given[name] is not None}
     gaussians: _Gaussians = _check_gaussians(sh_degree, tensors)
     settings = _Settings(
@@ -126,6 +119,18 @@ def rasterization(
     shape = (*gaussians.batch, gaussians.num_cameras, height, width, -1)
     picture, alpha = (torch.stack(each).reshape(shape) for each in zip(*drawn, strict=True))
     return like(means, (picture, alpha, meta))
+
+
+def _refuse_unsupported(given: Mapping[str, Any]) -> None:
+    """Raise UnsupportedOption for an argument that gsplat has and `rasterization` has not."""
+    shutter = getattr(given["rolling_shutter"], "name", given["rolling_shutter"])
+    if shutter not in (None, "GLOBAL"):
+        raise UnsupportedOption(f"rolling_shutter={shutter}: cameras have a global shutter")
+    for name, (allowed, remedy) in UNSUPPORTED.items():
+        value = given[name]
+        if not any(value is each or (isinstance(value, (str, bool)) and value == each) for each in allowed):
+            choices = " or ".join(repr(each) for each in allowed)
+            raise UnsupportedOption(f"{name}={value!r}: vdgs.ops.rasterization has only {choices}; {remedy}")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
