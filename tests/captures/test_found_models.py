@@ -115,7 +115,13 @@ def test_a_model_apart_from_its_photographs_is_named_with_what_joins_them(tmp_pa
     assert len(load_capture(Path(link[3])).views) == 12
 
 
-@pytest.mark.parametrize("name", ["opensfm/reconstruction.json", "cameras.xml", "odm_report/shots.geojson"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "opensfm/reconstruction.json", "reconstruction.json", "cameras.xml", "odm_report/shots.geojson", "a/model.nvm",
+        "database.db", "poses_bounds.npy", "place.psx", "place.rcproj",
+    ],
+)  # fmt: skip
 def test_poses_of_formats_that_are_not_read_are_said(tmp_path, name):
     large = tiny_scene(width=160, height=120)
     write_images(tmp_path, large)
@@ -124,6 +130,16 @@ def test_poses_of_formats_that_are_not_read_are_said(tmp_path, name):
     assert not any("Poses are made anew" in note for note in collect_images([tmp_path]).notes)
     (tmp_path / name).write_text('[{"shots": {"a": {"rotation": [0, 0, 0]}}}]')
     assert any(name in note and "Poses are made anew" in note for note in collect_images([tmp_path]).notes)
+    with pytest.raises(CaptureError, match=r"not a capture. Not read: "):
+        load_capture(tmp_path)
+
+
+def test_registered_cameras_of_realityscan_are_told_from_tables(tmp_path):
+    write_images(tmp_path, tiny_scene(width=160, height=120))
+    (tmp_path / "gps.csv").write_text("name,lat,lon,alt\nframe_000.png,1,2,3\n")
+    assert not any("RealityScan" in note for note in collect_images([tmp_path]).notes)
+    (tmp_path / "out.csv").write_text("#name,x,y,alt,heading,pitch,roll,f,px,py\nframe_000.png,1,2,3,0,0,0,30,0,0\n")
+    assert any("out.csv: poses of RealityScan" in note for note in collect_images([tmp_path]).notes)
 
 
 # --------------------------------------------------------------------------------------- points and sizes

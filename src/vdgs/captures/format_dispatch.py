@@ -18,7 +18,7 @@ from vdgs.captures.formats.ply_reader import read_point_cloud
 from vdgs.captures.formats.source_capture import SourceCapture
 from vdgs.captures.formats.sparse_points import POINT_CLOUDS, find_point_cloud
 from vdgs.captures.formats.transforms import TRANSFORMS_FILE, exclusive_information, read_transforms
-from vdgs.captures.nested_captures import model_below
+from vdgs.captures.nested_captures import foreign_poses, model_below
 from vdgs.captures.reconstruction import is_reconstruction
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -48,8 +48,9 @@ def read_source(root: Path, options: CaptureOptions) -> SourceCapture:
     below = model_below(root)
     if below:
         raise CaptureError(f"{root}: not a capture itself. {below}")
+    others = "".join(f"Not read: {poses}. " for poses in foreign_poses(root)) if root.is_dir() else ""
     raise CaptureError(
-        f"{root}: not a capture. {partial_model(root)}Looked for a COLMAP model (sparse/0/cameras.bin and "
+        f"{root}: not a capture. {partial_model(root)}{others}Looked for a COLMAP model (sparse/0/cameras.bin and "
         "images.bin, or .txt), transforms.json (nerfstudio), train/metadata/*.pt (Mega-NeRF) and transforms_train.json "
         f"(MatrixCity). Photographs alone become one first: vdgs sfm {shell_word(root)} --output CAPTURE"
     )

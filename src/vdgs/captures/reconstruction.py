@@ -147,7 +147,15 @@ class ReconstructionReport:
 
 def is_reconstruction(root: Path) -> bool:
     """Whether a folder is a capture made of photographs here, finished or not."""
-    return (root / RECONSTRUCTION_FILE).is_file() or (root / WORK_FOLDER / STEPS_FILE).is_file()
+    return _is_ours(root / RECONSTRUCTION_FILE) or (root / WORK_FOLDER / STEPS_FILE).is_file()
+
+
+def _is_ours(file: Path) -> bool:
+    """Whether there is a file of facts; OpenSfM's of the same name is a list."""
+    if not file.is_file():
+        return False
+    with file.open("rb") as stream:
+        return not stream.read(64).lstrip().startswith(b"[")
 
 
 def is_finished(root: Path) -> bool:
@@ -159,7 +167,7 @@ def is_finished(root: Path) -> bool:
 def read_reconstruction(root: Path) -> ReconstructionReport | None:
     """The facts of a capture that was made of photographs here; None for others. CaptureError if they are damaged."""
     file = root / RECONSTRUCTION_FILE
-    if not file.is_file():
+    if not _is_ours(file):
         return None
     try:
         return record_from_dict(ReconstructionReport, read_json(file))
