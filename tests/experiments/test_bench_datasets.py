@@ -55,7 +55,7 @@ def data(tmp_path_factory) -> Path:
 
 def test_the_published_data_sets_are_benched(data, tmp_path):
     """Their folders are found and read, methods run with the paper's settings, and pixels are grouped by V."""
-    asked = ("--scenes", "residence", "block-all", "--methods", "3dgs", "blocks-2", "--iterations-total", "80")
+    asked = ("--scenes", "residence", "block-all", "--methods", "3dgs", "blocks-2", "--iterations-total", "40")
     done = vdgs("bench", "table1", "--output", tmp_path, "--data", data, *asked, "--seeds", "1", prepare=do_tasks_here)
     assert done.returncode == 0, done.stderr
     results = json.loads((tmp_path / "table1" / "results.json").read_text())["results"]

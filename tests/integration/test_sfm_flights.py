@@ -150,7 +150,7 @@ def beside(cameras: list[Camera], east: float) -> list[Camera]:
 
 
 def test_of_two_parts_the_larger_is_kept_and_the_other_named(tmp_path):
-    flown = fly(tmp_path / "card", [*beside(grid(2, 3, 9.0), -60), *beside(grid(2, 2, 9.0), 60)], 220)
+    flown = fly(tmp_path / "card", [*beside(grid(2, 3, 9.0), -45), *beside(grid(2, 2, 9.0), 45)], 160)
     said = console()
     facts = reconstruct(SfmRequest(image_folders=(flown.folder,), output=tmp_path / "capture", threads=1), said)
     assert facts.components == (6, 4)

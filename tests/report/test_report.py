@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from vdgs.errors import RunError
-from vdgs.report import write_report
+from vdgs.report import charts, write_report
 from vdgs.report.charts import running_median
 from vdgs.report.embedded_images import MAX_BYTES, reduce_image
 from vdgs.report.html_page import escape_html
@@ -29,6 +29,15 @@ FILES = ("coarse/start.json",
          "evaluation/per_view.json", "evaluation/by_block.json", "config.yaml", "capture.json")  # fmt: skip
 PICTURES = ("visibility/map.png", "partition/blocks.png", "partition/block_facts.png", "partition/scores.png",
             "evaluation/contact_sheet.png")  # fmt: skip
+
+
+FULL_DPI = charts.DPI
+
+
+@pytest.fixture(autouse=True)
+def small_charts(monkeypatch):
+    """Drawing is what a report takes longest for, and few tests are about charts."""
+    monkeypatch.setattr(charts, "DPI", 40)
 
 
 class Page(HTMLParser):
@@ -387,7 +396,8 @@ def test_nothing_is_loaded_from_elsewhere(whole):
     assert "@import" not in page.source
 
 
-def test_the_report_stays_small_with_many_views_and_large_pictures(tmp_path):
+def test_the_report_stays_small_with_many_views_and_large_pictures(tmp_path, monkeypatch):
+    monkeypatch.setattr(charts, "DPI", FULL_DPI)
     run = whole_run(tmp_path / "run", noise=True)
     names = tuple(f"{index:03d}.jpg" for index in range(150))
     write(run.path / "evaluation/per_view.json", views(20.0, names))
