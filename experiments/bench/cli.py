@@ -6,13 +6,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional, arg
-
 from vdgs.cli.common import make_console, parse_arguments
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import BIN_COUNT_RANGE
 from vdgs.config.output_paths import Output
-from vdgs.config.ranges import MAX_COUNT, Range
+from vdgs.config.ranges import MAX_COUNT, FlagName, Positional, Range
 
 TableName = Literal[
     "table1", "table2", "table3", "table3-each", "table4", "factorial", "coarse-compensation", "more-anchors",
@@ -27,11 +25,11 @@ class BenchArguments:
     The same command continues what was stopped; finished runs are kept.
     """
 
-    table: Positional[TableName]
-    """table1 to table4: those of the paper; table3-each, factorial, coarse-compensation, more-anchors: where its
-    premise holds, each block trained as long, its choices crossed, its compensation without blocks, and its parts
-    against plain growth at lower thresholds; efficiency: its paragraph; longer: blocks that train two and four times
-    as long; choices: one choice of ours changed at a time; toy: a small one in a minute or two."""
+    table: Annotated[TableName, Positional()]
+    """What to measure. table1 to table4: those of the paper; table3-each, factorial, coarse-compensation, more-anchors:
+    where its premise holds, each block trained as long, its choices crossed, its compensation without blocks, and its
+    parts against plain growth at lower thresholds; efficiency: its paragraph; longer: blocks that train two and four
+    times as long; choices: one choice of ours changed at a time; toy: a small one in a minute or two."""
     output: Annotated[Path, Output()]
     """Folder for runs and results; new, or the one to continue."""
     seeds: Annotated[int | None, Range(1, 1000)] = None
@@ -58,19 +56,19 @@ class BenchArguments:
     jobs: Annotated[int, Range(1, 1024)] = 1
     """Runs at once; cores are shared among them."""
     overwrite: bool = False
-    """Allow other settings than those of the runs that are there to discard what they trained."""
+    """Let other settings discard what was trained with the old ones."""
     lpips_weights: Path | None = None
     """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
     visibility_bins: Annotated[int, BIN_COUNT_RANGE] = 4
     """Number of groups by visibility."""
     quiet: bool = False
     """Print nothing but notes, warnings and errors."""
-    options: Annotated[CaptureOptions, arg(name="")] = field(default_factory=CaptureOptions)
+    options: Annotated[CaptureOptions, FlagName("")] = field(default_factory=CaptureOptions)
     """How folders among --scenes are read; scenes with names have their own. --validation holds for all."""
 
 
 def bench_command(arguments: list[str]) -> None:
-    args = parse_arguments(BenchArguments, arguments, "vdgs bench")
+    args = parse_arguments(BenchArguments, arguments, "bench")
     from experiments.bench.bench import BenchSettings, run_bench
     from experiments.bench.plan import PlanOptions
 

@@ -2,35 +2,26 @@
 
 import importlib.util
 import os
+import re
 import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-import tyro
 from rich.console import Console
 
-from support.clusters import copy_run
+from experiments.bench.cli import BenchArguments
 from support.commands import PATIENCE_SECONDS, vdgs
 from vdgs import cli
-from vdgs.cli.common import absolute_command_line, make_console
-from vdgs.cli.main import COMMANDS, HELP, get_command, main
-
-HEAVY = ("torch", "numpy", "matplotlib", "pycolmap", "cv2", "scipy")
-
-
-@pytest.mark.parametrize("arguments", [["--help"], ["train-coarse", "--help"], ["eval", "--help"]])
-def test_help_imports_nothing_heavy(arguments):
-    code = (
-        "import sys\nfrom vdgs.cli.main import main\n"
-        f"try:\n    main({arguments!r})\nexcept SystemExit as exit:\n    assert not exit.code, exit.code\n"
-        f"heavy = [name for name in {HEAVY!r} if name in sys.modules]\nassert not heavy, heavy\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE_SECONDS)
-    assert done.returncode == 0, done.stderr
-    assert "usage" in done.stdout.lower()
-
+from vdgs.cli import common
+from vdgs.cli.argument_parser import GivenArguments, parse_words
+from vdgs.cli.common import make_console
+from vdgs.cli.export_cmd import ExportArguments
+from vdgs.cli.help_text import COMMON_OPTIONS
+from vdgs.cli.main import COMMANDS, HELP, get_command, main, verb_arguments
+from vdgs.cli.run_cmd import NOT_KEPT, RunArguments
+from vdgs.config.options import options_of
 
 #: A module of those that take long to import, and what it imports only when it is needed.
 IMPORTED_LATE = {"vdgs.export.export_run": "viser", "vdgs.viewer.server": "matplotlib"}
@@ -58,22 +49,55 @@ def test_every_verb_is_in_the_help_and_has_an_action():
         assert callable(get_command(verb))
 
 
+def test_the_help_begins_with_five_verbs():
+    assert COMMANDS[:5] == ("run", "status", "view", "export", "doctor")
+
+
 @pytest.mark.parametrize("verb", COMMANDS)
-def test_every_verb_explains_itself(verb, capsys):
+@pytest.mark.parametrize("columns", [70, 100])
+def test_every_verb_explains_itself_on_two_screens_and_in_full(verb, columns, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    pages = {}
+    for flag in ("--help", "--help-all"):
+        with pytest.raises(SystemExit) as ended:
+            main([verb, flag])
+        assert ended.value.code == 0
+        pages[flag] = capsys.readouterr().out
+        assert max(map(len, pages[flag].splitlines())) <= columns
+    assert len(pages["--help"].splitlines()) <= 96
+    kind = (verb_arguments() | {"bench": BenchArguments})[verb]
+    assert kind is not None
+    said = " ".join(pages["--help-all"].split())
+    for option in options_of(kind):
+        assert option.help
+        assert option.help.rstrip(".") in said
+        assert option.is_positional or re.search(rf"{re.escape(option.flag)}[ ,]", said)
+
+
+def test_what_people_set_has_a_line_each(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    shown = [flag for flags in COMMON_OPTIONS["run"].values() for flag in flags]
+    assert {"--images", "--preset", "--blocks", "--output", "--overwrite", "--config", "--dry-run"} <= set(shown)
+    with pytest.raises(SystemExit):
+        main(["run", "--help"])
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) <= 60
+    assert sum(line.startswith("      ") for line in lines) <= 1  # a long list of formats
+
+
+def help_of(capsys, *arguments: object) -> str:
     with pytest.raises(SystemExit) as ended:
-        main([verb, "--help"])
+        main([str(each) for each in arguments])
     assert ended.value.code == 0
-    assert len(capsys.readouterr().out) > 100
+    return " ".join(capsys.readouterr().out.split())
 
 
 def test_the_preset_decides_the_defaults(capsys):
-    with pytest.raises(SystemExit):
-        main(["train-coarse", "--preset", "laptop", "--help"])
-    laptop = capsys.readouterr().out
-    with pytest.raises(SystemExit):
-        main(["train-coarse", "--help"])
-    assert "100000" in capsys.readouterr().out
-    assert "100000" not in laptop
+    for arguments, shown in ((["--preset", "laptop"], "0.0001"), (["--preset=default"], "0.0002"), ([], "0.0001")):
+        text = help_of(capsys, "train-coarse", "--device", "cpu", *arguments, "--help-all")
+        assert re.findall(r"--densify\.grad-threshold NUMBER .*?\(default: ([^)]*)\)", text) == [shown]
+    assert "(default: 100000)" in help_of(capsys, "train-coarse", "--help", "--preset", "default")
+    assert "100000" not in help_of(capsys, "train-coarse", "--help", "--preset", "laptop")
 
 
 def test_an_unknown_verb_is_a_usage_error(capsys):
@@ -127,9 +151,13 @@ def test_quiet_leaves_what_a_person_must_know(capsys):
 
 @pytest.mark.parametrize(
     ("verb", "does"),
-    [("report", "vdgs.report.write_report"), ("ortho", "vdgs.rendering.ortho.render_ortho.render_ortho")],
+    [("report", "vdgs.report.write_report.write_report"), ("ortho", "vdgs.rendering.ortho.render_ortho.render_ortho")],
 )
-def test_verbs_that_show_a_result_can_be_quiet(verb, does, monkeypatch, capsys):
+def test_verbs_that_show_a_result_can_be_quiet(verb, does, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("run").mkdir()
+    Path("run/config.yaml").touch()
+
     def done(*given: object) -> Path:
         for console in (each for each in given if isinstance(each, Console)):
             console.print("how it goes")
@@ -137,6 +165,7 @@ def test_verbs_that_show_a_result_can_be_quiet(verb, does, monkeypatch, capsys):
         return Path("result")
 
     monkeypatch.setattr(does, done)
+    monkeypatch.setattr("vdgs.runs.run_context.RunContext.from_path", lambda run: run)
     get_command(verb)(["run"])
     assert capsys.readouterr().out.startswith({"report": "report: result", "ortho": "how it goes"}[verb])
     get_command(verb)(["run", "--quiet"])
@@ -147,24 +176,52 @@ def test_verbs_that_show_a_result_can_be_quiet(verb, does, monkeypatch, capsys):
 
 def test_the_command_that_is_kept_works_in_every_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    typed = ["my place", "--output", "run", "--overwrite", "--blocks", "2", "--quiet"]
-    kept = absolute_command_line("run", typed, (Path("my place"), Path("run")))
-    assert shlex.split(kept) == ["vdgs", "run", f"{tmp_path}/my place", "--output", f"{tmp_path}/run", "--blocks", "2"]
-    assert f"--output={tmp_path}/run" in absolute_command_line(
-        "run", ["my place", "--output=run"], (Path("my place"), Path("run"))
-    )
+    for output in (["--output", "run"], ["-o", "run"], ["--out=run"]):
+        typed = ["my place", *output, "--overwrite", "--blocks", "2", "--no-ortho", "--quiet"]
+        kept = parse_words(RunArguments, typed).command_line("run", NOT_KEPT)
+        assert shlex.split(kept) == [
+            "vdgs", "run", f"{tmp_path}/my place", "--output", f"{tmp_path}/run", "--no-ortho", "--blocks", "2",
+        ]  # fmt: skip
+
+
+def test_more_folders_of_photographs_are_used_wherever_they_stand():
+    for words in (["A", "B", "D", "-o", "R"], ["A", "-o", "R", "B", "D"], ["-o", "R", "--quiet", "A", "--", "B", "D"]):
+        arguments = parse_words(RunArguments, words).over()
+        assert (arguments.capture, arguments.extra_image_folders) == (Path("A"), (Path("B"), Path("D")))
+
+
+def test_values_are_read_as_their_types_say():
+    words = [
+        "C", "-o", "R", "--up", "-x", "--resolution-schedule", "0", "4", "0.5", "1", "--lr.offsets", "1e-2", "1e-4",
+        "--blocks", "auto", "--max_images", "None", "--anchors.no-mvs", "--sfm.check-points", "a", "b",
+        "--slurm.sbatch-args", "--qos=long", "--exclusive", "--seed=3",
+    ]  # fmt: skip
+    given = parse_words(RunArguments, words).over()
+    assert given.options.up == "-x"
+    assert given.training.resolution_schedule == ((0.0, 4), (0.5, 1))
+    assert given.training.lr.offsets == (0.01, 1e-4)
+    assert (given.partition.blocks, given.options.max_images, given.training.seed) == ("auto", None, 3)
+    assert given.training.anchors.mvs is False
+    assert given.sfm.check_points == ("a", "b")
+    assert given.executor_options.slurm.sbatch_args == ("--qos=long", "--exclusive")
+    files = parse_words(
+        ExportArguments, ["R", "-o", "a.ply", "--output", "b.spz", "--bbox", "-1", "-2e1", "3", "4"]
+    ).over()
+    assert files.output == (Path("a.ply"), Path("b.spz"))
+    assert files.bbox == (-1.0, -20.0, 3.0, 4.0)
 
 
 def test_the_arguments_are_parsed_once(uncut, monkeypatch, tmp_path, capsys):
-    parsed, parse = [], tyro.cli
+    parsed = []
 
-    def count(kind: type, **options: object) -> object:
+    def count(kind: type, words: list[str]) -> GivenArguments:
         parsed.append(kind.__name__)
-        return parse(kind, **options)
+        return parse_words(kind, words)
 
-    monkeypatch.setattr(tyro, "cli", count)
+    monkeypatch.setattr(common, "parse_words", count)
+    (tmp_path / "empty").mkdir()
     for arguments in (
-        ("train-coarse", tmp_path / "nowhere", "--output", tmp_path / "run", "--preset=laptop"),
+        ("train-coarse", tmp_path / "empty", "--output", tmp_path / "run", "--preset=laptop"),
         ("train-blocks", uncut),
         ("merge", uncut, "--rule", "owner"),
         ("partition", "--capture", uncut, tmp_path),
@@ -176,15 +233,6 @@ def test_the_arguments_are_parsed_once(uncut, monkeypatch, tmp_path, capsys):
     assert f"{tmp_path}: is not a run folder" in capsys.readouterr().err
 
 
-def test_another_run_than_the_one_asked_for_is_named(uncut, tmp_path, capsys):
-    other = copy_run(uncut, tmp_path / "other")
-    with pytest.raises(SystemExit):
-        main(["train-blocks", "--capture", str(other), str(uncut)])
-    assert f"{other}: is a run, and so is {uncut}" in capsys.readouterr().err
-
-
 def test_a_run_decides_the_defaults_of_its_help(uncut, capsys):
-    for arguments, sampling in (([str(uncut)], "sqrt-visibility"), ([], "uniform")):
-        with pytest.raises(SystemExit):
-            main(["train-blocks", *arguments, "--help"])
-        assert f"(default: {sampling})" in capsys.readouterr().out
+    for arguments, sampling in (([uncut], "sqrt-visibility"), ([], "uniform")):
+        assert f"(default: {sampling})" in help_of(capsys, "train-blocks", *arguments, "--help-all")

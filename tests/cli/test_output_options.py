@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-import tyro
 from PIL import Image
 
-from vdgs.cli.main import COMMANDS, get_command, main
+from experiments.bench.cli import BenchArguments
+from vdgs.cli.main import COMMANDS, main, verb_arguments
 from vdgs.config.output_paths import Output, is_output
 from vdgs.config.ranges import FlagName, to_flag
 from vdgs.config.serialization import field_hints
@@ -21,25 +21,8 @@ from vdgs.config.serialization import field_hints
 #: Options that name what is only read.
 READ = {
     "capture", "run", "images", "gps", "gcp", "scale_bar", "test_list", "georef", "lpips_weights", "path", "data",
-    "reuse_results", "image_folders", "extra_image_folders",
+    "reuse_results", "config", "image_folders", "extra_image_folders",
 }  # fmt: skip
-
-
-class _Parsed(Exception):
-    pass
-
-
-def arguments_type(verb: str) -> type:
-    """The class of a verb's arguments."""
-
-    def catch(kind: type, **_: Any) -> None:
-        raise _Parsed(kind)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tyro, "cli", catch)
-        with pytest.raises(_Parsed) as parsed:
-            get_command(verb)(["run"])
-    return parsed.value.args[0]
 
 
 def path_options(kind: type, within: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
@@ -52,6 +35,11 @@ def path_options(kind: type, within: tuple[str, ...] = ()) -> Iterator[tuple[tup
             yield from path_options(inner, (*within, *filter(None, names[:1] or [field.name])))
         elif "Path" in str(hint):
             yield (*within, field.name), hint
+
+
+def arguments_type(verb: str) -> type:
+    """The class of a verb's arguments."""
+    return verb_arguments()[verb] or BenchArguments
 
 
 WRITTEN = [(verb, names) for verb in COMMANDS for names, hint in path_options(arguments_type(verb)) if is_output(hint)]

@@ -54,6 +54,8 @@ def test_a_run_ends_with_maps_and_its_report_shows_them(copied, capture):
     assert done.returncode == 0, done.stderr
     assert {"orthophoto.tif", "dsm.tif", "visibility.tif"} <= {file.name for file in (copied / "maps").iterdir()}
     assert "The scene as maps." in (copied / "report.html").read_text()
+    assert vdgs(*asked).stdout.startswith("nothing to do")
+    (copied / "report.html").unlink()
     assert "already drawn" in vdgs(*asked).stdout
 
 
@@ -167,6 +169,11 @@ def test_every_camera_serves_a_block_and_v_is_brute_force(unbroken):
 
 def test_a_finished_run_does_nothing_again(capture, copied):
     before = moments(copied)
+    again = vdgs("run", capture, "--output", copied, *SETTINGS)
+    assert again.returncode == 0, again.stderr
+    assert again.stdout.startswith(f"nothing to do: {copied} is whole")
+    assert changed_files(copied, before) == set()
+    (copied / "report.html").unlink()  # so that every stage looks
     again = vdgs("run", capture, "--output", copied, *SETTINGS)
     assert again.returncode == 0, again.stderr
     assert again.stdout.count("nothing to do") == 7

@@ -33,7 +33,7 @@ from vdgs.geometry.geodesy import enu_from_geodetic
 from vdgs.geometry.similarity import Similarity
 from vdgs.pipeline.dry_run import estimate_run
 from vdgs.pipeline.run_pipeline import reconstruct_if_needed
-from vdgs.report import write_report
+from vdgs.report.write_report import write_report
 from vdgs.runs.create_or_resume import create_or_resume_run
 from vdgs.runs.run_folder import RunFolder
 from vdgs.sfm import feature_extraction, feature_matching, georegistration, incremental_mapper

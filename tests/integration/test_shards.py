@@ -32,9 +32,9 @@ from vdgs.evaluation.by_block import BlockMetrics, SeamMetrics
 from vdgs.evaluation.by_visibility import VisibilityHistogram
 from vdgs.evaluation.comparison_images import Thumbnail
 from vdgs.evaluation.depth_errors import DepthErrors
+from vdgs.evaluation.measured_as import is_evaluated
 from vdgs.evaluation.view_metrics import ViewMetrics
 from vdgs.evaluation.view_metrics_io import load_view_metrics, save_view_metrics
-from vdgs.pipeline.evaluate_stage import is_evaluated
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.system.atomic_files import write_json

@@ -136,21 +136,23 @@ def test_deciding_needs_no_torch():
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["train-coarse", "nowhere", "--output", "run"],
-        ["run", "nowhere", "--output", "run"],
-        ["render", "nowhere", "--output", "pictures"],
-        ["eval", "nowhere"],
+        ["train-coarse", "empty", "--output", "run"],
+        ["run", "empty", "--output", "run"],
+        ["render", "empty", "--output", "pictures"],
+        ["eval", "empty"],
     ],
 )
 def test_every_verb_that_computes_refuses_before_it_begins(arguments, tmp_path, monkeypatch, capsys):
     from vdgs.cli.main import main
 
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty" / "config.yaml").touch()
     with pytest.raises(SystemExit) as ended:
         main([*arguments, "--device", "cuda"])
     assert ended.value.code == 1
     assert "--device cpu" in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []  # nothing was written, and that there is no capture did not matter yet
+    assert [path.name for path in tmp_path.iterdir()] == ["empty"]  # nothing was written; what is in it did not matter
 
 
 @pytest.mark.parametrize("device", ["auto", "cpu"])

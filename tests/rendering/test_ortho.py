@@ -31,7 +31,7 @@ from vdgs.geometry.camera import Camera
 from vdgs.geometry.map_projection import MapProjection
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.renderer import render
-from vdgs.rendering.ortho import ortho_plan, render_ortho, tile_renderer
+from vdgs.rendering.ortho import map_status, ortho_plan, render_ortho, tile_renderer
 from vdgs.rendering.ortho.geotiff import GDAL_CACHE_BYTES, limit_gdal_cache
 from vdgs.rendering.ortho.nadir_camera import NadirCamera
 from vdgs.rendering.ortho.pixel_grid import TILE_PX, PixelGrid, capture_extent, grid_from_bbox, ground_sampling_distance
@@ -332,9 +332,9 @@ def test_a_map_killed_while_its_files_take_their_places_is_known_as_ours_and_as_
             make(capture, model, gsd=0.5)
     run = SimpleNamespace(path=make.path, merged=SimpleNamespace(status=lambda: SimpleNamespace(model_id="1-2")))
     assert (make.path / "maps" / "dsm.tif").exists()
-    assert not render_ortho.is_ortho_current(run)
+    assert not map_status.is_ortho_current(run)
     make(capture, model, gsd=0.4)
-    assert render_ortho.is_ortho_current(run)
+    assert map_status.is_ortho_current(run)
 
 
 def test_what_a_killed_command_left_goes_before_the_work_and_is_said(house, make, capsys):

@@ -13,11 +13,12 @@ import pytest
 from PIL import Image
 
 from vdgs.errors import RunError
-from vdgs.report import charts, write_report
+from vdgs.report import charts
 from vdgs.report.charts import running_median
 from vdgs.report.embedded_images import MAX_BYTES, reduce_image
 from vdgs.report.html_page import escape_html
 from vdgs.report.run_reader import format_difference
+from vdgs.report.write_report import write_report
 from vdgs.runs.run_folder import RunFolder
 
 pytestmark = [pytest.mark.xdist_group("report"), pytest.mark.slow]

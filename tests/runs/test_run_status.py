@@ -13,21 +13,21 @@ from unittest.mock import Mock
 
 import pytest
 import yaml
-from tyro import MISSING
 
 from support.hand_made_models import model_at
 from support.next_commands import next_commands
 from vdgs.captures.capture import Capture
-from vdgs.cli.common import parse_arguments, preset_defaults
+from vdgs.cli.argument_parser import parse_words
 from vdgs.cli.main import main
 from vdgs.cli.run_cmd import RunArguments
+from vdgs.cli.start_settings import start_settings
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.method import MergeConfig, MethodConfig
 from vdgs.config.presets import PRESETS
 from vdgs.errors import RunError
 from vdgs.model.anchor_model import ModelMetadata
-from vdgs.report import write_report
 from vdgs.report.status_cli import EXIT_INCOMPLETE, full_run_status, next_line
+from vdgs.report.write_report import write_report
 from vdgs.runs.model_integrity import load_verified
 from vdgs.runs.open_run import open_model, open_run
 from vdgs.runs.run_folder import RunFolder
@@ -327,12 +327,8 @@ def test_a_run_without_its_command_is_continued_with_its_settings(tmp_path, chan
     (command,) = next_commands(line)
     words = shlex.split(command)
     assert words[:5] == ["vdgs", "run", str(tmp_path / "a capture"), "--output", str(run.path)]
-    preset, settings = preset_defaults(words[2:])
-    asked = RunArguments(
-        capture=MISSING, output=MISSING, preset=preset, training=settings.training, partition=settings.partition,
-        assignment=settings.assignment, block=settings.block, merge=settings.merge,
-    )  # fmt: skip
-    parsed = parse_arguments(RunArguments, words[2:], "vdgs run", asked)
+    given = parse_words(RunArguments, words[2:])
+    parsed = given.over(start_settings(given).layer())
     assert (parsed.method(), parsed.options) == (method, options)
 
 

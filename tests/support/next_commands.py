@@ -3,16 +3,9 @@
 from __future__ import annotations
 
 import shlex
-from unittest.mock import patch
 
-from vdgs.cli import capture_cmds, common, export_cmd, result_cmds, run_cmd, stage_cmds
-from vdgs.cli.main import COMMANDS, get_command
-
-MODULES = (capture_cmds, common, export_cmd, result_cmds, run_cmd, stage_cmds)
-
-
-class _Parsed(Exception):
-    """The arguments of a command were accepted."""
+from vdgs.cli.argument_parser import parse_words
+from vdgs.cli.main import verb_arguments
 
 
 def next_commands(output: str) -> list[str]:
@@ -28,24 +21,7 @@ def next_commands(output: str) -> list[str]:
 
 
 def parse(words: list[str]) -> None:
-    """Let a verb read its arguments, and no more. SystemExit where it refuses them."""
-    assert words[0] in COMMANDS, words
-
-    def read(*arguments: object, **options: object) -> object:
-        common_parse(*arguments, **options)
-        raise _Parsed
-
-    common_parse = common.parse_arguments
-    patches = [
-        patch.object(module, "parse_arguments", read) for module in MODULES if hasattr(module, "parse_arguments")
-    ]
-    for each in patches:
-        each.start()
-    try:
-        get_command(words[0])(words[1:])
-    except _Parsed:
-        return
-    finally:
-        for each in patches:
-            each.stop()
-    raise AssertionError(f"{words} was not parsed")
+    """Let a verb read its arguments, and no more. Raises UsageError or VdgsError where it refuses them."""
+    kind = verb_arguments()[words[0]]
+    assert kind is not None, words
+    parse_words(kind, words[1:]).check()

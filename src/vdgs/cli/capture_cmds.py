@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Annotated
 
 from rich.markup import escape
-from tyro.conf import Positional, arg
 
 from vdgs.cli.common import QuietArguments, make_console, parse_arguments
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.output_paths import Output
-from vdgs.config.ranges import WORKER_COUNT, FlagName
+from vdgs.config.ranges import WORKER_COUNT, FlagName, Positional
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
-from vdgs.errors import CaptureError, VdgsError
+from vdgs.errors import CaptureError
 from vdgs.synth.options import SynthOptions
 from vdgs.system.quoting import shell_line
 
@@ -24,17 +23,17 @@ class InspectArguments:
     """Say what a capture holds, whether it can become a scene, and how well its photographs cover the place, in a table
     and figures. Fails where training would be pointless."""
 
-    capture: Positional[Path]
+    capture: Annotated[Path, Positional()]
     """Folder of the capture."""
     output: Annotated[Path, Output()]
     """Folder for report.json and the figures."""
     check: bool = True
     """Decode every photograph once, to find damaged ones."""
-    options: Annotated[CaptureOptions, arg(name="")] = field(default_factory=CaptureOptions)
+    options: Annotated[CaptureOptions, FlagName("")] = field(default_factory=CaptureOptions)
 
 
 def inspect_command(arguments: list[str]) -> None:
-    args = parse_arguments(InspectArguments, arguments, "vdgs inspect")
+    args = parse_arguments(InspectArguments, arguments, "inspect")
     from vdgs.captures.image_checks import check_images
     from vdgs.captures.loading import load_capture
     from vdgs.captures.output_guard import check_not_among_inputs
@@ -53,13 +52,13 @@ def inspect_command(arguments: list[str]) -> None:
 class SynthArguments(QuietArguments):
     """Generate an aerial place and a drone flight over it, as a COLMAP capture."""
 
-    output: Annotated[Positional[Path], Output()]
+    output: Annotated[Path, Positional(), Output()]
     """Folder for the capture; it must not exist or be empty."""
-    options: Annotated[SynthOptions, arg(name="")] = field(default_factory=SynthOptions)
+    options: Annotated[SynthOptions, FlagName("")] = field(default_factory=SynthOptions)
 
 
 def synth_command(arguments: list[str]) -> None:
-    args = parse_arguments(SynthArguments, arguments, "vdgs synth")
+    args = parse_arguments(SynthArguments, arguments, "synth")
     from rich.progress import TaskID
 
     from vdgs.synth import generate
@@ -83,7 +82,7 @@ class SfmArguments(QuietArguments):
     """Photographs to a capture: features, matches, poses and points, metres and north from their positions, photographs
     without lens distortion in three sizes. The same command goes on where it was stopped. Photographs are only read."""
 
-    images: Positional[tuple[Path, ...]]
+    images: Annotated[tuple[Path, ...], Positional("PHOTOGRAPHS")]
     """Folders of photographs, those below them included. A folder masks/ beside photographs has their masks (white =
     keep), named like them: name.png or name.jpg.png; name_mask.jpg beside name.jpg is one too."""
     output: Annotated[Path, Output()]
@@ -100,15 +99,13 @@ class SfmArguments(QuietArguments):
     """Keep COLMAP's database and models in OUTPUT/work once all is done."""
     overwrite: bool = False
     """Make the capture anew where photographs were added, removed or changed since it was begun."""
-    options: Annotated[SfmOptions, arg(name=""), FlagName("")] = field(default_factory=SfmOptions)
+    options: Annotated[SfmOptions, FlagName("")] = field(default_factory=SfmOptions)
 
 
 def sfm_command(arguments: list[str]) -> None:
-    args = parse_arguments(SfmArguments, arguments, "vdgs sfm")
+    args = parse_arguments(SfmArguments, arguments, "sfm")
     from vdgs.sfm.reconstruction_plan import plan_reconstruction, print_plan
 
-    if not args.images:
-        raise VdgsError("name the folder of the photographs: vdgs sfm PHOTOGRAPHS --output CAPTURE")
     request = SfmRequest(
         image_folders=args.images, output=args.output, gps=args.gps, threads=args.threads,
         keep_intermediate=args.keep_intermediate, overwrite=args.overwrite, options=args.options,

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-import tyro
-from tyro.conf import Positional, arg
-
+from vdgs.cli.advice import MESSAGE_FIT
+from vdgs.cli.argument_parser import FULL_HELP_FLAG, GivenArguments, UsageError, parse_words
 from vdgs.config.executor_options import ExecutorOptions
 from vdgs.config.method import MethodConfig
 from vdgs.config.output_paths import output_paths
-from vdgs.config.presets import PRESETS, PresetName
-from vdgs.config.ranges import WORKER_COUNT, check_ranges
+from vdgs.config.ranges import WORKER_COUNT, FlagName, Positional, check_ranges
 from vdgs.errors import VdgsError
-from vdgs.system.quoting import shell_line
 
 #: What lines begin with that are printed even where a person asked for quiet.
 ALWAYS_PRINTED_PREFIXES = ("[yellow]", "[red]")
@@ -52,7 +50,7 @@ class ComputeArguments(QuietArguments):
 class RunPathArguments:
     """What verbs about a run that is there take."""
 
-    run: Positional[Path]
+    run: Annotated[Path, Positional(is_run=True)]
     """Run folder."""
 
 
@@ -69,9 +67,8 @@ class ShardArguments:
     """What verbs take whose work is split into shards (views, tiles, cameras, parts)."""
 
     jobs: Annotated[int, WORKER_COUNT] = 0
-    """Shards done at once, each in a process of its own; 0: on this machine one process does all, a cluster as many as
-    it has room for."""
-    executor_options: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
+    """Shards done at once; 0: one here, on a cluster as many as it has room for. Each has a process of its own."""
+    executor_options: Annotated[ExecutorOptions, FlagName("")] = field(default_factory=ExecutorOptions)
 
     def execution(self, device: str) -> ExecutionOptions:
         """Where the shards are done. Raises VdgsError for options that do not work."""
@@ -81,59 +78,72 @@ class ShardArguments:
         return ExecutionOptions(self.executor_options, self.jobs, device=device)
 
 
-def parse_arguments(
-    arguments_type: type[Parsed], arguments: list[str], prog: str, default: Parsed | None = None
-) -> Parsed:
-    """The arguments of a verb. Raises VdgsError for a number that is outside its range (`config.ranges`), and
-    for an output among photographs or in a capture's inputs (`captures.output_guard`)."""
-    options: dict[str, Any] = {} if default is None else {"default": default}
-    parsed: Parsed = tyro.cli(arguments_type, args=arguments, prog=prog, **options)
+#: Defaults of some arguments, which may depend on what was given: values by path, or by the name of a field.
+Layers = Callable[[GivenArguments], Sequence[Mapping[Any, Any]]]
+
+
+def read_arguments(kind: type, words: list[str], verb: str, defaults: Layers = lambda _: ()) -> GivenArguments:
+    """What a command line gives for a verb. Prints the help with the `defaults` and ends the process where it is asked
+    for, or with the code for it where the command line cannot be understood.
+
+    Raises VdgsError for an input that does not exist, before anything heavy is imported.
+    """
+    try:
+        given = parse_words(kind, words)
+        if not given.help:
+            given.check()
+            return given
+    except UsageError as error:
+        print(
+            f"vdgs {verb}: {error}\n`vdgs {verb} --help` shows the options, `vdgs {verb} --help-all` all of them.",
+            file=sys.stderr,
+        )
+        sys.exit(2)
+    from vdgs.cli.help_text import help_text
+
+    try:
+        layers = defaults(given)
+    except VdgsError:  # of no run, or of none that can be read
+        layers = ()
+    print(help_text(verb, kind, given.over(*layers), full=given.help == FULL_HELP_FLAG), end="")
+    sys.exit(0)
+
+
+def parse_arguments(kind: type[Parsed], words: list[str], verb: str, defaults: Layers = lambda _: ()) -> Parsed:
+    """The arguments of a verb over its defaults. Raises what `read_arguments` and `defaults` raise, and VdgsError for a
+    number outside its range (`config.ranges`) and for an output among photographs."""
+    given = read_arguments(kind, words, verb, defaults)
+    parsed: Parsed = given.over(*defaults(given))
     check_ranges(parsed)
-    if outputs := list(output_paths(parsed)):
+    check_outputs(parsed)
+    return parsed
+
+
+def check_outputs(arguments: Any) -> None:
+    """Raise VdgsError for an output among photographs or in a capture's inputs (`captures.output_guard`)."""
+    if outputs := list(output_paths(arguments)):
         from vdgs.captures.output_guard import check_output
 
         for path in outputs:
             check_output(path)
-    return parsed
-
-
-# The values of a preset, or those that a run recorded, are the defaults of all other options, and --help shows them:
-# tyro must be given them before it parses and cannot look up one argument first. The two functions below look up that
-# one and nothing else.
-
-
-def preset_defaults(arguments: list[str]) -> tuple[PresetName, MethodConfig]:
-    """The preset that the arguments name, and its settings; `default` without one, or where tyro is to refuse it."""
-    named = "default"
-    for argument, following in zip(arguments, [*arguments[1:], ""], strict=True):
-        option, joined, value = argument.partition("=")
-        if option == "--preset":
-            named = value if joined else following
-    name: PresetName = named if named in PRESETS else "default"  # type: ignore[assignment]
-    return name, PRESETS[name]
 
 
 def parse_for_run(
-    arguments_type: type[Parsed], arguments: list[str], prog: str, defaults: Callable[[MethodConfig], Parsed]
+    kind: type[Parsed], words: list[str], verb: str, defaults: Callable[[MethodConfig], Mapping[str, Any]]
 ) -> tuple[Parsed, RunFolder, MethodConfig]:
     """The arguments of a verb, the run that they name and its settings, which are the `defaults`.
 
-    Raises what `parse_arguments` raises, RunError where the run is none, VdgsError where another option names a run.
+    Raises what `parse_arguments` raises, and RunError where the run is none.
     """
+    from vdgs.runs.run_folder import RunFolder
 
-    def open_folder(path: Path) -> RunFolder:
-        from vdgs.runs.run_folder import RunFolder  # --help of no run comes without it
+    def own(given: GivenArguments) -> list[Mapping[str, Any]]:
+        path = given.get("run")
+        return [] if path is None else [defaults(RunFolder(path).method())]
 
-        return RunFolder(path)
-
-    named = next((Path(each) for each in arguments if (Path(each) / "config.yaml").is_file()), None)
-    method = MethodConfig() if named is None else open_folder(named).method()
-    parsed = parse_arguments(arguments_type, arguments, prog, defaults(method))
-    run = open_folder(parsed.run)  # type: ignore[attr-defined]
-    own = run.method()
-    if named != run.path:
-        raise VdgsError(f"{named}: is a run, and so is {run.path}. Name one run; --capture takes a capture's folder.")
-    return parsed, run, own
+    parsed = parse_arguments(kind, words, verb, own)
+    run = RunFolder(parsed.run)  # type: ignore[attr-defined]
+    return parsed, run, run.method()
 
 
 def update_run_settings(run: RunFolder, method: MethodConfig, overwrite: bool, console: Console) -> None:
@@ -159,23 +169,26 @@ def set_up_compute(device: str, threads: int) -> str:
 
 
 def make_console(quiet: bool = False) -> Console:
-    """Where verbs print to; with `quiet` only notes and warnings are, on standard error."""
+    """Where the verb that runs prints to; with `quiet` only notes and warnings are, on standard error."""
     from rich.console import Console
 
     from vdgs.system.console import escape_names
 
-    class Names(Console):
-        """Prints names with brackets as they are."""
+    fit = MESSAGE_FIT.get()
+
+    class Fitted(Console):
+        """Prints texts as they are for the verb, and names with brackets as they are."""
 
         def print(self, *objects: Any, **options: Any) -> None:
+            texts = [fit(each) if isinstance(each, str) else each for each in objects]
             if options.get("markup", True):
-                objects = tuple(escape_names(each) if isinstance(each, str) else each for each in objects)
-            super().print(*objects, **options)
+                texts = [escape_names(each) if isinstance(each, str) else each for each in texts]
+            super().print(*texts, **options)
 
     if not quiet:
-        return Names(soft_wrap=True)
+        return Fitted(soft_wrap=True)
 
-    class Warnings(Names):
+    class Warnings(Fitted):
         """Prints what a person must know, and leaves out how work goes."""
 
         def print(self, *objects: Any, **options: Any) -> None:
@@ -186,11 +199,3 @@ def make_console(quiet: bool = False) -> Console:
             pass
 
     return Warnings(soft_wrap=True, stderr=True, force_terminal=False, force_interactive=False)
-
-
-def absolute_command_line(verb: str, arguments: list[str], paths: tuple[Path, ...]) -> str:
-    """The command as it can be typed in any folder: with absolute paths, without `--overwrite` and `--quiet`."""
-    whole = {str(path): str(path.resolve()) for path in paths}
-    whole |= {f"--output={name}": f"--output={path}" for name, path in whole.items()}
-    words = [whole.get(each, each) for each in arguments if each not in ("--overwrite", "--quiet")]
-    return shell_line(["vdgs", verb, *words])

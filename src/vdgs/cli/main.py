@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any
 
 HELP = """\
@@ -12,12 +13,18 @@ usage: vdgs VERB [options]
 
 vdgs turns a folder of drone photographs into one 3D Gaussian splatting scene.
 
-  inspect CAPTURE --output FOLDER   what a capture holds and how well it covers the place
   run CAPTURE --output RUN          everything: model, blocks, merge, metrics, report; the same command continues.
                                     CAPTURE may be a folder of photographs alone: `sfm` then comes first
   status RUN                        how far a run is, stage by stage, and what to type next
+  view RUN                          move through the scene in a browser: layers, places, camera paths
+  export RUN --output FILE          the scene for other programs: PLY, SPZ, SOG, glTF, 3D Tiles, LAZ
+  doctor                            what this machine can use, and what to install for the rest
 
-its stages, one by one:
+before a run:
+  inspect CAPTURE --output FOLDER   what a capture holds and how well it covers the place
+  config --output FILE              all settings as YAML with comments, for `run CAPTURE --config FILE`
+
+the stages of a run, one by one:
   sfm PHOTOGRAPHS --output CAPTURE  photographs to a capture: poses, points, metres and north; the same command goes on
   train-coarse CAPTURE --output RUN train the global model; the same command continues it
   visibility RUN                    how many cameras see each part of the scene
@@ -28,16 +35,14 @@ its stages, one by one:
   report RUN                        one HTML file with figures, metrics, pictures and settings
 
 more:
-  view RUN                          move through the scene in a browser: layers, places, camera paths
   render RUN                        views or a camera path, as PNG or video
   ortho RUN                         orthophoto, surface model and visibility as GeoTIFFs
-  export RUN --output FILE          the scene for other programs: PLY, SPZ, SOG, glTF, 3D Tiles, LAZ
   synth OUTPUT                      generate a small aerial town with known truth
   bench TABLE --output FOLDER       methods x scenes x seeds: the paper's tables and a verdict; needs a checkout
-  doctor                            what this machine can use, and what to install for the rest
 
-vdgs VERB --help explains the options of a verb. A capture is a folder with images/ and sparse/0 (COLMAP),
-transforms.json (nerfstudio), train/ and val/ (Mega-NeRF) or the layout of MatrixCity; `sfm` makes one of photographs.
+vdgs VERB --help shows the options that people set, --help-all every one. A capture is a folder with images/ and
+sparse/0 (COLMAP), transforms.json (nerfstudio), train/ and val/ (Mega-NeRF) or the layout of MatrixCity; `sfm` makes
+one of photographs.
 """
 
 #: The verbs, which begin the lines of the help.
@@ -59,25 +64,26 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"vdgs {__version__}")
         return
     if arguments[0] not in COMMANDS:
-        print(f"{HELP}\nvdgs: there is no verb {arguments[0]!r}{_suggestion(arguments[0])}", file=sys.stderr)
+        from vdgs.config.serialization import suggest
+
+        meant = suggest(arguments[0].lower().lstrip("-"), [*COMMANDS, "help"])
+        print(f"{HELP}\nvdgs: there is no verb {arguments[0]!r}{meant}", file=sys.stderr)
         sys.exit(2)
     sys.exit(_run_command(arguments[0], arguments[1:]))
 
 
-def _suggestion(word: str) -> str:
-    """A question about the verb that may be meant."""
-    import difflib
-
-    similar = difflib.get_close_matches(word.lower().lstrip("-"), [*COMMANDS, "help"], n=1)
-    return f"; did you mean {similar[0]!r}?" if similar else ""
-
-
 def _run_command(command: str, arguments: list[str]) -> int:
+    from vdgs.cli.advice import MESSAGE_FIT, Advice
     from vdgs.system.exit_codes import exit_code_of
 
     action = get_command(command)
     again = "continues: what is finished is kept" if command in RESUMABLE_COMMANDS else "begins it anew"
-    return exit_code_of(f"vdgs {command}", lambda: action(arguments), f"The same command {again}.")
+    fit = Advice(command, verb_arguments).fit
+    token = MESSAGE_FIT.set(fit)
+    try:
+        return exit_code_of(f"vdgs {command}", lambda: action(arguments), f"The same command {again}.", fit)
+    finally:
+        MESSAGE_FIT.reset(token)
 
 
 def get_command(name: str) -> Callable[[list[str]], Any]:
@@ -87,6 +93,15 @@ def get_command(name: str) -> Callable[[list[str]], Any]:
     function = f"{name.replace('-', '_')}_command"
     modules = (capture_cmds, export_cmd, result_cmds, run_cmd, stage_cmds, tool_cmds)
     return next(getattr(module, function) for module in modules if hasattr(module, function))
+
+
+@cache
+def verb_arguments() -> dict[str, type | None]:
+    """The dataclass of the arguments of every verb; None of `bench`, which only a checkout has."""
+    modules = {verb: sys.modules[get_command(verb).__module__] for verb in COMMANDS}
+    return {
+        verb: getattr(module, f"{verb.title().replace('-', '')}Arguments", None) for verb, module in modules.items()
+    }
 
 
 if __name__ == "__main__":

@@ -6,8 +6,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional
-
 from vdgs.cli.common import (
     ComputeArguments,
     QuietArguments,
@@ -19,6 +17,7 @@ from vdgs.cli.common import (
     set_up_compute,
 )
 from vdgs.config.commands import BIN_COUNT_RANGE, ModelName, OrthoRequest, RenderRequest, ViewRequest
+from vdgs.config.ranges import Positional
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +34,7 @@ class StatusArguments(RunPathArguments):
 
 
 def status_command(arguments: list[str]) -> int:
-    args = parse_arguments(StatusArguments, arguments, "vdgs status")
+    args = parse_arguments(StatusArguments, arguments, "status")
     from vdgs.report.status_cli import EXIT_INCOMPLETE, print_status, status_json
     from vdgs.runs.run_folder import RunFolder
 
@@ -65,7 +64,7 @@ class EvalArguments(ShardArguments, ComputeArguments, StageArguments):
 
 
 def eval_command(arguments: list[str]) -> None:
-    args = parse_arguments(EvalArguments, arguments, "vdgs eval")
+    args = parse_arguments(EvalArguments, arguments, "eval")
     from vdgs.pipeline.evaluate_stage import EvaluationRequest, evaluate_stage
     from vdgs.runs.run_context import RunContext
 
@@ -86,10 +85,13 @@ def eval_command(arguments: list[str]) -> None:
 class ReportArguments(RunPathArguments, QuietArguments):
     """Write RUN/report.html: one file with the figures, metrics, pictures and settings of a run."""
 
+    run: Annotated[Path, Positional()]
+    """Run folder; what is damaged or missing is left out."""
+
 
 def report_command(arguments: list[str]) -> None:
-    args = parse_arguments(ReportArguments, arguments, "vdgs report")
-    from vdgs.report import write_report
+    args = parse_arguments(ReportArguments, arguments, "report")
+    from vdgs.report.write_report import write_report
     from vdgs.runs.run_folder import RunFolder
 
     make_console(args.quiet).print(f"report: {write_report(RunFolder(args.run))}", highlight=False)
@@ -99,12 +101,9 @@ def report_command(arguments: list[str]) -> None:
 class RenderArguments(RenderRequest, QuietArguments):
     """Render a run: its test views, its training views, or a camera path; as PNG files or a video."""
 
-    run: Positional[Path]
-    """Run folder."""
-
 
 def render_command(arguments: list[str]) -> None:
-    args = parse_arguments(RenderArguments, arguments, "vdgs render")
+    args = parse_arguments(RenderArguments, arguments, "render")
     from vdgs.rendering.render_run import render_run
 
     render_run(replace(args, device=set_up_compute(args.device, args.threads)), make_console(args.quiet))
@@ -117,12 +116,9 @@ class OrthoArguments(OrthoRequest, ShardArguments, QuietArguments):
     Needs rasterio and pyproj: pip install 'vdgs[geo]'.
     """
 
-    run: Positional[Path]
-    """Run folder."""
-
 
 def ortho_command(arguments: list[str]) -> None:
-    args = parse_arguments(OrthoArguments, arguments, "vdgs ortho")
+    args = parse_arguments(OrthoArguments, arguments, "ortho")
     from vdgs.rendering.ortho.render_ortho import render_ortho
     from vdgs.runs.run_context import RunContext
 
@@ -139,12 +135,9 @@ class ViewArguments(ViewRequest):
     Prints the address to open; Ctrl-C ends it. Needs viser: pip install 'vdgs[viewer]'.
     """
 
-    run: Positional[Path]
-    """Run folder."""
-
 
 def view_command(arguments: list[str]) -> None:
-    args = parse_arguments(ViewArguments, arguments, "vdgs view")
+    args = parse_arguments(ViewArguments, arguments, "view")
     from vdgs.viewer.server import view_run
 
     view_run(replace(args, device=set_up_compute(args.device, args.threads)), make_console())

@@ -5,9 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Annotated
 
-import tyro
-from tyro.conf import arg
-
 from vdgs.cli.common import (
     ComputeArguments,
     ShardArguments,
@@ -20,7 +17,7 @@ from vdgs.cli.common import (
 )
 from vdgs.config.executor_options import CheckpointOptions, ExecutorOptions
 from vdgs.config.method import AssignmentConfig, BlockConfig, MergeConfig, PartitionConfig
-from vdgs.config.ranges import WORKER_COUNT, Range
+from vdgs.config.ranges import WORKER_COUNT, FlagName, Range
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +26,7 @@ class VisibilityArguments(StageArguments):
 
 
 def visibility_command(arguments: list[str]) -> None:
-    args = parse_arguments(VisibilityArguments, arguments, "vdgs visibility")
+    args = parse_arguments(VisibilityArguments, arguments, "visibility")
     from vdgs.pipeline.count_visibility import count_run_visibility
     from vdgs.runs.run_context import RunContext
 
@@ -44,14 +41,14 @@ class PartitionArguments(ShardArguments, ComputeArguments, StageArguments):
     """Allow another cut to discard blocks that are trained."""
     explain: str | None = None
     """Name of a training photograph: also say how well it shows each block and why it was assigned or not."""
-    partition: Annotated[PartitionConfig, arg(name="")] = field(default_factory=PartitionConfig)
+    partition: Annotated[PartitionConfig, FlagName("")] = field(default_factory=PartitionConfig)
     assignment: AssignmentConfig = field(default_factory=AssignmentConfig)
 
 
 def partition_command(arguments: list[str]) -> None:
     args, run, method = parse_for_run(
-        PartitionArguments, arguments, "vdgs partition",
-        lambda own: PartitionArguments(run=tyro.MISSING, partition=own.partition, assignment=own.assignment),
+        PartitionArguments, arguments, "partition",
+        lambda own: {"partition": own.partition, "assignment": own.assignment},
     )  # fmt: skip
     from vdgs.pipeline.partition_stage import explain_view, partition_run
     from vdgs.runs.run_context import RunContext
@@ -74,18 +71,18 @@ class TrainBlocksArguments(ComputeArguments, StageArguments):
     jobs: Annotated[int, WORKER_COUNT] = 0
     """Blocks trained at once; 0 takes what cores and memory allow."""
     overwrite: bool = False
-    """Allow other settings to discard blocks that are trained with the old ones."""
+    """Let other settings discard blocks trained with the old ones."""
     threads: Annotated[int, WORKER_COUNT] = 0
     """Threads of the kernels for --block; 0 for all cores. The result does not depend on it."""
-    block_config: Annotated[BlockConfig, arg(name="block")] = field(default_factory=BlockConfig)
-    checkpointing: Annotated[CheckpointOptions, arg(name="")] = field(default_factory=CheckpointOptions)
-    executor_options: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
+    block_config: Annotated[BlockConfig, FlagName("block")] = field(default_factory=BlockConfig)
+    checkpointing: Annotated[CheckpointOptions, FlagName("")] = field(default_factory=CheckpointOptions)
+    executor_options: Annotated[ExecutorOptions, FlagName("")] = field(default_factory=ExecutorOptions)
 
 
 def train_blocks_command(arguments: list[str]) -> None:
     args, run, method = parse_for_run(
-        TrainBlocksArguments, arguments, "vdgs train-blocks",
-        lambda own: TrainBlocksArguments(run=tyro.MISSING, block_config=own.block),
+        TrainBlocksArguments, arguments, "train-blocks",
+        lambda own: {"block_config": own.block},
     )  # fmt: skip
     from vdgs.pipeline.train_block import train_block
     from vdgs.pipeline.train_blocks import train_blocks
@@ -106,13 +103,11 @@ class MergeArguments(StageArguments):
 
     allow_missing_blocks: bool = False
     """Let the coarse model stand in for blocks that are missing or failed."""
-    merge: Annotated[MergeConfig, arg(name="")] = field(default_factory=MergeConfig)
+    merge: Annotated[MergeConfig, FlagName("")] = field(default_factory=MergeConfig)
 
 
 def merge_command(arguments: list[str]) -> None:
-    args, run, method = parse_for_run(
-        MergeArguments, arguments, "vdgs merge", lambda own: MergeArguments(run=tyro.MISSING, merge=own.merge)
-    )
+    args, run, method = parse_for_run(MergeArguments, arguments, "merge", lambda own: {"merge": own.merge})
     from vdgs.pipeline.merge_blocks import merge_run_blocks
     from vdgs.runs.run_context import RunContext
 

@@ -25,7 +25,7 @@ class DoctorArguments:
 
 
 def doctor_command(arguments: list[str]) -> int:
-    args = parse_arguments(DoctorArguments, arguments, "vdgs doctor")
+    args = parse_arguments(DoctorArguments, arguments, "doctor")
     from vdgs.cli.doctor.doctor_report import print_report
 
     return print_report(as_json=args.json)

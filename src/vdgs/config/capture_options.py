@@ -19,28 +19,28 @@ class CaptureOptions:
     """How to read a folder of photographs with cameras."""
 
     format: CaptureFormat = "auto"
-    """What to read where a folder holds captures of several formats. auto: of a COLMAP model and transforms.json the
+    """Format to read, where a folder holds several. auto: of a COLMAP model and transforms.json the
     model, unless transforms.json lists training and test photographs or names masks."""
     images: str | None = None
     """Image folder to use, such as images_4. Default: images, or where absent the largest images_N."""
     downscale: Annotated[float, Range(1, 1000)] = 1.0
-    """Extra shrink applied when images are loaded (2 = half the width and height)."""
+    """Shrink images by this factor when they are loaded. 2: half the width and height."""
     test_every: Annotated[int, Range(2, MAX_COUNT)] = 8
-    """Every n-th photograph in name order is kept for testing (0, n, 2n, ...), as in 3DGS (llffhold)."""
+    """Every n-th photograph in name order is kept for testing. Those are 0, n, 2n and so on, as in 3DGS (llffhold)."""
     test_list: Path | None = None
     """Text file with the names of the test photographs, one a line. Default: test.txt in the capture folder, if any."""
     split: SplitMode = "auto"
-    """auto: the capture's own split or test list where there is one, else every n-th (where transforms.json lists
-    training and test photographs, those in neither list are left out); explicit: insist on it;
-    every: always every n-th."""
+    """How photographs are kept for testing. auto: the capture's own split or test list where there is one, else every
+    n-th (where transforms.json lists training and test photographs, those in neither list are left out); explicit:
+    insist on it; every: always every n-th."""
     validation: bool = False
-    """Leave the test photographs out altogether and test on those named in validation.txt of the capture folder
-    instead, or where there is none on every n-th training photograph: for choosing settings without looking at the
-    test set. Photographs named in validation.txt never train."""
+    """Test on photographs for validation instead. The test photographs are left out altogether, and tests are on those
+    named in validation.txt of the capture folder instead, or where there is none on every n-th training photograph: for
+    choosing settings without looking at the test set. Photographs named in validation.txt never train."""
     up: UpAxis = "auto"
-    """Which axis of the capture's own world points up. auto: georeference, GPS, or estimated."""
+    """Which axis of the capture points up. auto: georeference, GPS, or estimated."""
     gps: Path | None = None
-    """Table of photographs' GPS positions: columns name,lat,lon,alt as exiftool, Metashape, Pix4D, RealityScan and
+    """Table of the photographs' GPS positions. Columns name,lat,lon,alt as exiftool, Metashape, Pix4D, RealityScan and
     others name them (further ones allowed), or ODM's geo.txt. Names need no folder and no extension where they are told
     apart without."""
     georef: Path | None = None
@@ -50,10 +50,10 @@ class CaptureOptions:
     x y photograph` mark points in two photographs or more, lines `NAME NAME metres` say how far they are apart. `vdgs
     view` writes such a file."""
     max_images: Annotated[int | None, Range(2, MAX_COUNT)] = None
-    """Use only this many photographs: those nearest to the middle of the flight."""
+    """Use only this many photographs. Those nearest to the middle of the flight are taken."""
     undistort: bool = False
-    """Undistort photographs whose camera model has lens distortion (written once, then reused)."""
+    """Undistort photographs with lens distortion. They are written once, then reused."""
     undistorted_folder: Annotated[Path | None, Output()] = None
     """Where undistorted photographs are kept. Default: undistorted/ inside the capture folder."""
     masks: str = "masks"
-    """Folder of masks (white = keep), named like the photographs: name.png or name.jpg.png."""
+    """Folder of masks (white = keep), named like the photographs. That is name.png or name.jpg.png."""

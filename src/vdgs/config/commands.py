@@ -10,8 +10,8 @@ from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.executor_options import CheckpointOptions, ExecutorOptions
 from vdgs.config.method import AssignmentConfig, BlockConfig, MergeConfig, MethodConfig, PartitionConfig, TrainConfig
 from vdgs.config.output_paths import Output
-from vdgs.config.presets import PresetName
-from vdgs.config.ranges import MAX_COUNT, MAX_FLOAT, WORKER_COUNT, FlagName, Range
+from vdgs.config.presets import PresetChoice
+from vdgs.config.ranges import MAX_COUNT, MAX_FLOAT, WORKER_COUNT, FlagName, Positional, Range, Repeatable
 from vdgs.config.sfm_options import SfmOptions
 
 #: Groups by visibility: with more than some dozens none holds enough pixels to say anything.
@@ -41,24 +41,26 @@ AxesName = Literal["z-up", "y-up", "y-down", "y-up-left"]
 class RunRequest:
     """Everything from a capture to a report (`vdgs run`)."""
 
-    capture: Path
-    """Folder of the capture, or of photographs alone: they become one in RUN/capture first (`vdgs sfm`)."""
+    capture: Annotated[Path, Positional()]
+    """Folder of the capture, or of photographs alone. These become one in RUN/capture first (`vdgs sfm`)."""
     output: Annotated[Path, Output()]
     """Run folder; new, or the run to continue."""
-    preset: PresetName = "default"
-    """`laptop`: a good result in minutes. `default`: the paper's numbers (100 000 + 50 000 iterations a block), and our
-    choices where it is silent: gaps filled, outliers left out, a background of the mean colour, of random colours in
-    training, bounded sizes, cameras by `coverage` and each in its best block, a minimum of cameras a block, blocks
-    drawn in their surroundings, a lower gate of compensated growth, g added to means, only visible anchors moved.
-    `paper`: the paper's numbers and none of those choices."""
+    preset: PresetChoice = "auto"
+    """Settings by name. `auto`: those of the run that is there, else `laptop` on a CPU
+    and `default` on a GPU. `laptop`: minutes to an hour on a CPU. `default`: the paper's numbers (100 000 + 50 000
+    iterations a block), and our choices where it is silent: gaps filled, outliers left out, a background of the mean
+    color, of random colors in training, bounded sizes, cameras by `coverage` and each in its best block, a minimum of
+    cameras a block, blocks drawn in their surroundings, a lower gate of compensated growth, g added to means, only
+    visible anchors moved. `paper`: the paper's numbers and none of those choices."""
     overwrite: bool = False
-    """Allow other settings than the run has to discard what was trained with the old ones."""
+    """Let other settings discard what was trained with the old ones."""
     jobs: Annotated[int, WORKER_COUNT] = 0
-    """Blocks trained at once, on a cluster also shards of other stages; 0 takes what there is room for."""
+    """Blocks trained at once; 0 takes what there is room for. On a cluster also shards of other stages."""
     allow_missing_blocks: bool = False
     """Go on if a block fails: the coarse model stands in for it."""
     ortho: bool = True
-    """End with orthophoto, surface model and visibility as GeoTIFFs in RUN/maps, where `vdgs ortho` can make them."""
+    """End with maps in RUN/maps. Orthophoto, surface model and visibility as GeoTIFFs, where `vdgs ortho` can make
+    them."""
     lpips_weights: Path | None = None
     """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
     visibility_bins: Annotated[int, BIN_COUNT_RANGE] = 4
@@ -76,8 +78,8 @@ class RunRequest:
     merge: MergeConfig = field(default_factory=MergeConfig)
     checkpointing: Annotated[CheckpointOptions, FlagName("")] = field(default_factory=CheckpointOptions)
     executor_options: Annotated[ExecutorOptions, FlagName("")] = field(default_factory=ExecutorOptions)
-    extra_image_folders: tuple[Path, ...] = ()
-    """More folders of photographs, where the first is one of photographs alone."""
+    extra_image_folders: Annotated[tuple[Path, ...], Positional("MORE")] = ()
+    """More folders of photographs, where CAPTURE is one."""
 
     def method(self) -> MethodConfig:
         """The settings that the result depends on."""
@@ -88,13 +90,13 @@ class RunRequest:
 class RenderRequest:
     """Views of a run, or a camera path, as PNG files or a film (`vdgs render`)."""
 
-    run: Path
+    run: Annotated[Path, Positional(is_run=True)]
     """Run folder."""
     output: Annotated[Path, Output()]
     """Folder for PNG files: new, empty, or filled by an earlier render, which is replaced. Or a file that ends in
     .mp4."""
     views: Literal["test", "train", "orbit", "flyover"] = "test"
-    """Which cameras; `orbit` and `flyover` are paths made from the capture."""
+    """Which cameras. `orbit` and `flyover` are paths made from the capture."""
     path: Path | None = None
     """JSON file with a camera path; overrides --views. Either one exported by nerfstudio's viewer, with the
     dataparser_transforms.json of that training beside it, one folder up or in the capture, or
@@ -119,7 +121,7 @@ class RenderRequest:
     """Also write the numbers of a map, NAME.npy beside NAME.png: float32 [height, width]. Depth is z along the view in
     units of the ground frame (metres where known); depth and V are NaN where nothing is drawn."""
     model: ModelName = "best"
-    """Which model; `best` is the merged one where there is one."""
+    """Which model. `best` is the merged one where there is one."""
     threads: Annotated[int, WORKER_COUNT] = 0
     """Threads of the kernels; 0 for all cores."""
     device: str = "auto"
@@ -130,22 +132,22 @@ class RenderRequest:
 class OrthoRequest:
     """Maps of a run as GeoTIFFs and pictures (`vdgs ortho`)."""
 
-    run: Path
+    run: Annotated[Path, Positional(is_run=True)]
     """Run folder."""
     output: Annotated[Path | None, Output()] = None
     """Folder for the maps, not among photographs nor with such files of others; by default RUN/maps."""
     gsd: Annotated[float | None, Range(0, MAX_FLOAT, exclusive_min=True)] = None
-    """Side of a pixel in units of the map (metres, mostly); by default the median that a pixel of the training
+    """Side of a pixel in units of the map, mostly metres. By default the median that a pixel of the training
     photographs shows of the ground, at the size at which they were used."""
     bbox: Annotated[tuple[float, float, float, float] | None, MAP_COORDINATE_RANGE] = None
-    """X0 Y0 X1 Y1 in coordinates of the map; by default what the training photographs show."""
+    """X0 Y0 X1 Y1 in coordinates of the map. By default what the training photographs show."""
     crs: str | None = None
     """Coordinates of the map: EPSG:n (EPSG:25832), `enu` (metres east and north of the scene's origin), `source` (those
     of the capture) or `local` (the ground frame). By default the UTM zone of a georeferenced capture, else `local`."""
     detail_from_images: bool = False
-    """Take the fine detail of the orthophoto from the photographs, where they truly see a place."""
+    """Take the fine detail of the orthophoto from the photographs. That is done where they truly see a place."""
     model: ModelName = "best"
-    """Which model; `best` is the merged one where there is one."""
+    """Which model. `best` is the merged one where there is one."""
     threads: Annotated[int, WORKER_COUNT] = 0
     """Threads of the kernels; 0 for all cores."""
     device: str = "auto"
@@ -156,27 +158,27 @@ class OrthoRequest:
 class ExportRequest:
     """A scene as files of Gaussians or points for other programs (`vdgs export`)."""
 
-    run: Path
+    run: Annotated[Path, Positional(is_run=True)]
     """Run folder."""
-    output: Annotated[tuple[Path, ...], Output()] = ()
-    """A file to write, by its ending: .ply (3DGS), .compressed.ply (PlayCanvas), .spz, .splat, .sog, .glb (glTF),
-    FOLDER/tileset.json (3D Tiles), .points.ply, .laz, .las (point clouds), .html (a page that shows the scene offline).
-    Give --output again for more: the scene is baked once (docs/export.md)."""
+    output: Annotated[tuple[Path, ...], Repeatable(), Output()] = ()
+    """A file to write, by its ending. These are .ply (3DGS), .compressed.ply (PlayCanvas), .spz, .splat, .sog, .glb
+    (glTF), FOLDER/tileset.json (3D Tiles), .points.ply, .laz, .las (point clouds), .html (a page that shows the scene
+    offline). Give --output again for more: the scene is baked once (docs/export.md)."""
     program: Annotated[ProgramName | None, FlagName("for")] = None
-    """Turn the files for this program, so that it shows the scene upright, and refuse files that it does not open.
+    """Program that opens the files. It shows the scene upright then; files that it does not open are refused.
     Without --output: write RUN/export/ and the file that suits it best."""
     axes: AxesName | None = None
-    """How the axes of .ply, .spz, .splat and .sog files stand: z-up (x east, y north, z up: the usual ones of .ply),
+    """Axes of .ply, .spz, .splat and .sog files: z-up (x east, y north, z up: the usual ones of .ply),
     y-up (of .spz: x east, z south), y-down (of .compressed.ply, .splat and .sog: x west, z south), y-up-left
     (left-handed: x east, z north). Instead of --for."""
     spz_version: Literal[2, 3, 4] = 3
     """Version of .spz files: 2 for older programs, 4 (zstd) for those of 2026; 3D Tiles always hold 2."""
     model: ModelName = "best"
-    """Which model; `best` is the merged one where there is one."""
+    """Which model. `best` is the merged one where there is one."""
     block: Annotated[int | None, Range(0, 10_000)] = None
     """Only what this block of the merged scene owns."""
     bbox: Annotated[tuple[float, float, float, float] | None, MAP_COORDINATE_RANGE] = None
-    """Only Gaussians whose centres lie within X0 Y0 X1 Y1, in coordinates of --crs."""
+    """Only Gaussians with centres in X0 Y0 X1 Y1, in coordinates of --crs."""
     max_gaussians: Annotated[int, Range(0, MAX_COUNT)] = 0
     """Only so many Gaussians, those that make most of the training photographs; 0 for all."""
     sh_degree: Literal[0, 1, 2, 3] = 3
@@ -187,14 +189,14 @@ class ExportRequest:
     """How often colours are fitted again to the difference from the model's images. By default 8 times, or once where
     the anchors spawn more than four million Gaussians (docs/export.md)."""
     optimize_seconds: Annotated[float, SECONDS_RANGE] = 0.0
-    """Seconds of optimization of all baked parameters towards the model's images, after the fit in closed form; 0:
-    none. Needs 0.7 kB of memory for each Gaussian of degree 3."""
+    """Seconds of optimization of all baked parameters; 0: none. Towards the model's images, after the fit in closed
+    form. Needs 0.7 kB of memory for each Gaussian of degree 3."""
     crs: str | None = None
     """Coordinates of the files: EPSG:n (EPSG:25832), `enu` (metres east and north of the scene's origin), `source`
     (those of the capture) or `local` (the ground frame). By default `enu` where the capture is georeferenced, and UTM
     for .laz and .las; else `local`. 3D Tiles of a georeferenced capture always stand on the globe (`enu`)."""
     evaluate: bool = True
-    """Read a file back, draw the test views and say what was lost against the model itself."""
+    """Report what was lost. A file is read back and its test views are compared with those of the model itself."""
     threads: Annotated[int, WORKER_COUNT] = 0
     """Threads of the kernels; 0 for all cores. The result does not depend on it, but for --optimize-seconds."""
     device: str = "auto"
@@ -205,10 +207,10 @@ class ExportRequest:
 class ViewRequest:
     """A scene in a browser (`vdgs view`)."""
 
-    run: Path
+    run: Annotated[Path, Positional(is_run=True)]
     """Run folder."""
     model: ModelName = "best"
-    """Which model; `best` is the merged one where there is one, else what training has saved last, followed while it
+    """Which model. `best` is the merged one where there is one, else what training has saved last, followed while it
     goes on."""
     host: str = "127.0.0.1"
     """Address to listen at: this machine alone can open it. Another one (0.0.0.0: all) lets others in who have the

@@ -1,4 +1,4 @@
-"""Options that never change the result: where blocks and shards run , and how training is saved."""
+"""Options that never change the result: where blocks and shards run, and how training is saved."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class ExecutorOptions:
     """Where blocks are trained and shards of other stages done, and what each asks of the place."""
 
     executor: ExecutorName = "local"
-    """What runs blocks and shards of other stages: processes of this machine, a Ray cluster, or SLURM
+    """What runs blocks and shards: local, ray or slurm. Processes of this machine, a Ray cluster, or SLURM
     (docs/clusters.md)."""
     address: str | None = None
     """Ray: where the cluster is (`auto`, or `head:6379`); without it what RAY_ADDRESS says, else a Ray of this machine

@@ -142,8 +142,9 @@ class TrainConfig:
     """Training of the coarse stage."""
 
     iterations: Annotated[int, Range(0, MAX_COUNT)] = 100_000
-    """Number of steps, one photograph each; 0 takes sixty for each training photograph, at least 3000 and at most
-    30 000 (choice: with few photographs a model overfits soon)."""
+    """Steps of the coarse stage; 0: by photograph count. Each step draws one photograph; 0 takes sixty steps
+    for each training photograph, at least 3000 and at most 30 000 (choice: with few photographs a model overfits
+    soon)."""
     view_sampling: Literal["uniform", "visibility", "sqrt-visibility"] = "uniform"
     """How often each photograph is used. `uniform`: all alike (the paper). `visibility`: every anchor divides one vote
     among the cameras that see it, and photographs are used in proportion to their votes. `sqrt-visibility`: in
@@ -158,7 +159,7 @@ class TrainConfig:
     parameters and moments (choice). `adam`: all, as in Scaffold-GS and 3DGS: others continue along their moments, and
     the bias correction counts the steps of the stage."""
     seed: Annotated[int, Range(0, 2**32 - 1)] = 0
-    """Everything random follows from it: on the CPU the same seed gives the same bits."""
+    """Everything random follows from it. On the CPU the same seed gives the same bits."""
     anchors: AnchorConfig = field(default_factory=AnchorConfig)
     """The anchor model."""
     lr: LearningRateConfig = field(default_factory=LearningRateConfig)
@@ -186,21 +187,22 @@ class PartitionConfig:
     """How the scene is cut into blocks (eq. 5 and what follows it)."""
 
     strategy: PartitionStrategy = "visibility"
-    """`visibility`: by position and visibility (the paper). The others are published methods for comparison, which also
+    """How blocks are cut. `visibility`: by position and visibility (the
+    paper). The others are published methods for comparison, which also
     assign cameras in their own way, whatever the settings of the assignment."""
     blocks: Annotated[int | Literal["auto"], Range(1, 10_000)] = 8
-    """K, the number of blocks; 1 is the whole scene (the paper's "w/o Blocking"); `auto` takes as few as
-    --block-memory-gb allows."""
+    """Number of blocks (K); `auto`: by memory. 1 is the whole scene (the paper's "w/o Blocking"); `auto`
+    takes as few as --block-memory-gb allows."""
     lambda_vis: Annotated[float, Range(0, 1000)] = 1.0
-    """lambda_vis: weight of visibility beside place in the clustering (paper: 0.7 to 1.3); 0 is purely spatial."""
+    """Weight of visibility beside place in the clustering. lambda_vis; paper: 0.7 to 1.3; 0 is purely spatial."""
     balanced: bool = False
-    """Blocks of about equally many anchors (choice; plain k-means leaves them several times apart)."""
+    """Blocks of about equally many anchors. Choice: plain k-means leaves them several times apart."""
     expansion: Annotated[float, Range(0, 1000)] = 0.4
-    """A block is widened by this share of the radius of a disc of its area. With a frozen margin (the default) that
-    only decides what is drawn when cameras are assigned."""
+    """Share of its radius by which a block is widened. The radius is that of a disc of its area. With a frozen margin
+    (the default) that only decides what is drawn when cameras are assigned."""
     block_memory_gb: Annotated[float, Range(0, MAX_FLOAT, exclusive_min=True)] = 4.0
-    """Memory that an average block may take in training, by estimate and beside cached photographs, for `--blocks
-    auto`. All take more where more blocks would have too few photographs (fifty) each."""
+    """Memory of an average block, for `--blocks auto`. By estimate, in training, beside cached
+    photographs. All take more where more blocks would have too few photographs (fifty) each."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,19 +210,20 @@ class AssignmentConfig:
     """Which cameras train which block (eqs. 6-7)."""
 
     mode: Literal["coverage", "paper", "leave-one-out", "frustum"] = "coverage"
-    """`coverage`: share of the drawn pixels that the block alone draws alike (choice). `paper`: eq. 7 as printed,
+    """How cameras are scored. `coverage`: share of the drawn pixels that the block
+    alone draws alike (choice). `paper`: eq. 7 as printed,
     where pixels empty in both renders count too. `leave-one-out`: 1 - SSIM of the scene without the block.
     `frustum`: share of the block's anchors that the camera holds (needs no renders)."""
     tau: Annotated[float, Range(0, 1, exclusive_min=True)] = 0.05
     """tau: pixels differ when the mean absolute difference of their channels is above this (choice)."""
     threshold: Annotated[float, FRACTION] = 0.45
-    """Share of pixels (or, for `frustum`, of anchors) above which a camera is assigned."""
+    """Share of pixels above which a camera is assigned. For `frustum`: of anchors."""
     threshold_leave_one_out: Annotated[float, FRACTION] = 0.05
     """The same for `leave-one-out` (peers: 0.05 to 0.12)."""
     always_best: bool = True
     """Every camera also joins its best block (choice: else one that is above the threshold nowhere trains nothing)."""
     min_cameras: Annotated[int, Range(0, MAX_COUNT)] = 100
-    """Each block gets at least this many cameras, as far as any show it (choice); 0: no minimum."""
+    """Each block gets at least this many cameras; 0: no minimum. As far as any show it (choice)."""
     image_size: Annotated[int, Range(16, 16_384)] = 320
     """Size at which the renders are compared."""
 
@@ -230,7 +233,8 @@ class BlockConfig:
     """Training of each block from the coarse anchors of its place. Loss and seed are those of the coarse stage."""
 
     iterations: Annotated[int, Range(0, MAX_COUNT)] = 50_000
-    """Steps for each block; 0 takes fifteen for each of its photographs, at least 500 and at most 15 000 (choice)."""
+    """Steps for each block; 0: by its photograph count. 0 takes fifteen for each of them, at least 500 and at
+    most 15 000 (choice)."""
     steps_scaler: Annotated[float, Range(0, 1000, exclusive_min=True)] = 1.0
     """Factor on the steps and on the start of statistics and growth, for scenes smaller than the paper's."""
     view_sampling: Literal["uniform", "visibility", "sqrt-visibility"] = "uniform"
@@ -265,7 +269,7 @@ class BlockConfig:
     densify: DensifyConfig = field(default_factory=DensifyConfig)
     """Growth and pruning of anchors, by default as in the coarse stage: the paper says nothing else."""
     max_anchors_total: Annotated[int, Range(0, MAX_COUNT)] = 0
-    """No growth beyond this many anchors of all blocks together; 0 for no limit. Each block has a share in proportion
+    """The same for all blocks together; 0 for no limit. Each block has a share in proportion
     to the coarse anchors it owns. No anchor is removed: a block that starts with more grows none."""
     compensation: CompensationConfig = field(default_factory=CompensationConfig)
     """Compensated growth (eqs. 8-10)."""

@@ -31,6 +31,8 @@ from vdgs.config.method import (
 )
 
 PresetName = Literal["default", "paper", "laptop"]
+#: `auto`: what the machine can do (`preset_for_device`).
+PresetChoice = Literal["auto", "laptop", "default", "paper"]
 
 PRESETS: dict[str, MethodConfig] = {
     "default": MethodConfig(),
@@ -73,3 +75,8 @@ PRESETS: dict[str, MethodConfig] = {
         ),
     ),
 }
+
+
+def preset_for_device(device: str) -> PresetName:
+    """The preset that suits a device: minutes to an hour on a CPU, the full schedule on a GPU."""
+    return "laptop" if device == "cpu" else "default"

@@ -59,6 +59,19 @@ class FlagName:
     name: str
 
 
+@dataclass(frozen=True)
+class Positional:
+    """Marks a field that is an argument without a name on the command line; `name` stands for it in help."""
+
+    name: str = ""
+    is_run: bool = False
+    """It is the folder of a run, which holds config.yaml."""
+
+
+class Repeatable:
+    """Marks a field whose option may be given several times, each for one more value."""
+
+
 FRACTION = Range(0, 1)
 #: Numbers of threads, processes and the like; 0 leaves the choice to the program.
 WORKER_COUNT = Range(0, 1024)
@@ -110,7 +123,7 @@ def iter_numbers(settings: Any, within: tuple[str, ...] = ()) -> Iterator[Numeri
     for field in dataclasses.fields(settings):
         value, hint = getattr(settings, field.name), hints[field.name]
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
-            names = [each.name for each in typing.get_args(hint)[1:] if isinstance(getattr(each, "name", None), str)]
+            names = [each.name for each in typing.get_args(hint)[1:] if isinstance(each, FlagName)]
             inner = names[0] if names else field.name
             yield from iter_numbers(value, (*within, inner) if inner else within)
         else:

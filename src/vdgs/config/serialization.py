@@ -53,10 +53,33 @@ def from_dict(kind: type, values: Mapping[str, Any], where: str = "settings") ->
     that it all stands in.
     """
     hints = field_hints(kind)
-    unknown = sorted(values.keys() - hints.keys(), key=str)
-    if unknown:
-        raise ValueError(f"{where or 'this file'} has no {unknown[0]!r}{suggest(str(unknown[0]), hints)}")
+    _check_names(values, hints, where)
     return kind(**{name: _read(hints[name], value, f"{where}.{name}".lstrip(".")) for name, value in values.items()})
+
+
+def flat_values(kind: type, values: Any, where: str, also: Iterable[str] = ()) -> dict[tuple[str, ...], Any]:
+    """The values of some settings of a config class, by the names of the fields down to them.
+
+    Raises what `from_dict` raises. `also` are further names that are there.
+    """
+    if not isinstance(values, Mapping):
+        raise ValueError(f"{where} is {values!r}, not a group of settings")
+    hints, flat = field_hints(kind), dict[tuple[str, ...], Any]()
+    _check_names(values, [*hints, *also], where)
+    for name, value in values.items():
+        inner, inside = _without_notes(hints[name]), f"{where}.{name}".lstrip(".")
+        if dataclasses.is_dataclass(inner):
+            within = flat_values(typing.cast(type, inner), value, inside)
+            flat |= {(name, *path): each for path, each in within.items()}
+        else:
+            flat[(name,)] = _read(hints[name], value, inside)
+    return flat
+
+
+def _check_names(values: Mapping[str, Any], known: Iterable[str], where: str) -> None:
+    unknown = sorted(values.keys() - set(known), key=str)
+    if unknown:
+        raise ValueError(f"{where or 'this file'} has no {unknown[0]!r}{suggest(str(unknown[0]), known)}")
 
 
 def suggest(word: str, known: Iterable[str]) -> str:
@@ -91,23 +114,23 @@ def _read(hint: Any, value: Any, where: str) -> Any:
     plain = isinstance(kind, type) and isinstance(value, (int, float) if kind is float else kind)
     if plain and (kind is bool or not isinstance(value, bool)):
         return value
-    raise ValueError(f"{where} is {value!r}; it must be {_words(hint)}")
+    raise ValueError(f"{where} is {value!r}; it must be {describe_type(hint)}")
 
 
 def _without_notes(hint: Any) -> Any:
     return typing.get_args(hint)[0] if typing.get_origin(hint) is typing.Annotated else hint
 
 
-def _words(hint: Any) -> str:
+def describe_type(hint: Any) -> str:
     """What a value of a type looks like, for people."""
     kind, inner = _without_notes(hint), typing.get_args(_without_notes(hint))
     origin = typing.get_origin(kind)
     if origin is tuple and inner[-1:] == (Ellipsis,):
-        return f"a list, each of it {_words(inner[0])}"
+        return f"a list, each of it {describe_type(inner[0])}"
     if origin is tuple:
-        return f"a list of {len(inner)}: {', '.join(map(_words, inner))}"
+        return f"a list of {len(inner)}: {', '.join(map(describe_type, inner))}"
     if origin in (typing.Union, UnionType):
-        return " or ".join(map(_words, inner))
+        return " or ".join(map(describe_type, inner))
     if origin is typing.Literal:
         return " or ".join(map(str, inner))
     named = {int: "a whole number", float: "a number", bool: "true or false", str: "text", Path: "a path"}

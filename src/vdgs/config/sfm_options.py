@@ -25,7 +25,7 @@ class SfmOptions:
     """Without positions: up to so many photographs, all are matched with all; beyond it those next to each other in
     order, and those that look alike."""
     max_image_size: Annotated[int, Range(200, 100_000)] = 2000
-    """Photographs are shrunk to this many pixels of their longer side to find features."""
+    """Longer side of photographs in which features are found, in pixels."""
     max_num_features: Annotated[int, Range(200, 1_000_000)] = 8192
     """Features of a photograph, at most about so many."""
     max_output_size: Annotated[int, Range(16, 1_000_000, allow_zero=True)] = 0
@@ -34,7 +34,7 @@ class SfmOptions:
     """gcp_list.txt (as for ODM): surveyed points and where photographs show them. The model is brought to them; that of
     a finished capture in seconds."""
     check_points: tuple[str, ...] = ()
-    """Names of points of --gcp that are held out and only measured afterwards; all: every one."""
+    """Points of --gcp that are only measured, by name; all: every one. They are held out."""
     georeference: Literal["auto", "anyway", "off"] = "auto"
     """Whether positions and control points place the scene. auto: as far as they are good, with their accuracy; not
     where that is worse than nothing, and an error where they contradict the photographs; anyway: as they are; off: not

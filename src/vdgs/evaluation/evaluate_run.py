@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -21,6 +20,7 @@ from vdgs.errors import RunError
 from vdgs.evaluation.block_seams import BlockInputs
 from vdgs.evaluation.evaluate_model import evaluate_model
 from vdgs.evaluation.lpips import load_lpips
+from vdgs.evaluation.measured_as import EvaluationSplit, evaluation_folder
 from vdgs.evaluation.opacity_coverage import coverage_map
 from vdgs.evaluation.renderable_model import EvaluatedModel, EvaluationSettings, ReferenceViews, RenderableModel
 from vdgs.evaluation.view_exposures import make_exposures
@@ -45,7 +45,6 @@ EXPOSURE_NOTES = {
 }
 
 #: What to measure on. A model that is good on training views and not on test views overfits.
-EvaluationSplit = Literal["test", "training"]
 #: Blocks are held assembled among their surroundings up to so many bytes (at least one): views show them in turn.
 CACHE_BYTES = 2_000_000_000
 
@@ -117,13 +116,6 @@ def cached_reference_views(views: Sequence[View]) -> Iterator[ReferenceViews]:
             return None if mask is None else mask.numpy() > 0
 
         yield ReferenceViews(views, lambda view: images.get(index[view.name]).image.numpy(), load_mask)
-
-
-def evaluation_folder(run: RunFolder, name: str, views: EvaluationSplit = "test") -> Path:
-    """Where the figures of a model ("coarse" or "merged") are: RUN/evaluation, RUN/coarse/evaluation; of training views
-    beside them, in `evaluation_training`."""
-    folder = run.evaluation if name == "merged" else run.coarse.path / "evaluation"
-    return folder if views == "test" else folder.with_name(f"{folder.name}_training")
 
 
 def make_visibility_map(coarse: OpenedRun) -> Callable[[Camera], np.ndarray]:

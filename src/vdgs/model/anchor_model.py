@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -21,13 +20,10 @@ from vdgs.errors import VdgsError
 from vdgs.kernels.kernel_types import FEATURE_SIZE
 from vdgs.model.anchors import TRAINED_TENSORS, Anchors
 from vdgs.model.decoder import Decoder
+from vdgs.model.model_metadata import ANCHOR_MODEL_FORMAT, MULTI_DECODER_FORMAT, NO_METADATA, ModelMetadata
 from vdgs.system.atomic_files import write_atomic
-from vdgs.system.documents import CaptureMetadata
 from vdgs.system.tensors import REBUILD_HINT, read_tensors, tensors_crc32, write_tensors
 
-ANCHOR_MODEL_FORMAT = "vdgs-anchors-1"
-#: Of a model whose blocks have decoders of their own, which readers of one decoder must refuse.
-MULTI_DECODER_FORMAT = "vdgs-anchors-2"
 #: Anchors checked at once.
 CHECK_CHUNK = 1 << 16
 
@@ -41,44 +37,6 @@ class DecoderSpan:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ModelMetadata:
-    """Where a model comes from; None: not known, or not of this kind of model."""
-
-    capture: CaptureMetadata | None = None
-    #: The version of vdgs that wrote it.
-    version: str | None = None
-    #: Steps of training that the model has seen.
-    iterations: int | None = None
-    #: Of the settings that it was made with (`runs.keys`).
-    key: str | None = None
-    #: Of a block: its number, how many photographs trained it, and its setting `decoder`.
-    block: int | None = None
-    views: int | None = None
-    decoder: str | None = None
-
-    def to_dict(self) -> dict[str, object]:
-        """Ready for JSON, without what is None, in the order in which the stages have always written it."""
-        names = ORDER if self.block is None else ORDER_OF_BLOCK
-        return {name: value for name in names if (value := getattr(self, name)) is not None}
-
-    @staticmethod
-    def from_dict(values: Mapping[str, Any]) -> ModelMetadata:
-        """The inverse; keys that a newer version wrote are left out. Raises ValueError for a value of another kind."""
-        if not isinstance(values, Mapping):
-            raise ValueError("its metadata are not an object")
-        kinds = {"capture": Mapping, "iterations": int, "block": int, "views": int}
-        known = {name: values[name] for name in ORDER if values.get(name) is not None}
-        for name, value in known.items():
-            if not isinstance(value, kinds.get(name, str)):
-                raise ValueError(f"{name} of its metadata is {value!r}")
-        return ModelMetadata(**known)
-
-
-ORDER = ("capture", "version", "iterations", "key", "block", "views", "decoder")
-ORDER_OF_BLOCK = ("capture", "version", "block", "views", "key", "iterations", "decoder")
-
-
-@dataclass(frozen=True, kw_only=True)
 class AnchorModel:
     """A scene: anchors, what decodes them, and what is needed to use them again."""
 
@@ -89,7 +47,7 @@ class AnchorModel:
     voxel_size: float
     #: Colour drawn where nothing is, RGB in [0, 1].
     background: tuple[float, float, float]
-    metadata: ModelMetadata = ModelMetadata()
+    metadata: ModelMetadata = NO_METADATA
     #: A merged scene whose blocks trained decoders of their own: all anchors, block by block. Else empty.
     decoder_spans: tuple[DecoderSpan, ...] = ()
 

@@ -40,7 +40,7 @@ from vdgs.pipeline.time_estimate import (
     time_stereo,
 )
 from vdgs.pipeline.train_coarse import build_coarse_problem, initial_coarse_state
-from vdgs.rendering.ortho.render_ortho import has_ortho_dependencies
+from vdgs.rendering.ortho.map_status import has_ortho_dependencies
 from vdgs.runs.config_file import changed_flags
 from vdgs.runs.create_or_resume import capture_options_changed, run_settings
 from vdgs.runs.run_folder import RunFolder

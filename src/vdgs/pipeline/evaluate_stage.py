@@ -33,25 +33,23 @@ from vdgs.evaluation.evaluate_model import require_views, summarize_views
 from vdgs.evaluation.evaluate_run import (
     CACHE_BYTES,
     IMAGE_CACHE_BYTES,
-    EvaluationSplit,
     cached_reference_views,
     check_bins,
     evaluate_run,
-    evaluation_folder,
     make_block_inputs,
     make_evaluation_settings,
     make_renderable_model,
     select_views,
 )
 from vdgs.evaluation.lpips import load_lpips
+from vdgs.evaluation.measured_as import EvaluationSplit, evaluation_folder, exposure_mode, measured_as
 from vdgs.evaluation.renderable_model import EvaluatedModel, EvaluationSettings
 from vdgs.evaluation.view_metrics import ViewInputs, measure_view
 from vdgs.evaluation.view_metrics_io import load_view_metrics, save_view_metrics
 from vdgs.runs.open_run import ModelLocation, load_run_blocks, locate_model
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
-from vdgs.system.atomic_files import read_json, read_json_or_empty, write_bytes, write_json
-from vdgs.system.documents import MeasuredAs
+from vdgs.system.atomic_files import read_json, write_bytes, write_json
 from vdgs.system.file_locks import lock_folder
 from vdgs.system.memory.memory_estimate import render_bytes
 from vdgs.system.memory.process_memory import peak_memory_bytes, reset_peak_memory
@@ -122,7 +120,7 @@ class _Evaluation:
         depends_on = [
             model.stage.status().model_id, model.key, run.coarse_model_id(), blocks, str(weights), request.views
         ]  # fmt: skip
-        if exposure := _exposure_mode(run):
+        if exposure := exposure_mode(run):
             depends_on.append(exposure)
         spans = split_ranges(view_count, *SHARD_VIEWS)
         return ShardedJob.create("views", request, self.output, VIEW_LABELS, depends_on, spans)
@@ -156,7 +154,7 @@ def evaluate_stage(
         peak = _evaluate_in_shards(context, evaluation, execution, console)
     else:
         peak = _evaluate_here(context, evaluation, console)
-    record = _record(run, model.name, request.lpips_weights, request.visibility_bins)
+    record = measured_as(run, model.name, request.lpips_weights, request.visibility_bins)
     status = record | {"seconds": time.monotonic() - start, "peak_memory_bytes": peak}
     write_json(evaluation.output / "status.json", status)
 
@@ -262,24 +260,3 @@ def _join(evaluation: _Evaluation, job: ShardedJob, console: Console) -> None:
         block_count = len(load_run_blocks(evaluation.run))
         console.print(make_block_table(summarize_blocks(figures, block_count, job.output)))
     console.print(f"pictures and figures: {job.output}", highlight=False)
-
-
-def is_evaluated(run: RunFolder, name: str, lpips_weights: Path | None, bins: int) -> bool:
-    """Whether the figures on disk are of the present model, measured in this way."""
-    expected = _record(run, name, lpips_weights, bins)
-    record = read_json_or_empty(evaluation_folder(run, name) / "status.json")
-    return {key: record.get(key) for key in expected} == expected
-
-
-def _record(run: RunFolder, name: str, lpips_weights: Path | None, bins: int) -> MeasuredAs:
-    keys = run.keys()
-    stage, key = (run.merged, keys.merge) if name == "merged" else (run.coarse, keys.coarse)
-    return {
-        "key": key, "model": stage.status().model_id, "lpips_weights": str(lpips_weights), "bins": bins,
-        "exposed": _exposure_mode(run),
-    }  # fmt: skip
-
-
-def _exposure_mode(run: RunFolder) -> str | None:
-    """How views are exposed, if training fitted exposures; None in neutral colors."""
-    return "interpolated and metered" if run.method().training.exposure_compensation else None

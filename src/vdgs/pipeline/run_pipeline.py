@@ -15,17 +15,19 @@ from vdgs.config.validation_rules import check_config
 from vdgs.distributed.backend_selection import check_backend_reachable
 from vdgs.distributed.sharded_job import ExecutionOptions
 from vdgs.errors import RunError, Stopped, VdgsError
-from vdgs.evaluation.evaluate_run import evaluation_folder
 from vdgs.evaluation.lpips import check_weights_file
+from vdgs.evaluation.measured_as import evaluation_folder, is_evaluated
 from vdgs.pipeline.count_visibility import count_run_visibility
-from vdgs.pipeline.evaluate_stage import EvaluationRequest, evaluate_stage, is_evaluated
+from vdgs.pipeline.evaluate_stage import EvaluationRequest, evaluate_stage
+from vdgs.pipeline.image_size import choose_image_size
 from vdgs.pipeline.merge_blocks import merge_run_blocks
 from vdgs.pipeline.partition_stage import partition_run
 from vdgs.pipeline.train_blocks import train_blocks
 from vdgs.pipeline.train_coarse import train_coarse
-from vdgs.rendering.ortho.render_ortho import has_ortho_dependencies, is_ortho_current, render_ortho
-from vdgs.report import write_report
+from vdgs.rendering.ortho.map_status import has_ortho_dependencies, is_ortho_current
+from vdgs.rendering.ortho.render_ortho import render_ortho
 from vdgs.report.status_cli import full_run_status, next_line
+from vdgs.report.write_report import write_report
 from vdgs.runs.create_or_resume import exclusive_run
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
@@ -45,7 +47,7 @@ def run_pipeline(request: RunRequest, console: Console, command: str | None = No
     check_ranges(request)
     check_weights_file(request.lpips_weights)
     check_output(request.output)
-    request = reconstruct_if_needed(request, console, command)
+    request = choose_image_size(reconstruct_if_needed(request, console, command), console)
     with exclusive_run(
         request.capture, request.output, request.options, request.method(), overwrite=request.overwrite, command=command
     ) as context:

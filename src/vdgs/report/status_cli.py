@@ -13,8 +13,8 @@ from vdgs.captures.place_facts import PlaceFacts, place_summary
 from vdgs.captures.reconstruction import PROGRESS_FILE, SFM_STAGE, WORK_FOLDER, is_finished
 from vdgs.errors import VdgsError
 from vdgs.report.place_section import read_place
+from vdgs.report.report_status import report_status
 from vdgs.report.run_reader import RunFiles
-from vdgs.report.write_report import report_status
 from vdgs.runs.run_folder import REPORT_FILE, RunFolder
 from vdgs.runs.run_status import RunStatus, StageState, StageStatus, get_run_status
 from vdgs.runs.stage_folder import StatusRecord

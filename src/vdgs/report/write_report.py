@@ -13,6 +13,7 @@ from vdgs.captures.output_guard import check_output
 from vdgs.errors import RunError
 from vdgs.report.html_page import Html, document, escape_html, join_html, paragraph, table_of_contents
 from vdgs.report.place_section import place_panel, read_place
+from vdgs.report.report_status import STATUS_META_NAME
 from vdgs.report.result_sections import (
     by_visibility_section,
     metrics_section,
@@ -30,7 +31,7 @@ from vdgs.report.scene_sections import (
 )
 from vdgs.report.training_section import costs_section, settings_section, training_section
 from vdgs.runs.run_folder import REPORT_FILE, RunFolder
-from vdgs.runs.run_status import RunStatus, StageStatus, get_run_status
+from vdgs.runs.run_status import get_run_status
 from vdgs.system.atomic_files import write_text
 
 #: The sections, each with its name and title for the links at the top; those that say nothing of a run are empty.
@@ -48,8 +49,6 @@ SECTIONS: tuple[tuple[Callable[[ReportedRun], Html], str, str], ...] = (
     (costs_section, "costs", "time and memory"),
     (settings_section, "settings", "settings"),
 )
-#: Name of the meta element with the status of the run that the page shows; it stands within so many characters.
-STATUS_META_NAME, MAX_HEAD_CHARS = "vdgs-status", 2000
 
 
 def write_report(run: RunFolder) -> Path:
@@ -72,18 +71,6 @@ def write_report(run: RunFolder) -> Path:
     )
     write_text(run.path / REPORT_FILE, page)
     return run.path / REPORT_FILE
-
-
-def report_status(run: RunFolder, status: RunStatus) -> StageStatus:
-    """Whether the report is there and shows the run as it stands."""
-    try:
-        with (run.path / REPORT_FILE).open(encoding="utf-8", errors="replace") as file:
-            head = file.read(MAX_HEAD_CHARS)
-    except OSError:
-        return StageStatus(name="report", state="missing", folder=REPORT_FILE)
-    if f'<meta name="{STATUS_META_NAME}" content="{status.digest}">' in head:
-        return StageStatus(name="report", state="done", folder=REPORT_FILE)
-    return StageStatus(name="report", state="stale", folder=REPORT_FILE, reason="the run went on since it was written")
 
 
 def _header(report: ReportedRun) -> tuple[Html, str]:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
-from safetensors import SafetensorError, safe_open
+from typing import TYPE_CHECKING
 
 from vdgs.errors import RunError
-from vdgs.model.anchor_model import ANCHOR_MODEL_FORMAT, MULTI_DECODER_FORMAT, AnchorModel, ModelMetadata
+from vdgs.model.model_metadata import read_model_metadata
 from vdgs.runs.stage_folder import StageFolder
-from vdgs.system.tensors import file_id
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from vdgs.model.anchor_model import AnchorModel
 
 MODEL_MISMATCH = "not the model that status.json beside it speaks of"
 
@@ -21,11 +22,8 @@ def integrity_error(stage: StageFolder, key: str, block: int | None = None) -> s
     By the header and the size of the file alone, which cost nothing.
     """
     try:
-        with safe_open(stage.model, framework="pt") as file:
-            header = dict(file.metadata() or {})
-        content = json.loads(header.get(ANCHOR_MODEL_FORMAT) or header[MULTI_DECODER_FORMAT])
-        metadata = ModelMetadata.from_dict(content["facts"])
-    except (OSError, SafetensorError, ValueError, KeyError, TypeError, AttributeError):
+        metadata = read_model_metadata(stage.model)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return "not a model that can be read"
     if metadata.block != block:
         return "a model of the whole scene" if metadata.block is None else f"the model of block {metadata.block}"
@@ -50,6 +48,9 @@ def load_verified(stage: StageFolder, key: str, block: int | None = None) -> Anc
 
     Raises RunError for a file that the stage did not make, however it came there; VdgsError for one that is damaged.
     """
+    from vdgs.model.anchor_model import AnchorModel
+    from vdgs.system.tensors import file_id
+
     model = AnchorModel.load(stage.model)
     error = integrity_error(stage, key, block)
     if not error and stage.status().model_id not in (None, file_id(stage.model)):

@@ -28,9 +28,9 @@ class SynthOptions:
     seed: Annotated[int, Range(0, 2**32 - 1)] = 0
     """The same seed and options give the same bytes."""
     size: SizeName = "village"
-    """toy: 24 images of 96x72 over 60 m (seconds, for tests); village: 56 images of 400x300 over 120 m; town: 120
-    images of 800x600 over 320 m; district: 150 images of 400x300 over 420 m, with towers and a lake; city: 600 images
-    of 400x300 over 900 m."""
+    """Size of the place. toy: 24 images of 96x72 over 60 m (seconds, for tests); village: 56 images of 400x300 over
+    120 m; town: 120 images of 800x600 over 320 m; district: 150 images of 400x300 over 420 m, with towers and a lake;
+    city: 600 images of 400x300 over 900 m."""
     images: Annotated[int | None, Range(3, 100_000)] = None
     """How many photographs the drone takes for training."""
     test_images: Annotated[int | None, Range(1, 100_000)] = None
@@ -46,9 +46,9 @@ class SynthOptions:
     samples_per_pixel: Annotated[int, Range(1, 1024)] = 4
     """Rays averaged in every pixel: more is smoother and slower."""
     flight: FlightName = "uneven"
-    """uneven: dense over the centre, sparse over the outskirts, some obliques; even: one regular grid and obliques;
-    distant: a dense middle and obliques far out, over land hardly seen; orbits: rings of obliques about landmarks;
-    corridor: along the main street."""
+    """How the drone flies. uneven: dense over the centre, sparse over the outskirts, some obliques; even: one regular
+    grid and obliques; distant: a dense middle and obliques far out, over land hardly seen; orbits: rings of obliques
+    about landmarks; corridor: along the main street."""
     overlap: Annotated[float | None, Range(0, 0.98, exclusive_max=True)] = None
     """Share of its side that a photograph has in common with the next, were the flight an even grid: sets the
     altitude. Default: an altitude of half the extent, between 36 and 95 m."""

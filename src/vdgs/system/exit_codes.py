@@ -14,9 +14,9 @@ REMOVABLE_PACKAGES = {
 }
 
 
-def exit_code_of(name: str, action: Callable[[], Any], when_interrupted: str) -> int:
-    """Run an action: 0 (or its result) when done, 1 after a printed error, 130 when stopped. `name` begins the message.
-    Errors that a user cannot cause are raised."""
+def exit_code_of(name: str, action: Callable[[], Any], when_interrupted: str, fit: Callable[[str], str] = str) -> int:
+    """Run an action: 0 (or its result) when done, 1 after a printed error, 130 when stopped. `name` begins the message,
+    which `fit` may change. Errors that a user cannot cause are raised."""
     from vdgs.errors import Interrupted, Stopped, VdgsError
     from vdgs.system.stop_signals import catch_stop_signals
 
@@ -27,7 +27,7 @@ def exit_code_of(name: str, action: Callable[[], Any], when_interrupted: str) ->
         print(f"{name}: interrupted. {when_interrupted}", file=sys.stderr)
         return 130
     except VdgsError as error:
-        print(f"{name}: {error}", file=sys.stderr)
+        print(f"{name}: {fit(str(error))}", file=sys.stderr)
         return 130 if isinstance(error, Stopped) else 1
     except BrokenPipeError:
         return 1
@@ -44,11 +44,9 @@ def exit_code_of(name: str, action: Callable[[], Any], when_interrupted: str) ->
 
         if not is_out_of_memory(error):
             raise
-        print(
-            f"{name}: out of memory ({str(error).strip().splitlines()[0] if str(error) else 'no room'}). What was "
-            "saved is kept. Smaller photographs (--downscale 2), a smaller --width or fewer --jobs need less.",
-            file=sys.stderr,
-        )
+        reason = str(error).strip().splitlines()[0] if str(error) else "no room"
+        remedy = "Smaller photographs (--downscale 2) or fewer --jobs need less."
+        print(fit(f"{name}: out of memory ({reason}). What was saved is kept. {remedy}"), file=sys.stderr)
         return 1
 
 

@@ -18,6 +18,7 @@ from vdgs.geometry.map_projection import MapProjection
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.rendering.ortho import pixel_grid
 from vdgs.rendering.ortho.detail_transfer import DetailTransfer
+from vdgs.rendering.ortho.map_status import METADATA_FILE
 from vdgs.rendering.ortho.nadir_camera import NadirCamera
 from vdgs.rendering.ortho.pixel_grid import PixelGrid
 from vdgs.rendering.ortho.tile_renderer import TileRenderer, samples_per_side
@@ -26,7 +27,6 @@ from vdgs.system.scratch import remove_leftovers, scratch_folder
 
 ORTHOPHOTO_FILE, DSM_FILE, VISIBILITY_FILE = "orthophoto.tif", "dsm.tif", "visibility.tif"
 HILLSHADE_FILE, PICTURE_FILE, PREVIEW_FILE = "hillshade.png", "orthophoto.png", "preview.png"
-METADATA_FILE = "map.json"
 FILE_NAMES = (
     ORTHOPHOTO_FILE, DSM_FILE, VISIBILITY_FILE, HILLSHADE_FILE, PICTURE_FILE, PREVIEW_FILE, METADATA_FILE
 )  # fmt: skip

@@ -7,7 +7,6 @@ import shutil
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -20,14 +19,15 @@ from vdgs.errors import VdgsError
 from vdgs.geometry.map_projection import MapProjection
 from vdgs.rendering.ortho import geotiff, ortho_plan
 from vdgs.rendering.ortho.geotiff import RasterLayer
-from vdgs.rendering.ortho.ortho_plan import DSM_FILE, METADATA_FILE, ORTHOPHOTO_FILE, VISIBILITY_FILE, OrthoPlan
+from vdgs.rendering.ortho.map_status import METADATA_FILE
+from vdgs.rendering.ortho.ortho_plan import DSM_FILE, ORTHOPHOTO_FILE, VISIBILITY_FILE, OrthoPlan
 from vdgs.rendering.ortho.previews import PreviewSheet, write_hillshade, write_picture, write_preview
 from vdgs.rendering.ortho.tile_renderer import NODATA_COUNT, NODATA_HEIGHT, OrthoTile
 from vdgs.rendering.ortho.tile_shards import distributed_tiles
 from vdgs.runs.open_run import locate_model
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
-from vdgs.system.atomic_files import read_json_or_empty, to_jsonable, write_json
+from vdgs.system.atomic_files import to_jsonable, write_json
 from vdgs.system.console import track
 from vdgs.system.documents import MapMetadata
 from vdgs.system.stop_signals import check_stop_requested
@@ -114,17 +114,6 @@ def _write(plan: OrthoPlan, tiles: Iterable[OrthoTile], console: Console) -> flo
         write_preview(orthophoto, dsm, visibility, staging / ortho_plan.PREVIEW_FILE, sheet)
         write_json(staging / METADATA_FILE, to_jsonable(metadata))
     return metadata["mapped_share"]
-
-
-def is_ortho_current(run: RunFolder) -> bool:
-    """Whether RUN/maps shows the merged model that is there."""
-    drawn = read_json_or_empty(run.path / "maps" / METADATA_FILE).get("model_digest")
-    return drawn is not None and drawn == run.merged.status().model_id
-
-
-def has_ortho_dependencies() -> bool:
-    """Whether what `vdgs ortho` needs is installed."""
-    return all(find_spec(name) is not None for name in ("rasterio", "pyproj"))
 
 
 def raster_layers(placement: MapProjection) -> tuple[RasterLayer, RasterLayer, RasterLayer]:

@@ -1,0 +1,190 @@
+"""Command lines parsed once: what a person gave, option by option, to be laid over defaults that depend on it."""
+
+from __future__ import annotations
+
+import difflib
+import shlex
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from vdgs.config.options import Option, Values, options_of, with_values
+from vdgs.config.output_paths import is_output
+from vdgs.config.ranges import check_ranges
+from vdgs.errors import RunError, VdgsError
+from vdgs.system.similar_paths import suggest_path
+
+HELP_FLAGS, FULL_HELP_FLAG = ("-h", "--help"), "--help-all"
+
+
+class UsageError(Exception):
+    """A command line that cannot be understood; the message says what is wrong with it."""
+
+
+@dataclass
+class GivenArguments:
+    """What a command line gives for the options of a dataclass, before any default."""
+
+    kind: type
+    words: dict[tuple[str, ...], list[str]] = field(default_factory=dict)
+    """Of each option, by its path, in the order in which they were given."""
+    values: Values = field(default_factory=dict)
+    help: str = ""
+    """The option that asks for help, if any does."""
+
+    def get(self, *path: str) -> Any:
+        """The value of an option; None where it was not given."""
+        return self.values.get(path)
+
+    def over(self, *layers: Any) -> Any:
+        """The arguments over layers of defaults, the later ones first: values by path, or by the name of a field."""
+        required = {each.path[0]: self.values.get(each.path) for each in options_of(self.kind) if each.is_required}
+        settings = self.kind(**required)
+        for layer in (*layers, self.values):
+            settings = with_values(settings, {(key,) if isinstance(key, str) else key: layer[key] for key in layer})
+        return settings
+
+    def check(self) -> None:
+        """Raise UsageError where something required is missing, VdgsError for a number outside its range and for an
+        input that does not exist."""
+        options = options_of(self.kind)
+        missing = [each for each in options if each.is_required and each.path not in self.values]
+        names = " and ".join(each.metavar if each.is_positional else f"{each.flag} {each.metavar}" for each in missing)
+        if missing:
+            raise UsageError(f"{names} {'is' if len(missing) == 1 else 'are'} missing")
+        check_ranges(self.over())
+        for option in options:
+            value = self.values.get(option.path)
+            for path in value if isinstance(value, tuple) else (value,):
+                if isinstance(path, Path) and not is_output(option.hint):
+                    _check_input(option, path)
+
+    def command_line(self, verb: str, without: Iterable[str] = ()) -> str:
+        """The command as it can be typed in any folder: with absolute paths, and without some options."""
+        line = ["vdgs", verb]
+        for option in options_of(self.kind):
+            line += [] if option.flag in without else self._absolute_words(option)
+        return shlex.join(line)
+
+    def _absolute_words(self, option: Option) -> list[str]:
+        words, value = self.words.get(option.path), self.values.get(option.path)
+        if words is None:
+            return []
+        if isinstance(value, Path) or (isinstance(value, tuple) and value and isinstance(value[0], Path)):
+            words = [str(Path(each).resolve()) for each in words]
+        if option.is_positional:
+            return words
+        if option.is_repeatable:
+            return [word for each in words for word in (option.flag, each)]
+        return [option.off_flag if value is False else option.flag, *words]
+
+
+def _check_input(option: Option, path: Path) -> None:
+    is_run = option.positional is not None and option.positional.is_run
+    if not path.exists():
+        named = "" if option.is_positional else f"{option.flag} "
+        fault = "is not a run folder, for it does not exist" if is_run else "no such file or folder"
+        raise VdgsError(f"{named}{path}: {fault}{suggest_path(path)}")
+    if is_run and not (path / "config.yaml").is_file():
+        raise RunError(f"{path}: is not a run folder (no config.yaml). Train first: vdgs run CAPTURE --output RUN")
+
+
+def parse_words(kind: type, words: Sequence[str]) -> GivenArguments:
+    """What words give for the options of a dataclass.
+
+    Raises UsageError for an option that is none, and for a value that is of another type.
+    """
+    given, free = GivenArguments(kind), list[str]()
+    asked = next((each for each in words if each in (*HELP_FLAGS, FULL_HELP_FLAG)), "")
+    try:
+        _read_options(given, words, free)
+        _read_positionals(given, free)
+    except UsageError:
+        if not asked:
+            raise
+    given.help = asked
+    return given
+
+
+def _read_options(given: GivenArguments, words: Sequence[str], free: list[str]) -> None:
+    """Read the options among the words; what has no name goes into `free`."""
+    known = _named(given.kind)
+    index = 0
+    while index < len(words):
+        word, index = words[index], index + 1
+        name, joined, value = word.partition("=")
+        name = _spelled(name)
+        if word == "--":
+            free += words[index:]
+            return
+        if word in (*HELP_FLAGS, FULL_HELP_FLAG):
+            continue
+        if name not in known:
+            if word.startswith("-") and not _is_number(word):
+                raise UsageError(f"there is no option {name}{_suggestion(name, known)}")
+            free.append(word)
+            continue
+        option = known[name]
+        taken = [value] if joined else []
+        limit = 1 if option.is_repeatable else len(words) if option.num_words is None else option.num_words
+        while index < len(words) and len(taken) < limit and _spelled(words[index].partition("=")[0]) not in known:
+            taken.append(words[index])
+            index += 1
+        _give(given, option, taken, name)
+
+
+def _give(given: GivenArguments, option: Option, words: list[str], name: str) -> None:
+    if option.num_words == 0:
+        if words:
+            raise UsageError(f"{name} takes no value; {option.flag} switches it on, {option.off_flag} off")
+        given.values[option.path], given.words[option.path] = name != option.off_flag, []
+        return
+    if option.is_repeatable:
+        words = [*given.words.get(option.path, []), *words]
+    try:
+        given.values[option.path] = option.read(words)
+    except ValueError as error:
+        raise UsageError(f"{option.metavar if option.is_positional else option.flag} {error}") from None
+    given.words[option.path] = words
+
+
+def _read_positionals(given: GivenArguments, free: list[str]) -> None:
+    for option in options_of(given.kind):
+        if option.is_positional and free and option.path not in given.values:
+            count = len(free) if option.num_words is None else option.num_words
+            words, free = free[:count], free[count:]
+            _give(given, option, words, option.flag)
+    if free:
+        raise UsageError(f"{free[0]!r} belongs to no option")
+
+
+def _named(kind: type) -> dict[str, Option]:
+    """Every option by each of its names."""
+    named = {name: option for option in options_of(kind) for name in option.flags}
+    switches = {option.off_flag: option for option in options_of(kind) if option.num_words == 0}
+    return named | switches | dict.fromkeys((*HELP_FLAGS, FULL_HELP_FLAG), _HELP)
+
+
+_HELP = Option(path=("help",), flag="--help", hint=bool, help="")
+
+
+def _spelled(name: str) -> str:
+    """An option as it is spelled here: with hyphens."""
+    return name.replace("_", "-") if name.startswith("--") else name
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _suggestion(name: str, known: dict[str, Option]) -> str:
+    """A question about the option that may be meant: by its whole name, or by that within its group."""
+    within = {f"--{each.rpartition('.')[2]}": each for each in reversed(known) if "." in each}
+    candidates = within | {each: each for each in known}
+    like = difflib.get_close_matches(name, list(candidates), n=1, cutoff=0.7)
+    return f"; did you mean {candidates[like[0]]}?" if like else ""

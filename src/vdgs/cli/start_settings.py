@@ -1,0 +1,70 @@
+"""What a run starts with: the defaults, below the preset, below the file of `--config`, below the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from vdgs.cli.argument_parser import GivenArguments
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.method import MethodConfig
+from vdgs.config.options import with_values
+from vdgs.config.presets import PRESETS, PresetName, preset_for_device
+
+
+@dataclass(frozen=True, kw_only=True)
+class StartSettings:
+    """Settings below those of the command line."""
+
+    preset: PresetName | None
+    """None where a run that is there keeps its own settings."""
+    options: CaptureOptions
+    method: MethodConfig
+    reason: str = ""
+    """Why the preset was chosen, where nobody named it."""
+
+    def layer(self) -> Mapping[str, Any]:
+        """As defaults of `vdgs run`."""
+        return {"options": self.options} | vars(self.method)
+
+
+def start_settings(given: GivenArguments) -> StartSettings:
+    """The settings that a command line starts from.
+
+    A run that is there reads its capture as before, and without a preset it keeps its own method; a new one takes what
+    the device can do. Raises VdgsError for a file of settings that does not work and for a device that is none.
+    """
+    named, file, own = given.get("preset"), given.get("config"), _own_settings(given.get("output"))
+    preset: PresetName | None = None if named in (None, "auto") else named
+    reason = ""
+    if preset is None and own is None:
+        preset, reason = _preset_for_machine(given.get("device") or "auto")
+    options = CaptureOptions() if own is None else own.capture
+    method = own.method if preset is None else PRESETS[preset]
+    if file is not None:
+        from vdgs.runs.settings_file import read_settings_file
+
+        of_capture, of_method = read_settings_file(file)
+        options, method = with_values(options, of_capture), with_values(method, of_method)
+    return StartSettings(preset=preset, options=options, method=method, reason=reason)
+
+
+def _own_settings(output: Path | None) -> Any:
+    """The settings of the run in a folder (`RunSettings`); None where there is none."""
+    if output is None or not (output / "config.yaml").is_file():
+        return None
+    from vdgs.runs.run_folder import RunFolder
+
+    return RunFolder(output).settings()
+
+
+def _preset_for_machine(device: str) -> tuple[PresetName, str]:
+    from vdgs.kernels.device_selection import select_device
+
+    selected = select_device(device)
+    preset = preset_for_device(selected.device)
+    takes = "minutes to an hour" if preset == "laptop" else "the paper's schedule"
+    suits = f"suits the device {selected.device} ({selected.reason})"
+    return preset, f"{preset} ({takes}), which {suits}; --preset overrides"

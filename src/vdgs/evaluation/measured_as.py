@@ -1,0 +1,41 @@
+"""Where the figures of a model are, and with what they were measured. Imports nothing heavy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from vdgs.runs.run_folder import RunFolder
+from vdgs.system.atomic_files import read_json_or_empty
+from vdgs.system.documents import MeasuredAs
+
+EvaluationSplit = Literal["test", "training"]
+
+
+def evaluation_folder(run: RunFolder, name: str, views: EvaluationSplit = "test") -> Path:
+    """Where the figures of a model ("coarse" or "merged") are: RUN/evaluation, RUN/coarse/evaluation; of training views
+    beside them, in `evaluation_training`."""
+    folder = run.evaluation if name == "merged" else run.coarse.path / "evaluation"
+    return folder if views == "test" else folder.with_name(f"{folder.name}_training")
+
+
+def is_evaluated(run: RunFolder, name: str, lpips_weights: Path | None, bins: int) -> bool:
+    """Whether the figures on disk are of the present model, measured in this way."""
+    expected = measured_as(run, name, lpips_weights, bins)
+    record = read_json_or_empty(evaluation_folder(run, name) / "status.json")
+    return {key: record.get(key) for key in expected} == expected
+
+
+def measured_as(run: RunFolder, name: str, lpips_weights: Path | None, bins: int) -> MeasuredAs:
+    """The record of an evaluation of a model, measured in this way."""
+    keys = run.keys()
+    stage, key = (run.merged, keys.merge) if name == "merged" else (run.coarse, keys.coarse)
+    return {
+        "key": key, "model": stage.status().model_id, "lpips_weights": str(lpips_weights), "bins": bins,
+        "exposed": exposure_mode(run),
+    }  # fmt: skip
+
+
+def exposure_mode(run: RunFolder) -> str | None:
+    """How views are exposed, if training fitted exposures; None in neutral colors."""
+    return "interpolated and metered" if run.method().training.exposure_compensation else None

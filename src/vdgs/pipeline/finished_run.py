@@ -1,0 +1,70 @@
+"""Whether `vdgs run` has nothing to do, found out without the libraries that its stages need."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from vdgs.config.commands import RunRequest
+from vdgs.errors import VdgsError
+from vdgs.evaluation.measured_as import is_evaluated
+from vdgs.rendering.ortho.map_status import has_ortho_dependencies, is_ortho_current
+from vdgs.report.status_cli import full_run_status, next_line
+from vdgs.runs.run_folder import RunFolder
+
+
+def nothing_to_do(request: RunRequest, command: str, files: Sequence[Path] = ()) -> str:
+    """What to say of a run that is whole, with the settings of the request and newer than the capture; empty for all
+    others, which the stages look at more closely. `files` are further ones that the command reads."""
+    run = RunFolder(request.output)
+    if not run.config_file.is_file():
+        return ""
+    try:
+        if not (_same_request(run, request, command) and _is_whole(run, request)):
+            return ""
+        options = [each for each in vars(request.options).values() if isinstance(each, Path)]
+        inputs = (request.capture, *request.extra_image_folders, *options, *files)
+        made = run.capture_file.stat().st_mtime_ns
+        if any(time > made for path in inputs for time in _times(path)):
+            return ""
+    except (OSError, VdgsError):
+        return ""
+    return f"nothing to do: {run.path} is whole\n{next_line(full_run_status(run))}"
+
+
+def _same_request(run: RunFolder, request: RunRequest, command: str) -> bool:
+    """Whether the run has the settings that are asked for, and is of this capture or of these photographs."""
+    own = run.settings()
+    if request.capture.resolve() != Path(own.capture_path):
+        if run.config.command() != command:
+            return False
+        request = replace(request, options=replace(request.options, gps=own.capture.gps))
+    method, training = request.method(), request.training
+    if not training.iterations:  # follows from the number of photographs, which are the same
+        method = replace(method, training=replace(training, iterations=own.training.iterations))
+    return method == own.method and _absolute(request.options) == own.capture
+
+
+def _absolute(options: object) -> object:
+    paths = {name: value.resolve() for name, value in vars(options).items() if isinstance(value, Path)}
+    return replace(options, **paths)  # type: ignore[type-var]
+
+
+def _is_whole(run: RunFolder, request: RunRequest) -> bool:
+    measured = (
+        is_evaluated(run, name, request.lpips_weights, request.visibility_bins) for name in ("coarse", "merged")
+    )
+    maps = not request.ortho or not has_ortho_dependencies() or is_ortho_current(run)
+    status = full_run_status(run)
+    return status.is_complete and not status.is_running and maps and all(measured)
+
+
+def _times(path: Path) -> Iterator[int]:
+    """When a file, or a folder and all that is in it, changed last."""
+    yield path.stat().st_mtime_ns
+    if path.is_dir():
+        for folder, _, names in os.walk(path):
+            yield os.stat(folder).st_mtime_ns
+            yield from (os.stat(os.path.join(folder, name)).st_mtime_ns for name in names)

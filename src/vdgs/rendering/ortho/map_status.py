@@ -1,0 +1,21 @@
+"""Whether the maps of a run are drawn and can be. Imports nothing heavy."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+from vdgs.runs.run_folder import RunFolder
+from vdgs.system.atomic_files import read_json_or_empty
+
+METADATA_FILE = "map.json"
+
+
+def is_ortho_current(run: RunFolder) -> bool:
+    """Whether RUN/maps shows the merged model that is there."""
+    drawn = read_json_or_empty(run.path / "maps" / METADATA_FILE).get("model_digest")
+    return drawn is not None and drawn == run.merged.status().model_id
+
+
+def has_ortho_dependencies() -> bool:
+    """Whether what `vdgs ortho` needs is installed."""
+    return all(find_spec(name) is not None for name in ("rasterio", "pyproj"))

@@ -1,0 +1,124 @@
+"""No message names an option that the verb lacks."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import vdgs
+from experiments.bench.cli import BenchArguments
+from vdgs.cli.advice import COMMAND, OPTION, Advice, flags_of
+from vdgs.cli.main import COMMANDS, verb_arguments
+
+SOURCE = Path(vdgs.__file__).parent
+#: Options of other programs, by the end of the file that names them.
+OF_OTHERS = {
+    "system_checks.py": {"--force-reinstall"},
+    "executor_options.py": {"--gres", "--qos", "--constraint"},
+    "slurm_commands.py": {
+        "--batch",
+        "--signal",
+        "--oneliner",
+        "--me",
+        "--noheader",
+        "--array",
+        "--format",
+        "--parsable",
+    },
+    "slurm_executor.py": {"--requeue"},
+    "crs.py": {"--file"},
+    "launch.py": {"--std"},
+    "nvrtc.py": {"--gpu-architecture"},
+    "cli/main.py": {"--version"},
+}  # fmt: skip
+
+#: Tables of options, and style sheets, whose variables look like options.
+NO_MESSAGES = {SOURCE / "cli" / "help_text.py", SOURCE / "report" / "html_page.py"}
+
+
+def all_arguments() -> dict[str, type | None]:
+    return verb_arguments() | {"bench": BenchArguments}
+
+
+def texts_with_options() -> Iterator[tuple[str, str]]:
+    """Every text of the sources that names an option of vdgs, and the file; `{}` stands for what is filled in."""
+    for path in sorted(set(SOURCE.rglob("*.py")) - NO_MESSAGES):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        skipped = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.JoinedStr):
+                skipped |= {id(part) for part in node.values}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.JoinedStr):
+                text = "".join(str(part.value) if isinstance(part, ast.Constant) else "{}" for part in node.values)
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in skipped:
+                text = node.value
+            else:
+                continue
+            others = next((flags for file, flags in OF_OTHERS.items() if path.as_posix().endswith(file)), set())
+            if set(OPTION.findall(text)) - others:
+                yield path.relative_to(SOURCE).as_posix(), text
+
+
+TEXTS = sorted(set(texts_with_options()))
+
+
+def others_of(file: str) -> set[str]:
+    return next((flags for name, flags in OF_OTHERS.items() if f"vdgs/{file}".endswith(name)), set())
+
+
+def test_there_is_advice_to_check():
+    assert len(TEXTS) > 100
+    assert {"captures/loading.py", "sfm/georeferencing.py", "training/session/trainer.py"} <= {
+        file for file, _ in TEXTS
+    }
+
+
+def test_a_command_in_a_message_has_the_options_it_is_shown_with():
+    kinds = all_arguments()
+    for file, text in TEXTS:
+        for command in COMMAND.finditer(text):
+            verb = command.group(1)
+            assert verb in kinds or f"`{command.group()}`" not in text, f"{file}: there is no verb {verb}: {text}"
+            if verb not in kinds:  # "vdgs turns a folder ..."
+                continue
+            wrong = set(OPTION.findall(command.group())) - flags_of(kinds[verb])
+            assert not wrong, f"{file}: vdgs {verb} has no {wrong}: {text}"
+
+
+def test_every_option_in_a_message_is_one_of_some_verb():
+    known = {flag for kind in all_arguments().values() for flag in flags_of(kind)}
+    known |= {f"--{flag.rpartition('.')[2]}" for flag in known if flag.startswith("--sfm.")}
+    for file, text in TEXTS:
+        assert not set(OPTION.findall(text)) - known - others_of(file), f"{file}: {text}"
+
+
+@pytest.mark.parametrize("verb", COMMANDS)
+def test_a_verb_names_an_option_that_it_lacks_only_with_those_that_have_it(verb):
+    kinds = all_arguments()
+    own = flags_of(kinds[verb])
+    for file, text in TEXTS:
+        fitted = Advice(verb, lambda: kinds).fit(text)
+        advice, _, note = (
+            fitted.rpartition(" (") if fitted.endswith(")") and " of `vdgs " in fitted else (fitted, "", "")
+        )
+        commands = [found.group() for found in COMMAND.finditer(advice) if found.group(1) in kinds]
+        of_commands = {flag for command in commands for flag in OPTION.findall(command)}
+        lacked = set(OPTION.findall(advice)) - own - of_commands - others_of(file)
+        assert lacked == set(OPTION.findall(note)), f"vdgs {verb}: {fitted}"
+
+
+def test_advice_is_fitted_to_the_verb():
+    fit = Advice("run", all_arguments).fit
+    assert fit("Leave the positions out: --georeference off") == "Leave the positions out: --sfm.georeference off"
+    assert fit("Give --jobs 1.") == "Give --jobs 1."
+    assert Advice("sfm", all_arguments).fit("say --georeference off") == "say --georeference off"
+    assert Advice("train-blocks", all_arguments).fit("raise --densify.grad-threshold") == (
+        "raise --block.densify.grad-threshold"
+    )
+    assert Advice("merge", all_arguments).fit("Add --undistort.") == "Add --undistort. (--undistort of `vdgs run`)"
+    named = "Cut the scene again: vdgs partition RUN --blocks 2"
+    assert Advice("merge", all_arguments).fit(named) == named

@@ -1,0 +1,155 @@
+"""What needs no computation is answered before anything heavy is imported; words that are mistyped get a suggestion."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from support.commands import PATIENCE_SECONDS
+from support.small_pipeline import NativeRun, vdgs
+from vdgs.cli.main import COMMANDS, main
+from vdgs.config.commands import RunRequest
+from vdgs.config.method import MergeConfig
+from vdgs.pipeline.finished_run import nothing_to_do
+from vdgs.runs.run_folder import RunFolder
+from vdgs.system.similar_paths import suggest_path
+
+HEAVY = ("torch", "numpy", "matplotlib", "pycolmap", "cv2", "scipy", "sklearn", "shapely", "rasterio", "PIL")
+#: A command line of each verb with an input that is mistyped: the folder `DCIM` or the run `flight`.
+MISTYPED = {
+    "inspect": ["DICM", "-o", "looks"],
+    "run": ["DCMI", "-o", "new"],
+    "sfm": ["DCIM", "dcin", "--out", "place"],
+    "train-coarse": ["DCI", "--output", "new"],
+    "config": ["--config", "flihgt"],
+    **{verb: ["fligth"] for verb in ("status", "visibility", "partition", "train-blocks", "merge", "eval", "report")},
+    **{verb: ["fligth"] for verb in ("view", "ortho")},
+    "render": ["fligth", "-o", "film.mp4"],
+    "export": ["fligth", "-o", "scene.ply"],
+    "bench": ["toy", "-o", "bench", "--data", "dicm"],
+}
+
+
+def answer(folder: Path, *arguments: object) -> tuple[int, str, str]:
+    """The exit code and the output of a command that must not import anything heavy."""
+    code = (
+        "import sys\nfrom vdgs.cli.main import main\n"
+        f"try:\n    main({[str(each) for each in arguments]!r})\n"
+        f"finally:\n    print([each for each in {HEAVY!r} if each in sys.modules], file=sys.stderr)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=folder, env=os.environ | {"COLUMNS": "200"}, capture_output=True, text=True,
+        timeout=PATIENCE_SECONDS,
+    )  # fmt: skip
+    *errors, heavy = done.stderr.splitlines()
+    assert heavy == "[]", f"{arguments}: imports {heavy}"
+    return done.returncode, done.stdout, "\n".join(errors)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("place")
+    for name in ("DCIM", "flight"):
+        (folder / name).mkdir()
+    return folder
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--help"], ["run", "--help"], ["train-coarse", "--help-all", "--preset", "paper"], ["eval", "-h"]]
+)
+def test_help_imports_nothing_heavy(arguments, place):
+    code, out, _ = answer(place, *arguments)
+    assert code == 0
+    assert "usage: vdgs" in out
+
+
+def test_no_verb_with_an_input_is_left_out():
+    assert set(MISTYPED) == set(COMMANDS) - {"doctor", "synth"}
+
+
+@pytest.mark.parametrize("verb", MISTYPED)
+def test_a_mistyped_path_is_answered_at_once(verb, place):
+    code, _, err = answer(place, verb, *MISTYPED[verb])
+    assert code == 1
+    meant = "flight" if {"fligth", "flihgt"} & set(MISTYPED[verb]) else "DCIM"
+    assert err.endswith(f"; did you mean {meant}?")
+    assert sorted(path.name for path in place.iterdir()) == ["DCIM", "flight"]
+
+
+@pytest.mark.parametrize(
+    "verb", ["eval", "render", "ortho", "export", "visibility", "partition", "train-blocks", "merge"]
+)
+def test_a_folder_that_is_no_run_is_answered_at_once(verb, place):
+    output = ["-o", "new"] if verb in ("render", "export") else []
+    code, _, err = answer(place, verb, "flight", *output)
+    assert code == 1
+    assert "flight: is not a run folder" in err
+
+
+def test_a_finished_run_is_answered_at_once(native_small: NativeRun, tmp_path):
+    run = shutil.copytree(native_small.whole, tmp_path / "run")
+    vdgs("report", run)
+    again = ("run", native_small.capture, "--output", run, "--no-ortho")
+    code, out, _ = answer(tmp_path, *again)
+    assert code == 0
+    assert out.startswith(f"nothing to do: {run} is whole\nnext: ")
+    code, out, _ = answer(tmp_path, "status", run)
+    assert code == 0
+    assert "next: open " in out
+
+
+def test_a_run_is_looked_at_closely_where_anything_differs(native_small: NativeRun, tmp_path):
+    run = shutil.copytree(native_small.whole, tmp_path / "run")
+    own = RunFolder(run).settings()
+    asked = RunRequest(capture=native_small.capture, output=run, ortho=False, options=own.capture, **vars(own.method))
+    assert nothing_to_do(asked, "") == ""  # without a report
+    vdgs("report", run)
+    assert nothing_to_do(asked, "").startswith("nothing to do")
+    others = (
+        replace(asked, visibility_bins=5),
+        replace(asked, capture=tmp_path),
+        replace(asked, options=replace(own.capture, downscale=2.0)),
+        replace(asked, merge=MergeConfig(rule="max-visibility")),
+        replace(asked, output=tmp_path / "new"),
+    )
+    assert [nothing_to_do(other, "") for other in others] == [""] * len(others)
+    newer = tmp_path / "settings.yaml"
+    newer.touch()
+    assert nothing_to_do(asked, "", [newer]) == ""
+    os.utime(run / "capture.json", ns=(0, 0))  # older than the capture
+    assert nothing_to_do(asked, "") == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["mrege"], "there is no verb 'mrege'; did you mean 'merge'?"),
+        (["run", "C", "--outptu", "R"], "there is no option --outptu; did you mean --output?"),
+        (["run", "C", "--out", "R", "--max-anchor", "5"], "did you mean --densify.max-anchors?"),
+        (["export", "R", "--modle=best"], "there is no option --modle; did you mean --model?"),
+        (["run", "C"], "--output PATH is missing"),
+        (["run", "-o"], "--output nothing: must be a path"),
+        (["status", "R", "S"], "'S' belongs to no option"),
+        (["eval", "R", "--model", "marged"], "--model marged: must be best or coarse or merged"),
+        (["eval", "R", "--jobs", "two"], "--jobs two: must be a whole number"),
+        (["run", "C", "-o", "R", "--dry-run=yes"], "--dry-run takes no value"),
+    ],
+)
+def test_a_command_line_that_is_not_understood_is_a_usage_error(arguments, says, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code == 2
+    assert says in capsys.readouterr().err
+
+
+def test_a_path_is_suggested_where_a_part_of_it_is_mistyped(tmp_path):
+    (tmp_path / "card" / "DCIM").mkdir(parents=True)
+    assert suggest_path(tmp_path / "crad" / "DCIM") == f"; did you mean {tmp_path / 'card' / 'DCIM'}?"
+    assert suggest_path(tmp_path / "card" / "dcim") == f"; did you mean {tmp_path / 'card' / 'DCIM'}?"
+    assert suggest_path(tmp_path / "card" / "quite another") == ""
