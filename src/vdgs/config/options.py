@@ -62,8 +62,7 @@ class Option:
     @property
     def off_flag(self) -> str:
         """The name that switches it off: `--anchors.no-mvs`."""
-        *groups, last = self.flag.removeprefix("--").split(".")
-        return "--" + ".".join([*groups, f"no-{last}"])
+        return off_flag(self.flag)
 
     @property
     def metavar(self) -> str:
@@ -91,6 +90,12 @@ class Option:
         except ValueError:
             said = " ".join(words)
             raise ValueError(f"{said or 'nothing'}: must be {describe_type(self.hint)}") from None
+
+
+def off_flag(flag: str) -> str:
+    """The name that switches an option off."""
+    *groups, last = flag.removeprefix("--").split(".")
+    return "--" + ".".join([*groups, f"no-{last}"])
 
 
 @cache

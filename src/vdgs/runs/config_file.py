@@ -65,8 +65,7 @@ def _words(setting: str, value: Any) -> list[str]:
     """An option and its values as a command line has them."""
     flag = setting_flag(setting)
     if isinstance(value, bool):
-        head, _, name = flag.rpartition(".")
-        return [flag if value else f"{head}.no-{name}" if head else f"--no-{flag.removeprefix('--')}"]
+        return [flag if value else off_flag(flag)]
     words = [flag]
     for item in value if isinstance(value, list) else [value]:
         words += map(str, item if isinstance(item, list) else [item])
