@@ -33,6 +33,7 @@ OF_OTHERS = {
     "launch.py": {"--std"},
     "nvrtc.py": {"--gpu-architecture"},
     "cli/main.py": {"--version"},
+    "config_file.py": {"--no"},  # the beginning of a switch
 }  # fmt: skip
 
 #: Tables of options, and style sheets, whose variables look like options.

@@ -80,7 +80,11 @@ def test_the_known_outputs_are_found() -> None:
 @pytest.mark.parametrize(("verb", "names"), WRITTEN, ids=[f"{verb} {names[-1]}" for verb, names in WRITTEN])
 def test_no_verb_writes_among_photographs(verb: str, names: tuple[str, ...], inside: str, card: Path, capsys) -> None:
     before, root = contents(card.parents[1]), card.parents[1].parent
-    arguments = [str(root / "is-not-there")] if verb not in ("synth", "bench") else ["toy"] if verb == "bench" else []
+    (root / "empty").mkdir()
+    (root / "empty" / "config.yaml").touch()  # neither a capture nor a run, which is not looked at yet
+    arguments = (
+        [str(root / "empty")] if verb not in ("synth", "bench", "config") else ["toy"] if verb == "bench" else []
+    )
     if names != ("output",):
         arguments += [] if verb in ("render", "ortho", "export") else ["--output", str(root / "free")]
     place = str(card / inside)
@@ -91,7 +95,7 @@ def test_no_verb_writes_among_photographs(verb: str, names: tuple[str, ...], ins
     assert "lies among the photographs" in said
     assert str(card.parents[1] / "") in said.split("such as")[1]
     assert contents(card.parents[1]) == before
-    assert sorted(root.iterdir()) == [root / "card"]
+    assert sorted(root.iterdir()) == [root / "card", root / "empty"]
 
 
 @pytest.mark.parametrize("verb", sorted({*COMMANDS} - {verb for verb, _ in WRITTEN} - {"doctor"}))

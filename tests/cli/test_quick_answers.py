@@ -98,10 +98,11 @@ def test_a_finished_run_is_answered_at_once(native_small: NativeRun, tmp_path):
     again = ("run", native_small.capture, "--output", run, "--no-ortho")
     code, out, _ = answer(tmp_path, *again)
     assert code == 0
-    assert out.startswith(f"nothing to do: {run} is whole\nnext: ")
+    assert out.startswith(f"nothing to do: {run} is whole\n")
+    assert "next: " in out
     code, out, _ = answer(tmp_path, "status", run)
     assert code == 0
-    assert "next: open " in out
+    assert "next: " in out
 
 
 def test_a_run_is_looked_at_closely_where_anything_differs(native_small: NativeRun, tmp_path):

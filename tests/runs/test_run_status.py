@@ -322,6 +322,7 @@ def test_a_run_without_its_command_is_continued_with_its_settings(tmp_path, chan
     method = PRESETS["laptop"]
     method = replace(method, **{name: replace(getattr(method, name), **new) for name, new in changed.items()})
     options = CaptureOptions(images="images_4", test_every=5)
+    (tmp_path / "a capture").mkdir()
     run.create_or_check(RunSettings.create(tmp_path / "a capture", options, method))
     line = next_line(get_run_status(run))
     (command,) = next_commands(line)

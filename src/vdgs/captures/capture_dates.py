@@ -31,13 +31,3 @@ def date_taken(file: Path) -> str:
     except (OSError, ValueError, SyntaxError, KeyError, TypeError, AttributeError, struct.error):
         return ""  # what Pillow raises for damaged EXIF
     return value if isinstance(value, str) else ""
-
-
-def format_flown(flown: tuple[str, ...]) -> str:
-    """The date of a flight, or the first and the last day."""
-    days = [each[:10] for each in flown]
-    if not days:
-        return ""
-    if days[0] == days[-1]:
-        return f"{days[0]}, {flown[0][11:]} to {flown[-1][11:]} by the camera's clock"
-    return f"{days[0]} to {days[-1]}"

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import difflib
-import shlex
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from vdgs.config.options import Option, Values, options_of, with_values
-from vdgs.config.output_paths import is_output
+from vdgs.config.output_paths import is_output, output_paths
 from vdgs.config.ranges import check_ranges
 from vdgs.errors import RunError, VdgsError
+from vdgs.system.quoting import shell_line
 from vdgs.system.similar_paths import suggest_path
 
 HELP_FLAGS, FULL_HELP_FLAG = ("-h", "--help"), "--help-all"
@@ -46,26 +46,34 @@ class GivenArguments:
         return settings
 
     def check(self) -> None:
-        """Raise UsageError where something required is missing, VdgsError for a number outside its range and for an
-        input that does not exist."""
+        """Raise UsageError where something required is missing, VdgsError for a number outside its range, for an output
+        among photographs or in a capture's inputs (`captures.output_guard`) and for an input that does not exist."""
         options = options_of(self.kind)
         missing = [each for each in options if each.is_required and each.path not in self.values]
         names = " and ".join(each.metavar if each.is_positional else f"{each.flag} {each.metavar}" for each in missing)
         if missing:
             raise UsageError(f"{names} {'is' if len(missing) == 1 else 'are'} missing")
-        check_ranges(self.over())
+        settings = self.over()
+        check_ranges(settings)
         for option in options:
             value = self.values.get(option.path)
             for path in value if isinstance(value, tuple) else (value,):
                 if isinstance(path, Path) and not is_output(option.hint):
                     _check_input(option, path)
 
+        outputs = [path for path in output_paths(settings) if not (path / "config.yaml").is_file()]
+        if outputs:
+            from vdgs.captures.output_guard import check_output
+
+            for path in outputs:
+                check_output(path)
+
     def command_line(self, verb: str, without: Iterable[str] = ()) -> str:
         """The command as it can be typed in any folder: with absolute paths, and without some options."""
         line = ["vdgs", verb]
         for option in options_of(self.kind):
             line += [] if option.flag in without else self._absolute_words(option)
-        return shlex.join(line)
+        return shell_line(line)
 
     def _absolute_words(self, option: Option) -> list[str]:
         words, value = self.words.get(option.path), self.values.get(option.path)

@@ -12,7 +12,6 @@ from vdgs.cli.advice import MESSAGE_FIT
 from vdgs.cli.argument_parser import FULL_HELP_FLAG, GivenArguments, UsageError, parse_words
 from vdgs.config.executor_options import ExecutorOptions
 from vdgs.config.method import MethodConfig
-from vdgs.config.output_paths import output_paths
 from vdgs.config.ranges import WORKER_COUNT, FlagName, Positional, check_ranges
 from vdgs.errors import VdgsError
 
@@ -115,17 +114,7 @@ def parse_arguments(kind: type[Parsed], words: list[str], verb: str, defaults: L
     given = read_arguments(kind, words, verb, defaults)
     parsed: Parsed = given.over(*defaults(given))
     check_ranges(parsed)
-    check_outputs(parsed)
     return parsed
-
-
-def check_outputs(arguments: Any) -> None:
-    """Raise VdgsError for an output among photographs or in a capture's inputs (`captures.output_guard`)."""
-    if outputs := list(output_paths(arguments)):
-        from vdgs.captures.output_guard import check_output
-
-        for path in outputs:
-            check_output(path)
 
 
 def parse_for_run(
@@ -180,10 +169,10 @@ def make_console(quiet: bool = False) -> Console:
         """Prints texts as they are for the verb, and names with brackets as they are."""
 
         def print(self, *objects: Any, **options: Any) -> None:
-            texts = [fit(each) if isinstance(each, str) else each for each in objects]
-            if options.get("markup", True):
-                texts = [escape_names(each) if isinstance(each, str) else each for each in texts]
-            super().print(*texts, **options)
+            def shown(text: str) -> str:
+                return fit(escape_names(text) if options.get("markup", True) else text)
+
+            super().print(*(shown(each) if isinstance(each, str) else each for each in objects), **options)
 
     if not quiet:
         return Fitted(soft_wrap=True)

@@ -11,7 +11,6 @@ from vdgs.cli.argument_parser import GivenArguments
 from vdgs.cli.common import (
     ComputeArguments,
     QuietArguments,
-    check_outputs,
     make_console,
     read_arguments,
     set_up_compute,
@@ -65,7 +64,6 @@ def train_coarse_command(arguments: list[str]) -> None:
     start = start_settings(given)
     args: TrainCoarseArguments = given.over(layer(start))
     check_ranges(args)
-    check_outputs(args)
     console, method = make_console(args.quiet), replace(start.method, training=args.training)
     if start.reason:
         console.print(f"preset: {start.reason}", highlight=False)
@@ -106,7 +104,6 @@ def run_command(arguments: list[str]) -> None:
         if done := nothing_to_do(args, command, [args.config] if args.config else []):
             console.print(done, markup=False, highlight=False)
             return
-    check_outputs(args)
     if start.reason:
         console.print(f"preset: {start.reason}", highlight=False)
     request = replace(args, device=set_up_compute(args.device, args.threads))
@@ -143,7 +140,6 @@ def config_command(arguments: list[str]) -> None:
     given = read_arguments(ConfigArguments, arguments, "config", lambda it: [layer(it)])
     args: ConfigArguments = given.over(layer(given))
     check_ranges(args)
-    check_outputs(args)
     from vdgs.runs.settings_file import write_settings_file
 
     text = write_settings_file(args.output, args.options, args.method, args.overwrite)

@@ -28,6 +28,7 @@ from vdgs.kernels import get_num_threads
 from vdgs.partition.partition_scene import choose_block_count
 from vdgs.pipeline.assumed_scene import as_many, assumed_capture
 from vdgs.pipeline.dense_points import max_dense_points
+from vdgs.pipeline.image_size import choose_image_size
 from vdgs.pipeline.time_estimate import (
     COARSE_VIEW_STEPS,
     MAP_STEPS,
@@ -115,6 +116,7 @@ def estimate_run(request: RunRequest, console: Console) -> RunEstimate:
         raise VdgsError("--dry-run writes nothing, and --undistort writes photographs: leave one of the two out.")
     if is_image_input(request):
         return _estimate_from_images(request, console)
+    request = choose_image_size(request, console)
     capture = load_capture(request.capture, request.options)
     for warning in capture.warnings:
         console.print(f"[yellow]note[/] {warning}", highlight=False)

@@ -14,7 +14,7 @@ from rich.table import Table
 from vdgs.captures.capture import Capture
 from vdgs.captures.image_checks import ImageCheckReport
 from vdgs.captures.output_guard import check_not_among_inputs
-from vdgs.captures.place_facts import place_rows
+from vdgs.captures.place_record import place_rows
 from vdgs.captures.reconstruction import ReconstructionReport, excluded_lines, report_rows
 from vdgs.captures.validation import format_reprojection, validate_capture
 from vdgs.geometry.similarity import sample_points

@@ -14,7 +14,8 @@ from scipy.spatial import cKDTree
 
 from vdgs.captures.capture import Capture
 from vdgs.captures.image_checks import ImageCheckReport
-from vdgs.captures.place_facts import PlaceFacts, measure_place
+from vdgs.captures.place_facts import measure_place
+from vdgs.captures.place_record import PlaceFacts
 from vdgs.captures.validation import ValidationReport
 from vdgs.visibility.visibility_counts import LOW_VISIBILITY_LIMITS, visibility_stats
 

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import contextlib
 
-from vdgs.captures.place_facts import PlaceFacts, format_area, place_rows
+from vdgs.captures.place_record import PlaceFacts, format_area, place_rows
 from vdgs.errors import RunError
 from vdgs.report.embedded_images import EmbeddedImage
 from vdgs.report.html_page import Html, Overlay, facts_table, map_figure, paragraph, side_by_side
+from vdgs.report.report_status import PLACE_FILE
 from vdgs.report.run_reader import JsonRecord, ReportedRun, RunFiles
 from vdgs.system.records import record_from_dict
 from vdgs.system.units import floor_to_nice_length, format_length
 
-PLACE_FILE, MAP_FILE, PICTURE_FILE = "place.json", "maps/map.json", "maps/orthophoto.png"
+MAP_FILE, PICTURE_FILE = "maps/map.json", "maps/orthophoto.png"
 #: Which share of the width of a map its scale bar has, at most.
 _BAR_SHARE = 0.3
 

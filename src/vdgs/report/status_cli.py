@@ -10,19 +10,18 @@ from rich.console import Console
 from rich.markup import escape
 
 from vdgs.captures.place_facts import PlaceFacts, place_summary
+from vdgs.captures.place_record import PlaceFacts, place_summary
 from vdgs.captures.reconstruction import PROGRESS_FILE, SFM_STAGE, WORK_FOLDER, is_finished
 from vdgs.errors import VdgsError
-from vdgs.report.place_section import read_place
-from vdgs.report.report_status import report_status
-from vdgs.report.run_reader import RunFiles
+from vdgs.report.report_status import PLACE_FILE, report_status
 from vdgs.runs.run_folder import REPORT_FILE, RunFolder
 from vdgs.runs.run_status import RunStatus, StageState, StageStatus, get_run_status
 from vdgs.runs.stage_folder import StatusRecord
 from vdgs.sfm.source_images import SourceImages, source_changes
-from vdgs.system.atomic_files import to_jsonable
+from vdgs.system.atomic_files import read_json_or_empty, to_jsonable
 from vdgs.system.documents import RunStatusDocument, StageStatusDocument
 from vdgs.system.quoting import shell_line
-from vdgs.system.records import record_to_dict
+from vdgs.system.records import record_from_dict, record_to_dict
 from vdgs.system.step_progress import read_step
 from vdgs.system.units import rough_duration
 
@@ -102,7 +101,10 @@ def status_json(run: RunFolder) -> RunStatusDocument:
 
 def _place(run: RunFolder) -> PlaceFacts | None:
     """The facts of the place, as the report begins with them; None where the run has none."""
-    return read_place(RunFiles(run.path))
+    try:
+        return record_from_dict(PlaceFacts, read_json_or_empty(run.path / PLACE_FILE))
+    except ValueError:  # none, or damaged
+        return None
 
 
 def next_line(status: RunStatus) -> str:

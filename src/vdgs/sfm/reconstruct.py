@@ -136,7 +136,7 @@ def _check_nothing_trained(request: SfmRequest, run: RunFolder | None) -> None:
     """Raise RunError where a capture is about to change that a run was trained on."""
     if run is not None and run.is_trained and not request.overwrite:
         raise RunError(
-            f"{run.path}: its capture was made with other positions or other settings of the reconstruction (--sfm, "
+            f"{run.path}: its capture was made with other positions or other settings of the reconstruction (--sfm.*, "
             "--gps), and the run was trained on it. Add --overwrite to do both again, give the old settings to "
             "continue, or take another --output."
         )

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from vdgs.captures.reconstruction import SOURCE_IMAGES_FILE
 from vdgs.errors import VdgsError
-from vdgs.sfm.find_images import find_files
 from vdgs.system.atomic_files import read_json_or_empty, write_json
 from vdgs.system.records import record_from_dict, record_to_dict
 from vdgs.system.units import first_names
@@ -34,6 +33,8 @@ class SourceImages:
     @staticmethod
     def of(folders: Sequence[Path], command: str | None = None) -> SourceImages:
         """Those that lie in the folders now. Raises VdgsError where they cannot be told."""
+        from vdgs.sfm.find_images import find_files  # reads pictures, which most runs do not need
+
         stats = {name: path.stat() for name, path in find_files(folders).named.items()}
         files = tuple(SourceFile(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats.items())
         return SourceImages(folders=tuple(str(each.resolve()) for each in folders), files=files, command=command)
