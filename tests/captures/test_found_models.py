@@ -253,6 +253,30 @@ def test_images_may_lie_in_other_folders_than_the_model_says(tmp_path, scene, mo
     assert any("by other folders" in warning for warning in capture.warnings)
 
 
+@pytest.mark.parametrize("folder", ["Images", "input", "."])
+def test_folders_of_images_by_other_names_are_used_or_named(tmp_path, scene, folder):
+    write_colmap(tmp_path, scene)
+    images = tmp_path / "images"
+    if folder == ".":
+        for file in images.iterdir():
+            file.rename(tmp_path / file.name)
+        images.rmdir()
+    else:
+        images.rename(tmp_path / folder)
+    if folder == "Images":
+        assert any("Images is used" in warning for warning in load_capture(tmp_path).warnings)
+        return
+    with pytest.raises(CaptureError, match=rf"--images {re.escape(folder)}\."):
+        load_capture(tmp_path)
+    assert len(load_capture(tmp_path, CaptureOptions(images=folder)).views) == 12
+
+
+def test_an_archive_is_called_a_file(tmp_path):
+    (tmp_path / "place.zip").write_bytes(b"PK")
+    with pytest.raises(CaptureError, match=r"is a file\. Unpack"):
+        load_capture(tmp_path / "place.zip")
+
+
 def test_images_of_one_name_in_two_folders_are_not_guessed(tmp_path, scene):
     write_colmap(tmp_path, scene, text=True)
     file = tmp_path / "sparse/0/images.txt"

@@ -232,6 +232,8 @@ def test_altitudes_of_exactly_zero_among_others_are_none(tmp_path):
     assert any("0.jpg: the position has no altitude; not used" in note for note in found.notes)
     beach = [replace(photo, altitude=float(k)) for k, photo in enumerate(seen)]
     assert len(read_gps_priors(beach, None, (1.0, 2.0))) == 8
+    none = [replace(photo, altitude=0.0, relative_altitude=None) for photo in seen]
+    assert not read_gps_priors(none, None, (1.0, 2.0)).has_altitudes
 
 
 def test_moments_of_a_drone_are_matched_by_number(tmp_path):

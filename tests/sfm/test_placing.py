@@ -20,7 +20,7 @@ from vdgs.captures.validation import validate_capture
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import geodetic_from_enu
-from vdgs.sfm import feature_extraction, feature_matching, incremental_mapper
+from vdgs.sfm import feature_extraction, feature_matching, gps_priors, incremental_mapper
 from vdgs.sfm.reconstruct import reconstruct
 
 pytestmark = pytest.mark.xdist_group("sfm")
@@ -90,6 +90,27 @@ def test_a_table_given_afterwards_moves_the_finished_capture(nine, capture, tmp_
     written = json.loads((capture / "reconstruction.json").read_text())["accuracy"]
     assert written["scale_percent"] > 0
     assert "nothing to do" in again(nine, capture, tmp_path / "gps.csv")[1]
+
+
+@pytest.mark.parametrize("altitudes", [True, False])
+def test_positions_of_half_of_the_photographs_place_all(nine, capture, tmp_path, altitudes, monkeypatch):
+    rows = table(tmp_path / "gps.csv", nine).read_text().splitlines()[:1:-2]
+    if not altitudes:
+        monkeypatch.setattr(gps_priors, "_altitude_beside", lambda photo: (np.nan, ""))
+    lines = rows if altitudes else [row.rpartition(",")[0] for row in rows]
+    (tmp_path / "gps.csv").write_text("\n".join(["name,lat,lon,alt" if altitudes else "name,lat,lon", *lines]))
+    facts, said = again(nine, capture, tmp_path / "gps.csv")
+    assert f"positions of {len(rows)} photographs" in facts.georeferenced
+    assert facts.registered == 9
+    assert facts.height_m == pytest.approx(45, abs=2)
+    assert facts.accuracy.scale_percent < 10
+    assert len(facts.residual_rms_m) == (3 if altitudes else 2)
+    georef = json.loads((capture / "georef.json").read_text())
+    assert (georef["origin_alt_m"] == 0) != altitudes
+    assert ("heights above the sea are not known" in said) != altitudes
+    scene = load_capture(capture)
+    assert scene.ground.metric
+    assert validate_capture(scene).problems == ()
 
 
 def test_altitudes_that_drift_afterwards_tilt_nothing(nine, capture, tmp_path):

@@ -18,6 +18,7 @@ from vdgs.captures.formats.ply_reader import read_point_cloud
 from vdgs.captures.formats.source_capture import SourceCapture
 from vdgs.captures.formats.sparse_points import POINT_CLOUDS, find_point_cloud
 from vdgs.captures.formats.transforms import TRANSFORMS_FILE, exclusive_information, read_transforms
+from vdgs.captures.image_files import IMAGE_SUFFIXES, find_images
 from vdgs.captures.nested_captures import foreign_poses, model_below
 from vdgs.captures.reconstruction import is_reconstruction
 from vdgs.config.capture_options import CaptureOptions
@@ -120,9 +121,22 @@ def image_folder(root: Path, options: CaptureOptions) -> tuple[str, list[str]]:
         if entry.is_dir() and entry.name.removeprefix("images_").isdigit()
     }
     if not shrunk:
-        raise CaptureError(f"{root}: no images/ folder (nor images_2, images_4, ...). Put the photographs there.")
+        return _other_image_folder(root)
     name = shrunk[min(shrunk)]
     return name, [f"no images/ folder; {name} is used instead (--images chooses)."]
+
+
+def _other_image_folder(root: Path) -> tuple[str, list[str]]:
+    """`Images` or `IMAGES`, and a note. Raises CaptureError that names the folders which hold images by other names."""
+    named = [entry.name for entry in sorted(root.iterdir()) if entry.is_dir() and find_images(entry)]
+    alike = [name for name in named if name.lower() == "images"]
+    if len(alike) == 1:
+        return alike[0], [f"no images/ folder; {alike[0]} is used instead (--images chooses)."]
+    named += ["."] if any(entry.suffix.lower() in IMAGE_SUFFIXES for entry in root.iterdir()) else []
+    where = (
+        f", or name the folder that they are in: {' or '.join(f'--images {name}' for name in named)}" if named else ""
+    )
+    raise CaptureError(f"{root}: no images/ folder (nor images_2, images_4, ...). Put the photographs there{where}.")
 
 
 #: Of each format, in the order in which they are looked for: whether a folder holds it, and its reader.

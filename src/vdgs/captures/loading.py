@@ -37,7 +37,8 @@ def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
     options = options or CaptureOptions()
     root = Path(path)
     if not root.is_dir():
-        raise CaptureError(f"{root}: no such folder. Give the folder that holds images/ and sparse/.")
+        what = "is a file. Unpack an archive first, and give" if root.is_file() else "no such folder. Give"
+        raise CaptureError(f"{root}: {what} the folder that holds images/ and sparse/.")
     _check_options(options)
     source = read_source(root, options)
     warnings = list(source.warnings)

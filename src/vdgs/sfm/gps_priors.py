@@ -184,9 +184,10 @@ def _without_default_altitudes(recorded: _Recorded, photographs: Sequence[ImageM
 
 
 def _without_single_zeros(geodetic: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Without altitudes of exactly 0 where the others are far from it: those of a receiver that had none."""
+    """Without altitudes of exactly 0 where the others are far from it, or all are 0: those of a receiver that had
+    none."""
     zero, others = geodetic[:, 2] == 0, known & (np.nan_to_num(geodetic[:, 2]) != 0)
-    if not zero.any() or not others.any() or abs(np.median(geodetic[others, 2])) < FAR_FROM_ZERO_M:
+    if not zero.any() or (others.any() and abs(np.median(geodetic[others, 2])) < FAR_FROM_ZERO_M):
         return geodetic
     return np.where(zero[:, None] & [False, False, True], np.nan, geodetic)
 
