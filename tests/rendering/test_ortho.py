@@ -108,7 +108,7 @@ def test_files_open_at_the_right_place_with_the_right_heights(house, make):
 def test_files_are_cloud_optimized_and_say_what_they_are(house, make):
     ortho_folder = make(*house, gsd=0.03)
     names = {file.name for file in ortho_folder.iterdir()}
-    assert names == {"orthophoto.tif", "dsm.tif", "visibility.tif", "hillshade.png", "preview.png", "map.json"}
+    assert names == set(ortho_plan.FILE_NAMES)
     layers = {
         "orthophoto": (4, "uint8", None),
         "dsm": (1, "float32", NODATA_HEIGHT),
@@ -351,7 +351,7 @@ def test_a_disk_without_room_is_named_before_anything_is_drawn(house, make, monk
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(10, 9, 1))
     monkeypatch.setattr(tile_renderer.TileRenderer, "render_tile", lambda *_: pytest.fail("drawn"))
-    with pytest.raises(VdgsError, match=r"0 MB are free\. Give a larger --gsd"):
+    with pytest.raises(VdgsError, match=r"0 MB are free\. Free some space, or give a larger --gsd"):
         make(*house, gsd=0.2)
 
 

@@ -14,12 +14,13 @@ from PIL import Image
 from rich.console import Console
 
 from support.captures import tiny_scene, write_colmap
-from vdgs.captures.capture_dates import date_taken, first_and_last, format_flown
+from vdgs.captures.capture_dates import date_taken, first_and_last
 from vdgs.captures.loading import load_capture
-from vdgs.captures.place_facts import PlaceFacts, format_area, measure_place, place_rows, place_summary
+from vdgs.captures.place_facts import measure_place
+from vdgs.captures.place_record import PlaceFacts, format_area, format_flown, place_rows, place_summary
 from vdgs.config.capture_options import CaptureOptions
-from vdgs.report import write_report
 from vdgs.report.status_cli import print_status, status_json
+from vdgs.report.write_report import write_report
 from vdgs.runs.run_folder import RunFolder
 from vdgs.system.records import record_to_dict
 

@@ -177,7 +177,7 @@ BAD_BARS = {
     "no mark": ("A B 3", "A is marked in fewer than two photographs"),
     "no number": ("A B three", "line 1: 'A B three' is not"),
     "no distance": ("A B -3", "line 1: 'A B -3' is not"),
-    "unknown": ("A 10 10 DJI_0999.JPG", "line 1: there is no photograph"),
+    "unknown": ("A 10 10 DJI_0999.JPG\nA B 3", "line 1: there is no photograph"),
 }
 
 

@@ -29,6 +29,7 @@ from vdgs.sfm.image_list import collect_images
 from vdgs.sfm.mask_files import read_keep_mask, write_upright_masks
 from vdgs.sfm.reconstruction_plan import plan_reconstruction, print_plan
 from vdgs.sfm.run_request import make_sfm_request
+from vdgs.sfm.step_keys import step_keys
 from vdgs.sfm.workspace import Workspace, silence_colmap
 
 pytestmark = pytest.mark.xdist_group("sfm")
@@ -86,7 +87,9 @@ def test_masks_beside_photographs_are_masks(tmp_path, asked, names, masks):
     ]  # fmt: skip
     assert any("3 of 4 photographs have a mask" in note for note in found.notes)
     said = console()
-    print_plan(plan_reconstruction(SfmRequest(image_folders=(tmp_path / asked,), output=tmp_path.parent / "new")), said)
+    print_plan(
+        plan_reconstruction(SfmRequest(image_folders=(tmp_path / asked,), output=tmp_path.parent / "new")), "", said
+    )
     assert "3 of 4 photographs have one" in said.file.getvalue()
 
 
@@ -150,7 +153,7 @@ def test_transparency_is_a_mask_and_both_count(tmp_path):
     assert np.array_equal(read_keep_mask(second), left_half() & upper)
     assert read_keep_mask(third) is None
     said = console()
-    print_plan(plan_reconstruction(SfmRequest(image_folders=(tmp_path,), output=tmp_path.parent / "new")), said)
+    print_plan(plan_reconstruction(SfmRequest(image_folders=(tmp_path,), output=tmp_path.parent / "new")), "", said)
     assert "1 of 3 photographs have one; 3 have an alpha channel" in said.file.getvalue()
 
 
@@ -195,7 +198,7 @@ def test_masks_are_written_with_the_capture_and_what_depends_on_them_is_done_aga
     first = masked.folder / f"masks/{masked.names[0]}.png"
     for change in (lambda: None, lambda: write_mask(first, ~left_half(300, 400)), first.unlink):
         change()
-        keys.append(reconstruct._keys(plan_reconstruction(request)))
+        keys.append(step_keys(plan_reconstruction(request)))
     for step in ("features", "matches", "model", "capture"):
         assert len({each[step] for each in keys}) == 3
 

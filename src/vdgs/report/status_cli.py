@@ -9,7 +9,6 @@ from pathlib import Path
 from rich.console import Console
 from rich.markup import escape
 
-from vdgs.captures.place_facts import PlaceFacts, place_summary
 from vdgs.captures.place_record import PlaceFacts, place_summary
 from vdgs.captures.reconstruction import PROGRESS_FILE, SFM_STAGE, WORK_FOLDER, is_finished
 from vdgs.errors import VdgsError

@@ -16,6 +16,7 @@ import yaml
 
 from vdgs import __version__
 from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.options import off_flag
 from vdgs.config.presets import PRESETS
 from vdgs.config.ranges import to_flag
 from vdgs.config.serialization import diff_settings

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shlex
 import threading
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 
 from vdgs.captures.camera_height import camera_height
 from vdgs.captures.known_distances import MIN_OBSERVATIONS, MOST_APART
+from vdgs.system.quoting import shell_word
 from vdgs.viewer.measurement import SCALE_BAR_FILE, KnownDistance, MeasuredPoint, Ruler, known_distances_text
 from vdgs.viewer.session_protocol import SessionProtocol
 
@@ -94,10 +94,9 @@ def scale_markdown(known: list[KnownDistance], capture: str) -> str:
         lines[0] += f"; they differ from that by up to {100 * apart:.2g} %"
     if apart > MOST_APART:
         lines.append("**They contradict each other**: look at places and metres again.")
-    folder = shlex.quote(capture)
     lines += [
-        f"`vdgs run {folder} --scale-bar {SCALE_BAR_FILE} --output NEW-RUN`",
+        f"`vdgs run {shell_word(capture)} --scale-bar {SCALE_BAR_FILE} --output NEW-RUN`",
         f"begins a run in metres. A capture by `vdgs sfm` is placed anew in seconds: `vdgs sfm PHOTOGRAPHS --output "
-        f"{folder} --scale-bar {SCALE_BAR_FILE}`",
+        f"{shell_word(capture)} --scale-bar {SCALE_BAR_FILE}`",
     ]
     return "\n\n".join(lines)
