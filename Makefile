@@ -41,17 +41,20 @@ $(TEST_STAMP): $(STAMP)
 
 setup-test: $(TEST_STAMP)
 
+# Fewer steps than the preset takes, so that it ends in minutes.
 demo: setup
 	rm -rf $(DEMO)
 	$(BIN)/vdgs synth $(DEMO)/capture
 	$(BIN)/vdgs inspect $(DEMO)/capture --output $(DEMO)/inspect
-	$(BIN)/vdgs run $(DEMO)/capture --output $(DEMO)/run --preset laptop --blocks 4
+	$(BIN)/vdgs run $(DEMO)/capture --output $(DEMO)/run --preset laptop --blocks 4 --iterations 2000 --block.iterations 500
+	$(BIN)/vdgs export $(DEMO)/run --output $(DEMO)/run/scene.html --color-iterations 1
+	$(BIN)/vdgs report $(DEMO)/run
 	@echo
-	@echo "report:      $(DEMO)/run/report.html"
 	@echo "test views:  $(DEMO)/run/evaluation/contact_sheet.png"
 	@echo "metrics:     $(DEMO)/run/evaluation/metrics.json"
-	@echo "maps:        $(DEMO)/run/maps/preview.png"
+	@echo "map:         $(DEMO)/run/maps/orthophoto.png"
 	@echo "model:       $(DEMO)/run/merged/model.safetensors (vdgs export $(DEMO)/run --output scene.ply for other programs)"
+	@echo "open this:   $(DEMO)/run/report.html (offline: the place, its map and figures, and a link into the scene)"
 
 lint: setup-test
 	$(BIN)/ruff check .
