@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from support.captures import tiny_scene, write_colmap
-from support.clusters import copy_run
 from support.commands import do_tasks_here, vdgs
 from support.pipeline_run import BLOCK_ITERATIONS, ITERATIONS, MERGED, SETTINGS, changed_files, model, moments
 from vdgs.evaluation.evaluate_run import IsolatedBlocks
@@ -24,21 +23,6 @@ from vdgs.runs.run_folder import RunFolder
 from vdgs.visibility.visibility_counts import count_visibility
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("pipeline")]
-
-
-@pytest.fixture(scope="module")
-def capture(two_blocks) -> Path:
-    return two_blocks.capture
-
-
-@pytest.fixture(scope="module")
-def unbroken(two_blocks) -> Path:
-    return two_blocks.run
-
-
-@pytest.fixture
-def copied(unbroken, tmp_path) -> Path:
-    return copy_run(unbroken, tmp_path / "run")
 
 
 def train_each(run: Path, *settings: str) -> None:

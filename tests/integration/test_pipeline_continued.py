@@ -9,26 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from support.clusters import copy_run
 from support.commands import begun, is_free, vdgs, wait_until
 from support.pipeline_run import SETTINGS, model
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("pipeline")]
-
-
-@pytest.fixture(scope="module")
-def capture(two_blocks) -> Path:
-    return two_blocks.capture
-
-
-@pytest.fixture(scope="module")
-def unbroken(two_blocks) -> Path:
-    return two_blocks.run
-
-
-@pytest.fixture
-def copied(unbroken, tmp_path) -> Path:
-    return copy_run(unbroken, tmp_path / "run")
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,14 @@ from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RunRequest
 from vdgs.config.presets import PRESETS
 from vdgs.pipeline import image_size
-from vdgs.pipeline.image_size import ImageSize, choose_image_size, image_sizes, largest_suitable, run_seconds
+from vdgs.pipeline.image_size import (
+    ImageSize,
+    choose_image_size,
+    image_sizes,
+    largest_suitable,
+    open_at_suitable_size,
+    run_seconds,
+)
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
 
@@ -87,6 +94,26 @@ def test_a_new_run_takes_it_and_says_so_in_a_line(capture, tmp_path, monkeypatch
     said = capsys.readouterr().out
     assert said.startswith("photographs: images_2 (800x600), not images (1600x1200), about ")
     assert said.endswith("; --images overrides\n")
+
+
+@pytest.mark.parametrize(("pixels_per_second", "size"), [(2e5, 800), (5e4, 400)])
+def test_the_capture_of_the_size_that_is_taken_is_that_of_its_options(
+    capture, tmp_path, monkeypatch, pixels_per_second, size
+):
+    monkeypatch.setattr(image_size, "PIXELS_PER_CORE_SECOND", pixels_per_second)
+    (capture / "images").rename(capture / "images_1")  # the choice leaves no note about it
+    try:
+        chosen, opened = open_at_suitable_size(request(capture, tmp_path / "run"), make_console())
+        again = load_capture(capture, chosen.options)
+        assert opened is not None
+        assert (opened.warnings, opened.images) == (again.warnings, again.images)
+        for one, other in zip(opened.views, again.views, strict=True):
+            assert (one.image_path, one.mask_path, one.split) == (other.image_path, other.mask_path, other.split)
+            assert one.camera.width == size
+            assert np.array_equal(one.camera.packed_float64, other.camera.packed_float64)
+        assert np.array_equal(opened.points, again.points)
+    finally:
+        (capture / "images_1").rename(capture / "images")
 
 
 def test_what_a_person_says_and_a_run_that_is_there_are_kept(capture, tmp_path, monkeypatch, capsys):

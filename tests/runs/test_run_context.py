@@ -13,13 +13,15 @@ import torch
 from support.captures import tiny_scene, write_colmap
 from support.clusters import copy_run
 from support.commands import CommandsHere
+from vdgs.captures import loading
 from vdgs.cli.main import main
 from vdgs.distributed import backend_selection
 from vdgs.distributed.executor import Task, TaskListener, TaskResult
 from vdgs.errors import VdgsError
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.runs import create_or_resume, open_run
+from vdgs.pipeline import image_size
 from vdgs.runs.run_context import RunContext
+from vdgs.runs.run_folder import RunFolder
 
 SETTINGS = (
     "--preset", "laptop", "--iterations", "12", "--anchors.num-offsets", "2", "--densify.start", "50", "--no-ortho",
@@ -33,18 +35,17 @@ class Reads:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.process = "driver"
         self.captures, self.models = Counter[str](), Counter[tuple[str, str]]()
-        load_capture, load_model = open_run.load_capture, AnchorModel.load
+        read_source, load_model = loading.read_source, AnchorModel.load
 
         def read_capture(*given):
             self.captures[self.process] += 1
-            return load_capture(*given)
+            return read_source(*given)
 
         def read_model(path: Path) -> AnchorModel:
             self.models[self.process, path.parent.name] += 1
             return load_model(path)
 
-        for module in (open_run, create_or_resume):
-            monkeypatch.setattr(module, "load_capture", read_capture)
+        monkeypatch.setattr(loading, "read_source", read_capture)
         monkeypatch.setattr(AnchorModel, "load", read_model)
         reads = self
 
@@ -71,10 +72,16 @@ def command(*arguments: object) -> None:
     assert ended.value.code == 0
 
 
-def test_one_run_reads_its_capture_once_and_each_block_once(tmp_path, reads):
+@pytest.mark.parametrize("smaller", [False, True])
+def test_one_run_reads_its_capture_once_and_each_block_once(tmp_path, reads, monkeypatch, smaller):
+    """Also where the run takes a smaller size of the photographs than the capture has."""
     write_colmap(tmp_path / "capture", tiny_scene())
+    if smaller:
+        monkeypatch.setattr(image_size, "MIN_SIDE", 1)
+        monkeypatch.setattr(image_size, "PIXELS_PER_CORE_SECOND", 1.0)
     command("run", tmp_path / "capture", "--output", tmp_path / "run", *SETTINGS)
     assert reads.captures == {"driver": 1, "block 00": 1, "block 01": 1}
+    assert (RunFolder(tmp_path / "run").settings().capture.downscale > 1) == smaller
     # The driver holds no model while blocks train: it reads the coarse one again to merge.
     assert (reads.models["driver", "coarse"], reads.models["driver", "merged"]) == (2, 1)
     assert [reads.models[f"block {index:02d}", "coarse"] for index in range(2)] == [1, 1]

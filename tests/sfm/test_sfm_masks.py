@@ -178,7 +178,8 @@ def test_features_lie_where_masks_are_white(masked, tmp_path):
     feature_extraction.create_database(work, kinds)
     feature_extraction.write_upright_images(work, seen)
     write_upright_masks(work, seen, 1)
-    counts = feature_extraction.extract_features(work, kinds, 300, 500, 1, console())
+    options = SfmOptions(max_image_size=300, max_num_features=500)
+    counts = feature_extraction.extract_features(work, kinds, options, 1, console())
     database = pycolmap.Database.open(work.database)
     found = {image.name: image.image_id for image in database.read_all_images()}
     x, y = np.asarray(database.read_keypoints(found[seen[0].name]))[:, :2].T

@@ -14,6 +14,7 @@ from PIL import Image
 from support.flights import add_xmp, write_photograph
 from vdgs.captures.image_files import decode_mask, verify_image
 from vdgs.captures.jpeg import lacks_only_end
+from vdgs.captures.strays import walk
 from vdgs.config.sfm_options import SfmOptions
 from vdgs.errors import CaptureError
 from vdgs.sfm.feature_extraction import write_upright_images
@@ -54,6 +55,13 @@ def half(height: int = 120, width: int = 160) -> np.ndarray:
 
 def said(found: ImageList) -> list[str]:
     return make_preflight_report(found, read_gps_priors(found.images, None, (1.0, 2.0))).warnings
+
+
+def test_a_folder_with_several_links_to_it_is_entered_once_by_its_own_name(tmp_path):
+    (tmp_path / "card/photos").mkdir(parents=True)
+    for name in ("again", "more"):
+        (tmp_path / "card" / name).symlink_to(tmp_path / "card/photos")
+    assert [each for each, _, _ in walk(tmp_path / "card")] == [tmp_path / "card", tmp_path / "card/photos"]
 
 
 # --------------------------------------------------------------------------------------------------- masks

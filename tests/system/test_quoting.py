@@ -37,7 +37,8 @@ def test_a_shell_reads_names_back(name: str, tmp_path: Path) -> None:
     file.write_text("here")
     said = subprocess.run(["sh", "-c", f"cat {shell_word(file)}"], capture_output=True, text=True, check=True).stdout
     assert said == "here"
-    assert shlex.split(f"cat {shell_word(Path('-x'))}") == ["cat", "./-x"]
+    for line in (f"cat {shell_word(Path('-x'))}", shell_line(["cat", Path("-x")])):
+        assert shlex.split(line) == ["cat", "./-x"]
 
 
 @pytest.mark.parametrize("name", ON_ONE_LINE)

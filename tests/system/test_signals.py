@@ -19,13 +19,14 @@ LOADED = """
 import importlib, signal, sys, threading
 from vdgs.system.stop_signals import catch_stop_signals
 with catch_stop_signals() as requests:
-    load = lambda: importlib.import_module("vdgs.system.colmap")
+    load = lambda: importlib.import_module("vdgs.system.colmap").pycolmap.Camera  # loaded at its first use
     if sys.argv[1] == "thread":
         thread = threading.Thread(target=load)
         thread.start()
         thread.join()
     else:
         load()
+    assert "pycolmap" in sys.modules
     signal.raise_signal(signal.SIGTERM)
     print("asked", *requests)
 signal.raise_signal(signal.SIGTERM)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -71,3 +72,8 @@ class Capture:
     @property
     def test_views(self) -> tuple[View, ...]:
         return tuple(view for view in self.views if view.split == "test")
+
+
+def spread_evenly(views: Sequence[View], most: int) -> tuple[View, ...]:
+    """At most so many of the views, spread over all of them."""
+    return tuple(views[k] for k in np.unique(np.linspace(0, len(views) - 1, most).round().astype(int)))

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
 from vdgs.captures.camera_height import camera_height
-from vdgs.captures.capture import Capture
+from vdgs.captures.capture import Capture, spread_evenly
 from vdgs.captures.scene_points import scene_points
 from vdgs.geometry.similarity import sample_points
 
@@ -69,9 +69,7 @@ class _Support:
     """From which directions cameras see points."""
 
     def __init__(self, capture: Capture, points: Float[np.ndarray, "n 3"]) -> None:
-        views = capture.train_views
-        chosen = np.unique(np.linspace(0, len(views) - 1, _MAX_CAMERAS).round().astype(int))
-        cameras = [views[index].camera for index in chosen]
+        cameras = [view.camera for view in spread_evenly(capture.train_views, _MAX_CAMERAS)]
         toward = np.stack([camera.position - points for camera in cameras])
         self._toward = toward / np.maximum(np.linalg.norm(toward, axis=2, keepdims=True), 1e-12)  # [c, n, 3]
         self._seen = np.stack([camera.in_frustum(points) for camera in cameras])

@@ -106,6 +106,13 @@ def _read_colmap(root: Path, options: CaptureOptions) -> SourceCapture:
     )  # fmt: skip
 
 
+def use_image_folder(source: SourceCapture, root: Path, name: str) -> SourceCapture:
+    """A COLMAP capture that was read without `--images`, with the photographs of another folder."""
+    _, notes = image_folder(root, CaptureOptions())
+    kept = tuple(note for note in source.warnings if note not in notes)
+    return replace(source, images=name, image_folders=(root / name,), warnings=kept)
+
+
 def image_folder(root: Path, options: CaptureOptions) -> tuple[str, list[str]]:
     """The image folder relative to `root`: the one asked for, else images, else the largest images_N."""
     if options.images is not None:

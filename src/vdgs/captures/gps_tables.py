@@ -30,7 +30,7 @@ _OTHERS = (
     (r"^% *(program|gpst|utc|jst)\b|^%.*latitude\(deg\)", f"is a solution of RTKLIB or Emlid, {_BY_TIME}"),
     (r"<blocksexchange", "is BlocksExchange XML (DJI Terra, ContextCapture). Export the positions as text instead."),
     (r"<document\b", "is Metashape's XML. Export the reference as text instead (.txt, .csv), with a line of columns."),
-    (r"^<", "is XML. Export the positions as text instead, with the columns name,lat,lon,alt."),
+    (r"\A<", "is XML. Export the positions as text instead, with the columns name,lat,lon,alt."),
     (
         r"^[{[]\s*[{\"\]]|^[{[]$",
         "is JSON. Export a table instead: `exiftool -csv -n -GPS* PHOTOGRAPHS`, or ODM's geo.txt.",
@@ -117,7 +117,7 @@ def read_gps_table(file: Path) -> GpsTable:
         return _moments(lines, file)
     head = "\n".join(line.text for line in lines[:LOOKED_AT]).lower()
     for begins, what in _OTHERS:
-        if re.search(begins, head[:1] if begins == "^<" else head, re.MULTILINE):
+        if re.search(begins, head, re.MULTILINE):
             raise CaptureError(f"{file}: {what}")
     system, body = None, list[Line]()
     for line in lines:

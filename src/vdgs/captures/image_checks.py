@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from vdgs.captures.capture import Capture, View
+from vdgs.captures.capture import Capture, View, spread_evenly
 from vdgs.captures.formats.source_capture import format_list
 from vdgs.captures.image_files import kept_fraction, pillow_without_limits, verify_image
 from vdgs.errors import CaptureError
@@ -78,8 +78,7 @@ def check_images(
     """
     views = capture.views
     if sample != "all":
-        chosen = np.unique(np.linspace(0, len(views) - 1, min(max(sample, 1), len(views))).round().astype(int))
-        views = tuple(views[index] for index in chosen)
+        views = spread_evenly(views, max(sample, 1))
     checked: list[_CheckedView] = []
     with pillow_without_limits(), ThreadPoolExecutor(NUM_DECODER_THREADS) as pool:
         for view in pool.map(_check_view, views):

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vdgs.captures.formats.source_capture import SourceView
-from vdgs.captures.name_resolution import NameLookup, ambiguity_message
+from vdgs.captures.name_resolution import NameLookup, find_one
 from vdgs.errors import CaptureError
 
 #: Photographs that must show a point: one view tells a line, no place.
@@ -169,7 +169,7 @@ def known_scale_of_views(
     lookup = NameLookup([(view.name, view) for view in views])
     seen: dict[str, list[tuple[SourceView, np.ndarray]]] = {}
     for mark in known.marks:
-        view = _view(mark, lookup, file)
+        view = find_one(lookup, mark.photograph, f"{file}: line {mark.number}", lambda view: view.name)
         seen.setdefault(mark.name, []).append((view, _ray(mark, view, file)))
     check_marked(known, {name: {view.name for view, _ in marks} for name, marks in seen.items()}, file)
     located = {name: place for name, marks in seen.items() if (place := _locate(marks)) is not None}
@@ -178,16 +178,6 @@ def known_scale_of_views(
     focal = np.array([view.intrinsics.focal[0] for view in views])
     pixel = float(np.median(np.linalg.norm(centers - middle, axis=1) / focal))
     return scale_of_distances(known.distances, located, pixel, file.name)
-
-
-def _view(mark: DistanceMark, lookup: NameLookup[SourceView], file: Path) -> SourceView:
-    where = f"{file}: line {mark.number}:"
-    _, found = lookup.find(mark.photograph)
-    if not found:
-        raise CaptureError(f"{where} there is no photograph {mark.photograph!r}. Mend the name, or remove the line.")
-    if len(found) > 1:
-        raise CaptureError(f"{where} {ambiguity_message(mark.photograph, found[0].name, found[1].name)}")
-    return found[0]
 
 
 def _ray(mark: DistanceMark, view: SourceView, file: Path) -> np.ndarray:

@@ -32,15 +32,23 @@ def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
     """Read, check and normalise the capture in the folder `path`.
 
     Raises `CaptureError` naming the file, what is wrong and the remedy, before anything expensive happens.
-    Pixels are not decoded here; `checks.check_images` does that.
+    Pixels are not decoded here; `image_checks.check_images` does that.
     """
     options = options or CaptureOptions()
-    root = Path(path)
+    return make_capture(Path(path), read_files(Path(path), options), options)
+
+
+def read_files(root: Path, options: CaptureOptions) -> SourceCapture:
+    """The files of a capture, without its photographs. Raises as `load_capture`."""
     if not root.is_dir():
         what = "is a file. Unpack an archive first, and give" if root.is_file() else "no such folder. Give"
         raise CaptureError(f"{root}: {what} the folder that holds images/ and sparse/.")
     _check_options(options)
-    source = read_source(root, options)
+    return read_source(root, options)
+
+
+def make_capture(root: Path, source: SourceCapture, options: CaptureOptions) -> Capture:
+    """The capture of files that are read (`read_files`). Raises as `load_capture`."""
     warnings = list(source.warnings)
     source = _without_bad_points(source, warnings)
     photographs, unused = match_images(root, source, options, warnings)

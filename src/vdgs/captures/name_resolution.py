@@ -7,9 +7,11 @@ both.
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path, PurePosixPath
 from typing import Generic, TypeVar
+
+from vdgs.errors import CaptureError
 
 T = TypeVar("T")
 
@@ -95,6 +97,17 @@ class NameLookup(Generic[T]):
     def find_elsewhere(self, name: str) -> tuple[tuple[int, int], list[T]]:
         """What has the name's file name, in whichever folder."""
         return self.find(PurePosixPath(_posix(name)).name)
+
+
+def find_one(lookup: NameLookup[T], written: str, where: str, name_of: Callable[[T], str]) -> T:
+    """The photograph that a line means, if need be in another folder. Raises CaptureError, which says `where` the line
+    is, for a name of none and for one of several."""
+    found = lookup.find(written)[1] or lookup.find_elsewhere(written)[1]
+    if not found:
+        raise CaptureError(f"{where}: there is no photograph {written!r}. Mend the name, or remove the line.")
+    if len(found) > 1:
+        raise CaptureError(f"{where}: {ambiguity_message(written, name_of(found[0]), name_of(found[1]))}")
+    return found[0]
 
 
 def ambiguity_message(written: str, one: str, other: str) -> str:

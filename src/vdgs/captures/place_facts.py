@@ -13,7 +13,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from vdgs.captures.camera_height import camera_height
-from vdgs.captures.capture import Capture
+from vdgs.captures.capture import Capture, spread_evenly
 from vdgs.captures.capture_dates import date_taken, first_and_last
 from vdgs.captures.place_record import Bounds, PlaceFacts
 from vdgs.captures.reconstruction import read_reconstruction
@@ -42,7 +42,7 @@ def measure_place(capture: Capture) -> PlaceFacts:
         corners = np.array([[x, y, np.median(points[:, 2])] for x in (low[0], high[0]) for y in (low[1], high[1])])
     else:
         extent, area, corners = None, None, np.zeros((1, 3))
-    latitudes, longitudes, crs_extent, projection = None, None, None, None
+    latitudes, longitudes, crs_extent, crs_name, crs_unit = None, None, None, None, None
     if ground.origin_geo is not None:
         places = geodetic_from_enu(corners, ground.origin_geo, ground.axes_origin)[:, :2]
         (south, west), (north, east) = places.min(axis=0).tolist(), places.max(axis=0).tolist()
@@ -51,28 +51,23 @@ def measure_place(capture: Capture) -> PlaceFacts:
             projection = MapProjection.of(ground)
             projected = projection.project(corners)[:, :2]
             crs_extent = (*projected.min(axis=0).tolist(), *projected.max(axis=0).tolist())
+            crs_name, crs_unit = projection.name, projection.unit
     reconstruction = None
     with contextlib.suppress(CaptureError):  # damaged: the report says so
         reconstruction = read_reconstruction(capture.root)
-    used = len(capture.views)
-    root = capture.root.resolve()
+    flown = reconstruction.flown if reconstruction else ()
+    if not flown:
+        flown = first_and_last(date_taken(view.image_path) for view in spread_evenly(capture.views, _MAX_DATED))
+    used, root = len(capture.views), capture.root.resolve()
     return PlaceFacts(
         name=root.parent.name if reconstruction and root.name == OWN_CAPTURE else root.name,
         unit=ground.unit, photographs_used=used, photographs_test=len(capture.test_views),
         photographs_found=max(used, reconstruction.found if reconstruction else used + capture.num_unused_images),
-        flown=(reconstruction.flown if reconstruction else ()) or _flown(capture),
-        ground_sampling_distance=ground_sampling_distance(capture), image_folder=capture.images,
+        flown=flown, ground_sampling_distance=ground_sampling_distance(capture), image_folder=capture.images,
         height=camera_height(capture), extent=extent, area=area, crs_extent=crs_extent,
-        crs_name=projection.name if projection and crs_extent else None,
-        crs_unit=projection.unit if projection and crs_extent else None, latitudes=latitudes, longitudes=longitudes,
-        accuracy=ground.accuracy,
+        crs_name=crs_name, crs_unit=crs_unit, latitudes=latitudes, longitudes=longitudes, accuracy=ground.accuracy,
         accuracy_method=reconstruction.georeferenced if reconstruction else ground.method,
     )  # fmt: skip
-
-
-def _flown(capture: Capture) -> tuple[str, ...]:
-    chosen = np.unique(np.linspace(0, len(capture.views) - 1, _MAX_DATED).round().astype(int))
-    return first_and_last(date_taken(capture.views[index].image_path) for index in chosen)
 
 
 def _area(

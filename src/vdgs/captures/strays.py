@@ -67,15 +67,18 @@ def is_result(file: Path) -> bool:
 
 def walk(folder: Path) -> Iterator[tuple[Path, list[Path], dict[Path, str]]]:
     """Each folder with its files, sorted, and the folders in it that are not entered, with the reason. Links are
-    followed, but not to where the walk has been or began below."""
+    followed, but not to a folder that is entered already or holds `folder`."""
     top = Path(os.path.realpath(folder))
     been = {top, *top.parents}
     for at, folders, files in os.walk(folder, followlinks=True):
         here = Path(at)
         reasons = {here / name: why_not_read(here / name) for name in sorted(folders)}
-        real = {path: Path(os.path.realpath(path)) for path, why in reasons.items() if why is None}
-        folders[:] = [path.name for path in real if real[path] not in been]
-        been |= set(real.values())
+        folders.clear()
+        for path in sorted((path for path, why in reasons.items() if why is None), key=os.path.islink):
+            if (real := Path(os.path.realpath(path))) not in been:
+                been.add(real)
+                folders.append(path.name)
+        folders.sort()
         yield here, [here / name for name in sorted(files)], {path: why for path, why in reasons.items() if why}
 
 

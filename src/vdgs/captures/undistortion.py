@@ -17,7 +17,7 @@ import numpy as np
 from vdgs.captures.formats.source_capture import Intrinsics
 from vdgs.captures.image_files import decode_image, decode_mask
 from vdgs.errors import CaptureError
-from vdgs.system.atomic_files import write_bytes
+from vdgs.system.atomic_files import read_json_or_empty, write_bytes
 
 JPEG_QUALITY = 95
 NUM_THREADS = 2
@@ -115,8 +115,8 @@ def _undistort_one(
     for kind, file in (("image", photo.path), ("mask", photo.mask)):
         status = file.stat() if file else None
         stamp[kind] = status and [str(file), status.st_size, status.st_mtime_ns]
-    known = _read_json(stamp_file)
-    if not (target.is_file() and isinstance(known, dict) and known.get("made_from") == stamp):
+    known = read_json_or_empty(stamp_file)
+    if not (target.is_file() and known.get("made_from") == stamp):
         keep = _write_straight(photo, map_of(lens), target, mask_target)
         write_bytes(stamp_file, json.dumps({"made_from": stamp, "mask": keep}).encode())
         known = {"mask": keep}
@@ -140,13 +140,6 @@ def _write_straight(photo: ImageFile, grid: np.ndarray, target: Path, mask_targe
     mask = cv2.remap(keep.astype(np.uint8) * 255, x, y, cv2.INTER_NEAREST, borderValue=(0.0,))
     write_bytes(mask_target, cv2.imencode(".png", mask)[1].tobytes())
     return True
-
-
-def _read_json(file: Path) -> object:
-    try:
-        return json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
 
 
 def _colmap(intrinsics: Intrinsics) -> Any:

@@ -44,7 +44,6 @@ EXPOSURE_NOTES = {
     "training": "in the exposure that was fitted to each",
 }
 
-#: What to measure on. A model that is good on training views and not on test views overfits.
 #: Blocks are held assembled among their surroundings up to so many bytes (at least one): views show them in turn.
 CACHE_BYTES = 2_000_000_000
 

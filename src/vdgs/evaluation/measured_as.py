@@ -9,6 +9,7 @@ from vdgs.runs.run_folder import RunFolder
 from vdgs.system.atomic_files import read_json_or_empty
 from vdgs.system.documents import MeasuredAs
 
+#: What to measure on. A model that is good on training views and not on test views overfits.
 EvaluationSplit = Literal["test", "training"]
 
 

@@ -327,6 +327,6 @@ def adjust_scores(
     scores: ScoreMatrix, positions: Float[np.ndarray, "n 3"], blocks: Blocks, cameras: Sequence[Camera], strategy: str
 ) -> ScoreMatrix:
     """The scores as the strategy of the partition decides by them."""
-    return (
-        scores if strategy == "visibility" else STRATEGIES[strategy].adjust_scores(scores, positions, blocks, cameras)
-    )
+    if strategy == "visibility":
+        return scores
+    return STRATEGIES[strategy].adjust_scores(scores, positions, blocks, cameras)

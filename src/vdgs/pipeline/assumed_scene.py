@@ -46,15 +46,12 @@ def assumed_capture(plan: ReconstructionPlan, options: CaptureOptions, points: i
     footprint = (first.width / first.fx) * (first.height / first.fy)
     half = np.sqrt(count * footprint * len(photographs) / max(points, 1) / overlap) / 2
     ground = rng.uniform((-half, -half, -RELIEF), (half, half, RELIEF), (count, 3))
+    level = GroundFrame(
+        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=False, description="assumed"
+    )  # fmt: skip
     return Capture(
         root=folder, source="colmap", images="", views=views, points=ground,
-        point_colors=rng.integers(0, 255, (count, 3), dtype=np.uint8), ground=_level_frame(),
-    )  # fmt: skip
-
-
-def _level_frame() -> GroundFrame:
-    return GroundFrame(
-        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=False, description="assumed"
+        point_colors=rng.integers(0, 255, (count, 3), dtype=np.uint8), ground=level,
     )  # fmt: skip
 
 

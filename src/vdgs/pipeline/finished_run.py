@@ -13,6 +13,7 @@ from vdgs.evaluation.measured_as import is_evaluated
 from vdgs.rendering.ortho.map_status import has_ortho_dependencies, is_ortho_current
 from vdgs.report.status_cli import full_run_status, next_line
 from vdgs.runs.run_folder import RunFolder
+from vdgs.runs.run_settings import with_absolute_paths
 
 
 def nothing_to_do(request: RunRequest, command: str, files: Sequence[Path] = ()) -> str:
@@ -44,12 +45,7 @@ def _same_request(run: RunFolder, request: RunRequest, command: str) -> bool:
     method, training = request.method(), request.training
     if not training.iterations:  # follows from the number of photographs, which are the same
         method = replace(method, training=replace(training, iterations=own.training.iterations))
-    return method == own.method and _absolute(request.options) == own.capture
-
-
-def _absolute(options: object) -> object:
-    paths = {name: value.resolve() for name, value in vars(options).items() if isinstance(value, Path)}
-    return replace(options, **paths)  # type: ignore[type-var]
+    return method == own.method and with_absolute_paths(request.options) == own.capture
 
 
 def _is_whole(run: RunFolder, request: RunRequest) -> bool:

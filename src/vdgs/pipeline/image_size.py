@@ -8,13 +8,15 @@ from pathlib import Path
 from rich.console import Console
 
 from vdgs.captures.capture import Capture
+from vdgs.captures.format_dispatch import use_image_folder
 from vdgs.captures.image_files import read_header
-from vdgs.captures.loading import load_capture
+from vdgs.captures.loading import make_capture, read_files
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RunRequest
 from vdgs.config.method import AUTO_BLOCK_ITERATIONS, MethodConfig, ResolutionSchedule, resolve_iterations
 from vdgs.kernels import default_num_threads
 from vdgs.runs.run_folder import RunFolder
+from vdgs.runs.run_settings import with_absolute_paths
 from vdgs.system.memory.process_memory import available_memory_bytes
 from vdgs.system.units import rough_duration
 
@@ -49,12 +51,22 @@ class ImageSize:
 
 
 def choose_image_size(request: RunRequest, console: Console) -> RunRequest:
-    """The request with the size of photographs that suits the machine; as it is where it names one, and where the run
-    is there already. Raises what `load_capture` raises."""
-    options = request.options
-    if options.images is not None or options.downscale != 1 or RunFolder(request.output).config_file.exists():
-        return request
-    capture, method = load_capture(request.capture, options), request.method()
+    """The request of `open_at_suitable_size`."""
+    return open_at_suitable_size(request, console)[0]
+
+
+def open_at_suitable_size(request: RunRequest, console: Console) -> tuple[RunRequest, Capture | None]:
+    """The request with the size of photographs that suits the machine, and its capture; the request as it is and no
+    capture where it names a size, and where the run is there already. Raises what `load_capture` raises."""
+    if (
+        request.options.images is not None
+        or request.options.downscale != 1
+        or RunFolder(request.output).config_file.exists()
+    ):
+        return request, None
+    root, options, method = request.capture.resolve(), with_absolute_paths(request.options), request.method()
+    source = read_files(root, options)
+    capture = make_capture(root, source, options)
     sizes = image_sizes(capture, options)
     cores = request.threads or default_num_threads()
     seconds = {size: run_seconds(method, len(capture.train_views), size.pixels, cores) for size in sizes}
@@ -63,9 +75,12 @@ def choose_image_size(request: RunRequest, console: Console) -> RunRequest:
     largest = "" if chosen == sizes[0] else f", not {sizes[0].name}"
     console.print(f"photographs: {chosen.name}{largest}{on_cpu}; --images overrides", markup=False, highlight=False)
     if chosen == sizes[0]:
-        return request
+        return request, capture
     images = None if chosen.images == capture.images else chosen.images
-    return replace(request, options=replace(options, images=images, downscale=chosen.downscale))
+    if images is not None:
+        source = use_image_folder(source, root, images)
+    options = replace(options, images=images, downscale=chosen.downscale)
+    return replace(request, options=options), make_capture(root, source, options)
 
 
 def image_sizes(capture: Capture, options: CaptureOptions) -> list[ImageSize]:

@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 from vdgs.captures.capture import Capture
-from vdgs.config.method import AssignmentConfig, MethodConfig, PartitionConfig
+from vdgs.config.method import PartitionConfig
 from vdgs.distributed.job_folders import clear, remove
 from vdgs.distributed.job_labels import shard_kind
 from vdgs.distributed.node_check import NodeRequirements, image_and_mask_files
@@ -49,12 +49,11 @@ from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.visibility_store import load_or_count_visibility
 from vdgs.system.atomic_files import read_json, write_json
-from vdgs.system.console import make_progress_bar
+from vdgs.system.console import show_share
 from vdgs.system.file_locks import lock_folder
 from vdgs.system.memory.memory_estimate import render_bytes
 from vdgs.system.memory.process_memory import peak_memory_bytes, reset_peak_memory
 from vdgs.system.records import record_to_dict
-from vdgs.system.stop_signals import check_stop_requested
 
 #: Cameras that are scored and saved together; such groups of a shard, least and most, and how many shards there are in
 #: between (choice).
@@ -117,7 +116,7 @@ def partition_run(
         elif saved is not None:
             blocks, warnings = saved, list(before.warnings)
         else:
-            blocks, warnings = _partition(scene, method)
+            blocks, warnings = cut_scene(scene.positions, scene.visibility, scene.cameras, method)
         is_distributed = execution is not None and execution.is_distributed
         clear(run.partition, job.key if is_distributed else None)
         if execution is not None and is_distributed:
@@ -125,7 +124,8 @@ def partition_run(
                 save_blocks(shard_blocks, blocks, [{} for _ in blocks.items], {"warnings": warnings})
             scores = _score_in_shards(run, scene, job, len(blocks), execution, console)
         else:
-            scores = _score(scene, blocks, config, console)
+            with show_share(console, "assigning cameras") as on_progress:
+                scores = compute_score_matrix(scene.opened.model, blocks, scene.cameras, config, on_progress)
         scores = adjust_scores(scores, scene.positions, blocks, scene.cameras, method.partition.strategy)
         assignment = assign_cameras(scores, config)
         for note in warnings + assignment.warnings:
@@ -159,10 +159,6 @@ def explain_view(run: RunFolder, view: str, console: Console) -> None:
     console.print(table)
 
 
-def _partition(scene: _Scene, method: MethodConfig) -> tuple[Blocks, list[str]]:
-    return cut_scene(scene.positions, scene.visibility, scene.cameras, method)
-
-
 def _spatial(scene: _Scene, config: PartitionConfig, seed: int, blocks: Blocks) -> Blocks:
     """The blocks that positions alone would give, to compare with."""
     if config.lambda_vis == 0 or len(blocks) == 1:
@@ -177,17 +173,6 @@ def _or_none(load: Callable[[], Loaded]) -> Loaded | None:
         return load()
     except RunError:
         return None
-
-
-def _score(scene: _Scene, blocks: Blocks, config: AssignmentConfig, console: Console) -> ScoreMatrix:
-    with make_progress_bar(console) as bar:
-        task = bar.add_task("assigning cameras", total=None)
-
-        def on_progress(done: int, total: int) -> None:
-            check_stop_requested()
-            bar.update(task, completed=done, total=total)
-
-        return compute_score_matrix(scene.opened.model, blocks, scene.cameras, config, on_progress)
 
 
 def _job(run: RunFolder, cameras: int) -> ShardedJob:

@@ -19,7 +19,7 @@ from vdgs.evaluation.lpips import check_weights_file
 from vdgs.evaluation.measured_as import evaluation_folder, is_evaluated
 from vdgs.pipeline.count_visibility import count_run_visibility
 from vdgs.pipeline.evaluate_stage import EvaluationRequest, evaluate_stage
-from vdgs.pipeline.image_size import choose_image_size
+from vdgs.pipeline.image_size import open_at_suitable_size
 from vdgs.pipeline.merge_blocks import merge_run_blocks
 from vdgs.pipeline.partition_stage import partition_run
 from vdgs.pipeline.train_blocks import train_blocks
@@ -47,10 +47,11 @@ def run_pipeline(request: RunRequest, console: Console, command: str | None = No
     check_ranges(request)
     check_weights_file(request.lpips_weights)
     check_output(request.output)
-    request = choose_image_size(reconstruct_if_needed(request, console, command), console)
+    request, capture = open_at_suitable_size(reconstruct_if_needed(request, console, command), console)
     with exclusive_run(
-        request.capture, request.output, request.options, request.method(), overwrite=request.overwrite, command=command
-    ) as context:
+        request.capture, request.output, request.options, request.method(), overwrite=request.overwrite,
+        command=command, capture=capture,
+    ) as context:  # fmt: skip
         _stages(context, request, console)
     console.print(escape(next_line(full_run_status(context.run))), highlight=False)
 

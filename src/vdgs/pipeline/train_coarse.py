@@ -34,8 +34,8 @@ from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.stage_folder import StatusRecord
 from vdgs.system.atomic_files import write_json
 from vdgs.system.checkpoints import save_checkpoint
+from vdgs.system.console import show_share
 from vdgs.system.step_progress import StepProgress
-from vdgs.system.stop_signals import check_stop_requested
 from vdgs.training import TrainingProblem, TrainingState, initial_state, mean_image_color, to_checkpoint
 from vdgs.training.schedule import view_sampling_weights
 from vdgs.training.session.trainer import (
@@ -137,18 +137,16 @@ def _dense_points(
 
 @contextmanager
 def show_progress(label: str, console: Console, run: RunFolder | None = None) -> Iterator[Callable[[int, int], None]]:
-    """Show how far something is while the context lasts, and record it for `vdgs status` in a run's folder; yields a
-    function that takes the steps done and all steps."""
+    """As `show_share`; the progress is also recorded in the folder of a run, for `vdgs status`."""
     progress: StepProgress | None = None
-    with console.status(label) as status:
+    with show_share(console, label) as show:
 
         def on_progress(done: int, total: int) -> None:
             nonlocal progress
-            check_stop_requested()
+            show(done, total)
             if run is not None:
                 progress = progress or run.begin_step("coarse", label, "steps", total)
                 progress(done)
-            status.update(f"{label}, {done / total:.0%}")
 
         yield on_progress
 
@@ -158,12 +156,12 @@ def fits_exposures(
 ) -> tuple[float | None, bool]:
     """By what share images of the same places differ in brightness (None where nothing depends on it, or the capture
     does not tell), and whether an exposure is fitted to each. Prints what follows."""
-    spread = _brightness_spread(run, images, config, console)
+    spread = _brightness_spread(images, config, console, run)
     return spread, config.exposure_compensation and (spread is None or spread >= config.exposure_min_spread)
 
 
 def _brightness_spread(
-    run: RunFolder | None, images: ImageCache, config: TrainConfig, console: Console
+    images: ImageCache, config: TrainConfig, console: Console, run: RunFolder | None
 ) -> float | None:
     if not (config.exposure_compensation and config.exposure_min_spread):
         return None

@@ -23,6 +23,7 @@ from vdgs.config.serialization import diff_settings
 from vdgs.errors import RunError
 from vdgs.runs.run_settings import SECTIONS, RunSettings
 from vdgs.system.atomic_files import write_text
+from vdgs.system.quoting import shell_line
 
 #: Sections whose options have no prefix on the command line.
 UNPREFIXED_SECTIONS = ("capture", "training", "partition")
@@ -50,7 +51,7 @@ def run_command(settings: RunSettings, output: Path) -> str:
         candidates.append(["vdgs", "run", settings.capture_path, "--output", str(output.resolve())])
         candidates[-1] += ["--preset", preset, *options]
     shortest: list[str] = min(candidates, key=len)
-    return shlex.join(shortest)
+    return shell_line(shortest)
 
 
 def _differences(old: Mapping[str, Any], new: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

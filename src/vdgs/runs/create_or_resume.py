@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from vdgs.captures.capture import Capture
 from vdgs.captures.capture_metadata import capture_fingerprint, check_same_capture
@@ -21,7 +20,7 @@ from vdgs.config.method import MethodConfig, resolve_iterations
 from vdgs.config.validation_rules import check_config
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.run_settings import RunSettings
+from vdgs.runs.run_settings import RunSettings, with_absolute_paths
 from vdgs.system.atomic_files import read_json, read_json_or_empty, to_jsonable, write_bytes, write_json
 from vdgs.system.records import record_to_dict
 
@@ -55,29 +54,29 @@ def exclusive_run(
     *,
     overwrite: bool | None = None,
     command: str | None = None,
+    capture: Capture | None = None,
 ) -> Iterator[RunContext]:
     """As `create_or_resume_run`, with the lock of a driver (`RunFolder.drive_lock`) from before anything is written or
-    removed to the end of the `with`."""
+    removed to the end of the `with`. `capture` is the one of these options, if it is read already."""
     check_config(method)
     check_output(output)
-    # Absolute paths, as config.yaml holds them: stages hand the capture on, also to other machines.
-    capture_path, capture_options = capture_path.resolve(), _with_absolute_paths(capture_options)
-    capture = load_capture(capture_path, capture_options)
+    if capture is None:
+        capture = load_capture(capture_path.resolve(), with_absolute_paths(capture_options))
     check_not_among_inputs(output, capture)
     method = replace(method, training=resolve_iterations(method.training, len(capture.train_views)))
+    settings = run_settings(capture_path, capture_options, method)
     run = RunFolder(output)
     if not run.config_file.exists():  # what cannot become a scene leaves no folder that other settings stumble over
         require_valid(capture)
     run.check_output_empty()
     with run.drive_lock():
-        _resume(run, capture, capture_path, run_settings(capture_path, capture_options, method), overwrite, command)
+        _resume(run, capture, settings, overwrite, command)
         yield RunContext(run, capture)
 
 
 def _resume(
-    run: RunFolder, capture: Capture, capture_path: Path, settings: RunSettings, overwrite: bool | None,
-    command: str | None,
-) -> None:  # fmt: skip
+    run: RunFolder, capture: Capture, settings: RunSettings, overwrite: bool | None, command: str | None
+) -> None:
     """Save the settings of a run that this process drives, new ones or others; what they make useless is deleted."""
     # Where nothing changes its blocks may be at work, begun by a driver that died.
     continues = run.config_file.exists() and run.capture_file.exists() and run.settings() == settings
@@ -87,7 +86,7 @@ def _resume(
             check_same_capture(run.capture_file, read_json(run.capture_file), capture)
         if overwrite is None or not run.config_file.exists():
             run.create_or_check(settings, ("capture", "training"), command)
-            run.move_capture(capture_path)
+            run.move_capture(Path(settings.capture_path))
         else:
             run.change_settings(settings, overwrite, command)
             if is_read_anew:  # nothing is left that was made of it; the coarse stage writes the new one
@@ -119,9 +118,4 @@ def _write_place(capture: Capture, run: RunFolder) -> None:
 
 def run_settings(capture_path: Path, capture_options: CaptureOptions, method: MethodConfig) -> RunSettings:
     """The settings in config.yaml: everything that the result depends on."""
-    return RunSettings.create(capture_path.resolve(), _with_absolute_paths(capture_options), method)
-
-
-def _with_absolute_paths(options: CaptureOptions) -> CaptureOptions:
-    paths: dict[str, Any] = {name: path.resolve() for name, path in vars(options).items() if isinstance(path, Path)}
-    return replace(options, **paths)
+    return RunSettings.create(capture_path.resolve(), with_absolute_paths(capture_options), method)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,12 @@ from vdgs.config.serialization import from_dict, to_dict
 
 #: The parts of config.yaml.
 SECTIONS = ("capture", "training", "partition", "assignment", "block", "merge")
+
+
+def with_absolute_paths(options: CaptureOptions) -> CaptureOptions:
+    """As config.yaml holds them: stages hand the capture on, also to other machines."""
+    paths: dict[str, Any] = {name: path.resolve() for name, path in vars(options).items() if isinstance(path, Path)}
+    return replace(options, **paths)
 
 
 @dataclass(frozen=True, kw_only=True)

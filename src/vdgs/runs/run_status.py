@@ -232,12 +232,12 @@ class _StatusScanner:
         try:
             status = folder.status()
         except VdgsError as error:
-            hint = f"rm {shell_word(str(folder.status_file))} && "
+            hint = f"rm {shell_word(folder.status_file)} && "
             return StageStatus(name=name, state="unknown", folder=inside, reason=_first_line(str(error)), hint=hint)
         state, why = self._state_of(folder, status, key, other, locked)
         if state == "done" and (wrong := integrity_error(folder, key or "", _number(name))):
             reason = f"model.safetensors is {wrong}"
-            hint = f"rm -r {shell_word(str(path_to_delete(folder)))} && "
+            hint = f"rm -r {shell_word(path_to_delete(folder))} && "
             return StageStatus(name=name, state="stale", folder=inside, reason=reason, status=status, hint=hint)
         output_id = status.model_id or ""
         return StageStatus(name=name, state=state, folder=inside, reason=why, status=status, output_id=output_id)

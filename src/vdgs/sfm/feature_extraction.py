@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -128,45 +128,40 @@ def create_database(workspace: Workspace, camera_groups: Sequence[CameraGroup]) 
 
 
 def extract_features(
-    workspace: Workspace,
-    camera_groups: Sequence[CameraGroup],
-    max_image_size: int,
-    max_num_features: int,
-    threads: int,
-    console: Console,
+    workspace: Workspace, camera_groups: Sequence[CameraGroup], options: SfmOptions, threads: int, console: Console
 ) -> dict[str, int]:
     """Features of all photographs into the database; those that are there already are kept. Returns their numbers."""
-    names = [photo.name for kind in camera_groups for photo in kind.images if (workspace.images / photo.name).exists()]
-    there = count_features(workspace)
-    count, done = len(names), sum(name in there for name in names)
+    names = [photo.name for group in camera_groups for photo in group.images]
+    count, there = sum((workspace.images / name).exists() for name in names), count_features(workspace)
     with report_progress(workspace, console, "features", count) as tell:
-        tell(done)
-        for number, kind in enumerate(camera_groups, 1):
-            missing = [photo.name for photo in kind.images if (workspace.images / photo.name).exists()]
-            missing = [name for name in missing if name not in there]
-            octave = first_octave(kind, max_image_size, count)
-            for masked in (False, True):  # COLMAP takes masks for all photographs of a call, or for none
-                names = [name for name in missing if workspace.mask(name).exists() == masked]
-                for start in range(0, len(names), IMAGES_PER_THREAD * threads):
-                    chunk = names[start : start + IMAGES_PER_THREAD * threads]
-                    _extract(workspace, chunk, masked, number, octave, max_image_size, max_num_features, threads)
-                    done += len(chunk)
-                    tell(done)
+        extract_groups(workspace, camera_groups, options, count, threads, there, tell)
     return count_features(workspace)
 
 
 def extract_groups(
-    workspace: Workspace, camera_groups: Sequence[CameraGroup], options: SfmOptions, count: int, threads: int
+    workspace: Workspace,
+    camera_groups: Sequence[CameraGroup],
+    options: SfmOptions,
+    count: int,
+    threads: int,
+    there: Collection[str] = (),
+    tell: Callable[[int], object] = lambda _done: None,
 ) -> None:
-    """Features of some of `count` photographs at once, searched as all are."""
-    for number, group in enumerate(camera_groups, 1):
-        octave = first_octave(group, options.max_image_size, count)
-        for masked in (False, True):
-            names = [photo.name for photo in group.images if workspace.mask(photo.name).exists() == masked]
-            if names:
-                _extract(
-                    workspace, names, masked, number, octave, options.max_image_size, options.max_num_features, threads
-                )  # fmt: skip
+    """Features of some of `count` photographs, but for those that are `there`, searched as all are. `tell` is called
+    with how many are done."""
+    present = [[photo.name for photo in each.images if (workspace.images / photo.name).exists()]
+               for each in camera_groups]  # fmt: skip
+    done = sum(name in there for names in present for name in names)
+    tell(done)
+    for number, (group, names) in enumerate(zip(camera_groups, present, strict=True), 1):
+        fine = is_upsampled(max(group.width, group.height), options.max_image_size, count)
+        for masked in (False, True):  # COLMAP takes masks for all photographs of a call, or for none
+            missing = [name for name in names if name not in there and workspace.mask(name).exists() == masked]
+            for start in range(0, len(missing), IMAGES_PER_THREAD * threads):
+                chunk = missing[start : start + IMAGES_PER_THREAD * threads]
+                _extract(workspace, chunk, masked, number, fine, options, threads)
+                done += len(chunk)
+                tell(done)
 
 
 def searched_megapixels(photographs: Sequence[ImageMetadata], options: SfmOptions) -> float:
@@ -179,35 +174,23 @@ def searched_megapixels(photographs: Sequence[ImageMetadata], options: SfmOption
     return total / 1e6
 
 
-def first_octave(group: CameraGroup, max_image_size: int, count: int) -> int:
-    """-1 where photographs are searched at twice their size."""
-    return -1 if is_upsampled(max(group.width, group.height), max_image_size, count) else 0
-
-
 def is_upsampled(longer_side: int, max_image_size: int, count: int) -> bool:
     """Whether photographs of this size, so many in all, are searched at twice their size."""
     return min(longer_side, max_image_size) < UPSAMPLE_BELOW_PX or count <= UPSAMPLE_BELOW_IMAGES
 
 
 def _extract(
-    workspace: Workspace,
-    names: list[str],
-    masked: bool,
-    camera: int,
-    first_octave: int,
-    max_image_size: int,
-    max_num_features: int,
-    threads: int,
+    workspace: Workspace, names: list[str], masked: bool, camera: int, fine: bool, options: SfmOptions, threads: int
 ) -> None:
-    reader, options = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
+    reader, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
     reader.existing_camera_id = camera
     if masked:
         reader.mask_path = workspace.masks
-    options.num_threads, options.max_image_size, options.use_gpu = threads, max_image_size, False
-    options.sift.first_octave, options.sift.max_num_features = first_octave, max_num_features
+    extraction.num_threads, extraction.max_image_size, extraction.use_gpu = threads, options.max_image_size, False
+    extraction.sift.first_octave, extraction.sift.max_num_features = -1 if fine else 0, options.max_num_features
     call_cancellable(
         pycolmap.extract_features, workspace.database, workspace.images, names, reader_options=reader,
-        extraction_options=options, device=pycolmap.Device.cpu,
+        extraction_options=extraction, device=pycolmap.Device.cpu,
     )  # fmt: skip
 
 

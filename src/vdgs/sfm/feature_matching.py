@@ -118,14 +118,11 @@ def match_chunk(workspace: Workspace, pairs: Sequence[tuple[str, str]], threads:
 
 def copy_features(workspace: Workspace, name: str, copy: str) -> None:
     """Give the features of a photograph to another one, which need not be there."""
-    database = pycolmap.Database.open(workspace.database)
-    try:
+    with workspace.open_database() as database:
         image = next(each for each in database.read_all_images() if each.name == name)
         number = database.write_image(pycolmap.Image(name=copy, camera_id=image.camera_id))
         database.write_keypoints(number, database.read_keypoints(image.image_id))
         database.write_descriptors(number, database.read_descriptors(image.image_id))
-    finally:
-        database.close()
 
 
 def count_verified_matches(workspace: Workspace, min_inliers: int = 15) -> dict[str, int]:

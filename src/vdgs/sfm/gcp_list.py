@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from vdgs.captures.coordinate_systems import to_geodetic
 from vdgs.captures.known_distances import MIN_OBSERVATIONS, text_lines
-from vdgs.captures.name_resolution import NameLookup, ambiguity_message
+from vdgs.captures.name_resolution import NameLookup, find_one
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, median_place
 from vdgs.geometry.similarity import is_collinear
@@ -195,14 +195,9 @@ def find_photograph(
     photograph: str, number: int, by_name: NameLookup[ImageMetadata | str], file: Path
 ) -> ImageMetadata | None:
     """The photograph that a line names; None for one that was left out."""
-    found = _photographs_of(photograph, by_name)
-    where = f"{file}: line {number}:"
-    if not found:
-        raise CaptureError(f"{where} there is no photograph {photograph!r}. Mend the name, or remove the line.")
-    photo = found[0]
-    if len(found) > 1:
-        one, other = (each if isinstance(each, str) else each.name for each in found[:2])
-        raise CaptureError(f"{where} {ambiguity_message(photograph, one, other)}")
+    photo = find_one(
+        by_name, photograph, f"{file}: line {number}", lambda each: each if isinstance(each, str) else each.name
+    )
     return None if isinstance(photo, str) else photo
 
 

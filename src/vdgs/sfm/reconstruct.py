@@ -292,9 +292,7 @@ def _features(
     counts = feature_extraction.count_features(workspace)
     if not workspace.is_done("features", key):
         mask_files.write_upright_masks(workspace, photographs, plan.threads)
-        counts = feature_extraction.extract_features(
-            workspace, camera_groups, options.max_image_size, options.max_num_features, plan.threads, console
-        )
+        counts = feature_extraction.extract_features(workspace, camera_groups, options, plan.threads, console)
         workspace.finish("features", key)
     named = {each.name for each in failed}
     return failed + [

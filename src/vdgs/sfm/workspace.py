@@ -128,7 +128,7 @@ def cache_key(*parts: Any) -> str:
 def call_cancellable(function: Callable[..., Result], *arguments: Any, **named: Any) -> Result:
     """Call a long function of COLMAP beside this thread, so that Ctrl-C is heard and ends it where it is whole.
 
-    Raises VdgsError for what COLMAP cannot do, and what asked to stop.
+    The first argument, if any, is the database. Raises VdgsError for what COLMAP cannot do, and what asked to stop.
     """
     token, ended, over = pycolmap.CancellationToken(), dict[str, Any](), threading.Event()
 
@@ -154,24 +154,24 @@ def call_cancellable(function: Callable[..., Result], *arguments: Any, **named: 
         raise
     thread.join()
     if "error" in ended:
-        with explain_colmap_errors(Path(arguments[0]).parent):
+        with explain_colmap_errors(Path(arguments[0]).parent if arguments else None):
             raise ended["error"]
     return ended["result"]
 
 
 @contextmanager
-def explain_colmap_errors(folder: Path) -> Iterator[None]:
-    """A context that lets COLMAP work in a folder: its errors become VdgsErrors, with the remedy where the disk is full
-    (SQLite says so, or that it cannot open its database)."""
+def explain_colmap_errors(folder: Path | None) -> Iterator[None]:
+    """A context in which COLMAP works, in a folder or in memory: errors of COLMAP become VdgsErrors, with the remedy
+    where the disk is full (SQLite says so, or that SQLite cannot open the database)."""
     try:
         yield
     except (RuntimeError, ValueError, IndexError) as error:
-        said = " ".join(str(error).split())
-        if is_disk_full(folder) or "full" in said or "disk I/O" in said:
+        said, where = " ".join(str(error).split()), "" if folder is None else f"{folder}: "
+        if folder is not None and (is_disk_full(folder) or "full" in said or "disk I/O" in said):
             raise VdgsError(
-                f"{folder}: the disk is full ({said}). Free some space; the same command then goes on."
+                f"{where}the disk is full ({said}). Free some space; the same command then goes on."
             ) from error
-        raise CaptureError(f"{folder}: COLMAP could not go on ({said}). What was done is kept.") from error
+        raise CaptureError(f"{where}COLMAP could not go on ({said}). What was done is kept.") from error
 
 
 @contextmanager

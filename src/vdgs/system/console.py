@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import TypeVar
 from weakref import WeakKeyDictionary
 
@@ -11,6 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TaskProgressColumn, TextColumn
 from rich.text import Text
 
+from vdgs.system.stop_signals import check_stop_requested
 from vdgs.system.units import clock
 
 Item = TypeVar("Item")
@@ -34,8 +36,8 @@ class TimeLeftColumn(ProgressColumn):
 
 
 def make_progress_bar(console: Console, counts: bool = False, transient: bool = True) -> Progress:
-    """A bar that shows how far work is, to be used as a context; none where the console is no terminal. With `counts`
-    it says how many are done, else what share."""
+    """A bar of the progress of work, to be used as a context; hidden where the console is no terminal. With `counts`
+    the bar says how many items are done, else what share."""
     done = MofNCompleteColumn() if counts else TaskProgressColumn()
     columns = (TextColumn("{task.description}"), BarColumn(), done, TimeLeftColumn())
     return Progress(*columns, console=console, disable=not console.is_terminal, transient=transient)
@@ -45,6 +47,20 @@ def track(items: Iterable[Item], description: str, total: int, console: Console)
     """The items, with a bar for them."""
     with make_progress_bar(console, transient=False) as bar:
         yield from bar.track(items, total, description=description)
+
+
+@contextmanager
+def show_share(console: Console, description: str) -> Iterator[Callable[[int, int], None]]:
+    """A bar while the context lasts; yields a function that takes how many are done and how many there are, and raises
+    Interrupted where a person asked to stop."""
+    with make_progress_bar(console) as bar:
+        task = bar.add_task(description, total=None)
+
+        def on_progress(done: int, total: int) -> None:
+            check_stop_requested()
+            bar.update(task, completed=done, total=total)
+
+        yield on_progress
 
 
 def escape_names(text: str) -> str:

@@ -23,7 +23,7 @@ def shell_word(text: str | Path) -> str:
 
 def shell_line(words: Iterable[str | Path]) -> str:
     """A command for a POSIX shell."""
-    return shlex.join(map(str, words))
+    return " ".join(map(shell_word, words))
 
 
 def sbatch_directive(option: str) -> str:
