@@ -1,13 +1,16 @@
-"""The documentation names files, links, verbs and modules that exist."""
+"""The documentation names files, links, verbs, options, modules and imports that exist, and each page is reached."""
 
 from __future__ import annotations
 
 import re
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
-from vdgs.cli.main import COMMANDS
+from experiments.bench.cli import BenchArguments
+from vdgs.cli.advice import COMMAND, OPTION, flags_of
+from vdgs.cli.main import COMMANDS, verb_arguments
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "vdgs"
@@ -20,7 +23,9 @@ PAGES = [
 ]
 #: Endings of files of the repository; others that pages name belong to a run or to a capture.
 SOURCE_FILE = re.compile(r"`((?:[\w.-]+/)*\w+\.(?:py|cpp|cu|h))`")
-CODE = re.compile(r"`([^`]+)`|^ {4}(.+)$", re.M)
+CODE = re.compile(r"```\w*\n([\s\S]*?)```|`([^`]+)`|^ {4}(.+)$", re.M)
+IMPORT = re.compile(r"^from (vdgs[\w.]*) import (\w+(?:, \w+)*)", re.M)
+FLAGS = {verb: flags_of(kind) for verb, kind in (verb_arguments() | {"bench": BenchArguments}).items()}
 
 
 def is_there(name: str) -> bool:
@@ -30,6 +35,15 @@ def is_there(name: str) -> bool:
     return any(
         next(root.rglob(name), None) for root in (PACKAGE, ROOT / "experiments", ROOT / "tests", ROOT / "native")
     )
+
+
+def can_be_imported(module: str, name: str) -> bool:
+    if not hasattr(import_module(module), name):
+        try:
+            import_module(f"{module}.{name}")
+        except ModuleNotFoundError:
+            return False
+    return True
 
 
 def headings(page: Path) -> set[str]:
@@ -55,7 +69,25 @@ def mistakes(page: Path) -> list[str]:
             wrong.append(f"module {module}")
     code = "\n".join(" ".join(found) for found in CODE.findall(text))
     verbs = re.findall(r"(?<![\w.'/-])vdgs ([a-z][a-z-]+)", code)
-    return wrong + [f"verb {verb}" for verb in verbs if verb not in COMMANDS]
+    wrong += [f"verb {verb}" for verb in verbs if verb not in COMMANDS]
+    for command in COMMAND.finditer(re.sub(r"&&|\"", "\n", code.replace("\\\n", " "))):
+        flags = FLAGS.get(command.group(1))
+        options = OPTION.findall(command.group()) if flags is not None else []
+        wrong += [f"option {option} of {command.group(1)}" for option in options if option not in (flags or ())]
+    for module, names in IMPORT.findall(text):
+        wrong += [f"import {module}.{name}" for name in names.split(", ") if not can_be_imported(module, name)]
+    return wrong
+
+
+def test_every_page_is_reached_from_the_first_one():
+    found, queue = set(), [ROOT / "docs" / "README.md"]
+    while queue:
+        page = queue.pop().resolve()
+        if page not in found and page.suffix == ".md" and page.is_file():
+            found.add(page)
+            links = re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8"))
+            queue += [page.parent / link for link in links if not link.startswith("http")]
+    assert set((ROOT / "docs").rglob("*.md")) <= found
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -73,6 +105,8 @@ def test_a_mistake_is_found(tmp_path):
     page.write_text(
         "## A heading\n`runs/keys.py`, [there](gone.md), [here](#a-heading), [no](#other), "
         "`python -m vdgs.executors.work`:\n\n    vdgs coarse CAPTURE\n"
+        "    vdgs merge RUN --block 2 \\\n        --rule owner --jobs 2\n"
+        "from vdgs.errors import VdgsError, Oops\n"
     )
     assert mistakes(page) == [
         "file runs/keys.py",
@@ -80,4 +114,7 @@ def test_a_mistake_is_found(tmp_path):
         "link #other",
         "module vdgs.executors.work",
         "verb coarse",
+        "option --block of merge",
+        "option --jobs of merge",
+        "import vdgs.errors.Oops",
     ]

@@ -184,8 +184,20 @@ def test_the_command_that_is_kept_works_in_every_folder(tmp_path, monkeypatch):
         ]  # fmt: skip
 
 
+def test_the_command_that_is_kept_says_the_same():
+    typed = ["A", "B", "-o", "R", "--sfm.check-points", "P4", "P7", "--slurm.sbatch-args", "--qos=long", "--exclusive"]
+    given = parse_words(RunArguments, typed)
+    again = parse_words(RunArguments, shlex.split(given.command_line("run"))[2:])
+    absolute = {path: again.values[path] for path in (("capture",), ("output",), ("extra_image_folders",))}
+    assert absolute["extra_image_folders",] == (Path("B").resolve(),)
+    assert again.values == given.values | absolute
+
+
 def test_more_folders_of_photographs_are_used_wherever_they_stand():
-    for words in (["A", "B", "D", "-o", "R"], ["A", "-o", "R", "B", "D"], ["-o", "R", "--quiet", "A", "--", "B", "D"]):
+    after_many = ["-o", "R", "--sfm.check-points", "P4", "P7", "--", "A", "B", "D"]
+    for words in (
+        ["A", "B", "D", "-o", "R"], ["A", "-o", "R", "B", "D"], ["-o", "R", "--quiet", "A", "--", "B", "D"], after_many,
+    ):  # fmt: skip
         arguments = parse_words(RunArguments, words).over()
         assert (arguments.capture, arguments.extra_image_folders) == (Path("A"), (Path("B"), Path("D")))
 

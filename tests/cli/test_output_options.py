@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import typing
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +11,9 @@ from PIL import Image
 
 from experiments.bench.cli import BenchArguments
 from vdgs.cli.main import COMMANDS, main, verb_arguments
+from vdgs.config.options import Option, options_of
 from vdgs.config.output_paths import Output, is_output
-from vdgs.config.ranges import FlagName, to_flag
-from vdgs.config.serialization import field_hints
+from vdgs.config.ranges import FlagName
 
 #: Options that name what is only read.
 READ = {
@@ -25,24 +22,12 @@ READ = {
 }  # fmt: skip
 
 
-def path_options(kind: type, within: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Every option that holds a path, by its names, with its type."""
-    for field in dataclasses.fields(kind):
-        hint = field_hints(kind)[field.name]
-        inner = typing.get_args(hint)[0] if typing.get_origin(hint) is typing.Annotated else hint
-        if dataclasses.is_dataclass(inner):
-            names = [each.name for each in getattr(hint, "__metadata__", ()) if hasattr(each, "name")]
-            yield from path_options(inner, (*within, *filter(None, names[:1] or [field.name])))
-        elif "Path" in str(hint):
-            yield (*within, field.name), hint
+def path_options(verb: str) -> list[Option]:
+    """Every option of a verb that holds a path."""
+    return [each for each in options_of(verb_arguments()[verb] or BenchArguments) if "Path" in str(each.hint)]
 
 
-def arguments_type(verb: str) -> type:
-    """The class of a verb's arguments."""
-    return verb_arguments()[verb] or BenchArguments
-
-
-WRITTEN = [(verb, names) for verb in COMMANDS for names, hint in path_options(arguments_type(verb)) if is_output(hint)]
+WRITTEN = [(verb, option) for verb in COMMANDS for option in path_options(verb) if is_output(option.hint)]
 
 
 @pytest.fixture
@@ -63,33 +48,33 @@ def contents(folder: Path) -> dict[Path, bytes | None]:
 
 @pytest.mark.parametrize("verb", COMMANDS)
 def test_every_path_is_known_as_read_or_written(verb: str) -> None:
-    for names, hint in path_options(arguments_type(verb)):
-        read = names[-1] in READ
-        assert read != is_output(hint), f"vdgs {verb} {to_flag(names)}: mark it with Output(), or list it as read"
+    for option in path_options(verb):
+        read = option.path[-1] in READ
+        assert read != is_output(option.hint), f"vdgs {verb} {option.flag}: mark it with Output(), or list it as read"
 
 
 def test_the_known_outputs_are_found() -> None:
     verbs = {verb for verb, _ in WRITTEN}
     assert verbs >= {"run", "sfm", "train-coarse", "inspect", "render", "ortho", "export", "synth", "bench"}
-    assert ("inspect", ("undistorted_folder",)) in WRITTEN
+    assert ("inspect", "--undistorted-folder") in {(verb, option.flag) for verb, option in WRITTEN}
     assert is_output(typing.Annotated[Path | None, FlagName("x"), Output()])
     assert not is_output(Path)
 
 
 @pytest.mark.parametrize("inside", ["", "new", "new/deep", "film.mp4", "scene.ply", "../ortho.tif", ".."])
-@pytest.mark.parametrize(("verb", "names"), WRITTEN, ids=[f"{verb} {names[-1]}" for verb, names in WRITTEN])
-def test_no_verb_writes_among_photographs(verb: str, names: tuple[str, ...], inside: str, card: Path, capsys) -> None:
+@pytest.mark.parametrize(("verb", "option"), WRITTEN, ids=[f"{verb} {option.flag}" for verb, option in WRITTEN])
+def test_no_verb_writes_among_photographs(verb: str, option: Option, inside: str, card: Path, capsys) -> None:
     before, root = contents(card.parents[1]), card.parents[1].parent
     (root / "empty").mkdir()
     (root / "empty" / "config.yaml").touch()  # neither a capture nor a run, which is not looked at yet
     arguments = (
         [str(root / "empty")] if verb not in ("synth", "bench", "config") else ["toy"] if verb == "bench" else []
     )
-    if names != ("output",):
+    if option.flag != "--output":
         arguments += [] if verb in ("render", "ortho", "export") else ["--output", str(root / "free")]
     place = str(card / inside)
     with pytest.raises(SystemExit) as ended:
-        main([verb, *arguments, *([place] if verb == "synth" else [to_flag(names), place])])
+        main([verb, *arguments, *([place] if option.is_positional else [option.flag, place])])
     assert ended.value.code == 1
     said = capsys.readouterr().err
     assert "lies among the photographs" in said

@@ -101,7 +101,7 @@ def test_nothing_is_in_metres_where_the_unit_is_unknown(tmp_path):
     source, text = page_of(run_of(tmp_path / "run", place))
     assert METERS.search(text) is None
     assert 'class="north"' not in source
-    assert "Which way north is, is not known." in text
+    assert "The direction of north is not known." in text
 
 
 def test_the_report_opens_with_the_place_then_pictures_then_metrics(tmp_path):

@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import cv2
 import numpy as np
@@ -35,7 +36,7 @@ from vdgs.viewer import navigation, overlays
 from vdgs.viewer.image_comparison import nearest_view_index, warp_image
 from vdgs.viewer.layers import LAYERS, DisplayOptions, Painter
 from vdgs.viewer.lod import LodPyramid
-from vdgs.viewer.measure_panel import scale_markdown
+from vdgs.viewer.measure_panel import MeasurePanel, scale_markdown
 from vdgs.viewer.measurement import KnownDistance, MeasuredPoint, Ruler
 from vdgs.viewer.path_panel import camera_at_time, path_json
 from vdgs.viewer.picking import measured_point, pick_point, pick_position, thumbnail
@@ -485,3 +486,17 @@ def test_the_newest_photograph_file_is_not_needed_to_look(scene, tmp_path: Path)
     with pytest.raises(CaptureError, match=r"gone\.png"):
         Painter(without).paint(DisplayOptions("error"), camera, camera)
     without.close()
+
+
+def test_a_distance_that_is_saved_again_replaces_the_first(scene):
+    session = MagicMock(scene=scene)
+    session.client.gui.add_number.return_value = meters = MagicMock(value=10.0)
+    panel = MeasurePanel(session)
+    for z in (0.0, 4.0):
+        panel.add(MeasuredPoint(np.array([0.0, 0.0, z]), rays=(("a.jpg", 0.1, 0.2), ("b.jpg", 0.3, z))))
+    panel.save()
+    meters.value = 12.0
+    panel.save()
+    assert [each.meters for each in panel.known] == [12.0]
+    (name, text), _ = session.client.send_file_download.call_args
+    assert (name, text.decode().count("ray")) == ("known-distances.txt", 4 + 1)  # the first line names the form

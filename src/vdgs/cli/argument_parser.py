@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from vdgs.config.options import Option, Values, options_of, with_values
-from vdgs.config.output_paths import is_output, output_paths
+from vdgs.config.output_paths import is_output
 from vdgs.config.ranges import check_ranges
 from vdgs.errors import RunError, VdgsError
 from vdgs.system.quoting import shell_line
@@ -37,13 +38,10 @@ class GivenArguments:
         """The value of an option; None where it was not given."""
         return self.values.get(path)
 
-    def over(self, *layers: Any) -> Any:
-        """The arguments over layers of defaults, the later ones first: values by path, or by the name of a field."""
+    def over(self, defaults: Mapping[str, Any] = MappingProxyType({})) -> Any:
+        """The arguments, over the values of some fields as defaults."""
         required = {each.path[0]: self.values.get(each.path) for each in options_of(self.kind) if each.is_required}
-        settings = self.kind(**required)
-        for layer in (*layers, self.values):
-            settings = with_values(settings, {(key,) if isinstance(key, str) else key: layer[key] for key in layer})
-        return settings
+        return with_values(self.kind(**{**required, **defaults}), self.values)
 
     def check(self) -> None:
         """Raise UsageError where something required is missing, VdgsError for a number outside its range, for an output
@@ -53,25 +51,22 @@ class GivenArguments:
         names = " and ".join(each.metavar if each.is_positional else f"{each.flag} {each.metavar}" for each in missing)
         if missing:
             raise UsageError(f"{names} {'is' if len(missing) == 1 else 'are'} missing")
-        settings = self.over()
-        check_ranges(settings)
-        for option in options:
-            value = self.values.get(option.path)
-            for path in value if isinstance(value, tuple) else (value,):
-                if isinstance(path, Path) and not is_output(option.hint):
-                    _check_input(option, path)
+        check_ranges(self.over())
+        paths = [(each, path) for each in options for path in _paths(self.values.get(each.path))]
+        for option, path in paths:
+            if not is_output(option.hint):
+                _check_input(option, path)
+        for option, path in paths:
+            if is_output(option.hint) and not (path / "config.yaml").is_file():
+                from vdgs.captures.output_guard import check_output
 
-        outputs = [path for path in output_paths(settings) if not (path / "config.yaml").is_file()]
-        if outputs:
-            from vdgs.captures.output_guard import check_output
-
-            for path in outputs:
                 check_output(path)
 
     def command_line(self, verb: str, without: Iterable[str] = ()) -> str:
         """The command as it can be typed in any folder: with absolute paths, and without some options."""
         line = ["vdgs", verb]
-        for option in options_of(self.kind):
+        # Arguments without a name come first: after an option of any number of words they would be taken for its own.
+        for option in sorted(options_of(self.kind), key=lambda each: not each.is_positional):
             line += [] if option.flag in without else self._absolute_words(option)
         return shell_line(line)
 
@@ -79,13 +74,17 @@ class GivenArguments:
         words, value = self.words.get(option.path), self.values.get(option.path)
         if words is None:
             return []
-        if isinstance(value, Path) or (isinstance(value, tuple) and value and isinstance(value[0], Path)):
-            words = [str(Path(each).resolve()) for each in words]
+        words = [str(path.resolve()) for path in _paths(value)] or words
         if option.is_positional:
             return words
         if option.is_repeatable:
             return [word for each in words for word in (option.flag, each)]
         return [option.off_flag if value is False else option.flag, *words]
+
+
+def _paths(value: Any) -> list[Path]:
+    """The paths in the value of an option."""
+    return [each for each in (value if isinstance(value, tuple) else (value,)) if isinstance(each, Path)]
 
 
 def _check_input(option: Option, path: Path) -> None:
@@ -135,8 +134,8 @@ def _read_options(given: GivenArguments, words: Sequence[str], free: list[str]) 
             continue
         option = known[name]
         taken = [value] if joined else []
-        limit = 1 if option.is_repeatable else len(words) if option.num_words is None else option.num_words
-        while index < len(words) and len(taken) < limit and _spelled(words[index].partition("=")[0]) not in known:
+        count = 1 if option.is_repeatable else option.num_words
+        while index < len(words) and len(taken) != count and not _ends_values(words[index], count, known):
             taken.append(words[index])
             index += 1
         _give(given, option, taken, name)
@@ -175,6 +174,12 @@ def _named(kind: type) -> dict[str, Option]:
 
 
 _HELP = Option(path=("help",), flag="--help", hint=bool, help="")
+
+
+def _ends_values(word: str, count: int | None, known: dict[str, Option]) -> bool:
+    """Whether a word does not belong to the option before it, which takes so many; those that take any number also take
+    options of other programs."""
+    return word == "--" or _spelled(word.partition("=")[0]) in known or (count is not None and word.startswith("--"))
 
 
 def _spelled(name: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
@@ -77,11 +77,11 @@ class ShardArguments:
         return ExecutionOptions(self.executor_options, self.jobs, device=device)
 
 
-#: Defaults of some arguments, which may depend on what was given: values by path, or by the name of a field.
-Layers = Callable[[GivenArguments], Sequence[Mapping[Any, Any]]]
+#: Defaults of some fields of the arguments, which may depend on what was given.
+Defaults = Callable[[GivenArguments], Mapping[str, Any]]
 
 
-def read_arguments(kind: type, words: list[str], verb: str, defaults: Layers = lambda _: ()) -> GivenArguments:
+def read_arguments(kind: type, words: list[str], verb: str, defaults: Defaults = lambda _: {}) -> GivenArguments:
     """What a command line gives for a verb. Prints the help with the `defaults` and ends the process where it is asked
     for, or with the code for it where the command line cannot be understood.
 
@@ -101,18 +101,18 @@ def read_arguments(kind: type, words: list[str], verb: str, defaults: Layers = l
     from vdgs.cli.help_text import help_text
 
     try:
-        layers = defaults(given)
+        shown = given.over(defaults(given))
     except VdgsError:  # of no run, or of none that can be read
-        layers = ()
-    print(help_text(verb, kind, given.over(*layers), full=given.help == FULL_HELP_FLAG), end="")
+        shown = given.over()
+    print(help_text(verb, kind, shown, full=given.help == FULL_HELP_FLAG), end="")
     sys.exit(0)
 
 
-def parse_arguments(kind: type[Parsed], words: list[str], verb: str, defaults: Layers = lambda _: ()) -> Parsed:
+def parse_arguments(kind: type[Parsed], words: list[str], verb: str, defaults: Defaults = lambda _: {}) -> Parsed:
     """The arguments of a verb over its defaults. Raises what `read_arguments` and `defaults` raise, and VdgsError for a
     number outside its range (`config.ranges`) and for an output among photographs."""
     given = read_arguments(kind, words, verb, defaults)
-    parsed: Parsed = given.over(*defaults(given))
+    parsed: Parsed = given.over(defaults(given))
     check_ranges(parsed)
     return parsed
 
@@ -126,9 +126,9 @@ def parse_for_run(
     """
     from vdgs.runs.run_folder import RunFolder
 
-    def own(given: GivenArguments) -> list[Mapping[str, Any]]:
+    def own(given: GivenArguments) -> Mapping[str, Any]:
         path = given.get("run")
-        return [] if path is None else [defaults(RunFolder(path).method())]
+        return {} if path is None else defaults(RunFolder(path).method())
 
     parsed = parse_arguments(kind, words, verb, own)
     run = RunFolder(parsed.run)  # type: ignore[attr-defined]

@@ -12,6 +12,7 @@ from vdgs.cli.common import (
     ComputeArguments,
     QuietArguments,
     make_console,
+    parse_arguments,
     read_arguments,
     set_up_compute,
 )
@@ -60,7 +61,7 @@ def train_coarse_command(arguments: list[str]) -> None:
     def layer(start: StartSettings) -> dict[str, object]:
         return {"options": start.options, "training": start.method.training}
 
-    given = read_arguments(TrainCoarseArguments, arguments, "train-coarse", lambda it: [layer(start_settings(it))])
+    given = read_arguments(TrainCoarseArguments, arguments, "train-coarse", lambda it: layer(start_settings(it)))
     start = start_settings(given)
     args: TrainCoarseArguments = given.over(layer(start))
     check_ranges(args)
@@ -93,7 +94,7 @@ class RunArguments(RunRequest, ConfigFileArguments, QuietArguments):
 
 
 def run_command(arguments: list[str]) -> None:
-    given = read_arguments(RunArguments, arguments, "run", lambda it: [start_settings(it).layer()])
+    given = read_arguments(RunArguments, arguments, "run", lambda it: start_settings(it).layer())
     start = start_settings(given)
     args: RunArguments = given.over(start.layer())
     check_ranges(args)
@@ -137,9 +138,7 @@ def config_command(arguments: list[str]) -> None:
         start = start_settings(given)
         return {"options": start.options, "method": start.method}
 
-    given = read_arguments(ConfigArguments, arguments, "config", lambda it: [layer(it)])
-    args: ConfigArguments = given.over(layer(given))
-    check_ranges(args)
+    args = parse_arguments(ConfigArguments, arguments, "config", layer)
     from vdgs.runs.settings_file import write_settings_file
 
     text = write_settings_file(args.output, args.options, args.method, args.overwrite)

@@ -23,7 +23,7 @@ from types import NoneType, UnionType
 from typing import Any
 
 from vdgs.config.ranges import FlagName, Positional, Repeatable, to_flag
-from vdgs.config.serialization import describe_type, field_hints
+from vdgs.config.serialization import describe_type, field_hints, without_notes
 
 #: Other names of an option.
 ALIASES = {"--output": ("-o", "--out")}
@@ -52,7 +52,7 @@ class Option:
     @property
     def num_words(self) -> int | None:
         """How many words follow its name; None for any number."""
-        return 0 if _bare(self.hint) is bool else count_words(self.hint)
+        return 0 if without_notes(self.hint) is bool else count_words(self.hint)
 
     @property
     def flags(self) -> tuple[str, ...]:
@@ -70,13 +70,15 @@ class Option:
         if self.positional is not None:
             name = self.positional.name or self.flag.removeprefix("--").upper()
             return name if self.num_words is not None else f"{name} ..." if self.is_required else f"[{name} ...]"
+        if self.is_repeatable:
+            return _metavar(typing.get_args(without_notes(self.hint))[0])
         return _metavar(self.hint)
 
     def summary(self, width: int) -> str:
         """The first sentence of its help, or as many clauses of it as fit into a width; with the values to choose
         from."""
         first = self.help.split(". ")[0].rstrip(".")
-        if choices := _choices(_bare(self.hint)):
+        if choices := _choices(without_notes(self.hint)):
             return f"{re.split('[:;]', first)[0]}: {', '.join(choices)}"
         if len(first) <= width:
             return first
@@ -88,8 +90,8 @@ class Option:
         try:
             return read_words(self.hint, words)
         except ValueError:
-            said = " ".join(words)
-            raise ValueError(f"{said or 'nothing'}: must be {describe_type(self.hint)}") from None
+            said, kind = " ".join(words), describe_type(self.hint)
+            raise ValueError(f"{said}: must be {kind}" if said else f"needs a value: {kind}") from None
 
 
 def off_flag(flag: str) -> str:
@@ -111,8 +113,8 @@ def _iter_options(kind: type, path: tuple[str, ...], names: tuple[str, ...]) -> 
         notes = typing.get_args(hint)[1:] if typing.get_origin(hint) is typing.Annotated else ()
         own = next((note.name for note in notes if isinstance(note, FlagName)), field.name)
         inner = (*names, own) if own else names
-        if dataclasses.is_dataclass(_bare(hint)):
-            yield from _iter_options(_bare(hint), (*path, field.name), inner)
+        if dataclasses.is_dataclass(without_notes(hint)):
+            yield from _iter_options(without_notes(hint), (*path, field.name), inner)
             continue
         has_default = field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
         yield Option(
@@ -161,7 +163,7 @@ def _field_docs(module: str) -> dict[tuple[str, str], str]:
 
 def count_words(hint: Any) -> int | None:
     """How many words a value of a type takes; None for any number."""
-    kind, inner = _bare(hint), typing.get_args(_bare(hint))
+    kind, inner = without_notes(hint), typing.get_args(without_notes(hint))
     origin = typing.get_origin(kind)
     if origin is tuple and inner[-1:] == (Ellipsis,):
         return None
@@ -175,7 +177,7 @@ def count_words(hint: Any) -> int | None:
 
 def read_words(hint: Any, words: Sequence[str]) -> Any:
     """The value of a type that words say. Raises ValueError for words that say none."""
-    kind, inner = _bare(hint), typing.get_args(_bare(hint))
+    kind, inner = without_notes(hint), typing.get_args(without_notes(hint))
     origin = typing.get_origin(kind)
     if origin in (typing.Union, UnionType):
         for each in inner:
@@ -199,14 +201,14 @@ def read_words(hint: Any, words: Sequence[str]) -> Any:
 
 def _read_word(kind: Any, word: str) -> Any:
     if typing.get_origin(kind) is typing.Literal:
-        return {str(each): each for each in typing.get_args(kind)}[word] if word in _choices(kind) else _fail()
-    if kind is NoneType:
-        return None if word in ("None", "none") else _fail()
-    return kind(word)
-
-
-def _fail() -> Any:
-    raise ValueError
+        values = [each for each in typing.get_args(kind) if str(each) == word]
+    elif kind is NoneType:
+        values = [None] if word.lower() in ("none", "null") else []
+    else:  # an empty word would be the path of the current folder
+        values = [kind(word)] if word or kind is not Path else []
+    if not values:
+        raise ValueError
+    return values[0]
 
 
 def _choices(kind: Any) -> list[str]:
@@ -216,12 +218,8 @@ def _choices(kind: Any) -> list[str]:
     return [str(each) for each in typing.get_args(kind)] if typing.get_origin(kind) is typing.Literal else []
 
 
-def _bare(hint: Any) -> Any:
-    return typing.get_args(hint)[0] if typing.get_origin(hint) is typing.Annotated else hint
-
-
 def _metavar(hint: Any) -> str:
-    kind, inner = _bare(hint), typing.get_args(_bare(hint))
+    kind, inner = without_notes(hint), typing.get_args(without_notes(hint))
     origin = typing.get_origin(kind)
     if origin is typing.Literal:
         return _choices(kind)[0] if len(_choices(kind)) == 1 else "{" + ",".join(_choices(kind)) + "}"

@@ -67,7 +67,7 @@ def flat_values(kind: type, values: Any, where: str, also: Iterable[str] = ()) -
     hints, flat = field_hints(kind), dict[tuple[str, ...], Any]()
     _check_names(values, [*hints, *also], where)
     for name, value in values.items():
-        inner, inside = _without_notes(hints[name]), f"{where}.{name}".lstrip(".")
+        inner, inside = without_notes(hints[name]), f"{where}.{name}".lstrip(".")
         if dataclasses.is_dataclass(inner):
             within = flat_values(typing.cast(type, inner), value, inside)
             flat |= {(name, *path): each for path, each in within.items()}
@@ -90,7 +90,7 @@ def suggest(word: str, known: Iterable[str]) -> str:
 
 def _read(hint: Any, value: Any, where: str) -> Any:
     """A plain value as what its type says. Raises ValueError for one that is of no such type."""
-    kind, inner = _without_notes(hint), typing.get_args(_without_notes(hint))
+    kind, inner = without_notes(hint), typing.get_args(without_notes(hint))
     origin = typing.get_origin(kind)
     if dataclasses.is_dataclass(kind):
         if not isinstance(value, Mapping):
@@ -117,13 +117,14 @@ def _read(hint: Any, value: Any, where: str) -> Any:
     raise ValueError(f"{where} is {value!r}; it must be {describe_type(hint)}")
 
 
-def _without_notes(hint: Any) -> Any:
+def without_notes(hint: Any) -> Any:
+    """A type without what `Annotated` says beside it."""
     return typing.get_args(hint)[0] if typing.get_origin(hint) is typing.Annotated else hint
 
 
 def describe_type(hint: Any) -> str:
     """What a value of a type looks like, for people."""
-    kind, inner = _without_notes(hint), typing.get_args(_without_notes(hint))
+    kind, inner = without_notes(hint), typing.get_args(without_notes(hint))
     origin = typing.get_origin(kind)
     if origin is tuple and inner[-1:] == (Ellipsis,):
         return f"a list, each of it {describe_type(inner[0])}"

@@ -319,9 +319,7 @@ def _draw_image(
         pad = (0, 3 - count)
         some, behind = (torch.nn.functional.pad(x[..., first : first + count], pad) for x in (colors, background))
         splats = Splats(means2d, image.conics, image.depths, some, image.opacities)
-        raster = kernels.rasterize(
-            splats, behind, settings.width, settings.height, depth=wants_depth and first == 0
-        )  # fmt: skip
+        raster = kernels.rasterize(splats, behind, settings.width, settings.height, depth=wants_depth and first == 0)
         parts.append(raster.image[..., :count])
         if first == 0:
             alpha, depth = raster.alpha, raster.depth

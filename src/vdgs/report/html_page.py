@@ -138,11 +138,9 @@ def figure(image: EmbeddedImage | None, caption: str, alt: str, wide: bool = Fal
     """A `wide` image scrolls on a phone; a `tall` one does not fill a desktop screen. Nothing without an image."""
     if image is None:
         return Html("")
-    size = f'width="{image.width}" height="{image.height}"'
-    tag = f'<img src="{image.data_uri()}" {size} alt="{escape_html(alt)}">'
     text = f"<figcaption>{escape_html(caption)}</figcaption>" if caption else ""
     attribute = _class_attribute("wide" if wide else "tall" if tall else "")
-    return Html(f'<figure{attribute}><div class="scroll">{tag}</div>{text}</figure>')
+    return Html(f'<figure{attribute}><div class="scroll">{_image_tag(image, alt)}</div>{text}</figure>')
 
 
 @dataclass(frozen=True)
@@ -156,8 +154,7 @@ class Overlay:
 
 def map_figure(image: EmbeddedImage, caption: str, alt: str, bar: Overlay | None, north: str | None) -> Html:
     """A map with a scale bar and an arrow to its upper side, both as text: they stay legible at any width."""
-    size = f'width="{image.width}" height="{image.height}"'
-    parts = [f'<img src="{image.data_uri()}" {size} alt="{escape_html(alt)}">']
+    parts = [_image_tag(image, alt)]
     if bar is not None:
         parts.append(f'<div class="bar" style="width:{bar.width_percent:.3f}%">{escape_html(bar.text)}</div>')
     if north is not None:
@@ -218,6 +215,11 @@ def document(title: str, parts: Iterable[Html], metadata: Mapping[str, str] | No
         f"{meta}<title>{escape_html(title)}</title>\n<style>{PAGE_STYLE}</style>\n</head>\n<body>\n<main>\n"
         f"{join_html(parts)}\n</main>\n</body>\n</html>\n"
     )
+
+
+def _image_tag(image: EmbeddedImage, alt: str) -> str:
+    size = f'width="{image.width}" height="{image.height}"'
+    return f'<img src="{image.data_uri()}" {size} alt="{escape_html(alt)}">'
 
 
 def _class_attribute(name: str) -> str:

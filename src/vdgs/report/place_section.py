@@ -39,9 +39,9 @@ def current_map(report: ReportedRun, source: RunFiles) -> JsonRecord:
     return JsonRecord({})
 
 
-def place_panel(report: ReportedRun, source: RunFiles) -> Html:
+def place_panel(report: ReportedRun, source: RunFiles, facts: PlaceFacts | None) -> Html:
     """The orthophoto with scale bar and north, and beside it the facts."""
-    facts, metadata = read_place(source), current_map(report, source)
+    metadata = current_map(report, source)
     rows = _map_rows(metadata)
     rows = place_rows(facts, rows) if facts is not None else rows
     image = source.image(PICTURE_FILE) if metadata else None
@@ -71,5 +71,5 @@ def _map_figure(image: EmbeddedImage, metadata: JsonRecord, facts: PlaceFacts | 
     is_north_up = is_known and metadata.text("crs") != "source"
     caption = f"Orthophoto, {metadata.text('crs_name')}."
     if not is_north_up:
-        caption += " Which way north is, is not known."
+        caption += " The direction of north is not known."
     return map_figure(image, caption, "orthophoto of the place", bar, "N" if is_north_up else None)

@@ -216,11 +216,11 @@ def _bins_table(bins: list[JsonRecord], pairs: list[tuple[JsonRecord, JsonRecord
 
 
 def seams_section(report: ReportedRun) -> Html:
+    if report.is_one_block:
+        return Html("")
     source, file = report.files(), f"{MERGED_EVALUATION}/by_block.json"
     metrics = source.record(file)
     is_absent = not metrics and not source.exists(file)
-    if report.is_one_block:
-        return Html("")
     rows = [_block_row(row.count("block"), row) for row in metrics.rows("blocks")]
     if rows and metrics.child("all"):
         rows.append(_block_row("all", metrics.child("all")))

@@ -76,16 +76,15 @@ def write_report(run: RunFolder) -> Path:
 def _header(report: ReportedRun) -> tuple[Html, str]:
     source = report.files()
     config, capture = _config(source), source.record("capture.json")
-    name = _capture_name(config, capture)
     version, commit = (config.child("vdgs").text(key) for key in ("version", "commit"))
-    place = read_place(report.files())
+    place = read_place(source)
+    name = place.name if place is not None and place.name else _capture_name(config, capture)
     facts = [
         f"Report of {datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
         f"run begun with vdgs {version or 'of unknown version'}{f', commit {commit[:12]}' if commit else ''}",
         _image_counts(capture) if place is None else "",
     ]
-    name = place.name if place is not None and place.name else name
-    panel = place_panel(report, source)
+    panel = place_panel(report, source, place)  # may add notes
     parts = [
         Html(f"<h1>{escape_html(name)}</h1>"),
         panel,

@@ -95,7 +95,7 @@ class CompensatedGrowth:
     ) -> None:
         """To be called after `loss.backward()`: counts, and every `refine_every` steps adds and removes Gaussians.
 
-        Changes `params`, the states of the optimizers and `state`. `packed` as it was drawn (None: as `info` says).
+        Changes `params`, the states of the optimizers and `state`. `packed` is gsplat's and not used: `info` says it.
         """
         if step >= self.refine_stop_iter:
             return

@@ -63,7 +63,9 @@ class MeasurePanel:
         elif min(len(point.rays) for point in points) < MIN_OBSERVATIONS:
             self._session.notify("Too few photographs", "Two photographs at least must show each place freely.")
         else:
-            self.known.append(KnownDistance(points[0], points[1], meters))
+            # Saved again, a distance takes the place of what was said of it before.
+            others = [each for each in self.known if (each.one, each.other) != tuple(points)]
+            self.known = [*others, KnownDistance(points[0], points[1], meters)]
             text = known_distances_text(self.known)
             self._session.client.send_file_download(SCALE_BAR_FILE, text.encode())
             self._command.content = scale_markdown(self.known, self._session.scene.capture.root.name)
