@@ -22,14 +22,13 @@ from torch import Tensor
 from vdgs.captures.capture import Capture as Capture
 from vdgs.config.capture_options import CaptureOptions as CaptureOptions
 from vdgs.config.commands import ExportRequest, ModelName, ViewRequest
-from vdgs.config.executor_options import CheckpointOptions
 from vdgs.config.method import AssignmentConfig, MergeConfig, MethodConfig, PartitionConfig, TrainConfig
 from vdgs.config.presets import PRESETS, PresetName
-from vdgs.errors import CaptureError, VdgsError
+from vdgs.errors import CaptureError, VdgsError, check_kind
 from vdgs.geometry.camera import Camera as Camera
-from vdgs.geometry.camera import CameraModel
+from vdgs.geometry.camera import CameraModel, check_cameras
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.ops.arrays import Array, like, to_torch
+from vdgs.ops.arrays import Array, as_tensor, like, to_torch
 from vdgs.partition.assignment.assign_cameras import Assignment
 from vdgs.partition.blocks import Blocks
 from vdgs.runs import open_run as runs
@@ -49,6 +48,9 @@ class Scene:
 
     def __len__(self) -> int:
         return len(self.model.anchors)
+
+    def __repr__(self) -> str:
+        return f"Scene({len(self):,} anchors, capture={self.capture!r})"
 
     @property
     def positions(self) -> Tensor:
@@ -78,6 +80,9 @@ class Run:
     def __init__(self, folder: RunFolder, model: ModelName, device: str, capture: Path | None) -> None:
         self.folder, self.model, self.device = folder, model, device
         self._context = RunContext.from_path(folder.path, capture)
+
+    def __repr__(self) -> str:
+        return f"Run({str(self.path)!r}, model={self.model!r})"
 
     @property
     def path(self) -> Path:
@@ -201,6 +206,8 @@ def render(
     """
     from vdgs.model.renderer import render as draw
 
+    _check_scene(scene)
+    check_kind("camera", camera, Camera)
     if mode not in ("rgb", "rgb+depth"):
         raise VdgsError(f"mode={mode!r}: choose rgb or rgb+depth")
     raster = draw(scene.model, camera, background=background, depth=mode != "rgb", image_index=image_index)
@@ -217,7 +224,8 @@ def count_visibility(points: Array, cameras: Sequence[Camera]) -> Array:
     """
     from vdgs.visibility import visibility_counts
 
-    return like(points, visibility_counts.count_visibility(_points(points), cameras))
+    check_cameras(cameras)
+    return like(points, visibility_counts.count_visibility(as_tensor("points", points), cameras))
 
 
 def visibility_ratio(points: Array, cameras: Sequence[Camera]) -> Array:
@@ -227,12 +235,12 @@ def visibility_ratio(points: Array, cameras: Sequence[Camera]) -> Array:
     """
     from vdgs.visibility import visibility_counts
 
-    return like(points, visibility_counts.visibility_ratio(_points(points), cameras))
+    check_cameras(cameras)
+    return like(points, visibility_counts.visibility_ratio(as_tensor("points", points), cameras))
 
 
-def _points(points: Any) -> Tensor:
-    """As a tensor in the precision that it came in."""
-    return torch.from_numpy(np.array(points)) if isinstance(points, np.ndarray) else points
+def _check_scene(scene: Any) -> None:
+    check_kind("scene", scene, Scene, remedy="vdgs.open_run(RUN).scene and vdgs.train(...) are scenes")
 
 
 def partition(
@@ -254,7 +262,9 @@ def partition(
     from vdgs.partition.partition_scene import partition_scene
 
     config = PartitionConfig(blocks=num_blocks, lambda_vis=lambda_vis, balanced=balanced, expansion=expansion)
-    places, counts = (_points(each).detach().cpu().numpy() for each in (points, visibility))
+    places, counts = (
+        as_tensor(name, each).detach().cpu().numpy() for name, each in (("points", points), ("visibility", visibility))
+    )
     blocks, notes = partition_scene(places, counts.astype(np.int64), config, seed)
     _warn(notes)
     return blocks
@@ -272,6 +282,8 @@ def assign_cameras(
     from vdgs.partition.assignment import assign_cameras as assignment
     from vdgs.partition.assignment.score_matrix import compute_score_matrix
 
+    _check_scene(scene)
+    check_cameras(cameras)
     config = config or AssignmentConfig()
     decided = assignment.assign_cameras(compute_score_matrix(scene.model, blocks, cameras, config), config)
     _warn(decided.warnings)
@@ -314,6 +326,7 @@ def export(scene: Scene | Run, path: str | Path, **options: Any) -> None:
     from vdgs.export.export_run import resolve_request, write_files
 
     scene = scene.scene if isinstance(scene, Run) else scene
+    _check_scene(scene)
     if scene.capture is None:
         raise VdgsError(f"{path}: baking needs the training cameras: give the capture, as in Scene(model, capture)")
     request = resolve_request(ExportRequest(run=Path(path).parent, output=(Path(path),), evaluate=False, **options))
@@ -342,7 +355,7 @@ def train(
     `capture_options` say how a folder is read. Raises CaptureError for a capture that cannot become a scene, VdgsError
     for settings, TrainingDiverged.
     """
-    from vdgs.pipeline.train_in_memory import train_in_memory
+    from vdgs.pipeline.train_in_memory import train_in_memory, train_in_run_folder
 
     config = preset(config) if isinstance(config, str) else config
     if run_dir is None:
@@ -351,27 +364,9 @@ def train(
     if callbacks or isinstance(capture, Capture):
         given = "callbacks" if callbacks else "Capture"
         raise VdgsError(f"run_dir={str(run_dir)!r} takes no {given}: processes of their own read the capture's folder")
-    _train_run(Path(capture), capture_options, config, Path(run_dir), device)
+    options = capture_options or CaptureOptions()
+    train_in_run_folder(Path(capture), options, config, Path(run_dir), _warning_console(), device)
     return open_run(run_dir, model="coarse" if isinstance(config, TrainConfig) else "best", device=device).scene
-
-
-def _train_run(
-    capture: Path, options: CaptureOptions | None, config: MethodConfig | TrainConfig, run_dir: Path, device: str
-) -> None:
-    """The stages of `vdgs run` that make the scene."""
-    from vdgs.pipeline import count_visibility as visibility
-    from vdgs.pipeline import merge_blocks, partition_stage, train_blocks, train_coarse
-    from vdgs.runs.create_or_resume import exclusive_run
-
-    method = config if isinstance(config, MethodConfig) else MethodConfig(training=config)
-    console, saving = _warning_console(), CheckpointOptions()
-    with exclusive_run(capture, run_dir, options or CaptureOptions(), method, overwrite=False) as context:
-        train_coarse.train_coarse(context, saving, console, device)
-        if isinstance(config, MethodConfig):
-            visibility.count_run_visibility(context, console)
-            partition_stage.partition_run(context, console, device)
-            train_blocks.train_blocks(context, saving, 0, console, device)
-            merge_blocks.merge_run_blocks(context, False, console)
 
 
 def view(run: Run | str | Path, *, host: str = "127.0.0.1", port: int | None = None) -> None:

@@ -33,3 +33,10 @@ class Interrupted(Stopped):
 
 class UnsupportedOption(VdgsError, NotImplementedError):
     """A function of the Python API was asked for what it does not have; the message says what to do instead."""
+
+
+def check_kind(name: str, value: object, *kinds: type, remedy: str = "") -> None:
+    """Raise TypeError, which names the argument of a function of the API, unless `value` is of one of the kinds."""
+    if not isinstance(value, kinds):
+        known = " or ".join(f"{each.__module__.partition('.')[0]}.{each.__name__}" for each in kinds)
+        raise TypeError(f"{name} must be {known}, not {type(value).__name__}{remedy and ': ' + remedy}")

@@ -237,3 +237,27 @@ def test_a_run_is_shown_in_a_browser_as_the_verb_does(run, monkeypatch):
     vdgs.view(run, port=8123)
     vdgs.view(str(run.path))
     assert [(each.run, each.port, each.model) for each in asked] == [(run.path, 8123, "best"), (run.path, None, "best")]
+
+
+def test_a_capture_in_a_shell_is_a_line_and_its_views_have_no_arrays_of_observations(capture, coarse, run):
+    assert "\n" not in repr(capture)
+    assert f"{len(capture.train_views)} training" in repr(capture)
+    assert "Observations" not in repr(capture.views[0])
+    assert f"{len(coarse):,} anchors" in repr(coarse)
+    assert str(run.path) in repr(run)
+
+
+def test_wrong_kinds_of_arguments_are_named(capture, coarse):
+    points, cameras = capture.points, coarse.cameras
+    for call, name in (
+        (lambda: vdgs.count_visibility(points, capture), "cameras must be .*Sequence, not Capture: of a capture take"),
+        (lambda: vdgs.visibility_ratio(points, capture.train_views), "cameras must be vdgs.Camera, not View"),
+        (lambda: vdgs.count_visibility(points.tolist(), cameras), "points must be torch.Tensor or numpy.ndarray"),
+        (lambda: vdgs.partition(points, [1] * len(points)), "visibility must be torch.Tensor or numpy.ndarray, not li"),
+        (lambda: vdgs.render(points, cameras[0]), "scene must be vdgs.Scene, not ndarray"),
+        (lambda: vdgs.render(coarse, capture.views[0]), "camera must be vdgs.Camera, not View"),
+        (lambda: vdgs.assign_cameras(points, None, cameras), "scene must be vdgs.Scene"),
+        (lambda: vdgs.export(points, "x.ply"), "scene must be vdgs.Scene"),
+    ):
+        with pytest.raises(TypeError, match=name):
+            call()

@@ -21,7 +21,7 @@ from vdgs.cli.export_cmd import ExportArguments
 from vdgs.cli.help_text import COMMON_OPTIONS
 from vdgs.cli.main import COMMANDS, HELP, get_command, main, verb_arguments
 from vdgs.cli.run_cmd import NOT_KEPT, RunArguments
-from vdgs.config.options import options_of
+from vdgs.config.options import Option, options_of
 
 #: A module of those that take long to import, and what it imports only when it is needed.
 IMPORTED_LATE = {"vdgs.export.export_run": "viser", "vdgs.viewer.server": "matplotlib"}
@@ -243,6 +243,17 @@ def test_the_arguments_are_parsed_once(uncut, monkeypatch, tmp_path, capsys):
         assert ended.value.code == 1
     assert parsed == ["TrainCoarseArguments", "TrainBlocksArguments", "MergeArguments", "PartitionArguments"]
     assert f"{tmp_path}: is not a run folder" in capsys.readouterr().err
+
+
+def test_a_short_help_ends_a_clause_where_it_makes_sense(capsys):
+    def option(text: str) -> Option:
+        return Option(path=("x",), flag="--x", hint=int, help=text)
+
+    assert option("Depth of the views (with what hides), and of points. More.").summary(40).endswith("and of points")
+    assert option("Frames of a film, of its path and the film; 0: what its file says").summary(50).endswith("the film")
+    assert option("Folder of maps, not among photographs, nor others").summary(20).endswith("nor others")
+    assert option("Steps (one for each photograph)").summary(20) == "Steps"
+    assert "(default: on; off: --no-ortho)" in help_of(capsys, "run", "--help")
 
 
 def test_a_run_decides_the_defaults_of_its_help(uncut, capsys):

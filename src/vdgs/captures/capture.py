@@ -43,7 +43,7 @@ class View:
     mask_path: Path | None
     split: Split
     #: Some of the points that the capture says this photograph shows, where it says so (ground frame).
-    observations: Observations | None = None
+    observations: Observations | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -64,6 +64,12 @@ class Capture:
     warnings: tuple[str, ...] = field(default=())
     #: Photographs that are there and not used: without a camera, or left out by an option.
     num_unused_images: int = 0
+
+    def __repr__(self) -> str:
+        return (
+            f"Capture({str(self.root)!r}, {self.source}, images={self.images!r}: {len(self.train_views)} training and "
+            f"{len(self.test_views)} test views, {len(self.points):,} points, {self.ground.description})"
+        )
 
     @property
     def train_views(self) -> tuple[View, ...]:

@@ -92,7 +92,7 @@ class SfmArguments(QuietArguments):
     Pix4D, RealityScan and others name them, ODM's geo.txt or DJI's .MRK. Names need no folder and no extension where
     they are told apart without."""
     dry_run: bool = False
-    """Only look: what the photographs say, what would be done and how long it takes. Writes nothing."""
+    """Say what the photographs hold, what would be done and how long it takes, and write nothing."""
     threads: Annotated[int, WORKER_COUNT] = 0
     """Threads to use; 0 for all cores."""
     keep_intermediate: bool = False

@@ -65,7 +65,7 @@ def help_text(verb: str, kind: type, settings: Any, *, full: bool) -> str:
     options = options_of(kind)
     free = " ".join(each.metavar for each in options if each.is_positional)
     named = " ".join(f"{each.flag} {each.metavar}" for each in options if each.is_required and not each.is_positional)
-    lines = [f"usage: vdgs {verb} {free} {named} [options]".replace("  ", " "), ""]
+    lines = [" ".join(f"usage: vdgs {verb} {free} {named} [options]".split()), ""]
     paragraphs = inspect.cleandoc(kind.__doc__ or "").split("\n\n")
     for text in paragraphs if full else paragraphs[:1]:
         lines += [*textwrap.wrap(" ".join(text.split()), width), ""]
@@ -138,6 +138,6 @@ def _default(option: Option, settings: Any) -> str:
         return " (required)" if not option.is_positional else ""
     value = value_at(settings, option.path)
     if option.num_words == 0:
-        return f" (off: {option.off_flag})" if value else ""
+        return f" (default: on; off: {option.off_flag})" if value else ""
     explained = value == 0 and "; 0" in option.help
     return "" if explained or value in (None, (), "") else f" (default: {value_words(value)})"

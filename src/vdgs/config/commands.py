@@ -93,8 +93,8 @@ class RenderRequest:
     run: Annotated[Path, Positional(is_run=True)]
     """Run folder."""
     output: Annotated[Path, Output()]
-    """Folder for PNG files: new, empty, or filled by an earlier render, which is replaced. Or a file that ends in
-    .mp4."""
+    """Folder for PNG files, or a film, NAME.mp4. The folder is new, empty, or filled by an earlier render, which is
+    replaced."""
     views: Literal["test", "train", "orbit", "flyover"] = "test"
     """Which cameras. `orbit` and `flyover` are paths made from the capture."""
     path: Path | None = None
@@ -161,7 +161,7 @@ class ExportRequest:
     run: Annotated[Path, Positional(is_run=True)]
     """Run folder."""
     output: Annotated[tuple[Path, ...], Repeatable(), Output()] = ()
-    """A file to write, by its ending. These are .ply (3DGS), .compressed.ply (PlayCanvas), .spz, .splat, .sog, .glb
+    """File to write; its ending is the format: .ply, .spz, .glb, .html, ... These are .ply (3DGS), .compressed.ply (PlayCanvas), .spz, .splat, .sog, .glb
     (glTF), FOLDER/tileset.json (3D Tiles), .points.ply, .laz, .las (point clouds), .html (a page that shows the scene
     offline). Give --output again for more: the scene is baked once (docs/export.md)."""
     program: Annotated[ProgramName | None, FlagName("for")] = None
@@ -192,9 +192,9 @@ class ExportRequest:
     """Seconds of optimization of all baked parameters; 0: none. Towards the model's images, after the fit in closed
     form. Needs 0.7 kB of memory for each Gaussian of degree 3."""
     crs: str | None = None
-    """Coordinates of the files: EPSG:n (EPSG:25832), `enu` (metres east and north of the scene's origin), `source`
-    (those of the capture) or `local` (the ground frame). By default `enu` where the capture is georeferenced, and UTM
-    for .laz and .las; else `local`. 3D Tiles of a georeferenced capture always stand on the globe (`enu`)."""
+    """Coordinates of the files: EPSG:n, `enu` (metres east and north of the scene's origin), `source` (of the capture)
+    or `local` (the ground frame). By default `enu` where the capture is georeferenced, and UTM for .laz and .las; else
+    `local`. 3D Tiles of a georeferenced capture always stand on the globe (`enu`)."""
     evaluate: bool = True
     """Report what was lost. A file is read back and its test views are compared with those of the model itself."""
     threads: Annotated[int, WORKER_COUNT] = 0

@@ -75,15 +75,17 @@ class Option:
         return _metavar(self.hint)
 
     def summary(self, width: int) -> str:
-        """The first sentence of its help, or as many clauses of it as fit into a width; with the values to choose
-        from."""
+        """The first sentence of its help, or as many clauses of it as fit into a width, if one does; with the values
+        to choose from."""
         first = self.help.split(". ")[0].rstrip(".")
         if choices := _choices(without_notes(self.hint)):
             return f"{re.split('[:;]', first)[0]}: {', '.join(choices)}"
         if len(first) <= width:
             return first
-        ends = [found.start() for found in re.finditer(r"[:;,] | \(", first)]
-        return first[: max([end for end in ends if end <= width] or ends[:1] or [len(first)])]
+        # A clause ends neither within a list or brackets nor before what a value means, as in "; 0: all".
+        outside = re.sub(r"\(.*?\)", lambda found: "_" * len(found[0]), first)
+        ends = [found.start() for found in re.finditer(r"(?<!; 0)[:;] | _+$", outside)]
+        return first[: max([end for end in ends if end <= width] or [len(first)])]
 
     def read(self, words: Sequence[str]) -> Any:
         """The value that words say. Raises ValueError, in words that follow the name, for others."""

@@ -22,8 +22,8 @@ class SfmOptions:
     """Each photograph is matched with so many that were taken near it, where positions are known; with more where those
     show little of the same: facades, oblique views, several cameras at one place."""
     exhaustive_max: Annotated[int, Range(0, MAX_COUNT)] = 50
-    """Without positions: up to so many photographs, all are matched with all; beyond it those next to each other in
-    order, and those that look alike."""
+    """Up to so many photographs without positions are matched all with all. Of more, those are matched that are next
+    to each other in order or look alike."""
     max_image_size: Annotated[int, Range(200, 100_000)] = 2000
     """Longer side of photographs in which features are found, in pixels."""
     max_num_features: Annotated[int, Range(200, 1_000_000)] = 8192
@@ -31,7 +31,7 @@ class SfmOptions:
     max_output_size: Annotated[int, Range(16, 1_000_000, allow_zero=True)] = 0
     """Longer side of the photographs that are written into images/, in pixels; 0: as large as they are."""
     gcp: Path | None = None
-    """gcp_list.txt (as for ODM): surveyed points and where photographs show them. The model is brought to them; that of
+    """Control points and where photographs show them: gcp_list.txt, as for ODM. The model is brought to them; that of
     a finished capture in seconds."""
     check_points: tuple[str, ...] = ()
     """Points of --gcp that are only measured, by name; all: every one. They are held out."""

@@ -6,11 +6,14 @@ Conventions (docs/conventions.md): OpenCV axes (+x right, +y down, +z forward), 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
+
+from vdgs.errors import check_kind
 
 CameraModel = Literal["pinhole", "orthographic"]
 
@@ -115,3 +118,11 @@ class Camera:
         pixels, depth = self.project(points)
         x, y = pixels[:, 0], pixels[:, 1]
         return (depth > NEAR_PLANE) & (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
+
+
+def check_cameras(cameras: object) -> None:
+    """Raise TypeError unless it is a sequence of cameras."""
+    remedy = "of a capture take [view.camera for view in capture.train_views]"
+    check_kind("cameras", cameras, Sequence, remedy=remedy)
+    for camera in cast("Sequence[object]", cameras):
+        check_kind("each of cameras", camera, Camera, remedy=remedy)

@@ -8,6 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from vdgs.errors import check_kind
+
 #: Tensors or arrays: what goes in comes out.
 Array = TypeVar("Array", Tensor, np.ndarray)
 
@@ -15,6 +17,12 @@ Array = TypeVar("Array", Tensor, np.ndarray)
 def in_place(value: Any) -> Tensor:
     """A tensor, or an array as one that shares its memory."""
     return torch.from_numpy(value) if isinstance(value, np.ndarray) else value
+
+
+def as_tensor(name: str, value: Any) -> Tensor:
+    """A tensor, or a copy of an array as one, in the precision that it came in. Raises TypeError for anything else."""
+    check_kind(name, value, Tensor, np.ndarray)
+    return torch.from_numpy(np.array(value)) if isinstance(value, np.ndarray) else value
 
 
 def to_torch(value: Any) -> Tensor:

@@ -182,12 +182,15 @@ def _check_gaussians(sh_degree: int | None, tensors: dict[str, Tensor]) -> _Gaus
         if tensor.dtype not in allowed or tensor.dtype != means.dtype:
             raise TypeError(f"{name} must be float32, not {tensor.dtype}: convert it with .float()")
     if means.ndim < 2 or tensors["viewmats"].ndim < 3:
-        raise ValueError("means must be [..., N, 3] and viewmats [..., C, 4, 4]")
+        given = f"{list(means.shape)} and {list(tensors['viewmats'].shape)}"
+        raise ValueError(f"means must be [..., N, 3] and viewmats [..., C, 4, 4], not {given}")
     batch, n, c = tuple(means.shape[:-2]), means.shape[-2], tensors["viewmats"].shape[-3]
     if "covars" in tensors:
         tensors = {name: each for name, each in tensors.items() if name not in ("quats", "scales")}
     elif not {"quats", "scales"} <= tensors.keys():
         raise ValueError("give quats and scales, or covars")
+    if sh_degree is not None and colors.ndim < len(batch) + 3:
+        raise ValueError(f"colors must be [..., N, K, 3] with sh_degree={sh_degree}, not {list(colors.shape)}")
     own = colors.ndim == len(batch) + (3 if sh_degree is None else 4)
     tail = (colors.shape[-1],) if sh_degree is None else (*colors.shape[-2:-1], 3)
     wanted = {

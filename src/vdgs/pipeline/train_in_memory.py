@@ -16,6 +16,7 @@ from vdgs import __version__
 from vdgs.captures.capture import Capture
 from vdgs.captures.capture_metadata import capture_metadata
 from vdgs.captures.validation import require_trainable
+from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.executor_options import CheckpointOptions
 from vdgs.config.method import MethodConfig, TrainConfig, resolve_iterations
 from vdgs.config.validation_rules import check_config
@@ -156,3 +157,23 @@ def _result(state: TrainingState, problem: TrainingProblem, metadata: ModelMetad
     """The model that training has arrived at, which nothing trains any more."""
     model = state.model(problem.voxel_size, problem.background, metadata)
     return replace(model, decoder=model.decoder.copy())
+
+
+def train_in_run_folder(
+    capture: Path, options: CaptureOptions, config: MethodConfig | TrainConfig, run_dir: Path, console: Console,
+    device: str,
+) -> None:  # fmt: skip
+    """The same stages with a run folder, which the same call continues."""
+    from vdgs.pipeline import count_visibility as visibility
+    from vdgs.pipeline import merge_blocks, partition_stage, train_blocks, train_coarse
+    from vdgs.runs.create_or_resume import exclusive_run
+
+    method = config if isinstance(config, MethodConfig) else MethodConfig(training=config)
+    saving = CheckpointOptions()
+    with exclusive_run(capture, run_dir, options, method, overwrite=False) as context:
+        train_coarse.train_coarse(context, saving, console, device)
+        if isinstance(config, MethodConfig):
+            visibility.count_run_visibility(context, console)
+            partition_stage.partition_run(context, console, device)
+            train_blocks.train_blocks(context, saving, 0, console, device)
+            merge_blocks.merge_run_blocks(context, False, console)
