@@ -161,9 +161,10 @@ class ExportRequest:
     run: Annotated[Path, Positional(is_run=True)]
     """Run folder."""
     output: Annotated[tuple[Path, ...], Repeatable(), Output()] = ()
-    """File to write; its ending is the format: .ply, .spz, .glb, .html, ... These are .ply (3DGS), .compressed.ply (PlayCanvas), .spz, .splat, .sog, .glb
-    (glTF), FOLDER/tileset.json (3D Tiles), .points.ply, .laz, .las (point clouds), .html (a page that shows the scene
-    offline). Give --output again for more: the scene is baked once (docs/export.md)."""
+    """File to write; its ending is the format: .ply, .spz, .glb, .html, ... These are .ply (3DGS), .compressed.ply
+    (PlayCanvas), .spz, .splat, .sog, .glb (glTF), FOLDER/tileset.json (3D Tiles), .points.ply, .laz, .las (point
+    clouds), .html (a page that shows the scene offline). Give --output again for more: the scene is baked once
+    (docs/export.md)."""
     program: Annotated[ProgramName | None, FlagName("for")] = None
     """Program that opens the files. It shows the scene upright then; files that it does not open are refused.
     Without --output: write RUN/export/ and the file that suits it best."""

@@ -209,7 +209,10 @@ def _advice(look: PreflightReport, held: bool, registered: int, found: int) -> l
     if look.forward_overlap is not None and look.forward_overlap < MIN_OVERLAP:
         advice.append("fly slower or take photographs more often: 75 to 80 % overlap along the flight.")
     if look.views_per_point is not None and look.views_per_point < 2 * MIN_VIEWS_PER_POINT:
-        advice.append("fly the strips closer together, or a second grid across the first, until 8 photographs or more show every place.")
+        advice.append(
+            "fly the strips closer together, or a second grid across the first, until 8 photographs or more show every "
+            "place."
+        )
     if held and look.oblique is not None and look.oblique == 0:
         advice.append(
             f"add oblique views (camera {OBLIQUE_ANGLE_DEG + 10:.0f}° or more from straight down) or "
