@@ -112,6 +112,14 @@ def test_a_run_is_looked_at_closely_where_anything_differs(native_small: NativeR
     assert nothing_to_do(asked, "") == ""  # without a report
     vdgs("report", run)
     assert nothing_to_do(asked, "").startswith("nothing to do")
+    bars = tmp_path / "bars.txt"
+    bars.touch()
+    os.utime(bars, ns=(0, 0))
+    options = replace(own.capture, scale_bar=bars)  # of photographs: the capture that was made of them has it already
+    of_photographs = replace(asked, capture=native_small.capture / "images", options=options)
+    RunFolder(run).config.write(own, "vdgs run DCIM")
+    assert nothing_to_do(of_photographs, "vdgs run DCIM").startswith("nothing to do")
+    assert nothing_to_do(of_photographs, "vdgs run OTHERS") == ""
     others = (
         replace(asked, visibility_bins=5),
         replace(asked, capture=tmp_path),

@@ -36,6 +36,7 @@ from vdgs.runs.run_status import OTHER_BLOCKS, OTHER_MODEL, OTHER_PARTITION, OTH
 from vdgs.runs.stage_folder import StatusRecord
 from vdgs.system.atomic_files import write_json
 from vdgs.system.file_locks import is_locked, lock_folder
+from vdgs.system.step_progress import StepRecord, read_step
 from vdgs.system.tensors import file_id
 
 PLACES = [[-1.0, -1.0, 0.0], [1.0, 1.0, 0.0]]
@@ -341,6 +342,15 @@ def test_what_the_driver_works_on_is_shown_as_running(run, capsys):
         assert states(run)["evaluation"] == "running"
         assert command_line("status", run.path) == EXIT_INCOMPLETE
     assert "test views: 3 of 12" in capsys.readouterr().out
+
+
+def test_only_the_driver_of_a_run_records_its_steps(run):
+    run.begin_step("report", "maps", "tiles", 9)
+    assert not run.progress_file.exists()
+    with run.drive_lock():
+        RunFolder(run.path).begin_step("report", "maps", "tiles", 9)
+    run.begin_step("evaluation", "test views", "", 4)
+    assert read_step(run.progress_file) == StepRecord(stage="report", step="maps", unit="tiles", total=9)
 
 
 def test_a_status_file_that_is_damaged_is_deleted_first(run):

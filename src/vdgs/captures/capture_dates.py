@@ -17,13 +17,13 @@ _FORM = re.compile(r"(\d{4})[:-](\d\d)[:-](\d\d)[ T](\d\d:\d\d)")
 
 
 def first_and_last(moments: Iterable[str]) -> tuple[str, ...]:
-    """Of dates and times as EXIF has them the first and the last, as 2026-06-23 16:31; empty where none is one."""
+    """The first and the last of EXIF's dates and times, as 2026-06-23 16:31; empty where none can be read."""
     found = [f"{m[1]}-{m[2]}-{m[3]} {m[4]}" for each in moments if (m := _FORM.match(each)) and m[1] > "1980"]
     return (min(found), max(found)) if found else ()
 
 
 def date_taken(file: Path) -> str:
-    """Date and time as the EXIF of a photograph has them; empty where it has none or cannot be read."""
+    """The date and time in the EXIF of a photograph; empty where EXIF lacks them or cannot be read."""
     try:
         with pillow_without_limits(), Image.open(file) as image:
             tags = image.getexif()

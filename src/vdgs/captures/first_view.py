@@ -16,8 +16,8 @@ from vdgs.geometry.similarity import sample_points
 
 #: Vertical angle of view of a first look (choice).
 FOV_DEG = 50.0
-#: The scene, but for this share of its points on every side, fills this share of the picture's height, and as much
-#: across: beside it a panel finds room.
+#: The scene, without this share of its points on every side, fills this share of the picture's height, and as many
+#: pixels across: a panel fits beside the scene.
 _TRIM_QUANTILE, _FILLED_SHARE = 0.003, 0.8
 #: Points by which the scene is found, points and cameras by which directions are compared.
 _MAX_SCENE_POINTS, _MAX_POINTS, _MAX_CAMERAS = 5000, 300, 60
@@ -39,10 +39,8 @@ class DefaultView(NamedTuple):
 
 
 def default_view(capture: Capture) -> DefaultView:
-    """All of the scene, half from above where cameras looked that way, else from as near to that as they did.
-
-    Of directions all around, that with the least cost (`_COST_OF_ELEVATION`).
-    """
+    """The whole scene, seen half from above where cameras looked that way, else from the nearest direction in which
+    cameras looked: the direction of the least cost (`_COST_OF_ELEVATION`)."""
     points = _trimmed(scene_points(capture, _MAX_SCENE_POINTS))
     if len(points) < 10:
         points = capture.points if len(capture.points) else np.zeros((1, 3))
@@ -98,7 +96,7 @@ def _trimmed(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
 
 
 def _outline(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-    """The corners of the smallest convex body about points: where they are in the picture, all are."""
+    """The corners of the convex hull of points: a picture that holds the corners holds all points."""
     try:
         return points[ConvexHull(points).vertices]
     except (QhullError, ValueError):  # all in a plane, or too few
@@ -106,7 +104,7 @@ def _outline(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
 
 
 def _direction(azimuth_deg: float, elevation_deg: float) -> Float[np.ndarray, "3"]:
-    """From the scene to who looks at it; azimuth 0 stands in the south and looks north."""
+    """The unit vector from the scene to the viewer; at azimuth 0 the viewer stands in the south and looks north."""
     azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
     level = np.array([math.sin(azimuth), -math.cos(azimuth), 0.0]) * math.cos(elevation)
     return level + np.array([0.0, 0.0, math.sin(elevation)])

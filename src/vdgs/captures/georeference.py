@@ -64,7 +64,7 @@ def _words(content: Mapping[str, object], key: str) -> str:
 
 
 def _accuracy(content: Mapping[str, object]) -> str:
-    """What a georef.json says of its accuracy; of a file that gives residuals alone, these."""
+    """The accuracy that a georef.json states; the residuals where the file gives residuals alone."""
     if stated := _words(content, "accuracy"):
         return stated
     for key, of in (("gcp", "control points"), ("gps", "positions")):

@@ -215,7 +215,7 @@ def _columns(rows: list[Row], system: str | None, file: Path) -> tuple[_Columns,
 
 
 def _meters(word: str) -> float:
-    """Metres in what a word says that it is in: feet, those of the United States' survey, or metres."""
+    """How many metres the unit has that a word names: feet, US survey feet, or metres."""
     feet = _FEET.search(word)
     return 1.0 if feet is None else SURVEY_FOOT_M if feet[1] else FOOT_M
 
@@ -333,8 +333,8 @@ def _moments(lines: Sequence[Line], file: Path) -> GpsTable:
 
 
 def with_altitudes(altitudes: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Which of the `known` positions [n] bool are used, and whether with their altitudes [n]: those that have one; all
-    of them, in the plane alone, where most have none."""
+    """Which of the `known` positions [n] bool are used, and whether their altitudes [n] are: the positions with an
+    altitude; where most positions have none, all positions, in the plane alone."""
     finite = known & np.isfinite(altitudes)
     enough = finite.sum() >= min(3, known.sum()) and 2 * finite.sum() >= known.sum()
     return (finite, True) if enough else (known, False)

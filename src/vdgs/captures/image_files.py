@@ -104,7 +104,7 @@ def read_header(path: Path) -> ImageHeader:
 
 
 def has_camera(path: Path) -> bool:
-    """Whether an image says of itself that a camera took it. Raw files and those of phones are of cameras."""
+    """Whether EXIF of an image names a camera. Files of raw formats and of phones count as photographs."""
     if path.suffix.lower() in UNREAD_IMAGE_SUFFIXES:
         return True
     try:

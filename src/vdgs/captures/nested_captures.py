@@ -69,7 +69,7 @@ def foreign_poses(root: Path) -> list[str]:
 
 
 def _has_angles(file: Path) -> bool:
-    """Whether a table is RealityScan's of registered cameras, by the names of its columns."""
+    """Whether a table has the columns of RealityScan's registered cameras."""
     with file.open("rb") as stream:
         return stream.read(64).lower().lstrip(b"\xef\xbb\xbf").startswith(b"#name,x,y,alt,heading,pitch,roll")
 

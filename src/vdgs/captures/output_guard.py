@@ -68,8 +68,8 @@ def _check_not_in_capture(output: Path, real: Path) -> None:
 
 
 def _folders_around(real: Path) -> list[Path]:
-    """The output and the folders around it, up to the first run or capture, in which results are at home: a capture's
-    root is among them where a file would be written into it."""
+    """The output and the folders around the output, up to the first run or capture, in which results may lie. The root
+    of a capture is included where a file would be written into the root."""
     around: list[Path] = []
     for folder in (real, *real.parents):
         if is_run(folder):
@@ -90,7 +90,7 @@ def _holds_photographs(folder: Path, output: Path) -> bool:
     """Whether an output in a folder would lie among photographs.
 
     Where it is written right into the folder, or is the folder, few photographs are enough; further up most of what is
-    there must be photographs: a home folder with some pictures is none of them.
+    there must be photographs: a home folder with some pictures is no folder of photographs.
     """
     try:
         names = {entry.name: entry.is_file() for entry in os.scandir(folder) if not entry.name.startswith(".")}
@@ -109,7 +109,7 @@ def _holds_photographs(folder: Path, output: Path) -> bool:
 
 
 def _without_undistorted(pictures: list[Path], names: Collection[str]) -> list[Path]:
-    """The pictures but those of `undistort`, each of which has its record beside it, and their masks."""
+    """The pictures without those of `undistort`, which have a record beside them, and without the masks of these."""
     recorded = [picture.name for picture in pictures if f"{picture.name}.json" in names]
     if not recorded or "made_from" not in read_json_or_empty(pictures[0].parent / f"{recorded[0]}.json"):
         return pictures

@@ -28,12 +28,12 @@ from vdgs.visibility.visibility_counts import count_visibility
 _MAX_POINTS, _CELLS, _TRIM_QUANTILE = 100_000, 128, 0.002
 #: Photographs that are asked for their date.
 _MAX_DATED = 60
-#: What a run of photographs alone calls its capture: the run's own name says more.
+#: The name of the capture in a run of photographs alone, for which the name of the run is shown.
 OWN_CAPTURE = "capture"
 
 
 def measure_place(capture: Capture) -> PlaceFacts:
-    """The facts of a capture, in a time that hardly depends on its size."""
+    """The facts of a capture, from samples of bounded size."""
     ground, points = capture.ground, scene_points(capture, _MAX_POINTS)
     if len(points) >= 10:
         low, high = np.quantile(points, [_TRIM_QUANTILE, 1 - _TRIM_QUANTILE], axis=0)

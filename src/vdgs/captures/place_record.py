@@ -1,4 +1,4 @@
-"""The facts of a place as a run keeps them, and their words. Imports nothing heavy."""
+"""The record of the facts of a place, and its text. Imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def _degrees(low: float, high: float, names: str) -> str:
 
 
 def format_area(area: float | None, unit: str) -> str:
-    """An area for people; square units stay what they are."""
+    """An area in m², ha or km²; in square units where the unit is unknown."""
     if area is None:
         return "unknown"
     if unit == "m" and area >= _SQUARE_KILOMETER:

@@ -107,7 +107,7 @@ class Problem:
     stated: np.ndarray | None = None
     """Standard gps_std [n, 3] that the receiver itself states."""
     has_altitudes: bool = True
-    """Whether the targets have heights; where not, these are anything, and the fit is one in the plane."""
+    """Whether the targets have heights; where not, heights are ignored and the fit is one in the plane."""
 
 
 def fit_positions(problem: Problem) -> PositionFit:

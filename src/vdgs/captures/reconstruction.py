@@ -216,7 +216,7 @@ def report_rows(metadata: ReconstructionReport) -> list[tuple[str, str]]:
 
 
 def by_axis(values: tuple[float, ...], axes: tuple[str, ...] = ("east", "north", "up"), number: str = "{:.2f}") -> str:
-    """Metres with the axes that they are along; the last is missing where no altitudes are known."""
+    """Metres along each axis, with the names of the axes; without the last where no altitudes are known."""
     return ", ".join(f"{number.format(value)} m {axis}" for value, axis in zip(values, axes, strict=False))
 
 

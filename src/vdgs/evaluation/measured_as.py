@@ -1,4 +1,4 @@
-"""Where the figures of a model are, and with what they were measured. Imports nothing heavy."""
+"""The folders of the figures of models, and the record of how figures were measured. Imports nothing heavy."""
 
 from __future__ import annotations
 

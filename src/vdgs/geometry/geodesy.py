@@ -45,7 +45,7 @@ def median_place(geodetic: np.ndarray) -> tuple[float, float, float]:
 
 
 def wrap_degrees(angles: np.ndarray) -> np.ndarray:
-    """Angles [n] as they are from -180 to below 180."""
+    """Angles [n] in degrees, brought into the range from -180 to below 180."""
     return (angles + 180.0) % 360.0 - 180.0
 
 

@@ -23,7 +23,7 @@ class GroundFrame(Similarity):
     #: frame that is moved keeps its axes.
     axes_geo: tuple[float, float] | None = None
 
-    #: How good place and scale are, and by what they were found, where that is known; for people.
+    #: The accuracy of place and scale, and the method that found both, in words; empty where unknown.
     accuracy: str = ""
     method: str = ""
 

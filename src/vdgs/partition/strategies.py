@@ -318,7 +318,7 @@ def cut_scene(
 
 
 def assignment_config(method: MethodConfig) -> AssignmentConfig:
-    """The settings of the assignment, as the strategy of the partition needs them."""
+    """The settings of the assignment, adapted to the strategy of the partition."""
     strategy = method.partition.strategy
     return method.assignment if strategy == "visibility" else STRATEGIES[strategy].assignment(method.assignment)
 
@@ -326,7 +326,7 @@ def assignment_config(method: MethodConfig) -> AssignmentConfig:
 def adjust_scores(
     scores: ScoreMatrix, positions: Float[np.ndarray, "n 3"], blocks: Blocks, cameras: Sequence[Camera], strategy: str
 ) -> ScoreMatrix:
-    """The scores as the strategy of the partition decides by them."""
+    """The scores, adapted to the strategy of the partition."""
     if strategy == "visibility":
         return scores
     return STRATEGIES[strategy].adjust_scores(scores, positions, blocks, cameras)

@@ -56,7 +56,7 @@ def assumed_capture(plan: ReconstructionPlan, options: CaptureOptions, points: i
 
 
 def _cameras(photographs: Sequence[ImageMetadata], factor: float, max_size: int, overlap: float) -> list[Camera]:
-    """In a row at height 1, so far apart that a place is seen by as many as `overlap` in rows as dense as they are."""
+    """Cameras in a row at height 1, spaced so that `overlap` cameras of a grid of that spacing see each place."""
     first = photographs[0]
     longer = max(first.width, first.height)
     scale = (min(1.0, max_size / longer) if max_size else 1.0) / factor
@@ -83,6 +83,6 @@ def _view(photo: ImageMetadata, camera: Camera, folder: Path, index: int) -> Vie
 
 
 def as_many(capture: Capture, count: int) -> Capture:
-    """A capture of `count` training views that are those of a smaller one again and again, for what counts them."""
+    """A capture of `count` training views, made of the views of a smaller one repeated, for functions that count."""
     views = capture.train_views
     return replace(capture, views=tuple(views[k % len(views)] for k in range(count)))

@@ -41,7 +41,8 @@ def _same_request(run: RunFolder, request: RunRequest, command: str) -> bool:
     if request.capture.resolve() != Path(own.capture_path):
         if run.config.command() != command:
             return False
-        request = replace(request, options=replace(request.options, gps=own.capture.gps))
+        gps, scale_bar = own.capture.gps, own.capture.scale_bar  # used by the reconstruction of the photographs alone
+        request = replace(request, options=replace(request.options, gps=gps, scale_bar=scale_bar))
     method, training = request.method(), request.training
     if not training.iterations:  # follows from the number of photographs, which are the same
         method = replace(method, training=replace(training, iterations=own.training.iterations))
@@ -58,7 +59,7 @@ def _is_whole(run: RunFolder, request: RunRequest) -> bool:
 
 
 def _times(path: Path) -> Iterator[int]:
-    """When a file, or a folder and all that is in it, changed last."""
+    """When a file changed last; of a folder, also of everything in the folder."""
     yield path.stat().st_mtime_ns
     if path.is_dir():
         for folder, _, names in os.walk(path):

@@ -26,7 +26,7 @@ PIXELS_PER_CORE_SECOND, MAX_SECONDS = 0.5e6, 3600.0
 BYTES_PER_PIXEL, MEMORY_SHARE = 400, 0.5
 #: Longer side of photographs that are never shrunk further, however long it takes, and at most on a GPU (as in 3DGS).
 MIN_SIDE, MAX_GPU_SIDE = 400, 1600
-#: Photographs of a block in several ones, over those of the whole scene divided by their number.
+#: How many photographs a block gets, as a multiple of the photographs of the scene divided by the number of blocks.
 BLOCK_OVERLAP = 1.3
 DOWNSCALES = (1, 2, 3, 4, 6, 8, 12, 16)
 

@@ -84,7 +84,7 @@ class BlockPlan:
     #: The training views of the capture that serve the block.
     indices: list[int]
     views: list[View]
-    #: What it moves, and what it only draws.
+    #: The anchors that the block moves, and those that it only draws.
     anchors: Anchors
     surroundings: Anchors
     config: TrainConfig
@@ -98,11 +98,11 @@ class BlockPlan:
 
     @property
     def can_train(self) -> bool:
-        """Whether there is anything to move, and a photograph of it."""
+        """Whether the block has anchors to move and photographs."""
         return bool(self.views) and len(self.anchors) > 0
 
     def open_images(self, budget_bytes: int) -> ImageCache:
-        """Its photographs in the sizes that it needs."""
+        """The photographs of the block, in the sizes that its training needs."""
         factors = tuple(sorted({factor for _, factor in self.config.resolution_schedule}))
         return ImageCache(self.views, budget_bytes, downscales=factors)
 

@@ -24,6 +24,8 @@ from vdgs.system.step_progress import StepProgress, StepRecord
 
 #: The page about a run, in its folder (`vdgs report`).
 REPORT_FILE = "report.html"
+#: The folders of runs that this process drives.
+_driven = set[Path]()
 
 
 @dataclass(frozen=True)
@@ -211,7 +213,11 @@ class RunFolder:
         two stages, and while a model is measured or drawn, it holds nothing else. RunError if another process has it.
         """
         with lock_folder(self._driver):
-            yield
+            _driven.add(self.path.resolve())
+            try:
+                yield
+            finally:
+                _driven.discard(self.path.resolve())
 
     def is_running(self) -> bool:
         return is_known_locked(self._driver)
@@ -222,8 +228,10 @@ class RunFolder:
         return self._driver / "progress.json"
 
     def begin_step(self, stage: str, step: str = "", unit: str = "", total: int = 0) -> StepProgress:
-        """Say what the process that drives the run works on; what is returned takes how many are done."""
-        progress = StepProgress(self.progress_file, StepRecord(stage=stage, step=step, unit=unit, total=total))
+        """Record what this process works on, if this process drives the run; what is returned takes how many are
+        done. Another process, such as `vdgs ortho` beside `vdgs run`, records nothing."""
+        file = self.progress_file if self.path.resolve() in _driven else None
+        progress = StepProgress(file, StepRecord(stage=stage, step=step, unit=unit, total=total))
         progress(0)
         return progress
 

@@ -51,11 +51,11 @@ class StageStatus:
     output_id: str = ""
     """The identity of its output."""
     hint: str = ""
-    """What to do before its command is of use, as the beginning of a shell command."""
+    """What must be done before the command of the stage, as the beginning of a shell command."""
     command: str = ""
-    """What makes it, where that is no verb for this stage alone."""
+    """The command that makes the stage, where no verb makes this stage alone."""
     step: StepRecord | None = None
-    """How far the step is that it is in, or was stopped in."""
+    """The progress of the step in which the stage is, or was stopped."""
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ def get_run_status(run: RunFolder, settings: RunSettings | None = None) -> RunSt
 
 
 def _at_work(stage: StageStatus, step: StepRecord) -> StageStatus:
-    """A stage that the process which drives the run says it works on."""
+    """The stage, which the process that drives the run has recorded as its work."""
     if stage.state in ("running", "done"):  # it says more itself
         return stage
     return replace(stage, state="running", reason="", step=step)

@@ -55,7 +55,7 @@ def _zoom_once(group: list[ImageMetadata]) -> list[ImageMetadata]:
 
 
 def _doubted(photo: ImageMetadata, lens: Lens) -> ImageMetadata:
-    """With a focal length that is fitted, because it may have the digital zoom in it twice."""
+    """The photograph, whose focal length is fitted because EXIF may count the digital zoom twice."""
     pixels = lens.focal * max(photo.size)
     doubt = (
         f"all photographs of this camera are zoomed digitally, and nothing tells whether EXIF's focal length has that "

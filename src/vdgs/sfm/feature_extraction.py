@@ -165,7 +165,7 @@ def extract_groups(
 
 
 def searched_megapixels(photographs: Sequence[ImageMetadata], options: SfmOptions) -> float:
-    """Megapixels of all photographs as they are searched, three times as many where that is done finely."""
+    """Megapixels of all photographs at the size of the search, times three for a fine search."""
     total = 0.0
     for photo in photographs:
         longer = max(photo.width, photo.height)

@@ -117,7 +117,7 @@ def match_chunk(workspace: Workspace, pairs: Sequence[tuple[str, str]], threads:
 
 
 def copy_features(workspace: Workspace, name: str, copy: str) -> None:
-    """Give the features of a photograph to another one, which need not be there."""
+    """Copy the features of a photograph in the database to a new name, for which no file is needed."""
     with workspace.open_database() as database:
         image = next(each for each in database.read_all_images() if each.name == name)
         number = database.write_image(pycolmap.Image(name=copy, camera_id=image.camera_id))

@@ -133,8 +133,7 @@ def georegister(
 
 
 def _recorded(values: np.ndarray, positions: GpsPriors) -> np.ndarray:
-    """Of values [n, 3] along each axis those that positions say something about: without up where none has an
-    altitude."""
+    """Of values [n, 3] those along axes that the positions record: without up where no position has an altitude."""
     return values if positions.has_altitudes else values[..., :2]
 
 

@@ -138,8 +138,8 @@ def _in_space_or_plane(
     kept, has_altitudes = with_altitudes(geodetic[:, 2], known)
     if not has_altitudes:
         notes.append(
-            f"{_some(names, known)}: the positions have no altitudes: they tell scale and north, the views or "
-            "attitudes up; heights above the sea are not known."
+            f"{_some(names, known)}: the positions have no altitudes. Positions give scale and north, views or "
+            "attitudes give up; heights above the sea are not known."
         )
         return np.where([True, True, False], geodetic, 0.0), kept, False
     if (kept != known).any():
@@ -184,8 +184,8 @@ def _without_default_altitudes(recorded: _Recorded, photographs: Sequence[ImageM
 
 
 def _without_single_zeros(geodetic: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Without altitudes of exactly 0 where the others are far from it, or all are 0: those of a receiver that had
-    none."""
+    """Positions without altitudes of exactly 0, where other altitudes are far from 0 or all are 0: a receiver without
+    altitude writes 0."""
     zero, others = geodetic[:, 2] == 0, known & (np.nan_to_num(geodetic[:, 2]) != 0)
     if not zero.any() or (others.any() and abs(np.median(geodetic[others, 2])) < FAR_FROM_ZERO_M):
         return geodetic

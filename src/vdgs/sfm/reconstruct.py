@@ -123,7 +123,7 @@ def reconstruct(
 
 @contextmanager
 def _writing(request: SfmRequest, run: RunFolder | None) -> Iterator[None]:
-    """Locks while the capture is written. At the end its work folder goes; it stays where the work was interrupted."""
+    """Hold the locks while the capture is written, then delete the work folder, unless the work was interrupted."""
     with run.drive_lock() if run is not None else nullcontext(), lock_folder(request.output):
         if run is not None:
             run.discard_training()

@@ -1,7 +1,7 @@
-"""What image libraries print about files by themselves, past every logger: left out, for errors come as exceptions.
+"""Discards what image libraries print about files, past every logger: errors come as exceptions.
 
-libjpeg and libpng write to the file descriptor of standard error. While at least one thread decodes, that leads into a
-temporary file; afterwards all lines that are not theirs are written where they were to go.
+libjpeg and libpng write to the file descriptor of standard error. While at least one thread decodes, the descriptor
+leads into a temporary file; afterwards the lines of others in this file are written to standard error.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _THEIRS = re.compile(
     re.MULTILINE,
 )
 _lock, _threads = threading.Lock(), 0
-#: The real standard error, and the file that stands for it.
+#: The real standard error, and the file that replaces it.
 _redirected: tuple[int, IO[bytes]] | None = None
 
 

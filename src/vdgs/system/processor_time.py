@@ -1,4 +1,4 @@
-"""How long work takes on an idle machine, measured on one that may be busy: by processor time, not by the clock."""
+"""How long work takes on an idle machine, found on a busy one by processor time instead of the clock."""
 
 from __future__ import annotations
 

@@ -88,7 +88,7 @@ def read_images_text(file: Path, with_points: bool = True) -> Iterator[ColmapIma
 
 
 def _is_pose(line: str) -> bool:
-    """Whether a line begins another image, by its name, where the points of the one before should be."""
+    """Whether a line is the pose of another image, which ends in a name, where points are expected."""
     words = line.split(maxsplit=9)
     try:
         _ = int(words[0]), int(words[8]), [float(word) for word in words[1:8]]

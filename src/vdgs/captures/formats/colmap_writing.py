@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def write_model_files(model: pycolmap.Reconstruction, folder: Path) -> None:
-    """Write a model to a folder, which is made. Raises VdgsError where the disk does not take all of it."""
+    """Create a folder and write a model to it. Raises VdgsError where the disk does not hold the whole model."""
     with explain_disk_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         try:
@@ -29,7 +29,7 @@ def write_model_files(model: pycolmap.Reconstruction, folder: Path) -> None:
 
 
 def check_whole_model(folder: Path) -> None:
-    """Raise OSError where a file of a model that COLMAP wrote ends before its counts say."""
+    """Raise OSError where a file of a model is shorter than its own counts say."""
     try:
         for _ in read_images_binary(folder / "images.bin"):
             pass

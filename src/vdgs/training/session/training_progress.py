@@ -46,10 +46,10 @@ class TrainingProgress:
 
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
-        with explain_disk_errors(self._file):
-            self._log.close()
         if self._board is not None:
             self._board.close()
+        with explain_disk_errors(self._file):
+            self._log.close()
 
     def step(self, state: TrainingState, report: StepReport) -> None:
         """Show and log one step."""
