@@ -16,12 +16,13 @@ __version__ = "0.1.0"
 #: Names of the API by the modules that define them; `__init__.pyi` lists them for type checkers.
 _PUBLIC = {
     "vdgs.api": (
-        "Camera", "Capture", "CaptureOptions", "Render", "Run", "Scene", "assign_cameras", "cameras_from",
+        "Camera", "Capture", "CaptureOptions", "Render", "Run", "Scene", "assign_cameras",
         "count_visibility", "export", "load_capture", "merge", "open_run", "partition", "preset", "render", "train",
         "view", "visibility_ratio",
     ),
     "vdgs.config.method": ("AssignmentConfig", "CompensationConfig", "MethodConfig", "TrainConfig"),
     "vdgs.errors": ("UnsupportedOption", "VdgsError"),
+    "vdgs.ops.arrays": ("cameras_from",),
     "vdgs.training.compensated_growth": ("CompensatedGrowth",),
 }  # fmt: skip
 _HOMES = {name: module for module, names in _PUBLIC.items() for name in names}

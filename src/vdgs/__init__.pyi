@@ -6,7 +6,6 @@ from vdgs.api import Render as Render
 from vdgs.api import Run as Run
 from vdgs.api import Scene as Scene
 from vdgs.api import assign_cameras as assign_cameras
-from vdgs.api import cameras_from as cameras_from
 from vdgs.api import count_visibility as count_visibility
 from vdgs.api import export as export
 from vdgs.api import load_capture as load_capture
@@ -25,6 +24,7 @@ from vdgs.config.method import TrainConfig as TrainConfig
 from vdgs.errors import UnsupportedOption as UnsupportedOption
 from vdgs.errors import VdgsError as VdgsError
 from vdgs.kernels import configure_threads as configure_threads
+from vdgs.ops.arrays import cameras_from as cameras_from
 from vdgs.training.compensated_growth import CompensatedGrowth as CompensatedGrowth
 
 __version__: str

@@ -8,11 +8,11 @@ look along +z (OpenCV). Torch tensors or numpy arrays go in, and the same comes 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -24,11 +24,14 @@ from vdgs.config.capture_options import CaptureOptions as CaptureOptions
 from vdgs.config.commands import ExportRequest, ModelName, ViewRequest
 from vdgs.config.method import AssignmentConfig, MergeConfig, MethodConfig, PartitionConfig, TrainConfig
 from vdgs.config.presets import PRESETS, PresetName
+from vdgs.config.ranges import check_ranges
+from vdgs.config.serialization import from_dict
 from vdgs.errors import CaptureError, VdgsError, check_kind
 from vdgs.geometry.camera import Camera as Camera
-from vdgs.geometry.camera import CameraModel, check_cameras
+from vdgs.geometry.camera import check_cameras
+from vdgs.kernels.device_selection import select_device
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.ops.arrays import Array, as_tensor, like, to_torch
+from vdgs.ops.arrays import Array, as_tensor, like
 from vdgs.partition.assignment.assign_cameras import Assignment
 from vdgs.partition.blocks import Blocks
 from vdgs.runs import open_run as runs
@@ -131,26 +134,36 @@ def open_run(
     """Open a run folder: `.scene`, `.capture`, `.blocks`, `.assignment`, `.block_scenes`, `.settings`.
 
     `model` is "coarse", "merged" or "best" (the merged one where there is one); `capture` is where the capture lies now
-    if it was moved (the run remembers it). Raises RunError for a folder that is no run.
+    if it was moved (the run remembers it). Raises RunError for a folder that is no run, VdgsError for another model
+    and for a device that cannot be used.
     """
+    if model not in get_args(ModelName):
+        raise VdgsError(f"model={model!r}: choose one of {', '.join(get_args(ModelName))}")
     folder = RunFolder(Path(path))
     folder.settings()
-    return Run(folder, model, device, None if capture is None else Path(capture))
+    return Run(folder, model, select_device(device).device, None if capture is None else Path(capture))
 
 
 def load_capture(path: str | Path, **options: Any) -> Capture:
     """Read and check a capture: a folder with COLMAP, nerfstudio, Mega-NeRF or MatrixCity files.
 
     `options` are those of `CaptureOptions`, as in `vdgs run --help`: images="images_4", downscale=2, test_every=8, ...
-    Raises CaptureError naming the file, the fault and the remedy.
+    Raises CaptureError naming the file, the fault and the remedy, VdgsError for an option that does not work.
     """
-    return _load_capture(Path(path), CaptureOptions(**options))
-
-
-def _load_capture(path: Path, options: CaptureOptions | None) -> Capture:
     from vdgs.captures.loading import load_capture as load
 
-    return load(path, options)
+    return load(Path(path), _checked(CaptureOptions, options))
+
+
+def _checked(kind: type, values: Mapping[str, Any]) -> Any:
+    """Options as a dataclass, read as from a file. Raises VdgsError for an unknown name, another type and a number that
+    is outside its range."""
+    try:
+        options = from_dict(kind, values, kind.__name__)
+    except ValueError as error:
+        raise VdgsError(str(error)) from error
+    check_ranges(options)
+    return options
 
 
 def preset(name: PresetName = "laptop") -> MethodConfig:
@@ -158,25 +171,6 @@ def preset(name: PresetName = "laptop") -> MethodConfig:
     if name not in PRESETS:
         raise VdgsError(f"there is no preset {name!r}: choose one of {', '.join(PRESETS)}")
     return PRESETS[name]
-
-
-def cameras_from(
-    viewmats: Array, Ks: Array, width: int, height: int, *, model: CameraModel = "pinhole"
-) -> list[Camera]:
-    """Cameras from camera-from-world matrices [c, 4, 4] (OpenCV axes) and intrinsics [c, 3, 3] or [3, 3] in pixels.
-
-    Raises ValueError for other shapes.
-    """
-    poses, intrinsics = (to_torch(each).detach().cpu().double().numpy() for each in (viewmats, Ks))
-    if poses.ndim != 3 or poses.shape[1:] != (4, 4) or intrinsics.shape[-2:] != (3, 3):
-        raise ValueError(f"viewmats must be [c, 4, 4] and Ks [c, 3, 3], not {poses.shape} and {intrinsics.shape}")
-    return [
-        Camera(
-            camera_from_world=pose, fx=K[0, 0].item(), fy=K[1, 1].item(), cx=K[0, 2].item(), cy=K[1, 2].item(),
-            width=width, height=height, model=model,
-        )
-        for pose, K in zip(poses, np.broadcast_to(intrinsics, (len(poses), 3, 3)), strict=True)
-    ]  # fmt: skip
 
 
 class Render(NamedTuple):
@@ -256,15 +250,19 @@ def partition(
     """Cut points [n, 3] into blocks on the ground plane, by place and by their visibility V [n].
 
     `lambda_vis` weighs visibility beside place (0: place alone); a block is widened by `expansion` of its radius.
-    Warns (UserWarning) where there are fewer blocks than asked for; raises VdgsError where nothing can be cut. `Blocks`
-    has `items` (polygons `core` and `expanded`) and `owner(xy)`. Source: VDGS eq. 5.
+    Warns (UserWarning) where there are fewer blocks than asked for; raises VdgsError where nothing can be cut and for
+    settings out of their range, ValueError for other shapes. `Blocks` has `items` (polygons `core` and `expanded`) and
+    `owner(xy)`. Source: VDGS eq. 5.
     """
     from vdgs.partition.partition_scene import partition_scene
 
     config = PartitionConfig(blocks=num_blocks, lambda_vis=lambda_vis, balanced=balanced, expansion=expansion)
+    check_ranges(config)
     places, counts = (
         as_tensor(name, each).detach().cpu().numpy() for name, each in (("points", points), ("visibility", visibility))
     )
+    if places.ndim != 2 or places.shape[1] != 3 or counts.shape != places.shape[:1]:
+        raise ValueError(f"points must be [n, 3] and visibility [n], not {places.shape} and {counts.shape}")
     blocks, notes = partition_scene(places, counts.astype(np.int64), config, seed)
     _warn(notes)
     return blocks
@@ -285,6 +283,7 @@ def assign_cameras(
     _check_scene(scene)
     check_cameras(cameras)
     config = config or AssignmentConfig()
+    check_ranges(config)
     decided = assignment.assign_cameras(compute_score_matrix(scene.model, blocks, cameras, config), config)
     _warn(decided.warnings)
     return decided
@@ -305,7 +304,7 @@ def merge(
     """
     from vdgs.partition.merging import merge_blocks
 
-    cameras = scene.cameras
+    settings, cameras = _checked(MergeConfig, {"rule": rule}), scene.cameras
     if assignment.cameras.shape != (len(cameras), len(blocks)):
         raise ValueError(
             f"the assignment is {list(assignment.cameras.shape)}, not [{len(cameras)} training cameras, "
@@ -313,7 +312,7 @@ def merge(
         )
     served = [[cameras[i] for i in np.flatnonzero(of_block)] for of_block in assignment.cameras.T]
     models = [each.model for each in block_scenes]
-    return Scene(merge_blocks(scene.model, models, blocks, served, MergeConfig(rule))[0], scene.capture)
+    return Scene(merge_blocks(scene.model, models, blocks, served, settings)[0], scene.capture)
 
 
 def export(scene: Scene | Run, path: str | Path, **options: Any) -> None:
@@ -329,7 +328,8 @@ def export(scene: Scene | Run, path: str | Path, **options: Any) -> None:
     _check_scene(scene)
     if scene.capture is None:
         raise VdgsError(f"{path}: baking needs the training cameras: give the capture, as in Scene(model, capture)")
-    request = resolve_request(ExportRequest(run=Path(path).parent, output=(Path(path),), evaluate=False, **options))
+    paths = {"run": Path(path).parent, "output": (Path(path),), "evaluate": False}
+    request = resolve_request(_checked(ExportRequest, options | paths))
     opened = runs.OpenedRun(
         folder=RunFolder(request.run), model=scene.model, model_path=Path(path), capture=scene.capture, key="",
         name="merged" if scene.model.decoder_spans else "coarse", status=StatusRecord(state="done"), warning="",
@@ -358,14 +358,15 @@ def train(
     from vdgs.pipeline.train_in_memory import train_in_memory, train_in_run_folder
 
     config = preset(config) if isinstance(config, str) else config
+    device, options = select_device(device).device, vars(capture_options or CaptureOptions())
     if run_dir is None:
-        opened = capture if isinstance(capture, Capture) else _load_capture(Path(capture), capture_options)
+        opened = capture if isinstance(capture, Capture) else load_capture(capture, **options)
         return Scene(train_in_memory(opened, config, tuple(callbacks), _warning_console(), device), opened)
     if callbacks or isinstance(capture, Capture):
         given = "callbacks" if callbacks else "Capture"
         raise VdgsError(f"run_dir={str(run_dir)!r} takes no {given}: processes of their own read the capture's folder")
-    options = capture_options or CaptureOptions()
-    train_in_run_folder(Path(capture), options, config, Path(run_dir), _warning_console(), device)
+    settings = _checked(CaptureOptions, options)
+    train_in_run_folder(Path(capture), settings, config, Path(run_dir), _warning_console(), device)
     return open_run(run_dir, model="coarse" if isinstance(config, TrainConfig) else "best", device=device).scene
 
 

@@ -104,8 +104,12 @@ def test_cameras_are_made_of_matrices(run):
     K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
     made = vdgs.cameras_from(camera.camera_from_world[None], K, camera.width, camera.height)
     torch.testing.assert_close(vdgs.render(run.scene, made[0]).rgb, vdgs.render(run.scene, camera).rgb)
-    with pytest.raises(ValueError, match="viewmats must be"):
-        vdgs.cameras_from(camera.camera_from_world, K, 4, 3)
+    far = camera.camera_from_world.copy()
+    far[0, 3] += 1e6 + 0.123  # in float32 the translation would be off by centimetres
+    assert np.array_equal(vdgs.cameras_from(far[None], torch.tensor(K), 4, 3)[0].camera_from_world, far)
+    for poses, intrinsics in ((camera.camera_from_world, K), (far[None], K[0]), (far[None], np.stack([K, K]))):
+        with pytest.raises(ValueError, match="viewmats must be"):
+            vdgs.cameras_from(poses, intrinsics, 4, 3)
 
 
 def test_visibility_is_counted_in_the_kind_that_is_given(coarse, native_small):
@@ -227,6 +231,34 @@ def test_what_does_not_work_is_said_before_any_work(capture, tmp_path):
     bad = replace(vdgs.preset(), training=replace(vdgs.preset().training, iterations=-1))
     with pytest.raises(VdgsError):
         vdgs.train(capture, bad)
+
+
+def test_an_option_that_does_not_work_is_named(run, capture, native_small, tmp_path):
+    points, counts = np.random.default_rng(0).uniform(0, 10, (300, 3)), np.full(300, 5)
+    for words, call in {
+        "AssignmentConfig|threshold 7": lambda: vdgs.assign_cameras(
+            run.scene, run.blocks, run.scene.cameras, vdgs.AssignmentConfig(threshold=7.0)
+        ),
+        "--lambda-vis -1": lambda: vdgs.partition(points, counts, lambda_vis=-1.0),
+        "--lambda-vis nan": lambda: vdgs.partition(points, counts, lambda_vis=float("nan")),
+        "--blocks 0": lambda: vdgs.partition(points, counts, num_blocks=0),
+        "sh_degree is 7; it must be 0 or 1": lambda: vdgs.export(run, tmp_path / "a.ply", sh_degree=7),
+        "--max-gaussians -1": lambda: vdgs.export(run, tmp_path / "a.ply", max_gaussians=-1),
+        "program is 'maya'": lambda: vdgs.export(run, tmp_path / "a.ply", program="maya"),
+        "did you mean 'sh_degree'": lambda: vdgs.export(run, tmp_path / "a.ply", sh_degre=1),
+        "rule is 'best'": lambda: vdgs.merge(run.scene, run.block_scenes, run.blocks, run.assignment, rule="best"),
+        "model='block'": lambda: vdgs.open_run(run.path, model="block"),
+        "did you mean 'downscale'": lambda: vdgs.load_capture(capture.root, downscal=2),
+        "x.csv": lambda: vdgs.load_capture(capture.root, gps="x.csv"),
+        "tpu": lambda: vdgs.open_run(run.path, device="tpu"),
+    }.items():
+        with pytest.raises(VdgsError, match=words):
+            call()
+    assert not any(tmp_path.iterdir())
+    with pytest.raises(ValueError, match=r"visibility \[n\]"):
+        vdgs.partition(points, counts[:9])
+    with pytest.raises(TypeError, match="not list"):
+        vdgs.count_visibility(points.tolist(), run.scene.cameras)
 
 
 def test_a_run_is_shown_in_a_browser_as_the_verb_does(run, monkeypatch):

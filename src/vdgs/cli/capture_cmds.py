@@ -98,7 +98,7 @@ class SfmArguments(QuietArguments):
     keep_intermediate: bool = False
     """Keep COLMAP's database and models in OUTPUT/work once all is done."""
     overwrite: bool = False
-    """Make the capture anew where photographs were added, removed or changed since it was begun."""
+    """Make the capture anew where photographs differ. They were added, removed or changed since it was begun."""
     options: Annotated[SfmOptions, FlagName("")] = field(default_factory=SfmOptions)
 
 

@@ -66,7 +66,7 @@ class ShardArguments:
     """What verbs take whose work is split into shards (views, tiles, cameras, parts)."""
 
     jobs: Annotated[int, WORKER_COUNT] = 0
-    """Shards done at once; 0: one here, on a cluster as many as it has room for. Each has a process of its own."""
+    """Shards done at once; 0: one, or what a cluster has room for. Each has a process of its own."""
     executor_options: Annotated[ExecutorOptions, FlagName("")] = field(default_factory=ExecutorOptions)
 
     def execution(self, device: str) -> ExecutionOptions:

@@ -46,12 +46,12 @@ class RunRequest:
     output: Annotated[Path, Output()]
     """Run folder; new, or the run to continue."""
     preset: PresetChoice = "auto"
-    """Settings by name. `auto`: those of the run that is there, else `laptop` on a CPU
-    and `default` on a GPU. `laptop`: minutes to an hour on a CPU. `default`: the paper's numbers (100 000 + 50 000
-    iterations a block), and our choices where it is silent: gaps filled, outliers left out, a background of the mean
-    color, of random colors in training, bounded sizes, cameras by `coverage` and each in its best block, a minimum of
-    cameras a block, blocks drawn in their surroundings, a lower gate of compensated growth, g added to means, only
-    visible anchors moved. `paper`: the paper's numbers and none of those choices."""
+    """Settings by name. `auto`: those of the run that is there, else `laptop` on a CPU and `default` on a GPU.
+    `laptop`: minutes to an hour on a CPU. `default`: the paper's numbers (100 000 + 50 000 iterations a block), and our
+    choices where it is silent: gaps filled, outliers left out, a background of the mean color, of random colors in
+    training, bounded sizes, cameras by `coverage` and each in its best block, a minimum of cameras a block, blocks
+    drawn in their surroundings, a lower gate of compensated growth, g added to means, only visible anchors moved.
+    `paper`: the paper's numbers and none of those choices."""
     overwrite: bool = False
     """Let other settings discard what was trained with the old ones."""
     jobs: Annotated[int, WORKER_COUNT] = 0
@@ -142,8 +142,9 @@ class OrthoRequest:
     bbox: Annotated[tuple[float, float, float, float] | None, MAP_COORDINATE_RANGE] = None
     """X0 Y0 X1 Y1 in coordinates of the map. By default what the training photographs show."""
     crs: str | None = None
-    """Coordinates of the map: EPSG:n (EPSG:25832), `enu` (metres east and north of the scene's origin), `source` (those
-    of the capture) or `local` (the ground frame). By default the UTM zone of a georeferenced capture, else `local`."""
+    """Coordinates: EPSG:n, `enu`, `source` or `local`. EPSG:25832, `enu` (metres east and north of the scene's origin),
+    `source` (those of the capture) or `local` (the ground frame). By default the UTM zone of a georeferenced capture,
+    else `local`."""
     detail_from_images: bool = False
     """Take the fine detail of the orthophoto from the photographs. That is done where they truly see a place."""
     model: ModelName = "best"
@@ -181,17 +182,17 @@ class ExportRequest:
     bbox: Annotated[tuple[float, float, float, float] | None, MAP_COORDINATE_RANGE] = None
     """Only Gaussians with centres in X0 Y0 X1 Y1, in coordinates of --crs."""
     max_gaussians: Annotated[int, Range(0, MAX_COUNT)] = 0
-    """Only so many Gaussians, those that make most of the training photographs; 0 for all."""
+    """Largest number of Gaussians; 0: all. Those that make most of the training photographs stay."""
     sh_degree: Literal[0, 1, 2, 3] = 3
     """Degree of the spherical harmonics of colours. 0: the same from everywhere, and a fifth of the size."""
     html_max_mb: Annotated[float, Range(1, 2000)] = 30.0
-    """A .html file has at most so many MB: the scene is thinned until it fits."""
+    """Largest size of a .html file in MB. The scene is thinned until it fits."""
     color_iterations: Annotated[int | None, Range(0, 100)] = None
-    """How often colours are fitted again to the difference from the model's images. By default 8 times, or once where
+    """Rounds in which colours are fitted again. To the difference from the model's images; by default 8, or 1 where
     the anchors spawn more than four million Gaussians (docs/export.md)."""
     optimize_seconds: Annotated[float, SECONDS_RANGE] = 0.0
-    """Seconds of optimization of all baked parameters; 0: none. Towards the model's images, after the fit in closed
-    form. Needs 0.7 kB of memory for each Gaussian of degree 3."""
+    """Seconds of optimization of baked parameters; 0: none. Of all parameters, towards the model's images, after the
+    fit in closed form. Needs 0.7 kB of memory for each Gaussian of degree 3."""
     crs: str | None = None
     """Coordinates of the files: EPSG:n, `enu` (metres east and north of the scene's origin), `source` (of the capture)
     or `local` (the ground frame). By default `enu` where the capture is georeferenced, and UTM for .laz and .las; else

@@ -142,9 +142,8 @@ class TrainConfig:
     """Training of the coarse stage."""
 
     iterations: Annotated[int, Range(0, MAX_COUNT)] = 100_000
-    """Steps of the coarse stage; 0: by photograph count. Each step draws one photograph; 0 takes sixty steps
-    for each training photograph, at least 3000 and at most 30 000 (choice: with few photographs a model overfits
-    soon)."""
+    """Steps of the coarse stage; 0: by photograph count. Each step draws one photograph; 0 takes sixty steps for each
+    training photograph, at least 3000 and at most 30 000 (choice: with few photographs a model overfits soon)."""
     view_sampling: Literal["uniform", "visibility", "sqrt-visibility"] = "uniform"
     """How often each photograph is used. `uniform`: all alike (the paper). `visibility`: every anchor divides one vote
     among the cameras that see it, and photographs are used in proportion to their votes. `sqrt-visibility`: in
@@ -187,9 +186,8 @@ class PartitionConfig:
     """How the scene is cut into blocks (eq. 5 and what follows it)."""
 
     strategy: PartitionStrategy = "visibility"
-    """How blocks are cut. `visibility`: by position and visibility (the
-    paper). The others are published methods for comparison, which also
-    assign cameras in their own way, whatever the settings of the assignment."""
+    """How blocks are cut. `visibility`: by position and visibility (the paper). The others are published methods for
+    comparison, which also assign cameras in their own way, whatever the settings of the assignment."""
     blocks: Annotated[int | Literal["auto"], Range(1, 10_000)] = 8
     """Number of blocks (K); `auto`: by memory. 1 is the whole scene (the paper's "w/o Blocking"); `auto`
     takes as few as --block-memory-gb allows."""
@@ -210,10 +208,9 @@ class AssignmentConfig:
     """Which cameras train which block (eqs. 6-7)."""
 
     mode: Literal["coverage", "paper", "leave-one-out", "frustum"] = "coverage"
-    """How cameras are scored. `coverage`: share of the drawn pixels that the block
-    alone draws alike (choice). `paper`: eq. 7 as printed,
-    where pixels empty in both renders count too. `leave-one-out`: 1 - SSIM of the scene without the block.
-    `frustum`: share of the block's anchors that the camera holds (needs no renders)."""
+    """How cameras are scored. `coverage`: share of the drawn pixels that the block alone draws alike (choice). `paper`:
+    eq. 7 as printed, where pixels empty in both renders count too. `leave-one-out`: 1 - SSIM of the scene without the
+    block. `frustum`: share of the block's anchors that the camera holds (needs no renders)."""
     tau: Annotated[float, Range(0, 1, exclusive_min=True)] = 0.05
     """tau: pixels differ when the mean absolute difference of their channels is above this (choice)."""
     threshold: Annotated[float, FRACTION] = 0.45

@@ -15,37 +15,37 @@ class SfmOptions:
     """How photographs become a capture (structure from motion)."""
 
     focal: Literal["auto", "fixed", "refine"] = "auto"
-    """The focal length. fixed: that of EXIF and XMP; refine: fitted; auto: held where the flight cannot tell it from
-    the height (straight down from one height, by what the drone recorded or by level positions all over an area) and
-    where the maker calibrated it; fitted otherwise."""
+    """How the focal length is found. fixed: that of EXIF and XMP; refine: fitted; auto: held where the flight cannot
+    tell it from the height (straight down from one height, by what the drone recorded or by level positions all over an
+    area) and where the maker calibrated it; fitted otherwise."""
     num_neighbors: Annotated[int, Range(2, 1000)] = 16
-    """Each photograph is matched with so many that were taken near it, where positions are known; with more where those
-    show little of the same: facades, oblique views, several cameras at one place."""
+    """Neighbours that each photograph is matched with. Where positions are known; more where neighbours show
+    little of the same: facades, oblique views, several cameras at one place."""
     exhaustive_max: Annotated[int, Range(0, MAX_COUNT)] = 50
     """Up to so many photographs without positions are matched all with all. Of more, those are matched that are next
     to each other in order or look alike."""
     max_image_size: Annotated[int, Range(200, 100_000)] = 2000
-    """Longer side of photographs in which features are found, in pixels."""
+    """Longer side at which features are found, in pixels."""
     max_num_features: Annotated[int, Range(200, 1_000_000)] = 8192
-    """Features of a photograph, at most about so many."""
+    """Features of a photograph, at most about this number."""
     max_output_size: Annotated[int, Range(16, 1_000_000, allow_zero=True)] = 0
-    """Longer side of the photographs that are written into images/, in pixels; 0: as large as they are."""
+    """Longer side of written photographs, in pixels; 0: full size. Of those in images/."""
     gcp: Path | None = None
     """Control points and where photographs show them: gcp_list.txt, as for ODM. The model is brought to them; that of
     a finished capture in seconds."""
     check_points: tuple[str, ...] = ()
-    """Points of --gcp that are only measured, by name; all: every one. They are held out."""
+    """Names of points of --gcp that are only measured; all: every point. The adjustment does not use them."""
     georeference: Literal["auto", "anyway", "off"] = "auto"
     """Whether positions and control points place the scene. auto: as far as they are good, with their accuracy; not
     where that is worse than nothing, and an error where they contradict the photographs; anyway: as they are; off: not
     at all (metres then come from --scale-bar). Changed afterwards, the finished capture is placed anew in seconds."""
     scale_bar: Path | None = None
-    """Text file of known distances: lines `NAME px py photograph` mark points in two photographs or more, lines
-    `NAME NAME metres` say how far they are apart. Gives the scale without positions, or in place of theirs."""
+    """Text file of known distances. Lines `NAME px py photograph` mark points in two photographs or more, lines
+    `NAME NAME metres` say how far these are apart. Gives the scale without positions, or together with positions."""
     gps_std_m: Annotated[tuple[float, float], Range(0, 100_000, exclusive_min=True)] = (1.0, 2.0)
-    """Standard deviation of GPS positions across and upwards, in metres, where the photographs say none themselves (RTK
-    in XMP; GPSHPositioningError in EXIF, with heights as much worse as here). Poses do not depend on it; how far off
-    positions are is found from the flight itself, and what is said here of a table counts beside it."""
+    """Standard deviation of GPS across and up, in metres. Where the photographs state none (RTK in XMP;
+    GPSHPositioningError in EXIF, with heights worse in the same ratio as here). Poses do not depend on it: the errors
+    of positions are estimated from the flight, and the value for a table counts in addition."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from vdgs.errors import check_kind
+from vdgs.geometry.camera import Camera, CameraModel
 
 #: Tensors or arrays: what goes in comes out.
 Array = TypeVar("Array", Tensor, np.ndarray)
@@ -44,3 +45,23 @@ def like(given: Any, value: Any) -> Any:
         items = [like(given, each) for each in value]
         return type(value)(*items) if hasattr(value, "_fields") else tuple(items)
     return value
+
+
+def cameras_from(
+    viewmats: Array, Ks: Array, width: int, height: int, *, model: CameraModel = "pinhole"
+) -> list[Camera]:
+    """Cameras from camera-from-world matrices [c, 4, 4] (OpenCV axes) and intrinsics [c, 3, 3] or [3, 3] in pixels.
+
+    Raises ValueError for other shapes.
+    """
+    given = (each.detach().cpu().numpy() if isinstance(each, Tensor) else each for each in (viewmats, Ks))
+    poses, intrinsics = (np.array(each, np.float64) for each in given)
+    if poses.shape != (len(poses), 4, 4) or intrinsics.shape not in ((3, 3), (len(poses), 3, 3)):
+        raise ValueError(f"viewmats must be [c, 4, 4] and Ks [c, 3, 3], not {poses.shape} and {intrinsics.shape}")
+    return [
+        Camera(
+            camera_from_world=pose, fx=K[0, 0].item(), fy=K[1, 1].item(), cx=K[0, 2].item(), cy=K[1, 2].item(),
+            width=width, height=height, model=model,
+        )
+        for pose, K in zip(poses, np.broadcast_to(intrinsics, (len(poses), 3, 3)), strict=True)
+    ]  # fmt: skip
