@@ -256,6 +256,12 @@ def test_a_short_help_ends_a_clause_where_it_makes_sense(capsys):
     assert "(default: on; off: --no-ortho)" in help_of(capsys, "run", "--help")
 
 
+def test_a_word_of_an_option_is_refused_with_words_that_may_stand_there():
+    program = next(each for each in options_of(ExportArguments) if each.flag == "--for")
+    with pytest.raises(ValueError, match=r"^ros: must be supersplat or .* or unity$"):
+        program.read(["ros"])
+
+
 def test_a_run_decides_the_defaults_of_its_help(uncut, capsys):
     for arguments, sampling in (([uncut], "sqrt-visibility"), ([], "uniform")):
         assert f"(default: {sampling})" in help_of(capsys, "train-blocks", *arguments, "--help-all")

@@ -193,7 +193,7 @@ def test_pictures_are_measured_in_the_exposure_that_the_model_knows_beside_neutr
     assert result["psnr"] > plain["psnr"] + 1
     assert result["notes"] == [
         "views are drawn and measured in the exposure of its neighbours; 1 of them neutral, for want of training "
-        "photographs near by; beside that in neutral colours"
+        "photographs near by; beside that in neutral colors"
     ]
     rows = read(tmp_path / "exposed" / "per_view.json")
     for row, shown, drawn in zip(rows, city.views, city.renders, strict=True):
@@ -206,7 +206,7 @@ def test_pictures_are_measured_in_the_exposure_that_the_model_knows_beside_neutr
         sum(10 ** (-row["psnr"] / 10) * row["unmasked_pixels"] for row in rows)
     )
     text = " ".join(out.getvalue().split())
-    assert "neutral colours" in text
+    assert "neutral colors" in text
     assert f"{result['psnr_reference_exposure']:.2f}" in text
     assert "in the exposure of its neighbours" in text
 

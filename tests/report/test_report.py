@@ -206,7 +206,7 @@ def whole(tmp_path_factory) -> Page:
 def test_the_report_of_a_whole_run_holds_its_figures(whole):
     page = whole
     assert page.row("PSNR (dB) ↑") == ["PSNR (dB) ↑", "27.12", "28.38", "+1.25"]
-    assert page.row("PSNR, colour-corrected (dB) ↑")[1:] == ["27.62", "28.88", "+1.25"]
+    assert page.row("PSNR, color-corrected (dB) ↑")[1:] == ["27.62", "28.88", "+1.25"]
     assert page.row("SSIM ↑")[1:] == ["0.8765", "0.8765", "+0.0000"]
     assert page.row("1 to 3")[1:5] == ["1,234", "25.12", "26.38", "+1.25"]
     assert page.row("nothing drawn")[2:4] == ["18.12", "19.38"]
@@ -280,7 +280,7 @@ def test_growth_is_summed_for_each_block(whole):
 def test_a_coarse_run_is_reported_with_what_it_has(tmp_path):
     page = Page(write_report(coarse_run(tmp_path / "run")))
     text = page.text()
-    assert "Coarse model: PSNR 27.12 dB (colour-corrected 27.62), SSIM 0.8765." in text
+    assert "Coarse model: PSNR 27.12 dB (color-corrected 27.62), SSIM 0.8765." in text
     assert "The scene is not cut into blocks yet." in text
     assert "No block has a log yet." in text
     assert page.row("PSNR (dB) ↑") == ["PSNR (dB) ↑", "27.12", "–", "–"]

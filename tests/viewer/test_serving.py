@@ -21,7 +21,7 @@ pytest.importorskip("viser", reason="viser is not installed (pip install 'vdgs[v
 
 import viser
 
-from support.commands import begun, vdgs, wait_until
+from support.commands import PATIENCE_SECONDS, begun, vdgs, wait_until
 from support.viewer import Guest, expected, quiet, trained
 from vdgs.errors import RunError, VdgsError
 from vdgs.geometry.camera import Camera
@@ -244,6 +244,14 @@ def test_nothing_of_the_machine_is_reached(viewer):
 
 
 @quiet
+def test_a_health_check_leaves_no_traceback(viewer, caplog):
+    with socket.create_connection(("127.0.0.1", viewer.access.port), timeout=PATIENCE_SECONDS) as connection:
+        connection.sendall(b"HEAD / HTTP/1.1\r\n\r\n")
+        while connection.recv(4096):
+            pass
+    assert not [record for record in caplog.records if record.name.startswith("websockets")]
+
+
 def test_others_need_the_token(run):
     said = io.StringIO()
     with serve(open_run(run), "0.0.0.0", None, Console(file=said)) as viewer:

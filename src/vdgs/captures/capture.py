@@ -68,7 +68,7 @@ class Capture:
     def __repr__(self) -> str:
         return (
             f"Capture({str(self.root)!r}, {self.source}, images={self.images!r}: {len(self.train_views)} training and "
-            f"{len(self.test_views)} test views, {len(self.points):,} points, {self.ground.description})"
+            f"{len(self.test_views)} test views, {len(self.points):,} points, unit: {self.ground.unit})"
         )
 
     @property

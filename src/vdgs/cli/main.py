@@ -73,9 +73,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _run_command(command: str, arguments: list[str]) -> int:
+    import logging
+
     from vdgs.cli.advice import MESSAGE_FIT, Advice
     from vdgs.system.exit_codes import exit_code_of
 
+    # matplotlib warns of a home folder without write access, and then works without it.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     action = get_command(command)
     again = "continues: what is finished is kept" if command in RESUMABLE_COMMANDS else "begins it anew"
     fit = Advice(command, verb_arguments).fit

@@ -92,7 +92,7 @@ class Option:
         try:
             return read_words(self.hint, words)
         except ValueError:
-            said, kind = " ".join(words), describe_type(self.hint)
+            said, kind = " ".join(words), describe_type(self.hint).removesuffix(" or null")
             raise ValueError(f"{said}: must be {kind}" if said else f"needs a value: {kind}") from None
 
 

@@ -165,7 +165,7 @@ def _exposure_note(rows: Sequence[Mapping[str, Any]], settings: EvaluationSettin
         return ""
     alone = sum(np.array_equal(exposure, np.eye(3, 4)) for exposure in exposures)
     without = f"; {alone} of them neutral, for want of training photographs near by" if alone else ""
-    return f"views are drawn and measured {settings.exposure_note}{without}; beside that in neutral colours"
+    return f"views are drawn and measured {settings.exposure_note}{without}; beside that in neutral colors"
 
 
 def _write(output: Path, result: Mapping[str, Any], gathered: _MetricTotals, title: str) -> None:

@@ -39,8 +39,8 @@ IMAGE_CACHE_BYTES = 256_000_000
 
 #: How views are exposed, where exposures were fitted (`evaluation.view_exposures`).
 EXPOSURE_NOTES = {
-    "test": "in the exposure interpolated from the training photographs before and after, corrected for what is "
-    "metered where that foretells these (no pixel of a test view is used)",
+    "test": "in the exposure that the training photographs taken before and after predict (no pixel of a test view "
+    "is used)",
     "training": "in the exposure that was fitted to each",
 }
 

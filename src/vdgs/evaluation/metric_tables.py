@@ -23,9 +23,9 @@ QUALITY_METRICS = (
 #: Figures over the pixels that training cameras cover; those that are null are not shown.
 COVERAGE_METRICS = (
     ("opacity_coverage", "opaque (alpha ≥ 0.95) ↑", "{:.2%}"),
-    ("psnr_covered_own_background", "PSNR before its own background (dB) ↑", "{:.2f}"),
-    ("psnr_covered_black", "PSNR before black (dB) ↑", "{:.2f}"),
-    ("psnr_covered_white", "PSNR before white (dB) ↑", "{:.2f}"),
+    ("psnr_covered_own_background", "PSNR on its own background (dB) ↑", "{:.2f}"),
+    ("psnr_covered_black", "PSNR on black (dB) ↑", "{:.2f}"),
+    ("psnr_covered_white", "PSNR on white (dB) ↑", "{:.2f}"),
     ("depth_error_median_expected", "median error of expected depth (camera heights) ↓", "{:.2%}"),
     ("depth_error_median_median", "median error of median depth (camera heights) ↓", "{:.2%}"),
     ("depth_within_1_percent_expected", "expected depth within 1 % of the camera height ↑", "{:.2%}"),
@@ -39,7 +39,7 @@ def make_metrics_table(result: Mapping[str, Any], title: str) -> RenderableType:
     quality = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
     besides = {"_cc": "color-corrected", "_affine": "affine fit"}
     if result["psnr_reference_exposure"] is not None:
-        besides["_reference_exposure"] = "neutral colours"
+        besides["_reference_exposure"] = "neutral colors"
     for column in ("", "raw", *besides.values()):
         quality.add_column(column, justify="left" if not column else "right")
     for key, label, form in QUALITY_METRICS:
@@ -63,7 +63,7 @@ def format_value(value: float | None, form: str) -> str:
 
 def _visibility_table(bins: list[Mapping[str, Any]]) -> Table:
     table = Table(box=box.SIMPLE_HEAD, title="by visibility (training cameras that see a pixel)", title_justify="left")
-    for column in ("V", "pixels", "PSNR (dB)", "SSIM", "PSNR cc"):
+    for column in ("V", "pixels", "PSNR (dB)", "SSIM", "PSNR corrected"):
         table.add_column(column, justify="right")
     for each in bins:
         bounds = "nothing drawn" if each["lower"] is None else format_bounds(each["lower"], each["upper"])

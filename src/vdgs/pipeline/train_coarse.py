@@ -26,7 +26,7 @@ from vdgs.model.exposure import zero_exposures
 from vdgs.model.initialization.initialize import initialize_anchors
 from vdgs.model.initialization.stereo import DensePoints
 from vdgs.model.scale_bounds import max_log_scales
-from vdgs.pipeline.dense_points import find_dense_points
+from vdgs.pipeline.dense_points import find_dense_points, max_dense_points
 from vdgs.runs.open_run import check_has_anchors
 from vdgs.runs.run_cameras import save_run_cameras
 from vdgs.runs.run_context import RunContext
@@ -127,11 +127,13 @@ def _dense_points(
     with show_progress("looking for ground by stereo", console, run) as on_progress:
         dense = find_dense_points(run, capture, images, config.anchors, on_progress, torch.get_num_threads())
     if dense is not None:
-        added = f"{len(dense.points):,} points beside the sparse ones, {time.monotonic() - start:.0f} s"
-        console.print(
-            f"stereo: {added if len(dense.points) else 'no points added: the sparse ones suffice, or nothing matches'}",
-            highlight=False,
-        )
+        if len(dense.points):
+            found = f"{len(dense.points):,} points beside the sparse ones, {time.monotonic() - start:.0f} s"
+        elif max_dense_points(capture) == 0:
+            found = "not used: the sparse points are as many as images of this size need"
+        else:
+            found = "no points added: no surface matches between the photographs beside the sparse points"
+        console.print(f"stereo: {found}", highlight=False)
     return dense
 
 

@@ -72,7 +72,10 @@ table.known th, table.known td { border-top: 1px solid var(--faint); }
 details { margin: 0.75rem 0; }
 summary { cursor: pointer; color: var(--link); }
 pre { overflow-x: auto; background: var(--code); padding: 0.75rem; font-size: 0.8rem; line-height: 1.4; }
-@media (max-width: 44rem) { .wide img { max-width: none; width: 44rem; } }
+@media (max-width: 44rem) {
+  .wide img { max-width: none; width: 44rem; }
+  td:first-child { white-space: normal; min-width: 7rem; }
+}
 @media print {
   body { font-size: 10pt; }
   main { max-width: none; padding: 0; }

@@ -26,19 +26,19 @@ MAX_VIEW_ROWS, MAX_SEAM_IMAGES = 400, 3
 #: key in metrics.json, label, format
 METRICS = (
     ("psnr", "PSNR (dB) ↑", DB),
-    ("psnr_cc", "PSNR, colour-corrected (dB) ↑", DB),
-    ("psnr_reference_exposure", "PSNR in neutral colours (dB) ↑", DB),
+    ("psnr_cc", "PSNR, color-corrected (dB) ↑", DB),
+    ("psnr_reference_exposure", "PSNR in neutral colors (dB) ↑", DB),
     ("ssim", "SSIM ↑", SIMILARITY),
-    ("ssim_cc", "SSIM, colour-corrected ↑", SIMILARITY),
-    ("ssim_reference_exposure", "SSIM in neutral colours ↑", SIMILARITY),
+    ("ssim_cc", "SSIM, color-corrected ↑", SIMILARITY),
+    ("ssim_reference_exposure", "SSIM in neutral colors ↑", SIMILARITY),
     ("lpips_vgg", "LPIPS vgg ↓", SIMILARITY),
-    ("lpips_vgg_cc", "LPIPS vgg, colour-corrected ↓", SIMILARITY),
+    ("lpips_vgg_cc", "LPIPS vgg, color-corrected ↓", SIMILARITY),
     ("lpips_vgg_01", "LPIPS vgg, [0, 1] input ↓", SIMILARITY),
-    ("lpips_vgg_01_cc", "LPIPS vgg, [0, 1] input, colour-corrected ↓", SIMILARITY),
+    ("lpips_vgg_01_cc", "LPIPS vgg, [0, 1] input, color-corrected ↓", SIMILARITY),
     ("opacity_coverage", "share of seen pixels that is opaque ↑", "{:.4f}"),
-    ("psnr_covered_own_background", "PSNR of seen pixels before its own background (dB) ↑", DB),
-    ("psnr_covered_black", "PSNR of seen pixels before black (dB) ↑", DB),
-    ("psnr_covered_white", "PSNR of seen pixels before white (dB) ↑", DB),
+    ("psnr_covered_own_background", "PSNR of seen pixels on its own background (dB) ↑", DB),
+    ("psnr_covered_black", "PSNR of seen pixels on black (dB) ↑", DB),
+    ("psnr_covered_white", "PSNR of seen pixels on white (dB) ↑", DB),
     ("depth_error_median_expected", "median error of expected depth (camera heights) ↓", "{:.4f}"),
     ("depth_error_median_median", "median error of median depth (camera heights) ↓", "{:.4f}"),
     ("depth_within_1_percent_expected", "share with expected depth within 1 % ↑", "{:.4f}"),
@@ -63,12 +63,12 @@ def _result_summary(coarse: JsonRecord, merged: JsonRecord) -> str:
     if after is None or before is None:
         name, one = ("Coarse", coarse) if after is None else ("Merged", merged)
         return (
-            f"{name} model: PSNR {one.format('psnr')} dB (colour-corrected {one.format('psnr_cc')}), "
+            f"{name} model: PSNR {one.format('psnr')} dB (color-corrected {one.format('psnr_cc')}), "
             f"SSIM {one.format('ssim', SIMILARITY)}."
         )
     return (
         f"Coarse → merged: PSNR {format_value(before, DB)} → {format_value(after, DB)} dB "
-        f"({format_difference(after, before)}), colour-corrected {_change(coarse, merged, 'psnr_cc', DB)} dB; "
+        f"({format_difference(after, before)}), color-corrected {_change(coarse, merged, 'psnr_cc', DB)} dB; "
         f"SSIM {_change(coarse, merged, 'ssim', SIMILARITY)}."
     )
 
@@ -172,7 +172,18 @@ def _views_table(rows: list[JsonRecord], coarse: dict[str | None, JsonRecord]) -
         opaque = [format_percent(row.number("opacity_coverage")), row.count("oversized_splats")]
         name = row.text("name") or ABSENT
         lines.append([name, row.format("mean_visibility"), *psnrs, row.format("psnr_cc"), *similarities, *opaque])
-    head = ["view", "mean V", "PSNR coarse", "PSNR", "Δ", "PSNR cc", "SSIM", "LPIPS vgg", "solid", "large splats"]
+    head = [
+        "view",
+        "mean V",
+        "PSNR coarse",
+        "PSNR",
+        "Δ",
+        "PSNR corrected",
+        "SSIM",
+        "LPIPS vgg",
+        "solid",
+        "large splats",
+    ]
     caption = f"The first {MAX_VIEW_ROWS} of {len(rows)}" if len(rows) > MAX_VIEW_ROWS else ""
     return table(head, lines, caption)
 
@@ -211,7 +222,19 @@ def _bins_table(bins: list[JsonRecord], pairs: list[tuple[JsonRecord, JsonRecord
         rows.append(
             [_bounds(row), row.count("pixels"), *psnr, *psnr_cc, *_compared(coarse, merged, "ssim", SIMILARITY)]
         )
-    head = ["V", "pixels", "PSNR coarse", "merged", "Δ", "PSNR cc coarse", "merged", "Δ", "SSIM coarse", "merged", "Δ"]
+    head = [
+        "V",
+        "pixels",
+        "PSNR coarse",
+        "merged",
+        "Δ",
+        "PSNR corrected coarse",
+        "merged",
+        "Δ",
+        "SSIM coarse",
+        "merged",
+        "Δ",
+    ]
     return table(head, rows)
 
 

@@ -6,6 +6,7 @@ import contextlib
 import gc
 import http
 import io
+import logging
 import math
 import secrets
 import socket
@@ -232,6 +233,8 @@ def _start(access: AccessControl, console: Console) -> Any:
             return None
 
     guarded = False
+    # Health checks and port scans, which send HEAD or nothing, are no reason for tracebacks.
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     unguarded = sockets.serve
 
     def serve_guarded(*args: Any, process_request: Any, **options: Any) -> Any:

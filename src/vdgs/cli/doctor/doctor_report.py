@@ -35,19 +35,27 @@ def print_report(as_json: bool = False, checks: list[SystemCheck] | None = None)
     if as_json:
         print(json.dumps({"healthy": is_healthy(checks), "checks": [asdict(check) for check in checks]}, indent=2))
     else:
-        _print_table(checks)
+        _print_checks(checks)
     return 0 if is_healthy(checks) else 1
 
 
-def _print_table(checks: list[SystemCheck]) -> None:
+def _print_checks(checks: list[SystemCheck]) -> None:
+    """As a table on a terminal; else, and where rich is missing, as a line for each, which can be searched and sent."""
+    broken = [check.name for check in checks if not check.is_ok]
+    verdict = f"Not usable yet: {', '.join(broken)}. See what to do there." if broken else "Everything essential works."
     try:
         from rich import box
         from rich.console import Console
         from rich.table import Table
         from rich.text import Text
     except ImportError:
+        console = None
+    else:
+        console = Console()
+    if console is None or not console.is_terminal:
         for check in checks:
-            print(f"{check.state:8} {check.name:22} {check.value}  {check.remedy}")
+            print(f"{check.state:8} {check.name}: {check.value}{check.remedy and f' -> {check.remedy}'}")
+        print(verdict)
         return
     signs = {"ok": ("✓", "green"), "note": ("•", "cyan"), "missing": ("–", "yellow"), "broken": ("✗", "red")}
     table = Table(box=box.SIMPLE_HEAD)
@@ -56,10 +64,5 @@ def _print_table(checks: list[SystemCheck]) -> None:
     for check in checks:
         sign, color = signs[check.state] if check.is_ok else ("✗", "bold red")
         table.add_row(Text(sign, color), Text(check.name), Text(check.value), Text(check.remedy))
-    console = Console()
     console.print(table)
-    broken = [check.name for check in checks if not check.is_ok]
-    if broken:
-        console.print(Text(f"Not usable yet: {', '.join(broken)}. See the last column.", "bold red"))
-    else:
-        console.print(Text("Everything essential works.", "green"))
+    console.print(Text(verdict, "bold red" if broken else "green"))

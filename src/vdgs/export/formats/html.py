@@ -181,8 +181,8 @@ def _document(gaussians: Gaussians, factor: float, page: InitialView, scene: Exp
         f'<script>window.__VISER_EMBED_DATA__="{recording}";window.__VISER_EMBED_CONFIG__={{darkMode:false}};</script>'
     )
     caption = (
-        f'<p style="{_CAPTION}">{title} · {len(gaussians):,} Gaussians, colours as seen from no particular side · '
-        "left button turns, right moves, wheel goes nearer</p>"
+        f'<p style="{_CAPTION}">{title} · {len(gaussians):,} Gaussians, the same colors from all sides · '
+        "drag to turn, right button or two fingers to move, wheel or pinch to zoom</p>"
     )
     client = _client_html().replace("<title>Viser</title>", f"<title>{title}</title>", 1)
     client = client.replace('<meta charset="utf-8" />', f'<meta charset="utf-8" />{head}', 1)
