@@ -132,7 +132,11 @@ def test_what_is_missing_is_said_in_one_line(backbone, nowhere: Path):
     assert lpips.VGG16_URL in why
     assert "\n" not in why
     torch.save(backbone, nowhere / "vgg.pth")
-    metric, why = load_lpips(nowhere / "vgg.pth")
+    with pytest.raises(VdgsError, match=r"--lpips-weights .*vgg.pth: no linear heads.*vdgs\[lpips\]"):
+        load_lpips(nowhere / "vgg.pth")  # was asked for by name
+    lpips.default_weights_path().parent.mkdir(parents=True)
+    torch.save(backbone, lpips.default_weights_path())
+    metric, why = load_lpips()  # was only found
     assert metric is None
     assert "vdgs[lpips]" in why
 

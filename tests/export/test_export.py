@@ -88,6 +88,12 @@ def test_all_files_of_one_baking_hold_the_same_scene(export, tmp_path: Path):
     assert not list(tmp_path.glob(".*"))
 
 
+def test_a_run_that_may_only_be_read_is_exported(export, tmp_path: Path):
+    (tmp_path / "run" / RECORD_FILE).mkdir(parents=True)  # stands for a folder that cannot be written, which root can
+    assert export("a.splat", sh_degree=0)["gaussians"]
+    assert (tmp_path / "a.splat").is_file()
+
+
 def test_the_size_of_tiles_is_theirs_alone(export, tmp_path: Path):
     (tmp_path / "other.bin").write_bytes(bytes(10_000_000))
     (tmp_path / "tiles-9").mkdir()

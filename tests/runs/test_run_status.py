@@ -357,3 +357,20 @@ def test_a_status_file_that_is_damaged_is_deleted_first(run):
     run.block(1).status_file.write_text("{}")
     commands = next_commands(next_line(get_run_status(run)))
     assert commands == [f"rm {run.block(1).status_file}", f"vdgs train-blocks {run.path}"]
+
+
+@pytest.mark.parametrize("content", ["", "[1, 2"])
+def test_figures_that_are_damaged_are_not_there(run, content):
+    (run.evaluation / "metrics.json").write_text(content)
+    assert states(run)["evaluation"] == "missing"
+
+
+def test_the_file_that_is_damaged_is_the_one_to_mend(run):
+    run.coarse.status_file.write_text("[]")
+    assert get_run_status(run).problem.startswith(f"{run.coarse.status_file}: is damaged")
+
+
+def test_work_goes_on_where_its_progress_cannot_be_noted(run):
+    run.progress_file.mkdir(parents=True)
+    progress = run.begin_step("report", "maps", "tiles", 2)
+    assert [progress(done).done for done in (1, 2)] == [1, 2]

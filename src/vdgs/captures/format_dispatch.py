@@ -21,6 +21,7 @@ from vdgs.captures.formats.transforms import TRANSFORMS_FILE, exclusive_informat
 from vdgs.captures.image_files import IMAGE_SUFFIXES, find_images
 from vdgs.captures.nested_captures import foreign_poses, model_below
 from vdgs.captures.reconstruction import is_reconstruction
+from vdgs.captures.strays import check_no_run
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.system.quoting import shell_word
@@ -41,6 +42,7 @@ def read_source(root: Path, options: CaptureOptions) -> SourceCapture:
         return _of_both(root, options)
     if here:
         return READERS[here[0]][1](root, options)
+    check_no_run(root)
     if is_reconstruction(root):
         raise CaptureError(
             f"{root}: is not finished: vdgs sfm was stopped. The command that began it goes on "

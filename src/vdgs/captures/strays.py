@@ -7,6 +7,9 @@ import re
 from collections.abc import Iterator
 from pathlib import Path, PurePath
 
+from vdgs.errors import CaptureError
+from vdgs.system.quoting import shell_word
+
 #: Folders that systems and programs keep for themselves; so are all whose names begin with a dot.
 _HIDDEN = re.compile(
     r"\..*|@.*|#recycle|\$recycle\.bin|__macosx|system volume information|lost\+found|_?thumb(nail)?s?|_?previews?"
@@ -57,6 +60,16 @@ def is_run(folder: Path) -> bool:
             return handle.readline().rstrip() == b"vdgs:"
     except OSError:
         return False
+
+
+def check_no_run(folder: Path) -> None:
+    """Raise CaptureError where a folder that is given as a capture, or as photographs, is a run: its pictures are
+    renders."""
+    if is_run(folder):
+        raise CaptureError(
+            f"{folder}: is a run, neither a capture nor photographs. Give what it was made of; to continue it, add "
+            f"--output {shell_word(folder)}"
+        )
 
 
 def is_result(file: Path) -> bool:

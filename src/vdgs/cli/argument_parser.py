@@ -13,7 +13,7 @@ from vdgs.config.options import Option, Values, options_of, with_values
 from vdgs.config.output_paths import is_output
 from vdgs.config.ranges import check_ranges
 from vdgs.errors import RunError, VdgsError
-from vdgs.system.quoting import shell_line
+from vdgs.system.quoting import check_is_text, shell_line
 from vdgs.system.similar_paths import suggest_path
 
 HELP_FLAGS, FULL_HELP_FLAG = ("-h", "--help"), "--help-all"
@@ -54,10 +54,14 @@ class GivenArguments:
         check_ranges(self.over())
         paths = [(each, path) for each in options for path in _paths(self.values.get(each.path))]
         for option, path in paths:
+            check_is_text(path)
             if not is_output(option.hint):
                 _check_input(option, path)
         for option, path in paths:
-            if is_output(option.hint) and not (path / "config.yaml").is_file():
+            if not is_output(option.hint):
+                continue
+            _check_place(path)
+            if not (path / "config.yaml").is_file():
                 from vdgs.captures.output_guard import check_output
 
                 check_output(path)
@@ -92,9 +96,23 @@ def _check_input(option: Option, path: Path) -> None:
     if not path.exists():
         named = "" if option.is_positional else f"{option.flag} "
         fault = "is not a run folder, for it does not exist" if is_run else "no such file or folder"
+        if path.is_symlink():
+            raise VdgsError(f"{named}{path}: is a link to {path.readlink()}, which leads to no file or folder")
         raise VdgsError(f"{named}{path}: {fault}{suggest_path(path)}")
     if is_run and not (path / "config.yaml").is_file():
         raise RunError(f"{path}: is not a run folder (no config.yaml). Train first: vdgs run CAPTURE --output RUN")
+
+
+def _check_place(output: Path) -> None:
+    """Raise VdgsError where the system can have no file or folder of this name: before any work, not after it."""
+    try:
+        output.stat()
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        from vdgs.system.atomic_files import disk_hint
+
+        raise VdgsError(f"{output}: cannot be written ({error.strerror}). {disk_hint(error)}.") from None
 
 
 def parse_words(kind: type, words: Sequence[str]) -> GivenArguments:

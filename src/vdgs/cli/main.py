@@ -8,6 +8,8 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any
 
+from vdgs.system.exit_codes import exit_code_of
+
 HELP = """\
 usage: vdgs VERB [options]
 
@@ -56,13 +58,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     `vdgs status`, of a run that is not whole."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if not arguments or arguments[0] in ("-h", "--help", "help"):
-        print(HELP, end="")
-        sys.exit(0 if arguments else 2)
+        sys.exit(exit_code_of("vdgs", lambda: print(HELP, end="") or (0 if arguments else 2), ""))
     if arguments[0] == "--version":
         from vdgs import __version__
 
-        print(f"vdgs {__version__}")
-        return
+        sys.exit(exit_code_of("vdgs", lambda: print(f"vdgs {__version__}"), ""))
     if arguments[0] not in COMMANDS:
         from vdgs.config.serialization import suggest
 
@@ -76,7 +76,6 @@ def _run_command(command: str, arguments: list[str]) -> int:
     import logging
 
     from vdgs.cli.advice import MESSAGE_FIT, Advice
-    from vdgs.system.exit_codes import exit_code_of
 
     # matplotlib warns of a home folder without write access, and then works without it.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)

@@ -17,7 +17,7 @@ from vdgs.config.sfm_options import SfmOptions
 #: Groups by visibility: with more than some dozens none holds enough pixels to say anything.
 BIN_COUNT_RANGE = Range(1, 100)
 #: Length and pace of a film; 0 leaves them to the path. Encoders take no more frames a second.
-SECONDS_RANGE, FPS_RANGE = Range(0, 86_400), Range(0, 1000)
+SECONDS_RANGE, FPS_RANGE = Range(0, 86_400), Range(0.1, 1000, allow_zero=True)
 #: The longest side of a picture that is drawn, in pixels: more than any film and any screen holds.
 MAX_RENDER_SIDE_PX = 16_384
 #: What drawing takes at most of memory for each pixel: the raster, its depth, pictures made of it.

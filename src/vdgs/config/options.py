@@ -92,7 +92,7 @@ class Option:
         try:
             return read_words(self.hint, words)
         except ValueError:
-            said, kind = " ".join(words), describe_type(self.hint).removesuffix(" or null")
+            said, kind = " ".join(words).strip(), describe_type(self.hint).removesuffix(" or null")
             raise ValueError(f"{said}: must be {kind}" if said else f"needs a value: {kind}") from None
 
 
@@ -206,8 +206,8 @@ def _read_word(kind: Any, word: str) -> Any:
         values = [each for each in typing.get_args(kind) if str(each) == word]
     elif kind is NoneType:
         values = [None] if word.lower() in ("none", "null") else []
-    else:  # an empty word would be the path of the current folder
-        values = [kind(word)] if word or kind is not Path else []
+    else:  # a blank word ("$RUN" of a variable that is not set) would be the path of the current folder
+        values = [kind(word)] if word.strip() or kind is not Path else []
     if not values:
         raise ValueError
     return values[0]

@@ -42,6 +42,7 @@ HEAD_FILES = {"torchmetrics": "functional/image/lpips_models/vgg.pth", "lpips": 
 #: ImageNet statistics on the [-1, 1] scale, constants of the metric.
 INPUT_SHIFT = (-0.030, -0.088, -0.188)
 INPUT_SCALE = (0.458, 0.448, 0.450)
+NO_HEADS = "no linear heads. They ship with torchmetrics: pip install 'vdgs[lpips]'."
 _EPSILON = 1e-10
 #: Four halvings must leave a pixel.
 MIN_SIDE_PX = 16
@@ -97,7 +98,8 @@ def load_lpips(weights: Path | None = None, heads: Path | None = None) -> tuple[
     `weights` is torchvision's VGG16 state dict (.pth or .safetensors); without it torch's own download
     folder is looked at. Raises VdgsError where a file that was named, or found, cannot be used.
     """
-    check_weights_file(weights)
+    head_file = heads or find_heads()
+    check_weights_file(weights, head_file)
     cached = default_weights_path()
     source = weights or (cached if cached.is_file() else None)
     if source is None:
@@ -105,9 +107,8 @@ def load_lpips(weights: Path | None = None, heads: Path | None = None) -> tuple[
             f"LPIPS is null: no VGG16 weights. Download {VGG16_URL} and give --lpips-weights PATH, "
             f"or put it at {cached}."
         )
-    head_file = heads or find_heads()
     if head_file is None:
-        return None, "LPIPS is null: no linear heads. They ship with torchmetrics: pip install 'vdgs[lpips]'."
+        return None, f"LPIPS is null: {NO_HEADS}"
     backbone, linear = _read(source, "VGG16 weights"), _read(head_file, "LPIPS heads")
     try:
         metric = Lpips(backbone, linear)
@@ -119,10 +120,13 @@ def load_lpips(weights: Path | None = None, heads: Path | None = None) -> tuple[
     return metric, f"LPIPS from {source.name} ({_weights_origin(source)})"
 
 
-def check_weights_file(weights: Path | None) -> None:
-    """Raise VdgsError where weights are named and no such file is there."""
+def check_weights_file(weights: Path | None, heads: Path | None = None) -> None:
+    """Raise VdgsError where weights are named and no such file is there, or no linear heads are, without which they
+    are of no use."""
     if weights is not None and not weights.is_file():
         raise VdgsError(f"--lpips-weights {weights}: no such file; it should hold the VGG16 weights.")
+    if weights is not None and (heads or find_heads()) is None:
+        raise VdgsError(f"--lpips-weights {weights}: {NO_HEADS}")
 
 
 def default_weights_path() -> Path:

@@ -21,10 +21,10 @@ def evaluation_folder(run: RunFolder, name: str, views: EvaluationSplit = "test"
 
 
 def is_evaluated(run: RunFolder, name: str, lpips_weights: Path | None, bins: int) -> bool:
-    """Whether the figures on disk are of the present model, measured in this way."""
-    expected = measured_as(run, name, lpips_weights, bins)
-    record = read_json_or_empty(evaluation_folder(run, name) / "status.json")
-    return {key: record.get(key) for key in expected} == expected
+    """Whether there are figures on disk, of the present model, measured in this way."""
+    expected, folder = measured_as(run, name, lpips_weights, bins), evaluation_folder(run, name)
+    record, figures = (read_json_or_empty(folder / file) for file in ("status.json", "metrics.json"))
+    return bool(figures) and {key: record.get(key) for key in expected} == expected
 
 
 def measured_as(run: RunFolder, name: str, lpips_weights: Path | None, bins: int) -> MeasuredAs:

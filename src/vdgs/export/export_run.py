@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int
 from rich.console import Console
+from rich.markup import escape
 
 from vdgs.captures.first_view import default_view
 from vdgs.captures.output_guard import check_not_among_inputs, check_output
@@ -117,7 +118,11 @@ def export_run(
     if execution is None or not execution.is_distributed:
         forget_shards(run)
     record = write_files(run, request, console, execution)
-    write_json(run.folder.path / RECORD_FILE, record)
+    try:
+        write_json(run.folder.path / RECORD_FILE, record)
+    except VdgsError:  # a run that may only be read
+        file = escape(str(run.folder.path / RECORD_FILE))
+        console.print(f"[yellow]note[/] {file} cannot be written: the report will not know of these files")
     return record
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import subprocess
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -111,7 +112,7 @@ def _parse_settings(path: Path, text: str) -> RunSettings:
     """The settings in the text of a file. Cached: a command reads its settings many times, and PyYAML takes tens of
     milliseconds for each (its parser in C crashes on deeply nested brackets)."""
     try:
-        settings = yaml.safe_load(text)
+        settings = load_yaml(text)
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         raise RunError(f"{path}: is damaged, not valid YAML ({error})") from error
     if not isinstance(settings, dict) or not {"capture", "training"} <= settings.keys():
@@ -146,3 +147,18 @@ def git_commit() -> str | None:
         return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip() or None
     except OSError:  # no git on this machine
         return None
+
+
+class _Loader(yaml.SafeLoader):
+    """Plain values only, each with a name of its own: of two of one name YAML would take the last."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        names = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
+        if twice := [name for name, count in names.items() if count > 1]:
+            raise yaml.constructor.ConstructorError(None, None, f"{twice[0]} is given twice", node.start_mark)
+        return super().construct_mapping(node, deep)
+
+
+def load_yaml(text: str) -> Any:
+    """What YAML says. Raises YAMLError, ValueError or RecursionError for what is none, and for names given twice."""
+    return yaml.load(text, _Loader)

@@ -133,15 +133,17 @@ class RunStatus:
 def get_run_status(run: RunFolder, settings: RunSettings | None = None) -> RunStatus:
     """How far a run is, for its settings or for others. Reads only and never fails: what is damaged is `unknown`, with
     the reason."""
+    keys, why, problem = None, "", ""
     try:
-        keys, why = run.keys() if settings is None else stage_keys(settings, run.coarse_model_id()), ""
+        settings = run.settings() if settings is None else settings
+        keys = stage_keys(settings, run.coarse_model_id())
     except VdgsError as error:
-        keys, why = None, _first_line(str(error))
+        why = _first_line(str(error))
+        problem = why if settings else f"correct {run.config_file}, or put back the one that was there: {why}"
     command, driven = run.config.command(), run.is_running()
     stages = tuple(_StatusScanner(run, keys, why).stages())
     if driven and (step := read_step(run.progress_file)) is not None:
         stages = tuple(_at_work(stage, step) if stage.name == step.stage else stage for stage in stages)
-    problem = f"correct {run.config_file}, or put back the one that was there: {why}" if why else ""
     written = "" if why or command else run_command(run.settings(), run.path)
     return RunStatus(run.path, stages, command, written, driven, problem)
 
@@ -274,7 +276,7 @@ class _StatusScanner:
 
     def _measured(self, name: str, folder: Path, model: StageStatus) -> StageStatus:
         """The figures of a model: they are out of date where the model is."""
-        there = (folder / "metrics.json").exists()
+        there = bool(read_json_or_empty(folder / "metrics.json"))
         record = read_json_or_empty(folder / "status.json")
         made = json.dumps([record.get(each) for each in ("model", "lpips_weights", "bins")])
         found = record.get("model")

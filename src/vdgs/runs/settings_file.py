@@ -15,6 +15,7 @@ from vdgs.config.method import MethodConfig
 from vdgs.config.options import Values, field_help
 from vdgs.config.serialization import flat_values, to_dict
 from vdgs.errors import VdgsError
+from vdgs.runs.config_file import load_yaml
 from vdgs.system.atomic_files import write_text
 
 HEADER = """\
@@ -29,7 +30,7 @@ def read_settings_file(path: Path) -> tuple[Values, Values]:
     Raises VdgsError, naming the setting, for one that is unknown, of another type or out of its range.
     """
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8-sig")) or {}
+        content = load_yaml(path.read_text(encoding="utf-8-sig")) or {}
     except (OSError, yaml.YAMLError, RecursionError, ValueError) as error:
         raise VdgsError(f"{path}: cannot be read as YAML ({error})") from error
     if not isinstance(content, Mapping):

@@ -18,6 +18,7 @@ from vdgs.captures.image_files import (
 from vdgs.captures.name_resolution import to_colmap_name
 from vdgs.captures.strays import is_result, previewed_stem, walk
 from vdgs.errors import CaptureError
+from vdgs.system.quoting import check_is_text
 
 #: Files beside a photograph that are no news.
 _SILENT = {".ds_store", "thumbs.db", "desktop.ini"}
@@ -73,6 +74,7 @@ def find_files(folders: Sequence[Path]) -> Found:
 
 
 def _add(found: Found, path: Path, written: str, stems: set[str]) -> None:
+    check_is_text(path)
     name = to_colmap_name(written)
     preview = previewed_stem(path.stem)
     if preview is not None and preview.lower() in stems:

@@ -15,7 +15,7 @@ from vdgs.captures.name_resolution import match_key
 from vdgs.captures.nested_captures import foreign_poses, model_below
 from vdgs.captures.output_guard import is_capture
 from vdgs.captures.reconstruction import is_reconstruction
-from vdgs.captures.strays import walk
+from vdgs.captures.strays import check_no_run, walk
 from vdgs.errors import CaptureError
 from vdgs.sfm.cross_checks import cross_checked, strays
 from vdgs.sfm.find_images import find_files, is_photograph, nothing_found
@@ -59,6 +59,7 @@ def collect_images(folders: Sequence[Path]) -> ImageList:
     for folder in folders:
         if not folder.is_dir():
             raise CaptureError(f"{folder}: no such folder. Give the folder that the photographs are in.")
+        check_no_run(folder)
         if is_reconstruction(folder) and not is_capture(folder):
             raise CaptureError(
                 f"{folder}: is a capture that is not finished. Give its photographs and --output {shell_word(folder)}"

@@ -67,7 +67,7 @@ def disk_hint(error: BaseException) -> str:
         number = int(match[1])
     if number in (errno.EACCES, errno.EPERM, errno.EROFS):
         return "Allow writing there (chmod u+w, or another mount) or choose another folder"
-    if number in (errno.ENOTDIR, errno.EISDIR, errno.EEXIST):
+    if number in (errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENOTEMPTY, errno.ELOOP):
         return "Move away what stands there under this name, or choose another"
     if number == errno.ENAMETOOLONG:
         return "Choose a shorter name"
@@ -100,8 +100,8 @@ def write_array(path: Path, values: np.ndarray) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file (UTF-8) atomically."""
-    write_bytes(path, text.encode())
+    """Write a text file (UTF-8) atomically. Bytes of file names that are no text are escaped, as JSON does it."""
+    write_bytes(path, text.encode(errors="backslashreplace"))
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import errno
+import io
+import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Any
 
 #: Required packages that an installation may leave out (`docs/third-party.md`), and what then does not work.
@@ -20,8 +23,14 @@ def exit_code_of(name: str, action: Callable[[], Any], when_interrupted: str, fi
     from vdgs.errors import Interrupted, Stopped, VdgsError
     from vdgs.system.stop_signals import catch_stop_signals
 
+    _open_streams()
     try:
-        with catch_stop_signals(interrupts=True):
+        os.getcwd()
+    except FileNotFoundError:
+        print(f"{name}: the current folder does not exist any more. Go to another one (cd).", file=sys.stderr)
+        return 1
+    try:
+        with catch_stop_signals(interrupts=True), _printed():
             return int(action() or 0)
     except (KeyboardInterrupt, Interrupted):
         print(f"{name}: interrupted. {when_interrupted}", file=sys.stderr)
@@ -30,6 +39,7 @@ def exit_code_of(name: str, action: Callable[[], Any], when_interrupted: str, fi
         print(f"{name}: {fit(str(error))}", file=sys.stderr)
         return 130 if isinstance(error, Stopped) else 1
     except BrokenPipeError:
+        _forget_output()
         return 1
     except ModuleNotFoundError as error:
         if error.name not in REMOVABLE_PACKAGES:
@@ -37,7 +47,10 @@ def exit_code_of(name: str, action: Callable[[], Any], when_interrupted: str, fi
         print(f"{name}: {error.name} is not installed: {REMOVABLE_PACKAGES[error.name]}", file=sys.stderr)
         return 1
     except OSError as error:  # a disk that is full, a folder that cannot be written: no news from a traceback
-        print(f"{name}: {error.filename or 'a file'}: {error.strerror or error}{_remedy(error)}", file=sys.stderr)
+        if not error.filename:
+            _forget_output()
+        what = error.filename or "a file, or what is printed"
+        print(f"{name}: {what}: {error.strerror or error}{_remedy(error)}", file=sys.stderr)
         return 1
     except (MemoryError, RuntimeError) as error:
         from vdgs.system.memory.process_memory import is_out_of_memory
@@ -50,11 +63,43 @@ def exit_code_of(name: str, action: Callable[[], Any], when_interrupted: str, fi
         return 1
 
 
+@contextmanager
+def _printed() -> Iterator[None]:
+    """A context whose output is with its reader in the end: that it cannot be is known before the process ends."""
+    try:
+        yield
+    finally:
+        if sys.stdout is not None:
+            sys.stdout.flush()
+
+
+def _forget_output() -> None:
+    """Send what was not printed nowhere, lest Python tries it once more, with a traceback, when it ends."""
+    with suppress(OSError, ValueError, AttributeError):  # no stream of a process
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _open_streams() -> None:
+    """Make standard streams such that every text can be printed, and no other file is taken for one of them.
+
+    Where one is closed (`2>&-`) the next file that is opened would get its number, and what libraries print. Characters
+    that its encoding lacks, and bytes of file names that are no text, are escaped.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="backslashreplace")
+
+
 def _remedy(error: OSError) -> str:
     """What to do about a file that the system refuses, where that is plain."""
     if error.errno in (errno.EACCES, errno.EPERM):
         return ". See whose it is and who may use it (ls -l, chmod), or choose another."
-    if error.errno in (errno.EROFS, errno.ENOSPC, errno.EDQUOT):
+    if error.errno in (errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ELOOP):
         from vdgs.system.atomic_files import disk_hint
 
         return f". {disk_hint(error)}."

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -24,6 +26,19 @@ def shell_word(text: str | Path) -> str:
 def shell_line(words: Iterable[str | Path]) -> str:
     """A command for a POSIX shell."""
     return " ".join(map(shell_word, words))
+
+
+def check_is_text(path: Path) -> None:
+    """Raise VdgsError for a file or folder whose name, with those of the folders around it, holds bytes that are no
+    text: libraries for images, films and maps cannot open it."""
+    try:
+        os.path.abspath(path).encode()
+    except UnicodeEncodeError:
+        encoding = sys.getfilesystemencoding()
+        raise VdgsError(
+            f"{path}: the name, or that of a folder around it, is no text in {encoding}, so libraries cannot open it. "
+            + ("Rename it." if encoding == "utf-8" else "Set the environment variable PYTHONUTF8=1, or rename it.")
+        ) from None
 
 
 def sbatch_directive(option: str) -> str:

@@ -6,6 +6,7 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from vdgs.errors import VdgsError
 from vdgs.system.atomic_files import read_json_or_empty, write_json
 from vdgs.system.records import record_from_dict, record_to_compact_dict
 from vdgs.system.units import rough_duration
@@ -64,6 +65,9 @@ class StepProgress:
         left = None if done <= first else (now - began) / (done - first) * (self._record.total - done)
         self._record = replace(self._record, done=done, seconds_left=left)
         if self._file is not None and (now - self._written >= WRITE_SECONDS or done >= self._record.total):
-            write_json(self._file, record_to_compact_dict(self._record))
+            try:
+                write_json(self._file, record_to_compact_dict(self._record))
+            except VdgsError:  # a run that may only be read: its maps, elsewhere, can be made
+                self._file = None
             self._written = now
         return self._record

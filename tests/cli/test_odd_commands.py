@@ -1,0 +1,152 @@
+"""Commands that nobody means, from folders and with streams that nobody expects: one line says what is wrong."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from experiments.bench.cli import BenchArguments
+from vdgs.cli.main import COMMANDS, main, verb_arguments
+from vdgs.config.options import Option, options_of
+from vdgs.config.output_paths import is_output
+
+#: A process that does what stands in the braces, and writes a file, as commands do.
+CODE = "import os, sys; from vdgs.system.exit_codes import exit_code_of; sys.exit(exit_code_of('vdgs', lambda: {}, ''))"
+
+
+def path_options(outputs_only: bool = False) -> list[tuple[str, Option]]:
+    """Every option and argument of every verb that names a file or folder."""
+    return [
+        (verb, option)
+        for verb in COMMANDS
+        for option in options_of(verb_arguments()[verb] or BenchArguments)
+        if "Path" in str(option.hint) and (is_output(option.hint) or not outputs_only)
+    ]
+
+
+def command(verb: str, option: Option, word: str) -> list[str]:
+    """A command line of a verb with a word for an option, and with what is required besides."""
+    others = [each for each in options_of(verb_arguments()[verb] or BenchArguments) if each.is_required]
+    words = [] if option.is_positional else [option.flag, word]
+    for each in others:
+        if each.is_positional:
+            words = [word if each == option else "toy" if verb == "bench" else ".", *words]
+        elif each != option:
+            words += [each.flag, "somewhere"]
+    return [verb, *words, *([word] if option.is_positional and not option.is_required else [])]
+
+
+def process(code: str, shell: str = '"$@"', cwd: Path | None = None, **env: str) -> subprocess.CompletedProcess[bytes]:
+    words = ["bash", "-c", shell, "bash", sys.executable, "-c", CODE.format(code)]
+    return subprocess.run(words, capture_output=True, cwd=cwd, env=os.environ | env, timeout=60, check=False)
+
+
+@pytest.mark.parametrize("word", ["", "  "])
+@pytest.mark.parametrize(("verb", "option"), path_options(), ids=lambda each: getattr(each, "flag", each))
+def test_an_empty_path_is_not_the_folder_here(verb, option, word, tmp_path, monkeypatch, capsys):
+    """`--output "$RUN"` of a variable that is not set."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        main(command(verb, option, word))
+    assert ended.value.code == 2
+    assert "nothing: must be" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("verb", "option"), path_options(), ids=lambda each: getattr(each, "flag", each))
+def test_a_name_that_is_no_text_is_refused_by_every_verb(verb, option, tmp_path, monkeypatch, capsys):
+    """OpenCV crashes on it, rasterio and safetensors raise."""
+    monkeypatch.chdir(tmp_path)
+    Path("config.yaml").write_text("vdgs:\n")
+    Path("\udcfc").mkdir()
+    with pytest.raises(SystemExit) as ended:
+        main(command(verb, option, "\udcfc"))
+    assert ended.value.code == 1
+    assert "is no text in utf-8, so libraries cannot open it. Rename it." in capsys.readouterr().err
+
+
+def test_a_photograph_whose_name_is_no_text_is_named(tmp_path, capsys):
+    for name in ("a", "b", "c", "\udcfc"):
+        (tmp_path / f"{name}.jpg").write_bytes(b"")
+    with pytest.raises(SystemExit) as ended:
+        main(["sfm", str(tmp_path), "--output", str(tmp_path.with_name("new")), "--dry-run"])
+    assert ended.value.code == 1
+    assert "\\udcfc.jpg: the name" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", ["below a file", "long", "loop"])
+@pytest.mark.parametrize(
+    ("verb", "option"), path_options(outputs_only=True), ids=lambda each: getattr(each, "flag", each)
+)
+def test_an_output_that_no_disk_can_hold_is_refused_at_once(verb, option, kind, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("file").write_text("kept")
+    Path("loop").symlink_to("loop")
+    (tmp_path / "config.yaml").write_text("vdgs:\n")
+    word = {"below a file": "file/new.ply", "long": "a" * 300 + ".ply", "loop": "loop/new.ply"}[kind]
+    with pytest.raises(SystemExit) as ended:
+        main(command(verb, option, word))
+    assert ended.value.code == 1
+    assert f"{word}: cannot be written (" in capsys.readouterr().err
+    assert Path("file").read_text() == "kept"
+
+
+@pytest.mark.parametrize("verb", ["run", "sfm", "inspect", "train-coarse"])
+def test_a_run_is_neither_a_capture_nor_photographs(verb, tmp_path, capsys):
+    """Its renders would become a scene."""
+    renders = tmp_path / "run" / "evaluation" / "renders"
+    renders.mkdir(parents=True)
+    (tmp_path / "run" / "config.yaml").write_text("vdgs:\n  version: 1\n")
+    (renders / "test_0001.png").write_bytes(b"")
+    with pytest.raises(SystemExit) as ended:
+        main([verb, str(tmp_path / "run"), "--output", str(tmp_path / "new")])
+    assert ended.value.code == 1
+    assert "run: is a run, neither a capture nor photographs" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("target", ["link", "gone"])
+@pytest.mark.parametrize("verb", ["status", "inspect"])
+def test_a_link_that_leads_nowhere_is_called_so(verb, target, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("link").symlink_to(target)
+    with pytest.raises(SystemExit) as ended:
+        main([verb, "link", *(["--output", "new"] if verb == "inspect" else [])])
+    assert ended.value.code == 1
+    assert f"link: is a link to {target}, which leads to no file or folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
+def test_every_text_can_be_printed_in_every_encoding(encoding):
+    done = process(r"print('20.1 \u2192 21.3 \u2191', 'no text: \udcfc')", PYTHONIOENCODING=encoding)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert rb"\udcfc" in done.stdout
+
+
+def test_streams_that_are_closed_are_no_files(tmp_path):
+    """The next file would get the number of standard error, and what libraries print."""
+    done = process("os.open('made', os.O_CREAT | os.O_WRONLY) < 3", shell='"$@" <&- >&- 2>&-', cwd=tmp_path)
+    assert done.returncode == 0
+    assert (tmp_path / "made").is_file()
+
+
+def test_a_folder_that_was_removed_is_named(tmp_path):
+    done = process("0", shell='mkdir gone && cd gone && rmdir ../gone && "$@"', cwd=tmp_path)
+    assert done.returncode == 1
+    assert b"the current folder does not exist any more" in done.stderr
+
+
+@pytest.mark.parametrize("buffered", ["", "1"])
+@pytest.mark.parametrize("words", ["--help", "--version", "run --help"])
+@pytest.mark.parametrize(("where", "says"), [("> /dev/full", b"No space left on device"), ("| true", b"")])
+def test_output_that_nobody_can_take_is_no_traceback(words, where, says, buffered):
+    line = f'"$0" -m vdgs {words} {where}; exit ${{PIPESTATUS[0]}}'
+    env = os.environ | {"PYTHONUNBUFFERED": buffered}
+    done = subprocess.run(["bash", "-c", line, sys.executable], capture_output=True, env=env, timeout=60, check=False)
+    assert done.returncode in ((1,) if says else (0, 1))
+    assert says in done.stderr
+    assert b"Traceback" not in done.stderr
+    assert b"Exception" not in done.stderr
