@@ -173,17 +173,9 @@ def _views_table(rows: list[JsonRecord], coarse: dict[str | None, JsonRecord]) -
         name = row.text("name") or ABSENT
         lines.append([name, row.format("mean_visibility"), *psnrs, row.format("psnr_cc"), *similarities, *opaque])
     head = [
-        "view",
-        "mean V",
-        "PSNR coarse",
-        "PSNR",
-        "Δ",
-        "PSNR corrected",
-        "SSIM",
-        "LPIPS vgg",
-        "solid",
-        "large splats",
-    ]
+        "view", "mean V", "PSNR coarse", "PSNR", "Δ",
+        "PSNR corrected", "SSIM", "LPIPS vgg", "solid", "large splats",
+    ]  # fmt: skip
     caption = f"The first {MAX_VIEW_ROWS} of {len(rows)}" if len(rows) > MAX_VIEW_ROWS else ""
     return table(head, lines, caption)
 
@@ -223,18 +215,9 @@ def _bins_table(bins: list[JsonRecord], pairs: list[tuple[JsonRecord, JsonRecord
             [_bounds(row), row.count("pixels"), *psnr, *psnr_cc, *_compared(coarse, merged, "ssim", SIMILARITY)]
         )
     head = [
-        "V",
-        "pixels",
-        "PSNR coarse",
-        "merged",
-        "Δ",
-        "PSNR corrected coarse",
-        "merged",
-        "Δ",
-        "SSIM coarse",
-        "merged",
-        "Δ",
-    ]
+        "V", "pixels", "PSNR coarse", "merged", "Δ", "PSNR corrected coarse",
+        "merged", "Δ", "SSIM coarse", "merged", "Δ",
+    ]  # fmt: skip
     return table(head, rows)
 
 
