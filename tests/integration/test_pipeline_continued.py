@@ -73,7 +73,7 @@ def test_ctrl_c_between_stages_stops_the_run_and_the_same_command_continues(capt
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     status = vdgs("status", copied)
     assert status.returncode == 0, status.stdout
-    assert "next: vdgs render" in status.stdout
+    assert "next: vdgs view" in status.stdout
 
 
 @pytest.mark.parametrize("file", ["partition/blocks.geojson", "partition/scores.npz", "partition/partition.json"])

@@ -104,7 +104,7 @@ def test_a_whole_run_is_whole(run, capsys):
     said = capsys.readouterr().out
     assert "10 done" in said
     assert f"report: {run.path / 'report.html'}" in said
-    assert next_commands(said) == [f"vdgs render {run.path} --views flyover --output flyover.mp4"]
+    assert next_commands(said) == [f"vdgs view {run.path}"]
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from pathlib import Path
 
 from vdgs.errors import VdgsError
 from vdgs.kernels.operations import GPU_VERIFIED
@@ -30,7 +31,9 @@ def select_device(device: str) -> SelectedDevice:
     if device == "cpu":
         return SelectedDevice("cpu", "as asked for")
     if device == "auto" and not GPU_VERIFIED:
-        return SelectedDevice("cpu", "vdgs has not been run on a GPU yet; --device cuda asks for the card")
+        has_driver = Path("/proc/driver/nvidia").exists()  # torch, which knows for sure, takes seconds to load
+        untried = "vdgs has not been run on a GPU yet; --device cuda uses the one here"
+        return SelectedDevice("cpu", untried if has_driver else "this machine has no NVIDIA GPU")
     index = int(named.group(1) or 0)
     reason = _no_card(index)
     if not reason:

@@ -114,8 +114,7 @@ def next_line(status: RunStatus) -> str:
         return "at work: nothing to type"
     if status.problem or not status.is_complete:
         return f"to mend: {status.problem or 'see above'}"
-    film = shell_line(["vdgs", "render", status.path, "--views", "flyover", "--output", "flyover.mp4"])
-    return f"next: {film}"
+    return f"next: {shell_line(['vdgs', 'view', status.path])}"
 
 
 def progress_text(status: StatusRecord | None) -> str:
