@@ -77,10 +77,12 @@ class TestWhichRasterizerDraws:
             rasterizer.select_rasterizer("native")
 
 
-def test_auto_takes_the_processor_until_a_card_has_run_it():
-    assert select_device("auto") == SelectedDevice(
-        "cpu", "vdgs has not been run on a GPU yet; --device cuda asks for the card"
-    )
+def test_auto_takes_the_processor_until_a_card_has_run_it(monkeypatch, tmp_path):
+    monkeypatch.setattr(device_selection, "DRIVER_FOLDER", tmp_path)
+    untried = "vdgs has not been run on a GPU yet; --device cuda uses the one here"
+    assert select_device("auto") == SelectedDevice("cpu", untried)
+    monkeypatch.setattr(device_selection, "DRIVER_FOLDER", tmp_path / "none")
+    assert select_device("auto") == SelectedDevice("cpu", "this machine has no NVIDIA GPU")
     assert select_device("cpu") == SelectedDevice("cpu", "as asked for")
 
 
@@ -189,7 +191,7 @@ def test_doctor_says_what_there_is(monkeypatch: pytest.MonkeyPatch, tmp_path):
     )
     assert lines["on cuda: gsplat or cuda"].value == "rasterize, rasterize_vjp"
     assert "adam_rows" in lines["on cuda: torch_ref"].value
-    assert lines["--device auto"].value.startswith("cpu: vdgs has not been run on a GPU")
+    assert lines["--device auto"].value.startswith("cpu: ")
     assert all(check.is_ok for check in lines.values())
 
 

@@ -14,6 +14,10 @@ class DeviceUnavailable(VdgsError):
     """The device that was asked for cannot do the work."""
 
 
+#: Is there where a driver of NVIDIA is loaded; torch, which knows for sure, takes seconds to load.
+DRIVER_FOLDER = Path("/proc/driver/nvidia")
+
+
 @dataclass(frozen=True)
 class SelectedDevice:
     """A device (`cpu`, `cuda:0`) and why it was chosen."""
@@ -31,9 +35,8 @@ def select_device(device: str) -> SelectedDevice:
     if device == "cpu":
         return SelectedDevice("cpu", "as asked for")
     if device == "auto" and not GPU_VERIFIED:
-        has_driver = Path("/proc/driver/nvidia").exists()  # torch, which knows for sure, takes seconds to load
         untried = "vdgs has not been run on a GPU yet; --device cuda uses the one here"
-        return SelectedDevice("cpu", untried if has_driver else "this machine has no NVIDIA GPU")
+        return SelectedDevice("cpu", untried if DRIVER_FOLDER.exists() else "this machine has no NVIDIA GPU")
     index = int(named.group(1) or 0)
     reason = _no_card(index)
     if not reason:
