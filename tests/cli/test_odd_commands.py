@@ -13,6 +13,7 @@ from experiments.bench.cli import BenchArguments
 from vdgs.cli.main import COMMANDS, main, verb_arguments
 from vdgs.config.options import Option, options_of
 from vdgs.config.output_paths import is_output
+from vdgs.errors import VdgsError
 
 #: A process that does what stands in the braces, and writes a file, as commands do.
 CODE = "import os, sys; from vdgs.system.exit_codes import exit_code_of; sys.exit(exit_code_of('vdgs', lambda: {}, ''))"
@@ -62,7 +63,6 @@ def test_a_name_that_is_no_text_is_refused_by_every_verb(verb, option, tmp_path,
     """OpenCV crashes on it, rasterio and safetensors raise."""
     monkeypatch.chdir(tmp_path)
     Path("config.yaml").write_text("vdgs:\n")
-    Path("\udcfc").mkdir()
     with pytest.raises(SystemExit) as ended:
         main(command(verb, option, "\udcfc"))
     assert ended.value.code == 1
@@ -150,3 +150,13 @@ def test_output_that_nobody_can_take_is_no_traceback(words, where, says, buffere
     assert says in done.stderr
     assert b"Traceback" not in done.stderr
     assert b"Exception" not in done.stderr
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:1", "ray://127.0.0.1:1", "localhost:99999999"])
+def test_a_cluster_that_does_not_answer_is_not_waited_for(address):
+    """Ray tries for minutes."""
+    pytest.importorskip("ray")
+    from vdgs.distributed.ray_executor import check_reachable
+
+    with pytest.raises(VdgsError, match="no Ray cluster that can be used"):
+        check_reachable(address)

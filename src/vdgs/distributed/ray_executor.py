@@ -10,6 +10,7 @@ import hashlib
 import importlib.util
 import os
 import secrets
+import socket
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -38,6 +39,8 @@ NAMESPACE = "vdgs"
 OBJECT_STORE_BYTES = 80 << 20
 #: Seconds that a node gets to answer before anything starts.
 NODE_CHECK_TIMEOUT_SECONDS = 300.0
+#: Seconds that a cluster has to take a connection.
+KNOCK_SECONDS = 10.0
 #: How often a node that does not answer any more is asked again, where Ray says that it may come back.
 MAX_UNAVAILABLE_POLLS = 20
 
@@ -87,11 +90,23 @@ def _token() -> str:
 
 def check_reachable(address: str | None) -> None:
     """Raises VdgsError where there is no Ray, or none that answers at that address. None is started for it."""
-    if _resolve_address(address) == "local":
-        _require_ray()
-    else:
+    _require_ray()
+    where = _resolve_address(address)
+    if where != "local":
+        _knock(where)
         with connect(address):
             pass
+
+
+def _knock(where: str) -> None:
+    """Raise VdgsError where nothing listens at `host:port`: Ray itself would try it for minutes."""
+    host, _, port = where.removeprefix("ray://").rpartition(":")
+    if not host or not port.isdecimal():  # `auto`
+        return
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=KNOCK_SECONDS).close()
+    except (OSError, OverflowError) as error:
+        raise VdgsError(f"{where}: no Ray cluster that can be used ({error}). See `ray status` there.") from error
 
 
 def _resolve_address(address: str | None) -> str:
