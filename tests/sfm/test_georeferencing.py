@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from vdgs.captures.position_fit import PositionFit, Problem, Up, fit_positions
 from vdgs.captures.reconstruction import AccuracyFacts
 from vdgs.captures.up_axis import up_by_views
 from vdgs.geometry.similarity import Similarity, fit_similarity
+from vdgs.sfm import georegistration
 from vdgs.sfm.georeferencing import FOOT_M, Doubts
 from vdgs.sfm.georegistration import Georegistration
 
@@ -109,6 +111,24 @@ def test_altitudes_that_drift_tilt_nothing_and_are_said(drift_m, shape, wrong_m)
             assert fit.place_error_m[1] > 0.3 * drift_m
         if shape == "line" and drift_m >= 30:
             assert fit.drift_m == pytest.approx(drift_m, rel=0.25)
+
+
+@pytest.mark.parametrize("drift_m", [12.0, 30.0])
+@pytest.mark.parametrize("shape", ["line", "there and back"])
+def test_heights_of_a_barometer_are_as_high_above_the_sea_as_altitudes_tell(drift_m, shape):
+    """Heights over the take-off give the shape; how high the take-off lies is known no better than altitudes drift."""
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        places = strips(5, 5, 11.0, rng)
+        time = np.linspace(0, 1, len(places))
+        recorded = places + rng.normal(0, 1.0, places.shape)
+        recorded[:, 2] += drift_m * (time if shape == "line" else np.sin(np.pi * time))
+        taken = [SimpleNamespace(relative_altitude=height) for height in places[:, 2] + rng.normal(0, 0.3, len(places))]
+        fit, barometer = georegistration._best_fit(problem_of(places, recorded, seed)[0], taken)
+        off = abs(fit.placed.mean(axis=0)[2] - places[:, 2].mean())
+        assert barometer
+        assert off <= fit.place_error_m[1] < 2 * drift_m
+        assert off > 0.3 * drift_m
 
 
 @pytest.mark.parametrize("wrong_m", [0.0, 3.0])

@@ -77,8 +77,10 @@ def train_coarse_command(arguments: list[str]) -> None:
         capture=args.capture, output=args.output, options=args.options, threads=args.threads, device=device,
         **vars(method),
     )  # fmt: skip
-    options, command = choose_image_size(request, console).options, given.command_line("train-coarse", NOT_KEPT)
-    context = create_or_resume_run(args.capture, args.output, options, method, command=command)
+    choice, command = choose_image_size(request, console), given.command_line("train-coarse", NOT_KEPT)
+    context = create_or_resume_run(
+        args.capture, args.output, choice.request.options, method, command=command, capture=choice.capture
+    )
     train_coarse(context, args.checkpointing, console, device)
 
 

@@ -7,7 +7,6 @@ the flight does: what a step costs depends on pixels and on the anchors that a v
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -18,7 +17,7 @@ from vdgs.captures.image_files import decode_image
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.ground_frame import GroundFrame
-from vdgs.sfm.capture_writer import IMAGE_SIZES, SIDE_MULTIPLE
+from vdgs.sfm.capture_writer import IMAGE_SIZES, JPEG_QUALITY, SIDE_MULTIPLE
 from vdgs.sfm.feature_extraction import DEFAULT_FOCAL_FACTOR
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
@@ -32,11 +31,9 @@ RELIEF = 0.02
 def assumed_capture(plan: ReconstructionPlan, options: CaptureOptions, points: int, folder: Path) -> Capture:
     """The scene of a plan with so many `points`; its photographs, at the size that is trained on, lie in `folder`."""
     photographs = plan.image_list.images
-    middle = len(photographs) // 2
-    chosen = photographs[max(0, middle - NUM_CAMERAS // 2) :][:NUM_CAMERAS]
-    factor = dict(IMAGE_SIZES)[Path(options.images or IMAGE_SIZES[0][0]).as_posix()] * options.downscale
-    overlap = plan.preflight.views_per_point or min(len(photographs), TYPICAL_VIEWS_PER_POINT)
-    cameras = _cameras(chosen, factor, plan.request.options.max_output_size, overlap)
+    chosen = _chosen(plan)
+    cameras = assumed_cameras(plan, options)
+    overlap = _views_per_point(plan)
     views = tuple(
         _view(photo, camera, folder, k) for k, (photo, camera) in enumerate(zip(chosen, cameras, strict=True))
     )
@@ -53,6 +50,22 @@ def assumed_capture(plan: ReconstructionPlan, options: CaptureOptions, points: i
         root=folder, source="colmap", images="", views=views, points=ground,
         point_colors=rng.integers(0, 255, (count, 3), dtype=np.uint8), ground=level,
     )  # fmt: skip
+
+
+def assumed_cameras(plan: ReconstructionPlan, options: CaptureOptions) -> list[Camera]:
+    """Of the scene, at the size that is trained on."""
+    factor = dict(IMAGE_SIZES)[Path(options.images or IMAGE_SIZES[0][0]).as_posix()] * options.downscale
+    return _cameras(_chosen(plan), factor, plan.request.options.max_output_size, _views_per_point(plan))
+
+
+def _chosen(plan: ReconstructionPlan) -> Sequence[ImageMetadata]:
+    """Some photographs from the middle of the flight."""
+    photographs = plan.image_list.images
+    return photographs[max(0, len(photographs) // 2 - NUM_CAMERAS // 2) :][:NUM_CAMERAS]
+
+
+def _views_per_point(plan: ReconstructionPlan) -> float:
+    return plan.preflight.views_per_point or min(len(plan.image_list.images), TYPICAL_VIEWS_PER_POINT)
 
 
 def _cameras(photographs: Sequence[ImageMetadata], factor: float, max_size: int, overlap: float) -> list[Camera]:
@@ -77,12 +90,6 @@ def _cameras(photographs: Sequence[ImageMetadata], factor: float, max_size: int,
 def _view(photo: ImageMetadata, camera: Camera, folder: Path, index: int) -> View:
     pixels, _ = decode_image(photo.path)
     small = cv2.resize(pixels, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    file = folder / f"{index}.png"
-    cv2.imwrite(str(file), cv2.cvtColor(small, cv2.COLOR_RGB2BGR))
+    file = folder / f"{index}.jpg"
+    cv2.imwrite(str(file), cv2.cvtColor(small, cv2.COLOR_RGB2BGR), (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))
     return View(name=file.name, camera=camera, image_path=file, mask_path=None, split="train")
-
-
-def as_many(capture: Capture, count: int) -> Capture:
-    """A capture of `count` training views, made of the views of a smaller one repeated, for functions that count."""
-    views = capture.train_views
-    return replace(capture, views=tuple(views[k % len(views)] for k in range(count)))

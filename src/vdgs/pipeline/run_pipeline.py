@@ -19,7 +19,7 @@ from vdgs.evaluation.lpips import check_weights_file
 from vdgs.evaluation.measured_as import evaluation_folder, is_evaluated
 from vdgs.pipeline.count_visibility import count_run_visibility
 from vdgs.pipeline.evaluate_stage import EvaluationRequest, evaluate_stage
-from vdgs.pipeline.image_size import open_at_suitable_size
+from vdgs.pipeline.image_size import choose_for_photographs, choose_image_size, names_size
 from vdgs.pipeline.merge_blocks import merge_run_blocks
 from vdgs.pipeline.partition_stage import partition_run
 from vdgs.pipeline.train_blocks import train_blocks
@@ -31,7 +31,9 @@ from vdgs.report.write_report import write_report
 from vdgs.runs.create_or_resume import exclusive_run
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
+from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.run_request import is_image_input, make_sfm_request
+from vdgs.sfm.sfm_estimate import SfmEstimate
 from vdgs.system.atomic_files import read_json
 from vdgs.system.documents import EvaluationMetrics
 from vdgs.system.stop_signals import check_stop_requested
@@ -47,17 +49,19 @@ def run_pipeline(request: RunRequest, console: Console, command: str | None = No
     check_ranges(request)
     check_weights_file(request.lpips_weights)
     check_output(request.output)
-    request, capture = open_at_suitable_size(reconstruct_if_needed(request, console, command), console)
+    choice = choose_image_size(reconstruct_if_needed(request, console, command), console)
+    request = choice.request
     with exclusive_run(
         request.capture, request.output, request.options, request.method(), overwrite=request.overwrite,
-        command=command, capture=capture,
+        command=command, capture=choice.capture,
     ) as context:  # fmt: skip
         _stages(context, request, console)
     console.print(escape(next_line(full_run_status(context.run))), highlight=False)
 
 
 def reconstruct_if_needed(run_request: RunRequest, console: Console, command: str | None = None) -> RunRequest:
-    """The request with a capture: photographs alone become one in RUN/capture first.
+    """The request with a capture: photographs alone become one in RUN/capture first, at a size that is chosen before,
+    with the time of the whole job, where nobody names one.
 
     Raises what `reconstruct` raises, RunError where another process drives the run, and VdgsError for settings that do
     not work, before the long work.
@@ -69,13 +73,16 @@ def reconstruct_if_needed(run_request: RunRequest, console: Console, command: st
     check_config(run_request.method())
     _title(console, "photographs")
     request = make_sfm_request(run_request)
-    reconstruct(request, console, RunFolder(run_request.output), command)
-    return replace(
-        run_request,
-        capture=request.output,
-        extra_image_folders=(),
-        options=replace(run_request.options, gps=None, scale_bar=None),
-    )
+    chosen = run_request
+
+    def choose(plan: ReconstructionPlan, sfm: SfmEstimate) -> None:
+        nonlocal chosen
+        if not names_size(run_request):
+            chosen = choose_for_photographs(run_request, plan, sfm, console).request
+
+    reconstruct(request, console, RunFolder(run_request.output), command, on_estimate=choose)
+    options = replace(chosen.options, gps=None, scale_bar=None)
+    return replace(run_request, capture=request.output, extra_image_folders=(), options=options)
 
 
 def _stages(context: RunContext, request: RunRequest, console: Console) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,8 +11,9 @@ import cv2
 import numpy as np
 import torch
 
-from vdgs.captures.capture import Capture
+from vdgs.captures.capture import Capture, View
 from vdgs.captures.image_cache import ImageCache
+from vdgs.captures.image_files import decode_image
 from vdgs.config.method import AnchorConfig, TrainConfig
 from vdgs.errors import VdgsError
 from vdgs.model.anchors import Anchors
@@ -25,14 +26,14 @@ from vdgs.system.stop_signals import check_stop_requested
 from vdgs.training import TrainingProblem, train
 
 #: Steps at each size that are timed at least, the first of them not; then as many as fit into so many seconds.
-MIN_TIMED_STEPS, MAX_TIMED_SECONDS = 4, 1.5
+MIN_TIMED_STEPS, MAX_TIMED_SECONDS = 8, 1.5
 #: What anchors gain where growth decides often, as a share of their number, in photographs of `USUAL_TEXTURE`, with the
 #: square of the texture; how many times as many they become in blocks whose growth is compensated below a fixed T_low;
 #: and after how many decisions half of that is reached. Measured (`laptop`, texture): 1.4 times at 13, 1.7 and 1.9 at
 #: 17 and 16, 4.6 at 34; 1.8 and 2.3 times at 17 with 100 000 iterations; compensated blocks 6 and 12 times.
 PLAIN_GAIN, USUAL_TEXTURE, COMPENSATED_GROWTH, HALF_GROWTH_DECISIONS = 1.3, 17.0, 9.0, 8
-#: Photographs whose texture is measured, about.
-TEXTURE_VIEWS = 6
+#: Photographs whose steps are timed and whose texture is measured; by how much the sides of small ones are shrunk.
+PROBED_VIEWS, SMALL_FACTOR = 6, 4
 #: Textures beyond these tell no more.
 TEXTURE_RANGE = (8.0, 36.0)
 #: Share of a photograph's stereo that confirming its depths adds to finding them.
@@ -45,31 +46,31 @@ COARSE_VIEW_STEPS, MERGED_VIEW_STEPS, MAP_STEPS, START_SECONDS, OTHER_SECONDS = 
 
 @dataclass(frozen=True, kw_only=True)
 class StepTimes:
-    """What a training step takes."""
+    """What a training step takes: some for its anchors and calls, and as much again for each pixel."""
 
-    by_downscale: Mapping[int, Cost]
+    fixed: Cost
+    per_pixel: Cost
     anchor_share: float
-    """Of the time of a step at the largest size, what goes with the number of anchors."""
+    """Of the time of a step at the size that was timed, what goes with the number of anchors."""
     slowdown: float
-    texture: float
-    """Of the photographs (`measure_texture`)."""
 
-    @property
-    def at_full_size(self) -> Cost:
-        return self.by_downscale[min(self.by_downscale)]
+    def step(self, pixels: float) -> Cost:
+        """A step of a photograph of so many pixels."""
+        return self.fixed + self.per_pixel * pixels
 
-    def stage(self, config: TrainConfig, start: float = 1.0) -> Cost:
+    def stage(self, config: TrainConfig, pixels: int, texture: float, room: float, start: float = 1.0) -> Cost:
         """All steps of a stage, each at the size that the schedule gives it, with anchors that grow from `start` times
         as many as were timed."""
         ends = [begin for begin, _ in config.resolution_schedule[1:]] + [1.0]
         total = NO_COST
         for (begin, factor), end in zip(config.resolution_schedule, ends, strict=True):
-            total += self.by_downscale[factor] * (config.iterations * max(0.0, end - begin))
-        return total * (1 + self.anchor_share * (start * mean_growth(config, self.texture) - 1))
+            total += self.step(pixels / factor**2) * (config.iterations * max(0.0, end - begin))
+        return total * (1 + self.anchor_share * (start * mean_growth(config, texture, room) - 1))
 
 
-def expected_growth(config: TrainConfig, texture: float) -> float:
-    """How many times their number anchors become in a stage, by estimate."""
+def expected_growth(config: TrainConfig, texture: float, room: float) -> float:
+    """How many times their number anchors become in a stage, by estimate. `room` is how many anchors there is a pixel
+    for, of a photograph, for each that it shows at the start: plain growth ends where each has its pixel."""
     densify = config.densify
     decisions = max(0.0, (densify.stop_fraction * config.iterations - densify.start) / densify.every)
     if not densify.num_levels:
@@ -77,48 +78,60 @@ def expected_growth(config: TrainConfig, texture: float) -> float:
     gain = PLAIN_GAIN * (float(np.clip(texture, *TEXTURE_RANGE)) / USUAL_TEXTURE) ** 2
     if max_growth_factor(config.compensation) != MAX_GROWTH:
         gain = COMPENSATED_GROWTH - 1
-    return 1 + gain * decisions / (decisions + HALF_GROWTH_DECISIONS)
+        room = np.inf
+    return 1 + min(gain * decisions / (decisions + HALF_GROWTH_DECISIONS), max(0.0, room - 1))
 
 
-def measure_texture(images: ImageCache) -> float:
-    """Mean absolute Laplacian of photographs at the size that is trained on, in grey levels."""
-    found = []
-    for index in range(0, len(images.views), max(1, len(images.views) // TEXTURE_VIEWS)):
-        gray = cv2.cvtColor(images.get(index).image.numpy(), cv2.COLOR_RGB2GRAY).astype(np.float32)
-        found.append(float(np.abs(cv2.Laplacian(gray, cv2.CV_32F)).mean()))
-    return float(np.mean(found))
+def measure_textures(views: Sequence[View], factors: Sequence[float]) -> dict[float, float]:
+    """Mean absolute Laplacian of photographs, shrunk from the size of their cameras by each factor, in grey levels."""
+    found: dict[float, list[float]] = {factor: [] for factor in factors}
+    for view in probed_views(views):
+        whole = cv2.cvtColor(decode_image(view.image_path)[0], cv2.COLOR_RGB2GRAY)
+        for factor in factors:
+            size = (max(1, int(view.camera.width / factor)), max(1, int(view.camera.height / factor)))
+            gray = cv2.resize(whole, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+            found[factor].append(float(np.abs(cv2.Laplacian(gray, cv2.CV_32F)).mean()))
+    return {factor: float(np.mean(values)) for factor, values in found.items()}
 
 
-def mean_growth(config: TrainConfig, texture: float) -> float:
+def probed_views(views: Sequence[View]) -> list[View]:
+    """A few from all over the capture: so few are decoded before steps are timed, as in training most of them are."""
+    return [views[k] for k in np.unique(np.linspace(0, len(views) - 1, PROBED_VIEWS).round().astype(int))]
+
+
+def mean_growth(config: TrainConfig, texture: float, room: float) -> float:
     """The mean over the steps of a stage: anchors grow from the first decision to the last."""
     first = min(1.0, config.densify.start / max(1, config.iterations))
     middle = (first + max(first, config.densify.stop_fraction)) / 2
-    return 1 + (expected_growth(config, texture) - 1) * (1 - middle)
+    return 1 + (expected_growth(config, texture, room) - 1) * (1 - middle)
 
 
-def time_steps(
-    stage: TrainingProblem, anchors: Anchors, images: ImageCache, factors: list[int], fit_exposures: bool
-) -> StepTimes:
-    """Train a few steps at each size, and with half of the anchors at the largest."""
-    timed, slowdowns = {}, []
-    for factor in factors:
-        timed[factor], slowdown = _step_cost(stage, anchors, factor, fit_exposures)
-        slowdowns.append(slowdown)
-    largest = min(factors)
+def time_steps(stage: TrainingProblem, anchors: Anchors, fit_exposures: bool) -> StepTimes:
+    """Train a few steps of whole photographs, of smaller ones, and with half of the anchors."""
+    full, slowdown = _step_cost(stage, anchors, 1, fit_exposures)
+    fewer_pixels, _ = _step_cost(stage, anchors, SMALL_FACTOR, fit_exposures)
     half = anchors.select(torch.arange(len(anchors)) % 2 == 0)
-    fewer, _ = _step_cost(stage, half, largest, fit_exposures) if len(half) else (timed[largest], 1.0)
-    share = 2 * (1 - fewer.processor_seconds / max(timed[largest].processor_seconds, 1e-9))
+    fewer_anchors = _step_cost(stage, half, 1, fit_exposures)[0] if len(half) else full
+    cameras = [stage.images.camera(0, factor) for factor in (1, SMALL_FACTOR)]
+    large, less = (camera.width * camera.height for camera in cameras)
+    slope = max(0.0, full.processor_seconds - fewer_pixels.processor_seconds) / max(1, large - less)
+    # What goes with pixels is shared by the threads as the whole step is.
+    clock = full.seconds / max(full.processor_seconds, 1e-9)
+    per_pixel = Cost(slope * clock, slope)
+    share = 2 * (1 - fewer_anchors.processor_seconds / max(full.processor_seconds, 1e-9))
     return StepTimes(
-        by_downscale=timed,
+        fixed=full + per_pixel * -large,
+        per_pixel=per_pixel,
         anchor_share=float(np.clip(share, 0.2, 1.0)),
-        slowdown=float(np.median(slowdowns)),
-        texture=measure_texture(images),
+        slowdown=slowdown,
     )
 
 
 def _step_cost(stage: TrainingProblem, anchors: Anchors, factor: int, fit_exposures: bool) -> tuple[Cost, float]:
     """Mean of the steps that are tried, without the first, which opens files; and how busy the machine was."""
     at_size = replace(stage, config=replace(stage.config, resolution_schedule=((0.0, factor),)))
+    for view in range(stage.num_images):
+        stage.images.get(view, factor)  # most steps of a stage find their photograph decoded
     moments = [Moment.now()]
 
     def enough() -> bool:
@@ -137,21 +150,24 @@ class _Enough(Exception):
 
 
 def time_stereo(capture: Capture, images: ImageCache, config: AnchorConfig) -> float:
-    """Processor seconds of the stereo of one photograph; 0 where no photograph can be matched."""
+    """Processor seconds of the stereo of one photograph, which is matched at one size however large it is; 0 where none
+    can be matched."""
     cameras = [view.camera for view in capture.train_views]
 
     def read(index: int) -> tuple[np.ndarray, np.ndarray | None]:
         return images.get(index).image.numpy(), None
 
+    moments = [Moment.now()]
+
     def stop(_done: int, _total: int) -> None:
+        moments.append(Moment.now())  # before the next photograph, which is begun, is matched
         check_stop_requested()
         raise _Enough
 
     inputs = StereoInputs(cameras, capture.points, capture.points, read)
-    before = Moment.now()
     try:
         with tempfile.TemporaryDirectory(prefix="vdgs-") as folder:
             compute_dense_points(inputs, fusion_cell(capture, config), Path(folder), stop)
     except (_Enough, VdgsError):
         pass
-    return Moment.now().cost_since(before).processor_seconds * (1 + CONFIRMING)
+    return moments[-1].cost_since(moments[0]).processor_seconds * (1 + CONFIRMING)

@@ -33,15 +33,19 @@ def create_or_resume_run(
     *,
     overwrite: bool | None = None,
     command: str | None = None,
+    capture: Capture | None = None,
 ) -> RunContext:
     """Open the capture and a new run of it, or the run that is there if it was started with the same settings.
 
     `overwrite` None compares the settings of the coarse stage only and refuses others; True or False is about changing
-    them (`RunFolder.change_settings`). `command` is the command line, saved in the run. Raises CaptureError for a
-    capture that cannot be used, RunError for other settings than the run's and for a run that another process drives,
-    VdgsError for settings that do not work and for an output among inputs.
+    them (`RunFolder.change_settings`). `command` is the command line, saved in the run; `capture` the one in the
+    folder, where it was read with these options before. Raises CaptureError for a capture that cannot be used,
+    RunError for other settings than the run's and for a run that another process drives, VdgsError for settings that
+    do not work and for an output among inputs.
     """
-    with exclusive_run(capture_path, output, capture_options, method, overwrite=overwrite, command=command) as context:
+    with exclusive_run(
+        capture_path, output, capture_options, method, overwrite=overwrite, command=command, capture=capture
+    ) as context:
         return context
 
 

@@ -125,6 +125,12 @@ def copy_features(workspace: Workspace, name: str, copy: str) -> None:
         database.write_descriptors(number, database.read_descriptors(image.image_id))
 
 
+def count_inliers(workspace: Workspace) -> list[int]:
+    """The matches of each pair that were verified."""
+    with workspace.open_database() as database:
+        return [int(count) for count in database.read_two_view_geometry_num_inliers()[1]]
+
+
 def count_verified_matches(workspace: Workspace, min_inliers: int = 15) -> dict[str, int]:
     """With how many others each photograph was matched for good, by its name."""
     with workspace.open_database() as database:

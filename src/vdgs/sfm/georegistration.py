@@ -158,14 +158,20 @@ def _best_fit(problem: Problem, taken: Sequence[ImageMetadata]) -> tuple[Positio
     targets = problem.targets.copy()
     targets[:, 2] = relative + np.median(targets[:, 2] - relative)
     steady = fit_positions(replace(problem, targets=targets, has_altitudes=True))
-    if not problem.has_altitudes:
-        return (steady, True) if steady.altitude == "used" else (fit, False)
-    return (steady, True) if steady.altitude == "used" and steady.score < fit.score else (fit, False)
+    if steady.altitude != "used" or (problem.has_altitudes and steady.score >= fit.score):
+        return fit, False
+    if problem.has_altitudes:  # they alone say how high the take-off is, with all of their drift
+        across, up = steady.place_error_m
+        steady = replace(steady, place_error_m=(across, max(up, fit.place_error_m[1])), drift_m=fit.drift_m)
+    return steady, True
 
 
 def _of_altitudes(fit: PositionFit, barometer: bool) -> list[str]:
     if barometer:
-        return ["altitudes drift against the heights over the take-off, which are used in their place."]
+        return [
+            "altitudes drift against the heights over the take-off, which are used in their place: heights above the "
+            f"sea are only good to ±{fit.place_error_m[1]:.0f} m."
+        ]
     if fit.altitude == "drifts":
         return [
             f"the recorded altitudes drift by {fit.drift_m:+.0f} m from the first photograph to the last: that is left "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -54,7 +54,7 @@ from vdgs.sfm.reconstruction_report import (
     exclusion_reasons,
     make_reconstruction_report,
 )
-from vdgs.sfm.sfm_estimate import estimate_sfm
+from vdgs.sfm.sfm_estimate import SfmEstimate, estimate_sfm
 from vdgs.sfm.source_images import SourceImages, check_unchanged
 from vdgs.sfm.step_keys import step_keys
 from vdgs.sfm.workspace import Workspace, silence_colmap
@@ -70,12 +70,17 @@ POSITIONS_FIGURE = "photographs.png"
 
 
 def reconstruct(
-    request: SfmRequest, console: Console, run: RunFolder | None = None, command: str | None = None
+    request: SfmRequest,
+    console: Console,
+    run: RunFolder | None = None,
+    command: str | None = None,
+    on_estimate: Callable[[ReconstructionPlan, SfmEstimate], None] | None = None,
 ) -> ReconstructionReport:
     """Make a capture of photographs in `request.output`, or go on with one that was begun.
 
     `run` is the run that the capture is for: this process drives it while anything is written, and what was trained on
-    another capture is deleted (`request.overwrite`). `command` is the command line, recorded for `vdgs status`. Raises
+    another capture is deleted (`request.overwrite`). `command` is the command line, recorded for `vdgs status`.
+    `on_estimate` is called before work that begins, once it is told. Raises
     CaptureError for photographs that cannot become a capture, RunError for a run that another process drives, VdgsError
     for an output that is something else, other photographs than before and a disk that is full. What was done is kept.
     """
@@ -107,6 +112,8 @@ def reconstruct(
     goes_on = work.is_begun("features", keys["features"])
     estimate = None if goes_on else estimate_sfm(prepared)
     print_plan(prepared, "" if estimate is None else estimate.text(prepared.threads), console)
+    if estimate is not None and on_estimate is not None:
+        on_estimate(prepared, estimate)
     with _writing(request, run):
         sources.write(output)
         if estimate is not None:

@@ -47,13 +47,13 @@ class Moment:
     def now() -> Moment:
         return Moment(time.monotonic(), time.thread_time(), time.process_time())
 
-    def cost_since(self, before: Moment, threads: int = 0) -> Cost:
+    def cost_since(self, before: Moment, threads: float = 0) -> Cost:
         """What was done between two moments. By the clock it takes as long as the calling thread computed, which waits
         for no processor on an idle machine; or, where `threads` share the work, as long as they take together."""
         processor = self.process - before.process
         return Cost(processor / threads if threads else self.thread - before.thread, processor)
 
-    def slowdown_since(self, before: Moment, threads: int = 0) -> float:
+    def slowdown_since(self, before: Moment, threads: float = 0) -> float:
         """How many times as long it took as it would on an idle machine."""
         idle = self.cost_since(before, threads).seconds
         return max(1.0, (self.clock - before.clock) / idle) if idle > 0 else 1.0

@@ -1,0 +1,223 @@
+"""What a run takes at each size of its photographs, by one probe: time and memory, before it begins.
+
+Steps are timed at one size; those of the others follow, for a step takes so much for its anchors and calls and so much
+for each pixel (`StepTimes`). The choice of a size and `vdgs run --dry-run` have the same figures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from vdgs.captures.capture import Capture
+from vdgs.captures.image_cache import ImageCache
+from vdgs.config.commands import RunRequest
+from vdgs.config.method import MethodConfig, block_train_config
+from vdgs.distributed.resource_allocation import Allocation, ShardWorkload, allocate_local, exceeds_memory
+from vdgs.geometry.camera import Camera
+from vdgs.kernels import get_num_threads
+from vdgs.model.initialization.initialize import initialize_anchors
+from vdgs.partition.partition_scene import choose_block_count
+from vdgs.pipeline.dense_points import PIXELS_PER_POINT
+from vdgs.pipeline.time_estimate import (
+    COARSE_VIEW_STEPS,
+    MAP_STEPS,
+    MERGED_VIEW_STEPS,
+    OTHER_SECONDS,
+    SMALL_FACTOR,
+    START_SECONDS,
+    StepTimes,
+    expected_growth,
+    measure_textures,
+    probed_views,
+    time_steps,
+    time_stereo,
+)
+from vdgs.pipeline.train_coarse import build_coarse_problem, initial_coarse_state
+from vdgs.rendering.ortho.map_status import has_ortho_dependencies
+from vdgs.system.memory.memory_estimate import (
+    TrainingWorkload,
+    block_workload,
+    decoded_image_bytes,
+    estimate_memory,
+    max_image_pixels,
+)
+from vdgs.system.memory.process_memory import available_memory_bytes
+from vdgs.system.processor_time import NO_COST, Cost, describe_cost
+from vdgs.training.session.memory_advice import training_workload
+from vdgs.training.session.trainer import image_cache_bytes
+
+START = Cost(START_SECONDS, START_SECONDS)
+#: Steps are timed at the largest size of so many pixels at most.
+MAX_PROBED_PIXELS = 500_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunEstimate:
+    """What a run takes by estimate."""
+
+    anchors: int
+    dense_points: int
+    """The most that stereo may add to the sparse points; an anchor starts at each."""
+    blocks: int
+    coarse_iterations: int
+    block_iterations: int
+    """Of one block, where all have equally many images and no step draws a crop."""
+    jobs: int
+    free_bytes: int
+    coarse_bytes: int
+    block_bytes: int
+    images_bytes: int
+    """Of one block, beside `block_bytes`."""
+    may_exceed_memory: bool
+    growth: tuple[float, float]
+    """How many times their number anchors become in the coarse stage, and in a block."""
+    times: Mapping[str, Cost]
+    """What each stage takes: photographs, stereo, coarse, blocks, measuring, maps, other."""
+    slowdown: float
+    """How many times as long it takes as busy as the machine is now."""
+
+    @property
+    def total(self) -> Cost:
+        return sum(self.times.values(), NO_COST)
+
+    def text(self) -> str:
+        """How long it takes."""
+        return describe_cost(self.total, get_num_threads(), self.slowdown)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is to be trained: a capture, or one that stands for the photographs of which one will be made."""
+
+    timed: Capture
+    """Whose steps are timed."""
+    cameras: Sequence[Camera]
+    """Of all training photographs, at the largest size that may be used."""
+    test_views: int
+    points: int
+    views_per_point: float = 8.0
+    """By how many photographs a place is seen."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Probe:
+    """What was measured of a scene."""
+
+    steps: StepTimes
+    textures: Mapping[float, float]
+    """At each size, by how much its sides are shrunk from the cameras of the scene."""
+    stereo: float
+    """Processor seconds of the stereo of a photograph."""
+    workload: TrainingWorkload
+    """Of the coarse stage, from the sparse points alone."""
+
+
+def probe(scene: Scene, method: MethodConfig, request: RunRequest, factors: Sequence[float]) -> Probe:
+    """Time steps at one of the sizes, and measure what differs from size to size: seconds."""
+    config, capture = method.training, scene.timed
+    first = capture.train_views[0].camera
+    pixels = first.width * first.height
+    at = next((each for each in sorted(factors) if pixels / each**2 <= MAX_PROBED_PIXELS), max(factors))
+    views = [replace(view, camera=_shrunk([view.camera], at)[0]) for view in probed_views(capture.train_views)]
+    budget = image_cache_bytes(request.checkpointing)
+    one_size = replace(config, resolution_schedule=((0.0, SMALL_FACTOR),))
+    cameras = [view.camera for view in capture.train_views]
+    with ImageCache(views, budget, downscales=(1, SMALL_FACTOR)) as images:
+        stage, _ = build_coarse_problem(replace(capture, views=tuple(views)), one_size, images, request.device)
+        anchors, _ = initialize_anchors(capture.points, capture.point_colors, cameras, config.anchors)
+        workload = training_workload(initial_coarse_state(anchors, stage, config.exposure_compensation), stage)
+        steps = time_steps(stage, anchors, config.exposure_compensation)
+    stereo = 0.0
+    if config.anchors.mvs and _dense_room(scene, min(factors)):
+        with ImageCache(capture.train_views, budget) as images:
+            stereo = time_stereo(capture, images, config.anchors)
+    return Probe(
+        steps=steps, textures=measure_textures(capture.train_views, factors), stereo=stereo, workload=workload
+    )  # fmt: skip
+
+
+def estimate_at(scene: Scene, probed: Probe, method: MethodConfig, request: RunRequest, factor: float) -> RunEstimate:
+    """What the run takes with photographs whose sides are shrunk by `factor` from the cameras of the scene."""
+    config, views, steps = method.training, len(scene.cameras), probed.steps
+    cameras, texture = _shrunk(scene.cameras, factor), probed.textures[factor]
+    dense = _dense_room(scene, factor) if config.anchors.mvs else 0
+    stereo = views * probed.stereo if dense else 0.0
+    share = scene.points / max(1, len(scene.timed.points))
+    images_bytes = decoded_image_bytes(cameras)
+    sparse = replace(
+        probed.workload,
+        anchors=round(share * probed.workload.anchors),
+        pixels=max_image_pixels(cameras, config.resolution_schedule),
+        image_cache_bytes=min(images_bytes, image_cache_bytes(request.checkpointing)),
+    )
+    need = replace(sparse, anchors=sparse.anchors + dense)
+    free = available_memory_bytes()
+    pixels = max_image_pixels(cameras, method.block.resolution_schedule)
+    blocks = choose_block_count(need.max_grown_anchors, views, pixels, method)
+    largest = block_workload(method, -(-need.max_grown_anchors // blocks), need.max_grown_anchors, pixels)
+    block_bytes, coarse_bytes = estimate_memory(largest).total, estimate_memory(need).total
+    work = ShardWorkload(
+        shards=blocks, shard_bytes=block_bytes, jobs=request.jobs, image_gb=request.checkpointing.image_cache_gb,
+        images_bytes=images_bytes,
+    )  # fmt: skip
+    local = allocate_local(work, get_num_threads(), free)
+    block = block_train_config(method, max(1, round(views * min(1.0, 1.5 / blocks))))
+    more = 1 + dense / max(sparse.anchors, 1) / 2  # stereo fills half of what it may, where it fills any
+    drawn = cameras[0].width * cameras[0].height
+    room = drawn / max(1.0, probed.workload.seen * sparse.anchors * more)
+    growth = expected_growth(config, texture, room)
+    times = {
+        "stereo": Cost(stereo / get_num_threads(), stereo),
+        "coarse": steps.stage(config, drawn, texture, room, more),
+        "blocks": _side_by_side(
+            (steps.stage(block, drawn, texture, room / growth, more * growth) + START) * blocks, local
+        ),
+        **_other_times(scene, steps.step(drawn), bool(request.ortho)),
+    }
+    return RunEstimate(
+        anchors=sparse.anchors,
+        dense_points=dense,
+        blocks=blocks,
+        coarse_iterations=config.iterations,
+        block_iterations=block.iterations,
+        jobs=local.max_concurrent,
+        free_bytes=free,
+        coarse_bytes=coarse_bytes,
+        block_bytes=block_bytes,
+        images_bytes=min(images_bytes, round(1e9 * local.image_gb)),
+        may_exceed_memory=coarse_bytes > free or exceeds_memory(work, local.max_concurrent, free),
+        growth=(growth, expected_growth(block, texture, room / growth)),
+        times=times,
+        slowdown=steps.slowdown,
+    )
+
+
+def _shrunk(cameras: Sequence[Camera], factor: float) -> list[Camera]:
+    return [
+        camera.resized(max(1, int(camera.width / factor)), max(1, int(camera.height / factor))) for camera in cameras
+    ]
+
+
+def _dense_room(scene: Scene, factor: float) -> int:
+    """The most points that stereo may add to those that there are, or will be."""
+    pixels = sum(camera.width * camera.height for camera in _shrunk(scene.cameras, factor))
+    return max(0, pixels // PIXELS_PER_POINT - scene.points)
+
+
+def _side_by_side(cost: Cost, allocation: Allocation) -> Cost:
+    """Blocks that are trained at once share the processors better than the threads of one do."""
+    if allocation.max_concurrent == 1:
+        return cost
+    return Cost(cost.processor_seconds / get_num_threads(), cost.processor_seconds)
+
+
+def _other_times(scene: Scene, step: Cost, ortho: bool) -> dict[str, Cost]:
+    """What is drawn and measured, by what steps take, and the rest."""
+    views = len(scene.cameras) + scene.test_views
+    maps = MAP_STEPS * views / scene.views_per_point if ortho and has_ortho_dependencies() else 0.0
+    return {
+        "measuring": step * (scene.test_views * (COARSE_VIEW_STEPS + MERGED_VIEW_STEPS)),
+        "maps": step * maps,
+        "other": Cost(OTHER_SECONDS, OTHER_SECONDS),
+    }
