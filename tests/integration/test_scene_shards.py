@@ -26,6 +26,7 @@ from vdgs.export.bake_io import (
 from vdgs.export.color_refinement import ColorResidual
 from vdgs.export.formats.gaussian_store import flatten, open_store, unflatten
 from vdgs.pipeline import run_pipeline
+from vdgs.rendering.ortho.ortho_plan import FILE_NAMES
 from vdgs.rendering.ortho.tile_renderer import OrthoTile
 from vdgs.rendering.ortho.tile_shards import load_tile, save_tile
 from vdgs.runs.run_context import RunContext
@@ -41,7 +42,7 @@ def mapped(uncut, tmp_path_factory) -> dict[str, object]:
     done = vdgs("ortho", uncut, *FINE, "--output", folder)
     assert done.returncode == 0, done.stderr + done.stdout
     files = evaluated(folder)
-    assert files.keys() == {"dsm.tif", "hillshade.png", "map.json", "orthophoto.tif", "preview.png", "visibility.tif"}
+    assert files.keys() == set(FILE_NAMES)
     return files
 
 

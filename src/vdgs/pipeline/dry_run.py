@@ -20,6 +20,7 @@ from vdgs.config.ranges import check_ranges
 from vdgs.config.validation_rules import check_config
 from vdgs.errors import VdgsError
 from vdgs.pipeline.image_size import choose_for_photographs, choose_image_size, estimate_capture
+from vdgs.pipeline.run_estimate import RunEstimate
 from vdgs.pipeline.time_estimate import (
     START_SECONDS,
 )
