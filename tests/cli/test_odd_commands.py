@@ -54,7 +54,7 @@ def test_an_empty_path_is_not_the_folder_here(verb, option, word, tmp_path, monk
     with pytest.raises(SystemExit) as ended:
         main(command(verb, option, word))
     assert ended.value.code == 2
-    assert "nothing: must be" in capsys.readouterr().err
+    assert "needs a value" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 

@@ -155,7 +155,12 @@ def test_photographs_are_not_made_a_capture_under_a_run_that_is_driven(tmp_path)
         place = np.array([10.0 * (k % 3), 12.0 * (k // 3), 40.0 + k % 2])
         write_photograph(photographs / f"p{k}.jpg", np.roll(noise, k, axis=0), k, place)
     request = RunRequest(
-        capture=photographs, output=run.path, preset="laptop", threads=1, training=PRESETS["laptop"].training
+        capture=photographs,
+        output=run.path,
+        preset="laptop",
+        threads=1,
+        device="cpu",
+        training=PRESETS["laptop"].training,
     )
     with driven_elsewhere(run), pytest.raises(RunError, match=AT_WORK):
         reconstruct_if_needed(request, Console(file=io.StringIO()))

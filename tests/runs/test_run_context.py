@@ -19,7 +19,7 @@ from vdgs.distributed import backend_selection
 from vdgs.distributed.executor import Task, TaskListener, TaskResult
 from vdgs.errors import VdgsError
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.pipeline import image_size
+from vdgs.pipeline import image_size, time_estimate
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
 
@@ -78,7 +78,9 @@ def test_one_run_reads_its_capture_once_and_each_block_once(tmp_path, reads, mon
     write_colmap(tmp_path / "capture", tiny_scene())
     if smaller:
         monkeypatch.setattr(image_size, "MIN_SIDE", 1)
-        monkeypatch.setattr(image_size, "PIXELS_PER_CORE_SECOND", 1.0)
+        monkeypatch.setattr(image_size, "MAX_SECONDS", 0.0)
+        monkeypatch.setattr(image_size, "DOWNSCALES", (1, 2))
+        monkeypatch.setattr(time_estimate, "MAX_TIMED_SECONDS", 0.0)
     command("run", tmp_path / "capture", "--output", tmp_path / "run", *SETTINGS)
     assert reads.captures == {"driver": 1, "block 00": 1, "block 01": 1}
     assert (RunFolder(tmp_path / "run").settings().capture.downscale > 1) == smaller
