@@ -65,7 +65,7 @@ def disk(tmp_path) -> Iterator[SmallDisk]:
         subprocess.run(["umount", "-l", str(folder)], check=True)
 
 
-def fails_then_works(
+def assert_fails_then_works(
     disk: SmallDisk, free_bytes: int, *command: object, prepare: Callable[[], None] | None = None
 ) -> None:
     """The law: words instead of traces, exit code 1, what was there stays whole, no leftovers, then the same command
@@ -98,7 +98,7 @@ def test_every_stage_of_a_run_says_that_the_disk_is_full_and_continues_to_the_sa
         ("eval", run),
         ("report", run),
     ):
-        fails_then_works(disk, free, *command)
+        assert_fails_then_works(disk, free, *command)
     for model in ("coarse/model.safetensors", "merged/model.safetensors"):
         assert (run / model).read_bytes() == (native_small.whole / model).read_bytes()
 
@@ -125,7 +125,7 @@ def test_files_for_others_are_whole_or_absent(disk, native_small, command):
             word = word.replace(name, str(path))
         return word
 
-    fails_then_works(disk, 4 << 10, *map(place, command))
+    assert_fails_then_works(disk, 4 << 10, *map(place, command))
 
 
 def expect_room() -> None:
@@ -140,7 +140,7 @@ def test_maps_are_whole_or_absent(disk, native_small, free_bytes, prepare):
     """Before they begin, while tiles are written, and after."""
     pytest.importorskip("rasterio")
     command = ("ortho", native_small.whole, "--output", disk.folder / "maps", "--gsd", "0.1")
-    fails_then_works(disk, free_bytes, *command, prepare=prepare)
+    assert_fails_then_works(disk, free_bytes, *command, prepare=prepare)
 
 
 @pytest.mark.parametrize(

@@ -21,9 +21,6 @@ from vdgs.config.validation_rules import check_config
 from vdgs.errors import VdgsError
 from vdgs.pipeline.image_size import choose_for_photographs, choose_image_size, estimate_capture
 from vdgs.pipeline.run_estimate import RunEstimate
-from vdgs.pipeline.time_estimate import (
-    START_SECONDS,
-)
 from vdgs.runs.config_file import changed_flags
 from vdgs.runs.create_or_resume import capture_options_changed, run_settings
 from vdgs.runs.run_folder import RunFolder
@@ -32,10 +29,7 @@ from vdgs.sfm.reconstruction_plan import plan_reconstruction, print_plan
 from vdgs.sfm.run_request import is_image_input, make_sfm_request
 from vdgs.sfm.sfm_estimate import estimate_sfm
 from vdgs.system.atomic_files import read_json
-from vdgs.system.processor_time import Cost
 from vdgs.system.units import data_size, rough_duration
-
-START = Cost(START_SECONDS, START_SECONDS)
 
 
 def estimate_run(request: RunRequest, console: Console) -> RunEstimate:
@@ -66,7 +60,7 @@ def _estimate_from_images(run_request: RunRequest, console: Console) -> RunEstim
     """The whole job of photographs alone; of a capture that was made of them before, what remains."""
     request = make_sfm_request(run_request)
     if read_reconstruction(request.output) is not None:
-        options = replace(run_request.options, gps=None)
+        options = replace(run_request.options, gps=None, scale_bar=None)
         with_capture = replace(run_request, capture=request.output, extra_image_folders=(), options=options)
         return estimate_run(with_capture, console)
     plan = plan_reconstruction(request)

@@ -15,7 +15,7 @@ from vdgs.captures.capture import Capture, View
 from vdgs.captures.image_cache import ImageCache
 from vdgs.captures.image_files import decode_image
 from vdgs.config.method import AnchorConfig, TrainConfig
-from vdgs.errors import VdgsError
+from vdgs.errors import Stopped, VdgsError
 from vdgs.model.anchors import Anchors
 from vdgs.model.initialization.stereo import StereoInputs, compute_dense_points
 from vdgs.pipeline.dense_points import fusion_cell
@@ -168,6 +168,8 @@ def time_stereo(capture: Capture, images: ImageCache, config: AnchorConfig) -> f
     try:
         with tempfile.TemporaryDirectory(prefix="vdgs-") as folder:
             compute_dense_points(inputs, fusion_cell(capture, config), Path(folder), stop)
+    except Stopped:
+        raise
     except (_Enough, VdgsError):
-        pass
+        pass  # what stereo cannot do is a matter of the run; the time until then counts
     return moments[-1].cost_since(moments[0]).processor_seconds * (1 + CONFIRMING)

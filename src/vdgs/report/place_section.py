@@ -8,8 +8,8 @@ from vdgs.captures.place_record import PlaceFacts, format_area, place_rows
 from vdgs.errors import RunError
 from vdgs.report.embedded_images import EmbeddedImage
 from vdgs.report.html_page import Html, Overlay, facts_table, map_figure, paragraph, side_by_side
-from vdgs.report.report_status import PLACE_FILE
 from vdgs.report.run_reader import JsonRecord, ReportedRun, RunFiles
+from vdgs.runs.run_folder import PLACE_FILE
 from vdgs.system.records import record_from_dict
 from vdgs.system.units import floor_to_nice_length, format_length
 

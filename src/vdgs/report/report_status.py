@@ -5,8 +5,6 @@ from __future__ import annotations
 from vdgs.runs.run_folder import REPORT_FILE, RunFolder
 from vdgs.runs.run_status import RunStatus, StageStatus
 
-#: The facts of the place, in the folder of a run.
-PLACE_FILE = "place.json"
 #: Name of the meta element with the status of the run that the page shows; it stands within so many characters.
 STATUS_META_NAME, MAX_HEAD_CHARS = "vdgs-status", 2000
 

@@ -12,8 +12,8 @@ from rich.markup import escape
 from vdgs.captures.place_record import PlaceFacts, place_summary
 from vdgs.captures.reconstruction import PROGRESS_FILE, SFM_STAGE, WORK_FOLDER, is_finished
 from vdgs.errors import VdgsError
-from vdgs.report.report_status import PLACE_FILE, report_status
-from vdgs.runs.run_folder import REPORT_FILE, RunFolder
+from vdgs.report.report_status import report_status
+from vdgs.runs.run_folder import PLACE_FILE, REPORT_FILE, RunFolder
 from vdgs.runs.run_status import RunStatus, StageState, StageStatus, get_run_status
 from vdgs.runs.stage_folder import StatusRecord
 from vdgs.sfm.source_images import SourceImages, source_changes

@@ -161,4 +161,4 @@ class _Loader(yaml.SafeLoader):
 
 def load_yaml(text: str) -> Any:
     """What YAML says. Raises YAMLError, ValueError or RecursionError for what is none, and for names given twice."""
-    return yaml.load(text, _Loader)
+    return yaml.load(text, _Loader)  # a SafeLoader: makes plain values only, and runs nothing

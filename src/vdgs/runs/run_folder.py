@@ -22,8 +22,8 @@ from vdgs.system.quoting import shell_line, shell_word
 from vdgs.system.records import record_from_dict
 from vdgs.system.step_progress import StepProgress, StepRecord
 
-#: The page about a run, in its folder (`vdgs report`).
-REPORT_FILE = "report.html"
+#: The page about a run (`vdgs report`) and the facts of its place, in its folder.
+REPORT_FILE, PLACE_FILE = "report.html", "place.json"
 #: The folders of runs that this process drives.
 _driven = set[Path]()
 
@@ -53,7 +53,7 @@ class RunFolder:
 
     @property
     def place_file(self) -> Path:
-        return self.path / "place.json"
+        return self.path / PLACE_FILE
 
     @property
     def cameras_file(self) -> Path:
