@@ -16,6 +16,7 @@ from vdgs.cli.common import make_console
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RunRequest
 from vdgs.config.presets import PRESETS
+from vdgs.errors import Interrupted
 from vdgs.pipeline import dry_run, image_size, time_estimate
 from vdgs.pipeline.image_size import ImageSize, choose_image_size, image_sizes, largest_suitable
 from vdgs.pipeline.time_estimate import StepTimes, measure_textures
@@ -176,3 +177,12 @@ def test_what_a_person_says_and_a_run_that_is_there_are_kept(capture, tmp_path, 
     RunFolder(tmp_path / "run").create_or_check(RunSettings.create(capture, CaptureOptions(), PRESETS["laptop"]))
     assert choose_image_size(asked, make_console()).request == asked
     assert capsys.readouterr().out == ""
+
+
+def test_a_request_to_stop_ends_the_probe_of_stereo(capture, monkeypatch):
+    def stopped(*_: object) -> None:
+        raise Interrupted("stop")
+
+    monkeypatch.setattr(time_estimate, "compute_dense_points", stopped)
+    with pytest.raises(Interrupted):
+        time_estimate.time_stereo(load_capture(capture), SimpleNamespace(), PRESETS["laptop"].training.anchors)
