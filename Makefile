@@ -7,7 +7,7 @@ BIN     = $(VENV)/bin
 STAMP   = $(VENV)/.installed
 TEST_STAMP = $(VENV)/.installed-test
 INSTALL = PIP_CONSTRAINT=constraints.txt $(BIN)/python -m pip install --quiet --disable-pip-version-check
-SOURCES = $(shell find native src/vdgs/kernels/shared -name "*.h" -o -name "*.cpp") CMakeLists.txt pyproject.toml constraints.txt
+SOURCES = $(shell find src/vdgs/kernels/native src/vdgs/kernels/shared -name "*.h" -o -name "*.cpp") CMakeLists.txt pyproject.toml constraints.txt
 
 # torch's threads block instead of spinning beside the kernels' own.
 export OMP_WAIT_POLICY = PASSIVE

@@ -32,9 +32,7 @@ def is_there(name: str) -> bool:
     """A file by its path from the root or from the package, or by its last parts where the text says of which room."""
     if any((root / name).exists() for root in (ROOT, PACKAGE)):
         return True
-    return any(
-        next(root.rglob(name), None) for root in (PACKAGE, ROOT / "experiments", ROOT / "tests", ROOT / "native")
-    )
+    return any(next(root.rglob(name), None) for root in (PACKAGE, ROOT / "experiments", ROOT / "tests"))
 
 
 def can_be_imported(module: str, name: str) -> bool:

@@ -27,13 +27,13 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("kernels",),
     ("visibility",),
     ("captures", "model"),
-    ("ops", "partition", "synth"),
-    ("plots", "runs"),
+    ("partition", "synth"),
+    ("runs",),
     ("distributed", "evaluation", "sfm", "training"),
     ("export", "rendering", "report"),
     ("pipeline", "viewer"),
     ("cli",),
-    ("__main__", "api"),
+    ("__main__", "ops"),
 )
 #: The folders of the experiments, lowest first, as the rooms of a package of its own.
 EXPERIMENT_LAYERS: tuple[tuple[str, ...], ...] = (("baselines", "microbench"), ("bench",), ("reports",))

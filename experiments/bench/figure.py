@@ -15,7 +15,7 @@ from experiments.bench.plan import BenchPlan
 from experiments.bench.result_tables import group_bounds
 from experiments.bench.results import BenchResult
 from experiments.bench.statistics import Summary, summarize
-from vdgs.plots.style import ACCENT, DPI, INK, MUTED, draw_titles, style_axes
+from vdgs.system.figure_style import ACCENT, DPI, INK, MUTED, draw_titles, style_axes
 
 #: Colours and markers of the other methods, told apart without colour too.
 METHOD_COLORS = ("#1f6f8b", "#8ab17d", "#e0a030", "#7b5ea7", "#22262b", "#2a9d8f", "#b5838d", "#6c757d")

@@ -132,9 +132,9 @@ def _rows(case: Case, folder: Path) -> Work:
 
 
 def _figures(case: Case, folder: Path) -> Work:
-    from vdgs.plots.partition.block_maps import plot_anchor_visibility, plot_blocks
-    from vdgs.plots.partition.block_stats import plot_block_stats
-    from vdgs.plots.partition.score_heatmap import plot_scores
+    from vdgs.partition.plots.block_maps import plot_anchor_visibility, plot_blocks
+    from vdgs.partition.plots.block_stats import plot_block_stats
+    from vdgs.partition.plots.score_heatmap import plot_scores
 
     blocks, positions, views = _cut_site(case)
     cameras, used = synthetic_scene.flight(case.photographs), np.ones((case.photographs, len(blocks)), bool)

@@ -12,7 +12,6 @@ from matplotlib.colors import to_rgb
 
 from vdgs.config.commands import RenderRequest
 from vdgs.errors import VdgsError
-from vdgs.plots.style import VISIBILITY_CMAP
 from vdgs.rendering import render_folder
 from vdgs.rendering.render_run import _check
 from vdgs.rendering.scalar_maps import (
@@ -23,6 +22,7 @@ from vdgs.rendering.scalar_maps import (
     depth_scale,
     visibility_scale,
 )
+from vdgs.system.figure_style import VISIBILITY_CMAP
 
 SCALES = {
     "depth": depth_scale((31.7, 48.2), "m"),

@@ -290,8 +290,8 @@ def _vdgs(arguments: list[str], prepare: Callable[[], None] | None) -> None:
 
 def draw_small_figures() -> None:
     """Let this process draw figures of so few pixels as still makes files of them: what they show, others test."""
-    from vdgs.plots import style
     from vdgs.report import charts
+    from vdgs.system import figure_style as style
 
     style.DPI = charts.DPI = SMALL_DPI
 

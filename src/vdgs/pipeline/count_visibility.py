@@ -9,7 +9,7 @@ from dataclasses import asdict
 
 from rich.console import Console
 
-from vdgs.plots.partition import block_maps as figures
+from vdgs.partition.plots import block_maps as figures
 from vdgs.runs.open_run import check_has_anchors
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.visibility_store import load_or_count_visibility

@@ -42,8 +42,8 @@ from vdgs.partition.assignment.score_matrix import CameraScorer, ScoreMatrix, co
 from vdgs.partition.block_records import BlockCamerasRecord, PartitionRecord
 from vdgs.partition.blocks import Blocks, load_blocks, save_blocks, save_blocks_wgs84
 from vdgs.partition.partition_scene import partition_scene
+from vdgs.partition.plots import block_maps as figures
 from vdgs.partition.strategies import STRATEGIES, adjust_scores, assignment_config, cut_scene
-from vdgs.plots.partition import block_maps as figures
 from vdgs.runs.open_run import OpenedRun
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder

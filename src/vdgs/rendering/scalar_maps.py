@@ -17,11 +17,11 @@ from vdgs.evaluation.comparison_images import FAINT, INK, PAPER, load_font
 from vdgs.geometry.camera import Camera
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.renderer import render, render_scalar_map
-from vdgs.plots.style import VISIBILITY_CMAP
-from vdgs.plots.visibility_map import visibility_color_norm
 from vdgs.runs.open_run import OpenedModel
 from vdgs.runs.run_cameras import RunCameras
 from vdgs.runs.visibility_store import get_run_visibility
+from vdgs.system.figure_style import VISIBILITY_CMAP
+from vdgs.visibility.visibility_map import visibility_color_norm
 
 ScalarMapMode = Literal["depth", "visibility", "alpha"]
 

@@ -11,11 +11,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 
 from vdgs.captures.capture import Capture
-from vdgs.plots.style import DPI, INK, NOTE_SIZE, TEXT_SIZE, VISIBILITY_CMAP, style_axes, write_png
-from vdgs.plots.visibility_map import CameraMarks, VisibilityMapData, plot_visibility_map, visibility_color_norm
 from vdgs.report.capture_stats import CaptureReport
+from vdgs.system.figure_style import DPI, INK, NOTE_SIZE, TEXT_SIZE, VISIBILITY_CMAP, style_axes, write_png
 from vdgs.system.units import format_length
 from vdgs.visibility.visibility_counts import LOW_VISIBILITY_LIMITS
+from vdgs.visibility.visibility_map import CameraMarks, VisibilityMapData, plot_visibility_map, visibility_color_norm
 
 
 def draw_capture_map(

@@ -12,8 +12,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FuncFormatter, MaxNLocator
 
-from vdgs.plots.style import INK, MUTED
 from vdgs.report.embedded_images import EmbeddedImage
+from vdgs.system.figure_style import INK, MUTED
 
 FIGURE_SIZE, DPI = (4.8, 3.0), 160
 #: Curves of one diagram that a legend names at most, and points of a curve that are drawn.

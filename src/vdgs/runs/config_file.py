@@ -140,7 +140,7 @@ def _is_of_another_run(command: str, folder: Path) -> bool:
 def git_commit() -> str | None:
     """The commit of the checkout that this package runs from; None outside a checkout of vdgs."""
     root = Path(__file__).resolve().parents[3]
-    if not (root / ".git").exists() or not (root / "native").exists():
+    if not (root / ".git").exists() or not (root / "CMakeLists.txt").exists():
         return None
     command = ["git", "-C", str(root), "rev-parse", "HEAD"]
     try:

@@ -10,10 +10,10 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from vdgs.plots.style import ACCENT, DPI, INK, MUTED, TEXT_SIZE, style_axes
 from vdgs.sfm.georegistration import Georegistration
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.system.atomic_files import write_bytes
+from vdgs.system.figure_style import ACCENT, DPI, INK, MUTED, TEXT_SIZE, style_axes
 
 #: The longest arrow of a residual is drawn this share of the picture long at most.
 MAX_ARROW_SHARE = 0.12

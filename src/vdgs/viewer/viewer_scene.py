@@ -141,7 +141,7 @@ class ViewerScene:
 
 def block_rgb(block: int) -> tuple[int, int, int]:
     """The colour of a block in all figures, 0 to 255."""
-    from vdgs.plots.partition.block_stats import block_color  # brings matplotlib: not before the first picture
+    from vdgs.partition.plots.block_stats import block_color  # brings matplotlib: not before the first picture
 
     red, green, blue = bytes.fromhex(block_color(block).lstrip("#"))
     return red, green, blue

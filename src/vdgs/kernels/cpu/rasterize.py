@@ -1,4 +1,4 @@
-"""Splats to a picture, in C++ on the CPU (native/cpu/rasterize/rasterize.h)."""
+"""Splats to a picture, in C++ on the CPU (kernels/native/cpu/rasterize/rasterize.h)."""
 
 from __future__ import annotations
 

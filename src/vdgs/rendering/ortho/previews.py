@@ -16,13 +16,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from vdgs.geometry.map_projection import MapProjection
-from vdgs.plots.style import INK, MUTED, VISIBILITY_CMAP, draw_titles, new_figure, style_axes, write_png
-from vdgs.plots.visibility_map import visibility_color_norm
 from vdgs.rendering.ortho.geotiff import read_overview
 from vdgs.rendering.ortho.pixel_grid import PixelGrid
 from vdgs.rendering.ortho.tile_renderer import NODATA_COUNT, NODATA_HEIGHT
 from vdgs.system.documents import MapMetadata
+from vdgs.system.figure_style import INK, MUTED, VISIBILITY_CMAP, draw_titles, new_figure, style_axes, write_png
 from vdgs.system.units import floor_to_nice_length
+from vdgs.visibility.visibility_map import visibility_color_norm
 
 #: The sun of a hillshade: from the north-west, half way up, as on printed maps.
 AZIMUTH_DEG, ALTITUDE_DEG = 315.0, 45.0

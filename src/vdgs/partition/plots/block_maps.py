@@ -18,10 +18,20 @@ from matplotlib.path import Path as Outline
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.similarity import sample_points
 from vdgs.partition.blocks import Blocks
-from vdgs.plots import visibility_map
-from vdgs.plots.partition.block_stats import block_color, compute_block_stats, mix_color, plot_block_stats, std_note
-from vdgs.plots.partition.score_heatmap import plot_scores
-from vdgs.plots.style import INK, MUTED, NOTE_SIZE, TEXT_SIZE, draw_titles, new_figure, pluralize, style_axes, write_png
+from vdgs.partition.plots.block_stats import block_color, compute_block_stats, mix_color, plot_block_stats, std_note
+from vdgs.partition.plots.score_heatmap import plot_scores
+from vdgs.system.figure_style import (
+    INK,
+    MUTED,
+    NOTE_SIZE,
+    TEXT_SIZE,
+    draw_titles,
+    new_figure,
+    pluralize,
+    style_axes,
+    write_png,
+)
+from vdgs.visibility import visibility_map
 
 __all__ = ["plot_anchor_visibility", "plot_block_stats", "plot_blocks", "plot_scores"]
 

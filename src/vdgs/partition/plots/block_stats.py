@@ -14,7 +14,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
 from vdgs.partition.blocks import Blocks, xy_positions
-from vdgs.plots.style import INK, MUTED, draw_titles, new_figure, pluralize, style_axes, write_png
+from vdgs.system.figure_style import INK, MUTED, draw_titles, new_figure, pluralize, style_axes, write_png
 
 #: Colours of blocks 0 to 15; block 16 begins anew. Neighbours in the list differ most.
 BLOCK_PALETTE = (

@@ -19,12 +19,12 @@ from vdgs.config.method import PartitionConfig
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.partition.blocks import Block, Blocks
+from vdgs.partition.plots import block_maps as figures
+from vdgs.partition.plots.block_stats import BLOCK_PALETTE, block_color, compute_block_stats
+from vdgs.partition.plots.score_heatmap import sort_cameras
 from vdgs.pipeline.partition_stage import describe_partition
-from vdgs.plots.partition import block_maps as figures
-from vdgs.plots.partition.block_stats import BLOCK_PALETTE, block_color, compute_block_stats
-from vdgs.plots.partition.score_heatmap import sort_cameras
-from vdgs.plots.style import DPI, draw_titles
-from vdgs.plots.visibility_map import remove_speckles
+from vdgs.system.figure_style import DPI, draw_titles
+from vdgs.visibility.visibility_map import remove_speckles
 
 pytestmark = pytest.mark.slow
 

@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgb
 
-from vdgs.plots import style
-from vdgs.plots.style import ACCENT, INK, MUTED, NOTE_SIZE, TEXT_SIZE, pluralize
+from vdgs.system import figure_style as style
+from vdgs.system.figure_style import ACCENT, INK, MUTED, NOTE_SIZE, TEXT_SIZE, pluralize
 
 #: From no score to the highest; nothing in it resembles the mark of an assigned camera.
 SCORE_CMAP = LinearSegmentedColormap.from_list("score", ["#f1f3f5", "#a9c7d6", "#1f6f8b", "#14395b"])

@@ -18,8 +18,8 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 from scipy.ndimage import binary_closing, binary_opening, gaussian_filter, label
 
 from vdgs.geometry.camera import Camera
-from vdgs.plots import style
-from vdgs.plots.style import ACCENT, INK, NOTE_SIZE, TEXT_SIZE, VISIBILITY_CMAP, style_axes
+from vdgs.system import figure_style as style
+from vdgs.system.figure_style import ACCENT, INK, NOTE_SIZE, TEXT_SIZE, VISIBILITY_CMAP, style_axes
 from vdgs.visibility.visibility_counts import LOW_VISIBILITY_LIMITS, count_visibility
 
 GRID_CELLS = 240
