@@ -17,10 +17,10 @@ from experiments.bench.results import BenchResult
 from experiments.bench.statistics import Summary, summarize
 from vdgs.system.figure_style import ACCENT, DPI, INK, MUTED, draw_titles, style_axes
 
-#: Colours and markers of the other methods, told apart without colour too.
+#: Colors and markers of the other methods, told apart without color too.
 METHOD_COLORS = ("#1f6f8b", "#8ab17d", "#e0a030", "#7b5ea7", "#22262b", "#2a9d8f", "#b5838d", "#6c757d")
 MARKERS = ("s", "^", "v", "D", "P", "X", "<", ">")
-#: ... and where there are more methods than colours, those of each further round by their lines and hollow markers.
+#: ... and where there are more methods than colors, those of each further round by their lines and hollow markers.
 LINES = ("-", "--", ":")
 #: In the title of a panel.
 VISIBILITY_LABELS = {"truth": "true V", "model": "V by a coarse model"}

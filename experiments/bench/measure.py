@@ -74,7 +74,7 @@ def measure_groups(
 def pixel_values(
     render: UInt8[np.ndarray, "h w 3"], photograph: UInt8[np.ndarray, "h w 3"], mask: np.ndarray | None
 ) -> dict[str, np.ndarray]:
-    """Squared error and SSIM at every pixel [h, w], raw and after the colour correction."""
+    """Squared error and SSIM at every pixel [h, w], raw and after the color correction."""
     corrected = metrics.to_8bit(correct_colors(render, photograph, mask).image)
     return {
         "squared_error": metrics.squared_error(render, photograph),

@@ -81,7 +81,7 @@ _3DGS_LEAVES_OUT = (
     "exposure compensation, depth regularisation and anti-aliasing, which came later than its paper",
 )
 _3DGS_SCHEDULE = (
-    f"its schedule of {PUBLISHED_ITERATIONS:,} iterations (warm-up, degree of colour, start and interval of density "
+    f"its schedule of {PUBLISHED_ITERATIONS:,} iterations (warm-up, degree of color, start and interval of density "
     "control, resets of opacity) moves in proportion to the total here, but neither decides nor resets more "
     f"often than every {MIN_INTERVAL} iterations"
 )
@@ -145,7 +145,7 @@ _OTHERS = [
         GS3D_STAGES,
         citation=_3DGS,
         omissions=_3DGS_LEAVES_OUT,
-        differs=f"background of the mean colour of the photographs, as ours; {_3DGS_SCHEDULE}",
+        differs=f"background of the mean color of the photographs, as ours; {_3DGS_SCHEDULE}",
     ),
     BenchMethod(
         "3dgs-black",

@@ -87,7 +87,7 @@ _TABLE4 = _residence(
     }
 )  # fmt: skip
 
-#: Per table: row -> scene -> (PSNR, SSIM, LPIPS) after colour correction, A100.
+#: Per table: row -> scene -> (PSNR, SSIM, LPIPS) after color correction, A100.
 PAPER_NUMBERS: dict[str, dict[str, dict[str, MetricTriple]]] = {
     "table1": _TABLE1, "table2": _TABLE2, "toy": _TABLE2, "table3": _TABLE3, "table4": _TABLE4,
 }  # fmt: skip

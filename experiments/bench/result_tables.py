@@ -95,8 +95,8 @@ COVERAGE_COLUMNS = (
 )
 #: What makes rows comparable that are exposed and rows that are not.
 REFERENCE_EXPOSURE_NOTE = (
-    "All methods in the colours of one exposure for the whole place. Raw figures of methods that fit exposures are of "
-    "views drawn as their neighbours in the flight are exposed; those of the others are the same here as there."
+    "All methods in the colors of one exposure for the whole place. Raw figures of methods that fit exposures are of "
+    "views drawn as their neighbors in the flight are exposed; those of the others are the same here as there."
 )
 #: Over which pixels, and what the columns hold.
 COVERAGE_NOTE = (
@@ -130,11 +130,11 @@ def make_result_tables(plan: BenchPlan, results: Sequence[BenchResult]) -> list[
             plan,
             results,
             "corrected",
-            f"{views}, colour-corrected ({across})",
+            f"{views}, color-corrected ({across})",
             _for_scenes(plan, CORRECTED_COLUMNS),
             unseen,
         ),
-        *_neutral(plan, results, f"{views}, neutral colours ({across})"),
+        *_neutral(plan, results, f"{views}, neutral colors ({across})"),
     ]
     for scene in plan.scenes:
         in_scene = [result for result in results if result.scene == scene.name]
@@ -162,7 +162,7 @@ def make_result_tables(plan: BenchPlan, results: Sequence[BenchResult]) -> list[
 
 
 def _neutral(plan: BenchPlan, results: Sequence[BenchResult], title: str) -> list[ResultTable]:
-    """Quality in neutral colours, of all methods; nothing where no method is measured in others."""
+    """Quality in neutral colors, of all methods; nothing where no method is measured in others."""
     if all(result.figures.get("psnr_reference_exposure") is None for result in results):
         return []
     in_neutral = [replace(result, figures=_in_neutral_colors(result.figures)) for result in results]
@@ -179,7 +179,7 @@ def _neutral(plan: BenchPlan, results: Sequence[BenchResult], title: str) -> lis
 
 
 def _in_neutral_colors(figures: Mapping[str, float | None]) -> Mapping[str, float | None]:
-    """The figures with those in neutral colours, which are the raw ones where nothing else is said."""
+    """The figures with those in neutral colors, which are the raw ones where nothing else is said."""
     if figures.get("psnr_reference_exposure") is not None:
         return figures
     return {**figures, "psnr_reference_exposure": figures.get("psnr"), "ssim_reference_exposure": figures.get("ssim")}

@@ -18,9 +18,9 @@ from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.stage_folder import StatusRecord
 from vdgs.system.atomic_files import read_json
 
-#: What evaluations report, raw and after colour correction.
+#: What evaluations report, raw and after color correction.
 QUALITY_KEYS = ("psnr", "ssim", "lpips_vgg", "lpips_vgg_01", "psnr_cc", "ssim_cc", "lpips_vgg_cc", "lpips_vgg_01_cc")
-#: The same in neutral colours, of views that are drawn exposed as their neighbours in the flight.
+#: The same in neutral colors, of views that are drawn exposed as their neighbors in the flight.
 REFERENCE_EXPOSURE_KEYS = ("psnr_reference_exposure", "ssim_reference_exposure")
 #: Over the pixels that training cameras see: how opaque they are, PSNR by background, errors of depth; and veils.
 COVERAGE_KEYS = (

@@ -43,7 +43,7 @@ from vdgs.runs.stage_folder import StatusRecord
 
 OFFSETS, ANCHORS_PER_VIEW, SEEN_BY, SPACING = 10, 1600, 10, 1.0
 WIDTH, HEIGHT = 400, 300
-#: Test views, whose photographs are grey: what they show does not matter here.
+#: Test views, whose photographs are gray: what they show does not matter here.
 TESTED = 40
 
 

@@ -3,7 +3,7 @@
     python -m experiments.microbench.gpu [--minutes 8] [--capture PLACE] [--small]
 
 In this order: what the kernels take of the card, parity of every operation with the processor, a generated town trained
-and measured on both, milliseconds and bytes of a training step by each rasteriser, and a capture of one's own if it is
+and measured on both, milliseconds and bytes of a training step by each rasterizer, and a capture of one's own if it is
 named. What there is no time left for is named. Exit codes: 0 all agrees, 1 something does not, 2 there is no GPU here
 that can be used.
 """

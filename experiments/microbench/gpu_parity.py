@@ -73,7 +73,7 @@ class ParityScene:
         return rows, kernels.decode(a.positions, features, offsets, log_scales, self.weights, self.camera, rows)
 
     def splats(self) -> Splats:
-        """Drawn numbers and not decoded ones: the same for every rasteriser."""
+        """Drawn numbers and not decoded ones: the same for every rasterizer."""
         count = 4 * len(self.anchors)
         g = generator(2)
         spread = 0.3 + 3 * torch.rand(count, generator=g) ** 4 * 10
@@ -300,7 +300,7 @@ CASES: dict[str, Callable[[KernelBackend, ParityScene], Results]] = {
 
 
 def differences(device: torch.device, anchors: int, width: int, height: int) -> Iterator[Difference]:
-    """All results of all operations; those of the rasterisers by each of them."""
+    """All results of all operations; those of the rasterizers by each of them."""
     from vdgs.kernels import cpu, gpu
 
     on_cpu, on_device = (

@@ -1,4 +1,4 @@
-"""How fast the rasteriser draws and differentiates: nine scenes, one and two threads, every instruction set.
+"""How fast the rasterizer draws and differentiates: nine scenes, one and two threads, every instruction set.
 
     python -m experiments.microbench.rasterizer
     python -m experiments.microbench.rasterizer --prototype DIR     beside the feasibility study in DIR, interleaved

@@ -222,7 +222,7 @@ def test_a_published_program_shows_what_we_draw(tmp_path, program: str, name: st
 
 
 def test_tiles_stand_on_the_globe_as_the_page_for_them_says(tmp_path):
-    """The root of a tileset takes east, north and up to Earth-centred axes."""
+    """The root of a tileset takes east, north and up to Earth-centered axes."""
     registry.write_scene(
         tmp_path / "tileset.json",
         ExportScene.of(random_gaussians(50, 0), ExportMetadata(geodetic=(48.13, 11.57, 512.0))),

@@ -1,4 +1,4 @@
-"""What lies in a folder is used: photographs that are left, models below it, points beside a model, any colours."""
+"""What lies in a folder is used: photographs that are left, models below it, points beside a model, any colors."""
 
 from __future__ import annotations
 
@@ -172,7 +172,7 @@ def test_numbers_that_are_whole_may_be_written_with_a_point(tmp_path, scene):
     assert load_capture(tmp_path / "nerf").views[0].camera.height == 48
 
 
-# ---------------------------------------------------------------------------------------------- colours
+# ---------------------------------------------------------------------------------------------- colors
 
 COLORS = np.random.default_rng(5).integers(0, 256, (50, 3))
 
@@ -297,7 +297,7 @@ def test_points_without_colors_are_remarked(tmp_path, scene):
     for k in range(len(COLORS)):
         text = text.replace("\n1 2 3 ", f"\n{k % 7} {k % 5} {k / 100} ", 1)
     (tmp_path / "sparse_pc.ply").write_text(text)
-    assert any("bring no colours" in warning for warning in load_capture(tmp_path).warnings)
+    assert any("bring no colors" in warning for warning in load_capture(tmp_path).warnings)
 
 
 # ------------------------------------------------------------------------------------------------- units

@@ -61,7 +61,7 @@ def test_a_capture_is_complete(folder, scene):
 
 
 def test_pixels_cameras_and_points_agree(folder, scene):
-    """The colour of the picture where a point falls is the colour of the point."""
+    """The color of the picture where a point falls is the color of the point."""
     capture = load_capture(folder, UP)
     differences = []
     for view in capture.views:
@@ -337,7 +337,7 @@ def test_truncated_jpegs_are_found_too(folder, scene):
 
 
 def test_gray_photographs_and_masks_of_sixteen_bits_pass_the_check(folder, scene):
-    """PNG and TIFF of either byte order; one of a single colour is told, and 32 bits are refused on sight."""
+    """PNG and TIFF of either byte order; one of a single color is told, and 32 bits are refused on sight."""
     first, second, third, *_ = sorted(scene.cameras)
     deep = {name: (render_plane(scene.cameras[name])[..., 0].astype(np.uint16)) * 257 for name in (first, second)}
     cv2.imwrite(str(folder / "images" / first), deep[first])
@@ -351,11 +351,11 @@ def test_gray_photographs_and_masks_of_sixteen_bits_pass_the_check(folder, scene
     cv2.imwrite(str(folder / "masks" / first), keep)
     checked = check_images(load_capture(folder, UP))
     assert (checked.files, checked.masked_fraction) == (13, pytest.approx(0.5 / 12))
-    assert [each for each in checked.warnings if "one colour only" in each] == [
-        f"photographs of one colour only, which teach nothing but that: 1 ({third})."
+    assert [each for each in checked.warnings if "one color only" in each] == [
+        f"photographs of one color only, which teach nothing but that: 1 ({third})."
     ]
     Image.fromarray(deep[second].astype(np.int32)).save(tiff)
-    with pytest.raises(CaptureError, match=r"\.tif: has the colour mode I; convert it to 8-bit RGB"):
+    with pytest.raises(CaptureError, match=r"\.tif: has the color mode I; convert it to 8-bit RGB"):
         load_capture(folder, UP)
 
 

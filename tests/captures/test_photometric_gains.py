@@ -55,7 +55,7 @@ NONE = np.zeros((len(VIEWS), 3))
 
 
 class Photographed(ImageCache):
-    """Photographs whose colours + LEAST_LIGHT are multiplied by exp(gains) [n, 3], darkened so that none saturates.
+    """Photographs whose colors + LEAST_LIGHT are multiplied by exp(gains) [n, 3], darkened so that none saturates.
     `change` may alter one; which sizes were asked for is in `asked`."""
 
     def __init__(
@@ -125,7 +125,7 @@ def test_a_drift_counts_by_what_it_makes_in_one_place_however_long_the_flight(co
 
 
 def test_what_moves_before_a_photograph_hardly_makes_it_brighter():
-    """A quarter of a photograph is white: the mean of its colours is brighter by more than 0.25."""
+    """A quarter of a photograph is white: the mean of its colors is brighter by more than 0.25."""
 
     def hidden(index: int, picture: np.ndarray) -> DecodedImage:
         if index == 3:
@@ -183,7 +183,7 @@ def part(sightings: Observations | None, which: slice) -> Observations:
 
 
 def test_a_photograph_that_shares_hardly_a_point_is_not_compared():
-    """Three of its points, and those in the wrong colours."""
+    """Three of its points, and those in the wrong colors."""
     lost = [*VIEWS[:7], replace(VIEWS[7], observations=part(VIEWS[7].observations, slice(0, 3))), *VIEWS[8:]]
     gains = NONE.copy()
     gains[7] = 0.6

@@ -10,7 +10,7 @@ import pytest
 
 from vdgs.captures.up_axis import estimate_up
 
-#: Of each way to take photographs: camera centres [n, 3], rotations [n, 3, 3] and points [m, 3], z up.
+#: Of each way to take photographs: camera centers [n, 3], rotations [n, 3, 3] and points [m, 3], z up.
 Scene = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 

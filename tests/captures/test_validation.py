@@ -272,10 +272,10 @@ def test_masks_that_leave_little_may_be_inverted(folder, scene):
 def test_photographs_that_show_nothing(folder, scene):
     names = list(scene.cameras)
     cv2.imwrite(str(folder / "images" / names[2]), np.zeros((48, 64, 3), np.uint8))
-    assert any("one colour only" in each and names[2] in each for each in check_images(load_capture(folder)).warnings)
+    assert any("one color only" in each and names[2] in each for each in check_images(load_capture(folder)).warnings)
     for name in names:
         cv2.imwrite(str(folder / "images" / name), np.zeros((48, 64, 3), np.uint8))
-    with pytest.raises(CaptureError, match="every photograph is of one colour only"):
+    with pytest.raises(CaptureError, match="every photograph is of one color only"):
         check_images(load_capture(folder))
     for name in names:
         cv2.imwrite(str(folder / "images" / name), np.zeros((48, 64, 4), np.uint8))

@@ -1,4 +1,4 @@
-"""Colour correction undoes what a quadratic can express, and only where there is enough to fit."""
+"""Color correction undoes what a quadratic can express, and only where there is enough to fit."""
 
 from __future__ import annotations
 

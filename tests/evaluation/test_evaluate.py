@@ -180,7 +180,7 @@ def test_pictures_are_measured_in_the_exposure_that_the_model_knows_beside_neutr
     photographs = ReferenceViews(
         city.views, lambda v: (city.load_image(v) * float(gains[v.name][0, 0])).clip(0, 255).astype(np.uint8), load_mask
     )
-    settings = EvaluationSettings(exposure_note="in the exposure of its neighbours")
+    settings = EvaluationSettings(exposure_note="in the exposure of its neighbors")
     out = StringIO()
     neutral = RenderableModel(render=city.render, visibility_map=city.visibility)
     evaluate_model(photographs, neutral, tmp_path / "plain", settings=settings)
@@ -192,7 +192,7 @@ def test_pictures_are_measured_in_the_exposure_that_the_model_knows_beside_neutr
     assert (result["psnr_reference_exposure"], result["ssim_reference_exposure"]) == (plain["psnr"], plain["ssim"])
     assert result["psnr"] > plain["psnr"] + 1
     assert result["notes"] == [
-        "views are drawn and measured in the exposure of its neighbours; 1 of them neutral, for want of training "
+        "views are drawn and measured in the exposure of its neighbors; 1 of them neutral, for want of training "
         "photographs near by; beside that in neutral colors"
     ]
     rows = read(tmp_path / "exposed" / "per_view.json")
@@ -208,7 +208,7 @@ def test_pictures_are_measured_in_the_exposure_that_the_model_knows_beside_neutr
     text = " ".join(out.getvalue().split())
     assert "neutral colors" in text
     assert f"{result['psnr_reference_exposure']:.2f}" in text
-    assert "in the exposure of its neighbours" in text
+    assert "in the exposure of its neighbors" in text
 
 
 def test_what_cannot_be_evaluated_is_said(city: City, tmp_path: Path):

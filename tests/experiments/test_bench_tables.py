@@ -186,7 +186,7 @@ def test_a_table_says_which_views_it_is_measured_on(validation, views):
     plan = make_plan("table2", PlanOptions(scenes=("lab-uneven",), methods=("baseline", "full"), validation=validation))
     titles = [grid.title for grid in make_result_tables(plan, results)]
     assert titles[0].startswith(f"{views}, raw")
-    assert titles[1].startswith(f"{views}, colour-corrected")
+    assert titles[1].startswith(f"{views}, color-corrected")
 
 
 def test_methods_that_get_more_are_no_rivals():

@@ -130,7 +130,7 @@ def test_older_tiles_go_when_new_ones_are_there(tmp_path, town):
     (tmp_path / "mine.txt").write_text("stays")
     for _ in range(2):
         notes = registry.write_scene(path, ExportScene.of(some))
-    assert any("centre of the Earth" in note for note in notes)
+    assert any("center of the Earth" in note for note in notes)
     assert sorted(each.name for each in tmp_path.iterdir()) == ["mine.txt", "tiles-2", "tileset.json"]
     broken = replace(some, sh0=some.sh0 * float("inf"))
     with pytest.raises(VdgsError, match="not finite"):
@@ -191,7 +191,7 @@ def test_a_crowd_on_one_spot_ends_in_one_tile(tmp_path):
 
 
 def surface(side: int = 60, step: float = 0.1, opacity: float = 0.98) -> Gaussians:
-    """A closed, flat, jittered surface in two colours, each Gaussian as wide as their distance."""
+    """A closed, flat, jittered surface in two colors, each Gaussian as wide as their distance."""
     rng = np.random.default_rng(0)
     x, y = np.meshgrid(np.arange(side) * step, np.arange(side) * step)
     means = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], 1) - side * step / 2
@@ -222,7 +222,7 @@ def test_a_thinned_surface_has_no_holes_and_keeps_its_colors(most):
     (image, alpha), (coarse_image, coarse_alpha) = drawn(fine), drawn(coarse)
     assert alpha.min() > 0.97
     assert coarse_alpha.min() > 0.9
-    for half in (slice(0, 24), slice(40, 64)):  # away from the border between the colours
+    for half in (slice(0, 24), slice(40, 64)):  # away from the border between the colors
         np.testing.assert_allclose(coarse_image[:, half].mean((0, 1)), image[:, half].mean((0, 1)), atol=0.05)
 
 

@@ -147,7 +147,7 @@ def test_places_and_numbers_of_what_is_kept():
 
 
 def steep(model: AnchorModel) -> AnchorModel:
-    """The model with colours, opacities and shapes that change much with where it is seen from."""
+    """The model with colors, opacities and shapes that change much with where it is seen from."""
 
     def steeper(head: MlpWeights) -> MlpWeights:
         return replace(head, w1=torch.cat([head.w1[:, :32], 6 * head.w1[:, 32:]], 1))
@@ -238,7 +238,7 @@ def test_cameras_between_lie_among_neighbors_that_look_alike_and_are_never_the_s
 
 
 def test_rounds_look_from_between_and_the_last_one_at_the_photographs_too():
-    """A camera without neighbours stays in all of them: nobody else looks there."""
+    """A camera without neighbors stays in all of them: nobody else looks there."""
     cameras = [*GRID, camera_above(0.0, 0.0, tilt_deg=80.0)]
     planned = color_iteration_cameras(cameras, 4)
     known = {camera.position.tobytes() for camera in GRID}

@@ -161,7 +161,7 @@ def test_what_killed_exports_left_goes_before_the_work_and_is_said(export, tmp_p
 
 
 def on_earth(local: torch.Tensor, geodetic: tuple[float, float, float]) -> np.ndarray:
-    """Earth-centred metres [n, 3] of what lies so far east, north and up of a place."""
+    """Earth-centered metres [n, 3] of what lies so far east, north and up of a place."""
     return local.double().numpy() @ enu_axes(*geodetic[:2]) + ecef_from_geodetic(np.array([geodetic]))
 
 
@@ -169,7 +169,7 @@ def on_earth(local: torch.Tensor, geodetic: tuple[float, float, float]) -> np.nd
 def test_tiles_stand_on_the_globe_whatever_other_files_are_written_in(export, tmp_path: Path, crs):
     pytest.importorskip("pyproj")
     record = export("a.ply", "tileset.json", origin=PLACE, crs=crs)
-    assert not any("centre of the Earth" in note for file in record["files"] for note in file["notes"])
+    assert not any("center of the Earth" in note for file in record["files"] for note in file["notes"])
     matrix = np.array(read_json(tmp_path / "tileset.json")["root"]["transform"]).reshape(4, 4).T
     np.testing.assert_allclose(matrix[:3, 3], ecef_from_geodetic(np.array([PLACE]))[0], atol=1e-6)
     np.testing.assert_allclose(matrix[:3, :3], enu_axes(*PLACE[:2]).T, atol=1e-12)
@@ -180,7 +180,7 @@ def test_tiles_of_nowhere_in_a_map_are_refused(export, tmp_path: Path):
         export("tileset.json", crs="EPSG:32632")
     assert not (tmp_path / "tileset.json").exists()
     (file,) = export("tileset.json")["files"]
-    assert any("centre of the Earth" in note for note in file["notes"])
+    assert any("center of the Earth" in note for note in file["notes"])
 
 
 def test_a_scene_far_from_its_origin_stays_where_it_is_on_earth(export, tmp_path, monkeypatch):

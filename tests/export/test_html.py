@@ -28,7 +28,7 @@ def test_a_page_holds_the_scene_in_any_unit(tmp_path, scale):
         gaussians, means=scale * gaussians.means, log_scales=gaussians.log_scales + float(np.log(scale))
     )
     assert registry.write_scene(tmp_path / "a.html", ExportScene.of(gaussians, PLACED)) == (
-        "colours do not change with the viewing direction",
+        "colors do not change with the viewing direction",
     )
     read = registry.read_gaussians(tmp_path / "a.html")
     assert torch.allclose(read.means, gaussians.means, rtol=1e-6, atol=1e-6 * scale)

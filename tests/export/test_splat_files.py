@@ -52,7 +52,7 @@ def turned(gaussians: Gaussians, matrix: np.ndarray) -> Gaussians:
 
 
 def flat(gaussians: Gaussians) -> Gaussians:
-    """Without the colours that change with the direction."""
+    """Without the colors that change with the direction."""
     return replace(gaussians, shN=gaussians.shN[:, :0])
 
 
@@ -172,7 +172,7 @@ def test_chunks_and_their_sizes_make_no_difference(tmp_path, monkeypatch):
 def test_a_splat_is_its_32_bytes(tmp_path):
     written = random_gaussians(200, 1)
     lost = registry.write_scene(tmp_path / "a.splat", ExportScene.of(written, PLACED))
-    assert "colours no longer change with the viewing direction" in lost
+    assert "colors no longer change with the viewing direction" in lost
     rows = np.frombuffer((tmp_path / "a.splat").read_bytes(), "<f4,<f4,<f4,<f4,<f4,<f4,u4,u4")
     assert len(rows) == 200
     wanted, theirs = turned(written, Y_DOWN.turn), independent(tmp_path / "a.splat")
@@ -289,7 +289,7 @@ def test_what_bytes_cannot_hold_is_counted(tmp_path):
     assert notes == (
         "1 of 10 Gaussians are larger than 377 units and were cut to that",
         "2 of 10 Gaussians are thinner than 0.00005 units and became as thick as that, which nobody sees",
-        "3 of 10 colours lay far outside of 0 .. 1 and were cut off",
+        "3 of 10 colors lay far outside of 0 .. 1 and were cut off",
     )
 
 

@@ -63,7 +63,7 @@ def test_a_local_similarity_turns_by_the_meridian_convergence_and_scales_by_the_
     latitude, longitude, height = geodetic_from_enu(center[None], BERN)[0]
     factors = pyproj.Proj(placement.crs).get_factors(longitude, latitude)
     turned = np.degrees(np.arctan2(rotation[1, 0], rotation[0, 0]))
-    # The ground frame's north is that of its origin; meridians run together on the way to the centre.
+    # The ground frame's north is that of its origin; meridians run together on the way to the center.
     between = (longitude - BERN[1]) * np.sin(np.radians(latitude))
     assert turned == pytest.approx(factors.meridian_convergence - between, abs=1e-4)
     assert abs(turned) > 1

@@ -80,7 +80,7 @@ def drivers(tmp_path_factory):
 
 @pytest.fixture(params=["gsplat", "cuda"])
 def rasterizer(request, drivers, compiled_code, monkeypatch) -> str:
-    """With each of the rasterisers that may draw on a card."""
+    """With each of the rasterizers that may draw on a card."""
     install(drivers, compiled_code, monkeypatch, "cuda", request.param)
     return request.param
 
@@ -96,7 +96,7 @@ def test_a_step_on_another_device_makes_the_numbers_of_the_processor(monkeypatch
 
 
 def test_steps_have_the_same_bits_whichever_block_comes_first(monkeypatch, drivers, compiled_code):
-    """With the own rasteriser: splats stand in another order, among frozen surroundings too."""
+    """With the own rasterizer: splats stand in another order, among frozen surroundings too."""
     found = []
     for order in ORDERS[:3]:
         install(drivers, compiled_code, monkeypatch, "cuda", "cuda")  # anew: tables are kept for a card

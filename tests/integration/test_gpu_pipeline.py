@@ -43,7 +43,7 @@ def runs(native_small, tmp_path_factory, compiled_code) -> tuple[Path, Path]:
 def test_a_card_learns_the_place_as_the_processor_does(runs):
     native, card = runs
     for ours, theirs in zip(psnr(native), psnr(card), strict=True):
-        assert ours > 13  # 12.0 for a plain grey picture
+        assert ours > 13  # 12.0 for a plain gray picture
         assert theirs == pytest.approx(ours, abs=0.6)
     first, same = (json.loads((run / "coarse" / "log.jsonl").read_text().splitlines()[0]) for run in runs)
     assert first["loss"] == pytest.approx(same["loss"], rel=0.05)

@@ -144,7 +144,7 @@ def exported(uncut, tmp_path_factory) -> bytes:
 
 
 def test_whenever_its_driver_is_killed_a_scene_baked_in_shards_is_that_of_one_process(uncut, exported, tmp_path):
-    """While a second shard surveys; before the first Gaussians, and those with fitted colours, are there whole."""
+    """While a second shard surveys; before the first Gaussians, and those with fitted colors, are there whole."""
     run, file = copy_run(uncut, tmp_path / "run"), tmp_path / "scene.ply"
     command = ("export", run, "--output", file, "--color-iterations", "2", "--no-evaluate", "--jobs", "2")
     for moment in ("*/shards/*/01/000010.npy", "*/shards/*/0.spool", "*/shards/*/1.spool"):
@@ -160,7 +160,7 @@ def test_whenever_its_driver_is_killed_a_scene_baked_in_shards_is_that_of_one_pr
     done = vdgs(*command, prepare=small_parts_here)
     assert done.returncode == 0, done.stderr + done.stdout
     assert "2 of 2 shards to survey views" not in done.stdout
-    assert done.stdout.count("shards to fit colours again") == 1
+    assert done.stdout.count("shards to fit colors again") == 1
     assert file.read_bytes() == exported
     assert not (run / "baking").exists()
 

@@ -356,7 +356,7 @@ def test_exposed_views_are_the_same_in_shards_and_where_a_file_is_compared(uncut
     assert is_evaluated(RunFolder(run), "coarse", None, 4)
     status = json.loads((measured / "status.json").read_text())
     assert status.pop("exposed") == "interpolated and metered"
-    (measured / "status.json").write_text(json.dumps(status))  # as if measured in neutral colours
+    (measured / "status.json").write_text(json.dumps(status))  # as if measured in neutral colors
     assert not is_evaluated(RunFolder(run), "coarse", None, 4)
     done = vdgs("eval", run, "--jobs", "2", prepare=do_tasks_here)
     assert done.returncode == 0, done.stderr + done.stdout

@@ -40,7 +40,7 @@ def runs(native_small, tmp_path_factory) -> tuple[Path, Path, Path]:
 def test_both_sets_learn_the_place_alike(runs):
     native, twin, _ = runs
     for ours, theirs in zip(psnr(native), psnr(twin), strict=True):
-        assert ours > 13  # 12.0 for a plain grey picture
+        assert ours > 13  # 12.0 for a plain gray picture
         assert theirs == pytest.approx(ours, abs=0.6)
     before, after = (len(AnchorModel.load(twin / name / "model.safetensors").anchors) for name in ("coarse", "merged"))
     assert after != before  # blocks have trained and grown

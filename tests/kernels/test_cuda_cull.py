@@ -48,7 +48,7 @@ def test_it_equals_the_reference_and_the_processor(camera, n, library):
 @needs_a_compiler
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_large_anchors_beside_the_picture_are_kept(camera, library):
-    """So that scales decide: hardly a centre lies on the image."""
+    """So that scales decide: hardly a center lies on the image."""
     positions, log_scales = anchors(2000, seed=4, spread=15.0, log_scale=1.0)
     rows = set(kept(positions, log_scales, camera, library).tolist())
     without = set(kept(positions, log_scales - 20.0, camera, library).tolist())

@@ -1,4 +1,4 @@
-"""The CUDA rasteriser without a GPU: its kernels, run on the processor by a stand-in driver, against the reference."""
+"""The CUDA rasterizer without a GPU: its kernels, run on the processor by a stand-in driver, against the reference."""
 
 from __future__ import annotations
 

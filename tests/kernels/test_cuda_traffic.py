@@ -203,7 +203,7 @@ def test_an_anchor_costs_no_more_than_was_aimed_at(counted):
 
 
 def test_what_is_written_for_others_is_written_once(counted):
-    """Sources, for statistics; the order of splats, for equal depths in the own rasteriser."""
+    """Sources, for statistics; the order of splats, for equal depths in the own rasterizer."""
     read, written = counted.of("name_splats")
     assert written.once == 4 * counted.splats
     assert read.once == 4 * V + 4 * V // ANCHORS_PER_BLOCK

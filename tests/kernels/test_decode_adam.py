@@ -11,7 +11,7 @@ from vdgs.kernels import cpu, torch_ref
 from vdgs.kernels.kernel_types import AdamState, SplatGradients
 
 CAMERA = turned(96, 64)
-#: A few of the anchors, some of them neighbours.
+#: A few of the anchors, some of them neighbors.
 ROWS = torch.tensor([row for row in range(700) if row % 7 in (0, 3, 4)])
 RATES = (0.01, 0.02, 0.005)
 #: How often each anchor has moved: some never, some so often that it no longer matters.

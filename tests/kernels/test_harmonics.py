@@ -1,4 +1,4 @@
-"""Spherical harmonics of many Gaussians, fit and colours: C++ of every instruction set does as the twin."""
+"""Spherical harmonics of many Gaussians, fit and colors: C++ of every instruction set does as the twin."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def unit(count: int, generator: torch.Generator) -> torch.Tensor:
 
 
 def seen(counts: list[int], seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Directions, colours and weights of so many pairs of each Gaussian, and where those of each begin."""
+    """Directions, colors and weights of so many pairs of each Gaussian, and where those of each begin."""
     generator, pairs = torch.Generator().manual_seed(seed), sum(counts)
     starts = torch.tensor([0, *counts[:-1]]).cumsum(0)
     # What makes a thousandth of a pixel stands beside what makes a thousand.
@@ -125,7 +125,7 @@ def test_every_instruction_set_shows_what_the_twin_shows(n, degree, seed):
             shown = native.harmonic_colors(means, coefficients, rows, eye, degree)
             one = native.harmonic_colors(means[:1], coefficients, rows[:1], means[0], degree)
         torch.testing.assert_close(shown, expected, atol=2e-5, rtol=1e-5)
-        assert torch.isfinite(one).all()  # seen from its own centre
+        assert torch.isfinite(one).all()  # seen from its own center
 
 
 @BOTH

@@ -1,4 +1,4 @@
-"""The rasteriser: what it draws and how that changes with its input."""
+"""The rasterizer: what it draws and how that changes with its input."""
 
 from __future__ import annotations
 
@@ -385,7 +385,7 @@ def test_only_what_is_asked_for_gets_gradients() -> None:
     assert raster.depth is None
     assert raster.median_depth is None
     raster.alpha.sum().backward()
-    assert not tensors[2].grad.any(), "alpha does not depend on colours"
+    assert not tensors[2].grad.any(), "alpha does not depend on colors"
     assert all(t.grad is None for i, t in enumerate(tensors) if i != 2)
 
 

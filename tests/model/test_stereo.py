@@ -210,7 +210,7 @@ def test_two_photographs_are_enough_and_one_is_not(tmp_path):
 
 
 def test_still_water_invents_nothing(tmp_path):
-    """One colour, and the noise of a sensor."""
+    """One color, and the noise of a sensor."""
     rng = np.random.default_rng(0)
     water = [rng.normal(90, 1.5, (120, 160, 3)).astype(np.uint8) for _ in flight()]
     found = points_of(flight(), tmp_path, read=lambda index: (water[index], None))

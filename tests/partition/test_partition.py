@@ -252,7 +252,7 @@ def test_fewer_blocks_than_asked_for_are_said_with_the_reason() -> None:
         assert notes(far_apart, views, 2, lambda_vis=lambda_vis) == ""  # as it advises
         assert notes(site, views[:2000], 4, lambda_vis=lambda_vis) == ""
     place = generator.uniform(0, 100, (4000, 3))
-    assert "scattered among those of their neighbours. A smaller --lambda-vis" in notes(place, views, 4, lambda_vis=9.0)
+    assert "scattered among those of their neighbors. A smaller --lambda-vis" in notes(place, views, 4, lambda_vis=9.0)
     stray = np.concatenate([place, generator.uniform(0, 5000, (120, 3))])
     said = notes(stray, np.append(views, views[:120]), 8, lambda_vis=0.0)
     assert "the other clusters hold hardly any anchors" in said

@@ -119,7 +119,7 @@ def test_blocks_have_colors_of_their_own_and_show_them(tmp_path: Path) -> None:
     file = tmp_path / "facts.png"
     figures.plot_block_stats(file, positions, views, grid(16), scores > 2, "m", None)
     picture = check(file).reshape(-1, 3)
-    for color in colors:  # the area of each block is a bar of its colour
+    for color in colors:  # the area of each block is a bar of its color
         assert (np.abs(picture - color).max(axis=1) < 0.01).sum() > 100
 
 
@@ -198,7 +198,7 @@ def test_the_border_of_coverage_has_no_speckles() -> None:
 
 
 def without_edges(covered: np.ndarray) -> np.ndarray:
-    """Where a cell and its neighbours are alike."""
+    """Where a cell and its neighbors are alike."""
     return (maximum_filter(covered, 5) == minimum_filter(covered, 5)) & np.ones_like(covered)
 
 

@@ -70,7 +70,7 @@ def test_detail_comes_from_the_photographs_where_they_see_the_place(house, tmp_p
 
 
 def gray(places: np.ndarray) -> AnchorModel:
-    """The same splats, all of one grey."""
+    """The same splats, all of one gray."""
     model = model_of(places)
     tensors = {name: tensor.clone() for name, tensor in model.decoder.tensors().items()}
     tensors["color_w2"].zero_()

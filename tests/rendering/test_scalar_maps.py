@@ -1,4 +1,4 @@
-"""Renders for people: colours that mean the same in every frame and say so, numbers on request, folders replaced with
+"""Renders for people: colors that mean the same in every frame and say so, numbers on request, folders replaced with
 care."""
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ MODEL_IDS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "OPENCV": 4}
 
 @dataclass(frozen=True)
 class TinyScene:
-    """Cameras by image name, points [n, 3] and colours [n, 3] uint8, in one world (z up unless moved)."""
+    """Cameras by image name, points [n, 3] and colors [n, 3] uint8, in one world (z up unless moved)."""
 
     cameras: dict[str, Camera]
     points: np.ndarray

@@ -1,4 +1,4 @@
-"""A coloured checkerboard plane photographed from above: the smallest place that training can learn."""
+"""A colored checkerboard plane photographed from above: the smallest place that training can learn."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ SIZE = (48, 40)
 
 
 class Photographs:
-    """Eight views from above of a coloured checkerboard plane, ray cast exactly."""
+    """Eight views from above of a colored checkerboard plane, ray cast exactly."""
 
     def __init__(self) -> None:
         self.cameras = [self._camera(x, y) for x in (-2.0, -0.7, 0.7, 2.0) for y in (-1.0, 1.0)]

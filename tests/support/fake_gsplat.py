@@ -64,7 +64,7 @@ def rasterize_to_pixels_3dgs_fwd(
     means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, backgrounds: Tensor, masks: None, width: int,
     height: int, tile_size: int, isect_offsets: Tensor, flatten_ids: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """Colours [1, h, w, channels], alphas [1, h, w, 1] and, as gsplat does, the last Gaussian of each pixel."""
+    """Colors [1, h, w, channels], alphas [1, h, w, 1] and, as gsplat does, the last Gaussian of each pixel."""
     assert masks is None
     with torch.no_grad():
         colors, alphas = _drawn(
@@ -78,7 +78,7 @@ def rasterize_to_pixels_3dgs_bwd(
     height: int, tile_size: int, isect_offsets: Tensor, flatten_ids: Tensor, render_alphas: Tensor, last_ids: Tensor,
     v_render_colors: Tensor, v_render_alphas: Tensor, absgrad: bool,
 ) -> tuple[None, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Gradients by means, conics, colours and opacities; the first place is that of absolute ones."""
+    """Gradients by means, conics, colors and opacities; the first place is that of absolute ones."""
     assert not absgrad
     assert render_alphas.shape == (*last_ids.shape, 1) == (1, height, width, 1)
     leaves = [tensor.detach().requires_grad_() for tensor in (means2d, conics, colors, opacities)]
@@ -106,7 +106,7 @@ def _drawn(
 def _tile(
     means: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, background: Tensor, origin: Tensor, side: int
 ) -> Tensor:
-    """Colours and alpha of a tile, [side, side, channels + 1]."""
+    """Colors and alpha of a tile, [side, side, channels + 1]."""
     y, x = torch.meshgrid(torch.arange(side), torch.arange(side), indexing="ij")
     pixels = torch.stack([x, y], dim=-1) + origin + 0.5
     dx, dy = (means[:, None, None] - pixels).unbind(-1)

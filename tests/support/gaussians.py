@@ -10,7 +10,7 @@ from vdgs.model.gaussians import Gaussians, render_gaussians
 
 
 def random_gaussians(count: int, degree: int, seed: int = 0, reach: float = 3.0) -> Gaussians:
-    """Scattered over a disc, of colours between 0 and 1 that change with the direction."""
+    """Scattered over a disc, of colors between 0 and 1 that change with the direction."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> torch.Tensor:

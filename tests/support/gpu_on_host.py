@@ -33,7 +33,7 @@ def build(folder: Path) -> dict[str, HostDriver]:
 def install(
     drivers: dict[str, HostDriver], code: Path, monkeypatch: pytest.MonkeyPatch, device_type: str, rasterizer: str
 ) -> None:
-    """Let tensors of a kind of device be computed on by the composed set, with one of its rasterisers."""
+    """Let tensors of a kind of device be computed on by the composed set, with one of its rasterizers."""
     monkeypatch.setenv(compile_cache.CUDA_CACHE_ENV_VAR, str(code))
     for program in PROGRAMS:
         driver = drivers[program.name]

@@ -54,7 +54,7 @@ def model_at(positions: np.ndarray, seed: int = 0, decoder_seed: int = 0) -> Anc
 
 
 def opaque_plane(spacing: float = 0.2, half: float = 3.0) -> AnchorModel:
-    """The square |x|, |y| < half at z = 0 covered by opaque splats of different colours."""
+    """The square |x|, |y| < half at z = 0 covered by opaque splats of different colors."""
     line = np.arange(-half + spacing / 2, half, spacing)
     x, y = np.meshgrid(line, line)
     model = model_at(np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]))

@@ -32,7 +32,7 @@ def surface(x0: float, y0: float, x1: float, y1: float, z: float) -> np.ndarray:
 
 
 def model_of(places: np.ndarray) -> AnchorModel:
-    """Opaque splats at these places, each of its own colour, flat enough that roofs stay roofs."""
+    """Opaque splats at these places, each of its own color, flat enough that roofs stay roofs."""
     plane = opaque_plane(spacing=SPACING)
     anchors = model_at(places).anchors
     anchors = replace(

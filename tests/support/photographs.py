@@ -18,7 +18,7 @@ from vdgs.geometry.camera import Camera
 
 
 def photograph(rng: np.random.Generator, height: int = 48, width: int = 64) -> np.ndarray:
-    """Smooth colours with some detail, uint8 [h, w, 3], no pixel saturated."""
+    """Smooth colors with some detail, uint8 [h, w, 3], no pixel saturated."""
     coarse = rng.uniform(0.15, 0.85, (5, 6, 3))
     smooth = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
     return ((smooth + rng.normal(0, 0.02, smooth.shape)).clip(0.05, 0.95) * 255).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Random splats for the tests of the rasteriser."""
+"""Random splats for the tests of the rasterizer."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def assert_first_gradients_are_those_of_all(
 
 
 def splats_of(tensors: tuple[Tensor, ...]) -> tuple[Splats, Tensor]:
-    """Splats and background from means, conics, colours, opacities, depths and background."""
+    """Splats and background from means, conics, colors, opacities, depths and background."""
     means, conics, colors, opacities, depths, background = tensors
     return Splats(means, conics, depths, colors, opacities), background
 

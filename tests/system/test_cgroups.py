@@ -71,7 +71,7 @@ def test_a_job_of_slurm_is_limited_by_the_group_above_its_step(machine):
     # The least room counts, not the least limit.
     second(job.parent, 40 * GB, 38 * GB)
     assert least(machine.limits(own)) == 2 * GB
-    # A neighbour's limit is none of ours.
+    # A neighbor's limit is none of ours.
     second(root / "user.slice", GB, 0)
     assert least(machine.limits(own)) == 2 * GB
 

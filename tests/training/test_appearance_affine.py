@@ -245,7 +245,7 @@ def test_a_picture_is_exposed_as_in_training_and_neutral_leaves_every_bit(seed):
 
 
 def test_before_another_background_the_exposed_scene_stays_as_it_is():
-    """Exposed, then put before black: as if its own colours were exposed and black stood behind them."""
+    """Exposed, then put before black: as if its own colors were exposed and black stood behind them."""
     scene, alpha = torch.rand(5, 7, 3).numpy(), torch.rand(5, 7).numpy()
     behind, model = (0.2, 0.4, 0.6), NEUTRAL + 0.5 * random_departures(1)[0]
     rendered = RenderedImage(alpha[..., None] * scene + (1 - alpha[..., None]) * np.float32(behind), alpha, behind)

@@ -121,7 +121,7 @@ def test_the_ramp_falls_from_core_to_boundary():
 
 
 def test_the_ramp_falls_into_a_hole_as_it_does_outwards():
-    """Outskirts lie around a dense centre."""
+    """Outskirts lie around a dense center."""
     middle = shapely.Point(0, 0)
     outskirts = Block(middle.buffer(20, 64).difference(middle.buffer(12, 64)),
                       middle.buffer(25, 64).difference(middle.buffer(7, 64)))  # fmt: skip

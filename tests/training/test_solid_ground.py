@@ -67,14 +67,14 @@ def test_pixels_well_below_the_horizon_show_no_sky(tilt):
 
 
 class Gray(Photographs):
-    """Of a place that has the colour of the background."""
+    """Of a place that has the color of the background."""
 
     def get(self, index: int, downscale: int = 1) -> tuple[torch.Tensor, None]:
         return torch.full_like(super().get(index, downscale)[0], 128), None
 
 
 def light_through(loss: LossConfig) -> float:
-    """The median of 1 - alpha, of a model that was trained before the colour of grey."""
+    """The median of 1 - alpha, of a model that was trained before the color of gray."""
     stage, state = block_stage(BlockConfig())
     config = replace(stage.config, iterations=300, loss=loss, densify=DensifyConfig(num_levels=0, start=10_000))
     photographs, gray = Gray(), (128 / 255,) * 3
@@ -85,7 +85,7 @@ def light_through(loss: LossConfig) -> float:
 
 
 def test_ground_becomes_opaque_although_the_background_has_its_color():
-    """Without backgrounds of random colour light shines through, with them nearly none does."""
+    """Without backgrounds of random color light shines through, with them nearly none does."""
     board = light_through(LossConfig())
     assert board < 0.02
     assert light_through(LossConfig(random_background=0.0)) > 3 * board

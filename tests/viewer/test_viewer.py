@@ -301,7 +301,7 @@ def test_a_clicked_pixel_is_the_place_that_it_shows(scene, x, y):
     again, _ = camera.project(found[None])
     assert np.abs(again - pixel).max() < 1e-6
     assert np.linalg.norm(found[:2] - [x, y]) < 6.0 / camera.fx  # a pixel on the ground
-    assert abs(found[2] - height) < 0.05  # depth is that of a splat's centre
+    assert abs(found[2] - height) < 0.05  # depth is that of a splat's center
     assert pick_position(scene.model("merged"), camera_at(50, 50), 3.0, 3.0) is None
     assert pick_position(scene.model("merged"), camera, -1.0, 3.0) is None
 

@@ -1,6 +1,6 @@
 """The scene of 3DGS: explicit Gaussians, each with its own shape, opacity and spherical harmonics.
 
-Dimensions: n Gaussians of the model, r = (degree + 1)² - 1 further coefficients of colour. Float32, ground frame.
+Dimensions: n Gaussians of the model, r = (degree + 1)² - 1 further coefficients of color. Float32, ground frame.
 Source: Kerbl, Kopanas, Leimkühler and Drettakis, "3D Gaussian Splatting for Real-Time Radiance Field Rendering",
 2023 (3DGS below); its equations 5 and 6 are in `kernels.project`, 2 and 3 in `kernels.rasterize`.
 """
@@ -36,7 +36,7 @@ def initialize_gaussians(
     points: Float[np.ndarray, "n 3"], colors: UInt8[np.ndarray, "n 3"], opacity: float, degree: int
 ) -> Gaussians:
     """A round Gaussian at each sparse point, as wide as its mean distance to the three nearest others (3DGS section
-    5.1), in its colour. Raises VdgsError with fewer than two points."""
+    5.1), in its color. Raises VdgsError with fewer than two points."""
     n = len(points)
     if n < 2:
         raise VdgsError(f"The capture has {n} sparse point(s); at least 2 are needed. Run the reconstruction again.")
@@ -59,7 +59,7 @@ class GaussianModel:
     """A trained scene of explicit Gaussians."""
 
     gaussians: Gaussians
-    #: Colour drawn where nothing is, RGB in [0, 1].
+    #: Color drawn where nothing is, RGB in [0, 1].
     background: tuple[float, float, float]
     #: JSON values that travel with the file: ground frame, capture, version.
     metadata: Mapping[str, Any]
@@ -104,7 +104,7 @@ def _check(gaussians: Gaussians) -> None:
     counts = [num_sh_bases(degree) - 1 for degree in range(MAX_SH_DEGREE + 1)]
     rest = gaussians.shN.shape[1] if gaussians.shN.ndim == 3 else -1
     if rest not in counts:
-        raise ValueError(f"{rest} further coefficients of colour belong to no degree")
+        raise ValueError(f"{rest} further coefficients of color belong to no degree")
     shapes = {"means": (n, 3), "log_scales": (n, 3), "quaternions": (n, 4), "opacity_logits": (n,), "sh0": (n, 3),
               "shN": (n, rest, 3)}  # fmt: skip
     for name, tensor in gaussians.tensors().items():

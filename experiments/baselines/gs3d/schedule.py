@@ -15,9 +15,9 @@ MIN_INTERVAL = 100
 
 
 def scale_schedule(iterations: int, config: Gs3dConfig | None = None, max_gaussians: int = 0) -> Gs3dConfig:
-    """`config` (default: as published) for so many iterations: warm-up, degree of colour, start and interval of density
+    """`config` (default: as published) for so many iterations: warm-up, degree of color, start and interval of density
     control and resets of opacity move in proportion, as rates and the end of density control do anyway. Trained as
-    published for a fifth of the time, 3DGS would reset its opacities too late, and use colours that depend on the
+    published for a fifth of the time, 3DGS would reset its opacities too late, and use colors that depend on the
     direction for a part of it only. At most `max_gaussians`; 0 for no limit."""
     config = config or Gs3dConfig()
     scale, density = iterations / PUBLISHED_ITERATIONS, config.density

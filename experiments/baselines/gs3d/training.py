@@ -34,9 +34,9 @@ class Gs3dLearningRates:
     means: tuple[float, float] = (1.6e-4, 1.6e-6)
     """Means, times the extent of the scene; decays exponentially from the first to the second value (section 5.1)."""
     sh0: float = 0.0025
-    """Constant colour."""
+    """Constant color."""
     shN: float = 0.0025 / 20
-    """The other coefficients of colour."""
+    """The other coefficients of color."""
     opacity_logits: float = 0.05
     """Opacities before the sigmoid."""
     log_scales: float = 0.005
@@ -64,7 +64,7 @@ class Gs3dConfig:
     ssim_weight: float = 0.2
     """lambda: loss = (1 - lambda) L1 + lambda (1 - SSIM) (eq. 7)."""
     background: Literal["black", "mean"] = "black"
-    """Colour behind the scene (program: black). `mean` is that of the training photographs, as this project's own
+    """Color behind the scene (program: black). `mean` is that of the training photographs, as this project's own
     method has it: to tell what the method gains from what its background does (choice)."""
     rates: Gs3dLearningRates = field(default_factory=Gs3dLearningRates)
     """Learning rates."""

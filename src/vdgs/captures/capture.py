@@ -56,7 +56,7 @@ class Capture:
     #: The image folder in use, relative to root ("images_4").
     images: str
     views: tuple[View, ...]
-    #: Sparse points [n, 3] float64 in the ground frame, and their colours [n, 3] uint8.
+    #: Sparse points [n, 3] float64 in the ground frame, and their colors [n, 3] uint8.
     points: np.ndarray
     point_colors: np.ndarray
     ground: GroundFrame

@@ -4,7 +4,7 @@ Where the up axis and the scale come from, in this order:
 
 1. `--up`: the person says so (no georeference, arbitrary scale).
 2. georef.json: the world already is ENU metres; only the origin may move.
-3. GPS of the photographs: robust similarity from camera centres to ENU.
+3. GPS of the photographs: robust similarity from camera centers to ENU.
 4. What the format promises about its world (Mega-NeRF, MatrixCity).
 5. Estimate (`up`): drones look down on what is flat, others hold their cameras level.
 
@@ -53,7 +53,7 @@ AXES = {
 
 @dataclass(frozen=True, eq=False)
 class _Scene:
-    """What the frame is found from: camera centres, camera_from_world rotations and finite points, source world."""
+    """What the frame is found from: camera centers, camera_from_world rotations and finite points, source world."""
 
     names: list[str]
     centers: np.ndarray
@@ -179,7 +179,7 @@ def _shifted(frame: GroundFrame, shift: np.ndarray, how: str) -> GroundFrame:
 
 
 def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | None:
-    """Similarity from camera centres to ENU, or None (with a warning) where the flight does not fix one."""
+    """Similarity from camera centers to ENU, or None (with a warning) where the flight does not fix one."""
     indices, geodetic, has_altitudes = match_gps(scene.names, file)
     origin = median_place(geodetic)
     enu = enu_from_geodetic(geodetic, origin)
@@ -282,7 +282,7 @@ def _middle(points: np.ndarray) -> np.ndarray:
 
 
 def transform_pose(camera_from_world: np.ndarray, frame: GroundFrame) -> np.ndarray:
-    """The pose [4, 4] of the same camera in the ground frame: rotation re-orthonormalised, centre scaled."""
+    """The pose [4, 4] of the same camera in the ground frame: rotation re-orthonormalized, center scaled."""
     rotation, translation = camera_from_world[:3, :3], camera_from_world[:3, 3]
     left, _, right = np.linalg.svd(rotation @ frame.rotation.T)
     center = frame.to_ground((-rotation.T @ translation)[None])[0]

@@ -34,7 +34,7 @@ class GroundTruth:
     folder: Path
 
     def depth(self, name: str) -> Float[np.ndarray, "h w"]:
-        """True depth along the viewing axis at pixel centres, float32 m (to 1 in 5,000 or better); inf for sky.
+        """True depth along the viewing axis at pixel centers, float32 m (to 1 in 5,000 or better); inf for sky.
 
         Raises VdgsError if this photograph's depth was not written.
         """

@@ -191,7 +191,7 @@ def load_image(view: View) -> DecodedImage:
 def resize_area(photo: DecodedImage, width: int, height: int) -> DecodedImage:
     """The picture at another size by area averaging.
 
-    A shrunk pixel is kept only if everything that it covers is kept: else masked colours would bleed in.
+    A shrunk pixel is kept only if everything that it covers is kept: else masked colors would bleed in.
     """
     if photo.image.shape[:2] == (height, width):
         return photo

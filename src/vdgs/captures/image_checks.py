@@ -74,7 +74,7 @@ def check_images(
 
     `which` is "all" or the number of views to check, spread evenly. `progress(done, total)` is called
     after each view. Raises `CaptureError` that lists up to ten files that are truncated or damaged, or of which masks
-    or transparency leave nothing, and where no photograph shows more than one colour.
+    or transparency leave nothing, and where no photograph shows more than one color.
     """
     views = capture.views
     if sample != "all":
@@ -94,7 +94,7 @@ def check_images(
         )
     blank = [view.name for view in checked if view.blank]
     if len(blank) == len(checked):
-        raise CaptureError(f"{folder}: every photograph is of one colour only. Copy the photographs again.")
+        raise CaptureError(f"{folder}: every photograph is of one color only. Copy the photographs again.")
     masked = 1.0 - sum(view.kept for view in checked) / len(checked)
     return ImageCheckReport(files, masked, tuple(_warnings(blank, masked)))
 
@@ -115,7 +115,7 @@ def _warnings(blank: list[str], masked: float) -> list[str]:
     found = []
     if blank:
         shown = ", ".join(blank[:5]) + (", ..." if len(blank) > 5 else "")
-        found.append(f"photographs of one colour only, which teach nothing but that: {len(blank)} ({shown}).")
+        found.append(f"photographs of one color only, which teach nothing but that: {len(blank)} ({shown}).")
     if masked > MAX_MASKED_FRACTION:
         found.append(f"masks leave out {masked:.0%} of the photographs. White is kept: are they inverted?")
     return found

@@ -99,7 +99,7 @@ def read_header(path: Path) -> ImageHeader:
             f"{path}: is {header.width}x{header.height} pixels, too small to show anything. Copy the image again."
         )
     if header.mode not in SUPPORTED_MODES:
-        raise CaptureError(f"{path}: has the colour mode {header.mode}; convert it to 8-bit RGB.")
+        raise CaptureError(f"{path}: has the color mode {header.mode}; convert it to 8-bit RGB.")
     return header
 
 
@@ -153,7 +153,7 @@ def find_mask_beside(folder: Path, name: str) -> Path | None:
 def decode_image(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     """Pixels [h, w, 3] uint8 RGB, and where the file has transparency its opaque part [h, w] bool.
 
-    Grey becomes RGB, 16 bits become 8; an alpha channel is a mask (choice: opaque from one half up), never
+    Gray becomes RGB, 16 bits become 8; an alpha channel is a mask (choice: opaque from one half up), never
     a blend. Raises `CaptureError` naming the file if it cannot be decoded.
     """
     pixels = _decode(path)
@@ -215,7 +215,7 @@ def _decode(path: Path) -> np.ndarray:
 
 
 class VerifiedImage(NamedTuple):
-    """What decoding an image told: whether it shows more than one colour, and whether it may be transparent."""
+    """What decoding an image told: whether it shows more than one color, and whether it may be transparent."""
 
     has_content: bool
     has_alpha_channel: bool
@@ -224,7 +224,7 @@ class VerifiedImage(NamedTuple):
 def verify_image(path: Path) -> VerifiedImage:
     """Decode every byte of an image file once. Raises `CaptureError` naming a file that is truncated or damaged.
 
-    OpenCV fills the missing part of a truncated file with grey and says nothing; Pillow is strict. JPEGs are
+    OpenCV fills the missing part of a truncated file with gray and says nothing; Pillow is strict. JPEGs are
     decoded at 1/8 size, which still reads the whole stream, several times faster.
     """
     try:

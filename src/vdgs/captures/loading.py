@@ -29,7 +29,7 @@ MAX_DISTANCE_RATIO = 100.0
 
 
 def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
-    """Read, check and normalise the capture in the folder `path`.
+    """Read, check and normalize the capture in the folder `path`.
 
     Raises `CaptureError` naming the file, what is wrong and the remedy, before anything expensive happens.
     Pixels are not decoded here; `image_checks.check_images` does that.
@@ -58,7 +58,7 @@ def make_capture(root: Path, source: SourceCapture, options: CaptureOptions) -> 
     views = [_view(photo, options, ground) for photo in photographs]
     points, colors = ground.to_ground(source.points), source.colors
     if (colors == GRAY).all():
-        warnings.append("the points bring no colours under a name that is known; the scene starts from grey.")
+        warnings.append("the points bring no colors under a name that is known; the scene starts from gray.")
     if options.max_images is not None and options.max_images < len(views):
         warnings.append(f"using the {options.max_images} of {len(views)} photographs nearest to the middle.")
         views = select_central_views(views, options.max_images)

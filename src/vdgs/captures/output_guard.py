@@ -42,7 +42,7 @@ _MANY_PICTURES = 3
 
 
 def check_output(output: Path) -> None:
-    """Raise VdgsError where `output` lies in a folder of inputs of some capture, known by its name and its neighbours,
+    """Raise VdgsError where `output` lies in a folder of inputs of some capture, known by its name and its neighbors,
     or in a folder of photographs.
 
     `output` is a file or folder that need not be there yet; links and `..` are followed. Reads no capture, so that it

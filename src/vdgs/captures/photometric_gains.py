@@ -1,6 +1,6 @@
-"""How bright photographs are beside each other, from the colours of the points that several of them show.
+"""How bright photographs are beside each other, from the colors of the points that several of them show.
 
-log colour of point p in photograph i = gain of i + colour of p: what a place looks like cancels out, so that it is
+log color of point p in photograph i = gain of i + color of p: what a place looks like cancels out, so that it is
 known before anything is trained whether the camera changed its exposure.
 """
 
@@ -25,7 +25,7 @@ LONGEST_SIDE_PX = 512
 #: They are blurred by this share of it, and by half a pixel at least: points are not found to the pixel, and edges fall
 #: on either side.
 BLUR = 0.006
-#: Added to colours of 0 to 255 before their logarithm is taken: nothing is quite black, and noise is.
+#: Added to colors of 0 to 255 before their logarithm is taken: nothing is quite black, and noise is.
 LOG_OFFSET = 4.0
 #: Of a photograph that shares fewer points with others nothing is known.
 MIN_SHARED_POINTS = 20
@@ -36,7 +36,7 @@ MEDIAN_ITERATIONS = 5
 @dataclass(frozen=True, eq=False)
 class PointColors:
     """Points as photographs show them: s sightings, of point `point[s]` in photograph `image[s]` (in the order of
-    photographs), whose colour has the logarithm `color[s]` there. Every point is shown by two photographs or more."""
+    photographs), whose color has the logarithm `color[s]` there. Every point is shown by two photographs or more."""
 
     image: Int64[np.ndarray, " s"]
     point: Int64[np.ndarray, " s"]
@@ -50,7 +50,7 @@ class PointColors:
 
     def gain_spread(self) -> float:
         """How differently photographs show the same point for their gains: the standard deviation of the gains of those
-        that show it, over all points and colours; about a share of their brightness. Slow drifts count by what they
+        that show it, over all points and colors; about a share of their brightness. Slow drifts count by what they
         make between photographs of one place."""
         numbers, image = np.unique(self.image, return_inverse=True)
         gains = self._fitted(image, len(numbers))[image]
@@ -74,7 +74,7 @@ class PointColors:
             return np.stack([np.bincount(image, column, count) for column in values.T], axis=1)
 
         def normal(gains: np.ndarray) -> np.ndarray:
-            # The colours of points, eliminated: each takes the mean of what the photographs of it leave.
+            # The colors of points, eliminated: each takes the mean of what the photographs of it leave.
             gains = gains.reshape(count, -1)
             return much * gains - by_image(mean(gains[image])[self.point])
 
@@ -119,7 +119,7 @@ def _factor(images: ImageCache) -> float:
 
 
 def _seen(view: View, image: DecodedImage) -> tuple[Int64[np.ndarray, " m"], Float[np.ndarray, "m 3"]]:
-    """The numbers of points that a photograph shows, each once, and logarithms of their colours in it."""
+    """The numbers of points that a photograph shows, each once, and logarithms of their colors in it."""
     assert view.observations is not None
     side = max(image.image.shape[:2])
     if side > LONGEST_SIDE_PX:

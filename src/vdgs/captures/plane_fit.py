@@ -19,7 +19,7 @@ MIRRORED_BY, MIRRORED_TIMES = 10.0, 0.7
 
 
 def mirrored(centers: np.ndarray, targets: np.ndarray, up: np.ndarray, others: dict[str, np.ndarray]) -> str:
-    """Which of other readings of positions `targets` [n, 3], by what they are called, explains camera centres [n, 3],
+    """Which of other readings of positions `targets` [n, 3], by what they are called, explains camera centers [n, 3],
     whose up [3] is known for sure, far better than the positions as they are; empty where none does."""
     if len(centers) < 3:
         return ""

@@ -1,4 +1,4 @@
-"""A similarity from camera centres to positions whose accuracy nobody knows: both are estimated together.
+"""A similarity from camera centers to positions whose accuracy nobody knows: both are estimated together.
 
 Positions of ordinary receivers are off by metres across and by tens of metres in altitude, which drifts through a
 flight. The fit therefore weighs east, north and up by what each is found to be good for, takes what the photographs
@@ -96,7 +96,7 @@ class PositionFit:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Problem:
-    """Camera centres [n, 3], positions [n, 3], when they were recorded [n] (0 to 1), and what else is known."""
+    """Camera centers [n, 3], positions [n, 3], when they were recorded [n] (0 to 1), and what else is known."""
 
     centers: np.ndarray
     targets: np.ndarray

@@ -24,7 +24,7 @@ TEST_LIST, VALIDATION_LIST = "test.txt", "validation.txt"
 
 
 def select_central_views(views: list[View], count: int) -> list[View]:
-    """The `count` views nearest to the median camera centre: a compact patch keeps its overlap."""
+    """The `count` views nearest to the median camera center: a compact patch keeps its overlap."""
     centers = np.stack([view.camera.position for view in views])
     distance = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
     chosen = np.sort(np.argsort(distance, kind="stable")[:count])

@@ -70,7 +70,7 @@ def undistort(folder: Path, photographs: list[ImageFile]) -> list[ImageFile]:
 
 
 def undistorted_pinhole(intrinsics: Intrinsics) -> Intrinsics:
-    """The pinhole camera whose picture holds no blank pixels (COLMAP's own choice of size and centre)."""
+    """The pinhole camera whose picture holds no blank pixels (COLMAP's own choice of size and center)."""
     from vdgs.system.colmap import pycolmap  # 60 MB of memory: only for lenses that need it
 
     try:
@@ -88,7 +88,7 @@ def undistorted_pinhole(intrinsics: Intrinsics) -> Intrinsics:
 def sampling_map(distorted: Intrinsics, pinhole: Intrinsics, strip_px: int = STRIP_PX) -> np.ndarray:
     """Where each pixel of the pinhole picture lies in the distorted one, [h, w, 2] float32.
 
-    In OpenCV's convention: pixel centres are at 0.5 here and at 0 in `cv2.remap`. Made `strip_px` pixels at a
+    In OpenCV's convention: pixel centers are at 0.5 here and at 0 in `cv2.remap`. Made `strip_px` pixels at a
     time: all at once would take eight times the memory of the map.
     """
     (fx, fy), (cx, cy) = pinhole.focal, pinhole.principal_point

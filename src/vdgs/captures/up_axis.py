@@ -77,7 +77,7 @@ def estimate_up(
 
 
 def _least_variance(centers: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, bool]:
-    """The axis [3], of either sign, of least variance of camera centres and points, and whether it is uncertain.
+    """The axis [3], of either sign, of least variance of camera centers and points, and whether it is uncertain.
 
     Both covariances are divided by their trace, so that each counts alike, and added; points beyond the 95 % quantile
     of distance to the median are left out.

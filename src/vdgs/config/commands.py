@@ -25,7 +25,7 @@ RENDER_BYTES_PER_PIXEL = 100
 #: Frames of one film: nearly two hours at 30 a second.
 MAX_FRAMES = 200_000
 
-#: Coordinates of maps: no system on Earth has larger ones (Earth-centred metres have seven digits).
+#: Coordinates of maps: no system on Earth has larger ones (Earth-centered metres have seven digits).
 MAP_COORDINATE_RANGE = Range(-1e9, 1e9)
 
 #: `best` is the merged model where there is one for the run's settings, else the coarse one.
@@ -113,10 +113,10 @@ class RenderRequest:
     capture: Path | None = None
     """Where the capture lies now; needed only where the run has lost its cameras.json."""
     mode: Literal["rgb", "depth", "visibility", "alpha"] = "rgb"
-    """What to draw: the picture; the median depth, at which a pixel becomes half opaque (grey where it never does); the
+    """What to draw: the picture; the median depth, at which a pixel becomes half opaque (gray where it never does); the
     number of training cameras that see each place, V; or alpha, how opaque the scene is."""
     colorbar: bool = True
-    """Put a strip with the scale of the colours below each map; without it a map is as large as the image."""
+    """Put a strip with the scale of the colors below each map; without it a map is as large as the image."""
     raw: bool = False
     """Also write the numbers of a map, NAME.npy beside NAME.png: float32 [height, width]. Depth is z along the view in
     units of the ground frame (metres where known); depth and V are NaN where nothing is drawn."""
@@ -180,15 +180,15 @@ class ExportRequest:
     block: Annotated[int | None, Range(0, 10_000)] = None
     """Only what this block of the merged scene owns."""
     bbox: Annotated[tuple[float, float, float, float] | None, MAP_COORDINATE_RANGE] = None
-    """Only Gaussians with centres in X0 Y0 X1 Y1, in coordinates of --crs."""
+    """Only Gaussians with centers in X0 Y0 X1 Y1, in coordinates of --crs."""
     max_gaussians: Annotated[int, Range(0, MAX_COUNT)] = 0
     """Largest number of Gaussians; 0: all. Those that make most of the training photographs stay."""
     sh_degree: Literal[0, 1, 2, 3] = 3
-    """Degree of the spherical harmonics of colours. 0: the same from everywhere, and a fifth of the size."""
+    """Degree of the spherical harmonics of colors. 0: the same from everywhere, and a fifth of the size."""
     html_max_mb: Annotated[float, Range(1, 2000)] = 30.0
     """Largest size of a .html file in MB. The scene is thinned until it fits."""
     color_iterations: Annotated[int | None, Range(0, 100)] = None
-    """Rounds in which colours are fitted again. To the difference from the model's images; by default 8, or 1 where
+    """Rounds in which colors are fitted again. To the difference from the model's images; by default 8, or 1 where
     the anchors spawn more than four million Gaussians (docs/export.md)."""
     optimize_seconds: Annotated[float, SECONDS_RANGE] = 0.0
     """Seconds of optimization of baked parameters; 0: none. Of all parameters, towards the model's images, after the

@@ -27,10 +27,10 @@ class AnchorConfig:
     num_offsets: Annotated[int, Range(1, 32)] = 10
     """Gaussians per anchor (k)."""
     voxel_size: Annotated[float, Range(0, MAX_FLOAT)] = 0.0
-    """Edge of the initial voxel grid in units of the ground frame; 0 takes the median nearest-neighbour distance of the
+    """Edge of the initial voxel grid in units of the ground frame; 0 takes the median nearest-neighbor distance of the
     sparse points."""
     outlier_distance: Annotated[float, Range(2, MAX_FLOAT, allow_zero=True)] = 30.0
-    """Sparse points whose fourth neighbour is this many times farther than the median start no anchor; 0 keeps all
+    """Sparse points whose fourth neighbor is this many times farther than the median start no anchor; 0 keeps all
     (choice: points deep below the ground become a backdrop)."""
     fill_gaps: bool = True
     """Also start anchors on ground that cameras see but that holds no sparse points: woods, water, fields (choice)."""
@@ -43,9 +43,9 @@ class AnchorConfig:
     view_distance: bool = False
     """Feed the distance between camera and anchor to the decoder too."""
     appearance_dim: Annotated[int, Range(0, 1024)] = 0
-    """Size of the appearance embedding of each training image (colour only); 0 for none."""
+    """Size of the appearance embedding of each training image (color only); 0 for none."""
     from_colors: bool = False
-    """Start the features from the colours of the sparse points instead of zeros."""
+    """Start the features from the colors of the sparse points instead of zeros."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +63,7 @@ class LearningRateConfig:
     covariance: Annotated[tuple[float, float], LEARNING_RATE_RANGE] = (0.004, 0.004)
     """Covariance decoder."""
     color: Annotated[tuple[float, float], LEARNING_RATE_RANGE] = (0.008, 5e-5)
-    """Colour decoder."""
+    """Color decoder."""
     appearance: Annotated[tuple[float, float], LEARNING_RATE_RANGE] = (0.05, 5e-4)
     """Appearance embedding."""
     exposure: Annotated[tuple[float, float], LEARNING_RATE_RANGE] = (0.001, 1e-4)
@@ -124,17 +124,17 @@ class CompensationConfig:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """What training minimises."""
+    """What training minimizes."""
 
     ssim_lambda: Annotated[float, FRACTION] = 0.2
     """Loss = (1 - w) L1 + w (1 - SSIM) + volume."""
     volume_reg: Annotated[float, Range(0, MAX_FLOAT)] = 0.01
     """Weight of the mean product of the three scales of the Gaussians that are drawn."""
     background: Literal["mean", "black"] = "mean"
-    """Colour behind the scene: the mean of the training photographs (choice), or black."""
+    """Color behind the scene: the mean of the training photographs (choice), or black."""
     random_background: Annotated[float, FRACTION] = 1.0
-    """Share of the background's colour that is drawn at random in every step, from the RGB cube: transparent ground
-    cannot borrow its colour (choice; the paper does not name its background)."""
+    """Share of the background's color that is drawn at random in every step, from the RGB cube: transparent ground
+    cannot borrow its color (choice; the paper does not name its background)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,8 +171,8 @@ class TrainConfig:
     loss: LossConfig = field(default_factory=LossConfig)
     """The loss."""
     exposure_compensation: bool = False
-    """Fit an affine colour model to each photograph, whose mean over all photographs is neutral. The scene is drawn in
-    neutral colours, and compared with a test photograph in the exposure predicted from the training photographs taken
+    """Fit an affine color model to each photograph, whose mean over all photographs is neutral. The scene is drawn in
+    neutral colors, and compared with a test photograph in the exposure predicted from the training photographs taken
     before and after it and from its metadata (no pixel of it is used). Blocks keep the models (choice)."""
     exposure_min_spread: Annotated[float, Range(0, 1)] = 0.0
     """Fit exposures only where photographs of the same sparse points differ in brightness by at least this share

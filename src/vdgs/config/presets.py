@@ -1,7 +1,7 @@
 """Settings by name.
 
 `default`   the paper's numbers. Where it is silent, or a reading of it leaves a scene that cannot be used, our choices
-            stay: gaps are filled and outliers start no anchor; the background is the mean colour, and in training
+            stay: gaps are filled and outliers start no anchor; the background is the mean color, and in training
             random ones, so that ground becomes opaque; Gaussians are bounded in size and stay about their anchors;
             cameras are assigned by `coverage`, join their best block, and blocks are topped up; what lies around a
             block is drawn; the gate of compensated growth is lower where few cameras look, and g is added to means;

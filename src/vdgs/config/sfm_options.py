@@ -19,7 +19,7 @@ class SfmOptions:
     tell it from the height (straight down from one height, by what the drone recorded or by level positions all over an
     area) and where the maker calibrated it; fitted otherwise."""
     num_neighbors: Annotated[int, Range(2, 1000)] = 16
-    """Neighbours that each photograph is matched with. Where positions are known; more where neighbours show
+    """Neighbors that each photograph is matched with. Where positions are known; more where neighbors show
     little of the same: facades, oblique views, several cameras at one place."""
     exhaustive_max: Annotated[int, Range(0, MAX_COUNT)] = 50
     """Up to so many photographs without positions are matched all with all. Of more, those are matched that are next

@@ -1,1 +1,1 @@
-"""Evaluation: metrics, colour correction, pictures."""
+"""Evaluation: metrics, color correction, pictures."""

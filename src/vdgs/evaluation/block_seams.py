@@ -201,7 +201,7 @@ def _isolated_errors(
 
 
 def draw_seam_image(view: SeamView) -> Image.Image:
-    """Coarse | merged | merged with the borders of blocks | error of the merged render, labelled."""
+    """Coarse | merged | merged with the borders of blocks | error of the merged render, labeled."""
     height, width = view.labels.shape
     size = panel_size(width, height, PANEL_MIN_PX, PANEL_MAX_PX)
     error = absolute_error(view.merged, view.reference)

@@ -1,6 +1,6 @@
 """Quality by block, and what the seams between blocks cost.
 
-Every pixel of a test view is labelled with the block that owns the point it shows. PSNR is pooled by block, and the
+Every pixel of a test view is labeled with the block that owns the point it shows. PSNR is pooled by block, and the
 error near the borders of the labels is compared with the error in the interior. The coarse model, which has no seams,
 is measured on the same pixels: borders may lie where images are hard to match anyway. Only sums stay in memory.
 """
@@ -31,7 +31,7 @@ NO_BLOCK = -1
 
 
 def block_label_map(raster: Raster, camera: Camera, blocks: Blocks) -> Int16[np.ndarray, "h w"]:
-    """The block that owns the point that each pixel shows (its centre at the median depth); NO_BLOCK where alpha is at
+    """The block that owns the point that each pixel shows (its center at the median depth); NO_BLOCK where alpha is at
     most one half. The expected depth would lie between roof and ground at the edge of a roof.
     Raises ValueError if the view was rendered without depth.
     """
@@ -68,7 +68,7 @@ def border_lines(labels: Int16[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 
 
 def border_pixels(labels: Int16[np.ndarray, "h w"], width_px: float = BORDER_PX) -> Bool[np.ndarray, "h w"]:
-    """Drawn pixels whose centre is within `width_px` (Euclidean) of the centre of one on a border line."""
+    """Drawn pixels whose center is within `width_px` (Euclidean) of the center of one on a border line."""
     lines = border_lines(labels)
     if not lines.any():
         return lines

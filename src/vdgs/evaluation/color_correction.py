@@ -1,8 +1,8 @@
-"""Colour correction before a comparison: a render is not blamed for the exposure of its photograph.
+"""Color correction before a comparison: a render is not blamed for the exposure of its photograph.
 
 Two of them. The correction of multinerf (Barron et al. 2022), which DOGS applies always and Momentum-GS on request:
-five rounds of least squares from ten quadratic colour features of the render to the photograph. And one affine map of
-the colours, the least that another exposure and white balance need: what a model of exposure in training can undo.
+five rounds of least squares from ten quadratic color features of the render to the photograph. And one affine map of
+the colors, the least that another exposure and white balance need: what a model of exposure in training can undo.
 Both are fitted on the test image itself, so a corrected figure never stands without the raw one beside it.
 """
 
@@ -40,11 +40,11 @@ def correct_colors(
     iterations: int = FIT_ITERATIONS,
     chunk: int = PIXELS_PER_CHUNK,
 ) -> ColorCorrection:
-    """Warp the colours of `image` [h, w, 3] towards those of `reference`, both uint8 or floats in [0, 1].
+    """Warp the colors of `image` [h, w, 3] towards those of `reference`, both uint8 or floats in [0, 1].
 
     Each round regresses every channel of the reference on the features of the current estimate, over
     the pixels whose value in that channel is unsaturated in the input, in the current estimate and in
-    the reference, because the set of saturated pixels moves with the colours. `mask` restricts the fit,
+    the reference, because the set of saturated pixels moves with the colors. `mask` restricts the fit,
     not the image that comes back. The features of `chunk` pixels are held at a time. With fewer than
     `MIN_PIXELS` usable pixels in any channel of any round the image comes back unchanged, `fitted` false.
     """
@@ -54,7 +54,7 @@ def correct_colors(
 def correct_colors_affine(
     image: np.ndarray, reference: np.ndarray, mask: Bool[np.ndarray, "h w"] | None = None
 ) -> ColorCorrection:
-    """As `correct_colors`, but by one affine map of the colours, fitted once."""
+    """As `correct_colors`, but by one affine map of the colors, fitted once."""
     return _correct(image, reference, mask, 1, _affine)
 
 
@@ -101,7 +101,7 @@ def _fit(
             counted = features * usable[channel, at]
             gram[channel] += counted @ features.T
             moment[channel] += counted @ target[channel, at]
-    # lstsq, not solve: a grey image makes the features collinear, and then the smallest solution is meant.
+    # lstsq, not solve: a gray image makes the features collinear, and then the smallest solution is meant.
     return np.stack([np.linalg.lstsq(gram[c], moment[c], rcond=1e-13)[0] for c in range(3)])
 
 

@@ -21,7 +21,7 @@ from PIL import Image, ImageDraw, ImageFont
 from vdgs.errors import VdgsError
 from vdgs.system.atomic_files import write_bytes
 
-#: Mean absolute error per channel at the bright end of the colour map: one scale for all views of all
+#: Mean absolute error per channel at the bright end of the color map: one scale for all views of all
 #: runs, so that two pictures can be held side by side.
 ERROR_LIMIT = 0.2
 #: Perceptually uniform: equal steps of error look equal.
@@ -61,7 +61,7 @@ def absolute_error(
 
 
 def colorize(values: Float[np.ndarray, "h w"], limit: float, cmap: str = ERROR_CMAP) -> UInt8[np.ndarray, "h w 3"]:
-    """Values from 0 to `limit` (clipped) to colours; NaN becomes white."""
+    """Values from 0 to `limit` (clipped) to colors; NaN becomes white."""
     table = (mpl.colormaps[cmap](np.linspace(0.0, 1.0, 256))[:, :3] * 255.0 + 0.5).astype(np.uint8)
     known = ~np.isnan(values)
     levels = np.clip(np.where(known, values, 0.0) / limit, 0.0, 1.0) * 255.0 + 0.5
@@ -78,7 +78,7 @@ def draw_comparison(
     mask: np.ndarray | None = None,
     limit: float = ERROR_LIMIT,
 ) -> Image.Image:
-    """Photograph | render | error with its colour bar. `figures` stands beside the render's label;
+    """Photograph | render | error with its color bar. `figures` stands beside the render's label;
     masked pixels of the error are white."""
     error = absolute_error(image, reference)
     if mask is not None:
@@ -90,7 +90,7 @@ def draw_comparison(
 
 
 def draw_panels(panels: Sequence[Panel], title: str, limit: float) -> Image.Image:
-    """Pictures of one size side by side under a title; the last is an error, its colour bar stands at its right."""
+    """Pictures of one size side by side under a title; the last is an error, its color bar stands at its right."""
     width, height = panels[0].picture.size
     count, unit = len(panels), max(12, width // 34)
     margin, gap, head = unit * 3 // 2, unit, unit * 9 // 2
@@ -172,7 +172,7 @@ def load_font(size_px: int, bold: bool = False) -> ImageFont.FreeTypeFont:
 
 
 def _draw_colorbar(canvas: Image.Image, box: tuple[int, int, int, int], limit: float, unit: int) -> None:
-    """A vertical bar (left, top, width, height), 0 at the foot, labelled at five places."""
+    """A vertical bar (left, top, width, height), 0 at the foot, labeled at five places."""
     left, top, width, height = box
     ramp = np.broadcast_to(np.linspace(limit, 0.0, height)[:, None], (height, width))
     canvas.paste(Image.fromarray(colorize(ramp, limit)), (left, top))

@@ -1,4 +1,4 @@
-"""Evaluates a model on views: every figure that papers report, raw, colour-corrected, by visibility; opacity; images.
+"""Evaluates a model on views: every figure that papers report, raw, color-corrected, by visibility; opacity; images.
 One view is in memory at a time.
 
     OUTPUT/
@@ -141,7 +141,7 @@ def _summary(
     unfitted = sum(row.get("color_correction_fitted") is False for row in rows)
     notes = [note for note in (lpips_note, _exposure_note(rows, settings)) if note]
     if unfitted:
-        notes.append(f"colour correction: too few unsaturated pixels in {unfitted} views, left as they are")
+        notes.append(f"color correction: too few unsaturated pixels in {unfitted} views, left as they are")
     result = {
         **{name: mean_or_none([row[name] for row in rows]) for name in keys + REFERENCE_EXPOSURE_KEYS},
         "by_visibility": pixel_bins,
@@ -159,7 +159,7 @@ def _summary(
 
 
 def _exposure_note(rows: Sequence[Mapping[str, Any]], settings: EvaluationSettings) -> str:
-    """How the views are exposed; empty where all are in neutral colours."""
+    """How the views are exposed; empty where all are in neutral colors."""
     exposures = [exposure for row in rows if (exposure := row.get("exposure")) is not None]
     if not exposures:
         return ""

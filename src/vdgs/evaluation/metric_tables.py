@@ -34,8 +34,8 @@ COVERAGE_METRICS = (
 
 
 def make_metrics_table(result: Mapping[str, Any], title: str) -> RenderableType:
-    """What `metrics.json` holds: quality raw, colour-corrected, after an affine map of the colours and, where pictures
-    are exposed, in neutral colours; quality by visibility, opacity, size and speed."""
+    """What `metrics.json` holds: quality raw, color-corrected, after an affine map of the colors and, where pictures
+    are exposed, in neutral colors; quality by visibility, opacity, size and speed."""
     quality = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
     besides = {"_cc": "color-corrected", "_affine": "affine fit"}
     if result["psnr_reference_exposure"] is not None:

@@ -1,6 +1,6 @@
 """Whether a model is opaque where photographs show ground.
 
-A model may leave ground half transparent and borrow the missing colour from its background. PSNR of test views from
+A model may leave ground half transparent and borrow the missing color from its background. PSNR of test views from
 nearby does not show that. Measured are the share of covered pixels that is opaque, PSNR over them before several
 backgrounds, and the number of splats larger than the image.
 """
@@ -51,7 +51,7 @@ class RenderedImage:
     background: RgbColor | None = None
 
     def with_exposure(self, exposure: Float[Tensor, "3 4"]) -> RenderedImage:
-        """The view with the colour model of a photograph: all colours, the background's too. They may leave [0, 1]."""
+        """The view with the color model of a photograph: all colors, the background's too. They may leave [0, 1]."""
         background = self.background
         if background is not None:
             red, green, blue = apply_exposure_numpy(np.array(background), exposure).tolist()
@@ -102,7 +102,7 @@ def summarize_opacity_coverage(rows: Sequence[Mapping[str, Any]]) -> dict[str, f
 def count_oversized_splats(splats: Splats, width: int, height: int) -> int:
     """How many splats are drawn into a picture (pixels) whose longer side their major diameter exceeds.
 
-    A splat ends where its alpha falls to ALPHA_MIN: at sqrt(2 ln(opacity / ALPHA_MIN)) standard deviations. Its centre
+    A splat ends where its alpha falls to ALPHA_MIN: at sqrt(2 ln(opacity / ALPHA_MIN)) standard deviations. Its center
     may lie anywhere, but the box around it reaches the picture.
     """
     a, b, c = splats.conics.double().unbind(dim=1)

@@ -61,7 +61,7 @@ class RenderableModel:
     camera_height: float | None = None
     #: The splats that a view is drawn from.
     decode_splats: Callable[[Camera], Splats] | None = None
-    #: The colour model of a view (`model.exposure`), in which its picture is measured; None: neutral colours.
+    #: The color model of a view (`model.exposure`), in which its picture is measured; None: neutral colors.
     exposure: Callable[[View], Float[Tensor, "3 4"]] | None = None
 
     def __post_init__(self) -> None:
@@ -74,7 +74,7 @@ class RenderableModel:
 class EvaluationSettings:
     """What to measure and draw."""
 
-    #: Also report every figure after colour correction (fitted on the test image itself).
+    #: Also report every figure after color correction (fitted on the test image itself).
     color_correction: bool = True
     #: Bins by visibility, of about equal size.
     visibility_bins: int = DEFAULT_BINS
@@ -86,7 +86,7 @@ class EvaluationSettings:
     exposure_note: str = "in the exposure of each photograph"
     #: Views on the contact sheet at most, chosen evenly.
     contact_sheet_views: int = 40
-    #: Error at the bright end of the colour map, where white is 1.
+    #: Error at the bright end of the color map, where white is 1.
     error_limit: float = comparison_images.ERROR_LIMIT
 
 

@@ -1,11 +1,11 @@
 """The exposure in which images of a model are compared with photographs.
 
-A photograph is brighter or darker than the scene in neutral colours, and so are its neighbours in the flight. Where the
+A photograph is brighter or darker than the scene in neutral colors, and so are its neighbors in the flight. Where the
 camera chose its exposure, what it saw decides too. Only training photographs are used: no pixel of a compared one.
 
 Automatic exposure: over bright fields a camera lets in less light than over a wood. The trained scene is drawn in
-neutral colours and metered as cameras do, most at the middle. The response is learnt from training photographs, each
-against its neighbours: with x the logarithm of how much brighter the scene is than between the neighbours, and y that
+neutral colors and metered as cameras do, most at the middle. The response is learnt from training photographs, each
+against its neighbors: with x the logarithm of how much brighter the scene is than between the neighbors, and y that
 of how much brighter the photograph is exposed, y = slope x. A fixed exposure has slope 0; -1 makes all images alike.
 """
 
@@ -31,7 +31,7 @@ from vdgs.model.exposure import apply_exposure, exposure_matrix, find_flight_nei
 from vdgs.model.renderer import render
 
 #: Training photographs that the law of metering is learnt from at most, evenly chosen: each is drawn small, and so are
-#: its two neighbours.
+#: its two neighbors.
 MAX_SAMPLE_VIEWS = 64
 #: Pictures are metered at this longest side: it is a mean that is wanted.
 METERING_SIZE_PX = 96
@@ -42,20 +42,20 @@ LUMINANCE_WEIGHTS, MIN_LUMINANCE = np.array([0.299, 0.587, 0.114]), 1e-3
 #: Fewer photographs than this teach nothing.
 MIN_SAMPLES = 8
 #: The law is used where it foretells photographs that it was not learnt from with at most so much of the error that
-#: their neighbours alone leave.
+#: their neighbors alone leave.
 MAX_ERROR_RATIO = 0.95
 
 
 def make_exposures(
     model: AnchorModel, capture: Capture, draw: Callable[[Camera], Raster] | None = None
 ) -> ViewExposures | None:
-    """The colour model (`model.exposure`) of any view of the capture that a model was trained on. None where training
+    """The color model (`model.exposure`) of any view of the capture that a model was trained on. None where training
     fitted none. `draw` makes the small pictures that are metered, where not the whole model shall."""
     return None if model.decoder.exposure is None else ViewExposures(model, capture, draw)
 
 
 class ViewExposures:
-    """The colour models of views: that of a training view was fitted, that of a test view is interpolated along its
+    """The color models of views: that of a training view was fitted, that of a test view is interpolated along its
     flight, and corrected for what the camera metered there."""
 
     def __init__(self, model: AnchorModel, capture: Capture, draw: Callable[[Camera], Raster] | None = None):
@@ -72,7 +72,7 @@ class ViewExposures:
         self._metered = cache(lambda image: log_luminance(self._render_small(self._trained[image])))
 
     def __call__(self, view: View) -> Float[Tensor, "3 4"]:
-        """The colour model of a view, [A | b] in float64."""
+        """The color model of a view, [A | b] in float64."""
         position = self._positions[view.name]
         images = self._flights[position.flight]
         exposure = interpolate_exposure(self._departures, images, position.number)
@@ -105,7 +105,7 @@ class ViewExposures:
         return log_luminance(exposed) - self._metered(image)
 
     def _render_small(self, view: View) -> Float[np.ndarray, "h w 3"]:
-        """A view in neutral colours, small."""
+        """A view in neutral colors, small."""
         shrunk = min(1.0, METERING_SIZE_PX / max(view.camera.width, view.camera.height))
         width, height = (max(1, round(shrunk * side)) for side in (view.camera.width, view.camera.height))
         image: np.ndarray = self._render(view.camera.resized(width, height)).image.clamp(0, 1).cpu().numpy()
@@ -129,11 +129,11 @@ class AutoExposure:
     #: Brightness beyond what was learnt from counts as this much, either way.
     max_brightness: float
     #: By how much, as logarithms and in the root of the mean square, photographs are brighter than foretold by their
-    #: neighbours alone, and by what is metered as well, each by a law that was learnt without it. NaN without any law.
+    #: neighbors alone, and by what is metered as well, each by a law that was learnt without it. NaN without any law.
     residual_error: tuple[float, float] = (math.nan, math.nan)
 
     def gain(self, brighter: float) -> float:
-        """The factor on the exposure of a photograph whose view is brighter than between its neighbours, by the
+        """The factor on the exposure of a photograph whose view is brighter than between its neighbors, by the
         logarithm."""
         return float(np.exp(self.slope * np.clip(brighter, -self.max_brightness, self.max_brightness)))
 
@@ -149,7 +149,7 @@ def log_luminance(image: Float[np.ndarray, "h w 3"]) -> float:
 
 def fit_auto_exposure(brighter: Float[np.ndarray, " n"], gains: Float[np.ndarray, " n"]) -> AutoExposure:
     """The law that n photographs tell, each by how much brighter its view is and how much brighter it was exposed than
-    its neighbours; slope 0 where that foretells hardly better those that are left out, one after the other."""
+    its neighbors; slope 0 where that foretells hardly better those that are left out, one after the other."""
     products, squares = brighter * gains, brighter**2
     if len(gains) < MIN_SAMPLES or squares.sum() <= squares.max() * (1 + 1e-9):
         return AutoExposure(0.0, 0.0)

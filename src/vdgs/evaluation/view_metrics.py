@@ -29,9 +29,9 @@ from vdgs.system.documents import JsonObject
 
 RAW_KEYS = ("psnr", "ssim", "lpips_vgg", "lpips_vgg_01")
 CORRECTED_KEYS = tuple(f"{name}_cc" for name in RAW_KEYS)
-#: After one affine map of the colours, which is fitted on the view too.
+#: After one affine map of the colors, which is fitted on the view too.
 AFFINE_KEYS = ("psnr_affine", "ssim_affine")
-#: In neutral colours, where the other figures are of an exposed picture.
+#: In neutral colors, where the other figures are of an exposed picture.
 REFERENCE_EXPOSURE_KEYS = ("psnr_reference_exposure", "ssim_reference_exposure")
 
 

@@ -1,8 +1,8 @@
 """An anchor model as explicit Gaussians that any program can draw.
 
-What anchors spawn depends on where it is seen from: opacity, shape and colour. A file of Gaussians holds one opacity
-and one shape of each, and colours as spherical harmonics. They are fitted over the training cameras, by how much of
-their pictures a Gaussian makes: the derivative of the sum of a picture by its colour. What no training view draws is
+What anchors spawn depends on where it is seen from: opacity, shape and color. A file of Gaussians holds one opacity
+and one shape of each, and colors as spherical harmonics. They are fitted over the training cameras, by how much of
+their pictures a Gaussian makes: the derivative of the sum of a picture by its color. What no training view draws is
 left out.
 
 Two passes. The first draws every training view and keeps for each of its splats how many pixels it is worth; the second
@@ -32,7 +32,7 @@ from vdgs.model.renderer import decode_view
 MIN_PIXELS = 1e-3
 #: Anchors that a thread fits at once.
 ANCHORS_PER_PART = 4096
-#: Pull of spherical harmonics towards one colour for all directions (choice): where cameras look from few directions,
+#: Pull of spherical harmonics towards one color for all directions (choice): where cameras look from few directions,
 #: the others must not swing. Chosen on validation views (docs/export.md).
 RIDGE_WEIGHT = 1e-3
 #: Opacities are kept away from 0 and 1, where their logits have no end.
@@ -176,7 +176,7 @@ def _gather_samples(views: BakeViews, wanted: Int[np.ndarray, " m"]) -> _ViewSam
 
 
 def _decode_from(model: AnchorModel, gaussians: Tensor, camera: Camera) -> tuple[Tensor, ...]:
-    """Direction, colour, opacity, logarithms of the scales and rotation of Gaussians (ascending) from a camera."""
+    """Direction, color, opacity, logarithms of the scales and rotation of Gaussians (ascending) from a camera."""
     anchors, k = model.anchors, model.anchors.offsets.shape[1]
     rows, place = torch.unique_consecutive(gaussians // k, return_inverse=True)
     offset = gaussians % k

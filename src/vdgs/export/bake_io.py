@@ -58,7 +58,7 @@ def load_residual(path: Path) -> ColorResidual:
 
 
 def save_color_updates(path: Path, rows: Int[np.ndarray, " c"], colors: Float[Tensor, "c f 3"]) -> None:
-    """Write what is to be added to the colours of some Gaussians."""
+    """Write what is to be added to the colors of some Gaussians."""
     numbers = colors.flatten(1).numpy().view(np.int32)
     write_array(path, np.concatenate([rows.astype(np.int32)[:, None], numbers], axis=1))
 

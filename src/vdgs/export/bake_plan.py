@@ -4,11 +4,11 @@ Each step needs all of the one before. Shards are numbered through all steps, so
 
     survey              training views      what each shows
     fit                 parts of anchors    their Gaussians
-    compare, then mend  views, then parts   what pictures lack; what is added to colours. For each of the
+    compare, then mend  views, then parts   what pictures lack; what is added to colors. For each of the
                                             `color_iteration_cameras`
 
     RUN/baking/shards/KEY/   of all shards together (`executors.sharded_job`): pixels.npy and kept.npy, from the survey;
-                             N.spool, the Gaussians after N rounds of fitting colours, the last of them alone
+                             N.spool, the Gaussians after N rounds of fitting colors, the last of them alone
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ VIEWS_OF_SHARD, PARTS_OF_SHARD = (16, 100, 8), (4, 50, 8)
 SURVEY = shard_kind("survey views", "views")
 FIT = shard_kind("fit Gaussians", "parts")
 COMPARE = shard_kind("compare pictures", "views")
-UPDATE_COLORS = shard_kind("fit colours again", "parts")
+UPDATE_COLORS = shard_kind("fit colors again", "parts")
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class BakeStep:
 
     kind: JobLabels
     round: int
-    """0: before colours are fitted again."""
+    """0: before colors are fitted again."""
     items: range
     shards: range
 
@@ -106,7 +106,7 @@ class BakePlan:
 
 
 def drop_unused_sh_degrees(request: ExportRequest) -> ExportRequest:
-    """Without colours that change with the direction where no file that is asked for holds them."""
+    """Without colors that change with the direction where no file that is asked for holds them."""
     if all(registry.format_from_path(path).fixed_colors for path in request.output):
         return replace(request, sh_degree=0)
     return request
@@ -140,7 +140,7 @@ def _request(run: OpenedRun, asked: ExportRequest) -> ExportRequest:
 
 
 def _depends_on(run: OpenedRun, request: ExportRequest) -> list[Any]:
-    """The model, the degree, how often colours are fitted, and what chooses among its Gaussians."""
+    """The model, the degree, how often colors are fitted, and what chooses among its Gaussians."""
     crs = None if request.bbox is None else request.crs or default_crs(run.capture.ground, request.output[0])
     box = None if request.bbox is None else list(request.bbox)
     count = color_iteration_count(request.color_iterations, gaussian_count(run.model))

@@ -1,10 +1,10 @@
-"""Colours fitted again to what pictures lack, once opacities and shapes are fixed.
+"""Colors fitted again to what pictures lack, once opacities and shapes are fixed.
 
-A model shows some of what changes with the direction by opacity and shape, which a file cannot. Colours can stand in
+A model shows some of what changes with the direction by opacity and shape, which a file cannot. Colors can stand in
 for them. The baked Gaussians are drawn where the model is, its picture minus theirs is what is missing, and each
-Gaussian takes of it the mean over the pixels that it makes, by its part of each: for the colours one step of the
+Gaussian takes of it the mean over the pixels that it makes, by its part of each: for the colors one step of the
 simultaneous iterative reconstruction technique (Gilbert, 1972). Spherical harmonics are fitted to these steps as they
-were to the colours.
+were to the colors.
 
 Cameras between those of the photographs take part: the model knows what is to be seen from there, and without them what
 few photographs ask for would be learnt by heart. Memory: 12 bytes for each Gaussian that a view shows.
@@ -35,7 +35,7 @@ FLUSH_EVERY = 16
 
 @dataclass(frozen=True, eq=False)
 class ColorResidual:
-    """What one view lacks: for Gaussians, ascending, the pixels that each makes and the mean colour missing there."""
+    """What one view lacks: for Gaussians, ascending, the pixels that each makes and the mean color missing there."""
 
     gaussians: Int32[Tensor, " p"]
     pixels: Float16[Tensor, " p"]
@@ -78,7 +78,7 @@ class BakedGaussians:
 def refine_colors(
     baked: BakedGaussians, cameras: Sequence[Camera], after_view: Callable[[], None] = lambda: None
 ) -> None:
-    """Add to the colours of all Gaussians, on the disk, what the pictures of these cameras lack."""
+    """Add to the colors of all Gaussians, on the disk, what the pictures of these cameras lack."""
     views, device = list[ColorResidual](), baked.model.anchors.positions.device
     for view in map_views(lambda camera: view_residual(baked, camera), cameras, device):
         views.append(view)
@@ -131,7 +131,7 @@ def _camera_center(camera: Camera) -> Float[Tensor, "3"]:
 def color_updates(
     baked: BakedGaussians, cameras: Sequence[Camera], residuals: Sequence[ColorResidual], rows: range
 ) -> tuple[Int[np.ndarray, " c"], Float[Tensor, "c f 3"]]:
-    """What is to be added to the colours of the Gaussians of some rows: of which, ascending, and how much."""
+    """What is to be added to the colors of the Gaussians of some rows: of which, ascending, and how much."""
     means, columns = torch.from_numpy(baked.spool.means), list[tuple[Tensor, ...]]()
     for camera, view in zip(cameras, residuals, strict=True):
         low, high = index_range(view.gaussians, rows.start, rows.stop)

@@ -39,7 +39,7 @@ class ExportLoss:
     of: str
     psnr: float
     psnr_baked: float
-    #: After the usual correction of colours, fitted to each photograph: what is lost but for its exposure.
+    #: After the usual correction of colors, fitted to each photograph: what is lost but for its exposure.
     psnr_cc: float
     psnr_cc_baked: float
     ssim: float
@@ -58,7 +58,7 @@ def measure_loss(
 ) -> ExportLoss:
     """Draw `views_to_measure` with the model and with Gaussians, which are in the ground frame, and compare both with
     the photographs, in 8 bits as all metrics, and as `vdgs eval` in the exposure of each view where exposures were
-    fitted: files hold neutral colours. Of the pieces only what those views show is kept in memory."""
+    fitted: files hold neutral colors. Of the pieces only what those views show is kept in memory."""
     views, exposure = views_to_measure(run), make_exposures(run.model, run.capture)
     gaussians = _seen(chunks, [view.camera for view in views])
     visibility = make_visibility_map(with_coarse_model(run))

@@ -82,7 +82,7 @@ class _BakedScene:
 
 
 def make_initial_view(run: OpenedRun, most_bytes: int) -> InitialView:
-    """All of the flight, before the colour that the model has behind it; ground frame."""
+    """All of the flight, before the color that the model has behind it; ground frame."""
     position, target = default_view(run.capture)
     red, green, blue = (float(each) for each in run.model.background)
     title = run.capture.root.resolve().name or "scene"
@@ -158,7 +158,7 @@ def write_files(
             baked = _BakedScene(spool, request.sh_degree, make_initial_view(run, int(request.html_max_mb * 1e6)))
             seconds = time.monotonic() - began
             rounds = color_iteration_count(request.color_iterations, gaussian_count(run.model))
-            console.print(f"baked in {seconds:.1f} s, colours fitted again in {rounds} rounds", highlight=False)
+            console.print(f"baked in {seconds:.1f} s, colors fitted again in {rounds} rounds", highlight=False)
             files = [
                 _write(path, baked.scene(frames[path], rows[path], path, request), console) for path in request.output
             ]

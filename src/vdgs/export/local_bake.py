@@ -76,7 +76,7 @@ class LocalBake:
         )
 
     def _improve(self, baked: BakedGaussians, bar: Progress) -> None:
-        """Fit the colours again to what pictures lack."""
+        """Fit the colors again to what pictures lack."""
         task = bar.add_task("comparing pictures", total=sum(map(len, self._rounds)))
 
         def after_view() -> None:

@@ -59,7 +59,7 @@ def make_local_frame(
 ) -> LocalFrame:
     """The local coordinates of a system (`Placement.of`) about a scene whose middle is `center` (ground frame).
 
-    Gaussians take the similarity that is right about the centre: over a kilometre a projection departs from it by
+    Gaussians take the similarity that is right about the center: over a kilometre a projection departs from it by
     centimetres, mostly in height (the Earth is round). A middle that is more than `far` from the origin of the system
     gets an origin of its own; in `enu` that is a place on Earth, about which x is east, y north and z up again, so that
     what says of the file where it stands is one thing, its latitude, longitude and height. Raises VdgsError for a

@@ -17,9 +17,9 @@ NUM_NEIGHBORS = 3
 #: That is: whose directions are at most about 45 degrees apart (cosine).
 MIN_DIRECTION_COSINE = 0.7
 #: They are turned about each axis by up to this share of half of what a picture's width holds, so as to look at what no
-#: photograph nearby shows too: seen from afar alone, it would take any colour (docs/export.md).
+#: photograph nearby shows too: seen from afar alone, it would take any color (docs/export.md).
 MAX_TURN_SHARE = 0.5
-#: So many times colours are fitted again, and how often where anchors spawn more Gaussians than that.
+#: So many times colors are fitted again, and how often where anchors spawn more Gaussians than that.
 DEFAULT_COLOR_ITERATIONS, LARGE_SCENE_COLOR_ITERATIONS, LARGE_SCENE_GAUSSIANS = 8, 1, 4_000_000
 #: No seed of `color_iteration_cameras` reaches here.
 FIRST_ENDLESS_SEED = 1000
@@ -33,7 +33,7 @@ def color_iteration_count(requested: int | None, gaussians: int) -> int:
 
 
 def color_iteration_cameras(training: Sequence[Camera], count: int) -> tuple[Sequence[Camera], ...]:
-    """By which pictures colours are fitted again, round by round: from between the training cameras, others each time,
+    """By which pictures colors are fitted again, round by round: from between the training cameras, others each time,
     for where the same places are looked at again and again, what suits them is learnt by heart; the last time by those
     of the photographs too."""
     inner = tuple(novel_cameras(training, number, include_isolated=True) for number in range(count - 1))
@@ -50,7 +50,7 @@ def endless_cameras(training: Sequence[Camera]) -> Iterator[Camera]:
 
 
 def novel_cameras(cameras: Sequence[Camera], seed: int, include_isolated: bool = False) -> list[Camera]:
-    """Each camera that has neighbours somewhere between itself and these, in their mean by random weights, all equally
+    """Each camera that has neighbors somewhere between itself and these, in their mean by random weights, all equally
     likely, and turned a little. With `alone` also those that have none, turned where they are."""
     places = np.array([camera.position for camera in cameras])
     forward = np.array([camera.forward for camera in cameras])

@@ -1,6 +1,6 @@
 """Cameras: where a picture was taken from and how space falls onto its pixels.
 
-Conventions (docs/conventions.md): OpenCV axes (+x right, +y down, +z forward), pixel centres at 0.5,
+Conventions (docs/conventions.md): OpenCV axes (+x right, +y down, +z forward), pixel centers at 0.5,
 `camera_from_world` maps world points to camera points. Names: w world, c camera, px pixels.
 """
 
@@ -42,7 +42,7 @@ class Camera:
 
     @cached_property
     def position(self) -> np.ndarray:
-        """Camera centre in the world, [3] float64."""
+        """Camera center in the world, [3] float64."""
         rotation, translation = self.camera_from_world[:3, :3], self.camera_from_world[:3, 3]
         return -rotation.T @ translation
 
@@ -104,7 +104,7 @@ class Camera:
         return np.stack([x, y], axis=1), depth
 
     def unproject(self, depth: np.ndarray) -> np.ndarray:
-        """Depth [h, w] at the pixel centres to world points [h, w, 3] (float64): the inverse of `project`."""
+        """Depth [h, w] at the pixel centers to world points [h, w, 3] (float64): the inverse of `project`."""
         x = (np.arange(self.width) + 0.5 - self.cx) / self.fx
         y = (np.arange(self.height) + 0.5 - self.cy) / self.fy
         across = np.stack(np.meshgrid(x, y), axis=-1)
@@ -114,7 +114,7 @@ class Camera:
         return (local - self.camera_from_world[:3, 3]) @ self.camera_from_world[:3, :3]
 
     def in_frustum(self, points: np.ndarray) -> np.ndarray:
-        """Which points fall inside the frustum: z > near and projected centre on the image, [n] bool."""
+        """Which points fall inside the frustum: z > near and projected center on the image, [n] bool."""
         pixels, depth = self.project(points)
         x, y = pixels[:, 0], pixels[:, 1]
         return (depth > NEAR_PLANE) & (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)

@@ -1,4 +1,4 @@
-"""WGS 84: geodetic coordinates, Earth-centred coordinates and local east-north-up frames, in float64."""
+"""WGS 84: geodetic coordinates, Earth-centered coordinates and local east-north-up frames, in float64."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ ECCENTRICITY2 = FLATTENING * (2 - FLATTENING)
 
 
 def ecef_from_geodetic(geodetic: np.ndarray) -> np.ndarray:
-    """(latitude deg, longitude deg, altitude m) [n, 3] to Earth-centred, Earth-fixed metres [n, 3]."""
+    """(latitude deg, longitude deg, altitude m) [n, 3] to Earth-centered, Earth-fixed metres [n, 3]."""
     latitude, longitude = np.radians(geodetic[:, 0]), np.radians(geodetic[:, 1])
     altitude = geodetic[:, 2]
     normal = SEMI_MAJOR_M / np.sqrt(1 - ECCENTRICITY2 * np.sin(latitude) ** 2)
@@ -50,7 +50,7 @@ def wrap_degrees(angles: np.ndarray) -> np.ndarray:
 
 
 def enu_axes(latitude_deg: float, longitude_deg: float) -> np.ndarray:
-    """Rows: east, north, up as Earth-centred unit vectors, [3, 3]."""
+    """Rows: east, north, up as Earth-centered unit vectors, [3, 3]."""
     latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
     sin_lat, cos_lat, sin_lon, cos_lon = np.sin(latitude), np.cos(latitude), np.sin(longitude), np.cos(longitude)
     north = [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]

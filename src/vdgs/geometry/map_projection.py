@@ -2,7 +2,7 @@
 
 A georeferenced ground frame is a plane tangent to the Earth (ENU), which differs from a map projection by centimetres
 in height over a kilometre, by the meridian convergence and by the scale factor. Points therefore pass through
-Earth-centred and geodetic coordinates (pyproj); tiles and shapes of Gaussians take the similarity that is exact at one
+Earth-centered and geodetic coordinates (pyproj); tiles and shapes of Gaussians take the similarity that is exact at one
 point.
 """
 

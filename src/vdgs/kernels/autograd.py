@@ -74,7 +74,7 @@ def vjp_from_autograd(
 
 
 def check_splats(tensors: tuple[Tensor, ...], width: int, height: int, device_type: str | None = None) -> None:
-    """Raise TypeError or ValueError unless these are means_px, conics, colours, opacities, depths and a background,
+    """Raise TypeError or ValueError unless these are means_px, conics, colors, opacities, depths and a background,
     float32 (on `device_type`, if given), and the image has a size that can be drawn."""
     for name, side in (("width", width), ("height", height)):
         if not 1 <= side <= MAX_IMAGE_SIDE_PX:

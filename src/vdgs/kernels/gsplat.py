@@ -1,9 +1,9 @@
 """The rasterizer of gsplat 1.5.3 (Apache-2.0, the extra `gsplat`) behind the operations of `vdgs.kernels`, on a GPU.
 
 It calls `isect_tiles`, `isect_offset_encode` and `rasterize_to_pixels`; `vdgs.kernels.gpu` uses it where it is
-installed (docs/cuda.md). Both sides agree on means (the first pixel's centre is (0.5, 0.5)), conics, alpha (1/255 to
+installed (docs/cuda.md). Both sides agree on means (the first pixel's center is (0.5, 0.5)), conics, alpha (1/255 to
 0.999), the end of a pixel (transmittance 1e-4) and equal depths (the order of the rows: `OrderedSplats.segments` is
-ignored). gsplat needs the extent of each splat, and has no depth: here depth is a fourth colour over a background of
+ignored). gsplat needs the extent of each splat, and has no depth: here depth is a fourth color over a background of
 zero. It cannot compute the median depth, which is None.
 """
 
@@ -74,7 +74,7 @@ def rasterize_vjp(
 
 @torch.no_grad()
 def splat_radii_px(splats: Splats) -> Int32[Tensor, "m 2"]:
-    """How far from its centre, in x and y, a splat's alpha is at least 1/255; 0 for one that is not to be drawn.
+    """How far from its center, in x and y, a splat's alpha is at least 1/255; 0 for one that is not to be drawn.
 
     Those are the splats of which a number is not finite, or whose conic is not positive definite. On the ellipse
     a dx² + 2 b dx dy + c dy² = q, dx² reaches q c / (a c - b²).

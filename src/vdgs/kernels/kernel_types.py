@@ -54,9 +54,9 @@ class MlpWeights:
 
 @dataclass(frozen=True, eq=False)
 class DecoderWeights:
-    """The three heads of the decoder: opacity (k outputs), covariance (7k), colour (3k).
+    """The three heads of the decoder: opacity (k outputs), covariance (7k), color (3k).
 
-    An appearance embedding e of the image enters as a changed first bias of the colour head,
+    An appearance embedding e of the image enters as a changed first bias of the color head,
     `b1 + w_e · e`, made by the caller: it is the same for every anchor of a view.
     """
 
@@ -104,9 +104,9 @@ class ProjectedGaussians:
 
 @dataclass(frozen=True, eq=False)
 class Splats:
-    """Gaussians on the image plane, ready to be rasterised."""
+    """Gaussians on the image plane, ready to be rasterized."""
 
-    #: Centres in pixels; the centre of the first pixel is (0.5, 0.5).
+    #: Centers in pixels; the center of the first pixel is (0.5, 0.5).
     means_px: Float[Tensor, "m 2"]
     #: (a, b, c) of a dx^2 + 2 b dx dy + c dy^2.
     conics: Float[Tensor, "m 3"]
@@ -117,7 +117,7 @@ class Splats:
 
     @property
     def tensors(self) -> tuple[Tensor, ...]:
-        """All that a rasteriser draws, in the order in which it takes them."""
+        """All that a rasterizer draws, in the order in which it takes them."""
         return self.means_px, self.conics, self.colors, self.opacities, self.depths
 
 
@@ -198,7 +198,7 @@ class AdamState(NamedTuple):
 class Raster(NamedTuple):
     """A drawn picture."""
 
-    #: Colour over the background.
+    #: Color over the background.
     image: Float[Tensor, "h w 3"]
     #: Opacity: 1 - T, where T is the share of the background that shows through.
     alpha: Float[Tensor, "h w"]
@@ -263,7 +263,7 @@ class DensificationStats:
     #: Norm of dL/d(mean) in NDC units, and how often the offset was drawn.
     gradient: Float[Tensor, "n k"]
     drawn: Float[Tensor, "n k"]
-    #: Opacity of the anchor's Gaussians, summed over them, and how often its centre was in the picture.
+    #: Opacity of the anchor's Gaussians, summed over them, and how often its center was in the picture.
     opacity: Float[Tensor, "n"]
     seen: Float[Tensor, "n"]
 

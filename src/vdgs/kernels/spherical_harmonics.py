@@ -1,4 +1,4 @@
-"""Colour that depends on the viewing direction: real spherical harmonics up to degree 3.
+"""Color that depends on the viewing direction: real spherical harmonics up to degree 3.
 
 Functions Y_l^m in the order (0,0), (1,-1), (1,0), (1,1), (2,-2), ..., (3,3), orthonormal on the sphere, with the
 Condon-Shortley phase (-1)^m: the layout of the files of 3DGS.
@@ -64,5 +64,5 @@ def eval_sh_colors(
 
 
 def rgb_to_sh(colors: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
-    """The coefficients of Y_0^0 that show these RGB colours in [0, 1] from everywhere."""
+    """The coefficients of Y_0^0 that show these RGB colors in [0, 1] from everywhere."""
     return (colors - 0.5) / SH_C0

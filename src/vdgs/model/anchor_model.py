@@ -45,7 +45,7 @@ class AnchorModel:
     decoder: Decoder
     #: Edge of the voxel grid on which the anchors started, in units of the ground frame.
     voxel_size: float
-    #: Colour drawn where nothing is, RGB in [0, 1].
+    #: Color drawn where nothing is, RGB in [0, 1].
     background: tuple[float, float, float]
     metadata: ModelMetadata = NO_METADATA
     #: A merged scene whose blocks trained decoders of their own: all anchors, block by block. Else empty.

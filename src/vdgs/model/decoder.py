@@ -1,7 +1,7 @@
 """The decoder of all anchors, or of those of a block: three small MLPs (Scaffold-GS eqs. 5-8), and appearance.
 
 Each head has one hidden layer of 32 with ReLU. Inputs: the anchor's feature [32], the unit direction from the
-camera to the anchor [3] and, on request, their distance. An appearance embedding enters the colour head only;
+camera to the anchor [3] and, on request, their distance. An appearance embedding enters the color head only;
 because it is the same for all anchors of a view, it amounts to a shift of the head's first bias.
 """
 
@@ -26,10 +26,10 @@ class Decoder:
     """The parameters of the three heads and, optionally, of the appearance embedding and the exposure of images."""
 
     weights: DecoderWeights
-    #: One row per training image, and its map to the colour head's hidden layer; None without appearance.
+    #: One row per training image, and its map to the color head's hidden layer; None without appearance.
     appearance_embedding: Float[Tensor, "images a"] | None = None
     appearance_weight: Float[Tensor, "32 a"] | None = None
-    #: Departures of each training image's colours from the mean (`model.exposure`); None: no exposure is fitted.
+    #: Departures of each training image's colors from the mean (`model.exposure`); None: no exposure is fitted.
     exposure: Float[Tensor, "images 3 4"] | None = None
 
     @staticmethod
@@ -82,7 +82,7 @@ class Decoder:
         return replace(self.weights, color=replace(color, b1=color.b1 + self.appearance_weight @ embedding))
 
     def exposure_for_image(self, image: int) -> Float[Tensor, "3 4"] | None:
-        """The colour model of a training image; None where none is fitted."""
+        """The color model of a training image; None where none is fitted."""
         return None if self.exposure is None else exposure_matrix(self.exposure, image)
 
     def check(self, offsets: int) -> None:

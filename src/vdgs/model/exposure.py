@@ -1,7 +1,7 @@
-"""The exposure of each photograph: an affine model of its colours, trained with the scene.
+"""The exposure of each photograph: an affine model of its colors, trained with the scene.
 
 Photographs of one flight differ in brightness and white balance. A photograph's model is its departure from the mean of
-all, so that the mean is neutral, and the scene is drawn in neutral colours. Exposure drifts along a flight: that of a
+all, so that the mean is neutral, and the scene is drawn in neutral colors. Exposure drifts along a flight: that of a
 test photograph is interpolated from those taken just before and after it (`interpolate_exposure`).
 """
 
@@ -24,7 +24,7 @@ def zero_exposures(images: int) -> Float[Tensor, "images 3 4"]:
 
 
 def exposure_matrix(departures: Float[Tensor, "images 3 4"], image: int) -> Float[Tensor, "3 4"]:
-    """The colour model [A | b] of a photograph: c -> A c + b. Over all photographs their mean is [1 | 0]."""
+    """The color model [A | b] of a photograph: c -> A c + b. Over all photographs their mean is [1 | 0]."""
     return _neutral(departures) + departures[image] - departures.mean(0)
 
 
@@ -57,7 +57,7 @@ def find_flight_neighbors(images: Mapping[int, int], place: int, include_self: b
 def interpolate_exposure(
     departures: Float[Tensor, "images 3 4"], images: Mapping[int, int], place: int
 ) -> Float[Tensor, "3 4"]:
-    """The colour model [A | b] at a position in a flight, linear between its neighbors; `images` maps positions to
+    """The color model [A | b] at a position in a flight, linear between its neighbors; `images` maps positions to
     rows of `departures`. That of the nearest at an end of the flight; neutral if none is within `MAX_FLIGHT_GAP`
     positions."""
     near = find_flight_neighbors(images, place)
@@ -67,7 +67,7 @@ def interpolate_exposure(
 
 
 def apply_exposure(image: Float[Tensor, "h w 3"], exposure: Float[Tensor, "3 4"]) -> Float[Tensor, "h w 3"]:
-    """A picture in neutral colours as the photograph with that model has them."""
+    """A picture in neutral colors as the photograph with that model has them."""
     return image @ exposure[:, :3].T + exposure[:, 3]
 
 

@@ -1,7 +1,7 @@
-"""Gaussians moved, turned and scaled, with the colours that their spherical harmonics show.
+"""Gaussians moved, turned and scaled, with the colors that their spherical harmonics show.
 
 The law: a transformed scene drawn from a transformed camera is the same picture. Rotations are those of space, in
-float64; coefficients of colour turn with them by a matrix per band (Wigner's D for real functions).
+float64; coefficients of color turn with them by a matrix per band (Wigner's D for real functions).
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def rotate_sh(rest: Float[Tensor, "n r 3"], rotation: Float[np.ndarray, "3 3"]) 
     _check(rotation)
     degree = math.isqrt(rest.shape[1] + 1) - 1
     if (degree + 1) ** 2 != rest.shape[1] + 1 or degree > MAX_SH_DEGREE:
-        raise ValueError(f"{rest.shape[1]} further coefficients of colour belong to no degree up to {MAX_SH_DEGREE}")
+        raise ValueError(f"{rest.shape[1]} further coefficients of color belong to no degree up to {MAX_SH_DEGREE}")
     parts, start = [], 0
     for band in range(1, degree + 1):
         width = 2 * band + 1

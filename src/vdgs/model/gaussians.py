@@ -1,7 +1,7 @@
 """Explicit Gaussians, each with its own shape, opacity and spherical harmonics: what 3DGS trains, and what an anchor
 model is baked into.
 
-Dimensions: n Gaussians, r = (degree + 1)² - 1 further coefficients of colour. Float32, ground frame. Source: Kerbl,
+Dimensions: n Gaussians, r = (degree + 1)² - 1 further coefficients of color. Float32, ground frame. Source: Kerbl,
 Kopanas, Leimkühler and Drettakis, "3D Gaussian Splatting for Real-Time Radiance Field Rendering", 2023 (3DGS); its
 equations 5 and 6 are in `kernels.project`, 2 and 3 in `kernels.rasterize`.
 """
@@ -76,7 +76,7 @@ def visible_gaussian_rows(gaussians: Gaussians, camera: Camera) -> Int64[Tensor,
 def render_gaussians(
     gaussians: Gaussians, camera: Camera, background: Float[Tensor, "3"], degree: int, depth: bool = False
 ) -> tuple[Raster, Float[Tensor, "n 2"]]:
-    """The picture, and the centres in pixels that it was drawn from (growth asks for their gradient).
+    """The picture, and the centers in pixels that it was drawn from (growth asks for their gradient).
 
     Differentiable in all tensors of `gaussians`.
     """

@@ -13,7 +13,7 @@ BELOW_HORIZON_DEG = 5.0
 
 
 def below_horizon(camera: Camera, rows: int, columns: int) -> Bool[np.ndarray, "rows columns"]:
-    """Cells through whose centre the view leads down (z is up)."""
+    """Cells through whose center the view leads down (z is up)."""
     if camera.model == "orthographic":
         return np.full((rows, columns), camera.forward[2] < 0)
     x = ((np.arange(columns) + 0.5) * (camera.width / columns) - camera.cx) / camera.fx

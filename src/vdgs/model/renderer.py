@@ -1,4 +1,4 @@
-"""From anchors and a camera to a picture: cull, decode, rasterise."""
+"""From anchors and a camera to a picture: cull, decode, rasterize."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def render(
 def render_scalar(
     model: AnchorModel, values: Float[Tensor, " n"], camera: Camera
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-    """A value per anchor blended in place of its colour, over 0, and alpha."""
+    """A value per anchor blended in place of its color, over 0, and alpha."""
     rows, splats = decode_view(model, camera)
     k = model.anchors.offsets.shape[1]
     of_splat = values.to(rows.device)[rows][splats.source.long() // k].float()

@@ -68,7 +68,7 @@ def _by_nearest(
         nearest = cKDTree(np.stack([cameras[int(index)].position for index in alike])).query(points, workers=1)[1]
         for chosen in np.unique(nearest):
             rows = torch.from_numpy(np.flatnonzero(nearest == chosen)).to(positions.device)
-            # An anchor in a camera's very centre would get a size of zero, whose logarithm is no number to train.
+            # An anchor in a camera's very center would get a size of zero, whose logarithm is no number to train.
             distance = project_points(positions[rows], cameras[int(alike[chosen])]).distance.clamp(min=NEAR_PLANE)
             near[rows] = torch.minimum(near[rows], span * distance)
     return near

@@ -2,7 +2,7 @@
 
 Torch tensors or numpy arrays go in, and the same comes out (numpy arrays of float64 become float32; they carry no
 gradients). Errors: ValueError for shapes, TypeError for dtypes, `UnsupportedOption` for what gsplat has and this has
-not. Pixel centres are at 0.5; quaternions are wxyz; cameras look along +z (OpenCV); docs/python.md has a guide.
+not. Pixel centers are at 0.5; quaternions are wxyz; cameras look along +z (OpenCV); docs/python.md has a guide.
 """
 
 from vdgs.ops.operations import Projection as Projection

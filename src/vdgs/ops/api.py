@@ -1,6 +1,6 @@
 """The Python API: what the verbs of the command line do, as functions. docs/python.md is its guide.
 
-Lengths are in units of the ground frame (metres where the capture says so), z up; pixel centres are at 0.5; cameras
+Lengths are in units of the ground frame (metres where the capture says so), z up; pixel centers are at 0.5; cameras
 look along +z (OpenCV). Torch tensors or numpy arrays go in, and the same comes out. What a caller can mend is raised as
 `VdgsError`, which says how. Everything here is loaded when `vdgs.NAME` is first used.
 """

@@ -29,7 +29,7 @@ UNSUPPORTED: Mapping[str, tuple[tuple[Any, ...], str]] = {
     "absgrad": ((False,), "the kernels sum signed gradients only; leave it out, and lower grow_grad2d"),
     "distributed": ((False,), "a process draws all Gaussians; draw other cameras in other processes"),
     "camera_model": (("pinhole", "ortho"), "undistort the photographs first (`vdgs run --undistort`)"),
-    "with_ut": ((False,), "Gaussians are projected by their linearisation (EWA)"),
+    "with_ut": ((False,), "Gaussians are projected by their linearization (EWA)"),
     "with_eval3d": ((False,), "Gaussians are evaluated on the image plane"),
     "radial_coeffs": ((None,), "undistort the photographs first"),
     "tangential_coeffs": ((None,), "undistort the photographs first"),
@@ -95,8 +95,8 @@ def rasterization(
     their rows are those drawn (`packed`), or they are [..., C, N, ...]. `means2d.retain_grad()` gives densification its
     gradients. `tile_size`, `channel_chunk` and `segmented` change nothing: those of the kernels are their own.
 
-    One difference: J is clamped at 1.3 half-angles on either side of the axis (3DGS), in gsplat of the image's centre,
-    which tells on Gaussians beside the image where the principal point is not its centre.
+    One difference: J is clamped at 1.3 half-angles on either side of the axis (3DGS), in gsplat of the image's center,
+    which tells on Gaussians beside the image where the principal point is not its center.
 
     Raises ValueError for shapes that do not fit, TypeError for tensors other than float32, UnsupportedOption for
     absgrad, sparse_grad, distributed, fisheye and ftheta cameras, distortion, rolling shutter, `with_ut` and
@@ -291,7 +291,7 @@ def _symmetric(covars: Tensor) -> Tensor:
 
 
 def _radii(projected: ProjectedGaussians, opacities: Tensor, settings: _Settings) -> Tensor:
-    """How far a Gaussian is drawn from its centre, [n, 2] int32 px: 0 for one that no pixel shows, as in gsplat."""
+    """How far a Gaussian is drawn from its center, [n, 2] int32 px: 0 for one that no pixel shows, as in gsplat."""
     a, b, c = projected.conics.unbind(-1)
     variances = torch.stack([c, a], -1) / (a * c - b * b)[:, None]
     extent = (2 * (opacities / ALPHA_MIN).clamp(min=1).log()).sqrt().clamp(max=MAX_EXTENT)
@@ -333,7 +333,7 @@ def _draw_image(
 
 
 def _colors(gaussians: _Gaussians, image: _Image, sh_degree: int | None) -> Tensor:
-    """The colours [v, d] that the drawn Gaussians show to a camera."""
+    """The colors [v, d] that the drawn Gaussians show to a camera."""
     of_camera = image.camera if gaussians.colors.shape[1] > 1 else 0
     colors = gaussians.colors[image.batch, of_camera][image.rows]
     if sh_degree is None:

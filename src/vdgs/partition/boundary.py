@@ -10,7 +10,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
-#: A cell is this many times the distance to a neighbour (its rank) that so large a share of the anchors has within.
+#: A cell is this many times the distance to a neighbor (its rank) that so large a share of the anchors has within.
 CELL_FACTOR, CELL_NEIGHBOR_RANK, CELL_QUANTILE, CELL_SAMPLE = 2.0, 8, 0.95, 20_000
 #: A block of average size is at least so many cells across; the whole scene at most so many.
 MIN_CELLS, MAX_CELLS = 6, 512
@@ -35,7 +35,7 @@ def block_cores(
     """The core of every cluster: polygons without common area. None for a cluster that is the strongest nowhere.
 
     The largest connected component of each cluster, its α-shape with holes filled, simplified. Where two shapes
-    overlap the smaller keeps its place: a dense centre becomes a hole in the core of the outskirts about it.
+    overlap the smaller keeps its place: a dense center becomes a hole in the core of the outskirts about it.
     """
     cell = cell_size(points, count)
     shapes = {label: _outline(members, cell) for label, members in _components(points, labels, count, cell).items()}
@@ -56,7 +56,7 @@ def block_cores(
 def expand_core(core: shapely.Polygon, expansion: float) -> shapely.Polygon:
     """The block's boundary: its core widened by `expansion` times the radius of a disc of its area (section IV-B).
 
-    For a disc that is a factor of 1 + expansion about its centre (choice); it is defined for any other shape too, and
+    For a disc that is a factor of 1 + expansion about its center (choice); it is defined for any other shape too, and
     always holds the core.
     """
     distance = expansion * float(np.sqrt(core.area / np.pi))
@@ -68,7 +68,7 @@ def expand_core(core: shapely.Polygon, expansion: float) -> shapely.Polygon:
 
 def cell_size(points: Float[np.ndarray, "n 2"], count: int) -> float:
     """Edge of the cells on which components are found (choice): twice the distance within which 95 % of the anchors
-    have eight neighbours, so that cells of sparse outskirts are seldom empty; within bounds set by the scene's size.
+    have eight neighbors, so that cells of sparse outskirts are seldom empty; within bounds set by the scene's size.
     """
     extent = scene_extent(points)
     rank = min(CELL_NEIGHBOR_RANK, len(points) - 1)

@@ -14,9 +14,9 @@ from jaxtyping import Float, Int64
 from vdgs.errors import VdgsError
 from vdgs.visibility.visibility_counts import normalize_visibility
 
-#: Places are normalised between these quantiles and clipped: far outliers would squash the scene (choice).
+#: Places are normalized between these quantiles and clipped: far outliers would squash the scene (choice).
 EXTENT_QUANTILES = (0.01, 0.99)
-#: Centres are fitted to at most so many anchors; all others join the nearest.
+#: Centers are fitted to at most so many anchors; all others join the nearest.
 MAX_FIT_SAMPLES = 300_000
 #: k-means++ starts, of which the one of least inertia is kept; fewer where there are so many clusters that each costs
 #: much and tells little (clusters of all starts together).
@@ -27,11 +27,11 @@ MAX_COMPARED = 5_000
 
 #: Balanced clusters: anchors fitted to (at least, and for each cluster), Lloyd rounds, sweeps over the weights.
 BALANCED_MIN_SAMPLES, BALANCED_SAMPLES_PER_CLUSTER = 30_000, 4_000
-#: ... and at most so many distances from them to centres.
+#: ... and at most so many distances from them to centers.
 BALANCED_MAX_DISTANCES = 100_000_000
 BALANCED_ITERATIONS, BALANCED_SWEEPS = 30, 10
 BALANCED_TOLERANCE = 0.01
-#: Distances from features to centres that are in memory at once.
+#: Distances from features to centers that are in memory at once.
 DISTANCES_PER_CHUNK = 3_200_000
 #: The nearest share of the anchors decides about the axes: far outliers would turn them.
 INLIER_SHARE = 0.98
@@ -102,9 +102,9 @@ def _fit(features: np.ndarray, count: int, seed: int) -> Float[np.ndarray, "coun
 def _fit_balanced(
     features: np.ndarray, centers: np.ndarray
 ) -> tuple[Float[np.ndarray, "count 3"], Float[np.ndarray, " count"]]:
-    """Lloyd's rounds in which every centre takes the same number of features; centres and weights w of the diagram.
+    """Lloyd's rounds in which every center takes the same number of features; centers and weights w of the diagram.
 
-    A feature belongs to the centre of least |f - c|² - w.
+    A feature belongs to the center of least |f - c|² - w.
     """
     weights = np.zeros(len(centers))
     for _ in range(BALANCED_ITERATIONS):
@@ -122,9 +122,9 @@ def _fit_balanced(
 
 
 def _balance(squares: np.ndarray, weights: np.ndarray) -> Float[np.ndarray, " count"]:
-    """Weights that give every centre n / count features: exact steps, one centre after the other (an auction).
+    """Weights that give every center n / count features: exact steps, one center after the other (an auction).
 
-    In its step a centre takes the weight at which exactly its share prefers it to the best of the others.
+    In its step a center takes the weight at which exactly its share prefers it to the best of the others.
     """
     n, count = squares.shape
     share, weights, columns = n // count, weights.copy(), np.asfortranarray(squares)
@@ -135,7 +135,7 @@ def _balance(squares: np.ndarray, weights: np.ndarray) -> Float[np.ndarray, " co
         worst = int(np.abs(sizes - share).argmax())
         if abs(sizes[worst] - share) <= max(BALANCED_TOLERANCE * share, 1):
             break
-        # One weight changes: all costs are looked at again only of features that prefer its centre.
+        # One weight changes: all costs are looked at again only of features that prefer its center.
         own = np.flatnonzero(labels == worst)
         costs = squares[own] - weights
         costs[:, worst] = np.inf
@@ -153,7 +153,7 @@ def _squared_distances(features: np.ndarray, centers: np.ndarray) -> Float[np.nd
 
 
 def _assign_clusters(features: np.ndarray, centers: np.ndarray, weights: np.ndarray) -> Int64[np.ndarray, " n"]:
-    """The centre of least |f - c|² - w, in chunks that keep memory small."""
+    """The center of least |f - c|² - w, in chunks that keep memory small."""
     chunk = max(1, DISTANCES_PER_CHUNK // len(centers))
     parts = (features[start : start + chunk] for start in range(0, len(features), chunk))
     return np.concatenate([(_squared_distances(part, centers) - weights).argmin(axis=1) for part in parts])
@@ -161,7 +161,7 @@ def _assign_clusters(features: np.ndarray, centers: np.ndarray, weights: np.ndar
 
 @dataclass(frozen=True, eq=False)
 class PrincipalPlane:
-    """x, y of the ground frame = centre + axes @ (place in the plane); `axes` is orthonormal, columns by variance."""
+    """x, y of the ground frame = center + axes @ (place in the plane); `axes` is orthonormal, columns by variance."""
 
     center: Float[np.ndarray, "2"]
     axes: Float[np.ndarray, "2 2"]
@@ -179,7 +179,7 @@ def fit_principal_plane(ground: Float[np.ndarray, "n 2"]) -> PrincipalPlane:
     """The principal axes of places (float64), each signed so that its third moment is positive.
 
     Choice: the paper clusters on x, y as they are; then the cut would change with the heading of the ground frame,
-    which is arbitrary without GPS. Centre and axes turn, move and scale with the places. In a scene that is its own
+    which is arbitrary without GPS. Center and axes turn, move and scale with the places. In a scene that is its own
     mirror image the signs, and so the numbers of the blocks, are decided by rounding.
     """
     center = ground.mean(axis=0)

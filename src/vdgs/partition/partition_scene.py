@@ -77,10 +77,10 @@ def _fewer_blocks_reason(
         )
     if lambda_vis > 0:
         return (
-            "the anchors of the other clusters are scattered among those of their neighbours. A smaller --lambda-vis "
+            "the anchors of the other clusters are scattered among those of their neighbors. A smaller --lambda-vis "
             "or fewer blocks avoid this."
         )
-    return "the other clusters hold hardly any anchors, or lie scattered among their neighbours. Use fewer blocks."
+    return "the other clusters hold hardly any anchors, or lie scattered among their neighbors. Use fewer blocks."
 
 
 def choose_block_count(n_anchors: int, n_cameras: int, image_pixels: int, method: MethodConfig) -> int:

@@ -1,6 +1,6 @@
 """Finds the core nearest to each of many points: whole cells of points at once, only points near borders one by one.
 
-A cell of half-diagonal r around its centre c belongs to core k as a whole where every other core is farther from c than
+A cell of half-diagonal r around its center c belongs to core k as a whole where every other core is farther from c than
 k by more than 2 r. The other cells are divided, until testing their points is cheaper. The candidate cores of cells and
 points are pairs, sorted by cell or point and then by core: few cores are near one point, however many there are.
 """
@@ -121,7 +121,7 @@ class BlockCores:
         return candidates[least <= most.min() * (1 + 1e-9) + RELATIVE_TOLERANCE * np.abs(self._box).max()]
 
     def _candidates(self, centers: Float[np.ndarray, "c 2"], radius: float, pairs: _CandidatePairs) -> _CandidatePairs:
-        """Those of the pairs whose core can be the nearest to a place within `radius` of its cell's centre."""
+        """Those of the pairs whose core can be the nearest to a place within `radius` of its cell's center."""
         distance = self._distances(centers, pairs)
         slack = 2 * radius + RELATIVE_TOLERANCE * (np.abs(centers).max() + np.abs(self._box).max())
         near = distance <= np.minimum.reduceat(distance, pairs.starts())[pairs.of] + slack

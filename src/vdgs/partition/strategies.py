@@ -100,7 +100,7 @@ def nonempty_cells(cells: Sequence[Block], ground: Float[np.ndarray, "n 2"], cou
 
 
 def scale_shape(shape: shapely.Polygon, factor: float) -> shapely.Polygon:
-    """The shape `factor` times as large about its centre."""
+    """The shape `factor` times as large about its center."""
     return shapely.affinity.scale(shape, factor, factor, origin="center")
 
 
@@ -174,7 +174,7 @@ def box_coverage(corners: Float[np.ndarray, "8 3"], camera: Camera) -> float:
 
 
 def _corners(core: shapely.Polygon, heights: Float[np.ndarray, " n"]) -> Float[np.ndarray, "8 3"]:
-    """The box over a cell, from its lowest to its highest anchor; corner i ^ 1, 2, 4 is the neighbour in x, y, z."""
+    """The box over a cell, from its lowest to its highest anchor; corner i ^ 1, 2, 4 is the neighbor in x, y, z."""
     x0, y0, x1, y1 = core.bounds
     z0, z1 = np.quantile(heights, EXTENT_QUANTILES)
     return np.array([[x0 if i & 1 else x1, y0 if i & 2 else y1, z0 if i & 4 else z1] for i in range(8)])
@@ -183,7 +183,7 @@ def _corners(core: shapely.Polygon, heights: Float[np.ndarray, " n"]) -> Float[n
 def _equal_camera_splits(
     centers: Float[np.ndarray, "c 2"], axis: int, parts: int, low: float, high: float
 ) -> list[tuple[float, float, Float[np.ndarray, "m 2"]]]:
-    """From, to and cameras of each part along an axis; parts meet halfway between neighbouring cameras."""
+    """From, to and cameras of each part along an axis; parts meet halfway between neighboring cameras."""
     if len(centers) == 0:
         return [(low, high, centers)]
     ordered = centers[np.argsort(centers[:, axis], kind="stable")]
@@ -249,7 +249,7 @@ def expand(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
 
 
 def _outline(x0: float, y0: float, x1: float, y1: float) -> Float[np.ndarray, "m 2"]:
-    """Points about a rectangle; neighbours share those on their common side."""
+    """Points about a rectangle; neighbors share those on their common side."""
     x, y = _side(x0, x1), _side(y0, y1)
     bottom, right = np.column_stack([x, np.full(len(x), y0)]), np.column_stack([np.full(len(y), x1), y])
     top, left = np.column_stack([x[::-1], np.full(len(x), y1)]), np.column_stack([np.full(len(y), x0), y[::-1]])

@@ -83,7 +83,7 @@ def expected_growth(config: TrainConfig, texture: float, room: float) -> float:
 
 
 def measure_textures(views: Sequence[View], factors: Sequence[float]) -> dict[float, float]:
-    """Mean absolute Laplacian of photographs, shrunk from the size of their cameras by each factor, in grey levels."""
+    """Mean absolute Laplacian of photographs, shrunk from the size of their cameras by each factor, in gray levels."""
     found: dict[float, list[float]] = {factor: [] for factor in factors}
     for view in probed_views(views):
         whole = cv2.cvtColor(decode_image(view.image_path)[0], cv2.COLOR_RGB2GRAY)

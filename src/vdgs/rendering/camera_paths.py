@@ -105,7 +105,7 @@ def flyover(
     """Along the track of the training cameras, smoothed, looking ahead and down.
 
     `tilt_deg` is the angle from straight down; by default the median of the training cameras, at least
-    20. Cameras are taken in the order given, or from neighbour to neighbour where that is much shorter
+    20. Cameras are taken in the order given, or from neighbor to neighbor where that is much shorter
     (names do not always follow the flight). The speed is even.
     """
     if not cameras:
@@ -169,7 +169,7 @@ def _knots(positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
 def _tangents(
     positions: Float[np.ndarray, "n 3"], knots: Float[np.ndarray, "n"], closed: bool
 ) -> Float[np.ndarray, "n 3"]:
-    """Catmull-Rom: the slope between the neighbours; at the ends of an open path, to the one neighbour."""
+    """Catmull-Rom: the slope between the neighbors; at the ends of an open path, to the one neighbor."""
     if closed:
         before, after = positions[-2] - positions[-1], positions[1] - positions[0]
         padded = np.concatenate([[positions[0] + before], positions, [positions[-1] + after]])

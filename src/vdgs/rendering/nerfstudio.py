@@ -1,6 +1,6 @@
 """The frame that nerfstudio trains in, and the way back from it.
 
-Before it trains, nerfstudio turns a scene upright, centres it on its cameras and scales it into a unit box; the camera
+Before it trains, nerfstudio turns a scene upright, centers it on its cameras and scales it into a unit box; the camera
 paths of its viewer are in that frame. The folder of the training, outputs/NAME/METHOD/DATE, has the transformation in
 dataparser_transforms.json: `transform`, a rigid motion [3, 4], and `scale`, with
 

@@ -1,4 +1,4 @@
-"""What `vdgs render --mode` draws of a model: values, colours that mean the same in every frame, and the colorbar."""
+"""What `vdgs render --mode` draws of a model: values, colors that mean the same in every frame, and the colorbar."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from vdgs.visibility.visibility_map import visibility_color_norm
 
 ScalarMapMode = Literal["depth", "visibility", "alpha"]
 
-#: Where there is nothing to draw; in none of the colour maps but that of alpha, which draws everywhere.
+#: Where there is nothing to draw; in none of the color maps but that of alpha, which draws everywhere.
 NO_DATA_COLOR = (208, 211, 215)
 #: The range of depths is that of so many views at most, spread over all, drawn so small (longer side): one for the
 #: whole film, found before its first frame.
@@ -37,11 +37,11 @@ _NO_DATA_LABEL = "nothing drawn"
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ColorScale:
-    """How numbers become colours: the same for all frames."""
+    """How numbers become colors: the same for all frames."""
 
     #: What the numbers are, with their unit: the longest first, for as much room as there is.
     titles: tuple[str, ...]
-    #: Where the colours end; numbers beyond take the colour of the end.
+    #: Where the colors end; numbers beyond take the color of the end.
     low: float
     high: float
     #: Numbers that the legend names, with their words.
@@ -52,7 +52,7 @@ class ColorScale:
     has_nodata: bool = True
 
     def colorize(self, values: Shaped[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
-        """A map in colours, `NO_DATA_COLOR` where it is NaN."""
+        """A map in colors, `NO_DATA_COLOR` where it is NaN."""
         known = np.isfinite(values)
         image = (self.colormap(np.where(known, values, self.low))[..., :3] * 255 + 0.5).astype(np.uint8)
         image[~known] = NO_DATA_COLOR
@@ -61,7 +61,7 @@ class ColorScale:
 
 @dataclass(frozen=True, eq=False)
 class ScalarMap:
-    """A kind of map of one run: its values in a view (float32, NaN where there is nothing), their colours and words."""
+    """A kind of map of one run: its values in a view (float32, NaN where there is nothing), their colors and words."""
 
     values: Callable[[Camera], Float[np.ndarray, "h w"]]
     scale: ColorScale
@@ -97,7 +97,7 @@ def _depth(run: OpenedModel, run_cameras: RunCameras, cameras: Sequence[Camera])
 
 
 def depth_range(depths: Iterable[Float[np.ndarray, "_ _"]], fallback: float) -> tuple[float, float]:
-    """Least and greatest depth in these maps, without the outermost 1 % of each: no view may fall out of the colours.
+    """Least and greatest depth in these maps, without the outermost 1 % of each: no view may fall out of the colors.
 
     From 0 to twice `fallback` where nothing is drawn in any.
     """
@@ -137,7 +137,7 @@ def _visibility(run: OpenedModel, run_cameras: RunCameras, cameras: Sequence[Cam
 
 
 def visibility_scale(counts: Shaped[np.ndarray, " n"]) -> ColorScale:
-    """One colour for each whole V, those of all other figures of the project; the last holds all above it."""
+    """One color for each whole V, those of all other figures of the project; the last holds all above it."""
     top, norm = visibility_color_norm(counts)
     more = bool(counts.max() > top)
     every = max(1, round(top / 10))
@@ -175,12 +175,12 @@ def alpha_scale() -> ColorScale:
 
 
 def add_colorbar(image: UInt8[np.ndarray, "h w 3"], scale: ColorScale) -> UInt8[np.ndarray, "tall w 3"]:
-    """The picture with the legend of its colours below it; both together have an even number of rows."""
+    """The picture with the legend of its colors below it; both together have an even number of rows."""
     return np.concatenate([image, draw_colorbar(scale, image.shape[1], image.shape[0])])
 
 
 def draw_colorbar(scale: ColorScale, width: int, above: int) -> UInt8[np.ndarray, "rows w 3"]:
-    """The strip for a picture of `width` and `above` rows: what is measured, a bar of colours, numbers."""
+    """The strip for a picture of `width` and `above` rows: what is measured, a bar of colors, numbers."""
     size = int(np.clip(round(width * _FONT_SHARE), _MIN_FONT_PX, _MAX_FONT_PX))
     margin, bar = size // 2, size
     top = margin + round(1.35 * size)
@@ -198,7 +198,7 @@ def draw_colorbar(scale: ColorScale, width: int, above: int) -> UInt8[np.ndarray
 
 
 def _heading(draw: ImageDraw.ImageDraw, scale: ColorScale, width: int, margin: int, size: int) -> None:
-    """What is measured at the left; at the right, where there is room for it, what no colour stands for."""
+    """What is measured at the left; at the right, where there is room for it, what no color stands for."""
     face = load_font(size)
     room = float(width - 2 * margin)
     title = next((each for each in scale.titles if face.getlength(each) <= room), "")

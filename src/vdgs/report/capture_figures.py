@@ -21,7 +21,7 @@ from vdgs.visibility.visibility_map import CameraMarks, VisibilityMapData, plot_
 def draw_capture_map(
     capture: Capture, report: CaptureReport, points: np.ndarray, visibility: np.ndarray, file: Path
 ) -> None:
-    """Cameras and points from above, points coloured by V; beside it the histogram of V."""
+    """Cameras and points from above, points colored by V; beside it the histogram of V."""
     low, high = _frame(capture, points)
     marks = (
         CameraMarks("training camera", [view.camera for view in capture.train_views], INK, "white"),
@@ -80,7 +80,7 @@ def _titles(capture: Capture, report: CaptureReport) -> tuple[str, str, str]:
         f"{format_length(report.place.ground_sampling_distance, report.unit)} per pixel",
         f"a point is seen by {report.visibility_quantiles[50]:g} training cameras (median)",
     ]
-    return name, "  ·  ".join(lines), "points coloured by V; pale: V on level ground"
+    return name, "  ·  ".join(lines), "points colored by V; pale: V on level ground"
 
 
 def _frame(capture: Capture, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,7 +1,7 @@
 """What a capture holds and where it looks thin, in numbers, before anyone trains.
 
 The visibility V of a sparse point is the number of *training* cameras whose frustum holds it (z > near,
-projected centre on the image; no occlusion), as in section IV-B of the VDGS paper. Where V is small, a
+projected center on the image; no occlusion), as in section IV-B of the VDGS paper. Where V is small, a
 scene trains badly.
 """
 
@@ -38,7 +38,7 @@ class CaptureReport:
     focal_px: float
     field_of_view_deg: float
     points: int
-    #: Median distance of a sparse point to its nearest neighbour.
+    #: Median distance of a sparse point to its nearest neighbor.
     point_spacing: float
     ground: str
     metric: bool

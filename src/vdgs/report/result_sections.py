@@ -149,7 +149,7 @@ def _comparison(source: RunFiles, folder: str, kind: str, row: JsonRecord, coars
 
 
 def _least_opaque_view(source: RunFiles, folder: str, rows: list[JsonRecord]) -> Html:
-    """Alpha of the view with the lowest share of opaque pixels: where ground is half transparent, it is grey."""
+    """Alpha of the view with the lowest share of opaque pixels: where ground is half transparent, it is gray."""
     known = [
         (solid, row) for row in rows if (solid := row.number("opacity_coverage")) is not None and row.text("alpha")
     ]

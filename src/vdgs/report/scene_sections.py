@@ -84,7 +84,7 @@ def visibility_section(report: ReportedRun) -> Html:
         ),
         *((paragraph(_visibility_sentence(stats)), _distribution(stats)) if stats else ()),
         paragraph("Visibility is not measured yet." if is_absent else "", "absent"),
-        figure(source.image(map_file), "The place from above, coloured by V.", "map of visibility", True),
+        figure(source.image(map_file), "The place from above, colored by V.", "map of visibility", True),
     ]
     if stats and not source.has(map_file):
         parts.append(paragraph(f"There is no map of it ({map_file}).", "absent"))

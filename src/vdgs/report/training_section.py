@@ -26,7 +26,7 @@ SMOOTHING_WINDOW = 9
 MAX_SETTINGS_CHARS = 60_000
 COST_CAPTION = "Blocks trained side by side count one by one; what is out of date does not count"
 
-#: A name, its colour and its log.
+#: A name, its color and its log.
 NamedLog = tuple[str, str, list[JsonRecord]]
 
 

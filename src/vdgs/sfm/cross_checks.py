@@ -22,7 +22,7 @@ LEVEL_DEG = 1.0
 LEAST_ALIKE = 3
 #: A smaller copy has at most this share of the longer side of the photograph of its name.
 SMALLER = 0.7
-#: A mask by another name is black and white: this share of it lies within so many grey values of the two.
+#: A mask by another name is black and white: this share of it lies within so many gray values of the two.
 BLACK_AND_WHITE, NEAR_GRAY = 0.97, 24
 #: Sides of the small picture that tells it.
 _LOOKED_AT = (128, 128)

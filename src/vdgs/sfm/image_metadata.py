@@ -186,7 +186,7 @@ class ImageMetadata:
 def read_image_metadata(path: Path, name: str) -> ImageMetadata:
     """Read the head of a photograph; its pixels are not decoded, unless its end is missing.
 
-    Raises `UnusableImage` for files that are no image, too small, of colours that are not understood, or cut off.
+    Raises `UnusableImage` for files that are no image, too small, of colors that are not understood, or cut off.
     """
     try:
         size = path.stat().st_size
@@ -257,7 +257,7 @@ def _check(image: Image.Image) -> None:
     if min(image.size) < MIN_SIDE_PX:
         raise UnusableImage(f"has {image.width} x {image.height} pixels only: a thumbnail")
     if image.mode not in SUPPORTED_MODES or image.mode.startswith("I"):
-        raise UnusableImage(f"has the colour mode {image.mode}: convert it to 8-bit RGB")
+        raise UnusableImage(f"has the color mode {image.mode}: convert it to 8-bit RGB")
 
 
 def _check_pixels(path: Path) -> None:

@@ -189,7 +189,7 @@ def glass(s: Surface) -> AlbedoAndGloss:
 
 
 def awning(s: Surface) -> AlbedoAndGloss:
-    """Broad stripes of colour and white."""
+    """Broad stripes of color and white."""
     stripe = ((s.uv[:, 0] / s.panel[:, 0] * np.float32(3.5)) % 1 < 0.5).astype(np.float32)
     fringe = 1 - 0.15 * np.exp(-s.uv[:, 1] / 0.15)
     return _matt(mix_colors(s.color, _FRAME * 0.95, stripe) * fringe[:, None])
@@ -205,7 +205,7 @@ def solar(s: Surface) -> AlbedoAndGloss:
 
 
 def dark(s: Surface) -> AlbedoAndGloss:
-    """A colour and nothing else."""
+    """A color and nothing else."""
     return _matt(s.color)
 
 
@@ -237,7 +237,7 @@ def bark(s: Surface) -> AlbedoAndGloss:
 
 
 def water(s: Surface) -> AlbedoAndGloss:
-    """Still water: its own colour below, the sky on top, faint ripples."""
+    """Still water: its own color below, the sky on top, faint ripples."""
     x, y = s.position[:, 0], s.position[:, 1]
     ripples = 1 + 0.1 * smooth(x, y * 1.6, 1.1, s.footprint) + 0.16 * smooth(x, y, 6.0)
     ripples = ripples + 0.07 * smooth(y, x, 0.5, s.footprint)

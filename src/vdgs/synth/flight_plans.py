@@ -102,7 +102,7 @@ def _even(over: FlightArea) -> FlightPlan:
 
 
 def _uneven(over: FlightArea) -> FlightPlan:
-    """Dense over the centre, sparse circuits around it, obliques; over a wide area the centre is a small part of it."""
+    """Dense over the center, sparse circuits around it, obliques; over a wide area the center is a small part of it."""
     wide = over.half > _WIDE * over.altitude
     center, outer, spacing, orbit = (0.25, 0.8, 1.0, 0.5) if wide else (0.4, 0.78, 0.75, 1.0)
     oblique, outskirts = (round(share * over.count) for share in ((0.2, 0.22) if wide else (0.27, 0.36)))

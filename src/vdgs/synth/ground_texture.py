@@ -65,7 +65,7 @@ def _gravel(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
 
 
 def _square(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
-    """Cobbles in two colours, laid in a large chequer with pale bands."""
+    """Cobbles in two colors, laid in a large chequer with pale bands."""
     base = _slabs(x, y, footprint, 0.42, "#c9b08c", 0.3)
     i, j = np.floor(x / 4.2), np.floor(y / 4.2)
     dark = ((i + j).astype(np.int32) & 1).astype(np.float32)
@@ -85,7 +85,7 @@ def _soil(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
 
 
 def _flowers(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
-    """A flower bed: drifts of a few colours among leaves."""
+    """A flower bed: drifts of a few colors among leaves."""
     leaf = grass(x, y, footprint, 0.0) * np.float32(0.6)
     i = np.floor(x / 0.24 + 0.5 * smooth(x, y, 0.9))
     j = np.floor(y / 0.24 + 0.5 * smooth(y, x, 0.9))
@@ -174,9 +174,9 @@ def _street_colors(
     along: np.ndarray, across: np.ndarray, half: np.ndarray, gap: np.ndarray, footprint: np.ndarray,
     color: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """Markings on a carriageway: centre dashes, edge lines on main streets, zebras before crossings.
+    """Markings on a carriageway: center dashes, edge lines on main streets, zebras before crossings.
 
-    `gap` is the distance to the edge of the crossing street (m), `across` the offset from the centre.
+    `gap` is the distance to the edge of the crossing street (m), `across` the offset from the center.
     """
     main, clear = half > 4, gap > 6.0
     dash = ((along / np.float32(4.5)) % 1 < 0.5) & clear

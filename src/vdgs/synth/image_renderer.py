@@ -86,7 +86,7 @@ def radiance(
 ) -> tuple[np.ndarray, RayHits]:
     """Linear light that comes along rays [n, 3] float32, [n, 3], and what they met.
 
-    `pixel_angle` is the angle between neighbouring pixels in radians.
+    `pixel_angle` is the angle between neighboring pixels in radians.
     """
     hits = tracer.intersect(origins, directions)
     light = sky_color(directions)
@@ -126,7 +126,7 @@ def _reflection(surface: Surface, gloss: np.ndarray, sun: np.ndarray) -> np.ndar
 
 
 def pixel_sample_offsets(count: int) -> np.ndarray:
-    """Places of a pixel's samples around its centre, [count, 2] in pixels: rotated grid or R2 sequence."""
+    """Places of a pixel's samples around its center, [count, 2] in pixels: rotated grid or R2 sequence."""
     if count == 1:
         return np.zeros((1, 2))
     if count == 4:
@@ -147,7 +147,7 @@ def pixel_rays(camera: Camera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def pixel_centers(camera: Camera) -> np.ndarray:
-    """Image places of all pixel centres, row by row, [height * width, 2]."""
+    """Image places of all pixel centers, row by row, [height * width, 2]."""
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     return np.stack([x.ravel(), y.ravel()], 1)
 

@@ -22,7 +22,7 @@ Material = IntEnum(
 class Mesh:
     """A triangle soup with per-corner texture coordinates and normals (float32 unless said).
 
-    vertices [v, 3] m; faces [f, 3] int32; material [f] uint8; colour [f, 3] linear albedo;
+    vertices [v, 3] m; faces [f, 3] int32; material [f] uint8; color [f, 3] linear albedo;
     seed [f] in [0, 1); uv [f, 3, 2] m; panel [f, 2]: extent of the polygon's uv, m; normals [f, 3, 3].
     """
 
@@ -37,7 +37,7 @@ class Mesh:
 
 
 def srgb(code: str) -> np.ndarray:
-    """A colour as people write it ("#c8a27a") to linear light, [3] float32."""
+    """A color as people write it ("#c8a27a") to linear light, [3] float32."""
     value = np.array([int(code[k : k + 2], 16) for k in (1, 3, 5)]) / 255
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
@@ -47,7 +47,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / (np.linalg.norm(vectors, axis=-1, keepdims=True) + 1e-12)
 
 
-#: Material, colour and seed of a polygon or part.
+#: Material, color and seed of a polygon or part.
 _Skin = tuple[Material, np.ndarray, float]
 
 

@@ -46,7 +46,7 @@ class SynthOptions:
     samples_per_pixel: Annotated[int, Range(1, 1024)] = 4
     """Rays averaged in every pixel: more is smoother and slower."""
     flight: FlightName = "uneven"
-    """How the drone flies. uneven: dense over the centre, sparse over the outskirts, some obliques; even: one regular
+    """How the drone flies. uneven: dense over the center, sparse over the outskirts, some obliques; even: one regular
     grid and obliques; distant: a dense middle and obliques far out, over land hardly seen; orbits: rings of obliques
     about landmarks; corridor: along the main street."""
     overlap: Annotated[float | None, Range(0, 0.98, exclusive_max=True)] = None
@@ -61,7 +61,7 @@ class SynthOptions:
     pose_noise_px: Annotated[float, Range(0, 100, exclusive_max=True)] = 0.0
     """Standard deviation of the error of the written poses, as the shift of the picture that it makes, in pixels."""
     exposure_stops: Annotated[float, Range(0, 10, exclusive_max=True)] = 0.0
-    """Standard deviation of the photographs' exposure in stops; it drifts along the flight, its colour a little too."""
+    """Standard deviation of the photographs' exposure in stops; it drifts along the flight, its color a little too."""
     extent_m: Annotated[float | None, Range(40, 1000)] = None
     """Side of the square that the flight covers, in metres."""
     truth: bool = False

@@ -1,4 +1,4 @@
-"""The town's colours, in linear light."""
+"""The town's colors, in linear light."""
 
 from __future__ import annotations
 
@@ -35,5 +35,5 @@ STRAW = srgb("#d8b765")
 
 
 def pick(rng: np.random.Generator, colors: list[np.ndarray], vary: float = 0.08) -> np.ndarray:
-    """One of the colours, a little lighter or darker."""
+    """One of the colors, a little lighter or darker."""
     return colors[rng.integers(len(colors))] * np.float32(1 + rng.uniform(-vary, vary))

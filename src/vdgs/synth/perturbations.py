@@ -11,7 +11,7 @@ from vdgs.synth.synthetic_points import SparseCloud
 
 #: Exposure keeps this share of its deviation from one photograph to the next: clouds drift, they do not flicker.
 _EXPOSURE_DRIFT = 0.85
-#: Colour temperature drifts along with exposure, by this share of it.
+#: Color temperature drifts along with exposure, by this share of it.
 _TINT = 0.2
 #: Mismatches put a point at its true distance times exp of a normal deviate of this size, and reproject worse.
 _OUTLIER_SHIFT = 0.35

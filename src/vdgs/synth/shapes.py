@@ -57,7 +57,7 @@ SIDES = np.array([(0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)])
 
 @dataclass(frozen=True)
 class SurfaceMaterial:
-    """Material, linear colour and seed of a surface."""
+    """Material, linear color and seed of a surface."""
 
     material: Material
     color: np.ndarray

@@ -17,7 +17,7 @@ KERB_RADIUS = 2.6
 class NearestStreet:
     """Places beside a street (m, [n] float32).
 
-    Signed offset from its centre line, distance outside its carriageway (negative: on it), half the
+    Signed offset from its center line, distance outside its carriageway (negative: on it), half the
     carriageway's width, and whether the street has ended there ([n] bool).
     """
 

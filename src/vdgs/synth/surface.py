@@ -16,7 +16,7 @@ _CELLS = np.random.default_rng(12).random(1 << 16, dtype=np.float32)
 class Surface:
     """Places where rays met the scene, float32.
 
-    position [n, 3] m; normal [n, 3] unit, facing the viewer; uv [n, 2] and panel [n, 2] m; colour [n, 3]
+    position [n, 3] m; normal [n, 3] unit, facing the viewer; uv [n, 2] and panel [n, 2] m; color [n, 3]
     linear albedo; seed [n]; footprint [n]: side of a pixel on the surface, m; view [n, 3]: unit direction
     in which the ray travels.
     """
@@ -36,12 +36,12 @@ class Surface:
 
 
 def mix_colors(a: np.ndarray, b: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Colours [n, 3] or [3] mixed by share [n]: 0 gives a, 1 gives b."""
+    """Colors [n, 3] or [3] mixed by share [n]: 0 gives a, 1 gives b."""
     return a + (b - a) * share[:, None]
 
 
 def scale_color(color: np.ndarray, factor: np.ndarray) -> np.ndarray:
-    """A colour [3] or [n, 3] times a factor [n], [n, 3] float32."""
+    """A color [3] or [n, 3] times a factor [n], [n, 3] float32."""
     return (color * factor[:, None]).astype(np.float32)
 
 
@@ -79,7 +79,7 @@ def cells(i: np.ndarray, j: np.ndarray, salt: int | np.ndarray = 0) -> np.ndarra
 
 
 def line(distance: np.ndarray, half_width: float, footprint: np.ndarray) -> np.ndarray:
-    """Coverage in [0, 1] of a line whose centre is `distance` metres away, anti-aliased by the footprint."""
+    """Coverage in [0, 1] of a line whose center is `distance` metres away, anti-aliased by the footprint."""
     soft = 0.5 * footprint + np.float32(0.01)
     return np.clip((half_width - np.abs(distance)) / soft + 0.5, 0, 1) * np.minimum(1, 2 * half_width / soft).astype(
         np.float32

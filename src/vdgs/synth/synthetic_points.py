@@ -25,7 +25,7 @@ _PAIRS_PER_CHUNK = 4_000_000
 
 @dataclass(frozen=True, eq=False)
 class SeedPoints:
-    """Places [n, 3] (m, float64) picked in one image, and their colours [n, 3] uint8."""
+    """Places [n, 3] (m, float64) picked in one image, and their colors [n, 3] uint8."""
 
     points: np.ndarray
     colors: np.ndarray
@@ -33,7 +33,7 @@ class SeedPoints:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SparseCloud:
-    """True places and noisy points [n, 3] (m), colours [n, 3] uint8, mean reprojection errors [n] (px);
+    """True places and noisy points [n, 3] (m), colors [n, 3] uint8, mean reprojection errors [n] (px);
     observations: point index [m], image index [m], pixels [m, 2], sorted by point, then by image;
     visibility [n, images]: in the frame and not occluded (a superset of the observations); outliers [n]: matched
     wrongly, so that the point is not where its place is."""
@@ -69,7 +69,7 @@ def sample_seed_points(
 def _recognized_views(
     cameras: list[Camera], places: np.ndarray, home: np.ndarray, visible: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
-    """In which of the pictures that see it a place is also recognised: the likelier, the nearer to the
+    """In which of the pictures that see it a place is also recognized: the likelier, the nearer to the
     direction of the picture it was found in (`home`), [n, cameras] bool."""
     positions = np.stack([camera.position for camera in cameras])
     matched = np.zeros_like(visible)

@@ -14,7 +14,7 @@ _REACH = 40.0
 
 @dataclass(frozen=True)
 class Pond:
-    """An elliptic pond: centre and half axes (m), level of its water (m)."""
+    """An elliptic pond: center and half axes (m), level of its water (m)."""
 
     x: float
     y: float

@@ -1,4 +1,4 @@
-"""Trees, bushes and hedges: a few crown shapes, turned, scaled and coloured anew for every tree."""
+"""Trees, bushes and hedges: a few crown shapes, turned, scaled and colored anew for every tree."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _HEIGHTS = {
 
 @dataclass(frozen=True, eq=False)
 class TreeCrown:
-    """A crown of unit radius about its own centre: vertices [v, 3], faces [f, 3], corner normals
+    """A crown of unit radius about its own center: vertices [v, 3], faces [f, 3], corner normals
     [f, 3, 3], and per corner how far out of the leaf mass it stands and how high, [f, 3, 2] in [0, 1]."""
 
     vertices: np.ndarray

@@ -70,7 +70,7 @@ def count_visibility(tracer: RayTracer, cameras: list[Camera], points: np.ndarra
 def view_ground_truth(
     tracer: RayTracer, camera: Camera, training: list[Camera], step: int = 1
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Per pixel centre of a view (every `step`-th pixel): depth along the viewing axis, float32 m, inf for sky; and how
+    """Per pixel center of a view (every `step`-th pixel): depth along the viewing axis, float32 m, inf for sky; and how
     many training cameras truly see the place met, uint16, 0 for sky. Both [height / step, width / step]."""
     shape = -(-camera.height // step), -(-camera.width // step)
     pixels = pixel_centers(camera).reshape(camera.height, camera.width, 2)[::step, ::step].reshape(-1, 2)

@@ -47,5 +47,5 @@ class LandUseMap:
         return np.where(outside, np.uint8(LandUse.OPEN), self.cells[row, column])
 
     def _fixed_point(self, points: np.ndarray) -> np.ndarray:
-        # cv2 takes sixteenths of a cell and puts cell centres at whole numbers
+        # cv2 takes sixteenths of a cell and puts cell centers at whole numbers
         return np.round(((np.asarray(points) + self.half_size) / self.cell - 0.5) * 16).astype(np.int32)

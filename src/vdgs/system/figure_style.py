@@ -1,4 +1,4 @@
-"""The look of all figures: ink, thin axes, titles, the colours of visibility."""
+"""The look of all figures: ink, thin axes, titles, the colors of visibility."""
 
 from __future__ import annotations
 

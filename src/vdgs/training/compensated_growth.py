@@ -37,7 +37,7 @@ class CompensatedGrowth:
     `vdgs.ops.rasterization` or `gsplat.rasterization`. Settings are named as in gsplat's `DefaultStrategy`; with
     `compensation.enabled` off it decides as that does (screen-size rules aside, which are off there too).
 
-    c_k is the share of the images of a cycle (between two decisions) that the centre of Gaussian k lies in, counted at
+    c_k is the share of the images of a cycle (between two decisions) that the center of Gaussian k lies in, counted at
     what was drawn: an image that is drawn twice counts twice (choice). `compensation.min_draws` plays no part: gsplat
     has no gate. Gradients are in NDC units, as in 3DGS.
     """

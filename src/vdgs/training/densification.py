@@ -93,7 +93,7 @@ def decide_densification(
 ) -> DensificationDecision:
     """One growth decision (Scaffold-GS eqs. 9-10 and its pruning; with `compensated`, VDGS section IV-C).
 
-    `frozen_positions` are further anchors that occupy cells; `growth_mask` says which cell centres may get an anchor.
+    `frozen_positions` are further anchors that occupy cells; `growth_mask` says which cell centers may get an anchor.
     Random numbers belong to offsets, not to policies: the same generator keeps the same offsets with compensation and
     without.
 
@@ -151,7 +151,7 @@ def _grow(
     generator: torch.Generator,
     growth_mask: GrowthMask | None,
 ) -> tuple[Anchors, int]:
-    """New anchors, at the centres of empty cells that hold a parent's Gaussian, and how many have a parent in L."""
+    """New anchors, at the centers of empty cells that hold a parent's Gaussian, and how many have a parent in L."""
     grown, grown_low = anchors.select(parents.index[:0]), 0
     for level in range(config.num_levels):
         parents = parents.select(parents.gradient >= config.grad_threshold * 2.0**level)
@@ -186,14 +186,14 @@ def _fill_cells(
     max_new: int | None,
     growth_mask: GrowthMask | None,
 ) -> tuple[Anchors, int]:
-    """An anchor at the centre of each allowed cell that holds a parent's Gaussian and no anchor, at most `max_new` of
+    """An anchor at the center of each allowed cell that holds a parent's Gaussian and no anchor, at most `max_new` of
     the largest gradients; and how many of the cells have a parent in L."""
     kernels, k = get_backend(anchors.positions.device), anchors.offsets.shape[1]
     rows = parents.index // k
     means = anchors.positions[rows] + anchors.offsets[rows, parents.index % k] * anchors.log_scales[rows, :3].exp()
     within = _within_lattice(means, cell)
     parents, means = parents.select(within), means[within]
-    # Cells are centred on multiples of their edge (upstream rounds), hence the origin at half a cell.
+    # Cells are centered on multiples of their edge (upstream rounds), hence the origin at half a cell.
     origin = means.new_full((3,), -0.5 * cell)
     cells, group = kernels.group_cells(kernels.cell_keys(means, cell, origin))
     chosen = ~_hold_any(cells, taken, cell, origin)

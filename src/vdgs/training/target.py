@@ -18,7 +18,7 @@ from vdgs.training.training_state import TrainingImages, TrainingProblem
 def mean_image_color(
     images: TrainingImages, count: int, downscale: int, max_images: int = 32
 ) -> tuple[float, float, float]:
-    """Mean colour in [0, 1] of the pixels that count, over up to `at_most` evenly chosen training views."""
+    """Mean color in [0, 1] of the pixels that count, over up to `at_most` evenly chosen training views."""
     total, pixels = np.zeros(3), 0
     for index in np.unique(np.linspace(0, count - 1, min(count, max_images)).astype(int)):
         image, mask = images.get(int(index), downscale)
@@ -30,11 +30,11 @@ def mean_image_color(
 
 
 def background_at(stage: TrainingProblem, iteration: int) -> Tensor:
-    """Colour [3] behind the scene at this iteration (from 0): from its own to a random one of the RGB cube."""
+    """Color [3] behind the scene at this iteration (from 0): from its own to a random one of the RGB cube."""
     color, share = torch.tensor(stage.background), stage.config.loss.random_background
     if share:
         generator = torch.Generator().manual_seed(stage.config.seed * 1_000_033 + iteration)
-        # Drawn on the CPU: the same colours for any device.
+        # Drawn on the CPU: the same colors for any device.
         color = torch.lerp(color, torch.rand(3, generator=generator), share)
     return color.to(stage.device, non_blocking=True)
 

@@ -35,7 +35,7 @@ LOSS_DECAY, PSNR_DECAY = 0.98, 0.9
 
 #: Camera height above the ground to which volumes are referred, so that the volume term means the same in any unit.
 REFERENCE_HEIGHT = 10.0
-#: Every so many iterations anchors are put into Morton order, so that neighbours in space are neighbours in memory.
+#: Every so many iterations anchors are put into Morton order, so that neighbors in space are neighbors in memory.
 SORT_INTERVAL = 1000
 #: Every so many iterations sizes are clamped to their bounds, and whenever a model is averaged or complete.
 BOUND_INTERVAL = 10
@@ -92,7 +92,7 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
 
     growing = iteration + 1 <= config.densify.stop_fraction * config.iterations
     if growing and iteration + 1 > config.densify.stats_start:
-        # Seen as V counts it: an anchor whose centre lies outside the image is not pruned for showing nothing there.
+        # Seen as V counts it: an anchor whose center lies outside the image is not pruned for showing nothing there.
         kernels = get_backend(stage.device)
         inside = kernels.mark_visible(state.anchors.positions[rows], camera)
         kernels.add_view_statistics(

@@ -129,7 +129,7 @@ class TrainingProblem:
     camera_height: float
     #: Whether the whole scene is trained or one block of it.
     kind: StageKind = "coarse"
-    #: Colour behind the scene.
+    #: Color behind the scene.
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     #: A block may leave the decoder as it is.
     frozen_decoder: bool = False

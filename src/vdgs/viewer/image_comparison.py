@@ -128,5 +128,5 @@ def warp_image(
 
 
 def _intrinsics(camera: Camera) -> Float[np.ndarray, "3 3"]:
-    """For OpenCV, where the centre of the first pixel is (0, 0)."""
+    """For OpenCV, where the center of the first pixel is (0, 0)."""
     return np.array([[camera.fx, 0.0, camera.cx - 0.5], [0.0, camera.fy, camera.cy - 0.5], [0.0, 0.0, 1.0]])

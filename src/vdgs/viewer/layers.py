@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 Layer = Literal["color", "depth", "visibility", "alpha", "blocks", "error"]
 LAYERS: tuple[Layer, ...] = get_args(Layer)
-#: Errors from here on have the colour of the end, as a share of full brightness (choice).
+#: Errors from here on have the color of the end, as a share of full brightness (choice).
 _MAX_ERROR = 0.25
-#: How much of the colour is that of the block.
+#: How much of the color is that of the block.
 _TINT_STRENGTH = 0.6
 #: The range of depths is found in an image so wide.
 _PREVIEW_PX = 160
@@ -170,7 +170,7 @@ def _draw_divider(image: np.ndarray, edge: int) -> UInt8[np.ndarray, "h w 3"]:
 
 @torch.no_grad()
 def _render_block_tints(model: AnchorModel, tints: Tensor, camera: Camera) -> UInt8[np.ndarray, "h w 3"]:
-    """The scene with the colours of the blocks that own its anchors."""
+    """The scene with the colors of the blocks that own its anchors."""
     rows, splats = decode_view(model, camera)
     k = model.anchors.offsets.shape[1]
     tint = tints[rows][splats.source.long() // k]

@@ -22,7 +22,7 @@ LineSegments = tuple[Float[np.ndarray, "s 2 3"], UInt8[np.ndarray, "s 2 3"]]
 
 
 def block_borders(scene: ViewerScene) -> LineSegments:
-    """The cores of the blocks as segments that lie on the ground, each in its block's colour."""
+    """The cores of the blocks as segments that lie on the ground, each in its block's color."""
     lines: list[np.ndarray] = []
     colors: list[tuple[int, int, int]] = []
     step = _STEP * camera_height(scene.capture)
@@ -47,7 +47,7 @@ def _ground_below(scene: ViewerScene, points_xy: Float[np.ndarray, "n 2"]) -> Fl
 
 
 def camera_frusta(scene: ViewerScene) -> LineSegments:
-    """All cameras as small frusta, in the colour of the block that they stand above."""
+    """All cameras as small frusta, in the color of the block that they stand above."""
     views = scene.capture.views
     size = _SIZE * camera_height(scene.capture)
     colors = [_GRAY] * len(views)
@@ -70,7 +70,7 @@ def _frustum(camera: Camera, size: float) -> Float[np.ndarray, "8 2 3"]:
 
 
 def sparse_points(scene: ViewerScene) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
-    """The sparse points and their colours, evenly thinned where there are many."""
+    """The sparse points and their colors, evenly thinned where there are many."""
     capture = scene.capture
     every = max(1, -(-len(capture.points) // _MAX_POINTS))
     return capture.points[::every].astype(np.float32), capture.point_colors[::every]

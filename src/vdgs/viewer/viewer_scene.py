@@ -140,7 +140,7 @@ class ViewerScene:
 
 
 def block_rgb(block: int) -> tuple[int, int, int]:
-    """The colour of a block in all figures, 0 to 255."""
+    """The color of a block in all figures, 0 to 255."""
     from vdgs.partition.plots.block_stats import block_color  # brings matplotlib: not before the first picture
 
     red, green, blue = bytes.fromhex(block_color(block).lstrip("#"))

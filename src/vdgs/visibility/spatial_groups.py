@@ -1,4 +1,4 @@
-"""Points in groups of neighbours, so that a query tests groups near a frustum instead of all points."""
+"""Points in groups of neighbors, so that a query tests groups near a frustum instead of all points."""
 
 from __future__ import annotations
 

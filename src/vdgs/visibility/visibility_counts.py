@@ -1,7 +1,7 @@
 """Visibility: how many training cameras hold each anchor in their frustum (sections IV-B and IV-C).
 
-A frustum holds a point where z > near and the projected centre lies on the image. Nothing is hidden behind anything
-else: the paper counts frusta, not lines of sight. Symbols: V_i (views of anchor i), V̂_i (normalised), c_k (share of
+A frustum holds a point where z > near and the projected center lies on the image. Nothing is hidden behind anything
+else: the paper counts frusta, not lines of sight. Symbols: V_i (views of anchor i), V̂_i (normalized), c_k (share of
 the cameras of a growth cycle).
 """
 

@@ -44,7 +44,7 @@ class CameraMarks:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class VisibilityMapData:
-    """What a map of V shows: points coloured by V, marked cameras, and (pale) V on level ground."""
+    """What a map of V shows: points colored by V, marked cameras, and (pale) V on level ground."""
 
     points: Float[np.ndarray, "n 3"]
     #: V of the points: how many of the cameras of `marks[0]` hold each in their frustum.
@@ -60,12 +60,12 @@ class VisibilityMapData:
     y_label: str
     #: What a point is, in the singular and with its article.
     noun: str
-    #: A bold line, a line of facts, and a line about the colours.
+    #: A bold line, a line of facts, and a line about the colors.
     titles: tuple[str, str, str]
 
 
 def plot_visibility_map(file: Path, data: VisibilityMapData) -> None:
-    """Points and cameras from above, points coloured by V; beside it the histogram of V. Writes a PNG."""
+    """Points and cameras from above, points colored by V; beside it the histogram of V. Writes a PNG."""
     width, height = map_size_inches(data.low, data.high)
     figure, place = style.new_figure(width + 4.7, height + 2.05)
     axes = place(0.85, 0.65, width, height)
@@ -147,7 +147,7 @@ def _legend(figure: Figure, axes: Axes, bordered: bool) -> None:
 
 
 def _histogram(bar: Axes, axes: Axes, visibility: np.ndarray, top: int, norm: Normalize, noun: str) -> None:
-    """The colour scale, and growing out of it the histogram of V; the last step holds all above it."""
+    """The color scale, and growing out of it the histogram of V; the last step holds all above it."""
     levels, limit, extent = np.arange(top + 1), LOW_VISIBILITY_LIMITS[0], (0, 1, -0.5, top + 0.5)
     bar.imshow(levels[:, None], VISIBILITY_CMAP, norm, origin="lower", extent=extent, aspect="auto")
     bar.set_xticks([])
@@ -179,7 +179,7 @@ def _histogram(bar: Axes, axes: Axes, visibility: np.ndarray, top: int, norm: No
 
 
 def visibility_color_norm(visibility: np.ndarray) -> tuple[int, Normalize]:
-    """The greatest V that has a colour of its own, and integer colour steps from 0 to it.
+    """The greatest V that has a color of its own, and integer color steps from 0 to it.
 
     The 99 % quantile: a few points that very many cameras see must not flatten the rest.
     """

@@ -33,7 +33,7 @@ QUATERNION_TOLERANCE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class ColmapModel:
-    """A sparse model: posed views, points [n, 3] float64 and colours [n, 3] uint8, in its own world."""
+    """A sparse model: posed views, points [n, 3] float64 and colors [n, 3] uint8, in its own world."""
 
     folder: Path
     views: tuple[SourceView, ...]

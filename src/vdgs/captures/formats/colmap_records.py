@@ -17,7 +17,7 @@ MAX_OBSERVATIONS = 400
 
 
 class ColmapPoints(NamedTuple):
-    """Points [n, 3] float64 and colours [n, 3] uint8 with the numbers [n] by which images name them."""
+    """Points [n, 3] float64 and colors [n, 3] uint8 with the numbers [n] by which images name them."""
 
     point_ids: np.ndarray
     positions: np.ndarray

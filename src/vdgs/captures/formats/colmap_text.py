@@ -123,7 +123,7 @@ def read_points3D_text(file: Path) -> ColmapPoints:
         except (ValueError, IndexError):
             raise _bad_line(file, number, "POINT3D_ID X Y Z R G B ERROR TRACK[]") from None
         if not all(0 <= value <= 255 for value in color):
-            raise _bad_line(file, number, "POINT3D_ID X Y Z R G B ERROR TRACK[], colours from 0 to 255")
+            raise _bad_line(file, number, "POINT3D_ID X Y Z R G B ERROR TRACK[], colors from 0 to 255")
         numbers.append(identifier)
         positions.append(position)
         colors.append(color)

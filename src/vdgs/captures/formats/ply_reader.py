@@ -1,4 +1,4 @@
-"""Point clouds from PLY files: vertices with x, y, z and, where present, colours."""
+"""Point clouds from PLY files: vertices with x, y, z and, where present, colors."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ class _Header:
 
 
 def read_point_cloud(file: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Points [n, 3] float64 and colours [n, 3] uint8 (mid-grey where the file has none).
+    """Points [n, 3] float64 and colors [n, 3] uint8 (mid-gray where the file has none).
 
-    Reads `ascii` and both binary formats, vertices first; floating-point colours may run from 0 to 1,
+    Reads `ascii` and both binary formats, vertices first; floating-point colors may run from 0 to 1,
     those of 16 bits to 65535. Raises `CaptureError` naming the file if it is missing, of another kind, or shorter than
     it announces.
     """
@@ -127,7 +127,7 @@ def _colors(vertices: np.ndarray, types: Mapping[str, str]) -> np.ndarray:
 
 
 def _factor(colors: np.ndarray, kind: str) -> float:
-    """What brings colours to 0 to 255: numbers with a point may run to 1, and 16 bits to 65535, where they do."""
+    """What brings colors to 0 to 255: numbers with a point may run to 1, and 16 bits to 65535, where they do."""
     finite = colors[np.isfinite(colors)]
     largest = float(finite.max()) if len(finite) else 0.0
     if "f" in kind and 0 < largest <= 1:

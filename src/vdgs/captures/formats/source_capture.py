@@ -99,7 +99,7 @@ class WorldPrior:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SourceCapture:
-    """A capture as the files have it; points [n, 3] float64, colours [n, 3] uint8."""
+    """A capture as the files have it; points [n, 3] float64, colors [n, 3] uint8."""
 
     source: str
     images: str

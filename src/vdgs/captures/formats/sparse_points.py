@@ -18,18 +18,18 @@ POINT_CLOUDS = (
     "points3D.ply", "points3d.ply", "sparse_pc.ply", "point_cloud.ply", "points.ply", "sparse.ply", "pointcloud.ply",
     "input.ply", "fused.ply",
 )  # fmt: skip
-#: A COLMAP model fits the poses if camera centres agree to this share of their spread (RMS).
+#: A COLMAP model fits the poses if camera centers agree to this share of their spread (RMS).
 MAX_RELATIVE_RMS = 0.02
 
 
 def find_sparse_points(
     root: Path, poses: Mapping[str, np.ndarray], what: str, aliases: Mapping[str, str] | None = None, option: str = ""
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points [n, 3] float64 in the world of `poses` (camera-from-world by image name) and colours [n, 3]
+    """Points [n, 3] float64 in the world of `poses` (camera-from-world by image name) and colors [n, 3]
     uint8.
 
     Taken from a PLY file in that world, else from a COLMAP model of the same photographs, which may live
-    in any world: it is brought over by the similarity between the camera centres that both have. `aliases`
+    in any world: it is brought over by the similarity between the camera centers that both have. `aliases`
     maps names in the COLMAP model to names in `poses`; `option` is what the command line needs beside a model, so
     that its cameras do not replace `poses`. Raises `CaptureError` if there is nothing, or nothing that fits.
     """

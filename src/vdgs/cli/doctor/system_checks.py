@@ -32,7 +32,7 @@ EXTRAS = {
     "geo": "maps as GeoTIFFs, any EPSG system (vdgs ortho)",
     "viewer": "a scene in a browser (vdgs view)",
     "ray": "blocks on many machines (--executor ray)",
-    "gsplat": "another rasteriser on an NVIDIA GPU, to compare with",
+    "gsplat": "another rasterizer on an NVIDIA GPU, to compare with",
     "test": "the test suite",
 }
 #: Imported for real, since these are the ones whose binary parts break.

@@ -1,7 +1,7 @@
-"""PlayCanvas' compressed PLY: 16 bytes a Gaussian, and a byte for each coefficient of colours that change.
+"""PlayCanvas' compressed PLY: 16 bytes a Gaussian, and a byte for each coefficient of colors that change.
 
-Chunks of 256 neighbours (in Morton order) have bounds as float32; within them a Gaussian has positions and logarithms
-of sizes in 11, 10 and 11 bits, the three smaller parts of its rotation in 10 bits each, colour and opacity in 8. The
+Chunks of 256 neighbors (in Morton order) have bounds as float32; within them a Gaussian has positions and logarithms
+of sizes in 11, 10 and 11 bits, the three smaller parts of its rotation in 10 bits each, color and opacity in 8. The
 coefficients of spherical harmonics are bytes between -4 and 4. The frame is that of `.sog`, y down.
 """
 
@@ -28,7 +28,7 @@ from vdgs.system.atomic_files import write_atomic
 from vdgs.system.scratch import scratch_folder
 
 CHUNK = 256
-#: What the float32 of a chunk are: lowest and highest position, logarithm of the size, colour.
+#: What the float32 of a chunk are: lowest and highest position, logarithm of the size, color.
 BOUNDS = tuple(
     f"{end}_{what}"
     for names in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
@@ -41,8 +41,8 @@ LARGEST_LOG = 20.0
 #: Coefficients of spherical harmonics lie between minus and plus half of this.
 SPAN = 8.0
 LOST = (
-    "positions and sizes are rounded to 1/2047 of what their chunk of 256 neighbours spans, colours to bytes, changing "
-    f"colours to {SPAN / 256:.3f}"
+    "positions and sizes are rounded to 1/2047 of what their chunk of 256 neighbors spans, colors to bytes, changing "
+    f"colors to {SPAN / 256:.3f}"
 )
 
 

@@ -55,7 +55,7 @@ class InitialView:
     #: Where one stands and what one looks at.
     position: tuple[float, float, float]
     target: tuple[float, float, float]
-    #: Colour behind the scene, RGB in 0 .. 1.
+    #: Color behind the scene, RGB in 0 .. 1.
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
     title: str = "scene"
     #: The file may have so many bytes.
@@ -145,7 +145,7 @@ def logits_from_opacity(opacity: Float[np.ndarray, " n"], steps: int = 255) -> F
 
 
 def base_colors(gaussians: Gaussians) -> Float[np.ndarray, "n 3"]:
-    """Colours without the part that changes with the direction; not clamped to 0 .. 1."""
+    """Colors without the part that changes with the direction; not clamped to 0 .. 1."""
     return (0.5 + SH_C0 * gaussians.sh0).numpy()
 
 

@@ -1,4 +1,4 @@
-"""glTF: one GLB of points that viewers with KHR_gaussian_splatting draw as Gaussians, and others as coloured points.
+"""glTF: one GLB of points that viewers with KHR_gaussian_splatting draw as Gaussians, and others as colored points.
 
 Every number is kept as float32. glTF's y is up: positions, rotations and spherical harmonics are turned there. The
 second kind, `spz_glb`, holds an SPZ in their place (KHR_gaussian_splatting_compression_spz_2): what 3D Tiles need.

@@ -1,7 +1,7 @@
 """`.html`: a page that shows the scene offline, in any browser with WebGL 2: viser's client with the scene inside.
 
 The client comes from the installed package viser, with a recording of one message that carries the Gaussians: 32 bytes
-each (mean in float32, covariance in float16, colour and opacity in bytes), compressed, as base64. Colours do not change
+each (mean in float32, covariance in float16, color and opacity in bytes), compressed, as base64. Colors do not change
 with the direction. A scene that would be too large for the file is thinned until it fits (`levels`).
 """
 
@@ -88,7 +88,7 @@ def write_html(path: Path, scene: ExportScene) -> tuple[str, ...]:
     while len(content := _document(kept, factor, page, scene)) > page.max_bytes:
         kept = _thin_to_fit(whole, len(kept), factor, page)
     write_bytes(path, content)
-    lost = ["colours do not change with the viewing direction"]
+    lost = ["colors do not change with the viewing direction"]
     if len(kept) < len(whole):
         lost.append(
             f"thinned from {len(whole):,} Gaussians to {len(kept):,}, for the page may have "
@@ -206,7 +206,7 @@ def _client_html() -> str:
 
 
 def _recording(rows: UInt32[np.ndarray, "n 8"], factor: float, page: InitialView) -> str:
-    """What the client plays: where one stands, the colour behind, and the Gaussians. Base64."""
+    """What the client plays: where one stands, the color behind, and the Gaussians. Base64."""
     from viser import _messages as messages
     from viser.infra import StateSerializer, WebsockMessageHandler
 
@@ -239,7 +239,7 @@ def _recording(rows: UInt32[np.ndarray, "n 8"], factor: float, page: InitialView
 
 
 def _png(color: tuple[float, float, float]) -> bytes:
-    """A picture of one colour."""
+    """A picture of one color."""
     pixels = np.broadcast_to(to_uint8(np.array(color))[::-1], (2, 2, 3))
     done, encoded = cv2.imencode(".png", np.ascontiguousarray(pixels))
     assert done

@@ -1,4 +1,4 @@
-"""The centres of the Gaussians as a point cloud: PLY in local coordinates, LAS and LAZ in those of the map.
+"""The centers of the Gaussians as a point cloud: PLY in local coordinates, LAS and LAZ in those of the map.
 
 What is faint is written too: opacity goes along (LAS: as intensity, 0 .. 65535), so that programs can filter by it.
 """
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 POINT_DTYPE = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3), ("opacity", "<f4")])
 #: LAS keeps whole numbers of this, in units of the coordinates.
 LAS_SCALE = 0.001
-LOSS_NOTES = ("sizes, rotations and changing colours are left out: these are points",)
+LOSS_NOTES = ("sizes, rotations and changing colors are left out: these are points",)
 
 
 def write_points(path: Path, scene: ExportScene) -> tuple[str, ...]:

@@ -39,7 +39,7 @@ class ExportFormat:
     writes_metadata_file: bool = False
     #: Coordinates lie below this, from the origin.
     max_coordinate: float = math.inf
-    #: Whether its colours do not change with the direction: best baked so, where all files are of that kind.
+    #: Whether its colors do not change with the direction: best baked so, where all files are of that kind.
     fixed_colors: bool = False
     #: Whether it stands on the globe, in no map's coordinates.
     on_globe: bool = False
@@ -68,7 +68,7 @@ FORMATS: tuple[ExportFormat, ...] = (
     ),
     ExportFormat(
         suffix=".splat",
-        description="32 bytes a Gaussian, fixed colours",
+        description="32 bytes a Gaussian, fixed colors",
         write=write_splat,
         read=read_splat_chunks,
         writes_metadata_file=True,

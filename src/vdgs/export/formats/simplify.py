@@ -1,8 +1,8 @@
 """Coarser levels of a scene: Gaussians merged where they are closer together than the level shows.
 
-Each cell of a grid becomes one Gaussian with the mean, spread and colour of those in it, weighted by what they cover.
-Two things differ from the moments alone, so that a surface stays closed. The spread of the centres within a cell counts
-`SPREAD_FACTOR` times: neighbours that only share an edge would leave gaps between them. And optical depth times area is
+Each cell of a grid becomes one Gaussian with the mean, spread and color of those in it, weighted by what they cover.
+Two things differ from the moments alone, so that a surface stays closed. The spread of the centers within a cell counts
+`SPREAD_FACTOR` times: neighbors that only share an edge would leave gaps between them. And optical depth times area is
 kept, not opacity: many small opaque Gaussians make one large opaque one, few make a faint one.
 """
 
@@ -18,8 +18,8 @@ from torch import Tensor
 from vdgs.model.gaussian_transform import gaussian_covariances
 from vdgs.model.gaussians import Gaussians
 
-#: Centres spread evenly over a cell of edge e have the variance e² / 12 along each axis; four times that is a standard
-#: deviation of 0.58 e: neighbours on a grid then overlap to an alpha of 0.9 and more everywhere between them.
+#: Centers spread evenly over a cell of edge e have the variance e² / 12 along each axis; four times that is a standard
+#: deviation of 0.58 e: neighbors on a grid then overlap to an alpha of 0.9 and more everywhere between them.
 SPREAD_FACTOR = 4.0
 #: Opacities of merged Gaussians end here, as those that are drawn do.
 MAX_OPACITY = 0.999
@@ -80,7 +80,7 @@ def _cell_count(cells: Int64[Tensor, " n"]) -> int:
 
 
 def cell_indices(means: Float[Tensor, "n 3"], edge: float) -> Int64[Tensor, " n"]:
-    """The number of the cell of a cubic grid that each centre lies in, 0 .. the number of cells in use - 1."""
+    """The number of the cell of a cubic grid that each center lies in, 0 .. the number of cells in use - 1."""
     places = ((means - means.amin(0)) / edge).floor()
     if float((places.amax(0) + 1).prod()) >= 2.0**62:
         # Small cells about something very far: 64 bits number the layers in use, but not all of the grid.

@@ -1,8 +1,8 @@
 """SOG, PlayCanvas' files: the numbers of a scene as lossless WebP images in one zip, a twelfth of a PLY and less.
 
-Version 2. Positions have 16 bits after a logarithm: fine near the origin, coarse far from it. Sizes and colours are
+Version 2. Positions have 16 bits after a logarithm: fine near the origin, coarse far from it. Sizes and colors are
 indices into 256 values each, spherical harmonics into a palette of whole sets. Gaussians stand in Morton order:
-neighbours are alike, so the images are small. The frame is that of `.splat`, y down.
+neighbors are alike, so the images are small. The frame is that of `.splat`, y down.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def write_sog(path: Path, scene: ExportScene) -> tuple[str, ...]:
     write_metadata_file(path, scene.metadata, axes)
     notes = [f"positions are rounded, farthest from the origin to {100 * coarsest:.1f} cm (if units are metres)"]
     if scene.degree:
-        notes.append(f"changing colours are taken from a palette of at most {MAX_SH_CENTROIDS}")
+        notes.append(f"changing colors are taken from a palette of at most {MAX_SH_CENTROIDS}")
     return tuple(notes)
 
 
@@ -80,7 +80,7 @@ class _Images:
             self.harmonics = fit_codebook(self.palette.rows.ravel())
 
     def max_step(self) -> float:
-        """The largest step between neighbouring positions, in units of the scene."""
+        """The largest step between neighboring positions, in units of the scene."""
         step = (self.high - self.low) / MAX_UINT16
         return float((step * np.exp(np.maximum(np.abs(self.low), np.abs(self.high)))).max())
 
@@ -158,7 +158,7 @@ def _packed(quaternions: np.ndarray) -> np.ndarray:
 
 
 def _webp(picture: np.ndarray) -> bytes:
-    """Lossless, with the colours of transparent pixels too."""
+    """Lossless, with the colors of transparent pixels too."""
     file = io.BytesIO()
     Image.fromarray(picture).save(file, "WEBP", lossless=True, exact=True, quality=50, method=2)
     return file.getvalue()

@@ -1,6 +1,6 @@
-"""`.splat`: 32 bytes a Gaussian, as viewers on the web stream them. Colours no longer change with the direction.
+"""`.splat`: 32 bytes a Gaussian, as viewers on the web stream them. Colors no longer change with the direction.
 
-Position and standard deviations as float32, colour and opacity as RGBA, rotation wxyz in four bytes; y down.
+Position and standard deviations as float32, color and opacity as RGBA, rotation wxyz in four bytes; y down.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ def write_splat(path: Path, scene: ExportScene) -> tuple[str, ...]:
 
     write_atomic(path, write)
     write_metadata_file(path, scene.metadata, axes)
-    lost = ["colours no longer change with the viewing direction"] if scene.degree else []
+    lost = ["colors no longer change with the viewing direction"] if scene.degree else []
     if clipped:
-        lost.append(f"{clipped} of {scene.count} colours lay outside of 0 .. 1 and were cut off")
+        lost.append(f"{clipped} of {scene.count} colors lay outside of 0 .. 1 and were cut off")
     return tuple(lost)
 
 

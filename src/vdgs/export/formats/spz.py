@@ -56,7 +56,7 @@ READ_BLOCK_BYTES = 1 << 22
 CLAMP_NOTES = {
     "large": "Gaussians are larger than 377 units and were cut to that",
     "thin": "Gaussians are thinner than 0.00005 units and became as thick as that, which nobody sees",
-    "colors": "colours lay far outside of 0 .. 1 and were cut off",
+    "colors": "colors lay far outside of 0 .. 1 and were cut off",
 }
 
 
@@ -165,7 +165,7 @@ def _stream(first: bytes, columns: Mapping[str, IO[bytes]]) -> Iterator[bytes]:
 
 
 def _count_clamped(piece: Gaussians) -> dict[str, int]:
-    """How many Gaussians have sizes or colours that bytes cannot hold, as in `CLAMP_NOTES`."""
+    """How many Gaussians have sizes or colors that bytes cannot hold, as in `CLAMP_NOTES`."""
     scales = (piece.log_scales + 10) * 16
     shown = piece.sh0 * COLOR_SCALE + 0.5
     return {

@@ -3,7 +3,7 @@
 `FOLDER/tileset.json` names the tiles in a folder beside it. The tree is a quadtree over x and y; a leaf holds its part
 of the scene as it is, a tile above holds its four children merged (`levels`) to as many Gaussians. A tile is a GLB
 around an SPZ, the only kind that CesiumJS draws so far. Tiles stand in local coordinates with z up, each about its own
-middle; the root's transform takes them to Earth-centred coordinates where the scene is georeferenced.
+middle; the root's transform takes them to Earth-centered coordinates where the scene is georeferenced.
 """
 
 from __future__ import annotations
@@ -89,9 +89,9 @@ def write_tiles(path: Path, scene: ExportScene, max_gaussians: int = MAX_GAUSSIA
         shutil.rmtree(folder, ignore_errors=True)
         raise
     _remove(older)
-    notes = ["positions are rounded to 0.24 mm, colours and shapes to bytes"]
+    notes = ["positions are rounded to 0.24 mm, colors and shapes to bytes"]
     if scene.metadata.geodetic is None:
-        notes.append("the scene is not georeferenced: globes show it at the centre of the Earth")
+        notes.append("the scene is not georeferenced: globes show it at the center of the Earth")
     return tuple(notes)
 
 
@@ -142,7 +142,7 @@ class _TileQuadtree:
 
     def __init__(self, scene: GaussianStore, folder: Path, facts: ExportMetadata, max_count: int) -> None:
         self.scene, self.folder, self.facts, self.most = scene, folder, facts, max_count
-        # Along a Morton curve neighbours follow each other: tiles are smaller, and read from the disk in one go.
+        # Along a Morton curve neighbors follow each other: tiles are smaller, and read from the disk in one go.
         self.order = get_backend(torch.device("cpu")).morton_order(torch.from_numpy(scene.means)).numpy()
 
     def build(self) -> TilesetNode:
@@ -213,7 +213,7 @@ def _tileset(root: TilesetNode, metadata: ExportMetadata) -> JsonObject:
 
 
 def tile_transform(metadata: ExportMetadata) -> list[float]:
-    """4 × 4, column by column, from local coordinates to Earth-centred metres; the identity where no place is known."""
+    """4 × 4, column by column, from local coordinates to Earth-centered metres; the identity without a known place."""
     matrix = np.eye(4)
     if metadata.geodetic is not None:
         matrix[:3, :3] = enu_axes(metadata.geodetic[0], metadata.geodetic[1]).T

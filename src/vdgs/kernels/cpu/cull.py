@@ -12,7 +12,7 @@ from vdgs.kernels.cpu.arguments import check_row_shapes, contiguous, packed_came
 
 
 def cull(positions: Float[Tensor, "n 3"], log_scales: Float[Tensor, "n 6"], camera: Camera) -> Int64[Tensor, "v"]:
-    """As `torch_ref.cull`, in float32; scales are read only where the centre lies outside the image. Raises ValueError
+    """As `torch_ref.cull`, in float32; scales are read only where the center lies outside the image. Raises ValueError
     for shapes that do not match."""
     check_row_shapes(positions.shape[0], positions=(positions, 3), log_scales=(log_scales, 6))
     visible = extension.get_extension().cull(

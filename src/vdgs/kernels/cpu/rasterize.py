@@ -56,7 +56,7 @@ def splat_contributions(
 
 
 def _draw(tensors: tuple[Tensor, ...], width: int, height: int, depth: bool, module: Any) -> tuple[Raster, _Pullback]:
-    """The picture of means_px, conics, colours, opacities, depths before a background, and the way back."""
+    """The picture of means_px, conics, colors, opacities, depths before a background, and the way back."""
     check_splats(tensors, width, height, "cpu")
     if len(tensors[0]) >= 2**31:
         raise ValueError(f"at most 2^31 - 1 splats can be drawn at once, not {len(tensors[0])}")

@@ -1,4 +1,4 @@
-"""How many cameras see each point, in C++: blocks of neighbouring points against frusta."""
+"""How many cameras see each point, in C++: blocks of neighboring points against frusta."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SORT_FROM_CAMERAS = 8
 
 def count_visibility(points: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Int32[Tensor, "n"]:
     """As `torch_ref.count_visibility`, exactly: float64 decides what float32 cannot. O(n) memory; a block of 512
-    neighbours inside or outside a frustum costs one test."""
+    neighbors inside or outside a frustum costs one test."""
     check_points(points)
     count = torch.zeros(points.shape[0], dtype=torch.int32)
     if len(cameras) == 0 or points.shape[0] == 0:

@@ -81,7 +81,7 @@ class _Entries:
 def _draw(
     tensors: tuple[Tensor, ...], runs: SplatSegments | None, width: int, height: int, depth: bool, program: CudaProgram
 ) -> tuple[Raster, RasterPullback]:
-    """The picture of means_px, conics, colours, opacities, depths before a background, and the way back."""
+    """The picture of means_px, conics, colors, opacities, depths before a background, and the way back."""
     check_splats(tensors, width, height)
     *splats, background = (t.detach().contiguous() for t in tensors)
     grid = -(-width // TILE_PX), -(-height // TILE_PX)

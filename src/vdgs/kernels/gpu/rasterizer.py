@@ -1,4 +1,4 @@
-"""Which rasteriser draws on a GPU: gsplat where it can be used, the own kernels elsewhere and wherever depth is asked
+"""Which rasterizer draws on a GPU: gsplat where it can be used, the own kernels elsewhere and wherever depth is asked
 for, since gsplat cannot tell the median depth of a pixel."""
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ def cell_keys(positions: Float[Tensor, "n 3"], cell_size: float, origin: Float[T
 
 
 def cell_centers(keys: Int64[Tensor, "n"], cell_size: float, origin: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
-    """Centre of each cell, in the type of `origin`."""
+    """Center of each cell, in the type of `origin`."""
     shifts = torch.tensor([2 * AXIS_BITS, AXIS_BITS, 0], device=keys.device)
     index = ((keys[:, None] >> shifts) & AXIS_MASK) - AXIS_OFFSET
     return ((index.to(torch.float64) + 0.5) * cell_size + origin.to(torch.float64)).to(origin.dtype)
@@ -68,7 +68,7 @@ def morton_order(positions: Float[Tensor, "n 3"]) -> Int64[Tensor, "n"]:
     """The permutation that sorts positions along a Morton curve, stable. O(n).
 
     Positions are quantised to 21 bits an axis over a cube at the lower corner of their bounding box (choice: a cube, so
-    that neighbours on the curve are near in a flat scene). Raises ValueError where a position is not finite.
+    that neighbors on the curve are near in a flat scene). Raises ValueError where a position is not finite.
     """
     check_positions(positions)
     if positions.shape[0] == 0:

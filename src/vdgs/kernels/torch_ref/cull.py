@@ -15,9 +15,9 @@ from vdgs.kernels.transfer import to_like
 def cull(positions: Float[Tensor, "n 3"], log_scales: Float[Tensor, "n 6"], camera: Camera) -> Int64[Tensor, "v"]:
     """Indices, ascending, of the anchors whose Gaussian of scales exp(s[0:3]) may touch the image.
 
-    Kept: z > near at the centre, and the square about the projected centre that surely holds the 3-sigma ellipse
+    Kept: z > near at the center, and the square about the projected center that surely holds the 3-sigma ellipse
     touches the image. Its half-width along x is 3·sqrt(σ²·(fx/z)²·(1 + u²) + 0.3 px²) with σ = max(exp(s[0:3])), that
-    of the sphere around the Gaussian under the same linearisation (u = clamp(x/z)) as in `project`; along y likewise.
+    of the sphere around the Gaussian under the same linearization (u = clamp(x/z)) as in `project`; along y likewise.
     Choice: no anchor is dropped whose projected ellipse touches the image; a few are kept whose ellipse does not.
     """
     rigid = to_like(camera.camera_from_world, positions)

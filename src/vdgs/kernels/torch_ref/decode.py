@@ -27,7 +27,7 @@ def decode(
     """Decode visible anchors (`rows` of those given; None: all) for one camera and project what they spawn.
 
     With d = (x - c)/|x - c| (orthographic: the viewing direction), each head sees [f, d], or
-    [f, d, |x - c|] where its first layer is 36 wide: opacity = tanh(·), covariance, colour =
+    [f, d, |x - c|] where its first layer is 36 wide: opacity = tanh(·), covariance, color =
     sigmoid(·). μ = x + O·exp(s[0:3]), scales exp(s[3:6])·sigmoid(cov[0:3]), rotation cov[3:7].
 
     Kept are splats that are opaque (> 0), valid in `project`, finite, and whose alpha reaches 1/255
@@ -142,7 +142,7 @@ def _finite_rows(*tensors: Float[Tensor, "v _"]) -> Bool[Tensor, "v"]:
 
 @torch.no_grad()
 def _on_image(means_px: Tensor, variances: Tensor, opacity: Tensor, camera: Camera) -> Bool[Tensor, "m"]:
-    """Whether the box around {alpha >= 1/255} reaches the centre of any pixel.
+    """Whether the box around {alpha >= 1/255} reaches the center of any pixel.
 
     alpha = opacity·exp(-q/2) is 1/255 on the ellipse q = 2·ln(255·opacity), which reaches
     sqrt(q·Σ'xx) to either side of the mean.

@@ -1,7 +1,7 @@
-"""Spherical harmonics of many Gaussians: the colours that they show, and their fit to colours that cameras saw.
+"""Spherical harmonics of many Gaussians: the colors that they show, and their fit to colors that cameras saw.
 
-The fit is a weighted ridge regression of each Gaussian, in closed form: minimise over c
-Σ_v w_v |Y(d_v) c - (colour_v - 1/2)|² / Σ_v w_v + ridge |c'|², where c' are the coefficients but the constant one.
+The fit is a weighted ridge regression of each Gaussian, in closed form: minimize over c
+Σ_v w_v |Y(d_v) c - (color_v - 1/2)|² / Σ_v w_v + ridge |c'|², where c' are the coefficients but the constant one.
 Dimensions: n Gaussians, m of them; p pairs of a Gaussian and a camera, sorted by Gaussian; f = (degree + 1)² functions.
 """
 

@@ -15,11 +15,11 @@ def project(
 ) -> ProjectedGaussians:
     """Project Gaussians (world means, standard deviations along their axes, wxyz rotations).
 
-    Quaternions are normalised here. Works in the precision of its arguments and is differentiable in all three. Not
+    Quaternions are normalized here. Works in the precision of its arguments and is differentiable in all three. Not
     valid, thus all zero and without gradient: z <= near, and whatever does not come out as finite numbers.
 
     In J, x/z and y/z are clamped to 1.3 times the half-angle of the frustum on either side, as 3DGS does: the
-    linearisation explodes far outside the image. The derivative is that of the clamped function: J's u = clamp(x/z)
+    linearization explodes far outside the image. The derivative is that of the clamped function: J's u = clamp(x/z)
     stands still beyond the bound, whether x or z moves.
     """
     return project_with_variances(means, scales, quaternions, camera)[0]

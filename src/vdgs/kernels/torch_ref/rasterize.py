@@ -63,7 +63,7 @@ def splat_contributions(
     """How many pixels each splat makes, the sum of its weights w = alpha T over them (3DGS, eq. 3), and the sum of w
     times what the picture lacks there of the wanted one (zero without).
 
-    These are the derivatives of the sum of the expected depth by the depth of the splat, and, by its colour, of half of
+    These are the derivatives of the sum of the expected depth by the depth of the splat, and, by its color, of half of
     the squared error of the picture, negated. Raises what `rasterize` raises.
     """
     return splat_contributions_from_vjp(rasterize_vjp, splats, background, width, height, wanted)
@@ -98,7 +98,7 @@ def _median_depth(transmittance: Float[Tensor, "m_and_one h w"], depths: Float[T
 def _alphas(
     means_px: Float[Tensor, "m 2"], conics: Float[Tensor, "m 3"], opacities: Float[Tensor, "m"], width: int, height: int
 ) -> Float[Tensor, "m h w"]:
-    """Opacity of every splat at every pixel centre, zero where it is too small to count."""
+    """Opacity of every splat at every pixel center, zero where it is too small to count."""
     x = torch.arange(width, dtype=means_px.dtype, device=means_px.device) + 0.5
     y = torch.arange(height, dtype=means_px.dtype, device=means_px.device) + 0.5
     dx = (x - means_px[:, 0, None])[:, None, :]

@@ -25,7 +25,7 @@ def add_view_statistics(
 
     `source` is (index in `visible`) k + offset, ascending without repetition; `gradient_px` is the gradient by the
     means in pixels, whose norm is taken in NDC ([-1, 1] across the image, hence width/2 and height/2). Each drawn
-    offset gains its norm and a count, each visible anchor the opacity of its splats, and a count if its centre is
+    offset gains its norm and a count, each visible anchor the opacity of its splats, and a count if its center is
     `inside` the image. Raises IndexError for a source beyond the visible anchors, ValueError for an unsuitable
     `inside`, before any change.
     """

@@ -1,6 +1,6 @@
 """How many cameras see each point: V_i of the visibility map (VDGS section IV-B, eq. 5).
 
-A camera sees a point where its frustum holds it: z > near and the projected centre on the image. Nothing
+A camera sees a point where its frustum holds it: z > near and the projected center on the image. Nothing
 is hidden behind anything else.
 """
 

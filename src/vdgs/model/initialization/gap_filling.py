@@ -48,7 +48,7 @@ def find_gap_points(
 
 
 def _empty_cells(points: np.ndarray, low: np.ndarray, high: np.ndarray, cell: float) -> Float[np.ndarray, "c 2"]:
-    """Centres of the cells that hold no point and touch none that does."""
+    """Centers of the cells that hold no point and touch none that does."""
     shape = tuple(int(count) for count in np.maximum(np.ceil((high - low) / cell), 1))
     index = np.floor((points[:, :2] - low) / cell).astype(np.int64)
     index = index[((index >= 0) & (index < shape)).all(axis=1)]
@@ -61,7 +61,7 @@ def _empty_cells(points: np.ndarray, low: np.ndarray, high: np.ndarray, cell: fl
 def _at_seen_heights(
     centers: np.ndarray, points: np.ndarray, tree: cKDTree, cameras: Sequence[Camera]
 ) -> Float[np.ndarray, "g 3"]:
-    """The centres lifted to the ground about them, where a camera sees them."""
+    """The centers lifted to the ground about them, where a camera sees them."""
     if not len(centers):
         return np.zeros((0, 3))
     _, nearest = tree.query(centers, k=min(NUM_NEIGHBORS, len(points)), workers=1)

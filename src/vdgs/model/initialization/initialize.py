@@ -17,7 +17,7 @@ from vdgs.kernels.kernel_types import FEATURE_SIZE
 from vdgs.model.anchors import Anchors
 from vdgs.model.initialization.gap_filling import find_gap_points
 
-#: An outlier is known by its distance to this neighbour: small clusters of false matches are outliers too.
+#: An outlier is known by its distance to this neighbor: small clusters of false matches are outliers too.
 OUTLIER_NEIGHBOR = 4
 
 
@@ -37,7 +37,7 @@ def auto_voxel_size(points: np.ndarray) -> float:
 
 
 def inlier_mask(points: np.ndarray, factor: float) -> np.ndarray:
-    """Which points [n, 3] have their fourth nearest neighbour within `factor` times the median such distance."""
+    """Which points [n, 3] have their fourth nearest neighbor within `factor` times the median such distance."""
     if factor <= 0 or len(points) <= OUTLIER_NEIGHBOR:
         return np.ones(len(points), bool)
     distances, _ = cKDTree(points).query(points, k=[OUTLIER_NEIGHBOR + 1], workers=1)
@@ -60,9 +60,9 @@ def initialize_anchors(
     """Anchors on the voxel grid of the sparse points [n, 3], and the voxel used.
 
     Points are rounded to the grid and made unique (Scaffold-GS eq. 3); so are the `dense` ones [m, 3], with their
-    colours, that stereo found beside them, and those that fill gaps seen by the training cameras. Log-scales start at
+    colors, that stereo found beside them, and those that fill gaps seen by the training cameras. Log-scales start at
     the logarithm of the mean distance to the three nearest other anchors, offsets at 0, features at 0 or at the
-    colours. Raises VdgsError with fewer than two distinct points.
+    colors. Raises VdgsError with fewer than two distinct points.
     """
     voxel = get_voxel_size(points, config)
     inliers = inlier_mask(points, config.outlier_distance)
@@ -89,6 +89,6 @@ def initialize_anchors(
 
 
 def _mean_colors(colors: np.ndarray, owner: Int64[np.ndarray, " n"], count: int) -> np.ndarray:
-    """Mean colour in [0, 1] of the points that share a cell, [count, 3]."""
+    """Mean color in [0, 1] of the points that share a cell, [count, 3]."""
     sums = np.stack([np.bincount(owner, colors[:, c] / 255.0, count) for c in range(3)], axis=1)
     return sums / np.bincount(owner, minlength=count)[:, None]

@@ -63,7 +63,7 @@ def compute_score_matrix(
       the scene with the widened block drawn alone. Pixels empty in both do not count; 0 where the scene is empty.
     - `paper`: the share of *all* pixels with Δ < τ (eq. 7).
     - `leave-one-out`: 1 - SSIM of the scene without the anchors that the block owns against the whole scene, 8 bits.
-    - `frustum`: the share of the anchors that the block owns whose centre the camera holds; nothing is drawn.
+    - `frustum`: the share of the anchors that the block owns whose center the camera holds; nothing is drawn.
 
     Pictures are at most `config.image_size` wide and high. The scores of a camera depend on no other camera and on
     no number of threads. Memory: O(n b) bytes, and one view for each thread.
@@ -140,7 +140,7 @@ class _BlockMembers:
     owner: Int64[Tensor, " n"]
     #: As `Blocks.in_expanded`, for all blocks at once.
     reached: Bool[Tensor, "b n"]
-    #: Anchor positions by owner, neighbours together: whole groups are then decided by one test each.
+    #: Anchor positions by owner, neighbors together: whole groups are then decided by one test each.
     points: Float[Tensor, "n 3"]
     #: Where the points of each block begin and end.
     bounds: list[int]

@@ -54,7 +54,7 @@ def plot_anchor_visibility(
     cameras: Sequence[Camera],
     axes: tuple[str, str],
 ) -> None:
-    """Anchors from above coloured by V_i, cameras, and the histogram of V. Writes a PNG; `axes` are the names of x
+    """Anchors from above colored by V_i, cameras, and the histogram of V. Writes a PNG; `axes` are the names of x
     and y with their unit (`GroundFrame.axis_names`)."""
     low, high = _map_corners(np.concatenate([_inner_quantiles(positions[:, :2]), _camera_xy(cameras)]))
     marks = visibility_map.CameraMarks("training camera", cameras, INK, "white", _mark_size(len(cameras)))
@@ -63,7 +63,7 @@ def plot_anchor_visibility(
     data = visibility_map.VisibilityMapData(
         points=positions, visibility=visibility, low=low, high=high, ground=float(np.median(positions[:, 2])),
         marks=(marks,), x_label=axes[0], y_label=axes[1], noun="an anchor",
-        titles=(*heading, "anchors coloured by V; pale: V on level ground"),
+        titles=(*heading, "anchors colored by V; pale: V on level ground"),
     )  # fmt: skip
     visibility_map.plot_visibility_map(file, data)
 
@@ -77,7 +77,7 @@ def plot_blocks(
     cuts: Sequence[tuple[str, Blocks]],
     names: tuple[str, str],
 ) -> None:
-    """Anchors from above coloured by block, with outlines and cameras, for each of the `cuts` with its name.
+    """Anchors from above colored by block, with outlines and cameras, for each of the `cuts` with its name.
 
     The first cut is the scene's own, to which cameras are assigned; another is there to compare with. The map shows
     99 % of the anchors in x and in y and all outlines, if these do not lead far away. Writes a PNG; `names` are those
@@ -142,7 +142,7 @@ def _frame_of_blocks(
 def _plot_partition(
     axes: Axes, blocks: Blocks, shown: Float[np.ndarray, "n 2"], low: np.ndarray, high: np.ndarray
 ) -> None:
-    """Anchors in the colours of their blocks, cores and widened boundaries, and the numbers."""
+    """Anchors in the colors of their blocks, cores and widened boundaries, and the numbers."""
     owner = blocks.owner(shown)
     palette = np.array([to_rgb(block_color(index)) for index in range(len(blocks))])
     size = float(np.clip(3e4 / len(shown), 0.6, 7.0))

@@ -16,7 +16,7 @@ from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 from vdgs.partition.blocks import Blocks, xy_positions
 from vdgs.system.figure_style import INK, MUTED, draw_titles, new_figure, pluralize, style_axes, write_png
 
-#: Colours of blocks 0 to 15; block 16 begins anew. Neighbours in the list differ most.
+#: Colors of blocks 0 to 15; block 16 begins anew. Neighbors in the list differ most.
 BLOCK_PALETTE = (
     "#4363d8", "#f58231", "#3cb44b", "#e6194b", "#911eb4", "#42c6e0", "#e0bd00", "#f032e6",
     "#9a6324", "#469990", "#a3cf3f", "#000075", "#f0a3c0", "#800000", "#b79be6", "#808000",
@@ -24,12 +24,12 @@ BLOCK_PALETTE = (
 
 
 def block_color(index: int) -> str:
-    """The colour of a block in all figures."""
+    """The color of a block in all figures."""
     return BLOCK_PALETTE[index % len(BLOCK_PALETTE)]
 
 
 def mix_color(color: str, scale: float, tone: float = 1.0) -> tuple[float, float, float]:
-    """The colour darkened by `scale`, then mixed with white; 1 and 1 leave it."""
+    """The color darkened by `scale`, then mixed with white; 1 and 1 leave it."""
     red, green, blue = (1 - tone * (1 - scale * part) for part in to_rgb(color))
     return red, green, blue
 
@@ -83,7 +83,7 @@ def plot_block_stats(
     for group_rows, caption in zip(rows, captions, strict=True):
         y = group_rows[0] - 0.95
         panels[0].text(0, y, caption, va="center", fontsize=size, fontweight="bold", color=INK)
-    draw_titles(figure, pluralize(len(blocks), "block"), note, "colours and numbers are those of the map of blocks")
+    draw_titles(figure, pluralize(len(blocks), "block"), note, "colors and numbers are those of the map of blocks")
     write_png(figure, file)
 
 

@@ -1,8 +1,8 @@
 """Detail from the photographs for an orthophoto: each pixel's place looked up in the pictures that see it best.
 
-Colours from afar (low frequencies) stay those of the scene, which knows no seams between exposures; what is finer
+Colors from afar (low frequencies) stay those of the scene, which knows no seams between exposures; what is finer
 than `_BLUR_PX` comes from the photographs, through the depth of the map. A photograph counts where it truly sees the
-place: the scene as that photograph shows it is no nearer, and not of quite another colour. What a pixel gets depends on
+place: the scene as that photograph shows it is no nearer, and not of quite another color. What a pixel gets depends on
 its place and on pixels up to `HALO_PX` away, and on no tile: tiles that are drawn with such a halo show no borders.
 """
 
@@ -73,7 +73,7 @@ class DetailTransfer:
     def detail(
         self, points: Float[np.ndarray, "n 3"], colors: Float[np.ndarray, "h w 3"], shown: Bool[np.ndarray, "h w"]
     ) -> Float[np.ndarray, "h w 3"]:
-        """What the photographs add to the colours. `points`: the places of the pixels that are shown."""
+        """What the photographs add to the colors. `points`: the places of the pixels that are shown."""
         light, weight = np.zeros((len(points), 3), np.float32), np.zeros(len(points), np.float32)
         agreed = np.zeros(len(points), np.float32)
         drawn = colors[shown]
@@ -113,7 +113,7 @@ class DetailTransfer:
     def _sample_view(
         self, index: int, points: Float[np.ndarray, "n 3"], min_trust: Float[np.ndarray, " n"]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Rows of the points that a photograph truly sees and is trusted at more than `min_trust`, their colours [m, 3]
+        """Rows of the points that a photograph truly sees and is trusted at more than `min_trust`, their colors [m, 3]
         in [0, 1], and the trust above it [m]."""
         camera = self._views[index].camera
         trust = _trust(camera, points) - min_trust
@@ -168,7 +168,7 @@ def _blurred(values: Float[np.ndarray, "h w ..."]) -> Float[np.ndarray, "h w ...
 
 
 def _sample_image(image: np.ndarray, at: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
-    """Colours in [0, 1] between the pixels of an image, cubic."""
+    """Colors in [0, 1] between the pixels of an image, cubic."""
     side = 1 << 14
     padded = np.zeros((-(-max(len(at), 1) // side) * side, 2), np.float32)
     padded[: len(at)] = at

@@ -1,4 +1,4 @@
-"""GeoTIFF files: written tile by tile, then rewritten as cloud-optimised ones with overviews."""
+"""GeoTIFF files: written tile by tile, then rewritten as cloud-optimized ones with overviews."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def write_tile(stream: Any, column: int, row: int, values: np.ndarray) -> None:
 
 
 def write_cog(source: Path, file: Path, layer: RasterLayer) -> None:
-    """Rewrite a GeoTIFF as a cloud-optimised one: overviews, DEFLATE with a predictor.
+    """Rewrite a GeoTIFF as a cloud-optimized one: overviews, DEFLATE with a predictor.
 
     Raises OSError where the result is not what was written: GDAL closes files without a word when a disk is full.
     """

@@ -53,7 +53,7 @@ def hillshade(heights: Float[np.ndarray, "h w"], pixel_size: float) -> Float[np.
 
 
 def write_hillshade(dsm: Path, file: Path, grid: PixelGrid) -> None:
-    """Grey relief with transparent holes, at most `MAX_IMAGE_PX` long."""
+    """Gray relief with transparent holes, at most `MAX_IMAGE_PX` long."""
     heights, factor = _heights(dsm, MAX_IMAGE_PX)
     light = hillshade(heights, grid.gsd * factor)
     shown = np.isfinite(light)

@@ -121,7 +121,7 @@ def raster_layers(placement: MapProjection) -> tuple[RasterLayer, RasterLayer, R
     return (
         RasterLayer(
             name=ORTHOPHOTO_FILE,
-            title="orthophoto: colours seen from straight above",
+            title="orthophoto: colors seen from straight above",
             bands=("red", "green", "blue", "alpha"),
             dtype="uint8",
             overviews="average",

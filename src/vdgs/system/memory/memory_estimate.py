@@ -17,7 +17,7 @@ TrainingKind = Literal["coarse", "block"]
 
 #: A process of vdgs with everything imported.
 PROCESS_BYTES = 350_000_000
-#: The picture being trained on: itself, its gradient, its target, what the rasteriser notes, the next ones in advance.
+#: The picture being trained on: itself, its gradient, its target, what the rasterizer notes, the next ones in advance.
 TRAIN_BYTES_PER_PIXEL = 150
 #: What a step makes of an anchor in view, for each of its Gaussians (measured with ten: 1.55 kB an anchor).
 STEP_BYTES_PER_OFFSET = 155

@@ -1,4 +1,4 @@
-// Memory that is not initialised, is aligned for SIMD, and is kept for the next use.
+// Memory that is not initialized, is aligned for SIMD, and is kept for the next use.
 #pragma once
 
 #include <cstddef>

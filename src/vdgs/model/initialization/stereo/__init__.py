@@ -1,7 +1,7 @@
 """Dense stereo before training: anchors may start where photographs agree on the depth of the ground.
 
 Structure-from-motion leaves few points where few photographs look, and two or three photographs fit any surface, so
-that anchors which start at a wrong height stay there. Stereo needs two photographs, and assumes that neighbouring
+that anchors which start at a wrong height stay there. Stereo needs two photographs, and assumes that neighboring
 pixels mostly lie on one surface. No GPU or network is needed; the result is the same for any number of threads.
 
     select_source_views(cameras, points)  the photographs that each one is compared with

@@ -45,7 +45,7 @@ MIN_SPACING = 0.7
 #: A pixel counts where at least one partner agrees on its depth, and at least this share of those that hold the place:
 #: one among many agrees by chance. Not more, for some of them do not see it.
 MIN_AGREEING_FRACTION = 0.25
-#: Grey photographs that are held at a time.
+#: Gray photographs that are held at a time.
 MAX_CACHED_VIEWS = 256
 #: Cells of photographs that are held at a time at least, before they are added up (72 bytes each).
 MERGE_BATCH = 2**20
@@ -78,7 +78,7 @@ class FusionCell(NamedTuple):
 
 
 class DensePoints(NamedTuple):
-    """Points [m, 3] float64 and their colours [m, 3] uint8."""
+    """Points [m, 3] float64 and their colors [m, 3] uint8."""
 
     points: Float[np.ndarray, "m 3"]
     colors: UInt8[np.ndarray, "m 3"]
@@ -87,7 +87,7 @@ class DensePoints(NamedTuple):
 @dataclass(frozen=True, eq=False)
 class _Cells:
     """Cells by their keys [c], which begin with the number of their size, and sums over the pixels that lie in them
-    [c, 8]: position, colour, 1, and the area that a pixel covers there."""
+    [c, 8]: position, color, 1, and the area that a pixel covers there."""
 
     keys: Int64[np.ndarray, " c"]
     sums: Float[np.ndarray, "c 8"]
@@ -164,7 +164,7 @@ def _matched_size(camera: Camera) -> Camera:
 
 
 def _view(inputs: StereoInputs, groups: SpatialGroups, camera: Camera, index: int) -> StereoView:
-    """A photograph grey, at the size at which it is matched."""
+    """A photograph gray, at the size at which it is matched."""
     picture, _ = inputs.read_image(index)
     small = camera.width < picture.shape[1]
     gray = cv2.resize(

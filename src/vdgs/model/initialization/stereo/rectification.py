@@ -71,7 +71,7 @@ class RectifiedPair:
         matrix = np.array([[self.focal, 0, self.columns[which]], [0, self.focal, self.row], [0, 0, 1.0]])
         turn = camera.camera_from_world[:3, :3] @ self.rotation.T
         homography = _intrinsics(camera) @ turn @ np.linalg.inv(matrix)
-        center = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # index 0 is the pixel whose centre is at 0.5
+        center = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # index 0 is the pixel whose center is at 0.5
         return np.linalg.inv(center) @ homography @ center
 
     def disparity(self, depth: float) -> float:

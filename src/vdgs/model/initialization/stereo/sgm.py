@@ -19,7 +19,7 @@ WINDOW = 5
 MAX_DISPARITIES = 256
 #: Per cent by which the best match must beat the second: water and sky match anything.
 UNIQUENESS_RATIO = 5
-#: Where grey values about a pixel, in a window of so many, deviate by less there is nothing to match (of 255; choice).
+#: Where gray values about a pixel, in a window of so many, deviate by less there is nothing to match (of 255; choice).
 MIN_CONTRAST, CONTRAST_WINDOW = 2.0, 11
 #: Two depths agree when they differ by less than this share.
 MAX_RELATIVE_DIFFERENCE = 0.01
@@ -27,7 +27,7 @@ MAX_RELATIVE_DIFFERENCE = 0.01
 
 @dataclass(frozen=True, eq=False)
 class StereoView:
-    """A photograph as it is matched: grey, at its camera's size, and the depths between which its ground lies."""
+    """A photograph as it is matched: gray, at its camera's size, and the depths between which its ground lies."""
 
     camera: Camera
     gray: UInt8[np.ndarray, "h w"]
