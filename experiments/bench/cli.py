@@ -47,9 +47,9 @@ class BenchArguments:
     same settings, seeds and scenes are taken from there and not trained, and the table says where each is from."""
     data: Path | None = None
     """Folder that holds the scenes with names which are not generated: residence-pixsfm, copr, ..."""
-    scale_iterations: Annotated[float, Range(0, 1000, exclusive_min=True)] = 1.0
+    steps_scaler: Annotated[float, Range(0, 1000, exclusive_min=True)] = 1.0
     """Factor on the iterations of every scene."""
-    iterations_total: Annotated[int | None, Range(1, MAX_COUNT)] = None
+    total_iterations: Annotated[int | None, Range(1, MAX_COUNT)] = None
     """Iterations that every method may spend on a scene, shared out as the scene's own; overrides the factor."""
     max_anchors: Annotated[int, Range(0, MAX_COUNT)] = 0
     """No growth beyond this many anchors, of the scene or of all blocks together; 0 for no limit."""
@@ -73,7 +73,7 @@ def bench_command(arguments: list[str]) -> None:
     from experiments.bench.plan import PlanOptions
 
     options = PlanOptions(
-        args.seeds, args.scenes, args.methods, args.scale_iterations, args.iterations_total, args.max_anchors,
+        args.seeds, args.scenes, args.methods, args.steps_scaler, args.total_iterations, args.max_anchors,
         args.options.validation, args.renders, replace(args.options, validation=False),
     )  # fmt: skip
     run_bench(

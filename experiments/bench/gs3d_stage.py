@@ -22,7 +22,7 @@ def gs3d_config(method: MethodConfig) -> Gs3dConfig:
     Gaussians at most as that may decode from its anchors. Everything else is as published, its schedule in proportion
     to the iterations."""
     training = method.training
-    most = training.densify.max_anchors * training.anchors.num_offsets
+    most = training.densify.max_anchors * training.model.num_offsets
     published = Gs3dConfig(seed=training.seed, background=training.loss.background)
     return scale_schedule(training.iterations, published, most)
 

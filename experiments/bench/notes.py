@@ -83,7 +83,7 @@ def _fairness(plan: BenchPlan) -> str:
 
 def _limit(plan: BenchPlan) -> str:
     """--max-anchors, for methods with anchors and for 3DGS."""
-    per_anchor = plan.runs[0].config.training.anchors.num_offsets
+    per_anchor = plan.runs[0].config.training.model.num_offsets
     return (
         f"At most {plan.max_anchors:,} anchors for a whole scene, or as many as it starts with (a block may grow to "
         "its share, in proportion to the coarse anchors it owns; nothing is removed to keep to it); for 3DGS "

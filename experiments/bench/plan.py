@@ -30,8 +30,8 @@ class PlanOptions:
     seeds: int | None = None
     scenes: tuple[str, ...] = ()
     methods: tuple[str, ...] = ()
-    scale_iterations: float = 1.0
-    iterations_total: int | None = None
+    steps_scaler: float = 1.0
+    total_iterations: int | None = None
     max_anchors: int = 0
     validation: bool = False
     #: NAME=FOLDER of renders by other programs.
@@ -169,11 +169,11 @@ def _method(name: str) -> BenchMethod:
 
 
 def _budget(scene: BenchScene, options: PlanOptions) -> Budget:
-    factor = options.scale_iterations
-    if options.iterations_total is not None:
-        factor = options.iterations_total / scene.budget.total
+    factor = options.steps_scaler
+    if options.total_iterations is not None:
+        factor = options.total_iterations / scene.budget.total
     if factor <= 0:
-        raise VdgsError("--scale-iterations and --iterations-total must be positive")
+        raise VdgsError("--steps-scaler and --total-iterations must be positive")
     return scene.budget.scaled(factor)
 
 

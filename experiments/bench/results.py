@@ -121,7 +121,7 @@ def _sizes(metrics: Mapping[str, Any], planned: PlannedRun) -> dict[str, float |
     """Anchors, where the model has them, and Gaussians: those of an explicit model, or at most as many as the anchors
     decode to (those without opacity are not drawn)."""
     anchors, explicit = metrics.get("n_anchors"), metrics.get("n_gaussians")
-    decoded = None if anchors is None else anchors * planned.config.training.anchors.num_offsets
+    decoded = None if anchors is None else anchors * planned.config.training.model.num_offsets
     return {"anchors": anchors, "gaussians": decoded if explicit is None else explicit}
 
 

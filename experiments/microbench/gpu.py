@@ -75,7 +75,7 @@ FULL = Sizes(
     ("--size", "village"), 1500,
 )  # fmt: skip
 SMALL = Sizes(
-    (60, 40, 32), ((60, 40, 32),), 1, 60, ("--size", "toy", "--images", "6", "--width", "48", "--height", "36"), 8
+    (60, 40, 32), ((60, 40, 32),), 1, 60, ("--size", "toy", "--num-images", "6", "--width", "48", "--height", "36"), 8
 )
 
 

@@ -259,7 +259,7 @@ def test_points_that_are_remembered_lie_all_over_a_photograph():
     assert (shares > 0.6 * MAX_OBSERVATIONS / 4).all()
 
 
-SETTINGS = ("--preset", "laptop", "--iterations", "20", "--anchors.num-offsets", "3", "--up", "z")
+SETTINGS = ("--preset", "laptop", "--iterations", "20", "--model.num-offsets", "3", "--up", "z")
 
 
 @pytest.mark.parametrize(
@@ -283,6 +283,6 @@ def test_exposures_are_fitted_where_photographs_differ(
     assert said in " ".join(done.stdout.split())
     model = AnchorModel.load(run / "coarse/model.safetensors")
     assert (model.decoder.exposure is not None) == fitted
-    begun = json.loads((run / "coarse/start.json").read_text())
+    begun = json.loads((run / "coarse/initialization.json").read_text())
     assert begun["exposures"] == fitted
     assert (begun["brightness_differs"] is not None) == tracks

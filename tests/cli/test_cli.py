@@ -205,7 +205,7 @@ def test_more_folders_of_photographs_are_used_wherever_they_stand():
 def test_values_are_read_as_their_types_say():
     words = [
         "C", "-o", "R", "--up", "-x", "--resolution-schedule", "0", "4", "0.5", "1", "--lr.offsets", "1e-2", "1e-4",
-        "--blocks", "auto", "--max_images", "None", "--anchors.no-mvs", "--sfm.check-points", "a", "b",
+        "--blocks", "auto", "--max_images", "None", "--init.no-mvs", "--sfm.check-points", "a", "b",
         "--slurm.sbatch-args", "--qos=long", "--exclusive", "--seed=3",
     ]  # fmt: skip
     given = parse_words(RunArguments, words).over()
@@ -213,7 +213,7 @@ def test_values_are_read_as_their_types_say():
     assert given.training.resolution_schedule == ((0.0, 4), (0.5, 1))
     assert given.training.lr.offsets == (0.01, 1e-4)
     assert (given.partition.blocks, given.options.max_images, given.training.seed) == ("auto", None, 3)
-    assert given.training.anchors.mvs is False
+    assert given.training.init.mvs is False
     assert given.sfm.check_points == ("a", "b")
     assert given.executor_options.slurm.sbatch_args == ("--qos=long", "--exclusive")
     files = parse_words(

@@ -24,7 +24,7 @@ from vdgs.config.ranges import NumericSetting, Range, check_ranges, find_range_e
 from vdgs.config.serialization import from_dict, to_dict
 from vdgs.config.validation_rules import validate_config
 from vdgs.errors import VdgsError
-from vdgs.synth.options import SynthOptions
+from vdgs.synth.synth_options import SynthOptions
 
 HERE = Path("here")
 ARGUMENTS: tuple[Any, ...] = (
@@ -93,8 +93,8 @@ def test_each_number_out_of_range_is_named_as_the_command_line_names_it():
     ]
     with pytest.raises(VdgsError, match=r"--downscale 0\.5: must be at least 1"):
         check_ranges(CaptureOptions(downscale=0.5))
-    with pytest.raises(VdgsError, match=r"(?s)--images 1: .*--overlap nan: "):
-        SynthOptions(images=1, overlap=math.nan).resolved()
+    with pytest.raises(VdgsError, match=r"(?s)--num-images 1: .*--overlap nan: "):
+        SynthOptions(num_images=1, overlap=math.nan).resolved()
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ def test_the_command_line_says_so_at_once(arguments, tmp_path, monkeypatch, caps
         ({"training": {"iterations": "many"}}, r"training\.iterations is 'many'; it must be a whole number"),
         ({"training": {"iterations": 1.5}}, "must be a whole number"),
         ({"training": {"lr": {"offsets": [1]}}}, "must be a list of 2: a number, a number"),
-        ({"training": {"anchors": 3}}, "not a group of settings"),
+        ({"training": {"model": 3}}, "not a group of settings"),
         ({"partition": {"blocks": "most"}}, "must be a whole number or auto"),
         ({"partition": {"balanced": 1}}, "must be true or false"),
         ({"block": {"margin": "frozn"}}, "must be frozen or ramp or free"),

@@ -25,12 +25,12 @@ from vdgs.geometry.camera import Camera
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("bench")]
 
-SMALL = ("--methods", "baseline", "full", "--scale-iterations", "0.1", "--jobs", "2")
+SMALL = ("--methods", "baseline", "full", "--steps-scaler", "0.1", "--jobs", "2")
 
 
 def settings(output: Path, scale: float = 0.1) -> BenchSettings:
     """The same in this process."""
-    return BenchSettings("toy", output, PlanOptions(methods=("baseline", "full"), scale_iterations=scale), jobs=2)
+    return BenchSettings("toy", output, PlanOptions(methods=("baseline", "full"), steps_scaler=scale), jobs=2)
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.xdist_group("bench_cached_results")
 
 
 def asked(data: Path, output: Path, seeds: int = 1, known: tuple[Path, ...] = (), total: int = 40) -> BenchSettings:
-    choices = PlanOptions(seeds, ("copr",), ("coarse", "baseline"), iterations_total=total, max_anchors=300)
+    choices = PlanOptions(seeds, ("copr",), ("coarse", "baseline"), total_iterations=total, max_anchors=300)
     return BenchSettings("table2", output, choices, data, reuse_results=known)
 
 

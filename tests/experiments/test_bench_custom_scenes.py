@@ -117,7 +117,7 @@ def test_what_cannot_be_held_out_is_refused_too(tmp_path):
 
 def benched(folder: Path, output: Path) -> list[BenchResult]:
     choices = PlanOptions(
-        scenes=(str(folder),), seeds=1, methods=("baseline",), iterations_total=24, options=CaptureOptions(downscale=2)
+        scenes=(str(folder),), seeds=1, methods=("baseline",), total_iterations=24, options=CaptureOptions(downscale=2)
     )
     return run_bench(BenchSettings("table2", output, choices), Console(file=io.StringIO()))
 

@@ -34,8 +34,8 @@ def data(tmp_path_factory) -> Path:
     pytest.importorskip("embreex")
     folder = tmp_path_factory.mktemp("data")
     options = SynthOptions(
-        size="toy", images=15, test_images=3, validation_images=0, width=WIDTH, height=HEIGHT, samples_per_pixel=1,
-        points=800, extent_m=60.0,
+        size="toy", num_images=15, num_test_images=3, num_validation_images=0, width=WIDTH, height=HEIGHT,
+        samples_per_pixel=1, num_points=800, extent_m=60.0,
     )  # fmt: skip
     generate(folder / "town", options)
     town = load_capture(folder / "town")
@@ -55,7 +55,7 @@ def data(tmp_path_factory) -> Path:
 
 def test_the_published_data_sets_are_benched(data, tmp_path):
     """Their folders are found and read, methods run with the paper's settings, and pixels are grouped by V."""
-    asked = ("--scenes", "residence", "block-all", "--methods", "3dgs", "blocks-2", "--iterations-total", "40")
+    asked = ("--scenes", "residence", "block-all", "--methods", "3dgs", "blocks-2", "--total-iterations", "40")
     done = vdgs("bench", "table1", "--output", tmp_path, "--data", data, *asked, "--seeds", "1", prepare=do_tasks_here)
     assert done.returncode == 0, done.stderr
     results = json.loads((tmp_path / "table1" / "results.json").read_text())["results"]

@@ -148,7 +148,7 @@ def test_default_and_paper_restart_the_coarse_stage_and_paper_leaves_our_choices
     assert ours == {
         "assignment.always_best", "assignment.min_cameras", "assignment.mode", "block.random_background",
         "block.compensation.target", "block.compensation.min_draws", "block.draw_outside", "training.optimizer",
-        "training.anchors.bound_scales", "training.anchors.fill_gaps", "training.anchors.outlier_distance",
+        "training.model.bound_scales", "training.init.fill_gaps", "training.init.outlier_distance",
         "training.loss.background", "training.loss.random_background",
     }  # fmt: skip
     assert not validate_config(paper)
@@ -200,17 +200,17 @@ def test_a_shared_coarse_stage_does_not_depend_on_the_methods_asked_for():
 
 
 def test_choices_change_the_budget_for_all_alike():
-    plan = make_plan("table2", PlanOptions(scenes=("tiny",), seeds=2, iterations_total=1200, max_anchors=1000))
+    plan = make_plan("table2", PlanOptions(scenes=("tiny",), seeds=2, total_iterations=1200, max_anchors=1000))
     assert plan.budgets["tiny"] == Budget(600, 2, 300)
     assert plan.seeds == (0, 1)
     full = plan.run_of["tiny", "full", 1].config
-    # Growth starts later in proportion, as block.scale_iterations does it.
+    # Growth starts later in proportion, as block.steps_scaler does it.
     assert (full.training.densify.start, full.block.densify.start) == (200, 100)
     for method in ("full", "no-blocking", "printed"):  # whatever the number of blocks
         config = plan.run_of["tiny", method, 1].config
         assert (config.training.densify.max_anchors, config.block.max_anchors_total) == (1000, 1000)
     for wrong in (PlanOptions(scenes=("nowhere",)), PlanOptions(methods=("magic",)), PlanOptions(seeds=0),
-                  PlanOptions(scale_iterations=0.0)):  # fmt: skip
+                  PlanOptions(steps_scaler=0.0)):  # fmt: skip
         with pytest.raises(VdgsError):
             make_plan("table2", wrong)
 

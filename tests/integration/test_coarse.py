@@ -32,7 +32,7 @@ SETTINGS = (
     "200",
     "--save-every",
     "10",
-    "--anchors.num-offsets",
+    "--model.num-offsets",
     "3",
     "--up",
     "z",

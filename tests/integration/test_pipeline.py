@@ -295,7 +295,7 @@ def test_stages_need_those_before_them(capture, tmp_path):
         "laptop",
         "--iterations",
         "30",
-        "--anchors.num-offsets",
+        "--model.num-offsets",
         "3",
     )
     assert done.returncode == 0, done.stderr

@@ -285,7 +285,7 @@ def test_a_block_by_memory_takes_at_most_that_in_training(
     method = PRESETS[preset]
     growth = replace(method.block.densify, max_anchors=limits.get("max_anchors", 0))
     block = replace(method.block, densify=growth, max_anchors_total=limits.get("max_anchors_total", 0))
-    training = replace(method.training, anchors=replace(method.training.anchors, num_offsets=offsets))
+    training = replace(method.training, model=replace(method.training.model, num_offsets=offsets))
     partition = PartitionConfig(blocks="auto", block_memory_gb=gb)
     method = MethodConfig(training, partition, method.assignment, block)
     count = choose_block_count(anchors, 50_000, pixels, method)

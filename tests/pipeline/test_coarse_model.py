@@ -16,7 +16,7 @@ from vdgs.captures.capture import Capture
 from vdgs.captures.capture_metadata import capture_metadata
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.executor_options import CheckpointOptions
-from vdgs.config.method import AnchorConfig, DensifyConfig, MethodConfig, TrainConfig
+from vdgs.config.method import DensifyConfig, InitConfig, MethodConfig, ModelConfig, TrainConfig
 from vdgs.errors import RunError
 from vdgs.model.anchor_model import AnchorModel, ModelMetadata
 from vdgs.pipeline.count_visibility import count_run_visibility
@@ -37,7 +37,13 @@ LAST = DensifyConfig(
     every=20, stats_start=0, start=20, num_levels=0, prune_opacity=1e6, prune_view_fraction=0.0, stop_fraction=1.0
 )  # fmt: skip
 METHOD = MethodConfig(
-    TrainConfig(iterations=20, anchors=AnchorConfig(num_offsets=2, fill_gaps=False), densify=LAST, swa_fraction=0.0)
+    TrainConfig(
+        iterations=20,
+        model=ModelConfig(num_offsets=2),
+        init=InitConfig(fill_gaps=False),
+        densify=LAST,
+        swa_fraction=0.0,
+    )
 )
 
 

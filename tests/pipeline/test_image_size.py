@@ -185,4 +185,4 @@ def test_a_request_to_stop_ends_the_probe_of_stereo(capture, monkeypatch):
 
     monkeypatch.setattr(time_estimate, "compute_dense_points", stopped)
     with pytest.raises(Interrupted):
-        time_estimate.time_stereo(load_capture(capture), SimpleNamespace(), PRESETS["laptop"].training.anchors)
+        time_estimate.time_stereo(load_capture(capture), SimpleNamespace(), PRESETS["laptop"].training.init)

@@ -14,7 +14,7 @@ from vdgs.cli.main import main
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RenderRequest
 from vdgs.config.executor_options import CheckpointOptions
-from vdgs.config.method import AnchorConfig, MethodConfig, TrainConfig
+from vdgs.config.method import MethodConfig, ModelConfig, TrainConfig
 from vdgs.errors import CaptureError, RunError, VdgsError
 from vdgs.pipeline.train_coarse import train_coarse
 from vdgs.rendering.render_run import render_run
@@ -25,7 +25,7 @@ from vdgs.runs.run_folder import RunFolder
 
 pytestmark = pytest.mark.xdist_group("moved_capture")
 
-METHOD = MethodConfig(TrainConfig(iterations=3, anchors=AnchorConfig(num_offsets=2)))
+METHOD = MethodConfig(TrainConfig(iterations=3, model=ModelConfig(num_offsets=2)))
 UP = CaptureOptions(up="z")
 QUIET = Console(quiet=True)
 

@@ -24,7 +24,7 @@ from vdgs.runs.run_folder import RunFolder
 pytestmark = [pytest.mark.xdist_group("report"), pytest.mark.slow]
 
 VOID = {"meta", "img", "br", "link", "hr", "input"}
-FILES = ("coarse/start.json",
+FILES = ("coarse/initialization.json",
          "coarse/log.jsonl", "coarse/evaluation/metrics.json", "visibility/visibility.json", "partition/partition.json",
          "blocks/00/log.jsonl", "blocks/01/status.json", "merged/status.json", "evaluation/metrics.json",
          "evaluation/per_view.json", "evaluation/by_block.json", "config.yaml", "capture.json")  # fmt: skip
@@ -117,7 +117,7 @@ def coarse_run(root: Path, name: str = "meadow") -> RunFolder:
               "peak_memory_bytes": 500_000_000, "psnr_training": 24.0}  # fmt: skip
     write(root / "coarse/status.json", status)
     start = {"sparse_points": 2000, "dense_points": 12_757, "brightness_differs": 0.029, "exposures": True}
-    write(root / "coarse/start.json", start)
+    write(root / "coarse/initialization.json", start)
     write(root / "coarse/log.jsonl", log(400))
     write(root / "coarse/evaluation/metrics.json", metrics(27.125, "coarse"))
     write(root / "coarse/evaluation/per_view.json", views(27.0))
@@ -310,11 +310,11 @@ def test_the_report_tells_what_training_began_with(tmp_path):
     assert "starts from 2,000 sparse points and 12,757 that stereo found" in Page(write_report(run)).text()
     assert "differ in brightness by 2.9 %. Each has an exposure" in Page(write_report(run)).text()
     alike = {"sparse_points": 90, "dense_points": None, "brightness_differs": 0.004, "exposures": False}
-    write(run.path / "coarse/start.json", alike)
+    write(run.path / "coarse/initialization.json", alike)
     text = Page(write_report(run)).text()
     assert "starts from 90 sparse points." in text
     assert "differ in brightness by 0.4 %. None has an exposure" in text
-    (run.path / "coarse/start.json").unlink()  # of a version before
+    (run.path / "coarse/initialization.json").unlink()  # of a version before
     assert "It starts from" not in Page(write_report(run)).text()
 
 

@@ -24,7 +24,7 @@ from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
 
 SETTINGS = (
-    "--preset", "laptop", "--iterations", "12", "--anchors.num-offsets", "2", "--densify.start", "50", "--no-ortho",
+    "--preset", "laptop", "--iterations", "12", "--model.num-offsets", "2", "--densify.start", "50", "--no-ortho",
     "--blocks", "2", "--assignment.min-cameras", "4", "--block.iterations", "6", "--quiet",
 )  # fmt: skip
 

@@ -14,12 +14,10 @@ from vdgs.runs.stage_keys import stage_keys
 PLAIN = MethodConfig()
 CHANGED = {
     "adam": replace(PLAIN, training=replace(PLAIN.training, optimizer="adam")),
-    "stereo": replace(PLAIN, training=replace(PLAIN.training, anchors=replace(PLAIN.training.anchors, mvs=True))),
+    "stereo": replace(PLAIN, training=replace(PLAIN.training, init=replace(PLAIN.training.init, mvs=True))),
     "exposure": replace(PLAIN, training=replace(PLAIN.training, exposure_compensation=True)),
     "spread": replace(PLAIN, training=replace(PLAIN.training, exposure_compensation=True, exposure_min_spread=0.1)),
-    "bound": replace(
-        PLAIN, training=replace(PLAIN.training, anchors=replace(PLAIN.training.anchors, bound_scales=False))
-    ),
+    "bound": replace(PLAIN, training=replace(PLAIN.training, model=replace(PLAIN.training.model, bound_scales=False))),
 }
 
 

@@ -42,7 +42,7 @@ def benched(
 ) -> dict[str, BenchResult]:
     """Table I of that scene with these methods, one seed."""
     options = PlanOptions(
-        seeds=1, scenes=("copr",), methods=methods, iterations_total=total, max_anchors=300, renders=renders
+        seeds=1, scenes=("copr",), methods=methods, total_iterations=total, max_anchors=300, renders=renders
     )
     settings = BenchSettings("table1", output, options, data, overwrite=overwrite)
     return {each.method: each for each in run_bench(settings, Console(file=io.StringIO()))}

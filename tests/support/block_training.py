@@ -9,7 +9,7 @@ import shapely
 import torch
 
 from support.checkerboard import Photographs
-from vdgs.config.method import AnchorConfig, BlockConfig, CompensationConfig, DensifyConfig, TrainConfig
+from vdgs.config.method import BlockConfig, CompensationConfig, DensifyConfig, InitConfig, ModelConfig, TrainConfig
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
 from vdgs.model.initialization.initialize import initialize_anchors
@@ -19,7 +19,7 @@ from vdgs.training import FrozenAnchors, TrainingProblem, TrainingState, initial
 
 CONFIG = TrainConfig(
     iterations=40,
-    anchors=AnchorConfig(num_offsets=4),
+    model=ModelConfig(num_offsets=4),
     densify=DensifyConfig(
         every=10,
         stats_start=0,
@@ -43,9 +43,7 @@ BLOCKS = Blocks(
 def coarse() -> tuple[Anchors, Decoder]:
     x, y = np.meshgrid(np.arange(-3.9, 4, 0.4), np.arange(-3.1, 3.2, 0.4))
     points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
-    anchors, _ = initialize_anchors(
-        points, np.zeros((x.size, 3), np.uint8), [], AnchorConfig(num_offsets=4, voxel_size=0.4)
-    )
+    anchors, _ = initialize_anchors(points, np.zeros((x.size, 3), np.uint8), [], InitConfig(voxel_size=0.4), 4)
     generator = torch.Generator().manual_seed(0)
     anchors = replace(
         anchors,

@@ -23,7 +23,7 @@ COARSE = (
     "laptop",
     "--iterations",
     "60",
-    "--anchors.num-offsets",
+    "--model.num-offsets",
     "3",
     "--densify.num-levels",
     "0",

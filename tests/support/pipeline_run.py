@@ -17,7 +17,7 @@ SETTINGS = (
     str(ITERATIONS),
     "--save-every",
     "20",
-    "--anchors.num-offsets",
+    "--model.num-offsets",
     "3",
     "--densify.start",
     "50",

@@ -14,7 +14,7 @@ from vdgs.cli.main import main
 
 #: As few and as small as lets anchors grow, blocks train and PSNR say something.
 SETTINGS = (
-    "--preset", "laptop", "--iterations", "40", "--anchors.num-offsets", "2", "--anchors.voxel-size", "0.8",
+    "--preset", "laptop", "--iterations", "40", "--model.num-offsets", "2", "--init.voxel-size", "0.8",
     "--lr.features", "0.03", "0.03", "--densify.start", "10", "--densify.stats-start", "0",
     "--densify.min-draw-fraction", "0.05", "--densify.every", "10", "--densify.max-anchors", "200",
 )  # fmt: skip

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from support.checkerboard import Photographs
-from vdgs.config.method import AnchorConfig, DensifyConfig, TrainConfig
+from vdgs.config.method import DensifyConfig, ModelConfig, TrainConfig
 from vdgs.model.decoder import Decoder
 from vdgs.model.initialization.initialize import initialize_anchors
 from vdgs.training import TrainingProblem, initial_state, to_checkpoint, train
@@ -19,7 +19,7 @@ BLACK = (0.0, 0.0, 0.0)
 CONFIG = TrainConfig(
     iterations=60,
     resolution_schedule=((0.0, 2), (0.5, 1)),
-    anchors=AnchorConfig(num_offsets=4, appearance_dim=3),
+    model=ModelConfig(num_offsets=4, appearance_dim=3),
     densify=DensifyConfig(
         every=10, stats_start=5, start=20, stop_fraction=0.9, grad_threshold=1e-6, min_draw_fraction=0.05
     ),
@@ -34,10 +34,14 @@ def start(config: TrainConfig = CONFIG):
     rng = np.random.default_rng(0)
     points = np.concatenate([rng.uniform(-4, 4, (300, 2)), np.zeros((300, 1))], axis=1)
     anchors, _ = initialize_anchors(
-        points, np.full((300, 3), 128, np.uint8), Photographs().cameras, replace(config.anchors, voxel_size=0.4)
+        points,
+        np.full((300, 3), 128, np.uint8),
+        Photographs().cameras,
+        replace(config.init, voxel_size=0.4),
+        config.model.num_offsets,
     )
     generator = torch.Generator().manual_seed(config.seed)
-    decoder = Decoder.init_random(config.anchors.num_offsets, False, config.anchors.appearance_dim, 8, generator)
+    decoder = Decoder.init_random(config.model.num_offsets, False, config.model.appearance_dim, 8, generator)
     return initial_state(anchors, decoder, stage(config))
 
 

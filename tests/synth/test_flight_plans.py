@@ -18,9 +18,9 @@ from vdgs.errors import VdgsError
 from vdgs.synth import SynthOptions, generate
 from vdgs.synth.flight_cameras import make_camera, make_flight_cameras, make_test_cameras
 from vdgs.synth.mesh import Material, MeshBuilder
-from vdgs.synth.options import ResolvedOptions
 from vdgs.synth.perturbations import add_outliers, exposure_gains, perturb_cameras
 from vdgs.synth.ray_tracing import RayTracer
+from vdgs.synth.synth_options import ResolvedOptions
 from vdgs.synth.synthetic_points import SparseCloud
 from vdgs.synth.town import Town, build_town
 from vdgs.synth.true_visibility import (
@@ -34,7 +34,7 @@ from vdgs.synth.true_visibility import (
 pytestmark = [pytest.mark.xdist_group("synth_flights"), pytest.mark.slow]
 
 FLIGHTS = ("uneven", "even", "distant", "orbits", "corridor")
-TOY = SynthOptions(size="toy", width=64, height=48, samples_per_pixel=1, points=300, seed=1, truth=True)
+TOY = SynthOptions(size="toy", width=64, height=48, samples_per_pixel=1, num_points=300, seed=1, truth=True)
 
 
 @pytest.fixture(scope="module")
@@ -50,12 +50,12 @@ def tracer(town: Town) -> RayTracer:
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("toy") / "capture"
-    generate(folder, replace(TOY, exposure_stops=0.3, outliers=0.1, pose_noise_px=0.5))
+    generate(folder, replace(TOY, exposure_stops=0.3, outlier_fraction=0.1, pose_noise_px=0.5))
     return folder
 
 
 def options_of(flight: str, images: int = 60, **more: object) -> ResolvedOptions:
-    return replace(SynthOptions(images=images, **more), flight=flight).resolved()  # type: ignore[arg-type]
+    return replace(SynthOptions(num_images=images, **more), flight=flight).resolved()  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("flight", FLIGHTS)

@@ -29,8 +29,8 @@ from vdgs.synth.zones import LandUse
 pytestmark = pytest.mark.xdist_group("synth")
 
 TINY = SynthOptions(
-    seed=3, images=6, test_images=2, validation_images=1, width=96, height=72, extent_m=50.0, points=400,
-    noise_px=0.3, truth=True,
+    seed=3, num_images=6, num_test_images=2, num_validation_images=1, width=96, height=72, extent_m=50.0,
+    num_points=400, noise_px=0.3, truth=True,
 )  # fmt: skip
 
 
@@ -88,8 +88,8 @@ def test_points_reproject_to_within_the_noise(model: pycolmap.Reconstruction) ->
 def test_every_track_is_truly_seen(capture: Path, model: pycolmap.Reconstruction) -> None:
     with np.load(capture / "truth" / "points.npz", allow_pickle=False) as points:
         visibility = points["visibility"]
-    assert visibility.shape == (model.num_points3D(), TINY.images)
-    assert model.num_points3D() > 0.5 * TINY.points
+    assert visibility.shape == (model.num_points3D(), TINY.num_images)
+    assert model.num_points3D() > 0.5 * TINY.num_points
     for point_id, point in model.points3D.items():
         seen_by = [element.image_id - 1 for element in point.track.elements]
         assert len(set(seen_by)) == len(seen_by) >= 2
@@ -199,11 +199,11 @@ def test_a_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"images": 1},
+        {"num_images": 1},
         {"extent_m": 5.0},
         {"samples_per_pixel": 0},
         {"size": "hamlet"},
-        {"outliers": 0.9},
+        {"outlier_fraction": 0.9},
         {"overlap": 1.0},
     ],
 )
@@ -214,7 +214,7 @@ def test_options_that_make_no_capture_are_refused(wrong: dict, tmp_path: Path) -
 
 
 def test_options_import_no_numerics() -> None:
-    code = "import sys, vdgs.synth.options; sys.exit('numpy' in sys.modules or 'torch' in sys.modules)"
+    code = "import sys, vdgs.synth.synth_options; sys.exit('numpy' in sys.modules or 'torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

@@ -19,7 +19,7 @@ LOADED = """
 import importlib, signal, sys, threading
 from vdgs.system.stop_signals import catch_stop_signals
 with catch_stop_signals() as requests:
-    load = lambda: importlib.import_module("vdgs.system.colmap").pycolmap.Camera  # loaded at its first use
+    load = lambda: importlib.import_module("vdgs.system.lazy_pycolmap").pycolmap.Camera  # loaded at its first use
     if sys.argv[1] == "thread":
         thread = threading.Thread(target=load)
         thread.start()
@@ -96,7 +96,7 @@ def test_pycolmap_is_imported_in_one_place():
     package = Path(vdgs.__file__).parent
     direct = re.compile(r"^\s*(import|from) pycolmap", re.MULTILINE)
     found = [str(file.relative_to(package)) for file in package.rglob("*.py") if direct.search(file.read_text())]
-    assert found == ["system/colmap.py"]
+    assert found == ["system/lazy_pycolmap.py"]
 
 
 def test_a_request_that_the_inner_work_had_no_time_for_stops_the_outer():

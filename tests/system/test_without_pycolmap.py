@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from vdgs.system import colmap
 from vdgs.system.exit_codes import REMOVABLE_PACKAGES, exit_code_of
 
 IMPORT_ALL = """

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from support.checkerboard import Photographs
 from support.small_training import BLACK, CONFIG, bits, run, stage, start
-from vdgs.config.method import AnchorConfig, LearningRateConfig
+from vdgs.config.method import InitConfig, LearningRateConfig
 from vdgs.errors import TrainingDiverged, VdgsError
 from vdgs.kernels import cpu
 from vdgs.kernels.cpu.extension import get_num_threads, set_num_threads
@@ -249,7 +249,7 @@ def test_a_damaged_model_is_refused(unbroken, tmp_path, damage):
 def test_anchors_start_on_the_voxel_grid():
     points = np.array([[0.1, 0.0, 0.0], [0.2, 0.0, 0.0], [5.0, 5.0, 5.0]])
     colors = np.array([[255, 0, 0], [0, 0, 0], [0, 255, 0]], np.uint8)
-    anchors, voxel = initialize_anchors(points, colors, [], AnchorConfig(voxel_size=1.0, from_colors=True))
+    anchors, voxel = initialize_anchors(points, colors, [], InitConfig(voxel_size=1.0, from_colors=True), 10)
     assert voxel == 1.0
     assert anchors.positions.tolist() == [[0, 0, 0], [5, 5, 5]]
     torch.testing.assert_close(anchors.features[:, :3], torch.tensor([[0.0, -1, -1], [-1, 1, -1]]))
@@ -259,12 +259,12 @@ def test_points_far_from_all_others_start_no_anchor():
     ground = np.random.default_rng(0).uniform(-5, 5, (500, 3)) * [1, 1, 0.02]
     deep = np.array([[0.0, 0.0, -300.0], [0.1, 0.0, -300.0]])
     points, colors = np.concatenate([ground, deep]), np.zeros((502, 3), np.uint8)
-    kept, _ = initialize_anchors(points, colors, [], AnchorConfig(voxel_size=0.1))
+    kept, _ = initialize_anchors(points, colors, [], InitConfig(voxel_size=0.1), 10)
     assert float(kept.positions[:, 2].min()) > -1
-    everything, _ = initialize_anchors(points, colors, [], AnchorConfig(voxel_size=0.1, outlier_distance=0.0))
+    everything, _ = initialize_anchors(points, colors, [], InitConfig(voxel_size=0.1, outlier_distance=0.0), 10)
     assert float(everything.positions[:, 2].min()) == pytest.approx(-300)
 
 
 def test_one_distinct_point_is_too_few():
     with pytest.raises(VdgsError, match="distinct sparse point"):
-        initialize_anchors(np.zeros((4, 3)), np.zeros((4, 3), np.uint8), [], AnchorConfig())
+        initialize_anchors(np.zeros((4, 3)), np.zeros((4, 3), np.uint8), [], InitConfig(), 10)

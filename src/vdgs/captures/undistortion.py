@@ -71,7 +71,7 @@ def undistort(folder: Path, photographs: list[ImageFile]) -> list[ImageFile]:
 
 def undistorted_pinhole(intrinsics: Intrinsics) -> Intrinsics:
     """The pinhole camera whose picture holds no blank pixels (COLMAP's own choice of size and center)."""
-    from vdgs.system.colmap import pycolmap  # 60 MB of memory: only for lenses that need it
+    from vdgs.system.lazy_pycolmap import pycolmap  # 60 MB of memory: only for lenses that need it
 
     try:
         camera = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), _colmap(intrinsics))
@@ -143,7 +143,7 @@ def _write_straight(photo: ImageFile, grid: np.ndarray, target: Path, mask_targe
 
 
 def _colmap(intrinsics: Intrinsics) -> Any:
-    from vdgs.system.colmap import pycolmap
+    from vdgs.system.lazy_pycolmap import pycolmap
 
     return pycolmap.Camera(
         model=intrinsics.model,

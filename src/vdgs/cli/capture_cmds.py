@@ -14,7 +14,7 @@ from vdgs.config.output_paths import Output
 from vdgs.config.ranges import WORKER_COUNT, FlagName, Positional
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError
-from vdgs.synth.options import SynthOptions
+from vdgs.synth.synth_options import SynthOptions
 from vdgs.system.quoting import shell_line
 
 

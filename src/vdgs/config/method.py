@@ -21,11 +21,24 @@ FACTOR_RANGE = Range(0, 1000, exclusive_min=True)
 
 
 @dataclass(frozen=True, kw_only=True)
-class AnchorConfig:
+class ModelConfig:
     """The anchor model (Scaffold-GS, section III-B of the paper)."""
 
     num_offsets: Annotated[int, Range(1, 32)] = 10
     """Gaussians per anchor (k)."""
+    bound_scales: bool = True
+    """No Gaussian may be longer than a quarter of the images that train it, and the unit of an anchor's offsets is
+    bounded likewise: fewer floaters (choice)."""
+    view_distance: bool = False
+    """Feed the distance between camera and anchor to the decoder too."""
+    appearance_dim: Annotated[int, Range(0, 1024)] = 0
+    """Size of the appearance embedding of each training image (color only); 0 for none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class InitConfig:
+    """Where anchors start, and with which features."""
+
     voxel_size: Annotated[float, Range(0, MAX_FLOAT)] = 0.0
     """Edge of the initial voxel grid in units of the ground frame; 0 takes the median nearest-neighbor distance of the
     sparse points."""
@@ -37,13 +50,6 @@ class AnchorConfig:
     mvs: bool = False
     """Also start anchors at dense stereo points (semi-global matching): where few photographs look, sparse points are
     few, and anchors that start at a wrong height stay there (choice)."""
-    bound_scales: bool = True
-    """No Gaussian may be longer than a quarter of the images that train it, and the unit of an anchor's offsets is
-    bounded likewise: fewer floaters (choice)."""
-    view_distance: bool = False
-    """Feed the distance between camera and anchor to the decoder too."""
-    appearance_dim: Annotated[int, Range(0, 1024)] = 0
-    """Size of the appearance embedding of each training image (color only); 0 for none."""
     from_colors: bool = False
     """Start the features from the colors of the sparse points instead of zeros."""
 
@@ -159,8 +165,10 @@ class TrainConfig:
     the bias correction counts the steps of the stage."""
     seed: Annotated[int, Range(0, 2**32 - 1)] = 0
     """Everything random follows from it. On the CPU the same seed gives the same bits."""
-    anchors: AnchorConfig = field(default_factory=AnchorConfig)
+    model: ModelConfig = field(default_factory=ModelConfig)
     """The anchor model."""
+    init: InitConfig = field(default_factory=InitConfig)
+    """Where anchors start."""
     lr: LearningRateConfig = field(default_factory=LearningRateConfig)
     """Learning rates."""
     lr_warm_boost: Annotated[float, Range(1, 1000)] = 1.0

@@ -61,7 +61,7 @@ class Option:
 
     @property
     def off_flag(self) -> str:
-        """The name that switches it off: `--anchors.no-mvs`."""
+        """The name that switches it off: `--init.no-mvs`."""
         return off_flag(self.flag)
 
     @property

@@ -18,14 +18,15 @@ from __future__ import annotations
 from typing import Literal
 
 from vdgs.config.method import (
-    AnchorConfig,
     AssignmentConfig,
     BlockConfig,
     CompensationConfig,
     DensifyConfig,
+    InitConfig,
     LearningRateConfig,
     LossConfig,
     MethodConfig,
+    ModelConfig,
     PartitionConfig,
     TrainConfig,
 )
@@ -39,7 +40,8 @@ PRESETS: dict[str, MethodConfig] = {
     "paper": MethodConfig(
         training=TrainConfig(
             optimizer="adam",
-            anchors=AnchorConfig(outlier_distance=0.0, fill_gaps=False, bound_scales=False),
+            model=ModelConfig(bound_scales=False),
+            init=InitConfig(outlier_distance=0.0, fill_gaps=False),
             loss=LossConfig(background="black", random_background=0.0),
         ),
         assignment=AssignmentConfig(mode="paper", always_best=False, min_cameras=0),
@@ -50,7 +52,7 @@ PRESETS: dict[str, MethodConfig] = {
     "laptop": MethodConfig(
         training=TrainConfig(
             iterations=0,
-            anchors=AnchorConfig(mvs=True),
+            init=InitConfig(mvs=True),
             exposure_compensation=True,
             exposure_min_spread=0.015,
             resolution_schedule=((0.0, 4), (0.1, 2), (0.4, 1)),

@@ -5,10 +5,10 @@ gradients). Errors: ValueError for shapes, TypeError for dtypes, `UnsupportedOpt
 not. Pixel centers are at 0.5; quaternions are wxyz; cameras look along +z (OpenCV); docs/python.md has a guide.
 """
 
-from vdgs.ops.operations import Projection as Projection
-from vdgs.ops.operations import cull as cull
-from vdgs.ops.operations import decode_anchors as decode_anchors
-from vdgs.ops.operations import photometric_loss as photometric_loss
-from vdgs.ops.operations import project as project
-from vdgs.ops.operations import sparse_adam_ as sparse_adam_
 from vdgs.ops.rasterization import rasterization as rasterization
+from vdgs.ops.single_kernels import Projection as Projection
+from vdgs.ops.single_kernels import cull as cull
+from vdgs.ops.single_kernels import decode_anchors as decode_anchors
+from vdgs.ops.single_kernels import photometric_loss as photometric_loss
+from vdgs.ops.single_kernels import project as project
+from vdgs.ops.single_kernels import sparse_adam_ as sparse_adam_

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from vdgs.captures.camera_height import camera_height
 from vdgs.captures.capture import Capture
 from vdgs.captures.image_cache import ImageCache
-from vdgs.config.method import AnchorConfig
+from vdgs.config.method import InitConfig
 from vdgs.errors import VdgsError
 from vdgs.model.initialization.gap_filling import find_gap_points
 from vdgs.model.initialization.initialize import get_voxel_size
@@ -37,7 +37,7 @@ CELL_VOXELS, CELL_PX = 1.2, 3.0
 PIXELS_PER_POINT = 180
 
 
-def load_dense_points(run: RunFolder, config: AnchorConfig) -> DensePoints | None:
+def load_dense_points(run: RunFolder, config: InitConfig) -> DensePoints | None:
     """The dense points of the coarse stage; None where its settings ask for none. VdgsError for a missing or damaged
     file."""
     return _read(run.coarse.path / DENSE_POINTS_FILE) if config.mvs else None
@@ -47,7 +47,7 @@ def find_dense_points(
     run: RunFolder,
     capture: Capture,
     images: ImageCache,
-    config: AnchorConfig,
+    config: InitConfig,
     on_progress: Callable[[int, int], None],
     threads: int,
 ) -> DensePoints | None:
@@ -61,7 +61,7 @@ def find_dense_points(
 def match_dense_points(
     capture: Capture,
     images: ImageCache,
-    config: AnchorConfig,
+    config: InitConfig,
     scratch_dir: Path,
     on_progress: Callable[[int, int], None],
     threads: int,
@@ -96,7 +96,7 @@ def max_dense_points(capture: Capture) -> int:
     return max(0, pixels // PIXELS_PER_POINT - len(capture.points))
 
 
-def fusion_cell(capture: Capture, config: AnchorConfig) -> FusionCell:
+def fusion_cell(capture: Capture, config: InitConfig) -> FusionCell:
     """The cells that get a dense point each, in units of the ground frame."""
     focal = float(np.median([view.camera.fx for view in capture.train_views]))
     return FusionCell(

@@ -125,13 +125,15 @@ def probe(scene: Scene, method: MethodConfig, request: RunRequest, factors: Sequ
     cameras = [view.camera for view in capture.train_views]
     with ImageCache(views, budget, downscales=(1, SMALL_FACTOR)) as images:
         stage, _ = build_coarse_problem(replace(capture, views=tuple(views)), one_size, images, request.device)
-        anchors, _ = initialize_anchors(capture.points, capture.point_colors, cameras, config.anchors)
+        anchors, _ = initialize_anchors(
+            capture.points, capture.point_colors, cameras, config.init, config.model.num_offsets
+        )
         workload = training_workload(initial_coarse_state(anchors, stage, config.exposure_compensation), stage)
         steps = time_steps(stage, anchors, config.exposure_compensation)
     stereo = 0.0
-    if config.anchors.mvs and _dense_room(scene, min(factors)):
+    if config.init.mvs and _dense_room(scene, min(factors)):
         with ImageCache(capture.train_views, budget) as images:
-            stereo = time_stereo(capture, images, config.anchors)
+            stereo = time_stereo(capture, images, config.init)
     return Probe(
         steps=steps, textures=measure_textures(capture.train_views, factors), stereo=stereo, workload=workload
     )  # fmt: skip
@@ -141,7 +143,7 @@ def estimate_at(scene: Scene, probed: Probe, method: MethodConfig, request: RunR
     """What the run takes with photographs whose sides are shrunk by `factor` from the cameras of the scene."""
     config, views, steps = method.training, len(scene.cameras), probed.steps
     cameras, texture = _shrunk(scene.cameras, factor), probed.textures[factor]
-    dense = _dense_room(scene, factor) if config.anchors.mvs else 0
+    dense = _dense_room(scene, factor) if config.init.mvs else 0
     stereo = views * probed.stereo if dense else 0.0
     share = scene.points / max(1, len(scene.timed.points))
     images_bytes = decoded_image_bytes(cameras)

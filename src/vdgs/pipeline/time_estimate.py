@@ -14,7 +14,7 @@ import torch
 from vdgs.captures.capture import Capture, View
 from vdgs.captures.image_cache import ImageCache
 from vdgs.captures.image_files import decode_image
-from vdgs.config.method import AnchorConfig, TrainConfig
+from vdgs.config.method import InitConfig, TrainConfig
 from vdgs.errors import Stopped, VdgsError
 from vdgs.model.anchors import Anchors
 from vdgs.model.initialization.stereo import StereoInputs, compute_dense_points
@@ -149,7 +149,7 @@ class _Enough(Exception):
     """The first photograph is matched."""
 
 
-def time_stereo(capture: Capture, images: ImageCache, config: AnchorConfig) -> float:
+def time_stereo(capture: Capture, images: ImageCache, config: InitConfig) -> float:
     """Processor seconds of the stereo of one photograph, which is matched at one size however large it is; 0 where none
     can be matched."""
     cameras = [view.camera for view in capture.train_views]

@@ -120,7 +120,7 @@ class BlockPlan:
             lr_mask=lr_ramp(blocks, self.index, method.block),
             image_indices=self.indices, view_weights=self.weights, crops=self.crops,
             max_log_scale=(
-                (lambda positions: max_log_scales(positions, cameras)) if config.anchors.bound_scales else None
+                (lambda positions: max_log_scales(positions, cameras)) if config.model.bound_scales else None
             ),
         )  # fmt: skip
 

@@ -125,7 +125,7 @@ def _dense_points(
     """The points that stereo adds to the sparse ones, computed now or before; prints how many."""
     start = time.monotonic()
     with show_progress("looking for ground by stereo", console, run) as on_progress:
-        dense = find_dense_points(run, capture, images, config.anchors, on_progress, torch.get_num_threads())
+        dense = find_dense_points(run, capture, images, config.init, on_progress, torch.get_num_threads())
     if dense is not None:
         if len(dense.points):
             found = f"{len(dense.points):,} points beside the sparse ones, {time.monotonic() - start:.0f} s"
@@ -193,7 +193,9 @@ def build_coarse_problem(
     """The problem of the coarse stage, and the anchors that it starts from: at the sparse and the `dense` points."""
     cameras = [view.camera for view in capture.train_views]
     # The voxel follows from the capture: recomputed when a run continues.
-    anchors, voxel = initialize_anchors(capture.points, capture.point_colors, cameras, config.anchors, dense)
+    anchors, voxel = initialize_anchors(
+        capture.points, capture.point_colors, cameras, config.init, config.model.num_offsets, dense
+    )
     background = (0.0, 0.0, 0.0)
     if config.loss.background != "black":
         smallest = max(factor for _, factor in config.resolution_schedule)
@@ -207,14 +209,14 @@ def build_coarse_problem(
         background=background,
         view_weights=view_sampling_weights(config, anchors, cameras),
         device=torch.device(device),
-        max_log_scale=(lambda positions: max_log_scales(positions, cameras)) if config.anchors.bound_scales else None,
+        max_log_scale=(lambda positions: max_log_scales(positions, cameras)) if config.model.bound_scales else None,
     )
     return stage, anchors
 
 
 def initial_coarse_state(anchors: Anchors, stage: TrainingProblem, fit_exposures: bool) -> TrainingState:
     """The state before the first step, with or without exposures that are fitted."""
-    config, generator = stage.config.anchors, torch.Generator().manual_seed(stage.config.seed)
+    config, generator = stage.config.model, torch.Generator().manual_seed(stage.config.seed)
     decoder = Decoder.init_random(
         config.num_offsets, config.view_distance, config.appearance_dim, stage.num_images, generator
     )

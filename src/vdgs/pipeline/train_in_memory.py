@@ -106,10 +106,10 @@ def _train_coarse(
 ) -> AnchorModel:
     with open_training_images(capture, config, image_cache_bytes(CheckpointOptions())) as images:
         dense = None
-        if config.anchors.mvs:
+        if config.init.mvs:
             with tempfile.TemporaryDirectory() as scratch, show_progress("stereo", console) as progress:
                 dense = match_dense_points(
-                    capture, images, config.anchors, Path(scratch), progress, torch.get_num_threads()
+                    capture, images, config.init, Path(scratch), progress, torch.get_num_threads()
                 )
         problem, anchors = build_coarse_problem(capture, config, images, device, dense)
         state = initial_coarse_state(anchors, problem, fits_exposures(images, config, console)[1])

@@ -49,7 +49,7 @@ def training_section(report: ReportedRun) -> Html:
         note = paragraph("No block has a log yet." if is_absent else "", "absent")
     parts = [
         heading("Coarse model"),
-        _initialization_note(source.record("coarse/start.json")),
+        _initialization_note(source.record("coarse/initialization.json")),
         _curves([("coarse", MERGED_COLOR, coarse)]),
         paragraph("The coarse model has no log yet." if no_coarse else "", "absent"),
         heading("Blocks"),

@@ -62,7 +62,7 @@ class StageFolder:
     @property
     def initialization_file(self) -> Path:
         """What the coarse stage started from."""
-        return self.path / "start.json"
+        return self.path / "initialization.json"
 
     @property
     def model(self) -> Path:

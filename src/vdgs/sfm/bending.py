@@ -11,7 +11,7 @@ from vdgs.sfm.georegistration import Georegistration, model_points
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.workspace import call_cancellable
-from vdgs.system.colmap import pycolmap
+from vdgs.system.lazy_pycolmap import pycolmap
 
 #: A model that is bent by more than this share of the flying height is torn (choice).
 MOST_BENT = 0.1

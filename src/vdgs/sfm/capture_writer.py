@@ -22,7 +22,7 @@ from vdgs.errors import CaptureError
 from vdgs.sfm.mask_files import encode_mask, undistort_mask
 from vdgs.sfm.workspace import Workspace, report_progress
 from vdgs.system.atomic_files import write_bytes
-from vdgs.system.colmap import pycolmap
+from vdgs.system.lazy_pycolmap import pycolmap
 from vdgs.system.stop_signals import check_stop_requested
 
 #: Sides are multiples of this, so that the smaller sizes are exactly a half and a quarter.

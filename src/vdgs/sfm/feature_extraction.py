@@ -18,7 +18,7 @@ from vdgs.sfm.image_list import ExcludedImage
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.workspace import Workspace, call_cancellable, report_progress
 from vdgs.system.atomic_files import write_atomic, write_bytes
-from vdgs.system.colmap import pycolmap
+from vdgs.system.lazy_pycolmap import pycolmap
 
 #: A focal length over the longer side where nothing says one: COLMAP's own guess.
 DEFAULT_FOCAL_FACTOR = 1.2

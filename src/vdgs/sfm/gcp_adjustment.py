@@ -17,7 +17,7 @@ from vdgs.geometry.similarity import Similarity, fit_similarity, fit_similarity_
 from vdgs.sfm.bending import bend_to_points
 from vdgs.sfm.gcp_list import MIN_CONTROL_POINTS, GcpList, GcpObservation, GroundControlPoint
 from vdgs.sfm.georegistration import transform_model
-from vdgs.system.colmap import pycolmap
+from vdgs.system.lazy_pycolmap import pycolmap
 
 #: With so many points, one that does not fit the others is found and left out.
 MIN_POINTS_FOR_OUTLIERS = 6

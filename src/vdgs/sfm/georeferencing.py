@@ -18,7 +18,7 @@ from vdgs.sfm.bending import bend_to_positions
 from vdgs.sfm.georegistration import AlignmentFailure, Georegistration
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.scale_bars import known_scale
-from vdgs.system.colmap import pycolmap
+from vdgs.system.lazy_pycolmap import pycolmap
 
 WITHOUT = (
     "give a known distance (--scale-bar), or the same command without --georeference off: the finished capture is "

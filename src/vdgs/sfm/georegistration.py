@@ -16,7 +16,7 @@ from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu, median_p
 from vdgs.geometry.similarity import Similarity, is_collinear, rotation_to_z
 from vdgs.sfm.gps_priors import MIN_POSITIONS, GpsPriors
 from vdgs.sfm.image_metadata import ImageMetadata
-from vdgs.system.colmap import pycolmap
+from vdgs.system.lazy_pycolmap import pycolmap
 
 #: Attitudes that agree on which way a world lies, at least.
 MIN_ATTITUDES = 3

@@ -59,8 +59,8 @@ from vdgs.sfm.source_images import SourceImages, check_unchanged
 from vdgs.sfm.step_keys import step_keys
 from vdgs.sfm.workspace import Workspace, silence_colmap
 from vdgs.system.atomic_files import to_jsonable, write_json
-from vdgs.system.colmap import pycolmap
 from vdgs.system.file_locks import lock_folder
+from vdgs.system.lazy_pycolmap import pycolmap
 from vdgs.system.records import record_to_dict
 
 #: A lens that moves pixels in the corners by no more leaves the photographs without distortion as they are.

@@ -18,7 +18,7 @@ from vdgs.sfm.image_list import ExcludedImage, ImageList
 from vdgs.sfm.incremental_mapper import refined_cameras
 from vdgs.sfm.preflight import MIN_OVERLAP, MIN_VIEWS_PER_POINT, OBLIQUE_ANGLE_DEG, PreflightReport
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
-from vdgs.system.colmap import pycolmap
+from vdgs.system.lazy_pycolmap import pycolmap
 
 #: A fitted focal length that left EXIF's by more than this share drifted, and so did a height over the recorded one.
 MAX_FOCAL_DRIFT, MAX_HEIGHT_DRIFT = 0.05, 0.15

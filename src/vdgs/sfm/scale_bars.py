@@ -11,7 +11,7 @@ from vdgs.captures.known_distances import LocatedPoint, check_marked, read_known
 from vdgs.sfm.gcp_adjustment import triangulate
 from vdgs.sfm.gcp_list import GcpObservation, GroundControlPoint, find_photograph, find_sighting, photographs_by_name
 from vdgs.sfm.image_list import ImageList
-from vdgs.system.colmap import pycolmap
+from vdgs.system.lazy_pycolmap import pycolmap
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ from rich.console import Console
 from vdgs.captures.reconstruction import PROGRESS_FILE, SFM_STAGE, STEPS_FILE
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.system.atomic_files import is_disk_full, read_json_or_empty, write_json
-from vdgs.system.colmap import pycolmap
 from vdgs.system.console import make_progress_bar
+from vdgs.system.lazy_pycolmap import pycolmap
 from vdgs.system.step_progress import StepProgress, StepRecord
 from vdgs.system.stop_signals import check_stop_requested
 from vdgs.system.units import rough_duration

@@ -1,6 +1,6 @@
 """A generated aerial capture of a small town: something to try every stage on, with known truth.
 
-Only `vdgs.synth.options` is imported here, so that the command line stays quick to start.
+Only `vdgs.synth.synth_options` is imported here, so that the command line stays quick to start.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vdgs.synth.options import SynthOptions
+from vdgs.synth.synth_options import SynthOptions
 
 if TYPE_CHECKING:
     from vdgs.synth.true_visibility import FlightStats

@@ -17,7 +17,7 @@ from vdgs.synth.ray_tracing import RayTracer
 from vdgs.synth.synthetic_points import SparseCloud, observations_by_image
 from vdgs.synth.true_visibility import FlightStats, view_ground_truth
 from vdgs.system.atomic_files import write_json
-from vdgs.system.colmap import pycolmap
+from vdgs.system.lazy_pycolmap import pycolmap
 
 
 def write_flight(folder: Path, flight: str, found: FlightStats) -> None:

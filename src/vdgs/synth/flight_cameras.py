@@ -8,8 +8,8 @@ from scipy.cluster.vq import kmeans2
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
 from vdgs.synth.flight_plans import FLIGHT_PLANS, FlightArea, altitude_for_overlap
-from vdgs.synth.options import ResolvedOptions
 from vdgs.synth.ray_tracing import RayTracer
+from vdgs.synth.synth_options import ResolvedOptions
 from vdgs.synth.terrain import Terrain
 from vdgs.synth.town import Town
 from vdgs.synth.true_visibility import view_ground_truth
@@ -59,11 +59,11 @@ def flight_altitude(options: ResolvedOptions, tallest: float) -> float:
     """
     if options.overlap is None:
         return float(np.clip(0.5 * options.extent_m, 36, 95))
-    altitude = altitude_for_overlap(options.extent_m, options.images, options.overlap, FOCAL_FACTOR)
+    altitude = altitude_for_overlap(options.extent_m, options.num_images, options.overlap, FOCAL_FACTOR)
     lowest = 1.4 * tallest
     if not lowest <= altitude <= _MAX_ALTITUDE:
         raise VdgsError(
-            f"--overlap {options.overlap:g} with {options.images} photographs over {options.extent_m:g} m needs an "
+            f"--overlap {options.overlap:g} with {options.num_images} photographs over {options.extent_m:g} m needs an "
             f"altitude of {altitude:.0f} m; it must lie between {lowest:.0f} and {_MAX_ALTITUDE:.0f}. "
             "Change --overlap, --images or --extent-m."
         )
@@ -77,7 +77,12 @@ def make_flight_cameras(options: ResolvedOptions, town: Town) -> list[Camera]:
     half, phase = options.extent_m / 2, float(rng.uniform(0, 6.28))
     mission = FLIGHT_PLANS[options.flight](
         FlightArea(
-            half=half, altitude=altitude, count=options.images, phase=phase, plan=town.plan, landmarks=town.landmarks
+            half=half,
+            altitude=altitude,
+            count=options.num_images,
+            phase=phase,
+            plan=town.plan,
+            landmarks=town.landmarks,
         )
     )
     cameras = []

@@ -20,9 +20,9 @@ from vdgs.synth.dataset_writer import write_cameras, write_flight, write_model, 
 from vdgs.synth.flight_cameras import flight_altitude, make_flight_cameras, make_test_cameras
 from vdgs.synth.image_renderer import render_image
 from vdgs.synth.lighting import SkyMap, make_sky_map
-from vdgs.synth.options import ResolvedOptions, SynthOptions
 from vdgs.synth.perturbations import add_outliers, exposure_gains, perturb_cameras
 from vdgs.synth.ray_tracing import RayTracer, require_embree
+from vdgs.synth.synth_options import ResolvedOptions, SynthOptions
 from vdgs.synth.synthetic_points import SeedPoints, SparseCloud, make_sparse_cloud, sample_seed_points
 from vdgs.synth.town import Town, build_town
 from vdgs.synth.true_visibility import FlightStats, compute_flight_stats, sample_visible_points
@@ -91,7 +91,7 @@ def _write_capture(folder: Path, options: ResolvedOptions, on_progress: Progress
     with ThreadPoolExecutor(options.workers or os.cpu_count() or 1) as pool:
         sky = make_sky_map(tracer, town.terrain, town.zones, options.extent_m / 2 + 40, pool)
         views, stats = _plan_views(town, tracer, options)
-        first_validation = views.training + options.test_images
+        first_validation = views.training + options.num_test_images
         write_text(folder / TEST_LIST, "\n".join(views.names[views.training : first_validation]) + "\n")
         if validation := views.names[first_validation:]:
             write_text(folder / VALIDATION_LIST, "\n".join(validation) + "\n")
@@ -109,7 +109,8 @@ def _write_capture(folder: Path, options: ResolvedOptions, on_progress: Progress
             named = list(zip(views.names, views.cameras, strict=True))
             write_views(truth, tracer, named, views.training, pool, lambda done: on_progress("truth", done, total))
     note = _NOTE.format(
-        version=__version__, training=views.training, test=options.test_images, validation=options.validation_images,
+        version=__version__, training=views.training, test=options.num_test_images,
+        validation=options.num_validation_images,
         poses="noisy" if options.pose_noise_px else "true", points=len(cloud.points), noise_px=options.noise_px,
         truth=_TRUTH_NOTE if options.truth else "", imbalance=stats.summary,
         options="\n".join(f"- {line}" for line in options.to_lines),
@@ -125,7 +126,10 @@ def _plan_views(town: Town, tracer: RayTracer, options: ResolvedOptions) -> tupl
     points, counts = sample_visible_points(tracer, town.mesh, training, half, np.random.default_rng([options.seed, 8]))
     names = [f"drone_{k + 1:04d}.jpg" for k in range(len(training))]
     cameras = list(training)
-    for stream, kind, count in ((9, "test", options.test_images), (10, "validation", options.validation_images)):
+    for stream, kind, count in (
+        (9, "test", options.num_test_images),
+        (10, "validation", options.num_validation_images),
+    ):
         rng = np.random.default_rng([options.seed, stream])
         cameras += make_test_cameras(tracer, town.terrain, training, points, count, options, rng)
         names += [f"{kind}_{k + 1:04d}.jpg" for k in range(count)]
@@ -139,7 +143,7 @@ def _render_images(
 ) -> list[SeedPoints]:  # fmt: skip
     """Render and save every image; returns the points picked in each training image."""
     folder.mkdir()
-    per_image = int(np.ceil(1.5 * options.points / views.training)) + 4
+    per_image = int(np.ceil(1.5 * options.num_points / views.training)) + 4
     total = len(views.names)
 
     def render(k: int) -> SeedPoints | None:
@@ -164,8 +168,8 @@ def _write_model(
     """The COLMAP model: points from training images only, poses of all."""
     training = views.cameras[: views.training]
     rng = {stream: np.random.default_rng([options.seed, stream]) for stream in (4, 6, 7)}
-    cloud = make_sparse_cloud(tracer, training, seeds, options.points, options.noise_px, rng[4])
-    cloud = add_outliers(cloud, training, options.outliers, rng[7])
+    cloud = make_sparse_cloud(tracer, training, seeds, options.num_points, options.noise_px, rng[4])
+    cloud = add_outliers(cloud, training, options.outlier_fraction, rng[7])
     altitude = flight_altitude(options, town.tallest)
     write_model(folder, perturb_cameras(views.cameras, options.pose_noise_px, altitude, rng[6]), views.names, cloud)
     return cloud

@@ -11,7 +11,7 @@ from vdgs.errors import CaptureError
 from vdgs.system.atomic_files import explain_disk_errors
 
 if TYPE_CHECKING:
-    from vdgs.system.colmap import pycolmap
+    from vdgs.system.lazy_pycolmap import pycolmap
 
 
 def write_model_files(model: pycolmap.Reconstruction, folder: Path) -> None:

@@ -189,7 +189,7 @@ def pixel_rays(intrinsics: Intrinsics, pixels: np.ndarray) -> np.ndarray:
     """x/z and y/z [n, 2] of the rays through pixels [n, 2] of a camera, its lens undone; NaN where it has no ray."""
     if not intrinsics.is_distorted:
         return (pixels - intrinsics.principal_point) / intrinsics.focal
-    from vdgs.system.colmap import pycolmap  # 60 MB of memory: only for lenses that need it
+    from vdgs.system.lazy_pycolmap import pycolmap  # 60 MB of memory: only for lenses that need it
 
     width, height, params = intrinsics.width, intrinsics.height, list(intrinsics.params)
     camera = pycolmap.Camera(model=intrinsics.model, width=width, height=height, params=params)

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Int64
 from scipy.spatial import cKDTree
 
-from vdgs.config.method import AnchorConfig
+from vdgs.config.method import InitConfig
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import FEATURE_SIZE
@@ -30,7 +30,7 @@ def auto_voxel_size(points: np.ndarray) -> float:
     if len(distinct) < 2:
         raise VdgsError(
             f"The capture has {len(distinct)} distinct sparse point(s); at least 2 are needed to place anchors. "
-            "Run the structure-from-motion again, or give --anchors.voxel-size."
+            "Run the structure-from-motion again, or give --init.voxel-size."
         )
     distances, _ = cKDTree(distinct).query(distinct, k=2, workers=1)
     return float(np.median(distances[:, 1]))
@@ -45,7 +45,7 @@ def inlier_mask(points: np.ndarray, factor: float) -> np.ndarray:
     return distances[:, 0] <= limit if limit > 0 else np.ones(len(points), bool)
 
 
-def get_voxel_size(points: np.ndarray, config: AnchorConfig) -> float:
+def get_voxel_size(points: np.ndarray, config: InitConfig) -> float:
     """The edge of the voxel grid of the sparse points [n, 3]. Raises VdgsError as `auto_voxel_size`."""
     return config.voxel_size if config.voxel_size > 0 else auto_voxel_size(points)
 
@@ -54,7 +54,8 @@ def initialize_anchors(
     points: np.ndarray,
     colors: np.ndarray,
     cameras: Sequence[Camera],
-    config: AnchorConfig,
+    config: InitConfig,
+    num_offsets: int,
     dense: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> tuple[Anchors, float]:
     """Anchors on the voxel grid of the sparse points [n, 3], and the voxel used.
@@ -84,7 +85,7 @@ def initialize_anchors(
     if config.from_colors:
         features[:, :3] = _mean_colors(colors, owner.reshape(-1), n) * 2.0 - 1.0
     as_tensor = lambda array: torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))  # noqa: E731
-    offsets, log_scales = torch.zeros(n, config.num_offsets, 3), np.repeat(np.log(spacing)[:, None], 6, axis=1)
+    offsets, log_scales = torch.zeros(n, num_offsets, 3), np.repeat(np.log(spacing)[:, None], 6, axis=1)
     return Anchors(as_tensor(positions), as_tensor(features), offsets, as_tensor(log_scales)), voxel
 
 

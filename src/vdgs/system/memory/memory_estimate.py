@@ -117,7 +117,7 @@ def block_workload(method: MethodConfig, anchors: int, total_anchors: int, pixel
     return TrainingWorkload(
         anchors=anchors,
         max_anchors=max_block_anchors(block, anchors, total_anchors),
-        offsets=method.training.anchors.num_offsets,
+        offsets=method.training.model.num_offsets,
         seen=MAX_VISIBLE_FRACTION,
         pixels=pixels,
         image_cache_bytes=0,

@@ -13,11 +13,11 @@ SizeName = Literal["toy", "village", "town", "district", "city"]
 FlightName = Literal["uneven", "even", "distant", "orbits", "corridor"]
 
 _SIZES: dict[str, dict[str, Any]] = {
-    "toy": {"images": 24, "width": 96, "height": 72, "extent_m": 60.0, "points": 1500},
-    "village": {"images": 56, "width": 400, "height": 300, "extent_m": 120.0, "points": 5000},
-    "town": {"images": 120, "width": 800, "height": 600, "extent_m": 320.0, "points": 40000},
-    "district": {"images": 150, "width": 400, "height": 300, "extent_m": 420.0, "points": 30000},
-    "city": {"images": 600, "width": 400, "height": 300, "extent_m": 900.0, "points": 120000},
+    "toy": {"num_images": 24, "width": 96, "height": 72, "extent_m": 60.0, "num_points": 1500},
+    "village": {"num_images": 56, "width": 400, "height": 300, "extent_m": 120.0, "num_points": 5000},
+    "town": {"num_images": 120, "width": 800, "height": 600, "extent_m": 320.0, "num_points": 40000},
+    "district": {"num_images": 150, "width": 400, "height": 300, "extent_m": 420.0, "num_points": 30000},
+    "city": {"num_images": 600, "width": 400, "height": 300, "extent_m": 900.0, "num_points": 120000},
 }
 
 
@@ -31,12 +31,12 @@ class SynthOptions:
     """Size of the place. toy: 24 images of 96x72 over 60 m (seconds, for tests); village: 56 images of 400x300 over
     120 m; town: 120 images of 800x600 over 320 m; district: 150 images of 400x300 over 420 m, with towers and a lake;
     city: 600 images of 400x300 over 900 m."""
-    images: Annotated[int | None, Range(3, 100_000)] = None
+    num_images: Annotated[int | None, Range(3, 100_000)] = None
     """How many photographs the drone takes for training."""
-    test_images: Annotated[int | None, Range(1, 100_000)] = None
+    num_test_images: Annotated[int | None, Range(1, 100_000)] = None
     """How many test photographs are taken besides, all over what the flight saw, poorly seen parts included; listed in
-    test.txt. Default: an eighth of --images, at least 2."""
-    validation_images: Annotated[int | None, Range(0, 100_000)] = None
+    test.txt. Default: an eighth of --num-images, at least 2."""
+    num_validation_images: Annotated[int | None, Range(0, 100_000)] = None
     """How many further photographs are kept apart from both, for choosing settings (validation.txt; used with
     --validation). Default: as many as test photographs."""
     width: Annotated[int | None, Range(16, MAX_RENDER_SIDE_PX)] = None
@@ -52,11 +52,11 @@ class SynthOptions:
     overlap: Annotated[float | None, Range(0, 0.98, exclusive_max=True)] = None
     """Share of its side that a photograph has in common with the next, were the flight an even grid: sets the
     altitude. Default: an altitude of half the extent, between 36 and 95 m."""
-    points: Annotated[int | None, Range(10, 100_000_000)] = None
+    num_points: Annotated[int | None, Range(10, 100_000_000)] = None
     """How many sparse points to aim for."""
     noise_px: Annotated[float, Range(0, 100, exclusive_max=True)] = 0.4
     """Standard deviation of the sparse points' observations, in pixels."""
-    outliers: Annotated[float, Range(0, 0.5)] = 0.0
+    outlier_fraction: Annotated[float, Range(0, 0.5)] = 0.0
     """Share of the sparse points that are mismatches: at a wrong distance along a ray, as in real models."""
     pose_noise_px: Annotated[float, Range(0, 100, exclusive_max=True)] = 0.0
     """Standard deviation of the error of the written poses, as the shift of the picture that it makes, in pixels."""
@@ -82,10 +82,10 @@ class SynthOptions:
         check_ranges(self)
         defaults = _SIZES[self.size]
         values = vars(self) | {name: value for name, value in defaults.items() if getattr(self, name) is None}
-        if values["test_images"] is None:
-            values["test_images"] = max(2, values["images"] // 8)
-        if values["validation_images"] is None:
-            values["validation_images"] = values["test_images"]
+        if values["num_test_images"] is None:
+            values["num_test_images"] = max(2, values["num_images"] // 8)
+        if values["num_validation_images"] is None:
+            values["num_validation_images"] = values["num_test_images"]
         return ResolvedOptions(**(values | {"extent_m": float(values["extent_m"])}))
 
 
@@ -93,12 +93,12 @@ class SynthOptions:
 class ResolvedOptions(SynthOptions):
     """`SynthOptions` with every value known; `overlap` alone may stay open."""
 
-    images: int
-    test_images: int
-    validation_images: int
+    num_images: int
+    num_test_images: int
+    num_validation_images: int
     width: int
     height: int
-    points: int
+    num_points: int
     extent_m: float
 
     @property
