@@ -14,7 +14,7 @@ from support.gaussians import overhead, picture, psnr, random_gaussians
 from vdgs.errors import VdgsError
 from vdgs.export.formats import registry, spz
 from vdgs.export.formats.axes import Y_UP
-from vdgs.export.formats.export_scene import ExportMetadata, ExportScene
+from vdgs.export.formats.export_scene import ExportMetadata, ExportScene, concatenate
 from vdgs.export.formats.simplify import cell_indices, simplify
 from vdgs.export.formats.tiles_3d import write_tiles
 from vdgs.geometry.geodesy import geodetic_from_ecef
@@ -48,7 +48,7 @@ def tile(path: Path) -> Gaussians:
     packed = primitive["extensions"]["KHR_gaussian_splatting"]["extensions"]["KHR_gaussian_splatting_compression_spz_2"]
     view = gltf["bufferViews"][packed["bufferView"]]
     content = zlib.decompress(data[28 + length : 28 + length + view["byteLength"]], 31)
-    gaussians = spz.decode_spz(content, path)
+    gaussians = concatenate(spz.decode_spz(content, path))
     assert gltf["accessors"][primitive["attributes"]["POSITION"]]["count"] == len(gaussians)
     # CesiumJS tells the degree of spherical harmonics by how many attributes are named so.
     assert sum("SH_DEGREE" in name for name in primitive["attributes"]) == gaussians.shN.shape[1]

@@ -16,7 +16,6 @@ from vdgs.errors import VdgsError
 from vdgs.export.formats import export_scene, registry, spz
 from vdgs.export.formats.axes import Y_DOWN, Y_UP
 from vdgs.export.formats.export_scene import ExportMetadata, ExportScene, metadata_path
-from vdgs.export.formats.gaussian_ply import read_ply
 from vdgs.export.formats.parallel_gzip import gzip_blocks
 from vdgs.export.formats.quaternion_canonical import canonicalize_quaternions
 from vdgs.model.gaussian_transform import gaussian_covariances, transform_gaussians
@@ -34,7 +33,7 @@ def independent(path: Path) -> Gaussians:
     if "error" in answer:  # it cannot hand over scenes without spherical harmonics, but converts them
         other = path.with_name("converted.ply")
         other.write_bytes(gaussforge.GaussForge().convert(path.read_bytes(), path.suffix[1:], "ply")["data"])
-        return read_ply(other)
+        return registry.read_gaussians(other)
     data, n = answer["data"], answer["data"]["numPoints"]
 
     def tensor(name: str, *shape: int) -> torch.Tensor:
@@ -345,7 +344,7 @@ def test_damaged_files_are_named(tmp_path, ending, what):
 def test_point_clouds_and_text_are_no_scenes(tmp_path):
     registry.write_scene(tmp_path / "a.points.ply", ExportScene.of(random_gaussians(3, 0)))
     with pytest.raises(VdgsError, match="no PLY of 3DGS"):
-        read_ply(tmp_path / "a.points.ply")
+        registry.read_gaussians(tmp_path / "a.points.ply")
 
 
 def test_a_stream_that_is_packed_in_parallel_is_one_gzip_member():

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from vdgs.cli.advice import MESSAGE_FIT
 from vdgs.cli.argument_parser import FULL_HELP_FLAG, GivenArguments, UsageError, parse_words
+from vdgs.config.commands import RunPath
 from vdgs.config.executor_options import ExecutorOptions
 from vdgs.config.method import MethodConfig
-from vdgs.config.ranges import WORKER_COUNT, FlagName, Positional, check_ranges
+from vdgs.config.ranges import WORKER_COUNT, FlagName, check_ranges
 from vdgs.errors import VdgsError
 
 #: What lines begin with that are printed even where a person asked for quiet.
@@ -36,25 +37,7 @@ class QuietArguments:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ComputeArguments(QuietArguments):
-    """What verbs that compute take."""
-
-    threads: Annotated[int, WORKER_COUNT] = 0
-    """Threads of the kernels; 0 for all cores. The result does not depend on it."""
-    device: str = "auto"
-    """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunPathArguments:
-    """What verbs about a run that is there take."""
-
-    run: Annotated[Path, Positional(is_run=True)]
-    """Run folder."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class StageArguments(RunPathArguments, QuietArguments):
+class StageArguments(RunPath, QuietArguments):
     """What verbs take that read the capture of a run."""
 
     capture: Path | None = None

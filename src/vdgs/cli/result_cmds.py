@@ -7,21 +7,27 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from vdgs.cli.common import (
-    ComputeArguments,
     QuietArguments,
-    RunPathArguments,
     ShardArguments,
     StageArguments,
     make_console,
     parse_arguments,
     set_up_compute,
 )
-from vdgs.config.commands import BIN_COUNT_RANGE, ModelName, OrthoRequest, RenderRequest, ViewRequest
+from vdgs.config.commands import (
+    BIN_COUNT_RANGE,
+    ComputeOptions,
+    ModelName,
+    OrthoRequest,
+    RenderRequest,
+    RunPath,
+    ViewRequest,
+)
 from vdgs.config.ranges import Positional
 
 
 @dataclass(frozen=True, kw_only=True)
-class StatusArguments(RunPathArguments):
+class StatusArguments(RunPath):
     """Say how far a run is, stage by stage and block by block, and what to type next.
 
     Stages are done, running, queued, stopped (they continue), failed (with the reason), missing, stale (made with other
@@ -48,7 +54,7 @@ def status_command(arguments: list[str]) -> int:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvalArguments(ShardArguments, ComputeArguments, StageArguments):
+class EvalArguments(ShardArguments, ComputeOptions, StageArguments):
     """Render the test views of a run, or its training views, and measure them: metrics.json, per_view.json, pictures, a
     table."""
 
@@ -82,7 +88,7 @@ def eval_command(arguments: list[str]) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReportArguments(RunPathArguments, QuietArguments):
+class ReportArguments(RunPath, QuietArguments):
     """Write RUN/report.html: one file with the figures, metrics, pictures and settings of a run."""
 
     run: Annotated[Path, Positional()]

@@ -9,7 +9,6 @@ from typing import Annotated
 
 from vdgs.cli.argument_parser import GivenArguments
 from vdgs.cli.common import (
-    ComputeArguments,
     QuietArguments,
     make_console,
     parse_arguments,
@@ -18,7 +17,7 @@ from vdgs.cli.common import (
 )
 from vdgs.cli.start_settings import StartSettings, start_settings
 from vdgs.config.capture_options import CaptureOptions
-from vdgs.config.commands import RunRequest
+from vdgs.config.commands import ComputeOptions, RunRequest
 from vdgs.config.executor_options import CheckpointOptions
 from vdgs.config.method import MethodConfig, TrainConfig
 from vdgs.config.output_paths import Output
@@ -40,7 +39,7 @@ class ConfigFileArguments:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainCoarseArguments(ConfigFileArguments, ComputeArguments):
+class TrainCoarseArguments(ConfigFileArguments, ComputeOptions, QuietArguments):
     """Train the global anchor model of a capture. The same command continues a run that was stopped."""
 
     capture: Annotated[Path, Positional()]

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 from vdgs.cli.common import (
-    ComputeArguments,
     ShardArguments,
     StageArguments,
     make_console,
@@ -15,6 +14,7 @@ from vdgs.cli.common import (
     set_up_compute,
     update_run_settings,
 )
+from vdgs.config.commands import ComputeOptions
 from vdgs.config.executor_options import CheckpointOptions, ExecutorOptions
 from vdgs.config.method import AssignmentConfig, BlockConfig, MergeConfig, PartitionConfig
 from vdgs.config.ranges import WORKER_COUNT, FlagName, Range
@@ -34,7 +34,7 @@ def visibility_command(arguments: list[str]) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PartitionArguments(ShardArguments, ComputeArguments, StageArguments):
+class PartitionArguments(ShardArguments, ComputeOptions, StageArguments):
     """Cut a run's scene into blocks by place and visibility, and give each block its cameras."""
 
     overwrite: bool = False
@@ -63,7 +63,7 @@ def partition_command(arguments: list[str]) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainBlocksArguments(ComputeArguments, StageArguments):
+class TrainBlocksArguments(ComputeOptions, StageArguments):
     """Train the blocks of a run. The same command continues; blocks may also be trained on several machines."""
 
     block: Annotated[int | None, Range(0, 10_000)] = None

@@ -38,7 +38,33 @@ AxesName = Literal["z-up", "y-up", "y-down", "y-up-left"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunRequest:
+class ComputeOptions:
+    """Where and how widely a command computes."""
+
+    threads: Annotated[int, WORKER_COUNT] = 0
+    """Threads of the kernels; 0 for all cores. The result does not depend on it."""
+    device: str = "auto"
+    """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunPath:
+    """A run that is there."""
+
+    run: Annotated[Path, Positional(is_run=True)]
+    """Run folder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelRequest(RunPath, ComputeOptions):
+    """A model of a run that is there."""
+
+    model: ModelName = "best"
+    """Which model. `best` is the merged one where there is one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunRequest(ComputeOptions):
     """Everything from a capture to a report (`vdgs run`)."""
 
     capture: Annotated[Path, Positional()]
@@ -65,10 +91,6 @@ class RunRequest:
     """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
     visibility_bins: Annotated[int, BIN_COUNT_RANGE] = 4
     """Number of visibility quantiles by which metrics are reported."""
-    threads: Annotated[int, WORKER_COUNT] = 0
-    """Threads of the kernels; 0 for all cores. The result does not depend on it."""
-    device: str = "auto"
-    """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
     options: Annotated[CaptureOptions, FlagName("")] = field(default_factory=CaptureOptions)
     sfm: SfmOptions = field(default_factory=SfmOptions)
     training: Annotated[TrainConfig, FlagName("")] = field(default_factory=TrainConfig)
@@ -87,11 +109,9 @@ class RunRequest:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RenderRequest:
+class RenderRequest(ModelRequest):
     """Views of a run, or a camera path, as PNG files or a film (`vdgs render`)."""
 
-    run: Annotated[Path, Positional(is_run=True)]
-    """Run folder."""
     output: Annotated[Path, Output()]
     """Folder for PNG files, or a film, NAME.mp4. The folder is new, empty, or filled by an earlier render, which is
     replaced."""
@@ -120,20 +140,12 @@ class RenderRequest:
     raw: bool = False
     """Also write the numbers of a map, NAME.npy beside NAME.png: float32 [height, width]. Depth is z along the view in
     units of the ground frame (metres where known); depth and V are NaN where nothing is drawn."""
-    model: ModelName = "best"
-    """Which model. `best` is the merged one where there is one."""
-    threads: Annotated[int, WORKER_COUNT] = 0
-    """Threads of the kernels; 0 for all cores."""
-    device: str = "auto"
-    """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class OrthoRequest:
+class OrthoRequest(ModelRequest):
     """Maps of a run as GeoTIFFs and pictures (`vdgs ortho`)."""
 
-    run: Annotated[Path, Positional(is_run=True)]
-    """Run folder."""
     output: Annotated[Path | None, Output()] = None
     """Folder for the maps, not among photographs nor with such files of others; by default RUN/maps."""
     gsd: Annotated[float | None, Range(0, MAX_FLOAT, exclusive_min=True)] = None
@@ -147,20 +159,12 @@ class OrthoRequest:
     else `local`."""
     detail_from_images: bool = False
     """Take the fine detail of the orthophoto from the photographs. That is done where they truly see a place."""
-    model: ModelName = "best"
-    """Which model. `best` is the merged one where there is one."""
-    threads: Annotated[int, WORKER_COUNT] = 0
-    """Threads of the kernels; 0 for all cores."""
-    device: str = "auto"
-    """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportRequest:
+class ExportRequest(ModelRequest):
     """A scene as files of Gaussians or points for other programs (`vdgs export`)."""
 
-    run: Annotated[Path, Positional(is_run=True)]
-    """Run folder."""
     output: Annotated[tuple[Path, ...], Repeatable(), Output()] = ()
     """File to write; its ending is the format: .ply, .spz, .glb, .html, ... These are .ply (3DGS), .compressed.ply
     (PlayCanvas), .spz, .splat, .sog, .glb (glTF), FOLDER/tileset.json (3D Tiles), .points.ply, .laz, .las (point
@@ -175,8 +179,6 @@ class ExportRequest:
     (left-handed: x east, z north). Instead of --for."""
     spz_version: Literal[2, 3, 4] = 3
     """Version of .spz files: 2 for older programs, 4 (zstd) for those of 2026; 3D Tiles always hold 2."""
-    model: ModelName = "best"
-    """Which model. `best` is the merged one where there is one."""
     block: Annotated[int | None, Range(0, 10_000)] = None
     """Only what this block of the merged scene owns."""
     bbox: Annotated[tuple[float, float, float, float] | None, MAP_COORDINATE_RANGE] = None
@@ -201,16 +203,12 @@ class ExportRequest:
     """Report what was lost. A file is read back and its test views are compared with those of the model itself."""
     threads: Annotated[int, WORKER_COUNT] = 0
     """Threads of the kernels; 0 for all cores. The result does not depend on it, but for --optimize-seconds."""
-    device: str = "auto"
-    """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewRequest:
+class ViewRequest(ModelRequest):
     """A scene in a browser (`vdgs view`)."""
 
-    run: Annotated[Path, Positional(is_run=True)]
-    """Run folder."""
     model: ModelName = "best"
     """Which model. `best` is the merged one where there is one, else what training has saved last, followed while it
     goes on."""
@@ -219,7 +217,3 @@ class ViewRequest:
     token of the printed address."""
     port: Annotated[int | None, Range(1, 65535)] = None
     """Port; by default the first free one from 8080."""
-    threads: Annotated[int, WORKER_COUNT] = 0
-    """Threads of the kernels; 0 for all cores."""
-    device: str = "auto"
-    """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""

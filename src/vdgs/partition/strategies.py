@@ -11,9 +11,10 @@ Only what is named in `omissions` differs from the publication; training and mer
 from __future__ import annotations
 
 import itertools
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Protocol
+from dataclasses import replace
+from typing import ClassVar
 
 import numpy as np
 import shapely
@@ -48,30 +49,27 @@ DOGS_EXPANSION = 1.4
 MIN_ANCHOR_SHARE = 0.25
 
 
-class PartitionStrategy(Protocol):
+class PartitionStrategy(ABC):
     """A published partition. Blocks own every point, by core or nearest core, as in `Blocks`."""
 
-    @property
-    def citation(self) -> str: ...
+    citation: ClassVar[str]
+    omissions: ClassVar[tuple[str, ...]]
 
-    @property
-    def omissions(self) -> tuple[str, ...]: ...
-
+    @abstractmethod
     def partition(
         self, positions: Float[np.ndarray, "n 3"], cameras: Sequence[Camera], count: int
     ) -> tuple[Blocks, list[str]]:
         """At most `count` blocks from anchors and training cameras, and warnings for people."""
-        ...
 
+    @abstractmethod
     def assignment(self, config: AssignmentConfig) -> AssignmentConfig:
         """How cameras are scored and above which score they join; topping up stays as it is."""
-        ...
 
     def adjust_scores(
         self, scores: ScoreMatrix, positions: Float[np.ndarray, "n 3"], blocks: Blocks, cameras: Sequence[Camera]
     ) -> ScoreMatrix:
         """The scores with what the method adds to, or takes instead of, those of `assignment`."""
-        ...
+        return scores
 
 
 def grid_shape(count: int, aspect: float) -> tuple[int, int]:
@@ -104,12 +102,11 @@ def scale_shape(shape: shapely.Polygon, factor: float) -> shapely.Polygon:
     return shapely.affinity.scale(shape, factor, factor, origin="center")
 
 
-@dataclass(frozen=True)
-class VastGaussian:
+class VastGaussian(PartitionStrategy):
     """Cells with equally many cameras; cameras by the area that a cell takes of their images (section 4.1)."""
 
-    citation: str = "Lin et al., VastGaussian, CVPR 2024"
-    omissions: tuple[str, ...] = (
+    citation = "Lin et al., VastGaussian, CVPR 2024"
+    omissions = (
         "coverage-based point selection: a block starts from the coarse anchors, and the rest is frozen context",
         "decoupled appearance modelling",
     )
@@ -193,12 +190,11 @@ def _equal_camera_splits(
     return [(edges[i], edges[i + 1], section) for i, section in enumerate(sections)]
 
 
-@dataclass(frozen=True)
-class CityGaussian:
+class CityGaussian(PartitionStrategy):
     """A uniform grid in contracted space (section 3.2); cameras by 1 - SSIM without the block, or standing in it."""
 
-    citation: str = "Liu et al., CityGaussian, ECCV 2024"
-    omissions: tuple[str, ...] = (
+    citation = "Liu et al., CityGaussian, ECCV 2024"
+    omissions = (
         "a block moves the anchors of its own cell; there all Gaussians of the coarse model move, and the cell is kept",
         "levels of detail, compression",
     )
@@ -261,12 +257,11 @@ def _side(a: float, b: float) -> Float[np.ndarray, " s"]:
     return np.union1d(np.linspace(a, b, POINTS_PER_SIDE), [each for each in (-1.0, 1.0) if a < each < b])
 
 
-@dataclass(frozen=True)
-class Dogs:
+class Dogs(PartitionStrategy):
     """The scene's oriented box cut into equal cells, each widened by 1.4, without the consensus of the blocks."""
 
-    citation: str = "Chen and Lee, DOGS, NeurIPS 2024"
-    omissions: tuple[str, ...] = (
+    citation = "Chen and Lee, DOGS, NeurIPS 2024"
+    omissions = (
         "the consensus (ADMM) on what blocks share: each block's own cell is kept, its ring is frozen",
         "splitting by content: cells are equal; cameras join by the share of the cell's anchors that they hold",
     )
@@ -290,11 +285,6 @@ class Dogs:
 
     def assignment(self, config: AssignmentConfig) -> AssignmentConfig:
         return replace(config, mode="frustum", threshold=MIN_ANCHOR_SHARE)
-
-    def adjust_scores(
-        self, scores: ScoreMatrix, positions: Float[np.ndarray, "n 3"], blocks: Blocks, cameras: Sequence[Camera]
-    ) -> ScoreMatrix:
-        return scores
 
 
 #: By the name in `PartitionConfig.strategy`.

@@ -65,7 +65,7 @@ def flight_altitude(options: ResolvedOptions, tallest: float) -> float:
         raise VdgsError(
             f"--overlap {options.overlap:g} with {options.num_images} photographs over {options.extent_m:g} m needs an "
             f"altitude of {altitude:.0f} m; it must lie between {lowest:.0f} and {_MAX_ALTITUDE:.0f}. "
-            "Change --overlap, --images or --extent-m."
+            "Change --overlap, --num-images or --extent-m."
         )
     return altitude
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import BinaryIO
@@ -20,7 +20,7 @@ import torch
 from vdgs.captures.formats.ply_reader import BYTE_ORDERS, PLY_DTYPES
 from vdgs.errors import VdgsError
 from vdgs.export.formats.axes import Z_UP, Axes, axes_named
-from vdgs.export.formats.export_scene import CHUNK_SIZE, ExportMetadata, ExportScene, concatenate
+from vdgs.export.formats.export_scene import CHUNK_SIZE, ExportMetadata, ExportScene
 from vdgs.kernels.spherical_harmonics import MAX_SH_DEGREE, num_sh_bases
 from vdgs.model.gaussians import Gaussians
 from vdgs.system.atomic_files import write_atomic, write_text
@@ -73,24 +73,29 @@ def write_crs_beside(path: Path, facts: ExportMetadata) -> None:
 
 def write_ply(path: Path, scene: ExportScene) -> tuple[str, ...]:
     """Write the scene, atomically; loses nothing. Raises VdgsError."""
-    names, axes = property_names(scene.degree), scene.axes or Z_UP
+    names = property_names(scene.degree)
+    write_vertices(path, scene, [f"float {name}" for name in names], lambda piece: _rows(piece, len(names)))
+    return ()
+
+
+def write_vertices(
+    path: Path, scene: ExportScene, properties: Sequence[str], rows_of: Callable[[Gaussians], np.ndarray]
+) -> None:
+    """A PLY of one row for each Gaussian, and its coordinate system beside it."""
+    axes = scene.axes or Z_UP
     lines = [
-        "ply",
-        "format binary_little_endian 1.0",
-        *header_comments(scene.metadata, axes),
-        f"element vertex {scene.count}",
-    ]
-    header = "\n".join([*lines, *(f"property float {name}" for name in names), "end_header", ""]).encode("ascii")
+        "ply", "format binary_little_endian 1.0", *header_comments(scene.metadata, axes),
+        f"element vertex {scene.count}", *(f"property {each}" for each in properties), "end_header", "",
+    ]  # fmt: skip
 
     def write(temporary: Path) -> None:
         with temporary.open("wb") as file:
-            file.write(header)
+            file.write("\n".join(lines).encode("ascii"))
             for piece in scene.pieces(axes):
-                _rows(piece, len(names)).tofile(file)
+                rows_of(piece).tofile(file)
 
     write_atomic(path, write)
     write_crs_beside(path, scene.metadata)
-    return ()
 
 
 def _rows(piece: Gaussians, width: int) -> np.ndarray:
@@ -103,11 +108,6 @@ def _rows(piece: Gaussians, width: int) -> np.ndarray:
     rows[:, -7:-4] = piece.log_scales.numpy()
     rows[:, -4:] = piece.quaternions.numpy()
     return rows
-
-
-def read_ply(path: Path) -> Gaussians:
-    """All Gaussians of a file: see `read_ply_chunks`."""
-    return concatenate(read_ply_chunks(path))
 
 
 def read_ply_chunks(path: Path) -> Iterator[Gaussians]:

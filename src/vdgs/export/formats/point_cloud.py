@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vdgs.errors import VdgsError
-from vdgs.export.formats.axes import Z_UP
 from vdgs.export.formats.export_scene import ExportMetadata, ExportScene, base_colors, opacities, to_uint8
-from vdgs.export.formats.gaussian_ply import header_comments, write_crs_beside
+from vdgs.export.formats.gaussian_ply import write_vertices
+from vdgs.model.gaussians import Gaussians
 from vdgs.system.atomic_files import write_atomic
 
 if TYPE_CHECKING:
@@ -30,26 +30,13 @@ def write_points(path: Path, scene: ExportScene) -> tuple[str, ...]:
     """Write x, y, z (ground frame, or along the axes that are asked for), red, green, blue and opacity as PLY,
     atomically. Returns what was lost."""
     names = ["float x", "float y", "float z", "uchar red", "uchar green", "uchar blue", "float opacity"]
-    axes = scene.axes or Z_UP
-    lines = [
-        "ply",
-        "format binary_little_endian 1.0",
-        *header_comments(scene.metadata, axes),
-        f"element vertex {scene.count}",
-    ]
-    header = "\n".join([*lines, *(f"property {name}" for name in names), "end_header", ""]).encode("ascii")
 
-    def write(temporary: Path) -> None:
-        with temporary.open("wb") as file:
-            file.write(header)
-            for piece in scene.pieces(axes):
-                rows = np.empty(len(piece), POINT_DTYPE)
-                rows["xyz"], rows["rgb"] = piece.means.numpy(), to_uint8(base_colors(piece))
-                rows["opacity"] = opacities(piece)
-                rows.tofile(file)
+    def rows_of(piece: Gaussians) -> np.ndarray:
+        rows = np.empty(len(piece), POINT_DTYPE)
+        rows["xyz"], rows["rgb"], rows["opacity"] = piece.means, to_uint8(base_colors(piece)), opacities(piece)
+        return rows
 
-    write_atomic(path, write)
-    write_crs_beside(path, scene.metadata)
+    write_vertices(path, scene, names, rows_of)
     return LOSS_NOTES
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from vdgs.errors import VdgsError
 from vdgs.export.formats.compressed_ply import compressed_ply_pieces, write_compressed_ply
-from vdgs.export.formats.export_scene import ExportScene, concatenate, metadata_path
-from vdgs.export.formats.gaussian_ply import beside_ply, read_ply_chunks, write_ply
+from vdgs.export.formats.export_scene import ExportScene, concatenate
+from vdgs.export.formats.gaussian_ply import read_ply_chunks, write_ply
 from vdgs.export.formats.gltf import check_glb_size, write_glb
 from vdgs.export.formats.html import check_viser, read_html_chunks, write_html
 from vdgs.export.formats.point_cloud import check_las_dependencies, write_laz, write_points
@@ -153,11 +153,3 @@ def read_chunks(path: Path) -> Iterator[Gaussians]:
         able = ", ".join(each.suffix for each in FORMATS if each.read)
         raise VdgsError(f"{path}: such files are written but not read. Readable are: {able}.")
     return chosen.read(path)
-
-
-def files_written(path: Path) -> tuple[Path, ...]:
-    """The files that writing `path` replaces, beside the tiles of a tileset."""
-    chosen = format_from_path(path)
-    if chosen.suffix.endswith(".ply"):
-        return (path, beside_ply(path))
-    return (path, metadata_path(path)) if chosen.writes_metadata_file else (path,)

@@ -24,7 +24,6 @@ from vdgs.export.formats.axes import Y_UP, axes_beside, in_ground
 from vdgs.export.formats.export_scene import (
     CHUNK_SIZE,
     ExportScene,
-    concatenate,
     logits_from_opacity,
     opacities,
     to_uint8,
@@ -214,7 +213,7 @@ def read_spz_chunks(path: Path) -> Iterator[Gaussians]:
         raise VdgsError(f"{path}: cannot be read ({error.strerror or error}).") from error
     except zlib.error as error:
         raise VdgsError(f"{path}: is no SPZ of versions 2 to 4, or damaged ({error}). Write it again.") from None
-    yield from in_ground(_decode(data, path), axes_beside(path, Y_UP))
+    yield from in_ground(decode_spz(data, path), axes_beside(path, Y_UP))
 
 
 def _of_streams(packed: bytes, path: Path) -> bytes:
@@ -236,12 +235,8 @@ def _of_streams(packed: bytes, path: Path) -> bytes:
     return b"".join(parts)
 
 
-def decode_spz(data: bytes, path: Path) -> Gaussians:
+def decode_spz(data: bytes, path: Path) -> Iterator[Gaussians]:
     """Gaussians, y up, of an inflated file; `path` is for what is said of a damaged one (VdgsError)."""
-    return concatenate(_decode(data, path))
-
-
-def _decode(data: bytes, path: Path) -> Iterator[Gaussians]:
     if (
         len(data) < HEADER_STRUCT.size
         or (fields := HEADER_STRUCT.unpack_from(data))[0] != MAGIC
