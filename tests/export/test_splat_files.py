@@ -16,6 +16,7 @@ from vdgs.errors import VdgsError
 from vdgs.export.formats import export_scene, registry, spz
 from vdgs.export.formats.axes import Y_DOWN, Y_UP
 from vdgs.export.formats.export_scene import ExportMetadata, ExportScene, metadata_path
+from vdgs.export.formats.gaussian_ply import read_ply_chunks
 from vdgs.export.formats.parallel_gzip import gzip_blocks
 from vdgs.export.formats.quaternion_canonical import canonicalize_quaternions
 from vdgs.model.gaussian_transform import gaussian_covariances, transform_gaussians
@@ -344,7 +345,7 @@ def test_damaged_files_are_named(tmp_path, ending, what):
 def test_point_clouds_and_text_are_no_scenes(tmp_path):
     registry.write_scene(tmp_path / "a.points.ply", ExportScene.of(random_gaussians(3, 0)))
     with pytest.raises(VdgsError, match="no PLY of 3DGS"):
-        registry.read_gaussians(tmp_path / "a.points.ply")
+        list(read_ply_chunks(tmp_path / "a.points.ply"))
 
 
 def test_a_stream_that_is_packed_in_parallel_is_one_gzip_member():
