@@ -141,6 +141,7 @@ def test_a_run_is_looked_at_closely_where_anything_differs(native_small: NativeR
         (["mrege"], "there is no verb 'mrege'; did you mean 'merge'?"),
         (["run", "C", "--outptu", "R"], "there is no option --outptu; did you mean --output?"),
         (["run", "C", "--out", "R", "--max-anchor", "5"], "did you mean --densify.max-anchors?"),
+        (["run", "C", "--out", "R", "--group-that-was.mvs"], "did you mean --init.mvs?"),
         (["export", "R", "--modle=best"], "there is no option --modle; did you mean --model?"),
         (["run", "C"], "--output PATH is missing"),
         (["run", "-o"], "--output needs a value: a path"),

@@ -214,8 +214,10 @@ def _is_number(word: str) -> bool:
 
 
 def _suggestion(name: str, known: dict[str, Option]) -> str:
-    """A question about the option that may be meant: by its whole name, or by that within its group."""
+    """A question about the option that may be meant: by its whole name, by that within its group, or in another group."""
     within = {f"--{each.rpartition('.')[2]}": each for each in reversed(known) if "." in each}
     candidates = within | {each: each for each in known}
-    like = difflib.get_close_matches(name, list(candidates), n=1, cutoff=0.7)
-    return f"; did you mean {candidates[like[0]]}?" if like else ""
+    for sought in (name, f"--{name.removeprefix('--').rpartition('.')[2]}"):
+        if like := difflib.get_close_matches(sought, list(candidates), n=1, cutoff=0.7):
+            return f"; did you mean {candidates[like[0]]}?"
+    return ""
