@@ -214,7 +214,7 @@ def _is_number(word: str) -> bool:
 
 
 def _suggestion(name: str, known: dict[str, Option]) -> str:
-    """A question about the option that may be meant: by its whole name, by that within its group, or in another group."""
+    """A question about the option that may be meant: by its whole name, or by that within its group or another one."""
     within = {f"--{each.rpartition('.')[2]}": each for each in reversed(known) if "." in each}
     candidates = within | {each: each for each in known}
     for sought in (name, f"--{name.removeprefix('--').rpartition('.')[2]}"):
