@@ -9,17 +9,19 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from support.captures import tiny_scene, write_colmap
 from vdgs.captures.loading import load_capture, read_files
 from vdgs.cli.common import make_console
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RunRequest
+from vdgs.config.method import block_train_config
 from vdgs.config.presets import PRESETS
 from vdgs.errors import Interrupted
 from vdgs.pipeline import dry_run, image_size, time_estimate
 from vdgs.pipeline.image_size import ImageSize, choose_image_size, image_sizes, largest_suitable
-from vdgs.pipeline.time_estimate import StepTimes, measure_textures
+from vdgs.pipeline.time_estimate import Growth, StepTimes, measure_textures
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
 from vdgs.system.processor_time import Cost
@@ -59,34 +61,71 @@ def test_the_sizes_of_a_capture_are_its_folders_and_the_smallest_of_them_shrunk(
     assert {each.images for each in undistorted} == {"images"}
 
 
-def step_times(fixed: float, per_pixel: float) -> StepTimes:
-    return StepTimes(
-        fixed=Cost(fixed / 2, fixed), per_pixel=Cost(per_pixel / 2, per_pixel), anchor_share=0.5, slowdown=1.0
-    )  # fmt: skip
+def step_times(fixed: float, per_pixel: float, per_anchor: float = 0.0) -> StepTimes:
+    costs = [Cost(seconds / 2, seconds) for seconds in (fixed, per_pixel, per_anchor)]
+    return StepTimes(fixed=costs[0], per_pixel=costs[1], per_anchor=costs[2], slowdown=1.0)
 
 
 def test_steps_of_all_sizes_follow_from_those_of_one():
     """A stage of a schedule in sizes: 30 % of its steps at a quarter of the pixels, 70 % whole."""
-    config = replace(
-        PRESETS["laptop"].training, iterations=1000, resolution_schedule=((0.0, 2), (0.3, 1)),
-        densify=replace(PRESETS["laptop"].training.densify, num_levels=0),
-    )  # fmt: skip
+    config = replace(PRESETS["laptop"].training, iterations=1000, resolution_schedule=((0.0, 2), (0.3, 1)))
     steps = step_times(0.01, 1e-7)
-    assert steps.step(1_000_000).processor_seconds == pytest.approx(0.11)
-    taken = steps.stage(config, 1_000_000, 17.0, np.inf).processor_seconds
+    assert steps.step(1_000_000, 0).processor_seconds == pytest.approx(0.11)
+    taken = steps.stage(config, 1_000_000, 1e5, 1.0).processor_seconds
     assert taken == pytest.approx(300 * (0.01 + 0.025) + 700 * 0.11)
-    assert steps.stage(config, 0, 17.0, np.inf).processor_seconds == pytest.approx(1000 * 0.01)
-    twice = steps.stage(config, 1_000_000, 17.0, np.inf, start=2.0).processor_seconds
-    assert twice == pytest.approx(1.5 * taken)  # half of a step goes with the anchors
+    assert steps.stage(config, 0, 1e5, 1.0).processor_seconds == pytest.approx(1000 * 0.01)
+    with_anchors = step_times(0.01, 1e-7, 1e-6).stage(config, 1_000_000, 1e5, 1.0).processor_seconds
+    assert with_anchors == pytest.approx(taken + 1000 * 0.1)
 
 
-def test_textured_photographs_take_longer():
+def test_steps_are_divided_into_what_pixels_take_and_what_anchors_take(monkeypatch):
+    """Of a machine whose steps take 1 ms, 100 ns for each pixel and 1 us for each anchor."""
+    cameras = {1: SimpleNamespace(width=1000, height=800), 4: SimpleNamespace(width=250, height=200)}
+    stage = SimpleNamespace(images=SimpleNamespace(camera=lambda index, factor: cameras[factor]))
+
+    def cost(stage: object, anchors: torch.Tensor, factor: int, fit: bool) -> tuple[Cost, float]:
+        seconds = 1e-3 + 1e-7 * cameras[factor].width * cameras[factor].height + 1e-6 * len(anchors)
+        return Cost(seconds / 2, seconds), 1.0
+
+    monkeypatch.setattr(time_estimate, "_step_cost", cost)
+    steps = time_estimate.time_steps(stage, Selectable(60_000), False)
+    assert steps.step(2_000_000, 100_000).processor_seconds == pytest.approx(1e-3 + 0.2 + 0.1)
+    assert steps.step(2_000_000, 100_000).seconds == pytest.approx((1e-3 + 0.2 + 0.1) / 2)
+
+
+class Selectable(list):
+    """Stands for so many anchors."""
+
+    def __init__(self, count: int) -> None:
+        super().__init__(range(count))
+
+    def select(self, mask: torch.Tensor) -> Selectable:
+        return Selectable(int(mask.sum()))
+
+
+def growth(texture: float, more: float = 1.0, room: float = np.inf) -> Growth:
+    return Growth(texture=texture, more=more, room=room)
+
+
+def test_anchors_grow_with_the_texture_until_each_has_its_pixel():
     config = replace(PRESETS["laptop"].training, iterations=3000)
-    steps = step_times(0.01, 1e-7)
-    smooth, rough = (steps.stage(config, 100_000, texture, np.inf).seconds for texture in (10.0, 34.0))
-    assert rough > 1.3 * smooth
-    full = steps.stage(config, 100_000, 34.0, room=1.0).seconds
-    assert full < smooth  # an anchor for each pixel: no growth
+    smooth, rough = (growth(texture).coarse(config) for texture in (10.0, 34.0))
+    assert 1 < smooth < rough / 1.3
+    assert growth(34.0, room=1.0).coarse(config) == 1  # an anchor for each pixel
+    assert growth(34.0, room=2.0).coarse(config) == 2
+    assert growth(34.0, more=3.0).coarse(config) - 1 == pytest.approx((rough - 1) / 3)  # what stereo adds does not grow
+    frozen = replace(config, densify=replace(config.densify, num_levels=0))
+    assert growth(34.0).coarse(frozen) == 1
+
+
+def test_blocks_go_on_growing_where_the_coarse_model_ended():
+    method = PRESETS["laptop"]
+    coarse, block = replace(method.training, iterations=3000), block_train_config(method, 15)
+    first = growth(34.0).coarse(coarse)
+    later = growth(34.0).block(coarse, block)
+    assert 1 < later < 1.1 < first
+    paper = PRESETS["paper"]
+    assert growth(34.0).block(coarse, block_train_config(paper, 15)) > 5  # compensated below a fixed threshold
 
 
 def test_texture_is_measured_at_each_size(capture):

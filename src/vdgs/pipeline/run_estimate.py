@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from vdgs.captures.capture import Capture
 from vdgs.captures.image_cache import ImageCache
 from vdgs.config.commands import RunRequest
-from vdgs.config.method import MethodConfig, block_train_config
+from vdgs.config.method import MethodConfig, TrainConfig, block_train_config
 from vdgs.distributed.resource_allocation import Allocation, ShardWorkload, allocate_local, exceeds_memory
 from vdgs.geometry.camera import Camera
 from vdgs.kernels import get_num_threads
@@ -26,8 +26,10 @@ from vdgs.pipeline.time_estimate import (
     OTHER_SECONDS,
     SMALL_FACTOR,
     START_SECONDS,
+    Growth,
     StepTimes,
-    expected_growth,
+    crowd,
+    mean_growth,
     measure_textures,
     probed_views,
     time_steps,
@@ -49,7 +51,9 @@ from vdgs.training.session.trainer import image_cache_bytes
 
 START = Cost(START_SECONDS, START_SECONDS)
 #: Steps are timed at the largest size of so many pixels at most.
-MAX_PROBED_PIXELS = 500_000
+MAX_PROBED_PIXELS = 700_000
+#: Share of the points that stereo may add which it finds, where it finds any.
+STEREO_SHARE = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,27 +127,40 @@ def probe(scene: Scene, method: MethodConfig, request: RunRequest, factors: Sequ
     budget = image_cache_bytes(request.checkpointing)
     one_size = replace(config, resolution_schedule=((0.0, SMALL_FACTOR),))
     cameras = [view.camera for view in capture.train_views]
+    textures = measure_textures(capture.train_views, factors)
     with ImageCache(views, budget, downscales=(1, SMALL_FACTOR)) as images:
         stage, _ = build_coarse_problem(replace(capture, views=tuple(views)), one_size, images, request.device)
-        anchors, _ = initialize_anchors(
-            capture.points, capture.point_colors, cameras, config.init, config.model.num_offsets
-        )
+        begun = (capture.points, capture.point_colors, cameras, config.init, config.model.num_offsets)
+        anchors, voxel = initialize_anchors(*begun)
         workload = training_workload(initial_coarse_state(anchors, stage, config.exposure_compensation), stage)
+        growth = _growth(scene, workload, config, at, textures[at])
+        grown = growth.more * mean_growth(config, growth.coarse(config))
+        extra = crowd(capture, grown, voxel)
+        anchors, _ = initialize_anchors(*begun, extra)
         steps = time_steps(stage, anchors, config.exposure_compensation)
     stereo = 0.0
-    if config.init.mvs and _dense_room(scene, min(factors)):
+    if _dense_room(scene, config, min(factors)):
         with ImageCache(capture.train_views, budget) as images:
             stereo = time_stereo(capture, images, config.init)
-    return Probe(
-        steps=steps, textures=measure_textures(capture.train_views, factors), stereo=stereo, workload=workload
-    )  # fmt: skip
+    return Probe(steps=steps, textures=textures, stereo=stereo, workload=workload)
+
+
+def _growth(
+    scene: Scene, workload: TrainingWorkload, config: TrainConfig, factor: float, texture: float
+) -> Growth:  # fmt: skip
+    sparse = max(1.0, workload.anchors * scene.points / max(1, len(scene.timed.points)))
+    more = 1 + _dense_room(scene, config, factor) * STEREO_SHARE / sparse
+    camera = _shrunk(scene.cameras[:1], factor)[0]
+    room = camera.width * camera.height / max(1.0, workload.seen * sparse * more)
+    return Growth(texture=texture, more=more, room=room)
 
 
 def estimate_at(scene: Scene, probed: Probe, method: MethodConfig, request: RunRequest, factor: float) -> RunEstimate:
     """What the run takes with photographs whose sides are shrunk by `factor` from the cameras of the scene."""
     config, views, steps = method.training, len(scene.cameras), probed.steps
     cameras, texture = _shrunk(scene.cameras, factor), probed.textures[factor]
-    dense = _dense_room(scene, factor) if config.init.mvs else 0
+    growth = _growth(scene, probed.workload, config, factor, texture)
+    dense = _dense_room(scene, config, factor)
     stereo = views * probed.stereo if dense else 0.0
     share = scene.points / max(1, len(scene.timed.points))
     images_bytes = decoded_image_bytes(cameras)
@@ -165,17 +182,16 @@ def estimate_at(scene: Scene, probed: Probe, method: MethodConfig, request: RunR
     )  # fmt: skip
     local = allocate_local(work, get_num_threads(), free)
     block = block_train_config(method, max(1, round(views * min(1.0, 1.5 / blocks))))
-    more = 1 + dense / max(sparse.anchors, 1) / 2  # stereo fills half of what it may, where it fills any
     drawn = cameras[0].width * cameras[0].height
-    room = drawn / max(1.0, probed.workload.seen * sparse.anchors * more)
-    growth = expected_growth(config, texture, room)
+    coarse_growth, block_growth = growth.coarse(config), growth.block(config, block)
+    start = probed.workload.anchors * growth.more  # of the scene whose steps were timed
+    grown = start * coarse_growth
+    block_steps = steps.stage(block, drawn, grown, block_growth)
     times = {
         "stereo": Cost(stereo / get_num_threads(), stereo),
-        "coarse": steps.stage(config, drawn, texture, room, more),
-        "blocks": _side_by_side(
-            (steps.stage(block, drawn, texture, room / growth, more * growth) + START) * blocks, local
-        ),
-        **_other_times(scene, steps.step(drawn), bool(request.ortho)),
+        "coarse": steps.stage(config, drawn, start, coarse_growth),
+        "blocks": _side_by_side((block_steps + START) * blocks, local),
+        **_other_times(scene, steps.step(drawn, grown), bool(request.ortho)),
     }
     return RunEstimate(
         anchors=sparse.anchors,
@@ -189,7 +205,7 @@ def estimate_at(scene: Scene, probed: Probe, method: MethodConfig, request: RunR
         block_bytes=block_bytes,
         images_bytes=min(images_bytes, round(1e9 * local.image_gb)),
         may_exceed_memory=coarse_bytes > free or exceeds_memory(work, local.max_concurrent, free),
-        growth=(growth, expected_growth(block, texture, room / growth)),
+        growth=(coarse_growth, block_growth),
         times=times,
         slowdown=steps.slowdown,
     )
@@ -201,8 +217,10 @@ def _shrunk(cameras: Sequence[Camera], factor: float) -> list[Camera]:
     ]
 
 
-def _dense_room(scene: Scene, factor: float) -> int:
+def _dense_room(scene: Scene, config: TrainConfig, factor: float) -> int:
     """The most points that stereo may add to those that there are, or will be."""
+    if not config.init.mvs:
+        return 0
     pixels = sum(camera.width * camera.height for camera in _shrunk(scene.cameras, factor))
     return max(0, pixels // PIXELS_PER_POINT - scene.points)
 

@@ -36,6 +36,9 @@ PLAIN_GAIN, USUAL_TEXTURE, COMPENSATED_GROWTH, HALF_GROWTH_DECISIONS = 1.3, 17.0
 PROBED_VIEWS, SMALL_FACTOR = 6, 4
 #: Textures beyond these tell no more.
 TEXTURE_RANGE = (8.0, 36.0)
+#: Steps are timed with at most so many times as many anchors as sparse points make; how far those that are added lie
+#: from them, in voxels.
+MAX_CROWDING, CROWD_SPREAD = 20.0, 3.0
 #: Share of a photograph's stereo that confirming its depths adds to finding them.
 CONFIRMING = 0.15
 #: What measuring a view takes, in training steps of its size: of the coarse model, and of the merged one with its
@@ -46,40 +49,75 @@ COARSE_VIEW_STEPS, MERGED_VIEW_STEPS, MAP_STEPS, START_SECONDS, OTHER_SECONDS = 
 
 @dataclass(frozen=True, kw_only=True)
 class StepTimes:
-    """What a training step takes: some for its anchors and calls, and as much again for each pixel."""
+    """What a training step takes: some for its calls, and as much again for each pixel and for each anchor.
+
+    The two add up: anchors that grow become smaller, so that a pixel shows about as many of them as before.
+    """
 
     fixed: Cost
     per_pixel: Cost
-    anchor_share: float
-    """Of the time of a step at the size that was timed, what goes with the number of anchors."""
+    per_anchor: Cost
     slowdown: float
 
-    def step(self, pixels: float) -> Cost:
-        """A step of a photograph of so many pixels."""
-        return self.fixed + self.per_pixel * pixels
+    def step(self, pixels: float, anchors: float) -> Cost:
+        """A step of a photograph of so many pixels, with so many anchors in the scene."""
+        return self.fixed + self.per_pixel * pixels + self.per_anchor * anchors
 
-    def stage(self, config: TrainConfig, pixels: int, texture: float, room: float, start: float = 1.0) -> Cost:
-        """All steps of a stage, each at the size that the schedule gives it, with anchors that grow from `start` times
-        as many as were timed."""
+    def stage(self, config: TrainConfig, pixels: int, anchors: float, growth: float) -> Cost:
+        """All steps of a stage, each at the size that the schedule gives it, with anchors that grow from so many."""
         ends = [begin for begin, _ in config.resolution_schedule[1:]] + [1.0]
+        mean = anchors * mean_growth(config, growth)
         total = NO_COST
         for (begin, factor), end in zip(config.resolution_schedule, ends, strict=True):
-            total += self.step(pixels / factor**2) * (config.iterations * max(0.0, end - begin))
-        return total * (1 + self.anchor_share * (start * mean_growth(config, texture, room) - 1))
+            total += self.step(pixels / factor**2, mean) * (config.iterations * max(0.0, end - begin))
+        return total
 
 
-def expected_growth(config: TrainConfig, texture: float, room: float) -> float:
-    """How many times their number anchors become in a stage, by estimate. `room` is how many anchors there is a pixel
-    for, of a photograph, for each that it shows at the start: plain growth ends where each has its pixel."""
+@dataclass(frozen=True, kw_only=True)
+class Growth:
+    """How anchors become more by estimate, of a coarse model and then of its blocks."""
+
+    texture: float
+    """Of the photographs."""
+    more: float
+    """How many times the anchors of the sparse points the coarse model begins with: growth adds to the sparse ones."""
+    room: float
+    """How many anchors there is a pixel for, of a photograph, for each that it shows at the start: growth ends where
+    each has its pixel."""
+
+    def coarse(self, config: TrainConfig) -> float:
+        """How many times their number the anchors become in the coarse stage."""
+        return self._after(_decisions(config)) if config.densify.num_levels else 1.0
+
+    def block(self, coarse: TrainConfig, config: TrainConfig) -> float:
+        """The same in a block, which goes on where the coarse stage ended unless its compensation grows far more."""
+        decisions = _decisions(config)
+        if not config.densify.num_levels:
+            return 1.0
+        if max_growth_factor(config.compensation) != MAX_GROWTH:
+            return 1 + (COMPENSATED_GROWTH - 1) * _progress(decisions)
+        before = _decisions(coarse)
+        return self._after(before + decisions) / self._after(before)
+
+    def _after(self, decisions: float) -> float:
+        gain = PLAIN_GAIN * (float(np.clip(self.texture, *TEXTURE_RANGE)) / USUAL_TEXTURE) ** 2
+        return 1 + min(gain * _progress(decisions) / self.more, max(0.0, self.room - 1))
+
+
+def _decisions(config: TrainConfig) -> float:
     densify = config.densify
-    decisions = max(0.0, (densify.stop_fraction * config.iterations - densify.start) / densify.every)
-    if not densify.num_levels:
-        return 1.0
-    gain = PLAIN_GAIN * (float(np.clip(texture, *TEXTURE_RANGE)) / USUAL_TEXTURE) ** 2
-    if max_growth_factor(config.compensation) != MAX_GROWTH:
-        gain = COMPENSATED_GROWTH - 1
-        room = np.inf
-    return 1 + min(gain * decisions / (decisions + HALF_GROWTH_DECISIONS), max(0.0, room - 1))
+    return max(0.0, (densify.stop_fraction * config.iterations - densify.start) / densify.every)
+
+
+def _progress(decisions: float) -> float:
+    return decisions / (decisions + HALF_GROWTH_DECISIONS)
+
+
+def mean_growth(config: TrainConfig, growth: float) -> float:
+    """The mean over the steps of a stage: anchors grow from the first decision to the last."""
+    first = min(1.0, config.densify.start / max(1, config.iterations))
+    middle = (first + max(first, config.densify.stop_fraction)) / 2
+    return 1 + (growth - 1) * (1 - middle)
 
 
 def measure_textures(views: Sequence[View], factors: Sequence[float]) -> dict[float, float]:
@@ -99,30 +137,39 @@ def probed_views(views: Sequence[View]) -> list[View]:
     return [views[k] for k in np.unique(np.linspace(0, len(views) - 1, PROBED_VIEWS).round().astype(int))]
 
 
-def mean_growth(config: TrainConfig, texture: float, room: float) -> float:
-    """The mean over the steps of a stage: anchors grow from the first decision to the last."""
-    first = min(1.0, config.densify.start / max(1, config.iterations))
-    middle = (first + max(first, config.densify.stop_fraction)) / 2
-    return 1 + (expected_growth(config, texture, room) - 1) * (1 - middle)
+def crowd(capture: Capture, times: float, voxel: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points [n, 3] and colors near those of a capture, with which it has so many times as many anchors."""
+    more = max(0, round(min(times, MAX_CROWDING) * len(capture.points)) - len(capture.points))
+    rng = np.random.default_rng(0)
+    near = rng.integers(0, len(capture.points), more)
+    return capture.points[near] + rng.normal(0, CROWD_SPREAD * voxel, (more, 3)), capture.point_colors[near]
 
 
 def time_steps(stage: TrainingProblem, anchors: Anchors, fit_exposures: bool) -> StepTimes:
-    """Train a few steps of whole photographs, of smaller ones, and with half of the anchors."""
+    """Train a few steps of whole photographs, of smaller ones, and with half of the anchors.
+
+    The anchors are about as many as the stage will have: a line through those that it begins with would be followed
+    too far.
+    """
     full, slowdown = _step_cost(stage, anchors, 1, fit_exposures)
     fewer_pixels, _ = _step_cost(stage, anchors, SMALL_FACTOR, fit_exposures)
     half = anchors.select(torch.arange(len(anchors)) % 2 == 0)
     fewer_anchors = _step_cost(stage, half, 1, fit_exposures)[0] if len(half) else full
     cameras = [stage.images.camera(0, factor) for factor in (1, SMALL_FACTOR)]
     large, less = (camera.width * camera.height for camera in cameras)
-    slope = max(0.0, full.processor_seconds - fewer_pixels.processor_seconds) / max(1, large - less)
-    # What goes with pixels is shared by the threads as the whole step is.
+    # What goes with pixels and anchors is shared by the threads as the whole step is.
     clock = full.seconds / max(full.processor_seconds, 1e-9)
-    per_pixel = Cost(slope * clock, slope)
-    share = 2 * (1 - fewer_anchors.processor_seconds / max(full.processor_seconds, 1e-9))
+
+    def slope(other: Cost, difference: int, most: float) -> float:
+        return min(max(0.0, full.processor_seconds - other.processor_seconds), most) / max(1, difference)
+
+    per_pixel = slope(fewer_pixels, large - less, full.processor_seconds)
+    left = full.processor_seconds - per_pixel * large
+    per_anchor = slope(fewer_anchors, len(anchors) - len(half), max(0.0, left) / 2)
     return StepTimes(
-        fixed=full + per_pixel * -large,
-        per_pixel=per_pixel,
-        anchor_share=float(np.clip(share, 0.2, 1.0)),
+        fixed=full + Cost(per_pixel * clock, per_pixel) * -large + Cost(per_anchor * clock, per_anchor) * -len(anchors),
+        per_pixel=Cost(per_pixel * clock, per_pixel),
+        per_anchor=Cost(per_anchor * clock, per_anchor),
         slowdown=slowdown,
     )
 
