@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vdgs.errors import CaptureError
+from vdgs.geometry.geodesy import geodetic_from_ecef
 
 ToGeodetic = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n 3"]]
 _STARTS = re.compile(
@@ -25,8 +26,9 @@ def names_a_system(line: str) -> bool:
     return bool(_STARTS.match(line.strip()))
 
 
-def to_geodetic(header: str, file: Path) -> tuple[ToGeodetic, str]:
-    """What brings x, y, z [n, 3] (x east or longitude) to latitude, longitude and height, and the name of their system.
+def to_geodetic(header: str, file: Path, where: str = "the first line") -> tuple[ToGeodetic, str]:
+    """What brings x, y, z [n, 3] (x east or longitude) to latitude, longitude and height, and the name of their system,
+    which `header` names; `where` that stands in the file.
 
     Raises CaptureError for a system that is unknown, and without pyproj.
     """
@@ -40,7 +42,7 @@ def to_geodetic(header: str, file: Path) -> tuple[ToGeodetic, str]:
         change = pyproj.Transformer.from_crs(crs, "EPSG:4326" if flat else "EPSG:4979", always_xy=True)
     except pyproj.exceptions.ProjError:
         raise CaptureError(
-            f"{file}: the first line must name the coordinate system (EPSG:32615, WGS84 UTM 15N, or a PROJ string), "
+            f"{file}: {where} must name the coordinate system (EPSG:32615, WGS84 UTM 15N, or a PROJ string), "
             f"and {header[:60]!r} names none."
         ) from None
 
@@ -55,6 +57,42 @@ def to_geodetic(header: str, file: Path) -> tuple[ToGeodetic, str]:
     name = crs.name if crs.name != "unknown" else header
     feet = flat and crs.is_projected and "foot" in (crs.axis_info[0].unit_name or "")
     return changed, f"{name}; x and y in feet, heights are taken as metres" if feet else name
+
+
+def is_local_system(name: str) -> bool:
+    """Whether a system is one of a site, without a place on Earth."""
+    return bool(re.match(r"\s*(LOCAL|ENG(INEERING)?CRS|ENGCRS|\w*LOCAL_?CS)", name, re.I))
+
+
+def is_in_degrees(header: str) -> bool:
+    """Whether a system that `to_geodetic` knows counts across in degrees."""
+    import pyproj
+
+    return bool(pyproj.CRS.from_user_input(_named(header)).is_geographic)
+
+
+def geocentric_to_geodetic(header: str, file: Path) -> ToGeodetic:
+    """What brings Earth-centred metres of the datum of a system to latitude, longitude and height of WGS 84."""
+    if re.search(r"EPSG:4326|GEOG(CS|CRS|RAPHICCRS)\[\s*\"WGS[ _]?(19)?84", header, re.I):
+        return geodetic_from_ecef
+    try:
+        import pyproj
+        from pyproj.crs.crs import GeocentricCRS
+    except ImportError:
+        raise CaptureError(f"{file}: needs pyproj: pip install 'vdgs[geo]'.") from None
+    try:
+        crs = pyproj.CRS.from_user_input(_named(header))
+        plain = crs.source_crs if crs.is_bound and crs.source_crs is not None else crs
+        datum = (plain.geodetic_crs or plain).datum
+        change = pyproj.Transformer.from_crs(GeocentricCRS(datum=datum), "EPSG:4979", always_xy=True)
+    except (pyproj.exceptions.ProjError, TypeError, AttributeError):
+        raise CaptureError(f"{file}: the coordinate system {header[:60]!r} is not understood.") from None
+
+    def changed(places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        longitude, latitude, height = change.transform(*places.T)
+        return np.stack([latitude, longitude, height], axis=1)
+
+    return changed
 
 
 def _named(header: str) -> str:

@@ -20,6 +20,7 @@ from vdgs.captures.formats.sparse_points import POINT_CLOUDS, find_point_cloud
 from vdgs.captures.formats.transforms import TRANSFORMS_FILE, exclusive_information, read_transforms
 from vdgs.captures.image_files import IMAGE_SUFFIXES, find_images
 from vdgs.captures.nested_captures import foreign_poses, model_below
+from vdgs.captures.project_formats import PROJECTS, find_projects, read_project
 from vdgs.captures.reconstruction import is_reconstruction
 from vdgs.captures.strays import check_no_run
 from vdgs.config.capture_options import CaptureOptions
@@ -33,15 +34,19 @@ def read_source(root: Path, options: CaptureOptions) -> SourceCapture:
     Raises `CaptureError` where there is none, and as the readers do.
     """
     here = [name for name, (is_here, _) in READERS.items() if is_here(root)]
+    here += dict.fromkeys(name for name, _ in find_projects(root))
     if options.format != "auto":
         if options.format not in here:
             found = f"It holds: {', '.join(here)}." if here else "It holds none that is known."
             raise CaptureError(f"{root}: --format {options.format}, but the folder holds no such capture. {found}")
-        return READERS[options.format][1](root, options)
+        return _read(root, options.format, options)
     if here[:2] == ["colmap", "transforms"]:
+        check_folder("--images", options.images)
         return _of_both(root, options)
     if here:
-        return READERS[here[0]][1](root, options)
+        source = _read(root, here[0], options)
+        note = f"{' and '.join(here[1:])} beside it: not read (--format chooses)."
+        return replace(source, warnings=(note, *source.warnings)) if PROJECTS.keys() & here[1:] else source
     check_no_run(root)
     if is_reconstruction(root):
         raise CaptureError(
@@ -54,9 +59,24 @@ def read_source(root: Path, options: CaptureOptions) -> SourceCapture:
     others = "".join(f"Not read: {poses}. " for poses in foreign_poses(root)) if root.is_dir() else ""
     raise CaptureError(
         f"{root}: not a capture. {partial_model(root)}{others}Looked for a COLMAP model (sparse/0/cameras.bin and "
-        "images.bin, or .txt), transforms.json (nerfstudio), train/metadata/*.pt (Mega-NeRF) and transforms_train.json "
-        f"(MatrixCity). Photographs alone become one first: vdgs sfm {shell_word(root)} --output CAPTURE"
+        "images.bin, or .txt), transforms.json (nerfstudio), train/metadata/*.pt (Mega-NeRF), transforms_train.json "
+        f"(MatrixCity) and projects of {', '.join(form.program for form in PROJECTS.values())}. Photographs alone "
+        f"become one first: vdgs sfm {shell_word(root)} --output CAPTURE"
     )
+
+
+def _read(root: Path, name: str, options: CaptureOptions) -> SourceCapture:
+    """The capture of a format that is there."""
+    if name in PROJECTS:
+        return read_project(root, name, options)
+    check_folder("--images", options.images)
+    return READERS[name][1](root, options)
+
+
+def check_folder(flag: str, folder: str | None) -> None:
+    """Raise `CaptureError` for an option that must name a folder inside the capture, and does not."""
+    if folder is not None and (Path(folder).is_absolute() or ".." in Path(folder).parts or not folder):
+        raise CaptureError(f"{flag} {folder}: must be a folder inside the capture, such as images_4.")
 
 
 def _of_both(root: Path, options: CaptureOptions) -> SourceCapture:

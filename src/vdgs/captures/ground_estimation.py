@@ -24,7 +24,7 @@ import numpy as np
 
 from vdgs.captures.camera_height import view_distance
 from vdgs.captures.formats.source_capture import SourceCapture, WorldPrior
-from vdgs.captures.georeference import match_gps, read_georef
+from vdgs.captures.georeference import Georef, match_gps, read_georef
 from vdgs.captures.known_distances import MOST_APART, known_scale_of_views
 from vdgs.captures.plane_fit import mirrored
 from vdgs.captures.position_fit import Problem, Up, fit_positions
@@ -106,17 +106,17 @@ def _frame_without_distances(
         return _unscaled(scene, rotation, f"up = {options.up} as given", warnings), warnings
     if options.georef and options.gps:
         raise CaptureError("--georef and --gps both say where the world is; give one.")
-    georef = options.georef or (root / "georef.json" if (root / "georef.json").is_file() else None)
-    if georef and options.georef is None and options.gps is not None:
-        georef = None  # what was asked for wins over what lies about
-    if georef:
-        frame = _georeferenced(scene, georef, warnings)
+    georef = _georef(source, root, options, warnings)
+    if georef is not None:
+        frame = _georeferenced(scene, *georef, warnings)
         _compare_up(scene, frame, warnings)
         return frame, warnings
     if options.gps:
         frame_or_none = _from_gps(scene, options.gps, warnings)
         if frame_or_none is not None:
             return frame_or_none, warnings
+        if source.georef is not None:
+            return _georeferenced(scene, source.georef, source.georef.method, warnings), warnings
     if source.world is not None:
         frame = _promised(scene, source.world, warnings)
         _compare_up(scene, frame, warnings)
@@ -135,9 +135,27 @@ def _scene(source: SourceCapture) -> _Scene:
 # ----------------------------------------------------------------------------------------- georeference
 
 
-def _georeferenced(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame:
+def _georef(
+    source: SourceCapture, root: Path, options: CaptureOptions, warnings: list[str]
+) -> tuple[Georef, str] | None:
+    """What says that the world is metres, z up, and its name: the file asked for, else the capture's own files, else
+    georef.json beside it. None where nothing does, and where a table of positions was asked for instead."""
+    beside = root / "georef.json"
+    if source.georef is not None and options.gps is None:
+        if options.georef is not None:
+            raise CaptureError(
+                f"--georef {options.georef}: the capture says itself where it lies ({source.georef.method}), and its "
+                "world is made of that. Leave --georef out, or give --gps."
+            )
+        if beside.is_file():
+            warnings.append(f"georef.json is not used: the capture says itself where it lies ({source.georef.method}).")
+        return source.georef, source.georef.method
+    file = options.georef or (beside if beside.is_file() and options.gps is None else None)
+    return (read_georef(file), file.name) if file else None
+
+
+def _georeferenced(scene: _Scene, georef: Georef, name: str, warnings: list[str]) -> GroundFrame:
     """Identity rotation in metres; the origin moves (by whole metres) only where float32 needs it."""
-    georef = read_georef(file)
     accuracy = f"; {georef.accuracy}" if georef.accuracy else ""
     if georef.origin is None:
         return GroundFrame(
@@ -145,22 +163,22 @@ def _georeferenced(scene: _Scene, file: Path, warnings: list[str]) -> GroundFram
             rotation=np.eye(3),
             translation=np.zeros(3),
             metric=True,
-            description=f"world is metres, z up ({file.name}{accuracy})",
+            description=f"world is metres, z up ({name}{accuracy})",
             accuracy=georef.accuracy,
-            method=georef.method or f"{file.name}, which does not say how",
+            method=georef.method or f"{name}, which does not say how",
         )
-    origin, how = georef.origin, f"world is ENU metres ({file.name}{accuracy})"
+    origin, how = georef.origin, f"world is ENU metres ({name}{accuracy})"
     middle = np.median(scene.centers, axis=0)
     shift = np.where(np.abs(middle) > FAR_FROM_ORIGIN_M, -np.round(middle), 0.0)
     if shift.any():
         how = f"{how}, origin moved by {np.abs(shift).max():.0f} m"
     frame = GroundFrame(
         scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, description=how, origin_geo=origin,
-        accuracy=georef.accuracy, method=georef.method or f"{file.name}, which does not say how",
+        accuracy=georef.accuracy, method=georef.method or f"{name}, which does not say how",
     )  # fmt: skip
     if np.linalg.norm(middle) > MAX_ENU_DISTANCE_M:
         warnings.append(
-            f"{file.name}: the cameras are {np.linalg.norm(middle) / 1000:,.0f} km away from the origin, where its "
+            f"{name}: the cameras are {np.linalg.norm(middle) / 1000:,.0f} km away from the origin, where its "
             "east, north and up do not hold. Are these projected coordinates (UTM) instead of ENU? Metres and up "
             "are kept, latitude and longitude are not known."
         )

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from vdgs.captures.formats.source_capture import (
+    BROWN,
     SINGLE_FOCAL,
     Intrinsics,
     SourceCapture,
@@ -49,7 +50,7 @@ def match_images(
     paths = [view.image_path or folder / (name or view.name) for view, name in zip(source.views, found_as, strict=True)]
     there = [path.is_file() for path in paths]
     missing = [view.name for view, found in zip(source.views, there, strict=True) if not found]
-    warnings += refuse_many_missing(missing, len(paths), folder)
+    warnings += refuse_many_missing(missing, len(paths), folder, options.strict)
     views = tuple(view for view, found in zip(source.views, there, strict=True) if found)
     source, paths = replace(source, views=views), [path for path in paths if path.is_file()]
     named = set(paths)
@@ -153,4 +154,6 @@ def scale_intrinsics(intrinsics: Intrinsics, width: int, height: int) -> Intrins
         return Intrinsics("PINHOLE", (fx * sx, fy * sy, cx * sx, cy * sy), width, height)
     head = (fx * (sx + sy) / 2,) if intrinsics.model in SINGLE_FOCAL else (fx * sx, fy * sy)
     tail = intrinsics.params[len(head) + 2 :]
+    if intrinsics.model == BROWN:
+        tail = (*tail[:-1], tail[-1] * sx)  # skew is in pixels across
     return Intrinsics(intrinsics.model, (*head, cx * sx, cy * sy, *tail), width, height)

@@ -8,14 +8,16 @@ from pathlib import Path
 import numpy as np
 
 from vdgs.captures.capture import Capture, Observations, View
-from vdgs.captures.format_dispatch import read_source
+from vdgs.captures.format_dispatch import check_folder, read_source
 from vdgs.captures.formats.ply_reader import GRAY
+from vdgs.captures.formats.project_photographs import UNDISTORTED
 from vdgs.captures.formats.source_capture import SourceCapture, format_list
 from vdgs.captures.ground_estimation import find_ground_frame, transform_pose
 from vdgs.captures.image_checks import detect_rounding
 from vdgs.captures.image_files import MIN_SIDE_PX
 from vdgs.captures.image_matching import MatchedView, match_images
 from vdgs.captures.output_guard import check_not_among_files
+from vdgs.captures.project_formats import capture_root, is_project
 from vdgs.captures.splits import assign_splits, select_central_views
 from vdgs.captures.undistortion import ImageFile, undistort
 from vdgs.config.capture_options import CaptureOptions
@@ -40,7 +42,7 @@ def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
 
 def read_files(root: Path, options: CaptureOptions) -> SourceCapture:
     """The files of a capture, without its photographs. Raises as `load_capture`."""
-    if not root.is_dir():
+    if not root.is_dir() and not is_project(root):
         what = "is a file. Unpack an archive first, and give" if root.is_file() else "no such folder. Give"
         raise CaptureError(f"{root}: {what} the folder that holds images/ and sparse/.")
     _check_options(options)
@@ -49,10 +51,11 @@ def read_files(root: Path, options: CaptureOptions) -> SourceCapture:
 
 def make_capture(root: Path, source: SourceCapture, options: CaptureOptions) -> Capture:
     """The capture of files that are read (`read_files`). Raises as `load_capture`."""
+    root = capture_root(root)
     warnings = list(source.warnings)
     source = _without_bad_points(source, warnings)
     photographs, unused = match_images(root, source, options, warnings)
-    photographs = _undistorted(root, photographs, options, warnings)
+    photographs = _undistorted(root, source, photographs, options, warnings)
     _refuse_tiny(photographs, options)
     ground, ground_warnings = find_ground_frame(source, root, options)
     views = [_view(photo, options, ground) for photo in photographs]
@@ -81,9 +84,7 @@ def _check_options(options: CaptureOptions) -> None:
     found = find_range_errors(options)
     if found:
         raise CaptureError("\n  ".join(found))
-    for flag, folder in (("--images", options.images), ("--masks", options.masks)):
-        if folder is not None and (Path(folder).is_absolute() or ".." in Path(folder).parts or not folder):
-            raise CaptureError(f"{flag} {folder}: must be a folder inside the capture, such as images_4.")
+    check_folder("--masks", options.masks)
 
 
 # -------------------------------------------------------------------------------------------- points
@@ -120,20 +121,21 @@ def _without_bad_points(source: SourceCapture, warnings: list[str]) -> SourceCap
 
 
 def _undistorted(
-    root: Path, photographs: list[MatchedView], options: CaptureOptions, warnings: list[str]
+    root: Path, source: SourceCapture, photographs: list[MatchedView], options: CaptureOptions, warnings: list[str]
 ) -> list[MatchedView]:
-    """Pinhole photographs only: undistorts on request, else refuses lens distortion."""
+    """Pinhole photographs only: undistorts on request and where they are those of the camera, else refuses."""
     bent = [photo for photo in photographs if photo.file.intrinsics.is_distorted]
     if not bent:
         return photographs
-    if not options.undistort:
+    if not (options.undistort or source.original_images):
         models = sorted({photo.file.intrinsics.model for photo in bent})
         raise CaptureError(
             f"{root}: {len(bent)} photographs have a camera with lens distortion ({', '.join(models)}); "
             "training needs a pinhole. Add --undistort, or run colmap image_undistorter."
             f"{format_list(photo.view.name for photo in bent)}"
         )
-    folder = options.undistorted_folder or root / "undistorted" / (options.images or "images")
+    inside = "images" if source.original_images else options.images or "images"
+    folder = options.undistorted_folder or root / UNDISTORTED / inside
     files = [photo.file for photo in photographs]
     check_not_among_files(folder, root, [path for file in files for path in (file.path, file.mask) if path is not None])
     straight = undistort(folder, files)

@@ -11,6 +11,7 @@ from vdgs.captures.formats.matrixcity import pose_files
 from vdgs.captures.formats.mega_nerf import is_mega_nerf
 from vdgs.captures.image_files import IMAGE_SUFFIXES
 from vdgs.captures.output_guard import is_capture
+from vdgs.captures.project_formats import PROJECTS, find_projects
 from vdgs.system.quoting import shell_word
 
 #: So many folders deep a model is looked for: WORKSPACE/dense/0 with sparse in it, and one above.
@@ -20,8 +21,7 @@ _COLMAP = "it exports COLMAP"
 _OTHERS = {
     "reconstruction.json": "poses of OpenSfM or ODM; `opensfm export_colmap` makes a COLMAP model of them",
     "shots.geojson": "poses of ODM; `opensfm export_colmap` on its opensfm folder makes a COLMAP model of them",
-    "cameras.xml": f"poses of Metashape; {_COLMAP}",
-    "*.psx": f"a project of Metashape; {_COLMAP}",
+    "*.psx": "a project of Metashape; what it exports (File > Export > Export Cameras, Agisoft XML) is read",
     "*.rcproj": f"a project of RealityScan; {_COLMAP}",
     "*.nvm": "poses of VisualSFM; COLMAP's import_nvm (scripts/python) makes a model of them",
     "poses_bounds.npy": "poses of LLFF; the COLMAP model that they were made of is read",
@@ -38,6 +38,13 @@ def model_below(root: Path) -> str | None:
     for folder in _folders(root):
         if not is_capture(folder):
             continue
+        project = next(find_projects(folder), None)
+        if project is not None:
+            name, file = project
+            return (
+                f"{file} is a project of {PROJECTS[name].program}: vdgs run {shell_word(file)} --images "
+                f"{shell_word(root)} --output RUN"
+            )
         if _has_photographs(folder):
             return f"{folder} is a capture: vdgs run {shell_word(folder)} --output RUN"
         models = find_models(folder)

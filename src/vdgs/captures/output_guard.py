@@ -23,6 +23,7 @@ from vdgs.captures.formats.colmap import find_models
 from vdgs.captures.formats.matrixcity import pose_files
 from vdgs.captures.formats.mega_nerf import is_mega_nerf
 from vdgs.captures.image_files import IMAGE_SUFFIXES, UNREAD_IMAGE_SUFFIXES, has_camera
+from vdgs.captures.project_formats import is_project
 from vdgs.captures.reconstruction import is_reconstruction
 from vdgs.captures.strays import is_result, is_run, why_not_read
 from vdgs.errors import VdgsError
@@ -181,10 +182,11 @@ def _identity(folder: Path) -> tuple[int, int] | None:
 def is_capture(root: Path) -> bool:
     """Whether a folder is a capture, of any format that is read: photographs whose cameras are known."""
     try:
-        known = (root / "transforms.json").is_file() or is_mega_nerf(root) or pose_files(root) or find_models(root)
+        if (root / "transforms.json").is_file() or is_mega_nerf(root) or pose_files(root) or find_models(root):
+            return True
+        return is_project(root)
     except OSError:
         return False
-    return bool(known)
 
 
 def _error(output: Path, folder: Path, root: Path) -> VdgsError:

@@ -9,12 +9,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
-from vdgs.captures.formats.source_capture import Intrinsics
+from vdgs.captures.formats.brown_lens import brown_pinhole
+from vdgs.captures.formats.lens_projection import colmap_camera, ray_pixels
+from vdgs.captures.formats.source_capture import BROWN, Intrinsics
 from vdgs.captures.image_files import decode_image, decode_mask
 from vdgs.errors import CaptureError
 from vdgs.system.atomic_files import read_json_or_empty, write_bytes
@@ -71,10 +72,12 @@ def undistort(folder: Path, photographs: list[ImageFile]) -> list[ImageFile]:
 
 def undistorted_pinhole(intrinsics: Intrinsics) -> Intrinsics:
     """The pinhole camera whose picture holds no blank pixels (COLMAP's own choice of size and center)."""
+    if intrinsics.model == BROWN:
+        return brown_pinhole(intrinsics)
     from vdgs.system.lazy_pycolmap import pycolmap  # 60 MB of memory: only for lenses that need it
 
     try:
-        camera = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), _colmap(intrinsics))
+        camera = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), colmap_camera(intrinsics))
     except Exception as error:  # pycolmap raises plain ValueError and RuntimeError kinds
         raise CaptureError(
             f"the camera {intrinsics.model} {intrinsics.params} cannot be undistorted ({error}). "
@@ -93,12 +96,12 @@ def sampling_map(distorted: Intrinsics, pinhole: Intrinsics, strip_px: int = STR
     """
     (fx, fy), (cx, cy) = pinhole.focal, pinhole.principal_point
     x = (np.arange(pinhole.width) + 0.5 - cx) / fx
-    lens, rows = _colmap(distorted), max(1, strip_px // pinhole.width)
+    rows = max(1, strip_px // pinhole.width)
     found = np.empty((pinhole.height, pinhole.width, 2), np.float32)
     for first in range(0, pinhole.height, rows):
         y = (np.arange(first, min(first + rows, pinhole.height)) + 0.5 - cy) / fy
-        rays = np.stack([*np.broadcast_arrays(x[None], y[:, None]), np.ones((len(y), len(x)))], axis=-1)
-        pixels = np.asarray(lens.img_from_cam(rays.reshape(-1, 3)), dtype=np.float64)
+        rays = np.stack(np.broadcast_arrays(x[None], y[:, None]), axis=-1)
+        pixels = ray_pixels(distorted, rays.reshape(-1, 2))
         pixels = np.where(np.isfinite(pixels), pixels, -1e6)  # behind a fisheye's rim: outside
         found[first : first + rows] = (pixels - 0.5).reshape(len(y), len(x), 2)
     return found
@@ -140,14 +143,3 @@ def _write_straight(photo: ImageFile, grid: np.ndarray, target: Path, mask_targe
     mask = cv2.remap(keep.astype(np.uint8) * 255, x, y, cv2.INTER_NEAREST, borderValue=(0.0,))
     write_bytes(mask_target, cv2.imencode(".png", mask)[1].tobytes())
     return True
-
-
-def _colmap(intrinsics: Intrinsics) -> Any:
-    from vdgs.system.lazy_pycolmap import pycolmap
-
-    return pycolmap.Camera(
-        model=intrinsics.model,
-        width=intrinsics.width,
-        height=intrinsics.height,
-        params=list(intrinsics.params),
-    )

@@ -11,7 +11,7 @@ from vdgs.config.ranges import MAX_COUNT, Range
 
 UpAxis = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
 SplitMode = Literal["auto", "explicit", "every"]
-CaptureFormat = Literal["auto", "colmap", "transforms", "mega-nerf", "matrixcity"]
+CaptureFormat = Literal["auto", "colmap", "transforms", "mega-nerf", "matrixcity", "metashape", "blocks-exchange"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,7 +22,10 @@ class CaptureOptions:
     """Format to read, where a folder holds several. auto: of a COLMAP model and transforms.json the
     model, unless transforms.json lists training and test photographs or names masks."""
     images: str | None = None
-    """Image folder to use, such as images_4. Default: images, or where absent the largest images_N."""
+    """Image folder to use, such as images_4. Default: images, or where absent the largest images_N. Of a project of
+    another program: any folder that its photographs are in or below; default: images, or the whole folder."""
+    strict: bool = False
+    """Refuse a capture of which photographs are missing. By default the others are used where two thirds are there."""
     downscale: Annotated[float, Range(1, 1000)] = 1.0
     """Shrink images by this factor when they are loaded. 2: half the width and height."""
     test_every: Annotated[int, Range(2, MAX_COUNT)] = 8

@@ -46,7 +46,7 @@ def _same_request(run: RunFolder, request: RunRequest, command: str) -> bool:
     method, training = request.method(), request.training
     if not training.iterations:  # follows from the number of photographs, which are the same
         method = replace(method, training=replace(training, iterations=own.training.iterations))
-    return method == own.method and with_absolute_paths(request.options) == own.capture
+    return method == own.method and with_absolute_paths(request.options, request.capture) == own.capture
 
 
 def _is_whole(run: RunFolder, request: RunRequest) -> bool:

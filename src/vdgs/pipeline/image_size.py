@@ -70,7 +70,7 @@ def choose_image_size(request: RunRequest, console: Console) -> SizeChoice:
     is there already. Raises what `load_capture` raises."""
     if names_size(request):
         return SizeChoice(request=request)
-    root, options = request.capture.resolve(), with_absolute_paths(request.options)
+    root, options = request.capture.resolve(), with_absolute_paths(request.options, request.capture)
     source = read_files(root, options)
     capture = make_capture(root, source, options)
     sizes = image_sizes(capture, options)

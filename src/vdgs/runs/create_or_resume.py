@@ -65,7 +65,7 @@ def exclusive_run(
     check_config(method)
     check_output(output)
     if capture is None:
-        capture = load_capture(capture_path.resolve(), with_absolute_paths(capture_options))
+        capture = load_capture(capture_path.resolve(), with_absolute_paths(capture_options, capture_path))
     check_not_among_inputs(output, capture)
     method = replace(method, training=resolve_iterations(method.training, len(capture.train_views)))
     settings = run_settings(capture_path, capture_options, method)
@@ -122,4 +122,4 @@ def _write_place(capture: Capture, run: RunFolder) -> None:
 
 def run_settings(capture_path: Path, capture_options: CaptureOptions, method: MethodConfig) -> RunSettings:
     """The settings in config.yaml: everything that the result depends on."""
-    return RunSettings.create(capture_path.resolve(), with_absolute_paths(capture_options), method)
+    return RunSettings.create(capture_path.resolve(), with_absolute_paths(capture_options, capture_path), method)

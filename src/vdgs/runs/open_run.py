@@ -159,7 +159,7 @@ def open_capture(folder: RunFolder, at: Path | None = None) -> Capture:
     """
     settings = folder.settings()
     path = at or Path(settings.capture_path)
-    if at is None and not path.is_dir():
+    if at is None and not path.exists():
         raise CaptureError(
             f"{path}: the capture of {folder.path} is not there. If it was moved, give its folder: --capture PATH."
         )

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from vdgs.captures.project_formats import capture_root
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.method import AssignmentConfig, BlockConfig, MergeConfig, MethodConfig, PartitionConfig, TrainConfig
 from vdgs.config.ranges import iter_out_of_range
@@ -16,9 +17,12 @@ from vdgs.config.serialization import from_dict, to_dict
 SECTIONS = ("capture", "training", "partition", "assignment", "block", "merge")
 
 
-def with_absolute_paths(options: CaptureOptions) -> CaptureOptions:
+def with_absolute_paths(options: CaptureOptions, capture: Path) -> CaptureOptions:
     """As config.yaml holds them: stages hand the capture on, also to other machines."""
     paths: dict[str, Any] = {name: path.resolve() for name, path in vars(options).items() if isinstance(path, Path)}
+    images = options.images
+    if images and not (capture_root(capture) / images).is_dir() and Path(images).is_dir():  # outside the capture
+        paths["images"] = Path(images).resolve().as_posix()
     return replace(options, **paths)
 
 

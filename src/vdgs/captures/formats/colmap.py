@@ -17,12 +17,12 @@ from vdgs.captures.capture import Observations
 from vdgs.captures.formats.colmap_binary import read_cameras_binary, read_images_binary, read_points3D_binary
 from vdgs.captures.formats.colmap_records import ColmapImage, ColmapPoints, empty_points
 from vdgs.captures.formats.colmap_text import read_cameras_text, read_images_text, read_points3D_text
+from vdgs.captures.formats.lens_projection import pixel_rays
 from vdgs.captures.formats.source_capture import (
     Intrinsics,
     SourceView,
     find_duplicates,
     format_list,
-    pixel_rays,
     safe_name,
     to_rigid,
 )

@@ -83,7 +83,7 @@ def read_matrixcity(root: Path, options: CaptureOptions) -> SourceCapture:
             view, scale = _read_frame(image, frame, content, file, split)
             views.append(view)
             scales.add(scale)
-    warnings = _missing(missing, count, root)
+    warnings = _missing(missing, count, root, options.strict)
     twice = find_duplicates(view.name for view in views)
     if twice:
         raise CaptureError(f"{root}: the same image occurs more than once in the pose files.{format_list(twice)}")
@@ -125,9 +125,9 @@ def _of_a_city(frame: JsonObject) -> bool:
     return any(CITY_PATTERN.fullmatch(part) for part in PurePosixPath(str(frame.get("file_path", ""))).parts)
 
 
-def _missing(missing: list[str], count: int, root: Path) -> tuple[str, ...]:
+def _missing(missing: list[str], count: int, root: Path, strict: bool) -> tuple[str, ...]:
     try:
-        return tuple(refuse_many_missing(missing, count, root))
+        return tuple(refuse_many_missing(missing, count, root, strict))
     except CaptureError as error:
         raise CaptureError(f"{error}\n(Unpack the .tar of each block into the block's folder.)") from None
 

@@ -58,7 +58,7 @@ def read_mega_nerf(root: Path, options: CaptureOptions) -> SourceCapture:
     for folder, split in SPLIT_FOLDERS:
         views += _read_folder(root, folder, images, split, origin, scale, missing)
     try:
-        warnings = refuse_many_missing(missing, len(views) + len(missing), root)
+        warnings = refuse_many_missing(missing, len(views) + len(missing), root, options.strict)
     except CaptureError as error:
         raise CaptureError(
             f"{error}\n(For UrbanScene3D, copy the raw photographs as Mega-NeRF's README says.)"

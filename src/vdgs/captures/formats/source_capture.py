@@ -15,6 +15,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 import numpy as np
 
 from vdgs.captures.capture import Observations, Split
+from vdgs.captures.georeference import Georef
 from vdgs.errors import CaptureError
 
 #: COLMAP's camera models: identifier -> (name, number of parameters).
@@ -37,15 +38,18 @@ PINHOLE_WHEN_ZERO = {
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVISION",
     "DIVISION",
 }  # fmt: skip
+#: The lens of `brown_lens`, which is none of COLMAP's.
+BROWN = "BROWN"
 MAX_SIDE_PX = 100_000
-MAX_LISTED = 10
+#: Names that messages list, and those of photographs that are gone, which a person must find.
+MAX_LISTED, MAX_MISSING_LISTED = 10, 100
 #: A capture is used without the photographs that are gone where at least this share is there (choice).
 LEAST_THERE = 2 / 3
 
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A COLMAP camera: model name, parameters in COLMAP's order (pixels), image size in pixels."""
+    """A COLMAP camera, or one of `brown_lens`: model name, parameters in its order (pixels), image size in pixels."""
 
     model: str
     params: tuple[float, ...]
@@ -107,30 +111,41 @@ class SourceCapture:
     points: np.ndarray
     colors: np.ndarray
     world: WorldPrior | None = None
+    #: Of a world that is metres, z up, by its own files: where it lies.
+    georef: Georef | None = None
+    #: Whether the photographs are those of the camera, whose lenses are undone without being asked.
+    original_images: bool = False
     #: Folders in which every image should have a camera.
     image_folders: tuple[Path, ...] = ()
     warnings: tuple[str, ...] = field(default=())
 
 
-def refuse_many_missing(missing: Sequence[str], count: int, where: Path) -> list[str]:
-    """A warning about photographs that have a camera but are not there; CaptureError where too few are left."""
+def refuse_many_missing(missing: Sequence[str], count: int, where: Path, strict: bool = False) -> list[str]:
+    """A warning about photographs that have a camera but are not there; CaptureError where too few are left, and of any
+    where a person is `strict`."""
     if not missing:
         return []
+    if strict:
+        raise CaptureError(
+            f"{where}: {len(missing)} of {count} images that have a camera are missing. Copy them there, or leave "
+            f"--strict out to use the others.{format_list(missing, MAX_MISSING_LISTED)}"
+        )
     if count - len(missing) < max(1, LEAST_THERE * count):
         raise CaptureError(
             f"{where}: {len(missing)} of {count} images that have a camera are missing; at least "
             f"{LEAST_THERE:.0%} must be there. Copy them there, or choose another folder with --images."
             f"{format_list(missing)}"
         )
-    shown = ", ".join(missing[:MAX_LISTED]) + (", ..." if len(missing) > MAX_LISTED else "")
+    more = len(missing) - MAX_MISSING_LISTED
+    shown = ", ".join(missing[:MAX_MISSING_LISTED]) + (f", ... and {more} more" if more > 0 else "")
     return [f"{len(missing)} of {count} images that have a camera are missing; the others are used ({shown})."]
 
 
-def format_list(names: Iterable[str]) -> str:
-    """Up to ten names, one a line, and how many more there are."""
+def format_list(names: Iterable[str], most: int = MAX_LISTED) -> str:
+    """Up to ten names, or as many as asked for, one a line, and how many more there are."""
     names = list(names)
-    shown = "".join(f"\n  {name}" for name in names[:MAX_LISTED])
-    more = len(names) - MAX_LISTED
+    shown = "".join(f"\n  {name}" for name in names[:most])
+    more = len(names) - most
     return shown + (f"\n  ... and {more} more" if more > 0 else "")
 
 
@@ -183,17 +198,6 @@ def check_intrinsics(intrinsics: Intrinsics, file: Path, label: str) -> Intrinsi
     if problem:
         raise CaptureError(f"{file}: {label} has {problem}. The file is damaged; copy or export it again.")
     return intrinsics
-
-
-def pixel_rays(intrinsics: Intrinsics, pixels: np.ndarray) -> np.ndarray:
-    """x/z and y/z [n, 2] of the rays through pixels [n, 2] of a camera, its lens undone; NaN where it has no ray."""
-    if not intrinsics.is_distorted:
-        return (pixels - intrinsics.principal_point) / intrinsics.focal
-    from vdgs.system.lazy_pycolmap import pycolmap  # 60 MB of memory: only for lenses that need it
-
-    width, height, params = intrinsics.width, intrinsics.height, list(intrinsics.params)
-    camera = pycolmap.Camera(model=intrinsics.model, width=width, height=height, params=params)
-    return np.asarray(camera.cam_from_img(pixels), dtype=np.float64).reshape(-1, 2)
 
 
 def to_rigid(matrix: np.ndarray, file: Path, label: str, tolerance: float = 5e-3) -> np.ndarray:

@@ -95,7 +95,7 @@ def read_transforms(root: Path, options: CaptureOptions) -> SourceCapture:
                 mask_path=mask_file,
             )
         )
-    warnings = refuse_many_missing(missing, len(frames), root / chosen)
+    warnings = refuse_many_missing(missing, len(frames), root / chosen, options.strict)
     twice = find_duplicates(view.name for view in views)
     if twice:
         raise CaptureError(f"{file}: the same image occurs more than once.{format_list(twice)}")

@@ -1,0 +1,317 @@
+"""BlocksExchange XML, by which ContextCapture (iTwin Capture) and DJI Terra hand on aligned photographs.
+
+Bentley's description is followed: pixels count from the centre of the first one; rotations lead from the world to the
+camera's axes, which CameraOrientation names; P1 and P2 are OpenCV's p2 and p1; the second focal length is the first
+times AspectRatio; poses and points are in the coordinate system of the block, x east or longitude.
+"""
+
+from __future__ import annotations
+
+import math
+from array import array
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from vdgs.captures.coordinate_systems import ToGeodetic, is_in_degrees, is_local_system, to_geodetic
+from vdgs.captures.formats.brown_lens import brown_intrinsics
+from vdgs.captures.formats.project import CloudFrame, Project, ProjectView, refuse_cameras
+from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
+from vdgs.captures.formats.terra import local_origin, original_names, warn_of_undistorted
+from vdgs.captures.formats.xml_documents import read_xml, root_element, xml_number, xml_numbers
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.errors import CaptureError
+from vdgs.geometry.geodesy import geodetic_from_enu
+
+#: Camera axes (right, down, forward) from those that CameraOrientation names: where its x and y point in the picture.
+_DIRECTIONS = {"Right": (1, 0), "Left": (-1, 0), "Down": (0, 1), "Up": (0, -1)}
+#: Where DJI Terra puts its files in a project.
+_TERRA_FOLDER = "AT"
+_WITHOUT_POINTS = "_withouttiepoints"
+#: Measurements of tie points that are kept, of each photograph: more than are looked at afterwards.
+_MEASUREMENTS = 4000
+#: Rolls in degrees that are none.
+_LEVEL_DEG = 1e-3
+
+
+def is_file(file: Path) -> bool:
+    return file.suffix.lower() == ".xml" and root_element(file) == "BlocksExchange"
+
+
+def find_files(root: Path) -> list[Path]:
+    """The files in a folder, and where DJI Terra puts them below it; without those that another holds with points."""
+    folders = [folder for folder in (root, root / _TERRA_FOLDER) if folder.is_dir()]
+    found = [file for folder in folders for file in sorted(folder.iterdir()) if is_file(file)]
+    whole = {file.with_suffix("").as_posix().lower() for file in found}
+    return [
+        file for file in found
+        if not (stem := file.with_suffix("").as_posix().lower()).endswith(_WITHOUT_POINTS)
+        or stem.removesuffix(_WITHOUT_POINTS) not in whole
+    ]  # fmt: skip
+
+
+def read(file: Path, options: CaptureOptions) -> Project:
+    """The photographs of a block that have whole poses, and its tie points. Raises `CaptureError` for damaged files,
+    lenses and systems that are not read, and several blocks."""
+    return _Block(file).project(original_names(file, options))
+
+
+@dataclass(frozen=True, eq=False)
+class _Photo:
+    name: str
+    intrinsics: Intrinsics
+    pose: np.ndarray
+    sightings: tuple[list[int], list[tuple[float, float]]] = field(default_factory=lambda: ([], []))
+
+
+class _Block:
+    """A file, read in one go: photographs come before tie points, which are dropped as they are read."""
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+        self._photos: dict[str, _Photo] = {}
+        self._without_pose: list[str] = []
+        self._problems: dict[str, None] = {}
+        self._masks = 0
+        self._points, self._colors = array("d"), array("d")
+        self._systems: set[str] = set()
+        handlers = {"Photogroup": self._photogroup, "TiePoint": self._tie_point, "ControlPoint": self._skip}
+        self._root = read_xml(file, handlers)
+
+    def project(self, originals: dict[str, str]) -> Project:
+        blocks = self._root.findall("Block")
+        if len(blocks) > 1:
+            raise CaptureError(f"{self._file}: holds {len(blocks)} blocks. Export one alone.")
+        refuse_cameras(list(self._problems), self._file, "photogroups or photographs")
+        geodetic, in_degrees, place, frames = self._system(blocks[0] if blocks else None)
+        warnings = []
+        if self._without_pose:
+            names = ", ".join(self._without_pose)
+            warnings.append(f"{len(self._without_pose)} photographs have no whole pose and are left out ({names}).")
+        views = tuple(self._view(photo, originals) for photo in self._photos.values())
+        if self._masks:
+            warnings.append(f"{self._masks} masks that the file names are not read; those in masks/ are (--masks).")
+        warnings += warn_of_undistorted(self._file, views, originals)
+        return Project(
+            format="blocks-exchange", file=self._file, views=views,
+            points=np.array(self._points).reshape(-1, 3),
+            colors=np.clip(np.round(255 * np.array(self._colors).reshape(-1, 3)), 0, 255).astype(np.uint8),
+            to_geodetic=geodetic, in_degrees=in_degrees, is_metric=True, place=place, cloud_frames=frames,
+            warnings=tuple(warnings),
+        )  # fmt: skip
+
+    def _view(self, photo: _Photo, originals: dict[str, str]) -> ProjectView:
+        numbers, pixels = photo.sightings
+        original = originals.get(PurePosixPath(photo.name.replace("\\", "/")).stem.lower())
+        return ProjectView(
+            names=(photo.name, original) if original else (photo.name,), camera_from_world=photo.pose,
+            intrinsics=photo.intrinsics,
+            sightings=(np.array(numbers, np.int64), np.array(pixels, np.float64).reshape(-1, 2)) if numbers else None,
+        )  # fmt: skip
+
+    def _skip(self, element: Element) -> None:
+        """Control points are not used: poses are adjusted to them already."""
+
+    # ------------------------------------------------------------------------------------- photographs
+
+    def _photogroup(self, group: Element) -> None:
+        label = f"photogroup {(group.findtext('Name') or '').strip()!r}"
+        self._note_system(group)
+        photos = group.findall("Photo")
+        posed = [photo for photo in photos if photo.find("Pose/Rotation") is not None and _has_center(photo)]
+        self._without_pose += [_path(photo) for photo in photos if photo not in posed]
+        if not posed:
+            return
+        try:
+            intrinsics = self._lens(group, label)
+        except CaptureError as error:
+            self._problems[str(error).removeprefix(f"{self._file}: ")] = None
+            return
+        axes = self._axes(group, label)
+        for photo in posed:
+            self._photo(photo, intrinsics, axes)
+
+    def _photo(self, photo: Element, intrinsics: Intrinsics, axes: np.ndarray) -> None:
+        name = _path(photo)
+        self._masks += photo.find("MaskPath") is not None
+        number = (photo.findtext("Id") or f"#{len(self._photos)}").strip()
+        if number in self._photos:
+            raise CaptureError(f"{self._file}: two photographs have the number {number}. Export the block again.")
+        try:
+            rotation = axes @ self._rotation(photo.find("Pose/Rotation"), name)  # type: ignore[arg-type]
+        except CaptureError as error:
+            self._problems[str(error).removeprefix(f"{self._file}: ")] = None
+            return
+        center = self._place(photo.find("Pose/Center"), f"the centre of {name}")
+        pose = to_rigid(np.column_stack([rotation, np.zeros(3)]), self._file, name)
+        pose[:3, 3] = -pose[:3, :3] @ center
+        self._photos[number] = _Photo(name, intrinsics, pose)
+
+    def _place(self, element: Element | None, label: str) -> list[float]:
+        if element is None:
+            raise CaptureError(f"{self._file}: {label} is missing. Export the block again.")
+        return [xml_number(element, axis, self._file, label) for axis in "xyz"]
+
+    def _rotation(self, element: Element, name: str) -> np.ndarray:
+        """From the world to the axes of the camera."""
+
+        def value(tag: str) -> float:
+            return xml_number(element, tag, self._file, f"the rotation of {name}")
+
+        if element.find("M_00") is not None:
+            return np.array([[value(f"M_{row}{column}") for column in range(3)] for row in range(3)])
+        if element.find("Omega") is not None:
+            omega, phi, kappa = (math.radians(value(tag)) for tag in ("Omega", "Phi", "Kappa"))
+            return (_about_x(omega) @ _about_y(phi) @ _about_z(kappa)).T
+        if element.find("Yaw") is not None and abs(value("Roll")) < _LEVEL_DEG:
+            yaw, pitch = math.radians(value("Yaw")), math.radians(value("Pitch"))
+            level = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # looks along y, z is up
+            return level @ (_about_z(-yaw) @ _about_x(pitch)).T
+        kinds = ", ".join(child.tag for child in element) or "nothing"
+        raise CaptureError(
+            f"{self._file}: {name}: its rotation is given by {kinds}, which programs mean in different ways. Export it "
+            "as a matrix, or as Omega, Phi, Kappa."
+        )
+
+    # ------------------------------------------------------------------------------------------ lenses
+
+    def _lens(self, group: Element, label: str) -> Intrinsics:
+        kind = (group.findtext("CameraModelType") or "Perspective").strip()
+        if kind != "Perspective":
+            raise CaptureError(f"{label} is {kind!r}; Perspective is read.")
+        size = group.find("ImageDimensions")
+        if size is None:
+            raise CaptureError(f"{label} has no ImageDimensions.")
+        width, height = (int(xml_number(size, side, self._file, label)) for side in ("Width", "Height"))
+        longer = max(width, height, 1)
+        pixel = xml_number(group, "PixelSize", self._file, label, 0.0)
+        pixel = pixel or xml_number(group, "SensorSize", self._file, label, 0.0) / longer
+        focal = xml_number(group, "FocalLengthPixels", self._file, label, 0.0)
+        if not focal:
+            if not pixel > 0:
+                raise CaptureError(f"{label} has neither FocalLengthPixels nor FocalLength with SensorSize.")
+            focal = xml_number(group, "FocalLength", self._file, label) / pixel
+        aspect = xml_number(group, "AspectRatio", self._file, label, 1.0)
+        center = self._center(group, (width, height), pixel, label)
+        bends = group.find("Distortion")
+        k1, k2, k3, p1, p2 = (
+            0.0 if bends is None else xml_number(bends, name, self._file, label, 0.0)
+            for name in ("K1", "K2", "K3", "P1", "P2")
+        )
+        skew = xml_number(group, "Skew", self._file, label, 0.0)
+        lens = brown_intrinsics((focal, focal * aspect), center, (width, height), (k1, k2, k3), (p2, p1), skew)
+        return check_intrinsics(lens, self._file, label)
+
+    def _center(
+        self, group: Element, size: tuple[int, int], pixel: float, label: str
+    ) -> tuple[float, float]:  # fmt: skip
+        """The principal point, from the corner of the picture."""
+        element, (width, height) = group.find("PrincipalPoint"), size
+        if element is None:
+            return width / 2, height / 2
+        if element.find("xmm") is not None:
+            if not pixel > 0:
+                raise CaptureError(f"{label} has a principal point in millimetres, and no SensorSize.")
+            across = [xml_number(element, name, self._file, label) / pixel for name in ("xmm", "ymm")]
+            x, y = self._axes(group, label)[:2, :2] @ across
+            return width / 2 + x, height / 2 + y
+        x, y = (xml_number(element, name, self._file, label) for name in "xy")
+        return x + 0.5, y + 0.5
+
+    def _axes(self, group: Element, label: str) -> np.ndarray:
+        """Right, down, forward [3, 3] from the axes that CameraOrientation names."""
+        name = (group.findtext("CameraOrientation") or "XRightYDown").strip()
+        x, _, y = name.removeprefix("X").partition("Y")
+        if x not in _DIRECTIONS or y not in _DIRECTIONS or np.dot(_DIRECTIONS[x], _DIRECTIONS[y]):
+            raise CaptureError(f"{self._file}: {label} has the CameraOrientation {name!r}, which is none.")
+        across = np.column_stack([(*_DIRECTIONS[x], 0.0), (*_DIRECTIONS[y], 0.0)])
+        return np.column_stack([across, np.cross(across[:, 0], across[:, 1])])
+
+    # -------------------------------------------------------------------------------------- tie points
+
+    def _tie_point(self, element: Element) -> None:
+        self._note_system(element)
+        place = element.find("Position")
+        if place is None:
+            return
+        number = len(self._points) // 3
+        self._points.extend(self._place(place, f"tie point {number}"))
+        color = element.find("Color")
+        self._colors.extend(
+            [0.5] * 3 if color is None
+            else [xml_number(color, name, self._file, "a color", 0.5) for name in ("Red", "Green", "Blue")]
+        )  # fmt: skip
+        for seen in element.findall("Measurement"):
+            photo = self._photos.get((seen.findtext("PhotoId") or "").strip())
+            if photo is not None and seen.find("x") is not None and len(photo.sightings[0]) < _MEASUREMENTS:
+                pixel = [xml_number(seen, axis, self._file, f"tie point {number}") + 0.5 for axis in "xy"]
+                photo.sightings[0].append(number)
+                photo.sightings[1].append((pixel[0], pixel[1]))
+
+    # ------------------------------------------------------------------------------------------- place
+
+    def _note_system(self, element: Element) -> None:
+        if (found := element.findtext("SRSId")) is not None:
+            self._systems.add(found.strip())
+
+    def _system(self, block: Element | None) -> tuple[ToGeodetic | None, bool, str, tuple[CloudFrame, ...]]:
+        """What brings coordinates to latitude, longitude and height, whether they are degrees, how the system is called
+        and what points beside the file may be in."""
+        for element in [] if block is None else [block, *block.findall("TiePoints"), *block.findall("Photogroups")]:
+            self._note_system(element)
+        if len(self._systems) > 1:
+            raise CaptureError(
+                f"{self._file}: mixes the coordinate systems {', '.join(sorted(self._systems))}. Export it in one."
+            )
+        number = next(iter(self._systems), None)
+        defined = {
+            (srs.findtext("Id") or "").strip(): (srs.findtext("Definition") or srs.findtext("Name") or "").strip()
+            for srs in self._root.iter("SRS")
+        }
+        definition = defined.get(number or "", "")
+        if number is not None and not definition:
+            raise CaptureError(f"{self._file}: the coordinate system {number} is not defined. Export it again.")
+        if number is None or is_local_system(definition):
+            return None, False, "BlocksExchange, local coordinates", ()
+        if definition.upper().startswith("ENU:"):
+            return self._enu(definition)
+        geodetic, name = to_geodetic(definition, self._file, "its SRS")
+        origin = local_origin(self._file)
+        frames: tuple[CloudFrame, ...] = ()
+        if origin is not None:
+            frames = ((f"of {name}, about SRSOrigin", lambda points: geodetic(points + origin)),)
+        return geodetic, is_in_degrees(definition), f"BlocksExchange, {name}", frames
+
+    def _enu(self, definition: str) -> tuple[ToGeodetic, bool, str, tuple[CloudFrame, ...]]:
+        """Metres about a place that the definition gives: `ENU:latitude,longitude`, at times with a height."""
+        numbers = [*xml_numbers(definition[4:], None, self._file, f"the system {definition!r}"), 0.0]
+        if len(numbers) not in (3, 4) or abs(numbers[0]) > 90:
+            raise CaptureError(f"{self._file}: the system {definition!r} must give latitude and longitude.")
+        origin = (numbers[0], numbers[1], numbers[2])
+        return (lambda points: geodetic_from_enu(points, origin)), False, f"BlocksExchange, {definition}", ()
+
+
+def _path(photo: Element) -> str:
+    return (photo.findtext("ImagePath") or f"photograph {photo.findtext('Id') or '?'}").strip()
+
+
+def _has_center(photo: Element) -> bool:
+    center = photo.find("Pose/Center")
+    return center is not None and all((center.findtext(axis) or "").strip() for axis in "xyz")
+
+
+def _about_x(angle: float) -> np.ndarray:
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[1.0, 0, 0], [0, c, -s], [0, s, c]])
+
+
+def _about_y(angle: float) -> np.ndarray:
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[c, 0, s], [0, 1.0, 0], [-s, 0, c]])
+
+
+def _about_z(angle: float) -> np.ndarray:
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])

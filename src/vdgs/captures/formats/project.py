@@ -1,0 +1,247 @@
+"""Projects of photogrammetry programs: what their readers find, and the capture that it makes.
+
+A reader knows one program's files and yields a `Project`: cameras by the names that the program has for photographs,
+poses and points in the project's coordinates, and what brings those to latitude, longitude and height. The rest is the
+same for all and is done here: photographs are found, the world becomes metres east, north and up, and points come from
+the project, or from a PLY beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from vdgs.captures.capture import Observations
+from vdgs.captures.coordinate_systems import ToGeodetic
+from vdgs.captures.formats.colmap_records import sample_observations
+from vdgs.captures.formats.lens_projection import pixel_rays
+from vdgs.captures.formats.ply_reader import read_point_cloud
+from vdgs.captures.formats.project_photographs import find_photographs
+from vdgs.captures.formats.source_capture import (
+    Intrinsics,
+    SourceCapture,
+    SourceView,
+    format_list,
+)
+from vdgs.captures.formats.sparse_points import find_point_cloud
+from vdgs.captures.georeference import Georef
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.errors import CaptureError
+from vdgs.geometry.geodesy import enu_from_geodetic, median_place
+from vdgs.geometry.similarity import sample_points
+from vdgs.system.quoting import shell_word
+
+#: A cloud belongs to the cameras if this share of its points fall into photographs (choice).
+LEAST_SEEN, POINTS_LOOKED_AT = 0.3, 2000
+#: Points farther from a camera than this many times the spread of the cameras are not of their place.
+MAX_DISTANCE_RATIO = 100.0
+#: The name of some coordinates, and what brings points [n, 3] from there.
+CloudFrame = tuple[str, Callable[[np.ndarray], np.ndarray]]
+
+
+class NoTiePoints(CaptureError):
+    """A project without points, from which `vdgs sfm` makes a capture that has them."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ProjectView:
+    """A camera of a project: what its photograph is called there (paths in any form, labels; the best name first), the
+    pose [4, 4] in the project's coordinates, and the points that it shows: their indices [m] and pixels [m, 2]."""
+
+    names: tuple[str, ...]
+    camera_from_world: np.ndarray
+    intrinsics: Intrinsics
+    sightings: tuple[np.ndarray, np.ndarray] | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Project:
+    """A project as its file has it; points [n, 3] float64 and colours [n, 3] uint8, none of either where it has none.
+
+    Its coordinates are those of a system that `to_geodetic` knows, with rotations about the axes of the system where
+    the camera is, or metres with z up (`is_metric`), or nothing that is known.
+    """
+
+    format: str
+    file: Path
+    views: tuple[ProjectView, ...]
+    points: np.ndarray
+    colors: np.ndarray
+    to_geodetic: ToGeodetic | None = None
+    in_degrees: bool = False
+    """Whether the first two coordinates are degrees."""
+    is_metric: bool = False
+    place: str = ""
+    """How the project says where it lies, in words ("Metashape, WGS 84 / UTM zone 32N")."""
+    cloud_frames: tuple[CloudFrame, ...] = ()
+    """Other coordinates that a PLY beside it may have, and what brings these to latitude, longitude and height, or to
+    the project's coordinates where these have no place on Earth."""
+    warnings: tuple[str, ...] = ()
+
+
+def project_capture(
+    project: Project, root: Path, options: CaptureOptions, *, needs_points: bool = True
+) -> SourceCapture:
+    """The capture of a project whose photographs lie in `root`, or in the folder that `options` name.
+
+    Raises `CaptureError` where no photograph of it is found, and `NoTiePoints` for a project without points, unless
+    nothing `needs_points`.
+    """
+    if not project.views:
+        raise CaptureError(f"{project.file}: no camera of it has a pose. Align the photographs, and export it again.")
+    _check_sightings(project)
+    names = [view.names for view in project.views]
+    found = find_photographs(root, options, names, project.file)
+    world = _world_of(project)
+    poses = world.moved_poses([view.camera_from_world for view in project.views])
+    points, colors, warnings = world.moved(project.points), project.colors, [*project.warnings, *found.warnings]
+    if not len(points) and needs_points:
+        points, colors, note = _cloud_beside(project, root, poses, world)
+        warnings.append(note)
+    views = tuple(
+        SourceView(
+            name=name, camera_from_world=pose, intrinsics=view.intrinsics, observations=_observations(view, points),
+            image_path=path,
+        )
+        for name, path, pose, view in zip(found.names, found.paths, poses, project.views, strict=True)
+    )  # fmt: skip
+    return SourceCapture(
+        source=project.format, images=found.folder, views=tuple(sorted(views, key=lambda view: view.name)),
+        points=points, colors=colors, georef=world.georef, original_images=True,
+        image_folders=() if found.folder == "." else (root / found.folder,), warnings=tuple(warnings),
+    )  # fmt: skip
+
+
+def _check_sightings(project: Project) -> None:
+    count = len(project.points)
+    if any(view.sightings is not None and (view.sightings[0] >= count).any() for view in project.views):
+        raise CaptureError(f"{project.file}: photographs show points that it does not have. Export it again.")
+
+
+def _observations(view: ProjectView, points: np.ndarray) -> Observations | None:
+    if view.sightings is None or not len(view.sightings[0]):
+        return None
+    numbers, pixels = sample_observations(*view.sightings)
+    rays = pixel_rays(view.intrinsics, pixels)
+    known = np.isfinite(rays).all(axis=1) & np.isfinite(points[numbers]).all(axis=1)
+    return Observations(points[numbers[known]], rays[known], numbers[known]) if known.any() else None
+
+
+# ----------------------------------------------------------------------------------------------------- world
+
+
+@dataclass(frozen=True, eq=False)
+class _World:
+    """Where a project lies: metres east, north and up of an origin, where it has a place on Earth."""
+
+    to_geodetic: ToGeodetic | None
+    step: np.ndarray
+    """Along each coordinate, for the slope of the change; about as long as the scene is wide."""
+    georef: Georef | None
+
+    def moved(self, points: np.ndarray) -> np.ndarray:
+        return points if self.to_geodetic is None or not len(points) else self.to_enu(self.to_geodetic(points))
+
+    def to_enu(self, geodetic: np.ndarray) -> np.ndarray:
+        """Latitude, longitude and height [n, 3] to the world; as they are where it has no place on Earth."""
+        if self.georef is None or self.georef.origin is None:
+            return geodetic
+        with np.errstate(invalid="ignore", over="ignore"):
+            return enu_from_geodetic(geodetic, self.georef.origin)
+
+    def moved_poses(self, poses: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Each camera moves as its surroundings do: its rotation by the nearest to the slope of the change there."""
+        if self.to_geodetic is None:
+            return list(poses)
+        stack = np.stack(poses)
+        centers = -np.einsum("nji,nj->ni", stack[:, :3, :3], stack[:, :3, 3])
+        ends = [self.moved(centers + sign * step) for step in np.diag(self.step) for sign in (1, -1)]
+        slopes = np.stack([(ends[k] - ends[k + 1]) for k in (0, 2, 4)], axis=2)
+        left, _, right = np.linalg.svd(slopes / np.linalg.norm(slopes, axis=1, keepdims=True))
+        turned, places = left @ right, self.moved(centers)
+        result = np.tile(np.eye(4), (len(stack), 1, 1))
+        result[:, :3, :3] = stack[:, :3, :3] @ np.swapaxes(turned, 1, 2)
+        result[:, :3, 3] = -np.einsum("nij,nj->ni", result[:, :3, :3], places)
+        return list(result)
+
+
+def _world_of(project: Project) -> _World:
+    if project.to_geodetic is None:
+        local = Georef(None, "", project.place) if project.is_metric else None
+        return _World(None, np.ones(3), local)
+    stack = np.stack([view.camera_from_world for view in project.views])
+    centers = -np.einsum("nji,nj->ni", stack[:, :3, :3], stack[:, :3, 3])
+    geodetic = project.to_geodetic(centers)
+    if not np.isfinite(geodetic).all() or (np.abs(geodetic[:, 0]) > 90).any():
+        raise CaptureError(
+            f"{project.file}: {project.place} has no place on Earth for some of its cameras, such as "
+            f"{np.round(centers[0], 3).tolist()}. Is the coordinate system another one? Export it again."
+        )
+    latitude, longitude, altitude = median_place(geodetic)
+    step = np.array([1e-4, 1e-4, 10.0]) if project.in_degrees else np.full(3, 10.0)
+    return _World(project.to_geodetic, step, Georef((latitude, longitude, round(altitude)), "", project.place))
+
+
+# ---------------------------------------------------------------------------------------------------- points
+
+
+def _cloud_beside(
+    project: Project, root: Path, poses: Sequence[np.ndarray], world: _World
+) -> tuple[np.ndarray, np.ndarray, str]:
+    """Points and colours of a PLY beside a project that its cameras see, in the world, and a note about it."""
+    cloud = find_point_cloud(root, project.file.parent, lone=True)
+    if cloud is None:
+        raise NoTiePoints(
+            f"{project.file}: brings poses but no 3D points, from which the scene starts. This finds them, with the "
+            f"poses as they are: vdgs sfm {shell_word(project.file)} --output CAPTURE\nOr put a point cloud in the "
+            "same coordinates beside it, as a PLY file."
+        )
+    points, colors = read_point_cloud(cloud)
+    frames: list[CloudFrame] = [("of the project", world.moved)]
+    frames += [(name, _after(change, world)) for name, change in project.cloud_frames]
+    frames.append(("of the scene", lambda points: points))
+    best, seen, what = points, -1.0, ""
+    for name, change in frames:
+        with np.errstate(all="ignore"):
+            share = _seen(change(sample_points(points, POINTS_LOOKED_AT)), poses, project.views)
+        if share > seen:
+            best, seen, what = change(points), share, name
+    if seen < LEAST_SEEN:
+        raise NoTiePoints(
+            f"{cloud}: its points are not where the cameras of {project.file.name} look ({seen:.0%} fall into "
+            "photographs, at best): it is in other coordinates, or of another project. Export it in the project's own, "
+            f"or move it away and find points anew: vdgs sfm {shell_word(project.file)} --output CAPTURE"
+        )
+    return best, colors, f"the project has no points; those of {cloud.name} are used (coordinates {what})."
+
+
+def _after(change: Callable[[np.ndarray], np.ndarray], world: _World) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda points: world.to_enu(change(points))
+
+
+def _seen(points: np.ndarray, poses: Sequence[np.ndarray], views: Sequence[ProjectView]) -> float:
+    """The share of points that lie before some camera, where its photograph is, lens distortion aside."""
+    points = points[np.isfinite(points).all(axis=1)]
+    centers = np.stack([-pose[:3, :3].T @ pose[:3, 3] for pose in poses])
+    farthest = MAX_DISTANCE_RATIO * float(
+        np.quantile(np.linalg.norm(centers - np.median(centers, axis=0), axis=1), 0.9)
+    )
+    seen = np.zeros(len(points), bool)
+    for pose, view in zip(poses, views, strict=True):
+        x, y, z = (points @ pose[:3, :3].T + pose[:3, 3]).T
+        (fx, fy), (cx, cy), lens = view.intrinsics.focal, view.intrinsics.principal_point, view.intrinsics
+        u, v = fx * x + cx * z, fy * y + cy * z
+        seen |= (z > 0) & (z <= farthest) & (u >= 0) & (v >= 0) & (u <= lens.width * z) & (v <= lens.height * z)
+    return float(seen.mean()) if len(seen) else 0.0
+
+
+def refuse_cameras(problems: Sequence[str], file: Path, what: str) -> None:
+    """Raise `CaptureError` that names all sensors, or cameras, which cannot be read."""
+    if problems:
+        raise CaptureError(
+            f"{file}: {len(problems)} of its {what} cannot be read. Export undistorted photographs with them as a "
+            f"COLMAP model instead, or leave them out.{format_list(problems)}"
+        )

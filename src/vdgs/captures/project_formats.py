@@ -1,0 +1,70 @@
+"""Which files are projects of photogrammetry programs, and who reads them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from vdgs.captures.formats import blocks_exchange, metashape
+from vdgs.captures.formats.project import Project, project_capture
+from vdgs.captures.formats.source_capture import SourceCapture
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.errors import CaptureError
+
+
+class ProjectFormat(NamedTuple):
+    """A program's files: its name, those in a folder that may be opened, whether a file is one, and the reader."""
+
+    program: str
+    find: Callable[[Path], list[Path]]
+    is_file: Callable[[Path], bool]
+    read: Callable[[Path, CaptureOptions], Project]
+
+
+#: In the order in which they are looked for, by what `--format` calls them.
+PROJECTS: dict[str, ProjectFormat] = {
+    "metashape": ProjectFormat("Metashape", metashape.find_files, metashape.is_file, metashape.read),
+    "blocks-exchange": ProjectFormat(
+        "ContextCapture or DJI Terra (BlocksExchange)", blocks_exchange.find_files, blocks_exchange.is_file,
+        blocks_exchange.read,
+    ),
+}  # fmt: skip
+
+
+def find_projects(path: Path) -> Iterator[tuple[str, Path]]:
+    """The formats and files of the projects that a folder holds, or that a file is."""
+    for name, form in PROJECTS.items():
+        if path.is_file():
+            if form.is_file(path):
+                yield name, path
+        elif path.is_dir():
+            yield from ((name, file) for file in form.find(path))
+
+
+def is_project(path: Path) -> bool:
+    """Whether a folder holds a project of another program, or a file is one."""
+    return next(find_projects(path), None) is not None
+
+
+def project_file(path: Path, name: str) -> Path:
+    """The one project of a format in a folder, or the file itself. Raises `CaptureError` for several."""
+    found = [file for form, file in find_projects(path) if form == name]
+    if len(found) > 1:
+        shown = ", ".join(file.relative_to(path).as_posix() for file in found)
+        raise CaptureError(f"{path}: holds several projects ({shown}). Give one of these files instead of the folder.")
+    if not found:
+        raise CaptureError(f"{path}: is no project of {PROJECTS[name].program}.")
+    return found[0]
+
+
+def capture_root(path: Path) -> Path:
+    """The folder of a capture that is given by its folder, or by the file of its project."""
+    return path.parent if path.is_file() else path
+
+
+def read_project(path: Path, name: str, options: CaptureOptions, *, needs_points: bool = True) -> SourceCapture:
+    """The capture of the project in a folder, or in a file. Without `needs_points` one without points is read too: what
+    finds them needs its poses."""
+    project = PROJECTS[name].read(project_file(path, name), options)
+    return project_capture(project, capture_root(path), options, needs_points=needs_points)

@@ -1,0 +1,196 @@
+"""BlocksExchange XML of ContextCapture and DJI Terra: a known flight in each system, and what else their files hold."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from support.blocks_files import ORIENTATIONS, PLAIN, blocks_xml, in_system
+from support.captures import write_ply
+from support.true_flight import ORIGIN, TrueFlight, assert_true, true_flight
+from vdgs.captures.formats.source_capture import SourceCapture
+from vdgs.captures.loading import read_files
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.errors import CaptureError
+from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu
+
+OPTIONS = CaptureOptions()
+
+
+@pytest.fixture(scope="module")
+def flight() -> TrueFlight:
+    return true_flight(count=6, lens=PLAIN)
+
+
+def read(root: Path, xml: str, flight: TrueFlight, name: str = "block.xml") -> SourceCapture:
+    flight.touch(root)
+    (root / name).write_text(xml, encoding="utf-8")
+    return read_files(root, OPTIONS)
+
+
+def assert_points(source: SourceCapture, flight: TrueFlight) -> None:
+    """Tie points are the flight's within a millimetre, and where photographs say that they show them."""
+    points = flight.points
+    if source.georef.origin is not None:
+        points = enu_from_geodetic(geodetic_from_enu(points, ORIGIN), source.georef.origin)
+    np.testing.assert_allclose(source.points, points, atol=1e-3)
+    np.testing.assert_array_equal(source.colors[0], [255, 128, 0])
+    for view in source.views:
+        seen = view.observations.points @ view.camera_from_world[:3, :3].T + view.camera_from_world[:3, 3]
+        assert np.abs(seen[:, :2] / seen[:, 2:] - view.observations.rays).max() * PLAIN.f < 0.01
+
+
+@pytest.mark.parametrize("system", ["EPSG:32632", "EPSG:25833", "EPSG:4326", "ENU:48.1,11.9,540", None])
+def test_systems_are_read_exactly(tmp_path, flight, system):
+    """Projected (near and far from the middle of the zone), degrees, and metres about a place."""
+    pytest.importorskip("pyproj")
+    source = read(tmp_path, blocks_xml(flight, system), flight)
+    assert_true(source, flight)
+    assert_points(source, flight)
+    assert (source.georef.origin is None) == (system is None)
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+@pytest.mark.parametrize("angles", [False, True])
+def test_rotations_and_axes(tmp_path, flight, orientation, angles):
+    xml = blocks_xml(flight, None, orientation=orientation, angles=angles, in_millimeters=True, tie_points=False)
+    write_ply(tmp_path / "points.ply", flight.points, np.zeros((900, 3), np.uint8))
+    source = read(tmp_path, xml, flight)
+    assert_true(source, flight)
+
+
+def test_yaw_and_pitch_are_read_where_nothing_rolls_and_refused_where_it_does(tmp_path, flight):
+    """Yaw clockwise about z, pitch about x; (0, 0, 0) looks along y with z up (Bentley's camera models)."""
+    level = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    yaw, pitch = np.radians(37.0), np.radians(-60.0)
+    turn = np.array([[np.cos(yaw), np.sin(yaw), 0], [-np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    lift = np.array([[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]])
+    xml = blocks_xml(flight, None)
+    start, end = xml.index("<Rotation>"), xml.index("</Rotation>")
+    angles = "<Yaw>37</Yaw><Pitch>-60</Pitch><Roll>0</Roll>"
+    source = read(tmp_path, xml[:start] + "<Rotation>" + angles + xml[end:], flight)
+    np.testing.assert_allclose(source.views[0].camera_from_world[:3, :3], level @ (turn @ lift).T, atol=1e-9)
+    assert source.views[0].camera_from_world[2, :3] @ [np.sin(yaw), np.cos(yaw), 0] > 0  # looks to 37° and down
+    assert source.views[0].camera_from_world[2, 2] < 0
+    with pytest.raises(CaptureError, match="Omega, Phi, Kappa"):
+        read(tmp_path, xml[:start] + "<Rotation>" + angles.replace(">0<", ">5<") + xml[end:], flight)
+
+
+def test_photographs_without_pose_are_named_and_left_out(tmp_path, flight):
+    more = (
+        "<Photogroup><Name>late</Name><Photo><Id>90</Id><ImagePath>late_1.JPG</ImagePath></Photo><Photo><Id>91</Id>"
+        "<ImagePath>late_2.JPG</ImagePath><Pose><Center><x>1</x><y>2</y><z>3</z></Center></Pose></Photo></Photogroup>"
+    )
+    source = read(tmp_path, blocks_xml(flight, None, more=more), flight)
+    assert_true(source, flight)
+    assert any(
+        "2 photographs have no whole pose and are left out (late_1.JPG, late_2.JPG)" in each for each in source.warnings
+    )
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        (">Perspective<", ">Fisheye<", "photogroup 'UCX' is 'Fisheye'"),
+        ("<Width>5472</Width>", "", "has no Width"),
+        ("<FocalLengthPixels>3656.4</FocalLengthPixels>", "", "neither FocalLengthPixels"),
+        (">XRightYDown<", ">XRightYRight<", "CameraOrientation"),
+        ("<Definition>EPSG:32632</Definition>", "<Definition>EPSG:1</Definition>", "its SRS must name"),
+        ("<SRSId>7</SRSId>", "<SRSId>8</SRSId>", "system 8 is not defined"),
+        ("<TiePoints>", "<TiePoints><SRSId>3</SRSId>", "mixes the coordinate systems 3, 7"),
+        ("<Id>11</Id>", "<Id>10</Id>", "two photographs have the number 10"),
+        ("</Block>", "</Block><Block/>", "holds 2 blocks"),
+        ("</M_00>", "e3</M_00>", "not orthonormal"),
+    ],
+)
+def test_what_is_not_read_is_named(tmp_path, flight, old, new, says):
+    xml = blocks_xml(flight)
+    assert old in xml
+    with pytest.raises(CaptureError, match=f"block.xml.*(?s:.)*{says}"):
+        read(tmp_path, xml.replace(old, new, 1), flight)
+
+
+def test_damaged_files_end_in_a_message(tmp_path, flight):
+    whole = blocks_xml(replace(flight, points=flight.points[:40]), None).encode()
+    flight.touch(tmp_path)
+    generator = np.random.default_rng(1)
+    for _ in range(150):
+        damaged = bytearray(whole)
+        if generator.random() < 0.3:
+            damaged = damaged[: generator.integers(0, len(whole))]
+        else:
+            for place in generator.integers(0, len(whole), 5):
+                damaged[place] = generator.integers(0, 256)
+        (tmp_path / "block.xml").write_bytes(bytes(damaged))
+        try:
+            source = read_files(tmp_path, OPTIONS)
+        except CaptureError:
+            continue
+        assert all(np.isfinite(view.camera_from_world).all() for view in source.views)
+
+
+# ------------------------------------------------------------------------------------------------ DJI Terra
+
+
+def terra_project(root: Path, flight: TrueFlight) -> TrueFlight:
+    """A project as Terra lays it out, photographs by its own names in the list; returns the flight with these names."""
+    called = [f"{index:08x}-aa.jpg" for index in range(len(flight.names))]
+    listed = [
+        {"id": Path(new).stem, "origin_path": f"D:/Card/{old}"} for new, old in zip(called, flight.names, strict=True)
+    ]
+    (root / "images" / "survey").mkdir(parents=True)
+    (root / "images" / "survey" / "image_list.json").write_text(json.dumps(listed))
+    (root / "AT").mkdir()
+    (root / "AT" / "sfm_geo_desc.json").write_text("{}")
+    temporary = [f"C:\\DJI\\.temp/ImageCorrection/undistort\\{name}" for name in called]
+    for name, points in (("", True), ("_WithoutTiePoints", False)):
+        xml = blocks_xml(flight, "EPSG:4326", angles=True, paths=temporary, tie_points=points)
+        (root / "AT" / f"BlocksExchangeUndistortAT{name}.xml").write_text(xml)
+    return replace(flight, names=[f"survey/{name}" for name in called])
+
+
+def test_terra_by_its_own_names_and_by_those_of_the_card(tmp_path):
+    flight = true_flight(count=6, lens=replace(PLAIN, k=(0, 0, 0, 0), p=(0, 0)))
+    mine, card = tmp_path / "terra", tmp_path / "card"
+    theirs = terra_project(mine, flight)
+    flight.touch(card)
+    source = read_files(mine, CaptureOptions(images=str(card)))
+    assert_true(source, flight)
+    assert any("lens distortion Terra has undone" in each for each in source.warnings)
+    theirs.touch(mine / "images")
+    source = read_files(mine, OPTIONS)
+    assert_true(source, theirs)
+    assert len(source.points) == len(flight.points)
+
+
+def test_terra_without_tie_points_takes_its_model_about_its_origin(tmp_path):
+    flight = true_flight(count=6, lens=PLAIN)
+    flight.touch(tmp_path / "images")
+    (tmp_path / "BlocksExchangeUndistortAT_WithoutTiePoints.xml").write_text(
+        blocks_xml(flight, "EPSG:32632", tie_points=False)
+    )
+    _, _, points = in_system(flight, "EPSG:32632")
+    origin = np.array([710000.0, 5330000.0, 500.0])
+    (tmp_path / "terra_ply").mkdir()
+    (tmp_path / "terra_ply" / "metadata.xml").write_text(
+        '<?xml version="1.0" encoding="utf-8"?>\n<ModelMetadata version="1"><SRS>EPSG:32632</SRS><SRSOrigin>'
+        f"{','.join(map(str, origin))}</SRSOrigin></ModelMetadata>"
+    )
+    write_ply(tmp_path / "cloud.ply", points - origin, np.zeros((900, 3), np.uint8))
+    source = read_files(tmp_path, OPTIONS)
+    assert_true(source, flight)
+    expected = enu_from_geodetic(geodetic_from_enu(flight.points, ORIGIN), source.georef.origin)
+    np.testing.assert_allclose(source.points, expected, atol=5e-3)  # written as float32
+
+
+def test_several_projects_of_a_folder_are_named(tmp_path, flight):
+    flight.touch(tmp_path)
+    for name in ("one.xml", "two.xml"):
+        (tmp_path / name).write_text(blocks_xml(flight, None))
+    with pytest.raises(CaptureError, match=r"several projects \(one\.xml, two\.xml\)"):
+        read_files(tmp_path, OPTIONS)
+    assert_true(read_files(tmp_path / "two.xml", OPTIONS), flight)

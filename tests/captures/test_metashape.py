@@ -1,0 +1,351 @@
+"""Metashape's cameras.xml: a known flight as the program writes it, and what people's exports hold besides."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from support.captures import write_ply
+from support.metashape_files import (
+    INITIAL,
+    LOCAL,
+    WGS84,
+    chunk_from_enu,
+    metashape_calibration,
+    metashape_cameras,
+    metashape_transform,
+    metashape_xml,
+)
+from support.true_flight import ORIGIN, SIZE, Lens, TrueFlight, assert_true, true_flight
+from vdgs.captures.formats.lens_projection import ray_pixels
+from vdgs.captures.formats.project import NoTiePoints
+from vdgs.captures.formats.source_capture import SourceCapture
+from vdgs.captures.loading import read_files
+from vdgs.captures.project_formats import read_project
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.errors import CaptureError
+from vdgs.geometry.geodesy import ecef_from_geodetic, enu_from_geodetic, geodetic_from_enu
+
+OPTIONS = CaptureOptions()
+
+
+def read(root: Path, xml: str, flight: TrueFlight, options: CaptureOptions = OPTIONS) -> SourceCapture:
+    """The export beside the photographs, read without points."""
+    flight.touch(root)
+    (root / "cameras.xml").write_text(xml, encoding="utf-8")
+    return read_project(root, "metashape", options, needs_points=False)
+
+
+@pytest.mark.parametrize("lens", [Lens(), Lens(b1=0, b2=0, k=(-0.1, 0.02, -0.01, 0)), Lens(k=(0, 0, 0, 0), p=(0, 0))])
+def test_a_georeferenced_chunk_is_read_exactly(tmp_path, lens):
+    flight = true_flight(lens=lens)
+    source = read(tmp_path, metashape_xml(flight), flight)
+    assert_true(source, flight)
+    assert source.georef.method == "Metashape, WGS 84"
+    assert source.original_images
+    np.testing.assert_allclose(source.georef.origin[:2], ORIGIN[:2], atol=0.01)
+
+
+def test_a_projected_system_of_the_chunk_does_not_matter_for_its_place(tmp_path):
+    import pyproj
+
+    flight = true_flight()
+    wkt = pyproj.CRS("EPSG:32632").to_wkt("WKT1_GDAL")
+    assert_true(read(tmp_path, metashape_xml(flight, reference=wkt), flight), flight)
+
+
+def test_local_coordinates_are_metres_with_z_up(tmp_path):
+    flight = true_flight()
+    source = read(tmp_path, metashape_xml(flight, reference=LOCAL), flight)
+    assert_true(source, flight)
+    assert source.georef.origin is None
+
+
+def test_a_chunk_without_transform_has_the_shape_alone(tmp_path):
+    flight = true_flight()
+    source = read(tmp_path, metashape_xml(flight, transform=""), flight)
+    assert source.georef is None
+    scaled = replace(flight, centers=chunk_from_enu(flight.centers))
+    views = {view.name: view.camera_from_world for view in source.views}
+    for name, center in zip(flight.names, scaled.centers, strict=True):
+        np.testing.assert_allclose(-views[name][:3, :3].T @ views[name][:3, 3], center, atol=1e-6)
+
+
+def test_older_files_have_the_transform_in_the_chunk_and_their_own_lens(tmp_path):
+    """PhotoScan before 1.2: fx, fy, skew, the principal point from the corner, p1 and p2 the other way round."""
+    flight = true_flight()
+    lens = flight.lens
+    values = {
+        "fx": lens.f + lens.b1, "fy": lens.f, "cx": SIZE[0] / 2 + lens.cx, "cy": SIZE[1] / 2 + lens.cy, "skew": lens.b2,
+        "p1": lens.p[1], "p2": lens.p[0], **{f"k{n}": k for n, k in enumerate(lens.k, 1)},
+    }  # fmt: skip
+    text = "".join(f"<{name}>{value!r}</{name}>" for name, value in values.items())
+    size = f'<resolution width="{SIZE[0]}" height="{SIZE[1]}"/>'
+    sensors = (
+        f'<sensor id="0" label="x" type="frame">{size}<calibration type="frame">{size}{text}</calibration></sensor>'
+    )
+    xml = metashape_xml(flight, sensors=sensors, cameras=metashape_cameras(flight, 'sensor_id="0"'), transform="")
+    xml = xml.replace("<reference>", f"{metashape_transform(WGS84)}<reference>")
+    assert_true(read(tmp_path, xml, flight), flight)
+
+
+def test_several_sensors_and_labels_of_one_name_are_told_apart_by_groups(tmp_path):
+    flight = true_flight()
+    names = [f"{folder}/DJI_{index:04d}.JPG" for folder in ("100MEDIA", "101MEDIA") for index in range(4)]
+    flight = replace(flight, names=names)
+    second = Lens(f=2900.0, cx=-5, cy=3, b1=0, b2=0, k=(0.02, 0, 0, 0), p=(0, 0))
+    sensors = "".join(
+        f'<sensor id="{n}" label="s" type="frame">{metashape_calibration(lens)}</sensor>'
+        for n, lens in enumerate((flight.lens, second))
+    )
+    cameras = metashape_cameras(flight)
+    head, tail = cameras.split('<group id="1"')
+    xml = metashape_xml(
+        flight, sensors=sensors, cameras=head + '<group id="1"' + tail.replace('sensor_id="0"', 'sensor_id="1"')
+    )
+    source = read(tmp_path, xml, flight)
+    for half, lens in ((0, flight.lens), (4, second)):
+        part = TrueFlight(
+            names[half : half + 4],
+            flight.rotations[half : half + 4],
+            flight.centers[half : half + 4],
+            flight.points,
+            lens,
+        )
+        assert_true(replace(source, views=tuple(view for view in source.views if view.name in part.names)), part)
+
+
+def test_a_camera_of_no_use_is_named_and_left_out(tmp_path):
+    flight = true_flight()
+    extra = (
+        '<camera id="90" sensor_id="0" label="unaligned_1"/><camera id="91" sensor_id="0" label="unaligned_2"/>'
+        '<camera id="92" sensor_id="0" enabled="false" label="switched_off"><transform>1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1'
+        '</transform></camera><camera id="93" sensor_id="0" master_id="0" label="slave"/>'
+    )
+    source = read(tmp_path, metashape_xml(flight, cameras=metashape_cameras(flight) + extra), flight)
+    assert_true(source, flight)
+    said = " ".join(source.warnings)
+    assert "2 cameras are not aligned and are left out (unaligned_1, unaligned_2)" in said
+    assert "1 cameras are disabled" in said
+    assert "belong to a multi-camera system" in said
+
+
+def test_fisheyes_are_read_as_the_program_describes_them(tmp_path):
+    lens = Lens(b2=0.0, k=(0.02, -0.01, 0.003, -0.001), p=(0.0007, -0.0004))
+    flight = true_flight(lens=lens)
+    sensors = f'<sensor id="0" label="fish" type="fisheye">{metashape_calibration(lens, kind="fisheye")}</sensor>'
+    source = read(tmp_path, metashape_xml(flight, sensors=sensors), flight)
+    rays = np.array([[0.5, 0.3], [-0.9, 0.1], [0.0, -1.4]])
+    radius = np.hypot(*rays.T)
+    angles = rays * (np.arctan(radius) / radius)[:, None]
+    found = ray_pixels(source.views[0].intrinsics, rays)
+    assert np.abs(found - lens.pixels(*angles.T)).max() < 0.01
+
+
+@pytest.mark.parametrize(
+    ("sensors", "says"),
+    [
+        (
+            '<sensor id="0" label="pano" type="spherical"><resolution width="8" height="4"/></sensor>',
+            "pano.*'spherical'",
+        ),
+        (
+            '<sensor id="0" label="bare" type="frame"><resolution width="8" height="4"/></sensor>',
+            "bare.*no calibration",
+        ),
+        (f'<sensor id="0" label="sat" type="rpc">{metashape_calibration(Lens(), kind="rpc")}</sensor>', "sat.*'rpc'"),
+        ("", "sensor 0 is missing"),
+        (f'<sensor id="0" label="x" type="frame">{metashape_calibration(Lens(f=-3.0))}</sensor>', "focal length"),
+        (
+            '<sensor id="0" label="x" type="frame">'
+            f"{metashape_calibration(Lens()).replace('<p1>', '<p3>1e-3</p3><p1>')}</sensor>",
+            "p3, p4",
+        ),
+        (
+            f'<sensor id="0" label="x" type="fisheye">{metashape_calibration(Lens(), kind="fisheye")}</sensor>',
+            "fisheye with b2",
+        ),
+    ],
+)
+def test_lenses_that_are_not_read_are_named(tmp_path, sensors, says):
+    flight = true_flight()
+    with pytest.raises(CaptureError, match=f"(?s)cannot be read.*{says}"):
+        read(tmp_path, metashape_xml(flight, sensors=sensors), flight)
+
+
+def test_the_adjusted_calibration_is_used_and_the_initial_one_where_there_is_no_other(tmp_path):
+    flight = true_flight()
+    first, second = metashape_calibration(Lens(f=3000.0), which=INITIAL), metashape_calibration(flight.lens)
+    for text in (first + second, second + first, metashape_calibration(flight.lens, which=INITIAL)):
+        sensors = f'<sensor id="0" label="x" type="frame">{text}</sensor>'
+        assert_true(read(tmp_path, metashape_xml(flight, sensors=sensors), flight), flight)
+
+
+def test_chunks(tmp_path):
+    flight = true_flight()
+    xml = metashape_xml(flight)
+    start, end = xml.index("<chunk"), xml.index("</document>")
+    chunk = xml[start:end]
+    empty = '<chunk label="other" enabled="true"><sensors/><cameras/></chunk>'
+    off = chunk.replace('enabled="true"', 'enabled="false"', 1)
+    for others in (empty, off):
+        assert_true(read(tmp_path, xml[:start] + others + xml[start:], flight), flight)
+    with pytest.raises(CaptureError, match="2 chunks have cameras"):
+        read(tmp_path, xml[:start] + chunk + xml[start:], flight)
+    with pytest.raises(CaptureError, match="no camera of it has a pose"):
+        read(tmp_path, xml[:start] + empty + xml[end:], flight)
+
+
+def test_components_without_a_common_world_leave_the_smaller_out(tmp_path):
+    flight = true_flight()
+    cameras = metashape_cameras(flight)
+    cut = cameras.index('<camera id="6"')
+    cameras = cameras[:cut] + cameras[cut:].replace('component_id="0"', 'component_id="1"')
+    source = read(tmp_path, metashape_xml(flight, cameras=cameras), flight)
+    kept = TrueFlight(flight.names[:6], flight.rotations[:6], flight.centers[:6], flight.points, flight.lens)
+    assert_true(source, kept)
+    assert any("2 cameras of other components" in each for each in source.warnings)
+
+
+# ------------------------------------------------------------------------------------------- photographs
+
+
+def test_photographs_are_found_in_another_folder_in_other_case_and_with_paths(tmp_path):
+    flight = true_flight()
+    xml = metashape_xml(flight)
+    for index, name in enumerate(flight.names):
+        label = f'"{Path(name).stem}"'
+        path = f'"C:\\card\\{name}"'.replace("/", "\\") if index % 2 else f'"file:///C:/card/{name}"'
+        xml = xml.replace(f"label={label}", f"label={path}")
+    elsewhere = tmp_path / "card copy"
+    for name in flight.names:
+        (elsewhere / name.lower()).parent.mkdir(parents=True, exist_ok=True)
+        (elsewhere / name.lower()).touch()
+    project = tmp_path / "project"
+    project.mkdir()
+    (project / "cameras.xml").write_text(xml, encoding="utf-8")
+    options = CaptureOptions(images=str(elsewhere))
+    source = read_project(project / "cameras.xml", "metashape", options, needs_points=False)
+    assert all(view.image_path.is_file() for view in source.views)
+    assert_true(source, replace(flight, names=[name.lower() for name in flight.names]))
+
+
+def test_a_project_whose_photographs_are_elsewhere_says_which_command_works(tmp_path):
+    flight = true_flight()
+    (tmp_path / "cameras.xml").write_text(metashape_xml(flight), encoding="utf-8")
+    with pytest.raises(CaptureError, match=r"none of its 8 photographs.*--images FOLDER"):
+        read_files(tmp_path, OPTIONS)
+
+
+def test_names_that_may_be_of_two_photographs_are_none(tmp_path):
+    flight = true_flight()
+    flight.touch(tmp_path)
+    (tmp_path / "copy" / "DJI_0001.JPG").parent.mkdir()
+    (tmp_path / "copy" / "DJI_0001.JPG").touch()
+    xml = metashape_xml(flight).replace('label="100MEDIA"', 'label="Group 1"')
+    source = read(tmp_path, xml, flight)
+    assert any("may be of several photographs" in each and "DJI_0001" in each for each in source.warnings)
+    assert not next(view for view in source.views if "DJI_0001" in view.name).image_path.is_file()
+
+
+# ------------------------------------------------------------------------------------------------ points
+
+
+@pytest.mark.parametrize("frame", ["enu of the scene", "ecef", "chunk", "utm"])
+def test_a_point_cloud_beside_is_used_in_whichever_coordinates_it_is(tmp_path, frame):
+    import pyproj
+
+    flight = true_flight()
+    geodetic = geodetic_from_enu(flight.points, ORIGIN)
+    source = read(tmp_path, metashape_xml(flight, reference=pyproj.CRS("EPSG:32632").to_wkt("WKT1_GDAL")), flight)
+    utm = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:32632", always_xy=True).transform(
+        geodetic[:, 1], geodetic[:, 0]
+    )
+    points = {
+        "enu of the scene": enu_from_geodetic(geodetic, source.georef.origin),
+        "ecef": ecef_from_geodetic(geodetic),
+        "chunk": chunk_from_enu(flight.points),
+        "utm": np.column_stack([*utm, geodetic[:, 2]]),
+    }[frame]
+    header = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n"
+    header += "".join(f"property double {axis}\n" for axis in "xyz") + "end_header\n"
+    rows = "\n".join(" ".join(map(repr, map(float, row))) for row in points)
+    (tmp_path / "tie points.ply").write_text(header + rows + "\n")
+    found = read_files(tmp_path, OPTIONS)
+    np.testing.assert_allclose(found.points, enu_from_geodetic(geodetic, found.georef.origin), atol=1e-3)
+
+
+def test_a_cloud_of_another_place_is_refused_and_none_names_the_command(tmp_path):
+    flight = true_flight()
+    flight.touch(tmp_path)
+    (tmp_path / "cameras.xml").write_text(metashape_xml(flight), encoding="utf-8")
+    with pytest.raises(NoTiePoints, match=r"vdgs sfm .*cameras.xml --output CAPTURE"):
+        read_files(tmp_path, OPTIONS)
+    write_ply(tmp_path / "points.ply", flight.points + np.array([5000.0, 0, 0]), np.zeros((900, 3), np.uint8))
+    with pytest.raises(NoTiePoints, match="not where the cameras"):
+        read_files(tmp_path, OPTIONS)
+
+
+# ------------------------------------------------------------------------------------------ hostile files
+
+
+def test_damaged_files_end_in_a_message(tmp_path):
+    flight = true_flight(count=3)
+    flight.touch(tmp_path)
+    whole = metashape_xml(flight).encode()
+    generator = np.random.default_rng(0)
+    for _ in range(150):
+        damaged = bytearray(whole)
+        if generator.random() < 0.3:
+            damaged = damaged[: generator.integers(0, len(whole))]
+        else:
+            for place in generator.integers(0, len(whole), 5):
+                damaged[place] = generator.integers(0, 256)
+        (tmp_path / "cameras.xml").write_bytes(bytes(damaged))
+        try:
+            source = read_project(tmp_path / "cameras.xml", "metashape", OPTIONS, needs_points=False)
+        except CaptureError:
+            continue
+        assert all(np.isfinite(view.camera_from_world).all() for view in source.views)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '<?xml version="1.0"?><!DOCTYPE d [<!ENTITY a "aaaaaaaa"><!ENTITY b "&a;&a;&a;">]><document>&b;</document>',
+        '<?xml version="1.0"?><!DOCTYPE d SYSTEM "file:///etc/passwd"><document/>',
+        "<document>" + "<chunk>" * 5000,
+        "<document><chunk><cameras><camera><transform>"
+        + "1 " * 15
+        + "nan</transform></camera></cameras></chunk></document>",
+        "<document><chunk><cameras><camera><transform>"
+        + "0 " * 16
+        + "</transform></camera></cameras></chunk></document>",
+        '<document encoding="nothing"/>',
+    ],
+)
+def test_hostile_files_are_refused(tmp_path, text):
+    file = tmp_path / "cameras.xml"
+    file.write_text(text)
+    with pytest.raises(CaptureError, match=r"cameras\.xml"):
+        read_project(file, "metashape", OPTIONS, needs_points=False)
+
+
+def test_angles_of_the_flight_are_those_of_the_sample_in_bentleys_description():
+    """The matrix and the angles that the format's own example gives for one photograph."""
+    from support.true_flight import angles_of, omega_phi_kappa
+
+    given = [179.6523471469934, 0.04985630236313049, 179.9065465708369]
+    matrix = omega_phi_kappa(*given)
+    np.testing.assert_allclose(
+        matrix[0], [-0.9999982912233401, -0.001636319085375301, -0.0008602425863163225], atol=2e-5
+    )
+    np.testing.assert_allclose(
+        matrix[2], [0.0008701565192966738, -0.006067647409696231, -0.9999812130648239], atol=2e-5
+    )
+    assert angles_of(matrix) == pytest.approx(given)
+    assert math.isclose(np.linalg.det(matrix), 1)
