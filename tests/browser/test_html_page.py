@@ -42,17 +42,21 @@ def two_floors() -> Gaussians:
     )  # fmt: skip
 
 
-def test_a_browser_without_network_draws_what_we_draw(tmp_path):
+@pytest.mark.parametrize(("width", "height"), [(640, 480), (320, 640)])
+def test_a_browser_without_network_draws_what_we_draw(tmp_path, width, height):
+    """On a telephone from as much farther as its window is narrow."""
     gaussians, background = two_floors(), (0.8, 0.75, 0.5)
     page = InitialView((-1.0, -8.0, 6.0), (0.0, 0.0, 0.0), background, "two floors")
     registry.write_scene(tmp_path / "scene.html", replace(ExportScene.of(gaussians), page=page))
-    pose = look_at_pose(np.array(page.position), np.array(page.target))
-    focal = 0.5 * 480 / np.tan(np.radians(25))
-    camera = Camera(camera_from_world=pose, fx=focal, fy=focal, cx=320.0, cy=240.0, width=640, height=480)
+    target, farther = np.array(page.target), max(1.0, height / width)
+    pose = look_at_pose(target + farther * (np.array(page.position) - target), target)
+    focal = 0.5 * height / np.tan(np.radians(25))
+    camera = Camera(camera_from_world=pose, fx=focal, fy=focal, cx=width / 2, cy=height / 2, width=width, height=height)
     with torch.no_grad():
         expected = render_gaussians(gaussians, camera, torch.tensor(background), 0)[0].image.clamp(0, 1).numpy()
-    part = slice(60, 440), slice(320, 580)  # beside what the client says of software rendering
-    with open_page((tmp_path / "scene.html").as_uri(), 640, 480, offline=True) as shown:
+    # Beside what the client says of software rendering.
+    part = slice(60, 440) if width > height else slice(200, 440), slice(width // 2, width - 60)
+    with open_page((tmp_path / "scene.html").as_uri(), width, height, offline=True) as shown:
 
         def likeness() -> float:
             return psnr(shown.screenshot()[part] / 255.0, expected[part])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from itertools import combinations
 from pathlib import Path
@@ -14,7 +15,7 @@ from rich.console import Console
 pytest.importorskip("viser", reason="viser is not installed (pip install 'vdgs[viewer]')")
 
 
-from support.commands import wait_until
+from support.commands import vdgs, wait_until
 from support.viewer import expected, needs_browser, open_page, quiet, trained
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
@@ -122,10 +123,9 @@ def test_a_browser_shows_every_layer_and_goes_where_buttons_lead(viewer):
 @quiet
 def test_a_distance_measured_in_a_browser_gives_the_capture_its_metres(viewer, run, tmp_path):
     wait_until(lambda: not viewer.sessions)
-    with open_page(viewer.access.local_url(), *WINDOW) as page:
+    with open_page(viewer.access.local_url(), *WINDOW, downloads=tmp_path / "downloads") as page:
         wait_until(lambda: viewer.sessions)
         (visitor,) = viewer.sessions.values()
-        visitor.client.send_file_download = lambda name, content: (tmp_path / name).write_bytes(content)
         wait_until(lambda: in_window(visitor))
         wait_until(  # a page that shows no picture yet takes no clicks
             lambda: np.abs(
@@ -139,8 +139,8 @@ def test_a_distance_measured_in_a_browser_gives_the_capture_its_metres(viewer, r
             wait_until(lambda count=count: len(panel.ruler.clicked) == count)
         wait_until(lambda: "units** ±" in panel._measured.content)
         wait_until(lambda: page.press("Save known distance"))
-        file = tmp_path / SCALE_BAR_FILE
-        wait_until(file.is_file)
+        file = tmp_path / "downloads" / SCALE_BAR_FILE
+        wait_until(file.is_file)  # the browser has stored it: until then it has another name
         wait_until(lambda: f"--scale-bar {SCALE_BAR_FILE}" in panel._command.content)
         before = viewer.scene.capture.ground
         ground = load_capture(viewer.scene.capture.root, CaptureOptions(up="z", scale_bar=file)).ground
@@ -148,3 +148,9 @@ def test_a_distance_measured_in_a_browser_gives_the_capture_its_metres(viewer, r
         assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(25.0, rel=1e-3)
         assert ground.metric
         assert not list(run.rglob(SCALE_BAR_FILE))  # nothing is written where the server is
+    inspected = vdgs(
+        "inspect", viewer.scene.capture.root, "--up", "z", "--scale-bar", file, "--output", tmp_path / "looks"
+    )
+    assert inspected.returncode == 0, inspected.stderr
+    assert SCALE_BAR_FILE in inspected.stdout
+    assert json.loads((tmp_path / "looks/report.json").read_text())["metric"] is True

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import math
 import os
 import shutil
 import subprocess
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +23,7 @@ from vdgs.config.commands import ExportRequest
 from vdgs.errors import VdgsError
 from vdgs.export.formats import registry, spz
 from vdgs.export.formats.axes import ALL, Y_UP_LEFT, Axes, reoriented
-from vdgs.export.formats.export_scene import ExportMetadata, ExportScene
+from vdgs.export.formats.export_scene import ExportMetadata, ExportScene, base_colors
 from vdgs.export.formats.gaussian_ply import short_name
 from vdgs.export.programs import FREE, PROGRAMS, axes_for, with_files
 from vdgs.geometry.camera import Camera
@@ -239,16 +241,69 @@ def test_a_system_has_a_short_name():
     assert short_name("EPSG:32633+5773") == "EPSG:32633+5773"
 
 
-@pytest.mark.parametrize("name", ["a.ply", "a.points.ply"])
-def test_open3d_reads_the_points(tmp_path, name: str):
+@pytest.mark.parametrize("name", ["a.ply", "a.points.ply", "a.las", "a.laz"])
+def test_open3d_shows_the_points(tmp_path, name: str):
+    """Where our camera sees their centres, in their colors. Map coordinates come by way of laspy, as Open3D reads no
+    LAS."""
     open3d = pytest.importorskip("open3d", reason="Open3D is not installed (pip install open3d)")
     pyproj = pytest.importorskip("pyproj")
-    some = random_gaussians(200, 3)
-    registry.write_scene(
-        tmp_path / name, ExportScene.of(some, ExportMetadata((5e5, 3.8e6, 0.0), pyproj.CRS.from_epsg(32611).to_wkt()))
-    )
-    points = np.asarray(open3d.io.read_point_cloud(str(tmp_path / name)).points)
-    np.testing.assert_allclose(points, some.means.numpy(), atol=1e-6)
+    laspy = pytest.importorskip("laspy")
+    some, camera, place = random_gaussians(200, 3), overhead(), np.array((5e5, 3.8e6, 0.0))
+    facts = ExportMetadata(tuple(place.tolist()), pyproj.CRS.from_epsg(32611).to_wkt())
+    registry.write_scene(tmp_path / name, ExportScene.of(some, facts))
+    if name.endswith(".ply"):
+        cloud = open3d.t.io.read_point_cloud(str(tmp_path / name))
+    else:
+        read = laspy.read(tmp_path / name)
+        cloud = open3d.t.geometry.PointCloud(np.ascontiguousarray(read.xyz - place, np.float32))
+        cloud.point.colors = np.stack([read.red, read.green, read.blue], 1).astype(np.float32) / 65535
+    np.testing.assert_allclose(cloud.point.positions.numpy(), some.means.numpy(), atol=6e-4)
+    if name == "a.ply":
+        return  # Open3D knows no harmonics: the points have no colors
+    pinhole = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    shown = cloud.project_to_rgbd_image(
+        camera.width, camera.height, open3d.core.Tensor(pinhole), open3d.core.Tensor(camera.camera_from_world),
+        depth_scale=1.0, depth_max=1e6,
+    )  # fmt: skip
+    pixels, depth = camera.project(some.means.double().numpy())
+    expected = np.zeros((camera.height, camera.width, 3))
+    order = np.argsort(-depth)
+    columns, rows = np.rint(pixels[order]).astype(int).T  # Open3D counts from the middle of the first pixel
+    held = (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height)
+    expected[rows[held], columns[held]] = base_colors(some)[order][held]
+    color = np.asarray(shown.color)
+    points = (color.max(axis=2) > 0) | (expected.max(axis=2) > 0)
+    assert points.sum() > 100
+    assert (np.abs(color - expected)[points].max(axis=1) < 0.01).mean() > (0.99 if name.endswith("ply") else 0.9)
+
+
+BLENDER = """
+import os, bpy
+bpy.ops.wm.read_factory_settings(use_empty=True)
+file = os.environ["FILE"]
+bpy.ops.import_scene.gltf(filepath=file) if file.endswith(".glb") else bpy.ops.wm.ply_import(filepath=file)
+(found,) = [each for each in bpy.data.objects if each.type == "MESH"]
+places = [list(found.matrix_world @ vertex.co) for vertex in found.data.vertices]
+with open(file + ".read.json", "w") as out:
+    import json
+    json.dump({"places": places, "attributes": [each.name for each in found.data.attributes]}, out)
+"""
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.points.ply", "a.glb"])
+def test_blender_reads_what_is_written_for_it(tmp_path, name: str):
+    """At its place, z up, with what draws Gaussians: harmonics, opacities, sizes and turns as attributes."""
+    if importlib.util.find_spec("bpy") is None:
+        pytest.skip("Blender's module is not installed (pip install bpy)")
+    some, file = random_gaussians(200, 1), tmp_path / name
+    axes = PROGRAMS["blender"].axes[registry.format_from_path(file).suffix]
+    registry.write_scene(file, replace(ExportScene.of(some), axes=axes))
+    environment = os.environ | {"FILE": str(file)}
+    subprocess.run([sys.executable, "-c", BLENDER], env=environment, check=True, capture_output=True)
+    read = json.loads(file.with_name(f"{name}.read.json").read_text())
+    np.testing.assert_allclose(read["places"], some.means.numpy(), atol=1e-6)
+    needed = {"f_dc_0", "f_rest_8", "opacity", "scale_2", "rot_3"} if name == "a.ply" else {"position"}
+    assert needed <= set(read["attributes"])
 
 
 # What killed exports leave

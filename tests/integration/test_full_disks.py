@@ -108,9 +108,22 @@ def test_every_stage_of_a_run_says_that_the_disk_is_full_and_continues_to_the_sa
     [
         *(
             ("export", "RUN", "--output", f"DISK/{name}")
-            for name in ("a.ply", "a.spz", "a.glb", "a.html", "tiles/tileset.json")
+            for name in (
+                "a.ply",
+                "a.compressed.ply",
+                "a.points.ply",
+                "a.spz",
+                "a.splat",
+                "a.sog",
+                "a.las",
+                "a.laz",
+                "a.glb",
+                "a.html",
+                "tiles/tileset.json",
+            )
         ),
         ("render", "RUN", "--output", "DISK/views"),
+        ("render", "RUN", "--mode", "depth", "--raw", "--output", "DISK/numbers"),
         ("render", "RUN", "--views", "flyover", "--output", "DISK/film.mp4"),
         ("inspect", "CAPTURE", "--output", "DISK/looks"),
         ("synth", "DISK/town", "--size", "toy"),

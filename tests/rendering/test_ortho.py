@@ -290,6 +290,15 @@ def test_a_folder_shards_beside_the_maps_is_not_ours(house, make, tmp_path):
     )
 
 
+def test_maps_that_are_put_into_a_run_go_where_its_maps_are(house, make, tmp_path):
+    run = tmp_path / "other"
+    run.mkdir()
+    (run / "config.yaml").write_text("vdgs:\n  version: 1\n")
+    make(*house, output=run)
+    assert {path.name for path in run.iterdir()} == {"config.yaml", "maps"}
+    assert (run / "maps/orthophoto.tif").is_file()
+
+
 def test_photographs_of_any_folder_are_no_place_for_maps(house, make, tmp_path):
     capture, model = house
     views = [replace(view, image_path=tmp_path / "card" / view.name) for view in capture.views]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ from rich.console import Console
 
 from support.captures import TinyScene, data_folder, tiny_scene, write_colmap
 from vdgs.captures.loading import load_capture
+from vdgs.captures.place_record import place_rows
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.geometry.similarity import sample_points
 from vdgs.report.capture_report import inspect_capture, print_report
@@ -64,6 +66,23 @@ def test_the_report_says_what_is_there(capture, tmp_path):
         pixels = cv2.imread(str(tmp_path / "out" / name))
         assert pixels.shape[1] > 900
         assert pixels.std() > 10
+
+
+def test_photographs_that_are_shrunk_are_said_to_be(capture, tmp_path):
+    shrunk = load_capture(capture.root, CaptureOptions(up="z", downscale=1.5))
+    report = inspect_capture(shrunk, tmp_path / "out")
+    assert report.place.image_source == "images with --downscale 1.5"
+    assert ("Pixel of the photographs", "26.2 cm on the ground (images with --downscale 1.5, as used)") in place_rows(
+        replace(report.place, unit="m", ground_sampling_distance=0.262)
+    )
+
+
+def test_in_a_run_it_gets_a_folder_of_its_own(capture, tmp_path):
+    (tmp_path / "config.yaml").write_text("vdgs:\n  version: 1\n")
+    before = {"capture", "config.yaml"}
+    inspect_capture(capture, tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == before | {"inspect"}
+    assert (tmp_path / "inspect/report.json").is_file()
 
 
 def test_the_table_is_printed_with_its_warnings(tmp_path):

@@ -211,8 +211,11 @@ class Page:
 
 
 @contextlib.contextmanager
-def open_page(address: str, width: int = 1000, height: int = 700, offline: bool = False) -> Iterator[Page]:
-    """A page of the machine's browser, without a window, drawn in software; `offline`: without any network."""
+def open_page(
+    address: str, width: int = 1000, height: int = 700, offline: bool = False, downloads: Path | None = None
+) -> Iterator[Page]:
+    """A page of the machine's browser, without a window, drawn in software; `offline`: without any network;
+    `downloads`: the folder where files are stored that the page gives."""
     command = browser()
     assert command is not None
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
@@ -233,6 +236,8 @@ def open_page(address: str, width: int = 1000, height: int = 700, offline: bool 
                 page.call(
                     "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False
                 )
+                if downloads is not None:
+                    page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(downloads))
                 if offline:
                     page.call("Network.enable")
                     speed = {"latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}

@@ -62,6 +62,8 @@ class Capture:
     ground: GroundFrame
     #: What a person should know but need not mend.
     warnings: tuple[str, ...] = field(default=())
+    #: By what --downscale shrinks the photographs of that folder.
+    downscale: float = 1.0
     #: Photographs that are there and not used: without a camera, or left out by an option.
     num_unused_images: int = 0
 

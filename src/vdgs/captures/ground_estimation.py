@@ -29,6 +29,7 @@ from vdgs.captures.known_distances import MOST_APART, known_scale_of_views
 from vdgs.captures.plane_fit import mirrored
 from vdgs.captures.position_fit import Problem, Up, fit_positions
 from vdgs.captures.reconstruction import by_axis
+from vdgs.captures.tables_beside import position_tables, table_note
 from vdgs.captures.up_axis import estimate_up, up_by_views
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -122,6 +123,9 @@ def _frame_without_distances(
         _compare_up(scene, frame, warnings)
         return frame, warnings
     up, how = estimate_up(scene.centers, scene.rotations, scene.points, warnings)
+    if not options.gps:
+        tables = position_tables((root, root / source.images), scene.names)
+        warnings += [table_note(table, len(scene.names)) for table in tables]
     return _unscaled(scene, rotation_to_z(up), how, warnings), warnings
 
 

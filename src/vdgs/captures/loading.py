@@ -75,7 +75,7 @@ def make_capture(root: Path, source: SourceCapture, options: CaptureOptions) -> 
     views = assign_splits(root, views, explicit, options, warnings)
     return Capture(
         root=root, source=source.source, images=source.images, views=tuple(views), points=points,
-        point_colors=colors, ground=ground, warnings=(*warnings, *ground_warnings),
+        point_colors=colors, ground=ground, warnings=(*warnings, *ground_warnings), downscale=options.downscale,
         num_unused_images=unused + len(photographs) - len(views),
     )  # fmt: skip
 

@@ -64,7 +64,7 @@ def measure_place(capture: Capture) -> PlaceFacts:
         unit=ground.unit, photographs_used=used, photographs_test=len(capture.test_views),
         photographs_found=max(used, reconstruction.found if reconstruction else used + capture.num_unused_images),
         flown=flown, ground_sampling_distance=ground_sampling_distance(capture), image_folder=capture.images,
-        height=camera_height(capture), extent=extent, area=area, crs_extent=crs_extent,
+        downscale=capture.downscale, height=camera_height(capture), extent=extent, area=area, crs_extent=crs_extent,
         crs_name=crs_name, crs_unit=crs_unit, latitudes=latitudes, longitudes=longitudes, accuracy=ground.accuracy,
         accuracy_method=reconstruction.georeferenced if reconstruction else ground.method,
     )  # fmt: skip

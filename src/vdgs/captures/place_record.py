@@ -29,6 +29,8 @@ class PlaceFacts:
     ground_sampling_distance: float | None
     """What a pixel of the photographs shows, at the size at which they are used."""
     image_folder: str
+    downscale: float = 1.0
+    """By what `--downscale` shrinks the photographs of that folder."""
     height: float
     """How high the cameras fly above the points, or how far they are from them."""
     extent: Bounds | None
@@ -45,6 +47,12 @@ class PlaceFacts:
     """West and east."""
     accuracy: str
     accuracy_method: str
+
+    @property
+    def image_source(self) -> str:
+        """The folder of the photographs, and how they are shrunk."""
+        shrunk = f" with --downscale {self.downscale:g}" if self.downscale > 1 else ""
+        return f"{self.image_folder or 'images'}{shrunk}"
 
 
 def format_flown(flown: tuple[str, ...]) -> str:
@@ -73,7 +81,7 @@ def place_rows(facts: PlaceFacts, more_on_pixels: Sequence[tuple[str, str]] = ()
         rows.append(("Area", f"{format_area(facts.area, unit)} in at least two training photographs, within {size}"))
     if facts.ground_sampling_distance is not None:
         gsd = format_length(facts.ground_sampling_distance, unit)
-        rows.append(("Pixel of the photographs", f"{gsd} on the ground ({facts.image_folder or 'images'}, as used)"))
+        rows.append(("Pixel of the photographs", f"{gsd} on the ground ({facts.image_source}, as used)"))
     rows += more_on_pixels
     rows.append(("Height of the cameras", f"{facts.height:.3g} {unit}"))
     if unit == "m":

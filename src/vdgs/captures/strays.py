@@ -62,6 +62,11 @@ def is_run(folder: Path) -> bool:
         return False
 
 
+def folder_in_run(output: Path, name: str) -> Path:
+    """A folder of this name where the output is a run, whose own files lie in its root; else the output."""
+    return output / name if is_run(output) else output
+
+
 def check_no_run(folder: Path) -> None:
     """Raise CaptureError where a folder that is given as a capture, or as photographs, is a run: its pictures are
     renders."""

@@ -147,7 +147,8 @@ class OrthoRequest(ModelRequest):
     """Maps of a run as GeoTIFFs and pictures (`vdgs ortho`)."""
 
     output: Annotated[Path | None, Output()] = None
-    """Folder for the maps, not among photographs nor with such files of others; by default RUN/maps."""
+    """Folder for the maps, not among photographs nor with such files of others; by default RUN/maps. Of a run that is
+    given here, its folder of maps."""
     gsd: Annotated[float | None, Range(0, MAX_FLOAT, exclusive_min=True)] = None
     """Side of a pixel in units of the map, mostly metres. By default the median that a pixel of the training
     photographs shows of the ground, at the size at which they were used."""

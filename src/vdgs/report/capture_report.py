@@ -16,6 +16,7 @@ from vdgs.captures.image_checks import ImageCheckReport
 from vdgs.captures.output_guard import check_not_among_inputs
 from vdgs.captures.place_record import place_rows
 from vdgs.captures.reconstruction import ReconstructionReport, excluded_lines, report_rows
+from vdgs.captures.strays import folder_in_run
 from vdgs.captures.validation import format_reprojection, validate_capture
 from vdgs.geometry.similarity import sample_points
 from vdgs.report.capture_figures import draw_capture_map, draw_visibility_histogram
@@ -31,11 +32,13 @@ MAX_PROJECTIONS = 2e8
 
 
 def inspect_capture(capture: Capture, output: Path, image_check: ImageCheckReport | None = None) -> CaptureReport:
-    """Measure the capture; write report.json and two figures into the folder `output` (made if absent).
+    """Measure the capture; write report.json and two figures into the folder `output` (made if absent), or into
+    `inspect` in it where it is a run.
 
     `image_check` is the result of decoding its photographs, where they were decoded. Raises VdgsError for an output
     among the capture's inputs.
     """
+    output = folder_in_run(output, "inspect")
     check_not_among_inputs(output, capture)
     output.mkdir(parents=True, exist_ok=True)
     few_enough = int(np.clip(MAX_PROJECTIONS / len(capture.train_views), MIN_POINTS, MAX_POINTS))
@@ -85,7 +88,7 @@ def _rows(report: CaptureReport) -> list[tuple[str, str]]:
     rows = [
         *place_rows(report.place),
         ("Source", report.source),
-        ("Images", f"{report.images or '.'}/: {sizes}" + (f" and {more} more sizes" if more > 0 else "") + " px"),
+        ("Images", f"{report.place.image_source}: {sizes}" + (f" and {more} more sizes" if more > 0 else "") + " px"),
         ("Focal length", f"{report.focal_px:.1f} px ({report.field_of_view_deg:.0f}° across)"),
         ("Sparse points", f"{report.points}, median spacing {format_length(report.point_spacing, unit)}"),
         ("Ground frame", report.ground + ("" if report.metric else " (not metric)")),

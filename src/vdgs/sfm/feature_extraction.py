@@ -10,7 +10,7 @@ from pathlib import Path
 from PIL import Image, ImageOps
 from rich.console import Console
 
-from vdgs.captures.image_files import pillow_without_limits
+from vdgs.captures.image_files import decode_image, pillow_without_limits
 from vdgs.captures.jpeg import with_end
 from vdgs.config.sfm_options import SfmOptions
 from vdgs.errors import CaptureError
@@ -30,6 +30,8 @@ IMAGES_PER_THREAD = 2
 #: Photographs with fewer features cannot be matched.
 MIN_FEATURES = 100
 _UPRIGHT_QUALITY = 97
+#: Their ends were looked at with their heads.
+_JPEGS = (".jpg", ".jpeg")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,11 +89,15 @@ def write_upright_images(workspace: Workspace, photographs: Sequence[ImageMetada
         if photo.orientation == 1 and not photo.whole:
             write_bytes(target, with_end(photo.path).read())
             continue
-        if photo.orientation == 1:
-            os.symlink(photo.path.resolve(), target)
-            continue
         try:
-            _write_upright(photo, target)
+            if photo.orientation == 1:
+                if photo.path.suffix.lower() not in _JPEGS:
+                    decode_image(photo.path)  # of a damaged file COLMAP uses what it can read, and the rest is black
+                os.symlink(photo.path.resolve(), target)
+            else:
+                _write_upright(photo, target)
+        except CaptureError as error:
+            failed.append(ExcludedImage(photo.name, str(error).removeprefix(f"{photo.path}: ")))
         except (OSError, SyntaxError, ValueError) as error:
             failed.append(ExcludedImage(photo.name, f"cannot be decoded ({error}): copy it again"))
     return failed

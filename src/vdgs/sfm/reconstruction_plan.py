@@ -9,6 +9,7 @@ from pathlib import Path
 from rich.console import Console
 
 from vdgs.captures.output_guard import check_output
+from vdgs.captures.tables_beside import ODM_POSITIONS, control_points_beside, position_tables, table_note
 from vdgs.config.ranges import check_ranges
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import VdgsError
@@ -16,10 +17,11 @@ from vdgs.kernels import default_num_threads
 from vdgs.sfm import feature_matching, incremental_mapper
 from vdgs.sfm.console_report import print_preflight
 from vdgs.sfm.gcp_list import GcpList, check_gcps_near, read_gcp_list
-from vdgs.sfm.gps_priors import GpsPriors, read_gps_priors
+from vdgs.sfm.gps_priors import MIN_POSITIONS, GpsPriors, read_gps_priors
 from vdgs.sfm.image_list import ImageList, collect_images
 from vdgs.sfm.preflight import PreflightReport, make_preflight_report
 from vdgs.sfm.scale_bars import ScaleBars, read_scale_bars
+from vdgs.system.quoting import shell_word
 from vdgs.system.units import data_size
 
 #: Bytes of disk for a feature, with its descriptor and its matches; and for a pixel of a written photograph.
@@ -51,11 +53,12 @@ def plan_reconstruction(request: SfmRequest) -> ReconstructionPlan:
     check_ranges(request)
     collection = collect_images(request.image_folders)
     check_output_outside_images(request.output, collection)
+    request, beside = _with_tables_beside(request, collection)
     positions = read_gps_priors(collection.images, request.gps, request.options.gps_std_m)
     control = _read_gcps(request.options, collection, positions)
     bars = read_scale_bars(request.options.scale_bar, collection) if request.options.scale_bar is not None else None
     look = make_preflight_report(collection, positions)
-    look = replace(look, warnings=[*look.warnings, *(control.notes if control else ())])
+    look = replace(look, warnings=[*look.warnings, *beside, *(control.notes if control else ())])
     threads = request.threads or default_num_threads()
     pairs = feature_matching.estimate_pair_count(collection.images, positions, request.options)
     return ReconstructionPlan(
@@ -68,6 +71,29 @@ def plan_reconstruction(request: SfmRequest) -> ReconstructionPlan:
         gcps=control,
         scale_bars=bars,
     )
+
+
+def _with_tables_beside(request: SfmRequest, collection: ImageList) -> tuple[SfmRequest, list[str]]:
+    """The request with ODM's table of positions, where it lies beside photographs that have none of their own; and what
+    to say of tables and lists that lie there."""
+    folders = [*collection.folders, *(photo.path.parent for photo in collection.images)]
+    folders += [folder.resolve().parent for folder in collection.folders]
+    notes, options = list[str](), request.options
+    points = None if options.gcp is not None else control_points_beside(folders)
+    if points is not None and options.georeference != "off":
+        notes.append(f"{points.name} beside the photographs is not used. To use it: --gcp {shell_word(points)}")
+    if request.gps is not None or options.georeference == "off":
+        return request, notes
+    tables = position_tables(folders, [photo.name for photo in collection.images])
+    placed, number = sum(photo.lat_lon is not None for photo in collection.images), len(collection.images)
+    used = next((table for table in tables if table.photographs and table.file.name.lower() == ODM_POSITIONS), None)
+    if used is not None and placed < MIN_POSITIONS:
+        notes.append(
+            f"{used.file.name} beside the photographs, which say no positions, has those of {used.photographs} of "
+            f"{number} and is used. To leave it out: --georeference off"
+        )
+        return replace(request, gps=used.file), notes
+    return request, [*notes, *(table_note(table, number) for table in tables)]
 
 
 def _read_gcps(options: SfmOptions, collection: ImageList, positions: GpsPriors) -> GcpList | None:

@@ -67,7 +67,7 @@ class MeasurePanel:
             others = [each for each in self.known if (each.one, each.other) != tuple(points)]
             self.known = [*others, KnownDistance(points[0], points[1], meters)]
             text = known_distances_text(self.known)
-            self._session.client.send_file_download(SCALE_BAR_FILE, text.encode())
+            self._session.client.send_file_download(SCALE_BAR_FILE, text.encode(), save_immediately=True)
             self._command.content = scale_markdown(self.known, self._session.scene.capture.root.name)
 
     def _show(self) -> None:

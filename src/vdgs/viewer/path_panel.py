@@ -58,7 +58,7 @@ class PathPanel:
             self._session.notify("No key frames", "Add key frames first.")
             return
         text = path_json(self.keyframes, float(self._seconds.value), bool(self._closed.value))
-        self._session.client.send_file_download(_FILE_NAME, text.encode())
+        self._session.client.send_file_download(_FILE_NAME, text.encode(), save_immediately=True)
 
     def play(self) -> None:
         """Move along the path, as fast as the video will."""

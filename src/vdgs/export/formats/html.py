@@ -65,6 +65,14 @@ _WORKERS = (
     "script.open('GET',url,false);script.send();"
     "url='data:text/javascript;charset=utf-8,'+encodeURIComponent(script.responseText);}super(url,options);}}}</script>"
 )
+#: On a window that is higher than wide one stands as many times farther, so that the scene still fits across. The
+#: client takes a place to stand from its address, which the script of a file cannot change.
+_PORTRAIT = (
+    "<script>{const usual=URLSearchParams,from=%s,to=%s;window.URLSearchParams=class extends usual{get(name){"
+    "const said=super.get(name),times=innerHeight/innerWidth;"
+    "if(said!==null||name!=='initialCameraPosition'||!(times>1))return said;"
+    "return from.map((x,i)=>to[i]+times*(x-to[i])).join(',');}}}</script>"
+)
 _CAPTION = (
     "position:fixed;left:0;bottom:0;z-index:2;margin:0;padding:.35em .7em;font:13px/1.4 system-ui,sans-serif;"
     "color:#222;background:rgba(255,255,255,.75);pointer-events:none"
@@ -176,6 +184,8 @@ def _document(gaussians: Gaussians, factor: float, page: InitialView, scene: Exp
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
         f'<meta name="vdgs" content="{html.escape(json.dumps(facts))}">{_WORKERS}'
     )
+    stand, target = ([factor * each for each in place] for place in (page.position, page.target))
+    head += _PORTRAIT % (stand, target)
     recording = _recording(_packed(gaussians, factor), factor, page)
     script = (
         f'<script>window.__VISER_EMBED_DATA__="{recording}";window.__VISER_EMBED_CONFIG__={{darkMode:false}};</script>'

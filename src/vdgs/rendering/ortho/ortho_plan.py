@@ -12,6 +12,7 @@ from rich.console import Console
 
 from vdgs.captures.capture import Capture
 from vdgs.captures.output_guard import check_not_among_inputs, check_output
+from vdgs.captures.strays import folder_in_run
 from vdgs.config.commands import OrthoRequest
 from vdgs.errors import VdgsError
 from vdgs.geometry.map_projection import MapProjection
@@ -35,8 +36,8 @@ STAGING = "maps"
 
 
 def output_folder(request: OrthoRequest, run: Path) -> Path:
-    """Where the files of a map go."""
-    return request.output or run / "maps"
+    """Where the files of a map go: where a run is asked for, into its folder of maps."""
+    return run / "maps" if request.output is None else folder_in_run(request.output, "maps")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

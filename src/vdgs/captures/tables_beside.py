@@ -1,0 +1,69 @@
+"""Tables of positions and lists of control points that lie beside photographs, and that nobody has given."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+from vdgs.captures.georeference import match_rows
+from vdgs.captures.gps_tables import read_gps_table
+from vdgs.errors import CaptureError
+from vdgs.system.quoting import shell_word
+
+#: What ODM calls its table and its list.
+ODM_POSITIONS, ODM_CONTROL_POINTS = "geo.txt", "gcp_list.txt"
+#: Positions of fewer photographs are not worth a word.
+_MIN_ROWS = 3
+_SUFFIXES = frozenset({".txt", ".csv", ".tsv", ".mrk"})
+#: Larger files are no tables of photographs; a folder of more of them is one for other things (choice).
+_MAX_BYTES, _MAX_FILES = 5_000_000, 20
+
+
+class TableBeside(NamedTuple):
+    """A table, and of how many photographs it has a position."""
+
+    file: Path
+    photographs: int
+    problem: str = ""
+    """Why ODM's own cannot be used."""
+
+
+def position_tables(folders: Iterable[Path], names: Sequence[str]) -> list[TableBeside]:
+    """Tables in the folders that hold positions of the photographs of these names; those of most photographs first."""
+    found = []
+    for file in _candidates(folders):
+        try:
+            table = read_gps_table(file)
+            found.append(TableBeside(file, len(match_rows(names, table.rows, file, table.numbered))))
+        except CaptureError as error:  # mostly some other text
+            found += [TableBeside(file, 0, str(error))] if file.name.lower() == ODM_POSITIONS else []
+    return sorted(
+        (each for each in found if each.photographs >= _MIN_ROWS or each.problem), key=lambda each: -each.photographs
+    )
+
+
+def control_points_beside(folders: Iterable[Path]) -> Path | None:
+    """ODM's list of control points in one of the folders."""
+    return next((file for file in _candidates(folders) if file.name.lower() == ODM_CONTROL_POINTS), None)
+
+
+def table_note(table: TableBeside, number: int) -> str:
+    """How to use a table that nobody has given, or why it cannot be used."""
+    if table.problem:
+        return f"positions beside the photographs are not used: {table.problem}"
+    return (
+        f"{table.file.name} beside the photographs holds positions of {table.photographs} of {number}; not used. To "
+        f"use it: --gps {shell_word(table.file)}"
+    )
+
+
+def _candidates(folders: Iterable[Path]) -> list[Path]:
+    found: dict[Path, None] = {}
+    for folder in dict.fromkeys(folders):
+        with suppress(OSError):
+            files = [each for each in sorted(folder.iterdir()) if each.suffix.lower() in _SUFFIXES and each.is_file()]
+            if len(files) <= _MAX_FILES:
+                found |= dict.fromkeys(each for each in files if each.stat().st_size <= _MAX_BYTES)
+    return list(found)

@@ -1,0 +1,90 @@
+"""Tables of positions and lists of control points that lie beside photographs, and that nobody has given."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from support.captures import tiny_scene, write_colmap
+from support.flights import write_photograph
+from vdgs.captures.loading import load_capture
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.sfm_options import SfmOptions, SfmRequest
+from vdgs.sfm.gps_priors import GpsPriors
+from vdgs.sfm.reconstruction_plan import plan_reconstruction
+
+NOISE = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
+TABLES = {
+    "card/geo.txt": "EPSG:4326\n{0} 8.5 47.1 500\n{1} 8.501 47.1 500\n{2} 8.502 47.1 500\n",
+    "geo.txt": "EPSG:4326\n{0} 8.5 47.1 500\n{1} 8.501 47.1 500\n{2} 8.502 47.1 500\n",
+    "card/flight.MRK": "1\t2.0\t[2]\t0,N\t0,E\t0,V\t47.1,Lat\t8.5,Lon\t500,Ellh\t0.01, 0.01, 0.02\t50,Q\n"
+    "2\t2.0\t[2]\t0,N\t0,E\t0,V\t47.1,Lat\t8.501,Lon\t500,Ellh\t0.01, 0.01, 0.02\t50,Q\n"
+    "3\t2.0\t[2]\t0,N\t0,E\t0,V\t47.1,Lat\t8.502,Lon\t500,Ellh\t0.01, 0.01, 0.02\t50,Q\n",
+    "positions.csv": "name,lat,lon,alt\n{0},47.1,8.5,500\n{1},47.1,8.501,500\n{2},47.1,8.502,500\n",
+}
+
+
+def planned(folder: Path, name: str, text: str, placed: bool, **more) -> tuple[GpsPriors, list[str]]:
+    """What is known before the work of three photographs with a file beside them, and what is said."""
+    (folder / "card").mkdir()
+    names = [f"DJI_{k + 1:04d}.JPG" for k in range(3)]
+    for k, each in enumerate(names):
+        write_photograph(
+            folder / "card" / each, np.roll(NOISE, 9 * k, 0), k, np.array((9.0 * k, 0, 40)) if placed else None
+        )
+    (folder / name).write_text(text.format(*names))
+    request = SfmRequest(image_folders=(folder / "card",), output=folder / "new", options=SfmOptions(**more))
+    plan = plan_reconstruction(request)
+    return plan.gps_priors, [each for each in plan.preflight.warnings if "beside" in each]
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_a_table_beside_photographs_is_named_before_the_work(tmp_path, name):
+    priors, said = planned(tmp_path, name, TABLES[name], placed=True)
+    assert priors.source == "EXIF"
+    file = Path(name).name
+    path = tmp_path / name
+    assert said == [f"{file} beside the photographs holds positions of 3 of 3; not used. To use it: --gps {path}"]
+
+
+@pytest.mark.parametrize("name", ["card/geo.txt", "geo.txt"])
+def test_the_table_of_odm_is_used_where_photographs_say_no_positions(tmp_path, name):
+    priors, (said,) = planned(tmp_path, name, TABLES[name], placed=False)
+    assert (priors.source, len(priors)) == ("geo.txt", 3)
+    assert "which say no positions, has those of 3 of 3 and is used. To leave it out: --georeference off" in said
+
+
+def test_the_table_of_odm_is_left_out_where_asked_and_where_it_cannot_be_read(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    priors, said = planned(tmp_path / "a", "geo.txt", TABLES["geo.txt"], placed=False, georeference="off")
+    assert (len(priors), said) == (0, [])
+    priors, (said,) = planned(tmp_path / "b", "geo.txt", "{0} 500123 5200123 500\n", placed=False)
+    assert len(priors) == 0
+    assert said.startswith(f"positions beside the photographs are not used: {tmp_path / 'b/geo.txt'}: names neither")
+
+
+def test_control_points_and_other_texts_beside_photographs(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    text = "EPSG:32632\n462000 5200000 500 10 10 {0} p1\n"
+    _, (said,) = planned(tmp_path / "a", "card/gcp_list.txt", text, placed=True)
+    assert said.endswith(f"is not used. To use it: --gcp {tmp_path / 'a/card/gcp_list.txt'}")
+    assert planned(tmp_path / "b", "card/readme.txt", "A flight of {0}\n\nOn a day, 1, 2, 3\n", placed=True)[1] == []
+
+
+def test_a_table_beside_a_capture_without_a_place_is_named(tmp_path):
+    scene = tiny_scene()
+    write_colmap(tmp_path, scene)
+    names = [path.name for path in sorted((tmp_path / "images").iterdir())]
+    rows = [f"{name},{47 + k // 4 * 1e-4},{8 + k % 4 * 1e-4},400" for k, name in enumerate(names)]
+    (tmp_path / "gps.csv").write_text("name,lat,lon,alt\n" + "\n".join(rows))
+    said = [each for each in load_capture(tmp_path, CaptureOptions()).warnings if "beside" in each]
+    file = tmp_path / "gps.csv"
+    number = len(names)
+    assert said == [
+        f"gps.csv beside the photographs holds positions of {number} of {number}; not used. To use it: --gps {file}"
+    ]
+    assert not [each for each in load_capture(tmp_path, CaptureOptions(up="z")).warnings if "beside" in each]
