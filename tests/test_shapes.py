@@ -25,7 +25,8 @@ from vdgs.visibility.visibility_counts import count_visibility
 
 def imports_jaxtyping(file: Path) -> bool:
     """In any form, anywhere in the file."""
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+    text = file.read_text(encoding="utf-8")
+    for node in ast.walk(ast.parse(text)) if "jaxtyping" in text else ():
         names = [each.name for each in node.names] if isinstance(node, ast.Import) else []
         names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
         if any(name.partition(".")[0] == "jaxtyping" for name in names):

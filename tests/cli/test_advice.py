@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -44,27 +44,26 @@ def all_arguments() -> dict[str, type | None]:
     return verb_arguments() | {"bench": BenchArguments}
 
 
-def texts_with_options() -> Iterator[tuple[str, str]]:
+@cache
+def texts_with_options() -> list[tuple[str, str]]:
     """Every text of the sources that names an option of vdgs, and the file; `{}` stands for what is filled in."""
+    found = set()
     for path in sorted(set(SOURCE.rglob("*.py")) - NO_MESSAGES):
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        skipped = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-        for node in ast.walk(tree):
-            if isinstance(node, ast.JoinedStr):
+        file, skipped = path.relative_to(SOURCE).as_posix(), set[int]()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):  # a node before what it holds
+            if isinstance(node, ast.Expr):
+                skipped.add(id(node.value))
+            elif isinstance(node, ast.JoinedStr):
                 skipped |= {id(part) for part in node.values}
-        for node in ast.walk(tree):
             if isinstance(node, ast.JoinedStr):
                 text = "".join(str(part.value) if isinstance(part, ast.Constant) else "{}" for part in node.values)
             elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in skipped:
                 text = node.value
             else:
                 continue
-            others = next((flags for file, flags in OF_OTHERS.items() if path.as_posix().endswith(file)), set())
-            if set(OPTION.findall(text)) - others:
-                yield path.relative_to(SOURCE).as_posix(), text
-
-
-TEXTS = sorted(set(texts_with_options()))
+            if set(OPTION.findall(text)) - others_of(file):
+                found.add((file, text))
+    return sorted(found)
 
 
 def others_of(file: str) -> set[str]:
@@ -72,15 +71,15 @@ def others_of(file: str) -> set[str]:
 
 
 def test_there_is_advice_to_check():
-    assert len(TEXTS) > 100
+    assert len(texts_with_options()) > 100
     assert {"captures/loading.py", "sfm/georeferencing.py", "training/session/trainer.py"} <= {
-        file for file, _ in TEXTS
+        file for file, _ in texts_with_options()
     }
 
 
 def test_a_command_in_a_message_has_the_options_it_is_shown_with():
     kinds = all_arguments()
-    for file, text in TEXTS:
+    for file, text in texts_with_options():
         for command in COMMAND.finditer(text):
             verb = command.group(1)
             assert verb in kinds or f"`{command.group()}`" not in text, f"{file}: there is no verb {verb}: {text}"
@@ -93,7 +92,7 @@ def test_a_command_in_a_message_has_the_options_it_is_shown_with():
 def test_every_option_in_a_message_is_one_of_some_verb():
     known = {flag for kind in all_arguments().values() for flag in flags_of(kind)}
     known |= {f"--{flag.rpartition('.')[2]}" for flag in known if flag.startswith("--sfm.")}
-    for file, text in TEXTS:
+    for file, text in texts_with_options():
         assert not set(OPTION.findall(text)) - known - others_of(file), f"{file}: {text}"
 
 
@@ -101,7 +100,7 @@ def test_every_option_in_a_message_is_one_of_some_verb():
 def test_a_verb_names_an_option_that_it_lacks_only_with_those_that_have_it(verb):
     kinds = all_arguments()
     own = flags_of(kinds[verb])
-    for file, text in TEXTS:
+    for file, text in texts_with_options():
         fitted = Advice(verb, lambda: kinds).fit(text)
         advice, _, note = (
             fitted.rpartition(" (") if fitted.endswith(")") and " of `vdgs " in fitted else (fitted, "", "")

@@ -38,7 +38,7 @@ BUSY = {
         every=2, stats_start=0, start=2, grad_threshold=1e-6, min_draw_fraction=0.1, stop_fraction=0.5
     ),
     "compensation": CompensationConfig(enabled=True, t_low=1.0),
-    "iterations": 8,
+    "iterations": 6,
     "swa_fraction": 0.4,
 }
 
@@ -127,7 +127,7 @@ def test_a_step_waits_for_the_card_only_where_it_must(rasterizer):
 def test_growth_a_new_order_and_the_mean_stay_on_the_device(monkeypatch, rasterizer):
     monkeypatch.setattr(training_loop, "SORT_INTERVAL", 5)
     with pretended_card():
-        state = trained_on(CARD, 8, **BUSY)
+        state = trained_on(CARD, 6, **BUSY)
         devices = {tensor.device.type for group in state.groups().values() for tensor in group.values()}
         devices |= {tensor.device.type for tensor in to_checkpoint(state).tensors.values()}
     assert devices == {"cuda"}

@@ -191,30 +191,19 @@ def test_a_changed_setting_redoes_exactly_what_depends_on_it(capture, copied):
     assert changed - {".run"} == {"config.yaml", "blocks", "merged", "evaluation", "report.html"}
 
 
-def time_few_steps() -> None:
-    """Let a plan be made of fewer steps than take seconds."""
-    from vdgs.pipeline import time_estimate
-
-    time_estimate.MAX_TIMED_SECONDS = 0.0
-
-
 def test_a_dry_run_says_what_it_takes_and_writes_nothing(capture, copied, tmp_path):
     before = moments(copied)
     for output, done in ((copied, True), (tmp_path / "new", False)):
-        planned = vdgs("run", capture, "--output", output, *SETTINGS, "--dry-run", prepare=time_few_steps)
+        planned = vdgs("run", capture, "--output", output, *SETTINGS, "--dry-run")
         assert planned.returncode == 0, planned.stderr
         assert f"{ITERATIONS} iterations" in planned.stdout
         assert f"2 blocks: about {BLOCK_ITERATIONS} iterations each, 2 at once" in planned.stdout
         assert planned.stdout.count("done already") == 2 * done
         assert "stereo" not in planned.stdout  # sparse points suffice
-    changed = vdgs(
-        "run", capture, "--output", copied, *SETTINGS, "--lambda-vis", "0", "--dry-run", prepare=time_few_steps
-    )
+    changed = vdgs("run", capture, "--output", copied, *SETTINGS, "--lambda-vis", "0", "--dry-run")
     assert "changed --lambda-vis: 1.0 -> 0.0" in changed.stdout
     assert changed.stdout.count("done already") == 1
-    shrunk = vdgs(
-        "run", capture, "--output", copied, *SETTINGS, "--downscale", "2", "--dry-run", prepare=time_few_steps
-    )
+    shrunk = vdgs("run", capture, "--output", copied, *SETTINGS, "--downscale", "2", "--dry-run")
     assert "changed --downscale: 1.0 -> 2.0" in shrunk.stdout, shrunk.stderr
     assert "done already" not in shrunk.stdout
     assert changed_files(copied, before) == set()
@@ -223,9 +212,7 @@ def test_a_dry_run_says_what_it_takes_and_writes_nothing(capture, copied, tmp_pa
 
 def test_a_dry_run_counts_what_stereo_may_add(tmp_path):
     write_colmap(tmp_path / "capture", tiny_scene(points=80))
-    planned = vdgs(
-        "run", tmp_path / "capture", "--output", tmp_path / "run", *SETTINGS, "--dry-run", prepare=time_few_steps
-    )
+    planned = vdgs("run", tmp_path / "capture", "--output", tmp_path / "run", *SETTINGS, "--dry-run")
     assert f"and at most {10 * 64 * 48 // PIXELS_PER_POINT - 80} where stereo finds ground" in planned.stdout
     assert "training steps at each size, stereo." in " ".join(planned.stdout.split())
 

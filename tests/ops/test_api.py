@@ -14,6 +14,7 @@ import pytest
 import torch
 
 import vdgs
+from support.commands import CommandsHere
 from support.small_pipeline import vdgs as verb
 from vdgs.errors import CaptureError, RunError, VdgsError
 
@@ -172,7 +173,8 @@ def test_a_callback_ends_a_stage(run, capture):
 
 
 @pytest.mark.slow
-def test_training_in_a_folder_leaves_a_run(run, native_small, tmp_path):
+def test_training_in_a_folder_leaves_a_run(run, native_small, tmp_path, monkeypatch):
+    monkeypatch.setattr("vdgs.distributed.backend_selection.LocalExecutor", CommandsHere)
     options = vdgs.CaptureOptions(up="z")
     scene = vdgs.train(native_small.capture, run.settings, run_dir=tmp_path / "run", capture_options=options)
     assert same(scene, run.scene)

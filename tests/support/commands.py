@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 PATIENCE_SECONDS = 900.0
 #: Resolution of the figures that commands draw.
 SMALL_DPI = 30
+#: Steps that they time to say how long training takes.
+FEW_STEPS = 2
 #: Seconds between two looks at what is waited for.
 GLANCE_SECONDS = 0.01
 
@@ -280,7 +282,7 @@ def _run(main: Callable[[], None], stdout: str, stderr: str, environment: dict[s
 
 def _vdgs(arguments: list[str], prepare: Callable[[], None] | None) -> None:
     fork_tasks()
-    draw_small_figures()
+    spare_seconds()
     if prepare is not None:
         prepare()
     from vdgs.cli.main import main
@@ -288,12 +290,15 @@ def _vdgs(arguments: list[str], prepare: Callable[[], None] | None) -> None:
     main(arguments)
 
 
-def draw_small_figures() -> None:
-    """Let this process draw figures of so few pixels as still makes files of them: what they show, others test."""
+def spare_seconds() -> None:
+    """Let this process draw figures of so few pixels as still makes files of them, and time few steps before it trains:
+    what figures show and how near estimates come, others test."""
+    from vdgs.pipeline import time_estimate
     from vdgs.report import charts
     from vdgs.system import figure_style as style
 
     style.DPI = charts.DPI = SMALL_DPI
+    time_estimate.MIN_TIMED_STEPS, time_estimate.MAX_TIMED_SECONDS = FEW_STEPS, 0.0
 
 
 def _execute(code: str) -> None:

@@ -8,6 +8,7 @@ import struct
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +21,9 @@ from vdgs.geometry.camera import Camera
 from vdgs.geometry.geodesy import geodetic_from_enu
 from vdgs.synth.flight_cameras import pose_from_angles
 from vdgs.synth.image_renderer import render_image
-from vdgs.synth.lighting import make_sky_map
+from vdgs.synth.lighting import SkyMap, make_sky_map
 from vdgs.synth.ray_tracing import RayTracer
-from vdgs.synth.town import build_town
+from vdgs.synth.town import Town, build_town
 
 #: Where the town lies: latitude, longitude in degrees, altitude in metres. South and west, where signs go wrong.
 ORIGIN = (-33.5, -70.6, 500.0)
@@ -61,14 +62,25 @@ def grid(strips: int, each: int, step: float) -> list[Camera]:
     return cameras
 
 
+@cache
+def town_of(extent: float) -> tuple[Town, RayTracer]:
+    """The town under flights, so many metres wide."""
+    town = build_town(3, extent)
+    return town, RayTracer(town.mesh)
+
+
+@cache
+def sky_over(extent: float) -> SkyMap:
+    town, tracer = town_of(extent)
+    with ThreadPoolExecutor(1) as pool:
+        return make_sky_map(tracer, town.terrain, town.zones, extent / 2 + 20, pool)
+
+
 def fly(folder: Path, cameras: Sequence[Camera], extent: float = 60.0) -> Flight:
     """Take the photographs and write them with what a drone writes."""
     folder.mkdir(parents=True)
-    town = build_town(3, extent)
-    tracer = RayTracer(town.mesh)
+    (town, tracer), sky = town_of(extent), sky_over(extent)
     flight = Flight(folder, list(cameras))
-    with ThreadPoolExecutor(1) as pool:
-        sky = make_sky_map(tracer, town.terrain, town.zones, extent / 2 + 20, pool)
     for k, (name, camera) in enumerate(zip(flight.names, cameras, strict=True)):
         pixels = render_image(town, tracer, sky, camera, 1, np.ones(3))
         write_photograph(folder / name, pixels, k, camera.position)
@@ -104,7 +116,7 @@ def copy_folder(of: Path, to: Path) -> None:
 def sightings(cameras: Sequence[Camera], points: np.ndarray, extent: float = 60.0) -> list[dict[int, np.ndarray]]:
     """For each place over the town (x, y) the pixels [2] at which cameras, by their numbers, see its ground; and, under
     -1, the place on the ground itself [3]."""
-    tracer = RayTracer(build_town(3, extent).mesh)
+    tracer = town_of(extent)[1]
     found = []
     for x, y in points:
         above = np.array([[x, y, 300.0]], np.float32)

@@ -14,8 +14,8 @@ from vdgs.cli.main import main
 
 #: As few and as small as lets anchors grow, blocks train and PSNR say something.
 SETTINGS = (
-    "--preset", "laptop", "--iterations", "40", "--model.num-offsets", "2", "--init.voxel-size", "0.8",
-    "--lr.features", "0.03", "0.03", "--densify.start", "10", "--densify.stats-start", "0",
+    "--preset", "laptop", "--iterations", "24", "--model.num-offsets", "2", "--init.voxel-size", "0.8",
+    "--lr.features", "0.05", "0.05", "--densify.start", "10", "--densify.stats-start", "0",
     "--densify.min-draw-fraction", "0.05", "--densify.every", "10", "--densify.max-anchors", "200",
 )  # fmt: skip
 
@@ -24,8 +24,8 @@ CUT = ("--blocks", "2", "--assignment.min-cameras", "3")
 
 
 BLOCK = (
-    "--block.iterations", "16", "--block.densify.start", "8", "--block.densify.stats-start", "0",
-    "--block.densify.every", "8", "--block.densify.min-draw-fraction", "0.05",
+    "--block.iterations", "10", "--block.densify.start", "4", "--block.densify.stats-start", "0",
+    "--block.densify.every", "4", "--block.densify.min-draw-fraction", "0.05",
 )  # fmt: skip
 
 
