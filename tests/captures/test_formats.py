@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from support.captures import TinyScene, moved, tiny_scene, to_source, write_colmap, write_images, write_ply
 from support.dataset_layouts import DRB, OPENGL, halves, matrixcity_frames, write_matrixcity, write_mega_nerf
 from vdgs.captures.capture import Capture
-from vdgs.captures.formats.json_poses import parse_intrinsics
+from vdgs.captures.formats.json_poses import parse_intrinsics, parse_matrix
 from vdgs.captures.formats.ply_reader import read_point_cloud
 from vdgs.captures.formats.source_capture import Intrinsics
 from vdgs.captures.loading import load_capture
@@ -487,3 +487,12 @@ def test_a_path_outside_the_capture_is_called_what_it_is(tmp_path, scene):
     write_transforms(tmp_path, scene, ply_file_path="/elsewhere/cloud.ply")
     with pytest.raises(CaptureError, match=r"the ply_file_path '/elsewhere/cloud\.ply' is not a path inside"):
         load_capture(tmp_path)
+
+
+def test_a_transposed_pose_is_refused(tmp_path):
+    """Without a look at the last row all cameras would stand at the origin."""
+    place = np.eye(4)
+    place[:3, 3] = 3.0, 4.0, 5.0
+    assert np.array_equal(parse_matrix(place.tolist(), tmp_path, "frame 1"), place)
+    with pytest.raises(CaptureError, match=r"frame 1 has a matrix whose last row is not 0 0 0 1\. It seems transposed"):
+        parse_matrix(place.T.tolist(), tmp_path, "frame 1")

@@ -351,3 +351,20 @@ def test_photographs_without_an_end_go_on_whole(tmp_path, orientation):
         assert image.size == ((160, 120) if orientation == 1 else (120, 160))
     if orientation == 1:
         assert np.array_equal(cv2.imread(str(work.images / names[0]), cv2.IMREAD_UNCHANGED), whole)
+
+
+def test_a_png_that_is_damaged_is_left_out_before_its_features_are_searched(tmp_path, capfd):
+    """COLMAP takes what it can read of one, and the end of the work would fail."""
+    exif = Image.Exif()
+    exif[0x0110] = "Drone"
+    for k in range(5):
+        picture(tmp_path / "card" / f"{k}.png", pixels(k), exif=exif)
+    whole = (tmp_path / "card/1.png").read_bytes()
+    (tmp_path / "card/1.png").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "card/2.png").write_bytes(whole[: len(whole) // 3] + bytes(8) + whole[len(whole) // 3 + 8 :])
+    work = Workspace(tmp_path / "work")
+    failed = write_upright_images(work, collect_images((tmp_path / "card",)).images)
+    assert [each.name for each in failed] == ["1.png", "2.png"]
+    assert all(each.reason.startswith("cannot be decoded (") for each in failed)
+    assert sorted(path.name for path in work.images.iterdir()) == ["0.png", "3.png", "4.png"]
+    assert capfd.readouterr().err == ""

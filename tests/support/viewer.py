@@ -237,7 +237,7 @@ def open_page(
                     "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False
                 )
                 if downloads is not None:
-                    page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(downloads))
+                    page.call("Page.setDownloadBehavior", behavior="allow", downloadPath=str(downloads))
                 if offline:
                     page.call("Network.enable")
                     speed = {"latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}

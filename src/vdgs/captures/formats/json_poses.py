@@ -47,6 +47,9 @@ def parse_matrix(value: object, file: Path, label: str) -> np.ndarray:
         matrix = np.zeros(0)
     if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
         raise CaptureError(f"{file}: {label} needs a 4x4 matrix of finite numbers. Export it again.")
+    if len(matrix) == 4 and np.abs(matrix[3, :3]).max() > 1e-6 * np.abs(matrix).max():
+        way = " It seems transposed: the place belongs into the last column." if not matrix[:3, 3].any() else ""
+        raise CaptureError(f"{file}: {label} has a matrix whose last row is not 0 0 0 1.{way} Export it again.")
     result = np.eye(4)
     result[:3] = matrix[:3]
     return result
@@ -93,7 +96,8 @@ def parse_intrinsics(frame: JsonObject, common: JsonObject, image: Path, file: P
     fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
     if fx is None or fy is None:
         raise CaptureError(f"{file}: no focal length for {image.name} (fl_x or camera_angle_x).")
-    head = (fx, fy, get("cx", width / 2) or 0.0, get("cy", height / 2) or 0.0)
+    # A corner is no principal point: programs that know none write 0.
+    head = (fx, fy, get("cx", width / 2) or width / 2, get("cy", height / 2) or height / 2)
     model, tail = _lens(_camera_model(values, file), _distortion(values, file), file)
     if not (0 < width < 1e6 and 0 < height < 1e6):
         raise CaptureError(f"{file}: {image.name} has an image size of {width}x{height}. Mend w and h.")

@@ -101,7 +101,7 @@ def _write(plan: OrthoPlan, tiles: Iterable[OrthoTile], console: Console) -> flo
         if not metadata["mapped_share"]:
             raise VdgsError(
                 f"{plan.folder}: the {plan.model} model shows nothing solid there, or no training photograph looks "
-                "there. Give another --bbox or leave it out."
+                "there. Give another --bbox or a smaller --gsd, or leave them out."
             )
         for layer in layers:
             rough = staging / f"rough-{layer.name}"
