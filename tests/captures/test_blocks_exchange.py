@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -83,13 +84,49 @@ def test_yaw_and_pitch_are_read_where_nothing_rolls_and_refused_where_it_does(tm
 def test_photographs_without_pose_are_named_and_left_out(tmp_path, flight):
     more = (
         "<Photogroup><Name>late</Name><Photo><Id>90</Id><ImagePath>late_1.JPG</ImagePath></Photo><Photo><Id>91</Id>"
-        "<ImagePath>late_2.JPG</ImagePath><Pose><Center><x>1</x><y>2</y><z>3</z></Center></Pose></Photo></Photogroup>"
+        "<ImagePath>late_2.JPG</ImagePath><Pose><Center><x>1</x><y>2</y><z>3</z></Center></Pose></Photo>"
+    )
+    guess = (
+        "<Rotation><Omega>1</Omega><Phi>2</Phi><Kappa>3</Kappa>{}</Rotation><Center><x>1</x><y>2</y><z>3</z></Center>"
+    )
+    more += (
+        "<Photo><Id>92</Id><ImagePath>late_3.JPG</ImagePath><Component>0</Component><Pose>"
+        f"{guess.format('')}</Pose></Photo><Photo><Id>93</Id><ImagePath>late_4.JPG</ImagePath><Pose>"
+        f"{guess.format('<Accurate>false</Accurate>')}</Pose></Photo></Photogroup>"
     )
     source = read(tmp_path, blocks_xml(flight, None, more=more), flight)
     assert_true(source, flight)
     assert any(
-        "2 photographs have no whole pose and are left out (late_1.JPG, late_2.JPG)" in each for each in source.warnings
+        "4 photographs are not oriented and are left out (late_1.JPG, late_2.JPG, late_3.JPG, late_4.JPG)" in each
+        for each in source.warnings
     )
+
+
+def test_zipped_files_and_tie_points_in_a_file_of_their_own(tmp_path, flight):
+    whole = blocks_xml(flight)
+    start, end = whole.index("<TiePoint>"), whole.index("</TiePoints>")
+    flight.touch(tmp_path)
+    points = '<?xml version="1.0" encoding="utf-8"?>\n' + whole[start:end]
+    (tmp_path / "block - Tiepoints.xml").write_text(points)
+    parts = whole[:start] + "<Path>C:\\out\\block - Tiepoints.xml</Path>" + whole[end:]
+    with zipfile.ZipFile(tmp_path / "block.xmlz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("Orientations.xml", parts)
+    source = read_files(tmp_path, OPTIONS)
+    assert_true(source, flight)
+    assert_points(source, flight)
+    (tmp_path / "block - Tiepoints.xml").write_text(points[:-20])
+    with pytest.raises(CaptureError, match=r"Tiepoints\.xml: is no whole XML file"):
+        read_files(tmp_path, OPTIONS)
+    whole_zip = (tmp_path / "block.xmlz").read_bytes()
+    (tmp_path / "block.xmlz").write_bytes(whole_zip[:-30])
+    with pytest.raises(CaptureError, match=r"not a capture"):
+        read_files(tmp_path, OPTIONS)
+
+
+def test_heights_above_a_geoid_without_its_grid_are_said(tmp_path, flight):
+    source = read(tmp_path, blocks_xml(flight).replace("EPSG:32632<", "EPSG:32632+5773<"), flight)
+    assert_true(source, flight)
+    assert "heights as they are" in source.georef.method
 
 
 @pytest.mark.parametrize(

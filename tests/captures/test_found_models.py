@@ -16,6 +16,7 @@ from support.captures import TinyScene, tiny_scene, write_colmap, write_images, 
 from support.dataset_layouts import DRB, OPENGL, halves, write_matrixcity, write_mega_nerf
 from vdgs.captures.formats.ply_reader import GRAY, read_point_cloud
 from vdgs.captures.loading import load_capture
+from vdgs.captures.output_guard import is_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.sfm.image_list import collect_images, is_image_folder
@@ -115,13 +116,7 @@ def test_a_model_apart_from_its_photographs_is_named_with_what_joins_them(tmp_pa
     assert len(load_capture(Path(link[3])).views) == 12
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "opensfm/reconstruction.json", "reconstruction.json", "cameras.xml", "odm_report/shots.geojson", "a/model.nvm",
-        "database.db", "poses_bounds.npy", "place.psx", "place.rcproj",
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("name", ["a/model.nvm", "database.db", "poses_bounds.npy", "place.psx", "place.rcproj"])
 def test_poses_of_formats_that_are_not_read_are_said(tmp_path, name):
     large = tiny_scene(width=160, height=120)
     write_images(tmp_path, large)
@@ -137,9 +132,14 @@ def test_poses_of_formats_that_are_not_read_are_said(tmp_path, name):
 def test_registered_cameras_of_realityscan_are_told_from_tables(tmp_path):
     write_images(tmp_path, tiny_scene(width=160, height=120))
     (tmp_path / "gps.csv").write_text("name,lat,lon,alt\nframe_000.png,1,2,3\n")
-    assert not any("RealityScan" in note for note in collect_images([tmp_path]).notes)
-    (tmp_path / "out.csv").write_text("#name,x,y,alt,heading,pitch,roll,f,px,py\nframe_000.png,1,2,3,0,0,0,30,0,0\n")
-    assert any("out.csv: poses of RealityScan" in note for note in collect_images([tmp_path]).notes)
+    assert not is_capture(tmp_path)
+    (tmp_path / "poses").mkdir()
+    table = tmp_path / "poses" / "out.csv"
+    table.write_text("#name,x,y,alt,heading,pitch,roll,f,px,py\nframe_000.png,1,2,3,0,0,0,30,0,0\n")
+    with pytest.raises(CaptureError, match=r"out\.csv is a project of RealityScan: vdgs run .*out\.csv --images"):
+        collect_images([tmp_path])
+    table.rename(tmp_path / "out.csv")
+    assert is_capture(tmp_path)
 
 
 # --------------------------------------------------------------------------------------- points and sizes

@@ -196,8 +196,9 @@ def test_chunks(tmp_path):
         assert_true(read(tmp_path, xml[:start] + others + xml[start:], flight), flight)
     with pytest.raises(CaptureError, match="2 chunks have cameras"):
         read(tmp_path, xml[:start] + chunk + xml[start:], flight)
+    (tmp_path / "empty.xml").write_text(xml[:start] + empty + xml[end:])
     with pytest.raises(CaptureError, match="no camera of it has a pose"):
-        read(tmp_path, xml[:start] + empty + xml[end:], flight)
+        read_project(tmp_path / "empty.xml", "metashape", OPTIONS)
 
 
 def test_components_without_a_common_world_leave_the_smaller_out(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -161,6 +162,21 @@ def test_a_project_below_is_named_with_the_command_that_reads_it(tmp_path, scene
     assert f"vdgs run {tmp_path}/export/cameras.xml --images {tmp_path} --output RUN" in said
     capture = load_capture(tmp_path / "export" / "cameras.xml", CaptureOptions(images=str(tmp_path)))
     assert_true_pictures(capture, scene)
+
+
+def test_exports_without_poses_do_not_stand_in_the_way_of_photographs(tmp_path, scene):
+    """Metashape's exports of markers and references, and cameras that are not aligned, look alike from outside."""
+    write_project(tmp_path, scene)
+    whole = (tmp_path / "cameras.xml").read_text()
+    for name in ("markers.xml", "reference.xml"):
+        (tmp_path / name).write_text(re.sub("<transform>.*?</transform>", "", whole))
+    (tmp_path / "bulk.xml").write_text('<BlocksExchange version="3.2"><Block><BulkPhotos/></Block></BlocksExchange>')
+    assert_true_pictures(load_capture(tmp_path), scene)
+    (tmp_path / "cameras.xml").unlink()
+    assert not is_capture(tmp_path)
+    for name in ("markers.xml", "bulk.xml"):
+        with pytest.raises(CaptureError, match="no camera of it has a pose"):
+            load_capture(tmp_path / name)
 
 
 def test_other_formats_take_no_folder_outside(tmp_path, scene):

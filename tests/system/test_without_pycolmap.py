@@ -27,9 +27,9 @@ def test_every_module_can_be_imported():
 
 def test_the_first_use_names_what_is_missing(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    monkeypatch.setattr(colmap, "pycolmap", type(colmap.pycolmap)())
+    monkeypatch.setattr(lazy_pycolmap, "pycolmap", type(lazy_pycolmap.pycolmap)())
     with pytest.raises(ModuleNotFoundError) as caught:
-        colmap.pycolmap.Reconstruction()
+        lazy_pycolmap.pycolmap.Reconstruction()
     assert caught.value.name in REMOVABLE_PACKAGES
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -55,8 +57,19 @@ def to_geodetic(header: str, file: Path, where: str = "the first line") -> tuple
         return np.stack([latitude, longitude, z], axis=1)
 
     name = crs.name if crs.name != "unknown" else header
+    if crs.is_compound and not _has_grids(crs):
+        name += "; heights as they are, for PROJ lacks the grid of their geoid"
     feet = flat and crs.is_projected and "foot" in (crs.axis_info[0].unit_name or "")
     return changed, f"{name}; x and y in feet, heights are taken as metres" if feet else name
+
+
+def _has_grids(crs: Any) -> bool:
+    """Whether the best way from a system with heights above a geoid to those above the ellipsoid is at hand."""
+    import pyproj
+
+    with warnings.catch_warnings():  # said in words instead
+        warnings.simplefilter("ignore", UserWarning)
+        return bool(pyproj.transformer.TransformerGroup(crs, "EPSG:4979", always_xy=True).best_available)
 
 
 def is_local_system(name: str) -> bool:

@@ -15,12 +15,13 @@ from vdgs.captures.formats.colmap import count_images, find_models, partial_mode
 from vdgs.captures.formats.matrixcity import pose_files, read_matrixcity
 from vdgs.captures.formats.mega_nerf import is_mega_nerf, read_mega_nerf
 from vdgs.captures.formats.ply_reader import read_point_cloud
+from vdgs.captures.formats.project import NoTiePoints
 from vdgs.captures.formats.source_capture import SourceCapture
 from vdgs.captures.formats.sparse_points import POINT_CLOUDS, find_point_cloud
 from vdgs.captures.formats.transforms import TRANSFORMS_FILE, exclusive_information, read_transforms
 from vdgs.captures.image_files import IMAGE_SUFFIXES, find_images
 from vdgs.captures.nested_captures import foreign_poses, model_below
-from vdgs.captures.project_formats import PROJECTS, find_projects, read_project
+from vdgs.captures.project_formats import PROJECTS, find_projects, is_project, read_project
 from vdgs.captures.reconstruction import is_reconstruction
 from vdgs.captures.strays import check_no_run
 from vdgs.config.capture_options import CaptureOptions
@@ -63,6 +64,18 @@ def read_source(root: Path, options: CaptureOptions) -> SourceCapture:
         f"(MatrixCity) and projects of {', '.join(form.program for form in PROJECTS.values())}. Photographs alone "
         f"become one first: vdgs sfm {shell_word(root)} --output CAPTURE"
     )
+
+
+def lacks_points(path: Path, options: CaptureOptions) -> bool:
+    """Whether a folder, or a file, is a project of another program with poses, whose points are to be found first.
+    Raises as `read_source`."""
+    if any(is_here(path) for is_here, _ in READERS.values()) or not is_project(path):
+        return False
+    try:
+        read_source(path, options)
+    except NoTiePoints:
+        return True
+    return False
 
 
 def _read(root: Path, name: str, options: CaptureOptions) -> SourceCapture:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from vdgs.captures.capture import Capture, Observations, View
+from vdgs.captures.capture_root import capture_root
 from vdgs.captures.format_dispatch import check_folder, read_source
 from vdgs.captures.formats.ply_reader import GRAY
 from vdgs.captures.formats.project_photographs import UNDISTORTED
@@ -17,7 +18,7 @@ from vdgs.captures.image_checks import detect_rounding
 from vdgs.captures.image_files import MIN_SIDE_PX
 from vdgs.captures.image_matching import MatchedView, match_images
 from vdgs.captures.output_guard import check_not_among_files
-from vdgs.captures.project_formats import capture_root, is_project
+from vdgs.captures.project_formats import is_project
 from vdgs.captures.splits import assign_splits, select_central_views
 from vdgs.captures.undistortion import ImageFile, undistort
 from vdgs.config.capture_options import CaptureOptions

@@ -19,15 +19,11 @@ DEEPEST = 3
 _COLMAP = "it exports COLMAP"
 #: Poses of programs that are not read, by the file that has them, and what turns them into what is.
 _OTHERS = {
-    "reconstruction.json": "poses of OpenSfM or ODM; `opensfm export_colmap` makes a COLMAP model of them",
-    "shots.geojson": "poses of ODM; `opensfm export_colmap` on its opensfm folder makes a COLMAP model of them",
     "*.psx": "a project of Metashape; what it exports (File > Export > Export Cameras, Agisoft XML) is read",
     "*.rcproj": f"a project of RealityScan; {_COLMAP}",
     "*.nvm": "poses of VisualSFM; COLMAP's import_nvm (scripts/python) makes a model of them",
     "poses_bounds.npy": "poses of LLFF; the COLMAP model that they were made of is read",
     "database.db": "features of COLMAP; `colmap mapper` makes a model of them",
-    "bundle.out": "poses of Bundler; COLMAP imports them",
-    "project.opf": "poses of Pix4D; pyopf makes a COLMAP model of them",
 }
 #: A file of poses with fewer bytes has none ("[]").
 _LEAST_BYTES = 20
@@ -64,21 +60,12 @@ def foreign_poses(root: Path) -> list[str]:
     found = []
     for folder in (root, *_folders(root)):
         known = [(file, what) for name, what in _OTHERS.items() for file in sorted(folder.glob(name))]
-        known += [
-            (file, f"poses of RealityScan; {_COLMAP}") for file in sorted(folder.glob("*.csv")) if _has_angles(file)
-        ]
         found += [
             f"{file.relative_to(root).as_posix()}: {what}"
             for file, what in known
             if file.is_file() and file.stat().st_size > _LEAST_BYTES
         ]
     return found
-
-
-def _has_angles(file: Path) -> bool:
-    """Whether a table has the columns of RealityScan's registered cameras."""
-    with file.open("rb") as stream:
-        return stream.read(64).lower().lstrip(b"\xef\xbb\xbf").startswith(b"#name,x,y,alt,heading,pitch,roll")
 
 
 def _folders(root: Path) -> Iterator[Path]:

@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from vdgs.captures.formats import blocks_exchange, metashape
+from vdgs.captures.capture_root import capture_root
+from vdgs.captures.formats import blocks_exchange, bundler, metashape, opensfm, opf, realityscan
 from vdgs.captures.formats.project import Project, project_capture
 from vdgs.captures.formats.source_capture import SourceCapture
 from vdgs.config.capture_options import CaptureOptions
@@ -29,6 +30,10 @@ PROJECTS: dict[str, ProjectFormat] = {
         "ContextCapture or DJI Terra (BlocksExchange)", blocks_exchange.find_files, blocks_exchange.is_file,
         blocks_exchange.read,
     ),
+    "opf": ProjectFormat("Pix4D (OPF)", opf.find_files, opf.is_file, opf.read),
+    "opensfm": ProjectFormat("OpenSfM or ODM", opensfm.find_files, opensfm.is_file, opensfm.read),
+    "realityscan": ProjectFormat("RealityScan", realityscan.find_files, realityscan.is_file, realityscan.read),
+    "bundler": ProjectFormat("Bundler", bundler.find_files, bundler.is_file, bundler.read),
 }  # fmt: skip
 
 
@@ -58,13 +63,16 @@ def project_file(path: Path, name: str) -> Path:
     return found[0]
 
 
-def capture_root(path: Path) -> Path:
-    """The folder of a capture that is given by its folder, or by the file of its project."""
-    return path.parent if path.is_file() else path
-
-
 def read_project(path: Path, name: str, options: CaptureOptions, *, needs_points: bool = True) -> SourceCapture:
     """The capture of the project in a folder, or in a file. Without `needs_points` one without points is read too: what
     finds them needs its poses."""
     project = PROJECTS[name].read(project_file(path, name), options)
     return project_capture(project, capture_root(path), options, needs_points=needs_points)
+
+
+def read_poses(path: Path, options: CaptureOptions) -> SourceCapture:
+    """The cameras of the project that a folder holds or a file is, whether it has points or not."""
+    name = options.format if options.format in PROJECTS else next(find_projects(path), ("", path))[0]
+    if not name:
+        raise CaptureError(f"{path}: is no project that is read.")
+    return read_project(path, name, options, needs_points=False)

@@ -147,7 +147,8 @@ class ReconstructionReport:
 
 def is_reconstruction(root: Path) -> bool:
     """Whether a folder is a capture made of photographs here, finished or not."""
-    return _is_ours(root / RECONSTRUCTION_FILE) or (root / WORK_FOLDER / STEPS_FILE).is_file()
+    made = isinstance(read_json_or_empty(root / STEPS_FILE).get("begun"), dict)  # of a project, without a report
+    return made or _is_ours(root / RECONSTRUCTION_FILE) or (root / WORK_FOLDER / STEPS_FILE).is_file()
 
 
 def _is_ours(file: Path) -> bool:

@@ -83,10 +83,14 @@ class SfmArguments(QuietArguments):
     without lens distortion in three sizes. The same command goes on where it was stopped. Photographs are only read."""
 
     images: Annotated[tuple[Path, ...], Positional("PHOTOGRAPHS")]
-    """Folders of photographs, those below them included. A folder masks/ beside photographs has their masks (white =
-    keep), named like them: name.png or name.jpg.png; name_mask.jpg beside name.jpg is one too."""
+    """Folders of photographs, those below them included; or a project of another program that has poses and no points
+    (Metashape, RealityScan, ODM, ...): points are found, with poses and lenses as the project has them. A folder masks/
+    beside photographs has their masks (white = keep), named like them: name.png or name.jpg.png; name_mask.jpg beside
+    name.jpg is one too."""
     output: Annotated[Path, Output()]
     """Folder of the capture; new, or the one to go on with."""
+    project_images: Annotated[str | None, FlagName("images")] = None
+    """Folder of the photographs of a project of another program. Default: images beside it, or its whole folder."""
     gps: Path | None = None
     """Table of positions to use instead of those in the photographs: columns name,lat,lon,alt as exiftool, Metashape,
     Pix4D, RealityScan and others name them, ODM's geo.txt or DJI's .MRK. Names need no folder and no extension where
@@ -104,6 +108,7 @@ class SfmArguments(QuietArguments):
 
 def sfm_command(arguments: list[str]) -> None:
     args = parse_arguments(SfmArguments, arguments, "sfm")
+    from vdgs.captures.format_dispatch import lacks_points
     from vdgs.sfm.reconstruction_plan import plan_reconstruction, print_plan
 
     request = SfmRequest(
@@ -111,6 +116,12 @@ def sfm_command(arguments: list[str]) -> None:
         keep_intermediate=args.keep_intermediate, overwrite=args.overwrite, options=args.options,
     )  # fmt: skip
     console = make_console(args.quiet)
+    options = CaptureOptions(images=args.project_images)
+    is_posed = len(args.images) == 1 and lacks_points(args.images[0], options)
+    if args.dry_run and is_posed:
+        console.print("points would be found, with poses and lenses as the project has them. Nothing was written.",
+                      highlight=False)  # fmt: skip
+        return
     if args.dry_run:
         from vdgs.sfm.sfm_estimate import estimate_sfm
 
@@ -118,9 +129,14 @@ def sfm_command(arguments: list[str]) -> None:
         print_plan(plan, estimate_sfm(plan).text(plan.threads), console)
         console.print("Nothing was written.", highlight=False)
         return
-    from vdgs.sfm.reconstruct import reconstruct
+    if is_posed:
+        from vdgs.sfm.posed_capture import make_posed_capture
 
-    reconstruct(request, console)
+        make_posed_capture(request, options, console)
+    else:
+        from vdgs.sfm.reconstruct import reconstruct
+
+        reconstruct(request, console)
     capture = args.output.resolve()
     run = shell_line(["vdgs", "run", capture, "--output", f"{capture}-run", "--preset", "laptop"])
     console.print(escape(f"capture: {args.output}\nnext: {run}"), highlight=False)

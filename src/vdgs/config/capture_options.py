@@ -11,7 +11,10 @@ from vdgs.config.ranges import MAX_COUNT, Range
 
 UpAxis = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
 SplitMode = Literal["auto", "explicit", "every"]
-CaptureFormat = Literal["auto", "colmap", "transforms", "mega-nerf", "matrixcity", "metashape", "blocks-exchange"]
+CaptureFormat = Literal[
+    "auto", "colmap", "transforms", "mega-nerf", "matrixcity", "metashape", "blocks-exchange", "opf", "opensfm",
+    "realityscan", "bundler",
+]  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -118,3 +118,13 @@ def sample_points(points: np.ndarray, max_points: int) -> np.ndarray:
     if len(points) <= max_points:
         return points
     return points[np.sort(np.random.default_rng(0).choice(len(points), max_points, replace=False))]
+
+
+def rotation_about(vector: np.ndarray) -> np.ndarray:
+    """The rotation about a vector by its length in radians (Rodrigues), [3, 3]."""
+    angle = float(np.linalg.norm(vector))
+    if angle == 0:
+        return np.eye(3)
+    x, y, z = vector / angle
+    cross = np.array([(0, -z, y), (z, 0, -x), (-y, x, 0)])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross

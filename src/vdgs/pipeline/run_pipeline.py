@@ -8,7 +8,9 @@ from typing import Literal, cast
 from rich.console import Console
 from rich.markup import escape
 
+from vdgs.captures.format_dispatch import lacks_points
 from vdgs.captures.output_guard import check_output
+from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import OrthoRequest, RunRequest
 from vdgs.config.ranges import check_ranges
 from vdgs.config.validation_rules import check_config
@@ -32,7 +34,7 @@ from vdgs.runs.create_or_resume import exclusive_run
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
-from vdgs.sfm.run_request import is_image_input, make_sfm_request
+from vdgs.sfm.run_request import is_image_input, make_posed_request, make_sfm_request
 from vdgs.sfm.sfm_estimate import SfmEstimate
 from vdgs.system.atomic_files import read_json
 from vdgs.system.documents import EvaluationMetrics
@@ -67,7 +69,7 @@ def reconstruct_if_needed(run_request: RunRequest, console: Console, command: st
     not work, before the long work.
     """
     if not is_image_input(run_request):
-        return run_request
+        return _find_points(run_request, console)
     from vdgs.sfm.reconstruct import reconstruct  # imports much that a run of a capture does not need
 
     check_config(run_request.method())
@@ -83,6 +85,21 @@ def reconstruct_if_needed(run_request: RunRequest, console: Console, command: st
     reconstruct(request, console, RunFolder(run_request.output), command, on_estimate=choose)
     options = replace(chosen.options, gps=None, scale_bar=None)
     return replace(run_request, capture=request.output, extra_image_folders=(), options=options)
+
+
+def _find_points(run_request: RunRequest, console: Console) -> RunRequest:
+    """The request with a capture that has points: a project of another program without any becomes one in
+    RUN/capture first."""
+    if not lacks_points(run_request.capture, run_request.options):
+        return run_request
+    from vdgs.sfm.posed_capture import make_posed_capture  # imports much that a run of a capture does not need
+
+    check_config(run_request.method())
+    _title(console, "points")
+    request = make_posed_request(run_request)
+    make_posed_capture(request, run_request.options, console, RunFolder(run_request.output))
+    options = replace(run_request.options, images=None, format="auto", masks=CaptureOptions.masks, undistort=False)
+    return replace(run_request, capture=request.output, options=options)
 
 
 def _stages(context: RunContext, request: RunRequest, console: Console) -> None:

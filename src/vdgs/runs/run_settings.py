@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from vdgs.captures.project_formats import capture_root
+from vdgs.captures.capture_root import capture_root
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.method import AssignmentConfig, BlockConfig, MergeConfig, MethodConfig, PartitionConfig, TrainConfig
 from vdgs.config.ranges import iter_out_of_range

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -11,7 +11,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from rich.console import Console
 
 from vdgs.captures.formats.colmap_writing import write_model_files
 from vdgs.captures.formats.source_capture import Intrinsics
@@ -20,7 +19,7 @@ from vdgs.captures.undistortion import sampling_map, undistorted_pinhole
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.sfm.mask_files import encode_mask, undistort_mask
-from vdgs.sfm.workspace import Workspace, report_progress
+from vdgs.sfm.workspace import Workspace
 from vdgs.system.atomic_files import write_bytes
 from vdgs.system.lazy_pycolmap import pycolmap
 from vdgs.system.stop_signals import check_stop_requested
@@ -45,9 +44,8 @@ class Undistortion:
     intrinsics: Intrinsics
 
 
-def make_undistortion(camera: pycolmap.Camera, max_size: int) -> Undistortion:
+def make_undistortion(bent: Intrinsics, max_size: int) -> Undistortion:
     """The pinhole camera and the way to it; `max_size` bounds the longer side (0: not at all)."""
-    bent = _intrinsics(camera)
     pinhole = undistorted_pinhole(bent)
     longer = max(pinhole.width, pinhole.height)
     scale = min(1.0, max_size / longer) if max_size else 1.0
@@ -65,17 +63,16 @@ def write_images(
     names: Mapping[int, Sequence[str]],
     undistortions: Mapping[int, Undistortion],
     threads: int,
-    console: Console,
+    tell: Callable[[int], object],
 ) -> None:
     """Write images, images_2, images_4, and masks of those that have one: `names` of the photographs of each camera.
-    What is there is kept.
+    What is there is kept; `tell` is called with how many are done.
 
     Raises CaptureError for photographs that cannot be decoded, VdgsError where the disk is full.
     """
-    total, done = sum(len(each) for each in names.values()), 0
-    note = "without distortion, "
-    with report_progress(workspace, console, "writing", total, note) as tell, ThreadPoolExecutor(threads) as pool:
-        tell(done)
+    done = 0
+    tell(done)
+    with ThreadPoolExecutor(threads) as pool:
         for camera, members in names.items():
             for _ in pool.map(partial(_write_one, output, workspace, undistortions[camera]), members):
                 check_stop_requested()
@@ -118,11 +115,16 @@ def _write_mask(output: Path, mask: Path, undistortion: Undistortion, name: str)
         write_bytes(target, encode_mask(keep))
 
 
-def write_model(output: Path, model: pycolmap.Reconstruction, undistortions: Mapping[int, Undistortion]) -> None:
-    """Write sparse/0 with pinhole cameras: poses, points, and the observations that points have, without distortion."""
+def write_model(
+    output: Path,
+    model: pycolmap.Reconstruction,
+    pinholes: Mapping[int, Intrinsics],
+    pinhole_of: Mapping[str, int] | None = None,
+) -> None:
+    """Write sparse/0 with pinhole cameras: poses, points, and the observations that points have, without distortion.
+    `pinhole_of` the names of photographs, where these have other cameras than in the model."""
     straight = pycolmap.Reconstruction()
-    for number, lens in undistortions.items():
-        kept = lens.intrinsics
+    for number, kept in pinholes.items():
         camera = pycolmap.Camera(
             model="PINHOLE", width=kept.width, height=kept.height, params=list(kept.params), camera_id=number
         )
@@ -132,11 +134,12 @@ def write_model(output: Path, model: pycolmap.Reconstruction, undistortions: Map
         seen = [k for k, point in enumerate(image.points2D) if point.has_point3D()]
         bent = np.array([image.points2D[k].xy for k in seen]).reshape(-1, 2)
         rays = np.asarray(model.cameras[image.camera_id].cam_from_img(bent)).reshape(-1, 2)
-        fx, fy, cx, cy = undistortions[image.camera_id].intrinsics.params
+        camera_id = image.camera_id if pinhole_of is None else pinhole_of[image.name]
+        fx, fy, cx, cy = pinholes[camera_id].params
         places |= {(image.image_id, k): place for place, k in enumerate(seen)}
         straight.add_image_with_trivial_frame(
             pycolmap.Image(
-                name=jpeg_name(image.name), keypoints=rays * [fx, fy] + [cx, cy], camera_id=image.camera_id,
+                name=jpeg_name(image.name), keypoints=rays * [fx, fy] + [cx, cy], camera_id=camera_id,
                 image_id=image.image_id,
             ),
             image.cam_from_world(),
@@ -161,7 +164,8 @@ def _registered_images(model: pycolmap.Reconstruction) -> Iterator[pycolmap.Imag
     return (model.images[number] for number in sorted(model.images) if model.images[number].has_pose)
 
 
-def _intrinsics(camera: pycolmap.Camera) -> Intrinsics:
+def fitted_intrinsics(camera: pycolmap.Camera) -> Intrinsics:
+    """The lens of a camera. Raises CaptureError for one that there is not."""
     if not camera.verify_params() or camera.has_bogus_params(0.1, 10.0, 1.0):
         raise CaptureError(
             f"the fitted lens of a camera ({camera.params_to_string()}) is none that there is: the photographs do not "

@@ -131,6 +131,21 @@ def count_inliers(workspace: Workspace) -> list[int]:
         return [int(count) for count in database.read_two_view_geometry_num_inliers()[1]]
 
 
+def count_matched_features(workspace: Workspace) -> int:
+    """The features of all photographs that were matched and verified with some other."""
+    with workspace.open_database() as database:
+        counts = {
+            image.image_id: database.num_keypoints_for_image(image.image_id) for image in database.read_all_images()
+        }
+        matched = {image: np.zeros(count, bool) for image, count in counts.items()}
+        for number in database.read_two_view_geometry_num_inliers()[0]:
+            pair = pycolmap.pair_id_to_image_pair(number)
+            inliers = np.asarray(database.read_two_view_geometry(*pair).inlier_matches).reshape(-1, 2)
+            for image, numbers in zip(pair, inliers.T, strict=True):
+                matched[image][numbers] = True
+    return int(sum(each.sum() for each in matched.values()))
+
+
 def count_verified_matches(workspace: Workspace, min_inliers: int = 15) -> dict[str, int]:
     """With how many others each photograph was matched for good, by its name."""
     with workspace.open_database() as database:

@@ -57,7 +57,7 @@ def collect_images(folders: Sequence[Path]) -> ImageList:
     """
     folders = list(dict.fromkeys(folders))
     for folder in folders:
-        if not folder.is_dir():
+        if not folder.is_dir() and not is_capture(folder):
             raise CaptureError(f"{folder}: no such folder. Give the folder that the photographs are in.")
         check_no_run(folder)
         if is_reconstruction(folder) and not is_capture(folder):

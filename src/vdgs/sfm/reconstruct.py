@@ -57,7 +57,7 @@ from vdgs.sfm.reconstruction_report import (
 from vdgs.sfm.sfm_estimate import SfmEstimate, estimate_sfm
 from vdgs.sfm.source_images import SourceImages, check_unchanged
 from vdgs.sfm.step_keys import step_keys
-from vdgs.sfm.workspace import Workspace, silence_colmap
+from vdgs.sfm.workspace import Workspace, report_progress, silence_colmap
 from vdgs.system.atomic_files import to_jsonable, write_json
 from vdgs.system.file_locks import lock_folder
 from vdgs.system.lazy_pycolmap import pycolmap
@@ -99,10 +99,10 @@ def reconstruct(
         return facts
     _check_output_folder(output)
     check_unchanged(output, sources, request.overwrite)
-    _check_nothing_trained(request, run)
+    check_nothing_trained(request, run)
     before = _placed_before(output, keys["capture"])
     if before is not None:
-        with _writing(request, run):
+        with writing(request, run):
             sources.write(output)
             facts = _place_anew(prepared, before, keys["placed"], console)
         console.print(f"{output}: placed anew; its photographs and poses stay", highlight=False)
@@ -114,7 +114,7 @@ def reconstruct(
     print_plan(prepared, "" if estimate is None else estimate.text(prepared.threads), console)
     if estimate is not None and on_estimate is not None:
         on_estimate(prepared, estimate)
-    with _writing(request, run):
+    with writing(request, run):
         sources.write(output)
         if estimate is not None:
             work.remove()
@@ -129,7 +129,7 @@ def reconstruct(
 
 
 @contextmanager
-def _writing(request: SfmRequest, run: RunFolder | None) -> Iterator[None]:
+def writing(request: SfmRequest, run: RunFolder | None) -> Iterator[None]:
     """Hold the locks while the capture is written, then delete the work folder, unless the work was interrupted."""
     with run.drive_lock() if run is not None else nullcontext(), lock_folder(request.output):
         if run is not None:
@@ -139,7 +139,7 @@ def _writing(request: SfmRequest, run: RunFolder | None) -> Iterator[None]:
             Workspace(request.output / WORK_FOLDER).remove()
 
 
-def _check_nothing_trained(request: SfmRequest, run: RunFolder | None) -> None:
+def check_nothing_trained(request: SfmRequest, run: RunFolder | None) -> None:
     """Raise RunError where a capture is about to change that a run was trained on."""
     if run is not None and run.is_trained and not request.overwrite:
         raise RunError(
@@ -277,7 +277,8 @@ def _finish(prepared: ReconstructionPlan, outcome: ReconstructionResult, key: st
     )
     if outcome.metric is not None:
         write_json(output / "georef.json", _georef(facts, outcome.found.origin))
-    capture_writer.write_model(output, model, _lenses(model, request.options.max_output_size))
+    lenses = _lenses(model, request.options.max_output_size)
+    capture_writer.write_model(output, model, {number: lens.intrinsics for number, lens in lenses.items()})
     write_json(
         output / RECONSTRUCTION_FILE,
         to_jsonable(record_to_dict(facts)) | {"options": to_jsonable(to_dict(request.options))},
@@ -342,7 +343,8 @@ def _gcp_positions(plan: ReconstructionPlan) -> np.ndarray:
 
 def _lenses(model: pycolmap.Reconstruction, max_size: int) -> dict[int, capture_writer.Undistortion]:
     used = sorted({image.camera_id for image in model.images.values() if image.has_pose})
-    return {number: capture_writer.make_undistortion(model.cameras[number], max_size) for number in used}
+    lenses = {number: capture_writer.fitted_intrinsics(model.cameras[number]) for number in used}
+    return {number: capture_writer.make_undistortion(lens, max_size) for number, lens in lenses.items()}
 
 
 def _write(
@@ -380,7 +382,9 @@ def _write_images(
     for image in sorted(model.images.values(), key=lambda image: image.name):
         if image.has_pose:
             names.setdefault(image.camera_id, []).append(image.name)
-    capture_writer.write_images(output, work, names, _lenses(model, max_size), prepared.threads, console)
+    lenses, total = _lenses(model, max_size), sum(map(len, names.values()))
+    with report_progress(work, console, "writing", total, "without distortion, ") as tell:
+        capture_writer.write_images(output, work, names, lenses, prepared.threads, tell)
 
 
 def _georef(report: ReconstructionReport, origin: tuple[float, float, float] | None) -> dict[str, Any]:

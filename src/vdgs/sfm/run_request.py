@@ -42,6 +42,16 @@ def _check_capture_options(options: CaptureOptions) -> None:
         raise VdgsError("--split explicit: photographs have no split of their own. Add --test-list, or leave it out.")
 
 
+def make_posed_request(request: RunRequest) -> SfmRequest:
+    """A project of another program without points into RUN/capture. Raises VdgsError where the output holds others."""
+    run = RunFolder(request.output)
+    run.check_output_empty()
+    return SfmRequest(
+        image_folders=(request.capture,), output=run.own_capture, threads=request.threads, overwrite=request.overwrite,
+        options=request.sfm,
+    )  # fmt: skip
+
+
 def make_sfm_request(request: RunRequest) -> SfmRequest:
     """Photographs into RUN/capture. Raises VdgsError for options that speak of a capture that is not there yet."""
     options = request.options

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from vdgs.geometry.camera import Camera
+from vdgs.geometry.similarity import rotation_about
 from vdgs.synth.synthetic_points import SparseCloud
 
 #: Exposure keeps this share of its deviation from one photograph to the next: clouds drift, they do not flicker.
@@ -38,23 +39,13 @@ def perturb_cameras(cameras: list[Camera], noise_px: float, altitude: float, rng
     result = []
     for camera in cameras:
         angle = noise_px / np.sqrt(2) / camera.fx
-        turn = _rotation(rng.normal(0, angle, 3))
+        turn = rotation_about(rng.normal(0, angle, 3))
         rigid = camera.camera_from_world.copy()
         position = camera.position + rng.normal(0, angle * altitude, 3)
         rigid[:3, :3] = turn @ rigid[:3, :3]
         rigid[:3, 3] = -rigid[:3, :3] @ position
         result.append(replace(camera, camera_from_world=rigid))
     return result
-
-
-def _rotation(vector: np.ndarray) -> np.ndarray:
-    """The rotation about a vector by its length in radians (Rodrigues), [3, 3]."""
-    angle = float(np.linalg.norm(vector))
-    if angle == 0:
-        return np.eye(3)
-    x, y, z = vector / angle
-    cross = np.array([(0, -z, y), (z, 0, -x), (-y, x, 0)])
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
 def add_outliers(cloud: SparseCloud, cameras: list[Camera], share: float, rng: np.random.Generator) -> SparseCloud:

@@ -20,7 +20,7 @@ from vdgs.captures.formats.brown_lens import brown_intrinsics
 from vdgs.captures.formats.project import CloudFrame, Project, ProjectView, refuse_cameras
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
 from vdgs.captures.formats.terra import local_origin, original_names, warn_of_undistorted
-from vdgs.captures.formats.xml_documents import read_xml, root_element, xml_number, xml_numbers
+from vdgs.captures.formats.xml_documents import holds, read_xml, root_element, xml_number, xml_numbers
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import geodetic_from_enu
@@ -37,13 +37,14 @@ _LEVEL_DEG = 1e-3
 
 
 def is_file(file: Path) -> bool:
-    return file.suffix.lower() == ".xml" and root_element(file) == "BlocksExchange"
+    return file.suffix.lower() in (".xml", ".xmlz") and root_element(file) == "BlocksExchange"
 
 
 def find_files(root: Path) -> list[Path]:
     """The files in a folder, and where DJI Terra puts them below it; without those that another holds with points."""
     folders = [folder for folder in (root, root / _TERRA_FOLDER) if folder.is_dir()]
-    found = [file for folder in folders for file in sorted(folder.iterdir()) if is_file(file)]
+    files = [file for folder in folders for file in sorted(folder.iterdir()) if is_file(file)]
+    found = [file for file in files if holds(file, b"<Rotation>")]
     whole = {file.with_suffix("").as_posix().lower() for file in found}
     return [
         file for file in found
@@ -79,6 +80,9 @@ class _Block:
         self._systems: set[str] = set()
         handlers = {"Photogroup": self._photogroup, "TiePoint": self._tie_point, "ControlPoint": self._skip}
         self._root = read_xml(file, handlers)
+        for path in self._root.iterfind("Block/TiePoints/Path"):
+            points = PurePosixPath((path.text or "").strip().replace("\\", "/")).name
+            read_xml(file.parent / points, handlers, fragment=True)
 
     def project(self, originals: dict[str, str]) -> Project:
         blocks = self._root.findall("Block")
@@ -89,7 +93,7 @@ class _Block:
         warnings = []
         if self._without_pose:
             names = ", ".join(self._without_pose)
-            warnings.append(f"{len(self._without_pose)} photographs have no whole pose and are left out ({names}).")
+            warnings.append(f"{len(self._without_pose)} photographs are not oriented and are left out ({names}).")
         views = tuple(self._view(photo, originals) for photo in self._photos.values())
         if self._masks:
             warnings.append(f"{self._masks} masks that the file names are not read; those in masks/ are (--masks).")
@@ -119,9 +123,12 @@ class _Block:
     def _photogroup(self, group: Element) -> None:
         label = f"photogroup {(group.findtext('Name') or '').strip()!r}"
         self._note_system(group)
-        photos = group.findall("Photo")
-        posed = [photo for photo in photos if photo.find("Pose/Rotation") is not None and _has_center(photo)]
-        self._without_pose += [_path(photo) for photo in photos if photo not in posed]
+        posed: list[Element] = []
+        for photo in group.findall("Photo"):
+            if _is_posed(photo):
+                posed.append(photo)
+            else:
+                self._without_pose.append(_path(photo))
         if not posed:
             return
         try:
@@ -297,9 +304,16 @@ def _path(photo: Element) -> str:
     return (photo.findtext("ImagePath") or f"photograph {photo.findtext('Id') or '?'}").strip()
 
 
-def _has_center(photo: Element) -> bool:
-    center = photo.find("Pose/Center")
-    return center is not None and all((center.findtext(axis) or "").strip() for axis in "xyz")
+def _is_posed(photo: Element) -> bool:
+    """Whether a photograph is oriented: in the main component, with a rotation and a centre that are no guesses."""
+    if (photo.findtext("Component") or "1").strip() != "1":
+        return False
+    rotation, center = photo.find("Pose/Rotation"), photo.find("Pose/Center")
+    if rotation is None or center is None:
+        return False
+    if any((part.findtext("Accurate") or "").strip().lower() == "false" for part in (rotation, center)):
+        return False
+    return all((center.findtext(axis) or "").strip() for axis in "xyz")
 
 
 def _about_x(angle: float) -> np.ndarray:

@@ -55,6 +55,26 @@ def parse_matrix(value: object, file: Path, label: str) -> np.ndarray:
     return result
 
 
+def axis_rotation(axis: int, degrees: float) -> np.ndarray:
+    """The rotation [3, 3] about the axis x, y or z (0, 1, 2), to the right as seen along it."""
+    one, other = [(1, 2), (2, 0), (0, 1)][axis]
+    turn, angle = np.eye(3), np.radians(degrees)
+    turn[one, one] = turn[other, other] = np.cos(angle)
+    turn[other, one], turn[one, other] = np.sin(angle), -np.sin(angle)
+    return turn
+
+
+def parse_vector(value: object, count: int, file: Path, label: str) -> np.ndarray:
+    """So many finite numbers, [count] float64. Raises `CaptureError` for anything else."""
+    try:
+        vector = np.array(value, dtype=np.float64)
+    except (ValueError, TypeError, OverflowError):
+        vector = np.zeros(0)
+    if vector.shape != (count,) or not np.isfinite(vector).all():
+        raise CaptureError(f"{file}: {label} needs {count} finite numbers. Export the file again.")
+    return vector
+
+
 def parse_number(source: JsonObject, key: str, file: Path) -> float | None:
     """A finite number by key, or None where it is absent. Raises `CaptureError` for anything else."""
     value = source.get(key)

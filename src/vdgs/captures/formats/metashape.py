@@ -19,7 +19,7 @@ from vdgs.captures.coordinate_systems import ToGeodetic, geocentric_to_geodetic,
 from vdgs.captures.formats.brown_lens import brown_intrinsics
 from vdgs.captures.formats.project import CloudFrame, Project, ProjectView, refuse_cameras
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
-from vdgs.captures.formats.xml_documents import read_xml, root_element, xml_number, xml_numbers
+from vdgs.captures.formats.xml_documents import holds, read_xml, root_element, xml_number, xml_numbers
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import SEMI_MAJOR_M
@@ -39,8 +39,9 @@ def is_file(file: Path) -> bool:
 
 
 def find_files(root: Path) -> list[Path]:
-    """The exports in a folder."""
-    return [file for file in sorted(root.iterdir()) if is_file(file)]
+    """The exports of aligned cameras in a folder; those of markers and of references hold none."""
+    files = [file for file in sorted(root.iterdir()) if is_file(file)]
+    return [file for file in files if holds(file, b"<camera ", b"<transform>")]
 
 
 def read(file: Path, options: CaptureOptions) -> Project:
@@ -60,7 +61,7 @@ def read(file: Path, options: CaptureOptions) -> Project:
     return _Chunk(enabled[0], file).project()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Camera:
     """A camera as the file has it, with the labels of the groups that it is in."""
 
@@ -118,10 +119,12 @@ class _Chunk:
 
     def _used(self, cameras: list[_Camera]) -> list[_Camera]:
         """Cameras that are aligned and enabled; the others are named."""
-        off = [camera for camera in cameras if camera.element.get("enabled", "1") in _FALSE]
-        on = [camera for camera in cameras if camera not in off]
+        on: list[_Camera] = []
+        off: list[_Camera] = []
+        for camera in cameras:
+            (off if camera.element.get("enabled", "1") in _FALSE else on).append(camera)
         bare = [camera for camera in on if camera.element.find("transform") is None]
-        slaves = [camera for camera in bare if camera.element.get("master_id") not in (None, camera.element.get("id"))]
+        slaves = {camera for camera in bare if camera.element.get("master_id") not in (None, camera.element.get("id"))}
         for some, what in (
             ([camera for camera in bare if camera not in slaves], "are not aligned"),
             (slaves, "belong to a multi-camera system and have no pose of their own, which is not read,"),
@@ -228,7 +231,8 @@ class _Chunk:
         placed = [camera for camera in cameras if self._component(camera) in self._transforms]
         if len(components) > 1:
             kept = placed or [camera for camera in cameras if camera.element.get("component_id", "") == largest]
-            lost = [camera.label for camera in cameras if camera not in kept]
+            known = set(kept)
+            lost = [camera.label for camera in cameras if camera not in known]
             if lost:
                 self._warnings.append(
                     f"{len(lost)} cameras of other components have no place in the same world and are left out "

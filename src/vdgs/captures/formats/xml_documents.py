@@ -1,11 +1,16 @@
-"""XML files of other programs, read piece by piece: no entities, no document types, whatever their size."""
+"""XML files of other programs, alone or zipped, read piece by piece: no entities, no document types, whatever their
+size."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
 from xml.etree.ElementTree import Element, TreeBuilder
 from xml.parsers import expat
 
@@ -15,15 +20,16 @@ from vdgs.errors import CaptureError
 CHUNK_BYTES, HEAD_BYTES = 1 << 20, 4096
 #: Elements lie in no more others than this; text and attributes of one are no longer than this.
 MAX_DEPTH, MAX_TEXT = 64, 1 << 24
+_DECLARATION = re.compile(rb"^\s*(\xef\xbb\xbf)?<\?xml[^>]*\?>")
 _ROOT = re.compile(r"<(?:\w+:)?([A-Za-z_][\w.-]*)[\s/>]")
 
 
 def root_element(file: Path) -> str:
     """The name of the first element of an XML file; empty for files of other kinds and those that cannot be read."""
     try:
-        with file.open("rb") as stream:
+        with _opened(file) as stream:
             head = stream.read(HEAD_BYTES)
-    except OSError:
+    except (OSError, CaptureError):
         return ""
     text = head.decode("utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8", "replace").lstrip(
         "\ufeff \r\n\t"
@@ -32,14 +38,47 @@ def root_element(file: Path) -> str:
     return found[1] if found else ""
 
 
-def read_xml(file: Path, each: Mapping[str, Callable[[Element], None]] | None = None) -> Element:
-    """The root of an XML file. An element named in `each` is handed over once it is whole and then dropped, so that
-    long lists take no memory.
+def holds(file: Path, *texts: bytes) -> bool:
+    """Whether a file holds all of these texts, wherever; not so where it cannot be read."""
+    missing, kept = set(texts), b""
+    try:
+        with _opened(file) as stream:
+            while missing and (block := stream.read(CHUNK_BYTES)):
+                missing -= {text for text in missing if text in kept + block}
+                kept = block[-max(map(len, texts)) :]
+    except (OSError, CaptureError):
+        return False
+    return not missing
+
+
+@contextmanager
+def _opened(file: Path) -> Iterator[IO[bytes]]:
+    """The bytes of a file, or of the first XML file in it where it is a zip."""
+    with file.open("rb") as plain:
+        if file.suffix.lower() != ".xmlz":
+            yield plain
+            return
+        try:
+            with zipfile.ZipFile(plain) as archive:
+                names = [name for name in archive.namelist() if name.lower().endswith(".xml")]
+                if not names:
+                    raise CaptureError(f"{file}: holds no XML file.")
+                with archive.open(names[0]) as stream:
+                    yield stream
+        except (zipfile.BadZipFile, NotImplementedError, RuntimeError, zlib.error, EOFError) as error:
+            raise CaptureError(f"{file}: is no zip file that can be read ({error}). Copy it again.") from None
+
+
+def read_xml(
+    file: Path, each: Mapping[str, Callable[[Element], None]] | None = None, *, fragment: bool = False
+) -> Element:
+    """The root of an XML file, or where it is a `fragment` without one, an element around all that it holds. An element
+    named in `each` is handed over once it is whole and then dropped, so that long lists take no memory.
 
     Raises `CaptureError` for files that cannot be read, are cut off, damaged or no XML, or declare a document type
     (entities could make a small file fill the memory, or read others).
     """
-    return _Reader(file, each or {}).read()
+    return _Reader(file, each or {}).read(fragment)
 
 
 class _Reader:
@@ -48,16 +87,18 @@ class _Reader:
         self._open: list[Element] = []
         self._text = 0
 
-    def read(self) -> Element:
+    def read(self, fragment: bool) -> Element:
         parser = expat.ParserCreate()
         parser.buffer_text = True
         parser.StartElementHandler, parser.EndElementHandler = self._start, self._end
         parser.CharacterDataHandler, parser.StartDoctypeDeclHandler = self._data, self._refuse
         try:
-            with self._file.open("rb") as stream:
+            with _opened(self._file) as stream:
+                if fragment:
+                    parser.Parse(b"<fragment>" + _DECLARATION.sub(b"", stream.read(CHUNK_BYTES)), False)
                 while block := stream.read(CHUNK_BYTES):
                     parser.Parse(block, False)
-            parser.Parse(b"", True)
+            parser.Parse(b"</fragment>" if fragment else b"", True)
             return self._builder.close()
         except OSError as error:
             raise CaptureError(f"{self._file}: cannot be read ({error.strerror or error}).") from error
@@ -65,14 +106,14 @@ class _Reader:
             raise CaptureError(f"{self._file}: is no whole XML file ({error}). Export or copy it again.") from None
 
     def _start(self, name: str, attributes: dict[str, str]) -> None:
-        if len(self._open) >= MAX_DEPTH or sum(map(len, attributes.values())) > MAX_TEXT:
+        if len(self._open) >= MAX_DEPTH or (attributes and sum(map(len, attributes.values())) > MAX_TEXT):
             raise self._strange("elements in elements, or attributes, without end")
         self._text = 0
-        self._open.append(self._builder.start(name.rpartition(":")[2], attributes))
+        self._open.append(self._builder.start(_without_prefix(name), attributes))
 
     def _end(self, name: str) -> None:
         self._text = 0
-        element = self._builder.end(name.rpartition(":")[2])
+        element = self._builder.end(_without_prefix(name))
         self._open.pop()
         handle = self._each.get(element.tag)
         if handle is not None and self._open:
@@ -92,6 +133,10 @@ class _Reader:
         return CaptureError(f"{self._file}: holds {what}, as no program writes it. It is not read.")
 
 
+def _without_prefix(name: str) -> str:
+    return name.rpartition(":")[2] if ":" in name else name
+
+
 def xml_numbers(text: str | None, count: int | None, file: Path, label: str) -> list[float]:
     """The finite numbers of a text, `count` of them. Raises `CaptureError` for anything else."""
     try:
@@ -108,9 +153,13 @@ def xml_numbers(text: str | None, count: int | None, file: Path, label: str) -> 
 
 def xml_number(parent: Element, name: str, file: Path, label: str, default: float | None = None) -> float:
     """The number in a child element. Raises `CaptureError` where it is none, or is missing and has no default."""
-    child = parent.find(name)
-    if child is None or not (child.text or "").strip():
+    text = parent.findtext(name)
+    if not text or text.isspace():
         if default is not None:
             return default
         raise CaptureError(f"{file}: {label} has no {name}. Export the file again.")
-    return xml_numbers(child.text, 1, file, f"{name} of {label}")[0]
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    return value if math.isfinite(value) else xml_numbers(text, 1, file, f"{name} of {label}")[0]

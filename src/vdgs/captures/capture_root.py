@@ -1,0 +1,17 @@
+"""The folder of a capture. Imports nothing: commands about runs ask for it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+#: Folders of ODM and Bundler whose files are about the photographs beside these folders.
+_INNER = {"opensfm", "odm_report", "bundle"}
+
+
+def capture_root(path: Path) -> Path:
+    """The folder of a capture that is given by its folder, or by the file of its project: the one that has images in
+    it, where programs put the file into a folder beside images."""
+    if not path.is_file():
+        return path
+    inner = path.parent.name in _INNER and not (path.parent / "images").is_dir()
+    return path.parent.parent if inner and (path.parent.parent / "images").is_dir() else path.parent

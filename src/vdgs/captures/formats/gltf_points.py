@@ -1,0 +1,74 @@
+"""Points of a glTF file with its buffers beside it, as OPF projects have them: places, colors, and what shows them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from urllib.parse import unquote
+
+import numpy as np
+
+from vdgs.captures.formats.json_poses import read_capture_json
+from vdgs.captures.formats.source_capture import safe_name
+from vdgs.errors import CaptureError
+from vdgs.system.documents import JsonObject
+
+_TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+#: glTF has y up; OPF's coordinates z.
+_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+
+
+def read_gltf_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Points [n, 3] float64 and colours [n, 3] uint8 of all nodes. Raises `CaptureError` for damaged files and buffers
+    that are missing."""
+    content = read_capture_json(file)
+    places, colors = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)]
+    try:
+        for node in content.get("nodes", []):
+            if "mesh" not in node:
+                continue
+            matrix = np.reshape(node.get("matrix", np.eye(4)), (4, 4)).astype(np.float64).T
+            for primitive in content["meshes"][node["mesh"]]["primitives"]:
+                attributes = primitive["attributes"]
+                points = _accessor(content, attributes["POSITION"], file).astype(np.float64)
+                places.append((points @ matrix[:3, :3].T + matrix[:3, 3]) @ _Z_UP.T)
+                colors.append(_colors(content, attributes.get("COLOR_0"), len(points), file))
+    except (AttributeError, KeyError, IndexError, TypeError, ValueError) as error:
+        raise CaptureError(f"{file}: is no point cloud of OPF ({error!r}). Export the project again.") from None
+    return np.concatenate(places), np.concatenate(colors)
+
+
+def _colors(content: JsonObject, number: int | None, count: int, file: Path) -> np.ndarray:
+    from vdgs.captures.formats.ply_reader import GRAY
+
+    if number is None:
+        return np.full((count, 3), GRAY, np.uint8)
+    colors = _accessor(content, number, file)[:, :3]
+    if colors.dtype == np.uint8:
+        return colors.copy()
+    most = 1.0 if colors.dtype.kind == "f" else float(np.iinfo(colors.dtype).max)
+    return np.nan_to_num(255 * colors / most).clip(0, 255).astype(np.uint8)
+
+
+def _accessor(content: JsonObject, number: int, file: Path) -> np.ndarray:
+    """The rows of an accessor [n, width]."""
+    accessor = content["accessors"][number]
+    view = content["bufferViews"][accessor["bufferView"]]
+    name = safe_name(unquote(content["buffers"][view["buffer"]]["uri"]), file, "buffer")
+    kind, width, count = np.dtype(_TYPES[accessor["componentType"]]), _WIDTHS[accessor["type"]], int(accessor["count"])
+    start = int(view.get("byteOffset", 0)) + int(accessor.get("byteOffset", 0))
+    stride = int(view.get("byteStride", 0)) or kind.itemsize * width
+    buffer = file.parent / name
+    need = start + (stride * (count - 1) + kind.itemsize * width if count else 0)
+    try:
+        size = buffer.stat().st_size
+        if start < 0 or count < 0 or stride < kind.itemsize * width or size < need:
+            raise CaptureError(f"{buffer}: has {size} bytes where {file.name} needs {need}. Copy or export it again.")
+        with buffer.open("rb") as stream:
+            stream.seek(start)
+            raw = stream.read(need - start)
+    except OSError as error:
+        raise CaptureError(f"{buffer}: cannot be read ({error.strerror or error}). Copy the whole project.") from error
+    return (
+        np.ndarray((count, width), kind, raw, strides=(stride, kind.itemsize)) if count else np.zeros((0, width), kind)
+    )

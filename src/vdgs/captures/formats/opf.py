@@ -1,0 +1,217 @@
+"""Pix4D's Open Photogrammetry Format: project.opf, which names the files of cameras, lenses, points and system.
+
+Angles are omega, phi and kappa: world from camera, in axes right, up, back, is Rx(omega) Ry(phi) Rz(kappa). Positions
+and points are in the processing system: the coordinates of the project's system, scaled, swapped where it is
+left-handed, and shifted.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlsplit
+
+import numpy as np
+
+from vdgs.captures.coordinate_systems import ToGeodetic, is_local_system, to_geodetic
+from vdgs.captures.formats.brown_lens import brown_intrinsics
+from vdgs.captures.formats.gltf_points import read_gltf_points
+from vdgs.captures.formats.json_poses import (
+    OPENGL_FROM_OPENCV,
+    axis_rotation,
+    parse_number,
+    parse_vector,
+    read_capture_json,
+)
+from vdgs.captures.formats.photograph_sizes import leave_out, name_unaligned
+from vdgs.captures.formats.project import Project, ProjectView
+from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, safe_name
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.errors import CaptureError
+from vdgs.system.documents import JsonObject
+
+_FORMAT = "application/opf-{}+json"
+_AGAIN = "Export the project again."
+
+
+def find_files(root: Path) -> list[Path]:
+    return [file for file in sorted(root.glob("*.opf")) if is_file(file)]
+
+
+def is_file(file: Path) -> bool:
+    return file.suffix.lower() == ".opf" and file.is_file()
+
+
+def read(file: Path, options: CaptureOptions) -> Project:
+    """The project of an OPF file. Raises `CaptureError` for damaged and missing files and projects without
+    calibration."""
+    items = _Items(file)
+    calibrated, list_file = items.document("calibrated-cameras"), items.path("camera-list")
+    if calibrated is None or list_file is None:
+        raise CaptureError(
+            f"{file}: has no calibrated cameras: the project was not calibrated. Calibrate it, then export."
+        )
+    sensors = _sensors(items, calibrated, items.path("calibrated-cameras") or file)
+    uris = {
+        _number(each, "id", list_file): str(each.get("uri"))
+        for each in _dicts(read_capture_json(list_file), "cameras", list_file)
+    }
+    where = items.path("calibrated-cameras") or file
+    views, refused, warnings, used = list[ProjectView](), list[str](), list[str](), set[int]()
+    for camera in _dicts(calibrated, "cameras", where):
+        number, sensor = _number(camera, "id", where), _number(camera, "sensor_id", where)
+        name = photograph_name(uris.get(number, f"camera {number}"))
+        lens = sensors.get(sensor, f"its sensor {sensor} is not calibrated")
+        used.add(number)
+        if isinstance(lens, str):
+            refused.append(f"{name}: {lens}")
+            continue
+        pose = _pose(camera, where, f"camera {number}")
+        views.append(ProjectView(names=(name,), camera_from_world=pose, intrinsics=lens))
+    warnings += leave_out(refused, len(views), file, "Export COLMAP from PIX4Dmatic, or undistort the photographs")
+    warnings += name_unaligned([photograph_name(uri) for number, uri in uris.items() if number not in used])
+    points, colors = _points(items)
+    system, place, is_metric = _system(items)
+    return Project(
+        format="opf", file=file, views=tuple(views), points=points, colors=colors, to_geodetic=system,
+        is_metric=is_metric, place=place, warnings=tuple(warnings),
+    )  # fmt: skip
+
+
+class _Items:
+    """The resources of a project: their formats and files."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        content = read_capture_json(file)
+        self.resources = [
+            (str(item.get("type")), str(each.get("format")), str(each.get("uri")))
+            for item in _dicts(content, "items", file)
+            for each in item.get("resources") or ()
+            if isinstance(each, dict)
+        ]
+
+    def path(self, what: str) -> Path | None:
+        """The file of a format, of the first item that has one."""
+        return next(iter(self.paths(_FORMAT.format(what))), None)
+
+    def paths(self, form: str, item: str | None = None) -> list[Path]:
+        uris = [uri for kind, each, uri in self.resources if each == form and item in (None, kind)]
+        return [
+            self.file.parent / safe_name(photograph_name(uri), self.file, "resource", self.file.parent) for uri in uris
+        ]
+
+    def document(self, what: str) -> JsonObject | None:
+        path = self.path(what)
+        return read_capture_json(path) if path is not None else None
+
+
+def photograph_name(uri: str) -> str:
+    """The path that a URI means, without the page of a TIFF."""
+    path = urlsplit(uri).path if uri.lower().startswith("file:") else uri.partition("#")[0]
+    return unquote(path)
+
+
+def _dicts(content: JsonObject, key: str, file: Path) -> list[JsonObject]:
+    found = content.get(key)
+    if not isinstance(found, list) or not all(isinstance(each, dict) for each in found):
+        raise CaptureError(f"{file}: has no list {key!r}. {_AGAIN}")
+    return found
+
+
+def _number(content: JsonObject, key: str, file: Path) -> int:
+    """A number by which things are told apart; drafts of the format write it in hexadecimal digits."""
+    value = content.get(key)
+    try:
+        return int(value, 0) if isinstance(value, str) else int(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        raise CaptureError(f"{file}: {key!r} must be a number, not {str(value)[:40]!r}. {_AGAIN}") from None
+
+
+def _sensors(items: _Items, calibrated: JsonObject, file: Path) -> dict[int, Intrinsics | str]:
+    """The lenses by the numbers of the sensors, or why one cannot be used."""
+    input_file = items.path("input-cameras")
+    if input_file is None:
+        raise CaptureError(f"{items.file}: names no input cameras, which have the sizes of the photographs. {_AGAIN}")
+    sizes = {
+        _number(each, "id", input_file): parse_vector(each.get("image_size_px"), 2, input_file, "'image_size_px'")
+        for each in _dicts(read_capture_json(input_file), "sensors", input_file)
+    }
+    found: dict[int, Intrinsics | str] = {}
+    for sensor in _dicts(calibrated, "sensors", file):
+        number, inside = _number(sensor, "id", file), sensor.get("internals")
+        if not isinstance(inside, dict) or number not in sizes:
+            found[number] = f"its sensor {number} has no calibration or no size"
+        elif inside.get("type") != "perspective":
+            found[number] = f"the lens {inside.get('type')!r} of its sensor {number} is not supported"
+        else:
+            found[number] = _perspective(inside, sizes[number], file, f"sensor {number}")
+    return found
+
+
+def _perspective(inside: JsonObject, size: np.ndarray, file: Path, label: str) -> Intrinsics:
+    focal = parse_number(inside, "focal_length_px", file) or 0.0
+    center = parse_vector(inside.get("principal_point_px"), 2, file, f"{label}: 'principal_point_px'")
+    radial = parse_vector(inside.get("radial_distortion", [0, 0, 0]), 3, file, f"{label}: 'radial_distortion'")
+    bent = parse_vector(inside.get("tangential_distortion", [0, 0]), 2, file, f"{label}: 'tangential_distortion'")
+    width, height = map(int, size.clip(0, 1e9))
+    lens = brown_intrinsics(
+        (focal, focal), (float(center[0]), float(center[1])), (width, height), radial=radial.tolist(),
+        tangential=(float(bent[0]), float(bent[1])),
+    )  # fmt: skip
+    return check_intrinsics(lens, file, label)
+
+
+def _pose(camera: JsonObject, file: Path, label: str) -> np.ndarray:
+    angles = parse_vector(camera.get("orientation_deg"), 3, file, f"{label}: 'orientation_deg'")
+    world_from_camera = np.eye(4)
+    world_from_camera[:3, :3] = axis_rotation(0, angles[0]) @ axis_rotation(1, angles[1]) @ axis_rotation(2, angles[2])
+    world_from_camera[:3, 3] = parse_vector(camera.get("position"), 3, file, f"{label}: 'position'")
+    return np.linalg.inv(world_from_camera @ OPENGL_FROM_OPENCV)
+
+
+def _points(items: _Items) -> tuple[np.ndarray, np.ndarray]:
+    """The points of the calibration; those of a cloud where it has none."""
+    for item in ("calibration", "point_cloud"):
+        clouds = [read_gltf_points(path) for path in items.paths("model/gltf+json", item)]
+        clouds = [cloud for cloud in clouds if len(cloud[0])]
+        if clouds:
+            return np.concatenate([each for each, _ in clouds]), np.concatenate([each for _, each in clouds])
+    return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+
+
+def _system(items: _Items) -> tuple[ToGeodetic | None, str, bool]:
+    """What brings processing coordinates to latitude, longitude and height, words about it, and whether they are metres
+    where nothing does: the project has no system, or one of its own (a building site)."""
+    file = items.path("scene-reference-frame")
+    content: Any = read_capture_json(file) if file is not None else {}
+    crs, change = content.get("crs"), content.get("base_to_canonical")
+    if file is None or not isinstance(crs, dict) or not isinstance(change, dict):
+        return None, "", False
+    definition = str(crs.get("definition", ""))
+    if is_local_system(definition) or not definition.strip():
+        is_metric = bool(definition.strip()) and "foot" not in definition.lower()
+        return None, "OPF, metres of a system of its own" if is_metric else "", is_metric
+    shift = parse_vector(change.get("shift"), 3, file, "'shift'")
+    scale = parse_vector(change.get("scale", [1, 1, 1]), 3, file, "'scale'")
+    if (scale <= 0).any():
+        raise CaptureError(f"{file}: 'scale' must be positive. {_AGAIN}")
+    geoid = parse_number(crs, "geoid_height", file) or 0.0
+    known, name = to_geodetic(definition, file, "'definition'")
+    meters = np.array([1.0, 1.0, _height_unit(definition)])
+    order = [1, 0, 2] if change.get("swap_xy") else [0, 1, 2]
+
+    def to_earth(points: np.ndarray) -> np.ndarray:
+        base = (points - shift)[:, order] / scale
+        # The system is told with its own axes; what is asked has x to the east.
+        return known(base[:, order] * meters) + np.array([0.0, 0.0, geoid])
+
+    return to_earth, f"OPF, {name}", False
+
+
+def _height_unit(definition: str) -> float:
+    """Metres in the unit of heights, of systems that have none: there they are in the unit of the others."""
+    import pyproj
+
+    crs = pyproj.CRS.from_user_input(definition)
+    return float(crs.axis_info[0].unit_conversion_factor) if len(crs.axis_info) == 2 and crs.is_projected else 1.0

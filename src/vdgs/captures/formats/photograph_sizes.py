@@ -1,0 +1,54 @@
+"""What readers of projects ask of the photographs, and say of those that cannot be used."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from vdgs.captures.formats.project_photographs import find_photographs
+from vdgs.captures.formats.source_capture import LEAST_THERE, MAX_LISTED, format_list
+from vdgs.captures.image_files import read_header
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.errors import CaptureError
+
+
+def photograph_sizes(root: Path, options: CaptureOptions, names: Sequence[str], file: Path) -> list[tuple[int, int]]:
+    """Width and height of each photograph, for files that do not tell them: those of the photographs as they were taken
+    where these are there too, and not of a folder of smaller ones. A photograph that is missing is taken to be as large
+    as most. Raises `CaptureError` where none is there."""
+    wanted = [(name,) for name in names]
+    try:
+        found = find_photographs(root, replace(options, images=None), wanted, file)
+    except CaptureError:
+        found = find_photographs(root, options, wanted, file)
+    headers = [read_header(path) if path.is_file() else None for path in found.paths]
+    sizes = [(header.width, header.height) if header else None for header in headers]
+    usual = Counter(size for size in sizes if size).most_common(1)[0][0]
+    return [size or usual for size in sizes]
+
+
+def leave_out(refused: Sequence[str], used: int, file: Path, remedy: str) -> list[str]:
+    """A warning about cameras that cannot be used, each with its reason; CaptureError where too few are left."""
+    count = used + len(refused)
+    if used < max(1, LEAST_THERE * count):
+        raise CaptureError(
+            f"{file}: {len(refused)} of its {count} cameras cannot be used. {remedy}.{format_list(refused)}"
+        )
+    return (
+        [f"{len(refused)} of {count} cameras cannot be used, and are left out ({_shown(refused)})."] if refused else []
+    )
+
+
+def name_unaligned(names: Sequence[str]) -> list[str]:
+    """A warning about photographs that the project has not placed."""
+    return (
+        [f"{len(names)} photographs of the project were not aligned, and are left out ({_shown(names)})."]
+        if names
+        else []
+    )
+
+
+def _shown(names: Sequence[str]) -> str:
+    return ", ".join(names[:MAX_LISTED]) + (", ..." if len(names) > MAX_LISTED else "")

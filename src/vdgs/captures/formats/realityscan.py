@@ -1,0 +1,267 @@
+"""RealityScan (RealityCapture): its table of registered cameras, and the XMP that it writes beside each photograph.
+
+Lengths in a picture count in its longer side: the focal length in 36ths of it, the principal point from the middle.
+Heading, pitch and roll turn a camera that looks down with its top to the north: world from camera, in axes right, up,
+back, is Rz(-heading) Rx(pitch) Ry(roll). The XMP has the rotation camera from world, in axes right, down, forward.
+Of the tangential terms t1 goes with r² + 2x²: it is OpenCV's p2, as AliceVision and Camorph read it too.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from itertools import islice
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from vdgs.captures.coordinate_systems import ToGeodetic
+from vdgs.captures.formats.brown_lens import brown_intrinsics
+from vdgs.captures.formats.json_poses import OPENGL_FROM_OPENCV, axis_rotation
+from vdgs.captures.formats.photograph_sizes import leave_out, photograph_sizes
+from vdgs.captures.formats.project import Project, ProjectView
+from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
+from vdgs.captures.formats.xml_documents import read_xml, xml_numbers
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.errors import CaptureError
+
+#: Columns that say where a camera is; with them a table is one of registered cameras.
+_POSE = ("x", "y", "alt", "heading", "pitch", "roll")
+_LENS = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
+#: What people's own templates call the columns.
+_ALIASES = {
+    "file": "name", "filename": "name", "image": "name", "imagename": "name", "label": "name",
+    "east": "x", "easting": "x", "north": "y", "northing": "y",
+    "z": "alt", "altitude": "alt", "height": "alt", "yaw": "heading",
+    "focal": "f", "focallength": "f", "focallength35mm": "f", "f35mm": "f",
+    "ppx": "px", "principalpointu": "px", "ppy": "py", "principalpointv": "py",
+}  # fmt: skip
+#: The models of the XMP that are Brown's, all in the order k1, k2, k3, k4, t1, t2.
+_BROWN_MODELS = {"", "perspective", "brown3", "brown4", "brown3t2", "brown4t2"}
+#: Bytes in which the line that names the columns is looked for, and the namespace of the XMP.
+_HEAD_BYTES, _NAMESPACE = 1024, b"capturingreality.com/ns/xcr"
+#: No camera of a survey has a longer focal length, in millimetres as of 35 mm film.
+_LONGEST_35MM = 1500.0
+#: XMP files that are looked at to tell whether they are RealityScan's: other programs write thousands.
+_XMP_LOOKED_AT = 20
+#: Cameras of one flight are no farther apart in degrees, and have coordinates as large only in a projected system.
+_DEGREES_APART, _PROJECTED_FROM = 0.2, 20_000.0
+_AGAIN = "Export the registration again."
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RegisteredCamera:
+    """A photograph that RealityScan has placed; its lens is told in shares of the picture, whose size is not."""
+
+    name: str
+    camera_from_world: np.ndarray
+    focal_35mm: float
+    lens: Mapping[str, float] = field(default_factory=dict)
+
+    def intrinsics(self, size: tuple[int, int], file: Path) -> Intrinsics:
+        """The lens at the size of the photograph."""
+        (width, height), longer = size, max(size)
+        px, py, k1, k2, k3, k4, t1, t2 = (self.lens.get(key, 0.0) for key in _LENS)
+        focal = self.focal_35mm * longer / 36
+        lens = brown_intrinsics(
+            (focal, focal * self.lens.get("aspect", 1.0)), (px * longer + width / 2, py * longer + height / 2), size,
+            radial=(k1, k2, k3, k4), tangential=(t2, t1), skew=self.lens.get("skew", 0.0) * longer,
+        )  # fmt: skip
+        return check_intrinsics(lens, file, f"the photograph {self.name!r}")
+
+
+def find_files(root: Path) -> list[Path]:
+    """The tables of registered cameras in a folder; else the first XMP beside its photographs, for all of them."""
+    tables = [file for file in sorted(root.glob("*.csv")) if _is_table(file)]
+    beside = (file for folder in (root, root / "images") for file in _xmp_below(folder, folder != root))
+    return tables or [file for file in islice(beside, _XMP_LOOKED_AT) if _is_xmp(file)][:1]
+
+
+def is_file(file: Path) -> bool:
+    return _is_xmp(file) if file.suffix.lower() == ".xmp" else _is_table(file)
+
+
+def read(file: Path, options: CaptureOptions) -> Project:
+    """The project of a table, or of all XMP files in the folder of one. Raises `CaptureError` for damaged files."""
+    refused = list[str]()
+    if file.suffix.lower() != ".xmp":
+        cameras, root = read_camera_table(file), file.parent
+    else:
+        above = next((folder for folder in file.parents if folder.name == "images"), file.parent)
+        files = [each for each in _xmp_below(above) if _is_xmp(each)]
+        read_all = [(each.relative_to(above).with_suffix("").as_posix(), read_xmp(each)) for each in files]
+        cameras = [replace(each, name=name) for name, each in read_all if not isinstance(each, str)]
+        refused = [f"{name}: {why}" for name, why in read_all if isinstance(why, str)]
+        root = above.parent if above.name == "images" else above
+    warnings = leave_out(refused, len(cameras), file, "Align them, and export the XMP files of all")
+    if file.suffix.lower() != ".xmp" and _may_be_division(cameras):
+        warnings.append(
+            f"{file.name}: of the lens only k1 is set, and is taken for Brown's. If the lens model was Division, align "
+            "with Brown3 and export again."
+        )
+    names = [camera.name for camera in cameras]
+    views = tuple(
+        ProjectView(
+            names=(camera.name,), camera_from_world=camera.camera_from_world, intrinsics=camera.intrinsics(size, file)
+        )
+        for camera, size in zip(cameras, photograph_sizes(root, options, names, file), strict=True)
+    )  # fmt: skip
+    system, is_metric, place = _world(views)
+    return Project(
+        format="realityscan", file=file, views=views, points=np.zeros((0, 3)), colors=np.zeros((0, 3), np.uint8),
+        to_geodetic=system, in_degrees=system is not None, is_metric=is_metric, place=place, warnings=tuple(warnings),
+    )  # fmt: skip
+
+
+def _may_be_division(cameras: list[RegisteredCamera]) -> bool:
+    """Whether the table may be of the Division model, which it does not say: k1 alone."""
+    set_terms = {key for camera in cameras for key, value in camera.lens.items() if value and key[0] in "kt"}
+    return set_terms == {"k1"}
+
+
+def _world(views: tuple[ProjectView, ...]) -> tuple[ToGeodetic | None, bool, str]:
+    """What the coordinates are, which neither file says: degrees, metres of a projected system, or of no scale."""
+    poses = np.stack([view.camera_from_world for view in views])
+    centers = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+    middle, spread = np.abs(np.median(centers, axis=0)), np.ptp(centers, axis=0)
+    if (
+        (spread[:2] < _DEGREES_APART).all()
+        and middle[0] <= 180
+        and middle[1] <= 90
+        and middle[2] > 1e3 * spread[:2].max()
+    ):
+        return lambda points: points[:, [1, 0, 2]], True, "RealityScan, longitude and latitude"
+    if middle[:2].max() > _PROJECTED_FROM:
+        return None, True, "RealityScan, metres of a projected system that it does not name"
+    return None, False, ""
+
+
+def _is_table(file: Path) -> bool:
+    """Whether a file begins with the columns of registered cameras."""
+    try:
+        with file.open("rb") as stream:
+            head = stream.read(_HEAD_BYTES).decode("utf-8-sig", "replace")
+    except OSError:
+        return False
+    return any(_column_names(line) is not None for line in head.splitlines()[:3])
+
+
+def _column_names(line: str) -> tuple[str, list[str]] | None:
+    """What parts the columns of a line, and their names, if they are those of registered cameras."""
+    for delimiter in (",", ";", "\t"):
+        words = [
+            word.strip().strip('"').lower().lstrip("#").replace(" ", "").replace("_", "")
+            for word in line.split(delimiter)
+        ]
+        names = [_ALIASES.get(word, word) for word in words]
+        if all(each in names for each in ("name", *_POSE)):
+            return delimiter, names
+    return None
+
+
+def read_camera_table(file: Path) -> list[RegisteredCamera]:
+    """Raises `CaptureError` for a row with too few columns or with what is no number, and for one without a focal
+    length; all such rows at once."""
+    try:
+        lines = file.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise CaptureError(f"{file}: cannot be read ({error}). {_AGAIN}") from None
+    start, found = next(
+        ((k, each) for k, each in enumerate(map(_column_names, lines[:3])) if each is not None), (0, None)
+    )
+    if found is None:
+        raise CaptureError(f"{file}: names no columns name, {', '.join(_POSE)}. {_AGAIN}")
+    delimiter, names = found
+    if "f" not in names:
+        raise CaptureError(
+            f"{file}: has no column f, the focal length. Export 'Internal/External camera parameters' instead."
+        )
+    cameras, problems = [], []
+    rows = csv.reader(io.StringIO("\n".join(lines[start + 1 :])), delimiter=delimiter)
+    for number, row in enumerate(rows, start + 2):
+        if not "".join(row).strip() or row[0].startswith("#"):
+            continue
+        try:
+            cameras.append(_row_camera(dict(zip(names, row, strict=False)), delimiter, file))
+        except (KeyError, ValueError) as error:
+            problems.append(f"line {number}: {error}")
+    if problems:
+        listed = "".join(f"\n  {each}" for each in problems[:10])
+        raise CaptureError(f"{file}: {len(problems)} of its rows cannot be read. {_AGAIN}{listed}")
+    if cameras and np.median([camera.focal_35mm for camera in cameras]) > _LONGEST_35MM:
+        raise CaptureError(
+            f"{file}: has focal lengths of {cameras[0].focal_35mm:g} mm as of 35 mm film. Are they in pixels? Export "
+            "'Internal/External camera parameters' as RealityScan has them."
+        )
+    return cameras
+
+
+def _row_camera(row: dict[str, str], delimiter: str, file: Path) -> RegisteredCamera:
+    """Raises ValueError, or KeyError for a row that ends too early."""
+
+    def number(key: str) -> float:
+        value = float(row[key].replace(",", ".") if delimiter == ";" else row[key])
+        if not np.isfinite(value):
+            raise ValueError(f"{key} is {row[key].strip()}")
+        return value
+
+    east, north, up, heading, pitch, roll = map(number, _POSE)
+    world_from_camera = np.eye(4)
+    world_from_camera[:3, :3] = axis_rotation(2, -heading) @ axis_rotation(0, pitch) @ axis_rotation(1, roll)
+    world_from_camera[:3, 3] = east, north, up
+    pose = np.linalg.inv(world_from_camera @ OPENGL_FROM_OPENCV)
+    lens = {key: number(key) for key in _LENS if row.get(key, "").strip()}
+    return RegisteredCamera(name=row["name"].strip(), camera_from_world=pose, focal_35mm=number("f"), lens=lens)
+
+
+def _xmp_below(folder: Path, deep: bool = True) -> list[Path]:
+    """The XMP files in a folder, and in those below it."""
+    return sorted((folder.rglob if deep else folder.glob)("*.[xX][mM][pP]"))
+
+
+def _is_xmp(file: Path) -> bool:
+    try:
+        with file.open("rb") as stream:
+            return _NAMESPACE in stream.read(4 * _HEAD_BYTES)
+    except OSError:
+        return False
+
+
+def read_xmp(file: Path) -> RegisteredCamera | str:
+    """The camera in an XMP, named without a suffix; why there is none where the photograph was not placed, or has a
+    lens that is not Brown's."""
+    found = {key: value for element in read_xml(file).iter() for key, value in _properties(element)}
+    model = found.get("DistortionModel", "").lower()
+    if "Rotation" not in found or "Position" not in found:
+        return "was not aligned"
+    if model not in _BROWN_MODELS:
+        return f"has the lens model {model!r}, which is not supported: align with Brown3 or Brown4, or export COLMAP"
+
+    def numbers(key: str, count: int) -> list[float]:
+        return xml_numbers(found[key], count, file, f"xcr:{key}")
+
+    def number(key: str, default: float) -> float:
+        return numbers(key, 1)[0] if key in found else default
+
+    if "FocalLength35mm" not in found:
+        raise CaptureError(f"{file}: has no xcr:FocalLength35mm. Export the XMP with the camera's calibration.")
+    pose = np.eye(4)
+    pose[:3, :3] = np.reshape(numbers("Rotation", 9), (3, 3))
+    pose[:3, 3] = -pose[:3, :3] @ numbers("Position", 3)
+    bent = model != "perspective" and "DistortionCoeficients" in found
+    lens = dict(zip(_LENS[2:], numbers("DistortionCoeficients", 6) if bent else [0.0] * 6, strict=True))
+    lens |= {"px": number("PrincipalPointU", 0.0), "py": number("PrincipalPointV", 0.0)}
+    lens |= {"aspect": number("AspectRatio", 1.0), "skew": number("Skew", 0.0)}
+    pose = to_rigid(pose, file, "xcr:Rotation")
+    return RegisteredCamera(
+        name=file.stem, camera_from_world=pose, focal_35mm=number("FocalLength35mm", 0.0), lens=lens
+    )
+
+
+def _properties(element: Element) -> list[tuple[str, str]]:
+    """What an element says as attributes, and as its own text: RealityScan writes either."""
+    said = [(key.rpartition(":")[2], value) for key, value in element.attrib.items()]
+    return [*said, (element.tag.rpartition(":")[2], element.text)] if element.text and element.text.strip() else said

@@ -1,0 +1,388 @@
+"""A capture of a project that has poses and no points: points are found with poses and lenses held as they are.
+
+Features are found in the photographs as they are, and their places brought to one pinhole for all photographs of a size
+by the project's own lenses, whatever their models and however many they are; pairs that look at the same are matched,
+and what agrees is triangulated. The same command goes on where it was stopped.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from vdgs.captures.capture_root import capture_root
+from vdgs.captures.formats.lens_projection import colmap_camera, pixel_rays
+from vdgs.captures.formats.source_capture import Intrinsics, SourceCapture
+from vdgs.captures.georeference import ENU_FRAME, LOCAL_FRAME, ORIGIN_KEYS
+from vdgs.captures.image_files import decode_image, read_header
+from vdgs.captures.image_matching import MatchedView, match_images
+from vdgs.captures.output_guard import check_output
+from vdgs.captures.project_formats import read_poses
+from vdgs.captures.reconstruction import STEPS_FILE, WORK_FOLDER
+from vdgs.captures.up_axis import estimate_up
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.ranges import check_ranges
+from vdgs.config.sfm_options import SfmRequest
+from vdgs.errors import CaptureError, VdgsError
+from vdgs.geometry.similarity import rotation_to_z
+from vdgs.kernels import default_num_threads
+from vdgs.runs.run_folder import RunFolder
+from vdgs.sfm import capture_writer, feature_extraction, feature_matching, mask_files, pair_selection
+from vdgs.sfm.image_metadata import ImageMetadata
+from vdgs.sfm.reconstruct import check_nothing_trained, writing
+from vdgs.sfm.workspace import Workspace, cache_key, call_cancellable, report_progress, silence_colmap
+from vdgs.system.atomic_files import write_json
+from vdgs.system.colmap import pycolmap
+
+#: The steps of the work, and the folder of the features as the photographs show them.
+FEATURES, MATCHES, POINTS, CAPTURE, BENT = "features", "matches", "points", "capture", "bent"
+#: Where features go that the lens cannot have shown: no pair of them agrees with any.
+_NOWHERE = -1e5
+#: Fewer points than this are no scene.
+MIN_POINTS = 100
+#: Of features that were matched and verified, poses that are true place at least this share (choice: of a generated
+#: flight 99.9 % are placed, 42 to 54 % where photographs and poses are exchanged).
+LEAST_AGREEING = 0.65
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PosedPhotographs:
+    """The photographs of a project in name order, and what makes each step anew."""
+
+    source: SourceCapture
+    views: tuple[MatchedView, ...]
+    #: A camera for each size of photographs, whose numbers in COLMAP's database are 1, 2, ...
+    pinholes: tuple[Intrinsics, ...]
+    keys: dict[str, str]
+    warnings: tuple[str, ...]
+
+    def number_of(self, view: MatchedView) -> int:
+        sizes = [_size(pinhole) for pinhole in self.pinholes]
+        return 1 + sizes.index(_size(view.file.intrinsics))
+
+
+def _size(lens: Intrinsics) -> tuple[int, int]:
+    return lens.width, lens.height
+
+
+def make_posed_capture(
+    request: SfmRequest,
+    options: CaptureOptions,
+    console: Console,
+    run: RunFolder | None = None,
+) -> None:
+    """Make a capture with points of a project without, in `request.output`, or go on with one that was begun.
+
+    `run` is the run that the capture is for. Raises CaptureError for projects and photographs that cannot become one,
+    VdgsError for an output that is something else.
+    """
+    silence_colmap()
+    check_ranges(request)
+    photographs = _read(request, options)
+    output, threads = request.output, request.threads or default_num_threads()
+    work, finished = Workspace(output / WORK_FOLDER), Workspace(output)
+    for warning in photographs.warnings:
+        console.print(f"[yellow]note[/] {warning}", highlight=False)
+    if finished.is_done(CAPTURE, photographs.keys[CAPTURE]):
+        console.print(f"{output}: made of this project already; nothing to do", highlight=False)
+        return
+    _check_output(output, work, finished, photographs.keys, request.overwrite)
+    check_nothing_trained(request, run)
+    console.print(
+        f"{len(photographs.views)} photographs, poses and lenses as the project has them; points are found",
+        highlight=False,
+    )
+    with writing(request, run):
+        _find_features(photographs, work, request, threads, console)
+        _match(photographs, work, request, threads, console)
+        model = _triangulate(photographs, work, threads, console)
+        if not finished.is_begun(CAPTURE, photographs.keys[CAPTURE]):
+            for name in (*(folder for folder, _ in capture_writer.IMAGE_SIZES), capture_writer.MASK_FOLDER, "sparse"):
+                shutil.rmtree(output / name, ignore_errors=True)
+            (output / "georef.json").unlink(missing_ok=True)
+            finished.begin(CAPTURE, photographs.keys[CAPTURE])
+        _write(photographs, work, model, request, threads, console)
+        finished.finish(CAPTURE, photographs.keys[CAPTURE])
+    console.print(f"{model.num_points3D():,} points, mean reprojection error "
+                  f"{model.compute_mean_reprojection_error():.2f} px", highlight=False)  # fmt: skip
+
+
+def _read(request: SfmRequest, options: CaptureOptions) -> PosedPhotographs:
+    [path] = request.image_folders
+    root, warnings = capture_root(path), list[str]()
+    source = read_poses(path, options)
+    views, _ = match_images(root, source, options, warnings)
+    if len(views) < 3:
+        raise CaptureError(f"{path}: {len(views)} photographs with a pose are there; points need 3 at the very least.")
+    views = sorted(views, key=lambda view: view.view.name)
+    lenses = [view.file.intrinsics for view in views]
+    files = [_fingerprint(view) for view in views]
+    chosen = request.options
+    found = cache_key(files, chosen.max_image_size, chosen.max_num_features)
+    straight = cache_key(
+        found, [vars(lens) for lens in lenses], [view.view.camera_from_world.tolist() for view in views]
+    )
+    matched = cache_key(straight, chosen.num_neighbors)
+    keys = {FEATURES: found, BENT: straight, MATCHES: matched, POINTS: matched}
+    keys[CAPTURE] = cache_key(matched, chosen.max_output_size, source.georef and vars(source.georef))
+    return PosedPhotographs(
+        source=source, views=tuple(views), pinholes=_pinholes(lenses), keys=keys, warnings=(*source.warnings, *warnings)
+    )
+
+
+def _pinholes(lenses: Sequence[Intrinsics]) -> tuple[Intrinsics, ...]:
+    """For the photographs of each size one camera about as theirs are, without distortion."""
+    found = []
+    for width, height in dict.fromkeys(map(_size, lenses)):
+        focal = float(np.median([lens.focal for lens in lenses if _size(lens) == (width, height)]))
+        found.append(Intrinsics("PINHOLE", (focal, focal, width / 2, height / 2), width, height))
+    return tuple(found)
+
+
+def _fingerprint(view: MatchedView) -> list[object]:
+    stats = [file.stat() for file in (view.file.path, view.file.mask) if file is not None]
+    return [view.view.name, *((stat.st_size, stat.st_mtime_ns) for stat in stats)]
+
+
+def _check_output(output: Path, work: Workspace, finished: Workspace, keys: dict[str, str], overwrite: bool) -> None:
+    """Only a new folder, an empty one, or one that was begun with the same project is written to."""
+    check_output(output)
+    if not output.exists() or (output.is_dir() and not any(each.name != ".lock" for each in output.iterdir())):
+        return
+    begun = (work.path / STEPS_FILE).is_file() or (output / STEPS_FILE).is_file()
+    same = work.is_begun(FEATURES, keys[FEATURES]) or finished.is_begun(CAPTURE, keys[CAPTURE])
+    if not begun:
+        raise VdgsError(f"{output}: holds other things already. Choose a new folder with --output.")
+    if not same and not overwrite:
+        raise VdgsError(
+            f"{output}: was begun with other photographs, poses or settings than there are now. Add --overwrite to "
+            "make it anew, or choose another --output."
+        )
+
+
+# ------------------------------------------------------------------------------------------------- the steps
+
+
+def _find_features(
+    photographs: PosedPhotographs, work: Workspace, request: SfmRequest, threads: int, console: Console
+) -> None:
+    """Features as the photographs show them, in their own database, then a copy in which the lens is undone."""
+    bent, keys = Workspace(work.path / BENT), photographs.keys
+    if not work.is_begun(FEATURES, keys[FEATURES]):
+        work.remove()
+        work.begin(FEATURES, keys[FEATURES])
+    groups = _groups(photographs)
+    images = [image for group in groups for image in group.images]
+    feature_extraction.create_database(bent, groups)
+    feature_extraction.write_upright_images(bent, images)
+    if not work.is_done(FEATURES, keys[FEATURES]):
+        mask_files.write_upright_masks(bent, images, threads)
+        there = feature_extraction.count_features(bent)
+        with report_progress(work, console, "features", len(images)) as tell:
+            feature_extraction.extract_groups(bent, groups, request.options, len(images), threads, there, tell)
+        work.finish(FEATURES, keys[FEATURES])
+    feature_extraction.images_without_features(images, feature_extraction.count_features(bent))
+    if work.is_done(BENT, keys[BENT]):
+        return
+    work.begin(BENT, keys[BENT])
+    for rest in work.path.glob("database.db*"):
+        rest.unlink()
+    shutil.copyfile(bent.database, work.database)
+    _straighten(photographs, work)
+    work.finish(BENT, keys[BENT])
+
+
+def _groups(photographs: PosedPhotographs) -> list[feature_extraction.CameraGroup]:
+    groups = []
+    for number, lens in enumerate(photographs.pinholes, 1):
+        members = tuple(_metadata(view) for view in photographs.views if photographs.number_of(view) == number)
+        groups.append(
+            feature_extraction.CameraGroup(
+                camera="", width=lens.width, height=lens.height, focal_px=lens.focal[0], has_focal_prior=True,
+                source="the project", images=members,
+            )
+        )  # fmt: skip
+    return groups
+
+
+def _metadata(view: MatchedView) -> ImageMetadata:
+    """The photograph as its file has it: poses of projects are of that, whatever EXIF says of its orientation."""
+    path, lens = view.file.path, view.file.intrinsics
+    return ImageMetadata(
+        name=view.view.name, path=path, width=lens.width, height=lens.height, orientation=1, camera="", lens=None,
+        datetime="", lat_lon=None, altitude=None, altitude_type="", gps_std=None, gps_error_m=None,
+        relative_altitude=None, attitude=None, file_bytes=path.stat().st_size,
+        has_alpha_channel="A" in read_header(path).mode, mask=view.file.mask,
+    )  # fmt: skip
+
+
+def _straighten(photographs: PosedPhotographs, work: Workspace) -> None:
+    """Cameras of the database become pinholes, and features lie where these show them."""
+    by_name = {view.view.name: view for view in photographs.views}
+    with work.open_database() as database:
+        for number, pinhole in enumerate(photographs.pinholes, 1):
+            database.update_camera(_camera(number, pinhole))
+        for image in database.read_all_images():
+            if database.exists_keypoints(image.image_id):
+                lens, pinhole = by_name[image.name].file.intrinsics, photographs.pinholes[image.camera_id - 1]
+                features = np.array(database.read_keypoints(image.image_id))
+                rays = pixel_rays(lens, features[:, :2].astype(np.float64))
+                features[:, :2] = np.nan_to_num(rays * pinhole.focal + pinhole.principal_point, nan=_NOWHERE)
+                database.update_keypoints(image.image_id, features)
+
+
+def _camera(number: int, lens: Intrinsics) -> pycolmap.Camera:
+    camera = colmap_camera(lens)
+    camera.camera_id = number
+    return camera
+
+
+def _match(photographs: PosedPhotographs, work: Workspace, request: SfmRequest, threads: int, console: Console) -> None:
+    key = photographs.keys[MATCHES]
+    if work.is_done(MATCHES, key):
+        return
+    if not work.is_begun(MATCHES, key):
+        feature_matching.delete_matches(work)
+        work.begin(MATCHES, key)
+    there = feature_extraction.count_features(work)
+    names = [view.view.name for view in photographs.views]
+    pairs = [(names[i], names[j]) for i, j in sorted(_near_pairs(photographs, request.options.num_neighbors))]
+    pairs = [pair for pair in pairs if all(there.get(name) for name in pair)]
+    feature_matching.match_pairs(work, pairs, threads, console)
+    work.finish(MATCHES, key)
+
+
+def _near_pairs(photographs: PosedPhotographs, num_neighbors: int) -> set[tuple[int, int]]:
+    """Pairs of photographs whose cameras are near each other and look the same way."""
+    count = len(photographs.views)
+    if count <= pair_selection.SEQUENTIAL_OVERLAP:
+        return pair_selection.exhaustive_pairs(count)
+    poses = np.stack([view.view.camera_from_world for view in photographs.views])
+    rotations, centers = poses[:, :3, :3], -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+    level = np.eye(3)
+    if photographs.source.georef is None:
+        level = rotation_to_z(estimate_up(centers, rotations, centers, [])[0])
+    return pair_selection.spatial_pairs(centers @ level.T, num_neighbors, rotations[:, 2] @ level.T)
+
+
+def _triangulate(
+    photographs: PosedPhotographs, work: Workspace, threads: int, console: Console
+) -> pycolmap.Reconstruction:
+    folder, key = work.models / "0", photographs.keys[POINTS]
+    if work.is_done(POINTS, key):
+        return pycolmap.Reconstruction(folder)
+    work.begin(POINTS, key)
+    shutil.rmtree(work.models, ignore_errors=True)
+    folder.mkdir(parents=True)
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads, options.random_seed, options.extract_colors = threads, 0, False
+    options.triangulation.ignore_two_view_tracks = False  # as in the mapper: edges of a flight have no others
+    with report_progress(work, console, "mapping", len(photographs.views), "poses held, ") as tell:
+        tell(0)
+        model = call_cancellable(
+            _triangulate_points, work.database, posed_model(photographs, work), work.path, folder, options
+        )
+        tell(len(photographs.views))
+    _check_agreement(model, work)
+    work.finish(POINTS, key)
+    return model
+
+
+def _check_agreement(model: pycolmap.Reconstruction, work: Workspace) -> None:
+    """Raise CaptureError where what was matched is not where the poses would have it."""
+    agreeing = sum(point.track.length() for point in model.points3D.values())
+    share = agreeing / max(1, feature_matching.count_matched_features(work))
+    if model.num_points3D() < MIN_POINTS or share < LEAST_AGREEING:
+        raise CaptureError(
+            f"{model.num_points3D()} points, {share:.0%} of what photographs show together, agree with the poses of "
+            "the project; of true poses nearly all do. Are the photographs those that it was made of, at their own "
+            "size and not turned, and are its lenses exported with it? Or let poses be found anew: give the folder of "
+            "the photographs alone to vdgs sfm."
+        )
+
+
+def _triangulate_points(database: Path, model: Any, images: Path, output: Path, options: Any, **named: Any) -> Any:
+    return pycolmap.triangulate_points(model, database, images, output, options=options, **named)
+
+
+def posed_model(photographs: PosedPhotographs, work: Workspace) -> pycolmap.Reconstruction:
+    """A model of the cameras alone, with the numbers of the database."""
+    model = pycolmap.Reconstruction()
+    for number, lens in enumerate(photographs.pinholes, 1):
+        model.add_camera_with_trivial_rig(_camera(number, lens))
+    with work.open_database() as database:
+        numbers = {image.name: image.image_id for image in database.read_all_images()}
+    for view in photographs.views:
+        name, camera = view.view.name, photographs.number_of(view)
+        if name in numbers:
+            image = pycolmap.Image(name=name, camera_id=camera, image_id=numbers[name])
+            pose = pycolmap.Rigid3d(view.view.camera_from_world[:3])
+            model.add_image_with_trivial_frame(image, pose)
+    return model
+
+
+# --------------------------------------------------------------------------------------------------- capture
+
+
+def _write(
+    photographs: PosedPhotographs,
+    work: Workspace,
+    model: pycolmap.Reconstruction,
+    request: SfmRequest,
+    threads: int,
+    console: Console,
+) -> None:
+    output, bent = request.output, Workspace(work.path / BENT)
+    members: dict[Intrinsics, list[str]] = {}
+    for view in photographs.views:
+        members.setdefault(view.file.intrinsics, []).append(view.view.name)
+    lenses, lens_of, done = dict[int, Intrinsics](), dict[str, int](), 0
+    with report_progress(work, console, "writing", len(photographs.views), "without distortion, ") as tell:
+        for number, (lens, names) in enumerate(members.items(), 1):  # one at a time: maps take memory
+            straight = capture_writer.make_undistortion(lens, request.options.max_output_size)
+
+            def told(count: int, before: int = done) -> None:
+                tell(before + count)
+
+            capture_writer.write_images(output, bent, {number: names}, {number: straight}, threads, told)
+            lenses[number], done = straight.intrinsics, done + len(names)
+            lens_of |= dict.fromkeys(names, number)
+    color_points(model, output, lenses, lens_of)
+    georef = photographs.source.georef
+    if georef is not None:
+        place = {} if georef.origin is None else dict(zip(ORIGIN_KEYS, georef.origin, strict=True))
+        frame = LOCAL_FRAME if georef.origin is None else ENU_FRAME
+        write_json(
+            output / "georef.json", {"frame": frame, **place, "method": georef.method, "accuracy": georef.accuracy}
+        )
+    shutil.rmtree(output / "sparse", ignore_errors=True)
+    capture_writer.write_model(output, model, lenses, lens_of)
+
+
+def color_points(
+    model: pycolmap.Reconstruction, output: Path, lenses: Mapping[int, Intrinsics], lens_of: Mapping[str, int]
+) -> None:
+    """Each point gets the mean colour of where written photographs (the smallest of them) show it."""
+    folder, factor = capture_writer.IMAGE_SIZES[-1]
+    numbers = np.array(sorted(model.points3D), dtype=np.uint64)
+    sums = np.zeros((len(numbers), 4))
+    for image in model.images.values():
+        seen = [point for point in image.points2D if point.has_point3D()]
+        if not seen:
+            continue
+        rays = np.asarray(model.cameras[image.camera_id].cam_from_img(np.array([point.xy for point in seen])))
+        fx, fy, cx, cy = lenses[lens_of[image.name]].params
+        pixels, _ = decode_image(output / folder / capture_writer.jpeg_name(image.name))
+        at = (rays.reshape(-1, 2) * [fx, fy] + [cx, cy]) / factor
+        x, y = at.astype(int).clip(0, np.array(pixels.shape[1::-1]) - 1).T
+        index = np.searchsorted(numbers, np.array([point.point3D_id for point in seen], dtype=np.uint64))
+        np.add.at(sums, index, np.column_stack([pixels[y, x], np.ones(len(x))]))
+    means = np.round(sums[:, :3] / np.maximum(sums[:, 3:], 1)).astype(np.uint8)
+    for number, mean in zip(numbers.tolist(), means, strict=True):
+        model.points3D[number].color = mean

@@ -1,0 +1,423 @@
+"""Projects of OpenSfM, ODM, Bundler, RealityScan and Pix4D: a known flight in each, read back to its numbers."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from support import project_writers as writers
+from support.known_flight import ORIGIN, BentLens, KnownFlight, centers_of, ecef, known_flight, poses_of
+from vdgs.captures.format_dispatch import lacks_points
+from vdgs.captures.formats.lens_projection import ray_pixels
+from vdgs.captures.formats.source_capture import SourceCapture
+from vdgs.captures.loading import load_capture
+from vdgs.captures.project_formats import PROJECTS, find_projects, read_poses, read_project
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.errors import CaptureError
+from vdgs.geometry.geodesy import geodetic_from_enu
+
+OPTIONS = CaptureOptions()
+
+
+@pytest.fixture
+def flight() -> KnownFlight:
+    return known_flight()
+
+
+def read(root: Path, name: str) -> SourceCapture:
+    [(found, _)] = find_projects(root)
+    assert found == name
+    return read_poses(root, OPTIONS)
+
+
+def check_numbers(source: SourceCapture, flight: KnownFlight, *, placed: bool = True, seen_px: float = 0.01) -> None:
+    """Cameras within a millimetre of where they were, and points in pictures where the true lens shows them."""
+    poses = poses_of(source, flight)
+    if placed:
+        assert source.georef is not None
+        assert source.georef.origin is not None
+        there, true = ecef(centers_of(poses), source.georef.origin), ecef(flight.centers)
+        assert np.abs(there - true).max() < 1e-3
+        points = _known_points(flight, source.georef.origin)
+    else:
+        assert np.abs(centers_of(poses) - flight.centers).max() < 1e-3
+        points = flight.points
+    lenses = {view.name.rsplit("/", 1)[-1]: view.intrinsics for view in source.views}
+    for index, (name, pose) in enumerate(zip(flight.names, poses, strict=True)):
+        local = points @ pose[:3, :3].T + pose[:3, 3]
+        pixels, true_px = ray_pixels(lenses[name], local[:, :2] / local[:, 2:]), flight.pixels(index)
+        inside = flight.shows(index)
+        assert inside.sum() > 20
+        assert np.abs(pixels - true_px)[inside].max() < seen_px
+        if source.views[index].observations is not None:
+            seen = source.views[index].observations
+            shown = seen.points @ pose[:3, :3].T + pose[:3, 3]
+            assert np.abs(shown[:, :2] / shown[:, 2:] - seen.rays).max() < 1e-5
+
+
+def _known_points(flight: KnownFlight, origin: tuple[float, float, float]) -> np.ndarray:
+    from vdgs.geometry.geodesy import enu_from_geodetic
+
+    return enu_from_geodetic(geodetic_from_enu(flight.points, ORIGIN), origin)
+
+
+def test_opensfm_is_read_to_its_numbers(tmp_path: Path, flight: KnownFlight) -> None:
+    writers.write_opensfm(tmp_path, flight)
+    flight.write_photographs(tmp_path / "images")
+    source = read(tmp_path, "opensfm")
+    check_numbers(source, flight)
+    assert all(len(view.observations.points) > 20 for view in source.views if view.observations)
+    assert sum(view.observations is not None for view in source.views) == len(flight.names)
+    assert source.points.shape == flight.points.shape
+    assert (source.colors == flight.colors).all()
+
+
+def test_odm_project_is_read_in_metres_east_and_north(tmp_path: Path, flight: KnownFlight) -> None:
+    """ODM writes UTM over reconstruction.json, and keeps what OpenSfM had made of it beside that."""
+    project = tmp_path / "project"
+    file = writers.write_opensfm(project / "opensfm", flight)
+    file.rename(file.with_name("reconstruction.topocentric.json"))
+    _write_utm_reconstruction(project, file, flight)
+    flight.write_photographs(project / "images")
+    check_numbers(read(project, "opensfm"), flight)
+
+
+def test_odm_project_without_its_topocentric_reconstruction_is_read_in_utm(tmp_path: Path, flight: KnownFlight) -> None:
+    """The report tells that the reconstruction was moved."""
+    file = writers.write_opensfm(tmp_path / "opensfm", flight)
+    writers.write_odm_report(tmp_path, flight)
+    flight.write_photographs(tmp_path / "images")
+    _write_utm_reconstruction(tmp_path, file, flight)
+    source = read(tmp_path, "opensfm")
+    check_numbers(source, flight)
+    assert source.georef is not None
+    assert "UTM" in source.georef.method
+
+
+def test_undistorted_folder_of_odm_is_read_in_its_utm(tmp_path: Path, flight: KnownFlight) -> None:
+    flight = replace(flight, lens=BentLens(k=(0, 0, 0, 0), p=(0, 0)))
+    file = writers.write_opensfm(tmp_path / "opensfm", flight)
+    file.rename(file.with_name("reconstruction.topocentric.json"))
+    _write_utm_reconstruction(tmp_path, tmp_path / "opensfm" / "undistorted" / "reconstruction.json", flight)
+    flight.write_photographs(tmp_path / "opensfm" / "undistorted" / "images")
+    check_numbers(read(tmp_path / "opensfm" / "undistorted", "opensfm"), flight)
+
+
+def _write_utm_reconstruction(project: Path, file: Path, flight: KnownFlight) -> None:
+    code, poses, points, centers = writers.utm_flight(flight)
+    offset = np.append(np.floor(centers[:, :2].mean(axis=0)), 0.0)
+    moved = np.array(poses)
+    moved[:, :3, 3] += np.einsum("nij,j->ni", moved[:, :3, :3], offset)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    content = writers.opensfm_reconstruction(replace(flight, poses=moved, points=points - offset))
+    file.write_text(json.dumps([content]))
+    (project / "odm_georeferencing").mkdir()
+    (project / "odm_georeferencing" / "coords.txt").write_text(
+        f"WGS84 UTM {code[-2:]}S\n{offset[0]:.0f} {offset[1]:.0f}\n"
+    )
+
+
+def test_report_of_odm_is_read_where_its_reconstruction_is_gone(tmp_path: Path, flight: KnownFlight) -> None:
+    writers.write_odm_report(tmp_path, flight)
+    flight.write_photographs(tmp_path / "images")
+    check_numbers(read(tmp_path, "opensfm"), flight)
+    with pytest.raises(CaptureError, match="vdgs sfm"):
+        read_project(tmp_path, "opensfm", OPTIONS)
+    assert lacks_points(tmp_path / "odm_report" / "shots.geojson", OPTIONS)
+    check_numbers(read_poses(tmp_path / "odm_report" / "shots.geojson", OPTIONS), flight)
+    (tmp_path / "images").rename(tmp_path / "elsewhere")
+    with pytest.raises(CaptureError, match="none of its 12 photographs"):
+        lacks_points(tmp_path / "odm_report" / "shots.geojson", OPTIONS)
+
+
+def test_bundler_is_read_to_its_numbers(tmp_path: Path) -> None:
+    flight = known_flight(BentLens(center=(400.0, 300.0), k=(-0.11, 0.034, 0.0, 0.0), p=(0.0, 0.0)))
+    writers.write_bundler(tmp_path, flight)
+    flight.write_photographs(tmp_path / "images")
+    source = read(tmp_path, "bundler")
+    check_numbers(source, flight, placed=False)
+    assert (source.colors == flight.colors).all()
+    assert sum(view.observations is not None for view in source.views) == len(flight.names)
+
+
+@pytest.mark.parametrize(
+    "lens", [BentLens(), BentLens(k=(-0.11, 0.034, -0.008, 0.004)), BentLens(k=(0, 0, 0, 0), p=(0, 0))]
+)
+def test_table_of_realityscan_is_read_to_its_numbers(tmp_path: Path, lens: BentLens) -> None:
+    flight = known_flight(lens)
+    writers.write_realityscan_csv(tmp_path / "cameras.csv", flight)
+    flight.write_photographs(tmp_path / "images")
+    check_numbers(read(tmp_path, "realityscan"), flight, placed=False)
+
+
+def test_table_of_realityscan_in_degrees_is_placed(tmp_path: Path, flight: KnownFlight) -> None:
+    level = _turned_to_each_place(flight)
+    degrees = geodetic_from_enu(flight.centers, ORIGIN)[:, [1, 0, 2]]
+    writers.write_realityscan_csv(tmp_path / "cameras.csv", level, degrees)
+    flight.write_photographs(tmp_path / "images")
+    check_numbers(read(tmp_path, "realityscan"), flight)
+
+
+def _turned_to_each_place(flight: KnownFlight) -> KnownFlight:
+    """The flight with the rotation of each camera about the east, north and up of where it is."""
+    from vdgs.geometry.geodesy import enu_axes
+
+    poses = np.array(flight.poses)
+    for pose, (latitude, longitude, _) in zip(poses, geodetic_from_enu(flight.centers, ORIGIN), strict=True):
+        pose[:3, :3] = pose[:3, :3] @ enu_axes(*ORIGIN[:2]) @ enu_axes(latitude, longitude).T
+    return replace(flight, poses=poses)
+
+
+def test_semicolons_decimal_commas_and_other_names_of_columns_are_understood(
+    tmp_path: Path, flight: KnownFlight
+) -> None:
+    file = writers.write_realityscan_csv(tmp_path / "cameras.csv", flight)
+    lines = file.read_text().replace(",", ";").replace(".", ",").replace(",JPG", ".JPG").splitlines()
+    lines[0] = (
+        "#Name;Easting;Northing;Altitude;Yaw;Pitch;Roll;FocalLength35mm;PrincipalPointU;PrincipalPointV;k1;k2;k3;k4;t1;t2"
+    )
+    file.write_text("\ufeff#cameras 12\n" + "\r\n".join(lines), encoding="utf-8")
+    flight.write_photographs(tmp_path / "images")
+    check_numbers(read(tmp_path, "realityscan"), flight, placed=False)
+
+
+def test_xmp_of_photographs_that_are_called_alike_in_folders(tmp_path: Path, flight: KnownFlight) -> None:
+    images = tmp_path / "images"
+    halves = [replace(flight, poses=flight.poses[k::2], names=flight.names[:6]) for k in (0, 1)]
+    for number, half in enumerate(halves):
+        half.write_photographs(images / f"10{number}MEDIA")
+        writers.write_realityscan_xmp(images / f"10{number}MEDIA", half)
+    source = read(tmp_path, "realityscan")
+    poses = np.stack([view.camera_from_world for view in source.views])
+    assert np.abs(centers_of(poses) - np.concatenate([half.centers for half in halves])).max() < 1e-9
+
+
+@pytest.mark.parametrize("as_attributes", [False, True])
+def test_xmp_of_realityscan_is_read_to_its_numbers(tmp_path: Path, flight: KnownFlight, as_attributes: bool) -> None:
+    flight.write_photographs(tmp_path / "images")
+    writers.write_realityscan_xmp(tmp_path / "images", flight, as_attributes=as_attributes)
+    check_numbers(read(tmp_path, "realityscan"), flight, placed=False)
+
+
+def test_opf_is_read_to_its_numbers(tmp_path: Path, flight: KnownFlight) -> None:
+    writers.write_opf(tmp_path, flight)
+    flight.write_photographs(tmp_path / "images")
+    source = read(tmp_path, "opf")
+    check_numbers(source, flight)
+    assert source.georef is not None
+    assert source.georef.origin is not None
+    assert np.abs(source.points - _known_points(flight, source.georef.origin)).max() < 1e-3
+    assert (source.colors == flight.colors).all()
+
+
+def test_opf_of_a_site_is_metres_without_a_place(tmp_path: Path, flight: KnownFlight) -> None:
+    writers.write_opf(tmp_path, flight)
+    flight.write_photographs(tmp_path / "images")
+    frame = tmp_path / "scene-reference-frame.json"
+    content = json.loads(frame.read_text())
+    content["crs"]["definition"] = (
+        'ENGINEERINGCRS["Site",ENGINEERINGDATUM["Corner"],CS[Cartesian,3],LENGTHUNIT["metre",1.0]]'
+    )
+    frame.write_text(json.dumps(content))
+    source = read(tmp_path, "opf")
+    assert source.georef is not None
+    assert source.georef.origin is None
+    source = read_poses(tmp_path, CaptureOptions(format="opf"))
+    apart = np.linalg.norm(np.diff(centers_of(poses_of(source, flight)), axis=0), axis=1)
+    true = np.linalg.norm(np.diff(flight.centers, axis=0), axis=1)
+    assert np.abs(apart / true - 1).max() < 1e-3  # UTM's scale
+
+
+# ------------------------------------------------------------------------------- what people's files are like
+
+
+def test_biggest_of_several_reconstructions_is_read_and_the_others_named(tmp_path: Path, flight: KnownFlight) -> None:
+    parts = [writers.opensfm_reconstruction(flight, names) for names in (flight.names[:3], flight.names[3:])]
+    (tmp_path / "reconstruction.json").write_text(json.dumps(parts))
+    flight.write_photographs(tmp_path / "images")
+    source = read(tmp_path, "opensfm")
+    assert [view.name for view in source.views] == flight.names[3:]
+    assert any("2 reconstructions" in note and flight.names[0] in note for note in source.warnings)
+
+
+@pytest.mark.parametrize(
+    ("kind", "keys", "model"),
+    [
+        ("perspective", {"focal": 0.875, "k1": -0.1, "k2": 0.01}, "RADIAL"),
+        ("fisheye", {"focal": 0.875, "k1": -0.1, "k2": 0.01}, "RADIAL_FISHEYE"),
+        ("fisheye_opencv", {"focal_x": 0.875, "focal_y": 0.875, "c_x": 0.01, "k1": 0.1, "k4": 0.01}, "OPENCV_FISHEYE"),
+        ("radial", {"focal_x": 0.875, "focal_y": 0.9, "c_x": 0.01, "c_y": 0, "k1": 0.1, "k2": 0.01}, "OPENCV"),
+    ],
+)  # fmt: skip
+def test_projections_of_opensfm_become_the_models_that_are_the_same(
+    tmp_path: Path, flight: KnownFlight, kind: str, keys: dict[str, float], model: str
+) -> None:
+    content = writers.opensfm_reconstruction(flight)
+    [camera] = content["cameras"]
+    content["cameras"][camera] = {"projection_type": kind, "width": 800, "height": 600, **keys}
+    (tmp_path / "reconstruction.json").write_text(json.dumps([content]))
+    flight.write_photographs(tmp_path / "images")
+    lens = read(tmp_path, "opensfm").views[0].intrinsics
+    assert lens.model == model
+    assert lens.focal[0] == pytest.approx(700)
+    assert lens.principal_point[0] == pytest.approx(400 + 800 * keys.get("c_x", 0))
+
+
+def test_panoramas_are_named_and_refused(tmp_path: Path, flight: KnownFlight) -> None:
+    content = writers.opensfm_reconstruction(flight)
+    content["cameras"]["ball"] = {"projection_type": "spherical", "width": 800, "height": 400}
+    for name in flight.names[:2]:
+        content["shots"][name]["camera"] = "ball"
+    (tmp_path / "reconstruction.json").write_text(json.dumps([content]))
+    flight.write_photographs(tmp_path / "images")
+    source = read(tmp_path, "opensfm")
+    assert len(source.views) == len(flight.names) - 2
+    assert any("spherical" in note and flight.names[0] in note for note in source.warnings)
+    for shot in content["shots"].values():
+        shot["camera"] = "ball"
+    (tmp_path / "reconstruction.json").write_text(json.dumps([content]))
+    with pytest.raises(CaptureError, match="spherical"):
+        read(tmp_path, "opensfm")
+
+
+def test_photographs_that_bundler_did_not_place_are_named(tmp_path: Path, flight: KnownFlight) -> None:
+    file = writers.write_bundler(tmp_path, flight)
+    lines = file.read_text().splitlines()
+    lines[2:7] = ["0 0 0", "0 0 0", "0 0 0", "0 0 0", "0 0 0"]
+    file.write_text("\n".join(lines))
+    flight.write_photographs(tmp_path / "images")
+    source = read(tmp_path, "bundler")
+    assert len(source.views) == len(flight.names) - 1
+    assert any("not aligned" in note and flight.names[0] in note for note in source.warnings)
+
+
+def test_xmp_without_a_pose_and_of_other_lenses_is_named(tmp_path: Path, flight: KnownFlight) -> None:
+    images = tmp_path / "images"
+    flight.write_photographs(images)
+    writers.write_realityscan_xmp(images, flight)
+    first, second = ((images / name).with_suffix(".xmp") for name in flight.names[:2])
+    first.write_text(first.read_text().replace("xcr:Rotation", "xcr:Gravity"))
+    second.write_text(second.read_text().replace("brown4t2", "division"))
+    source = read(tmp_path, "realityscan")
+    assert len(source.views) == len(flight.names) - 2
+    [note] = [note for note in source.warnings if "left out" in note]
+    assert "not aligned" in note
+    assert "'division'" in note
+
+
+def test_focal_lengths_in_pixels_are_refused(tmp_path: Path, flight: KnownFlight) -> None:
+    file = writers.write_realityscan_csv(tmp_path / "cameras.csv", flight)
+    flight.write_photographs(tmp_path / "images")
+    file.write_text(file.read_text().replace(",31.5,", ",3656.4,"))
+    with pytest.raises(CaptureError, match="in pixels"):
+        read(tmp_path, "realityscan")
+
+
+def test_rows_that_cannot_be_read_are_told_all_at_once(tmp_path: Path, flight: KnownFlight) -> None:
+    file = writers.write_realityscan_csv(tmp_path / "cameras.csv", flight)
+    flight.write_photographs(tmp_path / "images")
+    lines = file.read_text().splitlines()
+    lines[2], lines[5] = lines[2].replace(",", ",x", 1), "short.jpg,1,2"
+    file.write_text("\n".join(lines))
+    with pytest.raises(CaptureError, match=r"2 of its rows(.|\n)*line 3(.|\n)*line 6"):
+        read(tmp_path, "realityscan")
+
+
+def test_list_of_bundler_must_name_every_camera(tmp_path: Path, flight: KnownFlight) -> None:
+    writers.write_bundler(tmp_path, flight)
+    flight.write_photographs(tmp_path / "images")
+    (tmp_path / "list.txt").write_text("only.jpg\n")
+    with pytest.raises(CaptureError, match=r"list\.txt names 1"):
+        read(tmp_path, "bundler")
+    (tmp_path / "list.txt").unlink()
+    with pytest.raises(CaptureError, match=r"no list\.txt"):
+        read(tmp_path, "bundler")
+
+
+def test_opf_without_calibration_and_with_missing_files_says_so(tmp_path: Path, flight: KnownFlight) -> None:
+    file = writers.write_opf(tmp_path, flight)
+    flight.write_photographs(tmp_path / "images")
+    content = json.loads(file.read_text())
+    (tmp_path / "point_cloud" / "positions.bin").write_bytes(b"short")
+    with pytest.raises(CaptureError, match=r"positions\.bin: has 5 bytes"):
+        read(tmp_path, "opf")
+    (tmp_path / "point_cloud" / "positions.bin").unlink()
+    with pytest.raises(CaptureError, match=r"positions\.bin"):
+        read(tmp_path, "opf")
+    content["items"] = [item for item in content["items"] if item["type"] != "calibration"]
+    file.write_text(json.dumps(content))
+    with pytest.raises(CaptureError, match="not calibrated"):
+        read(tmp_path, "opf")
+
+
+def _all_formats(root: Path, flight: KnownFlight) -> list[tuple[str, Path]]:
+    flight.write_photographs(root / "images")
+    writers.write_realityscan_xmp(root / "images", flight)
+    return [
+        ("opensfm", writers.write_opensfm(root, flight)), ("opensfm", writers.write_odm_report(root, flight)),
+        ("bundler", writers.write_bundler(root, flight)), ("opf", writers.write_opf(root, flight)),
+        ("opf", root / "calibrated-cameras.json"), ("opf", root / "scene-reference-frame.json"),
+        ("opf", root / "camera-list.json"), ("opf", root / "point_cloud" / "sparse.gltf"),
+        ("realityscan", writers.write_realityscan_csv(root / "cameras.csv", flight)),
+        ("realityscan", (root / "images" / flight.names[0]).with_suffix(".xmp")),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("number", range(10))
+def test_damaged_files_are_refused_by_name_or_read(tmp_path: Path, flight: KnownFlight, number: int) -> None:
+    """Cut off, overwritten and hostile files: a CaptureError, never anything else."""
+    name, file = _all_formats(tmp_path, flight)[number]
+    start = tmp_path / "project.opf" if name == "opf" else file
+    whole = file.read_bytes()
+    assert len(PROJECTS[name].read(start, OPTIONS).views) == len(flight.names)
+    rng = np.random.default_rng(number)
+    damaged = [whole[: int(share * len(whole))] for share in (0.0, 0.01, 0.3, 0.7, 0.97)]
+    for _ in range(12):
+        bad, at = bytearray(whole), rng.integers(0, len(whole), 4)
+        bad[int(at[0])] = int(rng.integers(0, 256))
+        bad[int(at[1]) : int(at[1]) + 8] = rng.choice([b"NaN", b"1e999", b"null", b"[[[[", b"-1", b"\xff\xfe", b"{}"])
+        damaged.append(bytes(bad))
+    damaged += [
+        whole.replace(b"[", b"[" * 3000, 1),
+        whole.replace(b"800", b"-5"),
+        whole.replace(b"600", b"99999999999"),
+    ]
+    refusals = list[str]()
+    for content in damaged:
+        file.write_bytes(content)
+        try:
+            views = PROJECTS[name].read(start, OPTIONS).views
+        except CaptureError as error:
+            refusals.append(str(error))
+            continue
+        assert all(np.isfinite(view.camera_from_world).all() for view in views)
+    assert len(refusals) >= 3
+    assert all(str(tmp_path) in refusal for refusal in refusals)
+
+
+def test_names_that_leave_the_folder_are_not_followed(tmp_path: Path, flight: KnownFlight) -> None:
+    file = writers.write_opf(tmp_path / "project", flight)
+    flight.write_photographs(tmp_path / "project" / "images")
+    (tmp_path / "secret.json").write_text("{}")
+    content = json.loads(file.read_text())
+    content["items"][0]["resources"][0]["uri"] = "../secret.json"
+    file.write_text(json.dumps(content))
+    with pytest.raises(CaptureError, match="not a path inside"):
+        read(tmp_path / "project", "opf")
+
+
+def test_capture_of_a_project_is_loaded_whole(tmp_path: Path, flight: KnownFlight) -> None:
+    """From the folder to cameras in metres over the ground, photographs undistorted."""
+    writers.write_opensfm(tmp_path, flight)
+    flight.write_photographs(tmp_path / "images")
+    capture = load_capture(tmp_path, OPTIONS)
+    assert capture.source == "opensfm"
+    assert capture.ground.metric
+    assert capture.ground.origin_geo is not None
+    assert len(capture.views) == len(flight.names)
+    assert {view.image_path.parent.name for view in capture.views} == {"images"}
+    assert all("undistorted" in view.image_path.parts for view in capture.views)

@@ -1,0 +1,155 @@
+"""Points of a project that has poses and lenses: photographs of a generated town, bent by a known lens."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from rich.console import Console
+
+from support import flights, project_writers
+from support.known_flight import BentLens, KnownFlight, centers_of, ecef
+from vdgs.captures.format_dispatch import lacks_points
+from vdgs.captures.formats.brown_lens import brown_intrinsics, unproject_pixels
+from vdgs.captures.formats.colmap import read_colmap
+from vdgs.captures.loading import load_capture
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.commands import RunRequest
+from vdgs.config.sfm_options import SfmRequest
+from vdgs.errors import CaptureError, VdgsError
+from vdgs.geometry.geodesy import ecef_from_geodetic, geodetic_from_enu
+from vdgs.geometry.ground_frame import GroundFrame
+from vdgs.pipeline.run_pipeline import reconstruct_if_needed
+from vdgs.sfm import feature_extraction, feature_matching
+from vdgs.sfm.posed_capture import make_posed_capture
+from vdgs.synth.ray_tracing import RayTracer
+from vdgs.synth.town import build_town
+
+LENS = BentLens(focal=340.0, center=(203.0, 148.0), k=(0.08, -0.02, 0.004, 0.003), p=(0.001, -0.0006), size=(400, 300))
+
+
+@pytest.fixture(scope="module")
+def town_flight(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, KnownFlight]:
+    """Photographs in a folder, bent, and the cameras that took them."""
+    root = tmp_path_factory.mktemp("bent")
+    flight = flights.fly(root / "straight", flights.grid(2, 4, 9.0))
+    lens = brown_intrinsics((340.0, 340.0), LENS.center, LENS.size, LENS.k, LENS.p)
+    x, y = np.meshgrid(np.arange(400) + 0.5, np.arange(300) + 0.5)
+    rays = unproject_pixels(lens, np.stack([x.ravel(), y.ravel()], axis=1))
+    grid = (rays * 340.0 + [200.0, 150.0] - 0.5).reshape(300, 400, 2).astype(np.float32)
+    (root / "images").mkdir()
+    for name in flight.names:
+        pixels = np.asarray(Image.open(flight.folder / name))
+        bent = cv2.remap(pixels, grid[..., 0], grid[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        Image.fromarray(bent).save(root / "images" / name, "JPEG", quality=95, subsampling=0)
+    poses = np.stack([camera.camera_from_world for camera in flight.cameras])
+    return root, KnownFlight(flight.names, poses, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), LENS)
+
+
+def ask(root: Path, output: Path, **changes: object) -> str:
+    told = io.StringIO()
+    request = SfmRequest(image_folders=(root,), output=output, threads=2, **changes)  # type: ignore[arg-type]
+    make_posed_capture(request, CaptureOptions(), Console(file=told, width=200))
+    return told.getvalue()
+
+
+def _from_ground(ground: GroundFrame) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda points: (points - ground.translation) @ ground.rotation / ground.scale
+
+
+def test_points_lie_on_the_ground_and_poses_stay(town_flight: tuple[Path, KnownFlight], tmp_path: Path) -> None:
+    root, flight = town_flight
+    file = project_writers.write_realityscan_csv(root / "cameras.csv", flight)
+    lines = file.read_text().splitlines()  # as by default, every photograph has a lens of its own
+    own = [line.replace(",30.6,", f",{30.6 + k * 1e-4},") for k, line in enumerate(lines[1:])]
+    file.write_text("\n".join([lines[0], *own]))
+    assert lacks_points(root, CaptureOptions())
+    told = ask(root, tmp_path / "capture")
+    assert "mean reprojection error" in told
+    capture = load_capture(tmp_path / "capture", CaptureOptions(up="z"))
+    to_world = _from_ground(capture.ground)
+    centers = to_world(np.stack([view.camera.position for view in capture.views]))
+    assert np.abs(centers - centers_of(flight.poses)).max() < 1e-6
+    tracer, points = RayTracer(build_town(3, 60.0).mesh), to_world(capture.points)
+    middle = centers.mean(axis=0)
+    away = (points - middle).astype(np.float32)
+    hit = tracer.intersect(np.broadcast_to(middle.astype(np.float32), away.shape).copy(), away)
+    off = np.abs(hit.distance - 1) * np.linalg.norm(away, axis=1)
+    assert len(points) > 500
+    assert np.median(off) < 0.1
+    errors = [view.observations.reprojection_errors_px(view.camera) for view in capture.views]  # type: ignore[union-attr]
+    assert np.median(np.concatenate(errors)) < 0.7
+    assert len(read_colmap(tmp_path / "capture" / "sparse" / "0").views) == 8
+    assert len({view.intrinsics for view in read_colmap(tmp_path / "capture" / "sparse" / "0").views}) == 8
+    assert len(np.unique(capture.point_colors, axis=0)) > 100
+    assert "nothing to do" in ask(root, tmp_path / "capture")
+
+
+def test_report_of_odm_becomes_a_capture_that_has_its_place(
+    town_flight: tuple[Path, KnownFlight], tmp_path: Path
+) -> None:
+    """Stopped within the matches, the same command goes on with the features that there are."""
+    root, flight = _some_photographs(town_flight, tmp_path)
+    project_writers.write_odm_report(root, flight)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(feature_matching, "match_chunk", _stop)
+        with pytest.raises(KeyboardInterrupt):
+            ask(root, tmp_path / "capture")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(feature_extraction, "_extract", _stop)
+        ask(root, tmp_path / "capture")
+    capture = load_capture(tmp_path / "capture")
+    assert capture.ground.origin_geo is not None
+    assert "UTM" in capture.ground.method
+    assert json.loads((tmp_path / "capture" / "georef.json").read_text())["method"].startswith("ODM")
+    places = geodetic_from_enu(
+        np.stack([view.camera.position for view in capture.views]),
+        capture.ground.origin_geo,
+        capture.ground.axes_origin,
+    )
+    assert np.abs(ecef_from_geodetic(places) - ecef(flight.centers)).max() < 1e-3
+    (root / "images" / flight.names[0]).touch()
+    with pytest.raises(VdgsError, match="--overwrite"):
+        ask(root, tmp_path / "capture")
+
+
+def test_run_of_a_project_without_points_finds_them_first(
+    town_flight: tuple[Path, KnownFlight], tmp_path: Path
+) -> None:
+    """The run goes on with the capture in its own folder; asked again, the capture is there."""
+    root, flight = _some_photographs(town_flight, tmp_path)
+    project_writers.write_realityscan_xmp(root / "images", flight)
+    request = RunRequest(capture=root, output=tmp_path / "run", threads=2)
+    for _ in range(2):
+        found = reconstruct_if_needed(request, Console(file=io.StringIO()))
+        assert found.capture == tmp_path / "run" / "capture"
+    assert len(load_capture(found.capture, found.options).views) == 5
+
+
+def _some_photographs(town_flight: tuple[Path, KnownFlight], tmp_path: Path) -> tuple[Path, KnownFlight]:
+    """The first five photographs in a folder of their own."""
+    root, flight = town_flight
+    names = flight.names[:5]
+    (tmp_path / "project" / "images").mkdir(parents=True)
+    for name in names:
+        shutil.copy(root / "images" / name, tmp_path / "project" / "images" / name)
+    return tmp_path / "project", replace(flight, names=names, poses=flight.poses[:5])
+
+
+def _stop(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
+def test_photographs_of_other_poses_are_refused(town_flight: tuple[Path, KnownFlight], tmp_path: Path) -> None:
+    root, flight = _some_photographs(town_flight, tmp_path)
+    project_writers.write_realityscan_csv(root / "cameras.csv", replace(flight, names=flight.names[::-1]))
+    with pytest.raises(CaptureError, match="agree with the poses"):
+        ask(root, tmp_path / "capture")

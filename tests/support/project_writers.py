@@ -1,0 +1,231 @@
+"""A known flight in the files of other programs, each after the program's own description."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from support.known_flight import ORIGIN, KnownFlight
+from vdgs.geometry.crs import open_crs, utm_epsg
+from vdgs.geometry.geodesy import geodetic_from_enu
+
+
+def rotation_vector(rotation: np.ndarray) -> list[float]:
+    """The axis of a rotation times its angle in radians."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(rotation).as_rotvec().tolist()
+
+
+def opensfm_camera(flight: KnownFlight) -> dict[str, Any]:
+    lens, (width, height), longer = flight.lens, flight.lens.size, max(flight.lens.size)
+    k1, k2, k3, _ = lens.k
+    return {
+        "projection_type": "brown", "width": width, "height": height,
+        "focal_x": lens.focal / longer, "focal_y": lens.focal * lens.aspect / longer,
+        "c_x": (lens.center[0] - width / 2) / longer, "c_y": (lens.center[1] - height / 2) / longer,
+        "k1": k1, "k2": k2, "k3": k3, "p1": lens.p[0], "p2": lens.p[1],
+    }  # fmt: skip
+
+
+def opensfm_reconstruction(flight: KnownFlight, names: list[str] | None = None) -> dict[str, Any]:
+    """A reconstruction as OpenSfM's io.py writes it."""
+    camera = "v2 dji fc6310r 800 600 brown 0.6666"
+    shots = {
+        name: {"rotation": rotation_vector(pose[:3, :3]), "translation": pose[:3, 3].tolist(), "camera": camera,
+               "orientation": 1, "capture_time": 0.0, "gps_dop": 5.0, "scale": 1.0, "covariance": [], "merge_cc": 0}
+        for name, pose in zip(flight.names, flight.poses, strict=True) if names is None or name in names
+    }  # fmt: skip
+    points = {
+        str(k): {"color": [float(c) for c in color], "coordinates": point.tolist()}
+        for k, (point, color) in enumerate(zip(flight.points, flight.colors, strict=True))
+    }
+    return {"cameras": {camera: opensfm_camera(flight)}, "shots": shots, "points": points}
+
+
+def write_opensfm(folder: Path, flight: KnownFlight) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "reconstruction.json").write_text(json.dumps([opensfm_reconstruction(flight)]))
+    (folder / "reference_lla.json").write_text(
+        json.dumps(dict(zip(("latitude", "longitude", "altitude"), ORIGIN, strict=True)))
+    )
+    write_tracks(folder / "tracks.csv", flight)
+    return folder / "reconstruction.json"
+
+
+def write_tracks(file: Path, flight: KnownFlight) -> None:
+    """Which photograph shows which point, and where: shares of the longer side from the middle."""
+    size, lines = np.array(flight.lens.size), ["OPENSFM_TRACKS_VERSION_v2"]
+    for index, name in enumerate(flight.names):
+        pixels = flight.pixels(index)
+        for k in np.flatnonzero(flight.shows(index)):
+            x, y = ((pixels[k] - size / 2) / size.max()).tolist()
+            lines.append(f"{name}\t{k}\t{k}\t{x!r}\t{y!r}\t0.004\t9\t9\t9\t-1\t-1")
+    file.write_text("\n".join(lines) + "\n")
+
+
+def utm_flight(flight: KnownFlight) -> tuple[str, np.ndarray, np.ndarray, np.ndarray]:
+    """The zone of UTM; poses and points of the flight in it. Cameras turn with the grid where they are."""
+    code = utm_epsg(*ORIGIN[:2])
+    crs = open_crs(code, ORIGIN)
+
+    def to_utm(enu: np.ndarray) -> np.ndarray:
+        return crs.from_geodetic(geodetic_from_enu(enu, ORIGIN))
+
+    poses = []
+    for pose, center in zip(flight.poses, flight.centers, strict=True):
+        ends = [to_utm((center + step)[None])[0] - to_utm((center - step)[None])[0] for step in 5 * np.eye(3)]
+        slope = np.stack(ends, axis=1)
+        left, _, right = np.linalg.svd(slope / np.linalg.norm(slope, axis=0))
+        moved = np.eye(4)
+        moved[:3, :3] = pose[:3, :3] @ (left @ right).T
+        moved[:3, 3] = -moved[:3, :3] @ to_utm(center[None])[0]
+        poses.append(moved)
+    return code, np.array(poses), to_utm(flight.points), np.array([to_utm(each[None])[0] for each in flight.centers])
+
+
+def write_odm_report(project: Path, flight: KnownFlight) -> Path:
+    """odm_report/shots.geojson and cameras.json as ODM writes them: the translation is the place of the camera."""
+    _, poses, _, centers = utm_flight(flight)
+    width, height = flight.lens.size
+    geodetic = geodetic_from_enu(flight.centers, ORIGIN)
+    features = [
+        {"type": "Feature",
+         "properties": {"filename": name, "focal": flight.lens.focal / max(flight.lens.size), "width": width,
+                        "height": height, "translation": center.tolist(),
+                        "rotation": rotation_vector(pose[:3, :3])},
+         "geometry": {"type": "Point", "coordinates": [lon, lat, up]}}
+        for name, pose, center, (lat, lon, up) in zip(flight.names, poses, centers, geodetic, strict=True)
+    ]  # fmt: skip
+    (project / "odm_report").mkdir(parents=True, exist_ok=True)
+    (project / "cameras.json").write_text(json.dumps({"v2 dji fc6310r": opensfm_camera(flight)}))
+    file = project / "odm_report" / "shots.geojson"
+    file.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    return file
+
+
+def write_bundler(folder: Path, flight: KnownFlight, header: str = "# Bundle file v0.3") -> Path:
+    """bundle.out and list.txt as Bundler's manual has them; of the lens only focal length, k1 and k2."""
+    folder.mkdir(parents=True, exist_ok=True)
+    turn = np.diag([1.0, -1.0, -1.0])
+    lens, lines = flight.lens, [header, f"{len(flight.names)} {len(flight.points)}"]
+    for pose in flight.poses:
+        lines.append(f"{lens.focal!r} {lens.k[0]!r} {lens.k[1]!r}")
+        lines += [" ".join(map(repr, row.tolist())) for row in (*(turn @ pose[:3, :3]), turn @ pose[:3, 3])]
+    pixels = [flight.pixels(k) for k in range(len(flight.names))]
+    shown = [flight.shows(k) for k in range(len(flight.names))]
+    half = np.array(lens.size) / 2
+    for k, (point, color) in enumerate(zip(flight.points, flight.colors, strict=True)):
+        seen = [c for c in range(len(pixels)) if shown[c][k]]
+        sights = [f"{c} {k} {float(pixels[c][k][0] - half[0])!r} {float(half[1] - pixels[c][k][1])!r}" for c in seen]
+        lines += [" ".join(map(repr, point.tolist())), " ".join(map(str, color)), " ".join([str(len(seen)), *sights])]
+    (folder / "bundle.out").write_text("\n".join(lines) + "\n")
+    (folder / "list.txt").write_text("".join(f"images/{name}\n" for name in flight.names))
+    return folder / "bundle.out"
+
+
+def realityscan_lens(flight: KnownFlight) -> dict[str, float]:
+    lens, (width, height), longer = flight.lens, flight.lens.size, max(flight.lens.size)
+    names = dict(zip(("k1", "k2", "k3", "k4"), lens.k, strict=True))
+    return {"f": 36 * lens.focal / longer, "px": (lens.center[0] - width / 2) / longer,
+            "py": (lens.center[1] - height / 2) / longer, **names, "t1": lens.p[1], "t2": lens.p[0]}  # fmt: skip
+
+
+def heading_pitch_roll(pose: np.ndarray) -> tuple[float, float, float]:
+    """Of the rotation world from camera (right, up, back) Rz(-heading) Rx(pitch) Ry(roll)."""
+    from scipy.spatial.transform import Rotation
+
+    turn = (np.diag([1.0, -1.0, -1.0]) @ pose[:3, :3]).T
+    minus_heading, pitch, roll = Rotation.from_matrix(turn).as_euler("ZXY", degrees=True)
+    return -minus_heading, pitch, roll
+
+
+def write_realityscan_csv(file: Path, flight: KnownFlight, centers: np.ndarray | None = None) -> Path:
+    lens = realityscan_lens(flight)
+    lines = ["#name,x,y,alt,heading,pitch,roll," + ",".join(lens)]
+    for name, pose, center in zip(
+        flight.names, flight.poses, flight.centers if centers is None else centers, strict=True
+    ):
+        lines.append(
+            ",".join([name, *map(repr, (*center.tolist(), *map(float, heading_pitch_roll(pose)), *lens.values()))])
+        )
+    file.write_text("\n".join(lines) + "\n")
+    return file
+
+
+def write_realityscan_xmp(folder: Path, flight: KnownFlight, *, as_attributes: bool = False) -> None:
+    lens = realityscan_lens(flight)
+    bent = " ".join(repr(lens[key]) for key in ("k1", "k2", "k3", "k4", "t1", "t2"))
+    for name, pose, center in zip(flight.names, flight.poses, flight.centers, strict=True):
+        said = {"Rotation": " ".join(map(repr, pose[:3, :3].ravel().tolist())),
+                "Position": " ".join(map(repr, center.tolist())), "DistortionCoeficients": bent}  # fmt: skip
+        inside = "" if as_attributes else "".join(f"<xcr:{key}>{value}</xcr:{key}>" for key, value in said.items())
+        around = "".join(f' xcr:{key}="{value}"' for key, value in said.items()) if as_attributes else ""
+        (folder / name).with_suffix(".xmp").write_text(
+            '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+            '<rdf:Description xcr:Version="3" xcr:PosePrior="locked" xcr:Coordinates="absolute" '
+            f'xcr:DistortionModel="brown4t2" xcr:FocalLength35mm="{lens["f"]!r}" xcr:Skew="0" xcr:AspectRatio="1" '
+            f'xcr:PrincipalPointU="{lens["px"]!r}" xcr:PrincipalPointV="{lens["py"]!r}"{around} '
+            f'xmlns:xcr="http://www.capturingreality.com/ns/xcr/1.1#">{inside}</rdf:Description></rdf:RDF></x:xmpmeta>'
+        )
+
+
+def write_opf(folder: Path, flight: KnownFlight) -> Path:
+    """project.opf and its files, after the examples of the specification (1.0)."""
+    from scipy.spatial.transform import Rotation
+
+    code, poses, points, centers = utm_flight(flight)
+    shift = -np.round(centers.mean(axis=0))
+    lens = flight.lens
+    (folder / "point_cloud").mkdir(parents=True, exist_ok=True)
+    ids = [10**12 + k for k in range(len(flight.names))]
+    turns = [Rotation.from_matrix((np.diag([1.0, -1.0, -1.0]) @ pose[:3, :3]).T) for pose in poses]
+    cameras = [
+        {"id": number, "sensor_id": 77, "position": (center + shift).tolist(),
+         "orientation_deg": turn.as_euler("XYZ", degrees=True).tolist()}
+        for number, turn, center in zip(ids, turns, centers, strict=True)
+    ]  # fmt: skip
+    internals = {"type": "perspective", "principal_point_px": list(lens.center), "focal_length_px": lens.focal,
+                 "radial_distortion": list(lens.k[:3]), "tangential_distortion": list(lens.p)}  # fmt: skip
+    listed = [{"id": i, "uri": f"file:///c:/data/images/{name}"} for i, name in zip(ids, flight.names, strict=True)]
+    sensor = {"id": 77, "name": "DJI", "image_size_px": list(lens.size), "internals": internals}
+    change = {"shift": shift.tolist(), "scale": [1.0, 1.0, 1.0], "swap_xy": False}
+    documents: dict[str, tuple[str, dict[str, Any]]] = {
+        "camera-list": ("camera_list", {"cameras": listed}),
+        "input-cameras": ("input_cameras", {"sensors": [sensor], "captures": []}),
+        "scene-reference-frame": (
+            "scene_reference_frame", {"crs": {"definition": code}, "base_to_canonical": change}),
+        "calibrated-cameras": ("calibration", {"sensors": [{"id": 77, "internals": internals}], "cameras": cameras}),
+    }  # fmt: skip
+    items: list[dict[str, Any]] = []
+    for name, (kind, content) in documents.items():
+        form = f"application/opf-{name}+json"
+        (folder / f"{name}.json").write_text(json.dumps({"format": form, "version": "1.0", **content}))
+        items.append({"id": kind, "type": kind, "resources": [{"uri": f"{name}.json", "format": form}], "sources": []})
+    items[-1]["resources"].append({"uri": "point_cloud/sparse.gltf", "format": "model/gltf+json"})
+    _write_gltf(folder / "point_cloud", points + shift, flight.colors)
+    project = {"format": "application/opf-project+json", "version": "1.0", "id": "1", "name": "flight",
+               "description": "", "generator": {"name": "PIX4Dmatic", "version": "1.41.0"}, "items": items}  # fmt: skip
+    (folder / "project.opf").write_text(json.dumps(project))
+    return folder / "project.opf"
+
+
+def _write_gltf(folder: Path, points: np.ndarray, colors: np.ndarray) -> None:
+    (folder / "positions.bin").write_bytes(points.astype("<f4").tobytes())
+    (folder / "colors.bin").write_bytes(b"".join(struct.pack("4B", *color, 255) for color in colors.tolist()))
+    n = len(points)
+    accessors = [{"bufferView": 0, "componentType": 5126, "count": n, "type": "VEC3"},
+                 {"bufferView": 1, "componentType": 5121, "normalized": True, "count": n, "type": "VEC4"}]  # fmt: skip
+    content = {
+        "asset": {"version": "2.0", "extensions": {"OPF_asset_version": {"version": "1.0"}}},
+        "scene": 0, "scenes": [{"nodes": [0]}], "accessors": accessors,
+        "bufferViews": [{"buffer": 0, "byteLength": 12 * n}, {"buffer": 1, "byteLength": 4 * n}],
+        "buffers": [{"byteLength": 12 * n, "uri": "positions.bin"}, {"byteLength": 4 * n, "uri": "colors.bin"}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "COLOR_0": 1}, "mode": 0}]}],
+        "nodes": [{"mesh": 0, "matrix": [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1]}],
+    }  # fmt: skip
+    (folder / "sparse.gltf").write_text(json.dumps(content))
