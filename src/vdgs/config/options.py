@@ -76,10 +76,13 @@ class Option:
 
     def summary(self, width: int) -> str:
         """The first sentence of its help, or as many clauses of it as fit into a width, if one does; with the values
-        to choose from."""
+        to choose from, as many as two lines hold."""
         first = self.help.split(". ")[0].rstrip(".")
         if choices := _choices(without_notes(self.hint)):
-            return f"{re.split('[:;]', first)[0]}: {', '.join(choices)}"
+            head, shown = re.split("[:;]", first)[0], len(choices)
+            while shown > 1 and len(f"{head}: {', '.join(choices[:shown])}, ...") > 2 * width:
+                shown -= 1
+            return f"{head}: {', '.join((*choices[:shown], *(['...'] if shown < len(choices) else [])))}"
         if len(first) <= width:
             return first
         # A clause ends neither within a list or brackets nor before what a value means, as in "; 0: all".
