@@ -1,12 +1,14 @@
 """Where the time of one whole training step goes: cull, decode, rasterize, loss, its way back to the
 splats, from them to anchors that move, statistics.
 
-    python -m experiments.microbench.step [--threads 2] [--visible 20000] [--own 0.125]
+    python -m experiments.microbench.step [--threads 2] [--visible 20000] [--own 0.125] [--run RUN]
 
 A random anchor scene seen from above, in which all anchors are visible, with about half of the opacities positive
 (what a fresh decoder gives). Prints the median of each phase. With `--own` it is the step of a block: this share of
 the anchors, to the left, is trained, the others are drawn and never move (all of the view, of which training draws what
-the block's splats reach). Memory is the slope of the peak resident size of fresh processes over the number of anchors:
+the block's splats reach). With `--run` it is the step of a trained run, by processor time, over nine of its training
+photographs, with the counts of the rasterizer: a trained scene has about twice the pairs of splat and pixel of a
+random one. Memory is the slope of the peak resident size of fresh processes over the number of anchors:
 of those in view, with all that a step makes of them, and of those out of view; and for a model half in view the whole
 process without what it imports. Saving is what it adds to the resident size.
 """
@@ -30,13 +32,17 @@ import numpy as np
 import torch
 
 from experiments.microbench.hardware_info import describe
+from vdgs.captures.image_cache import ImageCache
 from vdgs.config.method import TrainConfig
 from vdgs.geometry.camera import Camera
 from vdgs.kernels import get_backend, set_num_threads
+from vdgs.kernels.cpu.extension import get_extension
 from vdgs.kernels.kernel_types import OrderedSplats
+from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.model.renderer import cull_anchors, decode_anchors_for_training
+from vdgs.model.renderer import cull_anchors, decode_anchors_for_training, decode_view
+from vdgs.runs.open_run import open_run
 from vdgs.system.checkpoints import save_checkpoint
 from vdgs.system.memory.process_memory import peak_memory_bytes, reset_peak_memory
 from vdgs.training import FrozenAnchors, TrainingProblem, initial_state, to_checkpoint
@@ -73,26 +79,28 @@ def scene(visible: int, width: int, height: int, hidden: int = 0) -> tuple[Ancho
 
 
 def timed_phase(
-    times: dict[str, list[float]], phase: str, work: Callable[[], Any], synchronize: Callable[[], None] | None
-) -> Any:
-    begin = time.perf_counter()
+    times: dict[str, list[float]], phase: str, work: Callable[[], Any], synchronize: Callable[[], None] | None,
+    clock: Callable[[], float] = time.perf_counter,
+) -> Any:  # fmt: skip
+    begin = clock()
     result = work()
     if synchronize is not None:
         synchronize()
-    times[phase].append(1e3 * (time.perf_counter() - begin))
+    times[phase].append(1e3 * (clock() - begin))
     return result
 
 
 def one_step(
     state: Any, camera: Camera, target: torch.Tensor, step: int, times: dict[str, list[float]],
     synchronize: Callable[[], None] | None = None, surroundings: FrozenAnchors | None = None,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> tuple[int, int]:  # fmt: skip
     """The work of vdgs.training.training_step, phase by phase, where the anchors are; `synchronize` waits for it."""
     device = state.anchors.positions.device
     kernels, rates = get_backend(device), learning_rates_at(TrainConfig().lr, 0.1)
 
     def timed(phase: str, work: Callable[[], Any]) -> Any:
-        return timed_phase(times, phase, work, synchronize)
+        return timed_phase(times, phase, work, synchronize, clock)
 
     weights = state.decoder.weights_for_image(0)
     with torch.no_grad():
@@ -174,6 +182,38 @@ def measure(visible: int, width: int, height: int, repeats: int, own: float) -> 
     print(f"{width}x{height}  {seen} visible anchors, {splats} splats: {total:.1f} ms a step   ({parts})", flush=True)
 
 
+def measure_run(path: Path, repeats: int) -> None:
+    """Median processor time of each phase of a step that continues the coarse model of a run."""
+    opened = open_run(path, "coarse")
+    views = opened.capture.train_views
+    chosen = sorted({round(i) for i in np.linspace(0, len(views) - 1, 9)})
+    with ImageCache([views[i] for i in chosen], 1 << 30, downscales=(1,)) as images:
+        problem = TrainingProblem(
+            config=TrainConfig(), images=images, num_images=len(chosen), voxel_size=1.0, camera_height=1.0
+        )
+        state = initial_state(opened.model.anchors, opened.model.decoder.copy(), problem)
+        times: dict[str, list[float]] = {phase: [] for phase in PHASES}
+        for step in range(1, repeats * len(chosen) + 1):
+            camera, (target, _) = images.camera(step % len(chosen)), images.get(step % len(chosen))
+            one_step(state, camera, target, step, times, clock=time.process_time)
+    print(f"{path}: {len(opened.model.anchors):,} anchors, {views[0].camera.width}x{views[0].camera.height}")
+    print("  ".join(f"{phase} {stats.median(values):.1f}" for phase, values in times.items()), "ms of processor time")
+    for i in chosen[:: len(chosen) // 2]:
+        print_counts(opened.model, views[i].camera)
+
+
+def print_counts(model: AnchorModel, camera: Camera) -> None:
+    """What the rasterizer does with one view."""
+    rows, splats = decode_view(model, camera)
+    image, alpha = torch.empty(camera.height, camera.width, 3), torch.empty(camera.height, camera.width)
+    counts = get_extension().rasterize_forward(
+        *(t.contiguous().numpy() for t in splats.tensors), (0.0, 0.0, 0.0), camera.width, camera.height,
+        image.numpy(), alpha.numpy(), None, None, True,
+    ).statistics  # fmt: skip
+    pairs = counts["pairs"] / (camera.width * camera.height)
+    print(f"  a view: {len(rows):,} anchors, {counts}, {pairs:.1f} pairs a pixel, alpha {float(alpha.mean()):.4f}")
+
+
 def peaks(visible: int, hidden: int) -> tuple[int, int, int]:
     """Bytes of a fresh process: once all is imported, at most during three steps, and what saving adds after them."""
     args = [sys.executable, "-m", "experiments.microbench.step", "--peak", str(visible), str(hidden)]
@@ -210,6 +250,7 @@ def main() -> None:
     parser.add_argument("--visible", type=int, default=20_000)
     parser.add_argument("--own", type=float, default=1.0)
     parser.add_argument("--repeats", type=int, default=15)
+    parser.add_argument("--run", type=Path)
     parser.add_argument("--peak", type=int, nargs=2, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.peak:
@@ -217,6 +258,9 @@ def main() -> None:
         return
     set_num_threads(arguments.threads)
     print(describe())
+    if arguments.run:
+        measure_run(arguments.run, arguments.repeats)
+        return
     for width, height in ((400, 300), (800, 600)):
         measure(arguments.visible, width, height, arguments.repeats, arguments.own)
     if arguments.own == 1:
