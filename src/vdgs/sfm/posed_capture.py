@@ -368,7 +368,7 @@ def _write(
 def color_points(
     model: pycolmap.Reconstruction, output: Path, lenses: Mapping[int, Intrinsics], lens_of: Mapping[str, int]
 ) -> None:
-    """Each point gets the mean colour of where written photographs (the smallest of them) show it."""
+    """Each point gets the mean color of where written photographs (the smallest of them) show it."""
     folder, factor = capture_writer.IMAGE_SIZES[-1]
     numbers = np.array(sorted(model.points3D), dtype=np.uint64)
     sums = np.zeros((len(numbers), 4))

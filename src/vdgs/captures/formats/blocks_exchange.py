@@ -1,6 +1,6 @@
 """BlocksExchange XML, by which ContextCapture (iTwin Capture) and DJI Terra hand on aligned photographs.
 
-Bentley's description is followed: pixels count from the centre of the first one; rotations lead from the world to the
+Bentley's description is followed: pixels count from the center of the first one; rotations lead from the world to the
 camera's axes, which CameraOrientation names; P1 and P2 are OpenCV's p2 and p1; the second focal length is the first
 times AspectRatio; poses and points are in the coordinate system of the block, x east or longitude.
 """
@@ -151,7 +151,7 @@ class _Block:
         except CaptureError as error:
             self._problems[str(error).removeprefix(f"{self._file}: ")] = None
             return
-        center = self._place(photo.find("Pose/Center"), f"the centre of {name}")
+        center = self._place(photo.find("Pose/Center"), f"the center of {name}")
         pose = to_rigid(np.column_stack([rotation, np.zeros(3)]), self._file, name)
         pose[:3, 3] = -pose[:3, :3] @ center
         self._photos[number] = _Photo(name, intrinsics, pose)
@@ -305,7 +305,7 @@ def _path(photo: Element) -> str:
 
 
 def _is_posed(photo: Element) -> bool:
-    """Whether a photograph is oriented: in the main component, with a rotation and a centre that are no guesses."""
+    """Whether a photograph is oriented: in the main component, with a rotation and a center that are no guesses."""
     if (photo.findtext("Component") or "1").strip() != "1":
         return False
     rotation, center = photo.find("Pose/Rotation"), photo.find("Pose/Center")

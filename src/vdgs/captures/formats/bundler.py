@@ -145,7 +145,7 @@ def _cameras(rows: np.ndarray, file: Path) -> tuple[BundlerCamera, ...]:
 
 
 def _points(numbers: np.ndarray, start: int, count: int, file: Path) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Places and colours [n, 6], and the numbers of each point's sightings."""
+    """Places and colors [n, 6], and the numbers of each point's sightings."""
     points, lists = np.zeros((count, _POINT_NUMBERS)), []
     for index in range(count):
         points[index] = numbers[start : start + _POINT_NUMBERS]

@@ -19,7 +19,7 @@ _Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 def read_gltf_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Points [n, 3] float64 and colours [n, 3] uint8 of all nodes. Raises `CaptureError` for damaged files and buffers
+    """Points [n, 3] float64 and colors [n, 3] uint8 of all nodes. Raises `CaptureError` for damaged files and buffers
     that are missing."""
     content = read_capture_json(file)
     places, colors = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)]

@@ -203,7 +203,7 @@ def _views(
 
 
 def _points(reconstruction: JsonObject, file: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Points [n, 3] float64 and colours [n, 3] uint8; none where the file has none."""
+    """Points [n, 3] float64 and colors [n, 3] uint8; none where the file has none."""
     listed: Any = reconstruction.get("points") or {}
     try:
         points = np.array([each["coordinates"] for each in listed.values()], dtype=np.float64).reshape(-1, 3)

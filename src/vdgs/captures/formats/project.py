@@ -59,7 +59,7 @@ class ProjectView:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Project:
-    """A project as its file has it; points [n, 3] float64 and colours [n, 3] uint8, none of either where it has none.
+    """A project as its file has it; points [n, 3] float64 and colors [n, 3] uint8, none of either where it has none.
 
     Its coordinates are those of a system that `to_geodetic` knows, with rotations about the axes of the system where
     the camera is, or metres with z up (`is_metric`), or nothing that is known.
@@ -191,7 +191,7 @@ def _world_of(project: Project) -> _World:
 def _cloud_beside(
     project: Project, root: Path, poses: Sequence[np.ndarray], world: _World
 ) -> tuple[np.ndarray, np.ndarray, str]:
-    """Points and colours of a PLY beside a project that its cameras see, in the world, and a note about it."""
+    """Points and colors of a PLY beside a project that its cameras see, in the world, and a note about it."""
     cloud = find_point_cloud(root, project.file.parent, lone=True)
     if cloud is None:
         raise NoTiePoints(
