@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from vdgs.system import lazy_pycolmap
 from vdgs.system.exit_codes import REMOVABLE_PACKAGES, exit_code_of
 
 IMPORT_ALL = """

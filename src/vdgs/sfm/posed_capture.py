@@ -38,7 +38,7 @@ from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.reconstruct import check_nothing_trained, writing
 from vdgs.sfm.workspace import Workspace, cache_key, call_cancellable, report_progress, silence_colmap
 from vdgs.system.atomic_files import write_json
-from vdgs.system.colmap import pycolmap
+from vdgs.system.lazy_pycolmap import pycolmap
 
 #: The steps of the work, and the folder of the features as the photographs show them.
 FEATURES, MATCHES, POINTS, CAPTURE, BENT = "features", "matches", "points", "capture", "bent"
