@@ -278,6 +278,7 @@ def frame(pose: np.ndarray, path: str = "images/frame_000.png") -> dict:
         ({"camera_model": "OPENCV_FISHEYE"}, "lens distortion"),
         ({"camera_model": "EQUIRECTANGULAR"}, "not supported"),
         ({"camera_model": "FISHEYE624"}, "'FISHEYE624' is not supported; undistort"),
+        ({"fl_x": None, "fl_y": None, "camera_angle_x": 61.0}, "camera_angle_x 61 must be radians"),
         ({"camera_model": "THIN_PRISM_FISHEYE"}, "'THIN_PRISM_FISHEYE' is not supported; undistort"),
         ({"camera_model": "OPENCV", "is_fisheye": True}, "is_fisheye contradicts the camera model OPENCV"),
         ({"camera_model": "OPENCV_FISHEYE", "p1": 0.01}, "p1, p2 of a fisheye"),

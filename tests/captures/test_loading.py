@@ -156,6 +156,21 @@ def test_image_folders_stay_inside_the_capture(folder, images):
         load_capture(folder, up(images=images))
 
 
+@pytest.mark.parametrize("linked", [False, True])
+def test_photographs_are_no_masks_of_themselves(folder, linked):
+    """Their dark pixels would be left out, and nothing would tell."""
+    if linked:
+        (folder / "masks").symlink_to("images")
+    with pytest.raises(CaptureError, match="is the photograph itself, not a mask"):
+        load_capture(folder, up() if linked else up(masks="images"))
+
+
+def test_a_text_model_that_is_not_read_is_named(folder):
+    (folder / "sparse" / "0" / "images.txt").write_text("# other poses\n")
+    (folder / "sparse" / "0" / "cameras.txt").write_text("# other cameras\n")
+    assert any("images.txt beside it is not" in warning for warning in load_capture(folder, UP).warnings)
+
+
 def test_missing_things_are_named(tmp_path, scene):
     with pytest.raises(CaptureError, match="no such folder"):
         load_capture(tmp_path / "nowhere")

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from experiments.bench.cli import BenchArguments
+from support.captures import tiny_scene, write_colmap
 from vdgs.cli.main import COMMANDS, main, verb_arguments
 from vdgs.config.options import Option, options_of
 from vdgs.config.output_paths import is_output
@@ -160,3 +161,48 @@ def test_a_cluster_that_does_not_answer_is_not_waited_for(address):
 
     with pytest.raises(VdgsError, match="no Ray cluster that can be used"):
         check_reachable(address)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["run", ".", "\u2014output", "R"], "type --output"),
+        (["run", ".", "\u2013\u2013output=R"], "type --output"),
+        (["run", "-place", "--output", "R"], "write the path as ./-place"),
+    ],
+)
+def test_dashes_of_texts_and_paths_are_explained(words, says, tmp_path, monkeypatch, capsys):
+    (tmp_path / "-place").mkdir()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2
+    assert says in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("verb", "more"),
+    [("run", []), ("run", ["--dry-run"]), ("train-coarse", [])],
+    ids=["run", "dry run", "train-coarse"],
+)
+def test_a_folder_of_other_files_is_refused_before_anything_is_measured(verb, more, tmp_path, monkeypatch, capsys):
+    write_colmap(tmp_path / "C", tiny_scene())
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "letter.txt").write_text("dear reader")
+
+    def fail(*_: object, **__: object) -> None:
+        raise AssertionError("measured first")
+
+    for user in ("run_pipeline", "dry_run", "image_size"):
+        monkeypatch.setattr(f"vdgs.pipeline.{user}.choose_image_size", fail)
+    with pytest.raises(SystemExit) as ended:
+        main([verb, str(tmp_path / "C"), "--output", str(tmp_path / "other"), *more])
+    assert ended.value.code == 1
+    assert "holds other files (letter.txt)" in capsys.readouterr().err
+
+
+def test_a_terminal_without_width_is_printed_to(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "0")
+    with pytest.raises(SystemExit):
+        main(["status", "nowhere"])
+    assert "COLUMNS" not in os.environ

@@ -72,7 +72,7 @@ def test_a_damaged_config_is_named(tmp_path, text):
         ({"capture": {"path": "/data/a", "images": 5}}, r"capture\.images is 5; it must be text"),
         ({"capture": {"images": None}}, "`capture` must be a group of settings with a path"),
         ({"merge": {"rule": "mine"}}, r"merge\.rule is 'mine'; it must be owner or max-visibility"),
-        ({"blocks": 4}, "this file has no 'blocks'"),
+        ({"blocks": 4}, "there is no setting 'blocks'"),
         ({"training": {"average": 0.3}}, r"config\.yaml: training has no 'average'.* or start a new --output"),
         ({"block": {"ring": "ramp"}}, r"config\.yaml: block has no 'ring'; did you mean .* or start a new --output"),
     ],

@@ -94,9 +94,10 @@ def test_a_run_that_is_there_keeps_its_settings(tmp_path):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("trainign: {seed: 1}", "this file has no 'trainign'; did you mean 'training'?"),
+        ("trainign: {seed: 1}", "there is no setting 'trainign'; did you mean 'training'?"),
         ("training: {densify: {evry: 1}}", "training.densify has no 'evry'; did you mean 'every'?"),
         ("capture: {image: images_4}", "capture has no 'image'; did you mean 'images'?"),
+        ("partition: {lambda_vis: .nan}", "settings.yaml: --lambda-vis nan"),
         ("training: {iterations: many}", "training.iterations is 'many'; it must be a whole number"),
         ("training: 5", "training is 5, not a group of settings"),
         ("- 1", "holds no settings"),

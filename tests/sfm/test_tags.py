@@ -74,6 +74,7 @@ def test_places_are_read_in_every_way_that_programs_write_them(latitude, side, l
 @pytest.mark.parametrize(
     ("gps", "said"),
     [
+        ({1: "S", 2: (R(33, 1), R(0, 0), R(0, 0)), 3: "W", 4: (70.5, 0.0, 0.0)}, "not understood (latitude"),
         ({1: "S", 2: (R(0, 0), R(0, 0), R(0, 0)), 3: "W", 4: (70.0, 36.0, 0.0)}, "not understood (latitude"),
         ({1: "S", 2: (33.0, R(5, 0), 0.0), 3: "W", 4: (70.0, 36.0, 0.0)}, "not understood (latitude"),
         ({1: "S", 2: (33.0, 30.0, 0.0)}, "not understood (longitude missing)"),

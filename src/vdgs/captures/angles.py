@@ -24,8 +24,11 @@ def side_of(word: str, axis: str) -> float | None:
 
 
 def degrees_of_parts(parts: Sequence[float | None]) -> float | None:
-    """Degrees from up to three numbers: degrees, minutes, seconds. Minutes and seconds that are none count as 0."""
+    """Degrees from up to three numbers: degrees, minutes, seconds. Seconds that are none count as 0, and so do minutes
+    where the degrees have a fraction: whole degrees alone are no place (up to 111 km off)."""
     if not 1 <= len(parts) <= 3 or parts[0] is None:
+        return None
+    if len(parts) > 1 and parts[1] is None and parts[0] % 1 == 0:
         return None
     whole, *rest = (value or 0.0 for value in parts)
     if any(not 0 <= value < 60.0001 for value in rest):

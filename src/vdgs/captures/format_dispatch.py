@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from vdgs.captures.formats.colmap import count_images, find_models, partial_model, read_colmap
+from vdgs.captures.formats.colmap import count_images, find_models, has_both_kinds, partial_model, read_colmap
 from vdgs.captures.formats.matrixcity import pose_files, read_matrixcity
 from vdgs.captures.formats.mega_nerf import is_mega_nerf, read_mega_nerf
 from vdgs.captures.formats.ply_reader import read_point_cloud
@@ -121,6 +121,8 @@ def _read_colmap(root: Path, options: CaptureOptions) -> SourceCapture:
         sizes = ", ".join(f"{model.relative_to(root)} ({count_images(model)})" for model in models)
         warnings.append(f"several sparse models: {sizes} images; the biggest is used.")
     images, image_warnings = image_folder(root, options)
+    if has_both_kinds(folder):
+        warnings.append(f"{folder.relative_to(root) / 'images.bin'} is read; images.txt beside it is not.")
     model = read_colmap(folder)
     if not model.views:
         raise CaptureError(f"{folder}: the model holds no registered images. Run the reconstruction again.")

@@ -91,7 +91,10 @@ def read_header(path: Path) -> ImageHeader:
     except FileNotFoundError:
         raise CaptureError(f"{path}: no such image.") from None
     except Exception as error:  # Pillow's parsers raise many kinds on damaged headers
-        raise CaptureError(f"{path}: not an image that can be read ({error}). Copy it again.") from None
+        raise CaptureError(
+            f"{path}: not an image that can be read ({error}). Copy it again, or convert it to 8-bit RGB if other "
+            "programs show it."
+        ) from None
     if header.width * header.height > MAX_IMAGE_PX:
         raise CaptureError(f"{path}: announces {header.width}x{header.height} pixels; the file is damaged.")
     if min(header.width, header.height) < MIN_SIDE_PX:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from vdgs.captures.formats.source_capture import SourceView
 from vdgs.captures.image_files import find_images, find_mask, find_mask_beside, read_header, same_aspect
+from vdgs.captures.name_resolution import find_file
 from vdgs.captures.strays import MASK_FOLDERS
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -30,6 +31,12 @@ def find_masks(
         view.name: view.mask_path or find_mask(folder, view.name) or find_mask_beside(root / images, view.name)
         for view in views
     }
+    for view in views:
+        mask, photograph = masks[view.name], find_file(root / images, view.name)
+        if mask is not None and photograph is not None and mask.samefile(photograph):
+            raise CaptureError(
+                f"{mask}: is the photograph itself, not a mask of it. Name the folder of the masks (--masks)."
+            )
     with_mask = [name for name, mask in masks.items() if mask is not None]
     if folder.is_dir() and not any(view.mask_path for view in views):
         _compare(folder, masks, asked_for, warnings)

@@ -355,7 +355,8 @@ def _errors(
         common = np.where(gps_std > BELIEVED * said, gps_std, said)
     across = math.hypot(float(np.hypot(*errors[4:6])), 2 * float(np.sqrt((common[:2] ** 2).mean())))
     mean_up = 2 * float(gps_std[2]) / math.sqrt(count) if model == "unused" else float(errors[6])
-    drift_error = float(errors[7]) if model == "drifts" else 0.0  # what is level decides how much of it is drift
+    # What is level decides how much of the altitudes is drift: at most half of it again may be tilt.
+    drift_error = min(float(errors[7]), abs(drift) / 2) if model == "drifts" else 0.0
     up = math.hypot(mean_up, 2 * float(common[2]) + (abs(drift) + drift_error) / 2)
     level = float(np.degrees(np.hypot(*errors[1:3])))
     return float(math.expm1(min(50.0, errors[0]))), float(np.degrees(errors[3])), level, (across, up)

@@ -19,6 +19,10 @@ from vdgs.system.similar_paths import suggest_path
 HELP_FLAGS, FULL_HELP_FLAG = ("-h", "--help"), "--help-all"
 
 
+#: What word processors and web pages make of two hyphens.
+_LONG_DASHES = "\u2010\u2011\u2012\u2013\u2014\u2015\u2212"
+
+
 class UsageError(Exception):
     """A command line that cannot be understood; the message says what is wrong with it."""
 
@@ -146,6 +150,11 @@ def _read_options(given: GivenArguments, words: Sequence[str], free: list[str]) 
         if word in (*HELP_FLAGS, FULL_HELP_FLAG):
             continue
         if name not in known:
+            typed = f"--{name.lstrip(_LONG_DASHES)}"
+            if name.startswith(tuple(_LONG_DASHES)) and typed in known:
+                raise UsageError(f"{name} begins with a long dash, as texts have them; type {typed}")
+            if word.startswith("-") and Path(word).exists():
+                raise UsageError(f"{word} is read as an option; write the path as ./{word}")
             if word.startswith("-") and not _is_number(word):
                 raise UsageError(f"there is no option {name}{_suggestion(name, known)}")
             free.append(word)

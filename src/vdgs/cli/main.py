@@ -74,11 +74,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _run_command(command: str, arguments: list[str]) -> int:
     import logging
+    import os
 
     from vdgs.cli.advice import MESSAGE_FIT, Advice
 
     # matplotlib warns of a home folder without write access, and then works without it.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
+    if os.environ.get("COLUMNS") == "0":  # no width is known; rich would print nothing
+        del os.environ["COLUMNS"]
     action = get_command(command)
     again = "continues: what is finished is kept" if command in RESUMABLE_COMMANDS else "begins it anew"
     fit = Advice(command, verb_arguments).fit

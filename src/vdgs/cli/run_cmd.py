@@ -71,7 +71,9 @@ def train_coarse_command(arguments: list[str]) -> None:
     from vdgs.pipeline.image_size import choose_image_size
     from vdgs.pipeline.train_coarse import train_coarse
     from vdgs.runs.create_or_resume import create_or_resume_run
+    from vdgs.runs.run_folder import RunFolder
 
+    RunFolder(args.output).check_output_empty()
     request = RunRequest(
         capture=args.capture, output=args.output, options=args.options, threads=args.threads, device=device,
         **vars(method),

@@ -79,7 +79,8 @@ def flat_values(kind: type, values: Any, where: str, also: Iterable[str] = ()) -
 def _check_names(values: Mapping[str, Any], known: Iterable[str], where: str) -> None:
     unknown = sorted(values.keys() - set(known), key=str)
     if unknown:
-        raise ValueError(f"{where or 'this file'} has no {unknown[0]!r}{suggest(str(unknown[0]), known)}")
+        what = f"{where} has no" if where else "there is no setting"
+        raise ValueError(f"{what} {unknown[0]!r}{suggest(str(unknown[0]), known)}")
 
 
 def suggest(word: str, known: Iterable[str]) -> str:

@@ -42,6 +42,7 @@ def estimate_run(request: RunRequest, console: Console) -> RunEstimate:
     check_config(method)
     if request.options.undistort:
         raise VdgsError("--dry-run writes nothing, and --undistort writes photographs: leave one of the two out.")
+    RunFolder(request.output).check_output_empty()
     if is_image_input(request):
         return _estimate_from_images(request, console)
     choice = choose_image_size(request, console)

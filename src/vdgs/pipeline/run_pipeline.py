@@ -51,6 +51,7 @@ def run_pipeline(request: RunRequest, console: Console, command: str | None = No
     check_ranges(request)
     check_weights_file(request.lpips_weights)
     check_output(request.output)
+    RunFolder(request.output).check_output_empty()
     choice = choose_image_size(reconstruct_if_needed(request, console, command), console)
     request = choice.request
     with exclusive_run(

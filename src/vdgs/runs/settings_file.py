@@ -12,7 +12,8 @@ import yaml
 
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.method import MethodConfig
-from vdgs.config.options import Values, field_help
+from vdgs.config.options import Values, field_help, with_values
+from vdgs.config.ranges import check_ranges
 from vdgs.config.serialization import flat_values, to_dict
 from vdgs.errors import VdgsError
 from vdgs.runs.config_file import load_yaml
@@ -42,7 +43,9 @@ def read_settings_file(path: Path) -> tuple[Values, Values]:
             capture = {key: value for key, value in capture.items() if key != "path"}
         options = flat_values(CaptureOptions, {} if capture is None else capture, "capture")
         method = flat_values(MethodConfig, sections, "", also=("capture",))
-    except ValueError as error:
+        check_ranges(with_values(CaptureOptions(), options))
+        check_ranges(with_values(MethodConfig(), method))
+    except (ValueError, VdgsError) as error:
         raise VdgsError(f"{path}: {error}") from error
     return options, method
 

@@ -248,7 +248,7 @@ def _not_an_image(path: Path) -> str:
         head = file.read(12)
     if head[4:8] == b"ftyp":
         return f"is no {path.suffix.lower().lstrip('.')} but HEIC, HEIF or AVIF inside: convert it to JPEG"
-    return "cannot be read (no image format that is known): copy it again"
+    return "cannot be read (no image format that is known): copy it again, or convert it to 8-bit RGB"
 
 
 def _check(image: Image.Image) -> None:

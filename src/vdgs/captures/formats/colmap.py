@@ -89,6 +89,11 @@ def count_images(folder: Path) -> int:
         return -1
 
 
+def has_both_kinds(folder: Path) -> bool:
+    """Whether a folder holds a binary model, which is read, and a text one of the same or of other poses."""
+    return all((folder / f"images{suffix}").is_file() for suffix in (".bin", ".txt")) and _format(folder) == ".bin"
+
+
 def partial_model(root: Path) -> str:
     """A sentence about a folder that holds part of a sparse model; empty where there is none."""
     for folder in _candidates(root):

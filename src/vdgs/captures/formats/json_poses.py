@@ -115,7 +115,11 @@ def parse_intrinsics(frame: JsonObject, common: JsonObject, image: Path, file: P
     fy = get("fl_y", fx if get("fl_x") is not None else _focal(height, get("camera_angle_y")))
     fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
     if fx is None or fy is None:
-        raise CaptureError(f"{file}: no focal length for {image.name} (fl_x or camera_angle_x).")
+        given = {key: get(key) for key in ("camera_angle_x", "camera_angle_y") if get(key) is not None}
+        wrong = f": {' and '.join(f'{key} {angle:g}' for key, angle in given.items())} must be radians, below pi"
+        raise CaptureError(
+            f"{file}: no focal length for {image.name} (fl_x or camera_angle_x{wrong if given else ''})."
+        )
     # A corner is no principal point: programs that know none write 0.
     head = (fx, fy, get("cx", width / 2) or width / 2, get("cy", height / 2) or height / 2)
     model, tail = _lens(_camera_model(values, file), _distortion(values, file), file)
