@@ -145,6 +145,13 @@ def test_the_wrong_reference_of_an_altitude_gives_way_to_the_sign_in_xmp(absolut
     assert read_altitude({5: b"\x01", 6: 96.0}, xmp)[0] == altitude
 
 
+def test_no_flight_is_far_below_the_sea():
+    altitude, datum = read_altitude({5: b"\x01", 6: 512.0}, {})
+    assert altitude == 512.0
+    assert "'below sea level' cannot be true" in datum
+    assert read_altitude({5: b"\x01", 6: 390.0}, {})[0] == -390.0  # over the shore of the Dead Sea
+
+
 def test_a_flight_without_a_hemisphere_is_told(tmp_path):
     for k in range(4):
         photograph(tmp_path, k)

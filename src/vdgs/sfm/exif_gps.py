@@ -11,6 +11,8 @@ from vdgs.sfm.xmp import first_number, text
 
 #: Places in EXIF and XMP that are farther apart than this (degrees, some 100 m) contradict each other.
 SAME_PLACE_DEG = 1e-3
+#: No land lies lower in the open (metres; the shore of the Dead Sea is at -430): the tag "below sea level" is wrong.
+LOWEST_M = -450
 #: Altitudes beyond this (metres) are damage.
 HIGHEST_M = 20_000.0
 #: EXIF's tags: latitude and longitude, each behind its reference.
@@ -88,6 +90,8 @@ def read_altitude(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[float
         value = absolute  # drones and programs write the wrong reference; the sign in XMP is written out
     if value is None or abs(value) > HIGHEST_M:
         return None, ""
+    if value < LOWEST_M:
+        return -value, "EXIF GPSAltitude, whose mark 'below sea level' cannot be true"
     ellipsoidal = first_number(xmp, "AltitudeWGS84")
     if ellipsoidal is not None and abs(ellipsoidal - value) < 0.01:
         return value, "above the WGS 84 ellipsoid (AltitudeWGS84)"
