@@ -126,7 +126,7 @@ def test_every_stage_of_a_run_says_that_the_disk_is_full_and_continues_to_the_sa
         ("render", "RUN", "--mode", "depth", "--raw", "--output", "DISK/numbers"),
         ("render", "RUN", "--views", "flyover", "--output", "DISK/film.mp4"),
         ("inspect", "CAPTURE", "--output", "DISK/looks"),
-        ("synth", "--size", "toy", "--images", "3", "DISK/town"),
+        ("synth", "--size", "toy", "--num-images", "3", "DISK/town"),
     ],
     ids=lambda command: f"{command[0]} {Path(command[-1]).name}",
 )
@@ -148,7 +148,7 @@ def expect_room() -> None:
     render_ortho._print_plan = lambda *_, **__: None  # type: ignore[assignment]
 
 
-@pytest.mark.parametrize(("free_bytes", "prepare"), [(4096, None), (4096, expect_room), (120 << 10, expect_room)])
+@pytest.mark.parametrize(("free_bytes", "prepare"), [(4096, None), (4096, expect_room), (60 << 10, expect_room)])
 def test_maps_are_whole_or_absent(disk, native_small, free_bytes, prepare):
     """Before they begin, while tiles are written, and after."""
     pytest.importorskip("rasterio")

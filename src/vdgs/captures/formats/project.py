@@ -196,8 +196,8 @@ def _cloud_beside(
     if cloud is None:
         raise NoTiePoints(
             f"{project.file}: brings poses but no 3D points, from which the scene starts. This finds them, with the "
-            f"poses as they are: vdgs sfm {_given(project, root)} --output CAPTURE\nOr put a point cloud in the "
-            "same coordinates beside it, as a PLY file."
+            f"poses as they are: vdgs sfm {shell_word(_given(project, root))} --output CAPTURE\nOr put a point cloud "
+            "in the same coordinates beside it, as a PLY file."
         )
     points, colors = read_point_cloud(cloud)
     frames: list[CloudFrame] = [("of the project", world.moved)]
@@ -213,14 +213,14 @@ def _cloud_beside(
         raise NoTiePoints(
             f"{cloud}: its points are not where the cameras of {project.file.name} look ({seen:.0%} fall into "
             "photographs, at best): it is in other coordinates, or of another project. Export it in the project's own, "
-            f"or move it away and find points anew: vdgs sfm {_given(project, root)} --output CAPTURE"
+            f"or move it away and find points anew: vdgs sfm {shell_word(_given(project, root))} --output CAPTURE"
         )
     return best, colors, f"the project has no points; those of {cloud.name} are used (coordinates {what})."
 
 
-def _given(project: Project, root: Path) -> str:
+def _given(project: Project, root: Path) -> Path:
     """What a command takes for a project: the file, or the folder that it lies below."""
-    return shell_word(project.file if project.file.parent == root else root)
+    return project.file if project.file.parent == root else root
 
 
 def _after(change: Callable[[np.ndarray], np.ndarray], world: _World) -> Callable[[np.ndarray], np.ndarray]:
