@@ -20,7 +20,7 @@ from support.metashape_files import (
     metashape_transform,
     metashape_xml,
 )
-from support.true_flight import ORIGIN, SIZE, Lens, TrueFlight, assert_true, true_flight
+from support.true_flight import ORIGIN, SIZE, Lens, TrueFlight, assert_read_or_refused, assert_true, true_flight
 from vdgs.captures.formats.lens_projection import ray_pixels
 from vdgs.captures.formats.project import NoTiePoints
 from vdgs.captures.formats.source_capture import SourceCapture
@@ -298,20 +298,8 @@ def test_damaged_files_end_in_a_message(tmp_path):
     flight = true_flight(count=3)
     flight.touch(tmp_path)
     whole = metashape_xml(flight).encode()
-    generator = np.random.default_rng(0)
-    for _ in range(150):
-        damaged = bytearray(whole)
-        if generator.random() < 0.3:
-            damaged = damaged[: generator.integers(0, len(whole))]
-        else:
-            for place in generator.integers(0, len(whole), 5):
-                damaged[place] = generator.integers(0, 256)
-        (tmp_path / "cameras.xml").write_bytes(bytes(damaged))
-        try:
-            source = read_project(tmp_path / "cameras.xml", "metashape", OPTIONS, needs_points=False)
-        except CaptureError:
-            continue
-        assert all(np.isfinite(view.camera_from_world).all() for view in source.views)
+    file = tmp_path / "cameras.xml"
+    assert_read_or_refused(file, whole, lambda: read_project(file, "metashape", OPTIONS, needs_points=False), seed=0)
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ The formulas there and here are the makers', written anew: nothing is shared wit
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from vdgs.captures.formats.lens_projection import ray_pixels
 from vdgs.captures.formats.source_capture import SourceCapture
+from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu
 
 #: Where the flight takes place: north of the Alps, far from the middle of its UTM zone.
@@ -122,3 +124,23 @@ def assert_true(source: SourceCapture, flight: TrueFlight, world=lambda points: 
         found = ray_pixels(views[name].intrinsics, seen[:, :2] / seen[:, 2:])
         assert np.abs(found - pixels).max() < 0.01
         assert np.linalg.norm(-pose[:3, :3].T @ pose[:3, 3] - world(flight.centers[[index]])[0]) < 0.001
+
+
+def assert_read_or_refused(file: Path, whole: bytes, read: Callable[[], SourceCapture], seed: int) -> None:
+    """A file cut off, or with five wrong bytes: a CaptureError, or finite poses; of 150 such files some are refused."""
+    generator, refused = np.random.default_rng(seed), 0
+    for _ in range(150):
+        damaged = bytearray(whole)
+        if generator.random() < 0.3:
+            damaged = damaged[: generator.integers(0, len(whole))]
+        else:
+            for place in generator.integers(0, len(whole), 5):
+                damaged[place] = generator.integers(0, 256)
+        file.write_bytes(bytes(damaged))
+        try:
+            source = read()
+        except CaptureError:
+            refused += 1
+        else:
+            assert all(np.isfinite(view.camera_from_world).all() for view in source.views)
+    assert refused > 15
