@@ -10,6 +10,7 @@ from __future__ import annotations
 import gc
 import os
 import sys
+from collections.abc import Generator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -47,16 +48,25 @@ settings.load_profile("vdgs")
 install_import_hook([module_name(file) for file in files_with_shapes()], f"{typecheck.__name__}.checked")
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Import and collect without the garbage collector, and let it forget what was imported: stages call it often."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
+
+
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Let the garbage collector forget what was imported: stages call it often. Let runs in this process begin without
-    seconds of timing. Refuse workers that do not keep groups together: each would make the expensive fixtures anew."""
+    """Let runs in this process begin without seconds of timing. Refuse workers that do not keep groups together: each
+    would make the expensive fixtures anew."""
     if "vdgs.pipeline.time_estimate" in sys.modules:  # the package is not imported for it
         from support.commands import FEW_STEPS
         from vdgs.pipeline import time_estimate
 
         time_estimate.MIN_TIMED_STEPS, time_estimate.MAX_TIMED_SECONDS = FEW_STEPS, 0.0
-    gc.collect()
-    gc.freeze()
     if "PYTEST_XDIST_WORKER" not in os.environ:
         return
     for item in session.items:

@@ -29,8 +29,8 @@ from vdgs.viewer.server import serve
 pytestmark = [pytest.mark.browser, needs_browser, pytest.mark.xdist_group("viewer")]
 
 
-#: Width and height of the browser's window.
-WINDOW = 1000, 700
+#: Width and height of the browser's window, and pixels of the screen for one of it.
+WINDOW, SCALE = (1000, 700), 0.5
 
 
 @pytest.fixture(scope="module")
@@ -55,14 +55,15 @@ def in_window(visitor: ClientSession) -> Camera | None:
 
 
 def beside_the_panel(picture: np.ndarray) -> np.ndarray:
-    """That part of a picture of the window, at a quarter of its size, where fewer pixels look the same."""
-    return cv2.resize(picture[250:650, 40:600], None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA).astype(int)
+    """That part of a picture of the window, at an eighth of its size, where fewer pixels look the same."""
+    small = cv2.resize(picture, (WINDOW[0] // 8, WINDOW[1] // 8), interpolation=cv2.INTER_AREA)
+    return small[31:81, 5:75].astype(int)
 
 
 @quiet
 def test_a_browser_shows_the_scene(viewer):
     wait_until(lambda: not viewer.sessions)
-    with open_page(viewer.access.local_url(), *WINDOW) as page:
+    with open_page(viewer.access.local_url(), *WINDOW, scale=SCALE) as page:
         wait_until(lambda: viewer.sessions)
         (visitor,) = viewer.sessions.values()
         wait_until(lambda: in_window(visitor))
@@ -88,7 +89,7 @@ def test_a_browser_shows_the_scene(viewer):
 @quiet
 def test_a_browser_shows_every_layer_and_goes_where_buttons_lead(viewer):
     wait_until(lambda: not viewer.sessions)
-    with open_page(viewer.access.local_url(), *WINDOW) as page:
+    with open_page(viewer.access.local_url(), *WINDOW, scale=SCALE) as page:
         wait_until(lambda: viewer.sessions)
         (visitor,) = viewer.sessions.values()
         wait_until(lambda: in_window(visitor))
@@ -123,7 +124,7 @@ def test_a_browser_shows_every_layer_and_goes_where_buttons_lead(viewer):
 @quiet
 def test_a_distance_measured_in_a_browser_gives_the_capture_its_metres(viewer, run, tmp_path):
     wait_until(lambda: not viewer.sessions)
-    with open_page(viewer.access.local_url(), *WINDOW, downloads=tmp_path / "downloads") as page:
+    with open_page(viewer.access.local_url(), *WINDOW, downloads=tmp_path / "downloads", scale=SCALE) as page:
         wait_until(lambda: viewer.sessions)
         (visitor,) = viewer.sessions.values()
         wait_until(lambda: in_window(visitor))

@@ -23,8 +23,8 @@ pytestmark = [
 
 
 @pytest.fixture(scope="module")
-def drivers(tmp_path_factory):
-    return build(tmp_path_factory.mktemp("kernels"))
+def drivers(compiled_code):
+    return build(compiled_code)
 
 
 def test_all_of_it_runs_and_agrees(drivers, compiled_code, tmp_path, monkeypatch, capsys):

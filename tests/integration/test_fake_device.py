@@ -74,8 +74,8 @@ WAITS = {
 
 
 @pytest.fixture(scope="module")
-def drivers(tmp_path_factory):
-    return build(tmp_path_factory.mktemp("composition"))
+def drivers(compiled_code):
+    return build(compiled_code)
 
 
 @pytest.fixture(params=["gsplat", "cuda"])

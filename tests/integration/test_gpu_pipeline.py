@@ -27,7 +27,7 @@ pytestmark = [
 def runs(native_small, tmp_path_factory, compiled_code) -> tuple[Path, Path]:
     """By the native set, and on the card."""
     folder = tmp_path_factory.mktemp("composed")
-    drivers = build(folder / "kernels")
+    drivers = build(compiled_code)
     card = folder / "card"
     with pytest.MonkeyPatch.context() as patch:
         install(drivers, compiled_code, patch, "cuda", "gsplat")

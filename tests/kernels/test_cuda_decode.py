@@ -32,8 +32,8 @@ CAMERAS = {
 
 
 @pytest.fixture(scope="module")
-def library(tmp_path_factory):
-    return build_on_host(PROGRAM.name, tmp_path_factory.mktemp("host"))
+def library(compiled_code):
+    return build_on_host(PROGRAM.name, compiled_code)
 
 
 def decoded(scene: Scene, camera: Camera, library: ctypes.CDLL, rows=None, order: int = 0) -> AnchorSplats:
@@ -196,9 +196,8 @@ def test_room_follows_what_views_need():
 def test_barriers_that_are_missing_are_noticed(tmp_path):
     """Those of blocks: before splats are added up, and before a block's place is read."""
     first, second, third = read_source(PROGRAM.name).split("__syncthreads();")
-    for number, (one, other) in enumerate((("", "__syncthreads();"), ("__syncthreads();", ""))):
-        (folder := tmp_path / str(number)).mkdir()
-        without = build_on_host(PROGRAM.name, folder, first + one + second + other + third)
+    for one, other in (("", "__syncthreads();"), ("__syncthreads();", "")):
+        without = build_on_host(PROGRAM.name, tmp_path, first + one + second + other + third)
         found = [decoded(Scene.random(61, 10), turned(), without, order=turns) for turns in (0, 1)]
         assert not all(torch.equal(*(getattr(each, field.name) for each in found)) for field in fields(AnchorSplats))
 

@@ -23,18 +23,18 @@ SIZES = [(1, 1), (3, 2), (16, 16), (17, 33), (37, 50), (64, 31)]
 
 
 @pytest.fixture(scope="module")
-def library(tmp_path_factory):
-    return build_on_host("loss.cu", tmp_path_factory.mktemp("host"))
+def library(compiled_code):
+    return build_on_host("loss.cu", compiled_code)
 
 
 @pytest.fixture(scope="module")
-def numbered(tmp_path_factory):
+def numbered(compiled_code):
     """The kernels, of whose barriers one can be left out: that of the number `left_out`."""
     before, *after = read_source("loss.cu").split("__syncthreads();")
     assert len(after) == BARRIERS
     parts = [f"if (left_out != {number}) __syncthreads();{part}" for number, part in enumerate(after)]
     text = 'extern "C" int left_out;\nint left_out = -1;\n' + before + "".join(parts)
-    return build_on_host("loss.cu", tmp_path_factory.mktemp("numbered"), text)
+    return build_on_host("loss.cu", compiled_code, text)
 
 
 @pytest.fixture

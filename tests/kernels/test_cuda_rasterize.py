@@ -45,12 +45,12 @@ SCENES = {
 
 
 @pytest.fixture(scope="module")
-def library(tmp_path_factory):
-    return build_on_host("rasterize.cu", tmp_path_factory.mktemp("host"))
+def library(compiled_code):
+    return build_on_host("rasterize.cu", compiled_code)
 
 
 @pytest.fixture(scope="module")
-def numbered(tmp_path_factory):
+def numbered(compiled_code):
     """The kernels, of whose barriers one can be left out: that of the number `left_out`."""
     text, number = read_source("rasterize.cu"), iter(range(BARRIERS))
     text = BARRIER.sub(lambda found: f"{found[0][:-1].replace('__', 'maybe_')}({next(number)}, ", text)
@@ -63,7 +63,7 @@ void maybe_syncthreads(int number) { if (number != left_out) __syncthreads(); }
 int maybe_syncthreads_and(int number, int mine) { return number == left_out ? mine : __syncthreads_and(mine); }
 int maybe_syncthreads_or(int number, int mine) { return number == left_out ? mine : __syncthreads_or(mine); }
 """
-    return build_on_host("rasterize.cu", tmp_path_factory.mktemp("numbered"), before + text)
+    return build_on_host("rasterize.cu", compiled_code, before + text)
 
 
 def drawn(scene: Scene, library: ctypes.CDLL, order: int = 0, depth: bool = True) -> Raster:

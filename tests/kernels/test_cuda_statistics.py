@@ -21,8 +21,8 @@ pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark
 
 
 @pytest.fixture(scope="module")
-def library(tmp_path_factory):
-    return build_on_host(PROGRAM.name, tmp_path_factory.mktemp("host"))
+def library(compiled_code):
+    return build_on_host(PROGRAM.name, compiled_code)
 
 
 def on_host(library: ctypes.CDLL, order: int = 0):

@@ -70,13 +70,11 @@ class Counted:
 
 
 @pytest.fixture(scope="module")
-def counted(tmp_path_factory, compiled_code) -> Counted:
-    folder = tmp_path_factory.mktemp("traffic")
+def counted(compiled_code) -> Counted:
     traffic: dict[str, list[Traffic]] = {}
 
     def count(program, work: Callable):
-        (own := folder / program.name).mkdir()
-        counting = CountedProgram(program, own)
+        counting = CountedProgram(program, compiled_code)
         made = work(counting)
         for each in counting.traffic:
             traffic.setdefault(each.kernel, []).append(each)

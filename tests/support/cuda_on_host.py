@@ -7,7 +7,7 @@ import os
 import re
 import shutil
 import subprocess
-from functools import cache
+from hashlib import sha256
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -32,27 +32,23 @@ def host_compiler() -> str | None:
 
 
 def build_on_host(source: str, folder: Path, text: str | None = None, counted: bool = False) -> ctypes.CDLL:
-    """A source of vdgs.kernels.cuda as a library for the processor; `host_NAME` runs one thread of a kernel.
+    """A source of vdgs.kernels.cuda as a library for the processor; `host_NAME` runs one thread of a kernel. The
+    library is kept in the folder, where the same source is found again.
 
     `text` is compiled instead of the source's own. `counted`: what it reads and writes can be counted
     (cuda_traffic.py).
     """
-    if text is None and not counted:
-        return _library_of(source)
-    return ctypes.CDLL(str(_built(source, folder, text, counted)))
-
-
-@cache
-def _library_of(source: str) -> ctypes.CDLL:
-    """As it stands: compiled once for all tests of this process."""
-    with TemporaryDirectory() as folder:  # a library that is loaded needs its file no more
-        return ctypes.CDLL(str(_built(source, Path(folder))))
-
-
-def _built(source: str, folder: Path, text: str | None = None, counted: bool = False) -> Path:
     text = text or read_source(source)
+    library = folder / f"{sha256(text.encode()).hexdigest()}{'-counted' if counted else ''}.so"
+    if not library.exists():
+        with TemporaryDirectory(dir=folder) as own:
+            _build(text, Path(own), counted).rename(library)
+    return ctypes.CDLL(str(library))
+
+
+def _build(text: str, folder: Path, counted: bool) -> Path:
     kernels = re.findall(r'extern "C" __global__ void(?: __launch_bounds__\([\w, ]+\))?\s+(\w+)\(', text)
-    assert kernels, f"no kernel in {source}"
+    assert kernels, "no kernel in the source"
     exported = "\n".join(f"HOST_KERNEL({name})" for name in kernels)
     (folder / "host.cpp").write_text(f'#include "cuda_on_host.h"\n{text}\n{exported}\n')
     library, built = folder / "host.so", folder / "host.o"

@@ -21,13 +21,8 @@ PROGRAMS = (loss.PROGRAM, RASTERIZE, DECODE, CULL, STATISTICS)
 
 
 def build(folder: Path) -> dict[str, HostDriver]:
-    """Drivers that run the kernels of each source, by its name."""
-    drivers = {}
-    for program in PROGRAMS:
-        own = folder / program.name
-        own.mkdir(parents=True)
-        drivers[program.name] = HostDriver(build_on_host(program.name, own))
-    return drivers
+    """Drivers that run the kernels of each source, by its name; the folder keeps what is compiled."""
+    return {program.name: HostDriver(build_on_host(program.name, folder)) for program in PROGRAMS}
 
 
 def install(

@@ -212,10 +212,12 @@ class Page:
 
 @contextlib.contextmanager
 def open_page(
-    address: str, width: int = 1000, height: int = 700, offline: bool = False, downloads: Path | None = None
-) -> Iterator[Page]:
+    address: str, width: int = 1000, height: int = 700, offline: bool = False, downloads: Path | None = None,
+    scale: float = 1.0,
+) -> Iterator[Page]:  # fmt: skip
     """A page of the machine's browser, without a window, drawn in software; `offline`: without any network;
-    `downloads`: the folder where files are stored that the page gives."""
+    `downloads`: the folder where files are stored that the page gives; `scale`: pixels of the screen for one of the
+    page, the fewer the quicker it is drawn."""
     command = browser()
     assert command is not None
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
@@ -234,7 +236,7 @@ def open_page(
             with connect(target["webSocketDebuggerUrl"], max_size=None) as socket:
                 page = Page(socket)
                 page.call(
-                    "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False
+                    "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=scale, mobile=False
                 )
                 if downloads is not None:
                     page.call("Page.setDownloadBehavior", behavior="allow", downloadPath=str(downloads))

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from vdgs.captures.plane_fit import ENOUGH_TO_DOUBT, LEAST_M, fit_plane, in_plane
 from vdgs.geometry.similarity import Similarity, fit_similarity_robust, is_collinear, rotation_to_z
@@ -345,7 +345,7 @@ def _errors(
     values = np.linalg.eigvalsh(normal[:7, :7])
     open_ = values[0] <= 1e-12 * values[-1]
     errors = np.sqrt(np.maximum(np.diag(covariance), 0.0) + wandering) * float(
-        student.ppf(0.975, 2 * count - 4 + (2 if count < ENOUGH_TO_DOUBT else 0))
+        stdtrit(2 * count - 4 + (2 if count < ENOUGH_TO_DOUBT else 0), 0.975)
     )
     if open_:
         errors[:4] = np.where(errors[:4] > 0, errors[:4], math.pi)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from vdgs.captures.known_distances import MIN_OBSERVATIONS, intersect_rays
 from vdgs.captures.reconstruction import AccuracyFacts, GcpReport
@@ -213,7 +213,7 @@ def _other_marks(model: pycolmap.Reconstruction, control: GcpList) -> str:
 def _accuracy(placed: np.ndarray, targets: np.ndarray) -> AccuracyFacts:
     """What 95 % stay below, from what a similarity to the points leaves."""
     off, count = placed - targets, len(targets)
-    times = float(student.ppf(0.975, max(1, 3 * count - 7)))
+    times = float(stdtrit(max(1, 3 * count - 7), 0.975))
     deviation = float(np.sqrt((off**2).sum() / max(1, 3 * count - 7)))
     spread = np.linalg.svd(targets - targets.mean(axis=0), compute_uv=False)
     scale = times * deviation / float(np.sqrt((spread**2).sum()))
