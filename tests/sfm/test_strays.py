@@ -261,7 +261,7 @@ def test_photographs_of_kinds_that_are_not_read_are_named_with_the_remedy(tmp_pa
 
 def test_films_are_named_where_there_is_nothing_else(tmp_path):
     (tmp_path / "DJI_0001.MP4").write_bytes(b"x")
-    with pytest.raises(CaptureError, match=r"1 \.mp4 file is not read: take single frames out of them"):
+    with pytest.raises(CaptureError, match=r"1 \.mp4 file is not read: name the films themselves"):
         collect_images([tmp_path])
     flight(tmp_path)
     assert not any("mp4" in note for note in collect_images([tmp_path]).notes)

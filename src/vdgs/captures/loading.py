@@ -15,7 +15,7 @@ from vdgs.captures.formats.project_photographs import UNDISTORTED
 from vdgs.captures.formats.source_capture import SourceCapture, format_list
 from vdgs.captures.ground_estimation import find_ground_frame, transform_pose
 from vdgs.captures.image_checks import detect_rounding
-from vdgs.captures.image_files import MIN_SIDE_PX
+from vdgs.captures.image_files import MIN_SIDE_PX, VIDEO_SUFFIXES
 from vdgs.captures.image_matching import MatchedView, match_images
 from vdgs.captures.output_guard import check_not_among_files
 from vdgs.captures.project_formats import is_project
@@ -26,6 +26,7 @@ from vdgs.config.ranges import find_range_errors
 from vdgs.errors import CaptureError
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.ground_frame import GroundFrame
+from vdgs.system.quoting import shell_word
 
 #: Points farther from the cameras than this many times their spread are strays of the matching.
 MAX_DISTANCE_RATIO = 100.0
@@ -44,6 +45,11 @@ def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
 def read_files(root: Path, options: CaptureOptions) -> SourceCapture:
     """The files of a capture, without its photographs. Raises as `load_capture`."""
     if not root.is_dir() and not is_project(root):
+        if root.suffix.lower() in VIDEO_SUFFIXES and root.is_file():
+            raise CaptureError(
+                f"{root}: is a film, which becomes a capture first: vdgs sfm {shell_word(root)} --output CAPTURE (with "
+                "--dry-run it only says what frames it has)"
+            )
         what = "is a file. Unpack an archive first, and give" if root.is_file() else "no such folder. Give"
         raise CaptureError(f"{root}: {what} the folder that holds images/ and sparse/.")
     _check_options(options)

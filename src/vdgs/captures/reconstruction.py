@@ -21,6 +21,8 @@ STEPS_FILE = "steps.json"
 PROGRESS_FILE = "progress.json"
 #: The photographs that it is made of, in the capture.
 SOURCE_IMAGES_FILE = "photographs.json"
+#: The frames of films that it is made of, a folder for each film; and which films these are.
+FRAMES_FOLDER, FILMS_FILE = "frames", "films.json"
 #: The stage of a run that makes a capture of photographs, as `vdgs status` names it.
 SFM_STAGE = "photographs"
 
@@ -148,7 +150,8 @@ class ReconstructionReport:
 def is_reconstruction(root: Path) -> bool:
     """Whether a folder is a capture made of photographs here, finished or not."""
     made = isinstance(read_json_or_empty(root / STEPS_FILE).get("begun"), dict)  # of a project, without a report
-    return made or _is_ours(root / RECONSTRUCTION_FILE) or (root / WORK_FOLDER / STEPS_FILE).is_file()
+    begun = any((root / name).is_file() for name in (f"{WORK_FOLDER}/{STEPS_FILE}", FILMS_FILE))
+    return made or begun or _is_ours(root / RECONSTRUCTION_FILE)
 
 
 def _is_ours(file: Path) -> bool:

@@ -83,7 +83,8 @@ class SfmArguments(QuietArguments):
     without lens distortion in three sizes. The same command goes on where it was stopped. Photographs are only read."""
 
     images: Annotated[tuple[Path, ...], Positional("PHOTOGRAPHS")]
-    """Folders of photographs, those below them included; or a project of another program that has poses and no points
+    """Folders of photographs, those below them included, or films. Of films frames are taken, by how far the picture
+    moved and how sharp it is; or a project of another program that has poses and no points
     (Metashape, RealityScan, ODM, ...): points are found, with poses and lenses as the project has them. A folder masks/
     beside photographs has their masks (white = keep), named like them: name.png or name.jpg.png; name_mask.jpg beside
     name.jpg is one too."""
@@ -123,10 +124,12 @@ def sfm_command(arguments: list[str]) -> None:
                       highlight=False)  # fmt: skip
         return
     if args.dry_run:
+        from vdgs.sfm.films.take_frames import temporary_frames
         from vdgs.sfm.sfm_estimate import estimate_sfm
 
-        plan = plan_reconstruction(request)
-        print_plan(plan, estimate_sfm(plan).text(plan.threads), console)
+        with temporary_frames(request, console) as with_frames:
+            plan = plan_reconstruction(with_frames)
+            print_plan(plan, estimate_sfm(plan).text(plan.threads), console)
         console.print("Nothing was written.", highlight=False)
         return
     if is_posed:

@@ -68,7 +68,7 @@ class RunRequest(ComputeOptions):
     """Everything from a capture to a report (`vdgs run`)."""
 
     capture: Annotated[Path, Positional()]
-    """Folder of the capture, or of photographs alone. These become one in RUN/capture first (`vdgs sfm`)."""
+    """Folder of the capture, or of photographs alone, or a film. These become one in RUN/capture first (`vdgs sfm`)."""
     output: Annotated[Path, Output()]
     """Run folder; new, or the run to continue."""
     preset: PresetChoice = "auto"

@@ -30,6 +30,9 @@ class SfmOptions:
     """Features of a photograph, at most about this number."""
     max_output_size: Annotated[int, Range(16, 1_000_000, allow_zero=True)] = 0
     """Longer side of written photographs, in pixels; 0: full size. Of those in images/."""
+    num_frames: Annotated[int, Range(3, MAX_COUNT)] = 300
+    """Frames of all films together, at most. They are taken where the picture has moved by an eighth, the sharpest of
+    those around each place."""
     gcp: Path | None = None
     """Control points and where photographs show them: gcp_list.txt, as for ODM. The model is brought to them; that of
     a finished capture in seconds."""

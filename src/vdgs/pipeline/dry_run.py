@@ -25,6 +25,7 @@ from vdgs.runs.config_file import changed_flags
 from vdgs.runs.create_or_resume import capture_options_changed, run_settings
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_status import RunStatus, get_run_status
+from vdgs.sfm.films.take_frames import temporary_frames
 from vdgs.sfm.reconstruction_plan import plan_reconstruction, print_plan
 from vdgs.sfm.run_request import is_image_input, make_sfm_request
 from vdgs.sfm.sfm_estimate import estimate_sfm
@@ -64,10 +65,11 @@ def _estimate_from_images(run_request: RunRequest, console: Console) -> RunEstim
         options = replace(run_request.options, gps=None, scale_bar=None)
         with_capture = replace(run_request, capture=request.output, extra_image_folders=(), options=options)
         return estimate_run(with_capture, console)
-    plan = plan_reconstruction(request)
-    sfm = estimate_sfm(plan)
-    print_plan(plan, sfm.text(plan.threads), console)
-    estimate = choose_for_photographs(run_request, plan, sfm, console).estimate
+    with temporary_frames(request, console) as with_frames:
+        plan = plan_reconstruction(with_frames)
+        sfm = estimate_sfm(plan)
+        print_plan(plan, sfm.text(plan.threads), console)
+        estimate = choose_for_photographs(run_request, plan, sfm, console).estimate
     assert estimate is not None
     _print_estimate(estimate, run_request.method(), None, console)
     return estimate

@@ -40,8 +40,13 @@ class Found:
 
     def notes(self) -> list[str]:
         """What people should know of what is not used."""
-        kinds = [kind for kind in self.unread if kind not in VIDEO_SUFFIXES]  # films lie on most cards
-        notes = [f"{_count(self.unread[kind], kind)} not read: {_remedy(kind)}." for kind in kinds]
+        kinds = [kind for kind in self.unread if kind not in VIDEO_SUFFIXES]
+        films = sum(self.unread.values()) - sum(self.unread[kind] for kind in kinds)
+        notes = [
+            f"{films} film{'s' if films > 1 else ''} beside the photographs: not used. To use a film too, name it."
+        ]
+        notes = notes if films else []
+        notes += [f"{_count(self.unread[kind], kind)} not read: {_remedy(kind)}." for kind in kinds]
         for why in dict.fromkeys(self.skipped.values()):
             names = [name for name, reason in self.skipped.items() if reason == why]
             shown = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
@@ -52,6 +57,31 @@ class Found:
 def is_photograph(path: Path) -> bool:
     """Whether a file is an image by its name."""
     return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and path.is_file()
+
+
+def is_film(path: Path) -> bool:
+    """Whether a file is a film by its name."""
+    return path.suffix.lower() in VIDEO_SUFFIXES and not path.name.startswith(".") and path.is_file()
+
+
+def films_in(paths: Sequence[Path]) -> list[Path]:
+    """The films among the paths, and those of folders without photographs, each once."""
+    found = dict[Path, Path]()
+    for path in dict.fromkeys(paths):
+        films = [path] if is_film(path) else _films_alone(path) if path.is_dir() else []
+        for film in films:
+            found.setdefault(film.resolve(), film)
+    return list(found.values())
+
+
+def _films_alone(folder: Path) -> list[Path]:
+    """The films in a folder and below it, where no photographs are."""
+    films = list[Path]()
+    for _, files, _ in walk(folder):
+        if any(is_photograph(path) for path in files):
+            return []
+        films += [path for path in files if is_film(path)]
+    return films
 
 
 def find_files(folders: Sequence[Path]) -> Found:
@@ -125,7 +155,7 @@ def _remedy(suffix: str) -> str:
     if suffix in JPEG_SUFFIXES:
         return "they are JPEG; rename them to .jpg"
     if suffix in VIDEO_SUFFIXES:
-        return "take single frames out of them first (ffmpeg -i VIDEO -vf fps=1 -qscale:v 2 frame_%05d.jpg)"
+        return "name the films themselves"
     if suffix in OTHER_SUFFIXES:
         return "convert them to JPEG, PNG or TIFF, with their tags"
     return "convert them to JPEG, with their tags (phones and macOS export them so)"

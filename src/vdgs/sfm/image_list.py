@@ -18,7 +18,7 @@ from vdgs.captures.reconstruction import is_reconstruction
 from vdgs.captures.strays import check_no_run, walk
 from vdgs.errors import CaptureError
 from vdgs.sfm.cross_checks import cross_checked, strays
-from vdgs.sfm.find_images import find_files, is_photograph, nothing_found
+from vdgs.sfm.find_images import find_files, is_film, is_photograph, nothing_found
 from vdgs.sfm.image_metadata import ImageMetadata, UnusableImage, read_image_metadata
 from vdgs.sfm.mask_files import check_mask, find_masks
 from vdgs.system.quoting import shell_word
@@ -58,7 +58,7 @@ def collect_images(folders: Sequence[Path]) -> ImageList:
     folders = list(dict.fromkeys(folders))
     for folder in folders:
         if not folder.is_dir() and not is_capture(folder):
-            raise CaptureError(f"{folder}: no such folder. Give the folder that the photographs are in.")
+            raise CaptureError(f"{folder}: no such folder or film. Give the folder that the photographs are in.")
         check_no_run(folder)
         if is_reconstruction(folder) and not is_capture(folder):
             raise CaptureError(
@@ -99,7 +99,10 @@ def collect_images(folders: Sequence[Path]) -> ImageList:
 
 
 def is_image_folder(folder: Path) -> bool:
-    """Whether photographs lie in the folder or below it and no capture, whole or in part, is there."""
+    """Whether a path is a film, or photographs or films lie in the folder or below it and no capture, whole or in part,
+    is there."""
+    if is_film(folder):
+        return True
     if (
         not folder.is_dir()
         or is_capture(folder)
@@ -108,7 +111,7 @@ def is_image_folder(folder: Path) -> bool:
         or (folder / "sparse").exists()
     ):
         return False
-    return any(is_photograph(path) for _, files, _ in walk(folder) for path in files)
+    return any(is_photograph(path) or is_film(path) for _, files, _ in walk(folder) for path in files)
 
 
 def _of_the_flight(photographs: Sequence[ImageMetadata]) -> tuple[list[ImageMetadata], list[ExcludedImage]]:

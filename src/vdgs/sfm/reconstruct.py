@@ -18,16 +18,14 @@ from vdgs.captures.reconstruction import (
     MAPPED,
     RECONSTRUCTION_FIGURE,
     RECONSTRUCTION_FILE,
-    SOURCE_IMAGES_FILE,
     WORK_FOLDER,
     CameraReport,
     ReconstructionReport,
-    is_reconstruction,
     read_reconstruction,
 )
 from vdgs.config.serialization import to_dict
 from vdgs.config.sfm_options import SfmRequest
-from vdgs.errors import RunError, VdgsError
+from vdgs.errors import RunError
 from vdgs.runs.run_folder import RunFolder
 from vdgs.sfm import (
     capture_writer,
@@ -38,12 +36,15 @@ from vdgs.sfm import (
     mask_files,
 )
 from vdgs.sfm.console_report import print_reconstruction_report
+from vdgs.sfm.films.take_frames import with_frames
 from vdgs.sfm.georeferencing import georeference
 from vdgs.sfm.image_list import ExcludedImage
 from vdgs.sfm.position_plots import plot_positions, plot_residuals
 from vdgs.sfm.reconstruction_plan import (
+    POSITIONS_FIGURE,
     ReconstructionPlan,
     check_disk_space,
+    check_output_folder,
     plan_reconstruction,
     print_plan,
     time_order,
@@ -65,8 +66,6 @@ from vdgs.system.records import record_to_dict
 
 #: A lens that moves pixels in the corners by no more leaves the photographs without distortion as they are.
 LENS_PX = 0.05
-#: Where the positions are shown before the work, inside the output.
-POSITIONS_FIGURE = "photographs.png"
 
 
 def reconstruct(
@@ -85,8 +84,9 @@ def reconstruct(
     for an output that is something else, other photographs than before and a disk that is full. What was done is kept.
     """
     silence_colmap()
-    prepared = plan_reconstruction(request)
     output = request.output
+    request = with_frames(request, console, run)
+    prepared = plan_reconstruction(request)
     work, keys = Workspace(output / WORK_FOLDER), step_keys(prepared)
     sources = SourceImages.of(request.image_folders, command)
     facts = read_reconstruction(output) if _is_finished(output, keys["placed"]) else None
@@ -97,7 +97,7 @@ def reconstruct(
         if not request.keep_intermediate:
             work.remove()
         return facts
-    _check_output_folder(output)
+    check_output_folder(output)
     check_unchanged(output, sources, request.overwrite)
     check_nothing_trained(request, run)
     before = _placed_before(output, keys["capture"])
@@ -212,22 +212,6 @@ def _lens_moved(before: Sequence[CameraReport], after: Sequence[CameraReport]) -
         bent = (other.radial_distortion - one.radial_distortion) * away**2
         moved.append(corner * abs(bent + other.focal_after_px / one.focal_after_px - 1))
     return max(moved)
-
-
-def _check_output_folder(output: Path) -> None:
-    """Only a new folder, an empty one, or one of an earlier reconstruction is written to."""
-    if output.is_dir() and not is_reconstruction(output) and _has_foreign_files(output):
-        raise VdgsError(f"{output}: holds other things already. Choose a new folder with --output.")
-    if output.exists() and not output.is_dir():
-        raise VdgsError(f"{output}: is a file. Choose a new folder with --output.")
-
-
-def _has_foreign_files(output: Path) -> bool:
-    """Whether a folder holds anything but what a reconstruction begins with."""
-    work = output / WORK_FOLDER
-    begun = work.is_dir() and all(each.suffix == ".tmp" for each in work.iterdir())  # ended before its first record
-    known = (".lock", POSITIONS_FIGURE, SOURCE_IMAGES_FILE, *([WORK_FOLDER] if begun else []))
-    return any(each.name not in known and each.suffix != ".tmp" for each in output.iterdir())
 
 
 def _steps(

@@ -9,6 +9,13 @@ from pathlib import Path
 from rich.console import Console
 
 from vdgs.captures.output_guard import check_output
+from vdgs.captures.reconstruction import (
+    FILMS_FILE,
+    FRAMES_FOLDER,
+    SOURCE_IMAGES_FILE,
+    WORK_FOLDER,
+    is_reconstruction,
+)
 from vdgs.captures.tables_beside import ODM_POSITIONS, control_points_beside, position_tables, table_note
 from vdgs.config.ranges import check_ranges
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
@@ -26,6 +33,8 @@ from vdgs.system.units import data_size
 
 #: Bytes of disk for a feature, with its descriptor and its matches; and for a pixel of a written photograph.
 BYTES_PER_FEATURE, BYTES_PER_PIXEL = 250, 0.9
+#: Where the positions are shown before the work, inside the output.
+POSITIONS_FIGURE = "photographs.png"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,6 +156,29 @@ def check_output_outside_images(output: Path, collection: ImageList) -> None:
                 f"{output}: lies among the photographs in {folder}, where it would be taken for more of them. Choose a "
                 "folder beside it."
             )
+
+
+def check_output_folder(output: Path) -> None:
+    """Only a new folder, an empty one, or one of an earlier reconstruction is written to."""
+    if output.is_dir() and not is_reconstruction(output) and _has_foreign_files(output):
+        raise VdgsError(f"{output}: holds other things already. Choose a new folder with --output.")
+    if output.exists() and not output.is_dir():
+        raise VdgsError(f"{output}: is a file. Choose a new folder with --output.")
+
+
+def _has_foreign_files(output: Path) -> bool:
+    """Whether a folder holds anything but what a reconstruction begins with."""
+    work = output / WORK_FOLDER
+    begun = work.is_dir() and all(each.suffix == ".tmp" for each in work.iterdir())  # ended before its first record
+    known = (
+        ".lock",
+        POSITIONS_FIGURE,
+        SOURCE_IMAGES_FILE,
+        FILMS_FILE,
+        FRAMES_FOLDER,
+        *([WORK_FOLDER] if begun else []),
+    )
+    return any(each.name not in known and each.suffix != ".tmp" for each in output.iterdir())
 
 
 def check_disk_space(plan: ReconstructionPlan) -> None:

@@ -62,9 +62,13 @@ class SourceImages:
 def source_changes(output: Path) -> str:
     """What changed in the folders of photographs since a capture was begun with them; empty where nothing did, and
     where they are not there any more (a card that was taken out)."""
+    from vdgs.sfm.films.take_frames import film_changes  # imports much that most runs do not need
+
     before = SourceImages.read(output)
     if before is None or not all(Path(folder).is_dir() for folder in before.folders):
         return ""
+    if films := film_changes(output):
+        return films
     try:
         return SourceImages.of([Path(folder) for folder in before.folders]).changes_since(before)
     except (VdgsError, OSError) as error:

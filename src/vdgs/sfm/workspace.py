@@ -26,8 +26,10 @@ from vdgs.system.units import rough_duration
 
 Result = TypeVar("Result")
 #: The steps that are counted, in their order.
-SfmStep = Literal["features", "matching", "mapping", "writing"]
+SfmStep = Literal["frames", "features", "matching", "mapping", "writing"]
 SFM_STEPS: tuple[SfmStep, ...] = get_args(SfmStep)
+#: What is counted of steps that do not count photographs.
+_UNITS = {"frames": "seconds", "matching": "pairs"}
 #: Seconds between two looks whether a person asked to stop.
 _POLL_SECONDS = 0.2
 #: Work that takes fewer seconds needs no lines about how far it is.
@@ -185,7 +187,7 @@ def report_progress(
     record = StepRecord(
         stage=SFM_STAGE,
         step=step,
-        unit="pairs" if step == "matching" else "photographs",
+        unit=_UNITS.get(step, "photographs"),
         total=total,
         later_seconds=sum(float(expected.get(name, 0)) for name in later),
     )

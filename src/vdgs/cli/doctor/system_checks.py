@@ -30,6 +30,7 @@ EXTRAS = {
     "lpips": "the linear heads of LPIPS",
     "tensorboard": "curves of the training in TensorBoard",
     "geo": "maps as GeoTIFFs, any EPSG system (vdgs ortho)",
+    "video": "films instead of photographs (vdgs sfm FILM.MP4)",
     "viewer": "a scene in a browser (vdgs view)",
     "ray": "blocks on many machines (--executor ray)",
     "gsplat": "another rasterizer on an NVIDIA GPU, to compare with",

@@ -1,0 +1,238 @@
+"""A film as PyAV decodes it: its frames with their moments, its subtitles, and what it says of itself."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from vdgs.errors import CaptureError
+from vdgs.sfm.films.high_dynamic_range import HDR_TRANSFERS, to_standard_range
+from vdgs.sfm.films.telemetry import Telemetry, read_subtitles, read_telemetry
+from vdgs.sfm.image_metadata import MIN_SIDE_PX
+from vdgs.system.quoting import shell_word
+
+#: Films of all directions, which hold no view of one lens.
+PANORAMIC_SUFFIXES = {".insv", ".360"}
+#: Of films with fewer lines than this, which do not say their colors, these are those of BT.601, else of BT.709.
+_HD_LINES = 720
+#: FFmpeg's numbers of color spaces: BT.709, BT.2020 (and its kind with constant luminance).
+_BT709, _BT2020, _UNSPECIFIED = 1, (9, 10), (2, 0)
+#: Codecs of data tracks in which cameras write positions that are not read.
+_DATA_TRACKS = {"djmd": "DJI", "dbgi": "DJI", "gpmd": "GoPro", "camm": "Google"}
+_ISO6709 = re.compile(r"([+-]\d+(?:\.\d+)?)([+-]\d+(?:\.\d+)?)")
+#: How films name who made them.
+_MAKE_KEYS = ("make", "com.apple.quicktime.make", "com.android.manufacturer")
+_MODEL_KEYS = ("model", "com.apple.quicktime.model", "com.android.model", "encoder")
+_PLACE_KEYS = ("location", "com.apple.quicktime.location.ISO6709", "location-eng", "xyz")
+_CAMERA = re.compile(r"(DJI|GoPro|Autel|Parrot|Skydio|Insta360)\b.*", re.IGNORECASE)
+
+
+class FilmFrame(NamedTuple):
+    """A decoded frame: the how many-th, its moment in seconds from the film's start, and the picture."""
+
+    number: int
+    seconds: float
+    picture: Any
+
+
+@dataclass(kw_only=True)
+class Film:
+    """An open film."""
+
+    path: Path
+    container: Any
+    stream: Any
+    seconds: float
+    camera: tuple[str, str]
+    """Maker and model; empty where the film does not say them."""
+    created: datetime | None
+    place: tuple[float, float] | None
+    """Latitude and longitude at the start."""
+    notes: list[str] = field(default_factory=list)
+    damaged: int = 0
+    """Packets that could not be decoded."""
+    subtitles: list[tuple[float, str]] = field(default_factory=list)
+    """Those that were read on the way."""
+
+    def frames(self) -> Iterator[FilmFrame]:
+        """All frames in order. Raises CaptureError for what cannot become photographs."""
+        number = 0
+        start = float((self.stream.start_time or 0) * self.stream.time_base)
+        for picture in self._pictures():
+            if not number:
+                _check(self, picture)
+            moment = (
+                float(picture.time) - start if picture.time is not None else number / (self.stream.average_rate or 25)
+            )
+            yield FilmFrame(number, moment, picture)
+            number += 1
+        if not number:
+            raise CaptureError(f"{self.path}: none of its frames can be decoded. Copy the film again.")
+
+    def _pictures(self) -> Iterator[Any]:
+        from av.error import FFmpegError
+
+        tracks = [self.stream, *self.container.streams.subtitles]
+        packets = self.container.demux(tracks)
+        while True:
+            try:
+                packet = next(packets, None)
+                if packet is None:
+                    return
+                if packet.stream.type == "subtitle":
+                    self._read_subtitle(packet)
+                    continue
+                yield from packet.decode()
+            except FFmpegError:  # what follows may be whole
+                self.damaged += 1
+                if self.damaged > 1000:
+                    return
+
+    def _read_subtitle(self, packet: Any) -> None:
+        words = bytes(packet)
+        if packet.stream.codec_context.name == "mov_text":
+            words = words[2 : 2 + int.from_bytes(words[:2], "big")]
+        if words and packet.pts is not None:
+            self.subtitles.append((float(packet.pts * packet.time_base), words.decode("utf-8", errors="replace")))
+
+    def telemetry(self) -> tuple[tuple[Telemetry, ...], str]:
+        """What its subtitles say, once its frames were read, or else the file of subtitles beside it; and which."""
+        records = read_telemetry(self.subtitles, self.place)
+        if records:
+            return records, "its subtitles"
+        for file in sorted(self.path.parent.glob("*.[sS][rR][tT]")):
+            if file.stem.lower() == self.path.stem.lower():
+                text = file.read_bytes().decode("utf-8-sig", errors="replace")
+                return read_telemetry(read_subtitles(text), self.place), file.name
+        return (), ""
+
+
+@contextmanager
+def open_film(path: Path) -> Iterator[Film]:
+    """An open film. Raises CaptureError where PyAV is missing, and for files that are no film or are cut off."""
+    av = _pyav(path)
+    if path.suffix.lower() in PANORAMIC_SUFFIXES:
+        raise CaptureError(
+            f"{path}: is a film of all directions. Export views of one direction out of the program of the camera, as "
+            "MP4 (reframe), and give these."
+        )
+    try:
+        container = av.open(str(path), metadata_errors="replace")
+    except (av.error.FFmpegError, OSError) as error:
+        raise CaptureError(_cannot_open(path, error)) from None
+    with container:
+        if not container.streams.video:
+            raise CaptureError(f"{path}: holds no pictures (sound alone?).")
+        stream = container.streams.video[0]
+        stream.thread_type = "AUTO"
+        tags = {**stream.metadata, **container.metadata}
+        tags = {key.lower(): value for key, value in tags.items()}
+        seconds = float((container.duration or 0) / av.time_base)
+        yield Film(
+            path=path, container=container, stream=stream, seconds=seconds, camera=_camera(tags),
+            created=_created(tags), place=_start_place(tags),
+        )  # fmt: skip
+
+
+def _pyav(path: Path) -> Any:
+    try:
+        av = importlib.import_module("av")
+        av.logging.set_level(av.logging.PANIC)
+        return av
+    except ImportError:
+        frames = f"ffmpeg -i {shell_word(path)} -vf fps=1 -qscale:v 2 frame_%05d.jpg"
+        raise CaptureError(
+            f"{path}: is a film, and films need PyAV: pip install 'vdgs[video]'. Or take frames out of the film with "
+            f"another program, without their positions ({frames}), and give their folder."
+        ) from None
+
+
+def _cannot_open(path: Path, error: BaseException) -> str:
+    with path.open("rb") as file:
+        head = file.read(12)
+    if head[4:8] == b"ftyp":
+        return (
+            f"{path}: the film has no index (moov), as where the battery was taken out while it was recorded, or it "
+            "was not copied whole. Copy it again; if the card has no more of it, the drone mends it when switched on "
+            "with the card in it, or untrunc does."
+        )
+    why = str(error).splitlines()[0][:120]
+    return f"{path}: is no film that can be read ({why}). Copy it again, or convert it to MP4."
+
+
+def _check(film: Film, picture: Any) -> None:
+    if min(picture.width, picture.height) < MIN_SIDE_PX:
+        raise CaptureError(f"{film.path}: is {picture.width} x {picture.height} pixels, too small to be matched.")
+    if picture.interlaced_frame:
+        better = film.path.with_name(f"{film.path.stem}-whole.mp4").name
+        raise CaptureError(
+            f"{film.path}: is interlaced: each frame holds the lines of two moments. Make whole frames first: ffmpeg "
+            f"-i {shell_word(film.path)} -vf bwdif -c:s copy -crf 16 {shell_word(better)}"
+        )
+    if picture.color_trc in HDR_TRANSFERS:
+        film.notes.append(f"is HDR ({HDR_TRANSFERS[picture.color_trc]}); its frames are written in the colors of sRGB")
+    others = {_DATA_TRACKS[tag] for tag in map(_codec_tag, film.container.streams) if tag in _DATA_TRACKS}
+    if others:
+        film.notes.append(f"has a data track of {' and '.join(sorted(others))}, which is not read")
+
+
+def _codec_tag(stream: Any) -> str:
+    context = getattr(stream, "codec_context", None)
+    return str(getattr(context, "codec_tag", "") or stream.metadata.get("handler_name", "")).strip().lower()[-4:]
+
+
+def _camera(tags: dict[str, str]) -> tuple[str, str]:
+    make, model = ("".join(tags.get(key, "") for key in keys[:1]) or next(
+        (tags[key] for key in keys if key in tags), "") for keys in (_MAKE_KEYS, _MODEL_KEYS))  # fmt: skip
+    if not make and not _CAMERA.fullmatch(model):  # an encoder's own name
+        return "", ""
+    return make.strip(), model.strip()
+
+
+def _created(tags: dict[str, str]) -> datetime | None:
+    try:
+        found = datetime.fromisoformat(tags.get("creation_time", "").replace("Z", "+00:00"))
+    except ValueError:
+        return None
+    return found.replace(tzinfo=None) if found.year > 1980 else None
+
+
+def _start_place(tags: dict[str, str]) -> tuple[float, float] | None:
+    found = next((match for key in _PLACE_KEYS if (match := _ISO6709.match(tags.get(key.lower(), "")))), None)
+    return (float(found[1]), float(found[2])) if found else None
+
+
+def gray_picture(picture: Any, width: int) -> UInt8[np.ndarray, "h w"]:
+    """The picture in gray, at most so wide: quick, for looking at many."""
+    width = min(width, picture.width)
+    height = max(1, round(picture.height * width / picture.width))
+    return picture.reformat(width=width, height=height, format="gray", interpolation="AREA").to_ndarray()
+
+
+def shrink(gray: UInt8[np.ndarray, "h w"], width: int) -> UInt8[np.ndarray, "h w"]:
+    if gray.shape[1] <= width:
+        return gray
+    return cv2.resize(gray, (width, max(1, round(gray.shape[0] * width / gray.shape[1]))), interpolation=cv2.INTER_AREA)
+
+
+def color_picture(picture: Any) -> UInt8[np.ndarray, "h w 3"]:
+    """The picture in sRGB, upright."""
+    space, trc = int(picture.colorspace), int(picture.color_trc)
+    if space in _UNSPECIFIED and picture.format.name.startswith("yuv"):
+        picture.colorspace = _BT709 if picture.height >= _HD_LINES else 5
+    if trc in HDR_TRANSFERS:
+        deep = picture.reformat(format="rgb48le").to_ndarray()
+        image = to_standard_range(deep, trc, wide_gamut=space in _BT2020)
+    else:
+        image = picture.reformat(format="rgb24").to_ndarray()
+    return np.ascontiguousarray(np.rot90(image, round(picture.rotation / 90)))

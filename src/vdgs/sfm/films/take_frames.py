@@ -1,0 +1,254 @@
+"""Films among what a capture is made of: their frames are taken into OUTPUT/frames, and are photographs from there on.
+
+Each film has a folder there; OUTPUT/films.json says which are finished. The same command takes no frame twice.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+
+from vdgs.captures.name_resolution import to_colmap_name
+from vdgs.captures.output_guard import check_output
+from vdgs.captures.reconstruction import FILMS_FILE, FRAMES_FOLDER, SOURCE_IMAGES_FILE, WORK_FOLDER
+from vdgs.config.ranges import check_ranges
+from vdgs.config.sfm_options import SfmRequest
+from vdgs.errors import CaptureError, VdgsError
+from vdgs.runs.run_folder import RunFolder
+from vdgs.sfm.films.film_reader import Film, FilmFrame, color_picture, gray_picture, open_film, shrink
+from vdgs.sfm.films.frame_choice import MOTION_WIDTH, SHARPNESS_WIDTH, FrameChooser, MotionTracker, sharpness
+from vdgs.sfm.films.frame_files import encode_frame, with_tags
+from vdgs.sfm.films.telemetry import Telemetry, places, telemetry_at
+from vdgs.sfm.find_images import films_in
+from vdgs.sfm.image_list import MIN_IMAGES
+from vdgs.sfm.reconstruction_plan import check_output_folder
+from vdgs.sfm.workspace import Workspace, report_progress
+from vdgs.system.atomic_files import read_json_or_empty, write_bytes, write_json
+from vdgs.system.file_locks import lock_folder
+from vdgs.system.records import record_from_dict, record_to_dict
+from vdgs.system.stop_signals import check_stop_requested
+from vdgs.system.units import duration, first_names
+
+#: So many frames a second are looked at.
+LOOKS_PER_SECOND = 15.0
+#: A film has at least so many frames of those that are asked for of all.
+LEAST_FRAMES = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilmRecord:
+    """A film whose frames were taken."""
+
+    film: str
+    file_bytes: int
+    mtime_ns: int
+    most: int
+    """The bound on its frames."""
+    frames: int
+    summary: str
+
+    def is_of(self, film: Path, most: int) -> bool:
+        status = film.stat()
+        return (self.film, self.file_bytes, self.mtime_ns, self.most) == (
+            str(film.resolve()), status.st_size, status.st_mtime_ns, most,
+        )  # fmt: skip
+
+
+@contextmanager
+def temporary_frames(request: SfmRequest, console: Console) -> Iterator[SfmRequest]:
+    """The request with frames in place of films, for a look that writes nothing into the output."""
+    if not films_in(request.image_folders):
+        yield request
+        return
+    with tempfile.TemporaryDirectory(prefix="vdgs-frames-") as folder:
+        yield replace(request, image_folders=_take(request, Path(folder), console))
+
+
+def with_frames(request: SfmRequest, console: Console, run: RunFolder | None = None) -> SfmRequest:
+    """The request with frames in place of films, which are taken into the output where they are not there yet.
+
+    Raises CaptureError for films that cannot be read or show no way, VdgsError for films that are others than those a
+    capture was begun with.
+    """
+    films = films_in(request.image_folders)
+    if not films:
+        return request
+    check_ranges(request)
+    check_output(request.output)
+    check_output_folder(request.output)
+    before = _records(request.output)
+    if (
+        (changes := _changes(before, films))
+        and not request.overwrite
+        and (request.output / SOURCE_IMAGES_FILE).exists()
+    ):
+        raise VdgsError(
+            f"{request.output}: was begun with other films than there are now ({changes}). Add --overwrite to make it "
+            "anew of those that are there, or choose another --output."
+        )
+    with run.drive_lock() if run is not None else nullcontext(), lock_folder(request.output):
+        return replace(request, image_folders=_take(request, request.output, console))
+
+
+def film_changes(output: Path) -> str:
+    """What changed of the films that a capture was made of; empty where nothing did, or they are not there any more."""
+    records = _records(output).values()
+    there = [Path(record.film) for record in records]
+    if not there or not all(film.is_file() for film in there):
+        return ""
+    return _changes(_records(output), there)
+
+
+def _changes(before: Mapping[str, FilmRecord], films: Sequence[Path]) -> str:
+    known, now = {record.film: record for record in before.values()}, {str(film.resolve()): film for film in films}
+    same = known.keys() & now.keys()
+    kinds = {
+        "added": now.keys() - known.keys(), "removed": known.keys() - now.keys(),
+        "changed": {name for name in same if not known[name].is_of(now[name], known[name].most)},
+    }  # fmt: skip
+    parts = [
+        f"{len(names)} {kind} ({first_names(sorted(Path(name).name for name in names))})"
+        for kind, names in kinds.items()
+        if names
+    ]
+    return f"films: {', '.join(parts)}" if known and parts else ""
+
+
+def _records(output: Path) -> dict[str, FilmRecord]:
+    """Of the films whose frames were taken, by their folders."""
+    try:
+        found = read_json_or_empty(output / FILMS_FILE)
+        return {name: record_from_dict(FilmRecord, value) for name, value in found.items()}
+    except ValueError:
+        return {}
+
+
+def _take(request: SfmRequest, output: Path, console: Console) -> tuple[Path, ...]:
+    """The folders of photographs: those of the request, and the folder of frames."""
+    films, folder = films_in(request.image_folders), output / FRAMES_FOLDER
+    names, before = _folder_names(films), _records(output)
+    most = _bounds(films, request.options.num_frames)
+    for rest in folder.iterdir() if folder.is_dir() else ():
+        if rest.is_dir() and rest.name not in names:
+            shutil.rmtree(rest)
+    bounds = dict(zip(names, zip(films, most, strict=True), strict=True))
+    records = {name: record for name, record in before.items() if name in names and record.is_of(*bounds[name])}
+    records = {name: record for name, record in records.items() if (folder / name).is_dir()}
+    _write_records(output, records)
+    for name, (film, bound) in bounds.items():
+        if name not in records:
+            records[name] = _take_frames(film, folder / name, bound, Workspace(output / WORK_FOLDER), console)
+            _write_records(output, records)
+        known = records[name]
+        console.print(escape(f"{film.name}: {known.summary}"), highlight=False)
+    count = sum(record.frames for record in records.values())
+    others = tuple(path for path in request.image_folders if not films_in((path,)))
+    if count < MIN_IMAGES and not others:
+        raise CaptureError(
+            f"{', '.join(map(str, films))}: {count} frames that differ from each other; a scene needs {MIN_IMAGES} at "
+            "the very least. The picture must move: films from one spot show no place from different sides."
+        )
+    return (*others, folder)
+
+
+def _write_records(output: Path, records: Mapping[str, FilmRecord]) -> None:
+    write_json(output / FILMS_FILE, {name: record_to_dict(record) for name, record in records.items()})
+
+
+def _folder_names(films: Sequence[Path]) -> list[str]:
+    """A name for each film, numbered where they are alike."""
+    names, used = list[str](), set[str]()
+    for film in films:
+        name = stem = to_colmap_name(film.stem).strip(".") or "film"
+        number = 2
+        while name.lower() in used:
+            name, number = f"{stem}_{number}", number + 1
+        used.add(name.lower())
+        names.append(name)
+    return names
+
+
+def _bounds(films: Sequence[Path], total: int) -> list[int]:
+    """How many frames are taken of each film at most: by how long they are."""
+    if len(films) == 1:
+        return [total]
+    lengths = []
+    for path in films:
+        with open_film(path) as film:
+            lengths.append(max(film.seconds, 1.0))
+    return [max(LEAST_FRAMES, int(total * length / sum(lengths))) for length in lengths]
+
+
+def _take_frames(path: Path, folder: Path, most: int, work: Workspace, console: Console) -> FilmRecord:
+    """Write the frames of a film that are chosen, then what is known of each into the files."""
+    shutil.rmtree(folder, ignore_errors=True)
+    moments, stat = dict[Path, float](), path.stat()
+
+    def keep(frame: FilmFrame) -> Path:
+        file = folder / f"{folder.name}_{frame.number:06d}.jpg"
+        write_bytes(file, encode_frame(color_picture(frame.picture)))
+        moments[file] = frame.seconds
+        return file
+
+    with open_film(path) as film:
+        chooser = FrameChooser[FilmFrame](most, keep, Path.unlink)
+        with report_progress(work, console, "frames", max(1, round(film.seconds)), f"{escape(path.name)}, ") as tell:
+            last = _look(film, chooser, tell)
+        chosen = chooser.finish()
+        records, source = film.telemetry()
+        for file in chosen:
+            known = telemetry_at(records, moments[file])
+            moment = _moment(film, records, known, moments[file])
+            write_bytes(file, with_tags(file.read_bytes(), folder.name, film.camera, moment, known))
+            os.utime(file, ns=(stat.st_mtime_ns, stat.st_mtime_ns))  # frames that are taken again are no others
+        summary = _summary(film, len(chosen), last, records, source)
+    return FilmRecord(
+        film=str(path.resolve()), file_bytes=stat.st_size, mtime_ns=stat.st_mtime_ns, most=most, frames=len(chosen),
+        summary=summary,
+    )  # fmt: skip
+
+
+def _look(film: Film, chooser: FrameChooser[FilmFrame], tell) -> FilmFrame:  # type: ignore[no-untyped-def]
+    """Show the frames to what chooses; returns the last."""
+    tracker, due = MotionTracker(), 0.0
+    for frame in film.frames():
+        check_stop_requested()
+        if frame.seconds < due:
+            continue
+        due = frame.seconds + 0.99 / LOOKS_PER_SECOND
+        gray = gray_picture(frame.picture, SHARPNESS_WIDTH)
+        travel = tracker.travel(shrink(gray, MOTION_WIDTH), frame.seconds)
+        chooser.offer(travel, sharpness(gray), frame)
+        tell(min(round(frame.seconds), max(1, round(film.seconds))))
+    return frame
+
+
+def _moment(film: Film, records: Sequence[Telemetry], known: Telemetry, seconds: float) -> datetime | None:
+    """When a frame was taken; of films that do not say when they were begun, in the order of the frames."""
+    if any(record.moment for record in records):
+        return known.moment
+    return film.created and film.created + timedelta(seconds=seconds)
+
+
+def _summary(film: Film, count: int, last: FilmFrame, records: Sequence[Telemetry], source: str) -> str:
+    """96 of 2,400 frames of 1 min 20 s, 3840 x 2160; positions of its subtitles."""
+    size = f"{film.stream.width} x {film.stream.height}"
+    placed = len(list(places(records)))
+    said = f"positions of {source}" if placed else "no positions"
+    if not placed:
+        said += " (drones write them into subtitles where captions are switched on; or give a table with --gps)"
+    notes = [said, *film.notes]
+    if film.damaged:
+        notes.append(f"{film.damaged} packets are damaged, their frames left out")
+    if last.seconds < 0.9 * film.seconds - 1:
+        notes.append(f"ends after {duration(last.seconds)}: cut off?")
+    return f"{count:,} of {last.number + 1:,} frames in {duration(last.seconds)}, {size}; {'; '.join(notes)}"

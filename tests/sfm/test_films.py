@@ -1,0 +1,318 @@
+"""Films as photographs: which frames are taken, what is known of each, and what is refused."""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+import sys
+from datetime import datetime
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from rich.console import Console
+
+from support.films import crops, panorama, write_film
+from vdgs.captures.loading import load_capture
+from vdgs.config.sfm_options import SfmOptions, SfmRequest
+from vdgs.errors import CaptureError, VdgsError
+from vdgs.runs.run_folder import RunFolder
+from vdgs.sfm.films import take_frames
+from vdgs.sfm.films.frame_choice import STEP, FrameChooser, MotionTracker, sharpness
+from vdgs.sfm.films.high_dynamic_range import to_standard_range
+from vdgs.sfm.films.take_frames import film_changes, temporary_frames, with_frames
+from vdgs.sfm.films.telemetry import read_subtitles, read_telemetry, telemetry_at
+from vdgs.sfm.find_images import films_in
+from vdgs.sfm.image_list import ImageList, collect_images, is_image_folder
+
+pytest.importorskip("av")
+#: Stands for 2 s, then moves by 4 of 200 pixels a frame.
+LEFTS = [0] * 20 + [4 * k for k in range(60)]
+
+
+def ask(output: Path, *films: Path, num_frames: int = 300, overwrite: bool = False) -> SfmRequest:
+    options = SfmOptions(num_frames=num_frames)
+    return SfmRequest(image_folders=films, output=output, options=options, overwrite=overwrite)
+
+
+def take(request: SfmRequest) -> tuple[ImageList, str]:
+    said = io.StringIO()
+    return collect_images(with_frames(request, Console(file=said, width=400)).image_folders), said.getvalue()
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A film of 80 frames in 8 s, each frame 1e-5 degrees north of the one before it; two of three are blurred."""
+    file = tmp_path_factory.mktemp("card") / "DJI 1.MP4"
+    pictures = crops(panorama(), LEFTS)
+    blurred = [each if k % 3 == 0 else cv2.blur(each, (9, 5)) for k, each in enumerate(pictures)]
+    words = [
+        f"<font>FrameCnt: {k}\n2026-06-01 10:00:{k // 10:02d}.{k % 10}00\n[focal_len: 240] [latitude: "
+        f"{-33.5 + k * 1e-5:.6f}] [longitude: -70.600000] [rel_alt: {10 + k / 10} abs_alt: -2.5] [gb_yaw: 90.0 "
+        "gb_pitch: -80.0 gb_roll: 0.0]</font>"
+        for k in range(80)
+    ]
+    write_film(file, blurred, 10.0, words, {"make": "DJI", "model": "FC3582"})
+    return file
+
+
+@pytest.mark.parametrize(
+    ("words", "place", "altitude", "relative", "focal"),
+    [
+        ("[latitude: -47.1] [longitude: 8.2] [rel_alt: 10.5 abs_alt: 400.0]", (-47.1, 8.2), 400.0, 10.5, None),
+        ("<font size=\"36\">[focal_len : 240] [dzoom_ratio: 15000, delta:0] [latitude : 47.1] [longtitude : 8.2] "
+         "[altitude: 12.3]</font>", (47.1, 8.2), 12.3, None, 36.0),
+        ("[focal_len: 24.00] [dzoom_ratio: 1.00] [latitude: 47.1] [longitude: -8.2]", (47.1, -8.2), None, None, 24.0),
+        ("HOME(8.1,47.2) 2017.08.05 14:11:51\nGPS(8.2,47.1,16) BAROMETER:1.9\nISO:100", (47.1, 8.2), None, 1.9, None),
+        ("F/2.8, SS 206, GPS (8.2, 47.1, 15), D 224.20m, H -58.20m, H.S 0.0m/s", (47.1, 8.2), None, -58.2, None),
+        ("RTK (120.08, 30.2, 18), HOME (120.0, 30.0, 103.55m), H 1.03m", (30.2, 120.08), None, 1.03, None),
+        ("GPS(W: 117.04, N: 32.96, 32.15m)", (32.96, -117.04), 32.15, None, None),
+        ("GPS (30.2, 120.08, 18)", (30.2, 120.08), None, None, None),
+    ],
+)  # fmt: skip
+def test_dialects_of_subtitles(words, place, altitude, relative, focal):
+    [record] = read_telemetry([(1.0, words)])
+    assert record.lat_lon == pytest.approx(place)
+    assert record.altitude == altitude
+    assert record.relative_altitude == relative
+    assert record.focal_35mm == (focal and pytest.approx(focal))
+
+
+def test_where_the_film_began_tells_the_order_of_two_numbers():
+    blocks = [(float(k), f"GPS (47.1{k}, 8.2, 12)") for k in range(3)]
+    assert read_telemetry(blocks, (47.1, 8.2))[0].lat_lon == (47.10, 8.2)
+    assert read_telemetry(blocks)[0].lat_lon == (8.2, 47.10)  # as DJI documents it
+
+
+def test_no_fix_and_no_place_are_no_position():
+    for words in ("[latitude: 0.000000] [longitude: 0.000000]", "GPS(0.0, 0.0, 0)", "[latitude: 95] [longitude: 8]"):
+        assert all(record.lat_lon is None for record in read_telemetry([(0.0, words)]))
+    assert read_telemetry([(0.0, "Turn left at the lights.")]) == ()
+
+
+def test_positions_lie_between_those_of_the_records_and_are_not_made_up():
+    text = "1\n00:00:01,000 --> 00:00:02,000\n{a}\n\n2\n00:00:02,000 --> 00:00:03,000\n{b}\n"
+    a, b = ("[latitude: 47.0] [longitude: 8.0] [rel_alt: 10.0]", "[latitude: 47.1] [longitude: 8.4] [rel_alt: 20.0]")
+    records = read_telemetry(read_subtitles(text.format(a=a, b=b)))
+    between = telemetry_at(records, 1.25)
+    assert between.lat_lon == pytest.approx((47.025, 8.1))
+    assert between.relative_altitude == pytest.approx(12.5)
+    assert telemetry_at(records, 60.0).lat_lon is None
+    assert telemetry_at((), 1.0).lat_lon is None
+
+
+def test_frames_are_apart_sharp_and_know_their_place(flight: Path, tmp_path: Path):
+    images, said = take(ask(tmp_path / "out", flight))
+    numbers = [int(photo.path.stem.rpartition("_")[2]) for photo in images.images]
+    assert sum(number < 20 for number in numbers) <= 1, "one of where it stands"
+    assert all(number % 3 == 0 for number in numbers), "none of the blurred"
+    lefts = np.array([LEFTS[number] for number in numbers])
+    assert (np.diff(lefts) > 0.5 * STEP * 200).all()
+    assert (np.diff(lefts) < 1.6 * STEP * 200).all()
+    assert lefts[-1] > LEFTS[-1] - STEP * 200
+    for number, photo in zip(numbers, images.images, strict=True):
+        assert photo.lat_lon == pytest.approx((-33.5 + number * 1e-5, -70.6), abs=2e-7)
+        assert photo.altitude == pytest.approx(-2.5)
+        assert photo.relative_altitude == pytest.approx(10 + number / 10, abs=1e-3)
+        assert photo.datetime == f"2026:06:01 10:00:{number // 10:02d}"
+        assert photo.camera == "DJI FC3582 no. DJI_1"
+        assert photo.attitude is not None
+        assert photo.attitude.tilt_deg == pytest.approx(10)
+        assert photo.lens is not None
+        assert photo.lens.focal == pytest.approx(24 / 43.27 * 1.25 * 1.0, rel=0.03)
+    assert f"{len(numbers)} of 80 frames" in said
+    assert "positions of its subtitles" in said
+
+
+def test_a_bound_on_frames_is_kept_and_spreads_them(flight: Path, tmp_path: Path):
+    images, _ = take(ask(tmp_path / "out", flight, num_frames=4))
+    lefts = [LEFTS[int(photo.path.stem.rpartition("_")[2])] for photo in images.images]
+    assert 3 <= len(lefts) <= 4
+    assert max(lefts) - min(lefts) > 0.7 * LEFTS[-1]
+
+
+def test_the_step_grows_where_a_film_goes_far():
+    written = set[Path]()
+
+    def keep(place: float) -> Path:
+        written.add(Path(str(place)))
+        return Path(str(place))
+
+    chooser = FrameChooser[float](10, keep, written.remove)
+    for k in range(5000):
+        chooser.offer(k * STEP / 4, 1.0, k * STEP / 4)
+        assert len(written) <= 21
+    chosen = np.array([float(str(each)) for each in chooser.finish()])
+    assert {Path(str(place)) for place in chosen} == written
+    assert len(chosen) == 10
+    assert np.diff(chosen).max() <= 2 * chosen[-1] / 9
+
+
+def test_motion_is_measured_also_after_cuts_and_over_water():
+    gray = panorama(seed=2)[..., 0]
+    tracker = MotionTracker()
+    moved = [tracker.travel(np.ascontiguousarray(gray[:160, 3 * k : 3 * k + 320]), k / 10) for k in range(100)]
+    assert moved[-1] == pytest.approx(3 * 99 / 320, rel=0.1)
+    jump = tracker.travel(np.ascontiguousarray(panorama(seed=9)[:160, :320, 0]), 10.0)
+    assert jump >= moved[-1] + STEP
+    blind = MotionTracker()
+    water = [blind.travel(np.full((160, 320), 80, np.uint8), k / 10) for k in range(41)]
+    assert water[-1] == pytest.approx(4 * STEP, rel=0.01)
+    assert sharpness(gray) > 4 * sharpness(cv2.blur(gray, (9, 5)))
+
+
+def test_films_of_folders_and_of_several_cards(flight: Path, tmp_path: Path):
+    for card in ("A", "B"):
+        (tmp_path / card).mkdir()
+        shutil.copy(flight, tmp_path / card / "DJI 1.MP4")
+    (tmp_path / "B" / "DJI 1.MP4").write_bytes(flight.read_bytes())
+    assert is_image_folder(tmp_path / "A")
+    assert is_image_folder(flight)
+    images, _ = take(ask(tmp_path / "out", tmp_path / "A", tmp_path / "B", num_frames=8))
+    assert {photo.camera for photo in images.images} == {"DJI FC3582 no. DJI_1", "DJI FC3582 no. DJI_1_2"}
+    assert len(images.images) <= 8
+
+
+def test_films_beside_photographs_are_named_and_used_where_they_are_named(flight: Path, tmp_path: Path):
+    images, _ = take(ask(tmp_path / "out", flight))
+    (tmp_path / "mixed").mkdir()
+    for photo in images.images[:4]:
+        shutil.copy(photo.path, tmp_path / "mixed")
+    film = Path(shutil.copy(flight, tmp_path / "mixed"))
+    assert films_in([tmp_path / "mixed"]) == []
+    assert any("1 film beside the photographs: not used" in note for note in collect_images([tmp_path / "mixed"]).notes)
+    assert films_in([tmp_path / "mixed", film]) == [film]
+
+
+def test_the_same_command_takes_no_frame_twice_and_other_films_are_refused(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    film, output = Path(shutil.copy(flight, tmp_path / "a.mp4")), tmp_path / "out"
+    before = {photo.path: photo.path.stat().st_mtime_ns for photo in take(ask(output, film))[0].images}
+    (output / "photographs.json").write_text("{}")
+    monkeypatch.setattr(take_frames, "open_film", None)
+    assert {photo.path: photo.path.stat().st_mtime_ns for photo in take(ask(output, film))[0].images} == before
+    monkeypatch.undo()
+    assert film_changes(output) == ""
+    os.utime(film, (1, 1))
+    assert film_changes(output) == "films: 1 changed (a.mp4)"
+    with pytest.raises(VdgsError, match=r"1 changed \(a.mp4\).*--overwrite"):
+        take(ask(output, film))
+    again = take(ask(output, film, overwrite=True))[0].images
+    assert {photo.path for photo in again} == before.keys()
+
+
+def test_a_stop_while_frames_are_taken_leaves_an_output_that_goes_on(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    run = RunFolder(tmp_path / "run")
+    request = ask(run.own_capture, Path(shutil.copy(flight, tmp_path / "a.mp4")), flight)
+    look, left = take_frames._look, [1]
+
+    def stop(*arguments):
+        if not left:
+            raise KeyboardInterrupt
+        left.pop()
+        return look(*arguments)
+
+    monkeypatch.setattr(take_frames, "_look", stop)
+    with pytest.raises(KeyboardInterrupt):
+        with_frames(request, Console(file=io.StringIO()), run)
+    finished = {file: file.stat().st_ino for file in (run.own_capture / "frames" / "a").iterdir()}
+    monkeypatch.undo()
+    run.check_output_empty()
+    with_frames(request, Console(file=io.StringIO()), run)
+    assert {file: file.stat().st_ino for file in (run.own_capture / "frames" / "a").iterdir()} == finished
+    assert len([*(run.own_capture / "frames" / "DJI_1").iterdir()]) > 3
+
+
+def test_a_look_writes_nothing_into_the_output(flight: Path, tmp_path: Path):
+    with temporary_frames(ask(tmp_path / "out", flight), Console(file=io.StringIO())) as request:
+        [folder] = request.image_folders
+        assert len(collect_images([folder]).images) > 3
+    assert not folder.exists()
+    assert not (tmp_path / "out").exists()
+
+
+def test_sidecar_subtitles_uneven_frames_and_no_positions(tmp_path: Path):
+    film = tmp_path / "DJI_2.MOV"
+    moments = [0.1 * k + (0.7 if k > 30 else 0) for k in range(60)]
+    write_film(film, crops(panorama(), [4 * k for k in range(60)]), moments=moments)
+    images, said = take(ask(tmp_path / "one", film))
+    assert "no positions (drones write them into subtitles" in said
+    assert [photo.lat_lon for photo in images.images] == [None] * len(images.images)
+    times = [f"00:00:{int(t):02d},{round(1000 * (t % 1)):03d}" for t in moments]
+    blocks = [f"{k}\n{at} --> {at}\n[latitude: {47 + k * 1e-5:.6f}] [longitude: 8.2]\n" for k, at in enumerate(times)]
+    (tmp_path / "dji_2.SRT").write_text("\n".join(blocks))
+    images, said = take(ask(tmp_path / "two", film))
+    assert "positions of dji_2.SRT" in said
+    for photo in images.images:
+        number = int(photo.path.stem.rpartition("_")[2])
+        assert photo.lat_lon == pytest.approx((47 + number * 1e-5, 8.2), abs=2e-7)
+
+
+def test_a_film_that_lies_on_its_side_becomes_upright(tmp_path: Path):
+    upright = crops(panorama(), [4 * k for k in range(40)])
+    write_film(tmp_path / "a.mp4", [np.rot90(each) for each in upright], rotation=-90)
+    images, _ = take(ask(tmp_path / "out", tmp_path / "a.mp4"))
+    for photo in images.images:
+        number = int(photo.path.stem.rpartition("_")[2])
+        pixels = np.asarray(Image.open(photo.path)).astype(float)
+        assert pixels.shape == (160, 200, 3)
+        assert np.abs(pixels - upright[number]).mean() < 6
+
+
+def test_what_cannot_become_photographs_is_refused(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    whole = flight.read_bytes()
+    files = {
+        "cut.mp4": (whole[: whole.index(b"moov") - 4], r"no index \(moov\)"),
+        "text.mp4": (b"no film at all" * 20, "is no film that can be read"),
+        "note.mp4": (b"", "is no film that can be read"),
+        "round.insv": (whole, "is a film of all directions"),
+    }
+    for name, (content, said) in files.items():
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(CaptureError, match=said):
+            take(ask(tmp_path / "out", tmp_path / name))
+    write_film(tmp_path / "still.mp4", crops(panorama(), [0] * 30))
+    with pytest.raises(CaptureError, match="1 frames that differ from each other"):
+        take(ask(tmp_path / "out", tmp_path / "still.mp4"))
+    with pytest.raises(CaptureError, match="is a film, which becomes a capture first: vdgs sfm"):
+        load_capture(flight)
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(CaptureError, match=r"pip install 'vdgs\[video\]'"):
+        take(ask(tmp_path / "other", flight))
+
+
+def test_a_film_that_ends_early_gives_what_it_has(flight: Path, tmp_path: Path):
+    content = bytearray(flight.read_bytes())
+    start = content.index(b"mdat") + 4
+    middle, end = start + (content.index(b"moov") - start) // 2, content.index(b"moov") - 4
+    content[middle:end] = bytes(end - middle)
+    (tmp_path / "a.mp4").write_bytes(content)
+    images, said = take(ask(tmp_path / "out", tmp_path / "a.mp4"))
+    assert len(images.images) >= 3
+    assert "damaged" in said or "cut off" in said
+
+
+def test_white_of_hdr_is_white_and_order_is_kept():
+    ramp = np.linspace(0, 65535, 1001).astype(np.uint16)[None, :, None].repeat(3, 2)
+    for transfer, white in ((18, 0.75), (16, 0.58)):
+        gray = to_standard_range(ramp, transfer)[0]
+        assert (np.diff(gray.astype(int), axis=0) >= 0).all()
+        assert gray[0].max() == 0
+        assert gray[round(1000 * white)].min() >= 245
+        assert gray[round(500 * white)].max() < 160
+        assert np.ptp(gray.astype(int), axis=1).max() <= 2, "gray stays gray"
+
+
+def test_moments_without_a_clock_in_the_film(tmp_path: Path):
+    write_film(tmp_path / "a.mp4", crops(panorama(), [4 * k for k in range(40)]),
+               metadata={"creation_time": "2026-06-01T10:00:58Z"})  # fmt: skip
+    images, _ = take(ask(tmp_path / "out", tmp_path / "a.mp4"))
+    moments = [datetime.strptime(photo.datetime, "%Y:%m:%d %H:%M:%S") for photo in images.images]
+    assert moments == sorted(moments)
+    assert moments[-1] > datetime(2026, 6, 1, 10, 1)

@@ -1,0 +1,95 @@
+"""Films as drones write them: H.264 with subtitles, of given pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from fractions import Fraction
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from support import flights
+from vdgs.geometry.camera import Camera
+from vdgs.geometry.geodesy import geodetic_from_enu
+from vdgs.synth.flight_cameras import pose_from_angles
+from vdgs.synth.image_renderer import render_image
+
+
+def write_film(
+    file: Path,
+    pictures: Iterable[np.ndarray],
+    fps: float = 10.0,
+    subtitles: Sequence[str] = (),
+    metadata: Mapping[str, str] | None = None,
+    moments: Sequence[float] | None = None,
+    rotation: int = 0,
+) -> None:
+    """Pictures [h, w, 3] uint8, each with its subtitle where there are any; `moments` are seconds, not even ones."""
+    import av
+
+    with av.open(str(file), "w", options={"movflags": "use_metadata_tags"}) as container:
+        container.metadata.update(metadata or {})
+        stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
+        words = container.add_mux_stream("mov_text") if subtitles else None
+        for number, picture in enumerate(pictures):
+            if not number:
+                stream.set_display_rotation(rotation)
+                stream.height, stream.width = picture.shape[:2]
+                stream.pix_fmt, stream.options = "yuv420p", {"crf": "12", "preset": "ultrafast"}
+                stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
+            moment = round(1000 * (number / fps if moments is None else moments[number]))
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
+            frame.pts, frame.time_base = moment, Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+            if words is not None:
+                text = subtitles[number].encode()
+                packet = av.Packet(len(text).to_bytes(2, "big") + text)
+                packet.stream, packet.time_base = words, Fraction(1, 1000)
+                packet.pts = packet.dts = moment
+                packet.duration = round(1000 / fps)
+                container.mux(packet)
+        container.mux(stream.encode(None))
+
+
+def panorama(width: int = 1200, height: int = 200, seed: int = 1) -> np.ndarray:
+    """Something with corners to move over, uint8 [h, w, 3]."""
+    rng = np.random.default_rng(seed)
+    layers = [rng.uniform(20, 120, (height // cell, width // cell, 3)).astype(np.float32) for cell in (10, 4)]
+    grown = [cv2.resize(layer, (width, height), interpolation=cv2.INTER_CUBIC) for layer in layers]
+    return sum(grown).clip(0, 255).astype(np.uint8)
+
+
+def crops(picture: np.ndarray, lefts: Iterable[float], size: tuple[int, int] = (200, 160)) -> list[np.ndarray]:
+    """Views of so many pixels (width, height) whose left edges are at these columns."""
+    width, height = size
+    return [
+        cv2.warpAffine(picture, np.float32([[1, 0, -left], [0, 1, -20]]), (width, height), flags=cv2.INTER_LINEAR)
+        for left in lefts
+    ]
+
+
+def town_film(file: Path, *, strips: int = 3, each: int = 25, step: float = 2.0) -> list[Camera]:
+    """A flight in strips over a generated town as a film of 320 x 240 pixels, of which two frames in three are blurred;
+    returns the true camera of each frame (metres east, north, up of `flights.ORIGIN`)."""
+    cameras, rng, spacing = list[Camera](), np.random.default_rng(3), 6
+    for strip in range(strips):
+        for k in range(each + (spacing if strip + 1 < strips else 0)):
+            along, beside = min(k, each - 1), max(0, k - each + 1)
+            x = (along if strip % 2 == 0 else each - 1 - along) - (each - 1) / 2
+            y = spacing * strip + beside - spacing * (strips - 1) / 2
+            place = np.array([step * x, step * y, flights.ALTITUDE_M + 0.3 * np.sin(k / 5)])
+            pose = pose_from_angles(place, np.radians(rng.normal(0, 1)), np.pi / 2, np.radians(rng.normal(0, 1)))
+            cameras.append(Camera(camera_from_world=pose, fx=272, fy=272, cx=160, cy=120, width=320, height=240))
+    (town, tracer), sky = flights.town_of(60.0), flights.sky_over(60.0)
+    pictures = [render_image(town, tracer, sky, camera, 1, np.ones(3)) for camera in cameras]
+    pictures = [cv2.blur(each, (7, 1)) if k % 3 else each for k, each in enumerate(pictures)]
+    places = geodetic_from_enu(np.stack([camera.position for camera in cameras]), flights.ORIGIN)
+    words = [
+        f'<font size="28">SrtCnt : {k + 1}, DiffTime : 100ms\n2026-06-01 10:00:{k // 10:02d},{k % 10}00\n[iso : 100] '
+        f"[focal_len: 29.40] [latitude: {lat:.6f}] [longitude: {lon:.6f}] [rel_alt: {camera.position[2]:.3f} abs_alt: "
+        f"{alt:.3f}] [gb_yaw: 0.0 gb_pitch: -90.0 gb_roll: 0.0] </font>"
+        for k, ((lat, lon, alt), camera) in enumerate(zip(places, cameras, strict=True))
+    ]
+    write_film(file, pictures, 10.0, words)
+    return cameras
