@@ -181,9 +181,9 @@ def test_gray_sixteen_bit_alpha_and_palette(tmp_path):
     np.testing.assert_array_equal(opaque, alpha[:, :, 0] > 0)
     Image.fromarray(rgb).quantize(8).save(tmp_path / "palette.png")
     assert decode_image(tmp_path / "palette.png")[0].shape == rgb.shape
-    Image.fromarray(rgb).convert("CMYK").save(tmp_path / "print.jpg")
-    with pytest.raises(CaptureError, match="CMYK; convert"):
-        read_header(tmp_path / "print.jpg")
+    Image.fromarray(rgb[:, :, 0].astype(np.float32)).save(tmp_path / "heights.tif")
+    with pytest.raises(CaptureError, match="F; convert"):
+        read_header(tmp_path / "heights.tif")
 
 
 def test_exif_orientation_is_not_applied(tmp_path):

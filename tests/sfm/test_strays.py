@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import struct
 from pathlib import Path
 
@@ -12,7 +13,9 @@ import pytest
 from PIL import Image
 
 from support.flights import add_xmp, write_photograph
-from vdgs.captures.image_files import decode_mask, verify_image
+from support.raw_writer import write_dng
+from vdgs.captures import image_files
+from vdgs.captures.image_files import decode_image, decode_mask, verify_image
 from vdgs.captures.jpeg import lacks_only_end
 from vdgs.captures.strays import walk
 from vdgs.config.sfm_options import SfmOptions
@@ -24,6 +27,7 @@ from vdgs.sfm.image_metadata import UnusableImage, read_image_metadata
 from vdgs.sfm.incremental_mapper import should_fix_focal
 from vdgs.sfm.preflight import make_preflight_report
 from vdgs.sfm.workspace import Workspace
+from vdgs.sfm.xmp import read_xmp
 
 COUNT = 6
 
@@ -216,6 +220,52 @@ def test_thermal_pictures_beside_visible_ones_are_left_out(tmp_path):
     assert len(collect_images([tmp_path]).images) == COUNT
 
 
+def bands(folder: Path, names: list[str], xmp: str = "") -> None:
+    for k, name in enumerate(names):
+        exif = Image.Exif()
+        exif[0x010F], exif[0x0110] = "Maker", "Bands"
+        exif.get_ifd(0x8769)[0x920A] = 5.4
+        gray = pixels(k)[..., 0].astype(np.uint16) * 257
+        more = {0x02BC: (xmp % k).encode()} if xmp else {}
+        Image.fromarray(gray).save(folder / name, exif=exif, tiffinfo=more)
+
+
+@pytest.mark.parametrize(
+    "tails", [("_MS_G.TIF", "_MS_R.TIF", "_MS_RE.TIF", "_MS_NIR.TIF"), ("_GRE.TIF", "_RED.TIF", "_REG.TIF", "_NIR.TIF")]
+)
+def test_of_a_multispectral_set_the_color_photographs_are_used(tmp_path, tails):
+    names = flight(tmp_path)
+    bands(tmp_path, [f"DJI_{k + 1:04d}{tail}" for k in range(COUNT) for tail in tails])
+    found = collect_images([tmp_path])
+    assert [photo.name for photo in found.images] == names
+    assert len(found.excluded) == COUNT * len(tails)
+    assert any(
+        "Green (6), NIR (6), Red (6), Red edge (6); the 6 color photographs beside them are used" in note
+        for note in found.notes
+    )
+
+
+def test_of_a_multispectral_set_without_color_one_band_is_used(tmp_path):
+    bands(tmp_path, [f"IMG_{k:04d}_{band}.tif" for k in range(COUNT) for band in range(1, 6)])
+    found = collect_images([tmp_path])
+    assert [photo.name for photo in found.images] == [f"IMG_{k:04d}_2.tif" for k in range(COUNT)]
+    assert any("Green is used, in gray" in note for note in found.notes)
+    for file in tmp_path.glob("*_[!4].tif"):
+        file.unlink()
+    assert len(collect_images([tmp_path]).images) == COUNT  # what is given alone is meant
+
+
+def test_bands_are_known_by_their_tags(tmp_path):
+    """DJI's P4 Multispectral numbers its pictures; color cameras list three bands."""
+    flight(tmp_path)
+    packet = "<Camera:BandName><rdf:Seq><rdf:li>Blue %d</rdf:li></rdf:Seq></Camera:BandName>"
+    bands(tmp_path, [f"DJI_{k:04d}.TIF" for k in (12, 13)], packet)
+    excluded = {each.name: each.reason for each in collect_images([tmp_path]).excluded}
+    assert excluded["DJI_0012.TIF"].startswith("is of the band Blue 0;")
+    three = packet % 0 + packet.replace("</rdf:li>", "</rdf:li><rdf:li>Red</rdf:li>") % 0
+    assert "Camera:BandName" not in read_xmp(three.partition("</Camera:BandName>")[2].encode())
+
+
 def test_pictures_twice_as_wide_as_high_without_a_lens_are_remarked(tmp_path):
     for k in range(COUNT):
         picture(tmp_path / f"{k}.png", pixels(k, 240, 120))
@@ -237,16 +287,15 @@ def test_panoramas_are_named(tmp_path):
 @pytest.mark.parametrize(
     ("suffix", "remedy"),
     [
-        (".HEIC", "convert"),
-        (".heif", "convert"),
-        (".avif", "convert"),
-        (".DNG", "develop"),
-        (".cr3", "develop"),
+        (".HEIC", "pip install 'vdgs[photos]'"),
+        (".cr3", "pip install 'vdgs[photos]'"),
+        (".jxl", "convert them to JPEG, with their tags (djxl"),
         (".jp2", "convert"),
         (".jfif", "they are JPEG; rename"),
     ],
 )
-def test_photographs_of_kinds_that_are_not_read_are_named_with_the_remedy(tmp_path, suffix, remedy):
+def test_photographs_of_kinds_that_are_not_read_are_named_with_the_remedy(tmp_path, monkeypatch, suffix, remedy):
+    monkeypatch.setattr(image_files, "has_decoder", lambda _module: False)
     flight(tmp_path)
     for k in range(3):
         (tmp_path / f"IMG_{k}{suffix}").write_bytes(b"\0" * 40)
@@ -255,8 +304,9 @@ def test_photographs_of_kinds_that_are_not_read_are_named_with_the_remedy(tmp_pa
     assert any(f"3 {suffix.lower()} files are not read: {remedy}" in note for note in found.notes)
     for file in tmp_path.glob("*.JPG"):
         file.unlink()
-    with pytest.raises(CaptureError, match=f"4 {suffix.lower()} files are not read: {remedy}"):
+    with pytest.raises(CaptureError, match=re.escape(f"4 {suffix.lower()} files are not read: {remedy}")):
         collect_images([tmp_path])
+    assert is_image_folder(tmp_path) == (suffix in (".HEIC", ".cr3"))
 
 
 def test_films_are_named_where_there_is_nothing_else(tmp_path):
@@ -267,11 +317,37 @@ def test_films_are_named_where_there_is_nothing_else(tmp_path):
     assert not any("mp4" in note for note in collect_images([tmp_path]).notes)
 
 
-def test_heic_by_the_name_of_a_jpeg_is_named(tmp_path):
-    file = tmp_path / "IMG_0001.JPG"
-    file.write_bytes(b"\0\0\0\x24ftypheic" + b"\0" * 100)
-    with pytest.raises(UnusableImage, match="is no jpg but HEIC"):
-        read_image_metadata(file, file.name)
+def test_many_photographs_without_their_decoder_are_an_error(tmp_path, monkeypatch):
+    """A few are a note; as many as those that are read are not left out with a note alone."""
+    monkeypatch.setattr(image_files, "has_decoder", lambda _module: False)
+    flight(tmp_path)
+    for k in range(COUNT):
+        (tmp_path / f"IMG_{k}.HEIC").write_bytes(b"\0" * 40)
+    with pytest.raises(CaptureError, match=r"holds 6 photographs that can be read, and 6 \.heic .*'vdgs\[photos\]'"):
+        collect_images([tmp_path])
+
+
+def test_what_is_done_with_other_kinds_is_said(tmp_path):
+    """Converted once, by the names of the capture; raw files beside their JPEG are left alone."""
+    flight(tmp_path)
+    pytest.importorskip("rawpy")
+    for k in range(2):
+        write_dng(tmp_path / f"R_{k}.DNG", pixels(k), orientation=6, lat_lon=(-33.5, -70.6))
+    write_dng(tmp_path / "DJI_0001.DNG", pixels(0))
+    Image.fromarray(pixels(9)).convert("CMYK").save(tmp_path / "print.jpg", quality=98, subsampling=0)
+    found = collect_images([tmp_path])
+    notes = " ".join(found.notes)
+    assert "R_0.DNG, R_1.DNG: raw; developed alike, with the daylight white balance" in notes
+    assert "(R_0.DNG.jpg)" in notes
+    assert "1 .dng file is not used, but the pictures of the same names beside" in notes
+    raw = next(photo for photo in found.images if photo.name == "R_0.DNG")
+    assert (raw.size, raw.lat_lon, raw.camera) == ((120, 160), pytest.approx((-33.5, -70.6)), "Maker Drone")
+    workspace = Workspace(tmp_path.parent / "work")
+    assert not write_upright_images(workspace, found.images)
+    shown = decode_image(workspace.images / "R_0.DNG")[0]
+    expected = np.rot90(pixels(0), -1)
+    assert np.abs(shown.astype(int) - expected)[20:-20, 20:-20].mean() < 12  # one color of three at each pixel
+    assert not (workspace.images / "R_0.DNG").is_symlink()
 
 
 # ---------------------------------------------------------------------------------------------- ends of JPEGs

@@ -140,13 +140,14 @@ def write_photograph(
     xmp: str | None = None,
     model: str = "Drone",
     error_m: float | None = None,
+    focal_mm: float = FOCAL_MM,
 ) -> None:
     """A JPEG with EXIF, its place (wrong by `error_m`) where `enu` is given, and XMP."""
     exif = Image.Exif()
     exif[0x010F], exif[0x0110], exif[0x0112] = "Maker", model, orientation
     details = exif.get_ifd(0x8769)
     details[0x9003] = f"2026:06:01 10:{number // 60:02d}:{number % 60:02d}"
-    details[0x920A] = FOCAL_MM
+    details[0x920A] = focal_mm
     shown = 4 * max(pixels.shape[:2])  # as where photographs were made smaller
     details[0xA002], details[0xA003] = shown, shown * 3 // 4
     details[0xA20E], details[0xA210] = shown / SENSOR_MM, 4

@@ -7,11 +7,10 @@ import struct
 from collections.abc import Iterable
 from pathlib import Path
 
-from PIL import Image
+from vdgs.captures.image_tags import read_tags
+from vdgs.errors import CaptureError
 
-from vdgs.captures.image_files import pillow_without_limits
-
-_EXIF_IFD, _DATE_TAKEN, _DATE = 0x8769, 0x9003, 0x0132
+_DATE_TAKEN, _DATE = 0x9003, 0x0132
 #: EXIF's form: 2026:06:23 16:31:59; some write hyphens.
 _FORM = re.compile(r"(\d{4})[:-](\d\d)[:-](\d\d)[ T](\d\d:\d\d)")
 
@@ -25,9 +24,8 @@ def first_and_last(moments: Iterable[str]) -> tuple[str, ...]:
 def date_taken(file: Path) -> str:
     """The date and time in the EXIF of a photograph; empty where EXIF lacks them or cannot be read."""
     try:
-        with pillow_without_limits(), Image.open(file) as image:
-            tags = image.getexif()
-            value = tags.get_ifd(_EXIF_IFD).get(_DATE_TAKEN) or tags.get(_DATE) or ""
-    except (OSError, ValueError, SyntaxError, KeyError, TypeError, AttributeError, struct.error):
+        found = read_tags(file)
+        value = found.details.get(_DATE_TAKEN) or found.tags.get(_DATE) or ""
+    except (CaptureError, OSError, ValueError, SyntaxError, KeyError, TypeError, AttributeError, struct.error):
         return ""  # what Pillow raises for damaged EXIF
     return value if isinstance(value, str) else ""

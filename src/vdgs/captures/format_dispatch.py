@@ -19,7 +19,7 @@ from vdgs.captures.formats.project import NoTiePoints
 from vdgs.captures.formats.source_capture import SourceCapture
 from vdgs.captures.formats.sparse_points import POINT_CLOUDS, find_point_cloud
 from vdgs.captures.formats.transforms import TRANSFORMS_FILE, exclusive_information, read_transforms
-from vdgs.captures.image_files import IMAGE_SUFFIXES, find_images
+from vdgs.captures.image_files import find_images, readable_suffixes
 from vdgs.captures.nested_captures import foreign_poses, model_below
 from vdgs.captures.project_formats import PROJECTS, find_projects, is_project, read_project
 from vdgs.captures.reconstruction import is_reconstruction
@@ -176,7 +176,7 @@ def _other_image_folder(root: Path) -> tuple[str, list[str]]:
     alike = [name for name in named if name.lower() == "images"]
     if len(alike) == 1:
         return alike[0], [f"no images/ folder; {alike[0]} is used instead (--images chooses)."]
-    named += ["."] if any(entry.suffix.lower() in IMAGE_SUFFIXES for entry in root.iterdir()) else []
+    named += ["."] if any(entry.suffix.lower() in readable_suffixes() for entry in root.iterdir()) else []
     where = (
         f", or name the folder that they are in: {' or '.join(f'--images {name}' for name in named)}" if named else ""
     )

@@ -1,13 +1,15 @@
 """The photographs on disk: finding them, their masks and their sizes, and decoding their pixels.
 
-Pixels are taken as COLMAP takes them: RGB, 8 bits, EXIF orientation not applied.
+Pixels are taken as COLMAP takes them: RGB, 8 bits, EXIF orientation not applied. Of whatever kind a photograph is, all
+verbs decode it by `decode_image`, to sRGB.
 """
 
 from __future__ import annotations
 
+import io
 import os
 import warnings as python_warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,10 +17,13 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from PIL import Image
+from PIL import Image, features
 
+from vdgs.captures.color_profiles import foreign_space, to_srgb
 from vdgs.captures.jpeg import JPEGS, has_end, lacks_only_end, with_end
 from vdgs.captures.name_resolution import find_file
+from vdgs.captures.optional_decoders import has_decoder, prepare_heif
+from vdgs.captures.raw_files import RAW_SUFFIXES, develop, is_raw, raw_size
 from vdgs.captures.strays import is_hidden
 from vdgs.errors import CaptureError
 from vdgs.system.memory.process_memory import is_out_of_memory
@@ -30,15 +35,14 @@ if "OPENCV_LOG_LEVEL" not in os.environ:
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"}
-#: Photographs that are not read: of Apple and others (to be converted), and raw ones (to be developed).
-APPLE_SUFFIXES = {".heic", ".heif", ".hif", ".avif", ".jxl"}
-RAW_SUFFIXES = {
-    ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw", ".raw", ".gpr", ".3fr", ".iiq",
-}  # fmt: skip
+#: Photographs that a decoder of the extra `photos` reads, besides `RAW_SUFFIXES`, and those that Pillow may be built
+#: with.
+HEIF_SUFFIXES, AVIF_SUFFIXES = {".heic", ".heif", ".hif"}, {".avif"}
 JPEG_SUFFIXES = {".jfif", ".jpe", ".jif", ".mpo"}
 VIDEO_SUFFIXES = {".mp4", ".mov", ".avi", ".mkv", ".mts", ".m2ts", ".m4v", ".insv", ".360", ".wmv"}
-OTHER_SUFFIXES = {".jp2", ".j2k", ".gif", ".psd", ".exr", ".hdr", ".tga", ".rjpeg", ".insp"}
-UNREAD_IMAGE_SUFFIXES = APPLE_SUFFIXES | RAW_SUFFIXES | JPEG_SUFFIXES | OTHER_SUFFIXES
+OTHER_SUFFIXES = {".jxl", ".jp2", ".j2k", ".gif", ".psd", ".exr", ".hdr", ".tga", ".rjpeg", ".insp"}
+#: Photographs of which only some installations read all, or none do.
+OTHER_IMAGE_SUFFIXES = HEIF_SUFFIXES | AVIF_SUFFIXES | RAW_SUFFIXES | JPEG_SUFFIXES | OTHER_SUFFIXES
 #: Maker and model of a camera in EXIF.
 _CAMERA_TAGS = {0x010F, 0x0110}
 #: Headers that announce more pixels than this are refused rather than decoded.
@@ -53,7 +57,13 @@ MASK_THRESHOLD = 128
 #: What programs put behind a photograph's name for that of its mask.
 _MASK_TAILS = ("_mask", ".mask", "-mask", "_msk")
 #: Pillow's modes that we know how to bring to 8-bit RGB.
-SUPPORTED_MODES = {"RGB", "RGBA", "L", "LA", "P", "1", "I;16", "I;16B", "I;16L"}
+SUPPORTED_MODES = {"RGB", "RGBA", "L", "LA", "P", "1", "I;16", "I;16B", "I;16L", "CMYK"}
+#: What may say, before the pixels, that colors are of another space than sRGB: profiles, CMYK, EXIF's Adobe RGB.
+_COLOR_MARKS = (b"ICC_PROFILE\0", b"iCCP", b"ICCP", b"Adobe\0", b"R03\0")
+_HEAD_BYTES = 1 << 20
+_TIFF = (b"II", b"MM")
+#: Values of 16 bits none of which is greater are those of 12 bits or fewer: black, as they are.
+_DARK = 4095
 
 
 @dataclass(frozen=True)
@@ -81,13 +91,36 @@ def pillow_without_limits() -> Iterator[None]:
             Image.MAX_IMAGE_PIXELS = limit
 
 
+@contextmanager
+def open_image(path: Path) -> Iterator[Image.Image]:
+    """A picture in Pillow, HEIC too; no raw file. Raises CaptureError where its decoder is not installed."""
+    prepare_heif(path)
+    with pillow_without_limits(), Image.open(path) as image:
+        yield image
+
+
+def mode_of(image: Image.Image) -> str:
+    """Pillow's mode. Mode I is 32 bits a pixel, but for PNG files of 16 bits as older versions of Pillow open them."""
+    return "I;16" if (image.mode, image.format) == ("I", "PNG") else image.mode
+
+
+def readable_suffixes() -> set[str]:
+    """Suffixes of the photographs that this installation reads."""
+    found = IMAGE_SUFFIXES | (AVIF_SUFFIXES if features.check("avif") else set())
+    found |= HEIF_SUFFIXES if has_decoder("pillow_heif") else set()
+    return found | (RAW_SUFFIXES if has_decoder("rawpy") else set())
+
+
 def read_header(path: Path) -> ImageHeader:
-    """Size and mode without decoding. Raises `CaptureError` for unreadable, huge, tiny or CMYK images."""
+    """Size and mode without decoding. Raises `CaptureError` for unreadable, huge and tiny images."""
     try:
-        with pillow_without_limits(), Image.open(path) as image:
-            # Mode I is 32 bits a pixel, but for PNG files of 16 bits as older versions of Pillow open them.
-            mode = "I;16" if (image.mode, image.format) == ("I", "PNG") else image.mode
-            header = ImageHeader(image.width, image.height, mode)
+        if is_raw(path):
+            header = ImageHeader(*raw_size(path), "RGB")
+        else:
+            with open_image(path) as image:
+                header = ImageHeader(image.width, image.height, mode_of(image))
+    except CaptureError:
+        raise
     except FileNotFoundError:
         raise CaptureError(f"{path}: no such image.") from None
     except Exception as error:  # Pillow's parsers raise many kinds on damaged headers
@@ -108,7 +141,7 @@ def read_header(path: Path) -> ImageHeader:
 
 def has_camera(path: Path) -> bool:
     """Whether EXIF of an image names a camera. Files of raw formats and of phones count as photographs."""
-    if path.suffix.lower() in UNREAD_IMAGE_SUFFIXES:
+    if path.suffix.lower() in OTHER_IMAGE_SUFFIXES:
         return True
     try:
         with pillow_without_limits(), Image.open(path) as image:
@@ -125,13 +158,19 @@ def same_aspect(one: tuple[int, int], other: tuple[int, int]) -> bool:
 
 
 def find_images(folder: Path) -> dict[str, Path]:
-    """All images under `folder` by their posix name relative to it, in name order."""
-    found = {
-        path.relative_to(folder).as_posix(): path
-        for path in folder.rglob("*")
-        if path.suffix.lower() in IMAGE_SUFFIXES and not is_hidden(path.relative_to(folder))
-    }
-    return dict(sorted(found.items()))
+    """All images under `folder` by their posix name relative to it, in name order; HEIC and raw files only where no
+    picture of the same name and another ending lies beside them."""
+    files = [path for path in readable_images(folder.rglob("*")) if not is_hidden(path.relative_to(folder))]
+    return dict(sorted((path.relative_to(folder).as_posix(), path) for path in files))
+
+
+def readable_images(files: Iterable[Path]) -> list[Path]:
+    """The images among files, by their names; HEIC and raw files only where no picture of the same name and another
+    ending lies beside them."""
+    readable = readable_suffixes()
+    images = [path for path in files if path.suffix.lower() in readable]
+    stems = {path.with_suffix("") for path in images if path.suffix.lower() in IMAGE_SUFFIXES}
+    return [path for path in images if path.suffix.lower() in IMAGE_SUFFIXES or path.with_suffix("") not in stems]
 
 
 def find_mask(folder: Path, name: str) -> Path | None:
@@ -156,11 +195,19 @@ def find_mask_beside(folder: Path, name: str) -> Path | None:
 def decode_image(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     """Pixels [h, w, 3] uint8 RGB, and where the file has transparency its opaque part [h, w] bool.
 
-    Gray becomes RGB, 16 bits become 8; an alpha channel is a mask (choice: opaque from one half up), never
-    a blend. Raises `CaptureError` naming the file if it cannot be decoded.
+    Gray becomes RGB, 16 bits become 8, colors of other spaces sRGB, raw files are developed; an alpha channel is a
+    mask (choice: opaque from one half up), never a blend. Raises `CaptureError` naming the file if it cannot be
+    decoded.
     """
+    if is_raw(path):
+        return develop(path), None
     pixels = _decode(path)
     if pixels.dtype == np.uint16:
+        if 0 < pixels.max() <= _DARK:
+            raise CaptureError(
+                f"{path}: has 16 bits a pixel, of which it uses no value above {pixels.max()} of 65535: black, as it "
+                "is. Scale the values of all photographs by one factor."
+            )
         pixels = ((pixels.astype(np.uint32) + 128) // 257).astype(np.uint8)
     if pixels.dtype != np.uint8:
         raise CaptureError(f"{path}: has {pixels.dtype} samples; convert it to 8-bit RGB.")
@@ -199,6 +246,9 @@ def _decode(path: Path) -> np.ndarray:
         data = np.fromfile(path, np.uint8)
     except OSError as error:
         raise CaptureError(f"{path}: cannot be read ({error.strerror or error}).") from error
+    converted = _converted(path, data)
+    if converted is not None:
+        return converted
     try:
         with without_decoder_messages():
             pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
@@ -217,6 +267,26 @@ def _decode(path: Path) -> np.ndarray:
         raise CaptureError(f"{path}: cannot be decoded ({error}). Copy it again or remove it.") from None
 
 
+def _converted(path: Path, data: np.ndarray) -> np.ndarray | None:
+    """Pixels, BGR or BGRA, of what OpenCV does not decode alike: HEIC, AVIF, and colors of other spaces. None for all
+    else, and for what Pillow does not open."""
+    head = data[:_HEAD_BYTES].tobytes()
+    own = head[4:8] == b"ftyp"
+    if not own and head[:2] not in _TIFF and not any(mark in head for mark in _COLOR_MARKS):
+        return None
+    try:
+        prepare_heif(path)
+        with pillow_without_limits(), Image.open(io.BytesIO(data)) as image:
+            if not own and not foreign_space(image):
+                return None
+            pixels = np.asarray(to_srgb(image))
+            return np.ascontiguousarray(pixels[:, :, [2, 1, 0, 3][: pixels.shape[2]]])
+    except (CaptureError, MemoryError):
+        raise
+    except Exception:  # OpenCV may know more, and else says what is wrong
+        return None
+
+
 class VerifiedImage(NamedTuple):
     """What decoding an image told: whether it shows more than one color, and whether it may be transparent."""
 
@@ -231,6 +301,9 @@ def verify_image(path: Path) -> VerifiedImage:
     decoded at 1/8 size, which still reads the whole stream, several times faster.
     """
     try:
+        if is_raw(path):
+            return VerifiedImage(bool(np.ptp(develop(path))), False)
+        prepare_heif(path)
         with Image.open(path) as image:
             if image.format in JPEGS and not has_end(path, image):
                 return _verify_without_end(path)

@@ -17,7 +17,7 @@ from vdgs.captures.formats.source_capture import (
     format_list,
     refuse_many_missing,
 )
-from vdgs.captures.image_files import IMAGE_SUFFIXES, find_images, read_header, same_aspect
+from vdgs.captures.image_files import find_images, read_header, readable_suffixes, same_aspect
 from vdgs.captures.mask_matching import check_mask, find_masks
 from vdgs.captures.name_resolution import ImageNameIndex, NameLookup
 from vdgs.captures.strays import masked_stem
@@ -85,7 +85,7 @@ def _elsewhere(names: list[str], available: ImageNameIndex, folder: Path, warnin
 
 def _is_mask(path: Path, stems: set[Path]) -> bool:
     """Whether an image is by its name the mask of one of those beside it, which are given without their suffixes."""
-    stem = masked_stem(path.stem) or (path.stem if Path(path.stem).suffix.lower() in IMAGE_SUFFIXES else None)
+    stem = masked_stem(path.stem) or (path.stem if Path(path.stem).suffix.lower() in readable_suffixes() else None)
     return stem is not None and bool({path.with_name(stem), path.with_name(Path(stem).stem)} & stems)
 
 

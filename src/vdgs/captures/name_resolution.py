@@ -28,6 +28,11 @@ def to_colmap_name(name: str) -> str:
     return f"_{plain[1:]}" if plain.startswith("#") else plain
 
 
+def jpeg_name(name: str) -> str:
+    """What the JPEG that is made of a photograph is called, whatever that was."""
+    return name if name.lower().endswith((".jpg", ".jpeg")) else f"{name}.jpg"
+
+
 def match_key(name: str) -> str:
     """The key by which names match across extensions: no suffix, lower case."""
     path = PurePosixPath(name)

@@ -9,7 +9,7 @@ from pathlib import Path
 from vdgs.captures.formats.colmap import count_images, find_models
 from vdgs.captures.formats.matrixcity import pose_files
 from vdgs.captures.formats.mega_nerf import is_mega_nerf
-from vdgs.captures.image_files import IMAGE_SUFFIXES
+from vdgs.captures.image_files import readable_suffixes
 from vdgs.captures.output_guard import is_capture
 from vdgs.captures.project_formats import PROJECTS, find_projects
 from vdgs.system.quoting import shell_word
@@ -90,6 +90,8 @@ def _has_photographs(folder: Path) -> bool:
 def _photographs_beside(root: Path, model: Path) -> Path | None:
     """The folder with most images in or right below `root`, but not in the model's own."""
     folders = [root, *(entry for entry in root.iterdir() if entry.is_dir() and entry not in (model, *model.parents))]
-    counts = {folder: sum(entry.suffix.lower() in IMAGE_SUFFIXES for entry in folder.iterdir()) for folder in folders}
+    counts = {
+        folder: sum(entry.suffix.lower() in readable_suffixes() for entry in folder.iterdir()) for folder in folders
+    }
     best = max(counts, key=lambda folder: counts[folder])
     return best if counts[best] else None

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 from vdgs.captures.formats.colmap import find_models
 from vdgs.captures.formats.matrixcity import pose_files
 from vdgs.captures.formats.mega_nerf import is_mega_nerf
-from vdgs.captures.image_files import IMAGE_SUFFIXES, UNREAD_IMAGE_SUFFIXES, has_camera
+from vdgs.captures.image_files import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES, has_camera
 from vdgs.captures.project_formats import is_project
 from vdgs.captures.reconstruction import is_reconstruction
 from vdgs.captures.strays import is_result, is_run, why_not_read
@@ -101,7 +101,7 @@ def _holds_photographs(folder: Path, output: Path) -> bool:
         return True
     if why_not_read(folder) is not None:
         return False
-    suffixes = IMAGE_SUFFIXES | UNREAD_IMAGE_SUFFIXES
+    suffixes = IMAGE_SUFFIXES | OTHER_IMAGE_SUFFIXES
     pictures = [folder / name for name, is_file in names.items() if is_file and Path(name).suffix.lower() in suffixes]
     pictures = [picture for picture in _without_undistorted(pictures, names) if not is_result(picture)]
     if _is_written_into(folder, output):

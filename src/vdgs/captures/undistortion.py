@@ -17,6 +17,7 @@ from vdgs.captures.formats.brown_lens import brown_pinhole
 from vdgs.captures.formats.lens_projection import colmap_camera, ray_pixels
 from vdgs.captures.formats.source_capture import BROWN, Intrinsics
 from vdgs.captures.image_files import decode_image, decode_mask
+from vdgs.captures.name_resolution import jpeg_name
 from vdgs.errors import CaptureError
 from vdgs.system.atomic_files import read_json_or_empty, write_bytes
 
@@ -110,8 +111,7 @@ def sampling_map(distorted: Intrinsics, pinhole: Intrinsics, strip_px: int = STR
 def _undistort_one(
     folder: Path, photo: ImageFile, pinhole: Intrinsics, map_of: Callable[[Intrinsics], np.ndarray]
 ) -> ImageFile:
-    plain = photo.name if photo.name.lower().endswith((".jpg", ".jpeg")) else photo.name + ".jpg"
-    target = folder / plain
+    target = folder / jpeg_name(photo.name)
     mask_target, stamp_file = (target.with_name(target.name + suffix) for suffix in (".mask.png", ".json"))
     lens = photo.intrinsics
     stamp: dict[str, object] = {"camera": [lens.model, *lens.params, lens.width, lens.height]}

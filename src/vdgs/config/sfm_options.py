@@ -9,6 +9,8 @@ from typing import Annotated, Literal
 from vdgs.config.output_paths import Output
 from vdgs.config.ranges import MAX_COUNT, WORKER_COUNT, FlagName, Range
 
+CameraModel = Literal["auto", "simple-radial", "opencv", "opencv-fisheye", "equirectangular"]
+
 
 @dataclass(frozen=True, kw_only=True)
 class SfmOptions:
@@ -18,6 +20,10 @@ class SfmOptions:
     """How the focal length is found. fixed: that of EXIF and XMP; refine: fitted; auto: held where the flight cannot
     tell it from the height (straight down from one height, by what the drone recorded or by level positions all over an
     area) and where the maker calibrated it; fitted otherwise."""
+    camera_model: CameraModel = "auto"
+    """How lenses bend. auto: one radial term, a fisheye's four where EXIF's name of the lens says so, and panoramas of
+    360° by their XMP; opencv: two radial and two tangential terms; equirectangular: every photograph twice as wide as
+    high is a panorama of 360°."""
     num_neighbors: Annotated[int, Range(2, 1000)] = 16
     """Neighbors that each photograph is matched with. Where positions are known; more where neighbors show
     little of the same: facades, oblique views, several cameras at one place."""

@@ -9,7 +9,7 @@ import numpy as np
 from vdgs.sfm.gcp_list import GcpObservation
 from vdgs.sfm.georegistration import Georegistration, model_points
 from vdgs.sfm.gps_priors import GpsPriors
-from vdgs.sfm.image_metadata import ImageMetadata
+from vdgs.sfm.image_metadata import EXACT_MODEL, ImageMetadata
 from vdgs.sfm.workspace import call_cancellable
 from vdgs.system.lazy_pycolmap import pycolmap
 
@@ -49,9 +49,7 @@ def bend_to_positions(
                 coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
             )
         )
-    config = pycolmap.BundleAdjustmentConfig()
-    for image in images.values():
-        config.add_image(image.image_id)
+    config = _config(bent, images)
     known = pycolmap.PosePriorBundleAdjustmentOptions()
     known.ceres.prior_position_loss_function_type = pycolmap.LossFunctionType.CAUCHY
     adjuster = pycolmap.create_pose_prior_bundle_adjuster(_options(hold_focal, threads), known, config, priors, bent)
@@ -70,9 +68,7 @@ def bend_to_points(
     model as it is, and a note, where that would tear it."""
     bent = pycolmap.Reconstruction(model)
     images = {image.name: image for image in bent.images.values() if image.has_pose}
-    config = pycolmap.BundleAdjustmentConfig()
-    for image in images.values():
-        config.add_image(image.image_id)
+    config = _config(bent, images)
     fixed = [_add_fixed(bent, images, sightings, target) for sightings, target in points]
     for number in fixed:
         config.add_constant_point(number)
@@ -88,6 +84,21 @@ def bend_to_points(
         note = f"the model was moved to the control points but not bent: that would move cameras by {moved:.3g} m."
         return model, (note,)
     return bent, ()
+
+
+def _config(model: pycolmap.Reconstruction, images: Mapping[str, pycolmap.Image]) -> pycolmap.BundleAdjustmentConfig:
+    """All these images; the lenses and the rigs of views that were cut out of panoramas stay."""
+    config = pycolmap.BundleAdjustmentConfig()
+    for image in images.values():
+        config.add_image(image.image_id)
+    exact = {number for number, camera in model.cameras.items() if camera.model_name == EXACT_MODEL}
+    for number in exact:
+        config.set_constant_cam_intrinsics(number)
+    for rig in model.rigs.values():
+        if rig.ref_sensor_id.id in exact:
+            for sensor in rig.non_ref_sensors:
+                config.set_constant_sensor_from_rig_pose(sensor)
+    return config
 
 
 def _options(hold_focal: bool, threads: int) -> pycolmap.BundleAdjustmentOptions:

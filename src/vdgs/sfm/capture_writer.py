@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -15,6 +15,7 @@ import numpy as np
 from vdgs.captures.formats.colmap_writing import write_model_files
 from vdgs.captures.formats.source_capture import Intrinsics
 from vdgs.captures.image_files import decode_image
+from vdgs.captures.name_resolution import jpeg_name
 from vdgs.captures.undistortion import sampling_map, undistorted_pinhole
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -80,11 +81,6 @@ def write_images(
                 tell(done)
 
 
-def jpeg_name(name: str) -> str:
-    """What a photograph is called in the capture: JPEG, whatever it was."""
-    return name if name.lower().endswith((".jpg", ".jpeg")) else f"{name}.jpg"
-
-
 def _write_one(output: Path, workspace: Workspace, undistortion: Undistortion, name: str) -> None:
     check_stop_requested()
     if workspace.mask(name).is_file():
@@ -130,10 +126,12 @@ def write_model(
         )
         straight.add_camera_with_trivial_rig(camera)
     places: dict[tuple[int, int], int] = {}
-    for image in _registered_images(model):
+    for image in placed_images(model):
         seen = [k for k, point in enumerate(image.points2D) if point.has_point3D()]
         bent = np.array([image.points2D[k].xy for k in seen]).reshape(-1, 2)
         rays = np.asarray(model.cameras[image.camera_id].cam_from_img(bent)).reshape(-1, 2)
+        shown = np.isfinite(rays).all(axis=1)  # a fisheye may look beside and behind itself
+        seen, rays = [k for k, there in zip(seen, shown, strict=True) if there], rays[shown]
         camera_id = image.camera_id if pinhole_of is None else pinhole_of[image.name]
         fx, fy, cx, cy = pinholes[camera_id].params
         places |= {(image.image_id, k): place for place, k in enumerate(seen)}
@@ -160,8 +158,10 @@ def write_model(
     os.replace(part, whole)
 
 
-def _registered_images(model: pycolmap.Reconstruction) -> Iterator[pycolmap.Image]:
-    return (model.images[number] for number in sorted(model.images) if model.images[number].has_pose)
+def placed_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+    """The images that a model places, by their numbers. Not those that have a pose by their rig alone: of the sky."""
+    images = (model.images[number] for number in sorted(model.images))
+    return [image for image in images if image.has_pose and image.num_points3D]
 
 
 def fitted_intrinsics(camera: pycolmap.Camera) -> Intrinsics:

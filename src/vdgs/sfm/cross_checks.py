@@ -10,7 +10,7 @@ from pathlib import PurePosixPath
 import numpy as np
 from PIL import Image
 
-from vdgs.captures.image_files import same_aspect
+from vdgs.captures.image_files import open_image, same_aspect
 from vdgs.sfm.focal_length import Lens, unzoomed
 from vdgs.sfm.image_metadata import UNKNOWN_CAMERA, ImageMetadata
 
@@ -148,7 +148,7 @@ def _smaller_copies(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
 def is_black_and_white(photo: ImageMetadata) -> bool:
     """Whether a picture shows black and white alone, as masks do."""
     try:
-        with Image.open(photo.path) as image:
+        with open_image(photo.path) as image:
             image.draft("L", _LOOKED_AT)
             gray = np.asarray(image.convert("L").resize(_LOOKED_AT, Image.Resampling.NEAREST)).astype(int)
     except (OSError, SyntaxError, ValueError):

@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from PIL import Image, ImageOps
 from rich.console import Console
 
@@ -15,13 +16,17 @@ from vdgs.captures.jpeg import with_end
 from vdgs.config.sfm_options import SfmOptions
 from vdgs.errors import CaptureError
 from vdgs.sfm.image_list import ExcludedImage
-from vdgs.sfm.image_metadata import ImageMetadata
+from vdgs.sfm.image_metadata import FISHEYE, RADIAL, ImageMetadata
+from vdgs.sfm.mask_files import apply_orientation
+from vdgs.sfm.panoramas import cut_view
 from vdgs.sfm.workspace import Workspace, call_cancellable, report_progress
 from vdgs.system.atomic_files import write_atomic, write_bytes
 from vdgs.system.lazy_pycolmap import pycolmap
 
 #: A focal length over the longer side where nothing says one: COLMAP's own guess.
 DEFAULT_FOCAL_FACTOR = 1.2
+#: The same for a fisheye: 72° from the middle to the ends of the longer side.
+FISHEYE_FOCAL_FACTOR = 0.4
 #: Photographs of fewer pixels of their longer side, and all where there are so few, are searched at twice their size:
 #: three times the work, half as many points again.
 UPSAMPLE_BELOW_PX, UPSAMPLE_BELOW_IMAGES = 1200, 40
@@ -46,6 +51,8 @@ class CameraGroup:
     """Whether something says the focal length."""
     source: str
     images: tuple[ImageMetadata, ...]
+    model: str = RADIAL
+    """COLMAP's model of the lens."""
 
 
 def group_by_camera(photographs: Sequence[ImageMetadata]) -> list[CameraGroup]:
@@ -53,12 +60,14 @@ def group_by_camera(photographs: Sequence[ImageMetadata]) -> list[CameraGroup]:
     groups: dict[tuple[object, ...], list[ImageMetadata]] = {}
     for photo in photographs:
         focal = photo.lens.focal if photo.lens else None
-        groups.setdefault((photo.camera, photo.width, photo.height, focal and round(focal, 4)), []).append(photo)
+        key = (photo.camera, photo.width, photo.height, focal and round(focal, 4), photo.camera_model, photo.face)
+        groups.setdefault(key, []).append(photo)
     kinds = []
     for members in groups.values():
         first = members[0]
         lens, longer = first.lens, max(first.width, first.height)
-        focal = (lens.focal if lens else DEFAULT_FOCAL_FACTOR) * longer
+        guess = FISHEYE_FOCAL_FACTOR if first.camera_model == FISHEYE else DEFAULT_FOCAL_FACTOR
+        focal = (lens.focal if lens else guess) * longer
         source = lens.source if lens else "a guess"
         kinds.append(
             CameraGroup(
@@ -69,28 +78,35 @@ def group_by_camera(photographs: Sequence[ImageMetadata]) -> list[CameraGroup]:
                 has_focal_prior=bool(lens),
                 source=source,
                 images=tuple(members),
+                model=first.camera_model,
             )
         )
     return kinds
 
 
 def write_upright_images(workspace: Workspace, photographs: Sequence[ImageMetadata]) -> list[ExcludedImage]:
-    """Fill the work folder with links to the photographs, and upright copies of those that EXIF says lie.
+    """Fill the work folder with links to the photographs, upright copies of those that EXIF says lie, and JPEGs in sRGB
+    of those of other kinds.
 
     Returns those that could not be decoded. Photographs themselves are never changed.
     """
     failed = []
-    for photo in photographs:
+    for photo in sorted(photographs, key=lambda photo: str(photo.path)):  # the views of a panorama one after the other
         target = workspace.images / photo.name
         if target.exists():
             continue
         target.parent.mkdir(parents=True, exist_ok=True)
         target.unlink(missing_ok=True)  # a link that leads nowhere
-        if photo.orientation == 1 and not photo.whole:
+        if photo.orientation == 1 and not photo.whole and not photo.kind and not photo.face:
             write_bytes(target, with_end(photo.path).read())
             continue
         try:
-            if photo.orientation == 1:
+            if photo.face:
+                _save(Image.fromarray(cut_view(photo)), target, "JPEG")
+            elif photo.kind:
+                upright = apply_orientation(decode_image(photo.path)[0], photo.orientation)
+                _save(Image.fromarray(np.ascontiguousarray(upright)), target, "JPEG")
+            elif photo.orientation == 1:
                 if photo.path.suffix.lower() not in _JPEGS:
                     decode_image(photo.path)  # of a damaged file COLMAP uses what it can read, and the rest is black
                 os.symlink(photo.path.resolve(), target)
@@ -109,7 +125,10 @@ def _write_upright(photo: ImageMetadata, target: Path) -> None:
     kind = (
         "PNG" if target.suffix.lower() == ".png" else "TIFF" if target.suffix.lower() in (".tif", ".tiff") else "JPEG"
     )
+    _save(upright, target, kind)
 
+
+def _save(upright: Image.Image, target: Path, kind: str) -> None:
     def write(file: Path) -> None:
         upright.save(file, kind, quality=_UPRIGHT_QUALITY, subsampling=0)
 
@@ -124,8 +143,7 @@ def create_database(workspace: Workspace, camera_groups: Sequence[CameraGroup]) 
             return
         database.clear_all_tables()
         for kind in camera_groups:
-            params = [kind.focal_px, kind.width / 2, kind.height / 2, 0.0]
-            camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=kind.width, height=kind.height, params=params)
+            camera = pycolmap.Camera.create_from_model_name(0, kind.model, kind.focal_px, kind.width, kind.height)
             camera.has_prior_focal_length = kind.has_focal_prior
             number = database.write_camera(camera)
             rig = pycolmap.Rig()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from rich.console import Console
@@ -23,6 +24,10 @@ _MAX_DESCRIPTORS = 2000
 
 def estimate_pair_count(photographs: Sequence[ImageMetadata], positions: GpsPriors, options: SfmOptions) -> int:
     """About how many pairs will be matched."""
+    references, at_references, _ = _references(photographs, positions)
+    if len(references) < len(photographs):
+        each = (len(photographs) / len(references)) ** 2
+        return round(each * estimate_pair_count(references, at_references, options))
     count = len(photographs)
     if not positions.usable:
         everyone = count * (count - 1) // 2
@@ -43,7 +48,10 @@ def estimate_pair_count(photographs: Sequence[ImageMetadata], positions: GpsPrio
 def select_pairs(
     workspace: Workspace, photographs: Sequence[ImageMetadata], positions: GpsPriors, options: SfmOptions
 ) -> list[tuple[str, str]]:
-    """Names of the pairs to match, sorted."""
+    """Names of the pairs to match, sorted. Views of panoramas are matched with all views of the panoramas that theirs
+    is matched with."""
+    everyone = photographs
+    photographs, positions, members = _references(photographs, positions)
     count = len(photographs)
     order = time_order(photographs)
     if count <= pair_selection.SEQUENTIAL_OVERLAP or (not positions.usable and count <= options.exhaustive_max):
@@ -52,12 +60,12 @@ def select_pairs(
         chosen = pair_selection.sequential_pairs(
             order, pair_selection.SEQUENTIAL_OVERLAP, pair_selection.QUADRATIC_OVERLAP
         )
-        chosen |= pair_selection.retrieval_pairs(_descriptors(workspace, photographs), range(count))
+        chosen |= pair_selection.retrieval_pairs(_descriptors(workspace, everyone, members), range(count))
     else:
         chosen = spatial_candidates(photographs, positions, options)
         lost = np.flatnonzero(~np.isfinite(positions.all_positions(count)).all(axis=1))
         if len(lost):
-            chosen |= pair_selection.retrieval_pairs(_descriptors(workspace, photographs), lost.tolist())
+            chosen |= pair_selection.retrieval_pairs(_descriptors(workspace, everyone, members), lost.tolist())
             place = {i: k for k, i in enumerate(order)}
             chosen |= {
                 (min(i, j), max(i, j))
@@ -69,8 +77,25 @@ def select_pairs(
                 ]
                 if i != j
             }
-    names = [photo.name for photo in photographs]
-    return [(names[i], names[j]) for i, j in sorted(chosen)]
+    names = [photo.name for photo in everyone]
+    numbers = {(min(a, b), max(a, b)) for i, j in chosen for a in members[i] for b in members[j]}
+    return [(names[i], names[j]) for i, j in sorted(numbers)]
+
+
+def _references(
+    photographs: Sequence[ImageMetadata], positions: GpsPriors
+) -> tuple[Sequence[ImageMetadata], GpsPriors, list[list[int]]]:
+    """One view of each panorama in place of all and every photograph, positions by these, and of each the numbers of
+    those that it stands for."""
+    if not any(photo.face for photo in photographs):
+        return photographs, positions, [[k] for k in range(len(photographs))]
+    groups: dict[str, list[int]] = {}
+    for k, photo in enumerate(photographs):
+        groups.setdefault(photo.frame if photo.face else photo.name, []).append(k)
+    members = list(groups.values())
+    group_of = {k: number for number, group in enumerate(members) for k in group}
+    indices = np.array([group_of[index] for index in positions.image_indices.tolist()], int)
+    return [photographs[group[0]] for group in members], replace(positions, image_indices=indices), members
 
 
 def spatial_candidates(
@@ -172,8 +197,10 @@ def delete_matches(workspace: Workspace) -> None:
         database.clear_two_view_geometries()
 
 
-def _descriptors(workspace: Workspace, photographs: Sequence[ImageMetadata]) -> list[np.ndarray]:
-    """Some descriptors [m, 128] of each photograph, the same in every run."""
+def _descriptors(
+    workspace: Workspace, photographs: Sequence[ImageMetadata], members: Sequence[Sequence[int]]
+) -> list[np.ndarray]:
+    """Some descriptors [m, 128] of each photograph, or of all views of a panorama, the same in every run."""
     with workspace.open_database() as database:
         numbers = {image.name: image.image_id for image in database.read_all_images()}
         found = []
@@ -184,4 +211,4 @@ def _descriptors(workspace: Workspace, photographs: Sequence[ImageMetadata]) -> 
                 continue
             rows = np.asarray(database.read_descriptors(number).data)
             found.append(rows[:: max(1, len(rows) // _MAX_DESCRIPTORS)].copy())
-        return found
+        return [found[group[0]] if len(group) == 1 else np.concatenate([found[k] for k in group]) for group in members]

@@ -8,14 +8,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from vdgs.captures.image_files import (
+    AVIF_SUFFIXES,
+    HEIF_SUFFIXES,
     IMAGE_SUFFIXES,
     JPEG_SUFFIXES,
-    OTHER_SUFFIXES,
-    RAW_SUFFIXES,
-    UNREAD_IMAGE_SUFFIXES,
+    OTHER_IMAGE_SUFFIXES,
     VIDEO_SUFFIXES,
+    readable_images,
+    readable_suffixes,
 )
 from vdgs.captures.name_resolution import to_colmap_name
+from vdgs.captures.optional_decoders import INSTALL
+from vdgs.captures.raw_files import RAW_SUFFIXES
 from vdgs.captures.strays import is_result, previewed_stem, walk
 from vdgs.errors import CaptureError
 from vdgs.system.quoting import check_is_text
@@ -37,16 +41,21 @@ class Found:
     """Folders that are not looked into, with the reason."""
     unread: Counter[str] = field(default_factory=Counter)
     """Photographs of kinds that are not read, by their suffix."""
+    doubled: Counter[str] = field(default_factory=Counter)
+    """HEIC and raw files beside a picture of the same name, by their suffix."""
 
     def notes(self) -> list[str]:
         """What people should know of what is not used."""
         kinds = [kind for kind in self.unread if kind not in VIDEO_SUFFIXES]
         films = sum(self.unread.values()) - sum(self.unread[kind] for kind in kinds)
-        notes = [
-            f"{films} film{'s' if films > 1 else ''} beside the photographs: not used. To use a film too, name it."
-        ]
+        notes = [f"{films} film{'s' if films > 1 else ''} beside the photographs: not used. To use a film too, name it."]
         notes = notes if films else []
         notes += [f"{_count(self.unread[kind], kind)} not read: {_remedy(kind)}." for kind in kinds]
+        notes += [
+            f"{_count(number, kind)} not used, but the pictures of the same names beside. To use the others, give a "
+            "folder of those alone."
+            for kind, number in self.doubled.items()
+        ]
         for why in dict.fromkeys(self.skipped.values()):
             names = [name for name, reason in self.skipped.items() if reason == why]
             shown = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
@@ -55,8 +64,8 @@ class Found:
 
 
 def is_photograph(path: Path) -> bool:
-    """Whether a file is an image by its name."""
-    return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and path.is_file()
+    """Whether a file is an image that can be read, by its name."""
+    return path.suffix.lower() in readable_suffixes() and not path.name.startswith(".") and path.is_file()
 
 
 def is_film(path: Path) -> bool:
@@ -90,9 +99,10 @@ def find_files(folders: Sequence[Path]) -> Found:
     for folder, prefix in zip(folders, _prefixes(folders), strict=True):
         for _, files, skipped in walk(folder):
             found.skipped |= {prefix + path.relative_to(folder).as_posix(): why for path, why in skipped.items()}
-            stems = {path.stem.lower() for path in files if is_photograph(path)}
+            images = {path for path in readable_images(files) if is_photograph(path)}
+            stems = {path.stem.lower() for path in images}
             for path in files:
-                if is_photograph(path):
+                if path in images:
                     real = path.resolve()
                     if real not in seen:  # a folder and one inside it may both be named
                         seen.add(real)
@@ -121,13 +131,15 @@ def _add(found: Found, path: Path, written: str, stems: set[str]) -> None:
 
 
 def _count_other(found: Found, path: Path, stems: set[str]) -> None:
-    """A file that is no image that is read. Raw files beside their JPEG are no news."""
+    """A file that is no image that is read, or not used because its picture lies beside it."""
     suffix = path.suffix.lower()
     if path.name.startswith("._") or path.name.lower() in _SILENT:
         return
     found.others += path.is_file()
-    if suffix in UNREAD_IMAGE_SUFFIXES | VIDEO_SUFFIXES and path.stem.lower() not in stems:
+    if suffix in OTHER_IMAGE_SUFFIXES | VIDEO_SUFFIXES and path.stem.lower() not in stems:
         found.unread[suffix] += 1
+    elif suffix in HEIF_SUFFIXES | RAW_SUFFIXES:
+        found.doubled[suffix] += 1
 
 
 def nothing_found(folders: Sequence[Path], found: Found) -> CaptureError:
@@ -142,7 +154,18 @@ def nothing_found(folders: Sequence[Path], found: Found) -> CaptureError:
     others = f", but {found.others} other files" if found.others else ""
     others += f", and {left} images that are no photographs ({next(iter(found.left_out))}, ...)" if left else ""
     skipped = f" Not looked into: {', '.join(list(found.skipped)[:5])}." if found.skipped else ""
-    return CaptureError(f"{said}{others}.{skipped} Raw files (.dng) must be developed first, HEIC converted to JPEG.")
+    return CaptureError(f"{said}{others}.{skipped}")
+
+
+def check_decoders(folders: Sequence[Path], found: Found) -> None:
+    """Raise CaptureError where photographs of which a decoder is not installed are as many as those that are read."""
+    waiting = {kind: number for kind, number in found.unread.items() if kind in HEIF_SUFFIXES | RAW_SUFFIXES}
+    if waiting and sum(waiting.values()) >= len(found.named):
+        kinds = ", ".join(f"{number} {kind}" for kind, number in waiting.items())
+        raise CaptureError(
+            f"{', '.join(map(str, folders))}: holds {len(found.named)} photographs that can be read, and {kinds} files "
+            f"that cannot, without their decoder: {INSTALL} (or move the latter elsewhere)."
+        )
 
 
 def _count(number: int, suffix: str) -> str:
@@ -150,15 +173,17 @@ def _count(number: int, suffix: str) -> str:
 
 
 def _remedy(suffix: str) -> str:
-    if suffix in RAW_SUFFIXES:
-        return "develop them to JPEG or TIFF first, with their tags"
+    if suffix in HEIF_SUFFIXES | RAW_SUFFIXES:
+        return f"{INSTALL} to read them, or convert them to JPEG, with their tags"
+    if suffix in AVIF_SUFFIXES:
+        return "pip install 'pillow>=11.3' to read them, or convert them to JPEG (magick mogrify -format jpg *.avif)"
+    if suffix == ".jxl":
+        return "convert them to JPEG, with their tags (djxl IN.jxl OUT.jpg, of libjxl, or: magick mogrify -format jpg)"
     if suffix in JPEG_SUFFIXES:
         return "they are JPEG; rename them to .jpg"
     if suffix in VIDEO_SUFFIXES:
         return "name the films themselves"
-    if suffix in OTHER_SUFFIXES:
-        return "convert them to JPEG, PNG or TIFF, with their tags"
-    return "convert them to JPEG, with their tags (phones and macOS export them so)"
+    return "convert them to JPEG, PNG or TIFF, with their tags"
 
 
 def _prefixes(folders: Sequence[Path]) -> list[str]:

@@ -229,7 +229,8 @@ def _moments(taken: Sequence[ImageMetadata]) -> np.ndarray:
 
 def up_of(model: pycolmap.Reconstruction, photographs: Sequence[ImageMetadata]) -> tuple[Up, list[str]]:
     """What attitudes that the drone recorded, or else the views, say of up in the model's world; and notes."""
-    images = {image.name: image for image in model.images.values() if image.has_pose}
+    poles = {photo.name for photo in photographs if photo.face in ("up", "down")}  # of panoramas, which are upright
+    images = {image.name: image for image in model.images.values() if image.has_pose and image.name not in poles}
     rotations = np.array([_rotation(image) for image in images.values()])
     centers = np.array([image.projection_center() for image in images.values()])
     direction, deviation, sure = up_by_views(centers, rotations, model_points(model))

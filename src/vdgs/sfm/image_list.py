@@ -11,17 +11,22 @@ from pathlib import Path
 
 from vdgs.captures.formats.colmap import partial_model
 from vdgs.captures.formats.source_capture import format_list
-from vdgs.captures.name_resolution import match_key
+from vdgs.captures.image_files import HEIF_SUFFIXES
+from vdgs.captures.name_resolution import jpeg_name, match_key
 from vdgs.captures.nested_captures import foreign_poses, model_below
 from vdgs.captures.output_guard import is_capture
+from vdgs.captures.raw_files import RAW_SUFFIXES
 from vdgs.captures.reconstruction import is_reconstruction
 from vdgs.captures.strays import check_no_run, walk
+from vdgs.config.sfm_options import CameraModel
 from vdgs.errors import CaptureError
 from vdgs.sfm.cross_checks import cross_checked, strays
-from vdgs.sfm.find_images import find_files, is_film, is_photograph, nothing_found
-from vdgs.sfm.image_metadata import ImageMetadata, UnusableImage, read_image_metadata
+from vdgs.sfm.find_images import check_decoders, find_files, is_film, is_photograph, nothing_found
+from vdgs.sfm.image_metadata import ImageMetadata, UnusableImage, is_twice_as_wide, read_image_metadata
 from vdgs.sfm.mask_files import check_mask, find_masks
+from vdgs.sfm.spectral_bands import unused_bands
 from vdgs.system.quoting import shell_word
+from vdgs.system.units import first_names
 
 #: Fewer photographs are no scene.
 MIN_IMAGES = 3
@@ -49,8 +54,8 @@ class ImageList:
     """What people should know of their masks."""
 
 
-def collect_images(folders: Sequence[Path]) -> ImageList:
-    """Read the heads of all photographs in the folders and those below them.
+def collect_images(folders: Sequence[Path], camera_model: CameraModel = "auto") -> ImageList:
+    """Read the heads of all photographs in the folders and those below them; `camera_model` is as in `SfmOptions`.
 
     Raises CaptureError for folders that are not there or hold no photographs, captures, names that are alike but for
     blanks, masks that belong to nothing, and where too few are usable.
@@ -76,6 +81,7 @@ def collect_images(folders: Sequence[Path]) -> ImageList:
     found = find_files(folders)
     if not found.named:
         raise nothing_found(folders, found)
+    check_decoders(folders, found)
     masks, notes = find_masks(folders, found.named.values())
     named = {name: path for name, path in found.named.items() if path in masks}
     with ThreadPoolExecutor(4) as pool:
@@ -84,9 +90,11 @@ def collect_images(folders: Sequence[Path]) -> ImageList:
     left_out = [ExcludedImage(name, why) for name, why in found.left_out.items()]
     left_out += [each for each in read if isinstance(each, ExcludedImage)]
     photographs, doubled = _drop_duplicates(photographs)
-    photographs, strange = _of_the_flight(photographs)
-    left_out += [*doubled, *strange]
-    notes = [*found.notes(), *notes]
+    unused, spectral = unused_bands(photographs)
+    photographs, strange = _of_the_flight([photo for photo in photographs if photo.name not in unused])
+    photographs, lone = _with_models(photographs, camera_model)
+    left_out += [*doubled, *strange, *lone, *(ExcludedImage(name, why) for name, why in unused.items())]
+    notes = [*found.notes(), *notes, *spectral, *_kind_notes(photographs)]
     notes += [f"not read: {poses}. Poses are made anew." for folder in folders for poses in foreign_poses(folder)]
     if len(photographs) < MIN_IMAGES:
         reasons = format_list(f"{each.name}: {each.reason}" for each in left_out)
@@ -111,7 +119,46 @@ def is_image_folder(folder: Path) -> bool:
         or (folder / "sparse").exists()
     ):
         return False
-    return any(is_photograph(path) or is_film(path) for _, files, _ in walk(folder) for path in files)
+    decoded = HEIF_SUFFIXES | RAW_SUFFIXES  # without their decoder the error of `collect_images` says what to install
+    return any(
+        is_photograph(path) or is_film(path) or path.suffix.lower() in decoded
+        for _, files, _ in walk(folder)
+        for path in files
+    )
+
+
+def _kind_notes(photographs: Sequence[ImageMetadata]) -> list[str]:
+    """What is done with photographs that are no 8-bit sRGB pictures which all programs read."""
+    kinds: dict[str, list[str]] = {}
+    for photo in photographs:
+        kinds.setdefault(photo.kind, []).append(photo.name)
+    how = {"raw": "developed alike, with the daylight white balance of the camera and no automatic exposure"}
+    return [
+        f"{first_names(names)}: {kind}; {how.get(kind, 'converted')} to 8-bit sRGB and written as JPEG "
+        f"({jpeg_name(names[0])})."
+        for kind, names in kinds.items()
+        if kind
+    ]
+
+
+def _with_models(
+    photographs: Sequence[ImageMetadata], camera_model: CameraModel
+) -> tuple[list[ImageMetadata], list[ExcludedImage]]:
+    """The photographs with the lenses and the panoramas that a person asks for; without the panoramas of a flight that
+    took photographs of one view."""
+    if camera_model == "equirectangular":
+        return [replace(photo, is_panorama=is_twice_as_wide(*photo.size)) for photo in photographs], []
+    if camera_model != "auto":
+        photographs = [replace(photo, camera_model=camera_model.replace("-", "_").upper()) for photo in photographs]
+    panoramas = [photo for photo in photographs if photo.is_panorama]
+    if 2 * len(panoramas) >= len(photographs):
+        return list(photographs), []
+    why = (
+        "is a panorama (equirectangular) among photographs of one view; to use panoramas, give a folder of those alone"
+    )
+    return [photo for photo in photographs if not photo.is_panorama], [
+        ExcludedImage(photo.name, why) for photo in panoramas
+    ]
 
 
 def _of_the_flight(photographs: Sequence[ImageMetadata]) -> tuple[list[ImageMetadata], list[ExcludedImage]]:

@@ -9,12 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import UnidentifiedImageError
 
-from vdgs.captures.image_files import MAX_IMAGE_PX, SUPPORTED_MODES, pillow_without_limits
-from vdgs.captures.jpeg import JPEGS, has_end, lacks_only_end
+from vdgs.captures.image_files import MAX_IMAGE_PX, SUPPORTED_MODES
+from vdgs.captures.image_tags import ImageTags, read_tags
+from vdgs.captures.jpeg import lacks_only_end
+from vdgs.errors import CaptureError
 from vdgs.sfm.exif_gps import finite, plain_text, read_altitude, read_place
 from vdgs.sfm.focal_length import Lens, read_lens
+from vdgs.sfm.spectral_bands import band_of
 from vdgs.sfm.xmp import first_number, read_xmp, text
 
 
@@ -110,8 +113,10 @@ MIN_SIDE_PX = 100
 TRANSPOSED_ORIENTATIONS = (5, 6, 7, 8)
 #: A receiver that is off by more has no position.
 MAX_GPS_ERROR_M = 1000.0
-_EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
-_XMP_HEADER = b"http://ns.adobe.com/xap/1.0/\x00"
+#: COLMAP's models of lenses that a photograph may ask for.
+RADIAL, FISHEYE = "SIMPLE_RADIAL", "OPENCV_FISHEYE"
+#: The model of cameras of which nothing is fitted: of views that were cut out of panoramas.
+EXACT_MODEL = "SIMPLE_PINHOLE"
 #: What cameras are called that do not say what they are.
 UNKNOWN_CAMERA = "unknown camera"
 
@@ -157,6 +162,20 @@ class ImageMetadata:
     """What its tags say that is not believed, and why."""
     whole: bool = True
     """False where its file lacks the end marker, but nothing of the picture."""
+    kind: str = ""
+    """What makes it other than 8-bit sRGB in a file that all programs read, such as HEIC; empty for what is."""
+    band: str = ""
+    """The one band of a multispectral camera that it shows; empty for color."""
+    camera_model: str = RADIAL
+    """COLMAP's, by which the lens is fitted."""
+    is_panorama: bool = False
+    """Whether it shows all directions, equirectangular."""
+    face: str = ""
+    """Which view of a panorama it is; empty for photographs."""
+    whole_size: tuple[int, int] = (0, 0)
+    """Of such a view, width and height of the upright panorama."""
+    frame: str = ""
+    """What was taken at one moment: the name of the panorama, or of the photograph itself."""
 
     @property
     def may_be_masked(self) -> bool:
@@ -189,19 +208,14 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
     Raises `UnusableImage` for files that are no image, too small, of colors that are not understood, or cut off.
     """
     try:
-        size = path.stat().st_size
-        with pillow_without_limits(), Image.open(path) as image:
-            width, height = image.size
-            _check(image)
-            exif = image.getexif()
-            tags, details, gps = dict(exif), dict(exif.get_ifd(_EXIF_IFD)), dict(exif.get_ifd(_GPS_IFD))
-            xmp = read_xmp(_xmp_packet(image))
-            if text(xmp, "GPano:ProjectionType"):
-                raise UnusableImage(f"is a panorama ({text(xmp, 'GPano:ProjectionType')}), no photograph of one view")
-            transparent = "A" in image.getbands() or "transparency" in image.info
-            whole = image.format not in JPEGS or has_end(path, image)
+        size, found = path.stat().st_size, read_tags(path)
+        _check(found)
+        xmp = read_xmp(found.xmp_packet)
+        panorama = _is_panorama(found, xmp)
     except UnusableImage:
         raise
+    except CaptureError as error:
+        raise UnusableImage(str(error).removeprefix(f"{path}: ")) from None
     except UnidentifiedImageError:
         raise UnusableImage(_not_an_image(path)) from None
     except OSError as error:
@@ -209,9 +223,10 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
         raise UnusableImage(f"cannot be read ({why}): copy it again") from None
     except (SyntaxError, ValueError, TypeError, KeyError, struct.error, OverflowError, MemoryError) as error:
         raise UnusableImage(f"is damaged ({error}): copy it again") from None
+    tags, details, gps, width, height = found.tags, found.details, found.gps, found.width, found.height
     orientation = tags.get(0x0112, 1)
     orientation = orientation if orientation in range(1, 9) else 1
-    if not whole:
+    if not found.whole:
         _check_pixels(path)
     lens = read_lens(tags, details, xmp, width, height)
     if orientation in TRANSPOSED_ORIENTATIONS:
@@ -236,28 +251,52 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
         relative_altitude=first_number(xmp, "RelativeAltitude", "sensefly:Height") or None,
         attitude=attitude if orientation == 1 else None,
         file_bytes=size,
-        has_alpha_channel=transparent,
+        has_alpha_channel=found.has_alpha_channel,
         doubts=tuple(filter(None, (unclear, default, lens.doubt if lens else ""))),
-        whole=whole,
+        whole=found.whole,
+        kind=found.kind,
+        band=band_of(name, found.mode, xmp),
+        camera_model=FISHEYE if "fisheye" in plain_text(details.get(0xA434)).lower().replace("-", "") else RADIAL,
+        is_panorama=panorama,
+        frame=name,
     )
 
 
 def _not_an_image(path: Path) -> str:
-    """Why Pillow knows no format for a file: HEIC by another name, most often."""
+    """Why Pillow knows no format for a file."""
     with path.open("rb") as file:
         head = file.read(12)
     if head[4:8] == b"ftyp":
-        return f"is no {path.suffix.lower().lstrip('.')} but HEIC, HEIF or AVIF inside: convert it to JPEG"
+        return f"is no {path.suffix.lower().lstrip('.')} inside, and damaged: copy it again, or convert it to JPEG"
     return "cannot be read (no image format that is known): copy it again, or convert it to 8-bit RGB"
 
 
-def _check(image: Image.Image) -> None:
-    if image.width * image.height > MAX_IMAGE_PX:
-        raise UnusableImage(f"announces {image.width} x {image.height} pixels: it is damaged")
-    if min(image.size) < MIN_SIDE_PX:
-        raise UnusableImage(f"has {image.width} x {image.height} pixels only: a thumbnail")
-    if image.mode not in SUPPORTED_MODES or image.mode.startswith("I"):
-        raise UnusableImage(f"has the color mode {image.mode}: convert it to 8-bit RGB")
+def _is_panorama(found: ImageTags, xmp: Mapping[str, str]) -> bool:
+    """Whether a photograph shows all directions, equirectangular, by Google's XMP. Raises Unusable for panoramas of
+    other projections, and for parts."""
+    projection = text(xmp, "GPano:ProjectionType")
+    if not projection:
+        return False
+    whole, cropped = (first_number(xmp, f"GPano:{which}Pixels") for which in ("FullPanoWidth", "CroppedAreaImageWidth"))
+    if projection.lower() != "equirectangular" or not is_twice_as_wide(found.width, found.height):
+        raise UnusableImage(f"is a panorama ({projection}), but not equirectangular and twice as wide as high")
+    if whole and cropped and cropped < whole:
+        raise UnusableImage("is a part of a panorama: export the whole of it, 360° by 180°")
+    return True
+
+
+def is_twice_as_wide(width: int, height: int) -> bool:
+    """Whether a picture has the shape of a whole equirectangular panorama."""
+    return abs(width - 2 * height) <= 2
+
+
+def _check(found: ImageTags) -> None:
+    if found.width * found.height > MAX_IMAGE_PX:
+        raise UnusableImage(f"announces {found.width} x {found.height} pixels: it is damaged")
+    if min(found.width, found.height) < MIN_SIDE_PX:
+        raise UnusableImage(f"has {found.width} x {found.height} pixels only: a thumbnail")
+    if found.mode not in SUPPORTED_MODES:
+        raise UnusableImage(f"has the color mode {found.mode}: convert it to 8-bit RGB")
 
 
 def _check_pixels(path: Path) -> None:
@@ -268,14 +307,6 @@ def _check_pixels(path: Path) -> None:
         complete = False
     if not complete:
         raise UnusableImage("cannot be read (it is cut off): copy it again")
-
-
-def _xmp_packet(image: Image.Image) -> bytes:
-    for marker, content in getattr(image, "applist", ()):
-        if marker == "APP1" and content.startswith(_XMP_HEADER):
-            return bytes(content[len(_XMP_HEADER) :])
-    packet = image.info.get("xmp", b"")
-    return packet if isinstance(packet, bytes) else str(packet).encode("utf-8", errors="replace")
 
 
 def _camera(tags: Mapping[int, Any], details: Mapping[int, Any], xmp: Mapping[str, str]) -> str:

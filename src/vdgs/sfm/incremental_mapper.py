@@ -13,11 +13,12 @@ from rich.console import Console
 from vdgs.captures.formats.colmap_writing import check_whole_model, write_model_files
 from vdgs.config.sfm_options import SfmOptions
 from vdgs.errors import CaptureError
+from vdgs.sfm.capture_writer import placed_images
 from vdgs.sfm.feature_extraction import CameraGroup
 from vdgs.sfm.focal_length import CALIBRATED_SOURCE
 from vdgs.sfm.georegistration import is_nearly_collinear
 from vdgs.sfm.gps_priors import GpsPriors
-from vdgs.sfm.image_metadata import ImageMetadata
+from vdgs.sfm.image_metadata import EXACT_MODEL, ImageMetadata
 from vdgs.sfm.preflight import OBLIQUE_ANGLE_DEG
 from vdgs.sfm.workspace import Workspace, call_cancellable, report_progress
 from vdgs.system.lazy_pycolmap import pycolmap
@@ -43,6 +44,9 @@ def should_fix_focal(
     wrong focal length that is held bends or tears all other scenes."""
     if options.focal != "auto":
         return options.focal == "fixed", "asked for"
+    photographs = [photo for photo in photographs if not photo.face]
+    if not photographs:
+        return True, "views that are cut out of panoramas have none to fit"
     few = max(1, FEW * len(photographs))
     if sum(photo.lens is None for photo in photographs) > few:
         return False, "nothing says it for some photographs"
@@ -91,6 +95,11 @@ def run_mapper(workspace: Workspace, count: int, fix_focal: bool, threads: int, 
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
     options = _options(fix_focal, threads)
+    with workspace.open_database() as database:
+        exact = {camera.camera_id for camera in database.read_all_cameras() if camera.model_name == EXACT_MODEL}
+        rigs = [rig for rig in database.read_all_rigs() if rig.ref_sensor_id.id in exact]
+    options.constant_cameras = options.mapper.constant_cameras = exact
+    options.constant_rigs = options.mapper.constant_rigs = {rig.rig_id for rig in rigs}
     options.snapshot_path, options.snapshot_frames_freq = (
         workspace.snapshots,
         max(MIN_SNAPSHOT_INTERVAL, count // MAX_SNAPSHOTS),
@@ -186,5 +195,5 @@ def refined_cameras(
     model: pycolmap.Reconstruction, camera_groups: Sequence[CameraGroup]
 ) -> list[pycolmap.Camera | None]:
     """The fitted cameras in the order of the kinds of photographs; None for those without a placed photograph."""
-    used = {image.camera_id for image in model.images.values() if image.has_pose}
+    used = {image.camera_id for image in placed_images(model)}
     return [model.cameras[k] if k in used and k in model.cameras else None for k in range(1, len(camera_groups) + 1)]

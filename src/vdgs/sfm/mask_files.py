@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from vdgs.captures.mask_matching import mask_name
 from vdgs.captures.strays import MASK_FOLDERS, is_mask_folder, masked_stem
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
+from vdgs.sfm.cube_faces import cut_face
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.workspace import Workspace
 from vdgs.system.atomic_files import write_bytes
@@ -143,8 +145,14 @@ def write_upright_masks(workspace: Workspace, photographs: Sequence[ImageMetadat
 def read_keep_mask(metadata: ImageMetadata) -> np.ndarray | None:
     """What counts of a photograph once it is upright, [h, w] bool; None: all of it.
 
-    A mask is of the file as it is, before EXIF's orientation, unless only the upright photograph has its shape.
+    A mask is of the file as it is, before EXIF's orientation, unless only the upright photograph has its shape. Of a
+    view that was cut out of a panorama it is the panorama's.
     """
+    if metadata.face:
+        width, height = metadata.whole_size
+        keep = read_keep_mask(replace(metadata, face="", width=width, height=height))
+        nearest = cv2.INTER_NEAREST
+        return None if keep is None else cut_face(keep.astype(np.uint8), metadata.face, metadata.width, nearest) > 0
     keep = _opaque(metadata) if metadata.has_alpha_channel else None
     if metadata.mask is None:
         return keep
@@ -165,9 +173,9 @@ def _opaque(photo: ImageMetadata) -> np.ndarray | None:
 
 
 def apply_orientation(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """Pixels [h, w] of a file turned and mirrored as EXIF's orientation says."""
+    """Pixels [h, w, ...] of a file turned and mirrored as EXIF's orientation says."""
     if orientation in (5, 6, 7, 8):
-        pixels = pixels.T
+        pixels = pixels.swapaxes(0, 1)
     down, across = orientation in (3, 4, 7, 8), orientation in (2, 3, 6, 7)
     return pixels[:: -1 if down else 1, :: -1 if across else 1]
 

@@ -22,6 +22,8 @@ from vdgs.captures.formats.source_capture import Intrinsics, SourceCapture
 from vdgs.captures.georeference import ENU_FRAME, LOCAL_FRAME, ORIGIN_KEYS
 from vdgs.captures.image_files import decode_image, read_header
 from vdgs.captures.image_matching import MatchedView, match_images
+from vdgs.captures.image_tags import kind_of
+from vdgs.captures.name_resolution import jpeg_name
 from vdgs.captures.output_guard import check_output
 from vdgs.captures.project_formats import read_poses
 from vdgs.captures.reconstruction import STEPS_FILE, WORK_FOLDER
@@ -218,7 +220,7 @@ def _metadata(view: MatchedView) -> ImageMetadata:
         name=view.view.name, path=path, width=lens.width, height=lens.height, orientation=1, camera="", lens=None,
         datetime="", lat_lon=None, altitude=None, altitude_type="", gps_std=None, gps_error_m=None,
         relative_altitude=None, attitude=None, file_bytes=path.stat().st_size,
-        has_alpha_channel="A" in read_header(path).mode, mask=view.file.mask,
+        has_alpha_channel="A" in read_header(path).mode, mask=view.file.mask, kind=kind_of(path),
     )  # fmt: skip
 
 
@@ -378,7 +380,7 @@ def color_points(
             continue
         rays = np.asarray(model.cameras[image.camera_id].cam_from_img(np.array([point.xy for point in seen])))
         fx, fy, cx, cy = lenses[lens_of[image.name]].params
-        pixels, _ = decode_image(output / folder / capture_writer.jpeg_name(image.name))
+        pixels, _ = decode_image(output / folder / jpeg_name(image.name))
         at = (rays.reshape(-1, 2) * [fx, fy] + [cx, cy]) / factor
         x, y = at.astype(int).clip(0, np.array(pixels.shape[1::-1]) - 1).T
         index = np.searchsorted(numbers, np.array([point.point3D_id for point in seen], dtype=np.uint64))

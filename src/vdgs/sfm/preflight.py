@@ -131,15 +131,21 @@ def _views_per_place(positions: GpsPriors, footprint: tuple[float, float] | None
 
 def _warnings(collection: ImageList, overlap: float | None, views: float | None, days: Sequence[str]) -> list[str]:
     photographs, found = collection.images, list[str]()
-    without = [photo.name for photo in photographs if photo.lens is None]
+    without = [photo.name for photo in photographs if photo.lens is None and not photo.is_panorama]
     if without:
         found.append(f"{first_names(without)}: nothing says the focal length; it is fitted from a guess.")
     found += _doubts(photographs)
-    round_ = [photo.name for photo in photographs if photo.width == 2 * photo.height and photo.lens is None]
+    around = [photo.name for photo in photographs if photo.is_panorama]
+    if around:
+        found.append(
+            f"{first_names(around)}: panoramas of 360°; each is cut into six views of 90° that move as one "
+            "(pano_front/NAME, pano_right/NAME, ...)."
+        )
+    round_ = [photo.name for photo in photographs if photo.width == 2 * photo.height and photo.name in without]
     if round_:
         found.append(
-            f"{first_names(round_)}: exactly twice as wide as high, of an unknown lens. Panoramas of 360° cannot be "
-            "used: cut views with a lens out of them first."
+            f"{first_names(round_)}: exactly twice as wide as high, of an unknown lens. If these are panoramas of "
+            "360°: --camera-model equirectangular"
         )
     endless = [photo.name for photo in photographs if not photo.whole]
     if endless:

@@ -39,6 +39,7 @@ from vdgs.sfm.console_report import print_reconstruction_report
 from vdgs.sfm.films.take_frames import with_frames
 from vdgs.sfm.georeferencing import georeference
 from vdgs.sfm.image_list import ExcludedImage
+from vdgs.sfm.panoramas import apply_rigs
 from vdgs.sfm.position_plots import plot_positions, plot_residuals
 from vdgs.sfm.reconstruction_plan import (
     POSITIONS_FIGURE,
@@ -223,6 +224,7 @@ def _steps(
     kinds = feature_extraction.group_by_camera(photographs)
     lost = _features(plan, workspace, kinds, keys["features"], console)
     usable = [photo for photo in photographs if photo.name not in {each.name for each in lost}]
+    apply_rigs(workspace, photographs)
     pairs = _matches(plan, workspace, keys["matches"], console)
     held = incremental_mapper.should_fix_focal(photographs, plan.gps_priors, request.options)
     models = _models(plan, workspace, keys["model"], len(usable), held[0], console)
@@ -240,7 +242,7 @@ def _steps(
         camera_groups=kinds,
         found=found,
         excluded=left_out,
-        components=[model.num_reg_images() for model in models],
+        components=[len(capture_writer.placed_images(model)) for model in models],
         pairs=pairs,
         focal_fixed=held,
         seconds=time.monotonic() - began,
@@ -326,7 +328,7 @@ def _gcp_positions(plan: ReconstructionPlan) -> np.ndarray:
 
 
 def _lenses(model: pycolmap.Reconstruction, max_size: int) -> dict[int, capture_writer.Undistortion]:
-    used = sorted({image.camera_id for image in model.images.values() if image.has_pose})
+    used = sorted({image.camera_id for image in capture_writer.placed_images(model)})
     lenses = {number: capture_writer.fitted_intrinsics(model.cameras[number]) for number in used}
     return {number: capture_writer.make_undistortion(lens, max_size) for number, lens in lenses.items()}
 
@@ -342,12 +344,8 @@ def _write(
     """Photographs without distortion, by the lenses of the placed model, and the model as it was mapped."""
     output = plan.request.output
     if not Workspace(output).is_begun("capture", key):
-        for name in (
-            *(folder for folder, _ in capture_writer.IMAGE_SIZES),
-            capture_writer.MASK_FOLDER,
-            "sparse",
-            MAPPED,
-        ):
+        folders = [*(folder for folder, _ in capture_writer.IMAGE_SIZES), capture_writer.MASK_FOLDER, "sparse", MAPPED]
+        for name in folders:
             shutil.rmtree(output / name, ignore_errors=True)
         for name in (RECONSTRUCTION_FILE, "georef.json", RECONSTRUCTION_FIGURE):
             (output / name).unlink(missing_ok=True)
@@ -363,9 +361,8 @@ def _write_images(
 ) -> None:
     output, max_size = prepared.request.output, prepared.request.options.max_output_size
     names: dict[int, list[str]] = {}
-    for image in sorted(model.images.values(), key=lambda image: image.name):
-        if image.has_pose:
-            names.setdefault(image.camera_id, []).append(image.name)
+    for image in sorted(capture_writer.placed_images(model), key=lambda image: image.name):
+        names.setdefault(image.camera_id, []).append(image.name)
     lenses, total = _lenses(model, max_size), sum(map(len, names.values()))
     with report_progress(work, console, "writing", total, "without distortion, ") as tell:
         capture_writer.write_images(output, work, names, lenses, prepared.threads, tell)

@@ -26,6 +26,7 @@ from vdgs.sfm.console_report import print_preflight
 from vdgs.sfm.gcp_list import GcpList, check_gcps_near, read_gcp_list
 from vdgs.sfm.gps_priors import MIN_POSITIONS, GpsPriors, read_gps_priors
 from vdgs.sfm.image_list import ImageList, collect_images
+from vdgs.sfm.panoramas import with_views
 from vdgs.sfm.preflight import PreflightReport, make_preflight_report
 from vdgs.sfm.scale_bars import ScaleBars, read_scale_bars
 from vdgs.system.quoting import shell_word
@@ -60,14 +61,16 @@ class ReconstructionPlan:
 def plan_reconstruction(request: SfmRequest) -> ReconstructionPlan:
     """The look before the work; nothing is written. Raises CaptureError for photographs that cannot become one."""
     check_ranges(request)
-    collection = collect_images(request.image_folders)
+    collection = collect_images(request.image_folders, request.options.camera_model)
     check_output_outside_images(request.output, collection)
     request, beside = _with_tables_beside(request, collection)
+    _check_marks(request.options, collection)
     positions = read_gps_priors(collection.images, request.gps, request.options.gps_std_m)
     control = _read_gcps(request.options, collection, positions)
     bars = read_scale_bars(request.options.scale_bar, collection) if request.options.scale_bar is not None else None
     look = make_preflight_report(collection, positions)
     look = replace(look, warnings=[*look.warnings, *beside, *(control.notes if control else ())])
+    collection, positions = with_views(collection, positions)
     threads = request.threads or default_num_threads()
     pairs = feature_matching.estimate_pair_count(collection.images, positions, request.options)
     return ReconstructionPlan(
@@ -103,6 +106,14 @@ def _with_tables_beside(request: SfmRequest, collection: ImageList) -> tuple[Sfm
         )
         return replace(request, gps=used.file), notes
     return request, [*notes, *(table_note(table, number) for table in tables)]
+
+
+def _check_marks(options: SfmOptions, collection: ImageList) -> None:
+    if any(photo.is_panorama for photo in collection.images) and (options.gcp or options.scale_bar):
+        raise VdgsError(
+            "--gcp and --scale-bar take marks in photographs of one view, not in panoramas: place panoramas by their "
+            "positions, in EXIF or by --gps."
+        )
 
 
 def _read_gcps(options: SfmOptions, collection: ImageList, positions: GpsPriors) -> GcpList | None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from vdgs.captures.capture_dates import first_and_last
 from vdgs.captures.reconstruction import CameraReport, GcpReport, ImageReport, ReconstructionReport
+from vdgs.sfm.capture_writer import placed_images
 from vdgs.sfm.feature_extraction import CameraGroup
 from vdgs.sfm.gcp_adjustment import MARK_WRONG_PX
 from vdgs.sfm.georeferencing import Georeferenced
@@ -53,7 +54,7 @@ def make_reconstruction_report(plan: ReconstructionPlan, result: ReconstructionR
     """The facts of a model that lies where it belongs."""
     model, placed, held = result.found.model, result.metric, result.focal_fixed
     collection, positions, look = plan.image_list, plan.gps_priors, plan.preflight
-    images = [image for image in model.images.values() if image.has_pose]
+    images = placed_images(model)
     metric = placed is not None
     height = _height(model, images) if metric else None
     forwards = np.array([image.cam_from_world().rotation.matrix()[2] for image in images])
@@ -62,7 +63,7 @@ def make_reconstruction_report(plan: ReconstructionPlan, result: ReconstructionR
     turned = tilt_from_attitudes(model, collection.images) if metric else None
     warnings = [*look.warnings, *_warnings(cameras, held[0], height, look.height_m, turned)]
     warnings += _survey_warnings(result.found.survey)
-    advice = _advice(look, held[0], len(images), len(collection.images))
+    advice = _advice(look, held[0], len(images), sum(photo.face != "up" for photo in collection.images))
     if isinstance(result.found.placed, AlignmentFailure):
         unplaced = result.found.placed
         georeferenced = f"none: {unplaced.reason}; scale, north and up are not known"
@@ -97,16 +98,15 @@ def exclusion_reasons(
     known: Sequence[ExcludedImage],
 ) -> list[ExcludedImage]:
     """Every photograph that the model does not place, with the reason."""
-    placed = {image.name for image in model.images.values() if image.has_pose}
+    placed = {image.name for image in placed_images(model)}
     reasons = {each.name: each.reason for each in known}
     for other in reversed(others):
-        count = other.num_reg_images()
-        for image in other.images.values():
-            if image.has_pose:
-                reasons.setdefault(
-                    image.name,
-                    f"belongs to a part of {count} photographs that nothing joins to the rest: more overlap between",
-                )
+        apart = placed_images(other)
+        for image in apart:
+            reasons.setdefault(
+                image.name,
+                f"belongs to a part of {len(apart)} photographs that nothing joins to the rest: more overlap between",
+            )
     found = []
     for name in names:
         if name in placed:
@@ -150,7 +150,7 @@ def cameras_of(model: pycolmap.Reconstruction, kinds: Sequence[CameraGroup]) -> 
             focal_before_px=float(kind.focal_px),
             focal_source=kind.source,
             focal_after_px=float(after.mean_focal_length()),
-            radial_distortion=float(after.params[3]),
+            radial_distortion=float(next(iter(after.params[after.extra_params_idxs()]), 0.0)),
         )
         for kind, after in zip(kinds, refined_cameras(model, kinds), strict=True)
         if after is not None

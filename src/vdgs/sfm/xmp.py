@@ -21,6 +21,11 @@ _ELEMENT = re.compile(rf"<({_NAME}):({_NAME})(?:[ \t\r\n][^<>]{{0,200}})?>([^<]{
 #: The one structure whose fields have names that others have too (Skydio): how the camera lies, north, east, down.
 _CAMERA = re.compile(r"CameraOrientationNED\b")
 _CAMERA_BYTES = 600
+#: The band of a multispectral camera, as a list; color photographs list three.
+_BAND = re.compile(
+    r"<(Camera:BandName)>\s{0,200}<rdf:(?:Seq|Bag)>((?:\s{0,200}<rdf:li>[^<]{0,100}</rdf:li>){1,8})\s{0,200}</rdf:(?:Seq|Bag)>"
+)
+_ITEM = re.compile(r"<rdf:li>([^<]{0,100})<")
 
 
 def read_xmp(packet: bytes) -> dict[str, str]:
@@ -30,6 +35,9 @@ def read_xmp(packet: bytes) -> dict[str, str]:
     for prefix, name, value in _values(text):
         if prefix != "xmlns" and len(found) < MAX_VALUES:
             found.setdefault(f"{prefix}:{name}", value)
+    band = _BAND.search(text)
+    if band and len(names := _ITEM.findall(band[2])) == 1:
+        found.setdefault(band[1], names[0].strip())
     camera = _CAMERA.search(text)
     if camera:
         body = text[camera.end() : camera.end() + _CAMERA_BYTES].partition("CameraOrientationNED")[0]

@@ -14,7 +14,7 @@ import numpy as np
 from vdgs.captures.formats.photograph_sizes import name_unaligned, photograph_sizes
 from vdgs.captures.formats.project import Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
-from vdgs.captures.image_files import IMAGE_SUFFIXES
+from vdgs.captures.image_files import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 
@@ -166,7 +166,10 @@ def read_list(file: Path) -> list[str]:
     except OSError as error:
         raise CaptureError(f"{file}: cannot be read ({error.strerror or error}).") from error
     whole = [line.strip() for line in lines if line.strip()]
-    return [line if Path(line).suffix.lower() in IMAGE_SUFFIXES else line.split()[0] for line in whole]
+    return [
+        line if Path(line).suffix.lower() in IMAGE_SUFFIXES | OTHER_IMAGE_SUFFIXES else line.split()[0]
+        for line in whole
+    ]
 
 
 def find_list(bundle: Path) -> Path | None:

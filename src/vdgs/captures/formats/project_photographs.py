@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
 
-from vdgs.captures.image_files import IMAGE_SUFFIXES, UNREAD_IMAGE_SUFFIXES
+from vdgs.captures.image_files import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES, readable_images
 from vdgs.captures.name_resolution import to_nfc
 from vdgs.captures.strays import is_mask_folder, walk
 from vdgs.config.capture_options import CaptureOptions
@@ -18,7 +18,7 @@ from vdgs.system.quoting import shell_word
 
 #: The folder of undistorted photographs, which are not those of a camera.
 UNDISTORTED = "undistorted"
-_SUFFIXES = IMAGE_SUFFIXES | UNREAD_IMAGE_SUFFIXES
+_SUFFIXES = IMAGE_SUFFIXES | OTHER_IMAGE_SUFFIXES
 _URI = re.compile(r"file:/*(?:localhost/)?", re.IGNORECASE)
 
 
@@ -85,12 +85,12 @@ def _find_images(root: Path, options: CaptureOptions) -> dict[str, Path]:
         inside = folder.relative_to(root).parts
         if UNDISTORTED in inside or any(map(is_mask_folder, inside)) or (apart and folder.resolve() == apart):
             continue
-        found.update({(folder / file.name).relative_to(root).as_posix(): file for file in files if _is_image(file)})
+        found.update({(folder / file.name).relative_to(root).as_posix(): file for file in _images(files)})
     return dict(sorted(found.items()))
 
 
-def _is_image(file: Path) -> bool:
-    return file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith(".")
+def _images(files: Iterable[Path]) -> list[Path]:
+    return [file for file in readable_images(files) if not file.name.startswith(".")]
 
 
 class PhotographIndex:

@@ -31,6 +31,7 @@ EXTRAS = {
     "tensorboard": "curves of the training in TensorBoard",
     "geo": "maps as GeoTIFFs, any EPSG system (vdgs ortho)",
     "video": "films instead of photographs (vdgs sfm FILM.MP4)",
+    "photos": "HEIC and raw photographs (vdgs sfm)",
     "viewer": "a scene in a browser (vdgs view)",
     "ray": "blocks on many machines (--executor ray)",
     "gsplat": "another rasterizer on an NVIDIA GPU, to compare with",

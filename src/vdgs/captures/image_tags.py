@@ -1,0 +1,94 @@
+"""What the file of a photograph says before its pixels, whatever its kind: size, EXIF, GPS, XMP, colors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from vdgs.captures.color_profiles import foreign_space
+from vdgs.captures.image_files import mode_of, open_image
+from vdgs.captures.jpeg import JPEGS, has_end
+from vdgs.captures.raw_files import is_raw, raw_size, raw_tags
+
+_EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
+_XMP_HEADER = b"http://ns.adobe.com/xap/1.0/\x00"
+_BITS_PER_SAMPLE = 0x0102
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageTags:
+    """Of a file as it is, before EXIF's orientation."""
+
+    width: int
+    height: int
+    mode: str
+    """Pillow's; RGB for raw files."""
+    tags: dict[int, Any]
+    """EXIF's first directory, and those of the exposure and of GPS."""
+    details: dict[int, Any]
+    gps: dict[int, Any]
+    xmp_packet: bytes
+    has_alpha_channel: bool
+    whole: bool
+    """False for a JPEG without an end marker."""
+    kind: str
+    """What makes it other than 8-bit sRGB in a file that all programs read: HEIC, raw, CMYK, Display P3, 16 bits a
+    channel; empty for what is."""
+
+
+def read_tags(path: Path) -> ImageTags:
+    """Raises what Pillow raises for files that are damaged or no image, and CaptureError for raw files and decoders
+    that are not installed."""
+    if is_raw(path):
+        width, height = raw_size(path)
+        tags, details, gps, packet = raw_tags(path)
+        return ImageTags(
+            width=width, height=height, mode="RGB", tags=tags, details=details, gps=gps, xmp_packet=packet,
+            has_alpha_channel=False, whole=True, kind="raw",
+        )  # fmt: skip
+    with open_image(path) as image:
+        kind, exif = _kind(image), image.getexif()  # of a PNG, the latter forgets how its pixels lie
+        return ImageTags(
+            width=image.width,
+            height=image.height,
+            mode=mode_of(image),
+            tags=dict(exif),
+            details=dict(exif.get_ifd(_EXIF_IFD)),
+            gps=dict(exif.get_ifd(_GPS_IFD)),
+            xmp_packet=_xmp_packet(image),
+            has_alpha_channel="A" in image.getbands() or "transparency" in image.info,
+            whole=image.format not in JPEGS or has_end(path, image),
+            kind=kind,
+        )
+
+
+def kind_of(path: Path) -> str:
+    """`ImageTags.kind` of a file whose head can be read."""
+    if is_raw(path):
+        return "raw"
+    with open_image(path) as image:
+        return _kind(image)
+
+
+def _kind(image: Image.Image) -> str:
+    parts = [image.format] if image.format in ("HEIF", "AVIF") else []
+    space = foreign_space(image)
+    parts += [space] if space else ["16 bits a channel"] if _has_16_bits(image) else []
+    return ", ".join(parts).replace("HEIF", "HEIC")
+
+
+def _has_16_bits(image: Image.Image) -> bool:
+    if image.format == "TIFF":
+        return 16 in image.tag_v2.get(_BITS_PER_SAMPLE, ())  # type: ignore[attr-defined]
+    return image.format == "PNG" and any("16" in str(tile[3]) for tile in image.tile)
+
+
+def _xmp_packet(image: Image.Image) -> bytes:
+    for marker, content in getattr(image, "applist", ()):
+        if marker == "APP1" and content.startswith(_XMP_HEADER):
+            return bytes(content[len(_XMP_HEADER) :])
+    packet = image.info.get("xmp", b"")
+    return packet if isinstance(packet, bytes) else str(packet).encode("utf-8", errors="replace")

@@ -1,0 +1,158 @@
+"""Panoramas of 360° and fisheyes: cut to perspective views, placed with their true places and headings."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+from rich.console import Console
+
+from support.flights import add_xmp, write_photograph
+from support.panoramas import fisheye, panorama, walk
+from vdgs.config.sfm_options import SfmOptions, SfmRequest
+from vdgs.errors import VdgsError
+from vdgs.sfm.cube_faces import FACES, cut_face
+from vdgs.sfm.image_list import collect_images
+from vdgs.sfm.mask_files import read_keep_mask
+from vdgs.sfm.reconstruct import reconstruct
+from vdgs.sfm.reconstruction_plan import plan_reconstruction
+
+WIDTH = 640
+
+
+def globe(width: int = 720) -> np.ndarray:
+    """A panorama whose red is the longitude and whose green is the latitude."""
+    u, v = np.meshgrid((np.arange(width) + 0.5) / width, (np.arange(width // 2) + 0.5) * 2 / width)
+    return np.stack([255 * u, 255 * v, 0 * u], axis=-1).astype(np.uint8)
+
+
+def test_faces_look_where_they_say():
+    """The middle of each face shows the panorama in that direction; neighbors meet at their edges."""
+    faces = {name: cut_face(globe(), name, 60).astype(float) for name in FACES}
+    for name, (longitude, latitude) in {
+        "front": (0.5, 0.5), "right": (0.75, 0.5), "left": (0.25, 0.5), "up": (None, 0.0), "down": (None, 1.0)
+    }.items():  # fmt: skip
+        middle = faces[name][29:31, 29:31].mean(axis=(0, 1)) / 255
+        assert longitude is None or middle[0] == pytest.approx(longitude, abs=0.01)
+        assert middle[1] == pytest.approx(latitude, abs=0.02)
+    assert faces["front"][30, -1] == pytest.approx(faces["right"][30, 0], abs=4)
+    assert faces["front"][-1, 30] == pytest.approx(faces["down"][0, 30], abs=4)
+    assert faces["front"][0, 30] == pytest.approx(faces["up"][-1, 30], abs=4)
+    for axes in FACES.values():
+        assert np.array_equal(np.cross(axes[0], axes[1]), axes[2])
+
+
+def write(folder, number: int, xmp: bytes = b'<rdf:Description GPano:ProjectionType="equirectangular"/>') -> None:
+    folder.mkdir(exist_ok=True)
+    pixels = np.random.default_rng(number).integers(0, 255, (120, 240, 3), np.uint8)
+    Image.fromarray(pixels).save(folder / f"P{number}.jpg")
+    if xmp:
+        add_xmp(folder / f"P{number}.jpg", xmp)
+
+
+def test_panoramas_are_known_by_their_tags_or_asked_for(tmp_path):
+    for k in range(3):
+        write(tmp_path / "tagged", k)
+        write(tmp_path / "plain", k, b"")
+        write(tmp_path / "part", k, b'<r GPano:ProjectionType="equirectangular" GPano:FullPanoWidthPixels="480" '
+              b'GPano:CroppedAreaImageWidthPixels="240"/>')  # fmt: skip
+    assert all(photo.is_panorama for photo in collect_images([tmp_path / "tagged"]).images)
+    assert not any(photo.is_panorama for photo in collect_images([tmp_path / "plain"]).images)
+    assert all(photo.is_panorama for photo in collect_images([tmp_path / "plain"], "equirectangular").images)
+    with pytest.raises(VdgsError, match="is a part of a panorama"):
+        collect_images([tmp_path / "part"])
+    plan = plan_reconstruction(SfmRequest(image_folders=(tmp_path / "tagged",), output=tmp_path / "out"))
+    assert len(plan.image_list.images) == 18
+    assert plan.pairs == 3 * 36
+    request = SfmRequest(
+        image_folders=(tmp_path / "tagged",), output=tmp_path / "out", options=SfmOptions(scale_bar=tmp_path / "bars")
+    )
+    with pytest.raises(VdgsError, match="not in panoramas"):
+        plan_reconstruction(request)
+
+
+def test_the_mask_of_a_panorama_masks_its_faces(tmp_path):
+    for k in range(3):
+        write(tmp_path / "images", k)
+    mask = np.full((120, 240), 255, np.uint8)
+    mask[60:] = 0
+    (tmp_path / "masks").mkdir()
+    Image.fromarray(mask).save(tmp_path / "masks" / "P0.png")
+    plan = plan_reconstruction(SfmRequest(image_folders=(tmp_path / "images",), output=tmp_path / "out"))
+    kept = {photo.face: read_keep_mask(photo) for photo in plan.image_list.images if photo.frame == "P0.jpg"}
+    assert kept["up"].all()
+    assert not kept["down"].any()
+    half = kept["front"].shape[0] // 2
+    assert kept["front"][: half - 1].all()
+    assert not kept["front"][half + 1 :].any()
+
+
+@pytest.mark.slow
+def test_a_walk_with_panoramas_is_placed(tmp_path):
+    """To centimetres and a degree (a pixel shows half of one); views of one share a place; none is of the sky."""
+    places = [np.array([x, y, 12.0 + z]) for x, y, z in [(-7, -3, 0), (0, -3, 1), (7, -3, 0), (3, 4, 1)]]
+    headings = walk(tmp_path / "photos", places, WIDTH)
+    output = tmp_path / "capture"
+    options = SfmOptions(max_num_features=1500)
+    request = SfmRequest(image_folders=(tmp_path / "photos",), output=output, threads=1, options=options)
+    report = reconstruct(request, Console(file=io.StringIO()))
+    assert report.reprojection_px < 0.6
+    images = pycolmap.Reconstruction(output / "sparse" / "0").images.values()
+    assert not any(image.name.startswith("pano_up/") for image in images)
+    centers, turns = dict[int, list[np.ndarray]](), []
+    for image in images:
+        face, number = image.name.partition("/")[0].removeprefix("pano_"), int(image.name[-8:-4]) - 1
+        centers.setdefault(number, []).append(np.asarray(image.projection_center()))
+        front_from_world = np.array(FACES[face]).T @ image.cam_from_world().rotation.matrix()
+        angle = np.radians(headings[number])
+        turns.append(front_from_world[2] @ [np.sin(angle), np.cos(angle), 0])
+    assert sorted(centers) == [0, 1, 2, 3]
+    assert len(turns) >= 14
+    assert np.degrees(np.arccos(np.clip(turns, -1, 1))).max() < 1
+    assert max(np.ptp(each, axis=0).max() for each in centers.values()) < 1e-6
+    assert np.ptp([centers[k][0] - places[k] for k in range(4)], axis=0).max() < 0.1  # the origin is another
+
+
+def test_the_name_of_the_lens_tells_a_fisheye(tmp_path):
+    for k, lens in enumerate(("8mm F3.5 Fish-Eye", "Fisheye 10.5mm", "24mm F2.8")):
+        exif = Image.Exif()
+        exif.get_ifd(0x8769)[0xA434] = lens
+        exif.get_ifd(0x8769)[0x920A] = 8.0
+        Image.fromarray(globe(240)).save(tmp_path / f"{k}.jpg", exif=exif)
+    models = [photo.camera_model for photo in collect_images([tmp_path]).images]
+    assert models == ["OPENCV_FISHEYE", "OPENCV_FISHEYE", "SIMPLE_RADIAL"]
+    assert {photo.camera_model for photo in collect_images([tmp_path], "opencv").images} == {"OPENCV"}
+
+
+@pytest.mark.slow
+def test_a_flight_with_a_fisheye_is_placed(tmp_path):
+    """The lens is fitted from a rough focal length, and straight lines come out of it: the sparse model, whose cameras
+    are pinholes, agrees with true projections."""
+    side, focal, bend = 400, 170.0, (0.03, -0.01, 0.0, 0.0)
+    places = [np.array([6.0 * (k % 3 - 1), 8.0 * (k // 3) - 4, 16.0 + k % 2]) for k in range(6)]
+    (tmp_path / "photos").mkdir()
+    for k, place in enumerate(places):
+        shown = fisheye(panorama(place, 30 * k, 900, 60.0), side, focal, bend)
+        write_photograph(tmp_path / "photos" / f"F{k}.jpg", shown, k, place, xmp="", focal_mm=4.5)
+    options = SfmOptions(camera_model="opencv-fisheye", max_num_features=2000)
+    request = SfmRequest(image_folders=(tmp_path / "photos",), output=tmp_path / "capture", threads=1, options=options)
+    report = reconstruct(request, Console(file=io.StringIO()))
+    assert report.registered == len(places)
+    assert not report.focal_fixed
+    assert report.reprojection_px < 0.6
+    assert report.cameras[0].focal_before_px == pytest.approx(180)
+    assert report.cameras[0].focal_after_px == pytest.approx(focal, rel=0.02)
+    model = pycolmap.Reconstruction(tmp_path / "capture" / "sparse" / "0")
+    assert {camera.model_name for camera in model.cameras.values()} == {"PINHOLE"}
+    centers = {image.name: image.projection_center() for image in model.images.values()}
+    assert np.ptp([centers[f"F{k}.jpg"] - place for k, place in enumerate(places)], axis=0).max() < 0.3
+    errors = [
+        np.linalg.norm(image.project_point(model.points3D[point.point3D_id].xyz) - point.xy)
+        for image in model.images.values()
+        for point in image.points2D
+        if point.has_point3D()
+    ]
+    assert np.median(errors) < 1
