@@ -12,7 +12,8 @@ import pytest
 
 from support.blocks_files import ORIENTATIONS, PLAIN, blocks_xml, in_system
 from support.captures import write_ply
-from support.true_flight import ORIGIN, TrueFlight, assert_read_or_refused, assert_true, true_flight
+from support.true_flight import ORIGIN, SIZE, TrueFlight, assert_read_or_refused, assert_true, true_flight
+from vdgs.captures.formats.lens_projection import ray_pixels
 from vdgs.captures.formats.source_capture import SourceCapture
 from vdgs.captures.loading import read_files
 from vdgs.config.capture_options import CaptureOptions
@@ -77,8 +78,9 @@ def test_yaw_and_pitch_are_read_where_nothing_rolls_and_refused_where_it_does(tm
     np.testing.assert_allclose(source.views[0].camera_from_world[:3, :3], level @ (turn @ lift).T, atol=1e-9)
     assert source.views[0].camera_from_world[2, :3] @ [np.sin(yaw), np.cos(yaw), 0] > 0  # looks to 37° and down
     assert source.views[0].camera_from_world[2, 2] < 0
-    with pytest.raises(CaptureError, match="Omega, Phi, Kappa"):
-        read(tmp_path, xml[:start] + "<Rotation>" + angles.replace(">0<", ">5<") + xml[end:], flight)
+    rolled = xml[:start] + "<Rotation>" + angles.replace(">0<", ">5<") + xml[end:]
+    [said] = [each for each in read(tmp_path, rolled, flight).warnings if "Omega, Phi, Kappa" in each]
+    assert "1 of 6 cameras" in said
 
 
 def test_photographs_without_pose_are_named_and_left_out(tmp_path, flight):
@@ -129,10 +131,51 @@ def test_heights_above_a_geoid_without_its_grid_are_said(tmp_path, flight):
     assert "heights as they are" in source.georef.method
 
 
+@pytest.mark.parametrize("in_pixels", [True, False])
+def test_fisheyes_are_bentleys(tmp_path, flight, in_pixels):
+    """A focal matrix, or a focal length, for angles in quarter turns, and a polynomial of them."""
+    xml = blocks_xml(flight, None, tie_points=False).replace(">Perspective<", ">Fisheye<")
+    write_ply(tmp_path / "points.ply", flight.points, np.zeros((900, 3), np.uint8))
+    matrix = np.array([[5000.0, 2.0], [-1.0, 4990.0]]) if in_pixels else np.diag([3656.4, 3656.4])
+    if in_pixels:
+        tags = [f"M_{row}{column}" for row in range(2) for column in range(2)]
+        inner = "".join(f"<{tag}>{value}</{tag}>" for tag, value in zip(tags, matrix.ravel(), strict=True))
+        xml = xml.replace("<FocalLengthPixels>3656.4</FocalLengthPixels>", "")
+        xml = xml.replace("<Distortion>", f"<FisheyeFocalMatrix>{inner}</FisheyeFocalMatrix><Distortion>")
+    powers = "<FisheyeDistortion><P0>0</P0><P1>1</P1><P2>0.02</P2><P3>-0.03</P3></FisheyeDistortion>"
+    xml = xml.replace("<Distortion>", f"{powers}<Distortion>")
+    source = read(tmp_path, xml, flight)
+    rays = np.array([[0.5, 0.3], [-0.9, 0.1], [0.0, -1.4]])
+    theta = 2 / np.pi * np.arctan(np.hypot(*rays.T))
+    bent = rays * ((theta + 0.02 * theta**2 - 0.03 * theta**3) / np.hypot(*rays.T))[:, None]
+    center = np.array([flight.lens.cx + SIZE[0] / 2, flight.lens.cy + SIZE[1] / 2])
+    assert np.abs(ray_pixels(source.views[0].intrinsics, rays) - bent @ matrix.T - center).max() < 0.01
+
+
+def test_a_photogroup_that_cannot_be_used_is_named_and_the_others_are_used(tmp_path, flight):
+    turned = "<Rotation><Omega>1</Omega><Phi>2</Phi><Kappa>3</Kappa></Rotation>"
+    pose = f"<Pose>{turned}<Center><x>1</x><y>2</y><z>3</z></Center></Pose>"
+    more = (
+        "<Photogroup><Name>ball</Name><CameraModelType>Spherical</CameraModelType><Photo><Id>90</Id><ImagePath>b_1.JPG"
+        f"</ImagePath>{pose}</Photo><Photo><Id>91</Id><ImagePath>b_2.JPG</ImagePath>{pose}</Photo></Photogroup>"
+    )
+    xml = blocks_xml(flight, None, more=more)
+    source = read(tmp_path, xml, flight)
+    assert_true(source, flight)
+    assert any("photogroup 'ball' is 'Spherical'" in each and "(b_1.JPG, b_2.JPG)" in each for each in source.warnings)
+    with pytest.raises(CaptureError, match=r"(?s)2 of its 8 cameras.*--strict.*b_1.JPG, b_2.JPG"):
+        read_files(tmp_path, CaptureOptions(strict=True))
+
+
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
-        (">Perspective<", ">Fisheye<", "photogroup 'UCX' is 'Fisheye'"),
+        (">Perspective<", ">Spherical<", "photogroup 'UCX' is 'Spherical'"),
+        (
+            ">Perspective<",
+            ">Fisheye</CameraModelType><FisheyeDistortion><P0>1</P0></FisheyeDistortion><CameraModelType><",
+            "fisheye with P0 = 1",
+        ),
         ("<Width>5472</Width>", "", "has no Width"),
         ("<FocalLengthPixels>3656.4</FocalLengthPixels>", "", "neither FocalLengthPixels"),
         (">XRightYDown<", ">XRightYRight<", "CameraOrientation"),

@@ -1,4 +1,4 @@
-"""Lenses beyond COLMAP's: Brown's with a fourth radial term and skew."""
+"""Lenses beyond COLMAP's: Brown's with a fourth radial term and skew, growing tangential terms, fisheyes."""
 
 from __future__ import annotations
 
@@ -7,9 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vdgs.captures.formats.brown_lens import brown_intrinsics, brown_pinhole, project_rays, unproject_pixels
+from vdgs.captures.formats.brown_lens import (
+    brown_intrinsics,
+    brown_pinhole,
+    fisheye_intrinsics,
+    project_rays,
+    quarter_turn_fisheye,
+    unproject_pixels,
+)
 from vdgs.captures.formats.lens_projection import pixel_rays, ray_pixels
-from vdgs.captures.formats.source_capture import BROWN, Intrinsics
+from vdgs.captures.formats.source_capture import BROWN, GENERAL, GENERAL_FISHEYE, Intrinsics
 from vdgs.captures.image_matching import scale_intrinsics
 from vdgs.captures.undistortion import sampling_map, undistorted_pinhole
 from vdgs.errors import CaptureError
@@ -17,6 +24,12 @@ from vdgs.errors import CaptureError
 SIZE = (5280, 3956)
 LENS = brown_intrinsics(
     (3706.0, 3705.47), (2651.7, 1950.3), SIZE, (-0.092, -0.076, 0.116, -0.076), (0.0012, -0.0031), -0.31
+)
+
+
+GROWING = brown_intrinsics((3706.0, 3705.0), (2651.7, 1950.3), SIZE, (-0.092,), (0.0012, -0.0031), 0.2, (0.4, -0.3))
+FISHEYE = fisheye_intrinsics(
+    (1500.0, 1.5, -0.7, 1498.0), (2651.7, 1950.3), SIZE, (0.01, -0.02, 0.004, 0.001), (0.001, 2e-4)
 )
 
 
@@ -44,11 +57,50 @@ def test_the_plainest_model_that_is_exactly_the_lens():
         np.testing.assert_allclose(pixel_rays(lens, project_rays(as_brown, rays)), rays, atol=1e-9)
 
 
-def test_unprojecting_undoes_projecting():
-    pixels = pixels_of(LENS)
-    rays = unproject_pixels(LENS, pixels)
-    assert np.isfinite(rays).all()
-    np.testing.assert_allclose(project_rays(LENS, rays) / SIZE[0], pixels / SIZE[0], atol=1e-9)
+@pytest.mark.parametrize("lens", [LENS, GROWING, FISHEYE])
+def test_unprojecting_undoes_projecting(lens):
+    pixels = pixels_of(lens)
+    rays = unproject_pixels(lens, pixels)
+    known = np.isfinite(rays).all(axis=1)
+    # A fisheye's corners look behind the camera.
+    assert known.all() or (lens is FISHEYE and known.mean() > 0.7)
+    np.testing.assert_allclose(project_rays(lens, rays[known]) / SIZE[0], pixels[known] / SIZE[0], atol=1e-9)
+    half = scale_intrinsics(lens, SIZE[0] // 4, SIZE[1] // 4)
+    np.testing.assert_allclose(project_rays(half, rays[known]) * 4, pixels[known], atol=1e-5)
+
+
+def test_general_lenses_are_those_of_colmap_where_it_has_them():
+    rays = np.random.default_rng(1).uniform(-1.5, 1.5, (500, 2))
+    center, powers, tangential = (400.0, 300.0), (0.0, 0.05, 0.0, -0.01, 0.0, 0.003, 0.0, -0.001), (0.001, -0.002)
+    for lens in (
+        fisheye_intrinsics((300.0, 0.0, 0.0, 301.0), center, (800, 600), powers),
+        fisheye_intrinsics((300.0, 0.0, 0.0, 301.0), center, (800, 600), powers, tangential),
+    ):
+        assert lens.model in ("OPENCV_FISHEYE", "THIN_PRISM_FISHEYE")
+        p1, p2 = tangential if lens.model == "THIN_PRISM_FISHEYE" else (0.0, 0.0)
+        general = Intrinsics(
+            GENERAL_FISHEYE, (300.0, 301.0, *center, 0.05, -0.01, p1, p2, 0.003, -0.001, *[0.0] * 8), 800, 600
+        )
+        np.testing.assert_allclose(project_rays(general, rays), ray_pixels(lens, rays), atol=1e-8)
+    rays /= 3
+    opencv = Intrinsics("OPENCV", (500.0, 501.0, 400.0, 300.0, -0.1, 0.03, 0.001, -0.002), 800, 600)
+    general = Intrinsics(GENERAL, (*opencv.params, *[0.0] * 10), 800, 600)
+    np.testing.assert_allclose(project_rays(general, rays), ray_pixels(opencv, rays), atol=1e-8)
+
+
+def test_fisheyes_of_pix4d_and_bentley_are_their_formula():
+    """Angles in quarter turns, a polynomial, an affine matrix (Pix4D's and Bentley's manuals)."""
+    affine, polynomial = (1960.0, 3.0, -2.0, 1950.0), (0.0, 0.99, 0.05, -0.02, 0.004)
+    lens = quarter_turn_fisheye(affine, (2000.0, 1500.0), (4000, 3000), polynomial)
+    rays = np.random.default_rng(1).uniform(-2, 2, (500, 2))
+    radius = np.hypot(*rays.T)
+    theta = 2 / np.pi * np.arctan(radius)
+    rho = sum(p * theta**power for power, p in enumerate(polynomial))
+    expected = (rays * (rho / radius)[:, None]) @ np.reshape(affine, (2, 2)).T + (2000.0, 1500.0)
+    np.testing.assert_allclose(ray_pixels(lens, rays), expected, atol=1e-8)
+    np.testing.assert_allclose(pixel_rays(lens, expected), rays, atol=1e-8)
+    assert quarter_turn_fisheye(affine, (2000.0, 1500.0), (4000, 3000), (0.1, 1.0)) is None
+    assert quarter_turn_fisheye(affine, (2000.0, 1500.0), (4000, 3000), (0.0, -1.0)) is None
 
 
 def test_where_a_lens_folds_over_there_is_no_ray():
@@ -71,19 +123,21 @@ def test_the_undistorted_camera_and_the_way_to_it_are_those_of_colmap(tail):
     np.testing.assert_allclose(sampling_map(brown, found), sampling_map(opencv, pinhole), atol=1e-3)
 
 
-def test_the_undistorted_picture_has_no_blank_pixel():
-    pinhole = undistorted_pinhole(LENS)
-    grid = sampling_map(LENS, pinhole)
+@pytest.mark.parametrize("lens", [LENS, GROWING])
+def test_the_undistorted_picture_has_no_blank_pixel(lens):
+    pinhole = undistorted_pinhole(lens)
+    grid = sampling_map(lens, pinhole)
     assert grid.min() >= -1
     assert grid[..., 0].max() <= SIZE[0]
     assert grid[..., 1].max() <= SIZE[1]
     assert pinhole.width > 0.9 * SIZE[0]
 
 
-def test_a_picture_shrunk_evenly_shows_the_same_rays():
-    half = scale_intrinsics(LENS, SIZE[0] // 4, SIZE[1] // 4)
-    rays = unproject_pixels(LENS, pixels_of(LENS, 200))
-    np.testing.assert_allclose(project_rays(half, rays) * 4, project_rays(LENS, rays), atol=1e-6)
+def test_a_fisheye_that_sees_behind_itself_becomes_a_pinhole():
+    small = scale_intrinsics(FISHEYE, 528, 396)
+    pinhole = undistorted_pinhole(small)
+    assert 0 < pinhole.width <= 2 * small.width
+    assert np.isfinite(sampling_map(small, pinhole)).all()
 
 
 def test_colmap_models_know_no_such_lens(tmp_path: Path):

@@ -40,7 +40,10 @@ def read(root: Path, xml: str, flight: TrueFlight, options: CaptureOptions = OPT
     return read_project(root, "metashape", options, needs_points=False)
 
 
-@pytest.mark.parametrize("lens", [Lens(), Lens(b1=0, b2=0, k=(-0.1, 0.02, -0.01, 0)), Lens(k=(0, 0, 0, 0), p=(0, 0))])
+@pytest.mark.parametrize(
+    "lens",
+    [Lens(), Lens(b1=0, b2=0, k=(-0.1, 0.02, -0.01, 0)), Lens(k=(0, 0, 0, 0), p=(0, 0)), Lens(growth=(0.4, -0.2))],
+)
 def test_a_georeferenced_chunk_is_read_exactly(tmp_path, lens):
     flight = true_flight(lens=lens)
     source = read(tmp_path, metashape_xml(flight), flight)
@@ -56,6 +59,12 @@ def test_a_projected_system_of_the_chunk_does_not_matter_for_its_place(tmp_path)
     flight = true_flight()
     wkt = pyproj.CRS("EPSG:32632").to_wkt("WKT1_GDAL")
     assert_true(read(tmp_path, metashape_xml(flight, reference=wkt), flight), flight)
+
+
+def test_cameras_that_name_no_component_are_of_the_only_one(tmp_path):
+    flight = true_flight()
+    cameras = metashape_cameras(flight, 'sensor_id="0"')
+    assert_true(read(tmp_path, metashape_xml(flight, cameras=cameras), flight), flight)
 
 
 def test_local_coordinates_are_metres_with_z_up(tmp_path):
@@ -134,8 +143,9 @@ def test_a_camera_of_no_use_is_named_and_left_out(tmp_path):
     assert "belong to a multi-camera system" in said
 
 
-def test_fisheyes_are_read_as_the_program_describes_them(tmp_path):
-    lens = Lens(b2=0.0, k=(0.02, -0.01, 0.003, -0.001), p=(0.0007, -0.0004))
+@pytest.mark.parametrize(("b2", "p"), [(0.0, (0.0007, -0.0004)), (-0.3, (0.0007, -0.0004)), (0.0, (0.0, 0.0))])
+def test_fisheyes_are_read_as_the_program_describes_them(tmp_path, b2, p):
+    lens = Lens(b2=b2, k=(0.02, -0.01, 0.003, -0.001), p=p)
     flight = true_flight(lens=lens)
     sensors = f'<sensor id="0" label="fish" type="fisheye">{metashape_calibration(lens, kind="fisheye")}</sensor>'
     source = read(tmp_path, metashape_xml(flight, sensors=sensors), flight)
@@ -161,20 +171,41 @@ def test_fisheyes_are_read_as_the_program_describes_them(tmp_path):
         ("", "sensor 0 is missing"),
         (f'<sensor id="0" label="x" type="frame">{metashape_calibration(Lens(f=-3.0))}</sensor>', "focal length"),
         (
-            '<sensor id="0" label="x" type="frame">'
-            f"{metashape_calibration(Lens()).replace('<p1>', '<p3>1e-3</p3><p1>')}</sensor>",
-            "p3, p4",
-        ),
-        (
-            f'<sensor id="0" label="x" type="fisheye">{metashape_calibration(Lens(), kind="fisheye")}</sensor>',
-            "fisheye with b2",
+            '<sensor id="0" label="x" type="fisheye">'
+            f"{metashape_calibration(Lens(growth=(0.1, 0.0)), kind='fisheye')}</sensor>",
+            "fisheye with p3, p4",
         ),
     ],
 )
 def test_lenses_that_are_not_read_are_named(tmp_path, sensors, says):
     flight = true_flight()
-    with pytest.raises(CaptureError, match=f"(?s)cannot be read.*{says}"):
+    with pytest.raises(CaptureError, match=f"(?s)8 of its 8 cameras cannot be used.*{says}.*DJI_0000, DJI_0001"):
         read(tmp_path, metashape_xml(flight, sensors=sensors), flight)
+
+
+def test_a_sensor_without_calibration_is_named_and_the_others_are_used(tmp_path):
+    flight = true_flight()
+    sensors = f'<sensor id="0" label="x" type="frame">{metashape_calibration(flight.lens)}</sensor>'
+    sensors += '<sensor id="1" label="thermal" type="frame"><resolution width="640" height="512"/></sensor>'
+    cameras = metashape_cameras(flight)
+    cut = cameras.index('<camera id="6"')
+    cameras = cameras[:cut] + cameras[cut:].replace('sensor_id="0"', 'sensor_id="1"')
+    xml = metashape_xml(flight, sensors=sensors, cameras=cameras)
+    source = read(tmp_path, xml, flight)
+    assert_true(source, replace(flight, names=flight.names[:6]))
+    [said] = [each for each in source.warnings if "cannot be used" in each]
+    assert "2 of 8 cameras" in said
+    assert "sensor 1 (thermal) has no calibration" in said
+    assert "(DJI_0006, DJI_0007)" in said
+    with pytest.raises(CaptureError, match=r"(?s)2 of its 8 cameras.*--strict.*thermal.*DJI_0006, DJI_0007"):
+        read(tmp_path, xml, flight, CaptureOptions(strict=True))
+
+
+def test_a_chunk_whose_cameras_are_all_disabled_has_none(tmp_path):
+    flight = true_flight()
+    cameras = metashape_cameras(flight).replace("<camera ", '<camera enabled="false" ')
+    with pytest.raises(CaptureError, match="no camera of it has a pose"):
+        read(tmp_path, metashape_xml(flight, cameras=cameras), flight)
 
 
 def test_the_adjusted_calibration_is_used_and_the_initial_one_where_there_is_no_other(tmp_path):

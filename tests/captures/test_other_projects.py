@@ -12,6 +12,7 @@ import pytest
 from support import project_writers as writers
 from support.known_flight import ORIGIN, BentLens, KnownFlight, centers_of, ecef, known_flight, poses_of
 from vdgs.captures.format_dispatch import lacks_points
+from vdgs.captures.formats import las_reader
 from vdgs.captures.formats.lens_projection import ray_pixels
 from vdgs.captures.formats.source_capture import SourceCapture
 from vdgs.captures.loading import load_capture
@@ -127,11 +128,37 @@ def test_report_of_odm_is_read_where_its_reconstruction_is_gone(tmp_path: Path, 
     check_numbers(read(tmp_path, "opensfm"), flight)
     with pytest.raises(CaptureError, match="vdgs sfm"):
         read_project(tmp_path, "opensfm", OPTIONS)
+    _check_dense_cloud(tmp_path, flight)
     assert lacks_points(tmp_path / "odm_report" / "shots.geojson", OPTIONS)
     check_numbers(read_poses(tmp_path / "odm_report" / "shots.geojson", OPTIONS), flight)
     (tmp_path / "images").rename(tmp_path / "elsewhere")
     with pytest.raises(CaptureError, match="none of its 12 photographs"):
         lacks_points(tmp_path / "odm_report" / "shots.geojson", OPTIONS)
+
+
+def _check_dense_cloud(project: Path, flight: KnownFlight) -> None:
+    """ODM's dense cloud is used where laspy is there, thinned evenly; removed again."""
+    laspy = pytest.importorskip("laspy")
+    points = writers.utm_flight(flight)[2]
+    cloud = laspy.LasData(laspy.LasHeader(version="1.4", point_format=7))
+    cloud.header.scales, cloud.header.offsets = np.full(3, 1e-4), np.floor(points.min(axis=0))
+    cloud.x, cloud.y, cloud.z = points.T
+    cloud.red, cloud.green, cloud.blue = flight.colors.T.astype(np.uint16) * 256
+    (project / "odm_georeferencing").mkdir()
+    file = project / "odm_georeferencing" / "odm_georeferenced_model.laz"
+    cloud.write(file)
+    source = read_project(project, "opensfm", OPTIONS)
+    assert source.georef is not None
+    assert source.georef.origin is not None
+    assert np.abs(source.points - _known_points(flight, source.georef.origin)).max() < 1e-3
+    assert (source.colors == flight.colors).all()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(las_reader, "MAX_POINTS", 60)
+        assert len(read_project(project, "opensfm", OPTIONS).points) == 50
+    file.write_bytes(file.read_bytes()[:-300])
+    with pytest.raises(CaptureError, match=r"odm_georeferenced_model\.laz"):
+        read_project(project, "opensfm", OPTIONS)
+    file.unlink()
 
 
 def test_bundler_is_read_to_its_numbers(tmp_path: Path) -> None:
@@ -152,6 +179,75 @@ def test_table_of_realityscan_is_read_to_its_numbers(tmp_path: Path, lens: BentL
     writers.write_realityscan_csv(tmp_path / "cameras.csv", flight)
     flight.write_photographs(tmp_path / "images")
     check_numbers(read(tmp_path, "realityscan"), flight, placed=False)
+
+
+def test_table_of_realityscan_for_opencv_is_read_to_its_numbers(tmp_path: Path, flight: KnownFlight) -> None:
+    file = writers.write_realityscan_opencv_csv(tmp_path / "cameras.csv", flight)
+    flight.write_photographs(tmp_path / "images")
+    check_numbers(read(tmp_path, "realityscan"), flight, placed=False)
+    file.write_text(file.read_text().replace(f",{flight.lens.center[0]!r},", ",913.0,"))
+    with pytest.raises(CaptureError, match="of another size"):
+        read(tmp_path, "realityscan")
+
+
+def test_version_2_of_realityscan_calls_its_columns_otherwise(tmp_path: Path, flight: KnownFlight) -> None:
+    file = writers.write_realityscan_csv(tmp_path / "cameras.csv", flight)
+    lines = file.read_text().splitlines()
+    lines[0] = "#name,x,y,alt,yaw,pitch,roll,f_35mm,px_norm,py_norm,k1,k2,k3,k4,t1,t2"
+    file.write_text("\n".join(lines))
+    flight.write_photographs(tmp_path / "images")
+    check_numbers(read(tmp_path, "realityscan"), flight, placed=False)
+
+
+def test_information_beside_a_cloud_of_realityscan_places_its_table(tmp_path: Path, flight: KnownFlight) -> None:
+    code, poses, _, centers = writers.utm_flight(flight)
+    writers.write_realityscan_csv(tmp_path / "cameras.csv", flight, centers, poses)
+    flight.write_photographs(tmp_path / "images")
+    (tmp_path / "cloud.ply.rsInfo").write_text(
+        f'<Model globalCoordinateSystem="+proj=utm" globalCoordinateSystemName="{code.lower()} - WGS 84 / UTM"/><X/>'
+    )
+    check_numbers(read(tmp_path, "realityscan"), flight)
+    (tmp_path / "cloud.ply.rsInfo").unlink()
+    assert read(tmp_path, "realityscan").georef.origin is None  # type: ignore[union-attr]
+
+
+def test_angles_that_degrees_have_spoiled_are_refused(tmp_path: Path, flight: KnownFlight) -> None:
+    degrees = geodetic_from_enu(flight.centers, ORIGIN)[:, [1, 0, 2]]
+    file = writers.write_realityscan_csv(tmp_path / "cameras.csv", flight, degrees)
+    flight.write_photographs(tmp_path / "images")
+    lines = [line.split(",") for line in file.read_text().splitlines()]
+    file.write_text(
+        "\n".join(
+            ",".join([*line[:5], *(line[5:7] if not k else ["1.5e-4", "89.9993"]), *line[7:]])
+            for k, line in enumerate(lines)
+        )
+    )
+    with pytest.raises(CaptureError, match="its cameras mean nothing"):
+        read(tmp_path, "realityscan")
+
+
+def test_parameters_of_pix4dmapper_are_read_to_their_numbers(tmp_path: Path, flight: KnownFlight) -> None:
+    file = writers.write_pix4d(tmp_path / "flight", flight)
+    flight.write_photographs(tmp_path / "images")
+    check_numbers(read(tmp_path, "pix4d"), flight)
+    check_numbers(read_poses(file, CaptureOptions(images=str(tmp_path / "images"))), flight)
+    whole = file.read_text()
+    file.write_text(whole[:-200])
+    with pytest.raises(CaptureError, match="10 lines"):
+        read(tmp_path, "pix4d")
+    file.write_text(whole)
+    file.with_name("flight_wkt.prj").write_text('LOCAL_CS["site",UNIT["metre",1]]')
+    source = read(tmp_path, "pix4d")
+    assert source.georef is not None
+    assert source.georef.origin is None
+
+
+def test_projects_that_are_not_read_say_what_is(tmp_path: Path) -> None:
+    for name, says in (("a.psx", "Export Cameras"), ("B.RCPROJ", "camera parameters"), ("c.rsproj", "CSV"),
+                       ("d.p4d", "1_initial/params"), ("e.p4m", "OPF"), ("f.ccm", "BlocksExchange")):  # fmt: skip
+        (tmp_path / name).write_bytes(b"x" * 50)
+        with pytest.raises(CaptureError, match=f"{name}: is a project of .*{says}"):
+            load_capture(tmp_path / name, OPTIONS)
 
 
 def test_table_of_realityscan_in_degrees_is_placed(tmp_path: Path, flight: KnownFlight) -> None:
@@ -211,7 +307,30 @@ def test_opf_is_read_to_its_numbers(tmp_path: Path, flight: KnownFlight) -> None
     assert source.georef is not None
     assert source.georef.origin is not None
     assert np.abs(source.points - _known_points(flight, source.georef.origin)).max() < 1e-3
+    assert all(len(view.observations.points) > 20 for view in source.views if view.observations)
+    assert sum(view.observations is not None for view in source.views) == len(flight.names)
     assert (source.colors == flight.colors).all()
+
+
+def test_fisheyes_of_opf_are_their_formula(tmp_path: Path, flight: KnownFlight) -> None:
+    writers.write_opf(tmp_path, flight)
+    flight.write_photographs(tmp_path / "images")
+    file = tmp_path / "calibrated-cameras.json"
+    content = json.loads(file.read_text())
+    content["sensors"][0]["internals"] = {
+        "type": "fisheye", "principal_point_px": [401.0, 299.0], "affine": [600.0, 1.0, -1.0, 601.0],
+        "polynomial": [0.0, 1.0, 0.02, -0.03], "is_p0_zero": True, "is_symmetric_affine": False,
+    }  # fmt: skip
+    file.write_text(json.dumps(content))
+    rays = np.array([[0.5, 0.3], [-0.9, 0.1], [0.0, -1.4]])
+    theta = 2 / np.pi * np.arctan(np.hypot(*rays.T))
+    bent = rays * ((theta + 0.02 * theta**2 - 0.03 * theta**3) / np.hypot(*rays.T))[:, None]
+    expected = bent @ np.array([[600.0, 1.0], [-1.0, 601.0]]).T + (401.0, 299.0)
+    assert np.abs(ray_pixels(read(tmp_path, "opf").views[0].intrinsics, rays) - expected).max() < 1e-6
+    content["sensors"][0]["internals"]["polynomial"][0] = 0.1
+    file.write_text(json.dumps(content))
+    with pytest.raises(CaptureError, match=r"12 of its 12 cameras(?s:.)*polynomial"):
+        read(tmp_path, "opf")
 
 
 def test_opf_of_a_site_is_metres_without_a_place(tmp_path: Path, flight: KnownFlight) -> None:
@@ -304,9 +423,9 @@ def test_xmp_without_a_pose_and_of_other_lenses_is_named(tmp_path: Path, flight:
     second.write_text(second.read_text().replace("brown4t2", "division"))
     source = read(tmp_path, "realityscan")
     assert len(source.views) == len(flight.names) - 2
-    [note] = [note for note in source.warnings if "left out" in note]
-    assert "not aligned" in note
+    [note] = [note for note in source.warnings if "cannot be used" in note]
     assert "'division'" in note
+    assert any("not aligned" in each and flight.names[0][:-4] in each for each in source.warnings)
 
 
 def test_focal_lengths_in_pixels_are_refused(tmp_path: Path, flight: KnownFlight) -> None:
@@ -336,6 +455,8 @@ def test_list_of_bundler_must_name_every_camera(tmp_path: Path, flight: KnownFli
     (tmp_path / "list.txt").unlink()
     with pytest.raises(CaptureError, match=r"no list\.txt"):
         read(tmp_path, "bundler")
+    (tmp_path / "export.imagelist").write_text("".join(f"C:\\card\\{name}\n" for name in flight.names))
+    assert len(read(tmp_path, "bundler").views) == len(flight.names)
 
 
 def test_opf_without_calibration_and_with_missing_files_says_so(tmp_path: Path, flight: KnownFlight) -> None:
@@ -363,11 +484,13 @@ def _all_formats(root: Path, flight: KnownFlight) -> list[tuple[str, Path]]:
         ("opf", root / "calibrated-cameras.json"), ("opf", root / "scene-reference-frame.json"),
         ("opf", root / "camera-list.json"), ("opf", root / "point_cloud" / "sparse.gltf"),
         ("realityscan", writers.write_realityscan_csv(root / "cameras.csv", flight)),
+        ("realityscan", writers.write_realityscan_opencv_csv(root / "opencv.csv", flight)),
+        ("pix4d", writers.write_pix4d(root / "flight", flight)),
         ("realityscan", (root / "images" / flight.names[0]).with_suffix(".xmp")),
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("number", range(10))
+@pytest.mark.parametrize("number", range(12))
 def test_damaged_files_are_refused_by_name_or_read(tmp_path: Path, flight: KnownFlight, number: int) -> None:
     """Cut off, overwritten and hostile files: a CaptureError, never anything else."""
     name, file = _all_formats(tmp_path, flight)[number]
@@ -385,6 +508,7 @@ def test_damaged_files_are_refused_by_name_or_read(tmp_path: Path, flight: Known
         whole.replace(b"[", b"[" * 3000, 1),
         whole.replace(b"800", b"-5"),
         whole.replace(b"600", b"99999999999"),
+        whole.replace(b"0.", b"0.x"),
     ]
     refusals = list[str]()
     for content in damaged:

@@ -27,6 +27,7 @@ from vdgs.config.sfm_options import SfmRequest
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.geometry.geodesy import ecef_from_geodetic, geodetic_from_enu
 from vdgs.geometry.ground_frame import GroundFrame
+from vdgs.pipeline.dry_run import estimate_run
 from vdgs.pipeline.run_pipeline import reconstruct_if_needed
 from vdgs.sfm import feature_extraction, feature_matching
 from vdgs.sfm.posed_capture import make_posed_capture
@@ -128,6 +129,11 @@ def test_run_of_a_project_without_points_finds_them_first(
     root, flight = _some_photographs(town_flight, tmp_path)
     project_writers.write_realityscan_xmp(root / "images", flight)
     request = RunRequest(capture=root, output=tmp_path / "run", threads=2)
+    said = Console(file=io.StringIO(), width=200)
+    estimate = estimate_run(replace(request, device="cpu"), said)
+    assert {"photographs", "coarse", "blocks"} <= {name for name, cost in estimate.times.items() if cost.seconds > 0}
+    assert "5 photographs, poses and lenses as the project has them: features, about 10 pairs" in said.file.getvalue()  # type: ignore[attr-defined]
+    assert not (tmp_path / "run").exists()
     for _ in range(2):
         found = reconstruct_if_needed(request, Console(file=io.StringIO()))
         assert found.capture == tmp_path / "run" / "capture"

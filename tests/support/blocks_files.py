@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from support.true_flight import ORIGIN, SIZE, Lens, TrueFlight, angles_of
+from support.true_flight import ORIGIN, Lens, TrueFlight, angles_of
 from vdgs.geometry.geodesy import enu_axes, geodetic_from_enu
 
 #: What BlocksExchange can say of a lens: three radial terms, no skew.
@@ -81,17 +81,17 @@ def blocks_xml(
 
 def camera(lens: Lens, orientation: str = "XRightYDown", in_millimeters: bool = False) -> str:
     """What a photogroup says of its lens, in pixels or in millimetres of the sensor."""
-    pixel = 13.2 / SIZE[0]
+    pixel = 13.2 / lens.size[0]
     if in_millimeters:
         across = ORIENTATIONS[orientation][:2, :2].T @ [lens.cx * pixel, lens.cy * pixel]
         inner = tags(("SensorSize", "FocalLength"), (13.2, lens.f * pixel))
         inner += f"<PrincipalPoint>{tags(('xmm', 'ymm'), across)}</PrincipalPoint>"
     else:  # from the centre of the first pixel
-        center = SIZE[0] / 2 + lens.cx - 0.5, SIZE[1] / 2 + lens.cy - 0.5
+        center = lens.size[0] / 2 + lens.cx - 0.5, lens.size[1] / 2 + lens.cy - 0.5
         inner = f"{tags(['FocalLengthPixels'], [lens.f])}<PrincipalPoint>{tags('xy', center)}</PrincipalPoint>"
     bends = tags(("K1", "K2", "K3", "P1", "P2"), (*lens.k[:3], *lens.p))
     return (
-        f"<ImageDimensions><Width>{SIZE[0]}</Width><Height>{SIZE[1]}</Height></ImageDimensions>"
+        f"<ImageDimensions><Width>{lens.size[0]}</Width><Height>{lens.size[1]}</Height></ImageDimensions>"
         f"<CameraModelType>Perspective</CameraModelType>{inner}<CameraOrientation>{orientation}</CameraOrientation>"
         f"<Distortion>{bends}</Distortion>"
     )

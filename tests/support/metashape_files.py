@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from support.true_flight import ORIGIN, SIZE, Lens, TrueFlight, omega_phi_kappa, words
+from support.true_flight import ORIGIN, Lens, TrueFlight, omega_phi_kappa, words
 from vdgs.geometry.geodesy import ecef_from_geodetic, enu_axes
 
 WGS84 = (
@@ -27,9 +27,9 @@ def chunk_from_enu(points: np.ndarray) -> np.ndarray:
 
 def metashape_calibration(lens: Lens, kind: str = "frame", which: str = ' class="adjusted"') -> str:
     values = {"f": lens.f, "cx": lens.cx, "cy": lens.cy, "b1": lens.b1, "b2": lens.b2, "p1": lens.p[0], "p2": lens.p[1]}
-    values |= {f"k{n}": k for n, k in enumerate(lens.k, 1)}
+    values |= {f"k{n}": k for n, k in enumerate(lens.k, 1)} | {"p3": lens.growth[0], "p4": lens.growth[1]}
     text = "".join(f"<{name}>{value!r}</{name}>" for name, value in values.items() if value)
-    size = f'<resolution width="{SIZE[0]}" height="{SIZE[1]}"/>'
+    size = f'<resolution width="{lens.size[0]}" height="{lens.size[1]}"/>'
     return f'<calibration type="{kind}"{which}>{size}{text}</calibration>'
 
 
@@ -67,7 +67,8 @@ def metashape_xml(
 ) -> str:  # fmt: skip
     """cameras.xml of version 2.0."""
     sensor = (
-        f'<sensor id="0" label="FC6310, 8.8mm" type="frame"><resolution width="{SIZE[0]}" height="{SIZE[1]}"/>'
+        '<sensor id="0" label="FC6310, 8.8mm" type="frame">'
+        f'<resolution width="{flight.lens.size[0]}" height="{flight.lens.size[1]}"/>'
         f'<property name="layer_index" value="0"/><bands><band label="Red"/></bands><data_type>uint8</data_type>'
         f"{metashape_calibration(Lens(f=3000.0), which=INITIAL)}{metashape_calibration(flight.lens)}"
         "<covariance><params>f cx</params><coeffs>1 0 0 1</coeffs></covariance></sensor>"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import struct
 from pathlib import Path
 from typing import Any
@@ -136,23 +137,36 @@ def realityscan_lens(flight: KnownFlight) -> dict[str, float]:
 
 
 def heading_pitch_roll(pose: np.ndarray) -> tuple[float, float, float]:
-    """Of the rotation world from camera (right, up, back) Rz(-heading) Rx(pitch) Ry(roll)."""
-    from scipy.spatial.transform import Rotation
+    """By the matrix camera from world that the maker publishes ("Registration export and camera orientations")."""
+    r = pose[:3, :3]
+    return (
+        math.degrees(math.atan2(-r[1, 0], -r[1, 1])), math.degrees(math.asin(-r[1, 2])),
+        math.degrees(math.atan2(-r[0, 2], -r[2, 2])),
+    )  # fmt: skip
 
-    turn = (np.diag([1.0, -1.0, -1.0]) @ pose[:3, :3]).T
-    minus_heading, pitch, roll = Rotation.from_matrix(turn).as_euler("ZXY", degrees=True)
-    return -minus_heading, pitch, roll
+
+def write_realityscan_opencv_csv(file: Path, flight: KnownFlight) -> Path:
+    """The table of RealityScan 2 in OpenCV's order and pixels."""
+    lens = flight.lens
+    columns = ",".join(f"R{row}{column}" for row in range(3) for column in range(3))
+    lines = [f"#name,tx,ty,tz,{columns},f_pix,px_pix,py_pix,k1,k2,t2,t1,k3,k4"]
+    for name, pose in zip(flight.names, flight.poses, strict=True):
+        k1, k2, k3, k4 = lens.k
+        numbers = [*pose[:3, 3], *pose[:3, :3].ravel(), lens.focal, *lens.center, k1, k2, *lens.p, k3, k4]
+        lines.append(",".join([name, *(repr(float(each)) for each in numbers)]))
+    file.write_text("\n".join(lines) + "\n")
+    return file
 
 
-def write_realityscan_csv(file: Path, flight: KnownFlight, centers: np.ndarray | None = None) -> Path:
+def write_realityscan_csv(
+    file: Path, flight: KnownFlight, centers: np.ndarray | None = None, poses: np.ndarray | None = None
+) -> Path:
     lens = realityscan_lens(flight)
     lines = ["#name,x,y,alt,heading,pitch,roll," + ",".join(lens)]
-    for name, pose, center in zip(
-        flight.names, flight.poses, flight.centers if centers is None else centers, strict=True
-    ):
-        lines.append(
-            ",".join([name, *map(repr, (*center.tolist(), *map(float, heading_pitch_roll(pose)), *lens.values()))])
-        )
+    centers, poses = (flight.centers if centers is None else centers), (flight.poses if poses is None else poses)
+    for name, pose, center in zip(flight.names, poses, centers, strict=True):
+        numbers = (*center.tolist(), *map(float, heading_pitch_roll(pose)), *lens.values())
+        lines.append(",".join([name, *map(repr, numbers)]))
     file.write_text("\n".join(lines) + "\n")
     return file
 
@@ -172,6 +186,29 @@ def write_realityscan_xmp(folder: Path, flight: KnownFlight, *, as_attributes: b
             f'xcr:PrincipalPointU="{lens["px"]!r}" xcr:PrincipalPointV="{lens["py"]!r}"{around} '
             f'xmlns:xcr="http://www.capturingreality.com/ns/xcr/1.1#">{inside}</rdf:Description></rdf:RDF></x:xmpmeta>'
         )
+
+
+def write_pix4d(project: Path, flight: KnownFlight) -> Path:
+    """1_initial/params as PIX4Dmapper writes it: poses in the system of the project, less an offset."""
+    import pyproj
+
+    code, poses, _, centers = utm_flight(flight)
+    offset = np.round(centers.mean(axis=0))
+    lens, params = flight.lens, project / "1_initial" / "params"
+    params.mkdir(parents=True, exist_ok=True)
+    lines = ["fileName imageWidth imageHeight ", "camera matrix K [3x3]", "radial distortion [3x1]",
+             "tangential distortion [2x1]", "camera position t [3x1]", "camera rotation R [3x3]",
+             "camera model m = K [R|-Rt] X", ""]  # fmt: skip
+    matrix = np.array([[lens.focal, 0, lens.center[0]], [0, lens.focal, lens.center[1]], [0, 0, 1]])
+    for name, pose, center in zip(flight.names, poses, centers, strict=True):
+        rows = [*matrix, lens.k[:3], lens.p, center - offset, *pose[:3, :3]]
+        lines.append(f"{name} {lens.size[0]} {lens.size[1]}")
+        lines += [" ".join(repr(float(each)) for each in row) for row in rows]
+    file = params / "flight_calibrated_camera_parameters.txt"
+    file.write_text("\n".join(lines) + "\n")
+    (params / "flight_offset.xyz").write_text(" ".join(map(str, offset)) + "\n")
+    (params / "flight_wkt.prj").write_text(pyproj.CRS(code).to_wkt("WKT1_ESRI"))
+    return file
 
 
 def write_opf(folder: Path, flight: KnownFlight) -> Path:
@@ -207,25 +244,44 @@ def write_opf(folder: Path, flight: KnownFlight) -> Path:
         (folder / f"{name}.json").write_text(json.dumps({"format": form, "version": "1.0", **content}))
         items.append({"id": kind, "type": kind, "resources": [{"uri": f"{name}.json", "format": form}], "sources": []})
     items[-1]["resources"].append({"uri": "point_cloud/sparse.gltf", "format": "model/gltf+json"})
-    _write_gltf(folder / "point_cloud", points + shift, flight.colors)
+    _write_gltf(folder / "point_cloud", points + shift, flight, ids)
     project = {"format": "application/opf-project+json", "version": "1.0", "id": "1", "name": "flight",
                "description": "", "generator": {"name": "PIX4Dmatic", "version": "1.41.0"}, "items": items}  # fmt: skip
     (folder / "project.opf").write_text(json.dumps(project))
     return folder / "project.opf"
 
 
-def _write_gltf(folder: Path, points: np.ndarray, colors: np.ndarray) -> None:
+def _write_gltf(folder: Path, points: np.ndarray, flight: KnownFlight, ids: list[int]) -> None:
+    """Points, and by the extension of OPF which camera shows which: of a point a range in the list of sightings, its
+    beginning in five bytes and its length in three."""
     (folder / "positions.bin").write_bytes(points.astype("<f4").tobytes())
-    (folder / "colors.bin").write_bytes(b"".join(struct.pack("4B", *color, 255) for color in colors.tolist()))
-    n = len(points)
+    (folder / "colors.bin").write_bytes(b"".join(struct.pack("4B", *color, 255) for color in flight.colors.tolist()))
+    pixels, shown = ([each(k) for k in range(len(ids))] for each in (flight.pixels, flight.shows))
+    seen = [[k for k in range(len(ids)) if shown[k][point]] for point in range(len(points))]
+    flat = [(k, *pixels[k][point]) for point, cameras in enumerate(seen) for k in cameras]
+    starts = np.cumsum([0, *map(len, seen)])
+    ranges = b"".join(
+        int(first).to_bytes(5, "little") + len(each).to_bytes(3, "little")
+        for first, each in zip(starts, seen, strict=False)
+    )
+    (folder / "ranges.bin").write_bytes(ranges)
+    (folder / "cameras.bin").write_bytes(np.array([k for k, _, _ in flat], "<u4").tobytes())
+    (folder / "pixels.bin").write_bytes(np.array([each[1:] for each in flat], "<f4").tobytes())
+    n, m = len(points), len(flat)
     accessors = [{"bufferView": 0, "componentType": 5126, "count": n, "type": "VEC3"},
-                 {"bufferView": 1, "componentType": 5121, "normalized": True, "count": n, "type": "VEC4"}]  # fmt: skip
+                 {"bufferView": 1, "componentType": 5121, "normalized": True, "count": n, "type": "VEC4"},
+                 {"bufferView": 2, "componentType": 5125, "count": n, "type": "VEC2"},
+                 {"bufferView": 3, "componentType": 5125, "count": m, "type": "SCALAR"},
+                 {"bufferView": 4, "componentType": 5126, "count": m, "type": "VEC2"}]  # fmt: skip
+    buffers = [(12 * n, "positions"), (4 * n, "colors"), (8 * n, "ranges"), (4 * m, "cameras"), (8 * m, "pixels")]
+    matches = {"cameraUids": ids, "pointIndexRanges": 2, "cameraIds": 3, "imagePoints": {"pixelCoordinates": 4}}
     content = {
         "asset": {"version": "2.0", "extensions": {"OPF_asset_version": {"version": "1.0"}}},
         "scene": 0, "scenes": [{"nodes": [0]}], "accessors": accessors,
-        "bufferViews": [{"buffer": 0, "byteLength": 12 * n}, {"buffer": 1, "byteLength": 4 * n}],
-        "buffers": [{"byteLength": 12 * n, "uri": "positions.bin"}, {"byteLength": 4 * n, "uri": "colors.bin"}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "COLOR_0": 1}, "mode": 0}]}],
+        "bufferViews": [{"buffer": k, "byteLength": size} for k, (size, _) in enumerate(buffers)],
+        "buffers": [{"byteLength": size, "uri": f"{name}.bin"} for size, name in buffers],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "COLOR_0": 1}, "mode": 0,
+                                    "extensions": {"OPF_mesh_primitive_matches": matches}}]}],
         "nodes": [{"mesh": 0, "matrix": [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1]}],
     }  # fmt: skip
     (folder / "sparse.gltf").write_text(json.dumps(content))

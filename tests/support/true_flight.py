@@ -33,15 +33,19 @@ class Lens:
     b2: float = -0.3
     k: tuple[float, float, float, float] = (-0.09, -0.076, 0.116, -0.076)
     p: tuple[float, float] = (-0.0013, 0.0021)
+    growth: tuple[float, float] = (0.0, 0.0)
+    """p3 and p4 of PhotoScan 1.2 to Metashape 1.5."""
+    size: tuple[int, int] = SIZE
 
     def pixels(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Pixels [n, 2], from the corner, of rays with z = 1 (manual, appendix on camera models)."""
         r2 = x**2 + y**2
         d = 1 + sum(k * r2 ** (n + 1) for n, k in enumerate(self.k))
-        bent_x = x * d + self.p[0] * (r2 + 2 * x**2) + 2 * self.p[1] * x * y
-        bent_y = y * d + self.p[1] * (r2 + 2 * y**2) + 2 * self.p[0] * x * y
-        u = SIZE[0] / 2 + self.cx + bent_x * self.f + bent_x * self.b1 + bent_y * self.b2
-        return np.stack([u, SIZE[1] / 2 + self.cy + bent_y * self.f], axis=1)
+        g = 1 + self.growth[0] * r2 + self.growth[1] * r2**2
+        bent_x = x * d + (self.p[0] * (r2 + 2 * x**2) + 2 * self.p[1] * x * y) * g
+        bent_y = y * d + (self.p[1] * (r2 + 2 * y**2) + 2 * self.p[0] * x * y) * g
+        u = self.size[0] / 2 + self.cx + bent_x * self.f + bent_x * self.b1 + bent_y * self.b2
+        return np.stack([u, self.size[1] / 2 + self.cy + bent_y * self.f], axis=1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 #: Folders of ODM and Bundler whose files are about the photographs beside these folders.
 _INNER = {"opensfm", "odm_report", "bundle"}
+_PIX4D_INNER = ("1_initial", "params")
 
 
 def capture_root(path: Path) -> Path:
@@ -13,5 +14,7 @@ def capture_root(path: Path) -> Path:
     it, where programs put the file into a folder beside images."""
     if not path.is_file():
         return path
+    if path.parts[-3:-1] == _PIX4D_INNER:
+        return path.parents[2]
     inner = path.parent.name in _INNER and not (path.parent / "images").is_dir()
     return path.parent.parent if inner and (path.parent.parent / "images").is_dir() else path.parent

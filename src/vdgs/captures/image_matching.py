@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from vdgs.captures.formats.source_capture import (
-    BROWN,
+    OWN_LENSES,
     SINGLE_FOCAL,
     Intrinsics,
     SourceCapture,
@@ -154,6 +154,6 @@ def scale_intrinsics(intrinsics: Intrinsics, width: int, height: int) -> Intrins
         return Intrinsics("PINHOLE", (fx * sx, fy * sy, cx * sx, cy * sy), width, height)
     head = (fx * (sx + sy) / 2,) if intrinsics.model in SINGLE_FOCAL else (fx * sx, fy * sy)
     tail = intrinsics.params[len(head) + 2 :]
-    if intrinsics.model == BROWN:
-        tail = (*tail[:-1], tail[-1] * sx)  # skew is in pixels across
+    if intrinsics.model in OWN_LENSES:  # skew and shear are in pixels across and down
+        tail = tuple(value * {6: sx, 9: sy}.get(index, 1.0) for index, value in enumerate(tail))
     return Intrinsics(intrinsics.model, (*head, cx * sx, cy * sy, *tail), width, height)

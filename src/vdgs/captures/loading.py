@@ -17,6 +17,7 @@ from vdgs.captures.ground_estimation import find_ground_frame, transform_pose
 from vdgs.captures.image_checks import detect_rounding
 from vdgs.captures.image_files import MIN_SIDE_PX, VIDEO_SUFFIXES
 from vdgs.captures.image_matching import MatchedView, match_images
+from vdgs.captures.nested_captures import check_no_foreign_file
 from vdgs.captures.output_guard import check_not_among_files
 from vdgs.captures.project_formats import is_project
 from vdgs.captures.splits import assign_splits, select_central_views
@@ -50,6 +51,7 @@ def read_files(root: Path, options: CaptureOptions) -> SourceCapture:
                 f"{root}: is a film, which becomes a capture first: vdgs sfm {shell_word(root)} --output CAPTURE (with "
                 "--dry-run it only says what frames it has)"
             )
+        check_no_foreign_file(root)
         what = "is a file. Unpack an archive first, and give" if root.is_file() else "no such folder. Give"
         raise CaptureError(f"{root}: {what} the folder that holds images/ and sparse/.")
     _check_options(options)

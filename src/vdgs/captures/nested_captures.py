@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from fnmatch import fnmatch
 from pathlib import Path
 
 from vdgs.captures.formats.colmap import count_images, find_models
@@ -12,15 +13,25 @@ from vdgs.captures.formats.mega_nerf import is_mega_nerf
 from vdgs.captures.image_files import readable_suffixes
 from vdgs.captures.output_guard import is_capture
 from vdgs.captures.project_formats import PROJECTS, find_projects
+from vdgs.errors import CaptureError
 from vdgs.system.quoting import shell_word
 
 #: So many folders deep a model is looked for: WORKSPACE/dense/0 with sparse in it, and one above.
 DEEPEST = 3
-_COLMAP = "it exports COLMAP"
+_METASHAPE = "a project of Metashape; what it exports (File > Export > Export Cameras, Agisoft XML) is read"
+_REALITYSCAN = (
+    "a project of RealityScan; what it exports (Registration: Internal/External camera parameters, CSV, with the "
+    "sparse point cloud as PLY) is read"
+)
 #: Poses of programs that are not read, by the file that has them, and what turns them into what is.
 _OTHERS = {
-    "*.psx": "a project of Metashape; what it exports (File > Export > Export Cameras, Agisoft XML) is read",
-    "*.rcproj": f"a project of RealityScan; {_COLMAP}",
+    "*.psx": _METASHAPE,
+    "*.psz": _METASHAPE,
+    "*.rcproj": _REALITYSCAN,
+    "*.rsproj": _REALITYSCAN,
+    "*.p4d": "a project of PIX4Dmapper; 1_initial/params in the folder of its name, after the first step, is read",
+    "*.p4m": "a project of PIX4Dmatic; the OPF that it exports is read",
+    "*.ccm": "a project of ContextCapture; the block that it exports (BlocksExchange, with tie points) is read",
     "*.nvm": "poses of VisualSFM; COLMAP's import_nvm (scripts/python) makes a model of them",
     "poses_bounds.npy": "poses of LLFF; the COLMAP model that they were made of is read",
     "database.db": "features of COLMAP; `colmap mapper` makes a model of them",
@@ -66,6 +77,13 @@ def foreign_poses(root: Path) -> list[str]:
             if file.is_file() and file.stat().st_size > _LEAST_BYTES
         ]
     return found
+
+
+def check_no_foreign_file(path: Path) -> None:
+    """Raise CaptureError for a file of another program that is not read, with what is read instead."""
+    what = next((what for name, what in _OTHERS.items() if fnmatch(path.name.lower(), name)), None)
+    if what is not None and path.is_file():
+        raise CaptureError(f"{path}: is {what}.")
 
 
 def _folders(root: Path) -> Iterator[Path]:

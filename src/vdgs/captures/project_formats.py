@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from vdgs.captures.capture_root import capture_root
-from vdgs.captures.formats import blocks_exchange, bundler, metashape, opensfm, opf, realityscan
+from vdgs.captures.formats import blocks_exchange, bundler, metashape, opensfm, opf, pix4d, realityscan
 from vdgs.captures.formats.project import Project, project_capture
 from vdgs.captures.formats.source_capture import SourceCapture
 from vdgs.config.capture_options import CaptureOptions
@@ -31,6 +31,7 @@ PROJECTS: dict[str, ProjectFormat] = {
         blocks_exchange.read,
     ),
     "opf": ProjectFormat("Pix4D (OPF)", opf.find_files, opf.is_file, opf.read),
+    "pix4d": ProjectFormat("PIX4Dmapper (parameters)", pix4d.find_files, pix4d.is_file, pix4d.read),
     "opensfm": ProjectFormat("OpenSfM or ODM", opensfm.find_files, opensfm.is_file, opensfm.read),
     "realityscan": ProjectFormat("RealityScan", realityscan.find_files, realityscan.is_file, realityscan.read),
     "bundler": ProjectFormat("Bundler", bundler.find_files, bundler.is_file, bundler.read),

@@ -15,7 +15,7 @@ import numpy as np
 
 from vdgs.captures.formats.brown_lens import brown_pinhole
 from vdgs.captures.formats.lens_projection import colmap_camera, ray_pixels
-from vdgs.captures.formats.source_capture import BROWN, Intrinsics
+from vdgs.captures.formats.source_capture import OWN_LENSES, Intrinsics
 from vdgs.captures.image_files import decode_image, decode_mask
 from vdgs.captures.name_resolution import jpeg_name
 from vdgs.errors import CaptureError
@@ -73,7 +73,7 @@ def undistort(folder: Path, photographs: list[ImageFile]) -> list[ImageFile]:
 
 def undistorted_pinhole(intrinsics: Intrinsics) -> Intrinsics:
     """The pinhole camera whose picture holds no blank pixels (COLMAP's own choice of size and center)."""
-    if intrinsics.model == BROWN:
+    if intrinsics.model in OWN_LENSES:
         return brown_pinhole(intrinsics)
     from vdgs.system.lazy_pycolmap import pycolmap  # 60 MB of memory: only for lenses that need it
 

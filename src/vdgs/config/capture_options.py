@@ -12,8 +12,8 @@ from vdgs.config.ranges import MAX_COUNT, Range
 UpAxis = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
 SplitMode = Literal["auto", "explicit", "every"]
 CaptureFormat = Literal[
-    "auto", "colmap", "transforms", "mega-nerf", "matrixcity", "metashape", "blocks-exchange", "opf", "opensfm",
-    "realityscan", "bundler",
+    "auto", "colmap", "transforms", "mega-nerf", "matrixcity", "metashape", "blocks-exchange", "opf", "pix4d",
+    "opensfm", "realityscan", "bundler",
 ]  # fmt: skip
 
 
@@ -28,7 +28,8 @@ class CaptureOptions:
     """Image folder to use, such as images_4. Default: images, or where absent the largest images_N. Of a project of
     another program: any folder that its photographs are in or below; default: images, or the whole folder."""
     strict: bool = False
-    """Refuse a capture of which photographs are missing. By default the others are used where two thirds are there."""
+    """Refuse a capture of which photographs are missing. By default the others are used where three
+    quarters are there. Of a project of another program also one with cameras that cannot be used."""
     downscale: Annotated[float, Range(1, 1000)] = 1.0
     """Shrink images by this factor when they are loaded. 2: half the width and height."""
     test_every: Annotated[int, Range(2, MAX_COUNT)] = 8

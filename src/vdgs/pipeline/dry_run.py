@@ -12,6 +12,7 @@ from rich.console import Console
 
 from vdgs.captures.capture import Capture
 from vdgs.captures.capture_metadata import check_same_capture
+from vdgs.captures.format_dispatch import lacks_points
 from vdgs.captures.loading import load_capture
 from vdgs.captures.reconstruction import read_reconstruction
 from vdgs.config.commands import RunRequest
@@ -26,8 +27,9 @@ from vdgs.runs.create_or_resume import capture_options_changed, run_settings
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_status import RunStatus, get_run_status
 from vdgs.sfm.films.take_frames import temporary_frames
+from vdgs.sfm.posed_plan import plan_posed_capture, print_posed_plan
 from vdgs.sfm.reconstruction_plan import plan_reconstruction, print_plan
-from vdgs.sfm.run_request import is_image_input, make_sfm_request
+from vdgs.sfm.run_request import is_image_input, make_posed_request, make_sfm_request
 from vdgs.sfm.sfm_estimate import estimate_sfm
 from vdgs.system.atomic_files import read_json
 from vdgs.system.units import data_size, rough_duration
@@ -46,6 +48,8 @@ def estimate_run(request: RunRequest, console: Console) -> RunEstimate:
     RunFolder(request.output).check_output_empty()
     if is_image_input(request):
         return _estimate_from_images(request, console)
+    if lacks_points(request.capture, request.options):
+        return _estimate_from_poses(request, console)
     choice = choose_image_size(request, console)
     request = choice.request
     capture = choice.capture or load_capture(request.capture, request.options)
@@ -70,6 +74,17 @@ def _estimate_from_images(run_request: RunRequest, console: Console) -> RunEstim
         sfm = estimate_sfm(plan)
         print_plan(plan, sfm.text(plan.threads), console)
         estimate = choose_for_photographs(run_request, plan, sfm, console).estimate
+    assert estimate is not None
+    _print_estimate(estimate, run_request.method(), None, console)
+    return estimate
+
+
+def _estimate_from_poses(run_request: RunRequest, console: Console) -> RunEstimate:
+    """The whole job of a project of another program without points."""
+    plan, sfm = plan_posed_capture(make_posed_request(run_request), run_request.options)
+    print_posed_plan(plan, sfm, console)
+    found = replace(run_request, options=replace(run_request.options, images=None))
+    estimate = choose_for_photographs(found, plan, sfm, console).estimate
     assert estimate is not None
     _print_estimate(estimate, run_request.method(), None, console)
     return estimate

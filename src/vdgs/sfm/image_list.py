@@ -13,7 +13,7 @@ from vdgs.captures.formats.colmap import partial_model
 from vdgs.captures.formats.source_capture import format_list
 from vdgs.captures.image_files import HEIF_SUFFIXES
 from vdgs.captures.name_resolution import jpeg_name, match_key
-from vdgs.captures.nested_captures import foreign_poses, model_below
+from vdgs.captures.nested_captures import check_no_foreign_file, foreign_poses, model_below
 from vdgs.captures.output_guard import is_capture
 from vdgs.captures.raw_files import RAW_SUFFIXES
 from vdgs.captures.reconstruction import is_reconstruction
@@ -63,6 +63,7 @@ def collect_images(folders: Sequence[Path], camera_model: CameraModel = "auto") 
     folders = list(dict.fromkeys(folders))
     for folder in folders:
         if not folder.is_dir() and not is_capture(folder):
+            check_no_foreign_file(folder)
             raise CaptureError(f"{folder}: no such folder or film. Give the folder that the photographs are in.")
         check_no_run(folder)
         if is_reconstruction(folder) and not is_capture(folder):

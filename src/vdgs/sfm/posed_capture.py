@@ -86,7 +86,7 @@ def make_posed_capture(
     """
     silence_colmap()
     check_ranges(request)
-    photographs = _read(request, options)
+    photographs = read_posed_photographs(request, options)
     output, threads = request.output, request.threads or default_num_threads()
     work, finished = Workspace(output / WORK_FOLDER), Workspace(output)
     for warning in photographs.warnings:
@@ -115,7 +115,8 @@ def make_posed_capture(
                   f"{model.compute_mean_reprojection_error():.2f} px", highlight=False)  # fmt: skip
 
 
-def _read(request: SfmRequest, options: CaptureOptions) -> PosedPhotographs:
+def read_posed_photographs(request: SfmRequest, options: CaptureOptions) -> PosedPhotographs:
+    """The cameras of a project and the photographs that are there. Raises `CaptureError` for fewer than three."""
     [path] = request.image_folders
     root, warnings = capture_root(path), list[str]()
     source = read_poses(path, options)
@@ -203,7 +204,7 @@ def _find_features(
 def _groups(photographs: PosedPhotographs) -> list[feature_extraction.CameraGroup]:
     groups = []
     for number, lens in enumerate(photographs.pinholes, 1):
-        members = tuple(_metadata(view) for view in photographs.views if photographs.number_of(view) == number)
+        members = tuple(image_metadata(view) for view in photographs.views if photographs.number_of(view) == number)
         groups.append(
             feature_extraction.CameraGroup(
                 camera="", width=lens.width, height=lens.height, focal_px=lens.focal[0], has_focal_prior=True,
@@ -213,7 +214,7 @@ def _groups(photographs: PosedPhotographs) -> list[feature_extraction.CameraGrou
     return groups
 
 
-def _metadata(view: MatchedView) -> ImageMetadata:
+def image_metadata(view: MatchedView) -> ImageMetadata:
     """The photograph as its file has it: poses of projects are of that, whatever EXIF says of its orientation."""
     path, lens = view.file.path, view.file.intrinsics
     return ImageMetadata(
@@ -254,13 +255,13 @@ def _match(photographs: PosedPhotographs, work: Workspace, request: SfmRequest, 
         work.begin(MATCHES, key)
     there = feature_extraction.count_features(work)
     names = [view.view.name for view in photographs.views]
-    pairs = [(names[i], names[j]) for i, j in sorted(_near_pairs(photographs, request.options.num_neighbors))]
+    pairs = [(names[i], names[j]) for i, j in sorted(near_pairs(photographs, request.options.num_neighbors))]
     pairs = [pair for pair in pairs if all(there.get(name) for name in pair)]
     feature_matching.match_pairs(work, pairs, threads, console)
     work.finish(MATCHES, key)
 
 
-def _near_pairs(photographs: PosedPhotographs, num_neighbors: int) -> set[tuple[int, int]]:
+def near_pairs(photographs: PosedPhotographs, num_neighbors: int) -> set[tuple[int, int]]:
     """Pairs of photographs whose cameras are near each other and look the same way."""
     count = len(photographs.views)
     if count <= pair_selection.SEQUENTIAL_OVERLAP:

@@ -2,13 +2,15 @@
 
 Bentley's description is followed: pixels count from the center of the first one; rotations lead from the world to the
 camera's axes, which CameraOrientation names; P1 and P2 are OpenCV's p2 and p1; the second focal length is the first
-times AspectRatio; poses and points are in the coordinate system of the block, x east or longitude.
+times AspectRatio; fisheyes count angles in quarter turns; poses and points are in the coordinate system of the block, x
+east or longitude.
 """
 
 from __future__ import annotations
 
 import math
 from array import array
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from xml.etree.ElementTree import Element
@@ -16,8 +18,8 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from vdgs.captures.coordinate_systems import ToGeodetic, is_in_degrees, is_local_system, to_geodetic
-from vdgs.captures.formats.brown_lens import brown_intrinsics
-from vdgs.captures.formats.project import CloudFrame, Project, ProjectView, refuse_cameras
+from vdgs.captures.formats.brown_lens import brown_intrinsics, quarter_turn_fisheye
+from vdgs.captures.formats.project import CloudFrame, Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
 from vdgs.captures.formats.terra import local_origin, original_names, warn_of_undistorted
 from vdgs.captures.formats.xml_documents import holds, read_xml, root_element, xml_number, xml_numbers
@@ -74,7 +76,7 @@ class _Block:
         self._file = file
         self._photos: dict[str, _Photo] = {}
         self._without_pose: list[str] = []
-        self._problems: dict[str, None] = {}
+        self._refused: dict[str, list[str]] = {}
         self._masks = 0
         self._points, self._colors = array("d"), array("d")
         self._systems: set[str] = set()
@@ -88,7 +90,6 @@ class _Block:
         blocks = self._root.findall("Block")
         if len(blocks) > 1:
             raise CaptureError(f"{self._file}: holds {len(blocks)} blocks. Export one alone.")
-        refuse_cameras(list(self._problems), self._file, "photogroups or photographs")
         geodetic, in_degrees, place, frames = self._system(blocks[0] if blocks else None)
         warnings = []
         if self._without_pose:
@@ -103,8 +104,12 @@ class _Block:
             points=np.array(self._points).reshape(-1, 3),
             colors=np.clip(np.round(255 * np.array(self._colors).reshape(-1, 3)), 0, 255).astype(np.uint8),
             to_geodetic=geodetic, in_degrees=in_degrees, is_metric=True, place=place, cloud_frames=frames,
-            warnings=tuple(warnings),
+            warnings=tuple(warnings), refused=self._refused,
         )  # fmt: skip
+
+    def _refuse(self, error: CaptureError, photos: Iterable[Element]) -> None:
+        why = str(error).removeprefix(f"{self._file}: ").rstrip(".")
+        self._refused.setdefault(why, []).extend(map(_path, photos))
 
     def _view(self, photo: _Photo, originals: dict[str, str]) -> ProjectView:
         numbers, pixels = photo.sightings
@@ -134,7 +139,7 @@ class _Block:
         try:
             intrinsics = self._lens(group, label)
         except CaptureError as error:
-            self._problems[str(error).removeprefix(f"{self._file}: ")] = None
+            self._refuse(error, posed)
             return
         axes = self._axes(group, label)
         for photo in posed:
@@ -147,9 +152,9 @@ class _Block:
         if number in self._photos:
             raise CaptureError(f"{self._file}: two photographs have the number {number}. Export the block again.")
         try:
-            rotation = axes @ self._rotation(photo.find("Pose/Rotation"), name)  # type: ignore[arg-type]
+            rotation = axes @ self._rotation(photo.find("Pose/Rotation"))  # type: ignore[arg-type]
         except CaptureError as error:
-            self._problems[str(error).removeprefix(f"{self._file}: ")] = None
+            self._refuse(error, [photo])
             return
         center = self._place(photo.find("Pose/Center"), f"the center of {name}")
         pose = to_rigid(np.column_stack([rotation, np.zeros(3)]), self._file, name)
@@ -161,11 +166,11 @@ class _Block:
             raise CaptureError(f"{self._file}: {label} is missing. Export the block again.")
         return [xml_number(element, axis, self._file, label) for axis in "xyz"]
 
-    def _rotation(self, element: Element, name: str) -> np.ndarray:
+    def _rotation(self, element: Element) -> np.ndarray:
         """From the world to the axes of the camera."""
 
         def value(tag: str) -> float:
-            return xml_number(element, tag, self._file, f"the rotation of {name}")
+            return xml_number(element, tag, self._file, "a rotation")
 
         if element.find("M_00") is not None:
             return np.array([[value(f"M_{row}{column}") for column in range(3)] for row in range(3)])
@@ -178,16 +183,16 @@ class _Block:
             return level @ (_about_z(-yaw) @ _about_x(pitch)).T
         kinds = ", ".join(child.tag for child in element) or "nothing"
         raise CaptureError(
-            f"{self._file}: {name}: its rotation is given by {kinds}, which programs mean in different ways. Export it "
-            "as a matrix, or as Omega, Phi, Kappa."
+            f"the rotation is given by {kinds}, which programs mean in different ways: export it as a matrix, or as "
+            "Omega, Phi, Kappa"
         )
 
     # ------------------------------------------------------------------------------------------ lenses
 
     def _lens(self, group: Element, label: str) -> Intrinsics:
         kind = (group.findtext("CameraModelType") or "Perspective").strip()
-        if kind != "Perspective":
-            raise CaptureError(f"{label} is {kind!r}; Perspective is read.")
+        if kind not in ("Perspective", "Fisheye"):
+            raise CaptureError(f"{label} is {kind!r}; Perspective and Fisheye are read.")
         size = group.find("ImageDimensions")
         if size is None:
             raise CaptureError(f"{label} has no ImageDimensions.")
@@ -196,12 +201,15 @@ class _Block:
         pixel = xml_number(group, "PixelSize", self._file, label, 0.0)
         pixel = pixel or xml_number(group, "SensorSize", self._file, label, 0.0) / longer
         focal = xml_number(group, "FocalLengthPixels", self._file, label, 0.0)
-        if not focal:
+        if not focal and (kind == "Perspective" or group.find("FisheyeFocalMatrix") is None):
             if not pixel > 0:
                 raise CaptureError(f"{label} has neither FocalLengthPixels nor FocalLength with SensorSize.")
             focal = xml_number(group, "FocalLength", self._file, label) / pixel
         aspect = xml_number(group, "AspectRatio", self._file, label, 1.0)
         center = self._center(group, (width, height), pixel, label)
+        if kind == "Fisheye":
+            lens = self._fisheye(group, focal, center, (width, height), label)
+            return check_intrinsics(lens, self._file, label)
         bends = group.find("Distortion")
         k1, k2, k3, p1, p2 = (
             0.0 if bends is None else xml_number(bends, name, self._file, label, 0.0)
@@ -210,6 +218,22 @@ class _Block:
         skew = xml_number(group, "Skew", self._file, label, 0.0)
         lens = brown_intrinsics((focal, focal * aspect), center, (width, height), (k1, k2, k3), (p2, p1), skew)
         return check_intrinsics(lens, self._file, label)
+
+    def _fisheye(
+        self, group: Element, focal: float, center: tuple[float, float], size: tuple[int, int], label: str
+    ) -> Intrinsics:
+        matrix, bends = group.find("FisheyeFocalMatrix"), group.find("FisheyeDistortion")
+        affine, polynomial = [focal, 0.0, 0.0, focal], [0.0, 1.0, 0.0, 0.0, 0.0]
+        if matrix is not None:
+            affine = [xml_number(matrix, f"M_{at}", self._file, label) for at in ("00", "01", "10", "11")]
+        if bends is not None:
+            polynomial = [
+                xml_number(bends, f"P{power}", self._file, label, default) for power, default in enumerate(polynomial)
+            ]
+        lens = quarter_turn_fisheye(affine, center, size, polynomial)
+        if lens is None:
+            raise CaptureError(f"{label} is a fisheye with P0 = {polynomial[0]:g} and P1 = {polynomial[1]:g}.")
+        return lens
 
     def _center(
         self, group: Element, size: tuple[int, int], pixel: float, label: str

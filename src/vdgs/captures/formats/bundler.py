@@ -173,9 +173,12 @@ def read_list(file: Path) -> list[str]:
 
 
 def find_list(bundle: Path) -> Path | None:
-    """The list of the photographs of a bundle: list.txt, or as the bundle is called."""
+    """The list of the photographs of a bundle: list.txt, or as the bundle is called, or the only list beside it
+    (RealityScan's .imagelist and .lst)."""
     stem = bundle.name.removesuffix(".out")
     names = ["list.txt", f"{stem.replace('bundle', 'list')}.txt", f"{stem}.list.txt", f"{stem}.txt", f"{stem}_list.txt"]
     folders = [bundle.parent, bundle.parent.parent] if bundle.parent.name == "bundle" else [bundle.parent]
     preferred = [names[1], names[0], *names[2:]]
-    return next((folder / name for folder in folders for name in preferred if (folder / name).is_file()), None)
+    named = next((folder / name for folder in folders for name in preferred if (folder / name).is_file()), None)
+    lists = [file for file in sorted(bundle.parent.iterdir()) if file.suffix.lower() in (".imagelist", ".lst")]
+    return lists[0] if named is None and len(lists) == 1 else named

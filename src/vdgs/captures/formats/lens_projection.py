@@ -7,21 +7,21 @@ from typing import Any
 import numpy as np
 
 from vdgs.captures.formats.brown_lens import project_rays, unproject_pixels
-from vdgs.captures.formats.source_capture import BROWN, Intrinsics
+from vdgs.captures.formats.source_capture import OWN_LENSES, Intrinsics
 
 
 def pixel_rays(intrinsics: Intrinsics, pixels: np.ndarray) -> np.ndarray:
     """x/z and y/z [n, 2] of the rays through pixels [n, 2] of a camera, its lens undone; NaN where it has no ray."""
     if not intrinsics.is_distorted:
         return (pixels - intrinsics.principal_point) / intrinsics.focal
-    if intrinsics.model == BROWN:
+    if intrinsics.model in OWN_LENSES:
         return unproject_pixels(intrinsics, pixels)
     return np.asarray(colmap_camera(intrinsics).cam_from_img(pixels), dtype=np.float64).reshape(-1, 2)
 
 
 def ray_pixels(intrinsics: Intrinsics, rays: np.ndarray) -> np.ndarray:
     """Pixels [n, 2] of rays x/z, y/z [n, 2]; not finite where the lens does not take them."""
-    if intrinsics.model == BROWN:
+    if intrinsics.model in OWN_LENSES:
         return project_rays(intrinsics, rays)
     points = np.column_stack([rays, np.ones(len(rays))])
     return np.asarray(colmap_camera(intrinsics).img_from_cam(points), dtype=np.float64)

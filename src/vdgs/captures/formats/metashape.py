@@ -16,8 +16,8 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from vdgs.captures.coordinate_systems import ToGeodetic, geocentric_to_geodetic, is_local_system, to_geodetic
-from vdgs.captures.formats.brown_lens import brown_intrinsics
-from vdgs.captures.formats.project import CloudFrame, Project, ProjectView, refuse_cameras
+from vdgs.captures.formats.brown_lens import brown_intrinsics, fisheye_intrinsics
+from vdgs.captures.formats.project import CloudFrame, Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
 from vdgs.captures.formats.xml_documents import holds, read_xml, root_element, xml_number, xml_numbers
 from vdgs.config.capture_options import CaptureOptions
@@ -45,8 +45,8 @@ def find_files(root: Path) -> list[Path]:
 
 
 def read(file: Path, options: CaptureOptions) -> Project:
-    """The aligned cameras of the chunk that has them. Raises `CaptureError` for damaged files, lenses that are not
-    modelled, cameras without calibration, and several chunks with cameras."""
+    """The aligned cameras of the chunk that has them. Raises `CaptureError` for damaged files and several chunks with
+    cameras."""
     root = read_xml(file, {name: lambda _: None for name in _UNUSED})
     aligned = [chunk for chunk in root.iter("chunk") if chunk.find(".//camera/transform") is not None]
     if not aligned:
@@ -73,6 +73,10 @@ class _Camera:
         return self.element.get("label") or f"camera {self.element.get('id', '?')}"
 
     @property
+    def sensor(self) -> str:
+        return self.element.get("sensor_id", "")
+
+    @property
     def names(self) -> tuple[str, ...]:
         """The label with its groups, which often are the folders of the photographs, and alone."""
         return tuple(dict.fromkeys(("/".join((*self.groups, self.label)), self.label)))
@@ -84,21 +88,24 @@ class _Chunk:
         self._warnings: list[str] = []
 
     def project(self) -> Project:
-        cameras = self._used(self._cameras())
-        lenses = self._lenses({camera.element.get("sensor_id", "") for camera in cameras})
-        cameras, place = self._placed(cameras)
+        cameras, place = self._placed(self._used(self._cameras()))
+        lenses = self._lenses({camera.sensor for camera in cameras})
+        refused: dict[str, list[str]] = {}
+        for camera in cameras:
+            if isinstance(why := lenses[camera.sensor], str):
+                refused.setdefault(why, []).append(camera.label)
         views = [
             ProjectView(
-                names=camera.names, intrinsics=lenses[camera.element.get("sensor_id", "")],
+                names=camera.names, intrinsics=lens,
                 camera_from_world=self._pose(camera, self._transforms.get(self._component(camera))),
             )
-            for camera in cameras
+            for camera in cameras if not isinstance(lens := lenses[camera.sensor], str)
         ]  # fmt: skip
         geodetic, words, frames = self._system(place) if place is not None else (None, "", ())
         return Project(
             format="metashape", file=self._file, views=tuple(views), points=np.zeros((0, 3)),
             colors=np.zeros((0, 3), np.uint8), to_geodetic=geodetic, is_metric=place is not None, place=words,
-            cloud_frames=frames, warnings=tuple(self._warnings),
+            cloud_frames=frames, warnings=tuple(self._warnings), refused=refused,
         )  # fmt: skip
 
     # ------------------------------------------------------------------------------------------- cameras
@@ -150,10 +157,10 @@ class _Chunk:
 
     # -------------------------------------------------------------------------------------------- lenses
 
-    def _lenses(self, used: set[str]) -> dict[str, Intrinsics]:
-        """The lenses of the sensors that are used. Raises `CaptureError` that names all which cannot be read."""
+    def _lenses(self, used: set[str]) -> dict[str, Intrinsics | str]:
+        """The lenses of the sensors that are used, or why one cannot be."""
         sensors = {sensor.get("id", ""): sensor for sensor in self._element.iter("sensor")}
-        problems, lenses = [], {}
+        lenses: dict[str, Intrinsics | str] = {}
         for number in sorted(used):
             sensor = sensors.get(number)
             label = f"sensor {number}" + (f" ({sensor.get('label')})" if sensor is not None else "")
@@ -162,8 +169,7 @@ class _Chunk:
                     raise CaptureError(f"{self._file}: {label} is missing.")
                 lenses[number] = self._lens(sensor, label)
             except CaptureError as error:
-                problems.append(str(error).removeprefix(f"{self._file}: "))
-        refuse_cameras(problems, self._file, "sensors")
+                lenses[number] = str(error).removeprefix(f"{self._file}: ").rstrip(".")
         return lenses
 
     def _lens(self, sensor: Element, label: str) -> Intrinsics:
@@ -180,22 +186,22 @@ class _Chunk:
         def value(name: str, default: float | None = 0.0) -> float:
             return xml_number(calibration, name, self._file, f"the calibration of {label}", default)
 
-        if value("p3") or value("p4"):
-            raise CaptureError(f"{label} has the lens parameters p3, p4, which are not read: fit the lens without.")
         width, height = self._size(sensor, calibration, label)
         radial = tuple(value(f"k{k}") for k in range(1, 5))
         if calibration.find("f") is None:  # PhotoScan before 1.2: from the corner, p1 and p2 as OpenCV's
-            focal, skew = (value("fx", None), value("fy", None)), value("skew")
+            focal, skew, growth = (value("fx", None), value("fy", None)), value("skew"), (0.0, 0.0)
             center, tangential = (value("cx", width / 2), value("cy", height / 2)), (value("p1"), value("p2"))
         else:
             focal, skew = (value("f", None) + value("b1"), value("f", None)), value("b2")
+            growth = value("p3"), value("p4")
             center, tangential = (width / 2 + value("cx"), height / 2 + value("cy")), (value("p2"), value("p1"))
         if kind == _PERSPECTIVE:
-            lens = brown_intrinsics(focal, center, (width, height), radial, tangential, skew)
-        elif skew:
-            raise CaptureError(f"{label} is a fisheye with b2, which is not read: fit the lens without.")
+            lens = brown_intrinsics(focal, center, (width, height), radial, tangential, skew, growth)
+        elif any(growth):
+            raise CaptureError(f"{label} is a fisheye with p3, p4, which are not read: fit the lens without.")
         else:
-            lens = _fisheye(focal, center, (width, height), radial, tangential)
+            powers = [power for k in radial for power in (0.0, k)]
+            lens = fisheye_intrinsics((focal[0], skew, 0.0, focal[1]), center, (width, height), powers, tangential)
         return check_intrinsics(lens, self._file, label)
 
     def _size(self, sensor: Element, calibration: Element, label: str) -> tuple[int, int]:
@@ -221,11 +227,15 @@ class _Chunk:
 
     def _component(self, camera: _Camera) -> str:
         number = camera.element.get("component_id", "")
+        if not number and "" not in self._transforms and len(self._transforms) == 1:
+            return next(iter(self._transforms))  # older files have one component, which cameras do not name
         return number if number in self._transforms else ""
 
     def _placed(self, cameras: list[_Camera]) -> tuple[list[_Camera], Similarity | None]:
         """Cameras of one world, those of most cameras where components hold together by nothing, and what leads from
         it to metres, None where nothing does."""
+        if not cameras:
+            return [], None
         components = Counter(camera.element.get("component_id", "") for camera in cameras)
         largest = max(components, key=lambda number: components[number])
         placed = [camera for camera in cameras if self._component(camera) in self._transforms]
@@ -286,14 +296,3 @@ def _calibration(sensor: Element) -> Element | None:
     ]
     rank = {"adjusted": 0, None: 1}
     return min(found, key=lambda each: rank.get(each.get("class"), 2), default=None)
-
-
-def _fisheye(
-    focal: tuple[float, float], center: tuple[float, float], size: tuple[int, int], radial: tuple[float, ...],
-    tangential: tuple[float, float],
-) -> Intrinsics:  # fmt: skip
-    """The equidistant fisheye: exactly COLMAP's OPENCV_FISHEYE, or THIN_PRISM_FISHEYE with tangential terms."""
-    k1, k2, k3, k4 = radial
-    if any(tangential):
-        return Intrinsics("THIN_PRISM_FISHEYE", (*focal, *center, k1, k2, *tangential, k3, k4, 0.0, 0.0), *size)
-    return Intrinsics("OPENCV_FISHEYE", (*focal, *center, k1, k2, k3, k4), *size)

@@ -19,7 +19,6 @@ import numpy as np
 
 from vdgs.captures.coordinate_systems import ToGeodetic, to_geodetic
 from vdgs.captures.formats.json_poses import parse_number, parse_vector, read_capture_json
-from vdgs.captures.formats.photograph_sizes import leave_out
 from vdgs.captures.formats.project import Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
 from vdgs.captures.gps_tables import check_geodetic
@@ -38,6 +37,7 @@ _HEAD_BYTES = 2048
 #: Positions that are told twice differ by less (about a metre on Earth, and in one system).
 _SAME_PLACE_DEG, _SAME_PLACE_M = 1e-5, 0.01
 _AGAIN = "Export it again."
+_UNDISTORT = "Undistort the photographs (opensfm undistort), and give the undistorted folder"
 #: COLMAP's model of each projection, and its distortion in COLMAP's order; with one focal length or two.
 _ONE_FOCAL = {"perspective": ("RADIAL", ("k1", "k2")), "fisheye": ("RADIAL_FISHEYE", ("k1", "k2"))}
 _TWO_FOCALS = {
@@ -78,13 +78,13 @@ def read(file: Path, options: CaptureOptions) -> Project:
 
 def _read_reconstruction(file: Path) -> Project:
     reconstruction, warnings = _biggest(file)
-    views = _views(reconstruction, _read_cameras(reconstruction.get("cameras"), file), file, warnings)
+    views, refused = _views(reconstruction, _read_cameras(reconstruction.get("cameras"), file), file)
     points, colors = _points(reconstruction, file)
     views = _with_tracks(views, list(reconstruction.get("points") or ()), file.parent / TRACKS)
     system, place = _system(reconstruction, file)
     return Project(
         format="opensfm", file=file, views=views, points=points, colors=colors, to_geodetic=system, place=place,
-        warnings=tuple(warnings),
+        warnings=tuple(warnings), refused=refused, remedy=_UNDISTORT,
     )  # fmt: skip
 
 
@@ -163,7 +163,7 @@ def _read_cameras(cameras: object, file: Path) -> dict[str, Intrinsics | str]:
 def _intrinsics(camera: JsonObject, name: str, file: Path) -> Intrinsics | str:
     kind = str(camera.get("projection_type", "perspective"))
     if kind not in _ONE_FOCAL and kind not in _TWO_FOCALS:
-        return f"the projection {kind!r} is not supported; undistort the photographs (opensfm undistort)"
+        return f"the projection {kind!r} of the camera {name!r} is not supported"
 
     def get(key: str) -> float:
         value = parse_number(camera, key, file) if key else None
@@ -181,25 +181,24 @@ def _intrinsics(camera: JsonObject, name: str, file: Path) -> Intrinsics | str:
 
 
 def _views(
-    reconstruction: JsonObject, known: Mapping[str, Intrinsics | str], file: Path, warnings: list[str]
-) -> tuple[ProjectView, ...]:
-    """The photographs in name order. Raises `CaptureError` for poses that are none, and where most have a lens that is
-    not supported."""
-    views, refused = list[ProjectView](), list[str]()
+    reconstruction: JsonObject, known: Mapping[str, Intrinsics | str], file: Path
+) -> tuple[tuple[ProjectView, ...], dict[str, list[str]]]:
+    """The photographs in name order, and those of lenses that are not supported. Raises `CaptureError` for poses that
+    are none."""
+    views, refused = list[ProjectView](), dict[str, list[str]]()
     for name, shot in sorted(reconstruction["shots"].items()):
         label = f"the photograph {name!r}"
         if not isinstance(shot, dict) or shot.get("camera") not in known:
             raise CaptureError(f"{file}: {label} has no camera that the file describes. {_AGAIN}")
         intrinsics = known[shot["camera"]]
         if isinstance(intrinsics, str):
-            refused.append(f"{name}: {intrinsics}")
+            refused.setdefault(intrinsics, []).append(name)
             continue
         pose = np.eye(4)
         pose[:3, :3] = rotation_about(parse_vector(shot.get("rotation"), 3, file, f"{label}: 'rotation'"))
         pose[:3, 3] = parse_vector(shot.get("translation"), 3, file, f"{label}: 'translation'")
         views.append(ProjectView(names=(name,), camera_from_world=to_rigid(pose, file, label), intrinsics=intrinsics))
-    warnings += leave_out(refused, len(views), file, "undistort the photographs (opensfm undistort)")
-    return tuple(views)
+    return tuple(views), refused
 
 
 def _points(reconstruction: JsonObject, file: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -265,7 +264,7 @@ def _read_report(file: Path) -> Project:
     features: Any = content.get("features")
     if not isinstance(features, list) or not features:
         raise CaptureError(f"{file}: has no 'features', the photographs. {_AGAIN}")
-    views, refused, geodetic, warnings = list[ProjectView](), list[str](), [], list[str]()
+    views, refused, geodetic, warnings = list[ProjectView](), dict[str, list[str]](), [], list[str]()
     for index, feature in enumerate(features):
         shot: Any = feature.get("properties") if isinstance(feature, dict) else None
         if not isinstance(shot, dict) or not isinstance(shot.get("filename"), str):
@@ -273,18 +272,17 @@ def _read_report(file: Path) -> Project:
         label = f"the photograph {shot['filename']!r}"
         intrinsics = _lens_of(shot, known, lenses_file)
         if isinstance(intrinsics, str):
-            refused.append(f"{shot['filename']}: {intrinsics}")
+            refused.setdefault(intrinsics, []).append(shot["filename"])
             continue
         pose = np.eye(4)
         pose[:3, :3] = rotation_about(parse_vector(shot.get("rotation"), 3, file, f"{label}: 'rotation'"))
         pose[:3, 3] = -pose[:3, :3] @ parse_vector(shot.get("translation"), 3, file, f"{label}: 'translation'")
         views.append(ProjectView(names=(shot["filename"],), camera_from_world=pose, intrinsics=intrinsics))
         geodetic.append(parse_vector(dict(feature.get("geometry") or {}).get("coordinates"), 3, file, label)[[1, 0, 2]])
-    warnings += leave_out(refused, len(views), file, "undistort the photographs")
     system, place = _report_system(views, np.array(geodetic), file, warnings)
     return Project(
         format="opensfm", file=file, views=tuple(views), points=np.zeros((0, 3)), colors=np.zeros((0, 3), np.uint8),
-        to_geodetic=system, place=place, warnings=tuple(warnings),
+        to_geodetic=system, place=place, warnings=tuple(warnings), refused=refused, remedy=_UNDISTORT,
     )  # fmt: skip
 
 
@@ -304,6 +302,8 @@ def _report_system(
     views: list[ProjectView], geodetic: np.ndarray, file: Path, warnings: list[str]
 ) -> tuple[ToGeodetic | None, str]:
     """The zone of UTM that the positions are in: the one in which they agree with their latitudes and longitudes."""
+    if not views:
+        return None, ""
     poses = np.stack([view.camera_from_world for view in views])
     places = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
     if (np.abs(geodetic[:, 0]) <= 90).all():

@@ -14,8 +14,8 @@ from urllib.parse import unquote, urlsplit
 import numpy as np
 
 from vdgs.captures.coordinate_systems import ToGeodetic, is_local_system, to_geodetic
-from vdgs.captures.formats.brown_lens import brown_intrinsics
-from vdgs.captures.formats.gltf_points import read_gltf_points
+from vdgs.captures.formats.brown_lens import MAX_POWERS, brown_intrinsics, quarter_turn_fisheye
+from vdgs.captures.formats.gltf_points import GltfPoints, join_points, read_gltf_points
 from vdgs.captures.formats.json_poses import (
     OPENGL_FROM_OPENCV,
     axis_rotation,
@@ -23,7 +23,7 @@ from vdgs.captures.formats.json_poses import (
     parse_vector,
     read_capture_json,
 )
-from vdgs.captures.formats.photograph_sizes import leave_out, name_unaligned
+from vdgs.captures.formats.photograph_sizes import name_unaligned
 from vdgs.captures.formats.project import Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, safe_name
 from vdgs.config.capture_options import CaptureOptions
@@ -56,25 +56,25 @@ def read(file: Path, options: CaptureOptions) -> Project:
         _number(each, "id", list_file): str(each.get("uri"))
         for each in _dicts(read_capture_json(list_file), "cameras", list_file)
     }
-    where = items.path("calibrated-cameras") or file
-    views, refused, warnings, used = list[ProjectView](), list[str](), list[str](), set[int]()
+    where, cloud = items.path("calibrated-cameras") or file, _points(items)
+    views, refused, warnings, used = list[ProjectView](), dict[str, list[str]](), list[str](), set[int]()
     for camera in _dicts(calibrated, "cameras", where):
         number, sensor = _number(camera, "id", where), _number(camera, "sensor_id", where)
         name = photograph_name(uris.get(number, f"camera {number}"))
         lens = sensors.get(sensor, f"its sensor {sensor} is not calibrated")
         used.add(number)
         if isinstance(lens, str):
-            refused.append(f"{name}: {lens}")
+            refused.setdefault(lens, []).append(name)
             continue
         pose = _pose(camera, where, f"camera {number}")
-        views.append(ProjectView(names=(name,), camera_from_world=pose, intrinsics=lens))
-    warnings += leave_out(refused, len(views), file, "Export COLMAP from PIX4Dmatic, or undistort the photographs")
+        seen = cloud.shown.get(number)
+        views.append(ProjectView(names=(name,), camera_from_world=pose, intrinsics=lens, sightings=seen))
     warnings += name_unaligned([photograph_name(uri) for number, uri in uris.items() if number not in used])
-    points, colors = _points(items)
     system, place, is_metric = _system(items)
     return Project(
-        format="opf", file=file, views=tuple(views), points=points, colors=colors, to_geodetic=system,
-        is_metric=is_metric, place=place, warnings=tuple(warnings),
+        format="opf", file=file, views=tuple(views), points=cloud.points, colors=cloud.colors, to_geodetic=system,
+        is_metric=is_metric, place=place, warnings=tuple(warnings), refused=refused,
+        remedy="Export COLMAP from PIX4Dmatic, or undistort the photographs",
     )  # fmt: skip
 
 
@@ -142,6 +142,8 @@ def _sensors(items: _Items, calibrated: JsonObject, file: Path) -> dict[int, Int
         number, inside = _number(sensor, "id", file), sensor.get("internals")
         if not isinstance(inside, dict) or number not in sizes:
             found[number] = f"its sensor {number} has no calibration or no size"
+        elif inside.get("type") == "fisheye":
+            found[number] = _fisheye(inside, sizes[number], file, f"sensor {number}")
         elif inside.get("type") != "perspective":
             found[number] = f"the lens {inside.get('type')!r} of its sensor {number} is not supported"
         else:
@@ -162,6 +164,20 @@ def _perspective(inside: JsonObject, size: np.ndarray, file: Path, label: str) -
     return check_intrinsics(lens, file, label)
 
 
+def _fisheye(inside: JsonObject, size: np.ndarray, file: Path, label: str) -> Intrinsics | str:
+    """Pix4D's fisheye: angles in quarter turns, a polynomial from the zeroth power on, and an affine matrix."""
+    center = parse_vector(inside.get("principal_point_px"), 2, file, f"{label}: 'principal_point_px'")
+    affine = parse_vector(inside.get("affine"), 4, file, f"{label}: 'affine'").tolist()
+    listed: Any = inside.get("polynomial")
+    count = max(2, len(listed)) if isinstance(listed, list) else 2
+    polynomial = parse_vector(listed, count, file, f"{label}: 'polynomial'").tolist()
+    width, height = map(int, size.clip(0, 1e9))
+    lens = quarter_turn_fisheye(affine, (float(center[0]), float(center[1])), (width, height), polynomial)
+    if lens is None:
+        return f"the fisheye's polynomial {polynomial[:MAX_POWERS]} of its {label} is not supported"
+    return check_intrinsics(lens, file, label)
+
+
 def _pose(camera: JsonObject, file: Path, label: str) -> np.ndarray:
     angles = parse_vector(camera.get("orientation_deg"), 3, file, f"{label}: 'orientation_deg'")
     world_from_camera = np.eye(4)
@@ -170,14 +186,13 @@ def _pose(camera: JsonObject, file: Path, label: str) -> np.ndarray:
     return np.linalg.inv(world_from_camera @ OPENGL_FROM_OPENCV)
 
 
-def _points(items: _Items) -> tuple[np.ndarray, np.ndarray]:
+def _points(items: _Items) -> GltfPoints:
     """The points of the calibration; those of a cloud where it has none."""
     for item in ("calibration", "point_cloud"):
         clouds = [read_gltf_points(path) for path in items.paths("model/gltf+json", item)]
-        clouds = [cloud for cloud in clouds if len(cloud[0])]
-        if clouds:
-            return np.concatenate([each for each, _ in clouds]), np.concatenate([each for _, each in clouds])
-    return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+        if any(len(cloud.points) for cloud in clouds):
+            return join_points(clouds)
+    return join_points([])
 
 
 def _system(items: _Items) -> tuple[ToGeodetic | None, str, bool]:

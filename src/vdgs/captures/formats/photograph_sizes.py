@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from vdgs.captures.formats.project_photographs import find_photographs
-from vdgs.captures.formats.source_capture import LEAST_THERE, MAX_LISTED, format_list
+from vdgs.captures.formats.source_capture import LEAST_THERE, MAX_MISSING_LISTED, format_list
 from vdgs.captures.image_files import read_header
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -29,16 +29,21 @@ def photograph_sizes(root: Path, options: CaptureOptions, names: Sequence[str], 
     return [size or usual for size in sizes]
 
 
-def leave_out(refused: Sequence[str], used: int, file: Path, remedy: str) -> list[str]:
-    """A warning about cameras that cannot be used, each with its reason; CaptureError where too few are left."""
-    count = used + len(refused)
-    if used < max(1, LEAST_THERE * count):
+def leave_out(
+    refused: Mapping[str, Sequence[str]], used: int, file: Path, remedy: str, *, strict: bool = False
+) -> list[str]:
+    """A warning about cameras that cannot be used, by the reasons; CaptureError where too few are left, and of any
+    where a person is `strict`."""
+    lost = sum(map(len, refused.values()))
+    if not lost:
+        return []
+    reasons, count = [f"{why} ({_shown(names)})" for why, names in refused.items()], used + lost
+    if strict or used < max(1, LEAST_THERE * count):
+        hint = " (or leave --strict out to use the others)" if strict and used >= max(1, LEAST_THERE * count) else ""
         raise CaptureError(
-            f"{file}: {len(refused)} of its {count} cameras cannot be used. {remedy}.{format_list(refused)}"
+            f"{file}: {lost} of its {count} cameras cannot be used. {remedy}{hint}.{format_list(reasons, len(reasons))}"
         )
-    return (
-        [f"{len(refused)} of {count} cameras cannot be used, and are left out ({_shown(refused)})."] if refused else []
-    )
+    return [f"{lost} of {count} cameras cannot be used, and are left out: {'; '.join(reasons)}."]
 
 
 def name_unaligned(names: Sequence[str]) -> list[str]:
@@ -51,4 +56,5 @@ def name_unaligned(names: Sequence[str]) -> list[str]:
 
 
 def _shown(names: Sequence[str]) -> str:
-    return ", ".join(names[:MAX_LISTED]) + (", ..." if len(names) > MAX_LISTED else "")
+    more = len(names) - MAX_MISSING_LISTED
+    return ", ".join(names[:MAX_MISSING_LISTED]) + (f", ... and {more} more" if more > 0 else "")

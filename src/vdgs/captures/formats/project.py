@@ -8,8 +8,8 @@ the project, or from a PLY beside it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -17,15 +17,12 @@ import numpy as np
 from vdgs.captures.capture import Observations
 from vdgs.captures.coordinate_systems import ToGeodetic
 from vdgs.captures.formats.colmap_records import sample_observations
+from vdgs.captures.formats.las_reader import can_read_las, find_las, read_las_points
 from vdgs.captures.formats.lens_projection import pixel_rays
+from vdgs.captures.formats.photograph_sizes import leave_out
 from vdgs.captures.formats.ply_reader import read_point_cloud
 from vdgs.captures.formats.project_photographs import find_photographs
-from vdgs.captures.formats.source_capture import (
-    Intrinsics,
-    SourceCapture,
-    SourceView,
-    format_list,
-)
+from vdgs.captures.formats.source_capture import Intrinsics, SourceCapture, SourceView
 from vdgs.captures.formats.sparse_points import find_point_cloud
 from vdgs.captures.georeference import Georef
 from vdgs.config.capture_options import CaptureOptions
@@ -38,6 +35,8 @@ from vdgs.system.quoting import shell_word
 LEAST_SEEN, POINTS_LOOKED_AT = 0.3, 2000
 #: Points farther from a camera than this many times the spread of the cameras are not of their place.
 MAX_DISTANCE_RATIO = 100.0
+#: Where ODM and PIX4Dmapper put their dense clouds.
+_DENSE = ("odm_georeferencing", "*/2_densification/point_cloud", "2_densification/point_cloud")
 #: The name of some coordinates, and what brings points [n, 3] from there.
 CloudFrame = tuple[str, Callable[[np.ndarray], np.ndarray]]
 
@@ -80,6 +79,9 @@ class Project:
     """Other coordinates that a PLY beside it may have, and what brings these to latitude, longitude and height, or to
     the project's coordinates where these have no place on Earth."""
     warnings: tuple[str, ...] = ()
+    refused: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    """Why some of its cameras cannot be used, and what these are called."""
+    remedy: str = "Export undistorted photographs with them as a COLMAP model instead"
 
 
 def project_capture(
@@ -87,9 +89,10 @@ def project_capture(
 ) -> SourceCapture:
     """The capture of a project whose photographs lie in `root`, or in the folder that `options` name.
 
-    Raises `CaptureError` where no photograph of it is found, and `NoTiePoints` for a project without points, unless
-    nothing `needs_points`.
+    Raises `CaptureError` where no photograph of it is found or too few of its cameras can be used, and `NoTiePoints`
+    for a project without points, unless nothing `needs_points`.
     """
+    lost = leave_out(project.refused, len(project.views), project.file, project.remedy, strict=options.strict)
     if not project.views:
         raise CaptureError(f"{project.file}: no camera of it has a pose. Align the photographs, and export it again.")
     _check_sightings(project)
@@ -97,7 +100,7 @@ def project_capture(
     found = find_photographs(root, options, names, project.file)
     world = _world_of(project)
     poses = world.moved_poses([view.camera_from_world for view in project.views])
-    points, colors, warnings = world.moved(project.points), project.colors, [*project.warnings, *found.warnings]
+    points, colors, warnings = world.moved(project.points), project.colors, [*project.warnings, *lost, *found.warnings]
     if not len(points) and needs_points:
         points, colors, note = _cloud_beside(project, root, poses, world)
         warnings.append(note)
@@ -191,15 +194,19 @@ def _world_of(project: Project) -> _World:
 def _cloud_beside(
     project: Project, root: Path, poses: Sequence[np.ndarray], world: _World
 ) -> tuple[np.ndarray, np.ndarray, str]:
-    """Points and colors of a PLY beside a project that its cameras see, in the world, and a note about it."""
+    """Points and colors of a PLY, LAS or LAZ beside a project that its cameras see, in the world, and a note on it."""
     cloud = find_point_cloud(root, project.file.parent, lone=True)
+    las = find_las((root, project.file.parent, *(folder for each in _DENSE for folder in sorted(root.glob(each)))))
+    if cloud is None and can_read_las():
+        cloud = las
     if cloud is None:
+        more = f" {las} is not read: it needs pip install 'vdgs[geo]'." if las is not None else ""
         raise NoTiePoints(
             f"{project.file}: brings poses but no 3D points, from which the scene starts. This finds them, with the "
             f"poses as they are: vdgs sfm {shell_word(_given(project, root))} --output CAPTURE\nOr put a point cloud "
-            "in the same coordinates beside it, as a PLY file."
+            f"in the same coordinates beside it, as a PLY, LAS or LAZ file.{more}"
         )
-    points, colors = read_point_cloud(cloud)
+    points, colors = (read_point_cloud if cloud.suffix.lower() == ".ply" else read_las_points)(cloud)
     frames: list[CloudFrame] = [("of the project", world.moved)]
     frames += [(name, _after(change, world)) for name, change in project.cloud_frames]
     frames.append(("of the scene", lambda points: points))
@@ -241,12 +248,3 @@ def _seen(points: np.ndarray, poses: Sequence[np.ndarray], views: Sequence[Proje
         u, v = fx * x + cx * z, fy * y + cy * z
         seen |= (z > 0) & (z <= farthest) & (u >= 0) & (v >= 0) & (u <= lens.width * z) & (v <= lens.height * z)
     return float(seen.mean()) if len(seen) else 0.0
-
-
-def refuse_cameras(problems: Sequence[str], file: Path, what: str) -> None:
-    """Raise `CaptureError` that names all sensors, or cameras, which cannot be read."""
-    if problems:
-        raise CaptureError(
-            f"{file}: {len(problems)} of its {what} cannot be read. Export undistorted photographs with them as a "
-            f"COLMAP model instead, or leave them out.{format_list(problems)}"
-        )

@@ -2,14 +2,16 @@
 
 Lengths in a picture count in its longer side: the focal length in 36ths of it, the principal point from the middle.
 Heading, pitch and roll turn a camera that looks down with its top to the north: world from camera, in axes right, up,
-back, is Rz(-heading) Rx(pitch) Ry(roll). The XMP has the rotation camera from world, in axes right, down, forward.
-Of the tangential terms t1 goes with r² + 2x²: it is OpenCV's p2, as AliceVision and Camorph read it too.
+back, is Rz(-heading) Rx(pitch) Ry(roll). The XMP, and the table for OpenCV, have the rotation camera from world, in
+axes right, down, forward. Of the tangential terms t1 goes with r² + 2x²: it is OpenCV's p2, and so the table for OpenCV
+writes t2 before t1.
 """
 
 from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import islice
@@ -18,10 +20,10 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from vdgs.captures.coordinate_systems import ToGeodetic
+from vdgs.captures.coordinate_systems import ToGeodetic, to_geodetic
 from vdgs.captures.formats.brown_lens import brown_intrinsics
 from vdgs.captures.formats.json_poses import OPENGL_FROM_OPENCV, axis_rotation
-from vdgs.captures.formats.photograph_sizes import leave_out, photograph_sizes
+from vdgs.captures.formats.photograph_sizes import name_unaligned, photograph_sizes
 from vdgs.captures.formats.project import Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
 from vdgs.captures.formats.xml_documents import read_xml, xml_numbers
@@ -30,6 +32,7 @@ from vdgs.errors import CaptureError
 
 #: Columns that say where a camera is; with them a table is one of registered cameras.
 _POSE = ("x", "y", "alt", "heading", "pitch", "roll")
+_MATRIX = ("tx", "ty", "tz", *(f"r{row}{column}" for row in range(3) for column in range(3)))
 _LENS = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
 #: What people's own templates call the columns.
 _ALIASES = {
@@ -37,7 +40,7 @@ _ALIASES = {
     "east": "x", "easting": "x", "north": "y", "northing": "y",
     "z": "alt", "altitude": "alt", "height": "alt", "yaw": "heading",
     "focal": "f", "focallength": "f", "focallength35mm": "f", "f35mm": "f",
-    "ppx": "px", "principalpointu": "px", "ppy": "py", "principalpointv": "py",
+    "ppx": "px", "principalpointu": "px", "pxnorm": "px", "ppy": "py", "principalpointv": "py", "pynorm": "py",
 }  # fmt: skip
 #: The models of the XMP that are Brown's, all in the order k1, k2, k3, k4, t1, t2.
 _BROWN_MODELS = {"", "perspective", "brown3", "brown4", "brown3t2", "brown4t2"}
@@ -49,6 +52,10 @@ _LONGEST_35MM = 1500.0
 _XMP_LOOKED_AT = 20
 #: Cameras of one flight are no farther apart in degrees, and have coordinates as large only in a projected system.
 _DEGREES_APART, _PROJECTED_FROM = 0.2, 20_000.0
+#: What RealityScan writes beside the points and models that it exports, and the system that it names there.
+_INFO, _SYSTEM = "*.[rR][cCsS][iI]nfo", re.compile(r'globalCoordinateSystemName="\s*epsg:(\d+)', re.IGNORECASE)
+#: Axes of cameras are so near the vertical, in degrees, only where a table in degrees has spoiled them.
+_SPOILED_DEG = 0.05
 _AGAIN = "Export the registration again."
 
 
@@ -60,14 +67,23 @@ class RegisteredCamera:
     camera_from_world: np.ndarray
     focal_35mm: float
     lens: Mapping[str, float] = field(default_factory=dict)
+    in_pixels: bool = False
+    """Whether focal length and principal point are told in pixels, from the corner, of the photograph."""
 
     def intrinsics(self, size: tuple[int, int], file: Path) -> Intrinsics:
         """The lens at the size of the photograph."""
         (width, height), longer = size, max(size)
         px, py, k1, k2, k3, k4, t1, t2 = (self.lens.get(key, 0.0) for key in _LENS)
-        focal = self.focal_35mm * longer / 36
+        focal, center = self.focal_35mm * longer / 36, (px * longer + width / 2, py * longer + height / 2)
+        if self.in_pixels:
+            focal, center = self.focal_35mm, (px, py)
+            if not (0.3 < px / width < 0.7 and 0.3 < py / height < 0.7):
+                raise CaptureError(
+                    f"{file}: {self.name} has its principal point at {px:.0f}, {py:.0f} pixels, and the photograph is "
+                    f"{width}x{height}: it is of another size. Give the photographs that were aligned (--images)."
+                )
         lens = brown_intrinsics(
-            (focal, focal * self.lens.get("aspect", 1.0)), (px * longer + width / 2, py * longer + height / 2), size,
+            (focal, focal * self.lens.get("aspect", 1.0)), center, size,
             radial=(k1, k2, k3, k4), tangential=(t2, t1), skew=self.lens.get("skew", 0.0) * longer,
         )  # fmt: skip
         return check_intrinsics(lens, file, f"the photograph {self.name!r}")
@@ -86,7 +102,7 @@ def is_file(file: Path) -> bool:
 
 def read(file: Path, options: CaptureOptions) -> Project:
     """The project of a table, or of all XMP files in the folder of one. Raises `CaptureError` for damaged files."""
-    refused = list[str]()
+    refused, unaligned = dict[str, list[str]](), list[str]()
     if file.suffix.lower() != ".xmp":
         cameras, root = read_camera_table(file), file.parent
     else:
@@ -94,9 +110,12 @@ def read(file: Path, options: CaptureOptions) -> Project:
         files = [each for each in _xmp_below(above) if _is_xmp(each)]
         read_all = [(each.relative_to(above).with_suffix("").as_posix(), read_xmp(each)) for each in files]
         cameras = [replace(each, name=name) for name, each in read_all if not isinstance(each, str)]
-        refused = [f"{name}: {why}" for name, why in read_all if isinstance(why, str)]
+        unaligned = [name for name, why in read_all if why == ""]
+        for name, why in read_all:
+            if isinstance(why, str) and why:
+                refused.setdefault(why, []).append(name)
         root = above.parent if above.name == "images" else above
-    warnings = leave_out(refused, len(cameras), file, "Align them, and export the XMP files of all")
+    warnings = name_unaligned(unaligned)
     if file.suffix.lower() != ".xmp" and _may_be_division(cameras):
         warnings.append(
             f"{file.name}: of the lens only k1 is set, and is taken for Brown's. If the lens model was Division, align "
@@ -109,10 +128,11 @@ def read(file: Path, options: CaptureOptions) -> Project:
         )
         for camera, size in zip(cameras, photograph_sizes(root, options, names, file), strict=True)
     )  # fmt: skip
-    system, is_metric, place = _world(views)
+    system, in_degrees, is_metric, place = _world(views, file)
     return Project(
         format="realityscan", file=file, views=views, points=np.zeros((0, 3)), colors=np.zeros((0, 3), np.uint8),
-        to_geodetic=system, in_degrees=system is not None, is_metric=is_metric, place=place, warnings=tuple(warnings),
+        to_geodetic=system, in_degrees=in_degrees, is_metric=is_metric, place=place, warnings=tuple(warnings),
+        refused=refused, remedy="Align with Brown3 or Brown4, or export COLMAP",
     )  # fmt: skip
 
 
@@ -122,8 +142,12 @@ def _may_be_division(cameras: list[RegisteredCamera]) -> bool:
     return set_terms == {"k1"}
 
 
-def _world(views: tuple[ProjectView, ...]) -> tuple[ToGeodetic | None, bool, str]:
-    """What the coordinates are, which neither file says: degrees, metres of a projected system, or of no scale."""
+def _world(views: tuple[ProjectView, ...], file: Path) -> tuple[ToGeodetic | None, bool, bool, str]:
+    """What the coordinates are, which neither file says: degrees, metres of a projected system (which the information
+    beside a point cloud names), or of no scale. What brings them to latitude, longitude and height, whether they are
+    degrees, whether they are metres, and words about them."""
+    if not views:
+        return None, False, False, ""
     poses = np.stack([view.camera_from_world for view in views])
     centers = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
     middle, spread = np.abs(np.median(centers, axis=0)), np.ptp(centers, axis=0)
@@ -133,10 +157,31 @@ def _world(views: tuple[ProjectView, ...]) -> tuple[ToGeodetic | None, bool, str
         and middle[1] <= 90
         and middle[2] > 1e3 * spread[:2].max()
     ):
-        return lambda points: points[:, [1, 0, 2]], True, "RealityScan, longitude and latitude"
+        spoiled = np.degrees(np.arccos(np.abs(poses[:, 0, 2]).clip(0, 1))) < _SPOILED_DEG
+        if spoiled.mean() > 0.5:
+            raise CaptureError(
+                f"{file}: the angles of its cameras mean nothing: RealityScan spoils them where it writes longitude "
+                "and latitude. Export the table again with the coordinate system 'Local Euclidean', or in a projected "
+                "system (UTM); --gps TABLE gives a local one its place."
+            )
+        return lambda points: points[:, [1, 0, 2]], True, True, "RealityScan, longitude and latitude"
     if middle[:2].max() > _PROJECTED_FROM:
-        return None, True, "RealityScan, metres of a projected system that it does not name"
-    return None, False, ""
+        if (named := _named_system(file)) is not None:
+            return named[0], False, True, f"RealityScan, {named[1]}"
+        return None, False, True, "RealityScan, metres of a projected system that it does not name"
+    return None, False, False, ""
+
+
+def _named_system(file: Path) -> tuple[ToGeodetic, str] | None:
+    """The projected system that the information beside a point cloud or a model in the folder names."""
+    for info in sorted(file.parent.glob(_INFO)):
+        try:
+            found = _SYSTEM.search(info.read_text(encoding="utf-8-sig", errors="replace"))
+        except OSError:
+            continue
+        if found is not None:
+            return to_geodetic(f"EPSG:{found[1]}", info, "globalCoordinateSystemName")
+    return None
 
 
 def _is_table(file: Path) -> bool:
@@ -157,7 +202,7 @@ def _column_names(line: str) -> tuple[str, list[str]] | None:
             for word in line.split(delimiter)
         ]
         names = [_ALIASES.get(word, word) for word in words]
-        if all(each in names for each in ("name", *_POSE)):
+        if "name" in names and ({*_POSE} <= {*names} or {*_MATRIX} <= {*names}):
             return delimiter, names
     return None
 
@@ -175,7 +220,7 @@ def read_camera_table(file: Path) -> list[RegisteredCamera]:
     if found is None:
         raise CaptureError(f"{file}: names no columns name, {', '.join(_POSE)}. {_AGAIN}")
     delimiter, names = found
-    if "f" not in names:
+    if not {"f", "fpix"} & {*names}:
         raise CaptureError(
             f"{file}: has no column f, the focal length. Export 'Internal/External camera parameters' instead."
         )
@@ -191,7 +236,7 @@ def read_camera_table(file: Path) -> list[RegisteredCamera]:
     if problems:
         listed = "".join(f"\n  {each}" for each in problems[:10])
         raise CaptureError(f"{file}: {len(problems)} of its rows cannot be read. {_AGAIN}{listed}")
-    if cameras and np.median([camera.focal_35mm for camera in cameras]) > _LONGEST_35MM:
+    if cameras and "f" in names and np.median([camera.focal_35mm for camera in cameras]) > _LONGEST_35MM:
         raise CaptureError(
             f"{file}: has focal lengths of {cameras[0].focal_35mm:g} mm as of 35 mm film. Are they in pixels? Export "
             "'Internal/External camera parameters' as RealityScan has them."
@@ -208,6 +253,14 @@ def _row_camera(row: dict[str, str], delimiter: str, file: Path) -> RegisteredCa
             raise ValueError(f"{key} is {row[key].strip()}")
         return value
 
+    if "fpix" in row:
+        values = list(map(number, _MATRIX))
+        pose = to_rigid(np.column_stack([np.reshape(values[3:], (3, 3)), values[:3]]), file, row["name"].strip())
+        terms = {key: key for key in _LENS[2:]} | {"px": "pxpix", "py": "pypix"}
+        lens = {key: number(column) for key, column in terms.items() if row.get(column, "").strip()}
+        return RegisteredCamera(
+            name=row["name"].strip(), camera_from_world=pose, focal_35mm=number("fpix"), lens=lens, in_pixels=True
+        )
     east, north, up, heading, pitch, roll = map(number, _POSE)
     world_from_camera = np.eye(4)
     world_from_camera[:3, :3] = axis_rotation(2, -heading) @ axis_rotation(0, pitch) @ axis_rotation(1, roll)
@@ -231,14 +284,16 @@ def _is_xmp(file: Path) -> bool:
 
 
 def read_xmp(file: Path) -> RegisteredCamera | str:
-    """The camera in an XMP, named without a suffix; why there is none where the photograph was not placed, or has a
-    lens that is not Brown's."""
+    """The camera in an XMP, named without a suffix; why there is none where it cannot be used, and nothing ("") where
+    the photograph was not aligned."""
     found = {key: value for element in read_xml(file).iter() for key, value in _properties(element)}
     model = found.get("DistortionModel", "").lower()
     if "Rotation" not in found or "Position" not in found:
-        return "was not aligned"
+        return ""
+    if found.get("Coordinates", "absolute").lower() == "relative":
+        return "the pose is relative to a rig: export absolute poses"
     if model not in _BROWN_MODELS:
-        return f"has the lens model {model!r}, which is not supported: align with Brown3 or Brown4, or export COLMAP"
+        return f"the lens model {model!r} is not supported"
 
     def numbers(key: str, count: int) -> list[float]:
         return xml_numbers(found[key], count, file, f"xcr:{key}")

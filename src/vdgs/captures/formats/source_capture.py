@@ -38,13 +38,13 @@ PINHOLE_WHEN_ZERO = {
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVISION",
     "DIVISION",
 }  # fmt: skip
-#: The lens of `brown_lens`, which is none of COLMAP's.
-BROWN = "BROWN"
+#: The lenses of `brown_lens`, which are none of COLMAP's.
+BROWN, GENERAL, GENERAL_FISHEYE = OWN_LENSES = ("BROWN", "GENERAL", "GENERAL_FISHEYE")
 MAX_SIDE_PX = 100_000
 #: Names that messages list, and those of photographs that are gone, which a person must find.
 MAX_LISTED, MAX_MISSING_LISTED = 10, 100
 #: A capture is used without the photographs that are gone where at least this share is there (choice).
-LEAST_THERE = 2 / 3
+LEAST_THERE = 3 / 4
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ def refuse_many_missing(missing: Sequence[str], count: int, where: Path, strict:
         raise CaptureError(
             f"{where}: {len(missing)} of {count} images that have a camera are missing; at least "
             f"{LEAST_THERE:.0%} must be there. Copy them there, or choose another folder with --images."
-            f"{format_list(missing)}"
+            f"{format_list(missing, MAX_MISSING_LISTED)}"
         )
     more = len(missing) - MAX_MISSING_LISTED
     shown = ", ".join(missing[:MAX_MISSING_LISTED]) + (f", ... and {more} more" if more > 0 else "")

@@ -1,0 +1,102 @@
+"""PIX4Dmapper's parameters (1_initial/params): *_calibrated_camera_parameters.txt with lenses and poses of all cameras.
+
+Ten lines for each photograph: its name and size, the camera matrix (3), R1 to R3, T1 and T2 (OpenCV's p1 and p2), the
+position t and the rotation R camera from world (3), in axes right, down, forward. *_offset.xyz beside it was taken off
+the coordinates of the system that *_wkt.prj names.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from vdgs.captures.coordinate_systems import ToGeodetic, is_local_system, to_geodetic
+from vdgs.captures.formats.brown_lens import brown_intrinsics
+from vdgs.captures.formats.project import CloudFrame, Project, ProjectView
+from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
+from vdgs.captures.formats.xml_documents import xml_numbers
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.errors import CaptureError
+
+_ENDING, _HEADER = "_calibrated_camera_parameters.txt", b"fileName imageWidth imageHeight"
+#: Where PIX4Dmapper puts the file in the folder of a project, which lies beside its .p4d.
+_FOLDERS = ("", "1_initial/params/", "*/1_initial/params/")
+_LINES = 10
+
+
+def find_files(root: Path) -> list[Path]:
+    return [file for folder in _FOLDERS for file in sorted(root.glob(f"{folder}*{_ENDING}")) if is_file(file)]
+
+
+def is_file(file: Path) -> bool:
+    try:
+        with file.open("rb") as stream:
+            return file.suffix.lower() == ".txt" and stream.read(len(_HEADER)) == _HEADER
+    except OSError:
+        return False
+
+
+def read(file: Path, options: CaptureOptions) -> Project:
+    """The calibrated cameras of a project. Raises `CaptureError` for damaged files and fisheyes."""
+    try:
+        lines = file.read_text(encoding="utf-8-sig", errors="replace").splitlines()
+    except OSError as error:
+        raise CaptureError(f"{file}: cannot be read ({error.strerror or error}).") from error
+    head = next((index for index, line in enumerate(lines) if line.startswith("camera model")), None)
+    rows = [line.strip() for line in lines[(0 if head is None else head) + 1 :] if line.strip()]
+    if head is None or len(rows) % _LINES:
+        raise CaptureError(
+            f"{file}: does not hold {_LINES} lines for each photograph after its header: it is cut off, or of a "
+            "fisheye, which is read from OPF (PIX4Dmatic). Copy or export it again."
+        )
+    views = tuple(_view(rows[first : first + _LINES], file) for first in range(0, len(rows), _LINES))
+    system, place, is_metric, frames = _system(file)
+    return Project(
+        format="pix4d", file=file, views=views, points=np.zeros((0, 3)), colors=np.zeros((0, 3), np.uint8),
+        to_geodetic=system, is_metric=is_metric, place=place, cloud_frames=frames,
+    )  # fmt: skip
+
+
+def _view(block: list[str], file: Path) -> ProjectView:
+    name, *size = block[0].rsplit(None, 2)
+    label = f"the photograph {name!r}"
+    width, height = map(int, xml_numbers(" ".join(size), 2, file, f"the size of {label}"))
+
+    def numbers(first: int, last: int, count: int, what: str) -> list[float]:
+        return xml_numbers(" ".join(block[first:last]), count, file, f"{what} of {label}")
+
+    matrix = np.reshape(numbers(1, 4, 9, "the camera matrix"), (3, 3))
+    t1, t2 = numbers(5, 6, 2, "the tangential distortion")
+    lens = brown_intrinsics(
+        (float(matrix[0, 0]), float(matrix[1, 1])), (float(matrix[0, 2]), float(matrix[1, 2])), (width, height),
+        numbers(4, 5, 3, "the radial distortion"), (t1, t2), float(matrix[0, 1]),
+    )  # fmt: skip
+    rotation = np.reshape(numbers(7, 10, 9, "the rotation"), (3, 3))
+    pose = to_rigid(np.column_stack([rotation, np.zeros(3)]), file, label)
+    pose[:3, 3] = -pose[:3, :3] @ numbers(6, 7, 3, "the position")
+    intrinsics: Intrinsics = check_intrinsics(lens, file, label)
+    return ProjectView(names=(name,), camera_from_world=pose, intrinsics=intrinsics)
+
+
+def _system(file: Path) -> tuple[ToGeodetic | None, str, bool, tuple[CloudFrame, ...]]:
+    """What brings coordinates to latitude, longitude and height, words about it, whether they are metres, and what a
+    point cloud beside them may be in."""
+    stem = file.name.removesuffix(_ENDING)
+    offset_file, system_file = (file.with_name(f"{stem}{ending}") for ending in ("_offset.xyz", "_wkt.prj"))
+    offset = np.zeros(3)
+    if offset_file.is_file():
+        offset = np.array(xml_numbers(_text(offset_file), 3, offset_file, "the offset"))
+    wkt = _text(system_file).strip() if system_file.is_file() else ""
+    if not wkt or is_local_system(wkt):
+        is_metric = bool(wkt) or bool(offset.any())
+        return None, "Pix4D, metres of a system of its own" if is_metric else "", is_metric, ()
+    change, name = to_geodetic(wkt, system_file, "the file")
+    return lambda points: change(points + offset), f"Pix4D, {name}", False, ((f"of {name}", change),)
+
+
+def _text(file: Path) -> str:
+    try:
+        return file.read_text(encoding="utf-8-sig", errors="replace")
+    except OSError as error:
+        raise CaptureError(f"{file}: cannot be read ({error.strerror or error}).") from error
