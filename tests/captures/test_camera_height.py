@@ -1,5 +1,6 @@
 """The length that settings refer to: the height of a flight, or the distance of cameras that fly at no height."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from support.captures import TinyScene, data_folder, look_down, moved, tiny_scene
-from vdgs.captures.camera_height import camera_height
+from vdgs.captures.camera_height import camera_height, offset_rate_factor
 from vdgs.captures.capture import Capture, View
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
@@ -94,6 +95,14 @@ def test_moving_and_scaling_the_scene_changes_the_weight_as_it_changes_volumes(s
     before, after = capture_of(scene), capture_of(moved(scene, scale, rotation, np.array(shift)))
     assert camera_height(after) == pytest.approx(scale * camera_height(before), rel=1e-6)
     assert volume_weight(after) * scale**3 == pytest.approx(volume_weight(before), rel=1e-5)
+    assert offset_rate_factor(after, TrainConfig()) == 1.0
+    by_cameras = TrainConfig(lr_offsets_unit="cameras")
+    factor = offset_rate_factor(before, by_cameras)
+    assert factor == pytest.approx(1.1 * 25 if tower else factor, rel=0.01)
+    assert offset_rate_factor(after, by_cameras) == pytest.approx(scale * factor, rel=1e-6)
+    # In another ground frame the capture's own units stay what they are.
+    rescaled = replace(after, ground=replace(after.ground, scale=scale))
+    assert offset_rate_factor(rescaled, by_cameras) == pytest.approx(factor, rel=1e-6)
 
 
 def test_all_in_one_place_is_no_division_by_zero():

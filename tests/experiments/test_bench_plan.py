@@ -146,8 +146,10 @@ def test_default_and_paper_restart_the_coarse_stage_and_paper_leaves_our_choices
         line.split(":")[0] for line in diff_settings(to_dict(default), to_dict(paper))
     }  # fmt: skip
     assert ours == {
-        "assignment.always_best", "assignment.min_cameras", "assignment.mode", "block.random_background",
-        "block.compensation.target", "block.compensation.min_draws", "block.draw_outside", "training.optimizer",
+        "partition.axes", "partition.clip_quantile", "partition.smoothing", "partition.min_block_share",
+        "assignment.always_best", "assignment.min_cameras", "assignment.mode", "assignment.tau",
+        "block.random_background", "block.margin", "merge.rule",
+        "block.compensation.target", "block.compensation.min_draws", "training.optimizer",
         "training.model.bound_scales", "training.init.fill_gaps", "training.init.outlier_distance",
         "training.loss.background", "training.loss.random_background",
     }  # fmt: skip

@@ -75,7 +75,10 @@ def test_without_its_best_block_a_camera_may_train_nothing(mode):
     given = hand_made(scores, np.ones((3, 2), int), mode=mode)
     literal = assign_cameras(given, replace(CONFIG, mode=mode, always_best=False, min_cameras=0))
     assert np.array_equal(literal.cameras, scores > 0.45)
-    assert assign_cameras(given, replace(CONFIG, mode=mode, min_cameras=0)).cameras.any(axis=1).all()
+    assert "1 of 3 training photographs train no block's core" in literal.warnings[-1]
+    joined = assign_cameras(given, replace(CONFIG, mode=mode, min_cameras=0))
+    assert joined.cameras.any(axis=1).all()
+    assert not any("train no block" in line for line in joined.warnings)
 
 
 def test_equal_scores_are_settled_by_anchors_held_and_then_by_index():

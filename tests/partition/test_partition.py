@@ -21,7 +21,7 @@ from vdgs.errors import RunError, VdgsError
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu
 from vdgs.geometry.ground_frame import GroundFrame
-from vdgs.partition import clustering
+from vdgs.partition import boundary, clustering
 from vdgs.partition.blocks import Block, Blocks, load_blocks, save_blocks, save_blocks_wgs84
 from vdgs.partition.boundary import alpha_shape, expand_core
 from vdgs.partition.partition_scene import choose_block_count, partition_scene
@@ -75,6 +75,45 @@ def test_the_order_of_the_anchors_does_not_matter() -> None:
     there, shuffled = cut(positions, views), cut(positions[order], views[order])
     assert all(a.core.equals(b.core) for a, b in zip(there.items, shuffled.items, strict=True))
     assert np.array_equal(owners(shuffled, positions), owners(there, positions))
+
+
+def test_on_the_axes_of_the_ground_frame_the_cut_does_not_turn_with_the_scene() -> None:
+    """Per axis the oblong site is a square; turned by 45 degrees it is another square."""
+    positions, views = town()
+    turned = positions @ np.array([[1, -1, 0], [1, 1, 0], [0, 0, np.sqrt(2)]]).T / np.sqrt(2)
+    for axes, same in (("principal", True), ("ground", False)):
+        before, after = (cut(each, views, lambda_vis=0.0, axes=axes, smoothing=0.5) for each in (positions, turned))
+        assert np.array_equal(owners(after, turned), owners(before, positions)) == same
+
+
+def test_positions_are_normalized_between_the_outermost_anchors_or_clipped() -> None:
+    points = np.array([[0.0, 5.0]] * 50 + [[10.0, 7.0]] * 50 + [[1000.0, 6.0]])
+    features = clustering.clustering_features(points, np.arange(101), 0.5, 0.0)
+    assert np.allclose(features, np.column_stack([points[:, 0] / 1000, (points[:, 1] - 5) / 2, np.arange(101) / 200]))
+    clipped = clustering.clustering_features(points, np.arange(101), 0.5, 0.02)
+    assert np.allclose(clipped[:, 0], [0.0] * 50 + [1.0] * 51)
+
+
+def test_components_are_sought_over_a_clusters_own_cells_or_where_it_is_strongest() -> None:
+    """Two clusters that are mixed over all of the site: each component is then the whole of it, or what it leads."""
+    generator = np.random.default_rng(5)
+    points = generator.uniform(0, 10, (6000, 2))
+    labels = (generator.uniform(size=6000) < 0.2 + 0.6 * (points[:, 0] > 5)).astype(np.int64)
+    site = shapely.box(0, 0, 10, 10).area
+    own = [core for core in boundary.block_cores(points, labels, 2, 0.0) if core is not None]
+    assert max(core.area for core in own) > 0.9 * site
+    for smoothing in (0.5, 1.5):
+        halves = boundary.block_cores(points, labels, 2, smoothing)
+        assert all(core is not None and 0.4 * site < core.area < 0.6 * site for core in halves)
+
+
+def test_a_small_block_is_left_out_or_kept() -> None:
+    generator = np.random.default_rng(8)
+    site, far = generator.uniform(0, 100, (4000, 3)), generator.normal([160, 50, 0], 1, (40, 3))
+    positions, views = np.concatenate([site, far]), np.full(4040, 5)
+    kept = cut(positions, views, 3, lambda_vis=0.0, min_block_share=0.0, clip_quantile=0.0)
+    assert len(kept) == 3
+    assert len(cut(positions, views, 3, lambda_vis=0.0, min_block_share=0.9, clip_quantile=0.0)) < 3
 
 
 def test_coordinates_as_large_as_utm() -> None:

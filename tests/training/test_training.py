@@ -56,6 +56,12 @@ def test_a_stopped_and_continued_run_has_the_same_bits(unbroken, tmp_path):
     assert bits(run(state, stage())) == bits(unbroken)
 
 
+def test_the_factor_of_offsets_multiplies_their_rates_alone():
+    first, last = CONFIG.lr.offsets
+    faster = replace(CONFIG, lr=replace(CONFIG.lr, offsets=(4 * first, 4 * last)))
+    assert bits(run(start(), replace(stage(), offset_rate_factor=4.0), until=5)) == bits(run(start(), stage(faster), 5))
+
+
 def test_the_number_of_threads_changes_no_bit(unbroken):
     before = get_num_threads()
     try:

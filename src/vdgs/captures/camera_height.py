@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vdgs.captures.capture import Capture
+from vdgs.config.method import TrainConfig
 from vdgs.geometry.similarity import geometric_median
 
 #: Cameras that are no higher above the points than this share of their distance to them fly at no height (choice).
@@ -33,6 +34,15 @@ def view_distance(
     height = float(np.median(centers @ up) - np.median(points @ up))
     distance = float(np.median(np.linalg.norm(centers - geometric_median(points), axis=1)))
     return ViewDistance(height, True) if height > MIN_HEIGHT_RATIO * distance else ViewDistance(distance, False)
+
+
+def offset_rate_factor(capture: Capture, config: TrainConfig) -> float:
+    """What the rates of offsets are multiplied by: 1, or with `lr_offsets_unit` cameras the "extent" of 3DGS and
+    Scaffold-GS: 1.1 times the largest distance of a training camera to their mean, in the capture's own units."""
+    if config.lr_offsets_unit == "anchor":
+        return 1.0
+    centers = np.array([view.camera.position for view in capture.train_views])
+    return 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()) / capture.ground.scale
 
 
 def camera_height(capture: Capture) -> float:

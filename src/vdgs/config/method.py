@@ -32,7 +32,7 @@ class ModelConfig:
     view_distance: bool = False
     """Feed the distance between camera and anchor to the decoder too."""
     appearance_dim: Annotated[int, Range(0, 1024)] = 0
-    """Size of the appearance embedding of each training image (color only); 0 for none."""
+    """Size of the appearance embedding of each training image (color only); 0 for none. Experimental: not measured."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +51,7 @@ class InitConfig:
     """Also start anchors at dense stereo points (semi-global matching): where few photographs look, sparse points are
     few, and anchors that start at a wrong height stay there (choice)."""
     from_colors: bool = False
-    """Start the features from the colors of the sparse points instead of zeros."""
+    """Start the features from the colors of the sparse points instead of zeros. Experimental: not measured."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +59,7 @@ class LearningRateConfig:
     """Learning rates of Adam; pairs decay exponentially from the first to the second value."""
 
     offsets: Annotated[tuple[float, float], LEARNING_RATE_RANGE] = (0.01, 1e-4)
-    """Offsets, in units of the anchor's own scale (choice: not multiplied by the size of the scene)."""
+    """Offsets, in the unit that `lr_offsets_unit` names."""
     features: Annotated[tuple[float, float], LEARNING_RATE_RANGE] = (0.0075, 0.0075)
     """Anchor features."""
     log_scales: Annotated[tuple[float, float], LEARNING_RATE_RANGE] = (0.007, 0.007)
@@ -171,6 +171,9 @@ class TrainConfig:
     """Where anchors start."""
     lr: LearningRateConfig = field(default_factory=LearningRateConfig)
     """Learning rates."""
+    lr_offsets_unit: Literal["anchor", "cameras"] = "anchor"
+    """Unit of the rates of offsets. `anchor`: the scale of the anchor, to which offsets relate (choice). `cameras`:
+    times the radius of the training cameras in the capture's own units, as Scaffold-GS has it."""
     lr_warm_boost: Annotated[float, Range(1, 1000)] = 1.0
     """Up to how many times faster an anchor moves while it has had few updates: after u of them, by the least of this
     and 1 / sqrt(1 - 0.999^u), which is 3 after 118 updates and 1.3 after 900 (choice, for short trainings; 1: Adam)."""
@@ -202,7 +205,20 @@ class PartitionConfig:
     lambda_vis: Annotated[float, Range(0, 1000)] = 1.0
     """Weight of visibility beside place in the clustering. lambda_vis; paper: 0.7 to 1.3; 0 is purely spatial."""
     balanced: bool = False
-    """Blocks of about equally many anchors. Choice: plain k-means leaves them several times apart."""
+    """Blocks of about equally many anchors. Choice: plain k-means leaves them several times apart. Experimental: no
+    table has it."""
+    axes: Literal["principal", "ground"] = "principal"
+    """Axes along which positions are normalized. `principal`: those of the anchors, so that the cut turns with the
+    scene (choice). `ground`: x and y of the ground frame, as printed."""
+    clip_quantile: Annotated[float, Range(0, 0.5, exclusive_max=True)] = 0.01
+    """Positions are normalized between this quantile and its opposite, and clipped; 0: between the outermost anchors
+    (choice: outliers would squash the scene; the paper says "normalized")."""
+    smoothing: Annotated[float, Range(0, 100)] = 1.5
+    """Components are sought where a cluster is the strongest within about so many cells; 0: over its own cells. At 0
+    all cells that hold an anchor of the cluster count, as printed (choice: clusters that mix have ragged borders)."""
+    min_block_share: Annotated[float, FRACTION] = 0.05
+    """A block that owns less than this share of an average one is left out; 0: one that owns none. Its anchors join the
+    blocks around it (choice)."""
     expansion: Annotated[float, Range(0, 1000)] = 0.4
     """Share of its radius by which a block is widened. The radius is that of a disc of its area. With a frozen margin
     (the default) that only decides what is drawn when cameras are assigned."""
@@ -258,8 +274,6 @@ class BlockConfig:
     """... and those of log-scales times this (CityGaussian: 0.8)."""
     lr_scale_features: Annotated[float, FACTOR_RANGE] = 1.0
     """... and those of features times this."""
-    lr_warm_boost: Annotated[float, Range(1, 1000)] = 1.0
-    """As in the coarse stage, for the block's own updates: its anchors begin trained."""
     random_background: Annotated[float, FRACTION] = 1.0
     """As in the loss of the coarse stage (choice: at 0 blocks make opaque ground transparent)."""
     decoder: Literal["frozen", "own"] = "frozen"
@@ -268,7 +282,7 @@ class BlockConfig:
     margin: Literal["frozen", "ramp", "free"] = "frozen"
     """Anchors between core and widened boundary: `frozen` are drawn and never move (choice for "gradients at the
     boundary are suppressed"); `ramp`: their learning rate falls linearly to zero at the widened boundary; `free`
-    move as those of the core."""
+    move as those of the core (experimental: gained nothing in our tables)."""
     draw_outside: bool = True
     """Draw the anchors outside the block too, frozen (choice). Off: what the block's cameras see there is empty."""
     densify: DensifyConfig = field(default_factory=DensifyConfig)
@@ -333,7 +347,7 @@ def block_train_config(config: MethodConfig, num_views: int) -> TrainConfig:
         iterations=max(1, round(scale * (block.iterations or _steps(num_views, *AUTO_BLOCK_ITERATIONS)))),
         view_sampling=block.view_sampling,
         swa_fraction=block.swa_fraction,
-        lr_warm_boost=block.lr_warm_boost,
+        lr_warm_boost=1.0,  # anchors of a block begin trained: in no table did a boost help them
         resolution_schedule=block.resolution_schedule,
         lr=replace(rates, **scaled),
         densify=replace(

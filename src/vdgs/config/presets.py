@@ -1,13 +1,10 @@
 """Settings by name.
 
-`default`   the paper's numbers. Where it is silent, or a reading of it leaves a scene that cannot be used, our choices
-            stay: gaps are filled and outliers start no anchor; the background is the mean color, and in training
-            random ones, so that ground becomes opaque; Gaussians are bounded in size and stay about their anchors;
-            cameras are assigned by `coverage`, join their best block, and blocks are topped up; what lies around a
-            block is drawn; the gate of compensated growth is lower where few cameras look, and g is added to means;
-            only anchors that a photograph shows are moved.
-`paper`     none of those. What remains ours has no reading without a choice: the threshold tau, the number of clusters'
-            starts, the width of a ring, who owns a place, how volumes are weighted in scenes of another scale.
+`paper`     the paper as printed; where it is silent, the reading that served it best on validation views. docs/paper.md
+            lists every choice that is left, with its alternatives.
+`default`   the paper's numbers, but a scene that can be used whatever the capture: axes that turn with the scene and
+            smoothed cores; gaps filled and outliers left out; a random background, bounded Gaussians, sparse Adam;
+            cameras by `coverage`, each with a block and each block with a hundred; a frozen margin, a lower gate.
 `laptop`    a good result in minutes on a CPU; reports/choices.md says what each of its departures brings. Growth in
             blocks is plain: compensated growth (`--block.compensation.enabled`) lost where few cameras look, and places
             start by stereo there instead.
@@ -25,6 +22,7 @@ from vdgs.config.method import (
     InitConfig,
     LearningRateConfig,
     LossConfig,
+    MergeConfig,
     MethodConfig,
     ModelConfig,
     PartitionConfig,
@@ -44,10 +42,12 @@ PRESETS: dict[str, MethodConfig] = {
             init=InitConfig(outlier_distance=0.0, fill_gaps=False),
             loss=LossConfig(background="black", random_background=0.0),
         ),
-        assignment=AssignmentConfig(mode="paper", always_best=False, min_cameras=0),
+        partition=PartitionConfig(axes="ground", clip_quantile=0.0, smoothing=0.5, min_block_share=0.0),
+        assignment=AssignmentConfig(mode="paper", tau=0.2, always_best=False, min_cameras=0),
         block=BlockConfig(
-            random_background=0.0, draw_outside=False, compensation=CompensationConfig(min_draws="paper", target="sum")
+            random_background=0.0, margin="ramp", compensation=CompensationConfig(min_draws="paper", target="sum")
         ),
+        merge=MergeConfig(rule="max-visibility"),
     ),
     "laptop": MethodConfig(
         training=TrainConfig(

@@ -22,23 +22,23 @@ MAX_OUTLINE_POINTS = 20_000
 MAX_DENSE_CELLS = 1 << 24
 #: α in cells to begin with, and its growth until the shape is one polygon.
 ALPHA_CELLS, ALPHA_GROWTH = 1.0, 1.25
-#: Standard deviation of the weights with which the cells about a cell count for which cluster is the strongest there.
-SMOOTHING_CELLS = 1.5
-#: What smoothing reaches, four standard deviations, and closing, in cells.
-SMOOTHING_REACH, CLOSING_CELLS = 6, 2
+#: What smoothing reaches, in standard deviations, and closing, in cells.
+SMOOTHING_REACH, CLOSING_CELLS = 4, 2
 EIGHT_NEIGHBORS = np.ones((3, 3), bool)
 
 
 def block_cores(
-    points: Float[np.ndarray, "n 2"], labels: Int64[np.ndarray, " n"], count: int
+    points: Float[np.ndarray, "n 2"], labels: Int64[np.ndarray, " n"], count: int, smoothing: float
 ) -> list[shapely.Polygon | None]:
-    """The core of every cluster: polygons without common area. None for a cluster that is the strongest nowhere.
+    """The core of every cluster: polygons without common area. None for a cluster that is the strongest nowhere, with
+    weights that fall off by `smoothing` cells about each cell. At 0 a cluster's own cells are its component.
 
     The largest connected component of each cluster, its α-shape with holes filled, simplified. Where two shapes
     overlap the smaller keeps its place: a dense center becomes a hole in the core of the outskirts about it.
     """
     cell = cell_size(points, count)
-    shapes = {label: _outline(members, cell) for label, members in _components(points, labels, count, cell).items()}
+    components = _components(points, labels, count, cell, smoothing)
+    shapes = {label: _outline(members, cell) for label, members in components.items()}
     labels_of = list(shapes)
     tree, cores = shapely.STRtree(list(shapes.values())), dict[int, shapely.Polygon]()
     for label in sorted(shapes, key=lambda each: (shapes[each].area, each)):
@@ -86,10 +86,13 @@ def scene_extent(points: Float[np.ndarray, "n 2"]) -> float:
     return float((high - low).max()) or float(np.ptp(points, axis=0).max())
 
 
-def _components(points: np.ndarray, labels: np.ndarray, count: int, cell: float) -> dict[int, Float[np.ndarray, "m 2"]]:
+def _components(
+    points: np.ndarray, labels: np.ndarray, count: int, cell: float, smoothing: float
+) -> dict[int, Float[np.ndarray, "m 2"]]:
     """The anchors of each cluster's largest component: most anchors, over cells in which the cluster is strongest.
 
-    Strongest about the cell, not only in it: borders drawn through mixed anchors would have fingers.
+    Strongest about the cell, not only in it: borders drawn through mixed anchors would have fingers. Without smoothing
+    over all cells that hold an anchor of the cluster.
     """
     low, high = np.quantile(points, WINDOW_QUANTILES, axis=0)
     margin = WINDOW_MARGIN * (high - low) + cell
@@ -100,7 +103,9 @@ def _components(points: np.ndarray, labels: np.ndarray, count: int, cell: float)
     rows, columns = index.max(axis=0) + 3
     flat = index[:, 0] * columns + index[:, 1]
     del index
-    strongest = _dominant_cluster(labels, flat, (int(rows), int(columns)), count)
+    if smoothing == 0:
+        return _own_components(points, labels, flat, (int(rows), int(columns)))
+    strongest = _dominant_cluster(labels, flat, (int(rows), int(columns)), count, smoothing)
     own = np.flatnonzero(strongest.ravel()[flat] == labels)
     members = np.split(
         own[np.argsort(labels[own], kind="stable")], np.cumsum(np.bincount(labels[own], minlength=count))
@@ -120,8 +125,21 @@ def _components(points: np.ndarray, labels: np.ndarray, count: int, cell: float)
     return result
 
 
+def _own_components(
+    points: np.ndarray, labels: np.ndarray, flat: Int64[np.ndarray, " n"], shape: tuple[int, int]
+) -> dict[int, Float[np.ndarray, "m 2"]]:
+    """The anchors of the largest component of each cluster, over the cells that hold one of its anchors."""
+    result = {}
+    for label in np.unique(labels).tolist():
+        home = np.flatnonzero(labels == label)
+        occupied = np.bincount(flat[home], minlength=shape[0] * shape[1]).reshape(shape) > 0
+        component = ndimage.label(occupied, EIGHT_NEIGHBORS)[0].ravel()[flat[home]]
+        result[label] = points[home[component == np.bincount(component).argmax()]]
+    return result
+
+
 def _dominant_cluster(
-    labels: Int64[np.ndarray, " n"], flat: Int64[np.ndarray, " n"], shape: tuple[int, int], count: int
+    labels: Int64[np.ndarray, " n"], flat: Int64[np.ndarray, " n"], shape: tuple[int, int], count: int, smoothing: float
 ) -> Int64[np.ndarray, "rows columns"]:
     """The cluster that is the strongest about each cell with anchors, else -1; `flat` is the cell of each anchor.
 
@@ -129,6 +147,7 @@ def _dominant_cluster(
     """
     most = np.zeros(shape)
     strongest = np.full(shape, -1, np.int64)
+    reach = round(SMOOTHING_REACH * smoothing)
     order = np.argsort(labels, kind="stable")
     ends = np.cumsum(np.bincount(labels, minlength=count))
     for label, cells in enumerate(np.split(flat[order], ends[:-1])):
@@ -137,13 +156,13 @@ def _dominant_cluster(
         row, column = np.divmod(cells, shape[1])
         window = _grow_window(
             (slice(int(row.min()), int(row.max()) + 1), slice(int(column.min()), int(column.max()) + 1)),
-            SMOOTHING_REACH, shape,
+            reach, shape,
         )  # fmt: skip
         above, left = window[0].start, window[1].start
         across = window[1].stop - left
         cells = (row - above) * across + (column - left)
         anchors = np.bincount(cells, minlength=(window[0].stop - above) * across).reshape(-1, across)
-        nearby = ndimage.gaussian_filter(anchors.astype(np.float64), SMOOTHING_CELLS, radius=SMOOTHING_REACH)
+        nearby = ndimage.gaussian_filter(anchors.astype(np.float64), smoothing, radius=reach)
         strongest[window][nearby > most[window]] = label
         most[window] = np.maximum(most[window], nearby)
     strongest.ravel()[np.bincount(flat, minlength=strongest.size) == 0] = -1

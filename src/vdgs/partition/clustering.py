@@ -14,8 +14,6 @@ from jaxtyping import Float, Int64
 from vdgs.errors import VdgsError
 from vdgs.visibility.visibility_counts import normalize_visibility
 
-#: Places are normalized between these quantiles and clipped: far outliers would squash the scene (choice).
-EXTENT_QUANTILES = (0.01, 0.99)
 #: Centers are fitted to at most so many anchors; all others join the nearest.
 MAX_FIT_SAMPLES = 300_000
 #: k-means++ starts, of which the one of least inertia is kept; fewer where there are so many clusters that each costs
@@ -39,10 +37,10 @@ NUM_ITERATIONS = 3
 
 
 def clustering_features(
-    points: Float[np.ndarray, "n 2"], visibility: Int64[np.ndarray, " n"], lambda_vis: float
+    points: Float[np.ndarray, "n 2"], visibility: Int64[np.ndarray, " n"], lambda_vis: float, clip_quantile: float
 ) -> Float[np.ndarray, "n 3"]:
-    """f_i = [x̂_i, ŷ_i, λ_vis V̂_i] (eq. 5), float64; x̂ and ŷ in [0, 1]."""
-    low, high = np.quantile(points, EXTENT_QUANTILES, axis=0)
+    """f_i = [x̂_i, ŷ_i, λ_vis V̂_i] (eq. 5), float64; x̂ and ŷ in [0, 1], clipped at the quantiles."""
+    low, high = np.quantile(points, (clip_quantile, 1 - clip_quantile), axis=0)
     extent = np.where(high > low, high - low, 1.0)
     unit = np.clip((points - low) / extent, 0.0, 1.0)
     # Not 0 * V̂: without weight the visibility must leave no trace, not even -0.0.
@@ -173,6 +171,11 @@ class PrincipalPlane:
     def to_ground(self, shape: shapely.Polygon) -> shapely.Polygon:
         """A polygon back in the ground frame."""
         return shapely.transform(shape, lambda places: places @ self.axes.T + self.center)
+
+
+def ground_plane() -> PrincipalPlane:
+    """The axes of the ground frame itself."""
+    return PrincipalPlane(np.zeros(2), np.eye(2))
 
 
 def fit_principal_plane(ground: Float[np.ndarray, "n 2"]) -> PrincipalPlane:

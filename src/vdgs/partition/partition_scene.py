@@ -12,12 +12,15 @@ from vdgs.config.method import MethodConfig, PartitionConfig
 from vdgs.errors import VdgsError
 from vdgs.partition.blocks import Block, Blocks
 from vdgs.partition.boundary import MIN_CELLS, block_cores, cell_size, expand_core, scene_extent
-from vdgs.partition.clustering import check_distinct, cluster_anchors, clustering_features, fit_principal_plane
+from vdgs.partition.clustering import (
+    check_distinct,
+    cluster_anchors,
+    clustering_features,
+    fit_principal_plane,
+    ground_plane,
+)
 from vdgs.partition.polygon_lookup import BlockCores
 from vdgs.system.memory.memory_estimate import block_workload, estimate_memory
-
-#: A block that would own less than this share of the anchors of an average block is not worth training.
-MIN_BLOCK_SHARE = 0.05
 
 #: `--blocks auto` (choice): images that an average block needs.
 CAMERAS_PER_BLOCK = 50
@@ -28,10 +31,10 @@ def partition_scene(
 ) -> tuple[Blocks, list[str]]:
     """Cut a scene into blocks by the positions of its anchors and their visibility V; also returns warnings.
 
-    Every point has exactly one owner (`Blocks.owner`). The cut turns, moves and scales with the scene and does not
-    depend on the order of the anchors. Blocks are numbered along the longer axis of the scene. There are fewer blocks
-    than requested, and a warning, where a cluster is the strongest nowhere on the plane (choice: its anchors join the
-    blocks around them). Raises VdgsError if the anchors cannot be cut.
+    Every point has exactly one owner (`Blocks.owner`). The cut moves and scales with the scene (and turns with it, with
+    `config.axes` principal) and does not depend on the order of the anchors. Blocks are numbered along the first axis.
+    There are fewer blocks than requested, and a warning, where a cluster is the strongest nowhere on the plane (choice:
+    its anchors join the blocks around them). Raises VdgsError if the anchors cannot be cut.
     """
     ground = _checked_positions(positions, visibility)
     if config.blocks == "auto":
@@ -43,18 +46,19 @@ def partition_scene(
         return _single_block(ground, config.expansion), []
     check_distinct(count, ground)
     ground, visibility = _sorted(ground, np.asarray(visibility, np.int64))
-    plane = fit_principal_plane(ground)
+    plane = fit_principal_plane(ground) if config.axes == "principal" else ground_plane()
     points, visibility = _sorted(plane.to_plane(ground), visibility)
-    features = clustering_features(points, visibility, config.lambda_vis)
+    features = clustering_features(points, visibility, config.lambda_vis, config.clip_quantile)
     labels = cluster_anchors(features, count, seed, config.balanced)
-    candidates = block_cores(points, labels, count)
+    candidates = block_cores(points, labels, count, config.smoothing)
     ordered = sorted(
         (core for core in candidates if core is not None), key=lambda core: (core.centroid.x, core.centroid.y)
     )
-    cores, warnings = _drop_tiny_blocks(ordered, points, count), []
+    least_owned = max(config.min_block_share * len(points) / count, 1.0)
+    cores, warnings = _drop_tiny_blocks(ordered, points, least_owned), []
     if len(cores) < count:
         lost = [label for label, core in enumerate(candidates) if not any(core is each for each in cores)]
-        reason = _fewer_blocks_reason(points, labels, lost, count, config.lambda_vis)
+        reason = _fewer_blocks_reason([points[labels == each] for each in lost], points, least_owned, config)
         warnings.append(f"the scene is cut into {len(cores)} blocks instead of {count}: {reason}")
     if len(cores) == 1:
         return _single_block(ground, config.expansion), warnings
@@ -63,19 +67,19 @@ def partition_scene(
 
 
 def _fewer_blocks_reason(
-    points: Float[np.ndarray, "n 2"], labels: Int[np.ndarray, " n"], lost: Sequence[int], count: int, lambda_vis: float
-) -> str:
-    """Why the `lost` of `count` clusters became no blocks, and what to do about it."""
-    cell, members = cell_size(points, count), [points[labels == label] for label in lost]
-    if any(
-        len(each) >= MIN_BLOCK_SHARE * len(points) / count and scene_extent(each) < MIN_CELLS * cell for each in members
-    ):
+    lost: Sequence[np.ndarray], points: Float[np.ndarray, "n 2"], least_owned: float,
+    config: PartitionConfig,
+) -> str:  # fmt: skip
+    """Why the `lost` clusters became no blocks, and what to do about it."""
+    assert config.blocks != "auto"
+    cell = cell_size(points, config.blocks)
+    if any(len(each) >= least_owned and scene_extent(each) < MIN_CELLS * cell for each in lost):
         return (
             f"blocks are told apart on cells of 1/{scene_extent(points) / cell:.0f} of the scene's extent, and the "
             f"other clusters are less than {MIN_CELLS} such cells across. Fewer blocks avoid this; of places that lie "
             "far apart, each is better a run of its own."
         )
-    if lambda_vis > 0:
+    if config.lambda_vis > 0:
         return (
             "the anchors of the other clusters are scattered among those of their neighbors. A smaller --lambda-vis "
             "or fewer blocks avoid this."
@@ -128,15 +132,15 @@ def _single_block(ground: np.ndarray, expansion: float) -> Blocks:
     return Blocks((Block(core, expand_core(core, expansion)),))
 
 
-def _drop_tiny_blocks(cores: list[shapely.Polygon], points: np.ndarray, count: int) -> list[shapely.Polygon]:
-    """The cores that own at least MIN_BLOCK_SHARE of an average block; at least one. The smallest goes first, and only
-    what it owned changes its owner."""
+def _drop_tiny_blocks(cores: list[shapely.Polygon], points: np.ndarray, least_owned: float) -> list[shapely.Polygon]:
+    """The cores that own at least so many anchors; at least one. The smallest goes first, and only what it owned
+    changes its owner."""
     lookup, left = BlockCores(cores), np.arange(len(cores))
     owner = lookup.nearest(points)
     while len(left) > 1:
         owned = np.bincount(owner, minlength=len(cores))[left]
         least = int(owned.argmin())
-        if owned[least] >= MIN_BLOCK_SHARE * len(points) / count:
+        if owned[least] >= least_owned:
             break
         orphans = np.flatnonzero(owner == left[least])
         left = np.delete(left, least)

@@ -16,7 +16,7 @@ import torch
 from rich.console import Console
 
 from vdgs import __version__
-from vdgs.captures.camera_height import camera_height
+from vdgs.captures.camera_height import camera_height, offset_rate_factor
 from vdgs.captures.capture import Capture, View
 from vdgs.captures.capture_metadata import capture_metadata
 from vdgs.captures.image_cache import ImageCache
@@ -113,7 +113,8 @@ class BlockPlan:
         cameras, coarse, config = [view.camera for view in capture.train_views], self.coarse, self.config
         return TrainingProblem(
             config=config, images=images, num_images=len(self.views), voxel_size=coarse.voxel_size,
-            camera_height=camera_height(capture), kind="block", background=coarse.background, device=device,
+            camera_height=camera_height(capture), offset_rate_factor=offset_rate_factor(capture, config),
+            kind="block", background=coarse.background, device=device,
             frozen_decoder=method.block.decoder == "frozen",
             frozen_anchors=FrozenAnchors(self.surroundings, coarse.decoder),
             growth_mask=growth_mask(blocks, self.index, method.block),

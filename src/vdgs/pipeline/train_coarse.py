@@ -11,7 +11,7 @@ import torch
 from rich.console import Console
 
 from vdgs import __version__
-from vdgs.captures.camera_height import camera_height
+from vdgs.captures.camera_height import camera_height, offset_rate_factor
 from vdgs.captures.capture import Capture
 from vdgs.captures.capture_metadata import capture_metadata
 from vdgs.captures.image_cache import ImageCache
@@ -206,6 +206,7 @@ def build_coarse_problem(
         num_images=len(cameras),
         voxel_size=voxel,
         camera_height=camera_height(capture),
+        offset_rate_factor=offset_rate_factor(capture, config),
         background=background,
         view_weights=view_sampling_weights(config, anchors, cameras),
         device=torch.device(device),

@@ -148,6 +148,7 @@ def _move(
     """One step of Adam for the visible anchors (where it is dense, for all) and the decoder."""
     config, step = stage.config, state.iteration + 1
     rates = learning_rates_at(config.lr, state.iteration / config.iterations)
+    rates["offsets"] *= stage.offset_rate_factor
     states, updates = state.optimizer.anchor_states(state.anchors, rates, config.lr_warm_boost), state.optimizer.updates
     dense = config.optimizer == "adam"
     if dense:

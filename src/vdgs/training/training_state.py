@@ -127,6 +127,8 @@ class TrainingProblem:
     #: Height of the cameras above the ground, or their distance from the scene (`captures.camera_height`), in units of
     #: the ground frame.
     camera_height: float
+    #: What the rates of offsets are multiplied by.
+    offset_rate_factor: float = 1.0
     #: Whether the whole scene is trained or one block of it.
     kind: StageKind = "coarse"
     #: Color behind the scene.

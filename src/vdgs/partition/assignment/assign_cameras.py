@@ -43,7 +43,7 @@ class Assignment:
     cameras: Bool[np.ndarray, "c b"]
     #: The first reason that applied, as an index of `REASONS`.
     reasons: Int8[np.ndarray, "c b"]
-    #: One sentence for each block that has no camera, or that none of the cameras sees.
+    #: One sentence for each block that has no camera, or that none of the cameras sees, and one on idle cameras.
     warnings: list[str]
 
 
@@ -72,7 +72,7 @@ def assign_cameras(scores: ScoreMatrix, config: AssignmentConfig) -> Assignment:
         order = np.lexsort((-scores.visible_anchors[:, block], -scores.scores[:, block]))
         candidates = order[seen[order, block] & (reasons[order, block] == NOT_ASSIGNED)]
         reasons[candidates[:missing], block] = TOPPED_UP
-    return Assignment(reasons != NOT_ASSIGNED, reasons, _warnings(scores, reasons, threshold))
+    return Assignment(reasons != NOT_ASSIGNED, reasons, _warnings(scores, reasons, threshold, config.always_best))
 
 
 def _best_blocks(scores: ScoreMatrix) -> np.ndarray:
@@ -85,7 +85,7 @@ def _best_blocks(scores: ScoreMatrix) -> np.ndarray:
     return np.where(blank, scores.nadir_block, best)
 
 
-def _warnings(scores: ScoreMatrix, reasons: np.ndarray, threshold: float) -> list[str]:
+def _warnings(scores: ScoreMatrix, reasons: np.ndarray, threshold: float, always_best: bool) -> list[str]:
     warnings = []
     for block, anchors in enumerate(scores.anchors):
         watching = int(np.count_nonzero(scores.visible_anchors[:, block]))
@@ -102,6 +102,12 @@ def _warnings(scores: ScoreMatrix, reasons: np.ndarray, threshold: float) -> lis
                 f"above {threshold:g} (best: {scores.scores[:, block].max():.3g}). Lower --assignment.threshold or "
                 "raise --assignment.min-cameras."
             )
+    idle = ~((reasons != NOT_ASSIGNED) & (scores.visible_anchors > 0)).any(axis=1)
+    if idle.any() and not always_best:
+        warnings.append(
+            f"{np.count_nonzero(idle)} of {len(idle)} training photographs train no block's core: none with an anchor "
+            f"in view scores above {threshold:g}. --assignment.always-best lets each join its best block."
+        )
     return warnings
 
 

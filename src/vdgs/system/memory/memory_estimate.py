@@ -5,6 +5,7 @@ The figures per anchor and per pixel are measured: `experiments/microbench/step.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -112,16 +113,19 @@ def decoded_image_bytes(cameras: Iterable[Camera]) -> int:
 
 def block_workload(method: MethodConfig, anchors: int, total_anchors: int, pixels: int) -> TrainingWorkload:
     """The workload of a block with `anchors` of all coarse anchors and photographs of up to `pixels`, before it is
-    opened and without cached photographs. A crop may be a whole photograph."""
-    block = method.block
+    opened and without cached photographs. A crop may be a whole photograph. A margin that moves is trained, too: about
+    the share by which the expansion makes a disc larger."""
+    block, moved = method.block, anchors
+    if block.margin != "frozen":
+        moved = min(total_anchors, math.ceil(anchors * (1 + method.partition.expansion) ** 2))
     return TrainingWorkload(
-        anchors=anchors,
+        anchors=moved,
         max_anchors=max_block_anchors(block, anchors, total_anchors),
         offsets=method.training.model.num_offsets,
         seen=MAX_VISIBLE_FRACTION,
         pixels=pixels,
         image_cache_bytes=0,
-        surroundings=total_anchors - anchors,
+        surroundings=total_anchors - moved,
         has_swa=block.swa_fraction > 0,
         growth=max_growth_factor(block.compensation),
     )

@@ -1,0 +1,229 @@
+"""Readings of what the paper leaves open, one changed at a time from the preset `paper`, on validation views.
+
+    python -m experiments.reports.analyses.paper_readings DATA WORK [--scenes seneca copr] [--only NAME ...] [--print]
+
+Of each scene one short coarse model is trained. Each reading cuts a copy of it, trains its blocks, merges and measures
+them; test photographs are left out. Rows are appended to WORK/rows.jsonl and kept: the same command continues, and
+prints all rows. `counts` (without training) are the cameras and anchors of each cut.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from experiments.microbench.hardware_info import describe
+from vdgs.cli.main import main as vdgs
+from vdgs.config.method import MethodConfig, PartitionConfig
+from vdgs.config.serialization import from_dict, to_dict
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.partition.assignment.score_file import load_scores
+from vdgs.partition.blocks import load_blocks
+from vdgs.partition.clustering import cluster_anchors, clustering_features, fit_principal_plane, ground_plane
+from vdgs.runs.run_folder import RunFolder
+from vdgs.runs.run_settings import RunSettings
+from vdgs.runs.visibility_store import VISIBILITY_FILE
+from vdgs.system.tensors import read_tensors
+
+Changes = dict[str, Any]
+#: Scene: options of its coarse stage, and number of blocks.
+SCENES = {
+    "seneca": (("--images", "images_4", "--downscale", "2"), 8),
+    "copr": (("--images", "images_4"), 4),
+}
+#: 1 500 steps instead of 100 000, 200 for each block instead of 50 000; growth begins and is decided sooner.
+COARSE = (
+    "--validation", "--preset", "paper", "--iterations", "1500", "--densify.stats-start", "100",
+    "--densify.start", "300",
+)  # fmt: skip
+BLOCKS: Changes = {"block.steps_scaler": 0.004, "block.densify.every": 20}
+#: Preset `default`'s partition, for the rows of one choice each.
+CUTS: dict[str, Changes] = {
+    "cut: principal axes": {"partition.axes": "principal"},
+    "cut: clipped at 1 %": {"partition.clip_quantile": 0.01},
+    "cut: own cells": {"partition.smoothing": 0.0},
+    "cut: smoothed over 1.5 cells": {"partition.smoothing": 1.5},
+    "cut: small blocks dropped": {"partition.min_block_share": 0.05},
+    "cut: place alone": {"partition.lambda_vis": 0.0},
+}
+#: Readings of the coarse stage, as options of `vdgs train-coarse`.
+COARSE_READINGS: dict[str, tuple[str, ...]] = {
+    "coarse: the preset `paper`": (),
+    "coarse: distance as an input of the decoder": ("--model.view-distance",),
+    "coarse: rates of offsets times the cameras' radius": ("--lr-offsets-unit", "cameras"),
+    "coarse: mean color behind the scene": ("--loss.background", "mean"),
+    "coarse: random color behind the scene": ("--loss.background", "mean", "--loss.random-background", "1"),
+    "coarse: Gaussians bounded": ("--model.bound-scales",),
+    "coarse: outliers left out, gaps filled": ("--init.outlier-distance", "30", "--init.fill-gaps"),
+    "coarse: sparse Adam": ("--optimizer", "sparse-adam"),
+}
+READINGS: dict[str, Changes] = {
+    "the preset `paper`": {},
+    **{f"τ = {tau:g}": {"assignment.tau": tau} for tau in (0.02, 0.05, 0.1, 0.2, 0.3)},
+    "nothing drawn around": {"block.draw_outside": False},
+    "margin frozen, merge by owner": {"block.margin": "frozen", "merge.rule": "owner"},
+    "margin free": {"block.margin": "free"},
+    "margin ramp, merge by owner": {"merge.rule": "owner"},
+    "no compensation": {"block.compensation.enabled": False},
+    "g to means, lower gate": {"block.compensation.target": "mean", "block.compensation.min_draws": "scaled"},
+    "g to sums, lower gate": {"block.compensation.target": "sum", "block.compensation.min_draws": "scaled"},
+    "g to means, one gate": {"block.compensation.target": "mean", "block.compensation.min_draws": "paper"},
+    "g to sums, one gate": {"block.compensation.target": "sum", "block.compensation.min_draws": "paper"},
+    "T_low = 0.05": {"block.compensation.t_low": 0.05},
+    "T_low = 0.3": {"block.compensation.t_low": 0.3},
+    "expansion 0": {"partition.expansion": 0.0},
+    "every photograph joins its best block": {"assignment.always_best": True},
+    "cameras by `coverage`": {"assignment.mode": "coverage"},
+    **CUTS,
+}
+
+
+def changed(method: MethodConfig, changes: Changes) -> MethodConfig:
+    """The settings with some replaced, by their dotted names."""
+    plain = to_dict(method)
+    for name, value in changes.items():
+        *groups, last = name.split(".")
+        inner = plain
+        for group in groups:
+            inner = inner[group]
+        inner[last] = value
+    return from_dict(MethodConfig, plain, "")
+
+
+def call(*arguments: object) -> None:
+    """A command of vdgs in this process. Raises SystemExit where it fails."""
+    try:
+        vdgs([str(each) for each in arguments])
+    except SystemExit as ended:
+        if ended.code:
+            raise
+
+
+def coarse_run(data: Path, folder: Path, scene: str, options: tuple[str, ...] = ()) -> RunFolder:
+    """A run of the scene's coarse model, trained once."""
+    call("train-coarse", data / scene, *SCENES[scene][0], *COARSE, *options, "--output", folder, "--quiet")
+    call("visibility", folder, "--quiet")
+    run = RunFolder(folder)
+    if not (run.coarse.path / "evaluation").exists():
+        call("eval", folder, "--model", "coarse", "--quiet")
+    return run
+
+
+def copy_with(coarse: RunFolder, folder: Path, changes: Changes) -> RunFolder:
+    """A copy of the coarse run with other settings of what follows it."""
+    shutil.rmtree(folder, ignore_errors=True)
+    shutil.copytree(coarse.path, folder, ignore=shutil.ignore_patterns("checkpoint*", "evaluation"))
+    run = RunFolder(folder)
+    settings, method = run.settings(), changed(run.method(), BLOCKS | changes)
+    run.change_settings(RunSettings.create(settings.capture_path, settings.capture, method), overwrite=True)
+    return run
+
+
+def own_cluster_share(run: RunFolder, visibility: np.ndarray) -> float:
+    """The share of the anchors that the block owns which most anchors of their cluster joined."""
+    config: PartitionConfig = run.method().partition
+    positions = AnchorModel.load(run.coarse.model).anchors.positions.double().numpy()[:, :2]
+    plane = fit_principal_plane(positions) if config.axes == "principal" else ground_plane()
+    assert config.blocks != "auto"
+    points = plane.to_plane(positions)
+    features = clustering_features(points, visibility, config.lambda_vis, config.clip_quantile)
+    order = np.lexsort((visibility, points[:, 1], points[:, 0]))
+    labels = cluster_anchors(features[order], config.blocks, run.method().training.seed, config.balanced)
+    owner = load_blocks(run.partition / "blocks.geojson").owner(positions[order])
+    pairs = np.zeros((owner.max() + 1, config.blocks), int)
+    np.add.at(pairs, (owner, labels), 1)
+    return float(pairs[linear_sum_assignment(-pairs)].sum() / len(labels))
+
+
+def counts(run: RunFolder) -> dict[str, Any]:
+    """Cameras and anchors of a cut."""
+    call("partition", run.path, "--quiet")
+    blocks = run.partition_record().blocks
+    scored = load_scores(run.partition / "scores.npz")
+    teaches = scored.assignment.cameras & (scored.scores.visible_anchors > 0)
+    visibility = read_tensors(run.visibility / VISIBILITY_FILE)[0]["visibility"].numpy().astype(np.int64)
+    owned = np.array([each.anchors_core for each in blocks])
+    deviations = np.array([each.std_v or 0.0 for each in blocks])
+    return {
+        "cameras": [each.cameras for each in blocks], "idle": int((~teaches.any(axis=1)).sum()),
+        "photographs": len(teaches), "own_cluster": round(own_cluster_share(run, visibility), 4),
+        "std_v": round(float(np.sqrt((deviations**2 * owned).sum() / owned.sum())), 3),
+        "std_v_all": round(float(visibility.std()), 3), "owned": owned.tolist(),
+    }  # fmt: skip
+
+
+def measured(run: RunFolder, coarse: RunFolder) -> dict[str, Any]:
+    """The merged scene on validation views, beside the coarse model that its blocks began with."""
+    call("train-blocks", run.path, "--jobs", 1, "--quiet")
+    call("merge", run.path, "--quiet")
+    call("eval", run.path, "--model", "merged", "--quiet")
+    return {"now": metrics(run.evaluation), "before": metrics(coarse.coarse.path / "evaluation")}
+
+
+def metrics(evaluation: Path) -> dict[str, Any]:
+    """Of what `vdgs eval` has written: means over the views, and quarters of the pixels by V."""
+    found = json.loads((evaluation / "metrics.json").read_text())
+    quarters = [each["psnr"] for each in found["by_visibility"] if each["lower"] is not None]
+    names = ("psnr", "ssim", "psnr_covered_own_background", "opacity_coverage", "n_anchors", "train_seconds")
+    return {name: found[name] for name in names} | {"quarters": quarters}
+
+
+def rows(data: Path, work: Path, scenes: list[str], only: list[str], train: bool) -> Iterator[dict[str, Any]]:
+    """Every reading of every scene that is not done yet."""
+    file = work / "rows.jsonl"
+    done = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+    yield from done
+    names = {(each["scene"], each["reading"], each["trained"]) for each in done}
+    for scene in scenes:
+        for reading, arguments in COARSE_READINGS.items() if train else ():
+            if (scene, reading, train) not in names and reading in only:
+                run = coarse_run(data, work / f"coarse-{os.getpid()}", scene, arguments)
+                row = {
+                    "scene": scene,
+                    "reading": reading,
+                    "trained": True,
+                    "now": metrics(run.coarse.path / "evaluation"),
+                }
+                shutil.rmtree(run.path)
+                yield write_row(file, row)
+        coarse = coarse_run(data, work / f"{scene}-coarse", scene)
+        for reading, changes in READINGS.items():
+            if (scene, reading, train) in names or (only and reading not in only):
+                continue
+            if changes and changed(coarse.method(), changes) == coarse.method():
+                continue  # what the preset has
+            if not train and any(name.startswith(("block", "merge")) for name in changes):
+                continue  # cuts and cameras are the same
+            run = copy_with(coarse, work / f"reading-{os.getpid()}", {"partition.blocks": SCENES[scene][1]} | changes)
+            row = {"scene": scene, "reading": reading, "trained": train, "changes": changes} | counts(run)
+            row |= measured(run, coarse) if train else {}
+            yield write_row(file, row)
+
+
+def write_row(file: Path, row: dict[str, Any]) -> dict[str, Any]:
+    """Append a row to the file."""
+    with file.open("a") as out:
+        out.write(json.dumps(row) + "\n")
+    return row
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("work", type=Path)
+    parser.add_argument("--scenes", nargs="+", default=list(SCENES))
+    parser.add_argument("--only", nargs="+", default=[])
+    parser.add_argument("--counts", action="store_true")
+    options = parser.parse_args()
+    options.work.mkdir(parents=True, exist_ok=True)
+    print(describe())
+    for each in rows(options.data, options.work, options.scenes, options.only, not options.counts):
+        print(json.dumps(each)[:300])
