@@ -13,7 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from support.captures import TinyScene, data_folder, tiny_scene, write_colmap
+from support.captures import TinyScene, data_folder, tiny_scene, write_colmap, write_images
 from vdgs.captures.formats.colmap import read_colmap
 from vdgs.captures.formats.source_capture import CAMERA_MODELS
 from vdgs.captures.loading import load_capture
@@ -87,15 +87,33 @@ def test_binary_wins_over_text_and_names_may_hold_spaces_and_folders(tmp_path):
         assert capture.views[0].image_path.read_bytes()
 
 
-@pytest.mark.parametrize(
-    "name", ["../up.png", "/etc/passwd", "a/../../b.png", "C:\\x.png", "..\\x.png", "", "a\nb.png"]
-)
-def test_names_that_leave_the_image_folder_are_refused(tmp_path, name):
+@pytest.mark.parametrize("name", ["", "..", "/", "a\nb.png"])
+def test_names_of_nothing_in_the_image_folder_are_refused(tmp_path, name):
     scene = tiny_scene(columns=1, rows=1)
     bad = TinyScene({name: next(iter(scene.cameras.values()))}, scene.points, scene.colors)
     folder = write_colmap(tmp_path, bad, images=None)
     with pytest.raises(CaptureError, match="inside the image folder"):
         read_colmap(folder)
+
+
+@pytest.mark.parametrize("above", ["../images/", "/home/u/p/images/", "C:\\p\\images\\", "..\\", "a/../../"])
+def test_names_that_lead_out_of_the_image_folder_are_found_in_it_by_their_ends(tmp_path, above):
+    """As some exporters write them; nothing outside is read."""
+    scene = tiny_scene()
+    cameras = {above + name: camera for name, camera in scene.cameras.items()}
+    write_colmap(tmp_path, TinyScene(cameras, scene.points, scene.colors), images=None)
+    write_images(tmp_path / "images", scene)
+    for view in load_capture(tmp_path, CaptureOptions(up="z")).views:
+        assert view.image_path == tmp_path / "images" / Path(view.name).name
+
+
+def test_comments_may_stand_anywhere_in_text_models(tmp_path):
+    scene = tiny_scene()
+    folder = write_colmap(tmp_path, scene, text=True, images=None)
+    for file in folder.iterdir():
+        lines = file.read_text(encoding="utf-8").split("\n")
+        file.write_text("\ufeff" + "\r\n".join(["  # exported", *lines[:1], "\t#", *lines[1:]]), encoding="utf-8")
+    assert_same(read_colmap(folder), scene)
 
 
 def patched(file: Path, offset: int, data: bytes) -> None:

@@ -97,6 +97,30 @@ def test_applied_scale_is_undone_too(tmp_path, scene):
     np.testing.assert_allclose(to_source(capture.ground, capture.points), scene.points, atol=1e-9)
 
 
+@pytest.mark.parametrize("above", ["images/", "../old/images/", "/data/old/images/", "./images/v1.2_"])
+def test_names_without_extension_are_photographs_and_no_masks(tmp_path, scene, above):
+    """A photograph must not be taken for the mask of the name that lacks its extension."""
+    content = write_transforms(tmp_path, scene)
+    start = above.rpartition("/")[2]
+    for frame, name in zip(content["frames"], scene.cameras, strict=True):
+        frame["file_path"] = above + name.removesuffix(".png")
+        (tmp_path / "images" / name).rename(tmp_path / "images" / (start + name))
+    (tmp_path / "transforms.json").write_text(json.dumps(content), encoding="utf-8")
+    capture = load_capture(tmp_path)
+    assert {view.name for view in capture.views} == {start + name for name in scene.cameras}
+    assert {view.mask_path for view in capture.views} == {None}
+
+
+def test_the_focal_length_of_a_frame_comes_before_a_common_one_in_other_words(tmp_path, scene):
+    content = write_transforms(tmp_path, scene)
+    content["frames"][0]["camera_angle_x"] = 2 * np.arctan(32 / 100)
+    (tmp_path / "transforms.json").write_text(json.dumps(content), encoding="utf-8")
+    focal = {view.name: view.camera.fx for view in load_capture(tmp_path).views}
+    first, second = list(scene.cameras)[:2]
+    assert focal[first] == pytest.approx(100)
+    assert focal[second] == scene.cameras[second].fx
+
+
 def test_intrinsics_per_frame_splits_and_masks(tmp_path, scene):
     content = write_transforms(tmp_path, scene)
     names = [frame["file_path"] for frame in content["frames"]]

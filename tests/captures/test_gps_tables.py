@@ -195,6 +195,7 @@ def test_a_flight_across_the_antimeridian_holds_together(tmp_path):
 @pytest.mark.parametrize(
     ("header", "code"),
     [
+        ("WGS84 UTM 19H", 32719), ("UTM Zone 19 South", 32719),
         ("WGS84 UTM 19S", 32719), ("WGS 84 UTM 19 S", 32719), ("UTM zone 19S", 32719), ("EPSG 32719", 32719),
         ("32719", 32719), ("crs: epsg:32719", 32719), ("WGS 84 / UTM zone 19S", 32719), ("utm 19s", 32719),
         ("urn:ogc:def:crs:EPSG::32719", 32719),
@@ -208,6 +209,21 @@ def test_systems_are_known_by_all_their_names(tmp_path, header, code):
     change, name = to_geodetic("EPSG:2225", tmp_path / "geo.txt")
     assert "heights are taken as metres" in name
     assert change(np.array([[6_000_000.0, 2_000_000, 5]]))[0, 2] == 5
+    assert "30N" in to_geodetic("WGS84 UTM 30U", tmp_path)[1]
+    assert to_geodetic("WGS84 longlat", tmp_path)[0](np.array([[7.0, 50, 5]])) == pytest.approx(np.array([[50, 7, 5]]))
+
+
+def test_degrees_under_a_system_in_metres_are_refused(tmp_path):
+    rows = [f"{name} {PLACE[0] + k / 9000:.8f} {PLACE[1]:.8f} 500" for k, name in enumerate(NAMES)]
+    (tmp_path / "geo.txt").write_text("\n".join(["EPSG:32719", *rows]))
+    with pytest.raises(CaptureError, match=r"look like degrees, but WGS 84 .* counts in metres"):
+        read_gps_table(tmp_path / "geo.txt")
+
+
+@pytest.mark.parametrize(("more", "is_said"), [("", True), (" +towgs84=-288,175,-376", False)])
+def test_an_ellipsoid_without_a_datum_is_said_to_be_none(tmp_path, more, is_said):
+    system = f"+proj=utm +zone=19 +south +ellps=intl{more} +units=m +no_defs"
+    assert ("no datum: taken as WGS 84" in to_geodetic(system, tmp_path)[1]) == is_said
 
 
 @pytest.mark.parametrize("altitude", [0.0, None])

@@ -266,6 +266,21 @@ def test_bands_are_known_by_their_tags(tmp_path):
     assert "Camera:BandName" not in read_xmp(three.partition("</Camera:BandName>")[2].encode())
 
 
+def test_cameras_of_one_moment_may_name_it_by_other_seconds(tmp_path):
+    """Thermal pictures and pictures of the screen, as DJI names them; bands are left out."""
+    for k in range(COUNT):
+        for second, camera, size in ((59, "W", (160, 120)), (60, "T", (128, 104)), (59, "S", (150, 120))):
+            time = f"2024032912{second // 60:02d}{second % 60:02d}"
+            picture = pixels(k + len(camera) + second + size[0], *size)
+            write_photograph(tmp_path / f"DJI_{time}_{k + 1:04d}_{camera}.JPG", picture, k, np.zeros(3))
+        Image.fromarray(np.full((120, 160), 300 * k, np.uint16)).save(tmp_path / f"DJI_{k + 1:04d}_MS_NIR.TIF")
+    found = collect_images([tmp_path])
+    assert [photo.name[-5] for photo in found.images] == ["W"] * COUNT
+    reasons = [each.reason for each in found.excluded]
+    for reason in ("thermal picture beside", "picture of the screen beside", "is of the band NIR"):
+        assert sum(reason in each for each in reasons) == COUNT
+
+
 def test_pictures_twice_as_wide_as_high_without_a_lens_are_remarked(tmp_path):
     for k in range(COUNT):
         picture(tmp_path / f"{k}.png", pixels(k, 240, 120))

@@ -71,6 +71,13 @@ def test_places_are_read_in_every_way_that_programs_write_them(latitude, side, l
     assert said == ""
 
 
+def test_xmp_says_what_exif_cuts_off_at_seconds():
+    xmp = packet('drone-dji:GpsLatitude="-33.5000931" drone-dji:GpsLongtitude="-70.6001257"')
+    for second, expected in ((0.0, (-33.5000931, -70.6001257)), (0.34, (-33.5 - 0.34 / 3600, WEST))):
+        place, said = read_place({1: "S", 2: (33.0, 30.0, second), 3: "W", 4: (70.0, 36.0, 0.0)}, xmp)
+        assert (place, said) == (pytest.approx(expected, abs=1e-9), "")
+
+
 @pytest.mark.parametrize(
     ("gps", "said"),
     [

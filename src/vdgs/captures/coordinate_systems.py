@@ -19,8 +19,14 @@ _STARTS = re.compile(
     r"(\d{4,6}$|(EPSG|ESRI)[\s:]+\d+|urn:ogc:def:crs:|https?://www\.opengis\.net/def/crs/|WGS\s?84\b|UTM\b"
     r"|\w[\w() +-]* / \w|\+proj=|\+init=|(GEOG|PROJ|GEO|PROJC|COMPD|COMPOUND)[A-Z]*CRS?\[|\w*CS\[)", re.I
 )  # fmt: skip
+#: Places that differ by less than this are of one flight in degrees, and one place in metres.
+_ONE_PLACE = 0.2
+#: Ellipsoids of datums that agree with WGS 84 to a metre or two.
+_GLOBAL = {"WGS 84", "GRS 1980"}
 #: ODM's words for the zones of UTM, and those that people write in their place.
-_UTM = re.compile(r"(?:WGS ?84)?[ /]*UTM(?: ZONE)? *(\d{1,2}) *([NS])", re.I)
+#: A band of latitude may stand for the half: C to M is south, N to X north, but S alone says south.
+_UTM = re.compile(r"(?:WGS[ _]?84)?[ /]*UTM(?:[ _]ZONE)?[ _]*(\d{1,2})[ _]*(NORTH|SOUTH|[C-HJ-NP-X])", re.I)
+_LONGITUDE_LATITUDE = re.compile(r"WGS[ _]?84(?:[ _]+(?:long?[ _]?lat|lat[ _]?long?))?", re.I)
 
 
 def names_a_system(line: str) -> bool:
@@ -50,6 +56,11 @@ def to_geodetic(header: str, file: Path, where: str = "the first line") -> tuple
 
     def changed(places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         x, y, z = places.T
+        if crs.is_projected and _look_like_degrees(places[:, :2]):
+            raise CaptureError(
+                f"{file}: coordinates such as {x[0]:.10g}, {y[0]:.10g} look like degrees, but {crs.name} ({where}) "
+                "counts in metres. Write the system that they are of, such as EPSG:4326 with longitude before latitude."
+            )
         if flat:  # heights are metres as they are, whatever they are measured from
             longitude, latitude = change.transform(x, y)
         else:
@@ -59,8 +70,22 @@ def to_geodetic(header: str, file: Path, where: str = "the first line") -> tuple
     name = crs.name if crs.name != "unknown" else header
     if crs.is_compound and not _has_grids(crs):
         name += "; heights as they are, for PROJ lacks the grid of their geoid"
+    unknown = crs.datum is not None and not crs.is_bound and crs.datum.name.lower().startswith("unknown")
+    if unknown and crs.ellipsoid.name not in _GLOBAL:
+        name += (
+            f" (ellipsoid {crs.ellipsoid.name} but no datum: taken as WGS 84, from which national datums differ by up "
+            "to some hundred metres; an EPSG code, or +towgs84, names it)"
+        )
     feet = flat and crs.is_projected and "foot" in (crs.axis_info[0].unit_name or "")
     return changed, f"{name}; x and y in feet, heights are taken as metres" if feet else name
+
+
+def _look_like_degrees(places: np.ndarray) -> bool:
+    """Whether x and y [n, 2] are latitudes and longitudes of one place: as metres they would be one and the same."""
+    if len(places) < 3 or (np.abs(places) > [180, 180]).any():
+        return False
+    spread = np.ptp(places, axis=0)
+    return bool((np.abs(places[0]) > 1).any() and 0 < spread.max() < _ONE_PLACE)
 
 
 def _has_grids(crs: Any) -> bool:
@@ -109,11 +134,12 @@ def geocentric_to_geodetic(header: str, file: Path) -> ToGeodetic:
 
 
 def _named(header: str) -> str:
-    """ODM's own words for systems, `WGS84` and `WGS84 UTM 15N`, as codes; others as they are."""
+    """ODM's own words for systems, `WGS84`, `WGS84 longlat` and `WGS84 UTM 15N`, as codes; others as they are."""
     header = re.sub(r"(?i)^(crs|srs)\s*:", "", header.strip()).strip()
-    if header.upper() in ("WGS84", "WGS 84"):
+    if _LONGITUDE_LATITUDE.fullmatch(header):
         return "EPSG:4326"
     zone = _UTM.fullmatch(header)
     if zone is not None:
-        return f"EPSG:{(32600 if zone[2] in 'Nn' else 32700) + int(zone[1])}"
+        south = zone[2].upper() in ("SOUTH", *"CDEFGHJKLMS")
+        return f"EPSG:{(32700 if south else 32600) + int(zone[1])}"
     return re.sub(r"(?i)^(EPSG|ESRI)[\s:]+", r"\1:", header)

@@ -183,13 +183,16 @@ def find_mask(folder: Path, name: str) -> Path | None:
     return next((found for found in (find_file(folder, each) for each in candidates) if found is not None), None)
 
 
-def find_mask_beside(folder: Path, name: str) -> Path | None:
-    """The mask of an image in the image's own folder: name.jpg.png or `name_mask` and its like."""
+def find_mask_beside(folder: Path, name: str, image: Path | None = None) -> Path | None:
+    """The mask of an image in the image's own folder: name.jpg.png or `name_mask` and its like. The `image` itself is
+    none, as it would be of a name without extension."""
     path = Path(name)
     stems = [str(path.with_name(path.stem + tail)) for tail in _MASK_TAILS]
     candidates = [name + ".png", name + ".mask.png"]
     candidates += [stem + suffix for stem in stems for suffix in (".png", path.suffix)]
-    return next((found for found in (find_file(folder, each) for each in candidates) if found is not None), None)
+    return next(
+        (found for found in (find_file(folder, each) for each in candidates) if found not in (None, image)), None
+    )
 
 
 def decode_image(path: Path) -> tuple[np.ndarray, np.ndarray | None]:

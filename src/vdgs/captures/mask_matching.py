@@ -27,16 +27,15 @@ def find_masks(
     asked_for = options.masks != CaptureOptions.masks
     if asked_for and not folder.is_dir():
         raise CaptureError(f"{folder}: no such folder, though --masks asks for it.")
-    masks = {
-        view.name: view.mask_path or find_mask(folder, view.name) or find_mask_beside(root / images, view.name)
-        for view in views
-    }
+    masks = dict[str, Path | None]()
     for view in views:
-        mask, photograph = masks[view.name], find_file(root / images, view.name)
+        photograph = view.image_path or find_file(root / images, view.name)
+        mask = view.mask_path or find_mask(folder, view.name)
         if mask is not None and photograph is not None and mask.samefile(photograph):
             raise CaptureError(
                 f"{mask}: is the photograph itself, not a mask of it. Name the folder of the masks (--masks)."
             )
+        masks[view.name] = mask or find_mask_beside(root / images, view.name, photograph)
     with_mask = [name for name, mask in masks.items() if mask is not None]
     if folder.is_dir() and not any(view.mask_path for view in views):
         _compare(folder, masks, asked_for, warnings)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
+from datetime import datetime, timedelta
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -24,6 +27,11 @@ LEAST_ALIKE = 3
 SMALLER = 0.7
 #: A mask by another name is black and white: this share of it lies within so many gray values of the two.
 BLACK_AND_WHITE, NEAR_GRAY = 0.97, 24
+#: How DJI names what cameras of one drone take at a moment: DJI_20240329124328_0001_T, maybe with a flight behind it.
+_DJI_NAME = re.compile(
+    r"(?:(?P<before>.*?)(?P<time>\d{14})|)(?P<number>.*?)_(?P<camera>[TSVWZ])(?P<after>_.*)?", re.IGNORECASE
+)
+_SAME_MOMENT = timedelta(seconds=2)
 #: Sides of the small picture that tells it.
 _LOOKED_AT = (128, 128)
 
@@ -88,7 +96,7 @@ def strays(photographs: Sequence[ImageMetadata]) -> tuple[dict[str, str], dict[s
 
     A picture without any tags is a stray only where most others have them.
     """
-    reasons = _smaller_copies(photographs) | _thermal(photographs)
+    reasons = _smaller_copies(photographs) | _other_cameras(photographs)
     tagged = [photo for photo in photographs if not is_bare(photo)]
     bare = [photo for photo in photographs if is_bare(photo) and photo.name not in reasons]
     lent = dict[str, ImageMetadata]()
@@ -116,16 +124,28 @@ def is_bare(photo: ImageMetadata) -> bool:
     return photo.camera == UNKNOWN_CAMERA and photo.lens is None and photo.lat_lon is None
 
 
-def _thermal(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
-    """Pictures of a thermal camera beside those that the same drone took (DJI: `_T` beside `_V`, `_W` or `_Z`)."""
-    stems = {str(PurePosixPath(photo.name).with_suffix("")).upper(): photo for photo in photographs}
+def _other_cameras(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
+    """Pictures of a thermal camera and of the screen beside those that the same drone took (DJI: `_T` and `_S` beside
+    `_V`, `_W` or `_Z` of the same moment, of which the cameras' clocks differ by a second or two)."""
+    moments: dict[tuple[str, str], list[tuple[datetime, str, ImageMetadata]]] = {}
+    for photo in photographs:
+        name = PurePosixPath(photo.name)
+        match = _DJI_NAME.fullmatch(name.stem)
+        if match:
+            with suppress(ValueError):
+                taken = datetime.strptime(match["time"], "%Y%m%d%H%M%S") if match["time"] else datetime.min
+                key = str(name.parent), f"{match['before']} {match['number']} {match['after']}".upper()
+                moments.setdefault(key, []).append((taken, match["camera"].upper(), photo))
     found = {}
-    for stem, photo in stems.items():
-        beside = [stems[stem[:-1] + other] for other in "VWZ" if stem.endswith("_T") and stem[:-1] + other in stems]
-        if any(photo.width * photo.height < each.width * each.height for each in beside):
-            found[photo.name] = (
-                f"is the thermal picture beside {beside[0].name}: give a folder of those alone to use them"
-            )
+    for shots in moments.values():
+        for taken, camera, photo in shots:
+            beside = [other for when, which, other in shots if which in "VWZ" and abs(when - taken) <= _SAME_MOMENT]
+            if camera == "T" and any(photo.width * photo.height < each.width * each.height for each in beside):
+                found[photo.name] = (
+                    f"is the thermal picture beside {beside[0].name}: give a folder of those alone to use them"
+                )
+            elif camera == "S" and beside:
+                found[photo.name] = f"is the picture of the screen beside {beside[0].name}"
     return found
 
 

@@ -61,7 +61,8 @@ def read_place(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[Place | 
     if in_xmp is not None and _same((abs(latitude[0]), abs(longitude[0])), (abs(in_xmp[0]), abs(in_xmp[1]))):
         if latitude[1] and longitude[1] and not _same((latitude[0], longitude[0]), in_xmp):
             return None, f"EXIF and XMP name different hemispheres ({_degrees(latitude, longitude)}, {_pair(in_xmp)})"
-        return (in_xmp if not (latitude[1] and longitude[1]) else (latitude[0], longitude[0])), ""
+        exact = latitude[1] and longitude[1] and not _whole_seconds(latitude[0], longitude[0])
+        return ((latitude[0], longitude[0]) if exact else in_xmp), ""
     if latitude[0] == longitude[0] == 0:
         return in_xmp or (0.0, 0.0), ""
     if not (latitude[1] and longitude[1]):
@@ -141,6 +142,11 @@ def _place_in_xmp(xmp: Mapping[str, str]) -> Place | None:
             return None
         read.append(angle[0])
     return (read[0], read[1]) if any(read) else None
+
+
+def _whole_seconds(latitude: float, longitude: float) -> bool:
+    """Whether a place is cut off at seconds, 30 m of latitude, as some firmware of DJI writes it into EXIF alone."""
+    return all(abs(3600 * angle - round(3600 * angle)) < 1e-6 for angle in (latitude, longitude))
 
 
 def _same(one: Place, other: Place) -> bool:

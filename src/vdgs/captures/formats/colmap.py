@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 
 import numpy as np
 
@@ -128,13 +128,20 @@ def _views(
     for record in records:
         intrinsics = cameras[record.camera]
         sightings = _sightings(record, sorted_points, intrinsics)
-        name, pose = safe_name(record.name, file), _pose(record, file)
+        name, pose = safe_name(_below_a_folder(record.name), file), _pose(record, file)
         views.append(SourceView(name=name, camera_from_world=pose, intrinsics=intrinsics, observations=sightings))
     views.sort(key=lambda view: view.name)
     twice = find_duplicates(view.name for view in views)
     if twice:
         raise CaptureError(f"{file}: the same image name occurs more than once.{format_list(twice)}")
     return tuple(views)
+
+
+def _below_a_folder(name: str) -> str:
+    """A name without what leads out of every folder (a drive, the root, `..`): its photograph is found by the rest."""
+    parts = PureWindowsPath(name).parts  # parted by both kinds of slashes
+    outside = [k for k, part in enumerate(parts) if part == ".." or PureWindowsPath(part).anchor]
+    return "/".join(parts[outside[-1] + 1 :]) if outside else name
 
 
 def _sightings(record: ColmapImage, points: ColmapPoints, intrinsics: Intrinsics) -> Observations | None:

@@ -19,11 +19,11 @@ from vdgs.errors import CaptureError
 
 
 def _lines(file: Path) -> Iterator[tuple[int, str]]:
-    """Numbered lines without the leading comments."""
+    """Numbered lines without comments."""
     try:
         with file.open(encoding="utf-8-sig") as stream:
             for number, line in enumerate(stream, 1):
-                if not line.startswith("#"):
+                if not line.lstrip().startswith("#"):
                     yield number, line.rstrip("\r\n")
     except UnicodeDecodeError as error:
         raise CaptureError(f"{file}: is not UTF-8 text ({error}). Export the COLMAP model again.") from None

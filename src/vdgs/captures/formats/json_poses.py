@@ -101,7 +101,9 @@ def parse_intrinsics(frame: JsonObject, common: JsonObject, image: Path, file: P
     Focal lengths may be given as camera_angle_x, y (radians). Where w and h are absent the image's own
     size is taken. Raises `CaptureError` for missing focal lengths and for lenses that are not understood.
     """
-    values = {**common, **{key: value for key, value in frame.items() if value is not None}}
+    own = {key: value for key, value in frame.items() if value is not None}
+    replaced = _FOCAL if not _FOCAL.isdisjoint(own) else frozenset()  # a frame's angle says more than a common fl_x
+    values = {**{key: value for key, value in common.items() if key not in replaced}, **own}
 
     def get(key: str, default: float | None = None) -> float | None:
         value = parse_number(values, key, file)
@@ -128,6 +130,8 @@ def parse_intrinsics(frame: JsonObject, common: JsonObject, image: Path, file: P
     return check_intrinsics(Intrinsics(model, (*head, *tail), int(width), int(height)), file, image.name)
 
 
+#: Ways to say a focal length, one of which is enough.
+_FOCAL = frozenset({"fl_x", "fl_y", "camera_angle_x", "camera_angle_y"})
 _LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
 #: Camera models that bend by radial and tangential polynomials, if at all, and fisheyes that k1...k4 describe.
 _PERSPECTIVE = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL"}

@@ -16,6 +16,7 @@ import numpy as np
 
 from vdgs.captures.capture import Observations, Split
 from vdgs.captures.georeference import Georef
+from vdgs.captures.name_resolution import find_file
 from vdgs.errors import CaptureError
 
 #: COLMAP's camera models: identifier -> (name, number of parameters).
@@ -158,7 +159,7 @@ def safe_name(name: str, file: Path, what: str = "image name", root: Path | None
     """A name in posix form. Raises `CaptureError`, saying `what` it is, if it leaves its folder.
 
     An absolute one may be meant too, if it lies in `root`: it is then relative to that; so may one of another machine
-    or folder, if its end is a file in `root`.
+    or folder, if its end is a file in `root`, with its extension or without.
     """
     if root is not None and Path(name).is_absolute():
         with suppress(ValueError):
@@ -170,7 +171,7 @@ def safe_name(name: str, file: Path, what: str = "image name", root: Path | None
     climbs = ".." in parts or posix.startswith("/") or bool(PureWindowsPath(name).drive)
     if climbs and root is not None:
         ends = ["/".join(parts[k:]) for k in range(1, len(parts)) if ".." not in parts[k:]]
-        inside = next((end for end in ends if "\0" not in end and (root / end).is_file()), None)
+        inside = next((end for end in ends if "\0" not in end and find_image(root, end) is not None), None)
         if inside is not None:
             return inside
     if not parts or climbs or any(ord(letter) < 32 for letter in name):
@@ -179,6 +180,15 @@ def safe_name(name: str, file: Path, what: str = "image name", root: Path | None
             "Names must be relative, without '..'; mend the file or export the model again."
         )
     return str(PurePosixPath(posix))
+
+
+def find_image(root: Path, name: str) -> Path | None:
+    """The file of an image's name below a folder; the name may lack its extension, and shrunk folders may hold another.
+    None where it is gone."""
+    suffixes, path = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG"), PurePosixPath(name)
+    others = [str(path.with_name(path.name + suffix)) for suffix in suffixes]
+    others += [str(path.with_suffix(suffix)) for suffix in suffixes]
+    return next((found for found in (find_file(root, each) for each in (name, *others)) if found is not None), None)
 
 
 def check_intrinsics(intrinsics: Intrinsics, file: Path, label: str) -> Intrinsics:

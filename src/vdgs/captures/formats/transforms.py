@@ -26,6 +26,7 @@ from vdgs.captures.formats.source_capture import (
     SourceCapture,
     SourceView,
     find_duplicates,
+    find_image,
     format_list,
     refuse_many_missing,
     safe_name,
@@ -74,10 +75,11 @@ def read_transforms(root: Path, options: CaptureOptions) -> SourceCapture:
     views, poses, missing = list[SourceView](), dict[str, np.ndarray](), list[str]()
     for frame, name in zip(frames, names, strict=True):
         short = name.removeprefix(folder + "/") if folder else name
-        image = _image(root, f"{chosen}/{short}" if chosen else short)
+        image = find_image(root, f"{chosen}/{short}" if chosen else short)
         if image is None:
             missing.append(short)
             continue
+        short += image.suffix if image.stem == PurePosixPath(short).name else ""
         world_from_camera = parse_matrix(frame.get("transform_matrix"), file, f"frame {name!r}") @ OPENGL_FROM_OPENCV
         in_file = to_rigid(world_from_camera, file, f"frame {name!r}")
         pose, poses[short] = np.linalg.inv(undo(in_file)), np.linalg.inv(in_file)
@@ -126,19 +128,6 @@ def _common_folder(names: list[str]) -> str:
     first = {PurePosixPath(name).parts[0] for name in names if len(PurePosixPath(name).parts) > 1}
     flat = any(len(PurePosixPath(name).parts) == 1 for name in names)
     return first.pop() if len(first) == 1 and not flat else ""
-
-
-def _image(root: Path, name: str) -> Path | None:
-    """The image itself; file_path may come without its extension, and shrunk folders may hold another.
-
-    None where it is gone.
-    """
-    suffixes = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
-    path = PurePosixPath(name)
-    others = (
-        str(other) for suffix in suffixes for other in (path.with_name(path.name + suffix), path.with_suffix(suffix))
-    )
-    return next((found for found in (find_file(root, each) for each in (name, *others)) if found is not None), None)
 
 
 def _splits(content: JsonObject, names: list[str], file: Path, root: Path, options: CaptureOptions) -> dict[str, Split]:
