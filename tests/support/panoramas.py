@@ -50,15 +50,17 @@ def panorama(place: np.ndarray, degrees: float, width: int, extent: float) -> np
     return found
 
 
-def fisheye(around: np.ndarray, side: int, focal: float, bend: tuple[float, ...]) -> np.ndarray:
-    """What a fisheye (OpenCV's k1 to k4) that looks straight down shows of a panorama, its top where that looks."""
+def fisheye(around: np.ndarray, side: int, focal: float, bend: tuple[float, ...], tilt_deg: float) -> np.ndarray:
+    """What a fisheye (OpenCV's k1 to k4) shows of a panorama, tilted from straight down to the middle of that."""
     angles = np.linspace(0, np.pi / 2, 2000)
     radii = focal * angles * (1 + sum(k * angles ** (2 * n + 2) for n, k in enumerate(bend)))
     x, y = np.meshgrid(np.arange(side) + 0.5 - side / 2, np.arange(side) + 0.5 - side / 2)
-    radius = np.hypot(x, y)
+    radius = np.maximum(np.hypot(x, y), 1e-9)
     angle = np.interp(radius, radii, angles, right=np.nan)
-    level = np.sin(angle) / np.maximum(radius, 1e-9)
-    longitude, latitude = np.arctan2(x * level, -y * level), angle - np.pi / 2
+    local = np.stack([np.sin(angle) * x / radius, np.sin(angle) * y / radius, np.cos(angle)], axis=-1)
+    sin, cos = np.sin(np.radians(tilt_deg)), np.cos(np.radians(tilt_deg))
+    right, ahead, up = np.moveaxis(local @ np.array([[1, 0, 0], [0, -cos, -sin], [0, sin, -cos]]), -1, 0)
+    longitude, latitude = np.arctan2(right, ahead), np.arcsin(np.clip(up, -1, 1))
     width = around.shape[1]
     column = np.nan_to_num((longitude / (2 * np.pi) + 0.5) * width - 0.5, nan=-9).astype(np.float32)
     row = np.nan_to_num((0.5 - latitude / np.pi) * width / 2 - 0.5, nan=-9).astype(np.float32)

@@ -60,7 +60,7 @@ def group_by_camera(photographs: Sequence[ImageMetadata]) -> list[CameraGroup]:
     groups: dict[tuple[object, ...], list[ImageMetadata]] = {}
     for photo in photographs:
         focal = photo.lens.focal if photo.lens else None
-        key = (photo.camera, photo.width, photo.height, focal and round(focal, 4), photo.camera_model, photo.face)
+        key = (photo.camera, photo.size, focal and round(focal, 4), photo.camera_model, photo.face or photo.sensor)
         groups.setdefault(key, []).append(photo)
     kinds = []
     for members in groups.values():
@@ -71,7 +71,7 @@ def group_by_camera(photographs: Sequence[ImageMetadata]) -> list[CameraGroup]:
         source = lens.source if lens else "a guess"
         kinds.append(
             CameraGroup(
-                camera=first.camera,
+                camera=f"{first.camera}, {first.sensor.rstrip('/')}" if first.sensor else first.camera,
                 width=first.width,
                 height=first.height,
                 focal_px=focal,

@@ -20,6 +20,7 @@ from vdgs.captures.reconstruction import is_reconstruction
 from vdgs.captures.strays import check_no_run, walk
 from vdgs.config.sfm_options import CameraModel
 from vdgs.errors import CaptureError
+from vdgs.sfm.camera_rigs import with_sensors
 from vdgs.sfm.cross_checks import cross_checked, strays
 from vdgs.sfm.find_images import check_decoders, find_files, is_film, is_photograph, nothing_found
 from vdgs.sfm.image_metadata import ImageMetadata, UnusableImage, is_twice_as_wide, read_image_metadata
@@ -94,8 +95,9 @@ def collect_images(folders: Sequence[Path], camera_model: CameraModel = "auto") 
     unused, spectral = unused_bands(photographs)
     photographs, strange = _of_the_flight([photo for photo in photographs if photo.name not in unused])
     photographs, lone = _with_models(photographs, camera_model)
+    photographs, rigs = with_sensors(photographs)
     left_out += [*doubled, *strange, *lone, *(ExcludedImage(name, why) for name, why in unused.items())]
-    notes = [*found.notes(), *notes, *spectral, *_kind_notes(photographs)]
+    notes = [*found.notes(), *notes, *spectral, *rigs, *_kind_notes(photographs)]
     notes += [f"not read: {poses}. Poses are made anew." for folder in folders for poses in foreign_poses(folder)]
     if len(photographs) < MIN_IMAGES:
         reasons = format_list(f"{each.name}: {each.reason}" for each in left_out)

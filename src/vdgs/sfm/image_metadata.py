@@ -174,6 +174,8 @@ class ImageMetadata:
     """Which view of a panorama it is; empty for photographs."""
     whole_size: tuple[int, int] = (0, 0)
     """Of such a view, width and height of the upright panorama."""
+    sensor: str = ""
+    """The folder of its camera in a rig (`rig1/cam0/`); empty for cameras on their own."""
     frame: str = ""
     """What was taken at one moment: the name of the panorama, or of the photograph itself."""
 

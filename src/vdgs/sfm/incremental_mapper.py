@@ -18,7 +18,7 @@ from vdgs.sfm.feature_extraction import CameraGroup
 from vdgs.sfm.focal_length import CALIBRATED_SOURCE
 from vdgs.sfm.georegistration import is_nearly_collinear
 from vdgs.sfm.gps_priors import GpsPriors
-from vdgs.sfm.image_metadata import EXACT_MODEL, ImageMetadata
+from vdgs.sfm.image_metadata import EXACT_MODEL, FISHEYE, ImageMetadata
 from vdgs.sfm.preflight import OBLIQUE_ANGLE_DEG
 from vdgs.sfm.workspace import Workspace, call_cancellable, report_progress
 from vdgs.system.lazy_pycolmap import pycolmap
@@ -56,7 +56,8 @@ def should_fix_focal(
     if tilts and np.mean(np.array(tilts) > OBLIQUE_ANGLE_DEG) >= MIN_OBLIQUE_SHARE:
         return False, f"{np.mean(np.array(tilts) > OBLIQUE_ANGLE_DEG):.0%} oblique views tell it"
     heights = np.array([photo.relative_altitude for photo in photographs if photo.relative_altitude is not None])
-    if len(heights) >= 3 and _range(heights) > MIN_HEIGHT_SPREAD * abs(np.median(heights)):
+    bent = any(photo.camera_model == FISHEYE for photo in photographs)  # of many terms: one may stand for a height
+    if not bent and len(heights) >= 3 and _range(heights) > MIN_HEIGHT_SPREAD * abs(np.median(heights)):
         return False, "flown at several heights, which tell it"
     if 2 * max(len(tilts), len(heights)) >= len(photographs):
         return True, "one height, straight down as far as known: the flight cannot tell it"
@@ -172,9 +173,22 @@ def _registered_count(folder: Path) -> int:
         return int.from_bytes(file.read(8), "little")
 
 
-def read_models(workspace: Workspace) -> list[pycolmap.Reconstruction]:
+def set_models_aside(workspace: Workspace) -> None:
+    """Keep the models of a first run of the mapper, for `read_models` and `take_models_back`, and begin anew."""
+    shutil.rmtree(workspace.models_aside, ignore_errors=True)
+    shutil.copytree(workspace.models, workspace.models_aside)
+    delete_models(workspace)
+
+
+def take_models_back(workspace: Workspace) -> None:
+    delete_models(workspace)
+    shutil.copytree(workspace.models_aside, workspace.models)
+
+
+def read_models(workspace: Workspace, aside: bool = False) -> list[pycolmap.Reconstruction]:
     """What `run_mapper` found, the model of most photographs first."""
-    models = [pycolmap.Reconstruction(folder) for folder in sorted(workspace.models.iterdir()) if folder.is_dir()]
+    place = workspace.models_aside if aside else workspace.models
+    models = [pycolmap.Reconstruction(folder) for folder in sorted(place.iterdir()) if folder.is_dir()]
     return sorted(models, key=lambda model: -model.num_reg_images())
 
 

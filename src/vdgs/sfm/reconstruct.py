@@ -35,6 +35,7 @@ from vdgs.sfm import (
     incremental_mapper,
     mask_files,
 )
+from vdgs.sfm.camera_rigs import map_rigs
 from vdgs.sfm.console_report import print_reconstruction_report
 from vdgs.sfm.films.take_frames import with_frames
 from vdgs.sfm.georeferencing import georeference
@@ -318,6 +319,12 @@ def _models(
             workspace.begin("model", key)
         incremental_mapper.run_mapper(workspace, count, fix_focal, plan.threads, console)
         workspace.finish("model", key)
+    if any(photo.sensor for photo in plan.image_list.images) and not workspace.is_done("rigs", key):
+        if not workspace.is_begun("rigs", key):
+            incremental_mapper.set_models_aside(workspace)
+            workspace.begin("rigs", key)
+        map_rigs(workspace, plan.image_list.images, count, fix_focal, plan.threads, console)
+        workspace.finish("rigs", key)
     # Read even if they are in memory: the order of their points decides the last bits of what follows.
     return incremental_mapper.read_models(workspace)
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from vdgs.captures.capture_dates import first_and_last
 from vdgs.captures.reconstruction import CameraReport, GcpReport, ImageReport, ReconstructionReport
+from vdgs.sfm.camera_rigs import describe_rigs
 from vdgs.sfm.capture_writer import placed_images
 from vdgs.sfm.feature_extraction import CameraGroup
 from vdgs.sfm.gcp_adjustment import MARK_WRONG_PX
@@ -63,6 +64,8 @@ def make_reconstruction_report(plan: ReconstructionPlan, result: ReconstructionR
     turned = tilt_from_attitudes(model, collection.images) if metric else None
     warnings = [*look.warnings, *_warnings(cameras, held[0], height, look.height_m, turned)]
     warnings += _survey_warnings(result.found.survey)
+    if any(photo.sensor for photo in collection.images):
+        warnings += describe_rigs(model, "m" if metric else "units of the model")
     advice = _advice(look, held[0], len(images), sum(photo.face != "up" for photo in collection.images))
     if isinstance(result.found.placed, AlignmentFailure):
         unplaced = result.found.placed

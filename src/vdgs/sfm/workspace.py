@@ -75,6 +75,11 @@ class Workspace:
         return self.path / "models"
 
     @property
+    def models_aside(self) -> Path:
+        """Models without rigs, where rigs are told by them."""
+        return self.path / "loose"
+
+    @property
     def snapshots(self) -> Path:
         """Where the mapper writes what it has from time to time; whole only once it goes on."""
         return self.path / "snapshots"

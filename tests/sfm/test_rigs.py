@@ -1,0 +1,112 @@
+"""Rigs of cameras: told by their folders, measured by a first model, held together in a second."""
+
+from __future__ import annotations
+
+import io
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+from rich.console import Console
+
+from support.known_flight import known_flight
+from vdgs.sfm import incremental_mapper
+from vdgs.sfm.camera_rigs import describe_rigs, map_rigs
+from vdgs.sfm.feature_extraction import create_database, group_by_camera
+from vdgs.sfm.image_list import collect_images
+from vdgs.sfm.workspace import Workspace, silence_colmap
+
+CONSOLE = Console(file=io.StringIO())
+#: The second camera from the first: 0.5 m to the left, turned by 20 degrees about the right vector.
+TURN = np.radians(20)
+SECOND = np.array([[1, 0, 0, -0.5], [0, np.cos(TURN), -np.sin(TURN), 0], [0, np.sin(TURN), np.cos(TURN), 0]])
+
+
+def photographs(folder: Path, names: list[str]) -> None:
+    for number, name in enumerate(names):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        pixels = np.random.default_rng(number).integers(0, 255, (120, 160, 3), np.uint8)
+        Image.fromarray(pixels).save(folder / name)
+
+
+@pytest.mark.parametrize(
+    ("folders", "rigs"),
+    [
+        (("rig1/cam0", "rig1/cam1"), 1), (("left", "right", "nadir"), 1), (("a/Camera_1", "a/Camera_2", "b/cam1"), 1),
+        (("100MEDIA", "101MEDIA"), 0), (("cam0",), 0), (("rig1/cam0", "rig2/cam0"), 0),
+    ],
+)  # fmt: skip
+def test_folders_tell_rigs(tmp_path, folders, rigs):
+    photographs(tmp_path, [f"{folder}/{k:04d}.jpg" for folder in folders for k in range(4)])
+    found = collect_images([tmp_path])
+    assert sum("taken for one rig" in note for note in found.notes) == rigs
+    sensors = {photo.sensor for photo in found.images if photo.sensor}
+    assert sensors == ({f"{each}/" for each in folders if not each.startswith("b/")} if rigs else set())
+    assert len(group_by_camera(found.images)) == max(1, len(sensors) + ("b/cam1" in folders))
+
+
+def test_cameras_that_do_not_release_together_are_no_rig(tmp_path):
+    photographs(tmp_path, [f"cam{s}/{10 * s + k:04d}.jpg" for s in range(2) for k in range(5)])
+    assert not any(photo.sensor for photo in collect_images([tmp_path]).images)
+
+
+def matched(workspace: Workspace, poses: dict[str, np.ndarray], points: np.ndarray) -> None:
+    """A database of photographs of known poses [3, 4] and points, all matched with all, in pixels and with noise."""
+    rng = np.random.default_rng(2)
+    with workspace.open_database() as database:
+        camera = {each.camera_id: each for each in database.read_all_cameras()}
+        seen = {}
+        for name, pose in sorted(poses.items()):
+            number = 1 + name.startswith("cam1/")
+            local = points @ pose[:, :3].T + pose[:, 3]
+            pixels = np.asarray(camera[number].img_from_cam(local)) + rng.normal(0, 0.2, (len(points), 2))
+            shown = np.flatnonzero((local[:, 2] > 0) & ((pixels > 0) & (pixels < (800, 600))).all(axis=1))
+            image = database.write_image(pycolmap.Image(name=name, camera_id=number))
+            frame = pycolmap.Frame(rig_id=number)
+            frame.add_data_id(pycolmap.data_t(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, number), image))
+            database.write_frame(frame)
+            database.write_keypoints(image, pixels[shown].astype(np.float32))
+            seen[image] = {point: k for k, point in enumerate(shown.tolist())}
+        for one, other in combinations(seen, 2):
+            pairs = [(seen[one][p], seen[other][p]) for p in seen[one] if p in seen[other]]
+            found = np.array(pairs, np.uint32).reshape(-1, 2)
+            database.write_matches(one, other, found)
+            geometry = pycolmap.TwoViewGeometry(config=2, inlier_matches=found)
+            database.write_two_view_geometry(one, other, geometry)
+
+
+def test_a_rig_is_measured_and_held_together(tmp_path):
+    """The distance of its cameras by their turn, and to the share of the scale by their distance."""
+    flight = known_flight(strips=2, each=4)
+    names = [f"cam{s}/{k:04d}.jpg" for s in range(2) for k in range(8)]
+    photographs(tmp_path / "photos", names)
+    images = collect_images([tmp_path / "photos"]).images
+    images = [type(photo)(**{**vars(photo), "width": 800, "height": 600}) for photo in images]
+    workspace = Workspace(tmp_path / "work")
+    create_database(workspace, group_by_camera(images))
+    firsts = {f"cam0/{k:04d}.jpg": pose[:3] for k, pose in enumerate(flight.poses)}
+    seconds = {
+        f"cam1/{name[5:]}": np.hstack([SECOND[:, :3] @ pose[:, :3], SECOND[:, :3] @ pose[:, 3:] + SECOND[:, 3:]])
+        for name, pose in firsts.items()
+    }
+    matched(workspace, firsts | seconds, flight.points)
+    workspace.images.mkdir()
+    silence_colmap()
+    incremental_mapper.run_mapper(workspace, 16, True, 1, CONSOLE)
+    incremental_mapper.set_models_aside(workspace)
+    map_rigs(workspace, images, 16, True, 1, CONSOLE)
+    model = incremental_mapper.read_models(workspace)[0]
+    assert (model.num_reg_images(), model.num_reg_frames()) == (16, 8)
+    rig = next(each for each in model.rigs.values() if each.num_sensors() == 2)
+    second_from_first = next(iter(rig.non_ref_sensors.values()))
+    turned = second_from_first.rotation.matrix()
+    turned = turned if rig.ref_sensor_id.id == 1 else turned.T
+    assert turned == pytest.approx(SECOND[:, :3], abs=0.01)
+    centers = {image.name: image.projection_center() for image in model.images.values()}
+    true = np.linalg.norm(flight.centers[7] - flight.centers[0])
+    scale = true / np.linalg.norm(centers["cam0/0007.jpg"] - centers["cam0/0000.jpg"])
+    assert scale * np.linalg.norm(second_from_first.translation) == pytest.approx(0.5, abs=0.1)
+    assert len(describe_rigs(model, "m")) == 1
