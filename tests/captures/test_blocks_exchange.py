@@ -179,7 +179,6 @@ def test_a_photogroup_that_cannot_be_used_is_named_and_the_others_are_used(tmp_p
         ("<Width>5472</Width>", "", "has no Width"),
         ("<FocalLengthPixels>3656.4</FocalLengthPixels>", "", "neither FocalLengthPixels"),
         (">XRightYDown<", ">XRightYRight<", "CameraOrientation"),
-        ("<Definition>EPSG:32632</Definition>", "<Definition>EPSG:1</Definition>", "its SRS must name"),
         ("<SRSId>7</SRSId>", "<SRSId>8</SRSId>", "system 8 is not defined"),
         ("<TiePoints>", "<TiePoints><SRSId>3</SRSId>", "mixes the coordinate systems 3, 7"),
         ("<Id>11</Id>", "<Id>10</Id>", "two photographs have the number 10"),
@@ -192,6 +191,21 @@ def test_what_is_not_read_is_named(tmp_path, flight, old, new, says):
     assert old in xml
     with pytest.raises(CaptureError, match=f"block.xml.*(?s:.)*{says}"):
         read(tmp_path, xml.replace(old, new, 1), flight)
+
+
+def test_a_system_that_nobody_knows_is_named_and_strict_refuses(tmp_path, flight):
+    xml = blocks_xml(flight, None).replace("<Block>", "<Block><SRSId>7</SRSId>")
+    site = "<SpatialReferenceSystems><SRS><Id>7</Id><Definition>Site grid 7</Definition></SRS>"
+    xml = xml.replace("<SpatialReferenceSystems>", site)
+    source = read(tmp_path, xml, flight)
+    assert_true(source, flight)
+    assert source.georef.origin is None
+    assert any("'Site grid 7' is not known" in each and "--gps" in each for each in source.warnings)
+    with pytest.raises(CaptureError, match=r"'Site grid 7' is not known.*--strict"):
+        read_files(tmp_path, CaptureOptions(strict=True))
+    degrees = blocks_xml(flight, "EPSG:4326").replace("<Definition>EPSG:4326<", "<Definition>Site grid 7<")
+    with pytest.raises(CaptureError, match="its SRS must name"):
+        read(tmp_path, degrees, flight)
 
 
 def test_damaged_files_end_in_a_message(tmp_path, flight):

@@ -67,6 +67,21 @@ def test_cameras_that_name_no_component_are_of_the_only_one(tmp_path):
     assert_true(read(tmp_path, metashape_xml(flight, cameras=cameras), flight), flight)
 
 
+def test_a_system_that_nobody_knows_is_named_and_strict_refuses(tmp_path):
+    """The transform is Earth-centred in whichever datum: the place is that of WGS 84, or there is none."""
+    flight = true_flight()
+    xml = metashape_xml(flight).replace("GEOGCS[&quot;WGS 84", "BOGUS[").replace('GEOGCS["WGS 84"', 'BOGUS["Site 7"')
+    source = read(tmp_path, xml, flight)
+    assert_true(source, flight)
+    assert any('\'BOGUS["Site 7"' in each and "is not known" in each for each in source.warnings)
+    with pytest.raises(CaptureError, match=r"Site 7.* is not known.*EPSG.*--strict"):
+        read(tmp_path, xml, flight, CaptureOptions(strict=True))
+    local = metashape_xml(flight, reference=LOCAL).replace("LOCAL_CS", "BOGUS")
+    source = read(tmp_path, local, flight)
+    assert_true(source, flight)
+    assert source.georef.origin is None
+
+
 def test_local_coordinates_are_metres_with_z_up(tmp_path):
     flight = true_flight()
     source = read(tmp_path, metashape_xml(flight, reference=LOCAL), flight)

@@ -236,10 +236,12 @@ def test_parameters_of_pix4dmapper_are_read_to_their_numbers(tmp_path: Path, fli
     with pytest.raises(CaptureError, match="10 lines"):
         read(tmp_path, "pix4d")
     file.write_text(whole)
-    file.with_name("flight_wkt.prj").write_text('LOCAL_CS["site",UNIT["metre",1]]')
-    source = read(tmp_path, "pix4d")
-    assert source.georef is not None
-    assert source.georef.origin is None
+    for wkt in ('LOCAL_CS["site",UNIT["metre",1]]', "Site grid 7"):
+        file.with_name("flight_wkt.prj").write_text(wkt)
+        source = read(tmp_path, "pix4d")
+        assert source.georef is not None
+        assert source.georef.origin is None
+    assert any("'Site grid 7' is not known" in each for each in source.warnings)
 
 
 def test_projects_that_are_not_read_say_what_is(tmp_path: Path) -> None:
@@ -338,6 +340,9 @@ def test_opf_of_a_site_is_metres_without_a_place(tmp_path: Path, flight: KnownFl
     flight.write_photographs(tmp_path / "images")
     frame = tmp_path / "scene-reference-frame.json"
     content = json.loads(frame.read_text())
+    content["crs"]["definition"] = "Site grid 7"
+    frame.write_text(json.dumps(content))
+    assert any("'Site grid 7' is not known" in each for each in read(tmp_path, "opf").warnings)
     content["crs"]["definition"] = (
         'ENGINEERINGCRS["Site",ENGINEERINGDATUM["Corner"],CS[Cartesian,3],LENGTHUNIT["metre",1.0]]'
     )

@@ -29,6 +29,14 @@ _UTM = re.compile(r"(?:WGS[ _]?84)?[ /]*UTM(?:[ _]ZONE)?[ _]*(\d{1,2})[ _]*(NORT
 _LONGITUDE_LATITUDE = re.compile(r"WGS[ _]?84(?:[ _]+(?:long?[ _]?lat|lat[ _]?long?))?", re.I)
 
 
+class UnknownSystem(CaptureError):
+    """A coordinate system that PROJ does not know, by its definition."""
+
+    def __init__(self, message: str, definition: str) -> None:
+        super().__init__(message)
+        self.definition = definition
+
+
 def names_a_system(line: str) -> bool:
     """Whether a line is the name of a coordinate system, as far as its beginning tells."""
     return bool(_STARTS.match(line.strip()))
@@ -38,7 +46,7 @@ def to_geodetic(header: str, file: Path, where: str = "the first line") -> tuple
     """What brings x, y, z [n, 3] (x east or longitude) to latitude, longitude and height, and the name of their system,
     which `header` names; `where` that stands in the file.
 
-    Raises CaptureError for a system that is unknown, and without pyproj.
+    Raises UnknownSystem, and CaptureError without pyproj.
     """
     try:
         import pyproj
@@ -49,9 +57,10 @@ def to_geodetic(header: str, file: Path, where: str = "the first line") -> tuple
         flat = len(crs.axis_info) == 2
         change = pyproj.Transformer.from_crs(crs, "EPSG:4326" if flat else "EPSG:4979", always_xy=True)
     except pyproj.exceptions.ProjError:
-        raise CaptureError(
+        raise UnknownSystem(
             f"{file}: {where} must name the coordinate system (EPSG:32615, WGS84 UTM 15N, or a PROJ string), "
-            f"and {header[:60]!r} names none."
+            f"and {header[:60]!r} names none.",
+            header,
         ) from None
 
     def changed(places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -124,7 +133,7 @@ def geocentric_to_geodetic(header: str, file: Path) -> ToGeodetic:
         datum = (plain.geodetic_crs or plain).datum
         change = pyproj.Transformer.from_crs(GeocentricCRS(datum=datum), "EPSG:4979", always_xy=True)
     except (pyproj.exceptions.ProjError, TypeError, AttributeError):
-        raise CaptureError(f"{file}: the coordinate system {header[:60]!r} is not understood.") from None
+        raise UnknownSystem(f"{file}: the coordinate system {header[:60]!r} is not understood.", header) from None
 
     def changed(places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         longitude, latitude, height = change.transform(*places.T)

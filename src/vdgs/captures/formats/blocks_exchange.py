@@ -17,7 +17,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from vdgs.captures.coordinate_systems import ToGeodetic, is_in_degrees, is_local_system, to_geodetic
+from vdgs.captures.coordinate_systems import ToGeodetic, UnknownSystem, is_in_degrees, is_local_system, to_geodetic
 from vdgs.captures.formats.brown_lens import brown_intrinsics, quarter_turn_fisheye
 from vdgs.captures.formats.project import CloudFrame, Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
@@ -77,7 +77,7 @@ class _Block:
         self._photos: dict[str, _Photo] = {}
         self._without_pose: list[str] = []
         self._refused: dict[str, list[str]] = {}
-        self._masks = 0
+        self._masks, self._unknown = 0, ""
         self._points, self._colors = array("d"), array("d")
         self._systems: set[str] = set()
         handlers = {"Photogroup": self._photogroup, "TiePoint": self._tie_point, "ControlPoint": self._skip}
@@ -104,7 +104,7 @@ class _Block:
             points=np.array(self._points).reshape(-1, 3),
             colors=np.clip(np.round(255 * np.array(self._colors).reshape(-1, 3)), 0, 255).astype(np.uint8),
             to_geodetic=geodetic, in_degrees=in_degrees, is_metric=True, place=place, cloud_frames=frames,
-            warnings=tuple(warnings), refused=self._refused,
+            warnings=tuple(warnings), refused=self._refused, unknown_system=self._unknown,
         )  # fmt: skip
 
     def _refuse(self, error: CaptureError, photos: Iterable[Element]) -> None:
@@ -308,12 +308,25 @@ class _Block:
             return None, False, "BlocksExchange, local coordinates", ()
         if definition.upper().startswith("ENU:"):
             return self._enu(definition)
-        geodetic, name = to_geodetic(definition, self._file, "its SRS")
+        try:
+            geodetic, name = to_geodetic(definition, self._file, "its SRS")
+        except UnknownSystem:
+            if self._seems_degrees():
+                raise
+            self._unknown = definition
+            return None, False, "", ()
         origin = local_origin(self._file)
         frames: tuple[CloudFrame, ...] = ()
         if origin is not None:
             frames = ((f"of {name}, about SRSOrigin", lambda points: geodetic(points + origin)),)
         return geodetic, is_in_degrees(definition), f"BlocksExchange, {name}", frames
+
+    def _seems_degrees(self) -> bool:
+        poses = np.array([photo.pose for photo in self._photos.values()]).reshape(-1, 4, 4)
+        centers = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+        return bool(
+            len(centers) and (np.abs(centers[:, :2]) <= (180, 90)).all() and (np.ptp(centers, axis=0)[:2] < 1).all()
+        )
 
     def _enu(self, definition: str) -> tuple[ToGeodetic, bool, str, tuple[CloudFrame, ...]]:
         """Metres about a place that the definition gives: `ENU:latitude,longitude`, at times with a height."""

@@ -15,7 +15,13 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from vdgs.captures.coordinate_systems import ToGeodetic, geocentric_to_geodetic, is_local_system, to_geodetic
+from vdgs.captures.coordinate_systems import (
+    ToGeodetic,
+    UnknownSystem,
+    geocentric_to_geodetic,
+    is_local_system,
+    to_geodetic,
+)
 from vdgs.captures.formats.brown_lens import brown_intrinsics, fisheye_intrinsics
 from vdgs.captures.formats.project import CloudFrame, Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
@@ -86,6 +92,7 @@ class _Chunk:
     def __init__(self, element: Element, file: Path) -> None:
         self._element, self._file = element, file
         self._warnings: list[str] = []
+        self._unknown = ""
 
     def project(self) -> Project:
         cameras, place = self._placed(self._used(self._cameras()))
@@ -106,6 +113,7 @@ class _Chunk:
             format="metashape", file=self._file, views=tuple(views), points=np.zeros((0, 3)),
             colors=np.zeros((0, 3), np.uint8), to_geodetic=geodetic, is_metric=place is not None, place=words,
             cloud_frames=frames, warnings=tuple(self._warnings), refused=refused,
+            unknown_system=self._unknown,
         )  # fmt: skip
 
     # ------------------------------------------------------------------------------------------- cameras
@@ -134,7 +142,7 @@ class _Chunk:
         slaves = {camera for camera in bare if camera.element.get("master_id") not in (None, camera.element.get("id"))}
         for some, what in (
             ([camera for camera in bare if camera not in slaves], "are not aligned"),
-            (slaves, "belong to a multi-camera system and have no pose of their own, which is not read,"),
+            (slaves, "belong to a multi-camera system and have no pose here (Metashape's COLMAP export has it),"),
             (off, "are disabled"),
         ):
             if some:
@@ -280,11 +288,20 @@ class _Chunk:
                 "the export names no coordinate system; its transform is Earth-centred, as of WGS 84."
             )
             wkt = "EPSG:4326"
-        geodetic = geocentric_to_geodetic(wkt, self._file)
+        crs, name = None, "WGS 84"
+        try:
+            geodetic = geocentric_to_geodetic(wkt, self._file)
+            if wkt != "EPSG:4326":
+                crs, name = to_geodetic(wkt, self._file, "the chunk's reference")
+        except UnknownSystem:
+            self._unknown = wkt
+            if not on_globe:
+                return None, "", (("of the chunk", chunk.apply),)
+            geodetic = geocentric_to_geodetic("EPSG:4326", self._file)
+            frame: CloudFrame = ("of the chunk", lambda points: geodetic(chunk.apply(points)))
+            return geodetic, "Metashape, Earth-centred metres, taken for those of WGS 84", (frame,)
         frames: list[CloudFrame] = [("of the chunk", lambda points: geodetic(chunk.apply(points)))]
-        name = "WGS 84"
-        if wkt != "EPSG:4326":
-            crs, name = to_geodetic(wkt, self._file, "the chunk's reference")
+        if crs is not None:
             frames.append((f"of {name}", crs))
         return geodetic, f"Metashape, {name}", tuple(frames)
 

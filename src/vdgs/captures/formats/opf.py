@@ -13,7 +13,7 @@ from urllib.parse import unquote, urlsplit
 
 import numpy as np
 
-from vdgs.captures.coordinate_systems import ToGeodetic, is_local_system, to_geodetic
+from vdgs.captures.coordinate_systems import ToGeodetic, UnknownSystem, is_local_system, to_geodetic
 from vdgs.captures.formats.brown_lens import MAX_POWERS, brown_intrinsics, quarter_turn_fisheye
 from vdgs.captures.formats.gltf_points import GltfPoints, join_points, read_gltf_points
 from vdgs.captures.formats.json_poses import (
@@ -70,11 +70,15 @@ def read(file: Path, options: CaptureOptions) -> Project:
         seen = cloud.shown.get(number)
         views.append(ProjectView(names=(name,), camera_from_world=pose, intrinsics=lens, sightings=seen))
     warnings += name_unaligned([photograph_name(uri) for number, uri in uris.items() if number not in used])
-    system, place, is_metric = _system(items)
+    unknown = ""
+    try:
+        system, place, is_metric = _system(items)
+    except UnknownSystem as error:
+        system, place, is_metric, unknown = None, "", True, error.definition
     return Project(
         format="opf", file=file, views=tuple(views), points=cloud.points, colors=cloud.colors, to_geodetic=system,
         is_metric=is_metric, place=place, warnings=tuple(warnings), refused=refused,
-        remedy="Export COLMAP from PIX4Dmatic, or undistort the photographs",
+        unknown_system=unknown, remedy="Export COLMAP from PIX4Dmatic, or undistort the photographs",
     )  # fmt: skip
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vdgs.captures.coordinate_systems import ToGeodetic, is_local_system, to_geodetic
+from vdgs.captures.coordinate_systems import ToGeodetic, UnknownSystem, is_local_system, to_geodetic
 from vdgs.captures.formats.brown_lens import brown_intrinsics
 from vdgs.captures.formats.project import CloudFrame, Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
@@ -51,10 +51,15 @@ def read(file: Path, options: CaptureOptions) -> Project:
             "fisheye, which is read from OPF (PIX4Dmatic). Copy or export it again."
         )
     views = tuple(_view(rows[first : first + _LINES], file) for first in range(0, len(rows), _LINES))
-    system, place, is_metric, frames = _system(file)
+    unknown = ""
+    try:
+        system, place, is_metric, frames = _system(file)
+    except UnknownSystem as error:
+        system, place, is_metric, frames, unknown = None, "", True, (), error.definition
     return Project(
         format="pix4d", file=file, views=views, points=np.zeros((0, 3)), colors=np.zeros((0, 3), np.uint8),
         to_geodetic=system, is_metric=is_metric, place=place, cloud_frames=frames,
+        unknown_system=unknown,
     )  # fmt: skip
 
 

@@ -81,6 +81,8 @@ class Project:
     warnings: tuple[str, ...] = ()
     refused: Mapping[str, Sequence[str]] = field(default_factory=dict)
     """Why some of its cameras cannot be used, and what these are called."""
+    unknown_system: str = ""
+    """The coordinate system that it names and that nobody knows; its coordinates are metres then."""
     remedy: str = "Export undistorted photographs with them as a COLMAP model instead"
 
 
@@ -96,6 +98,7 @@ def project_capture(
     if not project.views:
         raise CaptureError(f"{project.file}: no camera of it has a pose. Align the photographs, and export it again.")
     _check_sightings(project)
+    lost += _without_system(project, options.strict)
     names = [view.names for view in project.views]
     found = find_photographs(root, options, names, project.file)
     world = _world_of(project)
@@ -116,6 +119,18 @@ def project_capture(
         points=points, colors=colors, georef=world.georef, original_images=True,
         image_folders=() if found.folder == "." else (root / found.folder,), warnings=tuple(warnings),
     )  # fmt: skip
+
+
+def _without_system(project: Project, strict: bool) -> list[str]:
+    """A warning about a system that is not known; CaptureError where a person is `strict`."""
+    if not project.unknown_system:
+        return []
+    said = f"the coordinate system {project.unknown_system[:80]!r} is not known"
+    if strict:
+        raise CaptureError(
+            f"{project.file}: {said}. Export it in one that has an EPSG code, or leave --strict out to use it without."
+        )
+    return [f"{said}: {project.place or 'the scene has metres and no place on Earth; --gps TABLE gives one'}."]
 
 
 def _check_sightings(project: Project) -> None:
