@@ -3,7 +3,7 @@
 `paper`     the paper as printed; where it is silent, the reading that served it best on validation views. docs/paper.md
             lists every choice that is left, with its alternatives.
 `default`   the paper's numbers, but a scene that can be used whatever the capture: axes that turn with the scene and
-            smoothed cores; gaps filled and outliers left out; a random background, bounded Gaussians, sparse Adam;
+            smoothed cores; gaps filled; a random background, bounded Gaussians, sparse Adam;
             cameras by `coverage`, each with a block and each block with a hundred; a frozen margin, a lower gate.
 `laptop`    a good result in minutes on a CPU; reports/choices.md says what each of its departures brings. Growth in
             blocks is plain: compensated growth (`--block.compensation.enabled`) lost where few cameras look, and places
@@ -39,7 +39,7 @@ PRESETS: dict[str, MethodConfig] = {
         training=TrainConfig(
             optimizer="adam",
             model=ModelConfig(bound_scales=False),
-            init=InitConfig(outlier_distance=0.0, fill_gaps=False),
+            init=InitConfig(fill_gaps=False),
             loss=LossConfig(background="black", random_background=0.0),
         ),
         partition=PartitionConfig(axes="ground", clip_quantile=0.0, smoothing=0.5, min_block_share=0.0),
