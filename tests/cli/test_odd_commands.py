@@ -45,7 +45,9 @@ def command(verb: str, option: Option, word: str) -> list[str]:
 
 def process(code: str, shell: str = '"$@"', cwd: Path | None = None, **env: str) -> subprocess.CompletedProcess[bytes]:
     words = ["bash", "-c", shell, "bash", sys.executable, "-c", CODE.format(code)]
-    return subprocess.run(words, capture_output=True, cwd=cwd, env=os.environ | env, timeout=PATIENCE_SECONDS, check=False)
+    return subprocess.run(
+        words, capture_output=True, cwd=cwd, env=os.environ | env, timeout=PATIENCE_SECONDS, check=False
+    )
 
 
 @pytest.mark.parametrize("word", ["", "  "])
@@ -147,7 +149,9 @@ def test_a_folder_that_was_removed_is_named(tmp_path):
 def test_output_that_nobody_can_take_is_no_traceback(words, where, says, buffered):
     line = f'"$0" -m vdgs {words} {where}; exit ${{PIPESTATUS[0]}}'
     env = os.environ | {"PYTHONUNBUFFERED": buffered}
-    done = subprocess.run(["bash", "-c", line, sys.executable], capture_output=True, env=env, timeout=PATIENCE_SECONDS, check=False)
+    done = subprocess.run(
+        ["bash", "-c", line, sys.executable], capture_output=True, env=env, timeout=PATIENCE_SECONDS, check=False
+    )
     assert done.returncode in ((1,) if says else (0, 1))
     assert says in done.stderr
     assert b"Traceback" not in done.stderr

@@ -236,7 +236,11 @@ def open_page(
             with connect(target["webSocketDebuggerUrl"], max_size=None) as socket:
                 page = Page(socket)
                 page.call(
-                    "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=scale, mobile=False
+                    "Emulation.setDeviceMetricsOverride",
+                    width=width,
+                    height=height,
+                    deviceScaleFactor=scale,
+                    mobile=False,
                 )
                 if downloads is not None:
                     page.call("Page.setDownloadBehavior", behavior="allow", downloadPath=str(downloads))

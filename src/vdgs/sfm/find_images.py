@@ -48,7 +48,9 @@ class Found:
         """What people should know of what is not used."""
         kinds = [kind for kind in self.unread if kind not in VIDEO_SUFFIXES]
         films = sum(self.unread.values()) - sum(self.unread[kind] for kind in kinds)
-        notes = [f"{films} film{'s' if films > 1 else ''} beside the photographs: not used. To use a film too, name it."]
+        notes = [
+            f"{films} film{'s' if films > 1 else ''} beside the photographs: not used. To use a film too, name it."
+        ]
         notes = notes if films else []
         notes += [f"{_count(self.unread[kind], kind)} not read: {_remedy(kind)}." for kind in kinds]
         notes += [
