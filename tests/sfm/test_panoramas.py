@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import io
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
 from rich.console import Console
 
-from support.flights import add_xmp, write_photograph
-from support.panoramas import fisheye, panorama, walk
+from support.flights import add_xmp
+from support.panoramas import fisheye, walk
+from vdgs.captures.formats.source_capture import Intrinsics
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import VdgsError
+from vdgs.sfm.capture_writer import make_undistortion
 from vdgs.sfm.cube_faces import FACES, cut_face
 from vdgs.sfm.image_list import collect_images
 from vdgs.sfm.mask_files import read_keep_mask
@@ -127,32 +130,20 @@ def test_the_name_of_the_lens_tells_a_fisheye(tmp_path):
     assert {photo.camera_model for photo in collect_images([tmp_path], "opencv").images} == {"OPENCV"}
 
 
-@pytest.mark.slow
-def test_a_flight_with_a_fisheye_is_placed(tmp_path):
-    """The lens is fitted from a rough focal length, and straight lines come out of it: the sparse model, whose cameras
-    are pinholes, agrees with true projections."""
-    side, focal, bend = 400, 170.0, (0.03, -0.01, 0.0, 0.0)
-    places = [np.array([6.0 * (k % 3 - 1), 8.0 * (k // 3) - 4, 16.0 + k % 2]) for k in range(6)]
-    (tmp_path / "photos").mkdir()
-    for k, place in enumerate(places):
-        shown = fisheye(panorama(place, 30 * k, 900, 60.0), side, focal, bend)
-        write_photograph(tmp_path / "photos" / f"F{k}.jpg", shown, k, place, xmp="", focal_mm=4.5)
-    options = SfmOptions(camera_model="opencv-fisheye", max_num_features=2000)
-    request = SfmRequest(image_folders=(tmp_path / "photos",), output=tmp_path / "capture", threads=1, options=options)
-    report = reconstruct(request, Console(file=io.StringIO()))
-    assert report.registered == len(places)
-    assert not report.focal_fixed
-    assert report.reprojection_px < 0.6
-    assert report.cameras[0].focal_before_px == pytest.approx(180)
-    assert report.cameras[0].focal_after_px == pytest.approx(focal, rel=0.02)
-    model = pycolmap.Reconstruction(tmp_path / "capture" / "sparse" / "0")
-    assert {camera.model_name for camera in model.cameras.values()} == {"PINHOLE"}
-    centers = {image.name: image.projection_center() for image in model.images.values()}
-    assert np.ptp([centers[f"F{k}.jpg"] - place for k, place in enumerate(places)], axis=0).max() < 0.3
-    errors = [
-        np.linalg.norm(image.project_point(model.points3D[point.point3D_id].xyz) - point.xy)
-        for image in model.images.values()
-        for point in image.points2D
-        if point.has_point3D()
-    ]
-    assert np.median(errors) < 1
+def test_the_photograph_of_a_fisheye_becomes_a_perspective_view():
+    """What is written of the picture of a known fisheye is what the pinhole camera that goes with it sees."""
+    lens = Intrinsics("OPENCV_FISHEYE", (100.0, 100.0, 120.0, 120.0, 0.03, -0.01, 0.0, 0.0), 240, 240)
+    bent = fisheye(globe(1440), 240, 100.0, lens.params[4:], 60.0)
+    straight = make_undistortion(lens, 0)
+    x, y = straight.grid[..., 0], straight.grid[..., 1]
+    shown = cv2.remap(bent, x, y, cv2.INTER_CUBIC)[..., :2].astype(float)
+    (fx, fy), (cx, cy) = straight.intrinsics.focal, straight.intrinsics.principal_point
+    columns, rows = np.meshgrid(np.arange(shown.shape[1]) + 0.5, np.arange(shown.shape[0]) + 0.5)
+    local = np.stack([(columns - cx) / fx, (rows - cy) / fy, np.ones_like(rows)], axis=-1)
+    cos, sin = 0.5, np.sqrt(0.75)
+    right, ahead, up = local[..., 0], sin - cos * local[..., 1], -cos - sin * local[..., 1]
+    longitude, latitude = np.arctan2(right, ahead), np.arctan2(up, np.hypot(right, ahead))
+    expected = 255 * np.stack([longitude / (2 * np.pi) + 0.5, 0.5 - latitude / np.pi], axis=-1)
+    inside = (np.hypot(right, ahead) > 0.3) & (np.abs(longitude) < 3)  # not at the nadir, nor at the seam
+    assert inside.mean() > 0.8
+    assert np.abs(shown - expected)[inside].max() < 3

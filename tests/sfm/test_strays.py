@@ -284,7 +284,10 @@ def test_cameras_of_one_moment_may_name_it_by_other_seconds(tmp_path):
 def test_pictures_twice_as_wide_as_high_without_a_lens_are_remarked(tmp_path):
     for k in range(COUNT):
         picture(tmp_path / f"{k}.png", pixels(k, 240, 120))
-    assert any("Panoramas of 360° cannot be used" in each for each in said(collect_images([tmp_path])))
+    assert any(
+        "If these are panoramas of 360°: --camera-model equirectangular" in each
+        for each in said(collect_images([tmp_path]))
+    )
 
 
 def test_panoramas_are_named(tmp_path):

@@ -70,7 +70,7 @@ def _foreign(profile: bytes, mode: str) -> str:
         if mode == _CMYK:
             _transform(profile, mode)
             return f"CMYK ({name})"
-        steps = np.arange(0, 256, 17, np.uint8)
+        steps = np.arange(0, 256, 17).astype(np.uint8)
         lattice = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(16, -1, 3)
         moved = np.asarray(ImageCms.applyTransform(Image.fromarray(lattice), _transform(profile, mode)))
     except (ImageCms.PyCMSError, OSError, ValueError, TypeError):

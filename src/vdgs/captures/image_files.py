@@ -279,7 +279,7 @@ def _converted(path: Path, data: np.ndarray) -> np.ndarray | None:
         return None
     try:
         prepare_heif(path)
-        with pillow_without_limits(), Image.open(io.BytesIO(data)) as image:
+        with pillow_without_limits(), Image.open(io.BytesIO(data.tobytes())) as image:
             if not own and not foreign_space(image):
                 return None
             pixels = np.asarray(to_srgb(image))

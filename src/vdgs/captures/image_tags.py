@@ -83,7 +83,7 @@ def _kind(image: Image.Image) -> str:
 def _has_16_bits(image: Image.Image) -> bool:
     if image.format == "TIFF":
         return 16 in image.tag_v2.get(_BITS_PER_SAMPLE, ())  # type: ignore[attr-defined]
-    return image.format == "PNG" and any("16" in str(tile[3]) for tile in image.tile)
+    return image.format == "PNG" and any("16" in str(tile[3]) for tile in getattr(image, "tile", ()))
 
 
 def _xmp_packet(image: Image.Image) -> bytes:

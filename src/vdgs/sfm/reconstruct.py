@@ -19,7 +19,6 @@ from vdgs.captures.reconstruction import (
     RECONSTRUCTION_FIGURE,
     RECONSTRUCTION_FILE,
     WORK_FOLDER,
-    CameraReport,
     ReconstructionReport,
     read_reconstruction,
 )
@@ -55,6 +54,7 @@ from vdgs.sfm.reconstruction_report import (
     ReconstructionResult,
     cameras_of,
     exclusion_reasons,
+    lens_moved,
     make_reconstruction_report,
 )
 from vdgs.sfm.sfm_estimate import SfmEstimate, estimate_sfm
@@ -175,7 +175,7 @@ def _place_anew(
     output, photographs = prepared.request.output, collection.images
     kinds = feature_extraction.group_by_camera(photographs)
     found = georeference(pycolmap.Reconstruction(output / MAPPED), prepared, before.focal_fixed)
-    if _lens_moved(before.cameras, cameras_of(found.model, kinds)) > LENS_PX:
+    if lens_moved(before.cameras, cameras_of(found.model, kinds)) > LENS_PX:
         work = Workspace(output / WORK_FOLDER)
         feature_extraction.write_upright_images(work, photographs)
         mask_files.write_upright_masks(work, photographs, prepared.threads)
@@ -203,17 +203,6 @@ def _place_anew(
     return _finish(prepared, outcome, key)
 
 
-def _lens_moved(before: Sequence[CameraReport], after: Sequence[CameraReport]) -> float:
-    """By how many pixels of a photograph the picture without distortion changes in the corners, at most."""
-    if len(before) != len(after):
-        return float("inf")
-    moved = [0.0]
-    for one, other in zip(before, after, strict=True):
-        corner = float(np.hypot(one.width, one.height)) / 2
-        away = corner / one.focal_after_px
-        bent = (other.radial_distortion - one.radial_distortion) * away**2
-        moved.append(corner * abs(bent + other.focal_after_px / one.focal_after_px - 1))
-    return max(moved)
 
 
 def _steps(
