@@ -146,7 +146,7 @@ def test_default_and_paper_restart_the_coarse_stage_and_paper_leaves_our_choices
         line.split(":")[0] for line in diff_settings(to_dict(default), to_dict(paper))
     }  # fmt: skip
     assert ours == {
-        "partition.axes", "partition.clip_quantile", "partition.smoothing", "partition.min_block_share",
+        "partition.cluster_axes", "partition.cluster_clip", "partition.cluster_smoothing", "partition.min_block_share",
         "assignment.always_best", "assignment.min_cameras", "assignment.mode", "assignment.tau",
         "block.random_background", "block.margin", "merge.rule",
         "block.compensation.target", "block.compensation.min_draws", "training.optimizer",

@@ -82,7 +82,9 @@ def test_on_the_axes_of_the_ground_frame_the_cut_does_not_turn_with_the_scene() 
     positions, views = town()
     turned = positions @ np.array([[1, -1, 0], [1, 1, 0], [0, 0, np.sqrt(2)]]).T / np.sqrt(2)
     for axes, same in (("principal", True), ("ground", False)):
-        before, after = (cut(each, views, lambda_vis=0.0, axes=axes, smoothing=0.5) for each in (positions, turned))
+        before, after = (
+            cut(each, views, lambda_vis=0.0, cluster_axes=axes, cluster_smoothing=0.5) for each in (positions, turned)
+        )
         assert np.array_equal(owners(after, turned), owners(before, positions)) == same
 
 
@@ -111,9 +113,9 @@ def test_a_small_block_is_left_out_or_kept() -> None:
     generator = np.random.default_rng(8)
     site, far = generator.uniform(0, 100, (4000, 3)), generator.normal([160, 50, 0], 1, (40, 3))
     positions, views = np.concatenate([site, far]), np.full(4040, 5)
-    kept = cut(positions, views, 3, lambda_vis=0.0, min_block_share=0.0, clip_quantile=0.0)
+    kept = cut(positions, views, 3, lambda_vis=0.0, min_block_share=0.0, cluster_clip=0.0)
     assert len(kept) == 3
-    assert len(cut(positions, views, 3, lambda_vis=0.0, min_block_share=0.9, clip_quantile=0.0)) < 3
+    assert len(cut(positions, views, 3, lambda_vis=0.0, min_block_share=0.9, cluster_clip=0.0)) < 3
 
 
 def test_coordinates_as_large_as_utm() -> None:

@@ -48,18 +48,18 @@ TABLE_HEAD = (
     "    python -m experiments.reports.analyses.paper_readings DATA WORK [--counts]",
     "",
     f"Validation views (`vdgs train-coarse DATA/SCENE {' '.join(COARSE)}`):",
-    "test photographs are left out, and every eighth training photograph is held out. One seed. Steps are scaled: 1 500",
-    "of the coarse stage instead of 100 000, 200 of each block instead of 50 000, growth in blocks decided every 20 steps",
-    "instead of 100. Each reading changes one thing of the preset `paper`; all of a scene begin with the same coarse",
-    "model. Differences below 0.1 dB are within what seeds make.",
+    "test photographs are left out, and every eighth training photograph is held out. One seed. Steps are scaled:",
+    "1 500 of the coarse stage instead of 100 000, 200 of each block instead of 50 000, growth in blocks decided every",
+    "20 steps instead of 100. Each reading changes one thing of the preset `paper`; all of a scene begin with the same",
+    "coarse model. Differences below 0.1 dB are within what seeds make.",
 )
 BLOCKS: Changes = {"block.steps_scaler": 0.004, "block.densify.every": 20}
 #: Preset `default`'s partition, for the rows of one choice each.
 CUTS: dict[str, Changes] = {
-    "cut: principal axes": {"partition.axes": "principal"},
-    "cut: clipped at 1 %": {"partition.clip_quantile": 0.01},
-    "cut: own cells": {"partition.smoothing": 0.0},
-    "cut: smoothed over 1.5 cells": {"partition.smoothing": 1.5},
+    "cut: principal axes": {"partition.cluster_axes": "principal"},
+    "cut: clipped at 1 %": {"partition.cluster_clip": 0.01},
+    "cut: own cells": {"partition.cluster_smoothing": 0.0},
+    "cut: smoothed over 1.5 cells": {"partition.cluster_smoothing": 1.5},
     "cut: small blocks dropped": {"partition.min_block_share": 0.05},
     "cut: place alone": {"partition.lambda_vis": 0.0},
 }
@@ -141,10 +141,10 @@ def own_cluster_share(run: RunFolder, visibility: np.ndarray) -> float:
     """The share of the anchors that the block owns which most anchors of their cluster joined."""
     config: PartitionConfig = run.method().partition
     positions = AnchorModel.load(run.coarse.model).anchors.positions.double().numpy()[:, :2]
-    plane = fit_principal_plane(positions) if config.axes == "principal" else ground_plane()
+    plane = fit_principal_plane(positions) if config.cluster_axes == "principal" else ground_plane()
     assert config.blocks != "auto"
     points = plane.to_plane(positions)
-    features = clustering_features(points, visibility, config.lambda_vis, config.clip_quantile)
+    features = clustering_features(points, visibility, config.lambda_vis, config.cluster_clip)
     order = np.lexsort((visibility, points[:, 1], points[:, 0]))
     labels = cluster_anchors(features[order], config.blocks, run.method().training.seed, config.balanced)
     owner = load_blocks(run.partition / "blocks.geojson").owner(positions[order])

@@ -207,13 +207,13 @@ class PartitionConfig:
     balanced: bool = False
     """Blocks of about equally many anchors. Choice: plain k-means leaves them several times apart. Experimental: no
     table has it."""
-    axes: Literal["principal", "ground"] = "principal"
+    cluster_axes: Literal["principal", "ground"] = "principal"
     """Axes along which positions are normalized. `principal`: those of the anchors, so that the cut turns with the
     scene (choice). `ground`: x and y of the ground frame, as printed."""
-    clip_quantile: Annotated[float, Range(0, 0.5, exclusive_max=True)] = 0.01
+    cluster_clip: Annotated[float, Range(0, 0.5, exclusive_max=True)] = 0.01
     """Positions are normalized between this quantile and its opposite, and clipped; 0: between the outermost anchors
     (choice: outliers would squash the scene; the paper says "normalized")."""
-    smoothing: Annotated[float, Range(0, 100)] = 1.5
+    cluster_smoothing: Annotated[float, Range(0, 100)] = 1.5
     """Components are sought where a cluster is the strongest within about so many cells; 0: over its own cells. At 0
     all cells that hold an anchor of the cluster count, as printed (choice: clusters that mix have ragged borders)."""
     min_block_share: Annotated[float, FRACTION] = 0.05

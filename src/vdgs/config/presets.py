@@ -42,7 +42,7 @@ PRESETS: dict[str, MethodConfig] = {
             init=InitConfig(fill_gaps=False),
             loss=LossConfig(background="black", random_background=0.0),
         ),
-        partition=PartitionConfig(axes="ground", clip_quantile=0.0, smoothing=0.5, min_block_share=0.0),
+        partition=PartitionConfig(cluster_axes="ground", cluster_clip=0.0, cluster_smoothing=0.5, min_block_share=0.0),
         assignment=AssignmentConfig(mode="paper", tau=0.2, always_best=False, min_cameras=0),
         block=BlockConfig(
             random_background=0.0, margin="ramp", compensation=CompensationConfig(min_draws="paper", target="sum")

@@ -32,9 +32,9 @@ def partition_scene(
     """Cut a scene into blocks by the positions of its anchors and their visibility V; also returns warnings.
 
     Every point has exactly one owner (`Blocks.owner`). The cut moves and scales with the scene (and turns with it, with
-    `config.axes` principal) and does not depend on the order of the anchors. Blocks are numbered along the first axis.
-    There are fewer blocks than requested, and a warning, where a cluster is the strongest nowhere on the plane (choice:
-    its anchors join the blocks around them). Raises VdgsError if the anchors cannot be cut.
+    `config.cluster_axes` principal) and does not depend on the order of the anchors. Blocks are numbered along the
+    first axis. There are fewer blocks than requested, and a warning, where a cluster is the strongest nowhere on the
+    plane (choice: its anchors join the blocks around them). Raises VdgsError if the anchors cannot be cut.
     """
     ground = _checked_positions(positions, visibility)
     if config.blocks == "auto":
@@ -46,11 +46,11 @@ def partition_scene(
         return _single_block(ground, config.expansion), []
     check_distinct(count, ground)
     ground, visibility = _sorted(ground, np.asarray(visibility, np.int64))
-    plane = fit_principal_plane(ground) if config.axes == "principal" else ground_plane()
+    plane = fit_principal_plane(ground) if config.cluster_axes == "principal" else ground_plane()
     points, visibility = _sorted(plane.to_plane(ground), visibility)
-    features = clustering_features(points, visibility, config.lambda_vis, config.clip_quantile)
+    features = clustering_features(points, visibility, config.lambda_vis, config.cluster_clip)
     labels = cluster_anchors(features, count, seed, config.balanced)
-    candidates = block_cores(points, labels, count, config.smoothing)
+    candidates = block_cores(points, labels, count, config.cluster_smoothing)
     ordered = sorted(
         (core for core in candidates if core is not None), key=lambda core: (core.centroid.x, core.centroid.y)
     )
