@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from support.known_flight import BentLens, KnownFlight, centers_of, ecef
 from vdgs.captures.format_dispatch import lacks_points
 from vdgs.captures.formats.brown_lens import brown_intrinsics, unproject_pixels
 from vdgs.captures.formats.colmap import read_colmap
+from vdgs.captures.formats.source_capture import Intrinsics, SourceCapture, SourceView, WorldPrior
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RunRequest
@@ -31,6 +32,8 @@ from vdgs.pipeline.dry_run import estimate_run
 from vdgs.pipeline.run_pipeline import reconstruct_if_needed
 from vdgs.sfm import feature_extraction, feature_matching
 from vdgs.sfm.posed_capture import make_posed_capture
+from vdgs.sfm.posed_photographs import _in_metres, read_posed_photographs
+from vdgs.sfm.random_points import random_points
 from vdgs.synth.ray_tracing import RayTracer
 from vdgs.synth.town import build_town
 
@@ -159,3 +162,113 @@ def test_photographs_of_other_poses_are_refused(town_flight: tuple[Path, KnownFl
     project_writers.write_realityscan_csv(root / "cameras.csv", replace(flight, names=flight.names[::-1]))
     with pytest.raises(CaptureError, match="agree with the poses"):
         ask(root, tmp_path / "capture")
+
+
+# ------------------------------------------------------------------------------------- data sets without points
+
+
+def _frames(flight: KnownFlight, indices: Sequence[int], name: str) -> list[dict]:
+    opengl = np.diag([1.0, -1.0, -1.0, 1.0])
+    return [
+        {"file_path": name.format(k), "transform_matrix": (np.linalg.inv(flight.poses[k]) @ opengl).tolist()}
+        for k in indices
+    ]
+
+
+def test_transforms_without_points_keep_their_poses_and_lists(
+    town_flight: tuple[Path, KnownFlight], tmp_path: Path
+) -> None:
+    """As instant-ngp writes it, with nerfstudio's lists."""
+    root, flight = town_flight
+    names = [f"./images/{name}" for name in flight.names]
+    content = {
+        "fl_x": 340.0, "fl_y": 340.0, "cx": 200.0, "cy": 150.0, "w": 400, "h": 300, "aabb_scale": 16,
+        "frames": [frame | {"file_path": names[k]} for k, frame in enumerate(_frames(flight, range(7), ""))],
+        "train_filenames": names[:5], "test_filenames": names[5:6],
+    }  # fmt: skip
+    shutil.copytree(root / "straight", tmp_path / "set" / "images")
+    (tmp_path / "set" / "transforms.json").write_text(json.dumps(content))
+    assert lacks_points(tmp_path / "set", CaptureOptions())
+    with pytest.raises(CaptureError, match=r"found, with the poses as they are, by vdgs run and by vdgs sfm"):
+        load_capture(tmp_path / "set")
+    request = SfmRequest(image_folders=(tmp_path / "set",), output=tmp_path / "capture")
+    photographs = read_posed_photographs(request, CaptureOptions())
+    assert any("1 of 7 photographs stand in none" in warning for warning in photographs.warnings)
+    assert [photographs.views[k].view.name for k in photographs.trained] == flight.names[:5]
+    assert [view.view.split for view in photographs.views][5:] == ["test"]
+    poses = np.stack([view.view.camera_from_world for view in photographs.views])
+    np.testing.assert_allclose(poses, flight.poses[:6], atol=1e-9)
+    every = read_posed_photographs(request, CaptureOptions(split="every"))
+    assert len(every.trained) == 7
+
+
+def test_a_set_of_blender_is_put_on_white(town_flight: tuple[Path, KnownFlight], tmp_path: Path) -> None:
+    root, flight = town_flight
+    for side, indices in (("train", range(4)), ("test", range(4, 6))):
+        (tmp_path / "set" / side).mkdir(parents=True)
+        for k in indices:
+            pixels = np.asarray(Image.open(root / "straight" / flight.names[k]).convert("RGBA")).copy()
+            pixels[:, :100] = 0
+            Image.fromarray(pixels).save(tmp_path / "set" / side / f"r_{k}.png", compress_level=1)
+        content = {"camera_angle_x": 2 * np.arctan(200 / 340), "frames": _frames(flight, indices, f"./{side}/r_{{}}")}
+        (tmp_path / "set" / f"transforms_{side}.json").write_text(json.dumps(content))
+    said = ask(tmp_path / "set", tmp_path / "capture")
+    assert "6 photographs are transparent: what is transparent becomes white" in said
+    capture = load_capture(tmp_path / "capture", CaptureOptions(up="z"))
+    assert [view.name for view in capture.test_views] == ["test/r_4.png.jpg", "test/r_5.png.jpg"]
+    assert all(view.observations is None or not len(view.observations.points) for view in capture.test_views)
+    assert not (tmp_path / "capture" / "masks").exists()
+    for view in capture.views:
+        pixels = np.asarray(Image.open(view.image_path)).astype(int)
+        assert pixels[:, :90].min() > 240
+        assert pixels[:, 110:].mean() < 200
+    to_world = _from_ground(capture.ground)
+    centers = to_world(np.stack([view.camera.position for view in capture.train_views]))
+    assert np.abs(centers - centers_of(flight.poses[:4])).max() < 1e-6
+    heights = to_world(capture.points)[:, 2]
+    assert len(heights) > 100
+    assert (np.abs(heights - np.median(heights)) < 25).mean() > 0.95
+
+
+def test_photographs_without_features_start_from_random_points_that_are_said(tmp_path: Path) -> None:
+    """Cameras on a ring about an object without any feature."""
+    (tmp_path / "set" / "train").mkdir(parents=True)
+    frames = []
+    for k in range(6):
+        turn = 2 * np.pi * k / 6
+        back = np.array([np.cos(turn), np.sin(turn), 0.5]) / np.sqrt(1.25)
+        right = np.cross([0, 0, 1], back) / np.linalg.norm(np.cross([0, 0, 1], back))
+        pose = np.eye(4)
+        pose[:3] = np.column_stack([right, np.cross(back, right), back, 4 * back])
+        Image.new("RGB", (120, 120), (200, 200, 200)).save(tmp_path / "set" / "train" / f"r_{k}.png")
+        frames.append({"file_path": f"./train/r_{k}", "transform_matrix": pose.tolist()})
+    content = {"camera_angle_x": 0.7, "frames": frames}
+    (tmp_path / "set" / "transforms_train.json").write_text(json.dumps(content))
+    said = ask(tmp_path / "set", tmp_path / "capture")
+    assert "the scene starts from" in said
+    assert "random points in the middle of what the cameras see (a box of 2.67 units)" in said
+    capture = load_capture(tmp_path / "capture", CaptureOptions(up="z"))
+    points = _from_ground(capture.ground)(capture.points)
+    assert len(points) > 10_000
+    assert np.abs(points).max() <= 4 / 3 + 1e-6
+    lens = Intrinsics("PINHOLE", (164.0, 164.0, 60.0, 60.0), 120, 120)
+    along = [np.vstack([np.column_stack([np.eye(3), [k, 0, 0]]), [0, 0, 0, 1]]) for k in range(4)]
+    with pytest.raises(CaptureError, match="look at no common place"):
+        random_points(along, [lens] * 4)
+
+
+def test_metres_of_mega_nerf_and_the_city_stay() -> None:
+    down = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
+    pose = np.vstack([np.column_stack([np.eye(3), [1.0, 2, 3]]), [0, 0, 0, 1]])
+    lens = Intrinsics("PINHOLE", (164.0, 164.0, 60.0, 60.0), 120, 120)
+    source = SourceCapture(
+        source="matrixcity", images="", views=(SourceView(name="a", camera_from_world=pose, intrinsics=lens),),
+        points=np.zeros((0, 3)), colors=np.zeros((0, 3), np.uint8), world=WorldPrior(down, 100.0, True, "the format"),
+    )  # fmt: skip
+    moved = _in_metres(source)
+    point = np.array([0.3, -0.2, 5.0])
+    in_camera = pose[:3, :3] @ point + pose[:3, 3]
+    [view] = moved.views
+    again = view.camera_from_world[:3, :3] @ (100 * down @ point) + view.camera_from_world[:3, 3]
+    np.testing.assert_allclose(again, 100 * in_camera, atol=1e-9)
+    assert moved.georef is not None

@@ -15,13 +15,12 @@ from vdgs.captures.formats.colmap import count_images, find_models, has_both_kin
 from vdgs.captures.formats.matrixcity import pose_files, read_matrixcity
 from vdgs.captures.formats.mega_nerf import is_mega_nerf, read_mega_nerf
 from vdgs.captures.formats.ply_reader import read_point_cloud
-from vdgs.captures.formats.project import NoTiePoints
 from vdgs.captures.formats.source_capture import SourceCapture
-from vdgs.captures.formats.sparse_points import POINT_CLOUDS, find_point_cloud
+from vdgs.captures.formats.sparse_points import POINT_CLOUDS, NoTiePoints, find_point_cloud, has_sparse_points
 from vdgs.captures.formats.transforms import TRANSFORMS_FILE, exclusive_information, read_transforms
 from vdgs.captures.image_files import find_images, readable_suffixes
 from vdgs.captures.nested_captures import foreign_poses, model_below
-from vdgs.captures.project_formats import PROJECTS, find_projects, is_project, read_project
+from vdgs.captures.project_formats import PROJECTS, find_projects, is_project, read_project, read_project_poses
 from vdgs.captures.reconstruction import is_reconstruction
 from vdgs.captures.strays import check_no_run
 from vdgs.config.capture_options import CaptureOptions
@@ -67,15 +66,27 @@ def read_source(root: Path, options: CaptureOptions) -> SourceCapture:
 
 
 def lacks_points(path: Path, options: CaptureOptions) -> bool:
-    """Whether a folder, or a file, is a project of another program with poses, whose points are to be found first.
-    Raises as `read_source`."""
-    if any(is_here(path) for is_here, _ in READERS.values()) or not is_project(path):
+    """Whether a folder, or a file, has poses, as a project of another program or in the layout of a data set, and its
+    points are to be found first. Raises as `read_source`."""
+    if any(is_here(path) for is_here, _ in READERS.values()):
+        if has_sparse_points(path):
+            return False
+    elif not is_project(path):
         return False
     try:
         read_source(path, options)
     except NoTiePoints:
         return True
     return False
+
+
+def read_poses(path: Path, options: CaptureOptions) -> SourceCapture:
+    """The cameras of what `lacks_points`. Raises as `read_source`."""
+    layouts = [name for name, (is_here, _) in READERS.items() if is_here(path)]
+    if options.format in PROJECTS or not layouts:
+        return read_project_poses(path, options)
+    check_folder("--images", options.images)
+    return READERS[layouts[0]][1](path, options, needs_points=False)
 
 
 def _read(root: Path, name: str, options: CaptureOptions) -> SourceCapture:
@@ -184,7 +195,7 @@ def _other_image_folder(root: Path) -> tuple[str, list[str]]:
 
 
 #: Of each format, in the order in which they are looked for: whether a folder holds it, and its reader.
-READERS: dict[str, tuple[Callable[[Path], object], Callable[[Path, CaptureOptions], SourceCapture]]] = {
+READERS: dict[str, tuple[Callable[[Path], object], Callable[..., SourceCapture]]] = {
     "mega-nerf": (is_mega_nerf, read_mega_nerf),
     "matrixcity": (pose_files, read_matrixcity),
     "colmap": (find_models, _read_colmap),

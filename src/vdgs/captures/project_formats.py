@@ -71,7 +71,7 @@ def read_project(path: Path, name: str, options: CaptureOptions, *, needs_points
     return project_capture(project, capture_root(path), options, needs_points=needs_points)
 
 
-def read_poses(path: Path, options: CaptureOptions) -> SourceCapture:
+def read_project_poses(path: Path, options: CaptureOptions) -> SourceCapture:
     """The cameras of the project that a folder holds or a file is, whether it has points or not."""
     name = options.format if options.format in PROJECTS else next(find_projects(path), ("", path))[0]
     if not name:

@@ -1,4 +1,5 @@
-"""A capture of a project that has poses and no points: points are found with poses and lenses held as they are.
+"""A capture of a project or data set that has poses and no points: points are found with poses and lenses held as they
+are.
 
 Features are found in the photographs as they are, and their places brought to one pinhole for all photographs of a size
 by the project's own lenses, whatever their models and however many they are; pairs that look at the same are matched,
@@ -9,24 +10,22 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.console import Console
 
-from vdgs.captures.capture_root import capture_root
+from vdgs.captures.formats.colmap_writing import write_model_files
 from vdgs.captures.formats.lens_projection import colmap_camera, pixel_rays
-from vdgs.captures.formats.source_capture import Intrinsics, SourceCapture
+from vdgs.captures.formats.ply_reader import GRAY
+from vdgs.captures.formats.source_capture import Intrinsics, SourceCapture, SourceView
 from vdgs.captures.georeference import ENU_FRAME, LOCAL_FRAME, ORIGIN_KEYS
-from vdgs.captures.image_files import decode_image, read_header
-from vdgs.captures.image_matching import MatchedView, match_images
-from vdgs.captures.image_tags import kind_of
+from vdgs.captures.image_files import decode_image
 from vdgs.captures.name_resolution import jpeg_name
 from vdgs.captures.output_guard import check_output
-from vdgs.captures.project_formats import read_poses
 from vdgs.captures.reconstruction import STEPS_FILE, WORK_FOLDER
+from vdgs.captures.splits import TEST_LIST
 from vdgs.captures.up_axis import estimate_up
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.ranges import check_ranges
@@ -36,14 +35,22 @@ from vdgs.geometry.similarity import rotation_to_z
 from vdgs.kernels import default_num_threads
 from vdgs.runs.run_folder import RunFolder
 from vdgs.sfm import capture_writer, feature_extraction, feature_matching, mask_files, pair_selection
-from vdgs.sfm.image_metadata import ImageMetadata
+from vdgs.sfm.posed_photographs import (
+    BENT,
+    CAPTURE,
+    FEATURES,
+    MATCHES,
+    POINTS,
+    PosedPhotographs,
+    read_posed_photographs,
+    write_on_white,
+)
+from vdgs.sfm.random_points import random_points
 from vdgs.sfm.reconstruct import check_nothing_trained, writing
-from vdgs.sfm.workspace import Workspace, cache_key, call_cancellable, report_progress, silence_colmap
-from vdgs.system.atomic_files import write_json
+from vdgs.sfm.workspace import Workspace, call_cancellable, report_progress, silence_colmap
+from vdgs.system.atomic_files import write_json, write_text
 from vdgs.system.lazy_pycolmap import pycolmap
 
-#: The steps of the work, and the folder of the features as the photographs show them.
-FEATURES, MATCHES, POINTS, CAPTURE, BENT = "features", "matches", "points", "capture", "bent"
 #: Where features go that the lens cannot have shown: no pair of them agrees with any.
 _NOWHERE = -1e5
 #: Fewer points than this are no scene.
@@ -51,26 +58,6 @@ MIN_POINTS = 100
 #: Of features that were matched and verified, poses that are true place at least this share (choice: of a generated
 #: flight 99.9 % are placed, 42 to 54 % where photographs and poses are exchanged).
 LEAST_AGREEING = 0.65
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class PosedPhotographs:
-    """The photographs of a project in name order, and what makes each step anew."""
-
-    source: SourceCapture
-    views: tuple[MatchedView, ...]
-    #: A camera for each size of photographs, whose numbers in COLMAP's database are 1, 2, ...
-    pinholes: tuple[Intrinsics, ...]
-    keys: dict[str, str]
-    warnings: tuple[str, ...]
-
-    def number_of(self, view: MatchedView) -> int:
-        sizes = [_size(pinhole) for pinhole in self.pinholes]
-        return 1 + sizes.index(_size(view.file.intrinsics))
-
-
-def _size(lens: Intrinsics) -> tuple[int, int]:
-    return lens.width, lens.height
 
 
 def make_posed_capture(
@@ -92,12 +79,12 @@ def make_posed_capture(
     for warning in photographs.warnings:
         console.print(f"[yellow]note[/] {warning}", highlight=False)
     if finished.is_done(CAPTURE, photographs.keys[CAPTURE]):
-        console.print(f"{output}: made of this project already; nothing to do", highlight=False)
+        console.print(f"{output}: made of these poses already; nothing to do", highlight=False)
         return
     _check_output(output, work, finished, photographs.keys, request.overwrite)
     check_nothing_trained(request, run)
     console.print(
-        f"{len(photographs.views)} photographs, poses and lenses as the project has them; points are found",
+        f"{len(photographs.views)} photographs, poses and lenses as they are; points are found",
         highlight=False,
     )
     with writing(request, run):
@@ -107,50 +94,13 @@ def make_posed_capture(
         if not finished.is_begun(CAPTURE, photographs.keys[CAPTURE]):
             for name in (*(folder for folder, _ in capture_writer.IMAGE_SIZES), capture_writer.MASK_FOLDER, "sparse"):
                 shutil.rmtree(output / name, ignore_errors=True)
-            (output / "georef.json").unlink(missing_ok=True)
+            for name in ("georef.json", TEST_LIST):
+                (output / name).unlink(missing_ok=True)
             finished.begin(CAPTURE, photographs.keys[CAPTURE])
         _write(photographs, work, model, request, threads, console)
         finished.finish(CAPTURE, photographs.keys[CAPTURE])
     console.print(f"{model.num_points3D():,} points, mean reprojection error "
                   f"{model.compute_mean_reprojection_error():.2f} px", highlight=False)  # fmt: skip
-
-
-def read_posed_photographs(request: SfmRequest, options: CaptureOptions) -> PosedPhotographs:
-    """The cameras of a project and the photographs that are there. Raises `CaptureError` for fewer than three."""
-    [path] = request.image_folders
-    root, warnings = capture_root(path), list[str]()
-    source = read_poses(path, options)
-    views, _ = match_images(root, source, options, warnings)
-    if len(views) < 3:
-        raise CaptureError(f"{path}: {len(views)} photographs with a pose are there; points need 3 at the very least.")
-    views = sorted(views, key=lambda view: view.view.name)
-    lenses = [view.file.intrinsics for view in views]
-    files = [_fingerprint(view) for view in views]
-    chosen = request.options
-    found = cache_key(files, chosen.max_image_size, chosen.max_num_features)
-    straight = cache_key(
-        found, [vars(lens) for lens in lenses], [view.view.camera_from_world.tolist() for view in views]
-    )
-    matched = cache_key(straight, chosen.num_neighbors)
-    keys = {FEATURES: found, BENT: straight, MATCHES: matched, POINTS: matched}
-    keys[CAPTURE] = cache_key(matched, chosen.max_output_size, source.georef and vars(source.georef))
-    return PosedPhotographs(
-        source=source, views=tuple(views), pinholes=_pinholes(lenses), keys=keys, warnings=(*source.warnings, *warnings)
-    )
-
-
-def _pinholes(lenses: Sequence[Intrinsics]) -> tuple[Intrinsics, ...]:
-    """For the photographs of each size one camera about as theirs are, without distortion."""
-    found = []
-    for width, height in dict.fromkeys(map(_size, lenses)):
-        focal = float(np.median([lens.focal for lens in lenses if _size(lens) == (width, height)]))
-        found.append(Intrinsics("PINHOLE", (focal, focal, width / 2, height / 2), width, height))
-    return tuple(found)
-
-
-def _fingerprint(view: MatchedView) -> list[object]:
-    stats = [file.stat() for file in (view.file.path, view.file.mask) if file is not None]
-    return [view.view.name, *((stat.st_size, stat.st_mtime_ns) for stat in stats)]
 
 
 def _check_output(output: Path, work: Workspace, finished: Workspace, keys: dict[str, str], overwrite: bool) -> None:
@@ -183,6 +133,7 @@ def _find_features(
     groups = _groups(photographs)
     images = [image for group in groups for image in group.images]
     feature_extraction.create_database(bent, groups)
+    write_on_white(photographs, bent)
     feature_extraction.write_upright_images(bent, images)
     if not work.is_done(FEATURES, keys[FEATURES]):
         mask_files.write_upright_masks(bent, images, threads)
@@ -190,7 +141,8 @@ def _find_features(
         with report_progress(work, console, "features", len(images)) as tell:
             feature_extraction.extract_groups(bent, groups, request.options, len(images), threads, there, tell)
         work.finish(FEATURES, keys[FEATURES])
-    feature_extraction.images_without_features(images, feature_extraction.count_features(bent))
+    if not photographs.is_data_set:  # objects without texture begin from random points
+        feature_extraction.images_without_features(images, feature_extraction.count_features(bent))
     if work.is_done(BENT, keys[BENT]):
         return
     work.begin(BENT, keys[BENT])
@@ -204,7 +156,9 @@ def _find_features(
 def _groups(photographs: PosedPhotographs) -> list[feature_extraction.CameraGroup]:
     groups = []
     for number, lens in enumerate(photographs.pinholes, 1):
-        members = tuple(image_metadata(view) for view in photographs.views if photographs.number_of(view) == number)
+        members = tuple(
+            photographs.metadata(view) for view in photographs.views if photographs.number_of(view) == number
+        )
         groups.append(
             feature_extraction.CameraGroup(
                 camera="", width=lens.width, height=lens.height, focal_px=lens.focal[0], has_focal_prior=True,
@@ -212,17 +166,6 @@ def _groups(photographs: PosedPhotographs) -> list[feature_extraction.CameraGrou
             )
         )  # fmt: skip
     return groups
-
-
-def image_metadata(view: MatchedView) -> ImageMetadata:
-    """The photograph as its file has it: poses of projects are of that, whatever EXIF says of its orientation."""
-    path, lens = view.file.path, view.file.intrinsics
-    return ImageMetadata(
-        name=view.view.name, path=path, width=lens.width, height=lens.height, orientation=1, camera="", lens=None,
-        datetime="", lat_lon=None, altitude=None, altitude_type="", gps_std=None, gps_error_m=None,
-        relative_altitude=None, attitude=None, file_bytes=path.stat().st_size,
-        has_alpha_channel="A" in read_header(path).mode, mask=view.file.mask, kind=kind_of(path),
-    )  # fmt: skip
 
 
 def _straighten(photographs: PosedPhotographs, work: Workspace) -> None:
@@ -263,13 +206,19 @@ def _match(photographs: PosedPhotographs, work: Workspace, request: SfmRequest, 
 
 def near_pairs(photographs: PosedPhotographs, num_neighbors: int) -> set[tuple[int, int]]:
     """Pairs of photographs whose cameras are near each other and look the same way."""
-    count = len(photographs.views)
-    if count <= pair_selection.SEQUENTIAL_OVERLAP:
-        return pair_selection.exhaustive_pairs(count)
-    poses = np.stack([view.view.camera_from_world for view in photographs.views])
+    used = photographs.trained
+    if len(used) <= pair_selection.SEQUENTIAL_OVERLAP:
+        pairs = pair_selection.exhaustive_pairs(len(used))
+    else:
+        pairs = _near_views([photographs.views[k].view for k in used], photographs.source, num_neighbors)
+    return {(used[i], used[j]) for i, j in pairs}
+
+
+def _near_views(views: Sequence[SourceView], source: SourceCapture, num_neighbors: int) -> set[tuple[int, int]]:
+    poses = np.stack([view.camera_from_world for view in views])
     rotations, centers = poses[:, :3, :3], -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
     level = np.eye(3)
-    if photographs.source.georef is None:
+    if source.georef is None:
         level = rotation_to_z(estimate_up(centers, rotations, centers, [])[0])
     return pair_selection.spatial_pairs(centers @ level.T, num_neighbors, rotations[:, 2] @ level.T)
 
@@ -292,7 +241,12 @@ def _triangulate(
             _triangulate_points, work.database, posed_model(photographs, work), work.path, folder, options
         )
         tell(len(photographs.views))
-    _check_agreement(model, work)
+    if photographs.is_data_set and model.num_points3D() < MIN_POINTS:
+        model = _with_random_points(photographs, work, console)
+        shutil.rmtree(folder)
+        write_model_files(model, folder)
+    else:
+        _check_agreement(model, work)
     work.finish(POINTS, key)
     return model
 
@@ -308,6 +262,22 @@ def _check_agreement(model: pycolmap.Reconstruction, work: Workspace) -> None:
             "size and not turned, and are its lenses exported with it? Or let poses be found anew: give the folder of "
             "the photographs alone to vdgs sfm."
         )
+
+
+def _with_random_points(photographs: PosedPhotographs, work: Workspace, console: Console) -> pycolmap.Reconstruction:
+    """A model of the poses with random points, where features give too few."""
+    views = [photographs.views[k] for k in photographs.trained]
+    poses, lenses = [view.view.camera_from_world for view in views], [view.file.intrinsics for view in views]
+    points, edge = random_points(poses, lenses)
+    console.print(
+        f"[yellow]note[/] the photographs share too few features for points: the scene starts from {len(points):,} "
+        f"random points in the middle of what the cameras see (a box of {edge:.3g} units).",
+        highlight=False,
+    )
+    model = posed_model(photographs, work)
+    for point in points:
+        model.add_point3D(point, pycolmap.Track(), np.full(3, GRAY, np.uint8))
+    return model
 
 
 def _triangulate_points(database: Path, model: Any, images: Path, output: Path, options: Any, **named: Any) -> Any:
@@ -364,6 +334,9 @@ def _write(
         write_json(
             output / "georef.json", {"frame": frame, **place, "method": georef.method, "accuracy": georef.accuracy}
         )
+    tests = [capture_writer.jpeg_name(view.view.name) for view in photographs.views if view.view.split == "test"]
+    if tests:
+        write_text(output / TEST_LIST, "\n".join(tests) + "\n")
     shutil.rmtree(output / "sparse", ignore_errors=True)
     capture_writer.write_model(output, model, lenses, lens_of)
 
@@ -373,7 +346,7 @@ def color_points(
 ) -> None:
     """Each point gets the mean color of where written photographs (the smallest of them) show it."""
     folder, factor = capture_writer.IMAGE_SIZES[-1]
-    numbers = np.array(sorted(model.points3D), dtype=np.uint64)
+    numbers = np.array(sorted(number for number, point in model.points3D.items() if point.track.length()), np.uint64)
     sums = np.zeros((len(numbers), 4))
     for image in model.images.values():
         seen = [point for point in image.points2D if point.has_point3D()]

@@ -16,7 +16,8 @@ from vdgs.sfm.focal_length import Lens
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_list import ImageList
 from vdgs.sfm.image_metadata import ImageMetadata
-from vdgs.sfm.posed_capture import PosedPhotographs, image_metadata, near_pairs, read_posed_photographs
+from vdgs.sfm.posed_capture import near_pairs
+from vdgs.sfm.posed_photographs import PosedPhotographs, read_posed_photographs
 from vdgs.sfm.preflight import make_preflight_report
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.sfm_estimate import SfmEstimate, estimate_sfm
@@ -56,7 +57,8 @@ def _with_lenses(photographs: PosedPhotographs) -> Iterator[ImageMetadata]:
     for view in photographs.views:
         lens = view.file.intrinsics
         yield replace(
-            image_metadata(view), lens=Lens(float(np.mean(lens.focal)) / max(lens.width, lens.height), "the project")
+            photographs.metadata(view),
+            lens=Lens(float(np.mean(lens.focal)) / max(lens.width, lens.height), "the project"),
         )
 
 

@@ -203,8 +203,6 @@ def _place_anew(
     return _finish(prepared, outcome, key)
 
 
-
-
 def _steps(
     plan: ReconstructionPlan, workspace: Workspace, keys: dict[str, str], console: Console
 ) -> ReconstructionReport:

@@ -61,7 +61,7 @@ def pose_files(root: Path) -> list[tuple[Path, Split]]:
     return []
 
 
-def read_matrixcity(root: Path, options: CaptureOptions) -> SourceCapture:
+def read_matrixcity(root: Path, options: CaptureOptions, *, needs_points: bool = True) -> SourceCapture:
     """The capture in MatrixCity's layout, its world as in the files (z up).
 
     Points come from points3D.ply in the same world, or from a COLMAP model in sparse/. Raises
@@ -90,7 +90,8 @@ def read_matrixcity(root: Path, options: CaptureOptions) -> SourceCapture:
     if len(scales) > 1:
         raise CaptureError(f"{root}: some poses are in metres and some in units of 100 m. Use one kind of pose file.")
     poses = {view.name: view.camera_from_world for view in views}
-    points, colors = find_sparse_points(root, poses, "MatrixCity's layout")
+    what = "MatrixCity's layout" if is_city else files[0][0].name
+    points, colors = find_sparse_points(root, poses, what, needs_points=needs_points)
     world = WorldPrior(np.eye(3), 1.0, False, "z is up by the format")
     if is_city:
         unit = scales.pop()

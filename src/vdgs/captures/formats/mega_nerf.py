@@ -39,7 +39,7 @@ def is_mega_nerf(root: Path) -> bool:
     return (root / "train" / "metadata").is_dir()
 
 
-def read_mega_nerf(root: Path, options: CaptureOptions) -> SourceCapture:
+def read_mega_nerf(root: Path, options: CaptureOptions, *, needs_points: bool = True) -> SourceCapture:
     """The capture in Mega-NeRF's layout; its world is that of coordinates.pt, in metres, axes DRB.
 
     Points come from points3D.ply (in the same world) or a COLMAP model in sparse/. `options.images` names
@@ -64,7 +64,9 @@ def read_mega_nerf(root: Path, options: CaptureOptions) -> SourceCapture:
             f"{error}\n(For UrbanScene3D, copy the raw photographs as Mega-NeRF's README says.)"
         ) from None
     poses = {view.name: view.camera_from_world for view in views}
-    points, colors = find_sparse_points(root, poses, "Mega-NeRF's layout", _aliases(root, views))
+    points, colors = find_sparse_points(
+        root, poses, "Mega-NeRF's layout", _aliases(root, views), needs_points=needs_points
+    )
     world = WorldPrior(GROUND_FROM_DRB, 1.0, True, "Mega-NeRF: x is down, metres by pose_scale_factor")
     folders = tuple(root / folder / images for folder, _ in SPLIT_FOLDERS)
     return SourceCapture(

@@ -23,7 +23,7 @@ from vdgs.captures.formats.photograph_sizes import leave_out
 from vdgs.captures.formats.ply_reader import read_point_cloud
 from vdgs.captures.formats.project_photographs import find_photographs
 from vdgs.captures.formats.source_capture import Intrinsics, SourceCapture, SourceView
-from vdgs.captures.formats.sparse_points import find_point_cloud
+from vdgs.captures.formats.sparse_points import NoTiePoints, find_point_cloud
 from vdgs.captures.georeference import Georef
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -39,10 +39,6 @@ MAX_DISTANCE_RATIO = 100.0
 _DENSE = ("odm_georeferencing", "*/2_densification/point_cloud", "2_densification/point_cloud")
 #: The name of some coordinates, and what brings points [n, 3] from there.
 CloudFrame = tuple[str, Callable[[np.ndarray], np.ndarray]]
-
-
-class NoTiePoints(CaptureError):
-    """A project without points, from which `vdgs sfm` makes a capture that has them."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -12,6 +12,7 @@ from vdgs.captures.formats.ply_reader import read_point_cloud
 from vdgs.captures.name_resolution import match_stem
 from vdgs.errors import CaptureError
 from vdgs.geometry.similarity import fit_similarity_robust, is_collinear
+from vdgs.system.quoting import shell_word
 
 #: Names under which a point cloud in the capture's own world is looked for.
 POINT_CLOUDS = (
@@ -22,8 +23,18 @@ POINT_CLOUDS = (
 MAX_RELATIVE_RMS = 0.02
 
 
+class NoTiePoints(CaptureError):
+    """Poses without points, from which `vdgs sfm` makes a capture that has them."""
+
+
 def find_sparse_points(
-    root: Path, poses: Mapping[str, np.ndarray], what: str, aliases: Mapping[str, str] | None = None, option: str = ""
+    root: Path,
+    poses: Mapping[str, np.ndarray],
+    what: str,
+    aliases: Mapping[str, str] | None = None,
+    option: str = "",
+    *,
+    needs_points: bool = True,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points [n, 3] float64 in the world of `poses` (camera-from-world by image name) and colors [n, 3]
     uint8.
@@ -31,7 +42,8 @@ def find_sparse_points(
     Taken from a PLY file in that world, else from a COLMAP model of the same photographs, which may live
     in any world: it is brought over by the similarity between the camera centers that both have. `aliases`
     maps names in the COLMAP model to names in `poses`; `option` is what the command line needs beside a model, so
-    that its cameras do not replace `poses`. Raises `CaptureError` if there is nothing, or nothing that fits.
+    that its cameras do not replace `poses`. Raises `NoTiePoints` if there is nothing, unless nothing
+    `needs_points`, and `CaptureError` if there is nothing that fits.
     """
     cloud = find_point_cloud(root)
     if cloud is not None:
@@ -40,9 +52,12 @@ def find_sparse_points(
     cloud = None if models else find_point_cloud(root, lone=True)
     if cloud is not None:
         return read_point_cloud(cloud)
+    if not models and not needs_points:
+        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     if not models:
-        raise CaptureError(
-            f"{root}: {what} brings no 3D points, from which the scene starts. Put a point cloud in the "
+        raise NoTiePoints(
+            f"{root}: {what} brings no 3D points, from which the scene starts. They are found, with the poses as "
+            f"they are, by vdgs run and by vdgs sfm {shell_word(root)} --output CAPTURE. Or put a point cloud in the "
             f"same world there as {POINT_CLOUDS[0]}, or a COLMAP model of the same photographs as sparse/0 (colmap "
             f"feature_extractor, exhaustive_matcher, then mapper or point_triangulator){option}."
         )
@@ -69,6 +84,11 @@ def find_sparse_points(
             f"{spread:.3g}, {inliers.sum()} of {len(pairs)} agree); it is another reconstruction or naming."
         )
     return similarity.apply(model.points), model.colors
+
+
+def has_sparse_points(root: Path) -> bool:
+    """Whether something is there in which `find_sparse_points` looks for points."""
+    return find_point_cloud(root, lone=True) is not None or bool(find_models(root))
 
 
 def find_point_cloud(*folders: Path, lone: bool = False) -> Path | None:

@@ -57,7 +57,7 @@ def exclusive_information(file: Path) -> str:
     return " and ".join(filter(None, (lists, "masks" if masked else "")))
 
 
-def read_transforms(root: Path, options: CaptureOptions) -> SourceCapture:
+def read_transforms(root: Path, options: CaptureOptions, *, needs_points: bool = True) -> SourceCapture:
     """The capture described by `root`/transforms.json. Points come from the file that it names, else as
     `find_sparse_points` finds them.
 
@@ -101,7 +101,7 @@ def read_transforms(root: Path, options: CaptureOptions) -> SourceCapture:
     twice = find_duplicates(view.name for view in views)
     if twice:
         raise CaptureError(f"{file}: the same image occurs more than once.{format_list(twice)}")
-    points, colors = _points(root, content, file, poses)
+    points, colors = _points(root, content, file, poses, needs_points)
     homogeneous = np.tile(np.eye(4), (len(points), 1, 1))
     homogeneous[:, :3, 3] = points
     moved = undo(homogeneous)[:, :3, 3]
@@ -177,9 +177,12 @@ def _undo_applied(content: JsonObject, file: Path) -> Callable[[np.ndarray], np.
     return undo
 
 
-def _points(root: Path, content: JsonObject, file: Path, poses: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def _points(
+    root: Path, content: JsonObject, file: Path, poses: dict[str, np.ndarray], needs_points: bool
+) -> tuple[np.ndarray, np.ndarray]:
     """Points and `poses` (camera-from-world by name) in the world of the file, before `applied_transform` is undone."""
     ply = content.get("ply_file_path")
     if ply is not None:
         return read_point_cloud(root / safe_name(str(ply), file, "ply_file_path", root))
-    return find_sparse_points(root, poses, TRANSFORMS_FILE, option=" and give --format transforms")
+    option = " and give --format transforms"
+    return find_sparse_points(root, poses, TRANSFORMS_FILE, option=option, needs_points=needs_points)

@@ -1,0 +1,163 @@
+"""Photographs whose poses are known and whose points are to be found: of projects, and of data sets without points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from PIL import Image
+
+from vdgs.captures.capture_root import capture_root
+from vdgs.captures.format_dispatch import READERS, read_poses
+from vdgs.captures.formats.source_capture import Intrinsics, SourceCapture, SourceView
+from vdgs.captures.georeference import Georef
+from vdgs.captures.image_files import pillow_without_limits, read_header
+from vdgs.captures.image_matching import MatchedView, match_images
+from vdgs.captures.image_tags import kind_of
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.sfm_options import SfmRequest
+from vdgs.errors import CaptureError
+from vdgs.sfm.image_metadata import ImageMetadata
+from vdgs.sfm.workspace import Workspace, cache_key
+from vdgs.system.atomic_files import write_bytes
+
+#: The steps of the work, and the folder of the features as the photographs show them.
+FEATURES, MATCHES, POINTS, CAPTURE, BENT = "features", "matches", "points", "capture", "bent"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PosedPhotographs:
+    """The photographs in name order, and what makes each step anew."""
+
+    source: SourceCapture
+    views: tuple[MatchedView, ...]
+    #: A camera for each size of photographs, whose numbers in COLMAP's database are 1, 2, ...
+    pinholes: tuple[Intrinsics, ...]
+    keys: dict[str, str]
+    warnings: tuple[str, ...]
+    on_white: bool = False
+    """Whether what is transparent becomes white; else it is masked."""
+
+    @property
+    def is_data_set(self) -> bool:
+        """Whether the poses are those of a data set, not of a project of another program."""
+        return self.source.source in READERS
+
+    @property
+    def trained(self) -> list[int]:
+        """The photographs that points are found from: those that are kept for testing are not, where a data set says
+        which these are."""
+        return [k for k, view in enumerate(self.views) if view.view.split != "test"]
+
+    def number_of(self, view: MatchedView) -> int:
+        sizes = [_size(pinhole) for pinhole in self.pinholes]
+        return 1 + sizes.index(_size(view.file.intrinsics))
+
+    def metadata(self, view: MatchedView) -> ImageMetadata:
+        """The photograph as its file has it: poses of projects are of that, whatever EXIF says of its orientation."""
+        path, lens = view.file.path, view.file.intrinsics
+        return ImageMetadata(
+            name=view.view.name, path=path, width=lens.width, height=lens.height, orientation=1, camera="", lens=None,
+            datetime="", lat_lon=None, altitude=None, altitude_type="", gps_std=None, gps_error_m=None,
+            relative_altitude=None, attitude=None, file_bytes=path.stat().st_size,
+            has_alpha_channel=_has_alpha(view) and not self.on_white, mask=view.file.mask, kind=kind_of(path),
+        )  # fmt: skip
+
+
+def read_posed_photographs(request: SfmRequest, options: CaptureOptions) -> PosedPhotographs:
+    """Raises CaptureError as the readers do, and for fewer than three photographs."""
+    [path] = request.image_folders
+    root, warnings = capture_root(path), list[str]()
+    source = _in_metres(read_poses(path, options))
+    views, _ = match_images(root, source, options, warnings)
+    views = sorted(_listed(views, options, warnings), key=lambda view: view.view.name)
+    if sum(view.view.split != "test" for view in views) < 3:
+        raise CaptureError(f"{path}: {len(views)} photographs with a pose are there; points need 3 at the very least.")
+    on_white = source.source == "matrixcity" and source.georef is None  # not the city: sets of Blender
+    transparent = sum(map(_has_alpha, views))
+    if transparent and source.source in READERS:
+        what = "becomes white, as is usual for sets of Blender" if on_white else "is left out, as by a mask"
+        warnings.append(f"{transparent} photographs are transparent: what is transparent {what}.")
+    return PosedPhotographs(
+        source=source, views=tuple(views), pinholes=_pinholes([view.file.intrinsics for view in views]),
+        keys=_keys(request, source, views), warnings=(*source.warnings, *warnings),
+        on_white=bool(on_white and transparent),
+    )  # fmt: skip
+
+
+def _keys(request: SfmRequest, source: SourceCapture, views: Sequence[MatchedView]) -> dict[str, str]:
+    files, lenses = [_fingerprint(view) for view in views], [view.file.intrinsics for view in views]
+    chosen = request.options
+    found = cache_key(files, chosen.max_image_size, chosen.max_num_features)
+    straight = cache_key(
+        found, [vars(lens) for lens in lenses], [view.view.camera_from_world.tolist() for view in views]
+    )
+    splits = [view.view.split for view in views]
+    matched = cache_key(straight, chosen.num_neighbors, *([splits] if any(splits) else []))
+    keys = {FEATURES: found, BENT: straight, MATCHES: matched, POINTS: matched}
+    keys[CAPTURE] = cache_key(matched, chosen.max_output_size, source.georef and vars(source.georef))
+    return keys
+
+
+def _in_metres(source: SourceCapture) -> SourceCapture:
+    """With poses in metres, z up, where a data set says how its world becomes that."""
+    world = source.world
+    if world is None or not world.metric:
+        return source
+    moved = list[SourceView]()
+    for view in source.views:
+        pose = view.camera_from_world.copy()
+        pose[:3, :3], pose[:3, 3] = pose[:3, :3] @ world.rotation.T, world.scale * pose[:3, 3]
+        moved.append(replace(view, camera_from_world=pose))
+    return replace(source, views=tuple(moved), world=None, georef=Georef(None, "", world.how))
+
+
+def _listed(views: list[MatchedView], options: CaptureOptions, warnings: list[str]) -> list[MatchedView]:
+    """Without photographs that stand in none of a data set's lists, as where it has points."""
+    kept = [view for view in views if view.view.split is not None]
+    if not kept or options.split == "every":
+        return [MatchedView(replace(view.view, split=None), view.file) for view in views]
+    if len(kept) < len(views):
+        warnings.append(
+            f"{len(views) - len(kept)} of {len(views)} photographs stand in none of the lists of training and test "
+            "photographs and are left out. --split every uses them all."
+        )
+    return kept
+
+
+def _has_alpha(view: MatchedView) -> bool:
+    return "A" in read_header(view.file.path).mode
+
+
+def _size(lens: Intrinsics) -> tuple[int, int]:
+    return lens.width, lens.height
+
+
+def _pinholes(lenses: Sequence[Intrinsics]) -> tuple[Intrinsics, ...]:
+    """For the photographs of each size one camera about as theirs are, without distortion."""
+    found = []
+    for width, height in dict.fromkeys(map(_size, lenses)):
+        focal = float(np.median([lens.focal for lens in lenses if _size(lens) == (width, height)]))
+        found.append(Intrinsics("PINHOLE", (focal, focal, width / 2, height / 2), width, height))
+    return tuple(found)
+
+
+def _fingerprint(view: MatchedView) -> list[object]:
+    stats = [file.stat() for file in (view.file.path, view.file.mask) if file is not None]
+    return [view.view.name, *((stat.st_size, stat.st_mtime_ns) for stat in stats)]
+
+
+def write_on_white(photographs: PosedPhotographs, work: Workspace) -> None:
+    """Copies of transparent photographs in the work folder, on white, where they are to become that."""
+    for view in photographs.views if photographs.on_white else ():
+        target = work.images / view.view.name
+        if target.exists() or not _has_alpha(view):
+            continue
+        with pillow_without_limits(), Image.open(view.file.path) as image:
+            pixels = np.asarray(image.convert("RGBA")).astype(np.float32)
+        alpha = pixels[..., 3:] / 255
+        flat = (pixels[..., :3] * alpha + 255 * (1 - alpha) + 0.5).astype(np.uint8)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(target, cv2.imencode(".png", flat[..., ::-1])[1].tobytes())
