@@ -22,8 +22,7 @@ from support.metashape_files import (
 )
 from support.true_flight import ORIGIN, SIZE, Lens, TrueFlight, assert_read_or_refused, assert_true, true_flight
 from vdgs.captures.formats.lens_projection import ray_pixels
-from vdgs.captures.formats.source_capture import SourceCapture
-from vdgs.captures.formats.sparse_points import NoTiePoints
+from vdgs.captures.formats.source_capture import NoTiePoints, SourceCapture
 from vdgs.captures.loading import read_files
 from vdgs.captures.project_formats import read_project
 from vdgs.config.capture_options import CaptureOptions

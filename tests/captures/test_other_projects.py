@@ -11,12 +11,12 @@ import pytest
 
 from support import project_writers as writers
 from support.known_flight import ORIGIN, BentLens, KnownFlight, centers_of, ecef, known_flight, poses_of
-from vdgs.captures.format_dispatch import lacks_points
+from vdgs.captures.format_dispatch import lacks_points, read_source
 from vdgs.captures.formats import las_reader
 from vdgs.captures.formats.lens_projection import ray_pixels
 from vdgs.captures.formats.source_capture import SourceCapture
 from vdgs.captures.loading import load_capture
-from vdgs.captures.project_formats import PROJECTS, find_projects, read_poses, read_project
+from vdgs.captures.project_formats import PROJECTS, find_projects, read_project
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import geodetic_from_enu
@@ -32,7 +32,7 @@ def flight() -> KnownFlight:
 def read(root: Path, name: str) -> SourceCapture:
     [(found, _)] = find_projects(root)
     assert found == name
-    return read_poses(root, OPTIONS)
+    return read_source(root, OPTIONS, needs_points=False)
 
 
 def check_numbers(source: SourceCapture, flight: KnownFlight, *, placed: bool = True, seen_px: float = 0.01) -> None:
@@ -130,7 +130,7 @@ def test_report_of_odm_is_read_where_its_reconstruction_is_gone(tmp_path: Path, 
         read_project(tmp_path, "opensfm", OPTIONS)
     _check_dense_cloud(tmp_path, flight)
     assert lacks_points(tmp_path / "odm_report" / "shots.geojson", OPTIONS)
-    check_numbers(read_poses(tmp_path / "odm_report" / "shots.geojson", OPTIONS), flight)
+    check_numbers(read_source(tmp_path / "odm_report" / "shots.geojson", OPTIONS, needs_points=False), flight)
     (tmp_path / "images").rename(tmp_path / "elsewhere")
     with pytest.raises(CaptureError, match="none of its 12 photographs"):
         lacks_points(tmp_path / "odm_report" / "shots.geojson", OPTIONS)
@@ -230,7 +230,7 @@ def test_parameters_of_pix4dmapper_are_read_to_their_numbers(tmp_path: Path, fli
     file = writers.write_pix4d(tmp_path / "flight", flight)
     flight.write_photographs(tmp_path / "images")
     check_numbers(read(tmp_path, "pix4d"), flight)
-    check_numbers(read_poses(file, CaptureOptions(images=str(tmp_path / "images"))), flight)
+    check_numbers(read_source(file, CaptureOptions(images=str(tmp_path / "images")), needs_points=False), flight)
     whole = file.read_text()
     file.write_text(whole[:-200])
     with pytest.raises(CaptureError, match="10 lines"):
@@ -350,7 +350,7 @@ def test_opf_of_a_site_is_metres_without_a_place(tmp_path: Path, flight: KnownFl
     source = read(tmp_path, "opf")
     assert source.georef is not None
     assert source.georef.origin is None
-    source = read_poses(tmp_path, CaptureOptions(format="opf"))
+    source = read_source(tmp_path, CaptureOptions(format="opf"), needs_points=False)
     apart = np.linalg.norm(np.diff(centers_of(poses_of(source, flight)), axis=0), axis=1)
     true = np.linalg.norm(np.diff(flight.centers, axis=0), axis=1)
     assert np.abs(apart / true - 1).max() < 1e-3  # UTM's scale

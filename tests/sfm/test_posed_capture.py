@@ -16,11 +16,13 @@ from PIL import Image
 from rich.console import Console
 
 from support import flights, project_writers
+from support.captures import TinyScene, write_colmap
+from support.dataset_layouts import OPENGL
 from support.known_flight import BentLens, KnownFlight, centers_of, ecef
 from vdgs.captures.format_dispatch import lacks_points
 from vdgs.captures.formats.brown_lens import brown_intrinsics, unproject_pixels
 from vdgs.captures.formats.colmap import read_colmap
-from vdgs.captures.formats.source_capture import Intrinsics, SourceCapture, SourceView, WorldPrior
+from vdgs.captures.formats.source_capture import Intrinsics, NoTiePoints, SourceCapture, SourceView, WorldPrior
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RunRequest
@@ -141,6 +143,41 @@ def test_run_of_a_project_without_points_finds_them_first(
         found = reconstruct_if_needed(request, Console(file=io.StringIO()))
         assert found.capture == tmp_path / "run" / "capture"
     assert len(load_capture(found.capture, found.options).views) == 5
+
+
+@pytest.mark.parametrize("is_model", [False, True])
+def test_captures_without_points_get_them_with_their_poses_and_lists(
+    town_flight: tuple[Path, KnownFlight], tmp_path: Path, is_model: bool
+) -> None:
+    """transforms.json as programs write it that know poses alone, and a model whose points3D.txt is empty."""
+    root, flight = town_flight
+    root, names, poses = root / "straight", flight.names[:4], flight.poses[:4]
+    (tmp_path / "images").mkdir()
+    for name in names:
+        shutil.copyfile(root / name, tmp_path / "images" / name)
+    if is_model:
+        cameras = dict(zip(names, flights.grid(2, 4, 9.0)[:4], strict=True))
+        empty = TinyScene(cameras, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+        write_colmap(tmp_path, empty, text=True, images=None)
+    else:
+        frames = [
+            {"file_path": f"images/{Path(name).stem}", "transform_matrix": (np.linalg.inv(pose) @ OPENGL).tolist()}
+            for name, pose in zip(names, poses, strict=True)
+        ]
+        tests = {"test_filenames": [frames[1]["file_path"]]}
+        content = {"camera_angle_x": 2 * np.arctan(200 / 340), **tests, "frames": frames}
+        (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(NoTiePoints, match=r"no 3D points.*\. This finds them.*: vdgs sfm .* --output CAPTURE\n"):
+        load_capture(tmp_path)
+    found = reconstruct_if_needed(
+        RunRequest(capture=tmp_path, output=tmp_path / "run", threads=2), Console(file=io.StringIO())
+    )
+    capture = load_capture(found.capture, replace(found.options, up="z"))
+    centers = _from_ground(capture.ground)(np.stack([view.camera.position for view in capture.views]))
+    assert np.abs(centers - centers_of(poses)).max() < 1e-6
+    assert len(capture.points) > 100
+    if not is_model:
+        assert [Path(view.name).stem for view in capture.test_views] == [Path(names[1]).stem]
 
 
 def _some_photographs(town_flight: tuple[Path, KnownFlight], tmp_path: Path) -> tuple[Path, KnownFlight]:

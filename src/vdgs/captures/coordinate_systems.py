@@ -80,9 +80,10 @@ def to_geodetic(header: str, file: Path, where: str = "the first line") -> tuple
     if crs.is_compound and not _has_grids(crs):
         name += "; heights as they are, for PROJ lacks the grid of their geoid"
     unknown = crs.datum is not None and not crs.is_bound and crs.datum.name.lower().startswith("unknown")
-    if unknown and crs.ellipsoid.name not in _GLOBAL:
+    ellipsoid = crs.ellipsoid.name if unknown and crs.ellipsoid is not None else "WGS 84"
+    if ellipsoid not in _GLOBAL:
         name += (
-            f" (ellipsoid {crs.ellipsoid.name} but no datum: taken as WGS 84, from which national datums differ by up "
+            f" (ellipsoid {ellipsoid} but no datum: taken as WGS 84, from which national datums differ by up "
             "to some hundred metres; an EPSG code, or +towgs84, names it)"
         )
     feet = flat and crs.is_projected and "foot" in (crs.axis_info[0].unit_name or "")

@@ -11,16 +11,23 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from vdgs.captures.formats.colmap import count_images, find_models, has_both_kinds, partial_model, read_colmap
+from vdgs.captures.formats.colmap import (
+    count_images,
+    find_models,
+    has_both_kinds,
+    has_points,
+    partial_model,
+    read_colmap,
+)
 from vdgs.captures.formats.matrixcity import pose_files, read_matrixcity
 from vdgs.captures.formats.mega_nerf import is_mega_nerf, read_mega_nerf
 from vdgs.captures.formats.ply_reader import read_point_cloud
-from vdgs.captures.formats.source_capture import SourceCapture
-from vdgs.captures.formats.sparse_points import POINT_CLOUDS, NoTiePoints, find_point_cloud, has_sparse_points
+from vdgs.captures.formats.source_capture import NoTiePoints, SourceCapture, no_points
+from vdgs.captures.formats.sparse_points import POINT_CLOUDS, find_point_cloud
 from vdgs.captures.formats.transforms import TRANSFORMS_FILE, exclusive_information, read_transforms
 from vdgs.captures.image_files import find_images, readable_suffixes
 from vdgs.captures.nested_captures import foreign_poses, model_below
-from vdgs.captures.project_formats import PROJECTS, find_projects, is_project, read_project, read_project_poses
+from vdgs.captures.project_formats import PROJECTS, find_projects, is_project, read_project
 from vdgs.captures.reconstruction import is_reconstruction
 from vdgs.captures.strays import check_no_run
 from vdgs.config.capture_options import CaptureOptions
@@ -28,8 +35,9 @@ from vdgs.errors import CaptureError
 from vdgs.system.quoting import shell_word
 
 
-def read_source(root: Path, options: CaptureOptions) -> SourceCapture:
-    """The capture in the format asked for, or in whichever the folder is.
+def read_source(root: Path, options: CaptureOptions, *, needs_points: bool = True) -> SourceCapture:
+    """The capture in the format asked for, or in whichever the folder is. Without `needs_points` one without points is
+    read too: what finds them needs its poses.
 
     Raises `CaptureError` where there is none, and as the readers do.
     """
@@ -39,12 +47,12 @@ def read_source(root: Path, options: CaptureOptions) -> SourceCapture:
         if options.format not in here:
             found = f"It holds: {', '.join(here)}." if here else "It holds none that is known."
             raise CaptureError(f"{root}: --format {options.format}, but the folder holds no such capture. {found}")
-        return _read(root, options.format, options)
+        return _read(root, options.format, options, needs_points)
     if here[:2] == ["colmap", "transforms"]:
         check_folder("--images", options.images)
-        return _of_both(root, options)
+        return _of_both(root, options, needs_points)
     if here:
-        source = _read(root, here[0], options)
+        source = _read(root, here[0], options, needs_points)
         note = f"{' and '.join(here[1:])} beside it: not read (--format chooses)."
         return replace(source, warnings=(note, *source.warnings)) if PROJECTS.keys() & here[1:] else source
     check_no_run(root)
@@ -66,12 +74,12 @@ def read_source(root: Path, options: CaptureOptions) -> SourceCapture:
 
 
 def lacks_points(path: Path, options: CaptureOptions) -> bool:
-    """Whether a folder, or a file, has poses, as a project of another program or in the layout of a data set, and its
-    points are to be found first. Raises as `read_source`."""
-    if any(is_here(path) for is_here, _ in READERS.values()):
-        if has_sparse_points(path):
-            return False
-    elif not is_project(path):
+    """Whether a folder, or a file, is a capture or a project with poses, whose points are to be found first. Raises as
+    `read_source`."""
+    is_capture, models = any(is_here(path) for is_here, _ in READERS.values()), find_models(path)
+    if is_capture and (has_points(_biggest(models)) if models else find_point_cloud(path, lone=True) is not None):
+        return False  # the usual case, without reading it all
+    if not is_capture and not is_project(path):
         return False
     try:
         read_source(path, options)
@@ -80,21 +88,12 @@ def lacks_points(path: Path, options: CaptureOptions) -> bool:
     return False
 
 
-def read_poses(path: Path, options: CaptureOptions) -> SourceCapture:
-    """The cameras of what `lacks_points`. Raises as `read_source`."""
-    layouts = [name for name, (is_here, _) in READERS.items() if is_here(path)]
-    if options.format in PROJECTS or not layouts:
-        return read_project_poses(path, options)
-    check_folder("--images", options.images)
-    return READERS[layouts[0]][1](path, options, needs_points=False)
-
-
-def _read(root: Path, name: str, options: CaptureOptions) -> SourceCapture:
+def _read(root: Path, name: str, options: CaptureOptions, needs_points: bool) -> SourceCapture:
     """The capture of a format that is there."""
     if name in PROJECTS:
-        return read_project(root, name, options)
+        return read_project(root, name, options, needs_points=needs_points)
     check_folder("--images", options.images)
-    return READERS[name][1](root, options)
+    return READERS[name][1](root, options, needs_points)
 
 
 def check_folder(flag: str, folder: str | None) -> None:
@@ -103,17 +102,19 @@ def check_folder(flag: str, folder: str | None) -> None:
         raise CaptureError(f"{flag} {folder}: must be a folder inside the capture, such as images_4.")
 
 
-def _of_both(root: Path, options: CaptureOptions) -> SourceCapture:
+def _of_both(root: Path, options: CaptureOptions, needs_points: bool) -> SourceCapture:
     """One of a COLMAP model and transforms.json, with a note about the other."""
     model = _biggest(find_models(root)).relative_to(root)
     theirs = f"the COLMAP model in {model}" if model.parts else "the COLMAP model"
     says = exclusive_information(root / TRANSFORMS_FILE)
     if not says:
         note = f"{theirs} is read; {TRANSFORMS_FILE} beside it is not (--format transforms reads that instead)."
-        source = _read_colmap(root, options)
+        source = _read_colmap(root, options, needs_points)
         return replace(source, warnings=(note, *source.warnings))
     try:
-        source = read_transforms(root, options)
+        source = read_transforms(root, options, needs_points)
+    except NoTiePoints:
+        raise
     except CaptureError as error:
         raise CaptureError(f"{error}\nOr read {theirs} instead: --format colmap") from error
     note = f"{TRANSFORMS_FILE} is read, for its {says}; {theirs} is not (--format colmap reads that instead)."
@@ -124,7 +125,7 @@ def _biggest(models: list[Path]) -> Path:
     return max(models, key=count_images)
 
 
-def _read_colmap(root: Path, options: CaptureOptions) -> SourceCapture:
+def _read_colmap(root: Path, options: CaptureOptions, needs_points: bool) -> SourceCapture:
     warnings, models = [], find_models(root)
     folder = _biggest(models)
     distinct = [model for model in models if model.resolve() != folder.resolve()]
@@ -140,14 +141,15 @@ def _read_colmap(root: Path, options: CaptureOptions) -> SourceCapture:
     points, colors = model.points, model.colors
     if not len(points):
         cloud = find_point_cloud(folder, folder.parent, root, lone=True)
-        if cloud is None:
-            raise CaptureError(
-                f"{folder}: the model holds no 3D points, from which the scene starts. Keep points3D.bin beside "
-                f"images.bin, or triangulate (colmap point_triangulator), or put a point cloud in the same world there "
-                f"as {POINT_CLOUDS[0]}."
-            )
-        points, colors = read_point_cloud(cloud)
-        warnings.append(f"the model holds no points; those of {cloud.relative_to(root)} are used.")
+        if cloud is not None:
+            points, colors = read_point_cloud(cloud)
+            warnings.append(f"the model holds no points; those of {cloud.relative_to(root)} are used.")
+        elif needs_points:
+            raise no_points(
+                root, f"{folder}: the model holds",
+                "Or keep points3D.bin beside images.bin, or put a point cloud in the same world there as "
+                f"{POINT_CLOUDS[0]}.",
+            )  # fmt: skip
     return SourceCapture(
         source="colmap", images=images, views=model.views, points=points, colors=colors,
         image_folders=(root / images,), warnings=(*warnings, *image_warnings),
@@ -195,7 +197,8 @@ def _other_image_folder(root: Path) -> tuple[str, list[str]]:
 
 
 #: Of each format, in the order in which they are looked for: whether a folder holds it, and its reader.
-READERS: dict[str, tuple[Callable[[Path], object], Callable[..., SourceCapture]]] = {
+#: The readers take whether they need points.
+READERS: dict[str, tuple[Callable[[Path], object], Callable[[Path, CaptureOptions, bool], SourceCapture]]] = {
     "mega-nerf": (is_mega_nerf, read_mega_nerf),
     "matrixcity": (pose_files, read_matrixcity),
     "colmap": (find_models, _read_colmap),

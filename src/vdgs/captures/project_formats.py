@@ -69,11 +69,3 @@ def read_project(path: Path, name: str, options: CaptureOptions, *, needs_points
     finds them needs its poses."""
     project = PROJECTS[name].read(project_file(path, name), options)
     return project_capture(project, capture_root(path), options, needs_points=needs_points)
-
-
-def read_project_poses(path: Path, options: CaptureOptions) -> SourceCapture:
-    """The cameras of the project that a folder holds or a file is, whether it has points or not."""
-    name = options.format if options.format in PROJECTS else next(find_projects(path), ("", path))[0]
-    if not name:
-        raise CaptureError(f"{path}: is no project that is read.")
-    return read_project(path, name, options, needs_points=False)

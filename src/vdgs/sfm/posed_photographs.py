@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from vdgs.captures.capture_root import capture_root
-from vdgs.captures.format_dispatch import READERS, read_poses
+from vdgs.captures.format_dispatch import READERS, read_source
 from vdgs.captures.formats.source_capture import Intrinsics, SourceCapture, SourceView
 from vdgs.captures.georeference import Georef
 from vdgs.captures.image_files import pillow_without_limits, read_header
@@ -70,7 +70,7 @@ def read_posed_photographs(request: SfmRequest, options: CaptureOptions) -> Pose
     """Raises CaptureError as the readers do, and for fewer than three photographs."""
     [path] = request.image_folders
     root, warnings = capture_root(path), list[str]()
-    source = _in_metres(read_poses(path, options))
+    source = _in_metres(read_source(path, options, needs_points=False))
     views, _ = match_images(root, source, options, warnings)
     views = sorted(_listed(views, options, warnings), key=lambda view: view.view.name)
     if sum(view.view.split != "test" for view in views) < 3:

@@ -89,6 +89,18 @@ def count_images(folder: Path) -> int:
         return -1
 
 
+def has_points(folder: Path) -> bool:
+    """Whether the model announces points, without reading it all."""
+    try:
+        if _format(folder) == ".bin":
+            with (folder / "points3D.bin").open("rb") as stream:
+                return any(stream.read(8))
+        with (folder / "points3D.txt").open(encoding="utf-8-sig", errors="replace") as lines:
+            return any(line.strip() and not line.lstrip().startswith("#") for line in lines)
+    except OSError:
+        return False
+
+
 def has_both_kinds(folder: Path) -> bool:
     """Whether a folder holds a binary model, which is read, and a text one of the same or of other poses."""
     return all((folder / f"images{suffix}").is_file() for suffix in (".bin", ".txt")) and _format(folder) == ".bin"

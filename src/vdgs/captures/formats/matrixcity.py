@@ -61,7 +61,7 @@ def pose_files(root: Path) -> list[tuple[Path, Split]]:
     return []
 
 
-def read_matrixcity(root: Path, options: CaptureOptions, *, needs_points: bool = True) -> SourceCapture:
+def read_matrixcity(root: Path, options: CaptureOptions, needs_points: bool = True) -> SourceCapture:
     """The capture in MatrixCity's layout, its world as in the files (z up).
 
     Points come from points3D.ply in the same world, or from a COLMAP model in sparse/. Raises

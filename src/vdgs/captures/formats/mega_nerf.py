@@ -39,7 +39,7 @@ def is_mega_nerf(root: Path) -> bool:
     return (root / "train" / "metadata").is_dir()
 
 
-def read_mega_nerf(root: Path, options: CaptureOptions, *, needs_points: bool = True) -> SourceCapture:
+def read_mega_nerf(root: Path, options: CaptureOptions, needs_points: bool = True) -> SourceCapture:
     """The capture in Mega-NeRF's layout; its world is that of coordinates.pt, in metres, axes DRB.
 
     Points come from points3D.ply (in the same world) or a COLMAP model in sparse/. `options.images` names

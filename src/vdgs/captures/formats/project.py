@@ -22,8 +22,8 @@ from vdgs.captures.formats.lens_projection import pixel_rays
 from vdgs.captures.formats.photograph_sizes import leave_out
 from vdgs.captures.formats.ply_reader import read_point_cloud
 from vdgs.captures.formats.project_photographs import find_photographs
-from vdgs.captures.formats.source_capture import Intrinsics, SourceCapture, SourceView
-from vdgs.captures.formats.sparse_points import NoTiePoints, find_point_cloud
+from vdgs.captures.formats.source_capture import Intrinsics, NoTiePoints, SourceCapture, SourceView
+from vdgs.captures.formats.sparse_points import find_point_cloud
 from vdgs.captures.georeference import Georef
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError

@@ -18,6 +18,7 @@ from vdgs.captures.capture import Observations, Split
 from vdgs.captures.georeference import Georef
 from vdgs.captures.name_resolution import find_file
 from vdgs.errors import CaptureError
+from vdgs.system.quoting import shell_word
 
 #: COLMAP's camera models: identifier -> (name, number of parameters).
 CAMERA_MODELS: dict[int, tuple[str, int]] = {
@@ -46,6 +47,10 @@ MAX_SIDE_PX = 100_000
 MAX_LISTED, MAX_MISSING_LISTED = 10, 100
 #: A capture is used without the photographs that are gone where at least this share is there (choice).
 LEAST_THERE = 3 / 4
+
+
+class NoTiePoints(CaptureError):
+    """A capture or project with poses but without points, which `vdgs sfm` finds."""
 
 
 @dataclass(frozen=True)
@@ -180,6 +185,14 @@ def safe_name(name: str, file: Path, what: str = "image name", root: Path | None
             "Names must be relative, without '..'; mend the file or export the model again."
         )
     return str(PurePosixPath(posix))
+
+
+def no_points(root: Path, what: str, other: str) -> NoTiePoints:
+    """The error of a capture whose poses come without points: what finds them, and what else to do."""
+    return NoTiePoints(
+        f"{what} no 3D points, from which the scene starts. This finds them, with the poses as they are: vdgs sfm "
+        f"{shell_word(root)} --output CAPTURE\n{other}"
+    )
 
 
 def find_image(root: Path, name: str) -> Path | None:

@@ -9,10 +9,10 @@ import numpy as np
 
 from vdgs.captures.formats.colmap import count_images, find_models, read_colmap
 from vdgs.captures.formats.ply_reader import read_point_cloud
+from vdgs.captures.formats.source_capture import no_points
 from vdgs.captures.name_resolution import match_stem
 from vdgs.errors import CaptureError
 from vdgs.geometry.similarity import fit_similarity_robust, is_collinear
-from vdgs.system.quoting import shell_word
 
 #: Names under which a point cloud in the capture's own world is looked for.
 POINT_CLOUDS = (
@@ -21,10 +21,6 @@ POINT_CLOUDS = (
 )  # fmt: skip
 #: A COLMAP model fits the poses if camera centers agree to this share of their spread (RMS).
 MAX_RELATIVE_RMS = 0.02
-
-
-class NoTiePoints(CaptureError):
-    """Poses without points, from which `vdgs sfm` makes a capture that has them."""
 
 
 def find_sparse_points(
@@ -55,12 +51,12 @@ def find_sparse_points(
     if not models and not needs_points:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     if not models:
-        raise NoTiePoints(
-            f"{root}: {what} brings no 3D points, from which the scene starts. They are found, with the poses as "
-            f"they are, by vdgs run and by vdgs sfm {shell_word(root)} --output CAPTURE. Or put a point cloud in the "
-            f"same world there as {POINT_CLOUDS[0]}, or a COLMAP model of the same photographs as sparse/0 (colmap "
-            f"feature_extractor, exhaustive_matcher, then mapper or point_triangulator){option}."
-        )
+        raise no_points(
+            root, f"{root}: {what} brings",
+            f"Or put a point cloud in the same world there as {POINT_CLOUDS[0]}, or a COLMAP model of the same "
+            f"photographs as sparse/0 (colmap feature_extractor, exhaustive_matcher, then mapper or "
+            f"point_triangulator){option}.",
+        )  # fmt: skip
     folder = max(models, key=count_images)
     model = read_colmap(folder)
     theirs = {view.name: _center(view.camera_from_world) for view in model.views}
@@ -84,11 +80,6 @@ def find_sparse_points(
             f"{spread:.3g}, {inliers.sum()} of {len(pairs)} agree); it is another reconstruction or naming."
         )
     return similarity.apply(model.points), model.colors
-
-
-def has_sparse_points(root: Path) -> bool:
-    """Whether something is there in which `find_sparse_points` looks for points."""
-    return find_point_cloud(root, lone=True) is not None or bool(find_models(root))
 
 
 def find_point_cloud(*folders: Path, lone: bool = False) -> Path | None:

@@ -57,12 +57,12 @@ def exclusive_information(file: Path) -> str:
     return " and ".join(filter(None, (lists, "masks" if masked else "")))
 
 
-def read_transforms(root: Path, options: CaptureOptions, *, needs_points: bool = True) -> SourceCapture:
+def read_transforms(root: Path, options: CaptureOptions, needs_points: bool = True) -> SourceCapture:
     """The capture described by `root`/transforms.json. Points come from the file that it names, else as
     `find_sparse_points` finds them.
 
-    Raises `CaptureError` for missing images, non-rigid poses, unsafe names, lists of what is no frame, and where no
-    point cloud is found.
+    Raises `CaptureError` for missing images, non-rigid poses, unsafe names, lists of what is no frame, and
+    `NoTiePoints` where no point cloud is found, unless nothing `needs_points`.
     """
     file = root / TRANSFORMS_FILE
     content = read_capture_json(file)
