@@ -23,9 +23,11 @@ from vdgs.errors import CaptureError
 from vdgs.sfm.camera_rigs import with_sensors
 from vdgs.sfm.cross_checks import cross_checked, strays
 from vdgs.sfm.find_images import check_decoders, find_files, is_film, is_photograph, nothing_found
+from vdgs.sfm.cross_checks import cross_checked, strays, unused_bands
+from vdgs.sfm.find_images import check_decoders, find_files, is_photograph, nothing_found
 from vdgs.sfm.image_metadata import ImageMetadata, UnusableImage, is_twice_as_wide, read_image_metadata
 from vdgs.sfm.mask_files import check_mask, find_masks
-from vdgs.sfm.spectral_bands import unused_bands
+from vdgs.sfm.rig_folders import with_sensors
 from vdgs.system.quoting import shell_word
 from vdgs.system.units import first_names
 

@@ -327,9 +327,6 @@ def _write(
             lenses[number], done = straight.intrinsics, done + len(names)
             lens_of |= dict.fromkeys(names, number)
     color_points(model, output, lenses, lens_of)
-    tests = [view.view.name for view in photographs.views if view.view.split == "test"]
-    if tests:
-        write_bytes(output / TEST_LIST, "\n".join([*tests, ""]).encode())
     georef = photographs.source.georef
     if georef is not None:
         place = {} if georef.origin is None else dict(zip(ORIGIN_KEYS, georef.origin, strict=True))
