@@ -84,10 +84,10 @@ class SfmArguments(QuietArguments):
 
     images: Annotated[tuple[Path, ...], Positional("PHOTOGRAPHS")]
     """Folders of photographs, those below them included, or films. Of films frames are taken, by how far the picture
-    moved and how sharp it is; or a project of another program that has poses and no points
-    (Metashape, RealityScan, ODM, ...): points are found, with poses and lenses as the project has them. A folder masks/
-    beside photographs has their masks (white = keep), named like them: name.png or name.jpg.png; name_mask.jpg beside
-    name.jpg is one too."""
+    moved and how sharp it is; or a project of another program that has poses and no points (Metashape, RealityScan,
+    ODM, ..., or transforms.json of nerfstudio, instant-ngp, Blender): points are found, with poses and lenses as the
+    project has them. A folder masks/ beside photographs has their masks (white = keep), named like them: name.png or
+    name.jpg.png; name_mask.jpg beside name.jpg is one too."""
     output: Annotated[Path, Output()]
     """Folder of the capture; new, or the one to go on with."""
     project_images: Annotated[str | None, FlagName("images")] = None
@@ -120,10 +120,15 @@ def sfm_command(arguments: list[str]) -> None:
     options = CaptureOptions(images=args.project_images)
     is_posed = len(args.images) == 1 and lacks_points(args.images[0], options)
     if args.dry_run and is_posed:
+<<<<<<< HEAD
         from vdgs.sfm.posed_plan import plan_posed_capture, print_posed_plan
 
         print_posed_plan(*plan_posed_capture(request, options), console)
         console.print("Nothing was written.", highlight=False)
+=======
+        console.print("points would be found, with poses and lenses as they are. Nothing was written.",
+                      highlight=False)  # fmt: skip
+>>>>>>> film
         return
     if args.dry_run:
         from vdgs.sfm.films.take_frames import temporary_frames

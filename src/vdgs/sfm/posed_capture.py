@@ -99,8 +99,8 @@ def make_posed_capture(
             finished.begin(CAPTURE, photographs.keys[CAPTURE])
         _write(photographs, work, model, request, threads, console)
         finished.finish(CAPTURE, photographs.keys[CAPTURE])
-    console.print(f"{model.num_points3D():,} points, mean reprojection error "
-                  f"{model.compute_mean_reprojection_error():.2f} px", highlight=False)  # fmt: skip
+    if error := model.compute_mean_reprojection_error():  # random points have none
+        console.print(f"{model.num_points3D():,} points, mean reprojection error {error:.2f} px", highlight=False)
 
 
 def _check_output(output: Path, work: Workspace, finished: Workspace, keys: dict[str, str], overwrite: bool) -> None:
