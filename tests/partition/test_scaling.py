@@ -166,11 +166,11 @@ def test_the_strongest_cluster_of_a_cell_is_found_in_windows_as_over_all_cells()
     most, expected = np.zeros(shape), np.full(shape, -1)
     for label in range(count):
         anchors = np.bincount(flat[labels == label], minlength=shape[0] * shape[1]).reshape(shape)
-        nearby = ndimage.gaussian_filter(anchors.astype(np.float64), boundary.SMOOTHING_CELLS)
+        nearby = ndimage.gaussian_filter(anchors.astype(np.float64), 0.5)
         expected[nearby > most] = label
         most = np.maximum(most, nearby)
     expected.ravel()[np.bincount(flat, minlength=expected.size) == 0] = -1
-    assert np.array_equal(boundary._dominant_cluster(labels, flat, shape, count), expected)
+    assert np.array_equal(boundary._dominant_cluster(labels, flat, shape, count, 0.5), expected)
 
 
 @pytest.mark.parametrize("flags", [boundary.MAX_DENSE_CELLS, 0])

@@ -120,15 +120,10 @@ def sfm_command(arguments: list[str]) -> None:
     options = CaptureOptions(images=args.project_images)
     is_posed = len(args.images) == 1 and lacks_points(args.images[0], options)
     if args.dry_run and is_posed:
-<<<<<<< HEAD
         from vdgs.sfm.posed_plan import plan_posed_capture, print_posed_plan
 
         print_posed_plan(*plan_posed_capture(request, options), console)
         console.print("Nothing was written.", highlight=False)
-=======
-        console.print("points would be found, with poses and lenses as they are. Nothing was written.",
-                      highlight=False)  # fmt: skip
->>>>>>> film
         return
     if args.dry_run:
         from vdgs.sfm.films.take_frames import temporary_frames

@@ -20,7 +20,6 @@ from vdgs.captures.reconstruction import is_reconstruction
 from vdgs.captures.strays import check_no_run, walk
 from vdgs.config.sfm_options import CameraModel
 from vdgs.errors import CaptureError
-from vdgs.sfm.camera_rigs import with_sensors
 from vdgs.sfm.cross_checks import cross_checked, strays, unused_bands
 from vdgs.sfm.find_images import check_decoders, find_files, is_film, is_photograph, nothing_found
 from vdgs.sfm.image_metadata import ImageMetadata, UnusableImage, is_twice_as_wide, read_image_metadata
