@@ -88,6 +88,8 @@ def test_the_picture_of_a_block_counts_in_the_largest_size_that_it_trains_with()
     assert (laptop.has_swa, default.has_swa) == (True, False)
     assert (laptop.max_grown_anchors, default.max_grown_anchors) == (150_000, 750_000)
     assert laptop.surroundings == 350_000
+    paper = block_workload(PRESETS["paper"], 50_000, 400_000, 5472 * 3648)  # whose margin moves, too
+    assert (paper.anchors, paper.surroundings) == (98_000, 302_000)
 
 
 def test_growth_below_a_fixed_threshold_is_expected_to_be_large():

@@ -3,11 +3,11 @@
 `paper`     the paper as printed; where it is silent, the reading that served it best on validation views. docs/paper.md
             lists every choice that is left, with its alternatives.
 `default`   the paper's numbers, but a scene that can be used whatever the capture: axes that turn with the scene and
-            smoothed cores; gaps filled; a random background, bounded Gaussians, sparse Adam;
-            cameras by `coverage`, each with a block and each block with a hundred; a frozen margin, a lower gate.
-`laptop`    a good result in minutes on a CPU; reports/choices.md says what each of its departures brings. Growth in
-            blocks is plain: compensated growth (`--block.compensation.enabled`) lost where few cameras look, and places
-            start by stereo there instead.
+            smoothed cores; gaps filled; a random background, bounded Gaussians, sparse Adam; cameras by `coverage`,
+            each with a block and each block with a hundred; a frozen margin, a lower gate, g added to means.
+`laptop`    a good result in minutes on a CPU: what a few thousand steps ask for, and plain growth in blocks, for
+            compensated growth (`--block.compensation.enabled`) lost where few cameras look; docs/paper.md says what
+            decided each departure.
 """
 
 from __future__ import annotations
