@@ -14,6 +14,7 @@ import pytest
 
 from support.captures import TinyScene, tiny_scene, write_colmap, write_images, write_ply
 from support.dataset_layouts import DRB, OPENGL, halves, write_matrixcity, write_mega_nerf
+from vdgs.captures.format_dispatch import lacks_points
 from vdgs.captures.formats.ply_reader import GRAY, read_point_cloud
 from vdgs.captures.loading import load_capture
 from vdgs.captures.output_guard import is_capture
@@ -145,6 +146,29 @@ def test_registered_cameras_of_realityscan_are_told_from_tables(tmp_path):
 # --------------------------------------------------------------------------------------- points and sizes
 
 
+@pytest.mark.parametrize("folder", [".", "photos"])
+def test_the_only_place_of_photographs_beside_a_model_is_used(tmp_path, scene, folder):
+    write_colmap(tmp_path, scene, text=True, images=folder, sparse="." if folder == "." else "sparse/0")
+    write_images(tmp_path / "masks", scene)
+    capture = load_capture(tmp_path)
+    assert (capture.images, len(capture.views)) == (folder, len(scene.cameras))
+    assert any("no images/ folder; the photographs in" in each for each in capture.warnings)
+
+
+def test_a_model_alone_names_the_folder_that_has_its_photographs(tmp_path, scene):
+    folder = write_colmap(tmp_path, scene)
+    with pytest.raises(CaptureError, match=rf"is a model alone.* Give the folder of both: {tmp_path}"):
+        load_capture(folder)
+
+
+def test_transforms_json_stands_for_its_folder(tmp_path, scene):
+    write_transforms(tmp_path, scene)
+    write_colmap(tmp_path, scene, images=None)
+    capture = load_capture(tmp_path / "transforms.json")
+    assert (capture.source, capture.root, len(capture.views)) == ("transforms", tmp_path, len(scene.cameras))
+    assert not lacks_points(tmp_path / "transforms.json", CaptureOptions())
+
+
 @pytest.mark.parametrize("cloud", ["sparse/0/points3D.ply", "sparse/0/cloud.ply", "sparse/points.ply", "my_points.ply"])
 @pytest.mark.parametrize("text", [True, False])
 def test_points_come_from_a_cloud_beside_the_model(tmp_path, scene, cloud, text):
@@ -253,16 +277,13 @@ def test_images_may_lie_in_other_folders_than_the_model_says(tmp_path, scene, mo
     assert any("by other folders" in warning for warning in capture.warnings)
 
 
-@pytest.mark.parametrize("folder", ["Images", "input", "."])
+@pytest.mark.parametrize("folder", ["Images", "input", "photos"])
 def test_folders_of_images_by_other_names_are_used_or_named(tmp_path, scene, folder):
     write_colmap(tmp_path, scene)
     images = tmp_path / "images"
-    if folder == ".":
-        for file in images.iterdir():
-            file.rename(tmp_path / file.name)
-        images.rmdir()
-    else:
-        images.rename(tmp_path / folder)
+    images.rename(tmp_path / folder)
+    if folder == "photos":
+        shutil.copytree(tmp_path / folder, tmp_path / "more")
     if folder == "Images":
         assert any("Images is used" in warning for warning in load_capture(tmp_path).warnings)
         return

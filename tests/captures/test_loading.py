@@ -25,6 +25,7 @@ from vdgs.captures.loading import load_capture
 from vdgs.captures.undistortion import ImageFile, sampling_map, undistorted_pinhole
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
+from vdgs.pipeline.image_size import image_sizes
 
 UP = CaptureOptions(up="z")
 
@@ -381,10 +382,12 @@ def test_a_header_that_is_no_image_is_named(folder, scene):
         load_capture(folder, UP)
 
 
-def test_distorted_cameras_are_refused_with_a_remedy(tmp_path, scene):
+def test_distorted_cameras_are_undone_without_being_asked_and_said(tmp_path, scene):
     write_colmap(tmp_path, scene, model="SIMPLE_RADIAL", extra=(0.05,))
-    with pytest.raises(CaptureError, match=r"lens distortion \(SIMPLE_RADIAL\).*--undistort"):
-        load_capture(tmp_path, UP)
+    capture = load_capture(tmp_path, UP)
+    assert all(view.image_path.parent == tmp_path / "undistorted" / "images" for view in capture.views)
+    assert any("lens distortion (SIMPLE_RADIAL) were undistorted into" in each for each in capture.warnings)
+    assert {each.images for each in image_sizes(capture, UP)} == {"images"}
 
 
 @pytest.mark.parametrize(("model", "extra"), [("SIMPLE_RADIAL", (-0.12,)), ("OPENCV", (-0.1, 0.02, 0.004, -0.003))])

@@ -24,12 +24,12 @@ from vdgs.captures.formats.mega_nerf import is_mega_nerf, read_mega_nerf
 from vdgs.captures.formats.ply_reader import read_point_cloud
 from vdgs.captures.formats.source_capture import NoTiePoints, SourceCapture, no_points
 from vdgs.captures.formats.sparse_points import POINT_CLOUDS, find_point_cloud
-from vdgs.captures.formats.transforms import TRANSFORMS_FILE, exclusive_information, read_transforms
+from vdgs.captures.formats.transforms import TRANSFORMS_FILE, exclusive_information, is_transforms, read_transforms
 from vdgs.captures.image_files import find_images, readable_suffixes
 from vdgs.captures.nested_captures import foreign_poses, model_below
 from vdgs.captures.project_formats import PROJECTS, find_projects, is_project, read_project
 from vdgs.captures.reconstruction import is_reconstruction
-from vdgs.captures.strays import check_no_run
+from vdgs.captures.strays import check_no_run, is_mask_folder, why_not_read
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.system.quoting import shell_word
@@ -41,6 +41,8 @@ def read_source(root: Path, options: CaptureOptions, *, needs_points: bool = Tru
 
     Raises `CaptureError` where there is none, and as the readers do.
     """
+    if is_transforms(root):
+        root, options = root.parent, replace(options, format="transforms")
     here = [name for name, (is_here, _) in READERS.items() if is_here(root)]
     here += dict.fromkeys(name for name, _ in find_projects(root))
     if options.format != "auto":
@@ -77,6 +79,8 @@ def lacks_points(path: Path, options: CaptureOptions) -> bool:
     """Whether a folder, or a file, is a capture or a project with poses, whose points are to be found first. Raises as
     `read_source`."""
     is_capture, models = any(is_here(path) for is_here, _ in READERS.values()), find_models(path)
+    if is_transforms(path):
+        path, options, models, is_capture = path.parent, replace(options, format="transforms"), [], True
     if is_capture and (has_points(_biggest(models)) if models else find_point_cloud(path, lone=True) is not None):
         return False  # the usual case, without reading it all
     if not is_capture and not is_project(path):
@@ -184,12 +188,21 @@ def image_folder(root: Path, options: CaptureOptions) -> tuple[str, list[str]]:
 
 
 def _other_image_folder(root: Path) -> tuple[str, list[str]]:
-    """`Images` or `IMAGES`, and a note. Raises CaptureError that names the folders which hold images by other names."""
+    """`Images`, or the only other place of images beside the model, and a note. Raises CaptureError that names the
+    places where there are several, and what to give instead of a model alone."""
     named = [entry.name for entry in sorted(root.iterdir()) if entry.is_dir() and find_images(entry)]
     alike = [name for name in named if name.lower() == "images"]
     if len(alike) == 1:
         return alike[0], [f"no images/ folder; {alike[0]} is used instead (--images chooses)."]
     named += ["."] if any(entry.suffix.lower() in readable_suffixes() for entry in root.iterdir()) else []
+    likely = [name for name in named if not is_mask_folder(name) and not why_not_read(root / name)]
+    if len(likely) == 1 and likely[0].lower() not in ("input", "distorted"):  # 3DGS's, before lenses were undone
+        return likely[0], [f"no images/ folder; the photographs in {root / likely[0]} are used (--images chooses)."]
+    above = next((folder for folder in root.resolve().parents[:2] if (folder / "images").is_dir()), None)
+    if above is not None and not named:
+        raise CaptureError(
+            f"{root}: is a model alone; its photographs lie beside it. Give the folder of both: {shell_word(above)}"
+        )
     where = (
         f", or name the folder that they are in: {' or '.join(f'--images {name}' for name in named)}" if named else ""
     )

@@ -12,7 +12,8 @@ from vdgs.captures.capture_root import capture_root
 from vdgs.captures.format_dispatch import check_folder, read_source
 from vdgs.captures.formats.ply_reader import GRAY
 from vdgs.captures.formats.project_photographs import UNDISTORTED
-from vdgs.captures.formats.source_capture import SourceCapture, format_list
+from vdgs.captures.formats.source_capture import SourceCapture
+from vdgs.captures.formats.transforms import is_transforms
 from vdgs.captures.ground_estimation import find_ground_frame, transform_pose
 from vdgs.captures.image_checks import detect_rounding
 from vdgs.captures.image_files import MIN_SIDE_PX, VIDEO_SUFFIXES
@@ -45,7 +46,7 @@ def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
 
 def read_files(root: Path, options: CaptureOptions) -> SourceCapture:
     """The files of a capture, without its photographs. Raises as `load_capture`."""
-    if not root.is_dir() and not is_project(root):
+    if not (root.is_dir() or is_transforms(root) or is_project(root)):
         if root.suffix.lower() in VIDEO_SUFFIXES and root.is_file():
             raise CaptureError(
                 f"{root}: is a film, which becomes a capture first: vdgs sfm {shell_word(root)} --output CAPTURE (with "
@@ -132,23 +133,19 @@ def _without_bad_points(source: SourceCapture, warnings: list[str]) -> SourceCap
 def _undistorted(
     root: Path, source: SourceCapture, photographs: list[MatchedView], options: CaptureOptions, warnings: list[str]
 ) -> list[MatchedView]:
-    """Pinhole photographs only: undistorts on request and where they are those of the camera, else refuses."""
+    """Pinhole photographs only: those of other lenses are undistorted, once, into a folder of their own."""
     bent = [photo for photo in photographs if photo.file.intrinsics.is_distorted]
     if not bent:
         return photographs
-    if not (options.undistort or source.original_images):
-        models = sorted({photo.file.intrinsics.model for photo in bent})
-        raise CaptureError(
-            f"{root}: {len(bent)} photographs have a camera with lens distortion ({', '.join(models)}); "
-            "training needs a pinhole. Add --undistort, or run colmap image_undistorter."
-            f"{format_list(photo.view.name for photo in bent)}"
-        )
     inside = "images" if source.original_images else options.images or "images"
     folder = options.undistorted_folder or root / UNDISTORTED / inside
     files = [photo.file for photo in photographs]
     check_not_among_files(folder, root, [path for file in files for path in (file.path, file.mask) if path is not None])
     straight = undistort(folder, files)
-    warnings.append(f"{len(bent)} photographs were undistorted into {folder}.")
+    models = sorted({photo.file.intrinsics.model for photo in bent})
+    warnings.append(
+        f"{len(bent)} photographs with lens distortion ({', '.join(models)}) were undistorted into {folder}."
+    )
     return [MatchedView(photo.view, file) for photo, file in zip(photographs, straight, strict=True)]
 
 

@@ -59,7 +59,8 @@ class CaptureOptions:
     max_images: Annotated[int | None, Range(2, MAX_COUNT)] = None
     """Use only this many photographs. Those nearest to the middle of the flight are taken."""
     undistort: bool = False
-    """Undistort photographs with lens distortion. They are written once, then reused."""
+    """Says that photographs are bent by their lens. It is undone without being asked, once, and reused; then the folder
+    of photographs as the cameras took them is used, whatever smaller ones there are."""
     undistorted_folder: Annotated[Path | None, Output()] = None
     """Where undistorted photographs are kept. Default: undistorted/ inside the capture folder."""
     masks: str = "masks"

@@ -19,7 +19,6 @@ from vdgs.config.commands import RunRequest
 from vdgs.config.method import MethodConfig, resolve_iterations
 from vdgs.config.ranges import check_ranges
 from vdgs.config.validation_rules import check_config
-from vdgs.errors import VdgsError
 from vdgs.pipeline.image_size import choose_for_photographs, choose_image_size, estimate_capture
 from vdgs.pipeline.run_estimate import RunEstimate
 from vdgs.runs.config_file import changed_flags
@@ -43,8 +42,6 @@ def estimate_run(request: RunRequest, console: Console) -> RunEstimate:
     check_ranges(request)
     method = request.method()
     check_config(method)
-    if request.options.undistort:
-        raise VdgsError("--dry-run writes nothing, and --undistort writes photographs: leave one of the two out.")
     RunFolder(request.output).check_output_empty()
     if is_image_input(request):
         return _estimate_from_images(request, console)
@@ -128,8 +125,8 @@ def _print_estimate(plan: RunEstimate, method: MethodConfig, status: RunStatus |
         f"the whole job: {plan.text()}",
         f"Measured now on this machine: training steps at each size{', stereo' if plan.dense_points else ''}"
         f"{', features and matches of three photographs' if 'photographs' in plan.times else ''}. Anchors are taken to "
-        f"grow {coarse_growth:.2g} times in the coarse model and {block_growth:.2g} times in blocks. Nothing was "
-        "written.",
+        f"grow {coarse_growth:.2g} times in the coarse model and {block_growth:.2g} times in blocks. No run was "
+        "begun.",
     ]
     console.print("\n".join(lines), highlight=False)
     if plan.may_exceed_memory:

@@ -172,7 +172,8 @@ def image_sizes(capture: Capture, options: CaptureOptions) -> list[ImageSize]:
     camera = max((view.camera for view in capture.views), key=lambda camera: camera.width * camera.height)
     full = ImageSize(images=capture.images, downscale=1, width=camera.width, height=camera.height)
     sizes = [full]
-    if capture.source == "colmap" and not options.undistort:
+    in_folder = all(view.image_path.is_relative_to(capture.root / capture.images) for view in capture.views)
+    if capture.source == "colmap" and in_folder and not options.undistort:
         for folder in capture.root.glob("images_*"):
             if folder.is_dir() and folder.name.removeprefix("images_").isdigit() and folder.name != capture.images:
                 sizes += _size_in(folder, capture, full)

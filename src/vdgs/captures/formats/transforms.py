@@ -45,6 +45,11 @@ SPLIT_LISTS: tuple[tuple[str, Split], ...] = (
 )  # fmt: skip
 
 
+def is_transforms(path: Path) -> bool:
+    """Whether a path is the file itself, which stands for its folder."""
+    return path.name == TRANSFORMS_FILE and path.is_file()
+
+
 def exclusive_information(file: Path) -> str:
     """What a transforms.json says that a COLMAP model of its cameras cannot, for people; nothing if it says none of
     that, or cannot be read."""
