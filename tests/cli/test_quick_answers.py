@@ -143,6 +143,7 @@ def test_a_run_is_looked_at_closely_where_anything_differs(native_small: NativeR
         (["run", "C", "--out", "R", "--max-anchor", "5"], "did you mean --densify.max-anchors?"),
         (["run", "C", "--out", "R", "--group-that-was.mvs"], "did you mean --init.mvs?"),
         (["export", "R", "--modle=best"], "there is no option --modle; did you mean --model?"),
+        (["ortho", "R", "--epsg", "26911"], "there is no option --epsg; did you mean --crs?"),
         (["run", "C"], "--output PATH is missing"),
         (["run", "-o"], "--output needs a value: a path"),
         (["run", "C", "-o", ""], "--output needs a value: a path"),

@@ -226,7 +226,7 @@ def test_transforms_without_points_keep_their_poses_and_lists(
     shutil.copytree(root / "straight", tmp_path / "set" / "images")
     (tmp_path / "set" / "transforms.json").write_text(json.dumps(content))
     assert lacks_points(tmp_path / "set", CaptureOptions())
-    with pytest.raises(CaptureError, match=r"found, with the poses as they are, by vdgs run and by vdgs sfm"):
+    with pytest.raises(CaptureError, match=r"This finds them, with the poses as they are: vdgs sfm"):
         load_capture(tmp_path / "set")
     request = SfmRequest(image_folders=(tmp_path / "set",), output=tmp_path / "capture")
     photographs = read_posed_photographs(request, CaptureOptions())

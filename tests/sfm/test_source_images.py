@@ -10,11 +10,12 @@ import pytest
 
 from support.next_commands import next_commands
 from vdgs.captures.reconstruction import PROGRESS_FILE, RECONSTRUCTION_FILE, STEPS_FILE, WORK_FOLDER
+from vdgs.cli.main import main
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RunRequest
 from vdgs.config.method import MethodConfig
 from vdgs.errors import RunError, VdgsError
-from vdgs.report.status_cli import full_run_status, next_line, status_json
+from vdgs.report.status_cli import EXIT_INCOMPLETE, full_run_status, next_line, status_json
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
 from vdgs.sfm.run_request import make_sfm_request
@@ -55,8 +56,12 @@ def change(card: Path) -> None:
     (card / "DJI_3.jpg").write_bytes(b"other")
 
 
-def test_status_follows_the_photographs_before_there_is_a_capture(run):
+def test_status_follows_the_photographs_before_there_is_a_capture(run, capsys):
     with run.drive_lock():
+        with pytest.raises(SystemExit) as ended:
+            main(["status", str(run.path)])
+        assert ended.value.code == EXIT_INCOMPLETE
+        assert "features: 2 of 6 photographs" in " ".join(capsys.readouterr().out.split())
         status = full_run_status(run)
         step = status.of("photographs").step
         assert status.of("photographs").state == "running"

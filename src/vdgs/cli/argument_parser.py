@@ -103,7 +103,8 @@ def _check_input(option: Option, path: Path) -> None:
         if path.is_symlink():
             raise VdgsError(f"{named}{path}: is a link to {path.readlink()}, which leads to no file or folder")
         raise VdgsError(f"{named}{path}: {fault}{suggest_path(path)}")
-    if is_run and not (path / "config.yaml").is_file():
+    begins = (path / "capture").is_dir()  # a run that still makes a capture of photographs
+    if is_run and not begins and not (path / "config.yaml").is_file():
         raise RunError(f"{path}: is not a run folder (no config.yaml). Train first: vdgs run CAPTURE --output RUN")
 
 
@@ -222,8 +223,18 @@ def _is_number(word: str) -> bool:
     return True
 
 
+#: What other programs call options of ours.
+_ELSEWHERE = {
+    "--epsg": "--crs", "--srs": "--crs", "--t-srs": "--crs", "--resolution": "--gsd", "--steps": "--iterations",
+    "--max-steps": "--iterations", "--max-num-iterations": "--iterations",
+}  # fmt: skip
+
+
 def _suggestion(name: str, known: dict[str, Option]) -> str:
-    """A question about the option that may be meant: by its whole name, or by that within its group or another one."""
+    """A question about the option that may be meant: by another program's name for it, by its whole name, or by that
+    within its group or another one."""
+    if (ours := _ELSEWHERE.get(name)) in known:
+        return f"; did you mean {ours}?"
     within = {f"--{each.rpartition('.')[2]}": each for each in reversed(known) if "." in each}
     candidates = within | {each: each for each in known}
     for sought in (name, f"--{name.removeprefix('--').rpartition('.')[2]}"):

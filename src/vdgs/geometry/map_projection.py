@@ -62,6 +62,7 @@ class MapProjection:
             return _local(ground)
         if name.lower() == "source":
             return _source(ground)
+        name = f"EPSG:{name}" if name.isdecimal() else name
         if name.lower() != "enu" and not name.upper().startswith("EPSG:"):
             raise VdgsError(f"--crs {name}: is no coordinate system known here. Give {CRS_CHOICES}.")
         if ground.origin_geo is None:

@@ -161,7 +161,11 @@ def write_model(
 def placed_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
     """The images that a model places, by their numbers. Not those that have a pose by their rig alone: of the sky."""
     images = (model.images[number] for number in sorted(model.images))
-    return [image for image in images if image.has_pose and image.num_points3D]
+    return [image for image in images if image.has_pose and (image.num_points3D or not _is_of_rig(model, image))]
+
+
+def _is_of_rig(model: pycolmap.Reconstruction, image: pycolmap.Image) -> bool:
+    return bool(model.rigs[model.frames[image.frame_id].rig_id].num_sensors() > 1)
 
 
 def fitted_intrinsics(camera: pycolmap.Camera) -> Intrinsics:
