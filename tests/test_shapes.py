@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from jaxtyping import TypeCheckError
+from jaxtyping import Float, TypeCheckError, jaxtyped
 
 from support.package_files import checked_files, files_with_shapes, module_name
+from support.typecheck import checked
 from vdgs.captures.camera_height import view_distance
 from vdgs.config.method import CompensationConfig
 from vdgs.evaluation.metrics import squared_error
@@ -72,3 +73,15 @@ WRONG = {
 def test_a_wrong_shape_is_an_error(where):
     with pytest.raises(TypeCheckError):
         WRONG[where]()
+
+
+@jaxtyped(typechecker=checked)
+def first(values: Float[np.ndarray, "n"], count: int, more: object = None) -> Float[np.ndarray, "n"]:
+    return more if more is not None else values[:count]
+
+
+def test_so_is_a_result_that_does_not_fit_the_arguments():
+    assert len(first(np.zeros(3), 3)) == 3
+    for wrong in ((np.zeros(3), 2), (np.zeros((3, 1)), 3), (np.zeros(3), 3, [0.0] * 3)):
+        with pytest.raises(TypeCheckError):
+            first(*wrong)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import pytest
 import torch
 
 from experiments.microbench import gpu
-from support.captures import tiny_scene, write_colmap
 from support.cuda_on_host import host_compiler, needs_nvrtc
 from support.fake_device import CARD, pretended_card
 from support.fake_gsplat import needs_gsplat
@@ -32,11 +34,19 @@ def test_all_of_it_runs_and_agrees(drivers, compiled_code, tmp_path, monkeypatch
     monkeypatch.setattr(device_selection, "_no_card", lambda index: "")
     # Of each kind of kernel one source: kernels/test_cuda_compiling.py compiles them all.
     monkeypatch.setattr(gpu, "SOURCES", {name: gpu.SOURCES[name] for name in ("cull.cu", "statistics.cu")})
-    monkeypatch.setattr(gpu, "TOWN_DB", 3.0)  # after eight iterations, less says nothing
-    write_colmap(tmp_path / "capture", tiny_scene(columns=3, rows=2, width=32, height=24, points=80))
+    monkeypatch.setattr(gpu, "TOWN_DB", 3.0)  # after three iterations, less says nothing
+    monkeypatch.setattr(gpu, "SMALL", replace(gpu.SMALL, iterations=3))
+    capture, train, asked = tmp_path / "capture", gpu.train_and_measure, []
+
+    def trained(place: Path, *rest: object) -> tuple[float, float]:
+        """That of the town is really trained on both devices, as one's own capture would be."""
+        asked.append((place, *rest[1:]))
+        return (20.0, 1.0) if place == capture else train(place, *rest)
+
+    monkeypatch.setattr(gpu, "train_and_measure", trained)
     device = gpu.GpuDevice(CARD, lambda: None, lambda: None, lambda: 0, (8, 6))
     with pretended_card():
-        code = gpu.main(["--small", "--capture", str(tmp_path / "capture"), "--iterations", "4"], device)
+        code = gpu.main(["--small", "--minutes", "1000", "--capture", str(capture), "--iterations", "4"], device)
     said = capsys.readouterr()
     assert code == 0, said.err
     for operation in OPERATION_NAMES:
@@ -48,7 +58,8 @@ def test_all_of_it_runs_and_agrees(drivers, compiled_code, tmp_path, monkeypatch
     assert "gsplat  40x32" in said.out
     assert "cuda    40x32" in said.out
     assert "B for each anchor in view" in said.out
-    assert "capture: " in said.out
+    assert [each[1:3] for each in asked] == [("cpu", 3), ("cuda", 3), ("cuda", 4)]
+    assert "capture: 20.00 dB after 4 iterations" in said.out
 
 
 def test_what_differs_or_fails_is_told_and_the_rest_goes_on(monkeypatch, capsys):

@@ -26,9 +26,9 @@ from vdgs.system.tensors import read_tensors
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("coarse")]
 
 SETTINGS = (
-    "--preset", "laptop", "--iterations", "100", "--save-every", "10", "--model.num-offsets", "3", "--up", "z",
-    "--densify.start", "30", "--densify.every", "10", "--densify.stats-start", "20", "--densify.min-draw-fraction",
-    "0.05",
+    "--preset", "laptop", "--images", "images", "--iterations", "100", "--save-every", "10", "--model.num-offsets", "3",
+    "--up", "z", "--densify.start", "30", "--densify.every", "10", "--densify.stats-start", "20",
+    "--densify.min-draw-fraction", "0.05",
 )  # fmt: skip
 #: As many as the ten training photographs of a tiny scene can bear beside eighty sparse points; stereo finds more.
 STEREO = f"stereo: {10 * 64 * 48 // PIXELS_PER_POINT - 80} points"

@@ -36,7 +36,7 @@ def runs(native_small, tmp_path_factory, compiled_code) -> tuple[Path, Path]:
             train_coarse(native_small.capture, card, "--device", "cuda")
             after_the_coarse_stage(card, "--device", "cuda")
             vdgs("render", card, "--mode", "depth", "--output", folder / "depth", "--device", "cuda")
-            vdgs("export", card, "--output", folder / "scene.ply", "--device", "cuda")
+            vdgs("export", card, "--output", folder / "scene.ply", "--color-iterations", "1", "--device", "cuda")
     return native_small.whole, card
 
 

@@ -43,7 +43,6 @@ from vdgs.sfm.image_list import collect_images
 from vdgs.sfm.reconstruct import reconstruct
 from vdgs.sfm.workspace import call_cancellable
 from vdgs.system.atomic_files import write_json
-from vdgs.system.step_progress import read_step
 from vdgs.system.stop_signals import catch_stop_signals
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("sfm")]
@@ -139,55 +138,23 @@ def test_the_same_command_does_nothing_and_an_option_only_what_depends_on_it(mad
     assert not (output / "work").exists()
 
 
-def test_what_was_interrupted_goes_on(flight, tmp_path, monkeypatch):
-    output = tmp_path / "capture"
-    request = SfmRequest(image_folders=(flight.folder,), output=output, threads=1, options=SfmOptions(num_neighbors=3))
-    with monkeypatch.context() as patch:
-        calls = []
-
-        def stopped(function, *arguments, **named):
-            calls.append(function.__name__)
-            if len(calls) == 5:  # the first two are of the estimate
-                raise KeyboardInterrupt
-            return call_cancellable(function, *arguments, **named)
-
-        patch.setattr(feature_extraction, "call_cancellable", stopped)
-        with pytest.raises(KeyboardInterrupt):
-            reconstruct(request, console())
-    with pytest.raises(CaptureError, match="is not finished"):
-        load_capture(output)
-    step = read_step(output / "work" / "progress.json")
-    assert step is not None
-    assert (step.step, step.total) == ("features", 10)
-    extracted = []
-
-    def counted(function, *arguments, **named):
-        extracted.extend(arguments[2])
-        return call_cancellable(function, *arguments, **named)
-
-    monkeypatch.setattr(feature_extraction, "call_cancellable", counted)
-    facts = reconstruct(request, console())
-    assert facts.registered == 9
-    assert len(extracted) == 10 - 4  # four were searched before, in two calls
-    assert not (output / "work").exists()
-
-
 def test_photographs_that_came_later_are_refused_or_make_the_capture_anew(flight, tmp_path):
-    output, card, late = tmp_path / "capture", tmp_path / "card", flight.names[-1]
-    shutil.copytree(flight.folder, card)
-    (card / late).rename(tmp_path / "later.jpg")
+    output, card, (*names, late) = tmp_path / "capture", tmp_path / "card", flight.names[:5]
+    card.mkdir()
+    for name in names:
+        shutil.copy(flight.folder / name, card)
     run = RunFolder(tmp_path / "run")
     first = SfmRequest(image_folders=(card,), output=output, threads=1, options=SfmOptions(num_neighbors=3))
-    assert reconstruct(first, console(), run).registered == 8
+    assert reconstruct(first, console(), run).registered == 4
     write_json(run.capture_file, {})  # as training leaves it
     before = files(output)
     with pytest.raises(RunError, match="other positions or other settings"):
         reconstruct(replace(first, options=SfmOptions(max_output_size=200)), console(), run)
-    (tmp_path / "later.jpg").rename(card / late)
+    shutil.copy(flight.folder / late, card)
     with pytest.raises(VdgsError, match=rf"1 added \({late}\).*--overwrite"):
         reconstruct(first, console(), run)
     assert files(output) == before
-    assert reconstruct(replace(first, overwrite=True), console(), run).registered == 9
+    assert reconstruct(replace(first, overwrite=True), console(), run).registered == 5
     assert not run.is_trained
 
 

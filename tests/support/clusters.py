@@ -21,6 +21,8 @@ from vdgs.runs.run_folder import RunFolder
 COARSE = (
     "--preset",
     "laptop",
+    "--images",
+    "images",
     "--iterations",
     "60",
     "--model.num-offsets",

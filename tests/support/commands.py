@@ -46,6 +46,7 @@ GLANCE_SECONDS = 0.01
 
 #: What the server imports, as far as it is there; the last ones are what commands import when they need it.
 IMPORTED = [
+    "tests.support.without_collector",  # found where the tests begin in the repository's folder
     "vdgs.cli.main",
     "vdgs.cli",
     "vdgs.cli.capture_cmds",
@@ -70,6 +71,7 @@ IMPORTED = [
     "PIL.GifImagePlugin",
     "PIL.JpegImagePlugin",
     "PIL.PngImagePlugin",
+    "pytest",
     "sklearn.cluster",
     "rasterio",
 ]
@@ -276,6 +278,7 @@ def _run(main: Callable[[], None], stdout: str, stderr: str, environment: dict[s
         os.dup2(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), descriptor)
     os.environ.update(environment)
     gc.freeze()  # what is imported stays: the collector need not look at it, nor the system copy it
+    gc.enable()
     pause_where_asked()
     main()
 

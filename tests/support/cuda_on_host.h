@@ -9,6 +9,7 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <map>
 #include <memory>
 #include <numeric>
 #include <utility>
@@ -48,7 +49,7 @@ enum class State { ready, at_barrier, in_warp, ended };
 struct Fiber {
   ucontext_t context;
   jmp_buf place;
-  bool begun;
+  bool begun = false;
   std::unique_ptr<char[]> stack{new char[kStackBytes]};
   Index index;
   unsigned lane;
@@ -74,10 +75,12 @@ inline void wait(State why) {
   if (!_setjmp(running->place)) _longjmp(scheduler, 1);
 }
 
+// A fiber serves one block after another, of all launches of as many threads: to begin it asks the system.
 inline void begin_fiber() {
-  kernel_running(arguments_given);
-  running->state = State::ended;
-  _longjmp(scheduler, 1);
+  for (;;) {
+    kernel_running(arguments_given);
+    wait(State::ended);
+  }
 }
 
 inline void turn(Fiber& fiber) {
@@ -90,16 +93,20 @@ inline void turn(Fiber& fiber) {
   swapcontext(&scheduler_context, &fiber.context);
 }
 
+// What the threads of a block were last answered, and which barrier it was: the first of them counts for all.
+static bool answer;
+static unsigned answered;
+
 template <class Join>
 bool ask(bool mine, bool start, Join join) {
   const unsigned place = running->barriers++ % 2;
   running->vote[place] = mine;
-  Fiber* me = running;
   wait(State::at_barrier);
-  bool all = start;
-  for (Fiber& fiber : fibers) all = join(all, fiber.vote[place]);
-  running = me;
-  return all;
+  if (const unsigned asked = 2 * running->barriers + start; answered != asked) {
+    answered = asked, answer = start;
+    for (Fiber& fiber : fibers) answer = join(answer, fiber.vote[place]);
+  }
+  return answer;
 }
 
 inline Fiber& lane_of_my_warp(unsigned lane) {
@@ -145,20 +152,33 @@ inline std::vector<size_t> order_of(size_t count, unsigned turns) {
   return order;
 }
 
-// False: threads wait for others that never come, which a GPU may not survive.
-inline bool run_block(unsigned turns) {
-  unsigned i = 0;
+static std::map<size_t, std::vector<Fiber>> others;
+
+// The fibers of as many threads, begun as far as there were any.
+inline void provide_fibers(size_t threads) {
+  if (fibers.size() == threads) return;
+  std::swap(others[fibers.size()], fibers);
+  std::swap(others[threads], fibers);
+  if (!fibers.empty()) return;
+  fibers = std::vector<Fiber>(threads);
   for (Fiber& fiber : fibers) {
-    fiber.index = {i % blockDim.x, i / blockDim.x % blockDim.y, i / (blockDim.x * blockDim.y)};
-    fiber.lane = i % kWarp;
-    fiber.state = State::ready;
-    fiber.begun = false;
-    fiber.barriers = fiber.exchanges = 0;
     getcontext(&fiber.context);
     fiber.context.uc_stack.ss_sp = fiber.stack.get();
     fiber.context.uc_stack.ss_size = kStackBytes;
     fiber.context.uc_link = nullptr;
     makecontext(&fiber.context, begin_fiber, 0);
+  }
+}
+
+// False: threads wait for others that never come, which a GPU may not survive.
+inline bool run_block(unsigned turns) {
+  unsigned i = 0;
+  answered = 0;
+  for (Fiber& fiber : fibers) {
+    fiber.index = {i % blockDim.x, i / blockDim.x % blockDim.y, i / (blockDim.x * blockDim.y)};
+    fiber.lane = i % kWarp;
+    fiber.state = State::ready;
+    fiber.barriers = fiber.exchanges = 0;
     ++i;
   }
   const size_t warps = fibers.size() / kWarp;
@@ -194,7 +214,7 @@ struct Caller<kernel> {
 
 }  // namespace host
 
-inline void __syncthreads() { host::ask(false, false, [](bool a, bool b) { return a || b; }); }
+inline void __syncthreads() { host::wait(host::State::at_barrier); }
 inline int __syncthreads_or(int mine) {
   return host::ask(mine, false, [](bool a, bool b) { return a || b; });
 }
@@ -248,11 +268,13 @@ extern "C" int host_launch(host::Kernel kernel, const unsigned* grid, const unsi
   host::arguments_given = arguments;
   const size_t threads = block[0] * block[1] * block[2];
   if (threads % host::kWarp) return 0;
-  if (host::fibers.size() != threads) host::fibers = std::vector<host::Fiber>(threads);
+  host::provide_fibers(threads);
   for (size_t b : host::order_of(size_t{grid[0]} * grid[1] * grid[2], turns)) {
     const unsigned i = static_cast<unsigned>(b);
     blockIdx = {i % grid[0], i / grid[0] % grid[1], i / (grid[0] * grid[1])};
-    if (!host::run_block(turns)) return 0;
+    if (host::run_block(turns)) continue;
+    host::fibers.clear();  // they stand in the middle of the kernel
+    return 0;
   }
   return 1;
 }

@@ -24,8 +24,9 @@ STATE = Path(os.environ.get("VDGS_TEST_SLURM", ""))
 PLACES = 2
 NODE = "stand-in"
 GLANCE_SECONDS = 0.02
-#: SIGKILL follows SIGTERM after so long when a job is cancelled (SLURM: KillWait).
-KILL_SECONDS = 30.0
+#: SIGKILL follows SIGTERM after so long when a job is cancelled (SLURM: KillWait, 30 by default). What a job
+#: saves may take longer on a busy machine.
+KILL_SECONDS = 600.0
 
 
 def main(verb: str, words: list[str]) -> int:

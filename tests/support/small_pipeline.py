@@ -12,10 +12,10 @@ import pytest
 from support.captures import tiny_scene, write_colmap
 from vdgs.cli.main import main
 
-#: As few and as small as lets anchors grow, blocks train and PSNR say something.
+#: As few and as small as lets anchors grow, blocks train and PSNR say something. A named size is not looked for.
 SETTINGS = (
-    "--preset", "laptop", "--iterations", "24", "--model.num-offsets", "2", "--init.voxel-size", "0.8",
-    "--lr.features", "0.05", "0.05", "--densify.start", "10", "--densify.stats-start", "0",
+    "--preset", "laptop", "--images", "images", "--iterations", "24", "--model.num-offsets", "2",
+    "--init.voxel-size", "0.8", "--lr.features", "0.05", "0.05", "--densify.start", "10", "--densify.stats-start", "0",
     "--densify.min-draw-fraction", "0.05", "--densify.every", "10", "--densify.max-anchors", "200",
 )  # fmt: skip
 

@@ -13,7 +13,14 @@ _CONFIGURATION = BeartypeConf(is_pep484_tower=True)
 
 def checked(function: Callable[..., Any]) -> Callable[..., Any]:
     """A function that is checked; the checks are generated at its first call, for a worker calls few of those that it
-    imports."""
+    imports.
+
+    jaxtyping calls it twice for each function: for its arguments, and for its result, which has to fit the sizes that
+    its arguments had. The arguments were checked then, and are not again.
+    """
+    result = function.__annotations__.get("return", Any)
+    if result is not Any:
+        function.__annotations__ = {"return": result}
     made: list[Callable[..., Any]] = []
 
     @wraps(function)

@@ -218,7 +218,7 @@ def test_a_limit_of_the_process_counts():
 #: Without stereo, which would leave room behind in which a step fits.
 SETTINGS = (
     "--preset", "laptop", "--iterations", "20", "--up", "z", "--model.num-offsets", "3", "--threads", "1",
-    "--init.no-mvs",
+    "--init.no-mvs", "--images", "images",
 )  # fmt: skip
 #: The last iteration with photographs at half their size (preset laptop).
 LAST_HALF = 8

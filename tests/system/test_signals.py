@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import vdgs
+from support.commands import PATIENCE_SECONDS
 from vdgs.errors import Interrupted
 from vdgs.system.stop_signals import STOP_SIGNALS, catch_stop_signals, check_stop_requested
 
@@ -87,7 +88,9 @@ def test_only_ctrl_c_breaks_off_the_saving():
 
 @pytest.mark.parametrize("where", ["main", "thread"])
 def test_pycolmap_leaves_sigterm_to_us(where):
-    done = subprocess.run([sys.executable, "-c", LOADED, where], capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        [sys.executable, "-c", LOADED, where], capture_output=True, text=True, timeout=PATIENCE_SECONDS
+    )
     assert done.stdout == f"asked {int(signal.SIGTERM)}\n", done.stderr
     assert (done.returncode, done.stderr) == (-signal.SIGTERM, "")  # no trace of C++ outside of our contexts either
 
