@@ -196,7 +196,7 @@ def _other_image_folder(root: Path) -> tuple[str, list[str]]:
         return alike[0], [f"no images/ folder; {alike[0]} is used instead (--images chooses)."]
     named += ["."] if any(entry.suffix.lower() in readable_suffixes() for entry in root.iterdir()) else []
     likely = [name for name in named if not is_mask_folder(name) and not why_not_read(root / name)]
-    if len(likely) == 1 and likely[0].lower() not in ("input", "distorted"):  # 3DGS's, before lenses were undone
+    if len(likely) == 1 and likely[0].lower() not in ("input", "distorted", "undistorted"):  # of other lenses
         return likely[0], [f"no images/ folder; the photographs in {root / likely[0]} are used (--images chooses)."]
     above = next((folder for folder in root.resolve().parents[:2] if (folder / "images").is_dir()), None)
     if above is not None and not named:
