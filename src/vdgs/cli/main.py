@@ -50,7 +50,7 @@ one of photographs.
 #: The verbs, which begin the lines of the help.
 COMMANDS = tuple(re.findall(r"^  ([a-z][a-z-]*) ", HELP, re.MULTILINE))
 #: Verbs that take up what they left when they were interrupted.
-RESUMABLE_COMMANDS = ("run", "sfm", "train-coarse", "train-blocks", "bench")
+RESUMABLE_COMMANDS = ("run", "sfm", "train-coarse", "train-blocks", "ortho", "bench")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -83,7 +83,8 @@ def _run_command(command: str, arguments: list[str]) -> int:
     if os.environ.get("COLUMNS") == "0":  # no width is known; rich would print nothing
         del os.environ["COLUMNS"]
     action = get_command(command)
-    again = "continues: what is finished is kept" if command in RESUMABLE_COMMANDS else "begins it anew"
+    kept = command in RESUMABLE_COMMANDS and "--dry-run" not in arguments
+    again = "continues: what is finished is kept" if kept else "begins it anew"
     fit = Advice(command, verb_arguments).fit
     token = MESSAGE_FIT.set(fit)
     try:
