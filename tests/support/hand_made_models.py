@@ -93,3 +93,11 @@ def capture_at(origin: tuple[float, float, float] | None) -> Capture:
         root=Path("place"), source="colmap", images="images", views=tuple(views), points=points,
         point_colors=np.zeros((1, 3), np.uint8), ground=ground(origin),
     )  # fmt: skip
+
+
+def two_floors() -> AnchorModel:
+    """A plane of opaque splats, and a roof of 1.6 x 1.6 above its middle."""
+    ground, roof = opaque_plane(), opaque_plane(half=0.8)
+    lifted = replace(roof.anchors, positions=roof.anchors.positions + torch.tensor([0.0, 0.0, 1.5]))
+    tensors = {name: torch.cat([t, lifted.tensors()[name]]) for name, t in ground.anchors.tensors().items()}
+    return replace(ground, anchors=type(ground.anchors)(**tensors))

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
-import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,45 +11,33 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
 from support.captures import camera_at, look_down
-from support.hand_made_models import opaque_plane, quadrants
+from support.hand_made_models import opaque_plane, quadrants, two_floors
 from vdgs.captures.capture import Capture, View
 from vdgs.evaluation.metrics import to_8bit
 from vdgs.evaluation.view_exposures import apply_exposure_numpy, log_luminance
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.ground_frame import GroundFrame
-from vdgs.model.anchor_model import AnchorModel, DecoderSpan
+from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.exposure import exposure_matrix
 from vdgs.model.renderer import render
 from vdgs.partition.blocks import save_blocks
 from vdgs.rendering.camera_paths import look_at_pose
-from vdgs.rendering.path_io import load_path
 from vdgs.runs.open_run import OpenedRun
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.stage_folder import StatusRecord
 from vdgs.viewer import navigation, overlays
 from vdgs.viewer.image_comparison import nearest_view_index, warp_image
 from vdgs.viewer.layers import LAYERS, DisplayOptions, Painter
-from vdgs.viewer.lod import LodPyramid
-from vdgs.viewer.measure_panel import MeasurePanel, scale_markdown
-from vdgs.viewer.measurement import KnownDistance, MeasuredPoint, Ruler
-from vdgs.viewer.path_panel import camera_at_time, path_json
+from vdgs.viewer.measure_panel import MeasurePanel
+from vdgs.viewer.measurement import MeasuredPoint, Ruler
 from vdgs.viewer.picking import measured_point, pick_point, pick_position, thumbnail
 from vdgs.viewer.viewer_scene import ViewerScene
 
 pytestmark = pytest.mark.xdist_group("viewer_scene")
 
 PLACE = (46.95, 7.44, 560.0)
-
-
-def two_floors() -> AnchorModel:
-    """A plane of opaque splats, and a roof of 1.6 x 1.6 above its middle."""
-    ground, roof = opaque_plane(), opaque_plane(half=0.8)
-    lifted = replace(roof.anchors, positions=roof.anchors.positions + torch.tensor([0.0, 0.0, 1.5]))
-    tensors = {name: torch.cat([t, lifted.tensors()[name]]) for name, t in ground.anchors.tensors().items()}
-    return replace(ground, anchors=type(ground.anchors)(**tensors))
 
 
 def photographed(folder: Path, model: AnchorModel, change: Callable[[int, np.ndarray], np.ndarray]) -> ViewerScene:
@@ -235,28 +220,6 @@ def test_depth_keeps_its_colors_while_the_camera_moves(scene):
     assert after.high < before.high
 
 
-@pytest.mark.parametrize("parts", [False, True])
-def test_quick_pictures_of_much_are_drawn_with_fewer_larger_gaussians(parts):
-    model = two_floors()
-    if parts:
-        counts = (300, len(model.anchors) - 300)
-        model = replace(model, decoder_spans=tuple(DecoderSpan(count, model.decoder) for count in counts))
-    camera = camera_at(0.0, 0.0, 6.0)
-    levels = LodPyramid(model)
-    assert levels.of(camera)[0].model is model
-    assert levels.of(camera, 10_000)[0].model is model
-    few, count = levels.of(camera, 400)
-    assert 0 < count <= 400
-    assert few.mask is not None
-    assert len(few.model.anchors) == int(few.mask.sum()) < len(model.anchors) / 3
-    assert sum(part.count for part in few.model.decoder_spans) == (len(few.model.anchors) if parts else 0)
-    assert torch.equal(few.of(model.anchors.positions), few.model.anchors.positions)
-    thin, whole = render(few.model, camera), render(model, camera)
-    inner = slice(14, 34), slice(20, 44)
-    assert thin.alpha[inner].mean() > 0.95
-    assert (thin.image[inner].mean((0, 1)) - whole.image[inner].mean((0, 1))).abs().max() < 0.05
-
-
 # ------------------------------------------------------------------------------------- photographs
 
 
@@ -343,14 +306,6 @@ def test_a_ruler_measures(scene):
     assert "area **6.00 m²**" in ruler.to_markdown()
 
 
-def test_no_metres_are_said_of_a_scene_without_a_scale():
-    ruler = Ruler("units")
-    for corner in ((0, 0, 0), (2, 0, 0), (2, 3, 0)):
-        ruler.add(MeasuredPoint(np.array(corner, float)))
-    assert "3.00 square units" in ruler.to_markdown()
-    assert re.search(r"\bm\b|m²", ruler.to_markdown()) is None
-
-
 def test_a_measured_point_lies_where_its_photographs_show_it(scene):
     camera = camera_at(0.4, 0.3)
     point = measured_point(scene, "merged", camera, 30.0, 20.0)
@@ -361,16 +316,6 @@ def test_a_measured_point_lies_where_its_photographs_show_it(scene):
     for name, x, y in point.rays:
         there = views[name].camera_from_world @ [*point.position, 1.0]
         assert (there[0] / there[2], there[1] / there[2]) == pytest.approx((x, y), abs=1e-9)
-
-
-def test_known_distances_say_how_large_a_unit_is_and_what_contradicts_itself():
-    one, other = MeasuredPoint(np.zeros(3)), MeasuredPoint(np.array([0.0, 0.0, 4.0]))
-    known = [KnownDistance(one, other, 10.0), KnownDistance(one, other, 10.2)]
-    said = scale_markdown(known, "my place")
-    assert "**2.525 m**" in said
-    assert "vdgs run 'my place' --scale-bar known-distances.txt" in said
-    assert "contradict" not in said
-    assert "contradict" in scale_markdown([*known, KnownDistance(one, other, 20.0)], "my place")
 
 
 def test_lines_lie_where_cameras_and_borders_are(scene):
@@ -387,37 +332,6 @@ def test_lines_lie_where_cameras_and_borders_are(scene):
 
 
 # ------------------------------------------------------------------------------------- where one stands
-
-
-def test_the_browsers_camera_is_ours():
-    pose = look_at_pose(np.array([3.0, -8.0, 6.0]), np.array([1.0, 2.0, 0.0]))
-    wxyz = np.roll(Rotation.from_matrix(pose[:3, :3].T).as_quat(), 1)
-    camera = navigation.camera_from_browser(wxyz, np.array([3.0, -8.0, 6.0]), math.radians(60), 800, 600)
-    assert np.allclose(camera.camera_from_world, pose)
-    assert camera.fy == pytest.approx(300 / math.tan(math.radians(30)))
-    for broken in (np.zeros(4), np.array([np.nan, 0, 0, 1])):
-        with pytest.raises(ValueError, match="no camera"):
-            navigation.camera_from_browser(broken, np.zeros(3), 1.0, 8, 8)
-    with pytest.raises(ValueError, match="no camera"):
-        navigation.camera_from_browser(wxyz, np.zeros(3), 1.0, 0, 8)
-
-
-def test_no_canvas_is_larger_than_can_be_drawn():
-    def of(width: int, height: int) -> Camera:
-        return navigation.camera_from_browser(np.array([1.0, 0, 0, 0]), np.zeros(3), 1.0, width, height)
-
-    most = navigation.max_render_pixels(1 << 40)
-    for width, height in ((1280, 800), (3840, 2160), (7680, 4320)):
-        whole = of(width, height)
-        assert navigation.limit_resolution(whole, most) is whole
-    for width, height in ((200_000, 200_000), (200_000, 100), (1, 10**9), (20_000, 1)):
-        asked, drawn = of(width, height), navigation.limit_resolution(of(width, height), most)
-        assert drawn.width * drawn.height <= most
-        assert max(drawn.width, drawn.height) <= 16_384
-        assert drawn.fy / drawn.height == pytest.approx(asked.fy / asked.height)  # it sees the same
-    # Little memory is left: small pictures, but pictures.
-    assert navigation.limit_resolution(of(1280, 800), navigation.max_render_pixels(20_000_000)).height == 353
-    assert navigation.limit_resolution(of(1280, 800), navigation.max_render_pixels(0)).width == 1
 
 
 def test_buttons_lead_where_they_say(scene):
@@ -447,32 +361,6 @@ def test_buttons_lead_where_they_say(scene):
         height=48,
     )  # fmt: skip
     assert np.allclose(looking.camera_from_world, taken.camera_from_world, atol=0.02)  # its upper edge stays up
-
-
-def test_all_of_a_photograph_fits_the_canvas():
-    camera = Camera(camera_from_world=np.eye(4), fx=100.0, fy=100.0, cx=80.0, cy=60.0, width=160, height=120)
-    for aspect in (0.5, 1.0, 3.0):
-        fov = navigation.fov_to_fit(camera, aspect)
-        focal = 0.5 / math.tan(fov / 2)  # of a canvas one high
-        assert focal * 160 / 100 <= aspect + 1e-9
-        assert focal * 120 / 100 <= 1 + 1e-9
-
-
-def test_a_path_is_read_back_as_it_was_set(tmp_path):
-    frames = [camera_at(x, 1.0, 5.0, 10.0 * x, 7.0 * x, 640) for x in (0.0, 1.3, 2.9)]
-    file = tmp_path / "path.json"
-    file.write_text(path_json(frames, 4.0, fps=10.0))
-    read = load_path(file, camera_at(0, 0))
-    assert len(read.cameras) == 40
-    for first, second in ((frames[0], read.cameras[0]), (frames[-1], read.cameras[-1])):
-        assert np.allclose(first.camera_from_world, second.camera_from_world, atol=1e-12)
-        assert (first.fx, first.width, first.height) == (second.fx, second.width, second.height)
-    content = json.loads(file.read_text())
-    assert np.array_equal(content["keyframes"][1]["camera_from_world"], frames[1].camera_from_world)
-    assert np.allclose(camera_at_time(frames, 4.0, 0.0).camera_from_world, frames[0].camera_from_world)
-    assert np.allclose(camera_at_time(frames, 4.0, 99.0).camera_from_world, frames[-1].camera_from_world)
-    with pytest.raises(ValueError, match="at least one"):
-        path_json([], 1.0)
 
 
 def test_the_newest_photograph_file_is_not_needed_to_look(scene, tmp_path: Path):
