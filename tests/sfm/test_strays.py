@@ -355,7 +355,7 @@ def test_what_is_done_with_other_kinds_is_said(tmp_path):
     Image.fromarray(pixels(9)).convert("CMYK").save(tmp_path / "print.jpg", quality=98, subsampling=0)
     found = collect_images([tmp_path])
     notes = " ".join(found.notes)
-    assert "R_0.DNG, R_1.DNG: raw; developed alike, with the daylight white balance" in notes
+    assert "R_0.DNG, R_1.DNG: raw; developed alike (the daylight white balance" in notes
     assert "(R_0.DNG.jpg)" in notes
     assert "1 .dng file is not used, but the pictures of the same names beside" in notes
     raw = next(photo for photo in found.images if photo.name == "R_0.DNG")

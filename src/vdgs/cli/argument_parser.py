@@ -225,15 +225,15 @@ def _is_number(word: str) -> bool:
 
 #: What other programs call options of ours.
 _ELSEWHERE = {
-    "--epsg": "--crs", "--srs": "--crs", "--t-srs": "--crs", "--resolution": "--gsd", "--steps": "--iterations",
-    "--max-steps": "--iterations", "--max-num-iterations": "--iterations",
+    "epsg": "crs", "srs": "crs", "t-srs": "crs", "resolution": "gsd", "steps": "iterations", "max-steps": "iterations",
+    "max-num-iterations": "iterations",
 }  # fmt: skip
 
 
 def _suggestion(name: str, known: dict[str, Option]) -> str:
     """A question about the option that may be meant: by another program's name for it, by its whole name, or by that
     within its group or another one."""
-    if (ours := _ELSEWHERE.get(name)) in known:
+    if (ours := f"--{_ELSEWHERE.get(name.removeprefix('--'))}") in known:
         return f"; did you mean {ours}?"
     within = {f"--{each.rpartition('.')[2]}": each for each in reversed(known) if "." in each}
     candidates = within | {each: each for each in known}

@@ -22,6 +22,7 @@ from vdgs.sfm.panoramas import cut_view
 from vdgs.sfm.workspace import Workspace, call_cancellable, report_progress
 from vdgs.system.atomic_files import write_atomic, write_bytes
 from vdgs.system.lazy_pycolmap import pycolmap
+from vdgs.system.stop_signals import check_stop_requested
 
 #: A focal length over the longer side where nothing says one: COLMAP's own guess.
 DEFAULT_FOCAL_FACTOR = 1.2
@@ -84,14 +85,27 @@ def group_by_camera(photographs: Sequence[ImageMetadata]) -> list[CameraGroup]:
     return kinds
 
 
-def write_upright_images(workspace: Workspace, photographs: Sequence[ImageMetadata]) -> list[ExcludedImage]:
+def prepare_images(workspace: Workspace, photographs: Sequence[ImageMetadata], console: Console) -> list[ExcludedImage]:
+    """As `write_upright_images`, with the progress where photographs are of kinds that take long to decode."""
+    if not any(photo.kind or photo.face for photo in photographs):
+        return write_upright_images(workspace, photographs)
+    with report_progress(workspace, console, "features", len(photographs), "decoded, ") as tell:
+        return write_upright_images(workspace, photographs, tell)
+
+
+def write_upright_images(
+    workspace: Workspace, photographs: Sequence[ImageMetadata], tell: Callable[[int], object] = lambda _done: None
+) -> list[ExcludedImage]:
     """Fill the work folder with links to the photographs, upright copies of those that EXIF says lie, and JPEGs in sRGB
     of those of other kinds.
 
     Returns those that could not be decoded. Photographs themselves are never changed.
     """
     failed = []
-    for photo in sorted(photographs, key=lambda photo: str(photo.path)):  # the views of a panorama one after the other
+    # In the order of the files: the views of a panorama one after the other.
+    for number, photo in enumerate(sorted(photographs, key=lambda photo: str(photo.path))):
+        check_stop_requested()
+        tell(number)
         target = workspace.images / photo.name
         if target.exists():
             continue

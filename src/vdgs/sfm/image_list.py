@@ -134,10 +134,12 @@ def _kind_notes(photographs: Sequence[ImageMetadata]) -> list[str]:
     kinds: dict[str, list[str]] = {}
     for photo in photographs:
         kinds.setdefault(photo.kind, []).append(photo.name)
-    how = {"raw": "developed alike, with the daylight white balance of the camera and no automatic exposure"}
+    how = {
+        "raw": "developed alike (the daylight white balance of the camera, no automatic exposure) to 8-bit sRGB",
+        "": "converted to 8-bit sRGB",
+    }
     return [
-        f"{first_names(names)}: {kind}; {how.get(kind, 'converted')} to 8-bit sRGB and written as JPEG "
-        f"({jpeg_name(names[0])})."
+        f"{first_names(names)}: {kind}; {how.get(kind, how[''])} and written as JPEG ({jpeg_name(names[0])})."
         for kind, names in kinds.items()
         if kind
     ]

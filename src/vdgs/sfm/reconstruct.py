@@ -270,7 +270,7 @@ def _features(
 ) -> list[ExcludedImage]:
     options, photographs = plan.request.options, plan.image_list.images
     feature_extraction.create_database(workspace, camera_groups)
-    failed = feature_extraction.write_upright_images(workspace, photographs)
+    failed = feature_extraction.prepare_images(workspace, photographs, console)
     counts = feature_extraction.count_features(workspace)
     if not workspace.is_done("features", key):
         mask_files.write_upright_masks(workspace, photographs, plan.threads)

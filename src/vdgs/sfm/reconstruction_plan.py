@@ -195,7 +195,9 @@ def _has_foreign_files(output: Path) -> bool:
 def check_disk_space(plan: ReconstructionPlan) -> None:
     photographs, options = plan.image_list.images, plan.request.options
     pixels = sum(photo.width * photo.height for photo in photographs)
-    needed = BYTES_PER_PIXEL * 1.32 * pixels + BYTES_PER_FEATURE * options.max_num_features * len(photographs)
+    copied = sum(photo.width * photo.height for photo in photographs if photo.kind or photo.face)
+    needed = BYTES_PER_PIXEL * (1.32 * pixels + copied)
+    needed += BYTES_PER_FEATURE * options.max_num_features * len(photographs)
     parent = next(
         folder for folder in (plan.request.output.resolve(), *plan.request.output.resolve().parents) if folder.exists()
     )
