@@ -9,11 +9,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from support import flights
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.geodesy import geodetic_from_enu
 from vdgs.synth.flight_cameras import pose_from_angles
-from vdgs.synth.image_renderer import render_image
+
+#: Where the films were taken: latitude, longitude in degrees, altitude in metres.
+ORIGIN = (-33.5, -70.6, 500.0)
 
 
 def write_film(
@@ -69,27 +70,48 @@ def crops(picture: np.ndarray, lefts: Iterable[float], size: tuple[int, int] = (
     ]
 
 
-def town_film(file: Path, *, strips: int = 3, each: int = 25, step: float = 2.0) -> list[Camera]:
-    """A flight in strips over a generated town as a film of 320 x 240 pixels, of which two frames in three are blurred;
-    returns the true camera of each frame (metres east, north, up of `flights.ORIGIN`)."""
-    cameras, rng, spacing = list[Camera](), np.random.default_rng(3), 6
+def relief_film(file: Path, *, strips: int, each: int, spacing: int, step: float) -> list[Camera]:
+    """A flight in strips over plates at several heights as a film of 320 x 240 pixels with positions, of which two
+    frames in three are blurred; returns the true camera of each frame (metres east, north, up of `ORIGIN`). `step` is
+    how many metres the drone moves in a frame, `spacing` how many frames it flies from a strip of `each` to the next.
+    """
+    cameras, rng = list[Camera](), np.random.default_rng(3)
     for strip in range(strips):
         for k in range(each + (spacing if strip + 1 < strips else 0)):
             along, beside = min(k, each - 1), max(0, k - each + 1)
             x = (along if strip % 2 == 0 else each - 1 - along) - (each - 1) / 2
             y = spacing * strip + beside - spacing * (strips - 1) / 2
-            place = np.array([step * x, step * y, flights.ALTITUDE_M + 0.3 * np.sin(k / 5)])
+            place = np.array([step * x, step * y, 45 + 0.3 * np.sin(k / 5)])
             pose = pose_from_angles(place, np.radians(rng.normal(0, 1)), np.pi / 2, np.radians(rng.normal(0, 1)))
             cameras.append(Camera(camera_from_world=pose, fx=272, fy=272, cx=160, cy=120, width=320, height=240))
-    (town, tracer), sky = flights.town_of(60.0), flights.sky_over(60.0)
-    pictures = [render_image(town, tracer, sky, camera, 1, np.ones(3)) for camera in cameras]
-    pictures = [cv2.blur(each, (7, 1)) if k % 3 else each for k, each in enumerate(pictures)]
-    places = geodetic_from_enu(np.stack([camera.position for camera in cameras]), flights.ORIGIN)
+    plates = [(np.array([-80.0, -60, 0]), panorama(800, 600))]
+    for seed in range(40):
+        corner = rng.uniform([-50, -40, 2], [45, 35, 14])
+        plates.append((corner, panorama(*rng.integers(30, 70, 2).tolist(), seed=seed)))
+    plates.sort(key=lambda plate: plate[0][2])
+    pictures = [_draw(camera, plates) for camera in cameras]
+    pictures = [cv2.blur(picture, (7, 1)) if k % 3 else picture for k, picture in enumerate(pictures)]
     words = [
         f'<font size="28">SrtCnt : {k + 1}, DiffTime : 100ms\n2026-06-01 10:00:{k // 10:02d},{k % 10}00\n[iso : 100] '
-        f"[focal_len: 29.40] [latitude: {lat:.6f}] [longitude: {lon:.6f}] [rel_alt: {camera.position[2]:.3f} abs_alt: "
-        f"{alt:.3f}] [gb_yaw: 0.0 gb_pitch: -90.0 gb_roll: 0.0] </font>"
-        for k, ((lat, lon, alt), camera) in enumerate(zip(places, cameras, strict=True))
+        f"[focal_len: 29.40] [latitude: {latitude:.6f}] [longitude: {longitude:.6f}] [rel_alt: "
+        f"{camera.position[2]:.3f} abs_alt: {altitude:.3f}] [gb_yaw: 0.0 gb_pitch: -90.0 gb_roll: 0.0] </font>"
+        for k, camera in enumerate(cameras)
+        for latitude, longitude, altitude in geodetic_from_enu(camera.position[None], ORIGIN)
     ]
     write_film(file, pictures, 10.0, words)
     return cameras
+
+
+def _draw(camera: Camera, plates: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """What a camera sees of level plates, the highest last, of which a pixel is 20 cm wide."""
+    picture = np.zeros((camera.height, camera.width, 3), np.uint8)
+    lens = np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]])
+    pose = camera.camera_from_world
+    for corner, texture in plates:
+        world_from_pixel = np.array([[0.2, 0, corner[0]], [0, 0.2, corner[1]], [0, 0, corner[2]], [0, 0, 1]])
+        camera_from_pixel = lens @ pose[:3] @ world_from_pixel
+        size = camera.width, camera.height
+        seen = cv2.warpPerspective(texture, camera_from_pixel, size, flags=cv2.INTER_LINEAR)
+        there = cv2.warpPerspective(np.full(texture.shape[:2], 255, np.uint8), camera_from_pixel, size)
+        picture = np.where(there[..., None] > 127, seen, picture)
+    return picture

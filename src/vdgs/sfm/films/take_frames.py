@@ -85,18 +85,25 @@ def with_frames(request: SfmRequest, console: Console, run: RunFolder | None = N
     check_ranges(request)
     check_output(request.output)
     check_output_folder(request.output)
-    before = _records(request.output)
-    if (
-        (changes := _changes(before, films))
-        and not request.overwrite
-        and (request.output / SOURCE_IMAGES_FILE).exists()
-    ):
-        raise VdgsError(
-            f"{request.output}: was begun with other films than there are now ({changes}). Add --overwrite to make it "
-            "anew of those that are there, or choose another --output."
-        )
+    if (request.output / SOURCE_IMAGES_FILE).exists() and not request.overwrite:
+        _check_same(request, films)
     with run.drive_lock() if run is not None else nullcontext(), lock_folder(request.output):
         return replace(request, image_folders=_take(request, request.output, console))
+
+
+def _check_same(request: SfmRequest, films: Sequence[Path]) -> None:
+    """Raise VdgsError where the capture that is there was begun with other films or another bound on their frames."""
+    before = _records(request.output)
+    changes = _changes(before, films)
+    if before and not changes:
+        bounds = _bounds(films, request.options.num_frames)
+        if sorted(record.most for record in before.values()) != sorted(bounds):
+            changes = "--num-frames differs"
+    if changes:
+        raise VdgsError(
+            f"{request.output}: was begun with other films or frames than there are now ({changes}). Add --overwrite "
+            "to make it anew, or choose another --output."
+        )
 
 
 def film_changes(output: Path) -> str:
