@@ -24,6 +24,7 @@ from vdgs.sfm.mask_files import read_keep_mask
 from vdgs.sfm.reconstruct import reconstruct
 from vdgs.sfm.reconstruction_plan import plan_reconstruction
 from vdgs.sfm.sfm_estimate import SfmEstimate
+from vdgs.sfm.step_keys import step_keys
 
 WIDTH = 640
 
@@ -132,6 +133,11 @@ def test_the_name_of_the_lens_tells_a_fisheye(tmp_path):
     models = [photo.camera_model for photo in collect_images([tmp_path]).images]
     assert models == ["OPENCV_FISHEYE", "OPENCV_FISHEYE", "SIMPLE_RADIAL"]
     assert {photo.camera_model for photo in collect_images([tmp_path], "opencv").images} == {"OPENCV"}
+    output, keys = tmp_path.parent / "out", []
+    for options in (SfmOptions(), SfmOptions(camera_model="opencv")):
+        request = SfmRequest(image_folders=(tmp_path,), output=output, options=options)
+        keys.append(step_keys(plan_reconstruction(request)))
+    assert keys[0]["features"] != keys[1]["features"]
 
 
 def test_the_photograph_of_a_fisheye_becomes_a_perspective_view():

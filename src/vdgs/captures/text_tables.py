@@ -16,7 +16,10 @@ LONGEST_FILE = 1 << 26
 _SEPARATORS = ("\t", ";", ",", "|")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
 #: A photograph's name in front of a line whose words are parted by blanks, which may be in the name too.
-_NAME_WITH_BLANKS = re.compile(r"\s*([^\"#][^\"]*?\.(?:jpe?g|png|tiff?|webp|dng|heic))\s+(?=\S)", re.IGNORECASE)
+_NAME_WITH_BLANKS = re.compile(
+    r"\s*([^\"#][^\"]*?\.(?:jpe?g|png|tiff?|webp|avif|dng|cr[23]|nef|arw|raf|orf|rw2|hei[cf]|hif))\s+(?=\S)",
+    re.IGNORECASE,
+)
 #: Lines that are looked at for the separator.
 LOOKED_AT = 20
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from vdgs import __version__
+from vdgs.sfm.image_metadata import RADIAL
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.workspace import cache_key
 from vdgs.system.records import record_to_dict
@@ -19,8 +20,9 @@ def step_keys(plan: ReconstructionPlan) -> dict[str, str]:
     ]
     lenses = [photo.lens and photo.lens.focal for photo in plan.image_list.images]
     found = cache_key(
-        __version__, files, lenses, options.max_image_size, options.max_num_features, *_masked_images(plan)
-    )
+        __version__, files, lenses, options.max_image_size, options.max_num_features, *_masked_images(plan),
+        *_other_cameras(plan),
+    )  # fmt: skip
     matched = cache_key(found, options.num_neighbors, options.exhaustive_max)
     mapped = cache_key(matched, options.focal)
     capture = cache_key(mapped, options.max_output_size)
@@ -29,6 +31,12 @@ def step_keys(plan: ReconstructionPlan) -> dict[str, str]:
     known = [record_to_dict(point) for point in points], bars and record_to_dict(bars)
     placed = cache_key(capture, told, known, options.georeference)
     return {"features": found, "matches": matched, "model": mapped, "capture": capture, "placed": placed}
+
+
+def _other_cameras(plan: ReconstructionPlan) -> list[tuple[str, ...]]:
+    """Photographs that are converted, or whose lens has another model or whose camera is one of a rig."""
+    said = [(photo.name, photo.camera_model, photo.sensor, photo.kind) for photo in plan.image_list.images]
+    return [each for each in said if each[1:] != (RADIAL, "", "")]
 
 
 def _masked_images(plan: ReconstructionPlan) -> list[tuple[Any, ...]]:
