@@ -24,6 +24,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 
 import pytest
 from hypothesis import HealthCheck, settings
+from hypothesis.internal.conjecture import providers
 from jaxtyping import install_import_hook
 
 from support import typecheck
@@ -42,6 +43,9 @@ MOST_WORKERS = 4
 settings.register_profile("vdgs", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile("search", settings.get_profile("vdgs"), derandomize=False, max_examples=1000)
 settings.load_profile("vdgs")
+# hypothesis also tries numbers and words that it finds in the modules that happen to be loaded: other examples in each
+# worker, and after other tests.
+providers._get_local_constants = lambda: providers._local_constants  # type: ignore[attr-defined]
 
 
 # Their annotations are checked while the tests run.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import io
 import os
-import shutil
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -18,13 +17,14 @@ from rich.console import Console
 pytest.importorskip("embreex")
 import pycolmap
 
-from support.flights import ORIGIN, Flight, copy_folder, write_photograph
+from support.flights import ORIGIN, Flight, copy_folder, fly, grid, write_photograph
 from vdgs.captures.loading import load_capture
 from vdgs.captures.reconstruction import ReconstructionReport, read_reconstruction
 from vdgs.config.commands import RunRequest
 from vdgs.config.presets import PRESETS
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
+from vdgs.geometry.camera import Camera
 from vdgs.geometry.geodesy import enu_from_geodetic
 from vdgs.pipeline.run_pipeline import reconstruct_if_needed
 from vdgs.sfm import capture_writer, feature_extraction, feature_matching, incremental_mapper
@@ -132,25 +132,36 @@ def test_more_folders_beside_a_capture_are_refused(flight, tmp_path):
 # ------------------------------------------------------------------------------------------------- parts
 
 
-def test_of_two_parts_the_larger_is_kept_and_the_other_named(flight, tmp_path):
-    """The other one is of another town, far in the east."""
-    card, there = tmp_path / "card", fly(tmp_path / "there", grid(2, 2, 9.0), 50)
-    card.mkdir()
-    for name in flight.names[:6]:
-        shutil.copy(flight.folder / name, card)
-    for k, (name, camera) in enumerate(zip(there.names, there.cameras, strict=True)):
-        write_photograph(
-            card / f"there_{name}", pixels_of(there.folder / name), k + 6, camera.position + np.array([90.0, 0, 0])
+def beside(cameras: list[Camera], east: float) -> list[Camera]:
+    moved = []
+    for camera in cameras:
+        pose = camera.camera_from_world.copy()
+        pose[:3, 3] -= pose[:3, :3] @ [east, 0, 0]
+        moved.append(
+            Camera(
+                camera_from_world=pose,
+                fx=camera.fx,
+                fy=camera.fy,
+                cx=camera.cx,
+                cy=camera.cy,
+                width=camera.width,
+                height=camera.height,
+            )
         )
+    return moved
+
+
+def test_of_two_parts_the_larger_is_kept_and_the_other_named(tmp_path):
+    flown = fly(tmp_path / "card", [*beside(grid(2, 3, 9.0), -45), *beside(grid(2, 2, 9.0), 45)], 160)
     said = console()
-    facts = reconstruct(SfmRequest(image_folders=(card,), output=tmp_path / "capture", threads=1), said)
+    facts = reconstruct(SfmRequest(image_folders=(flown.folder,), output=tmp_path / "capture", threads=1), said)
     assert facts.components == (6, 4)
     assert facts.registered == 6
     why = {photo.name: photo.excluded_reason for photo in facts.photographs if photo.excluded_reason}
-    assert sorted(why) == [f"there_{name}" for name in there.names]
+    assert sorted(why) == flown.names[6:]
     assert all("belongs to a part of 4 photographs that nothing joins to the rest" in reason for reason in why.values())
     assert "parts that do not hold together: 6, 4" in said.file.getvalue()
-    assert [view.name for view in load_capture(tmp_path / "capture").views] == flight.names[:6]
+    assert [view.name for view in load_capture(tmp_path / "capture").views] == flown.names[:6]
 
 
 # ------------------------------------------------------------------------------------------------ stopped

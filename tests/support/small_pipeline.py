@@ -68,8 +68,9 @@ def native_run(folder: Path) -> NativeRun:
     return found
 
 
-def psnr(run: Path) -> tuple[float, float]:
-    """Of the coarse and of the merged model."""
-    folders = (run / "coarse" / "evaluation", run / "evaluation")
-    coarse, merged = (json.loads((folder / "metrics.json").read_text())["psnr"] for folder in folders)
-    return coarse, merged
+#: Where the coarse and the merged model of a run are measured.
+COARSE, MERGED = "coarse/evaluation", "evaluation"
+
+
+def psnr(run: Path, measured: str) -> float:
+    return float(json.loads((run / measured / "metrics.json").read_text())["psnr"])
