@@ -315,6 +315,9 @@ def test_what_cannot_become_photographs_is_refused(flight: Path, tmp_path: Path,
         take(ask(tmp_path / "out", tmp_path / "still.mp4"))
     with pytest.raises(CaptureError, match="is a film, which becomes a capture first: vdgs sfm"):
         load_capture(flight)
+    write_film(tmp_path / "lines.mp4", crops(panorama(), range(6)), x264="tff=1:interlaced=1")
+    with pytest.raises(CaptureError, match=r"is interlaced.*-vf bwdif"):
+        take(ask(tmp_path / "out", tmp_path / "lines.mp4"))
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(CaptureError, match=r"pip install 'vdgs\[video\]'"):
         take(ask(tmp_path / "other", flight))
@@ -329,6 +332,17 @@ def test_a_film_that_ends_early_gives_what_it_has(flight: Path, tmp_path: Path):
     images, said = take(ask(tmp_path / "out", tmp_path / "a.mp4"))
     assert len(images.images) >= 3
     assert "damaged" in said or "cut off" in said
+
+
+def test_frames_of_hdr_films_are_converted_and_it_is_said(tmp_path: Path):
+    hlg = "transfer=arib-std-b67:colorprim=bt2020:colormatrix=bt2020nc"
+    pictures = crops(panorama(), [30 * k for k in range(6)])
+    write_film(tmp_path / "plain.mp4", pictures)
+    write_film(tmp_path / "hdr.mp4", pictures, x264=hlg, pixels="yuv420p10le")
+    (plain, _), (deep, said) = (take(ask(tmp_path / name, tmp_path / f"{name}.mp4")) for name in ("plain", "hdr"))
+    assert "is HDR (HLG); its frames are written in the colors of sRGB" in said
+    one, other = (np.asarray(Image.open(images.images[2].path)).astype(float) for images in (plain, deep))
+    assert np.corrcoef(one.ravel(), other.ravel())[0, 1] > 0.85
 
 
 def test_white_of_hdr_is_white_and_order_is_kept():

@@ -25,6 +25,8 @@ def write_film(
     metadata: Mapping[str, str] | None = None,
     moments: Sequence[float] | None = None,
     rotation: int = 0,
+    x264: str = "",
+    pixels: str = "yuv420p",
 ) -> None:
     """Pictures [h, w, 3] uint8, each with its subtitle where there are any; `moments` are seconds, not even ones."""
     import av
@@ -37,7 +39,8 @@ def write_film(
             if not number:
                 stream.set_display_rotation(rotation)
                 stream.height, stream.width = picture.shape[:2]
-                stream.pix_fmt, stream.options = "yuv420p", {"crf": "12", "preset": "ultrafast"}
+                stream.pix_fmt = pixels
+                stream.options = {"crf": "12", "preset": "ultrafast", "x264-params": x264}
                 stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
             moment = round(1000 * (number / fps if moments is None else moments[number]))
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
