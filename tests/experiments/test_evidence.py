@@ -50,19 +50,19 @@ def is_of_validation_views(table: str) -> bool:
 
 
 @pytest.mark.parametrize("preset", ["paper", "laptop"])
-def test_every_departure_of_a_preset_is_listed_with_what_decided_it(preset: str):
+def test_every_departure_of_a_preset_is_listed_with_what_decided_it(preset: str) -> None:
     listed = {name for row in rows(section("What decided the defaults")) for name in re.findall(r"`([\w.]+)`", row[0])}
     assert departures(preset) - listed == set()
     assert listed <= settings()
 
 
-def test_every_choice_of_the_paper_has_a_row_and_a_setting():
+def test_every_choice_of_the_paper_has_a_row_and_a_setting() -> None:
     named = {name for row in rows(section("Choices")) for name in re.findall(r"`([a-z]+\.[\w.]+)`", row[2])}
     assert departures("paper") - named == set()
     assert named <= settings()
 
 
-def test_a_table_that_decided_a_default_was_made_of_validation_views():
+def test_a_table_that_decided_a_default_was_made_of_validation_views() -> None:
     for names, _, evidence in rows(section("What decided the defaults")):
         tables = re.findall(r"\]\((\S+/tables/[\w-]+\.\w+)\)", evidence)
         assert tables or any(words in evidence for words in WITHOUT_TABLE), names
@@ -70,7 +70,7 @@ def test_a_table_that_decided_a_default_was_made_of_validation_views():
             assert is_of_validation_views((PAGE.parent / table).read_text(encoding="utf-8")), table
 
 
-def test_a_table_of_test_views_is_found():
+def test_a_table_of_test_views_is_found() -> None:
     tables = PAGE.parents[1] / "experiments" / "reports" / "tables"
     assert is_of_validation_views((tables / "choices.md").read_text(encoding="utf-8"))
     assert not is_of_validation_views((tables / "few.md").read_text(encoding="utf-8"))

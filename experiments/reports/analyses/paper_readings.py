@@ -248,7 +248,9 @@ RESULT_COLUMNS: dict[str, Callable[[dict[str, Any]], str]] = {
 def as_markdown(found: list[dict[str, Any]]) -> str:
     """The rows as tables: cuts and cameras, coarse models, merged scenes."""
     lines = ["# Readings of what the paper leaves open", "", *TABLE_HEAD]
-    for scene in dict.fromkeys(each["scene"] for each in found):
+    order = [*COARSE_READINGS, *READINGS]
+    found = sorted(found, key=lambda each: order.index(each["reading"]))
+    for scene in sorted({each["scene"] for each in found}):
         of_scene = [each for each in found if each["scene"] == scene]
         trained = [each for each in of_scene if each["trained"]]
         before = [each["before"] for each in trained if "before" in each][:1]

@@ -1,10 +1,10 @@
 """Settings by name.
 
-`paper`     the paper as printed; where it is silent, the reading that served it best on validation views. docs/paper.md
-            lists every choice that is left, with its alternatives.
+`paper`     the paper as printed; where it is silent, the reading that served it best on validation views or, where
+            none was measured, that of Scaffold-GS. docs/paper.md lists every choice, with its alternatives.
 `default`   the paper's numbers, but a scene that can be used whatever the capture: axes that turn with the scene and
             smoothed cores; gaps filled; a random background, bounded Gaussians, sparse Adam; cameras by `coverage`,
-            each with a block and each block with a hundred; a frozen margin, a lower gate, g added to means.
+            each with a block and each block with a hundred; and a frozen margin.
 `laptop`    a good result in minutes on a CPU: what a few thousand steps ask for, and plain growth in blocks, for
             compensated growth (`--block.compensation.enabled`) lost where few cameras look; docs/paper.md says what
             decided each departure.
@@ -44,9 +44,7 @@ PRESETS: dict[str, MethodConfig] = {
         ),
         partition=PartitionConfig(cluster_axes="ground", cluster_clip=0.0, cluster_smoothing=0.5, min_block_share=0.0),
         assignment=AssignmentConfig(mode="paper", tau=0.2, always_best=False, min_cameras=0),
-        block=BlockConfig(
-            random_background=0.0, margin="ramp", compensation=CompensationConfig(min_draws="paper", target="sum")
-        ),
+        block=BlockConfig(random_background=0.0, margin="ramp"),
         merge=MergeConfig(rule="max-visibility"),
     ),
     "laptop": MethodConfig(
