@@ -135,7 +135,7 @@ def test_photographs_that_are_gone_are_all_named_and_strict_refuses(tmp_path, sc
         load_capture(tmp_path, CaptureOptions(strict=True))
     for number in range(5):
         (tmp_path / "photos" / f"frame_{number:03d}.png").unlink(missing_ok=True)
-    with pytest.raises(CaptureError, match="at least 75% must be there"):
+    with pytest.raises(CaptureError, match="at least 67% must be there"):
         load_capture(tmp_path)
 
 

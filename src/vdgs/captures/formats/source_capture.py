@@ -46,7 +46,7 @@ MAX_SIDE_PX = 100_000
 #: Names that messages list, and those of photographs that are gone, which a person must find.
 MAX_LISTED, MAX_MISSING_LISTED = 10, 100
 #: A capture is used without the photographs that are gone where at least this share is there (choice).
-LEAST_THERE = 3 / 4
+LEAST_THERE = 2 / 3
 
 
 class NoTiePoints(CaptureError):
