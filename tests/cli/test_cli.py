@@ -16,6 +16,7 @@ from support.commands import PATIENCE_SECONDS, vdgs
 from vdgs import cli
 from vdgs.cli import common
 from vdgs.cli.argument_parser import GivenArguments, parse_words
+from vdgs.cli.capture_cmds import SfmArguments, SynthArguments
 from vdgs.cli.common import make_console
 from vdgs.cli.export_cmd import ExportArguments
 from vdgs.cli.help_text import COMMON_OPTIONS
@@ -172,6 +173,15 @@ def test_verbs_that_show_a_result_can_be_quiet(verb, does, tmp_path, monkeypatch
     said = capsys.readouterr()
     assert said.out == ""
     assert said.err in ("", "note what a person must know\n")
+
+
+def test_scripts_of_before_may_keep_their_names_of_options(tmp_path):
+    (tmp_path / "DCIM").mkdir()
+    sfm = parse_words(SfmArguments, [str(tmp_path / "DCIM"), "-o", str(tmp_path / "c"), "--features", "1500"])
+    assert sfm.over().options.max_num_features == 1500
+    town = parse_words(SynthArguments, [str(tmp_path / "t"), "--images", "16", "--test-images=2"])
+    asked = town.over().options
+    assert (asked.num_images, asked.num_test_images) == (16, 2)
 
 
 def test_the_command_that_is_kept_works_in_every_folder(tmp_path, monkeypatch):

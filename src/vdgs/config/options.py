@@ -25,8 +25,11 @@ from typing import Any
 from vdgs.config.ranges import FlagName, Positional, Repeatable, to_flag
 from vdgs.config.serialization import describe_type, field_hints, without_notes
 
-#: Other names of an option.
-ALIASES = {"--output": ("-o", "--out")}
+#: Other names of an option: shorter ones, and those that scripts of before use.
+ALIASES = {
+    "--output": ("-o", "--out"), "--max-num-features": ("--features",), "--num-images": ("--images",),
+    "--num-test-images": ("--test-images",), "--num-validation-images": ("--validation-images",),
+}  # fmt: skip
 
 #: Values by the names of the fields down to them.
 Values = dict[tuple[str, ...], Any]
