@@ -33,6 +33,8 @@ FISHEYE_FOCAL_FACTOR = 0.4
 UPSAMPLE_BELOW_PX, UPSAMPLE_BELOW_IMAGES = 1200, 40
 #: Photographs that one call searches, for each thread: between two calls work can stop.
 IMAGES_PER_THREAD = 2
+#: What a feature takes in the database: descriptor, place, and what SQLite adds.
+BYTES_PER_FEATURE = 160
 #: Photographs with fewer features cannot be matched.
 MIN_FEATURES = 100
 _UPRIGHT_QUALITY = 97
@@ -197,6 +199,7 @@ def extract_groups(
             missing = [name for name in names if name not in there and workspace.mask(name).exists() == masked]
             for start in range(0, len(missing), IMAGES_PER_THREAD * threads):
                 chunk = missing[start : start + IMAGES_PER_THREAD * threads]
+                workspace.check_room(len(chunk) * options.max_num_features * BYTES_PER_FEATURE)
                 _extract(workspace, chunk, masked, number, fine, options, threads)
                 done += len(chunk)
                 tell(done)

@@ -22,7 +22,7 @@ from vdgs.system.console import make_progress_bar
 from vdgs.system.lazy_pycolmap import pycolmap
 from vdgs.system.step_progress import StepProgress, StepRecord
 from vdgs.system.stop_signals import check_stop_requested
-from vdgs.system.units import rough_duration
+from vdgs.system.units import data_size, rough_duration
 
 Result = TypeVar("Result")
 #: The steps that are counted, in their order.
@@ -111,6 +111,14 @@ class Workspace:
                 yield database
             finally:
                 database.close()
+
+    def check_room(self, size: int) -> None:
+        """Raise VdgsError where the disk has not so many bytes: COLMAP ends the process where it finds none."""
+        if shutil.disk_usage(self.path).free < size:
+            raise VdgsError(
+                f"{self.path}: the disk is full: the next step needs {data_size(size)}. Free some space; the same "
+                "command then goes on."
+            )
 
     def remove(self) -> None:
         shutil.rmtree(self.path, ignore_errors=True)
