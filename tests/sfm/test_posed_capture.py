@@ -169,9 +169,10 @@ def test_captures_without_points_get_them_with_their_poses_and_lists(
         (tmp_path / "transforms.json").write_text(json.dumps(content))
     with pytest.raises(NoTiePoints, match=r"no 3D points.*\. This finds them.*: vdgs sfm .* --output CAPTURE\n"):
         load_capture(tmp_path)
-    found = reconstruct_if_needed(
-        RunRequest(capture=tmp_path, output=tmp_path / "run", threads=2), Console(file=io.StringIO())
-    )
+    size = None if is_model else "images_2"  # of what is made
+    asked = RunRequest(capture=tmp_path, output=tmp_path / "run", threads=2, options=CaptureOptions(images=size))
+    found = reconstruct_if_needed(asked, Console(file=io.StringIO()))
+    assert found.options.images == size
     capture = load_capture(found.capture, replace(found.options, up="z"))
     centers = _from_ground(capture.ground)(np.stack([view.camera.position for view in capture.views]))
     assert np.abs(centers - centers_of(poses)).max() < 1e-6

@@ -28,7 +28,7 @@ from vdgs.runs.run_status import RunStatus, get_run_status
 from vdgs.sfm.films.take_frames import temporary_frames
 from vdgs.sfm.posed_plan import plan_posed_capture, print_posed_plan
 from vdgs.sfm.reconstruction_plan import plan_reconstruction, print_plan
-from vdgs.sfm.run_request import is_image_input, make_posed_request, make_sfm_request
+from vdgs.sfm.run_request import is_image_input, make_posed_request, make_sfm_request, size_apart
 from vdgs.sfm.sfm_estimate import estimate_sfm
 from vdgs.system.atomic_files import read_json
 from vdgs.system.units import data_size, rough_duration
@@ -45,8 +45,9 @@ def estimate_run(request: RunRequest, console: Console) -> RunEstimate:
     RunFolder(request.output).check_output_empty()
     if is_image_input(request):
         return _estimate_from_images(request, console)
-    if lacks_points(request.capture, request.options):
-        return _estimate_from_poses(request, console)
+    posed, size = size_apart(request)
+    if lacks_points(posed.capture, posed.options):
+        return _estimate_from_poses(posed, size, console)
     choice = choose_image_size(request, console)
     request = choice.request
     capture = choice.capture or load_capture(request.capture, request.options)
@@ -76,11 +77,11 @@ def _estimate_from_images(run_request: RunRequest, console: Console) -> RunEstim
     return estimate
 
 
-def _estimate_from_poses(run_request: RunRequest, console: Console) -> RunEstimate:
-    """The whole job of a project of another program without points."""
+def _estimate_from_poses(run_request: RunRequest, size: str | None, console: Console) -> RunEstimate:
+    """The whole job of a project of another program, or a data set, without points."""
     plan, sfm = plan_posed_capture(make_posed_request(run_request), run_request.options)
     print_posed_plan(plan, sfm, console)
-    found = replace(run_request, options=replace(run_request.options, images=None))
+    found = replace(run_request, options=replace(run_request.options, images=size))
     estimate = choose_for_photographs(found, plan, sfm, console).estimate
     assert estimate is not None
     _print_estimate(estimate, run_request.method(), None, console)

@@ -34,7 +34,7 @@ from vdgs.runs.create_or_resume import exclusive_run
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
-from vdgs.sfm.run_request import is_image_input, make_posed_request, make_sfm_request
+from vdgs.sfm.run_request import is_image_input, make_posed_request, make_sfm_request, size_apart
 from vdgs.sfm.sfm_estimate import SfmEstimate
 from vdgs.system.atomic_files import read_json
 from vdgs.system.documents import EvaluationMetrics
@@ -91,15 +91,16 @@ def reconstruct_if_needed(run_request: RunRequest, console: Console, command: st
 def _find_points(run_request: RunRequest, console: Console) -> RunRequest:
     """The request with a capture that has points: a project of another program without any becomes one in
     RUN/capture first."""
-    if not lacks_points(run_request.capture, run_request.options):
+    posed, size = size_apart(run_request)
+    if not lacks_points(posed.capture, posed.options):
         return run_request
     from vdgs.sfm.posed_capture import make_posed_capture  # imports much that a run of a capture does not need
 
     check_config(run_request.method())
     _title(console, "points")
     request = make_posed_request(run_request)
-    make_posed_capture(request, run_request.options, console, RunFolder(run_request.output))
-    options = replace(run_request.options, images=None, format="auto", masks=CaptureOptions.masks, undistort=False)
+    make_posed_capture(request, posed.options, console, RunFolder(run_request.output))
+    options = replace(run_request.options, images=size, format="auto", masks=CaptureOptions.masks, undistort=False)
     return replace(run_request, capture=request.output, options=options)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from vdgs.captures.capture_root import capture_root
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RunRequest
 from vdgs.config.sfm_options import SfmRequest
@@ -40,6 +41,17 @@ def _check_capture_options(options: CaptureOptions) -> None:
         raise VdgsError(f"--test-list {options.test_list}: no such file. Give a text file with a name in each line.")
     if options.split == "explicit" and options.test_list is None:
         raise VdgsError("--split explicit: photographs have no split of their own. Add --test-list, or leave it out.")
+
+
+def size_apart(request: RunRequest) -> tuple[RunRequest, str | None]:
+    """The request without the size of photographs that the capture to be made will have, and that size; None where
+    --images is a folder that is there, in which the photographs are, or not given."""
+    named = request.options.images
+    if named is None or Path(named).as_posix() not in [name for name, _ in IMAGE_SIZES]:
+        return request, None
+    if Path(named).is_dir() or (capture_root(request.capture) / named).is_dir():
+        return request, None
+    return replace(request, options=replace(request.options, images=None)), named
 
 
 def make_posed_request(request: RunRequest) -> SfmRequest:
