@@ -57,8 +57,8 @@ LOOKS_BEHIND = ("vdgs.cli.doctor", "experiments.microbench")
 STAGES = tuple(
     f"vdgs.pipeline.{name}"
     for name in (
-        "train_coarse", "count_visibility", "partition_stage", "train_block", "train_blocks", "merge_blocks",
-        "evaluate_stage",
+        "train_coarse", "find_motion", "count_visibility", "partition_stage", "train_block", "train_blocks",
+        "merge_blocks", "evaluate_stage",
     )
 )  # fmt: skip
 

@@ -94,7 +94,7 @@ def _check_options(options: CaptureOptions) -> None:
     found = find_range_errors(options)
     if found:
         raise CaptureError("\n  ".join(found))
-    check_folder("--masks", options.masks)
+    check_folder("--masks", options.mask_folder)
 
 
 # -------------------------------------------------------------------------------------------- points

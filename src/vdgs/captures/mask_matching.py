@@ -22,9 +22,9 @@ def find_masks(
     Raises `CaptureError` for a folder of masks that was asked for and is not there, and where masks are there but none
     of them is of a photograph.
     """
-    names = MASK_FOLDERS if options.masks == CaptureOptions.masks else ()
-    folder = next((root / name for name in names if (root / name).is_dir()), root / options.masks)
-    asked_for = options.masks != CaptureOptions.masks
+    names = MASK_FOLDERS if options.mask_folder == CaptureOptions.masks else ()
+    folder = next((root / name for name in names if (root / name).is_dir()), root / options.mask_folder)
+    asked_for = options.mask_folder != CaptureOptions.masks
     if asked_for and not folder.is_dir():
         raise CaptureError(f"{folder}: no such folder, though --masks asks for it.")
     masks = dict[str, Path | None]()

@@ -22,15 +22,21 @@ from vdgs.config.ranges import WORKER_COUNT, FlagName, Range
 
 @dataclass(frozen=True, kw_only=True)
 class VisibilityArguments(StageArguments):
-    """Count how many training cameras see each part of a run's scene; writes a map and the distribution."""
+    """Count how many training cameras see each part of a run's scene; writes a map and the distribution.
+
+    Of a run with --masks auto it first makes the masks of what moves.
+    """
 
 
 def visibility_command(arguments: list[str]) -> None:
     args = parse_arguments(VisibilityArguments, arguments, "visibility")
     from vdgs.pipeline.count_visibility import count_run_visibility
+    from vdgs.pipeline.find_motion import find_run_motion
     from vdgs.runs.run_context import RunContext
 
-    count_run_visibility(RunContext.from_path(args.run, args.capture), make_console(args.quiet))
+    context, console = RunContext.from_path(args.run, args.capture), make_console(args.quiet)
+    find_run_motion(context, console)
+    count_run_visibility(context, console)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,6 +20,7 @@ from rich.console import Console
 from torch import Tensor
 
 from vdgs.captures.capture import Capture as Capture
+from vdgs.config.capture_options import AUTO_MASKS
 from vdgs.config.capture_options import CaptureOptions as CaptureOptions
 from vdgs.config.commands import ExportRequest, ModelName, ViewRequest
 from vdgs.config.method import AssignmentConfig, MergeConfig, MethodConfig, PartitionConfig, TrainConfig
@@ -360,6 +361,8 @@ def train(
     config = preset(config) if isinstance(config, str) else config
     device, options = select_device(device).device, vars(capture_options or CaptureOptions())
     if run_dir is None:
+        if options["masks"] == AUTO_MASKS:
+            raise VdgsError("masks='auto' keeps the masks that it makes in a run folder: name one (run_dir)")
         opened = capture if isinstance(capture, Capture) else load_capture(capture, **options)
         return Scene(train_in_memory(opened, config, tuple(callbacks), _warning_console(), device), opened)
     if callbacks or isinstance(capture, Capture):

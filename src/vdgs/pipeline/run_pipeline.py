@@ -10,7 +10,7 @@ from rich.markup import escape
 
 from vdgs.captures.format_dispatch import lacks_points
 from vdgs.captures.output_guard import check_output
-from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.capture_options import AUTO_MASKS, CaptureOptions
 from vdgs.config.commands import OrthoRequest, RunRequest
 from vdgs.config.ranges import check_ranges
 from vdgs.config.validation_rules import check_config
@@ -21,6 +21,7 @@ from vdgs.evaluation.lpips import check_weights_file
 from vdgs.evaluation.measured_as import evaluation_folder, is_evaluated
 from vdgs.pipeline.count_visibility import count_run_visibility
 from vdgs.pipeline.evaluate_stage import EvaluationRequest, evaluate_stage
+from vdgs.pipeline.find_motion import find_run_motion
 from vdgs.pipeline.image_size import choose_for_photographs, choose_image_size, names_size
 from vdgs.pipeline.merge_blocks import merge_run_blocks
 from vdgs.pipeline.partition_stage import partition_run
@@ -100,7 +101,8 @@ def _find_points(run_request: RunRequest, console: Console) -> RunRequest:
     _title(console, "points")
     request = make_posed_request(run_request)
     make_posed_capture(request, posed.options, console, RunFolder(run_request.output))
-    options = replace(run_request.options, images=size, format="auto", masks=CaptureOptions.masks, undistort=False)
+    masks = AUTO_MASKS if run_request.options.masks == AUTO_MASKS else CaptureOptions.masks
+    options = replace(run_request.options, images=size, format="auto", masks=masks, undistort=False)
     return replace(run_request, capture=request.output, options=options)
 
 
@@ -110,6 +112,7 @@ def _stages(context: RunContext, request: RunRequest, console: Console) -> None:
     run.begin_step("coarse")
     train_coarse(context, request.checkpointing, console, request.device)
     check_stop_requested()
+    find_run_motion(context, console, request.device)
     run.begin_step("visibility")
     count_run_visibility(context, console)
     _measure(context, "coarse", request, console)

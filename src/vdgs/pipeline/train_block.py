@@ -29,6 +29,7 @@ from vdgs.model.anchors import Anchors
 from vdgs.model.scale_bounds import max_log_scales
 from vdgs.partition.block_regions import growth_mask, lr_ramp, split_trainable_anchors, visible_anchors
 from vdgs.partition.blocks import Blocks, xy_positions
+from vdgs.runs.motion_masks import with_motion_masks
 from vdgs.runs.open_run import block_view_indices, load_run_blocks
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.stage_folder import StageFolder, StatusRecord
@@ -164,7 +165,7 @@ def _train(
 ) -> None:
     run, opened = context.run, context.open_model("coarse", device)
     folder, method = run.block(index), run.method()
-    capture, coarse = opened.capture, opened.model
+    capture, coarse = with_motion_masks(run, opened.capture), opened.model
     start = time.monotonic()
     plan = plan_block(
         coarse, capture, blocks, index, block_view_indices(run, capture, index), method,

@@ -17,6 +17,7 @@ from vdgs.distributed.node_check import NodeRequirements, image_and_mask_files
 from vdgs.distributed.sharded_job import ExecutionOptions, ShardedJob, ShardNeeds
 from vdgs.errors import RunError, VdgsError
 from vdgs.geometry.camera import Camera
+from vdgs.runs.motion_masks import with_motion_masks
 from vdgs.runs.open_run import load_run_blocks
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
@@ -52,7 +53,7 @@ def train_blocks(
             console.print(f"{context.run.path}/blocks: all {len(blocks)} trained; nothing to do", highlight=False)
             return
         context.release_models()  # the memory is for the blocks
-        views = context.capture.train_views
+        views = with_motion_masks(run, context.capture).train_views
         cameras = [view.camera for view in views]
         files = [run.config_file, run.coarse.model, *image_and_mask_files(views)]
         job = ShardedJob(

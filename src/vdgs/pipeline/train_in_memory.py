@@ -165,7 +165,7 @@ def train_in_run_folder(
 ) -> None:  # fmt: skip
     """The same stages with a run folder, which the same call continues."""
     from vdgs.pipeline import count_visibility as visibility
-    from vdgs.pipeline import merge_blocks, partition_stage, train_blocks, train_coarse
+    from vdgs.pipeline import find_motion, merge_blocks, partition_stage, train_blocks, train_coarse
     from vdgs.runs.create_or_resume import exclusive_run
 
     method = config if isinstance(config, MethodConfig) else MethodConfig(training=config)
@@ -173,6 +173,7 @@ def train_in_run_folder(
     with exclusive_run(capture, run_dir, options, method, overwrite=False) as context:
         train_coarse.train_coarse(context, saving, console, device)
         if isinstance(config, MethodConfig):
+            find_motion.find_run_motion(context, console, device)
             visibility.count_run_visibility(context, console)
             partition_stage.partition_run(context, console, device)
             train_blocks.train_blocks(context, saving, 0, console, device)

@@ -17,6 +17,7 @@ from vdgs.captures.reconstruction import (
 from vdgs.report.html_page import Html, details, figure, heading, join_html, link, paragraph, section, table
 from vdgs.report.place_section import MAP_FILE, current_map
 from vdgs.report.run_reader import JsonRecord, ReportedRun, RunFiles, format_percent
+from vdgs.runs.motion_masks import MOTION_EXAMPLES, MOTION_FILE
 from vdgs.system.records import record_from_dict
 from vdgs.system.units import ABSENT, count, format_length
 
@@ -89,6 +90,24 @@ def visibility_section(report: ReportedRun) -> Html:
     if stats and not source.has(map_file):
         parts.append(paragraph(f"There is no map of it ({map_file}).", "absent"))
     return section("visibility", "The place and its visibility", parts, source.notes)
+
+
+def motion_section(report: ReportedRun) -> Html:
+    """What `--masks auto` found to move; nothing of a run without it."""
+    source = report.files()
+    record = source.record(MOTION_FILE)
+    if not record:
+        return Html("")
+    rows = record.rows("photographs")
+    masked = sum(row.text("mask") is not None for row in rows)
+    text = (
+        f"{format_percent(record.number('share'))} of the training photographs moves, in {masked} of {len(rows)}: it "
+        "shows there what other photographs of the same place do not show. The blocks leave it out of training; "
+        "test views are measured whole."
+    )
+    caption = "The photographs of which most moves; what their masks leave out is red."
+    parts = [paragraph(text), figure(source.image(MOTION_EXAMPLES), caption, "masks of what moves", True)]
+    return section("motion", "What moves", parts, source.notes)
 
 
 def blocks_section(report: ReportedRun) -> Html:

@@ -11,6 +11,7 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
+from vdgs.config.capture_options import AUTO_MASKS, CaptureOptions
 from vdgs.runs.run_settings import RunSettings
 
 #: Each stage with the sections of config.yaml that it depends on and the stages it builds on.
@@ -44,7 +45,9 @@ def stage_keys(settings: RunSettings, coarse_model: str | None = None) -> StageK
     keys, plain = dict[str, str](), settings.to_dict()
     for stage, (sections, before) in STAGE_DEPENDENCIES.items():
         # Where the capture lies is not what it is: a capture that moved keeps its results.
-        own = {name: hashable_settings(name, plain[name]) for name in sections}
+        own: dict[str, Any] = {name: hashable_settings(name, plain[name]) for name in sections}
+        if stage == "blocks" and settings.capture.masks == AUTO_MASKS:  # what moves is left out of the blocks alone
+            own["masks"] = AUTO_MASKS
         content = [own, *(keys[name] for name in before), *([coarse_model] if before == ("coarse",) else [])]
         keys[stage] = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
     return StageKeys(**keys)
@@ -52,5 +55,7 @@ def stage_keys(settings: RunSettings, coarse_model: str | None = None) -> StageK
 
 def hashable_settings(section: str, settings: dict[str, Any]) -> dict[str, Any]:
     """The settings of a section that keys are made of: one that needs another counts only beside it."""
+    if settings.get("masks") == AUTO_MASKS:
+        settings = settings | {"masks": CaptureOptions.masks}
     ignored = {("capture", "path"), *(each for each, needed in REQUIRED_SETTINGS.items() if not settings.get(needed))}
     return {name: value for name, value in settings.items() if (section, name) not in ignored}

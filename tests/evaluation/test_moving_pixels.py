@@ -1,0 +1,59 @@
+"""What moves: found where one photograph alone differs, and not where a model is wrong for all of them."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from support.captures import render_plane, tiny_scene
+from vdgs.evaluation.moving_pixels import Residual, make_residual, moving_pixels, overlapping_views
+
+CAMERAS = list(tiny_scene(columns=3, rows=2, width=160, height=120).cameras.values())
+
+
+def plane_depth(camera) -> np.ndarray:
+    near, far = (camera.unproject(np.full((camera.height, camera.width), depth))[..., 2] for depth in (1.0, 2.0))
+    return 1 + near / (near - far)
+
+
+def residual(camera, box=None, mask=None, ghost=0.0) -> Residual:
+    """Of a model that shows no detail, and `ghost` too bright in a place that all views see."""
+    photograph, depth = render_plane(camera), plane_depth(camera)
+    shown = cv2.GaussianBlur(photograph, (0, 0), 6).astype(np.float32) / 255
+    places = camera.unproject(depth)
+    shown[np.hypot(places[..., 0] - 3, places[..., 1] - 1.5) < 0.7] += ghost
+    if box is not None:
+        photograph = photograph.copy()
+        photograph[box] = (250, 250, 20)
+    return make_residual(camera, photograph, mask, shown, depth)
+
+
+BOX = np.s_[50:62, 70:92]
+
+
+def found(own: Residual) -> np.ndarray:
+    near = overlapping_views(2, CAMERAS, own.depth)
+    return moving_pixels(own, [residual(CAMERAS[other], ghost=0.3) for other in near])
+
+
+def test_an_object_of_one_photograph_is_found_and_nothing_else():
+    moves, painted = found(residual(CAMERAS[2], BOX, ghost=0.3)), np.zeros((120, 160), bool)
+    painted[BOX] = True
+    assert moves[painted].mean() > 0.9
+    assert moves[~painted].mean() < 0.02
+
+
+def test_what_the_model_lacks_or_shows_in_all_photographs_does_not_move():
+    assert not found(residual(CAMERAS[2], ghost=0.3)).any()
+
+
+def test_what_a_mask_leaves_out_is_not_looked_at():
+    mask = np.ones((120, 160), np.uint8)
+    mask[45:67, 65:97] = 0
+    assert not found(residual(CAMERAS[2], BOX, mask, ghost=0.3)).any()
+
+
+@pytest.mark.parametrize("others", [0, 2])
+def test_too_few_other_photographs_say_nothing(others):
+    assert not moving_pixels(residual(CAMERAS[2], BOX), [residual(camera) for camera in CAMERAS[:others]]).any()
