@@ -22,6 +22,8 @@ from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.report.capture_report import inspect_capture, print_report
 
+pytestmark = pytest.mark.slow  # whole reconstructions, runs or trainings
+
 UTM = np.array([500_000.0, 5_000_000.0, 300.0])
 
 

@@ -15,7 +15,7 @@ from experiments.bench.results import BenchResult
 from support.bench import InThisProcess, write_data
 from vdgs.errors import VdgsError
 
-pytestmark = pytest.mark.xdist_group("bench_cached_results")
+pytestmark = [pytest.mark.xdist_group("bench_cached_results"), pytest.mark.slow]
 
 
 def asked(data: Path, output: Path, seeds: int = 1, known: tuple[Path, ...] = (), total: int = 40) -> BenchSettings:

@@ -24,7 +24,7 @@ from vdgs.errors import RunError, Stopped
 from vdgs.runs.open_run import open_run
 from vdgs.runs.run_folder import RunFolder
 
-pytestmark = pytest.mark.xdist_group("bench_gs3d")
+pytestmark = [pytest.mark.xdist_group("bench_gs3d"), pytest.mark.slow]
 
 
 def test_the_published_length_has_the_published_schedule():

@@ -14,7 +14,7 @@ from PIL import Image
 
 from support.captures import tiny_scene, write_colmap
 
-pytestmark = pytest.mark.xdist_group("api")
+pytestmark = [pytest.mark.xdist_group("api"), pytest.mark.slow]
 EXAMPLES = Path(__file__).parents[2] / "examples"
 NAMES = sorted(file.name for file in EXAMPLES.iterdir() if file.suffix in (".py", ".ipynb"))
 

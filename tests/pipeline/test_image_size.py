@@ -26,6 +26,8 @@ from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
 from vdgs.system.processor_time import Cost
 
+pytestmark = pytest.mark.slow  # whole reconstructions, runs or trainings
+
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -23,6 +23,8 @@ from vdgs.pipeline import image_size, time_estimate
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
 
+pytestmark = pytest.mark.slow  # whole reconstructions, runs or trainings
+
 SETTINGS = (
     "--preset", "laptop", "--iterations", "12", "--model.num-offsets", "2", "--densify.start", "50", "--no-ortho",
     "--blocks", "2", "--assignment.min-cameras", "4", "--block.iterations", "6", "--quiet",

@@ -31,6 +31,8 @@ from vdgs.sfm.find_images import films_in
 from vdgs.sfm.image_list import ImageList, collect_images, is_image_folder
 from vdgs.sfm.reconstruct import reconstruct
 
+pytestmark = pytest.mark.slow  # whole reconstructions, runs or trainings
+
 pytest.importorskip("av")
 #: Stands for 1 s, then moves by 5 of 200 pixels a frame.
 LEFTS = [0] * 10 + [5 * k for k in range(40)]

@@ -23,7 +23,7 @@ from vdgs.geometry.geodesy import geodetic_from_enu
 from vdgs.sfm import feature_extraction, feature_matching, gps_priors, incremental_mapper
 from vdgs.sfm.reconstruct import reconstruct
 
-pytestmark = pytest.mark.xdist_group("sfm")
+pytestmark = [pytest.mark.xdist_group("sfm"), pytest.mark.slow]
 
 
 def console() -> Console:

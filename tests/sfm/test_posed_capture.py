@@ -39,6 +39,8 @@ from vdgs.sfm.random_points import random_points
 from vdgs.synth.ray_tracing import RayTracer
 from vdgs.synth.town import build_town
 
+pytestmark = pytest.mark.slow  # whole reconstructions, runs or trainings
+
 LENS = BentLens(focal=340.0, center=(203.0, 148.0), k=(0.08, -0.02, 0.004, 0.003), p=(0.001, -0.0006), size=(400, 300))
 
 

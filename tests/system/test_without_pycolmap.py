@@ -11,6 +11,8 @@ import pytest
 from vdgs.system import lazy_pycolmap
 from vdgs.system.exit_codes import REMOVABLE_PACKAGES, exit_code_of
 
+pytestmark = pytest.mark.slow  # whole reconstructions, runs or trainings
+
 IMPORT_ALL = """
 import importlib, pkgutil, sys
 sys.modules["pycolmap"] = None

@@ -35,7 +35,7 @@ from vdgs.model.exposure import MAX_FLIGHT_GAP, apply_exposure, exposure_matrix,
 from vdgs.model.renderer import render
 from vdgs.training import TrainingProblem, from_checkpoint, initial_state, to_checkpoint, train_step
 
-pytestmark = pytest.mark.xdist_group("training")
+pytestmark = [pytest.mark.xdist_group("training"), pytest.mark.slow]
 
 GAINS = torch.tensor([0.7, 1.3, 0.8, 1.2, 0.9, 1.1, 0.75, 1.25])
 
