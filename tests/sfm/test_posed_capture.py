@@ -139,7 +139,7 @@ def test_run_of_a_project_without_points_finds_them_first(
     said = Console(file=io.StringIO(), width=200)
     estimate = estimate_run(replace(request, device="cpu"), said)
     assert {"photographs", "coarse", "blocks"} <= {name for name, cost in estimate.times.items() if cost.seconds > 0}
-    assert "5 photographs, poses and lenses as the project has them: features, about 10 pairs" in said.file.getvalue()  # type: ignore[attr-defined]
+    assert "5 photographs, poses and lenses as they are given: features, about 10 pairs" in said.file.getvalue()  # type: ignore[attr-defined]
     assert not (tmp_path / "run").exists()
     for _ in range(2):
         found = reconstruct_if_needed(request, Console(file=io.StringIO()))

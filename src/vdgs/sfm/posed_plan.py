@@ -47,7 +47,7 @@ def print_posed_plan(plan: ReconstructionPlan, estimate: SfmEstimate, console: C
     for warning in plan.image_list.notes:
         console.print(f"[yellow]note[/] {warning}", highlight=False)
     console.print(
-        f"{len(plan.image_list.images)} photographs, poses and lenses as the project has them: features, about "
+        f"{len(plan.image_list.images)} photographs, poses and lenses as they are given: features, about "
         f"{plan.pairs} pairs, about {estimate.points:,} points, photographs without distortion\n"
         f"{estimate.text(plan.threads)}", highlight=False,
     )  # fmt: skip
