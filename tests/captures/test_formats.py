@@ -77,6 +77,17 @@ def test_transforms_json(tmp_path, scene):
     assert_sees_the_scene(capture, scene)
 
 
+def test_transforms_json_is_read_with_shrunk_photographs_alone(tmp_path, scene):
+    """nerfstudio's tools write images_2, images_4, ...; the largest are taken where images/ is gone."""
+    write_transforms(tmp_path, scene)
+    (tmp_path / "images").rename(tmp_path / "images_4")
+    write_images(tmp_path / "images_2", scene)
+    capture = load_capture(tmp_path)
+    assert capture.images == "images_2"
+    assert any("images_2 is used instead" in warning for warning in capture.warnings)
+    assert_sees_the_scene(capture, scene)
+
+
 def test_applied_transform_is_undone(tmp_path, scene):
     """The capture's own world is the one before it, so that a georeference keeps its meaning."""
     applied = np.eye(4)[[0, 2, 1, 3]]

@@ -22,10 +22,12 @@ from vdgs.captures.image_checks import check_images
 from vdgs.captures.image_files import decode_image
 from vdgs.captures.image_matching import fit_to_image, scale_intrinsics
 from vdgs.captures.loading import load_capture
+from vdgs.captures.output_guard import input_folders
 from vdgs.captures.undistortion import ImageFile, sampling_map, undistorted_pinhole
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.pipeline.image_size import image_sizes
+from vdgs.runs.run_settings import with_absolute_paths
 
 UP = CaptureOptions(up="z")
 
@@ -151,10 +153,33 @@ def test_the_largest_shrunk_folder_stands_in_for_images(folder, scene):
     assert any("images_2 is used instead" in warning for warning in capture.warnings)
 
 
-@pytest.mark.parametrize("images", ["../images", "/tmp", ""])
-def test_image_folders_stay_inside_the_capture(folder, images):
-    with pytest.raises(CaptureError, match="must be a folder inside"):
+@pytest.mark.parametrize("images", ["../gone", "/gone", "gone", ""])
+def test_image_folders_that_are_not_there_are_refused(folder, images):
+    with pytest.raises(CaptureError, match="no such folder"):
         load_capture(folder, up(images=images))
+
+
+@pytest.mark.parametrize("given", ["from the capture", "absolute", "from here"])
+def test_photographs_may_lie_outside_the_capture(folder, given, monkeypatch):
+    """As COLMAP's `--image_path` may; masks too."""
+    place = folder.parent / f"{folder.name}-elsewhere"
+    (folder / "images").rename(place)
+    monkeypatch.chdir(folder.parent)
+    masks = folder.parent / f"{folder.name}-masks"
+    masks.mkdir()
+    for path in place.iterdir():
+        with Image.open(path) as image:
+            Image.new("L", image.size, 255).save(masks / f"{path.stem}.png")
+    named = {"absolute": str(place), "from here": place.name}.get(given, f"../{place.name}")
+    options = up(images=named, masks=masks.name)
+    capture = load_capture(folder, options)
+    assert all(view.mask_path is not None for view in capture.views)
+    assert {view.image_path.resolve().parent for view in capture.views} == {place.resolve()}
+    assert place.resolve() in [each.resolve() for each in input_folders(capture)]
+    kept = with_absolute_paths(options, folder)
+    monkeypatch.chdir(folder)
+    again = load_capture(folder, kept)
+    assert [view.image_path.resolve() for view in again.views] == [view.image_path.resolve() for view in capture.views]
 
 
 @pytest.mark.parametrize("linked", [False, True])
@@ -185,7 +210,7 @@ def test_missing_things_are_named(tmp_path, scene):
         CaptureError, match=r"12 of 12 images that have a camera are missing.*(?s:.)*frame_000(?s:.)*frame_011"
     ):
         load_capture(tmp_path, UP)
-    with pytest.raises(CaptureError, match=r"images_9: no such folder. Present: images_2, sparse"):
+    with pytest.raises(CaptureError, match=r"images_9: no such folder.*Present in the capture: images_2, sparse"):
         load_capture(tmp_path, up(images="images_9"))
     (model / "points3D.bin").unlink()
     with pytest.raises(CaptureError, match="no 3D points"):

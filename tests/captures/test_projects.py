@@ -177,9 +177,3 @@ def test_exports_without_poses_do_not_stand_in_the_way_of_photographs(tmp_path, 
     for name in ("markers.xml", "bulk.xml"):
         with pytest.raises(CaptureError, match="no camera of it has a pose"):
             load_capture(tmp_path / name)
-
-
-def test_other_formats_take_no_folder_outside(tmp_path, scene):
-    write_colmap(tmp_path / "capture", scene)
-    with pytest.raises(CaptureError, match="must be a folder inside the capture"):
-        load_capture(tmp_path / "capture", CaptureOptions(images=str(tmp_path)))

@@ -22,10 +22,12 @@ from vdgs.captures.formats.colmap import (
 from vdgs.captures.formats.matrixcity import pose_files, read_matrixcity
 from vdgs.captures.formats.mega_nerf import is_mega_nerf, read_mega_nerf
 from vdgs.captures.formats.ply_reader import read_point_cloud
+from vdgs.captures.formats.project_photographs import image_root
 from vdgs.captures.formats.source_capture import NoTiePoints, SourceCapture, no_points
 from vdgs.captures.formats.sparse_points import POINT_CLOUDS, find_point_cloud
 from vdgs.captures.formats.transforms import TRANSFORMS_FILE, exclusive_information, is_transforms, read_transforms
 from vdgs.captures.image_files import find_images, readable_suffixes
+from vdgs.captures.name_resolution import largest_shrunk
 from vdgs.captures.nested_captures import foreign_poses, model_below
 from vdgs.captures.project_formats import PROJECTS, find_projects, is_project, read_project
 from vdgs.captures.reconstruction import is_reconstruction
@@ -51,8 +53,7 @@ def read_source(root: Path, options: CaptureOptions, *, needs_points: bool = Tru
             raise CaptureError(f"{root}: --format {options.format}, but the folder holds no such capture. {found}")
         return _read(root, options.format, options, needs_points)
     if here[:2] == ["colmap", "transforms"]:
-        check_folder("--images", options.images)
-        return _of_both(root, options, needs_points)
+        return _of_both(root, _with_image_folder(root, options), needs_points)
     if here:
         source = _read(root, here[0], options, needs_points)
         note = f"{' and '.join(here[1:])} beside it: not read (--format chooses)."
@@ -96,14 +97,31 @@ def _read(root: Path, name: str, options: CaptureOptions, needs_points: bool) ->
     """The capture of a format that is there."""
     if name in PROJECTS:
         return read_project(root, name, options, needs_points=needs_points)
-    check_folder("--images", options.images)
-    return READERS[name][1](root, options, needs_points)
+    if name == "mega-nerf":  # train/ and val/ each have a folder of this name
+        check_folder("--images", options.images)
+        return READERS[name][1](root, options, needs_points)
+    return READERS[name][1](root, _with_image_folder(root, options), needs_points)
 
 
 def check_folder(flag: str, folder: str | None) -> None:
     """Raise `CaptureError` for an option that must name a folder inside the capture, and does not."""
     if folder is not None and (Path(folder).is_absolute() or ".." in Path(folder).parts or not folder):
         raise CaptureError(f"{flag} {folder}: must be a folder inside the capture, such as images_4.")
+
+
+def _with_image_folder(root: Path, options: CaptureOptions) -> CaptureOptions:
+    """The options with `--images` by its path in the capture, or where it lies elsewhere by its absolute path. Raises
+    `CaptureError` where it is not there."""
+    if options.images is None:
+        return options
+    if not options.images or not ((root / options.images).is_dir() or Path(options.images).is_dir()):
+        present = sorted(entry.name for entry in root.iterdir() if entry.is_dir())
+        raise CaptureError(
+            f"--images {options.images}: no such folder, neither in {root} nor from here. Present in the capture: "
+            f"{', '.join(present) or 'none'}."
+        )
+    folder = image_root(root, options)
+    return replace(options, images=(folder.relative_to(root) if folder.is_relative_to(root) else folder).as_posix())
 
 
 def _of_both(root: Path, options: CaptureOptions, needs_points: bool) -> SourceCapture:
@@ -170,20 +188,12 @@ def use_image_folder(source: SourceCapture, root: Path, name: str) -> SourceCapt
 def image_folder(root: Path, options: CaptureOptions) -> tuple[str, list[str]]:
     """The image folder relative to `root`: the one asked for, else images, else the largest images_N."""
     if options.images is not None:
-        if not (root / options.images).is_dir():
-            present = sorted(entry.name for entry in root.iterdir() if entry.is_dir())
-            raise CaptureError(f"{root / options.images}: no such folder. Present: {', '.join(present) or 'none'}.")
-        return Path(options.images).as_posix(), []
+        return options.images, []
     if (root / "images").is_dir():
         return "images", []
-    shrunk = {
-        int(entry.name.removeprefix("images_")): entry.name
-        for entry in root.glob("images_*")
-        if entry.is_dir() and entry.name.removeprefix("images_").isdigit()
-    }
-    if not shrunk:
+    name = largest_shrunk(root, "images")
+    if name is None:
         return _other_image_folder(root)
-    name = shrunk[min(shrunk)]
     return name, [f"no images/ folder; {name} is used instead (--images chooses)."]
 
 
@@ -203,9 +213,8 @@ def _other_image_folder(root: Path) -> tuple[str, list[str]]:
         raise CaptureError(
             f"{root}: is a model alone; its photographs lie beside it. Give the folder of both: {shell_word(above)}"
         )
-    where = (
-        f", or name the folder that they are in: {' or '.join(f'--images {name}' for name in named)}" if named else ""
-    )
+    named = named or ["FOLDER, wherever it is"]
+    where = f", or name the folder that they are in: {' or '.join(f'--images {name}' for name in named)}"
     raise CaptureError(f"{root}: no images/ folder (nor images_2, images_4, ...). Put the photographs there{where}.")
 
 

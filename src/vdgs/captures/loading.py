@@ -55,7 +55,7 @@ def read_files(root: Path, options: CaptureOptions) -> SourceCapture:
         check_no_foreign_file(root)
         what = "is a file. Unpack an archive first, and give" if root.is_file() else "no such folder. Give"
         raise CaptureError(f"{root}: {what} the folder that holds images/ and sparse/.")
-    _check_options(options)
+    _check_options(root, options)
     return read_source(root, options)
 
 
@@ -90,11 +90,12 @@ def make_capture(root: Path, source: SourceCapture, options: CaptureOptions) -> 
     )  # fmt: skip
 
 
-def _check_options(options: CaptureOptions) -> None:
+def _check_options(root: Path, options: CaptureOptions) -> None:
     found = find_range_errors(options)
     if found:
         raise CaptureError("\n  ".join(found))
-    check_folder("--masks", options.mask_folder)
+    if not (root / options.mask_folder).is_dir() and not Path(options.mask_folder).is_dir():
+        check_folder("--masks", options.mask_folder)
 
 
 # -------------------------------------------------------------------------------------------- points
@@ -137,7 +138,8 @@ def _undistorted(
     bent = [photo for photo in photographs if photo.file.intrinsics.is_distorted]
     if not bent:
         return photographs
-    inside = "images" if source.original_images else options.images or "images"
+    elsewhere = Path(source.images).is_absolute()
+    inside = "images" if source.original_images or elsewhere else options.images or "images"
     folder = options.undistorted_folder or root / UNDISTORTED / inside
     files = [photo.file for photo in photographs]
     check_not_among_files(folder, root, [path for file in files for path in (file.path, file.mask) if path is not None])

@@ -25,6 +25,8 @@ def find_masks(
     names = MASK_FOLDERS if options.mask_folder == CaptureOptions.masks else ()
     folder = next((root / name for name in names if (root / name).is_dir()), root / options.mask_folder)
     asked_for = options.mask_folder != CaptureOptions.masks
+    if asked_for and not folder.is_dir() and Path(options.mask_folder).is_dir():
+        folder = Path(options.mask_folder)  # given from where the person stands
     if asked_for and not folder.is_dir():
         raise CaptureError(f"{folder}: no such folder, though --masks asks for it.")
     masks = dict[str, Path | None]()

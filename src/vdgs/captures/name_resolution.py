@@ -50,6 +50,13 @@ def find_file(folder: Path, name: str) -> Path | None:
     return next((folder / way for way in ways if (folder / way).is_file()), None)
 
 
+def largest_shrunk(root: Path, folder: str) -> str | None:
+    """The largest of the folders `folder`_N of shrunk photographs in `root`; None where there is none."""
+    shrunk = [entry.name for entry in root.glob(f"{folder}_*") if entry.is_dir()]
+    factors = {int(name.removeprefix(f"{folder}_")): name for name in shrunk if name[len(folder) + 1 :].isdigit()}
+    return factors[min(factors)] if factors else None
+
+
 class ImageNameIndex:
     """Looks images up by name: exactly, else by the only one that differs in how its letters are written, else by the
     only one that differs in extension or case."""

@@ -30,7 +30,7 @@ _OF_MAPS = {"orthophoto.tif", "dsm.tif", "visibility.tif", "hillshade.png", "pre
 #: Pictures of ours, and what screens leave on a disk.
 _PICTURES = re.compile(
     r"(photographs|reconstruction|contact[_ -]?sheet)\.(png|jpe?g)|screen[ _-]?shots?\b.*|bildschirmfoto.*"
-    r"|capture d.écran.*"
+    r"|capture d.écran.*|dynamic_mask_.+\.png"  # the latter instant-ngp's: white is what moves, not what to keep
     r"|(odm_)?(orthophoto|orthomosaic|ortho|dsm|dtm|dem|hillshade|mosaic)([_-].*)?\.(tiff?|png|jpe?g)"
     r"|.+[_-](orthophoto|orthomosaic|transparent_mosaic[_-]?\w*|mosaic_\w+|dsm|dtm|ortho)\.(tiff?|png|jpe?g)",
     re.IGNORECASE,

@@ -29,11 +29,12 @@ class CaptureOptions:
     """Format to read, where a folder holds several. auto: of a COLMAP model and transforms.json the
     model, unless transforms.json lists training and test photographs or names masks."""
     images: str | None = None
-    """Image folder to use, such as images_4. Default: images, or where absent the largest images_N. Of a project of
-    another program: any folder that its photographs are in or below; default: images, or the whole folder."""
+    """Image folder to use, such as images_4, in the capture or elsewhere. Default: images, or where absent the largest
+    images_N. Of a project of another program: any folder that its photographs are in or below; default: images, or the
+    whole folder."""
     strict: bool = False
-    """Refuse a capture of which photographs are missing. By default the others are used where three
-    quarters are there. Of a project of another program also one with cameras that cannot be used."""
+    """Refuse a capture of which photographs are missing. By default the others are used where two
+    thirds are there. Of a project of another program also one with cameras that cannot be used."""
     downscale: Annotated[float, Range(1, 1000)] = 1.0
     """Shrink images by this factor when they are loaded. 2: half the width and height."""
     test_every: Annotated[int, Range(2, MAX_COUNT)] = 8

@@ -33,7 +33,7 @@ from vdgs.captures.formats.source_capture import (
     to_rigid,
 )
 from vdgs.captures.formats.sparse_points import find_sparse_points
-from vdgs.captures.name_resolution import ImageNameIndex, find_file
+from vdgs.captures.name_resolution import ImageNameIndex, find_file, largest_shrunk
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.system.documents import JsonObject
@@ -74,7 +74,7 @@ def read_transforms(root: Path, options: CaptureOptions, needs_points: bool = Tr
     frames = get_frames(content, file)
     names = [_name(frame, file, root) for frame in frames]
     folder = _common_folder(names)
-    chosen = options.images or folder
+    chosen, notes = _image_folder(root, folder, options)
     splits = _splits(content, names, file, root, options)
     undo = _undo_applied(content, file)
     views, poses, missing = list[SourceView](), dict[str, np.ndarray](), list[str]()
@@ -102,7 +102,7 @@ def read_transforms(root: Path, options: CaptureOptions, needs_points: bool = Tr
                 mask_path=mask_file,
             )
         )
-    warnings = refuse_many_missing(missing, len(frames), root / chosen, options.strict)
+    warnings = notes + refuse_many_missing(missing, len(frames), root / chosen, options.strict)
     twice = find_duplicates(view.name for view in views)
     if twice:
         raise CaptureError(f"{file}: the same image occurs more than once.{format_list(twice)}")
@@ -133,6 +133,15 @@ def _common_folder(names: list[str]) -> str:
     first = {PurePosixPath(name).parts[0] for name in names if len(PurePosixPath(name).parts) > 1}
     flat = any(len(PurePosixPath(name).parts) == 1 for name in names)
     return first.pop() if len(first) == 1 and not flat else ""
+
+
+def _image_folder(root: Path, named: str, options: CaptureOptions) -> tuple[str, list[str]]:
+    """The folder of the photographs: the one asked for, else the one that all names begin with, else the largest of
+    shrunk ones (which is said)."""
+    if options.images is not None:
+        return options.images, []
+    shrunk = largest_shrunk(root, named) if named and not (root / named).is_dir() else None
+    return shrunk or named, [f"no {named}/ folder; {shrunk} is used instead (--images chooses)."] if shrunk else []
 
 
 def _splits(content: JsonObject, names: list[str], file: Path, root: Path, options: CaptureOptions) -> dict[str, Split]:
