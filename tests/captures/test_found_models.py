@@ -117,7 +117,7 @@ def test_a_model_apart_from_its_photographs_is_named_with_what_joins_them(tmp_pa
     assert len(load_capture(Path(link[3])).views) == 12
 
 
-@pytest.mark.parametrize("name", ["a/model.nvm", "database.db", "poses_bounds.npy", "place.psx", "place.rcproj"])
+@pytest.mark.parametrize("name", ["a/sfm_data.bin", "database.db", "poses_bounds.npy", "place.psx", "place.rcproj"])
 def test_poses_of_formats_that_are_not_read_are_said(tmp_path, name):
     large = tiny_scene(width=160, height=120)
     write_images(tmp_path, large)
@@ -127,6 +127,30 @@ def test_poses_of_formats_that_are_not_read_are_said(tmp_path, name):
     (tmp_path / name).write_text('[{"shots": {"a": {"rotation": [0, 0, 0]}}}]')
     assert any(name in note and "Poses are made anew" in note for note in collect_images([tmp_path]).notes)
     with pytest.raises(CaptureError, match=r"not a capture. Not read: "):
+        load_capture(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "says"),
+    [
+        (
+            "cameras.xml",
+            '<?xml version="1.0"?><document version="1.5.0"><chunk/></document>',
+            "of Metashape without poses",
+        ),
+        ("block.xml", '<?xml version="1.0"?><BlocksExchange version="3.2"><Block/></BlocksExchange>', "without poses"),
+        ("opk.txt", "# PhotoID, X, Y, Z, Omega, Phi, Kappa, r11, r12\na.jpg,1,2,3,4,5,6,1,0\n", "Agisoft XML"),
+        ("a_calibrated_external_camera_parameters.txt", "imageName X Y Z Omega Phi Kappa\na 1", "of PIX4Dmapper"),
+        ("flight.prj", "$PROJECT 4.4\n  $PROJECT_NAME : flight\n", "of Inpho"),
+        ("Ori-All/Orientation-a.jpg.xml", "<ExportAPERO><OrientationConique/></ExportAPERO>", "Apero2NVM"),
+        ("AT/sfm_geo_desc.json", '{"is_georeferenced": true, "x": 1}', "BlocksExchange"),
+    ],
+)
+def test_files_that_only_their_beginning_tells_are_said(tmp_path, name, text, says):
+    write_images(tmp_path, tiny_scene(width=160, height=120))
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text(text)
+    with pytest.raises(CaptureError, match=rf"not a capture. Not read: .*{Path(name).name}: .*{says}"):
         load_capture(tmp_path)
 
 

@@ -17,11 +17,13 @@ from support.metashape_files import (
     chunk_from_enu,
     metashape_calibration,
     metashape_cameras,
+    metashape_rig,
     metashape_transform,
     metashape_xml,
+    write_project,
 )
 from support.true_flight import ORIGIN, SIZE, Lens, TrueFlight, assert_read_or_refused, assert_true, true_flight
-from vdgs.captures.formats.lens_projection import ray_pixels
+from vdgs.captures.formats.lens_projection import pixel_rays, ray_pixels
 from vdgs.captures.formats.source_capture import NoTiePoints, SourceCapture
 from vdgs.captures.loading import read_files
 from vdgs.captures.project_formats import read_project
@@ -158,16 +160,82 @@ def test_a_camera_of_no_use_is_named_and_left_out(tmp_path):
 
 
 @pytest.mark.parametrize(("b2", "p"), [(0.0, (0.0007, -0.0004)), (-0.3, (0.0007, -0.0004)), (0.0, (0.0, 0.0))])
-def test_fisheyes_are_read_as_the_program_describes_them(tmp_path, b2, p):
+@pytest.mark.parametrize("kind", ["fisheye", "equisolid_fisheye"])
+def test_fisheyes_are_read_as_the_program_describes_them(tmp_path, kind, b2, p):
     lens = Lens(b2=b2, k=(0.02, -0.01, 0.003, -0.001), p=p)
     flight = true_flight(lens=lens)
-    sensors = f'<sensor id="0" label="fish" type="fisheye">{metashape_calibration(lens, kind="fisheye")}</sensor>'
-    source = read(tmp_path, metashape_xml(flight, sensors=sensors), flight)
+    sensors = f'<sensor id="0" label="fish" type="{kind}">{metashape_calibration(lens, kind=kind)}</sensor>'
+    intrinsics = read(tmp_path, metashape_xml(flight, sensors=sensors), flight).views[0].intrinsics
     rays = np.array([[0.5, 0.3], [-0.9, 0.1], [0.0, -1.4]])
     radius = np.hypot(*rays.T)
-    angles = rays * (np.arctan(radius) / radius)[:, None]
-    found = ray_pixels(source.views[0].intrinsics, rays)
-    assert np.abs(found - lens.pixels(*angles.T)).max() < 0.01
+    angles = np.arctan(radius) if kind == "fisheye" else 2 * np.sin(np.arctan(radius) / 2)
+    pixels = lens.pixels(*(rays * (angles / radius)[:, None]).T)
+    assert np.abs(ray_pixels(intrinsics, rays) - pixels).max() < 0.01
+    np.testing.assert_allclose(pixel_rays(intrinsics, pixels), rays, atol=1e-6)
+
+
+def test_slaves_are_where_their_masters_and_sensors_say(tmp_path):
+    flight = true_flight()
+    xml, slaves = metashape_rig(flight, Lens(f=2900.0, cx=4.0))
+    slaves.touch(tmp_path)
+    source = read(tmp_path, xml, flight)
+    for part in (flight, slaves):
+        assert_true(replace(source, views=tuple(view for view in source.views if view.name in part.names)), part)
+    xml, _ = metashape_rig(flight, Lens(), bands="NIR")
+    source = read(tmp_path, xml, flight)
+    assert_true(source, flight)
+    assert any("8 cameras show other bands than the masters" in each for each in source.warnings)
+
+
+def test_what_a_lens_has_besides_is_said(tmp_path):
+    flight = true_flight()
+    more = '<property name="rolling_shutter" value="true"/><calibration class="adjusted"><corrections type="fourier"/>'
+    xml = metashape_xml(flight).replace('<property name="layer_index" value="0"/>', "")
+    xml = xml.replace('<calibration type="frame" class="adjusted">', more)
+    said = " ".join(read(tmp_path, xml, flight).warnings)
+    assert "rolling shutter is not modelled" in said
+    assert "additional corrections of its lens are not applied" in said
+
+
+def test_a_camera_whose_transform_is_zeros_is_named_and_the_others_are_used(tmp_path):
+    flight = true_flight()
+    zeros = f'<camera id="90" sensor_id="0" label="DJI_9"><transform>{"0 " * 16}</transform></camera>'
+    source = read(tmp_path, metashape_xml(flight, cameras=metashape_cameras(flight) + zeros), flight)
+    assert_true(source, flight)
+    assert any("all zeros" in each and "(DJI_9)" in each for each in source.warnings)
+
+
+@pytest.mark.parametrize("suffix", [".psx", ".psz"])
+def test_a_project_is_read_with_its_tie_points(tmp_path, suffix):
+    flight = true_flight()
+    flight.touch(tmp_path)
+    file = write_project(tmp_path, flight, suffix=suffix)
+    for given in (tmp_path, file):
+        source = read_files(given, OPTIONS)
+        assert_true(source, flight)
+        np.testing.assert_array_equal(source.colors[0], [10, 11, 12])
+        truth = enu_from_geodetic(geodetic_from_enu(flight.points, ORIGIN), source.georef.origin)
+        np.testing.assert_allclose(source.points, truth, atol=2e-4)  # written as float32
+        for view in source.views:
+            seen = view.observations.points @ view.camera_from_world[:3, :3].T + view.camera_from_world[:3, 3]
+            assert np.abs(seen[:, :2] / seen[:, 2:] - view.observations.rays).max() * flight.lens.f < 0.02
+    (tmp_path / "cameras.xml").write_text(metashape_xml(flight))
+    assert not len(read_project(tmp_path, "metashape", OPTIONS, needs_points=False).points)
+
+
+def test_a_project_that_is_not_whole_says_what_to_copy(tmp_path):
+    flight = true_flight(count=3)
+    flight.touch(tmp_path)
+    file = write_project(tmp_path, flight)
+    cloud = tmp_path / "project.files" / "0" / "0" / "point_cloud" / "point_cloud.zip"
+    cloud.write_bytes(cloud.read_bytes()[:-40])
+    with pytest.raises(CaptureError, match=r"point_cloud\.zip: is no zip file"):
+        read_files(file, OPTIONS)
+    (tmp_path / "project.files").rename(tmp_path / "elsewhere")
+    with pytest.raises(CaptureError, match=r"project\.files, which is not beside it whole"):
+        read_files(file, OPTIONS)
+    with pytest.raises(CaptureError, match=r"not a capture. Not read: project\.psx"):
+        read_files(tmp_path, OPTIONS)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,5 @@
-"""Projects of OpenSfM, ODM, Bundler, RealityScan and Pix4D: a known flight in each, read back to its numbers."""
+"""Projects of OpenSfM, ODM, OpenMVG, Meshroom, VisualSFM, Bundler, RealityScan and Pix4D: a known flight in each, read
+back to its numbers."""
 
 from __future__ import annotations
 
@@ -10,7 +11,16 @@ import numpy as np
 import pytest
 
 from support import project_writers as writers
-from support.known_flight import ORIGIN, BentLens, KnownFlight, centers_of, ecef, known_flight, poses_of
+from support.known_flight import (
+    ORIGIN,
+    BentLens,
+    KnownFlight,
+    MeasuredLens,
+    centers_of,
+    ecef,
+    known_flight,
+    poses_of,
+)
 from vdgs.captures.format_dispatch import lacks_points, read_source
 from vdgs.captures.formats import las_reader
 from vdgs.captures.formats.lens_projection import ray_pixels
@@ -126,6 +136,7 @@ def test_report_of_odm_is_read_where_its_reconstruction_is_gone(tmp_path: Path, 
     writers.write_odm_report(tmp_path, flight)
     flight.write_photographs(tmp_path / "images")
     check_numbers(read(tmp_path, "opensfm"), flight)
+    _check_names_of_cameras(tmp_path, flight)
     with pytest.raises(CaptureError, match="vdgs sfm"):
         read_project(tmp_path, "opensfm", OPTIONS)
     _check_dense_cloud(tmp_path, flight)
@@ -134,6 +145,19 @@ def test_report_of_odm_is_read_where_its_reconstruction_is_gone(tmp_path: Path, 
     (tmp_path / "images").rename(tmp_path / "elsewhere")
     with pytest.raises(CaptureError, match="none of its 12 photographs"):
         lacks_points(tmp_path / "odm_report" / "shots.geojson", OPTIONS)
+
+
+def _check_names_of_cameras(project: Path, flight: KnownFlight) -> None:
+    """The report calls a camera as OpenSfM does, cameras.json without the prefix; another is as likely by its shape."""
+    file, lenses = project / "odm_report" / "shots.geojson", json.loads((project / "cameras.json").read_text())
+    [(name, lens)] = lenses.items()
+    other = {**lens, "k1": 0.5}
+    (project / "cameras.json").write_text(json.dumps({"a": other, name.removeprefix("v2 "): lens}))
+    content = json.loads(file.read_text())
+    for feature in content["features"]:
+        feature["properties"]["camera"] = name
+    file.write_text(json.dumps(content))
+    check_numbers(read(project, "opensfm"), flight)
 
 
 def _check_dense_cloud(project: Path, flight: KnownFlight) -> None:
@@ -169,6 +193,59 @@ def test_bundler_is_read_to_its_numbers(tmp_path: Path) -> None:
     check_numbers(source, flight, placed=False)
     assert (source.colors == flight.colors).all()
     assert sum(view.observations is not None for view in source.views) == len(flight.names)
+
+
+@pytest.mark.parametrize("radial", [0.12, -0.08, 0.0])
+@pytest.mark.parametrize("matrix", [False, True])
+def test_visualsfm_is_read_to_its_numbers(tmp_path: Path, radial: float, matrix: bool) -> None:
+    flight = known_flight(MeasuredLens(radial=radial))
+    flight.write_photographs(tmp_path / "images")
+    writers.write_visualsfm(tmp_path, flight, matrix=matrix)
+    check_tie_points(read(tmp_path, "visualsfm"), flight)
+
+
+def test_a_lens_of_visualsfm_that_folds_over_is_named(tmp_path: Path) -> None:
+    flight = known_flight(MeasuredLens(radial=0.0))
+    flight.write_photographs(tmp_path / "images")
+    file = writers.write_visualsfm(tmp_path, flight)
+    file.write_text(file.read_text().replace(" 0.0 0.0\n", " -2.5 0.0\n", 1))
+    [said] = [each for each in read(tmp_path, "visualsfm").warnings if "cannot be used" in each]
+    assert "folds over" in said
+    assert flight.names[0] in said
+
+
+@pytest.mark.parametrize("nested", [False, True])
+def test_openmvg_is_read_to_its_numbers(tmp_path: Path, flight: KnownFlight, nested: bool) -> None:
+    file = writers.write_openmvg(tmp_path, flight, nested=nested)
+    flight.write_photographs(tmp_path / "images")
+    check_tie_points(read(tmp_path, "openmvg"), replace(flight, colors=np.full_like(flight.colors, 128)))
+    file.unlink()
+    with pytest.raises(CaptureError, match="not a capture"):
+        read_source(tmp_path, OPTIONS)
+    with pytest.raises(CaptureError, match="no camera of it has a pose"):
+        read_source(tmp_path / "sfm_data.json", OPTIONS)
+
+
+@pytest.mark.parametrize("version", [(1, 0, 0), (1, 2, 6), (1, 2, 8)])
+def test_meshroom_is_read_to_its_numbers(tmp_path: Path, flight: KnownFlight, version: tuple[int, int, int]) -> None:
+    writers.write_alicevision(tmp_path, flight, version)
+    flight.write_photographs(tmp_path / "images")
+    check_tie_points(read(tmp_path, "alicevision"), flight)
+
+
+def test_a_lens_of_meshroom_that_is_not_read_is_named(tmp_path: Path, flight: KnownFlight) -> None:
+    file = writers.write_alicevision(tmp_path, flight)
+    flight.write_photographs(tmp_path / "images")
+    file.write_text(file.read_text().replace('"brown"', '"3deanamorphic4"'))
+    with pytest.raises(CaptureError, match="lens 7 is '3deanamorphic4'; read are pinhole"):
+        read(tmp_path, "alicevision")
+
+
+def check_tie_points(source: SourceCapture, flight: KnownFlight) -> None:
+    check_numbers(source, flight, placed=False)
+    assert np.abs(source.points - flight.points).max() < 1e-9
+    assert (source.colors == flight.colors).all()
+    assert all(view.observations is not None and len(view.observations.points) > 20 for view in source.views)
 
 
 @pytest.mark.parametrize(
@@ -433,6 +510,22 @@ def test_xmp_without_a_pose_and_of_other_lenses_is_named(tmp_path: Path, flight:
     assert any("not aligned" in each and flight.names[0][:-4] in each for each in source.warnings)
 
 
+def test_xmp_of_other_writers_is_read(tmp_path: Path, flight: KnownFlight) -> None:
+    """RealityScan's own sample has the model division without distortion; other programs write three terms of six."""
+    flight = replace(flight, lens=BentLens(k=(0, 0, 0, 0), p=(0, 0)))
+    flight.write_photographs(tmp_path / "images")
+    writers.write_realityscan_xmp(tmp_path / "images", flight)
+    files = sorted((tmp_path / "images").glob("*.xmp"))
+    for index, file in enumerate(files):
+        text = file.read_text().replace('"brown4t2"', '"division"' if index % 2 else '"brown3"')
+        file.write_text(text.replace("<xcr:DistortionCoeficients>0 0 0 ", "<xcr:DistortionCoeficients>"))
+    check_numbers(read(tmp_path, "realityscan"), flight, placed=False)
+    for file in files:
+        file.write_text(file.read_text().replace("xcr:Version", 'xcr:ProjectionModel="spherical" xcr:Version'))
+    with pytest.raises(CaptureError, match=r"12 of its 12 cameras cannot be used(.|\n)*'spherical' is not supported"):
+        read(tmp_path, "realityscan")
+
+
 def test_focal_lengths_in_pixels_are_refused(tmp_path: Path, flight: KnownFlight) -> None:
     file = writers.write_realityscan_csv(tmp_path / "cameras.csv", flight)
     flight.write_photographs(tmp_path / "images")
@@ -492,10 +585,12 @@ def _all_formats(root: Path, flight: KnownFlight) -> list[tuple[str, Path]]:
         ("realityscan", writers.write_realityscan_opencv_csv(root / "opencv.csv", flight)),
         ("pix4d", writers.write_pix4d(root / "flight", flight)),
         ("realityscan", (root / "images" / flight.names[0]).with_suffix(".xmp")),
+        ("visualsfm", writers.write_visualsfm(root, flight)), ("openmvg", writers.write_openmvg(root, flight)),
+        ("alicevision", writers.write_alicevision(root, flight)),
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("number", range(12))
+@pytest.mark.parametrize("number", range(15))
 def test_damaged_files_are_refused_by_name_or_read(tmp_path: Path, flight: KnownFlight, number: int) -> None:
     """Cut off, overwritten and hostile files: a CaptureError, never anything else."""
     name, file = _all_formats(tmp_path, flight)[number]

@@ -41,6 +41,22 @@ class BentLens:
         return np.stack([self.focal * u + self.center[0], self.focal * self.aspect * v + self.center[1]], axis=1)
 
 
+@dataclass(frozen=True)
+class MeasuredLens(BentLens):
+    """VisualSFM's: of a pixel at m from the middle, in focal lengths, the ray is m (1 + radial m²)."""
+
+    radial: float = 0.12
+    center: tuple[float, float] = (400.0, 300.0)
+
+    def project(self, local: np.ndarray) -> np.ndarray:
+        rays = local[:, :2] / local[:, 2:]
+        length = np.linalg.norm(rays, axis=1)
+        bent = length.copy()
+        for _ in range(60):
+            bent -= (bent * (1 + self.radial * bent**2) - length) / (1 + 3 * self.radial * bent**2)
+        return rays * (bent / np.maximum(length, 1e-12))[:, None] * self.focal + self.center
+
+
 @dataclass(frozen=True, eq=False)
 class KnownFlight:
     """Poses (camera from world [n, 4, 4]) and points [m, 3] in metres east, north, up of `ORIGIN`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -84,3 +85,83 @@ def metashape_xml(
         f"<reference>{reference.replace('&', '&amp;')}</reference><region><center>0 0 0</center></region>"
         '<frames next_id="1"><frame id="0"><markers/></frame></frames></chunk></document>'
     )
+
+
+def metashape_rig(flight: TrueFlight, lens: Lens, bands: str = "Red") -> tuple[str, TrueFlight]:
+    """cameras.xml in which each photograph has a slave, whose sensor looks 20° aside; and the flight of the slaves."""
+    turn, place = omega_phi_kappa(20.0, 0.0, 3.0).T, np.array([0.4, -0.1, 0.2])
+    rotations = np.stack([turn.T @ rotation for rotation in flight.rotations])
+    centers = flight.centers + np.einsum("nji,j->ni", flight.rotations, place)
+    names = [name.replace("DJI", "SIDE") for name in flight.names]
+    sensor = (
+        f'<sensor id="1" label="side" type="frame" master_id="0"><bands><band label="{bands}"/></bands>'
+        f"{metashape_calibration(lens)}<rotation>{words(turn)}</rotation>"
+        f"<location>{words(place / CHUNK_SCALE)}</location></sensor>"
+    )
+    slaves = "".join(
+        f'<camera id="{100 + index}" sensor_id="1" master_id="{index}" label="{Path(name).stem}"/>'
+        for index, name in enumerate(names)
+    )
+    xml = metashape_xml(flight, cameras=metashape_cameras(flight) + slaves).replace("</sensors>", f"{sensor}</sensors>")
+    return xml, TrueFlight(names, rotations, centers, flight.points, lens)
+
+
+def write_project(root: Path, flight: TrueFlight, *, suffix: str = ".psx") -> Path:
+    """A project as the program stores it: a document that points to a folder of zips, or one zip; with tie points."""
+    xml = metashape_xml(flight)
+    chunk = xml[xml.index("<chunk") : xml.index("</document>")].replace("<frame id", '<frame path="0/frame.zip" id')
+    photos = "".join(
+        f'<camera camera_id="{index}"><photo path="../../../{name}"/></camera>'
+        for index, name in enumerate(flight.names)
+    )
+    lists = _tie_points(flight)
+    counted = "".join(f'<projections camera_id="{k}" path="p{k}.ply"/>' for k in range(len(flight.names)))
+    cloud = f'<point_cloud><tracks path="tracks.ply"/><points path="points0.ply"/>{counted}</point_cloud>'
+    head = '<?xml version="1.0" encoding="UTF-8"?>\n'
+    file = root / f"project{suffix}"
+    if suffix == ".psz":
+        chunk = chunk.replace("<markers/>", f"<cameras>{photos}</cameras>{cloud}")
+        chunks = f'{head}<document version="1.2.0"><chunks active_id="0">{chunk}</chunks></document>'
+        return _zip(file, {"doc.xml": chunks, **lists})
+    folder = root / "project.files"
+    (folder / "0" / "0" / "point_cloud").mkdir(parents=True)
+    file.write_text(f'{head}<document version="1.2.0" path="{{projectname}}.files/project.zip"/>')
+    listed = '<chunks next_id="1" active_id="0"><chunk id="0" path="0/chunk.zip"/></chunks>'
+    _zip(folder / "project.zip", {"doc.xml": f'{head}<document version="1.2.0">{listed}</document>'})
+    _zip(folder / "0" / "chunk.zip", {"doc.xml": head + chunk})
+    _zip(folder / "0" / "0" / "frame.zip", {"doc.xml": f"{head}<frame><cameras>{photos}</cameras></frame>"})
+    _zip(folder / "0" / "0" / "point_cloud" / "point_cloud.zip", {"doc.xml": head + cloud, **lists})
+    return file
+
+
+def _tie_points(flight: TrueFlight) -> dict[str, bytes]:
+    """Lists of points in the chunk's coordinates, and of their pixels in each photograph."""
+    numbers = np.arange(len(flight.points), dtype="<u4")
+    places = chunk_from_enu(flight.points).astype("<f4")
+    lists = {
+        "points0.ply": _ply({**dict(zip("xyz", places.T, strict=True)), "id": numbers}),
+        "tracks.ply": _ply(
+            {name: np.full(len(numbers), 10 + k, "u1") for k, name in enumerate(("red", "green", "blue"))}
+        ),
+    }
+    for index in range(len(flight.names)):
+        pixels, seen = flight.pixels(index)
+        x, y = pixels.astype("<f4").T
+        lists[f"p{index}.ply"] = _ply({"x": x, "y": y, "size": np.ones_like(x), "id": seen.astype("<u4")})
+    return lists
+
+
+def _ply(columns: dict[str, np.ndarray]) -> bytes:
+    kinds = {"f4": "float", "u4": "uint", "u1": "uchar"}
+    listed = "".join(f"property {kinds[column.dtype.str[1:]]} {name}\n" for name, column in columns.items())
+    count = len(next(iter(columns.values())))
+    records = np.rec.fromarrays(list(columns.values()), names=list(columns))
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{listed}end_header\n"
+    return head.encode() + records.tobytes()
+
+
+def _zip(file: Path, members: dict[str, str | bytes]) -> Path:
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    return file

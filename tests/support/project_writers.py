@@ -129,6 +129,116 @@ def write_bundler(folder: Path, flight: KnownFlight, header: str = "# Bundle fil
     return folder / "bundle.out"
 
 
+def write_visualsfm(folder: Path, flight: KnownFlight, *, matrix: bool = False) -> Path:
+    """.nvm of a lens without distortion, or of a `MeasuredLens`, with a quaternion or a matrix for each camera."""
+    from scipy.spatial.transform import Rotation
+
+    folder.mkdir(parents=True, exist_ok=True)
+    lines = ["NVM_V3_R9T" if matrix else "NVM_V3 ", "", str(len(flight.names))]
+    for name, pose, center in zip(flight.names, flight.poses, flight.centers, strict=True):
+        turn = pose[:3, :3].ravel() if matrix else Rotation.from_matrix(pose[:3, :3]).as_quat()[[3, 0, 1, 2]]
+        numbers = [
+            flight.lens.focal,
+            *turn,
+            *(pose[:3, 3] if matrix else center),
+            getattr(flight.lens, "radial", 0.0),
+            0,
+        ]
+        lines.append("\t".join([f"images/{name}", " ".join(repr(float(each)) for each in numbers)]))
+    lines += ["", str(len(flight.points))]
+    for place, color, sights in _sights(flight, np.array(flight.lens.size) / 2):
+        shown = " ".join(f"{index} 0 {x!r} {y!r}" for index, x, y in sights)
+        lines.append(f"{' '.join(map(repr, place))} {' '.join(map(str, color))} {len(sights)} {shown}")
+    file = folder / "model.nvm"
+    file.write_text("\n".join([*lines, "", "0", ""]))
+    return file
+
+
+def _sights(
+    flight: KnownFlight, origin: np.ndarray
+) -> list[tuple[list[float], list[int], list[tuple[int, float, float]]]]:
+    """Of each point its place and color, and which cameras show it where, from a pixel on."""
+    pixels = [flight.pixels(index) - origin for index in range(len(flight.names))]
+    shows = [flight.shows(index) for index in range(len(flight.names))]
+    return [
+        (point.tolist(), color.tolist(), [(c, *pixels[c][k].tolist()) for c in range(len(pixels)) if shows[c][k]])
+        for k, (point, color) in enumerate(zip(flight.points, flight.colors, strict=True))
+    ]
+
+
+def write_openmvg(folder: Path, flight: KnownFlight, *, nested: bool = False) -> Path:
+    """sfm_data.json by cereal, as its versions nest the lens."""
+    lens, (width, height) = flight.lens, flight.lens.size
+    pinhole = {"width": width, "height": height, "focal_length": lens.focal, "principal_point": list(lens.center)}
+    values: dict[str, Any] = {"value0": pinhole} if nested else pinhole
+    values = {**values, "disto_t2": [*lens.k[:3], *lens.p]}
+    views = [
+        {"local_path": "", "filename": name, "width": width, "height": height, "id_view": k, "id_intrinsic": 0,
+         "id_pose": k}
+        for k, name in enumerate(flight.names)
+    ]  # fmt: skip
+    poses = [
+        {"key": k, "value": {"rotation": pose[:3, :3].tolist(), "center": center.tolist()}}
+        for k, (pose, center) in enumerate(zip(flight.poses, flight.centers, strict=True))
+    ]
+    structure = [
+        {"key": k, "value": {"X": place, "observations": [
+            {"key": c, "value": {"id_feat": 0, "x": [x, y]}} for c, x, y in sights]}}
+        for k, (place, _, sights) in enumerate(_sights(flight, np.zeros(2)))
+    ]  # fmt: skip
+    folder.mkdir(parents=True, exist_ok=True)
+    content = {
+        "sfm_data_version": "0.3", "root_path": "/home/u/images",
+        "views": [{"key": k, "value": {"polymorphic_id": 1, "ptr_wrapper": {"id": k, "data": view}}}
+                  for k, view in enumerate(views)],
+        "intrinsics": [{"key": 0, "value": {"polymorphic_id": 2, "polymorphic_name": "pinhole_brown_t2",
+                                            "ptr_wrapper": {"id": 99, "data": values}}}],
+        "extrinsics": poses, "structure": structure, "control_points": [],
+    }  # fmt: skip
+    (folder / "sfm_data.json").write_text(json.dumps({**content, "extrinsics": [], "structure": []}))
+    file = folder / "sfm_data_expanded.json"
+    file.write_text(json.dumps(content))
+    return file
+
+
+def write_alicevision(folder: Path, flight: KnownFlight, version: tuple[int, int, int] = (1, 2, 6)) -> Path:
+    """cameras.sfm: all numbers as texts, rotations column by column, lenses as the versions have them."""
+    lens, (width, height) = flight.lens, flight.lens.size
+    center, focal = np.array(lens.center), str(36 * lens.focal / width)
+    if version >= (1, 2, 1):
+        center = center - np.array(lens.size) / 2
+    told = {"focalLength": focal, "sensorWidth": "36", "pixelRatio": "1"}
+    if version < (1, 2, 0):
+        told = {"pxFocalLength": str(lens.focal)}
+    kind = {"type": "pinhole", "distortionType": "brown"} if version >= (1, 2, 7) else {"type": "brown"}
+    intrinsic = {
+        "intrinsicId": "7", "width": str(width), "height": str(height), **kind, **told,
+        "principalPoint": [str(each) for each in center.tolist()],
+        "distortionParams": [str(each) for each in (*lens.k[:3], *lens.p)],
+    }  # fmt: skip
+    poses = [
+        {"poseId": str(k), "pose": {"transform": {"rotation": [str(each) for each in pose[:3, :3].T.ravel().tolist()],
+                                                  "center": [str(each) for each in center.tolist()]}, "locked": "0"}}
+        for k, (pose, center) in enumerate(zip(flight.poses, flight.centers, strict=True))
+    ]  # fmt: skip
+    views = [
+        {"viewId": str(1000 + k), "poseId": str(k), "intrinsicId": "7", "path": f"D:/card/{name}", "width": str(width),
+         "height": str(height), "metadata": {"Make": "DJI"}}
+        for k, name in enumerate(flight.names)
+    ]  # fmt: skip
+    structure = [
+        {"landmarkId": str(k), "descType": "dspsift", "color": list(map(str, color)), "X": list(map(str, place)),
+         "observations": [{"observationId": str(1000 + c), "featureId": "1", "x": [str(x), str(y)], "scale": "2"}
+                          for c, x, y in sights]}
+        for k, (place, color, sights) in enumerate(_sights(flight, np.zeros(2)))
+    ]  # fmt: skip
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / "cameras.sfm"
+    content = {"version": list(map(str, version)), "views": views, "intrinsics": [intrinsic], "poses": poses}
+    file.write_text(json.dumps({**content, "structure": structure}))
+    return file
+
+
 def realityscan_lens(flight: KnownFlight) -> dict[str, float]:
     lens, (width, height), longer = flight.lens, flight.lens.size, max(flight.lens.size)
     names = dict(zip(("k1", "k2", "k3", "k4"), lens.k, strict=True))

@@ -18,7 +18,10 @@ from vdgs.system.quoting import shell_word
 
 #: So many folders deep a model is looked for: WORKSPACE/dense/0 with sparse in it, and one above.
 DEEPEST = 3
-_METASHAPE = "a project of Metashape; what it exports (File > Export > Export Cameras, Agisoft XML) is read"
+_METASHAPE = (
+    "a project of Metashape that is not aligned, or without its folder .files; with both it is read, as is what it "
+    "exports (File > Export > Export Cameras, Agisoft XML)"
+)
 _REALITYSCAN = (
     "a project of RealityScan; what it exports (Registration: Internal/External camera parameters, CSV, with the "
     "sparse point cloud as PLY) is read"
@@ -31,11 +34,42 @@ _OTHERS = {
     "*.rsproj": _REALITYSCAN,
     "*.p4d": "a project of PIX4Dmapper; 1_initial/params in the folder of its name, after the first step, is read",
     "*.p4m": "a project of PIX4Dmatic; the OPF that it exports is read",
+    "*_calibrated_external_camera_parameters*.txt": (
+        "poses of PIX4Dmapper without lenses; *_calibrated_camera_parameters.txt of the same folder is read"
+    ),
     "*.ccm": "a project of ContextCapture; the block that it exports (BlocksExchange, with tie points) is read",
-    "*.nvm": "poses of VisualSFM; COLMAP's import_nvm (scripts/python) makes a model of them",
+    "AT/sfm_geo_desc.json": (
+        "an aerotriangulation of DJI Terra; the BlocksExchange file that Terra puts beside it is read, and is not there"
+    ),
+    "sfm_data.bin": (
+        "poses of OpenMVG in binary; openMVG_main_ConvertSfM_DataFormat -i sfm_data.bin -o sfm_data.json -V -I -E -S "
+        "makes what is read"
+    ),
+    "*.mg": "a project of Meshroom; cameras.sfm of its step StructureFromMotion is read",
+    "sfm.abc": "poses of Meshroom in Alembic; cameras.sfm beside it, or the .sfm of its step ConvertSfMFormat, is read",
+    "Ori-*/Orientation-*.xml": "poses of MicMac; mm3d Apero2NVM makes a .nvm of them, which is read",
+    "keyframes/cameras/*.json": (
+        "poses of Polycam; ns-process-data polycam (nerfstudio) makes transforms.json of them, which is read"
+    ),
+    "*.r3d": "a capture of Record3D; ns-process-data record3d (nerfstudio) makes transforms.json of it, which is read",
     "poses_bounds.npy": "poses of LLFF; the COLMAP model that they were made of is read",
     "database.db": "features of COLMAP; `colmap mapper` makes a model of them",
 }
+#: The same for files that only their beginning tells: the suffix, a text of it in lower case, and what it is.
+_ALIGN = "it is read once its photographs are aligned and it is exported again"
+_BY_CONTENT = (
+    (".xml", b"<blocksexchange", f"a BlocksExchange file without poses; {_ALIGN}"),
+    (".xml", b"<document version", f"an export of Metashape without poses; {_ALIGN}"),
+    (
+        ".txt", b"photoid, x, y, z, omega",
+        "poses of Metashape without lenses; its Agisoft XML (File > Export > Export Cameras) is read",
+    ),
+    (
+        ".prj", b"$project",
+        "a project of Inpho; Metashape imports it (File > Import > Import Cameras), and its Agisoft XML is read",
+    ),
+)  # fmt: skip
+_HEAD_BYTES = 4096
 #: A file of poses with fewer bytes has none ("[]").
 _LEAST_BYTES = 20
 
@@ -70,20 +104,36 @@ def foreign_poses(root: Path) -> list[str]:
     """Poses below `root` that other programs made and that are not read, and what makes a capture of them."""
     found = []
     for folder in (root, *_folders(root)):
-        known = [(file, what) for name, what in _OTHERS.items() for file in sorted(folder.glob(name))]
+        known = [(next(iter(sorted(folder.glob(name))), None), what) for name, what in _OTHERS.items()]
+        known += [(file, _by_content(file)) for file in sorted(folder.iterdir())]
         found += [
             f"{file.relative_to(root).as_posix()}: {what}"
             for file, what in known
-            if file.is_file() and file.stat().st_size > _LEAST_BYTES
+            if file is not None and what and file.is_file() and file.stat().st_size > _LEAST_BYTES
         ]
     return found
 
 
 def check_no_foreign_file(path: Path) -> None:
     """Raise CaptureError for a file of another program that is not read, with what is read instead."""
-    what = next((what for name, what in _OTHERS.items() if fnmatch(path.name.lower(), name)), None)
-    if what is not None and path.is_file():
+    if not path.is_file():
+        return
+    what = next((what for name, what in _OTHERS.items() if fnmatch(path.name.lower(), name)), "") or _by_content(path)
+    if what:
         raise CaptureError(f"{path}: is {what}.")
+
+
+def _by_content(file: Path) -> str:
+    """What a file is of those that only their beginning tells; empty for others."""
+    known = [(text, what) for suffix, text, what in _BY_CONTENT if file.suffix.lower() == suffix]
+    if not known or not file.is_file():
+        return ""
+    try:
+        with file.open("rb") as stream:
+            head = stream.read(_HEAD_BYTES).lower()
+    except OSError:
+        return ""
+    return next((what for text, what in known if text in head), "")
 
 
 def _folders(root: Path) -> Iterator[Path]:

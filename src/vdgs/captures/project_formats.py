@@ -7,7 +7,17 @@ from pathlib import Path
 from typing import NamedTuple
 
 from vdgs.captures.capture_root import capture_root
-from vdgs.captures.formats import blocks_exchange, bundler, metashape, opensfm, opf, pix4d, realityscan
+from vdgs.captures.formats import (
+    blocks_exchange,
+    bundler,
+    metashape,
+    opensfm,
+    opf,
+    pix4d,
+    realityscan,
+    sfm_data,
+    visualsfm,
+)
 from vdgs.captures.formats.project import Project, project_capture
 from vdgs.captures.formats.source_capture import SourceCapture
 from vdgs.config.capture_options import CaptureOptions
@@ -34,6 +44,11 @@ PROJECTS: dict[str, ProjectFormat] = {
     "pix4d": ProjectFormat("PIX4Dmapper (parameters)", pix4d.find_files, pix4d.is_file, pix4d.read),
     "opensfm": ProjectFormat("OpenSfM or ODM", opensfm.find_files, opensfm.is_file, opensfm.read),
     "realityscan": ProjectFormat("RealityScan", realityscan.find_files, realityscan.is_file, realityscan.read),
+    "openmvg": ProjectFormat("OpenMVG", sfm_data.find_openmvg, sfm_data.is_openmvg, sfm_data.read_openmvg),
+    "alicevision": ProjectFormat(
+        "Meshroom (AliceVision)", sfm_data.find_alicevision, sfm_data.is_alicevision, sfm_data.read_alicevision
+    ),
+    "visualsfm": ProjectFormat("VisualSFM", visualsfm.find_files, visualsfm.is_file, visualsfm.read),
     "bundler": ProjectFormat("Bundler", bundler.find_files, bundler.is_file, bundler.read),
 }  # fmt: skip
 

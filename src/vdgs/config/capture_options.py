@@ -13,7 +13,7 @@ UpAxis = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
 SplitMode = Literal["auto", "explicit", "every"]
 CaptureFormat = Literal[
     "auto", "colmap", "transforms", "mega-nerf", "matrixcity", "metashape", "blocks-exchange", "opf", "pix4d",
-    "opensfm", "realityscan", "bundler",
+    "opensfm", "realityscan", "openmvg", "alicevision", "visualsfm", "bundler",
 ]  # fmt: skip
 
 

@@ -1,11 +1,12 @@
 """The lenses of photogrammetry programs that COLMAP's models lack: Brown's with a fourth radial term and skew (BROWN),
-with growing tangential terms (GENERAL), and fisheyes with any powers of the angle (GENERAL_FISHEYE).
+with growing tangential terms (GENERAL), and fisheyes with any powers of the angle (GENERAL_FISHEYE) or of twice the
+sine of half of it (EQUISOLID).
 
 Of a ray x, y (z = 1), r² = x² + y²: x' = x d + (2 p1 x y + p2 (r² + 2 x²)) g and y' = y d + (p1 (r² + 2 y²) + 2 p2 x y)
 g, with d = 1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸ + o1 r + o3 r³ + o5 r⁵ + o7 r⁷ and g = 1 + p3 r² + p4 r⁴; u = fx x' +
 skew y' + cx and v = fy y' + shear x' + cy in pixels. Of fisheyes x, y point as the ray, as long as its angle to the
-axis. p1, p2 are OpenCV's. Parameters: fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, skew (BROWN ends here; the first eight
-are those of COLMAP's OPENCV), p3, p4, shear, o1, o3, o5, o7.
+axis, or as twice the sine of half of it. p1, p2 are OpenCV's. Parameters: fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, skew
+(BROWN ends here; the first eight are those of COLMAP's OPENCV), p3, p4, shear, o1, o3, o5, o7.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vdgs.captures.formats.source_capture import BROWN, GENERAL, GENERAL_FISHEYE, Intrinsics
+from vdgs.captures.formats.source_capture import BROWN, EQUISOLID, GENERAL, GENERAL_FISHEYE, Intrinsics
 from vdgs.errors import CaptureError
 
 #: Newton's steps, which settle in five for lenses that there are, and what is left of the ray at most.
@@ -24,6 +25,7 @@ MIN_SCALE, MAX_SCALE = 0.2, 2.0
 #: Of a fisheye no more is kept than this angle to the axis, in radians.
 MAX_ANGLE = 1.3
 _NUM_TERMS, MAX_POWERS = 14, 10
+_FISHEYES = (GENERAL_FISHEYE, EQUISOLID)
 
 
 def brown_intrinsics(
@@ -45,16 +47,16 @@ def brown_intrinsics(
 
 def fisheye_intrinsics(
     affine: tuple[float, float, float, float], center: tuple[float, float], size: tuple[int, int],
-    powers: Sequence[float], tangential: tuple[float, float] = (0.0, 0.0),
+    powers: Sequence[float], tangential: tuple[float, float] = (0.0, 0.0), *, equisolid: bool = False,
 ) -> Intrinsics:  # fmt: skip
     """The plainest model that is exactly this fisheye: `affine` matrix row by row in pixels, and the factors of the
-    first to eighth powers of the angle in d; OPENCV_FISHEYE, THIN_PRISM_FISHEYE or GENERAL_FISHEYE."""
+    first to eighth powers of the angle in d; OPENCV_FISHEYE, THIN_PRISM_FISHEYE, GENERAL_FISHEYE or EQUISOLID."""
     fx, skew, shear, fy = affine
     o1, k1, o3, k2, o5, k3, o7, k4 = (*powers, *[0.0] * 8)[:8]
     head = (fx, fy, *center)
-    if skew or shear or o1 or o3 or o5 or o7:
+    if equisolid or skew or shear or o1 or o3 or o5 or o7:
         tail = (k1, k2, *tangential, k3, k4, skew, 0.0, 0.0, shear, o1, o3, o5, o7)
-        return Intrinsics(GENERAL_FISHEYE, (*head, *tail), *size)
+        return Intrinsics(EQUISOLID if equisolid else GENERAL_FISHEYE, (*head, *tail), *size)
     if any(tangential):
         return Intrinsics("THIN_PRISM_FISHEYE", (*head, k1, k2, *tangential, k3, k4, 0.0, 0.0), *size)
     return Intrinsics("OPENCV_FISHEYE", (*head, k1, k2, k3, k4), *size)
@@ -78,9 +80,10 @@ def project_rays(lens: Intrinsics, rays: np.ndarray) -> np.ndarray:
     """Pixels [n, 2] of rays x/z, y/z [n, 2]."""
     fx, fy, cx, cy = lens.params[:4]
     skew, shear = _affine(lens)
-    if lens.model == GENERAL_FISHEYE:
+    if lens.model in _FISHEYES:
         radius = np.hypot(*rays.T)[:, None]
-        rays = rays * np.where(radius > 1e-9, np.arctan(radius) / np.maximum(radius, 1e-9), 1.0)
+        angles = np.arctan(radius) if lens.model == GENERAL_FISHEYE else 2 * np.sin(np.arctan(radius) / 2)
+        rays = rays * np.where(radius > 1e-9, angles / np.maximum(radius, 1e-9), 1.0)
     bent = _bent(lens, rays)
     u = fx * bent[:, 0] + skew * bent[:, 1] + cx
     return np.stack([u, fy * bent[:, 1] + shear * bent[:, 0] + cy if shear else fy * bent[:, 1] + cy], axis=1)
@@ -111,11 +114,12 @@ def _straight(lens: Intrinsics, pixels: np.ndarray, widest: float, *, clip: bool
         a, b, c, d = _slopes(lens, rays)
         missed = np.abs(_bent(lens, rays) - bent).max(axis=1, initial=0.0)
         good = (missed < 1e-9) & (a > 0) & (a * d - b * c > 0)
-        if lens.model == GENERAL_FISHEYE:
-            angles = np.hypot(*rays.T)
+        if lens.model in _FISHEYES:
+            lengths = np.hypot(*rays.T)
+            angles = lengths if lens.model == GENERAL_FISHEYE else 2 * np.arcsin(np.minimum(lengths / 2, 1.0))
             good &= clip | (angles < widest)
             kept = np.minimum(angles, widest)
-            rays = rays * np.where(angles > 1e-9, np.tan(kept) / np.maximum(angles, 1e-9), 1.0)[:, None]
+            rays = rays * np.where(lengths > 1e-9, np.tan(kept) / np.maximum(lengths, 1e-9), 1.0)[:, None]
     return np.where(good[:, None], rays, np.nan)
 
 

@@ -1,14 +1,17 @@
-"""Metashape's cameras.xml (File > Export > Export Cameras, Agisoft XML): sensors, cameras, and where the chunk lies.
+"""Metashape's cameras.xml (File > Export > Export Cameras, Agisoft XML), and the chunks of its projects: sensors,
+cameras, and where the chunk lies.
 
-A camera's `transform` is camera to chunk, OpenCV's axes; that of its component, or of the chunk, leads on to
-Earth-centred metres of the datum of the chunk's coordinate system, or to local metres. The file holds no tie points.
-What it says of masks, regions, markers and depth maps is not used.
+A camera's `transform` is camera to chunk, OpenCV's axes; that of a slave is its master's, times where its sensor is in
+the master's axes. The transform of the component, or of the chunk, leads on to Earth-centred metres of the datum of the
+chunk's coordinate system, or to local metres. An export holds no tie points. What it says of masks, regions, markers
+and depth maps is not used.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -23,6 +26,7 @@ from vdgs.captures.coordinate_systems import (
     to_geodetic,
 )
 from vdgs.captures.formats.brown_lens import brown_intrinsics, fisheye_intrinsics
+from vdgs.captures.formats.metashape_project import ALIGNED, PROJECTS, StoredChunk, is_aligned, read_chunks
 from vdgs.captures.formats.project import CloudFrame, Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
 from vdgs.captures.formats.xml_documents import holds, read_xml, root_element, xml_number, xml_numbers
@@ -32,7 +36,8 @@ from vdgs.geometry.geodesy import SEMI_MAJOR_M
 from vdgs.geometry.similarity import Similarity
 
 #: Kinds of lenses that are read, by `type` of a sensor or its calibration.
-_PERSPECTIVE, _FISHEYES = "frame", ("fisheye", "equidistant_fisheye")
+_PERSPECTIVE, _EQUISOLID = "frame", "equisolid_fisheye"
+_FISHEYES = ("fisheye", "equidistant_fisheye", _EQUISOLID)
 #: Parts of an export that no reader needs, dropped as they come: they may be long.
 _UNUSED = ("frames", "markers", "shapes", "region", "depth_maps_sets")
 #: A chunk without a coordinate system whose origin is so far from that of its transform is on the globe (metres).
@@ -41,38 +46,56 @@ _FALSE = ("0", "false")
 
 
 def is_file(file: Path) -> bool:
+    if file.suffix.lower() in PROJECTS:
+        return root_element(file) == "document"
     return file.suffix.lower() == ".xml" and root_element(file) == "document"
 
 
 def find_files(root: Path) -> list[Path]:
-    """The exports of aligned cameras in a folder; those of markers and of references hold none."""
-    files = [file for file in sorted(root.iterdir()) if is_file(file)]
-    return [file for file in files if holds(file, b"<camera ", b"<transform>")]
+    """The exports of aligned cameras in a folder (those of markers and of references hold none); else the projects."""
+    files = sorted(root.iterdir())
+    exports = [file for file in files if file.suffix.lower() == ".xml" and is_file(file) and holds(file, *ALIGNED)]
+    return exports or [file for file in files if file.suffix.lower() in PROJECTS and is_file(file) and is_aligned(file)]
 
 
 def read(file: Path, options: CaptureOptions) -> Project:
     """The aligned cameras of the chunk that has them. Raises `CaptureError` for damaged files and several chunks with
     cameras."""
-    root = read_xml(file, {name: lambda _: None for name in _UNUSED})
-    aligned = [chunk for chunk in root.iter("chunk") if chunk.find(".//camera/transform") is not None]
+    if file.suffix.lower() in PROJECTS:
+        chunks = read_chunks(file)
+    else:
+        root = read_xml(file, {name: lambda _: None for name in _UNUSED})
+        chunks = [StoredChunk(chunk) for chunk in root.iter("chunk")]
+    aligned = [chunk for chunk in chunks if chunk.element.find(".//camera/transform") is not None]
     if not aligned:
         raise CaptureError(
             f"{file}: no camera of it has a pose. It must be an export of cameras (File > Export > Export Cameras, "
-            "Agisoft XML) of photographs that are aligned."
+            "Agisoft XML) or a project of photographs that are aligned."
         )
-    enabled = [chunk for chunk in aligned if chunk.get("enabled", "1") not in _FALSE] or aligned
-    if len(enabled) > 1:
-        labels = ", ".join(repr(chunk.get("label", "?")) for chunk in enabled)
-        raise CaptureError(f"{file}: {len(enabled)} chunks have cameras ({labels}). Merge them, or export one alone.")
-    return _Chunk(enabled[0], file).project()
+    enabled = [chunk for chunk in aligned if chunk.element.get("enabled", "1") not in _FALSE] or aligned
+    active = [chunk for chunk in enabled if chunk.is_active] or enabled
+    if len(active) > 1:
+        raise CaptureError(
+            f"{file}: {len(active)} chunks have cameras ({_labels(active)}). Merge them, or export one alone."
+        )
+    others = [chunk for chunk in enabled if chunk is not active[0]]
+    note = [f"the active chunk {_labels(active)} is read; {_labels(others)} is not."] if others else []
+    return _Chunk(active[0], file, note).project()
+
+
+def _labels(chunks: Sequence[StoredChunk]) -> str:
+    return ", ".join(repr(chunk.element.get("label", "?")) for chunk in chunks)
 
 
 @dataclass(frozen=True, eq=False)
 class _Camera:
-    """A camera as the file has it, with the labels of the groups that it is in."""
+    """A camera as the file has it, with the labels of the groups that it is in, its photograph's path where that is
+    known, and its master where it is a slave."""
 
     element: Element
     groups: tuple[str, ...]
+    path: str = ""
+    master: _Camera | None = None
 
     @property
     def label(self) -> str:
@@ -83,37 +106,49 @@ class _Camera:
         return self.element.get("sensor_id", "")
 
     @property
+    def is_aligned(self) -> bool:
+        return self.element.find("transform") is not None or (self.master is not None and self.master.is_aligned)
+
+    @property
+    def component(self) -> str:
+        return self.element.get("component_id") or (self.master.component if self.master is not None else "")
+
+    @property
     def names(self) -> tuple[str, ...]:
-        """The label with its groups, which often are the folders of the photographs, and alone."""
-        return tuple(dict.fromkeys(("/".join((*self.groups, self.label)), self.label)))
+        """The path; the label with its groups, which often are the folders of the photographs, and alone."""
+        named = ("/".join((*self.groups, self.label)), self.label)
+        return tuple(dict.fromkeys((self.path, *named) if self.path else named))
 
 
 class _Chunk:
-    def __init__(self, element: Element, file: Path) -> None:
-        self._element, self._file = element, file
-        self._warnings: list[str] = []
+    def __init__(self, stored: StoredChunk, file: Path, warnings: list[str]) -> None:
+        self._element, self._file, self._stored, self._warnings = stored.element, file, stored, warnings
+        self._sensors = {sensor.get("id", ""): sensor for sensor in self._element.iter("sensor")}
         self._unknown = ""
 
     def project(self) -> Project:
         cameras, place = self._placed(self._used(self._cameras()))
         lenses = self._lenses({camera.sensor for camera in cameras})
+        ties = self._stored.tie_points()
         refused: dict[str, list[str]] = {}
+        views: list[ProjectView] = []
         for camera in cameras:
-            if isinstance(why := lenses[camera.sensor], str):
-                refused.setdefault(why, []).append(camera.label)
-        views = [
-            ProjectView(
-                names=camera.names, intrinsics=lens,
-                camera_from_world=self._pose(camera, self._transforms.get(self._component(camera))),
-            )
-            for camera in cameras if not isinstance(lens := lenses[camera.sensor], str)
-        ]  # fmt: skip
+            lens = lenses[camera.sensor]
+            try:
+                if isinstance(lens, str):
+                    raise CaptureError(lens)
+                pose = self._pose(camera, self._transforms.get(self._component(camera)))
+            except CaptureError as error:
+                refused.setdefault(_why(error, self._file), []).append(camera.label)
+                continue
+            shown = ties.shown.get(camera.element.get("id", ""))
+            views.append(ProjectView(names=camera.names, intrinsics=lens, camera_from_world=pose, sightings=shown))
         geodetic, words, frames = self._system(place) if place is not None else (None, "", ())
         return Project(
-            format="metashape", file=self._file, views=tuple(views), points=np.zeros((0, 3)),
-            colors=np.zeros((0, 3), np.uint8), to_geodetic=geodetic, is_metric=place is not None, place=words,
-            cloud_frames=frames, warnings=tuple(self._warnings), refused=refused,
-            unknown_system=self._unknown,
+            format="metashape", file=self._file, views=tuple(views), colors=ties.colors,
+            points=ties.points if place is None else place.apply(ties.points), to_geodetic=geodetic,
+            is_metric=place is not None, place=words, cloud_frames=frames, warnings=tuple(self._warnings),
+            refused=refused, unknown_system=self._unknown,
         )  # fmt: skip
 
     # ------------------------------------------------------------------------------------------- cameras
@@ -124,38 +159,59 @@ class _Chunk:
         def collect(parent: Element, groups: tuple[str, ...]) -> None:
             for child in parent:
                 if child.tag == "camera":
-                    found.append(_Camera(child, groups))
+                    path = self._stored.photographs.get(child.get("id", ""), "")
+                    found.append(_Camera(child, groups, path))
                 elif child.tag == "group":
                     collect(child, (*groups, child.get("label") or ""))
 
         for parent in self._element.iter("cameras"):
             collect(parent, ())
-        return found
+        masters = {camera.element.get("id"): camera for camera in found}
+        return [
+            replace(camera, master=masters.get(number))
+            if (number := camera.element.get("master_id")) != camera.element.get("id")
+            else camera
+            for camera in found
+        ]
 
     def _used(self, cameras: list[_Camera]) -> list[_Camera]:
         """Cameras that are aligned and enabled; the others are named."""
-        on: list[_Camera] = []
-        off: list[_Camera] = []
-        for camera in cameras:
-            (off if camera.element.get("enabled", "1") in _FALSE else on).append(camera)
-        bare = [camera for camera in on if camera.element.find("transform") is None]
-        slaves = {camera for camera in bare if camera.element.get("master_id") not in (None, camera.element.get("id"))}
+        off = [camera for camera in cameras if camera.element.get("enabled", "1") in _FALSE]
+        on = [camera for camera in cameras if camera.element.get("enabled", "1") not in _FALSE]
+        slaves = [camera for camera in on if camera.element.find("transform") is None and camera.master is not None]
+        bands = [camera for camera in slaves if not self._shows_what_its_master_does(camera)]
+        bare = [camera for camera in slaves if camera.is_aligned and camera not in bands and not self._offset(camera)]
+        unaligned = [camera for camera in on if not camera.is_aligned and camera not in bands]
         for some, what in (
-            ([camera for camera in bare if camera not in slaves], "are not aligned"),
-            (slaves, "belong to a multi-camera system and have no pose here (Metashape's COLMAP export has it),"),
+            (unaligned, "are not aligned"),
+            (bands, "show other bands than the masters of their multi-camera systems"),
+            (bare, "belong to a multi-camera system whose file does not say where their sensors are"),
             (off, "are disabled"),
         ):
             if some:
                 names = ", ".join(camera.label for camera in some)
                 self._warnings.append(f"{len(some)} cameras {what} and are left out ({names}).")
-        return [camera for camera in on if camera.element.find("transform") is not None]
+        lost = {id(camera) for some in (unaligned, bands, bare) for camera in some}
+        return [camera for camera in on if id(camera) not in lost]
+
+    def _shows_what_its_master_does(self, camera: _Camera) -> bool:
+        """Not so for the bands of a multispectral camera, which are no photographs of the scene as people see it."""
+        assert camera.master is not None
+        own, masters = (
+            [band.get("label") for sensor in (self._sensors.get(each.sensor),) if sensor is not None
+             for band in sensor.iterfind("bands/band")]
+            for each in (camera, camera.master)
+        )  # fmt: skip
+        return not own or not masters or own == masters
+
+    def _offset(self, camera: _Camera) -> tuple[str, str] | None:
+        """The texts of a slave's rotation and place in its master's axes."""
+        sensor = self._sensors.get(camera.sensor)
+        found = [sensor.findtext(name) if sensor is not None else None for name in ("rotation", "location")]
+        return (found[0], found[1]) if found[0] and found[1] else None
 
     def _pose(self, camera: _Camera, chunk: Similarity | None) -> np.ndarray:
-        element = camera.element.find("transform")
-        assert element is not None
-        label = f"camera {camera.label!r}"
-        numbers = xml_numbers(element.text, 16, self._file, f"the transform of {label}")
-        pose = to_rigid(np.array(numbers).reshape(4, 4), self._file, label)
+        pose = self._camera_to_chunk(camera)
         if chunk is not None:
             pose[:3, 3] = chunk.apply(pose[:3, 3])
             pose[:3, :3] = chunk.rotation @ pose[:3, :3]
@@ -163,21 +219,37 @@ class _Chunk:
         inverse[:3, :3], inverse[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
         return inverse
 
+    def _camera_to_chunk(self, camera: _Camera) -> np.ndarray:
+        element, label = camera.element.find("transform"), f"camera {camera.label!r}"
+        if element is not None:
+            numbers = xml_numbers(element.text, 16, self._file, f"the transform of {label}")
+            if not any(numbers):
+                raise CaptureError("its transform is all zeros: align the photographs, and export again")
+            return to_rigid(np.array(numbers).reshape(4, 4), self._file, label)
+        offset = self._offset(camera)
+        assert camera.master is not None
+        assert offset is not None
+        turn, place = (
+            xml_numbers(text, count, self._file, f"the sensor of {label}")
+            for text, count in zip(offset, (9, 3), strict=True)
+        )
+        moved = to_rigid(np.column_stack([np.reshape(turn, (3, 3)), place]), self._file, f"the sensor of {label}")
+        return self._camera_to_chunk(camera.master) @ moved
+
     # -------------------------------------------------------------------------------------------- lenses
 
     def _lenses(self, used: set[str]) -> dict[str, Intrinsics | str]:
         """The lenses of the sensors that are used, or why one cannot be."""
-        sensors = {sensor.get("id", ""): sensor for sensor in self._element.iter("sensor")}
         lenses: dict[str, Intrinsics | str] = {}
         for number in sorted(used):
-            sensor = sensors.get(number)
+            sensor = self._sensors.get(number)
             label = f"sensor {number}" + (f" ({sensor.get('label')})" if sensor is not None else "")
             try:
                 if sensor is None:
                     raise CaptureError(f"{self._file}: {label} is missing.")
                 lenses[number] = self._lens(sensor, label)
             except CaptureError as error:
-                lenses[number] = str(error).removeprefix(f"{self._file}: ").rstrip(".")
+                lenses[number] = _why(error, self._file)
         return lenses
 
     def _lens(self, sensor: Element, label: str) -> Intrinsics:
@@ -187,9 +259,15 @@ class _Chunk:
             raise CaptureError(f"{label} is {kind!r}; {_PERSPECTIVE} and {', '.join(_FISHEYES)} are read.")
         if calibration is None:
             raise CaptureError(f"{label} has no calibration. Export the cameras again after they are aligned.")
-        rolling = sensor.find("rolling_shutter")
-        if rolling is not None and (rolling.text or "").strip().lower() not in ("", *_FALSE):
+        rolling = [sensor.findtext("rolling_shutter") or ""]
+        rolling += [each.get("value", "") for each in sensor.iterfind("property[@name='rolling_shutter']")]
+        if any(text.strip().lower() not in ("", *_FALSE) for text in rolling):
             self._warnings.append(f"{label}: its rolling shutter is not modelled; poses are those of the middle row.")
+        if calibration.find("corrections") is not None:
+            self._warnings.append(
+                f"{label}: the additional corrections of its lens are not applied, which may be off by some pixels. To "
+                "have it exact optimize the cameras without them, and export again."
+            )
 
         def value(name: str, default: float | None = 0.0) -> float:
             return xml_number(calibration, name, self._file, f"the calibration of {label}", default)
@@ -209,7 +287,8 @@ class _Chunk:
             raise CaptureError(f"{label} is a fisheye with p3, p4, which are not read: fit the lens without.")
         else:
             powers = [power for k in radial for power in (0.0, k)]
-            lens = fisheye_intrinsics((focal[0], skew, 0.0, focal[1]), center, (width, height), powers, tangential)
+            affine = (focal[0], skew, 0.0, focal[1])
+            lens = fisheye_intrinsics(affine, center, (width, height), powers, tangential, equisolid=kind == _EQUISOLID)
         return check_intrinsics(lens, self._file, label)
 
     def _size(self, sensor: Element, calibration: Element, label: str) -> tuple[int, int]:
@@ -234,7 +313,7 @@ class _Chunk:
         return found
 
     def _component(self, camera: _Camera) -> str:
-        number = camera.element.get("component_id", "")
+        number = camera.component
         if not number and "" not in self._transforms and len(self._transforms) == 1:
             return next(iter(self._transforms))  # older files have one component, which cameras do not name
         return number if number in self._transforms else ""
@@ -244,11 +323,11 @@ class _Chunk:
         it to metres, None where nothing does."""
         if not cameras:
             return [], None
-        components = Counter(camera.element.get("component_id", "") for camera in cameras)
+        components = Counter(camera.component for camera in cameras)
         largest = max(components, key=lambda number: components[number])
         placed = [camera for camera in cameras if self._component(camera) in self._transforms]
         if len(components) > 1:
-            kept = placed or [camera for camera in cameras if camera.element.get("component_id", "") == largest]
+            kept = placed or [camera for camera in cameras if camera.component == largest]
             known = set(kept)
             lost = [camera.label for camera in cameras if camera not in known]
             if lost:
@@ -304,6 +383,10 @@ class _Chunk:
         if crs is not None:
             frames.append((f"of {name}", crs))
         return geodetic, f"Metashape, {name}", tuple(frames)
+
+
+def _why(error: CaptureError, file: Path) -> str:
+    return str(error).removeprefix(f"{file}: ").rstrip(".")
 
 
 def _calibration(sensor: Element) -> Element | None:

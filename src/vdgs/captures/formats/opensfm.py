@@ -288,8 +288,10 @@ def _read_report(file: Path) -> Project:
 
 def _lens_of(shot: JsonObject, known: Mapping[str, Intrinsics | str], file: Path) -> Intrinsics | str:
     """The camera of a photograph: by its name, else the one of its shape whose focal length is nearest."""
-    if isinstance(shot.get("camera"), str) and shot["camera"] in known:
-        return known[shot["camera"]]
+    called = str(shot.get("camera"))
+    for name in (called, called.removeprefix("v2 ")):  # ODM drops the prefix in cameras.json
+        if name in known:
+            return known[name]
     lenses = [each for each in known.values() if not isinstance(each, str)]
     if not lenses or len(known) == 1:
         return next(iter(known.values()), f"{file.name} has no lens")

@@ -24,7 +24,7 @@ SH_0 = 0.28209479177387814
 PLY_DTYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
-    "double": "f8", "float64": "f8",
+    "double": "f8", "float64": "f8", "int64": "i8", "uint64": "u8",
 }  # fmt: skip
 
 
@@ -49,15 +49,25 @@ def read_point_cloud(file: Path) -> tuple[np.ndarray, np.ndarray]:
         data = file.read_bytes()
     except OSError as error:
         raise CaptureError(f"{file}: cannot be read ({error.strerror or error}).") from error
-    header = _header(data, file)
-    vertices = (_ascii if header.format == "ascii" else _binary)(data, header, file)
+    vertices, types = read_vertices(data, file)
     points = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    return points, _colors(vertices, header.types)
+    return points, _colors(vertices, types)
 
 
-def _header(data: bytes, file: Path) -> _Header:
+def read_vertices(
+    data: bytes, file: Path, needs: tuple[str, ...] = ("x", "y", "z")
+) -> tuple[np.ndarray, Mapping[str, str]]:
+    """The vertices of a PLY as records, with the properties that it `needs`, and what kind of number each is. Raises as
+    `read_point_cloud`."""
+    header = _header(data, file, needs)
+    return (_ascii if header.format == "ascii" else _binary)(data, header, file), header.types
+
+
+def _header(data: bytes, file: Path, needs: tuple[str, ...]) -> _Header:
+    listed = ", ".join(needs)
+
     def fail(what: str) -> CaptureError:
-        return CaptureError(f"{file}: {what}. A PLY point cloud with x, y, z is needed.")
+        return CaptureError(f"{file}: {what}. A PLY point cloud with {listed} is needed.")
 
     end = data.find(b"\nend_header", 0, MAX_HEADER_BYTES)
     start = data.find(b"\n", end + 1) + 1
@@ -81,8 +91,8 @@ def _header(data: bytes, file: Path) -> _Header:
             fields.append((words[2], PLY_DTYPES[words[1]]))
     if form not in BYTE_ORDERS:
         raise fail(f"is of format {form!r}")
-    if count < 0 or not {"x", "y", "z"} <= set(dict(fields)):
-        raise fail("announces no vertices with x, y, z")
+    if count < 0 or not {*needs} <= set(dict(fields)):
+        raise fail(f"announces no vertices with {listed}")
     layout = np.dtype([(name, BYTE_ORDERS[form] + kind) for name, kind in fields])
     return _Header(form, count, layout, start, dict(fields))
 

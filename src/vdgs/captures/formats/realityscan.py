@@ -122,11 +122,12 @@ def read(file: Path, options: CaptureOptions) -> Project:
             "with Brown3 and export again."
         )
     names = [camera.name for camera in cameras]
+    sizes = photograph_sizes(root, options, names, file) if names else []
     views = tuple(
         ProjectView(
             names=(camera.name,), camera_from_world=camera.camera_from_world, intrinsics=camera.intrinsics(size, file)
         )
-        for camera, size in zip(cameras, photograph_sizes(root, options, names, file), strict=True)
+        for camera, size in zip(cameras, sizes, strict=True)
     )  # fmt: skip
     system, in_degrees, is_metric, place = _world(views, file)
     return Project(
@@ -153,6 +154,7 @@ def _world(views: tuple[ProjectView, ...], file: Path) -> tuple[ToGeodetic | Non
     middle, spread = np.abs(np.median(centers, axis=0)), np.ptp(centers, axis=0)
     if (
         (spread[:2] < _DEGREES_APART).all()
+        and spread[:2].any()
         and middle[0] <= 180
         and middle[1] <= 90
         and middle[2] > 1e3 * spread[:2].max()
@@ -292,11 +294,18 @@ def read_xmp(file: Path) -> RegisteredCamera | str:
         return ""
     if found.get("Coordinates", "absolute").lower() == "relative":
         return "the pose is relative to a rig: export absolute poses"
-    if model not in _BROWN_MODELS:
-        return f"the lens model {model!r} is not supported"
+    projection = found.get("ProjectionModel", "perspective").lower()
+    if projection not in ("", "perspective"):
+        return f"the projection {projection!r} is not supported"
 
-    def numbers(key: str, count: int) -> list[float]:
+    def numbers(key: str, count: int | None) -> list[float]:
         return xml_numbers(found[key], count, file, f"xcr:{key}")
+
+    terms = numbers("DistortionCoeficients", None) if "DistortionCoeficients" in found else []
+    if model not in _BROWN_MODELS and any(terms):
+        return f"the lens model {model!r} is not supported"
+    if len(terms) > len(_LENS[2:]):
+        raise CaptureError(f"{file}: xcr:DistortionCoeficients has {len(terms)} numbers. {_AGAIN}")
 
     def number(key: str, default: float) -> float:
         return numbers(key, 1)[0] if key in found else default
@@ -306,8 +315,8 @@ def read_xmp(file: Path) -> RegisteredCamera | str:
     pose = np.eye(4)
     pose[:3, :3] = np.reshape(numbers("Rotation", 9), (3, 3))
     pose[:3, 3] = -pose[:3, :3] @ numbers("Position", 3)
-    bent = model != "perspective" and "DistortionCoeficients" in found
-    lens = dict(zip(_LENS[2:], numbers("DistortionCoeficients", 6) if bent else [0.0] * 6, strict=True))
+    bent = terms if model != "perspective" else []  # other programs leave out those at the end
+    lens = dict(zip(_LENS[2:], [*bent, *[0.0] * 6], strict=False))
     lens |= {"px": number("PrincipalPointU", 0.0), "py": number("PrincipalPointV", 0.0)}
     lens |= {"aspect": number("AspectRatio", 1.0), "skew": number("Skew", 0.0)}
     pose = to_rigid(pose, file, "xcr:Rotation")

@@ -41,7 +41,7 @@ PINHOLE_WHEN_ZERO = {
     "DIVISION",
 }  # fmt: skip
 #: The lenses of `brown_lens`, which are none of COLMAP's.
-BROWN, GENERAL, GENERAL_FISHEYE = OWN_LENSES = ("BROWN", "GENERAL", "GENERAL_FISHEYE")
+BROWN, GENERAL, GENERAL_FISHEYE, EQUISOLID = OWN_LENSES = ("BROWN", "GENERAL", "GENERAL_FISHEYE", "EQUISOLID")
 MAX_SIDE_PX = 100_000
 #: Names that messages list, and those of photographs that are gone, which a person must find.
 MAX_LISTED, MAX_MISSING_LISTED = 10, 100

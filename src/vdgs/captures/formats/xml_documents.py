@@ -18,6 +18,8 @@ from vdgs.errors import CaptureError
 
 #: Bytes that are read at once, and that are looked at to tell what a file is.
 CHUNK_BYTES, HEAD_BYTES = 1 << 20, 4096
+#: Files that are a zip with an XML file in it, which is called so where there are several.
+_ZIPPED, _DOCUMENT = (".xmlz", ".zip", ".psz"), "doc.xml"
 #: Elements lie in no more others than this; text and attributes of one are no longer than this.
 MAX_DEPTH, MAX_TEXT = 64, 1 << 24
 _DECLARATION = re.compile(rb"^\s*(\xef\xbb\xbf)?<\?xml[^>]*\?>")
@@ -55,7 +57,7 @@ def holds(file: Path, *texts: bytes) -> bool:
 def _opened(file: Path) -> Iterator[IO[bytes]]:
     """The bytes of a file, or of the first XML file in it where it is a zip."""
     with file.open("rb") as plain:
-        if file.suffix.lower() != ".xmlz":
+        if file.suffix.lower() not in _ZIPPED:
             yield plain
             return
         try:
@@ -63,7 +65,7 @@ def _opened(file: Path) -> Iterator[IO[bytes]]:
                 names = [name for name in archive.namelist() if name.lower().endswith(".xml")]
                 if not names:
                     raise CaptureError(f"{file}: holds no XML file.")
-                with archive.open(names[0]) as stream:
+                with archive.open(_DOCUMENT if _DOCUMENT in names else names[0]) as stream:
                     yield stream
         except (zipfile.BadZipFile, NotImplementedError, RuntimeError, zlib.error, EOFError) as error:
             raise CaptureError(f"{file}: is no zip file that can be read ({error}). Copy it again.") from None
