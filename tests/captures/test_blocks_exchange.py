@@ -13,6 +13,7 @@ import pytest
 from support.blocks_files import ORIENTATIONS, PLAIN, blocks_xml, in_system
 from support.captures import write_ply
 from support.true_flight import ORIGIN, SIZE, TrueFlight, assert_read_or_refused, assert_true, true_flight
+from vdgs.captures.formats import blocks_exchange
 from vdgs.captures.formats.lens_projection import ray_pixels
 from vdgs.captures.formats.source_capture import SourceCapture
 from vdgs.captures.loading import read_files
@@ -81,6 +82,36 @@ def test_yaw_and_pitch_are_read_where_nothing_rolls_and_refused_where_it_does(tm
     rolled = xml[:start] + "<Rotation>" + angles.replace(">0<", ">5<") + xml[end:]
     [said] = [each for each in read(tmp_path, rolled, flight).warnings if "Omega, Phi, Kappa" in each]
     assert "1 of 6 cameras" in said
+    assert "with its tie points" in said
+
+
+@pytest.mark.parametrize("direction", ["clockwise", "counter-clockwise"])
+def test_tie_points_tell_which_way_a_roll_turns(tmp_path, flight, direction):
+    source = read(tmp_path, blocks_xml(flight, None, angles="roll", rolls=direction), flight)
+    assert_true(source, flight)
+    assert any(f"turn cameras {direction}, seen from behind" in each for each in source.warnings)
+
+
+def test_groups_whose_poses_or_lens_are_left_to_the_program_are_not_taken_for_aligned(tmp_path, flight):
+    whole = blocks_xml(flight, None)
+    start, end = whole.index("<Photogroup>"), whole.index("</Photogroups>")
+    again = whole[start:end].replace("\\flights\\", "\\other\\").replace("<Id>", "<Id>9")
+    more = "".join(
+        again.replace("<Name>", f"<{tag}>false</{tag}><Name>", 1).replace("<Id>", f"<Id>{tag}")
+        for tag in ("ManualPose", "ManualOpticalParams")
+    )
+    bulk = "<BulkPhotos><Photo><ImagePath>bulk.JPG</ImagePath></Photo></BulkPhotos><ControlPoints>"
+    xml = blocks_xml(flight, None, more=more).replace("<ControlPoints>", bulk)
+    flight.touch(tmp_path)
+    (tmp_path / "block.xml").write_text(xml)
+    project = blocks_exchange.read(tmp_path / "block.xml", OPTIONS)
+    assert len(project.views) == len(flight.names)
+    [said] = project.warnings
+    assert f"{len(flight.names) + 1} photographs are not oriented" in said
+    assert "bulk.JPG" in said
+    [(why, names)] = project.refused.items()
+    assert "ManualOpticalParams" in why
+    assert len(names) == len(flight.names)
 
 
 def test_photographs_without_pose_are_named_and_left_out(tmp_path, flight):

@@ -17,6 +17,7 @@ from support.captures import TinyScene, moved, tiny_scene, to_source, write_colm
 from support.dataset_layouts import DRB, OPENGL, halves, matrixcity_frames, write_matrixcity, write_mega_nerf
 from vdgs.captures.capture import Capture
 from vdgs.captures.formats.json_poses import parse_intrinsics, parse_matrix
+from vdgs.captures.formats.lens_projection import ray_pixels
 from vdgs.captures.formats.ply_reader import read_point_cloud
 from vdgs.captures.formats.source_capture import Intrinsics
 from vdgs.captures.loading import load_capture
@@ -293,6 +294,11 @@ def test_distortion_is_read_from_keys_and_lists_alike():
     one, other = (parse_intrinsics({}, each, Path("a.png"), Path("transforms.json")) for each in (by_keys, by_list))
     assert one == other
     assert one.model == "OPENCV"
+    found = parse_intrinsics({}, by_keys | {"k3": -0.02, "k4": 0.3}, Path("a.png"), Path("transforms.json"))
+    x, y, r2 = 0.3, -0.4, 0.25
+    radial = 1 + 0.04 * r2 + 0.03 * r2**2 - 0.02 * r2**3 + 0.3 * r2**4
+    bent = x * radial + 2 * 0.02 * x * y + 0.01 * (r2 + 2 * x * x), y * radial + 0.02 * (r2 + 2 * y * y) + 0.02 * x * y
+    np.testing.assert_allclose(ray_pixels(found, np.array([[x, y]]))[0], (50 * bent[0] + 32, 51 * bent[1] + 24))
 
 
 def frame(pose: np.ndarray, path: str = "images/frame_000.png") -> dict:

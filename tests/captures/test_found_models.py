@@ -139,6 +139,12 @@ def test_poses_of_formats_that_are_not_read_are_said(tmp_path, name):
             "of Metashape without poses",
         ),
         ("block.xml", '<?xml version="1.0"?><BlocksExchange version="3.2"><Block/></BlocksExchange>', "without poses"),
+        ("sfm_data.json", '{"sfm_data_version": "0.3", "views": [], "extrinsics": []}', "OpenMVG without poses"),
+        (
+            "views.sfm",
+            '{"version": ["1", "2", "6"], "views": [{"viewId": "1", "poseId": "1"}]}',
+            "of its step StructureFrom",
+        ),
         ("opk.txt", "# PhotoID, X, Y, Z, Omega, Phi, Kappa, r11, r12\na.jpg,1,2,3,4,5,6,1,0\n", "Agisoft XML"),
         ("a_calibrated_external_camera_parameters.txt", "imageName X Y Z Omega Phi Kappa\na 1", "of PIX4Dmapper"),
         ("flight.prj", "$PROJECT 4.4\n  $PROJECT_NAME : flight\n", "of Inpho"),

@@ -4,6 +4,7 @@ back to its numbers."""
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -137,6 +138,7 @@ def test_report_of_odm_is_read_where_its_reconstruction_is_gone(tmp_path: Path, 
     flight.write_photographs(tmp_path / "images")
     check_numbers(read(tmp_path, "opensfm"), flight)
     _check_names_of_cameras(tmp_path, flight)
+    _check_parts(tmp_path, flight)
     with pytest.raises(CaptureError, match="vdgs sfm"):
         read_project(tmp_path, "opensfm", OPTIONS)
     _check_dense_cloud(tmp_path, flight)
@@ -158,6 +160,21 @@ def _check_names_of_cameras(project: Path, flight: KnownFlight) -> None:
         feature["properties"]["camera"] = name
     file.write_text(json.dumps(content))
     check_numbers(read(project, "opensfm"), flight)
+
+
+def _check_parts(project: Path, flight: KnownFlight) -> None:
+    """ODM's divided projects have the lenses beside each part, one camera with another lens in each; put back again."""
+    file, whole = project / "cameras.json", (project / "cameras.json").read_text()
+    lens = json.loads(whole)["dji fc6310r"]
+    for part, content in (("0000", {**lens, "focal_x": 1.01 * lens["focal_x"], "k1": 0.5}), ("0001", lens)):
+        (project / f"submodels/submodel_{part}").mkdir(parents=True)
+        (project / f"submodels/submodel_{part}/cameras.json").write_text(json.dumps({"dji fc6310r": content}))
+    file.unlink()
+    check_numbers(read(project, "opensfm"), flight)
+    shutil.rmtree(project / "submodels")
+    with pytest.raises(CaptureError, match=r"is not above it. Copy it there"):
+        read(project, "opensfm")
+    file.write_text(whole)
 
 
 def _check_dense_cloud(project: Path, flight: KnownFlight) -> None:

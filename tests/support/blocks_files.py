@@ -50,10 +50,12 @@ def tags(names: Iterable[str], values: Iterable[float]) -> str:
 
 
 def blocks_xml(
-    flight: TrueFlight, system: str | None = "EPSG:32632", *, angles: bool = False, orientation: str = "XRightYDown",
-    in_millimeters: bool = False, tie_points: bool = True, paths: Sequence[str] | None = None, more: str = "",
+    flight: TrueFlight, system: str | None = "EPSG:32632", *, angles: bool | str = False,
+    orientation: str = "XRightYDown", in_millimeters: bool = False, tie_points: bool = True,
+    paths: Sequence[str] | None = None, more: str = "", rolls: str = "clockwise",
 ) -> str:  # fmt: skip
-    """A block, version 2.1; `system` None or of the kind ENU: metres as the flight has them."""
+    """A block, version 2.1; `system` None or of the kind ENU: metres as the flight has them. Of
+    `angles` those called "roll" are Yaw, Pitch and Roll, which `rolls` cameras so, seen from behind."""
     mapped = system is not None and system.startswith("EPSG")
     rotations, centers, points = (
         in_system(flight, str(system)) if mapped else (flight.rotations, flight.centers, flight.points)
@@ -64,6 +66,8 @@ def blocks_xml(
         axes = ORIENTATIONS[orientation].T @ rotations[index]
         matrix = tags([f"M_{row}{column}" for row in range(3) for column in range(3)], axes.ravel())
         turned = tags(("Omega", "Phi", "Kappa"), angles_of(axes)) if angles else matrix
+        if angles == "roll":
+            turned = _yaw_pitch_roll(axes, 1 if rolls == "clockwise" else -1)
         photos.append(
             f"<Photo><Id>{index + 10}</Id><ImagePath>{path}</ImagePath><Component>1</Component><Pose><Rotation>{turned}"
             f"</Rotation><Center>{tags('xyz', centers[index])}</Center></Pose><NearDepth>80</NearDepth></Photo>"
@@ -77,6 +81,16 @@ def blocks_xml(
         "</Photogroups><ControlPoints><ControlPoint><Position><x>1</x><y>2</y></Position></ControlPoint>"
         f"</ControlPoints>{_tie_points(flight, points) if tie_points else ''}</Block></BlocksExchange>"
     )
+
+
+def _yaw_pitch_roll(axes: np.ndarray, clockwise: int) -> str:
+    """Of a camera with the axes right, down, forward: its right side is lower where it rolls clockwise."""
+    right, forward = axes[0], axes[2]
+    level = np.cross(forward, [0.0, 0.0, 1.0])
+    level /= np.linalg.norm(level)
+    roll = math.atan2(right @ np.cross(forward, level), right @ level)
+    angles = math.atan2(forward[0], forward[1]), math.asin(forward[2]), clockwise * roll
+    return tags(("Yaw", "Pitch", "Roll"), np.degrees(angles))
 
 
 def camera(lens: Lens, orientation: str = "XRightYDown", in_millimeters: bool = False) -> str:

@@ -60,6 +60,8 @@ _ALIGN = "it is read once its photographs are aligned and it is exported again"
 _BY_CONTENT = (
     (".xml", b"<blocksexchange", f"a BlocksExchange file without poses; {_ALIGN}"),
     (".xml", b"<document version", f"an export of Metashape without poses; {_ALIGN}"),
+    (".json", b'"sfm_data_version"', "photographs of OpenMVG without poses; the sfm_data.json after its SfM is read"),
+    (".sfm", b'"viewid"', "photographs of Meshroom without poses; cameras.sfm of its step StructureFromMotion is read"),
     (
         ".txt", b"photoid, x, y, z, omega",
         "poses of Metashape without lenses; its Agisoft XML (File > Export > Export Cameras) is read",

@@ -8,16 +8,16 @@ east or longitude.
 
 from __future__ import annotations
 
-import math
 from array import array
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from vdgs.captures.coordinate_systems import ToGeodetic, UnknownSystem, is_in_degrees, is_local_system, to_geodetic
+from vdgs.captures.formats.block_rotations import ASK_FOR_MATRIX, Rolled, block_rotation, has_roll, told_by_points
 from vdgs.captures.formats.brown_lens import brown_intrinsics, quarter_turn_fisheye
 from vdgs.captures.formats.project import CloudFrame, Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
@@ -34,8 +34,6 @@ _TERRA_FOLDER = "AT"
 _WITHOUT_POINTS = "_withouttiepoints"
 #: Measurements of tie points that are kept, of each photograph: more than are looked at afterwards.
 _MEASUREMENTS = 4000
-#: Rolls in degrees that are none.
-_LEVEL_DEG = 1e-3
 
 
 def is_file(file: Path) -> bool:
@@ -66,6 +64,8 @@ class _Photo:
     name: str
     intrinsics: Intrinsics
     pose: np.ndarray
+    other_roll: np.ndarray | None = None
+    """Its pose with the roll turned the other way, where the file has one."""
     sightings: tuple[list[int], list[tuple[float, float]]] = field(default_factory=lambda: ([], []))
 
 
@@ -90,8 +90,9 @@ class _Block:
         blocks = self._root.findall("Block")
         if len(blocks) > 1:
             raise CaptureError(f"{self._file}: holds {len(blocks)} blocks. Export one alone.")
+        warnings = self._settle_roll()
         geodetic, in_degrees, place, frames = self._system(blocks[0] if blocks else None)
-        warnings = []
+        self._without_pose += map(_path, self._root.iterfind("Block/BulkPhotos/Photo"))
         if self._without_pose:
             names = ", ".join(self._without_pose)
             warnings.append(f"{len(self._without_pose)} photographs are not oriented and are left out ({names}).")
@@ -129,8 +130,9 @@ class _Block:
         label = f"photogroup {(group.findtext('Name') or '').strip()!r}"
         self._note_system(group)
         posed: list[Element] = []
+        is_used = not _is_false(group, "ManualPose")
         for photo in group.findall("Photo"):
-            if _is_posed(photo):
+            if is_used and _is_posed(photo):
                 posed.append(photo)
             else:
                 self._without_pose.append(_path(photo))
@@ -151,45 +153,53 @@ class _Block:
         number = (photo.findtext("Id") or f"#{len(self._photos)}").strip()
         if number in self._photos:
             raise CaptureError(f"{self._file}: two photographs have the number {number}. Export the block again.")
+        element: Element = photo.find("Pose/Rotation")  # type: ignore[assignment]
+        center = self._place(photo.find("Pose/Center"), f"the center of {name}")
         try:
-            rotation = axes @ self._rotation(photo.find("Pose/Rotation"))  # type: ignore[arg-type]
+            rotations = [axes @ block_rotation(element, self._file, roll) for roll in (1, -1)]
         except CaptureError as error:
             self._refuse(error, [photo])
             return
-        center = self._place(photo.find("Pose/Center"), f"the center of {name}")
-        pose = to_rigid(np.column_stack([rotation, np.zeros(3)]), self._file, name)
-        pose[:3, 3] = -pose[:3, :3] @ center
-        self._photos[number] = _Photo(name, intrinsics, pose)
+        poses = [to_rigid(np.column_stack([each, np.zeros(3)]), self._file, name) for each in rotations]
+        for pose in poses:
+            pose[:3, 3] = -pose[:3, :3] @ center
+        self._photos[number] = _Photo(name, intrinsics, poses[0], poses[1] if has_roll(element, self._file) else None)
 
     def _place(self, element: Element | None, label: str) -> list[float]:
         if element is None:
             raise CaptureError(f"{self._file}: {label} is missing. Export the block again.")
         return [xml_number(element, axis, self._file, label) for axis in "xyz"]
 
-    def _rotation(self, element: Element) -> np.ndarray:
-        """From the world to the axes of the camera."""
-
-        def value(tag: str) -> float:
-            return xml_number(element, tag, self._file, "a rotation")
-
-        if element.find("M_00") is not None:
-            return np.array([[value(f"M_{row}{column}") for column in range(3)] for row in range(3)])
-        if element.find("Omega") is not None:
-            omega, phi, kappa = (math.radians(value(tag)) for tag in ("Omega", "Phi", "Kappa"))
-            return (_about_x(omega) @ _about_y(phi) @ _about_z(kappa)).T
-        if element.find("Yaw") is not None and abs(value("Roll")) < _LEVEL_DEG:
-            yaw, pitch = math.radians(value("Yaw")), math.radians(value("Pitch"))
-            level = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # looks along y, z is up
-            return level @ (_about_z(-yaw) @ _about_x(pitch)).T
-        kinds = ", ".join(child.tag for child in element) or "nothing"
-        raise CaptureError(
-            f"the rotation is given by {kinds}, which programs mean in different ways: export it as a matrix, or as "
-            "Omega, Phi, Kappa"
-        )
+    def _settle_roll(self) -> list[str]:
+        """Give rolled photographs the pose that tie points agree with, or refuse them; what is to be said of it."""
+        points = np.array(self._points).reshape(-1, 3)
+        rolled = {number: photo for number, photo in self._photos.items() if photo.other_roll is not None}
+        way, errors = told_by_points(
+            Rolled(photo.intrinsics, (photo.pose, photo.other_roll), points[photo.sightings[0]],  # type: ignore[arg-type]
+                   np.reshape(photo.sightings[1], (-1, 2)))
+            for photo in rolled.values()
+        )  # fmt: skip
+        for number, photo in rolled.items():
+            if way is None:
+                why = f"the rotation has a Roll, {ASK_FOR_MATRIX}; or export it with its tie points, which tell"
+                self._refused.setdefault(why, []).append(self._photos.pop(number).name)
+            elif way == 1 and photo.other_roll is not None:
+                self._photos[number] = replace(photo, pose=photo.other_roll)
+        if way is None or not rolled:
+            return []
+        turns = ("clockwise", "counter-clockwise")[way]
+        return [
+            f"Roll is taken to turn cameras {turns}, seen from behind: tie points are {errors[way]:.2f} px off, and "
+            f"{errors[1 - way]:.2f} px the other way."
+        ]
 
     # ------------------------------------------------------------------------------------------ lenses
 
     def _lens(self, group: Element, label: str) -> Intrinsics:
+        if _is_false(group, "ManualOpticalParams"):
+            raise CaptureError(
+                f"{label} leaves its lens to the program (ManualOpticalParams false): export it aligned."
+            )
         kind = (group.findtext("CameraModelType") or "Perspective").strip()
         if kind not in ("Perspective", "Fisheye"):
             raise CaptureError(f"{label} is {kind!r}; Perspective and Fisheye are read.")
@@ -348,21 +358,10 @@ def _is_posed(photo: Element) -> bool:
     rotation, center = photo.find("Pose/Rotation"), photo.find("Pose/Center")
     if rotation is None or center is None:
         return False
-    if any((part.findtext("Accurate") or "").strip().lower() == "false" for part in (rotation, center)):
+    if _is_false(rotation, "Accurate") or _is_false(center, "Accurate"):
         return False
     return all((center.findtext(axis) or "").strip() for axis in "xyz")
 
 
-def _about_x(angle: float) -> np.ndarray:
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[1.0, 0, 0], [0, c, -s], [0, s, c]])
-
-
-def _about_y(angle: float) -> np.ndarray:
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[c, 0, s], [0, 1.0, 0], [-s, 0, c]])
-
-
-def _about_z(angle: float) -> np.ndarray:
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
+def _is_false(element: Element, tag: str) -> bool:
+    return (element.findtext(tag) or "").strip().lower() == "false"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics
+from vdgs.captures.formats.source_capture import BROWN, Intrinsics, check_intrinsics
 from vdgs.captures.image_files import read_header
 from vdgs.errors import CaptureError
 from vdgs.system.documents import JsonObject
@@ -189,8 +189,8 @@ def _lens(model: str, k: dict[str, float], file: Path) -> tuple[str, tuple[float
         )
     if not any(k.values()):
         return "PINHOLE", ()
-    if k["k4"]:
-        raise CaptureError(f"{file}: the lens parameter k4 is not supported; undistort the images first.")
+    if k["k4"]:  # of r^8, as nerfstudio and Metashape, whose k4 its converter writes, have it
+        return BROWN, (k["k1"], k["k2"], k["p1"], k["p2"], k["k3"], k["k4"], 0.0)
     if k["k3"]:
         return "FULL_OPENCV", (k["k1"], k["k2"], k["p1"], k["p2"], k["k3"], 0.0, 0.0, 0.0)
     return "OPENCV", (k["k1"], k["k2"], k["p1"], k["p2"])

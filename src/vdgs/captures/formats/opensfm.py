@@ -257,10 +257,8 @@ def _with_sightings(view: ProjectView, numbers: np.ndarray, places: np.ndarray) 
 def _read_report(file: Path) -> Project:
     """The cameras of shots.geojson, with their places in the project's system and rotations camera from world, and the
     lenses of cameras.json."""
-    lenses_file = next((each for each in (file.parent.parent / CAMERAS, file.parent / CAMERAS) if each.is_file()), None)
-    if lenses_file is None:
-        raise CaptureError(f"{file}: has the poses, but {CAMERAS} of the project, with the lenses, is not above it.")
-    known, content = _read_cameras(read_capture_json(lenses_file), lenses_file), read_capture_json(file)
+    known, lenses_file = _report_cameras(file)
+    content = read_capture_json(file)
     features: Any = content.get("features")
     if not isinstance(features, list) or not features:
         raise CaptureError(f"{file}: has no 'features', the photographs. {_AGAIN}")
@@ -284,6 +282,22 @@ def _read_report(file: Path) -> Project:
         format="opensfm", file=file, views=tuple(views), points=np.zeros((0, 3)), colors=np.zeros((0, 3), np.uint8),
         to_geodetic=system, place=place, warnings=tuple(warnings), refused=refused, remedy=_UNDISTORT,
     )  # fmt: skip
+
+
+def _report_cameras(file: Path) -> tuple[dict[str, Intrinsics | str], Path]:
+    """The lenses beside a report, and the file that has them: of the project, or of each part of a divided one."""
+    project = file.parent.parent
+    for folder, pattern in ((project, CAMERAS), (file.parent, CAMERAS), (project, f"submodels/*/{CAMERAS}")):
+        found = {each: _read_cameras(read_capture_json(each), each) for each in sorted(folder.glob(pattern))}
+        if len(found) == 1:
+            return next(iter(found.values())), next(iter(found))
+        if found:  # one camera has another lens in each part, which its focal length tells
+            lenses = {f"{each.parent.name}/{name}": lens for each, of in found.items() for name, lens in of.items()}
+            return lenses, next(iter(found))
+    raise CaptureError(
+        f"{file}: has the poses, but {CAMERAS} of the project, with the lenses, is not above it. Copy it there from "
+        "the project (in WebODM: Download Assets, Camera Parameters)."
+    )
 
 
 def _lens_of(shot: JsonObject, known: Mapping[str, Intrinsics | str], file: Path) -> Intrinsics | str:

@@ -21,7 +21,7 @@ from vdgs.errors import CaptureError
 
 _ENDING, _HEADER = "_calibrated_camera_parameters.txt", b"fileName imageWidth imageHeight"
 #: Where PIX4Dmapper puts the file in the folder of a project, which lies beside its .p4d.
-_FOLDERS = ("", "1_initial/params/", "*/1_initial/params/")
+_FOLDERS = ("", "params/", "1_initial/params/", "*/1_initial/params/")
 _LINES = 10
 
 
