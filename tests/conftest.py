@@ -8,7 +8,9 @@ them.
 from __future__ import annotations
 
 import gc
+import itertools
 import os
+import re
 import sys
 from collections.abc import Generator
 from pathlib import Path
@@ -22,10 +24,10 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("VDGS_THREADS", "1")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import jaxtyping
 import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis.internal.conjecture import providers
-from jaxtyping import install_import_hook
 
 from support import typecheck
 from support.package_files import files_with_shapes, module_name
@@ -49,7 +51,8 @@ providers._get_local_constants = lambda: providers._local_constants  # type: ign
 
 
 # Their annotations are checked while the tests run.
-install_import_hook([module_name(file) for file in files_with_shapes()], f"{typecheck.__name__}.checked")
+jaxtyping.jaxtyped = typecheck.jaxtyped
+jaxtyping.install_import_hook([module_name(file) for file in files_with_shapes()], f"{typecheck.__name__}.checked")
 
 
 @pytest.hookimpl(wrapper=True)
@@ -79,6 +82,19 @@ def pytest_collection_finish(session: pytest.Session) -> None:
                 raise pytest.UsageError(
                     f"{item.nodeid}: this pytest-xdist keeps no groups with pytest {pytest.__version__}"
                 )
+
+
+_folders = itertools.count()
+
+
+@pytest.fixture
+def tmp_path(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Path:
+    """As pytest's, but beside those of the same file only: pytest lists all that were made before for each new one, and
+    every command lists the folders around its output."""
+    name = re.sub(r"\W", "_", request.node.name)[:30]
+    folder = tmp_path_factory.getbasetemp() / request.path.stem / f"{name}{next(_folders)}"
+    folder.mkdir(parents=True)
+    return folder
 
 
 @pytest.fixture(scope="session")

@@ -39,10 +39,10 @@ def write_project(root: Path, scene: TinyScene, photographs: Path | None = None,
     root.mkdir(exist_ok=True)
     u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     rays = unproject_pixels(LENS, np.stack([u.ravel(), v.ravel()], axis=1)).reshape(HEIGHT, WIDTH, 2)
-    grid = (rays * 500 + [400, 300] - 0.5).astype(np.float32)
+    grid = (rays * 250 + [200, 150] - 0.5).astype(np.float32)
     cameras = []
     for number, (name, camera) in enumerate(scene.cameras.items()):
-        large = replace(camera, width=800, height=600, fx=500.0, fy=500.0, cx=400.0, cy=300.0)
+        large = replace(camera, width=400, height=300, fx=250.0, fy=250.0, cx=200.0, cy=150.0)
         picture = cv2.remap(render_plane(large), grid[..., 0], grid[..., 1], cv2.INTER_LINEAR)
         assert cv2.imwrite(str(photographs / name), picture[:, :, ::-1])
         pose = words(np.linalg.inv(camera.camera_from_world))

@@ -43,7 +43,7 @@ def is_file(file: Path) -> bool:
 def find_files(root: Path) -> list[Path]:
     """The files in a folder, and where DJI Terra puts them below it; without those that another holds with points."""
     folders = [folder for folder in (root, root / _TERRA_FOLDER) if folder.is_dir()]
-    files = [file for folder in folders for file in sorted(folder.iterdir()) if is_file(file)]
+    files = [file for folder in folders for file in sorted(filter(is_file, folder.iterdir()))]
     found = [file for file in files if holds(file, b"<Rotation>")]
     whole = {file.with_suffix("").as_posix().lower() for file in found}
     return [

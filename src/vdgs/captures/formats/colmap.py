@@ -51,7 +51,7 @@ def _candidates(root: Path) -> list[Path]:
     candidates: list[Path] = []
     for parent in parents:
         if parent.is_dir():
-            numbered = [entry for entry in parent.iterdir() if entry.is_dir() and entry.name.isdigit()]
+            numbered = [entry for entry in parent.iterdir() if entry.name.isdigit() and entry.is_dir()]
             candidates += [*sorted(numbered, key=lambda entry: int(entry.name)), parent]
     return candidates
 

@@ -53,9 +53,9 @@ def is_file(file: Path) -> bool:
 
 def find_files(root: Path) -> list[Path]:
     """The exports of aligned cameras in a folder (those of markers and of references hold none); else the projects."""
-    files = sorted(root.iterdir())
-    exports = [file for file in files if file.suffix.lower() == ".xml" and is_file(file) and holds(file, *ALIGNED)]
-    return exports or [file for file in files if file.suffix.lower() in PROJECTS and is_file(file) and is_aligned(file)]
+    files = sorted(filter(is_file, root.iterdir()))
+    exports = [file for file in files if file.suffix.lower() == ".xml" and holds(file, *ALIGNED)]
+    return exports or [file for file in files if file.suffix.lower() in PROJECTS and is_aligned(file)]
 
 
 def read(file: Path, options: CaptureOptions) -> Project:
