@@ -16,7 +16,7 @@ import time
 import typing
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import psutil
@@ -24,7 +24,8 @@ from rich.console import Console
 
 from experiments.bench.cached_results import drop_cached_runs, match_pixel_groups, read_cached_results
 from experiments.bench.claim_check import check_claims
-from experiments.bench.definitions import BenchScene
+from experiments.bench.definitions import BenchScene, has_block_folders, has_gaussian_blocks
+from experiments.bench.equal_time import step_factors
 from experiments.bench.figure import plot_visibility_groups
 from experiments.bench.measure import FRUSTA_FILE, GROUPS_FILE, measure_groups
 from experiments.bench.notes import make_notes
@@ -68,6 +69,8 @@ class BenchSettings:
     overwrite: bool = False
     #: What other benches wrote as results.json: runs that they hold are not trained.
     reuse_results: tuple[Path, ...] = ()
+    #: Afterwards once more, each method with as many iterations as fit into the time of the table's own method.
+    equal_time: bool = False
 
 
 def run_bench(settings: BenchSettings, console: Console) -> list[BenchResult]:
@@ -79,6 +82,26 @@ def run_bench(settings: BenchSettings, console: Console) -> list[BenchResult]:
     if settings.jobs < 1 or settings.visibility_bins < 1:
         raise VdgsError("--jobs and --visibility-bins must be at least 1")
     _check_output_outside_inputs(settings.output, plan := make_plan(settings.table, settings.plan_options))
+    results, outcomes = _run_plan(plan, settings, console)
+    if settings.equal_time and not any(each.state == "stopped" for each in outcomes.values()):
+        options = replace(settings.plan_options, step_factors=step_factors(plan, results))
+        settings = replace(settings, plan_options=options)
+        results, outcomes = _run_plan(make_plan(settings.table, options), settings, console)
+    if any(each.state == "stopped" for each in outcomes.values()):
+        raise Stopped("Stopped; every run is saved. The same command continues.")
+    errors = [each for each in outcomes.values() if each.state == "failed"]
+    if errors:
+        raise VdgsError(
+            f"{len(errors)} of {len(outcomes)} runs failed; the tables say so:\n  "
+            + "\n  ".join(f"{each.name}: {each.reason}" for each in errors)
+        )
+    return results
+
+
+def _run_plan(
+    plan: BenchPlan, settings: BenchSettings, console: Console
+) -> tuple[list[BenchResult], dict[str, TaskResult]]:
+    """Train and measure what is not finished, and write the tables; the results, and how each run ended."""
     cached = read_cached_results(settings.reuse_results)
     keys = {run.name: _key(run, plan, settings) for run in plan.coarse + plan.runs}
     remaining = drop_cached_runs(plan, keys, cached)
@@ -93,15 +116,7 @@ def run_bench(settings: BenchSettings, console: Console) -> list[BenchResult]:
         results = match_pixel_groups(collect_results(plan, settings.output, outcomes, keys, cached), cached)
         _write(plan, results, settings, console)
     console.print(f"{(time.monotonic() - began) / 60:.1f} min", highlight=False)
-    if any(each.state == "stopped" for each in outcomes.values()):
-        raise Stopped("Stopped; every run is saved. The same command continues.")
-    errors = [each for each in outcomes.values() if each.state == "failed"]
-    if errors:
-        raise VdgsError(
-            f"{len(errors)} of {len(outcomes)} runs failed; the tables leave them out:\n  "
-            + "\n  ".join(f"{each.name}: {each.reason}" for each in errors)
-        )
-    return results
+    return results, outcomes
 
 
 def _check_output_outside_inputs(output: Path, plan: BenchPlan) -> None:
@@ -223,7 +238,7 @@ def _check_same_settings(settings: BenchSettings, run: PlannedRun) -> None:
     if settings.overwrite or not folder.config_file.exists():
         return
     wanted, held = to_dict(run.config), folder.settings().to_dict()
-    if "blocks" not in run.stages:  # no other section matters to it
+    if not (has_block_folders(run.stages) or has_gaussian_blocks(run.stages)):  # no other section matters to it
         wanted = {"training": wanted["training"]}
     before, after = ({name: hashable_settings(name, each[name]) for name in wanted} for each in (held, wanted))
     changed = diff_settings(before, after)
@@ -324,7 +339,7 @@ def _pixel_visibility(
 
 
 def _write(plan: BenchPlan, results: list[BenchResult], settings: BenchSettings, console: Console) -> None:
-    output = settings.output / plan.table.name
+    output = settings.output / (plan.table.name + "-equal-time" * bool(plan.step_factors))
     result_tables, claims = make_result_tables(plan, results), check_claims(plan, results)
     output.mkdir(exist_ok=True)
     write_json(

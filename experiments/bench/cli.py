@@ -38,7 +38,7 @@ class BenchArguments:
     """Other scenes than the table's, by name: tiny, lab-uneven, town-even, copr, residence, sci-art, ... Or captures of
     your own, as folders: ./my-place. What says how a capture is read (--images, --downscale and on) is about these."""
     methods: tuple[str, ...] = ()
-    """Other methods than the table's, by name: full, baseline, no-blocking, vastgaussian, lambda-vis-0, ..."""
+    """Other methods than the table's, by name: full, baseline, no-blocking, momentum-gs, lambda-vis-0, ..."""
     renders: tuple[str, ...] = ()
     """What other programs rendered of the test views, a row for each NAME=FOLDER (several after one --renders):
     FOLDER/SCENE/VIEW.png or FOLDER/SCENE/SEED/VIEW.png. Measured as all others (docs/bench.md)."""
@@ -51,6 +51,9 @@ class BenchArguments:
     """Factor on the iterations of every scene."""
     total_iterations: Annotated[int | None, Range(1, MAX_COUNT)] = None
     """Iterations that every method may spend on a scene, shared out as the scene's own; overrides the factor."""
+    equal: Literal["steps", "time"] = "steps"
+    """What all methods get alike. steps: iterations in all. time: then also a second table, TABLE-equal-time, for which
+    each method makes as many iterations as fit into the time that the table's own method (full) took."""
     max_anchors: Annotated[int, Range(0, MAX_COUNT)] = 0
     """No growth beyond this many anchors, of the scene or of all blocks together; 0 for no limit."""
     jobs: Annotated[int, Range(1, 1024)] = 1
@@ -87,6 +90,7 @@ def bench_command(arguments: list[str]) -> None:
             args.lpips_weights,
             args.overwrite,
             args.reuse_results,
+            args.equal == "time",
         ),
         make_console(args.quiet),
     )

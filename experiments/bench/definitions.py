@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,19 @@ COARSE_STAGES = ("coarse", "evaluate")
 BLOCK_STAGES = ("coarse", "partition", "blocks", "merge", "evaluate")
 GS3D_STAGES = ("gaussians",)
 RENDER_STAGES = ("renders",)
+MOMENTUM_STAGES = ("coarse", "partition", "momentum-gs", "merge", "evaluate")
+#: Of explicit Gaussians in blocks: one stage, named after the method.
+CITYGAUSSIAN_STAGES, VASTGAUSSIAN_STAGES, DOGS_STAGES = ("citygaussian",), ("vastgaussian",), ("dogs",)
+
+
+def has_block_folders(stages: Sequence[str]) -> bool:
+    """Whether the run is cut into blocks of anchors, which lie in RUN/blocks."""
+    return "blocks" in stages or "momentum-gs" in stages
+
+
+def has_gaussian_blocks(stages: Sequence[str]) -> bool:
+    """Whether explicit Gaussians are trained in blocks, which lie in RUN/gaussians/blocks."""
+    return tuple(stages) in (CITYGAUSSIAN_STAGES, VASTGAUSSIAN_STAGES, DOGS_STAGES)
 
 
 @dataclass(frozen=True)
@@ -63,8 +76,17 @@ class BenchMethod:
     less: str = ""
     #: What it gets more than the others, to find out what holds them back.
     more: str = ""
+    #: How it departs from what was published, in a few words for the column "rests on"; empty: it is whole.
+    adapted: str = ""
     #: Where another program left its renders of the test views (`renders.py`); None: the method is trained here.
     renders: Path | None = None
+
+    @property
+    def rests_on(self) -> str:
+        """What a row of Table I is: the published method whole, adapted, or another program's renders."""
+        if self.renders is not None:
+            return "renders of its own program"
+        return f"adapted: {self.adapted}" if self.adapted else "whole"
 
     def settings(self, base: MethodConfig, budget: Budget) -> MethodConfig:
         return self.override(base, budget)
@@ -134,6 +156,12 @@ class BenchTable:
     methods: tuple[str, ...]
     scenes: tuple[str, ...]
     seeds: tuple[int, ...] = (0, 1, 2)
+    #: Scenes of which, unless --seeds asks for more, only the first seed is trained: they take hours for each.
+    single_seed: tuple[str, ...] = ()
     groups: tuple[MethodGroup, ...] = ()
     #: The method that the verdict is about.
     ours: str = "full"
+    #: Rows of the paper's table that are not trained here, by the names that `paper_numbers.py` has for them.
+    quoted: tuple[str, ...] = ()
+    #: Whether it has one table a scene with quality, groups, size and cost of each method, and what its row rests on.
+    overview: bool = False

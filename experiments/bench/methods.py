@@ -9,18 +9,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal
 
-from experiments.baselines.gs3d.schedule import MIN_INTERVAL, PUBLISHED_ITERATIONS
-from experiments.bench.definitions import COARSE_STAGES, GS3D_STAGES, BenchMethod, ConfigOverride
+from experiments.bench.block_methods import BLOCK_METHODS
+from experiments.bench.definitions import COARSE_STAGES, BenchMethod, ConfigOverride
+from experiments.bench.other_methods import OTHER_METHODS
 from experiments.bench.overrides import (
     FACTORIAL_CAMERAS,
     as_in_paper,
+    as_preset,
     coarse_only,
     coarse_only_averaged,
     coarse_same_iterations,
     coarse_with_compensation,
     coarse_with_lower_threshold,
     disable_compensation,
-    explicit_gaussians,
     factorial_cell,
     full_method,
     with_assignment,
@@ -37,7 +38,6 @@ from experiments.bench.overrides import (
     with_more_blocks,
     with_paper_compensation,
     with_paper_gate,
-    with_partition_strategy,
     with_summed_compensation,
     with_t_low,
     without_blocking,
@@ -66,27 +66,25 @@ def _sweep(
     ]
 
 
-#: What the partitions leave out beyond what `partition.strategies` says of each.
-_COMMON = (
-    "training schedule, losses and (dense) Adam of their own: what is compared is the partition, and blocks are "
-    "trained as ours, with plain growth",
-)
-_3DGS = "Kerbl et al., 3D Gaussian Splatting for Real-Time Radiance Field Rendering, SIGGRAPH 2023"
 #: On which the paper is silent, and by which compensated growth gains where few cameras look (reports/findings.md).
 _GATE = "the gate of growth is lower where few cameras look, our choice"
-#: As the docstring of `experiments.baselines.gs3d.run` has it.
-_3DGS_LEAVES_OUT = (
-    "pruning by footprint in the image (its section 5.2)",
-    "its own image formation (alpha at most 0.999, near plane at 0.01 and extent by opacity are as for all methods)",
-    "exposure compensation, depth regularisation and anti-aliasing, which came later than its paper",
-)
-_3DGS_SCHEDULE = (
-    f"its schedule of {PUBLISHED_ITERATIONS:,} iterations (warm-up, degree of color, start and interval of density "
-    "control, resets of opacity) moves in proportion to the total here, but neither decides nor resets more "
-    f"often than every {MIN_INTERVAL} iterations"
-)
 _ABLATIONS = [
     BenchMethod("full", "VDGS (full)", full_method, citation="VDGS, sections IV-B and IV-C"),
+    BenchMethod(
+        "vdgs-paper",
+        "VDGS (preset paper)",
+        as_preset("paper"),
+        citation="VDGS, sections IV-B and IV-C",
+        differs="the paper as printed, its schedule in proportion to the iterations here; docs/paper.md says what it "
+        "takes where the paper is silent",
+    ),
+    BenchMethod(
+        "vdgs-default",
+        "VDGS (preset default)",
+        as_preset("default"),
+        citation="VDGS, sections IV-B and IV-C",
+        differs="the paper's numbers with this package's choices, its schedule in proportion to the iterations here",
+    ),
     BenchMethod("baseline", "baseline: coarse alone", coarse_only, COARSE_STAGES, citation="VDGS, Table II (a)"),
     BenchMethod(
         "baseline-mean",
@@ -136,57 +134,6 @@ _ABLATIONS = [
         less="photographs of the coarse stage and one block: as much time, if all blocks are trained at once",
     ),
     BenchMethod("no-anchor-generation", "w/o anchor generation", without_compensation, citation="VDGS, Table II (c)"),
-]
-_OTHERS = [
-    BenchMethod(
-        "3dgs",
-        "3DGS",
-        explicit_gaussians("mean"),
-        GS3D_STAGES,
-        citation=_3DGS,
-        omissions=_3DGS_LEAVES_OUT,
-        differs=f"background of the mean color of the photographs, as ours; {_3DGS_SCHEDULE}",
-    ),
-    BenchMethod(
-        "3dgs-black",
-        "3DGS, black background",
-        explicit_gaussians("black"),
-        GS3D_STAGES,
-        citation=_3DGS,
-        omissions=_3DGS_LEAVES_OUT,
-        differs=f"background black, as published; {_3DGS_SCHEDULE}",
-    ),
-    BenchMethod(
-        "scaffold-gs",
-        "Scaffold-GS",
-        with_dense_adam(coarse_only),
-        COARSE_STAGES,
-        citation="Lu et al., Scaffold-GS: Structured 3D Gaussians for View-Adaptive Rendering, CVPR 2024",
-        omissions=("its starts, background, rates and volume weight: they are those of our coarse stage",),
-        differs="its dense Adam; `baseline` is the same with ours, which moves only what a photograph shows",
-    ),
-    BenchMethod(
-        "vastgaussian",
-        "VastGaussian partition",
-        with_partition_strategy("vastgaussian"),
-        citation="Lin et al., VastGaussian: Vast 3D Gaussians for Large Scene Reconstruction, CVPR 2024",
-        omissions=_COMMON,
-    ),
-    BenchMethod(
-        "citygaussian",
-        "CityGaussian partition",
-        with_partition_strategy("citygaussian"),
-        citation="Liu et al., CityGaussian: Real-time High-quality Large-Scale Scene Rendering with Gaussians, "
-        "ECCV 2024",
-        omissions=_COMMON,
-    ),
-    BenchMethod(
-        "dogs",
-        "DOGS partition",
-        with_partition_strategy("dogs"),
-        citation="Chen and Lee, DOGS: Distributed-Oriented Gaussian Splatting via Gaussian Consensus, NeurIPS 2024",
-        omissions=_COMMON,
-    ),
 ]
 _BLOCKS = [
     BenchMethod(f"blocks-{count}", f"{count} block{'s' * (count > 1)}", with_block_count(count)) for count in BLOCKS
@@ -349,8 +296,8 @@ FACTORIAL = tuple(method.name for method in _FACTORIAL)
 METHODS: dict[str, BenchMethod] = {
     method.name: method
     for group in (
-        _ABLATIONS, _OTHERS, _BLOCKS, _EACH_AS_LONG, _COARSE_COMPENSATED, _COARSE_PARTS, _LONGER, _CHOICES, _SWEEPS,
-        _FACTORIAL, _EAGER,
+        _ABLATIONS, OTHER_METHODS, BLOCK_METHODS, _BLOCKS, _EACH_AS_LONG, _COARSE_COMPENSATED, _COARSE_PARTS, _LONGER,
+        _CHOICES, _SWEEPS, _FACTORIAL, _EAGER,
     )
     for method in group
 }  # fmt: skip

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from experiments.bench.claim_check import ClaimCheck
-from experiments.bench.definitions import BenchMethod
+from experiments.bench.definitions import BenchMethod, has_block_folders
 from experiments.bench.paper_numbers import PAPER_CONTRADICTIONS, PAPER_EFFICIENCY, PAPER_NUMBERS
 from experiments.bench.plan import BenchPlan
 from experiments.bench.result_tables import VISIBILITY_SOURCE_NOTES, all_group_bounds
@@ -33,7 +33,7 @@ def make_notes(
     parts.append(_list("Scenes", [f"{scene.title}: {scene.note}" for scene in plan.scenes if scene.note]))
     if plan.table.name in PAPER_NUMBERS:
         parts.append(_list("The paper's own numbers", PAPER_CONTRADICTIONS))
-    if plan.table.name == "efficiency":
+    if plan.table.overview or plan.table.name == "efficiency":
         parts.append(_list("Quoted from the paper", PAPER_EFFICIENCY))
     return [part for part in parts if part]
 
@@ -65,7 +65,7 @@ def _fairness(plan: BenchPlan) -> str:
         "the sum over all blocks, as if one after the other; it depends on how many runs went at once (--jobs).",
         "LPIPS is VGG with input in [-1, 1]; a dash means that no weights were given (--lpips-weights).",
     ]
-    if any(run.config.block.crop == "fixed-pixels" for run in plan.runs if "blocks" in run.stages):
+    if any(run.config.block.crop == "fixed-pixels" for run in plan.runs if has_block_folders(run.stages)):
         notes.append(_CROP_NOTE)
     notes += [
         f"{scene.title}: {budget.coarse:,} coarse iterations and {budget.blocks} × {budget.per_block:,} for blocks, "
@@ -73,6 +73,13 @@ def _fairness(plan: BenchPlan) -> str:
         for scene in plan.scenes
         for budget in [plan.budgets[scene.name]]
     ]
+    if plan.step_factors:
+        notes = [
+            "At equal time: each method with its iterations times the factor by which its time, at equal iterations in "
+            f"the table beside this one, was below that of `{plan.table.ours}`. "
+            + "; ".join(f"{method} on {scene}: {factor:g}" for scene, method, factor in plan.step_factors),
+            *notes[1:],
+        ]
     if plan.max_anchors:
         notes.append(_limit(plan))
     external = [method.title for method in plan.methods if method.renders is not None]

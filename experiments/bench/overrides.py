@@ -9,7 +9,8 @@ from dataclasses import replace
 from typing import Literal
 
 from experiments.bench.definitions import Budget, ConfigOverride
-from vdgs.config.method import CompensationConfig, MergeConfig, MethodConfig, PartitionStrategy
+from vdgs.config.method import CompensationConfig, DensifyConfig, MergeConfig, MethodConfig, PartitionStrategy
+from vdgs.config.presets import PRESETS, PresetName
 
 #: So many cameras has each block of the factorial: every camera joins its best block, and each block is topped up to
 #: these. With as few as one block's share (160) the cameras of the least seen places join none: the dense ones show
@@ -79,6 +80,32 @@ def as_in_paper(config: MethodConfig, _budget: Budget) -> MethodConfig:
             max_anchors_total=scene.max_anchors_total,
         ),
     )
+
+
+def as_preset(name: PresetName) -> ConfigOverride:
+    """A preset as it is, with the scene's iterations, blocks and limit of anchors. Growth begins at the same share of
+    the iterations as in the preset's own, but decides as often: its statistics need so many views."""
+
+    def change(config: MethodConfig, budget: Budget) -> MethodConfig:
+        preset = PRESETS[name]
+        training, block = preset.training, preset.block
+
+        def growth(own: DensifyConfig, published: int, iterations: int) -> DensifyConfig:
+            share = iterations / published
+            return replace(own, stats_start=round(share * own.stats_start), start=round(share * own.start),
+                           max_anchors=config.training.densify.max_anchors)  # fmt: skip
+
+        grown = growth(training.densify, training.iterations, budget.coarse)
+        inner = replace(growth(block.densify, block.iterations, budget.per_block), max_anchors=0)
+        return replace(
+            preset,
+            training=replace(training, iterations=budget.coarse, seed=config.training.seed, densify=grown),
+            partition=replace(preset.partition, blocks=budget.blocks),
+            block=replace(block, iterations=budget.per_block, densify=inner,
+                          max_anchors_total=config.block.max_anchors_total),
+        )  # fmt: skip
+
+    return change
 
 
 def with_paper_compensation(config: MethodConfig, **values: float) -> MethodConfig:
@@ -228,9 +255,17 @@ def with_partition_strategy(strategy: PartitionStrategy) -> ConfigOverride:
     return change
 
 
+def momentum_blocks(config: MethodConfig, budget: Budget) -> MethodConfig:
+    """Momentum-GS: blocks of CityGaussian's cut, of which each moves the one decoder, from the coarse stage of
+    Scaffold-GS; whole photographs used alike, the coarse stage's rates again, the last model."""
+    cut = with_partition_strategy("citygaussian")(as_in_paper(config, budget), budget)
+    shared = replace(cut, block=replace(cut.block, decoder="own"))
+    return with_dense_adam(lambda changed, _: changed)(shared, budget)
+
+
 def explicit_gaussians(background: Literal["mean", "black"]) -> ConfigOverride:
     """3DGS, by what it has in common with our coarse stage: iterations, seed, background and the limit of anchors
-    (`gs3d_stage.gs3d_config` makes its settings of these)."""
+    (`baseline_stages.gs3d_config` makes its settings of these)."""
 
     def change(config: MethodConfig, budget: Budget) -> MethodConfig:
         alone = coarse_only(config, budget)
@@ -238,6 +273,17 @@ def explicit_gaussians(background: Literal["mean", "black"]) -> ConfigOverride:
         return replace(alone, training=replace(alone.training, loss=loss))
 
     return change
+
+
+def gaussians_in_blocks(config: MethodConfig, budget: Budget) -> MethodConfig:
+    """Explicit Gaussians in blocks, after a coarse stage that is one of explicit Gaussians too."""
+    return replace(config, training=replace(config.training, loss=replace(config.training.loss, background="mean")))
+
+
+def gaussian_blocks_alone(config: MethodConfig, budget: Budget) -> MethodConfig:
+    """Explicit Gaussians in blocks that share all iterations: nothing is trained before them."""
+    alone = gaussians_in_blocks(config, budget)
+    return replace(alone, block=replace(alone.block, iterations=max(1, round(budget.total / budget.blocks))))
 
 
 def enable_compensation(config: MethodConfig, **values: float | bool | str) -> MethodConfig:

@@ -9,9 +9,16 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from experiments.bench.baseline_stages import BASELINES
 from experiments.bench.custom_scenes import resolve_scenes
-from experiments.bench.definitions import GS3D_STAGES, BenchMethod, BenchScene, BenchTable, Budget
-from experiments.bench.gs3d_stage import gs3d_config
+from experiments.bench.definitions import (
+    BenchMethod,
+    BenchScene,
+    BenchTable,
+    Budget,
+    has_block_folders,
+    has_gaussian_blocks,
+)
 from experiments.bench.methods import METHODS
 from experiments.bench.renders import method_from_renders, renders_digest, renders_folder
 from experiments.bench.tables import TABLES
@@ -38,6 +45,8 @@ class PlanOptions:
     renders: tuple[str, ...] = ()
     #: How scenes that are folders are read; `validation` above is that of all scenes.
     options: CaptureOptions = field(default_factory=CaptureOptions)
+    #: (scene, method, factor): what the iterations of a method on a scene are multiplied by (`equal_time.py`).
+    step_factors: tuple[tuple[str, str, float], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -67,11 +76,12 @@ class PlannedRun:
             return _digest([self.stages, self.identity, dict(capture), dict(measured)])
         plain = to_dict(self.config)
         # A method without blocks does not depend on their settings.
-        sections = list(plain) if "blocks" in self.stages else ["training"]
+        in_blocks = has_block_folders(self.stages) or has_gaussian_blocks(self.stages)
+        sections = list(plain) if in_blocks else ["training"]
         settings = {section: hashable_settings(section, plain[section]) for section in sections}
         content = [self.stages, settings, dict(capture), dict(measured)]
-        if self.stages == GS3D_STAGES:
-            content.append(to_dict(gs3d_config(self.config)))
+        if self.stages[0] in BASELINES:
+            content.append(to_dict(BASELINES[self.stages[0]].settings(self.config)))
         return _digest(content)
 
 
@@ -93,6 +103,8 @@ class BenchPlan:
     max_anchors: int = 0
     #: Measured on held-out training views instead of on the test views.
     validation: bool = False
+    #: At equal time: `PlanOptions.step_factors`; empty where all make the same iterations.
+    step_factors: tuple[tuple[str, str, float], ...] = ()
 
     def reference(self, scene: str) -> PlannedRun | None:
         """The run whose coarse model says how often each pixel of the scene is seen, for all methods and seeds; None
@@ -107,6 +119,7 @@ def make_plan(name: str, options: PlanOptions) -> BenchPlan:
     scenes = resolve_scenes(options.scenes or table.scenes, options.options, options.validation)
     methods = tuple(_method(each) for each in options.methods or table.methods)
     seeds = table.seeds if options.seeds is None else tuple(range(options.seeds))
+    factors = {(scene, method): factor for scene, method, factor in options.step_factors}
     if not seeds:
         raise VdgsError("--seeds must be at least 1")
     external = _render_methods(options, scenes, seeds)
@@ -115,9 +128,12 @@ def make_plan(name: str, options: PlanOptions) -> BenchPlan:
     coarse, runs = list[PlannedRun](), list[PlannedRun]()
     for scene in scenes:
         budgets[scene.name] = budget = _budget(scene, options)
-        for seed in seeds:
-            base = _limit_anchors(scene.base(budget, seed, budget.total / scene.budget.total), options)
-            planned = [_planned(scene, method, budget, base, seed) for method in methods]
+        for seed in seeds[:1] if options.seeds is None and scene.name in table.single_seed else seeds:
+            base = _base(scene, budget, seed, options)
+            planned = [
+                _planned(scene, method, seed, budget, options, factors.get((scene.name, method.name), 1.0))
+                for method in methods
+            ]
             planned += _render_runs(scene, external, base, seed)
             shared, planned = _share_coarse(planned)
             coarse += shared
@@ -127,7 +143,7 @@ def make_plan(name: str, options: PlanOptions) -> BenchPlan:
             runs += distinct.values()
     return BenchPlan(
         table, scenes, methods + external, seeds, budgets, tuple(coarse), tuple(runs), run_of, options.max_anchors,
-        options.validation,
+        options.validation, options.step_factors,
     )  # fmt: skip
 
 
@@ -177,6 +193,10 @@ def _budget(scene: BenchScene, options: PlanOptions) -> Budget:
     return scene.budget.scaled(factor)
 
 
+def _base(scene: BenchScene, budget: Budget, seed: int, options: PlanOptions) -> MethodConfig:
+    return _limit_anchors(scene.base(budget, seed, budget.total / scene.budget.total), options)
+
+
 def _limit_anchors(config: MethodConfig, options: PlanOptions) -> MethodConfig:
     """With --max-anchors: a scene may hold so many, all its blocks together too."""
     if not options.max_anchors:
@@ -189,12 +209,17 @@ def _limit_anchors(config: MethodConfig, options: PlanOptions) -> MethodConfig:
     )
 
 
-def _planned(scene: BenchScene, method: BenchMethod, budget: Budget, base: MethodConfig, seed: int) -> PlannedRun:
-    config = method.settings(base, budget)
+def _planned(
+    scene: BenchScene, method: BenchMethod, seed: int, budget: Budget, options: PlanOptions, factor: float
+) -> PlannedRun:
+    """The run of a method with `factor` times the budget; in a folder of its own where that is not 1."""
+    budget = budget.scaled(factor)
+    config = method.settings(_base(scene, budget, seed, options), budget)
     problems = validate_config(config)
     if problems:
         raise VdgsError(f"{method.name} on {scene.name}: these settings do not work:\n  " + "\n  ".join(problems))
-    return PlannedRun(scene.name, method.name, seed, Path("runs", scene.name, method.name, str(seed)), method.stages,
+    name = method.name if factor == 1.0 else f"{method.name}-equal-time"
+    return PlannedRun(scene.name, method.name, seed, Path("runs", scene.name, name, str(seed)), method.stages,
                       config)  # fmt: skip
 
 
@@ -204,7 +229,7 @@ def _share_coarse(planned: Sequence[PlannedRun]) -> tuple[list[PlannedRun], list
     shared: dict[str, PlannedRun] = {}
     for run in planned:
         digest = _coarse_digest(run)
-        if ("blocks" in run.stages or run.method == SHARED_COARSE_NAME) and digest not in shared:
+        if (has_block_folders(run.stages) or run.method == SHARED_COARSE_NAME) and digest not in shared:
             folder = Path("runs", run.scene, f"shared-coarse-{digest}", str(run.seed))
             # Nothing but what it depends on: which methods share it, and so are asked for, must not change it.
             alone = MethodConfig(training=run.config.training)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from experiments.bench.definitions import MethodGroup
+from experiments.bench.definitions import BenchScene, MethodGroup
 from experiments.bench.measure import group_names
 from experiments.bench.paper_numbers import METRIC_COLUMNS, PAPER_NUMBERS
 from experiments.bench.plan import BenchPlan
@@ -42,6 +42,8 @@ class TableRow:
 
     label: str
     cells: tuple[TableCell, ...] = ()
+    #: In the last column of an overview: whole, adapted and how, quoted, or why the row failed.
+    rests_on: str = ""
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,8 @@ CORRECTED_COLUMNS = (
     TableColumn("SSIM ↑", "ssim_cc", 3),
     TableColumn("LPIPS ↓", "lpips_vgg_cc", 3, -1),
 )
+#: Of an overview, beside PSNR where least and best seen.
+OVERVIEW_COST_KEYS = ("iterations", "anchors", "gaussians", "seconds", "peak_memory_bytes")
 REFERENCE_EXPOSURE_COLUMNS = (
     TableColumn("PSNR ↑", "psnr_reference_exposure"),
     TableColumn("SSIM ↑", "ssim_reference_exposure", 3),
@@ -77,7 +81,9 @@ COST_COLUMNS = (
     TableColumn("blocks", "blocks", 0, 0),
     TableColumn("cameras a block", "cameras_per_block", 0, 0),
     TableColumn("training s", "seconds", 0, 0),
+    TableColumn("blocks s", "block_seconds", 0, 0),
     TableColumn("longest block s", "longest_block_seconds", 0, 0),
+    TableColumn("block memory GB", "block_memory_bytes", 2, 0, 1e-9),
     TableColumn("peak memory GB", "peak_memory_bytes", 2, 0, 1e-9),
     TableColumn("model MB", "model_bytes", 1, 0, 1e-6),
     TableColumn("frames/s", "fps", 0, 0),
@@ -124,7 +130,8 @@ def make_result_tables(plan: BenchPlan, results: Sequence[BenchResult]) -> list[
     across = "mean ± standard deviation over seeds" if len(plan.seeds) > 1 else "one seed"
     views = "Validation views" if plan.validation else "Test views"
     unseen = _unseen(plan, results)
-    tables = [
+    tables = [_overview(plan, results, scene) for scene in plan.scenes if plan.table.overview]
+    tables += [
         _measured(plan, results, "raw", f"{views}, raw ({across})", _for_scenes(plan, QUALITY_COLUMNS), unseen),
         _measured(
             plan,
@@ -159,6 +166,34 @@ def make_result_tables(plan: BenchPlan, results: Sequence[BenchResult]) -> list[
         tables.append(_measured(plan, in_scene, f"costs-{scene.name}", title, columns, (SIZE_NOTE,)))
     from_paper = _paper_table(plan)
     return tables + ([from_paper] if from_paper else [])
+
+
+def _overview(plan: BenchPlan, results: Sequence[BenchResult], scene: BenchScene) -> ResultTable:
+    """Everything of a scene in one table, and what each row rests on; quoted rows, and why a row failed."""
+    in_scene = [result for result in results if result.scene == scene.name]
+    groups = next((len(result.groups) for result in in_scene if result.groups), 0)
+    ends = [(group_names(groups)[i], i) for i in sorted({0, groups - 1})] if groups else []
+    columns = [
+        *QUALITY_COLUMNS,
+        *(TableColumn(f"PSNR {name} ↑", f"psnr@{index}") for name, index in ends),
+        *(column for column in COST_COLUMNS if column.key in OVERVIEW_COST_KEYS),
+    ]
+    table = _measured(plan, in_scene, f"overview-{scene.name}", f"{scene.title}: {plan.table.title}",
+                      [_for_scene(column, scene.name) for column in columns], (SIZE_NOTE,))  # fmt: skip
+    methods = {method.title: method for method in plan.methods}
+    reasons = {each.method: each.reason or each.state for each in in_scene if each.state != "done"}
+    rows = [
+        replace(row, rests_on=f"{reasons[method.name]}" if (method := methods[row.label]).name in reasons
+                else method.rests_on) if row.cells else row for row in table.rows
+    ]  # fmt: skip
+    numbers = PAPER_NUMBERS.get(plan.table.name, {})
+    for name in plan.table.quoted:
+        known = numbers.get(name, {}).get(scene.name)
+        said = "quoted, color-corrected" if known else "quoted: the paper has it on its own scenes only, below"
+        cells = [TableCell(Summary(value, None, 1), column.digits) if value is not None else TableCell(None, 0)
+                 for column, value in zip(columns, [*(known or ()), *[None] * len(columns)], strict=False)]  # fmt: skip
+        rows.append(TableRow(name, tuple(cells), said))
+    return replace(table, rows=tuple(rows))
 
 
 def _neutral(plan: BenchPlan, results: Sequence[BenchResult], title: str) -> list[ResultTable]:

@@ -7,15 +7,17 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from experiments.baselines.gs3d.run import gaussians_folder
-from experiments.bench.definitions import GS3D_STAGES
+from experiments.baselines.gaussian_blocks.cut import GaussianCut
+from experiments.baselines.gaussian_blocks.training import block_statuses
+from experiments.bench.baseline_stages import baseline_folder
+from experiments.bench.definitions import has_block_folders, has_gaussian_blocks
 from experiments.bench.measure import FRUSTA_FILE, GROUPS_FILE, final_evaluation_folder
 from experiments.bench.plan import BenchPlan, PlannedRun
 from experiments.bench.worker import RECORD_FILE
 from vdgs.distributed.executor import TaskResult
 from vdgs.errors import VdgsError
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.stage_folder import StatusRecord
+from vdgs.runs.stage_folder import StageFolder, StatusRecord
 from vdgs.system.atomic_files import read_json
 
 #: What evaluations report, raw and after color correction.
@@ -27,6 +29,12 @@ COVERAGE_KEYS = (
     "opacity_coverage", "psnr_covered_own_background", "psnr_covered_black", "psnr_covered_white",
     "depth_error_median_expected", "depth_error_median_median", "depth_within_1_percent_expected",
     "depth_within_1_percent_median", "oversized_splats",
+)  # fmt: skip
+
+#: What a method with a training of its own notes of its blocks in COSTS_FILE beside its model.
+COSTS_FILE = "costs.json"
+BLOCK_COSTS = (
+    "blocks", "block_seconds", "longest_block_seconds", "block_memory_bytes", "cameras_per_block", "coarse_seconds"
 )  # fmt: skip
 
 
@@ -133,23 +141,31 @@ def _photographs_drawn(status: StatusRecord) -> float:
 def _costs(run: RunFolder, names: Sequence[str], stages: Mapping[str, float]) -> dict[str, float | None]:
     """Iterations, photographs drawn, seconds, memory and cameras of a run with the stages `names`. The shared coarse
     stage counts in full for each run that takes it."""
-    blocks = "blocks" in names
-    coarse = (gaussians_folder(run) if tuple(names) == GS3D_STAGES else run.coarse).status()
-    trained = [folder.status() for folder in run.block_folders()] if blocks else []
-    rows = run.partition_record().blocks if blocks else ()
+    own = baseline_folder(run, tuple(names))
+    if own is not None and has_gaussian_blocks(names):
+        coarse, trained = StageFolder(own.path / "coarse").status(), block_statuses(own.path)
+        cut = GaussianCut.load(own.path)
+        cameras = [len(views) for views in cut.views] if cut else []
+    else:
+        coarse = (own or run.coarse).status()
+        in_blocks = has_block_folders(names)
+        trained = [folder.status() for folder in run.block_folders()] if in_blocks else []
+        cameras = [row.cameras for row in run.partition_record().blocks] if in_blocks else []
     seconds = [float(each.seconds or 0) for each in trained]
     peaks = [each.peak_memory_bytes or 0 for each in [coarse, *trained]]
-    return {
+    known = {
         "iterations": (coarse.iteration or 0) + sum(each.iteration or 0 for each in trained),
         "photographs": sum(_photographs_drawn(each) for each in [coarse, *trained]),
         "coarse_seconds": coarse.seconds,
-        "block_seconds": sum(seconds) if blocks else None,
+        "block_seconds": sum(seconds) if trained else None,
         "longest_block_seconds": max(seconds, default=None),
         "seconds": float(coarse.seconds or 0) + sum(seconds),
         "partition_seconds": stages.get("partition"),
         "peak_memory_bytes": max(peaks),
         "block_memory_bytes": max(peaks[1:], default=None),
-        "blocks": len(trained) if blocks else None,
+        "blocks": len(trained) or None,
         "coarse_anchors": coarse.anchors,
-        "cameras_per_block": sum(row.cameras for row in rows) / len(rows) if rows else None,
+        "cameras_per_block": sum(cameras) / len(cameras) if cameras else None,
     }
+    costs = own.path / COSTS_FILE if own else None
+    return known | ({name: read_json(costs).get(name) for name in BLOCK_COSTS} if costs and costs.exists() else {})

@@ -72,13 +72,20 @@ def to_tidy_csv(tables: Sequence[ResultTable]) -> str:
 
 def _markdown_table(table: ResultTable) -> str:
     lines = [f"## {escape_markdown(table.title)}", ""]
-    lines.append("| method | " + " | ".join(map(escape_markdown, table.columns)) + " |")
-    lines.append("|---|" + "---:|" * len(table.columns))
+    said = any(row.rests_on for row in table.rows)
+    heads = ["method", *map(escape_markdown, table.columns), *["rests on"] * said]
+    lines.append("| " + " | ".join(heads) + " |")
+    lines.append("|---|" + "---:|" * len(table.columns) + "---|" * said)
     for row in table.rows:
         if row.cells:
-            lines.append(f"| {escape_markdown(row.label)} | " + " | ".join(map(_markdown_cell, row.cells)) + " |")
+            cells = [
+                escape_markdown(row.label),
+                *map(_markdown_cell, row.cells),
+                *[escape_markdown(row.rests_on)] * said,
+            ]
+            lines.append("| " + " | ".join(cells) + " |")
         else:
-            lines.append(f"| *{escape_markdown(row.label)}* |" + " |" * len(table.columns))
+            lines.append(f"| *{escape_markdown(row.label)}* |" + " |" * (len(table.columns) + said))
     for note in table.notes:
         lines += ["", escape_markdown(note)]
     return "\n".join(lines)
@@ -92,13 +99,18 @@ def _markdown_cell(cell: TableCell) -> str:
 def _latex_table(table: ResultTable) -> str:
     lines = [r"\begin{table}[htbp]", r"\centering", rf"\caption{{{escape_latex(table.title)}}}"]
     lines.append(rf"\label{{tab:{re.sub('[^a-z0-9-]', '-', table.name.lower())}}}")
-    lines += [r"\begin{tabular}{l" + "r" * len(table.columns) + "}", r"\toprule"]
-    lines += [" & ".join(["method", *map(escape_latex, table.columns)]) + r" \\", r"\midrule"]
+    said = any(row.rests_on for row in table.rows)
+    lines += [r"\begin{tabular}{l" + "r" * len(table.columns) + "l" * said + "}", r"\toprule"]
+    heads = ["method", *map(escape_latex, table.columns), *["rests on"] * said]
+    lines += [" & ".join(heads) + r" \\", r"\midrule"]
     for row in table.rows:
         if row.cells:
-            lines.append(" & ".join([escape_latex(row.label), *map(_latex_cell, row.cells)]) + r" \\")
+            cells = [escape_latex(row.label), *map(_latex_cell, row.cells), *[escape_latex(row.rests_on)] * said]
+            lines.append(" & ".join(cells) + r" \\")
         else:
-            lines.append(rf"\multicolumn{{{len(table.columns) + 1}}}{{l}}{{\textit{{{escape_latex(row.label)}}}}} \\")
+            lines.append(
+                rf"\multicolumn{{{len(table.columns) + 1 + said}}}{{l}}{{\textit{{{escape_latex(row.label)}}}}} \\"
+            )
     lines += [r"\bottomrule", r"\end{tabular}"]
     lines += [rf"\par\smallskip {escape_latex(note)}" for note in table.notes]
     return "\n".join([*lines, r"\end{table}"])

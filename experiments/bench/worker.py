@@ -90,6 +90,12 @@ def _blocks(at: _JobContext) -> None:
     train_blocks(at.context, CheckpointOptions(), at.job.block_jobs, at.console)
 
 
+def _momentum(at: _JobContext) -> None:
+    from experiments.baselines.momentum_gs.run import train_momentum_blocks
+
+    train_momentum_blocks(at.context, at.console)
+
+
 def _merge(at: _JobContext) -> None:
     from vdgs.pipeline.merge_blocks import merge_run_blocks
 
@@ -111,12 +117,6 @@ def _evaluate(at: _JobContext) -> None:
     )
 
 
-def _gaussians(at: _JobContext) -> None:
-    from experiments.bench.gs3d_stage import train_gs3d
-
-    train_gs3d(at.context.run, at.context.capture, at.job.lpips_weights, at.console)
-
-
 def _renders(at: _JobContext) -> None:
     from experiments.bench.renders import measure_renders
 
@@ -125,11 +125,21 @@ def _renders(at: _JobContext) -> None:
     measure_renders(at.context.capture, at.job.renders, output, at.job.lpips_weights, at.console)
 
 
-#: What a method may name as its stages. Each does nothing, or the same again, where it is done.
+#: What a method may name as its stages, beside `baseline_stages.BASELINES`. Each does nothing, or the same again,
+#: where it is done.
 STAGES: dict[str, Callable[[_JobContext], None]] = {
     "coarse": _coarse, "partition": _partition, "blocks": _blocks, "merge": _merge, "evaluate": _evaluate,
-    "gaussians": _gaussians, "renders": _renders,
+    "renders": _renders, "momentum-gs": _momentum,
 }  # fmt: skip
+
+
+def _stage(name: str) -> Callable[[_JobContext], None]:
+    """A stage of STAGES, or a method with a training of its own."""
+    if name in STAGES:
+        return STAGES[name]
+    from experiments.bench.baseline_stages import train_baseline
+
+    return lambda at: train_baseline(name, at.context.run, at.context.capture, at.job.lpips_weights, at.console)
 
 
 def link_coarse_stage(source: Path, target: Path) -> None:
@@ -174,7 +184,7 @@ def run_job(job: BenchJob) -> None:
         write_json(job.output / RECORD_FILE, record)  # what an interrupted run leaves is not what it was before
         for name in job.stages:
             began = time.monotonic()
-            STAGES[name](working)
+            _stage(name)(working)
             record["seconds"][name] = record["seconds"].get(name, 0.0) + time.monotonic() - began
             write_json(job.output / RECORD_FILE, record)
         write_json(job.output / RECORD_FILE, record | {"state": "done", "provenance": describe_provenance(job.threads)})

@@ -13,8 +13,9 @@ from experiments.baselines.gs3d.run import gaussians_folder
 from experiments.baselines.gs3d.schedule import MIN_INTERVAL, PUBLISHED_ITERATIONS, scale_schedule
 from experiments.baselines.gs3d.training import Gs3dConfig
 from experiments.bench import bench
-from experiments.bench.gs3d_stage import gs3d_config
+from experiments.bench.baseline_stages import gs3d_config
 from experiments.bench.measure import GROUPS_FILE
+from experiments.bench.methods import METHODS
 from experiments.bench.notes import make_notes
 from experiments.bench.plan import PlanOptions, make_plan
 from experiments.bench.results import BenchResult
@@ -131,3 +132,17 @@ def test_a_stopped_run_continues(data, tmp_path, monkeypatch):
     continued = benched(data, tmp_path / "half", "3dgs")["3dgs"]
     assert continued.figures["psnr"] == whole.figures["psnr"]
     assert continued.figures["iterations"] == 40
+
+
+def test_methods_that_train_in_blocks_stand_beside_the_others(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(bench, "LocalExecutor", InThisProcess)
+    names = ("momentum-gs", "citygaussian-whole")
+    for name, result in benched(data, tmp_path, *names).items():
+        figures = result.figures
+        assert figures["iterations"] == 40, name
+        assert figures["blocks"] == 4, name
+        for figure in ("psnr", "psnr@0", "longest_block_seconds", "block_memory_bytes", "cameras_per_block", "fps"):
+            assert figures[figure] is not None, (name, figure)
+        assert (figures["anchors"] is None) == (name != "momentum-gs")
+    text = (tmp_path / "table1" / "table.md").read_text()
+    assert all(f"{METHODS[name].title} ({METHODS[name].citation})" in text for name in names)

@@ -10,14 +10,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from experiments.bench.claim_check import check_claims
+from experiments.bench.equal_time import step_factors
 from experiments.bench.figure import plot_visibility_groups
 from experiments.bench.measure import group_names
+from experiments.bench.methods import METHODS
 from experiments.bench.notes import make_notes
 from experiments.bench.plan import PlanOptions, make_plan
 from experiments.bench.result_tables import ResultTable, TableCell, TableRow, make_result_tables
 from experiments.bench.results import BenchResult
 from experiments.bench.statistics import Summary, paired_difference, rank_marks, summarize
 from experiments.bench.table_writers import escape_latex, escape_markdown, to_latex, to_markdown, to_tidy_csv
+from vdgs.errors import VdgsError
 
 
 def test_mean_and_spread():
@@ -200,3 +203,63 @@ def test_methods_that_get_more_are_no_rivals():
     assert line.answer is True
     assert "longer" not in str(line)
     assert "times as long" not in str(line)
+
+
+def test_an_overview_says_what_each_row_rests_on():
+    methods = ("3dgs-black", "vastgaussian-whole", "full")
+    plan = make_plan("table1", PlanOptions(scenes=("lab-uneven",), methods=methods))
+    results = results_with(dict.fromkeys(methods, (0.0, 1.0)), method_failed="3dgs-black")
+    for result in results:
+        if result.state == "done":
+            result.figures.update({"seconds": 12.0, "anchors": 900, "peak_memory_bytes": 5e8})
+    overview = make_result_tables(plan, results)[0]
+    assert overview.name == "overview-lab-uneven"
+    assert "PSNR least seen quarter ↑" in overview.columns
+    said = {row.label: row.rests_on for row in overview.rows}
+    assert said["3DGS, black background"] == "it | broke"  # why it has no figures
+    assert said["VastGaussian"] == said["VDGS (full)"] == "whole"
+    assert said["Switch-NeRF"].startswith("quoted")
+    text = to_markdown([overview], "T", [])
+    assert re.search(r"\| rests on \|\n\|---\|(---:\|)+---\|\n", text)
+    assert all(
+        line.count("|") - line.count("\\|") == len(overview.columns) + 3
+        for line in text.splitlines()
+        if line.startswith("|")
+    )
+    assert r"rests on \\" in to_latex([overview])
+    quoted = make_plan("table1", PlanOptions(scenes=("residence",), methods=methods))
+    row = make_result_tables(quoted, [])[0].rows[-1]
+    assert [cell.summary and cell.summary.mean for cell in row.cells[:3]] == [22.57, 0.654, 0.352]
+
+
+def test_a_method_without_a_published_program_is_never_called_whole():
+    for name in ("hug", "mixgs", "octree-gs", "momentum-gs", "dogs", "citygaussian", "3dgs-black"):
+        assert METHODS[name].rests_on.startswith("adapted: "), name
+    assert METHODS["scaffold-gs"].rests_on == "whole"
+
+
+def test_at_equal_time_dear_methods_make_fewer_iterations():
+    methods = ("3dgs-black", "octree-gs", "full")
+    plan = make_plan("table1", PlanOptions(scenes=("tiny",), methods=methods, seeds=2))
+    seconds = {"3dgs-black": (1.0, 3.0), "octree-gs": (80.0, 80.0), "full": (10.0, 10.0)}
+    results = [
+        BenchResult("tiny", name, seed, "done", figures={"seconds": taken[seed]})
+        for name, taken in seconds.items() for seed in (0, 1)
+    ]  # fmt: skip
+    factors = step_factors(plan, results)
+    assert factors == (("tiny", "3dgs-black", 5.0), ("tiny", "octree-gs", 0.12), ("tiny", "full", 1.0))
+    again = make_plan("table1", PlanOptions(scenes=("tiny",), methods=methods, seeds=2, step_factors=factors))
+    assert again.run_of["tiny", "full", 0] == plan.run_of["tiny", "full", 0]  # not trained again
+    slower, before = again.run_of["tiny", "octree-gs", 0], plan.run_of["tiny", "octree-gs", 0]
+    assert slower.config.training.iterations == pytest.approx(0.12 * before.config.training.iterations, abs=2)
+    assert slower.folder != before.folder
+    assert "octree-gs on tiny: 0.12" in "".join(make_notes(again, [], [], False))
+    with pytest.raises(VdgsError, match="takes the time of `full`"):
+        step_factors(plan, results[:4])
+
+
+def test_large_scenes_of_a_table_have_one_seed_unless_more_are_asked_for():
+    assert {seed for scene, _, seed in make_plan("table1", PlanOptions()).run_of if scene == "seneca"} == {0}
+    assert {seed for scene, _, seed in make_plan("table1", PlanOptions()).run_of if scene == "copr"} == {0, 1, 2}
+    asked = make_plan("table1", PlanOptions(seeds=2, scenes=("seneca",)))
+    assert {seed for _, _, seed in asked.run_of} == {0, 1}

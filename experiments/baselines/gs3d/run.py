@@ -25,11 +25,16 @@ import numpy as np
 from jaxtyping import Float
 from rich.console import Console
 
+from experiments.baselines.evaluation import BaselineFacts, evaluate_baseline
 from experiments.baselines.gs3d.model import GaussianModel
-from experiments.baselines.gs3d.session import finish_training, resume_or_start, train_with_checkpoints
+from experiments.baselines.gs3d.session import (
+    finish_training,
+    resume_or_start,
+    state_from_points,
+    train_with_checkpoints,
+)
 from experiments.baselines.gs3d.training import Gs3dConfig, Gs3dProblem, scene_extent
 from vdgs import __version__
-from vdgs.captures.camera_height import camera_height
 from vdgs.captures.capture import Capture
 from vdgs.captures.capture_metadata import capture_metadata, check_same_capture
 from vdgs.captures.image_cache import ImageCache
@@ -37,13 +42,8 @@ from vdgs.captures.validation import require_trainable
 from vdgs.config.executor_options import CheckpointOptions
 from vdgs.config.serialization import diff_settings, to_dict
 from vdgs.errors import RunError, VdgsError
-from vdgs.evaluation.evaluate_model import evaluate_model
-from vdgs.evaluation.evaluate_run import cached_reference_views, make_true_depth
-from vdgs.evaluation.lpips import load_lpips
-from vdgs.evaluation.opacity_coverage import coverage_map
-from vdgs.evaluation.renderable_model import EvaluatedModel, EvaluationSettings, RenderableModel
+from vdgs.evaluation.renderable_model import EvaluationSettings
 from vdgs.geometry.camera import Camera
-from vdgs.kernels.kernel_types import Raster
 from vdgs.kernels.spherical_harmonics import MAX_SH_DEGREE
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.stage_folder import StageFolder
@@ -116,7 +116,7 @@ def train_gs3d(
             if config.background == "mean":
                 background = mean_image_color(images, len(views), factors[-1])
             stage = Gs3dProblem(config, images, len(views), extent, background)
-            state = resume_or_start(folder, capture, config, console)
+            state = resume_or_start(folder, config.iterations, lambda: state_from_points(capture, config), console)
             train_with_checkpoints(folder, state, stage, options, console)
         metadata = {"capture": capture_metadata(capture), "version": __version__, "iterations": state.iteration}
         model = GaussianModel(state.gaussians, stage.background, metadata)
@@ -134,6 +134,7 @@ def evaluate_gs3d(
     lpips_weights: Path | None = None,
     trained: StageFolder | None = None,
     settings: EvaluationSettings | None = None,
+    method: str = METHOD_NAME,
 ) -> dict[str, Any]:
     """Measure a model on the test views; writes the evaluation folder `output` and returns what metrics.json holds.
 
@@ -141,35 +142,12 @@ def evaluate_gs3d(
     are no figures by visibility. `trained` is where the model was trained, for its size, time and memory. Raises
     RunError without test views or for another capture than the model's.
     """
-    check_same_capture(output, model.metadata.get("capture", {}), capture)
-    lpips, note = load_lpips(lpips_weights)
-
-    def render_depth(camera: Camera) -> Raster:
-        return model.render(camera, depth=True)
-
-    measured = RenderableModel(
-        render=model.render, visibility_map=visibility_map, metadata=_model_metadata(trained),
-        background=model.background,
-        coverage_map=coverage_map(render_depth, [view.camera for view in capture.train_views]),
-        true_depth=make_true_depth(capture, capture.test_views), render_depth=render_depth,
-        camera_height=camera_height(capture),
-    )  # fmt: skip
-    with cached_reference_views(capture.test_views) as photographs:
-        result = evaluate_model(
-            photographs, measured, output, lpips=lpips, lpips_note=note, settings=settings, console=console
-        )
-    of_gaussians = {**dict(result), "n_gaussians": len(model.gaussians)}
-    write_json(output / "metrics.json", of_gaussians)
-    return of_gaussians
-
-
-def _model_metadata(trained: StageFolder | None) -> EvaluatedModel:
-    if trained is None:
-        return EvaluatedModel(model=METHOD_NAME)
-    status = trained.status()
-    return EvaluatedModel(
-        model=METHOD_NAME, model_bytes=trained.model.stat().st_size,
-        train_seconds=status.seconds, peak_memory_bytes=status.peak_memory_bytes,
+    facts = BaselineFacts(
+        name=method, capture=model.metadata.get("capture", {}), trained=trained, num_gaussians=len(model.gaussians)
+    )
+    return evaluate_baseline(
+        model, facts, capture, output, console,
+        lpips_weights=lpips_weights, settings=settings, visibility_map=visibility_map,
     )  # fmt: skip
 
 

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 
 from rich.console import Console
+from torch import Tensor
 
 from experiments.baselines.gs3d.model import GaussianModel, initialize_gaussians
 from experiments.baselines.gs3d.training import (
@@ -21,7 +22,6 @@ from experiments.baselines.gs3d.training import (
     downscale_at,
     from_checkpoint,
     initial_state,
-    sh_degree_at,
     to_checkpoint,
     train,
 )
@@ -33,24 +33,34 @@ from vdgs.training.session.training_progress import LINE_INTERVAL_SECONDS, LOG_I
 from vdgs.training.session.training_session import Checkpointer, TrainingSession, restore_or_start, run_session
 
 
-def resume_or_start(folder: StageFolder, capture: Capture, config: Gs3dConfig, console: Console) -> Gs3dState:
+def resume_or_start(
+    folder: StageFolder, iterations: int, start: Callable[[], Gs3dState], console: Console
+) -> Gs3dState:
     """The state of the newest whole checkpoint, or a new one; the log ends where the state does.
 
     Raises RunError for a state that this version cannot read.
     """
+    return restore_or_start(folder, iterations, start, from_checkpoint, "Choose another output folder.", console)
 
-    def start() -> Gs3dState:
-        points, colors = capture.points, capture.point_colors
-        return initial_state(initialize_gaussians(points, colors, config.initial_opacity, config.degree))
 
-    return restore_or_start(folder, config.iterations, start, from_checkpoint, "Choose another output folder.", console)
+def state_from_points(capture: Capture, config: Gs3dConfig, rows: Tensor | None = None) -> Gs3dState:
+    """A Gaussian at each sparse point, or at those of the given rows."""
+    points, colors = capture.points, capture.point_colors
+    every = initialize_gaussians(points, colors, config.initial_opacity, config.degree)
+    return initial_state(every if rows is None else every.select(rows))
 
 
 def train_with_checkpoints(
-    folder: StageFolder, state: Gs3dState, stage: Gs3dProblem, options: CheckpointOptions, console: Console
+    folder: StageFolder,
+    state: Gs3dState,
+    stage: Gs3dProblem,
+    options: CheckpointOptions,
+    console: Console,
+    loop: Callable[..., bool] | None = None,
 ) -> None:
-    """Train to the end, showing, logging and saving on the way. Raises what `run_session` raises."""
-    journal = _TrainingLog(folder, stage.config, console)
+    """Train to the end, showing, logging and saving on the way; by another `loop` than `train`, if one is given. Raises
+    what `run_session` raises."""
+    journal = _TrainingLog(folder, stage, console)
     training = TrainingSession(
         folder=folder, state=state,
         to_checkpoint=lambda: to_checkpoint(state),
@@ -61,7 +71,7 @@ def train_with_checkpoints(
         is_consistent=lambda: state.is_consistent,
     )  # fmt: skip
 
-    def loop(stop: Callable[[], bool]) -> bool:
+    def run_loop(stop: Callable[[], bool]) -> bool:
         checkpointer = Checkpointer(training, options.save_every)
 
         def after_step(state: Gs3dState, report: Gs3dStepReport) -> None:
@@ -69,16 +79,16 @@ def train_with_checkpoints(
             journal.step(state, report)
             checkpointer.save_if_due(training.status)
 
-        return train(state, stage, stop=stop, after_step=after_step)
+        return (loop or train)(state, stage, stop=stop, after_step=after_step)
 
-    run_session(training, loop)
+    run_session(training, run_loop)
 
 
 class _TrainingLog:
     """log.jsonl and a line now and then."""
 
-    def __init__(self, folder: StageFolder, config: Gs3dConfig, console: Console):
-        self._folder, self._config, self._console = folder, config, console
+    def __init__(self, folder: StageFolder, stage: Gs3dProblem, console: Console):
+        self._folder, self._stage, self._console = folder, stage, console
         self._shown = time.monotonic()
 
     def step(self, state: Gs3dState, report: Gs3dStepReport) -> None:
@@ -88,7 +98,7 @@ class _TrainingLog:
         if time.monotonic() - self._shown > LINE_INTERVAL_SECONDS:
             self._shown = time.monotonic()
             self._console.print(
-                f"{state.iteration}/{self._config.iterations}  loss {state.loss:.4f}  PSNR {state.psnr:.2f} dB  "
+                f"{state.iteration}/{self._stage.end}  loss {state.loss:.4f}  PSNR {state.psnr:.2f} dB  "
                 f"{len(state.gaussians):,} Gaussians",
                 highlight=False,
             )
@@ -96,7 +106,7 @@ class _TrainingLog:
     def status(self, state: Gs3dState) -> StatusRecord:
         """Where training stands."""
         return StatusRecord(
-            state="running", iteration=state.iteration, iterations=self._config.iterations,
+            state="running", iteration=state.iteration, iterations=self._stage.end,
             psnr_training=_number(state.psnr), seconds=round(state.seconds, 1),
             peak_memory_bytes=state.peak_memory_bytes,
         )  # fmt: skip
@@ -106,7 +116,7 @@ class _TrainingLog:
         record = {
             "iteration": state.iteration, "loss": report.loss, "l1": report.l1, "ssim": report.ssim,
             "psnr_smoothed": _number(state.psnr), "gaussians": len(state.gaussians), "visible": report.visible,
-            "downscale": downscale_at(done, self._config), "degree": sh_degree_at(done, self._config),
+            "downscale": downscale_at(done, self._stage.config), "degree": self._stage.sh_degree_at(done),
             "cloned": report.cloned, "split": report.split, "pruned": report.pruned,
             "seconds": round(state.seconds, 3),
         }  # fmt: skip

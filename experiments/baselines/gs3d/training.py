@@ -5,9 +5,9 @@ iteration): a run that is stopped and continued is the run that was not, bit for
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field, replace
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from experiments.baselines.gs3d.density import DensityConfig, adaptive_density_c
 from vdgs.errors import TrainingDiverged
 from vdgs.geometry.camera import Camera
 from vdgs.kernels import get_backend
-from vdgs.kernels.kernel_types import AdamState, IsFinite
+from vdgs.kernels.kernel_types import AdamState, IsFinite, PhotometricLoss
 from vdgs.model.gaussians import Gaussians, render_gaussians, visible_gaussian_rows
 from vdgs.system.checkpoints import Checkpoint
 from vdgs.training import PSNR_LOG_INTERVAL, TrainingImages, view_at
@@ -72,6 +72,23 @@ class Gs3dConfig:
     """Where Gaussians are added and removed."""
 
 
+@runtime_checkable
+class ImageLoss(Protocol):
+    """Another loss than that of 3DGS, which may train tensors of its own: those of `Gs3dState.extra`."""
+
+    def __call__(
+        self, image: Tensor, target: Tensor, mask: Tensor | None, view: int, extra: Mapping[str, Tensor]
+    ) -> PhotometricLoss: ...
+
+    def trained(self, extra: Mapping[str, Tensor]) -> list[Tensor]:
+        """The tensors of `extra` that the loss differentiates by."""
+        ...
+
+    def move(self, extra: Mapping[str, Tensor], gradients: Sequence[Tensor], step: int) -> None:
+        """One step of these, in place; `step` counts from 1."""
+        ...
+
+
 @dataclass(frozen=True)
 class Gs3dProblem:
     """What training works on: the same for all iterations."""
@@ -82,6 +99,24 @@ class Gs3dProblem:
     #: Size of the scene in units of the ground frame (`scene_extent`).
     extent: float
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    _: KW_ONLY
+    #: Gaussians that were trained before use their colors in all directions at once.
+    full_degree: bool = False
+    #: In place of the loss of 3DGS (eq. 7).
+    image_loss: ImageLoss | None = None
+    #: What else pulls at the Gaussians: gradients of all of them by the names of tensors, added to those of the loss.
+    pull: Callable[[Gaussians], Mapping[str, Tensor]] | None = None
+    #: Training ends after so many iterations, where it ends before its schedule does.
+    last: int | None = None
+
+    @property
+    def end(self) -> int:
+        """So many iterations are made."""
+        return self.config.iterations if self.last is None else self.last
+
+    def sh_degree_at(self, iteration: int) -> int:
+        """Degree of the spherical harmonics at this iteration (from 0)."""
+        return self.config.degree if self.full_degree else sh_degree_at(iteration, self.config)
 
 
 @dataclass
@@ -103,6 +138,8 @@ class Gs3dState:
     is_consistent: bool = True
     #: Zeros between steps, in the shape of each tensor of the Gaussians: where gradients are put. Not saved.
     scratch: dict[str, Tensor] = field(default_factory=dict)
+    #: What an `ImageLoss` trains besides.
+    extra: dict[str, Tensor] = field(default_factory=dict)
 
     def take_groups(self) -> dict[str, TensorGroup]:
         """What is kept per Gaussian and outlives a decision, no longer held here: see
@@ -165,7 +202,7 @@ def gs3d_train_step(state: Gs3dState, stage: Gs3dProblem) -> Gs3dStepReport:
     Changes `state` in place. Raises TrainingDiverged if the loss or a gradient is not finite.
     """
     config, iteration = stage.config, state.iteration
-    downscale, degree = downscale_at(iteration, config), sh_degree_at(iteration, config)
+    downscale, degree = downscale_at(iteration, config), stage.sh_degree_at(iteration)
     view = view_at(iteration, stage.image_count, config.seed)
     target, mask = stage.images.get(view, downscale)
     camera = stage.images.camera(view, downscale)
@@ -174,18 +211,21 @@ def gs3d_train_step(state: Gs3dState, stage: Gs3dProblem) -> Gs3dStepReport:
     seen = {name: t.index_select(0, rows).requires_grad_() for name, t in state.gaussians.tensors().items()}
     behind = state.gaussians.means.new_tensor(stage.background)
     raster, means_px = render_gaussians(Gaussians(**seen), camera, behind, degree)
-    kernels = get_backend(raster.image.device)
-    photometric = kernels.photometric_loss(raster.image, target, mask, ssim_weight=config.ssim_weight)
+    photometric, fitted = _compare(state, stage, raster.image, target, mask, view)
     value = float(photometric.loss.detach())
     if not math.isfinite(value):
         raise TrainingDiverged(f"The loss is {value} at iteration {iteration + 1}.")
-    *gradients, of_means_px = torch.autograd.grad(photometric.loss, [*seen.values(), means_px], materialize_grads=True)
+    of_means_px, *gradients = torch.autograd.grad(
+        photometric.loss, [means_px, *seen.values(), *fitted], materialize_grads=True
+    )
     psnr = training_psnr(raster.image.detach(), target, mask) if (iteration + 1) % PSNR_LOG_INTERVAL == 0 else None
+    pulled = {} if stage.pull is None else stage.pull(state.gaussians)
     _allocate_gradients(state)
     state.is_consistent = False
-    _adam_step(
-        state, rows, dict(zip(seen, gradients, strict=True)), learning_rates_at(config, stage.extent, iteration), degree
-    )
+    of_seen, rates = dict(zip(seen, gradients, strict=False)), learning_rates_at(config, stage.extent, iteration)
+    _adam_step(state, rows, of_seen, pulled, rates, degree)
+    if stage.image_loss is not None:
+        stage.image_loss.move(state.extra, gradients[len(seen) :], iteration + 1)
     state.iteration += 1
 
     report = Gs3dStepReport(value, float(photometric.l1), float(photometric.ssim), len(rows))
@@ -197,6 +237,16 @@ def gs3d_train_step(state: Gs3dState, stage: Gs3dProblem) -> Gs3dStepReport:
     return report
 
 
+def _compare(
+    state: Gs3dState, stage: Gs3dProblem, image: Tensor, target: Tensor, mask: Tensor | None, view: int
+) -> tuple[PhotometricLoss, list[Tensor]]:
+    """The loss of a view, and what else it differentiates by."""
+    if stage.image_loss is not None:
+        fitted = [tensor.requires_grad_() for tensor in stage.image_loss.trained(state.extra)]
+        return stage.image_loss(image, target, mask, view, state.extra), fitted
+    return get_backend(image.device).photometric_loss(image, target, mask, ssim_weight=stage.config.ssim_weight), []
+
+
 def _allocate_gradients(state: Gs3dState) -> None:
     """Room for gradients, where growth has taken it away: before anything moves, since it is large."""
     for name, tensor in state.gaussians.tensors().items():
@@ -205,16 +255,26 @@ def _allocate_gradients(state: Gs3dState) -> None:
 
 
 def _adam_step(
-    state: Gs3dState, rows: Int64[Tensor, " v"], gradients: dict[str, Tensor], rates: dict[str, float], degree: int
+    state: Gs3dState,
+    rows: Int64[Tensor, " v"],
+    gradients: Mapping[str, Tensor],
+    pulled: Mapping[str, Tensor],
+    rates: Mapping[str, float],
+    degree: int,
 ) -> None:
-    """One step of Adam for all Gaussians: those that the view does not show move on by their moments (program)."""
+    """One step of Adam for all Gaussians: those that the view does not show move on by their moments (program), and by
+    what pulls at them."""
     finite: IsFinite = True
     for name, tensor in state.gaussians.tensors().items():
         if name == "shN" and not degree:
             continue  # gradients and moments are zero: nothing moves
         everywhere = state.scratch[name].index_copy_(0, rows, gradients[name])
+        if name in pulled:
+            everywhere.add_(pulled[name])
         moved = AdamState(tensor, state.moments.first[name], state.moments.second[name], rates[name])
         finite = get_backend(tensor.device).adam_rows(moved, None, everywhere, state.iteration + 1) & finite
+        if name in pulled:
+            everywhere.zero_()
         everywhere.index_fill_(0, rows, 0.0)
     if not finite:
         raise TrainingDiverged(f"A gradient is not a finite number at iteration {state.iteration + 1}.")
@@ -270,10 +330,10 @@ def train(
 ) -> bool:
     """Steps until the last iteration or until `stop()` is true. True if complete. `after_step` sees every step."""
     config = stage.config
-    while state.iteration < config.iterations:
+    while state.iteration < stage.end:
         if stop():
             return False
-        for ahead in range(state.iteration + 1, min(state.iteration + 1 + prefetch, config.iterations)):
+        for ahead in range(state.iteration + 1, min(state.iteration + 1 + prefetch, stage.end)):
             stage.images.prefetch([view_at(ahead, stage.image_count, config.seed)], downscale_at(ahead, config))
         report = gs3d_train_step(state, stage)
         after_step(state, report)
@@ -285,6 +345,7 @@ def to_checkpoint(state: Gs3dState) -> Checkpoint:
     tensors = {f"gaussians.{name}": tensor for name, tensor in state.gaussians.tensors().items()}
     tensors |= {f"first.{name}": tensor for name, tensor in state.moments.first.items()}
     tensors |= {f"second.{name}": tensor for name, tensor in state.moments.second.items()}
+    tensors |= {f"extra.{name}": tensor.detach() for name, tensor in state.extra.items()}
     tensors |= {"gradient": state.gradient, "views": state.views}
     metadata = {"loss": repr(state.loss), "psnr": repr(state.psnr), "seconds": state.seconds,
                 "peak_memory_bytes": state.peak_memory_bytes}  # fmt: skip
@@ -301,4 +362,5 @@ def from_checkpoint(saved: Checkpoint) -> Gs3dState:
         saved.iteration, Gaussians(**part("gaussians.")), AdamMoments(part("first."), part("second.")),
         saved.tensors["gradient"], saved.tensors["views"], float(saved.metadata["loss"]), float(saved.metadata["psnr"]),
         float(saved.metadata["seconds"]), int(saved.metadata["peak_memory_bytes"]),
+        extra=part("extra."),
     )  # fmt: skip

@@ -175,6 +175,7 @@ def _gather_samples(views: BakeViews, wanted: Int[np.ndarray, " m"]) -> _ViewSam
     )  # fmt: skip
 
 
+@torch.no_grad()
 def _decode_from(model: AnchorModel, gaussians: Tensor, camera: Camera) -> tuple[Tensor, ...]:
     """Direction, color, opacity, logarithms of the scales and rotation of Gaussians (ascending) from a camera."""
     anchors, k = model.anchors, model.anchors.offsets.shape[1]

@@ -34,11 +34,10 @@ def gaussian_means(anchors: Anchors) -> Float[Tensor, "v k 3"]:
     return anchors.positions[:, None] + anchors.offsets * anchors.log_scales[:, None, :3].exp()
 
 
-@torch.no_grad()
 def decode_world(
     anchors: Anchors, rows: Int64[Tensor, " v"], weights: DecoderWeights, camera: Camera
 ) -> DecodedGaussians:
-    """The Gaussians of the anchors of the given rows."""
+    """The Gaussians of the anchors of the given rows, differentiable in the decoder's weights and the anchors."""
     k = anchors.offsets.shape[1]
     ray = anchors.positions[rows] - torch.as_tensor(camera.position).to(anchors.positions)
     distance = ray.norm(dim=1, keepdim=True)

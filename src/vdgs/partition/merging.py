@@ -41,6 +41,7 @@ def merge_blocks(
     result holds, block after block, the anchors of each block at the points that the rule gives to it. With
     `allow_missing` the coarse anchors stand in for a block that is None. A model may be given by a function that loads
     it: then one block at a time is in memory. Memory: coarse and merged anchors, and half of the merged ones again.
+    Blocks that trained one decoder together share it.
 
     Raises VdgsError for a missing block (unless allowed), and for a block that shows that it was not trained from
     `coarse`: by its grid, or by other bits of a frozen decoder.
@@ -76,7 +77,10 @@ def merge_blocks(
                 coarse_fallback=len(anchors) if model is None else 0, unseen=unseen,
             )
         )  # fmt: skip
-    return replace(coarse, anchors=_concatenate(selected), decoder_spans=tuple(spans) if own_decoder else ()), records
+    merged = replace(coarse, anchors=_concatenate(selected))
+    if own_decoder and all(_decoder_bytes(each.decoder) == _decoder_bytes(spans[0].decoder) for each in spans):
+        return replace(merged, decoder=spans[0].decoder), records
+    return replace(merged, decoder_spans=tuple(spans) if own_decoder else ()), records
 
 
 def has_own_decoder(model: AnchorModel) -> bool:

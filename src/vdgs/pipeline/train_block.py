@@ -176,7 +176,7 @@ def _train(
         capture=capture_metadata(capture), version=__version__, block=index, views=len(views), key=run.keys().blocks
     )
     if not plan.can_train:
-        _keep_coarse(folder, replace(coarse, anchors=plan.anchors, metadata=metadata), len(views), console)
+        keep_coarse_block(folder, replace(coarse, anchors=plan.anchors, metadata=metadata), len(views), console)
         return
     warn_without_densification(plan.config, console, "--block.")
     with plan.open_images(image_cache_bytes(options)) as images:
@@ -198,7 +198,7 @@ def _train(
     finish_stage(folder, state, model, console, plan.mean_area)
 
 
-def _keep_coarse(folder: StageFolder, model: AnchorModel, views: int, console: Console) -> None:
+def keep_coarse_block(folder: StageFolder, model: AnchorModel, views: int, console: Console) -> None:
     """A block that cannot be trained keeps what the coarse model has there, and says why."""
     why = "no camera sees it" if not views else "it holds no anchor"
     model.save(folder.model)

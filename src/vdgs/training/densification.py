@@ -60,7 +60,7 @@ class DensificationDecision:
 
 
 @dataclass(frozen=True)
-class _Parents:
+class Parents:
     """Offsets that ask for a new anchor: index into the flattened [n, k] (ascending), gradient, whether in L."""
 
     index: Int64[Tensor, " p"]
@@ -70,8 +70,8 @@ class _Parents:
     def __len__(self) -> int:
         return self.index.shape[0]
 
-    def select(self, mask: Bool[Tensor, " p"]) -> _Parents:
-        return _Parents(self.index[mask], self.gradient[mask], self.low[mask])
+    def select(self, mask: Bool[Tensor, " p"]) -> Parents:
+        return Parents(self.index[mask], self.gradient[mask], self.low[mask])
 
 
 def mean_gradient(statistics: DensificationStats) -> Float[Tensor, "n k"]:
@@ -130,7 +130,7 @@ def _parents(
     judged: Bool[Tensor, "n k"],
     threshold: float,
     compensated: CompensatedGradient | None,
-) -> _Parents:
+) -> Parents:
     """The judged offsets whose mean gradient, compensated, reaches the threshold of the first level."""
     gradient = mean_gradient(statistics)
     if compensated is not None:
@@ -139,12 +139,12 @@ def _parents(
     low = torch.zeros_like(index, dtype=torch.bool)
     if compensated is not None:
         low = compensated.low[index // gradient.shape[1]]
-    return _Parents(index, gradient.reshape(-1)[index], low)
+    return Parents(index, gradient.reshape(-1)[index], low)
 
 
 def _grow(
     anchors: Anchors,
-    parents: _Parents,
+    parents: Parents,
     taken: Sequence[Float[Tensor, "_ 3"]],
     voxel: float,
     config: DensifyConfig,
@@ -161,7 +161,7 @@ def _grow(
         count = anchors.offsets.shape[0] * anchors.offsets.shape[1]
         kept = parents.select(_random(parents.index, count, generator) > 0.5 ** (level + 1))
         cell = voxel * config.coarsest_voxels / 4.0**level
-        more, low = _fill_cells(anchors, kept, [*taken, grown.positions], cell, room, growth_mask)
+        more, low = fill_cells(anchors, kept, [*taken, grown.positions], cell, room, growth_mask)
         grown, grown_low = grown.concat(more), grown_low + low
     return grown, grown_low
 
@@ -178,9 +178,9 @@ def _random(index: Int64[Tensor, " p"], count: int, generator: torch.Generator) 
     return numbers.to(index.device)
 
 
-def _fill_cells(
+def fill_cells(
     anchors: Anchors,
-    parents: _Parents,
+    parents: Parents,
     taken: Sequence[Float[Tensor, "_ 3"]],
     cell: float,
     max_new: int | None,
@@ -210,7 +210,7 @@ def _fill_cells(
 
 
 def _anchors_at(
-    centers: Float[Tensor, "c 3"], place: Int64[Tensor, " p"], parents: _Parents, anchors: Anchors, cell: float
+    centers: Float[Tensor, "c 3"], place: Int64[Tensor, " p"], parents: Parents, anchors: Anchors, cell: float
 ) -> tuple[Anchors, int]:
     """New anchors at `centers`, the features the maximum of their parents', and how many have a parent in L."""
     kernels, k, count = get_backend(centers.device), anchors.offsets.shape[1], len(centers)

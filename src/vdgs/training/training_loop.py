@@ -69,6 +69,7 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
     camera = crop_camera(stage.images.camera(view, downscale), box)
 
     rows = cull_anchors(state.anchors, camera)
+    rows = rows if stage.select_rows is None else stage.select_rows(state, rows, camera)
     weights = state.decoder.weights_for_image(image_index_at(stage, view))
     background = background_at(stage, iteration)
     with torch.no_grad():
@@ -76,7 +77,8 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
         target = make_target(stage, view, downscale, crop_to_gradient_support(stage, splats, camera, box))
         frozen = _frozen_splats(stage, view, camera, target.camera)
         drawn = render_for_training(splats, target.camera, background, frozen)
-    compared = compute_loss(drawn, target, state.decoder, image_index_at(stage, view), config)
+    weight = stage.loss_weight
+    compared = compute_loss(drawn, target, state.decoder, image_index_at(stage, view), config, weight)
     volume_weight, loss = _volume_weight(stage), compared.loss
     if volume_weight and len(drawn.source):
         loss = loss + volume_weight * drawn.volume
@@ -84,7 +86,7 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
     value, l1, ssim = torch.stack([loss, compared.l1, compared.ssim]).tolist()
     if not math.isfinite(value):
         raise TrainingDiverged(f"The loss is {value} at iteration {iteration + 1}.")
-    gradients = drawn.backward(compared.image, volume_weight)
+    gradients = drawn.backward(compared.image, weight * volume_weight)
     measured = (iteration + 1) % PSNR_LOG_INTERVAL == 0
     psnr = training_psnr(compared.shown, target.image, target.mask) if measured else None
     state.is_consistent = False
@@ -101,7 +103,7 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
     state.iteration += 1
     report = StepReport(loss=value, l1=l1, ssim=ssim, visible=len(rows), splats=len(drawn.source))
     if growing and state.iteration >= config.densify.start and state.iteration % config.densify.every == 0:
-        report = replace(report, **densify(state, stage))
+        report = replace(report, **(stage.grow or densify)(state, stage))
     if state.iteration % SORT_INTERVAL == 0:
         sort_morton(state)
     last, averaged = state.iteration == config.iterations, is_averaged_step(state.iteration, config)
@@ -153,7 +155,14 @@ def _move(
     dense = config.optimizer == "adam"
     if dense:
         updates.fill_(state.iteration)
+    # Before the anchors move.
+    guided = (
+        {} if stage.guidance is None else stage.guidance.decoder_gradients(state.anchors, rows, state.decoder, camera)
+    )
     finite = backward_and_step(state.anchors, rows, gradients, weights, camera, states, updates, stage.lr_mask)
+    for name, gradient in guided.items():
+        tensor = state.decoder.tensors()[name]
+        tensor.grad = gradient if tensor.grad is None else tensor.grad + gradient
     if dense:
         step_unseen_anchors(state.anchors, rows, states, step, stage.lr_mask)
         updates.fill_(step)

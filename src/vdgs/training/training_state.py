@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -35,6 +35,21 @@ class TrainingImages(Protocol):
     def get(self, index: int, downscale: int = 1) -> tuple[Tensor, Tensor | None]: ...
     def camera(self, index: int, downscale: int = 1) -> Camera: ...
     def prefetch(self, indices: Sequence[int], downscale: int = 1) -> None: ...
+
+
+@runtime_checkable
+class LossGuidance(Protocol):
+    """What a method in which several blocks train one decoder adds to the loss of each of them."""
+
+    def weight(self) -> float:
+        """What the whole loss of the next step is multiplied by."""
+        ...
+
+    def decoder_gradients(
+        self, anchors: Anchors, rows: Tensor, decoder: Decoder, camera: Camera
+    ) -> Mapping[str, Tensor]:
+        """What is added to the gradients of the decoder's tensors, by name, for the anchors of the given rows."""
+        ...
 
 
 @dataclass(kw_only=True)
@@ -147,10 +162,21 @@ class TrainingProblem:
     image_indices: Sequence[int] | None = None
     #: How often each view is used, in proportion; None: all alike.
     view_weights: tuple[float, ...] | None = None
+    #: Which of the rows that may touch a view a step draws, in ascending order; None: all. For models with levels.
+    select_rows: Callable[[TrainingState, Tensor, Camera], Tensor] | None = None
+    #: What adds and removes anchors in place of `densification_step.densify`; returns what that does.
+    grow: Callable[[TrainingState, TrainingProblem], Any] | None = None
     #: The part of each view that is drawn, further limited by `gradient_roi`; None: all of it.
     crops: tuple[Crop, ...] | None = None
+    #: What is added to the loss by a method of several blocks with one decoder; None: nothing.
+    guidance: LossGuidance | None = None
     #: Where the arithmetic is done. Photographs and places come to it.
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+
+    @property
+    def loss_weight(self) -> float:
+        """What the loss of the next step is multiplied by."""
+        return 1.0 if self.guidance is None else self.guidance.weight()
 
     def max_log_scale_at(self, positions: Tensor) -> Tensor:
         """The largest log-scale [p] of Gaussians of anchors at places [p, 3]."""
@@ -221,13 +247,16 @@ def _group(saved: Checkpoint, name: str) -> dict[str, Tensor]:
     return {key.removeprefix(start): tensor for key, tensor in saved.tensors.items() if key.startswith(start)}
 
 
-def from_checkpoint(saved: Checkpoint, stage: TrainingProblem) -> TrainingState:
-    """The inverse of `to_checkpoint`, bit for bit, on the stage's device. Raises KeyError if a tensor is missing."""
+def from_checkpoint(
+    saved: Checkpoint, stage: TrainingProblem, start: Callable[..., TrainingState] = initial_state
+) -> TrainingState:
+    """The inverse of `to_checkpoint`, bit for bit, on the stage's device. Raises KeyError if a tensor is missing.
+    `start` makes a new state, of the kind that was saved, as `initial_state` does."""
 
     def group(name: str) -> dict[str, Tensor]:
         return {key: tensor.to(stage.device) for key, tensor in _group(saved, name).items()}
 
-    state = initial_state(Anchors(**group("anchors")), Decoder.from_tensors(group("decoder")), stage)
+    state = start(Anchors(**group("anchors")), Decoder.from_tensors(group("decoder")), stage)
     state.optimizer.decoder = AdamMoments(group("first.decoder"), group("second.decoder"))
     if averaged := saved.metadata["averaged"]:
         state.model_average = ModelAverage(averaged, group("average.anchors"), group("average.decoder"))

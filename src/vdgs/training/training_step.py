@@ -87,10 +87,16 @@ class LossGradients:
 
 
 def compute_loss(
-    rendered: RenderedTrainingView, target: TrainingTarget, decoder: Decoder, image_index: int, config: TrainConfig
+    rendered: RenderedTrainingView,
+    target: TrainingTarget,
+    decoder: Decoder,
+    image_index: int,
+    config: TrainConfig,
+    weight: float = 1.0,
 ) -> LossGradients:
     """Compare an image with its photograph, training image `image_index` of the capture. The gradient of a fitted
-    exposure is left in the decoder's `.grad`. Gradients are scaled to the whole photograph (`valid_fraction`)."""
+    exposure is left in the decoder's `.grad`. Gradients are scaled to the whole photograph (`valid_fraction`) and by
+    `weight`, the loss is not."""
     image = rendered.image.requires_grad_(True)
     exposure = decoder.exposure_for_image(image_index)
     shown = image if exposure is None else apply_exposure(image, exposure)
@@ -101,9 +107,10 @@ def compute_loss(
     found = torch.autograd.grad(photometric.loss, [image, *fitted])
     for tensor, gradient in zip(fitted, found[1:], strict=True):
         tensor.grad = gradient
-    if target.valid_fraction != 1.0:
+    scale = target.valid_fraction * weight
+    if scale != 1.0:
         for each in found:
-            each.mul_(target.valid_fraction)
+            each.mul_(scale)
     return LossGradients(loss=loss, l1=photometric.l1, ssim=photometric.ssim, shown=shown.detach(), image=found[0])
 
 

@@ -1,0 +1,1 @@
+"""CityGaussian (Liu et al. 2024) in our framework, to compare with."""

@@ -1,0 +1,1 @@
+"""Momentum-GS (Fan et al. 2024) in our framework, to compare with."""
