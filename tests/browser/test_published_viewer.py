@@ -159,6 +159,7 @@ FILES = [
     ("spark", "scene.ply", 30), ("spark", "scene.spz", 30), ("spark", "scene.compressed.ply", 27),
     ("spark", "scene.sog", 27), ("spark", "scene.splat", 30),
     ("playcanvas", "scene.ply", 30), ("playcanvas", "scene.compressed.ply", 27), ("playcanvas", "scene.sog", 27),
+    ("playcanvas", "lod-meta.json", 27),
     ("cesium", "tileset.json", 30),
 ]  # fmt: skip
 

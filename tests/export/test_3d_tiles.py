@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import torch
 
-from support.gaussians import overhead, picture, psnr, random_gaussians
+from support.gaussians import overhead, random_gaussians
 from vdgs.errors import VdgsError
 from vdgs.export.formats import registry, spz
 from vdgs.export.formats.axes import Y_UP
 from vdgs.export.formats.export_scene import ExportMetadata, ExportScene, concatenate
-from vdgs.export.formats.simplify import cell_indices, simplify
 from vdgs.export.formats.tiles_3d import write_tiles
 from vdgs.geometry.geodesy import geodetic_from_ecef
+from vdgs.model.gaussian_merging import merge_to
 from vdgs.model.gaussian_transform import gaussian_covariances, transform_gaussians
 from vdgs.model.gaussians import Gaussians, render_gaussians
 
@@ -208,11 +208,11 @@ def surface(side: int = 60, step: float = 0.1, opacity: float = 0.98) -> Gaussia
 
 
 @pytest.mark.parametrize("most", [900, 300, 100])
-def test_a_thinned_surface_has_no_holes_and_keeps_its_colors(most):
+def test_a_merged_surface_has_no_holes_and_keeps_its_colors(most):
     fine = surface()
-    coarse, edge = simplify(fine, most)
-    assert most / 4 < len(coarse) <= most
-    assert edge > 0.1
+    coarse, width = merge_to(fine, most)
+    assert len(coarse) == most
+    assert 0.1 < width < 1.0
     camera = replace(overhead(height=7.0, aside=0.01, size=64), fx=90.0, fy=90.0)  # sees the middle of it
 
     def drawn(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
@@ -228,7 +228,7 @@ def test_a_thinned_surface_has_no_holes_and_keeps_its_colors(most):
 
 def test_faint_things_stay_faint():
     fine = surface(opacity=0.1)
-    coarse, _ = simplify(fine, 200)
+    coarse, _ = merge_to(fine, 200)
     camera = replace(overhead(height=7.0, aside=0.01, size=64), fx=90.0, fy=90.0)
     means = [render_gaussians(each, camera, torch.zeros(3), 0)[0].alpha.mean().item() for each in (fine, coarse)]
     assert means[1] == pytest.approx(means[0], abs=0.08)
@@ -236,62 +236,6 @@ def test_faint_things_stay_faint():
 
 def test_nothing_changes_where_nothing_must_be_merged():
     some = random_gaussians(100, 2)
-    same, edge = simplify(some, 100)
+    same, width = merge_to(some, 100)
     assert same is some
-    assert edge == 0
-
-
-@pytest.mark.parametrize("share", [0.9, 0.2, 0.02])
-@pytest.mark.parametrize("far", [(), (3e3,), (1e6, -1e6), (1e9,)])
-def test_no_far_thing_decides_how_much_of_a_scene_is_left(far, share):
-    """As much is left of a flat scene and of a filled room as was asked for, whatever lies beyond the horizon."""
-    some = random_gaussians(5000, 0, reach=100.0)
-    most = int(share * len(some))
-    for flat in (0.02, 1.0):
-        scene = replace(some, means=some.means * torch.tensor([1.0, 1.0, flat]))
-        if far:
-            away = some.select(torch.arange(len(far)))
-            scene = scene.concat(replace(away, means=torch.tensor([[x, 0.0, 0.0] for x in far])))
-        coarse, edge = simplify(scene, most)
-        assert 0.8 * most <= len(coarse) <= most
-        again, same = simplify(scene, most)
-        assert same == edge
-        assert torch.equal(again.means, coarse.means)
-        for x in far:
-            assert (coarse.means == torch.tensor([x, 0.0, 0.0])).all(1).sum() == 1
-
-
-def test_cells_of_a_grid_too_large_to_number_hold_what_lies_together():
-    means = torch.tensor([[0.0, 0.0, 0.0], [1e9, 1e9, 1e9], [0.5, 0.5, 0.5], [0.5, 1.5, 0.5], [1e9, 1e9, -1e9]])
-    near, far = torch.tensor([[3.0, 3.0, 3.0]]).double(), means.double()
-    expected = [1, 4, 1, 2, 3, 0]
-    assert cell_indices(torch.cat([far, far[4:] - 1e9]), 1.0).tolist() == expected
-    # The same order as where all of the grid is numbered.
-    small = torch.cat([torch.rand(200, 3, generator=torch.Generator().manual_seed(0)).double() * 4, near])
-    beyond = torch.cat([small, torch.tensor([[1e8, 1e8, 1e8]]).double()])
-    assert torch.equal(cell_indices(beyond, 0.5)[:-1], cell_indices(small, 0.5))
-
-
-def test_what_has_one_place_becomes_one():
-    crowd = random_gaussians(300, 0)
-    coarse, _ = simplify(replace(crowd, means=torch.zeros(300, 3)), 100)
-    assert len(coarse) == 1
-
-
-def test_what_is_alone_in_its_cell_stays_as_it_is():
-    some = random_gaussians(60, 2)
-    some.means[:59] = some.means[:59] * 0.001
-    some.means[59] = torch.tensor([50.0, 50.0, 0.0])
-    coarse, _ = simplify(some, 20)
-    kept = coarse.select((coarse.means == some.means[59]).all(1))
-    assert len(kept) == 1
-    for name, tensor in kept.tensors().items():
-        assert torch.equal(tensor[0], some.tensors()[name][59]), name
-
-
-def test_coarser_levels_still_look_like_the_scene():
-    some = random_gaussians(3000, 2, reach=6.0)
-    some = replace(some, means=some.means * torch.tensor([1.0, 1.0, 0.05]), opacity_logits=some.opacity_logits + 2)
-    from_afar = replace(overhead(height=40.0, aside=3.0, size=48), fx=90.0, fy=90.0)
-    coarse, _ = simplify(some, 700)
-    assert psnr(picture(coarse, from_afar), picture(some, from_afar)) > 24
+    assert width == 0

@@ -333,7 +333,9 @@ registry.write_scene(path, ExportScene(chunks=chunks(), count=6000, degree=0))
 """
 
 
-@pytest.mark.parametrize("name", ["a.ply", "a.compressed.ply", "a.spz", "a.sog", "a.glb", "tileset.json"])
+@pytest.mark.parametrize(
+    "name", ["a.ply", "a.compressed.ply", "a.spz", "a.sog", "a.glb", "tileset.json", "lod-meta.json"]
+)
 def test_what_a_killed_export_left_goes_with_the_next(tmp_path, name: str):
     (tmp_path / ".a.ply.notes.scratch.txt").write_text("mine")
     (tmp_path / "tiles-7").mkdir()

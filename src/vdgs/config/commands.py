@@ -168,14 +168,15 @@ class ExportRequest(ModelRequest):
 
     output: Annotated[tuple[Path, ...], Repeatable(), Output()] = ()
     """File to write; its ending is the format: .ply, .spz, .glb, .html, ... These are .ply (3DGS), .compressed.ply
-    (PlayCanvas), .spz, .splat, .sog, .glb (glTF), FOLDER/tileset.json (3D Tiles), .points.ply, .laz, .las (point
+    (PlayCanvas), .spz, .splat, .sog, .glb (glTF), FOLDER/tileset.json (3D Tiles),
+    FOLDER/lod-meta.json (streamed SOG), .points.ply, .laz, .las (point
     clouds), .html (a page that shows the scene offline). Give --output again for more: the scene is baked once
     (docs/export.md)."""
     program: Annotated[ProgramName | None, FlagName("for")] = None
     """Program that opens the files. It shows the scene upright then; files that it does not open are refused.
     Without --output: write RUN/export/ and the file that suits it best."""
     axes: AxesName | None = None
-    """Axes of .ply, .spz, .splat and .sog files: z-up (x east, y north, z up: the usual ones of .ply),
+    """Axes of .ply, .spz, .splat, .sog and lod-meta.json files: z-up (x east, y north, z up: the usual ones of .ply),
     y-up (of .spz: x east, z south), y-down (of .compressed.ply, .splat and .sog: x west, z south), y-up-left
     (left-handed: x east, z north). Instead of --for."""
     spz_version: Literal[2, 3, 4] = 3
@@ -185,7 +186,8 @@ class ExportRequest(ModelRequest):
     bbox: Annotated[tuple[float, float, float, float] | None, MAP_COORDINATE_RANGE] = None
     """Only Gaussians with centers in X0 Y0 X1 Y1, in coordinates of --crs."""
     max_gaussians: Annotated[int, Range(0, MAX_COUNT)] = 0
-    """Largest number of Gaussians; 0: all. Those that make most of the training photographs stay."""
+    """Largest number of Gaussians; 0: all. Neighbors are merged, those first by which the pictures change least, and
+    then moved towards the model's images."""
     sh_degree: Literal[0, 1, 2, 3] = 3
     """Degree of the spherical harmonics of colors. 0: the same from everywhere, and a fifth of the size."""
     html_max_mb: Annotated[float, Range(1, 2000)] = 30.0

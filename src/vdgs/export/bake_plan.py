@@ -132,7 +132,6 @@ def _request(run: OpenedRun, asked: ExportRequest) -> ExportRequest:
         model=cast(ModelName, run.name),
         block=asked.block,
         bbox=asked.bbox,
-        max_gaussians=asked.max_gaussians,
         sh_degree=asked.sh_degree,
         color_iterations=asked.color_iterations,
         crs=asked.crs,
@@ -153,5 +152,4 @@ def _depends_on(run: OpenedRun, request: ExportRequest) -> list[Any]:
         request.block,
         box,
         crs,
-        request.max_gaussians,
     ]

@@ -72,7 +72,11 @@ class BakedGaussians:
         if len(of_these) < len(source):
             shown = Splats(*(getattr(splats, field.name)[of_these] for field in fields(Splats)))
         picture = rasterize_splats(shown, camera, shown.means_px.new_tensor(self.model.background)).image
-        return picture.cpu(), self.rows_of_anchors(rows.numpy())
+        return picture.cpu(), self.rows_in_view(rows.numpy(), camera)
+
+    def rows_in_view(self, anchors: Int[np.ndarray, " v"], camera: Camera) -> Int[np.ndarray, " p"]:
+        """The Gaussians that may touch a view which shows these anchors, ascending."""
+        return self.rows_of_anchors(anchors)
 
 
 def refine_colors(

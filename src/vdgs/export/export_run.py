@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -27,14 +28,21 @@ from vdgs.export.export_loss import measure_loss, views_to_measure
 from vdgs.export.formats import registry
 from vdgs.export.formats.export_scene import CHUNK_SIZE, ExportScene, InitialView
 from vdgs.export.formats.gaussian_store import GaussianStore
-from vdgs.export.formats.tiles_3d import TILESET_FILE, tileset_files
 from vdgs.export.gaussian_optimization import optimize_gaussians
-from vdgs.export.gaussian_selection import frame_for_file, local_bounds, select_gaussians, select_rows
+from vdgs.export.gaussian_selection import (
+    frame_for_file,
+    local_bounds,
+    rows_within_reach,
+    select_gaussians,
+    select_rows,
+)
 from vdgs.export.local_bake import BAKING, LocalBake
 from vdgs.export.local_frame import LocalFrame
+from vdgs.export.merged_scene import SceneMerging
 from vdgs.export.novel_cameras import color_iteration_count, endless_cameras
 from vdgs.export.programs import axes_for, with_files
 from vdgs.geometry.camera import Camera
+from vdgs.model.decode_world import gaussian_means
 from vdgs.model.gaussians import Gaussians
 from vdgs.runs.open_run import OpenedRun
 from vdgs.runs.run_folder import REPORT_FILE
@@ -143,31 +151,51 @@ def write_files(
     frames = {path: frame_for_file(path, run, request, center) for path in request.output}
     _tidy(request.output, console)
     began = time.monotonic()
-    with _make_baker(run, request, execution, console) as baker:
+    with _make_baker(run, request, execution, console) as baker, ExitStack() as stack:
         pixels = baker.pixels()
         kept = select_gaussians(pixels, run, request)
-        rows = select_rows(frames, run, pixels, kept, request.sh_degree, console, request.spz_version)
+        means = gaussian_means(run.model.anchors).cpu().reshape(-1, 3).numpy()[kept]
+        rows = select_rows(frames, means, pixels[kept], request, console)
         console.print(
             f"{run.summary}: {len(kept):,} Gaussians of {len(pixels):,} are drawn by the training cameras"
             + (" and asked for" if len(kept) < np.count_nonzero(pixels) else ""),
             highlight=False,
         )
-        del pixels
-        with baker.spool(kept) as spool:
-            _optimize(BakedGaussians(run.model, kept, spool), baker.training, request.optimize_seconds, console)
-            baked = _BakedScene(spool, request.sh_degree, make_initial_view(run, int(request.html_max_mb * 1e6)))
-            seconds = time.monotonic() - began
-            rounds = color_iteration_count(request.color_iterations, gaussian_count(run.model))
-            console.print(f"baked in {seconds:.1f} s, colors fitted again in {rounds} rounds", highlight=False)
-            files = [
-                _write(path, baked.scene(frames[path], rows[path], path, request), console) for path in request.output
-            ]
-            losses = _measure_losses(run, frames, baked, request, console)
+        pixels, means = pixels[kept], means[:0]
+        shown = whole = BakedGaussians(run.model, kept, stack.enter_context(baker.spool(kept)))
+        rounds = color_iteration_count(request.color_iterations, gaussian_count(run.model))
+        console.print(
+            f"baked in {time.monotonic() - began:.1f} s, colors fitted again in {rounds} rounds", highlight=False
+        )
+        merging = SceneMerging(request.output[0].parent / BAKING, baker.training, console, stack)
+        if 0 < request.max_gaussians < len(kept):
+            shown = merging.merged(whole, pixels, request.max_gaussians)
+            rows = {path: rows_within_reach(path, frame, shown.spool.means) for path, frame in frames.items()}
+        _optimize(shown, baker.training, request.optimize_seconds, console)
+        seconds = time.monotonic() - began
+        view = make_initial_view(run, int(request.html_max_mb * 1e6))
+        scene = _BakedScene(shown.spool, request.sh_degree, view)
+        files = []
+        for path in request.output:
+            count, notes, of_path = _capacity(path, scene), list[str](), (scene, rows[path])
+            if count < len(rows[path]):
+                fewer = merging.merged(whole, pixels, count)
+                notes.append(f"merged from {len(rows[path]):,} Gaussians to {count:,}, which the file has room for")
+                of_path = replace(scene, spool=fewer.spool), np.arange(count)
+            files.append(_write(path, of_path[0].scene(frames[path], of_path[1], path, request), console, notes))
+        losses = _measure_losses(run, frames, scene, request, console)
     record: ExportDocument = to_jsonable({
-        "model": run.name, "key": run.key, "gaussians": len(kept), "sh_degree": request.sh_degree, "rounds": rounds,
+        "model": run.name, "key": run.key, "gaussians": len(scene.spool.means), "sh_degree": request.sh_degree,
+        "rounds": rounds,
         "seconds_to_bake": seconds, "seconds_to_refine": request.optimize_seconds, "files": files, "losses": losses,
     })  # fmt: skip
     return record
+
+
+def _capacity(path: Path, scene: _BakedScene) -> int:
+    """How many Gaussians of a scene a file has room for."""
+    capacity = registry.format_from_path(path).capacity
+    return sys.maxsize if capacity is None else capacity(scene.spool.sample(CHUNK_SIZE), scene.page)
 
 
 def _make_baker(
@@ -221,21 +249,20 @@ def _check_names(asked: ExportRequest) -> None:
         raise VdgsError(f"--output {twice[0]}: is given twice.")
 
 
-def _write(path: Path, scene: ExportScene, console: Console) -> ExportedFile:
+def _write(path: Path, scene: ExportScene, console: Console, notes: Sequence[str]) -> ExportedFile:
     began = time.monotonic()
-    lost = registry.write_scene(path, scene)
+    lost = [*notes, *registry.write_scene(path, scene)]
     seconds, size = time.monotonic() - began, _size(path)
     console.print(f"{path}: {size / 1e6:,.1f} MB in {seconds:.1f} s", highlight=False)
     for each in lost:
         console.print(f"[yellow]note[/] {path.name}: {each}", highlight=False)
     return {"file": str(path.resolve()), "gaussians": scene.count, "bytes": size, "seconds": seconds,
-            "notes": list(lost)}  # fmt: skip
+            "notes": lost}  # fmt: skip
 
 
 def _size(path: Path) -> int:
-    """Bytes of a file, with the tiles that it names."""
-    tiles = tileset_files(path) if registry.format_from_path(path).suffix == TILESET_FILE else []
-    return sum(file.stat().st_size for file in (path, *tiles))
+    """Bytes of a file, with those that it names."""
+    return sum(file.stat().st_size for file in registry.format_from_path(path).files(path))
 
 
 def _measure_losses(

@@ -6,6 +6,7 @@ times (0.7 kB for each Gaussian of degree 3), and gains what is left.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 
@@ -25,11 +26,14 @@ LEARNING_RATES = {"sh0": 1.25e-3, "shN": 6e-5, "opacity_logits": 0.025, "log_sca
 def optimize_gaussians(
     baked: BakedGaussians,
     cameras: Iterator[Camera],
-    seconds: float,
+    seconds: float = math.inf,
     after_step: Callable[[float], None] = lambda passed: None,
     clock: Callable[[], float] = time.monotonic,
+    max_steps: float = math.inf,
+    rate: float = 1.0,
 ) -> int:
-    """Move the Gaussians on the disk for so long; returns in how many steps, each by the picture of the next camera.
+    """Move the Gaussians on the disk for so long, in so many steps at most; returns in how many, each by the picture of
+    the next camera. `rate` multiplies the learning rates.
 
     `after_step` is told how many seconds have passed.
     """
@@ -37,12 +41,12 @@ def optimize_gaussians(
     gaussians = baked.spool.rows(every)
     named = gaussians.tensors()
     states = {
-        name: AdamState(named[name], torch.zeros_like(named[name]), torch.zeros_like(named[name]), rate)
-        for name, rate in LEARNING_RATES.items() if named[name].numel()
+        name: AdamState(named[name], torch.zeros_like(named[name]), torch.zeros_like(named[name]), rate * each)
+        for name, each in LEARNING_RATES.items() if named[name].numel()
     }  # fmt: skip
     updates = torch.zeros(len(every), dtype=torch.int32)
     began, steps = clock(), 0
-    while (passed := clock() - began) < seconds:
+    while (passed := clock() - began) < seconds and steps < max_steps:
         _step(baked, gaussians, next(cameras), states, updates)
         steps += 1
         after_step(passed)

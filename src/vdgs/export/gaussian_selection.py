@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from rich.console import Console
 
 from vdgs.config.commands import ExportRequest
@@ -23,8 +23,8 @@ MAX_DROPPED_SHARE = 1e-3
 
 
 def select_gaussians(pixels: Float[np.ndarray, " g"], run: OpenedRun, request: ExportRequest) -> Int[np.ndarray, " m"]:
-    """The Gaussians to write, ascending: drawn by a training camera, of the block, within the box, most drawn first
-    where they are too many. `pixels`: how many each makes. Raises VdgsError where none is left."""
+    """The Gaussians to write, ascending: drawn by a training camera, of the block, within the box. `pixels`: how many
+    each makes. Raises VdgsError where none is left."""
     k = run.model.anchors.offsets.shape[1]
     wanted = pixels > 0
     if request.block is not None:
@@ -47,9 +47,6 @@ def select_gaussians(pixels: Float[np.ndarray, " g"], run: OpenedRun, request: E
     kept = np.flatnonzero(wanted)
     if not len(kept):
         raise VdgsError(f"{run.model_path}: no training camera draws anything of what was asked for.")
-    if 0 < request.max_gaussians < len(kept):
-        most = np.argpartition(pixels[kept], -request.max_gaussians)[-request.max_gaussians :]
-        kept = np.sort(kept[most])
     return kept
 
 
@@ -76,26 +73,24 @@ def frame_for_file(path: Path, run: OpenedRun, request: ExportRequest, center: n
 
 
 def select_rows(
-    frames: Mapping[Path, LocalFrame], run: OpenedRun, pixels: Float[np.ndarray, " g"], kept: Int[np.ndarray, " m"],
-    degree: int, console: Console, spz_version: int = 3,
+    frames: Mapping[Path, LocalFrame], means: Float[np.ndarray, "m 3"], pixels: Float[np.ndarray, " m"],
+    request: ExportRequest, console: Console,
 ) -> dict[Path, Int[np.ndarray, " r"]]:  # fmt: skip
     """Which of the Gaussians each file is given. What a format cannot hold is said before the work.
 
     A format that does not reach far goes without the few Gaussians that lie beyond and of which the photographs show
     next to nothing; more of them are refused.
     """
-    means = gaussian_means(run.model.anchors).cpu().reshape(-1, 3).numpy()[kept]
-    pixels = pixels[kept]
     rows = {}
     for path, frame in frames.items():
         reach = registry.format_from_path(path).max_coordinate
-        beyond = (np.abs(_local(frame, means)) >= 0.999 * reach).any(1)
+        beyond = ~_is_within_reach(path, frame, means)
         share = float(pixels[beyond].sum() / pixels.sum())
         if share > MAX_DROPPED_SHARE:
             beyond[:] = False  # it is refused below
         elif beyond.any():
             console.print(
-                f"[yellow]note[/] {path.name}: {np.count_nonzero(beyond):,} of {len(kept):,} Gaussians lie more than "
+                f"[yellow]note[/] {path.name}: {np.count_nonzero(beyond):,} of {len(means):,} Gaussians lie more than "
                 f"{reach:.0f} units away, where the format does not reach; they are left out. They make "
                 f"{share:.2g} of what the training cameras see.",
                 highlight=False,
@@ -105,14 +100,24 @@ def select_rows(
             path,
             ExportScene(
                 chunks=(),
-                count=len(rows[path]),
-                degree=degree,
+                count=min(len(rows[path]), request.max_gaussians or len(rows[path])),
+                degree=request.sh_degree,
                 metadata=frame.facts,
                 bounds=local_bounds(frame, means[rows[path]]),
-                spz_version=spz_version,
+                spz_version=request.spz_version,
             ),
         )
     return rows
+
+
+def rows_within_reach(path: Path, frame: LocalFrame, means: Float[np.ndarray, "m 3"]) -> Int[np.ndarray, " r"]:
+    """Those that the format of a file can hold."""
+    return np.flatnonzero(_is_within_reach(path, frame, means))
+
+
+def _is_within_reach(path: Path, frame: LocalFrame, means: Float[np.ndarray, "m 3"]) -> Bool[np.ndarray, " m"]:
+    inside: np.ndarray = (np.abs(_local(frame, means)) < 0.999 * registry.format_from_path(path).max_coordinate).all(1)
+    return inside
 
 
 def _local(frame: LocalFrame, means: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:

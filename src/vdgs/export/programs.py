@@ -14,6 +14,7 @@ from vdgs.config.commands import ExportRequest
 from vdgs.errors import VdgsError
 from vdgs.export.formats import registry
 from vdgs.export.formats.axes import BY_NAME, Y_DOWN, Y_UP, Y_UP_LEFT, Z_UP, Axes
+from vdgs.export.formats.streamed_sog import LOD_FILE
 from vdgs.export.formats.tiles_3d import TILESET_FILE
 
 #: Where files are written whose names nobody gave, in the run folder.
@@ -35,7 +36,8 @@ class Program:
 
 _PLAYCANVAS = Program(
     "SuperSplat and PlayCanvas", "supersplat.compressed.ply",
-    {".compressed.ply": Y_DOWN, ".ply": Y_DOWN, ".sog": Y_DOWN, ".splat": Y_DOWN},
+    {".compressed.ply": Y_DOWN, ".ply": Y_DOWN, ".sog": Y_DOWN, ".splat": Y_DOWN,
+     LOD_FILE: Y_DOWN},
     "its versions do not agree how an SPZ stands",
 )  # fmt: skip
 PROGRAMS: Mapping[str, Program] = {
@@ -61,7 +63,7 @@ PROGRAMS: Mapping[str, Program] = {
     ),
 }  # fmt: skip
 #: Formats whose axes may be chosen.
-FREE = (".points.ply", ".compressed.ply", ".ply", ".spz", ".splat", ".sog")
+FREE = (".points.ply", ".compressed.ply", ".ply", ".spz", ".splat", ".sog", LOD_FILE)
 
 
 def with_files(asked: ExportRequest) -> ExportRequest:

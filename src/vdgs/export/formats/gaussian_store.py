@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import mmap
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from vdgs.errors import RunError
@@ -131,3 +132,23 @@ def flatten(gaussians: Gaussians) -> Float[np.ndarray, "n w"]:
     """All numbers of each, as a spool holds them."""
     columns = [tensor.reshape(len(gaussians), -1) for tensor in gaussians.tensors().values()]
     return torch.cat(columns, 1).numpy()
+
+
+def plane_blocks(
+    means: Float[np.ndarray, "n 3"], rows: Int[np.ndarray, " r"], most: int
+) -> Iterator[Int[np.ndarray, " b"]]:
+    """Rows in blocks of at most so many, halved along the longer side of the ground; ascending in each."""
+    if len(rows) <= most:
+        yield np.sort(rows)
+        return
+    plane = means[rows, :2]
+    along = plane[:, int((plane.max(0) - plane.min(0)).argmax())]
+    order = np.argsort(along, kind="stable")
+    for half in (order[: len(order) // 2], order[len(order) // 2 :]):
+        yield from plane_blocks(means, rows[half], most)
+
+
+def in_memory(gaussians: Gaussians) -> GaussianStore:
+    """Gaussians as a store, without a file."""
+    shapes = {name: tuple(tensor.shape[1:]) for name, tensor in gaussians.tensors().items()}
+    return GaussianStore(gaussians.means.numpy(), flatten(gaussians), shapes)

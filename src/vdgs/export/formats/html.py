@@ -2,7 +2,7 @@
 
 The client comes from the installed package viser, with a recording of one message that carries the Gaussians: 32 bytes
 each (mean in float32, covariance in float16, color and opacity in bytes), compressed, as base64. Colors do not change
-with the direction. A scene that would be too large for the file is thinned until it fits (`levels`).
+with the direction. A scene that would be too large for the file is merged until it fits.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from vdgs.export.formats.export_scene import (
     opacities,
     to_uint8,
 )
-from vdgs.export.formats.simplify import ellipsoid_axes, simplify
 from vdgs.kernels.spherical_harmonics import rgb_to_sh
+from vdgs.model.gaussian_merging import ellipsoid_axes, group_neighbors, merge_by_moments
 from vdgs.model.gaussian_transform import gaussian_covariances
 from vdgs.model.gaussians import Gaussians
 from vdgs.system.atomic_files import write_bytes
@@ -94,12 +94,13 @@ def write_html(path: Path, scene: ExportScene) -> tuple[str, ...]:
     factor = _factor(whole)
     kept = whole
     while len(content := _document(kept, factor, page, scene)) > page.max_bytes:
-        kept = _thin_to_fit(whole, len(kept), factor, page)
+        count = min(html_capacity(whole, page), int(0.9 * len(kept)))
+        kept = merge_by_moments(whole, group_neighbors(whole, count))
     write_bytes(path, content)
     lost = ["colors do not change with the viewing direction"]
     if len(kept) < len(whole):
         lost.append(
-            f"thinned from {len(whole):,} Gaussians to {len(kept):,}, for the page may have "
+            f"merged from {len(whole):,} Gaussians to {len(kept):,}, for the page may have "
             f"{page.max_bytes / 1e6:g} MB (--html-max-mb)"
         )
     return tuple(lost)
@@ -131,18 +132,19 @@ def _without_sh(scene: ExportScene) -> Gaussians:
     return Gaussians(**{name: torch.cat([part.tensors()[name] for part in parts]) for name in parts[0].tensors()})
 
 
-def _thin_to_fit(whole: Gaussians, tried: int, factor: float, page: InitialView) -> Gaussians:
-    """The scene thinned to what there is room for, and by a tenth more than what was tried. Raises VdgsError."""
-    some = whole.select(torch.linspace(0, len(whole) - 1, min(SAMPLE_GAUSSIANS, len(whole))).long())
+def html_capacity(gaussians: Gaussians, page: InitialView) -> int:
+    """How many like these a page has room for, by a sample of them. Raises VdgsError for next to none."""
+    some = gaussians.select(torch.linspace(0, len(gaussians) - 1, min(SAMPLE_GAUSSIANS, len(gaussians))).long())
     frame = len(_client_html()) + 4096
+    factor = _factor(some)
     each = SIZE_MARGIN * len(_recording(_packed(some, factor), factor, page)) / len(some)
-    count = int(min((page.max_bytes - frame) / each, 0.9 * tried))
-    if count < MIN_GAUSSIANS:
+    count = int((page.max_bytes - frame) / each)
+    if count < min(MIN_GAUSSIANS, len(gaussians)):
         raise VdgsError(
             f"A page of {page.max_bytes / 1e6:g} MB has no room for the scene: the client alone takes "
             f"{frame / 1e6:.1f} MB. Allow more: --html-max-mb."
         )
-    return simplify(whole, count)[0]
+    return count
 
 
 def _factor(gaussians: Gaussians) -> float:

@@ -9,15 +9,17 @@ from pathlib import Path
 
 from vdgs.errors import VdgsError
 from vdgs.export.formats.compressed_ply import compressed_ply_pieces, write_compressed_ply
-from vdgs.export.formats.export_scene import ExportScene, concatenate
+from vdgs.export.formats.export_scene import ExportScene, InitialView, concatenate
+from vdgs.export.formats.file_folders import FileFolder
 from vdgs.export.formats.gaussian_ply import read_ply_chunks, write_ply
 from vdgs.export.formats.gltf import check_glb_size, write_glb
-from vdgs.export.formats.html import check_viser, read_html_chunks, write_html
+from vdgs.export.formats.html import check_viser, html_capacity, read_html_chunks, write_html
 from vdgs.export.formats.point_cloud import check_las_dependencies, write_laz, write_points
 from vdgs.export.formats.sog import write_sog
 from vdgs.export.formats.splat import read_splat_chunks, write_splat
 from vdgs.export.formats.spz import MAX_COORDINATE, check_range, read_spz_chunks, write_spz
-from vdgs.export.formats.tiles_3d import TILESET_FILE, check_tileset_folder, remove_killed, write_tiles
+from vdgs.export.formats.streamed_sog import LOD_FILE, LOD_FOLDER, check_lod_folder, write_streamed_sog
+from vdgs.export.formats.tiles_3d import TILE_FOLDER, TILESET_FILE, check_tileset_folder, write_tiles
 from vdgs.model.gaussians import Gaussians
 from vdgs.system.scratch import remove_leftovers
 
@@ -43,8 +45,18 @@ class ExportFormat:
     fixed_colors: bool = False
     #: Whether it stands on the globe, in no map's coordinates.
     on_globe: bool = False
-    #: Removes what killed exports left beside a file, and returns it.
-    tidy: Callable[[Path], list[Path]] = remove_leftovers
+    #: How many Gaussians like these a file has room for, where that depends on what is asked of it.
+    capacity: Callable[[Gaussians, InitialView], int] | None = None
+    #: Where other files lie that the file names.
+    folder: FileFolder | None = None
+
+    def files(self, path: Path) -> list[Path]:
+        """A file that was written, with those that it names."""
+        return [path, *(self.folder.files(path) if self.folder else [])]
+
+    def tidy(self, path: Path) -> list[Path]:
+        """Remove what killed exports left beside a file, and return it."""
+        return self.folder.remove_killed(path) if self.folder else remove_leftovers(path)
 
 
 #: The longer endings first: `.points.ply` and `.compressed.ply` are `.ply` too.
@@ -91,7 +103,15 @@ FORMATS: tuple[ExportFormat, ...] = (
         write=write_tiles,
         check=check_tileset_folder,
         on_globe=True,
-        tidy=remove_killed,
+        folder=TILE_FOLDER,
+    ),
+    ExportFormat(
+        suffix=LOD_FILE,
+        description="PlayCanvas' streamed SOG, in levels",
+        write=write_streamed_sog,
+        check=check_lod_folder,
+        writes_metadata_file=True,
+        folder=LOD_FOLDER,
     ),
     ExportFormat(
         suffix=".html",
@@ -100,6 +120,7 @@ FORMATS: tuple[ExportFormat, ...] = (
         read=read_html_chunks,
         check=check_viser,
         fixed_colors=True,
+        capacity=html_capacity,
     ),
     ExportFormat(
         suffix=".laz",
@@ -117,9 +138,7 @@ def format_from_path(path: Path) -> ExportFormat:
     """The format that a file's name asks for. Raises VdgsError, naming those there are, for any other."""
     name = path.name.lower()
     for each in FORMATS:
-        if name == TILESET_FILE == each.suffix or (
-            each.suffix[0] == "." and name.endswith(each.suffix) and name != each.suffix
-        ):
+        if name == each.suffix if each.folder else name.endswith(each.suffix) and name != each.suffix:
             return each
     known = ", ".join(f"{each.suffix} ({each.description})" for each in FORMATS)
     raise VdgsError(f"{path}: no format is known by this name. Let it end in one of: {known}.")
@@ -130,7 +149,7 @@ def check_export(path: Path, scene: ExportScene) -> None:
     chosen = format_from_path(path)
     if scene.count < 1:
         raise VdgsError(f"{path}: the scene has no Gaussians, there is nothing to write.")
-    if path.is_dir() and chosen.suffix != TILESET_FILE:
+    if path.is_dir() and chosen.folder is None:
         raise VdgsError(f"{path}: is a folder. Give the name of a file.")
     chosen.check(path, scene)
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Int
 from PIL import Image
 
 from vdgs.export.formats.axes import Y_DOWN
@@ -30,7 +31,7 @@ from vdgs.export.formats.export_scene import (
 from vdgs.export.formats.gaussian_store import GaussianStore, write_store
 from vdgs.kernels import get_backend
 from vdgs.model.gaussians import Gaussians
-from vdgs.system.atomic_files import write_atomic
+from vdgs.system.atomic_files import write_atomic, write_bytes, write_json
 from vdgs.system.documents import JsonObject
 from vdgs.system.scratch import scratch_folder
 
@@ -49,10 +50,12 @@ def write_sog(path: Path, scene: ExportScene) -> tuple[str, ...]:
     def write(temporary: Path) -> None:
         nonlocal coarsest
         with scratch_folder(path) as folder:
-            images = _Images(write_store(scene, folder / "rows", axes))
+            store = write_store(scene, folder / "rows", axes)
+            images = _Images(store)
+            order = get_backend(torch.device("cpu")).morton_order(torch.from_numpy(store.means)).numpy()
             coarsest = images.max_step()
             with zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as bundle:
-                for name, picture in images.encode().items():
+                for name, picture in images.encode(order).items():
                     bundle.writestr(f"{name}.webp", _webp(picture))
                 bundle.writestr("meta.json", json.dumps(images.meta(scene.metadata), allow_nan=False))
 
@@ -62,6 +65,14 @@ def write_sog(path: Path, scene: ExportScene) -> tuple[str, ...]:
     if scene.degree:
         notes.append(f"changing colors are taken from a palette of at most {MAX_SH_CENTROIDS}")
     return tuple(notes)
+
+
+def write_sog_folder(folder: Path, store: GaussianStore, facts: ExportMetadata) -> None:
+    """Write the unbundled kind, the Gaussians in their order, along the format's axes already: images, then JSON."""
+    images = _Images(store)
+    for name, picture in images.encode(np.arange(images.count)).items():
+        write_bytes(folder / f"{name}.webp", _webp(picture))
+    write_json(folder / "meta.json", images.meta(facts))
 
 
 class _Images:
@@ -84,13 +95,12 @@ class _Images:
         step = (self.high - self.low) / MAX_UINT16
         return float((step * np.exp(np.maximum(np.abs(self.low), np.abs(self.high)))).max())
 
-    def encode(self) -> dict[str, np.ndarray]:
-        """Every image by its name: uint8 [h, w, 4]."""
+    def encode(self, order: Int[np.ndarray, " n"]) -> dict[str, np.ndarray]:
+        """Every image by its name, of the Gaussians in an order: uint8 [h, w, 4]."""
         width = 4 * math.ceil(math.sqrt(self.count) / 4)
         height = 4 * math.ceil(self.count / width / 4)
         names = ("means_l", "means_u", "quats", "scales", "sh0", *(["shN_labels"] if self.palette else []))
         flat = {name: np.full((width * height, 4), 255, np.uint8) for name in names}
-        order = get_backend(torch.device("cpu")).morton_order(torch.from_numpy(self.scene.means)).numpy()
         for start in range(0, self.count, CHUNK_SIZE):
             piece = self.scene.rows(order[start : start + CHUNK_SIZE])
             for name, values in self._pixels(piece).items():

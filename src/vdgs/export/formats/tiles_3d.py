@@ -1,55 +1,45 @@
 """3D Tiles 1.1: the scene as a tree of small tiles by place, coarse ones from afar and fine ones near by.
 
 `FOLDER/tileset.json` names the tiles in a folder beside it. The tree is a quadtree over x and y; a leaf holds its part
-of the scene as it is, a tile above holds its four children merged (`levels`) to as many Gaussians. A tile is a GLB
-around an SPZ, the only kind that CesiumJS draws so far. Tiles stand in local coordinates with z up, each about its own
-middle; the root's transform takes them to Earth-centered coordinates where the scene is georeferenced.
+of the scene as it is, a tile above holds its four children merged (`model.gaussian_merging`) to as many Gaussians. A
+tile is a GLB around an SPZ, the only kind that CesiumJS draws so far. Tiles stand in local coordinates with z up, each
+about its own middle; the root's transform takes them to Earth-centered coordinates where the scene is georeferenced.
 """
 
 from __future__ import annotations
 
 import json
 import re
-import shutil
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from vdgs.errors import VdgsError
 from vdgs.export.formats import spz
 from vdgs.export.formats.axes import Y_UP
 from vdgs.export.formats.export_scene import ExportMetadata, ExportScene
+from vdgs.export.formats.file_folders import FileFolder, check_no_folder
 from vdgs.export.formats.gaussian_store import GaussianStore, write_store
 from vdgs.export.formats.gltf import EXTENSION, SPZ_EXTENSION, spz_glb
-from vdgs.export.formats.simplify import simplify
 from vdgs.geometry.geodesy import ecef_from_geodetic, enu_axes
 from vdgs.kernels import get_backend
+from vdgs.model.gaussian_merging import merge_to
 from vdgs.model.gaussian_transform import gaussian_covariances, transform_gaussians
 from vdgs.model.gaussians import MAX_SIGMA, Gaussians
-from vdgs.system.atomic_files import explain_disk_errors, write_bytes, write_json
+from vdgs.system.atomic_files import write_bytes
 from vdgs.system.documents import JsonObject
-from vdgs.system.scratch import leftovers, remove_leftovers, scratch_folder
 
 TILESET_FILE = "tileset.json"
-#: How tiles are named beside their tileset: the folder's number is one that nothing there has yet, the file says where
-#: in the quadtree it stands.
-_TILE = re.compile(r"tiles-[0-9]+/[0-3]+\.glb")
-#: What a killed export may leave there.
-_UNFINISHED = re.compile(r"tiles-[0-9]+/([0-3]+\.glb|\.[0-3]+\.glb\.[0-9]+\.tmp)")
-#: The file of a scratch folder that names the folder of tiles which is being filled.
-_WRITES = "tiles"
 #: Gaussians of a tile: about a megabyte with spherical harmonics of degree 3.
 MAX_GAUSSIANS_PER_TILE = 50_000
 #: The extension of glTF asks for version 2.
 SPZ_VERSION = 2
 #: Tiles are not divided below this share of the scene: what is closer together stays together, however many there are.
 MAX_DEPTH = 16
-#: A merged level errs by so many edges of its cells. Viewers go on to finer tiles where the error is larger than (as
-#: usual) 16 pixels: cells are then 4 pixels wide.
-ERROR_PER_CELL_EDGE = 4.0
+#: A merged level errs by so many of the widths that it merged. Viewers go on to finer tiles where the error is larger
+#: than (as usual) 16 pixels: what is merged is then 4 pixels wide.
+ERROR_PER_WIDTH = 4.0
 
 
 @dataclass(frozen=True)
@@ -65,8 +55,7 @@ class TilesetNode:
 
 def check_tileset_folder(path: Path, scene: ExportScene) -> None:
     """Raise VdgsError where the folder belongs to something else."""
-    if path.is_dir():
-        raise VdgsError(f"{path}: is a folder. 3D Tiles are written as FOLDER/{TILESET_FILE}.")
+    check_no_folder(path, "3D Tiles")
 
 
 def write_tiles(path: Path, scene: ExportScene, max_gaussians: int = MAX_GAUSSIANS_PER_TILE) -> tuple[str, ...]:
@@ -77,64 +66,33 @@ def write_tiles(path: Path, scene: ExportScene, max_gaussians: int = MAX_GAUSSIA
     lost. Raises VdgsError.
     """
     check_tileset_folder(path, scene)
-    older = tileset_files(path)
-    taken = [int(each.name[6:]) for each in path.parent.glob("tiles-*") if each.name[6:].isdecimal()]
-    folder = path.parent / f"tiles-{1 + max(taken, default=0)}"
-    try:
-        with explain_disk_errors(path), scratch_folder(path) as scratch:
-            (scratch / _WRITES).write_text(folder.name)
-            root = _TileQuadtree(write_store(scene, scratch / "rows"), folder, scene.metadata, max_gaussians).build()
-        write_json(path, _tileset(root, scene.metadata))
-    except BaseException:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise
-    _remove(older)
+
+    def fill(folder: Path, scratch: Path) -> JsonObject:
+        tree = _TileQuadtree(write_store(scene, scratch / "rows"), folder, scene.metadata, max_gaussians)
+        return _tileset(tree.build(), scene.metadata)
+
+    TILE_FOLDER.write(path, fill)
     notes = ["positions are rounded to 0.24 mm, colors and shapes to bytes"]
     if scene.metadata.geodetic is None:
         notes.append("the scene is not georeferenced: globes show it at the center of the Earth")
     return tuple(notes)
 
 
-def tileset_files(path: Path) -> list[Path]:
-    """The files that the tileset at `path` names, where it is one that `write_tiles` wrote; else none.
-
-    Any other tileset, a damaged one, and what is named otherwise than our own tiles is not for us to touch.
-    """
-    try:
-        tileset = json.loads(path.read_bytes())
-        if not str(tileset["asset"]["generator"]).startswith("vdgs "):
-            return []
-        found, waiting = [], [tileset["root"]]
-        while waiting:
-            entry = waiting.pop()
-            found.append(str(entry["content"]["uri"]))
-            waiting += entry.get("children", [])
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+def _named_tiles(path: Path) -> list[str]:
+    """The tiles that our own tileset names."""
+    tileset = json.loads(path.read_bytes())
+    if not str(tileset["asset"]["generator"]).startswith("vdgs "):
         return []
-    return [path.parent / uri for uri in sorted(set(found)) if _TILE.fullmatch(uri)]
+    found, waiting = list[str](), [tileset["root"]]
+    while waiting:
+        entry = waiting.pop()
+        found.append(str(entry["content"]["uri"]))
+        waiting += entry.get("children", [])
+    return found
 
 
-def remove_killed(path: Path) -> list[Path]:
-    """Remove what killed exports of the tileset at `path` left: scratch folders, and the tiles that they had begun.
-    Returns what was there. Raises nothing for what cannot be removed."""
-    named, begun = set(tileset_files(path)), list[Path]()
-    for each in leftovers(path):
-        with suppress(OSError, UnicodeDecodeError):
-            begun += sorted(path.parent.joinpath((each / _WRITES).read_text()).glob("*"))
-    inside = {each: str(each.relative_to(path.parent)) for each in begun if each.parent.parent == path.parent}
-    tiles = [each for each, name in inside.items() if _UNFINISHED.fullmatch(name) and each not in named]
-    _remove(tiles)
-    return [*remove_leftovers(path), *sorted({each.parent for each in tiles})]
-
-
-def _remove(tiles: list[Path]) -> None:
-    """Remove tiles and the folders that are empty then. What people have put beside them stays."""
-    for each in tiles:
-        with suppress(OSError):
-            each.unlink()
-    for folder in sorted({each.parent for each in tiles}):
-        with suppress(OSError):
-            folder.rmdir()
+#: A tile's name says where in the quadtree it stands.
+TILE_FOLDER = FileFolder("tiles", re.compile(r"[0-3]+\.glb|\.[0-3]+\.glb\.[0-9]+\.tmp"), _named_tiles)
 
 
 class _TileQuadtree:
@@ -163,10 +121,10 @@ class _TileQuadtree:
         together = children[0].gaussians
         for child in children[1:]:
             together = together.concat(child.gaussians)
-        coarse, edge = simplify(together, self.most)
+        coarse, width = merge_to(together, self.most)
         below = max(child.error for child in children)
         # A lone child is no coarser than its parent: errors must still grow towards the root.
-        return self._written(coarse, max(ERROR_PER_CELL_EDGE * edge, 1.25 * below, 1e-3), children, name)
+        return self._written(coarse, max(ERROR_PER_WIDTH * width, 1.25 * below, 1e-3), children, name)
 
     def _written(self, gaussians: Gaussians, error: float, children: list[TilesetNode], name: str) -> TilesetNode:
         low, high = _box(gaussians)
