@@ -51,7 +51,7 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         ortho_folder = SimpleNamespace(path=tmp_path / "run")
         status = SimpleNamespace(model_id="1-2")
         opened = SimpleNamespace(folder=ortho_folder, capture=capture, model=model, name="coarse", status=status)
-        monkeypatch.setattr(RunContext, "open_model", lambda *_: opened)
+        monkeypatch.setattr(RunContext, "open_model", lambda *_, **__: opened)
         request = OrthoRequest(run=tmp_path / "run", device="cpu", **asked)
         return render_ortho.render_ortho(
             RunContext.from_path(request.run), request, Console(file=sys.stderr, soft_wrap=True)

@@ -33,6 +33,7 @@ the stages of a run, one by one:
   partition RUN                     cut the scene into blocks and give each its cameras
   train-blocks RUN [--block N]      train the blocks, or one of them; the same command continues
   merge RUN                         the blocks become one scene
+  lod RUN                           levels of detail, for scenes of millions of anchors; the same command continues
   eval RUN                          metrics and pictures of the test views
   report RUN                        one HTML file with figures, metrics, pictures and settings
 
@@ -50,7 +51,7 @@ one of photographs.
 #: The verbs, which begin the lines of the help.
 COMMANDS = tuple(re.findall(r"^  ([a-z][a-z-]*) ", HELP, re.MULTILINE))
 #: Verbs that take up what they left when they were interrupted.
-RESUMABLE_COMMANDS = ("run", "sfm", "train-coarse", "train-blocks", "ortho", "bench")
+RESUMABLE_COMMANDS = ("run", "sfm", "train-coarse", "train-blocks", "lod", "ortho", "bench")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

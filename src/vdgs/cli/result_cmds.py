@@ -16,6 +16,7 @@ from vdgs.cli.common import (
 )
 from vdgs.config.commands import (
     BIN_COUNT_RANGE,
+    MAX_RENDER_SIDE_PX,
     ComputeOptions,
     ModelName,
     OrthoRequest,
@@ -23,7 +24,7 @@ from vdgs.config.commands import (
     RunPath,
     ViewRequest,
 )
-from vdgs.config.ranges import Positional
+from vdgs.config.ranges import Positional, Range
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,6 +64,9 @@ class EvalArguments(ShardArguments, ComputeOptions, StageArguments):
     views: Literal["test", "training"] = "test"
     """Which views. `training` goes into evaluation_training: a model that is much better there than on test views
     overfits. Blocks and seams are measured on test views only."""
+    lod_error: Annotated[float | None, Range(0, MAX_RENDER_SIDE_PX)] = None
+    """Draw through the run's level-of-detail tree (`vdgs lod`), at most so many pixels off. The figures go into
+    evaluation_lod_PX; blocks and seams are not measured."""
     lpips_weights: Path | None = None
     """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
     visibility_bins: Annotated[int, BIN_COUNT_RANGE] = 4
@@ -82,6 +86,7 @@ def eval_command(arguments: list[str]) -> None:
         visibility_bins=args.visibility_bins,
         views=args.views,
         device=device,
+        lod_error=args.lod_error,
     )
     context = RunContext.from_path(args.run, args.capture)
     evaluate_stage(context, request, make_console(args.quiet), args.execution(device))

@@ -14,7 +14,7 @@ from vdgs.cli.common import (
     set_up_compute,
     update_run_settings,
 )
-from vdgs.config.commands import ComputeOptions
+from vdgs.config.commands import ComputeOptions, LodRequest
 from vdgs.config.executor_options import CheckpointOptions, ExecutorOptions
 from vdgs.config.method import AssignmentConfig, BlockConfig, MergeConfig, PartitionConfig
 from vdgs.config.ranges import WORKER_COUNT, FlagName, Range
@@ -120,3 +120,23 @@ def merge_command(arguments: list[str]) -> None:
     context, console = RunContext.from_path(args.run, args.capture), make_console(args.quiet)
     update_run_settings(run, replace(method, merge=args.merge), False, console)
     merge_run_blocks(context, args.allow_missing_blocks, console)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LodArguments(LodRequest, StageArguments):
+    """Make a level-of-detail tree of a run's scene, so that views of any size are drawn in bounded time and memory.
+
+    `vdgs view` uses it by itself; `vdgs render`, `ortho` and `eval` with --lod-error. The same command continues.
+    """
+
+    threads: Annotated[int, WORKER_COUNT] = 0
+    """Threads; 0 for all cores. The result does not depend on it."""
+
+
+def lod_command(arguments: list[str]) -> None:
+    args = parse_arguments(LodArguments, arguments, "lod")
+    from vdgs.pipeline.build_lod import build_lod
+    from vdgs.runs.run_context import RunContext
+
+    set_up_compute("cpu", args.threads)
+    build_lod(RunContext.from_path(args.run, args.capture), args, make_console(args.quiet))

@@ -87,6 +87,8 @@ class RunRequest(ComputeOptions):
     ortho: bool = True
     """End with maps in RUN/maps. Orthophoto, surface model and visibility as GeoTIFFs, where `vdgs ortho` can make
     them."""
+    lod: bool = True
+    """Make levels of detail of a merged scene of more than a million anchors (`vdgs lod`)."""
     lpips_weights: Path | None = None
     """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
     visibility_bins: Annotated[int, BIN_COUNT_RANGE] = 4
@@ -106,6 +108,14 @@ class RunRequest(ComputeOptions):
     def method(self) -> MethodConfig:
         """The settings that the result depends on."""
         return MethodConfig(self.training, self.partition, self.assignment, self.block, self.merge)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LodRequest(RunPath):
+    """A level-of-detail tree of a run (`vdgs lod`)."""
+
+    model: ModelName = "best"
+    """Which model. `best` is the merged one where there is one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,6 +145,9 @@ class RenderRequest(ModelRequest):
     mode: Literal["rgb", "depth", "visibility", "alpha"] = "rgb"
     """What to draw: the picture; the median depth, at which a pixel becomes half opaque (gray where it never does); the
     number of training cameras that see each place, V; or alpha, how opaque the scene is."""
+    lod_error: Annotated[float | None, Range(0, MAX_RENDER_SIDE_PX)] = None
+    """Draw through the run's level-of-detail tree (`vdgs lod`), at most so many pixels off. By default, and with 0,
+    everything is drawn from all anchors."""
     colorbar: bool = True
     """Put a strip with the scale of the colors below each map; without it a map is as large as the image."""
     raw: bool = False
@@ -158,6 +171,9 @@ class OrthoRequest(ModelRequest):
     """Coordinates: EPSG:n, `enu`, `source` or `local`. EPSG:25832, `enu` (metres east and north of the scene's origin),
     `source` (those of the capture) or `local` (the ground frame). By default the UTM zone of a georeferenced capture,
     else `local`."""
+    lod_error: Annotated[float | None, Range(0, MAX_RENDER_SIDE_PX)] = None
+    """Draw through the run's level-of-detail tree (`vdgs lod`), at most so many pixels off. By default, and with 0,
+    everything is drawn from all anchors."""
     detail_from_images: bool = False
     """Take the fine detail of the orthophoto from the photographs. That is done where they truly see a place."""
 

@@ -27,8 +27,9 @@ from vdgs.evaluation.view_exposures import make_exposures
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import Raster
 from vdgs.model.anchor_model import AnchorModel, DecoderSpan
-from vdgs.model.renderer import decode_view, render, render_scalar_map
+from vdgs.model.renderer import render, render_scalar_map, view_splats
 from vdgs.partition.block_regions import split_trainable_anchors
+from vdgs.runs.lod_folder import drawn_scene
 from vdgs.runs.model_integrity import load_verified
 from vdgs.runs.open_run import OpenedRun, load_run_blocks
 from vdgs.runs.run_folder import RunFolder
@@ -55,12 +56,14 @@ def evaluate_run(
     bins: int,
     console: Console,
     views: EvaluationSplit = "test",
+    lod_error: float | None = None,
 ) -> None:
-    """Measure a model of a run, opened beside its coarse one, and print a table. Writes `evaluation_folder`."""
+    """Measure a model of a run, opened beside its coarse one, and print a table. Writes `evaluation_folder`. With a
+    `lod_error` it is drawn through its level-of-detail tree, on the device of the coarse one."""
     check_bins(bins)
-    output = evaluation_folder(run.folder, run.name, views)
+    output = evaluation_folder(run.folder, run.name, views, lod_error)
     lpips, note = load_lpips(lpips_weights)
-    model, settings = make_renderable_model(run, coarse, views), make_evaluation_settings(bins, views)
+    model, settings = make_renderable_model(run, coarse, views, lod_error), make_evaluation_settings(bins, views)
     with cached_reference_views(select_views(run.capture, views)) as images:
         stage = "evaluation" if run.name == "merged" else "coarse evaluation"
         evaluate_model(
@@ -84,8 +87,11 @@ def select_views(capture: Capture, views: EvaluationSplit) -> list[View]:
     return list(capture.test_views if views == "test" else capture.train_views)
 
 
-def make_renderable_model(run: OpenedRun, coarse: OpenedRun, views: EvaluationSplit) -> RenderableModel:
+def make_renderable_model(
+    run: OpenedRun, coarse: OpenedRun, views: EvaluationSplit, lod_error: float | None = None
+) -> RenderableModel:
     """The opened model as the evaluation sees it, beside the coarse model of its run."""
+    scene = drawn_scene(run, lod_error, str(coarse.device))
     metadata = EvaluatedModel(
         model=run.name,
         n_anchors=len(run.model.anchors),
@@ -96,11 +102,11 @@ def make_renderable_model(run: OpenedRun, coarse: OpenedRun, views: EvaluationSp
         key=run.key,
     )
     return RenderableModel(
-        render=lambda camera: render(run.model, camera), visibility_map=make_visibility_map(coarse), metadata=metadata,
+        render=lambda camera: render(scene, camera), visibility_map=make_visibility_map(coarse), metadata=metadata,
         background=run.model.background, coverage_map=make_coverage_map(coarse),
         true_depth=make_true_depth(run.capture, select_views(run.capture, views)),
-        render_depth=lambda camera: render(run.model, camera, depth=True), camera_height=camera_height(run.capture),
-        decode_splats=lambda camera: decode_view(run.model, camera)[1], exposure=make_exposures(run.model, run.capture),
+        render_depth=lambda camera: render(scene, camera, depth=True), camera_height=camera_height(run.capture),
+        decode_splats=lambda camera: view_splats(scene, camera)[1], exposure=make_exposures(run.model, run.capture),
     )  # fmt: skip
 
 

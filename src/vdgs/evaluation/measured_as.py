@@ -13,11 +13,14 @@ from vdgs.system.documents import MeasuredAs
 EvaluationSplit = Literal["test", "training"]
 
 
-def evaluation_folder(run: RunFolder, name: str, views: EvaluationSplit = "test") -> Path:
+def evaluation_folder(
+    run: RunFolder, name: str, views: EvaluationSplit = "test", lod_error: float | None = None
+) -> Path:
     """Where the figures of a model ("coarse" or "merged") are: RUN/evaluation, RUN/coarse/evaluation; of training views
-    beside them, in `evaluation_training`."""
+    beside them, in `evaluation_training`, and of levels of detail in `evaluation_lod_1.5` or the like."""
     folder = run.evaluation if name == "merged" else run.coarse.path / "evaluation"
-    return folder if views == "test" else folder.with_name(f"{folder.name}_training")
+    suffix = ("" if views == "test" else "_training") + ("" if lod_error is None else f"_lod_{lod_error:g}")
+    return folder.with_name(f"{folder.name}{suffix}")
 
 
 def is_evaluated(run: RunFolder, name: str, lpips_weights: Path | None, bins: int) -> bool:

@@ -62,6 +62,10 @@ class AnchorModel:
         parts = tuple(replace(part, decoder=part.decoder.to(device)) for part in self.decoder_spans)
         return replace(self, anchors=self.anchors.to(device), decoder=self.decoder.to(device), decoder_spans=parts)
 
+    def without_anchors(self) -> AnchorModel:
+        """The decoders of the model, whose spans still say which rows they decode."""
+        return replace(self, anchors=self.anchors.select(torch.zeros(0, dtype=torch.long)))
+
     def save(self, path: Path) -> None:
         """Write one safetensors file, atomically."""
         tensors = {f"anchors.{k}": v for k, v in self.anchors.tensors().items()}
@@ -80,8 +84,12 @@ class AnchorModel:
         write_atomic(path, lambda temporary: write_tensors(temporary, tensors, header))
 
     @staticmethod
-    def load(path: Path) -> AnchorModel:
-        """Read a model. Raises VdgsError if the file is missing, damaged or not an anchor model."""
+    def load(path: Path, *, checked: bool = True) -> AnchorModel:
+        """Read a model. Raises VdgsError if the file is missing, damaged or not an anchor model.
+
+        Unless `checked`, numbers are neither read nor checked: they stay in the file, which is mapped, until they are
+        used.
+        """
         tensors, header = read_tensors(path)
         found = next((name for name in (ANCHOR_MODEL_FORMAT, MULTI_DECODER_FORMAT) if name in header), None)
         if found is None:
@@ -92,14 +100,15 @@ class AnchorModel:
             decoder = _decoder_of(tensors, "decoder.")
             counts = known["parts"] if found == MULTI_DECODER_FORMAT else []
             parts = tuple(DecoderSpan(int(n), _decoder_of(tensors, f"part.{i}.")) for i, n in enumerate(counts))
-            if known["crc32"] != tensors_crc32(tensors):
+            if checked and known["crc32"] != tensors_crc32(tensors):
                 raise ValueError("its checksum does not agree")
             red, green, blue = (float(value) for value in known["background"])
             model = AnchorModel(
                 anchors=anchors, decoder=decoder, voxel_size=float(known["voxel"]), background=(red, green, blue),
                 metadata=ModelMetadata.from_dict(known["facts"]), decoder_spans=parts,
             )  # fmt: skip
-            model.check()
+            if checked:
+                model.check()
         except (KeyError, ValueError, TypeError) as error:
             raise VdgsError(f"{path}: is damaged or incomplete ({error}). {REBUILD_HINT}") from error
         return model

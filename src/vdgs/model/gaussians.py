@@ -80,6 +80,13 @@ def render_gaussians(
 
     Differentiable in all tensors of `gaussians`.
     """
+    splats = project_splats(gaussians, camera, degree)
+    kernels = get_backend(gaussians.means.device)
+    return kernels.rasterize(splats, background, camera.width, camera.height, depth=depth), splats.means_px
+
+
+def project_splats(gaussians: Gaussians, camera: Camera, degree: int) -> Splats:
+    """The splats of a view, with opacity 0 where none is to be drawn."""
     kernels = get_backend(gaussians.means.device)
     projected = kernels.project(gaussians.means, gaussians.log_scales.exp(), gaussians.quaternions, camera)
     if camera.model == "pinhole":
@@ -87,10 +94,8 @@ def render_gaussians(
         directions = torch.nn.functional.normalize(gaussians.means - center, dim=-1)
     else:
         directions = torch.from_numpy(camera.forward.astype(np.float32)).to(gaussians.means).expand(len(gaussians), 3)
-    splats = Splats(
+    return Splats(
         projected.means_px, projected.conics, projected.depths,
         eval_sh_colors(gaussians.sh0, gaussians.shN, directions, degree),
         torch.where(projected.valid, gaussians.opacity_logits.sigmoid(), 0.0),
     )  # fmt: skip
-    raster = kernels.rasterize(splats, background, camera.width, camera.height, depth=depth)
-    return raster, projected.means_px

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Int64
@@ -14,6 +15,20 @@ from vdgs.kernels import get_backend
 from vdgs.kernels.kernel_types import SPLAT_TENSORS, AnchorSplats, DecoderWeights, Raster, Splats, TrainingSplats
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
+
+
+@runtime_checkable
+class LodDrawable(Protocol):
+    """A scene in levels of detail (`model.lod_scene`)."""
+
+    @property
+    def background(self) -> tuple[float, float, float]: ...
+
+    def view_splats(self, camera: Camera, image_index: int | None = None) -> tuple[Int64[Tensor, " m"], Splats]: ...
+
+
+#: What can be drawn.
+Drawable = AnchorModel | LodDrawable
 
 
 def decode_anchors(
@@ -69,9 +84,17 @@ def rasterize_splats(splats: Splats, camera: Camera, background: Float[Tensor, "
     return kernels.rasterize(splats, background, camera.width, camera.height, depth=depth)
 
 
+def view_splats(model: Drawable, camera: Camera, image_index: int | None = None) -> tuple[Int64[Tensor, " m"], Splats]:
+    """The splats of a view, and the anchor that each is of (of a scene in levels of detail, the place)."""
+    if not isinstance(model, AnchorModel):
+        return model.view_splats(camera, image_index)
+    rows, splats = decode_view(model, camera, image_index)
+    return rows[splats.source.long() // model.anchors.offsets.shape[1]], splats
+
+
 @torch.no_grad()
 def render(
-    model: AnchorModel,
+    model: Drawable,
     camera: Camera,
     *,
     background: tuple[float, float, float] | None = None,
@@ -82,24 +105,24 @@ def render(
 
     `background` replaces the model's own. `image_index` selects the appearance of a training image; None: the mean.
     """
-    _, splats = decode_view(model, camera, image_index)
+    find = decode_view if isinstance(model, AnchorModel) else view_splats
+    _, splats = find(model, camera, image_index)  # type: ignore[arg-type]
     return rasterize_splats(splats, camera, splats.means_px.new_tensor(background or model.background), depth)
 
 
 @torch.no_grad()
 def render_scalar(
-    model: AnchorModel, values: Float[Tensor, " n"], camera: Camera
+    model: Drawable, values: Float[Tensor, " n"], camera: Camera
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
     """A value per anchor blended in place of its color, over 0, and alpha."""
-    rows, splats = decode_view(model, camera)
-    k = model.anchors.offsets.shape[1]
-    of_splat = values.to(rows.device)[rows][splats.source.long() // k].float()
+    rows, splats = view_splats(model, camera)
+    of_splat = values.to(rows.device)[rows].float()
     gray = replace(splats, colors=of_splat[:, None].expand(-1, 3).contiguous())
     painted = rasterize_splats(gray, camera, splats.means_px.new_zeros(3))
     return painted.image[..., 0], painted.alpha
 
 
-def render_scalar_map(model: AnchorModel, values: Float[Tensor, " n"], camera: Camera) -> Float[Tensor, "h w"]:
+def render_scalar_map(model: Drawable, values: Float[Tensor, " n"], camera: Camera) -> Float[Tensor, "h w"]:
     """A value per anchor as a map: the alpha-weighted mean at each pixel, NaN where alpha is at most one half."""
     scale = float(values.max().clamp(min=1)) if len(values) else 1.0
     painted, alpha = render_scalar(model, values / scale, camera)

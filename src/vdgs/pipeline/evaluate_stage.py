@@ -46,7 +46,7 @@ from vdgs.evaluation.measured_as import EvaluationSplit, evaluation_folder, expo
 from vdgs.evaluation.renderable_model import EvaluatedModel, EvaluationSettings
 from vdgs.evaluation.view_metrics import ViewInputs, measure_view
 from vdgs.evaluation.view_metrics_io import load_view_metrics, save_view_metrics
-from vdgs.runs.open_run import ModelLocation, load_run_blocks, locate_model
+from vdgs.runs.open_run import ModelLocation, OpenedRun, load_run_blocks, locate_model
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
 from vdgs.system.atomic_files import read_json, write_bytes, write_json
@@ -72,6 +72,8 @@ class EvaluationRequest:
     visibility_bins: int = 4
     views: EvaluationSplit = "test"
     device: str = "cpu"
+    lod_error: float | None = None
+    """Drawn through the level-of-detail tree, at most so many pixels off; None: from all anchors."""
 
 
 @dataclass(frozen=True)
@@ -90,12 +92,12 @@ class _Evaluation:
 
     @property
     def output(self) -> Path:
-        return evaluation_folder(self.run, self.model.name, self.request.views)
+        return evaluation_folder(self.run, self.model.name, self.request.views, self.request.lod_error)
 
     @property
     def has_seams(self) -> bool:
         """Whether blocks and the seams between them are measured too."""
-        is_merged = self.request.views == "test" and self.model.name == "merged"
+        is_merged = self.request.views == "test" and self.model.name == "merged" and self.request.lod_error is None
         return is_merged and len(load_run_blocks(self.run)) > 1
 
     @property
@@ -120,6 +122,8 @@ class _Evaluation:
         depends_on = [
             model.stage.status().model_id, model.key, run.coarse_model_id(), blocks, str(weights), request.views
         ]  # fmt: skip
+        if request.lod_error is not None:
+            depends_on.append(f"{request.lod_error}")
         if exposure := exposure_mode(run):
             depends_on.append(exposure)
         spans = split_ranges(view_count, *SHARD_VIEWS)
@@ -164,14 +168,22 @@ def _evaluate_here(context: RunContext, evaluation: _Evaluation, console: Consol
     request, output = evaluation.request, evaluation.output
     with lock_folder(output):
         clear(output)
-        opened, coarse = (context.open_model(which, request.device) for which in (request.which, "coarse"))
+        opened, coarse = _open(context, request, request.device)
         evaluation.begin(len(select_views(opened.capture, request.views)), console)
         reset_peak_memory()
-        evaluate_run(opened, coarse, request.lpips_weights, request.visibility_bins, console, request.views)
+        evaluate_run(
+            opened, coarse, request.lpips_weights, request.visibility_bins, console, request.views, request.lod_error
+        )
         if evaluation.has_seams:
             with cached_reference_views(opened.capture.test_views) as images:
                 console.print(make_block_table(evaluate_blocks(make_block_inputs(opened, coarse, images), output)))
     return peak_memory_bytes()
+
+
+def _open(context: RunContext, request: EvaluationRequest, device: str) -> tuple[OpenedRun, OpenedRun]:
+    """The model that is measured, and the coarse one."""
+    opened = context.open_model(request.which, device, mapped=request.lod_error is not None)
+    return opened, context.open_model("coarse", device)
 
 
 def _evaluate_in_shards(
@@ -197,14 +209,14 @@ def measure_shard(shard: Shard) -> None:
     belong."""
     evaluation = _Evaluation.create(shard.request(EvaluationRequest))
     request, context = evaluation.request, RunContext.from_path(evaluation.request.path)
-    opened, coarse = (context.open_model(which, shard.device) for which in (request.which, "coarse"))
+    opened, coarse = _open(context, request, shard.device)
     views = select_views(opened.capture, request.views)
     job = evaluation.job(len(views))
 
     def results(left: Sequence[int]) -> Results:
         with cached_reference_views(views) as images:
             lpips, note = load_lpips(request.lpips_weights)
-            model = make_renderable_model(opened, coarse, request.views)
+            model = make_renderable_model(opened, coarse, request.views, request.lod_error)
             inputs = ViewInputs(images, model, lpips, evaluation.settings, job.output)
             blocks = make_block_inputs(opened, coarse, images) if evaluation.has_seams else None
             metadata = {"model": record_to_dict(model.metadata), "lpips_note": note}

@@ -11,7 +11,7 @@ from rich.markup import escape
 from vdgs.captures.format_dispatch import lacks_points
 from vdgs.captures.output_guard import check_output
 from vdgs.config.capture_options import AUTO_MASKS, CaptureOptions
-from vdgs.config.commands import OrthoRequest, RunRequest
+from vdgs.config.commands import LodRequest, OrthoRequest, RunRequest
 from vdgs.config.ranges import check_ranges
 from vdgs.config.validation_rules import check_config
 from vdgs.distributed.backend_selection import check_backend_reachable
@@ -19,6 +19,7 @@ from vdgs.distributed.sharded_job import ExecutionOptions
 from vdgs.errors import RunError, Stopped, VdgsError
 from vdgs.evaluation.lpips import check_weights_file
 from vdgs.evaluation.measured_as import evaluation_folder, is_evaluated
+from vdgs.pipeline.build_lod import build_lod
 from vdgs.pipeline.count_visibility import count_run_visibility
 from vdgs.pipeline.evaluate_stage import EvaluationRequest, evaluate_stage
 from vdgs.pipeline.find_motion import find_run_motion
@@ -40,6 +41,9 @@ from vdgs.sfm.sfm_estimate import SfmEstimate
 from vdgs.system.atomic_files import read_json
 from vdgs.system.documents import EvaluationMetrics
 from vdgs.system.stop_signals import check_stop_requested
+
+#: Levels of detail are made of a merged scene with more anchors.
+LOD_MIN_ANCHORS = 1_000_000
 
 
 def run_pipeline(request: RunRequest, console: Console, command: str | None = None) -> None:
@@ -132,11 +136,24 @@ def _stages(context: RunContext, request: RunRequest, console: Console) -> None:
     _measure(context, "merged", request, console)
     context.release_models("coarse")
     _print_improvement(run, console)
+    if request.lod and (run.merged.status().anchors or 0) > LOD_MIN_ANCHORS:
+        _lod(context, console)
     if request.ortho:
         _ortho(context, request, console)
     check_stop_requested()
     run.begin_step("report")
     console.print(f"report: {write_report(run)}", highlight=False)
+
+
+def _lod(context: RunContext, console: Console) -> None:
+    """Levels of detail. An error of theirs does not fail the run: it is printed."""
+    _title(console, "levels of detail")
+    try:
+        build_lod(context, LodRequest(run=context.run.path), console)
+    except Stopped:
+        raise
+    except VdgsError as error:
+        console.print(f"[yellow]note[/] no levels of detail: {escape(str(error))}", highlight=False)
 
 
 def _ortho(context: RunContext, request: RunRequest, console: Console) -> None:

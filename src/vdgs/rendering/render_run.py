@@ -18,12 +18,13 @@ from vdgs.errors import VdgsError
 from vdgs.evaluation.comparison_images import unique_file_stems, write_png
 from vdgs.evaluation.metrics import to_8bit
 from vdgs.geometry.camera import Camera
-from vdgs.model.renderer import render
+from vdgs.model.renderer import Drawable, render
 from vdgs.rendering import camera_paths
 from vdgs.rendering.path_io import load_path
 from vdgs.rendering.render_folder import begin_render, finish_render
 from vdgs.rendering.scalar_maps import ScalarMap, add_colorbar, draw_colorbar, make_scalar_map
 from vdgs.rendering.video import VideoWriter, caution, default_encoder
+from vdgs.runs.lod_folder import open_lod
 from vdgs.runs.open_run import OpenedModel, open_capture, open_model
 from vdgs.runs.run_cameras import RunCameras, load_run_cameras, run_cameras_of_capture
 from vdgs.runs.run_folder import RunFolder
@@ -46,6 +47,7 @@ class _Render:
 
     request: RenderRequest
     run: OpenedModel
+    scene: Drawable
     run_cameras: RunCameras
     named: list[tuple[str, Camera]]
     console: Console
@@ -53,14 +55,14 @@ class _Render:
     def scalar_map(self) -> ScalarMap | None:
         """The map that all views are drawn as; None for color images."""
         mode, cameras = self.request.mode, [camera for _, camera in self.named]
-        return None if mode == "rgb" else make_scalar_map(mode, self.run, self.run_cameras, cameras)
+        return None if mode == "rgb" else make_scalar_map(mode, self.run, self.scene, self.run_cameras, cameras)
 
     def frames(self, scalar_map: ScalarMap | None) -> Iterator[_Frame]:
         """One frame per camera, in order."""
         for name, camera in track(self.named, "rendering", len(self.named), self.console):
             check_stop_requested()
             if scalar_map is None:
-                yield name, to_8bit(render(self.run.model, camera).image.cpu().numpy()), None
+                yield name, to_8bit(render(self.scene, camera).image.cpu().numpy()), None
                 continue
             values = scalar_map.values(camera)
             image = scalar_map.scale.colorize(values)
@@ -75,7 +77,7 @@ def render_run(request: RenderRequest, console: Console) -> None:
     """
     began = time.monotonic()
     _check(request)
-    run = open_model(RunFolder(request.run), request.model, request.device)
+    run, scene = _open(request)
     run_cameras = _load_cameras(request, run)
     check_not_among_folders(request.output, run_cameras.root, run_cameras.input_folders)
     if run.warning:
@@ -84,10 +86,19 @@ def render_run(request: RenderRequest, console: Console) -> None:
     if request.width:
         named = [(name, camera.resized(request.width, _height(camera, request.width))) for name, camera in named]
     _check_size(request, [camera for _, camera in named])
-    job = _Render(request=request, run=run, run_cameras=run_cameras, named=named, console=console)
+    job = _Render(request=request, run=run, scene=scene, run_cameras=run_cameras, named=named, console=console)
     summary = _write_video(job, fps) if request.output.suffix else _write_images(job)
     seconds = time.monotonic() - began
     console.print(f"{run.summary}: {summary}, drawn in {seconds:.1f} s: {request.output}", highlight=False)
+
+
+def _open(request: RenderRequest) -> tuple[OpenedModel, Drawable]:
+    """The model, and what it is drawn from."""
+    if request.lod_error is None:
+        run = open_model(RunFolder(request.run), request.model, request.device)
+        return run, run.model
+    run, tree = open_lod(RunFolder(request.run), request.model, request.device)
+    return run, tree.at_error(request.lod_error)
 
 
 def _check(request: RenderRequest) -> None:
@@ -146,6 +157,8 @@ def _metadata(request: RenderRequest, model: str, scalar_map: ScalarMap | None) 
     views = request.views if request.path is None else str(request.path)
     run = str(request.run.resolve())
     metadata: dict[str, object] = {"run": run, "model": model, "mode": request.mode, "views": views}
+    if request.lod_error is not None:
+        metadata["lod_error"] = request.lod_error
     if scalar_map is not None:
         limits = [scalar_map.scale.low, scalar_map.scale.high]
         metadata |= {"numbers": scalar_map.description, "colors_between": limits, "legend_below": request.colorbar}

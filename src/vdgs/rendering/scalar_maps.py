@@ -12,15 +12,17 @@ from jaxtyping import Float, Shaped, UInt8
 from matplotlib.colors import Normalize
 from matplotlib.ticker import MaxNLocator
 from PIL import Image, ImageDraw
+from torch import Tensor
 
 from vdgs.evaluation.comparison_images import FAINT, INK, PAPER, load_font
 from vdgs.geometry.camera import Camera
-from vdgs.model.anchor_model import AnchorModel
-from vdgs.model.renderer import render, render_scalar_map
+from vdgs.model.lod_scene import LodScene
+from vdgs.model.renderer import Drawable, render, render_scalar_map
 from vdgs.runs.open_run import OpenedModel
 from vdgs.runs.run_cameras import RunCameras
 from vdgs.runs.visibility_store import get_run_visibility
 from vdgs.system.figure_style import VISIBILITY_CMAP
+from vdgs.visibility.visibility_counts import count_visibility
 from vdgs.visibility.visibility_map import visibility_color_norm
 
 ScalarMapMode = Literal["depth", "visibility", "alpha"]
@@ -70,13 +72,15 @@ class ScalarMap:
 
 
 def make_scalar_map(
-    mode: ScalarMapMode, run: OpenedModel, run_cameras: RunCameras, cameras: Sequence[Camera]
+    mode: ScalarMapMode, run: OpenedModel, scene: Drawable, run_cameras: RunCameras, cameras: Sequence[Camera]
 ) -> ScalarMap:
-    """The map of a model to be drawn in all of `cameras`; `run_cameras` are those of its run."""
-    return {"depth": _depth, "visibility": _visibility, "alpha": _alpha}[mode](run, run_cameras, cameras)
+    """The map of a model, drawn as `scene`, in all of `cameras`; `run_cameras` are those of its run."""
+    if mode == "visibility":
+        return _visibility(run, scene, run_cameras)
+    return _alpha(scene) if mode == "alpha" else _depth(scene, run_cameras, cameras)
 
 
-def render_depth(model: AnchorModel, camera: Camera) -> Float[np.ndarray, "h w"]:
+def render_depth(model: Drawable, camera: Camera) -> Float[np.ndarray, "h w"]:
     """Median depth of a view; NaN where a pixel is at most half opaque."""
     raster = render(model, camera, depth=True)
     assert raster.median_depth is not None
@@ -84,16 +88,16 @@ def render_depth(model: AnchorModel, camera: Camera) -> Float[np.ndarray, "h w"]
     return np.where(alpha > 0.5, depth, np.nan).astype(np.float32)
 
 
-def _depth(run: OpenedModel, run_cameras: RunCameras, cameras: Sequence[Camera]) -> ScalarMap:
+def _depth(scene: Drawable, run_cameras: RunCameras, cameras: Sequence[Camera]) -> ScalarMap:
     unit = run_cameras.ground.unit
     meaning = (
         f"Median depth: z along the view, in {unit} of the ground frame, at which a pixel becomes half opaque; NaN "
         "where it never does."
     )
     sampled = np.linspace(0, len(cameras) - 1, min(len(cameras), _MAX_PREVIEWS)).round().astype(int)
-    previews = (render_depth(run.model, cameras[index].limit_size(_PREVIEW_PX)) for index in sampled)
+    previews = (render_depth(scene, cameras[index].limit_size(_PREVIEW_PX)) for index in sampled)
     scale = depth_scale(depth_range(previews, run_cameras.camera_height), unit)
-    return ScalarMap(lambda camera: render_depth(run.model, camera), scale, meaning)
+    return ScalarMap(lambda camera: render_depth(scene, camera), scale, meaning)
 
 
 def depth_range(depths: Iterable[Float[np.ndarray, "_ _"]], fallback: float) -> tuple[float, float]:
@@ -123,15 +127,21 @@ def depth_scale(depth_limits: tuple[float, float], unit: str) -> ColorScale:
     )
 
 
-def _visibility(run: OpenedModel, run_cameras: RunCameras, cameras: Sequence[Camera]) -> ScalarMap:
-    counts = get_run_visibility(run, run_cameras.cameras)
+def _visibility(run: OpenedModel, scene: Drawable, run_cameras: RunCameras) -> ScalarMap:
     meaning = (
         "V: how many training cameras see the place, the mean over the anchors that a pixel shows; NaN where alpha is "
         "at most 0.5."
     )
 
+    def count(places: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:
+        return count_visibility(places, run_cameras.cameras).float()
+
+    tree = scene if isinstance(scene, LodScene) else None
+    counts = get_run_visibility(run, run_cameras.cameras) if tree is None else count(tree.tree.gaussians(0).means)
+
     def values(camera: Camera) -> Float[np.ndarray, "h w"]:
-        return render_scalar_map(run.model, counts.float(), camera).cpu().numpy().astype(np.float32)
+        of_view = counts.float() if tree is None else tree.values(camera, lambda _, places: count(places))
+        return render_scalar_map(scene, of_view, camera).cpu().numpy().astype(np.float32)
 
     return ScalarMap(values, visibility_scale(counts.cpu().numpy()), meaning)
 
@@ -152,9 +162,9 @@ def visibility_scale(counts: Shaped[np.ndarray, " n"]) -> ColorScale:
     )
 
 
-def _alpha(run: OpenedModel, run_cameras: RunCameras, cameras: Sequence[Camera]) -> ScalarMap:
+def _alpha(scene: Drawable) -> ScalarMap:
     def values(camera: Camera) -> Float[np.ndarray, "h w"]:
-        return render(run.model, camera).alpha.cpu().numpy().astype(np.float32)
+        return render(scene, camera).alpha.cpu().numpy().astype(np.float32)
 
     return ScalarMap(values, alpha_scale(), "Alpha: how opaque the scene is, from 0 (nothing) to 1.")
 

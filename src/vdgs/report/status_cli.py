@@ -13,6 +13,7 @@ from vdgs.captures.place_record import PlaceFacts, place_summary
 from vdgs.captures.reconstruction import PROGRESS_FILE, SFM_STAGE, WORK_FOLDER, is_finished
 from vdgs.errors import VdgsError
 from vdgs.report.report_status import report_status
+from vdgs.runs.lod_status import lod_status
 from vdgs.runs.run_folder import PLACE_FILE, REPORT_FILE, RunFolder
 from vdgs.runs.run_status import RunStatus, StageState, StageStatus, get_run_status
 from vdgs.runs.stage_folder import StatusRecord
@@ -41,7 +42,7 @@ def full_run_status(run: RunFolder) -> RunStatus:
     if photographs is not None and not run.config_file.exists():  # it is written once there is a capture
         status = replace(status, problem="", command=photographs.command)
     before = () if photographs is None else (photographs,)
-    return replace(status, stages=(*before, *status.stages, report_status(run, status)))
+    return replace(status, stages=(*before, *status.stages, *lod_status(run, status), report_status(run, status)))
 
 
 def _photographs_status(run: RunFolder) -> StageStatus | None:

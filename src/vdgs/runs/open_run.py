@@ -17,7 +17,7 @@ from vdgs.model.anchor_model import AnchorModel
 from vdgs.partition.assignment.assign_cameras import Assignment
 from vdgs.partition.assignment.score_file import load_scores
 from vdgs.partition.blocks import Blocks, load_blocks
-from vdgs.runs.model_integrity import load_verified
+from vdgs.runs.model_integrity import load_verified, map_verified
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_status import get_run_status
 from vdgs.runs.stage_folder import StageFolder, StatusRecord
@@ -78,6 +78,11 @@ def open_model(folder: RunFolder, which: ModelName = "best", device: torch.devic
     """Open a model of a run on a device, without the capture. Raises RunError if it is not trained."""
     location = locate_model(folder, which)
     return location.opened(folder, load_verified(location.stage, location.key).to(torch.device(device)))
+
+
+def open_mapped(folder: RunFolder, location: ModelLocation) -> OpenedModel:
+    """A model of a run whose anchors stay on the disk until they are used. Raises what `map_verified` raises."""
+    return location.opened(folder, map_verified(location.stage, location.key))
 
 
 def check_has_anchors(folder: RunFolder, anchors: int | None) -> None:

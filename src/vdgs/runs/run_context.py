@@ -10,7 +10,15 @@ from vdgs.captures.capture import Capture
 from vdgs.config.commands import ModelName
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.runs.model_integrity import load_verified
-from vdgs.runs.open_run import ModelLocation, OpenedRun, locate_model, open_capture, relocate_capture, with_capture
+from vdgs.runs.open_run import (
+    ModelLocation,
+    OpenedRun,
+    locate_model,
+    open_capture,
+    open_mapped,
+    relocate_capture,
+    with_capture,
+)
 from vdgs.runs.run_folder import RunFolder
 
 
@@ -43,12 +51,17 @@ class RunContext:
             self._capture = open_capture(self.run)
         return self._capture
 
-    def open_model(self, which: ModelName = "best", device: torch.device | str = "cpu") -> OpenedRun:
-        """A model of the run on a device, with the capture; nobody may change its tensors.
+    def open_model(
+        self, which: ModelName = "best", device: torch.device | str = "cpu", *, mapped: bool = False
+    ) -> OpenedRun:
+        """A model of the run on a device, with the capture; nobody may change its tensors. Where it is `mapped`, its
+        anchors stay in their file until they are used.
 
         Raises RunError if it is not trained or was made from another capture, CaptureError as `capture` does.
         """
         capture, location = self.capture, locate_model(self.run, which)
+        if mapped:
+            return with_capture(open_mapped(self.run, location), capture)
         return with_capture(location.opened(self.run, self._model(location, torch.device(device))), capture)
 
     def release_models(self, *names: str) -> None:

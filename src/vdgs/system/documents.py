@@ -145,6 +145,7 @@ class MapMetadata(TypedDict, total=False):
     bounds: list[float]
     samples_per_pixel: int
     sharpened: bool
+    lod_error: float | None
     training_cameras: int
     notes: list[str]
     mapped_share: float

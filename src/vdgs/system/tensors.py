@@ -20,8 +20,8 @@ from vdgs.errors import VdgsError
 
 #: The types that are written, in the order in which the format's library lays tensors out: wide ones first.
 DTYPES = {
-    "I64": torch.int64, "F64": torch.float64, "F32": torch.float32, "I32": torch.int32, "U8": torch.uint8,
-    "BOOL": torch.bool,
+    "I64": torch.int64, "F64": torch.float64, "F32": torch.float32, "I32": torch.int32, "F16": torch.float16,
+    "U8": torch.uint8, "BOOL": torch.bool,
 }  # fmt: skip
 _NAMES = {dtype: name for name, dtype in DTYPES.items()}
 _CHUNK = 1 << 20

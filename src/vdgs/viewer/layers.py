@@ -14,8 +14,7 @@ from torch import Tensor
 from vdgs.captures.camera_height import camera_height
 from vdgs.evaluation.metrics import to_8bit
 from vdgs.geometry.camera import Camera
-from vdgs.model.anchor_model import AnchorModel
-from vdgs.model.renderer import decode_view, rasterize_splats, render, render_scalar_map
+from vdgs.model.renderer import Drawable, rasterize_splats, render, render_scalar_map, view_splats
 from vdgs.viewer.image_comparison import ImageComparison, warp_image
 from vdgs.viewer.lod import LodLevel
 from vdgs.viewer.viewer_scene import ViewerScene
@@ -46,6 +45,8 @@ class DisplayOptions:
     #: A photograph, by its number, laid over the image left of `image_split`; None: no photograph.
     image_index: int | None = None
     image_split: float = 0.5
+    #: Draw views at rest from all anchors, also where the run has a level-of-detail tree.
+    full_detail: bool = False
 
 
 class Painter:
@@ -69,7 +70,8 @@ class Painter:
             from vdgs.rendering import scalar_maps
 
             capture = self._scene.capture
-            depth = scalar_maps.render_depth(self._model(display), full_camera.limit_size(_PREVIEW_PX))
+            shown = self._scene.shown(self._scene.shown_name(display.model))
+            depth = scalar_maps.render_depth(shown, full_camera.limit_size(_PREVIEW_PX))
             depth_range = scalar_maps.depth_range([depth], camera_height(capture))
             self._depth = scalar_maps.depth_scale(depth_range, capture.ground.unit)
 
@@ -81,7 +83,7 @@ class Painter:
             return self._depth
         if display.layer == "visibility":
             name = self._scene.shown_name(display.model)
-            return scalar_maps.visibility_scale(self._scene.visibility(name).cpu().numpy())
+            return scalar_maps.visibility_scale(self._scene.visibility_sample(name).cpu().numpy())
         if display.layer == "alpha":
             return scalar_maps.alpha_scale()
         return error_scale() if display.layer == "error" else None
@@ -89,7 +91,7 @@ class Painter:
     def count_visible_anchors(self, display: DisplayOptions, camera: Camera) -> int:
         """How many anchors a full image is drawn from."""
         names = self._scene.names if self._shows_both(display) else [self._scene.shown_name(display.model)]
-        return sum(self._scene.get_level(name, camera)[1] for name in names)
+        return sum(self._scene.get_level(name, camera, full_detail=display.full_detail)[1] for name in names)
 
     def paint(
         self, display: DisplayOptions, camera: Camera, full_camera: Camera, max_anchors: int | None = None
@@ -105,18 +107,17 @@ class Painter:
     def _shows_both(self, display: DisplayOptions) -> bool:
         return display.model == "both" and len(self._scene.names) > 1
 
-    def _model(self, display: DisplayOptions) -> AnchorModel:
-        return self._scene.model(self._scene.shown_name(display.model))
-
     def _render_model(
         self, name: str, display: DisplayOptions, camera: Camera, full_camera: Camera, max_anchors: int | None
     ) -> UInt8[np.ndarray, "h w 3"]:
-        level, count = self._scene.get_level(name, camera, max_anchors)
+        level, count = self._scene.get_level(
+            name, camera, max_anchors, full_camera=full_camera, full_detail=display.full_detail
+        )
         self.drawn_anchors += count
         if display.layer == "color":
             return to_8bit(render(level.model, camera).image.cpu().numpy())
         if display.layer == "blocks":
-            return _render_block_tints(level.model, level.of(self._scene.block_tint(name)), camera)
+            return _render_block_tints(level.model, self._scene.level_tint(name, level, camera), camera)
         if display.layer == "depth" and self._depth is None:
             self.update_depth_range(display, full_camera)
         scale = self.scale(display)
@@ -131,7 +132,9 @@ class Painter:
 
             return render_depth(level.model, camera)
         if display.layer == "visibility":
-            return render_scalar_map(level.model, level.of(self._scene.visibility(name)), camera).cpu().numpy()
+            return (
+                render_scalar_map(level.model, self._scene.level_visibility(name, level, camera), camera).cpu().numpy()
+            )
         if display.layer == "alpha":
             return render(level.model, camera).alpha.cpu().numpy()
         return self._comparison.error_map(name, camera, full_camera)
@@ -169,11 +172,10 @@ def _draw_divider(image: np.ndarray, edge: int) -> UInt8[np.ndarray, "h w 3"]:
 
 
 @torch.no_grad()
-def _render_block_tints(model: AnchorModel, tints: Tensor, camera: Camera) -> UInt8[np.ndarray, "h w 3"]:
+def _render_block_tints(model: Drawable, tints: Tensor, camera: Camera) -> UInt8[np.ndarray, "h w 3"]:
     """The scene with the colors of the blocks that own its anchors."""
-    rows, splats = decode_view(model, camera)
-    k = model.anchors.offsets.shape[1]
-    tint = tints[rows][splats.source.long() // k]
+    rows, splats = view_splats(model, camera)
+    tint = tints[rows]
     colors = (1 - _TINT_STRENGTH) * splats.colors.mean(dim=1, keepdim=True) + _TINT_STRENGTH * tint
     background = splats.means_px.new_tensor(model.background)
     raster = rasterize_splats(replace(splats, colors=colors.contiguous()), camera, background)

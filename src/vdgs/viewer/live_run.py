@@ -12,8 +12,18 @@ from vdgs.config.commands import ModelName
 from vdgs.errors import RunError, VdgsError
 from vdgs.model.anchor_model import AnchorModel, ModelMetadata
 from vdgs.partition.merging import merge_blocks
+from vdgs.runs.lod_folder import has_lod
 from vdgs.runs.model_integrity import load_verified
-from vdgs.runs.open_run import OpenedRun, all_block_view_indices, load_run_blocks, open_capture, open_run
+from vdgs.runs.open_run import (
+    OpenedRun,
+    all_block_view_indices,
+    load_run_blocks,
+    locate_model,
+    open_capture,
+    open_mapped,
+    open_run,
+    with_capture,
+)
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_status import get_run_status
 from vdgs.runs.stage_folder import StageFolder
@@ -35,6 +45,9 @@ def open_run_or_checkpoint(path: Path, which: ModelName = "best", device: str = 
         return open_run(path, which, device)
     keys = run.keys()
     if run.merged.is_done(keys.merge):
+        location = locate_model(run, "merged")
+        if device == "cpu" and has_lod(run, location):
+            return with_capture(open_mapped(run, location), open_capture(run))
         return open_run(path, "merged", device)
     if run.coarse.is_done(keys.coarse):
         coarse = open_run(path, "coarse", device)

@@ -1,4 +1,5 @@
-"""Levels of detail: fewer, larger Gaussians for previews, whose time follows from their number, not from pixels.
+"""Levels of detail of a model without a tree (`vdgs lod`): fewer, larger Gaussians for previews, whose time follows
+from their number, not from pixels.
 
 Only previews of a moving camera use them, where so much is in view that single Gaussians are small. At rest the model
 itself is drawn.
@@ -16,7 +17,7 @@ from torch import Tensor
 from vdgs.geometry.camera import Camera
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
-from vdgs.model.renderer import cull_anchors
+from vdgs.model.renderer import Drawable, cull_anchors
 
 #: The first level has so many times fewer anchors than the model, each further one so many times fewer than the one
 #: before it: all together take 0.3 of the model's memory.
@@ -25,9 +26,9 @@ FIRST_FACTOR, NEXT_FACTOR = 5, 3
 
 @dataclass(frozen=True, eq=False)
 class LodLevel:
-    """A model, and which anchors of the whole one it holds; None: all."""
+    """What is drawn, and which anchors of the whole model it holds; None: all."""
 
-    model: AnchorModel
+    model: Drawable
     mask: Bool[Tensor, " n"] | None = None
 
     def of(self, values: Tensor) -> Tensor:
@@ -39,12 +40,12 @@ class LodPyramid:
     """A model and its thinner ones, each made when it is first needed."""
 
     def __init__(self, model: AnchorModel) -> None:
-        self._levels = [LodLevel(model)]
+        self._model, self._levels = model, [LodLevel(model)]
 
     def of(self, camera: Camera, max_anchors: int | None = None) -> tuple[LodLevel, int]:
         """The model itself, or the finest level of which the camera sees at most so many anchors; and about how many
         of them it sees."""
-        model = self._levels[0].model
+        model = self._model
         visible, number = len(cull_anchors(model.anchors, camera)), 0
         while max_anchors is not None and visible // decimation_factor(number) > max(max_anchors, 1):
             number += 1

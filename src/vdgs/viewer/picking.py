@@ -10,8 +10,7 @@ from jaxtyping import Float, UInt8
 
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.geodesy import geodetic_from_enu
-from vdgs.model.anchor_model import AnchorModel
-from vdgs.model.renderer import render
+from vdgs.model.renderer import Drawable, render
 from vdgs.viewer.image_comparison import load_resized_image
 from vdgs.viewer.measurement import MeasuredPoint
 from vdgs.viewer.viewer_scene import ViewerScene
@@ -57,7 +56,7 @@ class PickedPoint:
     coordinates: tuple[str, ...]
 
 
-def pick_position(model: AnchorModel, camera: Camera, x: float, y: float) -> Float[np.ndarray, "3"] | None:
+def pick_position(model: Drawable, camera: Camera, x: float, y: float) -> Float[np.ndarray, "3"] | None:
     """The point of the surface (median depth) that the pixel at `x`, `y` shows; None where nothing is drawn.
 
     Pixels from the upper left corner; the point lies on the ray through exactly there.
@@ -74,7 +73,7 @@ def pick_position(model: AnchorModel, camera: Camera, x: float, y: float) -> Flo
 
 
 def pick_point(scene: ViewerScene, name: str, position: Float[np.ndarray, "3"]) -> PickedPoint:
-    model, views = scene.model(name), scene.capture.views
+    model, views = scene.shown(name), scene.capture.views
     hits = [
         _image_hit(model, view.camera, index, view.name, position)
         for index, view in enumerate(views)
@@ -86,7 +85,7 @@ def pick_point(scene: ViewerScene, name: str, position: Float[np.ndarray, "3"]) 
     return PickedPoint(position, visibility, block, tuple(hits), coordinate_lines(scene, position))
 
 
-def _image_hit(model: AnchorModel, camera: Camera, index: int, name: str, position: np.ndarray) -> ImageHit:
+def _image_hit(model: Drawable, camera: Camera, index: int, name: str, position: np.ndarray) -> ImageHit:
     pixels, depth = camera.project(position[None])
     x, y = float(pixels[0, 0]), float(pixels[0, 1])
     column, row = min(int(x), camera.width - 1), min(int(y), camera.height - 1)
@@ -102,7 +101,7 @@ def measured_point(scene: ViewerScene, name: str, camera: Camera, x: float, y: f
     It is off across the view by half a pixel of the clicked picture, or of the photograph that shows it best where that
     is coarser, and along it by what the depths disagree that the nearest photographs see.
     """
-    position = pick_position(scene.model(name), camera, x, y)
+    position = pick_position(scene.shown(name), camera, x, y)
     if position is None:
         return None
     hits = [hit for hit in pick_point(scene, name, position).hits if hit.unoccluded][:_MARKED_IMAGES]
@@ -116,7 +115,7 @@ def measured_point(scene: ViewerScene, name: str, camera: Camera, x: float, y: f
     return MeasuredPoint(position, float(np.hypot(across, 1.48 * along)), tuple(rays))
 
 
-def _render_pixel(model: AnchorModel, camera: Camera, column: int, row: int) -> tuple[float, float]:
+def _render_pixel(model: Drawable, camera: Camera, column: int, row: int) -> tuple[float, float]:
     """Median depth and alpha of one pixel."""
     raster = render(model, camera.cropped(column, row, column + 1, row + 1), depth=True)
     assert raster.median_depth is not None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Literal
 
 import numpy as np
@@ -20,13 +20,20 @@ from vdgs.geometry.camera import Camera
 from vdgs.geometry.map_projection import MapProjection
 from vdgs.kernels.kernel_types import Raster
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.model.renderer import render
+from vdgs.model.lod_scene import LodScene, NodeContent
+from vdgs.model.lod_tree import ANCHOR_COST
+from vdgs.model.renderer import Drawable, render
 from vdgs.partition.blocks import Blocks, xy_positions
+from vdgs.runs.lod_folder import find_tree
 from vdgs.runs.open_run import OpenedRun, load_run_blocks, open_run
 from vdgs.runs.visibility_store import get_run_visibility
 from vdgs.viewer.lod import LodLevel, LodPyramid
+from vdgs.visibility.visibility_counts import count_visibility
 
 ModelChoice = Literal["coarse", "merged"]
+#: Of a tree: pixels that a view at rest and a preview may be off, and what a view at rest may cost, in merged Gaussians
+#: (choice: below it, at most a second on two cores).
+REST_ERROR_PX, PREVIEW_ERROR_PX, REST_MAX_COST = 0.3, 1.0, 1_500_000
 #: Photographs kept in memory, decoded (choice).
 _IMAGE_CACHE_BYTES = 128 << 20
 #: What a camera meters is drawn from at most about so many anchors (choice): fitting its law takes up to two hundred
@@ -45,6 +52,8 @@ class ViewerScene:
         self._visibility: dict[str, Tensor] = {}
         self._block_tints: dict[str, Tensor] = {}
         self._levels: dict[str, LodPyramid] = {}
+        self._trees: dict[str, LodScene | None] = {}
+        self._values: dict[tuple[str, NodeContent], Tensor] = {}
         self._exposures: dict[str, ViewExposures | None] = {}
         #: Grows with every newer model.
         self.generation = 0
@@ -69,17 +78,70 @@ class ViewerScene:
     def model(self, name: str) -> AnchorModel:
         return self.get_run(name).model
 
-    def get_level(self, name: str, camera: Camera, max_anchors: int | None = None) -> tuple[LodLevel, int]:
-        """The level of detail to draw, with at most so many anchors in view, and how many those are."""
-        if name not in self._levels:
-            self._levels[name] = LodPyramid(self.model(name))
-        return self._levels[name].of(camera, max_anchors)
+    def tree(self, name: str) -> LodScene | None:
+        """A model through its level-of-detail tree; None where it has none."""
+        if name not in self._trees:
+            self._trees[name] = find_tree(self.get_run(name))
+        return self._trees[name]
+
+    def shown(self, name: str) -> Drawable:
+        """What single pixels and comparisons are drawn from: the tree at its finest but for the anchors far away."""
+        tree = self.tree(name)
+        return self.model(name) if tree is None else tree.at_error(REST_ERROR_PX)
+
+    def get_level(
+        self, name: str, camera: Camera, max_anchors: int | None = None, *, full_camera: Camera | None = None,
+        full_detail: bool = False,
+    ) -> tuple[LodLevel, int]:  # fmt: skip
+        """The level of detail to draw, with at most so many anchors in view, and how many those are. Of a tree, merged
+        Gaussians count as anchors by their cost. `camera` may be a part of `full_camera`."""
+        tree = self.tree(name)
+        if tree is None:
+            if name not in self._levels:
+                self._levels[name] = LodPyramid(self.model(name))
+            return self._levels[name].of(camera, max_anchors)
+        if full_detail and max_anchors is None:
+            tree = tree.at_error(0.0)
+        else:
+            least = REST_ERROR_PX if max_anchors is None else PREVIEW_ERROR_PX
+            cost = REST_MAX_COST if max_anchors is None else max_anchors * ANCHOR_COST
+            tree = tree.at_error(least).within(full_camera or camera, cost)
+        return LodLevel(tree), max(1, tree.cost(camera) // ANCHOR_COST)
+
+    def level_visibility(self, name: str, level: LodLevel, camera: Camera) -> Tensor:
+        """V of what a level draws in a view."""
+        if isinstance(level.model, LodScene):
+            return level.model.values(camera, partial(self._node_values, f"{name} V", self._count_visibility))
+        return level.of(self.visibility(name))
+
+    def level_tint(self, name: str, level: LodLevel, camera: Camera) -> Tensor:
+        """The colors of the blocks of what a level draws in a view."""
+        if isinstance(level.model, LodScene):
+            return level.model.values(camera, partial(self._node_values, f"{name} blocks", self._tint))
+        return level.of(self.block_tint(name))
+
+    def visibility_sample(self, name: str) -> Float[Tensor, " n"]:
+        """V all over a model: of every anchor, or of the root of its tree."""
+        tree = self.tree(name)
+        return self.visibility(name) if tree is None else self._count_visibility(tree.tree.gaussians(0).means)
+
+    def _node_values(
+        self, what: str, of: Callable[[Tensor], Tensor], content: NodeContent, places: Float[Tensor, "p 3"]
+    ) -> Tensor:
+        """Values of the places of a node, each found once."""
+        if (what, content) not in self._values:
+            self._values[what, content] = of(places)
+        return self._values[what, content]
+
+    def _count_visibility(self, places: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:
+        return count_visibility(places, [view.camera for view in self.capture.train_views]).float()
 
     def replace_run(self, run: OpenedRun) -> None:
         """Put a newer model in place of the one of its name."""
         self.run = run
         self._runs = {run.name: run}
         self._visibility, self._block_tints, self._levels, self._exposures = {}, {}, {}, {}
+        self._trees, self._values = {}, {}
         self.generation += 1
         self.__dict__.pop("blocks", None)
 
@@ -112,14 +174,16 @@ class ViewerScene:
     def block_tint(self, name: str) -> Float[Tensor, "n 3"]:
         """The color of the block that owns each anchor, RGB in 0 to 1; gray where the scene is not cut."""
         if name not in self._block_tints:
-            positions = self.model(name).anchors.positions
-            if self.blocks is None:
-                colors = np.full((len(positions), 3), 0.6)
-            else:
-                palette = np.stack([block_rgb(index) for index in range(len(self.blocks))])
-                colors = palette[self.blocks.owner(xy_positions(positions))] / 255.0
-            self._block_tints[name] = torch.as_tensor(colors, dtype=torch.float32, device=positions.device)
+            self._block_tints[name] = self._tint(self.model(name).anchors.positions)
         return self._block_tints[name]
+
+    def _tint(self, places: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        if self.blocks is None:
+            colors = np.full((len(places), 3), 0.6)
+        else:
+            palette = np.stack([block_rgb(index) for index in range(len(self.blocks))])
+            colors = palette[self.blocks.owner(xy_positions(places))] / 255.0
+        return torch.as_tensor(colors, dtype=torch.float32, device=places.device)
 
     @cached_property
     def images(self) -> ImageCache:

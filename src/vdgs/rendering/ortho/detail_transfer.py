@@ -19,8 +19,7 @@ from jaxtyping import Bool, Float
 from vdgs.captures.capture import Capture
 from vdgs.captures.image_cache import ImageCache
 from vdgs.geometry.camera import Camera
-from vdgs.model.anchor_model import AnchorModel
-from vdgs.model.renderer import render
+from vdgs.model.renderer import Drawable, render
 
 #: Photographs looked up for one place; bytes of photographs, and depth maps, that are kept between tiles.
 _MAX_VIEWS, _IMAGE_CACHE_BYTES, _MAX_CACHED_DEPTHS = 12, 512_000_000, 32
@@ -61,7 +60,7 @@ def cache_sizes(detail_from_images: bool, capture: Capture) -> CacheSizes:
 class DetailTransfer:
     """Takes detail from the training photographs of a capture; caches images and depths between tiles."""
 
-    def __init__(self, model: AnchorModel, capture: Capture) -> None:
+    def __init__(self, model: Drawable, capture: Capture) -> None:
         self._model = model
         self._views = capture.train_views
         self._images = ImageCache(self._views, _IMAGE_CACHE_BYTES)

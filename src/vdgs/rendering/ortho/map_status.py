@@ -11,9 +11,10 @@ METADATA_FILE = "map.json"
 
 
 def is_ortho_current(run: RunFolder) -> bool:
-    """Whether RUN/maps shows the merged model that is there."""
-    drawn = read_json_or_empty(run.path / "maps" / METADATA_FILE).get("model_digest")
-    return drawn is not None and drawn == run.merged.status().model_id
+    """Whether RUN/maps shows the merged model that is there, in full detail."""
+    metadata = read_json_or_empty(run.path / "maps" / METADATA_FILE)
+    drawn, in_full = metadata.get("model_digest"), metadata.get("lod_error") is None
+    return drawn is not None and drawn == run.merged.status().model_id and in_full
 
 
 def has_ortho_dependencies() -> bool:

@@ -16,7 +16,7 @@ from vdgs.captures.strays import folder_in_run
 from vdgs.config.commands import OrthoRequest
 from vdgs.errors import VdgsError
 from vdgs.geometry.map_projection import MapProjection
-from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.renderer import Drawable
 from vdgs.rendering.ortho import pixel_grid
 from vdgs.rendering.ortho.detail_transfer import DetailTransfer
 from vdgs.rendering.ortho.map_status import METADATA_FILE
@@ -56,6 +56,8 @@ class OrthoPlan:
     """Samples per pixel, each way."""
     detail_from_images: bool
     """Whether detail is taken from the photographs."""
+    lod_error: float | None
+    """How many pixels places may be off, drawn through the level-of-detail tree; None: drawn from all anchors."""
 
     @staticmethod
     def of(request: OrthoRequest, run: Path, model: str, model_digest: str | None, capture: Capture) -> OrthoPlan:
@@ -74,6 +76,7 @@ class OrthoPlan:
         return OrthoPlan(
             folder=folder, run_name=run.name, model=model, model_digest=model_digest, nadir_camera=above, grid=grid,
             samples=samples_per_side(grid.gsd, finest), detail_from_images=request.detail_from_images,
+            lod_error=request.lod_error,
         )  # fmt: skip
 
     @property
@@ -81,7 +84,7 @@ class OrthoPlan:
         return self.nadir_camera.placement
 
     @contextmanager
-    def tile_renderer(self, model: AnchorModel) -> Iterator[TileRenderer]:
+    def tile_renderer(self, model: Drawable) -> Iterator[TileRenderer]:
         """What draws its tiles."""
         details = DetailTransfer(model, self.nadir_camera.capture) if self.detail_from_images else None
         try:

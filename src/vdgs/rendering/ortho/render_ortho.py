@@ -24,6 +24,7 @@ from vdgs.rendering.ortho.ortho_plan import DSM_FILE, ORTHOPHOTO_FILE, VISIBILIT
 from vdgs.rendering.ortho.previews import PreviewSheet, write_hillshade, write_picture, write_preview
 from vdgs.rendering.ortho.tile_renderer import NODATA_COUNT, NODATA_HEIGHT, OrthoTile
 from vdgs.rendering.ortho.tile_shards import distributed_tiles
+from vdgs.runs.lod_folder import drawn_scene
 from vdgs.runs.open_run import locate_model
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
@@ -61,11 +62,12 @@ def render_ortho(
 
 def _render_locally(context: RunContext, request: OrthoRequest, console: Console) -> tuple[float, Path]:
     """Draw in this process; returns the share of the pixels that are mapped, and the folder."""
-    run = context.open_model(request.model, request.device)
+    run = context.open_model(request.model, request.device, mapped=request.lod_error is not None)
+    scene = drawn_scene(run, request.lod_error, request.device)
     plan = OrthoPlan.of(request, run.folder.path, run.name, run.status.model_id, run.capture)
     _print_plan(plan, console)
     clear(plan.folder)
-    with plan.tile_renderer(run.model) as renderer:
+    with plan.tile_renderer(scene) as renderer:
         tiles = (renderer.render_tile(part) for _, _, part in plan.grid.tiles())
         return _write(plan, _counted(context.run, plan, tiles), console), plan.folder
 
@@ -214,5 +216,5 @@ def _metadata(plan: OrthoPlan) -> MapMetadata:
         "heights": placement.height_reference, "georeference": capture.ground.description,
         "gsd": grid.gsd, "width": grid.width, "height": grid.height, "bounds": list(grid.bounds),
         "samples_per_pixel": plan.samples**2, "sharpened": plan.detail_from_images,
-        "training_cameras": len(capture.train_views), "notes": list(placement.notes),
+        "training_cameras": len(capture.train_views), "notes": list(placement.notes), "lod_error": plan.lod_error,
     }  # fmt: skip

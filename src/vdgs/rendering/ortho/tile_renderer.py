@@ -10,8 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8, UInt16
 
 from vdgs.geometry.camera import Camera
-from vdgs.model.anchor_model import AnchorModel
-from vdgs.model.renderer import render
+from vdgs.model.renderer import Drawable, render
 from vdgs.rendering.ortho.detail_transfer import HALO_PX, DetailTransfer
 from vdgs.rendering.ortho.nadir_camera import NadirCamera
 from vdgs.rendering.ortho.pixel_grid import PixelGrid
@@ -48,7 +47,7 @@ class _PixelSurfaces(NamedTuple):
 class TileRenderer:
     """Draws tiles of a map of one model."""
 
-    model: AnchorModel
+    model: Drawable
     nadir_camera: NadirCamera
     #: Samples per pixel, each way.
     samples: int = 1

@@ -27,7 +27,9 @@ from vdgs.rendering.ortho.detail_transfer import HALO_PX, cache_sizes
 from vdgs.rendering.ortho.ortho_plan import OrthoPlan
 from vdgs.rendering.ortho.pixel_grid import TILE_PX
 from vdgs.rendering.ortho.tile_renderer import OrthoTile
-from vdgs.runs.open_run import ModelLocation, open_run
+from vdgs.runs.lod_folder import drawn_scene
+from vdgs.runs.open_run import ModelLocation
+from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
 from vdgs.system.atomic_files import write_bytes
 from vdgs.system.memory.memory_estimate import render_bytes
@@ -52,7 +54,7 @@ def distributed_tiles(
     """
     request = OrthoRequest(
         run=run.path, output=Path(os.path.abspath(plan.folder)), gsd=request.gsd, bbox=request.bbox, crs=request.crs,
-        detail_from_images=request.detail_from_images, model=model.name,
+        detail_from_images=request.detail_from_images, model=model.name, lod_error=request.lod_error,
     )  # fmt: skip
     job = _job(plan, request)
     images = cache_sizes(plan.detail_from_images, plan.nadir_camera.capture)
@@ -69,7 +71,7 @@ def distributed_tiles(
 
 def _job(plan: OrthoPlan, request: OrthoRequest) -> ShardedJob:
     """The tiles in shards, and what they depend on."""
-    grid, how = list(astuple(plan.grid)), [plan.samples, plan.detail_from_images]
+    grid, how = list(astuple(plan.grid)), [plan.samples, plan.detail_from_images, plan.lod_error]
     depends_on = [plan.model, plan.model_digest, plan.placement.crs, grid, *how]
     spans = split_ranges(plan.grid.tile_count(), *TILES_OF_SHARD)
     return ShardedJob.create("tiles", request, plan.folder, TILE_LABELS, depends_on, spans)
@@ -78,12 +80,14 @@ def _job(plan: OrthoPlan, request: OrthoRequest) -> ShardedJob:
 def draw_shard(shard: Shard) -> None:
     """Draw a shard of the tiles. They stay beside its status until all are gathered."""
     request = shard.request(OrthoRequest)
-    run = open_run(request.run, request.model, shard.device)
+    context = RunContext.from_path(request.run)
+    run = context.open_model(request.model, shard.device, mapped=request.lod_error is not None)
+    scene = drawn_scene(run, request.lod_error, shard.device)
     plan = OrthoPlan.of(request, request.run, run.name, run.status.model_id, run.capture)
 
     def results(left: Sequence[int]) -> Results:
         shard.console.print(f"drawing {len(left)} tiles of the {run.summary}", highlight=False)
-        with plan.tile_renderer(run.model) as renderer:
+        with plan.tile_renderer(scene) as renderer:
             for item in left:
                 yield partial(save_tile, tile=renderer.render_tile(plan.grid.tile(item)[2]))
 

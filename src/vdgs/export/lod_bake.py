@@ -1,0 +1,176 @@
+"""What the nodes of a level-of-detail tree draw: baked anchors in its leaves, and ever coarser merges of them above.
+
+A leaf is baked by itself, from the few training cameras that show it best from as many sides as possible: opacities,
+shapes and colors are what those cameras see of its anchors. All Gaussians whose centers share a cell of space then
+become one (`merge_by_moments`). The side of a cell is a fixed part of the side of the node, so that it doubles from
+level to level.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from vdgs.export.bake import BakeViews, fit_gaussians, gaussian_count, view_contributions
+from vdgs.geometry.camera import Camera
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.gaussian_merging import gaussian_weights, merge_by_moments
+from vdgs.model.gaussians import Gaussians
+from vdgs.model.lod_nodes import NodeRecord
+
+#: Cells along the side of a node.
+CELLS_PER_EDGE = 64
+#: Training cameras that a leaf is baked from, and of how many of the nearest they are chosen.
+CAMERAS_PER_LEAF, MAX_CANDIDATES = 8, 64
+#: They draw a leaf at most so wide and high (pixels): eight for each cell.
+MAX_WINDOW_PX = 512
+#: Anchors by which it is told how much of a leaf a camera shows.
+SAMPLES = 128
+#: Degree of the spherical harmonics of merged Gaussians.
+SH_DEGREE = 1
+#: A leaf's Gaussians are off by at least this part of a cell: they are no anchors, which change with the view.
+MIN_LEAF_ERROR = 0.1
+
+
+def bake_leaf(model: AnchorModel, cameras: CameraTable) -> tuple[Gaussians, Float[np.ndarray, " m"]]:
+    """The Gaussians that the best training cameras see of a few anchors, and how many pixels each makes."""
+    positions = model.anchors.positions.numpy()
+    windows = [window for camera in cameras.choose(positions) if (window := _turned(camera, positions)) is not None]
+    shown = [view_contributions(model, window) for window in windows]
+    pixels = np.zeros(gaussian_count(model), np.float32)
+    for view in shown:
+        pixels[view.gaussians.numpy()] += view.pixels.numpy()
+    wanted = np.flatnonzero(pixels)
+    if not len(wanted):
+        return empty_gaussians(SH_DEGREE), pixels[:0]
+    return fit_gaussians(BakeViews(model, windows, shown), wanted, SH_DEGREE), pixels[wanted]
+
+
+def empty_gaussians(degree: int) -> Gaussians:
+    """None, with room for colors of a degree."""
+    wide = torch.zeros(0, 3)
+    return Gaussians(
+        means=wide, log_scales=wide, quaternions=torch.zeros(0, 4), opacity_logits=torch.zeros(0), sh0=wide,
+        shN=torch.zeros(0, (degree + 1) ** 2 - 1, 3),
+    )  # fmt: skip
+
+
+def merge_cells(
+    gaussians: Gaussians, cell: float, errors: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"] | None = None
+) -> tuple[Gaussians, float]:
+    """One Gaussian for all that share a cell, apart from those larger than it, and how far they then are from their
+    true places: the root mean square by weight, on top of the `errors` that they had."""
+    if not len(gaussians):
+        return gaussians, 0.0
+    means = gaussians.means.double().numpy()
+    index = np.floor((means - means.min(0)) / cell).astype(np.int64)
+    large = gaussians.log_scales.amax(1).numpy() > np.log(cell)
+    sizes = index.max(0) + 1
+    keys = ((index[:, 0] * sizes[1] + index[:, 1]) * sizes[2] + index[:, 2]) * 2 + large
+    groups = np.unique(keys, return_inverse=True)[1]
+    merged = merge_by_moments(gaussians, groups, weights)
+    weights = gaussian_weights(gaussians) if weights is None else weights
+    apart = means - merged.means.double().numpy()[groups]
+    square = np.average(errors**2 + (apart * apart).sum(1), weights=weights)
+    return merged, float(np.sqrt(square))
+
+
+def node_record(
+    gaussians: Gaussians, error: float, anchors: AnchorModel | None, children: Sequence[NodeRecord]
+) -> NodeRecord:
+    """What the tree says of a node: boxes hold those of the children, errors are not less than theirs."""
+    boxes = [np.array(child.bounds) for child in children if np.isfinite(child.bounds).all()]
+    reach = [child.reach for child in children]
+    if anchors is not None:
+        boxes.append(_box(anchors.anchors.positions.numpy()))
+        reach.append(float(anchors.anchors.log_scales[:, :3].max().exp()))
+    if len(gaussians):
+        boxes.append(_box(gaussians.means.numpy()))
+        reach.append(float(gaussians.log_scales.max().exp()))
+    low = np.min([box[:3] for box in boxes], axis=0)
+    high = np.max([box[3:] for box in boxes], axis=0)
+    return NodeRecord(
+        error=max([error, *(child.error for child in children)]), bounds=(*low.tolist(), *high.tolist()),
+        reach=max(reach), gaussians=len(gaussians), anchors=0 if anchors is None else len(anchors.anchors),
+    )  # fmt: skip
+
+
+def _box(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "6"]:
+    return np.concatenate([points.min(0), points.max(0)]).astype(np.float64)
+
+
+def _turned(camera: Camera, positions: Float[np.ndarray, "n 3"]) -> Camera | None:
+    """The camera turned towards some places, with a picture of just these, at most `MAX_WINDOW_PX` wide and high: what
+    anchors show depends on where the camera is, not on where it looks. None where it is among them."""
+    center = np.median(positions, axis=0)
+    forward = center - camera.position
+    distance = float(np.linalg.norm(forward))
+    forward = forward / max(distance, 1e-9)
+    right = np.cross(forward, [0, 0, 1] if abs(forward[2]) < 0.99 else [0, 1, 0])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    pose[:3, 3] = -pose[:3, :3] @ camera.position
+    local = positions @ pose[:3, :3].T + pose[:3, 3]
+    local = local[local[:, 2] > 0.2 * distance]
+    if not len(local):
+        return None
+    slopes = local[:, :2] / local[:, 2:]
+    low, high = slopes.min(0), slopes.max(0)
+    focal = min(max(camera.fx, camera.fy), (MAX_WINDOW_PX - 8) / max(float((high - low).max()), 1e-9))
+    left, top = 4 - focal * low
+    width, height = (int(side) + 8 for side in focal * (high - low))
+    whole = 2 * int(np.ceil(focal * max(np.abs(low).max(), np.abs(high).max()))) + 16
+    return Camera(
+        camera_from_world=pose, fx=focal, fy=focal, cx=float(left), cy=float(top), width=width, height=height,
+        uncropped_size=(whole, whole),
+    )  # fmt: skip
+
+
+class CameraTable:
+    """The training cameras, of which a few are chosen for each leaf."""
+
+    def __init__(self, cameras: Sequence[Camera]) -> None:
+        self._cameras = cameras
+        self._places = np.stack([camera.position for camera in cameras])
+
+    def choose(self, positions: Float[np.ndarray, "n 3"]) -> list[Camera]:
+        """The cameras that show most of some places from near, from as many sides as possible."""
+        sample = positions[:: max(1, len(positions) // SAMPLES)].astype(np.float64)
+        rays = self._places - np.median(sample, axis=0)
+        distance = np.linalg.norm(rays, axis=1)
+        near = np.argsort(distance, kind="stable")[:MAX_CANDIDATES]
+        # A camera that looks elsewhere is better than none.
+        share = np.array([self._cameras[i].in_frustum(sample).mean() for i in near.tolist()]) + 0.02
+        directions = rays[near] / np.maximum(distance[near], 1e-9)[:, None]
+        score = share * (distance[near].min() / np.maximum(distance[near], 1e-9)) ** 0.5
+        chosen = [int(score.argmax())]
+        apart = 1 - directions @ directions[chosen[0]]
+        while len(chosen) < min(CAMERAS_PER_LEAF, len(near)):
+            value = score * (apart + 0.01)
+            value[chosen] = -1
+            chosen.append(int(value.argmax()))
+            apart = np.minimum(apart, 1 - directions @ directions[chosen[-1]])
+        return [self._cameras[near[i]] for i in sorted(chosen)]
+
+
+def leaf_gaussians(model: AnchorModel, cameras: CameraTable, edge: float) -> tuple[Gaussians, float]:
+    """What a leaf draws instead of its anchors, and how far off it is."""
+    baked, pixels = bake_leaf(model, cameras)
+    cell = edge / CELLS_PER_EDGE
+    merged, error = merge_cells(baked, cell, np.zeros(len(baked)), pixels.astype(np.float64))
+    return merged, max(error, MIN_LEAF_ERROR * cell)
+
+
+def parent_gaussians(
+    children: Sequence[Gaussians], records: Sequence[NodeRecord], edge: float
+) -> tuple[Gaussians, float]:
+    """What a node draws instead of its children, and how far off it is."""
+    together = Gaussians(
+        **{name: torch.cat([child.tensors()[name] for child in children]) for name in children[0].tensors()}
+    )
+    errors = np.repeat([record.error for record in records], [len(child) for child in children])
+    return merge_cells(together, edge / CELLS_PER_EDGE, errors)

@@ -1,0 +1,194 @@
+"""A level-of-detail tree that is open: which nodes a view is drawn from, and those nodes in bounded memory.
+
+The root holds the whole scene in few merged Gaussians, each child a part of the square of its parent in finer ones, and
+each leaf also the anchors themselves. A view is drawn from a cut through the tree: every node whose error falls below a
+number of pixels while that of its parent does not, and the anchors of the leaves whose merged Gaussians are too coarse.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import reduce
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from vdgs.geometry.camera import NEAR_PLANE, Camera
+from vdgs.kernels.constants import DILATION_PX2, FRUSTUM_MARGIN
+from vdgs.model.anchors import Anchors
+from vdgs.model.gaussians import Gaussians
+from vdgs.model.lod_nodes import TREE_FILE, LodTable, anchors_file, load_anchors, load_node, node_file
+
+#: Nodes are kept in memory up to so many bytes.
+CACHE_BYTES = 512 << 20
+#: The least distance of a camera from a node, as a part of the node's side.
+MIN_DISTANCE = 0.25
+#: What drawing an anchor costs, in merged Gaussians: it is decoded, and shows about six of its ten.
+ANCHOR_COST = 8
+
+_Content = TypeVar("_Content")
+
+
+@dataclass(frozen=True)
+class LodCut:
+    """Nodes that cover the scene in a view, each place once: some by their merged Gaussians, leaves by anchors."""
+
+    nodes: tuple[int, ...]
+    leaves: tuple[int, ...]
+
+
+class LodTree:
+    """The tree in a folder. Raises VdgsError where there is none or a damaged one."""
+
+    def __init__(self, folder: Path, cache_bytes: int = CACHE_BYTES) -> None:
+        self.folder, self.table = folder, LodTable.load(folder / TREE_FILE)
+        self._cache = _NodeCache(cache_bytes)
+        self._is_leaf = self.table.anchors > 0
+        self._parent = np.maximum(self.table.parent, 0)
+        self._levels = _levels(self.table.parent)
+        bounds = self.table.bounds
+        self._nearest = MIN_DISTANCE * (bounds[:, 3:5] - bounds[:, :2]).max(1)
+
+    @property
+    def cached_bytes(self) -> int:
+        """Memory that the cached nodes take."""
+        return self._cache.bytes
+
+    def errors_px(self, camera: Camera) -> Float[np.ndarray, " t"]:
+        """How many pixels of a view the merged Gaussians of each node are off; never less than those of a child.
+
+        At the nearest place of the node, but no nearer than a part of its side: what surrounds the camera is mostly
+        farther away.
+        """
+        focal = max(camera.fx, camera.fy)
+        if camera.model == "orthographic":
+            return self.table.error * focal
+        low, high = self.table.bounds[:, :3], self.table.bounds[:, 3:]
+        nearest = np.clip(camera.position, low, high)
+        distance = np.maximum(np.linalg.norm(nearest - camera.position, axis=1), self._nearest)
+        errors: np.ndarray = self.table.error * focal / np.maximum(distance, NEAR_PLANE)
+        for nodes in self._levels:
+            np.maximum.at(errors, self._parent[nodes], errors[nodes])
+        return errors
+
+    def visible(self, camera: Camera) -> Bool[np.ndarray, " t"]:
+        """Which nodes may show in a view: all but those of which `cull` would take no anchor."""
+        low, high = self.table.bounds[:, :3].astype(np.float64), self.table.bounds[:, 3:].astype(np.float64)
+        rotation, translation = camera.camera_from_world[:3, :3], camera.camera_from_world[:3, 3]
+        center, half = (low + high) / 2 @ rotation.T + translation, (high - low) / 2
+        shown = center[:, 2] + half @ np.abs(rotation[2]) > NEAR_PLANE
+        spare = 3 * DILATION_PX2**0.5 + 0.01
+        pinhole = camera.model == "pinhole"
+        for axis, focal, middle, size, whole in (
+            (0, camera.fx, camera.cx, camera.width, camera.full_size[0]),
+            (1, camera.fy, camera.cy, camera.height, camera.full_size[1]),
+        ):
+            stretch = np.hypot(1, FRUSTUM_MARGIN * 0.5 * whole / focal) if pinhole else 1.0
+            margin = 3.01 * stretch * self.table.reach + 1e-6 * np.abs(center).max(1)
+            for sign, edge in ((1, (size - middle + spare) / focal), (-1, (middle + spare) / focal)):
+                # A place lies beyond this side of the picture where sign · x > edge · z, at a distance of 1 / focal.
+                normal, offset = np.zeros(3), 0.0 if pinhole else edge
+                normal[axis], normal[2] = sign, -edge if pinhole else 0.0
+                shown &= center @ normal - half @ np.abs(normal @ rotation) - offset <= margin
+        return shown
+
+    def cut(self, camera: Camera, max_error_px: float) -> LodCut:
+        """What a view is drawn from so that nothing is off by more than so many pixels; 0: all from anchors."""
+        errors, visible = self.errors_px(camera), self.visible(camera)
+        fine = errors <= max_error_px
+        above = ~fine[self._parent]
+        above[0] = True
+        nodes = np.flatnonzero(visible & fine & above)
+        return LodCut(tuple(nodes.tolist()), tuple(np.flatnonzero(visible & ~fine & self._is_leaf).tolist()))
+
+    def cost(self, cut: LodCut) -> int:
+        """What drawing a cut costs, in merged Gaussians."""
+        table = self.table
+        return int(table.gaussians[list(cut.nodes)].sum() + ANCHOR_COST * table.anchors[list(cut.leaves)].sum())
+
+    def error_within(self, camera: Camera, least_px: float, max_cost: int) -> float:
+        """The least error in pixels, from `least_px` on, at which a view costs at most so much; the root's own if
+        even that costs more."""
+        errors, visible = self.errors_px(camera), self.visible(camera)
+        shown = np.where(visible, self.table.gaussians, 0)
+        gain = np.zeros(len(shown))
+        np.add.at(gain, self._parent[1:], shown[1:])
+        gain += np.where(visible, ANCHOR_COST * self.table.anchors, 0) - shown
+        order = np.argsort(-errors, kind="stable")
+        costs = shown[0] + np.cumsum(gain[order])
+        # Nodes are refined from the largest error on; the first that must not be is drawn as it is.
+        over = np.flatnonzero((costs > max_cost) & visible[order])
+        return max(least_px, float(errors[order[over[0]]])) if len(over) else least_px
+
+    def gaussians(self, node: int) -> Gaussians:
+        """The merged Gaussians of a node."""
+        return self._cache.get(("nodes", node), lambda: load_node(node_file(self.folder, node)), _bytes)
+
+    def anchors(self, leaf: int) -> tuple[Anchors, Tensor]:
+        """The anchors of a leaf, and their rows in the model, ascending."""
+        return self._cache.get(
+            ("anchors", leaf), lambda: load_anchors(anchors_file(self.folder, leaf)), lambda content: _bytes(content[0])
+        )
+
+    def gaussians_of(self, nodes: tuple[int, ...]) -> Gaussians | None:
+        """The merged Gaussians of some nodes, one after another."""
+        parts = [self.gaussians(node) for node in nodes]
+        return _joined(Gaussians, parts) if parts else None
+
+    def anchors_of(self, leaves: tuple[int, ...]) -> tuple[Anchors, Tensor] | None:
+        """The anchors of some leaves in the order of the model, and their rows there."""
+        parts = [self.anchors(leaf) for leaf in leaves]
+        if not parts:
+            return None
+        rows, order = torch.cat([rows for _, rows in parts]).sort()
+        return _joined(Anchors, [anchors for anchors, _ in parts]).select(order), rows
+
+
+def _levels(parent: Int[np.ndarray, " t"]) -> list[Int[np.ndarray, " n"]]:
+    """The nodes by their depth in the tree, the deepest first, without the root."""
+    depth = np.zeros(len(parent), int)
+    for node in range(1, len(parent)):
+        depth[node] = depth[parent[node]] + 1
+    return [np.flatnonzero(depth == level) for level in range(depth.max(), 0, -1)]
+
+
+class _NodeCache:
+    """Contents of nodes, up to so many bytes: those used longest ago go first."""
+
+    def __init__(self, max_bytes: int) -> None:
+        self._max_bytes, self.bytes = max_bytes, 0
+        self._held: OrderedDict[tuple[str, int], tuple[object, int]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, key: tuple[str, int], load: Callable[[], _Content], size: Callable[[_Content], int]) -> _Content:
+        with self._lock:
+            if key in self._held:
+                self._held.move_to_end(key)
+                return self._held[key][0]  # type: ignore[return-value]
+        content = load()
+        with self._lock:
+            if key not in self._held:
+                self._held[key] = (content, size(content))
+                self.bytes += self._held[key][1]
+            while self.bytes > self._max_bytes and len(self._held) > 1:
+                self.bytes -= self._held.popitem(last=False)[1][1]
+        return content
+
+
+_Kind = TypeVar("_Kind", Gaussians, Anchors)
+
+
+def _joined(kind: type[_Kind], parts: list[_Kind]) -> _Kind:
+    names = parts[0].tensors()
+    return parts[0] if len(parts) == 1 else kind(**{n: torch.cat([p.tensors()[n] for p in parts]) for n in names})
+
+
+def _bytes(content: Gaussians | Anchors) -> int:
+    return reduce(lambda total, tensor: total + tensor.nbytes, content.tensors().values(), 0)

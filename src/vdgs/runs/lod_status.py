@@ -1,0 +1,31 @@
+"""How far the level-of-detail tree of a run is. Imports nothing heavy."""
+
+from __future__ import annotations
+
+from vdgs.runs.run_folder import RunFolder
+from vdgs.runs.run_status import RunStatus, StageState, StageStatus
+from vdgs.runs.stage_folder import StageFolder
+from vdgs.system.file_locks import is_known_locked
+from vdgs.system.quoting import shell_word
+
+
+def lod_folder(run: RunFolder) -> StageFolder:
+    """Where the tree of a run lies."""
+    return StageFolder(run.path / "lod")
+
+
+def lod_status(run: RunFolder, status: RunStatus) -> tuple[StageStatus, ...]:
+    """The state of the tree, as a stage; none of a run that has no tree and need have none."""
+    folder = lod_folder(run)
+    if not folder.status_file.exists():
+        return ()
+    found = folder.status()
+    models = {status.of(stage).output_id for stage in ("coarse", "merge")}
+    state: StageState = "done" if found.state == "done" else "stopped"
+    reason = "" if state == "done" else "it continues"
+    if state == "done" and found.model_id not in models:
+        state, reason = "stale", "made of another model than the run has now"
+    elif state == "stopped" and is_known_locked(folder.path):
+        state, reason = "running", ""
+    command = f"vdgs lod {shell_word(run.path)}"
+    return (StageStatus(name="lod", state=state, folder="lod", reason=reason, status=found, command=command),)

@@ -1,0 +1,234 @@
+"""Levels of detail: what a tree holds, what a view of it shows, and what becomes of one that is cut off or foreign."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+
+from support.captures import camera_at
+from support.hand_made_models import model_at, opaque_plane
+from vdgs.config.commands import LodRequest
+from vdgs.errors import RunError, Stopped, VdgsError
+from vdgs.export.lod_bake import CameraTable, merge_cells
+from vdgs.geometry.camera import Camera
+from vdgs.model.anchor_model import AnchorModel, DecoderSpan
+from vdgs.model.decoder import Decoder
+from vdgs.model.gaussian_merging import gaussian_weights
+from vdgs.model.lod_nodes import TREE_FILE
+from vdgs.model.lod_quadtree import build_quadtree
+from vdgs.model.lod_scene import LodScene
+from vdgs.model.lod_tree import LodTree
+from vdgs.model.renderer import render, render_scalar_map
+from vdgs.pipeline import build_lod
+from vdgs.pipeline.build_lod import build_tree
+from vdgs.runs.lod_folder import find_tree, open_tree
+from vdgs.runs.open_run import ModelLocation, open_mapped
+from vdgs.runs.run_folder import RunFolder
+from vdgs.runs.stage_folder import StatusRecord
+from vdgs.system.tensors import file_id
+
+CAMERAS = [
+    camera_at(x, y, 5.0, 15.0, 90.0 * number) for number, (x, y) in enumerate([(-2, -2), (2, -2), (2, 2), (-2, 2)])
+]
+VIEWS = [camera_at(0.3, 0.2, 3.0), camera_at(-1.0, 2.0, 5.0, 40.0, 30.0), camera_at(0.0, 0.0, 0.6, 80.0)]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_leaves() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(build_lod, "MAX_LEAF_ANCHORS", 150)
+        yield
+
+
+@pytest.fixture(scope="module")
+def model() -> AnchorModel:
+    """A plane of 900 anchors in no order, of two decoders."""
+    plane = opaque_plane()
+    order = torch.randperm(len(plane.anchors), generator=torch.Generator().manual_seed(0))
+    other = Decoder.from_tensors({n: t + 0.3 * (n == "color_b2") for n, t in plane.decoder.tensors().items()})
+    spans = (DecoderSpan(300, plane.decoder), DecoderSpan(len(order) - 300, other))
+    return replace(plane, anchors=plane.anchors.select(order), decoder_spans=spans)
+
+
+@pytest.fixture(scope="module")
+def scene(model, tmp_path_factory) -> LodScene:
+    folder = tmp_path_factory.mktemp("lod")
+    build_tree(folder, model, "1-a", CameraTable(CAMERAS))
+    return LodScene(LodTree(folder), model.without_anchors())
+
+
+def test_every_anchor_lies_in_one_leaf_within_its_square():
+    positions = np.random.default_rng(0).normal(size=(5000, 3)).astype(np.float32) ** 3
+    tree = build_quadtree(positions, 100)
+    leaves = np.flatnonzero(tree.is_leaf).tolist()
+    rows = np.concatenate([tree.rows(leaf) for leaf in leaves])
+    assert np.array_equal(np.sort(rows), np.arange(5000))
+    assert tree.count[leaves].max() <= 100
+    for node in range(len(tree.parent)):
+        mine = positions[tree.rows(node), :2]
+        assert np.ptp(mine, axis=0).max() <= tree.edge[node] * (1 + 1e-6)
+        assert node in leaves or (np.diff(tree.rows(node)) != 0).all()
+        assert tree.parent[node] < node
+    assert all(np.array_equal(tree.rows(leaf), np.sort(tree.rows(leaf))) for leaf in leaves)
+    same = build_quadtree(np.zeros((300, 3), np.float32), 100)
+    assert same.count.tolist() == [300]
+
+
+@pytest.mark.parametrize("camera", VIEWS)
+def test_without_any_error_the_picture_is_that_of_the_model_to_the_last_bit(scene, model, camera):
+    for part in (camera, camera.cropped(10, 5, 40, 30)):
+        whole, drawn = (render(each, part, depth=True) for each in (model, scene.at_error(0.0)))
+        assert all(torch.equal(a, b) for a, b in zip(whole, drawn, strict=True))
+    values = torch.arange(len(model.anchors)).float()
+    rows = {tuple(place): value for place, value in zip(model.anchors.positions.tolist(), values, strict=True)}
+    known = scene.at_error(0.0).values(camera, lambda _, places: torch.stack([rows[tuple(p)] for p in places.tolist()]))
+    drawn = render_scalar_map(scene.at_error(0.0), known * 1.0, camera)
+    expected = render_scalar_map(model, values, camera)
+    torch.testing.assert_close(drawn, expected, rtol=1e-4, atol=1e-2, equal_nan=True)
+
+
+def test_a_cut_shows_each_place_once_and_is_coarser_the_larger_the_error(scene):
+    table, tree = scene.tree.table, scene.tree
+    under = [{leaf} if table.anchors[leaf] else set() for leaf in range(len(table))]
+    for node in range(len(table) - 1, 0, -1):
+        under[table.parent[node]] |= under[node]
+    everywhere = Camera(
+        camera_from_world=VIEWS[0].camera_from_world, fx=5.0, fy=5.0, cx=32.0, cy=24.0, width=64, height=48
+    )
+    costs = []
+    for error in (0.0, 0.001, 0.01, 0.1, 1.0, 100.0):
+        cut = tree.cut(everywhere, error)
+        shown = [*cut.leaves, *(leaf for node in cut.nodes for leaf in under[node])]
+        assert sorted(shown) == np.flatnonzero(table.anchors).tolist()
+        costs.append(tree.cost(cut))
+        assert tree.error_within(everywhere, 0.0, costs[-1]) <= error
+    assert costs == sorted(costs, reverse=True)
+    assert costs[0] > costs[-1]
+    within = tree.error_within(everywhere, 0.0, costs[0] // 3)
+    assert tree.cost(tree.cut(everywhere, within)) <= costs[0] // 3
+
+
+def test_merged_levels_stay_opaque_and_keep_their_colors(scene, model):
+    high = camera_at(0.0, 0.0, 9.0)
+    inner = slice(16, 32), slice(24, 40)
+    whole = render(model, high)
+    for error in (0.2, 1.0, 100.0):
+        drawn = render(scene.at_error(error), high, depth=True)
+        assert drawn.alpha[inner].min() > 0.9
+        assert (drawn.image[inner] - whole.image[inner]).mean((0, 1)).abs().max() < 0.03
+        assert (drawn.median_depth[inner] - 9.0).abs().max() < 0.1
+    assert not scene.tree.cut(high, 100.0).leaves
+
+
+def test_merging_cells_keeps_what_it_merges(scene):
+    gaussians = scene.tree.gaussians(0)
+    merged, error = merge_cells(gaussians, 1.5, np.zeros(len(gaussians)))
+    assert 1 < len(merged) < len(gaussians)
+    assert 0 < error < 1.5
+    alone, same = merge_cells(gaussians, 1e-4, np.full(len(gaussians), 0.5))
+    assert len(alone) == len(gaussians)
+    assert same == pytest.approx(0.5)
+    one, _ = merge_cells(gaussians, 100.0, np.zeros(len(gaussians)))
+    weights = torch.from_numpy(gaussian_weights(gaussians))[:, None]
+    assert len(one) == 1
+    torch.testing.assert_close(
+        one.means[0].double(), (weights * gaussians.means).sum(0) / weights.sum(), atol=1e-5, rtol=0
+    )
+
+
+def test_memory_is_bounded_by_what_was_asked_for(scene):
+    tree = LodTree(scene.tree.folder, cache_bytes=200_000)
+    bounded = LodScene(tree, scene.model)
+    for camera in VIEWS * 2:
+        for error in (0.0, 0.5, 5.0):
+            assert torch.equal(
+                render(bounded.at_error(error), camera).image, render(scene.at_error(error), camera).image
+            )
+            assert 0 < tree.cached_bytes <= 200_000
+
+
+def test_a_build_that_was_cut_off_continues_to_the_same_bytes(model, scene, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("cut_off")
+
+    def stop(records, total):
+        yield from islice(records, total // 2)
+        raise Stopped("stopped")
+
+    with pytest.raises(Stopped):
+        build_tree(folder, model, "1-a", CameraTable(CAMERAS), stop)
+    with pytest.raises(VdgsError, match="no finished level-of-detail tree"):
+        LodTree(folder)
+    kept = {file: file.stat().st_mtime_ns for file in folder.rglob("nodes/*.safetensors")}
+    assert kept
+    build_tree(folder, model, "1-a", CameraTable(CAMERAS))
+    assert {file: file.stat().st_mtime_ns for file in kept} == kept
+    names = sorted(file.relative_to(folder) for file in folder.rglob("*.safetensors"))
+    assert names == sorted(file.relative_to(scene.tree.folder) for file in scene.tree.folder.rglob("*.safetensors"))
+    assert all(file_id(folder / name) == file_id(scene.tree.folder / name) for name in names)
+
+
+def test_a_damaged_node_is_named(scene, tmp_path):
+    folder = Path(shutil.copytree(scene.tree.folder, tmp_path / "lod"))
+    file = folder / "nodes" / "000000.safetensors"
+    content = bytearray(file.read_bytes())
+    content[-5] ^= 0xFF
+    file.write_bytes(content)
+    with pytest.raises(VdgsError, match=r"000000\.safetensors: is missing or damaged.*vdgs lod"):
+        render(LodScene(LodTree(folder), scene.model, 1000.0), VIEWS[0])
+
+
+def test_a_scene_that_no_camera_shows_has_a_tree(tmp_path):
+    model = model_at(np.random.default_rng(1).normal(size=(400, 3)))
+    away = [camera_at(50.0, 50.0, 5.0)]
+    build_tree(tmp_path, model, "1-b", CameraTable(away))
+    scene = LodScene(LodTree(tmp_path), model.without_anchors(), 0.0)
+    assert torch.equal(render(scene, VIEWS[1]).image, render(model, VIEWS[1]).image)
+
+
+@pytest.fixture
+def coarse(model, tmp_path, monkeypatch) -> SimpleNamespace:
+    """A run whose coarse model is done, as a stage knows it."""
+    run = RunFolder(tmp_path / "run")
+    keyed = replace(model, metadata=replace(model.metadata, key="key"))
+    keyed.save(run.coarse.model)
+    status = StatusRecord(state="done", anchors=len(model.anchors), model_id=file_id(run.coarse.model))
+    run.coarse.set_status(status)
+    location = ModelLocation(run.coarse, "coarse", "key", "")
+    monkeypatch.setattr(build_lod, "locate_model", lambda *_: location)
+    capture = SimpleNamespace(train_views=[SimpleNamespace(camera=camera) for camera in CAMERAS])
+    return SimpleNamespace(run=run, capture=capture, location=location)
+
+
+def test_a_tree_belongs_to_its_model_and_no_other(coarse, model):
+    console = Console(record=True)
+    request = LodRequest(run=coarse.run.path)
+    folder = build_lod.build_lod(coarse, request, console)
+    build_lod.build_lod(coarse, request, console)
+    assert console.export_text().count("nothing to do") == 1
+    opened = open_mapped(coarse.run, coarse.location)
+    drawn = open_tree(opened).at_error(0.0)
+    assert torch.equal(render(drawn, VIEWS[0]).image, render(model, VIEWS[0]).image)
+    assert find_tree(opened) is not None
+    other = replace(opened, status=replace(opened.status, model_id="1-b"))
+    assert find_tree(other) is None
+    with pytest.raises(RunError, match=r"tree of another model than the coarse one.*vdgs lod .*--model coarse"):
+        open_tree(other)
+    (folder / TREE_FILE).unlink()
+    with pytest.raises(RunError, match="no finished level-of-detail tree"):
+        open_tree(opened)
+
+
+def test_a_disk_without_room_is_said_before_anything_is_written(coarse, monkeypatch):
+    monkeypatch.setattr(build_lod.shutil, "disk_usage", lambda _: SimpleNamespace(free=1000))
+    with pytest.raises(VdgsError, match=r"takes up to .* and .* are free"):
+        build_lod.build_lod(coarse, LodRequest(run=coarse.run.path), Console())
+    assert not list(coarse.run.path.rglob("lod/**/*.safetensors"))
