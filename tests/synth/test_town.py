@@ -74,6 +74,23 @@ def files(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
+def test_off_path_views_are_apart_and_true(capture: Path) -> None:
+    chosen = {kind: load_capture(capture, CaptureOptions(validation=kind)).off_path_views for kind in (False, True)}
+    sets = [f"{name}/{name}_{number:04d}.jpg" for name in ("low_oblique", "outside", "street") for number in (1, 2)]
+    assert [[view.name for view in chosen[kind]] for kind in (False, True)] == [sets[::2], sets[1::2]]
+    truth = load_ground_truth(capture / "off_path")
+    read = load_capture(capture)
+    assert not any(view.name.startswith(("low", "out", "street")) for view in read.views)
+    depth = make_true_depth(read, read.off_path_views)
+    assert depth is not None
+    for view in read.off_path_views:
+        assert depth(view).shape == (72, 96)
+        assert (truth.visibility_map(view) >= 3).mean() > 0.1
+    low, _, street = read.off_path_views
+    assert np.degrees(np.arccos(-low.camera.forward[2])) == pytest.approx(60, abs=2)
+    assert np.degrees(np.arccos(-street.camera.forward[2])) > 80
+
+
 def test_points_reproject_to_within_the_noise(model: pycolmap.Reconstruction) -> None:
     residuals = []
     for camera, _, pixels, points, _ in observations(model):

@@ -86,7 +86,9 @@ def step(monkeypatch: pytest.MonkeyPatch, stage: TrainingProblem, own: bool, nar
         if not narrowing:
             patch.setattr(training_loop, "crop_to_gradient_support", lambda stage, splats, camera, box: box)
         draw = training_loop.render_for_training
-        patch.setattr(training_loop, "render_for_training", lambda *given: drawn.append(given) or draw(*given))
+        patch.setattr(
+            training_loop, "render_for_training", lambda *given, **named: drawn.append(given) or draw(*given, **named)
+        )
         train_step(state, stage)
     ((_, camera, _, around),) = drawn
     return Stepped(state, camera.width * camera.height, len(around.depths))
@@ -124,6 +126,8 @@ def test_a_block_with_nothing_around_it_draws_all(monkeypatch):
     stage, state = block_stage(BlockConfig())
     nothing = stage.frozen_anchors.anchors.select(torch.zeros(0, dtype=torch.int64))
     camera, drawn, draw = stage.images.camera(0), [], training_loop.render_for_training
-    monkeypatch.setattr(training_loop, "render_for_training", lambda *given: drawn.append(given[1]) or draw(*given))
+    monkeypatch.setattr(
+        training_loop, "render_for_training", lambda *given, **named: drawn.append(given[1]) or draw(*given, **named)
+    )
     train_step(state, replace(stage, frozen_anchors=FrozenAnchors(nothing, state.decoder)))
     assert [(each.width, each.height) for each in drawn] == [(camera.width, camera.height)]

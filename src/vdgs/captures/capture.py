@@ -66,6 +66,8 @@ class Capture:
     downscale: float = 1.0
     #: Photographs that are there and not used: without a camera, or left out by an option.
     num_unused_images: int = 0
+    #: Photographs from where nobody flew (`captures.off_path`), which are measured by themselves.
+    off_path_views: tuple[View, ...] = ()
 
     def __repr__(self) -> str:
         return (

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vdgs.captures.capture import Capture, Observations, View
+from vdgs.captures.capture import Capture, Observations, Split, View
 from vdgs.captures.capture_root import capture_root
 from vdgs.captures.format_dispatch import check_folder, read_source
 from vdgs.captures.formats.ply_reader import GRAY
@@ -19,6 +19,7 @@ from vdgs.captures.image_checks import detect_rounding
 from vdgs.captures.image_files import MIN_SIDE_PX, VIDEO_SUFFIXES
 from vdgs.captures.image_matching import MatchedView, match_images
 from vdgs.captures.nested_captures import check_no_foreign_file
+from vdgs.captures.off_path import match_off_path
 from vdgs.captures.output_guard import check_not_among_files
 from vdgs.captures.project_formats import is_project
 from vdgs.captures.splits import assign_splits, select_central_views
@@ -83,10 +84,11 @@ def make_capture(root: Path, source: SourceCapture, options: CaptureOptions) -> 
             raise CaptureError(f"{root}: the chosen {options.max_images} photographs see no points; use more.")
     explicit = {photo.view.name: photo.view.split for photo in photographs}
     views = assign_splits(root, views, explicit, options, warnings)
+    off_path = [_view(photo, options, ground, "test") for photo in match_off_path(root, options, warnings)]
     return Capture(
         root=root, source=source.source, images=source.images, views=tuple(views), points=points,
         point_colors=colors, ground=ground, warnings=(*warnings, *ground_warnings), downscale=options.downscale,
-        num_unused_images=unused + len(photographs) - len(views),
+        num_unused_images=unused + len(photographs) - len(views), off_path_views=tuple(off_path),
     )  # fmt: skip
 
 
@@ -167,7 +169,7 @@ def _size(file: ImageFile) -> tuple[int, int]:
     return file.intrinsics.width, file.intrinsics.height
 
 
-def _view(photo: MatchedView, options: CaptureOptions, ground: GroundFrame) -> View:
+def _view(photo: MatchedView, options: CaptureOptions, ground: GroundFrame, split: Split = "train") -> View:
     intrinsics = photo.file.intrinsics
     (fx, fy), (cx, cy) = intrinsics.focal, intrinsics.principal_point
     width, height = intrinsics.width, intrinsics.height
@@ -179,6 +181,6 @@ def _view(photo: MatchedView, options: CaptureOptions, ground: GroundFrame) -> V
     seen = photo.view.observations
     sightings = None if seen is None else Observations(ground.to_ground(seen.points), seen.rays, seen.point_ids)
     return View(
-        name=photo.view.name, camera=camera, image_path=photo.file.path, mask_path=photo.file.mask, split="train",
+        name=photo.view.name, camera=camera, image_path=photo.file.path, mask_path=photo.file.mask, split=split,
         observations=sightings,
     )  # fmt: skip

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
 from vdgs.captures.capture import Split, View
+from vdgs.captures.flight_parts import MIN_STRIP, OBLIQUE_DEGREES, flight_strips, oblique_views
 from vdgs.captures.formats.source_capture import format_list
 from vdgs.captures.name_resolution import ImageNameIndex
 from vdgs.config.capture_options import CaptureOptions
@@ -21,6 +23,8 @@ from vdgs.errors import CaptureError
 
 #: Lists that a capture may bring, in its root folder.
 TEST_LIST, VALIDATION_LIST = "test.txt", "validation.txt"
+#: Splits that follow from positions and headings.
+_BY_FLIGHT = ("strips", "obliques")
 
 
 def select_central_views(views: list[View], count: int) -> list[View]:
@@ -48,15 +52,19 @@ def assign_splits(
     splits = _splits(root, views, explicit, options, names)
     chosen = [replace(view, split=split) for view, split in zip(views, splits, strict=True) if split is not None]
     unlisted = [view.name for view, split in zip(views, splits, strict=True) if split is None]
-    if unlisted:
+    if unlisted and options.split not in _BY_FLIGHT:
         shown = ", ".join(unlisted[:5]) + (", ..." if len(unlisted) > 5 else "")
         warnings.append(
             f"{len(unlisted)} of {len(views)} photographs stand in none of the capture's lists of training and test "
             f"photographs and are left out ({shown}). --split every uses them all."
         )
     own = root / VALIDATION_LIST
-    if own.is_file() and options.split != "every":
-        chosen = _with_validation_list(chosen, _listed(own, names, some=options.validation), options.validation)
+    if options.split in _BY_FLIGHT:
+        pass  # they know of validation themselves
+    elif own.is_file() and options.split != "every":
+        chosen = _with_validation_list(
+            chosen, listed_photographs(own, names, some=options.validation), options.validation
+        )
     elif options.validation:
         kept = [view for view in chosen if view.split == "train"]
         chosen = [replace(v, split="train" if i % options.test_every else "test") for i, v in enumerate(kept)]
@@ -77,9 +85,11 @@ def _splits(
     listed = options.test_list
     if listed is None and (root / TEST_LIST).is_file():
         listed = root / TEST_LIST
+    if options.split in _BY_FLIGHT:
+        return _splits_by_flight(root, views, options)
     if options.split != "every":
         if listed is not None:
-            tests = _listed(listed, names, some=True)
+            tests = listed_photographs(listed, names, some=True)
             return ["test" if view.name in tests else "train" for view in views]
         if any(split is not None for split in explicit.values()):
             return [explicit[view.name] for view in views]
@@ -91,6 +101,36 @@ def _splits(
     return ["test" if index % options.test_every == 0 else "train" for index in range(len(views))]
 
 
+def _splits_by_flight(root: Path, views: list[View], options: CaptureOptions) -> list[Split | None]:
+    """Whole strips, or all obliques, for testing; or for validation others, without those for testing.
+
+    Raises CaptureError where the flight has none to leave out.
+    """
+    if options.split == "obliques":
+        parts, least = [[k] for k in oblique_views(views)], 2
+        step, found = 2, f"{len(parts)} of {len(views)} photographs look more than {OBLIQUE_DEGREES} degrees from down"
+        if len(views) - len(parts) < MIN_STRIP:
+            parts = []
+    else:
+        parts, least = flight_strips(views), 4 if options.validation else 3
+        step = max(min(options.test_every, len(parts)), 2)
+        found = f"the flight has {len(parts)} straight strips of at least {MIN_STRIP} photographs"
+    if len(parts) < least:
+        raise CaptureError(
+            f"{root}: --split {options.split}, but {found}; at least {least} are needed, and {MIN_STRIP} photographs "
+            "that train. Use --split every."
+        )
+    tests, validation = parts[step // 2 :: step], parts[step // 2 - 1 :: step]
+    if options.split == "obliques" and not options.validation:
+        tests = parts
+    splits: list[Split | None] = ["train"] * len(views)
+    for k in chain.from_iterable(tests):
+        splits[k] = None if options.validation else "test"
+    for k in chain.from_iterable(validation if options.validation else ()):
+        splits[k] = "test"
+    return splits
+
+
 def _with_validation_list(views: list[View], listed: set[str], validation: bool) -> list[View]:
     """Leave the listed photographs out; or, for validation, test on them and leave the test photographs out."""
     held_out = {view.name for view in views if view.split == "test"}
@@ -100,7 +140,7 @@ def _with_validation_list(views: list[View], listed: set[str], validation: bool)
     return [replace(view, split="test" if view.name in listed else "train") for view in kept]
 
 
-def _listed(file: Path, names: ImageNameIndex, some: bool) -> set[str]:
+def listed_photographs(file: Path, names: ImageNameIndex, some: bool) -> set[str]:
     """The photographs named in a text file, one a line; extensions and case may differ. CaptureError for a list that
     cannot be read, names what is no photograph, or names nothing where `some` are needed."""
     try:

@@ -56,13 +56,14 @@ def status_command(arguments: list[str]) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class EvalArguments(ShardArguments, ComputeOptions, StageArguments):
-    """Render the test views of a run, or its training views, and measure them: metrics.json, per_view.json, pictures, a
-    table."""
+    """Render the test views of a run and measure them: metrics.json, per_view.json, pictures, a table. Where the
+    capture has a folder off_path, its views from where nobody flew are measured too, by themselves."""
 
     model: ModelName = "best"
     """Which model; `best` is the merged one where there is one."""
-    views: Literal["test", "training"] = "test"
-    """Which views. `training` goes into evaluation_training: a model that is much better there than on test views
+    views: Literal["test", "training", "off-path"] = "test"
+    """Which views. `off-path` goes into evaluation_off_path and counts pixels that three training cameras see; `test`
+    includes it. `training` goes into evaluation_training: a model that is much better there than on test views
     overfits. Blocks and seams are measured on test views only."""
     lod_error: Annotated[float | None, Range(0, MAX_RENDER_SIDE_PX)] = None
     """Draw through the run's level-of-detail tree (`vdgs lod`), at most so many pixels off. The figures go into

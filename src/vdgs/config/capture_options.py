@@ -10,7 +10,7 @@ from vdgs.config.output_paths import Output
 from vdgs.config.ranges import MAX_COUNT, Range
 
 UpAxis = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
-SplitMode = Literal["auto", "explicit", "every"]
+SplitMode = Literal["auto", "explicit", "every", "strips", "obliques"]
 CaptureFormat = Literal[
     "auto", "colmap", "transforms", "mega-nerf", "matrixcity", "metashape", "blocks-exchange", "opf", "pix4d",
     "opensfm", "realityscan", "openmvg", "alicevision", "visualsfm", "bundler",
@@ -44,7 +44,9 @@ class CaptureOptions:
     split: SplitMode = "auto"
     """How photographs are kept for testing. auto: the capture's own split or test list where there is one, else every
     n-th (where transforms.json lists training and test photographs, those in neither list are left out); explicit:
-    insist on it; every: always every n-th."""
+    insist on it; every: always every n-th. To measure away from where photographs train, whatever lists there are:
+    strips leaves out whole strips of the flight, obliques all photographs that do not look straight down (with
+    --validation other strips, and every second oblique, are tested)."""
     validation: bool = False
     """Test on photographs for validation instead. The test photographs are left out altogether, and tests are on those
     named in validation.txt of the capture folder instead, or where there is none on every n-th training photograph: for

@@ -136,6 +136,12 @@ class LossConfig:
     """Loss = (1 - w) L1 + w (1 - SSIM) + volume."""
     volume_reg: Annotated[float, Range(0, MAX_FLOAT)] = 0.01
     """Weight of the mean product of the three scales of the Gaussians that are drawn."""
+    depth_agreement: Annotated[float, Range(0, MAX_FLOAT)] = 0.0
+    """Weight of the mean difference between expected and median depth, in camera heights: fewer shreds in views from
+    where nobody flew (choice). On a GPU it takes slower kernels."""
+    opacity_noise: Annotated[float, Range(0, 1)] = 0.0
+    """Standard deviation of the factor by which the opacity of each Gaussian is multiplied in a step: Gaussians that
+    make a surface only together, spread in depth, come apart (choice)."""
     background: Literal["mean", "black"] = "mean"
     """Color behind the scene: the mean of the training photographs (choice), or black."""
     random_background: Annotated[float, FRACTION] = 1.0

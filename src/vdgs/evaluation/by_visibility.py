@@ -106,6 +106,17 @@ class VisibilityHistogram:
             result.append(self._bin(float(lower), float(upper), int(self._counts[chosen].sum()), sums))
         return result
 
+    def bins_at(self, edges: Sequence[float]) -> list[VisibilityBin]:
+        """As `bins`, cut at given values; a bin holds its lower edge, and the last one is open (upper: None)."""
+        keys, found = np.flatnonzero(self._counts), []
+        place = np.searchsorted(np.asarray(edges), histogram_values(keys), side="right")
+        for index, (lower, upper) in enumerate(zip((0.0, *edges), (*edges, None), strict=True)):
+            chosen = keys[place == index]
+            if len(chosen):
+                sums = {name: float(total[chosen].sum()) for name, total in self._sums.items()}
+                found.append(self._bin(lower, upper, int(self._counts[chosen].sum()), sums))
+        return found
+
     @staticmethod
     def _bin(lower: float | None, upper: float | None, pixels: int, sums: Mapping[str, float]) -> VisibilityBin:
         figures: VisibilityBin = {"lower": lower, "upper": upper, "pixels": pixels}

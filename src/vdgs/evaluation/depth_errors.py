@@ -15,13 +15,15 @@ from vdgs.evaluation.by_block import MIN_ALPHA
 from vdgs.evaluation.by_visibility import NUM_KEYS, histogram_keys, histogram_values
 from vdgs.kernels.kernel_types import Raster
 
-#: Errors up to this share of the camera height count as within one percent.
-NEAR_THRESHOLD = 0.01
+#: Errors up to this share of the camera height count as within one percent, and within two.
+NEAR_THRESHOLD, WITHIN_THRESHOLD = 0.01, 0.02
 #: Two depths of a pixel: the mean over what is blended, and where it becomes half opaque.
 DEPTH_KINDS = ("expected", "median")
 #: What is reported of each kind.
 METRIC_NAMES = tuple(
-    f"{name}_{kind}" for kind in DEPTH_KINDS for name in ("depth_error_median", "depth_within_1_percent")
+    f"{name}_{kind}"
+    for kind in DEPTH_KINDS
+    for name in ("depth_error_median", "depth_within_1_percent", "depth_within_2_percent")
 )
 
 
@@ -70,6 +72,11 @@ class DepthErrors:
         """Of the errors, how many are at most NEAR_THRESHOLD; exact."""
         return self._near / self.count if self.count else None
 
+    def within_share(self) -> float | None:
+        """Of the errors, how many are at most WITHIN_THRESHOLD (to 1 in 2,000)."""
+        end = int(histogram_keys(np.array([WITHIN_THRESHOLD]))[0]) + 1
+        return int(self._counts[:end].sum()) / self.count if self.count else None
+
 
 def compute_depth_errors(
     raster: Raster, true_depth: Float[np.ndarray, "h w"], covered: Bool[np.ndarray, "h w"], camera_height: float
@@ -99,4 +106,5 @@ def summarize_depth_errors(errors: Mapping[str, DepthErrors]) -> dict[str, float
     for kind, each in errors.items():
         figures[f"depth_error_median_{kind}"] = each.median()
         figures[f"depth_within_1_percent_{kind}"] = each.near_share()
+        figures[f"depth_within_2_percent_{kind}"] = each.within_share()
     return figures

@@ -13,9 +13,10 @@ One view is in memory at a time.
 from __future__ import annotations
 
 import statistics
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -25,11 +26,12 @@ from vdgs.captures.capture import View
 from vdgs.errors import RunError
 from vdgs.evaluation import comparison_images
 from vdgs.evaluation.by_visibility import VisibilityHistogram, mean_or_none, view_bins
-from vdgs.evaluation.depth_errors import DepthErrors, summarize_depth_errors
+from vdgs.evaluation.depth_errors import METRIC_NAMES, DepthErrors, summarize_depth_errors
 from vdgs.evaluation.lpips import Lpips
 from vdgs.evaluation.metric_tables import make_metrics_table
 from vdgs.evaluation.opacity_coverage import summarize_opacity_coverage, summarize_oversized_splats
 from vdgs.evaluation.renderable_model import EvaluatedModel, EvaluationSettings, ReferenceViews, RenderableModel
+from vdgs.evaluation.shreds import ANGLE_EDGES, SHRED_KEYS, summarize_shreds
 from vdgs.evaluation.view_metrics import (
     AFFINE_KEYS,
     CORRECTED_KEYS,
@@ -52,6 +54,7 @@ class _MetricTotals:
     rows: list[JsonObject] = field(default_factory=list)
     cells: list[comparison_images.Thumbnail] = field(default_factory=list)
     histogram: VisibilityHistogram | None = None
+    by_angle: VisibilityHistogram | None = None
     depth_errors: dict[str, DepthErrors] = field(default_factory=dict)
 
     def add(self, figures: ViewMetrics) -> None:
@@ -61,6 +64,9 @@ class _MetricTotals:
         if figures.by_visibility is not None:
             self.histogram = self.histogram or VisibilityHistogram(figures.by_visibility.names)
             self.histogram.merge(figures.by_visibility)
+        if figures.by_angle is not None:
+            self.by_angle = self.by_angle or VisibilityHistogram(figures.by_angle.names)
+            self.by_angle.merge(figures.by_angle)
         for kind, errors in figures.depth_errors.items():
             self.depth_errors.setdefault(kind, DepthErrors()).merge(errors)
 
@@ -149,13 +155,27 @@ def _summary(
         **summarize_opacity_coverage(rows),
         **summarize_depth_errors(gathered.depth_errors),
         **summarize_oversized_splats(rows),
+        **summarize_shreds(rows),
+        "by_angle": gathered.by_angle.bins_at(ANGLE_EDGES) if gathered.by_angle else None,
+        "sets": _by_folder(rows) if settings.by_folder else None,
         **asdict(metadata),
         "fps": 1.0 / max(statistics.median(row["render_seconds"] for row in rows), 1e-9) if timed else None,
-        settings.title.replace(" ", "_"): len(rows),
+        settings.title.replace(" ", "_").replace("-", "_"): len(rows),
         "notes": notes,
     }
     measured: EvaluationMetrics = to_jsonable(result)
     return measured
+
+
+def _by_folder(rows: Sequence[Mapping[str, Any]]) -> dict[str, JsonObject]:
+    """Means over the views of each folder."""
+    keys, folders = (*RAW_KEYS, *METRIC_NAMES, *SHRED_KEYS), defaultdict[str, list[Mapping[str, Any]]](list)
+    for row in rows:
+        folders[PurePosixPath(row["name"]).parts[0]].append(row)
+    return {
+        folder: {"views": len(of)} | {key: mean_or_none([row[key] for row in of]) for key in keys}
+        for folder, of in sorted(folders.items())
+    }
 
 
 def _exposure_note(rows: Sequence[Mapping[str, Any]], settings: EvaluationSettings) -> str:

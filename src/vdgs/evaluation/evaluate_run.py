@@ -16,12 +16,13 @@ from vdgs.captures.camera_height import camera_height
 from vdgs.captures.capture import Capture, View
 from vdgs.captures.ground_truth import has_ground_truth, load_ground_truth
 from vdgs.captures.image_cache import ImageCache
+from vdgs.captures.off_path import OFF_PATH_FOLDER
 from vdgs.errors import RunError
 from vdgs.evaluation.block_seams import BlockInputs
 from vdgs.evaluation.evaluate_model import evaluate_model
 from vdgs.evaluation.lpips import load_lpips
 from vdgs.evaluation.measured_as import EvaluationSplit, evaluation_folder
-from vdgs.evaluation.opacity_coverage import coverage_map
+from vdgs.evaluation.opacity_coverage import MIN_SEEN_BY, coverage_map
 from vdgs.evaluation.renderable_model import EvaluatedModel, EvaluationSettings, ReferenceViews, RenderableModel
 from vdgs.evaluation.view_exposures import make_exposures
 from vdgs.geometry.camera import Camera
@@ -43,6 +44,7 @@ EXPOSURE_NOTES = {
     "test": "in the exposure that the training photographs taken before and after predict (no pixel of a test view "
     "is used)",
     "training": "in the exposure that was fitted to each",
+    "off-path": "",
 }
 
 #: Blocks are held assembled among their surroundings up to so many bytes (at least one): views show them in turn.
@@ -79,12 +81,17 @@ def check_bins(bins: int) -> None:
 
 
 def make_evaluation_settings(bins: int, views: EvaluationSplit) -> EvaluationSettings:
-    return EvaluationSettings(visibility_bins=bins, title=f"{views} views", exposure_note=EXPOSURE_NOTES[views])
+    off_path = views == "off-path"
+    return EvaluationSettings(
+        visibility_bins=bins, title=f"{views} views", exposure_note=EXPOSURE_NOTES[views],
+        color_correction=not off_path, covered_only=off_path, by_folder=off_path,
+    )  # fmt: skip
 
 
 def select_views(capture: Capture, views: EvaluationSplit) -> list[View]:
     """The views that are measured."""
-    return list(capture.test_views if views == "test" else capture.train_views)
+    of = {"test": capture.test_views, "training": capture.train_views, "off-path": capture.off_path_views}
+    return list(of[views])
 
 
 def make_renderable_model(
@@ -101,12 +108,17 @@ def make_renderable_model(
         model_digest=run.status.model_id,
         key=run.key,
     )
+    visibility_map, coverage = make_visibility_map(coarse), make_coverage_map(coarse)
+    if views == "off-path" and (seen := true_visibility_map(run.capture)) is not None:
+        visibility_map, coverage = seen, lambda camera: seen(camera) >= MIN_SEEN_BY
     return RenderableModel(
-        render=lambda camera: render(scene, camera), visibility_map=make_visibility_map(coarse), metadata=metadata,
-        background=run.model.background, coverage_map=make_coverage_map(coarse),
+        render=lambda camera: render(scene, camera), visibility_map=visibility_map, metadata=metadata,
+        background=run.model.background, coverage_map=coverage,
         true_depth=make_true_depth(run.capture, select_views(run.capture, views)),
         render_depth=lambda camera: render(scene, camera, depth=True), camera_height=camera_height(run.capture),
-        decode_splats=lambda camera: view_splats(scene, camera)[1], exposure=make_exposures(run.model, run.capture),
+        decode_splats=lambda camera: view_splats(scene, camera)[1],
+        training_cameras=[view.camera for view in run.capture.train_views],
+        exposure=None if views == "off-path" else make_exposures(run.model, run.capture),
     )  # fmt: skip
 
 
@@ -139,6 +151,16 @@ def make_coverage_map(coarse: OpenedRun) -> Callable[[Camera], Bool[np.ndarray, 
     return coverage_map(lambda camera: render(coarse.model, camera, depth=True), cameras)
 
 
+def true_visibility_map(capture: Capture) -> Callable[[Camera], Float[np.ndarray, "h w"]] | None:
+    """True V at each pixel of the off-path views of a capture, NaN for sky, by their cameras; None where it is not
+    known."""
+    folder, views = capture.root / OFF_PATH_FOLDER, capture.off_path_views
+    if not has_ground_truth(folder):
+        return None
+    truth, by_pose = load_ground_truth(folder), {view.camera.camera_from_world.tobytes(): view for view in views}
+    return lambda camera: truth.visibility_map(by_pose[camera.camera_from_world.tobytes()])
+
+
 def with_coarse_model(run: OpenedRun) -> OpenedRun:
     """The run with its coarse model, whichever it was opened with."""
     if run.name == "coarse":
@@ -149,9 +171,10 @@ def with_coarse_model(run: OpenedRun) -> OpenedRun:
 def make_true_depth(capture: Capture, views: Sequence[View]) -> Callable[[View], Float[np.ndarray, "h w"]] | None:
     """The true depth of views of a generated capture, in units of the ground frame, inf for sky; None where it was
     written without."""
-    if not has_ground_truth(capture.root):
+    root = capture.root / OFF_PATH_FOLDER if views and views[0] in capture.off_path_views else capture.root
+    if not has_ground_truth(root):
         return None
-    truth, units_per_metre = load_ground_truth(capture.root), capture.ground.scale
+    truth, units_per_metre = load_ground_truth(root), capture.ground.scale
     if not all(truth.has_depth(view) for view in views):
         return None
     # The world of a generated capture is in metres, and the ground frame is a similarity of it.

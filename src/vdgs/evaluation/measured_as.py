@@ -10,17 +10,18 @@ from vdgs.system.atomic_files import read_json_or_empty
 from vdgs.system.documents import MeasuredAs
 
 #: What to measure on. A model that is good on training views and not on test views overfits.
-EvaluationSplit = Literal["test", "training"]
+EvaluationSplit = Literal["test", "training", "off-path"]
 
 
 def evaluation_folder(
     run: RunFolder, name: str, views: EvaluationSplit = "test", lod_error: float | None = None
 ) -> Path:
-    """Where the figures of a model ("coarse" or "merged") are: RUN/evaluation, RUN/coarse/evaluation; of training views
-    beside them, in `evaluation_training`, and of levels of detail in `evaluation_lod_1.5` or the like."""
+    """Where the figures of a model ("coarse" or "merged") are: RUN/evaluation, RUN/coarse/evaluation; of other views
+    beside them, in `evaluation_training` and `evaluation_off_path`, and of levels of detail in `evaluation_lod_1.5` or
+    the like."""
     folder = run.evaluation if name == "merged" else run.coarse.path / "evaluation"
-    suffix = ("" if views == "test" else "_training") + ("" if lod_error is None else f"_lod_{lod_error:g}")
-    return folder.with_name(f"{folder.name}{suffix}")
+    suffix = "" if views == "test" else f"_{views.replace('-', '_')}"
+    return folder.with_name(f"{folder.name}{suffix}{'' if lod_error is None else f'_lod_{lod_error:g}'}")
 
 
 def is_evaluated(run: RunFolder, name: str, lpips_weights: Path | None, bins: int) -> bool:

@@ -30,6 +30,16 @@ COVERAGE_METRICS = (
     ("depth_error_median_median", "median error of median depth (camera heights) ↓", "{:.2%}"),
     ("depth_within_1_percent_expected", "expected depth within 1 % of the camera height ↑", "{:.2%}"),
     ("depth_within_1_percent_median", "median depth within 1 % of the camera height ↑", "{:.2%}"),
+    ("depth_within_2_percent_median", "median depth within 2 % of the camera height ↑", "{:.2%}"),
+)
+#: Figures of each kind of off-path view: key, what people call it, format.
+SET_METRICS = (
+    ("views", "views", "{}"),
+    ("psnr", "PSNR (dB) ↑", "{:.2f}"),
+    ("ssim", "SSIM ↑", "{:.4f}"),
+    ("depth_within_2_percent_median", "depth within 2 % ↑", "{:.1%}"),
+    ("needles", "needles ↓", "{:.1%}"),
+    ("floaters", "floaters ↓", "{:.1%}"),
 )
 
 
@@ -46,6 +56,10 @@ def make_metrics_table(result: Mapping[str, Any], title: str) -> RenderableType:
         others = (format_value(result.get(f"{key}{suffix}"), form) for suffix in besides)
         quality.add_row(label, format_value(result[key], form), *others)
     parts: list[RenderableType] = [quality]
+    if result.get("sets"):
+        parts.append(_sets_table(result["sets"]))
+    if len(result.get("by_angle") or []) > 1:
+        parts.append(_angle_table(result["by_angle"]))
     if result["by_visibility"]:
         parts.append(_visibility_table(result["by_visibility"]))
     if result["psnr_covered_own_background"] is not None:
@@ -59,6 +73,35 @@ def make_metrics_table(result: Mapping[str, Any], title: str) -> RenderableType:
 def format_value(value: float | None, form: str) -> str:
     """The figure, or a dash where there is none."""
     return "–" if value is None else form.format(value)
+
+
+def format_angles(lower: float, upper: float | None) -> str:
+    """The bounds of a bin by angle for people: `10 to 20°`."""
+    return f"above {lower:g}°" if upper is None else f"{lower:g} to {upper:g}°"
+
+
+def _sets_table(sets: Mapping[str, Mapping[str, Any]]) -> Table:
+    title = "by kind of view (pixels that at least 3 training cameras see; needles and floaters: all pixels)"
+    table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
+    for column in ("", *(label for _, label, _ in SET_METRICS)):
+        table.add_column(column, justify="right" if column else "left", no_wrap=not column)
+    for name, figures in sets.items():
+        table.add_row(name, *(format_value(figures[key], form) for key, _, form in SET_METRICS))
+    return table
+
+
+def _angle_table(bins: list[Mapping[str, Any]]) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, title="by angle to the nearest training view", title_justify="left")
+    for column in ("angle", "share", "PSNR (dB)", "SSIM", "depth within 2 %"):
+        table.add_column(column, justify="right")
+    total = sum(each["pixels"] for each in bins)
+    for each in bins:
+        table.add_row(
+            format_angles(each["lower"], each["upper"]), f"{each['pixels'] / total:.1%}",
+            format_value(each["psnr"], "{:.2f}"), format_value(each["ssim"], "{:.4f}"),
+            format_value(each.get("depth_within_2_percent"), "{:.1%}"),
+        )  # fmt: skip
+    return table
 
 
 def _visibility_table(bins: list[Mapping[str, Any]]) -> Table:

@@ -61,6 +61,8 @@ class RenderableModel:
     camera_height: float | None = None
     #: The splats that a view is drawn from.
     decode_splats: Callable[[Camera], Splats] | None = None
+    #: Against whose views the angle of each pixel is measured; none: there are no figures by angle.
+    training_cameras: Sequence[Camera] = ()
     #: The color model of a view (`model.exposure`), in which its picture is measured; None: neutral colors.
     exposure: Callable[[View], Float[Tensor, "3 4"]] | None = None
 
@@ -80,6 +82,10 @@ class EvaluationSettings:
     visibility_bins: int = DEFAULT_BINS
     #: Write photograph | render | error for every view.
     comparisons: bool = True
+    #: Measure only pixels that show what enough training cameras see (`RenderableModel.coverage_map`).
+    covered_only: bool = False
+    #: Also report the figures of the views of each folder, by their names.
+    by_folder: bool = False
     #: What the contact sheet calls the views, and, with _ between its words, metrics.json their number.
     title: str = "test views"
     #: How pictures are exposed, if the model says how: what metrics.json notes of them.

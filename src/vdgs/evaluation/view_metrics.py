@@ -19,12 +19,20 @@ from jaxtyping import Bool, Float, UInt8
 from vdgs.captures.capture import View
 from vdgs.errors import CaptureError, TrainingDiverged
 from vdgs.evaluation import comparison_images, metrics
+from vdgs.evaluation.by_block import MIN_ALPHA
 from vdgs.evaluation.by_visibility import VisibilityHistogram
 from vdgs.evaluation.color_correction import correct_colors, correct_colors_affine
-from vdgs.evaluation.depth_errors import DepthErrors, compute_depth_errors, summarize_depth_errors
+from vdgs.evaluation.depth_errors import (
+    WITHIN_THRESHOLD,
+    DepthErrors,
+    compute_depth_errors,
+    summarize_depth_errors,
+)
 from vdgs.evaluation.lpips import MIN_SIDE_PX, Lpips
 from vdgs.evaluation.opacity_coverage import RenderedImage, count_oversized_splats, measure_opacity_coverage
 from vdgs.evaluation.renderable_model import EvaluationSettings, ReferenceViews, RenderableModel
+from vdgs.evaluation.shreds import floater_share, needle_share, training_view_angles
+from vdgs.kernels.kernel_types import Raster
 from vdgs.system.documents import JsonObject
 
 RAW_KEYS = ("psnr", "ssim", "lpips_vgg", "lpips_vgg_01")
@@ -69,6 +77,8 @@ class ViewMetrics:
     """Of its pixels alone; None where V is not known."""
     depth_errors: dict[str, DepthErrors] = field(default_factory=dict)
     """By kind, of its pixels alone."""
+    by_angle: VisibilityHistogram | None = None
+    """Of its pixels by the angle to the nearest training view; None where that is not known."""
     cell: comparison_images.Thumbnail | None = None
     """What the contact sheet shows of it, if it does."""
 
@@ -81,6 +91,9 @@ def measure_view(index: int, inputs: ViewInputs) -> ViewMetrics:
     """
     view, stem, settings = inputs.reference_views.views[index], inputs.stems[index], inputs.settings
     reference, mask = _load_reference(view, inputs.reference_views)
+    covered = _covered(view, inputs.model, mask)
+    if settings.covered_only:
+        mask = covered
     neutral, seconds = _render(view, inputs.model)
     exposure = None if inputs.model.exposure is None else inputs.model.exposure(view)
     rendered = neutral if exposure is None else neutral.with_exposure(exposure)
@@ -111,14 +124,9 @@ def measure_view(index: int, inputs: ViewInputs) -> ViewMetrics:
                 row |= _lpips(pixels, reference, mask, suffix, inputs.lpips)
     visibility = None if inputs.model.visibility_map is None else np.asarray(inputs.model.visibility_map(view.camera))
     by_visibility, row["mean_visibility"] = _count_visibility(visibility, maps, mask)
-    covered = None
-    if inputs.model.coverage_map is not None:
-        covered = np.asarray(inputs.model.coverage_map(view.camera))
-        covered = covered if mask is None else covered & mask
     row |= measure_opacity_coverage(rendered, reference, covered)
-    depth_errors = _depth_errors(view, inputs.model, covered)
-    row |= summarize_depth_errors(depth_errors)
-    row["oversized_splats"] = _oversized_splats(view, inputs.model)
+    by_angle, depth_errors, figures = _measure_depths(view, inputs.model, maps, mask, covered)
+    row |= summarize_depth_errors(depth_errors) | figures | _splat_figures(view, inputs.model)
     row["unmasked_pixels"] = image.shape[0] * image.shape[1] if mask is None else int(mask.sum())
     row["render_seconds"] = seconds
     if settings.comparisons:
@@ -130,7 +138,17 @@ def measure_view(index: int, inputs: ViewInputs) -> ViewMetrics:
     if index in inputs.on_sheet:
         small = comparison_images.make_thumbnail(reference), comparison_images.make_thumbnail(image)
         cell = comparison_images.Thumbnail(view.name, f"{row['psnr']:.2f} dB", *small)
-    return ViewMetrics(row, by_visibility, depth_errors, cell)
+    return ViewMetrics(row, by_visibility, depth_errors, by_angle, cell)
+
+
+def _covered(
+    view: View, model: RenderableModel, mask: Bool[np.ndarray, "h w"] | None
+) -> Bool[np.ndarray, "h w"] | None:
+    """The pixels that enough training cameras see; None where that is not known."""
+    if model.coverage_map is None:
+        return None
+    covered = np.asarray(model.coverage_map(view.camera))
+    return covered if mask is None else covered & mask
 
 
 def _load_reference(
@@ -220,25 +238,52 @@ def _count_visibility(
     return histogram, float(visibility[seen].mean(dtype=np.float64)) if seen.any() else None
 
 
-def _depth_errors(
-    view: View, model: RenderableModel, covered: Bool[np.ndarray, "h w"] | None
-) -> dict[str, DepthErrors]:
-    """How far the model's depth is from the truth in this view; nothing without a truth."""
-    if model.true_depth is None or model.render_depth is None or model.camera_height is None or covered is None:
-        return {}
+def _measure_depths(
+    view: View, model: RenderableModel, maps: Mapping[str, np.ndarray], mask: Bool[np.ndarray, "h w"] | None,
+    covered: Bool[np.ndarray, "h w"] | None,
+) -> tuple[VisibilityHistogram | None, dict[str, DepthErrors], dict[str, float | None]]:  # fmt: skip
+    """The pixels pooled by the angle to the nearest training view; errors of the model's depth and the share of
+    floaters, where there is a truth."""
+    if model.render_depth is None or not (model.training_cameras or model.true_depth):
+        return None, {}, {"floaters": None}
     with torch.inference_mode():
         raster = model.render_depth(view.camera)
+    assert raster.median_depth is not None
+    alpha, depth = (each.cpu().numpy() for each in (raster.alpha, raster.median_depth))
     result: dict[str, DepthErrors] = {}
-    errors = compute_depth_errors(raster, np.asarray(model.true_depth(view)), covered, model.camera_height)
-    for kind, values in errors.items():
+    floaters, named, place = None, dict(maps), np.where(alpha > MIN_ALPHA, depth, np.inf)
+    if model.true_depth is not None and model.camera_height is not None:
+        truth = np.asarray(model.true_depth(view))
+        place, floaters = truth, floater_share(depth, alpha, truth, model.camera_height)
+        if covered is not None:
+            result = _depth_errors(raster, truth, covered, model.camera_height)
+            near = (alpha > MIN_ALPHA) & (np.abs(depth - truth) <= WITHIN_THRESHOLD * model.camera_height)
+            named["depth_within_2_percent"] = near.astype(np.float64)
+    by_angle = None
+    if model.training_cameras:
+        by_angle = VisibilityHistogram([*named])
+        angles = training_view_angles(view.camera, place, model.training_cameras)
+        known = np.isfinite(angles) if mask is None else np.isfinite(angles) & mask
+        by_angle.add(angles, named, known)
+    return by_angle, result, {"floaters": floaters}
+
+
+def _depth_errors(
+    raster: Raster, truth: Float[np.ndarray, "h w"], covered: Bool[np.ndarray, "h w"], camera_height: float
+) -> dict[str, DepthErrors]:
+    """How far the model's depth is from the truth in a view."""
+    result: dict[str, DepthErrors] = {}
+    for kind, values in compute_depth_errors(raster, truth, covered, camera_height).items():
         result[kind] = DepthErrors()
         result[kind].add(values)
     return result
 
 
-def _oversized_splats(view: View, model: RenderableModel) -> int | None:
-    """How many of the splats of a view are larger than its picture."""
+def _splat_figures(view: View, model: RenderableModel) -> JsonObject:
+    """How many of the splats of a view are larger than its picture, and the share that needles draw."""
     if model.decode_splats is None:
-        return None
+        return {"oversized_splats": None, "needles": None}
     with torch.inference_mode():
-        return count_oversized_splats(model.decode_splats(view.camera), view.camera.width, view.camera.height)
+        splats = model.decode_splats(view.camera)
+        count = count_oversized_splats(splats, view.camera.width, view.camera.height)
+        return {"oversized_splats": count, "needles": needle_share(splats, view.camera)}

@@ -30,6 +30,8 @@ def save_view_metrics(path: Path, metrics: ViewMetrics, block_metrics: BlockView
     parts: dict[str, dict[str, np.ndarray]] = {"view": {"format": np.array(FILE_FORMAT), "row": _text(metrics.row)}}
     if metrics.by_visibility is not None:
         parts["visibility"] = metrics.by_visibility.to_arrays()
+    if metrics.by_angle is not None:
+        parts["angle"] = metrics.by_angle.to_arrays()
     parts |= {f"depth-{kind}": errors.to_arrays() for kind, errors in metrics.depth_errors.items()}
     if metrics.cell is not None:
         cell = metrics.cell
@@ -65,8 +67,11 @@ def _read(path: Path) -> tuple[ViewMetrics, BlockViewMetrics | None]:
     if str(parts["view"]["format"]) != FILE_FORMAT:
         raise ValueError(f"it is not a {FILE_FORMAT} file")
     depth = {part.removeprefix("depth-"): DepthErrors.of(each) for part, each in parts.items() if part[:6] == "depth-"}
-    visibility = VisibilityHistogram.of(parts["visibility"]) if "visibility" in parts else None
-    figures = ViewMetrics(_row(parts["view"]), visibility, depth, _cell(parts["cell"]) if "cell" in parts else None)
+    visibility, angle = (
+        VisibilityHistogram.of(parts[name]) if name in parts else None for name in ("visibility", "angle")
+    )
+    cell = _cell(parts["cell"]) if "cell" in parts else None
+    figures = ViewMetrics(_row(parts["view"]), visibility, depth, angle, cell)
     if "blocks" not in parts:
         return figures, None
     blocks = parts["blocks"]

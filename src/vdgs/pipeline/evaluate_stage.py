@@ -149,6 +149,9 @@ def evaluate_stage(
     Raises what `ShardedJob.send` raises, and RunError where another process measures the same.
     """
     check_bins(request.visibility_bins)
+    if request.views == "test" and context.capture.off_path_views:
+        # First: where there are figures of test views, all is measured.
+        evaluate_stage(context, replace(request, views="off-path"), console, execution)
     evaluation = _Evaluation.create(request)
     run, model = evaluation.run, evaluation.model
     if model.warning:

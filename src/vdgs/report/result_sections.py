@@ -6,6 +6,7 @@ from pathlib import PurePosixPath
 
 from vdgs.evaluation.by_visibility import format_bounds
 from vdgs.evaluation.comparison_images import unique_file_stems
+from vdgs.evaluation.metric_tables import format_angles
 from vdgs.report.charts import draw_gain_bars, draw_psnr_bars
 from vdgs.report.html_page import Html, details, figure, gallery, paragraph, section, table
 from vdgs.report.run_reader import (
@@ -43,6 +44,9 @@ METRICS = (
     ("depth_error_median_median", "median error of median depth (camera heights) ↓", "{:.4f}"),
     ("depth_within_1_percent_expected", "share with expected depth within 1 % ↑", "{:.4f}"),
     ("depth_within_1_percent_median", "share with median depth within 1 % ↑", "{:.4f}"),
+    ("depth_within_2_percent_median", "share with median depth within 2 % ↑", "{:.4f}"),
+    ("needles", "share of what is drawn by needles ↓", "{:.4f}"),
+    ("floaters", "share of pixels with floaters ↓", "{:.4f}"),
     ("oversized_splats", "splats larger than the picture, all test views ↓", "{:,.0f}"),
 )
 
@@ -219,6 +223,48 @@ def _bins_table(bins: list[JsonRecord], pairs: list[tuple[JsonRecord, JsonRecord
         "merged", "Δ", "SSIM coarse", "merged", "Δ",
     ]  # fmt: skip
     return table(head, rows)
+
+
+def off_path_section(report: ReportedRun) -> Html:
+    """Views from where nobody flew; empty where the capture has none."""
+    source = report.files()
+    before, after = (
+        record
+        if (record := source.record(f"{folder}_off_path/metrics.json")).text("key") == tested.text("key")
+        else JsonRecord({})
+        for folder, tested in zip((COARSE_EVALUATION, MERGED_EVALUATION), read_metrics(source), strict=True)
+    )
+    shown, folder = (after, MERGED_EVALUATION) if after else (before, COARSE_EVALUATION)
+    if not shown:
+        return Html("")
+    rows = []
+    for name in shown.child("sets").values:
+        one, other = before.child("sets").child(name), after.child("sets").child(name)
+        rows.append([name, shown.child("sets").child(name).count("views"), *_off_path_cells(one, other)])
+    angles = [
+        [format_angles(row.number("lower") or 0.0, row.number("upper")), row.count("pixels"), row.format("psnr"),
+         format_percent(row.number("depth_within_2_percent"))]
+        for row in shown.rows("by_angle")
+    ]  # fmt: skip
+    head = ["kind", "views", *(f"{what} {of}" for what in ("PSNR", "depth within 2 %", "needles", "floaters")
+                               for of in ("coarse", "merged"))]  # fmt: skip
+    sheet = source.image(f"{folder}_off_path/contact_sheet.png")
+    parts = [
+        paragraph("Views from where nobody flew. Quality and depth: of pixels that at least 3 training cameras see; "
+                  "depth within 2 % of the camera height. Needles: share of what is drawn by splats seen as lines. "
+                  "Floaters: share of pixels that show something before the true surface."),
+        table(head, rows),
+        table(["angle to the nearest training view", "pixels", "PSNR", "depth within 2 %"], angles),
+        figure(sheet, "Photograph and render of each off-path view.", "contact sheet of the off-path views", True),
+    ]  # fmt: skip
+    return section("off-path", "Off the path of the flight", parts, source.notes)
+
+
+def _off_path_cells(coarse: JsonRecord, merged: JsonRecord) -> list[str]:
+    cells = [one.format("psnr") for one in (coarse, merged)]
+    for key in ("depth_within_2_percent_median", "needles", "floaters"):
+        cells += [format_percent(one.number(key)) for one in (coarse, merged)]
+    return cells
 
 
 def seams_section(report: ReportedRun) -> Html:

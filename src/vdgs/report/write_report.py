@@ -17,6 +17,7 @@ from vdgs.report.report_status import STATUS_META_NAME
 from vdgs.report.result_sections import (
     by_visibility_section,
     metrics_section,
+    off_path_section,
     seams_section,
     views_section,
 )
@@ -40,6 +41,7 @@ SECTIONS: tuple[tuple[Callable[[ReportedRun], Html], str, str], ...] = (
     (views_section, "views", "test views"),
     (metrics_section, "metrics", "metrics"),
     (by_visibility_section, "by-visibility", "quality by visibility"),
+    (off_path_section, "off-path", "off the path"),
     (ortho_section, "maps", "maps"),
     (sfm_section, "photographs", "photographs"),
     (visibility_section, "visibility", "visibility"),

@@ -46,9 +46,12 @@ def write_views(
     training: int,
     pool: Executor,
     done: Callable[[int], None],
+    *,
+    only_seen: bool = False,
 ) -> None:
-    """Depth of all photographs, and true visibility of those after the first `training` (which count as seeing)."""
-    for kind in ("views", "depth"):
+    """Depth of all photographs, and true visibility of those after the first `training` (which count as seeing);
+    `only_seen`: of these alone."""
+    for kind in ("views",) if only_seen else ("views", "depth"):
         (folder / kind).mkdir(parents=True, exist_ok=True)
     seeing = [camera for _, camera in named[:training]]
 
@@ -62,7 +65,7 @@ def write_views(
         else:
             np.savez_compressed(folder / "views" / file, depth=packed, depth_bounds=bounds, visibility=views)
 
-    for count, _ in enumerate(pool.map(write, range(len(named))), start=1):
+    for count, _ in enumerate(pool.map(write, range(training if only_seen else 0, len(named))), start=1):
         done(count)
 
 
@@ -72,6 +75,31 @@ def write_model(folder: Path, cameras: list[Camera], names: list[str], cloud: Sp
     All images share one pinhole camera. Point k of the cloud gets the id k + 1, image k the id k + 1.
     """
     model = pycolmap.Reconstruction()
+    place_in_image = np.empty(len(cloud.observed_image), np.int64)
+    of_image = observations_by_image(cloud.observed_image, len(cameras))
+    for at in of_image:
+        place_in_image[at] = np.arange(len(at))
+    _add_images(model, cameras, names, [cloud.observed_px[at] for at in of_image])
+    ends = np.searchsorted(cloud.observed_point, np.arange(len(cloud.points) + 1))
+    for k, (start, end) in enumerate(pairwise(ends)):
+        track = pycolmap.Track(
+            [pycolmap.TrackElement(int(cloud.observed_image[m]) + 1, int(place_in_image[m])) for m in range(start, end)]
+        )
+        point_id = model.add_point3D(cloud.points[k], track, cloud.colors[k])
+        model.point3D(point_id).error = float(cloud.errors[k])
+    write_model_files(model, folder)
+
+
+def write_poses(folder: Path, cameras: list[Camera], names: list[str]) -> None:
+    """As `write_model`, without points."""
+    model = pycolmap.Reconstruction()
+    _add_images(model, cameras, names, [np.empty((0, 2))] * len(names))
+    write_model_files(model, folder)
+
+
+def _add_images(
+    model: pycolmap.Reconstruction, cameras: list[Camera], names: list[str], keypoints: list[np.ndarray]
+) -> None:
     first = cameras[0]
     model.add_camera_with_trivial_rig(
         pycolmap.Camera(
@@ -82,19 +110,7 @@ def write_model(folder: Path, cameras: list[Camera], names: list[str], cloud: Sp
             camera_id=1,
         )
     )
-    place_in_image = np.empty(len(cloud.observed_image), np.int64)
-    of_image = observations_by_image(cloud.observed_image, len(cameras))
-    for k, (camera, name, at) in enumerate(zip(cameras, names, of_image, strict=True)):
-        place_in_image[at] = np.arange(len(at))
+    for k, (camera, name, pixels) in enumerate(zip(cameras, names, keypoints, strict=True)):
         pose = camera.camera_from_world
-        image = pycolmap.Image(name=name, keypoints=cloud.observed_px[at], camera_id=1, image_id=k + 1)
-        rigid = pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:3, :3]), pose[:3, 3])
-        model.add_image_with_trivial_frame(image, rigid)
-    ends = np.searchsorted(cloud.observed_point, np.arange(len(cloud.points) + 1))
-    for k, (start, end) in enumerate(pairwise(ends)):
-        track = pycolmap.Track(
-            [pycolmap.TrackElement(int(cloud.observed_image[m]) + 1, int(place_in_image[m])) for m in range(start, end)]
-        )
-        point_id = model.add_point3D(cloud.points[k], track, cloud.colors[k])
-        model.point3D(point_id).error = float(cloud.errors[k])
-    write_model_files(model, folder)
+        image = pycolmap.Image(name=name, keypoints=pixels, camera_id=1, image_id=k + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:3, :3]), pose[:3, 3]))

@@ -39,6 +39,9 @@ class SynthOptions:
     num_validation_images: Annotated[int | None, Range(0, 100_000)] = None
     """How many further photographs are kept apart from both, for choosing settings (validation.txt; used with
     --validation). Default: as many as test photographs."""
+    num_off_path_images: Annotated[int | None, Range(0, 100_000)] = None
+    """How many photographs of each of three kinds are taken from where the drone never was: low and oblique, from the
+    street, from outside. Every second one is for validation. Default: an eighth of --num-images, even, 2 to 12."""
     width: Annotated[int | None, Range(16, MAX_RENDER_SIDE_PX)] = None
     """Width of an image in pixels."""
     height: Annotated[int | None, Range(16, MAX_RENDER_SIDE_PX)] = None
@@ -86,6 +89,8 @@ class SynthOptions:
             values["num_test_images"] = max(2, values["num_images"] // 8)
         if values["num_validation_images"] is None:
             values["num_validation_images"] = values["num_test_images"]
+        if values["num_off_path_images"] is None:
+            values["num_off_path_images"] = 2 * min(6, max(1, values["num_images"] // 16))
         return ResolvedOptions(**(values | {"extent_m": float(values["extent_m"])}))
 
 
@@ -96,6 +101,7 @@ class ResolvedOptions(SynthOptions):
     num_images: int
     num_test_images: int
     num_validation_images: int
+    num_off_path_images: int
     width: int
     height: int
     num_points: int

@@ -57,6 +57,13 @@ class EvaluationMetrics(TypedDict, total=False):
     peak_memory_bytes: int | None
     fps: float | None
     test_views: int
+    #: Means over the views: shares of what is drawn (`evaluation.shreds`).
+    needles: float | None
+    floaters: float | None
+    #: Pixels by the angle to the nearest training view, in degrees.
+    by_angle: list[JsonObject] | None
+    #: Figures of each kind of off-path view.
+    sets: dict[str, JsonObject] | None
     notes: list[str]
 
 

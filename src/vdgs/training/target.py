@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from vdgs.geometry.camera import Camera
@@ -37,6 +37,16 @@ def background_at(stage: TrainingProblem, iteration: int) -> Tensor:
         # Drawn on the CPU: the same colors for any device.
         color = torch.lerp(color, torch.rand(3, generator=generator), share)
     return color.to(stage.device, non_blocking=True)
+
+
+def opacity_factors_at(stage: TrainingProblem, iteration: int, count: int) -> Float[Tensor, " m"] | None:
+    """Factors of the opacities of so many splats at this iteration, not negative; None without noise."""
+    deviation = stage.config.loss.opacity_noise
+    if not deviation:
+        return None
+    generator = torch.Generator().manual_seed(stage.config.seed * 1_000_033 + iteration)
+    noise = torch.randn(count, generator=generator).mul_(deviation).add_(1.0).clamp_(min=0.0)
+    return noise.to(stage.device, non_blocking=True)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

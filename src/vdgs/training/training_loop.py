@@ -21,12 +21,19 @@ from vdgs.kernels.kernel_types import DecoderWeights, OrderedSplats, SplatGradie
 from vdgs.model.renderer import cull_anchors, decode_anchors_for_training
 from vdgs.model.scale_bounds import MAX_OFFSET_FACTOR
 from vdgs.training.densification_step import densify, sort_morton
+from vdgs.training.depth_agreement import DepthAgreement, depth_agreement
 from vdgs.training.gradient_roi import crop_to_gradient_support
 from vdgs.training.optimizer import learning_rates_at
 from vdgs.training.schedule import downscale_at, view_at
-from vdgs.training.target import background_at, crop_box, crop_camera, make_target
+from vdgs.training.target import background_at, crop_box, crop_camera, make_target, opacity_factors_at
 from vdgs.training.training_state import StepReport, TrainingProblem, TrainingState
-from vdgs.training.training_step import backward_and_step, compute_loss, render_for_training, step_unseen_anchors
+from vdgs.training.training_step import (
+    RenderedTrainingView,
+    backward_and_step,
+    compute_loss,
+    render_for_training,
+    step_unseen_anchors,
+)
 from vdgs.training.weight_averaging import ModelAverage, is_averaged_step
 
 #: How much of the value before is kept at each step.
@@ -76,17 +83,23 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
         splats = decode_anchors_for_training(state.anchors, rows, weights, camera)
         target = make_target(stage, view, downscale, crop_to_gradient_support(stage, splats, camera, box))
         frozen = _frozen_splats(stage, view, camera, target.camera)
-        drawn = render_for_training(splats, target.camera, background, frozen)
+        drawn = render_for_training(
+            splats, target.camera, background, frozen, depth=bool(config.loss.depth_agreement),
+            opacity_factors=opacity_factors_at(stage, iteration, len(splats.source)),
+        )  # fmt: skip
     weight = stage.loss_weight
     compared = compute_loss(drawn, target, state.decoder, image_index_at(stage, view), config, weight)
     volume_weight, loss = _volume_weight(stage), compared.loss
     if volume_weight and len(drawn.source):
         loss = loss + volume_weight * drawn.volume
+    agreement = _weighted_agreement(drawn, stage, target.valid_fraction)
+    if agreement is not None:
+        loss = loss + agreement.loss
     # Read at once: on a GPU each read waits for everything before it.
     value, l1, ssim = torch.stack([loss, compared.l1, compared.ssim]).tolist()
     if not math.isfinite(value):
         raise TrainingDiverged(f"The loss is {value} at iteration {iteration + 1}.")
-    gradients = drawn.backward(compared.image, weight * volume_weight)
+    gradients = drawn.backward(compared.image, weight * volume_weight, agreement)
     measured = (iteration + 1) % PSNR_LOG_INTERVAL == 0
     psnr = training_psnr(compared.shown, target.image, target.mask) if measured else None
     state.is_consistent = False
@@ -132,6 +145,16 @@ def _frozen_splats(stage: TrainingProblem, view: int, camera: Camera, part: Came
 def image_index_at(stage: TrainingProblem, view: int) -> int:
     """The number of a view among all training images of the capture."""
     return view if stage.image_indices is None else stage.image_indices[view]
+
+
+def _weighted_agreement(
+    drawn: RenderedTrainingView, stage: TrainingProblem, valid_fraction: float
+) -> DepthAgreement | None:
+    """The loss of depths and its gradients, scaled to the whole photograph; None where it has no weight."""
+    weight = stage.loss_weight * stage.config.loss.depth_agreement * valid_fraction
+    if not weight or not len(drawn.source):
+        return None
+    return DepthAgreement(*(weight * part for part in depth_agreement(drawn.raster, stage.camera_height)))
 
 
 def _volume_weight(stage: TrainingProblem) -> float:

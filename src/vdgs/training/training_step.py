@@ -7,7 +7,7 @@ reuse memory, and an anchor moves as soon as its gradient is known. The bits are
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -22,6 +22,7 @@ from vdgs.kernels.kernel_types import (
     DecoderWeights,
     IsFinite,
     OrderedSplats,
+    Raster,
     RasterPullback,
     SplatGradients,
     SplatSources,
@@ -30,6 +31,7 @@ from vdgs.kernels.kernel_types import (
 from vdgs.model.anchors import TRAINED_TENSORS, Anchors
 from vdgs.model.decoder import Decoder
 from vdgs.model.exposure import apply_exposure
+from vdgs.training.depth_agreement import DepthAgreement
 from vdgs.training.target import TrainingTarget
 
 
@@ -44,33 +46,48 @@ class RenderedTrainingView:
     #: Mean volume of the splats; NaN if there are none.
     volume: Float[Tensor, ""]
     pullback: RasterPullback
+    #: With depth, where it was asked for.
+    raster: Raster
+    #: By what opacities were multiplied; None: by nothing.
+    opacity_factors: Float[Tensor, " m"] | None = None
     #: What the gradients of means_px and conics of these splats may overwrite.
     scratch: tuple[Tensor, Tensor]
 
     @torch.no_grad()
-    def backward(self, image: Float[Tensor, "h w 3"], volume_weight: float) -> SplatGradients:
-        """Gradients of a loss: `image` by the image, `volume_weight` by the mean volume. Call it once."""
-        m = len(self.source)
-        g = self.pullback(image, None, None, out=self.scratch, count=m)
+    def backward(
+        self, image: Float[Tensor, "h w 3"], volume_weight: float, agreement: DepthAgreement | None = None
+    ) -> SplatGradients:
+        """Gradients of a loss: `image` by the image, `volume_weight` by the mean volume, and those by alpha and depth.
+        Call it once."""
+        m, (alpha, depth) = len(self.source), (None, None) if agreement is None else agreement[1:]
+        g = self.pullback(image, alpha, depth, out=self.scratch, count=m)
         # In float32, as autograd divides.
+        opacities = g.opacities if self.opacity_factors is None else g.opacities * self.opacity_factors
         volume = float(torch.tensor(volume_weight) / m) if m else 0.0
         return SplatGradients(
-            means_px=g.means_px, conics=g.conics, colors=g.colors, opacities=g.opacities,
+            means_px=g.means_px, conics=g.conics, colors=g.colors, opacities=opacities,
             volume=volume, source=self.source, color_values=self.colors, opacity_values=self.opacities,
+            depths=None if agreement is None else g.depths,
         )  # fmt: skip
 
 
 @torch.no_grad()
 def render_for_training(
-    splats: TrainingSplats, camera: Camera, background: Float[Tensor, "3"], frozen_splats: OrderedSplats | None = None
-) -> RenderedTrainingView:
+    splats: TrainingSplats, camera: Camera, background: Float[Tensor, "3"], frozen_splats: OrderedSplats | None = None,
+    *, depth: bool = False, opacity_factors: Float[Tensor, " m"] | None = None,
+) -> RenderedTrainingView:  # fmt: skip
     """Draw the splats of trained anchors with `frozen_splats`. The returned view reuses the memory of `splats`."""
-    m, drawn = len(splats.source), splats if frozen_splats is None else splats.concat(frozen_splats)
+    shown = splats
+    if opacity_factors is not None:
+        # At full opacity the rasterizer's own limit holds.
+        shown = replace(splats, opacities=(splats.opacities * opacity_factors).clamp_(max=1.0))
+    m, drawn = len(splats.source), shown if frozen_splats is None else shown.concat(frozen_splats)
     kernels = get_backend(drawn.means_px.device)
-    raster, pullback = kernels.rasterize_vjp(drawn, background, camera.width, camera.height)
+    raster, pullback = kernels.rasterize_vjp(drawn, background, camera.width, camera.height, depth=depth)
     return RenderedTrainingView(
         image=raster.image, source=splats.source, colors=splats.colors, opacities=splats.opacities,
-        volume=splats.volume, pullback=pullback, scratch=(drawn.means_px[:m], drawn.conics[:m]),
+        volume=splats.volume, pullback=pullback, raster=raster,
+        opacity_factors=opacity_factors, scratch=(drawn.means_px[:m], drawn.conics[:m]),
     )  # fmt: skip
 
 

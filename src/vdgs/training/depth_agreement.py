@@ -1,0 +1,43 @@
+"""One depth for each pixel: what hangs before or behind the surface that a pixel shows is drawn towards it or fades.
+
+The loss is |expected depth − alpha · median depth| in camera heights, a mean over the pixels; the median depth stands
+still. Photographs look the same with splats spread in depth, views from elsewhere do not. (2DGS's depth distortion sums
+over pairs of splats, which takes another pass.)
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from vdgs.kernels.kernel_types import Raster
+
+#: Pixels less opaque than this have no surface.
+MIN_ALPHA = 0.5
+#: Below this difference (camera heights) the loss is quadratic.
+SMOOTH_BELOW = 0.002
+
+
+class DepthAgreement(NamedTuple):
+    """The loss, and its gradients by alpha and expected depth."""
+
+    loss: Float[Tensor, ""]
+    alpha: Float[Tensor, "h w"]
+    depth: Float[Tensor, "h w"]
+
+
+@torch.no_grad()
+def depth_agreement(raster: Raster, camera_height: float) -> DepthAgreement:
+    """The loss of a picture drawn with depth, in units in which cameras are so high."""
+    assert raster.depth is not None
+    assert raster.median_depth is not None
+    shown = (raster.alpha > MIN_ALPHA) & (raster.median_depth > 0)
+    median = torch.where(shown, raster.median_depth, torch.zeros_like(raster.depth))
+    apart = torch.where(shown, (raster.depth - raster.alpha * median) / camera_height, torch.zeros_like(median))
+    far = apart.abs() > SMOOTH_BELOW
+    values = torch.where(far, apart.abs() - SMOOTH_BELOW / 2, apart**2 / (2 * SMOOTH_BELOW))
+    slope = torch.where(far, apart.sign(), apart / SMOOTH_BELOW) / (apart.numel() * camera_height)
+    return DepthAgreement(values.mean(), -slope * median, slope)

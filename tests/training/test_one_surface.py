@@ -1,0 +1,79 @@
+"""What keeps splats on one surface: the loss of depths, and noise of opacities."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from support.block_training import block_stage
+from support.checkerboard import Photographs
+from vdgs.config.method import BlockConfig, DensifyConfig, LossConfig
+from vdgs.kernels.kernel_types import Raster, TrainingSplats
+from vdgs.model.renderer import render
+from vdgs.training import train
+from vdgs.training.depth_agreement import MIN_ALPHA, SMOOTH_BELOW, depth_agreement
+from vdgs.training.target import opacity_factors_at
+from vdgs.training.training_step import render_for_training
+
+HEIGHT = 8.0
+
+
+def test_gradients_are_those_of_the_loss() -> None:
+    generator = torch.Generator().manual_seed(1)
+    alpha, depth, median = (torch.rand(12, 9, generator=generator, dtype=torch.float64) for _ in range(3))
+    depth, median = (alpha * (5 + 0.05 * depth)).requires_grad_(), 5 + 0.05 * median
+    alpha = alpha.requires_grad_()
+    shown = (alpha > MIN_ALPHA).detach()
+    apart = ((depth - alpha * median) / HEIGHT)[shown].abs()
+    loss = torch.where(apart > SMOOTH_BELOW, apart - SMOOTH_BELOW / 2, apart**2 / (2 * SMOOTH_BELOW)).sum() / 108
+    loss.backward()
+    found = depth_agreement(Raster(torch.zeros(12, 9, 3), alpha.detach(), depth.detach(), median), HEIGHT)
+    torch.testing.assert_close(found.loss, loss.detach())
+    torch.testing.assert_close(found.alpha, alpha.grad)
+    torch.testing.assert_close(found.depth, depth.grad)
+    assert 0 < shown.double().mean() < 1
+
+
+def test_training_with_it_draws_splats_to_one_depth() -> None:
+    def spread(weight: float) -> float:
+        stage, state = block_stage(BlockConfig())
+        still = DensifyConfig(num_levels=0, start=10_000)
+        config = replace(stage.config, iterations=150, loss=LossConfig(depth_agreement=weight), densify=still)
+        stage = replace(stage, config=config, frozen_anchors=None)
+        train(state, stage, stop=lambda: False, after_step=lambda *_: None)
+        model = state.model(stage.voxel_size, stage.background)
+        return float(depth_agreement(render(model, Photographs().camera(0), depth=True), stage.camera_height).loss)
+
+    assert spread(1.0) < 0.7 * spread(0.0)
+
+
+def test_opacities_vary_from_step_to_step_alike_for_a_seed() -> None:
+    stage, _ = block_stage(BlockConfig())
+    assert opacity_factors_at(stage, 3, 5) is None
+    noisy = replace(stage, config=replace(stage.config, loss=LossConfig(opacity_noise=0.2)))
+    one, again, other = (opacity_factors_at(noisy, iteration, 10_000) for iteration in (3, 3, 4))
+    assert one is not None
+    assert other is not None
+    assert again is not None
+    assert torch.equal(one, again)
+    assert not torch.equal(one, other)
+    assert abs(float(one.mean()) - 1) < 0.01
+    assert abs(float(one.std()) - 0.2) < 0.01
+
+
+def test_the_gradient_of_an_opacity_is_that_of_its_noisy_self() -> None:
+    """A factor of 2 of all opacities is a model that is twice as opaque, and moves twice as fast."""
+    camera, background = Photographs().camera(0), torch.zeros(3)
+    splats = TrainingSplats(
+        means_px=torch.tensor([[9.0, 9.0]]), conics=torch.tensor([[0.1, 0.0, 0.1]]), depths=torch.ones(1),
+        colors=torch.ones(1, 3), opacities=torch.tensor([0.3]), segments=None, source=torch.zeros(1, dtype=torch.int32),
+        volume=torch.tensor(1.0),
+    )  # fmt: skip
+    double = replace(splats, opacities=2 * splats.opacities)
+    plain = render_for_training(double, camera, background)
+    noisy = render_for_training(splats, camera, background, opacity_factors=torch.tensor([2.0]))
+    assert torch.equal(plain.image, noisy.image)
+    slope = torch.ones_like(plain.image)
+    expected = 2 * plain.backward(slope, 0.0).opacities
+    torch.testing.assert_close(noisy.backward(slope, 0.0).opacities, expected)
