@@ -139,6 +139,8 @@ def test_poses_of_formats_that_are_not_read_are_said(tmp_path, name):
             "of Metashape without poses",
         ),
         ("block.xml", '<?xml version="1.0"?><BlocksExchange version="3.2"><Block/></BlocksExchange>', "without poses"),
+        ("cameras.json", '[{"id": 0, "img_name": "a", "position": [0, 0, 1], "fx": 900}]', "of a trained 3DGS scene"),
+        ("meta_data.json", '{"camera_model": "OPENCV", "has_mono_prior": true, "frames": []}', "poses of SDFStudio"),
         ("sfm_data.json", '{"sfm_data_version": "0.3", "views": [], "extrinsics": []}', "OpenMVG without poses"),
         (
             "views.sfm",

@@ -417,7 +417,10 @@ def test_fisheyes_of_opf_are_their_formula(tmp_path: Path, flight: KnownFlight) 
         "type": "fisheye", "principal_point_px": [401.0, 299.0], "affine": [600.0, 1.0, -1.0, 601.0],
         "polynomial": [0.0, 1.0, 0.02, -0.03], "is_p0_zero": True, "is_symmetric_affine": False,
     }  # fmt: skip
+    for camera, shutter in zip(content["cameras"], ([0, 0, 0], [0.1, 0, 0], [0, 0, 0.02], "linear"), strict=False):
+        camera["rolling_shutter"] = shutter
     file.write_text(json.dumps(content))
+    assert any("rolling shutter of 2 photographs" in each for each in read(tmp_path, "opf").warnings)
     rays = np.array([[0.5, 0.3], [-0.9, 0.1], [0.0, -1.4]])
     theta = 2 / np.pi * np.arctan(np.hypot(*rays.T))
     bent = rays * ((theta + 0.02 * theta**2 - 0.03 * theta**3) / np.hypot(*rays.T))[:, None]

@@ -52,6 +52,7 @@ _OTHERS = {
         "poses of Polycam; ns-process-data polycam (nerfstudio) makes transforms.json of them, which is read"
     ),
     "*.r3d": "a capture of Record3D; ns-process-data record3d (nerfstudio) makes transforms.json of it, which is read",
+    "cameras_sphere.npz": "poses of NeuS; the COLMAP model that they were made of is read",
     "poses_bounds.npy": "poses of LLFF; the COLMAP model that they were made of is read",
     "database.db": "features of COLMAP; `colmap mapper` makes a model of them",
 }
@@ -60,6 +61,8 @@ _ALIGN = "it is read once its photographs are aligned and it is exported again"
 _BY_CONTENT = (
     (".xml", b"<blocksexchange", f"a BlocksExchange file without poses; {_ALIGN}"),
     (".xml", b"<document version", f"an export of Metashape without poses; {_ALIGN}"),
+    (".json", b'"has_mono_prior"', "poses of SDFStudio; the transforms.json or COLMAP model of the same data is read"),
+    (".json", b'"img_name"', "cameras of a trained 3DGS scene; the capture that it was trained on is read"),
     (".json", b'"sfm_data_version"', "photographs of OpenMVG without poses; the sfm_data.json after its SfM is read"),
     (".sfm", b'"viewid"', "photographs of Meshroom without poses; cameras.sfm of its step StructureFromMotion is read"),
     (

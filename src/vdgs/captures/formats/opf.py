@@ -70,6 +70,9 @@ def read(file: Path, options: CaptureOptions) -> Project:
         seen = cloud.shown.get(number)
         views.append(ProjectView(names=(name,), camera_from_world=pose, intrinsics=lens, sightings=seen))
     warnings += name_unaligned([photograph_name(uri) for number, uri in uris.items() if number not in used])
+    rolling = sum(_rolls(camera.get("rolling_shutter")) for camera in calibrated["cameras"])
+    if rolling:
+        warnings.append(f"the rolling shutter of {rolling} photographs is not modelled.")
     unknown = ""
     try:
         system, place, is_metric = _system(items)
@@ -80,6 +83,11 @@ def read(file: Path, options: CaptureOptions) -> Project:
         is_metric=is_metric, place=place, warnings=tuple(warnings), refused=refused,
         unknown_system=unknown, remedy="Export COLMAP from PIX4Dmatic, or undistort the photographs",
     )  # fmt: skip
+
+
+def _rolls(shutter: Any) -> bool:
+    """Whether a camera was calibrated as moving while its rows were read."""
+    return isinstance(shutter, list) and any(shutter)
 
 
 class _Items:
