@@ -3,30 +3,20 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
 
 import numpy as np
 import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from shapely.affinity import translate
 
-from vdgs.config.method import BlockConfig, MethodConfig, PartitionConfig
-from vdgs.config.presets import PRESETS
-from vdgs.errors import RunError, VdgsError
-from vdgs.geometry.camera import Camera
-from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu
-from vdgs.geometry.ground_frame import GroundFrame
+from vdgs.config.method import PartitionConfig
+from vdgs.errors import VdgsError
 from vdgs.partition import boundary, clustering
-from vdgs.partition.blocks import Block, Blocks, load_blocks, save_blocks, save_blocks_wgs84
+from vdgs.partition.blocks import Block, Blocks, load_blocks, save_blocks
 from vdgs.partition.boundary import alpha_shape, expand_core
-from vdgs.partition.partition_scene import choose_block_count, partition_scene
-from vdgs.pipeline.train_blocks import _block_bytes
-from vdgs.runs.run_folder import RunFolder
+from vdgs.partition.partition_scene import partition_scene
 
 
 def town(n: int = 4000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -300,61 +290,6 @@ def test_fewer_blocks_than_asked_for_are_said_with_the_reason() -> None:
     assert "lambda" not in said
 
 
-def test_the_number_of_blocks() -> None:
-    def count(anchors: int, cameras: int, **settings: Any) -> int:
-        method = replace(PRESETS["laptop"], partition=PartitionConfig(**settings))
-        return choose_block_count(anchors, cameras, 10**6, method)
-
-    assert count(10**6, 500, blocks=3) == 3
-    assert [count(10**5, cameras, blocks="auto") for cameras in (33, 145, 400, 5000)] == [1, 1, 1, 1]
-    # Memory asks for 20 blocks or so, photographs allow fewer.
-    few = [count(2 * 10**6, cameras, blocks="auto", block_memory_gb=3.0) for cameras in (33, 145, 400)]
-    assert few == [1, 2, 8]
-    by_memory = [count(2 * 10**6, 5000, blocks="auto", block_memory_gb=gb) for gb in (2.5, 3, 4, 8, 64)]
-    assert by_memory == sorted(by_memory, reverse=True)
-    assert by_memory[0] > by_memory[-1] == 1
-
-
-@pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize(("offsets", "pixels"), [(10, 10**6), (32, 10**6), (10, 2 * 10**7)])
-@pytest.mark.parametrize("limits", [{}, {"max_anchors": 15 * 10**5}, {"max_anchors_total": 2 * 10**6}])
-def test_a_block_by_memory_takes_at_most_that_in_training(
-    preset: str, offsets: int, pixels: int, limits: dict[str, int]
-) -> None:
-    """By the estimate of the stage that trains it: its growth, its limits of anchors, its mean, its picture."""
-    anchors, gb = 10**6, 1 + 150e-9 * pixels + 1.3 * offsets / 10
-    method = PRESETS[preset]
-    growth = replace(method.block.densify, max_anchors=limits.get("max_anchors", 0))
-    block = replace(method.block, densify=growth, max_anchors_total=limits.get("max_anchors_total", 0))
-    training = replace(method.training, model=replace(method.training.model, num_offsets=offsets))
-    partition = PartitionConfig(blocks="auto", block_memory_gb=gb)
-    method = MethodConfig(training, partition, method.assignment, block)
-    count = choose_block_count(anchors, 50_000, pixels, method)
-    assert 1 < count < 1000
-
-    def taken(blocks: int) -> int:
-        own = [SimpleNamespace(anchors_core=anchors // blocks)] * blocks
-        run = SimpleNamespace(method=lambda: method, partition_record=lambda: SimpleNamespace(blocks=own))
-        return _block_bytes(
-            cast(RunFolder, run),
-            [Camera(camera_from_world=np.eye(4), fx=1, fy=1, cx=0, cy=0, width=pixels // 1000, height=1000)],
-        )
-
-    assert taken(count) <= 1e9 * gb < 1.001 * taken(count - 1)
-
-
-def test_more_growth_asks_for_more_blocks_and_limits_of_anchors_for_fewer() -> None:
-    auto, paper = PartitionConfig(blocks="auto"), PRESETS["default"]
-
-    def count(block: BlockConfig) -> int:
-        return choose_block_count(10**6, 50_000, 10**6, MethodConfig(partition=auto, block=block))
-
-    plain = replace(paper.block, compensation=replace(paper.block.compensation, enabled=False))
-    limited = replace(paper.block, max_anchors_total=10**6)
-    assert count(paper.block) > count(plain) > count(limited)
-    assert count(replace(plain, swa_fraction=0.5)) > count(plain)
-
-
 # ----------------------------------------------------------------------------------------------- shapes
 
 
@@ -385,71 +320,3 @@ def test_what_is_read_owns_what_was_written(tmp_path: Path) -> None:
     assert all(np.array_equal(read.in_expanded(k, places), blocks.in_expanded(k, places)) for k in range(4))
     features = json.loads((tmp_path / "blocks.geojson").read_text())["features"]
     assert [f["properties"]["anchors"] for f in features] == [0, 0, 1, 1, 2, 2, 3, 3]
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        lambda text: text[: len(text) // 2],
-        lambda text: text.replace('"core"', '"kernel"', 1),
-        lambda text: text.replace("Polygon", "Point"),
-        lambda text: text.replace("Polygon", "Blob"),
-        lambda text: '{"type": "FeatureCollection", "features": []}',
-        lambda text: "[1, 2]",
-        lambda text: "\udcff",
-        lambda text: text.replace("2.0", "NaN"),
-    ],
-)
-def test_a_damaged_file_is_named(tmp_path: Path, damage: object) -> None:
-    file = tmp_path / "blocks.geojson"
-    box = shapely.box(0, 0, 2, 1)
-    save_blocks(file, Blocks((Block(box, box.buffer(1)),)), [{}])
-    file.write_bytes(damage(file.read_text()).encode(errors="surrogateescape"))  # type: ignore[operator]
-    with pytest.raises(RunError, match=r"blocks\.geojson: is damaged .*vdgs partition RUN"):
-        load_blocks(file)
-
-
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(RunError, match=r"blocks\.geojson: is not there.*vdgs partition RUN"):
-        load_blocks(tmp_path / "blocks.geojson")
-
-
-@pytest.mark.parametrize("origin", [(47.3, 8.5, 440.0), (-17.0, 179.9999, 20.0), (-33.9, -70.6, 900.0)])
-def test_blocks_on_the_map(tmp_path: Path, origin: tuple[float, float, float]) -> None:
-    ring = shapely.box(-400, -300, 500, 300).difference(shapely.box(-50, -50, 60, 50))
-    hole = shapely.box(-50, -50, 60, 50)
-    blocks = Blocks((Block(ring, ring.buffer(40)), Block(hole, hole.buffer(10))))
-    ground = GroundFrame(
-        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, description="GPS", origin_geo=origin
-    )
-    save_blocks_wgs84(tmp_path / "map.geojson", blocks, [{}, {}], ground)
-    features = json.loads((tmp_path / "map.geojson").read_text())["features"]
-    assert [(f["properties"]["block"], f["properties"]["boundary"]) for f in features][1:3] == [
-        (0, "expanded"),
-        (1, "core"),
-    ]
-    written = shapely.geometry.shape(features[0]["geometry"])
-    assert len(written.interiors) == 1
-    assert written.exterior.is_ccw
-    assert not written.interiors[0].is_ccw
-    corners = shapely.get_coordinates(written)
-    back = enu_from_geodetic(np.column_stack([corners[:, ::-1], np.full(len(corners), origin[2])]), origin)[:, :2]
-    # Height 0 of the frame is a plane, height `origin` of the map is not: they part by 1 cm half a kilometre away.
-    nearest = np.linalg.norm(back[:, None] - shapely.get_coordinates(ring)[None], axis=2).min(axis=1)
-    assert nearest.max() < 1e-3
-    assert np.ptp(corners[:, 0]) < 0.02
-    # A frame whose origin was moved keeps its axes: the same blocks about another origin are in the same place.
-    moved = tuple(geodetic_from_enu(np.array([[3000.0, 4000, 0]]), origin)[0])
-    away = replace(ground, origin_geo=moved, axes_geo=origin[:2])
-    there = Blocks(tuple(Block(*(translate(s, -3000, -4000) for s in (b.core, b.expanded))) for b in blocks.items))
-    save_blocks_wgs84(tmp_path / "moved.geojson", there, [{}, {}], away)
-    again = json.loads((tmp_path / "moved.geojson").read_text())["features"][0]["geometry"]
-    apart = shapely.get_coordinates(shapely.geometry.shape(again)) - corners
-    np.testing.assert_allclose((apart + 180) % 360 - 180, 0, atol=1e-9)
-    with pytest.raises(ValueError, match="not georeferenced"):
-        save_blocks_wgs84(
-            tmp_path / "map.geojson",
-            blocks,
-            [{}, {}],
-            GroundFrame(scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, description="-"),
-        )

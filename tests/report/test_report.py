@@ -5,25 +5,20 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from support.report_page import Page
 from vdgs.errors import RunError
 from vdgs.report import charts
-from vdgs.report.charts import running_median
-from vdgs.report.embedded_images import MAX_BYTES, reduce_image
-from vdgs.report.html_page import escape_html
-from vdgs.report.run_reader import format_difference
 from vdgs.report.write_report import write_report
 from vdgs.runs.run_folder import RunFolder
 
 pytestmark = [pytest.mark.xdist_group("report"), pytest.mark.slow]
 
-VOID = {"meta", "img", "br", "link", "hr", "input"}
 FILES = ("coarse/initialization.json",
          "coarse/log.jsonl", "coarse/evaluation/metrics.json", "visibility/visibility.json", "partition/partition.json",
          "blocks/00/log.jsonl", "blocks/01/status.json", "merged/status.json", "evaluation/metrics.json",
@@ -39,42 +34,6 @@ FULL_DPI = charts.DPI
 def small_charts(monkeypatch):
     """Drawing is what a report takes longest for, and few tests are about charts."""
     monkeypatch.setattr(charts, "DPI", 40)
-
-
-class Page(HTMLParser):
-    """Text and attributes of a page; elements that are not closed in order are an error."""
-
-    def __init__(self, path: Path):
-        super().__init__()
-        self.open: list[str] = []
-        self.tags: list[str] = []
-        self.attributes: list[tuple[str, str, str]] = []
-        self.texts: list[str] = []
-        self.source = path.read_text(encoding="utf-8")
-        self.feed(self.source)
-        self.close()
-        assert self.open == []
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append(tag)
-        self.attributes += [(tag, name, value or "") for name, value in attrs]
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        if self.open and self.open[-1] != "style":
-            self.texts.append(data)
-
-    def text(self) -> str:
-        return " ".join("\n".join(self.texts).split())
-
-    def row(self, first: str) -> list[str]:
-        """The cells of the first table row that begins with this cell."""
-        rows = [re.findall(r"<td>(.*?)</td>", row) for row in re.findall(r"<tr>(.*?)</tr>", self.source)]
-        return next(row for row in rows if row and row[0] == first)
 
 
 def picture(path: Path, size: tuple[int, int] = (60, 40), noise: bool = False) -> None:
@@ -412,22 +371,3 @@ def test_the_report_stays_small_with_many_views_and_large_pictures(tmp_path, mon
     assert path.stat().st_size < 8_000_000
     assert page.row("149.jpg")[3] == "169.00"
     assert sum(value.startswith("seams in") for _, name, value in page.attributes if name == "alt") == 3
-
-
-def test_a_picture_keeps_its_shape_and_stands_on_white():
-    wide = reduce_image(Image.new("RGBA", (4000, 1000), (0, 0, 0, 0)))
-    assert (wide.width, wide.height, wide.format) == (1600, 400, "png")
-    noise = Image.fromarray(np.random.default_rng(1).integers(0, 256, (900, 900, 3), dtype=np.uint8))
-    small = reduce_image(noise)
-    assert small.format == "jpeg"
-    assert len(small.content) <= MAX_BYTES
-
-
-def test_running_medians_pass_over_gaps():
-    values = np.array([1.0, 9.0, 2.0, np.nan, 4.0])
-    np.testing.assert_allclose(running_median(values, 3), [5.0, 2.0, 5.5, 3.0, 4.0])
-
-
-def test_words():
-    assert [format_difference(1.0, before) for before in (1.25, 1.001, None)] == ["−0.25", "+0.00", "–"]
-    assert escape_html("<a>&\"'\x01") == "&lt;a&gt;&amp;&quot;&#x27;\N{REPLACEMENT CHARACTER}"

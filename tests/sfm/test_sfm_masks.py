@@ -168,6 +168,7 @@ def masked(nine, tmp_path) -> Flight:
     return Flight(tmp_path / "card", nine.cameras)
 
 
+@pytest.mark.slow
 def test_features_lie_where_masks_are_white(masked, tmp_path):
     silence_colmap()
     collection = collect_images([masked.folder])
@@ -191,6 +192,7 @@ def test_features_lie_where_masks_are_white(masked, tmp_path):
         feature_extraction.images_without_features(seen, counts)
 
 
+@pytest.mark.slow
 def test_masks_are_written_with_the_capture_and_what_depends_on_them_is_done_again(nine_begun, masked, tmp_path):
     output, keys = tmp_path / "capture", []
     request = SfmRequest(

@@ -15,6 +15,7 @@ import struct
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -85,13 +86,13 @@ def tiny_scene(
 
 def render_plane(camera: Camera) -> np.ndarray:
     """The plane z = 0 as the camera sees it, [h, w, 3] uint8; the sky is white."""
-    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
-    return _rendered(camera.camera_from_world.astype(float).tobytes(), *intrinsics).copy()
+    intrinsics = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
+    return _rendered(camera.camera_from_world.astype(float).tobytes(), **intrinsics).copy()
 
 
 @lru_cache(maxsize=200)  # many tests take the same scene
-def _rendered(pose: bytes, *intrinsics: float) -> np.ndarray:
-    camera = Camera(np.frombuffer(pose).reshape(4, 4), *intrinsics)
+def _rendered(pose: bytes, **intrinsics: Any) -> np.ndarray:
+    camera = Camera(camera_from_world=np.frombuffer(pose).reshape(4, 4), **intrinsics)
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=-1)
     directions = rays @ camera.camera_from_world[:3, :3]

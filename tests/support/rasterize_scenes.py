@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from vdgs.kernels.cpu.extension import load_extension
+from vdgs.kernels.cpu.rasterize import rasterize
 from vdgs.kernels.kernel_types import OrderedSplats, Raster, RasterPullback, Splats
 from vdgs.kernels.splat_segments import SplatSegments
 
@@ -61,6 +63,10 @@ class Scene:
     def to(self, dtype: torch.dtype) -> Scene:
         tensors = tuple(t.detach().to(dtype).clone().requires_grad_() for t in self.tensors)
         return Scene(tensors, self.width, self.height)
+
+
+def draw(scene: Scene, isa: str, depth: bool = True) -> Raster:
+    return rasterize(*splats_of(scene.tensors), scene.width, scene.height, depth=depth, module=load_extension(isa))
 
 
 def make_scene(

@@ -156,8 +156,14 @@ def test_there_is_no_true_depth_of_what_was_not_written(capture: Path, tmp_path:
     assert make_true_depth(replace(loaded, root=tmp_path), loaded.views) is None
 
 
-def test_the_same_options_give_the_same_bytes(capture: Path, tmp_path: Path) -> None:
+def test_the_same_options_give_the_same_bytes_and_what_a_killed_command_left_goes(
+    capture: Path, tmp_path: Path
+) -> None:
+    left = tmp_path / ".again.abc.scratch"
+    left.mkdir()
+    (left / ".lock").touch()
     generate(tmp_path / "again", replace(TINY, workers=1))
+    assert [path.name for path in tmp_path.iterdir()] == ["again"]
     first, second = files(capture), files(tmp_path / "again")
     assert first.keys() == second.keys()
     assert [name for name in first if first[name] != second[name]] == []
@@ -197,14 +203,6 @@ def test_a_failure_leaves_nothing_behind(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         generate(tmp_path / "capture", TINY, interrupt)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_what_a_killed_command_left_goes(tmp_path: Path) -> None:
-    left = tmp_path / ".capture.abc.scratch"
-    left.mkdir()
-    (left / ".lock").touch()
-    generate(tmp_path / "capture", TINY)
-    assert [path.name for path in tmp_path.iterdir()] == ["capture"]
 
 
 def test_a_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
