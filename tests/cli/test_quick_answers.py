@@ -29,7 +29,7 @@ MISTYPED = {
     "train-coarse": ["DCI", "--output", "new"],
     "config": ["--config", "flihgt"],
     **{verb: ["fligth"] for verb in ("status", "visibility", "partition", "train-blocks", "merge", "eval", "report")},
-    **{verb: ["fligth"] for verb in ("view", "ortho")},
+    **{verb: ["fligth"] for verb in ("view", "ortho", "lod")},
     "render": ["fligth", "-o", "film.mp4"],
     "export": ["fligth", "-o", "scene.ply"],
     "bench": ["toy", "-o", "bench", "--data", "dicm"],
@@ -83,7 +83,7 @@ def test_a_mistyped_path_is_answered_at_once(verb, place):
 
 
 @pytest.mark.parametrize(
-    "verb", ["eval", "render", "ortho", "export", "visibility", "partition", "train-blocks", "merge"]
+    "verb", ["eval", "render", "ortho", "export", "visibility", "partition", "train-blocks", "merge", "lod"]
 )
 def test_a_folder_that_is_no_run_is_answered_at_once(verb, place):
     output = ["-o", "new"] if verb in ("render", "export") else []

@@ -17,17 +17,21 @@ from support.hand_made_models import opaque_plane, quadrants, two_floors
 from vdgs.captures.capture import Capture, View
 from vdgs.evaluation.metrics import to_8bit
 from vdgs.evaluation.view_exposures import apply_exposure_numpy, log_luminance
+from vdgs.export.lod_bake import CameraTable
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.exposure import exposure_matrix
+from vdgs.model.lod_scene import LodScene
+from vdgs.model.lod_tree import LodTree
 from vdgs.model.renderer import render
 from vdgs.partition.blocks import save_blocks
+from vdgs.pipeline import build_lod
 from vdgs.rendering.camera_paths import look_at_pose
 from vdgs.runs.open_run import OpenedRun
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.stage_folder import StatusRecord
-from vdgs.viewer import navigation, overlays
+from vdgs.viewer import navigation, overlays, viewer_scene
 from vdgs.viewer.image_comparison import nearest_view_index, warp_image
 from vdgs.viewer.layers import LAYERS, DisplayOptions, Painter
 from vdgs.viewer.measure_panel import MeasurePanel
@@ -124,6 +128,29 @@ def test_layers_show_what_they_say(scene):
         assert scale is not None
         assert scale.low < scale.high
     assert painter.scale(DisplayOptions("color")) is None
+
+
+def test_a_run_with_a_tree_is_drawn_through_it(scene, tmp_path, monkeypatch):
+    model, camera = scene.model("merged"), camera_at(0.3, -0.5, 6.0, 20.0)
+    monkeypatch.setattr(build_lod, "MAX_LEAF_ANCHORS", 200)
+    build_lod.build_tree(tmp_path, model, "1-a", CameraTable([view.camera for view in scene.capture.train_views]))
+    tree = LodScene(LodTree(tmp_path), model.without_anchors())
+    monkeypatch.setattr(viewer_scene, "find_tree", lambda run: tree if run.name == "merged" else None)
+    seen = ViewerScene(scene.run, scene._open)
+    seen.__dict__["blocks"] = quadrants()
+    for layer in LAYERS:
+        painter, full = Painter(seen), DisplayOptions(layer, full_detail=True)
+        whole = Painter(scene).paint(DisplayOptions(layer), camera, camera)
+        rows = [painter.paint(full, camera.cropped(0, a, camera.width, b), camera) for a, b in ((0, 13), (13, 48))]
+        assert np.abs(np.concatenate(rows).astype(int) - whole).mean() < 3, layer
+        quick = painter.paint(DisplayOptions(layer), camera, camera, 200)
+        assert 0 < painter.drawn_anchors <= 200
+        assert np.abs(quick.astype(int) - whole).mean() < 60, layer
+    exact = Painter(seen).paint(DisplayOptions("color", full_detail=True), camera, camera)
+    assert np.array_equal(exact, to_8bit(render(model, camera).image.numpy()))
+    near = pick_position(seen.shown("merged"), camera, 32.5, 20.5)
+    assert near is not None
+    assert np.linalg.norm(near - pick_position(model, camera, 32.5, 20.5)) < 0.3
 
 
 def test_photographs_that_the_model_draws_itself_show_no_error_and_others_do(scene):

@@ -1,6 +1,6 @@
 """A large scene for measurements: copies of a trained run side by side, as a run of its own.
 
-    python -m experiments.lod.copies RUN FOLDER --anchors 10000000 --keep-views 8
+    python -m experiments.microbench.lod_copies RUN FOLDER --anchors 10000000 --keep-views 8
 
 FOLDER/capture is a capture in the format of nerfstudio whose photographs are links to those of RUN's capture, of which
 every `--keep-views`-th is taken with each copy; FOLDER/run is the run, with one merged model of all copies. The memory
