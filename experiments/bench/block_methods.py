@@ -66,13 +66,13 @@ BLOCK_METHODS = [
         citation="Chen and Lee, DOGS: Distributed-Oriented Gaussian Splatting for Large-Scale 3D Reconstruction via "
         "Gaussian Consensus, NeurIPS 2024",
         omissions=(
-            "splitting by content: cells are equal; cameras join by the share of a cell's points that they hold",
             "pruning by importance before the consensus begins",
             "its appearance encoding, which its paper reports apart",
         ),
-        differs="penalties, their adaptation and over-relaxation have the usual values of ADMM (Boyd et al. 2011), for "
+        differs="cut and cameras as its program has them; a block without cameras gets the one that holds most of its "
+        "points; penalties, their adaptation and over-relaxation have the usual values of ADMM (Boyd et al. 2011), for "
         "neither paper nor program gives its own; only Gaussians that several blocks hold are pulled; copies keep "
         f"the moments of Adam; at least ten steps of consensus; {_AS_3DGS}",
-        adapted="equal cells, usual penalties of ADMM",
+        adapted="usual penalties of ADMM, no pruning before",
     ),
 ]

@@ -67,7 +67,12 @@ CORRECTED_COLUMNS = (
     TableColumn("SSIM ↑", "ssim_cc", 3),
     TableColumn("LPIPS ↓", "lpips_vgg_cc", 3, -1),
 )
-#: Of an overview, beside PSNR where least and best seen.
+#: What the figures of an overview are of.
+OVERVIEW_NOTE = (
+    "Corrected: after the color correction that the paper reports, fitted on the test view itself. By visibility: not "
+    "corrected. Methods that fit exposures are drawn as their neighbors in the flight: see the table in neutral colors."
+)
+#: Of an overview, beside quality and PSNR where least and best seen.
 OVERVIEW_COST_KEYS = ("iterations", "anchors", "gaussians", "seconds", "peak_memory_bytes")
 REFERENCE_EXPOSURE_COLUMNS = (
     TableColumn("PSNR ↑", "psnr_reference_exposure"),
@@ -173,27 +178,34 @@ def _overview(plan: BenchPlan, results: Sequence[BenchResult], scene: BenchScene
     in_scene = [result for result in results if result.scene == scene.name]
     groups = next((len(result.groups) for result in in_scene if result.groups), 0)
     ends = [(group_names(groups)[i], i) for i in sorted({0, groups - 1})] if groups else []
+    corrected = [replace(column, title=f"corrected {column.title}") for column in CORRECTED_COLUMNS]
     columns = [
-        *QUALITY_COLUMNS,
+        *QUALITY_COLUMNS[:2],
+        *corrected,
         *(TableColumn(f"PSNR {name} ↑", f"psnr@{index}") for name, index in ends),
         *(column for column in COST_COLUMNS if column.key in OVERVIEW_COST_KEYS),
     ]
-    table = _measured(plan, in_scene, f"overview-{scene.name}", f"{scene.title}: {plan.table.title}",
-                      [_for_scene(column, scene.name) for column in columns], (SIZE_NOTE,))  # fmt: skip
-    methods = {method.title: method for method in plan.methods}
-    reasons = {each.method: each.reason or each.state for each in in_scene if each.state != "done"}
-    rows = [
-        replace(row, rests_on=f"{reasons[method.name]}" if (method := methods[row.label]).name in reasons
-                else method.rests_on) if row.cells else row for row in table.rows
-    ]  # fmt: skip
-    numbers = PAPER_NUMBERS.get(plan.table.name, {})
-    for name in plan.table.quoted:
-        known = numbers.get(name, {}).get(scene.name)
-        said = "quoted, color-corrected" if known else "quoted: the paper has it on its own scenes only, below"
-        cells = [TableCell(Summary(value, None, 1), column.digits) if value is not None else TableCell(None, 0)
-                 for column, value in zip(columns, [*(known or ()), *[None] * len(columns)], strict=False)]  # fmt: skip
-        rows.append(TableRow(name, tuple(cells), said))
+    table = _measured(
+        plan, in_scene, f"overview-{scene.name}", f"{scene.title}: {plan.table.title}",
+        [_for_scene(column, scene.name) for column in columns], (OVERVIEW_NOTE, SIZE_NOTE),
+    )  # fmt: skip
+    rests_on = {method.title: method.rests_on for method in plan.methods}
+    titles = {method.name: method.title for method in plan.methods}
+    rests_on |= {titles[each.method]: each.reason or each.state for each in in_scene if each.state != "done"}
+    rows = [replace(row, rests_on=rests_on[row.label] if row.cells else "") for row in table.rows]
+    rows += [_quoted_row(plan, name, scene, columns) for name in plan.table.quoted]
     return replace(table, rows=tuple(rows))
+
+
+def _quoted_row(plan: BenchPlan, name: str, scene: BenchScene, columns: Sequence[TableColumn]) -> TableRow:
+    """A row of the paper's own, whose figures are color-corrected; dashes on scenes that the paper has not."""
+    known = PAPER_NUMBERS.get(plan.table.name, {}).get(name, {}).get(scene.name)
+    figures = dict(zip((column.key for column in CORRECTED_COLUMNS), known or (), strict=False))
+    cells = [
+        TableCell(Summary(figures[column.key], None, 1) if column.key in figures else None, column.digits)
+        for column in columns
+    ]
+    return TableRow(name, tuple(cells), "quoted" if known else "quoted, for the paper's own scenes only: see below")
 
 
 def _neutral(plan: BenchPlan, results: Sequence[BenchResult], title: str) -> list[ResultTable]:

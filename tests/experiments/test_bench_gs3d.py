@@ -1,5 +1,6 @@
 """3DGS as a method of the bench: its schedule, its settings, its run, its row."""
 
+import io
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rich.console import Console
 
 from experiments.baselines.gs3d import session as gaussian_session
 from experiments.baselines.gs3d.run import gaussians_folder
@@ -14,6 +16,7 @@ from experiments.baselines.gs3d.schedule import MIN_INTERVAL, PUBLISHED_ITERATIO
 from experiments.baselines.gs3d.training import Gs3dConfig
 from experiments.bench import bench
 from experiments.bench.baseline_stages import gs3d_config
+from experiments.bench.bench import BenchSettings, run_bench
 from experiments.bench.measure import GROUPS_FILE
 from experiments.bench.methods import METHODS
 from experiments.bench.notes import make_notes
@@ -56,7 +59,8 @@ def test_long_and_short_schedules_move_in_proportion():
 
 
 def test_its_settings_are_those_of_the_table():
-    plan = make_plan("table1", PlanOptions(seeds=2, scenes=("tiny",), max_anchors=700))
+    methods = ("3dgs", "3dgs-black", "full")
+    plan = make_plan("table1", PlanOptions(seeds=2, scenes=("tiny",), methods=methods, max_anchors=700))
     ours, black = plan.run_of["tiny", "3dgs", 1], plan.run_of["tiny", "3dgs-black", 1]
     config = gs3d_config(ours.config)
     assert (config.iterations, config.seed, config.background) == (600, 1, "mean")
@@ -83,15 +87,15 @@ def data(tmp_path_factory) -> Path:
 
 def test_it_stands_beside_methods_with_anchors(data, tmp_path, monkeypatch):
     monkeypatch.setattr(bench, "LocalExecutor", InThisProcess)
-    both = benched(data, tmp_path, "3dgs", "scaffold-gs")
-    explicit, anchored = both["3dgs"].figures, both["scaffold-gs"].figures
+    both = benched(data, tmp_path, "3dgs", "scaffold-gs-ours")
+    explicit, anchored = both["3dgs"].figures, both["scaffold-gs-ours"].figures
     assert explicit["iterations"] == anchored["iterations"] == 40
     assert explicit["anchors"] is None
     assert 0 < explicit["gaussians"] <= 3_000
     assert anchored["gaussians"] == 10 * anchored["anchors"]
     for name in ("psnr", "ssim", "psnr_cc", "psnr@0", "seconds", "peak_memory_bytes", "model_bytes", "fps"):
         assert explicit[name] is not None, name
-    assert both["3dgs"].groups == both["scaffold-gs"].groups  # the same pixels
+    assert both["3dgs"].groups == both["scaffold-gs-ours"].groups  # the same pixels
     assert both["3dgs"].visibility_source == "model"
     text = (tmp_path / "table1" / "table.md").read_text()
     assert "3DGS has no anchors" in text
@@ -146,3 +150,22 @@ def test_methods_that_train_in_blocks_stand_beside_the_others(data, tmp_path, mo
         assert (figures["anchors"] is None) == (name != "momentum-gs")
     text = (tmp_path / "table1" / "table.md").read_text()
     assert all(f"{METHODS[name].title} ({METHODS[name].citation})" in text for name in names)
+
+
+def test_other_methods_stand_beside_ours_at_equal_steps_and_at_equal_time(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(bench, "LocalExecutor", InThisProcess)
+    monkeypatch.setattr(bench, "step_factors", lambda plan, results: (("copr", "scaffold-gs", 0.5),))
+    methods = ("scaffold-gs", "hug", "mixgs")
+    options = PlanOptions(seeds=1, scenes=("copr",), methods=methods, total_iterations=24, max_anchors=300)
+    settings = BenchSettings("table1", tmp_path, options, data, equal_time=True)
+    at_equal_time = {each.method: each for each in run_bench(settings, Console(file=io.StringIO()))}
+    results = json.loads((tmp_path / "table1" / "results.json").read_text())["results"]
+    for name, figures in ((each["method"], each["figures"]) for each in results):
+        assert figures["iterations"] == 24, name
+        assert figures["psnr"] is not None
+        assert (figures["anchors"] is None) == (name == "mixgs")
+        assert figures["blocks"] == (4 if name == "hug" else None)
+        expected = pytest.approx(12, abs=2) if name == "scaffold-gs" else 24  # blocks round theirs
+        assert at_equal_time[name].figures["iterations"] == expected
+    assert (tmp_path / "runs" / "copr" / "scaffold-gs-equal-time").is_dir()
+    assert "scaffold-gs on copr: 0.5" in (tmp_path / "table1-equal-time" / "table.md").read_text()

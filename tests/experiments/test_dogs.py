@@ -11,6 +11,7 @@ from rich.console import Console
 
 from experiments.baselines import turns
 from experiments.baselines.dogs.consensus import Consensus, ConsensusConfig, find_members, mean_gaussians
+from experiments.baselines.dogs.cut import cut_dogs
 from experiments.baselines.dogs.training import DogsTraining, begin_consensus, restore, train_dogs
 from experiments.baselines.gaussian_blocks.cut import GaussianCut
 from experiments.baselines.gaussian_blocks.training import GaussianBlocksConfig, train_scene
@@ -70,6 +71,26 @@ def capture(tmp_path_factory):
     folder = tmp_path_factory.mktemp("place") / "capture"
     write_colmap(folder, tiny_scene())
     return load_capture(folder, CaptureOptions(up="z"))
+
+
+def test_cameras_train_the_points_of_their_place_in_the_grid():
+    rng = np.random.default_rng(1)
+    points = np.column_stack([rng.uniform(-40, 40, 900), rng.uniform(-10, 10, 900), np.zeros(900)])
+    looks_down = Photographs().cameras[0].camera_from_world
+    cameras = []
+    for x, y in rng.uniform((-40, -10), (40, 10), (60, 2)):
+        pose = looks_down.copy()
+        pose[:3, 3] = -pose[:3, :3] @ (x, y, 10.0)
+        cameras.append(replace(Photographs().cameras[0], camera_from_world=pose))
+    cut = cut_dogs(points, cameras, 4)
+    assert len(cut.blocks) == 4
+    assert set().union(*cut.views) == set(range(60))
+    for block, views in zip(cut.blocks.items, cut.views, strict=True):
+        x, y = np.array([cameras[view].position[:2] for view in views]).T
+        assert shapely.contains_xy(block.expanded, x, y).mean() > 0.8
+        assert len(views) < 30
+    shares = np.bincount(cut.blocks.owner(points[:, :2])) / len(points)
+    assert shares.min() > 0.15
 
 
 def test_one_block_is_3dgs(capture, tmp_path):

@@ -177,6 +177,8 @@ def test_opacities_are_reset_with_their_moments():
     assert float(state.gaussians.opacity_logits.sigmoid().max()) <= 0.01 + 1e-6
     assert not state.moments.first["opacity_logits"].any()
     assert state.moments.first["means"].any()
+    last = replace(CONFIG, density=replace(CONFIG.density, reset_interval=60))  # the last decision is that of step 60
+    assert float(run(start(), stage(last), until=60).gaussians.opacity_logits.sigmoid().max()) > 0.05
 
 
 def test_bands_of_color_are_released_one_after_the_other():

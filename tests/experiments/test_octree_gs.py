@@ -29,6 +29,7 @@ from vdgs.pipeline.train_coarse import open_training_images
 from vdgs.runs.run_folder import RunFolder
 from vdgs.system.checkpoints import load_latest_checkpoint, save_checkpoint
 from vdgs.training import from_checkpoint, initial_state, to_checkpoint, train
+from vdgs.training.training_loop import REFERENCE_HEIGHT
 
 pytestmark = pytest.mark.xdist_group("octree_gs")
 STEPS = 24
@@ -97,6 +98,14 @@ def test_scaffold_gs_differs_from_the_defaults_where_it_is_listed():
         "iterations", "optimizer", "lr_offsets_unit", "model.bound_scales", "init.outlier_distance", "init.fill_gaps",
         "loss.background", "loss.random_background", "densify.start", "densify.stop_fraction",
     }  # fmt: skip
+    rates = published.lr
+    assert (rates.offsets, rates.features, rates.log_scales) == ((0.01, 1e-4), (0.0075, 0.0075), (0.007, 0.007))
+    assert (rates.opacity, rates.covariance, rates.color) == ((0.002, 2e-5), (0.004, 0.004), (0.008, 5e-5))
+    assert (published.loss.volume_reg, published.loss.ssim_lambda, published.densify.grad_threshold) == (
+        0.01,
+        0.2,
+        2e-4,
+    )
     growth = published.densify
     assert (growth.stats_start, growth.start, growth.every) == (500, 1501, 100)
     assert growth.stop_fraction * 30_000 == pytest.approx(14_999)
@@ -116,6 +125,15 @@ def test_a_stopped_and_continued_run_has_the_same_bits(capture, tmp_path):
     assert bits(continued) == bits(whole)
     assert set(whole.levels.tolist()) == {0, 1}  # no camera is so near that it shows the finest
     assert whole.bias.any()
+
+
+def test_the_volume_weight_is_of_the_unit_of_the_capture(capture):
+    doubled = replace(capture, ground=replace(capture.ground, scale=2.0))  # its own unit is half as long
+    for place, scale in ((capture, capture.ground.scale), (doubled, 2.0)):
+        with open_training_images(place, SCAFFOLD.training, 10**8) as images:
+            _, problem = problem_of(place, SCAFFOLD, images)
+        weight = problem.config.loss.volume_reg / (problem.camera_height / REFERENCE_HEIGHT) ** 3
+        assert weight == pytest.approx(0.01 / scale**3)
 
 
 def test_levels_follow_the_distances_of_the_cameras(capture):

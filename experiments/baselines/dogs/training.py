@@ -18,7 +18,8 @@ import torch
 from torch import Tensor
 
 from experiments.baselines.dogs.consensus import Consensus, ConsensusConfig, find_members
-from experiments.baselines.gaussian_blocks.cut import GaussianCut, cut_points
+from experiments.baselines.dogs.cut import cut_dogs
+from experiments.baselines.gaussian_blocks.cut import GaussianCut
 from experiments.baselines.gaussian_blocks.training import BlockScene
 from experiments.baselines.gs3d.session import state_from_points
 from experiments.baselines.gs3d.training import (
@@ -44,7 +45,7 @@ MIN_STEPS = 10
 def train_dogs(scene: BlockScene, config: ConsensusConfig | None = None) -> Gaussians:
     """The global Gaussians. Raises what `run_session` raises."""
     points, count = scene.capture.points, scene.config.blocks
-    cut = scene.cut(lambda: cut_points("dogs", points, scene.cameras, count))
+    cut = scene.cut(lambda: cut_dogs(points, scene.cameras, count))
     problems = _grow(scene, cut)
     folder = StageFolder(scene.folder.path / "consensus")
 

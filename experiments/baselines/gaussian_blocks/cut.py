@@ -43,6 +43,15 @@ class GaussianCut:
         write_json(folder / "cut.json", {"views": self.views, "warnings": self.warnings})  # last: the rest is complete
 
     @staticmethod
+    def of(blocks: Blocks, joined: Bool[np.ndarray, "c b"], warnings: Sequence[str]) -> GaussianCut:
+        """The cut in which these cameras train these blocks. A single block is the scene: it has all cameras."""
+        if len(blocks) == 1:
+            joined = np.ones_like(joined)
+        empty = [f"block {index}: no camera shows it" for index in np.flatnonzero(~joined.any(axis=0)).tolist()]
+        views = tuple(tuple(np.flatnonzero(column).tolist()) for column in joined.T)
+        return GaussianCut(blocks, views, (*warnings, *empty))
+
+    @staticmethod
     def load(folder: Path) -> GaussianCut | None:
         """What `save` wrote; None where there is none."""
         if not (folder / "cut.json").exists():
@@ -57,7 +66,7 @@ def cut_points(strategy: str, points: Float[np.ndarray, "n 3"], cameras: Sequenc
     is its score, unless the strategy has another."""
     blocks, warnings = STRATEGIES[strategy].partition(points, cameras, count)
     owner = blocks.owner(xy_positions(points))
-    held = points_held(torch.from_numpy(points.astype(np.float32)), owner, len(blocks), cameras)
+    held = points_held(points, owner, len(blocks), cameras)
     shares = held / np.maximum(np.bincount(owner, minlength=len(blocks)), 1)
     return choose_cameras(strategy, shares, held, blocks, points, cameras, warnings)
 
@@ -70,16 +79,17 @@ def cut_by_removal(
     points = gaussians.means.numpy()
     blocks, warnings = STRATEGIES[strategy].partition(points, cameras, count)
     owner = blocks.owner(xy_positions(points))
-    held = points_held(gaussians.means, owner, len(blocks), cameras)
+    held = points_held(points, owner, len(blocks), cameras)
     scores = np.stack([_removal_scores(gaussians, owner, len(blocks), camera, image_size) for camera in cameras])
     return choose_cameras(strategy, scores, held, blocks, points, cameras, warnings)
 
 
 def points_held(
-    points: Float[Tensor, "n 3"], owner: Int64[np.ndarray, " n"], count: int, cameras: Sequence[Camera]
+    points: Float[np.ndarray, "n 3"], owner: Int64[np.ndarray, " n"], count: int, cameras: Sequence[Camera]
 ) -> Float[np.ndarray, "c b"]:
     """How many points of every block each camera holds in its frustum."""
-    return np.stack([np.bincount(owner[holds(points, camera)], minlength=count) for camera in cameras]).astype(float)
+    places = torch.from_numpy(points.astype(np.float32))
+    return np.stack([np.bincount(owner[holds(places, camera)], minlength=count) for camera in cameras]).astype(float)
 
 
 def holds(points: Float[Tensor, "n 3"], camera: Camera) -> Bool[np.ndarray, " n"]:
@@ -124,11 +134,7 @@ def choose_cameras(
         anchors=np.bincount(owner, minlength=len(blocks)).astype(np.int64), nadir_block=blocks.owner(centers),
     )  # fmt: skip
     joined = assign_cameras(chosen.adjust_scores(matrix, points, blocks, cameras), config).cameras
-    empty = [f"block {index}: no camera shows it" for index in np.flatnonzero(~joined.any(axis=0)).tolist()]
-    if len(blocks) == 1:  # it is the scene
-        joined = np.ones_like(joined)
-    views = tuple(tuple(np.flatnonzero(column).tolist()) for column in joined.T)
-    return GaussianCut(blocks, views, (*warnings, *empty))
+    return GaussianCut.of(blocks, joined, warnings)
 
 
 def load_or_cut(folder: Path, cut: Callable[[], GaussianCut]) -> GaussianCut:

@@ -37,7 +37,7 @@ class DensityConfig:
     prune_size: float = 0.1
     """Gaussians larger than this share of the extent go, once opacities were reset (section 5.2; value: program)."""
     reset_interval: int = 3000
-    """N: iterations between two resets of all opacities, as long as there are decisions (section 5.2)."""
+    """N: iterations between two resets of all opacities, before the last decision (section 5.2; program)."""
     reset_opacity: float = 0.01
     """Opacities are at most this after a reset (section 5.2: "close to zero"; value: program)."""
     max_gaussians: int = 0

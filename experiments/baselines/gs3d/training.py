@@ -300,7 +300,8 @@ def _densify(state: Gs3dState, stage: Gs3dProblem) -> dict[str, Any]:
         )  # fmt: skip
         _apply(state, change.added, change.kept)
         counts = {"cloned": change.cloned, "split": change.split, "pruned": change.pruned}
-    if done % config.reset_interval == 0:
+    # Not by the last decision (program): what is faint then would stay, and nothing would prune it.
+    if done % config.reset_interval == 0 and done < config.until * stage.config.iterations:
         state.gaussians.opacity_logits.copy_(cap_opacity_logits(state.gaussians.opacity_logits, config.reset_opacity))
         state.moments.first["opacity_logits"].zero_()
         state.moments.second["opacity_logits"].zero_()
