@@ -157,7 +157,7 @@ FILES = [
     ("gaussiansplats3d", "z-up.ply", 36), ("gaussiansplats3d", "scene.ply", 36),
     ("gaussiansplats3d", "scene.splat", 36),
     ("spark", "scene.ply", 30), ("spark", "scene.spz", 30), ("spark", "scene.compressed.ply", 27),
-    ("spark", "scene.sog", 27), ("spark", "scene.splat", 30),
+    ("spark", "scene.sog", 27), ("spark", "scene.rad", 27), ("spark", "scene.splat", 30),
     ("playcanvas", "scene.ply", 30), ("playcanvas", "scene.compressed.ply", 27), ("playcanvas", "scene.sog", 27),
     ("playcanvas", "lod-meta.json", 27),
     ("cesium", "tileset.json", 30),

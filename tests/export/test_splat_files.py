@@ -11,7 +11,8 @@ import pygltflib
 import pytest
 import torch
 
-from support.gaussians import overhead, picture, psnr, random_gaussians
+from support.gaussians import overhead, picture, psnr, random_gaussians, turned
+from support.splat_readers import independent
 from vdgs.errors import VdgsError
 from vdgs.export.formats import export_scene, registry, spz
 from vdgs.export.formats.axes import Y_DOWN, Y_UP
@@ -19,36 +20,12 @@ from vdgs.export.formats.export_scene import ExportMetadata, ExportScene, metada
 from vdgs.export.formats.gaussian_ply import read_ply_chunks
 from vdgs.export.formats.parallel_gzip import gzip_blocks
 from vdgs.export.formats.quaternion_canonical import canonicalize_quaternions
-from vdgs.model.gaussian_transform import gaussian_covariances, transform_gaussians
+from vdgs.model.gaussian_transform import gaussian_covariances
 from vdgs.model.gaussians import Gaussians
 
 PLACED = ExportMetadata(origin=(690_000.0, 5_334_000.25, 512.0), crs="EPSG:32632", geodetic=(48.13, 11.57, 512.0))
 #: PSNR of what is read back, drawn, against the scene as it was: at least.
 CLOSE = {".ply": 100, ".spz": 38, ".splat": 38}
-
-
-def independent(path: Path) -> Gaussians:
-    """Read by gaussforge, whose SPZ is Niantic's own code, in the coordinates of the file."""
-    gaussforge = pytest.importorskip("gaussforge")
-    answer = gaussforge.GaussForge().read(path.read_bytes(), path.suffix[1:])
-    if "error" in answer:  # it cannot hand over scenes without spherical harmonics, but converts them
-        other = path.with_name("converted.ply")
-        other.write_bytes(gaussforge.GaussForge().convert(path.read_bytes(), path.suffix[1:], "ply")["data"])
-        return registry.read_gaussians(other)
-    data, n = answer["data"], answer["data"]["numPoints"]
-
-    def tensor(name: str, *shape: int) -> torch.Tensor:
-        return torch.from_numpy(np.frombuffer(data[name], np.float32).reshape(shape).copy())
-
-    rest = tensor("sh", n, -1, 3) if data["sh"] else torch.zeros(n, 0, 3)
-    return Gaussians(
-        means=tensor("positions", n, 3), log_scales=tensor("scales", n, 3), quaternions=tensor("rotations", n, 4),
-        opacity_logits=tensor("alphas", n), sh0=tensor("colors", n, 3), shN=rest,
-    )  # fmt: skip
-
-
-def turned(gaussians: Gaussians, matrix: np.ndarray) -> Gaussians:
-    return transform_gaussians(gaussians, 1.0, matrix, np.zeros(3))
 
 
 def flat(gaussians: Gaussians) -> Gaussians:

@@ -11,9 +11,9 @@ import torch
 
 pytest.importorskip("gaussforge", reason="gaussforge is not installed (pip install 'vdgs[dev]')")
 
-from test_splat_files import independent, turned
 
-from support.gaussians import overhead, picture, psnr, random_gaussians
+from support.gaussians import overhead, picture, psnr, random_gaussians, turned
+from support.splat_readers import independent
 from vdgs.errors import VdgsError
 from vdgs.export.formats import registry, streamed_sog
 from vdgs.export.formats.axes import Y_DOWN

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from vdgs.geometry.camera import Camera
+from vdgs.model.gaussian_transform import transform_gaussians
 from vdgs.model.gaussians import Gaussians, render_gaussians
 
 
@@ -24,6 +25,11 @@ def random_gaussians(count: int, degree: int, seed: int = 0, reach: float = 3.0)
         sh0=normal(count, 3) * 0.4,
         shN=normal(count, (degree + 1) ** 2 - 1, 3) * 0.2,
     )
+
+
+def turned(gaussians: Gaussians, matrix: np.ndarray) -> Gaussians:
+    """Along other axes."""
+    return transform_gaussians(gaussians, 1.0, matrix, np.zeros(3))
 
 
 def overhead(height: float = 8.0, aside: float = 2.0, size: int = 96) -> Camera:

@@ -18,6 +18,7 @@ from vdgs.config.commands import (
     BIN_COUNT_RANGE,
     MAX_RENDER_SIDE_PX,
     ComputeOptions,
+    ExportRequest,
     ModelName,
     OrthoRequest,
     RenderRequest,
@@ -25,6 +26,9 @@ from vdgs.config.commands import (
     ViewRequest,
 )
 from vdgs.config.ranges import Positional, Range
+from vdgs.config.output_paths import Output
+from vdgs.config.ranges import Positional
+from vdgs.errors import VdgsError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,9 +151,38 @@ class ViewArguments(ViewRequest):
     Prints the address to open; Ctrl-C ends it. Needs viser: pip install 'vdgs[viewer]'.
     """
 
+    static: Annotated[Path | None, Output()] = None
+    """Folder to write for any web server: a page that loads near parts finely. Nothing is served then. With fixed
+    colors, not the true model. Options of a smaller or better one: `vdgs export --output FOLDER/scene.json`."""
+
 
 def view_command(arguments: list[str]) -> None:
     args = parse_arguments(ViewArguments, arguments, "view")
+    if args.static is not None:
+        write_static_viewer(args, args.static)
+        return
     from vdgs.viewer.server import view_run
 
     view_run(replace(args, device=set_up_compute(args.device, args.threads)), make_console())
+
+
+def write_static_viewer(args: ViewArguments, folder: Path) -> None:
+    """Write the folder of `--static`, and say how it is served."""
+    device, console = set_up_compute(args.device, args.threads), make_console()
+    from vdgs.export.export_run import export_run, resolve_request
+    from vdgs.export.formats.streamed_page import SCENE_FILE
+    from vdgs.runs.open_run import open_run
+    from vdgs.system.quoting import shell_word
+
+    if args.port is not None or args.host != ViewRequest.host:
+        raise VdgsError("--static writes a folder and serves nothing: leave out --host and --port.")
+    request = ExportRequest(
+        run=args.run, output=(folder / SCENE_FILE,), model=args.model, threads=args.threads, device=device
+    )
+    request = resolve_request(request)
+    export_run(open_run(request.run, request.model, device), request, console)
+    console.print(
+        f"{folder}: any web server serves it. Here: python -m http.server --directory {shell_word(folder)}, then open "
+        "http://localhost:8000",
+        highlight=False,
+    )

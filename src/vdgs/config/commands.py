@@ -184,16 +184,15 @@ class ExportRequest(ModelRequest):
 
     output: Annotated[tuple[Path, ...], Repeatable(), Output()] = ()
     """File to write; its ending is the format: .ply, .spz, .glb, .html, ... These are .ply (3DGS), .compressed.ply
-    (PlayCanvas), .spz, .splat, .sog, .glb (glTF), FOLDER/tileset.json (3D Tiles),
-    FOLDER/lod-meta.json (streamed SOG), .points.ply, .laz, .las (point
-    clouds), .html (a page that shows the scene offline). Give --output again for more: the scene is baked once
-    (docs/export.md)."""
+    (PlayCanvas), .spz, .splat, .sog, .rad (Spark), .glb (glTF), FOLDER/tileset.json (3D Tiles), FOLDER/lod-meta.json
+    (streamed SOG), .points.ply, .laz, .las (point clouds), .html (a page that shows the scene offline). Give --output
+    again for more: the scene is baked once (docs/export.md)."""
     program: Annotated[ProgramName | None, FlagName("for")] = None
     """Program that opens the files. It shows the scene upright then; files that it does not open are refused.
     Without --output: write RUN/export/ and the file that suits it best."""
     axes: AxesName | None = None
-    """Axes of .ply, .spz, .splat, .sog and lod-meta.json files: z-up (x east, y north, z up: the usual ones of .ply),
-    y-up (of .spz: x east, z south), y-down (of .compressed.ply, .splat and .sog: x west, z south), y-up-left
+    """Axes of .ply, .spz, .splat, .sog, .rad and lod-meta.json: z-up (x east, y north, z up: the usual ones of .ply),
+    y-up (of .spz and .rad: x east, z south), y-down (of .compressed.ply, .splat and .sog: x west, z south), y-up-left
     (left-handed: x east, z north). Instead of --for."""
     spz_version: Literal[2, 3, 4] = 3
     """Version of .spz files: 2 for older programs, 4 (zstd) for those of 2026; 3D Tiles always hold 2."""
@@ -207,7 +206,7 @@ class ExportRequest(ModelRequest):
     sh_degree: Literal[0, 1, 2, 3] = 3
     """Degree of the spherical harmonics of colors. 0: the same from everywhere, and a fifth of the size."""
     html_max_mb: Annotated[float, Range(1, 2000)] = 30.0
-    """Largest size of a .html file in MB. The scene is thinned until it fits."""
+    """Largest size of a .html file in MB. The scene is merged until it fits."""
     color_iterations: Annotated[int | None, Range(0, 100)] = None
     """Rounds in which colors are fitted again. To the difference from the model's images; by default 8, or 1 where
     the anchors spawn more than four million Gaussians (docs/export.md)."""

@@ -45,7 +45,8 @@ PROGRAMS: Mapping[str, Program] = {
     "playcanvas": _PLAYCANVAS,
     "spark": Program(
         "Spark (three.js)", "spark.spz",
-        {".spz": Y_UP, ".ply": Y_UP, ".compressed.ply": Y_UP, ".splat": Y_UP, ".sog": Y_UP},
+        {".spz": Y_UP, ".ply": Y_UP, ".compressed.ply": Y_UP, ".splat": Y_UP, ".sog": Y_UP,
+         ".rad": Y_UP},
         "Spark opens no others",
     ),
     "gaussiansplats3d": Program(
@@ -63,7 +64,7 @@ PROGRAMS: Mapping[str, Program] = {
     ),
 }  # fmt: skip
 #: Formats whose axes may be chosen.
-FREE = (".points.ply", ".compressed.ply", ".ply", ".spz", ".splat", ".sog", LOD_FILE)
+FREE = (".points.ply", ".compressed.ply", ".ply", ".spz", ".splat", ".sog", ".rad", LOD_FILE)
 
 
 def with_files(asked: ExportRequest) -> ExportRequest:

@@ -90,8 +90,8 @@ def check_viser(path: Path, scene: ExportScene) -> None:
 def write_html(path: Path, scene: ExportScene) -> tuple[str, ...]:
     """Write the page, atomically. Returns what was lost. Raises VdgsError."""
     whole = _without_sh(scene)
-    page = scene.page or _default_view(whole)
-    factor = _factor(whole)
+    page = scene.page or default_page_view(whole)
+    factor = length_factor(whole)
     kept = whole
     while len(content := _document(kept, factor, page, scene)) > page.max_bytes:
         count = min(html_capacity(whole, page), int(0.9 * len(kept)))
@@ -136,8 +136,8 @@ def html_capacity(gaussians: Gaussians, page: InitialView) -> int:
     """How many like these a page has room for, by a sample of them. Raises VdgsError for next to none."""
     some = gaussians.select(torch.linspace(0, len(gaussians) - 1, min(SAMPLE_GAUSSIANS, len(gaussians))).long())
     frame = len(_client_html()) + 4096
-    factor = _factor(some)
-    each = SIZE_MARGIN * len(_recording(_packed(some, factor), factor, page)) / len(some)
+    factor = length_factor(some)
+    each = SIZE_MARGIN * len(_recording(packed_rows(some, factor), factor, page)) / len(some)
     count = int((page.max_bytes - frame) / each)
     if count < min(MIN_GAUSSIANS, len(gaussians)):
         raise VdgsError(
@@ -147,13 +147,13 @@ def html_capacity(gaussians: Gaussians, page: InitialView) -> int:
     return count
 
 
-def _factor(gaussians: Gaussians) -> float:
+def length_factor(gaussians: Gaussians) -> float:
     """The power of two that lengths are multiplied with."""
     usual = float(gaussians.log_scales.amax(1).median().exp())
     return float(2.0 ** np.round(np.log2(TARGET_MEDIAN_SIZE / max(usual, 1e-30))))
 
 
-def _packed(gaussians: Gaussians, factor: float) -> UInt32[np.ndarray, "n 8"]:
+def packed_rows(gaussians: Gaussians, factor: float) -> UInt32[np.ndarray, "n 8"]:
     """As the client's textures hold them."""
     rows = np.zeros((len(gaussians), WORDS_PER_GAUSSIAN), np.uint32)
     rows[:, :3] = (factor * gaussians.means.numpy()).astype(np.float32).view(np.uint32)
@@ -167,7 +167,7 @@ def _packed(gaussians: Gaussians, factor: float) -> UInt32[np.ndarray, "n 8"]:
 
 
 def _unpacked(rows: UInt32[np.ndarray, "n 8"], factor: float) -> Gaussians:
-    """The inverse of `_packed`, but for what is rounded."""
+    """The inverse of `packed_rows`, but for what is rounded."""
     upper = torch.from_numpy(np.ascontiguousarray(rows[:, 4:7]).view(np.float16).astype(np.float64)) / factor**2
     log_scales, quaternions = ellipsoid_axes(upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3))
     rgba = np.ascontiguousarray(rows[:, 7:]).view(np.uint8).astype(np.float32) / 255
@@ -188,7 +188,7 @@ def _document(gaussians: Gaussians, factor: float, page: InitialView, scene: Exp
     )
     stand, target = ([factor * each for each in place] for place in (page.position, page.target))
     head += _PORTRAIT % (stand, target)
-    recording = _recording(_packed(gaussians, factor), factor, page)
+    recording = _recording(packed_rows(gaussians, factor), factor, page)
     script = (
         f'<script>window.__VISER_EMBED_DATA__="{recording}";window.__VISER_EMBED_CONFIG__={{darkMode:false}};</script>'
     )
@@ -258,7 +258,7 @@ def _png(color: tuple[float, float, float]) -> bytes:
     return encoded.tobytes()
 
 
-def _default_view(gaussians: Gaussians) -> InitialView:
+def default_page_view(gaussians: Gaussians) -> InitialView:
     """A view of all from the south, half from above."""
     low, high = (np.quantile(gaussians.means.numpy(), q, axis=0) for q in (0.02, 0.98))
     middle: Float[np.ndarray, "3"] = (low + high) / 2

@@ -15,9 +15,11 @@ from vdgs.export.formats.gaussian_ply import read_ply_chunks, write_ply
 from vdgs.export.formats.gltf import check_glb_size, write_glb
 from vdgs.export.formats.html import check_viser, html_capacity, read_html_chunks, write_html
 from vdgs.export.formats.point_cloud import check_las_dependencies, write_laz, write_points
+from vdgs.export.formats.rad import write_rad
 from vdgs.export.formats.sog import write_sog
 from vdgs.export.formats.splat import read_splat_chunks, write_splat
 from vdgs.export.formats.spz import MAX_COORDINATE, check_range, read_spz_chunks, write_spz
+from vdgs.export.formats.streamed_page import NODE_FOLDER, SCENE_FILE, check_page_folder, write_streamed_page
 from vdgs.export.formats.streamed_sog import LOD_FILE, LOD_FOLDER, check_lod_folder, write_streamed_sog
 from vdgs.export.formats.tiles_3d import TILE_FOLDER, TILESET_FILE, check_tileset_folder, write_tiles
 from vdgs.model.gaussians import Gaussians
@@ -91,6 +93,7 @@ FORMATS: tuple[ExportFormat, ...] = (
         write=write_sog,
         writes_metadata_file=True,
     ),
+    ExportFormat(suffix=".rad", description="Spark's RAD, with levels", write=write_rad, writes_metadata_file=True),
     ExportFormat(
         suffix=".glb",
         description="glTF with KHR_gaussian_splatting, nothing lost",
@@ -112,6 +115,14 @@ FORMATS: tuple[ExportFormat, ...] = (
         check=check_lod_folder,
         writes_metadata_file=True,
         folder=LOD_FOLDER,
+    ),
+    ExportFormat(
+        suffix=SCENE_FILE,
+        description="folder with a page that streams, for a web server",
+        write=write_streamed_page,
+        check=check_page_folder,
+        fixed_colors=True,
+        folder=NODE_FOLDER,
     ),
     ExportFormat(
         suffix=".html",

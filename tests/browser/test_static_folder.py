@@ -1,0 +1,83 @@
+"""The folder for a web server, in a real browser: it shows what we draw, coarse parts first and fine ones near by."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from support.commands import wait_until
+from support.gaussians import overhead, picture, psnr, random_gaussians
+from support.viewer import needs_browser, open_page, served
+from vdgs.captures.first_view import FOV_DEG
+from vdgs.export.formats.export_scene import ExportScene, InitialView
+from vdgs.export.formats.streamed_page import write_streamed_page
+from vdgs.geometry.camera import Camera
+
+pytestmark = [pytest.mark.browser, needs_browser]
+SIZE = 256
+
+
+def upright(position: np.ndarray, focal: float) -> Camera:
+    """Looks at the origin, z up."""
+    forward = -position / np.linalg.norm(position)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    matrix[:3, 3] = -matrix[:3, :3] @ position
+    return replace(overhead(size=SIZE), camera_from_world=matrix, fx=focal, fy=focal)
+
+
+def test_the_page_shows_what_we_draw_and_loads_what_is_near(tmp_path):
+    gaussians = random_gaussians(600, 0)
+    focal = SIZE / 2 / np.tan(np.radians(FOV_DEG) / 2)
+    camera = upright(np.array([2.0, -5.0, 6.0]), focal)
+    view = InitialView(tuple(camera.position), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), "town")
+    write_streamed_page(tmp_path / "scene.json", replace(ExportScene.of(gaussians), page=view), node_size=100)
+    expected, nodes = picture(gaussians, camera), len(list(tmp_path.glob("nodes-1/*.bin")))
+    assert nodes > 5
+
+    def state(page) -> str:
+        return page.evaluate("document.body.dataset.state")
+
+    def shown(page) -> np.ndarray:
+        wait_until(lambda: state(page) in ("complete", "failed"))
+        assert state(page) == "complete", page.evaluate("document.body.innerText")
+        return page.screenshot() / 255
+
+    with served(tmp_path) as address, open_page(address, SIZE, SIZE) as page:
+        near = shown(page)
+        assert page.evaluate("document.title") == "town"
+        assert "parts" in page.evaluate("document.getElementById('caption').textContent")
+        page.evaluate("document.getElementById('caption').remove()")
+        cv2.imwrite(str(tmp_path / "shown.png"), page.screenshot()[..., ::-1])
+        assert psnr(page.screenshot() / 255, expected) > 30
+        for other in (near[::-1], near[:, ::-1]):
+            assert psnr(other, expected) < 25
+        page.evaluate(
+            "document.getElementById('canvas').dispatchEvent(new WheelEvent('wheel', {deltaY: -900, cancelable: true}))"
+        )
+        wait_until(lambda: psnr(page.screenshot() / 255, expected) < 25)  # one stands nearer
+        assert state(page) in ("loading", "complete")
+    # From so far that a pixel holds the whole, the root is enough.
+    scene = json.loads((tmp_path / "scene.json").read_text())
+    scene["view"]["position"] = [0.0, -3000.0, 3000.0]
+    (tmp_path / "scene.json").write_text(json.dumps(scene))
+    with served(tmp_path) as address, open_page(address, SIZE, SIZE) as page:
+        shown(page)
+        assert f"1 of {nodes} parts" in page.evaluate("document.getElementById('caption').textContent")
+    # What is missing is said.
+    (tmp_path / scene["root"]["content"]["uri"]).unlink()
+    with served(tmp_path) as address, open_page(address, SIZE, SIZE) as page:
+        wait_until(lambda: state(page) == "failed")
+        assert "copy it whole" in page.evaluate("document.body.innerText")
+
+
+def test_a_page_that_was_opened_as_a_file_says_how_to_serve_it(tmp_path):
+    write_streamed_page(tmp_path / "scene.json", ExportScene.of(random_gaussians(20, 0)))
+    with open_page((tmp_path / "index.html").as_uri(), SIZE, SIZE) as page:
+        wait_until(lambda: "http.server" in page.evaluate("document.body.innerText"))
