@@ -33,6 +33,7 @@ from vdgs.runs.open_run import OpenedRun
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.stage_folder import StatusRecord
 from vdgs.system.atomic_files import read_json
+from vdgs.visibility.visibility_counts import count_visibility
 
 #: Far from the middle of its UTM zone: grid north is 1.1 degrees off.
 PLACE = (46.95, 7.44, 560.0)
@@ -225,6 +226,11 @@ def test_boxes_blocks_and_numbers_choose(export, tmp_path: Path):
     whole = export("all.ply")["gaussians"]
     assert export("few.ply", max_gaussians=50)["gaussians"] == 50
     assert export("many.ply", max_gaussians=whole + 1)["gaussians"] == whole
+    cameras = [view.camera for view in capture_at(None).train_views]
+    seen = int(count_visibility(scattered().anchors.positions, cameras).max())
+    assert 0 < export("seen.ply", min_visibility=seen)["gaussians"] < whole
+    with pytest.raises(VdgsError, match=f"at most {seen}"):
+        export("unseen.ply", min_visibility=seen + 1)
     box = export("box.ply", bbox=(-1.0, -1.0, 2.0, 0.5))["gaussians"]
     inside = registry.read_gaussians(tmp_path / "box.ply").means
     assert 0 < box < whole

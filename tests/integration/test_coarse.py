@@ -329,6 +329,8 @@ def test_evaluation_and_renders_of_a_run(unbroken, tmp_path):
     tall = cv2.imread(str(next((tmp_path / "alpha").glob("*.png"))))
     assert tall.shape[0] > 48
     assert tall[:48].mean() > 180
+    assert vdgs("render", run, "--output", tmp_path / "alpha", "--mode", "alpha", "--min-visibility", 6).returncode == 0
+    assert cv2.imread(str(next((tmp_path / "alpha").glob("*.png"))))[:48].mean() < tall[:48].mean() - 5
     film = ("render", run, "--output", tmp_path / "f.mp4", "--views", "orbit", "--seconds", "0.5")
     assert vdgs(*film).returncode == 0
     assert (tmp_path / "f.mp4").stat().st_size > 1000

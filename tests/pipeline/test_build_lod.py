@@ -96,6 +96,20 @@ def test_without_any_error_the_picture_is_that_of_the_model_to_the_last_bit(scen
     torch.testing.assert_close(drawn, expected, rtol=1e-4, atol=1e-2, equal_nan=True)
 
 
+def test_places_that_are_filtered_out_are_not_drawn_and_have_no_values(scene, model):
+    """As the viewer leaves out what few cameras see: of anchors and of merged Gaussians alike."""
+    camera, half = camera_at(0.0, 0.0, 6.0), scene.with_filter(lambda _, places: places[:, 0] > 0)
+    kept = model.select_anchors(model.anchors.positions[:, 0] > 0)
+    exact = render(half.at_error(0.0), camera).image
+    assert torch.equal(exact, render(kept, camera).image)
+    for error in (0.0, 2.0, 50.0):
+        drawn = half.at_error(error)
+        x = drawn.values(camera, lambda _, places: places[:, 0])
+        assert len(x)
+        assert bool((x > 0).all())
+        assert int(drawn.view_splats(camera)[0].max()) < len(x)
+
+
 def test_a_cut_shows_each_place_once_and_is_coarser_the_larger_the_error(scene):
     table, tree = scene.tree.table, scene.tree
     under = [{leaf} if table.anchors[leaf] else set() for leaf in range(len(table))]

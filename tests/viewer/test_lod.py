@@ -14,6 +14,17 @@ from vdgs.model.renderer import render
 from vdgs.viewer.lod import LodPyramid
 
 
+def test_levels_of_a_part_of_a_model_know_their_anchors():
+    model, camera = two_floors(), camera_at(0.0, 0.0, 6.0)
+    west = model.anchors.positions[:, 0] < 0
+    levels = LodPyramid(model, west)
+    for most in (None, 100):
+        level, _ = levels.of(camera, most)
+        assert torch.equal(level.of(model.anchors.positions), level.model.anchors.positions)
+        assert (level.model.anchors.positions[:, 0] < 0).all()
+    assert len(levels.of(camera)[0].model.anchors) == int(west.sum())
+
+
 @pytest.mark.parametrize("parts", [False, True])
 def test_quick_pictures_of_much_are_drawn_with_fewer_larger_gaussians(parts):
     model = two_floors()

@@ -153,6 +153,19 @@ def test_a_run_with_a_tree_is_drawn_through_it(scene, tmp_path, monkeypatch):
     assert np.linalg.norm(near - pick_position(model, camera, 32.5, 20.5)) < 0.3
 
 
+def test_what_few_cameras_see_can_be_left_out(scene):
+    camera, painter = scene.capture.views[0].camera, Painter(scene)
+    everything = painter.paint(DisplayOptions(), camera, camera)
+    most = int(scene.visibility("merged").max())
+    drawn = painter.paint(DisplayOptions(min_visibility=most), camera, camera)
+    kept = scene.visibility("merged") >= most
+    assert 0 < kept.double().mean() < 1
+    expected = render(scene.model("merged").select_anchors(kept), camera)
+    assert np.array_equal(drawn, to_8bit(expected.image.numpy()))
+    assert not np.array_equal(drawn, everything)
+    assert np.array_equal(painter.paint(DisplayOptions(), camera, camera), everything)
+
+
 def test_photographs_that_the_model_draws_itself_show_no_error_and_others_do(scene):
     camera = scene.capture.views[4].camera
     painter, shown = Painter(scene), DisplayOptions("error")

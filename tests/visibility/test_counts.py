@@ -151,6 +151,19 @@ def test_how_often_a_photograph_with_nine_times_the_votes_is_used(sampling: str,
     assert (None if shares is None else shares[1] / shares[0]) == (ratio and pytest.approx(ratio))
 
 
+@pytest.mark.parametrize(("obliques", "ratio"), [(2, 3.0), (4, 1.5), (8, 1.0), (0, None)])
+def test_obliques_are_used_more_often_but_not_more_than_the_others_together(obliques: int, ratio: float | None) -> None:
+    def camera(tilt_degrees: float) -> Camera:
+        pose = look_down(np.array([0.0, 0.0, 8.0]), tilt_degrees)
+        return Camera(camera_from_world=pose, fx=60.0, fy=60.0, cx=32.0, cy=24.0, width=64, height=48)
+
+    cameras = [camera(10.0)] * 6 + [camera(40.0)] * obliques
+    nothing = Anchors(torch.zeros(0, 3), torch.zeros(0, 32), torch.zeros(0, 1, 3), torch.zeros(0, 6))
+    shares = view_sampling_weights(TrainConfig(oblique_sampling=3.0), nothing, cameras)
+    assert (None if shares is None else shares[-1] / shares[0]) == (ratio and pytest.approx(ratio))
+    assert view_sampling_weights(TrainConfig(), nothing, cameras) is None
+
+
 def test_a_camera_alone_over_a_place_has_the_votes_of_all_its_anchors() -> None:
     def above(x: float) -> Camera:
         return Camera(

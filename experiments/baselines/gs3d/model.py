@@ -21,9 +21,9 @@ from scipy.spatial import cKDTree
 
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
-from vdgs.kernels.kernel_types import Raster
+from vdgs.kernels.kernel_types import Raster, Splats
 from vdgs.kernels.spherical_harmonics import MAX_SH_DEGREE, num_sh_bases, rgb_to_sh
-from vdgs.model.gaussians import Gaussians, render_gaussians, visible_gaussian_rows
+from vdgs.model.gaussians import Gaussians, project_splats, render_gaussians, visible_gaussian_rows
 from vdgs.system.atomic_files import write_atomic
 from vdgs.system.tensors import read_tensors, tensors_crc32, write_tensors
 
@@ -69,6 +69,11 @@ class GaussianModel:
         """One view: image [h, w, 3] (not clamped), alpha [h, w], depth [h, w] or None."""
         seen = self.gaussians.select(visible_gaussian_rows(self.gaussians, camera))
         return render_gaussians(seen, camera, torch.tensor(self.background), seen.sh_degree, depth)[0]
+
+    def splats(self, camera: Camera) -> Splats:
+        """What a view is drawn from."""
+        seen = self.gaussians.select(visible_gaussian_rows(self.gaussians, camera))
+        return project_splats(seen, camera, seen.sh_degree)
 
     def save(self, path: Path) -> None:
         """Write one safetensors file, atomically."""

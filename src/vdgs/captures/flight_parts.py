@@ -9,6 +9,7 @@ import numpy as np
 
 from vdgs.captures.capture import View
 from vdgs.captures.capture_order import flight_positions
+from vdgs.geometry.camera import Camera
 
 #: A camera looks obliquely if its axis is farther than this from straight down.
 OBLIQUE_DEGREES = 25
@@ -18,9 +19,14 @@ _TURN, _JUMP = np.radians(30), 3.0
 MIN_STRIP = 3
 
 
+def is_oblique(camera: Camera) -> bool:
+    """Whether a camera looks obliquely."""
+    return bool(camera.forward[2] > -np.cos(np.radians(OBLIQUE_DEGREES)))
+
+
 def oblique_views(views: Sequence[View]) -> list[int]:
     """Which views look obliquely."""
-    return [k for k, view in enumerate(views) if view.camera.forward[2] > -np.cos(np.radians(OBLIQUE_DEGREES))]
+    return [k for k, view in enumerate(views) if is_oblique(view.camera)]
 
 
 def flight_strips(views: Sequence[View]) -> list[list[int]]:

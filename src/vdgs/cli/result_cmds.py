@@ -25,9 +25,8 @@ from vdgs.config.commands import (
     RunPath,
     ViewRequest,
 )
-from vdgs.config.ranges import Positional, Range
 from vdgs.config.output_paths import Output
-from vdgs.config.ranges import Positional
+from vdgs.config.ranges import Positional, Range
 from vdgs.errors import VdgsError
 
 

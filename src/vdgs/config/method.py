@@ -162,6 +162,9 @@ class TrainConfig:
     proportion to the square root of their votes, which keeps more photographs in use (choice)."""
     resolution_schedule: ResolutionSchedule = ((0.0, 1),)
     """Resolution schedule: from this share of the iterations on, images are shrunk by this factor."""
+    oblique_sampling: Annotated[float, Range(1, 1000)] = 1.0
+    """How many times as often photographs are used that look more than 25 degrees from straight down, here and in
+    blocks; together at most as often as the others. They alone show facades (choice)."""
     swa_fraction: Annotated[float, Range(0, 1, exclusive_max=True)] = 0.0
     """The stage ends with the mean of the models of this last share of its iterations, after growth and at full size; 0
     for the very last model (choice)."""

@@ -108,18 +108,16 @@ def make_renderable_model(
         model_digest=run.status.model_id,
         key=run.key,
     )
-    visibility_map, coverage = make_visibility_map(coarse), make_coverage_map(coarse)
-    if views == "off-path" and (seen := true_visibility_map(run.capture)) is not None:
-        visibility_map, coverage = seen, lambda camera: seen(camera) >= MIN_SEEN_BY
-    return RenderableModel(
-        render=lambda camera: render(scene, camera), visibility_map=visibility_map, metadata=metadata,
-        background=run.model.background, coverage_map=coverage,
+    measured = RenderableModel(
+        render=lambda camera: render(scene, camera), visibility_map=make_visibility_map(coarse), metadata=metadata,
+        background=run.model.background, coverage_map=make_coverage_map(coarse),
         true_depth=make_true_depth(run.capture, select_views(run.capture, views)),
         render_depth=lambda camera: render(scene, camera, depth=True), camera_height=camera_height(run.capture),
         decode_splats=lambda camera: view_splats(scene, camera)[1],
         training_cameras=[view.camera for view in run.capture.train_views],
         exposure=None if views == "off-path" else make_exposures(run.model, run.capture),
     )  # fmt: skip
+    return with_off_path_truth(measured, run.capture) if views == "off-path" else measured
 
 
 @contextmanager
@@ -151,14 +149,18 @@ def make_coverage_map(coarse: OpenedRun) -> Callable[[Camera], Bool[np.ndarray, 
     return coverage_map(lambda camera: render(coarse.model, camera, depth=True), cameras)
 
 
-def true_visibility_map(capture: Capture) -> Callable[[Camera], Float[np.ndarray, "h w"]] | None:
-    """True V at each pixel of the off-path views of a capture, NaN for sky, by their cameras; None where it is not
-    known."""
+def with_off_path_truth(model: RenderableModel, capture: Capture) -> RenderableModel:
+    """The model as off-path views measure it: by true V and true depth where they are known."""
     folder, views = capture.root / OFF_PATH_FOLDER, capture.off_path_views
+    model = replace(model, true_depth=make_true_depth(capture, views))
     if not has_ground_truth(folder):
-        return None
+        return model
     truth, by_pose = load_ground_truth(folder), {view.camera.camera_from_world.tobytes(): view for view in views}
-    return lambda camera: truth.visibility_map(by_pose[camera.camera_from_world.tobytes()])
+
+    def visibility(camera: Camera) -> Float[np.ndarray, "h w"]:
+        return truth.visibility_map(by_pose[camera.camera_from_world.tobytes()])
+
+    return replace(model, visibility_map=visibility, coverage_map=lambda camera: visibility(camera) >= MIN_SEEN_BY)
 
 
 def with_coarse_model(run: OpenedRun) -> OpenedRun:

@@ -132,6 +132,7 @@ def _request(run: OpenedRun, asked: ExportRequest) -> ExportRequest:
         model=cast(ModelName, run.name),
         block=asked.block,
         bbox=asked.bbox,
+        min_visibility=asked.min_visibility,
         sh_degree=asked.sh_degree,
         color_iterations=asked.color_iterations,
         crs=asked.crs,
@@ -152,4 +153,5 @@ def _depends_on(run: OpenedRun, request: ExportRequest) -> list[Any]:
         request.block,
         box,
         crs,
+        *([request.min_visibility] if request.min_visibility else []),
     ]

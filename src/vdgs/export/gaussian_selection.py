@@ -17,6 +17,7 @@ from vdgs.export.local_frame import MAX_LOCAL_COORDINATE, LocalFrame, default_cr
 from vdgs.geometry.map_projection import MapProjection
 from vdgs.model.decode_world import gaussian_means
 from vdgs.runs.open_run import OpenedRun
+from vdgs.runs.visibility_store import get_run_visibility, require_some_seen
 
 #: A file goes without Gaussians beyond its reach where they make at most this part of what the training cameras see.
 MAX_DROPPED_SHARE = 1e-3
@@ -29,6 +30,11 @@ def select_gaussians(pixels: Float[np.ndarray, " g"], run: OpenedRun, request: E
     wanted = pixels > 0
     if request.block is not None:
         wanted &= np.repeat(_anchors_of_block(run, request.block), k)
+    if request.min_visibility:
+        visibility = get_run_visibility(run, [view.camera for view in run.capture.train_views]).cpu().numpy()
+        seen = visibility >= request.min_visibility
+        require_some_seen(bool(seen.any()), request.min_visibility, int(visibility.max(initial=0)))
+        wanted &= np.repeat(seen, k)
     if request.bbox is not None:
         x0, y0, x1, y1 = request.bbox
         if not (x0 < x1 and y0 < y1):

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from vdgs.errors import VdgsError
@@ -56,6 +57,12 @@ class AnchorModel:
         bounds = np.cumsum([0, *(part.count for part in self.decoder_spans)]).tolist()
         spans = [(a, b, part.decoder) for (a, b), part in zip(pairwise(bounds), self.decoder_spans, strict=True)]
         return spans or [(0, len(self.anchors), self.decoder)]
+
+    def select_anchors(self, kept: Bool[Tensor, " n"]) -> AnchorModel:
+        """The model with some of its anchors, each with the decoder that it has."""
+        counts = [int(each.sum()) for each in kept.split([span.count for span in self.decoder_spans] or len(kept))]
+        spans = tuple(replace(span, count=n) for span, n in zip(self.decoder_spans, counts, strict=False))
+        return replace(self, anchors=self.anchors.select(kept), decoder_spans=spans)
 
     def to(self, device: torch.device) -> AnchorModel:
         """The same model on a device."""

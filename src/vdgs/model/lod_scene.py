@@ -40,6 +40,8 @@ class LodScene:
     model: AnchorModel
     #: Nothing is drawn more pixels off than so many; 0: all from anchors, as the model itself is drawn.
     max_error_px: float = 1.0
+    #: Which places are drawn, as `values` asks for them; None: all.
+    is_drawn: Callable[[NodeContent, Tensor], Tensor] | None = None
     _assembled: dict[LodCut, _Assembled] = field(default_factory=dict)
 
     @property
@@ -53,6 +55,10 @@ class LodScene:
     def at_error(self, max_error_px: float) -> LodScene:
         """The same scene at another error; both share what is in memory."""
         return replace(self, max_error_px=max_error_px)
+
+    def with_filter(self, is_drawn: Callable[[NodeContent, Tensor], Tensor]) -> LodScene:
+        """The same scene without the places for which this is False."""
+        return replace(self, is_drawn=is_drawn, _assembled={})
 
     def within(self, camera: Camera, max_cost: int) -> LodScene:
         """The same scene, coarser where a view would cost more than so many merged Gaussians."""
@@ -87,6 +93,14 @@ class LodScene:
         """A value for each of the places that a view is drawn from, anchors and then centers of merged Gaussians:
         `of` gives those of the places of a node, or of the anchors of a leaf."""
         cut = self.tree.cut(camera, self.max_error_px)
+        found, drawn = self._values(cut, of), self._drawn(cut)
+        return found if drawn is None else found[drawn]
+
+    def _drawn(self, cut: LodCut) -> Tensor | None:
+        """Which of the places of a cut are drawn; None: all."""
+        return None if self.is_drawn is None else self._values(cut, self.is_drawn).bool()
+
+    def _values(self, cut: LodCut, of: Callable[[NodeContent, Tensor], Tensor]) -> Tensor:
         parts = list[Tensor]()
         if cut.leaves:
             rows, found = list[Tensor](), list[Tensor]()
@@ -104,18 +118,26 @@ class LodScene:
         if held is None:
             while len(self._assembled) >= MAX_ASSEMBLED:
                 self._assembled.pop(next(iter(self._assembled)), None)
-            gaussians = self.tree.gaussians_of(cut.nodes)
+            gaussians, drawn = self.tree.gaussians_of(cut.nodes), self._drawn(cut)
+            if gaussians is not None and drawn is not None:
+                gaussians = gaussians.select(drawn[len(drawn) - len(gaussians) :])
             moved = None if gaussians is None else Gaussians(
                 **{name: tensor.to(self.device) for name, tensor in gaussians.tensors().items()}
             )  # fmt: skip
-            held = _Assembled(self._anchor_model(cut), moved)
+            held = _Assembled(self._anchor_model(cut, drawn), moved)
         self._assembled[cut] = held
         return held
 
-    def _anchor_model(self, cut: LodCut) -> AnchorModel | None:
-        """The anchors of the leaves of a cut, each with its decoder."""
+    def _anchor_model(self, cut: LodCut, drawn: Tensor | None) -> AnchorModel | None:
+        """The anchors of the leaves of a cut that are drawn, each with its decoder."""
         found = self.tree.anchors_of(cut.leaves)
-        return None if found is None else model_of_rows(self.model, *found).to(self.device)
+        if found is None:
+            return None
+        anchors, rows = found
+        if drawn is not None:
+            kept = drawn[: len(rows)]
+            anchors, rows = anchors.select(kept), rows[kept]
+        return model_of_rows(self.model, anchors, rows).to(self.device)
 
 
 def model_of_rows(model: AnchorModel, anchors: Anchors, rows: Int[Tensor, " r"]) -> AnchorModel:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -28,6 +28,7 @@ from vdgs.runs.lod_folder import open_lod
 from vdgs.runs.open_run import OpenedModel, open_capture, open_model
 from vdgs.runs.run_cameras import RunCameras, load_run_cameras, run_cameras_of_capture
 from vdgs.runs.run_folder import RunFolder
+from vdgs.runs.visibility_store import get_run_visibility, without_rarely_seen
 from vdgs.system.atomic_files import write_array
 from vdgs.system.console import track
 from vdgs.system.memory.process_memory import available_memory_bytes
@@ -80,6 +81,9 @@ def render_run(request: RenderRequest, console: Console) -> None:
     run, scene = _open(request)
     run_cameras = _load_cameras(request, run)
     check_not_among_folders(request.output, run_cameras.root, run_cameras.input_folders)
+    if request.min_visibility:
+        visibility = get_run_visibility(run, run_cameras.cameras)
+        run = replace(run, model=without_rarely_seen(run.model, visibility, request.min_visibility))
     if run.warning:
         console.print(f"[yellow]warning[/] {run.warning}", highlight=False)
     named, fps = _named_cameras(request, run_cameras)

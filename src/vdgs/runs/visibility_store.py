@@ -11,6 +11,7 @@ from torch import Tensor
 
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
+from vdgs.model.anchor_model import AnchorModel
 from vdgs.runs.open_run import OpenedModel, OpenedRun
 from vdgs.runs.run_folder import RunFolder
 from vdgs.system.atomic_files import write_atomic
@@ -31,6 +32,22 @@ def get_run_visibility(opened: OpenedModel, cameras: Sequence[Camera]) -> Int32[
     if saved is None or len(saved) != len(opened.model.anchors):
         return count_visibility(opened.model.anchors.positions, list(cameras))
     return saved.to(opened.device)
+
+
+def without_rarely_seen(model: AnchorModel, visibility: Tensor, min_visibility: int) -> AnchorModel:
+    """A model without the anchors that fewer than `min_visibility` training cameras see: nothing fixes their depth.
+
+    Raises VdgsError where that leaves nothing.
+    """
+    kept = visibility.to(model.anchors.positions.device) >= min_visibility
+    require_some_seen(bool(kept.any()), min_visibility, int(visibility.max()) if len(visibility) else 0)
+    return model.select_anchors(kept)
+
+
+def require_some_seen(is_any: bool, min_visibility: int, most: int) -> None:
+    """Raise VdgsError where no anchor is seen by enough cameras."""
+    if not is_any:
+        raise VdgsError(f"--min-visibility {min_visibility}: leaves nothing; give at most {most}.")
 
 
 def load_or_count_visibility(opened: OpenedRun) -> Int32[Tensor, " n"]:

@@ -19,6 +19,9 @@ from vdgs.synth.true_visibility import FlightStats, view_ground_truth
 from vdgs.system.atomic_files import write_json
 from vdgs.system.lazy_pycolmap import pycolmap
 
+#: Visibility of off-path views is counted at every such pixel along and across: it takes most of the time.
+_OFF_PATH_STEP = 4
+
 
 def write_flight(folder: Path, flight: str, found: FlightStats) -> None:
     """`flight.json`."""
@@ -47,17 +50,20 @@ def write_views(
     pool: Executor,
     done: Callable[[int], None],
     *,
-    only_seen: bool = False,
+    off_path: bool = False,
 ) -> None:
-    """Depth of all photographs, and true visibility of those after the first `training` (which count as seeing);
-    `only_seen`: of these alone."""
-    for kind in ("views",) if only_seen else ("views", "depth"):
+    """Depth of all photographs, and true visibility of those after the first `training` (which count as seeing).
+    `off_path`: of these alone, and visibility at every `_OFF_PATH_STEP`-th pixel."""
+    for kind in ("views",) if off_path else ("views", "depth"):
         (folder / kind).mkdir(parents=True, exist_ok=True)
     seeing = [camera for _, camera in named[:training]]
 
     def write(index: int) -> None:
         name, camera = named[index]
-        depth, views = view_ground_truth(tracer, camera, [] if index < training else seeing)
+        depth, views = view_ground_truth(tracer, camera, [] if index < training or off_path else seeing)
+        if off_path:
+            _, few = view_ground_truth(tracer, camera, seeing, _OFF_PATH_STEP)
+            views = few.repeat(_OFF_PATH_STEP, 0).repeat(_OFF_PATH_STEP, 1)[: camera.height, : camera.width]
         packed, bounds = pack_depth(depth)
         file = f"{Path(name).stem}.npz"
         if index < training:
@@ -65,7 +71,7 @@ def write_views(
         else:
             np.savez_compressed(folder / "views" / file, depth=packed, depth_bounds=bounds, visibility=views)
 
-    for count, _ in enumerate(pool.map(write, range(training if only_seen else 0, len(named))), start=1):
+    for count, _ in enumerate(pool.map(write, range(training if off_path else 0, len(named))), start=1):
         done(count)
 
 

@@ -201,7 +201,7 @@ def _write_off_path(
     write_text(folder / VALIDATION_LIST, "".join(f"{name}\n" for name in [*views.off_path][1::2]))
     write_poses(folder / "sparse" / "0", [*views.off_path.values()], [*views.off_path])
     training = list(zip(views.names, views.cameras, strict=True))[: views.training]
-    write_views(folder / "truth", tracer, training + named, views.training, pool, lambda _: None, only_seen=True)
+    write_views(folder / "truth", tracer, training + named, views.training, pool, lambda _: None, off_path=True)
 
 
 def _write_model(

@@ -41,7 +41,7 @@ class SynthOptions:
     --validation). Default: as many as test photographs."""
     num_off_path_images: Annotated[int | None, Range(0, 100_000)] = None
     """How many photographs of each of three kinds are taken from where the drone never was: low and oblique, from the
-    street, from outside. Every second one is for validation. Default: an eighth of --num-images, even, 2 to 12."""
+    street, from outside. Every second one is for validation. Default: a twelfth of --num-images, even, 2 to 12."""
     width: Annotated[int | None, Range(16, MAX_RENDER_SIDE_PX)] = None
     """Width of an image in pixels."""
     height: Annotated[int | None, Range(16, MAX_RENDER_SIDE_PX)] = None
@@ -90,7 +90,7 @@ class SynthOptions:
         if values["num_validation_images"] is None:
             values["num_validation_images"] = values["num_test_images"]
         if values["num_off_path_images"] is None:
-            values["num_off_path_images"] = 2 * min(6, max(1, values["num_images"] // 16))
+            values["num_off_path_images"] = 2 * min(6, max(1, values["num_images"] // 24))
         return ResolvedOptions(**(values | {"extent_m": float(values["extent_m"])}))
 
 

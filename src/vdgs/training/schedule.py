@@ -8,6 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from vdgs.captures.flight_parts import is_oblique
 from vdgs.config.method import TrainConfig
 from vdgs.geometry.camera import Camera
 from vdgs.model.anchors import Anchors
@@ -62,7 +63,22 @@ def view_sampling_weights(config: TrainConfig, anchors: Anchors, cameras: Sequen
     Roots, because a view with few votes also costs little (`training.crops`): a mean varies least for what it costs
     if strata are drawn in proportion to their weight over the root of their cost (Cochran, 1977, section 5.5).
     """
-    if config.view_sampling == "uniform":
-        return None
-    votes = visibility_sampling_weights(anchors.positions, cameras)
-    return votes if config.view_sampling == "visibility" else tuple(math.sqrt(share) for share in votes)
+    shares = None
+    if config.view_sampling != "uniform":
+        shares = visibility_sampling_weights(anchors.positions, cameras)
+        if config.view_sampling == "sqrt-visibility":
+            shares = tuple(math.sqrt(share) for share in shares)
+    return _with_more_obliques(shares, config.oblique_sampling, cameras)
+
+
+def _with_more_obliques(
+    shares: tuple[float, ...] | None, factor: float, cameras: Sequence[Camera]
+) -> tuple[float, ...] | None:
+    """The shares with those of photographs that look obliquely times a factor, less where all of them together would
+    be drawn more often than the others."""
+    oblique, each = [is_oblique(camera) for camera in cameras], shares or (1.0,) * len(cameras)
+    of_obliques = sum(share for share, leans in zip(each, oblique, strict=True) if leans)
+    if factor == 1.0 or not of_obliques:
+        return shares
+    factor = min(factor, max(1.0, (sum(each) - of_obliques) / of_obliques))
+    return tuple(share * factor if leans else share for share, leans in zip(each, oblique, strict=True))

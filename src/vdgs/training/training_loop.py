@@ -92,8 +92,7 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
     volume_weight, loss = _volume_weight(stage), compared.loss
     if volume_weight and len(drawn.source):
         loss = loss + volume_weight * drawn.volume
-    agreement = _weighted_agreement(drawn, stage, target.valid_fraction)
-    if agreement is not None:
+    if (agreement := _weighted_agreement(drawn, stage, target.valid_fraction)) is not None:
         loss = loss + agreement.loss
     # Read at once: on a GPU each read waits for everything before it.
     value, l1, ssim = torch.stack([loss, compared.l1, compared.ssim]).tolist()
@@ -122,10 +121,8 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
     last, averaged = state.iteration == config.iterations, is_averaged_step(state.iteration, config)
     if state.iteration % BOUND_INTERVAL == 0 or averaged or last:
         _bound_sizes(state)
-    if averaged and state.model_average is not None:
-        state.model_average.add(state.anchors, state.decoder)
-    elif averaged:
-        state.model_average = ModelAverage.of(state.anchors, state.decoder)
+    if averaged:
+        _average(state)
     _smooth(state, value, psnr)
     state.is_consistent = True
     return report
@@ -192,6 +189,14 @@ def _move(
     finite = state.optimizer.update_decoder(state.decoder, rates, step) & finite
     if not finite:
         raise TrainingDiverged(f"A gradient is not a finite number at iteration {step}.")
+
+
+def _average(state: TrainingState) -> None:
+    """Add the present model to the mean."""
+    if state.model_average is not None:
+        state.model_average.add(state.anchors, state.decoder)
+    else:
+        state.model_average = ModelAverage.of(state.anchors, state.decoder)
 
 
 @torch.no_grad()

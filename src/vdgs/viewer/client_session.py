@@ -33,6 +33,8 @@ MODEL_LABELS = {"Merged": "merged", "Coarse": "coarse", "Side by side": "both"}
 #: JPEG quality of previews and of full images.
 _PREVIEW_QUALITY, _FULL_QUALITY = 70, 92
 _LEGEND_PX = 300
+#: The end of the slider that leaves out what few photographs show.
+_MAX_MIN_VISIBILITY = 10
 #: Farther from where a photograph was taken than this share of the camera height, it no longer lies over the model.
 _IMAGE_POSE_TOLERANCE = 2e-3
 
@@ -202,6 +204,10 @@ class ClientSession:
         full_detail.on_update(lambda _: self.change_display(full_detail=bool(full_detail.value)))
         self._image_split = gui.add_slider("Photograph | model", 0.0, 1.0, 0.01, 0.5, visible=False)
         self._image_split.on_update(lambda _: self.change_display(image_split=float(self._image_split.value)))
+        trust = gui.add_slider(
+            "Seen by at least", 0, _MAX_MIN_VISIBILITY, 1, 0, hint="Leave out what fewer photographs show: the edge"
+        )
+        trust.on_update(lambda _: self.change_display(min_visibility=int(trust.value)))
         self._build_views()
         self._build_overlays()
         self.point_panel = PointPanel(self)

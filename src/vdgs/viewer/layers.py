@@ -47,6 +47,8 @@ class DisplayOptions:
     image_split: float = 0.5
     #: Draw views at rest from all anchors, also where the run has a level-of-detail tree.
     full_detail: bool = False
+    #: What fewer training cameras see is not drawn.
+    min_visibility: int = 0
 
 
 class Painter:
@@ -91,7 +93,12 @@ class Painter:
     def count_visible_anchors(self, display: DisplayOptions, camera: Camera) -> int:
         """How many anchors a full image is drawn from."""
         names = self._scene.names if self._shows_both(display) else [self._scene.shown_name(display.model)]
-        return sum(self._scene.get_level(name, camera, full_detail=display.full_detail)[1] for name in names)
+        return sum(
+            self._scene.get_level(name, camera, full_detail=display.full_detail, min_visibility=display.min_visibility)[
+                1
+            ]
+            for name in names
+        )
 
     def paint(
         self, display: DisplayOptions, camera: Camera, full_camera: Camera, max_anchors: int | None = None
@@ -111,8 +118,9 @@ class Painter:
         self, name: str, display: DisplayOptions, camera: Camera, full_camera: Camera, max_anchors: int | None
     ) -> UInt8[np.ndarray, "h w 3"]:
         level, count = self._scene.get_level(
-            name, camera, max_anchors, full_camera=full_camera, full_detail=display.full_detail
-        )
+            name, camera, max_anchors, full_camera=full_camera, full_detail=display.full_detail,
+            min_visibility=display.min_visibility,
+        )  # fmt: skip
         self.drawn_anchors += count
         if display.layer == "color":
             return to_8bit(render(level.model, camera).image.cpu().numpy())

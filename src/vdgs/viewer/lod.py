@@ -39,8 +39,10 @@ class LodLevel:
 class LodPyramid:
     """A model and its thinner ones, each made when it is first needed."""
 
-    def __init__(self, model: AnchorModel) -> None:
-        self._model, self._levels = model, [LodLevel(model)]
+    def __init__(self, model: AnchorModel, mask: Bool[Tensor, " n"] | None = None) -> None:
+        """Of the model, or of its anchors in the mask."""
+        self._model = model if mask is None else model.select_anchors(mask)
+        self._levels = [LodLevel(self._model, mask)]
 
     def of(self, camera: Camera, max_anchors: int | None = None) -> tuple[LodLevel, int]:
         """The model itself, or the finest level of which the camera sees at most so many anchors; and about how many
@@ -50,8 +52,17 @@ class LodPyramid:
         while max_anchors is not None and visible // decimation_factor(number) > max(max_anchors, 1):
             number += 1
         while len(self._levels) <= number:
-            self._levels.append(decimate(model, decimation_factor(len(self._levels))))
+            self._levels.append(_within(self._levels[0], decimate(model, decimation_factor(len(self._levels)))))
         return self._levels[number], visible // decimation_factor(number)
+
+
+def _within(whole: LodLevel, level: LodLevel) -> LodLevel:
+    """A level of a part of a model as one of the model."""
+    if whole.mask is None or level.mask is None:
+        return level
+    mask = torch.zeros_like(whole.mask)
+    mask[whole.mask] = level.mask
+    return replace(level, mask=mask)
 
 
 def decimation_factor(level: int) -> int:
@@ -64,13 +75,7 @@ def decimate(model: AnchorModel, factor: int) -> LodLevel:
     count, device = len(model.anchors), model.anchors.positions.device
     chance = torch.rand(count, generator=torch.Generator().manual_seed(0))
     kept = (chance < 1 / factor).to(device)
-    anchors = model.anchors.select(kept)
-    log_scales = anchors.log_scales.clone()
+    fewer = model.select_anchors(kept)
+    log_scales = fewer.anchors.log_scales.clone()
     log_scales[:, 3:] += 0.5 * math.log(factor)
-    sums = torch.cat([torch.zeros(1, dtype=torch.long), kept.long().cumsum(0).cpu()])
-    parts, first = [], 0
-    for part in model.decoder_spans:
-        parts.append(replace(part, count=int(sums[first + part.count] - sums[first])))
-        first += part.count
-    fewer = Anchors(**{**anchors.tensors(), "log_scales": log_scales})
-    return LodLevel(replace(model, anchors=fewer, decoder_spans=tuple(parts)), kept)
+    return LodLevel(replace(fewer, anchors=Anchors(**{**fewer.anchors.tensors(), "log_scales": log_scales})), kept)

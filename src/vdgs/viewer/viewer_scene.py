@@ -51,7 +51,8 @@ class ViewerScene:
         self._runs: dict[str, OpenedRun] = {run.name: run}
         self._visibility: dict[str, Tensor] = {}
         self._block_tints: dict[str, Tensor] = {}
-        self._levels: dict[str, LodPyramid] = {}
+        #: By model, and by how many cameras must see an anchor; of each model the last such number beside 0.
+        self._levels: dict[str, dict[int, LodPyramid]] = {}
         self._trees: dict[str, LodScene | None] = {}
         self._values: dict[tuple[str, NodeContent], Tensor] = {}
         self._exposures: dict[str, ViewExposures | None] = {}
@@ -91,15 +92,17 @@ class ViewerScene:
 
     def get_level(
         self, name: str, camera: Camera, max_anchors: int | None = None, *, full_camera: Camera | None = None,
-        full_detail: bool = False,
+        full_detail: bool = False, min_visibility: int = 0,
     ) -> tuple[LodLevel, int]:  # fmt: skip
-        """The level of detail to draw, with at most so many anchors in view, and how many those are. Of a tree, merged
-        Gaussians count as anchors by their cost. `camera` may be a part of `full_camera`."""
+        """The level of detail to draw, with at most so many anchors in view, and how many those are; without what fewer
+        than `min_visibility` training cameras see. Of a tree, merged Gaussians count as anchors by their cost. `camera`
+        may be a part of `full_camera`."""
         tree = self.tree(name)
         if tree is None:
-            if name not in self._levels:
-                self._levels[name] = LodPyramid(self.model(name))
-            return self._levels[name].of(camera, max_anchors)
+            return self._pyramid(name, min_visibility).of(camera, max_anchors)
+        if min_visibility:
+            seen = partial(self._node_values, f"{name} V", self._count_visibility)
+            tree = tree.with_filter(lambda content, places: seen(content, places) >= min_visibility)
         if full_detail and max_anchors is None:
             tree = tree.at_error(0.0)
         else:
@@ -107,6 +110,15 @@ class ViewerScene:
             cost = REST_MAX_COST if max_anchors is None else max_anchors * ANCHOR_COST
             tree = tree.at_error(least).within(full_camera or camera, cost)
         return LodLevel(tree), max(1, tree.cost(camera) // ANCHOR_COST)
+
+    def _pyramid(self, name: str, min_visibility: int) -> LodPyramid:
+        """The levels of a model without a tree."""
+        pyramids = self._levels.setdefault(name, {})
+        if min_visibility not in pyramids:
+            whole = {0: pyramids[0]} if 0 in pyramids else {}
+            mask = self.visibility(name) >= min_visibility if min_visibility else None
+            pyramids = self._levels[name] = whole | {min_visibility: LodPyramid(self.model(name), mask)}
+        return pyramids[min_visibility]
 
     def level_visibility(self, name: str, level: LodLevel, camera: Camera) -> Tensor:
         """V of what a level draws in a view."""

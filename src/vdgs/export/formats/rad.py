@@ -89,7 +89,7 @@ def build_tree(gaussians: Gaussians) -> GaussianTree:
         above[several] = total + np.arange(np.count_nonzero(several))
         links.append((above[several], sizes[several], ids[order][np.repeat(several, sizes)]))
         nodes.append(merged.select(torch.from_numpy(several)))
-        level, ids, total = merged, above, total + np.count_nonzero(several)
+        level, ids, total = merged, above, total + int(np.count_nonzero(several))
     return _ordered(concatenate(nodes), int(ids[0]), links)
 
 
