@@ -111,6 +111,7 @@ class ViewerServer:
 def serve(run: OpenedRun, host: str, port: int | None, console: Console) -> Iterator[ViewerServer]:
     """A viewer of an opened run on a port (None: the first that is free), while the context lasts."""
     scene, scheduler = ViewerScene(run), RenderScheduler()
+    scene.tree(scene.names[0])  # a damaged one is refused here
     access, server = _start_listening(host, port, console)
     viewer = ViewerServer(server=server, access=access, scene=scene, scheduler=scheduler, sessions={})
     _set_initial_camera(server, run)
