@@ -305,6 +305,9 @@ def test_evaluation_and_renders_of_a_run(unbroken, tmp_path):
     assert metrics["lpips_vgg"] is None
     assert metrics["n_anchors"] > 100
     assert sum(bin["pixels"] for bin in metrics["by_visibility"]) == 2 * 64 * 48
+    without = vdgs("eval", run, "--views", "off-path")
+    assert without.returncode == 1
+    assert "brings no photographs from where nobody flew" in without.stderr
     test_files = {path: path.read_bytes() for path in (run / "coarse/evaluation").rglob("*.png")}
     assert vdgs("eval", run, "--views", "training").returncode == 0
     training = json.loads((run / "coarse/evaluation_training/metrics.json").read_text())

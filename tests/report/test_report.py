@@ -231,6 +231,19 @@ def test_the_least_solid_view_is_shown_and_solidity_compared(tmp_path):
     assert "25.0 % have alpha" in page.text()
 
 
+def test_views_from_where_nobody_flew_are_shown_of_the_model_that_is_reported(tmp_path):
+    run = coarse_run(tmp_path)
+    figures = {"views": 3, "psnr": 21.5, "depth_within_2_percent_median": 0.75, "needles": 0.05, "floaters": None}
+    angles = [{"lower": 40.0, "upper": None, "pixels": 90, "psnr": 19.25, "depth_within_2_percent": 0.5}]
+    known = metrics(20.0, "coarse") | {"sets": {"street": figures}, "by_angle": angles}
+    write(tmp_path / "coarse/evaluation_off_path/metrics.json", known)
+    page = Page(write_report(run))
+    assert page.row("street") == ["street", "3", "21.50", "–", "75.0 %", "–", "5.0 %", "–", "–", "–"]
+    assert page.row("above 40°") == ["above 40°", "90", "19.25", "50.0 %"]
+    write(tmp_path / "coarse/evaluation_off_path/metrics.json", known | {"key": "of another model"})
+    assert "Off the path" not in Page(write_report(run)).source
+
+
 def test_growth_is_summed_for_each_block(whole):
     table = whole.source[whole.source.index("Sums over all cycles") :]
     assert re.findall(r"<td>(.*?)</td>", table)[:6] == ["block 0", "3", "90", "30", "75.0 %", "40.0 %"]

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 pytest.importorskip("embreex")
@@ -18,8 +19,16 @@ from vdgs.captures.ground_truth import load_ground_truth
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import VdgsError
-from vdgs.evaluation.evaluate_run import make_true_depth
+from vdgs.evaluation.evaluate_model import evaluate_model
+from vdgs.evaluation.evaluate_run import (
+    cached_reference_views,
+    make_evaluation_settings,
+    make_true_depth,
+    with_off_path_truth,
+)
+from vdgs.evaluation.renderable_model import RenderableModel
 from vdgs.geometry.camera import Camera
+from vdgs.kernels.kernel_types import Raster
 from vdgs.synth import SynthOptions, generate
 from vdgs.synth.image_renderer import pixel_sample_offsets
 from vdgs.synth.streets import make_street_plan
@@ -89,6 +98,48 @@ def test_off_path_views_are_apart_and_true(capture: Path) -> None:
     low, _, street = read.off_path_views
     assert np.degrees(np.arccos(-low.camera.forward[2])) == pytest.approx(60, abs=2)
     assert np.degrees(np.arccos(-street.camera.forward[2])) > 80
+
+
+def test_off_path_figures_count_what_three_photographs_see(capture: Path, tmp_path: Path) -> None:
+    """Of a model that is nearly right there and wrong elsewhere, but hangs before half of the sky."""
+    read, truth = load_capture(capture), load_ground_truth(capture / "off_path")
+    by_pose = {view.camera.camera_from_world.tobytes(): view for view in read.off_path_views}
+    depth_of = make_true_depth(read, read.off_path_views)
+    assert depth_of is not None
+
+    def draw(camera: Camera) -> Raster:
+        view = by_pose[camera.camera_from_world.tobytes()]
+        with Image.open(view.image_path) as photograph:
+            right = np.asarray(photograph, np.float32) / 255
+        seen, depth = truth.visibility_map(view) >= 3, depth_of(view).copy()
+        depth[:, :48] = np.where(np.isinf(depth[:, :48]), 1.0, depth[:, :48])
+        right += np.where(right > 0.5, -0.1, 0.1).astype(np.float32)
+        image = torch.from_numpy(np.where(seen[..., None], right, 1 - right))
+        alpha = torch.from_numpy(np.isfinite(depth).astype(np.float32))
+        shown = torch.from_numpy(np.where(np.isfinite(depth), depth, 0.0))
+        return Raster(image, alpha, shown, shown)
+
+    model = RenderableModel(
+        render=draw, render_depth=draw, camera_height=30.0,
+        training_cameras=[view.camera for view in read.train_views],
+    )  # fmt: skip
+    model, settings = with_off_path_truth(model, read), make_evaluation_settings(3, "off-path")
+    with cached_reference_views(read.off_path_views) as photographs:
+        result = evaluate_model(photographs, model, tmp_path, settings=settings)
+    assert result["off_path_views"] == 3
+    assert result["sets"] is not None
+    assert [*result["sets"]] == ["low_oblique", "outside", "street"]
+    for figures in result["sets"].values():
+        assert figures["psnr"] == pytest.approx(20, abs=0.1)
+        assert figures["depth_within_2_percent_median"] == 1.0
+    sky = [np.isinf(depth_of(view)[:, :48]).sum() / (72 * 96) for view in read.off_path_views]
+    assert result["floaters"] == pytest.approx(np.mean(sky))
+    assert result["floaters"] > 0
+    by_angle = result["by_angle"]
+    assert by_angle is not None
+    assert sum(each["pixels"] for each in by_angle) == sum(
+        (truth.visibility_map(view) >= 3).sum() for view in read.off_path_views
+    )
 
 
 def test_points_reproject_to_within_the_noise(model: pycolmap.Reconstruction) -> None:

@@ -81,7 +81,7 @@ def format_angles(lower: float, upper: float | None) -> str:
 
 
 def _sets_table(sets: Mapping[str, Mapping[str, Any]]) -> Table:
-    title = "by kind of view (pixels that at least 3 training cameras see; needles and floaters: all pixels)"
+    title = "by kind of view"
     table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
     for column in ("", *(label for _, label, _ in SET_METRICS)):
         table.add_column(column, justify="right" if column else "left", no_wrap=not column)

@@ -13,12 +13,14 @@ from pathlib import Path
 from rich.console import Console
 
 from vdgs.captures.capture import View
+from vdgs.captures.off_path import OFF_PATH_FOLDER
 from vdgs.config.commands import ModelName
 from vdgs.distributed.job_folders import clear
 from vdgs.distributed.job_labels import shard_kind
 from vdgs.distributed.node_check import NodeRequirements, image_and_mask_files
 from vdgs.distributed.shard import Results, Shard
 from vdgs.distributed.sharded_job import ExecutionOptions, ShardedJob, ShardNeeds, split_ranges
+from vdgs.errors import RunError
 from vdgs.evaluation.block_seams import (
     SeamView,
     evaluate_blocks,
@@ -149,6 +151,11 @@ def evaluate_stage(
     Raises what `ShardedJob.send` raises, and RunError where another process measures the same.
     """
     check_bins(request.visibility_bins)
+    if request.views == "off-path" and not context.capture.off_path_views:
+        raise RunError(
+            f"{context.capture.root}: brings no photographs from where nobody flew (folder {OFF_PATH_FOLDER}, which "
+            "`vdgs synth` writes). Leave parts of the flight out instead, with --split strips or --split obliques."
+        )
     if request.views == "test" and context.capture.off_path_views:
         # First: where there are figures of test views, all is measured.
         evaluate_stage(context, replace(request, views="off-path"), console, execution)
