@@ -71,7 +71,7 @@ def test_no_verb_writes_among_photographs(verb: str, option: Option, inside: str
         [str(root / "empty")] if verb not in ("synth", "bench", "config") else ["toy"] if verb == "bench" else []
     )
     if option.flag != "--output":
-        arguments += [] if verb in ("render", "ortho", "export") else ["--output", str(root / "free")]
+        arguments += [] if verb in ("render", "ortho", "export", "view") else ["--output", str(root / "free")]
     place = str(card / inside)
     with pytest.raises(SystemExit) as ended:
         main([verb, *arguments, *([place] if option.is_positional else [option.flag, place])])

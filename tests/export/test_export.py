@@ -27,7 +27,7 @@ from vdgs.export.programs import PROGRAMS
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.geodesy import ecef_from_geodetic, enu_axes
 from vdgs.model.anchor_model import AnchorModel, DecoderSpan
-from vdgs.model.gaussians import render_gaussians
+from vdgs.model.gaussians import Gaussians, render_gaussians
 from vdgs.model.renderer import render
 from vdgs.runs.open_run import OpenedRun
 from vdgs.runs.run_folder import RunFolder
@@ -240,9 +240,33 @@ def test_boxes_blocks_and_numbers_choose(export, tmp_path: Path):
     first, second = (export(f"{block}.ply", model=parted, block=block)["gaussians"] for block in (0, 1))
     assert first + second == whole
     assert min(first, second) > 0
-    # Those that are left out make less of the photographs than those that stay.
+
+
+def test_fewer_gaussians_are_merged_and_moved_not_dropped(export, tmp_path: Path, monkeypatch):
+    whole = export("all.ply")["gaussians"]
+    few = export("few.ply", max_gaussians=whole // 4)
+    assert few["gaussians"] == whole // 4
+    every, merged = (registry.read_gaussians(tmp_path / name) for name in ("all.ply", "few.ply"))
     seen = collect_contributions(scattered(), [view.camera for view in capture_at(None).train_views])
-    assert np.sort(seen.pixels)[::-1][:50].sum() > 0.3 * seen.pixels.sum()
+    most = np.argsort(-seen.pixels[seen.pixels > 0], kind="stable")[: whole // 4]
+    dropped = every.select(torch.from_numpy(np.sort(most)))
+    camera = capture_at(None).train_views[0].camera
+
+    def error(gaussians: Gaussians) -> float:
+        drawn = [render_gaussians(each, camera, torch.zeros(3), each.sh_degree)[0].image for each in (gaussians, every)]
+        return float((drawn[0] - drawn[1]).square().mean())
+
+    assert error(merged) < error(dropped) / 2
+    assert not {tuple(each) for each in merged.means.tolist()} <= {tuple(each) for each in every.means.tolist()}
+    # Twice the same: no clock decides.
+    export("again.ply", max_gaussians=whole // 4)
+    assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "few.ply").read_bytes()
+    # A page that has room for fewer gets as many; the other file of the same command keeps all.
+    monkeypatch.setattr("vdgs.export.export_run._capacity", lambda path, scene: 60 if path.suffix == ".html" else 10**9)
+    record = export("page.html", "both.ply")
+    assert [each["gaussians"] for each in record["files"]] == [60, whole]
+    assert "merged from" in record["files"][0]["notes"][0]
+    assert len(registry.read_gaussians(tmp_path / "page.html")) == 60
 
 
 @pytest.mark.parametrize(

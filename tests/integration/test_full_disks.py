@@ -121,9 +121,13 @@ def test_every_stage_of_a_run_says_that_the_disk_is_full_and_continues_to_the_sa
                 "a.laz",
                 "a.glb",
                 "a.html",
+                "a.rad",
                 "tiles/tileset.json",
+                "lod/lod-meta.json",
+                "place/scene.json",
             )
         ),
+        ("view", "RUN", "--static", "DISK/site"),
         ("render", "RUN", "--output", "DISK/views"),
         ("render", "RUN", "--mode", "depth", "--raw", "--output", "DISK/numbers"),
         ("render", "RUN", "--views", "flyover", "--output", "DISK/film.mp4"),

@@ -181,7 +181,7 @@ def write_static_viewer(args: ViewArguments, folder: Path) -> None:
     request = resolve_request(request)
     export_run(open_run(request.run, request.model, device), request, console)
     console.print(
-        f"{folder}: any web server serves it. Here: python -m http.server --directory {shell_word(folder)}, then open "
+        f"{folder}: any web server serves it. Here: (cd {shell_word(folder)} && python -m http.server), then open "
         "http://localhost:8000",
         highlight=False,
     )
