@@ -78,6 +78,7 @@ def main() -> None:
     parser.add_argument("--height", type=int, default=480)
     parser.add_argument("--seconds", type=float, default=4.0)
     parser.add_argument("--flight", type=int, default=0, help="steps of a flight from over all into the street")
+    parser.add_argument("--motion-only", action="store_true", help="compare with no full detail, which takes minutes")
     options = parser.parse_args()
     configure_threads(0)
     scene = ViewerScene(open_run_or_checkpoint(options.run))
@@ -106,7 +107,7 @@ def main() -> None:
         )
     if options.flight:
         fly_down(tree, places, options.flight)
-    for name, camera in places.items():
+    for name, camera in () if options.motion_only else places.items():
         compare(name, rested[name] / 255.0, tree, camera)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float, Int, Int64
@@ -19,16 +20,8 @@ from vdgs.model.renderer import view_splats
 
 #: What a node draws: its merged Gaussians ("nodes"), or the anchors of a leaf ("anchors").
 NodeContent = tuple[str, int]
-#: Cuts that are kept assembled: that of the last full picture, and that of a preview.
+#: So many of each are kept assembled: those of the last full picture, and those of a preview.
 MAX_ASSEMBLED = 2
-
-
-@dataclass(frozen=True, eq=False)
-class _Assembled:
-    """What a cut is drawn from: anchors, in the order of the model, then merged Gaussians."""
-
-    anchors: AnchorModel | None
-    gaussians: Gaussians | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,9 +33,12 @@ class LodScene:
     model: AnchorModel
     #: Nothing is drawn more pixels off than so many; 0: all from anchors, as the model itself is drawn.
     max_error_px: float = 1.0
-    #: Which places are drawn, as `values` asks for them; None: all.
+    #: The view that pictures are parts of, where they are: the anchors of all of it are then held together.
+    view: Camera | None = None
+    #: Which places are drawn, asked for as by `values`; None: all.
     is_drawn: Callable[[NodeContent, Tensor], Tensor] | None = None
-    _assembled: dict[LodCut, _Assembled] = field(default_factory=dict)
+    _anchors: dict[tuple[int, ...], AnchorModel | None] = field(default_factory=dict)
+    _gaussians: dict[tuple[int, ...], Gaussians | None] = field(default_factory=dict)
 
     @property
     def background(self) -> tuple[float, float, float]:
@@ -56,13 +52,17 @@ class LodScene:
         """The same scene at another error; both share what is in memory."""
         return replace(self, max_error_px=max_error_px)
 
-    def with_filter(self, is_drawn: Callable[[NodeContent, Tensor], Tensor]) -> LodScene:
-        """The same scene without the places for which this is False."""
-        return replace(self, is_drawn=is_drawn, _assembled={})
-
     def within(self, camera: Camera, max_cost: int) -> LodScene:
         """The same scene, coarser where a view would cost more than so many merged Gaussians."""
         return self.at_error(self.tree.error_within(camera, self.max_error_px, max_cost))
+
+    def for_view(self, view: Camera) -> LodScene:
+        """The same scene for pictures of parts of a view, one after another."""
+        return replace(self, view=view)
+
+    def with_filter(self, is_drawn: Callable[[NodeContent, Tensor], Tensor]) -> LodScene:
+        """The same scene without the places for which this is False."""
+        return replace(self, is_drawn=is_drawn, _anchors={}, _gaussians={})
 
     def cost(self, camera: Camera) -> int:
         """What a view costs, in merged Gaussians."""
@@ -71,16 +71,18 @@ class LodScene:
     @torch.no_grad()
     def view_splats(self, camera: Camera, image_index: int | None = None) -> tuple[Int64[Tensor, " m"], Splats]:
         """The splats of a view, and to which of `places` each belongs."""
-        parts = self._parts(camera)
+        cut = self._cut(camera)
         shown, sources, first = list[Splats](), list[Tensor](), 0
-        if parts.anchors is not None:
-            rows, splats = view_splats(parts.anchors, camera, image_index)
+        anchors = _held(self._anchors, cut.leaves, self._assemble_anchors)
+        if anchors is not None:
+            rows, splats = view_splats(anchors, camera, image_index)
             sources.append(rows)
             shown.append(splats)
-            first = len(parts.anchors.anchors)
-        if parts.gaussians is not None:
-            splats = project_splats(parts.gaussians, camera, parts.gaussians.sh_degree)
-            sources.append(torch.arange(first, first + len(parts.gaussians), device=self.device))
+            first = len(anchors.anchors)
+        gaussians = _held(self._gaussians, cut.nodes, self._assemble_gaussians)
+        if gaussians is not None:
+            splats = project_splats(gaussians, camera, gaussians.sh_degree)
+            sources.append(torch.arange(first, first + len(gaussians), device=self.device))
             shown.append(splats)
         if not shown:
             empty = torch.zeros(0, device=self.device)
@@ -92,52 +94,64 @@ class LodScene:
     def values(self, camera: Camera, of: Callable[[NodeContent, Float[Tensor, "p 3"]], Tensor]) -> Tensor:
         """A value for each of the places that a view is drawn from, anchors and then centers of merged Gaussians:
         `of` gives those of the places of a node, or of the anchors of a leaf."""
+        cut, found = self._cut(camera), list[Tensor]()
+        for nodes, each in ((cut.leaves, self._leaf_values), (cut.nodes, self._node_values)):
+            if nodes:
+                values, drawn = each(nodes, of), None if self.is_drawn is None else each(nodes, self.is_drawn).bool()
+                found.append(values if drawn is None else values[drawn])
+        return torch.cat(found) if found else torch.zeros(0)
+
+    def _leaf_values(self, leaves: tuple[int, ...], of: Callable[[NodeContent, Tensor], Tensor]) -> Tensor:
+        """Values of the anchors of some leaves in the order of the model."""
+        rows, found = list[Tensor](), list[Tensor]()
+        for leaf in leaves:
+            anchors, these = self.tree.anchors(leaf)
+            rows.append(these)
+            found.append(of(("anchors", leaf), anchors.positions))
+        return torch.cat(found)[torch.cat(rows).argsort()]
+
+    def _node_values(self, nodes: tuple[int, ...], of: Callable[[NodeContent, Tensor], Tensor]) -> Tensor:
+        """Values of the merged Gaussians of some nodes."""
+        return torch.cat([of(("nodes", node), self.tree.gaussians(node).means) for node in nodes])
+
+    def _cut(self, camera: Camera) -> LodCut:
         cut = self.tree.cut(camera, self.max_error_px)
-        found, drawn = self._values(cut, of), self._drawn(cut)
-        return found if drawn is None else found[drawn]
+        return cut if self.view is None else replace(cut, leaves=self.tree.cut(self.view, self.max_error_px).leaves)
 
-    def _drawn(self, cut: LodCut) -> Tensor | None:
-        """Which of the places of a cut are drawn; None: all."""
-        return None if self.is_drawn is None else self._values(cut, self.is_drawn).bool()
-
-    def _values(self, cut: LodCut, of: Callable[[NodeContent, Tensor], Tensor]) -> Tensor:
-        parts = list[Tensor]()
-        if cut.leaves:
-            rows, found = list[Tensor](), list[Tensor]()
-            for leaf in cut.leaves:
-                anchors, these = self.tree.anchors(leaf)
-                rows.append(these)
-                found.append(of(("anchors", leaf), anchors.positions))
-            parts.append(torch.cat(found)[torch.cat(rows).argsort()])
-        parts += [of(("nodes", node), self.tree.gaussians(node).means) for node in cut.nodes]
-        return torch.cat(parts) if parts else torch.zeros(0)
-
-    def _parts(self, camera: Camera) -> _Assembled:
-        cut = self.tree.cut(camera, self.max_error_px)
-        held = self._assembled.pop(cut, None)
-        if held is None:
-            while len(self._assembled) >= MAX_ASSEMBLED:
-                self._assembled.pop(next(iter(self._assembled)), None)
-            gaussians, drawn = self.tree.gaussians_of(cut.nodes), self._drawn(cut)
-            if gaussians is not None and drawn is not None:
-                gaussians = gaussians.select(drawn[len(drawn) - len(gaussians) :])
-            moved = None if gaussians is None else Gaussians(
-                **{name: tensor.to(self.device) for name, tensor in gaussians.tensors().items()}
-            )  # fmt: skip
-            held = _Assembled(self._anchor_model(cut, drawn), moved)
-        self._assembled[cut] = held
-        return held
-
-    def _anchor_model(self, cut: LodCut, drawn: Tensor | None) -> AnchorModel | None:
-        """The anchors of the leaves of a cut that are drawn, each with its decoder."""
-        found = self.tree.anchors_of(cut.leaves)
+    def _assemble_anchors(self, leaves: tuple[int, ...]) -> AnchorModel | None:
+        """The anchors of some leaves that are drawn, in the order of the model, each with its decoder."""
+        found = self.tree.anchors_of(leaves)
         if found is None:
             return None
         anchors, rows = found
-        if drawn is not None:
-            kept = drawn[: len(rows)]
-            anchors, rows = anchors.select(kept), rows[kept]
+        if self.is_drawn is not None:
+            drawn = self._leaf_values(leaves, self.is_drawn).bool()
+            anchors, rows = anchors.select(drawn), rows[drawn]
         return model_of_rows(self.model, anchors, rows).to(self.device)
+
+    def _assemble_gaussians(self, nodes: tuple[int, ...]) -> Gaussians | None:
+        """The merged Gaussians of some nodes that are drawn."""
+        found = self.tree.gaussians_of(nodes)
+        if found is not None and self.is_drawn is not None:
+            found = found.select(self._node_values(nodes, self.is_drawn).bool())
+        if found is None:
+            return None
+        return Gaussians(**{name: tensor.to(self.device) for name, tensor in found.tensors().items()})
+
+
+_Held = TypeVar("_Held")
+
+
+def _held(
+    held: dict[tuple[int, ...], _Held], nodes: tuple[int, ...], assemble: Callable[[tuple[int, ...]], _Held]
+) -> _Held:
+    """What some nodes hold together, of which the last few are kept."""
+    content = held.pop(nodes, None)
+    content = assemble(nodes) if content is None else content
+    while len(held) >= MAX_ASSEMBLED:
+        held.pop(next(iter(held)), None)
+    held[nodes] = content
+    return content
 
 
 def model_of_rows(model: AnchorModel, anchors: Anchors, rows: Int[Tensor, " r"]) -> AnchorModel:

@@ -27,7 +27,7 @@ from vdgs.model.gaussians import Gaussians
 from vdgs.model.lod_nodes import TREE_FILE, LodTable, anchors_file, load_anchors, load_node, node_file
 
 #: Nodes are kept in memory up to so many bytes.
-CACHE_BYTES = 512 << 20
+CACHE_BYTES = 384 << 20
 #: The least distance of a camera from a node, as a part of the node's side.
 MIN_DISTANCE = 0.25
 #: What drawing an anchor costs, in merged Gaussians: it is decoded, and shows about six of its ten.

@@ -54,6 +54,8 @@ class ViewerScene:
         #: By model, and by how many cameras must see an anchor; of each model the last such number beside 0.
         self._levels: dict[str, dict[int, LodPyramid]] = {}
         self._trees: dict[str, LodScene | None] = {}
+        #: The last that was asked for.
+        self._filtered_trees: dict[tuple[str, int], LodScene] = {}
         self._values: dict[tuple[str, NodeContent], Tensor] = {}
         self._exposures: dict[str, ViewExposures | None] = {}
         #: Grows with every newer model.
@@ -97,19 +99,30 @@ class ViewerScene:
         """The level of detail to draw, with at most so many anchors in view, and how many those are; without what fewer
         than `min_visibility` training cameras see. Of a tree, merged Gaussians count as anchors by their cost. `camera`
         may be a part of `full_camera`."""
-        tree = self.tree(name)
+        tree = self._filtered(name, min_visibility)
         if tree is None:
             return self._pyramid(name, min_visibility).of(camera, max_anchors)
-        if min_visibility:
-            seen = partial(self._node_values, f"{name} V", self._count_visibility)
-            tree = tree.with_filter(lambda content, places: seen(content, places) >= min_visibility)
         if full_detail and max_anchors is None:
             tree = tree.at_error(0.0)
         else:
             least = REST_ERROR_PX if max_anchors is None else PREVIEW_ERROR_PX
             cost = REST_MAX_COST if max_anchors is None else max_anchors * ANCHOR_COST
-            tree = tree.at_error(least).within(full_camera or camera, cost)
+            view = full_camera or camera
+            tree = tree.at_error(least).within(view, cost).for_view(view)
         return LodLevel(tree), max(1, tree.cost(camera) // ANCHOR_COST)
+
+    def _filtered(self, name: str, min_visibility: int) -> LodScene | None:
+        """The tree of a model without what fewer than so many training cameras see; None where it has none."""
+        tree = self.tree(name)
+        if tree is None or not min_visibility:
+            return tree
+        if (name, min_visibility) not in self._filtered_trees:
+            seen = partial(self._node_values, f"{name} V", self._count_visibility)
+            self._filtered_trees.clear()
+            self._filtered_trees[name, min_visibility] = tree.with_filter(
+                lambda content, places: seen(content, places) >= min_visibility
+            )
+        return self._filtered_trees[name, min_visibility]
 
     def _pyramid(self, name: str, min_visibility: int) -> LodPyramid:
         """The levels of a model without a tree."""
@@ -153,7 +166,7 @@ class ViewerScene:
         self.run = run
         self._runs = {run.name: run}
         self._visibility, self._block_tints, self._levels, self._exposures = {}, {}, {}, {}
-        self._trees, self._values = {}, {}
+        self._trees, self._filtered_trees, self._values = {}, {}, {}
         self.generation += 1
         self.__dict__.pop("blocks", None)
 
