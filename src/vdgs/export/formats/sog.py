@@ -51,7 +51,7 @@ def write_sog(path: Path, scene: ExportScene) -> tuple[str, ...]:
         nonlocal coarsest
         with scratch_folder(path) as folder:
             store = write_store(scene, folder / "rows", axes)
-            images = _Images(store)
+            images = _Images(store, fit_palette(store))
             order = get_backend(torch.device("cpu")).morton_order(torch.from_numpy(store.means)).numpy()
             coarsest = images.max_step()
             with zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as bundle:
@@ -67,9 +67,15 @@ def write_sog(path: Path, scene: ExportScene) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def write_sog_folder(folder: Path, store: GaussianStore, facts: ExportMetadata) -> None:
+def fit_palette(scene: GaussianStore) -> VectorCodebook | None:
+    """The sets of changing colors of a scene; None where colors do not change."""
+    sample = scene.sample(SAMPLE_ROWS)
+    return VectorCodebook(sample.shN.numpy().reshape(len(sample), -1), MAX_SH_CENTROIDS) if sample.sh_degree else None
+
+
+def write_sog_folder(folder: Path, store: GaussianStore, palette: VectorCodebook | None, facts: ExportMetadata) -> None:
     """Write the unbundled kind, the Gaussians in their order, along the format's axes already: images, then JSON."""
-    images = _Images(store)
+    images = _Images(store, palette)
     for name, picture in images.encode(np.arange(images.count)).items():
         write_bytes(folder / f"{name}.webp", _webp(picture))
     write_json(folder / "meta.json", images.meta(facts))
@@ -78,16 +84,14 @@ def write_sog_folder(folder: Path, store: GaussianStore, facts: ExportMetadata) 
 class _Images:
     """The images of a bundle and what its JSON says of them."""
 
-    def __init__(self, scene: GaussianStore) -> None:
-        self.scene = scene
+    def __init__(self, scene: GaussianStore, palette: VectorCodebook | None) -> None:
+        self.scene, self.palette = scene, palette
         sample = scene.sample(SAMPLE_ROWS)
         self.count, self.degree = len(scene.means), sample.sh_degree
         self.low, self.high = _signed_log(scene.means.min(0)), _signed_log(scene.means.max(0))
         self.scales = fit_codebook(sample.log_scales.numpy().ravel())
         self.colors = fit_codebook(sample.sh0.numpy().ravel())
-        self.palette: VectorCodebook | None = None
-        if self.degree:
-            self.palette = VectorCodebook(sample.shN.numpy().reshape(len(sample), -1), MAX_SH_CENTROIDS)
+        if self.palette:
             self.harmonics = fit_codebook(self.palette.rows.ravel())
 
     def max_step(self) -> float:

@@ -16,11 +16,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from vdgs.export.formats.axes import Y_DOWN, Axes
+from vdgs.export.formats.axes import Y_DOWN
+from vdgs.export.formats.codebooks import VectorCodebook
 from vdgs.export.formats.export_scene import ExportMetadata, ExportScene, concatenate, write_metadata_file
 from vdgs.export.formats.file_folders import FileFolder, check_no_folder
 from vdgs.export.formats.gaussian_store import GaussianStore, in_memory, plane_blocks, write_store
-from vdgs.export.formats.sog import MAX_SH_CENTROIDS, write_sog_folder
+from vdgs.export.formats.sog import MAX_SH_CENTROIDS, fit_palette, write_sog_folder
 from vdgs.kernels import get_backend
 from vdgs.model.gaussian_merging import merge_to
 from vdgs.model.gaussians import Gaussians
@@ -54,9 +55,10 @@ def write_streamed_sog(path: Path, scene: ExportScene, node_size: int = MAX_NODE
     levels = level_count(scene.count)
 
     def fill(folder: Path, scratch: Path) -> JsonObject:
-        store, files = write_store(scene, scratch / "rows"), _LevelFiles(folder, levels, axes, scene.metadata)
-        nodes = []
-        for block in plane_blocks(store.means, np.arange(scene.count), node_size):
+        # Along the axes of the files: colors that change with the direction turn with them.
+        store = write_store(scene, scratch / "rows", axes)
+        files, nodes = _LevelFiles(folder, levels, fit_palette(store), scene.metadata), []
+        for block in plane_blocks(store.means @ axes.turn.astype(np.float32), np.arange(scene.count), node_size):
             check_stop_requested()
             nodes.append(_node(store, block, files))
         files.finish()
@@ -66,7 +68,7 @@ def write_streamed_sog(path: Path, scene: ExportScene, node_size: int = MAX_NODE
     write_metadata_file(path, scene.metadata, axes)
     notes = [f"{levels} levels: each coarser one merged to a quarter of the Gaussians"] if levels > 1 else []
     if scene.degree:
-        notes.append(f"changing colors are taken from palettes of at most {MAX_SH_CENTROIDS}, one for each file")
+        notes.append(f"changing colors are taken from a palette of at most {MAX_SH_CENTROIDS}")
     return tuple(notes)
 
 
@@ -86,10 +88,9 @@ def _node(store: GaussianStore, rows: np.ndarray, files: _LevelFiles) -> JsonObj
         if level:
             gaussians = merge_to(gaussians, max(len(gaussians) // LEVEL_RATIO, 1))[0]
         ordered = gaussians.select(get_backend(torch.device("cpu")).morton_order(gaussians.means))
-        turned = files.axes.of_ground(ordered)
-        means = turned.means.double().numpy()
+        means = ordered.means.double().numpy()
         low, high = np.minimum(low, means.min(0)), np.maximum(high, means.max(0))
-        lods[str(level)] = files.add(level, turned)
+        lods[str(level)] = files.add(level, ordered)
     return {"bound": {"min": low.tolist(), "max": high.tolist()}, "lods": lods}
 
 
@@ -99,7 +100,7 @@ class _LevelFiles:
 
     folder: Path
     levels: int
-    axes: Axes
+    palette: VectorCodebook | None
     facts: ExportMetadata
     names: list[str] = field(default_factory=list)
     counts: list[int] = field(default_factory=list)
@@ -134,7 +135,9 @@ class _LevelFiles:
         return f"{level}_{self._number[level]}"
 
     def _write(self, level: int) -> None:
-        write_sog_folder(self.folder / self._name(level), in_memory(concatenate(self._open[level])), self.facts)
+        write_sog_folder(
+            self.folder / self._name(level), in_memory(concatenate(self._open[level])), self.palette, self.facts
+        )
         self._open[level], self._number[level] = [], self._number[level] + 1
 
 
