@@ -17,6 +17,7 @@ import pycolmap
 
 from vdgs.captures.ground_truth import load_ground_truth
 from vdgs.captures.loading import load_capture
+from vdgs.captures.output_guard import input_folders
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import VdgsError
 from vdgs.evaluation.evaluate_model import evaluate_model
@@ -92,6 +93,7 @@ def test_off_path_views_are_apart_and_true(capture: Path) -> None:
     assert not any(view.name.startswith(("low", "out", "street")) for view in read.views)
     depth = make_true_depth(read, read.off_path_views)
     assert depth is not None
+    assert {capture / "off_path" / name for name in ("low_oblique", "outside", "street")} < set(input_folders(read))
     for view in read.off_path_views:
         assert depth(view).shape == (72, 96)
         assert (truth.visibility_map(view) >= 3).mean() > 0.1

@@ -132,8 +132,9 @@ def check_not_among_inputs(output: Path, capture: Capture) -> None:
 
 def input_folders(capture: Capture) -> list[Path]:
     """The folders that hold photographs or masks of a capture, wherever they are."""
-    files = [view.image_path for view in capture.views]
-    files += [view.mask_path for view in capture.views if view.mask_path is not None]
+    views = capture.views + capture.off_path_views
+    files = [view.image_path for view in views]
+    files += [view.mask_path for view in views if view.mask_path is not None]
     if Path(capture.images) != Path():
         files.append(capture.root / capture.images / "any")
     return _folders_of(files)
