@@ -116,6 +116,8 @@ def make_plan(name: str, options: PlanOptions) -> BenchPlan:
     """Raises VdgsError for a scene or method that does not exist and for settings that do not work, CaptureError for a
     folder that is no capture."""
     table = TABLES[name]
+    if options.step_factors:
+        table = replace(table, title=f"{table.title}, at equal time")
     scenes = resolve_scenes(options.scenes or table.scenes, options.options, options.validation)
     methods = tuple(_method(each) for each in options.methods or table.methods)
     seeds = table.seeds if options.seeds is None else tuple(range(options.seeds))

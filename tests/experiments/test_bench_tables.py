@@ -254,6 +254,7 @@ def test_at_equal_time_dear_methods_make_fewer_iterations():
     slower, before = again.run_of["tiny", "octree-gs", 0], plan.run_of["tiny", "octree-gs", 0]
     assert slower.config.training.iterations == pytest.approx(0.12 * before.config.training.iterations, abs=2)
     assert slower.folder != before.folder
+    assert again.table.title == f"{plan.table.title}, at equal time"
     assert "octree-gs on tiny: 0.12" in "".join(make_notes(again, [], [], False))
     with pytest.raises(VdgsError, match="takes the time of `full`"):
         step_factors(plan, results[:4])
