@@ -23,6 +23,8 @@ from vdgs.model.lod_nodes import NodeRecord
 
 #: Cells along the side of a node.
 CELLS_PER_EDGE = 64
+#: Merged Gaussians are enlarged so much at most where they cover less than their members: 2 blurs, 1 leaves holes.
+MAX_ENLARGED = 1.2
 #: Training cameras that a leaf is baked from, and of how many of the nearest they are chosen.
 CAMERAS_PER_LEAF, MAX_CANDIDATES = 8, 64
 #: They draw a leaf at most so wide and high (pixels): eight for each cell.
@@ -71,7 +73,7 @@ def merge_cells(
     sizes = index.max(0) + 1
     keys = ((index[:, 0] * sizes[1] + index[:, 1]) * sizes[2] + index[:, 2]) * 2 + large
     groups = np.unique(keys, return_inverse=True)[1]
-    merged = merge_by_moments(gaussians, groups, weights)
+    merged = merge_by_moments(gaussians, groups, weights, MAX_ENLARGED)
     weights = gaussian_weights(gaussians) if weights is None else weights
     apart = means - merged.means.double().numpy()[groups]
     square = np.average(errors**2 + (apart * apart).sum(1), weights=weights)
