@@ -64,12 +64,13 @@ class _BakedScene:
     degree: int
     #: How pages show it first, in the ground frame.
     page: InitialView
+    request: ExportRequest
 
-    def scene(self, frame: LocalFrame, rows: Int[np.ndarray, " r"], path: Path, asked: ExportRequest) -> ExportScene:
+    def scene(self, frame: LocalFrame, rows: Int[np.ndarray, " r"], path: Path) -> ExportScene:
         """What a writer is given for a file: the Gaussians of these rows."""
         chunks = (frame.to_local(piece) for piece in self.pieces(rows))
         bounds, page = local_bounds(frame, self.spool.means[rows]), _view_in_frame(self.page, frame)
-        axes = axes_for(path, asked)
+        axes = axes_for(path, self.request)
         return ExportScene(
             chunks=chunks,
             count=len(rows),
@@ -78,7 +79,7 @@ class _BakedScene:
             bounds=bounds,
             page=page,
             axes=axes,
-            spz_version=asked.spz_version,
+            spz_version=self.request.spz_version,
         )
 
     def pieces(self, rows: Int[np.ndarray, " r"]) -> Iterator[Gaussians]:
@@ -161,35 +162,41 @@ def write_files(
             + (" and asked for" if len(kept) < np.count_nonzero(pixels) else ""),
             highlight=False,
         )
-        pixels, means = pixels[kept], means[:0]
-        shown = whole = BakedGaussians(run.model, kept, stack.enter_context(baker.spool(kept)))
+        pixels = pixels[kept]
+        del means
+        shown = BakedGaussians(run.model, kept, stack.enter_context(baker.spool(kept)))
         rounds = color_iteration_count(request.color_iterations, gaussian_count(run.model))
         console.print(
             f"baked in {time.monotonic() - began:.1f} s, colors fitted again in {rounds} rounds", highlight=False
         )
-        merging = SceneMerging(request.output[0].parent / BAKING, baker.training, console, stack)
+        merging = SceneMerging(shown, pixels, request.output[0].parent / BAKING, baker.training, console, stack)
         if 0 < request.max_gaussians < len(kept):
-            shown = merging.merged(whole, pixels, request.max_gaussians)
+            shown = merging.merged(request.max_gaussians)
             rows = {path: rows_within_reach(path, frame, shown.spool.means) for path, frame in frames.items()}
         _optimize(shown, baker.training, request.optimize_seconds, console)
         seconds = time.monotonic() - began
-        view = make_initial_view(run, int(request.html_max_mb * 1e6))
-        scene = _BakedScene(shown.spool, request.sh_degree, view)
-        files = []
-        for path in request.output:
-            count, notes, of_path = _capacity(path, scene), list[str](), (scene, rows[path])
-            if count < len(rows[path]):
-                fewer = merging.merged(whole, pixels, count)
-                notes.append(f"merged from {len(rows[path]):,} Gaussians to {count:,}, which the file has room for")
-                of_path = replace(scene, spool=fewer.spool), np.arange(count)
-            files.append(_write(path, of_path[0].scene(frames[path], of_path[1], path, request), console, notes))
+        scene = _BakedScene(
+            shown.spool, request.sh_degree, make_initial_view(run, int(request.html_max_mb * 1e6)), request
+        )
+        files = [_write_fitting(path, frames[path], scene, rows[path], merging) for path in request.output]
         losses = _measure_losses(run, frames, scene, request, console)
     record: ExportDocument = to_jsonable({
         "model": run.name, "key": run.key, "gaussians": len(scene.spool.means), "sh_degree": request.sh_degree,
-        "rounds": rounds,
-        "seconds_to_bake": seconds, "seconds_to_refine": request.optimize_seconds, "files": files, "losses": losses,
+        "rounds": rounds, "seconds_to_bake": seconds, "seconds_to_refine": request.optimize_seconds, "files": files,
+        "losses": losses,
     })  # fmt: skip
     return record
+
+
+def _write_fitting(
+    path: Path, frame: LocalFrame, scene: _BakedScene, rows: Int[np.ndarray, " r"], merging: SceneMerging
+) -> ExportedFile:
+    """Write a file, of as many Gaussians as it has room for."""
+    notes, count = list[str](), _capacity(path, scene)
+    if count < len(rows):
+        notes.append(f"merged from {len(rows):,} Gaussians to {count:,}, which the file has room for")
+        scene, rows = replace(scene, spool=merging.merged(count).spool), np.arange(count)
+    return _write(path, scene.scene(frame, rows, path), merging.console, notes)
 
 
 def _capacity(path: Path, scene: _BakedScene) -> int:

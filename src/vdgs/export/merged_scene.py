@@ -93,15 +93,17 @@ def merged_blocks(
 class SceneMerging:
     """Makes fewer Gaussians of baked ones, in temporary files that go with `stack`."""
 
+    baked: BakedGaussians
+    #: How many pixels each makes.
+    weights: Float[np.ndarray, " m"]
     beside: Path
     training: Sequence[Camera]
     console: Console
     stack: ExitStack
 
-    def merged(self, baked: BakedGaussians, weights: Float[np.ndarray, " m"], count: int) -> MergedGaussians:
-        """So many Gaussians in place of a baked scene, moved towards the pictures of the model. `weights`: how many
-        pixels each makes."""
-        began, total = time.monotonic(), len(baked.spool.means)
+    def merged(self, count: int) -> MergedGaussians:
+        """So many Gaussians in place of the scene, moved towards the pictures of the model."""
+        began, total = time.monotonic(), len(self.weights)
         steps = min(PASSES * len(self.training), MAX_STEPS) if count <= MAX_MOVED else 0
         with make_progress_bar(self.console) as bar:
             task = bar.add_task("merging Gaussians", total=total)
@@ -110,7 +112,7 @@ class SceneMerging:
                 check_stop_requested()
                 bar.update(task, completed=done)
 
-            merged = self.stack.enter_context(merged_scene(baked, weights, count, self.beside, after_part))
+            merged = self.stack.enter_context(merged_scene(self.baked, self.weights, count, self.beside, after_part))
             task = bar.add_task("moving merged Gaussians", total=steps)
 
             def after_step(passed: float) -> None:
