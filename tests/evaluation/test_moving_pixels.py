@@ -29,7 +29,7 @@ def residual(camera, box=None, mask=None, ghost=0.0) -> Residual:
     return make_residual(camera, photograph, mask, shown, depth)
 
 
-BOX = np.s_[50:62, 70:92]
+BOX = np.s_[50:62, 80:102]  # where at least three of the others look
 
 
 def found(own: Residual) -> np.ndarray:
@@ -41,7 +41,7 @@ def test_an_object_of_one_photograph_is_found_and_nothing_else():
     moves, painted = found(residual(CAMERAS[2], BOX, ghost=0.3)), np.zeros((120, 160), bool)
     painted[BOX] = True
     assert moves[painted].mean() > 0.9
-    assert moves[~painted].mean() < 0.02
+    assert moves[~painted].mean() < 0.015
 
 
 def test_what_the_model_lacks_or_shows_in_all_photographs_does_not_move():
@@ -50,7 +50,7 @@ def test_what_the_model_lacks_or_shows_in_all_photographs_does_not_move():
 
 def test_what_a_mask_leaves_out_is_not_looked_at():
     mask = np.ones((120, 160), np.uint8)
-    mask[45:67, 65:97] = 0
+    mask[45:67, 75:107] = 0
     assert not found(residual(CAMERAS[2], BOX, mask, ghost=0.3)).any()
 
 

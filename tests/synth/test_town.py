@@ -32,6 +32,8 @@ from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import Raster
 from vdgs.synth import SynthOptions, generate
 from vdgs.synth.image_renderer import pixel_sample_offsets
+from vdgs.synth.moving_objects import make_moving_objects, place_moving_objects
+from vdgs.synth.ray_tracing import RayTracer
 from vdgs.synth.streets import make_street_plan
 from vdgs.synth.town import build_town
 from vdgs.synth.zones import LandUse
@@ -209,17 +211,31 @@ def test_there_is_no_true_depth_of_what_was_not_written(capture: Path, tmp_path:
     assert make_true_depth(replace(loaded, root=tmp_path), loaded.views) is None
 
 
-def test_the_same_options_give_the_same_bytes_and_what_a_killed_command_left_goes(
+def test_the_same_options_give_the_same_bytes_but_for_what_moves_and_what_a_killed_command_left_goes(
     capture: Path, tmp_path: Path
 ) -> None:
     left = tmp_path / ".again.abc.scratch"
     left.mkdir()
     (left / ".lock").touch()
-    generate(tmp_path / "again", replace(TINY, workers=1))
+    generate(tmp_path / "again", replace(TINY, workers=1, num_moving_objects=60))
     assert [path.name for path in tmp_path.iterdir()] == ["again"]
     first, second = files(capture), files(tmp_path / "again")
-    assert first.keys() == second.keys()
-    assert [name for name in first if first[name] != second[name]] == []
+    masks = sorted(second.keys() - first.keys())
+    assert masks == [f"truth/masks/drone_{number:04d}.png" for number in range(1, 7)]
+    changed = [name for name in first if first[name] != second[name]]
+    assert changed == ["capture.md", *(f"images/{Path(name).stem}.jpg" for name in masks)]
+    black = []
+    for name in masks:
+        before, after = (
+            np.asarray(Image.open(folder / "images" / f"{Path(name).stem}.jpg"), np.int16)
+            for folder in (capture, tmp_path / "again")
+        )
+        moves = np.asarray(Image.open(tmp_path / "again" / name)) == 0
+        assert np.abs(after - before)[~moves].mean() < 1.0  # but for what JPEG spreads about
+        assert not moves.any() or np.abs(after - before)[moves].mean() > 10
+        black.append(moves.mean())
+    assert 0.005 < np.mean(black) < 0.2
+    assert len(set(black)) > 3  # elsewhere in each
 
 
 def test_pictures_show_something_everywhere(capture: Path) -> None:
@@ -302,6 +318,10 @@ def test_every_seed_gives_a_town_of_its_own() -> None:
         assert np.isfinite(town.mesh.vertices).all()
         assert np.isfinite(town.mesh.normals).all()
         assert town.mesh.faces.max() < len(town.mesh.vertices)
+    tracer, things = RayTracer(towns[0].mesh), make_moving_objects(towns[0], 12, seed=0)
+    meshes = [place_moving_objects(towns[0], tracer, things, 0, photograph)[0].mesh for photograph in (3, 3, 4)]
+    np.testing.assert_array_equal(meshes[0].vertices, meshes[1].vertices)
+    assert not np.array_equal(meshes[0].vertices, meshes[2].vertices)
 
 
 @pytest.mark.parametrize("count", [1, 4, 7, 9])

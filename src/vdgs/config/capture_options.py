@@ -72,7 +72,8 @@ class CaptureOptions:
     """Where undistorted photographs are kept. Default: undistorted/ inside the capture folder."""
     masks: str = "masks"
     """Folder of masks (white = keep), named like the photographs. That is name.png or name.jpg.png. auto: those in
-    masks, if any, and for the blocks also masks of what moves, found by the coarse model after its training."""
+    masks, if any, and for the blocks and the detail of maps also masks of what moves, found by the coarse model after
+    its training."""
 
     @property
     def mask_folder(self) -> str:

@@ -32,7 +32,7 @@ THRESHOLD, WEAK = 6.0, 0.6
 #: Deviations below this are never motion, in colors from 0 to 1.
 MIN_DEVIATION = 0.08
 #: Smaller regions, in compared pixels, are dropped; what is left grows by so many.
-MIN_REGION_PX, GROW_PX = 20, 2
+MIN_REGION_PX, GROW_PX = 20, 1
 #: A photograph of which more is found is not masked: its camera or exposure is wrong, rather than all that it shows.
 MAX_SHARE = 0.3
 

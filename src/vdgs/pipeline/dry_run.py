@@ -118,6 +118,7 @@ def _print_estimate(plan: RunEstimate, method: MethodConfig, status: RunStatus |
     lines = [
         f"coarse model: {plan.anchors:,} anchors at the start{stereo}, {plan.coarse_iterations:,} iterations, at most "
         f"{data_size(plan.coarse_bytes)}, about {takes('stereo', 'coarse')}{done('coarse')}",
+        *([f"masks of what moves: about {takes('motion')}"] if plan.times["motion"].seconds else []),
         f"{blocks}{chosen}: about {plan.block_iterations:,} iterations each, {plan.jobs} at once, at most "
         f"{data_size(plan.block_bytes)} each and {data_size(plan.images_bytes)} for photographs, about "
         f"{takes('blocks')}{done(*names)}",

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 from vdgs.captures.capture import Capture
 from vdgs.captures.image_cache import ImageCache
+from vdgs.config.capture_options import AUTO_MASKS
 from vdgs.config.commands import RunRequest
 from vdgs.config.method import MethodConfig, TrainConfig, block_train_config
 from vdgs.distributed.resource_allocation import Allocation, ShardWorkload, allocate_local, exceeds_memory
@@ -23,6 +24,8 @@ from vdgs.pipeline.time_estimate import (
     COARSE_VIEW_STEPS,
     MAP_STEPS,
     MERGED_VIEW_STEPS,
+    MOTION_VIEW_SECONDS,
+    MOTION_VIEW_STEPS,
     OTHER_SECONDS,
     SMALL_FACTOR,
     START_SECONDS,
@@ -77,7 +80,7 @@ class RunEstimate:
     growth: tuple[float, float]
     """How many times their number anchors become in the coarse stage, and in a block."""
     times: Mapping[str, Cost]
-    """What each stage takes: photographs, stereo, coarse, blocks, measuring, maps, other."""
+    """What each stage takes: photographs, stereo, coarse, motion, blocks, measuring, maps, other."""
     slowdown: float
     """How many times as long it takes as busy as the machine is now."""
 
@@ -191,7 +194,7 @@ def estimate_at(scene: Scene, probed: Probe, method: MethodConfig, request: RunR
         "stereo": Cost(stereo / get_num_threads(), stereo),
         "coarse": steps.stage(config, drawn, start, coarse_growth),
         "blocks": _side_by_side((block_steps + START) * blocks, local),
-        **_other_times(scene, steps.step(drawn, grown), bool(request.ortho)),
+        **_other_times(scene, steps.step(drawn, grown), request),
     }
     return RunEstimate(
         anchors=sparse.anchors,
@@ -232,11 +235,14 @@ def _side_by_side(cost: Cost, allocation: Allocation) -> Cost:
     return Cost(cost.processor_seconds / get_num_threads(), cost.processor_seconds)
 
 
-def _other_times(scene: Scene, step: Cost, ortho: bool) -> dict[str, Cost]:
+def _other_times(scene: Scene, step: Cost, request: RunRequest) -> dict[str, Cost]:
     """What is drawn and measured, by what steps take, and the rest."""
     views = len(scene.cameras) + scene.test_views
-    maps = MAP_STEPS * views / scene.views_per_point if ortho and has_ortho_dependencies() else 0.0
+    maps = MAP_STEPS * views / scene.views_per_point if request.ortho and has_ortho_dependencies() else 0.0
+    masked = len(scene.cameras) if request.options.masks == AUTO_MASKS else 0
+    comparing = MOTION_VIEW_SECONDS * masked
     return {
+        "motion": step * (MOTION_VIEW_STEPS * masked) + Cost(comparing, comparing),
         "measuring": step * (scene.test_views * (COARSE_VIEW_STEPS + MERGED_VIEW_STEPS)),
         "maps": step * maps,
         "other": Cost(OTHER_SECONDS, OTHER_SECONDS),

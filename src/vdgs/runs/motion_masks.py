@@ -1,4 +1,5 @@
-"""Masks of what moves, which a run makes after its coarse stage (`--masks auto`) and its blocks train with.
+"""Masks of what moves, which a run makes after its coarse stage (`--masks auto`). Its blocks train with them, and maps
+take detail by them; test views are measured whole.
 
 RUN/coarse/motion/  key, motion.json (share and mask of each training photograph), NNNNN.png (white = keep, the
                     capture's own mask included), examples.png
@@ -37,12 +38,14 @@ def has_motion_masks(run: RunFolder) -> bool:
     return record.get("key") == run.keys().visibility and all((folder / mask).exists() for mask in masks)
 
 
-def with_motion_masks(run: RunFolder, capture: Capture) -> Capture:
+def with_motion_masks(run: RunFolder, capture: Capture, *, needed: bool = True) -> Capture:
     """The capture with the masks of what moves in place of its own, which they include; as it is where the run wants
-    none. RunError where they are not made yet."""
+    none. Where they are not made yet RunError, unless they are not `needed`: then the capture as it is."""
     if not wants_motion_masks(run):
         return capture
     if not has_motion_masks(run):
+        if not needed:
+            return capture
         raise RunError(
             f"{run.path / MOTION_FILE}: --masks auto needs the masks of what moves, which are not made for this coarse "
             f"model. Make them: vdgs visibility {shell_word(run.path)}"

@@ -51,6 +51,11 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 _Skin = tuple[Material, np.ndarray, float]
 
 
+def join_meshes(first: Mesh, second: Mesh) -> Mesh:
+    """Both as one; the triangles of the first keep their numbers."""
+    return Mesh(**_join([vars(first), vars(second)]))
+
+
 class MeshBuilder:
     """Collects polygons and ready-made parts, then joins them into one `Mesh`.
 

@@ -46,6 +46,15 @@ def bus(builder: MeshBuilder, frame: ObjectFrame, rng: np.random.Generator) -> N
         box(builder, frame, Box(x0=x - 0.5, x1=x + 0.5, y0=-1.15, y1=1.15, z0=0, z1=0.9), _DARK)
 
 
+def person(builder: MeshBuilder, frame: ObjectFrame, rng: np.random.Generator) -> None:
+    """Somebody who walks towards local +x."""
+    coat = SurfaceMaterial(Material.PAINT, palette.pick(rng, palette.CAR))
+    box(builder, frame, Box(x0=-0.14, x1=0.14, y0=-0.2, y1=0.2, z0=0, z1=0.85), _DARK, _DARK)
+    box(builder, frame, Box(x0=-0.16, x1=0.16, y0=-0.26, y1=0.26, z0=0.8, z1=1.5), coat, coat, inset=(0.04, 0.06))
+    head = SurfaceMaterial(Material.PAINT, palette.pick(rng, palette.OFFICE))
+    box(builder, frame, Box(x0=-0.11, x1=0.11, y0=-0.09, y1=0.09, z0=1.5, z1=1.76), head, head)
+
+
 def stall(builder: MeshBuilder, frame: ObjectFrame, rng: np.random.Generator) -> None:
     """A market stall under a striped awning, with crates of fruit."""
     stripes = SurfaceMaterial(Material.AWNING, palette.pick(rng, palette.AWNING))

@@ -108,6 +108,12 @@ class Site:
         return Plot((p0 + p1) / 2, (q0 + q1) / 2, p1 - p0, q1 - q0)
 
 
+def street_plot(position: float, across: float, along: float, *, along_q: bool, backwards: bool) -> Plot:
+    """A place of a street at `position` of the plan, facing along the street."""
+    p, q = (position + across, along) if along_q else (along, position - across)
+    return Plot(p, q, 1, 1, (1 if along_q else 0) + (2 if backwards else 0))
+
+
 def rotate_plot(plot: Plot, turns: int) -> Plot:
     """The same rectangle seen from another side: its front is where local b is least."""
     swap = turns % 2 == 1

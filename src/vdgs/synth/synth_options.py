@@ -42,6 +42,9 @@ class SynthOptions:
     num_off_path_images: Annotated[int | None, Range(0, 100_000)] = None
     """How many photographs of each of three kinds are taken from where the drone never was: low and oblique, from the
     street, from outside. Every second one is for validation. Default: a twelfth of --num-images, even, 2 to 12."""
+    num_moving_objects: Annotated[int, Range(0, 100_000)] = 0
+    """How many cars, buses and people move about the streets of the whole place: each training photograph shows them
+    elsewhere (what moves is black in truth/masks). Test, validation and off-path photographs show none."""
     width: Annotated[int | None, Range(16, MAX_RENDER_SIDE_PX)] = None
     """Width of an image in pixels."""
     height: Annotated[int | None, Range(16, MAX_RENDER_SIDE_PX)] = None
@@ -110,4 +113,5 @@ class ResolvedOptions(SynthOptions):
     @property
     def to_lines(self) -> list[str]:
         """One `name: value` a line, for people; without what does not change the result."""
-        return [f"{name}: {value}" for name, value in vars(self).items() if name not in ("size", "workers")]
+        unused = {"size", "workers"} | (set() if self.num_moving_objects else {"num_moving_objects"})
+        return [f"{name}: {value}" for name, value in vars(self).items() if name not in unused]

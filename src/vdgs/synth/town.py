@@ -11,7 +11,7 @@ from vdgs.synth import props, town_center
 from vdgs.synth.mesh import Mesh, MeshBuilder
 from vdgs.synth.outskirts import build_outskirts, build_periphery, edge_plots, scatter_trees
 from vdgs.synth.residential import residential_block
-from vdgs.synth.site import Plot, Site
+from vdgs.synth.site import Plot, Site, street_plot
 from vdgs.synth.streets import PAVEMENT, StreetPlan, make_street_plan
 from vdgs.synth.terrain import Pond, Terrain
 from vdgs.synth.town_center import MAX_HEIGHT, towers
@@ -146,9 +146,8 @@ def _stretch(site: Site, position: float, half: float, span: tuple[float, float]
     """One street between two crossings."""
     rng = site.rng
 
-    def at(across: float, along: float, turn: float) -> Plot:
-        p, q = (position + across, along) if along_q else (along, position - across)
-        return Plot(p, q, 1, 1, (1 if along_q else 0) + (2 if turn else 0))
+    def at(across: float, along: float, turn: bool) -> Plot:
+        return street_plot(position, across, along, along_q=along_q, backwards=turn)
 
     for direction in (-1, 1):
         passing = np.inf

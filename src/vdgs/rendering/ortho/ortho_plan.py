@@ -23,6 +23,8 @@ from vdgs.rendering.ortho.map_status import METADATA_FILE
 from vdgs.rendering.ortho.nadir_camera import NadirCamera
 from vdgs.rendering.ortho.pixel_grid import PixelGrid
 from vdgs.rendering.ortho.tile_renderer import TileRenderer, samples_per_side
+from vdgs.runs.motion_masks import with_motion_masks
+from vdgs.runs.run_folder import RunFolder
 from vdgs.system.atomic_files import read_json_or_empty, reason_of, write_json
 from vdgs.system.scratch import remove_leftovers, scratch_folder
 
@@ -65,6 +67,8 @@ class OrthoPlan:
         none, and for an output among inputs of the capture."""
         folder = output_folder(request, run)
         check_not_among_inputs(folder, capture)
+        if request.detail_from_images:  # nothing that moves in the photographs may be painted on the ground
+            capture = with_motion_masks(RunFolder(run), capture, needed=False)
         placement = MapProjection.of(capture.ground, request.crs)
         scale = placement.similarity_at(pixel_grid.median_point(capture)).scale
         finest = pixel_grid.ground_sampling_distance(capture, scale)
