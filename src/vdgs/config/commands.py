@@ -143,7 +143,7 @@ class RenderRequest(ModelRequest):
     capture: Path | None = None
     """Where the capture lies now; needed only where the run has lost its cameras.json."""
     min_visibility: Annotated[int, Range(0, MAX_COUNT)] = 0
-    """Leave out what fewer training cameras see (V). 2 or 3 takes shreds from the edge of the scene; 0: all."""
+    """Leave out what fewer training cameras see (V). 2 or 3 takes floaters from the edge of the scene; 0: all."""
     mode: Literal["rgb", "depth", "visibility", "alpha"] = "rgb"
     """What to draw: the picture; the median depth, at which a pixel becomes half opaque (gray where it never does); the
     number of training cameras that see each place, V; or alpha, how opaque the scene is."""
@@ -203,7 +203,7 @@ class ExportRequest(ModelRequest):
     bbox: Annotated[tuple[float, float, float, float] | None, MAP_COORDINATE_RANGE] = None
     """Only Gaussians with centers in X0 Y0 X1 Y1, in coordinates of --crs."""
     min_visibility: Annotated[int, Range(0, MAX_COUNT)] = 0
-    """Leave out what fewer training cameras see (V). 2 or 3 takes shreds from the edge of the scene; 0: all."""
+    """Leave out what fewer training cameras see (V). 2 or 3 takes floaters from the edge of the scene; 0: all."""
     max_gaussians: Annotated[int, Range(0, MAX_COUNT)] = 0
     """Largest number of Gaussians; 0: all. Neighbors are merged, those first by which the pictures change least, and
     then moved towards the model's images."""

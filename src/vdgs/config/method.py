@@ -137,7 +137,7 @@ class LossConfig:
     volume_reg: Annotated[float, Range(0, MAX_FLOAT)] = 0.01
     """Weight of the mean product of the three scales of the Gaussians that are drawn."""
     depth_agreement: Annotated[float, Range(0, MAX_FLOAT)] = 0.0
-    """Weight of the mean difference between expected and median depth, in camera heights: fewer shreds in views from
+    """Weight of the mean difference between expected and median depth, in camera heights: fewer floaters in views from
     where nobody flew (choice). On a GPU it takes slower kernels."""
     opacity_noise: Annotated[float, Range(0, 1)] = 0.0
     """Standard deviation of the factor by which the opacity of each Gaussian is multiplied in a step: Gaussians that

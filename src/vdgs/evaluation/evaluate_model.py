@@ -31,7 +31,7 @@ from vdgs.evaluation.lpips import Lpips
 from vdgs.evaluation.metric_tables import make_metrics_table
 from vdgs.evaluation.opacity_coverage import summarize_opacity_coverage, summarize_oversized_splats
 from vdgs.evaluation.renderable_model import EvaluatedModel, EvaluationSettings, ReferenceViews, RenderableModel
-from vdgs.evaluation.shreds import ANGLE_EDGES, SHRED_KEYS, summarize_shreds
+from vdgs.evaluation.splat_artifacts import ANGLE_EDGES, ARTIFACT_KEYS, summarize_artifacts
 from vdgs.evaluation.view_metrics import (
     AFFINE_KEYS,
     CORRECTED_KEYS,
@@ -155,7 +155,7 @@ def _summary(
         **summarize_opacity_coverage(rows),
         **summarize_depth_errors(gathered.depth_errors),
         **summarize_oversized_splats(rows),
-        **summarize_shreds(rows),
+        **summarize_artifacts(rows),
         "by_angle": gathered.by_angle.bins_at(ANGLE_EDGES) if gathered.by_angle else None,
         "sets": _by_folder(rows) if settings.by_folder else None,
         **asdict(metadata),
@@ -169,7 +169,7 @@ def _summary(
 
 def _by_folder(rows: Sequence[Mapping[str, Any]]) -> dict[str, JsonObject]:
     """Means over the views of each folder."""
-    keys, folders = (*RAW_KEYS, *METRIC_NAMES, *SHRED_KEYS), defaultdict[str, list[Mapping[str, Any]]](list)
+    keys, folders = (*RAW_KEYS, *METRIC_NAMES, *ARTIFACT_KEYS), defaultdict[str, list[Mapping[str, Any]]](list)
     for row in rows:
         folders[PurePosixPath(row["name"]).parts[0]].append(row)
     return {

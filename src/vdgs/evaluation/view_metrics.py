@@ -31,7 +31,7 @@ from vdgs.evaluation.depth_errors import (
 from vdgs.evaluation.lpips import MIN_SIDE_PX, Lpips
 from vdgs.evaluation.opacity_coverage import RenderedImage, count_oversized_splats, measure_opacity_coverage
 from vdgs.evaluation.renderable_model import EvaluationSettings, ReferenceViews, RenderableModel
-from vdgs.evaluation.shreds import floater_share, needle_share, training_view_angles
+from vdgs.evaluation.splat_artifacts import floater_share, needle_share, training_view_angles
 from vdgs.kernels.kernel_types import Raster
 from vdgs.system.documents import JsonObject
 

@@ -57,7 +57,7 @@ class EvaluationMetrics(TypedDict, total=False):
     peak_memory_bytes: int | None
     fps: float | None
     test_views: int
-    #: Means over the views: shares of what is drawn (`evaluation.shreds`).
+    #: Means over the views: shares of what is drawn (`evaluation.splat_artifacts`).
     needles: float | None
     floaters: float | None
     #: Pixels by the angle to the nearest training view, in degrees.

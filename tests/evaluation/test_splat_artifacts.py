@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from vdgs.evaluation.by_visibility import VisibilityHistogram
-from vdgs.evaluation.shreds import ANGLE_EDGES, floater_share, needle_share, training_view_angles
+from vdgs.evaluation.splat_artifacts import ANGLE_EDGES, floater_share, needle_share, training_view_angles
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.constants import DILATION_PX2
 from vdgs.kernels.kernel_types import Splats

@@ -28,7 +28,7 @@ FLOATER_THRESHOLD = 0.02
 MAX_ANGLE_PIXELS = 20_000
 #: Bins by angle (degrees) end below these; the last one is open.
 ANGLE_EDGES = (10.0, 20.0, 40.0)
-SHRED_KEYS = ("needles", "floaters")
+ARTIFACT_KEYS = ("needles", "floaters")
 
 
 @torch.no_grad()
@@ -54,9 +54,9 @@ def floater_share(
     return float(((alpha > MIN_ALPHA) & (depth < true_depth - FLOATER_THRESHOLD * camera_height)).mean())
 
 
-def summarize_shreds(rows: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
+def summarize_artifacts(rows: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
     """Means over the views."""
-    return {name: mean_or_none([row.get(name) for row in rows]) for name in SHRED_KEYS}
+    return {name: mean_or_none([row.get(name) for row in rows]) for name in ARTIFACT_KEYS}
 
 
 def training_view_angles(
