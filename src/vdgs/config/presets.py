@@ -56,7 +56,6 @@ PRESETS: dict[str, MethodConfig] = {
             resolution_schedule=((0.0, 4), (0.1, 2), (0.4, 1)),
             lr=LearningRateConfig(offsets=(0.02, 2e-4), features=(0.015, 0.015), log_scales=(0.014, 0.014)),
             lr_warm_boost=3.0,
-            loss=LossConfig(depth_agreement=0.05),
             densify=DensifyConfig(stats_start=300, start=500, stop_fraction=0.6, grad_threshold=1e-4),
         ),
         partition=PartitionConfig(blocks="auto"),
