@@ -156,7 +156,8 @@ def nine(tmp_path_factory: pytest.TempPathFactory) -> Flight:
 
 @pytest.fixture(scope="session")
 def nine_begun(nine: Flight, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """What the folder of their capture holds when each step begins. Not to be changed: `sfm_support.copy_folder`."""
+    """What the folder of their capture holds when each step begins, and when all are done. Not to be changed:
+    `flights.copy_folder`."""
     from support.flights import folders_of_steps
 
     return folders_of_steps(nine, tmp_path_factory.mktemp("begun"))

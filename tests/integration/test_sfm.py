@@ -159,7 +159,8 @@ def test_photographs_that_came_later_are_refused_or_make_the_capture_anew(flight
 
 
 def test_without_positions_the_scale_is_arbitrary_and_said_so(flight, tmp_path):
-    """One photograph lies on its side, and its mask with it."""
+    """One photograph lies on its side, and its mask with it. Three were taken with the camera turned: portrait for
+    EXIF, and for everybody after it."""
     card = tmp_path / "card"
     (card / "masks").mkdir(parents=True)
     keep = np.ones((300, 400), bool)
@@ -169,7 +170,7 @@ def test_without_positions_the_scale_is_arbitrary_and_said_so(flight, tmp_path):
         with Image.open(flight.folder / name) as image:
             pixels = np.array(image)
         turned = k == 2  # a photograph that lies on its side, as EXIF says
-        write_photograph(card / name, np.rot90(pixels).copy() if turned else pixels, k, None, 6 if turned else 1)
+        write_photograph(card / name, np.rot90(pixels).copy() if turned else pixels, k, None, 6 if k > 1 else 1)
     before = files(card)
     said = console()
     facts = reconstruct(SfmRequest(image_folders=(card,), output=tmp_path / "capture", threads=1), said)
@@ -182,8 +183,10 @@ def test_without_positions_the_scale_is_arbitrary_and_said_so(flight, tmp_path):
     assert [mask is not None for mask in masks] == [k == 2 for k in range(6)]
     assert not masks[2][:45].any()
     assert masks[2][55:].all()
-    sizes = {size(tmp_path / "capture/images" / name) for name in flight.names[:6]}
-    assert len(sizes) == 1  # all stand upright
+    sizes = [size(tmp_path / "capture/images" / name) for name in flight.names[:6]]
+    assert sizes == [view.camera.full_size for view in capture.views]
+    assert [height > width for width, height in sizes] == [k > 2 for k in range(6)]  # all stand upright
+    assert len(set(sizes[:3])) == len(set(sizes[3:])) == 1
     assert files(card) == before
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import io
 import os
+import shutil
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -17,14 +18,13 @@ from rich.console import Console
 pytest.importorskip("embreex")
 import pycolmap
 
-from support.flights import ORIGIN, Flight, copy_folder, fly, grid, write_photograph
+from support.flights import ORIGIN, Flight, copy_folder, write_photograph
 from vdgs.captures.loading import load_capture
 from vdgs.captures.reconstruction import ReconstructionReport, read_reconstruction
 from vdgs.config.commands import RunRequest
 from vdgs.config.presets import PRESETS
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
-from vdgs.geometry.camera import Camera
 from vdgs.geometry.geodesy import enu_from_geodetic
 from vdgs.pipeline.run_pipeline import reconstruct_if_needed
 from vdgs.sfm import capture_writer, feature_extraction, feature_matching, incremental_mapper
@@ -106,20 +106,6 @@ def test_two_folders_two_cameras_landscape_and_portrait_become_one_scene(flight,
     assert replace(again, options=found.options) == found
 
 
-def test_portrait_and_landscape_stand_beside_each_other(flight, tmp_path):
-    """Photographs that were taken with the camera turned: portrait for EXIF, and for everybody after it."""
-    card = tmp_path / "card"
-    card.mkdir()
-    for k, name in enumerate(flight.names[:6]):
-        pixels, place = pixels_of(flight.folder / name), flight.cameras[k].position
-        # the file as the sensor has it, and EXIF says that its right side is up
-        write_photograph(card / name, pixels, k, place, 6 if k in (3, 4, 5) else 1)
-    facts = reconstruct(SfmRequest(image_folders=(card,), output=tmp_path / "capture", threads=1), console())
-    assert facts.registered == 6
-    sizes = {view.name: view.camera.full_size for view in load_capture(tmp_path / "capture").views}
-    assert {name for name, (width, height) in sizes.items() if height > width} == set(flight.names[3:6])
-
-
 def test_more_folders_beside_a_capture_are_refused(flight, tmp_path):
     (tmp_path / "sparse").mkdir()
     request = RunRequest(
@@ -132,36 +118,23 @@ def test_more_folders_beside_a_capture_are_refused(flight, tmp_path):
 # ------------------------------------------------------------------------------------------------- parts
 
 
-def beside(cameras: list[Camera], east: float) -> list[Camera]:
-    moved = []
-    for camera in cameras:
-        pose = camera.camera_from_world.copy()
-        pose[:3, 3] -= pose[:3, :3] @ [east, 0, 0]
-        moved.append(
-            Camera(
-                camera_from_world=pose,
-                fx=camera.fx,
-                fy=camera.fy,
-                cx=camera.cx,
-                cy=camera.cy,
-                width=camera.width,
-                height=camera.height,
-            )
-        )
-    return moved
-
-
-def test_of_two_parts_the_larger_is_kept_and_the_other_named(tmp_path):
-    flown = fly(tmp_path / "card", [*beside(grid(2, 3, 9.0), -45), *beside(grid(2, 2, 9.0), 45)], 160)
-    said = console()
-    facts = reconstruct(SfmRequest(image_folders=(flown.folder,), output=tmp_path / "capture", threads=1), said)
+def test_of_two_parts_the_larger_is_kept_and_the_other_named(flight, tmp_path):
+    """Six photographs, and 90 m beside them four as of another place: mirrored negatives, whose features are others."""
+    card, said = tmp_path / "card", console()
+    card.mkdir()
+    for k, name in enumerate(flight.names[:6]):
+        shutil.copy(flight.folder / name, card)
+        if k in (0, 1, 4, 5):
+            place = flight.cameras[k].position * [-1, 1, 1] + [90, 0, 0]
+            write_photograph(card / f"far_{k}.JPG", 255 - pixels_of(flight.folder / name)[:, ::-1], 10 + k, place)
+    facts = reconstruct(SfmRequest(image_folders=(card,), output=tmp_path / "capture", threads=1), said)
     assert facts.components == (6, 4)
     assert facts.registered == 6
     why = {photo.name: photo.excluded_reason for photo in facts.photographs if photo.excluded_reason}
-    assert sorted(why) == flown.names[6:]
+    assert sorted(why) == [f"far_{k}.JPG" for k in (0, 1, 4, 5)]
     assert all("belongs to a part of 4 photographs that nothing joins to the rest" in reason for reason in why.values())
     assert "parts that do not hold together: 6, 4" in said.file.getvalue()
-    assert [view.name for view in load_capture(tmp_path / "capture").views] == flown.names[:6]
+    assert [view.name for view in load_capture(tmp_path / "capture").views] == flight.names[:6]
 
 
 # ------------------------------------------------------------------------------------------------ stopped

@@ -14,6 +14,7 @@ from PIL import Image
 from support.report_page import Page
 from vdgs.errors import RunError
 from vdgs.report import charts
+from vdgs.report.embedded_images import EmbeddedImage
 from vdgs.report.write_report import write_report
 from vdgs.runs.run_folder import RunFolder
 
@@ -34,6 +35,12 @@ FULL_DPI = charts.DPI
 def small_charts(monkeypatch):
     """Drawing is what a report takes longest for, and few tests are about charts."""
     monkeypatch.setattr(charts, "DPI", 40)
+
+
+@pytest.fixture
+def blank_charts(monkeypatch):
+    """For what is not about charts: they are laid out, not drawn."""
+    monkeypatch.setattr(charts, "_to_image", lambda figure: EmbeddedImage(b"", *figure.canvas.get_width_height()))
 
 
 def picture(path: Path, size: tuple[int, int] = (60, 40), noise: bool = False) -> None:
@@ -184,6 +191,7 @@ def test_the_report_of_a_whole_run_holds_its_figures(whole):
     assert page.tags.count("img") == 5 + 3 + 1 + 11
 
 
+@pytest.mark.usefixtures("blank_charts")
 def test_the_report_leads_to_a_page_of_the_scene_that_it_shows(tmp_path):
     run = whole_run(tmp_path / "run")
     page = tmp_path / "my place&co.html"
@@ -202,6 +210,7 @@ def test_the_report_leads_to_a_page_of_the_scene_that_it_shows(tmp_path):
     assert "Move through" not in write_report(run).read_text()
 
 
+@pytest.mark.usefixtures("blank_charts")
 def test_the_least_solid_view_is_shown_and_solidity_compared(tmp_path):
     run = whole_run(tmp_path)
     known = metrics(28.375, "merged") | {
@@ -231,6 +240,7 @@ def test_the_least_solid_view_is_shown_and_solidity_compared(tmp_path):
     assert "25.0 % have alpha" in page.text()
 
 
+@pytest.mark.usefixtures("blank_charts")
 def test_views_from_where_nobody_flew_are_shown_of_the_model_that_is_reported(tmp_path):
     run = coarse_run(tmp_path)
     figures = {"views": 3, "psnr": 21.5, "depth_within_2_percent_median": 0.75, "needles": 0.05, "floaters": None}
@@ -249,6 +259,7 @@ def test_growth_is_summed_for_each_block(whole):
     assert re.findall(r"<td>(.*?)</td>", table)[:6] == ["block 0", "3", "90", "30", "75.0 %", "40.0 %"]
 
 
+@pytest.mark.usefixtures("blank_charts")
 def test_a_coarse_run_is_reported_with_what_it_has(tmp_path):
     page = Page(write_report(coarse_run(tmp_path / "run")))
     text = page.text()
@@ -262,6 +273,7 @@ def test_a_coarse_run_is_reported_with_what_it_has(tmp_path):
     assert "It cannot be told whether these were made with the settings of the run: coarse, coarse eval" in text
 
 
+@pytest.mark.usefixtures("blank_charts")
 def test_the_coarse_model_may_be_the_one_that_is_evaluated(tmp_path):
     run = coarse_run(tmp_path / "run")
     shutil.move(run.path / "coarse/evaluation", run.path / "evaluation")
@@ -270,6 +282,7 @@ def test_the_coarse_model_may_be_the_one_that_is_evaluated(tmp_path):
     assert "Coarse model: PSNR 27.12" in page.text()
 
 
+@pytest.mark.usefixtures("blank_charts")
 def test_an_empty_folder_gives_a_report_and_none_an_error(tmp_path):
     text = Page(write_report(RunFolder(tmp_path))).text()
     assert "Nothing is evaluated yet." in text
@@ -277,6 +290,7 @@ def test_an_empty_folder_gives_a_report_and_none_an_error(tmp_path):
         write_report(RunFolder(tmp_path / "nowhere"))
 
 
+@pytest.mark.usefixtures("blank_charts")
 def test_the_report_tells_what_training_began_with(tmp_path):
     run = whole_run(tmp_path / "run")
     assert "starts from 2,000 sparse points and 12,757 that stereo found" in Page(write_report(run)).text()

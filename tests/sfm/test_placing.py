@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -30,19 +29,10 @@ def console() -> Console:
     return Console(file=io.StringIO(), width=500)
 
 
-@pytest.fixture(scope="module")
-def finished(nine, nine_begun, tmp_path_factory) -> Path:
-    """Placed by GPS; nothing but the capture is kept."""
-    output = tmp_path_factory.mktemp("finished") / "capture"
-    copy_folder(nine_begun["writing"], output)
-    reconstruct(SfmRequest(image_folders=(nine.folder,), output=output, threads=1), console())
-    return output
-
-
 @pytest.fixture
-def capture(finished, tmp_path, monkeypatch) -> Path:
-    """A copy whose features, matches and poses must not be made again."""
-    shutil.copytree(finished, tmp_path / "capture")
+def capture(nine_begun, tmp_path, monkeypatch) -> Path:
+    """A copy, placed by GPS, whose features, matches and poses must not be made again."""
+    copy_folder(nine_begun["done"], tmp_path / "capture")
     for room, name in (
         (feature_extraction, "extract_features"),
         (feature_matching, "match_pairs"),

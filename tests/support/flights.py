@@ -88,7 +88,8 @@ def fly(folder: Path, cameras: Sequence[Camera], extent: float = 60.0) -> Flight
 
 
 def folders_of_steps(flight: Flight, folder: Path) -> dict[str, Path]:
-    """Folders as those of a capture of a flight are when each step of its reconstruction begins, but for the first."""
+    """Folders as those of a capture of a flight are when each step of its reconstruction begins, but for the first, and
+    when it is done."""
     from vdgs.sfm import reconstruct as reconstructing
 
     output = folder / "capture"
@@ -98,7 +99,7 @@ def folders_of_steps(flight: Flight, folder: Path) -> dict[str, Path]:
         reconstructing.reconstruct(
             SfmRequest(image_folders=(flight.folder,), output=output, threads=1), Console(file=io.StringIO())
         )
-    return {step: folder / step for step in ("matching", "mapping", "writing")}
+    return {step: folder / step for step in ("matching", "mapping", "writing")} | {"done": output}
 
 
 def _after_copying(function: Callable, of: Path, to: Path) -> Callable:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
 from vdgs.captures.known_distances import MIN_OBSERVATIONS, intersect_rays
@@ -91,6 +90,8 @@ def _nearest_to_marks(
     model: pycolmap.Reconstruction, images: Mapping[str, pycolmap.Image], seen: Sequence[GcpObservation]
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """The place [3] that marks show, and how far each mark is from it in pixels; None where they show none."""
+    from scipy.optimize import least_squares  # slow to load, and few captures have marks
+
     if len({each.image for each in seen}) < MIN_OBSERVATIONS:
         return None
     views = [images[each.image] for each in seen]

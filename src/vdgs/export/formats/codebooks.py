@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float, Int
-from sklearn.cluster import MiniBatchKMeans
 
 #: Entries of a codebook of numbers.
 CODEBOOK_SIZE = 256
@@ -36,6 +35,8 @@ class VectorCodebook:
     """Rows that stand for all rows: k-means, seeded, learnt from a sample."""
 
     def __init__(self, sample: Float[np.ndarray, "n d"], max_count: int) -> None:
+        from sklearn.cluster import MiniBatchKMeans  # slow to load, and few formats have palettes
+
         count = min(max_count, max(1, len(np.unique(sample, axis=0))))
         means = MiniBatchKMeans(count, batch_size=8192, n_init=1, max_iter=10, random_state=0, init="random",
                                 reassignment_ratio=0.0)  # fmt: skip
