@@ -148,8 +148,10 @@ def train_town(sizes: Sizes, report: Report) -> None:
     with tempfile.TemporaryDirectory() as folder:
         capture = Path(folder) / "capture"
         run_command("synth", str(capture), *sizes.town)
+        # Both at the size that the town has: one chosen for each device would be another for each.
+        same = ("--seed", "1", "--images", "images")
         results = {
-            device: train_and_measure(capture, Path(folder) / device, device, sizes.iterations, "--seed", "1")
+            device: train_and_measure(capture, Path(folder) / device, device, sizes.iterations, *same)
             for device in ("cpu", "cuda")
         }
     for device, (psnr, seconds) in results.items():

@@ -132,7 +132,10 @@ def test_every_stage_of_a_run_says_that_the_disk_is_full_and_continues_to_the_sa
         ("render", "RUN", "--mode", "depth", "--raw", "--output", "DISK/numbers"),
         ("render", "RUN", "--views", "flyover", "--output", "DISK/film.mp4"),
         ("inspect", "CAPTURE", "--output", "DISK/looks"),
-        ("synth", "--size", "toy", "--num-images", "3", "--width", "48", "--height", "36", "DISK/town"),
+        (
+            *("synth", "--size", "toy", "--extent-m", "40", "--num-points", "200"),
+            *("--num-images", "3", "--width", "48", "--height", "36", "DISK/town"),
+        ),
     ],
     ids=lambda command: f"{command[0]} {Path(command[-1]).name}",
 )

@@ -271,29 +271,21 @@ def test_one_block_is_the_whole_scene_and_merging_it_the_identity(copied):
     assert all(torch.equal(t, block.anchors.tensors()[name]) for name, t in merged.anchors.tensors().items())
 
 
-def test_stages_need_those_before_them(capture, tmp_path):
-    run = tmp_path / "run"
-    done = vdgs(
-        "train-coarse",
-        capture,
-        "--output",
-        run,
-        "--preset",
-        "laptop",
-        "--iterations",
-        "30",
-        "--model.num-offsets",
-        "3",
-    )
+def test_stages_need_those_before_them(tmp_path):
+    capture, run = tmp_path / "capture", tmp_path / "run"
+    write_colmap(capture, tiny_scene(columns=3, rows=2, width=32, height=24, points=80))
+    asked = ("--preset", "laptop", "--images", "images", "--iterations", "20", "--model.num-offsets", "3")
+    done = vdgs("train-coarse", capture, "--output", run, *asked)
     assert done.returncode == 0, done.stderr
     for verb, needed in (("train-blocks", "vdgs partition"), ("merge", "vdgs partition")):
         refused = vdgs(verb, run)
         assert refused.returncode == 1
         assert needed in refused.stderr
         assert "Traceback" not in refused.stderr
-    short = ("--block.iterations", "30")
+    short = ("--block.iterations", "20")
+    cut = ("--blocks", "2", "--assignment.min-cameras", "3")
     commands = (
-        ("visibility", run), ("partition", run, "--blocks", "2"), ("train-blocks", run, "--block", "0", *short),
+        ("visibility", run), ("partition", run, *cut), ("train-blocks", run, "--block", "0", *short),
         ("train-blocks", run, "--block", "1"), ("train-blocks", run), ("merge", run), ("eval", run), ("report", run),
     )  # fmt: skip
     for command in commands:
