@@ -95,7 +95,7 @@ def test_what_views_come_to_merges_to_the_bits_of_one_count_and_is_read_back_to_
         cell = Thumbnail("ü", "1 dB", pixels, pixels[::-1].copy()) if place % 2 else None
         save_view_metrics(
             tmp_path / "1.npz",
-            ViewMetrics(row, own, {"median": depth}, cell),
+            ViewMetrics(row, own, {"median": depth}, cell=cell),
             BlockViewMetrics(row, of_blocks, of_seams),
         )
         read, read_blocks = load_view_metrics(tmp_path / "1.npz")

@@ -96,7 +96,7 @@ def test_the_plan_reads_them_as_asked(captures):
         ("no-such-place", PLAIN, VdgsError, "there is no scene 'no-such-place'.*tiny.*such as ./my-place"),
         ("./no-such-place", PLAIN, CaptureError, "no-such-place: no such folder"),
         ("2023", PLAIN, CaptureError, "2023: not a capture itself. 2023/site is a capture"),
-        ("./copr", CaptureOptions(images="images_8"), CaptureError, "images_8: no such folder. Present: images, spar"),
+        ("./copr", CaptureOptions(images="images_8"), CaptureError, "images_8: no such folder.*capture: images, spar"),
         ("./copr", CaptureOptions(downscale=0.5), CaptureError, r"--downscale 0.5: must be at least 1"),
     ],
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +18,7 @@ from vdgs.errors import VdgsError
 from vdgs.evaluation.comparison_images import unique_file_stems, write_png
 from vdgs.evaluation.metrics import to_8bit
 from vdgs.geometry.camera import Camera
+from vdgs.model.lod_scene import LodScene
 from vdgs.model.renderer import Drawable, render
 from vdgs.rendering import camera_paths
 from vdgs.rendering.path_io import load_path
@@ -28,12 +29,13 @@ from vdgs.runs.lod_folder import open_lod
 from vdgs.runs.open_run import OpenedModel, open_capture, open_model
 from vdgs.runs.run_cameras import RunCameras, load_run_cameras, run_cameras_of_capture
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.visibility_store import get_run_visibility, without_rarely_seen
+from vdgs.runs.visibility_store import get_run_visibility, require_some_seen, without_rarely_seen
 from vdgs.system.atomic_files import write_array
 from vdgs.system.console import track
 from vdgs.system.memory.process_memory import available_memory_bytes
 from vdgs.system.stop_signals import check_stop_requested
 from vdgs.system.units import data_size
+from vdgs.visibility.visibility_counts import count_visibility
 
 #: Frames a second of a video of separate views.
 STILLS_FPS = 2.0
@@ -82,8 +84,7 @@ def render_run(request: RenderRequest, console: Console) -> None:
     run_cameras = _load_cameras(request, run)
     check_not_among_folders(request.output, run_cameras.root, run_cameras.input_folders)
     if request.min_visibility:
-        visibility = get_run_visibility(run, run_cameras.cameras)
-        run = replace(run, model=without_rarely_seen(run.model, visibility, request.min_visibility))
+        run, scene = _without_rarely_seen(run, scene, run_cameras.cameras, request.min_visibility)
     if run.warning:
         console.print(f"[yellow]warning[/] {run.warning}", highlight=False)
     named, fps = _named_cameras(request, run_cameras)
@@ -103,6 +104,19 @@ def _open(request: RenderRequest) -> tuple[OpenedModel, Drawable]:
         return run, run.model
     run, tree = open_lod(RunFolder(request.run), request.model, request.device)
     return run, tree.at_error(request.lod_error)
+
+
+def _without_rarely_seen(
+    run: OpenedModel, scene: Drawable, cameras: Sequence[Camera], min_visibility: int
+) -> tuple[OpenedModel, Drawable]:
+    """The model and what it is drawn from, without what fewer of the training cameras see. Raises VdgsError where
+    nothing is left."""
+    if not isinstance(scene, LodScene):
+        model = without_rarely_seen(run.model, get_run_visibility(run, cameras), min_visibility)
+        return replace(run, model=model), model
+    root = count_visibility(scene.tree.gaussians(0).means, cameras)
+    require_some_seen(bool((root >= min_visibility).any()), min_visibility, int(root.max()))
+    return run, scene.with_filter(lambda _, places: count_visibility(places, cameras) >= min_visibility)
 
 
 def _check(request: RenderRequest) -> None:
