@@ -1,4 +1,4 @@
-"""A finished run of two blocks, and a copy of it that a test may change."""
+"""Runs of two blocks: a finished one with a copy of it that a test may change, and one to be trained on clusters."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from support.clusters import copy_run
+from support.clusters import CUT, copy_run, train_here
+from support.commands import vdgs
 
 
 @pytest.fixture(scope="module")
@@ -22,3 +23,18 @@ def unbroken(two_blocks) -> Path:
 @pytest.fixture
 def copied(unbroken, tmp_path) -> Path:
     return copy_run(unbroken, tmp_path / "run")
+
+
+@pytest.fixture(scope="session")
+def cut(uncut, tmp_path_factory) -> Path:
+    """`uncut`, cut into two blocks that are not trained. Not to be changed: `clusters.copy_run`."""
+    run = copy_run(uncut, tmp_path_factory.mktemp("cut") / "cut")
+    done = vdgs("partition", run, *CUT)
+    assert done.returncode == 0, done.stderr + done.stdout
+    return run
+
+
+@pytest.fixture(scope="session")
+def local(cut) -> Path:
+    """`cut`, its blocks trained by this machine alone. Not to be changed."""
+    return train_here(cut, cut.parent / "local")

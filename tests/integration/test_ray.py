@@ -20,11 +20,9 @@ from support.clusters import (
     alive,
     copy_run,
     evaluated,
-    make_run,
     models,
     parent_of,
     shard_of,
-    train_here,
     waiting_shards,
 )  # fmt: skip
 from support.commands import begun, do_tasks_here, python, vdgs, wait_until
@@ -32,20 +30,10 @@ from vdgs import cli
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.xdist_group("ray"),
+    pytest.mark.xdist_group("shards"),
     pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed: pip install 'vdgs[ray]'"),
     pytest.mark.skipif(sys.platform != "linux", reason="who runs on which node is read from /proc"),
 ]
-
-
-@pytest.fixture(scope="module")
-def cut(tmp_path_factory) -> Path:
-    return make_run(tmp_path_factory.mktemp("ray"))
-
-
-@pytest.fixture(scope="module")
-def local(cut) -> Path:
-    return train_here(cut, cut.parent / "local")
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from support.clusters import COARSE, KILLED, alive, copy_run, evaluated, merge_run, train_here
+from support.clusters import COARSE, KILLED, alive, copy_run, evaluated, merge_run
 from support.commands import begun, do_tasks_here, python, vdgs, wait_until
 from support.forking import start_tasks
 from vdgs.evaluation.measured_as import is_evaluated
@@ -18,12 +18,9 @@ pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("shards")]  # one worker
 
 
 @pytest.fixture(scope="module")
-def merged(uncut, tmp_path_factory) -> Path:
+def merged(local, tmp_path_factory) -> Path:
     """Cut into two blocks, trained and merged."""
-    run = copy_run(uncut, tmp_path_factory.mktemp("merged") / "cut")
-    done = vdgs("partition", run, "--blocks", "2", "--assignment.min-cameras", "3")
-    assert done.returncode == 0, done.stderr + done.stdout
-    return merge_run(train_here(run, run.parent / "local"), run.parent / "merged")
+    return merge_run(local, tmp_path_factory.mktemp("merged") / "merged")
 
 
 @pytest.fixture(scope="module")

@@ -16,11 +16,9 @@ from support.clusters import (
     alive,
     copy_run,
     evaluated,
-    make_run,
     models,
     parent_of,
     shard_of,
-    train_here,
     waiting_shards,
 )  # fmt: skip
 from support.commands import begun, do_tasks_here, vdgs, wait_until
@@ -33,21 +31,11 @@ from vdgs.distributed.slurm_executor import make_batch_script
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.xdist_group("slurm"),
+    pytest.mark.xdist_group("shards"),
     pytest.mark.skipif(sys.platform != "linux", reason="who is whose parent is read from /proc"),
 ]
 OWN = ("--cpus", "1", "--mem-gb", "1", "--slurm.poll-seconds", "0.2", "--slurm.time", "1:00:00")
 WITHOUT = "SLURM is not installed: apt-get install slurmctld slurmd slurm-client"
-
-
-@pytest.fixture(scope="module")
-def cut(tmp_path_factory) -> Path:
-    return make_run(tmp_path_factory.mktemp("slurm"))
-
-
-@pytest.fixture(scope="module")
-def local(cut) -> Path:
-    return train_here(cut, cut.parent / "local")
 
 
 BOTH = [pytest.param("real", marks=pytest.mark.skipif(not is_installed(), reason=WITHOUT)), "stand-in"]

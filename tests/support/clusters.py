@@ -13,7 +13,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from support.captures import tiny_scene, write_colmap
 from support.commands import PATIENCE_SECONDS, Command, do_tasks_here, vdgs
 from vdgs.runs.run_folder import RunFolder
 
@@ -165,16 +164,6 @@ def waiting_shards(driver: Command, count: int) -> dict[int, int]:
             if alive(process):
                 found[shard_of(process)] = process
     return found
-
-
-def make_run(folder: Path) -> Path:
-    """A run that is cut into two blocks."""
-    capture, run = folder / "capture", folder / "cut"
-    write_colmap(capture, tiny_scene())
-    for command in (("train-coarse", capture, "--output", run, *COARSE), ("partition", run, *CUT)):
-        done = vdgs(*command)
-        assert done.returncode == 0, done.stderr + done.stdout
-    return run
 
 
 def train_here(run: Path, to: Path) -> Path:
