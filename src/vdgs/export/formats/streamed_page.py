@@ -16,7 +16,7 @@ from vdgs.export.formats.export_scene import ExportScene
 from vdgs.export.formats.file_folders import FileFolder, check_no_folder
 from vdgs.export.formats.gaussian_store import write_store
 from vdgs.export.formats.html import default_page_view, length_factor, packed_rows
-from vdgs.export.formats.lod_quadtree import build_quadtree
+from vdgs.export.formats.tile_quadtree import build_tile_quadtree
 from vdgs.export.formats.tiles_3d import named_tiles
 from vdgs.model.gaussians import Gaussians
 from vdgs.system.atomic_files import write_bytes
@@ -60,7 +60,7 @@ def write_streamed_page(path: Path, scene: ExportScene, node_size: int = MAX_NOD
             write_bytes(folder / f"{name}.bin", packed_rows(gaussians, factor).tobytes())
             return f"{folder.name}/{name}.bin"
 
-        root = build_quadtree(store, write_node, node_size)
+        root = build_tile_quadtree(store, write_node, node_size)
         write_bytes(path.with_name(PAGE_FILE), _PAGE.read_bytes())
         facts = {**scene.metadata.to_dict(), "axes": "z up"}
         view = {"position": page.position, "target": page.target, "fov_deg": FOV_DEG, "background": page.background,

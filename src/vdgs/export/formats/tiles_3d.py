@@ -19,7 +19,7 @@ from vdgs.export.formats.export_scene import ExportMetadata, ExportScene
 from vdgs.export.formats.file_folders import FileFolder, check_no_folder
 from vdgs.export.formats.gaussian_store import write_store
 from vdgs.export.formats.gltf import EXTENSION, SPZ_EXTENSION, spz_glb
-from vdgs.export.formats.lod_quadtree import TilesetNode, build_quadtree
+from vdgs.export.formats.tile_quadtree import TilesetNode, build_tile_quadtree
 from vdgs.geometry.geodesy import ecef_from_geodetic, enu_axes
 from vdgs.model.gaussian_transform import transform_gaussians
 from vdgs.model.gaussians import Gaussians
@@ -55,7 +55,9 @@ def write_tiles(path: Path, scene: ExportScene, max_gaussians: int = MAX_GAUSSIA
             write_bytes(folder / f"{name}.glb", content)
             return f"{folder.name}/{name}.glb"
 
-        return _tileset(build_quadtree(write_store(scene, scratch / "rows"), write_tile, max_gaussians), scene.metadata)
+        return _tileset(
+            build_tile_quadtree(write_store(scene, scratch / "rows"), write_tile, max_gaussians), scene.metadata
+        )
 
     TILE_FOLDER.write(path, fill)
     notes = ["positions are rounded to 0.24 mm, colors and shapes to bytes"]

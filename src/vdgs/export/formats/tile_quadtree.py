@@ -39,7 +39,7 @@ class TilesetNode:
     error: float
 
 
-def build_quadtree(scene: GaussianStore, write: WriteContent, max_count: int) -> TilesetNode:
+def build_tile_quadtree(scene: GaussianStore, write: WriteContent, max_count: int) -> TilesetNode:
     """Write all nodes of a scene, at most so many Gaussians in each, and return the root."""
     return _Quadtree(scene, write, max_count).build()
 
