@@ -179,8 +179,11 @@ def _named_system(file: Path) -> tuple[ToGeodetic, str] | None:
     for info in sorted(file.parent.glob(_INFO)):
         try:
             found = _SYSTEM.search(info.read_text(encoding="utf-8-sig", errors="replace"))
-        except OSError:
-            continue
+        except OSError as error:
+            raise CaptureError(
+                f"{info}: names the coordinate system of the export, and cannot be read ({error.strerror or error}). "
+                "Copy it again."
+            ) from error
         if found is not None:
             return to_geodetic(f"EPSG:{found[1]}", info, "globalCoordinateSystemName")
     return None

@@ -1,0 +1,101 @@
+"""OPF of Pix4D, written by its specification, against the flight that wrote it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from support import project_writers as writers
+from support.known_flight import (
+    KnownFlight,
+    centers_of,
+    known_flight,
+    poses_of,
+)
+from support.project_reading import check_numbers, known_points, read
+from vdgs.captures.format_dispatch import read_source
+from vdgs.captures.formats.lens_projection import ray_pixels
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.errors import CaptureError
+
+
+@pytest.fixture
+def flight() -> KnownFlight:
+    return known_flight()
+
+
+def test_opf_is_read_to_its_numbers(tmp_path: Path, flight: KnownFlight) -> None:
+    writers.write_opf(tmp_path, flight)
+    flight.write_photographs(tmp_path / "images")
+    source = read(tmp_path, "opf")
+    check_numbers(source, flight)
+    assert source.georef is not None
+    assert source.georef.origin is not None
+    assert np.abs(source.points - known_points(flight, source.georef.origin)).max() < 1e-3
+    assert all(len(view.observations.points) > 20 for view in source.views if view.observations)
+    assert sum(view.observations is not None for view in source.views) == len(flight.names)
+    assert (source.colors == flight.colors).all()
+
+
+def test_fisheyes_of_opf_are_their_formula(tmp_path: Path, flight: KnownFlight) -> None:
+    writers.write_opf(tmp_path, flight)
+    flight.write_photographs(tmp_path / "images")
+    file = tmp_path / "calibrated-cameras.json"
+    content = json.loads(file.read_text())
+    content["sensors"][0]["internals"] = {
+        "type": "fisheye", "principal_point_px": [401.0, 299.0], "affine": [600.0, 1.0, -1.0, 601.0],
+        "polynomial": [0.0, 1.0, 0.02, -0.03], "is_p0_zero": True, "is_symmetric_affine": False,
+    }  # fmt: skip
+    for camera, shutter in zip(content["cameras"], ([0, 0, 0], [0.1, 0, 0], [0, 0, 0.02], "linear"), strict=False):
+        camera["rolling_shutter"] = shutter
+    file.write_text(json.dumps(content))
+    assert any("rolling shutter of 2 photographs" in each for each in read(tmp_path, "opf").warnings)
+    rays = np.array([[0.5, 0.3], [-0.9, 0.1], [0.0, -1.4]])
+    theta = 2 / np.pi * np.arctan(np.hypot(*rays.T))
+    bent = rays * ((theta + 0.02 * theta**2 - 0.03 * theta**3) / np.hypot(*rays.T))[:, None]
+    expected = bent @ np.array([[600.0, 1.0], [-1.0, 601.0]]).T + (401.0, 299.0)
+    assert np.abs(ray_pixels(read(tmp_path, "opf").views[0].intrinsics, rays) - expected).max() < 1e-6
+    content["sensors"][0]["internals"]["polynomial"][0] = 0.1
+    file.write_text(json.dumps(content))
+    with pytest.raises(CaptureError, match=r"12 of its 12 cameras(?s:.)*polynomial"):
+        read(tmp_path, "opf")
+
+
+def test_opf_of_a_site_is_metres_without_a_place(tmp_path: Path, flight: KnownFlight) -> None:
+    writers.write_opf(tmp_path, flight)
+    flight.write_photographs(tmp_path / "images")
+    frame = tmp_path / "scene-reference-frame.json"
+    content = json.loads(frame.read_text())
+    content["crs"]["definition"] = "Site grid 7"
+    frame.write_text(json.dumps(content))
+    assert any("'Site grid 7' is not known" in each for each in read(tmp_path, "opf").warnings)
+    content["crs"]["definition"] = (
+        'ENGINEERINGCRS["Site",ENGINEERINGDATUM["Corner"],CS[Cartesian,3],LENGTHUNIT["metre",1.0]]'
+    )
+    frame.write_text(json.dumps(content))
+    source = read(tmp_path, "opf")
+    assert source.georef is not None
+    assert source.georef.origin is None
+    source = read_source(tmp_path, CaptureOptions(format="opf"), needs_points=False)
+    apart = np.linalg.norm(np.diff(centers_of(poses_of(source, flight)), axis=0), axis=1)
+    true = np.linalg.norm(np.diff(flight.centers, axis=0), axis=1)
+    assert np.abs(apart / true - 1).max() < 1e-3  # UTM's scale
+
+
+def test_opf_without_calibration_and_with_missing_files_says_so(tmp_path: Path, flight: KnownFlight) -> None:
+    file = writers.write_opf(tmp_path, flight)
+    flight.write_photographs(tmp_path / "images")
+    content = json.loads(file.read_text())
+    (tmp_path / "point_cloud" / "positions.bin").write_bytes(b"short")
+    with pytest.raises(CaptureError, match=r"positions\.bin: has 5 bytes"):
+        read(tmp_path, "opf")
+    (tmp_path / "point_cloud" / "positions.bin").unlink()
+    with pytest.raises(CaptureError, match=r"positions\.bin"):
+        read(tmp_path, "opf")
+    content["items"] = [item for item in content["items"] if item["type"] != "calibration"]
+    file.write_text(json.dumps(content))
+    with pytest.raises(CaptureError, match="not calibrated"):
+        read(tmp_path, "opf")

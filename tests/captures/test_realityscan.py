@@ -1,0 +1,181 @@
+"""Tables and XMP of RealityScan, written as the program writes them, against the flight that wrote them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from support import project_writers as writers
+from support.known_flight import (
+    ORIGIN,
+    BentLens,
+    KnownFlight,
+    centers_of,
+    known_flight,
+)
+from support.project_reading import check_numbers, read
+from vdgs.errors import CaptureError
+from vdgs.geometry.geodesy import geodetic_from_enu
+
+
+@pytest.fixture
+def flight() -> KnownFlight:
+    return known_flight()
+
+
+@pytest.mark.parametrize(
+    "lens", [BentLens(), BentLens(k=(-0.11, 0.034, -0.008, 0.004)), BentLens(k=(0, 0, 0, 0), p=(0, 0))]
+)
+def test_table_of_realityscan_is_read_to_its_numbers(tmp_path: Path, lens: BentLens) -> None:
+    flight = known_flight(lens)
+    writers.write_realityscan_csv(tmp_path / "cameras.csv", flight)
+    flight.write_photographs(tmp_path / "images")
+    check_numbers(read(tmp_path, "realityscan"), flight, placed=False)
+
+
+def test_table_of_realityscan_for_opencv_is_read_to_its_numbers(tmp_path: Path, flight: KnownFlight) -> None:
+    file = writers.write_realityscan_opencv_csv(tmp_path / "cameras.csv", flight)
+    flight.write_photographs(tmp_path / "images")
+    check_numbers(read(tmp_path, "realityscan"), flight, placed=False)
+    file.write_text(file.read_text().replace(f",{flight.lens.center[0]!r},", ",913.0,"))
+    with pytest.raises(CaptureError, match="of another size"):
+        read(tmp_path, "realityscan")
+
+
+def test_version_2_of_realityscan_calls_its_columns_otherwise(tmp_path: Path, flight: KnownFlight) -> None:
+    file = writers.write_realityscan_csv(tmp_path / "cameras.csv", flight)
+    lines = file.read_text().splitlines()
+    lines[0] = "#name,x,y,alt,yaw,pitch,roll,f_35mm,px_norm,py_norm,k1,k2,k3,k4,t1,t2"
+    file.write_text("\n".join(lines))
+    flight.write_photographs(tmp_path / "images")
+    check_numbers(read(tmp_path, "realityscan"), flight, placed=False)
+
+
+def test_information_beside_a_cloud_of_realityscan_places_its_table(tmp_path: Path, flight: KnownFlight) -> None:
+    code, poses, _, centers = writers.utm_flight(flight)
+    writers.write_realityscan_csv(tmp_path / "cameras.csv", flight, centers, poses)
+    flight.write_photographs(tmp_path / "images")
+    (tmp_path / "cloud.ply.rsInfo").write_text(
+        f'<Model globalCoordinateSystem="+proj=utm" globalCoordinateSystemName="{code.lower()} - WGS 84 / UTM"/><X/>'
+    )
+    check_numbers(read(tmp_path, "realityscan"), flight)
+    (tmp_path / "cloud.ply.rsInfo").unlink()
+    assert read(tmp_path, "realityscan").georef.origin is None  # type: ignore[union-attr]
+    (tmp_path / "cloud.ply.rsInfo").symlink_to(tmp_path / "gone")  # a place must not get lost in silence
+    with pytest.raises(CaptureError, match=r"cloud\.ply\.rsInfo: .* cannot be read"):
+        read(tmp_path, "realityscan")
+
+
+def test_angles_that_degrees_have_spoiled_are_refused(tmp_path: Path, flight: KnownFlight) -> None:
+    degrees = geodetic_from_enu(flight.centers, ORIGIN)[:, [1, 0, 2]]
+    file = writers.write_realityscan_csv(tmp_path / "cameras.csv", flight, degrees)
+    flight.write_photographs(tmp_path / "images")
+    lines = [line.split(",") for line in file.read_text().splitlines()]
+    file.write_text(
+        "\n".join(
+            ",".join([*line[:5], *(line[5:7] if not k else ["1.5e-4", "89.9993"]), *line[7:]])
+            for k, line in enumerate(lines)
+        )
+    )
+    with pytest.raises(CaptureError, match="its cameras mean nothing"):
+        read(tmp_path, "realityscan")
+
+
+def test_table_of_realityscan_in_degrees_is_placed(tmp_path: Path, flight: KnownFlight) -> None:
+    level = _turned_to_each_place(flight)
+    degrees = geodetic_from_enu(flight.centers, ORIGIN)[:, [1, 0, 2]]
+    writers.write_realityscan_csv(tmp_path / "cameras.csv", level, degrees)
+    flight.write_photographs(tmp_path / "images")
+    check_numbers(read(tmp_path, "realityscan"), flight)
+
+
+def _turned_to_each_place(flight: KnownFlight) -> KnownFlight:
+    """The flight with the rotation of each camera about the east, north and up of where it is."""
+    from vdgs.geometry.geodesy import enu_axes
+
+    poses = np.array(flight.poses)
+    for pose, (latitude, longitude, _) in zip(poses, geodetic_from_enu(flight.centers, ORIGIN), strict=True):
+        pose[:3, :3] = pose[:3, :3] @ enu_axes(*ORIGIN[:2]) @ enu_axes(latitude, longitude).T
+    return replace(flight, poses=poses)
+
+
+def test_semicolons_decimal_commas_and_other_names_of_columns_are_understood(
+    tmp_path: Path, flight: KnownFlight
+) -> None:
+    file = writers.write_realityscan_csv(tmp_path / "cameras.csv", flight)
+    lines = file.read_text().replace(",", ";").replace(".", ",").replace(",JPG", ".JPG").splitlines()
+    lines[0] = (
+        "#Name;Easting;Northing;Altitude;Yaw;Pitch;Roll;FocalLength35mm;PrincipalPointU;PrincipalPointV;k1;k2;k3;k4;t1;t2"
+    )
+    file.write_text("\ufeff#cameras 12\n" + "\r\n".join(lines), encoding="utf-8")
+    flight.write_photographs(tmp_path / "images")
+    check_numbers(read(tmp_path, "realityscan"), flight, placed=False)
+
+
+def test_xmp_of_photographs_that_are_called_alike_in_folders(tmp_path: Path, flight: KnownFlight) -> None:
+    images = tmp_path / "images"
+    halves = [replace(flight, poses=flight.poses[k::2], names=flight.names[:6]) for k in (0, 1)]
+    for number, half in enumerate(halves):
+        half.write_photographs(images / f"10{number}MEDIA")
+        writers.write_realityscan_xmp(images / f"10{number}MEDIA", half)
+    source = read(tmp_path, "realityscan")
+    poses = np.stack([view.camera_from_world for view in source.views])
+    assert np.abs(centers_of(poses) - np.concatenate([half.centers for half in halves])).max() < 1e-9
+
+
+@pytest.mark.parametrize("as_attributes", [False, True])
+def test_xmp_of_realityscan_is_read_to_its_numbers(tmp_path: Path, flight: KnownFlight, as_attributes: bool) -> None:
+    flight.write_photographs(tmp_path / "images")
+    writers.write_realityscan_xmp(tmp_path / "images", flight, as_attributes=as_attributes)
+    check_numbers(read(tmp_path, "realityscan"), flight, placed=False)
+
+
+def test_xmp_without_a_pose_and_of_other_lenses_is_named(tmp_path: Path, flight: KnownFlight) -> None:
+    images = tmp_path / "images"
+    flight.write_photographs(images)
+    writers.write_realityscan_xmp(images, flight)
+    first, second = ((images / name).with_suffix(".xmp") for name in flight.names[:2])
+    first.write_text(first.read_text().replace("xcr:Rotation", "xcr:Gravity"))
+    second.write_text(second.read_text().replace("brown4t2", "division"))
+    source = read(tmp_path, "realityscan")
+    assert len(source.views) == len(flight.names) - 2
+    [note] = [note for note in source.warnings if "cannot be used" in note]
+    assert "'division'" in note
+    assert any("not aligned" in each and flight.names[0][:-4] in each for each in source.warnings)
+
+
+def test_xmp_of_other_writers_is_read(tmp_path: Path, flight: KnownFlight) -> None:
+    """RealityScan's own sample has the model division without distortion; other programs write three terms of six."""
+    flight = replace(flight, lens=BentLens(k=(0, 0, 0, 0), p=(0, 0)))
+    flight.write_photographs(tmp_path / "images")
+    writers.write_realityscan_xmp(tmp_path / "images", flight)
+    files = sorted((tmp_path / "images").glob("*.xmp"))
+    for index, file in enumerate(files):
+        text = file.read_text().replace('"brown4t2"', '"division"' if index % 2 else '"brown3"')
+        file.write_text(text.replace("<xcr:DistortionCoeficients>0 0 0 ", "<xcr:DistortionCoeficients>"))
+    check_numbers(read(tmp_path, "realityscan"), flight, placed=False)
+    for file in files:
+        file.write_text(file.read_text().replace("xcr:Version", 'xcr:ProjectionModel="spherical" xcr:Version'))
+    with pytest.raises(CaptureError, match=r"12 of its 12 cameras cannot be used(.|\n)*'spherical' is not supported"):
+        read(tmp_path, "realityscan")
+
+
+def test_focal_lengths_in_pixels_are_refused(tmp_path: Path, flight: KnownFlight) -> None:
+    file = writers.write_realityscan_csv(tmp_path / "cameras.csv", flight)
+    flight.write_photographs(tmp_path / "images")
+    file.write_text(file.read_text().replace(",31.5,", ",3656.4,"))
+    with pytest.raises(CaptureError, match="in pixels"):
+        read(tmp_path, "realityscan")
+
+
+def test_rows_that_cannot_be_read_are_told_all_at_once(tmp_path: Path, flight: KnownFlight) -> None:
+    file = writers.write_realityscan_csv(tmp_path / "cameras.csv", flight)
+    flight.write_photographs(tmp_path / "images")
+    lines = file.read_text().splitlines()
+    lines[2], lines[5] = lines[2].replace(",", ",x", 1), "short.jpg,1,2"
+    file.write_text("\n".join(lines))
+    with pytest.raises(CaptureError, match=r"2 of its rows(.|\n)*line 3(.|\n)*line 6"):
+        read(tmp_path, "realityscan")
