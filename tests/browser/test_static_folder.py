@@ -80,4 +80,5 @@ def test_the_page_shows_what_we_draw_and_loads_what_is_near(tmp_path):
 def test_a_page_that_was_opened_as_a_file_says_how_to_serve_it(tmp_path):
     write_streamed_page(tmp_path / "scene.json", ExportScene.of(random_gaussians(20, 0)))
     with open_page((tmp_path / "index.html").as_uri(), SIZE, SIZE) as page:
-        wait_until(lambda: "http.server" in page.evaluate("document.body.innerText"))
+        wait_until(lambda: page.evaluate("document.body.dataset.state") == "failed")
+        assert "http.server" in page.evaluate("document.body.innerText")
