@@ -31,11 +31,13 @@ $(BIN)/python:
 
 # PIP_CONSTRAINT also pins the tools that pip installs only for building.
 $(STAMP): $(BIN)/python $(SOURCES)
+	@echo "installing vdgs into $(VENV) and compiling its kernels: some minutes"
 	$(INSTALL) -e '.[demo,viewer]'
 	@touch $(STAMP)
 
 # The tests need more: linters, Ray, readers of what is exported.
 $(TEST_STAMP): $(STAMP)
+	@echo "installing what the tests need"
 	$(INSTALL) -e '.[test]'
 	@touch $(TEST_STAMP)
 

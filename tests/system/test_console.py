@@ -29,6 +29,21 @@ def test_all_items_come_with_or_without_a_terminal() -> None:
         assert list(track(range(5), "drawing", 5, console)) == list(range(5))
 
 
+def test_a_log_gets_a_line_of_progress_every_quarter_of_a_minute() -> None:
+    moments = iter(range(0, 1000, 1))
+    console = Console(file=io.StringIO(), width=100)
+    with make_progress_bar(console) as bar:
+        bar.get_time = lambda: float(next(moments))
+        bar._last_line = 0.0
+        task = bar.add_task("fitting [colors]", total=40)
+        for _ in range(20):
+            bar.advance(task)
+    lines = console.file.getvalue().splitlines()
+    assert 2 <= len(lines) <= 20
+    assert all(line.startswith("fitting [colors]  ") and "%" in line for line in lines)
+    assert lines[-1].endswith(" left")
+
+
 def test_a_note_is_printed_once_on_each_console() -> None:
     for _ in range(2):
         console = Console(file=io.StringIO())

@@ -75,6 +75,9 @@ def help_text(verb: str, kind: type, settings: Any, *, full: bool) -> str:
     hidden = len(options) - sum(map(len, groups.values()))
     if hidden:
         lines += textwrap.wrap(f"{hidden} more options and all explanations: vdgs {verb} --help-all", width)
+        if any(each.flag == "--sfm.gcp" for each in options):
+            text = "Options of `vdgs sfm`, for photographs, start with --sfm. here, such as --sfm.gcp gcp_list.txt."
+            lines += textwrap.wrap(text, width)
         if any(each.flag == "--config" for each in options):
             lines += textwrap.wrap(
                 "Settings in a file: `vdgs config --output settings.yaml` writes all of them with comments, "

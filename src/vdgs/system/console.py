@@ -5,17 +5,28 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import TypeVar
+from typing import Any, TypeVar
 from weakref import WeakKeyDictionary
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TaskProgressColumn, TextColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TaskID,
+    TaskProgressColumn,
+    TextColumn,
+)
 from rich.text import Text
 
 from vdgs.system.stop_signals import check_stop_requested
 from vdgs.system.units import clock
 
 Item = TypeVar("Item")
+#: Between two lines of work whose console is no terminal.
+LINE_INTERVAL_SECONDS = 15.0
 
 #: Brackets that rich would take for styles, but for those that lines of ours have.
 _NOT_OURS = re.compile(
@@ -35,12 +46,39 @@ class TimeLeftColumn(ProgressColumn):
         return Text("" if left is None else f"{clock(left)} left", style="progress.remaining")
 
 
+class _LineProgress(Progress):
+    """Prints a line now and then instead of a bar: what a log can hold."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__(console=console, disable=True)
+        self._last_line = self.get_time()
+
+    def update(self, task_id: TaskID, **changes: Any) -> None:
+        super().update(task_id, **changes)
+        self._print_line(task_id)
+
+    def advance(self, task_id: TaskID, advance: float = 1) -> None:
+        super().advance(task_id, advance)
+        self._print_line(task_id)
+
+    def _print_line(self, task_id: TaskID) -> None:
+        now = self.get_time()
+        if now - self._last_line < LINE_INTERVAL_SECONDS:
+            return
+        self._last_line, task = now, self._tasks[task_id]
+        share = "" if task.total is None else f"  {task.percentage:.0f}%"
+        left = TimeLeftColumn().render(task).plain
+        self.console.print(f"{task.description}{share}  {left}".rstrip(), highlight=False, markup=False)
+
+
 def make_progress_bar(console: Console, counts: bool = False, transient: bool = True) -> Progress:
-    """A bar of the progress of work, to be used as a context; hidden where the console is no terminal. With `counts`
-    the bar says how many items are done, else what share."""
+    """A bar of the progress of work, to be used as a context; where the console is no terminal, a line every
+    `LINE_INTERVAL_SECONDS`. With `counts` the bar says how many items are done, else what share."""
+    if not console.is_terminal:
+        return _LineProgress(console)
     done = MofNCompleteColumn() if counts else TaskProgressColumn()
     columns = (TextColumn("{task.description}"), BarColumn(), done, TimeLeftColumn())
-    return Progress(*columns, console=console, disable=not console.is_terminal, transient=transient)
+    return Progress(*columns, console=console, transient=transient)
 
 
 def track(items: Iterable[Item], description: str, total: int, console: Console) -> Iterator[Item]:

@@ -15,13 +15,10 @@ from vdgs.config.method import TrainConfig
 from vdgs.runs.stage_folder import StageFolder, StatusRecord
 from vdgs.system.atomic_files import explain_disk_errors
 from vdgs.system.console import make_progress_bar
-from vdgs.system.units import clock
 from vdgs.training import StepReport, TrainingState, downscale_at
 
 #: Iterations between two lines of log.jsonl.
 LOG_INTERVAL = 50
-#: Seconds between two lines where there is no terminal to redraw.
-LINE_INTERVAL_SECONDS = 15.0
 #: What TensorBoard shows.
 TENSORBOARD_SCALARS = ("loss", "l1", "ssim", "psnr_smoothed", "anchors", "splats")
 
@@ -30,12 +27,11 @@ class TrainingProgress:
     """A bar on a terminal, a line now and then elsewhere, and log.jsonl always."""
 
     def __init__(self, console: Console, folder: StageFolder, config: TrainConfig, start: int, board: Any = None):
-        self._console, self._config, self._board = console, config, board
+        self._config, self._board = config, board
         self._file = folder.log
         with explain_disk_errors(self._file):
             self._log: TextIO = self._file.open("a", encoding="utf-8")
         self._recent: deque[tuple[float, int]] = deque([(time.monotonic(), start)], maxlen=200)
-        self._last_line = time.monotonic()
         self._process = psutil.Process()
         self._bar = make_progress_bar(console, transient=False)
         self._task = self._bar.add_task("starting", total=config.iterations, completed=start)
@@ -57,11 +53,6 @@ class TrainingProgress:
         if state.iteration % 10 == 0:
             self._recent.append((now, state.iteration))
             self._bar.update(self._task, completed=state.iteration, description=self._line(state))
-        if not self._console.is_terminal and now - self._last_line > LINE_INTERVAL_SECONDS:
-            self._last_line = now
-            left = self._seconds_left(state)
-            said = self._line(state) + ("" if left is None else f"  {clock(left)} left")
-            self._console.print(said, highlight=False)
         if state.iteration % LOG_INTERVAL == 0 or report.grown is not None:
             self._write(state, report)
 
