@@ -55,13 +55,11 @@ def data(tmp_path_factory) -> Path:
 
 def test_the_published_data_sets_are_benched(data, tmp_path):
     """Their folders are found and read, methods run with the paper's settings, and pixels are grouped by V."""
-    asked = ("--scenes", "residence", "block-all", "--methods", "3dgs", "blocks-2", "--total-iterations", "40")
+    asked = ("--scenes", "residence", "block-all", "--methods", "blocks-2", "--total-iterations", "40")
     done = vdgs("bench", "table1", "--output", tmp_path, "--data", data, *asked, "--seeds", "1", prepare=do_tasks_here)
     assert done.returncode == 0, done.stderr
     results = json.loads((tmp_path / "table1" / "results.json").read_text())["results"]
-    assert [(each["scene"], each["method"], each["state"]) for each in results] == [
-        (scene, method, "done") for scene in ("residence", "block-all") for method in ("3dgs", "blocks-2")
-    ]
+    assert [(each["scene"], each["state"]) for each in results] == [("residence", "done"), ("block-all", "done")]
     for each in results:
         assert 5 < each["figures"]["psnr"] < 40
         assert each["figures"]["psnr@0"] is not None

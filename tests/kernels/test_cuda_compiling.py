@@ -19,6 +19,8 @@ from vdgs.kernels.cuda.nvrtc import CompileError, CompileTarget, CudaUnavailable
 pytestmark = pytest.mark.slow
 
 ARCHITECTURES = (75, 80, 86, 89, 90, 100, 120)
+#: Those whose compilers hand out registers in ways of their own; the others do as the one before them.
+UNLIKE = (75, 86, 90, 120)
 
 
 @pytest.fixture(autouse=True)
@@ -66,15 +68,13 @@ SOURCES = {
 
 
 @needs_nvrtc
-@pytest.mark.parametrize("architecture", ARCHITECTURES)
+@pytest.mark.parametrize("architecture", UNLIKE)
 @pytest.mark.parametrize("source", SOURCES)
-def test_every_source_compiles_for_every_card_and_spills_nothing(source, architecture):
+def test_every_source_compiles_and_spills_nothing(source, architecture):
     """Of 64 registers, four blocks of 256 threads fit on every card, of 255 one; of 16 KiB shared memory four."""
     headers, kernels = SOURCES[source]
     found = resources_of(source, CompileTarget(f"sm_{architecture}"), headers, COMPILER)
     assert {each.kernel for each in found} == kernels
-    for each in found:
-        print(f"sm_{architecture} {each}")
     assert all(each.spilled_bytes == 0 for each in found)
     assert all(0 < each.registers <= (255 if each.kernel == "move_anchors" else 64) for each in found)
     assert all(each.shared_bytes <= 16384 for each in found)

@@ -21,7 +21,7 @@ pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark
 
 @pytest.fixture(scope="module")
 def library(compiled_code):
-    return build_on_host(PROGRAM.name, compiled_code)
+    return build_on_host(compiled_code)
 
 
 def kept(

@@ -9,13 +9,13 @@ from functools import partial
 import pytest
 import torch
 
-from support.cuda_on_host import ORDERS, HostDriver, build_on_host, needs_a_compiler, needs_nvrtc
+from support.cuda_on_host import ORDERS, HostDriver, barriers_of, build_on_host, needs_a_compiler, needs_nvrtc
 from support.decode_scenes import Scene, looking_down, moved_by, turned
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.cuda.decode import PROGRAM, SplatCapacity, decode, decode_for_training, expand_sources
 from vdgs.kernels.cuda.decode_adam import decode_backward_adam
 from vdgs.kernels.cuda.driver import get_cuda_driver
-from vdgs.kernels.cuda.launch import CudaProgram, PackedCamera, read_header, read_source
+from vdgs.kernels.cuda.launch import CudaProgram, PackedCamera, read_header
 from vdgs.kernels.kernel_types import AdamState, AnchorSplats, SplatGradients, Splats, TrainingSplats
 from vdgs.kernels.splat_segments import SplatMask
 from vdgs.kernels.torch_ref.decode import decode as reference
@@ -23,6 +23,8 @@ from vdgs.kernels.torch_ref.decode_adam import decode_backward_adam as by_refere
 
 pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_decode")]
 
+#: Of the decoder, and of what moves anchors.
+*BARRIERS, BARRIER_OF_MOVING = barriers_of("decode")
 CAMERAS = {
     "down": looking_down(),
     "turned": turned(),
@@ -33,11 +35,14 @@ CAMERAS = {
 
 @pytest.fixture(scope="module")
 def library(compiled_code):
-    return build_on_host(PROGRAM.name, compiled_code)
+    return build_on_host(compiled_code)
 
 
-def decoded(scene: Scene, camera: Camera, library: ctypes.CDLL, rows=None, order: int = 0) -> AnchorSplats:
-    program = CudaProgram(name=PROGRAM.name, driver=HostDriver(library, order), headers=PROGRAM.headers)
+def decoded(
+    scene: Scene, camera: Camera, library: ctypes.CDLL, rows=None, order: int = 0, left_out: int = -1
+) -> AnchorSplats:
+    driver = HostDriver(library, order, left_out=left_out)
+    program = CudaProgram(name=PROGRAM.name, driver=driver, headers=PROGRAM.headers)
     anchors = scene.positions, scene.features, scene.offsets, scene.log_scales
     with torch.no_grad():
         return decode(*anchors, scene.weights, camera, rows, program=program)
@@ -193,13 +198,11 @@ def test_room_follows_what_views_need():
 
 
 @needs_a_compiler
-def test_barriers_that_are_missing_are_noticed(tmp_path):
+@pytest.mark.parametrize("barrier", BARRIERS)
+def test_a_missing_barrier_would_be_noticed(barrier, library):
     """Those of blocks: before splats are added up, and before a block's place is read."""
-    first, second, third = read_source(PROGRAM.name).split("__syncthreads();")
-    for one, other in (("", "__syncthreads();"), ("__syncthreads();", "")):
-        without = build_on_host(PROGRAM.name, tmp_path, first + one + second + other + third)
-        found = [decoded(Scene.random(61, 10), turned(), without, order=turns) for turns in (0, 1)]
-        assert not all(torch.equal(*(getattr(each, field.name) for each in found)) for field in fields(AnchorSplats))
+    found = [decoded(Scene.random(61, 10), turned(), library, order=turns, left_out=barrier) for turns in (0, 1)]
+    assert not all(torch.equal(*(getattr(each, field.name) for each in found)) for field in fields(AnchorSplats))
 
 
 @needs_a_compiler
@@ -324,13 +327,12 @@ class TestMoving:
         assert all(torch.equal(one, other) for one, other in zip(results[0][1], results[1][1], strict=True))
         assert all(torch.equal(one, other) for one, other in zip(results[0][3], results[1][3], strict=True))
 
-    def test_a_missing_barrier_would_be_noticed(self, tmp_path):
+    def test_a_missing_barrier_would_be_noticed(self, library):
         """The only one, of warps: it keeps a lane from counting up what others have not read yet."""
-        before, after = read_source(PROGRAM.name).split("__syncwarp();")
-        without = build_on_host(PROGRAM.name, tmp_path, before + after)
         scene, results = Scene.random(9, 4), []
         for turns in (0, 1):
-            program = CudaProgram(name=PROGRAM.name, driver=HostDriver(without, turns), headers=PROGRAM.headers)
+            driver = HostDriver(library, turns, left_out=BARRIER_OF_MOVING)
+            program = CudaProgram(name=PROGRAM.name, driver=driver, headers=PROGRAM.headers)
             results.append(moved_by(partial(decode_backward_adam, program=program), scene, turned(), torch.arange(9)))
         assert not all(torch.equal(one, other) for one, other in zip(results[0][1], results[1][1], strict=True))
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import ctypes
-
 import numpy as np
 import pytest
 import torch
 
-from support.cuda_on_host import HostDriver, build_on_host, needs_a_compiler, needs_nvrtc
+from support.cuda_on_host import HostDriver, barriers_of, build_on_host, needs_a_compiler, needs_nvrtc
 from support.loss_scenes import scene, with_gradient
 from vdgs.kernels.cuda import loss as cuda
 from vdgs.kernels.cuda.driver import CudaUnavailable, get_cuda_driver
@@ -17,24 +15,12 @@ from vdgs.kernels.torch_ref import loss as reference
 
 pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_loss")]
 
-#: How many the kernels have.
-BARRIERS = 7
 SIZES = [(1, 1), (3, 2), (16, 16), (17, 33), (37, 50), (64, 31)]
 
 
 @pytest.fixture(scope="module")
 def library(compiled_code):
-    return build_on_host("loss.cu", compiled_code)
-
-
-@pytest.fixture(scope="module")
-def numbered(compiled_code):
-    """The kernels, of whose barriers one can be left out: that of the number `left_out`."""
-    before, *after = read_source("loss.cu").split("__syncthreads();")
-    assert len(after) == BARRIERS
-    parts = [f"if (left_out != {number}) __syncthreads();{part}" for number, part in enumerate(after)]
-    text = 'extern "C" int left_out;\nint left_out = -1;\n' + before + "".join(parts)
-    return build_on_host("loss.cu", compiled_code, text)
+    return build_on_host(compiled_code)
 
 
 @pytest.fixture
@@ -81,19 +67,17 @@ def test_no_barrier_is_missing(program, library):
 
 
 @needs_a_compiler
-@pytest.mark.parametrize("barrier", range(BARRIERS))
-def test_a_missing_barrier_would_be_noticed(barrier, numbered):
+@pytest.mark.parametrize("barrier", barriers_of("loss"))
+def test_a_missing_barrier_would_be_noticed(barrier, library):
     """And every barrier is needed: without any one of them the order of turns changes the result."""
     image, target, _ = scene(18, 17)
-    left_out = ctypes.c_int.in_dll(numbered, "left_out")
 
-    def loss_and_gradient(left: int, order: int) -> tuple[float, bytes]:
-        left_out.value = left
-        result, gradient = on_host(CudaProgram(name="loss.cu", driver=HostDriver(numbered, order)), image, target)
+    def loss_and_gradient(order: int) -> tuple[float, bytes]:
+        driver = HostDriver(library, order, left_out=barrier)
+        result, gradient = on_host(CudaProgram(name="loss.cu", driver=driver), image, target)
         return float(result.loss.detach()), gradient.numpy().tobytes()
 
-    assert loss_and_gradient(barrier, 0) != loss_and_gradient(barrier, 1)
-    assert loss_and_gradient(-1, 0) == loss_and_gradient(-1, 1)
+    assert loss_and_gradient(0) != loss_and_gradient(1)
 
 
 @needs_a_compiler

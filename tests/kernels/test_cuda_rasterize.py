@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import ctypes
-import re
 from dataclasses import fields, replace
 
 import pytest
 import torch
 
-from support.cuda_on_host import ORDERS, HostDriver, Stuck, build_on_host, needs_a_compiler, needs_nvrtc
+from support.cuda_on_host import (
+    ORDERS,
+    HostDriver,
+    Stuck,
+    barriers_of,
+    build_on_host,
+    needs_a_compiler,
+    needs_nvrtc,
+)
 from support.rasterize_scenes import (
     Scene,
     assert_close,
@@ -21,16 +28,13 @@ from support.rasterize_scenes import (
     splats_of,
 )
 from vdgs.kernels.cuda.driver import get_cuda_driver
-from vdgs.kernels.cuda.launch import CudaProgram, read_source
+from vdgs.kernels.cuda.launch import CudaProgram
 from vdgs.kernels.cuda.rasterize import PROGRAM, rasterize, rasterize_vjp
 from vdgs.kernels.kernel_types import Raster, Splats
 from vdgs.kernels.torch_ref.rasterize import rasterize as reference
 
 pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_rasterize")]
 
-#: Whatever makes the threads of a block wait for each other.
-BARRIER = re.compile(r"__syncthreads(?:_and|_or)?\(")
-BARRIERS = 5
 SCENES = {
     "ordinary": make_scene(150, 37, 29),
     "dense": make_scene(700, 20, 18, opacity=2.0),
@@ -46,35 +50,19 @@ SCENES = {
 
 @pytest.fixture(scope="module")
 def library(compiled_code):
-    return build_on_host("rasterize.cu", compiled_code)
+    return build_on_host(compiled_code)
 
 
-@pytest.fixture(scope="module")
-def numbered(compiled_code):
-    """The kernels, of whose barriers one can be left out: that of the number `left_out`."""
-    text, number = read_source("rasterize.cu"), iter(range(BARRIERS))
-    text = BARRIER.sub(lambda found: f"{found[0][:-1].replace('__', 'maybe_')}({next(number)}, ", text)
-    assert next(number, None) is None
-    text = text.replace(", )", ")")
-    before = """
-extern "C" int left_out;
-int left_out = -1;
-void maybe_syncthreads(int number) { if (number != left_out) __syncthreads(); }
-int maybe_syncthreads_and(int number, int mine) { return number == left_out ? mine : __syncthreads_and(mine); }
-int maybe_syncthreads_or(int number, int mine) { return number == left_out ? mine : __syncthreads_or(mine); }
-"""
-    return build_on_host("rasterize.cu", compiled_code, before + text)
-
-
-def drawn(scene: Scene, library: ctypes.CDLL, order: int = 0, depth: bool = True) -> Raster:
-    program = CudaProgram(name="rasterize.cu", driver=HostDriver(library, order), headers=PROGRAM.headers)
+def drawn(scene: Scene, library: ctypes.CDLL, order: int = 0, depth: bool = True, left_out: int = -1) -> Raster:
+    driver = HostDriver(library, order, left_out=left_out)
+    program = CudaProgram(name="rasterize.cu", driver=driver, headers=PROGRAM.headers)
     return rasterize(*splats_of(scene.tensors), scene.width, scene.height, depth=depth, program=program)
 
 
-def bits_of(scene: Scene, library: ctypes.CDLL, order: int) -> list[bytes]:
+def bits_of(scene: Scene, library: ctypes.CDLL, order: int, left_out: int = -1) -> list[bytes]:
     """Everything that drawing and the way back give."""
     scene = scene.to(torch.float32)
-    raster = drawn(scene, library, order)
+    raster = drawn(scene, library, order, left_out=left_out)
     gradients = torch.autograd.grad(loss_of(raster), scene.tensors)
     return [tensor.detach().numpy().tobytes() for tensor in (*raster, *gradients)]
 
@@ -142,19 +130,17 @@ def test_splats_joined_with_others_keep_the_order_of_each():
 
 
 @needs_a_compiler
-@pytest.mark.parametrize("barrier", range(BARRIERS))
-def test_a_missing_barrier_would_be_noticed(barrier, numbered):
+@pytest.mark.parametrize("barrier", barriers_of("rasterize"))
+def test_a_missing_barrier_would_be_noticed(barrier, library):
     """And every barrier is needed: without any one of them the order of turns changes the result, or threads wait in
     vain for others."""
     scene = make_scene(600, 17, 5, opacity=-1.0)  # more than fit into shared memory at once
-    left_out = ctypes.c_int.in_dll(numbered, "left_out")
 
-    def results(left: int) -> set[tuple[bytes, ...] | str]:
-        left_out.value = left
+    def results(left_out: int) -> set[tuple[bytes, ...] | str]:
         found: set[tuple[bytes, ...] | str] = set()
         for order in ORDERS:
             try:
-                found.add(tuple(bits_of(scene, numbered, order)))
+                found.add(tuple(bits_of(scene, library, order, left_out)))
             except Stuck:
                 found.add("stuck")
         return found

@@ -22,7 +22,7 @@ pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark
 
 @pytest.fixture(scope="module")
 def library(compiled_code):
-    return build_on_host(PROGRAM.name, compiled_code)
+    return build_on_host(compiled_code)
 
 
 def on_host(library: ctypes.CDLL, order: int = 0):

@@ -51,9 +51,9 @@ def test_small_gaussians_have_the_covariance_of_their_projected_samples(camera):
 
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_gradients_of_the_twin_are_those_of_finite_differences(camera):
-    means, scales, quaternions = gaussians(12, seed=1)
-    means = torch.cat([means, means[:3] * torch.tensor([20.0, 20.0, 1.0])])  # beyond the clamp
-    scales, quaternions = torch.cat([scales, scales[:3]]), torch.cat([quaternions, quaternions[:3]])
+    means, scales, quaternions = gaussians(4, seed=1)
+    means = torch.cat([means, means[:2] * torch.tensor([20.0, 20.0, 1.0])])  # beyond the clamp
+    scales, quaternions = torch.cat([scales, scales[:2]]), torch.cat([quaternions, quaternions[:2]])
     arguments = [t.requires_grad_() for t in (means, scales, quaternions)]
 
     def f(*gaussian):

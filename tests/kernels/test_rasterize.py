@@ -38,11 +38,11 @@ NAMES = ("means_px", "conics", "colors", "opacities", "depths", "background")
 
 
 SCENES = {
-    "ordinary": make_scene(400, 61, 47),
-    "dense": make_scene(2500, 45, 39, opacity=2.0),
-    "huge": make_scene(150, 64, 64, size=200.0, opacity=-2.0),
-    "tiny": make_scene(1500, 40, 40, size=0.05),
-    "edge-on": make_scene(300, 50, 70, size=4.0, thinness=2.0),
+    "ordinary": make_scene(300, 45, 37),
+    "dense": make_scene(1200, 33, 29, opacity=2.0),
+    "huge": make_scene(100, 50, 50, size=200.0, opacity=-2.0),
+    "tiny": make_scene(800, 36, 36, size=0.05),
+    "edge-on": make_scene(200, 40, 50, size=4.0, thinness=2.0),
     "off-screen": make_scene(300, 20, 20, margin=4.0),
     "opaque": make_scene(200, 33, 17, size=6.0, opacity=30.0),
     "empty": make_scene(0, 20, 10),
@@ -180,7 +180,7 @@ def test_median_depth_is_that_of_the_splat_that_takes_transmittance_below_one_ha
 def test_median_depth_has_no_gradient() -> None:
     for draws in (
         draw(make_scene(50, 20, 20), ISAS[0]),
-        reference(*splats_of(SCENES["ordinary"].tensors), 61, 47, depth=True),
+        reference(*splats_of(SCENES["ordinary"].tensors), 45, 37, depth=True),
     ):
         assert draws.depth.requires_grad
         assert not draws.median_depth.requires_grad

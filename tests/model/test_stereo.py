@@ -92,6 +92,16 @@ def points_of(cameras: list[Camera], tmp_path, threads: int = 1, read=None, cell
     return compute_dense_points(inputs, FusionCell(cell, pixels), tmp_path, lambda done, of: None, threads)
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory):
+    """The points of the flight, what was told meanwhile, and what is left behind."""
+    cameras, folder = flight(), tmp_path_factory.mktemp("flight")
+    told: list[tuple[int, int]] = []
+    inputs = StereoInputs(cameras, sparse(), sparse(), lambda index: (photograph(cameras[index]), None))
+    found = compute_dense_points(inputs, FusionCell(0.6, 0.0), folder, lambda done, of: told.append((done, of)))
+    return found, told, list(folder.iterdir())
+
+
 def height_at(points: np.ndarray) -> np.ndarray:
     """How far points [n, 3] lie from the slope, the roof or its walls."""
     on_slope = np.abs(points[:, 2] - SLOPE * points[:, 0])
@@ -144,8 +154,8 @@ def test_pairs_without_a_common_plane_have_no_depth():
     assert pair_depth(first, view(replace(behind, camera_from_world=pose))) is None
 
 
-def test_points_lie_on_the_ground_and_cover_it(tmp_path):
-    found = points_of(flight(), tmp_path)
+def test_points_lie_on_the_ground_and_cover_it(whole):
+    found, told, left = whole
     off = height_at(found.points)
     assert np.quantile(off, 0.95) < 0.02 * HEIGHT
     roof = found.points[(np.abs(found.points[:, :2]) < HALF - 0.6).all(1)]
@@ -154,7 +164,8 @@ def test_points_lie_on_the_ground_and_cover_it(tmp_path):
     wanted = {(i, j) for i in range(-10, 10) for j in range(-10, 10)}
     assert len(wanted & cells) > 0.85 * len(wanted)
     assert np.abs(found.colors[:, 2].astype(int) + found.colors[:, 0] - 255).max() <= 2  # as painted
-    assert not list(tmp_path.iterdir())  # nothing is left behind
+    assert told == [(step, 18) for step in range(1, 19)]
+    assert not left
 
 
 def test_cells_are_as_large_as_pixels_are(tmp_path):
@@ -183,8 +194,8 @@ def test_a_cell_is_hardly_larger_or_smaller_than_its_pixels_ask_for(widths, leas
     assert (edges >= np.minimum(least * CELL_SCALES[-1], 0.7 * asked)).all()
 
 
-def test_the_same_points_for_any_number_of_threads(tmp_path):
-    one, many = points_of(flight(), tmp_path), points_of(flight(), tmp_path, threads=4)
+def test_the_same_points_for_any_number_of_threads(whole, tmp_path):
+    one, many = whole[0], points_of(flight(), tmp_path, threads=4)
     assert all(np.array_equal(a, b) for a, b in zip(one, many, strict=True))
 
 
@@ -209,12 +220,12 @@ def test_two_photographs_are_enough_and_one_is_not(tmp_path):
     assert len(points_of([camera(0.0, 0.0)], tmp_path).points) == 0
 
 
-def test_still_water_invents_nothing(tmp_path):
+def test_still_water_invents_nothing(whole, tmp_path):
     """One color, and the noise of a sensor."""
     rng = np.random.default_rng(0)
     water = [rng.normal(90, 1.5, (120, 160, 3)).astype(np.uint8) for _ in flight()]
     found = points_of(flight(), tmp_path, read=lambda index: (water[index], None))
-    assert len(found.points) < 0.02 * len(points_of(flight(), tmp_path).points)
+    assert len(found.points) < 0.02 * len(whole[0].points)
 
 
 def test_what_a_mask_leaves_out_starts_nothing(tmp_path):
@@ -229,11 +240,8 @@ def test_what_a_mask_leaves_out_starts_nothing(tmp_path):
     assert found.points[:, 0].max() < 0.6
 
 
-def test_every_step_is_told_and_may_stop_the_work(tmp_path):
-    told = []
+def test_every_step_may_stop_the_work(tmp_path):
     inputs = StereoInputs(flight(), sparse(), sparse(), lambda index: (photograph(flight()[index]), None))
-    compute_dense_points(inputs, FusionCell(0.6, 0.0), tmp_path, lambda done, of: told.append((done, of)))
-    assert told == [(step, 18) for step in range(1, 19)]
 
     def stop(done: int, of: int) -> None:
         raise KeyboardInterrupt

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import vdgs
-from support.commands import CommandsHere
+from support.commands import CommandsHere, small_figures
 from support.small_pipeline import vdgs as verb
 from vdgs.errors import CaptureError, RunError, VdgsError
 
@@ -176,7 +176,8 @@ def test_a_callback_ends_a_stage(run, capture):
 def test_training_in_a_folder_leaves_a_run(run, native_small, tmp_path, monkeypatch):
     monkeypatch.setattr("vdgs.distributed.backend_selection.LocalExecutor", CommandsHere)
     options = vdgs.CaptureOptions(up="z")
-    scene = vdgs.train(native_small.capture, run.settings, run_dir=tmp_path / "run", capture_options=options)
+    with small_figures():
+        scene = vdgs.train(native_small.capture, run.settings, run_dir=tmp_path / "run", capture_options=options)
     assert same(scene, run.scene)
     assert len(vdgs.open_run(tmp_path / "run").blocks) == 2
     again = vdgs.train(native_small.capture, run.settings, run_dir=tmp_path / "run", capture_options=options)

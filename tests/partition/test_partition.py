@@ -140,7 +140,7 @@ def test_every_place_has_one_owner_and_cores_are_disjoint_within_their_boundarie
         assert block.expanded.area > 1.2 * block.core.area
     generator = np.random.default_rng(4)
     places = np.concatenate(
-        [positions[:, :2], generator.uniform(-200, 300, (9000, 2)), generator.normal(0, 1e6, (50, 2))]
+        [positions[:, :2], generator.uniform(-200, 300, (2000, 2)), generator.normal(0, 1e6, (50, 2))]
     )
     owner = blocks.owner(places)
     assert np.array_equal(owner, by_distance(blocks, places))

@@ -14,6 +14,7 @@ import pytest
 from rich.console import Console
 
 from support.captures import look_down
+from support.commands import small_figures
 from support.mapped_house import (
     GROUND,
     HOUSE,
@@ -43,19 +44,24 @@ rasterio = pytest.importorskip("rasterio")
 pytest.importorskip("pyproj")
 
 
-@pytest.fixture
-def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def draw(run: Path, capture: Capture, model: AnchorModel, **asked) -> Path:
     """`vdgs ortho` of a model and a capture that were never trained; returns the folder of the maps."""
+    status = SimpleNamespace(model_id="1-2")
+    opened = SimpleNamespace(
+        folder=SimpleNamespace(path=run), capture=capture, model=model, name="coarse", status=status
+    )
+    with pytest.MonkeyPatch.context() as patch, small_figures():
+        patch.setattr(RunContext, "open_model", lambda *_, **__: opened)
+        request = OrthoRequest(run=run, device="cpu", **asked)
+        return render_ortho.render_ortho(RunContext.from_path(run), request, Console(file=sys.stderr, soft_wrap=True))
+
+
+@pytest.fixture
+def make(tmp_path: Path):
+    """Maps in a run of the test's own."""
 
     def run(capture: Capture, model: AnchorModel, **asked) -> Path:
-        ortho_folder = SimpleNamespace(path=tmp_path / "run")
-        status = SimpleNamespace(model_id="1-2")
-        opened = SimpleNamespace(folder=ortho_folder, capture=capture, model=model, name="coarse", status=status)
-        monkeypatch.setattr(RunContext, "open_model", lambda *_, **__: opened)
-        request = OrthoRequest(run=tmp_path / "run", device="cpu", **asked)
-        return render_ortho.render_ortho(
-            RunContext.from_path(request.run), request, Console(file=sys.stderr, soft_wrap=True)
-        )
+        return draw(run.path, capture, model, **asked)
 
     run.path = tmp_path / "run"
     return run
@@ -65,6 +71,12 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 def house() -> tuple[Capture, AnchorModel]:
     places = np.concatenate([GROUND, TOP])
     return capture_of(places), model_of(places)
+
+
+@pytest.fixture(scope="module")
+def fine(house, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Maps of several levels. Not to be changed."""
+    return draw(tmp_path_factory.mktemp("fine") / "run", *house, gsd=0.03)
 
 
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:2056", "enu", "local", "source"])
@@ -105,9 +117,8 @@ def test_files_open_at_the_right_place_with_the_right_heights(house, make):
         assert file.read(1)[file.index(*place[:2])] == pytest.approx(place[2], abs=0.05)
 
 
-def test_files_are_cloud_optimized_and_say_what_they_are(house, make):
-    ortho_folder = make(*house, gsd=0.03)
-    names = {file.name for file in ortho_folder.iterdir()}
+def test_files_are_cloud_optimized_and_say_what_they_are(fine):
+    names = {file.name for file in fine.iterdir()}
     assert names == set(ortho_plan.FILE_NAMES)
     layers = {
         "orthophoto": (4, "uint8", None),
@@ -115,7 +126,7 @@ def test_files_are_cloud_optimized_and_say_what_they_are(house, make):
         "visibility": (1, "uint16", NODATA_COUNT),
     }
     for name, (count, dtype, nodata) in layers.items():
-        with rasterio.open(ortho_folder / f"{name}.tif") as file:
+        with rasterio.open(fine / f"{name}.tif") as file:
             assert (file.count, file.dtypes[0], file.nodata) == (count, dtype, nodata)
             structure = file.tags(ns="IMAGE_STRUCTURE")
             assert (structure["LAYOUT"], structure["COMPRESSION"]) == ("COG", "DEFLATE")
@@ -123,19 +134,18 @@ def test_files_are_cloud_optimized_and_say_what_they_are(house, make):
             assert file.overviews(1)
             assert "ellipsoidal" in file.tags()["HEIGHTS"]
             assert file.tags()["MODEL"] == "coarse"
-    with rasterio.open(ortho_folder / "dsm.tif") as file:
+    with rasterio.open(fine / "dsm.tif") as file:
         assert file.units == ("m",)
         assert "ellipsoidal" in file.descriptions[0]
 
 
-def test_overviews_have_no_height_between_roof_and_street_either(house, make):
-    ortho_folder = make(*house, gsd=0.03)
+def test_overviews_have_no_height_between_roof_and_street_either(fine):
     for name, nothing in (("dsm", NODATA_HEIGHT), ("visibility", NODATA_COUNT)):
-        with rasterio.open(ortho_folder / f"{name}.tif") as file:
+        with rasterio.open(fine / f"{name}.tif") as file:
             whole, factors = file.read(1), file.overviews(1)
         assert factors
         for level in range(len(factors)):
-            with rasterio.open(ortho_folder / f"{name}.tif", overview_level=level) as file:
+            with rasterio.open(fine / f"{name}.tif", overview_level=level) as file:
                 values = file.read(1)
             assert set(np.unique(values)) <= set(np.unique(whole))
             assert (values != nothing).mean() == pytest.approx((whole != nothing).mean(), abs=0.02)

@@ -1,4 +1,4 @@
-// Runs a CUDA kernel on the processor, to check its arithmetic where there is no GPU. Include the source after this.
+// Runs a CUDA kernel on the processor, to check its arithmetic where there is no GPU. Include the sources after this.
 //
 // The threads of a block are fibers that take turns: each runs until it ends, or waits at a barrier of the block or in an
 // operation of its warp. Warps take turns too, and a warp goes on as long as it can: to the next barrier of the block.
@@ -230,6 +230,12 @@ inline float __shfl_sync(unsigned, float mine, int lane) {
   return host::given_by<float>(lane, place);
 }
 inline void __syncwarp() { host::exchange(0.0f, false); }
+// The sources' barriers have numbers: that of one which is left out, to see whether it is needed.
+static int left_out;
+inline void maybe_syncthreads(int number) { number != left_out ? __syncthreads() : void(); }
+inline int maybe_syncthreads_or(int number, int mine) { return number != left_out ? __syncthreads_or(mine) : mine; }
+inline int maybe_syncthreads_and(int number, int mine) { return number != left_out ? __syncthreads_and(mine) : mine; }
+inline void maybe_syncwarp(int number) { number != left_out ? __syncwarp() : void(); }
 inline unsigned __ballot_sync(unsigned, int mine) {
   const unsigned place = host::exchange(0.0f, mine);
   unsigned all = 0;
@@ -261,7 +267,8 @@ extern "C" unsigned long long host_thread() { return static_cast<unsigned long l
 
 // Grid and block: three sides each; a block is whole warps. Returns false for a kernel whose threads wait in vain.
 extern "C" int host_launch(host::Kernel kernel, const unsigned* grid, const unsigned* block, void** arguments,
-                           unsigned turns) {
+                           unsigned turns, int without_barrier) {
+  left_out = without_barrier;
   gridDim = {grid[0], grid[1], grid[2]};
   blockDim = {block[0], block[1], block[2]};
   host::kernel_running = kernel;

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import fcntl
 import os
 import re
 import shutil
@@ -22,6 +23,10 @@ from vdgs.kernels.cuda.nvrtc import CudaUnavailable, Nvrtc
 
 HERE = Path(__file__).parent
 SHARED = Path(launch.__file__).parents[1] / "shared"
+#: Sources of vdgs.kernels.cuda, all of which become one library: most of the time goes into what they share.
+SOURCES = ("cull", "decode", "loss", "rasterize", "statistics")
+#: Whatever makes threads wait for each other and for nothing else.
+BARRIER = re.compile(r"__(sync(?:threads(?:_and|_or)?|warp))\(\)?")
 #: Orders in which threads and warps take turns: forwards, backwards, and two shuffles.
 ORDERS = (0, 1, 2, 3)
 
@@ -31,26 +36,40 @@ def host_compiler() -> str | None:
     return next(filter(None, map(shutil.which, filter(None, (os.environ.get("CXX"), "c++", "g++", "clang++")))), None)
 
 
-def build_on_host(source: str, folder: Path, text: str | None = None, counted: bool = False) -> ctypes.CDLL:
-    """A source of vdgs.kernels.cuda as a library for the processor; `host_NAME` runs one thread of a kernel. The
-    library is kept in the folder, where the same source is found again.
+def barriers_of(source: str) -> list[int]:
+    """Numbers of the barriers of a source: any of them can be left out (HostDriver)."""
+    first = 100 * SOURCES.index(source)
+    return [first + i for i in range(len(BARRIER.findall(read_source(f"{source}.cu"))))]
 
-    `text` is compiled instead of the source's own. `counted`: what it reads and writes can be counted
-    (cuda_traffic.py).
+
+def build_on_host(folder: Path, counted: bool = False) -> ctypes.CDLL:
+    """The sources of vdgs.kernels.cuda as a library for the processor; `host_NAME` runs one thread of a kernel. The
+    library is kept in the folder, where the same sources are found again.
+
+    `counted`: what they read and write can be counted (cuda_traffic.py).
     """
-    text = text or read_source(source)
+    text = "".join(map(_on_host, SOURCES))
     library = folder / f"{sha256(text.encode()).hexdigest()}{'-counted' if counted else ''}.so"
-    if not library.exists():
-        with TemporaryDirectory(dir=folder) as own:
-            _build(text, Path(own), counted).rename(library)
+    with library.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # others wait and find it
+        if not library.exists():
+            with TemporaryDirectory(dir=folder) as own:
+                _build(text, Path(own), counted).rename(library)
     return ctypes.CDLL(str(library))
 
 
-def _build(text: str, folder: Path, counted: bool) -> Path:
+def _on_host(source: str) -> str:
+    """A source in a namespace of its own, its barriers numbered."""
+    text, numbers = read_source(f"{source}.cu"), iter(barriers_of(source))
+    text = BARRIER.sub(lambda found: f"maybe_{found[1]}({next(numbers)}{')' if found[0].endswith(')') else ', '}", text)
     kernels = re.findall(r'extern "C" __global__ void(?: __launch_bounds__\([\w, ]+\))?\s+(\w+)\(', text)
     assert kernels, "no kernel in the source"
     exported = "\n".join(f"HOST_KERNEL({name})" for name in kernels)
-    (folder / "host.cpp").write_text(f'#include "cuda_on_host.h"\n{text}\n{exported}\n')
+    return f"namespace {source} {{\n{text}\n{exported}\n}}\n"
+
+
+def _build(text: str, folder: Path, counted: bool) -> Path:
+    (folder / "host.cpp").write_text(f'#include "cuda_on_host.h"\n#include "gaussian_math.h"\n{text}')
     library, built = folder / "host.so", folder / "host.o"
     # Fibers jump between stacks, which fortified longjmp takes for an attack. Before every access to memory the thread
     # sanitizer calls a function; its own library, which is not asked for when linking, has other ones.
@@ -72,10 +91,13 @@ class Stuck(Exception):
 
 
 class HostDriver:
-    """`vdgs.kernels.cuda.driver.Driver` on tensors in main memory, whatever device they say that they are on."""
+    """`vdgs.kernels.cuda.driver.Driver` on tensors in main memory, whatever device they say that they are on.
 
-    def __init__(self, library: ctypes.CDLL, order: int = 0, device_type: str = "cpu"):
-        self._library, self.order, self.device_type = library, order, device_type
+    `left_out`: the number of a barrier at which nobody waits (`barriers_of`).
+    """
+
+    def __init__(self, library: ctypes.CDLL, order: int = 0, device_type: str = "cpu", left_out: int = -1):
+        self._library, self.order, self.device_type, self._left_out = library, order, device_type, left_out
         #: Modules loaded and kernels launched: (name, grid, block).
         self.loaded: list[bytes] = []
         self.launched: list[tuple[str, GridSize, GridSize]] = []
@@ -98,7 +120,7 @@ class HostDriver:
         self.launched.append((self._names[function], grid, block))
         whole = self._library.host_launch(
             ctypes.c_void_p(function), (ctypes.c_uint * 3)(*grid), (ctypes.c_uint * 3)(*block), arguments,
-            ctypes.c_uint(self.order),
+            ctypes.c_uint(self.order), ctypes.c_int(self._left_out),
         )  # fmt: skip
         if not whole:
             raise Stuck("threads of a block wait for others that never come")

@@ -41,7 +41,7 @@ class CountedProgram(CudaProgram):
     """A program whose launches are counted."""
 
     def __init__(self, program: CudaProgram, folder: Path):
-        self._library = build_on_host(program.name, folder, counted=True)
+        self._library = build_on_host(folder, counted=True)
         super().__init__(name=program.name, driver=HostDriver(self._library), headers=program.headers)
         self.traffic: list[Traffic] = []
         self._launches = 0

@@ -22,7 +22,8 @@ PROGRAMS = (loss.PROGRAM, RASTERIZE, DECODE, CULL, STATISTICS)
 
 def build(folder: Path) -> dict[str, HostDriver]:
     """Drivers that run the kernels of each source, by its name; the folder keeps what is compiled."""
-    return {program.name: HostDriver(build_on_host(program.name, folder)) for program in PROGRAMS}
+    library = build_on_host(folder)
+    return {program.name: HostDriver(library) for program in PROGRAMS}
 
 
 def install(

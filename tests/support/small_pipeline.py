@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from support.captures import tiny_scene, write_colmap
+from support.commands import small_figures
 from vdgs.cli.main import main
 
 #: As few and as small as lets anchors grow, blocks train and PSNR say something. A named size is not looked for.
@@ -31,7 +32,7 @@ BLOCK = (
 
 def vdgs(*arguments: object) -> None:
     """A verb in this process; its exit code must be 0."""
-    with pytest.raises(SystemExit) as ended:
+    with small_figures(), pytest.raises(SystemExit) as ended:
         main([str(each) for each in arguments])
     assert not ended.value.code
 

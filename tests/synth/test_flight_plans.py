@@ -15,6 +15,7 @@ from vdgs.captures.ground_truth import load_ground_truth, pack_depth, unpack_dep
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import VdgsError
+from vdgs.geometry.camera import Camera
 from vdgs.synth import SynthOptions, generate
 from vdgs.synth.flight_cameras import make_camera, make_flight_cameras, make_test_cameras
 from vdgs.synth.mesh import Material, MeshBuilder
@@ -58,6 +59,17 @@ def options_of(flight: str, images: int = 60, **more: object) -> ResolvedOptions
     return replace(SynthOptions(num_images=images, **more), flight=flight).resolved()  # type: ignore[arg-type]
 
 
+@pytest.fixture(scope="module")
+def seen(town: Town, tracer: RayTracer) -> dict[str, tuple[list[Camera], np.ndarray, np.ndarray]]:
+    """Of each flight: its cameras, places that they see, and how many of them see each."""
+    found = {}
+    for flight in FLIGHTS:
+        cameras = make_flight_cameras(options_of(flight, width=64, height=48), town)
+        places, views = sample_visible_points(tracer, town.mesh, cameras, 60.0, np.random.default_rng(0))
+        found[flight] = (cameras, places, views)
+    return found
+
+
 @pytest.mark.parametrize("flight", FLIGHTS)
 @pytest.mark.parametrize("images", [41, 120])
 def test_flights_take_what_was_asked_for_and_hit_nothing(
@@ -72,11 +84,9 @@ def test_flights_take_what_was_asked_for_and_hit_nothing(
     assert steepest < -np.cos(np.radians(70 if flight in ("distant", "orbits") else 52)), "too near to the horizon"
 
 
-def test_each_flight_is_uneven_in_its_own_way(town: Town, tracer: RayTracer) -> None:
+def test_each_flight_is_uneven_in_its_own_way(seen) -> None:
     found, share_in_middle, far = {}, {}, {}
-    for flight in FLIGHTS:
-        cameras = make_flight_cameras(options_of(flight), town)
-        places, views = sample_visible_points(tracer, town.mesh, cameras, 60.0, np.random.default_rng(0))
+    for flight, (cameras, places, views) in seen.items():
         found[flight] = compute_flight_stats(views, len(cameras))
         far[flight] = (np.abs(places[:, :2]).max(1) > 90).sum()
         at = np.array([camera.position[:2] for camera in cameras])
@@ -88,10 +98,8 @@ def test_each_flight_is_uneven_in_its_own_way(town: Town, tracer: RayTracer) -> 
 
 
 @pytest.mark.parametrize("flight", FLIGHTS)
-def test_test_views_fall_all_over_what_was_seen(flight: str, town: Town, tracer: RayTracer) -> None:
-    options = options_of(flight, width=64, height=48)
-    training = make_flight_cameras(options, town)
-    places, views = sample_visible_points(tracer, town.mesh, training, 60.0, np.random.default_rng(0))
+def test_test_views_fall_all_over_what_was_seen(flight: str, seen, town: Town, tracer: RayTracer) -> None:
+    options, (training, places, views) = options_of(flight, width=64, height=48), seen[flight]
     held = make_test_cameras(tracer, town.terrain, training, places, 8, options, np.random.default_rng(3))
     by_tests = count_visibility(tracer, held, places) > 0
     every_eighth = count_visibility(tracer, training[::8][:8], places) > 0

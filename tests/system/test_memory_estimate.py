@@ -217,11 +217,11 @@ def test_a_limit_of_the_process_counts():
 
 #: Without stereo, which would leave room behind in which a step fits.
 SETTINGS = (
-    "--preset", "laptop", "--iterations", "20", "--up", "z", "--model.num-offsets", "3", "--threads", "1",
+    "--preset", "laptop", "--iterations", "10", "--up", "z", "--model.num-offsets", "3", "--threads", "1",
     "--init.no-mvs", "--images", "images",
 )  # fmt: skip
 #: The last iteration with photographs at half their size (preset laptop).
-LAST_HALF = 8
+LAST_HALF = 4
 
 
 def limit_memory_before_full_size() -> None:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from support.commands import python
 from vdgs.system import lazy_pycolmap
 from vdgs.system.exit_codes import REMOVABLE_PACKAGES, exit_code_of
 
@@ -15,6 +15,8 @@ pytestmark = pytest.mark.slow  # whole reconstructions, runs or trainings
 
 IMPORT_ALL = """
 import importlib, pkgutil, sys
+for name in [each for each in sys.modules if each.partition(".")[0] in ("vdgs", "pycolmap")]:
+    del sys.modules[name]
 sys.modules["pycolmap"] = None
 import vdgs
 for module in pkgutil.walk_packages(vdgs.__path__, "vdgs."):
@@ -24,7 +26,7 @@ for module in pkgutil.walk_packages(vdgs.__path__, "vdgs."):
 
 
 def test_every_module_can_be_imported():
-    done = subprocess.run([sys.executable, "-c", IMPORT_ALL], capture_output=True, text=True)
+    done = python(IMPORT_ALL)
     assert done.returncode == 0, done.stderr
 
 

@@ -45,11 +45,11 @@ def is_alicevision(file: Path) -> bool:
 
 def find_openmvg(root: Path) -> list[Path]:
     """The files of a folder that have poses; the one that lists the photographs has none."""
-    return [file for file in _files(root) if is_openmvg(file) and holds(file, b'"center"')]
+    return [file for file in sorted(filter(is_openmvg, root.iterdir())) if holds(file, b'"center"')]
 
 
 def find_alicevision(root: Path) -> list[Path]:
-    return [file for file in _files(root) if is_alicevision(file) and holds(file, b'"poses"', b'"center"')]
+    return [file for file in sorted(filter(is_alicevision, root.iterdir())) if holds(file, b'"poses"', b'"center"')]
 
 
 def read_openmvg(file: Path, options: CaptureOptions) -> Project:
@@ -212,16 +212,14 @@ def _lens(
 
 
 def _head(file: Path, *texts: bytes) -> bool:
+    if not file.is_file():
+        return False
     try:
         with file.open("rb") as stream:
             head = stream.read(1 << 16)
     except OSError:
         return False
     return all(text in head for text in texts)
-
-
-def _files(root: Path) -> list[Path]:
-    return [file for file in sorted(root.iterdir()) if file.is_file()]
 
 
 def _dict(value: object) -> JsonObject:

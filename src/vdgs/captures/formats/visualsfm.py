@@ -27,15 +27,17 @@ _AGAIN = "The file is damaged or cut off; export it again."
 
 
 def is_file(file: Path) -> bool:
+    if file.suffix.lower() != ".nvm":
+        return False
     try:
         with file.open("rb") as stream:
-            return file.suffix.lower() == ".nvm" and stream.read(len(_HEADER)) == _HEADER.encode()
+            return stream.read(len(_HEADER)) == _HEADER.encode()
     except OSError:
         return False
 
 
 def find_files(root: Path) -> list[Path]:
-    return [file for file in sorted(root.iterdir()) if is_file(file)]
+    return sorted(filter(is_file, root.iterdir()))
 
 
 def read(file: Path, options: CaptureOptions) -> Project:
