@@ -9,8 +9,9 @@ TEST_STAMP = $(VENV)/.installed-test
 INSTALL = PIP_CONSTRAINT=constraints.txt $(BIN)/python -m pip install --quiet --disable-pip-version-check
 SOURCES = $(shell find src/vdgs/kernels/native src/vdgs/kernels/shared -name "*.h" -o -name "*.cpp") CMakeLists.txt pyproject.toml constraints.txt
 
-# torch's threads block instead of spinning beside the kernels' own.
+# Threads of torch and numpy block instead of spinning beside the kernels' own.
 export OMP_WAIT_POLICY = PASSIVE
+export OPENBLAS_NUM_THREADS = 1
 # What one process of the tests has compiled, the others find.
 unexport PYTHONDONTWRITEBYTECODE
 

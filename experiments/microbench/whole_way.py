@@ -30,6 +30,13 @@ ROOT = Path(__file__).resolve().parents[2]
 RESULTS = "whole_way.jsonl"
 #: Verbs after a run is there, in their order.
 STAGES = ("visibility", "partition", "train-blocks", "merge", "eval", "ortho", "report")
+#: Verbs and figures of versions that call them otherwise: those whose verbs lie in src/vdgs/verbs.
+FORMER_VERBS = {"train-coarse": "coarse", "train-blocks": "train", "ortho": "map"}
+FORMER_FIGURES = {
+    "psnr_reference_exposure": "psnr_neutral",
+    "ssim_reference_exposure": "ssim_neutral",
+    "opacity_coverage": "solid_share",
+}
 TOWN = ("--num-images", "70", "--width", "1000", "--height", "750")
 
 
@@ -45,7 +52,9 @@ class Scene:
 SCENES = (
     Scene("seneca-4", "seneca", "images_4"),
     Scene("seneca-2", "seneca", "images_2"),
+    Scene("copr-4", "copr", "images_4"),
     Scene("copr-2", "copr", "images_2"),
+    Scene("brighton-4", "brighton", "images_4"),
     Scene("brighton-photographs", "photographs/brighton", "images"),
     Scene("seneca-photographs", "photographs/seneca", "images_2"),
     Scene("town", "", None),
@@ -94,9 +103,12 @@ def commands(scene: Scene, data: Path, work: Path, settings: list[str]) -> dict[
 
 
 def quality(run: Path) -> dict[str, float]:
-    """Neutral metrics of the test views of the merged model, the foretold exposure beside, the opaque share."""
+    """Metrics of the test views of the merged model as measured, in neutral colors, and the opaque share."""
     metrics = json.loads((run / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
-    return {name: metrics[name] for name in ("psnr", "ssim", "psnr_reference_exposure", "opacity_coverage")}
+    return {
+        name: metrics[name] if name in metrics else metrics[FORMER_FIGURES[name]]
+        for name in ("psnr", "ssim", *FORMER_FIGURES)
+    }
 
 
 def run_scene(scene: Scene, arguments: argparse.Namespace, done: set[tuple[str, str, str]]) -> None:
@@ -109,13 +121,15 @@ def run_scene(scene: Scene, arguments: argparse.Namespace, done: set[tuple[str, 
             work.mkdir(parents=True, exist_ok=True)
             if (scene.name, stage, version) in done:
                 continue
-            words = commands(scene, arguments.data, work, arguments.settings)[stage]
+            verb, *words = commands(scene, arguments.data, work, arguments.settings)[stage]
+            if source is not None and (source / "src" / "vdgs" / "verbs").is_dir():
+                verb = FORMER_VERBS.get(verb, verb)
             record(
                 arguments.work,
                 scene,
                 stage,
                 version,
-                measure([sys.executable, "-m", "vdgs", *words], work / "log", source),
+                measure([sys.executable, "-m", "vdgs", verb, *words], work / "log", source),
             )
     if arguments.beside and (scene.name, "beside", "other") not in done:
         capture = (

@@ -48,10 +48,11 @@ def test_the_import_loads_nothing_heavy():
     assert torch_too == "False"
 
 
-def test_threads_are_set_up_before_callers_load_torch():
-    code = "import os; os.environ.pop('OMP_WAIT_POLICY', None); import vdgs; print(os.environ['OMP_WAIT_POLICY'])"
+def test_threads_are_set_up_before_callers_load_torch_and_numpy():
+    names = "OMP_WAIT_POLICY", "OPENBLAS_THREAD_TIMEOUT"
+    code = f"import os; [os.environ.pop(n, None) for n in {names}]; import vdgs; print(*map(os.environ.get, {names}))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "PASSIVE"
+    assert done.stdout.split() == ["PASSIVE", "4"]
 
 
 def test_the_stub_names_what_is_there():

@@ -115,7 +115,10 @@ class Camera:
 
     def in_frustum(self, points: np.ndarray) -> np.ndarray:
         """Which points fall inside the frustum: z > near and projected center on the image, [n] bool."""
-        pixels, depth = self.project(points)
+        return self.holds(*self.project(points))
+
+    def holds(self, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """Which points are in the frustum, of what `project` says of them."""
         x, y = pixels[:, 0], pixels[:, 1]
         return (depth > NEAR_PLANE) & (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
 

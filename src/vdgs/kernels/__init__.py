@@ -54,11 +54,12 @@ def configure_threads(count: int | None = None) -> None:
     """Set up the threads of this process and, through its environment, of its child processes.
 
     `import vdgs` calls it, for the command line and for callers of the API alike: torch's OpenMP threads must block,
-    not spin, beside the kernels' own pool, and torch reads OMP_WAIT_POLICY once, when it is imported. A value that is
-    set already stays. `count` 0 means `default_num_threads()`; None leaves the number of threads and imports nothing
-    heavy.
+    not spin, beside the kernels' own pool, and torch reads OMP_WAIT_POLICY once, when it is imported. So must those of
+    OpenBLAS, which numpy starts. A value that is set already stays. `count` 0 means `default_num_threads()`; None
+    leaves the number of threads and imports nothing heavy.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "4")  # the least: 2^4 cycles
     if count is not None:
         set_num_threads(count or default_num_threads())
 

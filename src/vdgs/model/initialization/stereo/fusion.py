@@ -189,11 +189,13 @@ def _geometric_consistency(
     depth = np.asarray(depths[index, : camera.height, : camera.width], np.float32)
     known = depth > 0
     places = camera.unproject(np.where(known, depth, 1.0))
-    held, agreed = (np.zeros(known.shape, np.int32) for _ in range(2))
+    some = places[known]
+    held, agreed = (np.zeros(len(some), np.int32) for _ in range(2))
     for other in others:
-        inside, agrees = _told_by(places, cameras[other], depths[other])
+        inside, agrees = _told_by(some, cameras[other], depths[other])
         held, agreed = held + inside, agreed + agrees
-    confirmed = known & (agreed >= 1) & (agreed >= MIN_AGREEING_FRACTION * held)
+    confirmed = known.copy()
+    confirmed[known] = (agreed >= 1) & (agreed >= MIN_AGREEING_FRACTION * held)
     confirmed &= (np.abs(places) < MAX_CELL_INDEX * cell.min_edge).all(-1)
     picture, mask = inputs.read_image(index)
     size = (camera.width, camera.height)
@@ -209,15 +211,14 @@ def _geometric_consistency(
 
 
 def _told_by(
-    points: Float[np.ndarray, "h w 3"], camera: Camera, depths: Float[np.ndarray, "r c"]
-) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    points: Float[np.ndarray, "p 3"], camera: Camera, depths: Float[np.ndarray, "r c"]
+) -> tuple[Bool[np.ndarray, " p"], Bool[np.ndarray, " p"]]:
     """Which places another photograph holds in its picture, and which of them lie where its own depth says."""
-    pixels, distance = camera.project(points.reshape(-1, 3))
-    inside = camera.in_frustum(points.reshape(-1, 3))
+    pixels, distance = camera.project(points)
+    inside = camera.holds(pixels, distance)
     column, row = (np.where(inside, pixels[:, axis], 0).astype(np.int64) for axis in (0, 1))
     there = np.asarray(depths[row, column], np.float64)
-    agrees = inside & (there > 0) & (np.abs(there - distance) < MAX_RELATIVE_DIFFERENCE * distance)
-    return inside.reshape(points.shape[:2]), agrees.reshape(points.shape[:2])
+    return inside, inside & (there > 0) & (np.abs(there - distance) < MAX_RELATIVE_DIFFERENCE * distance)
 
 
 def _summed(photographs: Iterable[_Cells], most_waiting: int = MERGE_BATCH) -> _Cells:
