@@ -19,7 +19,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import psutil
 from rich.console import Console
 
 from experiments.bench.cached_results import drop_cached_runs, match_pixel_groups, read_cached_results
@@ -49,6 +48,8 @@ from vdgs.distributed.executor import LogListener, Task, TaskResult
 from vdgs.distributed.local_executor import LocalExecutor
 from vdgs.distributed.progress_table import STATE_STYLES
 from vdgs.errors import Stopped, VdgsError
+from vdgs.evaluation.lpips import check_weights_file
+from vdgs.kernels import default_num_threads
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.stage_keys import hashable_settings
 from vdgs.synth import SynthOptions, generate
@@ -81,6 +82,7 @@ def run_bench(settings: BenchSettings, console: Console) -> list[BenchResult]:
     """
     if settings.jobs < 1 or settings.visibility_bins < 1:
         raise VdgsError("--jobs and --visibility-bins must be at least 1")
+    check_weights_file(settings.lpips_weights)
     _check_output_outside_inputs(settings.output, plan := make_plan(settings.table, settings.plan_options))
     results, outcomes = _run_plan(plan, settings, console)
     if settings.equal_time and not any(each.state == "stopped" for each in outcomes.values()):
@@ -172,8 +174,7 @@ def _train(
     """Every run whose scene is there, trained or found finished."""
     done, tasks = dict[str, TaskResult](), list[Task]()
     wanted = [run for run in plan.coarse + plan.runs if run.scene in captures]
-    cores = psutil.cpu_count() or 1
-    threads = max(1, cores // settings.jobs)
+    threads = max(1, default_num_threads() // settings.jobs)
     for run in wanted:
         _check_same_settings(settings, run)
     for run in wanted:
@@ -190,7 +191,7 @@ def _train(
         tasks.append(Task(name=run.name, command=command, output=output, environment=_environment(), after=after))
     if done:
         console.print(f"{len(done)} of {len(wanted)} runs are finished already", highlight=False)
-    outcomes = LocalExecutor(settings.jobs).run(tasks, _ProgressReporter(len(tasks), console))
+    outcomes = LocalExecutor(settings.jobs).run(tasks, ProgressReporter(len(tasks), console))
     return done | {outcome.name: outcome for outcome in outcomes}
 
 
@@ -200,24 +201,24 @@ def _environment() -> dict[str, str]:
     return {"OMP_WAIT_POLICY": "PASSIVE", "PYTHONPATH": os.pathsep.join(path for path in paths if path)}
 
 
-class _ProgressReporter(LogListener):
+class ProgressReporter(LogListener):
     """One line when a run starts and one when it ended."""
 
     def __init__(self, total: int, console: Console):
         super().__init__(self._print)
         self._left, self._total, self._console = total, total, console
 
-    def started(self, task: Task, attempt: int) -> None:
+    def on_started(self, task: Task, attempt: int) -> None:
         self.print_line(f"started  {task.name}", "dim")
 
-    def ended(self, task: Task, outcome: TaskResult) -> None:
+    def on_ended(self, task: Task, result: TaskResult) -> None:
         self._left -= 1
-        if outcome.state == "stopped" and not outcome.attempts:
+        if result.state == "stopped" and not result.attempts:
             return
         count = f"({self._total - self._left} of {self._total})"
         self.print_line(
-            f"{outcome.state:8} {task.name}  {outcome.seconds:.0f} s  {count} {outcome.reason}",
-            STATE_STYLES[outcome.state],
+            f"{result.state:8} {task.name}  {result.seconds:.0f} s  {count} {result.reason}",
+            STATE_STYLES[result.state],
         )
 
     def _print(self, text: str, style: str) -> None:

@@ -13,8 +13,8 @@ from vdgs.config.output_paths import Output
 from vdgs.config.ranges import MAX_COUNT, FlagName, Positional, Range
 
 TableName = Literal[
-    "table1", "table2", "table3", "table3-each", "table4", "factorial", "coarse-compensation", "more-anchors",
-    "efficiency", "longer", "choices", "toy",
+    "table1", "table2", "table3", "table3-each", "table4", "factorial", "crossed", "coarse-compensation",
+    "more-anchors", "efficiency", "longer", "choices", "toy",
 ]  # fmt: skip
 
 
@@ -28,8 +28,9 @@ class BenchArguments:
     table: Annotated[TableName, Positional()]
     """What to measure. table1 to table4: those of the paper; table3-each, factorial, coarse-compensation, more-anchors:
     where its premise holds, each block trained as long, its choices crossed, its compensation without blocks, and its
-    parts against plain growth at lower thresholds; efficiency: its paragraph; longer: blocks that train two and four
-    times as long; choices: one choice of ours changed at a time; toy: a small one in a minute or two."""
+    parts against plain growth at lower thresholds; crossed: the cut and compensation in the preset `paper`; efficiency:
+    its paragraph; longer: blocks that train two and four times as long; choices: one choice of ours changed at a time;
+    toy: a small one in a minute or two."""
     output: Annotated[Path, Output()]
     """Folder for runs and results; new, or the one to continue."""
     seeds: Annotated[int | None, Range(1, 1000)] = None

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from vdgs.config.method import MethodConfig
+from vdgs.config.method import DensifyConfig, MethodConfig, TrainConfig
 from vdgs.config.presets import PRESETS, PresetName
 
 #: Stages of the run of a method, by the names that `worker.STAGES` knows.
@@ -52,6 +52,29 @@ class Budget:
 
 
 ConfigOverride = Callable[[MethodConfig, Budget], MethodConfig]
+
+#: Training that is shorter than its schedule was made for decides about growth so often, in intervals of so many steps
+#: at least: gradients of fewer views say little.
+LEAST_DECISIONS, LEAST_INTERVAL = 3, 20
+
+
+def scaled_growth(growth: DensifyConfig, iterations: int, scale: float) -> DensifyConfig:
+    """Growth of `iterations`, `scale` times as many as its settings were made for: begins so much earlier or later, as
+    in `block.steps_scaler`, and where it is cut short decides in shorter intervals if else it hardly ever did."""
+    interval = max(LEAST_INTERVAL, int(growth.stop_fraction * iterations / LEAST_DECISIONS))
+    return replace(
+        growth,
+        stats_start=round(scale * growth.stats_start),
+        start=round(scale * growth.start),
+        every=min(growth.every, interval) if scale < 1 else growth.every,
+    )
+
+
+def growth_decisions(training: TrainConfig) -> int:
+    """How often a training decides about growth."""
+    growth = training.densify
+    last = int(growth.stop_fraction * training.iterations)
+    return sum(step >= growth.start for step in range(growth.every, last + 1, growth.every))
 
 
 @dataclass(frozen=True)
@@ -119,13 +142,10 @@ class BenchScene:
 
     def base(self, budget: Budget, seed: int, scale: float = 1.0) -> MethodConfig:
         """The full method on this scene with so many iterations: the scene's preset, with compensated growth, which the
-        paper's method has and the preset `laptop` leaves out. `scale` is that of the budget to the scene's own: growth
-        begins that much earlier or later, as in `block.steps_scaler`."""
+        paper's method has and the preset `laptop` leaves out. `scale` is that of the budget to the scene's own."""
         config = self.override(PRESETS[self.preset])
-        growth = config.training.densify
-        early = replace(growth, stats_start=round(scale * growth.stats_start), start=round(scale * growth.start))
-        inner = config.block.densify
-        earlier = replace(inner, stats_start=round(scale * inner.stats_start), start=round(scale * inner.start))
+        early = scaled_growth(config.training.densify, budget.coarse, scale)
+        earlier = scaled_growth(config.block.densify, budget.per_block, scale)
         return replace(
             config,
             training=replace(config.training, iterations=budget.coarse, seed=seed, densify=early),

@@ -21,6 +21,7 @@ from experiments.bench.overrides import (
     coarse_same_iterations,
     coarse_with_compensation,
     coarse_with_lower_threshold,
+    crossed_cell,
     disable_compensation,
     factorial_cell,
     full_method,
@@ -290,6 +291,19 @@ _EAGER = [
     ),
 ]  # fmt: skip
 
+_CROSSED = [
+    BenchMethod(
+        f"paper-{lambda_vis:g}-{'on' if compensated else 'off'}",
+        f"preset paper, λ_vis = {lambda_vis:g}, {'compensated' if compensated else 'plain'} growth",
+        crossed_cell(lambda_vis, compensated),
+        differs="its schedule in proportion to the iterations here",
+    )
+    for lambda_vis in FACTORIAL_VIS
+    for compensated in (False, True)
+]
+
+#: The cells of the preset `paper`.
+CROSSED = tuple(method.name for method in _CROSSED)
 #: The cells of the factorial.
 FACTORIAL = tuple(method.name for method in _FACTORIAL)
 #: Every method by name.
@@ -297,7 +311,7 @@ METHODS: dict[str, BenchMethod] = {
     method.name: method
     for group in (
         _ABLATIONS, OTHER_METHODS, BLOCK_METHODS, _BLOCKS, _EACH_AS_LONG, _COARSE_COMPENSATED, _COARSE_PARTS, _LONGER,
-        _CHOICES, _SWEEPS, _FACTORIAL, _EAGER,
+        _CHOICES, _SWEEPS, _FACTORIAL, _CROSSED, _EAGER,
     )
     for method in group
 }  # fmt: skip

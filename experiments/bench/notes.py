@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from experiments.bench.claim_check import ClaimCheck
-from experiments.bench.definitions import BenchMethod, has_block_folders
+from experiments.bench.definitions import BenchMethod, growth_decisions, has_block_folders
 from experiments.bench.paper_numbers import PAPER_CONTRADICTIONS, PAPER_EFFICIENCY, PAPER_NUMBERS
 from experiments.bench.plan import BenchPlan
 from experiments.bench.result_tables import VISIBILITY_SOURCE_NOTES, all_group_bounds
 from experiments.bench.results import BenchResult
 from experiments.bench.table_writers import escape_markdown as plain
+from vdgs.config.method import block_train_config
 from vdgs.partition.strategies import STRATEGIES
 
 
@@ -80,6 +81,14 @@ def _fairness(plan: BenchPlan) -> str:
             + "; ".join(f"{method} on {scene}: {factor:g}" for scene, method, factor in plan.step_factors),
             *notes[1:],
         ]
+    decided = {
+        f"{method} on {scene}": growth_decisions(block_train_config(run.config, 1))
+        for (scene, method, _), run in plan.run_of.items()
+        if has_block_folders(run.stages)
+    }
+    if decided:
+        rows = "; ".join(f"{name}: {count}" for name, count in decided.items())
+        notes.append(f"How often each block of anchors decides about growth (few times say little of it): {rows}.")
     if plan.max_anchors:
         notes.append(_limit(plan))
     external = [method.title for method in plan.methods if method.renders is not None]

@@ -8,8 +8,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal
 
-from experiments.bench.definitions import Budget, ConfigOverride
-from vdgs.config.method import CompensationConfig, DensifyConfig, MergeConfig, MethodConfig, PartitionStrategy
+from experiments.bench.definitions import Budget, ConfigOverride, scaled_growth
+from vdgs.config.method import CompensationConfig, MergeConfig, MethodConfig, PartitionStrategy
 from vdgs.config.presets import PRESETS, PresetName
 
 #: So many cameras has each block of the factorial: every camera joins its best block, and each block is topped up to
@@ -84,19 +84,14 @@ def as_in_paper(config: MethodConfig, _budget: Budget) -> MethodConfig:
 
 def as_preset(name: PresetName) -> ConfigOverride:
     """A preset as it is, with the scene's iterations, blocks and limit of anchors. Growth begins at the same share of
-    the iterations as in the preset's own, but decides as often: its statistics need so many views."""
+    the iterations as in the preset's own."""
 
     def change(config: MethodConfig, budget: Budget) -> MethodConfig:
         preset = PRESETS[name]
         training, block = preset.training, preset.block
-
-        def growth(own: DensifyConfig, published: int, iterations: int) -> DensifyConfig:
-            share = iterations / published
-            return replace(own, stats_start=round(share * own.stats_start), start=round(share * own.start),
-                           max_anchors=config.training.densify.max_anchors)  # fmt: skip
-
-        grown = growth(training.densify, training.iterations, budget.coarse)
-        inner = replace(growth(block.densify, block.iterations, budget.per_block), max_anchors=0)
+        grown = scaled_growth(training.densify, budget.coarse, budget.coarse / training.iterations)
+        grown = replace(grown, max_anchors=config.training.densify.max_anchors)
+        inner = scaled_growth(block.densify, budget.per_block, budget.per_block / block.iterations)
         return replace(
             preset,
             training=replace(training, iterations=budget.coarse, seed=config.training.seed, densify=grown),
@@ -104,6 +99,16 @@ def as_preset(name: PresetName) -> ConfigOverride:
             block=replace(block, iterations=budget.per_block, densify=inner,
                           max_anchors_total=config.block.max_anchors_total),
         )  # fmt: skip
+
+    return change
+
+
+def crossed_cell(lambda_vis: float, compensated: bool) -> ConfigOverride:
+    """The preset `paper`, cut by visibility or by place alone, grown with compensation or plainly."""
+
+    def change(config: MethodConfig, budget: Budget) -> MethodConfig:
+        cut = with_lambda_vis(lambda_vis)(as_preset("paper")(config, budget), budget)
+        return enable_compensation(cut, enabled=compensated)
 
     return change
 

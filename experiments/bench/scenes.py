@@ -6,6 +6,7 @@ All definitions of places stand here, so that another size or flight is one line
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from experiments.bench.definitions import BenchScene, Budget
@@ -82,12 +83,12 @@ def _in_the_lab(flight: str) -> BenchScene:
     )  # fmt: skip
 
 
-def _regime(config: MethodConfig) -> MethodConfig:
+def _regime(config: MethodConfig, voxel_size: float = 0.14) -> MethodConfig:
     """Blocks draw whole photographs, so that every row makes exactly the steps that it says. Anchors start from sparse
     points, and in gaps between them: stereo serves the very places that its claims are about. Their cells are
     four pixels wide below the flight: in finer ones there are more Gaussians than photographs have pixels."""
     config = _few_cameras(config)
-    init = replace(config.training.init, mvs=False, voxel_size=0.14)
+    init = replace(config.training.init, mvs=False, voxel_size=voxel_size)
     return replace(config, training=replace(config.training, init=init), block=replace(config.block, crop="off"))
 
 
@@ -103,6 +104,20 @@ def _in_the_regime(flight: str) -> BenchScene:
         "heart what few of them show. Anchors start from sparse points without stereo, and in gaps between them. "
         "Blocks draw whole photographs: all rows make the steps that they say.",
     )  # fmt: skip
+
+
+#: The same on a laptop's core: pictures of half the size, cells twice as wide, a third of the iterations.
+_SMALL_REGIME = replace(
+    _in_the_regime("uneven"),
+    name="regime-small",
+    title="paper's regime, small pictures",
+    budget=REGIME_BUDGET.scaled(1 / 3),
+    override=partial(_regime, voxel_size=0.28),
+    synth={
+        **_in_the_regime("uneven").synth, "width": 160, "height": 120, "num_points": 20_000, "num_test_images": 32,
+        "num_validation_images": 32,
+    },
+)  # fmt: skip
 
 
 def _real(name: str) -> BenchScene:
@@ -136,6 +151,7 @@ _SCENES = [
     ),
     *(_in_the_lab(flight) for flight in ("uneven", "distant", "even")),
     *(_in_the_regime(flight) for flight in ("uneven", "distant")),
+    _SMALL_REGIME,
     *(_lab(size, flight) for size in ("town", "district", "city") for flight in ("uneven", "distant", "even")),
     *(_real(name) for name in ("copr", "seneca", "brighton")),
     _mega_nerf("residence", "Residence", uneven=True),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from experiments.bench.definitions import BenchTable, MethodGroup
-from experiments.bench.methods import BETA_G, BLOCKS, FACTORIAL, GAMMA, LAMBDA_VIS, LOWER_THRESHOLDS, T_LOW
+from experiments.bench.methods import BETA_G, BLOCKS, CROSSED, FACTORIAL, GAMMA, LAMBDA_VIS, LOWER_THRESHOLDS, T_LOW
 
 LAB_SCENES = ("lab-uneven", "lab-distant", "lab-even")
 #: Where the paper's premise holds.
@@ -122,6 +122,13 @@ TABLES: dict[str, BenchTable] = {
             FACTORIAL,
             REGIME_SCENES,
             ours="cell-1-mean-0.2",
+        ),
+        BenchTable(
+            "crossed",
+            "Crossed factors of the preset paper: cut by visibility × compensation",
+            CROSSED,
+            ("regime-small",),
+            ours="paper-1-on",
         ),
         BenchTable(
             "coarse-compensation",

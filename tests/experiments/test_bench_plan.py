@@ -12,6 +12,7 @@ from experiments.bench.definitions import (
     BenchMethod,
     BenchScene,
     Budget,
+    growth_decisions,
     has_block_folders,
     has_gaussian_blocks,
 )
@@ -113,6 +114,30 @@ def test_more_anchors_by_plain_growth_differ_from_it_in_the_threshold_alone():
     assert not settings["cell-1-off"]["block"]["compensation"]["enabled"]
 
 
+def test_crossed_cells_differ_from_the_preset_paper_in_the_two_factors_alone():
+    scene = SCENES["regime-small"]
+    base = scene.base(scene.budget, 0)
+    settings = {name: METHODS[name].settings(base, scene.budget) for name in ("vdgs-paper", *TABLES["crossed"].methods)}
+    assert settings["paper-1-on"] == settings["vdgs-paper"]
+    by_place, plain = "partition.lambda_vis: 1.0 -> 0.0", "block.compensation.enabled: True -> False"
+    whole = to_dict(settings["vdgs-paper"])
+    for name, lines in (("0-on", [by_place]), ("1-off", [plain]), ("0-off", [by_place, plain])):
+        assert sorted(diff_settings(whole, to_dict(settings[f"paper-{name}"]))) == sorted(lines)
+
+
+def test_short_training_decides_about_growth_and_long_training_as_often_as_its_preset():
+    for scene, iterations in (("seneca", 900), ("seneca", 1000), ("regime-small", 1600)):
+        plan = make_plan("table1", PlanOptions(scenes=(scene,), seeds=1, total_iterations=iterations))
+        for method in ("full", "vdgs-paper", "vdgs-default"):
+            config = plan.run_of[scene, method, 0].config
+            assert growth_decisions(config.training) >= 2
+            assert growth_decisions(block_train_config(config, 100)) >= 2
+    for scene in ("residence", "regime-uneven", "copr"):
+        for method in ("full", "vdgs-paper", "vdgs-default"):
+            config = METHODS[method].settings(SCENES[scene].base(SCENES[scene].budget, 0), SCENES[scene].budget)
+            assert (config.training.densify.every, config.block.densify.every) == (100, 100)
+
+
 def test_blocks_as_printed_take_back_what_the_laptop_changes():
     scene = SCENES["lab-uneven"]
     base = scene.base(scene.budget, 0)
@@ -176,7 +201,7 @@ def test_comparators_that_published_dense_adam_have_it():
     assert baseline.training.optimizer == "sparse-adam"
     merged = {name: METHODS[name].settings(base, scene.budget).merge.rule for name in METHODS}
     assert {name for name, rule in merged.items() if rule == "max-visibility"} == {
-        "free-best-seen", "ramp-best-seen", "vdgs-paper"
+        "free-best-seen", "ramp-best-seen", "vdgs-paper", *TABLES["crossed"].methods
     }  # fmt: skip
 
 

@@ -8,7 +8,9 @@ import re
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rich.console import Console
 
+from experiments.bench.bench import BenchSettings, ProgressReporter, run_bench
 from experiments.bench.claim_check import check_claims
 from experiments.bench.equal_time import step_factors
 from experiments.bench.figure import plot_visibility_groups
@@ -20,6 +22,8 @@ from experiments.bench.result_tables import ResultTable, TableCell, TableRow, ma
 from experiments.bench.results import BenchResult
 from experiments.bench.statistics import Summary, paired_difference, rank_marks, summarize
 from experiments.bench.table_writers import escape_latex, escape_markdown, to_latex, to_markdown, to_tidy_csv
+from vdgs.distributed.executor import Task
+from vdgs.distributed.local_executor import LocalExecutor
 from vdgs.errors import VdgsError
 
 
@@ -255,7 +259,9 @@ def test_at_equal_time_dear_methods_make_fewer_iterations():
     assert slower.config.training.iterations == pytest.approx(0.12 * before.config.training.iterations, abs=2)
     assert slower.folder != before.folder
     assert again.table.title == f"{plan.table.title}, at equal time"
-    assert "octree-gs on tiny: 0.12" in "".join(make_notes(again, [], [], False))
+    said = "".join(make_notes(again, [], [], False))
+    assert "octree-gs on tiny: 0.12" in said
+    assert "decides about growth (few times say little of it): full on tiny: 1." in said
     with pytest.raises(VdgsError, match="takes the time of `full`"):
         step_factors(plan, results[:4])
 
@@ -265,3 +271,17 @@ def test_large_scenes_of_a_table_have_one_seed_unless_more_are_asked_for():
     assert {seed for scene, _, seed in make_plan("table1", PlanOptions()).run_of if scene == "copr"} == {0, 1, 2}
     asked = make_plan("table1", PlanOptions(seeds=2, scenes=("seneca",)))
     assert {seed for _, _, seed in asked.run_of} == {0, 1}
+
+
+def test_a_line_is_printed_when_a_run_starts_and_one_when_it_ended(tmp_path):
+    said = io.StringIO()
+    task = Task(name="tiny/full/0", command=["true"], output=tmp_path / "log")
+    LocalExecutor(1).run([task], ProgressReporter(1, Console(file=said)))
+    assert re.fullmatch(r"started  tiny/full/0\ndone     tiny/full/0  \d+ s  \(1 of 1\) *\n", said.getvalue())
+
+
+def test_weights_for_lpips_that_are_not_there_are_named_before_anything_is_trained(tmp_path):
+    asked = BenchSettings("toy", tmp_path / "out", PlanOptions(), lpips_weights=tmp_path / "vgg.pth")
+    with pytest.raises(VdgsError, match=r"vgg\.pth: no such file"):
+        run_bench(asked, Console(file=io.StringIO()))
+    assert not (tmp_path / "out").exists()

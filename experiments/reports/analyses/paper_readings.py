@@ -183,7 +183,9 @@ def metrics(evaluation: Path) -> dict[str, Any]:
     """Of what `vdgs eval` has written: means over the views, and quarters of the pixels by V."""
     found = json.loads((evaluation / "metrics.json").read_text())
     quarters = [each["psnr"] for each in found["by_visibility"] if each["lower"] is not None]
-    names = ("psnr", "ssim", "psnr_covered_own_background", "opacity_coverage", "n_anchors", "train_seconds")
+    names = (
+        "psnr", "ssim", "psnr_cc", "psnr_covered_own_background", "opacity_coverage", "n_anchors", "train_seconds"
+    )  # fmt: skip
     return {name: found[name] for name in names} | {"quarters": quarters}
 
 
