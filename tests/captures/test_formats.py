@@ -512,7 +512,9 @@ def test_absolute_paths_inside_the_capture_are_those_of_its_files(tmp_path, scen
         assert_sees_the_scene(capture, scene)
 
 
-@pytest.mark.parametrize("top", ["/home/other/place/", "C:\\data\\place\\", "../place/", "../../"])
+@pytest.mark.parametrize(
+    "top", ["/home/other/place/", "C:\\data\\place\\", "../place/", "../../", "file:///home/my%20place/"]
+)
 def test_paths_of_another_machine_are_those_of_the_captures_files(tmp_path, scene, top):
     content = write_transforms(tmp_path, scene)
     for each in content["frames"]:

@@ -55,6 +55,12 @@ TABLES = {
     "survey feet": "name,lat,lon,alt [us survey ft]\na.jpg,-33.5,-70.6,1640.416667\n",
     "feet in rows": "name,lat,lon,alt_ft\na.jpg,-33.5,-70.6,1640.41995 ft\n",
     "pix4d, external": "imageName longitude latitude altitude omega phi kappa\na.jpg -70.6 -33.5 500 0.1 0.2 0.3\n",
+    "excel": "sep=;\nname;lat;lon;alt\na.jpg;-33.5;-70.6;500\n",
+    "rows without a position": "SourceFile\tGPSLatitude\tGPSLongitude\tGPSAltitude\nb.jpg\t-\t-\t-\n"
+    "c.jpg\tNaN\tnan\tnan\na.jpg\t-33.5\t-70.6\t500\n",
+    "heights over the ground": "name,lat,lon,height,altitude\na.jpg,-33.5,-70.6,50,500\n",
+    "emlid": "Image name,Latitude,Longitude,Ellipsoidal height,RMS easting,RMS northing,RMS elevation\n"
+    "a.jpg,-33.5,-70.6,500,0.5,0.3,1\n",
     "moments without a fix": "1\t2.1\t[2]\t 0,N\t 0,E\t 0,V\t0.0,Lat\t0.0,Lon\t0.0,Ellh\t0, 0, 0\t0,Q\n"
     "1\t280.1\t[2145]\t 12,N\t 34,E\t -20,V\t-33.5,Lat\t-70.6,Lon\t500,Ellh\t0.01, 0.02, 0.03\t50,Q\n2\t280.2\n",
     "dji moments": "1\t280234.1\t[2145]\t  12,N\t 34,E\t -20,V\t-33.5,Lat\t-70.6,Lon\t500,Ellh\t"
@@ -73,6 +79,7 @@ def test_tables_are_read_as_programs_write_them(tmp_path, text):
         expected = (PLACE[0], -120.6, 500.0) if "-120.6" in text else PLACE
         assert row.position == pytest.approx(expected, abs=2e-6)
         assert row.name.endswith(("a.jpg", "a", "1"))
+        assert row.gps_std == ((0.5, 1.0) if "0.5 1\n" in text or "RMS" in text else row.gps_std)
 
 
 @pytest.mark.parametrize(
@@ -88,7 +95,7 @@ def test_tables_are_read_as_programs_write_them(tmp_path, text):
         ("name,lat,lon,alt\na.jpg,-70.6,233.5,1e9\n", "line 2: .* no place on Earth"),
         ("name,lat,lon,alt\na.jpg,-97.6,33.5,10\n", "line 2: .* no place on Earth"),
         ("EPSG:32719\na.jpg 1e12 1e12 5\n", "line 2: .* is no place in"),
-        ("\0\1\2\3\0\0\0\0", "is not a CSV table.*Save a spreadsheet as CSV"),
+        ("\0\1\2\3\0\0\0\0", "is not a text file.*save a spreadsheet as CSV"),
         ("EPSG:4326\n-70.6 -33.5 500 100 200 a.jpg P1\n", "control points is given as --gcp"),
         ("time,latitude,longitude,altitude\n1,-33.5,-70.6,5\n", "no column of photographs' names.*exiftool -geotag"),
         ('<?xml version="1.0"?>\n<gpx><trkpt lat="1" lon="2"/></gpx>', "is a track.*exiftool -geotag"),

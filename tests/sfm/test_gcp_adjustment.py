@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import shutil
 from dataclasses import replace
+from functools import reduce
 from pathlib import Path
 
 import numpy as np
@@ -134,12 +135,31 @@ def listed(flight: Flight, *changes: dict[str, object], header: str = "EPSG:3271
     return "\n".join([header, *(str(line.get("text", LINE.format(**line))) for line in lines)])
 
 
+def test_lists_that_a_spreadsheet_wrote_are_read(flight, tmp_path):
+    collection, file = collect_images([flight.folder]), tmp_path / "gcp_list.txt"
+    file.write_text(plain := listed(flight))
+    sound = read_gcp_list(file, collection, ())
+    head, *lines = (line.split() for line in plain.splitlines())
+    columns = ["geo_x", "geo_y", "geo_z", "im_x", "im_y", "image_name", "gcp_name"]
+    dots = (".JPG", "#JPG"), (".", ","), ("#JPG", ".JPG")
+    ways = (
+        ("utf-16", [f"{head[0]},,,,,,", *(",".join(line) for line in [columns, *lines])]),
+        (
+            "cp1252",
+            [f'"{head[0]}"', *(reduce(lambda text, two: text.replace(*two), dots, ";".join(line)) for line in lines)],
+        ),
+    )
+    for encoding, rows in ways:
+        file.write_bytes("\r\n".join(rows).encode(encoding))
+        assert read_gcp_list(file, collection, ()).points == sound.points
+
+
 BAD = {
     "nothing": ("", "is empty"),
     "no system": (None, "must name the coordinate system"),
     "no such system": ({"header": "EPSG:999999"}, "must name the coordinate system"),
     "a word for a number": ([{"text": "1 2 three 4 5 DJI_0001.JPG"}], "line 2: .* is not `x y z px py photograph"),
-    "too few words": ([{"text": "1 2 3 4 5"}], "line 2: .* is not `x y z px py photograph"),
+    "too few words": ([{"text": "a 1 2 3"}], "line 2: .* is not `x y z px py photograph.* points alone"),
     "not finite": ([{"text": "nan 2 3 4 5 DJI_0001.JPG"}], "line 2: numbers must be finite"),
     "unknown photograph": ([{"photograph": "DJI_0999.JPG"}], r"1 photographs that are not there; .*DJI_0999\.JPG"),
     "outside": ([{"text": "1 2 3 401 5 DJI_0001.JPG"}], "line 2: pixel 401, 5 is outside .* 400 x 300"),

@@ -81,6 +81,12 @@ def test_orientation_swaps_the_sides_and_what_the_drone_says_of_them(tmp_path):
 
 
 def test_rtk_says_how_accurate_it_is(tmp_path):
+    pix4d = (
+        'Camera:GPSXYAccuracy="0.02" Camera:GPSZAccuracy="0.04" Camera:VertCS="ellipsoidal" Camera:ModelType="fisheye"'
+    )
+    seen = [photograph(tmp_path, k, (9.0 * k, 0, 40), xmp=pix4d) for k in range(3)]
+    assert positions_of(seen).gps_std[0] == pytest.approx([0.02, 0.02, 0.04])
+    assert (seen[0].altitude_type, seen[0].camera_model) == ("ellipsoidal as recorded", "OPENCV_FISHEYE")
     xmp = 'drone-dji:RtkStdLon="0.012" drone-dji:RtkStdLat="0.015" drone-dji:RtkStdHgt="0.03"'
     seen = [photograph(tmp_path, k, (9.0 * k, 0, 40), xmp=xmp) for k in range(3)]
     assert positions_of(seen).gps_std[0] == pytest.approx([0.012, 0.015, 0.03])
@@ -164,6 +170,12 @@ def test_an_enormous_packet_is_no_trouble(tmp_path):
         pytest.param(
             {}, {0xA405: 20, 0xA002: 4000}, {"drone-dji:DewarpData": "2020-01-01;2800.0,2801,1,2,0,0,0,0,0"}, 0.7,
             id="calibrated by the maker",
+        ),
+        pytest.param(
+            {}, {0xA002: 4000}, {"Camera:FisheyeAffineMatrix": "4398.2,0,0,4398.2"}, 0.7, id="Pix4D's fisheye"
+        ),
+        pytest.param(
+            {}, {}, {"Camera:PerspectiveFocalLength": "4.2", "Camera:PrincipalPoint": "3.0,2.2"}, 0.7, id="Pix4D"
         ),
         pytest.param({}, {0x920A: float("nan"), 0xA405: 0}, {"drone-dji:DewarpData": "x;"}, None, id="nothing"),
     ],

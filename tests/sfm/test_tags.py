@@ -150,6 +150,7 @@ def test_angles_are_read_from_text(text, degrees):
 def test_the_wrong_reference_of_an_altitude_gives_way_to_the_sign_in_xmp(absolute, altitude):
     xmp = {"drone-dji:AbsoluteAltitude": absolute} if absolute else {}
     assert read_altitude({5: b"\x01", 6: 96.0}, xmp)[0] == altitude
+    assert read_altitude({5: b"\x00", 6: 0.0}, xmp)[0] == float(absolute or 0)  # firmware that leaves EXIF empty
 
 
 def test_no_flight_is_far_below_the_sea():

@@ -19,6 +19,8 @@ _STARTS = re.compile(
     r"(\d{4,6}$|(EPSG|ESRI)[\s:]+\d+|urn:ogc:def:crs:|https?://www\.opengis\.net/def/crs/|WGS\s?84\b|UTM\b"
     r"|\w[\w() +-]* / \w|\+proj=|\+init=|(GEOG|PROJ|GEO|PROJC|COMPD|COMPOUND)[A-Z]*CRS?\[|\w*CS\[)", re.I
 )  # fmt: skip
+#: What may stand around a name: quotes, and the separators by which spreadsheets fill a line.
+_AROUND = " \t\r\n,;'\""
 #: Places that differ by less than this are of one flight in degrees, and one place in metres.
 _ONE_PLACE = 0.2
 #: Ellipsoids of datums that agree with WGS 84 to a metre or two.
@@ -39,7 +41,7 @@ class UnknownSystem(CaptureError):
 
 def names_a_system(line: str) -> bool:
     """Whether a line is the name of a coordinate system, as far as its beginning tells."""
-    return bool(_STARTS.match(line.strip()))
+    return bool(_STARTS.match(line.strip(_AROUND)))
 
 
 def to_geodetic(header: str, file: Path, where: str = "the first line") -> tuple[ToGeodetic, str]:
@@ -145,7 +147,7 @@ def geocentric_to_geodetic(header: str, file: Path) -> ToGeodetic:
 
 def _named(header: str) -> str:
     """ODM's own words for systems, `WGS84`, `WGS84 longlat` and `WGS84 UTM 15N`, as codes; others as they are."""
-    header = re.sub(r"(?i)^(crs|srs)\s*:", "", header.strip()).strip()
+    header = re.sub(r"(?i)^(crs|srs)\s*:", "", header.strip(_AROUND)).strip()
     if _LONGITUDE_LATITUDE.fullmatch(header):
         return "EPSG:4326"
     zone = _UTM.fullmatch(header)

@@ -56,8 +56,10 @@ _COLUMNS: dict[str, frozenset[str]] = {
         "altref": "altref altituderef gpsaltituderef",
         "across": "accuracyhorizontal horizontalaccuracy hacc accuracyh hdev horizontalerror accuracyxy errorxy "
         "gpshpositioningerror accuracyhorz horizontalaccuracym hzaccuracy xyaccuracy",
+        "eastwards": "rmseasting eastingrms sde stddeve sigmae accuracyxeasting accuracyxlongitude accuracyx",
+        "northwards": "rmsnorthing northingrms sdn stddevn sigman accuracyynorthing accuracyylatitude accuracyy",
         "upwards": "accuracyvertical verticalaccuracy vacc accuracyv vdev verticalerror accuracyz errorz "
-        "verticalaccuracym zaccuracy",
+        "verticalaccuracym zaccuracy rmselevation elevationrms sdu stddevu sigmau accuracyzaltitude",
         "system": "epsg crs srs epsgcode",
     }.items()
 }  # fmt: skip
@@ -67,6 +69,10 @@ _UNIT = re.compile(
 #: How the names of columns, and values, say that they are feet.
 _FEET = re.compile(r"(?:[\[( _\d]|^alt|^altitude|^height)(us[ _]?(?:survey[ _]?)?)?(?:ft|feet|foot)\b", re.IGNORECASE)
 FOOT_M, SURVEY_FOOT_M = 0.3048, 1200 / 3937
+#: What programs write where they know nothing.
+_UNKNOWN = frozenset({"", "nan", "none", "null", "-", "n/a", "na"})
+#: Names of columns of altitudes that others of a table give way to: heights may be those over the ground.
+_ALTITUDE = re.compile(r"alt|elli?p|elev")
 #: Words of exiftool behind altitudes below the sea.
 _BELOW = re.compile(r"below|^1$", re.IGNORECASE)
 _LEADING_NUMBER = re.compile(r"\s*([+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)\s*(?:m|metres|meters)?\b", re.IGNORECASE)
@@ -107,6 +113,8 @@ class _Columns(NamedTuple):
     """Metres in one of its altitudes."""
     assumed: bool = False
     """The order is that of programs that write no header."""
+    heights: tuple[str, ...] = ()
+    """Names of the columns of altitudes: the one that is read, and those that are not."""
 
 
 def read_gps_table(file: Path) -> GpsTable:
@@ -143,6 +151,9 @@ def read_gps_table(file: Path) -> GpsTable:
     notes = list[str]()
     if columns.assumed:
         notes.append(f"{file.name} names no columns; read as name, latitude, longitude, altitude.")
+    if columns.heights:
+        read, *others = map(repr, columns.heights)
+        notes.append(f"{file.name}: altitudes are those of the column {read}, not of {', '.join(others)}.")
     if len(placed) < len(rows):
         notes.append(f"{file.name}: {len(rows) - len(placed)} of {len(rows)} rows have no position; not used.")
     return GpsTable(tuple(found), notes=tuple(notes))
@@ -167,7 +178,14 @@ def _known(words: Sequence[str]) -> dict[str, int]:
     for k, word in enumerate(words):
         plain = re.sub(r"[^a-z0-9]", "", _UNIT.sub("", word.lower()))
         what = next((what for what, names in _COLUMNS.items() if plain in names), None)
-        if what is not None:
+        if (
+            what == "alt"
+            and what in found
+            and _ALTITUDE.search(plain)
+            and not _ALTITUDE.search(words[found[what]].lower())
+        ):
+            found[what] = k
+        elif what is not None:
             found.setdefault(what, k)
     return found
 
@@ -177,7 +195,9 @@ def _columns(rows: list[Row], system: str | None, file: Path) -> tuple[_Columns,
     known = _known(rows[0].words)
     unit = _meters(rows[0].words[known["alt"]]) if "alt" in known else 1.0
     if {"name", "lat", "lon"} <= set(known):
-        return _Columns(known, None, unit), rows[1:]
+        others = [word for k, word in enumerate(rows[0].words) if "alt" in _known([word]) and k != known["alt"]]
+        heights = (rows[0].words[known["alt"]], *others) if others else ()
+        return _Columns(known, None, unit, heights=heights), rows[1:]
     if {"lat", "lon"} <= set(known):
         raise CaptureError(f"{file}: has positions but no column of photographs' names: it is {_BY_TIME}")
     if {"name", "x", "y"} <= set(known):
@@ -238,7 +258,7 @@ def _word(row: Row, columns: _Columns, what: str) -> str:
 
 def _has_place(row: Row, columns: _Columns) -> bool:
     both = ("x", "y") if "x" in columns.where and columns.system is not None else ("lat", "lon")
-    return bool(_word(row, columns, "name")) and all(_word(row, columns, what) for what in both)
+    return bool(_word(row, columns, "name")) and all(_word(row, columns, what).lower() not in _UNKNOWN for what in both)
 
 
 def _geodetic(rows: Sequence[Row], columns: _Columns, file: Path) -> list[tuple[float, float, float]]:
@@ -271,13 +291,11 @@ def _angle(row: Row, columns: _Columns, what: str, reference: str, axis: str) ->
 
 def _altitude(row: Row, columns: _Columns, file: Path) -> float:
     word = _word(row, columns, "alt")
-    if not word:
+    if word.lower() in _UNKNOWN:
         return math.nan
     number = _LEADING_NUMBER.match(word)
     unit = _meters(word)
     if number is None or (word[number.end() :].strip() and "sea" not in word.lower() and unit == 1):
-        if word.lower() in ("nan", "none", "null", "-", "n/a", "na"):
-            return math.nan
         raise CaptureError(f"{file}: line {row.number}: the altitude {word!r} is not a number. Mend the row.")
     value = float(number[1].replace(",", ".")) * (unit if unit != 1 else columns.altitude_unit)
     below = _BELOW.search(word[number.end() :]) or _BELOW.search(_word(row, columns, "altref"))
@@ -310,6 +328,8 @@ def _projected(rows: Sequence[Row], columns: _Columns, file: Path) -> list[tuple
 
 def _deviations(row: Row, columns: _Columns) -> tuple[float, float] | None:
     across, upwards = (_plain_number(_word(row, columns, what)) for what in ("across", "upwards"))
+    if "across" not in columns.where:
+        across = max(_plain_number(_word(row, columns, what)) for what in ("eastwards", "northwards"))
     return (across, upwards) if 0 < across < 1000 and 0 < upwards < 1000 else None
 
 

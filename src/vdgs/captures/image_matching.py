@@ -136,7 +136,7 @@ def fit_to_image(view: SourceView, path: Path) -> Intrinsics:
     if (header.width, header.height) == (intrinsics.width, intrinsics.height):
         return intrinsics
     if not same_aspect((header.width, header.height), (intrinsics.width, intrinsics.height)):
-        turned = (header.width > header.height) != (intrinsics.width > intrinsics.height)
+        turned = same_aspect((header.height, header.width), (intrinsics.width, intrinsics.height))
         hint = "The image is turned by a quarter (EXIF orientation applied?). " if turned else ""
         raise CaptureError(
             f"{path}: is {header.width}x{header.height}, but its camera is "

@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from vdgs.captures.formats.source_capture import SourceView
 from vdgs.captures.name_resolution import NameLookup, find_one
+from vdgs.captures.text_tables import read_lines
 from vdgs.errors import CaptureError
 
 #: Photographs that must show a point: one view tells a line, no place.
@@ -26,8 +27,6 @@ LEAST_PX, LEAST_SHARE = 0.5, 0.002
 MOST_APART = 0.1
 FORM = "`NAME px py photograph` or `NAME ray x y photograph` for a mark, or `NAME NAME metres` for a distance"
 _RAY = "ray"
-#: Larger files are none (bytes).
-_MAX_FILE_BYTES = 1 << 24
 
 
 @dataclass(frozen=True)
@@ -87,16 +86,8 @@ def _meters(word: str) -> float:
 
 def text_lines(file: Path, what: str) -> list[tuple[int, str]]:
     """The lines of a text file of `what` with their numbers, without empty ones and comments."""
-    try:
-        if file.stat().st_size > _MAX_FILE_BYTES:
-            raise CaptureError(f"{file}: is far too large for a list of {what}.")
-        text = file.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise CaptureError(f"{file}: cannot be read ({error.strerror}).") from error
-    except UnicodeDecodeError:
-        raise CaptureError(f"{file}: is not a text file. A list of {what} is expected.") from None
-    rows = [(k, line.strip()) for k, line in enumerate(text.splitlines(), 1)]
-    return [(k, line) for k, line in rows if line and not line.startswith("#")]
+    rows = [(line.number, line.text.strip()) for line in read_lines(file, f"list of {what}")]
+    return [(number, line) for number, line in rows if not line.startswith("#")]
 
 
 def check_marked(known: KnownDistances, images_of: Mapping[str, set[str]], file: Path) -> None:

@@ -6,19 +6,27 @@ both.
 
 from __future__ import annotations
 
+import re
 import unicodedata
 from collections.abc import Callable, Iterable
 from pathlib import Path, PurePosixPath
 from typing import Generic, TypeVar
+from urllib.parse import unquote
 
 from vdgs.errors import CaptureError
 
+_URI = re.compile(r"file:/*(?:localhost/)?", re.IGNORECASE)
 T = TypeVar("T")
 
 
 def to_nfc(name: str) -> str:
     """The name with accented letters in one piece."""
     return unicodedata.normalize("NFC", name)
+
+
+def without_uri(name: str) -> str:
+    """The path of a `file://` URI; other names as they are."""
+    return unquote(_URI.sub("", name)) if _URI.match(name) else name
 
 
 def to_colmap_name(name: str) -> str:

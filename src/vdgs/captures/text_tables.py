@@ -14,6 +14,8 @@ from vdgs.errors import CaptureError
 #: Larger files are no tables of photographs (bytes).
 LONGEST_FILE = 1 << 26
 _SEPARATORS = ("\t", ";", ",", "|")
+#: Excel's line that says what parts words.
+_EXCEL = re.compile(r"\"?sep=.?\"?", re.IGNORECASE)
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
 #: A photograph's name in front of a line whose words are parted by blanks, which may be in the name too.
 _NAME_WITH_BLANKS = re.compile(
@@ -38,18 +40,20 @@ class Row(NamedTuple):
     words: list[str]
 
 
-def read_lines(file: Path) -> list[Line]:
-    """The lines of a text file that are not empty, in UTF-8, UTF-16 or Windows' Latin. Raises CaptureError."""
+def read_lines(file: Path, what: str = "table of photographs") -> list[Line]:
+    """The lines of a text file that are not empty, in UTF-8, UTF-16 or Windows' Latin. Raises CaptureError, which says
+    `what` is expected."""
     try:
         if file.stat().st_size > LONGEST_FILE:
-            raise CaptureError(f"{file}: is far too large for a table of photographs.")
+            raise CaptureError(f"{file}: is far too large for a {what}.")
         data = file.read_bytes()
     except OSError as error:
         raise CaptureError(f"{file}: cannot be read ({error.strerror}).") from error
     text = _decoded(data)
     if "\x00" in text:
-        raise CaptureError(f"{file}: is not a CSV table (it holds bytes that are no text). Save a spreadsheet as CSV.")
-    return [Line(k, line.strip(" \r")) for k, line in enumerate(text.splitlines(), 1) if line.strip()]
+        raise CaptureError(f"{file}: is not a text file. A {what} is expected; save a spreadsheet as CSV.")
+    lines = [Line(k, line.strip(" \r")) for k, line in enumerate(text.splitlines(), 1) if line.strip()]
+    return lines[1:] if lines and _EXCEL.fullmatch(lines[0].text) else lines
 
 
 def _decoded(data: bytes) -> str:
@@ -66,7 +70,7 @@ def _decoded(data: bytes) -> str:
 
 def rows_of(lines: Sequence[Line]) -> list[Row]:
     """The lines as words, without quotes; decimal commas are points where the separator is another."""
-    separator = _separator([line.text for line in lines[:LOOKED_AT]])
+    separator = separator_of([line.text for line in lines[:LOOKED_AT]])
     rows = []
     for line in lines:
         if separator is None:
@@ -83,7 +87,7 @@ def rows_of(lines: Sequence[Line]) -> list[Row]:
     return rows
 
 
-def _separator(lines: Sequence[str]) -> str | None:
+def separator_of(lines: Sequence[str]) -> str | None:
     """What parts the words of most lines into three or more; None for blanks."""
     for separator in _SEPARATORS:
         if sum(line.count(separator) >= 2 for line in lines) * 2 > len(lines):

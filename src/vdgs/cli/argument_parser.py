@@ -105,7 +105,9 @@ def _check_input(option: Option, path: Path) -> None:
         raise VdgsError(f"{named}{path}: {fault}{suggest_path(path)}")
     begins = (path / "capture").is_dir()  # a run that still makes a capture of photographs
     if is_run and not begins and not (path / "config.yaml").is_file():
-        raise RunError(f"{path}: is not a run folder (no config.yaml). Train first: vdgs run CAPTURE --output RUN")
+        above = next((each for each in path.absolute().parents if (each / "merged").is_dir()), None)
+        remedy = f"It lies in one: {above}" if above else "Train first: vdgs run CAPTURE --output RUN"
+        raise RunError(f"{path}: is not a run folder (no config.yaml). {remedy}")
 
 
 def _check_place(output: Path) -> None:
@@ -157,7 +159,7 @@ def _read_options(given: GivenArguments, words: Sequence[str], free: list[str]) 
             if word.startswith("-") and Path(word).exists():
                 raise UsageError(f"{word} is read as an option; write the path as ./{word}")
             if word.startswith("-") and not _is_number(word):
-                raise UsageError(f"there is no option {name}{_suggestion(name, known)}")
+                raise UsageError(f"there is no option {name}{_suggestion(name, known, given.kind)}")
             free.append(word)
             continue
         option = known[name]
@@ -166,6 +168,8 @@ def _read_options(given: GivenArguments, words: Sequence[str], free: list[str]) 
         while index < len(words) and len(taken) != count and not _ends_values(words[index], count, known):
             taken.append(words[index])
             index += 1
+        if option.num_words == 0 and index < len(words) and words[index].lower() in _ON_OR_OFF:
+            taken = [] if Path(words[index]).exists() else words[index : index + 1]
         _give(given, option, taken, name)
 
 
@@ -223,18 +227,38 @@ def _is_number(word: str) -> bool:
     return True
 
 
-#: What other programs call options of ours.
+#: What other programs call options of ours; the first that a verb has is meant.
 _ELSEWHERE = {
-    "epsg": "crs", "srs": "crs", "t-srs": "crs", "resolution": "gsd", "steps": "iterations", "max-steps": "iterations",
-    "max-num-iterations": "iterations",
+    "epsg": "crs", "srs": "crs", "t-srs": "crs", "resolution": "gsd downscale", "r": "downscale", "d": "downscale",
+    "data-factor": "downscale", "steps": "iterations", "max-steps": "iterations", "max-num-iterations": "iterations",
+    "model-path": "output", "m": "output", "output-path": "output", "output-dir": "output", "result-dir": "output",
+    "project-path": "output", "i": "images", "size": "width", "format": "for",
 }  # fmt: skip
+#: What they call what is given without an option here.
+_WITHOUT_NAME = {
+    "source-path",
+    "s",
+    "data",
+    "data-dir",
+    "data-path",
+    "input",
+    "input-path",
+    "image-path",
+    "load-config",
+}
+#: Words behind an option that takes none.
+_ON_OR_OFF = {"true", "false", "yes", "no", "on", "off"}
 
 
-def _suggestion(name: str, known: dict[str, Option]) -> str:
+def _suggestion(name: str, known: dict[str, Option], kind: type) -> str:
     """A question about the option that may be meant: by another program's name for it, by its whole name, or by that
     within its group or another one."""
-    if (ours := f"--{_ELSEWHERE.get(name.removeprefix('--'))}") in known:
-        return f"; did you mean {ours}?"
+    plain = name.lstrip("-")
+    for ours in _ELSEWHERE.get(plain, "").split():
+        if f"--{ours}" in known:
+            return f"; did you mean --{ours}?"
+    if plain in _WITHOUT_NAME and (first := next((each for each in options_of(kind) if each.is_positional), None)):
+        return f"; {first.metavar} is given without one"
     within = {f"--{each.rpartition('.')[2]}": each for each in reversed(known) if "." in each}
     candidates = within | {each: each for each in known}
     for sought in (name, f"--{name.removeprefix('--').rpartition('.')[2]}"):

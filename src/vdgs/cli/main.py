@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         sys.exit(exit_code_of("vdgs", lambda: print(HELP, end="") or (0 if arguments else 2), ""))
-    if arguments[0] == "--version":
+    if arguments[0] in ("--version", "-v", "-V", "version"):
         from vdgs import __version__
 
         sys.exit(exit_code_of("vdgs", lambda: print(f"vdgs {__version__}"), ""))
@@ -68,6 +68,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         from vdgs.config.serialization import suggest
 
         meant = suggest(arguments[0].lower().lstrip("-"), [*COMMANDS, "help"])
+        if verb := next((each for each in arguments[1:] if arguments[0].startswith("-") and each in COMMANDS), ""):
+            meant = f"; the verb comes first: vdgs {verb} ..."
+        elif arguments[0] in ("train", "process", "reconstruct"):
+            meant = "; did you mean 'run'?"
         print(f"{HELP}\nvdgs: there is no verb {arguments[0]!r}{meant}", file=sys.stderr)
         sys.exit(2)
     sys.exit(_run_command(arguments[0], arguments[1:]))

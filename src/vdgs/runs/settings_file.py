@@ -30,6 +30,8 @@ def read_settings_file(path: Path) -> tuple[Values, Values]:
 
     Raises VdgsError, naming the setting, for one that is unknown, of another type or out of its range.
     """
+    if path.is_dir():
+        raise VdgsError(f"{path}: is a folder. Give a file of settings: vdgs config --output settings.yaml")
     try:
         content = load_yaml(path.read_text(encoding="utf-8-sig")) or {}
     except (OSError, yaml.YAMLError, RecursionError, ValueError) as error:

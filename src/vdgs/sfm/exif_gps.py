@@ -87,8 +87,12 @@ def read_altitude(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[float
     elif str(reference).strip("\x00 ") in ("1", "3") or reference in (1, 3):
         value = -abs(value)
     absolute = first_number(xmp, "AbsoluteAltitude")
-    if value is not None and absolute is not None and value * absolute < 0 and abs(value + absolute) < 1:
-        value = absolute  # drones and programs write the wrong reference; the sign in XMP is written out
+    if (
+        value is not None
+        and absolute is not None
+        and (value == 0 or (value * absolute < 0 and abs(value + absolute) < 1))
+    ):
+        value = absolute  # firmware leaves EXIF empty, or writes the wrong reference; the sign in XMP is written out
     if value is None or abs(value) > HIGHEST_M:
         return None, ""
     if value < LOWEST_M:
@@ -96,7 +100,7 @@ def read_altitude(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[float
     ellipsoidal = first_number(xmp, "AltitudeWGS84")
     if ellipsoidal is not None and abs(ellipsoidal - value) < 0.01:
         return value, "above the WGS 84 ellipsoid (AltitudeWGS84)"
-    named = text(xmp, "AltitudeType")
+    named = text(xmp, "AltitudeType", "Camera:VertCS")
     return value, f"{named} as recorded" if named else "EXIF GPSAltitude as recorded, datum not stated"
 
 

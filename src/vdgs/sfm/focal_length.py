@@ -24,6 +24,8 @@ _INCH, _CENTIMETRE, _MILLIMETRE = 25.4, 10.0, 1.0
 _UNITS = {2: _INCH, 3: _CENTIMETRE, 4: _MILLIMETRE}
 #: What says a focal length that was measured, lens by lens.
 CALIBRATED_SOURCE = "the maker's calibration in XMP"
+#: What Pix4D's names say, of the lens or of its model.
+PIX4D_SOURCE = "Camera:PerspectiveFocalLength in XMP"
 SENSOR, EQUIVALENT = "EXIF's focal length and sensor", "EXIF's 35 mm equivalent"
 #: Two ways to a focal length that differ by more than this factor contradict each other. The 35 mm equivalent is a
 #: whole number, of the diagonal or of the width: up to 15 %.
@@ -66,6 +68,7 @@ def read_lens(
         (_times(_calibrated(xmp, original), kept), CALIBRATED_SOURCE),
         (_times(_by_sensor(focal_mm, _sensor(details, original)), kept), SENSOR),
         (_times(_by_sensor(focal_mm, SENSOR_WIDTH_MM.get(model)), kept), f"EXIF's focal length, the sensor of {model}"),
+        (_times(_by_pix4d(xmp, _sensor(details, original)), kept), PIX4D_SOURCE),
     ]
     sides = (_number(details.get(0xA002)) or 0.0, _number(details.get(0xA003)) or 0.0) if cut else (width, height)
     equivalent = as_written = _times(_by_equivalent(equivalent_mm, *sides), kept / zoom)
@@ -162,16 +165,33 @@ def _model(tags: Mapping[int, Any]) -> str:
 
 
 def _calibrated(xmp: Mapping[str, str], original: float) -> float | None:
-    """DJI: DewarpData is `date;fx,fy,cx,cy,...` in pixels of the original, CalibratedFocalLength is fx alone."""
+    """DJI: DewarpData is `date;fx,fy,cx,cy,...` in pixels of the original, CalibratedFocalLength is fx alone. Pix4D's
+    matrix of fisheyes counts angles in quarter turns."""
     words = text(xmp, "DewarpData").partition(";")[2].split(",")
     try:
         focal = float(words[0])
     except ValueError:
-        focal = first_number(xmp, "CalibratedFocalLength") or 0.0
+        focal = (
+            first_number(xmp, "CalibratedFocalLength") or 2 / math.pi * _numbers(xmp, "Camera:FisheyeAffineMatrix")[0]
+        )
     middle = first_number(xmp, "CalibratedOpticalCenterX")
     if middle and not 1 / AGREE < 2 * middle / original < AGREE:
         original = 2 * middle  # a program that shrank the photograph wrote its new size into EXIF
     return focal / original if math.isfinite(focal) and focal > 0 else None
+
+
+def _by_pix4d(xmp: Mapping[str, str], sensor_mm: float | None) -> float | None:
+    """Pix4D's names: millimetres, and where the view meets the sensor, near the middle of its width."""
+    focal_mm = _numbers(xmp, "Camera:PerspectiveFocalLength")[0]
+    return _by_sensor(focal_mm, sensor_mm or 2 * _numbers(xmp, "Camera:PrincipalPoint")[0])
+
+
+def _numbers(xmp: Mapping[str, str], name: str) -> list[float]:
+    """The numbers of a value, parted by commas; a zero for nonsense."""
+    try:
+        return [float(word) for word in text(xmp, name).split(",")]
+    except ValueError:
+        return [0.0]
 
 
 def _sensor(details: Mapping[int, Any], original: float) -> float | None:

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from vdgs.captures.coordinate_systems import to_geodetic
 from vdgs.captures.known_distances import MIN_OBSERVATIONS, text_lines
 from vdgs.captures.name_resolution import NameLookup, find_one
+from vdgs.captures.text_tables import Line, Row, rows_of, separator_of
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, median_place
 from vdgs.geometry.similarity import is_collinear
@@ -94,11 +95,12 @@ def read_gcp_list(file: Path, collection: ImageList, check_points: Sequence[str]
     Raises CaptureError for a file that cannot be read, a system that is unknown, lines that are none, photographs that
     are not there, pixels outside them, names that are not there, and points that are too few or along a line.
     """
-    header, lines = _lines(file)
+    header, rows = _rows(file)
+    transform, system = to_geodetic(header, file)
+    lines = [_line(row, file) for row in rows]
     by_name = photographs_by_name(collection)
     lines, strange = _of_photographs(lines, by_name, file)
     found = [(line, find_sighting(line.pixel, line.photograph, line.number, by_name, file)) for line in lines]
-    transform, system = to_geodetic(header, file)
     groups: dict[tuple[object, ...], list[tuple[_Line, GcpObservation | None]]] = {}
     for line, sighting in found:
         groups.setdefault((line.name,) if line.name else line.place, []).append((line, sighting))
@@ -163,21 +165,36 @@ def check_gcps_near(gcps: GcpList, positions: np.ndarray, origin: tuple[float, f
         )
 
 
-def _lines(file: Path) -> tuple[str, list[_Line]]:
-    rows = text_lines(file, "control points")
-    if not rows:
+def _rows(file: Path) -> tuple[str, list[Row]]:
+    """The first line, and the words of the others, without names of columns: parted by blanks, or as in a CSV table."""
+    lines = [Line(*line) for line in text_lines(file, "control points")]
+    if not lines:
         raise CaptureError(f"{file}: is empty. The first line names the coordinate system, such as EPSG:32615.")
-    return rows[0][1], [_line(line, number, file) for number, line in rows[1:]]
+    header, *lines = lines
+    rows = [Row(line.number, line.text.split()) for line in lines]
+    if separator_of([line.text for line in lines]):
+        rows = [row if len(row.words) > 5 else plain for row, plain in zip(rows_of(lines), rows, strict=True)]
+    names_columns = bool(rows) and not any(_is_number(word) for word in rows[0].words[:5])
+    return header.text, rows[1:] if names_columns else rows
 
 
-def _line(text: str, number: int, file: Path) -> _Line:
-    words = text.split("\t") if text.count("\t") >= 5 else text.split()
+def _is_number(word: str) -> bool:
+    try:
+        return math.isfinite(float(word))
+    except ValueError:
+        return False
+
+
+def _line(row: Row, file: Path) -> _Line:
+    number, words = row
     try:
         x, y, z, across, down = (float(word) for word in words[:5])
         photograph = words[5].strip()
     except (ValueError, IndexError):
+        alone = " Surveyed points alone do not say where photographs show them." if len(words) < 6 else ""
+        line = " ".join(words)[:80]
         raise CaptureError(
-            f"{file}: line {number}: {text[:80]!r} is not `x y z px py photograph [name]`. Mend the line."
+            f"{file}: line {number}: {line!r} is not `x y z px py photograph [name]`. Mend the line.{alone}"
         ) from None
     if not all(map(math.isfinite, (x, y, z, across, down))):
         raise CaptureError(f"{file}: line {number}: numbers must be finite. Mend the line.")

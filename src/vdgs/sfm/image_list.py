@@ -64,7 +64,8 @@ def collect_images(folders: Sequence[Path], camera_model: CameraModel = "auto") 
     for folder in folders:
         if not folder.is_dir() and not is_capture(folder):
             check_no_foreign_file(folder)
-            raise CaptureError(f"{folder}: no such folder or film. Give the folder that the photographs are in.")
+            what = "is a file, and no film" if folder.is_file() else "no such folder or film"
+            raise CaptureError(f"{folder}: {what}. Give the folder that the photographs are in.")
         check_no_run(folder)
         if is_reconstruction(folder) and not is_capture(folder):
             raise CaptureError(

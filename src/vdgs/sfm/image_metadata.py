@@ -146,7 +146,7 @@ class ImageMetadata:
     altitude: float | None
     altitude_type: str
     gps_std: tuple[float, float, float] | None
-    """Standard deviations east, north and up in metres, where the receiver says them (RTK)."""
+    """Standard deviations east, north and up in metres, where the receiver says them (RTK, PPK)."""
     gps_error_m: float | None
     """How far the place may be off across, in metres, where EXIF says it (GPSHPositioningError)."""
     relative_altitude: float | None
@@ -248,7 +248,7 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
         lat_lon=place,
         altitude=altitude,
         altitude_type=altitude_type,
-        gps_std=_rtk_std(xmp),
+        gps_std=_stated_std(xmp),
         gps_error_m=_gps_error(gps),
         relative_altitude=first_number(xmp, "RelativeAltitude", "sensefly:Height") or None,
         attitude=attitude if orientation == 1 else None,
@@ -258,7 +258,7 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
         whole=found.whole,
         kind=found.kind,
         band=band_of(name, found.mode, xmp),
-        camera_model=FISHEYE if "fisheye" in plain_text(details.get(0xA434)).lower().replace("-", "") else RADIAL,
+        camera_model=FISHEYE if _is_fisheye(details, xmp) else RADIAL,
         is_panorama=panorama,
         frame=name,
     )
@@ -285,6 +285,12 @@ def _is_panorama(found: ImageTags, xmp: Mapping[str, str]) -> bool:
     if whole and cropped and cropped < whole:
         raise UnusableImage("is a part of a panorama: export the whole of it, 360° by 180°")
     return True
+
+
+def _is_fisheye(details: Mapping[int, Any], xmp: Mapping[str, str]) -> bool:
+    """By the name of the lens, or by Pix4D's camera model."""
+    words = plain_text(details.get(0xA434)), text(xmp, "Camera:ModelType")
+    return any("fisheye" in word.lower().replace("-", "") for word in words)
 
 
 def is_twice_as_wide(width: int, height: int) -> bool:
@@ -318,8 +324,11 @@ def _camera(tags: Mapping[int, Any], details: Mapping[int, Any], xmp: Mapping[st
     return f"{named or UNKNOWN_CAMERA}{f' no. {serial}' if serial else ''}"
 
 
-def _rtk_std(xmp: Mapping[str, str]) -> tuple[float, float, float] | None:
-    found = [first_number(xmp, f"RtkStd{which}") for which in ("Lon", "Lat", "Hgt")]
+def _stated_std(xmp: Mapping[str, str]) -> tuple[float, float, float] | None:
+    """What the receiver says: DJI's RTK, or Pix4D's names, which makers of wings and of multispectral cameras write."""
+    across, upwards = "Camera:GPSXYAccuracy", "Camera:GPSZAccuracy"
+    names = (("RtkStdLon", across), ("RtkStdLat", across), ("RtkStdHgt", upwards))
+    found = [first_number(xmp, *each) for each in names]
     east, north, up = (value if value is not None and 0 < value < 100 else None for value in found)
     return None if east is None or north is None or up is None else (east, north, up)
 

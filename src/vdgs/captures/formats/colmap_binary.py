@@ -12,11 +12,19 @@ from pathlib import Path
 
 import numpy as np
 
-from vdgs.captures.formats.colmap_records import ColmapImage, ColmapPoints, add_camera, sample_observations
+from vdgs.captures.formats.colmap_records import (
+    ColmapImage,
+    ColmapPoints,
+    add_camera,
+    sample_observations,
+    unsupported_model,
+)
 from vdgs.captures.formats.source_capture import CAMERA_MODELS, Intrinsics
 from vdgs.errors import CaptureError
 
 MAX_NAME_BYTES = 4096
+#: COLMAP's number of a model that is no lens.
+_EQUIRECTANGULAR = 17
 
 
 class _Cursor:
@@ -74,10 +82,11 @@ class _Cursor:
 def read_cameras_binary(file: Path) -> dict[int, Intrinsics]:
     cursor = _Cursor(file)
     cameras: dict[int, Intrinsics] = {}
-    for _ in range(cursor.count(24 + 3 * 8, "cameras")):
+    for _ in range(cursor.count(24 + 2 * 8, "cameras")):
         identifier, model, width, height = cursor.take("IiQQ")
         if model not in CAMERA_MODELS:
-            raise cursor.fail(f"camera {identifier} has the unknown or unsupported model number {model}")
+            named = f"number {model}{' (EQUIRECTANGULAR)' if model == _EQUIRECTANGULAR else ''}"
+            raise unsupported_model(file, f"camera {identifier}", named)
         name, parameters = CAMERA_MODELS[model]
         intrinsics = Intrinsics(name, cursor.take(f"{parameters}d"), width, height)
         add_camera(cameras, identifier, intrinsics, file)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics
+from vdgs.captures.formats.source_capture import MODEL_PARAMETERS, Intrinsics, check_intrinsics
 from vdgs.errors import CaptureError
 
 #: So many of the points that a photograph shows are remembered: enough to see whether cameras and points agree, and
@@ -52,6 +52,15 @@ def _chance(numbers: np.ndarray) -> np.ndarray:
     for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
         mixed = (mixed ^ (mixed >> np.uint64(shift))) * np.uint64(factor)
     return mixed ^ (mixed >> np.uint64(31))
+
+
+def unsupported_model(file: Path, where: str, model: str) -> CaptureError:
+    """The error of a camera model that is not read."""
+    panoramas = " Panoramas of 360° are read without a model: vdgs sfm IMAGES --output CAPTURE"
+    return CaptureError(
+        f"{file}: {where}: {model} is no camera model that is supported. Supported: {', '.join(MODEL_PARAMETERS)}."
+        f"{panoramas if 'EQUIRECTANGULAR' in model else ''}"
+    )
 
 
 def add_camera(cameras: dict[int, Intrinsics], identifier: int, intrinsics: Intrinsics, file: Path) -> None:

@@ -13,6 +13,7 @@ from vdgs.captures.formats.colmap_records import (
     add_camera,
     empty_points,
     sample_observations,
+    unsupported_model,
 )
 from vdgs.captures.formats.source_capture import MODEL_PARAMETERS, Intrinsics
 from vdgs.errors import CaptureError
@@ -54,11 +55,7 @@ def read_cameras_text(file: Path) -> dict[int, Intrinsics]:
         except (ValueError, IndexError):
             raise _bad_line(file, number, expected) from None
         if MODEL_PARAMETERS.get(model) != len(params):
-            raise CaptureError(
-                f"{file}: line {number}: {model!r} with {len(params)} parameters is no camera model that is "
-                "supported. "
-                f"Supported: {', '.join(MODEL_PARAMETERS)}."
-            )
+            raise unsupported_model(file, f"line {number}", f"{model!r} with {len(params)} parameters")
         add_camera(cameras, identifier, Intrinsics(model, params, width, height), file)
     return cameras
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from urllib.parse import unquote
 
 from vdgs.captures.image_files import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES, readable_images
-from vdgs.captures.name_resolution import to_nfc
+from vdgs.captures.name_resolution import to_nfc, without_uri
 from vdgs.captures.strays import is_mask_folder, walk
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -19,7 +17,6 @@ from vdgs.system.quoting import shell_word
 #: The folder of undistorted photographs, which are not those of a camera.
 UNDISTORTED = "undistorted"
 _SUFFIXES = IMAGE_SUFFIXES | OTHER_IMAGE_SUFFIXES
-_URI = re.compile(r"file:/*(?:localhost/)?", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -124,7 +121,7 @@ class PhotographIndex:
 
 def _plain(name: str) -> str:
     """A name of a project as a path inside a folder."""
-    name = _URI.sub("", name) if _URI.match(name) else name
+    name = without_uri(name)
     parts = [
         part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("/", "..") and ":" not in part
     ]
@@ -134,7 +131,7 @@ def _plain(name: str) -> str:
 
 def _parts(name: str) -> tuple[str, ...]:
     """The folders and the file of a name, in lower case."""
-    name = unquote(_URI.sub("", name)) if _URI.match(name) else name
+    name = without_uri(name)
     return PurePosixPath(to_nfc(name).replace("\\", "/").lower()).parts
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from vdgs.captures.capture import Observations, Split
 from vdgs.captures.georeference import Georef
-from vdgs.captures.name_resolution import find_file
+from vdgs.captures.name_resolution import find_file, without_uri
 from vdgs.errors import CaptureError
 from vdgs.system.quoting import shell_word
 
@@ -166,6 +166,7 @@ def safe_name(name: str, file: Path, what: str = "image name", root: Path | None
     An absolute one may be meant too, if it lies in `root`: it is then relative to that; so may one of another machine
     or folder, if its end is a file in `root`, with its extension or without.
     """
+    name = f"/{plain}" if (plain := without_uri(name)) != name else name
     if root is not None and Path(name).is_absolute():
         with suppress(ValueError):
             name = Path(name).relative_to(root.absolute()).as_posix()
