@@ -221,6 +221,9 @@ class ExportRequest(ModelRequest):
     """Coordinates of the files: EPSG:n, `enu` (metres east and north of the scene's origin), `source` (of the capture)
     or `local` (the ground frame). By default `enu` where the capture is georeferenced, and UTM for .laz and .las; else
     `local`. 3D Tiles of a georeferenced capture always stand on the globe (`enu`)."""
+    background: Annotated[Path | None, Output()] = None
+    """Also write sky and what is far away: an equirectangular PNG. Its middle looks east (+x), columns go clockwise.
+    Files of Gaussians leave them out."""
     evaluate: bool = True
     """Report what was lost. A file is read back and its test views are compared with those of the model itself."""
     threads: Annotated[int, WORKER_COUNT] = 0

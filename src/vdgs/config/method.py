@@ -33,6 +33,9 @@ class ModelConfig:
     """Feed the distance between camera and anchor to the decoder too."""
     appearance_dim: Annotated[int, Range(0, 1024)] = 0
     """Size of the appearance embedding of each training image (color only); 0 for none. Experimental: not measured."""
+    background_model: Literal["auto", "envmap", "off"] = "auto"
+    """What is behind the scene. `envmap`: an environment map, colors by direction, trained in the coarse stage: sky and
+    what is far away. `off`: one color. `auto`: an environment map where photographs show sky (choice)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,6 +77,8 @@ class LearningRateConfig:
     """Appearance embedding."""
     exposure: Annotated[tuple[float, float], LEARNING_RATE_RANGE] = (0.001, 1e-4)
     """Exposure of the photographs, where one is fitted."""
+    envmap: Annotated[tuple[float, float], LEARNING_RATE_RANGE] = (0.002, 2e-4)
+    """Environment map behind the scene, where there is one."""
 
 
 @dataclass(frozen=True, kw_only=True)

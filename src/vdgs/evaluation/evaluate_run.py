@@ -28,7 +28,7 @@ from vdgs.evaluation.view_exposures import make_exposures
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import Raster
 from vdgs.model.anchor_model import AnchorModel, DecoderSpan
-from vdgs.model.renderer import render, render_scalar_map, view_splats
+from vdgs.model.renderer import background_image, render, render_scalar_map, view_splats
 from vdgs.partition.block_regions import split_trainable_anchors
 from vdgs.runs.lod_folder import drawn_scene
 from vdgs.runs.model_integrity import load_verified
@@ -110,7 +110,8 @@ def make_renderable_model(
     )
     measured = RenderableModel(
         render=lambda camera: render(scene, camera), visibility_map=make_visibility_map(coarse), metadata=metadata,
-        background=run.model.background, coverage_map=make_coverage_map(coarse),
+        background=run.model.background, background_image=lambda camera: background_image(scene, camera),
+        coverage_map=make_coverage_map(coarse),
         true_depth=make_true_depth(run.capture, select_views(run.capture, views)),
         render_depth=lambda camera: render(scene, camera, depth=True), camera_height=camera_height(run.capture),
         decode_splats=lambda camera: view_splats(scene, camera)[1],

@@ -47,15 +47,12 @@ class RenderedImage:
     image: Float[np.ndarray, "h w 3"]
     #: None: the renderer does not say.
     alpha: Float[np.ndarray, "h w"] | None
-    #: What is behind the model in `image`; None: not known.
-    background: RgbColor | None = None
+    #: What is behind the model in `image`, a color or one for each pixel; None: not known.
+    background: RgbColor | Float[np.ndarray, "*pixels 3"] | None = None
 
     def with_exposure(self, exposure: Float[Tensor, "3 4"]) -> RenderedImage:
         """The view with the color model of a photograph: all colors, the background's too. They may leave [0, 1]."""
-        background = self.background
-        if background is not None:
-            red, green, blue = apply_exposure_numpy(np.array(background), exposure).tolist()
-            background = red, green, blue
+        background = None if self.background is None else apply_exposure_numpy(np.asarray(self.background), exposure)
         return RenderedImage(apply_exposure_numpy(self.image, exposure), self.alpha, background)
 
     def over_background(self, color: RgbColor) -> UInt8[np.ndarray, "h w 3"] | None:

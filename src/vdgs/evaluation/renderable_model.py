@@ -50,8 +50,9 @@ class RenderableModel:
     metadata: EvaluatedModel = EvaluatedModel()
     #: Whether the time that `render` takes says anything.
     is_timed: bool = True
-    #: What is behind the model in a render, RGB in [0, 1].
+    #: What is behind the model in a render, RGB in [0, 1]: one color, or an image where this is given and returns one.
     background: tuple[float, float, float] | None = None
+    background_image: Callable[[Camera], Float[Tensor, "h w 3"] | None] | None = None
     #: Pixels that show what enough training cameras see (`evaluation.seen`); solidity and depth are measured on them.
     coverage_map: Callable[[Camera], Bool[np.ndarray, "h w"]] | None = None
     #: Depth along the axis of a view's camera, inf for sky; then these two are needed as well: the model's own depth

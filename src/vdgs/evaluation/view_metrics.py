@@ -185,7 +185,8 @@ def _render(view: View, model: RenderableModel) -> tuple[RenderedImage, float]:
             f"the render of {view.name} holds values that are not finite numbers: the model is damaged. "
             "Evaluate an earlier state, or train again with lower rates."
         )
-    return RenderedImage(image, alpha, model.background), seconds
+    behind = None if model.background_image is None else model.background_image(view.camera)
+    return RenderedImage(image, alpha, model.background if behind is None else behind.cpu().numpy()), seconds
 
 
 def _write_alpha(output: Path, stem: str, rendered: RenderedImage) -> str | None:

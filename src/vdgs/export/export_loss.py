@@ -67,7 +67,9 @@ def measure_loss(
     with cached_reference_views(views) as photographs:
         for view in views:
             reference, mask = photographs.load_image(view), photographs.load_mask(view)
-            neutral = render(run.model, view.camera).image.cpu().numpy(), _render_gaussians(gaussians, run, view.camera)
+            # Over the plain color: files have no environment map.
+            own = render(run.model, view.camera, background=run.model.background).image.cpu().numpy()
+            neutral = own, _render_gaussians(gaussians, run, view.camera)
             exposed = neutral if exposure is None else [apply_exposure_numpy(each, exposure(view)) for each in neutral]
             drawn = [to_8bit(each) for each in exposed]
             corrected = [to_8bit(correct_colors(picture, reference, mask).image) for picture in drawn]

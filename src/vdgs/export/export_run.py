@@ -20,6 +20,7 @@ from vdgs.captures.output_guard import check_not_among_inputs, check_output
 from vdgs.config.commands import ExportRequest
 from vdgs.distributed.sharded_job import ExecutionOptions
 from vdgs.errors import VdgsError
+from vdgs.export.background_image import check_background, write_background
 from vdgs.export.bake import gaussian_count
 from vdgs.export.bake_plan import drop_unused_sh_degrees
 from vdgs.export.color_refinement import BakedGaussians
@@ -148,6 +149,9 @@ def write_files(
         console.print(f"[yellow]warning[/] {run.warning}", highlight=False)
     for path in request.output:
         check_not_among_inputs(path, run.capture)
+    if request.background is not None:
+        check_background(run, request.background)
+        check_not_among_inputs(request.background, run.capture)
     center = np.median(run.model.anchors.positions.cpu().double().numpy(), axis=0)
     frames = {path: frame_for_file(path, run, request, center) for path in request.output}
     _tidy(request.output, console)
@@ -180,6 +184,8 @@ def write_files(
         )
         files = [_write_fitting(path, frames[path], scene, rows[path], merging) for path in request.output]
         losses = _measure_losses(run, frames, scene, request, console)
+    if request.background is not None:
+        write_background(run, request.background)
     record: ExportDocument = to_jsonable({
         "model": run.name, "key": run.key, "gaussians": len(scene.spool.means), "sh_degree": request.sh_degree,
         "rounds": rounds, "seconds_to_bake": seconds, "seconds_to_refine": request.optimize_seconds, "files": files,

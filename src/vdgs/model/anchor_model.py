@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from vdgs.errors import VdgsError
@@ -51,6 +51,11 @@ class AnchorModel:
     metadata: ModelMetadata = NO_METADATA
     #: A merged scene whose blocks trained decoders of their own: all anchors, block by block. Else empty.
     decoder_spans: tuple[DecoderSpan, ...] = ()
+
+    @property
+    def envmap(self) -> Float[Tensor, "rows columns 3"] | None:
+        """What is drawn in place of `background` (`model.envmap`); None: nothing is."""
+        return self.decoder.envmap
 
     def decoder_ranges(self) -> list[tuple[int, int, Decoder]]:
         """Which rows of the anchors each decoder decodes: first, one past the last, decoder; ascending."""

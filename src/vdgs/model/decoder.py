@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from vdgs.kernels.kernel_types import FEATURE_SIZE, HIDDEN_SIZE, DecoderWeights, MlpWeights
+from vdgs.model.envmap import check_envmap
 from vdgs.model.exposure import exposure_matrix
 
 HEADS = {"opacity": 1, "covariance": 7, "color": 3}  # outputs per offset
@@ -23,7 +24,7 @@ HEAD_TENSORS = ("w1", "b1", "w2", "b2")
 
 @dataclass(frozen=True)
 class Decoder:
-    """The parameters of the three heads and, optionally, of the appearance embedding and the exposure of images."""
+    """The parameters of the three heads and, optionally, appearance and exposure of images and an environment map."""
 
     weights: DecoderWeights
     #: One row per training image, and its map to the color head's hidden layer; None without appearance.
@@ -31,6 +32,8 @@ class Decoder:
     appearance_weight: Float[Tensor, "32 a"] | None = None
     #: Departures of each training image's colors from the mean (`model.exposure`); None: no exposure is fitted.
     exposure: Float[Tensor, "images 3 4"] | None = None
+    #: What is drawn behind all anchors (`model.envmap`); None: a plain color.
+    envmap: Float[Tensor, "rows columns 3"] | None = None
 
     @staticmethod
     def init_random(
@@ -53,7 +56,7 @@ class Decoder:
     def from_tensors(tensors: Mapping[str, Tensor]) -> Decoder:
         """The inverse of `tensors`. Raises KeyError on a missing tensor."""
         weights = DecoderWeights(*(MlpWeights(*(tensors[f"{head}_{part}"] for part in HEAD_TENSORS)) for head in HEADS))
-        optional = (tensors.get(name) for name in ("appearance", "appearance_weight", "exposure"))
+        optional = (tensors.get(name) for name in ("appearance", "appearance_weight", "exposure", "envmap"))
         return Decoder(weights, *optional)
 
     def tensors(self) -> dict[str, Tensor]:
@@ -62,6 +65,8 @@ class Decoder:
             named |= {"appearance": self.appearance_embedding, "appearance_weight": self.appearance_weight}
         if self.exposure is not None:
             named["exposure"] = self.exposure
+        if self.envmap is not None:
+            named["envmap"] = self.envmap
         return named
 
     def to(self, device: torch.device) -> Decoder:
@@ -97,6 +102,8 @@ class Decoder:
                 shape = tuple(getattr(getattr(self.weights, head), part).shape)
                 if shape != expected:
                     raise ValueError(f"decoder {head}_{part} has shape {shape}, not {expected}")
+        if self.envmap is not None:
+            check_envmap(self.envmap)
         for name, tensor in self.tensors().items():
             if not bool(torch.isfinite(tensor).all()):
                 raise ValueError(f"decoder {name} holds numbers that are not finite")

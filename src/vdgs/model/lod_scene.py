@@ -45,6 +45,10 @@ class LodScene:
         return self.model.background
 
     @property
+    def envmap(self) -> Float[Tensor, "rows columns 3"] | None:
+        return self.model.envmap
+
+    @property
     def device(self) -> torch.device:
         return self.model.decoder.weights.opacity.w1.device
 

@@ -15,6 +15,7 @@ from vdgs.kernels import get_backend
 from vdgs.kernels.kernel_types import SPLAT_TENSORS, AnchorSplats, DecoderWeights, Raster, Splats, TrainingSplats
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
+from vdgs.model.envmap import ray_directions, sample_envmap
 
 
 @runtime_checkable
@@ -23,6 +24,9 @@ class LodDrawable(Protocol):
 
     @property
     def background(self) -> tuple[float, float, float]: ...
+
+    @property
+    def envmap(self) -> Float[Tensor, "rows columns 3"] | None: ...
 
     def view_splats(self, camera: Camera, image_index: int | None = None) -> tuple[Int64[Tensor, " m"], Splats]: ...
 
@@ -103,11 +107,24 @@ def render(
 ) -> Raster:
     """One view of a model: image [h, w, 3] (not clamped), alpha [h, w], expected and median depth [h, w] or None.
 
-    `background` replaces the model's own. `image_index` selects the appearance of a training image; None: the mean.
+    `background` replaces the model's own, its environment map too. `image_index` selects the appearance of a training
+    image; None: the mean.
     """
     find = decode_view if isinstance(model, AnchorModel) else view_splats
     _, splats = find(model, camera, image_index)  # type: ignore[arg-type]
-    return rasterize_splats(splats, camera, splats.means_px.new_tensor(background or model.background), depth)
+    plain = splats.means_px.new_tensor(background or model.background)
+    raster = rasterize_splats(splats, camera, plain, depth)
+    if background is not None or (behind := background_image(model, camera)) is None:
+        return raster
+    return raster._replace(image=raster.image + (1 - raster.alpha)[..., None] * (behind - plain))
+
+
+def background_image(model: Drawable, camera: Camera) -> Float[Tensor, "h w 3"] | None:
+    """What the environment map of a model shows in a view; None where its plain color is shown: without a map, and in
+    maps of the ground."""
+    if model.envmap is None or camera.model == "orthographic":
+        return None
+    return sample_envmap(model.envmap, ray_directions(camera, model.envmap.device))
 
 
 @torch.no_grad()

@@ -196,8 +196,8 @@ def render(
 ) -> Render:
     """Draw one view of a scene, without gradients.
 
-    `background` replaces the scene's own; `image_index` selects the appearance of a training photograph, where one was
-    trained. Source: Scaffold-GS eqs. 3-8, 3DGS eqs. 2-3.
+    `background` replaces the scene's own, its environment map too; `image_index` selects the appearance of a training
+    photograph, where one was trained. Source: Scaffold-GS eqs. 3-8, 3DGS eqs. 2-3.
     """
     from vdgs.model.renderer import render as draw
 

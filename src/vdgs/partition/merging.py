@@ -69,7 +69,9 @@ def merge_blocks(
             own_decoder = own_decoder or has_own_decoder(model)
         unseen = int((count_visibility(anchors.positions, cameras_of_block[index]) == 0).sum())
         # A copy: a tensor of a file keeps all of the file in memory.
-        spans.append(DecoderSpan(len(anchors), coarse.decoder if model is None else model.decoder.copy()))
+        # Nor the environment map again, which is the same in all blocks.
+        decoder = coarse.decoder if model is None else replace(model.decoder, envmap=None).copy()
+        spans.append(DecoderSpan(len(anchors), decoder))
         selected.append(anchors.tensors())
         records.append(
             MergedBlockRecord(
@@ -79,7 +81,7 @@ def merge_blocks(
         )  # fmt: skip
     merged = replace(coarse, anchors=_concatenate(selected))
     if own_decoder and all(_decoder_bytes(each.decoder) == _decoder_bytes(spans[0].decoder) for each in spans):
-        return replace(merged, decoder=spans[0].decoder), records
+        return replace(merged, decoder=replace(spans[0].decoder, envmap=coarse.decoder.envmap)), records
     return replace(merged, decoder_spans=tuple(spans) if own_decoder else ()), records
 
 

@@ -20,10 +20,12 @@ from vdgs.config.method import InitConfig
 from vdgs.errors import VdgsError
 from vdgs.model.initialization.gap_filling import find_gap_points
 from vdgs.model.initialization.initialize import get_voxel_size
+from vdgs.model.initialization.sky import in_sky
 from vdgs.model.initialization.stereo import DensePoints, FusionCell, StereoInputs, compute_dense_points
 from vdgs.runs.run_folder import RunFolder
 from vdgs.system.atomic_files import write_atomic
 from vdgs.system.tensors import read_tensors, tensors_crc32, write_tensors
+from vdgs.training.sky_background import view_skylines
 from vdgs.visibility.visibility_counts import count_visibility
 
 DENSE_POINTS_FORMAT = "vdgs-stereo-1"
@@ -82,6 +84,10 @@ def match_dense_points(
     gaps = find_gap_points(capture.points, cameras, get_voxel_size(capture.points, config))
     inputs = StereoInputs(cameras, capture.points, np.concatenate([capture.points, gaps]), read)
     dense = compute_dense_points(inputs, cell, scratch_dir, on_progress, threads)
+    skylines, show_sky = view_skylines(capture, capture.train_views)
+    if show_sky:  # clouds match too
+        kept = ~in_sky(dense.points, cameras, skylines)
+        dense = DensePoints(dense.points[kept], dense.colors[kept])
     if len(dense.points):
         away = np.flatnonzero(cKDTree(capture.points).query(dense.points, workers=1)[0] > cell.min_edge / 2)
         views = count_visibility(torch.from_numpy(dense.points[away]), cameras).numpy()

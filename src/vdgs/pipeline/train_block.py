@@ -44,6 +44,7 @@ from vdgs.training.session.trainer import (
     train_with_checkpoints,
     warn_without_densification,
 )
+from vdgs.training.sky_background import view_skylines
 from vdgs.visibility.visibility_counts import effective_sample_size
 
 
@@ -120,6 +121,7 @@ class BlockPlan:
             frozen_anchors=FrozenAnchors(self.surroundings, coarse.decoder),
             growth_mask=growth_mask(blocks, self.index, method.block),
             lr_mask=lr_ramp(blocks, self.index, method.block),
+            skylines=None if coarse.envmap is None else view_skylines(capture, self.views)[0],
             image_indices=self.indices, view_weights=self.weights, crops=self.crops,
             max_log_scale=(
                 (lambda positions: max_log_scales(positions, cameras)) if config.model.bound_scales else None

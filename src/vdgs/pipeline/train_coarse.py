@@ -24,6 +24,7 @@ from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
 from vdgs.model.exposure import zero_exposures
 from vdgs.model.initialization.initialize import initialize_anchors
+from vdgs.model.initialization.sky import Skyline, initial_envmap
 from vdgs.model.initialization.stereo import DensePoints
 from vdgs.model.scale_bounds import max_log_scales
 from vdgs.pipeline.dense_points import find_dense_points, max_dense_points
@@ -45,6 +46,7 @@ from vdgs.training.session.trainer import (
     train_with_checkpoints,
     warn_without_densification,
 )
+from vdgs.training.sky_background import view_skylines
 
 
 def train_coarse(context: RunContext, options: CheckpointOptions, console: Console, device: str = "cpu") -> None:
@@ -101,6 +103,12 @@ def _train(
             f"anchors, {config.iterations:,} iterations",
             highlight=False,
         )
+        if stage.skylines is not None:
+            shown = sum(skyline is not None for skyline in stage.skylines)
+            console.print(
+                f"sky: {shown} photographs show it or what is far away; an environment map is trained behind the scene",
+                highlight=False,
+            )
         train_with_checkpoints(folder, state, stage, options, console)
     if not len(state.anchors):  # not done, but kept: to come this far again would not help
         save_checkpoint(folder.checkpoints, to_checkpoint(state))
@@ -209,10 +217,19 @@ def build_coarse_problem(
         offset_rate_factor=offset_rate_factor(capture, config),
         background=background,
         view_weights=view_sampling_weights(config, anchors, cameras),
+        skylines=_skylines(capture, config),
         device=torch.device(device),
         max_log_scale=(lambda positions: max_log_scales(positions, cameras)) if config.model.bound_scales else None,
     )
     return stage, anchors
+
+
+def _skylines(capture: Capture, config: TrainConfig) -> tuple[Skyline | None, ...] | None:
+    """Those of the training photographs; None where no environment map is trained."""
+    if config.model.background_model == "off":
+        return None
+    skylines, show_sky = view_skylines(capture, capture.train_views)
+    return skylines if show_sky or config.model.background_model == "envmap" else None
 
 
 def initial_coarse_state(anchors: Anchors, stage: TrainingProblem, fit_exposures: bool) -> TrainingState:
@@ -223,4 +240,9 @@ def initial_coarse_state(anchors: Anchors, stage: TrainingProblem, fit_exposures
     )
     if fit_exposures:
         decoder = replace(decoder, exposure=zero_exposures(stage.num_images))
+    if stage.skylines is not None:
+        factor = max(factor for _, factor in stage.config.resolution_schedule)
+        cameras = [stage.images.camera(index) for index in range(stage.num_images)]
+        read = lambda index: (*stage.images.get(index, factor), stage.images.camera(index, factor))  # noqa: E731
+        decoder = replace(decoder, envmap=initial_envmap(read, stage.skylines, cameras, stage.background))
     return initial_state(anchors.to(stage.device), decoder.to(stage.device), stage)

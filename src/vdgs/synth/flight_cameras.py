@@ -26,6 +26,8 @@ _MAX_TRIES = 10
 #: Tilts up to this (rad) are as good as any; where a part lies far off, the least tilt that reaches it is taken.
 _EASY_TILT = np.radians(45)
 _MAX_TILT = np.radians(62)
+#: Tilt of every second test photograph of a flight that shows the horizon (rad).
+_HORIZON_TILT = np.radians(79)
 
 
 def pose_from_angles(position: np.ndarray, tilt: float, heading: float, roll: float) -> np.ndarray:
@@ -112,7 +114,7 @@ def make_test_cameras(
     if count == 0:
         return []
     _, part = kmeans2(visible_points[:, :2], min(count, len(visible_points)), minit="++", seed=rng)
-    return [
+    cameras = [
         _aim_camera(
             tracer,
             terrain,
@@ -123,6 +125,15 @@ def make_test_cameras(
         )
         for k in range(count)
     ]
+    if options.flight == "horizon":
+        cameras[1::2] = [_raised(camera, options) for camera in cameras[1::2]]
+    return cameras
+
+
+def _raised(camera: Camera, options: ResolvedOptions) -> Camera:
+    """A camera at the same place with the same heading that shows the horizon."""
+    x, y, _ = camera.forward
+    return make_camera(pose_from_angles(camera.position, _HORIZON_TILT, float(np.arctan2(x, y)), 0.0), options)
 
 
 def _central_point(points: np.ndarray) -> np.ndarray:

@@ -152,6 +152,19 @@ def _corridor(over: FlightArea) -> FlightPlan:
     return FlightPlan(position, tilt, heading, np.where(lane == 0, 1.0, _OBLIQUE_FACTOR))
 
 
+def _horizon(over: FlightArea) -> FlightPlan:
+    """An even grid, and photographs from all over it that look nearly level, across it and away from it: the horizon
+    lies 8 or 15 degrees above their middle."""
+    level = round(0.4 * over.count)
+    turn = over.phase + _GOLDEN * np.arange(level)
+    radius = over.half * (0.2 + 0.6 * ((np.arange(level) * 0.618) % 1))
+    position = np.stack([radius * np.cos(turn), radius * np.sin(turn)], 1)
+    heading = np.arctan2(position[:, 0], position[:, 1]) + np.where(np.arange(level) % 2 == 0, 0, np.pi)
+    tilt = np.radians(np.where(np.arange(level) % 4 < 2, 75.0, 82.0))
+    looking = FlightPlan(position, tilt, heading, np.full(level, _OBLIQUE_FACTOR))
+    return _joined([_grid(0.8 * over.half, over.count - level), looking])
+
+
 #: The missions by the name of the option `--flight`.
 FLIGHT_PLANS: dict[str, Callable[[FlightArea], FlightPlan]] = {
     "even": _even,
@@ -159,6 +172,7 @@ FLIGHT_PLANS: dict[str, Callable[[FlightArea], FlightPlan]] = {
     "distant": _distant,
     "orbits": _orbits,
     "corridor": _corridor,
+    "horizon": _horizon,
 }
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -109,6 +109,7 @@ def _write_capture(folder: Path, options: ResolvedOptions, on_progress: Progress
     on_progress("town", 1, 1)
     with ThreadPoolExecutor(options.workers or os.cpu_count() or 1) as pool:
         sky = make_sky_map(tracer, town.terrain, town.zones, options.extent_m / 2 + 40, pool)
+        sky = replace(sky, is_cloudy=options.flight == "horizon")
         views, stats = _plan_views(town, tracer, options)
         first_validation = views.training + options.num_test_images
         write_text(folder / TEST_LIST, "\n".join(views.names[views.training : first_validation]) + "\n")

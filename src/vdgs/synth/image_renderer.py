@@ -10,7 +10,17 @@ from vdgs.geometry.camera import Camera
 from vdgs.synth import facades
 from vdgs.synth.facades import AlbedoAndGloss
 from vdgs.synth.ground_texture import ground_albedo
-from vdgs.synth.lighting import BOUNCE_COLOR, SKY_COLOR, SUN, SUN_COLOR, SkyMap, sky_color, tone_map
+from vdgs.synth.lighting import (
+    BOUNCE_COLOR,
+    SKY_COLOR,
+    SUN,
+    SUN_COLOR,
+    SkyMap,
+    add_haze,
+    cloudy_sky_color,
+    sky_color,
+    tone_map,
+)
 from vdgs.synth.mesh import Material
 from vdgs.synth.ray_tracing import RayHits, RayTracer
 from vdgs.synth.surface import Surface
@@ -89,7 +99,7 @@ def radiance(
     `pixel_angle` is the angle between neighboring pixels in radians.
     """
     hits = tracer.intersect(origins, directions)
-    light = sky_color(directions)
+    light = cloudy_sky_color(directions) if sky.is_cloudy else sky_color(directions)
     met = np.flatnonzero(hits.triangle >= 0)
     if not len(met):
         return light, hits
@@ -107,6 +117,8 @@ def radiance(
     arriving = sun[:, None] * SUN_COLOR + (share * up)[:, None] * SKY_COLOR
     arriving += ((0.4 + 0.6 * share) * (1 - 0.75 * up))[:, None] * BOUNCE_COLOR
     light[met] = albedo * arriving + _reflection(surface, gloss, sun)
+    if sky.is_cloudy:
+        light[met] = add_haze(light[met], found.distance)
     return light, hits
 
 

@@ -34,6 +34,8 @@ class SkyMap:
     openness: np.ndarray
     half_size: float
     cell: float
+    #: Whether clouds are in the sky, and what is far fades into the color of the horizon.
+    is_cloudy: bool = False
 
     def sample(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Openness at world points by bilinear interpolation, [n] float32."""
@@ -85,6 +87,31 @@ def sky_color(directions: np.ndarray) -> np.ndarray:
     """Radiance of the clear sky along unit directions, [n, 3]."""
     up = np.clip(directions[:, 2:3], 0, 1) ** np.float32(0.6)
     return HORIZON_COLOR + (SKY_COLOR * 0.75 - HORIZON_COLOR) * up
+
+
+#: Distance (m) at which 1/e of the light of a surface comes through the haze.
+_HAZE_DISTANCE = np.float32(2500.0)
+
+
+def cloudy_sky_color(directions: np.ndarray) -> np.ndarray:
+    """Radiance of a sky with clouds along unit directions, [n, 3]: waves on a plane overhead, which haze hides at the
+    horizon."""
+    up = np.maximum(directions[:, 2], 0)
+    across = directions[:, :2] / (up + np.float32(0.08))[:, None]
+    density = np.zeros_like(up)
+    for octave in range(4):
+        turn, scale = 2.4 * octave, 1.1 * 1.9**octave
+        x = scale * (np.cos(turn) * across[:, 0] - np.sin(turn) * across[:, 1])
+        y = scale * (np.sin(turn) * across[:, 0] + np.cos(turn) * across[:, 1])
+        density += (np.sin(x + 1.3 * np.sin(y)) * np.cos(y + octave) / 1.6**octave).astype(np.float32)
+    share = np.clip((density - 0.25) / 0.9, 0, 1) * np.clip(up / 0.12, 0, 1)
+    return sky_color(directions) * (1 - share)[:, None] + share[:, None] * np.float32(1.15)
+
+
+def add_haze(light: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """Light [n, 3] from surfaces at distances [n] (m), after the haze between."""
+    clear = np.exp(-distance / _HAZE_DISTANCE)[:, None]
+    return light * clear + HORIZON_COLOR * (1 - clear)
 
 
 def tone_map(radiance: np.ndarray) -> np.ndarray:

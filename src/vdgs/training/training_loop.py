@@ -25,6 +25,7 @@ from vdgs.training.depth_agreement import DepthAgreement, depth_agreement
 from vdgs.training.gradient_roi import crop_to_gradient_support
 from vdgs.training.optimizer import learning_rates_at
 from vdgs.training.schedule import downscale_at, view_at
+from vdgs.training.sky_background import with_sky
 from vdgs.training.target import background_at, crop_box, crop_camera, make_target, opacity_factors_at
 from vdgs.training.training_state import StepReport, TrainingProblem, TrainingState
 from vdgs.training.training_step import (
@@ -87,6 +88,7 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
             splats, target.camera, background, frozen, depth=bool(config.loss.depth_agreement),
             opacity_factors=opacity_factors_at(stage, iteration, len(splats.source)),
         )  # fmt: skip
+    drawn = with_sky(drawn, stage, view, state.decoder, target.camera, background)
     weight = stage.loss_weight
     compared = compute_loss(drawn, target, state.decoder, image_index_at(stage, view), config, weight)
     volume_weight, loss = _volume_weight(stage), compared.loss

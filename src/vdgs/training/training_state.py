@@ -170,6 +170,8 @@ class TrainingProblem:
     crops: tuple[Crop, ...] | None = None
     #: What is added to the loss by a method of several blocks with one decoder; None: nothing.
     guidance: LossGuidance | None = None
+    #: The skyline of each view (`model.initialization.sky`), None for a view without sky; None: no view shows any.
+    skylines: Sequence[Tensor | None] | None = None
     #: Where the arithmetic is done. Photographs and places come to it.
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
 
@@ -204,8 +206,9 @@ def initial_state(anchors: Anchors, decoder: Decoder, stage: TrainingProblem) ->
     """A state before the first step. The anchors' tensors are moved in place: give copies of what must stay."""
     n, k, device = len(anchors), anchors.offsets.shape[1], anchors.positions.device
     for name, tensor in decoder.tensors().items():
-        # The mean appearance and exposure, in which other photographs are drawn, must stay the same in all blocks.
-        shared = stage.kind == "block" and name.startswith(("appearance", "exposure"))
+        # The mean appearance and exposure, in which other photographs are drawn, must stay the same in all blocks, and
+        # so must what is behind all of them.
+        shared = stage.kind == "block" and name.startswith(("appearance", "exposure", "envmap"))
         tensor.requires_grad_(not stage.frozen_decoder and not shared)
     compensation = CompensationState.zeros(n, k, device) if stage.config.compensation.enabled else None
     return TrainingState(

@@ -1,0 +1,172 @@
+"""What is behind the scene: the environment map, skylines, and training with both."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from support.hand_made_models import camera_above, model_at, opaque_plane, quadrants
+from support.small_training import stage as small_stage
+from support.small_training import start
+from vdgs.config.method import MergeConfig, TrainConfig
+from vdgs.geometry.camera import Camera
+from vdgs.kernels.kernel_types import TrainingSplats
+from vdgs.model.anchor_model import AnchorModel, ModelMetadata
+from vdgs.model.envmap import ray_angles, ray_directions, row_elevations, sample_envmap
+from vdgs.model.initialization.sky import above_skyline, find_skyline, find_skylines, in_sky, initial_envmap
+from vdgs.model.renderer import render
+from vdgs.partition.merging import merge_blocks
+from vdgs.training import initial_state
+from vdgs.training.sky_background import with_sky
+from vdgs.training.training_step import render_for_training
+
+TOWN = np.random.default_rng(0).uniform((-20, -20, 0), (20, 20, 2), (4000, 3))
+NOTHING = model_at(np.zeros((0, 3)))
+
+
+def dome(directions: torch.Tensor) -> torch.Tensor:
+    """A smooth sky that differs in every direction, over a plain ground."""
+    x, y, z = directions.unbind(-1)
+    sky = torch.stack([0.5 + 0.2 * x + 0.2 * z, 0.5 + 0.3 * y, 0.7 - 0.2 * x * y], dim=-1)
+    return torch.where(z[..., None] > 0, sky, torch.tensor([0.2, 0.3, 0.1]))
+
+
+def with_dome(model: AnchorModel, rows: int = 128) -> AnchorModel:
+    """The model with a map of the dome at the centers of its cells."""
+    elevation = row_elevations(rows)[:, None]
+    azimuth = -math.pi + 2 * math.pi * torch.arange(4 * rows) / (4 * rows)
+    across = elevation.cos()
+    up = elevation.sin().expand(rows, 4 * rows)
+    directions = torch.stack([across * azimuth.cos(), across * azimuth.sin(), up], dim=-1)
+    return replace(model, decoder=replace(model.decoder, envmap=dome(directions)))
+
+
+def level_camera(yaw_deg: float, tilt_deg: float = 88.0, altitude: float = 6.0) -> Camera:
+    return camera_above(0.0, 0.0, altitude, tilt_deg, yaw_deg)
+
+
+@pytest.mark.parametrize("yaw", [-90.0, 0.0, 37.0])  # -90 looks along -x, where the ends of the map meet
+def test_a_scene_without_anchors_is_the_dome(yaw: float) -> None:
+    camera = level_camera(yaw)
+    shown, true = render(with_dome(NOTHING), camera).image, dome(ray_directions(camera))
+    # But for the row at the horizon.
+    apart = (shown - true).abs().amax(dim=(1, 2))
+    assert float(apart.sort().values[-3]) < 2e-3
+
+
+def test_rays_are_those_of_the_camera() -> None:
+    camera = level_camera(37.0, 70.0).cropped(3, 5, 40, 30)
+    places = camera.unproject(np.full((25, 37), 2.0)) - camera.position
+    places /= np.linalg.norm(places, axis=-1, keepdims=True)
+    np.testing.assert_allclose(ray_directions(camera).numpy(), places, atol=1e-6)
+
+
+def test_maps_and_plain_backgrounds_leave_it_out() -> None:
+    plane = opaque_plane()
+    lit, camera = with_dome(plane), level_camera(0.0)
+    above = replace(camera_above(0.0, 0.0), model="orthographic", fx=8.0, fy=8.0)
+    assert torch.equal(render(lit, above).image, render(plane, above).image)
+    assert torch.equal(
+        render(lit, camera, background=(0.0, 0.0, 0.0)).image, render(plane, camera, background=(0, 0, 0)).image
+    )
+    assert not torch.equal(render(lit, camera).image, render(plane, camera).image)
+
+
+def test_files_keep_it_and_models_without_one_open(tmp_path) -> None:
+    for model in (with_dome(NOTHING, 16), NOTHING):
+        model.save(tmp_path / "model.safetensors")
+        back = AnchorModel.load(tmp_path / "model.safetensors").envmap
+        assert back is None if model.envmap is None else torch.equal(back, model.envmap)
+
+
+def test_merged_blocks_keep_one() -> None:
+    coarse = with_dome(model_at(TOWN[:50] / 10), 16)
+    own = replace(coarse, metadata=ModelMetadata(decoder="own"))
+    other = replace(own, decoder=replace(model_at(TOWN[:1], decoder_seed=1).decoder, envmap=coarse.envmap))
+    for blocks in ([coarse] * 4, [own] * 4, [own, other, own, own]):
+        merged, _ = merge_blocks(coarse, blocks, quadrants(), [[]] * 4, MergeConfig())
+        assert torch.equal(merged.envmap, coarse.envmap)
+        assert all(span.decoder.envmap is None for span in merged.decoder_spans)
+
+
+def test_a_skyline_is_above_the_town_but_not_above_mismatches() -> None:
+    eye = np.array([0.0, 0.0, 6.0])
+    tower = np.column_stack([np.full(9, 10.0), np.zeros(9), np.linspace(2, 12, 9)])
+    skyline = find_skyline(eye, np.concatenate([TOWN, tower, [[-10.0, 0.0, 30.0]]]))
+
+    def is_sky(x: float, y: float, z: float) -> bool:
+        ray = torch.tensor([[x, y, z]]) / math.hypot(x, y, z)
+        return bool(above_skyline(ray, skyline))
+
+    assert is_sky(-10, 0, 0.1)  # one point alone does not count
+    assert not is_sky(10, 0, 3)
+    assert is_sky(10, 0, 7)
+    assert is_sky(0, 10, 0.1)
+    assert not is_sky(0, 10, -5)
+    assert in_sky(
+        np.array([[-10.0, 0, 9], [10, 0, 7], [0, 10, 0]]), [level_camera(y) for y in (-90, 90, 0)], [skyline] * 3
+    ).tolist() == [True, False, False]
+
+
+def test_flights_that_look_down_have_no_sky() -> None:
+    obliques = [camera_above(x, 0, 6.0, 45.0, 60 * x) for x in range(3)]
+    skylines, show_sky = find_skylines(lambda: pytest.fail("not needed"), obliques)
+    assert (skylines, show_sky) == ((None,) * 3, False)
+    skylines, show_sky = find_skylines(lambda: TOWN, [*obliques, level_camera(0.0)])
+    assert show_sky
+    assert [skyline is None for skyline in skylines] == [True, True, True, False]
+
+
+def test_the_first_map_is_what_the_photographs_show() -> None:
+    cameras = [level_camera(yaw) for yaw in range(0, 360, 40)]
+    skylines, _ = find_skylines(lambda: TOWN, cameras)
+    read = lambda index: ((dome(ray_directions(cameras[index])) * 255).byte(), None, cameras[index])  # noqa: E731
+    envmap = initial_envmap(read, skylines, cameras, (0.9, 0.1, 0.9))
+    for yaw in (20.0, 100.0, 200.0):  # between the photographs
+        directions = ray_directions(level_camera(yaw))
+        clear = ray_angles(directions)[1] > 0.03
+        apart = (sample_envmap(envmap, directions) - dome(directions)).abs()[clear]
+        assert float(apart.mean()) < 0.01
+        assert float(apart.max()) < 0.1
+    straight_down = sample_envmap(envmap, torch.tensor([[[0.0, 0.0, -1.0]]]))
+    torch.testing.assert_close(straight_down[0, 0], torch.tensor([0.9, 0.1, 0.9]))
+
+
+def _drawn(envmap: torch.Tensor, opacity: float):
+    """A splat before the map of a step, and the camera."""
+    state, camera = start(TrainConfig(iterations=1)), level_camera(0.0)
+    stage = replace(small_stage(), skylines=(find_skyline(camera.position, TOWN),))
+    decoder = replace(state.decoder, envmap=envmap)
+    splats = TrainingSplats(
+        means_px=torch.tensor([[30.0, 8.0]]), conics=torch.tensor([[0.02, 0.0, 0.02]]), depths=torch.ones(1),
+        colors=torch.full((1, 3), 0.3), opacities=torch.tensor([opacity]), segments=None,
+        source=torch.zeros(1, dtype=torch.int32), volume=torch.tensor(1.0),
+    )  # fmt: skip
+    background = torch.tensor([0.9, 0.2, 0.6])
+    return with_sky(render_for_training(splats, camera, background), stage, 0, decoder, camera, background)
+
+
+def test_gradients_are_finite_differences() -> None:
+    envmap = with_dome(NOTHING, 16).envmap.clone().requires_grad_()
+    drawn = _drawn(envmap, 0.5)
+    weights = torch.rand(drawn.image.shape, generator=torch.Generator().manual_seed(2))
+    gradients = drawn.backward(weights.clone(), 0.0)
+    loss = lambda *given: float((_drawn(*given).image.double() * weights).sum())  # noqa: E731
+    changed = torch.rand(envmap.shape, generator=torch.Generator().manual_seed(3))
+    by_map = loss(envmap.detach() + changed, 0.5) - loss(envmap.detach(), 0.5)
+    assert float((envmap.grad * changed).sum()) == pytest.approx(by_map, rel=1e-4)
+    by_opacity = (loss(envmap.detach(), 0.51) - loss(envmap.detach(), 0.49)) / 0.02
+    assert float(gradients.opacities) == pytest.approx(by_opacity, rel=1e-3)
+    # Ground stays before the color of the step.
+    assert torch.equal(drawn.image[-1], torch.tensor([0.9, 0.2, 0.6]).expand(64, 3))
+
+
+def test_blocks_do_not_move_it() -> None:
+    model = with_dome(model_at(TOWN[:5]), 16)
+    for kind, moves in (("coarse", True), ("block", False)):
+        state = initial_state(model.anchors, model.decoder.copy(), replace(small_stage(), kind=kind))
+        assert state.decoder.envmap.requires_grad == moves
