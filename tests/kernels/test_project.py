@@ -14,6 +14,7 @@ from vdgs.kernels import constants
 from vdgs.kernels.constants import DILATION_PX2
 from vdgs.kernels.cpu import extension
 from vdgs.kernels.cpu.project import project as native_project
+from vdgs.kernels.gaussian_projection import GaussianShapes, area_shares, project_gaussians
 from vdgs.kernels.rotations import rotation_matrices
 from vdgs.kernels.torch_ref.project import project as twin_project
 
@@ -47,6 +48,19 @@ def test_small_gaussians_have_the_covariance_of_their_projected_samples(camera):
         covariance = np.linalg.inv([[xx, xy], [xy, yy]])
         sampled = monte_carlo_covariance(means[i].numpy(), scales[i], quaternions[i], camera)
         assert np.abs(covariance - sampled).max() < 0.02 * np.abs(sampled).max()
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_a_conic_alone_says_which_share_of_its_area_a_gaussian_had_before_the_blur(camera):
+    means, scales, quaternions = gaussians(300, log_sigma=-3.0)
+    exact = project_gaussians(means, GaussianShapes(scales, quaternions), camera)
+    shown = exact.projected.valid
+    conics = native_project(means.float(), scales.float(), quaternions.float(), camera).conics[shown]
+    shares = area_shares(conics, torch.full((len(conics),), DILATION_PX2))
+    torch.testing.assert_close(shares.double(), exact.compensation[shown], atol=4e-4, rtol=0)
+    assert shares.min() < 0.1
+    assert shares.max() > 0.5
+    assert (area_shares(conics, torch.zeros(len(conics))) == 1).all()
 
 
 @pytest.mark.parametrize("camera", CAMERAS)

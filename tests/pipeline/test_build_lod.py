@@ -27,7 +27,7 @@ from vdgs.model.lod_nodes import TREE_FILE
 from vdgs.model.lod_quadtree import build_quadtree
 from vdgs.model.lod_scene import LodScene
 from vdgs.model.lod_tree import LodTree
-from vdgs.model.renderer import render, render_scalar_map
+from vdgs.model.renderer import render, render_scalar_map, without_aliasing
 from vdgs.pipeline import build_lod
 from vdgs.pipeline.build_lod import build_tree
 from vdgs.runs.lod_folder import find_tree, open_tree
@@ -62,7 +62,7 @@ def model() -> AnchorModel:
 @pytest.fixture(scope="module")
 def scene(model, tmp_path_factory) -> LodScene:
     folder = tmp_path_factory.mktemp("lod")
-    build_tree(folder, model, "1-a", CameraTable(CAMERAS))
+    build_tree(folder, model, "1-a", CameraTable(CAMERAS, 5.0))
     return LodScene(LodTree(folder), model.without_anchors())
 
 
@@ -144,6 +144,21 @@ def test_merged_levels_stay_opaque_and_keep_their_colors(scene, model):
     assert not scene.tree.cut(high, 100.0).leaves
 
 
+def test_without_aliasing_a_picture_from_afar_is_that_of_many_samples_and_that_of_merged_levels(scene):
+    high, pixel = camera_at(0.0, 0.0, 60.0), 6.0 / 60.0  # as of photographs from a height of 6
+    tiny = model_at(np.random.default_rng(3).uniform((-3, -3, 0), (3, 3, 2), (400, 3)))
+    many = render(tiny, high.resized(8 * high.width, 8 * high.height)).image
+    many = many.reshape(high.height, 8, high.width, 8, 3).mean((1, 3))
+    errors = [
+        float((render(each, high).image - many).square().mean()) for each in (without_aliasing(tiny, pixel), tiny)
+    ]
+    assert errors[0] < errors[1] / 4
+    near = camera_at(0.3, 0.2, 3.0)
+    assert torch.equal(render(without_aliasing(tiny, pixel), near).image, render(tiny, near).image)
+    fine, merged = (render(without_aliasing(scene.at_error(error), pixel), high).image for error in (0.0, 1.0))
+    assert (fine - merged).square().mean() < (render(scene.at_error(0.0), high).image - merged).square().mean()
+
+
 def test_merging_cells_keeps_what_it_merges(scene):
     gaussians = scene.tree.gaussians(0)
     merged, error = merge_cells(gaussians, 1.5, np.zeros(len(gaussians)))
@@ -179,12 +194,12 @@ def test_a_build_that_was_cut_off_continues_to_the_same_bytes(model, scene, tmp_
         raise Stopped("stopped")
 
     with pytest.raises(Stopped):
-        build_tree(folder, model, "1-a", CameraTable(CAMERAS), stop)
+        build_tree(folder, model, "1-a", CameraTable(CAMERAS, 5.0), stop)
     with pytest.raises(VdgsError, match="no finished level-of-detail tree"):
         LodTree(folder)
     kept = {file: file.stat().st_mtime_ns for file in folder.rglob("nodes/*.safetensors")}
     assert kept
-    build_tree(folder, model, "1-a", CameraTable(CAMERAS))
+    build_tree(folder, model, "1-a", CameraTable(CAMERAS, 5.0))
     assert {file: file.stat().st_mtime_ns for file in kept} == kept
     names = sorted(file.relative_to(folder) for file in folder.rglob("*.safetensors"))
     assert names == sorted(file.relative_to(scene.tree.folder) for file in scene.tree.folder.rglob("*.safetensors"))
@@ -204,7 +219,7 @@ def test_a_damaged_node_is_named(scene, tmp_path):
 def test_a_scene_that_no_camera_shows_has_a_tree(tmp_path):
     model = model_at(np.random.default_rng(1).normal(size=(400, 3)))
     away = [camera_at(50.0, 50.0, 5.0)]
-    build_tree(tmp_path, model, "1-b", CameraTable(away))
+    build_tree(tmp_path, model, "1-b", CameraTable(away, 5.0))
     scene = LodScene(LodTree(tmp_path), model.without_anchors(), 0.0)
     assert torch.equal(render(scene, VIEWS[1]).image, render(model, VIEWS[1]).image)
 
@@ -219,6 +234,7 @@ def coarse(model, tmp_path, monkeypatch) -> SimpleNamespace:
     run.coarse.set_status(status)
     location = ModelLocation(run.coarse, "coarse", "key", "")
     monkeypatch.setattr(build_lod, "locate_model", lambda *_: location)
+    monkeypatch.setattr(build_lod, "camera_height", lambda _: 5.0)
     capture = SimpleNamespace(train_views=[SimpleNamespace(camera=camera) for camera in CAMERAS])
     return SimpleNamespace(run=run, capture=capture, location=location)
 

@@ -24,7 +24,7 @@ from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.exposure import exposure_matrix
 from vdgs.model.lod_scene import LodScene
 from vdgs.model.lod_tree import LodTree
-from vdgs.model.renderer import render
+from vdgs.model.renderer import render, without_aliasing
 from vdgs.partition.blocks import save_blocks
 from vdgs.pipeline import build_lod
 from vdgs.rendering.camera_paths import look_at_pose
@@ -97,6 +97,11 @@ def scene(tmp_path_factory):
 # ------------------------------------------------------------------------------------- layers
 
 
+def shown(scene: ViewerScene, model: AnchorModel, camera: Camera) -> np.ndarray:
+    """A picture as the viewer shows it: without aliasing."""
+    return to_8bit(render(without_aliasing(model, scene.photograph_pixel), camera).image.numpy())
+
+
 @pytest.mark.parametrize("layer", LAYERS)
 @pytest.mark.parametrize("model", ["merged", "both"])
 def test_rows_drawn_one_after_another_are_the_whole_picture(scene, layer, model):
@@ -111,7 +116,7 @@ def test_rows_drawn_one_after_another_are_the_whole_picture(scene, layer, model)
 def test_layers_show_what_they_say(scene):
     camera, painter = camera_at(0.0, 0.0, 6.0), Painter(scene)
     drawn = {layer: painter.paint(DisplayOptions(layer), camera, camera) for layer in LAYERS}
-    assert np.array_equal(drawn["color"], to_8bit(render(scene.model("merged"), camera).image.numpy()))
+    assert np.array_equal(drawn["color"], shown(scene, scene.model("merged"), camera))
     names = list(drawn)
     for a in names:
         assert all(not np.array_equal(drawn[a], drawn[b]) for b in names if b != a)
@@ -133,7 +138,7 @@ def test_layers_show_what_they_say(scene):
 def test_a_run_with_a_tree_is_drawn_through_it(scene, tmp_path, monkeypatch):
     model, camera = scene.model("merged"), camera_at(0.3, -0.5, 6.0, 20.0)
     monkeypatch.setattr(build_lod, "MAX_LEAF_ANCHORS", 200)
-    build_lod.build_tree(tmp_path, model, "1-a", CameraTable([view.camera for view in scene.capture.train_views]))
+    build_lod.build_tree(tmp_path, model, "1-a", CameraTable([view.camera for view in scene.capture.train_views], 4.0))
     tree = LodScene(LodTree(tmp_path), model.without_anchors())
     monkeypatch.setattr(viewer_scene, "find_tree", lambda run: tree if run.name == "merged" else None)
     seen = ViewerScene(scene.run, scene._open)
@@ -147,7 +152,7 @@ def test_a_run_with_a_tree_is_drawn_through_it(scene, tmp_path, monkeypatch):
         assert 0 < painter.drawn_anchors <= 200
         assert np.abs(quick.astype(int) - whole).mean() < 60, layer
     exact = Painter(seen).paint(DisplayOptions("color", full_detail=True), camera, camera)
-    assert np.array_equal(exact, to_8bit(render(model, camera).image.numpy()))
+    assert np.array_equal(exact, shown(scene, model, camera))
     near = pick_position(seen.shown("merged"), camera, 32.5, 20.5)
     assert near is not None
     assert np.linalg.norm(near - pick_position(model, camera, 32.5, 20.5)) < 0.3
@@ -160,8 +165,7 @@ def test_what_few_cameras_see_can_be_left_out(scene):
     drawn = painter.paint(DisplayOptions(min_visibility=most), camera, camera)
     kept = scene.visibility("merged") >= most
     assert 0 < kept.double().mean() < 1
-    expected = render(scene.model("merged").select_anchors(kept), camera)
-    assert np.array_equal(drawn, to_8bit(expected.image.numpy()))
+    assert np.array_equal(drawn, shown(scene, scene.model("merged").select_anchors(kept), camera))
     assert not np.array_equal(drawn, everything)
     assert np.array_equal(painter.paint(DisplayOptions(), camera, camera), everything)
 

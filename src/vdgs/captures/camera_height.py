@@ -6,6 +6,7 @@ are from it takes the place of the height then, for the scale of the ground fram
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from jaxtyping import Float
 
 from vdgs.captures.capture import Capture
 from vdgs.config.method import TrainConfig
+from vdgs.geometry.camera import Camera
 from vdgs.geometry.similarity import geometric_median
 
 #: Cameras that are no higher above the points than this share of their distance to them fly at no height (choice).
@@ -43,6 +45,12 @@ def offset_rate_factor(capture: Capture, config: TrainConfig) -> float:
         return 1.0
     centers = np.array([view.camera.position for view in capture.train_views])
     return 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()) / capture.ground.scale
+
+
+def photograph_pixel(height: float, cameras: Iterable[Camera]) -> float:
+    """Side of what a pixel of the training photographs shows from so far away (`camera_height`), at the median of
+    their focal lengths."""
+    return height / float(np.median([max(camera.fx, camera.fy) for camera in cameras]))
 
 
 def camera_height(capture: Capture) -> float:

@@ -50,7 +50,15 @@ COMMON_OPTIONS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
     },
 }  # fmt: skip
 #: Options of a cluster, and others that few need: in the full help alone.
-RARE_OPTIONS = ("--address", "--cpus", "--mem-gb", "--gpus", "--min-visibility", "--num-off-path-images")
+RARE_OPTIONS = (
+    "--address",
+    "--cpus",
+    "--mem-gb",
+    "--gpus",
+    "--min-visibility",
+    "--antialiased",
+    "--num-off-path-images",
+)
 
 #: The short help fits its explanations into a line of so many columns, and wraps them on narrower terminals.
 LINE_WIDTH = 100

@@ -106,6 +106,13 @@ def project_gaussians(
     )
 
 
+def area_shares(conics: Float[Tensor, "m 3"], blur_px2: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
+    """Share of its area that a projected Gaussian has without a blur, a part b of the dilation, from its conic K alone:
+    the root of det(Σ' - b) / det Σ' = det(1 - b K). 1 without any blur; elsewhere right to 3e-4 (float32)."""
+    a, b, c = (conics * blur_px2[:, None]).unbind(-1)
+    return ((1 - a) * (1 - c) - b * b).clamp(0, 1).sqrt()
+
+
 def _pixels(local: Tensor, camera: Camera) -> Tensor:
     x, y, z = local.unbind(-1)
     divisor = z if camera.model == "pinhole" else torch.ones_like(z)

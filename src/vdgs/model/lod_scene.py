@@ -16,7 +16,7 @@ from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.gaussians import Gaussians, project_splats
 from vdgs.model.lod_tree import LodCut, LodTree
-from vdgs.model.renderer import view_splats
+from vdgs.model.renderer import compensated_splats, view_splats, without_aliasing
 
 #: What a node draws: its merged Gaussians ("nodes"), or the anchors of a leaf ("anchors").
 NodeContent = tuple[str, int]
@@ -35,6 +35,8 @@ class LodScene:
     max_error_px: float = 1.0
     #: The view that pictures are parts of, where they are: the anchors of all of it are then held together.
     view: Camera | None = None
+    #: Of the photographs, where anchors are drawn without aliasing (`Antialiased`): merged Gaussians always are.
+    pixel: float | None = None
     #: Which places are drawn, asked for as by `values`; None: all.
     is_drawn: Callable[[NodeContent, Tensor], Tensor] | None = None
     _anchors: dict[tuple[int, ...], AnchorModel | None] = field(default_factory=dict)
@@ -64,6 +66,10 @@ class LodScene:
         """The same scene for pictures of parts of a view, one after another."""
         return replace(self, view=view)
 
+    def without_aliasing(self, pixel: float) -> LodScene:
+        """The same scene, its anchors drawn as `renderer.Antialiased` draws them."""
+        return replace(self, pixel=pixel)
+
     def with_filter(self, is_drawn: Callable[[NodeContent, Tensor], Tensor]) -> LodScene:
         """The same scene without the places for which this is False."""
         return replace(self, is_drawn=is_drawn, _anchors={}, _gaussians={})
@@ -79,13 +85,15 @@ class LodScene:
         shown, sources, first = list[Splats](), list[Tensor](), 0
         anchors = _held(self._anchors, cut.leaves, self._assemble_anchors)
         if anchors is not None:
-            rows, splats = view_splats(anchors, camera, image_index)
+            drawn = anchors if self.pixel is None else without_aliasing(anchors, self.pixel)
+            rows, splats = view_splats(drawn, camera, image_index)
             sources.append(rows)
             shown.append(splats)
             first = len(anchors.anchors)
         gaussians = _held(self._gaussians, cut.nodes, self._assemble_gaussians)
         if gaussians is not None:
-            splats = project_splats(gaussians, camera, gaussians.sh_degree)
+            # The blur that the model has learnt is part of them (`export.lod_bake`).
+            splats = compensated_splats(project_splats(gaussians, camera, gaussians.sh_degree), camera, 0.0)
             sources.append(torch.arange(first, first + len(gaussians), device=self.device))
             shown.append(splats)
         if not shown:

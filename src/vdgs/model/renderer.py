@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Protocol, runtime_checkable
 
@@ -12,6 +12,8 @@ from torch import Tensor
 
 from vdgs.geometry.camera import Camera
 from vdgs.kernels import get_backend
+from vdgs.kernels.constants import DILATION_PX2
+from vdgs.kernels.gaussian_projection import area_shares
 from vdgs.kernels.kernel_types import SPLAT_TENSORS, AnchorSplats, DecoderWeights, Raster, Splats, TrainingSplats
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
@@ -30,9 +32,55 @@ class LodDrawable(Protocol):
 
     def view_splats(self, camera: Camera, image_index: int | None = None) -> tuple[Int64[Tensor, " m"], Splats]: ...
 
+    def without_aliasing(self, pixel: float) -> LodDrawable: ...
+
 
 #: What can be drawn.
 Drawable = AnchorModel | LodDrawable
+
+
+@dataclass(frozen=True, eq=False)
+class Antialiased:
+    """A model seen without aliasing from farther away than its photographs were taken. `render` and its kin take it
+    wherever they take a model.
+
+    Each splat is drawn with a blur of 0.3 px². A model has learnt the blur of the pixels of its photographs; larger
+    pixels enlarge what it shows, so that the nearest splats hide the others. Splats become more transparent here by as
+    much as they grow (Mip-Splatting, eq. 9; gsplat's `rasterize_mode="antialiased"`), but for the learnt part of the
+    blur: from where the photographs were taken, and nearer, no bit changes.
+    """
+
+    model: AnchorModel
+    #: What a pixel of the photographs shows of the scene, in units of the ground frame
+    #: (`captures.camera_height.photograph_pixel`).
+    pixel: float
+
+    @property
+    def background(self) -> tuple[float, float, float]:
+        return self.model.background
+
+    def view_splats(self, camera: Camera, image_index: int | None = None) -> tuple[Int64[Tensor, " m"], Splats]:
+        """The splats of a view, and the anchor or place that each is of."""
+        rows, splats = view_splats(self.model, camera, image_index)
+        return rows, compensated_splats(splats, camera, self.pixel)
+
+    def without_aliasing(self, pixel: float) -> LodDrawable:
+        return Antialiased(self.model, pixel)
+
+
+def without_aliasing(scene: Drawable, pixel: float) -> LodDrawable:
+    """A scene seen without aliasing: see `Antialiased`."""
+    return Antialiased(scene, pixel) if isinstance(scene, AnchorModel) else scene.without_aliasing(pixel)
+
+
+def compensated_splats(splats: Splats, camera: Camera, pixel: float) -> Splats:
+    """The splats of a view as much more transparent as their blur enlarges them, but for what they have learnt of it:
+    that of pixels which show so much of the scene. 0: nothing."""
+    depths = splats.depths if camera.model == "pinhole" else torch.ones_like(splats.depths)
+    learnt = (pixel * max(camera.fx, camera.fy) / depths).square()
+    shares = area_shares(splats.conics, DILATION_PX2 * (1 - learnt).clamp(min=0))
+    # What is not drawn may have any depth.
+    return replace(splats, opacities=torch.where(splats.opacities > 0, splats.opacities * shares, 0.0))
 
 
 def decode_anchors(

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from rich.console import Console
 
+from vdgs.captures.camera_height import camera_height
 from vdgs.config.commands import LodRequest
 from vdgs.errors import RunError, VdgsError
 from vdgs.export import lod_bake
@@ -71,7 +72,7 @@ def build_lod(context: RunContext, request: LodRequest, console: Console) -> Pat
             raise RunError(f"{location.stage.model}: holds no anchors, so that there is nothing to make a tree of.")
         folder.reset_unless(_key(model_id))
         _check_disk(folder.path, model)
-        cameras = CameraTable([view.camera for view in context.capture.train_views])
+        cameras = CameraTable([view.camera for view in context.capture.train_views], camera_height(context.capture))
         console.print(f"level-of-detail tree of the {location.summary}", highlight=False)
         folder.set_status(StatusRecord(state="running"))
         progress = run.begin_step("lod", "leaves", "leaves")

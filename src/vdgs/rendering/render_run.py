@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from rich.console import Console
 
+from vdgs.captures.camera_height import photograph_pixel
 from vdgs.captures.capture_metadata import check_same_capture
 from vdgs.captures.output_guard import check_not_among_folders
 from vdgs.config.commands import MAX_RENDER_SIDE_PX, RENDER_BYTES_PER_PIXEL, RenderRequest
@@ -19,7 +20,7 @@ from vdgs.evaluation.comparison_images import unique_file_stems, write_png
 from vdgs.evaluation.metrics import to_8bit
 from vdgs.geometry.camera import Camera
 from vdgs.model.lod_scene import LodScene
-from vdgs.model.renderer import Drawable, render
+from vdgs.model.renderer import Drawable, render, without_aliasing
 from vdgs.rendering import camera_paths
 from vdgs.rendering.path_io import load_path
 from vdgs.rendering.render_folder import begin_render, finish_render
@@ -62,10 +63,13 @@ class _Render:
 
     def frames(self, scalar_map: ScalarMap | None) -> Iterator[_Frame]:
         """One frame per camera, in order."""
+        shown = self.scene
+        if self.request.is_antialiased:
+            shown = without_aliasing(shown, photograph_pixel(self.run_cameras.camera_height, self.run_cameras.cameras))
         for name, camera in track(self.named, "rendering", len(self.named), self.console):
             check_stop_requested()
             if scalar_map is None:
-                yield name, to_8bit(render(self.scene, camera).image.cpu().numpy()), None
+                yield name, to_8bit(render(shown, camera).image.cpu().numpy()), None
                 continue
             values = scalar_map.values(camera)
             image = scalar_map.scale.colorize(values)
@@ -177,6 +181,8 @@ def _metadata(request: RenderRequest, model: str, scalar_map: ScalarMap | None) 
     metadata: dict[str, object] = {"run": run, "model": model, "mode": request.mode, "views": views}
     if request.lod_error is not None:
         metadata["lod_error"] = request.lod_error
+    if request.is_antialiased and request.mode == "rgb":
+        metadata["antialiased"] = True
     if scalar_map is not None:
         limits = [scalar_map.scale.low, scalar_map.scale.high]
         metadata |= {"numbers": scalar_map.description, "colors_between": limits, "legend_below": request.colorbar}

@@ -14,7 +14,14 @@ from torch import Tensor
 from vdgs.captures.camera_height import camera_height
 from vdgs.evaluation.metrics import to_8bit
 from vdgs.geometry.camera import Camera
-from vdgs.model.renderer import Drawable, rasterize_splats, render, render_scalar_map, view_splats
+from vdgs.model.renderer import (
+    Drawable,
+    rasterize_splats,
+    render,
+    render_scalar_map,
+    view_splats,
+    without_aliasing,
+)
 from vdgs.viewer.image_comparison import ImageComparison, warp_image
 from vdgs.viewer.lod import LodLevel
 from vdgs.viewer.viewer_scene import ViewerScene
@@ -123,7 +130,8 @@ class Painter:
         )  # fmt: skip
         self.drawn_anchors += count
         if display.layer == "color":
-            return to_8bit(render(level.model, camera).image.cpu().numpy())
+            shown = without_aliasing(level.model, self._scene.photograph_pixel)
+            return to_8bit(render(shown, camera).image.cpu().numpy())
         if display.layer == "blocks":
             return _render_block_tints(level.model, self._scene.level_tint(name, level, camera), camera)
         if display.layer == "depth" and self._depth is None:
