@@ -19,7 +19,7 @@ from torch import Tensor
 from vdgs.config.executor_options import CheckpointOptions
 from vdgs.runs.stage_folder import StageFolder, StatusRecord
 from vdgs.system.checkpoints import Checkpoint
-from vdgs.training.session.training_progress import LINE_INTERVAL_SECONDS
+from vdgs.system.console import LINE_INTERVAL_SECONDS
 from vdgs.training.session.training_session import Checkpointer, TrainingSession, run_session
 
 

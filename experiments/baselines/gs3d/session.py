@@ -29,7 +29,8 @@ from vdgs.captures.capture import Capture
 from vdgs.config.executor_options import CheckpointOptions
 from vdgs.runs.stage_folder import StageFolder, StatusRecord
 from vdgs.system.checkpoints import save_checkpoint
-from vdgs.training.session.training_progress import LINE_INTERVAL_SECONDS, LOG_INTERVAL
+from vdgs.system.console import LINE_INTERVAL_SECONDS
+from vdgs.training.session.training_progress import LOG_INTERVAL
 from vdgs.training.session.training_session import Checkpointer, TrainingSession, restore_or_start, run_session
 
 

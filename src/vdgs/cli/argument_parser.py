@@ -169,7 +169,7 @@ def _read_options(given: GivenArguments, words: Sequence[str], free: list[str]) 
             taken.append(words[index])
             index += 1
         if option.num_words == 0 and index < len(words) and words[index].lower() in _ON_OR_OFF:
-            taken = [] if Path(words[index]).exists() else words[index : index + 1]
+            taken = [] if Path(words[index]).exists() else [words[index]]
         _give(given, option, taken, name)
 
 

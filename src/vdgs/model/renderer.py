@@ -59,6 +59,10 @@ class Antialiased:
     def background(self) -> tuple[float, float, float]:
         return self.model.background
 
+    @property
+    def envmap(self) -> Float[Tensor, "rows columns 3"] | None:
+        return self.model.envmap
+
     def view_splats(self, camera: Camera, image_index: int | None = None) -> tuple[Int64[Tensor, " m"], Splats]:
         """The splats of a view, and the anchor or place that each is of."""
         rows, splats = view_splats(self.model, camera, image_index)
