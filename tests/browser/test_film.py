@@ -11,7 +11,7 @@ from support.commands import wait_until
 from support.viewer import browser, open_page, served
 from vdgs.rendering.video import VideoWriter, default_encoder
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("viewer")]
 
 PAGE = """<video id="film" muted></video><script>const film = document.getElementById("film");
 film.onerror = () => { document.title = "failed: " + film.error.message; };

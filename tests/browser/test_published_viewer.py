@@ -27,7 +27,7 @@ from vdgs.export.programs import PROGRAMS
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.geodesy import enu_axes
 
-pytestmark = [pytest.mark.browser, needs_browser]
+pytestmark = [pytest.mark.browser, needs_browser, pytest.mark.xdist_group("viewer")]
 
 MODULES = Path(os.environ.get("VDGS_NODE") or "none") / "node_modules"
 SIZE = 256

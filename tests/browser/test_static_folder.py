@@ -17,7 +17,7 @@ from vdgs.export.formats.export_scene import ExportScene, InitialView
 from vdgs.export.formats.streamed_page import write_streamed_page
 from vdgs.geometry.camera import Camera
 
-pytestmark = [pytest.mark.browser, needs_browser]
+pytestmark = [pytest.mark.browser, needs_browser, pytest.mark.xdist_group("viewer")]
 SIZE = 256
 
 

@@ -52,23 +52,14 @@ def console() -> Console:
     return Console(file=io.StringIO(), width=500)
 
 
-@pytest.fixture(scope="module")
-def flight(nine, tmp_path_factory) -> Flight:
-    """Nine photographs; one that shows nothing, one that is cut off, and a text beside them."""
-    flown = Flight(tmp_path_factory.mktemp("flight") / "card", nine.cameras)
-    shutil.copytree(nine.folder, flown.folder)
-    gray = np.full((300, 400, 3), 128, np.uint8)
-    write_photograph(flown.folder / "gray.jpg", gray, 50, np.array([0.0, 3.0, 45.0]))
-    (flown.folder / "cut.jpg").write_bytes((flown.folder / flown.names[0]).read_bytes()[:9000])
-    (flown.folder / "notes.txt").write_text("windy")
-    return flown
+@pytest.fixture
+def flight(nine) -> Flight:
+    return nine
 
 
-@pytest.fixture(scope="module")
-def made(flight, tmp_path_factory) -> Path:
-    output = tmp_path_factory.mktemp("made") / "capture"
-    reconstruct(SfmRequest(image_folders=(flight.folder,), output=output, threads=1, keep_intermediate=True), console())
-    return output
+@pytest.fixture
+def made(nine_begun) -> Path:
+    return nine_begun["made"]
 
 
 def files(folder: Path) -> dict[str, tuple[int, int]]:

@@ -204,7 +204,7 @@ def test_a_signal_at_each_step_keeps_what_is_done_and_the_same_command_goes_on(
     whole_capture(output, flight, facts)
     assert all(path.stat().st_mtime_ns == when for path, when in written.items())
     here = list(STEPS).index(step)
-    assert len(extracted) == (3 if here == 0 else 0)  # the six of three calls are kept
+    assert len(extracted) == (4 if here == 0 else 0)  # the six of three calls are kept
     assert bool(matched) == (here <= 1)
     assert bool(mapped) == (here <= 2)
     if here == 2:  # goes on from what it had

@@ -17,7 +17,7 @@ pytest.importorskip("embreex")
 pytest.importorskip("pyproj")
 import pyproj
 
-from support.flights import ALTITUDE_M, HEIGHT, ORIGIN, WIDTH, Flight, copy_folder, sightings, write_photograph
+from support.flights import ALTITUDE_M, HEIGHT, ORIGIN, WIDTH, Flight, sightings, write_photograph
 from vdgs.captures.loading import load_capture
 from vdgs.captures.reconstruction import gcp_table, read_reconstruction, report_rows
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
@@ -50,13 +50,10 @@ def points(flight) -> list[dict[int, np.ndarray]]:
     return sightings(flight.cameras, PLACES)
 
 
-@pytest.fixture(scope="module")
-def made(flight, nine_begun, tmp_path_factory) -> Path:
+@pytest.fixture
+def made(nine_begun) -> Path:
     """Placed by GPS; its features, matches and model are kept."""
-    output = tmp_path_factory.mktemp("made") / "capture"
-    copy_folder(nine_begun["writing"], output)
-    reconstruct(SfmRequest(image_folders=(flight.folder,), output=output, threads=1, keep_intermediate=True), console())
-    return output
+    return nine_begun["made"]
 
 
 def projected(enu: np.ndarray, system: str) -> np.ndarray:

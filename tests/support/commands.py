@@ -239,10 +239,13 @@ def entry_point(*arguments: object) -> subprocess.CompletedProcess[str]:
 
 def wait_until(condition: Callable[[], object]) -> None:
     """Return once the condition holds; fail if that never comes."""
-    end = time.monotonic() + PATIENCE_SECONDS
+    began = time.monotonic()
+    end = began + PATIENCE_SECONDS
     while not condition():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(GLANCE_SECONDS)
+        looked = time.monotonic()
+        assert looked < end, "waited in vain"
+        time.sleep(max(GLANCE_SECONDS, looked - began))  # to look may cost more than what is waited for
+        began = time.monotonic()
 
 
 def is_free(run: Path) -> bool:

@@ -89,17 +89,25 @@ def fly(folder: Path, cameras: Sequence[Camera], extent: float = 60.0) -> Flight
 
 def folders_of_steps(flight: Flight, folder: Path) -> dict[str, Path]:
     """Folders as those of a capture of a flight are when each step of its reconstruction begins, but for the first, and
-    when it is done."""
+    when it is done (`made`: with its features, matches and models)."""
     from vdgs.sfm import reconstruct as reconstructing
 
     output = folder / "capture"
     with pytest.MonkeyPatch.context() as patch:
         for step, name in (("matching", "_matches"), ("mapping", "_models"), ("writing", "_write")):
             patch.setattr(reconstructing, name, _after_copying(getattr(reconstructing, name), output, folder / step))
-        reconstructing.reconstruct(
-            SfmRequest(image_folders=(flight.folder,), output=output, threads=1), Console(file=io.StringIO())
-        )
-    return {step: folder / step for step in ("matching", "mapping", "writing")} | {"done": output}
+        request = SfmRequest(image_folders=(flight.folder,), output=output, threads=1, keep_intermediate=True)
+        reconstructing.reconstruct(request, Console(file=io.StringIO()))
+    shutil.copytree(output, folder / "done", symlinks=True, ignore=shutil.ignore_patterns(".lock", "work"))
+    return {step: folder / step for step in ("matching", "mapping", "writing", "done")} | {"made": output}
+
+
+def add_what_is_left_out(flight: Flight) -> None:
+    """To a card of nine: a photograph that shows nothing, one that is cut off, and a text."""
+    gray = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
+    write_photograph(flight.folder / "gray.jpg", gray, 50, np.array([0.0, 3.0, ALTITUDE_M]))
+    (flight.folder / "cut.jpg").write_bytes((flight.folder / flight.names[0]).read_bytes()[:9000])
+    (flight.folder / "notes.txt").write_text("windy")
 
 
 def _after_copying(function: Callable, of: Path, to: Path) -> Callable:

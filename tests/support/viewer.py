@@ -16,7 +16,6 @@ from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
-from urllib.request import urlopen
 
 import cv2
 import msgspec
@@ -210,54 +209,81 @@ class Page:
         self.call("Input.dispatchMouseEvent", type="mouseReleased", x=end[0], y=end[1], **mouse)
 
 
+class Browser:
+    """The machine's browser, without a window, drawn in software."""
+
+    def __init__(self) -> None:
+        command = browser()
+        assert command is not None
+        self._profile = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+        self._process = subprocess.Popen(
+            [
+                command, "--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+                "--disable-dev-shm-usage", "--no-first-run", "--disable-extensions", "--remote-debugging-port=0",
+                f"--user-data-dir={self._profile.name}", "about:blank",
+            ],
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        try:
+            self._address = _address_of(Path(self._profile.name) / "DevToolsActivePort", self._process)
+        except BaseException:
+            self.close()
+            raise
+
+    @contextlib.contextmanager
+    def window(self, width: int, height: int) -> Iterator[Page]:
+        """An empty page that knows nothing of what other pages kept."""
+        with connect(self._address, max_size=None) as socket:
+            whole = Page(socket)
+            context = whole.call("Target.createBrowserContext")["browserContextId"]
+            size = {"width": width, "height": height, "newWindow": True}
+            target = whole.call("Target.createTarget", url="about:blank", browserContextId=context, **size)["targetId"]
+            try:
+                with connect(f"{self._address.partition('/devtools/')[0]}/devtools/page/{target}", max_size=None) as own:
+                    yield Page(own)
+            finally:
+                whole.call("Target.disposeBrowserContext", browserContextId=context)
+
+    def close(self) -> None:
+        self._process.terminate()
+        try:
+            self._process.wait(timeout=PATIENCE)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._profile.cleanup()
+
+
+#: Started by the first page, for all pages: its start takes longer than most pages. tests/browser/conftest.py ends it.
+_browsers = list[Browser]()
+
+
+def close_browser() -> None:
+    while _browsers:
+        _browsers.pop().close()
+
+
 @contextlib.contextmanager
 def open_page(
     address: str, width: int = 1000, height: int = 700, offline: bool = False, downloads: Path | None = None,
     scale: float = 1.0,
 ) -> Iterator[Page]:  # fmt: skip
-    """A page of the machine's browser, without a window, drawn in software; `offline`: without any network;
-    `downloads`: the folder where files are stored that the page gives; `scale`: pixels of the screen for one of the
-    page, the fewer the quicker it is drawn."""
-    command = browser()
-    assert command is not None
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
-        process = subprocess.Popen(
-            [
-                command, "--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-                "--disable-dev-shm-usage", "--no-first-run", "--disable-extensions", "--remote-debugging-port=0",
-                f"--user-data-dir={profile}", f"--window-size={width},{height}", "about:blank",
-            ],
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        )  # fmt: skip
-        try:
-            port = _port_of(Path(profile) / "DevToolsActivePort", process)
-            with urlopen(f"http://127.0.0.1:{port}/json/list") as answer:
-                target = next(each for each in json.load(answer) if each["type"] == "page")
-            with connect(target["webSocketDebuggerUrl"], max_size=None) as socket:
-                page = Page(socket)
-                page.call(
-                    "Emulation.setDeviceMetricsOverride",
-                    width=width,
-                    height=height,
-                    deviceScaleFactor=scale,
-                    mobile=False,
-                )
-                if downloads is not None:
-                    page.call("Page.setDownloadBehavior", behavior="allow", downloadPath=str(downloads))
-                if offline:
-                    page.call("Network.enable")
-                    speed = {"latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
-                    page.call("Network.emulateNetworkConditions", offline=True, **speed)
-                page.call("Page.navigate", url=address)
-                page.wait_until_loaded(address)
-                yield page
-        finally:
-            process.terminate()
-            try:
-                process.wait(timeout=PATIENCE)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+    """A page of the machine's browser; `offline`: without any network; `downloads`: the folder where files are stored
+    that the page gives; `scale`: pixels of the screen for one of the page, the fewer the quicker it is drawn."""
+    if not _browsers:
+        _browsers.append(Browser())
+    with _browsers[0].window(width, height) as page:
+        size = {"width": width, "height": height, "deviceScaleFactor": scale, "mobile": False}
+        page.call("Emulation.setDeviceMetricsOverride", **size)
+        if downloads is not None:
+            page.call("Page.setDownloadBehavior", behavior="allow", downloadPath=str(downloads))
+        if offline:
+            page.call("Network.enable")
+            speed = {"latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
+            page.call("Network.emulateNetworkConditions", offline=True, **speed)
+        page.call("Page.navigate", url=address)
+        page.wait_until_loaded(address)
+        yield page
 
 
 @contextlib.contextmanager
@@ -280,13 +306,14 @@ def served(folder: Path) -> Iterator[str]:
         thread.join()
 
 
-def _port_of(file: Path, process: subprocess.Popen[bytes]) -> int:
-    """The port that the browser listens at, once it says so."""
+def _address_of(file: Path, process: subprocess.Popen[bytes]) -> str:
+    """Where the browser listens, once it says so."""
     until = time.monotonic() + PATIENCE
     while time.monotonic() < until:
         assert process.poll() is None, "the browser does not start"
-        with contextlib.suppress(OSError, ValueError, IndexError):
-            return int(file.read_text().split()[0])
+        with contextlib.suppress(OSError, ValueError):
+            port, path = file.read_text().split()
+            return f"ws://127.0.0.1:{port}{path}"
         time.sleep(0.05)
     raise AssertionError("the browser does not listen")
 
