@@ -75,6 +75,10 @@ def pytest_collection_finish(session: pytest.Session) -> None:
         from vdgs.pipeline import time_estimate
 
         time_estimate.MIN_TIMED_STEPS, time_estimate.MAX_TIMED_SECONDS = FEW_STEPS, 0.0
+    if "torch.testing" in sys.modules:
+        from torch.testing import _comparison
+
+        _comparison._HAS_DTENSOR = False  # or the first comparison imports sympy: over a second in each worker
     if "PYTEST_XDIST_WORKER" not in os.environ:
         return
     for item in session.items:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import ast
 import graphlib
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -89,12 +89,20 @@ def imports_of(package: Path, of: Path | None = None) -> list[Import]:
         text = file.read_text(encoding="utf-8")
         if of is not package and of.name not in text:
             continue
-        for node in ast.walk(ast.parse(text, str(file))):
+        for node in statements_of(ast.parse(text, str(file))):
             if isinstance(node, (ast.Import, ast.ImportFrom)):
                 where = f"{file.relative_to(package.parent).as_posix()}:{node.lineno}"
                 within = name if file.name == "__init__.py" else name.rpartition(".")[0]
                 found += [Import(where, name, each) for each in _imported(node, within, modules, of.name)]
     return found
+
+
+def statements_of(node: ast.AST) -> Iterator[ast.AST]:
+    """All statements below a node: `ast.walk` visits the expressions too, which takes three times as long."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, (ast.stmt, ast.excepthandler, ast.match_case)):
+            yield child
+            yield from statements_of(child)
 
 
 def _imported(node: ast.Import | ast.ImportFrom, within: str, modules: Iterable[str], package: str) -> list[str]:

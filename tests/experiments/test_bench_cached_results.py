@@ -18,7 +18,7 @@ from vdgs.errors import VdgsError
 pytestmark = [pytest.mark.xdist_group("bench_cached_results"), pytest.mark.slow]
 
 
-def asked(data: Path, output: Path, seeds: int = 1, known: tuple[Path, ...] = (), total: int = 40) -> BenchSettings:
+def asked(data: Path, output: Path, seeds: int = 1, known: tuple[Path, ...] = (), total: int = 24) -> BenchSettings:
     choices = PlanOptions(seeds, ("copr",), ("coarse", "baseline"), total_iterations=total, max_anchors=300)
     return BenchSettings("table2", output, choices, data, reuse_results=known)
 

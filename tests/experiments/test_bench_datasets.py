@@ -1,4 +1,4 @@
-"""The published data sets' scenes of `vdgs bench`, end to end: a tiny generated town written in their layouts."""
+"""The published data sets' scenes of `vdgs bench`, end to end: a tiny place written in their layouts."""
 
 import json
 from dataclasses import replace
@@ -8,48 +8,25 @@ import cv2
 import pytest
 
 from experiments.bench.scenes import SCENES
-from support.captures import TinyScene, write_colmap
+from support.captures import tiny_scene, write_colmap
 from support.commands import do_tasks_here, vdgs
 from support.dataset_layouts import halves, write_matrixcity, write_mega_nerf
-from vdgs.captures.capture import Capture
-from vdgs.captures.loading import load_capture
 from vdgs.runs.run_folder import RunFolder
-from vdgs.synth import SynthOptions, generate
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("bench_datasets")]
 
 WIDTH, HEIGHT = 160, 120
 
 
-def photographs(files: list[Path], capture: Capture) -> None:
-    """Let files hold the photographs of the town, in the order of its views."""
-    for file, view in zip(files, capture.views, strict=True):
-        assert file.is_file()
-        assert cv2.imwrite(str(file), cv2.imread(str(view.image_path)))
-
-
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> Path:
-    """A town as `residence-pixsfm` with a COLMAP model beside it, and as MatrixCity's small city."""
-    pytest.importorskip("embreex")
+    """A place as `residence-pixsfm` with a COLMAP model beside it, and as MatrixCity's small city."""
     folder = tmp_path_factory.mktemp("data")
-    options = SynthOptions(
-        size="toy", num_images=15, num_test_images=3, num_validation_images=0, width=WIDTH, height=HEIGHT,
-        samples_per_pixel=1, num_points=800, extent_m=60.0,
-    )  # fmt: skip
-    generate(folder / "town", options)
-    town = load_capture(folder / "town")
-    scene = TinyScene({view.name: view.camera for view in town.views}, town.points, town.point_colors)
-
+    scene = tiny_scene(columns=6, rows=3, width=WIDTH, height=HEIGHT, points=800)
     residence = folder / "residence-pixsfm"
-    renamed = write_mega_nerf(residence, scene)
-    photographs([residence / Path(n).parent / "rgbs" / Path(n).name for n in renamed.cameras], town)
-    names = {Path(name).name: camera for name, camera in renamed.cameras.items()}
+    names = {Path(name).name: camera for name, camera in write_mega_nerf(residence, scene).cameras.items()}
     write_colmap(residence, replace(scene, cameras=names), images=None)
-
-    aerial = folder / "small_city" / "aerial"
-    both = write_matrixcity(aerial / "pose" / "block_all", *halves(scene, len(town.train_views)))
-    photographs([aerial / name for name in both.cameras], town)
+    write_matrixcity(folder / "small_city" / "aerial" / "pose" / "block_all", *halves(scene, 15))
     return folder
 
 

@@ -102,27 +102,35 @@ def test_it_stands_beside_methods_with_anchors(data, tmp_path, monkeypatch):
     assert "3,000, as many as they decode to" in text
 
 
-def test_alone_it_has_no_groups_and_other_settings_train_it_again(data, tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def alone(data, tmp_path_factory) -> tuple[Path, BenchResult]:
+    """A bench of nothing else, and its result."""
+    output = tmp_path_factory.mktemp("alone")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bench, "LocalExecutor", InThisProcess)
+        return output, benched(data, output, "3dgs")["3dgs"]
+
+
+def test_alone_it_has_no_groups_and_other_settings_train_it_again(data, alone, monkeypatch):
     monkeypatch.setattr(bench, "LocalExecutor", InThisProcess)
-    alone = benched(data, tmp_path, "3dgs")["3dgs"]
+    output, alone = alone
     assert (alone.state, alone.groups, alone.visibility_source) == ("done", (), "")
-    run = RunFolder(tmp_path / alone.folder)
+    run = RunFolder(output / alone.folder)
     assert not (run.path / GROUPS_FILE).exists()
     with pytest.raises(RunError, match="has no coarse model"):
         open_run(run.path)
     model = gaussians_folder(run).model
     before = model.stat().st_mtime_ns
     (run.path / "bench.json").unlink()  # measured again, not trained
-    assert benched(data, tmp_path, "3dgs")["3dgs"].figures["psnr"] == alone.figures["psnr"]
+    assert benched(data, output, "3dgs")["3dgs"].figures["psnr"] == alone.figures["psnr"]
     assert model.stat().st_mtime_ns == before
-    assert benched(data, tmp_path, "3dgs", total=80, overwrite=True)["3dgs"].figures["iterations"] == 80
+    assert benched(data, output, "3dgs", total=24, overwrite=True)["3dgs"].figures["iterations"] == 24
     assert model.stat().st_mtime_ns != before
 
 
-def test_a_stopped_run_continues(data, tmp_path, monkeypatch):
+def test_a_stopped_run_continues(data, alone, tmp_path, monkeypatch):
     monkeypatch.setattr(bench, "LocalExecutor", InThisProcess)
-    whole = benched(data, tmp_path / "whole", "3dgs")["3dgs"]
-    train = gaussian_session.train
+    whole, train = alone[1], gaussian_session.train
 
     def half(state, stage, *, stop, after_step):
         return train(state, stage, stop=lambda: state.iteration == 20, after_step=after_step)

@@ -36,7 +36,7 @@ def test_all_of_it_runs_and_agrees(drivers, compiled_code, tmp_path, monkeypatch
     monkeypatch.setattr(gpu, "SOURCES", {name: gpu.SOURCES[name] for name in ("cull.cu", "statistics.cu")})
     monkeypatch.setattr(gpu, "TOWN_DB", 3.0)  # after three iterations, less says nothing
     # Kernels that run on the processor take long for each anchor.
-    town = (*gpu.SMALL.town, "--num-points", "200", "--extent-m", "40")
+    town = (*gpu.SMALL.town, "--num-points", "200", "--extent-m", "40", "--num-test-images", "1")
     monkeypatch.setattr(gpu, "SMALL", replace(gpu.SMALL, iterations=3, town=town))
     capture, train, asked = tmp_path / "capture", gpu.train_and_measure, []
 

@@ -32,8 +32,9 @@ def weighted_sum(splats: AnchorSplats, seed: int = 0) -> torch.Tensor:
     return total
 
 
-@pytest.mark.parametrize("camera", CAMERAS)
-@pytest.mark.parametrize("with_distance", [False, True])
+@pytest.mark.parametrize(
+    ("camera", "with_distance"), [*((camera, False) for camera in CAMERAS), *((camera, True) for camera in CAMERAS[:2])]
+)
 def test_gradients_of_the_twin_are_those_of_finite_differences(camera, with_distance):
     scene = Scene.random(6, k=4, with_distance=with_distance, spread=0.5, seed=1).to(torch.float64)
 

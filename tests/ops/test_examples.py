@@ -6,6 +6,7 @@ import importlib.util
 import json
 import runpy
 import sys
+from functools import partial
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -13,6 +14,7 @@ import pytest
 from PIL import Image
 
 from support.captures import tiny_scene, write_colmap
+from vdgs.synth import SynthOptions
 
 pytestmark = [pytest.mark.xdist_group("api"), pytest.mark.slow]
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -111,6 +113,9 @@ def cells() -> list[str]:
 @pytest.mark.skipif(importlib.util.find_spec("embreex") is None, reason="embreex: pip install 'vdgs[synth]'")
 def test_the_notebook_runs_from_top_to_bottom(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    # Pictures are drawn, and no one looks at them.
+    small = partial(SynthOptions, width=48, height=36, samples_per_pixel=1, num_test_images=1, extent_m=50.0)
+    monkeypatch.setattr("vdgs.synth.SynthOptions", small)
     if importlib.util.find_spec("nbclient") and importlib.util.find_spec("ipykernel"):
         import nbclient
         import nbformat

@@ -14,7 +14,7 @@ from experiments.bench.plan import PlanOptions
 from experiments.bench.results import BenchResult
 from experiments.bench.worker import BenchJob, run_job
 from support.captures import tiny_scene, write_colmap
-from support.commands import threads_as_before
+from support.commands import small_figures, threads_as_before
 from vdgs.distributed.executor import Task, TaskListener, TaskResult
 
 
@@ -25,7 +25,7 @@ class InThisProcess:
     max_concurrent: int
 
     def run(self, tasks: Sequence[Task], _listener: TaskListener) -> list[TaskResult]:
-        with threads_as_before():
+        with threads_as_before(), small_figures():
             for task in tasks:
                 run_job(replace(BenchJob.read(Path(task.command[-1])), threads=1))
         return [TaskResult(name=task.name, state="done") for task in tasks]

@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import pytest
 import torch
+from rich.console import Console
 
 from support.captures import look_down
+from support.commands import small_figures
 from support.hand_made_models import model_at, opaque_plane
 from vdgs.captures.capture import Capture, View
+from vdgs.config.commands import OrthoRequest
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.geometry.map_projection import MapProjection
 from vdgs.model.anchor_model import AnchorModel
+from vdgs.rendering.ortho import render_ortho
 from vdgs.rendering.ortho.nadir_camera import NadirCamera
 from vdgs.rendering.ortho.tile_renderer import TileRenderer
+from vdgs.runs.run_context import RunContext
 
 #: Far from the middle of its zone: grid north is 1.1 degrees off.
 PLACE = (46.95, 7.44, 560.0)
@@ -74,3 +82,15 @@ def capture_of(points: np.ndarray, origin: tuple[float, float, float] | None = P
         root=Path("place"), source="colmap", images="images", views=tuple(views), points=points,
         point_colors=np.zeros((len(points), 3), np.uint8), ground=ground,
     )  # fmt: skip
+
+
+def draw_maps(run: Path, capture: Capture, model: AnchorModel, **asked) -> Path:
+    """`vdgs ortho` of a model and a capture that were never trained; returns the folder of the maps."""
+    status = SimpleNamespace(model_id="1-2")
+    opened = SimpleNamespace(
+        folder=SimpleNamespace(path=run), capture=capture, model=model, name="coarse", status=status
+    )
+    with pytest.MonkeyPatch.context() as patch, small_figures():
+        patch.setattr(RunContext, "open_model", lambda *_, **__: opened)
+        request = OrthoRequest(run=run, device="cpu", **asked)
+        return render_ortho.render_ortho(RunContext.from_path(run), request, Console(file=sys.stderr, soft_wrap=True))

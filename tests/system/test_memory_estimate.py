@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from support.captures import tiny_scene, write_colmap
-from support.commands import entry_point, vdgs
+from support.commands import vdgs
 from vdgs.config.method import CompensationConfig
 from vdgs.config.presets import PRESETS
 from vdgs.geometry.camera import Camera
@@ -264,7 +264,7 @@ def test_training_that_runs_out_of_memory_saves_says_what_helps_and_continues(tm
 
     continued = vdgs(*command)
     assert f"continuing at iteration {saved}" in continued.stdout
-    unbroken = entry_point("train-coarse", capture, "--output", tmp_path / "unbroken", *SETTINGS)
+    unbroken = vdgs("train-coarse", capture, "--output", tmp_path / "unbroken", *SETTINGS)
     assert continued.returncode == unbroken.returncode == 0
     models = [(tmp_path / run / "coarse" / "model.safetensors").read_bytes() for run in ("run", "unbroken")]
     assert models[0] == models[1]

@@ -284,7 +284,7 @@ def test_the_gradient_is_that_of_finite_differences():
 
 
 def test_photographs_of_unequal_brightness_are_told_from_the_scene():
-    config = replace(CONFIG, iterations=300, lr=replace(CONFIG.lr, exposure=(0.005, 5e-4)))
+    config = replace(CONFIG, iterations=180, lr=replace(CONFIG.lr, exposure=(0.005, 5e-4)))
     config = replace(config, model=replace(config.model, appearance_dim=0))
     state, unequal = fitted(config)
     plain = run(start(config), replace(stage(config), images=Unequal()))

@@ -68,11 +68,14 @@ def lr_ramp(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Tensor
     low, high = np.array(block.expanded.bounds[:2]), np.array(block.expanded.bounds[2:])
     cells = np.indices((RAMP_TABLE_SIZE, RAMP_TABLE_SIZE)).reshape(2, -1).T
     centers = (cells + 0.5) / RAMP_TABLE_SIZE * (high - low) + low
-    points = shapely.points(centers)
+    owned = blocks.owner(centers) == index
+    shapely.prepare(block.expanded)
+    margin = shapely.contains_xy(block.expanded, centers) & ~owned
+    points = shapely.points(centers[margin])  # distances to outlines take long
     inwards, outwards = shapely.distance(block.core, points), shapely.distance(block.expanded.boundary, points)
-    share = np.where(shapely.contains(block.expanded, points), outwards / np.maximum(inwards + outwards, 1e-12), 0.0)
-    share = np.where(blocks.owner(centers) == index, 1.0, share)
-    arrays = share.astype(np.float32).reshape(RAMP_TABLE_SIZE, RAMP_TABLE_SIZE), low, (high - low) / RAMP_TABLE_SIZE
+    share = owned.astype(np.float32)
+    share[margin] = outwards / np.maximum(inwards + outwards, 1e-12)
+    arrays = share.reshape(RAMP_TABLE_SIZE, RAMP_TABLE_SIZE), low, (high - low) / RAMP_TABLE_SIZE
 
     @cache
     def on(device: torch.device) -> list[Tensor]:

@@ -22,7 +22,7 @@ from vdgs.captures.formats.brown_lens import brown_intrinsics, quarter_turn_fish
 from vdgs.captures.formats.project import CloudFrame, Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
 from vdgs.captures.formats.terra import local_origin, original_names, warn_of_undistorted
-from vdgs.captures.formats.xml_documents import holds, read_xml, root_element, xml_number, xml_numbers
+from vdgs.captures.formats.xml_documents import files_ending, holds, read_xml, root_element, xml_number, xml_numbers
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import geodetic_from_enu
@@ -43,7 +43,7 @@ def is_file(file: Path) -> bool:
 def find_files(root: Path) -> list[Path]:
     """The files in a folder, and where DJI Terra puts them below it; without those that another holds with points."""
     folders = [folder for folder in (root, root / _TERRA_FOLDER) if folder.is_dir()]
-    files = [file for folder in folders for file in sorted(filter(is_file, folder.iterdir()))]
+    files = [file for folder in folders for file in files_ending(folder, ".xml", ".xmlz") if is_file(file)]
     found = [file for file in files if holds(file, b"<Rotation>")]
     whole = {file.with_suffix("").as_posix().lower() for file in found}
     return [

@@ -7,6 +7,7 @@ neither crash the process nor exhaust memory. Layout: https://colmap.github.io/f
 
 from __future__ import annotations
 
+import os
 import struct
 from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
@@ -51,8 +52,8 @@ def _candidates(root: Path) -> list[Path]:
     candidates: list[Path] = []
     for parent in parents:
         if parent.is_dir():
-            numbered = [entry for entry in parent.iterdir() if entry.name.isdigit() and entry.is_dir()]
-            candidates += [*sorted(numbered, key=lambda entry: int(entry.name)), parent]
+            numbered = sorted((name for name in os.listdir(parent) if name.isdecimal()), key=int)
+            candidates += [*filter(Path.is_dir, (parent / name for name in numbered)), parent]
     return candidates
 
 

@@ -29,7 +29,7 @@ from vdgs.captures.formats.brown_lens import brown_intrinsics, fisheye_intrinsic
 from vdgs.captures.formats.metashape_project import ALIGNED, PROJECTS, StoredChunk, is_aligned, read_chunks
 from vdgs.captures.formats.project import CloudFrame, Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
-from vdgs.captures.formats.xml_documents import holds, read_xml, root_element, xml_number, xml_numbers
+from vdgs.captures.formats.xml_documents import files_ending, holds, read_xml, root_element, xml_number, xml_numbers
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import SEMI_MAJOR_M
@@ -53,7 +53,7 @@ def is_file(file: Path) -> bool:
 
 def find_files(root: Path) -> list[Path]:
     """The exports of aligned cameras in a folder (those of markers and of references hold none); else the projects."""
-    files = sorted(filter(is_file, root.iterdir()))
+    files = [*filter(is_file, files_ending(root, ".xml", *PROJECTS))]
     exports = [file for file in files if file.suffix.lower() == ".xml" and holds(file, *ALIGNED)]
     return exports or [file for file in files if file.suffix.lower() in PROJECTS and is_aligned(file)]
 

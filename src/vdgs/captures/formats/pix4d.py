@@ -7,6 +7,7 @@ the coordinates of the system that *_wkt.prj names.
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -21,18 +22,23 @@ from vdgs.errors import CaptureError
 
 _ENDING, _HEADER = "_calibrated_camera_parameters.txt", b"fileName imageWidth imageHeight"
 #: Where PIX4Dmapper puts the file in the folder of a project, which lies beside its .p4d.
-_FOLDERS = ("", "params/", "1_initial/params/", "*/1_initial/params/")
+_FOLDERS = ("params", "1_initial/params")
 _LINES = 10
 
 
 def find_files(root: Path) -> list[Path]:
-    return [file for folder in _FOLDERS for file in sorted(root.glob(f"{folder}*{_ENDING}")) if is_file(file)]
+    with os.scandir(root) as entries:
+        inside = sorted(each.name for each in entries if each.is_dir() and os.path.isdir(f"{each.path}/{_FOLDERS[-1]}"))
+    folders = [root, *(root / each for each in _FOLDERS), *(root / each / _FOLDERS[-1] for each in inside)]
+    return [file for folder in folders for file in sorted(folder.glob(f"*{_ENDING}")) if is_file(file)]
 
 
 def is_file(file: Path) -> bool:
+    if file.suffix.lower() != ".txt":
+        return False
     try:
         with file.open("rb") as stream:
-            return file.suffix.lower() == ".txt" and stream.read(len(_HEADER)) == _HEADER
+            return stream.read(len(_HEADER)) == _HEADER
     except OSError:
         return False
 

@@ -19,7 +19,7 @@ from vdgs.captures.formats.photograph_sizes import name_unaligned
 from vdgs.captures.formats.ply_reader import GRAY
 from vdgs.captures.formats.project import Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
-from vdgs.captures.formats.xml_documents import holds
+from vdgs.captures.formats.xml_documents import files_ending, holds
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.system.documents import JsonObject
@@ -45,11 +45,12 @@ def is_alicevision(file: Path) -> bool:
 
 def find_openmvg(root: Path) -> list[Path]:
     """The files of a folder that have poses; the one that lists the photographs has none."""
-    return [file for file in sorted(filter(is_openmvg, root.iterdir())) if holds(file, b'"center"')]
+    return [file for file in files_ending(root, ".json") if is_openmvg(file) and holds(file, b'"center"')]
 
 
 def find_alicevision(root: Path) -> list[Path]:
-    return [file for file in sorted(filter(is_alicevision, root.iterdir())) if holds(file, b'"poses"', b'"center"')]
+    files = filter(is_alicevision, files_ending(root, ".sfm", ".json"))
+    return [file for file in files if holds(file, b'"poses"', b'"center"')]
 
 
 def read_openmvg(file: Path, options: CaptureOptions) -> Project:

@@ -16,6 +16,7 @@ from vdgs.captures.formats.colmap import rotation_from_quaternion
 from vdgs.captures.formats.photograph_sizes import photograph_sizes
 from vdgs.captures.formats.project import Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
+from vdgs.captures.formats.xml_documents import files_ending
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 
@@ -37,7 +38,7 @@ def is_file(file: Path) -> bool:
 
 
 def find_files(root: Path) -> list[Path]:
-    return sorted(filter(is_file, root.iterdir()))
+    return [*filter(is_file, files_ending(root, ".nvm"))]
 
 
 def read(file: Path, options: CaptureOptions) -> Project:

@@ -4,6 +4,7 @@ size."""
 from __future__ import annotations
 
 import math
+import os
 import re
 import zipfile
 import zlib
@@ -24,6 +25,14 @@ _ZIPPED, _DOCUMENT = (".xmlz", ".zip", ".psz"), "doc.xml"
 MAX_DEPTH, MAX_TEXT = 64, 1 << 24
 _DECLARATION = re.compile(rb"^\s*(\xef\xbb\xbf)?<\?xml[^>]*\?>")
 _ROOT = re.compile(r"<(?:\w+:)?([A-Za-z_][\w.-]*)[\s/>]")
+
+
+def files_ending(folder: Path, *endings: str) -> list[Path]:
+    """What a folder holds under names with these endings (lower case), in order. Folders above an output may hold
+    thousands of others."""
+    with os.scandir(folder) as entries:
+        names = sorted(entry.name for entry in entries if entry.name.lower().endswith(endings))
+    return [folder / name for name in names]
 
 
 def root_element(file: Path) -> str:
