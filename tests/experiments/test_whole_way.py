@@ -32,6 +32,11 @@ def test_the_table_adds_up_and_compares_versions(tmp_path):
     ]  # fmt: skip
     (tmp_path / RESULTS).write_text("".join(json.dumps(asdict(row)) + "\n" for row in rows), encoding="utf-8")
     assert "| copr-2 | all | 8.0 s (4.0 s) | 4.0 s (2.0 s) | 0.50 | 1.50 GB |" in table(tmp_path)
+    evaluation = tmp_path / "copr-2" / "before" / "run" / "evaluation"
+    evaluation.mkdir(parents=True)
+    former = {"psnr": 33.0, "ssim": 0.91, "psnr_neutral": 32.0, "ssim_neutral": 0.9, "solid_share": 1.0}
+    (evaluation / "metrics.json").write_text(json.dumps(former), encoding="utf-8")
+    assert "psnr_reference_exposure 32, ssim_reference_exposure 0.9, opacity_coverage 1" in table(tmp_path)
 
 
 def test_a_stage_that_fails_is_told_by_its_exit_code(tmp_path):
