@@ -112,6 +112,15 @@ def test_a_run_is_neither_a_capture_nor_photographs(verb, tmp_path, capsys):
     assert "run: is a run, neither a capture nor photographs" in capsys.readouterr().err
 
 
+def test_a_project_is_needed_for_a_folder_of_its_photographs(tmp_path, capsys):
+    """All photographs of the folder would be used, without a word."""
+    (tmp_path / "DCIM").mkdir()
+    with pytest.raises(SystemExit) as ended:
+        main(["sfm", str(tmp_path / "DCIM"), "--images", "images_4", "--output", str(tmp_path / "new"), "--dry-run"])
+    assert ended.value.code == 1
+    assert "--images images_4: is for projects" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("target", ["link", "gone"])
 @pytest.mark.parametrize("verb", ["status", "inspect"])
 def test_a_link_that_leads_nowhere_is_called_so(verb, target, tmp_path, monkeypatch, capsys):

@@ -13,7 +13,8 @@ import pytest
 
 from support.commands import PATIENCE_SECONDS
 from support.small_pipeline import NativeRun, vdgs
-from vdgs.cli.main import COMMANDS, main
+from vdgs.cli.argument_parser import parse_words
+from vdgs.cli.main import COMMANDS, main, verb_arguments
 from vdgs.config.commands import RunRequest
 from vdgs.config.method import MergeConfig
 from vdgs.pipeline.finished_run import nothing_to_do
@@ -168,6 +169,11 @@ def test_a_command_line_that_is_not_understood_is_a_usage_error(arguments, says,
         main(arguments)
     assert ended.value.code == 2
     assert says in capsys.readouterr().err
+
+
+def test_choices_are_taken_in_the_letters_of_other_programs():
+    given = parse_words(verb_arguments()["sfm"], ["DCIM", "--output", "C", "--camera-model", "SIMPLE_RADIAL"])
+    assert "simple-radial" in given.values.values()
 
 
 def test_a_path_is_suggested_where_a_part_of_it_is_mistyped(tmp_path):

@@ -81,10 +81,11 @@ def test_maps_of_others_are_not_written_over(house, make, tmp_path, monkeypatch,
     before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
     with pytest.raises(VdgsError, match=r"holds dsm\.tif.*Nothing was drawn"):
         render_ortho.render_ortho(context, OrthoRequest(run=tmp_path / "run", output=tmp_path), Console(quiet=True))
-    with pytest.raises(VdgsError, match="is a file"):
-        render_ortho.render_ortho(
-            context, OrthoRequest(run=tmp_path / "run", output=tmp_path / "dsm.tif"), Console(quiet=True)
-        )
+    for name, said in (("dsm.tif", "is a file"), ("maps.tif", "Give a folder for them, such as .*maps$")):
+        with pytest.raises(VdgsError, match=said):
+            render_ortho.render_ortho(
+                context, OrthoRequest(run=tmp_path / "run", output=tmp_path / name), Console(quiet=True)
+            )
     assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
 
 

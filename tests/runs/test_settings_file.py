@@ -101,6 +101,7 @@ def test_a_run_that_is_there_keeps_its_settings(tmp_path):
         ("training: {iterations: many}", "training.iterations is 'many'; it must be a whole number"),
         ("training: 5", "training is 5, not a group of settings"),
         ("- 1", "holds no settings"),
+        ("vdgs: {iterations: 5}", "vdgs has no 'iterations'"),
         ("training: [", "cannot be read as YAML"),
         ("training: {iterations: 5, seed: 1, iterations: 6}", "iterations is given twice"),
     ],

@@ -153,6 +153,16 @@ def test_the_wrong_reference_of_an_altitude_gives_way_to_the_sign_in_xmp(absolut
     assert read_altitude({5: b"\x00", 6: 0.0}, xmp)[0] == float(absolute or 0)  # firmware that leaves EXIF empty
 
 
+@pytest.mark.parametrize(
+    ("in_exif", "altitude", "said"), [(1640.42, 500, "in XMP as"), (50.0, 500, "in XMP as"), (420.0, 420, "differs")]
+)
+def test_altitudes_in_feet_or_over_the_take_off_give_way_to_xmp(in_exif, altitude, said):
+    xmp = packet('drone-dji:AbsoluteAltitude="+500.0" drone-dji:RelativeAltitude="+50.1"')
+    found, datum = read_altitude({5: b"\x00", 6: in_exif}, xmp)
+    assert found == altitude
+    assert said in datum
+
+
 def test_no_flight_is_far_below_the_sea():
     altitude, datum = read_altitude({5: b"\x01", 6: 512.0}, {})
     assert altitude == 512.0

@@ -54,8 +54,10 @@ def read_files(root: Path, options: CaptureOptions) -> SourceCapture:
                 "--dry-run it only says what frames it has)"
             )
         check_no_foreign_file(root)
-        what = "is a file. Unpack an archive first, and give" if root.is_file() else "no such folder. Give"
-        raise CaptureError(f"{root}: {what} the folder that holds images/ and sparse/.")
+        what, archive = (
+            ("is a file", " (of an archive, once it is unpacked)") if root.is_file() else ("no such folder", "")
+        )
+        raise CaptureError(f"{root}: {what}. Give the folder that holds images/ and sparse/{archive}.")
     _check_options(root, options)
     return read_source(root, options)
 

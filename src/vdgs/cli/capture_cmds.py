@@ -110,6 +110,7 @@ class SfmArguments(QuietArguments):
 def sfm_command(arguments: list[str]) -> None:
     args = parse_arguments(SfmArguments, arguments, "sfm")
     from vdgs.captures.format_dispatch import lacks_points
+    from vdgs.captures.output_guard import is_capture
     from vdgs.sfm.reconstruction_plan import plan_reconstruction, print_plan
 
     request = SfmRequest(
@@ -119,6 +120,11 @@ def sfm_command(arguments: list[str]) -> None:
     console = make_console(args.quiet)
     options = CaptureOptions(images=args.project_images)
     is_posed = len(args.images) == 1 and lacks_points(args.images[0], options)
+    if args.project_images is not None and not is_posed and not any(map(is_capture, args.images)):
+        raise CaptureError(
+            f"--images {args.project_images}: is for projects, whose photographs lie elsewhere. Of photographs alone "
+            "give their own folder, without --images."
+        )
     if args.dry_run and is_posed:
         from vdgs.sfm.posed_plan import plan_posed_capture, print_posed_plan
 

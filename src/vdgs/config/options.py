@@ -209,7 +209,8 @@ def read_words(hint: Any, words: Sequence[str]) -> Any:
 
 def _read_word(kind: Any, word: str) -> Any:
     if typing.get_origin(kind) is typing.Literal:
-        values = [each for each in typing.get_args(kind) if str(each) == word]
+        values = [each for each in typing.get_args(kind) if str(each) == word]  # else as COLMAP writes SIMPLE_RADIAL
+        values = values or [each for each in typing.get_args(kind) if str(each) == word.lower().replace("_", "-")]
     elif kind is NoneType:
         values = [None] if word.lower() in ("none", "null") else []
     else:  # a blank word ("$RUN" of a variable that is not set) would be the path of the current folder

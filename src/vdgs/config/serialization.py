@@ -107,8 +107,6 @@ def _read(hint: Any, value: Any, where: str) -> Any:
                 return _read(each, value, where)
     if origin is typing.Literal and value in inner:
         return value
-    if origin is typing.Literal and isinstance(value, str) and value.lower().replace("_", "-") in inner:
-        return value.lower().replace("_", "-")  # COLMAP's own names of lenses, names of programs
     if kind is Path and isinstance(value, (str, Path)):
         return Path(value)
     if kind is float and isinstance(value, str):  # YAML takes 1e-4 for text: it wants 1.0e-4

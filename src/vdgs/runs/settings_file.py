@@ -39,6 +39,11 @@ def read_settings_file(path: Path) -> tuple[Values, Values]:
     if not isinstance(content, Mapping):
         raise VdgsError(f"{path}: holds no settings. Write a file to start from: vdgs config --output settings.yaml")
     sections = {key: value for key, value in content.items() if key != "vdgs"}
+    header = content.get("vdgs")
+    if isinstance(header, Mapping) and (others := sorted(map(str, header.keys() - {"version", "commit", "command"}))):
+        raise VdgsError(
+            f"{path}: vdgs has no {others[0]!r}: it says what wrote the file. Settings have their own groups."
+        )
     capture = sections.pop("capture", None)
     try:
         if isinstance(capture, Mapping):  # config.yaml also says where the capture of its run lies

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from vdgs.captures.angles import LIMITS, SIDES, degrees_of_parts, degrees_of_text, side_of
+from vdgs.captures.gps_tables import FOOT_M
 from vdgs.sfm.xmp import first_number, text
 
 #: Places in EXIF and XMP that are farther apart than this (degrees, some 100 m) contradict each other.
@@ -15,6 +16,8 @@ SAME_PLACE_DEG = 1e-3
 LOWEST_M = -450
 #: Altitudes beyond this (metres) are damage.
 HIGHEST_M = 20_000.0
+#: Altitudes in EXIF and XMP that are farther apart (metres) are not of one reference (choice).
+MOST_APART_M = 30.0
 #: EXIF's tags: latitude and longitude, each behind its reference.
 _TAGS = {"latitude": (1, 2), "longitude": (3, 4)}
 #: XMP's names for them, the makers' (with their misspelling) before Adobe's.
@@ -87,12 +90,10 @@ def read_altitude(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[float
     elif str(reference).strip("\x00 ") in ("1", "3") or reference in (1, 3):
         value = -abs(value)
     absolute = first_number(xmp, "AbsoluteAltitude")
-    if (
-        value is not None
-        and absolute is not None
-        and (value == 0 or (value * absolute < 0 and abs(value + absolute) < 1))
-    ):
-        value = absolute  # firmware leaves EXIF empty, or writes the wrong reference; the sign in XMP is written out
+    source = "EXIF GPSAltitude"
+    if value is not None and absolute is not None and _is_absolute_otherwise(value, absolute, xmp):
+        source = source if abs(abs(value) - abs(absolute)) < 1 else "AbsoluteAltitude in XMP"
+        value = absolute
     if value is None or abs(value) > HIGHEST_M:
         return None, ""
     if value < LOWEST_M:
@@ -100,8 +101,18 @@ def read_altitude(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[float
     ellipsoidal = first_number(xmp, "AltitudeWGS84")
     if ellipsoidal is not None and abs(ellipsoidal - value) < 0.01:
         return value, "above the WGS 84 ellipsoid (AltitudeWGS84)"
+    if absolute is not None and abs(value - absolute) > MOST_APART_M:
+        return value, "EXIF GPSAltitude as recorded, which differs from AbsoluteAltitude in XMP by more than 30 m"
     named = text(xmp, "AltitudeType", "Camera:VertCS")
-    return value, f"{named} as recorded" if named else "EXIF GPSAltitude as recorded, datum not stated"
+    return value, f"{named} as recorded" if named else f"{source} as recorded, datum not stated"
+
+
+def _is_absolute_otherwise(value: float, absolute: float, xmp: Mapping[str, str]) -> bool:
+    """Whether EXIF's altitude is the one in XMP with another reference, in feet, or a default of firmware that leaves
+    it empty; or is the height over the take-off instead."""
+    over_take_off = first_number(xmp, "RelativeAltitude")
+    ways = (0.0, -absolute, absolute / FOOT_M, *([over_take_off] if over_take_off is not None else []))
+    return any(abs(value - way) < 1 for way in ways)
 
 
 def _angle(gps: Mapping[int, Any], axis: str) -> tuple[float, bool] | None:

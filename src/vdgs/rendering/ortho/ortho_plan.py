@@ -117,6 +117,8 @@ def check_output_folder(folder: Path) -> None:
     check_output(folder)
     if folder.exists() and not folder.is_dir():
         raise VdgsError(f"{folder}: is a file. Give a folder for the maps.")
+    if folder.suffix.lower() in (".tif", ".tiff", ".vrt", ".png") and not folder.exists():
+        raise VdgsError(f"{folder}: maps are several files. Give a folder for them, such as {folder.with_suffix('')}")
     present = [name for name in FILE_NAMES if os.path.lexists(folder / name)]
     is_ours = str(read_json_or_empty(folder / METADATA_FILE).get("software")).startswith("vdgs ")
     if present and not is_ours:
