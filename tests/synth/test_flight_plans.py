@@ -34,7 +34,7 @@ from vdgs.synth.true_visibility import (
 
 pytestmark = [pytest.mark.xdist_group("synth_flights"), pytest.mark.slow]
 
-FLIGHTS = ("uneven", "even", "distant", "orbits", "corridor")
+FLIGHTS = ("uneven", "even", "distant", "orbits", "corridor", "heights")
 TOY = SynthOptions(size="toy", width=64, height=48, samples_per_pixel=1, num_points=300, seed=1, truth=True)
 
 
@@ -85,15 +85,17 @@ def test_flights_take_what_was_asked_for_and_hit_nothing(
 
 
 def test_each_flight_is_uneven_in_its_own_way(seen) -> None:
-    found, share_in_middle, far = {}, {}, {}
+    found, share_in_middle, far, heights = {}, {}, {}, {}
     for flight, (cameras, places, views) in seen.items():
         found[flight] = compute_flight_stats(views, len(cameras))
         far[flight] = (np.abs(places[:, :2]).max(1) > 90).sum()
         at = np.array([camera.position[:2] for camera in cameras])
+        heights[flight] = [camera.position[2] for camera in cameras]
         share_in_middle[flight] = np.mean(np.abs(at).max(1) < 0.22 * 120)
     assert found["uneven"].gini > found["even"].gini
     assert share_in_middle["uneven"] > 1.2 * share_in_middle["even"]
     assert far["distant"] > 1.3 * max(far["even"], far["uneven"])
+    assert np.ptp(heights["heights"]) > 2.5 * np.median(heights["even"])
     assert all(0 < each.gini < 1 and each.quantiles[5] >= 1 for each in found.values())
 
 

@@ -7,7 +7,7 @@ share of the flight's altitude.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,6 +17,8 @@ from vdgs.synth.streets import StreetPlan
 _ASPECT = 0.75
 #: Altitude factor of oblique photographs: they are taken lower than those that look straight down.
 _OBLIQUE_FACTOR = 0.86
+#: That of the upper part of a flight of two heights.
+_HIGH_FACTOR = 4.0
 #: An area is wide if half its side is more than so many altitudes.
 _WIDE = 2.0
 _GOLDEN = np.pi * (3 - 5**0.5)
@@ -165,6 +167,13 @@ def _horizon(over: FlightArea) -> FlightPlan:
     return _joined([_grid(0.8 * over.half, over.count - level), looking])
 
 
+def _heights(over: FlightArea) -> FlightPlan:
+    """An even flight, and a grid from four times as high, of a third of the photographs."""
+    high = round(over.count / 3)
+    above = replace(_grid(0.6 * over.half, high), altitude_factor=np.full(high, _HIGH_FACTOR))
+    return _joined([_even(replace(over, count=over.count - high)), above])
+
+
 #: The missions by the name of the option `--flight`.
 FLIGHT_PLANS: dict[str, Callable[[FlightArea], FlightPlan]] = {
     "even": _even,
@@ -173,6 +182,7 @@ FLIGHT_PLANS: dict[str, Callable[[FlightArea], FlightPlan]] = {
     "orbits": _orbits,
     "corridor": _corridor,
     "horizon": _horizon,
+    "heights": _heights,
 }
 
 

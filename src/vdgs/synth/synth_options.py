@@ -10,7 +10,7 @@ from vdgs.config.ranges import WORKER_COUNT, Range, check_ranges
 from vdgs.errors import VdgsError
 
 SizeName = Literal["toy", "village", "town", "district", "city"]
-FlightName = Literal["uneven", "even", "distant", "orbits", "corridor", "horizon"]
+FlightName = Literal["uneven", "even", "distant", "orbits", "corridor", "horizon", "heights"]
 
 _SIZES: dict[str, dict[str, Any]] = {
     "toy": {"num_images": 24, "width": 96, "height": 72, "extent_m": 60.0, "num_points": 1500},
@@ -55,7 +55,7 @@ class SynthOptions:
     """How the drone flies. uneven: dense over the center, sparse over the outskirts, some obliques; even: one regular
     grid and obliques; distant: a dense middle and obliques far out, over land hardly seen; orbits: rings of obliques
     about landmarks; corridor: along the main street; horizon: a grid, and obliques that show the horizon below a cloudy
-    sky."""
+    sky; heights: the even flight, and a grid from four times as high."""
     overlap: Annotated[float | None, Range(0, 0.98, exclusive_max=True)] = None
     """Share of its side that a photograph has in common with the next, were the flight an even grid: sets the
     altitude. Default: an altitude of half the extent, between 36 and 95 m."""
