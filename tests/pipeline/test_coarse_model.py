@@ -20,7 +20,12 @@ from vdgs.config.method import DensifyConfig, InitConfig, MethodConfig, ModelCon
 from vdgs.errors import RunError
 from vdgs.model.anchor_model import AnchorModel, ModelMetadata
 from vdgs.pipeline.count_visibility import count_run_visibility
-from vdgs.pipeline.train_coarse import train_coarse
+from vdgs.pipeline.train_coarse import (
+    build_coarse_problem,
+    initial_coarse_state,
+    open_training_images,
+    train_coarse,
+)
 from vdgs.runs.create_or_resume import create_or_resume_run
 from vdgs.runs.open_run import open_run
 from vdgs.runs.run_context import RunContext
@@ -103,3 +108,14 @@ def test_visibility_that_is_counted_on_a_card_is_handed_on_in_main_memory(tmp_pa
         kept = load_or_count_visibility(open_run(run.path, "coarse", CARD)).numpy()
     assert counted[2] == 0 < counted[0]
     assert kept.tolist() == counted.tolist() == load_or_count_visibility(open_run(run.path, "coarse")).tolist()
+
+
+def test_photographs_that_look_down_have_an_environment_map_only_if_asked_for(tmp_path):
+    write_colmap(tmp_path / "place", tiny_scene())
+    _, capture = begin(tmp_path, METHOD)
+    for choice in ("auto", "off", "envmap"):
+        config = replace(METHOD.training, model=ModelConfig(num_offsets=2, background_model=choice))
+        with open_training_images(capture, config, 10**7) as images:
+            stage, anchors = build_coarse_problem(capture, config, images, "cpu")
+            state = initial_coarse_state(anchors, stage, False)
+        assert (state.decoder.envmap is None) == (stage.skylines is None) == (choice != "envmap")

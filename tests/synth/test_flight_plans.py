@@ -70,7 +70,7 @@ def seen(town: Town, tracer: RayTracer) -> dict[str, tuple[list[Camera], np.ndar
     return found
 
 
-@pytest.mark.parametrize("flight", FLIGHTS)
+@pytest.mark.parametrize("flight", [*FLIGHTS, "horizon"])
 @pytest.mark.parametrize("images", [41, 120])
 def test_flights_take_what_was_asked_for_and_hit_nothing(
     flight: str, images: int, town: Town, tracer: RayTracer
@@ -81,7 +81,9 @@ def test_flights_take_what_was_asked_for_and_hit_nothing(
     down = tracer.intersect(places.astype(np.float32), np.tile(np.float32([0, 0, -1]), (images, 1)))
     assert (down.distance > 5).all(), "a camera is inside a building or right above it"
     steepest = max(camera.forward[2] for camera in cameras)
-    assert steepest < -np.cos(np.radians(70 if flight in ("distant", "orbits") else 52)), "too near to the horizon"
+    limit = {"distant": 70, "orbits": 70, "horizon": 90}.get(flight, 52)
+    assert steepest < -np.cos(np.radians(limit)), "too near to the horizon"
+    assert (steepest > -np.cos(np.radians(80))) == (flight == "horizon")
 
 
 def test_each_flight_is_uneven_in_its_own_way(seen) -> None:

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from support.hand_made_models import camera_above, model_at, opaque_plane, quadrants
+from support.small_training import bits, run, start
 from support.small_training import stage as small_stage
-from support.small_training import start
 from vdgs.config.method import MergeConfig, TrainConfig
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import TrainingSplats
@@ -20,9 +20,9 @@ from vdgs.model.envmap import ray_angles, ray_directions, row_elevations, sample
 from vdgs.model.initialization.sky import above_skyline, find_skyline, find_skylines, in_sky, initial_envmap
 from vdgs.model.renderer import render
 from vdgs.partition.merging import merge_blocks
-from vdgs.training import initial_state
+from vdgs.training import TrainingState, from_checkpoint, initial_state, to_checkpoint
 from vdgs.training.sky_background import with_sky
-from vdgs.training.training_step import render_for_training
+from vdgs.training.training_step import RenderedTrainingView, render_for_training
 
 TOWN = np.random.default_rng(0).uniform((-20, -20, 0), (20, 20, 2), (4000, 3))
 NOTHING = model_at(np.zeros((0, 3)))
@@ -136,13 +136,13 @@ def test_the_first_map_is_what_the_photographs_show() -> None:
     torch.testing.assert_close(straight_down[0, 0], torch.tensor([0.9, 0.1, 0.9]))
 
 
-def _drawn(envmap: torch.Tensor, opacity: float):
-    """A splat before the map of a step, and the camera."""
+def _drawn(envmap: torch.Tensor, opacity: float) -> RenderedTrainingView:
+    """A splat larger than the picture before the map, in a step."""
     state, camera = start(TrainConfig(iterations=1)), level_camera(0.0)
     stage = replace(small_stage(), skylines=(find_skyline(camera.position, TOWN),))
     decoder = replace(state.decoder, envmap=envmap)
     splats = TrainingSplats(
-        means_px=torch.tensor([[30.0, 8.0]]), conics=torch.tensor([[0.02, 0.0, 0.02]]), depths=torch.ones(1),
+        means_px=torch.tensor([[30.0, 8.0]]), conics=torch.tensor([[1e-5, 0.0, 1e-5]]), depths=torch.ones(1),
         colors=torch.full((1, 3), 0.3), opacities=torch.tensor([opacity]), segments=None,
         source=torch.zeros(1, dtype=torch.int32), volume=torch.tensor(1.0),
     )  # fmt: skip
@@ -152,17 +152,23 @@ def _drawn(envmap: torch.Tensor, opacity: float):
 
 def test_gradients_are_finite_differences() -> None:
     envmap = with_dome(NOTHING, 16).envmap.clone().requires_grad_()
-    drawn = _drawn(envmap, 0.5)
+    drawn = _drawn(envmap, 0.4)
     weights = torch.rand(drawn.image.shape, generator=torch.Generator().manual_seed(2))
     gradients = drawn.backward(weights.clone(), 0.0)
     loss = lambda *given: float((_drawn(*given).image.double() * weights).sum())  # noqa: E731
-    changed = torch.rand(envmap.shape, generator=torch.Generator().manual_seed(3))
-    by_map = loss(envmap.detach() + changed, 0.5) - loss(envmap.detach(), 0.5)
-    assert float((envmap.grad * changed).sum()) == pytest.approx(by_map, rel=1e-4)
-    by_opacity = (loss(envmap.detach(), 0.51) - loss(envmap.detach(), 0.49)) / 0.02
+    # The gradient of a cell is the mean over the pixels that show it, in the loss of one pixel.
+    for row, column in ((5, 47), (6, 50), (7, 45)):
+        step = torch.zeros_like(envmap)
+        step[row, column] = 1.0
+        apart = (_drawn(envmap.detach() + step, 0.4).image - _drawn(envmap.detach(), 0.4).image).double()
+        expected = float((apart * weights).sum()) * 64 * 48 / max(float(apart.sum()) / 3, 1.0)
+        assert expected > 0
+        assert float(envmap.grad[row, column].sum()) == pytest.approx(expected, rel=1e-4, abs=1e-6)
+    by_opacity = (loss(envmap.detach(), 0.401) - loss(envmap.detach(), 0.399)) / 0.002
     assert float(gradients.opacities) == pytest.approx(by_opacity, rel=1e-3)
-    # Ground stays before the color of the step.
-    assert torch.equal(drawn.image[-1], torch.tensor([0.9, 0.2, 0.6]).expand(64, 3))
+    # What lies below the skyline does not show the map.
+    assert torch.equal(drawn.image[-1], _drawn(1 - envmap.detach(), 0.4).image[-1])
+    assert not torch.equal(drawn.image[0], _drawn(1 - envmap.detach(), 0.4).image[0])
 
 
 def test_blocks_do_not_move_it() -> None:
@@ -170,3 +176,20 @@ def test_blocks_do_not_move_it() -> None:
     for kind, moves in (("coarse", True), ("block", False)):
         state = initial_state(model.anchors, model.decoder.copy(), replace(small_stage(), kind=kind))
         assert state.decoder.envmap.requires_grad == moves
+
+
+def test_a_training_that_goes_on_moves_it_to_the_same_bits() -> None:
+    everywhere = torch.full((90,), -2.0)
+    stage = replace(small_stage(), skylines=(everywhere, None) * 4)
+
+    def begin() -> TrainingState:
+        state = start()
+        decoder = replace(state.decoder.copy(), envmap=torch.full((16, 64, 3), 0.5))
+        return initial_state(state.anchors, decoder, stage)
+
+    whole, part = run(begin(), stage, 12), run(begin(), stage, 5)
+    again = run(from_checkpoint(to_checkpoint(part), stage), stage, 12)
+    assert bits(again) == bits(whole)
+    moved = (whole.decoder.envmap.detach() - 0.5).abs().amax(dim=(1, 2))
+    assert float(moved[-1]) > 0
+    assert float(moved[:8].max()) == 0  # cameras that look down see nothing of it

@@ -78,7 +78,8 @@ class LearningRateConfig:
     exposure: Annotated[tuple[float, float], LEARNING_RATE_RANGE] = (0.001, 1e-4)
     """Exposure of the photographs, where one is fitted."""
     envmap: Annotated[tuple[float, float], LEARNING_RATE_RANGE] = (0.002, 2e-4)
-    """Environment map behind the scene, where there is one."""
+    """Environment map behind the scene, where there is one: plain steps in the mean gradient of the pixels that show a
+    cell, in units of color."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -31,8 +31,8 @@ def ray_angles(directions: Float[Tensor, "*n 3"]) -> tuple[Float[Tensor, "*n"], 
 
 
 def sample_envmap(
-    envmap: Float[Tensor, "rows columns 3"], directions: Float[Tensor, "h w 3"]
-) -> Float[Tensor, "h w 3"]:
+    envmap: Float[Tensor, "rows columns c"], directions: Float[Tensor, "h w 3"]
+) -> Float[Tensor, "h w c"]:
     """Colors of an environment map along unit directions: bilinear, round the sphere, differentiable by the map."""
     azimuth, elevation = ray_angles(directions)
     up = elevation.abs().mul_(2 / math.pi).sqrt_().copysign_(elevation)

@@ -14,6 +14,9 @@ from vdgs.kernels.kernel_types import AdamState, IsFinite
 from vdgs.model.anchors import TRAINED_TENSORS, Anchors
 from vdgs.model.decoder import Decoder
 
+#: The tensor of a decoder that moves by plain steps.
+ENVMAP = "envmap"
+
 
 @dataclass
 class AdamMoments:
@@ -42,7 +45,8 @@ class AnchorOptimizer:
     def zeros(anchors: Anchors, decoder: Decoder) -> AnchorOptimizer:
         trained = {name: tensor for name, tensor in anchors.tensors().items() if name in TRAINED_TENSORS}
         updates = torch.zeros_like(anchors.positions[:, 0], dtype=torch.int32)
-        return AnchorOptimizer(AdamMoments.zeros(trained), AdamMoments.zeros(decoder.tensors()), updates)
+        moved = {name: tensor for name, tensor in decoder.tensors().items() if name != ENVMAP}
+        return AnchorOptimizer(AdamMoments.zeros(trained), AdamMoments.zeros(moved), updates)
 
     def anchor_states(self, anchors: Anchors, rates: dict[str, float], lr_boost: float) -> list[AdamState]:
         """The states of `TRAINED_TENSORS`, in that order; `lr_boost` as in `AdamState`."""
@@ -53,10 +57,15 @@ class AnchorOptimizer:
         ]
 
     def update_decoder(self, decoder: Decoder, rates: dict[str, float], step: int) -> IsFinite:
-        """Step the decoder's tensors by their `.grad`, in place; `step` counts from 1. False: one is not finite."""
+        """Step the decoder's tensors by their `.grad`, in place; `step` counts from 1. False: one is not finite. The
+        environment map has no moments: see `sky_background`."""
         finite: IsFinite = True
         for name, tensor in decoder.tensors().items():
-            if tensor.grad is not None:
+            if tensor.grad is not None and name == ENVMAP:
+                finite = torch.isfinite(tensor.grad).all() & finite
+                tensor.detach().sub_(tensor.grad, alpha=rates[name])
+                tensor.grad = None
+            elif tensor.grad is not None:
                 moments = self.decoder.first[name], self.decoder.second[name]
                 state = AdamState(tensor.detach(), *moments, rates[name.split("_")[0]])
                 finite = get_backend(tensor.device).adam_rows(state, None, tensor.grad, step) & finite

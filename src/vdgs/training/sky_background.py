@@ -6,6 +6,7 @@ the picture outside the rasterizer: a pixel is C + T (sky - b) + T b with the pl
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -27,6 +28,10 @@ from vdgs.training.training_step import RenderedTrainingView
 _MAX_POINTS = 20_000
 
 
+#: The map moves by pixels alone of which it makes at least this share: what stands before it has errors of its own.
+MIN_SHOWN = 0.5
+
+
 def view_skylines(capture: Capture, views: Sequence[View]) -> tuple[tuple[Skyline | None, ...], bool]:
     """The skylines of views of a capture, and whether they show sky, as `find_skylines`."""
     return find_skylines(lambda: scene_points(capture, _MAX_POINTS), [view.camera for view in views])
@@ -37,26 +42,47 @@ def with_sky(
     background: Float[Tensor, "3"],
 ) -> RenderedTrainingView:  # fmt: skip
     """The view with the environment map of the decoder, where it has one and the view shows sky. Going backward leaves
-    the gradient of the map in its `.grad`."""
+    in the `.grad` of the map how the loss changes with each of its cells: the mean over the pixels that show the cell,
+    in the loss of one pixel. Cells that show for less than a pixel count as if it were one: Adam would move them as
+    fast as the others, away from what no pixel holds."""
     envmap, skyline = decoder.envmap, None if stage.skylines is None else stage.skylines[view]
     if envmap is None or skyline is None:
         return drawn
     directions = ray_directions(camera, stage.device)
+    # Rows without sky cost nothing more.
+    shows = (directions[..., 2] > math.sin(float(skyline.min()))).any(dim=1).nonzero()[:, 0].tolist()
+    if not shows:
+        return drawn
+    part = slice(shows[0], shows[-1] + 1)
+    directions = directions[part]
     is_sky = above_skyline(directions, skyline)[..., None]
-    sky = sample_envmap(envmap, directions)
-    through = (1 - drawn.raster.alpha)[..., None] * is_sky
-    difference = (sky.detach() - background) * is_sky
+    through = (1 - drawn.raster.alpha[part])[..., None] * is_sky
+    difference = (sample_envmap(envmap.detach(), directions) - background) * is_sky
+    composed = drawn.image.clone()
+    composed[part] += through * difference
 
     def pullback(
         image: Tensor | None, alpha: Tensor | None = None, depth: Tensor | None = None,
         out: tuple[Tensor, Tensor] | None = None, count: int | None = None,
     ) -> RasterGradients:  # fmt: skip
         if image is not None:
-            by_alpha = -(image * difference).sum(-1)
-            alpha = by_alpha if alpha is None else alpha + by_alpha
+            alpha = torch.zeros_like(drawn.raster.alpha) if alpha is None else alpha.clone()
+            alpha[part] -= (image[part] * difference).sum(-1)
             if envmap.requires_grad:
-                with torch.enable_grad():
-                    (envmap.grad,) = torch.autograd.grad((sky * (image * through)).sum(), [envmap])
+                shown = through * (through >= MIN_SHOWN)
+                by_map = _spread(torch.cat([image[part] * shown, shown], dim=-1), directions, envmap)
+                width, height = camera.full_size
+                envmap.grad = by_map[..., :3] * (width * height) / by_map[..., 3:].clamp(min=1)
         return drawn.pullback(image, alpha, depth, out=out, count=count)
 
-    return replace(drawn, image=drawn.image + through * difference, pullback=pullback)
+    return replace(drawn, image=composed, pullback=pullback)
+
+
+def _spread(
+    by_pixel: Float[Tensor, "h w c"], directions: Float[Tensor, "h w 3"], envmap: Float[Tensor, "rows columns 3"]
+) -> Float[Tensor, "rows columns c"]:
+    """The transpose of `sample_envmap`, for any number of channels: what pixels say of each cell of a map."""
+    cells = envmap.new_zeros(*envmap.shape[:2], by_pixel.shape[-1], requires_grad=True)
+    with torch.enable_grad():
+        (found,) = torch.autograd.grad((sample_envmap(cells, directions) * by_pixel).sum(), [cells])
+    return found

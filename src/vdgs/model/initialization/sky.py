@@ -131,20 +131,23 @@ def initial_envmap(
     sums = total.reshape(rows, columns, 4)
     below = (row_elevations(rows).numpy() < PLAIN_ELEVATION)[:, None] & (sums[..., 3] == 0)
     sums[below] = [*background, 1.0]
-    return torch.from_numpy(_fill(sums)).float().contiguous()
+    # Land is continued by land: by what is surely below the horizon.
+    land = int((row_elevations(rows) > LOWEST_ELEVATION / 2).sum())
+    return torch.from_numpy(np.concatenate([_fill(sums[:land]), _fill(sums[land:])])).float().contiguous()
 
 
 def _fill(total: Float[np.ndarray, "h w 4"]) -> Float[np.ndarray, "h w 3"]:
-    """Mean colors from sums and counts; where the count is 0, those of cells twice as large (pull and push)."""
+    """Mean colors from sums and counts; where the count is 0, those of larger cells (pull and push), four times as
+    wide and twice as high: skies differ more from row to row."""
     seen = total[..., 3:] > 0
     means = total[..., :3] / np.maximum(total[..., 3:], 1e-12)
     if seen.all():
         return means
-    if min(total.shape[:2]) < 4:
+    if total.shape[0] < 4 or total.shape[1] < 4:
         return np.where(seen, means, total[..., :3].sum((0, 1)) / max(total[..., 3].sum(), 1e-12))
     known = np.concatenate([np.where(seen, means, 0), seen], axis=2)
-    half = total.shape[1] // 2, total.shape[0] // 2
+    half = max(1, total.shape[1] // 4), total.shape[0] // 2
     coarse = _fill(cv2.resize(known, half, interpolation=cv2.INTER_AREA))
     wrapped = np.concatenate([coarse[:, -1:], coarse, coarse[:, :1]], axis=1)
-    large = cv2.resize(wrapped, (total.shape[1] + 4, total.shape[0]), interpolation=cv2.INTER_LINEAR)[:, 2:-2]
+    large = cv2.resize(wrapped, (total.shape[1] + 8, total.shape[0]), interpolation=cv2.INTER_LINEAR)[:, 4:-4]
     return np.where(seen, means, large)
