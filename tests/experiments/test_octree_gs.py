@@ -95,7 +95,8 @@ def test_scaffold_gs_differs_from_the_defaults_where_it_is_listed():
     published = scaffold_config(30_000).training
     changes = {line.split(":")[0] for line in diff_settings(to_dict(TrainConfig()), to_dict(published))}
     assert changes == {
-        "iterations", "optimizer", "lr_offsets_unit", "model.bound_scales", "init.outlier_distance", "init.fill_gaps",
+        "iterations", "optimizer", "lr_offsets_unit", "model.bound_scales", "model.photograph_blur",
+        "init.outlier_distance", "init.fill_gaps",
         "loss.background", "loss.random_background", "densify.start", "densify.stop_fraction",
     }  # fmt: skip
     rates = published.lr

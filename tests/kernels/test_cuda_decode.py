@@ -11,6 +11,8 @@ import torch
 
 from support.cuda_on_host import ORDERS, HostDriver, barriers_of, build_on_host, needs_a_compiler, needs_nvrtc
 from support.decode_scenes import Scene, looking_down, moved_by, turned
+from support.cuda_on_host import ORDERS, HostDriver, build_on_host, needs_a_compiler, needs_nvrtc
+from support.decode_scenes import Scene, looking_down, moved_by, near, turned
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.cuda.decode import PROGRAM, SplatCapacity, decode, decode_for_training, expand_sources
 from vdgs.kernels.cuda.decode_adam import decode_backward_adam
@@ -28,8 +30,8 @@ pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark
 CAMERAS = {
     "down": looking_down(),
     "turned": turned(),
-    "orthographic": looking_down("orthographic"),
-    "part": turned(width=96, height=64).cropped(20, 10, 70, 50),
+    "orthographic": near(looking_down("orthographic")),
+    "part": near(turned(width=96, height=64).cropped(20, 10, 70, 50)),
 }
 
 

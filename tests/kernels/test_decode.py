@@ -7,14 +7,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from support.decode_scenes import Scene, looking_down, turned
+from support.decode_scenes import CAMERAS, Scene, looking_down
 from vdgs.kernels.constants import ALPHA_MIN
 from vdgs.kernels.cpu import extension
 from vdgs.kernels.cpu.decode import decode as native_decode
 from vdgs.kernels.kernel_types import AnchorSplats, DecoderWeights
 from vdgs.kernels.torch_ref.decode import decode as twin_decode
 
-CAMERAS = [looking_down(), looking_down("orthographic"), turned(), turned().cropped(20, 5, 50, 40)]
 EVERY_ISA = pytest.mark.parametrize("isa", extension.supported_isas())
 BOTH = pytest.mark.parametrize("decode", [twin_decode, native_decode])
 NUMBERS = ("means_px", "conics", "depths", "colors", "opacities", "volumes")

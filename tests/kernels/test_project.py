@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from support.decode_scenes import looking_down, turned
+from support.decode_scenes import CAMERAS, looking_down
 from vdgs.geometry.camera import Camera
 from vdgs.kernels import constants
 from vdgs.kernels.constants import DILATION_PX2
@@ -17,8 +17,6 @@ from vdgs.kernels.cpu.project import project as native_project
 from vdgs.kernels.gaussian_projection import GaussianShapes, area_shares, project_gaussians
 from vdgs.kernels.rotations import rotation_matrices
 from vdgs.kernels.torch_ref.project import project as twin_project
-
-CAMERAS = [looking_down(), looking_down("orthographic"), turned(), turned().cropped(20, 5, 50, 40)]
 
 
 def gaussians(m: int, seed: int = 0, log_sigma: float = -2.0) -> tuple[torch.Tensor, ...]:
@@ -32,7 +30,9 @@ def gaussians(m: int, seed: int = 0, log_sigma: float = -2.0) -> tuple[torch.Ten
 def monte_carlo_covariance(mean: np.ndarray, scales, quaternion, camera: Camera) -> np.ndarray:
     rotation = rotation_matrices(quaternion[None])[0].numpy()
     samples = np.random.default_rng(0).normal(size=(200_000, 3)) * scales.numpy() @ rotation.T + mean
-    return np.cov(camera.project(samples)[0].T) + DILATION_PX2 * np.eye(2)
+    depth = float(camera.project(mean[None])[1][0]) if camera.model == "pinhole" else 1.0
+    magnified = max(1.0, camera.photograph_pixel * np.sqrt(camera.fx * camera.fy) / depth)
+    return np.cov(camera.project(samples)[0].T) + DILATION_PX2 * magnified**2 * np.eye(2)
 
 
 @pytest.mark.parametrize("camera", CAMERAS)

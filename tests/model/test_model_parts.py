@@ -11,6 +11,7 @@ import torch
 from support.hand_made_models import camera_above, model_at, quadrant_of, quadrants
 from vdgs.config.method import MergeConfig
 from vdgs.errors import VdgsError
+from vdgs.evaluation.splat_artifacts import needle_share
 from vdgs.model.anchor_model import AnchorModel, DecoderSpan, ModelMetadata
 from vdgs.model.anchors import Anchors
 from vdgs.model.renderer import decode_view, render, render_scalar_map
@@ -79,6 +80,26 @@ def test_a_file_keeps_parts(tmp_path):
     plain = model_at(scattered())
     plain.save(tmp_path / "plain.safetensors")
     assert AnchorModel.load(tmp_path / "plain.safetensors").decoder_spans == ()
+
+
+def test_views_from_nearer_than_the_photographs_keep_their_blur(tmp_path):
+    scene, near, far = model_at(scattered()), VIEWS[0], camera_above(0.3, -0.2, altitude=30.0)
+    thin = scene.anchors.log_scales - torch.tensor([0.0, 0.0, 0.0, 6.0, 6.0, 0.0])
+    plain = replace(scene, anchors=replace(scene.anchors, log_scales=thin))
+    depths = decode_view(plain, near)[1].depths
+    pixel = 3 * float(depths.max()) / near.fx
+    replace(plain, photograph_pixel=pixel).save(tmp_path / "model")
+    blurred = AnchorModel.load(tmp_path / "model")
+    assert blurred.photograph_pixel == pixel
+    assert needle_share(decode_view(plain, near)[1], near) > 0.01
+    assert needle_share(decode_view(blurred, near)[1], near) < 0.001
+    assert torch.equal(render(blurred, far).image, render(plain, far).image)
+    plain.save(tmp_path / "plain")  # as a file that says nothing of pixels
+    assert b"photograph_pixel" not in (tmp_path / "plain").read_bytes()
+    assert torch.equal(render(AnchorModel.load(tmp_path / "plain"), near).image, render(plain, near).image)
+    replace(plain, photograph_pixel=-1.0).save(tmp_path / "model")
+    with pytest.raises(VdgsError, match=r"its pixels are of size -1\.0"):
+        AnchorModel.load(tmp_path / "model")
 
 
 def test_parts_that_do_not_add_up_are_refused(tmp_path):

@@ -56,7 +56,7 @@ def model() -> AnchorModel:
     order = torch.randperm(len(plane.anchors), generator=torch.Generator().manual_seed(0))
     other = Decoder.from_tensors({n: t + 0.3 * (n == "color_b2") for n, t in plane.decoder.tensors().items()})
     spans = (DecoderSpan(300, plane.decoder), DecoderSpan(len(order) - 300, other))
-    return replace(plane, anchors=plane.anchors.select(order), decoder_spans=spans)
+    return replace(plane, anchors=plane.anchors.select(order), decoder_spans=spans, photograph_pixel=0.1)
 
 
 @pytest.fixture(scope="module")

@@ -41,6 +41,12 @@ def turned(width: int = 64, height: int = 48) -> Camera:
     )
 
 
+def near(camera: Camera) -> Camera:
+    """The same view, nearer to a part of what it shows than the photographs were."""
+    scale = 1.0 if camera.model == "orthographic" else 9.0
+    return replace(camera, photograph_pixel=1.05 * scale / camera.fx)
+
+
 @dataclass(frozen=True)
 class Scene:
     """The arguments of `decode`, but for the camera."""
@@ -95,7 +101,7 @@ class Scene:
         return self.positions, self.features, self.offsets, self.log_scales, self.weights
 
 
-CAMERAS = [looking_down(), looking_down("orthographic"), turned(), turned().cropped(20, 5, 50, 40)]
+CAMERAS = [looking_down(), near(looking_down("orthographic")), turned(), near(turned().cropped(20, 5, 50, 40))]
 
 
 def anchors(n: int, seed: int, spread: float = 8.0, log_scale: float = -1.0) -> tuple[torch.Tensor, torch.Tensor]:

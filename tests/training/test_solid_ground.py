@@ -18,7 +18,14 @@ from vdgs.geometry.camera import NEAR_PLANE, Camera
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.ground import BELOW_HORIZON_DEG, below_horizon
 from vdgs.model.renderer import decode_view, render
-from vdgs.model.scale_bounds import MAX_IMAGE_FRACTION, MAX_OFFSET_FACTOR, MAX_SIGMA, max_log_scales
+from vdgs.model.scale_bounds import (
+    CLOSEST_SHARE,
+    MAX_IMAGE_FRACTION,
+    MAX_OFFSET_FACTOR,
+    MAX_SIGMA,
+    max_log_scales,
+    photograph_pixel,
+)
 from vdgs.training import TrainingProblem, train
 from vdgs.training.target import background_at
 from vdgs.visibility.frustum import project_points
@@ -131,6 +138,14 @@ def test_no_camera_that_holds_a_place_is_veiled_from_there(seed):
     assert held.sum() > 10
     assert longest[held].max() <= MAX_IMAGE_FRACTION * WIDTH * (1 + 1e-6)
     assert longest[held].min() > MAX_IMAGE_FRACTION * WIDTH * 0.999  # no smaller than it must be
+
+
+def test_the_pixel_of_photographs_is_that_of_those_that_show_places_closest():
+    points = torch.from_numpy(np.random.default_rng(3).uniform(-8, 8, (400, 3)) * [1, 1, 0.5])
+    depths = camera_at().project(points.numpy())[1]
+    expected = np.quantile(depths, CLOSEST_SHARE) / FOCAL
+    assert photograph_pixel(points, [camera_at(), camera_at(height=40.0)]) == pytest.approx(expected, rel=1e-5)
+    assert photograph_pixel(points, []) == photograph_pixel(points[:0], [camera_at()]) == 0.0
 
 
 def test_what_no_camera_holds_is_bounded_by_the_nearest_and_nothing_without_cameras():

@@ -83,7 +83,9 @@ def _training(iterations: int, seed: int, growth: DensifyConfig) -> TrainConfig:
     which are those of Scaffold-GS, with the offsets' in units of the cameras' radius."""
     return TrainConfig(
         iterations=iterations, seed=seed, optimizer="adam", lr_offsets_unit="cameras", densify=growth,
-        model=ModelConfig(num_offsets=10, bound_scales=False, view_distance=False, appearance_dim=0),
+        model=ModelConfig(
+            num_offsets=10, bound_scales=False, photograph_blur=False, view_distance=False, appearance_dim=0
+        ),
         init=InitConfig(outlier_distance=0.0, fill_gaps=False, mvs=False, from_colors=False),
         loss=LossConfig(ssim_lambda=0.2, volume_reg=0.01, background="black", random_background=0.0),
     )  # fmt: skip

@@ -29,6 +29,9 @@ class ModelConfig:
     bound_scales: bool = True
     """No Gaussian may be longer than a quarter of the images that train it, and the unit of an anchor's offsets is
     bounded likewise: fewer floaters (choice)."""
+    photograph_blur: bool = True
+    """Drawn from nearer than the photographs, Gaussians stay as blurred as a pixel of these makes them: fewer needles.
+    Training draws as without (choice)."""
     view_distance: bool = False
     """Feed the distance between camera and anchor to the decoder too."""
     appearance_dim: Annotated[int, Range(0, 1024)] = 0

@@ -38,7 +38,7 @@ PRESETS: dict[str, MethodConfig] = {
     "paper": MethodConfig(
         training=TrainConfig(
             optimizer="adam",
-            model=ModelConfig(bound_scales=False, background_model="off"),
+            model=ModelConfig(bound_scales=False, photograph_blur=False, background_model="off"),
             init=InitConfig(fill_gaps=False),
             loss=LossConfig(background="black", random_background=0.0),
         ),

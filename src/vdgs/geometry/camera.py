@@ -39,6 +39,8 @@ class Camera:
     model: CameraModel = "pinhole"
     #: Width and height of the picture that this one is a part of (`cropped`); None: it is whole.
     uncropped_size: tuple[int, int] | None = None
+    #: Size in the world of a photograph's pixel; seen from nearer, Gaussians are drawn as blurred as it is. 0: nowhere.
+    photograph_pixel: float = 0.0
 
     @cached_property
     def position(self) -> np.ndarray:
@@ -53,9 +55,10 @@ class Camera:
 
     @cached_property
     def packed(self) -> np.ndarray:
-        """What the kernels read, [22] float32: rotation (9, row-major), translation (3),
-        fx, fy, cx, cy, width, height, orthographic (0 or 1), near, width and height of the whole picture."""
-        return np.concatenate([self.packed_float64, self.full_size]).astype(np.float32)
+        """What the kernels read, [23] float32: rotation (9, row-major), translation (3),
+        fx, fy, cx, cy, width, height, orthographic (0 or 1), near, width and height of the whole picture,
+        `photograph_pixel`."""
+        return np.concatenate([self.packed_float64, self.full_size, [self.photograph_pixel]]).astype(np.float32)
 
     @cached_property
     def packed_float64(self) -> np.ndarray:

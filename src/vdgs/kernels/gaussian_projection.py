@@ -1,7 +1,8 @@
 """Perspective (EWA) projection of 3D Gaussians onto the image in plain torch, differentiable in the pose too.
 
 3DGS, eq. 5: Σ' = J W Σ Wᵀ Jᵀ with Σ = R S Sᵀ Rᵀ (eq. 6), where W is the rotation of the camera and J
-the Jacobian of the projection at the mean. Σ' gets 0.3 px² on its diagonal.
+the Jacobian of the projection at the mean. Σ' gets 0.3 px² on its diagonal, and where the camera names the pixel of a
+photograph at least 0.3 of such pixels (`dilations_px2`).
 """
 
 from __future__ import annotations
@@ -90,11 +91,12 @@ def project_gaussians(
     rotation, translation = rigid[:3, :3], rigid[:3, 3]
     local = means @ rotation.T + translation
     with torch.no_grad():
-        valid = _is_valid(local, shapes, rotation, camera, dilation_px2, depths)
+        valid = _is_valid(local, shapes, rotation, camera, dilations_px2(local[:, 2], camera, dilation_px2), depths)
     # What is not valid is replaced before the arithmetic.
     shown = valid[:, None]
     local = torch.where(shown, local, to_like([0.0, 0.0, 1.0], local))
-    conics, variances, share = _conics(local, shapes.masked(valid), rotation, camera, dilation_px2)
+    dilation = dilations_px2(local[:, 2], camera, dilation_px2)
+    conics, variances, share = _conics(local, shapes.masked(valid), rotation, camera, dilation)
     projected = ProjectedGaussians(
         means_px=torch.where(shown, _pixels(local, camera), 0.0),
         conics=torch.where(shown, conics, 0.0),
@@ -104,6 +106,17 @@ def project_gaussians(
     return GaussianProjection(
         projected, torch.where(shown, variances, 1.0), share.clamp(min=MIN_AREA_SHARE).sqrt() * valid
     )
+
+
+def dilations_px2(
+    depths: Float[Tensor, " m"], camera: Camera, least: float = DILATION_PX2
+) -> Float[Tensor, " m"] | float:
+    """What is added to the variances of Gaussians at these depths, in px² (choice): `least`, or as much as in a view in
+    which a pixel is as large as one of a photograph (`Camera.photograph_pixel`)."""
+    if not camera.photograph_pixel:
+        return least
+    blur = least * camera.photograph_pixel**2 * camera.fx * camera.fy
+    return (blur / (depths**2 if camera.model == "pinhole" else torch.ones_like(depths))).clamp(min=least)
 
 
 def area_shares(conics: Float[Tensor, "m 3"], blur_px2: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
@@ -132,13 +145,13 @@ def _rows_of_jacobian(local: Tensor, rotation: Tensor, camera: Camera) -> tuple[
 
 
 def _conics(
-    local: Tensor, shapes: GaussianShapes, rotation: Tensor, camera: Camera, dilation: float
+    local: Tensor, shapes: GaussianShapes, rotation: Tensor, camera: Camera, dilation: Tensor | float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Inverse of [[xx + d, xy], [xy, yy + d]] for the dilation d, its diagonal, and the share of the determinant that
     it has without d. The determinant is that without d, + d(xx + yy) + d²."""
     xx, xy, yy, area = shapes.moments(*_rows_of_jacobian(local, rotation, camera))
     determinant = area + dilation * (xx + yy) + dilation**2
-    variances = torch.stack([xx, yy], -1) + dilation
+    variances = torch.stack([xx + dilation, yy + dilation], -1)
     return (
         torch.stack([variances[:, 1], -xy, variances[:, 0]], -1) / determinant[:, None],
         variances,
@@ -151,7 +164,7 @@ def _is_valid(
     shapes: GaussianShapes,
     rotation: Tensor,
     camera: Camera,
-    dilation: float,
+    dilation: Tensor | float,
     depths: tuple[float, float],
 ) -> Bool[Tensor, "m"]:
     conics, _, _ = _conics(local, shapes, rotation, camera, dilation)

@@ -7,6 +7,7 @@ Equations: Scaffold-GS eqs. 3-8; VDGS section III-B.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -48,6 +49,8 @@ class AnchorModel:
     voxel_size: float
     #: Color drawn where nothing is, RGB in [0, 1].
     background: tuple[float, float, float]
+    #: Size of a pixel of the photographs (`scale_bounds`): drawn from nearer, Gaussians are as blurred as it; 0: none.
+    photograph_pixel: float = 0.0
     metadata: ModelMetadata = NO_METADATA
     #: A merged scene whose blocks trained decoders of their own: all anchors, block by block. Else empty.
     decoder_spans: tuple[DecoderSpan, ...] = ()
@@ -89,6 +92,8 @@ class AnchorModel:
             "facts": self.metadata.to_dict(),
             "crc32": tensors_crc32(tensors),
         }
+        if self.photograph_pixel:
+            content["photograph_pixel"] = self.photograph_pixel
         if self.decoder_spans:
             content["parts"] = [part.count for part in self.decoder_spans]
         # A single key: several would be written in an order that varies.
@@ -117,6 +122,7 @@ class AnchorModel:
             red, green, blue = (float(value) for value in known["background"])
             model = AnchorModel(
                 anchors=anchors, decoder=decoder, voxel_size=float(known["voxel"]), background=(red, green, blue),
+                photograph_pixel=_pixel_size(known.get("photograph_pixel", 0.0)),
                 metadata=ModelMetadata.from_dict(known["facts"]), decoder_spans=parts,
             )  # fmt: skip
             if checked:
@@ -145,6 +151,13 @@ class AnchorModel:
     def _decoders(self) -> list[tuple[str, Decoder]]:
         """Every decoder with the prefix of its tensors in a file."""
         return [("decoder.", self.decoder), *((f"part.{i}.", s.decoder) for i, s in enumerate(self.decoder_spans))]
+
+
+def _pixel_size(value: float) -> float:
+    """The size of a pixel as a file states it. Raises ValueError or TypeError for what is none."""
+    if not 0.0 <= value < math.inf:
+        raise ValueError(f"its pixels are of size {value!r}")
+    return float(value)
 
 
 def _decoder_of(tensors: Mapping[str, Tensor], prefix: str) -> Decoder:

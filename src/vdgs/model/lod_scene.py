@@ -127,8 +127,12 @@ class LodScene:
         return torch.cat([of(("nodes", node), self.tree.gaussians(node).means) for node in nodes])
 
     def _cut(self, camera: Camera) -> LodCut:
-        cut = self.tree.cut(camera, self.max_error_px)
-        return cut if self.view is None else replace(cut, leaves=self.tree.cut(self.view, self.max_error_px).leaves)
+        cut = self._cut_of(camera)
+        return cut if self.view is None else replace(cut, leaves=self._cut_of(self.view).leaves)
+
+    def _cut_of(self, camera: Camera) -> LodCut:
+        seen = replace(camera, photograph_pixel=self.model.photograph_pixel)
+        return self.tree.cut(seen, self.max_error_px)
 
     def _assemble_anchors(self, leaves: tuple[int, ...]) -> AnchorModel | None:
         """The anchors of some leaves that are drawn, in the order of the model, each with its decoder."""

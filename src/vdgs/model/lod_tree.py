@@ -91,7 +91,8 @@ class LodTree:
             (1, camera.fy, camera.cy, camera.height, camera.full_size[1]),
         ):
             stretch = np.hypot(1, FRUSTUM_MARGIN * 0.5 * whole / focal) if pinhole else 1.0
-            margin = 3.01 * stretch * self.table.reach + 1e-6 * np.abs(center).max(1)
+            blur = DILATION_PX2**0.5 * camera.photograph_pixel * (camera.fx * camera.fy) ** 0.5 / focal
+            margin = 3.01 * (stretch * self.table.reach + blur) + 1e-6 * np.abs(center).max(1)
             for sign, edge in ((1, (size - middle + spare) / focal), (-1, (middle + spare) / focal)):
                 # A place lies beyond this side of the picture where sign · x > edge · z, at a distance of 1 / focal.
                 normal, offset = np.zeros(3), 0.0 if pinhole else edge

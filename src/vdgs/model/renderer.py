@@ -115,6 +115,7 @@ def decode_view(
 ) -> tuple[Int64[Tensor, " v"], AnchorSplats]:
     """The rows that may touch a view and their splats, each anchor by its own decoder; `source` counts rows.
     `image_index` as in `render`."""
+    camera = replace(camera, photograph_pixel=model.photograph_pixel)
     rows = cull_anchors(model.anchors, camera)
     spans = model.decoder_ranges()
     starts = rows.new_tensor([first for first, _, _ in spans] + [len(model.anchors)])

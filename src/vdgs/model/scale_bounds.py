@@ -5,6 +5,9 @@ No photograph constrains a Gaussian that is larger than the image: from between 
 at least 1/255, at full opacity) is no longer than `MAX_IMAGE_FRACTION` of the longer side. The unit of an anchor's
 offsets may be `MAX_OFFSET_FACTOR` times that scale: visibility, blocks, culling and growth assume Gaussians near their
 anchor.
+
+Nor does a photograph show how thin a Gaussian is that is thinner than its pixels: drawn from nearer it would become a
+needle. `photograph_pixel` is their size, which a model keeps for its views.
 """
 
 from __future__ import annotations
@@ -31,6 +34,8 @@ MAX_IMAGE_FRACTION = 0.25
 MAX_OFFSET_FACTOR = 4.0
 #: From the middle of a Gaussian of opacity 1 to where it is no longer drawn, in standard deviations.
 MAX_SIGMA = math.sqrt(-2.0 * math.log(ALPHA_MIN))
+#: Share of the places that photographs show closest: the largest of their pixels is that of a scene.
+CLOSEST_SHARE = 0.1
 #: Cameras processed at once, to limit memory.
 CAMERA_CHUNK = 1024
 
@@ -52,6 +57,17 @@ def max_log_scales(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -
     rows = bound.isinf().nonzero().squeeze(1)
     bound[rows] = _by_nearest(positions[rows], cameras, frusta.relative_extent.cpu().numpy())
     return (bound * (MAX_IMAGE_FRACTION / (2.0 * MAX_SIGMA))).log()
+
+
+def photograph_pixel(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> float:
+    """The size of a pixel, in units of the ground frame, in the photograph that shows a place closest, for the closest
+    of the places (`CLOSEST_SHARE`; choice: one number for a scene, which blurs no photograph of it). 0 without cameras
+    or places."""
+    if len(positions) == 0 or not cameras:
+        return 0.0
+    spans = max_log_scales(positions, cameras).double().exp() / (MAX_IMAGE_FRACTION / (2.0 * MAX_SIGMA))
+    longest = max(max(camera.width, camera.height) for camera in cameras)
+    return float(np.quantile(spans.cpu().numpy(), CLOSEST_SHARE)) / longest
 
 
 def _by_nearest(

@@ -123,6 +123,7 @@ class BlockPlan:
             lr_mask=lr_ramp(blocks, self.index, method.block),
             skylines=None if coarse.envmap is None else view_skylines(capture, self.views)[0],
             image_indices=self.indices, view_weights=self.weights, crops=self.crops,
+            photograph_pixel=coarse.photograph_pixel,
             max_log_scale=(
                 (lambda positions: max_log_scales(positions, cameras)) if config.model.bound_scales else None
             ),
@@ -196,7 +197,7 @@ def _train(
         )
         train_with_checkpoints(folder, state, stage, options, console)
     metadata = replace(metadata, iterations=state.iteration, decoder=method.block.decoder)
-    model = state.model(coarse.voxel_size, coarse.background, metadata)
+    model = state.model(coarse.voxel_size, coarse.background, metadata, coarse.photograph_pixel)
     finish_stage(folder, state, model, console, plan.mean_area)
 
 

@@ -26,7 +26,7 @@ from vdgs.model.exposure import zero_exposures
 from vdgs.model.initialization.initialize import initialize_anchors
 from vdgs.model.initialization.sky import Skyline, initial_envmap
 from vdgs.model.initialization.stereo import DensePoints
-from vdgs.model.scale_bounds import max_log_scales
+from vdgs.model.scale_bounds import max_log_scales, photograph_pixel
 from vdgs.pipeline.dense_points import find_dense_points, max_dense_points
 from vdgs.runs.open_run import check_has_anchors
 from vdgs.runs.run_cameras import save_run_cameras
@@ -118,7 +118,8 @@ def _train(
     metadata = ModelMetadata(
         capture=capture_metadata(capture), version=__version__, iterations=state.iteration, key=run.keys().coarse
     )
-    finish_stage(folder, state, state.model(stage.voxel_size, stage.background, metadata), console)
+    model = state.model(stage.voxel_size, stage.background, metadata, stage.photograph_pixel)
+    finish_stage(folder, state, model, console)
 
 
 def open_training_images(capture: Capture, config: TrainConfig, budget_bytes: int) -> ImageCache:
@@ -220,6 +221,7 @@ def build_coarse_problem(
         skylines=_skylines(capture, config),
         device=torch.device(device),
         max_log_scale=(lambda positions: max_log_scales(positions, cameras)) if config.model.bound_scales else None,
+        photograph_pixel=photograph_pixel(anchors.positions, cameras) if config.model.photograph_blur else 0.0,
     )
     return stage, anchors
 

@@ -116,11 +116,15 @@ class TrainingState:
         return anchors, Decoder.from_tensors(self.model_average.decoder)
 
     def model(
-        self, voxel: float, background: tuple[float, float, float], metadata: ModelMetadata | None = None
-    ) -> AnchorModel:
+        self, voxel: float, background: tuple[float, float, float], metadata: ModelMetadata | None = None,
+        pixel: float = 0.0,
+    ) -> AnchorModel:  # fmt: skip
         """The model of `result`."""
         (anchors, decoder), metadata = self.result(), metadata or ModelMetadata()
-        return AnchorModel(anchors=anchors, decoder=decoder, voxel_size=voxel, background=background, metadata=metadata)
+        return AnchorModel(
+            anchors=anchors, decoder=decoder, voxel_size=voxel, background=background, metadata=metadata,
+            photograph_pixel=pixel,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -152,6 +156,8 @@ class TrainingProblem:
     frozen_decoder: bool = False
     #: The largest log-scale of Gaussians of anchors at places [p, 3]; None: any.
     max_log_scale: Callable[[Tensor], Tensor] | None = None
+    #: As the model keeps it.
+    photograph_pixel: float = 0.0
     #: What is drawn and never moves: ring and context of a block.
     frozen_anchors: FrozenAnchors | None = None
     #: Which places [p, 3] may get new anchors; None: all.

@@ -14,7 +14,7 @@ def contiguous(tensor: Tensor) -> Tensor:
 
 
 def packed_camera(camera: Camera) -> Tensor:
-    """The camera as the kernels read it, [22] float32."""
+    """The camera as the kernels read it, [23] float32."""
     return torch.from_numpy(camera.packed)
 
 

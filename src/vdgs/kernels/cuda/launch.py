@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from vdgs.geometry.camera import Camera
-from vdgs.kernels.constants import FRUSTUM_MARGIN
+from vdgs.kernels.constants import DILATION_PX2, FRUSTUM_MARGIN
 from vdgs.kernels.cuda.compile_cache import load_or_compile
 from vdgs.kernels.cuda.driver import Driver, GridSize, get_cuda_driver
 from vdgs.kernels.cuda.nvrtc import CompileTarget, Nvrtc, get_nvrtc
@@ -106,7 +106,8 @@ class PackedCamera(ctypes.Structure):
 
     _fields_ = (
         *((name, 3 * ctypes.c_float) for name in ("right", "down", "forward", "center")),
-        *((name, ctypes.c_float) for name in ("fx", "fy", "cx", "cy", "width", "height", "near", "limit_x", "limit_y")),
+        *((name, ctypes.c_float) for name in ("fx", "fy", "cx", "cy", "width", "height", "near")),
+        *((name, ctypes.c_float) for name in ("limit_x", "limit_y", "blur")),
         ("orthographic", ctypes.c_bool),
     )  # fmt: skip
 
@@ -116,10 +117,11 @@ class PackedCamera(ctypes.Structure):
         numbers = [float(each) for each in camera.packed]
         axes, translation = [numbers[:3], numbers[3:6], numbers[6:9]], numbers[9:12]
         center = [-sum(axis[i] * shift for axis, shift in zip(axes, translation, strict=True)) for i in range(3)]
-        fx, fy, cx, cy, width, height, orthographic, near, whole_width, whole_height = numbers[12:]
+        fx, fy, cx, cy, width, height, orthographic, near, whole_width, whole_height, pixel = numbers[12:]
         limits = (FRUSTUM_MARGIN * 0.5 * side / focal for side, focal in ((whole_width, fx), (whole_height, fy)))
+        blur = DILATION_PX2 * pixel * pixel * fx * fy
         vectors = (tuple(vector) for vector in (*axes, center))
-        return PackedCamera(*vectors, fx, fy, cx, cy, width, height, near, *limits, bool(orthographic))
+        return PackedCamera(*vectors, fx, fy, cx, cy, width, height, near, *limits, blur, bool(orthographic))
 
 
 def pack_arguments(

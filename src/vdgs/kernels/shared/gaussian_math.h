@@ -89,11 +89,12 @@ struct Camera {
   Vec3<float> center;
   float fx, fy, cx, cy, width, height, near;
   float limit_x, limit_y;
+  float blur;  // least variance of the blur, px^2 at depth one
   bool orthographic;
 };
 
 // From vdgs.geometry.camera.Camera.packed: rotation (9), translation (3), fx, fy, cx, cy, width, height,
-// orthographic, near, width and height of the whole picture. A part of a picture has the limits of the whole one:
+// orthographic, near, width and height of the whole picture, size of a photograph's pixel. A part of a picture has the limits of the whole one:
 // else it would not show what that does.
 VDGS_FN Camera unpack_camera(const float* p) {
   Camera camera;
@@ -112,6 +113,7 @@ VDGS_FN Camera unpack_camera(const float* p) {
   camera.near = p[19];
   camera.limit_x = kFrustumMargin * 0.5f * p[20] / camera.fx;
   camera.limit_y = kFrustumMargin * 0.5f * p[21] / camera.fy;
+  camera.blur = kDilationPx2 * p[22] * p[22] * camera.fx * camera.fy;
   return camera;
 }
 
@@ -152,6 +154,12 @@ VDGS_FN Quaternion<T> rotation_gradient(Quaternion<T> q, const Columns<T>& g) {
 
 // ---------------------------------------------------------------------------------------- culling
 
+// What is added to the variances of a Gaussian: that of a pixel of the view, or of a photograph where that is larger.
+template <class T>
+VDGS_FN T dilation_of(const Camera& camera, T inverse_z) {
+  return max(constant<T>(kDilationPx2), constant<T>(camera.blur) * inverse_z * inverse_z);
+}
+
 // Along one side of the image: the squared distance in px of a center from 0 .. size, and the factor (squared) from
 // world to px at its bound.
 template <class T>
@@ -176,15 +184,15 @@ template <class T>
 struct Sight {
   Reach<T> x, y;
   Mask<T> before;  // the camera
+  T least;         // 3 sigma of the dilation, squared
 
   // Whether a Gaussian of any size is kept: the dilation alone reaches the image.
   VDGS_FN Mask<T> surely() const {
-    const T least = constant<T>(9.0f * kDilationPx2);
     return before & le(x.outside_squared, least) & le(y.outside_squared, least);
   }
   // Whether one is kept whose largest scale is exp(log_scale).
   VDGS_FN Mask<T> holds(T log_scale) const {
-    const T least = constant<T>(9.0f * kDilationPx2), reach = constant<T>(9.0f) * exp(constant<T>(2.0f) * log_scale);
+    const T reach = constant<T>(9.0f) * exp(constant<T>(2.0f) * log_scale);
     return before & le(x.outside_squared, fma(reach, x.stretch, least)) &
            le(y.outside_squared, fma(reach, y.stretch, least));
   }
@@ -196,7 +204,7 @@ VDGS_FN Sight<T> sight_of(const Camera& camera, Vec3<T> local) {
   const T inverse_z = camera.orthographic ? constant<T>(1.0f) : constant<T>(1.0f) / local.z;
   return {reach_of(camera.fx, camera.cx, camera.width, camera.limit_x, local.x, inverse_z, camera.orthographic),
           reach_of(camera.fy, camera.cy, camera.height, camera.limit_y, local.y, inverse_z, camera.orthographic),
-          gt(local.z, constant<T>(camera.near))};
+          gt(local.z, constant<T>(camera.near)), constant<T>(9.0f) * dilation_of(camera, inverse_z)};
 }
 
 // ---------------------------------------------------------------------------------------- projection
@@ -223,6 +231,7 @@ struct Projection {
 
   Vec3<T> local;
   T inverse_z;               // one for an orthographic camera
+  T dilation;                // of the variances, px^2
   T u, v;                    // clamped x/z and y/z
   Mask<T> u_moves, v_moves;  // where the clamp lets them follow
   Quaternion<T> unit;
@@ -266,7 +275,7 @@ VDGS_FN void project_mean(const Camera& camera, Vec3<T> mean, Projection<T>& p) 
   p.toward_y = jacobian_row(camera.fy, p.inverse_z, p.v, camera.down, camera.forward);
 }
 
-// 3DGS, eq. 5, with 0.3 px^2 on the diagonal. The determinant of A A^T + d is taken as
+// 3DGS, eq. 5, with the dilation d (0.3 px^2 or more) on the diagonal. The determinant of A A^T + d is taken as
 // |x cross y|^2 + d (x.x + y.y) + d^2 for the rows x, y of A: no difference of large numbers.
 template <class T>
 VDGS_FN Projection<T> project(const Camera& camera, const Gaussian<T>& g) {
@@ -282,7 +291,8 @@ VDGS_FN Projection<T> project(const Camera& camera, const Gaussian<T>& g) {
               dot(p.toward_y, p.rotation.c) * g.scale.z};
   const T xx = dot(p.axes_x, p.axes_x), yy = dot(p.axes_y, p.axes_y), xy = dot(p.axes_x, p.axes_y);
   p.area = cross(p.axes_x, p.axes_y);
-  const T dilation = constant<T>(kDilationPx2);
+  const T dilation = dilation_of(camera, p.inverse_z);
+  p.dilation = dilation;
   const T inverse = constant<T>(1.0f) / (dot(p.area, p.area) + dilation * (xx + yy + dilation));
   p.inverse_determinant = inverse;
   p.variance_x = xx + dilation, p.variance_y = yy + dilation;
@@ -302,7 +312,7 @@ VDGS_FN Projection<T> project(const Camera& camera, const Gaussian<T>& g) {
 template <class T>
 VDGS_FN void conic_gradient(const Projection<T>& p, const Footprint<T>& g, Vec3<T>& axes_x, Vec3<T>& axes_y) {
   const T a = p.drawn.conic_xx, b = p.drawn.conic_xy, c = p.drawn.conic_yy;
-  const T d = constant<T>(kDilationPx2);
+  const T d = p.dilation;
   const T scale = constant<T>(-2.0f) * p.inverse_determinant;
   const Vec3<T> ka_x = scale * (d * p.axes_x + cross(p.axes_y, p.area));
   const Vec3<T> ka_y = scale * (d * p.axes_y + cross(p.area, p.axes_x));
@@ -310,6 +320,16 @@ VDGS_FN void conic_gradient(const Projection<T>& p, const Footprint<T>& g, Vec3<
   const Vec3<T> gka_x = g.conic_xx * ka_x + half * ka_y, gka_y = half * ka_x + g.conic_yy * ka_y;
   axes_x = a * gka_x + b * gka_y;
   axes_y = b * gka_x + c * gka_y;
+}
+
+// Gradient of the depth through a dilation above that of a pixel, which is 1 / z^2 times a constant: that of the
+// dilation is -tr(K G K).
+template <class T>
+VDGS_FN T blur_gradient(const Projection<T>& p, const Footprint<T>& g) {
+  const T a = p.drawn.conic_xx, b = p.drawn.conic_xy, c = p.drawn.conic_yy;
+  const T by_dilation = g.conic_xx * (a * a + b * b) + g.conic_xy * b * (a + c) + g.conic_yy * (b * b + c * c);
+  return zero_unless(gt(p.dilation, constant<T>(kDilationPx2)),
+                     constant<T>(2.0f) * p.dilation * p.inverse_z * by_dilation);
 }
 
 // Gradient of one semi-axis (a column of the rotation times its scale) from those of its two images.
@@ -349,6 +369,8 @@ VDGS_FN Gaussian<T> project_backward(const Camera& camera, const Gaussian<T>& ga
   const Vec3<T> a = s.x * r.a, b = s.y * r.b, c = s.z * r.c;
   Gaussian<T> out;
   out.mean = mean_gradient(camera, p, g, dx.x * a + dx.y * b + dx.z * c, dy.x * a + dy.y * b + dy.z * c);
+  if (camera.blur > 0.0f && !camera.orthographic)
+    out.mean = out.mean + blur_gradient(p, g) * constant<T>(camera.forward);
   out.scale = {dot(d.a, r.a), dot(d.b, r.b), dot(d.c, r.c)};
   const Quaternion<T> q = p.unit;
   const Quaternion<T> dq = rotation_gradient(q, Columns<T>{s.x * d.a, s.y * d.b, s.z * d.c});
