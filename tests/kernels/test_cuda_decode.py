@@ -10,8 +10,6 @@ import pytest
 import torch
 
 from support.cuda_on_host import ORDERS, HostDriver, barriers_of, build_on_host, needs_a_compiler, needs_nvrtc
-from support.decode_scenes import Scene, looking_down, moved_by, turned
-from support.cuda_on_host import ORDERS, HostDriver, build_on_host, needs_a_compiler, needs_nvrtc
 from support.decode_scenes import Scene, looking_down, moved_by, near, turned
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.cuda.decode import PROGRAM, SplatCapacity, decode, decode_for_training, expand_sources

@@ -14,7 +14,7 @@ from vdgs.kernels import constants
 from vdgs.kernels.constants import DILATION_PX2
 from vdgs.kernels.cpu import extension
 from vdgs.kernels.cpu.project import project as native_project
-from vdgs.kernels.gaussian_projection import GaussianShapes, area_shares, project_gaussians
+from vdgs.kernels.gaussian_projection import GaussianShapes, area_shares, dilations_px2, project_gaussians
 from vdgs.kernels.rotations import rotation_matrices
 from vdgs.kernels.torch_ref.project import project as twin_project
 
@@ -56,7 +56,8 @@ def test_a_conic_alone_says_which_share_of_its_area_a_gaussian_had_before_the_bl
     exact = project_gaussians(means, GaussianShapes(scales, quaternions), camera)
     shown = exact.projected.valid
     conics = native_project(means.float(), scales.float(), quaternions.float(), camera).conics[shown]
-    shares = area_shares(conics, torch.full((len(conics),), DILATION_PX2))
+    blur = torch.zeros(len(conics)) + dilations_px2(exact.projected.depths[shown].float(), camera)
+    shares = area_shares(conics, blur)
     torch.testing.assert_close(shares.double(), exact.compensation[shown], atol=4e-4, rtol=0)
     assert shares.min() < 0.1
     assert shares.max() > 0.5

@@ -239,7 +239,9 @@ class Browser:
             size = {"width": width, "height": height, "newWindow": True}
             target = whole.call("Target.createTarget", url="about:blank", browserContextId=context, **size)["targetId"]
             try:
-                with connect(f"{self._address.partition('/devtools/')[0]}/devtools/page/{target}", max_size=None) as own:
+                with connect(
+                    f"{self._address.partition('/devtools/')[0]}/devtools/page/{target}", max_size=None
+                ) as own:
                     yield Page(own)
             finally:
                 whole.call("Target.disposeBrowserContext", browserContextId=context)
