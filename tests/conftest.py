@@ -170,6 +170,16 @@ def nine_begun(nine: Flight, tmp_path_factory: pytest.TempPathFactory) -> dict[s
     return folders_of_steps(nine, tmp_path_factory.mktemp("begun"))
 
 
+@pytest.fixture
+def unestimated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reconstructions begin without their estimate, for which three photographs are searched and matched."""
+    from vdgs.sfm import reconstruct
+    from vdgs.sfm.sfm_estimate import SfmEstimate
+
+    nothing = SfmEstimate(steps={}, slowdown=1.0, points=0, probed=())
+    monkeypatch.setattr(reconstruct, "estimate_sfm", lambda _plan: nothing)
+
+
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     """What `-n auto` means: no workers (0) where only some files were asked for, for they take seconds to start."""
     if any(argument.partition("::")[0].endswith(".py") for argument in config.args):

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from support.clusters import CUT, copy_run, train_here
+from support.clusters import CUT, FINE, copy_run, evaluated, train_here
 from support.commands import vdgs
+from vdgs.rendering.ortho.ortho_plan import FILE_NAMES
 
 
 @pytest.fixture(scope="module")
@@ -38,3 +39,15 @@ def cut(uncut, tmp_path_factory) -> Path:
 def local(cut) -> Path:
     """`cut`, its blocks trained by this machine alone. Not to be changed."""
     return train_here(cut, cut.parent / "local")
+
+
+@pytest.fixture(scope="session")
+def mapped(uncut, tmp_path_factory) -> dict[str, object]:
+    """Maps of `uncut` as one process draws them."""
+    pytest.importorskip("rasterio")
+    folder = tmp_path_factory.mktemp("mapped") / "maps"
+    done = vdgs("ortho", uncut, *FINE, "--output", folder)
+    assert done.returncode == 0, done.stderr + done.stdout
+    files = evaluated(folder)
+    assert files.keys() == set(FILE_NAMES)
+    return files

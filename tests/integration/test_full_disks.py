@@ -19,7 +19,7 @@ from support.small_pipeline import BLOCK, CUT, SETTINGS
 from vdgs.config.sfm_options import SfmRequest
 from vdgs.errors import VdgsError
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("sfm")]
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("sfm"), pytest.mark.usefixtures("unestimated")]
 
 SIZE_MB = 64
 #: Colors that are not fitted again: quicker, and files alike.

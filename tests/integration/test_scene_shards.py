@@ -26,24 +26,11 @@ from vdgs.export.bake_io import (
 from vdgs.export.color_refinement import ColorResidual
 from vdgs.export.formats.gaussian_store import flatten, open_store, unflatten
 from vdgs.pipeline import run_pipeline
-from vdgs.rendering.ortho.ortho_plan import FILE_NAMES
 from vdgs.rendering.ortho.tile_renderer import OrthoTile
 from vdgs.rendering.ortho.tile_shards import load_tile, save_tile
 from vdgs.runs.run_context import RunContext
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("shards")]  # one worker, which trains once
-
-
-@pytest.fixture(scope="module")
-def mapped(uncut, tmp_path_factory) -> dict[str, object]:
-    """What one process makes of it."""
-    pytest.importorskip("rasterio")
-    folder = tmp_path_factory.mktemp("mapped") / "maps"
-    done = vdgs("ortho", uncut, *FINE, "--output", folder)
-    assert done.returncode == 0, done.stderr + done.stdout
-    files = evaluated(folder)
-    assert files.keys() == set(FILE_NAMES)
-    return files
 
 
 def test_whatever_is_killed_maps_drawn_in_shards_are_those_of_one_process(uncut, mapped, tmp_path):

@@ -129,6 +129,7 @@ def test_the_same_command_does_nothing_and_an_option_only_what_depends_on_it(mad
     assert not (output / "work").exists()
 
 
+@pytest.mark.usefixtures("unestimated")
 def test_photographs_that_came_later_are_refused_or_make_the_capture_anew(flight, tmp_path):
     output, card, (*names, late) = tmp_path / "capture", tmp_path / "card", flight.names[:5]
     card.mkdir()
@@ -149,6 +150,7 @@ def test_photographs_that_came_later_are_refused_or_make_the_capture_anew(flight
     assert not run.is_trained
 
 
+@pytest.mark.usefixtures("unestimated")
 def test_without_positions_the_scale_is_arbitrary_and_said_so(flight, tmp_path):
     """One photograph lies on its side, and its mask with it. Three were taken with the camera turned: portrait for
     EXIF, and for everybody after it."""
@@ -181,6 +183,7 @@ def test_without_positions_the_scale_is_arbitrary_and_said_so(flight, tmp_path):
     assert files(card) == before
 
 
+@pytest.mark.usefixtures("unestimated")
 def test_photographs_that_do_not_overlap_are_no_scene(tmp_path):
     rng = np.random.default_rng(0)
     for k in range(3):

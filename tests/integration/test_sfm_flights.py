@@ -46,7 +46,7 @@ def flight(nine) -> Flight:
 
 
 @pytest.fixture
-def begun(nine_begun) -> dict[str, Path]:
+def begun(nine_begun, unestimated) -> dict[str, Path]:
     return nine_begun
 
 
@@ -118,6 +118,7 @@ def test_more_folders_beside_a_capture_are_refused(flight, tmp_path):
 # ------------------------------------------------------------------------------------------------- parts
 
 
+@pytest.mark.usefixtures("unestimated")
 def test_of_two_parts_the_larger_is_kept_and_the_other_named(flight, tmp_path):
     """Six photographs, and 90 m beside them four as of another place: mirrored negatives, whose features are others."""
     card, said = tmp_path / "card", console()
@@ -153,7 +154,7 @@ class Stopper:
 
 
 STEPS = {
-    "features": (feature_extraction, "_extract", 5, signal.SIGTERM),  # the first two calls are of the estimate
+    "features": (feature_extraction, "_extract", 3, signal.SIGTERM),
     "matching": (feature_matching, "call_cancellable", 2, signal.SIGHUP),
     "mapping": (incremental_mapper, "save_snapshots", 5, signal.SIGTERM),
     "writing": (capture_writer, "write_bytes", 8, signal.SIGINT),
@@ -300,7 +301,7 @@ def test_a_disk_that_is_full_for_the_database_is_said_and_nothing_is_lost(flight
 
     def full(function, *arguments, **named):
         full.calls += 1
-        if full.calls == (4 if room is feature_extraction else 3):  # two calls of the former are of the estimate
+        if full.calls == (2 if room is feature_extraction else 3):
             return call_cancellable(lambda _, cancellation_token: fail("SQLite error: disk is full"), arguments[0])
         return call_cancellable(function, *arguments, **named)
 

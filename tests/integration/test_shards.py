@@ -10,7 +10,6 @@ import pytest
 
 from support.clusters import COARSE, KILLED, alive, copy_run, evaluated, merge_run
 from support.commands import begun, do_tasks_here, python, vdgs, wait_until
-from support.forking import start_tasks
 from vdgs.evaluation.measured_as import is_evaluated
 from vdgs.runs.run_folder import RunFolder
 
@@ -118,7 +117,7 @@ def test_cameras_scored_in_shards_are_assigned_as_by_one_process(tmp_path, uncut
     cut = ("--blocks", "3", "--assignment.min-cameras", "3")
     assert vdgs("partition", one, *cut).returncode == 0
     command = ("partition", run, *cut, "--jobs", "2")
-    with begun(*command, pause_at=("*/shards/*/000001.npz", 1), prepare=start_tasks) as first:
+    with begun(*command, pause_at=("*/shards/*/000001.npz", 1)) as first:
         first.wait_until_paused(1)
         pattern = "partition/shards/*/00/status.json"
         wait_until(lambda: [json.loads(file.read_text())["state"] for file in run.glob(pattern)] == ["done"])

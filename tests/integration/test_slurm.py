@@ -18,7 +18,6 @@ from support.clusters import (
     evaluated,
     models,
     parent_of,
-    shard_of,
     waiting_shards,
 )  # fmt: skip
 from support.commands import begun, do_tasks_here, vdgs, wait_until
@@ -104,25 +103,8 @@ def test_time_limits_kills_and_lost_jobs_end_in_the_models_of_the_local_run(slur
     assert "block 00: crashed" not in done.stdout
 
 
-def test_a_driver_that_was_killed_finds_its_jobs_again_and_stops_them_when_asked(slurm, cut, local, tmp_path):
-    run = copy_run(cut, tmp_path / "run")
-    with begun(*by_slurm(run), pause_at=(MIDDLE, 1), environment=variables()) as first:
-        first.wait_until_paused(2)
-        first.send_signal(signal.SIGKILL)
-        first.finished()
-        with begun(*by_slurm(run), environment=variables()) as second:
-            wait_until(lambda: second.printed().count("is watched again") == 2)
-            second.send_signal(signal.SIGINT)
-            done = second.finished()
-        assert done.returncode == 130, done.stderr + done.stdout
-        assert not any(alive(process) for process in first.paused())
-    done = vdgs("train-blocks", run, *BLOCKS, prepare=do_tasks_here)  # what was saved leads to the same models anywhere
-    assert done.returncode == 0, done.stderr + done.stdout
-    assert models(run) == models(local)
-
-
-def test_views_are_measured_by_jobs_for_whatever_driver_lives(slurm, uncut, tmp_path):
-    """Two shards. The driver is killed; the next finds the jobs, one of which is killed, another's time is up."""
+def test_a_driver_that_was_killed_finds_its_jobs_again_and_stops_them_when_asked(slurm, uncut, tmp_path):
+    """Two shards that measure views; what they saved leads to the same figures anywhere."""
     here, run = (copy_run(uncut, tmp_path / name / "run") for name in ("here", "there"))
     assert vdgs("eval", here).returncode == 0
     command = ("eval", run, "--executor", "slurm", *OWN)
@@ -132,16 +114,14 @@ def test_views_are_measured_by_jobs_for_whatever_driver_lives(slurm, uncut, tmp_
         first.finished()
         with begun(*command, environment=variables()) as second:
             wait_until(lambda: second.printed().count("is watched again") == 2)
-            waiting = {shard_of(process): process for process in first.paused()}
-            os.kill(waiting[0], signal.SIGKILL)
-            wait_until(lambda: "shard 00: crashed by SIGKILL" in second.printed())
-            subprocess.run(["scancel", "--batch", "--signal=USR1", element_of(waiting[1])], check=True)
-            let_go_on_at_once(element_of(waiting[1]))
-            first.go_on()
+            second.send_signal(signal.SIGINT)
             done = second.finished()
+        assert done.returncode == 130, done.stderr + done.stdout
+        assert not any(alive(process) for process in first.paused())
+    (work,) = (run / "coarse/evaluation/shards").iterdir()
+    assert {file.stem for file in work.glob("*/*.npz")} == {"000000", "000002"}
+    done = vdgs("eval", run, "--jobs", "2", prepare=do_tasks_here)
     assert done.returncode == 0, done.stderr + done.stdout
-    assert "2 of 2 shards done" in done.stdout
-    assert "shard 01: crashed" not in done.stdout
     assert evaluated(run / "coarse/evaluation") == evaluated(here / "coarse/evaluation")
     assert not (run / "slurm").exists()
 

@@ -12,7 +12,7 @@ import torch
 
 from support.captures import tiny_scene, write_colmap
 from support.clusters import copy_run
-from support.commands import CommandsHere
+from support.commands import CommandsHere, small_figures
 from vdgs.captures import loading
 from vdgs.cli.main import main
 from vdgs.distributed import backend_selection
@@ -69,7 +69,7 @@ def reads(monkeypatch: pytest.MonkeyPatch) -> Reads:
 
 
 def command(*arguments: object) -> None:
-    with pytest.raises(SystemExit) as ended:
+    with small_figures(), pytest.raises(SystemExit) as ended:
         main([str(each) for each in arguments])
     assert ended.value.code == 0
 

@@ -64,6 +64,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
+@pytest.mark.usefixtures("unestimated")
 def test_cameras_of_a_film_lie_where_they_were_within_the_stated_accuracy(tmp_path: Path):
     cameras = relief_film(tmp_path / "DJI_0007.MP4", strips=2, each=4, spacing=1, step=8.0)
     request = ask(tmp_path / "out", tmp_path / "DJI_0007.MP4")

@@ -16,14 +16,12 @@ from support.panoramas import fisheye, walk
 from vdgs.captures.formats.source_capture import Intrinsics
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import VdgsError
-from vdgs.sfm import reconstruct as reconstructing
 from vdgs.sfm.capture_writer import make_undistortion
 from vdgs.sfm.cube_faces import FACES, cut_face
 from vdgs.sfm.image_list import collect_images
 from vdgs.sfm.mask_files import read_keep_mask
 from vdgs.sfm.reconstruct import reconstruct
 from vdgs.sfm.reconstruction_plan import plan_reconstruction
-from vdgs.sfm.sfm_estimate import SfmEstimate
 from vdgs.sfm.step_keys import step_keys
 
 WIDTH = 640
@@ -97,15 +95,14 @@ def test_the_mask_of_a_panorama_masks_its_faces(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_walk_with_panoramas_is_placed(tmp_path, monkeypatch):
+@pytest.mark.usefixtures("unestimated")
+def test_a_walk_with_panoramas_is_placed(tmp_path):
     """To centimetres and a degree (a pixel shows half of one); views of one share a place; none is of the sky."""
     places = [np.array([x, y, 12.0 + z]) for x, y, z in [(-7, -3, 0), (0, -3, 1), (7, -3, 0), (3, 4, 1)]]
     headings = walk(tmp_path / "photos", places, WIDTH)
     output = tmp_path / "capture"
     options = SfmOptions(max_num_features=1500)
     request = SfmRequest(image_folders=(tmp_path / "photos",), output=output, threads=1, options=options)
-    nothing = SfmEstimate(steps={}, slowdown=1.0, points=0, probed=())
-    monkeypatch.setattr(reconstructing, "estimate_sfm", lambda _plan: nothing)
     report = reconstruct(request, Console(file=io.StringIO()))
     assert report.reprojection_px < 0.6
     images = pycolmap.Reconstruction(output / "sparse" / "0").images.values()

@@ -296,9 +296,23 @@ def _vdgs(arguments: list[str], prepare: Callable[[], None] | None) -> None:
     main(arguments)
 
 
+@contextmanager
+def small_figures() -> Iterator[None]:
+    """Draw figures of so few pixels as still makes files of them: what they show, others test."""
+    from vdgs.report import charts
+    from vdgs.system import figure_style as style
+
+    before = style.DPI, charts.DPI
+    style.DPI = charts.DPI = SMALL_DPI
+    try:
+        yield
+    finally:
+        style.DPI, charts.DPI = before
+
+
 def spare_seconds() -> None:
-    """Let this process draw figures of so few pixels as still makes files of them, and time few steps before it trains:
-    what figures show and how near estimates come, others test."""
+    """Let this process, which ends with a command, draw small figures and time few steps before it trains: how near
+    estimates come, others test."""
     from vdgs.pipeline import time_estimate
     from vdgs.report import charts
     from vdgs.system import figure_style as style

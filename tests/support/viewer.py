@@ -233,15 +233,14 @@ class Browser:
     @contextlib.contextmanager
     def window(self, width: int, height: int) -> Iterator[Page]:
         """An empty page that knows nothing of what other pages kept."""
+        pages = self._address.partition("/devtools/")[0] + "/devtools/page/"
         with connect(self._address, max_size=None) as socket:
             whole = Page(socket)
             context = whole.call("Target.createBrowserContext")["browserContextId"]
             size = {"width": width, "height": height, "newWindow": True}
             target = whole.call("Target.createTarget", url="about:blank", browserContextId=context, **size)["targetId"]
             try:
-                with connect(
-                    f"{self._address.partition('/devtools/')[0]}/devtools/page/{target}", max_size=None
-                ) as own:
+                with connect(pages + target, max_size=None) as own:
                     yield Page(own)
             finally:
                 whole.call("Target.disposeBrowserContext", browserContextId=context)
