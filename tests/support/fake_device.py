@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
@@ -38,6 +38,9 @@ WAITING = {
 INDEXING = {ATEN.index.Tensor, ATEN.index_put.default, ATEN.index_put_.default}
 #: How a tensor of the card comes from numbers of Python.
 FROM_NUMBERS = {torch.tensor, torch.as_tensor, torch.asarray}
+#: What is looked at although no device is named; what a tensor is asked for its device by.
+DEVICE = Tensor.device.__get__
+ASKED = {DEVICE, Tensor.numpy, Tensor.cpu, Tensor.to, Tensor.new_tensor, Tensor.pin_memory, Tensor.tolist}
 #: Of the package that is tested.
 PACKAGE = str(Path(vdgs.__file__).parent)
 
@@ -83,13 +86,19 @@ class Memory:
 
 def tensors_in(values: Any) -> list[Tensor]:
     """Those among what an operation is given or makes. (Torch's own `tree_flatten` takes as long as the operation.)"""
-    if isinstance(values, Tensor):
-        return [values]
-    if isinstance(values, dict):
-        values = values.values()
-    elif not isinstance(values, list | tuple):
-        return []
-    return [tensor for each in values for tensor in tensors_in(each)]
+    found = list[Tensor]()
+    _collect((values,), found)
+    return found
+
+
+def _collect(values: Iterable[Any], found: list[Tensor]) -> None:
+    for each in values:
+        if isinstance(each, Tensor):
+            found.append(each)
+        elif isinstance(each, (list, tuple)):
+            _collect(each, found)
+        elif isinstance(each, dict):
+            _collect(each.values(), found)
 
 
 class Checked(TorchDispatchMode):
@@ -105,10 +114,11 @@ class Checked(TorchDispatchMode):
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         given = tensors_in((args, kwargs))
-        there = [tensor for tensor in given if self.memory.holds(tensor)]
-        elsewhere = [tensor for tensor in given if tensor.dim() and self.memory.is_elsewhere(tensor)]
-        if there and elsewhere and func not in CROSSING:
-            raise RuntimeError(f"{func}: tensors on cuda and of shape {list(elsewhere[0].shape)} on the CPU")
+        there = any(map(self.memory.holds, given))
+        if there and func not in CROSSING:
+            for tensor in given:
+                if self.memory.is_elsewhere(tensor) and tensor.dim():
+                    raise RuntimeError(f"{func}: tensors on cuda and of shape {list(tensor.shape)} on the CPU")
         masked = func in INDEXING and any(t.dtype in (torch.bool, torch.uint8) for t in tensors_in(args[1]))
         if there and (func in WAITING or masked):
             self.memory.wait("a mask as index" if masked else func.name().removeprefix("aten::"))
@@ -132,12 +142,14 @@ class Told(TorchFunctionMode):
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         self.memory.told = func not in BACKWARD
         try:
-            return self._call(func, args, dict(kwargs or {}))
+            return self._call(func, args, kwargs or {})
         finally:
             self.memory.told = False
 
     def _call(self, func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
-        if func == Tensor.device.__get__:  # a new object each time: never the same
+        if "device" not in kwargs and func not in ASKED:
+            return func(*args, **kwargs)
+        if func == DEVICE:
             return CARD if self.memory.holds(args[0]) else func(*args)
         if func is Tensor.numpy and self.memory.holds(args[0]):
             raise TypeError("can't convert a cuda tensor to numpy: use cpu() first")
