@@ -59,6 +59,9 @@ TABLES = {
     "rows without a position": "SourceFile\tGPSLatitude\tGPSLongitude\tGPSAltitude\nb.jpg\t-\t-\t-\n"
     "c.jpg\tNaN\tnan\tnan\na.jpg\t-33.5\t-70.6\t500\n",
     "heights over the ground": "name,lat,lon,height,altitude\na.jpg,-33.5,-70.6,50,500\n",
+    "german": "Dateiname;Breitengrad;Längengrad (°);Höhe [m]\na.jpg;-33,5;-70,6;500,0\n",
+    "spanish": "Nombre,Latitud,Longitud,Altitud\na.jpg,-33.5,-70.6,500\n",
+    "chinese": "照片名称,纬度,经度,高度\na.jpg,-33.5,-70.6,500\n",
     "emlid": "Image name,Latitude,Longitude,Ellipsoidal height,RMS easting,RMS northing,RMS elevation\n"
     "a.jpg,-33.5,-70.6,500,0.5,0.3,1\n",
     "moments without a fix": "1\t2.1\t[2]\t 0,N\t 0,E\t 0,V\t0.0,Lat\t0.0,Lon\t0.0,Ellh\t0, 0, 0\t0,Q\n"

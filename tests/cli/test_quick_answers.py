@@ -84,13 +84,13 @@ def test_a_mistyped_path_is_answered_at_once(verb, place):
 
 
 @pytest.mark.parametrize(
-    "verb", ["eval", "render", "ortho", "export", "visibility", "partition", "train-blocks", "merge", "lod"]
+    "verb", ["eval", "render", "ortho", "export", "visibility", "partition", "train-blocks", "merge", "lod", "report"]
 )
 def test_a_folder_that_is_no_run_is_answered_at_once(verb, place):
     output = ["-o", "new"] if verb in ("render", "export") else []
     code, _, err = answer(place, verb, "flight", *output)
     assert code == 1
-    assert "flight: is not a run folder" in err
+    assert f"flight: {'holds nothing of a run' if verb == 'report' else 'is not a run folder'}" in err
 
 
 def test_a_finished_run_is_answered_at_once(native_small: NativeRun, tmp_path):

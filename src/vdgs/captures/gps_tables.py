@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+import unicodedata
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,21 +37,24 @@ _OTHERS = (
         "is JSON. Export a table instead: `exiftool -csv -n -GPS* PHOTOGRAPHS`, or ODM's geo.txt.",
     ),
 )
-#: What each column is called, once blanks, signs, units and the case of letters are taken away.
+#: What each column is called, once blanks, signs, accents, units and the case of letters are taken away.
 _COLUMNS: dict[str, frozenset[str]] = {
     what: frozenset(names.split())
     for what, names in {
         "name": "name label image imagename imagefile imagefilename filename file sourcefile photo photoname "
-        "photograph picture picturename img imgname path filepath imagepath cameraname photolabel",
+        "photograph picture picturename img imgname path filepath imagepath cameraname photolabel "
+        "dateiname bildname bild nombre imagen fichier nomdufichier nomefile 照片名称 文件名 名称",
         "lat": "lat latitude gpslatitude gpslat ylatitude latitudey latitudedeg latdeg wgs84lat wgs84latitude "
-        "latitudewgs84 ylat cameralatitude originallatitude",
+        "latitudewgs84 ylat cameralatitude originallatitude breite breitengrad latitud latitudine 纬度",
         "lon": "lon long lng longitude gpslongitude gpslon gpslong gpslng xlongitude longitudex longitudedeg londeg "
-        "wgs84lon wgs84longitude longitudewgs84 xlon cameralongitude originallongitude",
+        "wgs84lon wgs84longitude longitudewgs84 xlon cameralongitude originallongitude lange langengrad "
+        "longitud longitudine 经度",
         "alt": "alt altitude gpsaltitude gpsalt zaltitude altitudez altitudem height ellipsoidheight ellipsoidalheight "
         "heightm heightz ele elev elevation z h up absolutealtitude altm cameraaltitude gpsheight zh altitudemsl "
-        "heightellipsoid ellh elevationm altft altitudeft altitudefeet heightft",
-        "x": "x easting east e utmeasting utmx xeasting xe eastingx coordx xm eastingm xeast",
-        "y": "y northing north n utmnorthing utmy ynorthing yn northingy coordy ym northingm ynorth",
+        "heightellipsoid ellh elevationm altft altitudeft altitudefeet heightft hohe altitud altura quota 高度 海拔",
+        "x": "x easting east e utmeasting utmx xeasting xe eastingx coordx xm eastingm xeast rechtswert ostwert este",
+        "y": "y northing north n utmnorthing utmy ynorthing yn northingy coordy ym northingm ynorth hochwert "
+        "nordwert norte",
         "latref": "latref latituderef gpslatituderef",
         "lonref": "lonref longituderef gpslongituderef",
         "altref": "altref altituderef gpsaltituderef",
@@ -176,7 +180,8 @@ def _known(words: Sequence[str]) -> dict[str, int]:
     """Which of these names of columns is what."""
     found: dict[str, int] = {}
     for k, word in enumerate(words):
-        plain = re.sub(r"[^a-z0-9]", "", _UNIT.sub("", word.lower()))
+        letters = unicodedata.normalize("NFKD", _UNIT.sub("", word.lower()))  # accents are signs of their own
+        plain = re.sub(r"[\W_]", "", letters)
         what = next((what for what, names in _COLUMNS.items() if plain in names), None)
         if (
             what == "alt"

@@ -27,7 +27,7 @@ from vdgs.config.commands import (
 )
 from vdgs.config.output_paths import Output
 from vdgs.config.ranges import Positional, Range
-from vdgs.errors import VdgsError
+from vdgs.errors import RunError, VdgsError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,6 +96,10 @@ def eval_command(arguments: list[str]) -> None:
     evaluate_stage(context, request, make_console(args.quiet), args.execution(device))
 
 
+#: What a run may have, however damaged it is.
+_RUN_PARTS = ("config.yaml", "capture.json", "capture", "coarse", "partition", "blocks", "merged", "evaluation")
+
+
 @dataclass(frozen=True, kw_only=True)
 class ReportArguments(RunPath, QuietArguments):
     """Write RUN/report.html: one file with the figures, metrics, pictures and settings of a run."""
@@ -106,6 +110,8 @@ class ReportArguments(RunPath, QuietArguments):
 
 def report_command(arguments: list[str]) -> None:
     args = parse_arguments(ReportArguments, arguments, "report")
+    if not any((args.run / part).exists() for part in _RUN_PARTS):
+        raise RunError(f"{args.run}: holds nothing of a run. Train first: vdgs run CAPTURE --output RUN")
     from vdgs.report.write_report import write_report
     from vdgs.runs.run_folder import RunFolder
 
