@@ -97,6 +97,15 @@ def test_before_its_own_background_a_picture_is_itself(alpha: float, background:
     assert np.array_equal(rendered.over_background(background), PHOTOGRAPHS[0])
 
 
+def test_a_background_may_be_a_picture():
+    rng = np.random.default_rng(0)
+    scene, sky = (rng.random((8, 9, 3)).astype(np.float32) for _ in range(2))
+    alpha = rng.random((8, 9)).astype(np.float32)
+    over = lambda behind: alpha[..., None] * scene + (1 - alpha[..., None]) * behind  # noqa: E731
+    white = RenderedImage(over(sky), alpha, sky).over_background((1.0, 1.0, 1.0))
+    assert np.abs(white.astype(int) - metrics.to_8bit(over(np.ones(3, np.float32)))).max() <= 1
+
+
 def plain_at(depth: float, alpha: np.ndarray) -> Callable:
     """A renderer of a plain square to the axis of any camera."""
 

@@ -51,14 +51,9 @@ COMMON_OPTIONS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
 }  # fmt: skip
 #: Options of a cluster, and others that few need: in the full help alone.
 RARE_OPTIONS = (
-    "--address",
-    "--cpus",
-    "--mem-gb",
-    "--gpus",
-    "--min-visibility",
-    "--antialiased",
-    "--num-off-path-images",
-)
+    "--address", "--cpus", "--mem-gb", "--gpus", "--min-visibility", "--antialiasing", "--num-off-path-images",
+    "--background",
+)  # fmt: skip
 
 #: The short help fits its explanations into a line of so many columns, and wraps them on narrower terminals.
 LINE_WIDTH = 100

@@ -133,6 +133,8 @@ def initial_envmap(
     sums[below] = [*background, 1.0]
     # Land is continued by land: by what is surely below the horizon.
     land = int((row_elevations(rows) > LOWEST_ELEVATION / 2).sum())
+    if not sums[:land, :, 3].any():  # masked, or looked for in vain
+        sums[:land] = [*background, 1.0]
     return torch.from_numpy(np.concatenate([_fill(sums[:land]), _fill(sums[land:])])).float().contiguous()
 
 
