@@ -8,9 +8,8 @@ import pytest
 
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.method import MethodConfig
-from vdgs.config.serialization import to_dict
 from vdgs.runs.run_settings import RunSettings
-from vdgs.runs.stage_keys import hashable_settings, stage_keys
+from vdgs.runs.stage_keys import stage_keys
 
 PLAIN = MethodConfig()
 CHANGED = {
@@ -47,11 +46,3 @@ def test_a_setting_counts_only_beside_the_one_that_it_needs():
     alone = replace(PLAIN, training=replace(PLAIN.training, exposure_min_spread=0.1))
     assert keys(alone) == keys(PLAIN)
     assert keys(CHANGED["spread"]).coarse != keys(CHANGED["exposure"]).coarse
-
-
-def test_runs_from_before_a_setting_was_there_stay_valid_at_its_default():
-    model = replace(PLAIN.training.model, background_model="off")
-    assert keys(replace(PLAIN, training=replace(PLAIN.training, model=model))).coarse != keys(PLAIN).coarse
-    counted = hashable_settings("training", to_dict(PLAIN.training))
-    assert "background_model" not in counted["model"]
-    assert "envmap" not in counted["lr"]

@@ -12,8 +12,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from vdgs.config.capture_options import AUTO_MASKS, CaptureOptions
-from vdgs.config.method import TrainConfig
-from vdgs.config.serialization import to_dict
 from vdgs.runs.run_settings import RunSettings
 
 #: Each stage with the sections of config.yaml that it depends on and the stages it builds on.
@@ -27,8 +25,6 @@ STAGE_DEPENDENCIES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 }
 #: Settings that do nothing without another.
 REQUIRED_SETTINGS: dict[tuple[str, ...], str] = {("training", "exposure_min_spread"): "exposure_compensation"}
-#: Settings that count only where they are not the default: models from before they were there stay valid.
-LATER_SETTINGS = {"model": ("background_model",), "lr": ("envmap",)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,13 +57,5 @@ def hashable_settings(section: str, settings: dict[str, Any]) -> dict[str, Any]:
     """The settings of a section that keys are made of: one that needs another counts only beside it."""
     if settings.get("masks") == AUTO_MASKS:
         settings = settings | {"masks": CaptureOptions.masks}
-    if section == "training":
-        settings = settings | {group: _without_defaults(group, settings[group]) for group in LATER_SETTINGS}
     ignored = {("capture", "path"), *(each for each, needed in REQUIRED_SETTINGS.items() if not settings.get(needed))}
     return {name: value for name, value in settings.items() if (section, name) not in ignored}
-
-
-def _without_defaults(group: str, settings: dict[str, Any]) -> dict[str, Any]:
-    default = to_dict(TrainConfig())[group]
-    later = {name for name in LATER_SETTINGS[group] if settings.get(name) == default[name]}
-    return {name: value for name, value in settings.items() if name not in later}

@@ -94,8 +94,8 @@ struct Camera {
 };
 
 // From vdgs.geometry.camera.Camera.packed: rotation (9), translation (3), fx, fy, cx, cy, width, height,
-// orthographic, near, width and height of the whole picture, size of a photograph's pixel. A part of a picture has the limits of the whole one:
-// else it would not show what that does.
+// orthographic, near, width and height of the whole picture, size of a photograph's pixel. A part of a picture has the
+// limits of the whole one: else it would not show what that does.
 VDGS_FN Camera unpack_camera(const float* p) {
   Camera camera;
   camera.right = {p[0], p[1], p[2]};
