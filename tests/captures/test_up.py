@@ -73,6 +73,12 @@ def flight(headings: Sequence[float], pitch: float, spread: tuple[float, float, 
     return *cameras(places, np.resize(np.repeat(headings, 9), 45), pitch, spread), ground
 
 
+def of_two_heights(scene: Scene) -> Scene:
+    """Every third camera from seven times as high."""
+    centers, rotations, points = scene
+    return np.where(np.arange(len(centers))[:, None] % 3 == 0, [1, 1, 7], 1) * centers, rotations, points
+
+
 def off_by(scene: Scene, turn: np.ndarray) -> tuple[float, list[str]]:
     """Degrees between up as found and as it is, where the world is turned; and the warnings."""
     centers, rotations, points = scene
@@ -136,6 +142,7 @@ def test_a_wall_seen_straight_on_cannot_be_told_from_a_flight_and_says_so():
     pytest.param(flight([0], -90, (4, 3, 20)), id="one heading in wind"),
     pytest.param(flight([0], -60, (1, 2, 1)), id="one heading oblique"),
     pytest.param(flight([0, 90, 180, 270], -30, (2, 5, 1)), id="low"),
+    pytest.param(of_two_heights(flight([0, 90, 180], -80, (2, 2, 5))), id="two heights"),
 ])  # fmt: skip
 def test_flights_have_their_up_against_the_view(scene):
     for turn in turns():

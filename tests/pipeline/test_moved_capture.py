@@ -107,7 +107,7 @@ def test_the_kept_flight_is_that_of_the_capture(trained):
 
 
 def test_views_and_orbits_are_drawn_without_the_photographs(trained, folder, tmp_path):
-    for views, extra in (("test", {}), ("orbit", {"seconds": 0.1, "antialiased": True})):
+    for views, extra in (("test", {}), ("orbit", {"seconds": 0.1, "antialiasing": "on"})):
         for run in (trained / "run", folder / "run"):
             render_run(
                 RenderRequest(run=run, output=tmp_path / run.parent.name / views, views=views, **extra, device="cpu"),

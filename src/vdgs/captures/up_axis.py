@@ -29,6 +29,8 @@ MAX_ROLL_RATIO = 0.25
 ROLL_PRIOR = 0.002
 #: Views whose mean is so long look down alike; it agrees with the shape of the flight within so many degrees (choice).
 LOOKS_DOWN, AGREE_DEG = 0.85, 12.0
+#: And below this cosine between both the shape of the flight does not say what up is (choice).
+MIN_DOWN_COSINE = 0.5
 #: Standard deviations of up in degrees: by views that look down, by cameras that are held level, where in doubt.
 VIEWS_DEG, LEVEL_DEG, UNCERTAIN_DEG = 3.0, 5.0, 20.0
 HINT = "--up x|y|z|-x|-y|-z says it outright."
@@ -47,6 +49,11 @@ def estimate_up(
     parallel = bool(np.linalg.eigvalsh(rights.T @ rights / len(rights))[1] < MAX_ROLL)
     up, uncertain = _least_variance(centers, points)
     how = "least variance of cameras and points"
+    if not same_side and np.linalg.norm(forward) >= LOOKS_DOWN and abs(forward @ up) < MIN_DOWN_COSINE:
+        # All look the same way, which is across the axis: cameras of several heights spread farther up than sideways.
+        flat, doubt = _least_variance(points)
+        if abs(forward @ flat) >= MIN_DOWN_COSINE:
+            up, uncertain, how = flat, doubt, "least variance of points"
     neither = abs(forward @ up) < MIN_VIEW_COSINE and abs(image_up @ up) < MIN_UPRIGHT_COSINE
     rolled = _roll(rights, up) > (MAX_ROLL_PARALLEL if parallel else MAX_ROLL)
     if same_side and (neither or rolled or (uncertain and not parallel)):
@@ -76,13 +83,13 @@ def estimate_up(
     return (-up if above < 0 else up), f"{how}, cameras above"
 
 
-def _least_variance(centers: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, bool]:
-    """The axis [3], of either sign, of least variance of camera centers and points, and whether it is uncertain.
+def _least_variance(*places: np.ndarray) -> tuple[np.ndarray, bool]:
+    """The axis [3], of either sign, of least variance of places (camera centers, points), and whether it is uncertain.
 
-    Both covariances are divided by their trace, so that each counts alike, and added; points beyond the 95 % quantile
+    All covariances are divided by their trace, so that each counts alike, and added; places beyond the 95 % quantile
     of distance to the median are left out.
     """
-    values, vectors = np.linalg.eigh(_shape(centers) + _shape(points))
+    values, vectors = np.linalg.eigh(np.sum([_shape(each) for each in places], axis=0))
     return vectors[:, 0], bool(values[0] > 0.5 * values[1])
 
 

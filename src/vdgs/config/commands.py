@@ -150,9 +150,9 @@ class RenderRequest(ModelRequest):
     lod_error: Annotated[float | None, Range(0, MAX_RENDER_SIDE_PX)] = None
     """Draw through the run's level-of-detail tree (`vdgs lod`), at most so many pixels off. By default, and with 0,
     everything is drawn from all anchors."""
-    antialiased: bool | None = None
+    antialiasing: Literal["auto", "on", "off"] = "auto"
     """Draw pictures without aliasing from farther away than the photographs were taken: splats that a pixel enlarges
-    become as much more transparent (docs/lod.md). By default only with --lod-error above 0. Maps stay as they are."""
+    become as much more transparent (docs/lod.md). auto: only with --lod-error above 0. Maps stay as they are."""
     colorbar: bool = True
     """Put a strip with the scale of the colors below each map; without it a map is as large as the image."""
     raw: bool = False
@@ -161,7 +161,7 @@ class RenderRequest(ModelRequest):
 
     @property
     def is_antialiased(self) -> bool:
-        return bool(self.lod_error) if self.antialiased is None else self.antialiased
+        return self.antialiasing == "on" or (self.antialiasing == "auto" and bool(self.lod_error))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -31,19 +31,23 @@ def optimize_gaussians(
     clock: Callable[[], float] = time.monotonic,
     max_steps: float = math.inf,
     rate: float = 1.0,
+    center_rate: float = 0.0,
 ) -> int:
     """Move the Gaussians on the disk for so long, in so many steps at most; returns in how many, each by the picture of
-    the next camera. `rate` multiplies the learning rates.
+    the next camera. `rate` multiplies the learning rates; `center_rate` is that of the centers, in median sizes.
 
     `after_step` is told how many seconds have passed.
     """
     every = np.arange(len(baked.spool.means))
     gaussians = baked.spool.rows(every)
     named = gaussians.tensors()
+    rates = {name: rate * each for name, each in LEARNING_RATES.items() if named[name].numel()}
+    if center_rate:
+        rates["means"] = center_rate * float(gaussians.log_scales.amax(1).median().exp())
     states = {
-        name: AdamState(named[name], torch.zeros_like(named[name]), torch.zeros_like(named[name]), rate * each)
-        for name, each in LEARNING_RATES.items() if named[name].numel()
-    }  # fmt: skip
+        name: AdamState(named[name], torch.zeros_like(named[name]), torch.zeros_like(named[name]), each)
+        for name, each in rates.items()
+    }
     updates = torch.zeros(len(every), dtype=torch.int32)
     began, steps = clock(), 0
     while (passed := clock() - began) < seconds and steps < max_steps:

@@ -33,9 +33,9 @@ from vdgs.system.stop_signals import check_stop_requested
 #: Gaussians that are merged at once, half a kilobyte each; larger scenes are cut in the plane.
 BLOCK_SIZE = 1 << 21
 #: Merged Gaussians move by every camera so often, and in so many steps at most.
-PASSES, MAX_STEPS = 2, 600
-#: They start farther from their end than baked ones.
-RATE = 2.0
+PASSES, MAX_STEPS = 3, 600
+#: They start farther from their end than baked ones. A step moves centers by so many median sizes.
+RATE, CENTER_RATE = 3.0, 0.03
 #: No more than these move: they must be in memory.
 MAX_MOVED = 4_000_000
 
@@ -121,7 +121,12 @@ class SceneMerging:
 
             if steps:
                 optimize_gaussians(
-                    merged, endless_cameras(self.training), after_step=after_step, max_steps=steps, rate=RATE
+                    merged,
+                    endless_cameras(self.training),
+                    after_step=after_step,
+                    max_steps=steps,
+                    rate=RATE,
+                    center_rate=CENTER_RATE,
                 )
         self.console.print(
             f"merged {total:,} Gaussians to {count:,} in {time.monotonic() - began:.1f} s, moved in {steps} steps",

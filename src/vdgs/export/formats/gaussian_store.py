@@ -69,6 +69,7 @@ class GaussianStore:
         for first in range(0, len(rows), CHUNK_SIZE):
             part = slice(first, first + CHUNK_SIZE)
             self.table[rows[part]] = flatten(gaussians.select(torch.arange(len(gaussians))[part]))
+            self.means[rows[part]] = gaussians.means[part].numpy()
 
     def sample(self, max_count: int) -> Gaussians:
         """At most so many, evenly taken."""
