@@ -107,9 +107,12 @@ class BenchPlan:
     step_factors: tuple[tuple[str, str, float], ...] = ()
 
     def reference(self, scene: str) -> PlannedRun | None:
-        """The run whose coarse model says how often each pixel of the scene is seen, for all methods and seeds; None
-        where no method has one."""
-        return next((run for run in self.coarse + self.runs if run.scene == scene and "coarse" in run.stages), None)
+        """The run whose coarse model says how often each pixel of the scene is seen, for all methods and seeds: that of
+        the table's own method where it is among them, whatever the others are; None where no method has one."""
+        ours = next((run for key, run in self.run_of.items() if key[:2] == (scene, self.table.ours)), None)
+        runs = [run for run in self.coarse + self.runs if run.scene == scene and "coarse" in run.stages]
+        first = [run for run in runs if ours is not None and run.folder == (ours.coarse_from or ours.folder)]
+        return next(iter(first + runs), None)
 
 
 def make_plan(name: str, options: PlanOptions) -> BenchPlan:

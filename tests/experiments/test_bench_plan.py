@@ -239,6 +239,18 @@ def test_a_shared_coarse_stage_does_not_depend_on_the_methods_asked_for():
     assert len(some) == 1
 
 
+def test_pixels_are_grouped_by_the_same_model_whichever_methods_stand_beside_the_own_one():
+    plans = [
+        make_plan("table1", PlanOptions(scenes=("seneca",), seeds=1, methods=methods))
+        for methods in (("full", "vdgs-paper"), ("3dgs-black", "vdgs-paper", "momentum-gs", "full"), ("full",))
+    ]
+    references = {plan.reference("seneca").folder for plan in plans}
+    assert references == {plans[0].run_of["seneca", "full", 0].coarse_from}
+    without = make_plan("table1", PlanOptions(scenes=("seneca",), seeds=1, methods=("3dgs-black", "baseline-mean")))
+    assert without.reference("seneca").method == "baseline-mean"
+    assert make_plan("table1", PlanOptions(scenes=("seneca",), methods=("3dgs-black",))).reference("seneca") is None
+
+
 def test_choices_change_the_budget_for_all_alike():
     plan = make_plan("table2", PlanOptions(scenes=("tiny",), seeds=2, total_iterations=1200, max_anchors=1000))
     assert plan.budgets["tiny"] == Budget(600, 2, 300)

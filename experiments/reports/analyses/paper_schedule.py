@@ -1,9 +1,10 @@
-"""The preset `paper` on one capture to its end, for several values of tau, on validation views, with steps scaled down.
+"""The preset `paper` on one capture to its end, on validation views, with steps scaled down.
 
-    python -m experiments.reports.analyses.paper_schedule DATA WORK [--tau 0.05 0.1 0.2]
+    python -m experiments.reports.analyses.paper_schedule DATA WORK             # three values of tau, eight blocks
+    python -m experiments.reports.analyses.paper_schedule DATA WORK --crossed   # cut x compensation, four blocks
 
-One coarse model of seneca is trained; each tau cuts a copy of it into eight blocks, trains, merges and measures them.
-Rows are kept in WORK/schedule.jsonl: the same command continues. Test photographs are left out.
+One coarse model of seneca is trained; each row cuts a copy of it into blocks, trains, merges and measures them. Rows are
+kept in WORK/schedule.jsonl: the same command continues. Test photographs are left out.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.microbench.hardware_info import describe
-from experiments.reports.analyses.paper_readings import call, copy_with, counts, measured, write_row
+from experiments.reports.analyses.paper_readings import Changes, call, copy_with, counts, measured, write_row
 from vdgs.runs.run_folder import RunFolder
 
 #: 2 000 of 100 000 steps, 300 of 50 000 for each block; decisions about growth in blocks every 30 steps, five in all.
@@ -22,14 +23,25 @@ COARSE = (
     "--images", "images_4", "--downscale", "2", "--validation", "--preset", "paper", "--iterations", "2000",
     "--densify.stats-start", "10", "--densify.start", "30",
 )  # fmt: skip
-CHANGES: dict[str, Any] = {"partition.blocks": 8, "block.steps_scaler": 0.006, "block.densify.every": 30}
-AS_OPTIONS = "--blocks 8 --block.steps-scaler 0.006 --block.densify.every 30 --assignment.tau TAU"
+CHANGES: Changes = {"partition.blocks": 8, "block.steps_scaler": 0.006, "block.densify.every": 30}
 
 
-def row_of(coarse: RunFolder, folder: Path, tau: float) -> dict[str, Any]:
-    """The run to its end with one tau: cameras and growth of each block, and the merged scene."""
-    run = copy_with(coarse, folder, CHANGES | {"assignment.tau": tau})
-    row = {"tau": tau} | counts(run) | measured(run, coarse)
+#: Rows by name. Crossed factors have half as many blocks, of 200 steps and five decisions each.
+BY_TAU: dict[str, Changes] = {f"τ = {tau:g}": CHANGES | {"assignment.tau": tau} for tau in (0.05, 0.1, 0.2)}
+CROSSED: dict[str, Changes] = {
+    f"λ_vis = {lambda_vis}, compensation {'on' if on else 'off'}": {
+        "partition.blocks": 4, "block.steps_scaler": 0.004, "block.densify.every": 20,
+        "partition.lambda_vis": float(lambda_vis), "block.compensation.enabled": on,
+    }
+    for lambda_vis in (0, 1)
+    for on in (False, True)
+}  # fmt: skip
+
+
+def row_of(coarse: RunFolder, folder: Path, name: str, changes: Changes) -> dict[str, Any]:
+    """The run to its end: cameras and growth of each block, and the merged scene."""
+    run = copy_with(coarse, folder, changes)
+    row = {"row": name} | counts(run) | measured(run, coarse)
     blocks = [each.status() for each in run.block_folders()]
     return row | {
         "anchors": [each.anchors for each in blocks], "seconds": [each.seconds for each in blocks],
@@ -41,11 +53,11 @@ def as_markdown(rows: list[dict[str, Any]]) -> str:
     """The rows as two tables: the scene, and its blocks."""
     scene = ["| | PSNR | SSIM | corrected PSNR | quarters by V, least seen first | opaque | anchors | training s |", "|---" * 8 + "|"]
     blocks = [
-        "| τ | cameras of each block | photographs that train no core | anchors of each block at its end | longest block s | block memory GB |",
+        "| | cameras of each block | photographs that train no core | anchors of each block at its end | longest block s | block memory GB |",
         "|---" * 6 + "|",
     ]
     named = [("coarse stage", rows[0]["before"], rows[0]["before"]["train_seconds"])]
-    named += [(f"eight blocks, merged, τ = {row['tau']:g}", row["now"], sum(row["seconds"])) for row in rows]
+    named += [(f"blocks, merged, {row['row']}", row["now"], sum(row["seconds"])) for row in rows]
     for name, found, seconds in named:
         quarters = ", ".join(f"{each:.2f}" for each in found["quarters"])
         scene.append(
@@ -54,30 +66,33 @@ def as_markdown(rows: list[dict[str, Any]]) -> str:
         )
     for row in rows:
         blocks.append(
-            f"| {row['tau']:g} | {', '.join(map(str, row['cameras']))} | {row['idle']} of {row['photographs']} "
+            f"| {row['row']} | {', '.join(map(str, row['cameras']))} | {row['idle']} of {row['photographs']} "
             f"| {', '.join(f'{each:,}' for each in row['anchors'])} | {max(row['seconds']):.0f} "
             f"| {row['memory'] / 1e9:.2f} |"
         )
     return "\n".join([*scene, "", *blocks]) + "\n"
 
 
-def main(data: Path, work: Path, taus: list[float]) -> list[dict[str, Any]]:
-    """The rows of all these tau; those that are there are kept."""
+def main(data: Path, work: Path, wanted: dict[str, Changes]) -> list[dict[str, Any]]:
+    """The rows of these names; those that are there are kept."""
     work.mkdir(parents=True, exist_ok=True)
     file, coarse = work / "schedule.jsonl", RunFolder(work / "coarse")
-    rows = {row["tau"]: row for row in map(json.loads, file.read_text().splitlines())} if file.exists() else {}
-    if set(taus) - set(rows):
+    rows = {row["row"]: row for row in map(json.loads, file.read_text().splitlines())} if file.exists() else {}
+    if wanted.keys() - rows:
         call("train-coarse", data / "seneca", *COARSE, "--output", coarse.path, "--quiet")
         call("visibility", coarse.path, "--quiet")
         call("eval", coarse.path, "--model", "coarse", "--quiet")
-    return [rows[tau] if tau in rows else write_row(file, row_of(coarse, work / f"tau-{tau:g}", tau)) for tau in taus]
+    for name, changes in wanted.items():
+        if name not in rows:
+            rows[name] = write_row(file, row_of(coarse, work / "row", name, changes))
+    return [rows[name] for name in wanted]
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("data", type=Path)
     parser.add_argument("work", type=Path)
-    parser.add_argument("--tau", type=float, nargs="+", default=[0.05, 0.1, 0.2])
+    parser.add_argument("--crossed", action="store_true")
     options = parser.parse_args()
     print(describe())
-    print(as_markdown(main(options.data, options.work, options.tau)))
+    print(as_markdown(main(options.data, options.work, CROSSED if options.crossed else BY_TAU)))
