@@ -122,14 +122,14 @@ def run_scene(scene: Scene, arguments: argparse.Namespace, done: set[tuple[str, 
             if (scene.name, stage, version) in done:
                 continue
             verb, *words = commands(scene, arguments.data, work, arguments.settings)[stage]
-            if source is not None and (source / "src" / "vdgs" / "verbs").is_dir():
-                verb = FORMER_VERBS.get(verb, verb)
+            former = source is not None and (source / "src" / "vdgs" / "verbs").is_dir()
+            module, verb = ("vdgs.cli", FORMER_VERBS.get(verb, verb)) if former else ("vdgs", verb)
             record(
                 arguments.work,
                 scene,
                 stage,
                 version,
-                measure([sys.executable, "-m", "vdgs", verb, *words], work / "log", source),
+                measure([sys.executable, "-m", module, verb, *words], work / "log", source),
             )
     if arguments.beside and (scene.name, "beside", "other") not in done:
         capture = (
