@@ -321,19 +321,5 @@ def spare_seconds() -> None:
     time_estimate.MIN_TIMED_STEPS, time_estimate.MAX_TIMED_SECONDS = FEW_STEPS, 0.0
 
 
-@contextmanager
-def small_figures() -> Iterator[None]:
-    """The same of figures in this process, for a while."""
-    from vdgs.report import charts
-    from vdgs.system import figure_style as style
-
-    before = style.DPI, charts.DPI
-    style.DPI = charts.DPI = SMALL_DPI
-    try:
-        yield
-    finally:
-        style.DPI, charts.DPI = before
-
-
 def _execute(code: str) -> None:
     exec(code, {"__name__": "__main__"})
