@@ -217,6 +217,9 @@ def test_refining_comes_nearer_and_ends_when_its_time_is_over(tmp_path):
     assert passed == list(range(1, 80))
     assert error(shown, GRID) < 0.9 * before
     assert np.array_equal(shown.spool.rows(np.arange(len(means))).means.numpy(), means)
+    optimize_gaussians(shown, endless_cameras(GRID), max_steps=2, center_rate=0.03)
+    assert not np.array_equal(shown.spool.means, means)
+    assert np.array_equal(shown.spool.rows(np.arange(len(means))).means.numpy(), shown.spool.means)
 
 
 def test_cameras_between_lie_among_neighbors_that_look_alike_and_are_never_the_same():
