@@ -326,7 +326,7 @@ def test_folders_of_images_by_other_names_are_used_or_named(tmp_path, scene, fol
 
 def test_an_archive_is_called_a_file(tmp_path):
     (tmp_path / "place.zip").write_bytes(b"PK")
-    with pytest.raises(CaptureError, match=r"is a file\. Unpack"):
+    with pytest.raises(CaptureError, match="of an archive, once it is unpacked"):
         load_capture(tmp_path / "place.zip")
 
 

@@ -198,7 +198,7 @@ def test_moments_of_a_drone_place_a_finished_capture(tmp_path):
         ("name,lat,lon,alt\nother,1,2,3\n", "none of its 1 rows"),
         ("name,lat,lon,alt\nframe_000,x,2,3\n", "not numbers"),
         ("name,lat,lon,alt\nframe_000,91,2,3\n", "no place on Earth"),
-        ("name,lat,lon,alt\nframe_000,nan,2,3\n", "no place on Earth"),
+        ("name,lat,lon,alt\nframe_000,nan,2,3\n", "none of its 1 rows has a position"),
     ],
 )
 def test_bad_gps_tables_are_named(tmp_path, content, message):

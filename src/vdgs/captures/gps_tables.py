@@ -146,6 +146,8 @@ def read_gps_table(file: Path) -> GpsTable:
     if not rows:
         raise CaptureError(f"{file}: names its columns but holds no rows. Write one for each photograph.")
     placed = [row for row in rows if _has_place(row, columns)]
+    if not placed:
+        raise CaptureError(f"{file}: none of its {len(rows)} rows has a position. Export the table once it has them.")
     place = _projected if columns.system is not None and "x" in columns.where else _geodetic
     positions = place(placed, columns, file)
     found = [
