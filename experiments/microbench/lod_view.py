@@ -108,7 +108,7 @@ def main() -> None:
     if options.flight:
         fly_down(tree, places, options.flight)
     for name, camera in () if options.motion_only else places.items():
-        compare(name, rested[name] / 255.0, tree, camera, scene.photograph_pixel)
+        compare(name, rested[name] / 255.0, tree, camera, scene.pixel_at_camera_height)
 
 
 def standpoints(tree: LodScene, width: int, height: int) -> dict[str, Camera]:

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from experiments.baselines.momentum_gs.blocks import MomentumTraining, restore, turn_length
+from experiments.baselines.momentum_gs.blocks import MomentumTraining, restore, set_trainable, turn_length
 from experiments.baselines.momentum_gs.guidance import BlockWeights, MomentumConfig, MomentumTeacher
 from experiments.baselines.turns import next_in_turn
 from support.block_training import BLOCKS, CONFIG, block_stage, coarse
@@ -67,6 +67,12 @@ def test_in_the_last_round_the_others_take_the_decoder_as_it_is():
     before = {name: tensor.clone() for name, tensor in training.decoder.tensors().items()}
     finish(training)
     assert all(torch.equal(tensor, before[name]) for name, tensor in training.decoder.tensors().items())
+
+
+def test_a_turn_moves_the_heads_and_nothing_that_all_blocks_share():
+    decoder = replace(coarse()[1].copy(), exposure=torch.zeros(2, 3, 4), envmap=torch.zeros(4, 8, 3))
+    set_trainable(decoder, replace(block_stage(BlockConfig(), 0, PLAIN)[0], frozen_decoder=False), True)
+    assert {name for name, tensor in decoder.tensors().items() if not tensor.requires_grad} == {"exposure", "envmap"}
 
 
 def test_consistency_pulls_the_student_to_its_teacher():

@@ -15,7 +15,7 @@ import torch
 from rich.console import Console
 
 from support.captures import camera_at
-from support.hand_made_models import model_at, opaque_plane
+from support.hand_made_models import camera_above, model_at, opaque_plane
 from vdgs.config.commands import LodRequest
 from vdgs.errors import RunError, Stopped, VdgsError
 from vdgs.export.lod_bake import CameraTable, merge_cells
@@ -157,6 +157,13 @@ def test_without_aliasing_a_picture_from_afar_is_that_of_many_samples_and_that_o
     assert torch.equal(render(without_aliasing(tiny, pixel), near).image, render(tiny, near).image)
     fine, merged = (render(without_aliasing(scene.at_error(error), pixel), high).image for error in (0.0, 1.0))
     assert (fine - merged).square().mean() < (render(scene.at_error(0.0), high).image - merged).square().mean()
+
+
+def test_levels_show_the_sky_with_aliasing_and_without(scene):
+    sky = replace(scene.model, decoder=replace(scene.model.decoder, envmap=torch.full((4, 8, 3), 0.53)))
+    up, lit = camera_above(0.0, 0.0, 6.0, 150.0), replace(scene, model=sky)
+    for shown in (lit, lit.at_error(1.0), without_aliasing(lit, 0.1), without_aliasing(sky, 0.1)):
+        assert (render(shown, up).image - 0.53).abs().max() < 1e-6
 
 
 def test_merging_cells_keeps_what_it_merges(scene):

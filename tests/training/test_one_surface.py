@@ -42,7 +42,7 @@ def test_training_with_it_draws_splats_to_one_depth() -> None:
         config = replace(stage.config, iterations=150, loss=LossConfig(depth_agreement=weight), densify=still)
         stage = replace(stage, config=config, frozen_anchors=None)
         train(state, stage, stop=lambda: False, after_step=lambda *_: None)
-        model = state.model(stage.voxel_size, stage.background)
+        model = state.model(stage)
         return float(depth_agreement(render(model, Photographs().camera(0), depth=True), stage.camera_height).loss)
 
     assert spread(1.0) < 0.7 * spread(0.0)

@@ -87,7 +87,7 @@ def light_through(loss: LossConfig) -> float:
     photographs, gray = Gray(), (128 / 255,) * 3
     stage = replace(stage, config=config, background=gray, frozen_anchors=None, images=photographs)
     train(state, stage, stop=lambda: False, after_step=lambda *_: None)
-    model = state.model(stage.voxel_size, gray)
+    model = state.model(stage)
     return float((1.0 - render(model, photographs.camera(0)).alpha.clamp(0, 1)).quantile(0.5))
 
 

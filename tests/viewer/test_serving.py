@@ -357,6 +357,7 @@ def test_a_run_that_trains_is_shown_as_it_was_saved_last(run, viewer, guest, tmp
     assert last.name == "training"
     assert "60 iterations" in last.warning
     assert np.array_equal(last.model.anchors.features, finished.model.anchors.features)
+    assert last.model.photograph_pixel == pytest.approx(finished.model.photograph_pixel, rel=0.2)
     assert "**coarse** stopped" in run_status_markdown(RunFolder(unfinished))
     with pytest.raises(RunError):
         open_run_or_checkpoint(unfinished, "merged")

@@ -99,7 +99,7 @@ def scene(tmp_path_factory):
 
 def shown(scene: ViewerScene, model: AnchorModel, camera: Camera) -> np.ndarray:
     """A picture as the viewer shows it: without aliasing."""
-    return to_8bit(render(without_aliasing(model, scene.photograph_pixel), camera).image.numpy())
+    return to_8bit(render(without_aliasing(model, scene.pixel_at_camera_height), camera).image.numpy())
 
 
 @pytest.mark.parametrize("layer", LAYERS)

@@ -25,6 +25,7 @@ from experiments.baselines.turns import JointTraining, split_checkpoint
 from vdgs.model.decoder import Decoder
 from vdgs.system.checkpoints import Checkpoint
 from vdgs.training import TrainingProblem, TrainingState, from_checkpoint, to_checkpoint, train_step
+from vdgs.training.training_state import SHARED_TENSORS
 
 #: So many turns has each block at least (choice): a decoder that one block kept for long would forget the others.
 MIN_ROUNDS = 12
@@ -89,7 +90,7 @@ def restore(saved: Checkpoint, problems: Sequence[TrainingProblem], config: Mome
 
 
 def set_trainable(decoder: Decoder, problem: TrainingProblem, trains: bool) -> None:
-    """Whether the heads move; appearance and exposure of images are as the block has them."""
+    """Whether the heads move; what no block moves stays."""
     for name, tensor in decoder.tensors().items():
-        if not name.startswith(("appearance", "exposure")):
+        if not name.startswith(SHARED_TENSORS):
             tensor.requires_grad_(trains and not problem.frozen_decoder)

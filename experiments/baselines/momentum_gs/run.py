@@ -77,7 +77,7 @@ def train_momentum_blocks(
                 )
                 continue
             state = training.states[able.index(plan)]
-            model = state.model(coarse.voxel_size, coarse.background, replace(of_block, iterations=state.iteration))
+            model = state.model(problems[able.index(plan)], replace(of_block, iterations=state.iteration))
             finish_stage(folders[index], state, model, console, plan.mean_area)
 
 

@@ -88,7 +88,7 @@ def train_levels(
     )  # fmt: skip
     train_with_checkpoints(folder, state, problem, CheckpointOptions(), console)
     metadata = ModelMetadata(capture=capture_metadata(capture), version=__version__, iterations=state.iteration)
-    anchors = state.model(octree.voxel, problem.background, metadata)
+    anchors = state.model(problem, metadata)
     model = OctreeModel(anchors, state.levels, state.bias, (octree,))
     model.save(folder.path)
     finish_stage(folder, state, anchors, console)

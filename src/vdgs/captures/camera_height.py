@@ -47,7 +47,7 @@ def offset_rate_factor(capture: Capture, config: TrainConfig) -> float:
     return 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()) / capture.ground.scale
 
 
-def photograph_pixel(height: float, cameras: Iterable[Camera]) -> float:
+def pixel_at_camera_height(height: float, cameras: Iterable[Camera]) -> float:
     """Side of what a pixel of the training photographs shows from so far away (`camera_height`), at the median of
     their focal lengths."""
     return height / float(np.median([max(camera.fx, camera.fy) for camera in cameras]))

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from vdgs.captures.camera_height import photograph_pixel
+from vdgs.captures.camera_height import pixel_at_camera_height
 from vdgs.export.bake import BakeViews, fit_gaussians, gaussian_count, view_contributions
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.constants import DILATION_PX2
@@ -147,7 +147,7 @@ class CameraTable:
 
     def __init__(self, cameras: Sequence[Camera], height: float) -> None:
         """`height`: how far they are from what they see (`captures.camera_height`)."""
-        self._cameras, self.pixel = cameras, photograph_pixel(height, cameras)
+        self._cameras, self.pixel = cameras, pixel_at_camera_height(height, cameras)
         self._places = np.stack([camera.position for camera in cameras])
 
     def choose(self, positions: Float[np.ndarray, "n 3"]) -> list[Camera]:
@@ -173,7 +173,7 @@ class CameraTable:
 def leaf_gaussians(model: AnchorModel, cameras: CameraTable, edge: float) -> tuple[Gaussians, float]:
     """What a leaf draws instead of its anchors, and how far off it is."""
     baked, pixels = bake_leaf(model, cameras)
-    baked = with_learnt_blur(baked, cameras.pixel)
+    baked = with_learnt_blur(baked, max(cameras.pixel, model.photograph_pixel))
     cell = edge / CELLS_PER_EDGE
     merged, error = merge_cells(baked, cell, np.zeros(len(baked)), pixels.astype(np.float64))
     return merged, max(error, MIN_LEAF_ERROR * cell)

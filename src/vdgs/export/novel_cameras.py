@@ -51,7 +51,7 @@ def endless_cameras(training: Sequence[Camera]) -> Iterator[Camera]:
 
 def novel_cameras(cameras: Sequence[Camera], seed: int, include_isolated: bool = False) -> list[Camera]:
     """Each camera that has neighbors somewhere between itself and these, in their mean by random weights, all equally
-    likely, and turned a little. With `alone` also those that have none, turned where they are."""
+    likely, and turned a little. With `include_isolated` also those that have none, turned where they are."""
     places = np.array([camera.position for camera in cameras])
     forward = np.array([camera.forward for camera in cameras])
     generator = np.random.default_rng(seed)

@@ -89,11 +89,10 @@ class AnchorModel:
         content: dict[str, object] = {
             "voxel": self.voxel_size,
             "background": self.background,
+            "photograph_pixel": self.photograph_pixel,
             "facts": self.metadata.to_dict(),
             "crc32": tensors_crc32(tensors),
         }
-        if self.photograph_pixel:
-            content["photograph_pixel"] = self.photograph_pixel
         if self.decoder_spans:
             content["parts"] = [part.count for part in self.decoder_spans]
         # A single key: several would be written in an order that varies.
@@ -122,7 +121,7 @@ class AnchorModel:
             red, green, blue = (float(value) for value in known["background"])
             model = AnchorModel(
                 anchors=anchors, decoder=decoder, voxel_size=float(known["voxel"]), background=(red, green, blue),
-                photograph_pixel=_pixel_size(known.get("photograph_pixel", 0.0)),
+                photograph_pixel=_pixel_size(known["photograph_pixel"]),
                 metadata=ModelMetadata.from_dict(known["facts"]), decoder_spans=parts,
             )  # fmt: skip
             if checked:

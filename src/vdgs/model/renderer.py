@@ -47,12 +47,12 @@ class Antialiased:
     Each splat is drawn with a blur of 0.3 px². A model has learnt the blur of the pixels of its photographs; larger
     pixels enlarge what it shows, so that the nearest splats hide the others. Splats become more transparent here by as
     much as they grow (Mip-Splatting, eq. 9; gsplat's `rasterize_mode="antialiased"`), but for the learnt part of the
-    blur: from where the photographs were taken, and nearer, no bit changes.
+    blur: of what is as far away as the scene is from the cameras of the photographs, or nearer, no bit changes.
     """
 
     model: AnchorModel
     #: What a pixel of the photographs shows of the scene, in units of the ground frame
-    #: (`captures.camera_height.photograph_pixel`).
+    #: (`captures.camera_height.pixel_at_camera_height`). At least the model's own `photograph_pixel` counts.
     pixel: float
 
     @property
@@ -66,7 +66,7 @@ class Antialiased:
     def view_splats(self, camera: Camera, image_index: int | None = None) -> tuple[Int64[Tensor, " m"], Splats]:
         """The splats of a view, and the anchor or place that each is of."""
         rows, splats = view_splats(self.model, camera, image_index)
-        return rows, compensated_splats(splats, camera, self.pixel)
+        return rows, compensated_splats(splats, camera, max(self.pixel, self.model.photograph_pixel))
 
     def without_aliasing(self, pixel: float) -> LodDrawable:
         return Antialiased(self.model, pixel)

@@ -197,8 +197,7 @@ def _train(
         )
         train_with_checkpoints(folder, state, stage, options, console)
     metadata = replace(metadata, iterations=state.iteration, decoder=method.block.decoder)
-    model = state.model(coarse.voxel_size, coarse.background, metadata, coarse.photograph_pixel)
-    finish_stage(folder, state, model, console, plan.mean_area)
+    finish_stage(folder, state, state.model(stage, metadata), console, plan.mean_area)
 
 
 def keep_coarse_block(folder: StageFolder, model: AnchorModel, views: int, console: Console) -> None:

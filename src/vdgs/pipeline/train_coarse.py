@@ -118,8 +118,7 @@ def _train(
     metadata = ModelMetadata(
         capture=capture_metadata(capture), version=__version__, iterations=state.iteration, key=run.keys().coarse
     )
-    model = state.model(stage.voxel_size, stage.background, metadata, stage.photograph_pixel)
-    finish_stage(folder, state, model, console)
+    finish_stage(folder, state, state.model(stage, metadata), console)
 
 
 def open_training_images(capture: Capture, config: TrainConfig, budget_bytes: int) -> ImageCache:

@@ -155,7 +155,7 @@ def _run(state: TrainingState, problem: TrainingProblem, stage: str, callbacks: 
 
 def _result(state: TrainingState, problem: TrainingProblem, metadata: ModelMetadata) -> AnchorModel:
     """The model that training has arrived at, which nothing trains any more."""
-    model = state.model(problem.voxel_size, problem.background, metadata, problem.photograph_pixel)
+    model = state.model(problem, metadata)
     return replace(model, decoder=model.decoder.copy())
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from rich.console import Console
 
-from vdgs.captures.camera_height import photograph_pixel
+from vdgs.captures.camera_height import pixel_at_camera_height
 from vdgs.captures.capture_metadata import check_same_capture
 from vdgs.captures.output_guard import check_not_among_folders
 from vdgs.config.commands import MAX_RENDER_SIDE_PX, RENDER_BYTES_PER_PIXEL, RenderRequest
@@ -65,7 +65,8 @@ class _Render:
         """One frame per camera, in order."""
         shown = self.scene
         if self.request.is_antialiased:
-            shown = without_aliasing(shown, photograph_pixel(self.run_cameras.camera_height, self.run_cameras.cameras))
+            known = self.run_cameras
+            shown = without_aliasing(shown, pixel_at_camera_height(known.camera_height, known.cameras))
         for name, camera in track(self.named, "rendering", len(self.named), self.console):
             check_stop_requested()
             if scalar_map is None:

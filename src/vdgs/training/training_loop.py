@@ -108,12 +108,7 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
 
     growing = iteration + 1 <= config.densify.stop_fraction * config.iterations
     if growing and iteration + 1 > config.densify.stats_start:
-        # Seen as V counts it: an anchor whose center lies outside the image is not pruned for showing nothing there.
-        kernels = get_backend(stage.device)
-        inside = kernels.mark_visible(state.anchors.positions[rows], camera)
-        kernels.add_view_statistics(
-            state.statistics, rows, inside, drawn.source, drawn.opacities, gradients.means_px, *camera.full_size
-        )
+        _count_view(state, rows, camera, drawn, gradients)
     state.iteration += 1
     report = StepReport(loss=value, l1=l1, ssim=ssim, visible=len(rows), splats=len(drawn.source))
     if growing and state.iteration >= config.densify.start and state.iteration % config.densify.every == 0:
@@ -128,6 +123,19 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
     _smooth(state, value, psnr)
     state.is_consistent = True
     return report
+
+
+def _count_view(
+    state: TrainingState, rows: Tensor, camera: Camera, drawn: RenderedTrainingView, gradients: SplatGradients
+) -> None:
+    """Add a view to the statistics of growth. Seen is what V counts: an anchor whose center lies outside the image is
+    not pruned for showing nothing there."""
+    positions = state.anchors.positions[rows]
+    kernels = get_backend(positions.device)
+    kernels.add_view_statistics(
+        state.statistics, rows, kernels.mark_visible(positions, camera), drawn.source, drawn.opacities,
+        gradients.means_px, *camera.full_size,
+    )  # fmt: skip
 
 
 @torch.no_grad()

@@ -26,6 +26,9 @@ from vdgs.training.weight_averaging import ModelAverage
 
 #: What is trained: the whole scene, or one block of it.
 StageKind = Literal["coarse", "block"]
+#: How the names of the decoder's tensors begin that no block moves: the mean appearance and exposure, in which other
+#: photographs are drawn, must stay the same in all blocks, and so must what is behind all of them.
+SHARED_TENSORS = ("appearance", "exposure", "envmap")
 
 
 @runtime_checkable
@@ -115,15 +118,12 @@ class TrainingState:
         anchors = Anchors(self.anchors.positions, **self.model_average.anchors)
         return anchors, Decoder.from_tensors(self.model_average.decoder)
 
-    def model(
-        self, voxel: float, background: tuple[float, float, float], metadata: ModelMetadata | None = None,
-        pixel: float = 0.0,
-    ) -> AnchorModel:  # fmt: skip
+    def model(self, stage: TrainingProblem, metadata: ModelMetadata | None = None) -> AnchorModel:
         """The model of `result`."""
-        (anchors, decoder), metadata = self.result(), metadata or ModelMetadata()
+        anchors, decoder = self.result()
         return AnchorModel(
-            anchors=anchors, decoder=decoder, voxel_size=voxel, background=background, metadata=metadata,
-            photograph_pixel=pixel,
+            anchors=anchors, decoder=decoder, voxel_size=stage.voxel_size, background=stage.background,
+            photograph_pixel=stage.photograph_pixel, metadata=metadata or ModelMetadata(),
         )  # fmt: skip
 
 
@@ -212,9 +212,7 @@ def initial_state(anchors: Anchors, decoder: Decoder, stage: TrainingProblem) ->
     """A state before the first step. The anchors' tensors are moved in place: give copies of what must stay."""
     n, k, device = len(anchors), anchors.offsets.shape[1], anchors.positions.device
     for name, tensor in decoder.tensors().items():
-        # The mean appearance and exposure, in which other photographs are drawn, must stay the same in all blocks, and
-        # so must what is behind all of them.
-        shared = stage.kind == "block" and name.startswith(("appearance", "exposure", "envmap"))
+        shared = stage.kind == "block" and name.startswith(SHARED_TENSORS)
         tensor.requires_grad_(not stage.frozen_decoder and not shared)
     compensation = CompensationState.zeros(n, k, device) if stage.config.compensation.enabled else None
     return TrainingState(

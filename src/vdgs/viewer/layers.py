@@ -130,7 +130,7 @@ class Painter:
         )  # fmt: skip
         self.drawn_anchors += count
         if display.layer == "color":
-            shown = without_aliasing(level.model, self._scene.photograph_pixel)
+            shown = without_aliasing(level.model, self._scene.pixel_at_camera_height)
             return to_8bit(render(shown, camera).image.cpu().numpy())
         if display.layer == "blocks":
             return _render_block_tints(level.model, self._scene.level_tint(name, level, camera), camera)

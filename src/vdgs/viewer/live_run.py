@@ -11,6 +11,7 @@ import torch
 from vdgs.config.commands import ModelName
 from vdgs.errors import RunError, VdgsError
 from vdgs.model.anchor_model import AnchorModel, ModelMetadata
+from vdgs.model.scale_bounds import photograph_pixel
 from vdgs.partition.merging import merge_blocks
 from vdgs.runs.lod_folder import has_lod
 from vdgs.runs.model_integrity import load_verified
@@ -97,9 +98,11 @@ def _coarse_from_checkpoint(run: RunFolder, device: str) -> OpenedRun:
     capture = open_capture(run)
     colors = capture.point_colors.mean(axis=0) / 255 if len(capture.points) else np.zeros(3)
     background = (float(colors[0]), float(colors[1]), float(colors[2]))
-    model = AnchorModel(anchors=saved.anchors, decoder=saved.decoder, voxel_size=1.0, background=background).to(
-        torch.device(device)
-    )
+    config, cameras = run.method().training.model, [view.camera for view in capture.train_views]
+    pixel = photograph_pixel(saved.anchors.positions, cameras) if config.photograph_blur else 0.0
+    model = AnchorModel(
+        anchors=saved.anchors, decoder=saved.decoder, voxel_size=1.0, background=background, photograph_pixel=pixel
+    ).to(torch.device(device))
     why = f"this is the coarse model after {saved.iteration:,} iterations; its background is not known yet"
     return OpenedRun(
         folder=run, model=model, model_path=saved.file, name=UNFINISHED_MODEL, status=run.coarse.status(), key=key,
@@ -141,10 +144,4 @@ def _load_block_so_far(
     if saved is None:
         return None
     metadata = ModelMetadata(decoder="own" if own_decoder else None)
-    return AnchorModel(
-        anchors=saved.anchors,
-        decoder=saved.decoder,
-        voxel_size=coarse.model.voxel_size,
-        background=coarse.model.background,
-        metadata=metadata,
-    )
+    return replace(coarse.model, anchors=saved.anchors, decoder=saved.decoder, metadata=metadata)

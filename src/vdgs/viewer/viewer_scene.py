@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vdgs.captures.camera_height import camera_height, photograph_pixel
+from vdgs.captures.camera_height import camera_height, pixel_at_camera_height
 from vdgs.captures.image_cache import ImageCache
 from vdgs.errors import VdgsError
 from vdgs.evaluation.view_exposures import ViewExposures, make_exposures
@@ -212,9 +212,9 @@ class ViewerScene:
         return torch.as_tensor(colors, dtype=torch.float32, device=places.device)
 
     @cached_property
-    def photograph_pixel(self) -> float:
-        """What a pixel of the photographs shows, in units of the ground frame."""
-        return photograph_pixel(camera_height(self.capture), (view.camera for view in self.capture.train_views))
+    def pixel_at_camera_height(self) -> float:
+        """What a pixel of the photographs shows from their height, in units of the ground frame."""
+        return pixel_at_camera_height(camera_height(self.capture), (view.camera for view in self.capture.train_views))
 
     @cached_property
     def images(self) -> ImageCache:

@@ -88,15 +88,20 @@ def in_sky(
     points: Float[np.ndarray, "n 3"], cameras: Sequence[Camera], skylines: Sequence[Skyline | None]
 ) -> Bool[np.ndarray, " n"]:
     """Which points more than half of the cameras that hold them in their pictures see above horizon and skyline."""
-    held, above = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
+    sky = np.zeros(len(points), bool)
+    # What lies below all cameras is below all horizons.
+    higher = np.flatnonzero(points[:, 2] > min((camera.position[2] for camera in cameras), default=np.inf))
+    places = points[higher]
+    held, above = np.zeros(len(places), np.int64), np.zeros(len(places), np.int64)
     for camera, skyline in zip(cameras, skylines, strict=True):
-        inside = np.flatnonzero(camera.in_frustum(points))
+        inside = np.flatnonzero(camera.in_frustum(places))
         held[inside] += 1
         if skyline is not None:
-            rays = torch.from_numpy(points[inside] - camera.position).float()
+            rays = torch.from_numpy(places[inside] - camera.position).float()
             rays = rays / rays.norm(dim=-1, keepdim=True)
             above[inside] += (above_skyline(rays, skyline) & (rays[:, 2] > 0)).numpy()
-    return 2 * above > held
+    sky[higher] = 2 * above > held
+    return sky
 
 
 def initial_envmap(
