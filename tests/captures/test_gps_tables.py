@@ -59,11 +59,14 @@ TABLES = {
     "rows without a position": "SourceFile\tGPSLatitude\tGPSLongitude\tGPSAltitude\nb.jpg\t-\t-\t-\n"
     "c.jpg\tNaN\tnan\tnan\na.jpg\t-33.5\t-70.6\t500\n",
     "heights over the ground": "name,lat,lon,height,altitude\na.jpg,-33.5,-70.6,50,500\n",
+    "alturas": "Nombre,Latitud,Longitud,Altura,Altitud\na.jpg,-33.5,-70.6,50,500\n",
     "german": "Dateiname;Breitengrad;Längengrad (°);Höhe [m]\na.jpg;-33,5;-70,6;500,0\n",
     "spanish": "Nombre,Latitud,Longitud,Altitud\na.jpg,-33.5,-70.6,500\n",
-    "chinese": "照片名称,纬度,经度,高度\na.jpg,-33.5,-70.6,500\n",
+    "chinese": "照片名称,纬度（°）,经度（°）,高度（m）,海拔（m）\na.jpg,-33.5,-70.6,50,500\n",
     "emlid": "Image name,Latitude,Longitude,Ellipsoidal height,RMS easting,RMS northing,RMS elevation\n"
     "a.jpg,-33.5,-70.6,500,0.5,0.3,1\n",
+    "centimetres": "name,lat,lon,alt (cm),RMS easting (cm),RMS northing (mm),RMS elevation [m]\n"
+    "a.jpg,-33.5,-70.6,50000,50,300,1\n",
     "moments without a fix": "1\t2.1\t[2]\t 0,N\t 0,E\t 0,V\t0.0,Lat\t0.0,Lon\t0.0,Ellh\t0, 0, 0\t0,Q\n"
     "1\t280.1\t[2145]\t 12,N\t 34,E\t -20,V\t-33.5,Lat\t-70.6,Lon\t500,Ellh\t0.01, 0.02, 0.03\t50,Q\n2\t280.2\n",
     "dji moments": "1\t280234.1\t[2145]\t  12,N\t 34,E\t -20,V\t-33.5,Lat\t-70.6,Lon\t500,Ellh\t"
@@ -83,6 +86,23 @@ def test_tables_are_read_as_programs_write_them(tmp_path, text):
         assert row.position == pytest.approx(expected, abs=2e-6)
         assert row.name.endswith(("a.jpg", "a", "1"))
         assert row.gps_std == ((0.5, 1.0) if "0.5 1\n" in text or "RMS" in text else row.gps_std)
+
+
+@pytest.mark.parametrize(("east", "north"), [("0.5", ""), ("", "0.5"), ("-", "0.5")])
+def test_an_accuracy_without_its_other_side_or_in_degrees_is_not_believed(tmp_path, east, north):
+    for unit, sides in (("m", (east, north)), ("°", ("0.5", "0.5"))):
+        names = f"name,lat,lon,alt,RMS easting ({unit}),RMS northing ({unit}),RMS elevation (m)"
+        (file := tmp_path / "table.csv").write_text(f"{names}\na.jpg,-33.5,-70.6,500,{','.join(sides)},1\n")
+        assert read_gps_table(file).rows[0].gps_std is None
+
+
+def test_columns_of_heights_are_named_in_tables_of_any_system(tmp_path):
+    file = tmp_path / "table.csv"
+    for columns in ("lat,lon,height,altitude", "x,y,height,altitude"):
+        file.write_text(f"EPSG:4326\nname,{columns}\na.jpg,-33.5,-70.6,50,500\n"[10 * columns.startswith("lat") :])
+        if columns.startswith("x"):
+            pytest.importorskip("pyproj")
+        assert "'altitude', not of 'height'" in "".join(read_gps_table(file).notes)
 
 
 @pytest.mark.parametrize(

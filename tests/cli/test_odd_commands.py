@@ -121,6 +121,16 @@ def test_a_project_is_needed_for_a_folder_of_its_photographs(tmp_path, capsys):
     assert "--images images_4: is for projects" in capsys.readouterr().err
 
 
+def test_a_folder_inside_a_run_is_answered_with_the_run_and_others_with_none(tmp_path, capsys):
+    for folder in ("run/coarse", "run/merged", "other", "merged"):
+        (tmp_path / folder).mkdir(parents=True, exist_ok=True)
+    (tmp_path / "run" / "config.yaml").touch()
+    for folder, said in (("run/merged", f"It lies in one: {tmp_path / 'run'}"), ("other", "Train first")):
+        with pytest.raises(SystemExit):
+            main(["eval", str(tmp_path / folder)])
+        assert said in " ".join(capsys.readouterr().err.split())
+
+
 @pytest.mark.parametrize("target", ["link", "gone"])
 @pytest.mark.parametrize("verb", ["status", "inspect"])
 def test_a_link_that_leads_nowhere_is_called_so(verb, target, tmp_path, monkeypatch, capsys):

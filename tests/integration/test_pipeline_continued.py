@@ -17,7 +17,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("pipeline")]
 
 @pytest.mark.parametrize(("number", "blocks"), [(signal.SIGINT, ["00", "01"]), (signal.SIGKILL, ["01"])])
 def test_a_run_that_is_cut_off_while_blocks_train_continues_to_the_same_bits(capture, unbroken, copied, number, blocks):
-    """That the other signals are taken as Ctrl-C is: test_coarse.py."""
+    """test_coarse.py shows that each other signal stops training as Ctrl-C does."""
     for name in ("merged", "evaluation", *(f"blocks/{block}" for block in blocks)):
         shutil.rmtree(copied / name)
     command = ("run", capture, "--output", copied, *SETTINGS)

@@ -25,7 +25,7 @@ from support.clusters import (
     shard_of,
     waiting_shards,
 )  # fmt: skip
-from support.commands import begun, do_tasks_here, python, vdgs, wait_until
+from support.commands import begun, python, vdgs, wait_until
 from vdgs import cli
 
 pytestmark = [
@@ -124,8 +124,9 @@ def test_a_driver_that_was_killed_finds_its_shards_again_and_stops_them_when_ask
         assert "every shard that was at work is saved" in done.stderr
         assert not any(alive(process) for process in first.paused())
     assert {file.stem for file in run.glob("maps/shards/*/*/*.npz")} == {"000000", "000002"}
-    done = vdgs("ortho", run, *FINE, "--jobs", "2", prepare=do_tasks_here)
+    done = vdgs(*command, environment=cluster.token)
     assert done.returncode == 0, done.stderr + done.stdout
+    assert "2 of 2 shards done" in done.stdout
     assert evaluated(run / "maps") == mapped
 
 

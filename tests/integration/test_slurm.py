@@ -20,7 +20,7 @@ from support.clusters import (
     parent_of,
     waiting_shards,
 )  # fmt: skip
-from support.commands import begun, do_tasks_here, vdgs, wait_until
+from support.commands import begun, vdgs, wait_until
 from support.slurm import is_installed, real, stand_in
 from vdgs.config.executor_options import SlurmOptions
 from vdgs.distributed import slurm_commands
@@ -104,7 +104,7 @@ def test_time_limits_kills_and_lost_jobs_end_in_the_models_of_the_local_run(slur
 
 
 def test_a_driver_that_was_killed_finds_its_jobs_again_and_stops_them_when_asked(slurm, uncut, tmp_path):
-    """Two shards that measure views; what they saved leads to the same figures anywhere."""
+    """Two shards that measure views; what they saved leads to the figures of one process."""
     here, run = (copy_run(uncut, tmp_path / name / "run") for name in ("here", "there"))
     assert vdgs("eval", here).returncode == 0
     command = ("eval", run, "--executor", "slurm", *OWN)
@@ -120,8 +120,9 @@ def test_a_driver_that_was_killed_finds_its_jobs_again_and_stops_them_when_asked
         assert not any(alive(process) for process in first.paused())
     (work,) = (run / "coarse/evaluation/shards").iterdir()
     assert {file.stem for file in work.glob("*/*.npz")} == {"000000", "000002"}
-    done = vdgs("eval", run, "--jobs", "2", prepare=do_tasks_here)
+    done = vdgs(*command, environment=variables())
     assert done.returncode == 0, done.stderr + done.stdout
+    assert "2 of 2 shards done" in done.stdout
     assert evaluated(run / "coarse/evaluation") == evaluated(here / "coarse/evaluation")
     assert not (run / "slurm").exists()
 

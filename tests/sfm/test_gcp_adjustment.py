@@ -156,6 +156,7 @@ BAD = {
     "no system": (None, "must name the coordinate system"),
     "no such system": ({"header": "EPSG:999999"}, "must name the coordinate system"),
     "a word for a number": ([{"text": "1 2 three 4 5 DJI_0001.JPG"}], "line 2: .* is not `x y z px py photograph"),
+    "columns in another order": ([{"text": "lat lon alt px py photo"}], "line 2: .* another order than `x y z px py"),
     "too few words": ([{"text": "a 1 2 3"}], "line 2: .* is not `x y z px py photograph.* points alone"),
     "not finite": ([{"text": "nan 2 3 4 5 DJI_0001.JPG"}], "line 2: numbers must be finite"),
     "unknown photograph": ([{"photograph": "DJI_0999.JPG"}], r"1 photographs that are not there; .*DJI_0999\.JPG"),

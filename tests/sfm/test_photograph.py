@@ -26,7 +26,6 @@ from vdgs.sfm.image_list import collect_images, is_image_folder
 from vdgs.sfm.image_metadata import (
     ImageMetadata,
     UnusableImage,
-    attitude_from_aircraft,
     attitude_from_gimbal,
     read_image_metadata,
 )
@@ -36,6 +35,7 @@ from vdgs.sfm.reconstruction_plan import plan_reconstruction
 from vdgs.sfm.xmp import MAX_PACKET_BYTES, first_number, read_xmp
 
 NOISE = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
+PIX4D_PIXELS = {"Camera:PerspectiveFocalLength": "2800", "Camera:PerspectiveFocalLengthUnits": "pixel"}
 
 
 def photograph(folder: Path, number: int, enu: tuple[float, float, float] | None = (0, 0, 40), **more) -> ImageMetadata:
@@ -177,6 +177,7 @@ def test_an_enormous_packet_is_no_trouble(tmp_path):
         pytest.param(
             {}, {}, {"Camera:PerspectiveFocalLength": "4.2", "Camera:PrincipalPoint": "3.0,2.2"}, 0.7, id="Pix4D"
         ),
+        pytest.param({}, {0xA002: 4000}, PIX4D_PIXELS, 0.7, id="Pix4D in pixels"),
         pytest.param({}, {0x920A: float("nan"), 0xA405: 0}, {"drone-dji:DewarpData": "x;"}, None, id="nothing"),
     ],
 )  # fmt: skip
@@ -184,18 +185,6 @@ def test_the_focal_length_is_the_best_that_is_known(tags, details, xmp, focal):
     for width, height in ((1600, 900), (900, 1600), (800, 450)):
         lens = read_lens(tags, details, xmp, width, height)
         assert (lens and lens.focal) == (focal and pytest.approx(focal, abs=1e-3))
-
-
-def test_attitudes_of_gimbal_and_aircraft_agree_straight_down():
-    level = attitude_from_aircraft(30, 0, 0)
-    assert attitude_from_gimbal(30, -90, 0).camera_from_enu == pytest.approx(level.camera_from_enu, abs=1e-12)
-    ahead = -level.camera_from_enu[1]
-    assert ahead == pytest.approx([0.5, np.sqrt(0.75), 0], abs=1e-12)  # the top of the picture looks where it flies
-    assert attitude_from_aircraft(0, 10, 0).camera_from_enu[2] @ [0, 1, 0] > 0.17  # nose up: the view swings ahead
-    assert (
-        attitude_from_aircraft(0, 0, 10).camera_from_enu[2] @ [1, 0, 0] < -0.17
-    )  # right wing down: it swings to the left
-    assert np.linalg.det(attitude_from_gimbal(12, -60, 5).camera_from_enu) == pytest.approx(1)
 
 
 # ------------------------------------------------------------------------------------------------- positions

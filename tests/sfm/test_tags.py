@@ -21,6 +21,7 @@ from vdgs.sfm.image_list import collect_images
 from vdgs.sfm.image_metadata import (
     DEFAULT_ANGLES,
     ImageMetadata,
+    attitude_from_aircraft,
     attitude_from_gimbal,
     read_attitude,
     read_image_metadata,
@@ -161,6 +162,27 @@ def test_altitudes_in_feet_or_over_the_take_off_give_way_to_xmp(in_exif, altitud
     found, datum = read_altitude({5: b"\x00", 6: in_exif}, xmp)
     assert found == altitude
     assert said in datum
+
+
+def test_an_altitude_gives_way_to_no_default_and_not_where_another_source_confirms_it():
+    heights = 'drone-dji:RelativeAltitude="+50.1" drone-dji:AbsoluteAltitude='
+    for xmp in ('"+0.00"', '"+90.00" drone-dji:AltitudeWGS84="50.0"'):  # a take-off at the sea
+        assert read_altitude({5: b"\x00", 6: 50.0}, packet(heights + xmp))[0] == 50.0
+    assert read_altitude({5: b"\x00", 6: 50.6}, packet(f'{heights}"+90.00"'))[0] == 50.6  # near the height by chance
+    found = read_altitude({5: b"\x00", 6: 0.0}, packet(f'{heights}"+90.00" drone-dji:AltitudeType="RtkAlt"'))
+    assert found == (90.0, "AbsoluteAltitude in XMP (RtkAlt) as recorded")
+
+
+def test_attitudes_of_gimbal_and_aircraft_agree_straight_down():
+    level = attitude_from_aircraft(30, 0, 0)
+    assert attitude_from_gimbal(30, -90, 0).camera_from_enu == pytest.approx(level.camera_from_enu, abs=1e-12)
+    ahead = -level.camera_from_enu[1]
+    assert ahead == pytest.approx([0.5, np.sqrt(0.75), 0], abs=1e-12)  # the top of the picture looks where it flies
+    assert attitude_from_aircraft(0, 10, 0).camera_from_enu[2] @ [0, 1, 0] > 0.17  # nose up: the view swings ahead
+    assert (
+        attitude_from_aircraft(0, 0, 10).camera_from_enu[2] @ [1, 0, 0] < -0.17
+    )  # right wing down: it swings to the left
+    assert np.linalg.det(attitude_from_gimbal(12, -60, 5).camera_from_enu) == pytest.approx(1)
 
 
 def test_no_flight_is_far_below_the_sea():

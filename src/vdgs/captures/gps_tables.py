@@ -9,9 +9,10 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -67,6 +68,7 @@ _COLUMNS: dict[str, frozenset[str]] = {
         "system": "epsg crs srs epsgcode",
     }.items()
 }  # fmt: skip
+_DEVIATIONS = ("across", "upwards", "eastwards", "northwards")
 _UNIT = re.compile(
     r"[\[(][^\])]*[\])]|[_ ](?:decimal degrees|dd|deg|degrees|m|met(?:er|re)s?|(?:us[ _]?)?f(?:oo|ee)?t)$"
 )
@@ -76,7 +78,10 @@ FOOT_M, SURVEY_FOOT_M = 0.3048, 1200 / 3937
 #: What programs write where they know nothing.
 _UNKNOWN = frozenset({"", "nan", "none", "null", "-", "n/a", "na"})
 #: Names of columns of altitudes that others of a table give way to: heights may be those over the ground.
-_ALTITUDE = re.compile(r"alt|elli?p|elev")
+_ALTITUDE = re.compile(r"alt(?!ura)|elli?p|ellh|elev|海拔", re.IGNORECASE)
+#: Units of columns: parts of metres, and angles.
+_PARTS = re.compile(r"[\[( _](mm|cm|km)\b", re.IGNORECASE)
+_ANGLES = re.compile(r"°|[\[( _](?:deg|degrees|rad)\b", re.IGNORECASE)
 #: Words of exiftool behind altitudes below the sea.
 _BELOW = re.compile(r"below|^1$", re.IGNORECASE)
 _LEADING_NUMBER = re.compile(r"\s*([+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)\s*(?:m|metres|meters)?\b", re.IGNORECASE)
@@ -119,6 +124,8 @@ class _Columns(NamedTuple):
     """The order is that of programs that write no header."""
     heights: tuple[str, ...] = ()
     """Names of the columns of altitudes: the one that is read, and those that are not."""
+    deviation_units: Mapping[str, float] = MappingProxyType({})
+    """Metres in one of each of its accuracies, NaN for angles."""
 
 
 def read_gps_table(file: Path) -> GpsTable:
@@ -175,22 +182,17 @@ def _after_colon(text: str) -> str:
 def _is_header(line: Line) -> bool:
     """Whether a line that begins like a comment names the columns (Metashape, RealityScan)."""
     words = rows_of([Line(line.number, line.text.lstrip("# "))])[0].words
-    return {"name"} < set(_known(words))
+    return {"name"} < set(known_columns(words))
 
 
-def _known(words: Sequence[str]) -> dict[str, int]:
+def known_columns(words: Sequence[str]) -> dict[str, int]:
     """Which of these names of columns is what."""
     found: dict[str, int] = {}
     for k, word in enumerate(words):
-        letters = unicodedata.normalize("NFKD", _UNIT.sub("", word.lower()))  # accents are signs of their own
-        plain = re.sub(r"[\W_]", "", letters)
+        letters = unicodedata.normalize("NFKD", word.lower())  # accents are signs of their own, brackets are narrow
+        plain = re.sub(r"[\W_]", "", _UNIT.sub("", letters))
         what = next((what for what, names in _COLUMNS.items() if plain in names), None)
-        if (
-            what == "alt"
-            and what in found
-            and _ALTITUDE.search(plain)
-            and not _ALTITUDE.search(words[found[what]].lower())
-        ):
+        if what == "alt" and what in found and _ALTITUDE.search(word) and not _ALTITUDE.search(words[found[what]]):
             found[what] = k
         elif what is not None:
             found.setdefault(what, k)
@@ -199,12 +201,14 @@ def _known(words: Sequence[str]) -> dict[str, int]:
 
 def _columns(rows: list[Row], system: str | None, file: Path) -> tuple[_Columns, list[Row]]:
     """The columns and the rows below their names. Raises CaptureError."""
-    known = _known(rows[0].words)
+    known = known_columns(rows[0].words)
     unit = _meters(rows[0].words[known["alt"]]) if "alt" in known else 1.0
+    others = [word for k, word in enumerate(rows[0].words) if "alt" in known_columns([word]) and k != known["alt"]]
+    heights = (rows[0].words[known["alt"]], *others) if others else ()
+    named = {what: rows[0].words[known[what]] for what in _DEVIATIONS if what in known}
+    units = {what: math.nan if _ANGLES.search(word) else _meters(word) for what, word in named.items()}
     if {"name", "lat", "lon"} <= set(known):
-        others = [word for k, word in enumerate(rows[0].words) if "alt" in _known([word]) and k != known["alt"]]
-        heights = (rows[0].words[known["alt"]], *others) if others else ()
-        return _Columns(known, None, unit, heights=heights), rows[1:]
+        return _Columns(known, None, unit, heights=heights, deviation_units=units), rows[1:]
     if {"lat", "lon"} <= set(known):
         raise CaptureError(f"{file}: has positions but no column of photographs' names: it is {_BY_TIME}")
     if {"name", "x", "y"} <= set(known):
@@ -217,7 +221,7 @@ def _columns(rows: list[Row], system: str | None, file: Path) -> tuple[_Columns,
                 "say of which coordinate system. Write its code as a first line of its own, such as EPSG:32633, or "
                 "give name,lat,lon,alt."
             )
-        return _Columns(known, system, unit), rows[1:]
+        return _Columns(known, system, unit, heights=heights, deviation_units=units), rows[1:]
     if not _has_numbers(rows[0]):
         found = ", ".join(sorted(word for word in rows[0].words if word)) or "nothing"
         marks = "" if system is None else " A list of control points is given as --gcp."
@@ -242,8 +246,10 @@ def _columns(rows: list[Row], system: str | None, file: Path) -> tuple[_Columns,
 
 
 def _meters(word: str) -> float:
-    """How many metres the unit has that a word names: feet, US survey feet, or metres."""
+    """How many metres the unit has that a word names: feet, US survey feet, parts of metres, or metres."""
     feet = _FEET.search(word)
+    if parts := _PARTS.search(word):
+        return {"mm": 1e-3, "cm": 1e-2, "km": 1e3}[parts[1].lower()]
     return 1.0 if feet is None else SURVEY_FOOT_M if feet[1] else FOOT_M
 
 
@@ -334,9 +340,11 @@ def _projected(rows: Sequence[Row], columns: _Columns, file: Path) -> list[tuple
 
 
 def _deviations(row: Row, columns: _Columns) -> tuple[float, float] | None:
-    across, upwards = (_plain_number(_word(row, columns, what)) for what in ("across", "upwards"))
+    across, upwards, *sides = (
+        _plain_number(_word(row, columns, what)) * columns.deviation_units.get(what, 1.0) for what in _DEVIATIONS
+    )
     if "across" not in columns.where:
-        across = max(_plain_number(_word(row, columns, what)) for what in ("eastwards", "northwards"))
+        across = float(np.max(sides))  # NaN where one of them is not known
     return (across, upwards) if 0 < across < 1000 and 0 < upwards < 1000 else None
 
 

@@ -105,7 +105,14 @@ def _check_input(option: Option, path: Path) -> None:
         raise VdgsError(f"{named}{path}: {fault}{suggest_path(path)}")
     begins = (path / "capture").is_dir()  # a run that still makes a capture of photographs
     if is_run and not begins and not (path / "config.yaml").is_file():
-        above = next((each for each in path.absolute().parents if (each / "merged").is_dir()), None)
+        above = next(
+            (
+                each
+                for each in path.absolute().parents
+                if (each / "config.yaml").is_file() and (each / "coarse").is_dir()
+            ),
+            None,
+        )
         remedy = f"It lies in one: {above}" if above else "Train first: vdgs run CAPTURE --output RUN"
         raise RunError(f"{path}: is not a run folder (no config.yaml). {remedy}")
 

@@ -18,6 +18,8 @@ LOWEST_M = -450
 HIGHEST_M = 20_000.0
 #: Altitudes in EXIF and XMP that are farther apart (metres) are not of one reference (choice).
 MOST_APART_M = 30.0
+#: Heights that differ by less (metres) are one number, written twice: near the sea, altitudes are nearly heights.
+SAME_HEIGHT_M = 0.2
 #: EXIF's tags: latitude and longitude, each behind its reference.
 _TAGS = {"latitude": (1, 2), "longitude": (3, 4)}
 #: XMP's names for them, the makers' (with their misspelling) before Adobe's.
@@ -90,20 +92,21 @@ def read_altitude(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[float
     elif str(reference).strip("\x00 ") in ("1", "3") or reference in (1, 3):
         value = -abs(value)
     absolute = first_number(xmp, "AbsoluteAltitude")
-    source = "EXIF GPSAltitude"
-    if value is not None and absolute is not None and _is_absolute_otherwise(value, absolute, xmp):
-        source = source if abs(abs(value) - abs(absolute)) < 1 else "AbsoluteAltitude in XMP"
+    ellipsoidal = first_number(xmp, "AltitudeWGS84")
+    source, named = "EXIF GPSAltitude", text(xmp, "AltitudeType", "Camera:VertCS")
+    confirmed = bool(value is not None and ellipsoidal and abs(ellipsoidal - value) < 0.01)
+    if value is not None and absolute and not confirmed and _is_absolute_otherwise(value, absolute, xmp):
+        if abs(abs(value) - abs(absolute)) >= 1:
+            source, named = "AbsoluteAltitude in XMP", f"AbsoluteAltitude in XMP ({named})" if named else ""
         value = absolute
     if value is None or abs(value) > HIGHEST_M:
         return None, ""
     if value < LOWEST_M:
         return -value, "EXIF GPSAltitude, whose mark 'below sea level' cannot be true"
-    ellipsoidal = first_number(xmp, "AltitudeWGS84")
     if ellipsoidal is not None and abs(ellipsoidal - value) < 0.01:
         return value, "above the WGS 84 ellipsoid (AltitudeWGS84)"
-    if absolute is not None and abs(value - absolute) > MOST_APART_M:
+    if absolute and abs(value - absolute) > MOST_APART_M:
         return value, "EXIF GPSAltitude as recorded, which differs from AbsoluteAltitude in XMP by more than 30 m"
-    named = text(xmp, "AltitudeType", "Camera:VertCS")
     return value, f"{named} as recorded" if named else f"{source} as recorded, datum not stated"
 
 
@@ -111,8 +114,9 @@ def _is_absolute_otherwise(value: float, absolute: float, xmp: Mapping[str, str]
     """Whether EXIF's altitude is the one in XMP with another reference, in feet, or a default of firmware that leaves
     it empty; or is the height over the take-off instead."""
     over_take_off = first_number(xmp, "RelativeAltitude")
-    ways = (0.0, -absolute, absolute / FOOT_M, *([over_take_off] if over_take_off is not None else []))
-    return any(abs(value - way) < 1 for way in ways)
+    if value == 0 or (over_take_off is not None and abs(value - over_take_off) < SAME_HEIGHT_M):
+        return True
+    return any(abs(value - way) < 1 for way in (-absolute, absolute / FOOT_M))
 
 
 def _angle(gps: Mapping[int, Any], axis: str) -> tuple[float, bool] | None:

@@ -68,7 +68,7 @@ def read_lens(
         (_times(_calibrated(xmp, original), kept), CALIBRATED_SOURCE),
         (_times(_by_sensor(focal_mm, _sensor(details, original)), kept), SENSOR),
         (_times(_by_sensor(focal_mm, SENSOR_WIDTH_MM.get(model)), kept), f"EXIF's focal length, the sensor of {model}"),
-        (_times(_by_pix4d(xmp, _sensor(details, original)), kept), PIX4D_SOURCE),
+        (_times(_by_pix4d(xmp, _sensor(details, original), original), kept), PIX4D_SOURCE),
     ]
     sides = (_number(details.get(0xA002)) or 0.0, _number(details.get(0xA003)) or 0.0) if cut else (width, height)
     equivalent = as_written = _times(_by_equivalent(equivalent_mm, *sides), kept / zoom)
@@ -90,7 +90,7 @@ def unzoomed(lens: Lens) -> Lens:
 def _agreed(known: list[tuple[float, str]], longer: int, copied: bool) -> tuple[float, str, str]:
     """The first of the ways that most others agree with, its source, and what contradicts it.
 
-    The calibration and EXIF's sensor are one witness: both count pixels of the original, whose size a program that
+    The calibrations and EXIF's sensor are one witness: they count pixels of the original, whose size a program that
     shrinks a photograph may rewrite. Of witnesses that contradict each other the 35 mm equivalent is the likelier:
     it stays right then; but not where it merely repeats the focal length. After it comes the table of sensors.
     """
@@ -115,7 +115,7 @@ def _agreed(known: list[tuple[float, str]], longer: int, copied: bool) -> tuple[
 
 
 def _witness(source: str) -> str:
-    return SENSOR if source == CALIBRATED_SOURCE else source
+    return SENSOR if source in (CALIBRATED_SOURCE, PIX4D_SOURCE) else source
 
 
 def _alike(one: float, other: float) -> bool:
@@ -180,18 +180,22 @@ def _calibrated(xmp: Mapping[str, str], original: float) -> float | None:
     return focal / original if math.isfinite(focal) and focal > 0 else None
 
 
-def _by_pix4d(xmp: Mapping[str, str], sensor_mm: float | None) -> float | None:
-    """Pix4D's names: millimetres, and where the view meets the sensor, near the middle of its width."""
-    focal_mm = _numbers(xmp, "Camera:PerspectiveFocalLength")[0]
-    return _by_sensor(focal_mm, sensor_mm or 2 * _numbers(xmp, "Camera:PrincipalPoint")[0])
+def _by_pix4d(xmp: Mapping[str, str], sensor_mm: float | None, original: float) -> float | None:
+    """Pix4D's names: millimetres, unless the unit is another (pixels), and where the view meets the sensor, near the
+    middle of its width."""
+    focal = _numbers(xmp, "Camera:PerspectiveFocalLength")[0]
+    if text(xmp, "Camera:PerspectiveFocalLengthUnits").lower() not in ("", "mm"):
+        return focal / original
+    return _by_sensor(focal, sensor_mm or 2 * _numbers(xmp, "Camera:PrincipalPoint")[0])
 
 
 def _numbers(xmp: Mapping[str, str], name: str) -> list[float]:
     """The numbers of a value, parted by commas; a zero for nonsense."""
     try:
-        return [float(word) for word in text(xmp, name).split(",")]
+        found = [float(word) for word in text(xmp, name).split(",")]
     except ValueError:
         return [0.0]
+    return found if all(map(math.isfinite, found)) else [0.0]
 
 
 def _sensor(details: Mapping[int, Any], original: float) -> float | None:

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vdgs.captures.coordinate_systems import to_geodetic
+from vdgs.captures.gps_tables import known_columns
 from vdgs.captures.known_distances import MIN_OBSERVATIONS, text_lines
 from vdgs.captures.name_resolution import NameLookup, find_one
 from vdgs.captures.text_tables import Line, Row, rows_of, separator_of
@@ -174,8 +175,21 @@ def _rows(file: Path) -> tuple[str, list[Row]]:
     rows = [Row(line.number, line.text.split()) for line in lines]
     if separator_of([line.text for line in lines]):
         rows = [row if len(row.words) > 5 else plain for row, plain in zip(rows_of(lines), rows, strict=True)]
-    names_columns = bool(rows) and not any(_is_number(word) for word in rows[0].words[:5])
-    return header.text, rows[1:] if names_columns else rows
+    if not rows or any(map(_is_number, rows[0].words[:5])):
+        return header.text, rows
+    _check_order(rows[0], file)
+    return header.text, rows[1:]
+
+
+def _check_order(names: Row, file: Path) -> None:
+    """Raise CaptureError where a line of column names has x, y and z elsewhere than in front."""
+    known = known_columns(names.words)
+    for place, columns in enumerate((("x", "lon"), ("y", "lat"), ("alt",))):
+        if any(known.get(what, place) != place for what in columns):
+            raise CaptureError(
+                f"{file}: line {names.number}: the columns {', '.join(names.words)[:80]} are in another order than "
+                "`x y z px py photograph [name]` (x is east or longitude). Put them into this order."
+            )
 
 
 def _is_number(word: str) -> bool:
