@@ -11,6 +11,7 @@ import gc
 import itertools
 import os
 import re
+import signal
 import sys
 from collections.abc import Generator
 from pathlib import Path
@@ -24,7 +25,6 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     # ask for theirs. Processes that tests start inherit this.
     os.environ.setdefault("VDGS_THREADS", "1")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-
 import jaxtyping
 import pytest
 from hypothesis import HealthCheck, settings
@@ -54,6 +54,13 @@ providers._get_local_constants = lambda: providers._local_constants  # type: ign
 # Their annotations are checked while the tests run.
 jaxtyping.jaxtyped = typecheck.jaxtyped
 jaxtyping.install_import_hook([module_name(file) for file in files_with_shapes()], f"{typecheck.__name__}.checked")
+
+
+def pytest_configure() -> None:
+    """Heed the signals that tests send to commands, which inherit what `nohup` and shells in the background ignore."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    for name in (signal.SIGHUP, signal.SIGQUIT):
+        signal.signal(name, signal.SIG_DFL)
 
 
 @pytest.hookimpl(wrapper=True)
