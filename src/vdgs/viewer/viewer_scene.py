@@ -34,7 +34,7 @@ from vdgs.visibility.visibility_counts import count_visibility
 ModelChoice = Literal["coarse", "merged"]
 #: Of a tree: pixels that a view at rest and a preview may be off, and what a view at rest may cost, in merged Gaussians
 #: (choice: below it, at most a second on two cores).
-REST_ERROR_PX, PREVIEW_ERROR_PX, REST_MAX_COST = 0.3, 1.0, 2_600_000
+REST_ERROR_PX, PREVIEW_ERROR_PX, REST_MAX_COST = 0.3, 1.0, 2_000_000
 #: Photographs kept in memory, decoded (choice).
 _IMAGE_CACHE_BYTES = 128 << 20
 #: What a camera meters is drawn from at most about so many anchors (choice): fitting its law takes up to two hundred
