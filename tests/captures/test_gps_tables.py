@@ -123,6 +123,8 @@ def test_columns_of_heights_are_named_in_tables_of_any_system(tmp_path):
         ("time,latitude,longitude,altitude\n1,-33.5,-70.6,5\n", "no column of photographs' names.*exiftool -geotag"),
         ('<?xml version="1.0"?>\n<gpx><trkpt lat="1" lon="2"/></gpx>', "is a track.*exiftool -geotag"),
         ("<?xml version='1.0'?><kml><coordinates>-70.6,-33.5,500</coordinates></kml>", "is a track"),
+        ("<?xml version='1.0'?><gpx>" + "<trkpt/>" * 20_000 + "</gpx>", "is a track"),
+        ("name;lat;lon\n" + "a" * 200_000 + ";1;x\n", "line 2: .* are not numbers"),
         ("$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\n", "is a track"),
         ("% program : RTKLIB\n%  GPST latitude(deg) longitude(deg) height(m)\n2023/05/01 10:00:00 1 2 3", "of RTKLIB"),
         ('<?xml version="1.0"?>\n<document version="1.2.0"><camera label="a"/></document>', "Metashape's XML"),

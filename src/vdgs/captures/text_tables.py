@@ -13,6 +13,8 @@ from vdgs.errors import CaptureError
 
 #: Larger files are no tables of photographs (bytes).
 LONGEST_FILE = 1 << 26
+# A track without line ends is one word: it is to be called a track, not to end in csv.Error.
+csv.field_size_limit(LONGEST_FILE)
 _SEPARATORS = ("\t", ";", ",", "|")
 #: Excel's line that says what parts words.
 _EXCEL = re.compile(r"\"?sep=.?\"?", re.IGNORECASE)
