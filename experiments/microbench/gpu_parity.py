@@ -206,6 +206,13 @@ def adam_rows(kernels: KernelBackend, scene: ParityScene) -> Results:
     return {"parameter": state.parameter, "first": state.first, "second": state.second}
 
 
+def adam_tensors(kernels: KernelBackend, scene: ParityScene) -> Results:
+    tensors = [scene.random(*shape) for shape in ((32, 35), (32,), (70, 32), (500, 12))]
+    states = [AdamState(t.clone(), torch.zeros_like(t), torch.zeros_like(t), 1e-2) for t in tensors]
+    assert kernels.adam_tensors(states, tensors, 3)
+    return {f"{name} {i}": getattr(s, name) for i, s in enumerate(states) for name in ("parameter", "second")}
+
+
 def add_view_statistics(kernels: KernelBackend, scene: ParityScene) -> Results:
     rows, splats = scene.decoded(kernels)
     inside = kernels.mark_visible(scene.anchors.positions[rows], scene.camera)
@@ -291,7 +298,7 @@ def row_mask(rows: Tensor, count: int) -> Tensor:
 CASES: dict[str, Callable[[KernelBackend, ParityScene], Results]] = {
     case.__name__: case
     for case in (
-        adam_rows, add_view_statistics, cell_centers, cell_keys, contains, count_visibility, cull, decode,
+        adam_rows, adam_tensors, add_view_statistics, cell_centers, cell_keys, contains, count_visibility, cull, decode,
         decode_for_training, decode_backward_adam, fit_harmonics, group_cells, group_max, harmonic_colors, mark_visible,
         mean_ellipsoids, morton_order, photometric_loss, project, rasterize, rasterize_vjp,
         splat_contributions,

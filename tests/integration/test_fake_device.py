@@ -63,13 +63,12 @@ def trained_on(device: torch.device, steps: int, **changes: Any) -> TrainingStat
     return state
 
 
-#: What a step waits for: how many anchors are visible, how many splats they show, how many tiles these reach, whether
-#: the loss is a number, and whether the gradients were.
+#: What a step waits for: how many anchors are visible, how many splats they show, how many tiles these reach, and at
+#: the end whether the loss and the gradients were numbers.
 WAITS = {
     "kernels/cuda/cull.py: cull: _local_scalar_dense": 1,
     "kernels/cuda/decode.py: _decoded: _local_scalar_dense": 1,
-    "training/training_loop.py: train_step: tolist": 1,
-    "training/training_loop.py: _move: _local_scalar_dense": 1,
+    "training/training_loop.py: _read_values: tolist": 1,
 }
 
 

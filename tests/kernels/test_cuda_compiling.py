@@ -49,6 +49,7 @@ class StandIn:
 
 #: By source: its shared headers and its kernels.
 SOURCES = {
+    "adam.cu": ((), {"adam_tensors"}),
     "cull.cu": (("gaussian_math.h", "image_formation.h"), {"mark_anchors", "write_rows"}),
     "decode.cu": (("gaussian_math.h", "image_formation.h"), {"decode_anchors", "name_splats", "move_anchors"}),
     "loss.cu": ((), {"photometric_forward", "photometric_backward", "photometric_total"}),
@@ -71,12 +72,14 @@ SOURCES = {
 @pytest.mark.parametrize("architecture", UNLIKE)
 @pytest.mark.parametrize("source", SOURCES)
 def test_every_source_compiles_and_spills_nothing(source, architecture):
-    """Of 64 registers, four blocks of 256 threads fit on every card, of 255 one; of 16 KiB shared memory four."""
+    """Of 64 registers, four blocks of 256 threads fit on every card, of 73 seven of 128, of 255 one of 256; of 16 KiB
+    shared memory four."""
+    most = {"move_anchors": 255, "rasterize_backward": 73}
     headers, kernels = SOURCES[source]
     found = resources_of(source, CompileTarget(f"sm_{architecture}"), headers, COMPILER)
     assert {each.kernel for each in found} == kernels
     assert all(each.spilled_bytes == 0 for each in found)
-    assert all(0 < each.registers <= (255 if each.kernel == "move_anchors" else 64) for each in found)
+    assert all(0 < each.registers <= most.get(each.kernel, 64) for each in found)
     assert all(each.shared_bytes <= 16384 for each in found)
 
 

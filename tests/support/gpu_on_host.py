@@ -10,6 +10,7 @@ import pytest
 from support import fake_gsplat
 from support.cuda_on_host import HostDriver, build_on_host
 from vdgs.kernels.cuda import compile_cache, loss
+from vdgs.kernels.cuda.adam import PROGRAM as ADAM
 from vdgs.kernels.cuda.cull import PROGRAM as CULL
 from vdgs.kernels.cuda.decode import PROGRAM as DECODE
 from vdgs.kernels.cuda.rasterize import PROGRAM as RASTERIZE
@@ -17,7 +18,7 @@ from vdgs.kernels.cuda.statistics import PROGRAM as STATISTICS
 from vdgs.kernels.gpu import rasterizer as choosing
 from vdgs.kernels.torch_ref import adam
 
-PROGRAMS = (loss.PROGRAM, RASTERIZE, DECODE, CULL, STATISTICS)
+PROGRAMS = (ADAM, loss.PROGRAM, RASTERIZE, DECODE, CULL, STATISTICS)
 
 
 def build(folder: Path) -> dict[str, HostDriver]:

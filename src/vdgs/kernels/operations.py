@@ -88,6 +88,11 @@ class KernelBackend(Protocol):
         beta2: float = 0.999, epsilon: float = 1e-15,
     ) -> IsFinite: ...  # fmt: skip
 
+    def adam_tensors(
+        self, states: Sequence[AdamState], gradients: Sequence[Tensor], step: int, *, beta1: float = 0.9,
+        beta2: float = 0.999, epsilon: float = 1e-15,
+    ) -> IsFinite: ...  # fmt: skip
+
     def add_view_statistics(
         self,
         statistics: DensificationStats,
@@ -135,6 +140,7 @@ OPERATION_NAMES = tuple(sorted(name for name in vars(KernelBackend) if not name.
 #: The implementations (modules of `vdgs.kernels`) of each operation on an NVIDIA GPU; of several the first that can be
 #: used. gsplat has no median depth: images with depth are always drawn by `cuda`.
 GPU_BACKENDS: dict[str, tuple[str, ...]] = dict.fromkeys(OPERATION_NAMES, ("torch_ref",)) | {
+    "adam_tensors": ("cuda",),
     "add_view_statistics": ("cuda",),
     "cull": ("cuda",),
     "decode": ("cuda",),

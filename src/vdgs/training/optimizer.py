@@ -60,17 +60,19 @@ class AnchorOptimizer:
         """Step the decoder's tensors by their `.grad`, in place; `step` counts from 1. False: one is not finite. The
         environment map has no moments: see `sky_background`."""
         finite: IsFinite = True
+        states, gradients = [], []
         for name, tensor in decoder.tensors().items():
-            if tensor.grad is not None and name == ENVMAP:
-                finite = torch.isfinite(tensor.grad).all() & finite
-                tensor.detach().sub_(tensor.grad, alpha=rates[name])
-                tensor.grad = None
-            elif tensor.grad is not None:
+            gradient, tensor.grad = tensor.grad, None
+            if gradient is not None and name == ENVMAP:
+                finite = torch.isfinite(gradient).all()
+                tensor.detach().sub_(gradient, alpha=rates[name])
+            elif gradient is not None:
                 moments = self.decoder.first[name], self.decoder.second[name]
-                state = AdamState(tensor.detach(), *moments, rates[name.split("_")[0]])
-                finite = get_backend(tensor.device).adam_rows(state, None, tensor.grad, step) & finite
-                tensor.grad = None
-        return finite
+                states.append(AdamState(tensor.detach(), *moments, rates[name.split("_")[0]]))
+                gradients.append(gradient)
+        if not states:
+            return finite
+        return get_backend(gradients[0].device).adam_tensors(states, gradients, step) & finite
 
 
 def learning_rates_at(config: LearningRateConfig, progress: float) -> dict[str, float]:

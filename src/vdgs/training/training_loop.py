@@ -17,7 +17,8 @@ from torch import Tensor
 from vdgs.errors import TrainingDiverged
 from vdgs.geometry.camera import Camera
 from vdgs.kernels import get_backend
-from vdgs.kernels.kernel_types import DecoderWeights, OrderedSplats, SplatGradients
+from vdgs.kernels.kernel_types import DecoderWeights, IsFinite, OrderedSplats, SplatGradients
+from vdgs.kernels.transfer import is_host
 from vdgs.model.renderer import cull_anchors, decode_anchors_for_training
 from vdgs.model.scale_bounds import MAX_OFFSET_FACTOR
 from vdgs.training.densification_step import densify, sort_morton
@@ -96,19 +97,19 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
         loss = loss + volume_weight * drawn.volume
     if (agreement := _weighted_agreement(drawn, stage, target.valid_fraction)) is not None:
         loss = loss + agreement.loss
-    # Read at once: on a GPU each read waits for everything before it.
-    value, l1, ssim = torch.stack([loss, compared.l1, compared.ssim]).tolist()
-    if not math.isfinite(value):
-        raise TrainingDiverged(f"The loss is {value} at iteration {iteration + 1}.")
+    values = torch.stack([loss, compared.l1, compared.ssim])
+    if is_host(values):  # before anything moves
+        _read_values(values, True, iteration)
     gradients = drawn.backward(compared.image, weight * volume_weight, agreement)
     measured = (iteration + 1) % PSNR_LOG_INTERVAL == 0
     psnr = training_psnr(compared.shown, target.image, target.mask) if measured else None
     state.is_consistent = False
-    _move(state, stage, rows, gradients, weights, camera)
+    finite = _move(state, stage, rows, gradients, weights, camera)
 
     growing = iteration + 1 <= config.densify.stop_fraction * config.iterations
     if growing and iteration + 1 > config.densify.stats_start:
         _count_view(state, rows, camera, drawn, gradients)
+    value, l1, ssim = _read_values(values, finite, iteration)
     state.iteration += 1
     report = StepReport(loss=value, l1=l1, ssim=ssim, visible=len(rows), splats=len(drawn.source))
     if growing and state.iteration >= config.densify.start and state.iteration % config.densify.every == 0:
@@ -123,6 +124,22 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
     _smooth(state, value, psnr)
     state.is_consistent = True
     return report
+
+
+def _read_values(values: Float[Tensor, "3"], finite: IsFinite, iteration: int) -> tuple[float, float, float]:
+    """Loss, L1 and SSIM of a step as numbers. Raises TrainingDiverged where the loss or a gradient is not finite: what
+    has no finite gradient has not moved.
+
+    On a GPU to read waits for everything before: once in a step, at its end.
+    """
+    if isinstance(finite, Tensor):
+        values = torch.cat([values, finite.reshape(1).to(values)])
+    loss, l1, ssim, *whole = values.tolist()
+    if not math.isfinite(loss):
+        raise TrainingDiverged(f"The loss is {loss} at iteration {iteration + 1}.")
+    if not (all(whole) if isinstance(finite, Tensor) else finite):
+        raise TrainingDiverged(f"A gradient is not a finite number at iteration {iteration + 1}.")
+    return loss, l1, ssim
 
 
 def _count_view(
@@ -176,8 +193,9 @@ def _move(
     gradients: SplatGradients,
     weights: DecoderWeights,
     camera: Camera,
-) -> None:
-    """One step of Adam for the visible anchors (where it is dense, for all) and the decoder."""
+) -> IsFinite:
+    """One step of Adam for the visible anchors (where it is dense, for all) and the decoder: whether all gradients were
+    finite."""
     config, step = stage.config, state.iteration + 1
     rates = learning_rates_at(config.lr, state.iteration / config.iterations)
     rates["offsets"] *= stage.offset_rate_factor
@@ -196,9 +214,7 @@ def _move(
     if dense:
         step_unseen_anchors(state.anchors, rows, states, step, stage.lr_mask)
         updates.fill_(step)
-    finite = state.optimizer.update_decoder(state.decoder, rates, step) & finite
-    if not finite:
-        raise TrainingDiverged(f"A gradient is not a finite number at iteration {step}.")
+    return state.optimizer.update_decoder(state.decoder, rates, step) & finite
 
 
 def _average(state: TrainingState) -> None:

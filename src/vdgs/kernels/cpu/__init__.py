@@ -1,6 +1,7 @@
 """C++ implementations for the CPU, chosen at run time by instruction set."""
 
 from vdgs.kernels.cpu.adam import adam_rows as adam_rows
+from vdgs.kernels.cpu.adam import adam_tensors as adam_tensors
 from vdgs.kernels.cpu.cells import cell_centers as cell_centers
 from vdgs.kernels.cpu.cells import cell_keys as cell_keys
 from vdgs.kernels.cpu.cells import contains as contains

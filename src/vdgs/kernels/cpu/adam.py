@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from jaxtyping import Float, Int32, Int64
@@ -46,6 +48,20 @@ def adam_rows(
         # What autograd has saved of these no longer holds their values.
         torch.autograd.graph.increment_version(tensors)
     return finite
+
+
+def adam_tensors(
+    states: Sequence[AdamState],
+    gradients: Sequence[Tensor],
+    step: int,
+    *,
+    beta1: float = 0.9,
+    beta2: float = 0.999,
+    epsilon: float = 1e-15,
+) -> bool:
+    """As `torch_ref.adam_tensors`, by `adam_rows`."""
+    each = zip(states, gradients, strict=True)
+    return all([adam_rows(s, None, g, step, beta1=beta1, beta2=beta2, epsilon=epsilon) for s, g in each])
 
 
 def round_factors(factors: AdamStepFactors) -> AdamStepFactors:

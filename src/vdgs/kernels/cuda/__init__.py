@@ -3,6 +3,7 @@
 Not all operations of `vdgs.kernels` are here: `vdgs.kernels.gpu` adds what a card needs besides.
 """
 
+from vdgs.kernels.cuda.adam import adam_tensors as adam_tensors
 from vdgs.kernels.cuda.cull import cull as cull
 from vdgs.kernels.cuda.decode import decode as decode
 from vdgs.kernels.cuda.decode import decode_for_training as decode_for_training

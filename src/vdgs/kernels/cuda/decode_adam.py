@@ -20,7 +20,7 @@ from vdgs.kernels.torch_ref.adam import bias_correction_tables, check_updates
 from vdgs.kernels.torch_ref.decode_adam import decode_backward_adam as torch_decode_backward_adam
 
 #: Anchors whose contributions to the decoder's gradients are stored at once: whole blocks.
-ANCHORS_PER_CHUNK = 2**14
+ANCHORS_PER_CHUNK = 2**16
 
 
 def decode_backward_adam(
@@ -38,7 +38,7 @@ def decode_backward_adam(
     """As `torch_ref.decode_backward_adam`, for float32 tensors on a CUDA device, without waiting for it.
 
     A warp moves an anchor; its gradients are never stored. Gradients of the decoder are matrix products (by torch) over
-    `chunk` anchors at a time, 1.4 kB each (22 MB fit the caches of large GPUs). An anchor whose gradient is not finite
+    `chunk` anchors at a time, 1.4 kB each (88 MB: fewer would be launches that cost more than the memory's time). An anchor whose gradient is not finite
     does not move. With gradients by depth, torch computes everything. `lr_boost` is the same for all of `moved`. Raises
     ValueError or TypeError for unsuitable tensors, CudaUnavailable where the kernel cannot be run.
     """
@@ -66,7 +66,7 @@ def decode_backward_adam(
         ctypes.c_float(gradients.volume), updates, lacking, roots, ctypes.c_int(len(roots)), broken,
     ]  # fmt: skip
     wanted = any(t.requires_grad for t in weights.tensors())
-    of_weights = [torch.zeros_like(t) for t in weights.tensors()] if wanted else None
+    of_weights: list[Tensor] = []
     at_once = chunk if wanted else max(v, 1)
     for first in range(0, v, at_once):
         count = min(at_once, v - first)
@@ -76,9 +76,12 @@ def decode_backward_adam(
             ctypes.c_longlong(first), ctypes.c_longlong(count), *after, *(made.tensors() if made else [None] * 6),
         )  # fmt: skip
         if made and of_weights:
-            for total, gradient in zip(of_weights, made.gradients(), strict=True):
-                total += gradient
-    return (broken == 0).all(), tuple(of_weights) if of_weights else None
+            torch._foreach_add_(of_weights, made.gradients())
+        elif made:
+            of_weights = list(made.gradients())
+    if wanted and not of_weights:
+        of_weights = [torch.zeros_like(t) for t in weights.tensors()]
+    return (broken == 0)[0], tuple(of_weights) if wanted else None
 
 
 def _weights(weights: DecoderWeights, k: int) -> list[Tensor]:

@@ -17,6 +17,8 @@ from vdgs.kernels.torch_ref.rasterize import splat_contributions_from_vjp
 
 #: Side of a tile, threads of a block and sums of an entry: kTile, kThreads and kSums of the source.
 TILE_PX, THREADS, SUMS_PER_ENTRY = 16, 256, 10
+#: Threads of a block of the backward pass: kBackThreads.
+BACK_THREADS = 128
 PROGRAM = CudaProgram(name="rasterize.cu", headers=("image_formation.h",))
 
 
@@ -158,7 +160,7 @@ class _Pullback:
         sums = means.new_zeros(len(entries.owners), SUMS_PER_ENTRY)
         picture: list[KernelArgument] = [self.raster.image, self.transmittance, self.last, self.raster.depth]
         self.program.launch(
-            "rasterize_backward", (-(-width // TILE_PX), -(-height // TILE_PX)), (THREADS,), *self.splats,
+            "rasterize_backward", (-(-width // TILE_PX), -(-height // TILE_PX)), (BACK_THREADS,), *self.splats,
             entries.owners, entries.order, entries.bounds, ctypes.c_int(width), ctypes.c_int(height), *picture,
             *wanted, kept, sums,
         )  # fmt: skip

@@ -3,6 +3,7 @@
 `vdgs.kernels.operations.GPU_BACKENDS` says which operation is which.
 """
 
+from vdgs.kernels.cuda import adam_tensors as adam_tensors
 from vdgs.kernels.cuda import add_view_statistics as add_view_statistics
 from vdgs.kernels.cuda import cull as cull
 from vdgs.kernels.cuda import decode as decode

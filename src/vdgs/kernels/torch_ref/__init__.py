@@ -1,6 +1,7 @@
 """Readable torch implementations: the oracle of the tests, and what the C++ means."""
 
 from vdgs.kernels.torch_ref.adam import adam_rows as adam_rows
+from vdgs.kernels.torch_ref.adam import adam_tensors as adam_tensors
 from vdgs.kernels.torch_ref.cells import cell_centers as cell_centers
 from vdgs.kernels.torch_ref.cells import cell_keys as cell_keys
 from vdgs.kernels.torch_ref.cells import contains as contains

@@ -7,6 +7,7 @@ step (1 - beta1) / sqrt(1 - beta2) = 3.2 times too large. `AdamState.lr_boost` l
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import cache
 from typing import NamedTuple
 
@@ -68,6 +69,23 @@ def adam_rows(
     ):
         tensor[index] = new if finite is None else torch.where(finite, new, old)
     return True if finite is None else finite
+
+
+def adam_tensors(
+    states: Sequence[AdamState],
+    gradients: Sequence[Tensor],
+    step: int,
+    *,
+    beta1: float = 0.9,
+    beta2: float = 0.999,
+    epsilon: float = 1e-15,
+) -> IsFinite:
+    """`adam_rows` on all rows of each of some small tensors. Returns whether every gradient was finite; a tensor with
+    one that is not stays as it is."""
+    finite: IsFinite = True
+    for state, gradient in zip(states, gradients, strict=True):
+        finite = adam_rows(state, None, gradient, step, beta1=beta1, beta2=beta2, epsilon=epsilon) & finite
+    return finite
 
 
 def _of_rows(

@@ -24,8 +24,12 @@ constexpr int kThreads = kTile * kTile;
 constexpr int kWarp = 32;
 constexpr int kWarps = kThreads / kWarp;
 constexpr unsigned kAllLanes = 0xffffffffu;
-// Entries that the backward pass has in shared memory at a time.
-constexpr int kBatch = 32;
+// The backward pass: two pixels a thread, so that sums over a warp, which take most of its time, are made half as often.
+constexpr int kPixels = 2;
+constexpr int kBackThreads = kThreads / kPixels;
+constexpr int kBackWarps = kWarps / kPixels;
+// Entries that it has in shared memory at a time.
+constexpr int kBatch = 64;
 // Of an entry: by log alpha; by u, v; by dx^2, dx dy, dy^2; by three colors; by depth.
 constexpr int kSums = 10;
 constexpr int kRoom = 16;  // kSums, and zeros up to a power of two
@@ -73,8 +77,8 @@ __device__ float along(const Shape& s, float dx, float dy) { return fmaf(s.ux, d
 __device__ float square_of(float u, float v) { return fmaf(u, u, v * v); }
 __device__ float quadratic(const Shape& s, float dx, float dy) { return square_of(along(s, dx, dy), s.vy * dy); }
 __device__ float clamped(float a, float low, float high) { return fminf(fmaxf(a, low), high); }
-// Alpha before it is clamped.
-__device__ float alpha_of(const Shape& s, float q) { return s.opacity * expf(-0.5f * q); }
+// Alpha before it is clamped. The card's own exponential is off by 1e-6 at most, for the q that reach here.
+__device__ float alpha_of(const Shape& s, float q) { return s.opacity * __expf(-0.5f * q); }
 
 // Whether a splat may reach a pixel's center of a tile: the least q over the rectangle of centers lies at the mean or on
 // the border. The rectangle is widened a little, for rounding.
@@ -119,6 +123,42 @@ __device__ void read_entry(const Splats& splats, long long i, Entry& entry) {
   shape_of(splats, i, entry.shape);  // only splats that are drawn have entries
   for (int k = 0; k < 3; ++k) entry.color[k] = splats.colors[3 * i + k];
   entry.depth = splats.depths[i];
+}
+
+// What the backward pass keeps of a pixel.
+struct PixelBack {
+  float y, wanted[3], wanted_depth;
+  float rest;     // the light behind what was looked at, as the gradient sees it
+  float through;  // transmittance
+  int until;      // entries that it looks at
+};
+
+// Adds what an entry does to a pixel to its sums. False: nothing.
+__device__ bool add_pixel(const Entry& entry, float dx, bool reached, PixelBack& pixel, float (&values)[kRoom]) {
+  const Shape& s = entry.shape;
+  const float dy = pixel.y - s.y;
+  const float u = along(s, dx, dy), v = s.vy * dy, q = square_of(u, v);
+  if (!reached || q > s.reach) return false;
+  const float free = alpha_of(s, q), alpha = fminf(free, kAlphaMax);
+  if (alpha < kAlphaMin) return false;
+  const float weight = alpha * pixel.through;
+  float value = pixel.wanted_depth * entry.depth;
+  for (int k = 0; k < 3; ++k) {
+    value = fmaf(pixel.wanted[k], entry.color[k], value);
+    values[6 + k] = fmaf(weight, pixel.wanted[k], values[6 + k]);
+  }
+  values[9] = fmaf(weight, pixel.wanted_depth, values[9]);
+  pixel.rest = fmaf(-weight, value, pixel.rest);
+  const float by_alpha = pixel.through * value - __fdividef(pixel.rest, 1.0f - alpha);
+  pixel.through *= 1.0f - alpha;
+  if (free <= kAlphaMax) {
+    const float by_log = by_alpha * alpha, by_q = -0.5f * by_log;
+    values[0] += by_log;
+    values[1] = fmaf(by_q, u, values[1]), values[2] = fmaf(by_q, v, values[2]);
+    values[3] = fmaf(by_q * dx, dx, values[3]), values[4] = fmaf(by_q * dx, dy, values[4]);
+    values[5] = fmaf(by_q * dy, dy, values[5]);
+  }
+  return true;
 }
 
 // Adds kRoom numbers of each lane over the warp: lane l returns the sum of the number l / 2. Half of what a lane still
@@ -246,7 +286,7 @@ rasterize_forward(const float* means, const float* conics, const float* colors, 
 //
 // With `value` = color . gradient (+ depth): the light behind a splat, as the gradient sees it, is what the whole pixel
 // shows without what is in front of it and itself: no transmittance has to be divided out of what was multiplied.
-extern "C" __global__ void __launch_bounds__(kThreads, 4)
+extern "C" __global__ void __launch_bounds__(kBackThreads, 7)
 rasterize_backward(const float* means, const float* conics, const float* colors, const float* opacities,
                    const float* depths, const int* owners, const long long* order, const long long* bounds, int width,
                    int height, const float* image, const float* transmittance, const int* last, const float* depth,
@@ -254,30 +294,35 @@ rasterize_backward(const float* means, const float* conics, const float* colors,
   __shared__ Entry batch[kBatch];
   __shared__ bool keeps[kBatch];  // whether the sums of an entry are wanted
   __shared__ long long slots[kBatch];
-  __shared__ float parts[kWarps][kBatch][kSums];
+  __shared__ float parts[kBackWarps][kBatch][kSums];
   const Splats splats{means, conics, colors, opacities, depths};
-  const int column = pixel_column(), row = pixel_row();
-  const bool inside = column < width && row < height;
-  const float x = static_cast<float>(column) + 0.5f, y = static_cast<float>(row) + 0.5f;
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
-  const long long first = bounds[static_cast<long long>(blockIdx.y) * gridDim.x + blockIdx.x];
-  float wanted[3] = {0.0f, 0.0f, 0.0f}, wanted_depth = 0.0f, rest = 0.0f, through = 1.0f;
+  // Pixels of a warp lie together, 8x8 of them: those of a thread four rows apart.
+  const int column = blockIdx.x * kTile + warp % 2 * 8 + lane % 8, row = blockIdx.y * kTile + warp / 2 * 8 + lane / 8;
+  const float x = static_cast<float>(column) + 0.5f;
+  const long long tile = static_cast<long long>(blockIdx.y) * gridDim.x + blockIdx.x, first = bounds[tile];
+  PixelBack pixels[kPixels];
   int until = 0;
-  if (inside) {
-    const long long pixel = static_cast<long long>(row) * width + column;
-    until = last[pixel];
+#pragma unroll
+  for (int p = 0; p < kPixels; ++p) {
+    const int its_row = row + 4 * p;
+    pixels[p] = {static_cast<float>(its_row) + 0.5f, {0.0f, 0.0f, 0.0f}, 0.0f, 0.0f, 1.0f, 0};
+    if (column >= width || its_row >= height) continue;
+    const long long pixel = static_cast<long long>(its_row) * width + column;
+    pixels[p].until = last[pixel];
     for (int k = 0; k < 3 && by_image; ++k) {
-      wanted[k] = by_image[3 * pixel + k];
-      rest = fmaf(image[3 * pixel + k], wanted[k], rest);
+      pixels[p].wanted[k] = by_image[3 * pixel + k];
+      pixels[p].rest = fmaf(image[3 * pixel + k], pixels[p].wanted[k], pixels[p].rest);
     }
     if (by_depth) {
-      wanted_depth = by_depth[pixel];
-      rest = fmaf(depth[pixel], wanted_depth, rest);
+      pixels[p].wanted_depth = by_depth[pixel];
+      pixels[p].rest = fmaf(depth[pixel], pixels[p].wanted_depth, pixels[p].rest);
     }
-    if (by_alpha) rest = fmaf(-transmittance[pixel], by_alpha[pixel], rest);
+    if (by_alpha) pixels[p].rest = fmaf(-transmittance[pixel], by_alpha[pixel], pixels[p].rest);
+    until = pixels[p].until > until ? pixels[p].until : until;
   }
   for (int begin = 0; __syncthreads_or(begin < until); begin += kBatch) {  // and before the batch is written anew
-    const long long end = bounds[static_cast<long long>(blockIdx.y) * gridDim.x + blockIdx.x + 1] - first;
+    const long long end = bounds[tile + 1] - first;
     const int size = end - begin < kBatch ? static_cast<int>(end - begin) : kBatch;
     if (threadIdx.x < size) {
       slots[threadIdx.x] = order[first + begin + threadIdx.x];
@@ -287,43 +332,21 @@ rasterize_backward(const float* means, const float* conics, const float* colors,
     }
     __syncthreads();
     for (int i = 0; i < size; ++i) {
-      const Shape& s = batch[i].shape;
-      const float dx = x - s.x, dy = y - s.y;
-      const float u = along(s, dx, dy), v = s.vy * dy, q = square_of(u, v);
       float values[kRoom] = {};
-      bool counts = begin + i < until && q <= s.reach;
-      if (counts) {
-        const float free = alpha_of(s, q), alpha = fminf(free, kAlphaMax);
-        counts = alpha >= kAlphaMin;
-        if (counts) {
-          const float weight = alpha * through;
-          float value = wanted_depth * batch[i].depth;
-          for (int k = 0; k < 3; ++k) {
-            value = fmaf(wanted[k], batch[i].color[k], value);
-            values[6 + k] = weight * wanted[k];
-          }
-          values[9] = weight * wanted_depth;
-          rest = fmaf(-weight, value, rest);
-          const float by_alpha_here = through * value - rest / (1.0f - alpha);
-          through *= 1.0f - alpha;
-          if (free <= kAlphaMax) {
-            const float by_log = by_alpha_here * alpha, by_q = -0.5f * by_log;
-            values[0] = by_log;
-            values[1] = by_q * u, values[2] = by_q * v;
-            values[3] = by_q * dx * dx, values[4] = by_q * dx * dy, values[5] = by_q * dy * dy;
-          }
-        }
-      }
+      bool counts = false;
+#pragma unroll
+      for (int p = 0; p < kPixels; ++p)
+        counts |= add_pixel(batch[i], x - batch[i].shape.x, begin + i < pixels[p].until, pixels[p], values);
       if (!keeps[i]) continue;  // the same for all threads
       float sum = 0.0f;
       if (__any_sync(kAllLanes, counts)) sum = add_over_warp(values);
       if (lane % 2 == 0 && lane / 2 < kSums) parts[warp][i][lane / 2] = sum;
     }
     __syncthreads();
-    for (int k = threadIdx.x; k < size * kSums; k += kThreads) {
+    for (int k = threadIdx.x; k < size * kSums; k += kBackThreads) {
       if (!keeps[k / kSums]) continue;
       float total = 0.0f;
-      for (int w = 0; w < kWarps; ++w) total += parts[w][k / kSums][k % kSums];
+      for (int w = 0; w < kBackWarps; ++w) total += parts[w][k / kSums][k % kSums];
       sums[slots[k / kSums] * kSums + k % kSums] = total;
     }
   }
