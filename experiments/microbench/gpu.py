@@ -38,8 +38,9 @@ from vdgs.kernels.gsplat import GsplatUnavailable
 
 #: Sources and the headers that they include.
 SOURCES = {
-    "adam.cu": (), "cull.cu": ("gaussian_math.h", "image_formation.h"), "decode.cu": ("gaussian_math.h", "image_formation.h"),
-    "loss.cu": (), "rasterize.cu": ("image_formation.h",), "statistics.cu": (),
+    "adam.cu": (), "cull.cu": ("gaussian_math.h", "image_formation.h"),
+    "decode.cu": ("gaussian_math.h", "image_formation.h"), "loss.cu": (), "rasterize.cu": ("image_formation.h",),
+    "statistics.cu": (), "visibility.cu": (),
 }  # fmt: skip
 #: How many dB the town may come out better or worse than on the processor: two trainings differ by rounding.
 TOWN_DB = 0.5

@@ -1,5 +1,5 @@
-"""Adam on whole small tensors: its CUDA kernel, run on the processor by a stand-in driver, and the native set, against the
-reference."""
+"""Adam on whole small tensors: its CUDA kernel, run on the processor by a stand-in driver, and the native set, against
+the reference."""
 
 from __future__ import annotations
 
@@ -22,7 +22,9 @@ def moved(implementation, device: str = "cpu", broken: int | None = None, steps:
     """Whether all was finite, and all tensors after some steps; one gradient may hold a NaN at its end."""
     g = torch.Generator().manual_seed(0)
     states = [
-        AdamState(*(t.to(device) for t in (torch.randn(s, generator=g), torch.zeros(s), torch.zeros(s))), 1e-2 * (1 + i % 3))
+        AdamState(
+            *(t.to(device) for t in (torch.randn(s, generator=g), torch.zeros(s), torch.zeros(s))), 1e-2 * (1 + i % 3)
+        )
         for i, s in enumerate(SHAPES)
     ]
     finite = []

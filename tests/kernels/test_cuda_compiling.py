@@ -65,6 +65,7 @@ SOURCES = {
         },
     ),
     "statistics.cu": ((), {"add_view"}),
+    "visibility.cu": ((), {"count_visibility", "mark_visible"}),
 }
 
 

@@ -8,9 +8,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from support.cuda_on_host import HostDriver, build_on_host, needs_a_compiler, needs_nvrtc
 from support.instruction_sets import every_instruction_set, on_threads, using
 from vdgs.geometry.camera import NEAR_PLANE, Camera
 from vdgs.kernels.cpu import visibility as native
+from vdgs.kernels.cuda import visibility as on_card
+from vdgs.kernels.cuda.launch import CudaProgram
 from vdgs.kernels.torch_ref import visibility as reference
 
 
@@ -144,3 +147,37 @@ class TestMeaning:
             implementation.count_visibility(torch.zeros(4, 3).long(), flight(1))
         with pytest.raises((ValueError, TypeError)):
             implementation.count_visibility(torch.zeros(4, 2), flight(1))
+
+
+@needs_nvrtc
+@needs_a_compiler
+@pytest.mark.usefixtures("compiled_once")
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_card_s_kernels_equal_brute_force(dtype, compiled_code):
+    """Run on the processor by a stand-in driver."""
+    program = CudaProgram(name=on_card.PROGRAM.name, driver=HostDriver(build_on_host(compiled_code)))
+    cloud, cameras = cloud_and_cameras(dtype)
+    expected = brute_force(cloud.nan_to_num(posinf=0.0), cameras)
+    expected[[3, 4]] = 0
+    assert torch.equal(on_card.count_visibility(cloud, cameras, program=program), expected)
+    marks = [on_card.mark_visible(cloud, camera, program=program) for camera in cameras]
+    assert torch.equal(torch.stack(marks).sum(0, dtype=torch.int32), expected)
+    assert on_card.count_visibility(cloud[:0], cameras, program=program).shape == (0,)
+    assert not on_card.count_visibility(cloud, [], program=program).any()
+
+
+@pytest.mark.gpu
+def test_a_card_counts_what_the_reference_counts():
+    cloud, cameras = cloud_and_cameras(torch.float32)
+    assert torch.equal(
+        on_card.count_visibility(cloud.cuda(), cameras).cpu(), reference.count_visibility(cloud, cameras)
+    )
+
+
+def cloud_and_cameras(dtype: torch.dtype) -> tuple[torch.Tensor, list[Camera]]:
+    """Points of which two are not finite, and cameras of both kinds."""
+    generator = np.random.default_rng(5)
+    cameras = [make_camera(generator, 50.0, ("pinhole", "orthographic")[i % 2]) for i in range(9)]
+    cloud = torch.from_numpy(generator.uniform(-50.0, 50.0, (700, 3))).to(dtype)
+    cloud[3, 1], cloud[4, 2] = torch.nan, torch.inf
+    return cloud, cameras

@@ -24,7 +24,7 @@ from vdgs.kernels.cuda.nvrtc import CudaUnavailable, Nvrtc
 HERE = Path(__file__).parent
 SHARED = Path(launch.__file__).parents[1] / "shared"
 #: Sources of vdgs.kernels.cuda, all of which become one library: most of the time goes into what they share.
-SOURCES = ("adam", "cull", "decode", "loss", "rasterize", "statistics")
+SOURCES = ("adam", "cull", "decode", "loss", "rasterize", "statistics", "visibility")
 #: Whatever makes threads wait for each other and for nothing else.
 BARRIER = re.compile(r"__(sync(?:threads(?:_and|_or)?|warp))\(\)?")
 #: Orders in which threads and warps take turns: forwards, backwards, and two shuffles.

@@ -15,10 +15,11 @@ from vdgs.kernels.cuda.cull import PROGRAM as CULL
 from vdgs.kernels.cuda.decode import PROGRAM as DECODE
 from vdgs.kernels.cuda.rasterize import PROGRAM as RASTERIZE
 from vdgs.kernels.cuda.statistics import PROGRAM as STATISTICS
+from vdgs.kernels.cuda.visibility import PROGRAM as VISIBILITY
 from vdgs.kernels.gpu import rasterizer as choosing
 from vdgs.kernels.torch_ref import adam
 
-PROGRAMS = (ADAM, loss.PROGRAM, RASTERIZE, DECODE, CULL, STATISTICS)
+PROGRAMS = (ADAM, loss.PROGRAM, RASTERIZE, DECODE, CULL, STATISTICS, VISIBILITY)
 
 
 def build(folder: Path) -> dict[str, HostDriver]:

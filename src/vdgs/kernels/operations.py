@@ -142,10 +142,12 @@ OPERATION_NAMES = tuple(sorted(name for name in vars(KernelBackend) if not name.
 GPU_BACKENDS: dict[str, tuple[str, ...]] = dict.fromkeys(OPERATION_NAMES, ("torch_ref",)) | {
     "adam_tensors": ("cuda",),
     "add_view_statistics": ("cuda",),
+    "count_visibility": ("cuda",),
     "cull": ("cuda",),
     "decode": ("cuda",),
     "decode_backward_adam": ("cuda",),
     "decode_for_training": ("cuda",),
+    "mark_visible": ("cuda",),
     "photometric_loss": ("cuda",),
     "rasterize": ("gsplat", "cuda"),
     "rasterize_vjp": ("gsplat", "cuda"),

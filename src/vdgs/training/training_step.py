@@ -152,9 +152,15 @@ def backward_and_step(
     )
     if slow is not None:
         slow.hold_back(anchors)
-    if of_weights is not None:
-        # A first bias that carries an appearance is made of other tensors: autograd knows of which.
-        _Given.apply(of_weights, *weights.tensors()).backward()
+    made: list[tuple[Tensor, Tensor]] = []
+    for tensor, gradient in zip(weights.tensors(), of_weights or [], strict=of_weights is not None):
+        if tensor.is_leaf and tensor.requires_grad and tensor.grad is None:
+            tensor.grad = gradient
+        elif tensor.requires_grad:
+            made.append((tensor, gradient))
+    if made:  # a first bias that carries an appearance is made of other tensors: autograd knows of which
+        tensors, given = zip(*made, strict=True)
+        _Given.apply(given, *tensors).backward()
     return finite
 
 

@@ -61,7 +61,8 @@ def adam_tensors(
 ) -> bool:
     """As `torch_ref.adam_tensors`, by `adam_rows`."""
     each = zip(states, gradients, strict=True)
-    return all([adam_rows(s, None, g, step, beta1=beta1, beta2=beta2, epsilon=epsilon) for s, g in each])
+    finite = [adam_rows(s, None, g, step, beta1=beta1, beta2=beta2, epsilon=epsilon) for s, g in each]
+    return all(finite)
 
 
 def round_factors(factors: AdamStepFactors) -> AdamStepFactors:

@@ -13,3 +13,5 @@ from vdgs.kernels.cuda.rasterize import rasterize as rasterize
 from vdgs.kernels.cuda.rasterize import rasterize_vjp as rasterize_vjp
 from vdgs.kernels.cuda.rasterize import splat_contributions as splat_contributions
 from vdgs.kernels.cuda.statistics import add_view_statistics as add_view_statistics
+from vdgs.kernels.cuda.visibility import count_visibility as count_visibility
+from vdgs.kernels.cuda.visibility import mark_visible as mark_visible

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
+from weakref import WeakKeyDictionary
 
 import torch
 from jaxtyping import Float, Int32, Int64
@@ -122,7 +123,7 @@ def _decoded(
     positions, _, offsets, _ = anchors
     k, inputs = offsets.shape[1], weights.opacity.w1.shape[1]
     check_decoder(k, weights, anchors)
-    heads = [tensor for head in (weights.opacity, weights.covariance, weights.color) for tensor in pack_head(head, k)]
+    heads = [tensor for head in pack_decoder(weights, k) for tensor in head]
     count = len(positions) if rows is None else len(rows)
     blocks = -(-count // ANCHORS_PER_BLOCK)
     bits, begins, lengths = (positions.new_empty(n, dtype=torch.int32) for n in (count, blocks, blocks))
@@ -162,6 +163,21 @@ def expand_sources(source: Tensor | SplatMask, *, program: CudaProgram = PROGRAM
         source.segments.starts, ctypes.c_longlong(count), ctypes.c_int(source.offsets), made,
     )  # fmt: skip
     return made
+
+
+#: Packed weights, with k and the versions of the tensors: a step decodes by them, and moves anchors by them.
+_packed: WeakKeyDictionary[DecoderWeights, tuple[tuple[int, ...], list[tuple[Tensor, ...]]]] = WeakKeyDictionary()
+
+
+def pack_decoder(weights: DecoderWeights, k: int) -> list[tuple[Tensor, ...]]:
+    """`pack_head` of the three heads, kept as long as the weights are there and unchanged."""
+    # A tensor of inference mode has no version, and is never kept beyond a view.
+    key = (k, *(0 if tensor.is_inference() else tensor._version for tensor in weights.tensors()))
+    known, packed = _packed.get(weights, ((), []))
+    if known != key:
+        packed = [pack_head(head, k) for head in (weights.opacity, weights.covariance, weights.color)]
+        _packed[weights] = key, packed
+    return packed
 
 
 def pack_head(head: MlpWeights, k: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -12,9 +12,9 @@ from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 from vdgs.geometry.camera import Camera
-from vdgs.kernels.cuda.decode import ANCHORS_PER_BLOCK, PROGRAM, check_decoder, expand_sources, pack_head
+from vdgs.kernels.cuda.decode import ANCHORS_PER_BLOCK, PROGRAM, check_decoder, expand_sources, pack_decoder
 from vdgs.kernels.cuda.launch import CudaProgram, KernelArgument, PackedCamera
-from vdgs.kernels.kernel_types import AdamState, DecoderWeights, IsFinite, SplatGradients
+from vdgs.kernels.kernel_types import HIDDEN_SIZE, AdamState, DecoderWeights, IsFinite, SplatGradients
 from vdgs.kernels.splat_segments import SplatMask
 from vdgs.kernels.torch_ref.adam import bias_correction_tables, check_updates
 from vdgs.kernels.torch_ref.decode_adam import decode_backward_adam as torch_decode_backward_adam
@@ -38,9 +38,10 @@ def decode_backward_adam(
     """As `torch_ref.decode_backward_adam`, for float32 tensors on a CUDA device, without waiting for it.
 
     A warp moves an anchor; its gradients are never stored. Gradients of the decoder are matrix products (by torch) over
-    `chunk` anchors at a time, 1.4 kB each (88 MB: fewer would be launches that cost more than the memory's time). An anchor whose gradient is not finite
-    does not move. With gradients by depth, torch computes everything. `lr_boost` is the same for all of `moved`. Raises
-    ValueError or TypeError for unsuitable tensors, CudaUnavailable where the kernel cannot be run.
+    `chunk` anchors at a time, 1.4 kB each: 88 MB, of which fewer would be launches that take longer than the memory. An
+    anchor whose gradient is not finite does not move. With gradients by depth, torch computes everything. `lr_boost` is
+    the same for all of `moved`. Raises ValueError or TypeError for unsuitable tensors, CudaUnavailable where the kernel
+    cannot be run.
     """
     if gradients.depths is not None:
         named = replace(gradients, source=expand_sources(gradients.source, program=program))
@@ -66,53 +67,58 @@ def decode_backward_adam(
         ctypes.c_float(gradients.volume), updates, lacking, roots, ctypes.c_int(len(roots)), broken,
     ]  # fmt: skip
     wanted = any(t.requires_grad for t in weights.tensors())
-    of_weights: list[Tensor] = []
+    sums: list[Tensor] = []
     at_once = chunk if wanted else max(v, 1)
     for first in range(0, v, at_once):
         count = min(at_once, v - first)
         made = _DecoderGradientBuffers.empty(count, k, inputs, positions) if wanted else None
         program.launch(
             "move_anchors", (-(-count // ANCHORS_PER_BLOCK),), (32 * ANCHORS_PER_BLOCK,), *before,
-            ctypes.c_longlong(first), ctypes.c_longlong(count), *after, *(made.tensors() if made else [None] * 6),
+            ctypes.c_longlong(first), ctypes.c_longlong(count), *after, *(made or [None] * 4),
         )  # fmt: skip
-        if made and of_weights:
-            torch._foreach_add_(of_weights, made.gradients())
+        if made and sums:
+            torch._foreach_add_(sums, made.sums())
         elif made:
-            of_weights = list(made.gradients())
-    if wanted and not of_weights:
-        of_weights = [torch.zeros_like(t) for t in weights.tensors()]
-    return (broken == 0)[0], tuple(of_weights) if wanted else None
+            sums = made.sums()
+    finite = (broken == 0)[0]
+    if wanted and not sums:  # nothing is visible
+        return finite, tuple(torch.zeros_like(t) for t in weights.tensors())
+    return finite, _of_heads(sums, k) if wanted else None
 
 
 def _weights(weights: DecoderWeights, k: int) -> list[Tensor]:
     """The kernel's layout: first for the forward products, then for the backward ones."""
     heads = weights.opacity, weights.covariance, weights.color
-    opacity, covariance, color = (pack_head(head, k) for head in heads)
+    forward = (tensor for head in pack_decoder(weights, k) for tensor in head)
     back = (w.detach().contiguous() for head in heads for w in (head.w1, head.w2))
-    return [*opacity, *covariance, *color, *back]
+    return [*forward, *back]
 
 
 class _DecoderGradientBuffers(NamedTuple):
-    """What each of some visible anchors adds to the gradients of the decoder."""
+    """What each of some visible anchors adds to the gradients of the decoder, the heads beside each other."""
 
-    by_outputs: tuple[Tensor, ...]
-    hidden: Tensor
-    by_hidden: Tensor
-    inputs: Tensor
+    by_outputs: Float[Tensor, "c 11k"]
+    hidden: Float[Tensor, "c 96"]
+    by_hidden: Float[Tensor, "c 96"]
+    inputs: Float[Tensor, "c inputs"]
 
     @staticmethod
     def empty(count: int, k: int, inputs: int, like: Tensor) -> _DecoderGradientBuffers:
-        by_outputs = tuple(like.new_empty(count, outputs * k) for outputs in (1, 7, 3))
-        hidden, by_hidden = (like.new_empty(3, count, 32) for _ in range(2))
-        return _DecoderGradientBuffers(by_outputs, hidden, by_hidden, like.new_empty(count, inputs))
+        widths = (11 * k, 3 * HIDDEN_SIZE, 3 * HIDDEN_SIZE, inputs)
+        return _DecoderGradientBuffers(*(like.new_empty(count, width) for width in widths))
 
-    def tensors(self) -> list[Tensor]:
-        return [*self.by_outputs, self.hidden, self.by_hidden, self.inputs]
+    def sums(self) -> list[Tensor]:
+        """Of w1 [96, inputs] and b1 [96]; of w2 [11k, 96], in which only the blocks of a head with itself have a
+        meaning, and b2 [11k]: four operations instead of twelve, which is what time they take on a card."""
+        by_hidden, by_outputs = self.by_hidden, self.by_outputs
+        return [by_hidden.t() @ self.inputs, by_hidden.sum(0), by_outputs.t() @ self.hidden, by_outputs.sum(0)]
 
-    def gradients(self) -> tuple[Tensor, ...]:
-        """Of the twelve tensors of the decoder."""
-        heads = zip(self.by_outputs, self.hidden, self.by_hidden, strict=True)
-        by_head = (
-            (b.t() @ self.inputs, b.sum(0), outputs.t() @ hidden, outputs.sum(0)) for outputs, hidden, b in heads
-        )
-        return tuple(gradient for gradients in by_head for gradient in gradients)
+
+def _of_heads(sums: Sequence[Tensor], k: int) -> tuple[Tensor, ...]:
+    """The gradients of the twelve tensors of the decoder."""
+    w1, b1, w2, b2 = sums
+    gradients: list[Tensor] = []
+    for head, (first, last) in enumerate(((0, k), (k, 8 * k), (8 * k, 11 * k))):
+        units = slice(head * HIDDEN_SIZE, (head + 1) * HIDDEN_SIZE)
+        gradients += [w1[units], b1[units], w2[first:last, units], b2[first:last]]
+    return tuple(gradients)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
@@ -113,7 +114,13 @@ class PackedCamera(ctypes.Structure):
 
     @staticmethod
     def of(camera: Camera) -> PackedCamera:
-        """As `unpack_camera` of gaussian_math.h makes it of the same numbers."""
+        """As `unpack_camera` of gaussian_math.h makes it of the same numbers; kept as long as the camera is there."""
+        if camera not in _packed_cameras:
+            _packed_cameras[camera] = PackedCamera._made_of(camera)
+        return _packed_cameras[camera]
+
+    @staticmethod
+    def _made_of(camera: Camera) -> PackedCamera:
         numbers = [float(each) for each in camera.packed]
         axes, translation = [numbers[:3], numbers[3:6], numbers[6:9]], numbers[9:12]
         center = [-sum(axis[i] * shift for axis, shift in zip(axes, translation, strict=True)) for i in range(3)]
@@ -122,6 +129,9 @@ class PackedCamera(ctypes.Structure):
         blur = DILATION_PX2 * pixel * pixel * fx * fy
         vectors = (tuple(vector) for vector in (*axes, center))
         return PackedCamera(*vectors, fx, fy, cx, cy, width, height, near, *limits, blur, bool(orthographic))
+
+
+_packed_cameras: WeakKeyDictionary[Camera, PackedCamera] = WeakKeyDictionary()
 
 
 def pack_arguments(
@@ -138,15 +148,16 @@ def common_device(arguments: Sequence[KernelArgument], device_type: str) -> torc
     tensors = [argument for argument in arguments if isinstance(argument, Tensor)]
     if not tensors:
         raise ValueError("a kernel must be given at least one tensor")
+    devices = {tensor.device for tensor in tensors}
+    for device in devices:
+        if device.type != device_type:
+            raise TypeError(f"a kernel's tensors must be on a {device_type} device, not on {device}")
     for tensor in tensors:
-        if tensor.device.type != device_type:
-            raise TypeError(f"a kernel's tensors must be on a {device_type} device, not on {tensor.device}")
         if not tensor.is_contiguous():
             raise ValueError(f"a kernel's tensors must be contiguous; one of shape {list(tensor.shape)} is not")
-    devices = {tensor.device for tensor in tensors}
     if len(devices) > 1:
         raise ValueError(f"a kernel's tensors are on several devices: {', '.join(sorted(map(str, devices)))}")
-    return tensors[0].device
+    return devices.pop()
 
 
 def _value(argument: KernelArgument) -> ctypes._SimpleCData | ctypes.Structure:

@@ -244,8 +244,8 @@ struct Moved {
 // and where their splats are, as in `decode_anchors`. What these looked like is computed again, to the same bits. `updates`
 // [n] counts up; `lacking` and `roots` [t] hold 1 - beta1^u and 1 / sqrt(1 - beta2^u) of u = 1, 2, ... updates. `broken` [1]
 // becomes 1 where a gradient is no number: that anchor stays.
-// For the gradients of the decoder, by matrix products, with c for `count`: by outputs [c, k], [c, 7k], [c, 3k], hidden
-// layers and by hidden layers [3, c, 32], inputs [c, inputs]; all of these null where nobody wants them.
+// For the gradients of the decoder, by matrix products, with c for `count`: by the outputs of all heads [c, k + 7k + 3k],
+// hidden layers and by hidden layers [c, 3, 32], inputs [c, inputs]; all of these null where nobody wants them.
 extern "C" __global__ void __launch_bounds__(kThreads, 1)
 move_anchors(const float* positions, float* features, float* offsets, float* log_scales, float* features_first,
              float* offsets_first, float* log_scales_first, float* features_second, float* offsets_second,
@@ -257,8 +257,7 @@ move_anchors(const float* positions, float* features, float* offsets, float* log
              long long first, long long count, int k, int inputs_wide, const unsigned* shown, const int* begins,
              const float* by_means_px, const float* by_conics, const float* by_colors, const float* by_opacities,
              float by_volume, int* updates, const float* lacking, const float* roots, int most_updates, int* broken,
-             float* by_opacity_out, float* by_covariance_out, float* by_color_out, float* hidden_out,
-             float* by_hidden_out, float* inputs_out) {
+             float* by_outputs_out, float* hidden_out, float* by_hidden_out, float* inputs_out) {
   const long long place = static_cast<long long>(blockIdx.x) * kWarps + threadIdx.x / kWarp, visible = first + place;
   if (place >= count) return;  // whole warps
   const int lane = threadIdx.x % kWarp;
@@ -323,16 +322,16 @@ move_anchors(const float* positions, float* features, float* offsets, float* log
                  by_feature_of(r_w1, inputs_wide, by_hidden[2]);
     for (float& each : by_scales) each = add_over_lanes(each);
   }
-  if (by_opacity_out) {
+  if (by_outputs_out) {
     if (has_offset) {
-      const long long at = place * k + lane;
-      by_opacity_out[at] = by_opacity[0];
-      for (int c = 0; c < 7; ++c) by_covariance_out[7 * at + c] = by_covariance[c];
-      for (int c = 0; c < 3; ++c) by_color_out[3 * at + c] = by_color[c];
+      float* out = by_outputs_out + place * 11 * k;
+      out[lane] = by_opacity[0];
+      for (int c = 0; c < 7; ++c) out[k + 7 * lane + c] = by_covariance[c];
+      for (int c = 0; c < 3; ++c) out[8 * k + 3 * lane + c] = by_color[c];
     }
     for (int head = 0; head < 3; ++head) {
-      hidden_out[(head * count + place) * kHidden + lane] = hidden[head];
-      by_hidden_out[(head * count + place) * kHidden + lane] = by_hidden[head];
+      hidden_out[(place * 3 + head) * kHidden + lane] = hidden[head];
+      by_hidden_out[(place * 3 + head) * kHidden + lane] = by_hidden[head];
     }
     // An anchor that shows nothing may be made of anything: zeros for it, which times zero are zero.
     float* out = inputs_out + place * inputs_wide;
