@@ -111,10 +111,10 @@ class CudaDriver:
     def launch(self, function: int, grid: GridSize, block: GridSize, device: torch.device, arguments: Any) -> None:
         stream = torch.cuda.current_stream(device).cuda_stream
         with self._current(_index(device)):
-            # Whole numbers are passed as they are: grid, block and shared bytes are 32 bits wide, the others pointers.
             self._call(
-                "cuLaunchKernel", ctypes.c_void_p(function), *grid, *block, 0, ctypes.c_void_p(stream), arguments, None
-            )
+                "cuLaunchKernel", ctypes.c_void_p(function), *(ctypes.c_uint(side) for side in (*grid, *block)),
+                ctypes.c_uint(0), ctypes.c_void_p(stream), arguments, None,
+            )  # fmt: skip
 
     @contextmanager
     def _current(self, index: int) -> Iterator[None]:
