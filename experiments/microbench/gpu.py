@@ -1,6 +1,6 @@
 """Check a GPU in a few minutes: whether it computes what the processor computes, and how long that takes.
 
-    python -m experiments.microbench.gpu [--minutes 8] [--capture PLACE] [--small]
+    python -m experiments.microbench.gpu [--minutes 8] [--town PLACE] [--capture PLACE] [--small]
 
 In this order: what the kernels take of the card, parity of every operation with the processor, a generated town trained
 and measured on both, milliseconds and bytes of a training step by each rasterizer, and a capture of one's own if it is
@@ -145,10 +145,11 @@ def print_parity(gpu: GpuDevice, sizes: Sizes, report: Report) -> None:
             report.errors.append(f"{name} differs by {difference.size:.1e}")
 
 
-def train_town(sizes: Sizes, report: Report) -> None:
+def train_town(sizes: Sizes, report: Report, town: Path | None) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        capture = Path(folder) / "capture"
-        run_command("synth", str(capture), *sizes.town)
+        capture = town or Path(folder) / "capture"
+        if town is None:
+            run_command("synth", str(capture), *sizes.town)
         # Both at the size that the town has: one chosen for each device would be another for each.
         same = ("--seed", "1", "--images", "images")
         results = {
@@ -238,6 +239,9 @@ def train_capture(capture: Path, iterations: int) -> None:
 def main(arguments: list[str] | None = None, gpu: GpuDevice | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=8.0, help="no section begins after so long (default 8)")
+    parser.add_argument(
+        "--town", type=Path, help="what `vdgs synth PLACE --size village` has made (default: made anew)"
+    )
     parser.add_argument("--capture", type=Path, help="also train on this capture")
     parser.add_argument("--iterations", type=int, default=1500, help="of that training (default 1500)")
     parser.add_argument("--small", action="store_true", help="as little of everything as tries all of it")
@@ -251,7 +255,7 @@ def main(arguments: list[str] | None = None, gpu: GpuDevice | None = None) -> in
     sections: dict[str, Callable[[], None]] = {
         "what the kernels take": lambda: print_resources(device),
         "parity with the processor": lambda: print_parity(device, sizes, report),
-        "a generated town": lambda: train_town(sizes, report),
+        "a generated town": lambda: train_town(sizes, report, args.town),
         "a training step": lambda: time_steps(device, sizes),
         "memory": lambda: print_memory(device, sizes),
     }

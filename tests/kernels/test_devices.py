@@ -77,10 +77,8 @@ class TestWhichRasterizerDraws:
             rasterizer.select_rasterizer("native")
 
 
-def test_auto_takes_the_processor_until_a_card_has_run_it(monkeypatch, tmp_path):
-    monkeypatch.setattr(device_selection, "DRIVER_FOLDER", tmp_path)
-    untried = "vdgs has not been run on a GPU yet; --device cuda uses the one here"
-    assert select_device("auto") == SelectedDevice("cpu", untried)
+def test_without_a_driver_auto_is_the_processor_and_loads_nothing(monkeypatch, tmp_path):
+    monkeypatch.setattr(device_selection, "_no_card", lambda index: pytest.fail("a card was looked for"))
     monkeypatch.setattr(device_selection, "DRIVER_FOLDER", tmp_path / "none")
     assert select_device("auto") == SelectedDevice("cpu", "this machine has no NVIDIA GPU")
     assert select_device("cpu") == SelectedDevice("cpu", "as asked for")
@@ -104,22 +102,21 @@ class TestWithCards:
     def test_the_card_that_is_asked_for(self):
         assert select_device("cuda") == SelectedDevice("cuda:0", "as asked for")
         assert select_device("cuda:1").device == "cuda:1"
-        assert select_device("auto").device == "cpu"
 
-    def test_auto_takes_the_first_card_once_one_has_run_it(self, monkeypatch):
-        monkeypatch.setattr(device_selection, "GPU_VERIFIED", True)
+    def test_auto_takes_the_first_card(self, monkeypatch, tmp_path):
+        monkeypatch.setattr(device_selection, "DRIVER_FOLDER", tmp_path)
         assert select_device("auto") == SelectedDevice("cuda:0", "there is a card that can be used")
 
     def test_a_card_that_is_not_there(self):
         with pytest.raises(DeviceUnavailable, match="no card 2; the driver knows 2"):
             select_device("cuda:2")
 
-    def test_auto_without_a_driver_is_the_processor(self, monkeypatch):
+    def test_auto_without_a_driver_is_the_processor(self, monkeypatch, tmp_path):
         def none() -> None:
             raise CudaUnavailable("There is no NVIDIA driver here")
 
         monkeypatch.setattr(driver, "get_cuda_driver", none)
-        monkeypatch.setattr(device_selection, "GPU_VERIFIED", True)
+        monkeypatch.setattr(device_selection, "DRIVER_FOLDER", tmp_path)
         assert select_device("auto") == SelectedDevice("cpu", "There is no NVIDIA driver here")
         with pytest.raises(DeviceUnavailable, match="no NVIDIA driver here"):
             select_device("cuda")

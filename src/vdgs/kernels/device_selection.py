@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vdgs.errors import VdgsError
-from vdgs.kernels.operations import GPU_VERIFIED
 
 
 class DeviceUnavailable(VdgsError):
@@ -27,16 +26,15 @@ class SelectedDevice:
 
 
 def select_device(device: str) -> SelectedDevice:
-    """The device for `auto`, `cpu`, `cuda` or `cuda:i`; `auto` takes a GPU only if GPU_VERIFIED. Raises
+    """The device for `auto` (the first card that can be used, else the processor), `cpu`, `cuda` or `cuda:i`. Raises
     DeviceUnavailable for a GPU that is absent or cannot be used, VdgsError for another value."""
     named = re.fullmatch(r"auto|cpu|cuda(?::(\d+))?", device)
     if named is None:
         raise VdgsError(f"--device {device}: choose auto, cpu, cuda or cuda:0 (the number is that of the card)")
     if device == "cpu":
         return SelectedDevice("cpu", "as asked for")
-    if device == "auto" and not GPU_VERIFIED:
-        untried = "vdgs has not been run on a GPU yet; --device cuda uses the one here"
-        return SelectedDevice("cpu", untried if DRIVER_FOLDER.exists() else "this machine has no NVIDIA GPU")
+    if device == "auto" and not DRIVER_FOLDER.exists():
+        return SelectedDevice("cpu", "this machine has no NVIDIA GPU")
     index = int(named.group(1) or 0)
     reason = _no_card(index)
     if not reason:

@@ -154,9 +154,6 @@ GPU_BACKENDS: dict[str, tuple[str, ...]] = dict.fromkeys(OPERATION_NAMES, ("torc
     "splat_contributions": ("cuda",),
 }
 
-#: Whether all that has been run on a card. Until it is, `--device auto` takes the processor.
-GPU_VERIFIED = False
-
 
 def backends_for(operation: str, device_type: str) -> tuple[str, ...]:
     """The implementations of an operation on a kind of device, the preferred one first."""

@@ -37,6 +37,7 @@ struct Inputs {
 __device__ float hidden_of(const Head& head, const Inputs& inputs, bool with_distance) {
   const int lane = threadIdx.x % kWarp;
   float sum = head.b1[lane];
+#pragma unroll 8  // all at once take registers that twice as many warps need
   for (int i = 0; i < kFeatures; ++i) {
     sum = fmaf(head.w1[i * kHidden + lane], __shfl_sync(kAllLanes, inputs.feature, i), sum);
   }
@@ -215,6 +216,7 @@ __device__ float by_hidden_of(const float* w2, int k, float hidden, const float 
 // Of the lane's feature, from those of the hidden layer. w1 [32, inputs].
 __device__ float by_feature_of(const float* w1, int inputs, float by_hidden) {
   float sum = 0.0f;
+#pragma unroll 8
   for (int j = 0; j < kHidden; ++j) {
     sum = fmaf(w1[j * inputs + threadIdx.x % kWarp], __shfl_sync(kAllLanes, by_hidden, j), sum);
   }
@@ -246,7 +248,7 @@ struct Moved {
 // becomes 1 where a gradient is no number: that anchor stays.
 // For the gradients of the decoder, by matrix products, with c for `count`: by the outputs of all heads [c, k + 7k + 3k],
 // hidden layers and by hidden layers [c, 3, 32], inputs [c, inputs]; all of these null where nobody wants them.
-extern "C" __global__ void __launch_bounds__(kThreads, 1)
+extern "C" __global__ void __launch_bounds__(kThreads, 2)
 move_anchors(const float* positions, float* features, float* offsets, float* log_scales, float* features_first,
              float* offsets_first, float* log_scales_first, float* features_second, float* offsets_second,
              float* log_scales_second, float features_rate, float offsets_rate, float log_scales_rate, float early,
