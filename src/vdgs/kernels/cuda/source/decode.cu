@@ -37,7 +37,6 @@ struct Inputs {
 __device__ float hidden_of(const Head& head, const Inputs& inputs, bool with_distance) {
   const int lane = threadIdx.x % kWarp;
   float sum = head.b1[lane];
-#pragma unroll 8  // all at once take registers that twice as many warps need
   for (int i = 0; i < kFeatures; ++i) {
     sum = fmaf(head.w1[i * kHidden + lane], __shfl_sync(kAllLanes, inputs.feature, i), sum);
   }
@@ -216,7 +215,7 @@ __device__ float by_hidden_of(const float* w2, int k, float hidden, const float 
 // Of the lane's feature, from those of the hidden layer. w1 [32, inputs].
 __device__ float by_feature_of(const float* w1, int inputs, float by_hidden) {
   float sum = 0.0f;
-#pragma unroll 8
+#pragma unroll 8  // all at once take registers that twice as many warps need
   for (int j = 0; j < kHidden; ++j) {
     sum = fmaf(w1[j * inputs + threadIdx.x % kWarp], __shfl_sync(kAllLanes, by_hidden, j), sum);
   }
