@@ -57,18 +57,19 @@ class TestWhichRasterizerDraws:
         yield
         rasterizer.select_rasterizer.cache_clear()
 
-    def test_gsplat_where_it_can_be_used_but_not_for_depth(self, monkeypatch):
-        monkeypatch.delenv(rasterizer.RASTERIZER_ENV_VAR, raising=False)
+    def test_the_own_kernels_unless_gsplat_is_asked_for(self, monkeypatch):
         monkeypatch.setattr(rasterizer, "load_gsplat", lambda: None)
+        assert rasterizer.select_rasterizer("") is rasterizer.select_rasterizer("cuda") is cuda
+        monkeypatch.setenv(rasterizer.RASTERIZER_ENV_VAR, "gsplat")
         assert rasterizer._drawing(depth=False) is gsplat
         assert rasterizer._drawing(depth=True) is cuda
 
-    def test_the_own_kernels_elsewhere(self, monkeypatch):
+    def test_gsplat_that_cannot_be_used_is_an_error(self, monkeypatch):
         def none() -> None:
             raise GsplatUnavailable("gsplat is not here")
 
         monkeypatch.setattr(rasterizer, "load_gsplat", none)
-        assert rasterizer.select_rasterizer("") is rasterizer.select_rasterizer("cuda") is cuda
+        assert rasterizer.select_rasterizer("") is cuda
         with pytest.raises(GsplatUnavailable, match="not here"):
             rasterizer.select_rasterizer("gsplat")
 
@@ -186,7 +187,7 @@ def test_doctor_says_what_there_is(monkeypatch: pytest.MonkeyPatch, tmp_path):
         "adam_tensors, add_view_statistics, count_visibility, cull, decode, decode_backward_adam, "
         "decode_for_training, mark_visible, photometric_loss, splat_contributions"
     )
-    assert lines["on cuda: gsplat or cuda"].value == "rasterize, rasterize_vjp"
+    assert lines["on cuda: cuda or gsplat"].value == "rasterize, rasterize_vjp"
     assert "adam_rows" in lines["on cuda: torch_ref"].value
     assert lines["--device auto"].value.startswith("cpu: ")
     assert all(check.is_ok for check in lines.values())

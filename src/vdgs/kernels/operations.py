@@ -137,8 +137,8 @@ class KernelBackend(Protocol):
 #: The names of the operations: each implementation's `__init__` imports them under these.
 OPERATION_NAMES = tuple(sorted(name for name in vars(KernelBackend) if not name.startswith("_")))
 
-#: The implementations (modules of `vdgs.kernels`) of each operation on an NVIDIA GPU; of several the first that can be
-#: used. gsplat has no median depth: images with depth are always drawn by `cuda`.
+#: The implementations (modules of `vdgs.kernels`) of each operation on an NVIDIA GPU; of several the first one unless
+#: another is asked for (`gpu/rasterizer.py`).
 GPU_BACKENDS: dict[str, tuple[str, ...]] = dict.fromkeys(OPERATION_NAMES, ("torch_ref",)) | {
     "adam_tensors": ("cuda",),
     "add_view_statistics": ("cuda",),
@@ -149,8 +149,8 @@ GPU_BACKENDS: dict[str, tuple[str, ...]] = dict.fromkeys(OPERATION_NAMES, ("torc
     "decode_for_training": ("cuda",),
     "mark_visible": ("cuda",),
     "photometric_loss": ("cuda",),
-    "rasterize": ("gsplat", "cuda"),
-    "rasterize_vjp": ("gsplat", "cuda"),
+    "rasterize": ("cuda", "gsplat"),
+    "rasterize_vjp": ("cuda", "gsplat"),
     "splat_contributions": ("cuda",),
 }
 

@@ -1,5 +1,5 @@
-"""Which rasterizer draws on a GPU: gsplat where it can be used, the own kernels elsewhere and wherever depth is asked
-for, since gsplat cannot tell the median depth of a pixel."""
+"""Which rasterizer draws on a GPU: the own kernels, or gsplat where it is asked for. The own kernels draw depth in any
+case, since gsplat cannot tell the median depth of a pixel."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from vdgs.errors import VdgsError
 from vdgs.kernels import cuda, gsplat
-from vdgs.kernels.gsplat import GsplatUnavailable, load_gsplat
+from vdgs.kernels.gsplat import load_gsplat
 from vdgs.kernels.kernel_types import Raster, RasterPullback, Splats
 
 #: Environment variable that takes one of them: `gsplat` or `cuda`.
@@ -39,16 +39,11 @@ def _drawing(depth: bool) -> ModuleType:
 
 @cache
 def select_rasterizer(name: str) -> ModuleType:
-    """The implementation that is asked for, or the one that can be used. Raises GsplatUnavailable where gsplat is asked
-    for and cannot be used, VdgsError for another word."""
+    """The implementation of this name, of "" the own kernels. Raises GsplatUnavailable where gsplat cannot be
+    used, VdgsError for another word."""
     if name not in ("", "gsplat", "cuda"):
         raise VdgsError(f"{RASTERIZER_ENV_VAR} must be gsplat, cuda or not set, not {name!r}.")
-    if name == "cuda":
+    if name != "gsplat":
         return cuda
-    try:
-        load_gsplat()
-    except GsplatUnavailable:
-        if name:
-            raise
-        return cuda
+    load_gsplat()
     return gsplat
