@@ -13,10 +13,11 @@ from vdgs.cli import run_cmd
 from vdgs.config.executor_options import ExecutorOptions, SlurmOptions
 from vdgs.config.presets import PRESETS
 from vdgs.distributed import node_check
-from vdgs.distributed.backend_selection import MachineResources, select_backend
+from vdgs.distributed.backend_selection import select_backend
 from vdgs.distributed.executor import AttemptResult, AttemptStarted, LogListener, Task, TaskListener, TaskResources
 from vdgs.distributed.node_check import NodeRequirements, check_node
 from vdgs.distributed.resource_allocation import (
+    MachineResources,
     ShardWorkload,
     allocate_cluster,
     allocate_local,
@@ -173,25 +174,25 @@ works = st.builds(
 
 @given(works, st.integers(1, 128), st.integers(0, 10**12))
 def test_blocks_at_once_and_their_photographs_fit_into_one_machine(work, cores, free):
-    share = allocate_local(work, cores, free)
+    share = allocate_local(work, MachineResources(cores, free))
     photographs = min(work.images_bytes, 1e9 * share.image_gb)
     assert share.max_concurrent == 1 or share.max_concurrent * (work.shard_bytes + photographs) <= free + 1
     assert share.max_concurrent == 1 or not exceeds_memory(work, share.max_concurrent, free)
     assert (
         exceeds_memory(replace(work, image_gb=0), 1, free)
-        or allocate_local(replace(work, image_gb=0), 1, free).image_gb
+        or allocate_local(replace(work, image_gb=0), MachineResources(1, free)).image_gb
     )
 
 
 def test_large_photographs_leave_room_for_fewer_blocks():
     """Photographs of 20 MP: 3 GB for the picture of a block and 16 GB for those that are kept."""
     large = ShardWorkload(shards=32, shard_bytes=3_800_000_000, images_bytes=10**11)
-    share = allocate_local(large, 32, 64 * GB)
+    share = allocate_local(large, MachineResources(32, 64 * GB))
     assert (share.max_concurrent, share.image_gb) == (12, 16 / 12)
-    assert allocate_local(replace(large, image_gb=40), 32, 64 * GB).max_concurrent == 6
+    assert allocate_local(replace(large, image_gb=40), MachineResources(32, 64 * GB)).max_concurrent == 6
     # Small ones need no quarter of the memory.
     small = ShardWorkload(shards=32, shard_bytes=2 * GB, images_bytes=10**7)
-    assert allocate_local(small, 32, 64 * GB).max_concurrent == 31
+    assert allocate_local(small, MachineResources(32, 64 * GB)).max_concurrent == 31
 
 
 def test_two_small_blocks_fit_into_a_laptop_with_4_gb_free():
@@ -201,14 +202,25 @@ def test_two_small_blocks_fit_into_a_laptop_with_4_gb_free():
     work = ShardWorkload(
         shards=4, shard_bytes=estimate_memory(largest).total, images_bytes=decoded_image_bytes(cameras)
     )
-    assert allocate_local(work, 2, 4 * GB).max_concurrent == 2
+    assert allocate_local(work, MachineResources(2, 4 * GB)).max_concurrent == 2
     assert not exceeds_memory(work, 2, 4 * GB)
+
+
+@pytest.mark.parametrize(("cards", "at_once"), [((80 * GB,), 2), ((80 * GB, 80 * GB), 4), ((4 * GB, 80 * GB), 2)])
+def test_cards_take_two_blocks_each_where_there_is_room(cards, at_once, question):
+    """However much memory and however many cores the machine has."""
+    work = ShardWorkload(shards=9, shard_bytes=2 * GB)
+    machine = MachineResources(16, 128 * GB, cards)
+    assert allocate_local(work, machine).max_concurrent == at_once
+    assert allocate_local(replace(work, jobs=7), machine).max_concurrent == 7
+    with select_backend(ExecutorOptions(), work, machine, lambda: question) as chosen:
+        assert f"{at_once} at once on {'one card' if len(cards) == 1 else '2 cards'} with" in chosen.description
 
 
 def test_photographs_give_way_to_blocks_that_a_person_asked_for():
     work = ShardWorkload(shards=4, shard_bytes=3 * GB, jobs=2, images_bytes=10**11)
-    assert allocate_local(work, 4, 7 * GB).image_gb == 0.5
-    assert allocate_local(work, 4, 6 * GB).image_gb == 0.1
+    assert allocate_local(work, MachineResources(4, 7 * GB)).image_gb == 0.5
+    assert allocate_local(work, MachineResources(4, 6 * GB)).image_gb == 0.1
     assert [exceeds_memory(work, 2, free) for free in (6 * GB, 7 * GB)] == [True, False]
     assert exceeds_memory(replace(work, image_gb=2), 2, 7 * GB)
 
@@ -238,7 +250,10 @@ def test_what_a_person_asks_for_is_asked_of_the_cluster():
         ).image_gb
         == 2
     )
-    assert allocate_local(ShardWorkload(shards=8, shard_bytes=2 * GB, image_gb=4), 2, 8 * GB).image_gb == 2
+    assert (
+        allocate_local(ShardWorkload(shards=8, shard_bytes=2 * GB, image_gb=4), MachineResources(2, 8 * GB)).image_gb
+        == 2
+    )
 
 
 @pytest.mark.parametrize(

@@ -108,6 +108,11 @@ class TestWithCards:
         monkeypatch.setattr(device_selection, "DRIVER_FOLDER", tmp_path)
         assert select_device("auto") == SelectedDevice("cuda:0", "there is a card that can be used")
 
+    def test_processes_share_all_cards_but_where_another_than_the_first_is_asked_for(self):
+        assert device_selection.cards_of("cuda:0") == {"cuda:0": 8 * 10**9, "cuda:1": 8 * 10**9}
+        assert device_selection.cards_of("cuda:1") == {"cuda:1": 8 * 10**9}
+        assert device_selection.cards_of("cpu") == {}
+
     def test_a_card_that_is_not_there(self):
         with pytest.raises(DeviceUnavailable, match="no card 2; the driver knows 2"):
             select_device("cuda:2")

@@ -12,6 +12,7 @@ from vdgs.distributed.local_executor import LocalExecutor
 from vdgs.distributed.node_check import NodeRequirements
 from vdgs.distributed.resource_allocation import (
     Allocation,
+    MachineResources,
     ShardWorkload,
     allocate_cluster,
     allocate_local,
@@ -35,14 +36,6 @@ class SelectedBackend:
     """Where they run and with what, in words."""
     notes: tuple[str, ...] = ()
     """What a person should know before it begins."""
-
-
-@dataclass(frozen=True)
-class MachineResources:
-    """What this machine has."""
-
-    cores: int
-    free_bytes: int
 
 
 @contextmanager
@@ -84,12 +77,12 @@ def check_backend_reachable(options: ExecutorOptions) -> None:
 
 
 def _local(workload: ShardWorkload, machine: MachineResources) -> SelectedBackend:
-    allocation = allocate_local(workload, machine.cores, machine.free_bytes)
+    allocation = allocate_local(workload, machine)
     at_once, kind = allocation.max_concurrent, workload.kind
     images = min(workload.images_bytes, round(1e9 * allocation.image_gb))
     images_text = f" and {data_size(images)} for photographs" if images else ""
     text = (
-        f"{at_once} at once with {allocation.resources.cpus} thread(s) each; by estimate a {kind.singular} takes "
+        f"{at_once} at once{_on_cards(machine)} with {allocation.resources.cpus} thread(s) each; by estimate a {kind.singular} takes "
         f"at most {data_size(workload.shard_bytes)}{images_text}, of {data_size(machine.free_bytes)} free"
     )
     notes: tuple[str, ...] = ()
@@ -97,6 +90,11 @@ def _local(workload: ShardWorkload, machine: MachineResources) -> SelectedBacken
         remedies = ", ".join(("less --jobs", *kind.memory_saving_options))
         notes = (f"[yellow]warning[/] {at_once} at once may run out of memory. What helps: {remedies}",)
     return SelectedBackend(LocalExecutor(at_once), allocation, text, notes)
+
+
+def _on_cards(machine: MachineResources) -> str:
+    count = len(machine.cards)
+    return "" if not count else " on one card" if count == 1 else f" on {count} cards"
 
 
 def _ray(options: ExecutorOptions, workload: ShardWorkload, requirements: NodeRequirements) -> SelectedBackend:

@@ -14,6 +14,9 @@ from vdgs.distributed.job_labels import BLOCK_LABELS, JobLabels
 DEFAULT_CPUS = 4
 #: Share of its memory in which a shard caches decoded images, and GB where nobody knows how much there is (choice).
 IMAGE_MEMORY_SHARE, DEFAULT_IMAGE_GB = 0.25, 1.0
+#: Shards at once on a card (choice: a step waits for the processor about as long as for the card), and what each takes
+#: of its memory beside the estimate: the context, kernels, what torch keeps.
+SHARDS_PER_CARD, CARD_OVERHEAD_BYTES = 2, 10**9
 #: GB for images at least (choice): those of a step and of the next.
 MIN_IMAGE_GB = 0.1
 
@@ -60,6 +63,20 @@ class Allocation:
     image_gb: float
 
 
+@dataclass(frozen=True)
+class MachineResources:
+    """What this machine has; `cards` are the bytes of each GPU that shards may use."""
+
+    cores: int
+    free_bytes: int
+    cards: tuple[int, ...] = ()
+
+    def max_on_cards(self, shard_bytes: int) -> int:
+        """How many shards of so many bytes find room on the cards, at least one on each."""
+        room = max(1, int(0.9 * min(self.cards)) // (shard_bytes + CARD_OVERHEAD_BYTES))
+        return len(self.cards) * min(SHARDS_PER_CARD, room)
+
+
 def default_jobs(shards: int, cores: int, memory_available: int, memory_each: int) -> tuple[int, int]:
     """How many shards to run at once on the CPU, and with how many threads each (choice).
 
@@ -71,19 +88,20 @@ def default_jobs(shards: int, cores: int, memory_available: int, memory_each: in
     return jobs, max(1, cores // jobs)
 
 
-def allocate_local(workload: ShardWorkload, cores: int, free_bytes: int) -> Allocation:
-    """On one machine: as many shards at once as there are cores and memory for.
+def allocate_local(workload: ShardWorkload, machine: MachineResources) -> Allocation:
+    """On one machine: as many shards at once as there are cores, memory and, where these compute, cards for.
 
     Images share one budget: what was requested, else a quarter of what is free, or less where shards leave less.
     """
+    cores, free_bytes = machine.cores, machine.free_bytes
     budget = 1e9 * workload.image_gb or IMAGE_MEMORY_SHARE * free_bytes
     at_once, threads = max(
         default_jobs(workload.shards, cores, max(0, int(free_bytes - budget)), workload.shard_bytes),
         # Where all images take less than the budget.
         default_jobs(workload.shards, cores, free_bytes, workload.shard_bytes + workload.images_bytes),
     )
-    if workload.jobs:
-        at_once = workload.max_concurrent
+    if workload.jobs or machine.cards:
+        at_once = workload.max_concurrent if workload.jobs else min(at_once, machine.max_on_cards(workload.shard_bytes))
         threads = max(1, cores // at_once)
     if not workload.image_gb:
         budget = min(budget, max(1e9 * MIN_IMAGE_GB * at_once, free_bytes - at_once * workload.shard_bytes))

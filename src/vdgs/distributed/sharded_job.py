@@ -12,13 +12,13 @@ by another driver. All of it is removed once the items are gathered (`job_folder
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,15 +26,16 @@ from rich.console import Console
 
 from vdgs.config.executor_options import ExecutorOptions
 from vdgs.config.serialization import to_dict
-from vdgs.distributed.backend_selection import MachineResources, select_backend
+from vdgs.distributed.backend_selection import select_backend
 from vdgs.distributed.executor import TaskResult
 from vdgs.distributed.job_folders import SHARDS, clear, remove
 from vdgs.distributed.job_labels import JobLabels
 from vdgs.distributed.node_check import NodeRequirements, code_digest
-from vdgs.distributed.resource_allocation import Allocation, ShardWorkload
+from vdgs.distributed.resource_allocation import Allocation, MachineResources, ShardWorkload
 from vdgs.distributed.shard_runner import ShardCommand, run_shards
 from vdgs.errors import RunError, Stopped
 from vdgs.kernels import get_num_threads
+from vdgs.kernels.device_selection import cards_of
 from vdgs.runs.stage_folder import StageFolder, StatusRecord
 from vdgs.system.atomic_files import write_json
 from vdgs.system.file_locks import lock_folder
@@ -82,7 +83,7 @@ def split_ranges(items: int, min_items: int, max_items: int, shards: int) -> tup
     `min_items` or longer than `max_items`. Nothing but the number of items decides: any driver splits the same."""
     each = min(max_items, max(min_items, -(-items // shards)))
     count = max(1, -(-items // each))
-    return tuple(range(*ends) for ends in pairwise(items * index // count for index in range(count + 1)))
+    return tuple(range(*ends) for ends in itertools.pairwise(items * index // count for index in range(count + 1)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,7 +173,8 @@ class ShardedJob:
             shards=len(shards), shard_bytes=needs.memory_bytes, jobs=execution.jobs, image_gb=execution.image_gb,
             kind=kind, images_bytes=needs.images_bytes,
         )  # fmt: skip
-        machine = MachineResources(get_num_threads(), available_memory_bytes())
+        cards = cards_of(execution.device) if execution.executor_options.executor == "local" else {}
+        machine = MachineResources(get_num_threads(), available_memory_bytes(), tuple(cards.values()))
         with select_backend(execution.executor_options, workload, machine, needs.requirements) as backend:
             line = f"{len(shards)} of {total} {kind.plural} to {kind.verb}, {backend.description}"
             for text in (line, *backend.notes):
@@ -180,10 +182,10 @@ class ShardedJob:
             request = {name: value for name, value in to_dict(self.request).items() if name not in EXECUTION_FIELDS}
             write_json(self.folder / REQUEST, {"worker": self.worker, "request": request})
             (on_ready or self.mark_queued)()
-            share, device = backend.allocation, execution.device
+            share, devices = backend.allocation, itertools.cycle(cards or [execution.device])
             commands = [
                 ShardCommand(index, self.shard(index), self._command(index, share, device), share.resources, kind)
-                for index in shards
+                for index, device in zip(shards, devices, strict=False)
             ]
             results = run_shards(commands, backend.executor, console)
         self._raise_unless_done(results, total)

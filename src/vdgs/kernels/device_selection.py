@@ -45,6 +45,17 @@ def select_device(device: str) -> SelectedDevice:
     raise DeviceUnavailable(f"--device {device}: {reason}. Use --device cpu, which does everything, or leave it out.")
 
 
+def cards_of(device: str) -> dict[str, int]:
+    """The cards that processes of this machine share where one of them computes on this device, with the bytes of each:
+    all where it is the first card, that one where it is another, none for the CPU."""
+    from vdgs.kernels.cuda.driver import get_cuda_driver
+
+    if not device.startswith("cuda"):
+        return {}
+    every = {f"cuda:{card.index}": card.memory_bytes for card in get_cuda_driver().list_gpus()}
+    return {name: size for name, size in every.items() if device in ("cuda", "cuda:0", name)}
+
+
 def _no_card(index: int) -> str:
     """Why a card cannot be used, in words; empty if it can."""
     from vdgs.kernels.cuda.driver import get_cuda_driver

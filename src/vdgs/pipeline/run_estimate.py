@@ -14,9 +14,16 @@ from vdgs.captures.image_cache import ImageCache
 from vdgs.config.capture_options import AUTO_MASKS
 from vdgs.config.commands import RunRequest
 from vdgs.config.method import MethodConfig, TrainConfig, block_train_config
-from vdgs.distributed.resource_allocation import Allocation, ShardWorkload, allocate_local, exceeds_memory
+from vdgs.distributed.resource_allocation import (
+    Allocation,
+    MachineResources,
+    ShardWorkload,
+    allocate_local,
+    exceeds_memory,
+)
 from vdgs.geometry.camera import Camera
 from vdgs.kernels import get_num_threads
+from vdgs.kernels.device_selection import cards_of
 from vdgs.model.initialization.initialize import initialize_anchors
 from vdgs.partition.partition_scene import choose_block_count
 from vdgs.pipeline.dense_points import PIXELS_PER_POINT
@@ -183,7 +190,8 @@ def estimate_at(scene: Scene, probed: Probe, method: MethodConfig, request: RunR
         shards=blocks, shard_bytes=block_bytes, jobs=request.jobs, image_gb=request.checkpointing.image_cache_gb,
         images_bytes=images_bytes,
     )  # fmt: skip
-    local = allocate_local(work, get_num_threads(), free)
+    cards = tuple(cards_of(request.device).values())
+    local = allocate_local(work, MachineResources(get_num_threads(), free, cards))
     block = block_train_config(method, max(1, round(views * min(1.0, 1.5 / blocks))))
     drawn = cameras[0].width * cameras[0].height
     coarse_growth, block_growth = growth.coarse(config), growth.block(config, block)
