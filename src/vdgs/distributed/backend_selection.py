@@ -82,8 +82,9 @@ def _local(workload: ShardWorkload, machine: MachineResources) -> SelectedBacken
     images = min(workload.images_bytes, round(1e9 * allocation.image_gb))
     images_text = f" and {data_size(images)} for photographs" if images else ""
     text = (
-        f"{at_once} at once{_on_cards(machine)} with {allocation.resources.cpus} thread(s) each; by estimate a {kind.singular} takes "
-        f"at most {data_size(workload.shard_bytes)}{images_text}, of {data_size(machine.free_bytes)} free"
+        f"{at_once} at once{_on_cards(machine)} with {allocation.resources.cpus} thread(s) each; by estimate a "
+        f"{kind.singular} takes at most {data_size(workload.shard_bytes)}{images_text}, of "
+        f"{data_size(machine.free_bytes)} free"
     )
     notes: tuple[str, ...] = ()
     if exceeds_memory(workload, at_once, machine.free_bytes):
