@@ -151,7 +151,7 @@ def train_town(sizes: Sizes, report: Report, town: Path | None) -> None:
         if town is None:
             run_command("synth", str(capture), *sizes.town)
         # Both at the size that the town has: one chosen for each device would be another for each.
-        same = ("--seed", "1", "--images", "images")
+        same = ("--seed", "1", "--images", "images", "--preset", "laptop")
         results = {
             device: train_and_measure(capture, Path(folder) / device, device, sizes.iterations, *same)
             for device in ("cpu", "cuda")

@@ -44,7 +44,7 @@ def on_host(folder, order: int = 0, left_out: int = -1):
 def assert_all_close(found, expected):
     assert found[0] == expected[0]
     for one, other in zip(found[1], expected[1], strict=True):
-        torch.testing.assert_close(one, other, rtol=5e-6, atol=5e-6)
+        torch.testing.assert_close(one, other, rtol=3e-6, atol=3e-6)
 
 
 @needs_a_compiler

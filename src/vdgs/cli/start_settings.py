@@ -11,7 +11,7 @@ from vdgs.cli.argument_parser import GivenArguments
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.method import MethodConfig
 from vdgs.config.options import with_values
-from vdgs.config.presets import PRESETS, PresetName, preset_for_device
+from vdgs.config.presets import NEW_RUN_PRESET, PRESETS, PresetName
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,14 +33,14 @@ class StartSettings:
 def start_settings(given: GivenArguments) -> StartSettings:
     """The settings that a command line starts from.
 
-    A run that is there reads its capture as before, and without a preset it keeps its own method; a new one takes what
-    the device can do. Raises VdgsError for a file of settings that does not work and for a device that is none.
+    A run that is there reads its capture as before, and without a preset it keeps its own method; a new one takes
+    `NEW_RUN_PRESET`. Raises VdgsError for a file of settings that does not work and for a device that is none.
     """
     named, file, own = given.get("preset"), given.get("config"), _own_settings(given.get("output"))
     preset: PresetName | None = None if named in (None, "auto") else named
     reason = ""
     if preset is None and own is None:
-        preset, reason = _preset_for_machine(given.get("device") or "auto")
+        preset, reason = NEW_RUN_PRESET, _device_of_new_run(given.get("device") or "auto")
     options = CaptureOptions() if own is None else own.capture
     method = own.method if preset is None else PRESETS[preset]
     if file is not None:
@@ -60,11 +60,9 @@ def _own_settings(output: Path | None) -> Any:
     return RunFolder(output).settings()
 
 
-def _preset_for_machine(device: str) -> tuple[PresetName, str]:
+def _device_of_new_run(device: str) -> str:
     from vdgs.kernels.device_selection import select_device
 
     selected = select_device(device)
-    preset = preset_for_device(selected.device)
-    takes = "minutes to an hour" if preset == "laptop" else "the paper's schedule"
-    suits = f"suits the device {selected.device} ({selected.reason})"
-    return preset, f"{preset} ({takes}), which {suits}; --preset overrides"
+    takes = "steps follow the number of photographs"
+    return f"{NEW_RUN_PRESET} ({takes}) on {selected.device} ({selected.reason}); --preset overrides"

@@ -72,12 +72,12 @@ class RunRequest(ComputeOptions):
     output: Annotated[Path, Output()]
     """Run folder; new, or the run to continue."""
     preset: PresetChoice = "auto"
-    """Settings by name. `auto`: those of the run that is there, else `laptop` on a CPU and `default` on a GPU.
-    `laptop`: minutes to an hour on a CPU. `default`: the paper's numbers (100 000 + 50 000 iterations a block), and our
-    choices where it is silent: gaps filled, outliers left out, a background of the mean color, of random colors in
-    training, bounded sizes, cameras by `coverage` and each in its best block, a minimum of cameras a block, blocks
-    drawn in their surroundings, a lower gate of compensated growth, g added to means, only visible anchors moved.
-    `paper`: the paper's numbers and none of those choices."""
+    """Settings by name. `auto`: those of the run that is there, else `laptop`. `laptop`: steps by the number of
+    photographs, minutes to an hour on a CPU. `default`: the paper's numbers (100 000 + 50 000 iterations a block),
+    and our choices where it is silent: gaps filled, outliers left out, a background of the mean color, of random
+    colors in training, bounded sizes, cameras by `coverage` and each in its best block, a minimum of cameras a
+    block, blocks drawn in their surroundings, a lower gate of compensated growth, g added to means, only visible
+    anchors moved. `paper`: the paper's numbers and none of those choices."""
     overwrite: bool = False
     """Let other settings discard what was trained with the old ones."""
     jobs: Annotated[int, WORKER_COUNT] = 0

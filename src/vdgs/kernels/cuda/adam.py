@@ -57,7 +57,7 @@ def adam_tensors(
     for first in range(0, len(states), MAX_TENSORS):
         some = slice(first, first + MAX_TENSORS)
         table = _table(states[some], packed[some], rates[some])
-        settings = (ctypes.c_float(value) for value in (roots[0], beta1, beta2, epsilon))
+        settings = (ctypes.c_float(value) for value in (roots[0], beta1, beta2, 1 - beta1, 1 - beta2, epsilon))
         program.launch("adam_tensors", (len(states[some]),), (THREADS,), table, *settings, finite[some])
     torch.autograd.graph.increment_version(moved)
     return finite.all()

@@ -20,9 +20,11 @@ __device__ bool is_finite(float a) { return fabsf(a) <= 3.402823466e38f; }
 
 }  // namespace
 
-// parameter -= rate m / (sqrt(v) root + epsilon); `finite` [tensors].
+// parameter -= rate m / (sqrt(v) root + epsilon); `fresh`: 1 - beta, of which a float's difference would be 1e-5 off;
+// `finite` [tensors].
 extern "C" __global__ void __launch_bounds__(kThreads)
-adam_tensors(const Tensors tensors, float root, float beta1, float beta2, float epsilon, bool* finite) {
+adam_tensors(const Tensors tensors, float root, float beta1, float beta2, float fresh1, float fresh2,
+             float epsilon, bool* finite) {
   const int which = blockIdx.x, size = tensors.size[which];
   const float* gradient = tensors.gradient[which];
   bool mine = true;
@@ -33,8 +35,8 @@ adam_tensors(const Tensors tensors, float root, float beta1, float beta2, float 
   float *parameter = tensors.parameter[which], *first = tensors.first[which], *second = tensors.second[which];
   for (int i = threadIdx.x; i < size; i += kThreads) {
     const float g = gradient[i];
-    first[i] = beta1 * first[i] + (1.0f - beta1) * g;
-    second[i] = beta2 * second[i] + (1.0f - beta2) * (g * g);
+    first[i] = beta1 * first[i] + fresh1 * g;
+    second[i] = beta2 * second[i] + fresh2 * (g * g);
     parameter[i] -= tensors.rate[which] * first[i] / (sqrtf(second[i]) * root + epsilon);
   }
 }
