@@ -107,6 +107,6 @@ def tensors_crc32(tensors: Mapping[str, Tensor]) -> int:
 
 def _bytes_of(tensor: Tensor) -> memoryview:
     """The memory of a contiguous tensor; of a copy of it where it is not in main memory."""
-    tensor = tensor.cpu()
+    tensor = tensor if tensor.device.type == "cpu" else tensor.cpu()
     # An empty array has no memory to view; and numpy's types do not say that an array is a buffer.
     return memoryview(tensor.reshape(-1).view(torch.uint8).numpy() if tensor.numel() else bytearray())  # type: ignore[arg-type]
