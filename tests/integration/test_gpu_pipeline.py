@@ -1,12 +1,13 @@
 """The whole pipeline on a card that is not there, by the composed set of operations: `--device cuda`, from photographs
-to pictures and files, beside the same by the native set. Only what gsplat compiles is stood in for; own kernels run
-their own text on the processor."""
+to pictures and files, beside the same by the native set. Own kernels run their own text on the processor."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import get_args
 
+import numpy as np
 import pytest
 
 from support.cuda_on_host import host_compiler, needs_nvrtc
@@ -15,6 +16,9 @@ from support.fake_gsplat import needs_gsplat
 from support.gpu_on_host import build, install
 from support.small_pipeline import COARSE, MERGED, after_the_coarse_stage, psnr, train_coarse, vdgs
 from vdgs.kernels import device_selection
+from vdgs.runs.open_run import open_run
+from vdgs.viewer.layers import DisplayOptions, Layer, Painter
+from vdgs.viewer.viewer_scene import ViewerScene
 
 pytestmark = [
     pytest.mark.slow,
@@ -30,14 +34,29 @@ def runs(native_small, tmp_path_factory, compiled_code) -> tuple[Path, Path]:
     drivers = build(compiled_code)
     card = folder / "card"
     with pytest.MonkeyPatch.context() as patch:
-        install(drivers, compiled_code, patch, "cuda", "gsplat")
+        install(drivers, compiled_code, patch, "cuda", "cuda")
         patch.setattr(device_selection, "_no_card", lambda index: "")
         with pretended_card():
             train_coarse(native_small.capture, card, "--device", "cuda")
             after_the_coarse_stage(card, "--device", "cuda")
             vdgs("render", card, "--mode", "depth", "--output", folder / "depth", "--device", "cuda")
+            vdgs("ortho", card, "--device", "cuda")
+            vdgs("lod", card)
+            painted = paint_layers(card, "cuda")
             vdgs("export", card, "--output", folder / "scene.ply", "--color-iterations", "1", "--device", "cuda")
+    for layer, image in paint_layers(card, "cpu").items():
+        np.testing.assert_allclose(painted[layer].mean(axis=(0, 1)), image.mean(axis=(0, 1)), atol=4, err_msg=layer)
     return native_small.whole, card
+
+
+def paint_layers(run: Path, device: str) -> dict[str, np.ndarray]:
+    """What the viewer shows of a run with a tree, by layer."""
+    scene = ViewerScene(open_run(run, "merged", device), lambda name: open_run(run, name, device))
+    painter, camera = Painter(scene), scene.capture.train_views[0].camera
+    try:
+        return {layer: painter.paint(DisplayOptions(layer), camera, camera) for layer in get_args(Layer)}
+    finally:
+        scene.close()
 
 
 def test_a_card_learns_the_place_as_the_processor_does(runs):

@@ -79,7 +79,7 @@ class AnchorModel:
 
     def without_anchors(self) -> AnchorModel:
         """The decoders of the model, whose spans still say which rows they decode."""
-        return replace(self, anchors=self.anchors.select(torch.zeros(0, dtype=torch.long)))
+        return replace(self, anchors=Anchors(**{name: tensor[:0] for name, tensor in self.anchors.tensors().items()}))
 
     def save(self, path: Path) -> None:
         """Write one safetensors file, atomically."""

@@ -191,7 +191,7 @@ def _draw_divider(image: np.ndarray, edge: int) -> UInt8[np.ndarray, "h w 3"]:
 def _render_block_tints(model: Drawable, tints: Tensor, camera: Camera) -> UInt8[np.ndarray, "h w 3"]:
     """The scene with the colors of the blocks that own its anchors."""
     rows, splats = view_splats(model, camera)
-    tint = tints[rows]
+    tint = tints.to(rows.device)[rows]
     colors = (1 - _TINT_STRENGTH) * splats.colors.mean(dim=1, keepdim=True) + _TINT_STRENGTH * tint
     background = splats.means_px.new_tensor(model.background)
     raster = rasterize_splats(replace(splats, colors=colors.contiguous()), camera, background)
