@@ -111,8 +111,7 @@ def tmp_path(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRe
 
 @pytest.fixture(scope="session")
 def compiled_code(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where CUDA kernels that tests compile are kept, so that NVRTC runs once for all workers (that what is kept is
-    never wrong: kernels/test_cuda_compiling.py)."""
+    """Where CUDA kernels that tests compile for the processor are kept, once for all workers."""
     own = tmp_path_factory.getbasetemp()
     folder = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "compiled"
     folder.mkdir(exist_ok=True)
@@ -120,11 +119,13 @@ def compiled_code(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def compiled_once(compiled_code: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Compiled kernels are found again."""
-    from vdgs.kernels.cuda import compile_cache
+def not_for_a_card(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Kernels are run on the processor by all tests but those that need a GPU: they are compiled for no card."""
+    from support.cuda_on_host import no_code
+    from vdgs.kernels.cuda import launch
 
-    monkeypatch.setenv(compile_cache.CUDA_CACHE_ENV_VAR, str(compiled_code))
+    if not request.node.get_closest_marker("gpu"):
+        monkeypatch.setattr(launch, "compile_source", no_code)
 
 
 @pytest.fixture(scope="session")

@@ -25,7 +25,7 @@ from vdgs.geometry.camera import Camera
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("bench")]
 
-SMALL = ("--methods", "baseline", "full", "--steps-scaler", "0.1", "--jobs", "2")
+SMALL = ("--methods", "baseline", "full", "--steps-scaler", "0.1")
 
 
 def settings(output: Path, scale: float = 0.1) -> BenchSettings:
@@ -37,13 +37,13 @@ def settings(output: Path, scale: float = 0.1) -> BenchSettings:
 def benched(tmp_path_factory) -> Path:
     pytest.importorskip("embreex")
     output = tmp_path_factory.mktemp("bench") / "out"
-    command = ("bench", "toy", "--output", output, *SMALL)
-    with begun(*command, pause_at=("*/runs/*/coarse/log.jsonl", 1), prepare=start_tasks) as process:
+    command = ("bench", "toy", "--output", output, *SMALL, "--jobs")
+    with begun(*command, "1", pause_at=("*/runs/*/coarse/log.jsonl", 1), prepare=start_tasks) as process:
         process.wait_until_paused()  # the first run begins to train
         process.send_signal(signal.SIGKILL)  # without a word
         process.finished()
     wait_until(lambda: all(is_free(run) for run in output.glob("runs/*/*/*")))  # its processes notice, save and end
-    done = vdgs(*command)
+    done = vdgs(*command, "2")
     assert done.returncode == 0, done.stderr + done.stdout
     return output
 

@@ -16,6 +16,8 @@ from support.fake_gsplat import needs_gsplat
 from support.gpu_on_host import build, install
 from vdgs import kernels
 from vdgs.config.method import CompensationConfig, DensifyConfig
+from vdgs.model.anchors import Anchors
+from vdgs.model.decoder import Decoder
 from vdgs.training import (
     FrozenAnchors,
     TrainingProblem,
@@ -43,12 +45,19 @@ BUSY = {
 }
 
 
-def begun(device: torch.device, **changes: Any) -> tuple[TrainingState, TrainingProblem]:
-    """A block among frozen surroundings, about to be trained on a device."""
+def few() -> tuple[Anchors, Decoder]:
+    """Kernels that run on the processor take long for each anchor."""
     anchors, decoder = coarse()
+    return anchors.select(torch.arange(0, len(anchors), 3)), decoder
+
+
+def begun(device: torch.device, **changes: Any) -> tuple[TrainingState, TrainingProblem]:
+    """A block among frozen surroundings, about to be trained on a device with photographs of half their size."""
+    anchors, decoder = few()
     away = replace(anchors, positions=anchors.positions + torch.tensor([3.0, 0.0, 0.0]))
     stage = TrainingProblem(
-        config=replace(CONFIG, **changes), images=Photographs(), num_images=8, voxel_size=0.4, camera_height=5.0,
+        config=replace(CONFIG, resolution_schedule=((0.0, 2),), **changes),
+        images=Photographs(), num_images=8, voxel_size=0.4, camera_height=5.0,
         kind="block", background=(0.3, 0.4, 0.5), frozen_anchors=FrozenAnchors(away.to(device), decoder.to(device)),
         device=device,
     )  # fmt: skip
@@ -78,9 +87,9 @@ def drivers(compiled_code):
 
 
 @pytest.fixture(params=["gsplat", "cuda"])
-def rasterizer(request, drivers, compiled_code, monkeypatch) -> str:
+def rasterizer(request, drivers, monkeypatch) -> str:
     """With each of the rasterizers that may draw on a card."""
-    install(drivers, compiled_code, monkeypatch, "cuda", request.param)
+    install(drivers, monkeypatch, "cuda", request.param)
     return request.param
 
 
@@ -94,17 +103,17 @@ def test_a_step_on_another_device_makes_the_numbers_of_the_processor(monkeypatch
         torch.testing.assert_close(found[name], tensor, rtol=1e-3, atol=1e-5)
 
 
-def test_steps_have_the_same_bits_whichever_block_comes_first(monkeypatch, drivers, compiled_code):
+def test_steps_have_the_same_bits_whichever_block_comes_first(monkeypatch, drivers):
     """With the own rasterizer: splats stand in another order, among frozen surroundings too."""
     found = []
-    for order in ORDERS[:3]:
-        install(drivers, compiled_code, monkeypatch, "cuda", "cuda")  # anew: tables are kept for a card
+    for order in (ORDERS[0], ORDERS[2]):
+        install(drivers, monkeypatch, "cuda", "cuda")  # anew: tables are kept for a card
         for driver in drivers.values():
             monkeypatch.setattr(driver, "order", order)
         with pretended_card():
             found.append(to_checkpoint(trained_on(CARD, 2)).tensors)
-    for other in found[1:]:
-        assert all(torch.equal(tensor, other[name]) for name, tensor in found[0].items())
+    one, other = found
+    assert all(torch.equal(tensor, other[name]) for name, tensor in one.items())
 
 
 def test_a_step_waits_for_the_card_only_where_it_must(rasterizer):
@@ -123,6 +132,7 @@ def test_a_step_waits_for_the_card_only_where_it_must(rasterizer):
         assert dict(waits) == WAITS | tiles | surroundings
 
 
+@pytest.mark.parametrize("rasterizer", ["cuda"], indirect=True)
 def test_growth_a_new_order_and_the_mean_stay_on_the_device(monkeypatch, rasterizer):
     monkeypatch.setattr(training_loop, "SORT_INTERVAL", 5)
     with pretended_card():
@@ -131,7 +141,7 @@ def test_growth_a_new_order_and_the_mean_stay_on_the_device(monkeypatch, rasteri
         devices |= {tensor.device.type for tensor in to_checkpoint(state).tensors.values()}
     assert devices == {"cuda"}
     assert state.model_average is not None
-    assert len(state.anchors) != len(coarse()[0])  # some have come, others have gone
+    assert len(state.anchors) != len(few()[0])  # some have come, others have gone
 
 
 def test_mixed_devices_are_found(monkeypatch, rasterizer):

@@ -14,7 +14,7 @@ from vdgs.kernels.cuda.adam import MAX_TENSORS, PROGRAM, adam_tensors
 from vdgs.kernels.cuda.launch import CudaProgram
 from vdgs.kernels.kernel_types import AdamState
 
-pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once")]
+pytestmark = [needs_nvrtc, pytest.mark.usefixtures("not_for_a_card")]
 SHAPES = [(32, 35), (32,), (10, 32), (1,), (300, 12), *((3, i + 1) for i in range(MAX_TENSORS))]
 
 

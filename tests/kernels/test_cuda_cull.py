@@ -16,7 +16,7 @@ from vdgs.kernels.cuda.driver import get_cuda_driver
 from vdgs.kernels.cuda.launch import CudaProgram, read_source
 from vdgs.kernels.torch_ref.cull import cull as reference
 
-pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_cull")]
+pytestmark = [needs_nvrtc, pytest.mark.usefixtures("not_for_a_card"), pytest.mark.xdist_group("cuda_cull")]
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from vdgs.kernels.splat_segments import SplatMask
 from vdgs.kernels.torch_ref.decode import decode as reference
 from vdgs.kernels.torch_ref.decode_adam import decode_backward_adam as by_reference
 
-pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_decode")]
+pytestmark = [needs_nvrtc, pytest.mark.usefixtures("not_for_a_card"), pytest.mark.xdist_group("cuda_decode")]
 
 #: Of the decoder, and of what moves anchors.
 *BARRIERS, BARRIER_OF_MOVING = barriers_of("decode")

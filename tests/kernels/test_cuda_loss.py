@@ -8,12 +8,13 @@ import torch
 
 from support.cuda_on_host import HostDriver, barriers_of, build_on_host, needs_a_compiler, needs_nvrtc
 from support.loss_scenes import scene, with_gradient
+from vdgs.kernels.cuda import compile_cache
 from vdgs.kernels.cuda import loss as cuda
 from vdgs.kernels.cuda.driver import CudaUnavailable, get_cuda_driver
 from vdgs.kernels.cuda.launch import CudaProgram, read_source
 from vdgs.kernels.torch_ref import loss as reference
 
-pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_loss")]
+pytestmark = [needs_nvrtc, pytest.mark.usefixtures("not_for_a_card"), pytest.mark.xdist_group("cuda_loss")]
 
 SIZES = [(1, 1), (3, 2), (16, 16), (17, 33), (37, 50), (64, 31)]
 
@@ -81,7 +82,9 @@ def test_a_missing_barrier_would_be_noticed(barrier, library):
 
 
 @needs_a_compiler
-def test_kernels_are_loaded_once_and_launched_over_every_tile(program):
+def test_kernels_are_compiled_and_loaded_once_and_launched_over_every_tile(program, monkeypatch, tmp_path):
+    monkeypatch.undo()  # compiled for a card here
+    monkeypatch.setenv(compile_cache.CUDA_CACHE_ENV_VAR, str(tmp_path))
     image, target, _ = scene(33, 50)
     for _ in range(2):
         on_host(program, image, target)

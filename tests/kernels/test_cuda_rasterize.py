@@ -33,7 +33,7 @@ from vdgs.kernels.cuda.rasterize import PROGRAM, rasterize, rasterize_vjp
 from vdgs.kernels.kernel_types import Raster, Splats
 from vdgs.kernels.torch_ref.rasterize import rasterize as reference
 
-pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_rasterize")]
+pytestmark = [needs_nvrtc, pytest.mark.usefixtures("not_for_a_card"), pytest.mark.xdist_group("cuda_rasterize")]
 
 SCENES = {
     "ordinary": make_scene(150, 37, 29),

@@ -17,7 +17,7 @@ from vdgs.kernels.cuda.statistics import PROGRAM, add_view_statistics
 from vdgs.kernels.kernel_types import DensificationStats
 from vdgs.kernels.torch_ref.statistics import add_view_statistics as by_reference
 
-pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_statistics")]
+pytestmark = [needs_nvrtc, pytest.mark.usefixtures("not_for_a_card"), pytest.mark.xdist_group("cuda_statistics")]
 
 
 @pytest.fixture(scope="module")

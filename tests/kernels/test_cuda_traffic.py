@@ -14,12 +14,12 @@ from functools import partial
 import pytest
 import torch
 
-from support.cuda_on_host import host_compiler, needs_nvrtc
+from support.cuda_on_host import host_compiler, needs_nvrtc, no_code
 from support.cuda_traffic import Bytes, CountedProgram, Traffic, total
 from support.decode_scenes import CAMERAS, Scene, anchors, moved_by, turned, view_statistics
 from support.loss_scenes import scene as pictures
 from support.rasterize_scenes import in_runs, make_scene, splats_of
-from vdgs.kernels.cuda import compile_cache
+from vdgs.kernels.cuda import launch
 from vdgs.kernels.cuda.cull import PROGRAM as CULL
 from vdgs.kernels.cuda.cull import cull
 from vdgs.kernels.cuda.decode import ANCHORS_PER_BLOCK, decode_for_training, expand_sources
@@ -81,7 +81,7 @@ def counted(compiled_code) -> Counted:
         return made
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(compile_cache.CUDA_CACHE_ENV_VAR, str(compiled_code))
+        patch.setattr(launch, "compile_source", no_code)
         source, opaque = count(DECODE, decoding)
         positions, log_scales = anchors(2048, seed=1)
         rows = count(CULL, lambda program: cull(positions, log_scales, CAMERAS[0], program=program))

@@ -151,7 +151,7 @@ class TestMeaning:
 
 @needs_nvrtc
 @needs_a_compiler
-@pytest.mark.usefixtures("compiled_once")
+@pytest.mark.usefixtures("not_for_a_card")
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_card_s_kernels_equal_brute_force(dtype, compiled_code):
     """Run on the processor by a stand-in driver."""

@@ -9,7 +9,6 @@ import sys
 from functools import partial
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import pytest
 from PIL import Image
 
@@ -122,6 +121,8 @@ def test_the_notebook_runs_from_top_to_bottom(capsys, tmp_path, monkeypatch):
 
         nbclient.NotebookClient(nbformat.read(EXAMPLES / NAMES[-1], as_version=4)).execute()
         return
+    import matplotlib.pyplot as plt
+
     namespace: dict[str, object] = {"__name__": "__main__"}
     for source in cells():
         exec(compile(source, NAMES[-1], "exec"), namespace)

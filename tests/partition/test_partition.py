@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,11 @@ def cut(positions: np.ndarray, views: np.ndarray, count: int = 4, **settings: ob
     return partition_scene(positions, views, PartitionConfig(blocks=count, **settings), seed=0)[0]
 
 
+@cache
+def cut_town(balanced: bool = False) -> Blocks:
+    return cut(*town(), balanced=balanced)
+
+
 def owners(blocks: Blocks, positions: np.ndarray) -> np.ndarray:
     return blocks.owner(positions[:, :2])
 
@@ -55,14 +61,14 @@ def test_the_cut_turns_moves_and_scales_with_the_scene(
     positions, views = town()
     c, s = np.cos(turn), np.sin(turn)
     moved = factor * positions @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + [*shift, 7]
-    expected = owners(cut(positions, views, balanced=balanced), positions)
+    expected = owners(cut_town(balanced), positions)
     assert np.array_equal(owners(cut(moved, views, balanced=balanced), moved), expected)
 
 
 def test_the_order_of_the_anchors_does_not_matter() -> None:
     positions, views = town()
     order = np.random.default_rng(3).permutation(len(positions))
-    there, shuffled = cut(positions, views), cut(positions[order], views[order])
+    there, shuffled = cut_town(), cut(positions[order], views[order])
     assert all(a.core.equals(b.core) for a, b in zip(there.items, shuffled.items, strict=True))
     assert np.array_equal(owners(shuffled, positions), owners(there, positions))
 
@@ -112,7 +118,7 @@ def test_coordinates_as_large_as_utm() -> None:
     positions, views = town()
     far = positions + np.array([4.5e5, 5.4e6, 300])
     blocks = cut(far, views)
-    assert np.array_equal(owners(blocks, far), owners(cut(positions, views), positions))
+    assert np.array_equal(owners(blocks, far), owners(cut_town(), positions))
     assert overlap(blocks) < 1e-6 * sum(block.core.area for block in blocks.items)
 
 
@@ -124,8 +130,7 @@ def overlap(blocks: Blocks) -> float:
     return sum(a.intersection(b).area for i, a in enumerate(cores) for b in cores[:i])
 
 
-@pytest.mark.parametrize("lambda_vis", [0.0, 1.0])
-@pytest.mark.parametrize("count", [2, 7])
+@pytest.mark.parametrize(("lambda_vis", "count"), [(0.0, 2), (1.0, 7)])
 def test_every_place_has_one_owner_and_cores_are_disjoint_within_their_boundaries(
     lambda_vis: float, count: int
 ) -> None:
@@ -214,7 +219,7 @@ def test_an_enclosed_dense_center_keeps_its_place() -> None:
 
 
 def test_balanced_blocks_hold_about_equally_many_anchors() -> None:
-    positions, views = town(8000)
+    positions, views = town()
     for count in (3, 6):
         sizes = np.bincount(owners(cut(positions, views, count, balanced=True, lambda_vis=0.0), positions))
         assert np.abs(sizes * count / len(positions) - 1).max() < 0.1
@@ -311,8 +316,7 @@ def test_an_alpha_shape_follows_a_bay_and_widening_follows_the_area() -> None:
 
 
 def test_what_is_read_owns_what_was_written(tmp_path: Path) -> None:
-    positions, views = town()
-    blocks = cut(positions, views)
+    blocks = cut_town()
     save_blocks(tmp_path / "blocks.geojson", blocks, [{"anchors": index} for index in range(4)])
     read = load_blocks(tmp_path / "blocks.geojson")
     places = np.random.default_rng(9).uniform(-50, 150, (5000, 2))

@@ -23,6 +23,7 @@ from vdgs.partition.plots import block_maps as figures
 from vdgs.partition.plots.block_stats import BLOCK_PALETTE, block_color, compute_block_stats
 from vdgs.partition.plots.score_heatmap import sort_cameras
 from vdgs.pipeline.partition_stage import describe_partition
+from vdgs.system import figure_style
 from vdgs.system.figure_style import DPI, draw_titles
 from vdgs.visibility.visibility_map import remove_speckles
 
@@ -56,10 +57,17 @@ def scene(anchors: int, cameras: int, blocks: int) -> tuple[np.ndarray, np.ndarr
     return positions, views, cameras_above(cameras), random.random((cameras, blocks)).astype(np.float32)
 
 
-def check(file: Path) -> np.ndarray:
+@pytest.fixture
+def half_as_sharp(monkeypatch: pytest.MonkeyPatch) -> float:
+    """Half the resolution, which costs a part of the time: what `check` is told."""
+    monkeypatch.setattr(figure_style, "DPI", DPI // 2)
+    return 0.5
+
+
+def check(file: Path, sharpness: float = 1.0) -> np.ndarray:
     """A picture of sane size with something drawn on white."""
     picture = imread(file)[..., :3]
-    height, width = picture.shape[:2]
+    height, width = (int(side / sharpness) for side in picture.shape[:2])
     assert 250 <= height <= 6000
     assert 600 <= width <= 3000
     assert (picture < 0.9).any(axis=-1).mean() > 0.001
@@ -78,7 +86,7 @@ SCENES = {
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_all_figures_of_all_scenes(tmp_path: Path, name: str) -> None:
+def test_all_figures_of_all_scenes(tmp_path: Path, name: str, half_as_sharp: float) -> None:
     anchors, count, blocks = SCENES[name]
     positions, views, cameras, scores = scene(anchors, count, blocks)
     cut, assigned = grid(blocks), scores > 0.7
@@ -86,16 +94,16 @@ def test_all_figures_of_all_scenes(tmp_path: Path, name: str) -> None:
     file = tmp_path / "figure.png"
     cuts = [("λ_vis = 1", cut)] + ([] if compare is None else [(figures.SPATIAL_ONLY_LABEL, compare)])
     figures.plot_blocks(file, positions, views, cameras, assigned, cuts, METERS)
-    check(file)
+    check(file, half_as_sharp)
     figures.plot_block_stats(file, positions, views, cut, assigned, "m", compare)
-    check(file)
+    check(file, half_as_sharp)
     figures.plot_scores(file, scores, assigned)
-    check(file)
+    check(file, half_as_sharp)
     figures.plot_anchor_visibility(file, positions, views, cameras, ("x (units)", "y (units)"))
-    check(file)
+    check(file, half_as_sharp)
 
 
-def test_the_comparison_stands_beside_or_below(tmp_path: Path) -> None:
+def test_the_comparison_stands_beside_or_below(tmp_path: Path, half_as_sharp: float) -> None:
     positions, views, cameras, scores = scene(300, 5, 2)
     alone, both, wide = (tmp_path / f"{name}.png" for name in ("alone", "both", "wide"))
     cut, assigned = grid(2), scores > 0.5
@@ -104,7 +112,7 @@ def test_the_comparison_stands_beside_or_below(tmp_path: Path) -> None:
     figures.plot_blocks(both, positions, views, cameras, assigned, compared, METERS)
     stretched = positions * np.float32([10, 1, 1])
     figures.plot_blocks(wide, stretched, views, cameras, assigned, compared, METERS)
-    one, two, three = (check(file).shape for file in (alone, both, wide))
+    one, two, three = (check(file, half_as_sharp).shape for file in (alone, both, wide))
     assert two[1] > 1.5 * one[1]
     assert two[0] == one[0]
     assert three[1] < 1.2 * one[1]

@@ -69,10 +69,31 @@ static Fiber* running;
 static Kernel kernel_running;
 static void** arguments_given;
 
-// Fibers are begun by swapcontext and change by longjmp, which asks nothing of the system.
+// Lanes of the warp whose turn it is that have not had theirs, in their order, and its first fiber.
+static const size_t *next_lane, *last_lane;
+static Fiber* warp_running;
+
+inline Fiber* next_ready() {
+  while (next_lane != last_lane)
+    if (Fiber& fiber = warp_running[*next_lane++]; fiber.state == State::ready) return &fiber;
+  return nullptr;
+}
+
+inline void choose(Fiber& fiber) {
+  running = &fiber;
+  threadIdx = fiber.index;
+}
+
+// Fibers are begun by swapcontext and change by longjmp, which asks nothing of the system: where they can, to the next
+// lane and not by the scheduler.
 inline void wait(State why) {
   running->state = why;
-  if (!_setjmp(running->place)) _longjmp(scheduler, 1);
+  if (_setjmp(running->place)) return;
+  if (Fiber* next = next_ready()) {
+    if (next->begun) choose(*next), _longjmp(next->place, 1);
+    --next_lane;
+  }
+  _longjmp(scheduler, 1);
 }
 
 // A fiber serves one block after another, of all launches of as many threads: to begin it asks the system.
@@ -84,9 +105,7 @@ inline void begin_fiber() {
 }
 
 inline void turn(Fiber& fiber) {
-  running = &fiber;
-  threadIdx = fiber.index;
-  fiber.state = State::ready;
+  choose(fiber);
   if (_setjmp(scheduler)) return;
   if (fiber.begun) _longjmp(fiber.place, 1);
   fiber.begun = true;
@@ -185,11 +204,10 @@ inline bool run_block(unsigned turns) {
   const std::vector<size_t> by_warp = order_of(warps, turns), by_lane = order_of(kWarp, turns);
   for (;;) {
     for (size_t warp : by_warp) {
+      warp_running = &fibers[warp * kWarp];
       do {
-        for (size_t lane : by_lane) {
-          Fiber& fiber = fibers[warp * kWarp + lane];
-          if (fiber.state == State::ready) turn(fiber);
-        }
+        next_lane = by_lane.data(), last_lane = next_lane + kWarp;
+        while (Fiber* fiber = next_ready()) turn(*fiber);
       } while (release_warp(warp));
     }
     size_t ended = 0, waiting = 0;

@@ -11,6 +11,8 @@ from support import fake_gsplat
 from support.cuda_on_host import HostDriver, build_on_host
 from vdgs.kernels.cuda import compile_cache, loss
 from vdgs.kernels.cuda.adam import PROGRAM as ADAM
+from support.cuda_on_host import HostDriver, build_on_host, no_code
+from vdgs.kernels.cuda import launch, loss
 from vdgs.kernels.cuda.cull import PROGRAM as CULL
 from vdgs.kernels.cuda.decode import PROGRAM as DECODE
 from vdgs.kernels.cuda.rasterize import PROGRAM as RASTERIZE
@@ -28,11 +30,9 @@ def build(folder: Path) -> dict[str, HostDriver]:
     return {program.name: HostDriver(library) for program in PROGRAMS}
 
 
-def install(
-    drivers: dict[str, HostDriver], code: Path, monkeypatch: pytest.MonkeyPatch, device_type: str, rasterizer: str
-) -> None:
+def install(drivers: dict[str, HostDriver], monkeypatch: pytest.MonkeyPatch, device_type: str, rasterizer: str) -> None:
     """Let tensors of a kind of device be computed on by the composed set, with one of its rasterizers."""
-    monkeypatch.setenv(compile_cache.CUDA_CACHE_ENV_VAR, str(code))
+    monkeypatch.setattr(launch, "compile_source", no_code)
     for program in PROGRAMS:
         driver = drivers[program.name]
         driver.device_type = device_type

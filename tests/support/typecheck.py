@@ -1,7 +1,8 @@
 """The run-time type checker of the tests: jaxtyping's shapes by beartype, for which an int is also a float (PEP 484).
 
 `jaxtyping.jaxtyped` binds the arguments of every call and checks them apart from the result; `jaxtyped` here checks the
-same in one step, in half the time.
+same in one step, in half the time. What jaxtyping asks of an array, it asks here only where the answer is not known:
+one of that kind had fit before, and its sizes do.
 """
 
 from __future__ import annotations
@@ -14,11 +15,39 @@ from typing import Any, get_type_hints
 
 import jaxtyping
 from beartype import BeartypeConf, beartype
+from jaxtyping._storage import get_shape_memo, pop_shape_memo, push_shape_memo
 
 _CONFIGURATION = BeartypeConf(is_pep484_tower=True, violation_type=jaxtyping.TypeCheckError)
 _OF_JAXTYPING = jaxtyping.jaxtyped
-#: While a call lasts, a name of a size means one number.
-_CALL = _OF_JAXTYPING("context")
+_ARRAY: Any = type(jaxtyping.AbstractArray)
+_FITS_BY_JAXTYPING = _ARRAY.__instancecheck__
+#: Of a hint, and of arrays of a type and a dtype that fit it: its sizes, each a number, a name, or None for any.
+_SIZES: dict[tuple[Any, type, Any], tuple[int | str | None, ...]] = {}
+
+
+def _fits(hint: Any, value: Any) -> bool:
+    """`isinstance(value, hint)` of jaxtyping's hints."""
+    key = hint, type(value), getattr(value, "dtype", None)
+    expected = _SIZES.get(key)
+    if expected is None:
+        fits: bool = _FITS_BY_JAXTYPING(hint, value)
+        words = hint.dim_str.split()
+        if fits and all(word.isdecimal() or word.isidentifier() for word in words):
+            _SIZES[key] = tuple(int(w) if w.isdecimal() else None if w.startswith("_") else w for w in words)
+        return fits
+    shape, known, found = value.shape, get_shape_memo()[0], dict[str, int]()
+    if len(shape) != len(expected):
+        return bool(_FITS_BY_JAXTYPING(hint, value))
+    for size, wanted in zip(shape, expected, strict=True):
+        if isinstance(wanted, str):
+            wanted = known[wanted] if wanted in known else found.setdefault(wanted, size)
+        if wanted is not None and wanted != size:
+            return bool(_FITS_BY_JAXTYPING(hint, value))
+    known.update(found)
+    return True
+
+
+_ARRAY.__instancecheck__ = _fits
 
 
 def checked(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -32,8 +61,11 @@ def checked(function: Callable[..., Any]) -> Callable[..., Any]:
             names = getattr(function, "__globals__", {})
             function.__annotations__ = {key: _resolved(hint, names) for key, hint in function.__annotations__.items()}
             made.append(beartype(function, conf=_CONFIGURATION))
-        with _CALL:
+        push_shape_memo({})  # while a call lasts, a name of a size means one number
+        try:
             return made[0](*arguments, **named)
+        finally:
+            pop_shape_memo()
 
     return call
 

@@ -35,7 +35,10 @@ from vdgs.synth.true_visibility import (
 pytestmark = [pytest.mark.xdist_group("synth_flights"), pytest.mark.slow]
 
 FLIGHTS = ("uneven", "even", "distant", "orbits", "corridor", "heights")
-TOY = SynthOptions(size="toy", width=64, height=48, samples_per_pixel=1, num_points=300, seed=1, truth=True)
+TOY = SynthOptions(
+    size="toy", width=64, height=48, samples_per_pixel=1, num_points=300, seed=1, truth=True,
+    num_images=12, num_test_images=2, num_validation_images=2,
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -152,7 +155,7 @@ def test_a_generated_capture_is_split_by_its_own_lists(capture: Path) -> None:
     assert {view.name.split("_")[0] for view in tested.test_views} == {"test"}
     assert {view.name.split("_")[0] for view in validated.test_views} == {"validation"}
     assert [view.name for view in tested.train_views] == [view.name for view in validated.train_views]
-    assert len(tested.train_views) == 24
+    assert len(tested.train_views) == TOY.num_images
 
 
 def test_truth_is_read_back_at_the_size_in_use(capture: Path) -> None:
@@ -163,7 +166,7 @@ def test_truth_is_read_back_at_the_size_in_use(capture: Path) -> None:
         visibility = truth.visibility_map(view)
         assert visibility.shape == (48, 64)
         np.testing.assert_array_equal(np.isnan(visibility), np.isinf(truth.depth(view.name)))
-        assert np.nanmax(visibility) <= 24
+        assert np.nanmax(visibility) <= TOY.num_images
         assert np.nanmean(visibility > 0) > 0.6
         assert truth.visibility_map(small).shape == (24, 32)
     with pytest.raises(VdgsError, match="test and validation"):
@@ -175,14 +178,14 @@ def test_truth_is_read_back_at_the_size_in_use(capture: Path) -> None:
 def test_the_flight_says_how_uneven_it_is(capture: Path) -> None:
     facts = json.loads((capture / "truth" / "flight.json").read_text())
     assert facts["flight"] == "uneven"
-    assert facts["photographs"] == 24
+    assert facts["photographs"] == TOY.num_images
     assert facts["quantiles"]["5"] <= facts["quantiles"]["95"]
 
 
 def test_disturbances_are_written_and_known(capture: Path) -> None:
     with np.load(capture / "truth" / "cameras.npz", allow_pickle=False) as cameras:
         assert np.std(np.log2(cameras["gains"])) > 0.05
-        assert len(cameras["names"]) == len(cameras["camera_from_world"]) == 24 + 3 + 3
+        assert len(cameras["names"]) == len(cameras["camera_from_world"]) == 12 + 2 + 2
     with np.load(capture / "truth" / "points.npz", allow_pickle=False) as points:
         assert points["outliers"].mean() == pytest.approx(0.1, abs=0.02)
 

@@ -217,15 +217,15 @@ def test_a_limit_of_the_process_counts():
 
 #: Without stereo, which would leave room behind in which a step fits.
 SETTINGS = (
-    "--preset", "laptop", "--iterations", "10", "--up", "z", "--model.num-offsets", "3", "--threads", "1",
+    "--preset", "laptop", "--iterations", "5", "--up", "z", "--model.num-offsets", "3", "--threads", "1",
     "--init.no-mvs", "--images", "images",
 )  # fmt: skip
 #: The last iteration with photographs at half their size (preset laptop).
-LAST_HALF = 4
+LAST_HALF = 2
 
 
 def limit_memory_before_full_size() -> None:
-    """Once this process begins with photographs at full size, it may take 16 MB more; a step takes three times that.
+    """Once this process begins with photographs at full size, it may take 8 MB more; a step takes three times that.
 
     From then on every large piece is asked of the system, so that nothing depends on what malloc has kept.
     """
@@ -238,7 +238,7 @@ def limit_memory_before_full_size() -> None:
             after_step(state, report)
             if state.iteration == LAST_HALF:
                 assert ctypes.CDLL(None).mallopt(mmap_threshold, 128 * 1024)
-                most = psutil.Process().memory_info().vms + 16 * 10**6
+                most = psutil.Process().memory_info().vms + 8 * 10**6
                 resource.setrlimit(resource.RLIMIT_AS, (most, most))
 
         return train(state, stage, after_step=step, **others)
@@ -249,7 +249,7 @@ def limit_memory_before_full_size() -> None:
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="limits of address space, and a malloc that can be told")
 def test_training_that_runs_out_of_memory_saves_says_what_helps_and_continues(tmp_path):
     capture = tmp_path / "capture"
-    write_colmap(capture, tiny_scene(columns=3, rows=2, width=1000, height=750))
+    write_colmap(capture, tiny_scene(columns=3, rows=2, width=720, height=540))
     command = ("train-coarse", capture, "--output", tmp_path / "run", *SETTINGS)
     broken = vdgs(*command, prepare=limit_memory_before_full_size)
     assert broken.returncode == 1, broken.stdout + broken.stderr

@@ -27,25 +27,29 @@ HOSTILE = (
 ON_ONE_LINE = [name for name in HOSTILE if "\n" not in name]
 
 
-@pytest.mark.parametrize("name", HOSTILE)
-def test_a_shell_reads_names_back(name: str, tmp_path: Path) -> None:
-    line = shell_line(["printf", "%s\\n", name, "end"])
-    assert shlex.split(line) == ["printf", "%s\\n", name, "end"]
-    assert subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=True).stdout == f"{name}\nend\n"
-    file = tmp_path / name
-    file.parent.mkdir(exist_ok=True)
-    file.write_text("here")
-    said = subprocess.run(["sh", "-c", f"cat {shell_word(file)}"], capture_output=True, text=True, check=True).stdout
-    assert said == "here"
+def said_by(shell: str, lines: list[str]) -> str:
+    return subprocess.run([shell, "-c", "\n".join(lines)], capture_output=True, text=True, check=True).stdout
+
+
+def test_a_shell_reads_names_back(tmp_path: Path) -> None:
+    lines = [shell_line(["printf", "%s\\n", name, "end"]) for name in HOSTILE]
+    for name, line in zip(HOSTILE, lines, strict=True):
+        assert shlex.split(line) == ["printf", "%s\\n", name, "end"]
+    assert said_by("bash", lines) == "".join(f"{name}\nend\n" for name in HOSTILE)
+    files = [tmp_path / name for name in HOSTILE]
+    for file in files:
+        file.parent.mkdir(exist_ok=True)
+        file.write_text(f"here is {file.name}\n")
+    assert said_by("sh", [f"cat {shell_word(file)}" for file in files]) == "".join(f"here is {f.name}\n" for f in files)
     for line in (f"cat {shell_word(Path('-x'))}", shell_line(["cat", Path("-x")])):
         assert shlex.split(line) == ["cat", "./-x"]
 
 
-@pytest.mark.parametrize("name", ON_ONE_LINE)
-def test_sbatch_reads_directives_back(name: str) -> None:
-    line = sbatch_directive(f"--comment={name}")
-    assert directive_words(line.removeprefix("#SBATCH ")) == [f"--comment={name}"]
-    assert not re.search("(het|pack)job", line)  # sbatch blanks these words
+def test_sbatch_reads_directives_back() -> None:
+    for name in ON_ONE_LINE:
+        line = sbatch_directive(f"--comment={name}")
+        assert directive_words(line.removeprefix("#SBATCH ")) == [f"--comment={name}"]
+        assert not re.search("(het|pack)job", line)  # sbatch blanks these words
 
 
 @pytest.mark.parametrize("name", [each for each in ON_ONE_LINE if "\\" not in each])
@@ -70,13 +74,13 @@ def test_folders_that_slurm_cannot_name_are_refused(name: str, tmp_path: Path) -
         slurm_file_pattern(Path("a\\b"), "%a")
 
 
-@pytest.mark.parametrize("name", HOSTILE)
-def test_headers_stay_one_line(name: str) -> None:
-    line = header_line(name)
-    assert line.isascii()
-    assert line.splitlines() == [line]
-    assert json.loads(f'"{line}"') == " ".join(name.split())
-    assert re.fullmatch(r'"[^"\n]*"', wkt_string(name))
+def test_headers_stay_one_line() -> None:
+    for name in HOSTILE:
+        line = header_line(name)
+        assert line.isascii()
+        assert line.splitlines() == [line]
+        assert json.loads(f'"{line}"') == " ".join(name.split())
+        assert re.fullmatch(r'"[^"\n]*"', wkt_string(name))
 
 
 def test_a_console_prints_names_with_brackets() -> None:

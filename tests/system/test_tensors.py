@@ -2,6 +2,7 @@
 
 import sys
 import zlib
+from pathlib import Path
 
 import pytest
 import torch
@@ -21,13 +22,17 @@ def tensor(seed: int, dtype: torch.dtype, shape: list[int]) -> torch.Tensor:
     return (values > 0) if dtype == torch.bool else values.abs().to(dtype)
 
 
-@settings(max_examples=40)
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("files")
+
+
+@settings(max_examples=25)
 @given(
     kinds=st.dictionaries(st.text(max_size=8), st.tuples(st.sampled_from(list(DTYPES.values())), SHAPES), max_size=6),
     note=st.none() | st.dictionaries(st.just("key"), st.text(max_size=9), min_size=1),
 )
-def test_the_bytes_are_those_of_the_library(tmp_path_factory, kinds, note):
-    folder = tmp_path_factory.mktemp("files")
+def test_the_bytes_are_those_of_the_library(folder, kinds, note):
     kinds.pop("__metadata__", None)
     tensors = {name: tensor(i, *kind) for i, (name, kind) in enumerate(kinds.items())}
     write_tensors(folder / "ours", tensors, note)

@@ -4,7 +4,7 @@ photographs from those before and after them."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from support.hand_made_models import capture_at
 from support.small_training import CONFIG, bits, run, stage, start
 from vdgs.captures.capture import Capture, View
 from vdgs.captures.capture_order import flight_positions
+from vdgs.config.method import LearningRateConfig
 from vdgs.evaluation.opacity_coverage import RenderedImage
 from vdgs.evaluation.view_exposures import (
     AutoExposure,
@@ -284,7 +285,8 @@ def test_the_gradient_is_that_of_finite_differences():
 
 
 def test_photographs_of_unequal_brightness_are_told_from_the_scene():
-    config = replace(CONFIG, iterations=180, lr=replace(CONFIG.lr, exposure=(0.005, 5e-4)))
+    rates = {name: (3 * first, 3 * last) for name, (first, last) in asdict(CONFIG.lr).items()}
+    config = replace(CONFIG, iterations=120, lr=LearningRateConfig(**rates | {"exposure": (0.005, 5e-4)}))
     config = replace(config, model=replace(config.model, appearance_dim=0))
     state, unequal = fitted(config)
     plain = run(start(config), replace(stage(config), images=Unequal()))
@@ -323,10 +325,11 @@ def test_blocks_take_exposures_as_they_are():
 
 
 def test_a_stopped_run_and_a_file_keep_them(tmp_path):
-    state, unequal = fitted()
+    short = replace(CONFIG, iterations=30)
+    state, unequal = fitted(short)
     whole = bits(run(state, unequal))
-    state, _ = fitted()
-    run(state, unequal, until=33)
+    state, _ = fitted(short)
+    run(state, unequal, until=17)
     again = run(from_checkpoint(to_checkpoint(state), unequal), unequal)
     assert bits(again) == whole
     AnchorModel(anchors=again.anchors, decoder=again.decoder, voxel_size=0.4, background=(0.0, 0.0, 0.0)).save(

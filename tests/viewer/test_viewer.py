@@ -1,11 +1,9 @@
-"""What a viewer draws and says, without a browser: every layer where it belongs, places, photographs, paths."""
+"""What a viewer draws and says, without a browser: every layer where it belongs, and photographs."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from unittest.mock import MagicMock
 
 import cv2
 import numpy as np
@@ -14,84 +12,24 @@ import torch
 
 from support.captures import camera_at, look_down
 from support.hand_made_models import opaque_plane, quadrants, two_floors
-from vdgs.captures.capture import Capture, View
+from support.viewer_scene import photographed
 from vdgs.evaluation.metrics import to_8bit
 from vdgs.evaluation.view_exposures import apply_exposure_numpy, log_luminance
 from vdgs.export.lod_bake import CameraTable
 from vdgs.geometry.camera import Camera
-from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.exposure import exposure_matrix
 from vdgs.model.lod_scene import LodScene
 from vdgs.model.lod_tree import LodTree
 from vdgs.model.renderer import render, without_aliasing
-from vdgs.partition.blocks import save_blocks
 from vdgs.pipeline import build_lod
-from vdgs.rendering.camera_paths import look_at_pose
-from vdgs.runs.open_run import OpenedRun
-from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.stage_folder import StatusRecord
-from vdgs.viewer import navigation, overlays, viewer_scene
+from vdgs.viewer import viewer_scene
 from vdgs.viewer.image_comparison import nearest_view_index, warp_image
 from vdgs.viewer.layers import LAYERS, DisplayOptions, Painter
-from vdgs.viewer.measure_panel import MeasurePanel
-from vdgs.viewer.measurement import MeasuredPoint, Ruler
-from vdgs.viewer.picking import measured_point, pick_point, pick_position, thumbnail
+from vdgs.viewer.picking import pick_position
 from vdgs.viewer.viewer_scene import ViewerScene
 
 pytestmark = pytest.mark.xdist_group("viewer_scene")
-
-PLACE = (46.95, 7.44, 560.0)
-
-
-def photographed(folder: Path, model: AnchorModel, change: Callable[[int, np.ndarray], np.ndarray]) -> ViewerScene:
-    """Nine photographs that a model has itself drawn, each changed by its number, all of them masked where a mask
-    `N.mask.png` lies beside; the last one tests."""
-    views = []
-    for number, (x, y) in enumerate((x, y) for x in (-1.5, 0.0, 1.5) for y in (-1.5, 0.0, 1.5)):
-        camera, file = camera_at(x, y, 4.0, 8.0, 40.0 * number), folder / f"{number}.png"
-        cv2.imwrite(str(file), to_8bit(change(number, render(model, camera).image.numpy()))[..., ::-1])
-        mask = file.with_suffix(".mask.png")
-        views.append(
-            View(
-                name=file.name,
-                camera=camera,
-                image_path=file,
-                mask_path=mask if mask.exists() else None,
-                split="test" if number == 8 else "train",
-            )
-        )
-    points = model.anchors.positions.double().numpy()
-    ground = GroundFrame(
-        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, description="hand-made", origin_geo=PLACE
-    )
-    capture = Capture(
-        root=folder, source="colmap", images=".", views=tuple(views), points=points,
-        point_colors=np.full((len(points), 3), 99, np.uint8), ground=ground,
-    )  # fmt: skip
-    run = OpenedRun(
-        folder=RunFolder(folder / "run"),
-        model=model,
-        model_path=folder / "model",
-        name="merged",
-        status=StatusRecord(),
-        key="key",
-        warning="",
-        capture=capture,
-    )
-    coarse = replace(run, model=opaque_plane(), name="coarse")
-    return ViewerScene(run, lambda name: coarse)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    """Nine photographs that a model of two floors has itself drawn; four blocks."""
-    folder = tmp_path_factory.mktemp("viewer")
-    opened = photographed(folder, two_floors(), lambda number, image: image)
-    save_blocks(folder / "run/partition/blocks.geojson", quadrants(), [{}] * 4)
-    opened.__dict__["blocks"] = quadrants()
-    yield opened
-    opened.close()
 
 
 # ------------------------------------------------------------------------------------- layers
@@ -295,118 +233,6 @@ def test_the_nearest_photograph_is_that_of_the_place_and_direction(scene):
         assert nearest_view_index(scene, view.camera) == index
 
 
-# ------------------------------------------------------------------------------------- places
-
-
-@pytest.mark.parametrize(("x", "y"), [(2.05, 2.13), (-1.71, 0.94), (0.33, -0.41)])
-def test_a_clicked_pixel_is_the_place_that_it_shows(scene, x, y):
-    camera = camera_at(0.2, -0.3, 6.0, tilt=15.0, width=640)
-    height = 1.5 if max(abs(x), abs(y)) < 0.8 else 0.0
-    pixel, _ = camera.project(np.array([[x, y, height]]))
-    found = pick_position(scene.model("merged"), camera, *pixel[0])
-    assert found is not None
-    again, _ = camera.project(found[None])
-    assert np.abs(again - pixel).max() < 1e-6
-    assert np.linalg.norm(found[:2] - [x, y]) < 6.0 / camera.fx  # a pixel on the ground
-    assert abs(found[2] - height) < 0.05  # depth is that of a splat's center
-    assert pick_position(scene.model("merged"), camera_at(50, 50), 3.0, 3.0) is None
-    assert pick_position(scene.model("merged"), camera, -1.0, 3.0) is None
-
-
-def test_a_place_knows_who_sees_it_and_what_stands_between(scene):
-    place = pick_point(scene, "merged", np.array([0.3, -0.2, 0.0]))  # below the roof
-    lies_in = [view for view in scene.capture.views if view.camera.in_frustum(place.position[None])[0]]
-    assert len(place.hits) == len(lies_in)
-    assert place.visibility == sum(view.split == "train" for view in lies_in)
-    assert not any(sight.unoccluded for sight in place.hits if sight.name == "4.png")
-    above = pick_point(scene, "merged", np.array([0.3, -0.2, 1.5]))
-    assert all(sight.unoccluded for sight in above.hits)
-    assert [s.ground_sampling for s in above.hits] == sorted(s.ground_sampling for s in above.hits)
-    assert above.block == 2
-    assert above.coordinates[0] == "east 0.30, north -0.20, up 1.50 m (ground frame)"
-    latitude, longitude = (float(part.strip(" °")) for part in above.coordinates[1].split(",")[:2])
-    assert (latitude, longitude) == pytest.approx(PLACE[:2], abs=1e-5)
-
-
-def test_a_thumbnail_marks_the_place(scene):
-    sight = pick_point(scene, "merged", np.array([0.3, -0.2, 1.5])).hits[0]
-    small = thumbnail(scene, sight)
-    assert max(small.shape[:2]) == 320
-    red = (small[..., 0] > 200) & (small[..., 1] < 120) & (small[..., 2] < 100)
-    assert red.any()
-
-
-def test_a_ruler_measures(scene):
-    ruler = Ruler("m")
-    for corner in ((0, 0, 0), (3, 4, 0), (3, 4, 2)):
-        ruler.add(MeasuredPoint(np.array(corner, float), 0.1))
-    assert (ruler.distance(), ruler.height_difference()) == (7.0, 2.0)
-    assert ruler.distance_deviation() == pytest.approx(0.1 * 6**0.5)  # the point in the middle moves both segments
-    assert "± 0.24" in ruler.to_markdown()
-    ruler.clear()
-    for corner in ((0, 0, 5), (2, 0, 1), (2, 3, 0), (0, 3, 0)):
-        ruler.add(MeasuredPoint(np.array(corner, float)))
-    assert ruler.area() == 6.0
-    assert "area **6.00 m²**" in ruler.to_markdown()
-
-
-def test_a_measured_point_lies_where_its_photographs_show_it(scene):
-    camera = camera_at(0.4, 0.3)
-    point = measured_point(scene, "merged", camera, 30.0, 20.0)
-    assert point is not None
-    assert 0 < point.deviation < 0.5
-    views = {view.name: view.camera for view in scene.capture.views}
-    assert 2 <= len(point.rays) <= 8
-    for name, x, y in point.rays:
-        there = views[name].camera_from_world @ [*point.position, 1.0]
-        assert (there[0] / there[2], there[1] / there[2]) == pytest.approx((x, y), abs=1e-9)
-
-
-def test_lines_lie_where_cameras_and_borders_are(scene):
-    lines, colors = overlays.camera_frusta(scene)
-    assert lines.shape == (8 * 9, 2, 3)
-    assert colors.shape == lines.shape
-    assert np.allclose(lines[:4, 0], scene.capture.views[0].camera.position, atol=1e-5)
-    corners, _ = scene.capture.views[0].camera.project(lines[:4, 1].astype(float))
-    assert corners == pytest.approx(np.array([[0, 0], [64, 0], [64, 48], [0, 48]]), abs=0.01)
-    lines, _ = overlays.block_borders(scene)
-    assert np.abs(lines[..., :2]).max() == pytest.approx(4.0)
-    assert lines[..., 2].min() >= -0.1
-    assert len(overlays.sparse_points(scene)[0]) == len(scene.capture.points)
-
-
-# ------------------------------------------------------------------------------------- where one stands
-
-
-def test_buttons_lead_where_they_say(scene):
-    stand = navigation.overview_pose(scene.capture)
-    whole = Camera(
-        camera_from_world=look_at_pose(stand.position, stand.look_at),
-        fx=500.0,
-        fy=500.0,
-        cx=320.0,
-        cy=240.0,
-        width=640,
-        height=480,
-    )
-    assert all(whole.in_frustum(np.array([[x, y, 0.0]]))[0] for x in (-1.5, 1.5) for y in (-1.5, 1.5))
-    above = navigation.top_down_pose(stand)
-    assert np.allclose(above.look_at, stand.look_at)
-    assert np.linalg.norm(above.position[:2] - above.look_at[:2]) < 0.01 * above.distance
-    east = navigation.CameraPose(np.array([5.0, 0.0, 3.0]), np.zeros(3))
-    north = navigation.north_up_pose(east)
-    assert north.position == pytest.approx(np.array([0.0, -5.0, 3.0]))
-    near = navigation.zoom_to(east, np.array([1.0, 1.0, 0.0]))
-    assert near.distance < east.distance
-    taken = camera_at(1.0, 2.0, 4.0, 0.0, 30.0)
-    there = navigation.pose_from_camera(taken, 4.0)
-    looking = Camera(
-        camera_from_world=look_at_pose(there.position, there.look_at), fx=64.0, fy=64.0, cx=32.0, cy=24.0, width=64,
-        height=48,
-    )  # fmt: skip
-    assert np.allclose(looking.camera_from_world, taken.camera_from_world, atol=0.02)  # its upper edge stays up
-
-
 def test_the_newest_photograph_file_is_not_needed_to_look(scene, tmp_path: Path):
     """A photograph that is gone is one layer's trouble."""
     views = tuple(replace(view, image_path=tmp_path / "gone.png") for view in scene.capture.views)
@@ -418,17 +244,3 @@ def test_the_newest_photograph_file_is_not_needed_to_look(scene, tmp_path: Path)
     with pytest.raises(CaptureError, match=r"gone\.png"):
         Painter(without).paint(DisplayOptions("error"), camera, camera)
     without.close()
-
-
-def test_a_distance_that_is_saved_again_replaces_the_first(scene):
-    session = MagicMock(scene=scene)
-    session.client.gui.add_number.return_value = meters = MagicMock(value=10.0)
-    panel = MeasurePanel(session)
-    for z in (0.0, 4.0):
-        panel.add(MeasuredPoint(np.array([0.0, 0.0, z]), rays=(("a.jpg", 0.1, 0.2), ("b.jpg", 0.3, z))))
-    panel.save()
-    meters.value = 12.0
-    panel.save()
-    assert [each.meters for each in panel.known] == [12.0]
-    (name, text), _ = session.client.send_file_download.call_args
-    assert (name, text.decode().count("ray")) == ("known-distances.txt", 4 + 1)  # the first line names the form
