@@ -8,11 +8,9 @@ from pathlib import Path
 import pytest
 
 from support import fake_gsplat
-from support.cuda_on_host import HostDriver, build_on_host
-from vdgs.kernels.cuda import compile_cache, loss
-from vdgs.kernels.cuda.adam import PROGRAM as ADAM
 from support.cuda_on_host import HostDriver, build_on_host, no_code
 from vdgs.kernels.cuda import launch, loss
+from vdgs.kernels.cuda.adam import PROGRAM as ADAM
 from vdgs.kernels.cuda.cull import PROGRAM as CULL
 from vdgs.kernels.cuda.decode import PROGRAM as DECODE
 from vdgs.kernels.cuda.rasterize import PROGRAM as RASTERIZE

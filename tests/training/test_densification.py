@@ -1,6 +1,7 @@
 """Laws of growth: new anchors fill empty cells that hold a strong offset, and nothing else."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -150,9 +151,10 @@ def test_a_view_is_counted_where_it_was_drawn():
 def test_surroundings_occupy_cells_but_neither_grow_nor_go():
     before = anchors(60)
     free = decide_densification(before, statistics(60), 1.0, ALWAYS, torch.Generator().manual_seed(0))
-    neighbors = torch.cat([free.added.positions[::2], torch.full((1, 3), 1e9)])  # one is beyond the lattice
+    neighbors = free.added.select(torch.arange(0, len(free.added), 2))
+    neighbors = neighbors.concat(replace(anchors(1), positions=torch.full((1, 3), 1e9)))  # beyond the lattice
     decision = decide_densification(
-        before, statistics(60), 1.0, ALWAYS, torch.Generator().manual_seed(0), frozen_positions=neighbors
+        before, statistics(60), 1.0, ALWAYS, torch.Generator().manual_seed(0), frozen=neighbors
     )
     assert torch.equal(decision.added.positions, free.added.positions[1::2])
     assert torch.equal(decision.added.features, free.added.features[1::2])

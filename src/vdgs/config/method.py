@@ -32,6 +32,10 @@ class ModelConfig:
     photograph_blur: bool = True
     """Drawn from nearer than the photographs, Gaussians stay as blurred as a pixel of these makes them: fewer needles.
     Training draws as without (choice)."""
+    levels: Annotated[int, Range(0, 16)] = 1
+    """Levels of anchors, drawn by the size of a pixel (Octree-GS): far views draw fewer splats. 1: none. 0: as many as
+    the photographs' pixels ask for; one unless some are about three times as large as others, as in flights of several
+    heights (choice)."""
     view_distance: bool = False
     """Feed the distance between camera and anchor to the decoder too."""
     appearance_dim: Annotated[int, Range(0, 1024)] = 0

@@ -81,9 +81,9 @@ def collect_contributions(
 
 @torch.no_grad()
 def view_contributions(model: AnchorModel, camera: Camera) -> ViewContributions:
-    """Draw one view, on the device of the model: what it shows."""
+    """Draw one view, on the device of the model: what it shows, of all levels of anchors (a file has no levels)."""
     k = model.anchors.offsets.shape[1]
-    rows, splats = decode_view(model, camera)
+    rows, splats = decode_view(model.with_all_levels(), camera)
     kernels = get_backend(rows.device)
     pixels = kernels.splat_contributions(splats, splats.means_px.new_zeros(3), camera.width, camera.height).pixels
     source = splats.source.long()

@@ -63,7 +63,7 @@ class BakedGaussians:
     @torch.no_grad()
     def render_target(self, camera: Camera) -> tuple[Float[Tensor, "h w 3"], Int[np.ndarray, " p"]]:
         """What the model shows by what is baked of it, and the Gaussians that may touch this view, ascending."""
-        rows, splats = decode_view(self.model, camera)
+        rows, splats = decode_view(self.model.with_all_levels(), camera)
         rows, k = rows.cpu(), self.model.anchors.offsets.shape[1]
         source = splats.source.long().cpu()
         spawned = rows.index_select(0, source // k) * k + source % k

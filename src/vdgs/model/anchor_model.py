@@ -77,6 +77,11 @@ class AnchorModel:
         parts = tuple(replace(part, decoder=part.decoder.to(device)) for part in self.decoder_spans)
         return replace(self, anchors=self.anchors.to(device), decoder=self.decoder.to(device), decoder_spans=parts)
 
+    def with_all_levels(self) -> AnchorModel:
+        """The model of which every view draws all levels of the anchors; itself where they have none."""
+        plain = self.anchors.max_pixels is None
+        return self if plain else replace(self, anchors=replace(self.anchors, max_pixels=None))
+
     def without_anchors(self) -> AnchorModel:
         """The decoders of the model, whose spans still say which rows they decode."""
         return replace(self, anchors=Anchors(**{name: tensor[:0] for name, tensor in self.anchors.tensors().items()}))
@@ -111,7 +116,10 @@ class AnchorModel:
         if found is None:
             raise VdgsError(f"{path}: is not a vdgs anchor model (its header has no {ANCHOR_MODEL_FORMAT!r})")
         try:
-            anchors = Anchors(**{n: tensors[f"anchors.{n}"] for n in ("positions", *TRAINED_TENSORS)})
+            anchors = Anchors(
+                **{n: tensors[f"anchors.{n}"] for n in ("positions", *TRAINED_TENSORS)},
+                max_pixels=tensors.get("anchors.max_pixels"),
+            )
             known = json.loads(header[found])
             decoder = _decoder_of(tensors, "decoder.")
             counts = known["parts"] if found == MULTI_DECODER_FORMAT else []
@@ -141,6 +149,9 @@ class AnchorModel:
             # In chunks: `isfinite` of all takes more memory than the tensor.
             if not all(bool(torch.isfinite(chunk).all()) for chunk in tensor.split(CHECK_CHUNK)):
                 raise ValueError(f"{name} holds numbers that are not finite")
+        largest = self.anchors.max_pixels
+        if largest is not None and not (tuple(largest.shape) == (n,) and bool((largest > 0).all())):
+            raise ValueError(f"max_pixels is {largest.dtype} {tuple(largest.shape)}, not {n} numbers above 0")
         for _, decoder in self._decoders():
             decoder.check(k)
         total = sum(span.count for span in self.decoder_spans)

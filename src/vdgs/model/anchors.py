@@ -23,12 +23,16 @@ class Anchors:
     features: Float[Tensor, "n 32"]
     offsets: Float[Tensor, "n k 3"]
     log_scales: Float[Tensor, "n 6"]
+    #: The largest pixel, in units of the ground frame, in which each anchor is drawn (`model.levels`); None: in any.
+    max_pixels: Float[Tensor, " n"] | None = None
 
     def __len__(self) -> int:
         return self.positions.shape[0]
 
     def tensors(self) -> dict[str, Tensor]:
-        return {name: getattr(self, name) for name in ("positions", *TRAINED_TENSORS)}
+        names = ("positions", *TRAINED_TENSORS)
+        levels = {} if self.max_pixels is None else {"max_pixels": self.max_pixels}
+        return {name: getattr(self, name) for name in names} | levels
 
     def to(self, device: torch.device) -> Anchors:
         """The same anchors on a device; themselves where they are on it."""

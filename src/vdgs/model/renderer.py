@@ -18,6 +18,7 @@ from vdgs.kernels.kernel_types import SPLAT_TENSORS, AnchorSplats, DecoderWeight
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.envmap import ray_directions, sample_envmap
+from vdgs.model.levels import pixel_sizes
 
 
 @runtime_checkable
@@ -106,8 +107,11 @@ def decode_anchors_for_training(
 
 
 def cull_anchors(anchors: Anchors, camera: Camera) -> Int64[Tensor, " v"]:
-    """Rows of the anchors that may touch a view, ascending."""
-    return get_backend(anchors.positions.device).cull(anchors.positions, anchors.log_scales, camera)
+    """Rows of the anchors that may touch a view and have a level that it draws, ascending."""
+    rows = get_backend(anchors.positions.device).cull(anchors.positions, anchors.log_scales, camera)
+    if anchors.max_pixels is None:
+        return rows
+    return rows[pixel_sizes(anchors.positions[rows], camera) <= anchors.max_pixels[rows]]
 
 
 def decode_view(

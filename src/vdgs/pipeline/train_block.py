@@ -26,6 +26,7 @@ from vdgs.distributed.shard import Shard
 from vdgs.errors import RunError
 from vdgs.model.anchor_model import AnchorModel, ModelMetadata
 from vdgs.model.anchors import Anchors
+from vdgs.model.levels import level_sizes
 from vdgs.model.scale_bounds import max_log_scales
 from vdgs.partition.block_regions import growth_mask, lr_ramp, split_trainable_anchors, visible_anchors
 from vdgs.partition.blocks import Blocks, xy_positions
@@ -115,6 +116,7 @@ class BlockPlan:
         cameras, coarse, config = [view.camera for view in capture.train_views], self.coarse, self.config
         return TrainingProblem(
             config=config, images=images, num_images=len(self.views), voxel_size=coarse.voxel_size,
+            max_pixels=level_sizes(coarse.anchors),
             camera_height=camera_height(capture), offset_rate_factor=offset_rate_factor(capture, config),
             kind="block", background=coarse.background, device=device,
             frozen_decoder=method.block.decoder == "frozen",

@@ -26,6 +26,7 @@ from vdgs.model.exposure import zero_exposures
 from vdgs.model.initialization.initialize import initialize_anchors
 from vdgs.model.initialization.sky import Skyline, initial_envmap
 from vdgs.model.initialization.stereo import DensePoints
+from vdgs.model.levels import add_coarser_levels, describe_levels, fit_levels
 from vdgs.model.scale_bounds import max_log_scales, photograph_pixel
 from vdgs.pipeline.dense_points import find_dense_points, max_dense_points
 from vdgs.runs.open_run import check_has_anchors
@@ -103,6 +104,8 @@ def _train(
             f"anchors, {config.iterations:,} iterations",
             highlight=False,
         )
+        if stage.max_pixels:
+            console.print(describe_levels(state.anchors), highlight=False)
         if stage.skylines is not None:
             shown = sum(skyline is not None for skyline in stage.skylines)
             console.print(
@@ -204,7 +207,7 @@ def build_coarse_problem(
     anchors, voxel = initialize_anchors(
         capture.points, capture.point_colors, cameras, config.init, config.model.num_offsets, dense
     )
-    background = (0.0, 0.0, 0.0)
+    background, max_pixels = (0.0, 0.0, 0.0), fit_levels(capture.points, cameras, config.model.levels)
     if config.loss.background != "black":
         smallest = max(factor for _, factor in config.resolution_schedule)
         background = mean_image_color(images, len(cameras), smallest)
@@ -213,6 +216,7 @@ def build_coarse_problem(
         images=images,
         num_images=len(cameras),
         voxel_size=voxel,
+        max_pixels=max_pixels,
         camera_height=camera_height(capture),
         offset_rate_factor=offset_rate_factor(capture, config),
         background=background,
@@ -222,7 +226,7 @@ def build_coarse_problem(
         max_log_scale=(lambda positions: max_log_scales(positions, cameras)) if config.model.bound_scales else None,
         photograph_pixel=photograph_pixel(anchors.positions, cameras) if config.model.photograph_blur else 0.0,
     )
-    return stage, anchors
+    return stage, add_coarser_levels(anchors, voxel, max_pixels) if max_pixels else anchors
 
 
 def _skylines(capture: Capture, config: TrainConfig) -> tuple[Skyline | None, ...] | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -88,12 +88,16 @@ def decide_densification(
     generator: torch.Generator,
     *,
     compensated: CompensatedGradient | None = None,
-    frozen_positions: Float[Tensor, "s 3"] | None = None,
+    frozen: Anchors | None = None,
     growth_mask: GrowthMask | None = None,
+    max_pixels: Sequence[float] = (),
 ) -> DensificationDecision:
     """One growth decision (Scaffold-GS eqs. 9-10 and its pruning; with `compensated`, VDGS section IV-C).
 
-    `frozen_positions` are further anchors that occupy cells; `growth_mask` says which cell centers may get an anchor.
+    `frozen` are further anchors that occupy cells; `growth_mask` says which cell centers may get an anchor;
+    `max_pixels` are those of the levels, finest first (`model.levels`): each level grows in cells of its own, of twice
+    the size of those of the finer one, for its own offsets and for those of the next coarser one that ask twice as
+    strongly.
     Random numbers belong to offsets, not to policies: the same generator keeps the same offsets with compensation and
     without.
 
@@ -102,8 +106,10 @@ def decide_densification(
     """
     judged = _judged(statistics, config, compensated)
     parents = _parents(statistics, judged, config.grad_threshold, compensated)
-    taken = [anchors.positions] if frozen_positions is None else [anchors.positions, frozen_positions]
-    added, grown_low = _grow(anchors, parents, taken, voxel, config, generator, growth_mask)
+    added, grown_low = anchors.select(parents.index[:0]), 0
+    for level in reversed(_levels(anchors, frozen, parents, voxel, max_pixels)):
+        more, low = _grow(anchors, level, len(added), config, generator, growth_mask)
+        added, grown_low = added.concat(more), grown_low + low
     statistics.gradient[judged] = 0
     statistics.drawn[judged] = 0
 
@@ -142,26 +148,54 @@ def _parents(
     return Parents(index, gradient.reshape(-1)[index], low)
 
 
+@dataclass(frozen=True, eq=False)
+class _Level:
+    """What one level of anchors grows from: parents, the places that are taken, and its voxel."""
+
+    parents: Parents
+    taken: Sequence[Float[Tensor, "_ 3"]]
+    voxel: float
+    max_pixel: float | None = None
+
+
+def _levels(
+    anchors: Anchors, frozen: Anchors | None, parents: Parents, voxel: float, max_pixels: Sequence[float]
+) -> list[_Level]:
+    """The levels of the anchors, finest first; one without levels."""
+    there = [anchors] if frozen is None else [anchors, frozen]
+    if anchors.max_pixels is None:
+        return [_Level(parents, [each.positions for each in there], voxel)]
+    own, levels = anchors.max_pixels[parents.index // anchors.offsets.shape[1]], []
+    for level, largest in enumerate(max_pixels):
+        coarser = own == (max_pixels[level + 1] if level + 1 < len(max_pixels) else -1.0)
+        asking = Parents(parents.index, torch.where(coarser, 0.5 * parents.gradient, parents.gradient), parents.low)
+        taken = [each.positions[each.max_pixels == largest] for each in there]
+        levels.append(_Level(asking.select(coarser | (own == largest)), taken, voxel * 2.0**level, largest))
+    return levels
+
+
 def _grow(
     anchors: Anchors,
-    parents: Parents,
-    taken: Sequence[Float[Tensor, "_ 3"]],
-    voxel: float,
+    level: _Level,
+    added: int,
     config: DensifyConfig,
     generator: torch.Generator,
     growth_mask: GrowthMask | None,
 ) -> tuple[Anchors, int]:
-    """New anchors, at the centers of empty cells that hold a parent's Gaussian, and how many have a parent in L."""
-    grown, grown_low = anchors.select(parents.index[:0]), 0
-    for level in range(config.num_levels):
-        parents = parents.select(parents.gradient >= config.grad_threshold * 2.0**level)
-        room = config.max_anchors - len(anchors) - len(grown) if config.max_anchors else None
+    """New anchors of a level, at the centers of empty cells that hold a parent's Gaussian, and how many have a parent
+    in L. So many were `added` before."""
+    parents, grown, grown_low = level.parents, anchors.select(level.parents.index[:0]), 0
+    for size in range(config.num_levels):
+        parents = parents.select(parents.gradient >= config.grad_threshold * 2.0**size)
+        room = config.max_anchors - len(anchors) - added - len(grown) if config.max_anchors else None
         if not len(parents) or (room is not None and room <= 0):
             break  # later levels ask for more
         count = anchors.offsets.shape[0] * anchors.offsets.shape[1]
-        kept = parents.select(_random(parents.index, count, generator) > 0.5 ** (level + 1))
-        cell = voxel * config.coarsest_voxels / 4.0**level
-        more, low = fill_cells(anchors, kept, [*taken, grown.positions], cell, room, growth_mask)
+        kept = parents.select(_random(parents.index, count, generator) > 0.5 ** (size + 1))
+        cell = level.voxel * config.coarsest_voxels / 4.0**size
+        more, low = fill_cells(anchors, kept, [*level.taken, grown.positions], cell, room, growth_mask)
+        if level.max_pixel is not None:
+            more = replace(more, max_pixels=torch.full_like(more.positions[:, 0], level.max_pixel))
         grown, grown_low = grown.concat(more), grown_low + low
     return grown, grown_low
 

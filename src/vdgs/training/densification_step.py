@@ -34,8 +34,8 @@ def densify(state: TrainingState, stage: TrainingProblem) -> Growth:
     decision = decide_densification(
         state.anchors, state.statistics, stage.voxel_size, config.densify, generator,
         compensated=compensated,
-        frozen_positions=None if stage.frozen_anchors is None else stage.frozen_anchors.anchors.positions,
-        growth_mask=stage.growth_mask,
+        frozen=None if stage.frozen_anchors is None else stage.frozen_anchors.anchors,
+        growth_mask=stage.growth_mask, max_pixels=stage.max_pixels,
     )  # fmt: skip
     before, added = len(state.anchors), len(decision.added)
     kept = torch.cat([decision.keep_mask, decision.keep_mask.new_ones(added)])

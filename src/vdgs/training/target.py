@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -11,8 +11,12 @@ from torch import Tensor
 
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.transfer import upload
+from vdgs.model.anchors import Anchors
 from vdgs.training.crops import PixelBox, crop_at
 from vdgs.training.training_state import TrainingImages, TrainingProblem
+
+#: Share of the steps that draw all levels of the anchors, whatever the size of their pixels (choice).
+ALL_LEVELS_SHARE = 0.5
 
 
 def mean_image_color(
@@ -47,6 +51,14 @@ def opacity_factors_at(stage: TrainingProblem, iteration: int, count: int) -> Fl
     generator = torch.Generator().manual_seed(stage.config.seed * 1_000_033 + iteration)
     noise = torch.randn(count, generator=generator).mul_(deviation).add_(1.0).clamp_(min=0.0)
     return noise.to(stage.device, non_blocking=True)
+
+
+def levels_at(anchors: Anchors, seed: int, iteration: int) -> Anchors:
+    """The anchors as this iteration (from 0) draws them: in a share of the steps without levels. Photographs from high
+    above then train fine anchors too, without which these overfit the few photographs from near."""
+    if anchors.max_pixels is None or np.random.default_rng((seed, 1, iteration)).random() >= ALL_LEVELS_SHARE:
+        return anchors
+    return replace(anchors, max_pixels=None)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

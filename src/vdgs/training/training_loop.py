@@ -27,7 +27,7 @@ from vdgs.training.gradient_roi import crop_to_gradient_support
 from vdgs.training.optimizer import learning_rates_at
 from vdgs.training.schedule import downscale_at, view_at
 from vdgs.training.sky_background import with_sky
-from vdgs.training.target import background_at, crop_box, crop_camera, make_target, opacity_factors_at
+from vdgs.training.target import background_at, crop_box, crop_camera, levels_at, make_target, opacity_factors_at
 from vdgs.training.training_state import StepReport, TrainingProblem, TrainingState
 from vdgs.training.training_step import (
     RenderedTrainingView,
@@ -77,14 +77,14 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
     box = crop_box(stage, view, downscale, iteration)
     camera = crop_camera(stage.images.camera(view, downscale), box)
 
-    rows = cull_anchors(state.anchors, camera)
+    rows = cull_anchors(levels_at(state.anchors, config.seed, iteration), camera)
     rows = rows if stage.select_rows is None else stage.select_rows(state, rows, camera)
     weights = state.decoder.weights_for_image(image_index_at(stage, view))
     background = background_at(stage, iteration)
     with torch.no_grad():
         splats = decode_anchors_for_training(state.anchors, rows, weights, camera)
         target = make_target(stage, view, downscale, crop_to_gradient_support(stage, splats, camera, box))
-        frozen = _frozen_splats(stage, view, camera, target.camera)
+        frozen = _frozen_splats(stage, view, camera, target.camera, iteration)
         drawn = render_for_training(
             splats, target.camera, background, frozen, depth=bool(config.loss.depth_agreement),
             opacity_factors=opacity_factors_at(stage, iteration, len(splats.source)),
@@ -156,14 +156,17 @@ def _count_view(
 
 
 @torch.no_grad()
-def _frozen_splats(stage: TrainingProblem, view: int, camera: Camera, part: Camera) -> OrderedSplats | None:
+def _frozen_splats(
+    stage: TrainingProblem, view: int, camera: Camera, part: Camera, iteration: int
+) -> OrderedSplats | None:
     """The splats of the frozen anchors around a block in a part of a view, without autograd."""
     frozen = stage.frozen_anchors
     if frozen is None or not len(frozen.anchors):
         return None
     weights = frozen.decoder.weights_for_image(image_index_at(stage, view))
     # Culled by the whole view: an anchor outside the part may have Gaussians in it.
-    return decode_anchors_for_training(frozen.anchors, cull_anchors(frozen.anchors, camera), weights, part)
+    rows = cull_anchors(levels_at(frozen.anchors, stage.config.seed, iteration), camera)
+    return decode_anchors_for_training(frozen.anchors, rows, weights, part)
 
 
 def image_index_at(stage: TrainingProblem, view: int) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
@@ -115,7 +115,7 @@ class TrainingState:
         """What training has arrived at: the mean of the last models where there is one, else the last one."""
         if self.model_average is None:
             return self.anchors, self.decoder
-        anchors = Anchors(self.anchors.positions, **self.model_average.anchors)
+        anchors = replace(self.anchors, **self.model_average.anchors)
         return anchors, Decoder.from_tensors(self.model_average.decoder)
 
     def model(self, stage: TrainingProblem, metadata: ModelMetadata | None = None) -> AnchorModel:
@@ -143,6 +143,8 @@ class TrainingProblem:
     images: TrainingImages
     num_images: int
     voxel_size: float
+    #: The largest pixel of each level of the anchors, finest first (`model.levels.fit_levels`); empty: no levels.
+    max_pixels: tuple[float, ...] = ()
     #: Height of the cameras above the ground, or their distance from the scene (`captures.camera_height`), in units of
     #: the ground frame.
     camera_height: float

@@ -16,6 +16,7 @@ from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import FEATURE_SIZE
 from vdgs.model.anchors import Anchors
 from vdgs.model.initialization.gap_filling import find_gap_points
+from vdgs.model.levels import mean_spacing
 
 #: An outlier is known by its distance to this neighbor: small clusters of false matches are outliers too.
 OUTLIER_NEIGHBOR = 4
@@ -76,11 +77,7 @@ def initialize_anchors(
         points, colors = np.concatenate([points, gaps]), np.concatenate([colors, colors[nearest]])
     cells, owner = np.unique(np.round(points / voxel).astype(np.int64), axis=0, return_inverse=True)
     positions = cells * voxel
-    n = len(positions)
-    spacing = np.full(n, voxel)
-    if n > 1:
-        distances, _ = cKDTree(positions).query(positions, k=min(4, n), workers=1)
-        spacing = np.clip(distances[:, 1:].mean(axis=1), 0.5 * voxel, None)
+    n, spacing = len(positions), mean_spacing(positions, voxel)
     features = np.zeros((n, FEATURE_SIZE))
     if config.from_colors:
         features[:, :3] = _mean_colors(colors, owner.reshape(-1), n) * 2.0 - 1.0
