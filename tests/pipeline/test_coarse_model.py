@@ -12,6 +12,7 @@ from rich.console import Console
 from support.captures import tiny_scene, write_colmap
 from support.fake_device import CARD, pretended_card
 from support.hand_made_models import model_at
+from vdgs import kernels
 from vdgs.captures.capture import Capture
 from vdgs.captures.capture_metadata import capture_metadata
 from vdgs.config.capture_options import CaptureOptions
@@ -98,8 +99,9 @@ def test_a_model_without_anchors_of_an_earlier_version_is_refused_too(tmp_path):
         count_run_visibility(RunContext(run), QUIET)
 
 
-def test_visibility_that_is_counted_on_a_card_is_handed_on_in_main_memory(tmp_path):
+def test_visibility_that_is_counted_on_a_card_is_handed_on_in_main_memory(tmp_path, monkeypatch):
     """As `vdgs partition --device cuda` does, where nothing has counted it before."""
+    monkeypatch.setenv(kernels.KERNELS_ENV_VAR, "torch_ref")  # no driver stands in for the card's
     write_colmap(tmp_path / "place", tiny_scene())
     run, capture = begin(tmp_path, METHOD)
     finished(run, capture, model_at([[-1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [90.0, 0.0, 0.0]]))
