@@ -180,12 +180,11 @@ def nine_begun(nine: Flight, tmp_path_factory: pytest.TempPathFactory) -> dict[s
 
 @pytest.fixture
 def unestimated(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reconstructions begin without their estimate, for which three photographs are searched and matched."""
+    """Reconstructions begin without their estimate."""
+    from support import flights
     from vdgs.sfm import reconstruct
-    from vdgs.sfm.sfm_estimate import SfmEstimate
 
-    nothing = SfmEstimate(steps={}, slowdown=1.0, points=0, probed=())
-    monkeypatch.setattr(reconstruct, "estimate_sfm", lambda _plan: nothing)
+    monkeypatch.setattr(reconstruct, "estimate_sfm", flights.unestimated)
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:

@@ -25,7 +25,7 @@ from support.clusters import (
     shard_of,
     waiting_shards,
 )  # fmt: skip
-from support.commands import begun, python, vdgs, wait_until
+from support.commands import begun, do_tasks_here, python, vdgs, wait_until
 from vdgs import cli
 
 pytestmark = [
@@ -64,7 +64,10 @@ from vdgs.distributed.ray_executor import connect, list_nodes
 for _ in range(2):
     with connect(None):
         print(len(list_nodes()), "node")
-"""
+""",
+        RAY_enable_worker_prestart="0",
+        RAY_prestart_worker_first_driver="0",
+        RAY_agent_register_timeout_ms="600000",
     )
     assert done.stdout.splitlines() == ["1 node", "1 node"], done.stderr
 
@@ -124,7 +127,7 @@ def test_a_driver_that_was_killed_finds_its_shards_again_and_stops_them_when_ask
         assert "every shard that was at work is saved" in done.stderr
         assert not any(alive(process) for process in first.paused())
     assert {file.stem for file in run.glob("maps/shards/*/*/*.npz")} == {"000000", "000002"}
-    done = vdgs(*command, environment=cluster.token)
+    done = vdgs("ortho", run, *FINE, "--jobs", "2", prepare=do_tasks_here)  # it is the same job
     assert done.returncode == 0, done.stderr + done.stdout
     assert "2 of 2 shards done" in done.stdout
     assert evaluated(run / "maps") == mapped

@@ -19,7 +19,7 @@ from rich.console import Console
 pytest.importorskip("embreex")
 import pycolmap
 
-from support.flights import FOCAL, ORIGIN, Flight, write_photograph
+from support.flights import FOCAL, HEIGHT, ORIGIN, WIDTH, Flight, write_photograph
 from vdgs.captures.image_cache import load_image
 from vdgs.captures.loading import load_capture
 from vdgs.captures.reconstruction import read_reconstruction, report_rows
@@ -105,7 +105,8 @@ def test_facts_name_what_came_out_and_what_was_left_out(made):
     assert facts.focal_fixed
     assert facts.cameras[0].focal_after_px == pytest.approx(FOCAL)
     assert any("9 of 11" in value for _, value in report_rows(facts))
-    assert (made / "reconstruction.png").stat().st_size > 10_000
+    with Image.open(made / "reconstruction.png") as picture:
+        assert len(picture.convert("L").getcolors()) > 20  # points, positions and words
 
 
 def test_the_same_command_does_nothing_and_an_option_only_what_depends_on_it(made, flight, monkeypatch, tmp_path):
@@ -156,8 +157,8 @@ def test_without_positions_the_scale_is_arbitrary_and_said_so(flight, tmp_path):
     EXIF, and for everybody after it."""
     card = tmp_path / "card"
     (card / "masks").mkdir(parents=True)
-    keep = np.ones((300, 400), bool)
-    keep[:50] = False
+    keep = np.ones((HEIGHT, WIDTH), bool)
+    keep[:40] = False
     Image.fromarray(np.rot90(keep)).save(card / "masks" / f"{flight.names[2]}.png")
     for k, name in enumerate(flight.names[:6]):
         with Image.open(flight.folder / name) as image:
@@ -174,8 +175,8 @@ def test_without_positions_the_scale_is_arbitrary_and_said_so(flight, tmp_path):
     assert not capture.ground.metric
     masks = [load_image(view).mask for view in capture.views]
     assert [mask is not None for mask in masks] == [k == 2 for k in range(6)]
-    assert not masks[2][:45].any()
-    assert masks[2][55:].all()
+    assert not masks[2][:35].any()
+    assert masks[2][45:].all()
     sizes = [size(tmp_path / "capture/images" / name) for name in flight.names[:6]]
     assert sizes == [view.camera.full_size for view in capture.views]
     assert [height > width for width, height in sizes] == [k > 2 for k in range(6)]  # all stand upright

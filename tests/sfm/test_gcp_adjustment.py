@@ -160,7 +160,7 @@ BAD = {
     "too few words": ([{"text": "a 1 2 3"}], "line 2: .* is not `x y z px py photograph.* points alone"),
     "not finite": ([{"text": "nan 2 3 4 5 DJI_0001.JPG"}], "line 2: numbers must be finite"),
     "unknown photograph": ([{"photograph": "DJI_0999.JPG"}], r"1 photographs that are not there; .*DJI_0999\.JPG"),
-    "outside": ([{"text": "1 2 3 401 5 DJI_0001.JPG"}], "line 2: pixel 401, 5 is outside .* 400 x 300"),
+    "outside": ([{"text": "1 2 3 321 5 DJI_0001.JPG"}], "line 2: pixel 321, 5 is outside .* 320 x 240"),
     "two places": ([{}, {"x": 5.0}], "line 3: the point a has another place in line 2"),
     "too few points": ([{"name": "c"}] * 4, "another place"),
     "no place on Earth": ([{"x": 1e12}, {"x": 1e12}], "line 2: .* is no place in"),

@@ -63,7 +63,7 @@ def north_off_deg(fit: PositionFit, turn: np.ndarray) -> float:
     return float(np.degrees(np.arctan2(against[1, 0] - against[0, 1], against[0, 0] + against[1, 1])))
 
 
-@pytest.mark.parametrize("wrong_m", [0.0, 1.0, 3.0, 5.0, 10.0, 20.0])
+@pytest.mark.parametrize("wrong_m", [0.0, 5.0, 20.0])
 @pytest.mark.parametrize(("count", "each", "step"), [(3, 4, 17.0), (6, 12, 25.0)])
 def test_flights_lie_within_their_stated_accuracy(wrong_m, count, each, step):
     """Positions wrong by 0 to 20 m, heights by half as much again: nineteen of twenty within what is stated."""
@@ -90,7 +90,7 @@ def test_flights_lie_within_their_stated_accuracy(wrong_m, count, each, step):
     assert np.median(stated) < 0.01 + 4 * wrong_m / spread / np.sqrt(count * each)
 
 
-@pytest.mark.parametrize("drift_m", [10.0, 30.0, 60.0, 114.0])
+@pytest.mark.parametrize("drift_m", [10.0, 30.0, 114.0])
 @pytest.mark.parametrize("shape", ["line", "there and back"])
 @pytest.mark.parametrize("wrong_m", [0.0, 3.0])
 def test_altitudes_that_drift_tilt_nothing_and_are_said(drift_m, shape, wrong_m):
@@ -117,7 +117,7 @@ def test_altitudes_that_drift_tilt_nothing_and_are_said(drift_m, shape, wrong_m)
 @pytest.mark.parametrize("shape", ["line", "there and back"])
 def test_heights_of_a_barometer_are_as_high_above_the_sea_as_altitudes_tell(drift_m, shape):
     """Heights over the take-off give the shape; how high the take-off lies is known no better than altitudes drift."""
-    for seed in range(5):
+    for seed in range(3):
         rng = np.random.default_rng(seed)
         places = strips(5, 5, 11.0, rng)
         time = np.linspace(0, 1, len(places))
@@ -176,7 +176,7 @@ def test_positions_worse_than_nothing_are_refused_in_words_that_agree_with_each_
 def test_positions_that_wander_as_a_phone_does_tell_no_scale_of_a_small_orbit(radius, believed):
     """Errors that follow each other look like a smaller or larger orbit: they count for more than random ones."""
     taken, within = [], []
-    for seed in range(20):
+    for seed in range(12):
         rng, angle = np.random.default_rng(seed), np.linspace(0, 2 * np.pi, 30, endpoint=False)
         places = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(30, 1.5)], axis=1)
         walk = np.cumsum(rng.normal(0, 1, places.shape), axis=0)

@@ -95,6 +95,7 @@ def test_the_mask_of_a_panorama_masks_its_faces(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.xdist_group("sfm")  # over the town that its flights share
 @pytest.mark.usefixtures("unestimated")
 def test_a_walk_with_panoramas_is_placed(tmp_path):
     """To centimetres and a degree (a pixel shows half of one); views of one share a place; none is of the sky."""

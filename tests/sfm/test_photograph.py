@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from support.flights import FOCAL, FOCAL_MM, ORIGIN, SENSOR_MM, add_xmp, write_photograph
+from support.flights import FOCAL, FOCAL_MM, ORIGIN, SENSOR_MM, WIDTH, add_xmp, write_photograph
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.geometry.geodesy import geodetic_from_enu
@@ -64,7 +64,7 @@ def test_a_photograph_says_where_it_was_taken_and_through_what(tmp_path):
     assert (seen.width, seen.height, seen.relative_altitude) == (160, 120, 41.5)
     assert seen.lens is not None
     assert seen.lens.focal == pytest.approx(FOCAL_MM / SENSOR_MM)  # though EXIF's sizes are those of the original
-    assert pytest.approx(FOCAL / 400) == seen.lens.focal
+    assert pytest.approx(FOCAL / WIDTH) == seen.lens.focal
     assert seen.attitude is not None
     assert seen.attitude.tilt_deg == pytest.approx(0, abs=1e-6)
 

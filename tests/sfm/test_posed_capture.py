@@ -18,6 +18,7 @@ from rich.console import Console
 from support import flights, project_writers
 from support.captures import TinyScene, write_colmap
 from support.dataset_layouts import OPENGL
+from support.flights import ALTITUDE_M, FOCAL, HEIGHT, WIDTH
 from support.known_flight import BentLens, KnownFlight, centers_of, ecef
 from vdgs.captures.format_dispatch import lacks_points
 from vdgs.captures.formats.brown_lens import brown_intrinsics, unproject_pixels
@@ -36,12 +37,12 @@ from vdgs.sfm import feature_extraction, feature_matching
 from vdgs.sfm.posed_capture import make_posed_capture
 from vdgs.sfm.posed_photographs import _in_metres, read_posed_photographs
 from vdgs.sfm.random_points import random_points
-from vdgs.synth.ray_tracing import RayTracer
-from vdgs.synth.town import build_town
 
-pytestmark = pytest.mark.slow  # whole reconstructions, runs or trainings
+pytestmark = [pytest.mark.xdist_group("sfm"), pytest.mark.slow]  # whole reconstructions, runs or trainings
 
-LENS = BentLens(focal=340.0, center=(203.0, 148.0), k=(0.08, -0.02, 0.004, 0.003), p=(0.001, -0.0006), size=(400, 300))
+LENS = BentLens(
+    focal=FOCAL, center=(163.0, 118.0), k=(0.08, -0.02, 0.004, 0.003), p=(0.001, -0.0006), size=(WIDTH, HEIGHT)
+)
 
 
 @pytest.fixture(scope="module")
@@ -49,10 +50,10 @@ def town_flight(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, KnownFl
     """Photographs in a folder, bent, and the cameras that took them."""
     root = tmp_path_factory.mktemp("bent")
     flight = flights.fly(root / "straight", flights.grid(2, 4, 9.0))
-    lens = brown_intrinsics((340.0, 340.0), LENS.center, LENS.size, LENS.k, LENS.p)
-    x, y = np.meshgrid(np.arange(400) + 0.5, np.arange(300) + 0.5)
+    lens = brown_intrinsics((FOCAL, FOCAL), LENS.center, LENS.size, LENS.k, LENS.p)
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     rays = unproject_pixels(lens, np.stack([x.ravel(), y.ravel()], axis=1))
-    grid = (rays * 340.0 + [200.0, 150.0] - 0.5).reshape(300, 400, 2).astype(np.float32)
+    grid = (rays * FOCAL + [WIDTH / 2, HEIGHT / 2] - 0.5).reshape(HEIGHT, WIDTH, 2).astype(np.float32)
     (root / "images").mkdir()
     for name in flight.names:
         pixels = np.asarray(Image.open(flight.folder / name))
@@ -86,13 +87,13 @@ def test_points_lie_on_the_ground_and_poses_stay(town_flight: tuple[Path, KnownF
     to_world = _from_ground(capture.ground)
     centers = to_world(np.stack([view.camera.position for view in capture.views]))
     assert np.abs(centers - centers_of(flight.poses)).max() < 1e-6
-    tracer, points = RayTracer(build_town(3, 60.0).mesh), to_world(capture.points)
+    tracer, points = flights.town_of(60.0)[1], to_world(capture.points)
     middle = centers.mean(axis=0)
     away = (points - middle).astype(np.float32)
     hit = tracer.intersect(np.broadcast_to(middle.astype(np.float32), away.shape).copy(), away)
     off = np.abs(hit.distance - 1) * np.linalg.norm(away, axis=1)
     assert len(points) > 500
-    assert np.median(off) < 0.1
+    assert np.median(off) < 0.75 * ALTITUDE_M / FOCAL  # three quarters of a pixel
     errors = [view.observations.reprojection_errors_px(view.camera) for view in capture.views]  # type: ignore[union-attr]
     assert np.median(np.concatenate(errors)) < 0.7
     assert len(read_colmap(tmp_path / "capture" / "sparse" / "0").views) == 8
@@ -167,7 +168,7 @@ def test_captures_without_points_get_them_with_their_poses_and_lists(
             for name, pose in zip(names, poses, strict=True)
         ]
         tests = {"test_filenames": [frames[1]["file_path"]]}
-        content = {"camera_angle_x": 2 * np.arctan(200 / 340), **tests, "frames": frames}
+        content = {"camera_angle_x": 2 * np.arctan(WIDTH / 2 / FOCAL), **tests, "frames": frames}
         (tmp_path / "transforms.json").write_text(json.dumps(content))
     with pytest.raises(NoTiePoints, match=r"no 3D points.*\. This finds them.*: vdgs sfm .* --output CAPTURE\n"):
         load_capture(tmp_path)
@@ -222,7 +223,7 @@ def test_transforms_without_points_keep_their_poses_and_lists(
     root, flight = town_flight
     names = [f"./images/{name}" for name in flight.names]
     content = {
-        "fl_x": 340.0, "fl_y": 340.0, "cx": 200.0, "cy": 150.0, "w": 400, "h": 300, "aabb_scale": 16,
+        "fl_x": FOCAL, "fl_y": FOCAL, "cx": WIDTH / 2, "cy": HEIGHT / 2, "w": WIDTH, "h": HEIGHT, "aabb_scale": 16,
         "frames": [frame | {"file_path": names[k]} for k, frame in enumerate(_frames(flight, range(7), ""))],
         "train_filenames": names[:5], "test_filenames": names[5:6],
     }  # fmt: skip
@@ -250,7 +251,10 @@ def test_a_set_of_blender_is_put_on_white(town_flight: tuple[Path, KnownFlight],
             pixels = np.asarray(Image.open(root / "straight" / flight.names[k]).convert("RGBA")).copy()
             pixels[:, :100] = 0
             Image.fromarray(pixels).save(tmp_path / "set" / side / f"r_{k}.png", compress_level=1)
-        content = {"camera_angle_x": 2 * np.arctan(200 / 340), "frames": _frames(flight, indices, f"./{side}/r_{{}}")}
+        content = {
+            "camera_angle_x": 2 * np.arctan(WIDTH / 2 / FOCAL),
+            "frames": _frames(flight, indices, f"./{side}/r_{{}}"),
+        }
         (tmp_path / "set" / f"transforms_{side}.json").write_text(json.dumps(content))
     said = ask(tmp_path / "set", tmp_path / "capture")
     assert "6 photographs are transparent: what is transparent becomes white" in said

@@ -15,7 +15,7 @@ from rich.console import Console
 pytest.importorskip("embreex")
 import pycolmap
 
-from support.flights import Flight, copy_folder, write_photograph
+from support.flights import HEIGHT, WIDTH, Flight, copy_folder, write_photograph
 from vdgs.captures.image_cache import load_image
 from vdgs.captures.image_files import decode_mask
 from vdgs.captures.loading import load_capture
@@ -164,7 +164,7 @@ def masked(nine, tmp_path) -> Flight:
     for name in nine.names:
         os.link(nine.folder / name, tmp_path / "card" / name)
     for name in nine.names[:2]:
-        write_mask(tmp_path / f"card/masks/{name}.png", left_half(300, 400))
+        write_mask(tmp_path / f"card/masks/{name}.png", left_half(HEIGHT, WIDTH))
     return Flight(tmp_path / "card", nine.cameras)
 
 
@@ -173,19 +173,19 @@ def test_features_lie_where_masks_are_white(masked, tmp_path):
     silence_colmap()
     collection = collect_images([masked.folder])
     seen = (collection.images[0], collection.images[5])
-    black = write_mask(tmp_path / "black.png", np.zeros((300, 400), bool))
+    black = write_mask(tmp_path / "black.png", np.zeros((HEIGHT, WIDTH), bool))
     seen = (*seen, replace(collection.images[1], mask=black))
     work, kinds = Workspace(tmp_path / "work"), feature_extraction.group_by_camera(seen)
     feature_extraction.create_database(work, kinds)
     feature_extraction.write_upright_images(work, seen)
     write_upright_masks(work, seen, 1)
-    options = SfmOptions(max_image_size=300, max_num_features=500)
+    options = SfmOptions(max_image_size=240, max_num_features=500)
     counts = feature_extraction.extract_features(work, kinds, options, 1, console())
     database = pycolmap.Database.open(work.database)
     found = {image.name: image.image_id for image in database.read_all_images()}
     x, y = np.asarray(database.read_keypoints(found[seen[0].name]))[:, :2].T
     database.close()
-    assert left_half(300, 400)[y.astype(int), x.astype(int)].all()
+    assert left_half(HEIGHT, WIDTH)[y.astype(int), x.astype(int)].all()
     assert 0 < counts[seen[0].name] < counts[seen[1].name]
     assert counts[seen[2].name] == 0
     with pytest.raises(CaptureError, match="shows only 0 features where its mask is white"):
@@ -199,14 +199,14 @@ def test_masks_are_written_with_the_capture_and_what_depends_on_them_is_done_aga
         image_folders=(masked.folder,), output=output, threads=1, options=SfmOptions(max_output_size=200)
     )
     first = masked.folder / f"masks/{masked.names[0]}.png"
-    for change in (lambda: None, lambda: write_mask(first, ~left_half(300, 400)), first.unlink):
+    for change in (lambda: None, lambda: write_mask(first, ~left_half(HEIGHT, WIDTH)), first.unlink):
         change()
         keys.append(step_keys(plan_reconstruction(request)))
     for step in ("features", "matches", "model", "capture"):
         assert len({each[step] for each in keys}) == 3
 
     copy_folder(nine_begun["writing"], output)
-    write_mask(first, left_half(300, 400))
+    write_mask(first, left_half(HEIGHT, WIDTH))
     prepared, work = plan_reconstruction(request), Workspace(output / "work")
     write_upright_masks(work, prepared.image_list.images, 1)
     model = incremental_mapper.read_models(work)[0]

@@ -91,7 +91,7 @@ class Cluster:
             # A node that is gone refuses to be asked, at once; one that is slow to answer is not taken for dead.
             "RAY_health_check_initial_delay_ms": "0", "RAY_health_check_period_ms": "1000",
             "RAY_health_check_failure_threshold": "2", "RAY_health_check_timeout_ms": "600000",
-            "RAY_gcs_rpc_server_reconnect_timeout_s": "600",
+            "RAY_gcs_rpc_server_reconnect_timeout_s": "600", "RAY_agent_register_timeout_ms": "600000",
             "RAY_memory_monitor_refresh_ms": "0",  # what other tests take is not for Ray to free
             "VDGS_THREADS": "1", "OMP_NUM_THREADS": "1", **self.token,
         }  # fmt: skip

@@ -10,12 +10,14 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from PIL import Image
 from rich.console import Console
 
+from support.commands import small_figures
 from vdgs.config.sfm_options import SfmRequest
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.geodesy import geodetic_from_enu
@@ -25,9 +27,12 @@ from vdgs.synth.lighting import SkyMap, make_sky_map
 from vdgs.synth.ray_tracing import RayTracer
 from vdgs.synth.town import Town, build_town
 
+if TYPE_CHECKING:
+    from vdgs.sfm.sfm_estimate import SfmEstimate
+
 #: Where the town lies: latitude, longitude in degrees, altitude in metres. South and west, where signs go wrong.
 ORIGIN = (-33.5, -70.6, 500.0)
-WIDTH, HEIGHT, FOCAL = 400, 300, 340.0
+WIDTH, HEIGHT, FOCAL = 320, 240, 272.0
 FOCAL_MM, SENSOR_MM = 8.5, 10.0
 ALTITUDE_M = 45.0
 
@@ -93,9 +98,10 @@ def folders_of_steps(flight: Flight, folder: Path) -> dict[str, Path]:
     from vdgs.sfm import reconstruct as reconstructing
 
     output = folder / "capture"
-    with pytest.MonkeyPatch.context() as patch:
+    with small_figures(), pytest.MonkeyPatch.context() as patch:
         for step, name in (("matching", "_matches"), ("mapping", "_models"), ("writing", "_write")):
             patch.setattr(reconstructing, name, _after_copying(getattr(reconstructing, name), output, folder / step))
+        patch.setattr(reconstructing, "estimate_sfm", unestimated)
         request = SfmRequest(image_folders=(flight.folder,), output=output, threads=1, keep_intermediate=True)
         reconstructing.reconstruct(request, Console(file=io.StringIO()))
     shutil.copytree(output, folder / "done", symlinks=True, ignore=shutil.ignore_patterns(".lock", "work"))
@@ -108,6 +114,13 @@ def add_what_is_left_out(flight: Flight) -> None:
     write_photograph(flight.folder / "gray.jpg", gray, 50, np.array([0.0, 3.0, ALTITUDE_M]))
     (flight.folder / "cut.jpg").write_bytes((flight.folder / flight.names[0]).read_bytes()[:9000])
     (flight.folder / "notes.txt").write_text("windy")
+
+
+def unestimated(_plan: object) -> SfmEstimate:
+    """Instead of an estimate, for which three photographs are searched and matched."""
+    from vdgs.sfm.sfm_estimate import SfmEstimate
+
+    return SfmEstimate(steps={}, slowdown=1.0, points=0, probed=())
 
 
 def _after_copying(function: Callable, of: Path, to: Path) -> Callable:

@@ -12,7 +12,8 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 
 from vdgs.captures.capture import Capture
 from vdgs.report.capture_stats import CaptureReport
-from vdgs.system.figure_style import DPI, INK, NOTE_SIZE, TEXT_SIZE, VISIBILITY_CMAP, style_axes, write_png
+from vdgs.system import figure_style as style
+from vdgs.system.figure_style import INK, NOTE_SIZE, TEXT_SIZE, VISIBILITY_CMAP, style_axes, write_png
 from vdgs.system.units import format_length
 from vdgs.visibility.visibility_counts import LOW_VISIBILITY_LIMITS
 from vdgs.visibility.visibility_map import CameraMarks, VisibilityMapData, plot_visibility_map, visibility_color_norm
@@ -37,7 +38,7 @@ def draw_capture_map(
 
 def draw_visibility_histogram(report: CaptureReport, visibility: np.ndarray, file: Path) -> None:
     """How many points are seen at least so often, and the share that fewer than 3, 5, 10 cameras see."""
-    figure = Figure(figsize=(10.5, 4.3), dpi=DPI, layout="constrained")
+    figure = Figure(figsize=(10.5, 4.3), dpi=style.DPI, layout="constrained")
     figure.get_layout_engine().set(w_pad=0.12, h_pad=0.1)  # type: ignore[union-attr, call-arg]
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2, width_ratios=[1.7, 1])

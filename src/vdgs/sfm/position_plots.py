@@ -12,8 +12,9 @@ from matplotlib.figure import Figure
 
 from vdgs.sfm.georegistration import Georegistration
 from vdgs.sfm.gps_priors import GpsPriors
+from vdgs.system import figure_style as style
 from vdgs.system.atomic_files import write_bytes
-from vdgs.system.figure_style import ACCENT, DPI, INK, MUTED, TEXT_SIZE, style_axes
+from vdgs.system.figure_style import ACCENT, INK, MUTED, TEXT_SIZE, style_axes
 
 #: The longest arrow of a residual is drawn this share of the picture long at most.
 MAX_ARROW_SHARE = 0.12
@@ -71,7 +72,7 @@ def plot_residuals(
 
 
 def _axes(title: str, metric: bool = True):  # type: ignore[no-untyped-def]
-    figure = Figure(figsize=(8.5, 7.5), dpi=DPI, layout="constrained")
+    figure = Figure(figsize=(8.5, 7.5), dpi=style.DPI, layout="constrained")
     axes = figure.subplots()
     axes.set_aspect("equal", adjustable="box")
     axes.set_title(title, loc="left", fontsize=TEXT_SIZE, color=INK)

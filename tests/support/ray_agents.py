@@ -1,0 +1,27 @@
+"""What stands for the two agents of every Ray node, which serve dashboards and packages of environments: nothing here
+asks for either, and each takes half a second of processor time to start."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+#: For the program of an agent, the names of the ports that a node waits for.
+PORTS = {
+    "dashboard/agent.py": ("metrics_agent_port", "metrics_export_port", "dashboard_agent_listen_port"),
+    "runtime_env/agent/main.py": ("runtime_env_agent_port",),
+}
+
+
+def stand_in_for_agents() -> None:
+    """If this process is to be an agent, say that it has no ports, wait for the end of its node, and end."""
+    for program, names in PORTS.items():
+        if any(word.endswith(f"/{program}") for word in sys.orig_argv[:4]):
+            options = dict(word[2:].split("=", 1) for word in sys.orig_argv if word.startswith("--") and "=" in word)
+            for name in names:
+                file = Path(options["session-dir"], f"{name}_{options['node-id']}")
+                (begun := file.with_name(f"{file.name}.begun")).write_text("-1")
+                begun.rename(file)  # a node reads it as soon as it is there
+            sys.stdin.read()
+            os._exit(0)
